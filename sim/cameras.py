@@ -102,6 +102,11 @@ class Cameras:
         """Whether a random occlusion lasted at the last sample."""
         return self._hidden
 
+    def clock_us(self, at_ns: int) -> int:
+        """Return the cameras' own clock at a time of the simulation [µs]."""
+        since_ns = at_ns - self._start_ns
+        return self._clock_us + since_ns // 1000 + round(since_ns * self._camera.clock_drift_ppm * 1e-9)
+
     def mistake(self, axes: str) -> None:
         """Permute the axes of positions from now on, by a name in `AXES`, as of a wrong setup."""
         self._axes = AXES[axes]
@@ -143,8 +148,7 @@ class Cameras:
                 north, east, down = (p + off for p, off in zip(place, self._creep_m(at_ns), strict=True))
                 place = (north, east, down)
             self._seen = body._replace(position_m=place, velocity_mps=speed)
-        drift_us = round(since_ns * camera.clock_drift_ppm * 1e-9)
-        msg = self._message(self._clock_us + since_ns // 1000 + drift_us, self._seen)
+        msg = self._message(self.clock_us(at_ns), self._seen)
         data = bytes(msg.pack(self._mav))
         self._mav.seq = (self._mav.seq + 1) % 256  # pack() does not advance it
         return at_ns + round(latency_s * 1e9), data

@@ -1,4 +1,4 @@
-"""Simulation server: simulated vehicles on real sockets, alone or as a fleet."""
+"""Simulation server: simulated vehicles on real sockets."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 import signal
 import socket
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from multiprocessing import parent_process
@@ -16,15 +16,12 @@ from selectors import EVENT_READ, SelectSelector
 from typing import Protocol
 from urllib.parse import urlsplit
 
-import msgspec
-
 from sim.autopilot.profile import SIMULATED
+from sim.natnet import SCHEME, NatNetPort, as_motive
 from sim.simulation import MOCAP, VEHICLE, Peers, VehicleSnapshot
-from uavctl.config.checks import outside
-from uavctl.config.sim import ids
 from uavctl.config.types import Config
-from uavctl.errors import ConfigError, ConnectionSpecError
-from uavctl.records import Truth, Vec3
+from uavctl.errors import ConnectionSpecError
+from uavctl.records import Truth
 
 # The simulator's own sockets: datagrams in and out over UDP or TCP; nothing blocks.
 
@@ -264,10 +261,13 @@ def open_port(url: str, greeting: Greeting = ()) -> Port:
     Raises:
         ConnectionSpecError: not a URL of a kind that the simulator has, or it cannot be opened.
     """
+    urls = [one.strip() for one in url.split(",")]
+    if len(urls) > 1 and any(one.startswith(f"{SCHEME}:") for one in urls):
+        raise ConnectionSpecError(f"{url}: NatNet is no MAVLink, so it stands alone; give one of them")
     opened: list[Port] = []
     try:
-        for one in url.split(","):
-            opened.append(_open(one.strip(), greeting))
+        for one in urls:
+            opened.append(_open(one, greeting))
     except ConnectionSpecError:
         Ports(opened).close()
         raise
@@ -280,6 +280,8 @@ def _open(url: str, greeting: Greeting) -> Port:
         "udpin": lambda address: UdpPort("udpin", address),
         "tcpin": lambda address: TcpPort(address, greeting),
     }
+    if url.startswith(f"{SCHEME}:"):
+        return _attempt(url, lambda: NatNetPort(url))
     try:
         parts = urlsplit(url)
         host, port = parts.hostname, parts.port
@@ -289,8 +291,13 @@ def _open(url: str, greeting: Greeting) -> Port:
         raise ConnectionSpecError(f"{url}: port 0 is no address to send to; write udpout://127.0.0.1:14540")
     if parts.scheme not in kinds or host is None or port is None:
         raise ConnectionSpecError(f'"{url}": the simulator speaks {", ".join(kinds)}; write udpout://127.0.0.1:14540')
+    address = host, port
+    return _attempt(url, lambda: kinds[parts.scheme](address))
+
+
+def _attempt(url: str, make: Callable[[], Port]) -> Port:
     try:
-        return kinds[parts.scheme]((host, port))
+        return make()
     except socket.gaierror as error:
         raise ConnectionSpecError(f"{url}: no such host ({error.strerror}); check its name") from error
     except OSError as error:
@@ -369,7 +376,8 @@ def serve_all(
     can.
 
     Args:
-        seats: the vehicles; their URLs are udpout (PX4 sends *to* the client's port), udpin, or tcpin.
+        seats: the vehicles; their URLs are udpout (PX4 sends *to* the client's port), udpin, or tcpin; those of the
+            cameras may be natnet.
         duration_s: length of the run, in simulated time [s], None for ever.
         airborne: start flying in the external mode, else on the floor and disarmed.
         on_ready: called once for each vehicle, all ports being open.
@@ -383,18 +391,21 @@ def serve_all(
     opened: list[dict[str, Port]] = []
     try:
         for seat in seats:
+            if seat.vehicle.startswith(f"{SCHEME}:"):
+                raise ConnectionSpecError(f"{seat.vehicle}: a vehicle speaks no NatNet; give it to the cameras")
             ports: dict[str, Port] = {}
             opened.append(ports)
             ports[VEHICLE] = open_port(seat.vehicle, SIMULATED[seat.config.sim.autopilot].greeting)
             if seat.mocap != seat.vehicle:
                 ports[MOCAP] = open_port(seat.mocap)
-            if door is not None:
-                ports.update({name: door(name, port) for name, port in ports.items()})
+            if door is not None:  # NatNet has no signatures
+                plain = {name: port for name, port in ports.items() if not isinstance(port, NatNetPort)}
+                ports.update({name: door(name, port) for name, port in plain.items()})
         # One grid for all: a multiple of every step.
         dt_ns = math.lcm(*(round(seat.config.plant.dt_s * 1e9) for seat in seats))
         clock = _Clock(grid_start(time.monotonic_ns(), dt_ns), speed)
         end_ns = None if duration_s is None else clock.start_ns + round(duration_s * 1e9)
-        worlds = [_world(seat, ports, clock.start_ns, airborne) for seat, ports in zip(seats, opened, strict=True)]
+        worlds = [_world(seat, ports, clock, airborne) for seat, ports in zip(seats, opened, strict=True)]
         for ports in opened:
             on_ready(Ready(ports[VEHICLE].url, ports.get(MOCAP, ports[VEHICLE]).url, clock.start_ns))
         _run(worlds, clock, end_ns, stop, on_look)
@@ -422,9 +433,15 @@ class _Clock:
 _World = tuple[Peers, dict[str, Port]]
 
 
-def _world(seat: Seat, ports: dict[str, Port], start_ns: int, airborne: bool) -> _World:
+def _world(seat: Seat, ports: dict[str, Port], clock: _Clock, airborne: bool) -> _World:
     shared = seat.mocap == seat.vehicle
-    return Peers(seat.config, start_ns, airborne=airborne, shared_link=shared, on_truth=seat.on_truth), ports
+    config, cameras = seat.config, ports.get(MOCAP)
+    if isinstance(cameras, NatNetPort):
+        config = as_motive(config)
+    peers = Peers(config, clock.start_ns, airborne=airborne, shared_link=shared, on_truth=seat.on_truth)
+    if isinstance(cameras, NatNetPort):
+        cameras.clock_us = lambda: peers.cameras.clock_us(clock.now_ns())
+    return peers, ports
 
 
 def _run(
@@ -510,92 +527,3 @@ def serve_in_child(
         return  # nobody listens any more
     finally:
         pipe.close()
-
-
-# Several simulated vehicles from one configuration, each with ports of its own.
-
-
-LARGEST_ID = 250
-APART_M = 1.0
-TCP_PORTS = 10  # from one vehicle to the next, as ArduPilot's simulator counts instances; UDP counts by one
-
-
-def fleet(config: Config, vehicle: str, mocap: str, count: int, on_truth: Callable[[Truth], None]) -> tuple[Seat, ...]:
-    """Return the seats of `count` vehicles, the first as configured.
-
-    Each of the others has the system id and the seed of the one before plus one, and its ports lie one (UDP) or ten
-    (TCP) higher; port 0, any free one, stays 0. They start 1 m apart within the limits of the position: eastwards in
-    rows, each 1 m north of the one before. What is configured to happen happens to all.
-
-    Raises:
-        ConfigError: the system ids run out or meet the daemon's, or the limits have no room for all.
-        ConnectionSpecError: two vehicles would have one port.
-    """
-    last = config.sim.system_id + count - 1
-    if last > LARGEST_ID:
-        raise ConfigError(
-            (f"sim.system_id: {count} vehicles would go up to {last}; set {LARGEST_ID + 1 - count} or less",)
-        )
-    places = _places(config, count)
-    configs = [_another(config, i, place) for i, place in enumerate(places)]
-    wrong = [problem for one in configs for problem in ids(one.sim, one.daemon)]
-    if wrong:
-        raise ConfigError(tuple(f"{one.key}: {one.reason}; {one.todo}" for one in wrong))
-    seats = tuple(Seat(configs[i], _shifted(vehicle, i), _shifted(mocap, i), on_truth) for i in range(count))
-    taken: dict[str, int] = {}
-    for i, seat in enumerate(seats):
-        for url in _fixed(seat):
-            if taken.setdefault(url, i) != i:
-                raise ConnectionSpecError(
-                    f"{url}: vehicles {taken[url] + 1} and {i + 1} would both have it; choose ports further apart"
-                )
-    return seats
-
-
-def _places(config: Config, count: int) -> list[Vec3]:
-    """Return the start positions [m]."""
-
-    def fits(place: Vec3) -> bool:
-        return not any(outside(config.plant, config.sets, place, "", ""))
-
-    north, east, down = config.sim.start_position_m
-    places = [(north, east, down)]
-    while len(places) < count:
-        at_north, at_east, _ = places[-1]
-        places.append((at_north, at_east + APART_M, down))
-        if not fits(places[-1]):
-            places[-1] = (at_north + APART_M, east, down)
-        if not fits(places[-1]):
-            reason = f"the limits of the position (sets) have room for {len(places) - 1} of {count} vehicles from here"
-            raise ConfigError((f"sim.start_position_m: {reason}; start further south and west, or serve fewer",))
-    return places
-
-
-def _another(config: Config, number: int, place: Vec3) -> Config:
-    sim, replace = config.sim, msgspec.structs.replace
-    other = replace(sim, system_id=sim.system_id + number, seed=sim.seed + number, start_position_m=place)
-    return replace(config, sim=other)
-
-
-def _shifted(urls: str, number: int) -> str:
-    return ",".join(_higher(url.strip(), number) for url in urls.split(","))
-
-
-def _higher(url: str, number: int) -> str:
-    """Return the URL with a higher port; one without a port stays as it is, for `open_port` to refuse."""
-    try:
-        parts = urlsplit(url)
-        port = parts.port
-    except ValueError:
-        return url
-    if not port or parts.hostname is None:
-        return url
-    step = TCP_PORTS if parts.scheme == "tcpin" else 1
-    return f"{parts.scheme}://{parts.hostname}:{port + step * number}"
-
-
-def _fixed(seat: Seat) -> Iterator[str]:
-    """Return the URLs of a seat, without those that stand for any free port."""
-    for url in {*seat.vehicle.split(","), *seat.mocap.split(",")}:
-        if not url.endswith(":0"):
-            yield url

@@ -79,8 +79,8 @@ class Peers:
             self.vehicle = LinearVehicle(config, for_vehicle, start_ns)
         self.autopilot = Autopilot(config, self.vehicle, start_ns, for_inertial, airborne=airborne)
         self.channel = Channel(config.link, for_channel, start_ns, round(config.plant.dt_s * 1e9))
-        self._cameras = Cameras(config.sim.camera, config.frame, for_cameras, start_ns)
-        self._faults = Faults(config, self.vehicle, self.autopilot, self._cameras, start_ns)
+        self.cameras = Cameras(config.sim.camera, config.frame, for_cameras, start_ns)
+        self._faults = Faults(config, self.vehicle, self.autopilot, self.cameras, start_ns)
         self._airborne = airborne
         self._start_ns = start_ns
         self._mocap_link = VEHICLE if shared_link else MOCAP
@@ -108,7 +108,7 @@ class Peers:
 
     def _earliest_ns(self, autopilot_ns: int | None, fault_ns: int | None) -> int:
         found_ns = earliest((autopilot_ns, fault_ns))
-        return self._cameras.next_ns if found_ns is None else min(self._cameras.next_ns, found_ns)
+        return self.cameras.next_ns if found_ns is None else min(self.cameras.next_ns, found_ns)
 
     def advance(self, to_ns: int) -> list[Due]:
         """Move time on; return the datagrams due up to and including `to_ns`, in order of time."""
@@ -160,7 +160,7 @@ class Peers:
     def _amiss(self) -> tuple[str, ...]:
         """Kinds of the faults that act now; a random occlusion is one too."""
         found = active(self._config, self.now_ns - self._start_ns)
-        return (*found, "occluded") if self._cameras.hidden and "occluded" not in found else found
+        return (*found, "occluded") if self.cameras.hidden and "occluded" not in found else found
 
     def look(self) -> VehicleSnapshot:
         """Return a snapshot of the vehicle."""
@@ -200,9 +200,9 @@ class Peers:
             if autopilot_ns is not None and autopilot_ns <= at_ns:
                 self._wire.extend((at_ns, VEHICLE, data) for data in self.autopilot.run(at_ns))
                 busy = True
-            if self._cameras.next_ns <= at_ns:
+            if self.cameras.next_ns <= at_ns:
                 craft = self.vehicle
-                sample = self._cameras.capture(craft.position_m, craft.velocity_mps, craft.attitude)
+                sample = self.cameras.capture(craft.position_m, craft.velocity_mps, craft.attitude)
                 if sample is None:
                     self.channel.pass_over(at_ns)
                 else:  # A flight that begins in the air begins with a known position: a(0) = 0, as in the paper.

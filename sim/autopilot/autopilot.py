@@ -2,8 +2,8 @@
 
 Its bytes are made and read with pymavlink's dialect directly, not with the controller's codec. It shows what was
 observed of the real autopilots: the table of `profile.py`, the rules for setpoints in `setpoints.py`, the state
-machine of `pilot.py`, the estimate of `estimator.py`, and the commands, parameters and streams in the files of these
-names. What is not known is not answered, as the real ones do.
+machine of `pilot.py`, the estimate of `estimator.py`, and the commands, parameters, files and streams in the modules of
+these names. What is not known is not answered, as the real ones do.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.autopilot.commands import CommandRequest, Commands
 from sim.autopilot.estimator import Estimator
+from sim.autopilot.files import Files
 from sim.autopilot.inertial import ERRORS, InertialSensors
 from sim.autopilot.pilot import CRASHED, CRITICAL, WARNING, Phase, Pilot
 from sim.autopilot.profile import SIMULATED, Mode, Parameters, ParameterType, Role, SimulatedProfile
@@ -270,6 +271,13 @@ COMPONENT_ID = 1
 UPTIME_NS = 20 * SECOND_NS
 NO_INDEX = 65535  # param_index that is none
 HASH = "_HASH_CHECK"
+ERROR = 3  # MAV_SEVERITY
+MISSION_RESULTS = {
+    "MISSION_CLEAR_ALL": mavlink.MAV_MISSION_ACCEPTED,
+    "MISSION_COUNT": mavlink.MAV_MISSION_UNSUPPORTED,
+    "MISSION_REQUEST": mavlink.MAV_MISSION_INVALID_SEQUENCE,
+    "MISSION_REQUEST_INT": mavlink.MAV_MISSION_INVALID_SEQUENCE,
+}
 # MAV_DATA_STREAM, as ArduPilot groups its messages; 0 is all.
 DATA_STREAMS = {1: (27, 116), 2: (1, 24), 3: (65,), 6: (32, 33), 10: (30,), 11: (74,), 12: (193, 147)}
 
@@ -316,6 +324,7 @@ class Autopilot:
         whole = TelemetrySources(kind, craft, *parts, origin, boot_ns, radio, config.sim.streams)
         self.telemetry = Telemetry(whole, start_ns)
         self._commands = Commands(whole, self.telemetry, self._send)
+        self._files = Files(self.parameters, packs=kind.name == "ardupilot")
         self._failsafes = Failsafes(
             kind, self.pilot, self.parameters, self.estimator, craft.battery, clears=config.sim.checks.clears
         )
@@ -327,7 +336,13 @@ class Autopilot:
             "ATT_POS_MOCAP": self.estimator.take,
             "COMMAND_INT": self._on_command,
             "COMMAND_LONG": self._on_command,
+            "FILE_TRANSFER_PROTOCOL": self._on_file,
             "HEARTBEAT": self._on_heartbeat,
+            "LOG_REQUEST_LIST": self._on_log_list,
+            "MISSION_CLEAR_ALL": self._on_mission,
+            "MISSION_COUNT": self._on_mission,
+            "MISSION_REQUEST": self._on_mission,
+            "MISSION_REQUEST_INT": self._on_mission,
             "MISSION_REQUEST_LIST": self._on_mission_list,
             "ODOMETRY": self.estimator.take,
             "PARAM_REQUEST_LIST": self._on_parameter_list,
@@ -456,6 +471,27 @@ class Autopilot:
         if self._for_me(msg):  # there are no missions
             to = msg.get_srcSystem(), msg.get_srcComponent()
             self._send(mavlink.MAVLink_mission_count_message(*to, 0, msg.mission_type))
+
+    def _on_mission(self, msg: Any, _at_ns: int) -> None:
+        """Refuse a mission, fence or rally points, and items that nobody has; what is empty can be cleared."""
+        if self._for_me(msg):
+            to = msg.get_srcSystem(), msg.get_srcComponent()
+            result = MISSION_RESULTS[msg.get_type()]
+            self._send(mavlink.MAVLink_mission_ack_message(*to, result, msg.mission_type))
+
+    def _on_log_list(self, msg: Any, _at_ns: int) -> None:
+        """Tell that there are no logs. Data of one that is not there are not answered, as by the real ones."""
+        if not self._for_me(msg):
+            return
+        if self._kind.name == "ardupilot" and self.pilot.armed:
+            self.pilot.texts.append((ERROR, "Disarm for log download"))
+        else:
+            self._send(mavlink.MAVLink_log_entry_message(0, 0, 0, 0, 0))
+
+    def _on_file(self, msg: Any, at_ns: int) -> None:
+        if self._for_me(msg):
+            for answer in self._files.answer(msg, at_ns):
+                self._send(answer)
 
     def _on_data_stream(self, msg: Any, at_ns: int) -> None:
         """Set the rate of a group of streams [Hz]; ArduPilot only."""

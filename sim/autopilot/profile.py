@@ -153,6 +153,10 @@ class Parameters:
         """Return the type of a parameter."""
         return self._table[name].kind
 
+    def default(self, name: str) -> float:
+        """Return the value of a parameter at the start."""
+        return _stored(self._table[name].value, self._table[name].kind)
+
     def allowed(self, name: str) -> tuple[float, ...]:
         """Return the values of a parameter that are simulated; empty means all."""
         return self._table[name].allowed

@@ -133,9 +133,9 @@ Message = Any  # pymavlink's classes have no types
 # MAV_SYS_STATUS_SENSOR
 GYRO, ACCEL, MAG, BARO, GPS, VISION = 1, 2, 4, 8, 32, 128
 CONTROL = 1024 | 2048 | 4096 | 8192 | 16384 | 32768  # rates, attitude, yaw, height, position, motors
-RADIO, AHRS, BATTERY, PREARM = 1 << 16, 1 << 21, 1 << 25, 1 << 28
+RADIO, FENCE, AHRS, BATTERY, PREARM = 1 << 16, 1 << 20, 1 << 21, 1 << 25, 1 << 28
 # MAV_PROTOCOL_CAPABILITY
-FLOAT, COMMAND_INT, BYTEWISE, LOCAL_TARGETS, MAVLINK2, CAST = 2, 8, 16, 128, 8192, 131072
+FLOAT, COMMAND_INT, BYTEWISE, FILES, LOCAL_TARGETS, MAVLINK2, CAST = 2, 8, 16, 32, 128, 8192, 131072
 
 # Roll, pitch, throttle and yaw of a stick that nobody moves [µs]; telemetry has room for 18 channels.
 STICK_US = (1500, 1500, 1500, 1500)
@@ -316,8 +316,11 @@ class Telemetry:
             healthy |= present & (AHRS | VISION)
         if self._may_arm(at_ns):
             healthy |= PREARM
+        # As recorded: an ArduPilot has a fence that is healthy while nobody enables it, a PX4 tells of none.
+        fence = FENCE if v.kind.name == "ardupilot" else 0
         power = round(1000.0 * battery.voltage_v), round(100.0 * battery.current_a), round(100.0 * battery.remaining)
-        return mavlink.MAVLink_sys_status_message(present, present, healthy, 250, *power, 0, 0, 0, 0, 0, 0)
+        told = present | fence, present, healthy | fence
+        return mavlink.MAVLink_sys_status_message(*told, 250, *power, 0, 0, 0, 0, 0, 0)
 
     def _gps(self, at_ns: int) -> Message:
         v = self._v
@@ -449,7 +452,7 @@ class Telemetry:
 
     def _version(self, _at_ns: int) -> Message:
         px4 = self._v.kind.name == "px4"
-        can = FLOAT | COMMAND_INT | LOCAL_TARGETS | MAVLINK2 | (BYTEWISE if px4 else CAST)
+        can = FLOAT | COMMAND_INT | FILES | LOCAL_TARGETS | MAVLINK2 | (BYTEWISE if px4 else CAST)
         version = self._v.kind.version
         return mavlink.MAVLink_autopilot_version_message(
             can, version, 0, 0, 0, [0] * 8, [0] * 8, [0] * 8, 0, 0, 0x5541564354, [0] * 18

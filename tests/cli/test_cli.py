@@ -251,3 +251,19 @@ def test_without_the_extras_a_command_says_what_it_needs_and_a_wrong_one_is_refu
     done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, cwd=ROOT, check=False)
     assert done.returncode == 2 and done.stdout == ""
     assert told in done.stderr and done.stderr.startswith("error:") and done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("place", [["-1,0,-1"], ["-1", "0", "-1"], ["-1.5", "-0.5", "-1e0"]])
+def test_a_place_below_zero_is_taken_with_commas_and_with_spaces(
+    place: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["ctl", "goto", *place, "--control", str(tmp_path)]) != 2
+    assert "no daemon answers" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "told"), [(["-1", "0"], "write three numbers"), (["1", "0", "-1", "--contrl", "x"], "--contrl")]
+)
+def test_a_place_that_is_none_is_told(words: list[str], told: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["ctl", "goto", *words]) == 2
+    assert told in capsys.readouterr().err

@@ -7,11 +7,11 @@ from functools import cache
 
 import numpy as np
 import pytest
-from rich.console import Console, RenderableType
+from rich.console import Console, Group, RenderableType
 
 from uavctl.build.controller import build_design
-from uavctl.cli.common import Column, WideTable
-from uavctl.cli.solve import plan_table
+from uavctl.cli.common import DEFAULTS, Column, WideTable, columns, two_columns
+from uavctl.cli.solve import _column, plan_table
 from uavctl.config import load_config
 from uavctl.smpc.answer import Answer
 from uavctl.smpc.hahn_stursberg.design import Design
@@ -53,10 +53,10 @@ def test_a_plan_fits_its_terminal_stage_by_stage(width: int, tables: int) -> Non
         *("back-off x", "back-off u"),
     ]
     for i, name in enumerate(("p_n", "v_n", "a_n", "p_e", "v_e", "a_e", "p_d", "v_d", "a_d")):
-        assert list(columns[name]) == [f"{value:.3f}" for value in answer.states[:, i]]
+        assert list(columns[name]) == [f"{value:z.3f}" for value in answer.states[:, i]]
     for i, name in enumerate(("u_n", "u_e", "u_d")):
-        assert list(columns[name]) == [*(f"{value:.3f}" for value in answer.inputs[:, i]), ""]
-    assert list(columns["back-off x"]) == [f"{row.max():.3f}" for row in answer.backoff_x]
+        assert list(columns[name]) == [*(f"{value:z.3f}" for value in answer.inputs[:, i]), ""]
+    assert list(columns["back-off x"]) == [f"{row.max():z.3f}" for row in answer.backoff_x]
 
 
 def test_groups_stay_together_where_they_fit() -> None:
@@ -72,3 +72,29 @@ def test_groups_stay_together_where_they_fit() -> None:
     assert headings[53] == [["t", *"abcdef"], ["t", "g"]]
     assert headings[29] == [["t", *"abc"], ["t", *"def"], ["t", "g"]]
     assert headings[28] == [["t", *"ab"], ["t", *"cd"], ["t", *"ef"], ["t", "g"]]
+
+
+LONG = "x" * 170  # as a path may be
+
+
+@pytest.mark.parametrize(
+    "table",
+    [
+        two_columns("title", [("file", LONG), ("more", "two words")]),
+        columns("title", ["a", "b"], [["1", LONG], ["2", "two words"]]),
+        Group("before", columns("title", ["a", "b"], [[LONG, LONG]]), "two words"),
+    ],
+)
+def test_a_table_that_goes_to_a_file_is_whole(table: RenderableType, capsys: pytest.CaptureFixture[str]) -> None:
+    DEFAULTS.show({}, lambda: table)
+    told = capsys.readouterr().out
+    assert LONG in told and "two words" in told and "…" not in told
+
+
+def test_a_table_with_room_keeps_the_usual_width_in_a_file(capsys: pytest.CaptureFixture[str]) -> None:
+    DEFAULTS.show({}, lambda: columns("", ["a", "b"], [["1", "word " * 100]]))
+    assert {len(line) for line in capsys.readouterr().out.splitlines()} == {120}
+
+
+def test_a_figure_as_good_as_zero_has_no_minus() -> None:
+    assert list(_column("x", [-1e-9, -0.0004, -0.0006], 4).cells) == ["0.000", "0.000", "-0.001", ""]

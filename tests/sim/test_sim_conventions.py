@@ -5,12 +5,13 @@ from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from sim_rig import ARM, LAND, SET_MODE, TAKE_OFF, Bench, S, bench, heartbeat
+from recorded_rig import packets
+from sim_rig import ARM, LAND, SET_MODE, TAKE_OFF, Bench, S, bench, decode, heartbeat
 
 from sim.autopilot.profile import TABLES
 
 GUIDED, OFFBOARD, HOLD, BRAKE = (1, 4, 0), (1, 6, 0), (1, 4, 3), (1, 17, 0)
-RADIO = 1 << 16  # MAV_SYS_STATUS_SENSOR_RC_RECEIVER
+RADIO, FENCE = 1 << 16, 1 << 20  # MAV_SYS_STATUS_SENSOR_RC_RECEIVER, MAV_SYS_STATUS_GEOFENCE
 STICK = 'sim.fault=[{at_s=50.0, kind="mode", name="POSCTL"}]'
 BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 
@@ -153,3 +154,17 @@ def test_a_quadrotor_flown_onto_the_floor_has_landed_and_disarms(autopilot: str)
     one.stream(3.0, 0.0, 0.0, -1.0)  # landed: it does not rise again
     assert not one.peers.autopilot.pilot.armed
     assert one.peers.truth().position_m[2] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "recording"), [("ardupilot", "arducopter-relay-pilot-switches"), ("px4", "px4-sih-false-reboot")]
+)
+def test_the_fence_that_nobody_set_is_told_as_it_was_recorded(autopilot: str, recording: str) -> None:
+    def told(status: Any) -> tuple[bool, ...]:
+        masks = ("present", "enabled", "health")
+        return tuple(bool(getattr(status, f"onboard_control_sensors_{mask}") & FENCE) for mask in masks)
+
+    real = [msg for packet in packets(recording) for msg in decode(packet.data) if msg.get_type() == "SYS_STATUS"]
+    one = bench(autopilot)
+    one.wait(2.0)
+    assert {told(status) for status in one.of("SYS_STATUS")} == {told(status) for status in real}

@@ -11,7 +11,8 @@ from patience import LIMIT_S, until
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import LAND, Bench, Client, bench, decode
 
-from sim.server import Ready, Seat, fleet, serve_all
+from sim.fleet import fleet
+from sim.server import Ready, Seat, serve_all
 from uavctl.cli.app import run
 from uavctl.config import load_config
 from uavctl.errors import ConfigError, ConnectionSpecError

@@ -12,10 +12,10 @@ from sim.autopilot.profile import Parameters
 
 @pytest.mark.slow
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
-def test_fifteen_thousand_mutants_each(autopilot: Literal["px4", "ardupilot"]) -> None:
+def test_twenty_thousand_mutants_each(autopilot: Literal["px4", "ardupilot"]) -> None:
     """`tools/fuzz.py` sends a million."""
-    judge = Judge(autopilot, 5)
-    judge.run(15_000)
+    judge = Judge(autopilot, 6)
+    judge.run(20_000)
     # The handlers were reached, in all their answers, and well-meant mutants did change things.
     assert {0, 2, 3, 4} <= set(judge.results)
     deaf = set() if autopilot == "ardupilot" else {"REQUEST_DATA_STREAM"}

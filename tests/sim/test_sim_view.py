@@ -71,6 +71,11 @@ def test_the_live_page_tells_the_same() -> None:
     assert ONE.mode in alone and LANDED[ONE.phase] in alone
 
 
+def test_what_is_as_good_as_zero_has_no_minus() -> None:
+    rests = replace(ONE, position_m=(-1e-9, -0.004, -0.0), velocity_mps=(-1e-4, 0.0, -0.004))
+    assert "-0.00" not in line(rests) and line(rests).count("+0.00 +0.00 +0.00") == 2
+
+
 def test_the_line_tells_the_same() -> None:
     text = line(ONE)
     assert "\n" not in text

@@ -278,7 +278,7 @@ def in_virtual_time(rig: Endings) -> Iterator[None]:
     """The command's clock, connections and threads in our hands."""
 
     @contextmanager
-    def connected(config: object) -> Iterator[dict[str, Line]]:
+    def connected(*given: object) -> Iterator[dict[str, Line]]:
         yield rig.lines
 
     class Watched(HealthWatch):

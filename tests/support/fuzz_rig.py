@@ -22,7 +22,13 @@ HANDLED = (
     "ATT_POS_MOCAP",
     "COMMAND_INT",
     "COMMAND_LONG",
+    "FILE_TRANSFER_PROTOCOL",
     "HEARTBEAT",
+    "LOG_REQUEST_LIST",
+    "MISSION_CLEAR_ALL",
+    "MISSION_COUNT",
+    "MISSION_REQUEST",
+    "MISSION_REQUEST_INT",
     "MISSION_REQUEST_LIST",
     "ODOMETRY",
     "PARAM_REQUEST_LIST",
@@ -67,6 +73,8 @@ class Mutants:
 
     def _payload(self, kind: Any) -> bytes:
         """Likely values for all fields, and hostile ones for a few."""
+        if kind.msgname == "FILE_TRANSFER_PROTOCOL":
+            return bytes((0, self._rng.choice((1, 1, 0, 7)), self._rng.choice((1, 0, 9)))) + self._request()
         forms = letters(kind.unpacker.format)
         hostile = {self._rng.randrange(len(forms)) for _ in range(self._rng.choice((0, 1, 1, 2, 4)))}
         values = [self._hostile(form) if i in hostile else self._likely(form) for i, form in enumerate(forms)]
@@ -96,6 +104,15 @@ class Mutants:
             "child_frame_id": (12,),
         }
         return rng.choice(choices[name]) if name in choices else value
+
+    def _request(self) -> bytes:
+        """A request of MAVLink FTP."""
+        rng = self._rng
+        query = rng.choice((b"", b"?start=2", b"?count=3&start=1", b"?withdefaults=1", b"?start=-1", rng.randbytes(9)))
+        path = rng.choice((b"@PARAM/param.pck" + query, b"/", b"", rng.randbytes(30)))
+        size = rng.choice((len(path), 80, 239, 240, 0, rng.randrange(256)))
+        head = rng.randrange(2**16), rng.randrange(3), rng.choice((4, 4, 5, 15, rng.randrange(256))), size, 0, 0
+        return (struct.pack("<HBBBBBxI", *head, rng.choice((0, 80, 2**32 - 1))) + path).ljust(251, b"\0")
 
     def _likely(self, form: str) -> Any:
         if form.endswith("s"):

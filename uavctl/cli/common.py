@@ -16,6 +16,7 @@ from cyclopts import Parameter, validators
 from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions, JustifyMethod, RenderableType
 from rich.markup import escape
+from rich.measure import Measurement
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
@@ -26,7 +27,7 @@ from uavctl.errors import ConfigError, DesignError
 # What all commands share: --config, --set and --json, where output goes, and how a bad design is told.
 
 
-_FILE_WIDTH = 120
+_FILE_WIDTH, _WIDEST = 120, 10_000
 
 Overrides = Annotated[
     tuple[str, ...],
@@ -78,8 +79,12 @@ class Common:
         if self.json:
             write_document(name, document)
         else:
-            # Files and pipes have no width of their own; the usual 80 columns would fold the tables.
-            Console(width=None if sys.stdout.isatty() else _FILE_WIDTH).print(picture())
+            shown, console = picture(), Console()
+            if not sys.stdout.isatty():
+                # Files and pipes have no width of their own; the usual 80 columns would fold tables and cut words.
+                anything = console.options.update_width(_WIDEST)
+                console.width = max(_FILE_WIDTH, Measurement.get(console, anything, shown).minimum)
+            console.print(shown)
 
 
 # Documents of which a key has gone, or means something else, since the first version; the others have version 1.

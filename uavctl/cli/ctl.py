@@ -42,9 +42,13 @@ ANY = Which()
 
 
 @ctl_app.command
-def goto(place: Annotated[str, Parameter(allow_leading_hyphen=True)], /, *, which: Which = ANY) -> int:
-    """Fly to a place and stay there: north,east,down in local NED [m], as in `ctl goto 2,1,-2`."""
-    return _order(ControlRequest(ask="goto", position_m=_place(place)), which)
+def goto(*place: Annotated[str, Parameter(allow_leading_hyphen=True)], which: Which = ANY) -> int:
+    """Fly to a place and stay there: north, east, down in local NED [m], as in `ctl goto 2,1,-2` or `goto 2 1 -2`.
+
+    Args:
+        place: north,east,down, or each for itself.
+    """
+    return _order(ControlRequest(ask="goto", position_m=_place(",".join(place))), which)
 
 
 Ask = Literal["hold", "resume", "land", "engage"]
@@ -82,6 +86,9 @@ def _place(text: str) -> Vec3:
     try:
         north, east, down = map(float, text.split(","))
     except ValueError:
+        unknown = [word for word in text.split(",") if word.startswith("--")]
+        if unknown:
+            raise UsageError(f'Unknown option: "{unknown[0]}"; see uavctl ctl goto --help') from None
         raise UsageError(f"goto {text}: write three numbers, north,east,down [m], as in 2,1,-2") from None
     request = ControlRequest(ask="goto", position_m=(north, east, down))
     if request.problem() is not None:
@@ -204,4 +211,4 @@ def _trouble(recorder: RecorderHealth) -> str:
 
 
 def _point(point: dict[str, float] | None) -> str:
-    return "-" if point is None else ", ".join(f"{axis} {value:.2f} m" for axis, value in point.items())
+    return "-" if point is None else ", ".join(f"{axis} {value:z.2f} m" for axis, value in point.items())

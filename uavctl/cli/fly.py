@@ -40,6 +40,7 @@ from uavctl.cli.flying import (
     stop_limit_s,
     stop_on_signals,
     tell_ending,
+    wait_for_server,
 )
 from uavctl.cli.prepare import prepare
 from uavctl.clock import Ticker, monotonic_ns, zero_utc_ns
@@ -241,7 +242,7 @@ def fly_daemon(
         with (
             as_realtime(as_realtime_process) as collect,
             stop_on_signals() as stopped,
-            connected(config) as connections,
+            connected(config, wait_for_server(stopped)) as connections,
         ):
             checked: tuple[Item, ...] = ()
             told = ParameterReader()

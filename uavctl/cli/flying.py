@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -391,6 +392,25 @@ def stop_on_signals() -> Iterator[Callable[[], bool]]:
             signal.signal(number, handler)
 
 
+SERVER_RETRY_S = 1.0
+
+
+def wait_for_server(stopped: Callable[[], bool]) -> Callable[[str], bool]:
+    """Return a function that waits a second for a server of TCP, says so once, and returns False once it is to stop."""
+    told: set[str] = set()
+
+    def wait(url: str) -> bool:
+        if url not in told:
+            told.add(url)
+            messages().print(f"waiting for {escape(url)}, where nobody listens yet; Ctrl-C ends it", soft_wrap=True)
+        until_s = time.monotonic() + SERVER_RETRY_S
+        while time.monotonic() < until_s and not stopped():
+            time.sleep(0.05)
+        return not stopped()
+
+    return wait
+
+
 class LiveFeed:
     """Last tick and messages of a flight that are to be shown: filled by the control loop's thread, emptied by another.
 
@@ -466,7 +486,7 @@ def _line(ticked: Ticked, who_flies: HandoverState) -> str:
     decision, vehicle, estimate = ticked.decision, ticked.vehicle, ticked.estimate
     mode = "no vehicle" if vehicle is None else f"{vehicle.mode} {'armed' if vehicle.armed else 'disarmed'}"
     age = "-" if estimate is None else f"{max(0.0, estimate.age_s):.2f} s"
-    accel = "-" if decision.input is None else " ".join(f"{u:+.2f}" for u in decision.input)
+    accel = "-" if decision.input is None else " ".join(f"{u:+z.2f}" for u in decision.input)
     waiting = waits_for(who_flies) if decision.mode is ControlMode.WAIT else ""
     mode = f"{mode}, waiting for {waiting}" if waiting else mode
     return f"{decision.mode.value:7} age {age:>6}  input {accel}  [dim]{mode}[/dim]"

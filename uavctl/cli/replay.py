@@ -279,7 +279,7 @@ def _context(context: Context) -> Iterator[tuple[str, object]]:
     yield "before it", f"{context.decisions_before} decisions, {context.records_before} records: all identical"
     newest = ""
     if context.position_m is not None and context.position_age_s is not None:
-        place = ", ".join(f"{value:.3f}" for value in context.position_m)
+        place = ", ".join(f"{value:z.3f}" for value in context.position_m)
         newest = f", the newest {context.position_age_s:.3f} s old at ({place}) m"
     parts = [
         f"{context.positions} position{'' if context.positions == 1 else 's'}{newest}",

@@ -18,7 +18,8 @@ from rich.live import Live
 from rich.markup import escape
 
 from sim.faults import problems
-from sim.server import Door, Port, Ready, Seat, fleet, serve_all
+from sim.fleet import fleet
+from sim.server import Door, Port, Ready, Seat, serve_all
 from sim.simulation import VehicleSnapshot
 from uavctl.cli.common import DEFAULTS, Column, Common, WideTable, messages, write_document
 from uavctl.cli.flying import stop_on_signals
@@ -149,7 +150,7 @@ def _cells(one: VehicleSnapshot) -> tuple[str, ...]:
 
 
 def _vector(vector: Vec3) -> str:
-    return " ".join(f"{component:+.2f}" for component in vector)
+    return " ".join(f"{component:+z.2f}" for component in vector)
 
 
 def _setpoint(one: VehicleSnapshot) -> str:
@@ -260,9 +261,13 @@ def sim(
             "PX4 sends to udpout://127.0.0.1:14540 and 14550, ArduPilot listens at tcpin://127.0.0.1:5760"
         ),
     ] = None,
-    mocap: Annotated[str, Parameter(help="the same for the cameras; an equal URL is one connection")] = (
-        "udpout://127.0.0.1:14560"
-    ),
+    mocap: Annotated[
+        str,
+        Parameter(
+            help="the same for the cameras; an equal URL is one connection. natnet://127.0.0.1/drone lets them be an "
+            "OptiTrack server whose body is the vehicle"
+        ),
+    ] = "udpout://127.0.0.1:14560",
     autopilot: Annotated[
         Literal["px4", "ardupilot"] | None, Parameter(help="whose behaviour it shows; else sim.autopilot")
     ] = None,

@@ -123,5 +123,5 @@ def state_names(n_x: int, axes: Sequence[str]) -> list[str]:
 
 def _column(heading: str, values: Iterable[float], rows: int) -> Column:
     """Return a column of figures, blank where there are fewer of them than `rows`."""
-    cells = [f"{value:.3f}" for value in values]
+    cells = [f"{value:z.3f}" for value in values]
     return Column(heading, [*cells, *([""] * (rows - len(cells)))])

@@ -77,6 +77,7 @@ class CameraSystem:
     extra: str  # our optional dependency group that installs the package
     port: int  # of its server, if a URL names none; 0: a URL has to
     advice: str  # what to check if no answer comes
+    up: Literal["y", "z"] = "y"  # the axis that is up where a URL says nothing
 
 
 # By the scheme of their URLs, SCHEME://SERVER[:PORT]/BODY.
@@ -87,7 +88,15 @@ CAMERA_SYSTEMS = {
         extra="optitrack",
         port=1510,  # Motive's own default
         advice="does Motive run there, is NatNet enabled in its streaming settings, and does no firewall block it?",
-    )
+    ),
+    "qualisys": CameraSystem(
+        camera="uavctl.io.qualisys:Qualisys",
+        package="qtm_rt",
+        extra="qualisys",
+        port=22223,  # QTM's little-endian port
+        advice="does QTM run there, with a measurement or its preview, and does no firewall block TCP 22223?",
+        up="z",
+    ),
 }
 SOURCES = "uavctl.sources"  # entry points of those of other packages
 _TRANSPORTS = ("udpin", "udpout", "tcp", "serial")  # MAVLink as it is
@@ -184,8 +193,9 @@ class DaemonConfig(Section, frozen=True, kw_only=True):
         Meta(
             max_length=LONGEST_URL,
             description="URL of the source of positions; the same URL as the vehicle's is one connection. "
-            "`natnet://SERVER/BODY` is a body of an OptiTrack system (docs/sources.md), `NAME://SERVER:PORT/BODY` one "
-            "of another package, by its entry point `uavctl.sources` or as `module:Class` (docs/extending.md)",
+            "`natnet://SERVER/BODY` is a rigid body of an OptiTrack system, `qualisys://SERVER/BODY` one of Qualisys "
+            "(docs/sources.md), `NAME://SERVER:PORT/BODY` one of another package, by its entry point `uavctl.sources` or "
+            "as `module:Class` (docs/extending.md)",
         ),
     ] = "udpin://0.0.0.0:14560"
     vehicle_system_id: Annotated[

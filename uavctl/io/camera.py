@@ -38,7 +38,11 @@ class Echo:
 
 
 class Camera(Protocol):
-    """One camera system and the body to follow, without input or output of its own: datagrams in, sights out."""
+    """One camera system and the body to follow, without input or output of its own: datagrams in, sights out.
+
+    A class with an attribute `stream` that is true is given a TCP connection in pieces as they come, and an empty one
+    where a connection begins.
+    """
 
     @property
     def ready(self) -> bool:
@@ -80,7 +84,9 @@ class Camera(Protocol):
 # SCHEME://SERVER[:PORT]/BODY[?up=y|z&interface=ADDRESS].
 
 
-FORM = "SERVER[:PORT]/BODY, and after it ?up=z where the cameras' up is Z, interface=ADDRESS for our side"
+FORM = (
+    "SERVER[:PORT]/BODY, and after it ?up=y or ?up=z for the cameras' axis that is up, interface=ADDRESS for our side"
+)
 
 
 @dataclass(frozen=True)
@@ -112,7 +118,7 @@ def parse(url: str) -> CameraUrl:
     body = unquote(parts.path.removeprefix("/"))
     if not camera_scheme(url) or not host or not body or parts.fragment or port == 0:
         raise ConnectionSpecError(f"connection {url!r} needs a server and the name of a rigid body; {form}")
-    up, interface = options.pop("up", "y"), options.pop("interface", "0.0.0.0")
+    up, interface = options.pop("up", CAMERA_SYSTEMS[scheme].up), options.pop("interface", "0.0.0.0")
     if options:
         raise ConnectionSpecError(f"connection {url!r}: option {min(options)!r} is not known; {form}")
     for axis in get_args(Up):

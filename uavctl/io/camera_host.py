@@ -18,6 +18,7 @@ import sys
 import time
 from collections import Counter, deque
 from collections.abc import Callable
+from contextlib import suppress
 from importlib import import_module
 from typing import cast
 
@@ -82,6 +83,7 @@ NOT_SERVER = "not-listed"
 _PIPE_BYTES = 8192  # asked of the kernel: what waits there cannot be replaced by newer
 _READS = 64
 _PAUSE_S = 0.1
+_AGAIN_S = 0.5  # between two attempts to connect a lost stream
 _COUNTS_S = 0.5
 _MEMORY = 2**30
 
@@ -104,10 +106,40 @@ class Host:
         self._ready = False
         self._group: tuple[str, int] | None = None
         self._group_socket: socket.socket | None = None
-        self._command = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._command.bind((interface, 0))
-        for one in (self._command, pipe):
-            one.setblocking(False)
+        self._stream: bool = getattr(camera, "stream", False)
+        self._connected_s = time.monotonic()  # of the last attempt
+        self._command: socket.socket | None = self._reach(ANSWER_S)
+        pipe.setblocking(False)
+
+    def _reach(self, patience_s: float) -> socket.socket:
+        """Open the socket to the server."""
+        reached = socket.socket(socket.AF_INET, socket.SOCK_STREAM if self._stream else socket.SOCK_DGRAM)
+        try:
+            reached.bind((self._interface, 0))
+            if self._stream:
+                reached.settimeout(patience_s)
+                reached.connect(self._server)
+                reached.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                self._camera.receive(b"", time.monotonic_ns())
+        except OSError:
+            reached.close()
+            raise
+        reached.setblocking(False)
+        return reached
+
+    def _reach_again(self) -> None:
+        """Connect a lost stream again, if it is time."""
+        if time.monotonic() - self._connected_s < _AGAIN_S:
+            return
+        self._connected_s = time.monotonic()
+        with suppress(OSError):
+            self._command = self._reach(_PAUSE_S)
+
+    def _lose(self) -> None:
+        self._lost["connection-lost"] += 1
+        if self._command is not None:
+            self._command.close()
+        self._command = None
 
     def run(self) -> None:
         """Serve until the daemon has gone.
@@ -124,12 +156,15 @@ class Host:
 
     def close(self) -> None:
         """Release the sockets to the server."""
-        self._command.close()
+        if self._command is not None:
+            self._command.close()
         if self._group_socket is not None:
             self._group_socket.close()
 
     def _turn(self) -> bool:
         """Wait for something and pass it on; False once the daemon has gone."""
+        if self._command is None:
+            self._reach_again()
         for data in self._camera.due(time.monotonic_ns()):
             self._send(data)
         self._follow_group()
@@ -142,8 +177,13 @@ class Host:
         return self._pipe not in readable or self._ask()
 
     def _send(self, data: bytes) -> None:
+        if self._command is None or not data:
+            return
         try:
-            self._command.sendto(data, self._server)
+            if self._stream:  # a handful of short words, for which there is room
+                self._command.sendall(data)
+            else:
+                self._command.sendto(data, self._server)
         except OSError:  # no route for now: asked again
             self._lost["unsent"] += 1
 
@@ -154,8 +194,14 @@ class Host:
             except BlockingIOError:
                 return
             except OSError:  # the server's port is closed
+                if self._stream:
+                    self._lose()
+                    return
                 continue
-            if sender[0] != self._server[0]:
+            if self._stream and not data:
+                self._lose()
+                return
+            if not self._stream and sender[0] != self._server[0]:
                 self._lost[NOT_SERVER] += 1
                 continue
             heard = self._camera.receive(data, time.monotonic_ns())

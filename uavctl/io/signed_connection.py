@@ -7,6 +7,7 @@ ahead of what was seen, so that whatever a killed process has taken or sent is b
 from __future__ import annotations
 
 import base64
+import errno
 import fcntl
 import hashlib
 import os
@@ -22,7 +23,7 @@ from typing import TextIO
 from uavctl.clock import monotonic_ns
 from uavctl.config import Config
 from uavctl.config.connections import MOCAP_LINK, SecurityConfig
-from uavctl.errors import KeyFileError
+from uavctl.errors import ConnectionSpecError, KeyFileError
 from uavctl.io.admission import Rules
 from uavctl.io.base import Connection
 from uavctl.io.sources import open_source
@@ -346,9 +347,17 @@ def rules(security: SecurityConfig) -> Rules:
     )
 
 
+Waits = Callable[[str], bool]
+# A computer that starts, or a program on it that does
+_NOT_UP = (errno.ECONNREFUSED, errno.EHOSTUNREACH, errno.EHOSTDOWN, errno.ECONNRESET)
+
+
 @contextmanager
-def connected(config: Config) -> Iterator[dict[str, Connection]]:
+def connected(config: Config, waits: Waits | None = None) -> Iterator[dict[str, Connection]]:
     """The daemon's connections by link name, open, with the doors that `[security]` asks for; one if both URLs are one.
+
+    Args:
+        waits: waits a while for a TCP server that is not up yet, and says whether to try again; None gives up at once.
 
     Raises:
         ConnectionSpecError: a URL cannot be understood or opened.
@@ -360,9 +369,20 @@ def connected(config: Config) -> Iterator[dict[str, Connection]]:
     with ExitStack() as stack:
         plain: dict[str, Connection] = {}
         for name, url in urls.items():
-            plain[name] = open_source(url, monotonic_ns, rules(config.security))
+            plain[name] = _opened(url, config.security, waits)
             stack.callback(plain[name].close)
         yield stack.enter_context(sealed(plain, config.security))
+
+
+def _opened(url: str, security: SecurityConfig, waits: Waits | None) -> Connection:
+    while True:
+        try:
+            return open_source(url, monotonic_ns, rules(security))
+        except ConnectionSpecError as error:
+            cause = error.__cause__
+            absent = isinstance(cause, OSError) and (isinstance(cause, TimeoutError) or cause.errno in _NOT_UP)
+            if waits is None or not url.startswith("tcp:") or not absent or not waits(url):
+                raise
 
 
 @contextmanager

@@ -1,0 +1,176 @@
+"""Qualisys: a rigid body out of QTM's real-time protocol, over TCP.
+
+The package `qtm_rt` reads the frames. The conversation is held here: a welcome, the version, the names of the bodies
+(XML), then frames until the connection ends. Layout: QTM's real-time server protocol, little-endian; a packet is its
+size, its kind, and what it holds. Places are in millimetres, turns are matrices by columns, and both are NaN while the
+body is not seen. A stamp counts microseconds from the start of the measurement; nobody can ask for that clock.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections import Counter
+from xml.etree import ElementTree
+
+from qtm_rt.packet import QRTComponentType, QRTPacket
+
+from uavctl.frames import Quaternion, Up, levelled, unit
+from uavctl.io.camera import BodyPose, CameraError, Echo
+from uavctl.records import Vec3
+
+ERROR, COMMAND, XML, DATA, NO_DATA, EVENT = 0, 1, 2, 3, 4, 6
+VERSION = "1.25"
+WELCOME = b"QTM RT Interface connected"
+# Events after which the bodies may be others: connected, capture started, playing a file started, settings changed
+CHANGED = (1, 3, 8, 11)
+LARGEST = 1 << 22  # more is no packet of ours [bytes]
+
+UNREADABLE = "unreadable"
+UNTRACKED = "untracked"
+MISSING = "body-missing"
+NO_MEASUREMENT = "no-measurement"
+SILENT = "server-silent"
+
+_HEAD = struct.Struct("<II")
+_SILENT_NS = 1_000_000_000
+_UNREADABLE = (struct.error, ValueError, IndexError, TypeError, KeyError, ElementTree.ParseError)
+_TOLERANCE = 1e-3
+
+
+class Qualisys:
+    """One rigid body of one server; implements `uavctl.io.camera.Camera` on a stream.
+
+    Args:
+        up: the axis that QTM calls up.
+    """
+
+    stream = True
+
+    def __init__(self, body: str, up: Up) -> None:
+        self._body, self._up = body, up
+        self._place: int | None = None  # of the body among those of a frame
+        self._rest = bytearray()
+        self._say: list[bytes] = []
+        self._heard_ns = 0
+        self.ready, self.awaits = False, "answer"
+        self.group: tuple[str, int] | None = None
+        self.dropped: Counter[str] = Counter()
+
+    def receive(self, data: bytes, at_ns: int) -> tuple[BodyPose | Echo, ...]:
+        """See `Camera`; no bytes at all are a connection that begins."""
+        self._heard_ns = at_ns
+        if not data:
+            self._rest.clear()
+            self._say.clear()
+            self._place = None
+            return ()
+        self._rest += data
+        found: list[BodyPose | Echo] = []
+        while len(self._rest) >= _HEAD.size:
+            size, kind = _HEAD.unpack_from(self._rest)
+            if not _HEAD.size <= size <= LARGEST:  # the stream is out of step: it has to begin anew
+                self.dropped[UNREADABLE] += 1
+                self._rest.clear()
+                self._say.append(_command("Quit"))
+                break
+            if len(self._rest) < size:
+                break
+            payload = bytes(self._rest[_HEAD.size : size])
+            del self._rest[:size]
+            try:
+                found += self._packet(kind, payload)
+            except _UNREADABLE:
+                self.dropped[UNREADABLE] += 1
+        return tuple(found)
+
+    def due(self, at_ns: int) -> tuple[bytes, ...]:
+        """See `Camera`: what is to be said, and the wish for frames again when none have come for a second."""
+        if self._place is not None and at_ns - self._heard_ns >= _SILENT_NS:
+            self._heard_ns = at_ns
+            self.dropped[SILENT] += 1
+            self._ask()
+        said = tuple(self._say)
+        self._say.clear()
+        return said
+
+    def ask_time(self, token: int) -> bytes:
+        """See `Camera`: QTM tells its time with frames alone."""
+        del token
+        return b""
+
+    def _ask(self) -> None:
+        self._say.append(_command("GetParameters 6D"))
+
+    def _packet(self, kind: int, payload: bytes) -> tuple[BodyPose, ...]:
+        if kind == COMMAND and payload.startswith(WELCOME):
+            self._say.append(_command(f"Version {VERSION}"))
+        elif kind == COMMAND and payload.startswith(b"Version set"):
+            self.awaits = "names of rigid bodies, though the server answers,"
+            self._ask()
+        elif kind == ERROR:
+            self._refuse(f"refused a request: {payload.rstrip(bytes(1)).decode(errors='replace')}")
+        elif kind == XML:
+            self._describe(payload.rstrip(b"\0"))
+        elif kind == EVENT and payload and payload[0] in CHANGED and self._place is not None:
+            self._ask()
+        elif kind == NO_DATA:
+            self.dropped[NO_MEASUREMENT] += 1
+        elif kind == DATA and self._place is not None:
+            return self._frame(QRTPacket(payload))
+        return ()
+
+    def _describe(self, text: bytes) -> None:
+        names = [(name.text or "").strip() for name in ElementTree.fromstring(text).iterfind("./The_6D/Body/Name")]
+        if self._body not in names:
+            self._place = None
+            seen = ", ".join(map(repr, sorted(names))) or "none"
+            self._refuse(f"has no rigid body {self._body!r}; it has: {seen}. Write one of them behind its address")
+            return
+        self._place, self.ready = names.index(self._body), True
+        self._say.append(_command("StreamFrames AllFrames 6D"))
+
+    def _frame(self, frame: QRTPacket) -> tuple[BodyPose, ...]:
+        if QRTComponentType.Component6d not in frame.components:
+            return self._drop(NO_MEASUREMENT)
+        _, bodies = frame.get_6d()
+        if self._place is None or self._place >= len(bodies):
+            return self._drop(MISSING)
+        place, rotation = bodies[self._place]
+        attitude = _turn(rotation.matrix)
+        if attitude is None or not all(map(math.isfinite, place)):
+            return self._drop(UNTRACKED)
+        position_m: Vec3 = (place.x * 1e-3, place.y * 1e-3, place.z * 1e-3)
+        return (BodyPose(frame.timestamp * 1000, *levelled(position_m, attitude, self._up)),)
+
+    def _drop(self, reason: str) -> tuple[BodyPose, ...]:
+        self.dropped[reason] += 1
+        return ()
+
+    def _refuse(self, text: str) -> None:
+        """End the start with an error; a flight goes on without positions, and counts."""
+        if not self.ready:
+            raise CameraError(f"the server {text}")
+        self.dropped[MISSING] += 1
+
+
+def _command(words: str) -> bytes:
+    text = words.encode() + b"\0"
+    return _HEAD.pack(_HEAD.size + len(text), COMMAND) + text
+
+
+def _turn(columns: tuple[float, ...]) -> Quaternion | None:
+    """Return the quaternion (w, x, y, z) of a rotation matrix given by columns; None if it is none."""
+    a, d, g, b, e, h, c, f, i = columns  # rows are a b c, d e f, g h i
+    squares = 1.0 + a + e + i, 1.0 + a - e - i, 1.0 - a + e - i, 1.0 - a - e + i
+    if not all(map(math.isfinite, columns)) or abs(sum(value * value for value in columns) - 3.0) > _TOLERANCE:
+        return None
+    largest = max(range(4), key=squares.__getitem__)
+    two = 2.0 * math.sqrt(squares[largest])
+    rows = (
+        (squares[0], h - f, c - g, d - b),
+        (h - f, squares[1], b + d, c + g),
+        (c - g, b + d, squares[2], f + h),
+        (d - b, c + g, f + h, squares[3]),
+    )
+    return unit(tuple(value / two for value in rows[largest]))
