@@ -174,7 +174,7 @@ def check(file: File, /, *, json: QuietJson = False) -> int:
         ],
         "nearest_m": fleet.nearest_m if math.isfinite(fleet.nearest_m) else None,
     }
-    Common(json=json).show(document, lambda: _boxes(fleet))
+    Common(json=json).show("fleet/check", document, lambda: _boxes(fleet))
     return 0
 
 
@@ -195,7 +195,7 @@ def fly(
 
     When one ends otherwise than it was asked to, the others are landed, too. Exit code: the largest of theirs.
     """
-    from uavctl.cli.fly import checked_take_off
+    from uavctl.cli.flying import checked_take_off
 
     checked_take_off(arm, takeoff)
     fleet = read_fleet(file)
@@ -219,7 +219,7 @@ def fly(
             {"name": one.member.name, "exit_code": one.exit_code, "out": str(out / one.member.name)} for one in flights
         ]
     }
-    Common(json=json).show(document, lambda: _ended(flights))
+    Common(json=json).show("fleet/fly", document, lambda: _ended(flights))
     return max((one.exit_code or 0 for one in flights), default=0)
 
 
@@ -230,7 +230,7 @@ def status(
     """Say how all vehicles of a file are doing, in one table. Exit code 1: not all daemons answer."""
     fleet, folder = read_fleet(file), control_folder(control)
     found = {one.name: _health(one, folder) for one in fleet.members}
-    Common(json=json).show({"vehicles": found}, lambda: _table(found))
+    Common(json=json).show("fleet/status", {"vehicles": found}, lambda: _table(found))
     return 0 if all(found.values()) else 1
 
 

@@ -194,8 +194,8 @@ class DaemonConfig(Section, frozen=True, kw_only=True):
             max_length=LONGEST_URL,
             description="URL of the source of positions; the same URL as the vehicle's is one connection. "
             "`natnet://SERVER/BODY` is a rigid body of an OptiTrack system, `qualisys://SERVER/BODY` one of Qualisys "
-            "(docs/sources.md), `NAME://SERVER:PORT/BODY` one of another package, by its entry point `uavctl.sources` or "
-            "as `module:Class` (docs/extending.md)",
+            "(docs/sources.md), `NAME://SERVER:PORT/BODY` one of another package, by its entry point `uavctl.sources` "
+            "or as `module:Class` (docs/extending.md)",
         ),
     ] = "udpin://0.0.0.0:14560"
     vehicle_system_id: Annotated[

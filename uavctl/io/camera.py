@@ -118,7 +118,7 @@ def parse(url: str) -> CameraUrl:
     body = unquote(parts.path.removeprefix("/"))
     if not camera_scheme(url) or not host or not body or parts.fragment or port == 0:
         raise ConnectionSpecError(f"connection {url!r} needs a server and the name of a rigid body; {form}")
-    up, interface = options.pop("up", CAMERA_SYSTEMS[scheme].up), options.pop("interface", "0.0.0.0")
+    up, interface = options.pop("up", camera_system(scheme).up), options.pop("interface", "0.0.0.0")
     if options:
         raise ConnectionSpecError(f"connection {url!r}: option {min(options)!r} is not known; {form}")
     for axis in get_args(Up):
