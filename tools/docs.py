@@ -204,14 +204,15 @@ in `RETURNING`.
   relayed, nor any until for 3 s none has been: a vehicle that lands needs them once they are right again.
 * Landing: once the vehicle has shown that it lands, another mode is the pilot's. So it is once landing was granted: at
   once, or after 2 s where it is the mode of before, which a slow vehicle may still be in. What we took off is asked
-  to land as long as it is heard in the air, up to ten times `land_s`; that `land_s` is over is told.
+  to land as long as it is heard armed, up to ten times `land_s`; that `land_s` is over is told.
 * PX4: AUTO.TAKEOFF, arming, OFFBOARD as soon as the positions show the height, not when its own climb ends
   (MIS_TAKEOFF_ALT). ArduPilot: GUIDED, arming, MAV_CMD_NAV_TAKEOFF, setpoints at nine tenths of the height.
 * What was granted by COMMAND_ACK counts before the next heartbeat shows it (they come once a second); a heartbeat that
   still says otherwise 0.3 s later is the pilot's word.
 * A request of the external mode, or of landing, is made again right after a heartbeat only: in between the pilot may
   have switched, which the next one shows. Landing is asked for without heartbeats, too. The first request of the
-  external mode, at the end of a climb, waits for none: a pilot who switches in that second has to switch again.
+  external mode, at the end of a climb, and of landing wait for none: a pilot who switches in that second has to switch
+  again. A switch that a heartbeat has shown is his, whatever ends the flight.
 * While the heartbeats of an engaged vehicle are missing, the controller brakes and holds, then sends nothing.
 """
 

@@ -195,6 +195,7 @@ def status(path: Path) -> list[dict[str, Any]]:
 
 
 @pytest.mark.slow
+@pytest.mark.fault(70)
 @pytest.mark.parametrize("how", ["ctrl-c", "order", "a daemon is killed", "the fleet is killed"])
 def test_all_land_together_and_have_never_been_near_each_other(how: str) -> None:
     with flying() as (path, truths, fleet):

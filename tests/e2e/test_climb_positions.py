@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 
 import pytest
 from take_off_rig import GOAL, RELAYED, Flight
 
+from logs.recording.reader import records
+from uavctl.cli.app import run
+from uavctl.config import load_config
+from uavctl.config.checks import position_index
 from uavctl.mavlink.handover_states import HandoverState
+from uavctl.records import Truth
 
 START_M = (0.0, 0.0, -0.7)  # the rig's, whose vehicle begins on the floor below
 SIDE_M, CEILING_M = 1.5, 2.5  # how far to the side, and how high, the vehicle may come
@@ -94,3 +100,36 @@ def test_px4_s_own_climb_to_another_height_ends_at_the_ceiling() -> None:
     flight.take_off(2.4)
     _, height_m = furthest(flight)
     assert height_m < CEILING_M + 0.5
+
+
+def flown(folder: Path, seed: int, seconds: float, *settings: str) -> tuple[int, float]:
+    """Exit code of a loopback flight of an ArduPilot with GPS, and how far outside the true vehicle was at most [m]."""
+    words = [word for one in settings for word in ("--set", one)]
+    code = run(["loopback", "--config", "room-ardupilot", "--arm", "--takeoff", "1.2", "--seed", str(seed),
+                "--duration", str(seconds), "--out", str(folder), "--json", *words])  # fmt: skip
+    config = load_config("room-ardupilot")
+    sides = [(config.sets.state_lower[i], config.sets.state_upper[i]) for i in position_index(config.plant)]
+    beyond = [
+        max(low - place, place - high)
+        for one in records(folder / "flight.mcap", Truth)
+        for (low, high), place in zip(sides, one.position_m, strict=True)
+    ]
+    return code, max(beyond)
+
+
+@pytest.mark.slow
+@pytest.mark.fault(42)
+@pytest.mark.parametrize("frame", ["mirrored-north", "mirrored-east", "turned-180", "turned-270"])
+def test_a_wrong_frame_is_found_from_the_first_tick_on_that_flies_on_it(tmp_path: Path, frame: str) -> None:
+    """ArduPilot tells once a second whether it climbs; until then nothing was held against what was sent: 1.8 m out."""
+    code, beyond_m = flown(tmp_path, 9855, 10.1, f'sim.fault=[{{kind="frame",at_s=0.0,name="{frame}"}}]')
+    assert code == 1 and beyond_m < 1.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "settings"), [(9523, ()), (25, ("link.loss=0.6", "sim.camera.rate_hz=5.0"))])
+def test_a_healthy_climb_is_not_let_go_for_a_watch_that_began_in_its_midst(
+    tmp_path: Path, seed: int, settings: tuple[str, ...]
+) -> None:
+    code, beyond_m = flown(tmp_path, seed, 14.0, *settings)
+    assert code == 0 and beyond_m < 0.1  # it lands on the floor, which is a side

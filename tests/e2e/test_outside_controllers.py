@@ -87,6 +87,7 @@ def replays(path: Path, capsys: pytest.CaptureFixture[str]) -> bool:
     return bool(json.loads(capsys.readouterr().out)["identical"])
 
 
+@pytest.mark.fault(69)
 def test_one_that_fails_brakes_within_the_room_and_replays(
     ready: Callable[[str], Prepared], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -104,6 +105,7 @@ def test_a_good_one_flies_to_the_target(ready: Callable[[str], Prepared], plant:
     assert math.dist(seen.place_m, prepared.config.target.position_m) < 0.15
 
 
+@pytest.mark.fault(69)
 @pytest.mark.slow
 @pytest.mark.parametrize(("plant", "autopilot"), WORLDS)
 @pytest.mark.parametrize("name", FAILING)
@@ -114,6 +116,7 @@ def test_one_that_fails_never_leaves_the_room(
     assert_let_go(flown(ready(name), plant, autopilot), words)
 
 
+@pytest.mark.fault(69)
 @pytest.mark.slow
 @pytest.mark.parametrize(("plant", "autopilot"), WORLDS)
 @pytest.mark.parametrize("took_ns", [60_000_000, 700_000_000])

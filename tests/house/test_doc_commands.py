@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import re
 import shlex
+import subprocess
+import sys
 
 import pytest
 from places import ROOT
 
 from uavctl.build.controller import build_design
+from uavctl.cli.app import app
 from uavctl.cli.common import Common
 
 
@@ -47,3 +50,26 @@ def test_a_command_for_one_recording_is_not_given_all_of_them() -> None:
     bare = re.compile(r"^uavctl log (?:replay|report|whatif|export|info) [^\"\n]*\*", re.M)
     for page in ("README.md", "docs/quick-start.md"):
         assert not bare.search((ROOT / page).read_text(encoding="utf-8"))
+
+
+def expected() -> list[str]:
+    """The command of each row of what people expect."""
+    page = (ROOT / "docs" / "expectations.md").read_text(encoding="utf-8")
+    return [re.findall(r"`([^`]+)`", row)[-1] for row in re.findall(r"^\| \d+ \|.*$", page, re.M)]
+
+
+def test_what_people_expect_has_a_command_in_each_of_its_rows() -> None:
+    assert len(expected()) == 28
+    assert {shlex.split(command)[0] for command in expected()} <= {"uavctl", "pytest", "make"}
+
+
+@pytest.mark.parametrize("command", [one for one in expected() if one.startswith("uavctl ")])
+def test_an_expectation_s_command_is_understood(command: str) -> None:
+    app.parse_args(shlex.split(command)[1:], exit_on_error=False, print_error=False)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", [one for one in expected() if one.startswith("pytest ")])
+def test_an_expectation_s_tests_are_there(command: str) -> None:
+    words = [sys.executable, "-m", *shlex.split(command), "--collect-only", "-n", "0", "-p", "no:cacheprovider"]
+    assert subprocess.run(words, cwd=ROOT, stdout=subprocess.DEVNULL, check=False).returncode == 0
