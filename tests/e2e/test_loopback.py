@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
+from html import unescape
 from pathlib import Path
 from typing import Any
 
@@ -87,6 +89,18 @@ def test_a_replay_with_another_cost_decides_otherwise(tmp_path: Path, capsys: py
     assert document(capsys, "log", "replay", flight)["identical"]
     found = document(capsys, "log", "replay", flight, "--set", "cost.input=[1.0, 1.0]", code=1)
     assert not found["identical"] and found["first_difference"]
+
+
+def test_the_command_tells_what_the_page_says_first(
+    flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = tmp_path / "page.html"
+    main = document(capsys, "log", "report", str(flown), "--out", str(page))["headline"]
+    text = " ".join(unescape(re.sub(r"<[^>]+>", " ", page.read_text(encoding="utf-8"))).split())
+    assert run(["log", "report", str(flown), "--out", str(page)]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    for told in (main["text"], *main["why"]):
+        assert told in shown and told in text
 
 
 def test_recover_restores_a_cut_file_and_says_so_in_its_exit_code(

@@ -31,6 +31,7 @@ from logs.report.compare import (
 )
 from logs.report.figures import picture
 from logs.report.flight_page import verdict_rows, write_report
+from logs.report.headline import BAD, GOOD, MIND, Headline, headline
 from logs.report.tlog_page import write_tlog_page
 from logs.report.verdicts import judge
 from uavctl.cli.common import Column, Common, Flight, Json, WideTable, bars, can_be_read, columns, two_columns, warn
@@ -126,9 +127,20 @@ def report(
     write_report(data, summary, page, judged)
     if cut := lacks_end(flight):
         warn(f"{cut}: shown up to there")
-    document = {**msgspec.structs.asdict(summary), "verdicts": judged.verdicts}
-    Common(json=json).show("log/report", document, lambda: render(summary, verdict_rows(judged.verdicts)))
+    main = headline(data, summary, judged)
+    first = {"tone": main.tone, "text": f"{main.word}: {main.text}", "why": main.why}
+    document = {**msgspec.structs.asdict(summary), "verdicts": judged.verdicts, "headline": first}
+    Common(json=json).show("log/report", document, lambda: _told(main, render(summary, verdict_rows(judged.verdicts))))
     return 0
+
+
+_STYLES = {GOOD: "bold green", MIND: "bold yellow", BAD: "bold red"}
+
+
+def _told(main: Headline, summary: RenderableType) -> Group:
+    """Return what a terminal shows: the page's first line and why, then the figures."""
+    why = [Text(f"  {sentence}") for sentence in main.why]
+    return Group(Text.assemble((f"{main.word}: ", _STYLES[main.tone]), main.text), *why, summary)
 
 
 def _report_tlog(flight: Path, out: Path, svg: Path | None, common: Common) -> int:
