@@ -113,7 +113,7 @@ def test_two_workers_give_the_same(spec: Path, flown: Path, tmp_path: Path, caps
     assert out.count("\n") == 1
     assert contents(tmp_path / "two") == contents(flown)
     told: dict[str, Any] = json.loads(out)
-    assert told.keys() == {"name", "runs_file", "report", "wall_s", "cells"} and told["name"] == "small"
+    assert told.keys() == {"schema", "name", "runs_file", "report", "wall_s", "cells"} and told["name"] == "small"
     assert told["runs_file"] == str(tmp_path / "two" / "runs.parquet") and Path(told["report"]).exists()
     assert all(list(cell)[: len(KEYS)] == KEYS for cell in told["cells"])
     smpc, refused, lqg, _ = told["cells"]
