@@ -191,11 +191,8 @@ class FlightScene:
 
 def _headline(decision: Decision, age_s: float | None) -> str:
     age = "no position yet" if age_s is None else f"newest position {age_s:.2f} s old"
-    return (
-        f"{decision.mode.value}: {decision.reason or age}"
-        if decision.mode not in _IN_CONTROL
-        else (f"{decision.mode.value}: {age}")
-    )
+    why = "" if decision.mode in _IN_CONTROL else decision.reason
+    return f"{decision.mode.value}: {why or age}"
 
 
 def _level_of(decision: Decision, age_s: float | None, limit_s: float | None) -> Level:

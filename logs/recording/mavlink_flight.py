@@ -90,7 +90,7 @@ class MavlinkFlightInfo(msgspec.Struct, frozen=True, kw_only=True):
     notes: tuple[str, ...]  # on the file: what was left out, and what was odd about its clock
 
 
-class Track(NamedTuple):
+class HeardTrack(NamedTuple):
     """Places over time."""
 
     t_s: Floats  # (n,)
@@ -112,8 +112,8 @@ class MavlinkFlight:
     """A flight as its MAVLink tells it, with arrays to draw; times count from the first packet."""
 
     info: MavlinkFlightInfo
-    own: Track
-    sent: dict[str, Track]  # by source, the one with most positions first
+    own: HeardTrack
+    sent: dict[str, HeardTrack]  # by source, the one with most positions first
     ages: dict[str, Ages]
     setpoint_t_s: Floats  # (n,)
     setpoint_m: Floats  # (n, 3), NaN where it is to be ignored
@@ -299,9 +299,9 @@ class _Reader:
             setpoint_mps2=told[:, 6:],
         )
 
-    def _track(self, points: Sequence[tuple[int, Vec3, Vec3 | None]]) -> Track:
+    def _track(self, points: Sequence[tuple[int, Vec3, Vec3 | None]]) -> HeardTrack:
         unknown = (math.nan, math.nan, math.nan)
-        return Track(
+        return HeardTrack(
             self._seconds(at_ns for at_ns, _, _ in points),
             np.array([position_m for _, position_m, _ in points], dtype=np.float64).reshape(-1, 3),
             np.array([velocity or unknown for _, _, velocity in points], dtype=np.float64).reshape(-1, 3),

@@ -324,9 +324,9 @@ def _whole(data: Buffer, at: int) -> int:
     elif opcode == Opcode.ATTACHMENT:
         good = length >= _ATTACHMENT_FIELDS
     elif opcode == Opcode.METADATA:
-        good = _metadata_length(data, inner, length) == length
+        good = _pair_length(data, inner, length) == length
     elif opcode == Opcode.HEADER:
-        good = at == len(MAGIC) and _header_length(data, inner, length) == length
+        good = at == len(MAGIC) and _pair_length(data, inner, length) == length
     else:
         good = False
     if not good:
@@ -346,24 +346,14 @@ def _attached(data: Buffer, at: int, length: int) -> AttachedFile:
     return AttachedFile(found.name, found.media_type, len(found.data))
 
 
-def _metadata_length(data: Buffer, inner: int, length: int) -> int:
-    """Return the length of a metadata record by its name and its mapping; -1 if they do not fit."""
+def _pair_length(data: Buffer, inner: int, length: int) -> int:
+    """Return the length of a header or metadata record by those of its two fields; -1 if they do not fit."""
     if length < 8:
         return -1
-    (name,) = struct.unpack_from("<I", data, inner)
-    if name > length - 8:
+    (first,) = struct.unpack_from("<I", data, inner)
+    if first > length - 8:
         return -1
-    return int(8 + name + struct.unpack_from("<I", data, inner + 4 + name)[0])
-
-
-def _header_length(data: Buffer, inner: int, length: int) -> int:
-    """Return the length of a header record by its two strings; -1 if they do not fit."""
-    if length < 8:
-        return -1
-    (profile,) = struct.unpack_from("<I", data, inner)
-    if profile > length - 8:
-        return -1
-    return int(8 + profile + struct.unpack_from("<I", data, inner + 4 + profile)[0])
+    return int(8 + first + struct.unpack_from("<I", data, inner + 4 + first)[0])
 
 
 def _chunk(data: Buffer, at: int, length: int) -> bytes:

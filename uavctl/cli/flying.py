@@ -244,7 +244,7 @@ LivePort = Annotated[
 SWITCH_INTERVAL_S = 0.0005
 
 
-class Recording(Protocol):
+class FlightRecorder(Protocol):
     """Interface of a recorder."""
 
     def put(self, topic: str, at_ns: int, record: Record) -> None:
@@ -434,7 +434,9 @@ class LiveFeed:
 
 
 @contextmanager
-def live_line(loop: ControlLoop, recorder: Recording, duration_s: float | None, tick_s: float) -> Iterator[LiveFeed]:
+def live_line(
+    loop: ControlLoop, recorder: FlightRecorder, duration_s: float | None, tick_s: float
+) -> Iterator[LiveFeed]:
     """Show the state of the loop while it flies, from a thread of its own, on standard error; yields its feed."""
     before_s = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_INTERVAL_S)

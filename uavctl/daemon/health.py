@@ -81,7 +81,7 @@ class Health(msgspec.Struct, frozen=True, kw_only=True):
     let_go: str = ""  # why the envelope has let the vehicle go; empty as long as it has not
 
 
-class Flight(Protocol):
+class WatchedFlight(Protocol):
     """Control loop as far as its health is looked at."""
 
     course: FlightCourse
@@ -112,7 +112,7 @@ class HealthWatch:
 
     def __init__(
         self,
-        flight: Flight,
+        flight: WatchedFlight,
         config: Config,
         identity: tuple[str, str, int],
         recorder: Callable[[], RecorderHealth],

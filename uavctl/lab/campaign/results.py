@@ -75,7 +75,7 @@ class _Document(msgspec.Struct, frozen=True, kw_only=True):
 
 
 @dataclass(frozen=True, eq=False)
-class Runs:
+class CampaignRuns:
     """Runs of one cell that ended in order, sorted, and the errors of the others."""
 
     index: NDArray[np.int64]  # indices of the runs (N,)
@@ -101,7 +101,7 @@ class Results:
     planned: int  # runs of a cell that were asked for
     steps: int  # steps of a run
     cells: tuple[CellFigures, ...]  # what was compared, in the order of the specification
-    runs: dict[int, Runs]  # the runs of each cell, by its index; none of a cell that was refused
+    runs: dict[int, CampaignRuns]  # the runs of each cell, by its index; none of a cell that was refused
 
 
 def read_results(folder: Path) -> Results:
@@ -153,12 +153,12 @@ def read_cells(folder: Path, cells: Sequence[C], figures: Callable[[pa.Table, C]
         ) from error
 
 
-def _of_cell(rows: pa.Table, cell: CellFigures) -> Runs:  # noqa: ARG001 all are alike
+def _of_cell(rows: pa.Table, cell: CellFigures) -> CampaignRuns:  # noqa: ARG001 all are alike
     errors = rows["error"].to_pylist()
     numbers = rows["run"].to_numpy()
     good = np.array([not error for error in errors], dtype=np.bool_) & np.isfinite(rows["cost"].to_numpy())
     failed = tuple((int(numbers[i]), errors[i] or "the cost is not a finite number") for i in np.flatnonzero(~good))
-    return Runs(
+    return CampaignRuns(
         index=numbers[good],
         figures={name: _column(rows, name, good) for name in (*_FIGURES, *_SINCE)},
         ages=_histogram(rows["ages"], good),
@@ -290,7 +290,7 @@ def _finite(figure: Callable[[Array], np.float64], values: Array) -> float | Non
     return finite(float(figure(values))) if values.size else None
 
 
-def difference(a: Runs, b: Runs, column: str, per: float = 1.0) -> PairedDifference | None:
+def difference(a: CampaignRuns, b: CampaignRuns, column: str, per: float = 1.0) -> PairedDifference | None:
     """Return the paired difference of a column over `per`, for runs that ended in order in both; None without any."""
     _, of_a, of_b = np.intersect1d(a.index, b.index, assume_unique=True, return_indices=True)
     return paired_difference(a[column][of_a] / per, b[column][of_b] / per) if of_a.size else None
