@@ -171,7 +171,7 @@ def shifted(
     left = budgets - np.add.reduce(risk, axis=1)
     everywhere = np.count_nonzero(count) == count.size
     share = quantile(left / (count if everywhere else np.maximum(count, 1.0)))
-    np.putmask(kept, binds, share[:, None] * sigma)
+    np.multiply(share[:, None], sigma, out=kept, where=binds)
     return kept if everywhere else np.where(count[:, None] > 0.0, kept, backoff)
 
 

@@ -384,9 +384,12 @@ class ConditionedSolver:
         cost += problem.slack_linear * slack + problem.slack_quadratic * np.vdot(over, over)
         if slack <= KEPT:  # rounding
             return float(cost), slack, ()
+        stages, columns = (over > KEPT).nonzero()
         gave_way = tuple(
-            GaveWay(constraint="state", stage=t + 1, index=int(self._rows[i]), amount=float(over[t, i]))
-            for t, i in np.argwhere(over > KEPT).tolist()
+            GaveWay(constraint="state", stage=t + 1, index=i, amount=amount)
+            for t, i, amount in zip(
+                stages.tolist(), self._rows[columns].tolist(), over[stages, columns].tolist(), strict=True
+            )
         )
         return float(cost), slack, gave_way
 
