@@ -297,6 +297,7 @@ class ToldParameter(Record, frozen=True, kw_only=True):
     type: str  # of MAV_PARAM_TYPE: REAL32, INT32 ...
     system: int
     component: int
+    count: int = 0  # parameters that the vehicle says it has; 0 if that is not known
 
 
 class Ending(Record, frozen=True, kw_only=True):

@@ -7,20 +7,19 @@ or replayed from it.
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
 from functools import cache
 from importlib import resources
 
 import msgspec
 from mcap.records import Attachment, Metadata
 
-from logs.recording.parameters import VehicleParameter, parameter_file
+from logs.recording.parameters import ParameterReader, listed, parameter_file
 from uavctl.config.load import dotted
 from uavctl.records import Header
 
 CONFIG, LAYOUT, PARAMETERS = "config.toml", "foxglove-layout.json", "vehicle.params"
 _ORIGIN, _CONFIG, _VERSIONS = "uavctl", "configuration", "versions"
-_VALUES, _TYPES = "vehicle parameters", "vehicle parameter types"
+_VALUES, _TYPES, _LIST = "vehicle parameters", "vehicle parameter types", "vehicle parameter list"
 
 
 @cache
@@ -53,12 +52,16 @@ def layout(utc_ns: int) -> tuple[Attachment, ...]:
     return (_file(LAYOUT, "application/json", layout_text(), utc_ns),)
 
 
-def of_parameters(parameters: Mapping[str, VehicleParameter], utc_ns: int) -> tuple[Attachment | Metadata, ...]:
+def of_parameters(told: ParameterReader, utc_ns: int) -> tuple[Attachment | Metadata, ...]:
     """Return the vehicle's parameters for other programs; nothing if it told none."""
+    parameters, count = told.parameters(), told.count
     if not parameters:
         return ()
+    found = listed(parameters)
+    whole = "unknown" if count is None else str(found >= count).lower()
     return (
-        _file(PARAMETERS, "text/tab-separated-values", parameter_file(parameters), utc_ns),
+        _file(PARAMETERS, "text/tab-separated-values", parameter_file(parameters, count), utc_ns),
+        Metadata(_LIST, {"told": str(found), "of": str(count or "unknown"), "complete": whole}),
         Metadata(_VALUES, {name: str(one.value) for name, one in parameters.items()}),
         Metadata(_TYPES, {name: one.type for name, one in parameters.items()}),
     )

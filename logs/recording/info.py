@@ -127,6 +127,7 @@ class RecordingInfo(msgspec.Struct, frozen=True, kw_only=True):
     begin_utc: str | None = None  # of the first message; None if the recording does not tell
     attachments: tuple[AttachmentInfo, ...] = ()
     parameters: dict[str, VehicleParameter] = {}  # of the vehicle, as it told them
+    parameter_count: int | None = None  # parameters that it says it has
 
 
 class _Course:
@@ -302,6 +303,7 @@ def info(path: Path) -> RecordingInfo:
         begin_utc=_utc(start_ns + zero_utc_ns) if zero_utc_ns else None,
         attachments=tuple(attachments.values()),
         parameters=parameters.parameters(),
+        parameter_count=parameters.count,
     )
 
 

@@ -33,6 +33,7 @@ _TYPES = {
 }
 _NUMBERS = {name: number for number, name in _TYPES.items()}
 _INTEGERS = {"UINT8": "<B", "INT8": "<b", "UINT16": "<H", "INT16": "<h", "UINT32": "<I", "INT32": "<i"}
+_HASH = "_HASH_CHECK"
 _MOST = 20_000  # parameters kept: a vehicle has one or two thousand
 
 
@@ -53,6 +54,8 @@ class ParameterReader:
         self._lost: set[str] = set()  # links on which nobody knows where the next frame begins
         self._before: dict[str, VehicleParameter] = {}  # told before the recording began
         self._told: dict[tuple[int, int, str], tuple[float, int]] = {}
+        self._counts: dict[tuple[int, int], int] = {}  # parameters that each says it has
+        self._count_before: int | None = None
         self._autopilots: dict[int, int] = {}  # MAV_AUTOPILOT by system, in the order in which they were heard
 
     def take(self, record: Record) -> None:
@@ -61,6 +64,7 @@ class ParameterReader:
             value = int(record.value) if record.type in _INTEGERS and math.isfinite(record.value) else record.value
             told = VehicleParameter(value=value, type=record.type, system=record.system, component=record.component)
             self._before[record.name] = told
+            self._count_before = record.count or self._count_before
         elif isinstance(record, Datagram) and not record.outgoing:
             self._take_bytes(record)
 
@@ -98,6 +102,14 @@ class ParameterReader:
         key = fields.src_system, fields.src_component, text_of(fields.param_id)
         if len(self._told) < _MOST or key in self._told:
             self._told[key] = fields.param_value, fields.param_type
+            self._counts[key[:2]] = fields.param_count
+
+    @property
+    def count(self) -> int | None:
+        """Number of parameters that the autopilot says it has; None if it told none."""
+        systems = [*self._autopilots, *(system for system, _ in self._counts)]
+        told = self._counts.get((systems[0], mavlink.MAV_COMP_ID_AUTOPILOT1)) if systems else None
+        return told or self._count_before
 
     def parameters(self) -> dict[str, VehicleParameter]:
         """Return the parameters by name, in order: of the first vehicle that was heard, or else told any."""
@@ -116,16 +128,34 @@ class ParameterReader:
         return dict(sorted({**self._before, **found}.items()))
 
 
-def told_records(parameters: Mapping[str, VehicleParameter], at_ns: int) -> Iterator[ToldParameter]:
-    """Return records of parameters, for a recording that begins after they were told."""
+def listed(parameters: Mapping[str, VehicleParameter]) -> int:
+    """Return how many of the autopilot's list were told; PX4's hash over all is none of them."""
+    return sum(one.component == mavlink.MAV_COMP_ID_AUTOPILOT1 and name != _HASH for name, one in parameters.items())
+
+
+def told_records(
+    parameters: Mapping[str, VehicleParameter], at_ns: int, count: int | None = None
+) -> Iterator[ToldParameter]:
+    """Return records of parameters, for a recording that begins after they were told.
+
+    Args:
+        count: how many the vehicle says it has.
+    """
     for name, one in parameters.items():
         where = {"system": one.system, "component": one.component}
-        yield ToldParameter(at_ns=at_ns, name=name, value=float(one.value), type=one.type, **where)
+        yield ToldParameter(at_ns=at_ns, name=name, value=float(one.value), type=one.type, count=count or 0, **where)
 
 
-def parameter_file(parameters: Mapping[str, VehicleParameter]) -> str:
-    """Return parameters as a file of QGroundControl: system, component, name, value and type, parted by tabs."""
-    head = "# Vehicle parameters, as PARAM_VALUE told them\n# system\tcomponent\tname\tvalue\tMAV_PARAM_TYPE\n"
+def parameter_file(parameters: Mapping[str, VehicleParameter], count: int | None = None) -> str:
+    """Return parameters as a file of QGroundControl: system, component, name, value and type, parted by tabs.
+
+    Args:
+        count: how many the vehicle says it has.
+    """
+    found = listed(parameters)
+    lacks = "" if count is None or found >= count else ": INCOMPLETE"
+    of = "" if count is None else f"# {found} of the {count} that the vehicle says it has{lacks}\n"
+    head = f"# Vehicle parameters, as PARAM_VALUE told them\n{of}# system\tcomponent\tname\tvalue\tMAV_PARAM_TYPE\n"
     return head + "".join(
         f"{one.system}\t{one.component}\t{name}\t{one.value}\t{_NUMBERS.get(one.type, one.type)}\n"
         for name, one in parameters.items()

@@ -348,7 +348,7 @@ class WriteQueue:
         try:
             self._write_note(f"{text}; {blind.unseen} without views: {blind.reason}" if blind.unseen else text)
             utc_ns = self._files.at_ns + self._files.zero_utc_ns
-            self._files.finish(attachments.of_parameters(self._parameters.parameters(), utc_ns))
+            self._files.finish(attachments.of_parameters(self._parameters, utc_ns))
         except OSError as error:
             self._files.fail(error)
 

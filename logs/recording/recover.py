@@ -163,7 +163,7 @@ def _copy(src: Path, file: DiskFile) -> RecoverResult:
             at_ns=at_ns, segment=1, written=result.messages, dropped=0, refused=0, failures=0, text=text
         )
         segment.add(QueuedMessage(definition(RECORDER), tally.messages + 1, at_ns, encode(note)))
-    segment.attach(attachments.of_parameters(parameters.parameters(), at_ns + zero_utc_ns))
+    segment.attach(attachments.of_parameters(parameters, at_ns + zero_utc_ns))
     segment.finish()
     return result
 

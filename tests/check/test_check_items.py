@@ -270,7 +270,14 @@ def test_a_check_sends_nothing_that_arms_or_moves(autopilot: str) -> None:
                 kinds.add(message.get_type())
                 if message.get_type() == "COMMAND_LONG":
                     commands.add(message.command)
-    quiet = {"HEARTBEAT", "TIMESYNC", "PARAM_REQUEST_READ", "COMMAND_LONG", "VISION_POSITION_ESTIMATE"}
+    quiet = {
+        "HEARTBEAT",
+        "TIMESYNC",
+        "PARAM_REQUEST_LIST",
+        "PARAM_REQUEST_READ",
+        "COMMAND_LONG",
+        "VISION_POSITION_ESTIMATE",
+    }
     assert kinds <= quiet | {"SET_GPS_GLOBAL_ORIGIN"}
     assert commands <= {511, 512}  # MAV_CMD_SET_MESSAGE_INTERVAL, MAV_CMD_REQUEST_MESSAGE
     assert not peers.autopilot.pilot.armed

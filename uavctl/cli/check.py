@@ -138,7 +138,7 @@ def record_items(sink: Sink, items: Iterable[Item], at_ns: int) -> None:
 
 def record_parameters(sink: Sink, told: ParameterReader, at_ns: int) -> None:
     """Record the vehicle's parameters that a check has heard."""
-    for one in told_records(told.parameters(), at_ns):
+    for one in told_records(told.parameters(), at_ns, told.count):
         sink.put(PARAMETER, at_ns, one)
 
 

@@ -18,7 +18,7 @@ from logs.recording.export import Exported, TableFormat, Watch, export_tables
 from logs.recording.info import PositionLoss, RecordingInfo
 from logs.recording.info import info as recording_info
 from logs.recording.mavlink_flight import MavlinkFlightInfo, facts_of, is_tlog, read_flight
-from logs.recording.parameters import VehicleParameter
+from logs.recording.parameters import VehicleParameter, listed
 from logs.recording.reader import RecordedMessage, lacks_end
 from logs.recording.recover import RecoverResult
 from logs.recording.recover import recover as restore
@@ -156,13 +156,15 @@ def _lines(found: RecordingInfo) -> Iterator[str]:
     for file in found.attachments:
         yield f"attached: {file.name}, {file.bytes:,} bytes"
     if found.parameters:
-        yield from _parameters(found.parameters)
+        yield from _parameters(found.parameters, found.parameter_count)
 
 
-def _parameters(told: Mapping[str, VehicleParameter]) -> Iterator[str]:
+def _parameters(told: Mapping[str, VehicleParameter], count: int | None) -> Iterator[str]:
     some = ", ".join(f"{name} {one.value}" for name, one in [*told.items()][:_SOME_PARAMETERS])
     more = "" if len(told) <= _SOME_PARAMETERS else " ...; --json has all"
-    yield f"vehicle parameters: {len(told)} ({some}{more})"
+    found = listed(told)
+    lacks = "" if count is None or found >= count else f"; INCOMPLETE: {found} of the {count} that it says it has"
+    yield f"vehicle parameters: {len(told)} ({some}{more}){lacks}"
 
 
 def _loss(loss: PositionLoss) -> Iterator[str]:

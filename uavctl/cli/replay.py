@@ -36,7 +36,7 @@ from uavctl.build.prepared import CONTROLLER, Prepared, cpu, versions
 from uavctl.cli.common import DEFAULTS, Common, Flight, columns, counted, located, messages, two_columns, warn
 from uavctl.cli.prepare import prepare
 from uavctl.config import Config, LoadedConfig
-from uavctl.config.load import parse
+from uavctl.config.load import parse_recorded
 from uavctl.errors import DesignError, LibraryError, RecordingError, UsageError
 from uavctl.loop import VEHICLE, ControlLoop, make_links
 from uavctl.records import Header, StepInput
@@ -132,13 +132,13 @@ def replay_flight(flight: Path, tolerance: float = 0.0, overrides: Sequence[str]
     check_first(flight)
     recorded = header(flight)
     name = f"{flight} (configuration)"
-    config = flown = parse(recorded.config_toml, name).config
+    config = flown = parse_recorded(recorded.config_toml, name).config
     cut, note = lacks_end(flight), last_note(flight)
     if cut and next(records(flight, StepInput), None) is None:  # so early that the policy library may be missing
         nothing = ReplayResult(decisions=0, compared=0, identical=True, first_difference=None)
         return Replayed(nothing, cut, "", (), tuple(other_versions(recorded, flown.smpc.controller)))
     if overrides:
-        loaded = parse(recorded.config_toml, name, overrides)
+        loaded = parse_recorded(recorded.config_toml, name, overrides)
         if make_links(loaded.config).keys() != make_links(config).keys():
             raise UsageError(
                 "daemon.vehicle and daemon.mocap say over which connections the recorded bytes came; leave them as "

@@ -34,7 +34,7 @@ from uavctl.cli.prepare import prepare, ready_library
 from uavctl.cli.replay import changed_flyer, check_first, other_versions, recorded_flyer
 from uavctl.config import Config, LoadedConfig, load
 from uavctl.config.checks import dimensions
-from uavctl.config.load import parse
+from uavctl.config.load import parse_recorded
 from uavctl.config.types import PlantConfig, TargetConfig
 from uavctl.errors import UsageError
 from uavctl.lab.campaign.controllers import BaselineSolver, build, recipe_for
@@ -95,7 +95,7 @@ def changed(before: Config, toml: str, flight: Path, config: str | None, overrid
                 "is the controller, its beliefs (plant, sets, cost, smpc, schedule, ...) and link.*"
             )
     name = f"{flight} (configuration)"
-    loaded = parse(toml, name, overrides) if config is None else load(config, overrides)
+    loaded = parse_recorded(toml, name, overrides) if config is None else load(config, overrides)
     given = loaded.config
     source = replace(before.source, rate_hz=given.source.rate_hz)
     surroundings = {section: getattr(before, section) for section in RECORDED_KEYS}
@@ -221,7 +221,7 @@ def whatif(
         raise UsageError("--seed is of a simulated link; add --link configured, or --link KEY=VALUE")
     check_first(flight)
     recorded = header(flight)
-    before = parse(recorded.config_toml, f"{flight} (configuration)").config
+    before = parse_recorded(recorded.config_toml, f"{flight} (configuration)").config
     loaded = changed(before, recorded.config_toml, flight, config, overrides)
     keys = tuple(f"link.{text.strip()}" for text in link if "=" in text)
     on = changed(before, recorded.config_toml, flight, config, (*overrides, *keys)).config.link

@@ -209,6 +209,16 @@ def parse(text: str, file: str, overrides: Sequence[str] = ()) -> LoadedConfig:
     return LoadedConfig(msgspec.structs.replace(cast("Config", config), mission=mission, link=link), source)
 
 
+def parse_recorded(text: str, file: str, overrides: Sequence[str] = ()) -> LoadedConfig:
+    """Load the configuration of a recording; one of before has no key for what was not done then.
+
+    Raises:
+        ConfigError: With all problems found.
+    """
+    asked = "parameters" in parse_toml(text, file).get("daemon", {})
+    return parse(text, file, overrides if asked else ("daemon.parameters=false", *overrides))
+
+
 def explain(source: Source, error: DesignError) -> str:
     """A refused design as the loader's own problems are told: place, key, reason, what to do."""
     return source.tell(ConfigProblem(error.key, error.reason, error.hint))

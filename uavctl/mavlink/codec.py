@@ -104,6 +104,8 @@ def _param_value(raw: Fields) -> ParamValue:
         name=text_of(raw.param_id),
         cast=raw.param_value,
         bytewise=float(bytewise),
+        index=raw.param_index,
+        count=raw.param_count,
     )
 
 
@@ -388,6 +390,7 @@ ACCEL_AND_YAW = 0x083F  # type_mask 2111: yaw is used too
 _COMMAND_LONG = MessageLayout(mavlink.MAVLink_command_long_message)
 _HEARTBEAT = MessageLayout(mavlink.MAVLink_heartbeat_message)
 _ODOMETRY = MessageLayout(mavlink.MAVLink_odometry_message)
+_PARAM_REQUEST_LIST = MessageLayout(mavlink.MAVLink_param_request_list_message)
 _PARAM_REQUEST_READ = MessageLayout(mavlink.MAVLink_param_request_read_message)
 _SET_GPS_GLOBAL_ORIGIN = MessageLayout(mavlink.MAVLink_set_gps_global_origin_message)
 _SET_POSITION_TARGET_LOCAL_NED = MessageLayout(mavlink.MAVLink_set_position_target_local_ned_message)
@@ -471,6 +474,12 @@ class Encoder:
     def request_parameter(self, name: str, target_system: int, target_component: int) -> bytes:
         """PARAM_REQUEST_READ by name."""
         return self._pack(_PARAM_REQUEST_READ, target_system, target_component, name.encode(), -1)
+
+    def request_parameters(self, index: int, target_system: int, target_component: int) -> bytes:
+        """PARAM_REQUEST_READ by index, or with -1 PARAM_REQUEST_LIST."""
+        if index < 0:
+            return self._pack(_PARAM_REQUEST_LIST, target_system, target_component)
+        return self._pack(_PARAM_REQUEST_READ, target_system, target_component, b"", index)
 
     def request_interval(self, message_id: int, interval_us: int, target_system: int, target_component: int) -> bytes:
         """COMMAND_LONG MAV_CMD_SET_MESSAGE_INTERVAL: send this message so often."""

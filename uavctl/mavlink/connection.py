@@ -61,6 +61,11 @@ RATES_HZ = {LOCAL_POSITION_NED: 10.0, ATTITUDE: 10.0, EXTENDED_SYS_STATE: 5.0, S
 
 INERTIAL_HZ = 50.0  # of what shows how it turns, and its acceleration
 
+# Of the list of all parameters: 50 a second are asked for again at most, which a telemetry radio bears.
+MOST_PARAMETERS, ROUNDS = 5000, 10
+READS, READS_NS = 10, SECOND_NS // 5
+QUIET_NS = SECOND_NS // 2  # without a parameter: the list has ended
+
 SOURCE_PARAMETER = "EK3_SRC1_POSXY"
 EXTERNAL = 6.0  # of the source: external positions
 
@@ -119,6 +124,51 @@ class Streams:
             self._felt_tries += 1
             wanted.update(dict.fromkeys(kinds, INERTIAL_HZ))
         return tuple(wanted.items())
+
+
+class ParameterList:
+    """Schedule of asking a vehicle that has not been armed yet for all its parameters: the list, then what was lost."""
+
+    def __init__(self) -> None:
+        self._missing: set[int] | None = None  # indices not told yet; None before the vehicle says how many it has
+        self._news = False  # one was told since the last look
+        self._next_ns = 0
+        self._lists = self._rounds = 0
+        self._round: list[int] = []  # indices of this round that are still to be asked for
+        self._over = False
+
+    def saw(self, message: Message) -> None:
+        """Take a message of the vehicle."""
+        if isinstance(message, ParamValue) and message.index < message.count <= MOST_PARAMETERS:
+            if self._missing is None:
+                self._missing = set(range(message.count))
+            self._missing.discard(message.index)
+            self._news = True
+
+    def due(self, at_ns: int, *, armed: bool) -> tuple[int, ...]:
+        """Return the indices to ask for now, -1 for the whole list; nothing any more once the vehicle was armed."""
+        self._over = self._over or armed or self._missing == set()
+        if self._over:
+            return ()
+        if self._news and not self._rounds:  # the list is on its way
+            self._news, self._next_ns = False, at_ns + QUIET_NS
+        if at_ns < self._next_ns:
+            return ()
+        if self._missing is None:
+            self._lists += 1
+            self._next_ns = at_ns + AGAIN_NS
+            self._over = self._lists > TRIES
+            return () if self._over else (-1,)
+        self._next_ns = at_ns + READS_NS
+        if not self._round:
+            self._rounds += 1
+            self._over = self._rounds > ROUNDS
+            self._round = [] if self._over else sorted(self._missing, reverse=True)
+        asked = self._round[-READS:][::-1]
+        del self._round[-READS:]
+        if not self._round:  # the last answers of a round are waited for
+            self._next_ns = at_ns + QUIET_NS
+        return tuple(index for index in asked if index in self._missing)
 
 
 class Globe:
@@ -219,6 +269,7 @@ class MavlinkConnection:
         feels = estimator.inertial_std_mps2 > 0.0
         self._vehicle = VehicleWatch(self._count, self._own, daemon.vehicle_system_id, inertial=feels)
         self._streams, self._globe, self._texts = Streams(inertial=feels), Globe(), Joiner()
+        self._lists, self._parameters = daemon.parameters, ParameterList()
         self._bad: Counter[str] = Counter()
         self._untold: Counter[str] = Counter()
         self._told_ns: int | None = None
@@ -299,6 +350,8 @@ class MavlinkConnection:
         if VEHICLE in self._roles and self._vehicle.address is not None:
             wanted = self._streams.due(at_ns, self._vehicle.autopilot)
             out += [self.request_stream(number, rate_hz) for number, rate_hz in wanted]
+            indices = self._parameters.due(at_ns, armed=self._vehicle.armed) if self._lists else ()
+            out += [self._encoder.request_parameters(index, *self._target()) for index in indices]
         return tuple(out)
 
     def setpoint(self, setpoint: Setpoint) -> bytes:
@@ -436,7 +489,7 @@ class MavlinkConnection:
         items = self._vehicle.take(message, at_ns)
         if self._vehicle.boots != boots:
             self._streams.restart()
-            self._globe = Globe()
+            self._globe, self._parameters = Globe(), ParameterList()
             text = f"link {self._name}: the vehicle has started anew"
             return (*items, Event(at_ns=at_ns, severity=Severity.ERROR, code="vehicle-reboot", text=text))
         if self._vehicle.unready != unready:
@@ -444,6 +497,8 @@ class MavlinkConnection:
         if self.vehicle is not None and message.system == self.vehicle[0]:
             self._streams.saw(message)
             self._globe.saw(message)
+            if message.component == self.vehicle[1]:
+                self._parameters.saw(message)
         return items
 
     def _timesync(self, message: TimeSync, at_ns: int) -> None:

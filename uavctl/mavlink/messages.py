@@ -107,6 +107,8 @@ class ParamValue(Message, frozen=True, kw_only=True):
     name: str  # of the parameter
     cast: float  # the value as a number, as ArduPilot means it
     bytewise: float  # the value as PX4 means it: the bytes of an integer, if the type is one
+    index: int = 65535  # its place in the list; 65535 where that is not told
+    count: int = 0  # parameters that the vehicle says it has
 
 
 class EstimatorFlags(Message, frozen=True, kw_only=True):

@@ -255,6 +255,11 @@ class VehicleWatch:
         """Name of its autopilot; empty before its first heartbeat."""
         return "" if self._status is None else self._status.autopilot
 
+    @property
+    def armed(self) -> bool:
+        """Whether it says that it is armed."""
+        return self._status is not None and self._status.armed
+
     def take(
         self, message: Message, at_ns: int
     ) -> tuple[VehicleStatus | VehicleMotion | InertialSample | Event | Ack | Text, ...]:

@@ -136,3 +136,22 @@ def test_info_shows_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert run(["log", "info", str(path)]) == 0
     out = capsys.readouterr().out
     assert "attached: config.toml" in out and "vehicle parameters: 1 (A 4)" in out and "2025-11-24T16:00:00" in out
+
+
+@pytest.mark.parametrize("recovered", [False, True])
+@pytest.mark.parametrize(("names", "complete"), [("A", "false"), ("AB", "true")])
+def test_the_attachment_says_whether_the_list_is_whole(
+    names: str, complete: str, recovered: bool, tmp_path: Path
+) -> None:
+    path = tmp_path / "flight.mcap"
+    with SyncRecorder(path, LogConfig()) as recorder:
+        recorder.put("/uavctl/header", 0, HEADER)
+        for data in (heartbeat(12), *(told(name, 1.0, REAL32) for name in (*names, "_HASH_CHECK"))):
+            recorder.put("/raw/vehicle/in", 1, Datagram(at_ns=1, link="vehicle", outgoing=False, data=data))
+    if recovered:
+        recover(path, tmp_path / "again.mcap")
+        path = tmp_path / "again.mcap"
+    with path.open("rb") as file:
+        found = {one.name: one.metadata for one in make_reader(file).iter_metadata()}["vehicle parameter list"]
+    assert found == {"told": str(len(names)), "of": "2", "complete": complete}
+    assert info(path).parameter_count == 2

@@ -1,0 +1,106 @@
+"""All parameters of the vehicle come into the recording before it is armed, over a link that loses a third."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+from loopback_rig import make_loop
+from sim_rig import decode
+from take_off_rig import Flight
+
+from logs.recording.parameters import ParameterReader, listed
+from logs.recording.replay import replay
+from sim.autopilot.profile import TABLES
+from uavctl.mavlink.connection import READS, ROUNDS, TRIES, ParameterList
+from uavctl.mavlink.handover_states import HandoverState
+from uavctl.mavlink.messages import ParamValue
+from uavctl.records import Datagram
+
+SECOND = 1_000_000_000
+BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+
+
+def read(flight: Flight) -> ParameterReader:
+    reader = ParameterReader()
+    for datagram in flight.memory.of(Datagram):
+        reader.take(datagram)
+    return reader
+
+
+def asks(data: bytes) -> bool:
+    return any(m.get_type().startswith("PARAM_") for m in decode(data))
+
+
+def value(index: int, count: int) -> ParamValue:
+    return ParamValue(system=1, component=1, name=f"P{index}", cast=0.0, bytewise=0.0, index=index, count=count)
+
+
+@BOTH
+def test_a_lossy_link_loses_none(autopilot: str) -> None:
+    flight, dice = Flight(autopilot), random.Random(4)
+    flight.hears = lambda data: not asks(data) or dice.random() > 0.3
+    flight.told = lambda data: not asks(data) or dice.random() > 0.3
+    flight.run(15.0)
+    found = read(flight)
+    assert TABLES[autopilot].keys() <= found.parameters().keys()
+    assert found.count == listed(found.parameters()) == len(TABLES[autopilot])
+    assert flight.sent("PARAM_REQUEST_READ")  # some were lost
+    before = len(flight.sent("PARAM_REQUEST_LIST")), len(flight.sent("PARAM_REQUEST_READ"))
+    flight.run(5.0)
+    assert before == (len(flight.sent("PARAM_REQUEST_LIST")), len(flight.sent("PARAM_REQUEST_READ")))
+    assert replay(flight.memory.entries, lambda sink: make_loop(flight.config, sink)).identical
+
+
+def test_a_vehicle_that_never_answers_is_asked_a_few_times() -> None:
+    flight = Flight("px4")
+    flight.hears = lambda data: not asks(data)
+    flight.run(15.0)
+    assert len(flight.sent("PARAM_REQUEST_LIST")) == TRIES and not flight.sent("PARAM_REQUEST_READ")
+
+
+@BOTH
+def test_nothing_is_asked_once_it_is_armed(autopilot: str) -> None:
+    flight = Flight(autopilot)
+    flight.told = lambda data: not asks(data)
+    flight.take_off().run(10.0, until=HandoverState.CLIMBING)
+    armed_ns = flight.now_ns
+    flight.run(6.0)
+    asked = [at for kind in ("PARAM_REQUEST_LIST", "PARAM_REQUEST_READ") for at, _ in flight.sent(kind)]
+    # An ArduPilot is asked for the source of its positions by name, which is no part of the list.
+    assert asked and max(at for at, _ in flight.sent("PARAM_REQUEST_LIST")) < armed_ns
+    assert all(m.param_index < 0 for at, m in flight.sent("PARAM_REQUEST_READ") if at >= armed_ns)
+
+
+def test_it_can_be_left_out() -> None:
+    flight = Flight("px4", "daemon.parameters=false").run(3.0)
+    assert not flight.sent("PARAM_REQUEST_LIST")
+
+
+def test_the_lost_ones_are_asked_for_at_a_bounded_rate_and_not_for_ever() -> None:
+    asking, asked = ParameterList(), []
+    assert asking.due(0, armed=False) == (-1,)
+    asking.saw(value(0, 1001))  # and of the others none comes, ever
+    for at_ns in range(0, 400 * SECOND, SECOND // 20):
+        asked += [(at_ns, index) for index in asking.due(at_ns, armed=False)]
+    assert sorted(index for _, index in asked) == sorted(ROUNDS * [*range(1, 1001)])
+    for begin in range(0, 200 * SECOND, SECOND):
+        assert sum(begin <= at < begin + SECOND for at, _ in asked) <= 5 * READS
+
+
+def test_the_list_is_waited_for_while_it_comes_and_armed_ends_it_for_good() -> None:
+    asking = ParameterList()
+    assert asking.due(0, armed=False) == (-1,)
+    for index in range(0, 40, 2):
+        asking.saw(value(index, 41))
+        assert asking.due((index + 1) * SECOND // 10, armed=False) == ()
+    assert asking.due(5 * SECOND, armed=False) == tuple(range(1, 20, 2))
+    assert asking.due(6 * SECOND, armed=True) == ()
+    assert asking.due(7 * SECOND, armed=False) == ()
+
+
+def test_what_is_no_place_in_a_list_counts_for_nothing() -> None:
+    asking = ParameterList()
+    for odd in (value(65_535, 3), value(60_000, 65_535)):
+        asking.saw(odd)
+    assert asking.due(0, armed=False) == (-1,)
