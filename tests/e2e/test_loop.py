@@ -229,7 +229,7 @@ def test_row_31_a_restart_is_disarmed_and_asks_for_nothing() -> None:
             after.heartbeat(OFFBOARD, armed=False)
         sent += after.run(1, deaf=True)
     assert after.mode is ControlMode.WAIT
-    assert set(sent) == {"HEARTBEAT", "TIMESYNC", SETPOINT, LAND}
+    assert set(sent) == {"HEARTBEAT", "TIMESYNC", "PARAM_REQUEST_LIST", SETPOINT, LAND}
     commands = {
         m.command for d in after.memory.of(Datagram) if d.outgoing for m in decode(d.data) if m.get_type() == LAND
     }

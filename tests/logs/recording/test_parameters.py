@@ -144,10 +144,11 @@ def test_the_attachment_says_whether_the_list_is_whole(
     names: str, complete: str, recovered: bool, tmp_path: Path
 ) -> None:
     path = tmp_path / "flight.mcap"
-    with SyncRecorder(path, LogConfig()) as recorder:
-        recorder.put("/uavctl/header", 0, HEADER)
-        for data in (heartbeat(12), *(told(name, 1.0, REAL32) for name in (*names, "_HASH_CHECK"))):
-            recorder.put("/raw/vehicle/in", 1, Datagram(at_ns=1, link="vehicle", outgoing=False, data=data))
+    recorder = SyncRecorder(path, LogConfig())
+    recorder.put("/uavctl/header", 0, HEADER)
+    for data in (heartbeat(12), *(told(name, 1.0, REAL32) for name in (*names, "_HASH_CHECK"))):
+        recorder.put("/raw/vehicle/in", 1, Datagram(at_ns=1, link="vehicle", outgoing=False, data=data))
+    recorder.close()
     if recovered:
         recover(path, tmp_path / "again.mcap")
         path = tmp_path / "again.mcap"
