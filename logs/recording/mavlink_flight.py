@@ -74,7 +74,7 @@ class MavlinkFlightInfo(msgspec.Struct, frozen=True, kw_only=True):
     """Figures of a flight as its MAVLink tells it."""
 
     recording: str
-    begin_utc: str
+    begin_utc: str  # "" where the recording does not tell it
     duration_s: float
     autopilot: str  # "" without a heartbeat of one
     vehicle_system: int | None
@@ -119,6 +119,8 @@ class MavlinkFlight:
     setpoint_m: Floats  # (n, 3), NaN where it is to be ignored
     setpoint_mps: Floats  # (n, 3)
     setpoint_mps2: Floats  # (n, 3)
+    attitude_t_s: Floats = field(default_factory=lambda: np.empty(0))
+    attitude_deg: Floats = field(default_factory=lambda: np.empty((0, 3)))  # roll, pitch, yaw
 
     @property
     def duration_s(self) -> float:
@@ -153,7 +155,7 @@ def _vehicle(log: Tlog) -> Heartbeat | None:
 
 
 @dataclass
-class _Source:
+class SentSource:
     """Positions of one source, as they arrive."""
 
     track: list[tuple[int, Vec3, Vec3 | None]] = field(default_factory=list)
@@ -161,13 +163,14 @@ class _Source:
     refused: int = 0
     clock: ClockSync = field(default_factory=lambda: ClockSync(_WINDOW_NS, 0, _AHEAD_NS))
 
-    def take(self, position: Position, at_ns: int) -> None:
+    def take(self, position_m: Vec3, velocity_mps: Vec3 | None, stamp_us: int | None, at_ns: int) -> None:
+        """Take a position in local NED, with the stamp of its source."""
         captured = None
-        if position.stamp_us is not None:
-            found = self.clock.captured_ns(position.stamp_us * 1000, at_ns)
+        if stamp_us is not None:
+            found = self.clock.captured_ns(stamp_us * 1000, at_ns)
             self.refused += isinstance(found, str)
             captured = None if isinstance(found, str) else found
-        self.track.append((at_ns, _ned(position, position.position_m), _velocity(position)))
+        self.track.append((at_ns, position_m, velocity_mps))
         self.captured_ns.append(captured)
 
 
@@ -178,7 +181,7 @@ class _Reader:
         self._origin_ns = self._last_ns = origin_ns
         self._vehicle = vehicle
         self._own: dict[str, list[tuple[int, Vec3, Vec3 | None]]] = {}  # of each system's messages, by name
-        self._sources: dict[str, _Source] = {}
+        self._sources: dict[str, SentSource] = {}
         self._setpoints: list[tuple[int, list[float]]] = []
         self._modes: list[ModeBegin] = []
         self._texts: list[SpokenText] = []
@@ -215,7 +218,8 @@ class _Reader:
                 track.append((at_ns, message.position_m, message.velocity_mps))
             case Position(local_ned=False):
                 name = f"{message.name} of system {message.system}"
-                self._sources.setdefault(name, _Source()).take(message, at_ns)
+                place = _ned(message, message.position_m)
+                self._sources.setdefault(name, SentSource()).take(place, _velocity(message), message.stamp_us, at_ns)
             case Text() if self._is_vehicle(message.system):
                 self._take_text(message, at_ns)
 
@@ -268,7 +272,7 @@ class _Reader:
         """Return the flight in what was taken."""
         own_source = next((one for one in _OWN if one in self._own), "")
         sources = dict(sorted(self._sources.items(), key=lambda one: -len(one[1].track)))
-        ages = {source: self._ages(one) for source, one in sources.items()}
+        ages = {source: ages_of(one, self._origin_ns) for source, one in sources.items()}
         told = np.array([numbers for _, numbers in self._setpoints], dtype=np.float64).reshape(-1, 9)
         begin = datetime.fromtimestamp(self._origin_ns // 1_000_000 / 1000, UTC)
         info = MavlinkFlightInfo(
@@ -279,7 +283,7 @@ class _Reader:
             vehicle_system=None if self._vehicle is None else self._vehicle.system,
             own_positions=len(self._own.get(own_source, ())),
             own_source=own_source,
-            sent=tuple(_figures(source, one, ages[source]) for source, one in sources.items()),
+            sent=tuple(figures_of(source, one, ages[source]) for source, one in sources.items()),
             setpoints=len(told),
             modes=tuple(self._modes),
             texts=tuple(self._texts),
@@ -290,46 +294,53 @@ class _Reader:
         )
         return MavlinkFlight(
             info=info,
-            own=self._track(self._own.get(own_source, ())),
-            sent={source: self._track(one.track) for source, one in sources.items()},
+            own=track_of(self._own.get(own_source, ()), self._origin_ns),
+            sent={source: track_of(one.track, self._origin_ns) for source, one in sources.items()},
             ages=ages,
-            setpoint_t_s=self._seconds(at_ns for at_ns, _ in self._setpoints),
+            setpoint_t_s=seconds((at_ns for at_ns, _ in self._setpoints), self._origin_ns),
             setpoint_m=told[:, :3],
             setpoint_mps=told[:, 3:6],
             setpoint_mps2=told[:, 6:],
         )
 
-    def _track(self, points: Sequence[tuple[int, Vec3, Vec3 | None]]) -> HeardTrack:
-        unknown = (math.nan, math.nan, math.nan)
-        return HeardTrack(
-            self._seconds(at_ns for at_ns, _, _ in points),
-            np.array([position_m for _, position_m, _ in points], dtype=np.float64).reshape(-1, 3),
-            np.array([velocity or unknown for _, _, velocity in points], dtype=np.float64).reshape(-1, 3),
-        )
-
-    def _ages(self, source: _Source) -> Ages:
-        at_ns = [one for one, _, _ in source.track]
-        delay_s, age_at_ns, age_s = [], [], []
-        newest_ns: int | None = None
-        for at, captured in zip(at_ns, source.captured_ns, strict=True):
-            delay_s.append(math.nan if captured is None else (at - captured) * 1e-9)
-            if captured is None:
-                continue
-            for known_ns in (newest_ns, captured if newest_ns is None else max(newest_ns, captured)):
-                if known_ns is not None:
-                    age_at_ns.append(at)
-                    age_s.append((at - known_ns) * 1e-9)
-                    newest_ns = known_ns
-        return Ages(self._seconds(at_ns), np.array(delay_s), self._seconds(age_at_ns), np.array(age_s))
-
     def _second(self, at_ns: int) -> float:
         return (at_ns - self._origin_ns) * 1e-9
 
-    def _seconds(self, at_ns: Iterable[int]) -> Floats:
-        return np.array([self._second(at) for at in at_ns], dtype=np.float64)
+
+def seconds(at_ns: Iterable[int], origin_ns: int) -> Floats:
+    """Return times from the origin on [s]."""
+    return np.array([(at - origin_ns) * 1e-9 for at in at_ns], dtype=np.float64)
 
 
-def _figures(name: str, source: _Source, ages: Ages) -> SentPositions:
+def track_of(points: Sequence[tuple[int, Vec3, Vec3 | None]], origin_ns: int) -> HeardTrack:
+    """Return places and speeds as arrays."""
+    unknown = (math.nan, math.nan, math.nan)
+    return HeardTrack(
+        seconds((at_ns for at_ns, _, _ in points), origin_ns),
+        np.array([position_m for _, position_m, _ in points], dtype=np.float64).reshape(-1, 3),
+        np.array([velocity or unknown for _, _, velocity in points], dtype=np.float64).reshape(-1, 3),
+    )
+
+
+def ages_of(source: SentSource, origin_ns: int) -> Ages:
+    """Return the ages of a source's positions."""
+    at_ns = [one for one, _, _ in source.track]
+    delay_s, age_at_ns, age_s = [], [], []
+    newest_ns: int | None = None
+    for at, captured in zip(at_ns, source.captured_ns, strict=True):
+        delay_s.append(math.nan if captured is None else (at - captured) * 1e-9)
+        if captured is None:
+            continue
+        for known_ns in (newest_ns, captured if newest_ns is None else max(newest_ns, captured)):
+            if known_ns is not None:
+                age_at_ns.append(at)
+                age_s.append((at - known_ns) * 1e-9)
+                newest_ns = known_ns
+    return Ages(seconds(at_ns, origin_ns), np.array(delay_s), seconds(age_at_ns, origin_ns), np.array(age_s))
+
+
+def figures_of(name: str, source: SentSource, ages: Ages) -> SentPositions:
+    """Return the figures of a source."""
     span_s = float(ages.t_s[-1] - ages.t_s[0])
     delays_ms = 1e3 * ages.delay_s[np.isfinite(ages.delay_s)]
     return SentPositions(
@@ -366,7 +377,7 @@ def _velocity(position: Position) -> Vec3 | None:
 def facts_of(info: MavlinkFlightInfo) -> Iterator[tuple[str, str]]:
     """Return names and values for a table, on a page or in a terminal."""
     yield "recording", info.recording
-    yield "begins at", info.begin_utc
+    yield "begins at", info.begin_utc or "not told"
     yield "duration", f"{info.duration_s:.1f} s"
     yield "autopilot", f"{info.autopilot}, system {info.vehicle_system}" if info.vehicle_system is not None else "none"
     own = f"{info.own_positions} ({info.own_source})" if info.own_positions else "none"

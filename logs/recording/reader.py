@@ -302,7 +302,9 @@ def _scan(path: Path, data: Buffer, order: ReadingOrder | None) -> Iterator[Scan
 def _hint(path: Path) -> str:
     if path.suffix.lower() == ".tlog":
         return "; `uavctl log info`, `report` and `replay`, and `uavctl identify` read a .tlog"
-    if path.suffix.lower() in (".ulg", ".bin"):
+    if path.suffix.lower() in (".ulg", ".ulog"):
+        return "; `uavctl log info` and `report` read a ULog; what else takes a recording needs its MAVLink, as a .tlog"
+    if path.suffix.lower() == ".bin":
         return "; it is called like an autopilot's own log: give the MAVLink of that flight, as a .tlog"
     return ""
 

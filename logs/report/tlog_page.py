@@ -1,4 +1,4 @@
-"""Page of a flight as its MAVLink tells it: a `.tlog` of any ground station, whoever flew."""
+"""Page of a flight as its MAVLink or its autopilot tells it: a `.tlog` or a ULog, whoever flew."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def tlog_html(flight: MavlinkFlight) -> str:
     who = info.autopilot or "no autopilot"
     return page.page(
         f"Flight in {Path(info.recording).name}",
-        f"{info.begin_utc} · {info.duration_s:.1f} s · {who}",
+        f"{info.begin_utc or 'no date'} · {info.duration_s:.1f} s · {who}",
         story(info),
         _sections(flight),
     )
@@ -66,8 +66,10 @@ def _sections(flight: MavlinkFlight) -> Iterator[PageSection]:
         yield PageSection("Path", "", page.grid(list(_paths(flight))), marks)
         asked = np.isfinite(flight.setpoint_m).any() or np.isfinite(flight.setpoint_mps).any()
         wanted = (_WANTED,) if asked else ()
-        note = "Time counts from the first packet. All is in local NED, height upwards."
+        note = "Time counts from the recording's begin. All is in local NED, height upwards."
         yield PageSection("Axes over time", note, page.grid(list(_axes(flight))), (*marks, *wanted))
+    if len(flight.attitude_t_s):
+        yield PageSection("Attitude", "", page.grid(list(_attitude(flight))))
     aged = {source: ages for source, ages in flight.ages.items() if len(ages.age_s)}
     if aged:
         note = (
@@ -153,6 +155,15 @@ def _over_time(
         ax.plot(*thin(flight.setpoint_t_s, wanted), color=colour("target"), lw=1.1, ls=DOTTED, zorder=4)
         ax.set_xlim(0, max(flight.duration_s, 1e-3))
     return Drawing(key, one.svg, f"{title} over time")
+
+
+def _attitude(flight: MavlinkFlight) -> Iterator[Drawing]:
+    for number, angle in enumerate(("roll", "pitch", "yaw")):
+        with canvas(f"attitude-{angle}", 2.3) as one:
+            ax = one.axes(angle.capitalize(), "time [s]", f"{angle} [°]")
+            ax.plot(*thin(flight.attitude_t_s, flight.attitude_deg[:, number]), color=colour("estimate"), lw=1.1)
+            ax.set_xlim(0, max(flight.duration_s, 1e-3))
+        yield Drawing(f"attitude-{angle}", one.svg, f"{angle.capitalize()} over time")
 
 
 def _age(flight: MavlinkFlight, key: str, source: str, ages: Ages) -> Drawing:

@@ -24,6 +24,7 @@ from logs.recording.recover import RecoverResult
 from logs.recording.recover import recover as restore
 from logs.recording.summary import count
 from logs.recording.tlog import ExportedTlog, export_tlog
+from logs.recording.ulog import is_ulog, read_ulog
 from uavctl.cli.common import Common, Flight, Json, bars, columns, counted, two_columns, warn
 from uavctl.errors import UsageError
 
@@ -195,7 +196,7 @@ _COMMANDS = {
     ),
     "report": (
         "log_report:report",
-        "Write the page of a recording, or of a .tlog: one HTML file that needs nothing else.",
+        "Write the page of a recording, of a .tlog, or of a ULog of PX4: one HTML file that needs nothing else.",
     ),
     "compare": (
         "log_report:compare_command",
@@ -224,10 +225,11 @@ for _name, (_path, _help) in _COMMANDS.items():
 
 @log_app.command
 def info(flight: Flight, /, *, json: Json = False) -> int:
-    """Say what a recording, or a .tlog, holds: topics, rates, gaps, losses, and how it was made."""
-    if is_tlog(flight):
-        told = read_flight(flight).info
-        Common(json=json).show("log/info-tlog", told, lambda: _tlog_info(told))
+    """Say what a recording, a .tlog or a ULog holds: topics, rates, gaps, losses, and how it was made."""
+    if is_tlog(flight) or is_ulog(flight):
+        told = (read_ulog if is_ulog(flight) else read_flight)(flight).info
+        kind = "ulog" if is_ulog(flight) else "tlog"
+        Common(json=json).show(f"log/info-{kind}", told, lambda: _tlog_info(told))
         return 0
     found = recording_info(flight)
     Common(json=json).show("log/info", found, lambda: info_table(found))

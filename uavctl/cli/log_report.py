@@ -16,6 +16,7 @@ from logs.recording.mavlink_flight import facts_of, is_tlog, read_flight
 from logs.recording.outputs import spare_recording, write_whole
 from logs.recording.reader import lacks_end, read
 from logs.recording.summary import names_and_values, render, summarise
+from logs.recording.ulog import is_ulog, read_ulog
 from logs.report.compare import (
     ComparedFlight,
     FlightComparison,
@@ -101,7 +102,7 @@ def _figures(found: FlightComparison) -> WideTable:
     return WideTable(Column("figure", list(map(label, rows)), "left"), groups, ends)
 
 
-# `uavctl log report`: the page of a recording, ours or a `.tlog` of any ground station.
+# `uavctl log report`: the page of a recording, ours, a `.tlog` of any ground station, or a ULog of PX4.
 
 
 def report(
@@ -112,11 +113,11 @@ def report(
     svg: Annotated[Path | None, Parameter(help="also write a small picture of the flight")] = None,
     json: Json = False,
 ) -> int:
-    """Write the page of a recording, or of a .tlog: one HTML file that needs nothing else."""
+    """Write the page of a recording, of a .tlog, or of a ULog of PX4: one HTML file that needs nothing else."""
     page = out if out is not None else flight.with_suffix(".html")
     for target in (page, *(() if svg is None else (svg,))):
         spare_recording(target)
-    if is_tlog(flight):
+    if is_tlog(flight) or is_ulog(flight):
         return _report_tlog(flight, page, svg, Common(json=json))
     data = FlightData.from_records(read(flight), flight)
     dropped = max((note.dropped for note in data.notes), default=0)
@@ -145,11 +146,12 @@ def _told(main: Headline, summary: RenderableType) -> Group:
 
 def _report_tlog(flight: Path, out: Path, svg: Path | None, common: Common) -> int:
     if svg is not None:
-        raise UsageError(f"--svg draws a recording of ours; {flight} is a .tlog, of which there is the page")
-    found = read_flight(flight)
+        raise UsageError(f"--svg draws a recording of ours; {flight} is none, and of it there is the page")
+    found = (read_ulog if is_ulog(flight) else read_flight)(flight)
     write_tlog_page(found, out)
     for note in found.info.notes:
         warn(note)
     document = {**msgspec.to_builtins(found.info), "report": str(out)}
-    common.show("log/report-tlog", document, lambda: two_columns("", [*facts_of(found.info), ("page", str(out))]))
+    kind = "ulog" if is_ulog(flight) else "tlog"
+    common.show(f"log/report-{kind}", document, lambda: two_columns("", [*facts_of(found.info), ("page", str(out))]))
     return 0
