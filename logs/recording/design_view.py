@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uavctl.errors import RecordingError
-from uavctl.labels import Names, names_of
-from uavctl.records import Header, Matrix, Vec3, Vector
+from uavctl.records import Header, Matrix, Names, Vec3, Vector, names_of
 
 Floats = NDArray[np.float64]
 AXIS_NUMBER = {"north": 0, "east": 1, "down": 2}

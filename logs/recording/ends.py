@@ -10,12 +10,10 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 
-from logs.recording.disk import check_room
-from logs.recording.outputs import no_empty_folders
+from logs.recording.disk import check_room, no_empty_folders
 from logs.recording.recorder import RecorderStatus
 from logs.recording.topics import HEADER, LIBRARY
-from uavctl.build.controller import record_of
-from uavctl.build.prepared import Prepared, cpu, versions
+from uavctl.build.controller import Prepared, cpu, record_of, versions
 from uavctl.clock import VIRTUAL_ZERO_UTC_NS
 from uavctl.config.load import dump_config
 from uavctl.outcome import lacking

@@ -30,7 +30,7 @@ import msgspec
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
-from logs.recording.outputs import all_or_none, check_free, unfinished
+from logs.recording.disk import all_or_none, check_free, unfinished
 from logs.recording.reader import RecordedMessage, good_messages, lacks_end, segment_files
 from logs.recording.topics import HEADER, LIBRARY, decode, is_known, is_view, record_type
 from uavctl.config.load import find_nearest

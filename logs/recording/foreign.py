@@ -20,7 +20,7 @@ from mcap.exceptions import EndOfFile, McapError
 from mcap.records import Channel, Message, Schema
 from mcap.stream_reader import StreamReader
 
-from logs.recording.segment import MAGIC
+from logs.recording.disk import MAGIC
 from logs.recording.summary import count
 from logs.recording.tlog import MARKERS, SteadyClock, TlogPacket, frame_length, in_order, is_frame, packet_of
 from uavctl.errors import RecordingError, UsageError

@@ -20,8 +20,8 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Schema
 
-from logs.recording.disk import later_segments
-from logs.recording.segment import CHUNK, CHUNK_FIELDS, INDEX, MAGIC, MESSAGE, ZERO_UTC
+from logs.recording.disk import MAGIC, later_segments
+from logs.recording.segment import CHUNK, CHUNK_FIELDS, INDEX, MESSAGE, ZERO_UTC
 from logs.recording.topics import (
     END,
     GOES_ON,

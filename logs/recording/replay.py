@@ -21,7 +21,6 @@ import msgspec
 from logs.recording.reader import records
 from logs.recording.topics import RecorderNote, alike, decode, raw_link, record_type, says
 from uavctl.errors import RecordingError
-from uavctl.labels import names_of
 from uavctl.loop import ControlLoop
 from uavctl.records import (
     Command,
@@ -34,6 +33,7 @@ from uavctl.records import (
     Refused,
     Sink,
     StepInput,
+    names_of,
     to_nobody,
 )
 from uavctl.smpc.plant import AXES, Plant

@@ -41,11 +41,10 @@ from mcap.records import (
 )
 from mcap.records import SummaryOffset as Group
 
-from logs.recording.disk import OutputFile, is_there, segment_path
+from logs.recording.disk import MAGIC, OutputFile, is_there, segment_path
 from logs.recording.topics import HEADER, LIBRARY, Definition, definition, is_view
 from uavctl.config.types import LogConfig
 
-MAGIC = b"\x89MCAP0\r\n"
 MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
 _MESSAGE_FIELDS = 22  # bytes of a message record besides its data
 _OPCODE = int(Opcode.MESSAGE)

@@ -15,9 +15,8 @@ from rich.text import Text
 from logs.recording.design_view import Box, Floats
 from logs.recording.flight import FLOWN, FlightData
 from uavctl.config.mission import FenceConfig
-from uavctl.labels import duration, number, percent_above
 from uavctl.outcome import Cause, lacking, make_ending
-from uavctl.records import ControlMode, Ending, Matrix, SolveStatus, Vector
+from uavctl.records import ControlMode, Ending, Matrix, SolveStatus, Vector, duration, number, percent_above
 
 # How a recorded flight ended: the daemon's own last word, or what its records tell where there is none.
 

@@ -14,8 +14,8 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from logs.recording.disk import all_or_none, check_free, unfinished
 from logs.recording.export import Watch, known_number, unwatched
-from logs.recording.outputs import all_or_none, check_free, unfinished
 from logs.recording.reader import RecordedMessage, good_messages, header
 from logs.recording.summary import count
 from logs.recording.topics import raw_link

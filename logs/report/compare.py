@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from logs.recording.design_view import AXIS_NUMBER, Floats
+from logs.recording.disk import spare_recording, write_whole
 from logs.recording.flight import FlightData
 from logs.recording.info import info
-from logs.recording.outputs import spare_recording, write_whole
 from logs.recording.parameters import VehicleParameter
 from logs.recording.reader import RecordedMessage, good_messages, read
 from logs.recording.replay import leaves

@@ -19,8 +19,7 @@ from logs.report.statistics import normal_reach
 from logs.report.svg import PALETTE, WIDTH_IN, Drawing, canvas, colour, dots, power_of_ten, ramp, standalone, strokes
 from logs.report.verdict_model import AxisVerdict, LeadVerdict
 from logs.report.verdicts import ClockVerdict, LinkVerdict, delays_s, offsets
-from uavctl.labels import duration
-from uavctl.records import Plan
+from uavctl.records import Plan, duration
 
 # How it was controlled: age of information, inputs and their plan index, decision times.
 

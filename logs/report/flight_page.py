@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import pickle
+import sys
 import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
+from logs.recording.disk import write_whole
 from logs.recording.flight import FlightData
-from logs.recording.outputs import write_whole
+from logs.recording.reader import read
 from logs.recording.summary import FlightSummary, input_outside, rows, state_outside
 from logs.report import figures, page, plots
-from logs.report.cursor import script
 from logs.report.excursion import excursions
 from logs.report.figures import picture
 from logs.report.headline import headline
@@ -18,11 +20,11 @@ from logs.report.page import Mark, PageSection
 from logs.report.plots import path_3d
 from logs.report.statistics import LEVEL
 from logs.report.summary_text import part_begins, story
-from logs.report.timeline import timeline
+from logs.report.timeline import script, timeline
 from logs.report.verdict_model import AxisVerdict, ModelOutcome, ModelVerdict
 from logs.report.verdicts import ClockVerdict, DelayVerdict, Judged, LimitRisk, LinkVerdict, Verdicts, judge, plain
-from uavctl.labels import number
-from uavctl.records import Event
+from uavctl.errors import UavctlError
+from uavctl.records import Event, number
 
 # The sections of a report that say what was flown with: design, vehicle, checks before arming, configuration.
 
@@ -509,3 +511,18 @@ def _config_name(config_toml: str) -> str | None:
     except tomllib.TOMLDecodeError:
         return None
     return name if isinstance(name, str) else None
+
+
+def main() -> int:
+    """Write the page; return 0, or 1 with the reason on standard error if it cannot be written."""
+    recording, page = Path(sys.argv[1]), Path(sys.argv[2])
+    try:
+        write_report(FlightData.from_records(read(recording), recording), pickle.load(sys.stdin.buffer), page)
+    except UavctlError as error:
+        sys.stderr.write(f"{error}\n")
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -18,9 +18,8 @@ from logs.report.verdicts import Judged, flown_config
 from uavctl.build.controller import build_estimator
 from uavctl.config import Config
 from uavctl.flight.envelope import OF_POSITIONS
-from uavctl.labels import number
 from uavctl.outcome import Cause
-from uavctl.records import ControlMode, Decision
+from uavctl.records import ControlMode, Decision, number
 
 GOOD, MIND, BAD = "good", "mind", "bad"  # of a headline: its colour
 

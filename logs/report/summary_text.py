@@ -17,7 +17,7 @@ from logs.recording.summary import (
     state_outside,
 )
 from logs.recording.topics import GOES_ON, RECOVERED
-from uavctl.labels import duration, number, severity, tell, worst
+from uavctl.records import duration, number, severity, tell, worst
 
 # A target that moves by less than this share of its longest step only settles.
 _STILL = 0.05

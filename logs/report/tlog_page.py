@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from logs.recording.design_view import AXIS_NUMBER, Floats
+from logs.recording.disk import write_whole
 from logs.recording.mavlink_flight import Ages, MavlinkFlight, MavlinkFlightInfo, facts_of, longest_gap
-from logs.recording.outputs import write_whole
 from logs.recording.summary import count
 from logs.report import page
 from logs.report.figures import largest

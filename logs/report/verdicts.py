@@ -20,8 +20,7 @@ from uavctl.config import Config
 from uavctl.config.load import parse
 from uavctl.errors import ConfigError, DesignError
 from uavctl.flight.link_estimate import NOTHING_SEEN, LinkEstimateParameters, burst_statistic, observe
-from uavctl.labels import duration
-from uavctl.records import ControlMode, LinkStats, PositionSample, Truth
+from uavctl.records import ControlMode, LinkStats, PositionSample, Truth, duration
 
 # Verdict on the clocks: where capture times come from, how steady the offset was, and how true the stamps were.
 

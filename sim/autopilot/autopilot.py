@@ -20,8 +20,16 @@ from sim.autopilot.estimator import Estimator
 from sim.autopilot.files import Files
 from sim.autopilot.inertial import ERRORS, InertialSensors
 from sim.autopilot.pilot import CRASHED, CRITICAL, WARNING, Phase, Pilot
-from sim.autopilot.profile import SIMULATED, Mode, Parameters, ParameterType, Role, SimulatedProfile
-from sim.autopilot.setpoints import SetpointKind, interpret
+from sim.autopilot.profile import (
+    SIMULATED,
+    Mode,
+    Parameters,
+    ParameterType,
+    Role,
+    SetpointKind,
+    SimulatedProfile,
+    interpret,
+)
 from sim.autopilot.telemetry import HOME_POSITION, GeodeticOrigin, Message, Telemetry, TelemetrySources
 from sim.channel import earliest, within
 from sim.vehicle.interface import SteeredPlant, Supply, Vehicle

@@ -10,8 +10,18 @@ import math
 from enum import Enum
 
 from sim.autopilot.estimator import Estimator
-from sim.autopilot.profile import ACCEPTED, FAILED, TEMPORARILY_REJECTED, Mode, Parameters, Role, SimulatedProfile
-from sim.autopilot.setpoints import STOP, ParsedSetpoint, SetpointKind
+from sim.autopilot.profile import (
+    ACCEPTED,
+    FAILED,
+    STOP,
+    TEMPORARILY_REJECTED,
+    Mode,
+    Parameters,
+    ParsedSetpoint,
+    Role,
+    SetpointKind,
+    SimulatedProfile,
+)
 from sim.channel import earliest
 from sim.vehicle.interface import SteeredPlant, Supply, Vehicle
 from uavctl.records import Vec3

@@ -12,8 +12,16 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim.autopilot.estimator import Estimator
 from sim.autopilot.inertial import InertialSensors
 from sim.autopilot.pilot import Phase, Pilot, preflight
-from sim.autopilot.profile import Parameters, Role, SimulatedProfile
-from sim.autopilot.setpoints import IGNORE_ACCEL, IGNORE_POSITION, IGNORE_VELOCITY, IGNORE_YAW, SetpointKind
+from sim.autopilot.profile import (
+    IGNORE_ACCEL,
+    IGNORE_POSITION,
+    IGNORE_VELOCITY,
+    IGNORE_YAW,
+    Parameters,
+    Role,
+    SetpointKind,
+    SimulatedProfile,
+)
 from sim.vehicle.interface import ZERO, Quaternion, Vehicle, heading_rad
 from sim.vehicle.rigid_body import GRAVITY_MPS2
 from uavctl.records import Vec3

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from uavctl.build.code_id import decider_id, maker_id
+from uavctl.build.outside import decider_id, maker_id
 
 
 @pytest.mark.parametrize("hash_of", [maker_id, decider_id], ids=["maker", "decider"])

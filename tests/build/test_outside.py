@@ -14,7 +14,7 @@ import uavctl.build.outside as outside
 from uavctl.build.controller import build_controller, build_problem, design_of
 from uavctl.config import load_config
 from uavctl.errors import DesignError
-from uavctl.lab.campaign import plugins
+from uavctl.lab.campaign.spec import check_kind, make_controller
 from uavctl.records import SolveStatus
 
 MODULE = """
@@ -55,17 +55,17 @@ def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
 
 
 def test_a_class_of_the_working_directory_is_found(module: str) -> None:
-    plugins.check_kind(f"{module}:Still")
-    assert type(plugins.make_controller(f"{module}:Still", problem("paper"))).__name__ == "Still"
+    check_kind(f"{module}:Still")
+    assert type(make_controller(f"{module}:Still", problem("paper"))).__name__ == "Still"
 
 
 def test_an_entry_point_has_a_short_name(module: str, monkeypatch: pytest.MonkeyPatch) -> None:
     point = EntryPoint("still", f"{module}:Still", outside.GROUP)
     monkeypatch.setattr(outside, "entry_points", lambda group: (point,) if group == outside.GROUP else ())
     assert outside.installed() == ("still",)
-    plugins.check_kind("still")
+    check_kind("still")
     with pytest.raises(DesignError, match='nearest valid name "still"'):
-        plugins.check_kind("stil")
+        check_kind("stil")
     assert build_controller(load_config("room", ["smpc.controller=still"])).outside == "still"
 
 
@@ -75,7 +75,7 @@ def test_an_entry_point_has_a_short_name(module: str, monkeypatch: pytest.Monkey
 )
 def test_what_a_campaign_cannot_ask_is_refused_with_the_reason(module: str, name: str, told: str) -> None:
     with pytest.raises(DesignError, match=told) as found:
-        plugins.make_controller(f"{module}:{name}", problem("paper"))
+        make_controller(f"{module}:{name}", problem("paper"))
     assert found.value.key == "kind"
 
 
@@ -91,7 +91,7 @@ def test_what_cannot_fly_is_refused_with_the_reason(module: str, name: str, told
 
 def test_a_module_that_is_not_there(module: str) -> None:
     with pytest.raises(DesignError, match="ModuleNotFoundError"):
-        plugins.check_kind(f"{module}_not:Still")
+        check_kind(f"{module}_not:Still")
 
 
 def test_only_what_plans_is_told_a_trajectory(module: str) -> None:

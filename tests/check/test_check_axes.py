@@ -10,9 +10,8 @@ import pytest
 from check_rig import Checked, Hand, S, look, twisted
 from mavlink_rig import packets, read
 
-from uavctl.check.axes import axis_items, compared
 from uavctl.check.findings import Heard, ItemState, Sample
-from uavctl.check.preflight import Preflight
+from uavctl.check.preflight import Preflight, axis_items, compared
 from uavctl.config import load_config
 from uavctl.loop import make_links
 from uavctl.mavlink.messages import Heartbeat

@@ -11,7 +11,7 @@ from rich.console import Console, Group, RenderableType
 
 from uavctl.build.controller import build_design
 from uavctl.cli.common import DEFAULTS, Column, WideTable, columns, two_columns
-from uavctl.cli.solve import _column, plan_table
+from uavctl.cli.design import _column, plan_table
 from uavctl.config import load_config
 from uavctl.smpc.answer import Answer
 from uavctl.smpc.hahn_stursberg.design import Design

@@ -11,8 +11,8 @@ from collections.abc import Iterator
 import pytest
 from ticked_rig import ticked
 
-from uavctl.daemon import realtime as module
-from uavctl.daemon.realtime import Collector, Outcome, collected_between_ticks, realtime
+from uavctl.daemon import daemon as module
+from uavctl.daemon.daemon import Collector, Outcome, collected_between_ticks, realtime
 
 SECOND = 1_000_000_000
 

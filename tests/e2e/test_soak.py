@@ -19,7 +19,7 @@ from soak_take_off import fly_take_off, outcome, tally_take_offs
 from take_off_rig import RELAYED, Flight
 
 from logs.recording.reader import read
-from uavctl.build.prepared import Prepared
+from uavctl.build.controller import Prepared
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.records import Truth, Vec3
 

@@ -30,8 +30,7 @@ from uavctl.flight.mission import (
     stay,
     wanted,
 )
-from uavctl.labels import names_of, tell, tell_all
-from uavctl.records import GaveWay, Vec3
+from uavctl.records import GaveWay, Vec3, names_of, tell, tell_all
 from uavctl.smpc.hahn_stursberg.design import Design
 
 Array = NDArray[np.float64]

@@ -13,8 +13,8 @@ from scipy.linalg import solve_discrete_lyapunov
 
 from uavctl.errors import DesignError
 from uavctl.smpc.baselines import Lqg
-from uavctl.smpc.bounds import lqr, stationary_bound
 from uavctl.smpc.link import LatePackets, LinkModel, bernoulli, empirical, gilbert_elliott
+from uavctl.smpc.nominal import lqr, stationary_bound
 from uavctl.smpc.plant import Plant
 
 Array = NDArray[np.float64]

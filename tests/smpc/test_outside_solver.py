@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import Path, Preview
 from uavctl.smpc.batch import News
-from uavctl.smpc.bounds import lqr
-from uavctl.smpc.nominal import ControlProblem
+from uavctl.smpc.nominal import ControlProblem, lqr
 from uavctl.smpc.outside import OutsideSolver, PlanRequest, Rehearsal, moved
 
 Array = NDArray[np.float64]

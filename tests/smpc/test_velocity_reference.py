@@ -20,8 +20,8 @@ from uavctl.build.controller import build_plant
 from uavctl.cli.app import run as main
 from uavctl.config import load_config
 from uavctl.errors import ConfigError, DesignError
-from uavctl.labels import names_of
-from uavctl.smpc.bounds import lqr
+from uavctl.records import names_of
+from uavctl.smpc.nominal import lqr
 from uavctl.smpc.plant import STATES, HeldAxis, Plant, steps_to_reach, velocity_reference
 
 Array = NDArray[np.float64]

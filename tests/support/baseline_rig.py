@@ -12,18 +12,10 @@ from numpy.typing import NDArray
 from plant_cases import NAMED, spec_of
 
 from uavctl.lab.campaign.world import Flown, Scene, fly
-from uavctl.smpc.baselines import (
-    CascadedPid,
-    ControlProblem,
-    HoldLast,
-    Lqg,
-    PacketisedPredictive,
-    PidGains,
-    WorstCaseDelay,
-    ZeroOnLoss,
-)
+from uavctl.smpc.baselines import CascadedPid, HoldLast, Lqg, PacketisedPredictive, PidGains, WorstCaseDelay, ZeroOnLoss
 from uavctl.smpc.batch import BatchController, News
 from uavctl.smpc.hahn_stursberg.design import DesignSpec
+from uavctl.smpc.nominal import ControlProblem
 from uavctl.smpc.sets import Polytope
 
 Array = NDArray[np.float64]

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 from uavctl.smpc.answer import Preview
-from uavctl.smpc.baselines import ControlProblem
-from uavctl.smpc.bounds import lqr
+from uavctl.smpc.nominal import ControlProblem, lqr
 from uavctl.smpc.qp import OPEN, SOFT, QuadraticProgram
 
 Array = NDArray[np.float64]

@@ -7,8 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from uavctl.build.controller import design_of
-from uavctl.build.prepared import Prepared
+from uavctl.build.controller import Prepared, design_of
 from uavctl.cli.prepare import prepare
 from uavctl.config import Config, load_config
 from uavctl.errors import ConfigError, DesignError

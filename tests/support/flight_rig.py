@@ -19,8 +19,7 @@ from uavctl.flight.link_estimate import LinkEstimateParameters
 from uavctl.flight.mission import Room, hold
 from uavctl.flight.sensor_faults import GateParameters
 from uavctl.flight.step import StepOutput, initial_state, step
-from uavctl.labels import names_of
-from uavctl.records import Command, ControlMode, PositionSample, SolveStatus, StepInput, Vec3, VehicleStatus
+from uavctl.records import Command, ControlMode, PositionSample, SolveStatus, StepInput, Vec3, VehicleStatus, names_of
 from uavctl.smpc.answer import NOMINAL, Answer, Preview
 from uavctl.smpc.plant import Plant
 

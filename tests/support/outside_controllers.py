@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uavctl.smpc.bounds import lqr
-from uavctl.smpc.nominal import ControlProblem
+from uavctl.smpc.nominal import ControlProblem, lqr
 from uavctl.smpc.outside import PlanRequest
 
 Array = NDArray[np.float64]

@@ -11,7 +11,7 @@ import numpy as np
 from msgspec.structs import replace
 from soak_rig import fly
 
-from uavctl.build.prepared import Prepared
+from uavctl.build.controller import Prepared
 from uavctl.config import Config, load_config
 from uavctl.config.sim import FaultConfig
 

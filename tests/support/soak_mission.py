@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from soak_rig import Watch, fly
 
 from sim.simulation import World
-from uavctl.build.prepared import Prepared
+from uavctl.build.controller import Prepared
 from uavctl.config import load_config
 from uavctl.records import ControlMode
 

@@ -13,7 +13,7 @@ from soak_rig import Watch, fly
 
 from sim.cameras import AXES
 from sim.simulation import World
-from uavctl.build.prepared import Prepared
+from uavctl.build.controller import Prepared
 from uavctl.config import Config, load_config
 from uavctl.config.sim import FaultConfig
 from uavctl.records import ControlMode, Vec3

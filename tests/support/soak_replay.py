@@ -22,7 +22,7 @@ from logs.recording.recorder import DerivedTopics, SyncRecorder
 from logs.recording.replay import ReplayResult
 from logs.recording.views import Views
 from sim.simulation import Peers, World
-from uavctl.build.prepared import Prepared
+from uavctl.build.controller import Prepared
 from uavctl.cli.replay import replay_flight
 from uavctl.config import Config
 from uavctl.loop import ControlLoop

@@ -10,8 +10,7 @@ from pathlib import Path
 from logs.recording.ends import put_header
 from logs.recording.recorder import SyncRecorder
 from sim.simulation import World
-from uavctl.build.controller import design_of
-from uavctl.build.prepared import Prepared
+from uavctl.build.controller import Prepared, design_of
 from uavctl.cli.flying import stop_limit_s
 from uavctl.cli.prepare import prepare
 from uavctl.config import Config, load_config

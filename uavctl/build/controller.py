@@ -1,17 +1,22 @@
-"""Composition: a configuration's numbers become plant, design, solver and controller."""
+"""Composition: a configuration's numbers become plant, design, solver and controller; and its provenance."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+import platform
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from importlib import metadata
+from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from uavctl import __version__
 from uavctl.build.link import build_ages, build_delayed_link, late_steps, promised
 from uavctl.build.mission import build_mission, build_names, build_rests
-from uavctl.build.outside import flown_outside
+from uavctl.build.outside import controller_id, decider_id, flown_outside
 from uavctl.config.types import Config
 from uavctl.errors import DesignError
 from uavctl.flight.controller import Controller
@@ -37,9 +42,9 @@ from uavctl.smpc.sets import Polytope, equilibria
 
 # The paper's scheme is loaded only where it is flown: loading it takes a tenth of the time of all else.
 if TYPE_CHECKING:
+    from uavctl.build.library import Advance, StoredLibrary
     from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec
     from uavctl.smpc.hahn_stursberg.library import Library
-
 
 NANOSECONDS = 1e9
 
@@ -414,3 +419,61 @@ def build_controller(config: Config, design: AnyDesign | None = None, library: L
         tick_ns=round(config.daemon.tick_s * NANOSECONDS),
         dead_ns=round(config.plant.dead_time_s * NANOSECONDS),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """Controller that is ready to fly, and what it is made from."""
+
+    config: Config  # the configuration
+    design: AnyDesign  # its design
+    library: StoredLibrary | None  # the design's policy library; None where scheme or `solver.method` ask for none
+    controller: Controller  # the controller
+
+
+def prepare(config: Config, design: AnyDesign, library: StoredLibrary | None) -> Prepared:
+    """Make the controller of a design and its policy library.
+
+    Raises:
+        DesignError: The configuration asks for what the design cannot do.
+    """
+    controller = build_controller(config, design, None if library is None else library.library)
+    return Prepared(config, design, library, controller)
+
+
+def ready_library(
+    config: Config, design: AnyDesign, advance: Advance | None = None, tell: Callable[[str], None] | None = None
+) -> StoredLibrary | None:
+    """Return the policy library of a design that asks for one: from the cache, or made, which takes half a minute.
+
+    Args:
+        advance: See `uavctl.build.library.library_for`, as `tell`.
+    """
+    if isinstance(design, ConditionedDesign) or not config.uses_library:
+        return None
+    from uavctl.build.library import library_for
+
+    return library_for(design, advance, tell)
+
+
+# What decides a flight's last bits beside its configuration: code, libraries, CPU type.
+
+CONTROLLER = "controller"  # under which the one of another package stands among the versions
+_LIBRARIES = ("numpy", "scipy", "clarabel", "daqp", "pymavlink", "msgspec", "mcap")
+
+
+def versions(controller: str) -> dict[str, str]:
+    """Return the versions of code and libraries that decisions depend on; `controller`: one of another package."""
+    found = {name: metadata.version(name) for name in _LIBRARIES}
+    if controller:
+        found[CONTROLLER] = controller_id(controller)
+    return {"uavctl": __version__, "code": decider_id(), "python": platform.python_version(), **found}
+
+
+def cpu() -> str:
+    """Return the CPU type: linear algebra kernels, and so the last bits of decisions, depend on it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.machine())

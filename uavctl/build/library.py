@@ -20,7 +20,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from uavctl.build.code_id import maker_id
+from uavctl.build.outside import maker_id
 from uavctl.errors import LibraryError
 from uavctl.smpc.answer import NOMINAL, Preview
 from uavctl.smpc.hahn_stursberg.design import Design

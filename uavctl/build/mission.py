@@ -12,7 +12,7 @@ from uavctl.config.mission import FenceConfig, TrajectoryConfig
 from uavctl.config.types import Config
 from uavctl.errors import DesignError
 from uavctl.flight.mission import Fence, Mission, PlantMotion, Room, Trajectory, Waypoint, along, follow, hold, room
-from uavctl.labels import Names, names_of
+from uavctl.records import Names, names_of
 from uavctl.smpc.conditioned.planner import AnyDesign
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope, equilibria

@@ -1,4 +1,4 @@
-"""Classes of other packages, by entry point or as `module:Class`: how they are found, made, and told apart.
+"""Identity of our code by hashes, and classes of other packages: how they are found, made, and told apart.
 
 A controller is made with the `ControlProblem` that it is to solve (plant, limits, weights, target, horizon). What flies
 has `plan(request)` (`uavctl.smpc.outside.FlightPlanner`); what campaigns ask has `begin(runs)` and `act(news)`, once a
@@ -10,7 +10,8 @@ from __future__ import annotations
 import inspect
 import sys
 from collections.abc import Callable, Collection
-from importlib import import_module
+from functools import cache
+from importlib import import_module, metadata, resources
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TypeVar, cast
@@ -18,7 +19,6 @@ from typing import TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from uavctl.build.code_id import sources_of
 from uavctl.config import Config
 from uavctl.config.load import find_nearest
 from uavctl.errors import DesignError
@@ -26,6 +26,35 @@ from uavctl.smpc.batch import BatchController
 from uavctl.smpc.nominal import ControlProblem
 from uavctl.smpc.outside import FlightPlanner, OutsideSolver, Rehearsal, moved
 from uavctl.smpc.plant import digest
+
+COMPUTES_WITH = ("numpy", "scipy", "clarabel", "daqp")
+
+
+@cache
+def maker_id() -> str:
+    """Hash of the code that makes libraries, and of the versions of what it computes with."""
+    versions = tuple((name, metadata.version(name)) for name in COMPUTES_WITH)
+    return digest((sources_of("uavctl.smpc"), versions))
+
+
+@cache
+def decider_id() -> str:
+    """Hash of the code that a flight's records come from: from bytes to estimate, plan, decision and bytes again."""
+    return digest(
+        tuple(sources_of(f"uavctl{name}") for name in ("", ".build", ".config", ".flight", ".mavlink", ".smpc"))
+    )
+
+
+def sources_of(package: str) -> tuple[tuple[str, bytes], ...]:
+    """Names and contents of a package's modules, and of those of the packages in it; of `uavctl` only its own."""
+    found = []
+    for entry in resources.files(package).iterdir():
+        if entry.name.endswith(".py"):
+            found.append((f"{package}.{entry.name}", entry.read_bytes()))
+        elif package != "uavctl" and (entry / "__init__.py").is_file():
+            found.extend(sources_of(f"{package}.{entry.name}"))
+    return tuple(sorted(found))
+
 
 GROUP = "uavctl.controllers"
 KEY = "smpc.controller"

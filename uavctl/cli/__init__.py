@@ -1,4 +1,4 @@
-"""Command line: joins configuration, controller, simulator and recorder; one module for each command."""
+"""Command line: joins configuration, controller, simulator and recorder; a module for each command or pair of them."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ _COMMANDS = {
     "sim": ("sim:sim", "Run the simulated vehicle and cameras alone, for any MAVLink client."),
     "check": ("check:check", "Before take-off: rates, ages, frames, clocks, parameters, disk; never arms."),
     "design": ("design:design", "Make a design: schedule, terminal ingredients, Assumption 4 with figures."),
-    "solve": ("solve:solve", "Solve one decision problem, towards the configured target."),
+    "solve": ("design:solve", "Solve one decision problem, towards the configured target."),
     "identify": ("identify:identify_command", "Identify plant, lag, disturbance and link from a recording."),
     "tune": ("tune:tune", "Excite inside a box, identify, write a tuned configuration, fly again, compare."),
     "bench": ("bench:bench", "Measure the speed of a decision, beside the problem as printed."),

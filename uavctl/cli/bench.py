@@ -17,9 +17,8 @@ from uavctl.build.controller import build_conditioned, build_design, build_spec
 from uavctl.cli.common import DEFAULTS, SEED, SPAN_S, Common, bars, columns, located
 from uavctl.config.types import Config
 from uavctl.errors import DesignError
-from uavctl.lab.bench.decisions import DecisionBench, time_decisions, time_flight
 from uavctl.lab.bench.loop import LoopBench, LoopRun, run_loop_bench
-from uavctl.lab.bench.run import DEFAULT_SIZES, Advance, run_bench
+from uavctl.lab.bench.run import DEFAULT_SIZES, Advance, DecisionBench, run_bench, time_decisions, time_flight
 from uavctl.lab.bench.timing import BenchResult, ConditionedTimes
 from uavctl.smpc.conditioned.planner import ConditionedSolver
 

@@ -47,11 +47,10 @@ from uavctl.clock import Ticker, monotonic_ns, zero_utc_ns
 from uavctl.config import Config, LoadedConfig
 from uavctl.config.connections import warnings
 from uavctl.daemon.control_socket import ControlServer, control_folder, daemon_name, listening
-from uavctl.daemon.daemon import AfterTick
+from uavctl.daemon.daemon import AfterTick, collected_between_ticks, realtime
 from uavctl.daemon.daemon import fly as run_daemon
 from uavctl.daemon.health import HealthWatch, Notifier, RecorderHealth
 from uavctl.daemon.lock import sole_daemon
-from uavctl.daemon.realtime import collected_between_ticks, realtime
 from uavctl.io.signed_connection import connected
 from uavctl.loop import ControlLoop
 

@@ -349,7 +349,7 @@ def draw_page(path: Path, summary: FlightSummary, page: Path) -> None:
     Raises:
         UavctlError: it cannot be written; the recording is as it was.
     """
-    command = [sys.executable, "-P", "-m", "logs.report", str(path), str(page)]
+    command = [sys.executable, "-P", "-m", "logs.report.flight_page", str(path), str(page)]
     done = subprocess.run(command, input=pickle.dumps(summary), capture_output=True, check=False)
     if done.returncode:
         told = done.stderr.decode(errors="replace").strip().splitlines()

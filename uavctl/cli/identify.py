@@ -14,7 +14,7 @@ from rich.console import Group, RenderableType
 from rich.markup import escape
 from rich.table import Table
 
-from logs.recording.outputs import spare_recording, write_whole
+from logs.recording.disk import spare_recording, write_whole
 from logs.recording.reader import header, lacks_end, read
 from logs.recording.tlog import read_tlog
 from uavctl.build.controller import design_of

@@ -11,9 +11,9 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from logs.recording.disk import spare_recording, write_whole
 from logs.recording.flight import FlightData
 from logs.recording.mavlink_flight import facts_of, is_tlog, read_flight
-from logs.recording.outputs import spare_recording, write_whole
 from logs.recording.reader import lacks_end, read
 from logs.recording.summary import names_and_values, render, summarise
 from logs.recording.ulog import is_ulog, read_ulog

@@ -21,8 +21,7 @@ from logs.recording.recorder import DerivedTopics, Recorder
 from logs.recording.summary import FlightSummary, render
 from logs.recording.topics import ENDED
 from sim.server import Ready, serve_in_child
-from uavctl.build.controller import design_of
-from uavctl.build.prepared import Prepared
+from uavctl.build.controller import Prepared, design_of
 from uavctl.cli.common import DEFAULTS, SEED, SPAN_S, Common, TakeOff, given_keys, located, messages
 from uavctl.cli.flying import (
     Engagement,
@@ -44,8 +43,7 @@ from uavctl.cli.prepare import prepare
 from uavctl.cli.sim import make_door
 from uavctl.clock import Ticker, monotonic_ns, zero_utc_ns
 from uavctl.config import Config, LoadedConfig
-from uavctl.daemon.daemon import fly
-from uavctl.daemon.realtime import collected_between_ticks
+from uavctl.daemon.daemon import collected_between_ticks, fly
 from uavctl.errors import UavctlError, UsageError
 from uavctl.io.signed_connection import connected
 from uavctl.lab.lockstep import TRUTH, LockstepFlight, check_length

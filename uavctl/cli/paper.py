@@ -34,7 +34,7 @@ from uavctl.lab.paper.claims import (
     claims_of_depth,
 )
 from uavctl.lab.paper.runs import HERE_UP_TO, Advance, Flights, Setup, fly_all
-from uavctl.labels import percent_above
+from uavctl.records import percent_above
 
 _RUNS = validators.Number(gte=1, lte=1_000_000)
 # Beyond, a second design would take minutes more to say the same of the claims.

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from rich.markup import escape
 from rich.progress import TimeElapsedColumn
 
-from uavctl.build import prepared
+from uavctl.build import controller
 from uavctl.cli.common import bars, messages
 from uavctl.config import Config
 from uavctl.smpc.conditioned.planner import AnyDesign
@@ -18,13 +18,13 @@ if TYPE_CHECKING:
     from uavctl.build.library import StoredLibrary
 
 
-def prepare(config: Config, design: AnyDesign) -> prepared.Prepared:
+def prepare(config: Config, design: AnyDesign) -> controller.Prepared:
     """Make policy library and controller of a design.
 
     Raises:
         DesignError: The configuration asks for what the design cannot do.
     """
-    return prepared.prepare(config, design, ready_library(config, design))
+    return controller.prepare(config, design, ready_library(config, design))
 
 
 def ready_library(config: Config, design: AnyDesign) -> StoredLibrary | None:
@@ -37,7 +37,7 @@ def ready_library(config: Config, design: AnyDesign) -> StoredLibrary | None:
                 bar.append(stack.enter_context(_bar("policy library, made once for a design")))
             bar[0](f"policy library: {name}, {count} policies, worst gap {worst_gap:.0e}")
 
-        return prepared.ready_library(
+        return controller.ready_library(
             config, design, advance, lambda text: messages().print(escape(text), style="yellow", soft_wrap=True)
         )
 

@@ -29,10 +29,9 @@ from logs.recording.replay import replay as replay_recording
 from logs.recording.summary import count
 from logs.recording.tlog import ForeignReplay, TlogPacket, read_tlog, replay_tlog
 from logs.recording.topics import HOLES, RECOVERED, RecorderNote
-from uavctl.build.controller import build_controller, design_of
+from uavctl.build.controller import CONTROLLER, Prepared, build_controller, cpu, design_of, versions
 from uavctl.build.library import check_fits, decode
 from uavctl.build.outside import KEY
-from uavctl.build.prepared import CONTROLLER, Prepared, cpu, versions
 from uavctl.cli.common import DEFAULTS, Common, Flight, columns, counted, located, messages, two_columns, warn
 from uavctl.cli.prepare import prepare
 from uavctl.config import Config, LoadedConfig

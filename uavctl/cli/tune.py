@@ -18,8 +18,8 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
+from logs.recording.disk import write_whole
 from logs.recording.flight import FlightData
-from logs.recording.outputs import write_whole
 from logs.recording.reader import header, lacks_end, read
 from logs.recording.summary import FlightSummary, summarise
 from uavctl.build.controller import design_of
@@ -61,19 +61,11 @@ from uavctl.lab.tune.change import (
     tuned,
 )
 from uavctl.lab.tune.excitation import DOWN, SafeBox, check_start, excited, parse_box
-from uavctl.lab.tune.page import (
-    CHANGE_COLUMNS,
-    FIGURE_COLUMNS,
-    change_rows,
-    error_columns,
-    error_rows,
-    figure_rows,
-    story,
-    write_page,
-)
 from uavctl.lab.tune.run_folder import (
     AFTER,
     BEFORE,
+    CHANGE_COLUMNS,
+    FIGURE_COLUMNS,
     FIT_PAGE,
     PAGE,
     TUNED,
@@ -81,10 +73,16 @@ from uavctl.lab.tune.run_folder import (
     TuneComparison,
     TuneFolder,
     TuneProgress,
+    change_rows,
+    error_columns,
+    error_rows,
+    figure_rows,
     figures_of,
     last_place,
     read_tuned,
     sole_run,
+    story,
+    write_page,
 )
 from uavctl.loop import make_links
 from uavctl.mavlink.connection import MavlinkConnection

@@ -16,18 +16,17 @@ from rich.console import Group, RenderableType
 from rich.progress import Progress, TaskProgressColumn, TimeElapsedColumn
 from rich.text import Text
 
+from logs.recording.disk import write_whole
 from logs.recording.ends import new_recording, put_header
 from logs.recording.export import known_number
 from logs.recording.flight import FlightData
 from logs.recording.foreign import is_foreign
-from logs.recording.outputs import write_whole
 from logs.recording.reader import header, lacks_end, read
 from logs.recording.recorder import DerivedTopics, RecorderStatus, SyncRecorder
 from logs.recording.summary import count, summarise
 from logs.recording.topics import HEADER, RecorderNote
 from logs.recording.views import Views
-from uavctl.build.controller import build_problem, design_of
-from uavctl.build.prepared import Prepared
+from uavctl.build.controller import Prepared, build_problem, design_of
 from uavctl.cli.common import SEED, Common, Flight, Json, bars, columns, located, warn
 from uavctl.cli.flying import conclude
 from uavctl.cli.prepare import prepare, ready_library
@@ -38,8 +37,7 @@ from uavctl.config.load import parse_recorded
 from uavctl.config.types import PlantConfig, TargetConfig
 from uavctl.errors import UsageError
 from uavctl.lab.campaign.controllers import BaselineSolver, build, recipe_for
-from uavctl.lab.campaign.plugins import KINDS
-from uavctl.lab.campaign.spec import CampaignSpec, ControllerSpec
+from uavctl.lab.campaign.spec import KINDS, CampaignSpec, ControllerSpec
 from uavctl.lab.whatif.comparison import (
     HEADINGS,
     WhatIf,
@@ -64,8 +62,8 @@ from uavctl.lab.whatif.flight import (
     response_of,
 )
 from uavctl.records import Header, Record
-from uavctl.smpc.baselines import ControlProblem
 from uavctl.smpc.batch import BatchController
+from uavctl.smpc.nominal import ControlProblem
 from uavctl.smpc.plant import AXES
 
 # What flies in a what-if: the recorded configuration with what was changed, and its controller.

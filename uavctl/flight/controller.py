@@ -15,8 +15,7 @@ from uavctl.flight.limits import ZERO, LimitsParameters
 from uavctl.flight.link_estimate import NOTHING_SEEN, LinkBelief, LinkEstimateParameters
 from uavctl.flight.mission import Mission, MissionState
 from uavctl.flight.sensor_faults import GateParameters, Reach, make_reach
-from uavctl.labels import Names
-from uavctl.records import Command, Plan, Vec3
+from uavctl.records import Command, Names, Plan, Vec3
 from uavctl.smpc.answer import Solver
 from uavctl.smpc.plant import Plant
 

@@ -52,13 +52,13 @@ from uavctl.flight.limits import ZERO, gate
 from uavctl.flight.link_estimate import LinkBelief, observe, report
 from uavctl.flight.mission import wanted
 from uavctl.flight.sensor_faults import REPEATED
-from uavctl.labels import Names, tell_all
 from uavctl.records import (
     ControlMode,
     Decision,
     Estimate,
     Event,
     LinkEstimate,
+    Names,
     Order,
     Plan,
     PositionSample,
@@ -69,6 +69,7 @@ from uavctl.records import (
     Vec3,
     Vector,
     VehicleStatus,
+    tell_all,
 )
 from uavctl.smpc.plant import Plant
 

@@ -12,7 +12,7 @@ from logs.recording.recorder import DerivedTopics, RecorderStatus, SyncRecorder
 from logs.recording.topics import ENDED
 from logs.recording.views import Views
 from sim.simulation import World
-from uavctl.build.prepared import Prepared
+from uavctl.build.controller import Prepared
 from uavctl.config.types import Config
 from uavctl.errors import UsageError
 from uavctl.loop import ControlLoop

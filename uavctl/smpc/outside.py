@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import NOMINAL, Answer, Preview, all_finite
 from uavctl.smpc.batch import BatchController, News
-from uavctl.smpc.bounds import lqr
-from uavctl.smpc.nominal import ControlProblem
+from uavctl.smpc.nominal import ControlProblem, lqr
 from uavctl.smpc.sets import equilibria
 
 Array = NDArray[np.float64]

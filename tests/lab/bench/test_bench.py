@@ -19,8 +19,18 @@ from uavctl.cli.app import run as command
 from uavctl.config import load_config
 from uavctl.errors import UavctlError
 from uavctl.lab.bench import run
-from uavctl.lab.bench.decisions import ROUNDS, questions, time_decisions, time_flight
-from uavctl.lab.bench.run import LOOP_STEPS, BenchSizes, InFlight, closed_loops, draw_states, run_bench
+from uavctl.lab.bench.run import (
+    LOOP_STEPS,
+    ROUNDS,
+    BenchSizes,
+    InFlight,
+    closed_loops,
+    draw_states,
+    questions,
+    run_bench,
+    time_decisions,
+    time_flight,
+)
 from uavctl.lab.bench.timing import FROZEN, BenchResult, Case, timed
 from uavctl.lab.paper.depth import alone, few_policies
 from uavctl.loop import ControlLoop

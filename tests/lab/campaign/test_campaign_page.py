@@ -14,8 +14,8 @@ from campaign_results import cell, runs, write
 from report_rig import unwritten
 from told_numbers import numbers_in
 
+from logs.report.statistics import PairedDifference
 from uavctl.errors import UavctlError
-from uavctl.lab.campaign.intervals import PairedDifference
 from uavctl.lab.campaign.page import CampaignView, story, write_report
 from uavctl.lab.campaign.plots import Looks, legend
 from uavctl.lab.campaign.results import (

@@ -12,12 +12,12 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import binom
 
+from logs.report.statistics import worst_step
 from uavctl.build.controller import build_estimator, build_plant, build_problem
 from uavctl.config import Config, load_config
 from uavctl.flight.estimator import absorb, begin, estimate, set_input
 from uavctl.flight.kalman import make_kalman
 from uavctl.lab.campaign.controllers import met, sight_of
-from uavctl.lab.campaign.intervals import worst_step
 from uavctl.lab.campaign.pool import Columns
 from uavctl.lab.campaign.tasks import Cell, flown, tasks_of
 from uavctl.lab.campaign.world import PositionFilter, draw, draw_noise, known, newest_of

@@ -12,8 +12,7 @@ from ratios import paired_ratio
 from scipy.optimize import brentq
 from scipy.stats import binom
 
-from uavctl.errors import UavctlError, UsageError
-from uavctl.lab.campaign.intervals import (
+from logs.report.statistics import (
     BOOTSTRAP_UP_TO,
     bootstrap_mean,
     clopper_pearson,
@@ -21,6 +20,7 @@ from uavctl.lab.campaign.intervals import (
     step_rate,
     worst_step,
 )
+from uavctl.errors import UavctlError, UsageError
 from uavctl.lab.campaign.results import difference, read_results, summarise
 
 

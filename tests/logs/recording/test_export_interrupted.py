@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from recording_fakes import record_flight
 
+from logs.recording.disk import all_or_none
 from logs.recording.export import TableFormat, Watch, export_tables
-from logs.recording.outputs import all_or_none
 from logs.recording.reader import RecordedMessage, good_messages
 from logs.recording.tlog import export_tlog
 from uavctl.errors import RecordingError

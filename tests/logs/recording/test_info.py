@@ -9,12 +9,11 @@ from recording_fakes import HEADER, Clock, record_flight, write_two_segments
 from rich.console import Console
 from view_rig import record
 
-from logs.recording.disk import check_room
+from logs.recording.disk import MAGIC, check_room
 from logs.recording.info import RecordingInfo, info
 from logs.recording.reader import header, read
 from logs.recording.recorder import SyncRecorder
 from logs.recording.recover import recover
-from logs.recording.segment import MAGIC
 from logs.recording.topics import RecorderNote
 from uavctl.cli.app import run
 from uavctl.cli.log import info_table

@@ -20,9 +20,9 @@ from logs.recording.reader import RecordedMessage, read, records, walk
 from logs.recording.recorder import SyncRecorder
 from logs.recording.recover import recover
 from logs.recording.replay import recorded_library, replay
-from uavctl.build.code_id import decider_id
 from uavctl.build.controller import build_design
 from uavctl.build.library import StoredLibrary, cache_file, decode, encode, library_for
+from uavctl.build.outside import decider_id
 from uavctl.cli.app import run
 from uavctl.config import load_config
 from uavctl.config.types import LogConfig

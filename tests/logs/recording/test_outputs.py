@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from recording_fakes import record_flight
 
-from logs.recording.outputs import check_free, write_whole
+from logs.recording.disk import check_free, write_whole
 from logs.recording.recover import recover
 from logs.recording.segment import Segment
 from uavctl.cli.flying import LIVE_PORT, live_view_port
@@ -21,7 +21,7 @@ from uavctl.errors import RecordingError, UsageError
 LIMITED = """
 import resource, signal, sys
 from pathlib import Path
-from logs.recording.outputs import write_whole
+from logs.recording.disk import write_whole
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
 write_whole(Path(sys.argv[1]), "new" * 1000)
@@ -39,8 +39,7 @@ def test_a_text_that_does_not_fit_leaves_the_one_before(tmp_path: Path) -> None:
 
 def test_a_text_goes_through_what_is_no_file(tmp_path: Path) -> None:
     script = (
-        "from pathlib import Path; from logs.recording.outputs import write_whole; "
-        "write_whole(Path('/dev/stdout'), 'a')"
+        "from pathlib import Path; from logs.recording.disk import write_whole; write_whole(Path('/dev/stdout'), 'a')"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout == "a"

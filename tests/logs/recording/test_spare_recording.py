@@ -8,10 +8,9 @@ from pathlib import Path
 import pytest
 from loopback_rig import lockstep
 
-from logs.recording.outputs import spare_recording
+from logs.recording.disk import MAGIC, spare_recording
 from logs.recording.reader import lacks_end
 from logs.recording.recorder import SyncRecorder
-from logs.recording.segment import MAGIC
 from uavctl.cli.app import run
 from uavctl.errors import RecordingError, UsageError
 

@@ -16,7 +16,6 @@ from logs.recording.flight import FALLBACK, FlightData
 from logs.recording.summary import FlightSummary, Percentiles, render, spread, summarise
 from uavctl.errors import RecordingError
 from uavctl.flight.decision import MISSION_OVER
-from uavctl.labels import number, percent_above
 from uavctl.records import (
     ORDER_ACCEPTED,
     ControlMode,
@@ -31,6 +30,8 @@ from uavctl.records import (
     StepInput,
     Timing,
     Truth,
+    number,
+    percent_above,
 )
 
 DT_NS = 1_000_000_000

@@ -16,10 +16,10 @@ from synthetic_scene import room
 
 from logs.recording.flight import FlightData
 from logs.recording.summary import summarise
-from logs.report.cursor import script
 from logs.report.excursion import excursions
 from logs.report.headline import BAD, GOOD, MIND, Headline, headline
 from logs.report.plots import fences, input_beyond, path, path_3d, state_beyond
+from logs.report.timeline import script
 from logs.report.verdicts import Judged, judge
 from uavctl.records import Setpoint, SetpointSource, Truth
 

@@ -17,7 +17,6 @@ from logs.report.summary_text import story
 from uavctl.config import load_config
 from uavctl.config.load import dump_config
 from uavctl.flight.decision import MISSION_OVER
-from uavctl.labels import number
 from uavctl.records import (
     ORDER_ACCEPTED,
     ControlMode,
@@ -29,6 +28,7 @@ from uavctl.records import (
     Severity,
     StepInput,
     Truth,
+    number,
 )
 
 TICK_S = room().tick_s

@@ -9,7 +9,7 @@ import pytest
 from baseline_rig import MAKERS, arrivals, cube, flown, noise, problem
 from numpy.typing import NDArray
 
-from uavctl.smpc.baselines import ControlProblem
+from uavctl.smpc.nominal import ControlProblem
 
 Array = NDArray[np.float64]
 RUNS, STEPS, LOSS = 12, 30, 0.4

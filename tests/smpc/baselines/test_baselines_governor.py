@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from uavctl.smpc.baselines import Governor, Lqg, MeanQp, PacketisedPredictive
 from uavctl.smpc.batch import News, predict
-from uavctl.smpc.bounds import lqr
-from uavctl.smpc.nominal import ControlProblem
+from uavctl.smpc.nominal import ControlProblem, lqr
 
 Array = NDArray[np.float64]
 

@@ -13,9 +13,8 @@ import pytest
 from baseline_rig import PAPER_START, arrivals, cube, flown, noise, problem, unlimited
 from numpy.typing import NDArray
 
-from uavctl.smpc.baselines import ControlProblem, HoldLast, Lqg, PacketisedPredictive, ZeroOnLoss
-from uavctl.smpc.bounds import lqr
-from uavctl.smpc.nominal import BatchMpc
+from uavctl.smpc.baselines import HoldLast, Lqg, PacketisedPredictive, ZeroOnLoss
+from uavctl.smpc.nominal import BatchMpc, ControlProblem, lqr
 from uavctl.smpc.sets import Polytope
 
 Array = NDArray[np.float64]

@@ -9,9 +9,9 @@ import pytest
 from baseline_rig import PAPER_START, Fed, arrivals, cube, flown, gains, noise, problem
 from numpy.typing import NDArray
 
-from uavctl.smpc.baselines import CascadedPid, ControlProblem, PidGains, tune
-from uavctl.smpc.baselines.feedback import _costs
+from uavctl.smpc.baselines import CascadedPid, PidGains, _costs, tune
 from uavctl.smpc.batch import News
+from uavctl.smpc.nominal import ControlProblem
 
 Array = NDArray[np.float64]
 Scene = tuple[ControlProblem, NDArray[np.intp], Array]

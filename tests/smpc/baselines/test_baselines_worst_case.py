@@ -10,10 +10,9 @@ from baseline_rig import PAPER_START, Fed, arrivals, cube, flown, noise, problem
 from numpy.typing import NDArray
 
 from uavctl.errors import DesignError
-from uavctl.smpc.baselines import ControlProblem, Lqg, WorstCaseDelay
-from uavctl.smpc.baselines.mpc import _backoffs, _prediction_gain
+from uavctl.smpc.baselines import Lqg, WorstCaseDelay, _backoffs, _prediction_gain
 from uavctl.smpc.batch import News
-from uavctl.smpc.bounds import lqr
+from uavctl.smpc.nominal import ControlProblem, lqr
 
 Array = NDArray[np.float64]
 DELAY = 4

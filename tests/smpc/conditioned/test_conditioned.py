@@ -16,12 +16,12 @@ from scipy.stats import binomtest, norm
 from uavctl.errors import DesignError
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import NOMINAL, Answer, Path, Preview
-from uavctl.smpc.baselines import ControlProblem, PacketisedPredictive
+from uavctl.smpc.baselines import PacketisedPredictive
 from uavctl.smpc.batch import BatchSmpc
-from uavctl.smpc.bounds import lqr
 from uavctl.smpc.conditioned.backoffs import SELDOM, age_risk, equal_risk
 from uavctl.smpc.conditioned.planner import METHOD, MOST_SHIFTING, ConditionedDecider, ConditionedSolver
 from uavctl.smpc.link import bernoulli, gilbert_elliott
+from uavctl.smpc.nominal import ControlProblem, lqr
 
 Array = NDArray[np.float64]
 LOSS, ALLOWED = 0.3, 0.05

@@ -7,7 +7,7 @@ import pytest
 
 from uavctl.build.controller import build_controller
 from uavctl.config import load_config
-from uavctl.lab.bench.decisions import questions
+from uavctl.lab.bench.run import questions
 from uavctl.smpc.answer import Answer
 from uavctl.smpc.conditioned.planner import ConditionedSolver
 from uavctl.smpc.qp import FirstRows

@@ -9,14 +9,12 @@ import pytest
 from baseline_rig import problem
 from numpy.typing import NDArray
 
-from uavctl.labels import names_of, tell, worst
-from uavctl.records import GaveWay, SolveStatus
+from uavctl.records import GaveWay, SolveStatus, names_of, tell, worst
 from uavctl.smpc.answer import Preview
-from uavctl.smpc.baselines import ControlProblem
 from uavctl.smpc.conditioned.planner import ConditionedSolver
 from uavctl.smpc.conditioned.program import SlewRows
 from uavctl.smpc.link import bernoulli
-from uavctl.smpc.nominal import parts
+from uavctl.smpc.nominal import ControlProblem, parts
 from uavctl.smpc.sets import Polytope
 
 Array = NDArray[np.float64]

@@ -11,7 +11,7 @@ import pytest
 from cut_rig import NAME, Cuts
 from report_rig import unpaged
 
-from uavctl.build.prepared import Prepared
+from uavctl.build.controller import Prepared
 from uavctl.cli.app import run
 from uavctl.cli.replay import recorded_flyer
 from uavctl.config import Config

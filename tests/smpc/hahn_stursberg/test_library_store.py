@@ -14,7 +14,6 @@ import pytest
 from optimisation_cases import START, paper_spec
 
 from uavctl.build import library as library_store
-from uavctl.build.code_id import maker_id
 from uavctl.build.library import (
     Advance,
     LibraryCheck,
@@ -26,6 +25,7 @@ from uavctl.build.library import (
     library_for,
     load,
 )
+from uavctl.build.outside import maker_id
 from uavctl.errors import DesignError, LibraryError
 from uavctl.smpc.hahn_stursberg.design import Design, make_design
 from uavctl.smpc.hahn_stursberg.horizon import decompose, horizon_of

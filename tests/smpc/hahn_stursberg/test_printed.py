@@ -12,7 +12,7 @@ import pytest
 from optimisation_cases import ORIGIN, PAPER_COST, PAPER_COST_X, PAPER_COST_Y, START, paper, room
 from rich.console import Console
 
-from uavctl.cli.solve import solve_document, solve_picture
+from uavctl.cli.design import solve_document, solve_picture
 from uavctl.config import load_config
 from uavctl.records import SolveStatus
 from uavctl.smpc.hahn_stursberg.design import Design

@@ -26,14 +26,12 @@ from uavctl.build.library import StoredLibrary, decode
 from uavctl.config import Config
 from uavctl.config.link import LinkConfig
 from uavctl.config.types import PlantConfig
-from uavctl.lab.campaign.plugins import make_controller
-from uavctl.lab.campaign.spec import CampaignSpec, ControllerSpec, DisturbanceSpec
+from uavctl.lab.campaign.spec import CampaignSpec, ControllerSpec, DisturbanceSpec, make_controller
 from uavctl.lab.campaign.world import FilterBelief, Scene, draw, draw_noise, known, newest_of
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import NOMINAL, Answer, Preview
 from uavctl.smpc.baselines import (
     CascadedPid,
-    ControlProblem,
     Governor,
     HoldLast,
     Lqg,
@@ -48,6 +46,7 @@ from uavctl.smpc.batch import BatchController, BatchSmpc, Counts, OneByOne
 from uavctl.smpc.conditioned.planner import ConditionedDecider
 from uavctl.smpc.estimate import innovations
 from uavctl.smpc.hahn_stursberg.design import Design, kappa
+from uavctl.smpc.nominal import ControlProblem
 from uavctl.smpc.outside import Rehearsal, make_answer
 
 # Disturbances of many runs: each kind a transform of the same standard normal draws.
@@ -183,7 +182,7 @@ class Recipe:
     """Everything that a controller is built from; it can be sent to another process."""
 
     key: str  # hash of all the others
-    kind: str  # one of `uavctl.lab.campaign.plugins.KINDS`, or of another package
+    kind: str  # one of `uavctl.lab.campaign.spec.KINDS`, or of another package
     config: Config  # the configuration that it believes in
     design: Design | None = None  # its design, of the SMPC with scheme `hahn-stursberg`
     # Its policy library as `library_bytes.decode` reads it, of the SMPC with solver.method = `library`

@@ -13,9 +13,9 @@ from logs.recording.summary import count
 from logs.report import page
 from logs.report.excursion import GRAVE_M
 from logs.report.page import PageSection
+from logs.report.statistics import Pair
 from uavctl.errors import UavctlError
 from uavctl.lab.campaign import plots
-from uavctl.lab.campaign.intervals import Pair
 from uavctl.lab.campaign.plots import Looks, legend
 from uavctl.lab.campaign.results import (
     SMPC,

@@ -14,8 +14,8 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 
 from logs.report.figures import WIDE_IN
 from logs.report.plots import DASHED, DOTTED
+from logs.report.statistics import Pair
 from logs.report.svg import WIDTH_IN, Drawing, canvas, colour
-from uavctl.lab.campaign.intervals import Pair
 from uavctl.lab.campaign.results import BaselineComparison, CampaignVerdict, CellSummary, Results
 
 # Legends of a campaign's figures, with the markers that the figures have.

@@ -13,17 +13,17 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from logs.report.statistics import finite
-from uavctl.errors import UavctlError
-from uavctl.lab.campaign.intervals import (
+from logs.report.statistics import (
     Pair,
     PairedDifference,
     bootstrap_mean,
     clopper_pearson,
+    finite,
     paired_difference,
     step_rate,
     worst_step,
 )
+from uavctl.errors import UavctlError
 
 # A finished campaign's folder, read: what was compared, and what each run came to.
 

@@ -1,4 +1,4 @@
-"""Specification of a campaign: its file, its types, and the configurations that come of it."""
+"""Specification of a campaign: its file, its types and kinds of controllers, and the configurations that come of it."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
+from uavctl.build.outside import ACTS, controller_class, make
 from uavctl.config import Config, Source, dump_config, load, parse, presets
 from uavctl.config.checks import dimensions
 from uavctl.config.document import (
@@ -29,7 +30,30 @@ from uavctl.config.document import (
 from uavctl.config.load import decode, find_nearest, parse_toml
 from uavctl.config.mission import MissionConfig
 from uavctl.errors import ConfigError, DesignError
-from uavctl.lab.campaign.plugins import KINDS, check_kind
+from uavctl.smpc.batch import BatchController
+from uavctl.smpc.nominal import ControlProblem
+
+KINDS = ("smpc", "lqg", "packetised", "mean-qp", "governor", "worst-case-delay", "hold-last", "zero-on-loss", "pid")
+KEY = "kind"
+
+
+def check_kind(kind: str) -> None:
+    """Check that a kind that is none of `KINDS` is a controller of another package.
+
+    Raises:
+        DesignError: Nothing has that name, it cannot be imported, or it is no controller.
+    """
+    controller_class(kind, KEY, (ACTS,), KINDS)
+
+
+def make_controller(kind: str, problem: ControlProblem) -> BatchController:
+    """Make a controller of another package for a problem.
+
+    Raises:
+        DesignError: There is none, or its class does not take the problem.
+    """
+    return cast(BatchController, make(controller_class(kind, KEY, (ACTS,), KINDS), kind, KEY, problem))
+
 
 # What a campaign is asked to fly, as its TOML file says it.
 #

@@ -9,13 +9,12 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from logs.report.statistics import clopper_pearson
 from uavctl.build.controller import build_problem, build_spec, needed
-from uavctl.lab.campaign.intervals import clopper_pearson
 from uavctl.lab.paper.runs import DRAWN, LIKELIHOOD, Flights, Setup, Totals, fly_runs, planes
-from uavctl.smpc.baselines.feedback import Lqg
-from uavctl.smpc.baselines.mpc import WorstCaseDelay
-from uavctl.smpc.bounds import stationary_bound
+from uavctl.smpc.baselines import Lqg, WorstCaseDelay
 from uavctl.smpc.hahn_stursberg.design import Design, kappa
+from uavctl.smpc.nominal import stationary_bound
 from uavctl.smpc.sets import Polytope
 
 # What the paper's example came to; one document.

@@ -25,7 +25,6 @@ from uavctl.config import load
 from uavctl.errors import ConfigError, DesignError, UavctlError
 from uavctl.lab.bench.timing import Case, median, timed
 from uavctl.lab.paper.claims import PRESET, PRINTED, Complexity, Depth, DesignTried
-from uavctl.smpc.bounds import lqr
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver, optimal_cost
 from uavctl.smpc.hahn_stursberg.horizon import Component, decompose, horizon_of
@@ -34,6 +33,7 @@ from uavctl.smpc.hahn_stursberg.mean import MeanProblem
 from uavctl.smpc.hahn_stursberg.policies import PolicyProgram
 from uavctl.smpc.hahn_stursberg.printed import PrintedSolver
 from uavctl.smpc.hahn_stursberg.terminal import make_terminal
+from uavctl.smpc.nominal import lqr
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope
 

@@ -31,7 +31,6 @@ from uavctl.errors import DesignError
 from uavctl.records import GaveWay, SolveStatus
 from uavctl.smpc.answer import INPUT_TOLERANCE, KEPT, NOMINAL, Answer, Preview, finite, inside
 from uavctl.smpc.batch import Decisions, gathered
-from uavctl.smpc.bounds import lqr
 from uavctl.smpc.conditioned.backoffs import (
     DISTANT,
     LARGEST_RISK,
@@ -49,7 +48,7 @@ from uavctl.smpc.conditioned.backoffs import (
 )
 from uavctl.smpc.conditioned.program import PartProgram, RegulatedRows, RestPlaces, SlewRows
 from uavctl.smpc.link import AgeModel
-from uavctl.smpc.nominal import ControlProblem, parts, unseen
+from uavctl.smpc.nominal import ControlProblem, lqr, parts, unseen
 from uavctl.smpc.plant import Plant, digest
 from uavctl.smpc.qp import OPEN
 from uavctl.smpc.sets import Polytope, equilibria

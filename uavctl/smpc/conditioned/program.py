@@ -9,8 +9,7 @@ from operator import le
 import numpy as np
 from numpy.typing import NDArray
 
-from uavctl.smpc.bounds import Lqr
-from uavctl.smpc.nominal import ControlProblem, Part, regulated
+from uavctl.smpc.nominal import ControlProblem, Lqr, Part, regulated
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.qp import ACTIVE, BELOW, OPEN, SOFT, FirstRows, QuadraticProgram, Sense, pairs_of
 from uavctl.smpc.sets import Equilibria, Polytope

@@ -3,8 +3,7 @@
 import numpy as np
 
 from uavctl.smpc.batch import News, predict
-from uavctl.smpc.bounds import lqr
-from uavctl.smpc.nominal import ControlProblem
+from uavctl.smpc.nominal import ControlProblem, lqr
 from uavctl.smpc.outside import PlanRequest
 
 
