@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 import pytest
 from hypothesis import settings
 
+from uavctl.arithmetic import ARITHMETIC  # loaded before numpy, so that tests compute as the commands do
+
 if TYPE_CHECKING:
     from logs.recording.summary import FlightSummary
 
@@ -35,6 +37,10 @@ LONGEST = (
     "test_check_axes", "test_frozen", "test_take_off", "test_replay_soak", "test_foreign_ros", "test_paper_depth",
     "test_viewers", "test_sealed", "test_sim_observed",
 )  # fmt: skip
+
+
+def pytest_report_header() -> str:
+    return f"arithmetic: {ARITHMETIC}"
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:

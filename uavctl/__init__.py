@@ -5,6 +5,8 @@ The functions for Python (docs/python.md) are loaded when they are first asked f
 
 from importlib import import_module
 
+from uavctl.arithmetic import ARITHMETIC as ARITHMETIC  # first of all: numpy asks for it when it is loaded
+
 __version__ = "0.2.0"
 _MODULES = {
     "Config": "uavctl.config",

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uavctl import __version__
+from uavctl.arithmetic import ARITHMETIC
 from uavctl.build.link import build_ages, build_delayed_link, late_steps, promised
 from uavctl.build.mission import build_mission, build_names, build_rests
 from uavctl.build.outside import controller_id, decider_id, flown_outside
@@ -459,6 +460,7 @@ def ready_library(
 # What decides a flight's last bits beside its configuration: code, libraries, CPU type.
 
 CONTROLLER = "controller"  # under which the one of another package stands among the versions
+ARITHMETIC_NAME = "arithmetic"
 _LIBRARIES = ("numpy", "scipy", "clarabel", "daqp", "pymavlink", "msgspec", "mcap")
 
 
@@ -467,11 +469,12 @@ def versions(controller: str) -> dict[str, str]:
     found = {name: metadata.version(name) for name in _LIBRARIES}
     if controller:
         found[CONTROLLER] = controller_id(controller)
-    return {"uavctl": __version__, "code": decider_id(), "python": platform.python_version(), **found}
+    own = {"uavctl": __version__, "code": decider_id(), "python": platform.python_version()}
+    return {**own, ARITHMETIC_NAME: ARITHMETIC, **found}
 
 
 def cpu() -> str:
-    """Return the CPU type: linear algebra kernels, and so the last bits of decisions, depend on it."""
+    """Return the CPU type: without portable arithmetic the last bits of decisions depend on it."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import gc
 import os
 import sys
+from collections.abc import Mapping
 
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 INTERRUPTED = 130  # as a shell says of what SIGINT ended
+_words: list[str] | None = None  # of the command line that this process runs; None if it is somebody else's
 
 
 def main() -> None:
@@ -20,11 +22,20 @@ def main() -> None:
     try:
         from uavctl.cli.app import run
 
-        code = run(sys.argv[1:], _imported)
+        global _words
+        _words = sys.argv[1:]
+        code = run(_words, _imported)
     except KeyboardInterrupt:
         sys.stderr.write("interrupted\n")
         code = INTERRUPTED
     sys.exit(code)
+
+
+def start_anew(environ: Mapping[str, str]) -> None:
+    """Run this process's command line again with this environment; do nothing in a process that is not `uavctl`."""
+    if _words is not None:
+        sys.stdout.flush()
+        os.execve(sys.executable, [sys.executable, "-m", "uavctl", *_words], dict(environ))
 
 
 def _imported() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -29,9 +30,11 @@ from logs.recording.replay import replay as replay_recording
 from logs.recording.summary import count
 from logs.recording.tlog import ForeignReplay, TlogPacket, read_tlog, replay_tlog
 from logs.recording.topics import HOLES, RECOVERED, RecorderNote
-from uavctl.build.controller import CONTROLLER, Prepared, build_controller, cpu, design_of, versions
+from uavctl.arithmetic import ARITHMETIC, OWN, without_choice
+from uavctl.build.controller import ARITHMETIC_NAME, CONTROLLER, Prepared, build_controller, cpu, design_of, versions
 from uavctl.build.library import check_fits, decode
 from uavctl.build.outside import KEY
+from uavctl.cli import start_anew
 from uavctl.cli.common import DEFAULTS, Common, Flight, columns, counted, located, messages, two_columns, warn
 from uavctl.cli.prepare import prepare
 from uavctl.config import Config, LoadedConfig
@@ -130,6 +133,7 @@ def replay_flight(flight: Path, tolerance: float = 0.0, overrides: Sequence[str]
     """
     check_first(flight)
     recorded = header(flight)
+    compute_as(recorded)
     name = f"{flight} (configuration)"
     config = flown = parse_recorded(recorded.config_toml, name).config
     cut, note = lacks_end(flight), last_note(flight)
@@ -210,8 +214,18 @@ def _changes(before: object, now: object, key: str) -> Iterator[Changed]:
         yield Changed(key=key, recorded=str(before), replayed=str(now))
 
 
+def compute_as(recorded: Header) -> None:
+    """Start the command anew if a recording was made with all of this processor's own instructions.
+
+    So it was where numpy was loaded before `uavctl`, and by version 0.1.
+    """
+    made = recorded.versions.get(ARITHMETIC_NAME, OWN)
+    if made == OWN and ARITHMETIC != OWN and recorded.cpu == cpu():
+        start_anew(without_choice(os.environ))
+
+
 def other_versions(recorded: Header, controller: str) -> Iterator[str]:
-    """Return which code, libraries and CPU type, on which the last bits depend, differ from the recording's.
+    """Return which code, libraries and arithmetic, on which the last bits depend, differ from the recording's.
 
     Args:
         controller: The one of another package that flew, if one did.
@@ -220,8 +234,9 @@ def other_versions(recorded: Header, controller: str) -> Iterator[str]:
         found = versions(controller)
     except DesignError:  # the controller of another package is not here
         found = versions("")
-    here = {**found, "cpu": cpu()}
-    there = {**recorded.versions, "cpu": recorded.cpu}
+    here, there = {**found, "cpu": cpu()}, {**recorded.versions, "cpu": recorded.cpu}
+    if here[ARITHMETIC_NAME] != OWN and here[ARITHMETIC_NAME] == there.get(ARITHMETIC_NAME):
+        there["cpu"] = here["cpu"]  # any computes alike
     for name in sorted(here.keys() | there.keys()):
         if here.get(name) != there.get(name):
             yield f"recorded with {name} {there.get(name, 'unknown')}, here is {here.get(name, 'none')}"

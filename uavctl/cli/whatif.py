@@ -30,7 +30,7 @@ from uavctl.build.controller import Prepared, build_problem, design_of
 from uavctl.cli.common import SEED, Common, Flight, Json, bars, columns, located, warn
 from uavctl.cli.flying import conclude
 from uavctl.cli.prepare import prepare, ready_library
-from uavctl.cli.replay import changed_flyer, check_first, other_versions, recorded_flyer
+from uavctl.cli.replay import changed_flyer, check_first, compute_as, other_versions, recorded_flyer
 from uavctl.config import Config, LoadedConfig, load
 from uavctl.config.checks import dimensions
 from uavctl.config.load import parse_recorded
@@ -219,6 +219,7 @@ def whatif(
         raise UsageError("--seed is of a simulated link; add --link configured, or --link KEY=VALUE")
     check_first(flight)
     recorded = header(flight)
+    compute_as(recorded)
     before = parse_recorded(recorded.config_toml, f"{flight} (configuration)").config
     loaded = changed(before, recorded.config_toml, flight, config, overrides)
     keys = tuple(f"link.{text.strip()}" for text in link if "=" in text)
