@@ -33,7 +33,7 @@ _TYPES = {
 }
 _NUMBERS = {name: number for number, name in _TYPES.items()}
 _INTEGERS = {"UINT8": "<B", "INT8": "<b", "UINT16": "<H", "INT16": "<h", "UINT32": "<I", "INT32": "<i"}
-_HASH = "_HASH_CHECK"
+_HASH = "_HASH_CHECK"  # PX4's checksum over all of them, told as one; any setting changes it
 _MOST = 20_000  # parameters kept: a vehicle has one or two thousand
 
 
@@ -100,7 +100,7 @@ class ParameterReader:
                 self._autopilots.setdefault(fields.src_system, fields.autopilot)
             return
         key = fields.src_system, fields.src_component, text_of(fields.param_id)
-        if len(self._told) < _MOST or key in self._told:
+        if key[2] != _HASH and (len(self._told) < _MOST or key in self._told):
             self._told[key] = fields.param_value, fields.param_type
             self._counts[key[:2]] = fields.param_count
 
@@ -129,8 +129,8 @@ class ParameterReader:
 
 
 def listed(parameters: Mapping[str, VehicleParameter]) -> int:
-    """Return how many of the autopilot's list were told; PX4's hash over all is none of them."""
-    return sum(one.component == mavlink.MAV_COMP_ID_AUTOPILOT1 and name != _HASH for name, one in parameters.items())
+    """Return how many of the autopilot's list were told."""
+    return sum(one.component == mavlink.MAV_COMP_ID_AUTOPILOT1 for one in parameters.values())
 
 
 def told_records(
