@@ -75,8 +75,9 @@ def computed(first: str) -> tuple[str, bool, list[str]]:
     return arithmetic, wide, bits
 
 
-def test_the_last_bits_are_those_of_other_makers() -> None:
-    arithmetic, wide, bits = computed("import uavctl")
+@pytest.mark.parametrize("first", ["uavctl", "logs.recording.topics", "sim.vehicle"])
+def test_the_last_bits_are_those_of_other_makers(first: str) -> None:
+    arithmetic, wide, bits = computed(f"import {first}")
     own, _, others = computed("import numpy")
     assert own == OWN
     if arithmetic == PORTABLE:
