@@ -108,7 +108,7 @@ def test_recover_restores_a_cut_file_and_says_so_in_its_exit_code(
 ) -> None:
     cut, whole = tmp_path / "cut.mcap", tmp_path / "whole.mcap"
     data = flown.read_bytes()
-    cut.write_bytes(data[: len(data) // 2])
+    cut.write_bytes(data[: len(data) // 2] + b"\x05")  # begins a record, wherever the half of it ends
     found = document(capsys, "log", "recover", str(cut), str(whole), code=3)
     # the clean file has one message more: the recorder's note of where it comes from
     assert found["lost_bytes"] > 0 and found["messages"] + 1 == sum(
