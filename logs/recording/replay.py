@@ -263,6 +263,8 @@ COMPARED = frozenset(_SAID_BY)
 Labels = frozenset[tuple[str, str]]
 # What a plan says of who made it, which a changed controller need not repeat to decide alike.
 MAKERS: Labels = frozenset({("/uavctl/plan", "design_id"), ("/uavctl/plan", "method")})
+# What turns with the last bit of a number that is the same to within a tolerance: a hash, and whether a limit was met.
+LAST_BITS: Labels = frozenset({("/uavctl/plan", "design_id"), ("/uavctl/setpoint", "limited")})
 
 
 class ReplayResult(msgspec.Struct, frozen=True, kw_only=True):
@@ -463,7 +465,7 @@ def replay(
         messages: (topic, log time [ns], record or the bytes that it is recorded as) in the order of recording.
         make_loop: builds the loop from the recording's configuration, around the given sink.
         tolerance: largest difference of two numbers that counts as none, relative to the larger
-            of 1 and their size; 0 compares bit for bit. For a recording of another CPU type.
+            of 1 and their size; 0 compares bit for bit. For a recording of another arithmetic.
         finished: the recording was closed in order; a torn one's last tick may lack records.
         ignored: (topic, field) that may differ; of a vector all entries.
     """

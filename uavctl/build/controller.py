@@ -457,7 +457,7 @@ def ready_library(
     return library_for(design, advance, tell)
 
 
-# What decides a flight's last bits beside its configuration: code, libraries, CPU type.
+# What decides a flight's last bits beside its configuration: code, libraries, arithmetic.
 
 CONTROLLER = "controller"  # under which the one of another package stands among the versions
 ARITHMETIC_NAME = "arithmetic"

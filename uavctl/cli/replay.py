@@ -18,6 +18,7 @@ from rich.table import Table
 from logs.recording.foreign import is_foreign, read_mcap
 from logs.recording.reader import good_messages, header, lacks_end, last_note, records
 from logs.recording.replay import (
+    LAST_BITS,
     MAKERS,
     Chosen,
     Context,
@@ -69,9 +70,8 @@ def recorded_flyer(flight: Path, config: Config) -> Prepared:
     try:
         return _with_library(flight, config, design)
     except LibraryError as error:
-        raise RecordingError(
-            f"{flight}: {error.reason}; use the version that recorded it (`uavctl log info` tells)"
-        ) from error
+        made = "; ".join(other_versions(header(flight), config.smpc.controller)) or "the file was changed"
+        raise RecordingError(f"{flight}: {error.reason} ({made}); use the version that recorded it") from error
 
 
 def changed_flyer(flight: Path, before: Config, loaded: LoadedConfig) -> Prepared:
@@ -116,6 +116,7 @@ class Replayed:
     holes: str  # from what it was recovered, and what was lost before its end, in words; nothing if that is all there
     changed: tuple[Changed, ...]  # what was asked to be different
     other_versions: tuple[str, ...]  # what decides the last bits, and is not here what the recording was made with
+    tolerance: float  # largest relative difference that counts as none
 
 
 def replay_flight(flight: Path, tolerance: float = 0.0, overrides: Sequence[str] = ()) -> Replayed:
@@ -139,7 +140,7 @@ def replay_flight(flight: Path, tolerance: float = 0.0, overrides: Sequence[str]
     cut, note = lacks_end(flight), last_note(flight)
     if cut and next(records(flight, StepInput), None) is None:  # so early that the policy library may be missing
         nothing = ReplayResult(decisions=0, compared=0, identical=True, first_difference=None)
-        return Replayed(nothing, cut, "", (), tuple(other_versions(recorded, flown.smpc.controller)))
+        return Replayed(nothing, cut, "", (), tuple(other_versions(recorded, flown.smpc.controller)), tolerance)
     if overrides:
         loaded = parse_recorded(recorded.config_toml, name, overrides)
         if make_links(loaded.config).keys() != make_links(config).keys():
@@ -153,15 +154,18 @@ def replay_flight(flight: Path, tolerance: float = 0.0, overrides: Sequence[str]
     else:
         controller, changed = recorded_flyer(flight, config).controller, ()
     holes = note.text if note is not None and note.text.startswith(RECOVERED) and HOLES in note.text else ""
+    # Before it had a name of its own, scheme `age-conditioned` flew under that of a design that decided nothing.
+    ignored = MAKERS if overrides or (config.conditioned and "scheme" not in recorded.design) else frozenset()
+    if tolerance:
+        ignored |= LAST_BITS
     result = replay_recording(
         ((one.definition.topic, one.at_ns, one.data) for one in good_messages(flight)),
         lambda sink: ControlLoop(config, controller, sink, lambda: 0),
         tolerance,
         finished=not cut and not holes,
-        # Before it had a name of its own, scheme `age-conditioned` flew under that of a design that decided nothing.
-        ignored=MAKERS if overrides or (config.conditioned and "scheme" not in recorded.design) else frozenset(),
+        ignored=ignored,
     )
-    return Replayed(result, cut, holes, changed, tuple(other_versions(recorded, flown.smpc.controller)))
+    return Replayed(result, cut, holes, changed, tuple(other_versions(recorded, flown.smpc.controller)), tolerance)
 
 
 def foreign_packets(flight: Path, topics: Sequence[str]) -> tuple[TlogPacket, ...] | None:
@@ -252,11 +256,12 @@ _LONGEST = 60
 def replay_table(replayed: Replayed) -> RenderableType:
     """Return the whole result for a terminal."""
     result = replayed.result
+    same = "yes" if result.identical else "no"
     rows: list[tuple[str, object]] = [
         *(("changed", f"{one.key}: {_cut(one.recorded)} -> {_cut(one.replayed)}") for one in replayed.changed),
         ("decisions", result.decisions),
         ("records compared", result.compared),
-        ("identical, bit for bit", "yes" if result.identical else "no"),
+        (f"the same to {replayed.tolerance:g}" if replayed.tolerance else "identical, bit for bit", same),
     ]
     first = result.first_difference
     if first is None:
@@ -351,7 +356,7 @@ def replay(
     *,
     common: Common = DEFAULTS,
     tolerance: Annotated[
-        float, Parameter(help="largest relative difference that counts as none; for another CPU type")
+        float, Parameter(help="largest relative difference that counts as none; for another arithmetic")
     ] = 0.0,
     topic: Annotated[
         tuple[str, ...],
