@@ -6,7 +6,7 @@ import math
 import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache, cached_property, lru_cache
 
 import msgspec
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
@@ -21,7 +21,7 @@ from google.protobuf.message import Message
 from google.protobuf.message_factory import GetMessageClass
 from mcap_protobuf.schema import build_file_descriptor_set
 
-from logs.recording.design_view import DesignView, Floats
+from logs.recording.design_view import Box, DesignView, Floats
 from uavctl.records import Decision, Estimate, LinkStats, Matrix, Plan, Record, Setpoint, Timing, Truth
 
 PlotRecord = typing.TypeVar("PlotRecord", bound=Record)
@@ -173,9 +173,9 @@ def age_plot(design: DesignView, decision: Decision, captured_ns: int | None) ->
 
 def input_plot(design: DesignView, decision: Decision) -> InputPlot:
     """Return the input that a tick chose."""
-    box = design.input_box
+    lower, upper = _sides(design.input_box, design.axes, tuple(range(len(design.axes))))
     chosen = Axes() if decision.input is None else axes_of(design, decision.input)
-    return InputPlot(chosen=chosen, lower=axes_of(design, box.lower), upper=axes_of(design, box.upper))
+    return InputPlot(chosen=chosen, lower=lower, upper=upper)
 
 
 def setpoint_plot(setpoint: Setpoint) -> SetpointPlot:
@@ -197,16 +197,24 @@ def state_plot(design: DesignView, estimate: Estimate) -> StatePlot:
 
 def limits_plot(design: DesignView, plan: Plan) -> LimitsPlot:
     """Return the limits, and the tightened ones of a plan."""
-    box = design.state_box
+    position_lower_m, position_upper_m = _sides(design.state_box, design.axes, design.position_index)
+    velocity_lower_mps, velocity_upper_mps = _sides(design.state_box, design.axes, design.velocity_index)
     lower, upper = tightened(design, plan.backoff_x, -1)
     return LimitsPlot(
-        position_lower_m=axes_of(design, pick(box.lower, design.position_index)),
-        position_upper_m=axes_of(design, pick(box.upper, design.position_index)),
+        position_lower_m=position_lower_m,
+        position_upper_m=position_upper_m,
         tightened_lower_m=axes_of(design, pick(lower, design.position_index)),
         tightened_upper_m=axes_of(design, pick(upper, design.position_index)),
-        velocity_lower_mps=axes_of(design, pick(box.lower, design.velocity_index)),
-        velocity_upper_mps=axes_of(design, pick(box.upper, design.velocity_index)),
+        velocity_lower_mps=velocity_lower_mps,
+        velocity_upper_mps=velocity_upper_mps,
     )
+
+
+@lru_cache(maxsize=16)
+def _sides(box: Box, axes: tuple[str, ...], index: tuple[int, ...]) -> tuple[Axes, Axes]:
+    """Return a box's lower and upper sides at some indices, one for each axis; asked anew in every tick."""
+    lower, upper = (Axes(**dict(zip(axes, pick(side, index), strict=True))) for side in (box.lower, box.upper))
+    return lower, upper
 
 
 def tightened(design: DesignView, backoff: Matrix, stage: int) -> tuple[Floats, Floats]:

@@ -203,12 +203,13 @@ class WriteQueue:
                 self._files.write_unwritten()
             if self._files.is_open and self._dropped and not self._noted[0]:
                 self._note_news()  # before all that was put after it: a recording without an end tells of it, too
+            files = self._files
             for _ in range(min(records, len(self.queue))):
-                if not self._ready():
+                if not (files.has_room or self._ready()):
                     return
                 self._take(*self.queue.popleft())
             for _ in range(min(views, len(self.views_due))):
-                if not self._ready():
+                if not (files.has_room or self._ready()):
                     return
                 self._show(*self.views_due.popleft())
             if due and self._files.is_open:
@@ -266,10 +267,10 @@ class WriteQueue:
     def _ready(self) -> bool:
         """Return whether there is a file to write to; one is begun if something waits for it."""
         files = self._files
-        if files.is_open and not files.is_full:
+        if files.has_room:
             return True
         waits = bool(self.queue or self.views_due or files.unwritten)
-        if waits and files.is_full:
+        if waits and files.is_open:
             files.because = f"goes on after {files.name}"
             self._finish_file(GOES_ON)
         if files.is_open:
@@ -314,8 +315,10 @@ class WriteQueue:
 
     def _show(self, topic: str, at_ns: int, record: Record, data: bytes) -> None:
         """Write the messages for viewers that are derived from a record."""
-        self._files.unwritten.extend(self._onlookers.beside(topic, at_ns, record, data))
-        self._files.write_unwritten()
+        made = self._onlookers.beside(topic, at_ns, record, data)
+        if made:
+            self._files.unwritten.extend(made)
+            self._files.write_unwritten()
 
     def _note_news(self) -> None:
         if (self._dropped, self._refused) != self._noted:

@@ -99,6 +99,7 @@ class Segment:
         self._times_ns: tuple[int, int] | None = None  # first and last
         self._counts: Counter[int] = Counter()
         self._crc = 0
+        self._size = 0
         self._begin_chunk()
         self.open_entries: list[QueuedMessage] = []  # not on the disk yet
         self.messages = 0  # on the disk
@@ -117,19 +118,29 @@ class Segment:
         Raises:
             OSError: the chunk could not be written; its messages and this one are in `open_entries`.
         """
-        channel = self._channels.get(entry.definition.topic)
+        kind, sequence, at_ns, data = entry
+        channel = self._channels.get(kind.topic)
+        index = None if channel is None else self._indexes.get(channel.number)
         if channel is None:
-            channel, head = self._new_channel(entry.definition)
+            channel, head = self._new_channel(kind)
         else:
-            head = b"" if channel.number in self._indexes else channel.record
-        size = len(head) + MESSAGE.size + len(entry.data)
-        full = bool(self.open_entries) and self._size + size > self._chunk_bytes
-        self.open_entries.append(entry)
+            head = channel.record if index is None else b""
+        size = MESSAGE.size + len(data)
+        entries = self.open_entries
+        full = bool(entries) and self._size + len(head) + size > self._chunk_bytes
+        entries.append(entry)
         if full:
-            self._commit(self.open_entries[:-1])
+            self._commit(entries[:-1])
             self.open_entries = [entry]
-            head = head or channel.record
-        self._put(entry, channel.number, head)
+            head, index = head or channel.record, None
+        utc_ns, place = at_ns + self._zero_utc_ns, self._size + len(head)
+        if index is None:
+            self._indexes[channel.number] = [utc_ns, place]
+        else:
+            index += (utc_ns, place)
+        fields = MESSAGE.pack(_OPCODE, _MESSAGE_FIELDS + len(data), channel.number, sequence, utc_ns, utc_ns)
+        self._parts += (head, fields, data)
+        self._size = place + size
 
     def commit(self) -> None:
         """Write the open chunk, if there is anything in it.
@@ -233,17 +244,6 @@ class Segment:
         )
         channel = self._channels[definition.topic] = _Channel(record.id, _bytes(record))
         return channel, head + channel.record
-
-    def _put(self, entry: QueuedMessage, channel: int, head: bytes) -> None:
-        data, at_ns, place = entry.data, entry.at_ns + self._zero_utc_ns, self._size + len(head)
-        index = self._indexes.get(channel)
-        if index is None:
-            self._indexes[channel] = [at_ns, place]
-        else:
-            index += (at_ns, place)
-        fields = MESSAGE.pack(_OPCODE, _MESSAGE_FIELDS + len(data), channel, entry.sequence, at_ns, at_ns)
-        self._parts += (head, fields, data)
-        self._size = place + MESSAGE.size + len(data)
 
     def _commit(self, entries: list[QueuedMessage]) -> None:
         content = b"".join(self._parts)
@@ -424,12 +424,12 @@ class Rotation:
         return segment is not None and bool(segment.bytes)
 
     @property
-    def is_full(self) -> bool:
-        """Whether the open file has reached its size, not counting what every file begins with."""
+    def has_room(self) -> bool:
+        """Whether a file is open and has not reached its size, not counting what every file begins with."""
         segment = self._segment
         if segment is None:
             return False
-        return segment.bytes - segment.attached_bytes >= self._log.segment_bytes + self._repeats_bytes
+        return segment.bytes - segment.attached_bytes < self._log.segment_bytes + self._repeats_bytes
 
     @property
     def may_begin(self) -> bool:

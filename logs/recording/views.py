@@ -282,10 +282,9 @@ def _sides(design: DesignView, lower: Floats, upper: Floats) -> tuple[Vec3, Vec3
 
 def _reach(design: DesignView, backoff: Matrix) -> Floats:
     """Return the semi-axes of the stages' ellipsoids (n, 3) [m]; 0 in an axis without limits."""
-    rows = np.array(backoff)
-    reach = np.zeros((len(rows), len(design.target)))
+    reach = np.zeros((len(backoff), len(design.target)))
     for state, row, size in design.position_rows:
-        np.maximum(reach[:, state], rows[:, row] / size, out=reach[:, state])
+        np.maximum(reach[:, state], np.array([stage[row] for stage in backoff]) / size, out=reach[:, state])
     return design.positions_of(reach)
 
 
