@@ -15,7 +15,8 @@ from uavctl.lab.campaign.store import SCHEMA, Store, first_difference, table_of
 from uavctl.lab.campaign.tasks import Task, flown, tasks_of
 
 TWO = table("link", "a") + table("link", "b", 'set = ["link.loss=0.5"]')
-DOCUMENT = {"name": "one", "runs": 3, "cells": [{"index": 0}]}
+CELLS = [{"index": 0, "controller": "lqg", "link": "a"}, {"index": 1, "controller": "lqg", "link": "b"}]
+DOCUMENT = {"name": "one", "runs": 3, "cells": CELLS}
 
 
 @pytest.fixture
@@ -35,7 +36,10 @@ def test_the_table_is_sorted_whatever_the_order_of_the_tasks(tmp_path: Path, giv
         assert store.complete() and not (tmp_path / name / "parts").exists()
     assert files[0].read_bytes() == files[1].read_bytes()
     found = pq.read_table(files[0])
-    assert found.schema.names == SCHEMA.names
+    assert found.schema.names == ["cell", "controller", "link", *SCHEMA.names[1:]]
+    assert set(zip(*(found[name].to_pylist() for name in ("cell", "controller", "link")), strict=True)) == {
+        (0, "lqg", "a"), (1, "lqg", "b"),
+    }  # fmt: skip
     assert list(found["cell"].to_numpy()) == [0] * (CHUNK + 4) + [1] * (CHUNK + 4)
     assert list(found["run"].to_numpy()) == [*range(CHUNK + 4)] * 2
     whole = given[1].fly()
@@ -74,7 +78,7 @@ def test_only_the_same_campaign_goes_on_and_only_if_it_is_asked_to(tmp_path: Pat
         pass
     with store.opened(DOCUMENT, "text", resume=True):
         pass
-    other = {**DOCUMENT, "cells": [{"index": 1}]}
+    other = {**DOCUMENT, "cells": [{"index": 1, "controller": "lqg", "link": "a"}, *CELLS[1:]]}
     with (
         pytest.raises(UsageError, match=r"cells\[0\]\.index is 0 there and 1 here"),
         store.opened(other, "text", resume=True),
