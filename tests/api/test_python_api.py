@@ -316,6 +316,11 @@ FILE = "nothing-here.toml"
         (lambda: uavctl.controller("room", "pid-loop"), DesignError, "pid"),
         (lambda: uavctl.fly("room", duration_s=1e-3), UsageError, "shorter than a tick"),
         (lambda: uavctl.fly("room", seed=-1), ConfigError, "sim.seed"),
+        (lambda: uavctl.fly("room", take_off_m=0.0), UsageError, "take_off_m 0.0: give a height"),
+        (lambda: uavctl.fly("room", take_off_m=2.499), UsageError, "may not rest"),
+        (lambda: uavctl.fly("room", goto=(0.0, 0.0, -2.499)), UsageError, "goto: down -2.499 m is outside"),
+        (lambda: uavctl.fly("room", goto=(0.0, 1.0)), UsageError, "goto (0.0, 1.0): give north, east and down"),
+        (lambda: uavctl.fly("room", goto=(0.0, 1.0, np.nan)), UsageError, "give north, east and down"),
         (lambda: uavctl.read("none.mcap"), RecordingError, "none.mcap"),
         (lambda: uavctl.read(ROOT), RecordingError, "is a folder"),
         (lambda: uavctl.read(ROOT / "README.md"), RecordingError, "README.md"),
@@ -362,3 +367,18 @@ def test_a_flight_that_breaks_off_leaves_a_whole_recording(
     (end,) = recording.arrow("/uavctl/end").to_pylist()
     assert recording.arrow("/uavctl/decision").num_rows == 31
     assert end["cause"] == ("still flying" if error is KeyboardInterrupt else "the controller has failed")
+
+
+def test_a_flight_may_begin_on_the_ground_as_the_command_line_s_does(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], no_page: None
+) -> None:
+    given = uavctl.load("room", {"link.loss": 0.3})
+    flight = uavctl.fly(given, tmp_path / "python", seed=3, duration_s=18, take_off_m=1.0, goto=(0.5, 0.0, -1.1))
+    words = "loopback --set link.loss=0.3 --seed 3 --duration 18 --arm --takeoff 1.0 --goto 0.5,0,-1.1 --json --out"
+    assert run([*words.split(), str(tmp_path / "typed")]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert recorded(flight.recording.path) == recorded(Path(told["recording"]))
+    heights_m = -flight.position_m[:, 2]
+    assert heights_m[0] == 0.0 and heights_m.max() > 0.9 and heights_m[-1] < 0.05
+    assert np.hypot(flight.position_m[:, 0] - 0.5, flight.position_m[:, 1]).min() < 0.1
+    assert flight.ending.as_ordered

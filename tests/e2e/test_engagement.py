@@ -34,7 +34,7 @@ def typed(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, st
         (["--goto", "1,2,nan"], "give north, east and down"),
         (["--goto", "9,0,-1"], "north 9 m is outside"),
         # In the room, but nearer to its ceiling than a plan may rest.
-        (["--goto", "0,0,-2.499"], "--goto: down -2.499 m is outside"),
+        (["--goto", "0,0,-2.499"], "goto: down -2.499 m is outside"),
         (["--arm", "--takeoff", "2.499"], "may not rest"),
         (["--config", "paper", "--arm", "--takeoff", "1"], "no vertical axis"),
     ],

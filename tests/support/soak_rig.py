@@ -11,9 +11,9 @@ from logs.recording.ends import put_header
 from logs.recording.recorder import SyncRecorder
 from sim.simulation import World
 from uavctl.build.controller import Prepared, design_of
-from uavctl.cli.flying import stop_limit_s
 from uavctl.cli.prepare import prepare
 from uavctl.config import Config, load_config
+from uavctl.daemon.engagement import stop_limit_s
 from uavctl.loop import ControlLoop
 from uavctl.records import (
     Command,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -20,6 +21,7 @@ from logs.recording.summary import FlightSummary, summarise
 from uavctl.api.control import Array, Runs, Source, load, loaded, need
 from uavctl.build.controller import build_problem, design_of, prepare, ready_library
 from uavctl.config import Config, parse
+from uavctl.daemon.engagement import Engagement, check_places, goto_keys, stop_limit_s
 from uavctl.errors import RecordingError, UsageError
 from uavctl.lab.lockstep import LockstepFlight, check_length
 from uavctl.records import Ending, Truth
@@ -150,7 +152,13 @@ class Flight:
 
 
 def fly(
-    config: Source = "room", out: str | Path | None = None, *, seed: int | None = None, duration_s: float | None = None
+    config: Source = "room",
+    out: str | Path | None = None,
+    *,
+    seed: int | None = None,
+    duration_s: float | None = None,
+    take_off_m: float | None = None,
+    goto: Sequence[float] | None = None,
 ) -> Flight:
     """Fly the simulated vehicle in virtual time, as `uavctl loopback` does; the same seed gives the same flight.
 
@@ -159,22 +167,31 @@ def fly(
         out: Folder of the recording; None: a new one below `flights/`.
         seed: Seed of every random draw; None: `sim.seed`.
         duration_s: Length [s]; None: that of the configuration.
+        take_off_m: Begin on the ground, disarmed, arm, climb so far [m], and land after the length; None begins and
+            ends in the air.
+        goto: Place in local NED [m] to fly to and stay; None: the configured mission.
 
     Raises:
         ConfigError: The configuration is wrong.
         DesignError: There is no design.
         RecordingError: The recording cannot be written, or is there already.
-        UsageError: The flight is shorter than a tick.
+        UsageError: The flight is shorter than a tick, or the vehicle may not rest where it is to climb or go.
     """
-    given = {"sim.seed": seed, "duration_s": duration_s}
+    given = {"sim.seed": seed, "duration_s": duration_s, **({} if goto is None else goto_keys(goto))}
+    if take_off_m is not None and not take_off_m > 0:
+        raise UsageError(f"take_off_m {take_off_m}: give a height above the ground [m]")
     found = load(loaded(config), {key: value for key, value in given.items() if value is not None})
     check_length(found)
     design = design_of(found)
+    engagement = Engagement(found, take_off_m=take_off_m, goto=goto is not None)
+    check_places(found, design, take_off_m, engagement.goal)
     prepared = prepare(found, design, ready_library(found, design))
     with new_recording(None if out is None else Path(out), found.name, found.log.free_bytes) as path:
         flight = LockstepFlight(prepared, path, command="uavctl.fly")
+        engagement.begin(flight.loop)
+        landing_s = None if take_off_m is None else stop_limit_s(found, takes_off=True)
         try:
-            flight.fly(lambda _: True)
+            flight.fly(lambda _: True, follower=engagement, landing_s=landing_s)
         except Exception as error:
             flight.loop.course.died = f"{type(error).__name__}: {error}"
             raise

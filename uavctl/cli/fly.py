@@ -25,10 +25,8 @@ from uavctl.build.controller import design_of
 from uavctl.check.findings import Item
 from uavctl.cli.common import DEFAULTS, SPAN_S, Common, Mocap, TakeOff, given_keys, located, messages
 from uavctl.cli.flying import (
-    Engagement,
     Live,
     LivePort,
-    check_places,
     checked_take_off,
     conclude,
     ending_noted,
@@ -37,7 +35,6 @@ from uavctl.cli.flying import (
     live_view_port,
     onlookers,
     stand_by,
-    stop_limit_s,
     stop_on_signals,
     tell_ending,
     wait_for_server,
@@ -49,6 +46,7 @@ from uavctl.config.connections import warnings
 from uavctl.daemon.control_socket import ControlServer, control_folder, daemon_name, listening
 from uavctl.daemon.daemon import AfterTick, collected_between_ticks, realtime
 from uavctl.daemon.daemon import fly as run_daemon
+from uavctl.daemon.engagement import Engagement, check_places, stop_limit_s
 from uavctl.daemon.health import HealthWatch, Notifier, RecorderHealth
 from uavctl.daemon.lock import sole_daemon
 from uavctl.io.signed_connection import connected

@@ -24,10 +24,8 @@ from sim.server import Ready, serve_in_child
 from uavctl.build.controller import Prepared, design_of
 from uavctl.cli.common import DEFAULTS, SEED, SPAN_S, Common, TakeOff, given_keys, located, messages
 from uavctl.cli.flying import (
-    Engagement,
     Live,
     LivePort,
-    check_places,
     checked_take_off,
     conclude,
     ending_noted,
@@ -35,7 +33,6 @@ from uavctl.cli.flying import (
     live_line,
     live_view_port,
     onlookers,
-    stop_limit_s,
     stop_on_signals,
     tell_ending,
 )
@@ -44,6 +41,7 @@ from uavctl.cli.sim import make_door
 from uavctl.clock import Ticker, monotonic_ns, zero_utc_ns
 from uavctl.config import Config, LoadedConfig
 from uavctl.daemon.daemon import collected_between_ticks, fly
+from uavctl.daemon.engagement import Engagement, check_places, stop_limit_s
 from uavctl.errors import UavctlError, UsageError
 from uavctl.io.signed_connection import connected
 from uavctl.lab.lockstep import TRUTH, LockstepFlight, check_length

@@ -26,7 +26,7 @@ from uavctl.lab.campaign.pool import Columns, Work
 
 DOCUMENT, SPECIFICATION, RUNS, PARTS = "campaign.json", "campaign.toml", "runs.parquet", "parts"
 _GROUP_ROWS = 65_536
-# What tells a cell from the others, in either world: named in each row, so that the table says what was flown by itself.
+# What tells a cell from the others, in either world: named in each row, so that the table speaks for itself.
 NAMES = ("scenario", "autopilot", "rate_hz", "controller", "link", "air", "disturbance", "plant")
 _WRITER: dict[str, Any] = {
     "version": "2.6",
@@ -138,16 +138,20 @@ class Store:
         with self._disk():
             if not self.complete():
                 draft = path.with_suffix(".draft")
-                cells = {
-                    one["index"]: one for one in msgspec.json.decode((self.folder / DOCUMENT).read_bytes())["cells"]
+                told = msgspec.json.decode((self.folder / DOCUMENT).read_bytes())["cells"]
+                cells = {one["index"]: one for one in told}
+                kinds = {
+                    name: _F64 if name == "rate_hz" else pa.string()
+                    for name in NAMES
+                    if all(name in cell for cell in told)
                 }
-                named = [name for name in NAMES if all(name in cell for cell in cells.values())]
-                kinds = [(name, _F64 if name == "rate_hz" else pa.string()) for name in named]
-                schema = pa.schema([self._schema.field("cell"), *kinds, *[*self._schema][1:]])
+                names = list(kinds.items())
+                fields = [self._schema.field(place) for place in range(len(self._schema.names))]
+                schema = pa.schema([fields[0], *names, *fields[1:]])
                 with pq.ParquetWriter(draft, schema, **_WRITER) as writer:
                     for cell, of_cell in groupby(tasks, lambda task: task.cell):
                         table = pa.concat_tables([self._read(task) for task in of_cell]).combine_chunks()
-                        for place, (name, kind) in enumerate(kinds, 1):
+                        for place, (name, kind) in enumerate(kinds.items(), 1):
                             values = pa.array([cells[cell][name]] * table.num_rows, type=kind)
                             table = table.add_column(place, name, values)
                         writer.write_table(table, row_group_size=_GROUP_ROWS)

@@ -1,0 +1,116 @@
+"""What a flight is asked for: whether to arm and take off, where to go, and how long its end may take."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from uavctl.build.controller import resting
+from uavctl.build.mission import build_mission
+from uavctl.config import Config
+from uavctl.errors import UsageError
+from uavctl.loop import ControlLoop
+from uavctl.mavlink.handover_guards import MUST_LAND
+from uavctl.mavlink.handover_states import HandoverState
+from uavctl.records import Command, ControlMode, Order, Ticked, Vec3
+from uavctl.smpc.conditioned.planner import AnyDesign
+from uavctl.smpc.plant import AXES
+
+DOWN = 2
+LANDING_S = 10.0  # after braking: for asking the vehicle to land
+
+
+def goto_keys(place_m: Sequence[float]) -> dict[str, object]:
+    """Return configuration keys that make a place in local NED [m] the mission, checked and recorded as one.
+
+    Raises:
+        UsageError: it is not three finite numbers.
+    """
+    if len(place_m) != 3 or not all(map(math.isfinite, place_m)):
+        raise UsageError(f"goto {place_m}: give north, east and down in local NED [m], as in 2, 1, -2 (up is < 0)")
+    return {
+        "mission.waypoints": [[float(one) for one in place_m]],
+        "mission.hold_s": 0.0,
+        "mission.trajectory": {},
+        "mission.then": "hold",
+    }
+
+
+class Engagement:
+    """Order of the command line (take-off, place to go to), and what became of it.
+
+    Attributes:
+        goal: the place of `--goto`, local NED [m].
+        arrived: whether it has been reached.
+        engaged: whether the controller has been in charge.
+
+    Args:
+        config: the configuration, `--goto` in it.
+        take_off_m: height of the climb above the ground [m]; None leaves arming and modes to the pilot.
+        goto: whether the mission is the place of `--goto`.
+    """
+
+    def __init__(self, config: Config, *, take_off_m: float | None, goto: bool) -> None:
+        self._config = config
+        self._take_off_m = take_off_m
+        self.goal: Vec3 | None = config.mission.waypoints[0] if goto else None
+        self._ordered = False
+        self.engaged = False
+        self.arrived = False
+
+    @property
+    def takes_off(self) -> bool:
+        """Whether the vehicle is to be armed."""
+        return self._take_off_m is not None
+
+    def begin(self, loop: ControlLoop) -> None:
+        """Say before the first tick what the flight is to do."""
+        loop.course.takes_off = self.takes_off
+        loop.course.goal = "" if self.goal is None else f"--goto {','.join(f'{x:g}' for x in self.goal)}"
+
+    def follow(self, loop: ControlLoop, ticked: Ticked) -> None:
+        """Look at the tick that has just run; the first one gives the order to take off."""
+        self.engaged = self.engaged or loop.who_flies is HandoverState.ENGAGED
+        self._look_for_arrival(loop, ticked)
+        loop.course.arrived = self.arrived
+        if self._take_off_m is not None and not self._ordered:
+            self._ordered = loop.order(Command(order=Order.TAKE_OFF, height_m=self._take_off_m))
+
+    def _look_for_arrival(self, loop: ControlLoop, ticked: Ticked) -> None:
+        estimate = ticked.estimate
+        if self.goal is None or estimate is None or ticked.decision.mode is not ControlMode.TRACK:
+            return
+        plant = loop.plant
+        where = [estimate.mean[index] for index in plant.position_index]
+        goal = [self.goal[AXES.index(axis)] for axis in plant.axes]
+        self.arrived = self.arrived or math.dist(where, goal) <= self._config.mission.accept_m
+
+
+def check_places(config: Config, design: AnyDesign, take_off_m: float | None, goal: Vec3 | None) -> None:
+    """Refuse places outside the room, before anything is made for the flight, or sent.
+
+    Raises:
+        UsageError: the plant may not rest at the goal, or the climb would end above the room.
+        DesignError: the mission does not fit the design.
+    """
+    if take_off_m is not None and "down" not in design.plant.axes:
+        raise UsageError("take-off: the plant has no vertical axis, so it cannot tell how high it is; see plant.axes")
+    if take_off_m is None and goal is None:
+        return
+    room = build_mission(config, design, resting(design)).room
+    if room is None:
+        raise UsageError("take-off, goto: this plant cannot rest wherever it is sent; see plant")
+    why = "" if goal is None else room.refusal(goal)
+    if why:
+        raise UsageError(f"goto: {why}")
+    if take_off_m is None:
+        return
+    highest_m = -float(room.lower[room.axes.index(DOWN)])
+    if take_off_m > highest_m:
+        raise UsageError(f"take-off to {take_off_m:g} m: above {highest_m:.2f} m it may not rest (sets.state_lower)")
+
+
+def stop_limit_s(config: Config, *, takes_off: bool) -> float:
+    """Return how long a hand-over may take [s]; it ends on the ground if we took off, or land by our positions."""
+    landings = 1 + MUST_LAND if takes_off else int(config.relay.enabled)
+    return config.fallback.brake_s + LANDING_S + landings * config.hand_over.land_s
