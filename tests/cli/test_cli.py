@@ -17,6 +17,7 @@ from places import ROOT
 
 from uavctl import __version__
 from uavctl.cli.app import app, run
+from uavctl.cli.common import bars
 
 PRESET = ROOT / "uavctl" / "presets" / "paper.toml"
 STATE = "35,-2,-20,-4"
@@ -267,3 +268,23 @@ def test_a_place_below_zero_is_taken_with_commas_and_with_spaces(
 def test_a_place_that_is_none_is_told(words: list[str], told: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["ctl", "goto", *words]) == 2
     assert told in capsys.readouterr().err
+
+
+def test_progress_is_told_in_lines_where_no_bar_can_be_drawn(capsys: pytest.CaptureFixture[str]) -> None:
+    now_s = 0.0
+    with bars() as progress:
+        progress.get_time = lambda: now_s
+        task = progress.add_task("flights", total=40_000)
+        for _ in range(20):
+            now_s += 1.0
+            progress.advance(task, 1000)
+        page = progress.add_task("", total=None)
+        now_s += 7.0
+        progress.update(page, description="the page")
+    # The first word says when it began, so that what is quick says nothing.
+    assert capsys.readouterr().err.splitlines() == [
+        "flights: 6000 of 40000 (6 s)",
+        "flights: 11000 of 40000 (11 s)",
+        "flights: 16000 of 40000 (16 s)",
+        "the page (7 s)",
+    ]

@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 from cyclopts import Parameter, validators
@@ -17,7 +17,7 @@ from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions, JustifyMethod, RenderableType
 from rich.markup import escape
 from rich.measure import Measurement
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from uavctl.config import LoadedConfig, explain, load
@@ -180,11 +180,47 @@ def counted(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{number} {name}" for name, number in counts.items()) or "none"
 
 
+LINE_S = 5.0  # between two lines of progress where no bar can be drawn
+
+
+class _Bars(Progress):
+    """Bars in a terminal; in a file or a pipe a line now and then, so that one who reads it sees that it goes on."""
+
+    _told_s: float | None = None
+
+    def advance(self, task_id: TaskID, advance: float = 1) -> None:
+        """Go on by so many."""
+        super().advance(task_id, advance)
+        self._tell(task_id)
+
+    def update(self, task_id: TaskID, **changes: Any) -> None:
+        """Change what rich's own takes, by name."""
+        super().update(task_id, **changes)
+        self._tell(task_id)
+
+    def _tell(self, task_id: TaskID) -> None:
+        if self.console.is_terminal:
+            return
+        now_s = self.get_time()
+        if self._told_s is None:
+            self._told_s = now_s
+        if now_s - self._told_s < LINE_S:
+            return
+        self._told_s = now_s
+        task = self._tasks[task_id]
+        done = "" if task.total is None else f": {round(task.completed, 1):.10g} of {round(task.total, 1):.10g}"
+        # Not by the bar's own console, which would draw it.
+        messages().print(f"{task.description or 'at work'}{done} ({task.elapsed or 0.0:.0f} s)", soft_wrap=True)
+
+
 def bars(*more: ProgressColumn, auto_refresh: bool = True) -> Progress:
-    """Progress among the messages, gone in the end: what is done, a bar, and `more`; else how many of all, and time."""
+    """Progress among the messages, gone in the end: what is done, a bar, and `more`; else how many of all, and time.
+
+    Where there is no terminal it is a line every five seconds.
+    """
     counted = more or (MofNCompleteColumn(), TimeElapsedColumn())
     head = (TextColumn("{task.description}"), BarColumn())
-    return Progress(*head, *counted, console=messages(), transient=True, auto_refresh=auto_refresh)
+    return _Bars(*head, *counted, console=messages(), transient=True, auto_refresh=auto_refresh)
 
 
 class _Messages(Console):

@@ -14,7 +14,7 @@ from typing import Annotated
 
 import msgspec
 from cyclopts import Parameter
-from rich.progress import Progress
+from rich.progress import TaskProgressColumn, TimeRemainingColumn
 
 from logs.recording.ends import final, new_recording, put_header
 from logs.recording.recorder import DerivedTopics, Recorder
@@ -22,7 +22,7 @@ from logs.recording.summary import FlightSummary, render
 from logs.recording.topics import ENDED
 from sim.server import Ready, serve_in_child
 from uavctl.build.controller import Prepared, design_of
-from uavctl.cli.common import DEFAULTS, SEED, SPAN_S, Common, TakeOff, given_keys, located, messages
+from uavctl.cli.common import DEFAULTS, SEED, SPAN_S, Common, TakeOff, bars, given_keys, located
 from uavctl.cli.flying import (
     Live,
     LivePort,
@@ -133,7 +133,7 @@ def lockstep(prepared: Prepared, path: Path, engagement: Engagement) -> FlightSu
         with (
             ending_noted(flight.loop),
             stop_on_signals() as stopped,
-            Progress(console=messages(), transient=True) as progress,
+            bars(TaskProgressColumn(), TimeRemainingColumn()) as progress,
         ):
             task = progress.add_task("flying in virtual time", total=config.duration_s)
 

@@ -44,12 +44,10 @@ def ready_library(config: Config, design: AnyDesign) -> StoredLibrary | None:
 
 @contextmanager
 def _bar(title: str) -> Iterator[Callable[[str], None]]:
-    """Show a progress bar of unknown length; where standard error is no terminal, its title alone."""
+    """Show a progress bar of unknown length; without a terminal its title, and a line now and then."""
     console = messages()
     if not console.is_terminal:
         console.print(escape(title), soft_wrap=True)
-        yield lambda _: None
-        return
     with bars(TimeElapsedColumn()) as progress:
         task = progress.add_task(escape(title), total=None)
         yield lambda text: progress.update(task, description=escape(text))
