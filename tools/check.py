@@ -84,6 +84,9 @@ def check_wheel() -> str:
         where = run([sys.executable, "-P", "-c", "import uavctl; print(uavctl.__file__)"], cwd=folder, extra=outside)
         if not Path(where.strip()).is_relative_to(site):
             raise StageError(f"the wheel was not what was imported, but {where.strip()}")
+        page = run([sys.executable, "-P", "-m", "uavctl", "docs", "faults"], cwd=folder, extra=outside)
+        if page != (ROOT / "docs" / "faults.md").read_text(encoding="utf-8"):
+            raise StageError("`uavctl docs faults` of the wheel does not show that page")
         return run([sys.executable, "-P", "-m", "uavctl", *flight], cwd=folder, extra=outside)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import cast
@@ -12,6 +13,7 @@ from msgspec.structs import FieldInfo
 
 from logs.recording.derived_topics import VIEWS, DerivedTopic
 from logs.recording.topics import TOPICS, definition
+from uavctl.cli.app import app
 from uavctl.config.document import Section, description, element, is_section, type_text
 from uavctl.config.types import OF_HAHN_STURSBERG, Config
 from uavctl.lab.campaign.spec import CampaignSpec
@@ -235,9 +237,61 @@ def drawing() -> str:
     return "\n".join([*lines, "    DONE --> [*]", "    FAILED --> [*]"]) + "\n"
 
 
+_MANUAL = """.SH EXIT STATUS
+0 good; 1 ran, but failed its purpose; 2 usage or configuration; 3 recovered with loss; 4 \\fBtune\\fR: the pilot has
+taken over; 130 interrupted.
+.SH FILES
+.TP
+.I flights/
+recordings, unless \\-\\-out names another folder
+.SH ENVIRONMENT
+.TP
+.B UAVCTL_CACHE
+folder of designs and policy libraries, which may be removed at any time
+.TP
+.B UAVCTL_CONTROL
+folder of the socket by which \\fBuavctl ctl\\fR reaches a flight
+.SH SEE ALSO
+\\fBuavctl docs\\fR lists the pages of the manual, and shows them.
+""".replace("\\\\", "\\")
+
+
+def man_page() -> str:
+    """The manual page docs/uavctl.1, made from the commands and their options."""
+    told = app.generate_docs(output_format="markdown", recursive=True)
+    _, _, commands = told.partition("**Commands**")
+    lines = [
+        '.TH UAVCTL 1 "" "uavctl" "User Commands"',
+        ".SH NAME",
+        "uavctl \\- stochastic model predictive flight control shaped by the age of information, over MAVLink",
+        ".SH SYNOPSIS",
+        ".B uavctl",
+        "COMMAND [OPTIONS]",
+        ".SH COMMANDS",
+    ]
+    for line in commands.splitlines()[1:]:
+        item = re.fullmatch(r"\* (?:\[?`(.+?)`(?:\]\(.*?\))?)(?:: (.*))?", line)
+        if line.startswith("#"):
+            title = _roff(line.lstrip("# "))
+            lines.append(f".SH {title.upper()}" if line.startswith("## ") else f".SS {title}")
+        elif item is not None:
+            lines += [".TP", f".B {_roff(item[1])}", _roff(item[2] or "")]
+        elif line and not line.startswith(("```", "**")):
+            lines += [".PP", _roff(line)]
+    return "\n".join(lines) + "\n" + _MANUAL
+
+
+def _roff(text: str) -> str:
+    """Return Markdown text as roff: without marks, and with what roff would take as its own escaped."""
+    plain = re.sub(r"\*\[(.*?)\]\*", r"[\1]", text.replace("`", "").replace("**", ""))
+    plain = plain.replace("\\", "\\e").replace("-", "\\-")
+    return f"\\&{plain}" if plain.startswith((".", "'")) else plain
+
+
 PAGES: dict[Path, Callable[[], str]] = {
     ROOT / "docs" / "configuration.md": configuration_page,
     ROOT / "docs" / "campaign-keys.md": campaign_page,
     ROOT / "docs" / "topics.md": topics_page,
     ROOT / "docs" / "hand-over.md": hand_over_page,
+    ROOT / "docs" / "uavctl.1": man_page,
 }

@@ -288,3 +288,26 @@ def test_progress_is_told_in_lines_where_no_bar_can_be_drawn(capsys: pytest.Capt
         "flights: 16000 of 40000 (16 s)",
         "the page (7 s)",
     ]
+
+
+def test_the_manual_is_shown_page_by_page(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["docs"]) == 0
+    listed = capsys.readouterr().out
+    for path in (ROOT / "docs").glob("*.md"):
+        assert f" {path.stem} " in listed
+    for named in ("faults", "faults.md", "docs/faults.md"):
+        assert run(["docs", named]) == 0
+        assert capsys.readouterr().out == (ROOT / "docs" / "faults.md").read_text(encoding="utf-8")
+    assert run(["docs", "fault"]) == 2
+    assert 'There is no page "fault" (nearest valid name "faults")' in capsys.readouterr().err
+    assert run(["docs", "../README"]) == 2
+
+
+def test_the_manual_page_tells_every_command_with_its_options() -> None:
+    text = (ROOT / "docs" / "uavctl.1").read_text(encoding="utf-8").replace("\\-", "-")
+    for heading, option in (
+        (".SH UAVCTL LOOPBACK", "--takeoff FLOAT"), (".SH UAVCTL FLY", "--realtime"),
+        (".SS uavctl log replay", "--tolerance FLOAT"), (".SS uavctl ctl status", "--json"),
+    ):  # fmt: skip
+        section = re.split(r"^\.S[HS] ", text.partition(f"{heading}\n")[2], maxsplit=1, flags=re.MULTILINE)[0]
+        assert f".TP\n.B {option}\n" in section

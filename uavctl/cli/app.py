@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Sequence
 from difflib import get_close_matches
+from pathlib import Path
+from typing import Annotated
 
-from cyclopts import App, CycloptsError
+from cyclopts import App, CycloptsError, Parameter
+from rich.console import Console
 from rich.markup import escape
 
 from uavctl import __version__
-from uavctl.cli.common import messages, write_document
+from uavctl.cli.common import messages, two_columns, write_document
+from uavctl.config.load import find_nearest
 from uavctl.errors import ConfigError, UavctlError, UsageError
 
 _EPILOGUE = """Exit codes: 0 good; 1 ran, but failed its purpose; 2 usage or configuration; 3 recovered with loss;
 4 `tune`: the pilot has taken over; 130 interrupted.
 
 With --json, standard output holds one JSON document and nothing else, also of an error; messages go to standard error.
-Every configuration key is described in docs/configuration.md."""
+`uavctl docs` has the manual; `uavctl docs configuration` describes every configuration key."""
 
 app = App(
     name="uavctl",
@@ -50,11 +55,35 @@ _COMMANDS = {
     "ctl": ("ctl:ctl_app", "Give a flight that goes on an order: goto, hold, resume, land, engage; or its status."),
     "key": ("key:key_app", "Make and look at keys of MAVLink 2 signing."),
     "log": ("log:log_app", "Look into recordings: info, recover, replay, report, compare, whatif, export."),
+    "docs": ("app:docs", "Show a page of the manual, or list its pages."),
 }
 for _name, (_path, _help) in _COMMANDS.items():
     app.command(f"uavctl.cli.{_path}", name=_name, help=_help)
+
 _EXTRAS = {"pyarrow": "campaign"}  # of a package that a command cannot do without
 app.register_install_completion_command(add_to_startup=False)
+
+
+def docs(page: Annotated[str, Parameter(help="name of a page; else all of them are listed")] = "", /) -> int:
+    """Show a page of the manual, or list its pages; in a pipe or file as Markdown."""
+    from rich.markdown import Markdown
+
+    folder = Path(__file__).parents[1] / "docs"
+    pages = {path.stem: path.read_text(encoding="utf-8") for path in sorted(folder.glob("*.md"))}
+    name = page.rpartition("/")[2].removesuffix(".md")
+    if name and name not in pages:
+        near = find_nearest(name, tuple(pages))
+        raise UsageError(f'There is no page "{page}"{near}; `uavctl docs` lists all of them')
+    if name and sys.stdout.isatty():
+        Console().print(Markdown(pages[name]))
+    elif name:
+        sys.stdout.write(pages[name])
+    else:
+        titles: list[tuple[str, object]] = [
+            (one, text.partition("\n")[0].removeprefix("# ")) for one, text in pages.items()
+        ]
+        Console().print(two_columns(f"Pages, as files in {folder.resolve()}", titles))
+    return 0
 
 
 def run(arguments: Sequence[str], imported: Callable[[], None] = lambda: None) -> int:
