@@ -353,6 +353,8 @@ def live_line(
     columns = (BarColumn(bar_width=20), TimeElapsedColumn(), TextColumn("{task.description}"))
     done, told = threading.Event(), threading.Event()
     with Progress(*columns, console=messages(), transient=True, refresh_per_second=1 / REFRESH_S) as progress:
+        # The bar's own console would draw it, also into a file.
+        console = progress.console if progress.console.is_terminal else messages()
         task = progress.add_task("waiting", total=duration_s)
         said, feed = Said(), LiveFeed()
 
@@ -360,16 +362,16 @@ def live_line(
             while feed.news:
                 line = said.line(feed.news.popleft(), loop.who_flies)
                 if line is not None:
-                    progress.console.print(f"[yellow]{escape(line)}[/]", soft_wrap=True)
+                    console.print(f"[yellow]{escape(line)}[/]", soft_wrap=True)
 
         def show() -> None:
             while not done.wait(REFRESH_S):
                 tell()
                 ticked = feed.ticked
-                tell_notices(feed.notices, progress.console)
+                tell_notices(feed.notices, console)
                 if loop.let_go and not told.is_set():
                     told.set()
-                    progress.console.print(f"[bold red]letting go:[/] {escape(loop.let_go)}", soft_wrap=True)
+                    console.print(f"[bold red]letting go:[/] {escape(loop.let_go)}", soft_wrap=True)
                 if ticked is not None:
                     line = _line(ticked, loop.who_flies) + _alarm(recorder.status())
                     progress.update(task, completed=ticked.decision.tick * tick_s, description=line)
@@ -382,7 +384,7 @@ def live_line(
             done.set()
             thread.join()
             tell()
-            tell_notices(feed.notices, progress.console)
+            tell_notices(feed.notices, console)
             sys.setswitchinterval(before_s)
 
 
