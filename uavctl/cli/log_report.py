@@ -33,7 +33,7 @@ from logs.report.compare import (
 from logs.report.figures import picture
 from logs.report.flight_page import verdict_rows, write_report
 from logs.report.headline import BAD, GOOD, MIND, Headline, headline
-from logs.report.tlog_page import write_tlog_page
+from logs.report.tlog_page import headline_of, write_tlog_page
 from logs.report.verdicts import judge
 from uavctl.cli.common import Column, Common, Flight, Json, WideTable, bars, can_be_read, columns, two_columns, warn
 from uavctl.errors import UsageError
@@ -129,13 +129,16 @@ def report(
     if cut := lacks_end(flight):
         warn(f"{cut}: shown up to there")
     main = headline(data, summary, judged)
-    first = {"tone": main.tone, "text": f"{main.word}: {main.text}", "why": main.why}
-    document = {**msgspec.structs.asdict(summary), "verdicts": judged.verdicts, "headline": first}
+    document = {**msgspec.structs.asdict(summary), "verdicts": judged.verdicts, "headline": _document(main)}
     Common(json=json).show("log/report", document, lambda: _told(main, render(summary, verdict_rows(judged.verdicts))))
     return 0
 
 
 _STYLES = {GOOD: "bold green", MIND: "bold yellow", BAD: "bold red"}
+
+
+def _document(main: Headline) -> dict[str, object]:
+    return {"tone": main.tone, "text": f"{main.word}: {main.text}", "why": main.why}
 
 
 def _told(main: Headline, summary: RenderableType) -> Group:
@@ -151,7 +154,9 @@ def _report_tlog(flight: Path, out: Path, svg: Path | None, common: Common) -> i
     write_tlog_page(found, out)
     for note in found.info.notes:
         warn(note)
-    document = {**msgspec.to_builtins(found.info), "report": str(out)}
+    main = headline_of(found)
+    document = {**msgspec.to_builtins(found.info), "report": str(out), "headline": _document(main)}
     kind = "ulog" if is_ulog(flight) else "tlog"
-    common.show(f"log/report-{kind}", document, lambda: two_columns("", [*facts_of(found.info), ("page", str(out))]))
+    facts: list[tuple[str, object]] = [*facts_of(found.info), ("page", str(out))]
+    common.show(f"log/report-{kind}", document, lambda: _told(main, two_columns("", facts)))
     return 0

@@ -174,3 +174,63 @@ def test_a_torn_one_is_shown_up_to_there(tmp_path: Path, exported: Path, capsys:
     told = capsys.readouterr()
     assert json.loads(told.out)["notes"] and "torn" in told.err
     assert run(["log", "report", str(path), "--svg", str(tmp_path / "a.svg")]) == 2
+
+
+def beat(mode: int, *, armed: bool) -> Any:
+    flags = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | (mavlink.MAV_MODE_FLAG_SAFETY_ARMED if armed else 0)
+    return mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_QUADROTOR, 3, flags, mode, 4, 3)
+
+
+def flown_with(
+    tmp_path: Path, *, off_m: float = 0.0, silent: range = range(0), text: str = "", armed: bool = True
+) -> Any:
+    """Twelve seconds in GUIDED (4), five positions of its own and five sent a second; the sent ones begin 2 m north."""
+    told = bytearray()
+    own, cameras = (mavlink.MAVLink(None, srcSystem=system, srcComponent=1) for system in (1, 20))
+    for number in range(60):
+        north_m = 0.1 * number
+        sent_m = north_m + 2.0 + (off_m if number == 40 else 0.0)
+        parts = [(own, mavlink.MAVLink_local_position_ned_message(200 * number, north_m, 0, -1, 0.5, 0, 0))]
+        if number not in silent:
+            position = mavlink.MAVLink_vision_position_estimate_message(200_000 * number, sent_m, 0, -1, 0, 0, 0)
+            parts.append((cameras, position))
+        if number % 5 == 0:
+            parts.append((own, beat(9 if number >= 55 else 4, armed=armed and number >= 5)))
+        if number == 30 and text:
+            parts.append((own, mavlink.MAVLink_statustext_message(mavlink.MAV_SEVERITY_CRITICAL, text.encode())))
+        for mav, message in parts:
+            told += struct.pack(">Q", 1_764_000_000_000_000 + 200_000 * number) + message.pack(mav)
+    path = tmp_path / "foreign.tlog"
+    path.write_bytes(told)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("given", "tone", "line"),
+    [
+        ({}, "good", "Nothing odd: armed for 10.8 s; no position was missing for longer than 0.2 s"),
+        ({"silent": range(20, 35)}, "mind", "Blind: no position came for 3.2 s, from 3.8 s on (GUIDED), while its own "
+         "position moved by 1.6 m."),
+        ({"off_m": 0.7}, "mind", "Positions disagree: its own position was 0.70 m off that of VISION_POSITION_ESTIMATE "
+         "of system 20 at 8.0 s (GUIDED)."),
+        ({"off_m": 1.5}, "bad", "Positions disagree: its own position was 1.5 m off"),
+        ({"text": "EKF variance", "off_m": 0.7}, "bad", "The vehicle alarmed: it said \"EKF variance\" (critical) at "
+         "6.0 s (GUIDED)."),
+        ({"armed": False}, "mind", "Not armed: "),
+    ],
+)  # fmt: skip
+def test_the_main_thing_comes_first(
+    given: dict[str, Any], tone: str, line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = flown_with(tmp_path, **given)
+    assert run(["log", "report", str(path), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["headline"]["tone"] == tone and told["headline"]["text"].startswith(line)
+    banner = f'<div class="banner {tone}"><p><strong>'
+    assert path.with_suffix(".html").read_text(encoding="utf-8").index(banner) > 0
+    if tone == "bad":
+        assert ["0.70 m" in one for one in told["headline"]["why"]].count(True) == ("text" in given)
+    if given.get("armed", True):
+        assert "It left GUIDED for LAND at 11.0 s." in told["headline"]["why"]
+    assert run(["log", "report", str(path)]) == 0
+    assert " ".join(capsys.readouterr().out.split()).startswith(told["headline"]["text"][:60])
