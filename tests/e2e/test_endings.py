@@ -21,8 +21,8 @@ from logs.recording.summary import summarise
 from logs.report import flight_page as report
 from sim.autopilot.profile import FAILED, SIMULATED, Role
 from uavctl import loop as control
-from uavctl.cli import flying
 from uavctl.cli.app import run
+from uavctl.daemon import engagement
 from uavctl.daemon.lock import sole_daemon
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.handover_states import HandoverState
@@ -466,7 +466,7 @@ def test_an_end_that_is_cut_off_is_told_everywhere(
     tmp_path: Path, typed: Type, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # The time of a hand-over is longer than that of any request to land, so it takes a shorter one to be cut off.
-    monkeypatch.setattr(flying, "LANDING_S", 1.0)
+    monkeypatch.setattr(engagement, "LANDING_S", 1.0)
     rig = Endings(tmp_path, airborne=True).at(HandoverState.ENGAGED, deafen("COMMAND_LONG"))
     told = typed(rig.at(HandoverState.ENGAGED, interrupt, after_s=3.0), Cause.CUT_OFF)
     assert Cause.OPERATOR in told.ending["sentence"] and "in the air" in told.ending["sentence"]
