@@ -170,8 +170,8 @@ class FlightScene:
             if vehicle.battery_v is not None:
                 yield SceneFigure("battery", f"{vehicle.battery_v:.1f} V")
         if link is not None:
-            lost = 1.0 - link.arrival_mean
-            yield SceneFigure("steps without news", f"{lost:.0%}", "warn" if link.below_promise else "plain")
+            own = f"{link.arrival_mean:.0%}"
+            yield SceneFigure("steps with a position of their own", own, "warn" if link.below_promise else "plain")
         if setpoint is not None:
             told = ", ".join(f"{value:+.2f}" for value in setpoint.accel_mps2)
             limited = f" (limited: {', '.join(setpoint.limited)})" if setpoint.limited else ""

@@ -16,7 +16,7 @@ from uavctl.config import Config
 from uavctl.flight.controller import Controller
 from uavctl.flight.decision import CONTROLLER_FAULT
 from uavctl.flight.step import BIAS_AT_BOUND, BIAS_FREE, StepOutput, disbelieves, initial_state, step
-from uavctl.mavlink.connection import OVERRUN, MavlinkConnection
+from uavctl.mavlink.connection import HUNG_UP, OVERRUN, MavlinkConnection
 from uavctl.mavlink.handover import HAND_OVER_ORDERS, HandOver, HandoverStep
 from uavctl.mavlink.handover_guards import HandoverView, against_moving
 from uavctl.mavlink.handover_states import LEAVES_NONE, HandoverState, Sending
@@ -215,7 +215,7 @@ class ControlLoop:
         sent until it is heard again.
         """
         self._put("/uavctl/refused", at_ns, Refused(at_ns=at_ns, link=link, counts=counts))
-        if link == VEHICLE and OVERRUN in counts:
+        if link == VEHICLE and counts.keys() & {HUNG_UP, OVERRUN}:
             self._unsure_since_ns = at_ns
         for event in self._links[link].refused(counts, at_ns):
             self._put("/uavctl/event", at_ns, event)

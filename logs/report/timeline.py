@@ -19,7 +19,7 @@ from logs.report.excursion import trusted
 from logs.report.page import Mark
 from logs.report.plots import SEEN, VIEWS, span
 from logs.report.svg import WIDTH_IN, Drawing, canvas, colour, strokes
-from uavctl.records import ControlMode, Severity, SolveStatus
+from uavctl.records import ControlMode, Decision, Severity, SolveStatus
 
 WIDE_IN = 8.6
 MARKS = 400  # of one lane: more would touch each other
@@ -88,6 +88,17 @@ def timeline(flight: FlightData) -> tuple[Drawing, Drawing, tuple[Mark, ...], st
     return drawings[0], drawings[1], tuple(_untold(rows, flight)), f"What a lane shows: {meanings}."
 
 
+def _silent(flight: FlightData) -> Iterator[Decision]:
+    """Return the flown boundaries before which no position was taken since the one before."""
+    flown, came = {one.tick for one in flight.flown}, 0
+    for decision in flight.decisions:
+        came += decision.accepted
+        if decision.boundary:
+            if not came and decision.tick in flown:
+                yield decision
+            came = 0
+
+
 def _untold(rows: list[Lane], flight: FlightData) -> Iterator[Mark]:
     """Return legend entries for bars that are too short for their text on the narrow page."""
     shown_s = max(flight.duration_s, flight.design.dt_s)
@@ -102,15 +113,13 @@ def _untold(rows: list[Lane], flight: FlightData) -> Iterator[Mark]:
 
 def lanes(flight: FlightData) -> Iterator[Lane]:
     """Return the lanes that this flight has something for; each means one thing."""
-    flown, decisions = flight.flown, flight.decisions
+    decisions = flight.decisions
     plans = flight.flown_plans.values()
     yield Lane("controller", "what flew", tuple(_modes(flight)))
     found = (
         Lane("hand-over", "who is in charge", tuple(_hand_over(flight))),
         Lane("vehicle", "its own mode", tuple(_vehicle(flight))),
-        _marks(
-            flight, "no news", "lost", "a step without a new position", (d for d in flown if d.boundary and d.age_steps)
-        ),
+        _marks(flight, "no news", "lost", "a step without a new position", _silent(flight)),
         _marks(flight, "refused", "fallback", "a position that was not believed", (d for d in decisions if d.rejected)),
         _marks(
             flight,

@@ -327,7 +327,7 @@ def _link_text(found: LinkVerdict, independent: bool) -> str:
     news = found.news
     if not news.trials:
         return "No step was flown, so nothing is known of the link."
-    seen = f"News came in {100 * news.rate:.3g} % of {count(news.trials, 'step')}"
+    seen = f"News, a position captured within the step, came in {100 * news.rate:.3g} % of {count(news.trials, 'step')}"
     if found.promised_news is None:
         return f"{seen}; what was promised is not known any more."
     least = f"{100 * found.promised_news:.3g} %"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import msgspec
 import pytest
 from loopback_rig import Memory, shared_loop
@@ -65,10 +67,31 @@ def test_a_flight_in_figures() -> None:
     assert health.velocity_mps == dict(zip(("north", "east", "down"), estimate.mean[1::3], strict=True))
     assert health.target_m == dict(zip(("north", "east", "down"), decision.target[0::3], strict=True))
     assert health.age_s is not None and 0.0 < health.age_s < 0.5
-    assert health.loss is not None and health.loss < 0.2
+    assert health.loss == 0.0
     assert health.vehicle is not None and health.vehicle.mode == "OFFBOARD" and health.vehicle.heard_s <= 1.0
     assert health.lateness_us == 700.0 and health.missed_ticks == 0
     assert msgspec.json.decode(msgspec.json.encode(health), type=Health) == health
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("latency_s", [0.0, 0.12])  # steps of 0.05 s: no position is of its own step then
+def test_losses_are_those_of_the_link_whatever_the_age(latency_s: float) -> None:
+    flight = Flight("room", "link.loss=0.3", "link.jitter_s=0.0", f"link.delay_s={latency_s}", "sim.seed=4")
+    assert flight.run(20).loss is None  # a second is not over
+    told = []
+    for _ in range(12):
+        loss = flight.run(200).loss
+        assert loss is not None
+        told.append(loss)
+    assert sum(told) / len(told) == pytest.approx(0.3, abs=4.0 * math.sqrt(0.3 * 0.7 / 2400))
+
+
+@pytest.mark.slow
+def test_without_positions_the_losses_rise_to_all() -> None:
+    flight = Flight("room", "link.loss=0.0", "sim.camera.occluded=[[5.0,30.0]]")
+    assert flight.run(20).loss is None and flight.run(61).loss == 0.0
+    assert flight.run(100).loss == pytest.approx(4.1 / 9.0, abs=0.02)
+    assert flight.run(160).loss == 1.0
 
 
 def test_a_plant_of_two_axes_leaves_the_third_out() -> None:

@@ -116,20 +116,22 @@ def test_a_take_over_in_a_backlog_counts_before_anything_goes_out_whatever_comes
 
 @pytest.mark.slow
 @pytest.mark.fault(50)
-def test_where_the_vehicle_s_words_were_lost_nothing_goes_out_until_it_is_heard_again() -> None:
+@pytest.mark.parametrize("why", ["overrun", "hung-up"])
+def test_where_the_vehicle_s_words_were_lost_nothing_goes_out_until_it_is_heard_again(why: str) -> None:
     rig = Rig('solver.method="exact"')
     rig.run(40)
-    rig.loop.refused("mocap", {"overrun": 3}, rig.tick * TICK_NS)  # of the cameras': nothing that could be the pilot's
+    rig.loop.refused("mocap", {why: 3}, rig.tick * TICK_NS)  # of the cameras': nothing that could be the pilot's
     assert rig.run(5, deaf=True).count(SETPOINT) == 5
     rig.heartbeat(OFFBOARD)
-    rig.loop.refused("vehicle", {"overrun": 3}, rig.tick * TICK_NS)
+    rig.loop.refused("vehicle", {why: 3}, rig.tick * TICK_NS)
     silent = rig.run(20, deaf=True)
     assert not {SETPOINT, LAND} & set(silent)
     rig.heartbeat(OFFBOARD, late_ns=1)
     assert rig.run(20, deaf=True).count(SETPOINT) == 20
-    rig.loop.refused("vehicle", {"overrun": 1}, rig.tick * TICK_NS)
+    rig.loop.refused("vehicle", {why: 1}, rig.tick * TICK_NS)
     rig.heartbeat(HOLD_MODE, late_ns=1)
     assert SETPOINT not in rig.run(60, deaf=True)
+    assert any("closed the connection" in event.text for event in rig.memory.of(Event)) == (why == "hung-up")
     result = replay(iter(rig.memory.entries), lambda sink: make_loop(rig.config, sink))
     assert result.identical, result.first_difference
 

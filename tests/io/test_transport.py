@@ -11,12 +11,13 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 
 import pytest
-from patience import LIMIT_S
+from patience import LIMIT_S, until
 from transport_rig import FRAME, LIMIT_NS, Clock, port_of
 
 from uavctl.errors import ConnectionSpecError
 from uavctl.io.base import Connection
-from uavctl.io.transport import PEER_SILENCE_NS, open_connection, wait
+from uavctl.io.transport import PEER_SILENCE_NS, RETRY_NS, open_connection, wait
+from uavctl.mavlink.connection import HUNG_UP
 
 
 @contextmanager
@@ -34,10 +35,15 @@ def udp() -> Iterator[socket.socket]:
 
 
 def arrived(connection: Connection, at_least: int = 1) -> list[bytes]:
-    """Data that arrives, waited for."""
+    """Data that arrives, waited for while there is a connection."""
     got: list[bytes] = []
     deadline_ns = time.monotonic_ns() + LIMIT_NS
-    while sum(map(len, got)) < at_least and not connection.closed and wait({"it": connection}, deadline_ns):
+    while (
+        sum(map(len, got)) < at_least
+        and not connection.closed
+        and connection.filenos()
+        and wait({"it": connection}, deadline_ns)
+    ):
         got += [data for data, _ in connection.receive()]
     return got
 
@@ -145,7 +151,7 @@ def test_udpout_survives_a_peer_that_is_not_there() -> None:
         assert not connection.closed
 
 
-def test_tcp_carries_bytes_both_ways_and_reports_the_end() -> None:
+def test_tcp_carries_bytes_both_ways_and_counts_the_end() -> None:
     with (
         socket.create_server(("127.0.0.1", 0)) as server,
         opened(f"tcp://127.0.0.1:{server.getsockname()[1]}") as connection,
@@ -159,9 +165,45 @@ def test_tcp_carries_bytes_both_ways_and_reports_the_end() -> None:
             assert b"".join(arrived(connection, 12)) == FRAME * 4
             assert not connection.closed
         assert arrived(connection) == []
-        assert connection.closed
+        assert connection.refused == {HUNG_UP: 1} and not connection.closed
         connection.send(FRAME)  # no error into the loop
+        assert connection.send_errors == 1
         assert wait({"it": connection}, time.monotonic_ns()) == []
+
+
+def test_tcp_calls_a_peer_again_that_has_hung_up_and_never_waits_for_it() -> None:
+    clock = [0]
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = server.getsockname()
+        connection = open_connection(f"tcp://127.0.0.1:{address[1]}", lambda: clock[0])
+        peer, _ = server.accept()
+        peer.settimeout(LIMIT_S)
+        half = bytes(2048)
+        while connection.send_errors == 0:  # until something of a frame waits
+            connection.send(half)
+        peer.close()
+    with closing(connection):
+        until(lambda: connection.receive() == [] and bool(connection.refused), "the end is noticed")
+        for _ in range(3):  # nobody listens
+            clock[0] += RETRY_NS
+            assert connection.receive() == [] and wait({"it": connection}, time.monotonic_ns()) == []
+        with socket.create_server(address) as server:
+            assert connection.receive() == []  # its time has not come
+            server.settimeout(0.0)
+            with pytest.raises(BlockingIOError):
+                server.accept()
+            clock[0] += RETRY_NS
+            connection.receive()
+            server.settimeout(LIMIT_S)
+            peer, _ = server.accept()
+            with peer:
+                peer.settimeout(LIMIT_S)
+                until(lambda: connection.receive() == [] and connection.filenos() != (), "the connection stands")
+                peer.sendall(FRAME)
+                assert b"".join(arrived(connection, len(FRAME))) == FRAME
+                connection.send(FRAME)
+                assert peer.recv(4096) == FRAME  # nothing of what waited for the one before
+        assert connection.refused == {HUNG_UP: 1}
 
 
 def test_tcp_never_cuts_a_frame_when_the_peer_does_not_read() -> None:

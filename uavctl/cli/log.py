@@ -170,9 +170,10 @@ def _parameters(told: Mapping[str, VehicleParameter], count: int | None) -> Iter
 
 def _loss(loss: PositionLoss) -> Iterator[str]:
     if loss.believed is not None:
-        bursts = ", in bursts" if loss.bursts else ""
-        promise = ", more than promised" if loss.below_promise else ""
-        yield f"positions: {100 * loss.believed:.0f} % of the steps without news, as last estimated{bursts}{promise}"
+        bursts = ", lost in bursts" if loss.bursts else ""
+        promise = ", fewer than promised" if loss.below_promise else ""
+        own = f"{100 * (1.0 - loss.believed):.0f} % of the steps"
+        yield f"positions: {own} had one captured within them, as last estimated{promise}{bursts}"
     if loss.simulated_sent:
         yield f"simulated channel: {loss.simulated_lost} of {loss.simulated_sent} positions lost"
 

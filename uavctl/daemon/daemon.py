@@ -20,7 +20,7 @@ from uavctl.errors import ConnectionClosedError
 from uavctl.io.base import Connection
 from uavctl.io.transport import wait
 from uavctl.loop import SECOND_NS, VEHICLE, ControlLoop
-from uavctl.mavlink.connection import OVERRUN
+from uavctl.mavlink.connection import HUNG_UP, OVERRUN
 from uavctl.outcome import Cause
 from uavctl.records import Event, Outgoing, Ticked
 
@@ -299,8 +299,9 @@ class _Refusals:
         self._next_ns = 0
 
     def tell(self, at_ns: int, *, last: bool = False) -> None:
-        """Tell what is new if a second has passed, or this is the last call."""
-        if at_ns < self._next_ns and not last:
+        """Tell what is new if a second has passed, a peer has hung up, or this is the last call."""
+        hung_up = any(one.refused[HUNG_UP] > self._told[name][HUNG_UP] for name, one in self._connections.items())
+        if at_ns < self._next_ns and not hung_up and not last:
             return
         self._next_ns = at_ns + SECOND_NS
         for name, connection in self._connections.items():

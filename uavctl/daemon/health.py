@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
+from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Protocol
@@ -15,12 +16,13 @@ from uavctl.config.checks import position_index
 from uavctl.errors import UsageError
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.outcome import FlightCourse
-from uavctl.records import ControlMode, LinkEstimate, RelayStats, Ticked, Vector, VehicleStatus
+from uavctl.records import ControlMode, RelayStats, Ticked, Vector, VehicleStatus
 
 # State of a flight, once a second: for a person, for `uavctl ctl status`, for the service manager.
 
 
 PERIOD_NS = 1_000_000_000
+LOSS_PERIODS = 10  # over which losses are counted
 
 
 class RecorderHealth(msgspec.Struct, frozen=True, kw_only=True):
@@ -70,7 +72,7 @@ class Health(msgspec.Struct, frozen=True, kw_only=True):
     velocity_mps: dict[str, float] | None
     target_m: dict[str, float] | None
     waypoint: int | None
-    loss: float | None  # share of the steps Δt without a position, as believed
+    loss: float | None  # share of the positions counted on that did not come lately; None in the first second
     lateness_us: float  # largest of the last second
     missed_ticks: int  # since the start
     vehicle: VehicleHealth | None
@@ -123,7 +125,10 @@ class HealthWatch:
         speeds = config.plant.velocity_index if config.plant.model == "matrices" else [i + 1 for _, i in self._axes]
         self._speed_axes = tuple(zip(config.plant.axes, speeds, strict=True))
         self._ticked: Ticked | None = None  # the last tick
-        self._link: LinkEstimate | None = None  # the last one that there was
+        self._rate_hz = config.source.rate_hz or 1.0 / config.plant.dt_s
+        self._came = 0  # positions, since the start
+        self._came_by: deque[tuple[int, int]] = deque(maxlen=LOSS_PERIODS + 1)  # at_ns, came; once a period
+        self._loss: float | None = None
         self._begun_ns: int | None = None
         self._now_ns = 0
         self._told_ns = 0
@@ -136,11 +141,13 @@ class HealthWatch:
 
     def after_tick(self, ticked: Ticked, lateness_ns: int) -> None:
         """The control loop has run a tick."""
-        self._ticked, self._link = ticked, ticked.link or self._link
+        self._ticked = ticked
         at_ns = ticked.decision.at_ns
         if self._begun_ns is None:
             self._begun_ns = self._told_ns = at_ns
+            self._came_by.append((at_ns, 0))
         self._now_ns = at_ns
+        self._came += ticked.decision.accepted + ticked.decision.rejected
         self._missed += ticked.decision.missed_ticks
         self._worst_ns = max(self._worst_ns, lateness_ns)
         if self._flight.let_go and not self._let_go:
@@ -148,6 +155,7 @@ class HealthWatch:
             self._tell(f"error: the vehicle is let go: {self._let_go}")
         if at_ns - self._told_ns >= PERIOD_NS:
             self._told_ns = at_ns
+            self._count_losses()
             self._worst_before_ns, self._worst_ns = self._worst_ns, 0
             relay = self._flight.relay
             if relay is not None:
@@ -155,6 +163,12 @@ class HealthWatch:
             health = self.look()
             self._alarm(health.recorder)
             self._tell(line(health))
+
+    def _count_losses(self) -> None:
+        since_ns, before = self._came_by[0]
+        expected = self._rate_hz * (self._now_ns - since_ns) * 1e-9
+        self._loss = max(0.0, 1.0 - (self._came - before) / expected)
+        self._came_by.append((self._now_ns, self._came))
 
     def _alarm(self, recorder: RecorderHealth) -> None:
         """Report each change of the recording's health once, in a line of its own."""
@@ -167,7 +181,7 @@ class HealthWatch:
 
     def look(self) -> Health:
         """The flight as it is now."""
-        flight, recorder, ticked, link = self._flight, self._recorder(), self._ticked, self._link
+        flight, recorder, ticked = self._flight, self._recorder(), self._ticked
         decision, estimate, vehicle = (
             (None, None, None) if ticked is None else (ticked.decision, ticked.estimate, ticked.vehicle)
         )
@@ -186,7 +200,7 @@ class HealthWatch:
             velocity_mps=_along(self._speed_axes, mean),
             target_m=None if decision is None else _along(self._axes, decision.target),
             waypoint=None if decision is None else decision.waypoint,
-            loss=None if link is None else 1.0 - link.arrival_mean,
+            loss=self._loss,
             lateness_us=max(self._worst_ns, self._worst_before_ns) * 1e-3,
             missed_ticks=self._missed,
             vehicle=None if vehicle is None else _vehicle(vehicle, self._now_ns),

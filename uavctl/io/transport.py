@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import select
 import socket
@@ -18,6 +19,7 @@ import serial
 from uavctl.errors import ConnectionSpecError
 from uavctl.io.admission import MAGIC, NOT_LISTED, SILENCE_NS, Address, AllowList, Budgets, Rules
 from uavctl.io.base import BACKLOG_READS, MAX_READS, Base, Connection
+from uavctl.mavlink.connection import HUNG_UP
 
 # UDP: an allow-list and budgets come before anything that looks into a datagram.
 
@@ -300,6 +302,7 @@ def _share_port(sockets: Iterable[socket.socket], *, shared: bool) -> None:
 
 
 CONNECT_TIMEOUT_S = 5.0
+RETRY_NS = 1_000_000_000  # from the end of a connection, or of an attempt, to the next attempt
 CHUNK_BYTES = 4096
 MAX_CHUNKS = 4  # of one call, so that a flood cannot hold the loop; what waits is read in the next one
 BACKLOG_CHUNKS = 128  # of a call that is to read everything; the other side waits, and loses nothing
@@ -323,24 +326,62 @@ class _Pending:
 
 
 class Tcp(Socket):
-    """TCP client; not connected again once the peer has gone."""
+    """TCP client; a peer that has hung up is called again each second, and nobody waits for it."""
 
-    ends_on_error = True
     max_reads = MAX_CHUNKS
     backlog_reads = BACKLOG_CHUNKS
 
     def __init__(self, url: str, family: socket.AddressFamily, address: Address, now: Callable[[], int]) -> None:
         super().__init__(url, family, socket.SOCK_STREAM, now)
+        self._family, self._address = family, address
         self._pending = _Pending()
+        self._up = True
+        self._tried_ns = 0  # when the last attempt began, or the connection ended
         self._socket.settimeout(CONNECT_TIMEOUT_S)
         self._attempt(self._socket.connect, address, "is the vehicle or simulator running and listening there?")
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._socket.setblocking(False)
 
+    def filenos(self) -> tuple[int, ...]:
+        """See `Connection`; none while there is no connection, which would count as something to read."""
+        return (self._socket.fileno(),) if self._up else ()
+
     def _read(self) -> bytes | None:
-        data = self._socket.recv(CHUNK_BYTES)
-        self.closed = not data
+        if not self._up:
+            self._call()
+        try:
+            data = self._socket.recv(CHUNK_BYTES)
+        except BlockingIOError:
+            raise
+        except OSError:
+            self._hang_up()
+            raise
+        if not data:
+            self._hang_up()
         return data or None
+
+    def _hang_up(self) -> None:
+        self._socket.close()
+        self._up, self._tried_ns = False, self._now()
+        self._pending = _Pending()  # a frame of which the peer has had the beginning
+        self.refused[HUNG_UP] += 1
+
+    def _call(self) -> None:
+        """Begin an attempt to connect, or go on with it; BlockingIOError while there is no connection."""
+        late = self._now() - self._tried_ns >= RETRY_NS
+        if self._socket.fileno() < 0:
+            if not late:
+                raise BlockingIOError
+            self._tried_ns, late = self._now(), False
+            self._socket = socket.socket(self._family, socket.SOCK_STREAM)
+            self._socket.setblocking(False)
+            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        state = self._socket.connect_ex(self._address)
+        self._up = state in (0, errno.EISCONN)
+        if not self._up:
+            if late or state not in (errno.EINPROGRESS, errno.EALREADY):
+                self._socket.close()
+            raise BlockingIOError
 
     def send(self, data: bytes) -> None:
         """See `Connection`."""
@@ -406,7 +447,7 @@ class SerialConnection(Base):
 #     tcp://HOST:PORT           connect
 #     serial:///dev/NAME:BAUD   open a serial port
 #
-# Nothing here raises once a connection is open: errors are counted, a lost connection shows as `closed`.
+# Nothing here raises once a connection is open: errors are counted, a lost serial port shows as `closed`.
 
 
 FORMS = "udpin://HOST:PORT, udpout://HOST:PORT, tcp://HOST:PORT or serial:///dev/NAME:BAUD"

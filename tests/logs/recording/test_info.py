@@ -178,7 +178,7 @@ def test_links_losses_and_what_the_recorder_said(tmp_path: Path) -> None:
         "20 datagrams, 18 messages, 2 positions",
         "bad: 2 checksum",
         "refused: 4 address, 3 rate",
-        "30 % of the steps",
+        "70 % of the steps",
         "in bursts",
         "9 of 50 positions lost",
     ):
