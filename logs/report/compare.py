@@ -12,6 +12,7 @@ from string import ascii_uppercase
 
 import msgspec
 import numpy as np
+from markupsafe import Markup
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -535,7 +536,7 @@ def _limits(flight: FlightData, axis: str) -> list[float]:
     return [side for side in position_limits(flight.design, axis) if np.isfinite(side)]
 
 
-def _sides(found: FlightComparison) -> str:
+def _sides(found: FlightComparison) -> Markup:
     return page.facts(
         (
             one.name,
@@ -545,13 +546,13 @@ def _sides(found: FlightComparison) -> str:
     )
 
 
-def _figures(found: FlightComparison) -> str:
+def _figures(found: FlightComparison) -> Markup:
     others = range(1, len(found.recordings))
     parts = [others[begin : begin + _OTHERS_OF_A_TABLE] for begin in range(0, len(others), _OTHERS_OF_A_TABLE)]
-    return "".join(_figures_of(found, part) for part in parts)
+    return page.joined(_figures_of(found, part) for part in parts)
 
 
-def _figures_of(found: FlightComparison, others: Sequence[int]) -> str:
+def _figures_of(found: FlightComparison, others: Sequence[int]) -> Markup:
     """Return a table of the first flight's figures beside those of some others."""
     names = {place: found.recordings[place].name for place in others}
     columns = ["figure", "A"]
@@ -566,7 +567,7 @@ def _figures_of(found: FlightComparison, others: Sequence[int]) -> str:
     return page.table(columns, rows, frozenset(range(1, len(columns))))
 
 
-def _parameter_table(found: FlightComparison) -> str:
+def _parameter_table(found: FlightComparison) -> Markup:
     if not found.parameters:
         return page.paragraph("None.")
     columns = ["parameter", *(one.name for one in found.recordings)]

@@ -55,14 +55,14 @@ def origin_sections(flight: FlightData) -> Iterator[PageSection]:
     assumptions = list(_assumptions(flight.header.design))
     if assumptions:
         columns = ("assumption", "value", "limit", "holds")
-        parts.append(page.table_folded("Assumptions of the design", columns, assumptions, frozenset({1, 2})))
+        parts.append(page.folded("Assumptions of the design", page.table(columns, assumptions, frozenset({1, 2}))))
     if flight.checks:
         columns = ("check before arming", "state", "found", "wanted")
         found = [(one.name, one.state, one.value, one.want) for one in flight.checks]
-        parts.append(page.table_folded("Checked before arming", columns, found, frozenset()))
+        parts.append(page.folded("Checked before arming", page.table(columns, found, frozenset())))
     header = flight.header
     parts.append(page.folded("Configuration", header.config_toml))
-    yield PageSection("Configuration and parameters", "", "".join(parts))
+    yield PageSection("Configuration and parameters", "", page.joined(parts))
     made = [("Design", header.design_id), ("Processor", header.cpu), *sorted(header.versions.items())]
     yield PageSection("Made with", "", page.facts(made))
 
@@ -164,7 +164,7 @@ def _risk(verdicts: Verdicts) -> PageSection:
         "(Clopper and Pearson), all limits together. A promise holds for all limits of the states, or of the inputs, "
         "at once."
     )
-    return PageSection("Verdict: promised risk against measured", note, "".join(body))
+    return PageSection("Verdict: promised risk against measured", note, page.joined(body))
 
 
 def _risk_row(one: LimitRisk) -> tuple[str, ...]:
@@ -211,7 +211,7 @@ def _model(flight: FlightData, judged: Judged) -> PageSection:
             )
             for one in verdict.leads
         ]
-        body.append(page.table_folded("Ellipsoids in figures", ahead, rows, frozenset({0, 1, 2, 3})))
+        body.append(page.folded("Ellipsoids in figures", page.table(ahead, rows, frozenset({0, 1, 2, 3}))))
     note = (
         "The flight's filter is run again over all positions it used, in the order of capture. An error is a position "
         "minus what those before it foretell; if the model is right, errors are as large as foretold (1 ×), zero on "
@@ -219,7 +219,7 @@ def _model(flight: FlightData, judged: Judged) -> PageSection:
         "the inputs that were then flown. ✗ refutes the model; ○ departs from it on the cautious side."
     )
     legend = (_PREDICTED, _BAND, Mark("dashed", "limit", "promised")) if drawings else ()
-    return PageSection(title, note, "".join(body), legend)
+    return PageSection(title, note, page.joined(body), legend)
 
 
 def _axis_row(one: AxisVerdict) -> tuple[str, ...]:
@@ -251,7 +251,7 @@ def _clocks(flight: FlightData, verdicts: Verdicts) -> PageSection:
         body.append(page.table(columns, [_clock_row(one) for one in verdicts.clocks], frozenset({2, 3, 4, 5})))
     if drawings:
         body.append(page.grid(drawings))
-    return PageSection("Verdict: clocks", note, "".join(body))
+    return PageSection("Verdict: clocks", note, page.joined(body))
 
 
 def _clock_row(one: ClockVerdict) -> tuple[str, ...]:

@@ -7,6 +7,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+from markupsafe import Markup
 
 from logs.recording.design_view import AXIS_NUMBER, Floats
 from logs.recording.disk import write_whole
@@ -223,14 +224,14 @@ def _sections(flight: MavlinkFlight) -> Iterator[PageSection]:
     yield PageSection("Texts of the vehicle", "", _table(("at [s]", "severity", "text"), texts))
     messages = [(name, str(number)) for name, number in info.messages.items()]
     parameters = [(name, str(one.value), one.type) for name, one in info.parameters.items()]
-    folded = page.table_folded("Messages", ("message", "number"), messages, frozenset({1}))
+    folded = page.folded("Messages", page.table(("message", "number"), messages, frozenset({1})))
     if parameters:
         columns = ("parameter", "value", "type")
-        folded += page.table_folded("Parameters of the vehicle", columns, parameters, frozenset({1}))
+        folded += page.folded("Parameters of the vehicle", page.table(columns, parameters, frozenset({1})))
     yield PageSection("What is in it", "", folded)
 
 
-def _table(columns: Sequence[str], rows: Sequence[tuple[str, ...]]) -> str:
+def _table(columns: Sequence[str], rows: Sequence[tuple[str, ...]]) -> Markup:
     return page.table(columns, rows, frozenset({0})) if rows else page.paragraph(_NONE)
 
 

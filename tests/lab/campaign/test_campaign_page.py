@@ -14,10 +14,11 @@ from campaign_results import cell, runs, write
 from report_rig import unwritten
 from told_numbers import numbers_in
 
+from logs.report.page import legend
 from logs.report.statistics import PairedDifference
 from uavctl.errors import UavctlError
 from uavctl.lab.campaign.page import CampaignView, story, write_report
-from uavctl.lab.campaign.plots import Looks, legend
+from uavctl.lab.campaign.plots import Looks
 from uavctl.lab.campaign.results import (
     CampaignVerdict,
     brief,
@@ -273,8 +274,8 @@ def test_numbers_below_the_axis_of_differences_do_not_touch(tmp_path: Path) -> N
 
 def test_a_legend_has_the_markers_of_its_figure() -> None:
     looks = Looks(tuple(f"controller {place}" for place in range(12)))
-    entries = {name: look for look, name in looks.entries(looks.controllers)}
-    assert len({(look.role, look.marker, look.full) for look in entries.values()}) == 12
-    drawn = re.findall(r"<li>.*?</li>", legend(looks.entries(looks.controllers)))
+    entries = list(looks.entries(looks.controllers))
+    assert len({(one.role, one.path, one.full) for one in entries}) == 12
+    drawn = re.findall(r"<li>.*?</li>", legend(entries))
     assert len({re.sub(r"controller \d+", "", one) for one in drawn}) == 12
-    assert all(f"var(--{look.role})" in one for look, one in zip(entries.values(), drawn, strict=True))
+    assert all(f"var(--{one.role})" in text and one.path in text for one, text in zip(entries, drawn, strict=True))

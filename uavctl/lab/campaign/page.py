@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from html import escape
 from pathlib import Path
 from typing import Self
+
+from markupsafe import Markup
 
 from logs.recording.summary import count
 from logs.report import page
 from logs.report.excursion import GRAVE_M
-from logs.report.page import PageSection
+from logs.report.page import Mark, PageSection
 from logs.report.statistics import Pair
 from uavctl.errors import UavctlError
 from uavctl.lab.campaign import plots
-from uavctl.lab.campaign.plots import Looks, legend
+from uavctl.lab.campaign.plots import Looks
 from uavctl.lab.campaign.results import (
     SMPC,
     CampaignVerdict,
@@ -123,14 +124,14 @@ def _judged(view: CampaignView) -> tuple[list[CellSummary], list[CellSummary], l
     return kept, above, over
 
 
-def _main(view: CampaignView) -> str:
+def _main(view: CampaignView) -> Markup:
     """Return the line on what matters most as HTML: failures, else whether promises were kept."""
     kept, above, over = _judged(view)
     failed, flown = sum(cell.failed for cell in view.cells), sum(cell.runs for cell in view.cells)
     if failed:
         return page.banner("bad", "Runs failed", f"{failed} of {count(flown, 'run')}; they are in no figure.", ())
     if not kept:
-        return ""
+        return page.NOTHING
     worst = max(kept, key=lambda cell: (cell.violation_rate or 0.0) / (cell.promised_x or 1.0))
     most = (
         f"the most was {percent(worst.violation_rate)} of steps where {percent(worst.promised_x)} are allowed "
@@ -223,12 +224,12 @@ def _write(folder: Path, text: str) -> Path:
     return path
 
 
-def _specification(folder: Path) -> str:
+def _specification(folder: Path) -> Markup:
     """Return the campaign's file as folded HTML; empty where it is missing."""
     try:
         return page.folded("Specification", (folder / SPECIFICATION).read_text(encoding="utf-8"))
     except OSError:
-        return ""
+        return page.NOTHING
 
 
 def report_html(results: Results) -> str:
@@ -277,11 +278,12 @@ def _verdict_section(view: CampaignView) -> PageSection:
         said = {one.baseline.controller: brief(one) for one in verdict.comparisons}
         if verdict.comparisons:
             rows.append((name, word_of(verdict), *(said.get(baseline, "–") for baseline in baselines)))
-        sentences = "".join(f"<li>{escape(sentence)}</li>" for sentence in in_words(verdict))
-        words.append(f'<p><strong>{escape(name)}</strong></p><ul class="story">{sentences}</ul>')
-    table = _table(("", "best at its rate", *baselines), rows, frozenset()) if rows else ""
-    body = f"{table}<details><summary>In words, with figures and reasons</summary>{''.join(words)}</details>"
-    return PageSection(_QUESTION, _VERDICT, body)
+        words += [page.strong(name), page.listed(in_words(verdict))]
+    folded = page.folded("In words, with figures and reasons", page.joined(words))
+    if not rows:
+        return PageSection(_QUESTION, _VERDICT, folded)
+    columns = ("", "best at its rate", *baselines)
+    return PageSection(_QUESTION, _VERDICT, page.table(columns, rows, frozenset(), dense=True) + folded)
 
 
 def _name(view: CampaignView, verdict: CampaignVerdict) -> str:
@@ -300,7 +302,7 @@ def _scene_section(
     if drawings:
         note = "" if key != "s0" else _HOW_SURE + " An arrow stands at the upper end of the interval of a rate of zero."
         flown = {cell.controller for cell in cells if cell.cost is not None}
-        body = legend(view.looks.entries(flown), limit=_PROMISED) + page.grid(drawings)
+        body = page.legend([*view.looks.entries(flown), Mark("dashed", "limit", _PROMISED)]) + page.grid(drawings)
         yield PageSection(f"Costs and limits{_suffix(view, scene)}", note, body)
 
 
@@ -317,8 +319,10 @@ def _difference_section(view: CampaignView) -> PageSection:
     if not drawings:
         return PageSection(_DIFFERENCE, "", page.paragraph("There is nothing to compare."))
     who = {one.baseline.controller for one in compared}
-    cross = "" if all(one.as_safe for one in compared) else "the SMPC breaks limits more often"
-    body = legend(view.looks.entries(who), cross=cross) + page.grid(drawings)
+    marks = [*view.looks.entries(who)]
+    if not all(one.as_safe for one in compared):
+        marks.append(Mark("cross", "ink", "the SMPC breaks limits more often"))
+    body = page.legend(marks) + page.grid(drawings)
     return PageSection(_DIFFERENCE, _DIFFERENCES, body)
 
 
@@ -333,7 +337,7 @@ def _age_section(view: CampaignView) -> PageSection:
     if not any(cell.ages for cell in view.cells):
         return PageSection("Age of information", "", page.paragraph("No run ended in order."))
     figures = page.wide_or_narrow(*plots.ages(view.cells, view.results))
-    return PageSection("Age of information", note, legend(plots.age_entries(view.cells)) + figures)
+    return PageSection("Age of information", note, page.legend(plots.age_entries(view.cells)) + figures)
 
 
 def _ways_section(view: CampaignView) -> Iterator[PageSection]:
@@ -365,7 +369,7 @@ def _ways_section(view: CampaignView) -> Iterator[PageSection]:
         "second half of a run, median. Beyond a wall: furthest of all runs; negative is the room that was left. Usable "
         "room: share of it in which a plan may rest."
     )
-    yield PageSection("Through the room", note, _table(columns, rows, frozenset(range(2, 7))))
+    yield PageSection("Through the room", note, page.table(columns, rows, frozenset(range(2, 7)), dense=True))
 
 
 _COLUMNS = (
@@ -379,15 +383,15 @@ def _cells_section(view: CampaignView) -> PageSection:
     for group, cells in view.groups.items():
         rows = [_row(cell) for cell in cells if not cell.refused]
         refused = [f"{cell.index} {cell.controller}: no design; {cell.refused}" for cell in cells if cell.refused]
-        body = _table(_COLUMNS, rows, frozenset(range(len(_COLUMNS))) - {1}, refused)
-        tables.append(f"<details><summary>{escape(view.place(group))}</summary>{body}</details>")
+        body = page.table(_COLUMNS, rows, frozenset(range(len(_COLUMNS))) - {1}, refused, dense=True)
+        tables.append(page.folded(view.place(group), body))
     note = (
         "States and inputs outside: share of steps. Worst step: share of runs with a state outside in the step with "
         "the most, its exact interval for all steps at once (Bonferroni). Runs with any: share of runs with a state "
         "outside. No plan left: steps in which the SMPC braked. No plan found, limits eased: decisions. Oldest: "
         "largest age in steps."
     )
-    return PageSection("All figures", note, "".join(tables))
+    return PageSection("All figures", note, page.joined(tables))
 
 
 def _row(cell: CellSummary) -> tuple[str, ...]:
@@ -431,18 +435,9 @@ def _failures_section(view: CampaignView) -> PageSection:
     ]
     shown = failed[:_SHOWN_FAILURES]
     columns = ("cell", "controller", "where", "run", "what ended it")
-    body = _table(columns, shown, frozenset({0, 3})) if shown else page.paragraph("There were none.")
+    body = page.table(columns, shown, frozenset({0, 3}), dense=True) if shown else page.paragraph("There were none.")
     note = "" if len(shown) == len(failed) else f"The first {len(shown)} of {len(failed)}; runs.parquet has all."
     return PageSection("Runs that failed", note, body)
-
-
-def _table(
-    columns: Sequence[str], rows: Iterable[Sequence[str]], numbers: frozenset[int], remarks: Iterable[str] = ()
-) -> str:
-    """Return a table of many columns as HTML, in small print, with remarks as rows of their own below."""
-    text = page.table(columns, rows, numbers).replace('class="many"', 'class="many dense"', 1)
-    below = "".join(f'<tr><td colspan="{len(columns)}">{escape(remark)}</td></tr>' for remark in remarks)
-    return text.replace("</tbody>", f"{below}</tbody>", 1)
 
 
 # The page of a campaign in the world of the quadrotor: one HTML file, complete in itself.
@@ -473,14 +468,14 @@ def write_trial_report(folder: Path) -> Path:
     return _write(folder, trial_html(*summarise_trial(folder), _specification(folder)))
 
 
-def trial_html(told: ToldTrial, cells: Sequence[TrialSummary], specification: str = "") -> str:
+def trial_html(told: ToldTrial, cells: Sequence[TrialSummary], specification: Markup = page.NOTHING) -> str:
     """Return the page of a campaign of trials as HTML."""
     subtitle = f"{count(len(cells), 'cell')} · seed {told.master} · uavctl {told.uavctl_version}"
     title, sections = f"Campaign “{told.name}”", _trial_sections(told, cells, specification)
     return page.page(title, subtitle, _story(cells), sections, top=_trial_main(cells))
 
 
-def _trial_main(cells: Sequence[TrialSummary]) -> str:
+def _trial_main(cells: Sequence[TrialSummary]) -> Markup:
     """Return the line on what matters most as HTML: failures, else the furthest beyond a wall that any flight was."""
     failed = sum(cell.failed for cell in cells)
     runs = sum(cell.runs for cell in cells)
@@ -493,7 +488,7 @@ def _trial_main(cells: Sequence[TrialSummary]) -> str:
         if math.isfinite(value)
     ]
     if not beyond:
-        return ""
+        return page.NOTHING
     worst_m, worst = max(beyond, key=lambda one: one[0])
     where = f"{worst.place.controller}, {_TITLES[worst.place.scenario].lower()}, {', '.join(_where(worst))}"
     left = sum(value > 0.0 for value, _ in beyond)
@@ -535,7 +530,7 @@ def _where(cell: TrialSummary) -> tuple[str, ...]:
     return place.autopilot, f"{place.rate_hz:g} Hz", place.link, place.air
 
 
-def _trial_sections(told: ToldTrial, cells: Sequence[TrialSummary], specification: str) -> Iterator[PageSection]:
+def _trial_sections(told: ToldTrial, cells: Sequence[TrialSummary], specification: Markup) -> Iterator[PageSection]:
     rows = [
         ("Flights of a cell", str(told.runs)),
         ("Seed", f"{told.master}; flight i of every cell has the draws of (seed, i)"),
@@ -558,7 +553,7 @@ def _trial_sections(told: ToldTrial, cells: Sequence[TrialSummary], specificatio
             )
             for cell in mine
         ]
-        body = _table(columns, table, frozenset(range(5, 5 + len(shown))))
+        body = page.table(columns, table, frozenset(range(5, 5 + len(shown))), dense=True)
         yield PageSection(_TITLES[scenario], MEANING if number == 0 else "", body)
     yield _amiss(cells)
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
-from html import escape
 from textwrap import fill
 
 import numpy as np
@@ -13,6 +12,7 @@ from matplotlib.markers import CARETDOWNBASE, CARETLEFTBASE
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, SymmetricalLogLocator
 
 from logs.report.figures import WIDE_IN
+from logs.report.page import Mark
 from logs.report.plots import DASHED, DOTTED
 from logs.report.statistics import Pair
 from logs.report.svg import WIDTH_IN, Drawing, canvas, colour
@@ -40,32 +40,9 @@ class MarkerStyle:
     marker: str
     full: bool
 
-
-def legend(entries: Iterable[tuple[MarkerStyle, str]], limit: str = "", cross: str = "") -> str:
-    """Return a legend as HTML.
-
-    Args:
-        limit: Meaning of a dashed line; empty without one.
-        cross: Meaning of a cross instead of a marker; empty without one.
-    """
-    items = [(_swatch(look), text) for look, text in entries]
-    if limit:
-        items.append(('<path d="M1 7H25" style="stroke:var(--limit);stroke-width:2.2;stroke-dasharray:6 4"/>', limit))
-    if cross:
-        items.append(('<path d="M9 3l8 8M17 3l-8 8" style="stroke:var(--ink);stroke-width:2.2"/>', cross))
-    rows = "".join(
-        f'<li><svg viewBox="0 0 26 14" aria-hidden="true">{drawn}</svg>{escape(text)}</li>' for drawn, text in items
-    )
-    return f'<ul class="legend">{rows}</ul>'
-
-
-def _swatch(look: MarkerStyle) -> str:
-    paint = f"var(--{look.role})"
-    face = paint if look.full else "var(--card)"
-    return (
-        f'<path d="M1 7H25" style="stroke:{paint};stroke-width:2.2"/>'
-        f'<path d="{_SHAPES[look.marker]}" style="fill:{face};stroke:{paint};stroke-width:1.4"/>'
-    )
+    def meaning(self, text: str) -> Mark:
+        """Return the legend's entry of what has this style."""
+        return Mark("marker", self.role, text, _SHAPES[self.marker], self.full)
 
 
 # Rows of a figure, one a link, with the names of the links beside the axis.
@@ -168,9 +145,9 @@ class Looks:
         """Return the style of a controller."""
         return _LOOKS[self.controllers.index(controller) % len(_LOOKS)]
 
-    def entries(self, shown: Collection[str]) -> Iterator[tuple[MarkerStyle, str]]:
+    def entries(self, shown: Collection[str]) -> Iterator[Mark]:
         """Return the legend's entries of the controllers shown."""
-        return ((self.of(name), name) for name in self.controllers if name in shown)
+        return (self.of(name).meaning(name) for name in self.controllers if name in shown)
 
 
 @dataclass(frozen=True)
@@ -343,10 +320,10 @@ def _tails(ax: Axes, histograms: list[list[int]]) -> None:
     ax.set_xlim(left=-0.3)
 
 
-def age_entries(cells: Sequence[CellSummary]) -> Iterator[tuple[MarkerStyle, str]]:
+def age_entries(cells: Sequence[CellSummary]) -> Iterator[Mark]:
     """Return the legend of `ages`."""
     links = dict.fromkeys(cell.link for cell in cells if cell.ages)
-    return ((_LOOKS[place % len(_LOOKS)], link) for place, link in enumerate(links))
+    return (_LOOKS[place % len(_LOOKS)].meaning(link) for place, link in enumerate(links))
 
 
 def _paint(look: MarkerStyle) -> tuple[str, str]:

@@ -1,0 +1,71 @@
+"""The parts that pages are made of: whatever comes from elsewhere is shown as it is, once, and never run."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from html import unescape
+
+import pytest
+from markupsafe import Markup
+
+from logs.report import page
+from logs.report.page import Mark, PageSection
+from logs.report.svg import Drawing
+
+HOSTILE = "<script>alert('1')</script> & \"it\" &amp;"
+DRAWING = Drawing("one", '<svg viewBox="0 0 1 1"></svg>', HOSTILE)
+
+PARTS: dict[str, Callable[[str], str]] = {
+    "banner": lambda text: page.banner("bad", text, text, [text]),
+    "listed": lambda text: page.listed([text]),
+    "grid": lambda text: page.grid([DRAWING]),
+    "wide_or_narrow": lambda text: page.wide_or_narrow(DRAWING, DRAWING),
+    "facts": lambda text: page.facts([(text, text)]),
+    "table": lambda text: page.table([text, "b"], [[text, "c"]], frozenset({1}), [text]),
+    "paragraph": page.paragraph,
+    "strong": page.strong,
+    "note": page.note,
+    "folded": lambda text: page.folded(text, text),
+    "folded around HTML": lambda text: page.folded(text, page.note(text)),
+    "legend": lambda text: page.legend([Mark("dot", "target", text)]),
+    "page": lambda text: page.page(
+        text, text, [text], [PageSection(text, text, page.note(text), (Mark("line", "plan", text),))], heading=text
+    ),
+    "contents": lambda text: page.page("t", "s", [], [PageSection(text, "", page.note(""))] * 9),
+}
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_text_is_escaped_once_and_only_once(part: str) -> None:
+    html = PARTS[part](HOSTILE)
+    assert "<script>" not in html
+    shown = unescape(html)
+    times = shown.count(HOSTILE)
+    assert times >= 1 and shown.count("alert(") == times  # nothing of it is shown otherwise
+
+
+def test_a_body_that_nobody_has_marked_as_html_is_text() -> None:
+    html = page.page("t", "s", [], [PageSection("a", "", "<b>bold</b>")])  # type: ignore[arg-type]
+    assert "&lt;b&gt;bold&lt;/b&gt;" in html and "<b>" not in html
+    assert isinstance(page.joined([page.note("a"), page.paragraph("b")]), Markup)
+
+
+@pytest.mark.parametrize("sections", [7, 8])
+def test_a_long_page_has_links_to_its_sections(sections: int) -> None:
+    titles = [f"Section {number}: x & y" for number in range(sections)]
+    html = page.page("t", "s", [], [PageSection(title, "", page.note("")) for title in titles])
+    links = re.findall(r'<a href="#([^"]+)">', html)
+    assert len(links) == (0 if sections == 7 else 9)  # with what happened
+    assert set(links) <= set(re.findall(r'<h2 id="([^"]+)">', html))
+
+
+def test_a_row_longer_than_its_head_is_an_error() -> None:
+    with pytest.raises(Exception, match="has no element 1"):
+        page.table(["a"], [["1", "2"]], frozenset())
+
+
+def test_each_kind_of_mark_has_a_shape_of_its_own() -> None:
+    kinds = ("line", "thin", "dashed", "dotted", "planned", "dot", "ring", "star", "cross", "tick", "band", "marker")
+    assert len({page.legend([Mark(kind, "plan", "")]) for kind in kinds}) == len(kinds)
+    assert "opacity:0.9" in page.legend([Mark("band", "grid", "")])
