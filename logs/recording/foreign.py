@@ -29,6 +29,9 @@ from uavctl.errors import RecordingError, UsageError
 #
 # Layout of ROS 1: http://wiki.ros.org/msg#Fields, little-endian without gaps. ROS 2: CDR, each number aligned to its
 # size, after 4 bytes that tell the byte order (https://www.omg.org/spec/DDSI-RTPS/2.5, 10.2).
+#
+# Read here, not by mcap-ros1-support, whose genpy makes Python source of a definition and imports it: a file that a
+# stranger sends must run nothing. The tests hold both libraries beside this reader.
 
 
 ROS1, ROS2 = "ros1", "cdr"  # encodings of messages
