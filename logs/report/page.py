@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 from string import Template
-from typing import cast
+from typing import Literal, cast
 
 import jinja2
 from markupsafe import Markup, escape
@@ -19,14 +19,19 @@ NOTHING = Markup("")
 _MANY = 9  # sections from which on a page has a list of them
 
 
+MarkKind = Literal[
+    "line", "thin", "dashed", "dotted", "planned", "dot", "ring", "star", "cross", "tick", "band", "marker"
+]
+
+
 @dataclass(frozen=True)
 class Mark:
     """One entry of a legend: the kind of mark, its colour's role, its meaning."""
 
-    kind: str  # line, thin, dashed, dotted, dot, ring, star, cross, tick, band; marker has a path of its own
+    kind: MarkKind
     role: str
     text: str
-    path: str = ""
+    path: str = ""  # of a marker
     full: bool = False
 
 
@@ -130,16 +135,21 @@ def table(
     rows: Iterable[Sequence[str]],
     numbers: frozenset[int],
     remarks: Iterable[str] = (),
-    *,
-    dense: bool = False,
+    kind: str = "",
 ) -> Markup:
     """Return a table with a head as HTML; columns in `numbers` are set flush right.
 
     Args:
         remarks: Rows of their own below the others.
-        dense: In small print, for many columns.
+        kind: "dense" is small print, for many columns; "words" keeps words whole.
+
+    Raises:
+        ValueError: A row is not as long as its head.
     """
-    return _made("table", columns, rows, numbers, "many dense" if dense else "many", remarks)
+    rows = [tuple(row) for row in rows]
+    if any(len(row) != len(columns) for row in rows):
+        raise ValueError(f"a row of another length than its head {columns}")
+    return _made("table", columns, rows, numbers, f"many {kind}".rstrip(), remarks)
 
 
 def paragraph(text: str) -> Markup:

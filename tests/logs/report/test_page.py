@@ -5,12 +5,13 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from html import unescape
+from typing import get_args
 
 import pytest
 from markupsafe import Markup
 
 from logs.report import page
-from logs.report.page import Mark, PageSection
+from logs.report.page import Mark, MarkKind, PageSection
 from logs.report.svg import Drawing
 
 HOSTILE = "<script>alert('1')</script> & \"it\" &amp;"
@@ -60,12 +61,19 @@ def test_a_long_page_has_links_to_its_sections(sections: int) -> None:
     assert set(links) <= set(re.findall(r'<h2 id="([^"]+)">', html))
 
 
-def test_a_row_longer_than_its_head_is_an_error() -> None:
-    with pytest.raises(Exception, match="has no element 1"):
-        page.table(["a"], [["1", "2"]], frozenset())
+@pytest.mark.parametrize("row", [["1"], ["1", "2", "3"]])
+def test_a_row_of_another_length_than_its_head_is_an_error(row: list[str]) -> None:
+    with pytest.raises(ValueError, match="another length"):
+        page.table(["a", "b"], [["1", "2"], row], frozenset())
+
+
+@pytest.mark.parametrize("kind", ["", "dense", "words"])
+def test_a_kind_of_table_is_a_class_of_its_own(kind: str) -> None:
+    html = page.table(["a"], [["1"]], frozenset(), kind=kind)
+    assert re.findall(r"<table class=([^>]*)>", html) == [f'"many {kind}"' if kind else '"many"']
 
 
 def test_each_kind_of_mark_has_a_shape_of_its_own() -> None:
-    kinds = ("line", "thin", "dashed", "dotted", "planned", "dot", "ring", "star", "cross", "tick", "band", "marker")
+    kinds = get_args(MarkKind)
     assert len({page.legend([Mark(kind, "plan", "")]) for kind in kinds}) == len(kinds)
     assert "opacity:0.9" in page.legend([Mark("band", "grid", "")])

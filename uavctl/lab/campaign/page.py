@@ -283,7 +283,7 @@ def _verdict_section(view: CampaignView) -> PageSection:
     if not rows:
         return PageSection(_QUESTION, _VERDICT, folded)
     columns = ("", "best at its rate", *baselines)
-    return PageSection(_QUESTION, _VERDICT, page.table(columns, rows, frozenset(), dense=True) + folded)
+    return PageSection(_QUESTION, _VERDICT, page.table(columns, rows, frozenset(), kind="dense") + folded)
 
 
 def _name(view: CampaignView, verdict: CampaignVerdict) -> str:
@@ -369,7 +369,7 @@ def _ways_section(view: CampaignView) -> Iterator[PageSection]:
         "second half of a run, median. Beyond a wall: furthest of all runs; negative is the room that was left. Usable "
         "room: share of it in which a plan may rest."
     )
-    yield PageSection("Through the room", note, page.table(columns, rows, frozenset(range(2, 7)), dense=True))
+    yield PageSection("Through the room", note, page.table(columns, rows, frozenset(range(2, 7)), kind="dense"))
 
 
 _COLUMNS = (
@@ -383,7 +383,7 @@ def _cells_section(view: CampaignView) -> PageSection:
     for group, cells in view.groups.items():
         rows = [_row(cell) for cell in cells if not cell.refused]
         refused = [f"{cell.index} {cell.controller}: no design; {cell.refused}" for cell in cells if cell.refused]
-        body = page.table(_COLUMNS, rows, frozenset(range(len(_COLUMNS))) - {1}, refused, dense=True)
+        body = page.table(_COLUMNS, rows, frozenset(range(len(_COLUMNS))) - {1}, refused, kind="dense")
         tables.append(page.folded(view.place(group), body))
     note = (
         "States and inputs outside: share of steps. Worst step: share of runs with a state outside in the step with "
@@ -435,7 +435,7 @@ def _failures_section(view: CampaignView) -> PageSection:
     ]
     shown = failed[:_SHOWN_FAILURES]
     columns = ("cell", "controller", "where", "run", "what ended it")
-    body = page.table(columns, shown, frozenset({0, 3}), dense=True) if shown else page.paragraph("There were none.")
+    body = page.table(columns, shown, frozenset({0, 3}), kind="dense") if shown else page.paragraph("There were none.")
     note = "" if len(shown) == len(failed) else f"The first {len(shown)} of {len(failed)}; runs.parquet has all."
     return PageSection("Runs that failed", note, body)
 
@@ -553,7 +553,7 @@ def _trial_sections(told: ToldTrial, cells: Sequence[TrialSummary], specificatio
             )
             for cell in mine
         ]
-        body = page.table(columns, table, frozenset(range(5, 5 + len(shown))), dense=True)
+        body = page.table(columns, table, frozenset(range(5, 5 + len(shown))), kind="dense")
         yield PageSection(_TITLES[scenario], MEANING if number == 0 else "", body)
     yield _amiss(cells)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from markupsafe import Markup
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 
 from logs.report.page import PageSection, folded, grid, page, table
@@ -95,7 +96,7 @@ def _rows(found: Identification) -> Iterator[tuple[str, ...]]:
         )
 
 
-def _candidates(found: Identification) -> str:
+def _candidates(found: Identification) -> Markup:
     candidates = found.result.candidates
     ahead = [f"{time_s:g} s on [mm]" for time_s in candidates[0].ahead_s]
     rows = [
@@ -111,7 +112,7 @@ def _candidates(found: Identification) -> str:
     ]
     columns = ("plant", "dead time [s]", "axis", "lag [s]", *ahead)
     # Names of axes are no paths: they stay whole, and the columns are as wide as they need.
-    return table(columns, rows, frozenset(range(3, len(columns)))).replace('class="many"', 'class="many words"', 1)
+    return table(columns, rows, frozenset(range(3, len(columns))), kind="words")
 
 
 def _curves(found: Identification) -> Drawing:
