@@ -169,9 +169,8 @@ class FlightScene:
             yield SceneFigure("vehicle", f"{vehicle.mode}, {armed}", "bad" if vehicle.failsafe else "plain")
             if vehicle.battery_v is not None:
                 yield SceneFigure("battery", f"{vehicle.battery_v:.1f} V")
-        if link is not None:
-            own = f"{link.arrival_mean:.0%}"
-            yield SceneFigure("steps with a position of their own", own, "warn" if link.below_promise else "plain")
+        if link is not None and link.below_promise:
+            yield SceneFigure("positions", "fewer in time than counted on", "warn")
         if setpoint is not None:
             told = ", ".join(f"{value:+.2f}" for value in setpoint.accel_mps2)
             limited = f" (limited: {', '.join(setpoint.limited)})" if setpoint.limited else ""

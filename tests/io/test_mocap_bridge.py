@@ -46,14 +46,15 @@ class Cameras:
 
 
 @contextmanager
-def bridge(body: str, tmp_path: Path) -> Iterator[tuple[socket.socket, Path]]:
+def bridge(body: str, tmp_path: Path, *more: str) -> Iterator[tuple[socket.socket, Path]]:
     """Run it for a body; yields the socket that it sends to, and the file of its messages."""
     (tmp_path / "motioncapture.py").write_text(CAMERAS, encoding="utf-8")
     told = tmp_path / "told.txt"
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ours, told.open("wb") as err:
         ours.bind(("127.0.0.1", 0))
         ours.settimeout(LIMIT_S)
-        words = [sys.executable, str(BRIDGE), "vrpn", "10.1.2.3", body, "--to", f"127.0.0.1:{ours.getsockname()[1]}"]
+        to = f"127.0.0.1:{ours.getsockname()[1]}"
+        words = [sys.executable, str(BRIDGE), "vrpn", "10.1.2.3", body, "--to", to, *more]
         with subprocess.Popen(words, env={**os.environ, "PYTHONPATH": str(tmp_path)}, stderr=err) as process:
             try:
                 yield ours, told
@@ -65,7 +66,7 @@ def test_a_body_reaches_uavctl_as_it_is_seen_and_the_clock_is_told(tmp_path: Pat
     asked = mavlink.MAVLink_timesync_message(0, 77).pack(mavlink.MAVLink(None, srcSystem=245))
     found: list[Position] = []
     answers: list[TimeSync] = []
-    with bridge("drone", tmp_path) as (ours, _):
+    with bridge("drone", tmp_path, "--latency", "0.5") as (ours, _):
         while len(found) < 8 or not answers:
             data, sender = ours.recvfrom(2048)
             ours.sendto(asked, sender)
@@ -76,7 +77,7 @@ def test_a_body_reaches_uavctl_as_it_is_seen_and_the_clock_is_told(tmp_path: Pat
     numbers = [one.position_m[0] for one in found]
     assert all(number % 2 == 0 and number % 3 for number in numbers) and numbers == sorted(set(numbers))
     assert all(one.position_m[1:] == (2.0, 1.5) for one in found)
-    assert all(one.stamp_us is not None and 0 <= now_ns - one.stamp_us * 1000 < LIMIT_S * 1e9 for one in found)
+    assert all(one.stamp_us is not None and 0.5e9 <= now_ns - one.stamp_us * 1000 < LIMIT_S * 1e9 for one in found)
     assert answers[0].ts1_ns == 77 and 0 < now_ns - answers[0].tc1_ns < LIMIT_S * 1e9
 
 
@@ -101,4 +102,5 @@ def test_cameras_that_cannot_be_had_end_it_with_a_sentence(tmp_path: Path) -> No
     assert ends("vrpn", "10.1.2.3", "drone").startswith("motioncapture cannot be imported (no such wheel); install it")
     (tmp_path / "motioncapture.py").write_text(CAMERAS, encoding="utf-8")
     assert ends("vikon", "10.1.2.3", "drone") == "vikon at 10.1.2.3 cannot be read: Unknown motion capture type!\n"
+    assert "--latency: 2 s is not from 0 to 1 s" in ends("vrpn", "10.1.2.3", "drone", "--latency", "2")
     assert "--to: '14560' is not HOST:PORT" in ends("vrpn", "10.1.2.3", "drone", "--to", "14560")

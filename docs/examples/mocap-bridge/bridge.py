@@ -17,6 +17,7 @@ import socket
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
@@ -60,7 +61,7 @@ class Bridge:
         self._parser.robust_parsing = True
 
     def send(self, body: Any, at_ns: int) -> None:
-        """Send a pose, stamped with when its frame came."""
+        """Send a pose, stamped with when it was."""
         x, y, z = (float(one) for one in body.position)
         if not all(map(math.isfinite, (x, y, z))):
             return
@@ -71,18 +72,16 @@ class Bridge:
         while True:
             try:
                 data = self._socket.recv(2048)
-            except (BlockingIOError, ConnectionRefusedError):  # nothing more, or nobody listens yet
+            except OSError:  # nothing more, or nobody listens yet
                 return
             for message in self._parser.parse_buffer(data) or ():
                 if message.get_type() == "TIMESYNC" and message.tc1 == 0:
                     self._say(mavlink.MAVLink_timesync_message(time.monotonic_ns(), message.ts1))
 
     def _say(self, message: Any) -> None:
-        try:
+        with suppress(OSError):  # nobody listens yet, or the network is away: the next one may come through
             self._socket.sendto(message.pack(self._mav), self._to)
-        except ConnectionRefusedError:
-            return
-        self._mav.seq = (self._mav.seq + 1) % 256
+            self._mav.seq = (self._mav.seq + 1) % 256
 
 
 def main() -> None:
@@ -91,21 +90,25 @@ def main() -> None:
     parser.add_argument("kind", help="vrpn, vicon, nokov, fzmotion ..., as libmotioncapture names it")
     parser.add_argument("server", help="address of the camera system")
     parser.add_argument("body", help="name of the rigid body")
+    parser.add_argument("--latency", type=float, default=0.0, help="of the cameras, from exposure to frame [s]")
     parser.add_argument("--to", default="127.0.0.1:14560", help="where uavctl listens [default: %(default)s]")
     given = parser.parse_args()
     host, _, port = given.to.rpartition(":")
     if not (host and port.isdecimal() and 0 < int(port) < 65536):
         parser.error(f"--to: {given.to!r} is not HOST:PORT")
+    if not 0.0 <= given.latency <= 1.0:
+        parser.error(f"--latency: {given.latency:g} s is not from 0 to 1 s")
     bridge, told_s = Bridge((host, int(port))), -math.inf
     for bodies in frames(given.kind, given.server):
         at_ns = time.monotonic_ns()
         bridge.answer()
         if given.body in bodies:
-            bridge.send(bodies[given.body], at_ns)
+            bridge.send(bodies[given.body], at_ns - round(given.latency * 1e9))
         elif at_ns * 1e-9 - told_s > TOLD_S:
             told_s = at_ns * 1e-9
             print(f"no body {given.body!r}; seen: {', '.join(sorted(bodies)) or 'none'}", file=sys.stderr)  # noqa: T201
 
 
 if __name__ == "__main__":
-    main()
+    with suppress(KeyboardInterrupt):
+        main()
