@@ -19,6 +19,8 @@ from concurrent.futures import ThreadPoolExecutor
 from itertools import repeat
 from pathlib import Path
 
+from safety_core import TARGETS, what_is_not_run
+
 from docs import PAGES, ROOT
 
 BIN = Path(sys.executable).parent
@@ -90,6 +92,14 @@ def check_wheel() -> str:
         return run([sys.executable, "-P", "-m", "uavctl", *flight], cwd=folder, extra=outside)
 
 
+def check_core() -> str:
+    """Every branch of the safety core is run by its own tests."""
+    for module in TARGETS:
+        if missing := what_is_not_run(module):
+            raise StageError(missing)
+    return ""
+
+
 def check_tests(failed: threading.Event, *, everything: bool) -> str:
     """All tests, or those that are not slow; no test at all is a failure (exit code 5). They end early if `failed`.
 
@@ -110,13 +120,13 @@ def check_tests(failed: threading.Event, *, everything: bool) -> str:
 
 def stages(failed: threading.Event, *, everything: bool) -> tuple[tuple[str, Callable[[], str]], ...]:
     """All checks: what is told soonest first, and the types beside the tests, which take longest."""
-    wheel = (("wheel, outside the checkout", check_wheel),)
+    slow = (("wheel, outside the checkout", check_wheel), ("branches of the safety core", check_core))
     return (
         ("ruff check", lambda: run([BIN / "ruff", "check"])),
         ("ruff format", lambda: run([BIN / "ruff", "format", "--check"])),
         ("import contracts", lambda: run([BIN / "lint-imports"])),
         ("generated pages of docs/", check_pages),
-        *(wheel if everything else ()),
+        *(slow if everything else ()),
         ("mypy", lambda: run([BIN / "mypy"])),
         ("pytest", lambda: check_tests(failed, everything=everything)),
     )
@@ -137,7 +147,7 @@ def take(name: str, stage: Callable[[], str], failed: threading.Event) -> None:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the stages, two at a time; 0 if all of them pass. `--all`: the wheel and slow tests too."""
+    """Run the stages, two at a time; 0 if all of them pass. `--all`: wheel, safety core and slow tests too."""
     if list(arguments) == ["--write-docs"]:
         for page, text in PAGES.items():
             page.write_text(text(), encoding="utf-8")

@@ -16,15 +16,12 @@ import gc
 import importlib.machinery
 import os
 import resource
-import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import chain
-from pathlib import Path
 from types import CodeType
 
 import msgspec  # noqa: F401  # these only so that the forks find them imported
@@ -34,22 +31,9 @@ import scipy.integrate
 import scipy.linalg  # noqa: F401
 from cosmic_ray.mutating import mutate_code
 from cosmic_ray.plugins import get_operator, operator_names
+from safety_core import ROOT, TARGETS, what_is_not_run
 
-ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "docs" / "safety-core.md"
-# The safety core, and the tests that must see every change of it.
-TARGETS: dict[str, tuple[str, ...]] = {
-    "uavctl/flight/envelope.py": (
-        "tests/flight/test_envelope_observer.py",
-        "tests/flight/test_envelope_velocity.py",
-        "tests/flight/test_envelope.py",
-    ),
-    "uavctl/flight/fallback.py": ("tests/flight/test_fallback.py",),
-    "uavctl/flight/limits.py": ("tests/flight/test_limits.py",),
-    "uavctl/flight/sensor_faults.py": ("tests/flight/test_reach_rules.py", "tests/flight/test_stuck_rules.py"),
-    "uavctl/mavlink/handover_states.py": ("tests/mavlink/test_mode.py",),
-    "uavctl/mavlink/signing.py": ("tests/mavlink/test_signing.py", "tests/mavlink/test_gate.py"),
-}
 CPU_S = 10  # of one change's tests, which take about one: a change may make a loop endless
 
 
@@ -127,19 +111,6 @@ def told(source: str, changed: str) -> str:
     return f"{before}{f' [{again + 1}]' if again else ''} -> {after}"
 
 
-def covered(module: str) -> bool:
-    """Whether the tests of a module pass and run every branch of it; what is missing is printed."""
-    with tempfile.TemporaryDirectory() as folder:
-        coverage = [sys.executable, "-m", "coverage"]
-        data = f"--data-file={folder}/coverage"
-        tests = ["-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", *TARGETS[module]]
-        commands = (
-            [*coverage, "run", data, "--branch", f"--include={module}", *tests],
-            [*coverage, "report", data, "--show-missing", "--fail-under=100"],
-        )
-        return all(subprocess.run(command, cwd=ROOT, check=False).returncode == 0 for command in commands)
-
-
 def survives(mutant: Mutant) -> bool:
     """Whether all tests of the module pass with the change."""
     child = os.fork()
@@ -188,8 +159,9 @@ def main(arguments: Sequence[str]) -> int:
     wrong = 0
     for module in modules:
         begun = time.monotonic()
-        if not covered(module) or not survives(Mutant(module, "", _source(module))):
-            sys.stdout.write(f"FAILED  {module}: its tests do not pass as it is, or leave branches out\n")
+        uncovered = what_is_not_run(module)
+        if uncovered or not survives(Mutant(module, "", _source(module))):
+            sys.stdout.write(f"{uncovered}FAILED  {module}: its tests do not pass as it is, or leave branches out\n")
             return 1
         changes = list(mutants(module))
         gc.freeze()  # the forks need not look through what is here already

@@ -24,6 +24,7 @@ from uavctl.flight.envelope import (
     Breach,
     Observation,
     Watching,
+    beyond,
     is_outside,
     lean_mps2,
     watch,
@@ -88,6 +89,14 @@ def test_an_estimate_that_comes_to_rest_at_the_margin_is_not_outside() -> None:
     for speed, outside in ((1.0, False), (1.0 + 1e-9, True)):
         ours = structs.replace(seen(AT_NS), position_m=(3.0, 0.0, -2.0), velocity_mps=(speed, 0.0, 0.0))
         assert is_outside(ours, parameters) == outside
+
+
+@pytest.mark.parametrize("speed", [-0.31, -0.3, -just_less(0.3), 9.0])
+@pytest.mark.parametrize("beyond_m", [-1.0, 0.0, 1e-9, 2.0])
+def test_being_beyond_a_limit_is_without_what_braking_needs(beyond_m: float, speed: float) -> None:
+    north = PARAMETERS.upper_m[0] + PARAMETERS.outside_m[0] + beyond_m
+    ours = structs.replace(seen(AT_NS), position_m=(north, 0.0, -2.0), velocity_mps=(speed, 0.0, 0.0))
+    assert bool(beyond(ours, PARAMETERS)) == (beyond_m > 0.0 and speed > -0.3)
 
 
 def test_being_outside_has_to_persist() -> None:

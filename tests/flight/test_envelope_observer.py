@@ -42,9 +42,11 @@ from uavctl.flight.envelope import (
     Observation,
     Observer,
     Watching,
+    contradicts,
     misled,
     own_velocity,
     watch,
+    witness,
 )
 from uavctl.flight.limits import ZERO
 from uavctl.records import Vec3, VehicleMotion
@@ -444,6 +446,35 @@ def test_a_prediction_far_off_the_vehicle_s_own_velocity_misleads(
     watching, tick = told(ZERO, (0.0, -apart_mps, 0.0), apart_mps=0.1)
     assert misled(watching, tick, age_s, PARAMETERS) == is_misled
     assert not misled(structs.replace(watching, contradicted=True), tick, age_s, PARAMETERS)
+
+
+@pytest.mark.parametrize(
+    ("apart_mps", "agreed_mps", "age_s", "is_contradicted"),
+    [
+        (0.25, 0.1, 0.0, False),
+        (0.26, 0.1, 0.0, True),
+        (0.26, 0.1, 9.0, True),  # what was felt since has gusts in it: the age of the positions excuses nothing
+        (0.26, None, 9.0, True),  # gusts may have made as much, so it is believed without positions, too
+        (0.26, None, 0.0, False),  # but where nothing speaks for it, it contradicts nobody
+    ],
+)
+def test_inertial_data_are_contradicted_by_a_velocity_that_may_be_believed(
+    apart_mps: float, agreed_mps: float | None, age_s: float, is_contradicted: bool
+) -> None:
+    watching, tick = told(ZERO, (0.0, 0.0, apart_mps), apart_mps=agreed_mps, flown_mps=(9.0, 0.0, 0.0))
+    assert contradicts(watching, tick, age_s, PARAMETERS) == is_contradicted
+    assert not contradicts(structs.replace(watching, contradicted=True), tick, age_s, PARAMETERS)
+    assert not contradicts(watching, structs.replace(tick, motion=None), age_s, PARAMETERS)
+
+
+def test_a_witness_is_who_agreed_with_positions_and_still_speaks() -> None:
+    velocity: Vec3 = (1.0, -2.0, 0.5)
+    words, agreed = motion(velocity, AT_NS), Watching(apart_mps=0.1)
+    assert witness(agreed, words, AT_NS) == velocity
+    assert witness(agreed, None, AT_NS) is None
+    assert witness(agreed, words, AT_NS + 60 * S) is None
+    assert witness(structs.replace(agreed, contradicted=True), words, AT_NS) is None
+    assert witness(Watching(), words, AT_NS) is None  # no position has been compared with it
 
 
 def test_what_was_sent_acts_behind_the_lag_from_tick_to_tick() -> None:

@@ -146,8 +146,7 @@ class Signing:
         if stream not in self._newest and len(self._newest) >= MAX_STREAMS:
             oldest = min(self._newest, key=lambda one: self._newest[one])
             self._floor = max(self._floor, self._newest.pop(oldest))
-            if not any(one[:2] == oldest[:2] for one in self._newest):
-                self._links.pop(oldest[:2], None)
+            self._links.pop(oldest[:2], None)
         self._newest[stream] = stamp
 
     def _expects(self, address: tuple[int, int], link_id: int) -> bool:

@@ -1,0 +1,45 @@
+"""The modules of the safety core and their own tests, which must run every branch of them.
+
+`make test-all` asks that of each run; tools/mutation.py asks more, and takes an hour.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+# The safety core, and the tests that must see every change of it.
+TARGETS: dict[str, tuple[str, ...]] = {
+    "uavctl/flight/envelope.py": (
+        "tests/flight/test_envelope_observer.py",
+        "tests/flight/test_envelope_velocity.py",
+        "tests/flight/test_envelope.py",
+    ),
+    "uavctl/flight/fallback.py": ("tests/flight/test_fallback.py",),
+    "uavctl/flight/limits.py": ("tests/flight/test_limits.py",),
+    "uavctl/flight/sensor_faults.py": ("tests/flight/test_reach_rules.py", "tests/flight/test_stuck_rules.py"),
+    "uavctl/mavlink/handover_states.py": ("tests/mavlink/test_mode.py",),
+    "uavctl/mavlink/signing.py": ("tests/mavlink/test_signing.py", "tests/mavlink/test_gate.py"),
+}
+
+
+def what_is_not_run(module: str) -> str:
+    """Run the tests of a module alone; return what they printed if one fails or a branch is not run, else nothing."""
+    with tempfile.TemporaryDirectory() as folder:
+        coverage = [sys.executable, "-m", "coverage"]
+        data = f"--data-file={folder}/coverage"
+        tests = ["-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", *TARGETS[module]]
+        commands = (
+            [*coverage, "run", data, "--branch", f"--include={module}", *tests],
+            [*coverage, "report", data, "--show-missing", "--fail-under=100"],
+        )
+        for command in commands:
+            done = subprocess.run(
+                command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False
+            )
+            if done.returncode != 0:
+                return done.stdout
+    return ""
