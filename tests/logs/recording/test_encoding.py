@@ -103,6 +103,9 @@ def test_fields_beside_a_non_finite_float_are_written_as_without_it(field: str, 
     fields = json.loads(encode(plan))
     fields[field] = [[spelled, -0.0, 5e-324], list(rows[1])] if field == "backoff_x" else spelled
     assert written == msgspec.json.encode(fields)
+    for method in ("NaN", "qp"):  # a text that looks like a number stays one
+        whole = msgspec.structs.replace(plan, method=method, **{field: odd})
+        assert repr(decode("/uavctl/plan", encode(whole), 0)) == repr(whole)
 
 
 def test_text_is_left_alone() -> None:
