@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 from operation_rig import PATIENT_DAEMON, PATIENT_VEHICLE, ended, port
 from patience import until
+from places import ROOT
 
 from sim.server import Seat, serve_all
 from uavctl.cli.app import run
@@ -68,6 +69,13 @@ def test_a_fleet_that_can_be_flown_is_told_with_its_nearest_boxes(
     found = json.loads(capsys.readouterr().out)
     assert [one["name"] for one in found["vehicles"]] == ["west", "east"]
     assert found["nearest_m"] == pytest.approx(EAST[0] - WEST[1])
+
+
+def test_the_example_is_that_of_the_page_and_can_be_flown(capsys: pytest.CaptureFixture[str]) -> None:
+    example = ROOT / "docs" / "examples" / "duo.toml"
+    assert example.read_text() in (ROOT / "docs" / "fleet.md").read_text()
+    assert run(["fleet", "check", str(example), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["nearest_m"] == pytest.approx(0.8)
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Annotated, Any, Generic, TypeVar
 
 import msgspec
+import pyarrow
 from cyclopts import Parameter, validators
 from rich.console import Group, RenderableType
 from rich.markup import escape
@@ -97,12 +98,6 @@ def _text(value: object) -> str:
 
 
 # `uavctl campaign`: many flights of many controllers on the same noise and the same losses.
-
-
-try:
-    import pyarrow  # everything below needs it
-except ImportError as missing:
-    raise UsageError("campaigns are kept by pyarrow, which is not there; install uavctl[campaign]") from missing
 
 
 _NAMES = ("controller", "link", "disturbance", "plant")
