@@ -6,7 +6,7 @@ import pytest
 from mavlink_rig import SECOND, Peer, make_link, read, samples, statuses
 from signing_rig import KEY, OTHER_KEY, STAMP, SignedPeer, make_gate, seal, unknown
 
-from uavctl.mavlink.codec import StreamDecoder
+from uavctl.mavlink.codec import MAX_DATAGRAM_BYTES, StreamDecoder
 from uavctl.mavlink.framing import MAX_FAILED
 from uavctl.mavlink.signing import NEWEST_STAMP, SignatureRefusal, Signing
 
@@ -41,6 +41,13 @@ def test_what_is_not_signed_with_our_key_stays_outside(data: bytes, reason: str)
     assert gate.admit(data, 0) == b""
     assert gate.refused == {reason: 1}
     assert gate.admit(genuine.heartbeat(), 0) == Peer().heartbeat()
+
+
+def test_a_datagram_of_the_largest_size_is_looked_at() -> None:
+    gate, peer = make_gate(), SignedPeer()
+    frames = b"".join(peer.vision(5) for _ in range(MAX_DATAGRAM_BYTES // len(SignedPeer().vision(5))))
+    data = frames + bytes(MAX_DATAGRAM_BYTES - len(frames))
+    assert gate.admit(data, 0) and "oversize" not in gate.refused
 
 
 @pytest.mark.fault(36, 38)

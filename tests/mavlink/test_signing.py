@@ -8,7 +8,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from signing_rig import EPOCH_S, KEY, NOW_S, OFFSET_NS, OTHER_KEY, SECOND, STAMP, SignedPeer, make_signing, seal, sign
 
 from uavctl.mavlink.signing import (
-    MAX_STREAMS,
     NEWEST_STAMP,
     SKEW,
     SignatureRefusal,
@@ -168,6 +167,15 @@ def test_old_frames_of_one_connection_are_none_of_another() -> None:
 
 
 @pytest.mark.fault(37)
+@pytest.mark.parametrize(("behind", "refusal"), [(500_000, None), (500_001, SignatureRefusal.REPLAYED)])
+def test_a_frame_may_be_five_seconds_behind_another_connection(behind: int, refusal: SignatureRefusal | None) -> None:
+    stamps = Stamps()
+    here, elsewhere = make_signing(stamps), make_signing(stamps)
+    assert here.verify(SignedPeer().heartbeat(), 0) is None
+    assert elsewhere.verify(SignedPeer(stamp=STAMP - behind).heartbeat(), 0) is refusal
+
+
+@pytest.mark.fault(37)
 def test_a_stream_begins_at_most_a_minute_behind() -> None:
     signing = make_signing()
     behind = STAMP - MINUTE
@@ -233,13 +241,13 @@ def test_streams_are_bounded_and_keep_no_later_one_out() -> None:
     signing = make_signing(stamps)
     first = [SignedPeer(system=1 + n // 250, component=1 + n % 250, stamp=STAMP + n).heartbeat() for n in range(300)]
     assert {signing.verify(frame, 0) for frame in first} == {None}
-    assert len(stamps.streams) == len(signing._newest) == MAX_STREAMS
+    assert len(stamps.streams) == len(signing._newest) == 64
     assert {signing.verify(frame, 0) for frame in first} == {
         SignatureRefusal.REPLAYED
     }  # also of those that are not kept
     late = SignedPeer(system=1, component=1, stamp=STAMP + 1000, link_id=9)
     assert signing.verify(late.heartbeat(), 0) is None  # one that was not kept may have another link id
-    assert len(signing._links) <= MAX_STREAMS
+    assert len(signing._links) <= 64
 
 
 @pytest.mark.parametrize("secret", [b"", KEY[:-1], KEY + b"x", bytes(32)])

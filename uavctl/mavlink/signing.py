@@ -83,7 +83,7 @@ class Stamps:
         self.own = max(self.own, stamp)
         if stream not in self.streams and len(self.streams) >= MAX_STREAMS:
             del self.streams[min(self.streams, key=lambda one: self.streams[one])]
-        self.streams[stream] = max(stamp, self.streams.get(stream, 0))
+        self.streams[stream] = max(stamp, self.streams.get(stream, stamp))
 
 
 class Signing:
@@ -110,7 +110,7 @@ class Signing:
         self._offset_ns = wall_offset_ns
         self._peer_link_ids = peer_link_ids
         self._newest: dict[Stream, int] = {}  # stamp of each stream, here
-        self._floor = 0  # newest of the streams that are not kept any more
+        self._floor = stamps.floor  # ... or the newest of the streams that are not kept any more
         self._links: dict[tuple[int, int], int] = {}  # link id of each (system, component) that has been heard
 
     def sign(self, frame: bytes, at_ns: int) -> bytes:
@@ -155,12 +155,12 @@ class Signing:
         return self._links.get(address) in (None, link_id)
 
     def _too_old(self, stream: Stream, stamp: int, at_ns: int) -> SignatureRefusal | None:
-        if stamp + SKEW < self._stamps.streams.get(stream, 0):
+        if stamp + SKEW < self._stamps.streams.get(stream, stamp):
             return SignatureRefusal.REPLAYED
         newest = self._newest.get(stream)
         if newest is not None:
             return SignatureRefusal.REPLAYED if stamp <= newest else None
-        if stamp <= max(self._floor, self._stamps.floor):
+        if stamp <= self._floor:
             return SignatureRefusal.REPLAYED
         ours = max(self._now(at_ns), self._stamps.own)
         return SignatureRefusal.STALE if stamp + FIRST_BEHIND < ours else None
