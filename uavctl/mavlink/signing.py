@@ -110,7 +110,7 @@ class Signing:
         self._offset_ns = wall_offset_ns
         self._peer_link_ids = peer_link_ids
         self._newest: dict[Stream, int] = {}  # stamp of each stream, here
-        self._floor = stamps.floor  # ... or the newest of the streams that are not kept any more
+        self._floor = stamps.floor  # nothing older begins a stream; rises with the streams that are not kept any more
         self._links: dict[tuple[int, int], int] = {}  # link id of each (system, component) that has been heard
 
     def sign(self, frame: bytes, at_ns: int) -> bytes:
