@@ -31,6 +31,12 @@ def test_it_is_chosen_before_numpy_is_loaded_and_told_in_processes_started_from_
     assert own == {"HOME": "/", CHOICE: ""}
 
 
+def test_half_of_the_choice_made_by_the_machine_is_completed() -> None:
+    environ = {CORE: "Haswell"}
+    assert choose_arithmetic(WIDE, environ, begun=False) == PORTABLE
+    assert environ == {CORE: "Haswell", CHOICE: "X86_V4"}
+
+
 def test_a_processor_without_the_instructions_is_left_alone() -> None:
     for flags in (set[str](), {"fp", "asimd"}, WIDE - {"fma"}):
         environ: dict[str, str] = {}

@@ -34,8 +34,8 @@ def choose_arithmetic(flags: Set[str], environ: MutableMapping[str, str], begun:
     wanted = {_CORE: "Haswell"} | ({CHOICE: "X86_V4"} if flags >= _WIDE else {})
     if begun:
         environ.setdefault(CHOICE, "")  # processes started from here compute as this one does
-    elif CHOICE not in environ and _CORE not in environ:
-        environ.update(wanted)
+    elif CHOICE not in environ and environ.get(_CORE, wanted[_CORE]) == wanted[_CORE]:
+        environ.update(wanted)  # also where the machine has made half of this choice
     return PORTABLE if all(environ.get(name) == value for name, value in wanted.items()) else OWN
 
 

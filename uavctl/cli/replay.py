@@ -221,10 +221,9 @@ def _changes(before: object, now: object, key: str) -> Iterator[Changed]:
 def compute_as(recorded: Header) -> None:
     """Start the command anew if a recording was made with all of this processor's own instructions.
 
-    So it was where numpy was loaded before `uavctl`, and by version 0.1.
+    So it was where numpy was loaded before `uavctl`, or where somebody chose it.
     """
-    made = recorded.versions.get(ARITHMETIC_NAME, OWN)
-    if made == OWN and ARITHMETIC != OWN and recorded.cpu == cpu():
+    if recorded.versions.get(ARITHMETIC_NAME) == OWN and ARITHMETIC != OWN and recorded.cpu == cpu():
         start_anew(without_choice(os.environ))
 
 
