@@ -489,6 +489,7 @@ class ControlLoop:
             ready=out.setpoint is not None,
             land=out.land,
             stop=inp.stop,
+            unsure=self._unsure_since_ns is not None,
             unfit=unfit,
             unsafe=out.unsafe,
             up_m=up_m,

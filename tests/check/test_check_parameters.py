@@ -40,7 +40,8 @@ def test_parameters_that_were_seen_to_fly_indoors_are_good(autopilot: str) -> No
 @pytest.mark.parametrize(
     ("autopilot", "values", "name", "want"),
     [
-        ("ardupilot", {"GUID_TIMEOUT": 3.0}, "GUID_TIMEOUT", ItemState.NOTE),
+        ("ardupilot", {"GUID_TIMEOUT": 3.0}, "GUID_TIMEOUT", ItemState.BAD),  # out of the room from its middle
+        ("ardupilot", {"GUID_TIMEOUT": 1.01}, "GUID_TIMEOUT", ItemState.NOTE),
         ("ardupilot", {"GUID_TIMEOUT": 0.1}, "GUID_TIMEOUT", ItemState.BAD),
         ("ardupilot", {"EK3_SRC1_POSXY": 6, "VISO_TYPE": 0}, "EK3_SRC1_POSXY", ItemState.BAD),
         ("ardupilot", {"EK3_SRC1_POSXY": 6, "VISO_TYPE": 0}, "VISO_TYPE", ItemState.BAD),
@@ -50,7 +51,7 @@ def test_parameters_that_were_seen_to_fly_indoors_are_good(autopilot: str) -> No
         ("ardupilot", {"FS_EKF_ACTION": 0}, "FS_EKF_ACTION", ItemState.NOTE),
         ("px4", {"COM_OBL_RC_ACT": 0}, "COM_OBL_RC_ACT", ItemState.BAD),  # there is no radio (COM_RC_IN_MODE 4)
         ("px4", {"COM_OBL_RC_ACT": 4}, "COM_OBL_RC_ACT", ItemState.GOOD),
-        ("px4", {"COM_OF_LOSS_T": 5.0}, "COM_OF_LOSS_T", ItemState.NOTE),
+        ("px4", {"COM_OF_LOSS_T": 5.0}, "COM_OF_LOSS_T", ItemState.BAD),
         ("px4", {"EKF2_EV_CTRL": 11}, "EKF2_GPS_CTRL", ItemState.NOTE),
         ("px4", {"EKF2_EV_CTRL": 11, "EKF2_HGT_REF": 1}, "EKF2_HGT_REF", ItemState.NOTE),
         ("px4", {"EKF2_EV_CTRL": 0}, "EKF2_EV_CTRL", ItemState.NOTE),
@@ -60,6 +61,17 @@ def test_parameters_that_lead_astray_are_found(
     autopilot: str, values: dict[str, float], name: str, want: ItemState
 ) -> None:
     assert with_parameters(autopilot, **values)[name].state is want
+
+
+def test_the_timeout_that_is_wanted_is_one_that_the_room_holds() -> None:
+    small = load_config("room-ardupilot", ["limits.accel_mps2=[4.0,2.0,1.5]"])
+    rule = next(one for one in RULES[3] if one.name == "GUID_TIMEOUT")
+    judged = {t: rule.judge(t, lambda _: None, small) for t in (0.7, 0.75, 0.77, 3.0)}
+    assert judged[3.0].want.endswith("to 0.7 s")  # 4 t²/2 + (4 t)²/5 = 3 m at 0.76 s
+    assert "46.8 m north" in judged[3.0].figures  # 18 + 28.8
+    assert [judged[t].state for t in (0.7, 0.75, 0.77)] == [
+        ItemState.GOOD, ItemState.NOTE, ItemState.BAD
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize(("autopilot", "name"), [("px4", "EKF2_EV_CTRL"), ("ardupilot", "EK3_SRC1_POSXY")])

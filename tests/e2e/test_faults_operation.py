@@ -78,6 +78,23 @@ def test_ardupilot_that_hears_no_setpoints_brakes_by_itself() -> None:
     assert flight.speed_mps < 0.2 and flight.truths[-1].mode == "GUIDED"
 
 
+@pytest.mark.fault(8)
+@pytest.mark.parametrize("timeout_s, stays", [(1.0, True), (3.0, False)])
+def test_a_silence_that_the_check_takes_keeps_ardupilot_in_the_room_and_the_one_it_is_shipped_with_does_not(
+    timeout_s: float, stays: bool
+) -> None:
+    flight = Flight(
+        'sim.autopilot="ardupilot"', f"sim.setpoint_timeout_s={timeout_s}", "sim.start_position_m=[0.0,0.0,-1.0]",
+        "target.position_m=[2.0,0.0,-1.0]",
+    )  # fmt: skip
+    flight.run(1.0)
+    flight.run(10.0, uplink=False)
+    far_m = max(abs(truth.position_m[0]) for truth in flight.truths)
+    assert (far_m < 3.0) is stays
+    assert flight.speed_mps < 0.2
+    assert far_m < timeout_s**2 + (2.0 * timeout_s) ** 2 / 5.0 + 1.0  # a second under way, then as the check counts it
+
+
 @pytest.mark.slow
 @pytest.mark.fault(27)
 def test_a_vehicle_that_falls_silent_is_braked_then_held_then_left_to_its_own_failsafe() -> None:

@@ -136,6 +136,17 @@ def test_where_the_vehicle_s_words_were_lost_nothing_goes_out_until_it_is_heard_
     assert result.identical, result.first_difference
 
 
+@pytest.mark.fault(50)
+def test_the_first_word_of_a_vehicle_whose_connection_was_lost_is_answered_with_the_landing_that_waits() -> None:
+    rig = Rig('solver.method="exact"')
+    rig.run(40)
+    rig.heartbeat(OFFBOARD)
+    rig.loop.refused("vehicle", {"hung-up": 1}, rig.tick * TICK_NS)
+    assert not {SETPOINT, LAND} & set(rig.run(70, stop=True, deaf=True))
+    rig.heartbeat(OFFBOARD, late_ns=1)
+    assert LAND in rig.run(2, stop=True, deaf=True)
+
+
 @pytest.mark.fault(48)
 def test_of_a_flood_of_positions_a_tick_looks_at_the_newest() -> None:
     rig = Rig()

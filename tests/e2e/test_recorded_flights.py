@@ -356,13 +356,13 @@ def test_a_good_set_up_passes_the_check_over_a_link_that_loses_in_bursts(
         (
             GPS,  # "EKF3 IMU0 is using GPS" comes 41.5 s after the boot: before, it sends no position
             42.0,
-            ["GUID_TIMEOUT", "EK3_SRC1_POSXY"],
+            ["EK3_SRC1_POSXY"],
             ["GUID_OPTIONS", "EK3_SRC1_YAW", "FS_EKF_ACTION", "FS_EKF_THRESH", "position age"],
         ),
         (
             VICON,  # 25 to 142 ms late, while the preset counts on 30 to 70
             20.0,
-            ["GUID_TIMEOUT", "position age", "source clock"],
+            ["position age", "source clock"],
             ["EK3_SRC1_POSXY", "EK3_SRC1_POSZ", "EK3_SRC1_YAW", "VISO_TYPE", "own position", "FS_EKF_THRESH"],
         ),
         (OFFBOARD, 8.0, ["MIS_TAKEOFF_ALT"], ["COM_OF_LOSS_T", "COM_OBL_RC_ACT", "position noise"]),
@@ -373,7 +373,8 @@ def test_parameters_that_another_client_read_are_judged_as_that_flight_was_set_u
 ) -> None:
     """At rest before the flight. TIMESYNC is noted of each: it was the other client's that was answered."""
     items = checked(name, 0.0, seconds)
-    assert [one for one, state in items.items() if state == BAD] == []
+    # An ArduPilot's 3 s, as shipped, are more than a room holds.
+    assert [one for one, state in items.items() if state == BAD] == ([] if name == OFFBOARD else ["GUID_TIMEOUT"])
     assert {one: items[one] for one in noted} == dict.fromkeys(noted, NOTE)
     assert {one: items[one] for one in good} == dict.fromkeys(good, GOOD)
     standing = ["vehicle", "armed", "landed", "position rate", "position loss", "position in the room"]

@@ -51,13 +51,19 @@ def test_a_failsafe_that_only_seemed_to_land_for_us_is_asked_again() -> None:
     assert rig.is_in(HandoverState.LANDING) and rig.asked_last(RequestKind.LAND)
 
 
-def landing(autopilot: str) -> Rig:
-    """A flight of ours that is asked to land, from the mode that takes setpoints."""
+def engaged(autopilot: str) -> Rig:
+    """A flight of ours in the mode that takes setpoints."""
     rig = Rig(autopilot)
     rig.to(HandoverState.CLIMBING).be(landed=False)
     rig.tick(up_m=1.9)
     rig.be(mode="OFFBOARD" if autopilot == "px4" else "GUIDED")
     rig.run(1.0, until=HandoverState.ENGAGED)
+    return rig
+
+
+def landing(autopilot: str) -> Rig:
+    """A flight of ours that is asked to land, from the mode that takes setpoints."""
+    rig = engaged(autopilot)
     rig.tick(land=True)
     rig.tick(land=False)
     assert rig.is_in(HandoverState.LANDING) and rig.asked_last(RequestKind.LAND)
@@ -196,3 +202,15 @@ def test_a_climb_that_is_told_late_does_not_keep_the_controller_from_watching_wh
     rig.run(1.0, until=HandoverState.ENGAGED)
     flown = rig.hand_over.flown(rig.view.at_ns, rig.vehicle)
     assert flown is not None and flown.own_climb is not ours  # of another one's climb nobody knows when it ends
+
+
+@pytest.mark.fault(8)
+@pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+def test_a_landing_waits_for_the_first_word_after_a_lost_connection_and_no_longer(autopilot: str) -> None:
+    rig = engaged(autopilot)
+    asked = len(rig.asked)
+    rig.tick(land=True, unsure=True)
+    rig.run(3.2)
+    assert rig.is_in(HandoverState.LANDING) and len(rig.asked) == asked
+    rig.tick(unsure=False)
+    assert rig.asked[asked:] == [(rig.view.at_ns, RequestKind.LAND)]

@@ -20,6 +20,7 @@ from uavctl.config.types import Config
 from uavctl.flight.envelope import MOTION_NS
 from uavctl.mavlink.clocksync import MAX_ROUND_TRIP_NS, RoundTrips
 from uavctl.mavlink.vehicle import SECOND_VEHICLE
+from uavctl.smpc.plant import AXES
 
 # Items of the clocks: who answers TIMESYNC, how far it can be believed, how the clocks drift apart.
 
@@ -79,6 +80,7 @@ def _with_stamps(clock: Item, seen: Heard) -> Item:
 
 Get = Callable[[str], float | None]
 _SLOW_S = 1.0
+_BRAKING_MPS2 = 2.5  # of an ArduPilot whose setpoints have stopped
 _NO_RADIO = 4  # COM_RC_IN_MODE
 _EXTERNAL = 6  # EK3_SRC1_*
 _HORIZONTAL, _VERTICAL, _YAW = 1, 2, 8  # EKF2_EV_CTRL
@@ -90,6 +92,7 @@ class ParameterVerdict(NamedTuple):
 
     state: ItemState
     want: str
+    figures: str = ""  # what this value comes to here, to be added to the hint
 
 
 Judge = Callable[[float, Get, Config], ParameterVerdict]
@@ -114,11 +117,28 @@ def _only(applies: bool, want: str, unless: str, *, good: bool) -> ParameterVerd
 
 
 def _timeout(value: float, _get: Get, config: Config) -> ParameterVerdict:
-    least_s = 3.0 * config.daemon.tick_s
-    want = f"{least_s:g} s (three times daemon.tick_s) to {_SLOW_S:g} s"
-    return _wanted(
-        want, good=least_s <= value <= _SLOW_S, otherwise=ItemState.BAD if value < least_s else ItemState.NOTE
-    )
+    """Judge the silence for which the last acceleration goes on: from rest in its middle, the room has to hold that."""
+    least_s, most_s = 3.0 * config.daemon.tick_s, _SLOW_S
+    figures = ""
+    for axis, (low_m, high_m) in limits_m(config).items():
+        accel_mps2, free_m = config.limits.accel_mps2[AXES.index(axis)], (high_m - low_m) / 2.0
+        most_s = min(most_s, math.sqrt(free_m / _gone_m(accel_mps2, 1.0)))
+        gone_m = _gone_m(accel_mps2, value)
+        if gone_m > free_m and not figures:
+            figures = (
+                f"; {value:g} s at {accel_mps2:g} m/s² are up to {gone_m:.1f} m {axis} from rest, where the room has "
+                f"{free_m:g} m from its middle"
+            )
+    most_s = max(math.floor(10.0 * most_s) / 10.0, least_s)
+    state = ItemState.GOOD if least_s <= value <= most_s else ItemState.NOTE
+    if value < least_s or figures:
+        state = ItemState.BAD
+    return ParameterVerdict(state, f"{least_s:g} s (three times daemon.tick_s) to {most_s:g} s", figures)
+
+
+def _gone_m(accel_mps2: float, timeout_s: float) -> float:
+    """How far a vehicle goes that flies on with an acceleration from rest, then brakes until it stands [m]."""
+    return accel_mps2 * timeout_s**2 / 2.0 + (accel_mps2 * timeout_s) ** 2 / (2.0 * _BRAKING_MPS2)
 
 
 def _offboard_loss(value: float, get: Get, _config: Config) -> ParameterVerdict:
@@ -194,7 +214,7 @@ _INDOORS = "the cameras; GPS and compass lead astray indoors"
 ARDUPILOT = (
     Rule(
         "GUID_TIMEOUT",
-        "when our setpoints stop, the last acceleration goes on for so long: 3 s took 1.9 m/s to 4.9 m/s",
+        "set it to 1, or less: when our setpoints stop, the last acceleration goes on for so long",
         _timeout,
     ),
     Rule("GUID_OPTIONS", "with them an acceleration is not held against the wind", _guided_options),
@@ -215,7 +235,7 @@ ARDUPILOT = (
     ),
 )
 PX4 = (
-    Rule("COM_OF_LOSS_T", "the last setpoint goes on for so long when ours stop", _timeout),
+    Rule("COM_OF_LOSS_T", "set it to 1, or less: the last setpoint goes on for so long when ours stop", _timeout),
     Rule(
         "COM_OBL_RC_ACT",
         "set it to 4 (land) or 5 (hold; it goes back to OFFBOARD by itself when setpoints come again): with 0 to 2 and "
@@ -274,7 +294,7 @@ def _one(rule: Rule, get: Get, config: Config) -> Item:
         hint = "it was asked for several times; does this version have it, and does the link carry our messages?"
         return item(rule.name, ItemState.UNDETERMINED, "not told", "its value, to judge it", hint)
     verdict = rule.judge(value, get, config)
-    return item(rule.name, verdict.state, f"{value:g}", verdict.want, rule.hint)
+    return item(rule.name, verdict.state, f"{value:g}", verdict.want, rule.hint + verdict.figures)
 
 
 # Items of the vehicle: who it is, whether others are heard, armed, landed, battery.

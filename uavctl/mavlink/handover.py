@@ -177,7 +177,7 @@ class HandOver:
         self._see_to_disarming(view)
         held = view.unfit if now.state in _ON_THE_GROUND else ""
         ask = None
-        if now.request.ask is not None:
+        if now.request.ask is not None and not view.unsure:
             ask = now.request.due(view.at_ns, held, blind=self._may_be_the_pilot_s(view))
         if now.state is HandoverState.FAILED and before is HandoverState.ARMING:
             ask = RequestKind.DISARM  # arming may have been granted after all

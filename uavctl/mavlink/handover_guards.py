@@ -56,6 +56,7 @@ class HandoverView(msgspec.Struct, frozen=True, kw_only=True):
     up_s: float | None = None  # time since it started [s]; None if it does not tell
     land: bool = False  # the controller asks for landing
     stop: bool = False  # the operator asks for the end
+    unsure: bool = False  # the pilot may have taken over unheard: nothing is asked of the vehicle
     unfit: str = ""  # why nothing may be armed now; empty if it may
     unsafe: str = ""  # why a vehicle in the air must not climb on by these positions; empty if it may
     up_m: float | None = None  # height of the estimate in local NED [m]; None without one
