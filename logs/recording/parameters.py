@@ -69,7 +69,11 @@ class ParameterReader:
             self._take_bytes(record)
 
     def _take_bytes(self, datagram: Datagram) -> None:
-        data, at = self._rest.pop(datagram.link, b"") + datagram.data, 0
+        data, at = datagram.data, 0
+        if datagram.link in self._rest:
+            data = self._rest.pop(datagram.link) + data
+        elif datagram.link not in self._lost:
+            at = _unread(data)
         while at < len(data):
             begin = _next_frame(data, at)
             if begin > at:
@@ -174,6 +178,17 @@ def _value(value: float, kind: int, *, bytewise: bool) -> int | float:
     if form is not None and math.isfinite(value):
         return round(value)
     return float(str(np.float32(value)))
+
+
+def _unread(data: bytes) -> int:
+    """Return where the first frame begins that may tell something: most datagrams are whole frames that do not."""
+    at, last = 0, len(data) - _HEAD_BYTES
+    while at <= last and data[at] == _V2 and int.from_bytes(data[at + 7 : at + 10], "little") not in _LAYOUTS:
+        end = at + 12 + data[at + 1] + (_SIGNATURE_BYTES if data[at + 2] & _SIGNED else 0)
+        if end > len(data) or (end < len(data) and data[end] not in (_V1, _V2)):
+            break
+        at = end
+    return at
 
 
 def _next_frame(data: bytes, at: int) -> int:
