@@ -16,7 +16,7 @@ from uavctl.config import Config
 from uavctl.flight.controller import Controller
 from uavctl.flight.decision import CONTROLLER_FAULT
 from uavctl.flight.step import BIAS_AT_BOUND, BIAS_FREE, StepOutput, disbelieves, initial_state, step
-from uavctl.mavlink.connection import HUNG_UP, OVERRUN, MavlinkConnection
+from uavctl.mavlink.connection import HUNG_UP, OVERRUN, WENT_SILENT, MavlinkConnection
 from uavctl.mavlink.handover import HAND_OVER_ORDERS, HandOver, HandoverStep
 from uavctl.mavlink.handover_guards import HandoverView, against_moving
 from uavctl.mavlink.handover_states import LEAVES_NONE, HandoverState, Sending
@@ -60,7 +60,7 @@ SECOND_NS = 1_000_000_000
 FAILED = "the controller has failed:"  # and what failed in it
 MAX_ORDERS = 16  # that wait for one tick
 FOR_A_PERSON = frozenset(
-    {"vehicle-text", BIAS_AT_BOUND, BIAS_FREE, CONTROLLER_FAULT}
+    {"vehicle-text", BIAS_AT_BOUND, BIAS_FREE, CONTROLLER_FAULT, HUNG_UP, WENT_SILENT}
 )  # codes of the events that the console tells
 MISLED_NS = 3_000_000_000  # positions are held back for so long after they could not be the vehicle's own
 MAX_INERTIAL = 20  # newest of one tick: their mean is what counts
@@ -208,8 +208,8 @@ class ControlLoop:
         answers = tuple([self._outgoing(link, answer, at_ns) for answer in asked]) if asked else ()
         return Received(answers, from_vehicle, from_source, news)
 
-    def refused(self, link: str, counts: dict[str, int], at_ns: int) -> None:
-        """Take note that a connection has dropped datagrams unread.
+    def refused(self, link: str, counts: dict[str, int], at_ns: int) -> tuple[Event, ...]:
+        """Take note that a connection has dropped datagrams unread, and return what a person is to be told of it.
 
         Where that was the vehicle's, it may have been that the pilot has taken over: nothing that moves the vehicle is
         sent until it is heard again.
@@ -217,8 +217,10 @@ class ControlLoop:
         self._put("/uavctl/refused", at_ns, Refused(at_ns=at_ns, link=link, counts=counts))
         if link == VEHICLE and counts.keys() & {HUNG_UP, OVERRUN}:
             self._unsure_since_ns = at_ns
-        for event in self._links[link].refused(counts, at_ns):
+        events = self._links[link].refused(counts, at_ns)
+        for event in events:
             self._put("/uavctl/event", at_ns, event)
+        return tuple([event for event in events if event.code in FOR_A_PERSON])
 
     def tick(self, tick: int, at_ns: int, send: Send, missed_ticks: int = 0, stop: bool = False) -> Ticked:
         """Run the control tick of grid time `at_ns`.

@@ -80,6 +80,15 @@ def test_words_of_the_vehicle_are_told_a_person_as_they_come_and_once() -> None:
     assert "PreArm: no" in text and told_ns == at_ns
 
 
+def test_a_connection_that_is_lost_is_told_a_person() -> None:
+    bench = Bench('solver.method="exact"')
+    bench.connections["vehicle"].refused["hung-up"] += 1
+    bench.connections["mocap"].refused["went-silent"] += 1
+    bench.connections["mocap"].refused["not-listed"] += 1  # counted, and no word for the console
+    bench.fly(duration_s=1.5, stop_limit_s=0.0)
+    assert [text.partition(":")[0] for text, _ in bench.told] == ["link vehicle", "link mocap"]
+
+
 @pytest.mark.fault(21)
 def test_row_21_an_oversleeping_loop_counts_what_it_missed_and_sends_no_burst() -> None:
     bench = Bench()

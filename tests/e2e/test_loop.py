@@ -123,7 +123,8 @@ def test_where_the_vehicle_s_words_were_lost_nothing_goes_out_until_it_is_heard_
     rig.loop.refused("mocap", {why: 3}, rig.tick * TICK_NS)  # of the cameras': nothing that could be the pilot's
     assert rig.run(5, deaf=True).count(SETPOINT) == 5
     rig.heartbeat(OFFBOARD)
-    rig.loop.refused("vehicle", {why: 3}, rig.tick * TICK_NS)
+    told = rig.loop.refused("vehicle", {why: 3}, rig.tick * TICK_NS)
+    assert [event.code for event in told] == ["hung-up"] * (why == "hung-up")  # a person at the console is told
     silent = rig.run(20, deaf=True)
     assert not {SETPOINT, LAND} & set(silent)
     rig.heartbeat(OFFBOARD, late_ns=1)
@@ -134,6 +135,15 @@ def test_where_the_vehicle_s_words_were_lost_nothing_goes_out_until_it_is_heard_
     assert any("closed the connection" in event.text for event in rig.memory.of(Event)) == (why == "hung-up")
     result = replay(iter(rig.memory.entries), lambda sink: make_loop(rig.config, sink))
     assert result.identical, result.first_difference
+
+
+def test_a_vehicle_that_fell_silent_is_told_and_its_landing_goes_out_all_the_same() -> None:
+    rig = Rig('solver.method="exact"')
+    rig.run(40)
+    rig.heartbeat(OFFBOARD)
+    told = rig.loop.refused("vehicle", {"went-silent": 1}, rig.tick * TICK_NS)
+    assert [event.code for event in told] == ["went-silent"]
+    assert LAND in rig.run(70, stop=True, deaf=True)  # no word of a pilot's was lost: it said nothing
 
 
 @pytest.mark.fault(50)

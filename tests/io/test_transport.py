@@ -17,7 +17,7 @@ from transport_rig import FRAME, LIMIT_NS, Clock, port_of
 from uavctl.errors import ConnectionSpecError
 from uavctl.io.base import Connection
 from uavctl.io.transport import PEER_SILENCE_NS, RETRY_NS, open_connection, wait
-from uavctl.mavlink.connection import HUNG_UP
+from uavctl.mavlink.connection import HUNG_UP, WENT_SILENT
 
 
 @contextmanager
@@ -204,6 +204,37 @@ def test_tcp_calls_a_peer_again_that_has_hung_up_and_never_waits_for_it() -> Non
                 connection.send(FRAME)
                 assert peer.recv(4096) == FRAME  # nothing of what waited for the one before
         assert connection.refused == {HUNG_UP: 1}
+
+
+def test_tcp_makes_a_connection_again_that_has_fallen_silent() -> None:
+    clock = [0]
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(LIMIT_S)
+        with closing(open_connection(f"tcp://127.0.0.1:{server.getsockname()[1]}", lambda: clock[0])) as connection:
+            peer, _ = server.accept()
+            with peer:
+                clock[0] += 10 * PEER_SILENCE_NS  # a vehicle that is still starting up
+                assert connection.receive() == [] and not connection.refused
+                peer.sendall(FRAME)
+                assert b"".join(arrived(connection, len(FRAME))) == FRAME
+                connection.send(FRAME)
+                clock[0] += PEER_SILENCE_NS
+                assert connection.receive() == [] and not connection.refused
+                clock[0] += 1
+                assert connection.receive() == [] and connection.refused == {WENT_SILENT: 1}
+                peer.settimeout(LIMIT_S)
+                with pytest.raises(ConnectionResetError):  # an end that is still there knows at once
+                    while peer.recv(100):
+                        pass
+            for again in (2, 3):  # the next one is given as long
+                clock[0] += RETRY_NS
+                until(lambda: connection.receive() == [] and connection.filenos() != (), "the connection stands")
+                peer, _ = server.accept()
+                with peer:
+                    clock[0] += PEER_SILENCE_NS
+                    assert connection.receive() == [] and connection.refused == {WENT_SILENT: again - 1}
+                    clock[0] += 1
+                    assert connection.receive() == [] and connection.refused == {WENT_SILENT: again}
 
 
 def test_tcp_never_cuts_a_frame_when_the_peer_does_not_read() -> None:

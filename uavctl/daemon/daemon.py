@@ -160,7 +160,7 @@ def fly(
         stop_limit_s: the hand-over is cut off after this time [s], unless the vehicle is in the air by the positions
             that are relayed to it; 0 ends without one.
         after_tick: called in this order after each tick.
-        on_news: called with what a datagram brings for a person; may neither wait nor raise.
+        on_news: called with what a datagram or a lost connection brings for a person; may neither wait nor raise.
         wait_for: sleeps until a deadline or the first arrival; gives the names of connections to read.
         now: the clock [ns].
 
@@ -172,7 +172,7 @@ def fly(
     """
     first_ns: int | None = None
     stop_ns: int | None = None
-    refusals = _Refusals(loop, connections)
+    refusals = _Refusals(loop, connections, on_news)
     reader = _Reader(loop, connections, now, on_news)
     withheld = 0
 
@@ -293,8 +293,10 @@ class _Reader:
 class _Refusals:
     """Tells the loop once a second what the connections dropped."""
 
-    def __init__(self, loop: ControlLoop, connections: Mapping[str, Connection]) -> None:
-        self._loop, self._connections = loop, connections
+    def __init__(
+        self, loop: ControlLoop, connections: Mapping[str, Connection], on_news: Callable[[tuple[Event, ...]], None]
+    ) -> None:
+        self._loop, self._connections, self._on_news = loop, connections, on_news
         self._told: dict[str, Counter[str]] = {name: Counter() for name in connections}
         self._next_ns = 0
 
@@ -309,4 +311,4 @@ class _Refusals:
             new = refused - self._told[name]
             if new:
                 self._told[name] = refused
-                self._loop.refused(name, dict(new), at_ns)
+                self._on_news(self._loop.refused(name, dict(new), at_ns))

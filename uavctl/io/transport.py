@@ -19,7 +19,7 @@ import serial
 from uavctl.errors import ConnectionSpecError
 from uavctl.io.admission import MAGIC, NOT_LISTED, SILENCE_NS, Address, AllowList, Budgets, Rules
 from uavctl.io.base import BACKLOG_READS, MAX_READS, Base, Connection
-from uavctl.mavlink.connection import HUNG_UP
+from uavctl.mavlink.connection import HUNG_UP, WENT_SILENT
 
 # UDP: an allow-list and budgets come before anything that looks into a datagram.
 
@@ -307,6 +307,7 @@ CHUNK_BYTES = 4096
 MAX_CHUNKS = 4  # of one call, so that a flood cannot hold the loop; what waits is read in the next one
 BACKLOG_CHUNKS = 128  # of a call that is to read everything; the other side waits, and loses nothing
 PORT_BYTES = 4095  # capacity of a Linux port's buffer; a serial line does not wait
+_DROP_UNSENT = struct.pack("ii", 1, 0)  # of SO_LINGER: closed at once, by a reset
 _PENDING_LIMIT = 4096  # bytes that wait for a stream that does not drain
 
 
@@ -326,7 +327,7 @@ class _Pending:
 
 
 class Tcp(Socket):
-    """TCP client; a peer that has hung up is called again each second, and nobody waits for it."""
+    """TCP client; a peer that has hung up or fallen silent is called again each second, and nobody waits for it."""
 
     max_reads = MAX_CHUNKS
     backlog_reads = BACKLOG_CHUNKS
@@ -337,6 +338,7 @@ class Tcp(Socket):
         self._pending = _Pending()
         self._up = True
         self._tried_ns = 0  # when the last attempt began, or the connection ended
+        self._heard_ns: int | None = None  # when something came last, or the connection was made again
         self._socket.settimeout(CONNECT_TIMEOUT_S)
         self._attempt(self._socket.connect, address, "is the vehicle or simulator running and listening there?")
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -352,19 +354,26 @@ class Tcp(Socket):
         try:
             data = self._socket.recv(CHUNK_BYTES)
         except BlockingIOError:
+            # A network that went and came back may have forgotten the connection, and neither end is told.
+            if self._heard_ns is not None and self._now() - self._heard_ns > PEER_SILENCE_NS:
+                self._hang_up(WENT_SILENT)
             raise
         except OSError:
-            self._hang_up()
+            self._hang_up(HUNG_UP)
             raise
         if not data:
-            self._hang_up()
-        return data or None
+            self._hang_up(HUNG_UP)
+            return None
+        self._heard_ns = self._now()
+        return data
 
-    def _hang_up(self) -> None:
+    def _hang_up(self, why: str) -> None:
+        with suppress(OSError):  # what still waits in the system for a peer that does not answer is old by then
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _DROP_UNSENT)
         self._socket.close()
         self._up, self._tried_ns = False, self._now()
         self._pending = _Pending()  # a frame of which the peer has had the beginning
-        self.refused[HUNG_UP] += 1
+        self.refused[why] += 1
 
     def _call(self) -> None:
         """Begin an attempt to connect, or go on with it; BlockingIOError while there is no connection."""
@@ -378,7 +387,9 @@ class Tcp(Socket):
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         state = self._socket.connect_ex(self._address)
         self._up = state in (0, errno.EISCONN)
-        if not self._up:
+        if self._up:
+            self._heard_ns = self._now()
+        else:
             if late or state not in (errno.EINPROGRESS, errno.EALREADY):
                 self._socket.close()
             raise BlockingIOError

@@ -221,7 +221,12 @@ SLOW_TOLD_NS = 10_000_000_000  # between two events of slow answers
 UNANSWERED = "timesync-flood"
 OVERRUN = "overrun"  # dropped by the system while nobody read, the vehicle's newest words perhaps
 HUNG_UP = "hung-up"  # times that the other side of a TCP connection has closed it
-_USUAL = frozenset({BadBytes.UNKNOWN, OWN_ESTIMATE, HUNG_UP})  # counted, not told: every flight has them, or told else
+WENT_SILENT = "went-silent"  # times that nothing came over a TCP connection for so long that it is made again
+_LOST = {
+    HUNG_UP: "the other side has closed the connection; it is called again each second",
+    WENT_SILENT: "nothing comes over the connection any more; it is made again",
+}
+_USUAL = frozenset({BadBytes.UNKNOWN, OWN_ESTIMATE, *_LOST})  # counted, not told: every flight has them, or told else
 
 Item = PositionSample | VehicleStatus | VehicleMotion | InertialSample | Event | Ack | Text
 
@@ -331,14 +336,14 @@ class MavlinkConnection:
 
     def refused(self, counts: Mapping[str, int], at_ns: int) -> tuple[Event, ...]:
         """Take the counts of what the connection dropped unread: addresses, rates, signatures."""
-        events = self._hung_up(at_ns) if HUNG_UP in counts else ()
         for reason, count in counts.items():
             self._count(reason, count)
-        return events + self._tell(at_ns)
-
-    def _hung_up(self, at_ns: int) -> tuple[Event, ...]:
-        text = f"link {self._name}: the other side has closed the connection; it is called again each second"
-        return (Event(at_ns=at_ns, severity=Severity.ERROR, code=HUNG_UP, text=text),)
+        lost = tuple(
+            Event(at_ns=at_ns, severity=Severity.ERROR, code=reason, text=f"link {self._name}: {text}")
+            for reason, text in _LOST.items()
+            if reason in counts
+        )
+        return lost + self._tell(at_ns)
 
     def due(self, at_ns: int) -> tuple[bytes, ...]:
         """Return what is to be sent at `at_ns` besides setpoints: heartbeat, TIMESYNC, requests for streams."""
