@@ -18,11 +18,14 @@ from logs.report.verdicts import Judged, flown_config
 from uavctl.build.controller import build_estimator
 from uavctl.config import Config
 from uavctl.flight.envelope import OF_POSITIONS
+from uavctl.mavlink.connection import HUNG_UP, WENT_SILENT
 from uavctl.outcome import Cause
 from uavctl.records import ControlMode, Decision, number
 
 GOOD, MIND, BAD = "good", "mind", "bad"  # of a headline: its colour
 
+_ITS_LINK = "link vehicle: "  # begins what is told of the vehicle's connection
+_UNHEARD_S = 2.5  # a heartbeat comes each second
 _PUSH_MPS2, _PUSH_MPS = 0.1, 0.3  # carries a vehicle off by as much as is worth telling, if it lasts
 _LOOKED_AT_S, _AFTER_S = 0.3, 3.0  # least time to tell a push in, and the longest until a limit is left for it
 _WRONG_M = 0.3  # between a position that was used and the true place: no noise of a camera
@@ -272,6 +275,7 @@ class _Told:
         """Return sentences on what lies behind the headline; where nothing does, one with the figures that show it."""
         told = [
             *(self._outside(worst) if worst is not None else ()),
+            *self._unheard(),
             *self._let_go(),
             *self._blind(),
             *self._off(),
@@ -313,6 +317,21 @@ class _Told:
         if not np.isfinite(off_m) or off_m < _WRONG_M:
             return None
         return f"At {seconds(worst.worst_s)} the estimate put it {metres(off_m)} away from where it was."
+
+    def _unheard(self) -> Iterator[str]:
+        """Return a sentence on the longest time without a heartbeat of the vehicle, and how its connection was lost."""
+        flight = self.flight
+        heard_s = flight.seconds([*(one.at_ns for one in flight.vehicles), flight.decisions[-1].at_ns])
+        gaps_s = np.diff(heard_s)
+        if not gaps_s.size or gaps_s.max() <= _UNHEARD_S:
+            return
+        begun_s, ended_s = heard_s[gaps_s.argmax() :][:2]
+        text = f"No heartbeat of the vehicle came for {seconds(ended_s - begun_s)}, from {seconds(begun_s)} on"
+        lost = [one for one in flight.events if one.code in (HUNG_UP, WENT_SILENT) and one.text.startswith(_ITS_LINK)]
+        if lost:
+            (at_s,) = flight.seconds([lost[0].at_ns])
+            text += f"; at {seconds(at_s)} {lost[0].text.removeprefix(_ITS_LINK).partition(';')[0]}"
+        yield f"{text}."
 
     def _let_go(self) -> Iterator[str]:
         flight, s = self.flight, self.summary

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from msgspec.structs import replace
 from scipy.linalg import expm, logm
 from synthetic_scene import Array, Scene, box
 
@@ -56,16 +57,14 @@ def fly(
     per_step, ticks = round(scene.dt_s / scene.tick_s), round(duration_s / scene.tick_s)
     config = config_toml or f'name = "{scene.name}"\nduration_s = {duration_s}\n\n[link]\nloss = 0.3\n'
     yield "/uavctl/header", start_ns, header(scene, config, start_ns)
-    yield (
-        "/uavctl/vehicle",
-        start_ns,
-        VehicleStatus(at_ns=start_ns, autopilot="px4", armed=True, mode="OFFBOARD", external=True, battery_v=15.2),
-    )
+    heartbeat = VehicleStatus(at_ns=0, autopilot="px4", armed=True, mode="OFFBOARD", external=True, battery_v=15.2)
     pilot, x, lost = _Pilot(scene.start.copy()), scene.start.copy(), 0
     u, w = np.zeros(len(scene.input_limit)), np.zeros(len(scene.axes))
     fine = _substep(scene, per_step)
     for tick in range(ticks):
         at_ns, step = start_ns + round(tick * scene.tick_s * 1e9), tick // per_step
+        if tick % round(1.0 / scene.tick_s) == 0:
+            yield "/uavctl/vehicle", at_ns, replace(heartbeat, at_ns=at_ns)
         boundary = tick % per_step == 0
         heard = boundary and (step == 0 or rng.random() > 0.3)
         if blackout is not None and blackout[0] <= tick * scene.tick_s < blackout[1]:

@@ -223,8 +223,8 @@ OVERRUN = "overrun"  # dropped by the system while nobody read, the vehicle's ne
 HUNG_UP = "hung-up"  # times that the other side of a TCP connection has closed it
 WENT_SILENT = "went-silent"  # times that nothing came over a TCP connection for so long that it is made again
 _LOST = {
-    HUNG_UP: "the other side has closed the connection; it is called again each second",
-    WENT_SILENT: "nothing comes over the connection any more; it is made again",
+    HUNG_UP: "the other side closed the connection; it is called again each second",
+    WENT_SILENT: "nothing came over the connection any more; it is made again",
 }
 _USUAL = frozenset({BadBytes.UNKNOWN, OWN_ESTIMATE, *_LOST})  # counted, not told: every flight has them, or told else
 

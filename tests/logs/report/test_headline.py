@@ -9,6 +9,7 @@ import re
 import numpy as np
 import pytest
 from loopback_rig import lockstep
+from mavlink_rig import make_link
 from recorded_rig import RELAYED, listened, page_of, truth
 from report_rig import drawn
 from synthetic_flight import fly
@@ -139,6 +140,21 @@ def test_blind_is_the_time_without_a_position() -> None:
     assert lasted == pytest.approx(gap_s, abs=0.26)  # known at ticks, and until the next position has come
     assert ended - begun == pytest.approx(lasted, abs=0.11)
     assert begun <= 4.05 and 7.9 <= ended <= 8.6
+
+
+@pytest.mark.parametrize("code", [None, "hung-up", "went-silent"])
+def test_a_vehicle_that_was_not_heard_is_told_before_what_came_of_it(
+    flight: FlightData, judged: Judged, code: str | None
+) -> None:
+    assert "heartbeat" not in " ".join(head(flight, judged).why)
+    kept = [one for one in flight.vehicles if not 3.0 < (one.at_ns - flight.origin_ns) * 1e-9 < 7.0]
+    events = () if code is None else make_link().refused({code: 1}, flight.origin_ns + 3_400_000_000)
+    deaf = dataclasses.replace(flight, vehicles=tuple(kept), events=(*flight.events, *events))
+    first = head(deaf, judged).why[0]
+    assert "for 4.0 s, from 3.0 s on" in first
+    assert ("at 3.4 s" in first and "connection" in first) == (code is not None)
+    ends = dataclasses.replace(flight, vehicles=flight.vehicles[:8])
+    assert "for 5.0 s, from 7.0 s on" in head(ends, judged).why[0]
 
 
 @pytest.mark.parametrize("every", [3, 50])
