@@ -20,7 +20,7 @@ from typing import Literal, TypeVar
 import msgspec
 
 from logs.recording.derived_topics import tightened
-from logs.recording.design_view import AXIS_NUMBER, DesignView, Floats, design_view
+from logs.recording.design_view import AXIS_NUMBER, DesignView, Floats, config_name, design_view
 from uavctl.errors import RecordingError, UsageError
 from uavctl.records import (
     ControlMode,
@@ -109,6 +109,7 @@ class FlightScene:
         self._newest: dict[type[Record], Record] = {}
         self._events: deque[Event] = deque(maxlen=MOST_EVENTS)
         self._design: DesignView | None = None
+        self._name: str | None = None  # of the configuration
 
     def see(self, record: Record) -> None:
         """Take a record."""
@@ -116,6 +117,7 @@ class FlightScene:
         if isinstance(record, Event):
             self._events.append(record)
         elif isinstance(record, Header):
+            self._name = config_name(record)
             try:
                 self._design = design_view(record)
             except RecordingError:
@@ -139,7 +141,7 @@ class FlightScene:
         current = plan if plan is not None and plan.seq == decision.plan_seq else None
         level = _level_of(decision, age_s, limit_s)
         return LiveScene(
-            title=f"{header.command.split(' ')[0] or 'flight'}: {header.design_id[:8]}",
+            title=f"uavctl: {self._name}" if self._name else "uavctl",
             time_s=(decision.at_ns - header.started_ns) * 1e-9,
             headline=_headline(decision, age_s),
             level=level,

@@ -187,3 +187,12 @@ def _free_input(header: Header) -> float:
     except tomllib.TOMLDecodeError:
         return 0.0  # the page shows the damaged text, and limits that are cautious
     return float(estimator.get("bias_max", 0.0))
+
+
+def config_name(header: Header) -> str | None:
+    """Return the name in a recording's configuration; None if there is none, or the TOML is damaged."""
+    try:
+        name = tomllib.loads(header.config_toml).get("name")
+    except tomllib.TOMLDecodeError:
+        return None
+    return name if isinstance(name, str) else None

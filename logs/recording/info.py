@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections import Counter
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -11,6 +10,7 @@ from pathlib import Path
 
 import msgspec
 
+from logs.recording.design_view import config_name
 from logs.recording.parameters import ParameterReader, VehicleParameter
 from logs.recording.reader import AttachedFile, Damage, EndOfFile, RecordedMessage, segment_files, walk
 from logs.recording.topics import END, HEADER, LIBRARY, PARAMETER, RECORDER, RecorderNote, decode, raw_link
@@ -312,9 +312,5 @@ def _utc(utc_ns: int) -> str:
 
 
 def _origin(header: Header) -> RecordingOrigin:
-    try:
-        name = str(tomllib.loads(header.config_toml).get("name", ""))
-    except tomllib.TOMLDecodeError:
-        name = ""
     copied = {key: getattr(header, key) for key in RecordingOrigin.__struct_fields__ if key != "config"}
-    return RecordingOrigin(config=name, **copied)
+    return RecordingOrigin(config=config_name(header) or "", **copied)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pickle
 import sys
-import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
+from logs.recording.design_view import config_name
 from logs.recording.disk import write_whole
 from logs.recording.flight import FlightData
 from logs.recording.reader import read
@@ -309,7 +309,7 @@ def report_html(flight: FlightData, summary: FlightSummary, judged: Judged | Non
     """Return the page of a flight as HTML."""
     judged = judge(flight) if judged is None else judged
     header = flight.header
-    name = _config_name(header.config_toml)
+    name = config_name(header)
     title = f"Flight “{name}”" if name else "Flight"
     title += ", a part" if part_begins(flight) else ""
     subtitle = f"{header.started_utc} · {header.command} · seed {header.seed}"
@@ -502,15 +502,6 @@ def _truth_mark(flight: FlightData) -> tuple[Mark, ...]:
 
 def _fallback_mark(flight: FlightData) -> tuple[Mark, ...]:
     return (_FALLBACK,) if flight.fallback_spans else ()
-
-
-def _config_name(config_toml: str) -> str | None:
-    """Return the name in a configuration; None if there is none, or the TOML is damaged."""
-    try:
-        name = tomllib.loads(config_toml).get("name")
-    except tomllib.TOMLDecodeError:
-        return None
-    return name if isinstance(name, str) else None
 
 
 def main() -> int:

@@ -16,6 +16,7 @@ from view_rig import flown
 
 from logs.live import HOST, MOST_PAGES, FlightScene, LiveScene, live_page
 from logs.recording.design_view import design_view
+from uavctl.config import parse
 from uavctl.errors import UsageError
 from uavctl.records import Decision, Estimate, Event, Header, Plan, Record, Truth
 
@@ -61,6 +62,7 @@ def test_it_shows_what_the_records_say() -> None:
         assert found is not None
         header, estimate, truth = newest[Header], newest.get(Estimate), newest.get(Truth)
         design = design_view(header)
+        assert found.title == f"uavctl: {parse(header.config_toml, 'flight').config.name}"
         places = {body.name: body.at_m for body in found.bodies}
         assert found.time_s == pytest.approx((record.at_ns - header.started_ns) * 1e-9)
         assert found.age_s == (None if estimate is None else pytest.approx(estimate.age_s))

@@ -15,6 +15,7 @@ from uavctl.cli.app import run
 from uavctl.cli.sim import HEADINGS, LANDED, line, scene_of, view, watching
 from uavctl.config import load_config
 
+ROOM = load_config("room", ("sets.state_upper=[3, 1.5, inf, 2.5, 1.5, inf, inf, 1, inf]",))
 ANY = "udpin://127.0.0.1:0"
 ONE = VehicleSnapshot(
     system_id=3,
@@ -60,14 +61,16 @@ def test_the_table_has_a_row_for_each_vehicle_and_takes_no_text_for_markup() -> 
 
 
 def test_the_live_page_tells_the_same() -> None:
-    found = scene_of((ONE, replace(ONE, system_id=2, faults=())))
+    found = scene_of((ONE, replace(ONE, system_id=2, faults=())), ROOM)
     assert [body.at_m for body in found.bodies] == [ONE.position_m] * 2
+    assert found.box is not None  # what is open is drawn open
+    assert (found.box.lower_m, found.box.upper_m) == ((-3.0, -2.5, -2.5), (3.0, 2.5, None))
     told = " ".join(f"{one.name} {one.value}" for one in found.figures)
     for name in HEADINGS[4:-1]:
         assert f"{ONE.system_id}: {name}" in told and f"2: {name}" in told
     assert {one.level for one in found.figures} == {"plain", "warn"} and bool(ONE.faults)
     assert [event.text for event in found.events] == [f"{ONE.system_id}: {ONE.text}", f"2: {ONE.text}"]
-    alone = scene_of((ONE,)).headline
+    alone = scene_of((ONE,), ROOM).headline
     assert ONE.mode in alone and LANDED[ONE.phase] in alone
 
 
@@ -122,7 +125,7 @@ def test_without_a_terminal_it_is_said_and_told_line_by_line(capsys: pytest.Capt
 
 def test_in_a_terminal_the_table_is_drawn_to_the_end() -> None:
     console = Console(file=io.StringIO(), width=250, force_terminal=True)
-    with watching(console) as tell:
+    with watching(console, ROOM) as tell:
         tell((ONE,))
         tell((replace(ONE, mode="AUTO.LAND"),))
     assert isinstance(console.file, io.StringIO)
@@ -146,7 +149,7 @@ def test_a_terminal_that_has_stopped_does_not_hold_up_the_simulation() -> None:
     stuck = Stuck()
     told: list[int] = []
     seat = Seat(load_config("room-hahn-stursberg"), ANY, ANY, lambda truth: told.append(truth.at_ns))
-    with watching(Console(file=stuck, force_terminal=True)) as tell:
+    with watching(Console(file=stuck, force_terminal=True), ROOM) as tell:
         tell((ONE,))
         assert stuck.tried.wait(LIMIT_S)
         serve_all(

@@ -18,6 +18,7 @@ from uavctl.arithmetic import ARITHMETIC
 from uavctl.build.link import build_ages, build_delayed_link, late_steps, promised
 from uavctl.build.mission import build_mission, build_names, build_rests
 from uavctl.build.outside import controller_id, decider_id, flown_outside
+from uavctl.config.checks import position_limits_m
 from uavctl.config.types import Config
 from uavctl.errors import DesignError
 from uavctl.flight.controller import Controller
@@ -342,10 +343,8 @@ def _bias_bounds(config: Config) -> tuple[float, ...]:
 
 def build_envelope(config: Config, plant: Plant) -> EnvelopeParameters:
     """Return the bounds of what is possible in flight, by the limits, the plant and the last gate."""
-    sets, envelope, limits = config.sets, config.envelope, config.limits
-    places = dict(zip(plant.axes, plant.position_index, strict=True))
-    lower = [sets.state_lower[places[axis]] if axis in places else -math.inf for axis in AXES]
-    upper = [sets.state_upper[places[axis]] if axis in places else math.inf for axis in AXES]
+    envelope, limits, walls = config.envelope, config.limits, position_limits_m(config)
+    lower, upper = map(list, zip(*(walls.get(axis, (-math.inf, math.inf)) for axis in AXES), strict=True))
     room = [high - low for low, high in zip(lower, upper, strict=True)]
     outside = [envelope.outside_m or max(0.1 * size if math.isfinite(size) else 0.0, LEAST_OUTSIDE_M) for size in room]
     # What one step's disturbance does to a velocity, as an acceleration over the step.

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uavctl.check.findings import Heard, Item, ItemState, Sample, item, judged
-from uavctl.config.checks import position_index
+from uavctl.config.checks import position_limits_m
 from uavctl.config.connections import camera_scheme
 from uavctl.config.types import Config
 from uavctl.flight.link_estimate import loss_std
@@ -192,17 +192,10 @@ def _noise(samples: list[Sample], config: Config) -> Item:
     return judged("position noise", good=worst_m <= _NOISE_FACTOR * believed_m, value=value, want=want, hint=hint)
 
 
-def limits_m(config: Config) -> dict[str, tuple[float, float]]:
-    """Limits of each axis that the plant has [m]."""
-    plant, sets = config.plant, config.sets
-    places = position_index(plant)
-    return {axis: (sets.state_lower[i], sets.state_upper[i]) for axis, i in zip(plant.axes, places, strict=True)}
-
-
 def _place(samples: list[Sample], config: Config) -> Item:
     middle = np.median(np.array([one.position_m for one in samples]), axis=0)
     where = ", ".join(f"{value:.3g}" for value in middle)
-    limits = limits_m(config)
+    limits = position_limits_m(config)
     inside = _is_inside(middle.tolist(), limits, config.check.margin_m)
     hint = "see [frame] (axes, origin, unit), or the limits of [sets]"
     if from_cameras(config):

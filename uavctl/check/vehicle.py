@@ -15,7 +15,7 @@ from typing import NamedTuple
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.check.findings import Heard, Item, ItemState, item, judged
-from uavctl.check.positions import limits_m
+from uavctl.config.checks import position_limits_m
 from uavctl.config.types import Config
 from uavctl.flight.envelope import MOTION_NS
 from uavctl.mavlink.clocksync import MAX_ROUND_TRIP_NS, RoundTrips
@@ -120,7 +120,7 @@ def _timeout(value: float, _get: Get, config: Config) -> ParameterVerdict:
     """Judge the silence for which the last acceleration goes on: from rest in its middle, the room has to hold that."""
     least_s, most_s = 3.0 * config.daemon.tick_s, _SLOW_S
     figures = ""
-    for axis, (low_m, high_m) in limits_m(config).items():
+    for axis, (low_m, high_m) in position_limits_m(config).items():
         accel_mps2, free_m = config.limits.accel_mps2[AXES.index(axis)], (high_m - low_m) / 2.0
         most_s = min(most_s, math.sqrt(free_m / _gone_m(accel_mps2, 1.0)))
         gone_m = _gone_m(accel_mps2, value)
@@ -273,7 +273,7 @@ def parameter_items(seen: Heard, config: Config, take_off_m: float | None = None
 
 def _climb(config: Config, take_off_m: float | None) -> Rule:
     """PX4 climbs to a height of its own, and is asked for OFFBOARD on the way, where `--takeoff` is reached."""
-    ceiling_m = -limits_m(config).get("down", (-math.inf, 0.0))[0]
+    ceiling_m = -position_limits_m(config).get("down", (-math.inf, 0.0))[0]
     least_m = 0.0 if take_off_m is None else take_off_m
     bounds = [f"at most {ceiling_m:g} m, the room (sets)"] if math.isfinite(ceiling_m) else []
     bounds += [f"at least {least_m:g} m, --takeoff"] if least_m else []

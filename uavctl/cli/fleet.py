@@ -31,7 +31,7 @@ from uavctl.cli import main
 from uavctl.cli.common import SPAN_S, Common, QuietJson, TakeOff, columns, given_keys, messages
 from uavctl.cli.ctl import ask
 from uavctl.config import Config, load
-from uavctl.config.checks import position_index
+from uavctl.config.checks import position_limits_m
 from uavctl.config.document import ConfigProblem, Section
 from uavctl.config.load import read_document
 from uavctl.daemon.control_socket import ControlRequest, control_folder, daemon_name
@@ -82,11 +82,7 @@ class Member:
 
     def limits_m(self, axis: str) -> tuple[float, float]:
         """Limits of its position along an axis; infinite where there are none."""
-        places = dict(zip(self.config.plant.axes, position_index(self.config.plant), strict=True))
-        if axis not in places:
-            return -math.inf, math.inf
-        sets = self.config.sets
-        return sets.state_lower[places[axis]], sets.state_upper[places[axis]]
+        return position_limits_m(self.config).get(axis, (-math.inf, math.inf))
 
 
 Looks = dict[str, Health | None]  # by name; None where no daemon answers

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import socket
 import sys
 import threading
@@ -24,6 +25,8 @@ from sim.simulation import VehicleSnapshot
 from uavctl.cli.common import DEFAULTS, Column, Common, WideTable, messages, write_document
 from uavctl.cli.flying import stop_on_signals
 from uavctl.clock import monotonic_ns
+from uavctl.config import Config
+from uavctl.config.checks import position_limits_m
 from uavctl.config.connections import MOCAP_LINK, SecurityConfig
 from uavctl.config.load import with_faults
 from uavctl.io.signed_connection import read_key
@@ -31,6 +34,7 @@ from uavctl.mavlink.connection import MOCAP
 from uavctl.mavlink.framing import scan
 from uavctl.mavlink.signing import Gate, Signing, SigningKey, Stamps
 from uavctl.records import Truth, Vec3
+from uavctl.smpc.plant import AXES
 
 if TYPE_CHECKING:
     from logs.live import Level, LiveScene
@@ -168,7 +172,7 @@ def line(one: VehicleSnapshot) -> str:
 
 
 @contextmanager
-def watching(console: Console) -> Iterator[Callable[[tuple[VehicleSnapshot, ...]], None]]:
+def watching(console: Console, config: Config) -> Iterator[Callable[[tuple[VehicleSnapshot, ...]], None]]:
     """Show snapshots of vehicles given to the yielded function: a live table, or a line each second without a terminal.
 
     The same is on a page for browsers on this machine. A thread of its own draws, so whoever tells never waits, not
@@ -185,7 +189,7 @@ def watching(console: Console) -> Iterator[Callable[[tuple[VehicleSnapshot, ...]
     draw = _draw if console.is_terminal else _write
     if not console.is_terminal:
         console.print("--view: no terminal to draw in, so a line a second", soft_wrap=True)
-    with live_page(lambda: scene_of(latest[0]) if latest else None, 0) as address:
+    with live_page(lambda: scene_of(latest[0], config) if latest else None, 0) as address:
         thread = threading.Thread(target=draw, args=(console, address, latest, done), name="view", daemon=True)
         thread.start()
         try:
@@ -195,10 +199,13 @@ def watching(console: Console) -> Iterator[Callable[[tuple[VehicleSnapshot, ...]
             thread.join(END_S)
 
 
-def scene_of(looks: Looks) -> LiveScene:
-    """Return what a live page shows of simulated vehicles."""
-    from logs.live import LiveScene, SceneBody, SceneEvent, SceneFigure
+def scene_of(looks: Looks, config: Config) -> LiveScene:
+    """Return what a live page shows of simulated vehicles, and the limits of the room they fly in."""
+    from logs.live import LiveScene, SceneBody, SceneBox, SceneEvent, SceneFigure
 
+    limits = position_limits_m(config)
+    walls = [[side if math.isfinite(side) else None for side in limits.get(axis, (math.inf,) * 2)] for axis in AXES]
+    lower_m, upper_m = zip(*walls, strict=True)
     figures, events = [], []
     for one in looks:
         level: Level = "warn" if one.faults else "plain"
@@ -209,11 +216,12 @@ def scene_of(looks: Looks) -> LiveScene:
             events.append(SceneEvent(one.time_s, "plain", f"{name}{one.text}"))
     told = [f"{one.mode}, {'armed' if one.armed else 'disarmed'}, {LANDED[one.phase]}" for one in looks]
     return LiveScene(
-        title="uavctl sim",
+        title=f"uavctl sim: {config.name}",
         time_s=max(one.time_s for one in looks),
         headline=told[0] if len(told) == 1 else f"{len(told)} vehicles",
         level="plain",
         bodies=tuple(SceneBody(f"vehicle {one.system_id}", one.position_m) for one in looks),
+        box=SceneBox(lower_m, upper_m),
         figures=tuple(figures),
         events=tuple(events),
     )
@@ -319,7 +327,7 @@ def sim(
         if len(opened) == len(seats):
             _announce(seats, opened, as_json=common.json)
 
-    watch = watching(messages()) if view else nullcontext()
+    watch = watching(messages(), config) if view else nullcontext()
     with stop_on_signals() as stopped, watch as on_look:
         serve_all(
             seats,

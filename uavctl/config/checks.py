@@ -22,6 +22,7 @@ from uavctl.config.mission import FenceConfig, MissionConfig, TrajectoryConfig
 from uavctl.config.types import (
     LIBRARY_HORIZON,
     PLANNED_HORIZON,
+    Config,
     CostConfig,
     EstimatorConfig,
     LimitsConfig,
@@ -44,6 +45,13 @@ def position_index(plant: PlantConfig) -> tuple[int, ...]:
     """State index of each axis' position."""
     size = plant.states_per_axis
     return tuple(range(0, size * len(plant.axes), size)) if size else plant.position_index
+
+
+def position_limits_m(config: Config) -> dict[str, tuple[float, float]]:
+    """Return the least and the largest position along each axis that the plant has [m]; infinite without a wall."""
+    plant, sets = config.plant, config.sets
+    places = position_index(plant)
+    return {axis: (sets.state_lower[i], sets.state_upper[i]) for axis, i in zip(plant.axes, places, strict=True)}
 
 
 def outside(plant: PlantConfig, sets: SetsConfig, place: Position, key: str, what: str) -> Iterator[ConfigProblem]:
