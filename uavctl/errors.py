@@ -81,3 +81,22 @@ class NotReachedError(UavctlError):
 
 class KeyFileError(UsageError):
     """A file of a signing key, or of its stamps, cannot be used."""
+
+
+class EndedBySignal(SystemExit):
+    """The operator's second signal: it ends the process wherever that is, also in code of another package."""
+
+
+# What code of other packages may raise, where nothing that it does may end a flight or a campaign.
+RAISED = (Exception, SystemExit, GeneratorExit)
+LONGEST_WORDS = 500  # of what an error says [characters]
+
+
+def in_words(error: BaseException, longest: int = LONGEST_WORDS) -> str:
+    """Return an error of any code on one line: its type, and what it says as far as it can."""
+    try:
+        said = str(error)[:longest]
+    except RAISED:
+        said = ""
+    said = "".join(c if c.isprintable() else " " for c in said).strip()
+    return f"{type(error).__name__}: {said}" if said else type(error).__name__

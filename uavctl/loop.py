@@ -13,6 +13,7 @@ from traceback import extract_tb
 from msgspec.structs import replace
 
 from uavctl.config import Config
+from uavctl.errors import in_words
 from uavctl.flight.controller import Controller
 from uavctl.flight.decision import CONTROLLER_FAULT
 from uavctl.flight.step import BIAS_AT_BOUND, BIAS_FREE, StepOutput, disbelieves, initial_state, step
@@ -323,7 +324,7 @@ class ControlLoop:
         """
         last = next(reversed(extract_tb(error.__traceback__)), None)
         where = "" if last is None else f" ({last.filename.rpartition('/')[2]}, line {last.lineno})"
-        self.course.died = self.course.died or f"{type(error).__name__}: {error}{where}"
+        self.course.died = self.course.died or f"{in_words(error)}{where}"
         event = Event(at_ns=at_ns, severity=Severity.ERROR, code="control", text=f"{FAILED} {self.course.died}")
         self._put("/uavctl/event", at_ns, event)
         return event

@@ -22,7 +22,7 @@ from uavctl.outcome import Cause
 from uavctl.records import ControlMode, Ending
 
 MODULE = "outside_controllers"
-FAILING = ("Raises", "RaisesSoon", "NotFinite", "WrongShape")
+FAILING = ("Raises", "RaisesSoon", "Leaves", "NotFinite", "WrongShape")
 WAY_S = 14.0
 
 
@@ -95,6 +95,15 @@ def test_one_that_fails_brakes_within_the_room_and_replays(
     assert replays(path, capsys)
 
 
+def test_what_one_prints_is_no_part_of_the_document(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ("loopback", "--config", "room", "--duration", "2", "--set", f"smpc.controller={MODULE}:Prints")
+    assert run([*command, "--out", str(tmp_path / "one"), "--json"]) == 0
+    out, err = capsys.readouterr()
+    assert json.loads(out)["schema"] == "uavctl/loopback/1" and err.count("step ") > 10
+    assert run([*command, "--out", str(tmp_path / "two")]) == 0
+    assert capsys.readouterr().out.count("step ") > 10  # a person sees it where it was printed
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("plant", "autopilot"), WORLDS)
 def test_a_good_one_flies_to_the_target(ready: Callable[[str], Prepared], plant: str, autopilot: str) -> None:
@@ -111,7 +120,8 @@ def test_a_good_one_flies_to_the_target(ready: Callable[[str], Prepared], plant:
 def test_one_that_fails_never_leaves_the_room(
     ready: Callable[[str], Prepared], name: str, plant: str, autopilot: str
 ) -> None:
-    words = {"NotFinite": "not finite", "WrongShape": "shape"}.get(name, "raised ZeroDivisionError: no gain")
+    told = {"NotFinite": "not finite", "WrongShape": "shape", "Leaves": "raised SystemExit: 0"}
+    words = told.get(name, "raised ZeroDivisionError: no gain")
     assert_let_go(flown(ready(name), plant, autopilot), words)
 
 

@@ -10,6 +10,7 @@ import pytest
 from baseline_rig import problem
 from numpy.typing import NDArray
 
+from uavctl.errors import EndedBySignal
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import Path, Preview
 from uavctl.smpc.batch import News
@@ -85,6 +86,18 @@ def fail(_: PlanRequest) -> None:
     raise KeyError("gain" * 200)
 
 
+def raising(error: BaseException) -> Callable[[PlanRequest], Any]:
+    def say(_: PlanRequest) -> Any:
+        raise error
+
+    return say
+
+
+class SpeechlessError(Exception):
+    def __str__(self) -> str:
+        raise RuntimeError("not even that")
+
+
 class Worse:
     def __array__(self, *_: object, **__: object) -> Array:
         raise OSError("none")
@@ -103,6 +116,12 @@ class Worse:
         (lambda r: "left", "no array of numbers"),
         (lambda r: [[1.0], [1.0, 2.0]], "no array of numbers"),
         (lambda r: Worse(), "no array of numbers"),
+        (lambda r: r.inputs + 0.0j, "no array of numbers"),
+        (lambda r: r.inputs.astype(str), "no array of numbers"),
+        (raising(SystemExit(0)), "raised SystemExit: 0 ("),
+        (raising(GeneratorExit()), "raised GeneratorExit ("),
+        (raising(SpeechlessError()), "raised SpeechlessError ("),
+        (raising(ValueError("two\nlines \x1b[31m")), "raised ValueError: two lines  [31m ("),
     ],
 )
 def test_what_cannot_be_flown_is_a_fault_that_names_it(
@@ -112,6 +131,22 @@ def test_what_cannot_be_flown_is_a_fault_that_names_it(
     assert answer.status is SolveStatus.FAILED and answer.inputs.size == 0
     assert answer.fault.startswith("the controller ours ") and len(answer.fault) < 300
     assert any(words in answer.fault for words in told.split("|"))
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), EndedBySignal(130)])
+def test_what_an_operator_ends_ends(paper: ControlProblem, error: BaseException) -> None:
+    with pytest.raises(type(error)):
+        OutsideSolver("ours", paper, Saying(raising(error))).solve(1, here(paper), paper.target)
+
+
+def test_how_it_takes_overflows_stays_with_it(paper: ControlProblem) -> None:
+    def strict(request: PlanRequest) -> Array:
+        np.seterr(all="raise")
+        return request.inputs
+
+    before = np.geterr()
+    OutsideSolver("ours", paper, Saying(strict)).solve(1, here(paper), paper.target)
+    assert np.geterr() == before
 
 
 def test_where_it_raised_is_told(paper: ControlProblem) -> None:

@@ -47,6 +47,25 @@ class Raises(RaisesSoon):
     fails_at = 100
 
 
+class Leaves(RaisesSoon):
+    """Ends the program, as a script would."""
+
+    def fail(self, request: PlanRequest) -> Any:
+        """Exit."""
+        raise SystemExit(0)
+
+
+class Prints(Regulates):
+    """Prints all the way."""
+
+    fails_at = 0
+
+    def fail(self, request: PlanRequest) -> Any:
+        """Print, and answer well."""
+        print("step", request.step)  # noqa: T201 the test is about it
+        return request.inputs[0] + self.k @ (request.state - request.states[0])
+
+
 class NotFinite(Regulates):
     """Answers with one NaN."""
 

@@ -22,7 +22,7 @@ from uavctl.api.control import Array, Runs, Source, load, loaded, need
 from uavctl.build.controller import build_problem, design_of, prepare, ready_library
 from uavctl.config import Config, parse
 from uavctl.daemon.engagement import Engagement, check_places, goto_keys, stop_limit_s
-from uavctl.errors import RecordingError, UsageError
+from uavctl.errors import RecordingError, UsageError, in_words
 from uavctl.lab.lockstep import LockstepFlight, check_length
 from uavctl.records import Ending, Truth
 from uavctl.smpc.answer import Answer
@@ -193,7 +193,7 @@ def fly(
         try:
             flight.fly(lambda _: True, follower=engagement, landing_s=landing_s)
         except Exception as error:
-            flight.loop.course.died = f"{type(error).__name__}: {error}"
+            flight.loop.course.died = in_words(error)
             raise
         finally:
             status = flight.close()

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from uavctl.config import Config
 from uavctl.config.load import find_nearest
-from uavctl.errors import DesignError
+from uavctl.errors import RAISED, DesignError, in_words
 from uavctl.smpc.batch import BatchController
 from uavctl.smpc.nominal import ControlProblem
 from uavctl.smpc.outside import FlightPlanner, OutsideSolver, Rehearsal, moved
@@ -95,10 +95,10 @@ def controller_class(
         sys.path.append(here)
     try:
         made = getattr(import_module(module), attribute)
-    except Exception as error:
+    except RAISED as error:
         raise DesignError(
             key,
-            f'controller "{name}" cannot be imported ({type(error).__name__}: {error})',
+            f'controller "{name}" cannot be imported ({in_words(error)})',
             "install its package, or start uavctl in the folder of its module",
         ) from error
     lacking = min(([one for one in kind if not callable(getattr(made, one, None))] for kind in kinds), key=len)
@@ -121,10 +121,10 @@ def make(made: Callable[[ControlProblem], object], name: str, key: str, problem:
         return made(problem)
     except DesignError:
         raise
-    except Exception as error:
+    except RAISED as error:
         raise DesignError(
             key,
-            f'controller "{name}" cannot be made for this problem ({type(error).__name__}: {error})',
+            f'controller "{name}" cannot be made for this problem ({in_words(error)})',
             "mend its __init__, or raise uavctl.errors.DesignError where it is not for such a plant",
         ) from error
 

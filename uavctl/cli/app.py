@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated
@@ -13,7 +14,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from uavctl import __version__
-from uavctl.cli.common import messages, two_columns, write_document
+from uavctl.cli.common import documents_alone, messages, two_columns, write_document
 from uavctl.config.load import find_nearest
 from uavctl.errors import ConfigError, UavctlError, UsageError
 
@@ -97,7 +98,8 @@ def run(arguments: Sequence[str], imported: Callable[[], None] = lambda: None) -
         _know(arguments)
         command, bound, _ = app.parse_args(list(arguments), exit_on_error=False, print_error=False)
         imported()
-        result = command(*bound.args, **bound.kwargs)
+        with documents_alone() if "--json" in arguments else nullcontext():
+            result = command(*bound.args, **bound.kwargs)
     except ImportError as error:
         missing = error.__cause__ if error.__cause__ is not None else error
         extra = _EXTRAS.get(getattr(missing, "name", None) or "")

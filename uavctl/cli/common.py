@@ -6,10 +6,11 @@ import os
 import stat
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TextIO
 
 import msgspec
 from cyclopts import Parameter, validators
@@ -87,6 +88,20 @@ class Common:
             console.print(shown)
 
 
+_DOCUMENTS: ContextVar[TextIO | None] = ContextVar("documents", default=None)
+
+
+@contextmanager
+def documents_alone() -> Iterator[None]:
+    """Keep standard output for documents: what a controller of another package prints goes to standard error."""
+    kept = _DOCUMENTS.set(sys.stdout)
+    try:
+        with redirect_stdout(sys.stderr):
+            yield
+    finally:
+        _DOCUMENTS.reset(kept)
+
+
 # Documents of which a key has gone, or means something else, since the first version; the others have version 1.
 _VERSIONS: dict[str, int] = {}
 
@@ -95,8 +110,9 @@ def write_document(name: str, document: Mapping[str, object] | msgspec.Struct) -
     """Write a JSON document, on one line, to standard output; its first key says which one it is, of which version."""
     fields = msgspec.to_builtins(document)
     text = msgspec.json.encode({"schema": f"uavctl/{name}/{_VERSIONS.get(name, 1)}", **fields}).decode()
-    sys.stdout.write(text + "\n")
-    sys.stdout.flush()
+    out = _DOCUMENTS.get() or sys.stdout
+    out.write(text + "\n")
+    out.flush()
 
 
 def can_be_read(type_: object, path: object) -> None:

@@ -29,7 +29,7 @@ from logs.recording.summary import FlightSummary, summarise
 from logs.recording.views import Views
 from uavctl.cli.common import FREE_PORT, messages
 from uavctl.daemon.engagement import goto_keys
-from uavctl.errors import ConnectionClosedError, RecordingError, UavctlError, UsageError
+from uavctl.errors import ConnectionClosedError, EndedBySignal, RecordingError, UavctlError, UsageError, in_words
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.records import Command, ControlMode, Ending, Event, Order, Record, Severity, Ticked
@@ -279,7 +279,7 @@ def ending_noted(loop: ControlLoop) -> Iterator[None]:
         loop.course.kill(int(ended.code or 0) - SIGNALLED)
         raise
     except Exception as error:
-        loop.course.died = f"{type(error).__name__}: {error}"
+        loop.course.died = in_words(error)
         raise
 
 
@@ -291,7 +291,7 @@ def stop_on_signals() -> Iterator[Callable[[], bool]]:
     def ask(number: int, frame: object) -> None:
         del frame
         if asked.is_set():
-            raise SystemExit(SIGNALLED + number)
+            raise EndedBySignal(SIGNALLED + number)
         asked.set()
 
     before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}

@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
+from uavctl.errors import in_words
 from uavctl.flight import envelope
 from uavctl.flight import fallback as fb
 from uavctl.flight.controller import Controller, ControlState
@@ -161,7 +162,7 @@ def ask(
     try:
         answer = solver.solve(seq, np.array(base.mean), target, outlook)
     except SOLVER_ERRORS as error:
-        return SolveOutcome(SolveStatus.FAILED, None, f"the solver raised {type(error).__name__}: {error}")
+        return SolveOutcome(SolveStatus.FAILED, None, f"the solver raised {in_words(error)}")
     if answer.seq != seq:
         return SolveOutcome(SolveStatus.LATE, None, f"the answer is to step {answer.seq}, asked was step {seq}")
     if answer.status is not SolveStatus.OPTIMAL:

@@ -25,6 +25,7 @@ from typing import cast
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.config.connections import CAMERA_SYSTEM_ID
+from uavctl.errors import in_words
 from uavctl.frames import Up
 from uavctl.io.camera import ANSWER_S, COUNTS, LARGEST, READY, REFUSED, UNREACHABLE, BodyPose, Camera, CameraError, Echo
 from uavctl.mavlink.codec import decode
@@ -288,7 +289,7 @@ def _made(camera: str, body: str, up: Up) -> Camera:
         raise
     except Exception as error:
         raise CameraError(
-            f"its class {camera} cannot be made ({type(error).__name__}: {error}); install its package, or start "
+            f"its class {camera} cannot be made ({in_words(error)}); install its package, or start "
             "uavctl in the folder of its module"
         ) from error
 

@@ -16,6 +16,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from uavctl.errors import RAISED, EndedBySignal, in_words
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import NOMINAL, Answer, Preview, all_finite
 from uavctl.smpc.batch import BatchController, News
@@ -80,12 +81,15 @@ class OutsideSolver:
         request = self._request(seq, x, target, outlook)
         shapes = ((self._problem.plant.n_u,), request.inputs.shape)
         try:
-            told = self._planner.plan(request)
-        except Exception as error:  # noqa: BLE001 whatever it raises: a vehicle is in the air
-            return self._refused(seq, f"raised {type(error).__name__}: {str(error)[:LONGEST_WORDS]}{_where(error)}")
+            with np.errstate():  # how it takes its own overflows is not to be how ours are taken
+                told = self._planner.plan(request)
+        except EndedBySignal:
+            raise
+        except RAISED as error:  # a vehicle is in the air
+            return self._refused(seq, f"raised {in_words(error, LONGEST_WORDS)}{_where(error)}")
         try:
-            given = np.array(told, dtype=np.float64)
-        except Exception:  # noqa: BLE001 a conversion of its own may raise anything
+            given = _numbers(told)
+        except RAISED:  # a conversion of its own may raise anything
             return self._refused(seq, f"answered with {type(told).__name__}, which is no array of numbers")
         if given.shape not in shapes:
             return self._refused(seq, f"answered with shape {given.shape}; give {shapes[1]}, or {shapes[0]}")
@@ -229,7 +233,14 @@ def _read_only(values: Array) -> Array:
     return kept
 
 
-def _where(error: Exception) -> str:
+def _numbers(told: object) -> Array:
+    raw = np.array(told)
+    if raw.dtype.kind not in "biufO":  # complex numbers and words would be made to fit
+        raise TypeError(raw.dtype)
+    return raw.astype(np.float64)
+
+
+def _where(error: BaseException) -> str:
     """Return the file and line that raised, in brackets."""
     found: TracebackType | None = error.__traceback__
     while found is not None and found.tb_next is not None:

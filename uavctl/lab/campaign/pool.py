@@ -10,6 +10,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
@@ -210,7 +211,8 @@ def _pool(workers: int) -> ProcessPoolExecutor:
 
 
 def _begin() -> None:
-    """Prepare a worker: leave Ctrl-C to the parent, and end with the parent however it ends."""
+    """Prepare a worker: leave Ctrl-C and standard output to the parent, and end with the parent however it ends."""
+    sys.stdout = sys.stderr  # a controller of another package may print
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     if parent is not None:

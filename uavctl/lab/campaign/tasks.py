@@ -15,7 +15,7 @@ from uavctl import __version__
 from uavctl.config import Config
 from uavctl.config.checks import position_index
 from uavctl.config.link import LinkConfig
-from uavctl.errors import DesignError
+from uavctl.errors import RAISED, DesignError, in_words
 from uavctl.lab.campaign.controllers import LibraryFor, Recipe, Setting, built, met, recipe_for, sight_of
 from uavctl.lab.campaign.pool import Columns, Work
 from uavctl.lab.campaign.results import SMPC
@@ -205,11 +205,11 @@ class Task(Work):
         """
         try:
             built(self.recipe)
-        except Exception as error:  # noqa: BLE001 a crashed run is reported and stops nothing
-            return self.lost(told_of(error))
+        except RAISED as error:  # a crashed run is reported and stops nothing
+            return self.lost(in_words(error))
         try:
             return _figures(self, self.first, self.runs)
-        except Exception:  # noqa: BLE001 as above
+        except RAISED:  # as above
             rows = [_alone(self, self.first + i) for i in range(self.runs)]
             return {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}
 
@@ -243,13 +243,8 @@ def flown(task: Task, first: int, runs: int) -> tuple[Flown, Tally | None]:
 def _alone(task: Task, run: int) -> Columns:
     try:
         return _figures(task, run, 1)
-    except Exception as error:  # noqa: BLE001 as above
-        return _without_figures(task, run, 1, told_of(error))
-
-
-def told_of(error: Exception) -> str:
-    """Return the error that ended a run, in words."""
-    return f"{type(error).__name__}: {error}"
+    except RAISED as error:  # as above
+        return _without_figures(task, run, 1, in_words(error))
 
 
 def _without_figures(task: Task, first: int, runs: int, error: str) -> Columns:

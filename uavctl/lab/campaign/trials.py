@@ -21,7 +21,7 @@ from uavctl.build.controller import build_controller, design_of
 from uavctl.config import Config, dump_config, load, load_config, parse
 from uavctl.config.document import LARGEST_SEED, ConfigProblem, Section
 from uavctl.config.load import parse_toml
-from uavctl.errors import ConfigError, DesignError
+from uavctl.errors import RAISED, ConfigError, DesignError, in_words
 from uavctl.lab.campaign.controllers import LibraryFor
 from uavctl.lab.campaign.pool import Columns, Work
 from uavctl.lab.campaign.results import ToldCell, read_cells, read_document
@@ -38,7 +38,6 @@ from uavctl.lab.campaign.spec import (
     taken_twice,
     text_of,
 )
-from uavctl.lab.campaign.tasks import told_of
 from uavctl.lab.own_loop import TUNED, OwnTuning
 from uavctl.lab.trial import (
     AUTOPILOTS,
@@ -182,8 +181,8 @@ class TrialTask(Work):
             seed = seed_of(self.master, run)
             try:
                 rows.append((fly(self.flown, seed, seconds=self.seconds, from_s=self.from_s), ""))
-            except Exception as error:  # noqa: BLE001 a crashed run is reported and stops nothing
-                rows.append((TrialFlight(seed), told_of(error)))
+            except RAISED as error:  # a crashed run is reported and stops nothing
+                rows.append((TrialFlight(seed), in_words(error)))
         return self._columns(rows)
 
     def lost(self, error: str) -> Columns:
