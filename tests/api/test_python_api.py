@@ -300,6 +300,7 @@ FILE = "nothing-here.toml"
         (lambda: uavctl.load("room", {"link.loss": 3}), ConfigError, "link.loss"),
         (lambda: uavctl.load("room", {"link.loss": None}), ConfigError, "link.loss: None is no value"),
         (lambda: uavctl.load("room", {"": 1}), ConfigError, "is not an override"),
+        (lambda: uavctl.load("room", ["link.loss=0.3"]), UsageError, 'give {"link.loss": 0.3}'),  # type: ignore[arg-type]
         (lambda: uavctl.load("room", duration_s=[1, 2]), ConfigError, "duration_s"),
         (lambda: uavctl.load("room", sim={"fault": [{"at_s": 1.0, "kind": "mode", "name": "NO"}]}), ConfigError, "NO"),
         (lambda: uavctl.solve("room", [1.0, 2.0]), UsageError, "give 9 finite numbers"),

@@ -45,7 +45,10 @@ def load(source: Source = "room", overrides: Mapping[str, object] | None = None,
 
     Raises:
         ConfigError: With all problems found, one a line.
+        UsageError: The overrides are no mapping.
     """
+    if not isinstance(overrides, Mapping | None):
+        raise UsageError(f'{overrides!r} does not say which key is to differ; give {{"link.loss": 0.3}}')
     given = tuple(override_texts({**(overrides or {}), **keys}))
     if isinstance(source, Config):
         loaded = parse(dump_config(source), source.name, given)
