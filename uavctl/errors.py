@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from importlib import import_module
+from types import ModuleType
+
 
 class UavctlError(Exception):
     """Base of all errors that are meant for a person."""
@@ -22,6 +25,18 @@ class ExtraMissingError(UsageError):
         self.package = package
         self.extra = extra
         super().__init__(f"{package} is not installed; pip install 'uavctl[{extra}]'")
+
+
+def need(package: str, extra: str) -> ModuleType:
+    """Return an optional package, imported.
+
+    Raises:
+        ExtraMissingError: It is not installed; names the extra to install.
+    """
+    try:
+        return import_module(package)
+    except ImportError as missing:
+        raise ExtraMissingError(package, extra) from missing
 
 
 class ConfigError(UavctlError):

@@ -17,6 +17,14 @@ from uavctl.records import Vec3
 Convention = Literal["ned", "enu", "flu"]
 Quaternion = tuple[float, float, float, float]
 
+
+def up_hint(axis: str, value_m: float, low_m: float, high_m: float) -> str:
+    """Return a hint for a height that was written as a positive "down" outside limits; empty if it was not."""
+    if axis != "down" or value_m <= high_m or not low_m <= -value_m <= high_m:
+        return ""
+    return f"up is negative: write {-value_m:g}"
+
+
 # Each map is its own inverse and has determinant +1.
 _SWAP: dict[Convention, Callable[[Vec3], Vec3]] = {
     "ned": lambda v: v,  # also FRD: forward, right, down

@@ -34,7 +34,7 @@ from logs.recording.disk import all_or_none, check_free, unfinished
 from logs.recording.reader import RecordedMessage, good_messages, lacks_end, segment_files
 from logs.recording.topics import HEADER, LIBRARY, decode, is_known, is_view, record_type
 from uavctl.config.load import find_nearest
-from uavctl.errors import RecordingError, UsageError
+from uavctl.errors import RecordingError, need
 from uavctl.records import Record, Vec3
 
 if TYPE_CHECKING:
@@ -314,7 +314,8 @@ def export_tables(
 
     Raises:
         RecordingError: It cannot be read, holds no record, or the files cannot be written.
-        UsageError: A file exists and is not to be overwritten, the folder cannot be made, or `pyarrow` is not there.
+        ExtraMissingError: `pyarrow` is not there.
+        UsageError: A file exists and is not to be overwritten, or the folder cannot be made.
     """
     begin = _writer(kind)
     tables, unknown, total = _survey(flight, watch)
@@ -379,16 +380,11 @@ def _writer(kind: TableFormat) -> _Writer:
     """Return the writer of a table format.
 
     Raises:
-        UsageError: `pyarrow` is not there.
+        ExtraMissingError: `pyarrow` is not there.
     """
     if kind is TableFormat.CSV:
         return _csv_file
-    try:
-        import pyarrow  # noqa: F401 before anything is read or written
-    except ImportError as missing:
-        raise UsageError(
-            "Parquet is written by pyarrow, which is not there; install uavctl[parquet], or take --to csv"
-        ) from missing
+    need("pyarrow", "parquet")  # before anything is read or written
     return _parquet_file
 
 

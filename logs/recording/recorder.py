@@ -12,7 +12,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 from typing import Protocol
@@ -36,7 +35,7 @@ from logs.recording.topics import (
     encode_message,
 )
 from uavctl.config.types import LogConfig
-from uavctl.errors import RecordingError, UsageError
+from uavctl.errors import RecordingError, UsageError, need
 from uavctl.records import Datagram, Header, Record
 
 # What a recording carries for those who look on: messages for viewers beside each record, and a live view's share.
@@ -376,14 +375,15 @@ def live_view(port: int | None, *, on_open: Callable[[int], None] = lambda _: No
         on_open: called with the port once viewers can connect.
 
     Raises:
-        UsageError: foxglove-sdk is not installed, or the port cannot be had.
+        ExtraMissingError: foxglove-sdk is not installed.
+        UsageError: The port cannot be had.
     """
     if port is None:
         yield None
         return
     if not 0 <= port <= 65535:
         raise UsageError(f"--live-port {port}: ports are 1 to 65535; 0 takes one that is free")
-    foxglove = _sdk()
+    foxglove = need("foxglove", "live")
     context = foxglove.Context()
     try:
         server = foxglove.start_server(
@@ -399,13 +399,6 @@ def live_view(port: int | None, *, on_open: Callable[[int], None] = lambda _: No
         stopping = threading.Thread(target=server.stop, name="live view's end", daemon=True)
         stopping.start()
         stopping.join(STOP_S)
-
-
-def _sdk() -> ModuleType:
-    try:
-        return import_module("foxglove")
-    except ImportError as error:
-        raise UsageError("--live needs foxglove-sdk: pip install 'uavctl[live]'") from error
 
 
 def _watcher(foxglove: ModuleType, context: object) -> Watcher:

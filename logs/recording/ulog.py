@@ -22,7 +22,7 @@ from logs.recording.design_view import Floats
 from logs.recording.mavlink_flight import MavlinkFlight, ModeBegin, SentSource, SpokenText
 from logs.recording.parameters import VehicleParameter
 from logs.recording.summary import count
-from uavctl.errors import ExtraMissingError, RecordingError
+from uavctl.errors import RecordingError, need
 
 MAGIC = b"ULog\x01\x12\x35"
 _HEAD_BYTES = 16  # magic, version, time of the start
@@ -65,10 +65,9 @@ def read_ulog(path: Path) -> MavlinkFlight:
 
 
 def _parsed(path: Path, data: bytes) -> Any:
-    try:
-        from pyulog.core import ULog, ULogException  # type: ignore[import-untyped]
-    except ImportError as missing:
-        raise ExtraMissingError("pyulog", "ulog") from missing
+    need("pyulog", "ulog")
+    from pyulog.core import ULog, ULogException  # type: ignore[import-untyped]
+
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # it prints its warnings, among our documents
             return ULog(io.BytesIO(data))

@@ -17,7 +17,7 @@ from logs.report.statistics import LEVEL, Share, at_least, autocorrelation, norm
 from logs.report.verdict_model import InnovationSamples, ModelVerdict, innovations, judge_innovations
 from uavctl.build.link import build_ages, build_delayed_link, promised
 from uavctl.config import Config
-from uavctl.config.load import parse
+from uavctl.config.load import parse_recorded
 from uavctl.errors import ConfigError, DesignError
 from uavctl.flight.link_estimate import NOTHING_SEEN, LinkEstimateParameters, burst_statistic, observe
 from uavctl.records import ControlMode, LinkStats, PositionSample, Truth, duration
@@ -509,7 +509,7 @@ def judge(flight: FlightData) -> Judged:
 def flown_config(flight: FlightData) -> Config | None:
     """Return the configuration that was flown; None if this version cannot read it or it is another plant's."""
     try:
-        config = parse(flight.header.config_toml, "the recording's configuration").config
+        config = parse_recorded(flight.header.config_toml, "the recording's configuration").config
     except ConfigError:
         return None
     return config if config.plant.axes == flight.design.axes else None

@@ -74,7 +74,14 @@ def test_the_page_runs_as_written(
     names: dict[str, object] = {}
     for block in blocks("docs/python.md"):
         exec(compile(block, "docs/python.md", "exec"), names)
+    ours, theirs = names["ours"], names["theirs"]
+    assert isinstance(ours, uavctl.Runs) and isinstance(theirs, uavctl.Runs)
+    assert ours.state_violated.mean() <= 0.05 and theirs.state_violated.mean() >= 0.2
     told = capsys.readouterr().out.splitlines()
+    # The front page says these figures, and that they cost more.
+    text = " ".join((ROOT / "README.md").read_text(encoding="utf-8").split())
+    assert f"`{told[0]}`" in text
+    assert ours.cost.sum(axis=1).mean() > theirs.cost.sum(axis=1).mean()
     assert (tmp_path / "path.png").read_bytes().startswith(b"\x89PNG")
     assert isinstance(names["page"], Path)
     assert names["page"].exists()

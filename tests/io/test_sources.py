@@ -22,7 +22,7 @@ from patience import LIMIT_S, until
 
 from uavctl.config import Config, load_config
 from uavctl.config.connections import warnings
-from uavctl.errors import ConfigError, ConnectionSpecError
+from uavctl.errors import ConfigError, ConnectionSpecError, ExtraMissingError
 from uavctl.io.admission import Rules
 from uavctl.io.base import Connection
 from uavctl.io.camera import COUNTS, READY, BodyPose, Echo
@@ -288,8 +288,9 @@ def test_what_is_wrong_before_anything_is_started(monkeypatch: pytest.MonkeyPatc
     with pytest.raises(ConnectionSpecError, match=r"not in security\.allow"):
         open_source("natnet://127.0.0.1/drone", rules=Rules(allow=("10.0.0.0/8",)))
     monkeypatch.setattr("uavctl.io.sources.find_spec", lambda name: None)
-    with pytest.raises(ConnectionSpecError, match=r"pip install 'uavctl\[optitrack\]'"):
+    with pytest.raises(ExtraMissingError) as caught:
         open_source("natnet://127.0.0.1/drone")
+    assert (caught.value.package, caught.value.extra) == ("natnet", "optitrack")
 
 
 def test_other_urls_are_opened_as_ever() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -20,7 +19,7 @@ from uavctl.config import Config, dump_config, parse
 from uavctl.config import load as load_file
 from uavctl.config.load import override_texts
 from uavctl.config.mission import MissionConfig
-from uavctl.errors import ConfigError, ExtraMissingError, UavctlError, UsageError
+from uavctl.errors import ConfigError, UavctlError, UsageError, need
 from uavctl.smpc.answer import Answer, Solver
 from uavctl.smpc.batch import BatchController, News
 from uavctl.smpc.conditioned.planner import AnyDesign
@@ -222,18 +221,6 @@ def cell_of(config: Config, kind: str, **spec: object) -> tuple[Recipe, Setting]
     recipe = recipe_for(made.tuned(0, believed), made.believed[0, believed], campaign, ready_library)
     setting = Setting(campaign, made.base, made.flown_plant[0].plant, made.flown_link[0].link, campaign.disturbance[0])
     return recipe, setting
-
-
-def need(package: str, extra: str) -> None:
-    """See that an optional package is there.
-
-    Raises:
-        ExtraMissingError: It is not; names the extra to install.
-    """
-    try:
-        import_module(package)
-    except ImportError as missing:
-        raise ExtraMissingError(package, extra) from missing
 
 
 _ARRAYS = ("states", "inputs", "age", "cost", "state_violated", "input_violated", "failed")

@@ -18,11 +18,12 @@ from logs.recording.flight import FlightData
 from logs.recording.reader import header, lacks_end, records
 from logs.recording.reader import read as read_records
 from logs.recording.summary import FlightSummary, summarise
-from uavctl.api.control import Array, Runs, Source, load, loaded, need
+from uavctl.api.control import Array, Runs, Source, load, loaded
 from uavctl.build.controller import build_problem, design_of, prepare, ready_library
-from uavctl.config import Config, parse
+from uavctl.config import Config
+from uavctl.config.load import parse_recorded
 from uavctl.daemon.engagement import Engagement, check_places, goto_keys, stop_limit_s
-from uavctl.errors import RecordingError, UsageError, in_words
+from uavctl.errors import RecordingError, UsageError, in_words, need
 from uavctl.lab.lockstep import LockstepFlight, check_length
 from uavctl.records import Ending, Truth
 from uavctl.smpc.answer import Answer
@@ -53,7 +54,7 @@ class Recording:
         Raises:
             RecordingError: The recording has no header.
         """
-        return parse(header(self.path).config_toml, f"{self.path} (configuration)").config
+        return parse_recorded(header(self.path).config_toml, f"{self.path} (configuration)").config
 
     @cached_property
     def data(self) -> FlightData:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import gc
 import os
 import sys
+import threading
 from collections.abc import Mapping
+from typing import NoReturn
 
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 INTERRUPTED = 130  # as a shell says of what SIGINT ended
@@ -28,6 +30,14 @@ def main() -> None:
     except KeyboardInterrupt:
         sys.stderr.write("interrupted\n")
         code = INTERRUPTED
+    _end(code)
+
+
+def _end(code: int) -> NoReturn:
+    """End the process, at once where a thread hangs in a write: the interpreter would abort on the stream's lock."""
+    if any(thread.daemon for thread in threading.enumerate()):
+        sys.stdout.flush()
+        os._exit(code)
     sys.exit(code)
 
 

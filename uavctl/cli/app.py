@@ -5,29 +5,27 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated
 
 from cyclopts import App, CycloptsError, Parameter
-from rich.console import Console
-from rich.markup import escape
 
 from uavctl import __version__
-from uavctl.cli.common import documents_alone, messages, two_columns, write_document
+from uavctl.cli.common import documents_alone, labelled, messages, pictures, two_columns, write_document
+from uavctl.cli.usage import example, explain, unknown_command, unknown_option
 from uavctl.config.load import find_nearest
 from uavctl.errors import ConfigError, UavctlError, UsageError
 
-_EPILOGUE = """Exit codes: 0 good; 1 ran, but failed its purpose; 2 usage or configuration; 3 recovered with loss;
-4 `tune`: the pilot has taken over; 130 interrupted.
+_HELP = """Stochastic model predictive flight control shaped by the age of information, over MAVLink.
 
-With --json, standard output holds one JSON document and nothing else, also of an error; messages go to standard error.
-`uavctl docs` has the manual; `uavctl docs configuration` describes every configuration key."""
+Exit codes: 0 good; 1 ran, but failed its purpose; 2 usage or configuration; 3 recovered with loss;
+4 `tune`: the pilot has taken over; 130 interrupted. With --json, standard output holds one JSON document and nothing
+else, also of an error. `uavctl docs` has the manual."""
 
 app = App(
     name="uavctl",
-    help="Stochastic model predictive flight control shaped by the age of information, over MAVLink.",
-    help_epilogue=_EPILOGUE,
+    help=_HELP,
+    help_epilogue=example(""),
     help_format="markdown",
     version=__version__,
     suppress_keyboard_interrupt=False,
@@ -58,10 +56,12 @@ _COMMANDS = {
     "log": ("log:log_app", "Look into recordings: info, recover, replay, report, compare, whatif, export."),
     "docs": ("app:docs", "Show a page of the manual, or list its pages."),
 }
+_USAGES = {"docs": {"usage": "Usage: uavctl docs [PAGE]"}}
 for _name, (_path, _help) in _COMMANDS.items():
-    app.command(f"uavctl.cli.{_path}", name=_name, help=_help)
+    # A command with commands of its own is an application, and says these things itself.
+    _more = {} if _path.endswith("_app") else {"help_epilogue": example(_name), **_USAGES.get(_name, {})}
+    app.command(f"uavctl.cli.{_path}", name=_name, help=_help, **_more)
 
-_EXTRAS = {"pyarrow": "campaign"}  # of a package that a command cannot do without
 app.register_install_completion_command(add_to_startup=False)
 
 
@@ -76,14 +76,14 @@ def docs(page: Annotated[str, Parameter(help="name of a page; else all of them a
         near = find_nearest(name, tuple(pages))
         raise UsageError(f'There is no page "{page}"{near}; `uavctl docs` lists all of them')
     if name and sys.stdout.isatty():
-        Console().print(Markdown(pages[name]))
+        pictures().print(Markdown(pages[name]))
     elif name:
         sys.stdout.write(pages[name])
     else:
         titles: list[tuple[str, object]] = [
             (one, text.partition("\n")[0].removeprefix("# ")) for one, text in pages.items()
         ]
-        Console().print(two_columns(f"Pages, as files in {folder.resolve()}", titles))
+        pictures().print(two_columns(f"Pages, as files in {folder.resolve()}", titles))
     return 0
 
 
@@ -100,15 +100,9 @@ def run(arguments: Sequence[str], imported: Callable[[], None] = lambda: None) -
         imported()
         with documents_alone() if "--json" in arguments else nullcontext():
             result = command(*bound.args, **bound.kwargs)
-    except ImportError as error:
-        missing = error.__cause__ if error.__cause__ is not None else error
-        extra = _EXTRAS.get(getattr(missing, "name", None) or "")
-        if extra is None:
-            raise
-        text = f"{arguments[0]} needs a package that is not installed: pip install 'uavctl[{extra}]'"
-        return _refuse(UsageError(text), [text], arguments)
     except CycloptsError as error:
-        return _refuse(UsageError(str(error)), [str(error)], arguments)
+        text = explain(error, arguments, app)
+        return _refuse(UsageError(text), [text], arguments)
     except ConfigError as error:
         return _refuse(error, error.problems, arguments)
     except UavctlError as error:
@@ -122,17 +116,17 @@ def run(arguments: Sequence[str], imported: Callable[[], None] = lambda: None) -
 
 
 def _know(arguments: Sequence[str]) -> None:
-    """Refuse a command that there is none of, before all of them are imported to find one like it.
+    """Refuse a command or a leading option that there is none of, before all commands are imported to find one like it.
 
     Raises:
         UsageError: There is none.
     """
-    name = arguments[0] if arguments else "-"
-    if name.startswith("-") or name in app:
+    name = arguments[0] if arguments else "--help"
+    if name.partition("=")[0] in app:
         return
-    near = get_close_matches(name, _COMMANDS, 1)
-    did = f' Did you mean "{near[0]}"?' if near else f" Commands are {', '.join(_COMMANDS)}."
-    raise UsageError(f'Unknown command "{name}".{did}')
+    if name.startswith("-"):
+        raise UsageError(f"{unknown_option(name, app)} A command comes first: uavctl COMMAND [OPTIONS]")
+    raise UsageError(unknown_command(name, app, ("uavctl",)))
 
 
 def _refuse(error: UavctlError, problems: Sequence[str], arguments: Sequence[str]) -> int:
@@ -140,7 +134,7 @@ def _refuse(error: UavctlError, problems: Sequence[str], arguments: Sequence[str
     shown = [_shown(problem) for problem in problems[:_MOST_SHOWN]]
     if len(problems) > _MOST_SHOWN:
         shown.append(f"{len(problems) - _MOST_SHOWN} more")
-    messages().print(f"[bold red]error:[/] {escape(chr(10).join(shown))}", soft_wrap=True)
+    messages().print(labelled("error", "\n".join(shown), "bold red"), soft_wrap=True)
     if "--json" in arguments:  # what could not be parsed, too, is told to a program
         told = {"type": type(error).__name__, "message": "\n".join(problems), "exit_code": error.exit_code}
         write_document("error", told)

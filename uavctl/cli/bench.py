@@ -12,6 +12,7 @@ import msgspec
 from cyclopts import Parameter, validators
 from rich.console import Group, RenderableType
 from rich.table import Table
+from rich.text import Text
 
 from uavctl.build.controller import build_conditioned, build_design, build_spec
 from uavctl.cli.common import DEFAULTS, SEED, SPAN_S, Common, bars, columns, located
@@ -45,7 +46,7 @@ def loop_picture(result: LoopBench) -> RenderableType:
     """Return the figures of the control loop as a table."""
     table = columns("Control loop on real UDP, recording", ("", "median", "p99", "p99.9", "largest"), ())
     for name, run in (("without --realtime", result.plain), ("with --realtime", result.realtime)):
-        table.add_row(f"[bold]{name}")
+        table.add_row(Text(name, style="bold"))
         for label, spread in (
             ("position in -> setpoint out", run.in_to_out_us),
             ("tick late by", run.lateness_us),

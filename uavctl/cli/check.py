@@ -10,14 +10,14 @@ from typing import Annotated
 
 import msgspec
 from cyclopts import Parameter
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from logs.recording.parameters import ParameterReader, told_records
 from logs.recording.topics import PARAMETER
 from uavctl.check.findings import Item, ItemState, item, judged, refusals
 from uavctl.check.preflight import Preflight
-from uavctl.cli.common import DEFAULTS, SPAN_S, Common, Mocap, columns, given_keys, messages
+from uavctl.cli.common import DEFAULTS, SPAN_S, Common, Mocap, columns, given_keys, labelled, messages
 from uavctl.cli.flying import stop_on_signals
 from uavctl.clock import Ticker, monotonic_ns
 from uavctl.config import Config
@@ -125,7 +125,7 @@ def checked_before_arming(
         raise NotReadyError("\n".join(("not armed, as the check before it failed:", *lines)))
     for one in items:
         if one.state is not ItemState.GOOD:
-            messages().print(f"[yellow]check:[/] {escape(f'{one.name}: {one.value}; {one.hint}')}", soft_wrap=True)
+            messages().print(labelled("check", f"{one.name}: {one.value}; {one.hint}"), soft_wrap=True)
     return items
 
 
@@ -186,7 +186,7 @@ def check(
     items.append(_strangers(warnings(config.security, config.daemon)))
 
     def prompt(text: str) -> None:
-        messages().print(f"[bold]{text or 'good; let it rest for a moment'}[/]")
+        messages().print(text or "good; let it rest for a moment", style="bold")
 
     try:
         with connected(config) as connections, stop_on_signals() as stopped:
@@ -234,11 +234,6 @@ def _table(report: Report) -> Table:
     words = "ready" if report.ok else "not ready: see what is red"
     headings = ("", "what", "found", "wanted", "what to do")
     rows = (
-        (f"[{_STYLES[one.state]}]{one.state}[/]", *map(_plain, (one.name, one.value, one.want, one.hint)))
-        for one in report.items
+        (Text(one.state, style=_STYLES[one.state]), one.name, one.value, one.want, one.hint) for one in report.items
     )
     return columns(f"check: {words}", headings, rows, headings, fold=True)
-
-
-def _plain(text: str) -> str:
-    return text.replace("[", r"\[")

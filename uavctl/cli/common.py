@@ -16,16 +16,17 @@ import msgspec
 from cyclopts import Parameter, validators
 from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions, JustifyMethod, RenderableType
-from rich.markup import escape
 from rich.measure import Measurement
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
+from rich.text import Text
 
 from uavctl.config import LoadedConfig, explain, load
 from uavctl.config.document import LARGEST_SEED, LONGEST_S
 from uavctl.errors import ConfigError, DesignError
 
 # What all commands share: --config, --set and --json, where output goes, and how a bad design is told.
+# A string is never markup: paths, units and what vehicles say have brackets. Styles are those of `rich.text.Text`.
 
 
 _FILE_WIDTH, _WIDEST = 120, 10_000
@@ -80,7 +81,7 @@ class Common:
         if self.json:
             write_document(name, document)
         else:
-            shown, console = picture(), Console()
+            shown, console = picture(), pictures()
             if not sys.stdout.isatty():
                 # Files and pipes have no width of their own; the usual 80 columns would fold tables and cut words.
                 anything = console.options.update_width(_WIDEST)
@@ -156,10 +157,10 @@ def given_keys(**given: str | float | None) -> list[str]:
 
 
 def two_columns(title: str, rows: list[tuple[str, object]]) -> Table:
-    """Return a table of names and values; nothing in it is markup."""
+    """Return a table of names and values."""
     table = Table(title=title, show_header=False, title_justify="left")
     for name, value in rows:
-        table.add_row(escape(name), escape(str(value)))
+        table.add_row(Text(name), Text(str(value)))
     return table
 
 
@@ -175,7 +176,7 @@ def columns(
     """A table with headings.
 
     Args:
-        rows: Cells, in which markup is markup.
+        rows: Cells; a `Text` has a style.
         left: Headings of the columns that are set flush left, the others right; the first alone if None.
         fold: Go on in the next line where a column is too narrow, else cut.
         lines: Draw one between the rows.
@@ -183,11 +184,9 @@ def columns(
     table = Table(title=title or None, title_justify="left", show_lines=lines)
     for heading in headings:
         flush_left = heading in (headings[:1] if left is None else left)
-        table.add_column(
-            escape(heading), justify="left" if flush_left else "right", overflow="fold" if fold else "ellipsis"
-        )
+        table.add_column(heading, justify="left" if flush_left else "right", overflow="fold" if fold else "ellipsis")
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*(Text(cell) if isinstance(cell, str) else cell for cell in row))
     return table
 
 
@@ -235,7 +234,7 @@ def bars(*more: ProgressColumn, auto_refresh: bool = True) -> Progress:
     Where there is no terminal it is a line every five seconds.
     """
     counted = more or (MofNCompleteColumn(), TimeElapsedColumn())
-    head = (TextColumn("{task.description}"), BarColumn())
+    head = (TextColumn("{task.description}", markup=False), BarColumn())
     return _Bars(*head, *counted, console=messages(), transient=True, auto_refresh=auto_refresh)
 
 
@@ -254,12 +253,22 @@ def messages() -> Console:
     Called interactive also where it is a file or a pipe: there rich shows no progress, but else would leave an empty
     line where the bar would have been.
     """
-    return _Messages(stderr=True, force_interactive=True)
+    return _Messages(stderr=True, force_interactive=True, markup=False, emoji=False)
+
+
+def pictures() -> Console:
+    """Return the console for results that people read: standard output."""
+    return Console(markup=False, emoji=False)
+
+
+def labelled(label: str, text: str, style: str = "yellow") -> Text:
+    """Return a message that begins with a label in a style, as in "warning: ..."."""
+    return Text.assemble((f"{label}:", style), f" {text}")
 
 
 def warn(text: str) -> None:
-    """Write a warning on a line of its own; nothing in it is markup."""
-    messages().print(text, style="yellow", markup=False, soft_wrap=True)
+    """Write a warning on a line of its own."""
+    messages().print(text, style="yellow", soft_wrap=True)
 
 
 @contextmanager
@@ -308,10 +317,10 @@ class WideTable:
         for columns in self._cut(options.max_width - 1 - self.first.width):
             table = Table()
             for column in (self.first, *columns):
-                table.add_column(column.heading, justify=column.justify, no_wrap=True)
+                table.add_column(Text(column.heading), justify=column.justify, no_wrap=True)
             rows = zip(self.first.cells, *(column.cells for column in columns), strict=True)
             for number, row in enumerate(rows):
-                table.add_row(*row, end_section=number in self.sections)
+                table.add_row(*map(Text, row), end_section=number in self.sections)
             yield table
 
     def _cut(self, room: int) -> list[list[Column]]:

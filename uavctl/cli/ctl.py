@@ -13,6 +13,7 @@ from cyclopts import App, Parameter
 from rich.table import Table
 
 from uavctl.cli.common import Common, QuietJson, messages, two_columns
+from uavctl.cli.usage import example
 from uavctl.daemon.control_socket import SUFFIX, ControlRequest, Reply, control_folder
 from uavctl.daemon.health import Health, RecorderHealth, RelayHealth
 from uavctl.errors import NotReachedError, UsageError
@@ -21,7 +22,11 @@ from uavctl.records import Vec3
 ANSWER_LIMIT_S = 5.0  # a tick takes a tenth of a second at most
 _BLOCK = 65_536
 
-ctl_app = App(name="ctl", help="Orders to a flight that goes on: goto, hold, resume, land, engage; and its status.")
+ctl_app = App(
+    name="ctl",
+    help="Orders to a flight that goes on: goto, hold, resume, land, engage; and its status.",
+    help_epilogue=example("ctl"),
+)
 
 
 @Parameter(name="*")
@@ -41,7 +46,7 @@ class Which:
 ANY = Which()
 
 
-@ctl_app.command
+@ctl_app.command(usage="Usage: uavctl ctl goto [OPTIONS] NORTH EAST DOWN", help_epilogue=example("ctl goto"))
 def goto(*place: Annotated[str, Parameter(allow_leading_hyphen=True)], which: Which = ANY) -> int:
     """Fly to a place and stay there: north, east, down in local NED [m], as in `ctl goto 2,1,-2` or `goto 2 1 -2`.
 
@@ -68,10 +73,10 @@ _ORDERS: dict[Ask, str] = {
     "engage": "Ask for the external mode again, after the pilot or the vehicle has left it.",
 }
 for _name, _help in _ORDERS.items():
-    ctl_app.command(_plain_order(_name), name=_name, help=_help)
+    ctl_app.command(_plain_order(_name), name=_name, help=_help, help_epilogue=example(f"ctl {_name}"))
 
 
-@ctl_app.command
+@ctl_app.command(help_epilogue=example("ctl status"))
 def status(*, which: Which = ANY) -> int:
     """Say how the flight is doing. Exit code 1: no daemon answers."""
     reply = ask(ControlRequest(ask="status"), control_folder(which.control), which.vehicle)
@@ -102,7 +107,7 @@ def _order(request: ControlRequest, which: Which) -> int:
         Common(json=True).show("ctl/order", {"ok": reply.ok, "text": reply.text}, str)
     else:
         verdict = "accepted" if reply.ok else "refused"
-        messages().print(f"{request.ask} {verdict}: {reply.text}", soft_wrap=True, markup=False, highlight=False)
+        messages().print(f"{request.ask} {verdict}: {reply.text}", soft_wrap=True, highlight=False)
     return 0 if reply.ok else 1
 
 

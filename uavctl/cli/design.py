@@ -196,7 +196,7 @@ def design_picture(made: Design, stored: StoredLibrary | None, name: str) -> Ren
     checked = (
         (
             check.item,
-            "[green]yes[/]" if check.ok else "[red]no[/]",
+            Text("yes", style="green") if check.ok else Text("no", style="red"),
             f"{check.value:.4g}",
             f"{check.limit:.4g}",
             check.text,

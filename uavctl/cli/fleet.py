@@ -8,6 +8,7 @@ anything is sent. A vehicle that ends otherwise than it was asked to may be anyw
 from __future__ import annotations
 
 import math
+import os
 import re
 import signal
 import subprocess
@@ -24,12 +25,12 @@ from typing import Annotated
 from cyclopts import App, Parameter
 from msgspec import Meta
 from rich.live import Live
-from rich.markup import escape
 from rich.table import Table
 
 from uavctl.cli import main
 from uavctl.cli.common import SPAN_S, Common, QuietJson, TakeOff, columns, given_keys, messages
 from uavctl.cli.ctl import ask
+from uavctl.cli.usage import example
 from uavctl.config import Config, load
 from uavctl.config.checks import position_limits_m
 from uavctl.config.document import ConfigProblem, Section
@@ -46,7 +47,9 @@ MOST_VEHICLES = 20
 LONGEST_NAME = 30
 _HEALTH = re.compile(r"\w+ +age .* dropped \d+$")  # a daemon's line of each second
 
-fleet_app = App(name="fleet", help="Fly several vehicles from one file: check, fly, status, land.")
+fleet_app = App(
+    name="fleet", help="Fly several vehicles from one file: check, fly, status, land.", help_epilogue=example("fleet")
+)
 File = Annotated[Path, Parameter(help="TOML file: spacing_m, and a [[vehicle]] table for each vehicle")]
 
 
@@ -160,7 +163,7 @@ def _problems(members: Sequence[Member], spacing_m: float) -> Iterator[ConfigPro
             )
 
 
-@fleet_app.command
+@fleet_app.command(help_epilogue=example("fleet check"))
 def check(file: File, /, *, json: QuietJson = False) -> int:
     """Say whether a fleet can be flown: its configurations, links, and how far apart its boxes are; sends nothing."""
     fleet = read_fleet(file)
@@ -174,7 +177,7 @@ def check(file: File, /, *, json: QuietJson = False) -> int:
     return 0
 
 
-@fleet_app.command
+@fleet_app.command(help_epilogue=example("fleet fly"))
 def fly(
     file: File,
     /,
@@ -206,10 +209,12 @@ def fly(
             why = "asked to" if asked.is_set() else _astray(flights, looks)
             if why and not landing:
                 landing = True
-                messages().print(f"{why}: all vehicles end their flights", soft_wrap=True, markup=False)
+                messages().print(f"{why}: all vehicles end their flights", soft_wrap=True)
                 for flight in flights:
                     flight.end()
             asked.wait(POLL_S) if not landing else time.sleep(POLL_S)
+        for flight in flights:
+            flight.last_words()
     document = {
         "vehicles": [
             {"name": one.member.name, "exit_code": one.exit_code, "out": str(out / one.member.name)} for one in flights
@@ -219,7 +224,7 @@ def fly(
     return max((one.exit_code or 0 for one in flights), default=0)
 
 
-@fleet_app.command
+@fleet_app.command(help_epilogue=example("fleet status"))
 def status(
     file: File, /, *, control: Annotated[Path | None, Parameter(show=False)] = None, json: QuietJson = False
 ) -> int:
@@ -230,7 +235,7 @@ def status(
     return 0 if all(found.values()) else 1
 
 
-@fleet_app.command
+@fleet_app.command(help_epilogue=example("fleet land"))
 def land(file: File, /, *, control: Annotated[Path | None, Parameter(show=False)] = None) -> int:
     """Land all vehicles of a file. Exit code 1: not all of them take the order."""
     fleet, folder, good = read_fleet(file), control_folder(control), True
@@ -241,7 +246,7 @@ def land(file: File, /, *, control: Annotated[Path | None, Parameter(show=False)
         except NotReachedError as error:
             verdict, text = "not reached", str(error)
         good = good and verdict == "accepted"
-        messages().print(f"{one.name}: land {verdict}: {text}", soft_wrap=True, markup=False, highlight=False)
+        messages().print(f"{one.name}: land {verdict}: {text}", soft_wrap=True, highlight=False)
     return 0 if good else 1
 
 
@@ -253,6 +258,7 @@ class FleetFlight:
         begin = "from uavctl.cli.fleet import begin_daemon; begin_daemon()"
         self._command = [sys.executable, "-P", "-c", begin, "fly", *member.options, *options]
         self._process: subprocess.Popen[str] | None = None
+        self._speaker = threading.Thread(target=self._say, name=member.name, daemon=True)
 
     @property
     def exit_code(self) -> int | None:
@@ -272,7 +278,7 @@ class FleetFlight:
             errors="replace",
             start_new_session=True,
         )
-        threading.Thread(target=self._say, name=self.member.name, daemon=True).start()
+        self._speaker.start()
 
     def lasts(self) -> bool:
         """Whether the daemon runs."""
@@ -283,12 +289,16 @@ class FleetFlight:
         if self._process is not None and self._process.stdin is not None:
             self._process.stdin.close()
 
+    def last_words(self) -> None:
+        """Wait until all that the daemon said is shown; not for a process of its own that outlives it."""
+        self._speaker.join(LINE_S)
+
     def _say(self) -> None:
         assert self._process is not None and self._process.stderr is not None
         for line in self._process.stderr:
             text = line.rstrip()
             if text and not _HEALTH.match(text):  # of which the table has the newest
-                messages().print(f"{self.member.name}: {text}", soft_wrap=True, markup=False, highlight=False)
+                messages().print(f"{self.member.name}: {text}", soft_wrap=True, highlight=False)
 
 
 def begin_daemon() -> None:
@@ -298,7 +308,9 @@ def begin_daemon() -> None:
     """
 
     def watch() -> None:
-        sys.stdin.buffer.read()
+        # Not by `sys.stdin`: the interpreter wants its lock when it ends, and aborts where this thread holds it.
+        while os.read(0, 1):
+            pass
         signal.raise_signal(signal.SIGINT)
 
     threading.Thread(target=watch, name="fleet", daemon=True).start()
@@ -372,18 +384,16 @@ def _table(found: Looks) -> Table:
     rows = []
     for name, health in found.items():
         if health is None:
-            rows.append([escape(name), "-", "no daemon answers", "-", "-", "-"])
+            rows.append([name, "-", "no daemon answers", "-", "-", "-"])
             continue
         vehicle = health.vehicle
         place = health.position_m
         rows.append(
             [
-                escape(name),
+                name,
                 "waiting" if health.mode is None else health.mode.value,
-                escape(health.ending or health.who_flies or "-"),
-                "not heard"
-                if vehicle is None
-                else f"{escape(vehicle.mode)}, {'armed' if vehicle.armed else 'disarmed'}",
+                health.ending or health.who_flies or "-",
+                "not heard" if vehicle is None else f"{vehicle.mode}, {'armed' if vehicle.armed else 'disarmed'}",
                 "-" if health.age_s is None else f"{health.age_s:.2f} s",
                 "-" if place is None else ", ".join(f"{value:+.2f}" for value in place.values()),
             ]
@@ -396,11 +406,11 @@ def _boxes(fleet: Fleet) -> Table:
     rows = []
     for one in fleet.members:
         sides = [f"{low:g} to {high:g}" for low, high in map(one.limits_m, AXES)]
-        rows.append([escape(one.name), escape(one.config.daemon.vehicle), *sides])
+        rows.append([one.name, one.config.daemon.vehicle, *sides])
     near = "one vehicle" if not math.isfinite(fleet.nearest_m) else f"nearest boxes {fleet.nearest_m:.2f} m apart"
     return columns(near, ("vehicle", "link", *(f"{axis} [m]" for axis in AXES)), rows, ("vehicle", "link"), fold=True)
 
 
 def _ended(flights: Sequence[FleetFlight]) -> Table:
-    rows = [[escape(one.member.name), str(one.exit_code)] for one in flights]
+    rows = [[one.member.name, str(one.exit_code)] for one in flights]
     return columns("how the daemons ended", ("vehicle", "exit code"), rows)

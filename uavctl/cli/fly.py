@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
-from rich.markup import escape
+from rich.text import Text
 
 from logs.recording.ends import final, new_recording, put_header
 from logs.recording.parameters import ParameterReader
@@ -23,7 +23,7 @@ from logs.recording.summary import FlightSummary, render
 from logs.recording.topics import ENDED
 from uavctl.build.controller import design_of
 from uavctl.check.findings import Item
-from uavctl.cli.common import DEFAULTS, SPAN_S, Common, Mocap, TakeOff, given_keys, located, messages
+from uavctl.cli.common import DEFAULTS, SPAN_S, Common, Mocap, TakeOff, given_keys, labelled, located, messages
 from uavctl.cli.flying import (
     Live,
     LivePort,
@@ -94,8 +94,8 @@ def as_realtime(wanted: bool) -> Iterator[Sequence[AfterTick]]:
     """Set real-time scheduling and memory if wanted; return the function to call after each tick."""
     with ExitStack() as stack:
         for outcome in stack.enter_context(realtime()) if wanted else ():
-            style = "" if outcome.ok else "[bold yellow]warning:[/] "
-            messages().print(f"{style}--realtime: {outcome.part}: {outcome.text}", soft_wrap=True)
+            told = Text(f"--realtime: {outcome.part}: {outcome.text}")
+            messages().print(told if outcome.ok else labelled("warning", told.plain, "bold yellow"), soft_wrap=True)
         yield (stack.enter_context(collected_between_ticks()).after_tick,)
 
 
@@ -254,7 +254,7 @@ def fly_daemon(
                 record_items(recorder, checked, monotonic_ns())
                 record_parameters(recorder, told, monotonic_ns())
                 for warning in warnings(config.security, config.daemon):
-                    messages().print(f"[yellow]warning:[/] {escape(warning)}", soft_wrap=True)
+                    messages().print(labelled("warning", warning), soft_wrap=True)
                 if tenure.left_ns is not None:
                     stand_by(loop, tenure.left_ns)
                 messages().print(f"recording to {path}; Ctrl-C hands over", soft_wrap=True)

@@ -18,8 +18,8 @@ from typing import Annotated, Protocol
 from cyclopts import Parameter
 from msgspec.structs import replace
 from rich.console import Console
-from rich.markup import escape
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, ProgressColumn, Task, TimeElapsedColumn
+from rich.text import Text
 
 from logs.recording.ends import final, lacks
 from logs.recording.flight import FlightData
@@ -27,7 +27,7 @@ from logs.recording.reader import read
 from logs.recording.recorder import DerivedTopics, RecorderStatus, live_view
 from logs.recording.summary import FlightSummary, summarise
 from logs.recording.views import Views
-from uavctl.cli.common import FREE_PORT, messages
+from uavctl.cli.common import FREE_PORT, labelled, messages
 from uavctl.daemon.engagement import goto_keys
 from uavctl.errors import ConnectionClosedError, EndedBySignal, RecordingError, UavctlError, UsageError, in_words
 from uavctl.loop import ControlLoop
@@ -62,8 +62,12 @@ def stand_by(loop: ControlLoop, flown_ns: int) -> None:
     """
     loop.order(Command(order=Order.STAND_BY, flown_ns=flown_ns))
     messages().print(
-        "[bold yellow]warning:[/] the daemon before this one left the vehicle in flight; if it is still armed, and "
-        "has not started anew since, nothing is sent until `uavctl ctl engage`",
+        labelled(
+            "warning",
+            "the daemon before this one left the vehicle in flight; if it is still armed, and has not started anew "
+            "since, nothing is sent until `uavctl ctl engage`",
+            "bold yellow",
+        ),
         soft_wrap=True,
     )
 
@@ -83,10 +87,10 @@ def checked_take_off(arm: bool, takeoff: float | None) -> float | None:
 
 def tell_ending(ending: Ending) -> None:
     """Say on the console how the flight ended."""
-    style = "[bold]ended:[/]" if ending.as_ordered else "[bold red]ended:[/]"
-    messages().print(f"{style} {escape(ending.sentence)}", soft_wrap=True)
+    style = "bold" if ending.as_ordered else "bold red"
+    messages().print(labelled("ended", ending.sentence, style), soft_wrap=True)
     if ending.relay:
-        messages().print(f"[bold]relay:[/] {escape(ending.relay)}", soft_wrap=True)
+        messages().print(labelled("relay", ending.relay, "bold"), soft_wrap=True)
 
 
 # What a person at the console is told of a flight's events, and of what is being waited for.
@@ -243,7 +247,7 @@ def conclude(path: Path, wall_s: float, status: RecorderStatus, ending: Ending |
     try:
         draw_page(path, summary, page)
     except UavctlError as error:  # the flight and its recording are as they are
-        messages().print(f"[yellow]warning:[/] no page: {escape(str(error))}", soft_wrap=True)
+        messages().print(labelled("warning", f"no page: {error}"), soft_wrap=True)
         summary = replace(summary, report=None)
     return summary
 
@@ -312,7 +316,7 @@ def wait_for_server(stopped: Callable[[], bool]) -> Callable[[str], bool]:
     def wait(url: str) -> bool:
         if url not in told:
             told.add(url)
-            messages().print(f"waiting for {escape(url)}, where nobody listens yet; Ctrl-C ends it", soft_wrap=True)
+            messages().print(f"waiting for {url}, where nobody listens yet; Ctrl-C ends it", soft_wrap=True)
         until_s = time.monotonic() + SERVER_RETRY_S
         while time.monotonic() < until_s and not stopped():
             time.sleep(0.05)
@@ -350,7 +354,7 @@ def live_line(
     """Show the state of the loop while it flies, from a thread of its own, on standard error; yields its feed."""
     before_s = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_INTERVAL_S)
-    columns = (BarColumn(bar_width=20), TimeElapsedColumn(), TextColumn("{task.description}"))
+    columns = (BarColumn(bar_width=20), TimeElapsedColumn(), _State())
     done, told = threading.Event(), threading.Event()
     with Progress(*columns, console=messages(), transient=True, refresh_per_second=1 / REFRESH_S) as progress:
         # The bar's own console would draw it, also into a file.
@@ -362,7 +366,7 @@ def live_line(
             while feed.news:
                 line = said.line(feed.news.popleft(), loop.who_flies)
                 if line is not None:
-                    console.print(f"[yellow]{escape(line)}[/]", soft_wrap=True)
+                    console.print(Text(line, style="yellow"), soft_wrap=True)
 
         def show() -> None:
             while not done.wait(REFRESH_S):
@@ -371,10 +375,10 @@ def live_line(
                 tell_notices(feed.notices, console)
                 if loop.let_go and not told.is_set():
                     told.set()
-                    console.print(f"[bold red]letting go:[/] {escape(loop.let_go)}", soft_wrap=True)
+                    console.print(labelled("letting go", loop.let_go, "bold red"), soft_wrap=True)
                 if ticked is not None:
                     line = _line(ticked, loop.who_flies) + _alarm(recorder.status())
-                    progress.update(task, completed=ticked.decision.tick * tick_s, description=line)
+                    progress.update(task, completed=ticked.decision.tick * tick_s, line=line)
 
         thread = threading.Thread(target=show, name="live", daemon=True)
         thread.start()
@@ -393,32 +397,45 @@ def tell_notices(notices: deque[Event], console: Console) -> None:
     while notices:
         event = notices.popleft()
         style = "bold red" if event.severity is Severity.ERROR else "bold yellow"
-        console.print(f"[{style}]{event.code}:[/] {escape(event.text)}", soft_wrap=True)
+        console.print(labelled(event.code, event.text, style), soft_wrap=True)
 
 
-def _line(ticked: Ticked, who_flies: HandoverState) -> str:
+class _State(ProgressColumn):
+    """State of a flight, in its styles."""
+
+    def render(self, task: Task) -> Text:
+        """Return what the task's field `line` holds."""
+        line = task.fields.get("line")
+        return line if isinstance(line, Text) else Text(task.description)
+
+
+def _line(ticked: Ticked, who_flies: HandoverState) -> Text:
     decision, vehicle, estimate = ticked.decision, ticked.vehicle, ticked.estimate
     mode = "no vehicle" if vehicle is None else f"{vehicle.mode} {'armed' if vehicle.armed else 'disarmed'}"
     age = "-" if estimate is None else f"{max(0.0, estimate.age_s):.2f} s"
     accel = "-" if decision.input is None else " ".join(f"{u:+z.2f}" for u in decision.input)
     waiting = waits_for(who_flies) if decision.mode is ControlMode.WAIT else ""
     mode = f"{mode}, waiting for {waiting}" if waiting else mode
-    return f"{decision.mode.value:7} age {age:>6}  input {accel}  [dim]{mode}[/dim]"
+    return Text.assemble(f"{decision.mode.value:7} age {age:>6}  input {accel}  ", (mode, "dim"))
 
 
-def _alarm(status: RecorderStatus) -> str:
+def _alarm(status: RecorderStatus) -> Text:
     """Return a warning on the recording while it is being made; empty if there is none."""
     if status.ok:
-        return f"  [yellow]disk gets low: {escape(status.warning)}[/]" if status.warning else ""
-    return f"  [bold red]recording in trouble: {escape(status.reason or f'{status.dropped} records dropped')}[/]"
+        return Text(f"  disk gets low: {status.warning}" if status.warning else "", style="yellow")
+    return Text(f"  recording in trouble: {status.reason or f'{status.dropped} records dropped'}", style="bold red")
 
 
 def tell_losses(status: RecorderStatus) -> None:
     """Print after a flight what the recording lacks, and why."""
     if status.failures or not status.ok:
         messages().print(
-            f"[bold red]warning:[/] the recording lacks {lacks(status)} records "
-            f"({escape(status.reason or status.refusal or 'the disk was too slow')}); what is in it is whole. "
-            f"Files: {escape(', '.join(status.segments)) or 'none'}",
+            labelled(
+                "warning",
+                f"the recording lacks {lacks(status)} records "
+                f"({status.reason or status.refusal or 'the disk was too slow'}); what is in it is whole. "
+                f"Files: {', '.join(status.segments) or 'none'}",
+                "bold red",
+            ),
             soft_wrap=True,
         )

@@ -11,8 +11,8 @@ from typing import Annotated
 import msgspec
 from cyclopts import Parameter
 from rich.console import Group, RenderableType
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from logs.recording.disk import spare_recording, write_whole
 from logs.recording.reader import header, lacks_end, read
@@ -96,7 +96,7 @@ def _picture(found: Identification, target: Path, page: Path) -> RenderableType:
     result = found.result
     plant = Table(title=f"{result.flown_s:.0f} s flown under setpoints, {result.positions} positions")
     for column in ("axis", "lag [s]", "drag [1/s]", "gain", "wind [m/s²]", "residual [mm]", "R²"):
-        plant.add_column(escape(column), justify="left" if column == "axis" else "right")
+        plant.add_column(column, justify="left" if column == "axis" else "right")
     for one in result.response:
         plant.add_row(
             one.axis,
@@ -109,7 +109,7 @@ def _picture(found: Identification, target: Path, page: Path) -> RenderableType:
         )
     kinds = Table(title="dead time, and error on the halves not fitted to")
     for column in ("plant", "dead time [s]", "range [s]", "error [mm]"):
-        kinds.add_column(escape(column), justify="left" if column == "plant" else "right")
+        kinds.add_column(column, justify="left" if column == "plant" else "right")
     for kind in result.candidates:
         low_s, high_s = kind.dead_time_range_s
         within = f"{low_s:.2f} to {high_s:.2f}"
@@ -123,8 +123,6 @@ def _picture(found: Identification, target: Path, page: Path) -> RenderableType:
         ("delay", f"{1e3 * found.link.delay_s:.0f} ms, 99 % within {1e3 * found.link.jitter_s:.0f} ms more"),
     ):
         link.add_row(name, value)
-    told = [f"[yellow]{escape(text)}[/]" for text in result.warnings]
+    told = [Text(text, style="yellow") for text in result.warnings]
     ramps = [ramp] if result.ramp_s > 0.0 else []
-    return Group(
-        plant, kinds, *ramps, link, *told, f"configuration: {escape(str(target))}", f"page: {escape(str(page))}"
-    )
+    return Group(plant, kinds, *ramps, link, *told, f"configuration: {target}", f"page: {page}")

@@ -9,12 +9,13 @@ from cyclopts import App, Parameter
 from rich.table import Table
 
 from uavctl.cli.common import Common, Json
+from uavctl.cli.usage import example
 from uavctl.io.signed_connection import new_key, read_key
 
-key_app = App(name="key", help="Make and look at keys of MAVLink 2 signing.")
+key_app = App(name="key", help="Make and look at keys of MAVLink 2 signing.", help_epilogue=example("key"))
 
 
-@key_app.command
+@key_app.command(help_epilogue=example("key new"))
 def new(
     file: Annotated[Path, Parameter(help="file to make; one that is there is not written over")], *, json: Json = False
 ) -> int:
@@ -25,7 +26,7 @@ def new(
     return _show(file, new_key(file).name, json=json)
 
 
-@key_app.command
+@key_app.command(help_epilogue=example("key show"))
 def show(file: Annotated[Path, Parameter(help="file to read")], *, json: Json = False) -> int:
     """Say which key a file holds: equal names are equal keys. Nothing of the key itself is shown."""
     return _show(file, read_key(file).name, json=json)
@@ -35,6 +36,6 @@ def _show(file: Path, name: str, *, json: bool) -> int:
     table = Table.grid(padding=(0, 2))
     table.add_row("file", str(file))
     table.add_row("name of the key", name)
-    table.add_row("to use it", f'key_file = "{file.absolute()}" in \\[security]')
+    table.add_row("to use it", f'key_file = "{file.absolute()}" in [security]')
     Common(json=json).show("key", {"file": str(file.absolute()), "name": name}, lambda: table)
     return 0

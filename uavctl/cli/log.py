@@ -26,6 +26,7 @@ from logs.recording.summary import count
 from logs.recording.tlog import ExportedTlog, export_tlog
 from logs.recording.ulog import is_ulog, read_ulog
 from uavctl.cli.common import Common, Flight, Json, bars, columns, counted, two_columns, warn
+from uavctl.cli.usage import example
 from uavctl.errors import UsageError
 
 # `uavctl log export`: a recording for other programs.
@@ -182,7 +183,11 @@ def _loss(loss: PositionLoss) -> Iterator[str]:
 
 
 RECOVERED_WITH_LOSS = 3
-log_app = App(name="log", help="Recordings: info, recover, replay, report, compare, whatif, export; a layout.")
+log_app = App(
+    name="log",
+    help="Recordings: info, recover, replay, report, compare, whatif, export; a layout.",
+    help_epilogue=example("log"),
+)
 # Imported when they run: a replay does not wait for what draws pages.
 _COMMANDS = {
     "replay": (
@@ -221,10 +226,11 @@ _COMMANDS = {
     ),
 }
 for _name, (_path, _help) in _COMMANDS.items():
-    log_app.command(f"uavctl.cli.{_path}", name=_name, help=_help)
+    _more = {"usage": "Usage: uavctl log compare [OPTIONS] FIRST SECOND [MORE]..."} if _name == "compare" else {}
+    log_app.command(f"uavctl.cli.{_path}", name=_name, help=_help, help_epilogue=example(f"log {_name}"), **_more)
 
 
-@log_app.command
+@log_app.command(help_epilogue=example("log info"))
 def info(flight: Flight, /, *, json: Json = False) -> int:
     """Say what a recording, a .tlog or a ULog holds: topics, rates, gaps, losses, and how it was made."""
     if is_tlog(flight) or is_ulog(flight):
@@ -237,7 +243,7 @@ def info(flight: Flight, /, *, json: Json = False) -> int:
     return 0
 
 
-@log_app.command
+@log_app.command(help_epilogue=example("log recover"))
 def recover(flight: Flight, out: Annotated[Path, Parameter(help="file to write")], /, *, json: Json = False) -> int:
     """Restore what a torn or damaged recording still holds. Exit code 3: with loss."""
     result = restore(flight, out)
@@ -245,7 +251,7 @@ def recover(flight: Flight, out: Annotated[Path, Parameter(help="file to write")
     return 0 if result.lossless else RECOVERED_WITH_LOSS
 
 
-@log_app.command
+@log_app.command(help_epilogue=example("log layout"))
 def layout() -> int:
     """Print the layout for Foxglove: `uavctl log layout > uavctl.json`, there "Import from file"."""
     sys.stdout.write(layout_text())

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING
 
-from rich.markup import escape
 from rich.progress import TimeElapsedColumn
 
 from uavctl.build import controller
@@ -38,7 +37,7 @@ def ready_library(config: Config, design: AnyDesign) -> StoredLibrary | None:
             bar[0](f"policy library: {name}, {count} policies, worst gap {worst_gap:.0e}")
 
         return controller.ready_library(
-            config, design, advance, lambda text: messages().print(escape(text), style="yellow", soft_wrap=True)
+            config, design, advance, lambda text: messages().print(text, style="yellow", soft_wrap=True)
         )
 
 
@@ -47,7 +46,7 @@ def _bar(title: str) -> Iterator[Callable[[str], None]]:
     """Show a progress bar of unknown length; without a terminal its title, and a line now and then."""
     console = messages()
     if not console.is_terminal:
-        console.print(escape(title), soft_wrap=True)
+        console.print(title, soft_wrap=True)
     with bars(TimeElapsedColumn()) as progress:
-        task = progress.add_task(escape(title), total=None)
-        yield lambda text: progress.update(task, description=escape(text))
+        task = progress.add_task(title, total=None)
+        yield lambda text: progress.update(task, description=text)

@@ -12,7 +12,6 @@ from typing import Annotated
 import msgspec
 from cyclopts import Parameter
 from rich.console import Group, RenderableType
-from rich.markup import escape
 from rich.table import Table
 
 from logs.recording.foreign import is_foreign, read_mcap
@@ -185,7 +184,7 @@ def foreign_packets(flight: Path, topics: Sequence[str]) -> tuple[TlogPacket, ..
         packets, notes = tlog.packets, tlog.notes
     elif is_foreign(flight):
         found = read_mcap(flight, topics)
-        messages().print(f"MAVLink in {', '.join(found.topics)}", markup=False, soft_wrap=True)
+        messages().print(f"MAVLink in {', '.join(found.topics)}", soft_wrap=True)
         torn = ("the recording is torn: replayed up to its end",) if found.torn else ()
         packets, notes = found.packets, (*found.notes, *torn)
     else:
@@ -333,10 +332,10 @@ def _course(course: tuple[FieldDivergence, ...]) -> Table:
         unit = f" {one.unit}" if one.unit else ""
         entry = f" ({one.entry})" if one.entry else ""
         table.add_row(
-            escape(f"{one.topic} {one.field or '(a record on one side only)'}"),
+            f"{one.topic} {one.field or '(a record on one side only)'}",
             f"{one.first_s:.3f}",
             f"{one.differing} of {one.records}",
-            "-" if one.largest is None else escape(f"{one.largest:.3g}{unit}{entry}"),
+            "-" if one.largest is None else f"{one.largest:.3g}{unit}{entry}",
             "-" if one.largest_s is None else f"{one.largest_s:.3f}",
         )
     return table

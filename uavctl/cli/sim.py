@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter, validators
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
-from rich.markup import escape
 
 from sim.faults import problems
 from sim.fleet import fleet
@@ -128,10 +127,7 @@ Looks = Sequence[VehicleSnapshot]
 def view(looks: Looks) -> RenderableType:
     """Return a table with a row for each vehicle; cut into several where the terminal is narrow."""
     rows = zip(*(_cells(one) for one in looks), strict=True)
-    # What vehicles say, and units in brackets, are no markup.
-    columns = [
-        Column(escape(heading), [escape(cell) for cell in row]) for heading, row in zip(HEADINGS, rows, strict=True)
-    ]
+    columns = [Column(heading, row) for heading, row in zip(HEADINGS, rows, strict=True)]
     time_s = max(one.time_s for one in looks)
     return Group(f"simulated time {time_s:.1f} s", WideTable(columns[0], [[column] for column in columns[1:]]))
 
@@ -247,7 +243,7 @@ def _write(console: Console, address: str, latest: Latest, done: threading.Event
         ended = done.wait(LINE_S)
         for looks in latest:
             for one in looks:
-                console.print(line(one), markup=False, highlight=False, soft_wrap=True)
+                console.print(line(one), highlight=False, soft_wrap=True)
 
 
 # `uavctl sim`: the simulated vehicle and cameras alone, for any MAVLink client.

@@ -14,7 +14,6 @@ import msgspec
 import numpy as np
 from cyclopts import Parameter
 from rich.console import Group, RenderableType
-from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
@@ -32,6 +31,7 @@ from uavctl.cli.common import (
     can_be_read,
     columns,
     given_keys,
+    labelled,
     located,
     messages,
     warn,
@@ -42,7 +42,7 @@ from uavctl.cli.identify import design_doubts, fitting
 from uavctl.cli.loopback import fly_simulated
 from uavctl.clock import Ticker, monotonic_ns
 from uavctl.config import Config, LoadedConfig
-from uavctl.config.load import dump_config, parse, parse_toml
+from uavctl.config.load import dump_config, parse, parse_recorded, parse_toml
 from uavctl.daemon.lock import sole_daemon
 from uavctl.errors import NotReachedError, RecordingError, UsageError
 from uavctl.io.base import Connection
@@ -263,7 +263,7 @@ def comparison_picture(progress: TuneProgress, folder: Path) -> RenderableType:
 
 
 def _table(title: str, headings: Sequence[str], rows: Iterable[Sequence[str]], left: Sequence[str]) -> Table:
-    return columns(title, headings, (map(escape, row) for row in rows), left, fold=True)
+    return columns(title, headings, rows, left, fold=True)
 
 
 # `uavctl tune`: fly to learn how the vehicle answers, write that down, fly again, compare. Goes on where it ended.
@@ -337,8 +337,8 @@ def tune(
         except KeyboardInterrupt:  # beside a flight, which has its own end
             code, why = INTERRUPTED, "interrupted by the operator"
     if why:
-        messages().print(f"[bold yellow]stopped:[/] {escape(why)}", soft_wrap=True)
-        messages().print(f"Go on with the same command; what is done stays in {escape(str(folder))}.", soft_wrap=True)
+        messages().print(labelled("stopped", why, "bold yellow"), soft_wrap=True)
+        messages().print(f"Go on with the same command; what is done stays in {folder}.", soft_wrap=True)
     progress = run.folder.progress
     document = {
         **msgspec.to_builtins(progress),
@@ -384,7 +384,7 @@ class _Flights:
         """
         lands = not simulated or take_off_m is not None
         if flight is not None:
-            flown = parse(header(flight).config_toml, f"{flight} (configuration)").config
+            flown = parse_recorded(header(flight).config_toml, f"{flight} (configuration)").config
             mission = msgspec.structs.replace(
                 flown.mission, then="land" if lands and flown.mission.waypoints else "hold"
             )
@@ -453,7 +453,7 @@ class _TuneRun:
         lines = [f"# {one}" for one in _written(told)]
         write_whole(self.folder.path / TUNED, "\n".join([*lines, dump_config(result.config)]))
         self.folder.note(tuned=told)
-        messages().print(f"written: {escape(str(self.folder.path / TUNED))}", soft_wrap=True)
+        messages().print(f"written: {self.folder.path / TUNED}", soft_wrap=True)
         return 0, ""
 
     def _refly(self) -> tuple[int, str]:
@@ -532,7 +532,7 @@ class _TuneRun:
 
     def _say_what_comes(self, what: str) -> None:
         mission, box = self._made.mission.mission, self._made.box
-        messages().print(f"[bold]{what}.[/]", soft_wrap=True)
+        messages().print(f"{what}.", style="bold", soft_wrap=True)
         if box is not None:
             sides = ", ".join(
                 f"{axis} {low:g} to {high:g}" for axis, low, high in zip(AXES, box.lower, box.upper, strict=True)
@@ -546,7 +546,7 @@ class _TuneRun:
             )
 
     def _told(self, what: str) -> tuple[int, str]:
-        messages().print(f"[dim]{what}[/]", soft_wrap=True)
+        messages().print(what, style="dim", soft_wrap=True)
         return 0, ""
 
 

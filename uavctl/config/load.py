@@ -142,6 +142,7 @@ _WORDS = {
 _MAY_BE_INFINITE = ("sets.", "link.trace_s")  # an open side, a lost packet; everything else is finite
 _LONGEST_VALUE = 40
 _UNKNOWN = "unknown key"
+_MOST_NAMED = 3  # keys that a wrong one may have meant
 _MOST_UNKNOWN = 10  # keys of a table that are told one by one
 _MOST_PROBLEMS = 50
 MOST_OVERRIDES = 1000
@@ -193,6 +194,7 @@ def parse(text: str, file: str, overrides: Sequence[str] = ()) -> LoadedConfig:
         raise ConfigError((*problems, *map(source.tell, found)))
     sections: dict[str, Decoded] = {}
     config = decode(Config, table, "", found, sections, needed=_needed(table))
+    found.extend(_of_other_scheme(table))
     mission, link = sections.get("mission", MissionConfig()), sections.get("link", LinkConfig())
     if isinstance(mission, MissionConfig) and isinstance(link, LinkConfig):
         mission, of_mission = read_samples(mission, Path(file).parent, found)
@@ -215,13 +217,38 @@ def parse_recorded(text: str, file: str, overrides: Sequence[str] = ()) -> Loade
     Raises:
         ConfigError: With all problems found.
     """
-    asked = "parameters" in parse_toml(text, file).get("daemon", {})
-    return parse(text, file, overrides if asked else ("daemon.parameters=false", *overrides))
+    table = parse_toml(text, file)
+    before = {("daemon", "parameters"): "false", ("smpc", "scheme"): '"hahn-stursberg"'}
+    lacks = [
+        f"{section}.{key}={value}" for (section, key), value in before.items() if key not in table.get(section, {})
+    ]
+    return parse(text, file, (*lacks, *overrides))
 
 
 def explain(source: Source, error: DesignError) -> str:
     """A refused design as the loader's own problems are told: place, key, reason, what to do."""
     return source.tell(ConfigProblem(error.key, error.reason, error.hint))
+
+
+def keys_named(name: str) -> tuple[str, ...]:
+    """Return the configuration keys whose last part or whole path is `name`, else those where a unit follows it.
+
+    Dashes, dots and underscores are alike.
+    """
+
+    def listed(section: type[Section], path: str) -> Iterator[str]:
+        for field in msgspec.structs.fields(section):
+            key = f"{path}{field.encode_name}"
+            if is_section(field.type):
+                yield from listed(field.type, f"{key}.")
+            elif element(field.type) is None:
+                yield key
+
+    wanted = re.sub(r"[-.]", "_", name.lstrip("-").lower())
+    names = {key: (key.rpartition(".")[2], key.replace(".", "_")) for key in listed(Config, "")}
+    same = tuple(key for key, both in names.items() if wanted in both)
+    with_unit = re.compile(rf"{re.escape(wanted)}_[a-z0-9]{{1,4}}")
+    return same or tuple(key for key, both in names.items() if any(map(with_unit.fullmatch, both)))
 
 
 def find_nearest(name: str, names: Sequence[str]) -> str:
@@ -302,7 +329,21 @@ def _needed(table: Mapping[str, Any]) -> frozenset[str]:
     """Keys that have to be given though the types have a default."""
     smpc = table.get("smpc")
     scheme = smpc.get("scheme") if isinstance(smpc, dict) else None
-    return frozenset() if scheme == "age-conditioned" else OF_HAHN_STURSBERG
+    return OF_HAHN_STURSBERG if scheme == "hahn-stursberg" else frozenset()
+
+
+def _of_other_scheme(table: Mapping[str, Any]) -> Iterator[ConfigProblem]:
+    """Find keys of scheme `hahn-stursberg` without the scheme: it was the default once, and another one would fly."""
+    smpc = table.get("smpc")
+    if not isinstance(smpc, dict) or "scheme" in smpc:
+        return
+    given = [name for name in ("tau", "delta_tau", "k_tau") if name in smpc]
+    if given:
+        yield ConfigProblem(
+            f"smpc.{given[0]}",
+            "this key is of scheme hahn-stursberg, and no scheme is given",
+            'write smpc.scheme = "hahn-stursberg", or "age-conditioned", the default, which does without',
+        )
 
 
 def decode(
@@ -375,6 +416,9 @@ def _decode_element(section: type[Section], value: object, path: str, found: lis
 def _unknown(path: str, key: str, names: Sequence[str], table: str) -> ConfigProblem:
     nearest = find_nearest(key, names)
     where = f"[{table[:-1]}]" if table else "the top level"
+    elsewhere = () if nearest else keys_named(path) or keys_named(key)
+    if elsewhere:
+        return ConfigProblem(path, _UNKNOWN, f"write {' or '.join(elsewhere[:_MOST_NAMED])}")
     return ConfigProblem(
         path,
         f"{_UNKNOWN}{nearest}",

@@ -219,10 +219,10 @@ class SmpcConfig(Section, frozen=True, kw_only=True):
     scheme: Annotated[
         Scheme,
         Meta(
-            description="`hahn-stursberg`: the paper's, with planned feedback, its library and terminal law; "
-            "`age-conditioned`: plans without feedback, back-offs by the age of information, the regulator's tail"
+            description="`age-conditioned`: plans without feedback, back-offs by the age of information, the "
+            "regulator's tail; `hahn-stursberg`: the paper's, with planned feedback, its library and terminal law"
         ),
-    ] = "hahn-stursberg"
+    ] = "age-conditioned"
     controller: Annotated[
         str,
         Meta(

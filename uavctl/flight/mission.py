@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from uavctl.frames import up_hint
 from uavctl.records import Vec3, Vector
 from uavctl.smpc.answer import Path, Preview
 from uavctl.smpc.plant import AXES, Plant
@@ -63,7 +64,9 @@ class Room:
         """Return why nothing may rest at a place; empty if it may."""
         for axis, lower, upper in zip(self.axes, self.lower, self.upper, strict=True):
             if not lower <= position_m[axis] <= upper:
-                return f"{AXES[axis]} {position_m[axis]:g} m is outside [{lower:.2f}, {upper:.2f}] m, where it may rest"
+                hint = up_hint(AXES[axis], position_m[axis], lower, upper)
+                text = f"{AXES[axis]} {position_m[axis]:g} m is outside [{lower:.2f}, {upper:.2f}] m, where it may rest"
+                return f"{text}; {hint}" if hint else text
         return ""
 
     def at(self, position_m: Vec3) -> Vector:

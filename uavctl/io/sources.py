@@ -13,7 +13,7 @@ from contextlib import ExitStack
 from importlib.util import find_spec
 
 from uavctl.config.connections import camera_scheme, camera_system
-from uavctl.errors import ConnectionSpecError
+from uavctl.errors import ConnectionSpecError, ExtraMissingError
 from uavctl.io.admission import AllowList, Budgets, Rules
 from uavctl.io.base import Base, Connection
 from uavctl.io.camera import ANSWER_S, COUNTS, LARGEST, READY, REFUSED, parse
@@ -126,15 +126,13 @@ def _open_camera(url: str, now: Callable[[], int], rules: Rules) -> Connection:
     """Open a body of a camera system; see `open_source`.
 
     Raises:
-        ConnectionSpecError: the URL, the package, the server or the body is not as it has to be.
+        ConnectionSpecError: the URL, the server or the body is not as it has to be.
+        ExtraMissingError: the camera system's package is not installed.
     """
     place = parse(url)
     system = camera_system(place.system)
-    if system.package and find_spec(system.package) is None:
-        raise ConnectionSpecError(
-            f"connection {url!r} needs the package {system.package}, which is not installed; run: "
-            f"pip install 'uavctl[{system.extra}]'"
-        )
+    if system.package and find_spec(system.package) is None:  # not imported: the camera has a process of its own
+        raise ExtraMissingError(system.package, system.extra)
     try:
         address = socket.gethostbyname(place.host)
     except OSError as error:

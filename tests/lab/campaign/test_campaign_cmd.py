@@ -16,7 +16,7 @@ import pytest
 from campaign_rig import HEAD, controller, table
 from distributed import LocalCluster
 
-from uavctl.cli import campaign as campaign_cmd
+from uavctl.cli import campaign_run
 from uavctl.cli.app import run
 from uavctl.lab.campaign.spec import CHUNK
 
@@ -161,7 +161,7 @@ def test_ctrl_c_before_the_first_run_leaves_nothing_to_go_on_with(
     def interrupted(*arguments: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(campaign_cmd, "cells_of", interrupted)
+    monkeypatch.setattr(campaign_run, "cells_of", interrupted)
     assert run(["campaign", str(spec), "--out", str(tmp_path / "none")]) == 130
     assert "interrupted before the first run" in capsys.readouterr().err and not (tmp_path / "none").exists()
 

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uavctl import __version__
-from uavctl.errors import UavctlError, UsageError
+from uavctl.errors import UavctlError, UsageError, need
 
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 _CONNECT_S = 10.0
@@ -158,13 +158,10 @@ def cluster(address: str) -> Iterator[Cluster]:
     """Return the workers of the Dask scheduler at an address, as many as it has now.
 
     Raises:
-        UsageError: There is no Dask here, no scheduler there, no worker, or one that would fly otherwise.
+        ExtraMissingError: Dask is not installed.
+        UsageError: There is no scheduler there, no worker, or one that would fly otherwise.
     """
-    try:
-        from distributed import Client
-    except ImportError as error:
-        raise UsageError("--dask needs the package distributed; install uavctl[cluster]") from error
-    connect: Callable[..., Any] = Client  # it is typed in part only
+    connect: Callable[..., Any] = need("distributed", "cluster").Client
     try:
         client = connect(address, timeout=_CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:

@@ -1,0 +1,174 @@
+"""Help with the command line: an example for each command, and what a wrong command line should have been."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterable, Iterator, Sequence
+from difflib import get_close_matches
+
+from cyclopts import (
+    App,
+    CycloptsError,
+    MissingArgumentError,
+    UnknownCommandError,
+    UnknownOptionError,
+    UnusedCliTokensError,
+)
+
+from uavctl.config.load import keys_named
+
+MOST_SUGGESTED = 3
+SET = "--set"
+
+# One for each command, by its words; each can be typed as it is, but for the names of files.
+EXAMPLES = {
+    "": "uavctl loopback --config room",
+    "loopback": "uavctl loopback --config room --set link.loss=0.3",
+    "fly": "uavctl fly --config my-room.toml --arm --takeoff 1.2 --goto 1.5,1,-1.2",
+    "fleet": "uavctl fleet check duo.toml",
+    "fleet check": "uavctl fleet check duo.toml",
+    "fleet fly": "uavctl fleet fly duo.toml --arm --takeoff 1.2 --out flights/duo",
+    "fleet status": "uavctl fleet status duo.toml",
+    "fleet land": "uavctl fleet land duo.toml",
+    "sim": "uavctl sim --config room-px4 --autopilot px4 --view",
+    "check": "uavctl check --config my-room.toml --vehicle udpin://0.0.0.0:14540 --move",
+    "design": "uavctl design --config room",
+    "solve": "uavctl solve --config paper --state 35,-2,-20,-4",
+    "identify": "uavctl identify flights/NAME/flight.mcap",
+    "tune": "uavctl tune my-room.toml --folder tuning",
+    "bench": "uavctl bench --config room",
+    "paper": "uavctl paper --runs 200",
+    "campaign": "uavctl campaign docs/campaigns/loss.toml --runs 200",
+    "ctl": "uavctl ctl status",
+    "ctl goto": "uavctl ctl goto 2 1 -1.2",
+    "ctl hold": "uavctl ctl hold",
+    "ctl resume": "uavctl ctl resume",
+    "ctl land": "uavctl ctl land",
+    "ctl engage": "uavctl ctl engage",
+    "ctl status": "uavctl ctl status --json",
+    "key": "uavctl key new my.key",
+    "key new": "uavctl key new my.key",
+    "key show": "uavctl key show my.key",
+    "log": "uavctl log info flights/NAME/flight.mcap",
+    "log replay": "uavctl log replay flights/NAME/flight.mcap",
+    "log report": "uavctl log report flights/NAME/flight.mcap",
+    "log compare": "uavctl log compare flights/A/flight.mcap flights/B/flight.mcap",
+    "log whatif": "uavctl log whatif flights/NAME/flight.mcap --link loss=0.6",
+    "log export": "uavctl log export flights/NAME/flight.mcap --to csv",
+    "log info": "uavctl log info flights/NAME/flight.mcap",
+    "log recover": "uavctl log recover flights/NAME/flight.mcap whole.mcap",
+    "log layout": "uavctl log layout > uavctl.json",
+    "docs": "uavctl docs first-flight",
+}
+
+
+def example(command: str) -> str:
+    """Return the last line of a command's help."""
+    return f"Example: `{EXAMPLES[command]}`"
+
+
+def explain(error: CycloptsError, words: Sequence[str], app: App) -> str:
+    """Return what is wrong with a command line, and what it may have been meant to be."""
+    chain = tuple(error.command_chain or ())
+    if isinstance(error, UnknownOptionError):
+        return _unknown_option(error, words)
+    if isinstance(error, UnknownCommandError) and error.unused_tokens:
+        return unknown_command(error.unused_tokens[0], _command(app, chain), ("uavctl", *chain))
+    if isinstance(error, UnusedCliTokensError) and error.unused_tokens:
+        unused = list(error.unused_tokens)
+        meant = [text for word in unused for text in _as_settings(*_split(word), error)][:MOST_SUGGESTED]
+        hint = f"write {' or '.join(meant)}" if meant else usage_of(app, chain)
+        return f"{' '.join(['uavctl', *chain])} does not understand {_quoted(unused)}; {hint}"
+    if isinstance(error, MissingArgumentError) and error.argument is not None:
+        return f"{_missing(error)}; {usage_of(app, chain)}"
+    return str(error)
+
+
+def unknown_command(word: str, app: App, chain: Iterable[str]) -> str:
+    """Return that there is no such command, with one that is like it, or all of them."""
+    names = [name for name in app if not name.startswith("-")]
+    near = get_close_matches(word, names, 1)
+    did = f' Did you mean "{near[0]}"?' if near else f" Commands are {', '.join(names)}."
+    place = " ".join(chain)
+    return f'Unknown command "{word}".{did}' if place == "uavctl" else f'Unknown command "{word}" of {place}.{did}'
+
+
+def unknown_option(word: str, names: Iterable[str]) -> str:
+    """Return that there is no such option, with those that begin like it, or are like it."""
+    bare = word.lstrip("-").lower()
+    known = {name.lstrip("-").lower(): name for name in names if name.startswith("--")}
+    near = [name for text, name in known.items() if bare and text.startswith(bare)]
+    near = near or [known[text] for text in get_close_matches(bare, known, 1)]
+    did = f" Did you mean {' or '.join(near[:MOST_SUGGESTED])}?" if near else ""
+    return f"Unknown option: {word}.{did}"
+
+
+def _missing(error: MissingArgumentError) -> str:
+    assert error.argument is not None
+    unknown = [word for word in error.unused_tokens or () if word.startswith("--")]
+    if error.keyword or error.argument.tokens:
+        return f"{error.keyword or error.argument.name} needs a value"
+    name = error.argument.name
+    name = name.lstrip("-").upper() if error.argument.field_info.is_positional else name
+    return f"{name} is missing" + (f", and {_quoted(unknown)} is no option" if unknown else "")
+
+
+def usage_of(app: App, chain: Sequence[str]) -> str:
+    """Return the usage of a command in one line."""
+    one = _command(app, chain)
+    from cyclopts.help import format_usage  # draws: not for every command line
+
+    text = one.usage or str(format_usage(app, chain))
+    return f"usage: {text.strip().removeprefix('Usage: ')}"
+
+
+def _command(app: App, chain: Sequence[str]) -> App:
+    for word in chain:
+        app = app[word]
+    return app
+
+
+def _unknown_option(error: UnknownOptionError, words: Sequence[str]) -> str:
+    name, _ = _split(error.token.keyword or error.token.value)
+    place = next(i for i, one in enumerate(words) if _split(one)[0] == name)
+    _, value = _split(words[place])
+    if not value and place + 1 < len(words) and not words[place + 1].startswith("--"):
+        value = words[place + 1]
+    settings = _as_settings(name, value, error)
+    if settings:
+        more = " …" if len(settings) > MOST_SUGGESTED else ""
+        return f"Unknown option: {name}; write {' or '.join(settings[:MOST_SUGGESTED])}{more}"
+    text = unknown_option(name, _options(error))
+    return text if text.endswith("?") else f"{text} See {' '.join(['uavctl', *(error.command_chain or ())])} --help"
+
+
+def _split(word: str) -> tuple[str, str]:
+    name, _, value = word.partition("=")
+    return name, value
+
+
+def _as_settings(name: str, value: str, error: CycloptsError) -> list[str]:
+    """Return `--set KEY=VALUE` for each configuration key with this name, if the command takes them."""
+    if SET not in _options(error):
+        return []
+    given = value or "VALUE"
+    return [f"{SET} {shlex.quote(f'{key}={given}')}" for key in keys_named(name)]
+
+
+def _options(error: CycloptsError) -> list[str]:
+    collection: Iterable[object] = getattr(error, "argument_collection", None) or ()
+    if not collection and error.target is not None and error.app is not None:
+        collection = error.app.assemble_argument_collection()
+    return [name for one in collection for name in getattr(one, "names", ())]
+
+
+def _quoted(words: Iterable[str]) -> str:
+    return ", ".join(f'"{word}"' for word in words)
+
+
+def commands_of(app: App, chain: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], App]]:
+    """Yield every command with its words, the application first."""
+    yield chain, app
+    for name in app:
+        if not name.startswith("-"):
+            yield from commands_of(app[name], (*chain, name))
