@@ -26,7 +26,7 @@ from places import ROOT
 from sim.server import Seat, serve_all
 from uavctl.cli.app import run
 from uavctl.cli.ctl import ask
-from uavctl.cli.fleet import Member, horizontally_apart_m, read_fleet
+from uavctl.cli.fleet import FleetFlight, Member, horizontally_apart_m, read_fleet
 from uavctl.config import load_config
 from uavctl.daemon.control_socket import FOLDER_VARIABLE, ControlRequest
 from uavctl.errors import ConfigError, NotReachedError
@@ -224,3 +224,19 @@ def test_all_land_together_and_have_never_been_near_each_other(how: str) -> None
     flown = [(one.position_m, other.position_m) for one, other in places if one.mode == other.mode == "OFFBOARD"]
     assert len(flown) > 5
     assert min(max(abs(a - b) for a, b in zip(one[:2], other[:2], strict=True)) for one, other in flown) >= SPACING_M
+
+
+def test_a_daemon_that_refuses_to_arm_ends_with_its_own_exit_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not with the interpreter's abort: its standard input stays open, and a thread waits on it."""
+    monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path / "control"))
+    path = tmp_path / "fleet.toml"
+    path.write_text(HEAD + entry("west", WEST, "udpin://127.0.0.1:0", "udpin://127.0.0.1:0", "check.seconds=0.2"))
+    (one,) = read_fleet(path).members
+    flight = FleetFlight(one, ["--arm", "--takeoff", "1.2", "--out", str(tmp_path / "out")])
+    flight.begin()
+    until(lambda: not flight.lasts(), "the end of the daemon")
+    flight.last_words()
+    flight.end()
+    assert flight.exit_code == 1

@@ -16,7 +16,9 @@ from places import ROOT
 from uavctl.build.controller import build_spec
 from uavctl.config import Config, dump_config, explain, load, load_config, parse, presets
 from uavctl.config.document import key_lines
+from uavctl.config.load import parse_recorded
 from uavctl.config.mission import FenceConfig
+from uavctl.config.types import SmpcConfig
 from uavctl.errors import ConfigError, DesignError
 
 PAPER = (ROOT / "uavctl" / "presets" / "paper.toml").read_text(encoding="utf-8")
@@ -310,3 +312,15 @@ def test_a_configuration_cannot_be_changed() -> None:
     config: Config = load_config("paper")
     with pytest.raises(AttributeError):
         config.name = "other"  # type: ignore[misc]  # frozen: that is the point
+
+
+def test_the_default_scheme_is_that_of_the_rooms_and_a_recording_without_the_key_has_the_one_of_before() -> None:
+    text = dump_config(load_config("room-hahn-stursberg"))
+    without = text.replace('scheme = "hahn-stursberg"\n', "")
+    assert without != text
+    assert parse_recorded(without, "flight").config == load_config("room-hahn-stursberg")
+    with pytest.raises(ConfigError) as caught:  # what flew before must not silently fly otherwise
+        parse(without, "mine.toml")
+    assert "smpc.tau" in str(caught.value) and "smpc.scheme" in str(caught.value)
+    (default,) = [field.default for field in msgspec.structs.fields(SmpcConfig) if field.name == "scheme"]
+    assert default == load_config("room").smpc.scheme == "age-conditioned"

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import tomllib
 from copy import deepcopy
+from pathlib import Path
 from typing import Any
 
 import grimp
@@ -81,3 +84,11 @@ def test_an_indirect_import_counts(graph: grimp.ImportGraph) -> None:
     planted.add_import(importer="uavctl.smpc", imported="uavctl.frames")
     planted.add_import(importer="uavctl.frames", imported="socket")
     assert "The control core is pure" in broken(planted)
+
+
+def test_a_folder_of_the_package_s_name_does_not_hide_it(tmp_path: Path) -> None:
+    """As in the folder above a clone: Python would take it for a namespace package where the real one comes later."""
+    (tmp_path / "uavctl" / "docs").mkdir(parents=True)
+    program = "import uavctl; print(uavctl.__file__)"
+    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.stdout.strip() == str(ROOT / "uavctl" / "__init__.py"), done.stderr

@@ -295,10 +295,11 @@ class FleetFlight:
 
     def _say(self) -> None:
         assert self._process is not None and self._process.stderr is not None
-        for line in self._process.stderr:
-            text = line.rstrip()
-            if text and not _HEALTH.match(text):  # of which the table has the newest
-                messages().print(f"{self.member.name}: {text}", soft_wrap=True, highlight=False)
+        with self._process.stderr as lines:
+            for line in lines:
+                text = line.rstrip()
+                if text and not _HEALTH.match(text):  # of which the table has the newest
+                    messages().print(f"{self.member.name}: {text}", soft_wrap=True, highlight=False)
 
 
 def begin_daemon() -> None:
