@@ -123,6 +123,9 @@ class Plan(Record, frozen=True, kw_only=True):
     design_id: str
     gave_way: tuple[GaveWay, ...] = ()
     bias: Vector = ()  # (n_u,), what `states` count on beside `inputs`, in their units
+    # CRC-32 of the exact inputs, states, backoff_x and backoff_u, as doubles row by row; they are rounded here. None:
+    # they are exact
+    exact_crc32: int | None = None
 
 
 class Setpoint(Record, frozen=True, kw_only=True):

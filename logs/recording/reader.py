@@ -19,9 +19,10 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Schema
+from zstandard import ZstdDecompressor, ZstdError, get_frame_parameters
 
 from logs.recording.disk import MAGIC, later_segments
-from logs.recording.segment import CHUNK, CHUNK_FIELDS, INDEX, MESSAGE, ZERO_UTC
+from logs.recording.segment import CHUNK, CHUNK_FIELDS, COMPRESSION, INDEX, MESSAGE, STORED_SIZE, ZERO_UTC
 from logs.recording.topics import (
     END,
     GOES_ON,
@@ -152,6 +153,8 @@ _FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of summary, start of 
 _DATA_END = struct.Struct("<BQI")
 _CHUNK_INDEX = struct.Struct("<BQQQQQ")  # opcode, length, start, end, offset and length of the chunk
 _ATTACHMENT_FIELDS = 36  # bytes besides name, type and data
+_DECOMPRESSOR = ZstdDecompressor()
+_MOST_CHUNK_BYTES = 2**28  # a policy library is the largest message, some ten million bytes
 _IS_INDEX = int(Opcode.MESSAGE_INDEX)  # a plain number: compared for every record
 
 
@@ -360,11 +363,22 @@ def _pair_length(data: Buffer, inner: int, length: int) -> int:
 
 def _chunk(data: Buffer, at: int, length: int) -> bytes:
     """Return the content of the chunk at `at`, if its checksum is right."""
-    _, _, first, last, size, crc, name, inner = CHUNK.unpack_from(data, at)
-    if name != 0 or inner != length - CHUNK.size or size != inner or first > last:
-        raise _BadRecordError("has a damaged head (or is compressed, as no recording of uavctl is)")
-    content = data[at + CHUNK.size : at + length]
-    if zlib.crc32(content) != crc:
+    _, _, first, last, size, crc, name_length = CHUNK.unpack_from(data, at)
+    name_at = at + CHUNK.size
+    begin = name_at + name_length + STORED_SIZE.size
+    if name_length not in (0, len(COMPRESSION)) or begin > at + length or first > last or size > _MOST_CHUNK_BYTES:
+        raise _BadRecordError("has a damaged head")
+    name, (stored,) = data[name_at : name_at + name_length], STORED_SIZE.unpack_from(data, name_at + name_length)
+    if stored != at + length - begin or (size != stored and not name) or name not in (b"", COMPRESSION):
+        raise _BadRecordError("has a damaged head (or a compression that no recording of uavctl has)")
+    content = data[begin : at + length]
+    if name:
+        try:
+            # The frame's own size is what would be allocated.
+            content = _DECOMPRESSOR.decompress(content) if get_frame_parameters(content).content_size == size else b""
+        except ZstdError as error:
+            raise _BadRecordError("cannot be decompressed") from error
+    if len(content) != size or zlib.crc32(content) != crc:
         raise _BadRecordError("has a wrong checksum")
     return content
 

@@ -19,7 +19,7 @@ from pathlib import Path
 import msgspec
 
 from logs.recording.reader import records
-from logs.recording.topics import RecorderNote, alike, decode, raw_link, record_type, says
+from logs.recording.topics import DIGITS, RecorderNote, alike, condense, decode, raw_link, record_type, says
 from uavctl.errors import RecordingError
 from uavctl.loop import ControlLoop
 from uavctl.records import (
@@ -27,6 +27,7 @@ from uavctl.records import (
     Datagram,
     Decision,
     Event,
+    Plan,
     PolicyLibrary,
     PositionSample,
     Record,
@@ -42,6 +43,7 @@ from uavctl.smpc.plant import AXES, Plant
 
 
 DECISION = "/uavctl/decision"
+PLAN = "/uavctl/plan"
 NOTHING = "nothing"
 Leaf = tuple[str, object, object]  # path, recorded, replayed
 
@@ -264,7 +266,7 @@ Labels = frozenset[tuple[str, str]]
 # What a plan says of who made it, which a changed controller need not repeat to decide alike.
 MAKERS: Labels = frozenset({("/uavctl/plan", "design_id"), ("/uavctl/plan", "method")})
 # What turns with the last bit of a number that is the same to within a tolerance: a hash, and whether a limit was met.
-LAST_BITS: Labels = frozenset({("/uavctl/plan", "design_id"), ("/uavctl/setpoint", "limited")})
+LAST_BITS: Labels = frozenset({(PLAN, "design_id"), (PLAN, "exact_crc32"), ("/uavctl/setpoint", "limited")})
 
 
 class ReplayResult(msgspec.Struct, frozen=True, kw_only=True):
@@ -372,11 +374,13 @@ class _Findings:
     def compare(self, topic: str, at_ns: int, recorded: Record | None, replayed: Record | None) -> None:
         """Compare a recorded record with the replayed one; either may be missing."""
         parts: list[Leaf] = []
+        if isinstance(recorded, Plan) and isinstance(replayed, Plan) and recorded.exact_crc32 is not None:
+            replayed = condense(replayed)
         if recorded is not None and replayed is not None and not alike(recorded, replayed):
             parts = [
                 one
                 for one in leaves(recorded, replayed)
-                if (topic, plain(one[0])) not in self.ignored and not close(one[1], one[2], self.tolerance)
+                if (topic, plain(one[0])) not in self.ignored and not close(one[1], one[2], self._tolerance_of(topic))
             ]
         differs = bool(parts) or recorded is None or replayed is None
         if differs:
@@ -391,6 +395,10 @@ class _Findings:
         of_tick = topic == DECISION and self._tick is not None and at_ns == self._tick.at_ns
         if of_tick and self.context is None and self._tick is not None:
             self.context = context(self._tick, *self._before, recorded, replayed)
+
+    def _tolerance_of(self, topic: str) -> float:
+        """Return the tolerance of a topic: two numbers of a plan that are close may be rounded apart."""
+        return max(self.tolerance, 10.0 ** (1 - DIGITS)) if self.tolerance and topic == PLAN else self.tolerance
 
     def _differs(
         self, topic: str, at_ns: int, recorded: Record | None, replayed: Record | None, parts: list[Leaf]

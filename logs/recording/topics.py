@@ -11,12 +11,15 @@ import math
 import re
 import types
 import typing
+import zlib
 from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache
+from itertools import chain, islice
 from typing import cast
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from logs.recording.derived_topics import VIEWS
 from uavctl.errors import RecordingError
@@ -30,6 +33,7 @@ from uavctl.records import (
     Header,
     LinkEstimate,
     LinkStats,
+    Matrix,
     Plan,
     PolicyLibrary,
     Record,
@@ -195,7 +199,11 @@ def _anything(kind: type) -> dict[str, object]:
 # it has any value at all (`Header.design`) they stay strings.
 
 
+Array = NDArray[np.float64]
 _MAX_TIME_NS = 2**64 - 1
+MATRICES = ("inputs", "states", "backoff_x", "backoff_u")  # of a plan, rounded in recordings
+DIGITS = 4  # of them: of 3 m, a millimetre
+_LEAST = 1e-12  # a smaller number is left as it is: its power of ten would not be exact
 _NON_FINITE = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
 
 
@@ -226,6 +234,8 @@ def encode(record: Record) -> bytes:
     if isinstance(record, Datagram):
         return record.data
     try:
+        if isinstance(record, Plan):
+            record = condense(record)
         if not _is_seen_to_be_non_finite(record):
             data = _ENCODER.encode(record)
             # msgspec writes every non-finite float as null: without one, all is said.
@@ -234,6 +244,34 @@ def encode(record: Record) -> bytes:
         return _ENCODER.encode({field: _spelled(getattr(record, field)) for field in record.__struct_fields__})
     except (TypeError, ValueError, NotImplementedError, OverflowError, RecursionError) as error:
         raise EncodingError(f"{type(record).__name__}: {error}") from error
+
+
+def condense(plan: Plan) -> Plan:
+    """Round a plan's matrices as they are recorded, and note the checksum of all their bits; a condensed one stays.
+
+    An exact plan is two thirds of a recording: 1,461 numbers in each step. What flies of it is in the decisions, bit
+    for bit. So four digits are enough for people, and the checksum for a replay.
+    """
+    if plan.exact_crc32 is not None:
+        return plan
+    crc32, rounded = 0, {}
+    for name in MATRICES:
+        matrix: Matrix = getattr(plan, name)
+        exact = np.array([*chain.from_iterable(matrix)], dtype=np.float64)
+        crc32 = zlib.crc32(exact.tobytes(), crc32)
+        numbers = iter(_round(exact).tolist())
+        rounded[name] = tuple(tuple(islice(numbers, len(row))) for row in matrix)
+    return msgspec.structs.replace(plan, exact_crc32=crc32, **rounded)
+
+
+def _round(values: Array) -> Array:
+    """Round to `DIGITS` significant digits; what is zero, too small or not finite stays."""
+    size = np.abs(values)
+    counts = (size > _LEAST) & (size < np.inf)
+    # scale = 10^(digits − 1 − floor(log10 |x|)), rounded = rint(x · scale) / scale
+    digits = DIGITS - 1 - np.floor(np.log10(np.where(counts, size, 1.0)))
+    up, down = 10.0 ** np.maximum(digits, 0.0), 10.0 ** np.maximum(-digits, 0.0)  # exact powers: no digit is added
+    return np.where(counts, np.rint(values / down * up) / up * down, values)
 
 
 def alike(one: Record, other: Record) -> bool:

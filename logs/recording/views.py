@@ -316,8 +316,9 @@ _SPHERES = Many(
 
 STILL_NS = 5_000_000_000  # what does not move is told again: for viewers that come late, and files begun later
 TRAIL_NS = 1_000_000_000
+PLAN_NS = 200_000_000  # between two drawn plans: each has some 10 kB, and five a second look smooth
 TRAIL_S = 20.0
-_TRAIL_POINTS = 200  # at most, however fast positions come
+_TRAIL_POINTS = 100  # at most, however fast positions come
 _Item = tuple[str, Message]
 
 
@@ -330,7 +331,7 @@ class Views:
         self._flown = _Trail()
         self._measured = _Trail()
         self._true_path = False
-        self._still_ns = self._trail_ns = 0
+        self._still_ns = self._trail_ns = self._plan_ns = 0
         self._zero_utc_ns = 0  # stamps, like log times, are so much later than the records' times
 
     def made(self, at_ns: int, record: Record) -> list[tuple[str, bytes]]:
@@ -402,7 +403,8 @@ class Views:
                     self._measured.add(record.at_ns, sample.position_m)
                     captured_utc_ns = sample.captured_ns + self._zero_utc_ns
                     yield topics.MEASURED, pose_in_frame(captured_utc_ns, sample.position_m)
-            case Plan() if record.status is SolveStatus.OPTIMAL:
+            case Plan() if record.status is SolveStatus.OPTIMAL and at_ns >= self._plan_ns:
+                self._plan_ns = at_ns + PLAN_NS
                 places = design.positions_of(record.states)
                 utc_ns = at_ns + self._zero_utc_ns
                 yield topics.PLAN, poses_in_frame(utc_ns, places)

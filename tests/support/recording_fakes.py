@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import errno
 from collections.abc import Callable
+from io import BytesIO
 from pathlib import Path
+
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Chunk
+from mcap.stream_reader import MAGIC_SIZE
+from zstandard import ZstdDecompressor
 
 from logs.recording.disk import DiskFile, OutputFile
 from logs.recording.recorder import SyncRecorder
@@ -23,6 +30,25 @@ HEADER = Header(
     cpu="x86-64",
 )
 Item = tuple[str, int, Record]
+
+
+def stored_byte(path: Path, needle: bytes) -> int:
+    """Offset of a byte in the middle of the stored content of the first chunk that holds `needle`."""
+    data = path.read_bytes()
+    return next(begin + length // 2 for begin, length, content in stored_chunks(data) if needle in content)
+
+
+def stored_chunks(data: bytes) -> list[tuple[int, int, bytes]]:
+    """Offset and length of each chunk's stored content, and that content, by the format's own reader."""
+    found, at = [], MAGIC_SIZE
+    while at + 9 <= len(data) and data[at] != Opcode.DATA_END:
+        length = int.from_bytes(data[at + 1 : at + 9], "little")
+        if data[at] == Opcode.CHUNK:
+            chunk = Chunk.read(ReadDataStream(BytesIO(data[at + 9 : at + 9 + length])))
+            content = ZstdDecompressor().decompress(chunk.data) if chunk.compression else chunk.data
+            found.append((at + 9 + length - len(chunk.data), len(chunk.data), content))
+        at += 9 + length
+    return found
 
 
 def flight(count: int) -> list[Item]:

@@ -42,7 +42,9 @@ from uavctl.config.sim import SimConfig
 class LogConfig(Section, frozen=True, kw_only=True):
     """Recording."""
 
-    chunk_bytes: Annotated[int, Meta(ge=1024, le=16384, description="largest chunk of the recording [bytes]")] = 16384
+    chunk_bytes: Annotated[
+        int, Meta(ge=1024, le=2**20, description="largest chunk of the recording, before it is compressed [bytes]")
+    ] = 131072
     segment_bytes: Annotated[
         int,
         Meta(ge=100_000, le=10**12, description="after about so much the recording goes on in another file [bytes]"),

@@ -10,6 +10,7 @@ from pathlib import Path
 import msgspec
 import pytest
 from loopback_rig import Memory, lockstep, make_loop, shared_loop
+from recording_fakes import stored_chunks
 from report_rig import unpaged
 
 from logs.recording.reader import lacks_end, records, segment_files
@@ -220,7 +221,8 @@ def test_a_hole_in_a_recovered_recording_is_told(
     rotated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     data = bytearray((rotated / "flight.mcap").read_bytes())
-    data[data.index(b"/uavctl/decision", len(data) // 2)] ^= 1
+    holding = [begin for begin, _, content in stored_chunks(bytes(data)) if b"/uavctl/decision" in content]
+    data[holding[len(holding) // 2] + 100] ^= 1
     (tmp_path / "flight.mcap").write_bytes(data)
     for file in segment_files(rotated / "flight.mcap")[1:]:
         (tmp_path / file.name).write_bytes(file.read_bytes())

@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 import pytest
 import view_rig
 from flat_rig import tabulate
-from recording_fakes import record_flight
+from recording_fakes import record_flight, stored_byte
 
 from logs.recording.disk import DiskFile
 from logs.recording.export import TableFormat, export_tables, file_stem
@@ -195,7 +195,7 @@ def test_damage_is_told_before_anything_is_written(tmp_path: Path) -> None:
     path = tmp_path / "flight.mcap"
     record_flight(path, 90)
     data = bytearray(path.read_bytes())
-    data[data.index(b"number 80")] ^= 1
+    data[stored_byte(path, b"number 80")] ^= 1
     path.write_bytes(data)
     with pytest.raises(RecordingError, match="uavctl log recover"):
         export_tables(path, tmp_path / "out", TableFormat.CSV)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from recording_fakes import HEADER, Clock, record_flight, write_two_segments
+from recording_fakes import HEADER, Clock, record_flight, stored_byte, write_two_segments
 from rich.console import Console
 from view_rig import record
 
@@ -84,7 +84,7 @@ def test_damage_is_told_not_raised(tmp_path: Path) -> None:
     path = tmp_path / "flight.mcap"
     record_flight(path, 60)
     data = bytearray(path.read_bytes())
-    data[data.index(b"number 29")] ^= 1
+    data[stored_byte(path, b"number 29")] ^= 1
     path.write_bytes(data)
     found = info(path)
     assert found.finished
@@ -121,7 +121,7 @@ def test_lost_header_is_not_taken_for_an_early_end(tmp_path: Path) -> None:
     path = tmp_path / "flight.mcap"
     record_flight(path, 60)
     data = bytearray(path.read_bytes())
-    data[data.index(b"started_utc")] ^= 1
+    data[stored_byte(path, b"started_utc")] ^= 1
     path.write_bytes(data)
     recover(path, tmp_path / "out.mcap")
     with pytest.raises(RecordingError, match="or that chunk was lost"):

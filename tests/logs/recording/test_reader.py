@@ -3,7 +3,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from recording_fakes import HEADER, Clock, Disk, Item, flight, own, record_flight, write_two_segments
+from recording_fakes import HEADER, Clock, Disk, Item, flight, own, record_flight, stored_byte, write_two_segments
 
 from logs.recording.disk import DiskFile
 from logs.recording.reader import header, read, records, segment_files
@@ -119,7 +119,7 @@ def test_damaged_chunk_is_named_and_refused(tmp_path: Path) -> None:
     path = tmp_path / "flight.mcap"
     record_flight(path, 60)
     data = bytearray(path.read_bytes())
-    at = data.index(b"number 29")
+    at = stored_byte(path, b"number 29")
     data[at] ^= 1
     path.write_bytes(data)
     got: list[Item] = []

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
-from recording_fakes import flight, own, record_flight, write_two_segments
+from recording_fakes import flight, own, record_flight, stored_byte, write_two_segments
 
 from logs.recording.disk import DiskFile
 from logs.recording.info import info
@@ -41,9 +41,7 @@ def test_segments_become_one_file(tmp_path: Path) -> None:
 def test_one_bad_chunk_costs_only_its_messages(tmp_path: Path, number: int) -> None:
     path, out = tmp_path / "flight.mcap", tmp_path / "out.mcap"
     items = record_flight(path, 60)
-    data = path.read_bytes()
-    at = data.index(b"started_utc") if number == 0 else data.index(f"number {number}".encode())
-    flip(path, at)
+    flip(path, stored_byte(path, b"started_utc" if number == 0 else f"number {number}".encode()))
     result = recover(path, out)
     got = own(list(read(out)))
     lost = [item for item in items if item not in got]
@@ -80,7 +78,7 @@ def test_torn_end_counts_as_loss(tmp_path: Path) -> None:
     path, out = tmp_path / "flight.mcap", tmp_path / "out.mcap"
     record_flight(path, 30)
     data = path.read_bytes()
-    path.write_bytes(data[: data.index(b"number 20")])
+    path.write_bytes(data[: stored_byte(path, b"number 20")])
     result = recover(path, out)
     assert (result.finished, result.lossless, result.chunks_bad) == (False, False, 1)
     assert 0 < result.lost_bytes < 1100

@@ -14,7 +14,7 @@ from view_rig import flown
 
 from logs.recording.derived_topics import VIEWS
 from logs.recording.design_view import DesignView, design_view
-from logs.recording.views import STD_95, STILL_NS, Views, plan_scene, room_scene
+from logs.recording.views import PLAN_NS, STD_95, STILL_NS, Views, plan_scene, room_scene
 from uavctl.errors import RecordingError
 from uavctl.frames import Frame, rotate
 from uavctl.records import (
@@ -79,6 +79,16 @@ def test_each_topic_has_as_many_messages_as_its_records(found: Found) -> None:
     assert counts["/view/scene/link"] == len(boundaries) >= counts["/view/target"] > 20
     assert counts["/view/log"] == len(memory.of(Event))
     assert all(counts.values())
+
+
+def test_plans_that_come_quickly_are_not_all_drawn() -> None:
+    header, plan = flown().of(Header)[0], next(p for p in flown().of(Plan) if p.status is SolveStatus.OPTIMAL)
+    maker = Views()
+    maker.made(0, header)
+    times_ns = [n * 50_000_000 for n in range(40)]
+    drawn_ns = [at for at in times_ns if any(topic == "/view/scene/plan" for topic, _ in maker.made(at, plan))]
+    assert min(later - one for one, later in pairwise(drawn_ns)) == PLAN_NS
+    assert len(drawn_ns) == 10
 
 
 def test_positions_are_those_of_the_records(found: Found, design: DesignView) -> None:
