@@ -19,7 +19,7 @@ from uavctl.config.types import OF_HAHN_STURSBERG, Config
 from uavctl.lab.campaign.spec import CampaignSpec
 from uavctl.lab.campaign.trials import TrialSpec
 from uavctl.mavlink.handover_states import TRANSITIONS, HandoverEvent, HandoverState
-from uavctl.mavlink.profile import PROFILES
+from uavctl.mavlink.profile import PROFILES, ModeChoice
 from uavctl.records import Record
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -194,12 +194,20 @@ in `RETURNING`.
   of its lock ([operation.md](operation.md#how-it-ends)).
 * `refused`: the vehicle said no for good, or did not do it within the tries and times of `[hand_over]`
   (configuration.md). Its own reason (COMMAND_ACK, STATUSTEXT) is in the event `refused`, and ends the program with 1.
-* `failsafe`: the vehicle itself says that a failsafe acts (system status CRITICAL, or "failsafe" in a text), and is in
-  a mode that failsafes choose ({_failsafe_modes()}).
-  Any other mode is the pilot's, and so are these without such a word. On a flight that began with `--arm` it is waited
-  for: PX4 takes its climb up again by itself, and so does the hand-over, all within `climb_s`. A failsafe that lands
-  has `land_s`; one that hovers, or that has ended an engaged flight, is ended by our landing after `climb_s`, unless
-  `ctl engage` comes first. A flight that the pilot began is released.
+* `failsafe`: the vehicle itself says that a failsafe or a fence of its own acts (system status CRITICAL; "failsafe" or
+  "fence breached" in a text of any severity; FENCE_STATUS, SYS_STATUS), and is in a mode that these choose
+  ({_modes(ModeChoice.EITHER)}), or in one that nothing else chooses
+  ({_modes(ModeChoice.FAILSAFE)}).
+  On a flight that began with `--arm` it is waited for: PX4 takes its climb up again by itself, and so does the
+  hand-over, all within `climb_s`. A failsafe that lands has `land_s`; one that hovers, or that has ended an engaged
+  flight, is ended by our landing after `climb_s`, unless `ctl engage` comes first. A flight that the pilot began is
+  released.
+* `other`: a person has it. A stick or switch of the remote control has moved at the time (RC_CHANNELS, by a tenth of
+  its way); or a ground station has ordered a mode; or a remote control is heard, and only a person chooses this mode.
+  What the vehicle says of a failsafe explains such a mode too, if nobody's stick has moved ({_degrades()}):
+  then the exit code is 1, and nothing is sent.
+* `unclear`: none of these shows who it was. Nothing is sent, and word of it may still come. What we took off, and
+  flies by itself in the air, is asked to land after `climb_s`, unless a stick moves. The exit code is 1.
 * `unsafe`: on the way up the positions cannot be the vehicle's own (they jump, or contradict what it feels or its own
   velocity), or are beyond the limits of `[sets]` by more than `envelope.outside_m`, or none has come for a horizon. The
   climb is broken off and the vehicle asked to land. Positions further off what it feels than noise explains are not
@@ -219,9 +227,17 @@ in `RETURNING`.
 """
 
 
-def _failsafe_modes() -> str:
-    """The modes that failsafes choose, by autopilot."""
-    return "; ".join(f"{name}: {', '.join(sorted(profile.failsafes))}" for name, profile in PROFILES.items())
+def _modes(choice: ModeChoice) -> str:
+    """The modes that such a one can have chosen, by autopilot."""
+    chosen = {
+        name: sorted(mode for mode, by in profile.choices.items() if by is choice) for name, profile in PROFILES.items()
+    }
+    return "; ".join(f"{name}: {', '.join(modes)}" for name, modes in chosen.items())
+
+
+def _degrades() -> str:
+    """The modes of a person that a failsafe chooses as well, by autopilot."""
+    return "; ".join(f"{name}: {', '.join(sorted(profile.degrades))}" for name, profile in PROFILES.items())
 
 
 def drawing() -> str:

@@ -418,7 +418,9 @@ class ControlLoop:
         self._inbox, self._inertial = waiting, tuple(felt[-MAX_INERTIAL:])
         flown = self._hand_over.state is HandoverState.ENGAGED
         left = [status for status in heard if flown and self._hand_over.has_left(status)]
-        self._vehicle = next(iter(left or heard[::-1]), self._vehicle)
+        # Of the mode that it left for the newest word counts: it may say who has chosen it.
+        left = [status for status in left if status.mode == left[0].mode]
+        self._vehicle = next(iter((left or heard)[::-1]), self._vehicle)
         if heard and self._unsure_since_ns is not None and heard[-1].at_ns > self._unsure_since_ns:
             self._unsure_since_ns = None
         return _newest_of_each(samples), tuple(heard), tuple(words)

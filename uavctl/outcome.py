@@ -15,6 +15,7 @@ from uavctl.mavlink.handover import Passage
 from uavctl.mavlink.handover_guards import BROKEN_OFF, fails, silent
 from uavctl.mavlink.handover_states import HandoverEvent, HandoverState
 from uavctl.mavlink.requests import RequestKind
+from uavctl.mavlink.switcher import PERSONS, Switcher
 from uavctl.records import ORDER_ACCEPTED, ControlMode, Decision, Ending, Event, Order, VehicleStatus
 
 SECOND_NS = 1_000_000_000
@@ -30,6 +31,8 @@ class Cause(StrEnum):
     IN_FLIGHT = "still flying"  # a simulated flight that was to end in the air, or a recording that says no more
     PILOT = "the pilot has taken over"
     PILOT_LANDED = "landed by the pilot"
+    GROUND_STATION = "a ground station has taken over"
+    UNKNOWN_SWITCH = "the mode was changed, and it is not known by whom"
     NOT_FLOWN = "nothing was flown"
     NO_VEHICLE = "no vehicle was heard"
     NO_POSITIONS = "no positions came"
@@ -49,6 +52,8 @@ class Cause(StrEnum):
     LET_GO = "let go by the envelope"
     FAILSAFE = "a failsafe of the vehicle's own took over"
     FAILSAFE_LANDED = "landed by a failsafe of the vehicle's own"
+    FENCE = "a fence of the vehicle's own took over"
+    FENCE_LANDED = "landed by a fence of the vehicle's own"
     RESTARTED = "the vehicle has started anew"
     SILENT = "the vehicle fell silent"
     DISARMED = "the vehicle disarmed in flight"
@@ -61,16 +66,26 @@ class Cause(StrEnum):
     WAITING = "waiting"  # by an older recording, which does not say for what
 
 
-# Ends that somebody wanted: the operator, the mission, or the pilot.
-WANTED = frozenset(
-    {Cause.MISSION, Cause.ORDERED, Cause.OPERATOR, Cause.TIME, Cause.IN_FLIGHT, Cause.PILOT, Cause.PILOT_LANDED}
-)
+# Ends that a person wanted who has the vehicle since
+TAKEN = frozenset({Cause.PILOT, Cause.PILOT_LANDED, Cause.GROUND_STATION})
+# Ends that somebody wanted: the operator, the mission, or whoever has taken over.
+WANTED = TAKEN | {Cause.MISSION, Cause.ORDERED, Cause.OPERATOR, Cause.TIME, Cause.IN_FLIGHT}
+_SWITCHED = {
+    Switcher.PILOT: Cause.PILOT,
+    Switcher.GROUND_STATION: Cause.GROUND_STATION,
+    Switcher.FAILSAFE: Cause.FAILSAFE,
+    Switcher.FENCE: Cause.FENCE,
+    Switcher.UNKNOWN: Cause.UNKNOWN_SWITCH,
+}
+_LANDED = {Cause.PILOT: Cause.PILOT_LANDED, Cause.FAILSAFE: Cause.FAILSAFE_LANDED, Cause.FENCE: Cause.FENCE_LANDED}
+_OWN = frozenset({Cause.FAILSAFE, Cause.FENCE})
 _BEFORE = "before the controller was in charge"
 _REFUSED = {
     HandoverState.MODE: Cause.NO_MODE,
     HandoverState.ARMING: Cause.NOT_ARMED,
     HandoverState.ENGAGING: Cause.NOT_GRANTED,
     HandoverState.FAILSAFE: Cause.FAILSAFE,
+    HandoverState.UNCLEAR: Cause.UNKNOWN_SWITCH,
     HandoverState.LANDING: Cause.LANDING_FAILED,
     HandoverState.SETTLING: Cause.LANDING_FAILED,
 }
@@ -120,7 +135,7 @@ class FlightCourse:
     _failsafes: int = 0  # number of failsafes that have ended by themselves
     _armed: bool = False  # it has been armed
     _aloft: bool = False  # it has been in the air, as far as it tells
-    _taken: bool = False  # the pilot has taken over
+    _taken: Cause | None = None  # who has changed the mode to one that is none of ours, if that is not the cause
     _fails: bool = False  # it landed by a failsafe of its own while, or after, it was asked to
     _vehicle: VehicleStatus | None = None
     _positions: bool = False  # there has been an estimate
@@ -175,8 +190,8 @@ class FlightCourse:
         if one.after is HandoverState.ENGAGED or (
             one.before is HandoverState.FAILSAFE and one.after is HandoverState.CLIMBING
         ):
-            self._failsafes += self._found is Cause.FAILSAFE
-            self._found, self._why, self._taken = None, "", False
+            self._failsafes += self._found in _OWN
+            self._found, self._why, self._taken = None, "", None
         self.engaged = self.engaged or one.after is HandoverState.ENGAGED
         if one.seen is HandoverEvent.REBOOT:
             self._find(Cause.RESTARTED, "")
@@ -186,18 +201,22 @@ class FlightCourse:
             self._find(Cause.BROKEN_OFF, _reason(one))
         elif one.seen is HandoverEvent.LEFT:
             self._find(Cause.LEFT, "")
-        elif one.after is HandoverState.FAILSAFE:
-            self._find(Cause.FAILSAFE, _mode(vehicle))
+        elif one.who is not None:
+            self._switch(one.who, vehicle)
         elif one.seen is HandoverEvent.DISARMED:
             self._disarm(one)
-        elif one.after is HandoverState.RELEASED and one.before is not HandoverState.RETURNING:
-            own = one.before is HandoverState.ENGAGED and vehicle is not None and fails(vehicle)
-            if not own and (self._found is Cause.FAILSAFE or self._found in WANTED):
-                self._found = None  # the landing that was asked for does not come
-            self._taken = not own
-            self._find(Cause.FAILSAFE if own else Cause.PILOT, _mode(vehicle) if own else "")
         elif one.seen is HandoverEvent.LAND and self._stop is None and not self.engaged and self._found is None:
             self._asked = Cause.ORDERED
+
+    def _switch(self, who: Switcher, vehicle: VehicleStatus | None) -> None:
+        """Note that somebody has changed the mode to one that is none of ours; the newest word of it counts."""
+        cause = _SWITCHED[who]
+        before = self._found
+        if before is Cause.UNKNOWN_SWITCH or before in WANTED or (who in PERSONS and before in _OWN):
+            self._found = None  # it is known now; or the landing that was asked for does not come
+        self._taken = cause
+        said = "" if vehicle is None or not vehicle.said else f', "{vehicle.said}"'
+        self._find(cause, "" if cause in TAKEN else f"{_mode(vehicle)}{said}")
 
     def ending(self, *, over: bool | None = None) -> Ending:
         """Return how it ended, or would end now; `over`: nothing more was to be sent, if that is known better."""
@@ -212,12 +231,12 @@ class FlightCourse:
         early = cause in WANTED and ((self.takes_off and not self.engaged) or not self.flown)
         if self._failed and cause is not Cause.LANDING_FAILED:
             what += f"; landing has failed: {self._failed}"
-        if self._failsafes and cause is not Cause.FAILSAFE:
+        if self._failsafes and cause not in _OWN:
             what += "; a failsafe of the vehicle's own had acted and ended"
-        elif self._fails and cause in WANTED:
+        elif self._fails and self._taken is None and cause not in _OWN:
             what += "; a failsafe of the vehicle's own acted in the landing"
-        if self._taken and cause not in (Cause.PILOT, Cause.PILOT_LANDED):
-            what += "; the pilot has taken over"
+        if self._taken is not None and cause not in (self._taken, _LANDED.get(self._taken)):
+            what += f"; {self._taken.value}"
         text = f"{what}{f', {_BEFORE}' if early else ''}{f'; {where}' if where else ''}"
         good = cause in WANTED and not (early or missed or self._failed)
         return make_ending(cause, text, as_ordered=good, exit_code=128 + self._signal if self._signal else None)
@@ -248,7 +267,8 @@ class FlightCourse:
                 self._find(Cause.SILENT, "")
             self._failed = _reason(one)
         elif cause is Cause.FAILSAFE:
-            self._found, self._why = cause, _reason(one)
+            self._found = self._found if self._found in _OWN else cause
+            self._why = _reason(one)
         else:
             self._find(cause, "" if cause is Cause.NO_VEHICLE else _reason(one))
 
@@ -264,10 +284,8 @@ class FlightCourse:
     def _disarm(self, one: Passage) -> None:
         if one.before in (HandoverState.CLIMBING, HandoverState.ENGAGING, HandoverState.ENGAGED):
             self._find(Cause.DISARMED if self._aloft else Cause.NOT_RISEN, "")
-        elif one.before is HandoverState.RELEASED and self._found is Cause.PILOT and self._aloft:
-            self._found, self._why = Cause.PILOT_LANDED, ""
-        elif one.before in (HandoverState.FAILSAFE, HandoverState.RELEASED) and self._found is Cause.FAILSAFE:
-            self._found = Cause.FAILSAFE_LANDED
+        elif one.before not in _COMES_DOWN and self._found is not None and (self._aloft or self._found in _OWN):
+            self._found = _LANDED.get(self._found, self._found)
 
     def _told(self, over: bool) -> tuple[Cause, str]:
         """Return the cause that counts most, and the reason behind it."""
@@ -284,7 +302,7 @@ class FlightCourse:
         wanted = self._found is None or self._found in WANTED
         if self._failed and (wanted or self._found is Cause.FALLBACK):
             return Cause.LANDING_FAILED, self._failed
-        if self._found is not None and (not wanted or self._found in (Cause.PILOT, Cause.PILOT_LANDED)):
+        if self._found is not None and (not wanted or self._found in TAKEN):
             return self._found, self._why
         return self._wished(over)
 
@@ -339,6 +357,7 @@ def _reason(one: Passage) -> str:
         BROKEN_OFF,
         "another vehicle is heard on this link: ",
         "the vehicle's own failsafe ",
+        "the vehicle's own fence ",
     ):
         text = text.removeprefix(said)
     if one.ask is None and text.startswith("("):  # the failsafe's mode

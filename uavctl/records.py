@@ -177,6 +177,11 @@ class VehicleStatus(Record, frozen=True, kw_only=True):
     own_climb: bool = False  # it climbs, or lands, by itself, whatever it is sent
     alone: bool = True  # no other vehicle has been heard lately
     failsafe: bool = False  # it says that a failsafe of its own acts
+    fence: bool = False  # it said within the last seconds that it had come beyond a fence of its own
+    said: str = ""  # text in which it said so of a failsafe or a fence, within the last seconds
+    stick: bool = False  # a stick or switch of its remote control has moved within the last seconds
+    radio: bool = False  # it hears a remote control
+    station: int = 0  # system id of whom else it took an order for a mode from, within the last seconds; 0: nobody
 
 
 class VehicleMotion(Record, frozen=True, kw_only=True):

@@ -329,7 +329,7 @@ class Autopilot:
         errors = ERRORS[kind.name].scaled(config.sim.inertial.errors)
         self.inertial = InertialSensors(errors, craft, seed, flown=config.sim.inertial.flown)
         parts = self.pilot, self.estimator, self.inertial, self.parameters
-        whole = TelemetrySources(kind, craft, *parts, origin, boot_ns, radio, config.sim.streams)
+        whole = TelemetrySources(kind, craft, *parts, origin, boot_ns, config.sim.streams)
         self.telemetry = Telemetry(whole, start_ns)
         self._commands = Commands(whole, self.telemetry, self._send)
         self._files = Files(self.parameters, packs=kind.name == "ardupilot")

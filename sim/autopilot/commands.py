@@ -74,7 +74,7 @@ class Commands:
         if not base & CUSTOM_MODE_FLAG:
             return UNSUPPORTED
         mode: Mode | None = self._v.kind.by_number(custom)
-        return self._v.kind.unknown_mode if mode is None else self._v.pilot.change(mode, at_ns)
+        return self._v.kind.unknown_mode if mode is None else self._v.pilot.change(mode, at_ns, ordered=True)
 
     def _arm_disarm(self, request: CommandRequest, at_ns: int) -> int:
         if request.params[0] == 1.0:
@@ -92,7 +92,7 @@ class Commands:
     def _land(self, _request: CommandRequest, at_ns: int) -> int:
         if self._v.kind.name == "px4":
             self._v.pilot.texts.append((INFO, "Landing at current position"))
-        return self._v.pilot.change(self._v.kind.by_role(Role.LAND), at_ns)
+        return self._v.pilot.change(self._v.kind.by_role(Role.LAND), at_ns, ordered=True)
 
     def _take_off(self, request: CommandRequest, at_ns: int) -> int:
         """Take off: to an altitude above the sea, else its own height (PX4), or a height above home (ArduPilot)."""

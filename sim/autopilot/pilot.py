@@ -143,6 +143,7 @@ PASSING = frozenset({Role.TAKEOFF, Role.LAND})  # modes that end by themselves
 LANDS = 4  # COM_OBL_RC_ACT; less leaves it to the stick
 CRASHED = "CRASHED"
 CRITICAL, WARNING, INFO = 2, 4, 6  # MAV_SEVERITY
+SWITCH_US, SWITCH_STEP_US = 1000, 120  # of the switch of modes: before it was moved, and from mode to mode
 FORCED = 21196.0  # param2 of arming that skips the checks
 
 
@@ -165,6 +166,8 @@ class Pilot:
         texts: (severity, text) of what is to be said, in order; the caller empties it.
         crashed: why the autopilot's program died, None while it lives.
         failsafe: whether a failsafe chose the mode.
+        radio: whether it hears a remote control.
+        switch_us: where that one's switch of modes stands [µs].
         helm: knows which setpoint is flown.
         setpoint_ns: when the last setpoint that counts came [ns], None before the first.
         home_m: where it was armed last, local NED.
@@ -187,7 +190,8 @@ class Pilot:
         self._parameters = parameters
         self._estimator = estimator
         self._boot_ns = boot_ns
-        self._radio = radio
+        self.radio = radio
+        self.switch_us = SWITCH_US
         self._watch_ns = craft.now_ns
         self._phase_end_ns: int | None = None  # end of a timed climb or descent, or of the wait for disarming
         self._disarm_text = kind.preflight_text
@@ -222,7 +226,7 @@ class Pilot:
         if last_ns is None or not self.external:
             return None
         if self._kind.name == "px4":
-            if self._parameters["COM_OBL_RC_ACT"] < LANDS and not self._radio:  # seen to go on as if nothing were
+            if self._parameters["COM_OBL_RC_ACT"] < LANDS and not self.radio:  # seen to go on as if nothing were
                 return None
         elif self.helm.obeyed is None or self.helm.obeyed.ask is SetpointKind.POSITION:  # a position is kept
             return None
@@ -329,8 +333,14 @@ class Pilot:
             return FAILED
         return ACCEPTED
 
-    def change(self, mode: Mode, at_ns: int) -> int:
-        """Change the mode; PX4's OFFBOARD needs a stream of setpoints before, and most modes a position."""
+    def change(self, mode: Mode, at_ns: int, *, ordered: bool = False) -> int:
+        """Change the mode; PX4's OFFBOARD needs a stream of setpoints before, and most modes a position.
+
+        Args:
+            ordered: by a command; else the pilot's switch moves.
+        """
+        if not ordered:
+            self.radio, self.switch_us = True, SWITCH_US + SWITCH_STEP_US * (1 + self._kind.modes.index(mode))
         px4 = self._kind.name == "px4"
         if mode.needs_position and not self._estimator.position_ok and (self.armed or not px4):
             what = "switching to this mode is currently not available" if px4 else f"{mode.name} requires position"

@@ -298,6 +298,8 @@ PX4 = SimulatedProfile(
         Mode("AUTO.TAKEOFF", px4_custom(4, 2), 29, Role.TAKEOFF),
         Mode("AUTO.LAND", px4_custom(4, 6), 29, Role.LAND, needs_position=False),
         Mode("POSCTL", px4_custom(3, 0), 81, Role.HOLD),
+        Mode("AUTO.RTL", px4_custom(4, 5), 29, Role.LAND),  # its home is below: it goes down where it is
+        Mode("AUTO.DESCEND", px4_custom(4, 20), 29, Role.LAND, needs_position=False),
     ),
     ground="AUTO.LOITER",
     frames=frozenset({1, 8}),
@@ -336,6 +338,7 @@ ARDUPILOT = SimulatedProfile(
         Mode("LAND", 9, 89, Role.LAND, needs_position=False),
         Mode("BRAKE", 17, 89, Role.HOLD),
         Mode("STABILIZE", 0, 81, Role.HOLD, needs_position=False),
+        Mode("RTL", 6, 89, Role.LAND),  # its home is below: it goes down where it is
     ),
     ground="STABILIZE",
     frames=frozenset({1, 7, 8, 9}),

@@ -204,7 +204,6 @@ class TelemetrySources:
     parameters: Parameters
     origin: GeodeticOrigin
     boot_ns: int
-    radio: bool  # whether there is a stick
     streams: str  # `sim.streams`
 
 
@@ -318,7 +317,7 @@ class Telemetry:
         estimator = v.estimator
         present = GYRO | ACCEL | MAG | BARO | CONTROL | AHRS | BATTERY | PREARM
         present |= (GPS if estimator.uses_gps else 0) | (VISION if estimator.uses_external else 0)
-        present |= RADIO if v.radio else 0
+        present |= RADIO if v.pilot.radio else 0
         healthy = present & ~(AHRS | VISION | PREARM)
         if estimator.position_ok:
             healthy |= present & (AHRS | VISION)
@@ -421,11 +420,12 @@ class Telemetry:
         return mavlink.MAVLink_home_position_message(*place, *home, level, 0.0, 0.0, 0.0, self._boot_us(at_ns))
 
     def _radio(self, at_ns: int) -> Message | None:
-        """Return RC_CHANNELS with the stick at rest; nothing without a remote control."""
-        if not self._v.radio:
+        """Return RC_CHANNELS with the stick at rest, and the switch of modes; nothing without a remote control."""
+        if not self._v.pilot.radio:
             return None
-        channels = *STICK_US, *([NO_CHANNEL] * (18 - len(STICK_US)))
-        return mavlink.MAVLink_rc_channels_message(self._boot_ms(at_ns), len(STICK_US), *channels, FULL_SIGNAL)
+        used = *STICK_US, self._v.pilot.switch_us
+        channels = *used, *([NO_CHANNEL] * (18 - len(used)))
+        return mavlink.MAVLink_rc_channels_message(self._boot_ms(at_ns), len(used), *channels, FULL_SIGNAL)
 
     def _hud(self, _at_ns: int) -> Message:
         v = self._v

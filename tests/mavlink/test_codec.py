@@ -143,9 +143,12 @@ VEHICLE = Peer(1, 1)
         (VEHICLE.send("extended_sys_state", 0, 0), Landed(system=1, component=1, landed=None)),
         (
             VEHICLE.send("sys_status", 0, 0, 0, 0, 12_600, 0, 0, 0, 0, 0, 0, 0, 0),
-            Battery(system=1, component=1, voltage_v=12.6),
+            Battery(system=1, component=1, voltage_v=12.6, radio=False),
         ),
-        (VEHICLE.send("sys_status", 0, 0, 0, 0, 65_535, 0, 0, 0, 0, 0, 0, 0, 0), None),
+        (
+            VEHICLE.send("sys_status", 0, 1 << 16 | 1 << 20, 1 << 16, 0, 65_535, 0, 0, 0, 0, 0, 0, 0, 0),
+            Battery(system=1, component=1, voltage_v=None, radio=True, fenced=False),
+        ),
         (
             VEHICLE.send("battery_status", 0, 0, 0, 0, [4_000, 4_100] + [65_535] * 8, 0, 0, 0, 0),
             Battery(system=1, component=1, voltage_v=8.1),

@@ -49,11 +49,11 @@ def test_a_failsafe_that_ends_on_the_way_up_is_waited_for_and_the_climb_goes_on(
 @pytest.mark.parametrize(
     ("mode", "failsafe"), [("AUTO.LAND", False), ("AUTO.RTL", False), ("POSCTL", True), ("MANUAL", True)]
 )
-def test_without_its_word_or_in_a_mode_that_failsafes_do_not_choose_it_is_the_pilot(
+def test_with_his_switch_or_in_a_mode_that_a_person_flies_it_is_not_waited_for(
     state: HandoverState, mode: str, failsafe: bool
 ) -> None:
     rig = Rig().to(state)
-    rig.be(mode=mode, failsafe=failsafe)
+    rig.be(mode=mode, failsafe=failsafe, stick=not failsafe)
     assert rig.tick().sending is NOTHING and rig.is_in(HandoverState.RELEASED)
     rig.be(mode="AUTO.TAKEOFF", failsafe=False)
     rig.run(60.0)

@@ -105,7 +105,7 @@ def test_a_mode_that_was_granted_and_is_not_there_is_not_asked_for_over_the_pilo
 @pytest.mark.fault(68)
 def test_px4_s_hold_while_it_stands_armed_is_the_pilot_s() -> None:
     rig = Rig("px4").to(HandoverState.CLIMBING)
-    rig.be(mode="AUTO.LOITER")
+    rig.be(mode="AUTO.LOITER", stick=True)
     rig.tick()
     assert rig.is_in(HandoverState.RELEASED)
 
@@ -123,7 +123,7 @@ def test_the_pilot_s_mode_before_arming_ends_the_take_off_on_the_ground(autopilo
 @pytest.mark.fault(68)
 def test_px4_s_hold_on_the_ground_is_no_end_of_a_climb() -> None:
     rig = Rig().to(HandoverState.ARMING)
-    rig.be(mode="AUTO.LOITER")
+    rig.be(mode="AUTO.LOITER", stick=True)
     rig.tick()
     assert rig.is_in(HandoverState.RELEASED)
     rig.be(armed=True)
@@ -166,7 +166,7 @@ def test_an_end_that_comes_with_the_pilot_s_switch_asks_for_nothing(
     assert rig.is_in(state)
     rig.run(0.5)
     asked = len(rig.asked)
-    rig.be(mode=mode)
+    rig.be(mode=mode, stick=True)
     if end == "controller":
         rig.tick(land=True, ready=False)
     elif end == "time":

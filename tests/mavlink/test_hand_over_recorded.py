@@ -19,10 +19,12 @@ from uavctl.mavlink.handover_guards import HandoverView
 from uavctl.mavlink.handover_states import HandoverState, Sending
 from uavctl.mavlink.messages import Ack, Text
 from uavctl.mavlink.requests import RequestKind
-from uavctl.records import Command, Event, Order, PositionSample, VehicleStatus
+from uavctl.mavlink.switcher import Switcher
+from uavctl.outcome import Cause, FlightCourse
+from uavctl.records import Command, Ending, Event, Order, PositionSample, VehicleStatus
 
 CLIENT, TICK_NS = 255, 50_000_000
-SET_MODE = 176
+SET_MODE, LAND = 176, 21
 
 
 @dataclass
@@ -32,6 +34,8 @@ class Flown:
     states: list[tuple[HandoverState, float]] = field(default_factory=list)
     asked: list[tuple[RequestKind, float]] = field(default_factory=list)
     sent: list[tuple[Sending, float]] = field(default_factory=list)
+    who: list[Switcher] = field(default_factory=list)  # has changed the mode to one that is none of ours
+    ending: Ending | None = None
 
     def at(self, state: HandoverState, number: int = 0) -> float:
         return [time_s for one, time_s in self.states if one is state][number]
@@ -54,7 +58,7 @@ def fly(
         source=SourceConfig(messages=("LOCAL_POSITION_NED",)),
         estimator=EstimatorConfig(position_std_m=0.005),
     )
-    hand_over, flown = HandOver(config), Flown()
+    hand_over, flown, course = HandOver(config), Flown(), FlightCourse(takes_off=True, flown=True)
     vehicle: VehicleStatus | None = None
     where: PositionSample | None = None
     heard: list[Ack | Text] = []
@@ -85,6 +89,10 @@ def fly(
             )
             heard.clear()
             wanted.clear()
+            course.see(tick_ns, vehicle)
+            if told.passage is not None:
+                course.turn(told.passage, vehicle)
+                flown.who += [] if told.passage.who is None else [told.passage.who]
             if hand_over.state is not state:
                 state = hand_over.state
                 flown.states.append((state, boot_s))
@@ -94,7 +102,7 @@ def fly(
                 flown.sent.append((told.sending, boot_s))
         (message,) = read(data)
         if message.get_srcSystem() == client:
-            if message.get_type() == "COMMAND_LONG" and message.command == SET_MODE:
+            if message.get_type() == "COMMAND_LONG" and message.command in (SET_MODE, LAND):
                 order = orders.get((message.param2, message.param3, round((at_ns - booted_ns) * 1e-9)), "")
                 order = order or orders.get((message.param2, message.param3, 0.0), "")
                 wanted += [order] if order else []
@@ -111,6 +119,7 @@ def fly(
                     heard.append(item)
                 case Event():
                     pass
+    flown.ending = course.ending(over=True)
     return flown
 
 
@@ -233,3 +242,37 @@ def test_px4_whose_checks_come_and_go_is_asked_to_arm_again() -> None:
     flown = fly("px4-flickering-checks.tlog", 1.2, orders, HandOverConfig(retry_s=1.0), client=245)
     assert [state for state, _ in flown.states] == [R, M, A]
     assert [ask for ask, _ in flown.asked] == [RequestKind.TAKE_OFF_MODE, RequestKind.ARM, RequestKind.ARM]
+
+
+@pytest.mark.fault(28, 61)
+def test_arducopter_s_own_fence_is_not_the_pilot() -> None:
+    """Its heartbeat says ACTIVE, and its text is a mere notice; two seconds later its estimator fails, too."""
+    flown = fly("arducopter-fence.tlog", 1.2, {(4.0, 0.0, 0.0): "take off"}, HandOverConfig(), client=245)
+    assert [state for state, _ in flown.states] == [R, M, A, C, G, E, HandoverState.FAILSAFE]
+    assert flown.who[-1] is Switcher.FENCE
+    assert flown.ending is not None and (flown.ending.cause, flown.ending.exit_code) == (Cause.FENCE, 1)
+    assert "Max Alt fence breached" in flown.ending.sentence
+    assert RequestKind.LAND not in [ask for ask, _ in flown.asked]
+
+
+@pytest.mark.fault(28, 61)
+@pytest.mark.parametrize("asks", [True, False])
+def test_px4_s_descend_is_its_failsafe(asks: bool) -> None:
+    """Landing was asked for just before; without that it is the first that is seen of its failsafe. It ends armed."""
+    orders = {(4.0, 2.0, 0.0): "take off"} | ({(0.0, 0.0, 0.0): "land"} if asks else {})
+    flown = fly("px4-descend.tlog", 1.2, orders, HandOverConfig(engage_s=30.0), client=245)
+    down = HandoverState.LANDING if asks else HandoverState.FAILSAFE
+    assert [state for state, _ in flown.states] == [R, M, A, C, G, E, down]
+    assert flown.who == ([] if asks else [Switcher.FAILSAFE])
+    landings = [ask for ask, _ in flown.asked if ask is RequestKind.LAND]
+    assert len(landings) > 1 if asks else not landings  # asked on; its failsafe has precedence
+    assert flown.ending is not None and (asks or flown.ending.cause == Cause.FAILSAFE)
+    assert asks or flown.ending.exit_code == 1
+
+
+@pytest.mark.fault(25)
+def test_arducopter_s_pilot_who_takes_loiter_is_the_pilot() -> None:
+    flown = fly("arducopter-pilot.tlog", 1.2, {(4.0, 0.0, 0.0): "take off"}, HandOverConfig(), client=245)
+    assert [state for state, _ in flown.states][:7] == [R, M, A, C, G, E, HandoverState.RELEASED]
+    assert set(flown.who) == {Switcher.PILOT} and RequestKind.LAND not in [ask for ask, _ in flown.asked]
+    assert flown.ending is not None and (flown.ending.cause, flown.ending.exit_code) == (Cause.PILOT, 0)

@@ -157,7 +157,7 @@ def test_a_vehicle_that_disarms_itself_on_the_way_ends_it(state: HandoverState) 
 @pytest.mark.fault(25)
 def test_the_pilot_may_take_over_at_any_time(state: HandoverState, mode: str, armed: bool) -> None:
     rig = Rig("px4").to(state)
-    rig.be(mode=mode, armed=armed)
+    rig.be(mode=mode, armed=armed, stick=True)
     told = rig.tick()
     assert (rig.state, told.sending, told.ask) == (HandoverState.RELEASED, NOTHING, None)
 

@@ -8,26 +8,27 @@ import pytest
 
 from uavctl.mavlink.handover_states import LEAVES_NONE, TRANSITIONS, HandoverEvent, HandoverState, Sending
 
-# W waiting, R ready, M mode, A arming, C climbing, G engaging, B returning, E engaged, V failsafe, X released,
-# L landing, S settling, D done, F failed; + neutral setpoints, * setpoints, nothing else is sent.
+# W waiting, R ready, M mode, A arming, C climbing, G engaging, B returning, E engaged, V failsafe, U unclear,
+# X released, L landing, S settling, D done, F failed; + neutral setpoints, * setpoints, nothing else is sent.
 GRID = """
-     reboot land unsafe refused silence take-off engage left disarmed failsafe other granted external pending
-W    W      W    W      F       W       W        W      X    R+       W        R+    W       E*       W
-R    R      R    R      F       W       M+       B+     R    R+       R        R+    R       E*       R
-M    F      D    M      F       M       M        M      M    M        M        X     A+      M        M+
-A    F      L    A      F       A       A        A      A    A        V        X     C+      A        A+
-C    F      L    L      L       C       C        C      C    F        V        X     G+      C        C+
-G    F      L    L      L       G       G        G      G    F        V        X     E*      G        G+
-B    X      X    B      X       B       B        B      B    D        B        X     E*      B        B+
-E    X      L    E      E       E*      E        E      E    D        V        X     E       E*       E
-V    F      L    V      L       V       V        G+     V    D        V        X     C+      V        V
-X    X      X    X      X       X       X        B+     X    D        X        X     X       X        X
-L    L      L    L      F       L       L        L      L    D        L        X     S       L        L
-S    S      S    S      F       S       S        S      S    D        L        X     S       S        S
-D    D      D    D      D       D       D        D      D    D        D        D     D       D        D
-F    F      F    F      F       F       F        F      F    F        F        F     F       F        F
+  reboot land unsafe refused silence take-off engage left disarmed failsafe unclear other granted external pending
+W W      W    W      F       W       W        W      X    R+       W        W       R+    W       E*       W
+R R      R    R      F       W       M+       B+     R    R+       R        R       R+    R       E*       R
+M F      D    M      F       M       M        M      M    M        X        U       X     A+      M        M+
+A F      L    A      F       A       A        A      A    A        V        U       X     C+      A        A+
+C F      L    L      L       C       C        C      C    F        V        U       X     G+      C        C+
+G F      L    L      L       G       G        G      G    F        V        U       X     E*      G        G+
+B X      X    B      X       B       B        B      B    D        V        U       X     E*      B        B+
+E X      L    E      E       E*      E        E      E    D        V        U       X     E       E*       E
+V F      L    V      L       V       V        G+     V    D        V        U       X     C+      V        V
+U X      L    U      L       U       U        B+     U    D        V        U       X     U       U        U
+X X      X    X      X       X       X        B+     X    D        X        X       X     X       X        X
+L L      L    L      F       L       L        L      L    D        L        X       X     S       L        L
+S S      S    S      F       S       S        S      S    D        L        X       X     S       S        S
+D D      D    D      D       D       D        D      D    D        D        D       D     D       D        D
+F F      F    F      F       F       F        F      F    F        F        F       F     F       F        F
 """
-LETTERS = dict(zip("WRMACGBEVXLSDF", HandoverState, strict=True))
+LETTERS = dict(zip("WRMACGBEVUXLSDF", HandoverState, strict=True))
 SENDING = {"": Sending.NOTHING, "+": Sending.NEUTRAL, "*": Sending.SETPOINTS}
 
 

@@ -132,6 +132,7 @@ class Endings:
         self.config = load_config(preset, settings)
         self.folder, self.now_ns = folder, BEGUN_NS
         self.peers = Peers(self.config, BEGUN_NS, airborne=airborne)
+        self.peers.autopilot.pilot.radio = True  # the pilot is there, with his stick
         self.lines = {"vehicle": Line(self, "vehicle"), "mocap": Line(self, "mocap")}
         self.hears: Callable[[bytes], bool] = lambda data: True
         self.told: Callable[[bytes], bool] = lambda data: True

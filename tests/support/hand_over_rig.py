@@ -31,7 +31,7 @@ class Rig:
         self.hand_over = HandOver(config)
         ground = "AUTO.LOITER" if autopilot == "px4" else "STABILIZE"
         self.vehicle: VehicleStatus | None = VehicleStatus(
-            at_ns=NOW, autopilot=autopilot, armed=False, mode=ground, external=False, landed=True
+            at_ns=NOW, autopilot=autopilot, armed=False, mode=ground, external=False, landed=True, radio=True
         )
         self.mute = False
         self.view = HandoverView(at_ns=NOW, vehicle=None, ready=True, up_m=0.0)
@@ -113,6 +113,10 @@ class Rig:
             return self
         if state is HandoverState.FAILSAFE:
             self.fail()
+            return self
+        if state is HandoverState.UNCLEAR:
+            self.be(mode="AUTO.RTL" if px4 else "RTL")
+            self.tick()
             return self
         self.tick(up_m=1.9)
         return self

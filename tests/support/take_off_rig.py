@@ -44,6 +44,7 @@ class Flight:
         self.memory.put("/uavctl/header", 0, header(self.config, design))
         self.loop = ControlLoop(self.config, controller, self.memory, lambda: 0)
         self.peers = Peers(self.config, 0, airborne=False)
+        self.peers.autopilot.pilot.radio = True  # the pilot is there, with his stick
         self.tick = 0
         self.ticked: Ticked | None = None  # the last one
         self.notices: list[Event] = []  # of the whole flight

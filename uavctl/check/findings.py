@@ -154,7 +154,7 @@ class Heard:
                 self.angles_rad.append((at_ns, angles))
             case Landed(landed=landed):
                 self.landed = landed
-            case Battery(voltage_v=voltage_v):
+            case Battery(voltage_v=float(voltage_v)):
                 self.battery_v = voltage_v
             case EstimatorFlags(flags=flags):
                 self.estimator = flags

@@ -22,13 +22,16 @@ from uavctl.mavlink.messages import (
     AutopilotVersion,
     Battery,
     EstimatorFlags,
+    FenceBreach,
     GlobalOrigin,
     Heartbeat,
     Inertial,
     Landed,
     Message,
+    ModeOrder,
     ParamValue,
     Position,
+    RadioChannels,
     Text,
     TimeSync,
 )
@@ -313,8 +316,64 @@ def _landed(raw: Fields) -> Landed:
 _NO_VOLTAGE_MV = 0xFFFF
 
 
-def _sys_status(raw: Fields) -> Battery | None:
-    return _battery(raw, [raw.voltage_battery])
+def _sys_status(raw: Fields) -> Battery:
+    works = raw.onboard_control_sensors_enabled & raw.onboard_control_sensors_health
+    beyond = raw.onboard_control_sensors_enabled & ~raw.onboard_control_sensors_health
+    known = raw.voltage_battery != _NO_VOLTAGE_MV
+    return Battery(
+        system=raw.src_system,
+        component=raw.src_component,
+        voltage_v=raw.voltage_battery / 1000 if known else None,
+        radio=bool(works & mavlink.MAV_SYS_STATUS_SENSOR_RC_RECEIVER),
+        fenced=not beyond & mavlink.MAV_SYS_STATUS_GEOFENCE,
+    )
+
+
+def _fence(raw: Fields) -> FenceBreach:
+    return FenceBreach(system=raw.src_system, component=raw.src_component, breached=raw.breach_status != 0)
+
+
+_NO_CHANNEL_US = 0xFFFF
+
+
+def _channels(raw: Fields, count: int) -> RadioChannels:
+    pulses = (getattr(raw, f"chan{number}_raw") for number in range(1, count + 1))
+    return RadioChannels(
+        system=raw.src_system,
+        component=raw.src_component,
+        channels_us=tuple(0 if pulse == _NO_CHANNEL_US else pulse for pulse in pulses),
+    )
+
+
+def _all_channels(raw: Fields) -> RadioChannels:
+    return _channels(raw, min(raw.chancount, 18))
+
+
+def _raw_channels(raw: Fields) -> RadioChannels | None:
+    return _channels(raw, 8) if raw.port == 0 else None
+
+
+# Commands that change the mode of a vehicle in the air
+MODE_COMMANDS = frozenset(
+    {
+        mavlink.MAV_CMD_DO_SET_MODE,
+        mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH,
+        mavlink.MAV_CMD_NAV_LAND,
+        mavlink.MAV_CMD_NAV_LOITER_UNLIM,
+        mavlink.MAV_CMD_DO_REPOSITION,
+        mavlink.MAV_CMD_DO_PAUSE_CONTINUE,
+        mavlink.MAV_CMD_MISSION_START,
+        mavlink.MAVLINK_MSG_ID_SET_MODE,  # ArduPilot acknowledges the message by its number
+    }
+)
+
+
+def _command(raw: Fields) -> ModeOrder | None:
+    return _set_mode(raw) if raw.command in MODE_COMMANDS else None
+
+
+def _set_mode(raw: Fields) -> ModeOrder:
+    return ModeOrder(system=raw.src_system, component=raw.src_component, target_system=raw.target_system)
 
 
 def _battery_status(raw: Fields) -> Battery | None:
@@ -374,6 +433,11 @@ _READERS: dict[int, Callable[[Fields], Message | None]] = {
     mavlink.MAVLINK_MSG_ID_STATUSTEXT: _text,
     mavlink.MAVLINK_MSG_ID_COMMAND_ACK: _ack,
     mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN: _origin,
+    mavlink.MAVLINK_MSG_ID_FENCE_STATUS: _fence,
+    mavlink.MAVLINK_MSG_ID_RC_CHANNELS: _all_channels,
+    mavlink.MAVLINK_MSG_ID_RC_CHANNELS_RAW: _raw_channels,
+    mavlink.MAVLINK_MSG_ID_SET_MODE: _set_mode,
+    mavlink.MAVLINK_MSG_ID_COMMAND_LONG: _command,
     **STATE_READERS,
 }
 _UNDERSTOOD = {number: (MessageLayout(mavlink.mavlink_map[number]), reader) for number, reader in _READERS.items()}

@@ -25,6 +25,7 @@ from uavctl.mavlink.messages import (
     Message,
     ParamValue,
     Position,
+    RadioChannels,
     Text,
     TimeSync,
 )
@@ -55,9 +56,10 @@ TRIES = 5
 ORIGIN_TRIES = 30  # once a second: its estimator may take that long to begin
 
 LOCAL_POSITION_NED, ATTITUDE, EXTENDED_SYS_STATE, SYS_STATUS = 32, 30, 245, 1
+RC_CHANNELS = 65
 ATTITUDE_QUATERNION, HIGHRES_IMU, RAW_IMU = 31, 105, 27
 GPS_GLOBAL_ORIGIN = 49
-RATES_HZ = {LOCAL_POSITION_NED: 10.0, ATTITUDE: 10.0, EXTENDED_SYS_STATE: 5.0, SYS_STATUS: 1.0}
+RATES_HZ = {LOCAL_POSITION_NED: 10.0, ATTITUDE: 10.0, EXTENDED_SYS_STATE: 5.0, SYS_STATUS: 1.0, RC_CHANNELS: 5.0}
 
 INERTIAL_HZ = 50.0  # of what shows how it turns, and its acceleration
 
@@ -97,6 +99,8 @@ class Streams:
                 self._seen.add(EXTENDED_SYS_STATE)
             case Battery():
                 self._seen.add(SYS_STATUS)
+            case RadioChannels() if self._tries:  # as often as is asked for: it shows a pilot's hand
+                self._seen.add(RC_CHANNELS)
             case Inertial():
                 self._feels = self._felt_tries > 0
 

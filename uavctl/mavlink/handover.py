@@ -15,11 +15,12 @@ from uavctl.mavlink.handover_guards import (
     against_engaging,
     evaluate,
     fails,
-    profile_of,
+    nobody_s,
     silent,
 )
 from uavctl.mavlink.handover_states import TRANSITIONS, HandoverEvent, HandoverState, Sending
 from uavctl.mavlink.requests import Patience, PendingRequest, RequestKind
+from uavctl.mavlink.switcher import Switcher, profile_of
 from uavctl.records import ORDER_ACCEPTED, ORDER_REFUSED, Command, Event, Order, Severity, VehicleStatus
 
 LAND_TRIES = 5
@@ -33,18 +34,23 @@ _BEGUN = frozenset(
         HandoverState.CLIMBING,
         HandoverState.ENGAGING,
         HandoverState.FAILSAFE,
+        HandoverState.UNCLEAR,
         HandoverState.LANDING,
         HandoverState.SETTLING,
     }
 )
 _PLAIN = frozenset(HandoverState) - {
     HandoverState.FAILSAFE,
+    HandoverState.UNCLEAR,
     HandoverState.RELEASED,
     HandoverState.LANDING,
     HandoverState.FAILED,
 }
 # In these it counts which mode the vehicle was in as they were entered.
 _NOTES_MODE = frozenset({HandoverState.MODE, HandoverState.RETURNING, HandoverState.FAILSAFE, HandoverState.LANDING})
+# A failsafe that ends one of these, and ends itself, has interrupted the climb only.
+_CLIMBS = frozenset({HandoverState.ARMING, HandoverState.CLIMBING, HandoverState.ENGAGING})
+_TAKEN = frozenset({HandoverState.FAILSAFE, HandoverState.UNCLEAR})
 _PROMISES = {
     Order.TAKE_OFF: "will take off",
     Order.ENGAGE: "asks for the mode that takes setpoints",
@@ -62,6 +68,7 @@ class Passage(msgspec.Struct, frozen=True):
     why: str = ""  # more about it, where something failed
     ask: RequestKind | None = None  # request to the vehicle at that time
     granted: bool = False  # it had said yes to that
+    who: Switcher | None = None  # who has changed the mode, where it is none of ours
 
 
 class HandoverStep(msgspec.Struct, frozen=True):
@@ -91,6 +98,7 @@ class HandOver:
         self._landed_ns: int | None = None  # since when it stands on the ground, armed
         self._disarms = False
         self._silent = False
+        self._waits_for_nobody = False  # what we took off flies by itself, and nothing shows that a person has it
         self._overdue = False  # a landing that is asked for has not begun in the time for it
         self._aloft_ns: int | None = None  # the last tick in which the vehicle was heard, and in the air
         self.failure = ""
@@ -133,6 +141,8 @@ class HandOver:
         """Whether an answer of the vehicle is waited for, or it is in the air by the positions it gets from here."""
         if self.carries:
             return True
+        if self.state is HandoverState.UNCLEAR:
+            return self._waits_for_nobody
         return self.state in ASKING or (self.state is HandoverState.SETTLING and (self.ours or self._sees_it_down))
 
     def flown(self, at_ns: int, vehicle: VehicleStatus | None) -> VehicleStatus | None:
@@ -165,13 +175,19 @@ class HandOver:
         sight = evaluate(now, view)
         if view.vehicle is not None and view.vehicle.mode in profile_of(view.vehicle).landing:
             now.lands_failing = fails(view.vehicle)
+        if before is HandoverState.FAILSAFE and view.vehicle is not None and fails(view.vehicle):
+            now.left_mode = view.vehicle.mode  # one failsafe may follow another, and ArduPilot stays in its mode
         now.boots = 0 if view.vehicle is None else view.vehicle.boots
         now.state, sending = TRANSITIONS[before, sight.seen]
         passage = None
-        if now.state is not before:
+        late = now.state is before is HandoverState.RELEASED and sight.who is not now.who
+        if now.state is not before or late:
             was = now.request
-            passage = Passage(before, sight.seen, now.state, sight.why, was.ask, was.granted_ns is not None)
+            passage = Passage(before, sight.seen, now.state, sight.why, was.ask, was.granted_ns is not None, sight.who)
+            now.who = sight.who
+        if now.state is not before:
             self._enter(before, sight, view)
+        self._waits_for_nobody = now.state is HandoverState.UNCLEAR and nobody_s(now, view.vehicle)
         if sending is Sending.NEUTRAL and not (view.ready and self._may_warm_up(view)):
             sending = Sending.NOTHING
         self._see_to_disarming(view)
@@ -181,7 +197,9 @@ class HandOver:
             ask = now.request.due(view.at_ns, held, blind=self._may_be_the_pilot_s(view))
         if now.state is HandoverState.FAILED and before is HandoverState.ARMING:
             ask = RequestKind.DISARM  # arming may have been granted after all
-        return HandoverStep(sending, ask, (*events, *self._tell(view, before, sight)), passage)
+        return HandoverStep(
+            sending, ask, (*events, *self._tell(view, before, sight, passed=passage is not None)), passage
+        )
 
     def look_up(self, at_ns: int, vehicle: VehicleStatus | None) -> None:
         """See whether the vehicle is in the air; the last word of it counts for the time of a landing."""
@@ -237,10 +255,15 @@ class HandOver:
     def _enter(self, before: HandoverState, sight: GuardResult, view: HandoverView) -> None:
         now = self._now
         now.since_ns, now.stands_by = view.at_ns, False
+        if now.state in _TAKEN and before not in _TAKEN:
+            now.resumes = before in _CLIMBS
         if now.state is HandoverState.FAILSAFE:
-            now.resumes, now.words = before is not HandoverState.ENGAGED, now.request.words
+            said = "" if view.vehicle is None else view.vehicle.said
+            now.words = now.request.words + (f', "{said}"' if said and said not in now.request.words else "")
         if now.state is HandoverState.CLIMBING and now.climb_ns is None:
             now.climb_ns = view.at_ns
+        if now.state is HandoverState.CLIMBING:
+            now.left_mode = ""  # that of the ground would be the pilot's by now
         now.request = PendingRequest(self._ask(view), view.at_ns, self._patience(now.state, view.at_ns))
         if now.state is HandoverState.ARMING:
             now.ground_up_m = view.up_m
@@ -303,7 +326,7 @@ class HandOver:
                 RequestKind.DISARM, view.at_ns, self._patience(HandoverState.SETTLING, view.at_ns)
             )
 
-    def _tell(self, view: HandoverView, before: HandoverState, sight: GuardResult) -> list[Event]:
+    def _tell(self, view: HandoverView, before: HandoverState, sight: GuardResult, *, passed: bool) -> list[Event]:
         events = []
         silence = self.state is HandoverState.ENGAGED and sight.seen is HandoverEvent.SILENCE
         if silence != self._silent:
@@ -315,12 +338,15 @@ class HandOver:
             text = f"{overdue}; it is asked on, as it is heard in the air"
             events.append(Event(at_ns=view.at_ns, severity=Severity.ERROR, code="refused", text=text))
         self._overdue = bool(overdue)
-        if self.state is not before:
+        if passed:
             vehicle = view.vehicle
             mode = "" if vehicle is None else f" ({vehicle.mode}, {'armed' if vehicle.armed else 'disarmed'})"
             plain = self.state in _PLAIN and before is not HandoverState.FAILSAFE
             severity = Severity.INFO if plain else Severity.WARNING
             text = f"{before} -> {self.state}{mode}"
+            if sight.who is not None:
+                said = "" if vehicle is None or not vehicle.said else f', "{vehicle.said}"'
+                text += f": {sight.who}{said}"
             events.append(Event(at_ns=view.at_ns, severity=severity, code="hand-over", text=text))
             if sight.why:
                 events.append(Event(at_ns=view.at_ns, severity=Severity.ERROR, code="refused", text=sight.why))

@@ -13,13 +13,15 @@ import msgspec
 from uavctl.config.connections import HandOverConfig
 from uavctl.mavlink.handover_states import HandoverEvent, HandoverState
 from uavctl.mavlink.messages import Ack, Text
-from uavctl.mavlink.profile import PROFILES, AutopilotProfile
+from uavctl.mavlink.profile import PROFILES
 from uavctl.mavlink.requests import PendingRequest
+from uavctl.mavlink.switcher import OWN, Switcher, flies_itself, profile_of, who_switched
 from uavctl.records import Command, Order, VehicleStatus
 
 HEARTBEAT_TIMEOUT_NS = 3_000_000_000
 # A heartbeat may have been under way when arming or the external mode was granted: PX4 shows it up to a second later.
 GRACE_NS = 300_000_000
+LATE_WORD_NS = 1_000_000_000  # from the heartbeat that shows a mode to the text that says why
 LOOK_AHEAD_S = 0.5  # from asking for the external mode in a climb to the first braking: answer, news, the vehicle's lag
 SHOWN_NS = 2_000_000_000  # a heartbeat shows by then that landing was asked for
 MUST_LAND = 10  # times `land_s` for which landing is asked for: as long as a battery lasts
@@ -80,6 +82,7 @@ class Progress:
     climb_ns: int | None = None  # time at which the climb first began [ns]; None before
     resumes: bool = False  # the failsafe that acts ended the climb, not the flight
     words: str = ""  # texts of the vehicle from before its failsafe acted
+    who: Switcher | None = None  # who has the vehicle, where it is not we; None while it is we, or nobody
     lands_failing: bool = False  # the landing that is waited for was last seen as a failsafe's
     granted_ns: int | None = None  # when arming or the external mode was granted, ahead of the heartbeat [ns]
     boots: int = 0  # times that the vehicle had started anew by the last tick
@@ -98,16 +101,12 @@ class GuardResult(msgspec.Struct, frozen=True):
     seen: HandoverEvent  # in the words of the table
     why: str = ""  # why something failed
     granted_ns: int | None = None  # when it was granted, if a heartbeat does not show it yet [ns]
+    who: Switcher | None = None  # who has changed the mode, where it is none of ours
 
 
 def silent(at_ns: int, vehicle: VehicleStatus | None) -> bool:
     """Whether there is no heartbeat, or the last one is too old."""
     return vehicle is None or at_ns - vehicle.at_ns > HEARTBEAT_TIMEOUT_NS
-
-
-def profile_of(vehicle: VehicleStatus) -> AutopilotProfile:
-    """The autopilot's profile; those of PX4 for one that is not known, which is never asked for a mode."""
-    return PROFILES.get(vehicle.autopilot, PROFILES["px4"])
 
 
 def ordered(view: HandoverView, order: Order) -> bool:
@@ -116,14 +115,26 @@ def ordered(view: HandoverView, order: Order) -> bool:
 
 
 def fails(vehicle: VehicleStatus) -> bool:
-    """Whether a failsafe of its own has chosen its mode: it says that one acts, in a mode that they choose."""
-    return vehicle.failsafe and vehicle.mode in profile_of(vehicle).failsafes
+    """Whether a failsafe or a fence of its own has chosen its mode, which needs no person."""
+    return flies_itself(vehicle) and who_switched(vehicle) in OWN
+
+
+def _taken(progress: Progress, vehicle: VehicleStatus) -> GuardResult:
+    """Return the event seen in a mode that is none of ours, by who has chosen it.
+
+    A failsafe is waited for on a flight that we began, unless a person flies in its mode: the stick always wins.
+    """
+    who = who_switched(vehicle, had_failed=progress.state is HandoverState.FAILSAFE)
+    if who is Switcher.UNKNOWN:
+        return GuardResult(HandoverEvent.UNCLEAR, who=who)
+    waits = who in OWN and progress.ordered_ns is not None and flies_itself(vehicle)
+    return GuardResult(HandoverEvent.FAILSAFE if waits else HandoverEvent.OTHER, who=who)
 
 
 def against_engaging(state: HandoverState, view: HandoverView) -> str:
     """Return why the external mode must not be asked for again; empty if it may."""
     vehicle = view.vehicle
-    if state not in (HandoverState.READY, HandoverState.RELEASED, HandoverState.FAILSAFE):
+    if state not in (HandoverState.READY, HandoverState.RELEASED, HandoverState.UNCLEAR, HandoverState.FAILSAFE):
         return f"there is nothing to engage; now: {state}"
     if vehicle is None or silent(view.at_ns, vehicle) or vehicle.autopilot not in PROFILES:
         return "no vehicle is heard that could be flown"
@@ -143,9 +154,8 @@ def against_moving(state: HandoverState, vehicle: VehicleStatus | None) -> str:
         return f"it is not we who fly: the vehicle is in mode {mode}, and the pilot has not switched"
     if state in LEAVING:
         return f"the vehicle is on its way up ({state}); order it once it is flown"
-    if state in (HandoverState.FAILSAFE, HandoverState.RELEASED, HandoverState.RETURNING):
-        whose = "a failsafe of its own" if state is HandoverState.FAILSAFE else "the pilot"
-        return f"{whose} has the vehicle, in mode {mode}; `uavctl ctl engage` asks for it back"
+    if state in (HandoverState.FAILSAFE, HandoverState.UNCLEAR, HandoverState.RELEASED, HandoverState.RETURNING):
+        return f"the vehicle has been taken over ({state}, in mode {mode}); `uavctl ctl engage` asks for it back"
     return f"the vehicle has been handed over ({state})"
 
 
@@ -158,9 +168,12 @@ def evaluate(progress: Progress, view: HandoverView) -> GuardResult:
     if vehicle is not None and not silent(view.at_ns, vehicle):
         there = _LOOKS.get(state, _around)(progress, view, vehicle)
     lands = vehicle is not None and vehicle.mode in profile_of(vehicle).landing
-    if there.seen is HandoverEvent.OTHER and not lands and state not in (HandoverState.WAITING, HandoverState.READY):
+    taken = there.seen in (HandoverEvent.UNCLEAR, HandoverEvent.OTHER)
+    if taken and not lands and state not in (HandoverState.WAITING, HandoverState.READY):
         return there  # whatever ends the flight: what the pilot has taken is asked for nothing
-    if view.land or (state in _UNDER_WAY and (view.stop or ordered(view, Order.LAND))):
+    if view.land and state is not HandoverState.UNCLEAR:
+        return GuardResult(HandoverEvent.LAND)
+    if (state in _UNDER_WAY and (view.stop or ordered(view, Order.LAND))) or _may_be_landed(progress, view):
         return GuardResult(HandoverEvent.LAND)
     if state is HandoverState.ENGAGED and view.stop and not view.ready and progress.ordered_ns is not None:
         # The controller has ended without a landing, and nobody else has what we took off.
@@ -181,8 +194,8 @@ def _given_up(progress: Progress, view: HandoverView) -> str:
         return _never_ready(progress, view)
     if state in (HandoverState.MODE, HandoverState.ARMING) and vehicle is not None and not vehicle.alone:
         return _ANOTHER
-    if state is HandoverState.FAILSAFE:
-        return _failsafe_stays(progress, view)
+    if state in (HandoverState.FAILSAFE, HandoverState.UNCLEAR):
+        return _stays(progress, view)
     waits = (state in ASKING or state is HandoverState.SETTLING) and not _must_land(progress, view)
     return progress.request.given_up(view.at_ns) if waits else ""
 
@@ -196,18 +209,37 @@ def _must_land(progress: Progress, view: HandoverView) -> bool:
     return heard and view.at_ns - progress.since_ns < round(MUST_LAND * progress.config.land_s * 1e9)
 
 
-def _failsafe_stays(progress: Progress, view: HandoverView) -> str:
-    """Return why the vehicle's failsafe is not waited for any longer; empty while it is."""
+def nobody_s(progress: Progress, vehicle: VehicleStatus | None) -> bool:
+    """Whether a vehicle that we took off flies by itself, and nothing shows that a person has it."""
+    if progress.ordered_ns is None or vehicle is None or vehicle.landed or vehicle.stick:
+        return False
+    return flies_itself(vehicle) or vehicle.external or vehicle.mode in profile_of(vehicle).climbing
+
+
+def _may_be_landed(progress: Progress, view: HandoverView) -> bool:
+    """Whether the operator orders a landing of what is nobody's."""
+    unclear = progress.state is HandoverState.UNCLEAR and ordered(view, Order.LAND)
+    return unclear and nobody_s(progress, view.vehicle)
+
+
+def _stays(progress: Progress, view: HandoverView) -> str:
+    """Return why the vehicle's failsafe, or who has it, is not waited for any longer; empty while it is."""
     vehicle, config = view.vehicle, progress.config
+    unclear = progress.state is HandoverState.UNCLEAR
+    if unclear and not nobody_s(progress, vehicle):
+        return ""
     lands = vehicle is not None and vehicle.mode in profile_of(vehicle).landing
     begun_ns, limit_s = progress.since_ns, config.land_s if lands else config.climb_s
     if progress.resumes and not lands and progress.climb_ns is not None:
         begun_ns = progress.climb_ns
     if view.at_ns - begun_ns < round(limit_s * 1e9):
         return ""
+    if unclear:
+        mode = "" if vehicle is None else vehicle.mode
+        return f"nobody has shown in {limit_s:g} s that he has the vehicle, which flies by itself ({mode})"
     acts = vehicle is None or fails(vehicle)
     became = "has not ended" if acts else "has ended, and nobody has taken the flight up again,"
-    return f"the vehicle's own failsafe ({progress.left_mode}) {became} in {limit_s:g} s{progress.words}"
+    return f"{progress.who or Switcher.FAILSAFE} ({progress.left_mode}) {became} in {limit_s:g} s{progress.words}"
 
 
 def _never_ready(progress: Progress, view: HandoverView) -> str:
@@ -248,8 +280,12 @@ def _around(progress: Progress, view: HandoverView, vehicle: VehicleStatus) -> G
         return GuardResult(HandoverEvent.SILENCE) if tells_not_yet else GuardResult(HandoverEvent.LEFT, _LEFT)
     if vehicle.external:
         return GuardResult(HandoverEvent.EXTERNAL)
-    ours = progress.state is HandoverState.ENGAGED and progress.ordered_ns is not None
-    return GuardResult(HandoverEvent.FAILSAFE if ours and fails(vehicle) else HandoverEvent.OTHER)
+    if progress.state is HandoverState.ENGAGED:
+        return _taken(progress, vehicle)
+    # A text that says of a failsafe comes after the heartbeat that shows its mode, sometimes.
+    guessed = progress.who in (Switcher.PILOT, Switcher.UNKNOWN) and view.at_ns - progress.since_ns < LATE_WORD_NS
+    who = who_switched(vehicle) if guessed and progress.state is HandoverState.RELEASED else progress.who
+    return GuardResult(HandoverEvent.OTHER, who=progress.who if who is Switcher.UNKNOWN else who)
 
 
 def _has_started_since(progress: Progress, view: HandoverView) -> bool:
@@ -262,12 +298,12 @@ def _has_started_since(progress: Progress, view: HandoverView) -> bool:
 def _for_mode(progress: Progress, view: HandoverView, vehicle: VehicleStatus) -> GuardResult:
     profile = profile_of(vehicle)
     if vehicle.armed:
-        return GuardResult(HandoverEvent.OTHER)
+        return _taken(progress, vehicle)
     if vehicle.alone and vehicle.mode == profile.take_off:
         return GuardResult(HandoverEvent.GRANTED)
     # A mode that nobody here asked for is the pilot's; the one of before may be that of a vehicle that is slow.
     if vehicle.alone and vehicle.mode not in (profile.take_off, progress.left_mode):
-        return GuardResult(HandoverEvent.OTHER)
+        return _taken(progress, vehicle)
     if _shows_granted(progress, vehicle, SHOWN_NS):
         return GuardResult(HandoverEvent.REFUSED, f"{progress.request.given_up(view.at_ns, at_once=True)}; {_OR_PILOT}")
     return GuardResult(HandoverEvent.PENDING)
@@ -283,7 +319,7 @@ def _for_arming(progress: Progress, _view: HandoverView, vehicle: VehicleStatus)
     profile, granted_ns = profile_of(vehicle), progress.request.granted_ns
     # Disarmed it has not climbed, so it is not where PX4's climb ends.
     if vehicle.mode != profile.take_off and not (vehicle.armed and vehicle.mode in profile.climbing):
-        return GuardResult(HandoverEvent.FAILSAFE if vehicle.armed and fails(vehicle) else HandoverEvent.OTHER)
+        return _taken(progress, vehicle)
     if profile.climbs_on_arming and granted_ns is not None:  # it climbs already
         return GuardResult(HandoverEvent.GRANTED, granted_ns=granted_ns)
     return GuardResult(HandoverEvent.GRANTED if vehicle.armed else HandoverEvent.PENDING)
@@ -294,9 +330,9 @@ def _at_climb(progress: Progress, view: HandoverView, vehicle: VehicleStatus) ->
         return GuardResult(HandoverEvent.DISARMED, _DISARMED)
     profile = profile_of(vehicle)
     if vehicle.mode not in profile.climbing:
-        return GuardResult(HandoverEvent.FAILSAFE if fails(vehicle) else HandoverEvent.OTHER)
+        return _taken(progress, vehicle)
     if vehicle.mode != profile.take_off and vehicle.landed and _climbed(progress, view, 0.0) < NONE:
-        return GuardResult(HandoverEvent.OTHER)  # no climb has ended on the ground
+        return _taken(progress, vehicle)  # no climb has ended on the ground
     share = _climbed(progress, view, LOOK_AHEAD_S if profile.climbs_on_arming else 0.0)
     ended = profile.climbs_on_arming and vehicle.mode != profile.take_off  # below the height: as high as it goes
     return GuardResult(
@@ -320,23 +356,36 @@ def _for_external(progress: Progress, _view: HandoverView, vehicle: VehicleStatu
     engaging = progress.state is HandoverState.ENGAGING
     if vehicle.mode == progress.left_mode or (engaging and vehicle.mode in profile_of(vehicle).climbing):
         return GuardResult(HandoverEvent.PENDING)
-    return GuardResult(HandoverEvent.FAILSAFE if engaging and fails(vehicle) else HandoverEvent.OTHER)
+    return _taken(progress, vehicle)
 
 
 def _at_failsafe(progress: Progress, view: HandoverView, vehicle: VehicleStatus) -> GuardResult:
     """Return the event seen in a failsafe on a flight that we began; the pilot may take over as at any other time."""
     if not vehicle.armed:
         return GuardResult(
-            HandoverEvent.DISARMED, f"the vehicle's own failsafe ({progress.left_mode}) has landed it{progress.words}"
+            HandoverEvent.DISARMED,
+            f"{progress.who or Switcher.FAILSAFE} ({progress.left_mode}) has landed it{progress.words}",
         )
     if ordered(view, Order.ENGAGE) and not against_engaging(progress.state, view):
         return GuardResult(HandoverEvent.ENGAGE)
     profile = profile_of(vehicle)
     if progress.resumes and vehicle.mode in profile.climbing:
         return GuardResult(HandoverEvent.GRANTED)
-    stays = not profile.returns and vehicle.mode == progress.left_mode
+    stays = not profile.returns and vehicle.mode == progress.left_mode and not vehicle.stick
     # The external mode is not taken up again unasked: nobody knows whose doing it is.
-    return GuardResult(HandoverEvent.PENDING if vehicle.external or fails(vehicle) or stays else HandoverEvent.OTHER)
+    if vehicle.external or fails(vehicle) or stays:
+        return GuardResult(HandoverEvent.PENDING)
+    return _taken(progress, vehicle)
+
+
+def _at_unclear(progress: Progress, view: HandoverView, vehicle: VehicleStatus) -> GuardResult:
+    """Return the event seen while it is not known who has changed the mode: word of that may still come."""
+    if not vehicle.armed:
+        return GuardResult(HandoverEvent.DISARMED)
+    if ordered(view, Order.ENGAGE) and not against_engaging(progress.state, view):
+        return GuardResult(HandoverEvent.ENGAGE)
+    seen = GuardResult(HandoverEvent.PENDING) if vehicle.external else _taken(progress, vehicle)
+    return GuardResult(HandoverEvent.PENDING) if seen.seen is HandoverEvent.UNCLEAR else seen
 
 
 def _at_landing(progress: Progress, _view: HandoverView, vehicle: VehicleStatus) -> GuardResult:
@@ -357,11 +406,11 @@ def _at_landing(progress: Progress, _view: HandoverView, vehicle: VehicleStatus)
         passing = vehicle.external or vehicle.mode in profile.climbing
         for_ns = SHOWN_NS if vehicle.mode == progress.left_mode else GRACE_NS
         taken = not passing or _shows_granted(progress, vehicle, for_ns)
-        return GuardResult(HandoverEvent.OTHER if taken else HandoverEvent.PENDING)
+        return _taken(progress, vehicle) if taken else GuardResult(HandoverEvent.PENDING)
     if ours and progress.lands_failing and profile.climbs_on_arming and vehicle.mode == profile.take_off:
         shown = vehicle.at_ns > progress.since_ns + SHOWN_NS
         return GuardResult(HandoverEvent.FAILSAFE if shown else HandoverEvent.PENDING)
-    return GuardResult(HandoverEvent.OTHER)
+    return _taken(progress, vehicle)
 
 
 _LOOKS: dict[HandoverState, Callable[[Progress, HandoverView, VehicleStatus], GuardResult]] = {
@@ -371,6 +420,7 @@ _LOOKS: dict[HandoverState, Callable[[Progress, HandoverView, VehicleStatus], Gu
     HandoverState.ENGAGING: _for_external,
     HandoverState.RETURNING: _for_external,
     HandoverState.FAILSAFE: _at_failsafe,
+    HandoverState.UNCLEAR: _at_unclear,
     HandoverState.LANDING: _at_landing,
     HandoverState.SETTLING: _at_landing,
 }

@@ -1,7 +1,7 @@
 """The hand-over between pilot and controller, as a table of transitions.
 
 Without an order the controller never asks for a mode but landing: it streams neutral setpoints so that the pilot may
-switch, flies while the vehicle is armed in its external mode, and is out once the pilot has taken over. Ordered to,
+switch, flies while the vehicle is armed in its external mode, and is out once somebody else has taken over. Ordered to,
 it asks for the mode, arms, lets the vehicle climb and asks for the external mode: `uavctl.mavlink.handover` walks
 the table. A vehicle that a daemon before has left in the air is not taken up again without an order.
 """
@@ -23,7 +23,8 @@ class HandoverState(StrEnum):
     RETURNING = "returning"  # the same from `released`, ordered to
     ENGAGED = "engaged"  # armed and in the external mode: setpoints
     FAILSAFE = "failsafe"  # what we took off is flown by a failsafe of its own: nothing is sent; in bounded time
-    RELEASED = "released"  # the pilot has taken over: nothing is sent unless ordered to
+    UNCLEAR = "unclear"  # in a mode that is none of ours, and it is not known by whom: nothing is sent; in bounded time
+    RELEASED = "released"  # somebody else has taken over: nothing is sent unless ordered to
     LANDING = "landing"  # landing was asked for: no setpoints any more, for good
     SETTLING = "settling"  # the vehicle lands by itself
     DONE = "done"  # disarmed after all: nothing is sent, for good
@@ -44,7 +45,8 @@ class HandoverEvent(StrEnum):
     LEFT = "left"  # found armed, and a daemon before this one ended while it had it
     DISARMED = "disarmed"
     FAILSAFE = "failsafe"  # armed, in a mode that a failsafe of its own has chosen, on a flight that we began
-    OTHER = "other"  # armed, in a mode that is none of ours: the pilot's, or on the pilot's flight a failsafe's
+    UNCLEAR = "unclear"  # in a mode that is none of ours, and nothing shows who has chosen it
+    OTHER = "other"  # in a mode that is none of ours: a person's, or on the pilot's flight a failsafe's
     EXTERNAL = "external"  # armed, in the external mode
     PENDING = "pending"  # what was asked for is not there yet
 
@@ -73,6 +75,7 @@ _G, _B, _E, _X, _L = (
     HandoverState.LANDING,
 )
 _S, _D, _F, _V = HandoverState.SETTLING, HandoverState.DONE, HandoverState.FAILED, HandoverState.FAILSAFE
+_U = HandoverState.UNCLEAR
 _NOTHING, _NEUTRAL, _FLY = Sending.NOTHING, Sending.NEUTRAL, Sending.SETPOINTS
 
 # What is not here changes nothing, and nothing is sent.
@@ -97,6 +100,8 @@ _CHANGES: dict[HandoverState, dict[HandoverEvent, Target]] = {
         HandoverEvent.REBOOT: (_F, _NOTHING),
         HandoverEvent.LAND: (_D, _NOTHING),  # it stands on the ground, disarmed
         HandoverEvent.REFUSED: (_F, _NOTHING),
+        HandoverEvent.FAILSAFE: (_X, _NOTHING),  # on the ground, disarmed
+        HandoverEvent.UNCLEAR: (_U, _NOTHING),
         HandoverEvent.OTHER: (_X, _NOTHING),
         HandoverEvent.GRANTED: (_A, _NEUTRAL),
         HandoverEvent.PENDING: (_M, _NEUTRAL),
@@ -106,6 +111,7 @@ _CHANGES: dict[HandoverState, dict[HandoverEvent, Target]] = {
         HandoverEvent.LAND: (_L, _NOTHING),  # arming may have been granted, and starts PX4's climb
         HandoverEvent.REFUSED: (_F, _NOTHING),
         HandoverEvent.FAILSAFE: (_V, _NOTHING),
+        HandoverEvent.UNCLEAR: (_U, _NOTHING),
         HandoverEvent.OTHER: (_X, _NOTHING),
         HandoverEvent.GRANTED: (_C, _NEUTRAL),
         HandoverEvent.PENDING: (_A, _NEUTRAL),
@@ -117,6 +123,7 @@ _CHANGES: dict[HandoverState, dict[HandoverEvent, Target]] = {
         HandoverEvent.REFUSED: (_L, _NOTHING),
         HandoverEvent.DISARMED: (_F, _NOTHING),
         HandoverEvent.FAILSAFE: (_V, _NOTHING),
+        HandoverEvent.UNCLEAR: (_U, _NOTHING),
         HandoverEvent.OTHER: (_X, _NOTHING),
         HandoverEvent.GRANTED: (_G, _NEUTRAL),
         HandoverEvent.PENDING: (_C, _NEUTRAL),
@@ -128,6 +135,7 @@ _CHANGES: dict[HandoverState, dict[HandoverEvent, Target]] = {
         HandoverEvent.REFUSED: (_L, _NOTHING),
         HandoverEvent.DISARMED: (_F, _NOTHING),
         HandoverEvent.FAILSAFE: (_V, _NOTHING),
+        HandoverEvent.UNCLEAR: (_U, _NOTHING),
         HandoverEvent.OTHER: (_X, _NOTHING),
         HandoverEvent.GRANTED: (_E, _FLY),
         HandoverEvent.PENDING: (_G, _NEUTRAL),
@@ -137,6 +145,8 @@ _CHANGES: dict[HandoverState, dict[HandoverEvent, Target]] = {
         HandoverEvent.LAND: (_X, _NOTHING),  # the pilot flies still
         HandoverEvent.REFUSED: (_X, _NOTHING),
         HandoverEvent.DISARMED: (_D, _NOTHING),
+        HandoverEvent.FAILSAFE: (_V, _NOTHING),
+        HandoverEvent.UNCLEAR: (_U, _NOTHING),
         HandoverEvent.OTHER: (_X, _NOTHING),
         HandoverEvent.GRANTED: (_E, _FLY),
         HandoverEvent.PENDING: (_B, _NEUTRAL),
@@ -150,6 +160,7 @@ _CHANGES: dict[HandoverState, dict[HandoverEvent, Target]] = {
         ),  # the controller brakes and holds, for a while: the vehicle may hear us still
         HandoverEvent.DISARMED: (_D, _NOTHING),
         HandoverEvent.FAILSAFE: (_V, _NOTHING),
+        HandoverEvent.UNCLEAR: (_U, _NOTHING),
         HandoverEvent.OTHER: (_X, _NOTHING),
         HandoverEvent.EXTERNAL: (_E, _FLY),
     },
@@ -160,12 +171,23 @@ _CHANGES: dict[HandoverState, dict[HandoverEvent, Target]] = {
         HandoverEvent.REFUSED: (_L, _NOTHING),
         HandoverEvent.ENGAGE: (_G, _NEUTRAL),
         HandoverEvent.DISARMED: (_D, _NOTHING),
+        HandoverEvent.UNCLEAR: (_U, _NOTHING),
+        HandoverEvent.OTHER: (_X, _NOTHING),
+    },
+    _U: {
+        HandoverEvent.REBOOT: (_X, _NOTHING),
+        HandoverEvent.LAND: (_L, _NOTHING),  # the operator's order
+        HandoverEvent.REFUSED: (_L, _NOTHING),  # it flies by itself, and nobody has shown in time that he has it
+        HandoverEvent.ENGAGE: (_B, _NEUTRAL),
+        HandoverEvent.DISARMED: (_D, _NOTHING),
+        HandoverEvent.FAILSAFE: (_V, _NOTHING),
         HandoverEvent.OTHER: (_X, _NOTHING),
     },
     _X: {HandoverEvent.ENGAGE: (_B, _NEUTRAL), HandoverEvent.DISARMED: (_D, _NOTHING)},
     _L: {
         HandoverEvent.REFUSED: (_F, _NOTHING),
         HandoverEvent.DISARMED: (_D, _NOTHING),
+        HandoverEvent.UNCLEAR: (_X, _NOTHING),
         HandoverEvent.OTHER: (_X, _NOTHING),
         HandoverEvent.GRANTED: (_S, _NOTHING),
     },
@@ -173,6 +195,7 @@ _CHANGES: dict[HandoverState, dict[HandoverEvent, Target]] = {
         HandoverEvent.REFUSED: (_F, _NOTHING),
         HandoverEvent.DISARMED: (_D, _NOTHING),
         HandoverEvent.FAILSAFE: (_L, _NOTHING),  # it only seemed to land for us: its climb goes on
+        HandoverEvent.UNCLEAR: (_X, _NOTHING),
         HandoverEvent.OTHER: (_X, _NOTHING),
     },
     _D: {},

@@ -57,9 +57,29 @@ class Landed(Message, frozen=True, kw_only=True):
 
 
 class Battery(Message, frozen=True, kw_only=True):
-    """SYS_STATUS or BATTERY_STATUS with a voltage [V]."""
+    """SYS_STATUS or BATTERY_STATUS."""
 
-    voltage_v: float
+    voltage_v: float | None  # None if it is not measured
+    radio: bool | None = None  # a remote control is heard; None if the message does not tell
+    fenced: bool = True  # it is not beyond a fence of its own
+
+
+class FenceBreach(Message, frozen=True, kw_only=True):
+    """FENCE_STATUS."""
+
+    breached: bool  # it is beyond a fence of its own
+
+
+class RadioChannels(Message, frozen=True, kw_only=True):
+    """RC_CHANNELS or RC_CHANNELS_RAW."""
+
+    channels_us: tuple[int, ...]  # pulse of each channel, from the first [µs]; 0 where there is none
+
+
+class ModeOrder(Message, frozen=True, kw_only=True):
+    """SET_MODE or COMMAND_LONG that changes the mode, from whomever."""
+
+    target_system: int
 
 
 class Text(Message, frozen=True, kw_only=True):

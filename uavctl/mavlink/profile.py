@@ -8,31 +8,49 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import Enum
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-# PX4: custom_mode is reserved (16 bits), main mode (8), sub mode (8); src/modules/commander/px4_custom_mode.h
+
+class ModeChoice(Enum):
+    """Who can have chosen a mode of an autopilot."""
+
+    PERSON = "a person, with a stick or at a ground station"  # also what the autopilot gives such a person back to
+    EITHER = "a person, or a failsafe"  # it flies by itself
+    FAILSAFE = "a failsafe only"
+
+
+_P, _E, _F = ModeChoice.PERSON, ModeChoice.EITHER, ModeChoice.FAILSAFE
+# PX4: custom_mode is reserved (16 bits), main mode (8), sub mode (8). Main modes: src/modules/commander/
+# px4_custom_mode.h; who chooses them: src/modules/commander/failsafe/failsafe.cpp.
 _PX4_MAIN = {
-    1: "MANUAL",
-    2: "ALTCTL",
-    3: "POSCTL",
-    4: "AUTO",
-    5: "ACRO",
-    6: "OFFBOARD",
-    7: "STABILIZED",
-    8: "RATTITUDE",
-    9: "SIMPLE",
-    10: "TERMINATION",
+    1: ("MANUAL", _P),
+    2: ("ALTCTL", _P),
+    3: ("POSCTL", _P),
+    4: ("AUTO", _P),
+    5: ("ACRO", _P),
+    6: ("OFFBOARD", _P),
+    7: ("STABILIZED", _P),
+    8: ("RATTITUDE", _P),
+    9: ("SIMPLE", _P),
+    10: ("TERMINATION", _F),
+    11: ("ALTITUDE_CRUISE", _P),
 }
 _PX4_AUTO = {
-    1: "READY",
-    2: "TAKEOFF",
-    3: "LOITER",
-    4: "MISSION",
-    5: "RTL",
-    6: "LAND",
-    8: "FOLLOW_TARGET",
-    9: "PRECLAND",
+    1: ("READY", _P),
+    2: ("TAKEOFF", _P),
+    3: ("LOITER", _E),
+    4: ("MISSION", _P),
+    5: ("RTL", _E),
+    6: ("LAND", _E),
+    7: ("RTGS", _E),  # of old versions: back to the ground station
+    8: ("FOLLOW_TARGET", _P),
+    9: ("PRECLAND", _E),
+    10: ("VTOL_TAKEOFF", _P),
+    **{10 + number: (f"EXTERNAL{number}", _P) for number in range(1, 9)},
+    19: ("GUIDED_COURSE", _P),
+    20: ("DESCEND", _F),  # recorded: down without a position
 }
 _COPTER_TYPES = frozenset(
     {
@@ -46,19 +64,26 @@ _COPTER_TYPES = frozenset(
         mavlink.MAV_TYPE_DECAROTOR,
     }
 )
-# ArduCopter: enum COPTER_MODE
+# ArduCopter: enum COPTER_MODE; who chooses them: ArduCopter/events.cpp, fence.cpp, avoidance_adsb.cpp.
 _COPTER = {
     int(getattr(mavlink, name)): name.removeprefix("COPTER_MODE_")
     for name in dir(mavlink)
     if name.startswith("COPTER_MODE_") and name != "COPTER_MODE_ENUM_END"
 }
+_COPTER_EITHER = frozenset({"AUTO", "AUTO_RTL", "AUTOROTATE", "BRAKE", "LAND", "RTL", "SMART_RTL"})
+_PX4_CHOICES = {name: choice for name, choice in _PX4_MAIN.values() if name != "AUTO"} | {
+    f"AUTO.{name}": choice for name, choice in _PX4_AUTO.values()
+}
+_COPTER_CHOICES = {name: _E if name in _COPTER_EITHER else _P for name in _COPTER.values()} | {"AVOID_ADSB": _F}
 
 
 def _px4_mode(vehicle_type: int, custom_mode: int) -> str:
     del vehicle_type
     main, sub = custom_mode >> 16 & 0xFF, custom_mode >> 24 & 0xFF
-    name = _PX4_MAIN.get(main, f"MODE_{main}")
-    return f"AUTO.{_PX4_AUTO.get(sub, sub)}" if name == "AUTO" else name
+    name = _PX4_MAIN[main][0] if main in _PX4_MAIN else f"MODE_{main}"
+    if name != "AUTO":
+        return name
+    return f"AUTO.{_PX4_AUTO[sub][0] if sub in _PX4_AUTO else sub}"
 
 
 def _copter_mode(vehicle_type: int, custom_mode: int) -> str:
@@ -73,8 +98,11 @@ class AutopilotProfile:
     take_off: str  # the mode that take-off begins in, asked for on the ground
     climbing: frozenset[str]  # modes that it is in during its own climb and right after
     landing: frozenset[str]  # modes in which it lands by itself
-    failsafes: frozenset[str]  # modes that its own failsafes choose
-    returns: bool  # A failsafe that ends gives back the mode of before; else its mode stays
+    choices: dict[str, ModeChoice]  # its modes, and who can have chosen each
+    # Modes of a person that a failsafe chooses all the same where the one of before cannot go on
+    degrades: frozenset[str]
+    # A failsafe that ends gives back the mode of before, and ends what the vehicle says of it; else its mode stays
+    returns: bool
     # Arming in `take_off` starts the climb, to a height of its own; else MAV_CMD_NAV_TAKEOFF does, to a height above
     # the place of arming
     climbs_on_arming: bool
@@ -94,8 +122,9 @@ PROFILES = {
         external="OFFBOARD",
         take_off="AUTO.TAKEOFF",
         climbing=frozenset({"AUTO.TAKEOFF", "AUTO.LOITER"}),
-        landing=frozenset({"AUTO.LAND", "AUTO.PRECLAND"}),
-        failsafes=frozenset({"AUTO.LAND", "AUTO.LOITER", "AUTO.RTL"}),
+        landing=frozenset({"AUTO.LAND", "AUTO.PRECLAND", "AUTO.DESCEND"}),
+        choices=_PX4_CHOICES,
+        degrades=frozenset({"POSCTL", "ALTCTL", "STABILIZED", "MANUAL"}),  # COM_OBL_RC_ACT 0 to 2, COM_POSCTL_NAVL
         returns=True,
         climbs_on_arming=True,
         reads_raw=False,
@@ -112,7 +141,8 @@ PROFILES = {
         take_off="GUIDED",
         climbing=frozenset({"GUIDED"}),
         landing=frozenset({"LAND"}),
-        failsafes=frozenset({"LAND", "RTL", "SMART_RTL", "BRAKE"}),
+        choices=_COPTER_CHOICES,
+        degrades=frozenset({"ALT_HOLD", "LOITER"}),  # FS_EKF_ACTION 2, and where BRAKE ends
         returns=False,
         climbs_on_arming=False,
         reads_raw=True,

@@ -9,8 +9,23 @@ import msgspec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.frames import Quaternion, from_euler, rotate
-from uavctl.mavlink.messages import Ack, Attitude, Battery, Heartbeat, Inertial, Landed, Message, Position, Text
+from uavctl.mavlink.codec import MODE_COMMANDS
+from uavctl.mavlink.messages import (
+    Ack,
+    Attitude,
+    Battery,
+    FenceBreach,
+    Heartbeat,
+    Inertial,
+    Landed,
+    Message,
+    ModeOrder,
+    Position,
+    RadioChannels,
+    Text,
+)
 from uavctl.mavlink.profile import PROFILES, autopilot_name, describe_mode
+from uavctl.mavlink.switcher import speaks_of_failsafe, speaks_of_fence, speaks_of_radio
 from uavctl.records import Event, InertialSample, Severity, Vec3, VehicleMotion, VehicleStatus
 
 # A vehicle's time since boot: how long it has been up, and whether it has started anew. Pure: time is an argument.
@@ -157,6 +172,67 @@ def _plain(first: Text, text: str) -> Text:
     return Text(system=first.system, component=first.component, severity=first.severity, text=text.rstrip())
 
 
+class Evidence:
+    """What the vehicle says, and shows, of who changes its modes: each counts for `EVIDENCE_NS`."""
+
+    def __init__(self) -> None:
+        self._failsafe_ns = self._fence_ns = self._said_ns = self._stick_ns = self._station_ns = -EVIDENCE_NS
+        self._said = ""
+        self._station = 0
+        self._rest_us: list[int] = []  # of each channel, since it moved last; 0: not known
+        self._radio = False
+        self._fenced = True
+
+    def word(self, text: str, at_ns: int) -> None:
+        """Take a text, of any severity."""
+        fence, failsafe = speaks_of_fence(text), speaks_of_failsafe(text)
+        if fence or failsafe:
+            self._said, self._said_ns = text, at_ns
+        if fence:
+            self._fence_ns = at_ns
+        if failsafe:
+            self._failsafe_ns = at_ns
+        elif "failsafe" in text.lower() and "clear" in text.lower():
+            self._failsafe_ns = at_ns - EVIDENCE_NS
+
+    def fence(self, at_ns: int, *, within: bool) -> None:
+        """Take whether it is within its fence; that it comes beyond it counts."""
+        if self._fenced and not within:
+            self._fence_ns = at_ns
+        self._fenced = within
+
+    def radio(self, *, heard: bool) -> None:
+        """Take whether a remote control is heard."""
+        self._radio = heard
+
+    def channels(self, pulses_us: tuple[int, ...], at_ns: int) -> None:
+        """Take the channels of a remote control."""
+        if len(pulses_us) != len(self._rest_us):
+            self._rest_us = [0] * len(pulses_us)
+        for i, pulse in enumerate(pulses_us):
+            rest = self._rest_us[i]
+            if not rest or abs(pulse - rest) >= STICK_US:
+                self._rest_us[i] = pulse
+                self._stick_ns = at_ns if rest and pulse else self._stick_ns
+
+    def ordered(self, station: int, at_ns: int) -> None:
+        """Take an order of a mode that another than us has given."""
+        self._station, self._station_ns = station, at_ns
+
+    def on(self, status: VehicleStatus, at_ns: int, *, critical: bool) -> VehicleStatus:
+        """Return a status with what counts at a time; `critical`: by its heartbeat a failsafe acts."""
+        said = self._said if at_ns - self._said_ns < EVIDENCE_NS else ""
+        return msgspec.structs.replace(
+            status,
+            failsafe=critical or at_ns - self._failsafe_ns < EVIDENCE_NS,
+            fence=at_ns - self._fence_ns < EVIDENCE_NS,
+            said=said,
+            stick=at_ns - self._stick_ns < EVIDENCE_NS and not speaks_of_radio(said),
+            radio=self._radio,
+            station=self._station if at_ns - self._station_ns < EVIDENCE_NS else 0,
+        )
+
+
 # The vehicle as its messages tell: status, and its own words.
 
 
@@ -165,7 +241,9 @@ UNPUNCTUAL = "inertial-not-of-now"  # late, repeated, or frozen
 ALONE_NS = 5_000_000_000  # after that time of silence another vehicle counts as gone
 GONE_NS = 30_000_000_000  # and after that one its place is taken, if it stood on the ground
 BOOTING_NS = 3_000_000_000  # of silence before a heartbeat of booting, for that to be a restart
-FAILSAFE_NS = 2_000_000_000  # for which a word of a failsafe speaks for the modes that are shown
+# For which what it says of failsafes, fences and sticks speaks for its mode: heartbeats come once a second.
+EVIDENCE_NS = 2_000_000_000
+STICK_US = 100  # by which a channel of a remote control moves at least when a person moves it: a tenth of its way
 TURNED_NS = 100_000_000  # an attitude that is older turns no specific force: at 1 rad/s it is 0.1 rad, 1 m/s², off
 GRAVITY_MPS2 = 9.80665
 LATE_NS = 60_000_000  # later than the quickest: a stream of 50 Hz is 20 ms apart
@@ -240,7 +318,8 @@ class VehicleWatch:
         self._clock = BootClock()
         self._ready = False  # by its last heartbeat
         self._heard_ns = 0  # any word of it
-        self._failsafe_ns: int | None = None  # when it said that a failsafe acts
+        self._evidence = Evidence()
+        self._critical = False  # by its last heartbeat
         self._another_ns: int | None = None  # when another vehicle was heard last
         self._status: VehicleStatus | None = None
         self._motion = VehicleMotion()
@@ -266,14 +345,27 @@ class VehicleWatch:
         """Take any message; only the vehicle's count."""
         if isinstance(message, Heartbeat) and is_vehicle(message):
             return self._heartbeat(message, at_ns)
+        if isinstance(message, ModeOrder):
+            return self._is_ordered(message.system, message.target_system, at_ns)
         if self.address is None or message.system != self.address[0]:
             return ()
         self._heard_ns = at_ns
         match message:
             case Landed(landed=landed, own_climb=own_climb):
                 return self._phase(landed, own_climb)
-            case Battery(voltage_v=voltage_v):
-                self._battery_v = voltage_v
+            case Battery():
+                self._battery_v = self._battery_v if message.voltage_v is None else message.voltage_v
+                if message.radio is None or message.component != self.address[1]:
+                    return ()
+                self._evidence.radio(heard=message.radio)
+                self._evidence.fence(at_ns, within=message.fenced)
+                return self._proves(at_ns)
+            case FenceBreach(breached=breached):
+                self._evidence.fence(at_ns, within=not breached)
+                return self._proves(at_ns)
+            case RadioChannels(channels_us=channels_us) if message.component == self.address[1]:
+                self._evidence.channels(channels_us, at_ns)
+                return self._proves(at_ns)
             case Position(boot_ms=True, stamp_us=int(stamp_us)) if message.component == self.address[1]:
                 anew = self._tells_time("position", stamp_us, at_ns)
                 return (*anew, *self._moves(at_ns, velocity=message.velocity_mps))
@@ -289,12 +381,28 @@ class VehicleWatch:
                 known = PROFILES.get(self.autopilot)
                 return self._accelerates(message, at_ns) if not raw or (known and known.reads_raw) else ()
             case Text(severity=severity, text=text):
-                if "failsafe" in text.lower():
-                    self._failsafe_ns = None if "clear" in text.lower() else at_ns
-                return message, Event(at_ns=at_ns, severity=_severity(severity), code="vehicle-text", text=text)
+                event = Event(at_ns=at_ns, severity=_severity(severity), code="vehicle-text", text=text)
+                self._evidence.word(text, at_ns)
+                return message, event, *self._proves(at_ns)
             case Ack() if self._is_ours(message):
                 return (message,) if message.command in _ROUTINE else (message, _ack_event(message, at_ns))
+            case Ack(command=command, result=mavlink.MAV_RESULT_ACCEPTED) if command in MODE_COMMANDS:
+                return self._is_ordered(message.target_system, message.system, at_ns)
         return ()
+
+    def _is_ordered(self, station: int, target: int, at_ns: int) -> tuple[VehicleStatus, ...]:
+        """Take note that somebody orders a mode of a vehicle; only others' orders of this one count."""
+        if self.address is None or target not in (0, self.address[0]) or station in (self._own[0], self.address[0]):
+            return ()
+        self._evidence.ordered(station, at_ns)
+        return self._proves(at_ns)
+
+    def _proves(self, at_ns: int) -> tuple[VehicleStatus, ...]:
+        """Return a status at once where there is new evidence of who has changed its mode."""
+        if self._status is None:
+            return ()
+        before, self._status = self._status, self._evidence.on(self._status, at_ns, critical=self._critical)
+        return () if self._status == before else (self._status,)
 
     def _is_ours(self, ack: Ack) -> bool:
         system, component = self._own
@@ -361,14 +469,11 @@ class VehicleWatch:
     def _reboot(self) -> tuple[VehicleStatus, ...]:
         self.boots += 1
         self._punctual, self._turned = {}, None
-        self._landed = self._failsafe_ns = None
+        self._landed, self._evidence = None, Evidence()
         if self._status is None:
             return ()
         self._status = msgspec.structs.replace(self._status, boots=self.boots)
         return (self._status,)
-
-    def _has_told_of_failsafe(self, at_ns: int) -> bool:
-        return self._failsafe_ns is not None and at_ns - self._failsafe_ns <= FAILSAFE_NS
 
     def _has_gone(self, at_ns: int) -> bool:
         """Whether the vehicle that is followed is silent and was on the ground: nothing of ours can be flying it."""
@@ -404,7 +509,8 @@ class VehicleWatch:
         self._ready = ready
         autopilot = autopilot_name(message.autopilot)
         mode, external = describe_mode(autopilot, message.vehicle_type, message.custom_mode)
-        self._status = VehicleStatus(
+        self._critical = message.system_status in _IN_FAILSAFE
+        status = VehicleStatus(
             at_ns=at_ns,
             autopilot=autopilot,
             armed=bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED),
@@ -415,8 +521,8 @@ class VehicleWatch:
             battery_v=self._battery_v,
             boots=self.boots,
             alone=self._another_ns is None or at_ns - self._another_ns > ALONE_NS,
-            failsafe=message.system_status in _IN_FAILSAFE or self._has_told_of_failsafe(at_ns),
         )
+        self._status = self._evidence.on(status, at_ns, critical=self._critical)
         return (self._status,)
 
 

@@ -1,0 +1,280 @@
+"""Who has changed the vehicle's mode: the table of modes, what the vehicle says, and what the hand-over does then."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import pytest
+from hand_over_rig import ENGAGE, LAND, NOTHING, Rig
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from uavctl.config.connections import HandOverConfig
+from uavctl.mavlink.handover_states import HandoverState
+from uavctl.mavlink.messages import Ack, FenceBreach, Heartbeat, RadioChannels, Text
+from uavctl.mavlink.profile import PROFILES, describe_mode
+from uavctl.mavlink.requests import RequestKind
+from uavctl.mavlink.switcher import Switcher, who_switched
+from uavctl.mavlink.vehicle import VehicleWatch
+from uavctl.records import VehicleStatus
+
+SECOND = 1_000_000_000
+BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+EXTERNAL = {"px4": "OFFBOARD", "ardupilot": "GUIDED"}
+NUMBER = {"px4": mavlink.MAV_AUTOPILOT_PX4, "ardupilot": mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA}
+
+
+def px4(main: int, sub: int = 0) -> int:
+    return main << 16 | sub << 24
+
+
+def test_every_mode_of_both_autopilots_has_its_name_and_who_can_have_chosen_it() -> None:
+    numbers = {
+        "px4": [px4(main) for main in (1, 2, 3, 5, 6, 7, 8, 9, 10, 11)] + [px4(4, sub) for sub in range(1, 21)],
+        "ardupilot": [n for n in range(29) if n not in (8, 10, 12)],
+    }
+    for autopilot, all_of_it in numbers.items():
+        names = [describe_mode(autopilot, mavlink.MAV_TYPE_QUADROTOR, number)[0] for number in all_of_it]
+        assert set(names) == set(PROFILES[autopilot].choices)
+    assert describe_mode("px4", 2, px4(4, 20))[0] == "AUTO.DESCEND"
+    assert describe_mode("px4", 2, px4(4, 33))[0] not in PROFILES["px4"].choices
+
+
+def status(mode: str, autopilot: str, **said: object) -> VehicleStatus:
+    return VehicleStatus(at_ns=0, autopilot=autopilot, armed=True, mode=mode, external=False, **said)  # type: ignore[arg-type]
+
+
+@pytest.mark.fault(25, 28)
+@pytest.mark.parametrize(
+    ("autopilot", "mode", "said", "who"),
+    [
+        ("px4", "AUTO.DESCEND", {}, Switcher.FAILSAFE),
+        ("px4", "TERMINATION", {"radio": True}, Switcher.FAILSAFE),
+        ("px4", "AUTO.DESCEND", {"stick": True}, Switcher.FAILSAFE),
+        ("px4", "AUTO.RTL", {"failsafe": True, "radio": True}, Switcher.FAILSAFE),
+        ("px4", "AUTO.RTL", {"fence": True, "failsafe": True}, Switcher.FENCE),
+        ("px4", "AUTO.LOITER", {"radio": True}, Switcher.UNKNOWN),
+        ("px4", "AUTO.LOITER", {"radio": True, "stick": True}, Switcher.PILOT),
+        ("px4", "AUTO.LOITER", {"station": 255}, Switcher.GROUND_STATION),
+        ("px4", "AUTO.21", {"radio": True}, Switcher.UNKNOWN),
+        ("px4", "AUTO.21", {"failsafe": True}, Switcher.FAILSAFE),
+        ("px4", "POSCTL", {"radio": True}, Switcher.PILOT),
+        ("px4", "POSCTL", {}, Switcher.UNKNOWN),
+        ("px4", "POSCTL", {"failsafe": True, "radio": True}, Switcher.FAILSAFE),  # COM_OBL_RC_ACT 0
+        ("px4", "POSCTL", {"failsafe": True, "stick": True}, Switcher.PILOT),
+        ("px4", "ACRO", {"failsafe": True, "radio": True}, Switcher.PILOT),
+        ("ardupilot", "RTL", {"radio": True}, Switcher.UNKNOWN),
+        ("ardupilot", "RTL", {"radio": True, "fence": True, "said": "Max Alt fence breached"}, Switcher.FENCE),
+        ("ardupilot", "BRAKE", {"stick": True}, Switcher.PILOT),
+        ("ardupilot", "AVOID_ADSB", {"radio": True}, Switcher.FAILSAFE),
+        ("ardupilot", "LOITER", {"radio": True}, Switcher.PILOT),
+        ("ardupilot", "LOITER", {"radio": True, "failsafe": True}, Switcher.PILOT),  # it says so of before
+        ("ardupilot", "ALT_HOLD", {"radio": True, "failsafe": True, "said": "EKF Failsafe"}, Switcher.FAILSAFE),
+        ("ardupilot", "LAND", {"stick": True, "failsafe": True}, Switcher.UNKNOWN),
+        ("ardupilot", "MODE_77", {"radio": True}, Switcher.UNKNOWN),
+    ],
+)
+def test_who_it_was(autopilot: str, mode: str, said: dict[str, object], who: Switcher) -> None:
+    assert who_switched(status(mode, autopilot, **said)) is who
+
+
+def test_who_takes_over_from_a_failsafe_by_stick_is_the_pilot() -> None:
+    shown = status("POSCTL", "px4", failsafe=True, radio=True, said="Failsafe activated")
+    assert who_switched(shown, had_failed=True) is Switcher.PILOT
+
+
+# From messages
+
+
+class Vehicle:
+    """A vehicle's words to the watch."""
+
+    def __init__(self, autopilot: str) -> None:
+        self.watch = VehicleWatch(lambda _: None, (245, 25))
+        self.autopilot, self.now_ns = autopilot, 100 * SECOND
+        self.status: VehicleStatus | None = None
+        self.beat(EXTERNAL_NUMBER[autopilot])
+
+    def say(self, message: Ack | FenceBreach | Heartbeat | RadioChannels | Text) -> None:
+        for item in self.watch.take(message, self.now_ns):
+            self.status = item if isinstance(item, VehicleStatus) else self.status
+
+    def beat(self, mode: int) -> None:
+        self.say(
+            Heartbeat(
+                system=1,
+                component=1,
+                vehicle_type=mavlink.MAV_TYPE_QUADROTOR,
+                autopilot=NUMBER[self.autopilot],
+                base_mode=128,
+                custom_mode=mode,
+                system_status=mavlink.MAV_STATE_ACTIVE,
+            )
+        )
+
+    def text(self, text: str, severity: int = 6) -> None:
+        self.say(Text(system=1, component=1, severity=severity, text=text))
+
+    def channels(self, *pulses_us: int) -> None:
+        self.say(RadioChannels(system=1, component=1, channels_us=pulses_us))
+
+    @property
+    def who(self) -> Switcher:
+        assert self.status is not None
+        return who_switched(self.status)
+
+
+EXTERNAL_NUMBER = {"px4": px4(6), "ardupilot": 4}
+HOME = {"px4": px4(4, 5), "ardupilot": 6}
+
+
+@BOTH
+@pytest.mark.parametrize("severity", range(8))
+@pytest.mark.parametrize("late", [False, True])
+@pytest.mark.parametrize(
+    ("text", "who"),
+    [
+        ("Max Alt fence breached", Switcher.FENCE),
+        ("Circle fence breached", Switcher.FENCE),
+        ("Geofence violation", Switcher.FENCE),
+        ("Radio Failsafe", Switcher.FAILSAFE),
+        ("Battery Failsafe", Switcher.FAILSAFE),
+        ("Failsafe: Terrain data missing", Switcher.FAILSAFE),
+        ("Fence breach cleared", Switcher.UNKNOWN),
+        ("EKF Failsafe Cleared", Switcher.UNKNOWN),
+        ("PreArm: Radio failsafe on", Switcher.UNKNOWN),
+        ("Takeoff detected", Switcher.UNKNOWN),
+    ],
+)
+def test_its_own_words_of_any_severity_before_and_after_the_mode(
+    autopilot: str, severity: int, late: bool, text: str, who: Switcher
+) -> None:
+    vehicle = Vehicle(autopilot)
+    if not late:
+        vehicle.text(text, severity)
+    vehicle.now_ns += SECOND // 10
+    vehicle.beat(HOME[autopilot])
+    if late:
+        vehicle.text(text, severity)
+    assert vehicle.who is who
+    vehicle.now_ns += 3 * SECOND
+    vehicle.beat(HOME[autopilot])
+    assert vehicle.who is Switcher.UNKNOWN  # that was another time
+
+
+@BOTH
+def test_a_switch_of_the_remote_control_is_the_pilot_s_and_a_hand_that_rests_is_not(autopilot: str) -> None:
+    vehicle = Vehicle(autopilot)
+    vehicle.channels(1500, 1500, 1500, 1500, 1800)
+    vehicle.channels(1512, 1490, 1500, 1500, 1800)
+    vehicle.beat(HOME[autopilot])
+    assert vehicle.who is Switcher.UNKNOWN
+    vehicle.channels(1512, 1490, 1500, 1500, 1300)
+    assert vehicle.who is Switcher.PILOT
+    vehicle.text("Radio Failsafe")  # its receiver moves them, and nobody's hand
+    assert vehicle.who is Switcher.FAILSAFE
+
+
+def test_a_fence_that_is_told_without_words_and_an_order_of_a_ground_station() -> None:
+    vehicle = Vehicle("ardupilot")
+    vehicle.beat(HOME["ardupilot"])
+    vehicle.say(
+        Ack(system=1, component=1, command=mavlink.MAV_CMD_DO_SET_MODE, result=0, target_system=255, target_component=0)
+    )
+    assert vehicle.who is Switcher.GROUND_STATION
+    vehicle.say(FenceBreach(system=1, component=1, breached=True))
+    assert vehicle.who is Switcher.FENCE
+
+
+# What the hand-over does
+
+
+def engaged(autopilot: str) -> Rig:
+    rig = Rig(autopilot, HandOverConfig(climb_s=10.0)).to(HandoverState.ENGAGING)
+    rig.be(mode=EXTERNAL[autopilot], landed=False)
+    rig.run(1.0, until=HandoverState.ENGAGED)
+    return rig
+
+
+def landings(rig: Rig) -> int:
+    return sum(ask is RequestKind.LAND for _, ask in rig.asked)
+
+
+@pytest.mark.fault(25, 61)
+@BOTH
+def test_unknown_in_a_mode_that_flies_by_itself_is_landed_in_bounded_time_unless_a_stick_moves(autopilot: str) -> None:
+    home = "AUTO.RTL" if autopilot == "px4" else "RTL"
+    rig = engaged(autopilot)
+    rig.be(mode=home)
+    rig.run(9.0)
+    assert rig.is_in(HandoverState.UNCLEAR) and not landings(rig) and rig.hand_over.busy
+    rig.run(2.0)
+    assert landings(rig)
+    pilots = engaged(autopilot)
+    pilots.be(mode=home)
+    pilots.run(5.0)
+    pilots.be(stick=True)
+    pilots.run(60.0)
+    assert pilots.is_in(HandoverState.RELEASED) and not landings(pilots)
+
+
+@pytest.mark.fault(28, 61)
+def test_word_of_the_fence_that_comes_after_its_mode_counts() -> None:
+    rig = engaged("ardupilot")
+    rig.be(mode="RTL")
+    rig.tick()
+    rig.be(fence=True, said="Max Alt fence breached")
+    rig.tick()
+    assert rig.is_in(HandoverState.FAILSAFE) and "Max Alt fence breached" in rig.codes("hand-over")[-1]
+    rig.be(fence=False, said="", mode="LAND", failsafe=True)
+    rig.run(3.0)
+    assert rig.is_in(HandoverState.FAILSAFE) and not landings(rig)
+
+
+@pytest.mark.fault(28, 61)
+def test_px4_s_descend_while_landing_is_asked_for_is_a_landing() -> None:
+    rig = engaged("px4")
+    rig.tick(land=True)
+    rig.tick(land=False)
+    rig.be(mode="AUTO.DESCEND", failsafe=True)
+    rig.run(3.0)
+    assert rig.is_in(HandoverState.LANDING) and landings(rig) > 1  # not for us: it is asked on
+    rig.answer(0, RequestKind.LAND)
+    assert rig.is_in(HandoverState.SETTLING)
+    rig.be(armed=False, mode="OFFBOARD", failsafe=False)
+    rig.tick()
+    assert rig.is_in(HandoverState.DONE)
+
+
+@pytest.mark.fault(25)
+@BOTH
+def test_whoever_it_was_nothing_flies_it_and_by_order_only_is_it_asked_for(autopilot: str) -> None:
+    """Every mode that is none of ours, in every state of a flight, with and without each kind of word."""
+    profile = PROFILES[autopilot]
+    states = (HandoverState.CLIMBING, HandoverState.ENGAGING, HandoverState.ENGAGED)
+    modes = [*sorted(set(profile.choices) - {profile.external} - profile.climbing), "MODE_99"]
+    words = ({}, {"failsafe": True}, {"fence": True, "said": "Circle fence breached"})
+    for state, mode, stick, said in product(states, modes, (False, True), words):
+        rig = engaged(autopilot) if state is HandoverState.ENGAGED else Rig(autopilot).to(state)
+        asked = len(rig.asked)
+        rig.be(mode=mode, stick=stick, landed=False, **said)
+        sent = {rig.tick().sending for _ in range(80)}
+        assert sent == {NOTHING} and len(rig.asked) == asked, (state, mode, stick, said)
+        assert rig.is_in(HandoverState.RELEASED, HandoverState.FAILSAFE, HandoverState.UNCLEAR), (
+            rig.state,
+            state,
+            mode,
+            stick,
+            said,
+            rig.codes("hand-over"),
+        )
+
+
+def test_the_operator_s_orders_count_while_it_is_unknown() -> None:
+    rig = Rig("px4").to(HandoverState.UNCLEAR)
+    rig.be(landed=False)
+    rig.tick(commands=(LAND,))
+    assert rig.is_in(HandoverState.LANDING)
+    rig = Rig("px4").to(HandoverState.UNCLEAR)
+    rig.be(landed=False)
+    rig.tick(commands=(ENGAGE,))
+    assert rig.is_in(HandoverState.RETURNING)
