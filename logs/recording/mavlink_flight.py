@@ -27,7 +27,7 @@ from logs.recording.tlog import Tlog, TlogPacket, read_tlog
 from uavctl.errors import RecordingError
 from uavctl.mavlink.clocksync import ClockSync
 from uavctl.mavlink.codec import OWN_ESTIMATE, decoded
-from uavctl.mavlink.framing import MessageLayout, scan
+from uavctl.mavlink.framing import MessageLayout, scan_one
 from uavctl.mavlink.messages import Attitude, Battery, Heartbeat, Message, Position, Text
 from uavctl.mavlink.profile import autopilot_name, describe_mode
 from uavctl.mavlink.vehicle import Joiner
@@ -221,7 +221,7 @@ class _Reader:
     def take(self, packet: TlogPacket) -> None:
         """Take one packet."""
         self._last_ns = packet.at_ns
-        found = scan(packet.data, final=True)
+        found = scan_one(packet.data)
         for frame in found.frames:
             system = system_of(frame.data)
             name = f"{mavlink.mavlink_map[frame.message_id].msgname} of system {system}"

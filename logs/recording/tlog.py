@@ -23,7 +23,7 @@ from logs.recording.topics import raw_link
 from uavctl.errors import RecordingError, UsageError
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.connection import STREAM_SCHEMES
-from uavctl.mavlink.framing import scan
+from uavctl.mavlink.framing import scan, scan_one
 from uavctl.records import Decision, Header, LinkStats, PositionSample, Record, Sink, StepInput, to_nobody
 
 # The clock of another program's recording, which may leap, stand still or run back: what that does to its times.
@@ -122,6 +122,8 @@ class SteadyClock:
 GROUND_SYSTEMS = frozenset({245, 255})  # our own system id, and that of ground stations
 _STAMP = struct.Struct(">Q")
 _OLD_STAMP = struct.Struct("<Q")  # as QGroundControl wrote them before 2014
+# A stamp before a frame: its highest byte is zero up to the year 4253
+_LIKELY = {_STAMP: re.compile(b"\0.{7}[\xfd\xfe]", re.DOTALL), _OLD_STAMP: re.compile(b".{7}\0[\xfd\xfe]", re.DOTALL)}
 _STX_V1, _STX_V2 = MARKERS = 0xFE, 0xFD  # first byte of a frame
 _ANY_MARKER = re.compile(b"[\xfd\xfe]")
 _SIGNED = 0x01
@@ -227,7 +229,8 @@ class _Cutter:
                 self.packets.append(packet_of(self.clock.steady(self._stamp_us(at) * 1000), data[begin:end]))
                 at = end
             else:
-                later = min(next_marker(data, begin + 1) - self._stamp.size, len(data) - least + 1)
+                likely = _LIKELY[self._stamp].search(data, at + 1)
+                later = min(len(data) if likely is None else likely.start(), len(data) - least + 1)
                 self.skipped_bytes += later - at
                 at = later
         self.torn_bytes = len(data) - at
@@ -291,7 +294,7 @@ def in_order(packets: list[TlogPacket]) -> tuple[TlogPacket, ...]:
 
 def is_frame(data: bytes) -> bool:
     """Return whether bytes are one frame of a known id with the right checksum."""
-    frames = scan(data, final=True).frames
+    frames = scan_one(data).frames
     return len(frames) == 1 and len(frames[0].data) == len(data)
 
 

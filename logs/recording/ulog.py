@@ -152,7 +152,7 @@ class _Reader:
             },
             notes=(*self._notes, *self._odd()),
             rates_hz={
-                name: (len(at_us) - 1) * 1e6 / (at_us[-1] - at_us[0])
+                name: (len(at_us) - 1) * 1e6 / float(at_us[-1] - at_us[0])
                 for name, at_us in stamps.items()
                 if at_us[-1] > at_us[0]
             },

@@ -169,7 +169,7 @@ def replay_flight(flight: Path, tolerance: float = 0.0, overrides: Sequence[str]
     return Replayed(result, cut, holes, changed, tuple(other_versions(recorded, flown.smpc.controller)), tolerance)
 
 
-def foreign_packets(flight: Path, topics: Sequence[str], system: int | None) -> tuple[TlogPacket, ...] | None:
+def foreign_packets(flight: Path, topics: Sequence[str], system: int | None = None) -> tuple[TlogPacket, ...] | None:
     """Return the packets of another program's recording, None if it is one of ours; say what was left out.
 
     Args:

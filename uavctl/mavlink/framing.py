@@ -137,6 +137,16 @@ def scan(data: bytes, *, final: bool, in_step: bool = True, verify: Verify | Non
     return result
 
 
+def scan_one(data: bytes) -> Scan:
+    """Look at bytes that should be one whole frame; others are not searched for in them."""
+    result = Scan(consumed=0)
+    end, reason = _try_frame(data, result, None, final=True) if data else (None, BadBytes.TRUNCATED)
+    if end is None:
+        result.skip(reason)
+    result.consumed = len(data)
+    return result
+
+
 _TAKEN, _WAIT = "taken", "wait"
 
 
