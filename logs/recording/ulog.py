@@ -40,6 +40,7 @@ _LEAST_FIX = 3  # of `fix_type`: a place in three dimensions
 _LEAST_BYTES = {"D": 2, "L": 9, "C": 11, "A": 4, "R": 2, "O": 2, "P": 1, "Q": 2, "I": 1, "M": 2}  # of messages by type
 _KNOWN_TYPES = frozenset(map(ord, (*_LEAST_BYTES, "F", "S", "B")))
 _LONGEST = 10_000  # of a message of a type that is not known; beyond, it is damage
+_MOST_READ = 20  # times that a damaged file is read over: one that is whole is read once
 _SYNC = ord("S")  # a type of message whose content no reader looks at
 _FLAGS_BYTES = 40
 _ARMED = 2  # of vehicle_status.arming_state
@@ -86,9 +87,25 @@ def _parsed(path: Path, data: bytearray) -> Any:
         raise ExtraMissingError("pyulog", "ulog") from missing
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # it prints its warnings, among our documents
-            return ULog(io.BytesIO(data))
+            return ULog(_BoundedFile(data))
     except (ULogException, ArithmeticError, LookupError, RecursionError, TypeError, ValueError, struct.error) as error:
         raise RecordingError(f"{path}: damaged, or a ULog that pyulog cannot read ({error})") from error
+
+
+class _BoundedFile(io.BytesIO):
+    """A file that ends when it was read over and over: in some damaged files pyulog goes back without end."""
+
+    def __init__(self, data: bytearray) -> None:
+        super().__init__(data)
+        self._reads_left, self._bytes_left = len(data), _MOST_READ * len(data)
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Read bytes; none once each byte was read too often."""
+        if self._reads_left <= 0 or self._bytes_left <= 0:
+            return b""
+        found = super().read(size)
+        self._reads_left, self._bytes_left = self._reads_left - 1, self._bytes_left - len(found)
+        return found
 
 
 def _without_short(data: bytearray) -> tuple[int, int]:

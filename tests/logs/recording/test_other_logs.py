@@ -215,6 +215,17 @@ def test_a_message_without_content_does_not_end_a_ulog(tmp_path: Path, kind: str
     assert len(read_ulog(tmp_path / "a.ulg").attitude_t_s) == 10
 
 
+def test_damage_that_pyulog_reads_without_end_ends(tmp_path: Path) -> None:
+    whole = ulog()
+    at = whole.definitions_bytes
+    # a type that is not known, and longer than the rest of the file
+    (tmp_path / "a.ulg").write_bytes(whole.file[:at] + struct.pack("<Hc", 60_000, b"x") + whole.file[at:])
+    try:
+        assert read_ulog(tmp_path / "a.ulg").info.notes
+    except RecordingError as error:
+        assert "a.ulg" in str(error)
+
+
 @pytest.mark.parametrize(
     ("text", "plain"),
     [
