@@ -1,4 +1,4 @@
-"""Disk under recordings and other outputs: what was written is kept, or whole; names of segments, free space."""
+"""Disk under recordings and other outputs: kinds of files, what was written is kept or whole, segments, free space."""
 
 from __future__ import annotations
 
@@ -8,12 +8,86 @@ import re
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from enum import StrEnum
 from pathlib import Path
 from typing import Protocol
 
 from uavctl.errors import RecordingError, UsageError
 
 MAGIC = b"\x89MCAP0\r\n"  # the first bytes of a recording
+
+# What kind of recording a file is: by its first bytes where they tell, else by its name, in whatever case.
+
+
+ULOG_MAGIC = b"ULog\x01\x12\x35"
+_STAMP_BYTES = 8  # of a `.tlog`, before each packet
+_MARKERS = b"\xfe\xfd"  # first byte of a packet
+_HEAD_BYTES = 16  # as many as tell a kind
+
+
+class FileKind(StrEnum):
+    """Kind of a recording."""
+
+    MCAP = "mcap"  # ours, or one of another program
+    TLOG = "tlog"
+    ULOG = "ulog"
+
+
+_SUFFIXES = {
+    ".mcap": FileKind.MCAP,
+    ".tlog": FileKind.TLOG,
+    ".raw": FileKind.TLOG,  # MAVProxy's `.tlog.raw`: its reader says what it lacks
+    ".rlog": FileKind.TLOG,
+    ".ulg": FileKind.ULOG,
+    ".ulog": FileKind.ULOG,
+}
+_READ_BY = {
+    FileKind.TLOG: "`uavctl log info`, `report` and `replay`, and `uavctl identify` read a .tlog",
+    FileKind.ULOG: "`uavctl log info` and `report` read a ULog; all else needs its MAVLink, as a .tlog",
+}
+_OTHERS = {
+    b"\xa3\x95": "it begins as an ArduPilot's own log does: give the MAVLink of that flight, as a .tlog",
+    b"#ROSBAG": "it is a bag of ROS 1: convert it to MCAP",
+    b"SQLite format 3": "it is a bag of ROS 2 in SQLite: convert it to MCAP",
+    b"\x1f\x8b": "it is packed by gzip: unpack it first",
+    b"\xfd7zXZ\x00": "it is packed by xz: unpack it first",
+    b"PK\x03\x04": "it is packed by zip: unpack it first",
+}
+
+
+def kind_of(path: Path) -> FileKind:
+    """Return the kind of a recording; one that cannot be read, or tells nothing, counts as MCAP."""
+    begin = _begin(path)
+    if begin.startswith(MAGIC):
+        return FileKind.MCAP
+    if begin.startswith(ULOG_MAGIC):
+        return FileKind.ULOG
+    if (named := _SUFFIXES.get(path.suffix.lower())) is not None:
+        return named
+    # Eight bytes of big-endian microseconds begin with a zero up to the year 4253.
+    stamped = len(begin) > _STAMP_BYTES and begin[0] == 0 and begin[_STAMP_BYTES] in _MARKERS
+    return FileKind.TLOG if stamped else FileKind.MCAP
+
+
+def hint_of(path: Path) -> str:
+    """Return what to do with a file that is not of the kind that is asked for, after a semicolon; empty if unknown."""
+    begin = _begin(path)
+    other = next((words for magic, words in _OTHERS.items() if begin.startswith(magic)), "")
+    if not other and path.suffix.lower() == ".bin":
+        other = "it is called like an autopilot's own log: give the MAVLink of that flight, as a .tlog"
+    words = other or _READ_BY.get(kind_of(path), "")
+    return f"; {words}" if words else ""
+
+
+def _begin(path: Path) -> bytes:
+    try:
+        with path.open("rb") as file:
+            return file.read(_HEAD_BYTES)
+    except OSError:
+        return b""  # told by who reads it
+
+
+# Files that are written.
 
 
 class OutputFile(Protocol):

@@ -1,8 +1,8 @@
-"""MAVLink out of MCAP files of other programs, whatever channels hold it.
+"""Recordings of other programs: `.tlog`, ULog, and MAVLink out of MCAP files, whatever channels hold it.
 
-There is no agreed name for such a topic, nor for its encoding, so the bytes decide: a channel is read as a stream of
-frames, however it was cut into messages. ROS wraps each frame in a message of its own, which is unwrapped first. The
-file is read from its front to its end, so it needs neither chunks nor a summary.
+In an MCAP there is no agreed name for such a topic, nor for its encoding, so the bytes decide: a channel is read as a
+stream of frames, however it was cut into messages. ROS wraps each frame in a message of its own, which is unwrapped
+first. The file is read from its front to its end, so it needs neither chunks nor a summary.
 """
 
 from __future__ import annotations
@@ -20,9 +20,22 @@ from mcap.exceptions import EndOfFile, McapError
 from mcap.records import Channel, Message, Schema
 from mcap.stream_reader import StreamReader
 
-from logs.recording.disk import MAGIC
+from logs.recording.disk import MAGIC, FileKind, kind_of
+from logs.recording.mavlink_flight import MavlinkFlight, flight_in
 from logs.recording.summary import count
-from logs.recording.tlog import MARKERS, SteadyClock, TlogPacket, frame_length, in_order, is_frame, packet_of
+from logs.recording.tlog import (
+    MARKERS,
+    SteadyClock,
+    Tlog,
+    TlogPacket,
+    frame_length,
+    in_order,
+    is_frame,
+    next_marker,
+    packet_of,
+    read_tlog,
+)
+from logs.recording.ulog import is_ulog, read_ulog
 from uavctl.errors import RecordingError, UsageError
 
 # Messages of ROS read by the definition that their recording brings along, as far as it takes to unwrap MAVLink.
@@ -271,19 +284,13 @@ def cut(pieces: list[tuple[int, bytes]]) -> Cut:
         checked = whole and is_frame(data[at:end])
         in_step = checked or (whole and in_step and (end == len(data) or data[end] in MARKERS))
         if not in_step:
-            end = _next_marker(data, at + 1)
+            end = next_marker(data, at + 1)
             left_out += end - at
         else:
             right += checked
             packets.append(packet_of(pieces[bisect_right(ends, end - 1)][0], data[at:end]))
         at = end
     return Cut(tuple(packets), right, left_out)
-
-
-def _next_marker(data: bytes, start: int) -> int:
-    """Return the index of the next byte that could begin a frame, or the end."""
-    found = [index for marker in MARKERS if (index := data.find(marker, start)) >= 0]
-    return min(found, default=len(data))
 
 
 _OURS = "/uavctl/"
@@ -483,3 +490,51 @@ def _names(names: list[str]) -> str:
         return "it has no topic at all"
     more = f", and {len(names) - _TOLD} more" if len(names) > _TOLD else ""
     return f"it has: {', '.join(names[:_TOLD])}{more}"
+
+
+# Any recording of another program, by its kind.
+
+
+def foreign_log(path: Path, topics: Sequence[str] = ()) -> Tlog | None:
+    """Return the MAVLink packets of another program's recording, and what was odd; None if it is of no such kind.
+
+    Args:
+        path: The file.
+        topics: Topics of an MCAP to take; all that hold MAVLink if none is named.
+
+    Raises:
+        RecordingError: It cannot be read, or holds no MAVLink.
+        UsageError: It has no such topic.
+    """
+    if kind_of(path) is FileKind.TLOG and path.exists():
+        if topics:
+            raise UsageError("--topic is for an MCAP: a .tlog has no topics")
+        return read_tlog(path)
+    if kind_of(path) is not FileKind.MCAP or not is_foreign(path):
+        return None
+    found = read_mcap(path, topics)
+    torn = ("the recording is torn: read up to its end",) if found.torn else ()
+    return Tlog(found.packets, clock_notes=(f"MAVLink in {', '.join(found.topics)}", *found.notes, *torn))
+
+
+def foreign_flight(path: Path, system: int | None = None) -> MavlinkFlight | None:
+    """Return the flight in another program's recording; None if it is one of ours.
+
+    Args:
+        path: The file.
+        system: The vehicle's system id; None for the first that is heard.
+
+    Raises:
+        RecordingError: It cannot be read, or tells nothing.
+        UsageError: There is nothing of that system, or the recording is of one vehicle alone.
+    """
+    if is_ulog(path):
+        if system is not None:
+            raise UsageError("--system is for MAVLink: a ULog is of one vehicle")
+        return read_ulog(path)
+    log = read_tlog(path) if kind_of(path) is FileKind.TLOG else foreign_log(path)
+    if log is not None:
+        return flight_in(log, str(path), system)
+    if system is not None:
+        raise UsageError("--system is for another program's MAVLink: a recording of ours is of one vehicle")
+    return None

@@ -1,15 +1,16 @@
 """A flight as its MAVLink tells it: what was sent and what the vehicle said, out of a `.tlog` of any ground station.
 
-Such a file does not say which way a packet went. The vehicle is the autopilot whose heartbeat comes first; what is sent
-to it comes from anybody else. The clock is that of whoever wrote the file.
+Such a file does not say which way a packet went. The vehicle is the one that is asked for, else the autopilot whose
+heartbeat comes first; what is sent to it comes from anybody else but other vehicles. The clock is that of whoever wrote
+the file.
 """
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Sequence, Sized
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
@@ -20,24 +21,29 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from logs.recording.design_view import Floats
 from logs.recording.parameters import ParameterReader, VehicleParameter
+from logs.recording.senders import ChosenVehicle, LogSender, Senders, choose_vehicle, message_of, system_of
 from logs.recording.summary import count
 from logs.recording.tlog import Tlog, TlogPacket, read_tlog
 from uavctl.errors import RecordingError
 from uavctl.mavlink.clocksync import ClockSync
-from uavctl.mavlink.codec import OWN_ESTIMATE, decode
-from uavctl.mavlink.framing import MessageLayout, scan
-from uavctl.mavlink.messages import Heartbeat, Message, Position, Text
+from uavctl.mavlink.codec import OWN_ESTIMATE, decoded
+from uavctl.mavlink.framing import MessageLayout, scan_one
+from uavctl.mavlink.messages import Attitude, Battery, Heartbeat, Message, Position, Text
 from uavctl.mavlink.profile import autopilot_name, describe_mode
-from uavctl.mavlink.vehicle import Joiner, is_vehicle
+from uavctl.mavlink.vehicle import Joiner
 from uavctl.records import Datagram, Vec3
 
 _SETPOINT, _GLOBAL = mavlink.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED, mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT
+_GPS, _GPS_LAYOUT = mavlink.MAVLINK_MSG_ID_GPS_RAW_INT, MessageLayout(mavlink.MAVLink_gps_raw_int_message)
+_LOOKED_INTO = frozenset({mavlink.MAVLINK_MSG_ID_HEARTBEAT, mavlink.MAVLINK_MSG_ID_PARAM_VALUE})  # for parameters
 _SETPOINT_LAYOUT = MessageLayout(mavlink.MAVLink_set_position_target_local_ned_message)
 _ODOMETRY, _ODOMETRY_LAYOUT = mavlink.MAVLINK_MSG_ID_ODOMETRY, MessageLayout(mavlink.MAVLink_odometry_message)
-_OWN = ("LOCAL_POSITION_NED", "ODOMETRY", "GLOBAL_POSITION_INT")  # the vehicle's position: the first that it sends
+# The vehicle's position: the first of these that it sends
+_OWN = ("LOCAL_POSITION_NED", "ODOMETRY", "GLOBAL_POSITION_INT", "GPS_RAW_INT")
 _GLOBAL_LAYOUT = MessageLayout(mavlink.MAVLink_global_position_int_message)
 _EARTH_M = 6_371_000.8  # mean radius
 _WINDOW_NS, _AHEAD_NS = 10_000_000_000, 20_000_000  # of a source's clock, as the daemon judges it
+_LARGEST_V = 1000.0  # of a battery that flies; beyond, it is no voltage
 _AXES = {"ned": (1, 1, 1), "flu": (1, -1, -1)}
 
 
@@ -87,7 +93,11 @@ class MavlinkFlightInfo(msgspec.Struct, frozen=True, kw_only=True):
     messages: dict[str, int]  # by name, and sender
     bad: dict[str, int]  # what was passed over, by reason
     parameters: dict[str, VehicleParameter]
-    notes: tuple[str, ...]  # on the file: what was left out, and what was odd about its clock
+    notes: tuple[str, ...]  # on the file: what was left out, what was odd about its clock, who else is in it
+    rates_hz: dict[str, float] = {}  # of `messages`, mean from first to last; without those that came once
+    senders: tuple[LogSender, ...] = ()  # who speaks in it; none is told in a ULog
+    battery_v: tuple[float, float] | None = None  # first and last voltage; None if it tells none
+    missing: tuple[str, ...] = ()  # parts of the page that the file has nothing for
 
 
 class HeardTrack(NamedTuple):
@@ -121,6 +131,10 @@ class MavlinkFlight:
     setpoint_mps2: Floats  # (n, 3)
     attitude_t_s: Floats = field(default_factory=lambda: np.empty(0))
     attitude_deg: Floats = field(default_factory=lambda: np.empty((0, 3)))  # roll, pitch, yaw
+    height_t_s: Floats = field(default_factory=lambda: np.empty(0))
+    height_m: Floats = field(default_factory=lambda: np.empty(0))  # where it tells no whole position
+    battery_t_s: Floats = field(default_factory=lambda: np.empty(0))
+    battery_v: Floats = field(default_factory=lambda: np.empty(0))
 
     @property
     def duration_s(self) -> float:
@@ -128,30 +142,38 @@ class MavlinkFlight:
         return self.info.duration_s
 
 
-def is_tlog(path: Path) -> bool:
-    """Return whether a file is called like a `.tlog`."""
-    return path.suffix.lower() == ".tlog"
-
-
-def read_flight(path: Path) -> MavlinkFlight:
+def read_flight(path: Path, system: int | None = None) -> MavlinkFlight:
     """Read the flight in a `.tlog`.
+
+    Args:
+        path: The file.
+        system: The vehicle's system id; None for the first that is heard.
 
     Raises:
         RecordingError: The file cannot be read, holds no packet, or none that says anything.
+        UsageError: There is nothing of that system.
     """
-    log: Tlog = read_tlog(path)
-    reader = _Reader(log.packets[0].at_ns, _vehicle(log))
+    return flight_in(read_tlog(path), str(path), system)
+
+
+def flight_in(log: Tlog, name: str, system: int | None = None) -> MavlinkFlight:
+    """Return the flight in some packets.
+
+    Args:
+        log: They, and what was odd about them.
+        name: Of the recording.
+        system: The vehicle's system id; None for the first that is heard.
+
+    Raises:
+        RecordingError: None of them is a known message.
+        UsageError: There is nothing of that system.
+    """
+    reader = _Reader(log.packets[0].at_ns, choose_vehicle(log.packets, name, system))
     for packet in log:
         reader.take(packet)
     if not reader.counted:
-        raise RecordingError(f"{path}: {len(log.packets)} packets, none of which is a known MAVLink message")
-    return reader.flight(str(path), log)
-
-
-def _vehicle(log: Tlog) -> Heartbeat | None:
-    """Return the first heartbeat of an autopilot."""
-    messages = (message for packet in log for message in decode(packet.data).messages)
-    return next((one for one in messages if isinstance(one, Heartbeat) and is_vehicle(one)), None)
+        raise RecordingError(f"{name}: {count(len(log.packets), 'packet')}, none of which is a known MAVLink message")
+    return reader.flight(name, log)
 
 
 @dataclass
@@ -177,9 +199,14 @@ class SentSource:
 class _Reader:
     """Reader of packets in order of time."""
 
-    def __init__(self, origin_ns: int, vehicle: Heartbeat | None) -> None:
+    def __init__(self, origin_ns: int, vehicle: ChosenVehicle) -> None:
         self._origin_ns = self._last_ns = origin_ns
-        self._vehicle = vehicle
+        self._vehicle, self._beat = vehicle, vehicle.heartbeat
+        self._senders = Senders()
+        self._attitudes: dict[bool, list[tuple[int, Vec3]]] = {}  # of quaternions, and of angles
+        self._battery: list[tuple[int, float]] = []
+        self._height: list[tuple[int, float]] = []
+        self._spans_ns: dict[str, tuple[int, int]] = {}  # first and last of each message
         self._own: dict[str, list[tuple[int, Vec3, Vec3 | None]]] = {}  # of each system's messages, by name
         self._sources: dict[str, SentSource] = {}
         self._setpoints: list[tuple[int, list[float]]] = []
@@ -194,38 +221,72 @@ class _Reader:
     def take(self, packet: TlogPacket) -> None:
         """Take one packet."""
         self._last_ns = packet.at_ns
-        self._parameters.take(Datagram(at_ns=packet.at_ns, link="", outgoing=False, data=packet.data))
-        for frame in scan(packet.data, final=True).frames:
-            system = frame.data[5 if frame.data[0] == mavlink.PROTOCOL_MARKER_V2 else 3]
-            self.counted[f"{mavlink.mavlink_map[frame.message_id].msgname} of system {system}"] += 1
+        found = scan_one(packet.data)
+        for frame in found.frames:
+            system = system_of(frame.data)
+            name = f"{mavlink.mavlink_map[frame.message_id].msgname} of system {system}"
+            self.counted[name] += 1
+            self._spans_ns[name] = self._spans_ns.get(name, (packet.at_ns, 0))[0], packet.at_ns
+            self._senders.take(frame.data)
             if frame.message_id == _SETPOINT:
                 self._take_setpoint(frame.data, packet.at_ns)
-            elif frame.message_id == _GLOBAL and self._is_vehicle(system):
-                self._take_global(frame.data, packet.at_ns)
-            elif frame.message_id == _ODOMETRY and self._is_vehicle(system):
-                self._take_odometry(frame.data, packet.at_ns)
-        found = decode(packet.data)
-        self._bad.update(found.bad)
-        for message in found.messages:
+            elif self._is_vehicle(system):
+                self._take_own(frame.message_id, frame.data, packet.at_ns)
+        if message_of(packet.data) in _LOOKED_INTO and self._is_vehicle(system_of(packet.data)):
+            self._take_parameter(packet)
+        understood = decoded(found)
+        self._bad.update(understood.bad)
+        for message in understood.messages:
             self._take_message(message, packet.at_ns)
 
+    def _take_own(self, message_id: int, frame: bytes, at_ns: int) -> None:
+        if message_id == _GLOBAL:
+            self._take_global(frame, at_ns)
+        elif message_id == _GPS:
+            self._take_gps(frame, at_ns)
+        elif message_id == _ODOMETRY:
+            self._take_odometry(frame, at_ns)
+
+    def _take_parameter(self, packet: TlogPacket) -> None:
+        """Take a parameter, or the heartbeat that says how they are written: that of the autopilot alone."""
+        component = packet.data[6 if packet.data[0] == mavlink.PROTOCOL_MARKER_V2 else 4]
+        beats = message_of(packet.data) == mavlink.MAVLINK_MSG_ID_HEARTBEAT
+        if not beats or (self._beat is not None and component == self._beat.component):
+            self._parameters.take(Datagram(at_ns=packet.at_ns, link="", outgoing=False, data=packet.data))
+
     def _take_message(self, message: Message, at_ns: int) -> None:
+        own = self._is_vehicle(message.system)
         match message:
-            case Heartbeat() if is_vehicle(message) and self._is_vehicle(message.system):
-                self._take_mode(message, at_ns)
-            case Position(local_ned=True) if self._is_vehicle(message.system):
+            case Heartbeat():
+                self._senders.take_heartbeat(message)
+                if self._beat is not None and (message.system, message.component) == self._address:
+                    self._take_mode(message, at_ns)
+            case Position(local_ned=True) if own:
                 track = self._own.setdefault(message.name, [])
                 track.append((at_ns, message.position_m, message.velocity_mps))
-            case Position(local_ned=False):
+            case Position(local_ned=False) if not self._is_another(message.system):
                 name = f"{message.name} of system {message.system}"
                 place = _ned(message, message.position_m)
                 self._sources.setdefault(name, SentSource()).take(place, _velocity(message), message.stamp_us, at_ns)
-            case Text() if self._is_vehicle(message.system):
+            case Text() if own:
                 self._take_text(message, at_ns)
+            case Attitude() if own:
+                self._attitudes.setdefault(message.quaternion, []).append((at_ns, message.angles_rad))
+            case Battery(voltage_v=float(voltage_v)) if own and 0 < voltage_v < _LARGEST_V:
+                self._battery.append((at_ns, voltage_v))
+
+    @property
+    def _address(self) -> tuple[int, int] | None:
+        """System and component of the autopilot whose heartbeats count."""
+        return None if self._beat is None else (self._beat.system, self._beat.component)
 
     def _is_vehicle(self, system: int) -> bool:
         """Return whether a system is the vehicle."""
-        return self._vehicle is not None and system == self._vehicle.system
+        return system == self._vehicle.system
+
+    def _is_another(self, system: int) -> bool:
+        """Return whether a system is another vehicle."""
+        return any(system == one.system for one in self._vehicle.others)
 
     def _take_mode(self, beat: Heartbeat, at_ns: int) -> None:
         mode, _ = describe_mode(autopilot_name(beat.autopilot), beat.vehicle_type, beat.custom_mode)
@@ -242,6 +303,8 @@ class _Reader:
         raw = _SETPOINT_LAYOUT.read(frame)
         if raw.coordinate_frame != mavlink.MAV_FRAME_LOCAL_NED:
             return  # counted, but no place or direction in local NED
+        if self._vehicle.system is not None and raw.target_system not in (0, self._vehicle.system):
+            return  # for another vehicle
         numbers = (raw.x, raw.y, raw.z, raw.vx, raw.vy, raw.vz, raw.afx, raw.afy, raw.afz)
         ignored = raw.type_mask
         self._setpoints.append(
@@ -250,15 +313,24 @@ class _Reader:
 
     def _take_global(self, frame: bytes, at_ns: int) -> None:
         raw = _GLOBAL_LAYOUT.read(frame)
-        lat_deg, lon_deg = raw.lat * 1e-7, raw.lon * 1e-7
+        down_m = -raw.relative_alt / 1000
         if (raw.lat, raw.lon) == (0, 0):  # it has no position yet
+            self._height.append((at_ns, -down_m))
             return
-        home = self._home_deg = self._home_deg or (lat_deg, lon_deg)
-        north_m = math.radians(lat_deg - home[0]) * _EARTH_M
-        east_m = math.radians(lon_deg - home[1]) * _EARTH_M * math.cos(math.radians(home[0]))
         velocity_mps = (raw.vx / 100, raw.vy / 100, raw.vz / 100)
-        place = (at_ns, (north_m, east_m, -raw.relative_alt / 1000), velocity_mps)
-        self._own.setdefault(raw.msgname, []).append(place)
+        self._take_place(raw.msgname, raw.lat, raw.lon, down_m, velocity_mps, at_ns)
+
+    def _take_gps(self, frame: bytes, at_ns: int) -> None:
+        raw = _GPS_LAYOUT.read(frame)
+        if raw.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX:
+            self._take_place(raw.msgname, raw.lat, raw.lon, -raw.alt / 1000, None, at_ns)
+
+    def _take_place(self, name: str, lat: int, lon: int, down_m: float, velocity: Vec3 | None, at_ns: int) -> None:
+        """Take a place on the globe, in 1e-7 degrees, as north and east of the first one."""
+        lat_deg, lon_deg = lat * 1e-7, lon * 1e-7
+        self._home_deg = self._home_deg or (lat_deg, lon_deg)
+        north_m, east_m = from_home(lat_deg, lon_deg, self._home_deg)
+        self._own.setdefault(name, []).append((at_ns, (north_m, east_m, down_m), velocity))
 
     def _take_odometry(self, frame: bytes, at_ns: int) -> None:
         """Take the vehicle's own estimate, as PX4 sends it where it sends no LOCAL_POSITION_NED."""
@@ -270,6 +342,7 @@ class _Reader:
 
     def flight(self, name: str, log: Tlog) -> MavlinkFlight:
         """Return the flight in what was taken."""
+        beat, attitudes = self._beat, self._attitudes.get(False, self._attitudes.get(True, []))
         own_source = next((one for one in _OWN if one in self._own), "")
         sources = dict(sorted(self._sources.items(), key=lambda one: -len(one[1].track)))
         ages = {source: ages_of(one, self._origin_ns) for source, one in sources.items()}
@@ -279,8 +352,8 @@ class _Reader:
             recording=name,
             begin_utc=begin.isoformat(timespec="milliseconds"),
             duration_s=self._second(self._last_ns),
-            autopilot="" if self._vehicle is None else autopilot_name(self._vehicle.autopilot),
-            vehicle_system=None if self._vehicle is None else self._vehicle.system,
+            autopilot="" if beat is None else autopilot_name(beat.autopilot),
+            vehicle_system=None if beat is None else beat.system,
             own_positions=len(self._own.get(own_source, ())),
             own_source=own_source,
             sent=tuple(figures_of(source, one, ages[source]) for source, one in sources.items()),
@@ -290,9 +363,15 @@ class _Reader:
             messages=dict(sorted(self.counted.items())),
             bad={reason: number for reason, number in sorted(self._bad.items()) if reason != OWN_ESTIMATE},
             parameters=self._parameters.parameters(),
-            notes=log.notes,
+            notes=(*self._vehicle.notes, *log.notes),
+            rates_hz={
+                name: (self.counted[name] - 1) * 1e9 / (last_ns - first_ns)
+                for name, (first_ns, last_ns) in sorted(self._spans_ns.items())
+                if last_ns > first_ns
+            },
+            senders=tuple(self._senders.listed()),
         )
-        return MavlinkFlight(
+        flight = MavlinkFlight(
             info=info,
             own=track_of(self._own.get(own_source, ()), self._origin_ns),
             sent={source: track_of(one.track, self._origin_ns) for source, one in sources.items()},
@@ -301,10 +380,41 @@ class _Reader:
             setpoint_m=told[:, :3],
             setpoint_mps=told[:, 3:6],
             setpoint_mps2=told[:, 6:],
+            attitude_t_s=seconds((at_ns for at_ns, _ in attitudes), self._origin_ns),
+            attitude_deg=np.degrees(np.array([angles for _, angles in attitudes], dtype=np.float64).reshape(-1, 3)),
+            height_t_s=seconds((at_ns for at_ns, _ in self._height), self._origin_ns),
+            height_m=np.array([height_m for _, height_m in self._height], dtype=np.float64),
+            battery_t_s=seconds((at_ns for at_ns, _ in self._battery), self._origin_ns),
+            battery_v=np.array([voltage_v for _, voltage_v in self._battery], dtype=np.float64),
         )
+        return with_parts(flight)
 
     def _second(self, at_ns: int) -> float:
         return (at_ns - self._origin_ns) * 1e-9
+
+
+def with_parts(flight: MavlinkFlight) -> MavlinkFlight:
+    """Return a flight that names the parts which are not in its recording."""
+    info = flight.info
+    parts: dict[str, Sized] = {
+        "positions of its own": flight.own.t_s,
+        "positions sent to it": flight.sent,
+        "setpoints": flight.setpoint_t_s,
+        "modes and arming": info.modes,
+        "attitude": flight.attitude_t_s,
+        "battery": flight.battery_t_s,
+        "texts": info.texts,
+        "parameters": info.parameters,
+    }
+    battery_v = (float(flight.battery_v[0]), float(flight.battery_v[-1])) if len(flight.battery_v) else None
+    missing = tuple(name for name, part in parts.items() if not len(part))
+    return replace(flight, info=msgspec.structs.replace(info, battery_v=battery_v, missing=missing))
+
+
+def from_home(lat_deg: float, lon_deg: float, home_deg: tuple[float, float]) -> tuple[float, float]:
+    """Return how far north and east of a first place another one is [m]; its surroundings count as flat."""
+    north_m = math.radians(lat_deg - home_deg[0]) * _EARTH_M
+    return north_m, math.radians(lon_deg - home_deg[1]) * _EARTH_M * math.cos(math.radians(home_deg[0]))
 
 
 def seconds(at_ns: Iterable[int], origin_ns: int) -> Floats:
@@ -387,9 +497,21 @@ def facts_of(info: MavlinkFlightInfo) -> Iterator[tuple[str, str]]:
     yield "setpoints in local NED", str(info.setpoints)
     yield "modes", ", ".join(dict.fromkeys(one.mode for one in info.modes)) or "none"
     yield "texts", str(len(info.texts))
+    if info.battery_v is not None:
+        yield "battery", "{:.2f} V at the begin, {:.2f} V at the end".format(*info.battery_v)
+    for one in info.senders:
+        kind, lost = f" ({one.kind})" if one.kind else "", f"; {one.missing} more did not come" if one.missing else ""
+        yield f"from {one.system}, component {one.component}{kind}", f"{count(one.messages, 'message')}{lost}"
     yield "parameters told", str(len(info.parameters))
     if info.bad:
         yield "passed over", ", ".join(f"{number} {reason}" for reason, number in info.bad.items())
+    if info.missing:
+        yield "not in it", ", ".join(info.missing)
+
+
+def rate_of(info: MavlinkFlightInfo, message: str) -> str:
+    """Return how often a message came, in words; empty if it came once."""
+    return f"{info.rates_hz[message]:.3g}/s" if message in info.rates_hz else ""
 
 
 def longest_gap(sent: SentPositions) -> str:

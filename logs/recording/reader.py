@@ -21,7 +21,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Schema
 from zstandard import ZstdDecompressor, ZstdError, get_frame_parameters
 
-from logs.recording.disk import MAGIC, later_segments
+from logs.recording.disk import MAGIC, hint_of, later_segments
 from logs.recording.segment import CHUNK, CHUNK_FIELDS, COMPRESSION, INDEX, MESSAGE, STORED_SIZE, ZERO_UTC
 from logs.recording.topics import (
     END,
@@ -265,7 +265,7 @@ def _scan(path: Path, data: Buffer, order: ReadingOrder | None) -> Iterator[Scan
             return
         first = _next_chunk(data, 0)
         if first is None:
-            raise RecordingError(f"{path}: not a recording (no MCAP magic, no whole chunk){_hint(path)}")
+            raise RecordingError(f"{path}: not a recording (no MCAP magic, no whole chunk){hint_of(path)}")
         yield Damage(path, 0, first, "damaged before the first whole chunk")
         at, damaged = first, True
     contents = Contents()
@@ -300,16 +300,6 @@ def _scan(path: Path, data: Buffer, order: ReadingOrder | None) -> Iterator[Scan
             yield Damage(path, at, later - at, f"chunk or index {error}", torn=torn)
             at, damaged = later, True
     yield EndOfFile(finished=False, complete=False)
-
-
-def _hint(path: Path) -> str:
-    if path.suffix.lower() == ".tlog":
-        return "; `uavctl log info`, `report` and `replay`, and `uavctl identify` read a .tlog"
-    if path.suffix.lower() in (".ulg", ".ulog"):
-        return "; `uavctl log info` and `report` read a ULog; what else takes a recording needs its MAVLink, as a .tlog"
-    if path.suffix.lower() == ".bin":
-        return "; it is called like an autopilot's own log: give the MAVLink of that flight, as a .tlog"
-    return ""
 
 
 def _whole(data: Buffer, at: int) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import re
 import struct
 import tomllib
 from collections import Counter
@@ -14,7 +15,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from logs.recording.disk import all_or_none, check_free, unfinished
+from logs.recording.disk import all_or_none, check_free, hint_of, unfinished
 from logs.recording.export import Watch, known_number, unwatched
 from logs.recording.reader import RecordedMessage, good_messages, header
 from logs.recording.summary import count
@@ -22,7 +23,7 @@ from logs.recording.topics import raw_link
 from uavctl.errors import RecordingError, UsageError
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.connection import STREAM_SCHEMES
-from uavctl.mavlink.framing import scan
+from uavctl.mavlink.framing import scan, scan_one
 from uavctl.records import Decision, Header, LinkStats, PositionSample, Record, Sink, StepInput, to_nobody
 
 # The clock of another program's recording, which may leap, stand still or run back: what that does to its times.
@@ -32,6 +33,7 @@ from uavctl.records import Decision, Header, LinkStats, PositionSample, Record, 
 FARTHEST_BACK_NS = 1_000_000_000
 LONGEST_SILENCE_NS = 3600 * 1_000_000_000
 _TOLD_SILENCE_NS = 10_000_000_000  # a vehicle's heartbeats come once a second
+_MOST_AT_ONCE = 200  # packets of one stamp: what a fast link brings within the 16 ms of a coarse clock is less
 
 
 class SteadyClock:
@@ -45,6 +47,8 @@ class SteadyClock:
         self._offset_ns = self._former_ns = 0
         self._last_ns: int | None = None  # the latest time given
         self._stamps = self._zeros = self._missing = self._backward = self._leaps = 0
+        self._first_ns: int | None = None  # the first stamp
+        self._same = True  # all stamps so far are that one
         self._farthest_ns = self._silence_ns = 0
 
     def expects(self, stamp_ns: int) -> bool:
@@ -55,6 +59,8 @@ class SteadyClock:
         """Return the steady time of a stamp [ns]; stamps come in the order of the recording."""
         self._stamps += 1
         self._zeros += stamp_ns == 0
+        self._first_ns = stamp_ns if self._first_ns is None else self._first_ns
+        self._same = self._same and stamp_ns == self._first_ns
         if self._last_ns is None:
             self._last_ns = stamp_ns
         offset_ns = self._fitting(stamp_ns)
@@ -77,10 +83,12 @@ class SteadyClock:
         """Refuse stamps that carry no time.
 
         Raises:
-            RecordingError: There are several, and all are zero.
+            RecordingError: There are several, and all are zero; or many, and all are the same.
         """
         if self._zeros == self._stamps > 1:
             raise RecordingError(f"{name}: all {self._stamps} time stamps are zero, so nobody knows what came when")
+        if self._same and self._stamps > _MOST_AT_ONCE:
+            raise RecordingError(f"{name}: all {self._stamps} time stamps are the same, so they tell no time")
 
     def notes(self, name: str) -> tuple[str, ...]:
         """Return sentences on what was odd about the stamps."""
@@ -113,12 +121,17 @@ class SteadyClock:
 
 GROUND_SYSTEMS = frozenset({245, 255})  # our own system id, and that of ground stations
 _STAMP = struct.Struct(">Q")
+_OLD_STAMP = struct.Struct("<Q")  # as QGroundControl wrote them before 2014
+# A stamp before a frame: its highest byte is zero up to the year 4253
+_LIKELY = {_STAMP: re.compile(b"\0.{7}[\xfd\xfe]", re.DOTALL), _OLD_STAMP: re.compile(b".{7}\0[\xfd\xfe]", re.DOTALL)}
 _STX_V1, _STX_V2 = MARKERS = 0xFE, 0xFD  # first byte of a frame
+_ANY_MARKER = re.compile(b"[\xfd\xfe]")
 _SIGNED = 0x01
 _LAST_STAMP_US = 2**63 // 1000  # later ones have no place in 64 bits of nanoseconds
+_PROBED_BYTES = 65_536  # of a file: enough to see whether its frames have stamps
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class TlogPacket:
     """One packet; `outgoing` is guessed from its system id (one of a ground station counts as sent by us)."""
 
@@ -132,8 +145,8 @@ class Tlog:
     """Packets of a `.tlog` in order of time, and what was left out of the file."""
 
     packets: tuple[TlogPacket, ...]
-    torn_bytes: int  # of an unfinished packet at the end
-    skipped_bytes: int  # between packets
+    torn_bytes: int = 0  # of an unfinished packet at the end
+    skipped_bytes: int = 0  # between packets
     clock_notes: tuple[str, ...] = ()
 
     def __iter__(self) -> Iterator[TlogPacket]:
@@ -153,33 +166,108 @@ class Tlog:
 def read_tlog(path: Path) -> Tlog:
     """Read all packets of a file; unknown message ids and bad checksums are left to the parser.
 
+    Stamps are big-endian, or else little-endian where far more of the file is packets then.
+
     Raises:
-        RecordingError: The file cannot be read, holds no packet, or no time stamp but zero.
+        RecordingError: The file cannot be read, holds no packet, its packets have no stamps, or stamps without a time.
     """
     try:
         data = path.read_bytes()
     except OSError as error:
         raise RecordingError(f"{path}: {error.strerror}") from error
-    packets: list[TlogPacket] = []
-    clock = SteadyClock()
-    at = skipped = 0
-    while at + _STAMP.size + 3 <= len(data):
-        begin = at + _STAMP.size
-        length = frame_length(data, begin)
-        end = begin + length
-        expected = bool(length) and clock.expects(_stamp_us(data, at) * 1000)
-        if expected and end > len(data):
-            break
-        if expected or (length and _believed(data, at, end)):
-            packets.append(packet_of(clock.steady(_stamp_us(data, at) * 1000), data[begin:end]))
-            at = end
-        else:
-            at += 1
-            skipped += 1
-    if not packets:
-        raise RecordingError(f"{path}: no MAVLink packet with a time stamp in it; is it a .tlog?")
-    clock.check(str(path))
-    return Tlog(in_order(packets), torn_bytes=len(data) - at, skipped_bytes=skipped, clock_notes=clock.notes(path.name))
+    found = _Cutter(data, _STAMP)
+    note: tuple[str, ...] = ()
+    if 2 * found.skipped_bytes > len(data) or not found.packets:
+        other = _Cutter(data, _OLD_STAMP)
+        if 2 * other.skipped_bytes < found.skipped_bytes or len(other.packets) > 2 * len(found.packets):
+            found = other
+            note = (f"{path.name}: its time stamps are little-endian, as QGroundControl wrote them before 2014",)
+    if found.lacks_stamps():
+        raise RecordingError(
+            f"{path}: its MAVLink packets have no time stamps (the bytes of a link as they came, like MAVProxy's "
+            ".tlog.raw), so nobody knows what came when; give the .tlog of that flight"
+        )
+    if not found.packets:
+        raise RecordingError(f"{path}: no MAVLink packet with a time stamp in it; is it a .tlog?{hint_of(path)}")
+    found.clock.check(str(path))
+    return Tlog(
+        in_order(found.packets),
+        torn_bytes=found.torn_bytes,
+        skipped_bytes=found.skipped_bytes,
+        clock_notes=(*note, *found.clock.notes(path.name)),
+    )
+
+
+class _Cutter:
+    """Bytes of a file cut into packets, each after its stamp.
+
+    Args:
+        data: the whole file.
+        stamp: byte order of its stamps.
+    """
+
+    def __init__(self, data: bytes, stamp: struct.Struct) -> None:
+        self._data, self._stamp = data, stamp
+        self._first = 0  # where the first packet begins
+        self.packets: list[TlogPacket] = []
+        self.clock = SteadyClock()
+        self.skipped_bytes = self.torn_bytes = 0
+        self._cut()
+
+    def _cut(self) -> None:
+        data, at = self._data, 0
+        least = self._stamp.size + 3  # of a packet: enough to know its length
+        while at + least <= len(data):
+            begin = at + self._stamp.size
+            length = frame_length(data, begin)
+            end = begin + length
+            expected = bool(length) and self.clock.expects(self._stamp_us(at) * 1000)
+            if expected and end > len(data):
+                break
+            if expected or (length and self._is_believed(at, end)):
+                self._first = self._first if self.packets else begin
+                self.packets.append(packet_of(self.clock.steady(self._stamp_us(at) * 1000), data[begin:end]))
+                at = end
+            else:
+                likely = _LIKELY[self._stamp].search(data, at + 1)
+                later = min(len(data) if likely is None else likely.start(), len(data) - least + 1)
+                self.skipped_bytes += later - at
+                at = later
+        self.torn_bytes = len(data) - at
+
+    def lacks_stamps(self) -> bool:
+        """Return whether most frames follow each other without a stamp, by those near the first packet."""
+        at, last = self._first, min(self._first + _PROBED_BYTES, len(self._data))
+        frames = stamped = 0
+        before = -1  # the end of the frame before
+        while (at := next_marker(self._data, at)) < last:
+            end = at + frame_length(self._data, at)
+            if end <= at or end > len(self._data) or not is_frame(self._data[at:end]):
+                at += 1
+                continue
+            frames += 1
+            stamped += at != before
+            at = before = end
+        return frames > 2 * stamped
+
+    def _stamp_us(self, at: int) -> int:
+        return int(self._stamp.unpack_from(self._data, at)[0])
+
+    def _is_believed(self, at: int, end: int) -> bool:
+        """Return whether a packet with an unexpected stamp is real: by its checksum, or by the packet after it."""
+        data, begin = self._data, at + self._stamp.size
+        if end > len(data) or self._stamp_us(at) >= _LAST_STAMP_US:
+            return False
+        if is_frame(data[begin:end]):
+            return True
+        follows = frame_length(data, end + self._stamp.size) > 0
+        return follows and abs(self._stamp_us(end) - self._stamp_us(at)) * 1000 <= LONGEST_SILENCE_NS
+
+
+def next_marker(data: bytes, start: int) -> int:
+    """Return the index of the next byte that could begin a frame, or the end."""
+    found = _ANY_MARKER.search(data, start)
+    return len(data) if found is None else found.start()
 
 
 def frame_length(data: bytes, at: int) -> int:
@@ -206,22 +294,8 @@ def in_order(packets: list[TlogPacket]) -> tuple[TlogPacket, ...]:
 
 def is_frame(data: bytes) -> bool:
     """Return whether bytes are one frame of a known id with the right checksum."""
-    frames = scan(data, final=True).frames
+    frames = scan_one(data).frames
     return len(frames) == 1 and len(frames[0].data) == len(data)
-
-
-def _stamp_us(data: bytes, at: int) -> int:
-    return int(_STAMP.unpack_from(data, at)[0])
-
-
-def _believed(data: bytes, at: int, end: int) -> bool:
-    """Return whether a packet with an unexpected stamp is real: by its checksum, or by the packet after it."""
-    if end > len(data) or _stamp_us(data, at) >= _LAST_STAMP_US:
-        return False
-    if is_frame(data[at + _STAMP.size : end]):
-        return True
-    follows = frame_length(data, end + _STAMP.size) > 0
-    return follows and abs(_stamp_us(data, end) - _stamp_us(data, at)) * 1000 <= LONGEST_SILENCE_NS
 
 
 # The raw MAVLink of a recording as a `.tlog`: each packet after 8 bytes of big-endian microseconds since the epoch.

@@ -19,15 +19,30 @@ import numpy as np
 
 from logs.recording import mavlink_flight as neutral
 from logs.recording.design_view import Floats
+from logs.recording.disk import ULOG_MAGIC, FileKind, hint_of, kind_of
 from logs.recording.mavlink_flight import MavlinkFlight, ModeBegin, SentSource, SpokenText
 from logs.recording.parameters import VehicleParameter
 from logs.recording.summary import count
+from logs.recording.tlog import LONGEST_SILENCE_NS
 from uavctl.errors import RecordingError, need
+from uavctl.mavlink.framing import plain_text
 
-MAGIC = b"ULog\x01\x12\x35"
 _HEAD_BYTES = 16  # magic, version, time of the start
 _OWN, _SENT = "vehicle_local_position", ("vehicle_visual_odometry", "vehicle_mocap_odometry")
 _SETPOINT, _GPS = "trajectory_setpoint", ("vehicle_gps_position", "sensor_gps")
+# Places on the globe, where there is no local position: names of latitude, longitude and height, and their units
+_PLACES = {
+    "vehicle_global_position": (("lat", "lon", "alt"), (1.0, 1.0)),
+    "sensor_gps": (("latitude_deg", "longitude_deg", "altitude_msl_m"), (1.0, 1.0)),
+    "vehicle_gps_position": (("lat", "lon", "alt"), (1e-7, 1e-3)),
+}
+_LEAST_FIX = 3  # of `fix_type`: a place in three dimensions
+_LEAST_BYTES = {"D": 2, "L": 9, "C": 11, "A": 4, "R": 2, "O": 2, "P": 1, "Q": 2, "I": 1, "M": 2}  # of messages by type
+_KNOWN_TYPES = frozenset(map(ord, (*_LEAST_BYTES, "F", "S", "B")))
+_LONGEST = 10_000  # of a message of a type that is not known; beyond, it is damage
+_MOST_READ = 20  # times that a damaged file is read over: one that is whole is read once
+_SYNC = ord("S")  # a type of message whose content no reader looks at
+_FLAGS_BYTES = 40
 _ARMED = 2  # of vehicle_status.arming_state
 _SEVERITIES = ("emergency", "alert", "critical", "error", "warning", "notice", "info", "debug")
 # vehicle_status.nav_state, by the names that the modes of a heartbeat have
@@ -39,8 +54,8 @@ _MODES = {
 
 
 def is_ulog(path: Path) -> bool:
-    """Return whether a file is called like a ULog."""
-    return path.suffix.lower() in {".ulg", ".ulog"}
+    """Return whether a file is a ULog, by its first bytes or else its name."""
+    return kind_of(path) is FileKind.ULOG
 
 
 def read_ulog(path: Path) -> MavlinkFlight:
@@ -48,80 +63,117 @@ def read_ulog(path: Path) -> MavlinkFlight:
 
     Raises:
         ExtraMissingError: pyulog is not there.
-        RecordingError: The file cannot be read, is no ULog, or holds no message or no position.
+        RecordingError: The file cannot be read, is no ULog, or holds no message.
     """
     try:
-        data = path.read_bytes()
+        data = bytearray(path.read_bytes())
     except OSError as error:
         raise RecordingError(f"{path}: {error.strerror}") from error
-    if not data.startswith(MAGIC):
-        raise RecordingError(f"{path}: does not begin as a ULog does; is it a .ulg of PX4?")
+    if not data.startswith(ULOG_MAGIC):
+        raise RecordingError(f"{path}: does not begin as a ULog does; is it a .ulg of PX4?{hint_of(path)}")
     if len(data) < _HEAD_BYTES:
         raise RecordingError(f"{path}: torn within its head, {len(data)} of {_HEAD_BYTES} bytes; fetch it again")
+    short, torn_bytes = _without_short(data)
     log = _parsed(path, data)
-    if not log.data_list:
+    if not log.data_list and not log.logged_messages and not log.logged_messages_tagged:
         raise RecordingError(f"{path}: no message in it; was logging stopped at once, or the file torn?")
-    return _Reader(path, log, _torn_bytes(data) if not log.has_data_appended else 0).flight()
+    return _Reader(path, log, short, torn_bytes).flight()
 
 
-def _parsed(path: Path, data: bytes) -> Any:
+def _parsed(path: Path, data: bytearray) -> Any:
     need("pyulog", "ulog")
     from pyulog.core import ULog, ULogException  # type: ignore[import-untyped]
 
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # it prints its warnings, among our documents
-            return ULog(io.BytesIO(data))
-    except (ULogException, ArithmeticError, LookupError, RecursionError, ValueError, struct.error) as error:
+            return ULog(_BoundedFile(data))
+    except (ULogException, ArithmeticError, LookupError, RecursionError, TypeError, ValueError, struct.error) as error:
         raise RecordingError(f"{path}: damaged, or a ULog that pyulog cannot read ({error})") from error
 
 
-def _torn_bytes(data: bytes) -> int:
-    """Return the length of an unfinished message at the end."""
-    at = _HEAD_BYTES
-    while at + 3 <= len(data) and (end := at + 3 + int.from_bytes(data[at : at + 2], "little")) <= len(data):
-        at = end
-    return len(data) - at
+class _BoundedFile(io.BytesIO):
+    """A file that ends when it was read over and over: in some damaged files pyulog goes back without end."""
+
+    def __init__(self, data: bytearray) -> None:
+        super().__init__(data)
+        self._reads_left, self._bytes_left = len(data), _MOST_READ * len(data)
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Read bytes; none once each byte was read too often."""
+        if self._reads_left <= 0 or self._bytes_left <= 0:
+            return b""
+        found = super().read(size)
+        self._reads_left, self._bytes_left = self._reads_left - 1, self._bytes_left - len(found)
+        return found
+
+
+def _without_short(data: bytearray) -> tuple[int, int]:
+    """Take out the messages that are too short for their type, at which pyulog would end without a word.
+
+    Returns:
+        How many there were, and the length of an unfinished message at the end; 0 where data were appended.
+    """
+    at, short, end = _HEAD_BYTES, 0, len(data)
+    if data[at : at + 3] == struct.pack("<HB", _FLAGS_BYTES, ord("B")):
+        appended = struct.unpack_from("<3Q", data, at + 3 + 16)[0] if at + 3 + _FLAGS_BYTES <= end else 0
+        end = min(appended or end, end)
+    while at + 3 <= end:
+        length, kind = int.from_bytes(data[at : at + 2], "little"), data[at + 2]
+        if at + 3 + length > end:
+            break
+        if kind not in _KNOWN_TYPES and not 0 < length <= _LONGEST:
+            return short, 0  # damage: where the next message begins is not known
+        if length < _LEAST_BYTES.get(chr(kind), 0):
+            data[at + 2], short = _SYNC, short + 1
+        at += 3 + length
+    return short, end - at if end == len(data) else 0
 
 
 class _Reader:
     """Reader of what pyulog has parsed."""
 
-    def __init__(self, path: Path, log: Any, torn_bytes: int) -> None:
-        self._path, self._log, self._torn_bytes = path, log, torn_bytes
-        self._origin_us = int(log.start_timestamp)
+    def __init__(self, path: Path, log: Any, short: int, torn_bytes: int) -> None:
+        self._path, self._log, self._short, self._torn_bytes = path, log, short, torn_bytes
         self._bad: Counter[str] = Counter()
         self._notes: list[str] = []
+        self._origin_us, self._last_us = self._span()
 
     def flight(self) -> MavlinkFlight:
         """Return the flight."""
         log, origin_ns = self._log, self._origin_us * 1000
         sources = dict(sorted(self._sources(), key=lambda one: -len(one[1].track)))
-        own = self._own()
-        messages = {_name(one): len(one.data["timestamp"]) for one in log.data_list if "timestamp" in one.data}
-        if not own and not sources:
-            wanted, there = " nor ".join((_OWN, *_SENT)), ", ".join(sorted(messages))
-            raise RecordingError(f"{self._path}: no valid position in it, neither {wanted}; it has {there}")
+        own_source, own = self._own()
+        stamps = {_name(one): one.data["timestamp"].astype(np.float64) for one in self._topics()}
         ages = {name: neutral.ages_of(one, origin_ns) for name, one in sources.items()}
-        setpoints, attitude = self._setpoints(), self._attitude()
-        system = log.initial_parameters.get("MAV_SYS_ID", 1)  # as PX4 comes
+        setpoints, attitude, height, battery = self._setpoints(), self._attitude(), self._height(), self._battery()
+        system = int(log.initial_parameters.get("MAV_SYS_ID", 1))  # as PX4 comes
         info = neutral.MavlinkFlightInfo(
             recording=str(self._path),
             begin_utc=self._begin_utc(),
-            duration_s=self._second(log.last_timestamp),
-            autopilot=str(log.msg_info_dict.get("sys_name", "PX4")).lower(),
-            vehicle_system=int(system),
+            duration_s=self._second(self._last_us),
+            autopilot=plain_text(str(log.msg_info_dict.get("sys_name", "PX4"))).lower(),
+            vehicle_system=system,
             own_positions=len(own),
-            own_source=_OWN if own else "",
+            own_source=own_source if own else "",
             sent=tuple(neutral.figures_of(name, one, ages[name]) for name, one in sources.items()),
             setpoints=len(setpoints[0]),
             modes=tuple(self._modes()),
             texts=tuple(self._texts()),
-            messages=messages,
+            messages={name: len(at_us) for name, at_us in stamps.items()},
             bad=dict(self._bad),
-            parameters={name: _parameter(value, int(system)) for name, value in log.initial_parameters.items()},
+            parameters={
+                plain_text(name): _parameter(value, system)
+                for name, value in log.initial_parameters.items()
+                if isinstance(value, int | float)
+            },
             notes=(*self._notes, *self._odd()),
+            rates_hz={
+                name: (len(at_us) - 1) * 1e6 / float(at_us[-1] - at_us[0])
+                for name, at_us in stamps.items()
+                if at_us[-1] > at_us[0]
+            },
         )
-        return MavlinkFlight(
+        flight = MavlinkFlight(
             info=info,
             own=neutral.track_of(own, origin_ns),
             sent={name: neutral.track_of(one.track, origin_ns) for name, one in sources.items()},
@@ -132,10 +184,40 @@ class _Reader:
             setpoint_mps2=setpoints[1][:, 6:],
             attitude_t_s=attitude[0],
             attitude_deg=attitude[1],
+            height_t_s=height[0],
+            height_m=height[1],
+            battery_t_s=battery[0],
+            battery_v=battery[1],
         )
+        return neutral.with_parts(flight)
+
+    def _span(self) -> tuple[int, int]:
+        """Return when the log begins and ends [µs]; leave out what has a stamp far from all others.
+
+        A damaged stamp is anything: what counts is the longest part that no hour of silence parts.
+        """
+        begin_us = int(self._log.start_timestamp)
+        every = [one.data["timestamp"].astype(np.uint64) for one in self._topics()]
+        if not every:
+            return begin_us, max(begin_us, int(self._log.last_timestamp))
+        at_us = np.sort(np.concatenate(every))
+        cuts = np.flatnonzero(np.diff(at_us) > LONGEST_SILENCE_NS // 1000) + 1
+        longest = max(np.split(at_us, cuts), key=len)
+        first_us, last_us = int(longest[0]), int(longest[-1])
+        if strays := len(at_us) - len(longest):
+            self._bad["stamp of another time"] += strays
+            for one in self._topics():
+                stamps = one.data["timestamp"]
+                known = (stamps >= longest[0]) & (stamps <= longest[-1])
+                one.data = {name: values[known] for name, values in one.data.items()}
+        # What held before the log began is logged with its own, earlier stamp.
+        near = abs(begin_us - first_us) * 1000 <= LONGEST_SILENCE_NS and begin_us <= last_us
+        return begin_us if near else first_us, last_us
 
     def _topics(self, *names: str) -> Iterator[Any]:
-        return (one for one in self._log.data_list if one.name in names and "timestamp" in one.data)
+        """Yield the topics of some names, or all, that have times."""
+        named = (one for one in self._log.data_list if not names or one.name in names)
+        return (one for one in named if len(one.data.get("timestamp", ())))
 
     def _first(self, name: str) -> dict[str, Any]:
         return next((one.data for one in self._topics(name)), {"timestamp": np.empty(0)})
@@ -146,8 +228,44 @@ class _Reader:
     def _seconds(self, fields: dict[str, Any]) -> Floats:
         return np.asarray((fields["timestamp"].astype(np.int64) - self._origin_us) * 1e-6, dtype=np.float64)
 
-    def _own(self) -> list[tuple[int, Any, Any]]:
-        fields = self._first(_OWN)
+    def _own(self) -> tuple[str, list[tuple[int, Any, Any]]]:
+        """Return the name and the points of its own position: in local NED, else on the globe."""
+        for one in self._topics(_OWN):
+            if known := self._local(one.data):
+                return _OWN, known
+        for name, (columns, (unit_deg, unit_m)) in _PLACES.items():
+            for one in self._topics(name):
+                newer = _PLACES["sensor_gps"] if "latitude_deg" in one.data else (columns, (unit_deg, unit_m))
+                if known := self._global(one.data, *newer):
+                    return name, known
+        return "", []
+
+    def _global(
+        self, fields: dict[str, Any], names: tuple[str, ...], units: tuple[float, float]
+    ) -> list[tuple[int, Any, Any]]:
+        """Return places on the globe as north, east and down of the first one."""
+        unit_deg, unit_m = units
+        lat_deg, lon_deg, height_m = (_columns(fields, *names) * (unit_deg, unit_deg, unit_m)).T
+        known = np.isfinite(lat_deg + lon_deg + height_m) & (np.abs(lat_deg) <= 90) & ((lat_deg != 0) | (lon_deg != 0))
+        if "fix_type" in fields:
+            known &= fields["fix_type"] >= _LEAST_FIX
+        at = np.flatnonzero(known)
+        if not len(at):
+            return []
+        home_deg, unknown = (float(lat_deg[at[0]]), float(lon_deg[at[0]])), (math.nan,) * 3
+        return [
+            (
+                int(fields["timestamp"][one]) * 1000,
+                (
+                    *neutral.from_home(float(lat_deg[one]), float(lon_deg[one]), home_deg),
+                    height_m[at[0]] - height_m[one],
+                ),
+                unknown,
+            )
+            for one in at
+        ]
+
+    def _local(self, fields: dict[str, Any]) -> list[tuple[int, Any, Any]]:
         position_m, velocity_mps = _columns(fields, "x", "y", "z"), _columns(fields, "vx", "vy", "vz")
         for prefix, array in (("", position_m), ("v_", velocity_mps)):
             for flag, axes in ((f"{prefix}xy_valid", slice(2)), (f"{prefix}z_valid", slice(2, 3))):
@@ -162,6 +280,19 @@ class _Reader:
             self._bad[f"{name} without a valid position"] += int((~known).sum())
         at_ns = [int(one) * 1000 for one in at_us[known]]
         return list(zip(at_ns, map(tuple, position_m[known].tolist()), more[known].tolist(), strict=True))
+
+    def _height(self) -> tuple[Floats, Floats]:
+        """Return the height of its own local position, which may be known without a place."""
+        fields = self._first(_OWN)
+        height_m = -_columns(fields, "z")[:, 0]
+        known = np.isfinite(height_m) & (fields.get("z_valid", np.ones(len(height_m))) != 0)
+        return self._seconds(fields)[known], height_m[known]
+
+    def _battery(self) -> tuple[Floats, Floats]:
+        fields = self._first("battery_status")
+        voltage_v = _columns(fields, "voltage_v")[:, 0]
+        known = voltage_v > 0
+        return self._seconds(fields)[known], voltage_v[known]
 
     def _sources(self) -> Iterator[tuple[str, SentSource]]:
         for one in self._topics(*_SENT):
@@ -204,7 +335,7 @@ class _Reader:
         tagged = [one for some in self._log.logged_messages_tagged.values() for one in some]
         for one in sorted([*self._log.logged_messages, *tagged], key=lambda one: int(one.timestamp)):
             severity = _SEVERITIES[min(max(one.log_level - ord("0"), 0), 7)]
-            yield SpokenText(at_s=self._second(one.timestamp), severity=severity, text=one.message)
+            yield SpokenText(at_s=self._second(one.timestamp), severity=severity, text=plain_text(one.message))
 
     def _begin_utc(self) -> str:
         """Return when the log began, by the first GPS time; `time_ref_utc` is but the offset of a time zone."""
@@ -221,9 +352,12 @@ class _Reader:
             total_s, longest_s = sum(dropouts) * 1e-3, max(dropouts) * 1e-3
             yield f"{count(len(dropouts), 'dropout')} of the log, {total_s:.2f} s in all, the longest {longest_s:.2f} s"
         for at_us, name, value in self._log.changed_parameters:
-            yield f"parameter {name} became {value:g} at {self._second(at_us):.2f} s"
+            if isinstance(value, int | float):
+                yield f"parameter {plain_text(name)} became {value:g} at {self._second(at_us):.2f} s"
         if self._log.file_corruption:
             yield "parts of the file are damaged; left out"
+        if self._short:
+            yield f"{count(self._short, 'message')} too short for its kind left out"
         if self._torn_bytes:
             yield f"the recording is torn within a message: its last {count(self._torn_bytes, 'byte')} left out"
 
@@ -234,7 +368,8 @@ def _parameter(value: Any, system: int) -> VehicleParameter:
 
 
 def _name(topic: Any) -> str:
-    return f"{topic.name} {topic.multi_id}" if topic.multi_id else str(topic.name)
+    name = plain_text(topic.name)
+    return f"{name} {topic.multi_id}" if topic.multi_id else name
 
 
 def _vector(fields: dict[str, Any], name: str, older: Sequence[str]) -> Sequence[str]:

@@ -11,7 +11,7 @@ from markupsafe import Markup
 
 from logs.recording.design_view import AXIS_NUMBER, Floats
 from logs.recording.disk import write_whole
-from logs.recording.mavlink_flight import Ages, MavlinkFlight, MavlinkFlightInfo, facts_of, longest_gap
+from logs.recording.mavlink_flight import Ages, MavlinkFlight, MavlinkFlightInfo, facts_of, longest_gap, rate_of
 from logs.recording.summary import BLIND_S, count
 from logs.report import page
 from logs.report.figures import largest
@@ -25,6 +25,7 @@ _OWN = Mark("line", "estimate", "position of the vehicle's own")
 _SENT = Mark("dot", "sample", "position sent to it")
 _WANTED = Mark("dotted", "target", "setpoint")
 _NONE = "There are none."
+_MOST_ROWS = 1000  # of a table on the page; the document of `--json` has all
 
 
 def write_tlog_page(flight: MavlinkFlight, path: Path) -> None:
@@ -66,6 +67,8 @@ def headline_of(flight: MavlinkFlight) -> Headline:
     if info.vehicle_system is None:
         return Headline(MIND, "No vehicle", "no autopilot's heartbeat is in it.", ())
     spans = armed_spans(info)
+    if not info.modes:
+        return Headline(MIND, "Arming not known", "nothing in it tells modes or arming.", ())
     if not spans:
         said = tuple(_alarms(flight, [(0.0, np.inf)]))
         return Headline(MIND, "Not armed", "the vehicle was never armed in it.", said)
@@ -191,6 +194,8 @@ def story(info: MavlinkFlightInfo) -> Iterator[str]:
     for sent in info.sent:
         yield f"{sent.source}: {count(sent.positions, 'position')}, {sent.rate_hz:.1f}/s, {longest_gap(sent)}."
     yield f"{count(info.setpoints, 'setpoint')} in local NED; {count(len(info.texts), 'text')} of the vehicle."
+    if info.missing:
+        yield f"Not in it, and so not shown: {', '.join(info.missing)}."
     yield from (f"{note}." for note in info.notes)
 
 
@@ -204,6 +209,12 @@ def _sections(flight: MavlinkFlight) -> Iterator[PageSection]:
         wanted = (_WANTED,) if asked else ()
         note = "Time counts from the recording's begin. All is in local NED, height upwards."
         yield PageSection("Axes over time", note, page.grid(list(_axes(flight))), (*marks, *wanted))
+    elif len(flight.height_t_s):
+        height = _course(flight, "height", "Height", "height [m]", flight.height_t_s, flight.height_m)
+        yield PageSection("Height", "It told no place, and its height alone.", page.grid([height]))
+    if len(flight.battery_t_s):
+        battery = _course(flight, "battery", "Battery", "voltage [V]", flight.battery_t_s, flight.battery_v)
+        yield PageSection("Battery", "", page.grid([battery]))
     if len(flight.attitude_t_s):
         yield PageSection("Attitude", "", page.grid(list(_attitude(flight))))
     aged = {source: ages for source, ages in flight.ages.items() if len(ages.age_s)}
@@ -222,9 +233,9 @@ def _sections(flight: MavlinkFlight) -> Iterator[PageSection]:
     yield PageSection("Modes", "", _table(("from [s]", "mode", "armed"), modes))
     texts = [(f"{one.at_s:.2f}", one.severity, one.text) for one in info.texts]
     yield PageSection("Texts of the vehicle", "", _table(("at [s]", "severity", "text"), texts))
-    messages = [(name, str(number)) for name, number in info.messages.items()]
+    messages = [(name, str(number), rate_of(info, name)) for name, number in info.messages.items()]
     parameters = [(name, str(one.value), one.type) for name, one in info.parameters.items()]
-    folded = page.folded("Messages", page.table(("message", "number"), messages, frozenset({1})))
+    folded = page.folded("Messages", page.table(("message", "number", "rate"), messages, frozenset({1, 2})))
     if parameters:
         columns = ("parameter", "value", "type")
         folded += page.folded("Parameters of the vehicle", page.table(columns, parameters, frozenset({1})))
@@ -232,7 +243,8 @@ def _sections(flight: MavlinkFlight) -> Iterator[PageSection]:
 
 
 def _table(columns: Sequence[str], rows: Sequence[tuple[str, ...]]) -> Markup:
-    return page.table(columns, rows, frozenset({0})) if rows else page.paragraph(_NONE)
+    more = [f"{len(rows) - _MOST_ROWS} more are in the document of --json"] if len(rows) > _MOST_ROWS else []
+    return page.table(columns, rows[:_MOST_ROWS], frozenset({0}), more) if rows else page.paragraph(_NONE)
 
 
 def _paths(flight: MavlinkFlight) -> Iterator[Drawing]:
@@ -295,11 +307,16 @@ def _over_time(
 
 def _attitude(flight: MavlinkFlight) -> Iterator[Drawing]:
     for number, angle in enumerate(("roll", "pitch", "yaw")):
-        with canvas(f"attitude-{angle}", 2.3) as one:
-            ax = one.axes(angle.capitalize(), "time [s]", f"{angle} [°]")
-            ax.plot(*thin(flight.attitude_t_s, flight.attitude_deg[:, number]), color=colour("estimate"), lw=1.1)
-            ax.set_xlim(0, max(flight.duration_s, 1e-3))
-        yield Drawing(f"attitude-{angle}", one.svg, f"{angle.capitalize()} over time")
+        values = flight.attitude_deg[:, number]
+        yield _course(flight, f"attitude-{angle}", angle.capitalize(), f"{angle} [°]", flight.attitude_t_s, values)
+
+
+def _course(flight: MavlinkFlight, key: str, title: str, y_label: str, t_s: Floats, values: Floats) -> Drawing:
+    with canvas(key, 2.3) as one:
+        ax = one.axes(title, "time [s]", y_label)
+        ax.plot(*thin(t_s, values), color=colour("estimate"), lw=1.1)
+        ax.set_xlim(0, max(flight.duration_s, 1e-3))
+    return Drawing(key, one.svg, f"{title} over time")
 
 
 def _age(flight: MavlinkFlight, key: str, source: str, ages: Ages) -> Drawing:

@@ -155,8 +155,8 @@ VEHICLE = Peer(1, 1)
         ),
         (VEHICLE.send("battery_status", 1, 0, 0, 0, [4_000] + [65_535] * 9, 0, 0, 0, 0), None),
         (
-            VEHICLE.send("statustext", 4, b"bad \x1b[2J\xff text\t"),
-            Text(system=1, component=1, severity=4, text="bad ?[2J\ufffd text"),
+            VEHICLE.send("statustext", 4, b"\x1b[32mbad\x1b[0m \xc2\xb0\xff\x07 text\t"),
+            Text(system=1, component=1, severity=4, text="bad °\ufffd? text"),
         ),
         (
             VEHICLE.send("command_ack", 21, 4, 0, 0, 245, 25),

@@ -25,7 +25,14 @@ from uavctl.mavlink.profile import PROFILES, autopilot_name, describe_mode
         ("ardupilot", 2, 0, "STABILIZE", False),
         ("ardupilot", 2, 20, "GUIDED_NOGPS", False),
         ("ardupilot", 2, 29, "MODE_29", False),
-        ("ardupilot", 1, 4, "MODE_4", False),  # a plane: 4 is not GUIDED there
+        ("ardupilot", 1, 4, "ACRO", False),  # a plane: 4 is not GUIDED there
+        ("ardupilot", 1, 15, "GUIDED", False),  # and its GUIDED takes no setpoint of ours
+        ("ardupilot", 21, 18, "QHOVER", False),
+        ("ardupilot", 10, 4, "HOLD", False),
+        ("ardupilot", 11, 12, "SMART_RTL", False),
+        ("ardupilot", 12, 9, "SURFACE", False),
+        ("ardupilot", 12, 4, "GUIDED", False),
+        ("ardupilot", 7, 1, "MODE_1", False),
         ("ardupilot", 2, 6 << 16, "MODE_393216", False),
         ("unknown", 2, 4, "MODE_4", False),
     ],

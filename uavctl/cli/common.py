@@ -136,6 +136,12 @@ def can_be_read(type_: object, path: object) -> None:
 
 DEFAULTS = Common()
 Flight = Annotated[Path, Parameter(help="the recording", validator=can_be_read)]
+System = Annotated[
+    int | None,
+    Parameter(
+        help="with several vehicles' MAVLink: the vehicle's system id", validator=validators.Number(gte=1, lte=255)
+    ),
+]
 SPAN_S = validators.Number(gt=0, lte=LONGEST_S)
 HEIGHT_M = validators.Number(gt=0, lte=1000)
 SEED = validators.Number(gte=0, lte=LARGEST_SEED)

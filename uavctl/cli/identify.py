@@ -14,7 +14,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from logs.recording.disk import spare_recording, write_whole
+from logs.recording.disk import FileKind, kind_of, spare_recording, write_whole
 from logs.recording.reader import header, lacks_end, read
 from logs.recording.tlog import read_tlog
 from uavctl.build.controller import design_of
@@ -59,7 +59,7 @@ def identify_command(
 
 def _history(flight: Path, common: Common) -> tuple[FlightHistory, Config]:
     """Return the flight, and the configuration that its result goes into."""
-    if flight.suffix == ".tlog":
+    if kind_of(flight) is FileKind.TLOG:
         config = common.load().config
         one_link = msgspec.structs.replace(config.daemon, vehicle="tlog", mocap="tlog")
         read_as = msgspec.structs.replace(config, daemon=one_link)

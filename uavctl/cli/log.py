@@ -14,18 +14,20 @@ from rich.table import Table
 from rich.text import Text
 
 from logs.recording.attachments import layout_text
+from logs.recording.disk import FileKind, kind_of
 from logs.recording.export import Exported, TableFormat, Watch, export_tables
+from logs.recording.foreign import foreign_flight
 from logs.recording.info import PositionLoss, RecordingInfo
 from logs.recording.info import info as recording_info
-from logs.recording.mavlink_flight import MavlinkFlightInfo, facts_of, is_tlog, read_flight
+from logs.recording.mavlink_flight import MavlinkFlightInfo, facts_of, rate_of
 from logs.recording.parameters import VehicleParameter, listed
 from logs.recording.reader import RecordedMessage, lacks_end
 from logs.recording.recover import RecoverResult
 from logs.recording.recover import recover as restore
 from logs.recording.summary import count
 from logs.recording.tlog import ExportedTlog, export_tlog
-from logs.recording.ulog import is_ulog, read_ulog
-from uavctl.cli.common import Common, Flight, Json, bars, columns, counted, two_columns, warn
+from logs.recording.ulog import is_ulog
+from uavctl.cli.common import Common, Flight, Json, System, bars, columns, counted, two_columns, warn
 from uavctl.cli.usage import example
 from uavctl.errors import UsageError
 
@@ -105,9 +107,9 @@ _SOME_PARAMETERS = 4
 
 
 def _tlog_info(told: MavlinkFlightInfo) -> RenderableType:
-    rows = ((Text(name), str(number)) for name, number in told.messages.items())
+    rows = ((Text(name), str(number), rate_of(told, name)) for name, number in told.messages.items())
     lines = [f"{name}: {value}" for name, value in facts_of(told)]
-    return Group(columns("", ("message", "number"), rows, fold=True), *map(Text, (*lines, *told.notes)))
+    return Group(columns("", ("message", "number", "rate"), rows, fold=True), *map(Text, (*lines, *told.notes)))
 
 
 def info_table(found: RecordingInfo) -> RenderableType:
@@ -231,12 +233,13 @@ for _name, (_path, _help) in _COMMANDS.items():
 
 
 @log_app.command(help_epilogue=example("log info"))
-def info(flight: Flight, /, *, json: Json = False) -> int:
+def info(flight: Flight, /, *, system: System = None, json: Json = False) -> int:
     """Say what a recording, a .tlog or a ULog holds: topics, rates, gaps, losses, and how it was made."""
-    if is_tlog(flight) or is_ulog(flight):
-        told = (read_ulog if is_ulog(flight) else read_flight)(flight).info
-        kind = "ulog" if is_ulog(flight) else "tlog"
-        Common(json=json).show(f"log/info-{kind}", told, lambda: _tlog_info(told))
+    if kind_of(flight) is not FileKind.MCAP or system is not None:
+        told = foreign_flight(flight, system)
+        assert told is not None  # only one of ours is none, of which there is no system
+        name = FileKind.ULOG if is_ulog(flight) else FileKind.TLOG
+        Common(json=json).show(f"log/info-{name}", told.info, lambda: _tlog_info(told.info))
         return 0
     found = recording_info(flight)
     Common(json=json).show("log/info", found, lambda: info_table(found))

@@ -11,12 +11,13 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from logs.recording.disk import spare_recording, write_whole
+from logs.recording.disk import FileKind, spare_recording, write_whole
 from logs.recording.flight import FlightData
-from logs.recording.mavlink_flight import facts_of, is_tlog, read_flight
+from logs.recording.foreign import foreign_flight
+from logs.recording.mavlink_flight import MavlinkFlight, facts_of
 from logs.recording.reader import lacks_end, read
 from logs.recording.summary import names_and_values, render, summarise
-from logs.recording.ulog import is_ulog, read_ulog
+from logs.recording.ulog import is_ulog
 from logs.report.compare import (
     ComparedFlight,
     FlightComparison,
@@ -35,7 +36,19 @@ from logs.report.flight_page import verdict_rows, write_report
 from logs.report.headline import BAD, GOOD, MIND, Headline, headline
 from logs.report.tlog_page import headline_of, write_tlog_page
 from logs.report.verdicts import judge
-from uavctl.cli.common import Column, Common, Flight, Json, WideTable, bars, can_be_read, columns, two_columns, warn
+from uavctl.cli.common import (
+    Column,
+    Common,
+    Flight,
+    Json,
+    System,
+    WideTable,
+    bars,
+    can_be_read,
+    columns,
+    two_columns,
+    warn,
+)
 from uavctl.errors import UsageError
 
 # `uavctl log compare`: recordings beside each other.
@@ -111,14 +124,16 @@ def report(
     *,
     out: Annotated[Path | None, Parameter(help="page to write; else beside the recording")] = None,
     svg: Annotated[Path | None, Parameter(help="also write a small picture of the flight")] = None,
+    system: System = None,
     json: Json = False,
 ) -> int:
     """Write the page of a recording, of a .tlog, or of a ULog of PX4: one HTML file that needs nothing else."""
     page = out if out is not None else flight.with_suffix(".html")
     for target in (page, *(() if svg is None else (svg,))):
         spare_recording(target)
-    if is_tlog(flight) or is_ulog(flight):
-        return _report_tlog(flight, page, svg, Common(json=json))
+    foreign = foreign_flight(flight, system)
+    if foreign is not None:
+        return _report_foreign(flight, foreign, page, svg, Common(json=json))
     data = FlightData.from_records(read(flight), flight)
     dropped = max((note.dropped for note in data.notes), default=0)
     summary = summarise(data, wall_s=None, recording=str(flight), report=str(page), recorder_dropped=dropped)
@@ -147,16 +162,15 @@ def _told(main: Headline, summary: RenderableType) -> Group:
     return Group(Text.assemble((f"{main.word}: ", _STYLES[main.tone]), main.text), *why, summary)
 
 
-def _report_tlog(flight: Path, out: Path, svg: Path | None, common: Common) -> int:
+def _report_foreign(flight: Path, found: MavlinkFlight, out: Path, svg: Path | None, common: Common) -> int:
     if svg is not None:
         raise UsageError(f"--svg draws a recording of ours; {flight} is none, and of it there is the page")
-    found = (read_ulog if is_ulog(flight) else read_flight)(flight)
     write_tlog_page(found, out)
     for note in found.info.notes:
         warn(note)
     main = headline_of(found)
     document = {**msgspec.to_builtins(found.info), "report": str(out), "headline": _document(main)}
-    kind = "ulog" if is_ulog(flight) else "tlog"
+    kind = FileKind.ULOG if is_ulog(flight) else FileKind.TLOG
     facts: list[tuple[str, object]] = [*facts_of(found.info), ("page", str(out))]
     common.show(f"log/report-{kind}", document, lambda: _told(main, two_columns("", facts)))
     return 0

@@ -14,7 +14,7 @@ from cyclopts import Parameter
 from rich.console import Group, RenderableType
 from rich.table import Table
 
-from logs.recording.foreign import is_foreign, read_mcap
+from logs.recording.foreign import foreign_log
 from logs.recording.reader import good_messages, header, lacks_end, last_note, records
 from logs.recording.replay import (
     LAST_BITS,
@@ -27,15 +27,16 @@ from logs.recording.replay import (
     recorded_library,
 )
 from logs.recording.replay import replay as replay_recording
+from logs.recording.senders import choose_vehicle
 from logs.recording.summary import count
-from logs.recording.tlog import ForeignReplay, TlogPacket, read_tlog, replay_tlog
+from logs.recording.tlog import ForeignReplay, TlogPacket, replay_tlog
 from logs.recording.topics import HOLES, RECOVERED, RecorderNote
 from uavctl.arithmetic import ARITHMETIC, OWN, without_choice
 from uavctl.build.controller import ARITHMETIC_NAME, CONTROLLER, Prepared, build_controller, cpu, design_of, versions
 from uavctl.build.library import check_fits, decode
 from uavctl.build.outside import KEY
 from uavctl.cli import start_anew
-from uavctl.cli.common import DEFAULTS, Common, Flight, columns, counted, located, messages, two_columns, warn
+from uavctl.cli.common import DEFAULTS, Common, Flight, System, columns, counted, located, two_columns, warn
 from uavctl.cli.prepare import prepare
 from uavctl.config import Config, LoadedConfig
 from uavctl.config.load import parse_recorded
@@ -167,31 +168,24 @@ def replay_flight(flight: Path, tolerance: float = 0.0, overrides: Sequence[str]
     return Replayed(result, cut, holes, changed, tuple(other_versions(recorded, flown.smpc.controller)), tolerance)
 
 
-def foreign_packets(flight: Path, topics: Sequence[str]) -> tuple[TlogPacket, ...] | None:
+def foreign_packets(flight: Path, topics: Sequence[str], system: int | None = None) -> tuple[TlogPacket, ...] | None:
     """Return the packets of another program's recording, None if it is one of ours; say what was left out.
 
     Args:
         topics: Topics of an MCAP to take; all that hold MAVLink if none is named.
+        system: The vehicle's system id; what other vehicles sent is left out then.
 
     Raises:
         RecordingError: It cannot be read, or holds no MAVLink.
-        UsageError: It has no such topic.
+        UsageError: It has no such topic, or nothing of that system.
     """
-    if flight.suffix == ".tlog":
-        if topics:
-            raise UsageError("--topic is for an MCAP: a .tlog has no topics")
-        tlog = read_tlog(flight)
-        packets, notes = tlog.packets, tlog.notes
-    elif is_foreign(flight):
-        found = read_mcap(flight, topics)
-        messages().print(f"MAVLink in {', '.join(found.topics)}", soft_wrap=True)
-        torn = ("the recording is torn: replayed up to its end",) if found.torn else ()
-        packets, notes = found.packets, (*found.notes, *torn)
-    else:
+    log = foreign_log(flight, topics)
+    if log is None:
         return None
-    for note in notes:
+    vehicle = choose_vehicle(log.packets, str(flight), system)
+    for note in (*vehicle.notes, *log.notes):
         warn(note)
-    return packets
+    return log.packets if system is None else tuple(one for one in log if not vehicle.of_others(one))
 
 
 def check_first(flight: Path) -> None:
@@ -360,16 +354,17 @@ def replay(
         tuple[str, ...],
         Parameter(negative=(), help="with the MCAP of another program: take this topic alone; may be repeated"),
     ] = (),
+    system: System = None,
 ) -> int:
     """Drive the recorded inputs through the same control loop and compare all that it decides."""
     if not 0.0 <= tolerance < 1.0:
         raise UsageError(f"--tolerance {tolerance:g}: it is a share of a number; give 0 or more, and less than 1")
-    packets = foreign_packets(flight, topic)
+    packets = foreign_packets(flight, topic, system)
     if packets is not None:
         return _replay_foreign(flight, packets, common)
-    if common.config != DEFAULTS.config or topic:
+    if common.config != DEFAULTS.config or topic or system is not None:
         raise UsageError(
-            "--config and --topic are for another program's recording: one of ours is replayed with its own "
+            "--config, --topic and --system are for another program's recording: one of ours is replayed with its own "
             "configuration, of which --set changes a key"
         )
     replayed = replay_flight(flight, tolerance, common.overrides)

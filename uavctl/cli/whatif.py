@@ -16,7 +16,7 @@ from rich.console import Group, RenderableType
 from rich.progress import Progress, TaskProgressColumn, TimeElapsedColumn
 from rich.text import Text
 
-from logs.recording.disk import write_whole
+from logs.recording.disk import FileKind, kind_of, write_whole
 from logs.recording.ends import new_recording, put_header
 from logs.recording.export import known_number
 from logs.recording.flight import FlightData
@@ -209,7 +209,7 @@ def whatif(
     json: Json = False,
 ) -> int:
     """Fly a recorded flight again with something changed, in the same disturbance, and compare."""
-    if (flight.suffix == ".tlog" and flight.exists()) or is_foreign(flight):
+    if (kind_of(flight) is FileKind.TLOG and flight.exists()) or is_foreign(flight):
         raise UsageError(
             f"{flight} is another program's recording: it does not tell what was decided; `uavctl log replay` and "
             "`uavctl identify` read it"

@@ -166,7 +166,7 @@ def decode(data: bytes) -> Decoded:
     """
     if len(data) > MAX_DATAGRAM_BYTES:
         return Decoded((), 0, {BadBytes.OVERSIZE: 1})
-    return _decoded(scan(data, final=True))
+    return decoded(scan(data, final=True))
 
 
 class StreamDecoder:
@@ -181,10 +181,11 @@ class StreamDecoder:
         data = self._rest + chunk
         found = scan(data, final=False, in_step=self._in_step)
         self._rest, self._in_step = data[found.consumed :], found.in_step
-        return _decoded(found)
+        return decoded(found)
 
 
-def _decoded(found: Scan) -> Decoded:
+def decoded(found: Scan) -> Decoded:
+    """Decode the frames that a scan has found."""
     messages = []
     for frame in found.frames:
         understood = _UNDERSTOOD.get(frame.message_id)
@@ -389,10 +390,8 @@ def _battery(raw: Fields, voltages_mv: list[int]) -> Battery | None:
 
 
 def _text(raw: Fields) -> Text:
-    # Control characters would act on the terminal that shows them; PX4 ends its texts with a tab.
-    said = text_of(raw.text)
     more = raw.id != 0 and b"\0" not in raw.text
-    shown = "".join(character if character.isprintable() else "?" for character in (said if more else said.rstrip()))
+    shown = text_of(raw.text if more else raw.text.split(b"\0", 1)[0].rstrip())  # PX4 ends its texts with a tab
     return Text(
         system=raw.src_system,
         component=raw.src_component,

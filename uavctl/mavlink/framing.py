@@ -6,6 +6,7 @@ counted by reason, and the search goes on at the next byte that could begin one.
 
 from __future__ import annotations
 
+import re
 from collections import namedtuple
 from collections.abc import Callable
 from enum import StrEnum
@@ -136,6 +137,16 @@ def scan(data: bytes, *, final: bool, in_step: bool = True, verify: Verify | Non
     return result
 
 
+def scan_one(data: bytes) -> Scan:
+    """Look at bytes that should be one whole frame; others are not searched for in them."""
+    result = Scan(consumed=0)
+    end, reason = _try_frame(data, result, None, final=True) if data else (None, BadBytes.TRUNCATED)
+    if end is None:
+        result.skip(reason)
+    result.consumed = len(data)
+    return result
+
+
 _TAKEN, _WAIT = "taken", "wait"
 
 
@@ -253,6 +264,20 @@ class MessageLayout:
         return with_checksum(header + payload)
 
 
+# Escape sequences of a terminal, ECMA-48: CSI with its parameters, OSC up to its end, and those of two characters.
+_ESCAPES = re.compile(
+    r"(?:\x1b\[|\x9b)[0-?]*[ -/]*[@-~]?|(?:\x1b\]|\x9d)[^\x07\x1b\x9c]*(?:\x07|\x1b\\|\x9c)?|\x1b[ -/]*[0-~]?"
+)
+
+
+def plain_text(text: str) -> str:
+    """A text that somebody else wrote, without what would act on the terminal that shows it.
+
+    Escape sequences go, as PX4's colours; any other character that is not printable becomes a question mark.
+    """
+    return "".join(character if character.isprintable() else "?" for character in _ESCAPES.sub("", text))
+
+
 def text_of(raw: bytes) -> str:
-    """A text of a fixed length, up to its first zero."""
-    return raw.split(b"\0", 1)[0].decode("ascii", errors="replace")
+    """A text of a fixed length, up to its first zero, as it may be shown."""
+    return plain_text(raw.split(b"\0", 1)[0].decode("utf-8", errors="replace"))

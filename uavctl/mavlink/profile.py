@@ -64,12 +64,26 @@ _COPTER_TYPES = frozenset(
         mavlink.MAV_TYPE_DECAROTOR,
     }
 )
-# ArduCopter: enum COPTER_MODE; who chooses them: ArduCopter/events.cpp, fence.cpp, avoidance_adsb.cpp.
-_COPTER = {
-    int(getattr(mavlink, name)): name.removeprefix("COPTER_MODE_")
-    for name in dir(mavlink)
-    if name.startswith("COPTER_MODE_") and name != "COPTER_MODE_ENUM_END"
+
+
+def _mode_names(prefix: str) -> dict[int, str]:
+    """Return the names of an enum of modes by their numbers."""
+    named = {name.removeprefix(prefix): int(getattr(mavlink, name)) for name in dir(mavlink) if name.startswith(prefix)}
+    return {number: name for name, number in named.items() if name != "ENUM_END"}
+
+
+# ArduPilot: the enum of modes of each kind of vehicle; ArduPlane's is that of a plane that can hover, too
+_COPTER, _PLANE, _ROVER = map(_mode_names, ("COPTER_MODE_", "PLANE_MODE_", "ROVER_MODE_"))
+_ARDUPILOT = {
+    **dict.fromkeys(_COPTER_TYPES, _COPTER),
+    mavlink.MAV_TYPE_FIXED_WING: _PLANE,
+    **dict.fromkeys(range(mavlink.MAV_TYPE_VTOL_DUOROTOR, mavlink.MAV_TYPE_VTOL_RESERVED5 + 1), _PLANE),
+    mavlink.MAV_TYPE_GROUND_ROVER: _ROVER,
+    mavlink.MAV_TYPE_SURFACE_BOAT: _ROVER,
+    mavlink.MAV_TYPE_SUBMARINE: _mode_names("SUB_MODE_"),
+    mavlink.MAV_TYPE_ANTENNA_TRACKER: _mode_names("TRACKER_MODE_"),
 }
+# Who chooses the modes of a copter: ArduCopter/events.cpp, fence.cpp, avoidance_adsb.cpp.
 _COPTER_EITHER = frozenset({"AUTO", "AUTO_RTL", "AUTOROTATE", "BRAKE", "LAND", "RTL", "SMART_RTL"})
 _PX4_CHOICES = {name: choice for name, choice in _PX4_MAIN.values() if name != "AUTO"} | {
     f"AUTO.{name}": choice for name, choice in _PX4_AUTO.values()
@@ -86,8 +100,9 @@ def _px4_mode(vehicle_type: int, custom_mode: int) -> str:
     return f"AUTO.{_PX4_AUTO[sub][0] if sub in _PX4_AUTO else sub}"
 
 
-def _copter_mode(vehicle_type: int, custom_mode: int) -> str:
-    return _COPTER.get(custom_mode, f"MODE_{custom_mode}") if vehicle_type in _COPTER_TYPES else ""
+def _ardupilot_mode(vehicle_type: int, custom_mode: int) -> str:
+    names = _ARDUPILOT.get(vehicle_type)
+    return "" if names is None else names.get(custom_mode, f"MODE_{custom_mode}")
 
 
 @dataclass(frozen=True)
@@ -150,7 +165,7 @@ PROFILES = {
         moves_stamps=False,
         number=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
         inertial=(mavlink.MAVLINK_MSG_ID_ATTITUDE, mavlink.MAVLINK_MSG_ID_RAW_IMU),
-        mode_name=_copter_mode,
+        mode_name=_ardupilot_mode,
         modes={"GUIDED": (4, 0)},
     ),
 }
@@ -171,4 +186,5 @@ def describe_mode(autopilot: str, vehicle_type: int, custom_mode: int) -> tuple[
     name = "" if profile is None else profile.mode_name(vehicle_type, custom_mode)
     if profile is None or not name:
         return f"MODE_{custom_mode}", False
-    return name, name == profile.external
+    # GUIDED of a plane, a rover or a submarine is not the mode that a copter takes setpoints in.
+    return name, name == profile.external and (autopilot != "ardupilot" or vehicle_type in _COPTER_TYPES)

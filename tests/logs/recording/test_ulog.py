@@ -156,7 +156,6 @@ def test_a_torn_one_is_shown_up_to_there(path: Path, capsys: pytest.CaptureFixtu
     [
         b"", b"no recording", MAGIC, MAGIC + bytes(8), MAGIC + bytes(9), MAGIC[:-1] + b"\x36" + bytes(60),
         UlogWriter(START_US).file, flown().file[: flown().definitions_bytes], flown().file[:80],
-        flown(own=False, sent=False).file,
         flown().file[:27] + b"\x02" + flown().file[28:],  # a flag that no reader may pass over
     ],
 )  # fmt: skip

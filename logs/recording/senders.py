@@ -1,0 +1,162 @@
+"""Who speaks in a recording of MAVLink, and which of them is the vehicle that it is read for.
+
+A log of a ground station may have several vehicles, and each of them a gimbal, a camera and a companion computer that
+send heartbeats too. Header of a frame: https://mavlink.io/en/guide/serialization.html.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import msgspec
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from logs.recording.tlog import GROUND_SYSTEMS, TlogPacket
+from uavctl.errors import UsageError
+from uavctl.mavlink.codec import decode
+from uavctl.mavlink.messages import Heartbeat
+from uavctl.mavlink.profile import autopilot_name
+from uavctl.mavlink.vehicle import is_vehicle
+
+_AUTOPILOT = int(mavlink.MAV_COMP_ID_AUTOPILOT1)
+# Kinds of devices aboard, whose heartbeats may name the autopilot that they are made for.
+_DEVICES = frozenset(
+    {
+        mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_TYPE_GIMBAL, mavlink.MAV_TYPE_CAMERA, mavlink.MAV_TYPE_ADSB,
+        mavlink.MAV_TYPE_CHARGING_STATION, mavlink.MAV_TYPE_FLARM, mavlink.MAV_TYPE_SERVO, mavlink.MAV_TYPE_ODID,
+        mavlink.MAV_TYPE_BATTERY, mavlink.MAV_TYPE_PARACHUTE, mavlink.MAV_TYPE_LOG, mavlink.MAV_TYPE_OSD,
+        mavlink.MAV_TYPE_IMU, mavlink.MAV_TYPE_GPS, mavlink.MAV_TYPE_WINCH,
+    }
+)  # fmt: skip
+# What a vehicle alone tells, so that one is known even where no heartbeat is in the file.
+_STATES = frozenset(
+    {
+        mavlink.MAVLINK_MSG_ID_SYS_STATUS, mavlink.MAVLINK_MSG_ID_GPS_RAW_INT, mavlink.MAVLINK_MSG_ID_ATTITUDE,
+        mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
+        mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT, mavlink.MAVLINK_MSG_ID_VFR_HUD,
+    }
+)  # fmt: skip
+_MOST_AT_ONCE = 128  # numbers of a sequence of 256 that are missing at once; more is disorder
+
+
+class LogSender(msgspec.Struct, frozen=True, kw_only=True):
+    """One component that speaks in a recording."""
+
+    system: int
+    component: int
+    kind: str  # of MAV_TYPE by its heartbeats; empty without any
+    messages: int
+    missing: int  # by the numbers of its messages: lost on the way to the recorder
+
+
+@dataclass(frozen=True)
+class ChosenVehicle:
+    """The vehicle that a recording is read for, and the others in it."""
+
+    system: int | None  # None: there is none
+    heartbeat: Heartbeat | None  # its first; None if it sends none
+    others: tuple[Heartbeat, ...] = ()  # the first of each other vehicle
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences on who else is in the recording, and on what is not known of the vehicle."""
+        found = []
+        if self.system is not None and self.heartbeat is None:
+            found.append(f"system {self.system} sends no heartbeat of an autopilot: its mode and arming are not known")
+        if self.others:
+            names = ", ".join(f"system {one.system} ({autopilot_name(one.autopilot)})" for one in self.others)
+            found.append(
+                f"another vehicle is in it: {names}; system {self.system} is shown, `--system` chooses another"
+                if len(self.others) == 1
+                else f"other vehicles are in it: {names}; system {self.system} is shown, `--system` chooses another"
+            )
+        return tuple(found)
+
+    def of_others(self, packet: TlogPacket) -> bool:
+        """Return whether a packet comes from another vehicle's system."""
+        return any(system_of(packet.data) == one.system for one in self.others)
+
+
+def system_of(frame: bytes) -> int:
+    """Return the system id of a whole frame."""
+    return frame[5 if frame[0] == mavlink.PROTOCOL_MARKER_V2 else 3]
+
+
+def message_of(frame: bytes) -> int:
+    """Return the message id of a whole frame."""
+    return int.from_bytes(frame[7:10], "little") if frame[0] == mavlink.PROTOCOL_MARKER_V2 else frame[5]
+
+
+def choose_vehicle(packets: Sequence[TlogPacket], name: str, system: int | None = None) -> ChosenVehicle:
+    """Return the vehicle of some packets: the one that is asked for, else the first that is heard.
+
+    Args:
+        packets: whole frames in order of time.
+        name: of the recording, for errors.
+        system: the one that is asked for.
+
+    Raises:
+        UsageError: It is not in the recording.
+    """
+    first: dict[tuple[int, int], Heartbeat] = {}
+    for packet in packets:
+        if message_of(packet.data) == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
+            for one in decode(packet.data).messages:
+                if isinstance(one, Heartbeat) and _may_be_vehicle(one):
+                    first.setdefault((one.system, one.component), one)
+    vehicles: dict[int, Heartbeat] = {}
+    for one in sorted(first.values(), key=lambda one: one.component != _AUTOPILOT):  # in order else
+        vehicles.setdefault(one.system, one)
+    if system is None:
+        system = next(iter(vehicles), None)
+    elif system not in vehicles and all(system_of(packet.data) != system for packet in packets):
+        there = sorted({system_of(packet.data) for packet in packets})
+        listed = ", ".join(map(str, there))
+        raise UsageError(f"--system {system}: {name} has nothing of it; systems in it: {listed}")
+    if system is None:
+        told = (system_of(one.data) for one in packets if message_of(one.data) in _STATES)
+        system = next((one for one in told if one not in GROUND_SYSTEMS), None)
+    others = tuple(one for number, one in sorted(vehicles.items()) if number != system)
+    return ChosenVehicle(system, None if system is None else vehicles.get(system), others)
+
+
+def _may_be_vehicle(heartbeat: Heartbeat) -> bool:
+    return is_vehicle(heartbeat) and heartbeat.vehicle_type not in _DEVICES
+
+
+class Senders:
+    """Counts what each component sent, by the frames that were right."""
+
+    def __init__(self) -> None:
+        self._last: dict[tuple[int, int], int] = {}
+        self._messages: dict[tuple[int, int], int] = {}
+        self._missing: dict[tuple[int, int], int] = {}
+        self._kinds: dict[tuple[int, int], int] = {}
+
+    def take(self, frame: bytes) -> None:
+        """Take a whole frame."""
+        at = 4 if frame[0] == mavlink.PROTOCOL_MARKER_V2 else 2
+        number, sender = frame[at], (frame[at + 1], frame[at + 2])
+        skipped = (number - self._last.get(sender, number - 1) - 1) % 256
+        self._last[sender] = number
+        self._messages[sender] = self._messages.get(sender, 0) + 1
+        self._missing[sender] = self._missing.get(sender, 0) + (skipped if skipped <= _MOST_AT_ONCE else 0)
+
+    def take_heartbeat(self, heartbeat: Heartbeat) -> None:
+        """Take what a sender says that it is."""
+        self._kinds[heartbeat.system, heartbeat.component] = heartbeat.vehicle_type
+
+    def listed(self) -> Iterable[LogSender]:
+        """Return who spoke, by system and component."""
+        for (system, component), messages in sorted(self._messages.items()):
+            kind = self._kinds.get((system, component))
+            yield LogSender(
+                system=system, component=component, kind="" if kind is None else _kind_name(kind),
+                messages=messages, missing=self._missing[system, component],
+            )  # fmt: skip
+
+
+def _kind_name(kind: int) -> str:
+    known = mavlink.enums["MAV_TYPE"].get(kind)
+    return f"type {kind}" if known is None else known.name.removeprefix("MAV_TYPE_").lower().replace("_", " ")
