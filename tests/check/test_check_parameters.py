@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tomllib
 from itertools import product
 
 import msgspec
@@ -11,13 +12,16 @@ import pytest
 from check_rig import Checked, Hand, look
 from hypothesis import given
 from hypothesis import strategies as st
+from manual_rig import blocks, keys
 from mavlink_rig import packets, read
+from places import ROOT
 
 from sim.simulation import Peers
-from uavctl.check.findings import ItemState
+from uavctl.check.findings import ItemState, describe, refusals
 from uavctl.check.preflight import Preflight
 from uavctl.check.vehicle import RULES, ParameterVerdict
 from uavctl.config import Config, load_config
+from uavctl.config.checks import position_limits_m
 from uavctl.lab.own_loop import EXTERNAL_ONLY
 from uavctl.loop import make_links
 
@@ -241,3 +245,43 @@ def test_a_value_is_good_just_when_it_is_what_the_words_want(autopilot: int, rel
                 judged += 1
                 kinds.add((rule.name, good))
     assert judged > 800 and kinds == {(rule.name, good) for rule in RULES[autopilot] for good in (True, False)}
+
+
+DUO = tomllib.loads((ROOT / "docs/examples/duo.toml").read_text(encoding="utf-8"))["vehicle"]
+FOR_ONE = {"room-px4": "px4", "room-ardupilot": "ardupilot"}  # presets of one autopilot
+ROOMS: list[tuple[str, str, list[str]]] = [
+    *[
+        (name, autopilot, [])
+        for name in ("room", "room-px4", "room-ardupilot", "room-hahn-stursberg", "paper")
+        for autopilot in ("px4", "ardupilot")
+        if FOR_ONE.get(name, autopilot) == autopilot
+    ],
+    *[(one["config"], "px4", one["set"]) for one in DUO],
+    (
+        "room-px4",
+        "px4",
+        [f"{table}.{key}={value}" for table, key, value in keys(blocks("docs/first-flight.md", "toml")[0])],
+    ),
+]
+
+
+@pytest.mark.parametrize(("name", "autopilot", "overrides"), ROOMS)
+def test_a_simulated_vehicle_passes_the_check_of_each_preset_and_of_the_manual_s_rooms(
+    name: str, autopilot: str, overrides: list[str]
+) -> None:
+    config = load_config(name, overrides)
+    simulated = load_config(name, [*overrides, f"sim.autopilot={autopilot}"])
+    place = [(a + b) / 2.0 for a, b in position_limits_m(config).values()]
+    simulated = msgspec.structs.replace(
+        simulated, sim=msgspec.structs.replace(simulated.sim, start_position_m=(*place[:2], -0.1), seed=1)
+    )
+    tick_ns = round(config.daemon.tick_s * 1e9)
+    peers, flight = Peers(simulated, 0, airborne=False), Preflight(config, make_links, 0, take_off_m=1.0)
+    ticks = round(max(8.0, 50.0 * config.plant.dt_s) * 1e9) // tick_ns
+    for tick in range(ticks):
+        for arrival_ns, link, data in peers.advance(tick * tick_ns):
+            flight.receive(link, data, arrival_ns)
+        flight.tick(tick, tick * tick_ns, peers.receiver(tick * tick_ns))
+    found = flight.items(ticks * tick_ns)
+    assert [describe(one) for one in refusals(found, config.check)] == []
+    assert {one.name: one.state for one in found}[TIMEOUTS[3 if autopilot == "ardupilot" else 12]] is ItemState.GOOD
