@@ -10,11 +10,10 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TextIO
 
 from patience import until
 from places import ROOT
@@ -45,7 +44,8 @@ def keys(block: str) -> list[tuple[str, str, str]]:
     """Table, key and value of each line of a TOML block."""
     found = []
     for table, body in _TABLE.findall(block):
-        found += [(table, *map(str.strip, line.split("=", 1))) for line in body.splitlines() if "=" in line]
+        parts = (line.partition("=") for line in body.splitlines() if "=" in line)
+        found += [(table, key.strip(), value.strip()) for key, _, value in parts]
     return found
 
 
@@ -57,7 +57,7 @@ def edited(text: str, block: str) -> str:
             text += f"\n[{table}]\n{line}"
             continue
         old = re.compile(rf"^{key} = (\[\n(?:.*\n)*?\]|.*)\n", re.M)
-        new, count = old.subn(lambda _, line=line: line, found[0], count=1)  # type: ignore[misc]
+        new, count = old.subn(line.replace("\\", r"\\"), found[0], count=1)
         new = new if count else found[0].replace(f"[{table}]\n", f"[{table}]\n{line}", 1)
         text = text[: found.start()] + new + text[found.end() :]
     return text
@@ -123,7 +123,6 @@ def _network() -> Iterator[tuple[str, ...]]:
         ["unshare", "-n", "sh", "-c", "ip link set lo up && echo up && exec sleep infinity"], stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL, text=True,
     )  # fmt: skip
-    lock: TextIO | None = None
     try:
         assert holder.stdout is not None
         if holder.stdout.readline() == "up\n":
@@ -169,8 +168,3 @@ def desk(folder: Path) -> Iterator[Desk]:
                 except subprocess.TimeoutExpired:
                     process.kill()
                     process.wait()
-
-
-def covered(command: str, patterns: Sequence[str]) -> bool:
-    """Whether one of the patterns is found in a command."""
-    return any(re.search(pattern, command) for pattern in patterns)

@@ -248,8 +248,8 @@ class Findings:
         accepted = tuple(one for one in items if not one.ok and one not in problems)
         noted = tuple(one for one in items if one.ok and one.state is not ItemState.GOOD)
         counts = ((problems, "problem"), (accepted, "accepted"), (noted, "to know"))
-        told = ", ".join(f"{len(some)} {kind}" for some, kind in counts if some)
-        yield Text(f"check: {'ready' if self.report.ok else 'not ready'}{f' ({told})' if told else ''}", "bold")
+        summary = ", ".join(f"{len(some)} {kind}" for some, kind in counts if some)
+        yield Text(f"check: {'ready' if self.report.ok else 'not ready'}{f" ({summary})" if summary else ''}", "bold")
         for one in (*problems, *accepted, *noted):
             yield Text()
             label = "accepted" if one in accepted else str(one.state)
