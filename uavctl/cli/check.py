@@ -249,7 +249,8 @@ class Findings:
         noted = tuple(one for one in items if one.ok and one.state is not ItemState.GOOD)
         counts = ((problems, "problem"), (accepted, "accepted"), (noted, "to know"))
         summary = ", ".join(f"{len(some)} {kind}" for some, kind in counts if some)
-        yield Text(f"check: {'ready' if self.report.ok else 'not ready'}{f" ({summary})" if summary else ''}", "bold")
+        verdict = "ready" if self.report.ok else "not ready"
+        yield Text(f"check: {verdict} ({summary})" if summary else f"check: {verdict}", "bold")
         for one in (*problems, *accepted, *noted):
             yield Text()
             label = "accepted" if one in accepted else str(one.state)
