@@ -247,7 +247,11 @@ class Findings:
         problems = refusals(items, self.config)
         accepted = tuple(one for one in items if not one.ok and one not in problems)
         noted = tuple(one for one in items if one.ok and one.state is not ItemState.GOOD)
-        counts = ((problems, "problem"), (accepted, "accepted"), (noted, "to know"))
+        counts = (
+            (problems, "problem" if len(problems) == 1 else "problems"),
+            (accepted, "accepted"),
+            (noted, "to know"),
+        )
         summary = ", ".join(f"{len(some)} {kind}" for some, kind in counts if some)
         verdict = "ready" if self.report.ok else "not ready"
         yield Text(f"check: {verdict} ({summary})" if summary else f"check: {verdict}", "bold")
