@@ -15,7 +15,12 @@ from places import DATA, ROOT
 from uavctl.config import load_config
 
 # Placeholders that are no names of files: what a reader has in their place.
-VALUES = {"<the flight>": "NAME", "VEHICLE": "udpin://0.0.0.0:14540", "CAMERAS": "udpin://0.0.0.0:14560"}
+VALUES = {
+    "<the flight>": "NAME",
+    "FLIGHT.tlog": "somebody-elses.tlog",
+    "VEHICLE": "udpin://0.0.0.0:14540",
+    "CAMERAS": "udpin://0.0.0.0:14560",
+}
 # What is typed otherwise so that all of it takes minutes, not hours: (pattern, in its place).
 SHORTER = (
     (r"--runs 200(000)?\b", "--runs 2"),
@@ -81,8 +86,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
         shutil.move(one.folder / "flights", folder / "flights")
     shutil.copy(folder / "flights/NAME/flight.mcap", folder / "FLIGHT")
     shutil.copy(folder / "flights/NAME/identified.toml", folder / "identified.toml")
-    for name in ("FLIGHT.tlog", "somebody-elses.tlog"):
-        shutil.copy(DATA / "px4-offboard.tlog", folder / name)
+    shutil.copy(DATA / "arducopter-vicon-loop.tlog", folder / "somebody-elses.tlog")
     shutil.copy(ROOT / "uavctl/presets/room-px4.toml", folder / "my-room.toml")
     return folder
 
