@@ -21,7 +21,7 @@ CACHE = "UAVCTL_CACHE"
 OWN = pytest.StashKey[str]()
 # Most of a run's time. They begin, so that no worker is left alone with one of them in the end.
 LONGEST = (
-    "test_tune_cmd", "test_endings", "test_operation", "test_faults_truth", "test_take_off_failsafes",
+    "test_manual", "test_tune_cmd", "test_endings", "test_operation", "test_faults_truth", "test_take_off_failsafes",
     "test_tune_real", "test_closed_loop", "test_soak", "test_properties", "test_whatif_inertial", "test_conditioned",
     "test_recorded_flights", "test_extending", "test_relay_outlives", "test_tune", "test_inertial_lies",
     "test_campaign_cmd", "test_general_plants", "test_identify", "test_faults_storage", "test_bias", "test_python_docs",

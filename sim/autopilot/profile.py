@@ -62,7 +62,8 @@ def _degrees(autopilot: str) -> float:
     return round(math.degrees(TUNINGS[autopilot].tilt_limit_rad))
 
 
-# Values as in the recorded flights; COM_OBL_RC_ACT too, since with the default 0 a lost stream goes unnoticed.
+# Values as in the recorded flights; COM_OBL_RC_ACT too, since with the default 0 a lost stream goes unnoticed. Setpoint
+# timeouts are the room's, as docs/first-flight.md sets them: as shipped PX4 has 1 s and ArduPilot 3 s.
 PX4_PARAMETERS = {
     "BAT_CRIT_THR": _real(0.07),
     "BAT_LOW_THR": _real(0.15),
@@ -70,7 +71,7 @@ PX4_PARAMETERS = {
     "COM_DL_LOSS_T": _int(10),
     "COM_LOW_BAT_ACT": _int(0, 0, 2),  # warn, land when critical
     "COM_OBL_RC_ACT": _int(5, 0, 1, 2, 4, 5),  # 0-2 leave it to the stick, and without one do nothing; land, hold
-    "COM_OF_LOSS_T": _real(1.0),
+    "COM_OF_LOSS_T": _real(0.7),
     "COM_RC_IN_MODE": _told(4, ParameterType.INT32),  # no stick
     "EKF2_BARO_CTRL": _int(1, 0, 1),
     "EKF2_EV_CTRL": _int(0),
@@ -109,7 +110,7 @@ ARDUPILOT_PARAMETERS = {
     "FS_GCS_TIMEOUT": _real(5.0),
     "GPS1_TYPE": _byte(1, 0, 1),
     "GUID_OPTIONS": _told(0, ParameterType.INT32),
-    "GUID_TIMEOUT": _real(3.0),
+    "GUID_TIMEOUT": _real(0.7),
     "LAND_SPEED": _told(100 * LAND_MPS, ParameterType.INT16),
     "PSC_JERK_XY": _told(TUNINGS["ardupilot"].jerk_mps3),
     "PSC_JERK_Z": _told(TUNINGS["ardupilot"].jerk_mps3),

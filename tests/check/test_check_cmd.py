@@ -92,10 +92,18 @@ def test_a_wrong_frame_is_not(capsys: pytest.CaptureFixture[str], urls: list[str
 
 
 @pytest.mark.slow
-def test_people_get_a_table(capsys: pytest.CaptureFixture[str], urls: list[str]) -> None:
+def test_people_get_problems_first_and_a_line_for_what_is_good(
+    capsys: pytest.CaptureFixture[str], urls: list[str]
+) -> None:
     assert run(["check", "--seconds", "4", *urls, "--set", "frame.yaw_deg=90"]) == 1
-    out = capsys.readouterr().out
-    assert "not ready" in out and "what to do" in out and "axes" in out
+    blocks = capsys.readouterr().out.split("\n\n")
+    assert blocks[0].startswith("check: not ready (")
+    states = [block.split()[0] for block in blocks[1:]]
+    assert states[0] == "bad" and states[-1] == "good"
+    assert states == sorted(states, key=lambda state: {"bad": 0, "good": 2}.get(state, 1))
+    assert any(block.startswith("bad") and "axes:" in block for block in blocks)
+    assert all(line.split()[0] == "good" for line in blocks[-1].splitlines())
+    assert max(len(line) for block in blocks for line in block.splitlines()) <= 80
 
 
 @pytest.mark.slow

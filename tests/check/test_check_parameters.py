@@ -3,17 +3,25 @@
 from __future__ import annotations
 
 import re
+import tomllib
 from itertools import product
 
+import msgspec
+import numpy as np
 import pytest
 from check_rig import Checked, Hand, look
+from hypothesis import given
+from hypothesis import strategies as st
+from manual_rig import blocks, keys
 from mavlink_rig import packets, read
+from places import ROOT
 
 from sim.simulation import Peers
-from uavctl.check.findings import ItemState
+from uavctl.check.findings import ItemState, describe, refusals
 from uavctl.check.preflight import Preflight
-from uavctl.check.vehicle import RULES
-from uavctl.config import load_config
+from uavctl.check.vehicle import RULES, ParameterVerdict
+from uavctl.config import Config, load_config
+from uavctl.config.checks import position_limits_m
 from uavctl.lab.own_loop import EXTERNAL_ONLY
 from uavctl.loop import make_links
 
@@ -63,15 +71,76 @@ def test_parameters_that_lead_astray_are_found(
     assert with_parameters(autopilot, **values)[name].state is want
 
 
+TIMEOUTS = {3: "GUID_TIMEOUT", 12: "COM_OF_LOSS_T"}
+
+
+def judge_timeout(autopilot: int, value: float, config: Config) -> ParameterVerdict:
+    rule = next(one for one in RULES[autopilot] if one.name == TIMEOUTS[autopilot])
+    return rule.judge(value, lambda _: None, config)
+
+
 def test_the_timeout_that_is_wanted_is_one_that_the_room_holds() -> None:
     small = load_config("room-ardupilot", ["limits.accel_mps2=[4.0,2.0,1.5]"])
-    rule = next(one for one in RULES[3] if one.name == "GUID_TIMEOUT")
-    judged = {t: rule.judge(t, lambda _: None, small) for t in (0.7, 0.75, 0.77, 3.0)}
+    judged = {t: judge_timeout(3, t, small) for t in (0.7, 0.75, 0.77, 3.0)}
     assert judged[3.0].want.endswith("to 0.7 s")  # 4 t²/2 + (4 t)²/5 = 3 m at 0.76 s
-    assert "46.8 m north" in judged[3.0].figures  # 18 + 28.8
+    assert "46.8 m north" in judged[3.0].hint  # 18 + 28.8
     assert [judged[t].state for t in (0.7, 0.75, 0.77)] == [
         ItemState.GOOD, ItemState.NOTE, ItemState.BAD
     ]  # fmt: skip
+
+
+def stands_after_m(accel_mps2: float, timeout_s: float) -> float:
+    """Fly in steps after setpoints have stopped: it accelerates, then brakes with 2.5 m/s² until it stands."""
+    step_s, place_m, speed_mps = timeout_s / 2000.0, 0.0, 0.0
+    for step in range(1, 2001):
+        speed_mps = accel_mps2 * (step - 0.5) * step_s
+        place_m += speed_mps * step_s
+    step_s = (speed_mps := accel_mps2 * timeout_s) / 2.5 / 2000.0
+    return place_m + sum(speed_mps - 2.5 * (step - 0.5) * step_s for step in range(1, 2001)) * step_s
+
+
+@given(
+    autopilot=st.sampled_from([3, 12]),
+    half_m=st.tuples(*[st.floats(0.01, 20.0)] * 3),
+    accel_mps2=st.tuples(*[st.floats(0.1, 12.0)] * 3),
+    tick_s=st.sampled_from([0.001, 0.01, 0.02, 0.025, 0.05]),
+    value=st.one_of(st.floats(0.0, 6.0), st.sampled_from([0.6, 0.7, 0.9, 1.0, 3.0])),
+)
+def test_the_timeout_that_the_hint_gives_passes_once_it_is_set(
+    autopilot: int, half_m: tuple[float, ...], accel_mps2: tuple[float, ...], tick_s: float, value: float
+) -> None:
+    room = load_config("room-px4")
+    sides = [list(room.sets.state_lower), list(room.sets.state_upper)]
+    for axis, half in enumerate(half_m):
+        sides[0][3 * axis], sides[1][3 * axis] = -half, half
+    config = msgspec.structs.replace(
+        room,
+        sets=msgspec.structs.replace(room.sets, state_lower=tuple(sides[0]), state_upper=tuple(sides[1])),
+        limits=msgspec.structs.replace(room.limits, accel_mps2=accel_mps2),
+        daemon=msgspec.structs.replace(room.daemon, tick_s=tick_s),
+    )
+
+    def held(timeout_s: float) -> bool:
+        return all(stands_after_m(a, timeout_s) <= half * 1.00001 for a, half in zip(accel_mps2, half_m, strict=True))
+
+    value = float(np.float32(value))  # as a vehicle keeps it
+    verdict = judge_timeout(autopilot, value, config)
+    if not held(value):
+        assert verdict.state is ItemState.BAD
+    if verdict.state is ItemState.GOOD:
+        assert held(value) and value <= 1.00001 and value >= 2.99999 * tick_s
+        return
+    given_s = re.search(r"Set it to ([\d.]+) s", verdict.hint)
+    if given_s is None:  # nothing can be set: the shortest there may be is already too long
+        assert verdict.state is ItemState.BAD
+        assert not held(1.0001 * max(3.0 * tick_s, 0.1 if autopilot == 3 else 0.0))
+        return
+    advised_s = float(np.float32(float(given_s[1])))
+    again = judge_timeout(autopilot, advised_s, config)
+    assert again.state is ItemState.GOOD and held(advised_s)
+    assert float(verdict.want.split()[2]) == float(given_s[1])
+    if carried := re.search(r"carry it ([\d.]+) m .* allows ([\d.]+) m", verdict.hint):
+        assert (float(carried[1]) > float(carried[2])) == (verdict.state is ItemState.BAD)
 
 
 @pytest.mark.parametrize(("autopilot", "name"), [("px4", "EKF2_EV_CTRL"), ("ardupilot", "EK3_SRC1_POSXY")])
@@ -136,7 +205,7 @@ def is_wanted(want: str, value: float, told: dict[str, float]) -> bool:
     """Whether a value is what the words ask for, as a person reads them."""
     if want.startswith("any value"):
         return True
-    if seconds := re.fullmatch(r"([\d.]+) s \(.*\) to ([\d.]+) s", want):
+    if seconds := re.fullmatch(r"([\d.]+) to ([\d.]+) s", want):
         return float(seconds[1]) <= value <= float(seconds[2])
     if climb := re.fullmatch(r"at most ([\d.]+) m, .*?(?:; at least ([\d.]+) m, .*)?", want):
         return float(climb[2] or 0.0) <= value <= float(climb[1])
@@ -176,3 +245,43 @@ def test_a_value_is_good_just_when_it_is_what_the_words_want(autopilot: int, rel
                 judged += 1
                 kinds.add((rule.name, good))
     assert judged > 800 and kinds == {(rule.name, good) for rule in RULES[autopilot] for good in (True, False)}
+
+
+DUO = tomllib.loads((ROOT / "docs/examples/duo.toml").read_text(encoding="utf-8"))["vehicle"]
+FOR_ONE = {"room-px4": "px4", "room-ardupilot": "ardupilot"}  # presets of one autopilot
+ROOMS: list[tuple[str, str, list[str]]] = [
+    *[
+        (name, autopilot, [])
+        for name in ("room", "room-px4", "room-ardupilot", "room-hahn-stursberg", "paper")
+        for autopilot in ("px4", "ardupilot")
+        if FOR_ONE.get(name, autopilot) == autopilot
+    ],
+    *[(one["config"], "px4", one["set"]) for one in DUO],
+    (
+        "room-px4",
+        "px4",
+        [f"{table}.{key}={value}" for table, key, value in keys(blocks("docs/first-flight.md", "toml")[0])],
+    ),
+]
+
+
+@pytest.mark.parametrize(("name", "autopilot", "overrides"), ROOMS)
+def test_a_simulated_vehicle_passes_the_check_of_each_preset_and_of_the_manual_s_rooms(
+    name: str, autopilot: str, overrides: list[str]
+) -> None:
+    config = load_config(name, overrides)
+    simulated = load_config(name, [*overrides, f"sim.autopilot={autopilot}"])
+    place = [(a + b) / 2.0 for a, b in position_limits_m(config).values()]
+    simulated = msgspec.structs.replace(
+        simulated, sim=msgspec.structs.replace(simulated.sim, start_position_m=(*place[:2], -0.1), seed=1)
+    )
+    tick_ns = round(config.daemon.tick_s * 1e9)
+    peers, flight = Peers(simulated, 0, airborne=False), Preflight(config, make_links, 0, take_off_m=1.0)
+    ticks = round(max(8.0, 50.0 * config.plant.dt_s) * 1e9) // tick_ns
+    for tick in range(ticks):
+        for arrival_ns, link, data in peers.advance(tick * tick_ns):
+            flight.receive(link, data, arrival_ns)
+        flight.tick(tick, tick * tick_ns, peers.receiver(tick * tick_ns))
+    found = flight.items(ticks * tick_ns)
+    assert [describe(one) for one in refusals(found, config.check)] == []
+    assert {one.name: one.state for one in found}[TIMEOUTS[3 if autopilot == "ardupilot" else 12]] is ItemState.GOOD

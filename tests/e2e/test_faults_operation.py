@@ -59,7 +59,7 @@ def test_px4_that_hears_no_setpoints_leaves_offboard_by_itself_and_we_stop() -> 
     flight = Flight()
     assert flight.run(3.0).count(SETPOINT) > 50
     assert flight.truths[-1].mode == "OFFBOARD"
-    flight.run(3.0, uplink=False)  # COM_OF_LOSS_T is 1 s, a heartbeat comes each second
+    flight.run(3.0, uplink=False)  # COM_OF_LOSS_T is 0.7 s, a heartbeat comes each second
     assert flight.truths[-1].mode != "OFFBOARD"
     assert flight.ticked is not None and flight.ticked.vehicle is not None
     assert not flight.ticked.vehicle.external  # seen in its heartbeats
@@ -71,7 +71,7 @@ def test_px4_that_hears_no_setpoints_leaves_offboard_by_itself_and_we_stop() -> 
 
 @pytest.mark.fault(8)
 def test_ardupilot_that_hears_no_setpoints_brakes_by_itself() -> None:
-    flight = Flight('sim.autopilot="ardupilot"')
+    flight = Flight('sim.autopilot="ardupilot"', "sim.setpoint_timeout_s=3.0")
     flight.run(1.5)
     assert flight.speed_mps > 0.3
     flight.run(8.0, uplink=False)  # the last acceleration for GUID_TIMEOUT = 3 s, then the brakes

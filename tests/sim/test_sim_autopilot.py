@@ -151,7 +151,7 @@ def test_the_timeout_counts_from_the_first_setpoint() -> None:
 
 
 def test_px4_holds_after_silence_and_comes_back_with_the_stream() -> None:
-    one = bench("px4")
+    one = bench("px4", "sim.setpoint_timeout_s=1.0")
     one.stream(1.0, 1.0, 0.0, 0.0)  # the last one at 0.9 s
     one.wait(0.899)
     assert one.peers.autopilot.mode_name == "OFFBOARD"
@@ -170,13 +170,9 @@ def test_px4_holds_after_silence_and_comes_back_with_the_stream() -> None:
     assert flying(one) == (0.5, 0.0, 0.0)
 
 
-@pytest.mark.parametrize(
-    ("autopilot", "parameter", "own_s"), [("px4", "COM_OF_LOSS_T", 1.0), ("ardupilot", "GUID_TIMEOUT", 3.0)]
-)
-def test_the_silence_that_counts_is_the_autopilot_s_own_unless_configured(
-    autopilot: str, parameter: str, own_s: float
-) -> None:
-    assert bench(autopilot).peers.autopilot.parameters[parameter] == own_s
+@pytest.mark.parametrize(("autopilot", "parameter"), [("px4", "COM_OF_LOSS_T"), ("ardupilot", "GUID_TIMEOUT")])
+def test_the_silence_that_counts_is_the_autopilot_s_own_unless_configured(autopilot: str, parameter: str) -> None:
+    assert bench(autopilot).peers.autopilot.parameters[parameter] == pytest.approx(0.7)
     one = bench(autopilot, "sim.setpoint_timeout_s=0.5", "plant.drag_1ps=[0.0,0.0,0.0]")
     assert one.peers.autopilot.parameters[parameter] == 0.5
     one.stream(1.0, 1.0, 0.0, 0.0)  # the last one at 0.9 s
@@ -195,7 +191,8 @@ def test_px4_does_not_come_back_by_itself_from_a_hold_that_was_asked_for() -> No
 
 
 def test_ardupilot_keeps_the_last_acceleration_then_brakes_and_stays_guided() -> None:
-    one = bench("ardupilot", "plant.drag_1ps=[0.0,0.0,0.0]", "plant.lag_s=[0.25,0.25,0.25]")
+    shipped = "sim.setpoint_timeout_s=3.0"
+    one = bench("ardupilot", shipped, "plant.drag_1ps=[0.0,0.0,0.0]", "plant.lag_s=[0.25,0.25,0.25]")
     one.stream(2.0, 1.0, 0.0, 0.0)  # the last one at 1.9 s
     one.wait(2.8)
     assert flying(one) == (1.0, 0.0, 0.0)

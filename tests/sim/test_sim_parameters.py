@@ -16,8 +16,20 @@ from sim.autopilot.profile import TABLES, ParameterType
 BOTH = pytest.mark.parametrize("name", ["px4", "ardupilot"])
 # Of vehicles that were flown: what a ground check reads before take-off.
 ASKED = {
-    "px4": {"COM_OF_LOSS_T": 1.0, "COM_OBL_RC_ACT": 5, "EKF2_EV_CTRL": 0, "EKF2_HGT_REF": 1, "MPC_TILTMAX_AIR": 45.0},
-    "ardupilot": {"GUID_TIMEOUT": 3.0, "GUID_OPTIONS": 0, "EK3_SRC1_POSXY": 3, "WPNAV_ACCEL": 250, "ANGLE_MAX": 3000},
+    "px4": {
+        "COM_OF_LOSS_T": pytest.approx(0.7),
+        "COM_OBL_RC_ACT": 5,
+        "EKF2_EV_CTRL": 0,
+        "EKF2_HGT_REF": 1,
+        "MPC_TILTMAX_AIR": 45.0,
+    },
+    "ardupilot": {
+        "GUID_TIMEOUT": pytest.approx(0.7),
+        "GUID_OPTIONS": 0,
+        "EK3_SRC1_POSXY": 3,
+        "WPNAV_ACCEL": 250,
+        "ANGLE_MAX": 3000,
+    },
 }
 
 

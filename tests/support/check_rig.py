@@ -58,7 +58,6 @@ def look(
         twist: what happens to the cameras' datagrams on their way.
         prepare: called with the peers before the start.
     """
-    overrides = ["sim.setpoint_timeout_s=1.0", *overrides]  # ArduPilot's own, 3 s, is refused for a room
     config = load_config("room-hahn-stursberg", [*CALM, *overrides, *wrong])
     shared = config.daemon.vehicle == config.daemon.mocap
     peers = Peers(load_config("room-hahn-stursberg", [*CALM, *overrides]), 0, airborne=airborne, shared_link=shared)

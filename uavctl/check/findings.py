@@ -73,6 +73,18 @@ def refusals(items: Iterable[Item], config: CheckConfig) -> tuple[Item, ...]:
     return tuple(one for one in items if one.state is ItemState.BAD and one.name not in config.accept)
 
 
+def describe(one: Item) -> str:
+    """Describe an item in sentences: what was seen, what is wanted, what to do."""
+    return " ".join((f"{one.name}: {one.value}.", f"Wanted: {one.want}.", *([_sentence(one.hint)] if one.hint else ())))
+
+
+def _sentence(hint: str) -> str:
+    """Begin a hint with a capital letter and end it with a stop; a name stays as it is."""
+    word = hint.split(" ", 1)[0]
+    begun = hint[:1].upper() + hint[1:] if word.isalpha() else hint
+    return begun if begun.endswith((".", "?")) else f"{begun}."
+
+
 # Record of what cameras and vehicle said while a check listened.
 
 

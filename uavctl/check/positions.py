@@ -144,11 +144,11 @@ def _loss(captured_s: list[float], config: Config) -> Item:
     value = f"{loss:.0%} of {count} steps"
     if link.model != "bernoulli" or link.probability:
         return item(name, ItemState.NOTE, value, f"as link.model {link.model!r} has it", "compare it with the model's")
-    # Two standard deviations: fewer than one right set-up in forty is told of more losses than it has.
+    # Three standard deviations: a right set-up is refused once in seven hundred checks (with two, once in forty).
     # Losses in bursts vary more than that.
     alone = math.sqrt(max(expected * (1.0 - expected), 0.25 / count) / count)
     in_runs = loss_std(np.diff(np.unique(steps)) - 1)
-    surely = loss - 2.0 * max(alone, in_runs)
+    surely = loss - 3.0 * max(alone, in_runs)
     hint = "design for the loss that is there (link.loss, link.model), or better the link"
     if surely <= expected < loss:
         value += ", which is within the chance of so few"

@@ -81,6 +81,8 @@ def _with_stamps(clock: Item, seen: Heard) -> Item:
 Get = Callable[[str], float | None]
 _SLOW_S = 1.0
 _BRAKING_MPS2 = 2.5  # of an ArduPilot whose setpoints have stopped
+_SINGLE = 1e-6  # relative: vehicles keep parameters in single precision
+_DIGITS = 7  # decimals, which single precision does not exceed for times up to a second
 _NO_RADIO = 4  # COM_RC_IN_MODE
 _EXTERNAL = 6  # EK3_SRC1_*
 _HORIZONTAL, _VERTICAL, _YAW = 1, 2, 8  # EKF2_EV_CTRL
@@ -92,7 +94,7 @@ class ParameterVerdict(NamedTuple):
 
     state: ItemState
     want: str
-    figures: str = ""  # what this value comes to here, to be added to the hint
+    hint: str = ""  # what to do with this value here; empty is the hint of the rule
 
 
 Judge = Callable[[float, Get, Config], ParameterVerdict]
@@ -116,29 +118,91 @@ def _only(applies: bool, want: str, unless: str, *, good: bool) -> ParameterVerd
     return _wanted(want, good=good) if applies else ParameterVerdict(ItemState.GOOD, f"{_ANY}: {unless}")
 
 
-def _timeout(value: float, _get: Get, config: Config) -> ParameterVerdict:
-    """Judge the silence for which the last acceleration goes on: from rest in its middle, the room has to hold that."""
-    least_s, most_s = 3.0 * config.daemon.tick_s, _SLOW_S
-    figures = ""
-    for axis, (low_m, high_m) in position_limits_m(config).items():
-        accel_mps2, free_m = config.limits.accel_mps2[AXES.index(axis)], (high_m - low_m) / 2.0
-        most_s = min(most_s, math.sqrt(free_m / _gone_m(accel_mps2, 1.0)))
-        gone_m = _gone_m(accel_mps2, value)
-        if gone_m > free_m and not figures:
-            figures = (
-                f"; {value:g} s at {accel_mps2:g} m/s² are up to {gone_m:.1f} m {axis} from rest, where the room has "
-                f"{free_m:g} m from its middle"
+class Runaway(NamedTuple):
+    """Flight on one axis after setpoints have stopped: from rest in the room's middle, with the largest acceleration.
+
+    It accelerates until the vehicle's own timeout, then it brakes: d(t) = a t²/2 + (a t)²/(2 b).
+    """
+
+    axis: str
+    accel_mps2: float
+    free_m: float  # from the middle to a limit
+
+    def distance_m(self, timeout_s: float) -> float:
+        """Return how far the vehicle goes until it stands [m]."""
+        speed_mps = self.accel_mps2 * timeout_s
+        return speed_mps * timeout_s / 2.0 + speed_mps**2 / (2.0 * _BRAKING_MPS2)
+
+    @property
+    def longest_s(self) -> float:
+        """Timeout after which the vehicle stands at the limit [s]."""
+        return math.sqrt(self.free_m / self.distance_m(1.0))  # d grows with t²
+
+
+def _runaways(config: Config) -> list[Runaway]:
+    """Return the axes that have limits, the one with the least room for its acceleration first."""
+    limits = position_limits_m(config).items()
+    found = [Runaway(axis, config.limits.accel_mps2[AXES.index(axis)], (b - a) / 2.0) for axis, (a, b) in limits]
+    found = [one for one in found if math.isfinite(one.free_m)]
+    return sorted(found, key=lambda one: one.longest_s)
+
+
+def _timeout(shortest_s: float) -> Judge:
+    """Judge the silence for which the last acceleration goes on: from rest in its middle, the room has to hold that.
+
+    Args:
+        shortest_s: timeout that the autopilot does not go below [s].
+    """
+
+    def judge(value: float, _get: Get, config: Config) -> ParameterVerdict:
+        least_s, tightest = max(3.0 * config.daemon.tick_s, shortest_s), _runaways(config)[:1]
+        longest_s = min((one.longest_s for one in tightest), default=math.inf)
+        most_s = _rounded_down(min(_SLOW_S, longest_s), least_s)
+        if most_s is None:
+            hint = (
+                f"No value fits. {_carried(tightest, least_s)} Give [sets] more room, or lower limits.accel_mps2 "
+                f"({tightest[0].axis})."
             )
-    most_s = max(math.floor(10.0 * most_s) / 10.0, least_s)
-    state = ItemState.GOOD if least_s <= value <= most_s else ItemState.NOTE
-    if value < least_s or figures:
-        state = ItemState.BAD
-    return ParameterVerdict(state, f"{least_s:g} s (three times daemon.tick_s) to {most_s:g} s", figures)
+            return ParameterVerdict(ItemState.BAD, f"at least {least_s:.7g} s, in a larger room", hint)
+        want = f"{least_s:.7g} to {most_s:.7g} s"
+        if value < least_s * (1.0 - _SINGLE):
+            hint = (
+                f"Set it to {most_s:.7g} s. It has to outlast three setpoints ({3.0 * config.daemon.tick_s:.7g} s), "
+                "or a short pause of the link ends the flight."
+            )
+            return ParameterVerdict(ItemState.BAD, want, hint)
+        hint = (
+            f"Set it to {most_s:.7g} s or less. If setpoints stop, the vehicle keeps accelerating that long. "
+            f"{_carried(tightest, value)}"
+        )
+        if value > longest_s * (1.0 + _SINGLE):
+            return ParameterVerdict(ItemState.BAD, want, hint)
+        good = value <= most_s * (1.0 + _SINGLE)
+        return ParameterVerdict(ItemState.GOOD if good else ItemState.NOTE, want, hint)
+
+    return judge
 
 
-def _gone_m(accel_mps2: float, timeout_s: float) -> float:
-    """How far a vehicle goes that flies on with an acceleration from rest, then brakes until it stands [m]."""
-    return accel_mps2 * timeout_s**2 / 2.0 + (accel_mps2 * timeout_s) ** 2 / (2.0 * _BRAKING_MPS2)
+def _rounded_down(most_s: float, least_s: float) -> float | None:
+    """Return `most_s` with as few decimals as leave it at `least_s` or above; None if it is below."""
+    least_s *= 1.0 - _SINGLE
+    rounded = (math.floor(most_s * 10**digits + _SINGLE) / 10**digits for digits in range(1, _DIGITS))
+    return None if most_s < least_s else next((one for one in rounded if one >= least_s), most_s)
+
+
+def _carried(tightest: list[Runaway], timeout_s: float) -> str:
+    """Say how far a timeout carries the vehicle where the room is tightest; empty in a room without limits."""
+    ways = {"north": "north or south", "east": "east or west", "down": "up or down"}
+    texts = []
+    for one in tightest:
+        gone_m = one.distance_m(timeout_s)
+        # As many digits as tell the two apart.
+        digits = next((n for n in range(3, 9) if f"{gone_m:.{n}g}" != f"{one.free_m:.{n}g}"), 9)
+        texts.append(
+            f"{timeout_s:.7g} s would carry it {gone_m:.{digits}g} m {ways[one.axis]}; your room allows "
+            f"{one.free_m:.{digits}g} m from its middle."
+        )
+    return "".join(texts)
 
 
 def _offboard_loss(value: float, get: Get, _config: Config) -> ParameterVerdict:
@@ -210,42 +274,40 @@ def _px4_mag(value: float, get: Get, _config: Config) -> ParameterVerdict:
     return _only(_takes(get, _YAW), "5: none", "EKF2_EV_CTRL takes no yaw", good=value == 5)
 
 
-_INDOORS = "the cameras; GPS and compass lead astray indoors"
+_INDOORS = "the cameras. GPS and compass are wrong indoors"
+_DOORS = "Set it to {0}. Air pressure indoors changes with doors."
+_IRON = "Set it to {0}. A compass indoors is off by tens of degrees."
 ARDUPILOT = (
-    Rule(
-        "GUID_TIMEOUT",
-        "set it to 1, or less: when our setpoints stop, the last acceleration goes on for so long",
-        _timeout,
-    ),
-    Rule("GUID_OPTIONS", "with them an acceleration is not held against the wind", _guided_options),
-    Rule("EK3_SRC1_POSXY", f"set it to 6, and VISO_TYPE to 1, to fly on {_INDOORS}", _copter_source),
-    Rule("EK3_SRC1_POSZ", "set it to 6: pressure indoors moves with doors", _copter_also),
-    Rule("EK3_SRC1_YAW", "set it to 6: a compass indoors is off by tens of degrees", _copter_also),
-    Rule("VISO_TYPE", "set it to 1 and restart: without it they are not read", _viso),
-    Rule("COMPASS_USE", "set it to 0: arming checks a compass that is not used", _compass),
+    Rule("GUID_TIMEOUT", "", _timeout(0.1)),  # ArduCopter takes a shorter one for 0.1 s
+    Rule("GUID_OPTIONS", "Clear these bits. With them an acceleration is not held against the wind.", _guided_options),
+    Rule("EK3_SRC1_POSXY", f"Set it to 6, and VISO_TYPE to 1, to fly on {_INDOORS}.", _copter_source),
+    Rule("EK3_SRC1_POSZ", _DOORS.format(6), _copter_also),
+    Rule("EK3_SRC1_YAW", _IRON.format(6), _copter_also),
+    Rule("VISO_TYPE", "Set it to 1 and restart. Without it the vehicle does not read external positions.", _viso),
+    Rule("COMPASS_USE", "Set it to 0. Arming checks a compass that is not used.", _compass),
     Rule(
         "FS_EKF_ACTION",
-        "set it to 1: without its position the vehicle would stay GUIDED and drift, whatever GUID_TIMEOUT is",
+        "Set it to 1. Otherwise a vehicle without positions stays in GUIDED and drifts, whatever GUID_TIMEOUT is.",
         _copter_failsafe,
     ),
     Rule(
         "FS_EKF_THRESH",
-        "set it to 0.8, as shipped: 0 turns FS_EKF_ACTION off, which was seen to act 8 s after the last position",
+        "Set it to 0.8, as shipped. 0 turns FS_EKF_ACTION off. It was seen to act 8 s after the last position.",
         _copter_threshold,
     ),
 )
 PX4 = (
-    Rule("COM_OF_LOSS_T", "set it to 1, or less: the last setpoint goes on for so long when ours stop", _timeout),
+    Rule("COM_OF_LOSS_T", "", _timeout(0.0)),
     Rule(
         "COM_OBL_RC_ACT",
-        "set it to 4 (land) or 5 (hold; it goes back to OFFBOARD by itself when setpoints come again): with 0 to 2 and "
-        "no radio it was seen to fly on the last acceleration for 12 s",
+        "Set it to 4 (land) or 5 (hold; PX4 goes back to OFFBOARD by itself when setpoints come again). With 0 to 2 "
+        "and no radio it was seen to fly on the last acceleration for 12 s.",
         _offboard_loss,
     ),
-    Rule("EKF2_EV_CTRL", f"set it to 11 to fly on {_INDOORS}", _px4_external),
-    Rule("EKF2_HGT_REF", "set it to 3: pressure indoors moves with doors", _px4_height),
-    Rule("EKF2_GPS_CTRL", f"set it to 0 to fly on {_INDOORS}", _px4_gps),
-    Rule("EKF2_MAG_TYPE", "set it to 5: a compass indoors is off by tens of degrees", _px4_mag),
+    Rule("EKF2_EV_CTRL", f"Set it to 11 to fly on {_INDOORS}.", _px4_external),
+    Rule("EKF2_HGT_REF", _DOORS.format(3), _px4_height),
+    Rule("EKF2_GPS_CTRL", f"Set it to 0 to fly on {_INDOORS}.", _px4_gps),
+    Rule("EKF2_MAG_TYPE", _IRON.format(5), _px4_mag),
 )
 RULES = {3: ARDUPILOT, 12: PX4}  # MAV_AUTOPILOT
 _TAKE_OFF = "MIS_TAKEOFF_ALT"
@@ -278,8 +340,8 @@ def _climb(config: Config, take_off_m: float | None) -> Rule:
     bounds = [f"at most {ceiling_m:g} m, the room (sets)"] if math.isfinite(ceiling_m) else []
     bounds += [f"at least {least_m:g} m, --takeoff"] if least_m else []
     hint = (
-        "set it to the height of --takeoff: PX4 climbs to it by itself. Lower, the flight begins below --takeoff (not "
-        "at all under a third of it); higher than the room, the ceiling ends the climb if OFFBOARD is not granted"
+        "Set it to the height of --takeoff. PX4 climbs to it by itself. Lower, the flight begins below --takeoff (not "
+        "at all under a third of it). Higher than the room, the ceiling ends the climb if OFFBOARD is not granted."
     )
 
     def judge(value: float, _get: Get, _config: Config) -> ParameterVerdict:
@@ -294,7 +356,7 @@ def _one(rule: Rule, get: Get, config: Config) -> Item:
         hint = "it was asked for several times; does this version have it, and does the link carry our messages?"
         return item(rule.name, ItemState.UNDETERMINED, "not told", "its value, to judge it", hint)
     verdict = rule.judge(value, get, config)
-    return item(rule.name, verdict.state, f"{value:g}", verdict.want, rule.hint + verdict.figures)
+    return item(rule.name, verdict.state, f"{value:g}", verdict.want, verdict.hint or rule.hint)
 
 
 # Items of the vehicle: who it is, whether others are heard, armed, landed, battery.

@@ -4,24 +4,26 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterable, Mapping
+import textwrap
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import msgspec
 from cyclopts import Parameter
-from rich.table import Table
+from rich.console import Console, ConsoleOptions
 from rich.text import Text
 
 from logs.recording.parameters import ParameterReader, told_records
 from logs.recording.topics import PARAMETER
-from uavctl.check.findings import Item, ItemState, item, judged, refusals
+from uavctl.check.findings import Item, ItemState, describe, item, judged, refusals
 from uavctl.check.preflight import Preflight
-from uavctl.cli.common import DEFAULTS, SPAN_S, Common, Mocap, columns, given_keys, labelled, messages
+from uavctl.cli.common import DEFAULTS, SPAN_S, Common, Mocap, given_keys, labelled, messages
 from uavctl.cli.flying import stop_on_signals
 from uavctl.clock import Ticker, monotonic_ns
 from uavctl.config import Config
-from uavctl.config.connections import warnings
+from uavctl.config.connections import CheckConfig, warnings
 from uavctl.errors import ConnectionSpecError, KeyFileError, NotReadyError
 from uavctl.io.base import Connection
 from uavctl.io.signed_connection import connected
@@ -121,11 +123,10 @@ def checked_before_arming(
     items = run_preflight(config, connections, config.check.seconds, take_off_m=take_off_m, stop=stop, told=told)
     against = refusals(items, config.check)
     if against:
-        lines = (f"{one.name}: {one.value} (wanted: {one.want}); {one.hint}" for one in against)
-        raise NotReadyError("\n".join(("not armed, as the check before it failed:", *lines)))
+        raise NotReadyError("\n".join(("not armed, as the check before it failed:", *map(describe, against))))
     for one in items:
         if one.state is not ItemState.GOOD:
-            messages().print(labelled("check", f"{one.name}: {one.value}; {one.hint}"), soft_wrap=True)
+            messages().print(labelled("check", describe(one)), soft_wrap=True)
     return items
 
 
@@ -153,6 +154,8 @@ _STYLES = {
 }
 
 
+_WIDTH = 80  # columns
+_LABEL = 14  # of them for the longest state and a blank
 _PERMISSIONS = "see to cable, port, permissions (serial ports: group dialout), or another program that has it"
 
 
@@ -197,7 +200,7 @@ def check(
             raise  # a URL that is none: usage
         items.append(item("connections", ItemState.BAD, str(error), "connections and key can be used", _PERMISSIONS))
     report = Report(ok=not refusals(items, config.check), items=tuple(items))
-    common.show("check", report, lambda: _table(report))
+    common.show("check", report, lambda: Findings(report, config.check))
     return 0 if report.ok else 1
 
 
@@ -226,14 +229,44 @@ def disk_items(folder: Path, free_bytes: int) -> list[Item]:
 
 def _strangers(texts: tuple[str, ...]) -> Item:
     state = ItemState.NOTE if texts else ItemState.GOOD
-    value, hint = "; ".join(texts) or "none can speak", "see security.allow and security.key_file (docs/security.md)"
+    value, hint = ". ".join(texts) or "none can speak", "see docs/security.md"
     return item("strangers", state, value, "known peers, and signed frames", hint)
 
 
-def _table(report: Report) -> Table:
-    words = "ready" if report.ok else "not ready: see what is red"
-    headings = ("", "what", "found", "wanted", "what to do")
-    rows = (
-        (Text(one.state, style=_STYLES[one.state]), one.name, one.value, one.want, one.hint) for one in report.items
-    )
-    return columns(f"check: {words}", headings, rows, headings, fold=True)
+@dataclass(frozen=True)
+class Findings:
+    """A check on the screen: problems in paragraphs, then notes, then a line for each thing that is good."""
+
+    report: Report
+    config: CheckConfig  # names the items that may fail
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Text]:
+        del console
+        width, items = min(options.max_width, _WIDTH) - _LABEL, self.report.items
+        problems = refusals(items, self.config)
+        accepted = tuple(one for one in items if not one.ok and one not in problems)
+        noted = tuple(one for one in items if one.ok and one.state is not ItemState.GOOD)
+        counts = (
+            (problems, "problem" if len(problems) == 1 else "problems"),
+            (accepted, "accepted"),
+            (noted, "to know"),
+        )
+        summary = ", ".join(f"{len(some)} {kind}" for some, kind in counts if some)
+        verdict = "ready" if self.report.ok else "not ready"
+        yield Text(f"check: {verdict} ({summary})" if summary else f"check: {verdict}", "bold")
+        for one in (*problems, *accepted, *noted):
+            yield Text()
+            label = "accepted" if one in accepted else str(one.state)
+            # A word that is longer than a line, as the name of a folder, stays whole.
+            lines = textwrap.wrap(describe(one), width, break_long_words=False, break_on_hyphens=False)
+            yield _line(label, one.state, lines[0])
+            yield from (_line("", one.state, line) for line in lines[1:])
+        yield Text()
+        for one in items:
+            if one.state is ItemState.GOOD:
+                text = textwrap.shorten(f"{one.name}: {one.value}", width, placeholder=" …", break_on_hyphens=False)
+                yield _line(str(one.state), one.state, text)
+
+
+def _line(label: str, state: ItemState, text: str) -> Text:
+    return Text.assemble((label.ljust(_LABEL), _STYLES[state]), text, no_wrap=True, overflow="ignore")

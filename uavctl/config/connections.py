@@ -296,16 +296,18 @@ def warnings(security: SecurityConfig, daemon: DaemonConfig) -> tuple[str, ...]:
     urls = {"vehicle": daemon.vehicle, "mocap": daemon.mocap}
     if daemon.vehicle == daemon.mocap:
         del urls["mocap"]
-    found = []
+    found: dict[str, list[str]] = {}
     for name, url in urls.items():
         signed = bool(security.key_file) and name in security.require
         if url.startswith("udpin:") and not security.allow:
-            found.append(f"{name}: {url} listens to any address; list the peers in security.allow")
+            found.setdefault("any address may send; list the peers in security.allow", []).append(name)
         if url.startswith("udp") and not signed:
-            found.append(f"{name}: {url} is not signed, so a sender's address can be forged; see security.key_file")
+            found.setdefault("not signed, so an address can be forged; see security.key_file", []).append(name)
         if camera_scheme(url):
-            found.append(f"{name}: {url} has no signatures, so a sender's address can be forged; see docs/sources.md")
-    return tuple(found)
+            found.setdefault(f"{url} has no signatures, so an address can be forged; see docs/sources.md", []).append(
+                name
+            )
+    return tuple(f"{', '.join(names)}: {text}" for text, names in found.items())
 
 
 # Checks of a camera system that is listened to without a bridge to MAVLink.

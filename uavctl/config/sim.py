@@ -234,8 +234,8 @@ class SimConfig(Section, frozen=True, kw_only=True):
     setpoint_timeout_s: Annotated[
         Annotated[float, Meta(ge=0.01, le=3600)] | None,
         Meta(
-            description="silence after which setpoints count as gone [s]; without it the autopilot's own: 1 s with PX4 "
-            "(COM_OF_LOSS_T), 3 s with ArduPilot (GUID_TIMEOUT)"
+            description="silence after which setpoints count as gone [s], COM_OF_LOSS_T or GUID_TIMEOUT; without it "
+            "0.7 s, as a room needs it (as shipped PX4 has 1 s and ArduPilot 3 s)"
         ),
     ] = None
 

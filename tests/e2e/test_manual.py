@@ -1,0 +1,205 @@
+"""Every command of the manual, typed as printed; what is typed otherwise, or not at all, stands in the tables here."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from manual_rig import PAGES, Desk, blocks, commands, desk, edited, keys
+from places import DATA, ROOT
+
+from uavctl.config import load_config
+
+# Placeholders that are no names of files: what a reader has in their place.
+VALUES = {
+    "<the flight>": "NAME",
+    "FLIGHT.tlog": "somebody-elses.tlog",
+    "VEHICLE": "udpin://0.0.0.0:14540",
+    "CAMERAS": "udpin://0.0.0.0:14560",
+}
+# What is typed otherwise so that all of it takes minutes, not hours: (pattern, in its place).
+SHORTER = (
+    (r"--runs 200(000)?\b", "--runs 2"),
+    (r"^(uavctl campaign docs/campaigns/\w+\.toml)(?!.*--(runs|resume))", r"\1 --runs 2"),
+    (r"^(uavctl paper)(?!.*--runs)", r"\1 --runs 2 --steps 20"),
+    (r"^(uavctl loopback (?!.*--duration))", r"\1--duration 8 "),
+    (r"^(uavctl fly .*) --duration 120", r"\1 --duration 6"),
+)
+# What is not typed, and why.
+NOT_TYPED = {
+    r"^make |^\. \.venv": "sets up an environment: continuous integration is a `make test-all`",
+    r"--move$": "a person has to move the body",
+    r"^uavctl fly \.\.\.": "the dots are the reader's",
+    r"--dask ": "needs a cluster",
+    r"^uavctl bench|^python tools/(storage|trials)\.py": "measures for minutes; tests/lab/bench and tests/lab/trial",
+    r"^uavctl paper --full|docs/campaigns/(flights|room)\.toml": "minutes; tests/lab/paper, tests/lab/campaign",
+    r"^uavctl tune ": "flies for minutes; tests/lab/tune",
+    r"^uavctl log replay OTHER\.mcap": "another's recording; tests/logs/recording/test_foreign_stream.py",
+    r"^python -c .*systemd": "prints the path of a file of the installed package",
+}
+# Pages whose commands belong to each other: walked below, or in test_extending.py.
+WALKED = {"docs/first-flight.md", "docs/fleet.md", "docs/operation.md", "docs/extending.md"}
+TOML_OF_OTHERS = {"docs/extending.md", "docs/fleet.md"}  # campaigns, packages, fleets: tests of their own
+FLIES = """uavctl ctl status --json | grep -q '"mode":"track"'"""
+# The machine may stand still for a while: what a check then finds, and a setpoint timeout, are not the manual's. That
+# the vehicle's own timeout passes is seen in step 6, and in tests/check in virtual time.
+OF_TIME = ["vehicle", "position rate", "position age", "longest gap", "position loss", "vehicle clock", "source clock"]
+TIMEOUTS = ["COM_OF_LOSS_T", "GUID_TIMEOUT"]
+PATIENT = "--set sim.setpoint_timeout_s=600.0"
+ROOM_START = '--set sim.camera.rate_hz=25 --set "sim.start_position_m=[0,0,-0.1]"'
+
+
+def typed(command: str) -> str:
+    """What is typed for a command."""
+    for name, value in VALUES.items():
+        command = command.replace(name, value)
+    for pattern, instead in SHORTER:
+        command = re.sub(pattern, instead, command)
+    return command
+
+
+def is_typed(command: str) -> bool:
+    return not any(re.search(pattern, command) for pattern in NOT_TYPED)
+
+
+@pytest.fixture
+def at_desk(tmp_path: Path) -> Iterator[Desk]:
+    with desk(tmp_path) as one:
+        yield one
+
+
+@pytest.fixture(scope="session")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Files that pages take for granted: flights by the names that they have there, other people's recordings."""
+    folder = tmp_path_factory.mktemp("flown")
+    with desk(tmp_path_factory.mktemp("desk")) as one:
+        ways = "mission.waypoints=[[1.5,1.0,-1.2],[-1.5,-1.0,-0.8],[1.5,-1.0,-1.4]]"
+        flight = f"uavctl loopback --config room-px4 --duration 40 --out flights/NAME --set '{ways}'"
+        one.run(flight)
+        one.run("uavctl identify flights/NAME/flight.mcap")
+        for name in ("A", "B"):
+            one.run(f"uavctl loopback --duration 8 --out flights/{name}")
+        shutil.move(one.folder / "flights", folder / "flights")
+    shutil.copy(folder / "flights/NAME/flight.mcap", folder / "FLIGHT")
+    shutil.copy(folder / "flights/NAME/identified.toml", folder / "identified.toml")
+    shutil.copy(DATA / "arducopter-vicon-loop.tlog", folder / "somebody-elses.tlog")
+    shutil.copy(ROOT / "uavctl/presets/room-px4.toml", folder / "my-room.toml")
+    return folder
+
+
+def test_what_the_tables_name_is_in_the_manual() -> None:
+    """A row that nothing needs any more would hide the next command that looks like it."""
+    every = [command for page in PAGES for command in commands(page)]
+    assert [row for row in NOT_TYPED if not any(re.search(row, command) for command in every)] == []
+    assert [row for row in VALUES if not any(row in command for command in every)] == []
+    assert [row for row, _ in SHORTER if not any(re.search(row, command) for command in every)] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", [page for page in PAGES if page not in WALKED and any(map(is_typed, commands(page)))])
+def test_a_page_s_commands_do_what_they_say(page: str, at_desk: Desk, flown: Path) -> None:
+    shutil.copytree(flown, at_desk.folder, dirs_exist_ok=True)
+    if page == "README.md":  # its last commands fly what stands there
+        at_desk.until_said(at_desk.start("uavctl sim --config room-px4"), "system_id")
+    for command in filter(is_typed, commands(page)):
+        if re.match(r"uavctl fly ", command):
+            flight = at_desk.start(typed(command))
+            at_desk.until_good("uavctl ctl status")
+            at_desk.stop(flight)
+            assert flight.returncode == 1, at_desk.said(flight)  # nobody switched to it: nothing was flown
+        else:
+            at_desk.run(typed(command))
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if page not in TOML_OF_OTHERS and blocks(page, "toml")])
+def test_a_page_s_configurations_load(page: str) -> None:
+    for block in blocks(page, "toml"):
+        overrides = [f"{table}.{key}={value.split('   #')[0]}" for table, key, value in keys(block)]
+        assert overrides
+        load_config("room-px4", overrides)
+
+
+def test_the_page_of_fleets_shows_its_example() -> None:
+    (shown,) = blocks("docs/fleet.md", "toml")
+    assert shown == (ROOT / "docs/examples/duo.toml").read_text(encoding="utf-8")
+
+
+FIRST = "docs/first-flight.md"
+AUTOPILOTS = {"px4": "udpin://0.0.0.0:14540", "ardupilot": "tcp://127.0.0.1:5760"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("autopilot", AUTOPILOTS)
+def test_the_first_flight_as_the_page_says(autopilot: str, at_desk: Desk) -> None:
+    def on_page(section: str) -> list[str]:
+        lines = [typed(one.replace("VEHICLE", AUTOPILOTS[autopilot])) for one in commands(FIRST, section)]
+        return [line.replace("room-px4", f"room-{autopilot}") for line in lines if is_typed(line)]
+
+    copy, design = on_page("1. ")
+    at_desk.run(copy)
+    room = at_desk.folder / "my-room.toml"
+    for section in ("1. ", "2. "):
+        for block in blocks(FIRST, "toml", section):
+            if autopilot == "ardupilot":
+                block = block.replace("-inf", "-inf, -inf, -inf, -inf").replace(" inf", " inf, inf, inf, inf")
+            room.write_text(edited(room.read_text(), block))
+        at_desk.run(design)
+    (sim,) = on_page("From an empty room")
+    assert ROOM_START in sim
+    sim = sim if autopilot == "px4" else f"{sim} --autopilot ardupilot"
+    vehicle = at_desk.start(sim)
+    at_desk.until_said(vehicle, "system_id")
+    own = room.read_text()
+    room.write_text(edited(own, f"[check]\naccept = {json.dumps(OF_TIME)}\n"))
+    (check,) = on_page("6. ")
+    assert "check: ready" in at_desk.run(check)
+    (dry,) = on_page("7. ")
+    at_desk.run(dry, code=1)  # nothing was flown
+    at_desk.stop(vehicle)
+    at_desk.until_said(at_desk.start(f"{sim} {PATIENT}"), "system_id")
+    room.write_text(edited(own, f"[check]\naccept = {json.dumps(OF_TIME + TIMEOUTS)}\n"))
+    fly, *orders = on_page("9. ")
+    flight = at_desk.start(f"{fly} --out flights/NAME")
+    at_desk.until_good(FLIES)
+    for order in orders:
+        at_desk.run(order)
+    at_desk.ends(flight, fly)
+    for command in on_page("10. "):
+        if command.startswith("uavctl fly"):
+            command += " --duration 15"
+        at_desk.run(command)
+
+
+@pytest.mark.slow
+def test_a_fleet_flies_as_the_page_says(at_desk: Desk) -> None:
+    page = "docs/fleet.md"
+    (sim,) = commands(page, "Try it")
+    check, fly, *orders = (one for one in commands(page) if one != sim)
+    at_desk.run(check)
+    duo = at_desk.folder / "duo.toml"
+    accepted = f"check.accept={json.dumps(OF_TIME + TIMEOUTS)}"
+    duo.write_text(duo.read_text().replace("set = [", f"set = [\n  {json.dumps(accepted)},"))
+    at_desk.until_said(at_desk.start(f"{sim} {PATIENT}"), "system_id 2")
+    flight = at_desk.start(fly)
+    at_desk.until_good(FLIES.replace("--json", "--json --vehicle 14540"))
+    at_desk.until_good(FLIES.replace("--json", "--json --vehicle 14541"))
+    status, land, one = orders
+    at_desk.run(status)
+    at_desk.until_good(one)
+    at_desk.run(land)
+    at_desk.ends(flight, fly)
+
+
+@pytest.mark.slow
+def test_orders_do_what_the_page_says(at_desk: Desk) -> None:
+    at_desk.until_said(at_desk.start(f"uavctl sim --config room-px4 {PATIENT}"), "system_id")
+    accepted = f"--set 'check.accept={json.dumps(OF_TIME + TIMEOUTS)}'"
+    flight = at_desk.start(f"uavctl fly --config room-px4 --arm --takeoff 1.2 {accepted}")
+    at_desk.until_good(FLIES)
+    for order in filter(is_typed, commands("docs/operation.md")):
+        at_desk.run(order, code=1 if order == "uavctl ctl engage" else 0)
+    at_desk.ends(flight, "fly")

@@ -1,0 +1,170 @@
+"""The manual's blocks, and a machine of its own to type them on: a scratch folder, and ports nobody else has."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from patience import until
+from places import ROOT
+
+PAGES = ("README.md", *sorted(f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md")))
+_BLOCK = re.compile(r"^( *)```(\w+)\n(.*?)^ *```$", re.M | re.S)
+_TABLE = re.compile(r"^\[(\w+)\]\n((?:(?!^\[).*\n?)*)", re.M)
+LIMIT_S = 300.0  # for what is stuck
+
+
+def blocks(page: str, language: str, section: str = "") -> list[str]:
+    """Blocks of a page in a language, or those of the section whose heading begins so."""
+    text = (ROOT / page).read_text(encoding="utf-8")
+    if section:
+        (text,) = re.findall(rf"^#+ {re.escape(section)}.*?(?=^#+ |\Z)", text, re.M | re.S)
+    return [
+        re.sub(rf"^{indent}", "", body, flags=re.M) for indent, kind, body in _BLOCK.findall(text) if kind == language
+    ]
+
+
+def commands(page: str, section: str = "") -> list[str]:
+    """Commands of a page in their order, without comments; a line that goes on in the next one is one command."""
+    lines = "\n".join(blocks(page, "sh", section)).replace("\\\n", " ").splitlines()
+    return [command for line in lines if (command := re.sub(r"\s+# .*", "", line).strip())]
+
+
+def keys(block: str) -> list[tuple[str, str, str]]:
+    """Table, key and value of each line of a TOML block."""
+    found = []
+    for table, body in _TABLE.findall(block):
+        parts = (line.partition("=") for line in body.splitlines() if "=" in line)
+        found += [(table, key.strip(), value.strip()) for key, _, value in parts]
+    return found
+
+
+def edited(text: str, block: str) -> str:
+    """Change the lines of a configuration as a block says, where the table is there; else add it."""
+    for table, key, value in keys(block):
+        line, found = f"{key} = {value}\n", re.search(rf"^\[{table}\]\n(?:(?!^\[).*\n?)*", text, re.M)
+        if found is None:
+            text += f"\n[{table}]\n{line}"
+            continue
+        old = re.compile(rf"^{key} = (\[\n(?:.*\n)*?\]|.*)\n", re.M)
+        new, count = old.subn(line.replace("\\", r"\\"), found[0], count=1)
+        new = new if count else found[0].replace(f"[{table}]\n", f"[{table}]\n{line}", 1)
+        text = text[: found.start()] + new + text[found.end() :]
+    return text
+
+
+@dataclass
+class Desk:
+    """A folder like a checkout, and a shell in it; the network is its own, or the default ports are locked."""
+
+    folder: Path
+    network: tuple[str, ...]
+    environment: dict[str, str]
+    open: list[subprocess.Popen[bytes]] = field(default_factory=list)
+
+    def start(self, command: str) -> subprocess.Popen[bytes]:
+        """Begin a command."""
+        log = (self.folder / f"log-{len(self.open)}").open("wb")
+        process = subprocess.Popen(
+            [*self.network, "sh", "-c", f"exec {command}" if command.startswith("uavctl ") else command],
+            cwd=self.folder, env=self.environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+        )  # fmt: skip
+        log.close()
+        self.open.append(process)
+        return process
+
+    def said(self, process: subprocess.Popen[bytes]) -> str:
+        """What a command has written."""
+        return (self.folder / f"log-{self.open.index(process)}").read_text(errors="replace")
+
+    def ends(self, process: subprocess.Popen[bytes], command: str, code: int = 0) -> str:
+        """Wait for the end of a command; what it wrote."""
+        found = process.wait(LIMIT_S)
+        assert found == code, f"{command}: exit code {found}, not {code}\n{self.said(process)}"
+        return self.said(process)
+
+    def run(self, command: str, code: int = 0) -> str:
+        """Type a command, and wait for its end."""
+        return self.ends(self.start(command), command, code)
+
+    def until_said(self, process: subprocess.Popen[bytes], text: str) -> None:
+        """Wait until a command has written something."""
+
+        def said() -> bool:
+            assert process.poll() is None or text in self.said(process), self.said(process)
+            return text in self.said(process)
+
+        until(said, f"it says {text!r}")
+
+    def until_good(self, command: str) -> None:
+        """Type a command again and again, until it ends well."""
+        until(lambda: self.start(command).wait(LIMIT_S) == 0, command, pause_s=0.5)
+
+    def stop(self, process: subprocess.Popen[bytes]) -> None:
+        """Press Ctrl-C."""
+        process.send_signal(signal.SIGINT)
+        process.wait(LIMIT_S)
+
+
+@contextmanager
+def _network() -> Iterator[tuple[str, ...]]:
+    """Words before a command that let it run in a network of its own; without the right to that, wait for the ports."""
+    holder = subprocess.Popen(
+        ["unshare", "-n", "sh", "-c", "ip link set lo up && echo up && exec sleep infinity"], stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL, text=True,
+    )  # fmt: skip
+    try:
+        assert holder.stdout is not None
+        if holder.stdout.readline() == "up\n":
+            yield ("nsenter", f"--net=/proc/{holder.pid}/ns/net")
+            return
+        with (Path(tempfile.gettempdir()) / "uavctl-default-ports.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            yield ()
+    finally:
+        holder.kill()
+        holder.wait()
+        if holder.stdout is not None:
+            holder.stdout.close()
+
+
+@contextmanager
+def desk(folder: Path) -> Iterator[Desk]:
+    """A desk with a checkout's folders on it; what was begun there and still runs is ended."""
+    for name in ("uavctl", "docs", "tools", "sim", "logs"):
+        (folder / name).symlink_to(ROOT / name)
+    (folder / "duo.toml").write_bytes((ROOT / "docs/examples/duo.toml").read_bytes())
+    with tempfile.TemporaryDirectory(prefix="uavctl-") as short, _network() as network:  # sockets want short names
+        (Path(short) / "bin").mkdir()
+        (Path(short) / "bin/uavctl").write_text(f'#!/bin/sh\nexec {sys.executable} -m uavctl "$@"\n')
+        (Path(short) / "bin/uavctl").chmod(0o755)
+        (Path(short) / "bin/python").symlink_to(sys.executable)
+        environment = {
+            **os.environ, "PATH": f"{short}/bin:{os.environ['PATH']}", "HOME": short, "XDG_RUNTIME_DIR": short,
+            "PYTHONPATH": str(ROOT), "PYTHONSAFEPATH": "1", "COLUMNS": "80",
+        }  # fmt: skip
+        (folder / ".venv").mkdir()
+        shutil.copytree(Path(short) / "bin", folder / ".venv/bin", symlinks=True)
+        one = Desk(folder, network, environment)
+        try:
+            yield one
+        finally:
+            for process in one.open:
+                if process.poll() is None:
+                    process.send_signal(signal.SIGINT)
+            for process in one.open:
+                try:
+                    process.wait(20.0)
+                except subprocess.TimeoutExpired:
+                    process.kill()
+                    process.wait()
