@@ -19,6 +19,7 @@ from msgspec import NODEFAULT, Meta
 from msgspec.structs import FieldInfo
 
 from uavctl.config.checks import check
+from uavctl.config.defaults import complete
 from uavctl.config.document import (
     DEEPEST,
     LONGEST_KEY,
@@ -191,6 +192,7 @@ def parse(text: str, file: str, overrides: Sequence[str] = ()) -> LoadedConfig:
     found: list[ConfigProblem] = list(oversized(table))
     if found:
         raise ConfigError((*problems, *map(source.tell, found)))
+    complete(table, file)
     sections: dict[str, Decoded] = {}
     config = decode(Config, table, "", found, sections, needed=_needed(table))
     mission, link = sections.get("mission", MissionConfig()), sections.get("link", LinkConfig())
