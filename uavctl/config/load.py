@@ -30,6 +30,7 @@ from uavctl.config.document import (
     description,
     element,
     excess,
+    given_before,
     is_section,
     key_lines,
     oversized,
@@ -131,6 +132,7 @@ def dotted(value: object, path: str = "") -> Iterator[tuple[str, object]]:
 
 
 _SYNTAX_PLACE = re.compile(r" \(at (?:line (?P<line>\d+), column \d+|end of document)\)$")
+_GIVEN_AGAIN = ("Cannot overwrite", "Cannot declare", "Cannot mutate", "Cannot redefine", "Duplicate")
 _DECODE_PLACE = re.compile(r" - at `\$(?P<path>.*)`$")
 Decoded = Section | tuple[Section, ...]
 _WORDS = {
@@ -266,6 +268,14 @@ def parse_toml(text: str, file: str) -> dict[str, Any]:
         place = _SYNTAX_PLACE.search(message)
         line = place["line"] if place and place["line"] else str(text.count("\n") + 1)
         reason = _SYNTAX_PLACE.sub("", message)
+        again = None
+        if message.startswith(_GIVEN_AGAIN):
+            again = given_before("".join(text.splitlines(keepends=True)[: int(line)]))
+        if again is not None:
+            key, first, second = again
+            raise ConfigError(
+                (f"{file}:{second}: {key}: is given again, first in line {first}; keep one of the two",)
+            ) from error
         raise ConfigError((f"{file}:{line}: TOML syntax: {reason}; mend the line",)) from error
     except ValueError as error:  # a whole number of thousands of digits
         raise ConfigError((f"{file}:1: TOML: {error}; mend the number",)) from error

@@ -566,6 +566,15 @@ class Config(Section, frozen=True, kw_only=True):
     mission: MissionConfig = MissionConfig()
     fence: Annotated[tuple[FenceConfig, ...], Meta(max_length=50, description="limits that change in flight")] = ()
 
+    def __repr__(self) -> str:
+        """Return one line; `dump_config` has all keys."""
+        plant, axes = self.plant, " ".join(self.plant.axes)
+        return (
+            f"configuration {self.name}: plant {plant.model}{f' ({axes})' if axes else ''}, Δt {plant.dt_s:g} s, "
+            f"{self.smpc.controller or self.smpc.scheme} with horizon {self.smpc.horizon}, "
+            f"link {self.link.model} with loss {self.link.loss:g}"
+        )
+
     @property
     def conditioned(self) -> bool:
         """Whether plans are made by the scheme with risk conditioned on the age."""

@@ -150,6 +150,11 @@ class Plant:
         generator = _logarithm(self) / self.dt_s if self.axes else np.full((size, size), np.nan)
         object.__setattr__(self, "_generator", _frozen(generator))
 
+    def __repr__(self) -> str:
+        """Return one line: sizes, step, axes; the matrices are `a`, `b`, `e`, `w`."""
+        where = f", {' '.join(self.axes)}" if self.axes else ""
+        return f"plant of {self.n_x} states, {self.n_u} inputs, {self.n_w} disturbances; Δt {self.dt_s:g} s{where}"
+
     @property
     def n_x(self) -> int:
         """Number of states."""
