@@ -342,6 +342,7 @@ class Source:
     lines: Mapping[str, int]  # key path -> line in the file
     overrides: tuple[tuple[str, str], ...] = ()  # (key path, text as typed) of each override, in order
     elsewhere: Mapping[str, str] = field(default_factory=dict)  # key path -> place, for what another file holds
+    below: Mapping[str, str] = field(default_factory=dict)  # key path -> place in the base, for what the file has not
 
     def where(self, key: str) -> str:
         """The place in another file, the override that set `key`, or `file:line` of it or the nearest table around."""
@@ -351,8 +352,12 @@ class Source:
         for path, text in reversed(self.overrides):
             if key == path or key.startswith((f"{path}.", f"{path}[")) or path.startswith(f"{key}."):
                 return f"--set {text}"
-        line = next((self.lines[around] for around in _outwards(key) if around in self.lines), 1)
-        return f"{self.file}:{line}"
+        for around in _outwards(key):
+            if around in self.lines:
+                return f"{self.file}:{self.lines[around]}"
+            if around in self.below:
+                return self.below[around]
+        return f"{self.file}:1"
 
     def tell(self, problem: ConfigProblem) -> str:
         """One line: place, key, what is wrong, what to do."""

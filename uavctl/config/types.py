@@ -224,7 +224,8 @@ class SmpcConfig(Section, frozen=True, kw_only=True):
         Scheme,
         Meta(
             description="`hahn-stursberg`: the paper's, with planned feedback, its library and terminal law; "
-            "`age-conditioned`: plans without feedback, back-offs by the age of information, the regulator's tail"
+            "`age-conditioned`: plans without feedback, back-offs by the age of information, the regulator's tail; a "
+            "file that gives no key of the other one alone means this one"
         ),
     ] = "hahn-stursberg"
     controller: Annotated[
