@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from uavctl.config import load
@@ -40,7 +41,7 @@ def motion(tmp_path: Path, text: str) -> tuple[tuple[float, ...], ...]:
     ],
 )
 def test_places_are_those_that_the_header_states(tmp_path: Path, text: str) -> None:
-    assert motion(tmp_path, text) == pytest.approx(PLACES)
+    np.testing.assert_allclose(motion(tmp_path, text), PLACES, rtol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -52,7 +53,7 @@ def test_places_are_those_that_the_header_states(tmp_path: Path, text: str) -> N
     ],
 )
 def test_so_are_velocities(tmp_path: Path, text: str) -> None:
-    assert motion(tmp_path, text) == pytest.approx(SPEEDS)
+    np.testing.assert_allclose(motion(tmp_path, text), SPEEDS, rtol=1e-12)
 
 
 @pytest.mark.parametrize(

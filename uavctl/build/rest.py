@@ -94,4 +94,4 @@ def _middle(rows: Array, low: Array, high: Array) -> Array | None:
     kept = np.isfinite(sides)
     aim = np.append(np.zeros(rows.shape[1]), -1.0)
     found = linprog(aim, c[kept], sides[kept], bounds=[(None, None)] * rows.shape[1] + [(0.0, 1.0)])
-    return np.asarray(found.x[:-1]) if found.status == 0 else None
+    return None if found.status or found.x is None else np.asarray(found.x[:-1])

@@ -15,11 +15,12 @@ from uavctl.build.controller import design_of, resting
 from uavctl.build.mission import resting_places
 from uavctl.cli.common import messages
 from uavctl.config import parse
-from uavctl.errors import DesignError, UsageError
+from uavctl.errors import UsageError
 
 WALL_M = 0.3  # between a wall and the limit of the vehicle's centre: half a vehicle, and a hand
 LEAST_M = 0.2  # between the places to rest in, so that there is somewhere to fly to
 LARGEST_M = 1000.0
+_WIDE_M = 3.0
 _STEP_M = 0.1  # that a smallest size is rounded up to
 _AXES = ("length", "width", "height")
 
@@ -74,7 +75,7 @@ def init(
     sizes = read_sizes(room)
     name = "my-room.toml" if out == "-" else out
     text = room_text(sizes, autopilot, name)
-    _check_fits(text, name, sizes)
+    _check_fits(sizes, autopilot)
     if out == "-":
         sys.stdout.write(text)
         return 0
@@ -83,6 +84,8 @@ def init(
             file.write(text)
     except FileExistsError as error:
         raise UsageError(f"{out}: is there already; give another file with --out, or remove it") from error
+    except OSError as error:
+        raise UsageError(f"{out}: cannot be written ({error.strerror}); give another file with --out") from error
     messages().print(
         f"wrote {out}: limits {WALL_M:g} m from walls and ceiling; next: uavctl design --config {out}",
         markup=False,
@@ -130,28 +133,24 @@ def room_text(sizes: tuple[float, float, float], autopilot: str, file: str) -> s
     )
 
 
-def _check_fits(text: str, file: str, sizes: tuple[float, float, float]) -> None:
+def _check_fits(sizes: tuple[float, float, float], autopilot: str) -> None:
     """See that plans may rest in a room, and somewhere to fly to is left.
 
     Raises:
         UsageError: A side is too short; the shortest possible one is told.
     """
-    small = [2.0 * WALL_M, 2.0 * WALL_M, WALL_M]
-    short = {
-        i: least + LEAST_M for i, (size, least) in enumerate(zip(sizes, small, strict=True)) if size <= least + LEAST_M
-    }
-    if not short:
-        config = parse(text, file).config
-        try:
-            design = design_of(config)
-            least, most = resting_places(design.plant, design.state_set, resting(design))
-        except DesignError as error:
-            raise UsageError(f"--room: {error}") from error
-        left = most - least
-        short = {int(i): sizes[i] + LEAST_M - float(left[i]) for i in np.flatnonzero(left < LEAST_M)}
+    length, width, height = (max(size, _WIDE_M) for size in sizes)  # where there is a design in any case
+    config = parse(room_text((length, width, height), autopilot, "room"), "room").config
+    design = design_of(config)
+    least, most = resting_places(design.plant, design.state_set, resting(design))
+    needed = np.array((length, width, height)) - (most - least) + LEAST_M
+    short = [
+        f"a {name} of {size:g} m (at least {math.ceil(need / _STEP_M) * _STEP_M:.1f} m)"
+        for name, size, need in zip(_AXES, sizes, needed.tolist(), strict=True)
+        if size < need
+    ]
     if short:
-        told = ", ".join(
-            f"a {_AXES[i]} of {sizes[i]:g} m (at least {math.ceil(need / _STEP_M - 1e-9) * _STEP_M:.1f} m)"
-            for i, need in short.items()
+        raise UsageError(
+            f"--room: {', '.join(short)} leaves no place to fly to, {WALL_M:g} m from walls and ceiling and with room "
+            "to stop"
         )
-        raise UsageError(f"--room: {told} leaves no place to fly to, {WALL_M:g} m from the walls and with room to stop")

@@ -243,7 +243,7 @@ def _expand(
             found.append(ConfigProblem("base", reason, f"give one of {', '.join(presets())}"))
             return own, {}
         place, text = _read(base)
-        table = merge(parse_toml(text, place), own)
+        table = merge({key: one for key, one in parse_toml(text, place).items() if key != "name"}, own)
         below = {key: f"{place}:{line}" for key, line in key_lines(text).items()}
     room = table.pop("room", None)
     if room is None:
