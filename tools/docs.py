@@ -15,6 +15,7 @@ from logs.recording.derived_topics import VIEWS, DerivedTopic
 from logs.recording.topics import TOPICS, definition
 from uavctl.cli.app import app
 from uavctl.config.document import Section, description, element, is_section, type_text
+from uavctl.config.room import RoomConfig
 from uavctl.config.types import OF_HAHN_STURSBERG, Config
 from uavctl.lab.campaign.spec import CampaignSpec
 from uavctl.lab.campaign.trials import TrialSpec
@@ -38,7 +39,26 @@ and every list and text a longest length, whether it is told below or not (1e7 a
 States are ordered axis by axis: position, velocity (and acceleration with model `drag-lag`; acceleration,
 lead of the vehicle's own reference in position and in velocity, and integral with model `velocity-reference`).
 n_x, n_u and n_w are the numbers of states, inputs (one an axis) and disturbances.
+
+A file needs `[plant]`, `[sets]` and `[cost]`; what it leaves out has a default, or follows from these: the target is
+the origin (the middle where that is outside), the last gate is as wide as the inputs' limits, a camera sends a
+position each Δt. The name is that of the file. A plant of model `matrices` without `axes` is one of states that mean
+nothing in a room: `solve`, `design`, `campaign` and `uavctl.simulate` take it, flights do not.
+
+`base = "room-px4"` (any preset) at the top of a file gives all keys that the file has not. With it `[room]` gives the
+limits by name, in place of the lists of `[sets]` and `[target]`; `uavctl init` writes such a file.
 """
+# Keys that follow from others where they are left out.
+_DERIVED = {
+    "name": "the file's name",
+    "plant.model": "`matrices` where `a` is given",
+    "smpc.horizon": "48 with scheme `age-conditioned`",
+    "target.position_m": "0, or the middle of the limits",
+    "limits.accel_mps2": "what the limits of the inputs allow",
+    "limits.slew_mps3": "15, more where an own plant's inputs are wider",
+    "daemon.tick_s": "the longest up to 0.1 that divides Δt",
+    "sim.camera.rate_hz": "one sample each Δt",
+}
 _CAMPAIGN = """# Keys of a campaign
 
 This page is generated from the types in `uavctl/lab/campaign` (`make docs`); do not edit it.
@@ -56,7 +76,7 @@ _RAW_TEXT = "bytes of a datagram as they crossed connection `<link>`; log time =
 
 def configuration_page() -> str:
     """The page docs/configuration.md, made from the types of the configuration."""
-    return "\n".join((_CONFIGURATION, *tables(Config, "")))
+    return "\n".join((_CONFIGURATION, *tables(RoomConfig, "room"), *tables(Config, "")))
 
 
 def tables(section: type[Section], path: str) -> Iterator[str]:
@@ -68,7 +88,7 @@ def tables(section: type[Section], path: str) -> Iterator[str]:
     for field in fields:
         if not is_section(field.type):
             needed = f"{path}.{field.encode_name}" in OF_HAHN_STURSBERG
-            default = "required with scheme `hahn-stursberg`" if needed else _default(field)
+            default = "required with scheme `hahn-stursberg`" if needed else _default(field, section, path)
             cells = (f"`{field.encode_name}`", type_text(field.type), description(field), default)
             yield "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
     yield ""
@@ -81,9 +101,10 @@ def tables(section: type[Section], path: str) -> Iterator[str]:
             yield from tables(field.type, name)
 
 
-def _default(field: FieldInfo) -> str:
+def _default(field: FieldInfo, section: type[Section], path: str) -> str:
     if field.default is NODEFAULT:
-        return "required"
+        key = f"{path}.{field.encode_name}" if path else field.encode_name
+        return "required" if section is not Config and not path else _DERIVED.get(key, "required")
     if field.default is None:
         return "none"
     return f"`{msgspec.json.encode(field.default).decode()}`"

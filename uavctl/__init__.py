@@ -11,6 +11,7 @@ __version__ = "0.2.0"
 _MODULES = {
     "Config": "uavctl.config",
     "Flight": "uavctl.api.flights",
+    "Plan": "uavctl.api.control",
     "Recording": "uavctl.api.flights",
     "Runs": "uavctl.api.control",
     "SteppedController": "uavctl.api.control",

@@ -1,3 +1,4 @@
+from uavctl.api.control import Plan as Plan
 from uavctl.api.control import Runs as Runs
 from uavctl.api.control import SteppedController as SteppedController
 from uavctl.api.control import controller as controller

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -354,7 +355,7 @@ def rows(summary: FlightSummary) -> list[tuple[str, str]]:
         ("Input outside limits", f"{count(s.input_violations, 'step')}{_share(s.input_violations, s.steps)}"),
         ("Solves", f"{s.solves}, {s.failed_solves} without an optimum; {s.slack_used} flown with slack"),
         ("Plans found", _methods(s)),
-        ("Cost", f"{s.cost:.6g}{seen}"),
+        ("Cost", f"{s.cost:.6g}{seen}" if math.isfinite(s.cost) else "unknown: not every step's state is a number"),
         (f"Distance from {'trajectory' if s.trajectory else 'target'}", _distance(s)),
         ("Decision time", _times(s.decision_us)),
         _punctuality(s),
@@ -418,8 +419,9 @@ def _outside(
 
 
 def _cost(flight: FlightData) -> float:
-    """Return the closed-loop cost (3), summed over the flown boundaries."""
+    """Return the closed-loop cost (3), summed over the flown boundaries; NaN where their states are not all known."""
     design, steps = flight.design, flight.steps
     x = steps.state - steps.target
     u = steps.input
-    return float(np.sum((x @ np.array(design.q_x)) * x) + np.sum((u @ np.array(design.q_u)) * u))
+    with np.errstate(over="ignore", invalid="ignore"):
+        return float(np.sum((x @ np.array(design.q_x)) * x) + np.sum((u @ np.array(design.q_u)) * u))

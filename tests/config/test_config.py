@@ -101,7 +101,7 @@ def without_the_paper_s(text: str) -> str:
 
 def test_what_the_paper_s_scheme_alone_needs_need_not_be_given_for_the_other_one() -> None:
     text = without_the_paper_s(PAPER)
-    told = problems(text)
+    told = problems(text, "smpc.scheme=hahn-stursberg")
     keys = ("smpc.tau", "smpc.delta_u", "smpc.delta_tau", "smpc.k_tau", "smpc.offset_weight")
     assert [one.partition(": ")[2].split(": ")[0] for one in told] == [*keys, "schedule"]
     assert told[-1].endswith("schedule: missing table; add [schedule]; the presets are complete examples")
@@ -202,9 +202,7 @@ def test_what_an_override_broke_is_named_as_the_override() -> None:
     assert any("--set name.x=1: name is a value, not a table" in problem for problem in found)
 
 
-@pytest.mark.parametrize(
-    ("text", "line"), [("a = 1\nb = = 2\n", 2), ("[plant\n", 1), ("a = 1\na = 2\n", 2), ('a = """\n', 2)]
-)
+@pytest.mark.parametrize(("text", "line"), [("a = 1\nb = = 2\n", 2), ("[plant\n", 1), ('a = """\n', 2)])
 def test_toml_syntax_errors_have_their_line(text: str, line: int) -> None:
     (problem,) = problems(text)
     assert problem.startswith(f"my.toml:{line}: TOML syntax: ")

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -20,6 +21,7 @@ from uavctl.config import load as load_file
 from uavctl.config.load import override_texts
 from uavctl.config.mission import MissionConfig
 from uavctl.errors import ConfigError, UavctlError, UsageError, need
+from uavctl.records import names_of
 from uavctl.smpc.answer import Answer, Solver
 from uavctl.smpc.batch import BatchController, News
 from uavctl.smpc.conditioned.planner import AnyDesign
@@ -28,6 +30,9 @@ from uavctl.smpc.nominal import ControlProblem
 from uavctl.smpc.plant import Plant
 
 if TYPE_CHECKING:
+    import pandas
+    import polars
+
     from uavctl.lab.campaign.controllers import Recipe, Setting
 
 Array = NDArray[np.float64]
@@ -82,7 +87,59 @@ def link(config: Source) -> AgeModel:
     return build_ages(loaded(config))
 
 
-def solve(config: Source, state: ArrayLike, target: ArrayLike | None = None) -> Answer:
+class Signal(NamedTuple):
+    """A state or an input: its name, its unit (empty where that is not known), and the column of tables."""
+
+    name: str
+    unit: str
+    column: str
+
+
+_SUFFIXES = {"m": "_m", "m/s": "_mps", "m/s²": "_mps2"}
+
+
+def signals(config: Config) -> tuple[tuple[Signal, ...], tuple[Signal, ...]]:
+    """Return the states and the inputs of a configuration's plant, in order."""
+    of = build_plant(config)
+    states = names_of((), of.n_x, of.axes, of.position_index, of.velocity_index, of.further).states
+    unit = "" if config.plant.model == "matrices" else "m/s²"
+    inputs = [(f"{axis} input", unit) for axis in of.axes] or [(f"input {i}", "") for i in range(of.n_u)]
+    made = (
+        tuple(Signal(name, unit, re.sub(r"\W+", "_", name) + _SUFFIXES.get(unit, "")) for name, unit in given)
+        for given in (states, inputs)
+    )
+    return next(made), next(made)
+
+
+def limits_of(config: Config) -> tuple[list[tuple[float, float]], list[tuple[float, float]]]:
+    """Return lower and upper limit of each state and of each input; infinite where there is none."""
+    sets = config.sets
+    states = list(zip(sets.state_lower, sets.state_upper, strict=True))
+    return states, list(zip(sets.input_lower, sets.input_upper, strict=True))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Plan(Answer):
+    """The answer of `solve`, with the configuration that it was asked for."""
+
+    config: Config = field(kw_only=True)
+
+    def __repr__(self) -> str:
+        """Return a few lines: how it ended, and the first input with its units."""
+        text = super().__repr__()
+        if not self.inputs.size:
+            return text
+        _, inputs = signals(self.config)
+        begins = ", ".join(
+            f"{one.name} {value:.4g} {one.unit}".rstrip() for one, value in zip(inputs, self.inputs[0], strict=True)
+        )
+        ahead_s = len(self.inputs) * self.config.plant.dt_s
+        return (
+            f"{text.partition(chr(10))[0]}\n  first input: {begins}\n  looks {ahead_s:g} s ahead ({self.config.name})"
+        )
+
+
+def solve(config: Source, state: ArrayLike, target: ArrayLike | None = None) -> Plan:
     """Solve one decision problem: the plan from a state to the configured target.
 
     The solver of a configuration is kept for the next call.
@@ -97,10 +154,12 @@ def solve(config: Source, state: ArrayLike, target: ArrayLike | None = None) -> 
         DesignError: There is no design.
         UsageError: The state is none of this plant.
     """
-    design, solver = _solver(loaded(config))
+    found = loaded(config)
+    design, solver = _solver(found)
     n_x = design.plant.n_x
     wanted = design.target if target is None else state_of(target, n_x)
-    return solver.solve(0, state_of(state, n_x), wanted)
+    answer = solver.solve(0, state_of(state, n_x), wanted)
+    return Plan(**{one.name: getattr(answer, one.name) for one in fields(Answer)}, config=found)
 
 
 @lru_cache(maxsize=8)
@@ -136,6 +195,10 @@ class SteppedController:
     def __init__(self, controller: BatchController, problem: ControlProblem) -> None:
         self._controller, self.problem = controller, problem
         self.reset()
+
+    def __repr__(self) -> str:
+        """Return one line."""
+        return f"{type(self._controller).__name__} after {len(self._inputs)} steps, for a {self.problem.plant!r}"
 
     def reset(self) -> None:
         """Begin a new run."""
@@ -241,6 +304,74 @@ class Runs:
     state_violated: NDArray[np.bool_]  # whether x(1) … x(T) left the limits (N, T)
     input_violated: NDArray[np.bool_]  # whether the input asked for was outside its limits (N, T)
     failed: NDArray[np.bool_]  # whether a run ended in numbers that are not finite (N,)
+
+    def __repr__(self) -> str:
+        """Return two lines: what was flown, and what it came to."""
+        runs, steps = self.cost.shape
+        good = ~self.failed
+        cost = f"{self.cost[good].sum(axis=1).mean():.6g}" if good.any() else "none, all failed"
+        failed = f", {int(self.failed.sum())} failed" if self.failed.any() else ""
+        return (
+            f"{runs} runs of {steps} steps by {self.controller} on {self.config.name}, seed {self.seed}{failed}\n"
+            f"  mean cost {cost}, outside the state limits {self.state_violated[good].mean() if good.any() else 0:.2%} "
+            f"of the time, oldest position {int(self.age_steps.max(initial=0))} steps"
+        )
+
+    def _columns(self) -> dict[str, list[object]]:
+        """One row for each run and step; the last state of a run has no input, age or cost, the first no verdict."""
+        (runs, steps), (states, inputs) = self.cost.shape, signals(self.config)
+        before, after = np.arange(steps + 1) < steps, np.arange(steps + 1) > 0
+
+        def spread(values: NDArray[Any], where: NDArray[np.bool_]) -> list[object]:
+            cells = np.full((runs, steps + 1), None, dtype=object)
+            cells[:, where] = values
+            return list(cells.ravel())
+
+        found: dict[str, list[object]] = {
+            "run": np.repeat(np.arange(runs), steps + 1).tolist(),
+            "step": np.tile(np.arange(steps + 1), runs).tolist(),
+            "time_s": np.tile(self.time_s, runs).tolist(),
+        }
+        found |= {one.column: self.states[:, :, i].ravel().tolist() for i, one in enumerate(states)}
+        found |= {one.column: spread(self.inputs[:, :, i], before) for i, one in enumerate(inputs)}
+        for name, values, where in (
+            ("age_steps", self.age_steps, before),
+            ("cost", self.cost, before),
+            ("state_violated", self.state_violated, after),
+            ("input_violated", self.input_violated, before),
+        ):
+            found[name] = spread(values, where)
+        return found | {"failed": np.repeat(self.failed, steps + 1).tolist()}
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """Return one table, a row for each run and step: `run`, `step`, `time_s`, states, inputs, age and cost.
+
+        Raises:
+            ExtraMissingError: pandas is not there.
+        """
+        need("pandas", "pandas")
+        import pandas as pd
+
+        kinds = {"age_steps": "Int64", "state_violated": "boolean", "input_violated": "boolean"}
+        columns = self._columns()
+        _, inputs = signals(self.config)
+        kinds |= dict.fromkeys(("cost", *(one.column for one in inputs)), "float64")
+        return pd.DataFrame({name: pd.Series(cells, dtype=kinds.get(name)) for name, cells in columns.items()})
+
+    def to_polars(self) -> polars.DataFrame:
+        """Return the same table as a polars frame.
+
+        Raises:
+            ExtraMissingError: polars is not there.
+        """
+        need("polars", "polars")
+        import polars as pl
+
+        plain = {
+            name: [cell.item() if isinstance(cell, np.generic) else cell for cell in cells]
+            for name, cells in self._columns().items()
+        }
+        return pl.DataFrame(plain)
 
 
 def simulate(

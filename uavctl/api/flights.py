@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 import numpy as np
@@ -18,7 +18,7 @@ from logs.recording.flight import FlightData
 from logs.recording.reader import header, lacks_end, records
 from logs.recording.reader import read as read_records
 from logs.recording.summary import FlightSummary, summarise
-from uavctl.api.control import Array, Runs, Source, load, loaded
+from uavctl.api.control import Array, Plan, Runs, Signal, Source, limits_of, load, loaded, signals
 from uavctl.build.controller import build_problem, design_of, prepare, ready_library
 from uavctl.config import Config
 from uavctl.config.load import parse_recorded
@@ -26,7 +26,7 @@ from uavctl.daemon.engagement import Engagement, check_places, goto_keys, stop_l
 from uavctl.errors import RecordingError, UsageError, in_words, need
 from uavctl.lab.lockstep import LockstepFlight, check_length
 from uavctl.records import Ending, Truth
-from uavctl.smpc.answer import Answer
+from uavctl.smpc.plant import AXES
 
 if TYPE_CHECKING:
     import pandas
@@ -46,6 +46,10 @@ class Recording:
 
     path: Path  # its first file
     topics: tuple[str, ...]  # those it holds, and lists of records within them, as `/uavctl/step_input.samples`
+
+    def __repr__(self) -> str:
+        """Return one line; `topics` are the tables."""
+        return f"recording {self.path}, {len(self.topics)} tables"
 
     @cached_property
     def config(self) -> Config:
@@ -151,6 +155,14 @@ class Flight:
     position_m: Array  # true position (n, 3), local NED
     velocity_mps: Array  # true velocity (n, 3), local NED
 
+    def __repr__(self) -> str:
+        """Return three lines: configuration and length, how it ended, recording."""
+        flown_s = self.time_s[-1] - self.time_s[0] if len(self.time_s) else 0.0
+        return (
+            f"flight of {self.config.name}, {flown_s:g} s\n  ended: {self.ending.sentence}\n"
+            f"  recorded in {self.recording.path}"
+        )
+
 
 def fly(
     config: Source = "room",
@@ -212,11 +224,11 @@ def fly(
 _QUANTILES = (0.05, 0.5, 0.95)
 
 
-def plot(what: Answer | Runs | Flight | Recording) -> Figure:
-    """Draw an answer, runs or a flight; the figure is returned, not shown.
+def plot(what: Plan | Runs | Flight | Recording) -> Figure:
+    """Draw a plan, runs or a flight, with names, units and limits; the figure is returned, not shown.
 
-    Answer: predicted states and inputs by step. Runs: median of each position, and between which two values nine in
-    ten runs are, with limits and target. Flight: the path from above and from the side.
+    Plan: predicted states and inputs, and where it ends. Runs: median of each position (of each state, where a plant
+    has no axes), and between which two values nine in ten runs are. Flight: the path from above and from the side.
 
     Raises:
         UsageError: It is nothing that has a figure.
@@ -225,7 +237,7 @@ def plot(what: Answer | Runs | Flight | Recording) -> Figure:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8.0, 3.2), layout="constrained")
-    if isinstance(what, Answer):
+    if isinstance(what, Plan):
         _draw_answer(figure, what)
     elif isinstance(what, Runs):
         _draw_runs(figure, what)
@@ -238,27 +250,91 @@ def plot(what: Answer | Runs | Flight | Recording) -> Figure:
     return figure
 
 
-def _draw_answer(figure: Figure, answer: Answer) -> None:
-    for place, (name, rows) in enumerate((("state", answer.states), ("input", answer.inputs)), 1):
-        ax = _axes(figure, 2, place, f"Predicted {name}", "step", name)
-        for number, values in enumerate(rows.T):
-            ax.plot(np.arange(len(rows)), values, marker=".", label=f"{name} {number}")
-        ax.legend()
+_PANELS = 3  # in a row
+_MOST_PANELS = 12
+
+
+class _Panel(NamedTuple):
+    """Signals that share a panel: its title and unit, and (label, values (…, T), limits, target) of each."""
+
+    title: str
+    unit: str
+    rows: list[tuple[str, Array, tuple[float, float], float | None]]
+
+
+def _panels(
+    given: Sequence[Signal], values: Array, limits: Sequence[tuple[float, float]], target: Array | None
+) -> list[_Panel]:
+    """Put signals of a kind into one panel, those of an own plant each into its own."""
+    found: dict[str, _Panel] = {}
+    for i, one in enumerate(given):
+        axis, _, kind = one.name.partition(" ")
+        key = kind if axis in AXES else one.name
+        panel = found.setdefault(key, _Panel(key, one.unit, []))
+        label = axis if axis in AXES else one.name
+        panel.rows.append((label, values[..., i], limits[i], None if target is None else float(target[i])))
+    return list(found.values())
+
+
+def _draw_answer(figure: Figure, plan: Plan) -> None:
+    if not plan.inputs.size:
+        raise UsageError(f"there is no plan to draw: {plan!r}")
+    (states, inputs), (low_x, low_u) = signals(plan.config), limits_of(plan.config)
+    panels = [*_panels(states, plan.states, low_x, plan.reference), *_panels(inputs, plan.inputs, low_u, None)]
+    for ax, panel in _grid(figure, panels, "time ahead [s]"):
+        for number, (label, values, limits, target) in enumerate(panel.rows):
+            time_s = plan.config.plant.dt_s * np.arange(len(values))
+            held = "steps-post" if len(values) < len(plan.states) else "default"
+            ax.plot(time_s, values, color=f"C{number}", label=label, drawstyle=held)
+            _draw_limits(ax, limits, target, f"C{number}")
+        _explain(ax, panel)
 
 
 def _draw_runs(figure: Figure, runs: Runs) -> None:
-    problem = build_problem(runs.config)
-    axes, index = problem.plant.axes, problem.plant.position_index
-    lower, upper = problem.state_set.bounds
-    for place, (axis, of) in enumerate(zip(axes, index, strict=True), 1):
-        ax = _axes(figure, len(axes), place, axis.capitalize(), "time [s]", f"{axis} [m]")
-        low, middle, high = np.quantile(runs.states[~runs.failed, :, of], _QUANTILES, axis=0)
-        ax.fill_between(runs.time_s, low, high, alpha=0.25, lw=0)
-        ax.plot(runs.time_s, middle)
-        ax.axhline(problem.target[of], ls=":", color="C2")
-        for limit in (lower[of], upper[of]):
-            if np.isfinite(limit):
-                ax.axhline(limit, ls="--", color="C3")
+    if runs.failed.all():
+        raise UsageError(f"there is no run to draw: {runs!r}")
+    problem, (states, _), (limits, _) = build_problem(runs.config), signals(runs.config), limits_of(runs.config)
+    shown = list(problem.plant.position_index) or list(range(problem.plant.n_x))
+    panels = [
+        _Panel(states[i].name, states[i].unit, [("median", runs.states[:, :, i], limits[i], float(problem.target[i]))])
+        for i in shown
+    ]
+    for ax, panel in _grid(figure, panels, "time [s]"):
+        ((label, values, sides, target),) = panel.rows
+        low, middle, high = np.quantile(values[~runs.failed], _QUANTILES, axis=0)
+        ax.fill_between(runs.time_s, low, high, alpha=0.25, lw=0, label="nine in ten runs")
+        ax.plot(runs.time_s, middle, label=label)
+        _draw_limits(ax, sides, target, "C3")
+        _explain(ax, panel)
+
+
+def _draw_limits(ax: Axes, limits: tuple[float, float], target: float | None, colour: str) -> None:
+    for limit in limits:
+        if np.isfinite(limit):
+            ax.axhline(limit, ls="--", lw=1.0, color=colour, alpha=0.7)
+    if target is not None:
+        ax.axhline(target, ls=":", lw=1.0, color=colour)
+
+
+def _explain(ax: Axes, panel: _Panel) -> None:
+    ax.plot([], [], ls="--", lw=1.0, color="0.4", label="limit")
+    if any(target is not None for *_, target in panel.rows):
+        ax.plot([], [], ls=":", lw=1.0, color="0.4", label="target")
+    ax.legend(fontsize="x-small")
+
+
+def _grid(figure: Figure, panels: Sequence[_Panel], x_label: str) -> Iterator[tuple[Axes, _Panel]]:
+    """Yield axes for the first panels, a few in a row, with title, unit and time."""
+    shown = panels[:_MOST_PANELS]
+    columns = min(_PANELS, len(shown))
+    rows = -(-len(shown) // columns)
+    figure.set_size_inches(3.4 * columns + 0.6, 2.9 * rows)
+    for place, panel in enumerate(shown, 1):
+        ax = figure.add_subplot(rows, columns, place)
+        unit = f" [{panel.unit}]" if panel.unit else ""
+        ax.set(title=panel.title.capitalize(), xlabel=x_label, ylabel=f"{panel.title}{unit}")
+        ax.grid(visible=True, alpha=0.3)
+        yield ax, panel
 
 
 def _draw_path(figure: Figure, recording: Recording) -> None:

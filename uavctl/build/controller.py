@@ -18,6 +18,7 @@ from uavctl.arithmetic import ARITHMETIC
 from uavctl.build.link import build_ages, build_delayed_link, late_steps, promised
 from uavctl.build.mission import build_mission, build_names, build_rests
 from uavctl.build.outside import controller_id, decider_id, flown_outside
+from uavctl.build.rest import check_axes, resting_target
 from uavctl.config.checks import position_limits_m
 from uavctl.config.types import Config
 from uavctl.errors import DesignError
@@ -40,7 +41,7 @@ from uavctl.smpc.conditioned.planner import (
 from uavctl.smpc.estimate import InnovationForm, innovations, with_bias
 from uavctl.smpc.nominal import ControlProblem
 from uavctl.smpc.plant import AXES, HeldAxis, Plant, drag_lag, velocity_reference
-from uavctl.smpc.sets import Polytope, equilibria
+from uavctl.smpc.sets import Polytope
 
 # The paper's scheme is loaded only where it is flown: loading it takes a tenth of the time of all else.
 if TYPE_CHECKING:
@@ -75,6 +76,8 @@ def build_plant(config: Config) -> Plant:
     a, b, e, w, accel = (
         np.array(rows, dtype=np.float64) for rows in (plant.a, plant.b, plant.e, plant.w, plant.accel_per_input)
     )
+    if not plant.axes:
+        accel = np.zeros((0, b.shape[1]))
     return Plant(
         a=a,
         b=b,
@@ -90,6 +93,8 @@ def build_plant(config: Config) -> Plant:
 
 def start_state(config: Config, plant: Plant) -> NDArray[np.float64]:
     """State (n_x,) in which the simulator starts."""
+    if not plant.axes:
+        return resting_target(config, plant)[0]
     state = plant.equilibrium(config.sim.start_position_m)
     for axis, index in zip(plant.axes, plant.velocity_index, strict=True):
         state[index] = config.sim.start_velocity_mps[AXES.index(axis)]
@@ -156,8 +161,7 @@ def build_problem(config: Config) -> ControlProblem:
     """
     plant, sets = build_plant(config), config.sets
     q_x, q_u = np.diag(config.cost.state), np.diag(config.cost.input)
-    rests = equilibria(plant.a, plant.b, q_x, q_u, np.array(plant.position_index, dtype=np.intp))
-    target = plant.equilibrium(config.target.position_m)
+    target, u_target = resting_target(config, plant)
     return ControlProblem(
         plant=plant,
         state_set=Polytope.from_box(sets.state_lower, sets.state_upper),
@@ -165,7 +169,7 @@ def build_problem(config: Config) -> ControlProblem:
         q_x=q_x,
         q_u=q_u,
         target=target,
-        u_target=rests.u_eq @ target[rests.held],
+        u_target=u_target,
         horizon=config.smpc.horizon,
         slack_linear=config.smpc.slack_linear,
         slack_quadratic=config.smpc.slack_quadratic,
@@ -187,6 +191,7 @@ def build_conditioned(
         DesignError: See `build_problem`, `build_ages`, `ConditionedSolver` and `innovations`.
     """
     problem = replace(build_problem(config), input_set=_planned_inputs(config))
+    flown = flown and bool(config.plant.axes)
     link, allowed = build_ages(config), 1.0 - config.smpc.delta_x
     slew_mps3 = config.limits.slew_mps3 if flown else math.inf
     plant, estimator, seen = problem.plant, config.estimator, None
@@ -385,6 +390,7 @@ def build_controller(config: Config, design: AnyDesign | None = None, library: L
     Raises:
         DesignError: There is no design.
     """
+    check_axes(config)
     design = design_of(config) if design is None else design
     estimator, fallback, limits = config.estimator, config.fallback, config.limits
     plant, outside = build_plant(config), config.smpc.controller

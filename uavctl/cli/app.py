@@ -36,6 +36,7 @@ _LONGEST_HALF = 500  # characters of a problem at either end
 
 # A command's module is imported when the command runs, so that help, completion and usage errors stay quick.
 _COMMANDS = {
+    "init": ("init:init", "Write a short configuration for a room: the keys that matter, by name."),
     "loopback": ("loopback:loopback", "Fly the simulated vehicle over a lossy link, record it, and report."),
     "fly": ("fly:fly", "Fly a real vehicle: the flight daemon on a real link."),
     "fleet": (

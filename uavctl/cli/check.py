@@ -17,9 +17,10 @@ from rich.text import Text
 
 from logs.recording.parameters import ParameterReader, told_records
 from logs.recording.topics import PARAMETER
+from uavctl.build.rest import check_axes
 from uavctl.check.findings import Item, ItemState, describe, item, judged, refusals
 from uavctl.check.preflight import Preflight
-from uavctl.cli.common import DEFAULTS, SPAN_S, Common, Mocap, given_keys, labelled, messages
+from uavctl.cli.common import DEFAULTS, SPAN_S, Common, Mocap, given_keys, labelled, located, messages
 from uavctl.cli.flying import stop_on_signals
 from uavctl.clock import Ticker, monotonic_ns
 from uavctl.config import Config
@@ -184,7 +185,10 @@ def check(
     Exit code 0: nothing speaks against flying. What could not be determined is told, and does not fail the check.
     """
     overrides = given_keys(daemon__vehicle=vehicle, daemon__mocap=mocap, check__seconds=seconds)
-    config = common.with_overrides(overrides).load().config
+    loaded = common.with_overrides(overrides).load()
+    config = loaded.config
+    with located(loaded):
+        check_axes(config)
     items = [*disk_items(out, config.log.free_bytes)]
     items.append(_strangers(warnings(config.security, config.daemon)))
 

@@ -312,7 +312,8 @@ def solve_picture(answer: Answer, design: AnyDesign, config: Config, solve_us: f
 def plan_table(answer: Answer, design: AnyDesign) -> WideTable:
     """Return the plan as a table, stage by stage; the columns of an axis stay together, and so do back-offs."""
     axes, count = design.plant.axes, len(answer.states)
-    names = [*state_names(design.plant.n_x, axes), *(f"u_{axis[0]}" for axis in axes)]
+    inputs = [f"u_{axis[0]}" for axis in axes] if axes else [f"u{i}" for i in range(design.plant.n_u)]
+    names = [*state_names(design.plant.n_x, axes), *inputs]
     values = [*answer.states.T, *answer.inputs.T]
     groups: dict[str, list[Column]] = {}
     for name, of_stages in zip(names, values, strict=True):
@@ -326,8 +327,8 @@ def plan_table(answer: Answer, design: AnyDesign) -> WideTable:
 
 def state_names(n_x: int, axes: Sequence[str]) -> list[str]:
     """Return the names of the states, axis by axis: position, velocity, acceleration; numbers for other plants."""
-    each, rest = divmod(n_x, len(axes))
-    if rest or each > len("pva"):
+    each, rest = divmod(n_x, len(axes)) if axes else (n_x, 0)
+    if not axes or rest or each > len("pva"):
         return [f"x{i}" for i in range(n_x)]
     return [f"{letter}_{axis[0]}" for axis in axes for letter in "pva"[:each]]
 

@@ -21,7 +21,8 @@ from sim.faults import problems
 from sim.fleet import fleet
 from sim.server import Door, Port, Ready, Seat, serve_all
 from sim.simulation import VehicleSnapshot
-from uavctl.cli.common import DEFAULTS, Column, Common, WideTable, messages, write_document
+from uavctl.build.rest import check_axes
+from uavctl.cli.common import DEFAULTS, Column, Common, WideTable, located, messages, write_document
 from uavctl.cli.flying import stop_on_signals
 from uavctl.clock import monotonic_ns
 from uavctl.config import Config
@@ -308,7 +309,10 @@ def sim(
 ) -> int:
     """Serve simulated vehicles; a line for each (one document with --json) says when all ports are open."""
     overrides = () if autopilot is None else (f'sim.autopilot="{autopilot}"',)
-    config = common.with_overrides(overrides).load().config
+    loaded = common.with_overrides(overrides).load()
+    config = loaded.config
+    with located(loaded):
+        check_axes(config)
     if faults is not None:
         config = with_faults(config, faults, problems)
 

@@ -195,7 +195,8 @@ def solver_fences(given: SolverConfig, told: Sequence[FenceConfig]) -> Iterator[
         yield ConfigProblem("solver.method", '"printed" knows no limits that move', 'use "library" or "exact"')
 
 
-_MATRIX_KEYS: tuple[str, ...] = ("a", "b", "e", "w", "position_index", "velocity_index", "accel_per_input")
+_OF_AXES: tuple[str, ...] = ("position_index", "velocity_index", "accel_per_input")
+_MATRIX_KEYS: tuple[str, ...] = ("a", "b", "e", "w", *_OF_AXES)
 _DRAG_LAG_KEYS: tuple[str, ...] = ("drag_1ps", "lag_s", "gain", "wind_std_mps2")
 _REFERENCE_KEYS: tuple[str, ...] = (
     "drag_1ps",
@@ -215,8 +216,8 @@ _RELATIVE = 1e-9  # asymmetry and negative eigenvalues below this share of W's s
 
 
 def dimensions(plant: PlantConfig) -> tuple[int, int]:
-    """(n_x, n_u) that the other sections must fit."""
-    n_u = len(plant.axes)
+    """(n_x, n_u) that the other sections must fit; a plant without axes has as many inputs as B has columns."""
+    n_u = len(plant.axes) or (len(plant.b[0]) if plant.b else 0)
     return (plant.states_per_axis * n_u or len(plant.a)), n_u
 
 
@@ -249,12 +250,28 @@ def _plant(plant: PlantConfig) -> Iterator[ConfigProblem]:
             "plant.axes", f"{list(plant.axes)} repeats or turns round axes", "keep the order north, east, down"
         )
     wanted = _KEYS[plant.model]
+    if not plant.axes:
+        named = [key for key in _OF_AXES if getattr(plant, key)]
+        if plant.model != "matrices" or named:
+            asks = f"plant.{named[0]}" if named else f'model "{plant.model}"'
+            yield ConfigProblem(
+                "plant.axes", f"is missing, and {asks} needs it", 'add it, as in ["north", "east", "down"]'
+            )
+            return
+        wanted = tuple(key for key in wanted if key not in _OF_AXES)
     foreign = dict.fromkeys(key for keys in _KEYS.values() for key in keys if key not in wanted)
     missing = [key for key in wanted if not getattr(plant, key)]
+    if plant.model == "matrices" and {*missing} >= {*_OF_AXES}:  # one thing is missing: what the states are
+        yield ConfigProblem(
+            "plant.axes",
+            f"is given without {', '.join(_OF_AXES)}, which say how the plant moves along them",
+            "add them, or remove plant.axes: then the plant is planned for and simulated, and flies nowhere",
+        )
+        return
     for key in missing:
         yield ConfigProblem(f"plant.{key}", f'is missing, and model "{plant.model}" needs it', "add it")
     for key in foreign:
-        if getattr(plant, key):
+        if key not in _KEYS[plant.model] and getattr(plant, key):
             yield ConfigProblem(
                 f"plant.{key}", f'has no meaning with model "{plant.model}"', "remove it, or change the model"
             )
@@ -270,6 +287,8 @@ def _matrices(plant: PlantConfig) -> Iterator[ConfigProblem]:
     yield from _shape("plant.e", plant.e, (n_x, n_w), "n_x x n_w")
     wrong_w = list(_shape("plant.w", plant.w, (n_w, n_w), "n_w x n_w"))
     yield from wrong_w or _covariance(plant.w)
+    if not plant.axes:
+        return
     for key in ("position_index", "velocity_index"):
         index = getattr(plant, key)
         yield from _length(f"plant.{key}", index, n_u, "number of axes")

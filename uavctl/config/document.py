@@ -11,6 +11,7 @@ import re
 import stat
 import types
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
@@ -183,11 +184,25 @@ def key_lines(text: str) -> dict[str, int]:
     return scanner.lines
 
 
+def given_before(text: str) -> tuple[str, int, int] | None:
+    """Key that the last statement of a text gives again, its first line, and this one's; None if it gives none again.
+
+    The text may break off after it.
+    """
+    scanner = _Scanner(text)
+    with suppress(IndexError):  # it breaks off
+        scanner.document()
+    return scanner.again[0] if scanner.again else None
+
+
 class _Scanner:
     """Recursive descent over the tokens; only structure is read, values are passed over."""
 
     def __init__(self, text: str) -> None:
         self.lines: dict[str, int] = {}
+        self.again: list[tuple[str, int, int]] = []  # keys of the last statement that were there: key, first line, line
+        self._values: set[str] = set()  # keys that have a value
+        self._known: set[str] = set()
         self._count: dict[str, int] = {}  # elements so far of each array of tables, less one
         self._tokens: list[tuple[str, int]] = []  # token, line; a newline is "\n"
         self._at = 0
@@ -203,7 +218,9 @@ class _Scanner:
         while self._at < len(self._tokens):
             if self._peek() == "\n":
                 self._at += 1
-            elif self._peek() == "[":
+                continue
+            self.again = []
+            if self._peek() == "[":
                 table = self._header()
             else:
                 self._pair(table)
@@ -236,9 +253,14 @@ class _Scanner:
             token, line = self._tokens[self._at]
             part = token[1:-1] if token[0] in "\"'" else token
             path = f"{path}.{part}" if path else part
-            self.lines.setdefault(path, line)
+            first = self.lines.setdefault(path, line)
+            known = path in self._known
+            self._known.add(path)
             self._at += 1
-            if self._peek() != ".":
+            last = self._peek() != "."
+            if known and (last or path in self._values):
+                self.again.append((path, first, line))
+            if last:
                 return path
             self._at += 1
 
@@ -246,6 +268,7 @@ class _Scanner:
         path = self._key(prefix)
         self._skip("=")
         self._value(path)
+        self._values.add(path)
 
     def _value(self, path: str) -> None:
         if self._peek() == "[":
@@ -319,6 +342,7 @@ class Source:
     lines: Mapping[str, int]  # key path -> line in the file
     overrides: tuple[tuple[str, str], ...] = ()  # (key path, text as typed) of each override, in order
     elsewhere: Mapping[str, str] = field(default_factory=dict)  # key path -> place, for what another file holds
+    below: Mapping[str, str] = field(default_factory=dict)  # key path -> place in the base, for what the file has not
 
     def where(self, key: str) -> str:
         """The place in another file, the override that set `key`, or `file:line` of it or the nearest table around."""
@@ -328,8 +352,12 @@ class Source:
         for path, text in reversed(self.overrides):
             if key == path or key.startswith((f"{path}.", f"{path}[")) or path.startswith(f"{key}."):
                 return f"--set {text}"
-        line = next((self.lines[around] for around in _outwards(key) if around in self.lines), 1)
-        return f"{self.file}:{line}"
+        for around in _outwards(key):
+            if around in self.lines:
+                return f"{self.file}:{self.lines[around]}"
+            if around in self.below:
+                return self.below[around]
+        return f"{self.file}:1"
 
     def tell(self, problem: ConfigProblem) -> str:
         """One line: place, key, what is wrong, what to do."""

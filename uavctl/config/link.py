@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Literal
@@ -78,7 +79,7 @@ class LinkConfig(Section, frozen=True, kw_only=True):
             max_length=LONGEST_PATH,
             description="with `trace`: CSV file beside this one (given on the command line: in the folder there) with "
             "one line for each packet in the order of sending: its delay in s, nothing or `inf` for a lost one; of "
-            "several columns, the one headed `delay_s`",
+            "several columns, the one headed `delay_s` (or `delay_ms`, `delay_us`, `delay_ns`)",
         ),
     ] = ""
     trace_s: Annotated[
@@ -145,6 +146,8 @@ class LinkConfig(Section, frozen=True, kw_only=True):
 
 
 _COLUMN = "delay_s"
+_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_HEADING = re.compile(r"^delay(?:[_ ]?[\[(]?(?P<unit>s|ms|us|ns)[\])]?)?$")
 
 
 def read_trace(link: LinkConfig, folder: Path, found: list[ConfigProblem]) -> tuple[LinkConfig, dict[str, str]]:
@@ -175,17 +178,33 @@ def read_trace(link: LinkConfig, folder: Path, found: list[ConfigProblem]) -> tu
 def _delays(path: Path) -> Floats:
     """Delay of each packet [s], infinite for a lost one."""
     rows = [(number, line.split(",")) for number, line in enumerate(read_lines(path), 1)]
-    column, width = 0, 1
-    if rows and any(cell.strip() == _COLUMN for cell in rows[0][1]):
-        names = [cell.strip() for cell in rows[0][1]]
-        column, width = names.index(_COLUMN), len(names)
+    rows = [(number, cells) for number, cells in rows if not cells[0].lstrip().startswith("#")]
+    column, width, factor = 0, 1, 1.0
+    if rows and any(cell.strip() for cell in rows[0][1]) and not any(_is_number(cell) for cell in rows[0][1]):
+        number, cells = rows[0]
+        names = [cell.strip().strip("\"'").lower() for cell in cells]
+        found = [i for i, name in enumerate(names) if _HEADING.match(name)]
+        if len(found) != 1:
+            told = "none of its columns" if not found else f"{len(found)} of its columns"
+            raise DataFileError((f"{path}:{number}: {told} is a delay; head one of them {_COLUMN}, or delay_ms",))
+        column, width = found[0], len(names)
+        heading = _HEADING.match(names[column])
+        factor = _UNITS[(heading and heading["unit"]) or "s"]
         rows = rows[1:]
     if not rows:
         raise DataFileError((f"{path}: has no packets",))
     if len(rows) > LONGEST_TRACE:
         raise DataFileError((f"{path}: has {len(rows)} packets, more than {LONGEST_TRACE}",))
     refuse(path, [f"{path}:{number}: {reason}" for number, cells in rows for reason in _wrong(cells, column, width)])
-    return tuple(_delay(cells[column]) for _, cells in rows)
+    return tuple(_delay(cells[column]) * factor for _, cells in rows)
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
 
 
 def _wrong(cells: list[str], column: int, width: int) -> Iterator[str]:

@@ -19,6 +19,7 @@ from msgspec import NODEFAULT, Meta
 from msgspec.structs import FieldInfo
 
 from uavctl.config.checks import check
+from uavctl.config.defaults import complete
 from uavctl.config.document import (
     DEEPEST,
     LONGEST_KEY,
@@ -29,6 +30,7 @@ from uavctl.config.document import (
     description,
     element,
     excess,
+    given_before,
     is_section,
     key_lines,
     oversized,
@@ -38,6 +40,7 @@ from uavctl.config.document import (
 )
 from uavctl.config.link import LinkConfig, read_trace
 from uavctl.config.mission import MissionConfig, read_samples
+from uavctl.config.room import WRITTEN, RoomConfig, furnish, merge
 from uavctl.config.sim import MOST_FAULTS, FaultConfig, faults
 from uavctl.config.types import OF_HAHN_STURSBERG, Config
 from uavctl.errors import ConfigError, DesignError
@@ -130,6 +133,8 @@ def dotted(value: object, path: str = "") -> Iterator[tuple[str, object]]:
 
 
 _SYNTAX_PLACE = re.compile(r" \(at (?:line (?P<line>\d+), column \d+|end of document)\)$")
+_BY_NAME = re.compile(r"\s*(base|room)\s*[.=]")
+_GIVEN_AGAIN = ("Cannot overwrite", "Cannot declare", "Cannot mutate", "Cannot redefine", "Duplicate")
 _DECODE_PLACE = re.compile(r" - at `\$(?P<path>.*)`$")
 Decoded = Section | tuple[Section, ...]
 _WORDS = {
@@ -187,11 +192,20 @@ def parse(text: str, file: str, overrides: Sequence[str] = ()) -> LoadedConfig:
     problems: list[str] = []
     if len(overrides) > MOST_OVERRIDES:
         raise ConfigError((f"--set: is given {len(overrides)} times, at most {MOST_OVERRIDES} are taken; use a file",))
-    applied = tuple(_override(table, override, problems) for override in overrides)
-    source = Source(file, key_lines(text), tuple(pair for pair in applied if pair is not None))
+    # What [room] stands for is written before any other key is overridden.
+    early = [text for text in overrides if _BY_NAME.match(text)]
+    applied = [_override(table, override, problems) for override in early]
     found: list[ConfigProblem] = list(oversized(table))
+    lines = key_lines(text)
+    below: dict[str, str] = {}
+    if not found:
+        table, below = _expand(table, lines, found)
+    applied += [_override(table, override, problems) for override in overrides if override not in early]
+    source = Source(file, lines, tuple(pair for pair in applied if pair is not None), below=below)
+    found.extend(oversized(table))
     if found:
         raise ConfigError((*problems, *map(source.tell, found)))
+    complete(table, file)
     sections: dict[str, Decoded] = {}
     config = decode(Config, table, "", found, sections, needed=_needed(table))
     found.extend(_of_other_scheme(table))
@@ -209,6 +223,49 @@ def parse(text: str, file: str, overrides: Sequence[str] = ()) -> LoadedConfig:
     if problems or config is None:
         raise ConfigError(tuple(problems))
     return LoadedConfig(msgspec.structs.replace(cast("Config", config), mission=mission, link=link), source)
+
+
+def _expand(
+    own: dict[str, Any], lines: dict[str, int], found: list[ConfigProblem]
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """Write what `base` and `[room]` say into the keys that they stand for.
+
+    Args:
+        lines: Lines of the file; those of keys that [room] writes are added.
+        found: What is wrong with them is added here.
+
+    Returns:
+        The document, and where the keys stand that come from the base.
+    """
+    table, below = own, {}
+    base = own.pop("base", None)
+    if base is not None:
+        if base not in presets():
+            reason = f"{_short(base)} is no preset{find_nearest(str(base), presets())}"
+            found.append(ConfigProblem("base", reason, f"give one of {', '.join(presets())}"))
+            return own, {}
+        place, text = _read(base)
+        table = merge({key: one for key, one in parse_toml(text, place).items() if key != "name"}, own)
+        below = {key: f"{place}:{line}" for key, line in key_lines(text).items()}
+    room = table.pop("room", None)
+    if room is None:
+        return table, below
+    known = len(found)
+    if not isinstance(room, dict):
+        found.append(ConfigProblem("room", f"expected a table, got {_short(room)}", "write [room] and its keys below"))
+        return table, below
+    given = decode(RoomConfig, room, "room.", found, {})
+    for key in WRITTEN:
+        head, _, inner = key.partition(".")
+        there = own.get(head)
+        if there is not None and (not inner or (isinstance(there, dict) and inner in there)):
+            reason = f"is given, and [room] in line {lines.get('room', 1)} says it by name"
+            found.append(ConfigProblem(key, reason, "keep one of the two"))
+    if len(found) == known:
+        written: dict[str, str] = {}
+        found.extend(furnish(table, cast("RoomConfig", given), own, written))
+        lines.update({key: lines[by] for key, by in written.items() if by in lines})
+    return table, below
 
 
 def parse_recorded(text: str, file: str, overrides: Sequence[str] = ()) -> LoadedConfig:
@@ -291,6 +348,14 @@ def parse_toml(text: str, file: str) -> dict[str, Any]:
         place = _SYNTAX_PLACE.search(message)
         line = place["line"] if place and place["line"] else str(text.count("\n") + 1)
         reason = _SYNTAX_PLACE.sub("", message)
+        again = None
+        if message.startswith(_GIVEN_AGAIN):
+            again = given_before("".join(text.splitlines(keepends=True)[: int(line)]))
+        if again is not None:
+            key, first, second = again
+            raise ConfigError(
+                (f"{file}:{second}: {key}: is given again, first in line {first}; keep one of the two",)
+            ) from error
         raise ConfigError((f"{file}:{line}: TOML syntax: {reason}; mend the line",)) from error
     except ValueError as error:  # a whole number of thousands of digits
         raise ConfigError((f"{file}:1: TOML: {error}; mend the number",)) from error

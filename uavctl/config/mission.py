@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Literal
@@ -10,6 +11,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from uavctl.config.columns import TRAJECTORY, Column, quantity, read_header
 from uavctl.config.document import (
     LARGEST,
     LARGEST_PLANT,
@@ -49,7 +51,8 @@ class TrajectoryConfig(Section, frozen=True, kw_only=True):
         Meta(
             max_length=LONGEST_PATH,
             description="CSV file with the samples instead, beside this file: columns t, x, y, z in s and m, and "
-            "vx, vy, vz in m/s or none of them; a header line is allowed",
+            "vx, vy, vz in m/s or none of them, in local NED; with a header line in the order that it states, by names "
+            "and units as in `time_ms`, `east_m`, `height [cm]`, `v_north_mps`",
         ),
     ] = ""
     interpolation: Annotated[
@@ -151,18 +154,53 @@ def read_samples(
 
 
 def _rows(path: Path) -> list[tuple[int, Floats]]:
-    """Line number and values of each row, all of the same width."""
-    lines = read_lines(path)
-    rows = [(number, line.split(",")) for number, line in enumerate(lines, 1) if line.strip()]
-    if rows and not any(_number(cell) is not None for cell in rows[0][1]):
-        rows = rows[1:]  # a header
+    """Line number and values of each row, as t, x, y, z and vx, vy, vz in s, m and m/s, all of the same width."""
+    rows: list[tuple[int, list[str]]] = []
+    for number, line in enumerate(read_lines(path), 1):
+        text = line.strip()
+        if text.startswith("#"):  # a comment, or a header in one
+            cells = re.split(r"[,\s]+(?![^\[(]*[\])])", text.lstrip("# ").strip())
+            if rows or len(cells) < _WITHOUT or not all(quantity(cell) for cell in cells):
+                continue
+            text = ",".join(cells)
+        if text:
+            rows.append((number, text.split(",")))
+    columns, rows = _columns(path, rows)
     if not rows:
         raise DataFileError((f"{path}: has no rows",))
     if len(rows) > LONGEST_MOTION:
         raise DataFileError((f"{path}: has {len(rows)} rows, more than {LONGEST_MOTION}",))
     width = len(rows[0][1])
     refuse(path, [f"{path}:{number}: {reason}" for number, cells in rows for reason in _wrong(cells, width)])
-    return [(number, tuple(float(cell) for cell in cells)) for number, cells in rows]
+    return [
+        (number, tuple(float(cells[column.place]) * column.factor for column in columns or _in_order(width)))
+        for number, cells in rows
+    ]
+
+
+def _in_order(width: int) -> list[Column]:
+    return [Column(place, 1.0) for place in range(width)]
+
+
+def _columns(path: Path, rows: list[tuple[int, list[str]]]) -> tuple[list[Column], list[tuple[int, list[str]]]]:
+    """The columns by a header, none without one, and the rows below it.
+
+    Raises:
+        DataFileError: The header states what is not known, or not all that is needed.
+    """
+    if not rows or any(_number(cell) is not None for cell in rows[0][1]):
+        return [], rows
+    (line, cells), rows = rows[0], rows[1:]
+    units = None
+    if rows and not any(_number(cell) is not None for cell in rows[0][1]):
+        units, rows = rows[0][1], rows[1:]
+    found, wrong = read_header(cells, units, TRAJECTORY)
+    names = list(TRAJECTORY)
+    needed = names if any(name in found for name in names[_WITHOUT:]) else names[:_WITHOUT]
+    if not wrong and (missing := [name for name in needed if name not in found]):
+        wrong.append(f"the header has no column for {', '.join(missing)}; {_WANTED}")
+    refuse(path, [f"{path}:{line}: {reason}" for reason in wrong])
+    return [found[name] for name in needed], rows
 
 
 def _three(values: Floats) -> tuple[float, float, float]:

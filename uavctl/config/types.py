@@ -93,25 +93,29 @@ class PlantConfig(Section, frozen=True, kw_only=True):
     model: Annotated[
         Literal["matrices", "drag-lag", "velocity-reference"],
         Meta(
-            description="`matrices`: a, b, e, w as given; `drag-lag`: an acceleration setpoint is flown, after a lag; "
-            "`velocity-reference`: it moves a velocity and position that the vehicle's own loops hold"
+            description="`matrices`: a, b, e, w as given (so it is where `a` is given); `drag-lag`: an acceleration "
+            "setpoint is flown, after a lag; `velocity-reference`: it moves a velocity and position that the vehicle's "
+            "own loops hold"
         ),
     ]
     dt_s: Annotated[float, Meta(ge=0.001, le=5, description="time step Δt [s]")]
     axes: Annotated[
         tuple[Literal["north", "east", "down"], ...],
         Meta(
-            min_length=1,
             max_length=3,
-            description="axes of local NED that the plant moves in, in the order of its states",
+            description="axes of local NED that the plant moves in, in the order of its states; with model `matrices` "
+            "it may have none: then it is planned for and simulated, and flies nowhere",
         ),
-    ]
+    ] = ()
     a: Annotated[Rows, Meta(max_length=LARGEST_PLANT, description="A (n_x, n_x), with model `matrices`")] = ()
     b: Annotated[Rows, Meta(max_length=LARGEST_PLANT, description="B (n_x, n_u), with model `matrices`")] = ()
     e: Annotated[Rows, Meta(max_length=LARGEST_PLANT, description="E (n_x, n_w), with model `matrices`")] = ()
     w: Annotated[
         Rows,
-        Meta(max_length=LARGEST_PLANT, description="covariance W (n_w, n_w) of the disturbance, with model `matrices`"),
+        Meta(
+            max_length=LARGEST_PLANT,
+            description="covariance W (n_w, n_w) of the disturbance, with model `matrices`; without it the identity",
+        ),
     ] = ()
     position_index: Annotated[
         tuple[int, ...], Meta(max_length=3, description="state index of each axis' position, with model `matrices`")
@@ -246,7 +250,7 @@ class SmpcConfig(Section, frozen=True, kw_only=True):
     tau: Annotated[
         Annotated[int, Meta(ge=1, le=20)] | None, Meta(description="delay τ of the terminal control law [steps]")
     ] = None
-    delta_x: Annotated[float, Meta(gt=0, lt=1, description="likelihood δ_x of the state constraints")]
+    delta_x: Annotated[float, Meta(gt=0, lt=1, description="likelihood δ_x of the state constraints")] = 0.95
     delta_u: Annotated[Likelihood, Meta(description="likelihood δ_u of the input constraints")] = None
     delta_tau: Annotated[Likelihood, Meta(description="threshold δ_τ of Assumption 4.1")] = None
     k_tau: Annotated[Annotated[Rows, Meta(max_length=3)] | None, Meta(description="terminal gain K_τ (n_u, n_x)")] = (
@@ -254,8 +258,8 @@ class SmpcConfig(Section, frozen=True, kw_only=True):
     )
     slack_linear: Annotated[
         float, Meta(ge=1e-6, le=1e12, description="exact penalty of a state-constraint slack, linear [cost per unit]")
-    ]
-    slack_quadratic: Annotated[float, Meta(ge=1e-6, le=1e12, description="the same, quadratic [cost per unit²]")]
+    ] = 1e5
+    slack_quadratic: Annotated[float, Meta(ge=1e-6, le=1e12, description="the same, quadratic [cost per unit²]")] = 1e3
     offset_weight: Annotated[
         Annotated[float, Meta(ge=1e-6, le=1e12)] | None,
         Meta(description="l1 weight T that pulls the artificial reference to the target [cost per unit]"),
@@ -364,7 +368,7 @@ class EstimatorConfig(Section, frozen=True, kw_only=True):
     position_std_m: Annotated[
         float,
         Meta(ge=1e-9, le=100, description="least standard deviation believed of a position sample, each axis [m]"),
-    ]
+    ] = 0.005
     velocity_std_mps: Annotated[
         float, Meta(ge=1e-9, le=100, description="standard deviation of a velocity sample, each axis [m/s]")
     ] = 0.05
@@ -537,7 +541,7 @@ class Config(Section, frozen=True, kw_only=True):
     """A complete configuration."""
 
     name: Annotated[str, Meta(max_length=100, description="name of the configuration")]
-    duration_s: Annotated[float, Meta(gt=0, le=LONGEST_S, description="length of a loopback flight [s]")]
+    duration_s: Annotated[float, Meta(gt=0, le=LONGEST_S, description="length of a loopback flight [s]")] = 40.0
     plant: PlantConfig
     sets: SetsConfig
     cost: CostConfig
@@ -563,6 +567,15 @@ class Config(Section, frozen=True, kw_only=True):
     log: LogConfig = LogConfig()
     mission: MissionConfig = MissionConfig()
     fence: Annotated[tuple[FenceConfig, ...], Meta(max_length=50, description="limits that change in flight")] = ()
+
+    def __repr__(self) -> str:
+        """Return one line; `dump_config` has all keys."""
+        plant, axes = self.plant, " ".join(self.plant.axes)
+        return (
+            f"configuration {self.name}: plant {plant.model}{f' ({axes})' if axes else ''}, Δt {plant.dt_s:g} s, "
+            f"{self.smpc.controller or self.smpc.scheme} with horizon {self.smpc.horizon}, "
+            f"link {self.link.model} with loss {self.link.loss:g}"
+        )
 
     @property
     def conditioned(self) -> bool:

@@ -93,6 +93,17 @@ class Answer:
     gave_way: tuple[GaveWay, ...] = ()  # which constraints gave way, and by how much
     fault: str = ""  # why the solver is not to be asked again; empty if it may be
 
+    def __repr__(self) -> str:
+        """Return two lines: how it ended, and where it begins."""
+        if not self.inputs.size:
+            return f"no plan: {self.status.value}, method {self.method}"
+        gave = f", {len(self.gave_way)} limits gave way" if self.gave_way else ""
+        begins = ", ".join(f"{value:.4g}" for value in self.inputs[0])
+        return (
+            f"plan of {len(self.inputs)} steps: {self.status.value}, cost {self.cost:.6g}, method {self.method}{gave}\n"
+            f"  first input: {begins}"
+        )
+
     @classmethod
     def failed(cls, seq: int, status: SolveStatus, method: str, iterations: int = 0, fault: str = "") -> Answer:
         """An answer without a plan: empty arrays, infinite cost.

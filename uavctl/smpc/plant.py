@@ -114,8 +114,10 @@ _DRIFT = 1e-9
 class Plant:
     """A linear plant with the meaning of its states; the arrays are copied and read-only.
 
+    One without axes has states that mean nothing in a room: it has steps, and no part of a step.
+
     Raises:
-        DesignError: Shapes do not fit, W is no covariance, or A has no real logarithm.
+        DesignError: Shapes do not fit, W is no covariance, or A of a plant with axes has no real logarithm.
     """
 
     a: Array  # A (n_x, n_x)
@@ -144,7 +146,14 @@ class Plant:
         object.__setattr__(self, "_accel_map", _frozen(np.diag(accel)) if accel.ndim == 1 else accel)
         object.__setattr__(self, "_columns", tuple(AXES.index(axis) for axis in self.axes))
         object.__setattr__(self, "_units", _frozen(balanced_units(self.a, self.b, self.e)))
-        object.__setattr__(self, "_generator", _frozen(_logarithm(self) / self.dt_s))
+        size = self._units.size
+        generator = _logarithm(self) / self.dt_s if self.axes else np.full((size, size), np.nan)
+        object.__setattr__(self, "_generator", _frozen(generator))
+
+    def __repr__(self) -> str:
+        """Return one line: sizes, step, axes; the matrices are `a`, `b`, `e`, `w`."""
+        where = f", {' '.join(self.axes)}" if self.axes else ""
+        return f"plant of {self.n_x} states, {self.n_u} inputs, {self.n_w} disturbances; Δt {self.dt_s:g} s{where}"
 
     @property
     def n_x(self) -> int:
@@ -215,11 +224,13 @@ class Plant:
         return nearest
 
     def equilibrium(self, position_m: Vec3) -> Array:
-        """State (n_x,) at rest at a position [m].
+        """State (n_x,) at rest at a position [m]; the origin of a plant without axes.
 
         Raises:
             DesignError: The plant cannot rest there; the axes that it cannot hold by themselves are named.
         """
+        if not self.axes:
+            return np.zeros(self.n_x)
         positions = np.array([position_m[AXES.index(axis)] for axis in self.axes])
         state, drift = self._rest(positions)
         if drift > _DRIFT:
@@ -360,7 +371,7 @@ def _check_shapes(plant: Plant) -> None:
                 f"shape {given} is not {shape}",
                 f"A has {n_x} rows, there are {n_axes} axes, {n_u} inputs and {n_w} disturbances",
             )
-    if not n_axes or list(plant.axes) != [axis for axis in AXES if axis in plant.axes]:
+    if list(plant.axes) != [axis for axis in AXES if axis in plant.axes]:
         raise DesignError("plant.axes", f"{list(plant.axes)} are no axes", f"give some of {list(AXES)}, in this order")
     for name in ("position_index", "velocity_index"):
         index = getattr(plant, name)

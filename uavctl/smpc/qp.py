@@ -67,8 +67,9 @@ class QuadraticProgram:
         f = np.zeros(h.shape[0]) if linear else None
         model.setup(h, f, a, sides, -sides, sense)  # the soft rows fix the workspace
         model.settings = {"primal_tol": tolerance, "dual_tol": tolerance, "eps_prox": 0.0, "iter_limit": most}
-        rho = 0.5 / np.maximum(curve, LEAST_CURVE * np.abs(np.diagonal(h)).max(initial=1.0))
-        model.soft_weights(rho_l=rho, rho_u=rho, w_l=price, w_u=price)
+        if len(sides):
+            rho = 0.5 / np.maximum(curve, LEAST_CURVE * np.abs(np.diagonal(h)).max(initial=1.0))
+            model.soft_weights(rho_l=rho, rho_u=rho, w_l=price, w_u=price)
         self._update, self._solve = model.update, model.solve
 
     def solve(self, f: Array, upper: Array, lower: Array) -> tuple[Array, Array] | None:

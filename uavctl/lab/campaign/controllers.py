@@ -23,6 +23,7 @@ from uavctl.build.controller import (
     start_state,
 )
 from uavctl.build.library import StoredLibrary, decode
+from uavctl.build.rest import check_axes
 from uavctl.config import Config
 from uavctl.config.link import LinkConfig
 from uavctl.config.types import PlantConfig
@@ -174,6 +175,8 @@ def _starts(setting: Setting, first: int, runs: int) -> Array:
 TUNING_FIRST, TUNING_RUNS = 10_000_000, 64
 TUNING_STEPS = 200  # longer runs show nothing new, and every candidate flies them all
 
+_OF_POSITIONS = ("pid",)  # it goes by positions and velocities, whatever else a plant has
+
 LibraryFor = Callable[[Config, Design], StoredLibrary | None]
 
 
@@ -206,6 +209,8 @@ def recipe_for(given: ControllerSpec, config: Config, spec: CampaignSpec, librar
     """
     kind = config.smpc.controller or "smpc" if given.kind == "smpc" else given.kind
     made = Recipe("", kind, config, margin=given.margin)
+    if kind in _OF_POSITIONS or spec.measured == "position":
+        check_axes(config)
     if spec.measured == "position":
         sight = sight_of(config)
         made = replace(made, cov=innovations(sight.plant, sight.position_std_m, 0.0, 0).estimate_cov)

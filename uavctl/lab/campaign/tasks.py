@@ -154,6 +154,8 @@ Array = NDArray[np.float64]
 def ways(config: Config, states: Array) -> dict[str, Array]:
     """Return figures (N,) of runs by column of the results: way to the target, hold, and distance to walls.
 
+    A plant without axes has none of them.
+
     `near_s` and `nearer_s` are when the target was first that near, infinite if it never was; `hold_rms_m` is of the
     second half of a run; `beyond_m` is the furthest beyond a wall, negative for the room that was left.
 
@@ -162,6 +164,8 @@ def ways(config: Config, states: Array) -> dict[str, Array]:
         states: (N, T+1, n_x).
     """
     plant, index = config.plant, list(position_index(config.plant))
+    if not index:
+        return {}
     axes = [AXES.index(axis) for axis in plant.axes]
     where = states[:, :, index]
     off = np.linalg.norm(where - np.array(config.target.position_m)[axes], axis=2)

@@ -266,7 +266,7 @@ def _of_part(problem: ControlProblem, part: Part, seen: Plant, noise: Array) -> 
     for _ in range(problem.horizon):
         power, spread = a @ power, a @ spread @ a.T + noise
         phi = c @ power
-        of_cov.append((phi[:, :, None] * phi[:, None, :]).reshape(len(c), -1))
+        of_cov.append((phi[:, :, None] * phi[:, None, :]).reshape(len(c), states.size**2))
         alone.append(np.einsum("mi,ij,mj->m", c, spread, c))
     return np.array(of_cov), np.array(alone), own
 

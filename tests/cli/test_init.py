@@ -1,0 +1,127 @@
+"""`uavctl init`: a short configuration by name, that is designed for, flown, and refused where nothing could fly."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from uavctl.build.controller import design_of
+from uavctl.cli.app import run
+from uavctl.cli.init import WALL_M, read_sizes, room_text
+from uavctl.config import dump_config, load, parse
+from uavctl.config.checks import position_limits_m
+from uavctl.errors import ConfigError, UsageError
+
+
+def written(autopilot: str, room: str = "6x5x2.5") -> str:
+    return room_text(read_sizes(room), autopilot, "mine.toml")
+
+
+@pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+def test_the_file_has_a_dozen_keys_and_is_the_room(autopilot: str, tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    assert run(["init", "--autopilot", autopilot, "--room", "8x4x3", "--out", str(path)]) == 0
+    table = tomllib.loads(path.read_text())
+    assert sum(len(one) if isinstance(one, dict) else 1 for one in table.values()) <= 16
+    config = load(str(path)).config
+    assert position_limits_m(config) == {
+        "north": (-4.0 + WALL_M, 4.0 - WALL_M),
+        "east": (-2.0 + WALL_M, 2.0 - WALL_M),
+        "down": (-3.0 + WALL_M, 0.0),
+    }
+    assert config.name == "mine"
+    assert config.sim.autopilot == autopilot
+    assert design_of(config).plant.axes == ("north", "east", "down")
+    for axis, (low, high) in position_limits_m(config).items():
+        place = ("north", "east", "down").index(axis)
+        assert low < config.target.position_m[place] < high
+        assert low < config.sim.start_position_m[place] < high
+    assert parse(dump_config(config), "recorded.toml").config == config
+
+
+def test_it_overwrites_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text("kept")
+    assert run(["init", "--out", str(path)]) == 2
+    assert path.read_text() == "kept"
+
+
+def test_it_writes_to_standard_output(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert run(["init", "--out", "-"]) == 0
+    assert tomllib.loads(capsys.readouterr().out)["base"] == "room-px4"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        *(["--room", room] for room in ("6x5", "0x5x2", "-1x5x2", "nanx5x2", "infx5x2", "6x5x2x1", "", "1e9x5x2")),
+        ["--room", "0.6x5x2.5"],
+        ["--room", "6x0.7x2.5"],
+        ["--room", "6x5x0.3"],
+        ["--autopilot", "pix4"],
+        ["--out", "/no/such/folder/mine.toml"],
+    ],
+)  # fmt: skip
+def test_what_cannot_be_is_refused(words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run(["init", *words]) == 2
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_smallest_side_that_is_named_can_be_flown_in(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["init", "--room", "0.7x5x2.5", "--out", "-"]) == 2
+    least = capsys.readouterr().err.partition("at least ")[2].partition(" m")[0]
+    assert run(["init", "--room", f"{least}x5x2.5", "--out", "-"]) == 0
+
+
+def test_limits_as_lists_beside_a_room_are_refused_with_both_lines() -> None:
+    text = written("px4") + "\n[sets]\nstate_lower = [-1.0]\n"
+    with pytest.raises(ConfigError) as refused:
+        parse(text, "mine.toml")
+    (told,) = refused.value.problems
+    lines = text.splitlines()
+    assert told.startswith(f"mine.toml:{lines.index('[sets]') + 1}: sets: ")
+    assert f"line {lines.index('[room]') + 1} " in told
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "key"),
+    [
+        ("north_m = [-2.7, 2.7]", "north_m = [2.7, -2.7]", "room.north_m"),
+        ("speed_mps = 1.5", "speed_mps = -1.5", "room.speed_mps"),
+        ("speed_mps = 1.5", "sped_mps = 1.5", "room.sped_mps"),
+        ("target_north_m = 0.0", "target_north_m = 4.0", "target.position_m[0]"),
+    ],
+)
+def test_what_is_wrong_in_a_room_is_named_with_its_line(old: str, new: str, key: str) -> None:
+    text = written("px4").replace(old, new)
+    with pytest.raises(ConfigError) as refused:
+        parse(text, "mine.toml")
+    assert refused.value.problems[0].startswith(f"mine.toml:{text.splitlines().index(new) + 1}: {key}: ")
+
+
+def test_a_key_of_the_base_is_told_with_its_place() -> None:
+    with pytest.raises(ConfigError) as refused:
+        parse(written("px4") + "\n[smpc]\nhorizon = 1\n", "mine.toml")
+    assert refused.value.problems[0].startswith("mine.toml:")
+    with pytest.raises(ConfigError) as refused:
+        parse(written("px4") + "\n[plant]\ndrag_1ps = [0.1]\n\n[sim.camera]\nrate_hz = 20.0\n", "mine.toml")
+    assert "mine.toml" in refused.value.problems[0]
+
+
+def test_overrides_reach_names_and_lists() -> None:
+    config = parse(written("px4"), "mine.toml", ["room.speed_mps=0.8", "sets.input_lower=[-1.5,-1.5,-1.5]"]).config
+    assert config.sets.state_upper[1] == 0.8
+    assert config.sets.input_lower == (-1.5, -1.5, -1.5)
+
+
+def test_a_room_whose_sizes_are_not_lengths() -> None:
+    with pytest.raises(UsageError):
+        read_sizes("6 by 5 by 2")
+
+
+def test_a_base_that_is_no_preset_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"mine\.toml:\d+: base: "):
+        parse(written("px4").replace('"room-px4"', '"room-pix4"'), "mine.toml")
