@@ -317,17 +317,17 @@ class Runs:
             f"of the time, oldest position {int(self.age_steps.max(initial=0))} steps"
         )
 
-    def _columns(self) -> dict[str, list[object]]:
+    def _columns(self) -> dict[str, list[Any]]:
         """One row for each run and step; the last state of a run has no input, age or cost, the first no verdict."""
         (runs, steps), (states, inputs) = self.cost.shape, signals(self.config)
         before, after = np.arange(steps + 1) < steps, np.arange(steps + 1) > 0
 
-        def spread(values: NDArray[Any], where: NDArray[np.bool_]) -> list[object]:
+        def spread(values: NDArray[Any], where: NDArray[np.bool_]) -> list[Any]:
             cells = np.full((runs, steps + 1), None, dtype=object)
             cells[:, where] = values
             return list(cells.ravel())
 
-        found: dict[str, list[object]] = {
+        found: dict[str, list[Any]] = {
             "run": np.repeat(np.arange(runs), steps + 1).tolist(),
             "step": np.tile(np.arange(steps + 1), runs).tolist(),
             "time_s": np.tile(self.time_s, runs).tolist(),

@@ -33,7 +33,7 @@ EXAMPLES = {
     "sim": "uavctl sim --config room-px4 --autopilot px4 --view",
     "check": "uavctl check --config my-room.toml --vehicle udpin://0.0.0.0:14540 --move",
     "design": "uavctl design --config room",
-    "init": "uavctl init my-room.toml --autopilot px4 --room 6x5x2.5",
+    "init": "uavctl init --autopilot px4 --room 6x5x2.5",
     "solve": "uavctl solve --config paper --state 35,-2,-20,-4",
     "identify": "uavctl identify flights/NAME/flight.mcap",
     "tune": "uavctl tune my-room.toml --folder tuning",
