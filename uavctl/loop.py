@@ -161,7 +161,10 @@ class ControlLoop:
         kept = {reason: count for reason, count in self._relay.kept.items() if count}
         at_ns = 0 if self._decision is None else self._decision.at_ns
         alone = bool(self.course.died) or (self._controlled_ns is not None and self._controlled_ns < at_ns)
-        return RelayStats(at_ns=at_ns, sent=self._relay.sent, kept=kept, last_ns=self._relay.last_ns, alone=alone)
+        relay = self._relay
+        return RelayStats(
+            at_ns=at_ns, sent=relay.sent, kept=kept, last_ns=relay.last_ns, alone=alone, silent_for=relay.silent_for
+        )
 
     @property
     def plant(self) -> Plant:
@@ -250,11 +253,17 @@ class ControlLoop:
         if out.astray and self._hand_over.has_begun:
             self._misled_ns = at_ns
         misled = self._misled_ns is not None and at_ns - self._misled_ns < MISLED_NS
-        if self._relays and not misled and not disbelieves(self._state):
+        held_back = misled or disbelieves(self._state)
+        if self._relays and not held_back:
             for data in self._links[VEHICLE].relay(
                 self._relay, at_ns, autopilot, refused=inp.samples if out.leaps else out.refused
             ):
                 send(self._outgoing(VEHICLE, data, at_ns))
+        if self._relays and self._vehicle is not None:
+            silence = self._relay.report(at_ns, held_back=held_back, armed=self._vehicle.armed)
+            if silence is not None:
+                self._put("/uavctl/event", at_ns, silence)
+                notices.append(silence)
         answers: tuple[tuple[Command, Event], ...] = ()
         if self._adrift:
             self._hand_over.look_up(at_ns, self._vehicle)

@@ -320,6 +320,7 @@ class RelayStats(Record, frozen=True, kw_only=True):
     kept: dict[str, int]  # positions not passed on, by reason
     last_ns: int | None  # time at which the last one went
     alone: bool  # nothing else is sent: control has ended, or failed
+    silent_for: str = ""  # reason why none has gone for half a second; empty while they go
 
 
 class LinkStats(Record, frozen=True, kw_only=True):

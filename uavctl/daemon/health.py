@@ -55,6 +55,7 @@ class RelayHealth(msgspec.Struct, frozen=True, kw_only=True):
     kept: dict[str, int]  # positions not passed on, by reason
     last_s: float | None  # since the last one; None before the first
     alone: bool  # nothing else is sent any more: control has ended, or failed
+    silent_for: str = ""  # reason why the vehicle has got none for half a second; empty while it gets them
 
 
 class Health(msgspec.Struct, frozen=True, kw_only=True):
@@ -216,7 +217,14 @@ class HealthWatch:
         if stats is None:
             return None
         last_s = None if stats.last_ns is None else max(0.0, (self._now_ns - stats.last_ns) * 1e-9)
-        return RelayHealth(sent=stats.sent, sent_hz=self._relayed[1], kept=stats.kept, last_s=last_s, alone=stats.alone)
+        return RelayHealth(
+            sent=stats.sent,
+            sent_hz=self._relayed[1],
+            kept=stats.kept,
+            last_s=last_s,
+            alone=stats.alone,
+            silent_for=stats.silent_for,
+        )
 
 
 def line(health: Health) -> str:
@@ -232,7 +240,7 @@ def line(health: Health) -> str:
         f"missed {health.missed_ticks}",
         f"vehicle {mode}",
         f"battery {_number(battery, '.1f')} V",
-        *(() if relay is None else (f"relay {relay.sent_hz:.0f} /s{' alone' if relay.alone else ''}",)),
+        *(() if relay is None else (_relayed(relay),)),
         f"dropped {health.recorder.dropped}" + (f" ({health.recorder.reason})" if health.recorder.reason else ""),
     )
     return "  ".join(fields)
@@ -252,6 +260,11 @@ def _vehicle(vehicle: VehicleStatus, now_ns: int) -> VehicleHealth:
         battery_v=vehicle.battery_v,
         heard_s=max(0.0, (now_ns - vehicle.at_ns) * 1e-9),
     )
+
+
+def _relayed(relay: RelayHealth) -> str:
+    silent = f" SILENT ({relay.silent_for})" if relay.silent_for else ""
+    return f"relay {relay.sent_hz:.0f} /s{' alone' if relay.alone else ''}{silent}"
 
 
 def _number(value: float | None, form: str) -> str:

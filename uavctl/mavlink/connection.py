@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from uavctl.config.connections import ClockConfig, DaemonConfig, FrameConfig, SourceConfig
 from uavctl.config.types import EstimatorConfig
 from uavctl.frames import Quaternion
-from uavctl.mavlink.clocksync import ClockSource, RoundTrips
+from uavctl.mavlink.clocksync import LEAP_NS, NEAR_NS, ArrivalClock, ClockSource, RoundTrips
 from uavctl.mavlink.codec import OWN_ESTIMATE, Encoder, StreamDecoder, UnsendableError, decode
 from uavctl.mavlink.framing import BadBytes
 from uavctl.mavlink.messages import (
@@ -289,7 +289,7 @@ class MavlinkConnection:
         self._open: deque[int] = deque(maxlen=OPEN_REQUESTS)
         self._answered = False
         self._listen = listen
-        self._askers: set[int] = set()  # systems that ask for our time
+        self._vehicle_clock = ArrivalClock()
         self._answers: list[bytes] = []  # to requests of the datagram in hand
         self._answers_from_ns = 0
         self._answered_to: Counter[bool] = Counter()  # requests of the vehicle's, and of all others, in that time
@@ -310,11 +310,6 @@ class MavlinkConnection:
             address: system and component whose stamps it tells of.
         """
         self._intake.answer(address, sent_ns, remote_ns, received_ns)
-
-    @property
-    def vehicle_asks_time(self) -> bool:
-        """Whether the vehicle has asked for our time."""
-        return self.vehicle is not None and self.vehicle[0] in self._askers
 
     def vehicle_up_s(self, at_ns: int) -> float | None:
         """Return the time since the vehicle started, by its own clock [s]; None if it does not tell."""
@@ -443,16 +438,29 @@ class MavlinkConnection:
         """The positions that go to the vehicle's own estimator in the tick of `at_ns`.
 
         Args:
-            autopilot: the vehicle's kind; only PX4 moves stamps by what it has asked.
+            autopilot: the vehicle's kind; only PX4 moves stamps itself.
             refused: samples that the tick did not believe.
         """
         if not relay.enabled or self.vehicle is None:
             return ()
-        trips = self.trips(self.vehicle)
-        offset_ns = None if trips is None else trips.offset_ns(at_ns)
-        asks = autopilot in PROFILES and PROFILES[autopilot].moves_stamps and self.vehicle_asks_time
-        poses = relay.due(at_ns, offset_ns=offset_ns, asks=asks, refused=refused)
+        moves = autopilot in PROFILES and PROFILES[autopilot].moves_stamps
+        offset_ns = 0 if moves else self._vehicle_offset_ns(at_ns)
+        poses = relay.due(at_ns, offset_ns=offset_ns, refused=refused)
         return tuple(self._encoder.external_position(pose) for pose in poses)
+
+    def _vehicle_offset_ns(self, at_ns: int) -> int:
+        """(our time - the vehicle's) by its newest answers, or else by older ones as far as its messages agree.
+
+        A message arrives after its stamp, and no round trip was shorter than its way. A vehicle that neither answers
+        nor stamps its messages gets our own time: steady, so its own estimate of the delay works.
+        """
+        trips, arrival_ns = self.trips(self.vehicle), self._vehicle_clock.offset_ns(at_ns)
+        known_ns = None if trips is None else trips.last_known_ns(at_ns)
+        if trips is None or known_ns is None:
+            return arrival_ns or 0
+        if arrival_ns is None or trips.offset_ns(at_ns) is not None or abs(arrival_ns - known_ns) > LEAP_NS:
+            return known_ns
+        return min(max(known_ns, arrival_ns - trips.shortest_ns - NEAR_NS), arrival_ns)
 
     def stats(self, at_ns: int) -> LinkStats:
         """Counters since the start."""
@@ -500,7 +508,7 @@ class MavlinkConnection:
         items = self._vehicle.take(message, at_ns)
         if self._vehicle.boots != boots:
             self._streams.restart()
-            self._globe, self._parameters = Globe(), ParameterList()
+            self._globe, self._parameters, self._vehicle_clock = Globe(), ParameterList(), ArrivalClock()
             text = f"link {self._name}: the vehicle has started anew"
             return (*items, Event(at_ns=at_ns, severity=Severity.ERROR, code="vehicle-reboot", text=text))
         if self._vehicle.unready != unready:
@@ -510,11 +518,13 @@ class MavlinkConnection:
             self._globe.saw(message)
             if message.component == self.vehicle[1]:
                 self._parameters.saw(message)
+                match message:
+                    case Position(boot_ms=True, stamp_us=int(stamp_us)) | Attitude(stamp_us=stamp_us) if stamp_us:
+                        self._vehicle_clock.delay_ns(1000 * stamp_us, at_ns)
         return items
 
     def _timesync(self, message: TimeSync, at_ns: int) -> None:
         if message.tc1_ns == 0:
-            self._askers.add(message.system)
             if at_ns - self._answers_from_ns >= ANSWERS_NS:
                 self._answers_from_ns = at_ns
                 self._answered_to.clear()
