@@ -167,6 +167,11 @@ class ControlLoop:
         )
 
     @property
+    def inertial(self) -> tuple[int, int] | None:
+        """Inertial data of the vehicle that are used, and all that came; None where none are used."""
+        return self._links[VEHICLE].inertial if self._feels else None
+
+    @property
     def plant(self) -> Plant:
         """The model by which the vehicle's state is estimated."""
         return self._controller.plant

@@ -338,6 +338,8 @@ class LinkStats(Record, frozen=True, kw_only=True):
     clock_rtt_ns: int | None = None  # median of the last minute's round trips
     clock_drift_ppm: float | None = None  # gain of our clock on the peer's
     clock_rejected: int = 0  # answers that came too late, or deviated
+    inertial_used: int = 0  # inertial data that gave an acceleration
+    inertial_total: int = 0  # all that came with a new stamp
 
 
 class Truth(Record, frozen=True, kw_only=True):

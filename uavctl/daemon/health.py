@@ -82,6 +82,8 @@ class Health(msgspec.Struct, frozen=True, kw_only=True):
     ending: str = ""  # end of the flight, under way or come, in words; empty while nothing ends it
     relay: RelayHealth | None = None  # None where no positions are passed on
     let_go: str = ""  # why the envelope has let the vehicle go; empty as long as it has not
+    # share of the vehicle's inertial data of the last second that are used; None where none came, or none are wanted
+    inertial: float | None = None
 
 
 class WatchedFlight(Protocol):
@@ -97,6 +99,11 @@ class WatchedFlight(Protocol):
     @property
     def relay(self) -> RelayStats | None:
         """Counts of the positions passed on to the vehicle; None where none are passed on."""
+        ...
+
+    @property
+    def inertial(self) -> tuple[int, int] | None:
+        """Inertial data of the vehicle that are used, and all that came; None where none are used."""
         ...
 
     @property
@@ -138,6 +145,8 @@ class HealthWatch:
         self._worst_before_ns = 0  # of the last one
         self._recording = "well"  # as last told
         self._let_go = ""  # the same
+        self._inertial = (0, 0)  # data used and all, by the last look of a second
+        self._inertial_share: float | None = None
         self._relayed = (0, 0.0)  # positions by the last look of a second, and how many a second came in it
 
     def after_tick(self, ticked: Ticked, lateness_ns: int) -> None:
@@ -161,6 +170,10 @@ class HealthWatch:
             relay = self._flight.relay
             if relay is not None:
                 self._relayed = relay.sent, float(relay.sent - self._relayed[0])
+            inertial = self._flight.inertial
+            if inertial is not None:
+                used, total = (now - before for now, before in zip(inertial, self._inertial, strict=True))
+                self._inertial, self._inertial_share = inertial, used / total if total else None
             health = self.look()
             self._alarm(health.recorder)
             self._tell(line(health))
@@ -210,6 +223,7 @@ class HealthWatch:
             ending=flight.course.told,
             relay=self._relay(),
             let_go=flight.let_go,
+            inertial=self._inertial_share,
         )
 
     def _relay(self) -> RelayHealth | None:
@@ -241,6 +255,7 @@ def line(health: Health) -> str:
         f"vehicle {mode}",
         f"battery {_number(battery, '.1f')} V",
         *(() if relay is None else (_relayed(relay),)),
+        *(() if health.inertial is None else (f"inertial {100 * health.inertial:.0f} %",)),
         f"dropped {health.recorder.dropped}" + (f" ({health.recorder.reason})" if health.recorder.reason else ""),
     )
     return "  ".join(fields)

@@ -32,7 +32,7 @@ from uavctl.mavlink.positions import SLOW_ANSWER, PositionDecoder
 from uavctl.mavlink.profile import PROFILES
 from uavctl.mavlink.relay import Relay
 from uavctl.mavlink.requests import COMMANDS, RequestKind
-from uavctl.mavlink.vehicle import SECOND_VEHICLE, Joiner, VehicleWatch
+from uavctl.mavlink.vehicle import ENOUGH, LOW_SHARE, SECOND_VEHICLE, UNPUNCTUAL, Joiner, VehicleWatch
 from uavctl.records import (
     Event,
     InertialSample,
@@ -226,7 +226,8 @@ _LOST = {
     HUNG_UP: "the other side closed the connection; it is called again each second",
     WENT_SILENT: "nothing came over the connection any more; it is made again",
 }
-_USUAL = frozenset({BadBytes.UNKNOWN, OWN_ESTIMATE, *_LOST})  # counted, not told: every flight has them, or told else
+# Counted, not told: every flight has them, or they are told in another way.
+_USUAL = frozenset({BadBytes.UNKNOWN, OWN_ESTIMATE, UNPUNCTUAL, *_LOST})
 
 Item = PositionSample | VehicleStatus | VehicleMotion | InertialSample | Event | Ack | Text
 
@@ -282,6 +283,7 @@ class MavlinkConnection:
         self._slow = 0  # answers to TIMESYNC that were not used, and not told yet
         self._slow_told_ns: int | None = None
         self._resyncs_told = 0
+        self._low_share_told = False
         self._datagrams = self._messages = 0
         self._heartbeat_ns: int | None = None
         self._request_ns: int | None = None
@@ -310,6 +312,11 @@ class MavlinkConnection:
             address: system and component whose stamps it tells of.
         """
         self._intake.answer(address, sent_ns, remote_ns, received_ns)
+
+    @property
+    def inertial(self) -> tuple[int, int]:
+        """Inertial data of the vehicle that are used, and all that came."""
+        return self._vehicle.inertial_used, self._vehicle.inertial_total
 
     def vehicle_up_s(self, at_ns: int) -> float | None:
         """Return the time since the vehicle started, by its own clock [s]; None if it does not tell."""
@@ -478,6 +485,8 @@ class MavlinkConnection:
             clock_rtt_ns=round(median(round_trips_ns)) if round_trips_ns else None,
             clock_drift_ppm=None if trips is None else trips.drift_ppm,
             clock_rejected=0 if trips is None else trips.rejected,
+            inertial_used=self._vehicle.inertial_used,
+            inertial_total=self._vehicle.inertial_total,
         )
 
     def _target(self) -> tuple[int, int]:
@@ -552,6 +561,12 @@ class MavlinkConnection:
             self._resyncs_told = self._intake.resyncs
             text = f"link {self._name}: a source's clock has jumped; synchronised anew"
             events.append(Event(at_ns=at_ns, severity=Severity.WARNING, code="clock-resync", text=text))
+        used, total = self._vehicle.inertial_used, self._vehicle.inertial_total
+        if not self._low_share_told and total >= ENOUGH and used < LOW_SHARE * total:
+            self._low_share_told = True
+            text = f"link {self._name}: {1 - used / total:.0%} of the inertial data are not used: late, frozen, "
+            text += "or without an attitude of now"
+            events.append(Event(at_ns=at_ns, severity=Severity.WARNING, code=UNPUNCTUAL, text=text, count=total - used))
         if self._slow and (self._slow_told_ns is None or at_ns - self._slow_told_ns >= SLOW_TOLD_NS):
             self._slow_told_ns = at_ns
             events.append(self._slow_answers(at_ns))

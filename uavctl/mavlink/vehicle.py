@@ -9,6 +9,7 @@ import msgspec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.frames import Quaternion, from_euler, rotate
+from uavctl.mavlink.clocksync import ArrivalClock
 from uavctl.mavlink.messages import Ack, Attitude, Battery, Heartbeat, Inertial, Landed, Message, Position, Text
 from uavctl.mavlink.profile import PROFILES, autopilot_name, describe_mode
 from uavctl.records import Event, InertialSample, Severity, Vec3, VehicleMotion, VehicleStatus
@@ -162,6 +163,10 @@ def _plain(first: Text, text: str) -> Text:
 
 SECOND_VEHICLE = "second-vehicle"
 UNPUNCTUAL = "inertial-not-of-now"  # late, repeated, or frozen
+# The same readings for longer are those of a frozen sensor. Whole thousandths of g repeat, in recorded flights of
+# ArduCopter for 0.7 s at most. Fractions have noise, and never did.
+FROZEN_RAW_US, FROZEN_US = 1_000_000, 100_000
+LOW_SHARE, ENOUGH = 0.8, 250  # part of so many inertial data under which it is reported that they are not used
 ALONE_NS = 5_000_000_000  # after that time of silence another vehicle counts as gone
 GONE_NS = 30_000_000_000  # and after that one its place is taken, if it stood on the ground
 BOOTING_NS = 3_000_000_000  # of silence before a heartbeat of booting, for that to be a restart
@@ -169,7 +174,6 @@ FAILSAFE_NS = 2_000_000_000  # for which a word of a failsafe speaks for the mod
 TURNED_NS = 100_000_000  # an attitude that is older turns no specific force: at 1 rad/s it is 0.1 rad, 1 m/s², off
 GRAVITY_MPS2 = 9.80665
 LATE_NS = 60_000_000  # later than the quickest: a stream of 50 Hz is 20 ms apart
-CREEP = 1e-3  # by which two clocks may drift apart: ten times what bad oscillators do
 BACK_US = 1_000_000  # a stamp that goes back by more is of another clock
 _ROUTINE = frozenset({mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAV_CMD_REQUEST_MESSAGE})
 # PX4 stands by only while its pre-flight checks pass, and is uninitialised else: that comes and goes, no restart.
@@ -184,36 +188,40 @@ def is_vehicle(heartbeat: Heartbeat) -> bool:
     return heartbeat.autopilot != _NO_AUTOPILOT and heartbeat.vehicle_type != _GROUND_STATION
 
 
-class Punctual:
-    """Tells what is late, or says again what has been said, in one stream of one sender.
+class SensorStream:
+    """Judges the messages of one stream of one sensor by their stamps and arrival.
 
-    A message's delay is told against that of the quickest before it: clocks need not agree.
+    A new stamp is a new measurement, as integer readings repeat; the same readings for long are a frozen sensor. The
+    delay counts from the quickest message, at the drift of the sender's clock: clocks need not agree.
     """
 
     def __init__(self) -> None:
-        self._least_ns: int | None = None  # arrival less stamp
-        self._heard_ns = 0  # the last that was taken
+        self._clock = ArrivalClock()
+        self._heard_ns = 0  # the last that was judged
         self._stamp_us = 0  # of that
         self._values: Vec3 | None = None
+        self._since_us = 0  # stamp of the first of the same readings in a row
 
-    def takes(self, stamp_us: int, values: Vec3, at_ns: int) -> bool:
-        """Whether a message is current.
+    def takes(self, stamp_us: int, values: Vec3, at_ns: int, *, frozen_us: int = 0) -> bool | None:
+        """Whether a message is a measurement of now; None for one that was there already.
 
         Args:
             stamp_us: when it was measured, by the sender's clock.
-            values: what was measured; the same to the last bit is no measurement.
+            values: the readings.
+            frozen_us: readings that are the same to the last bit for longer are those of a frozen sensor; 0 where noise
+                never repeats.
         """
-        if stamp_us < self._stamp_us - BACK_US:
-            self._least_ns, self._stamp_us = None, 0
-        behind_ns = at_ns - 1000 * stamp_us
-        least_ns = behind_ns
-        if self._least_ns is not None:
-            least_ns = min(behind_ns, self._least_ns + round(CREEP * (at_ns - self._heard_ns)))
-        if stamp_us <= self._stamp_us or values == self._values or behind_ns - least_ns > LATE_NS:
-            return False
-        self._least_ns, self._heard_ns = least_ns, at_ns
-        self._stamp_us, self._values = stamp_us, values
-        return True
+        advance_us = stamp_us - self._stamp_us
+        if advance_us < -BACK_US or advance_us > (at_ns - self._heard_ns) // 1000 + BACK_US:
+            self._clock, self._since_us = ArrivalClock(), stamp_us
+        elif advance_us <= 0:
+            return None
+        if values != self._values:
+            self._since_us = stamp_us
+        repeats = values == self._values
+        delay_ns = self._clock.delay_ns(1000 * stamp_us, at_ns)
+        self._stamp_us, self._heard_ns, self._values = stamp_us, at_ns, values
+        return delay_ns <= LATE_NS and not (repeats and stamp_us - self._since_us >= frozen_us)
 
 
 class VehicleWatch:
@@ -244,8 +252,9 @@ class VehicleWatch:
         self._another_ns: int | None = None  # when another vehicle was heard last
         self._status: VehicleStatus | None = None
         self._motion = VehicleMotion()
-        self._punctual: dict[str, Punctual] = {}  # by stream
+        self._streams: dict[str, SensorStream] = {}  # by kind of message
         self._turned: tuple[Vec3, int] | None = None  # attitude, and when it was told
+        self.inertial_used = self.inertial_total = 0  # inertial data that gave an acceleration, and all
         self.boots = 0
         self.unready = 0  # times that it ceased to be ready: its streams may be gone
         self.address: tuple[int, int] | None = None  # system, component
@@ -338,29 +347,33 @@ class VehicleWatch:
         if not self._inertial:
             return
         kind = "quaternion" if message.quaternion else "angles"
-        if self._punctual.setdefault(kind, Punctual()).takes(message.stamp_us, message.angles_rad, at_ns):
+        if self._streams.setdefault(kind, SensorStream()).takes(message.stamp_us, message.angles_rad, at_ns):
             self._turned = message.angles_rad, at_ns
-        else:
-            self._bad(UNPUNCTUAL)
 
     def _accelerates(self, message: Inertial, at_ns: int) -> tuple[InertialSample, ...]:
         """Its acceleration by a specific force and its newest attitude; nothing where either is old or unknown."""
         if not self._inertial:
             return ()
-        kind = "raw" if message.raw else "highres"
-        if not self._punctual.setdefault(kind, Punctual()).takes(message.stamp_us, message.specific_force_mps2, at_ns):
+        kind, frozen_us = ("raw", FROZEN_RAW_US) if message.raw else ("highres", FROZEN_US)
+        stream = self._streams.setdefault(kind, SensorStream())
+        new = stream.takes(message.stamp_us, message.specific_force_mps2, at_ns, frozen_us=frozen_us)
+        if new is None:
+            return ()
+        self.inertial_total += 1
+        if not new:
             self._bad(UNPUNCTUAL)
             return ()
         attitude = self.attitude(at_ns)
         turned = None if attitude is None else rotate(attitude, message.specific_force_mps2)
         if turned is None:
             return ()
+        self.inertial_used += 1
         north, east, down = turned
         return (InertialSample(at_ns=at_ns, accel_mps2=(north, east, down + GRAVITY_MPS2)),)
 
     def _reboot(self) -> tuple[VehicleStatus, ...]:
         self.boots += 1
-        self._punctual, self._turned = {}, None
+        self._streams, self._turned = {}, None
         self._landed = self._failsafe_ns = None
         if self._status is None:
             return ()
