@@ -7,13 +7,25 @@ import random
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from mavlink_rig import MS, SECOND, packets, read
+from mavlink_rig import MS, SECOND, Peer, events, make_link, packets, read, samples
 from places import DATA
 
-from uavctl.mavlink.clocksync import ArrivalClock, ClockSource, ClockSync, RoundTrips, SlidingMinimum, StampRefusal
+from uavctl.config.connections import ClockConfig
+from uavctl.mavlink.clocksync import (
+    ArrivalClock,
+    ClockSource,
+    ClockSync,
+    RoundTrips,
+    SlidingMinimum,
+    StampRefusal,
+    StampUnit,
+    StampUnitWatch,
+)
+from uavctl.records import Event
 
 OFFSET = 1_000_000 * SECOND  # our clock is that far ahead of the source's
 PERIOD = 40 * MS
+NOW_NS = 1000 * SECOND
 WRAP = 2**32
 
 
@@ -432,3 +444,42 @@ def test_recorded_camera_delays() -> None:
     assert clock.offset_ns - truth_ns == pytest.approx(25 * MS, abs=6 * MS)  # the smallest delay
     assert true_delays[len(delays) // 2] == pytest.approx(80 * MS, abs=8 * MS)
     assert sorted(delays)[len(delays) // 2] == pytest.approx((80 - 25) * MS, abs=8 * MS)
+
+
+# --- the unit of stamps
+
+
+@pytest.mark.parametrize(
+    ("per_second", "unit"),
+    [(1e6, "us"), (0.986e6, "us"), (1e3, "ms"), (1e9, "ns"), (1.0, "s"), (0.0, "constant"), (3e7, "us")],
+)
+def test_the_unit_of_stamps_is_recognised_by_how_fast_they_go_on(per_second: float, unit: str) -> None:
+    watch = StampUnitWatch()
+    for n in range(100):
+        got = watch.take(50_000 + round(per_second * n / 20), (0.001 * (n % 3), 0.0, float(n)), n * 50 * MS)
+    assert got.value == unit
+
+
+def test_a_message_that_is_repeated_has_no_constant_stamp() -> None:
+    watch = StampUnitWatch()
+    for n in range(100):
+        got = watch.take(1_000_000 + 50_000 * min(n, 40), (0.0, 0.0, float(min(n, 40))), n * 50 * MS)
+    assert got is StampUnit.MICROSECONDS
+
+
+@pytest.mark.parametrize(("per_s", "unit"), [(1e3, "ms"), (1e9, "ns"), (1.0, "s"), (0.0, "constant")])
+def test_positions_with_stamps_of_another_unit_count_by_their_arrival_and_are_reported_once(
+    per_s: float, unit: str
+) -> None:
+    link, source = make_link(clock=ClockConfig(latency_s=0.02)), Peer(20, 1)
+    told, ages_ms = list[Event](), list[float]()
+    for n in range(200):
+        at_ns = NOW_NS + n * 50 * MS + (n % 7) * MS
+        items = link.receive(
+            source.vision(50_000 + round(per_s * n / 20), 0.001 * (n % 5), 2.0 + 1e-3 * n), at_ns
+        ).items
+        told += events(items)
+        ages_ms += [(one.received_ns - one.captured_ns) / MS for one in samples(items) if n > 40]
+    assert [event.code for event in told if event.code == "stamp-unit"] == ["stamp-unit"]
+    assert link.stats(NOW_NS).stamp_units == [unit]
+    assert ages_ms == [20.0] * 159

@@ -351,3 +351,61 @@ def test_inertial_data_are_asked_for_where_they_are_used_until_they_come(autopil
     assert [every <= one for one in silent] == [True] * 5 + [False]  # the last is for what is wanted of any vehicle
     assert [every <= one for one in asked(0.1, tells=True)][:4] == [True, True, True, False]
     assert not any(every & one for one in asked(0.0, tells=False))
+
+
+# --- Who is the vehicle
+
+GIMBAL, CAMERA, ONBOARD, QUADROTOR = 26, 30, 18, 2
+
+
+@pytest.mark.fault(16)
+@pytest.mark.parametrize("first", [True, False])
+@pytest.mark.parametrize(
+    ("component", "kind", "autopilot"),
+    [(154, GIMBAL, ARDUPILOT), (191, ONBOARD, 0), (100, CAMERA, PX4), (154, QUADROTOR, 0), (191, QUADROTOR, ARDUPILOT)],
+)
+def test_the_autopilot_is_the_vehicle_whatever_of_its_system_is_heard_first(
+    component: int, kind: int, autopilot: int, first: bool
+) -> None:
+    link, vehicle, device = make_link(), Peer(1, 1), Peer(1, component)
+    for n in range(4):
+        beats = [device.heartbeat(autopilot=autopilot, kind=kind), vehicle.heartbeat(OFFBOARD, 129, autopilot=PX4)]
+        for beat in beats if first else beats[::-1]:
+            found = statuses(link.receive(beat, NOW + n * SECOND).items)
+    assert link.vehicle == (1, 1)
+    status = newest(link, vehicle, NOW + 4 * SECOND)
+    assert (status.boots, status.alone) == (0, True)
+    assert {one.autopilot for one in found} <= {"px4"}
+
+
+@pytest.mark.fault(16)
+def test_a_component_that_is_configured_is_the_vehicle() -> None:
+    link = make_link(daemon=DaemonConfig(tick_s=0.05, vehicle_component_id=2))
+    for n in range(3):
+        link.receive(Peer(1, 1).heartbeat(), NOW + n * SECOND)
+        link.receive(Peer(1, 2).heartbeat(), NOW + n * SECOND)
+    assert link.vehicle == (1, 2)
+
+
+@pytest.mark.fault(16)
+def test_another_component_of_the_vehicles_system_says_nothing_of_the_vehicle() -> None:
+    link, vehicle = heard()
+    device = Peer(1, 191)
+    answer = device.send("command_ack", 400, 0, 0, 0, 245, 25)
+    landed = device.send("extended_sys_state", 0, 1)
+    moves = device.send("attitude", 60_000, 0.5, 0.0, 0.0, 0.0, 0.0, 0.0)
+    assert not [item for data in (answer, landed, moves) for item in link.receive(data, NOW).items]
+    (said,) = link.receive(device.send("statustext", 4, b"failsafe"), NOW).items  # shown, and nothing is made of it
+    assert not isinstance(said, Text)
+    status = newest(link, vehicle)
+    assert status.landed is None and not status.failsafe
+
+
+def test_a_vehicle_that_sends_its_position_but_no_heartbeat_is_reported_once() -> None:
+    link, told = make_link(), list[str]()
+    for n in range(100):
+        told += [
+            event.code
+            for event in events(link.receive(Peer(1, 1).local_position(60_000 + 100 * n), NOW + n * SECOND // 10).items)
+        ]
+    assert told == ["no-heartbeat"] and link.vehicle is None

@@ -12,6 +12,8 @@ from enum import StrEnum
 from itertools import combinations
 from statistics import median, median_low
 
+from uavctl.records import Vec3
+
 MAX_ROUND_TRIP_NS = 1_000_000_000  # a slower answer bounds the offset by nothing of use
 NEAR_NS = 10_000_000  # a round trip that is so much longer than the shortest says as much
 # By which a clock's drift may change: real ones keep 1e-4, that of a simulator on a busy computer is followed so.
@@ -44,6 +46,55 @@ class ClockSource(StrEnum):
     TIMESYNC = "timesync"
     MINIMUM = "minimum"
     NONE = "none"
+
+
+class StampUnit(StrEnum):
+    """Unit of a source's stamps; MAVLink wants microseconds."""
+
+    MICROSECONDS = "us"
+    MILLISECONDS = "ms"
+    NANOSECONDS = "ns"
+    SECONDS = "s"
+    CONSTANT = "constant"  # they do not go on at all
+
+
+_PER_SECOND = {
+    StampUnit.SECONDS: 1.0,
+    StampUnit.MILLISECONDS: 1e3,
+    StampUnit.MICROSECONDS: 1e6,
+    StampUnit.NANOSECONDS: 1e9,
+}
+UNIT_NS = 1_500_000_000  # over which stamps are compared with our clock: stamps in s go on in it
+
+
+class StampUnitWatch:
+    """Recognises the unit of a source's stamps by how fast they go on, against our clock.
+
+    Attributes:
+        unit: as recognised; microseconds until another one is.
+    """
+
+    def __init__(self) -> None:
+        self.unit = StampUnit.MICROSECONDS
+        self._begun: tuple[int, int, Vec3] | None = None  # stamp, arrival, position
+
+    def take(self, stamp: int, position_m: Vec3, at_ns: int) -> StampUnit:
+        """Take a stamp, and the position that has it; return the unit.
+
+        The same stamp with the same position is a repeated message, and says nothing of the unit.
+        """
+        if self._begun is None:
+            self._begun = stamp, at_ns, position_m
+        elif at_ns - self._begun[1] >= UNIT_NS:
+            advance, passed_s = stamp - self._begun[0], (at_ns - self._begun[1]) * 1e-9
+            if advance == 0 and position_m != self._begun[2]:
+                self.unit = StampUnit.CONSTANT
+            for unit, per_second in _PER_SECOND.items():
+                # Whole seconds may be one more or less than have passed.
+                if 0.5 * per_second * passed_s <= advance <= 2.0 * per_second * passed_s:
+                    self.unit = unit
+            self._begun = stamp, at_ns, position_m
+        return self.unit
 
 
 class SlidingMinimum:

@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from uavctl.config.connections import ClockConfig, DaemonConfig, FrameConfig, SourceConfig
 from uavctl.config.types import EstimatorConfig
 from uavctl.frames import Quaternion
-from uavctl.mavlink.clocksync import LEAP_NS, NEAR_NS, ArrivalClock, ClockSource, RoundTrips
+from uavctl.mavlink.clocksync import LEAP_NS, NEAR_NS, ArrivalClock, ClockSource, RoundTrips, StampUnit
 from uavctl.mavlink.codec import OWN_ESTIMATE, Encoder, StreamDecoder, UnsendableError, decode
 from uavctl.mavlink.framing import BadBytes
 from uavctl.mavlink.messages import (
@@ -218,6 +218,9 @@ OPEN_REQUESTS = 8  # requests whose answers are still taken
 MAX_ANSWERS, ANSWERS_NS = 8, 50_000_000
 STREAM_SCHEMES = ("tcp:", "serial:")
 SLOW_TOLD_NS = 10_000_000_000  # between two events of slow answers
+MUTE_NS = 3 * SECOND_NS  # three heartbeats that did not come
+NO_HEARTBEAT = "no-heartbeat"
+STAMP_UNIT = "stamp-unit"
 UNANSWERED = "timesync-flood"
 OVERRUN = "overrun"  # dropped by the system while nobody read, the vehicle's newest words perhaps
 HUNG_UP = "hung-up"  # times that the other side of a TCP connection has closed it
@@ -274,7 +277,9 @@ class MavlinkConnection:
         self._encoder = Encoder(*self._own)
         self._intake = PositionDecoder(frame, clock, source, estimator, self._count)
         feels = estimator.inertial_std_mps2 > 0.0
-        self._vehicle = VehicleWatch(self._count, self._own, daemon.vehicle_system_id, inertial=feels)
+        self._vehicle = VehicleWatch(
+            self._count, self._own, daemon.vehicle_system_id, daemon.vehicle_component_id, inertial=feels
+        )
         self._streams, self._globe, self._texts = Streams(inertial=feels), Globe(), Joiner()
         self._lists, self._parameters = daemon.parameters, ParameterList()
         self._bad: Counter[str] = Counter()
@@ -284,6 +289,11 @@ class MavlinkConnection:
         self._slow_told_ns: int | None = None
         self._resyncs_told = 0
         self._low_share_told = False
+        # A vehicle that sends its position, but no heartbeat: its address, since when, and whether that was reported
+        self._mute: tuple[int, int] | None = None
+        self._mute_since_ns: int | None = None
+        self._mute_told = False
+        self._units_told: set[tuple[int, int, StampUnit]] = set()
         self._datagrams = self._messages = 0
         self._heartbeat_ns: int | None = None
         self._request_ns: int | None = None
@@ -485,6 +495,7 @@ class MavlinkConnection:
             clock_rtt_ns=round(median(round_trips_ns)) if round_trips_ns else None,
             clock_drift_ppm=None if trips is None else trips.drift_ppm,
             clock_rejected=0 if trips is None else trips.rejected,
+            stamp_units=sorted({str(unit) for unit in self._intake.units.values()}),
             inertial_used=self._vehicle.inertial_used,
             inertial_total=self._vehicle.inertial_total,
         )
@@ -513,8 +524,13 @@ class MavlinkConnection:
         if isinstance(message, Text):
             whole = self._texts.take(message, at_ns)
             return tuple(item for text in whole for item in self._vehicle.take(text, at_ns))
-        boots, unready = self._vehicle.boots, self._vehicle.unready
+        boots, unready, address = self._vehicle.boots, self._vehicle.unready, self.vehicle
         items = self._vehicle.take(message, at_ns)
+        if address is None and self.vehicle is None:
+            self._look_for_one(message, at_ns)
+        elif self.vehicle != address:
+            self._streams.restart()
+            self._globe, self._parameters, self._vehicle_clock = Globe(), ParameterList(), ArrivalClock()
         if self._vehicle.boots != boots:
             self._streams.restart()
             self._globe, self._parameters, self._vehicle_clock = Globe(), ParameterList(), ArrivalClock()
@@ -522,15 +538,21 @@ class MavlinkConnection:
             return (*items, Event(at_ns=at_ns, severity=Severity.ERROR, code="vehicle-reboot", text=text))
         if self._vehicle.unready != unready:
             self._streams.restart()  # those that go on will have been seen by the time they would be asked for
-        if self.vehicle is not None and message.system == self.vehicle[0]:
+        if (message.system, message.component) == self.vehicle:
             self._streams.saw(message)
             self._globe.saw(message)
-            if message.component == self.vehicle[1]:
-                self._parameters.saw(message)
-                match message:
-                    case Position(boot_ms=True, stamp_us=int(stamp_us)) | Attitude(stamp_us=stamp_us) if stamp_us:
-                        self._vehicle_clock.delay_ns(1000 * stamp_us, at_ns)
+            self._parameters.saw(message)
+            match message:
+                case Position(boot_ms=True, stamp_us=int(stamp_us)) | Attitude(stamp_us=stamp_us) if stamp_us:
+                    self._vehicle_clock.delay_ns(1000 * stamp_us, at_ns)
         return items
+
+    def _look_for_one(self, message: Message, at_ns: int) -> None:
+        """Note a vehicle that sends its position or attitude, and no heartbeat."""
+        if isinstance(message, Attitude) or (isinstance(message, Position) and message.boot_ms):
+            self._mute = (message.system, message.component)
+            if self._mute_since_ns is None:
+                self._mute_since_ns = at_ns
 
     def _timesync(self, message: TimeSync, at_ns: int) -> None:
         if message.tc1_ns == 0:
@@ -561,6 +583,19 @@ class MavlinkConnection:
             self._resyncs_told = self._intake.resyncs
             text = f"link {self._name}: a source's clock has jumped; synchronised anew"
             events.append(Event(at_ns=at_ns, severity=Severity.WARNING, code="clock-resync", text=text))
+        for (system, component), unit in self._intake.units.items():
+            if (system, component, unit) not in self._units_told:
+                self._units_told.add((system, component, unit))
+                what = "do not go on" if unit is StampUnit.CONSTANT else f"are in {unit}, not in us"
+                text = f"link {self._name}: stamps of the positions of {system}/{component} {what}: "
+                text += "they count by their arrival, and their ages are not known"
+                events.append(Event(at_ns=at_ns, severity=Severity.WARNING, code=STAMP_UNIT, text=text))
+        since_ns = self._mute_since_ns
+        if since_ns is not None and self.vehicle is None and not self._mute_told and at_ns - since_ns >= MUTE_NS:
+            self._mute_told = True
+            text = f"link {self._name}: system {self._mute and self._mute[0]} sends its position or attitude, "
+            text += "but no heartbeat of an autopilot: its mode is not known, so it is not flown"
+            events.append(Event(at_ns=at_ns, severity=Severity.WARNING, code=NO_HEARTBEAT, text=text))
         used, total = self._vehicle.inertial_used, self._vehicle.inertial_total
         if not self._low_share_told and total >= ENOUGH and used < LOW_SHARE * total:
             self._low_share_told = True

@@ -180,12 +180,30 @@ _ROUTINE = frozenset({mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAV_CMD_REQU
 _UNREADY = frozenset({mavlink.MAV_STATE_UNINIT, mavlink.MAV_STATE_BOOT, mavlink.MAV_STATE_CALIBRATING})
 _IN_FAILSAFE = frozenset({mavlink.MAV_STATE_CRITICAL, mavlink.MAV_STATE_EMERGENCY})
 _NO_AUTOPILOT = int(mavlink.MAV_AUTOPILOT_INVALID)
-_GROUND_STATION = int(mavlink.MAV_TYPE_GCS)
+_AUTOPILOT1 = int(mavlink.MAV_COMP_ID_AUTOPILOT1)
+# Types of what is no vehicle, whatever autopilot it names: its own, or the one that it is made for.
+_DEVICES = frozenset(
+    int(getattr(mavlink, f"MAV_TYPE_{name}"))
+    for name in (
+        *("GCS", "ANTENNA_TRACKER", "ONBOARD_CONTROLLER", "GIMBAL", "ADSB", "CAMERA", "CHARGING_STATION", "FLARM"),
+        *("SERVO", "ODID", "BATTERY", "LOG", "OSD", "IMU", "GPS", "WINCH"),
+    )
+)
 
 
 def is_vehicle(heartbeat: Heartbeat) -> bool:
-    """Whether a heartbeat is an autopilot's: not a ground station's, a camera's or a gimbal's."""
-    return heartbeat.autopilot != _NO_AUTOPILOT and heartbeat.vehicle_type != _GROUND_STATION
+    """Whether a heartbeat is an autopilot's: not that of a ground station, a companion computer, a gimbal, a camera."""
+    return heartbeat.autopilot != _NO_AUTOPILOT and heartbeat.vehicle_type not in _DEVICES
+
+
+def is_better(address: tuple[int, int], than: tuple[int, int] | None) -> bool:
+    """Whether of two that say that they are vehicles the first one is to be followed.
+
+    Of one system it is the component of autopilots; of two systems the one that is followed already.
+    """
+    if than is None:
+        return True
+    return address[0] == than[0] and address[1] == _AUTOPILOT1 != than[1]
 
 
 class SensorStream:
@@ -233,15 +251,22 @@ class VehicleWatch:
         bad: counter that heartbeats of other vehicles are added to.
         own: our system and component id; answers to others' commands are not ours.
         system: the vehicle's system id; 0 takes any.
+        component: its component id; 0 takes any, and that of autopilots rather than another.
     """
 
     def __init__(
-        self, bad: Callable[[str], None], own: tuple[int, int], system: int = 0, *, inertial: bool = False
+        self,
+        bad: Callable[[str], None],
+        own: tuple[int, int],
+        system: int = 0,
+        component: int = 0,
+        *,
+        inertial: bool = False,
     ) -> None:
         self._bad = bad
         self._inertial = inertial
         self._own = own
-        self._system = system
+        self._system, self._component = system, component
         self._landed: bool | None = None
         self._own_climb = False
         self._battery_v: float | None = None
@@ -277,16 +302,18 @@ class VehicleWatch:
             return self._heartbeat(message, at_ns)
         if self.address is None or message.system != self.address[0]:
             return ()
+        if message.component != self.address[1]:  # a companion computer or gimbal of the same system: its words only
+            return (_text_event(message, at_ns),) if isinstance(message, Text) else ()
         self._heard_ns = at_ns
         match message:
             case Landed(landed=landed, own_climb=own_climb):
                 return self._phase(landed, own_climb)
             case Battery(voltage_v=voltage_v):
                 self._battery_v = voltage_v
-            case Position(boot_ms=True, stamp_us=int(stamp_us)) if message.component == self.address[1]:
+            case Position(boot_ms=True, stamp_us=int(stamp_us)):
                 anew = self._tells_time("position", stamp_us, at_ns)
                 return (*anew, *self._moves(at_ns, velocity=message.velocity_mps))
-            case Attitude(angles_rad=angles_rad) if message.component == self.address[1]:
+            case Attitude(angles_rad=angles_rad):
                 kind = "quaternion" if message.quaternion else "angles"
                 anew = self._tells_time(kind, message.stamp_us, at_ns) if message.stamp_us else ()
                 # Beside inertial data both are of use; else a vehicle that streams both is believed by one.
@@ -294,13 +321,13 @@ class VehicleWatch:
                     return anew
                 self._turns(message, at_ns)
                 return (*anew, *self._moves(at_ns, attitude=angles_rad))
-            case Inertial(raw=raw) if message.component == self.address[1]:
+            case Inertial(raw=raw):
                 known = PROFILES.get(self.autopilot)
                 return self._accelerates(message, at_ns) if not raw or (known and known.reads_raw) else ()
-            case Text(severity=severity, text=text):
+            case Text(text=text):
                 if "failsafe" in text.lower():
                     self._failsafe_ns = None if "clear" in text.lower() else at_ns
-                return message, Event(at_ns=at_ns, severity=_severity(severity), code="vehicle-text", text=text)
+                return message, _text_event(message, at_ns)
             case Ack() if self._is_ours(message):
                 return (message,) if message.command in _ROUTINE else (message, _ack_event(message, at_ns))
         return ()
@@ -390,7 +417,11 @@ class VehicleWatch:
 
     def _begin(self, address: tuple[int, int], at_ns: int) -> None:
         """Follow a vehicle; if it is another one than before, forget the old one's state: nothing is armed yet."""
-        if self.address is not None:
+        if self.address is not None and self.address[0] == address[0]:  # it was a device of this one
+            self._streams, self._turned, self._battery_v, self._landed = {}, None, None, None
+            self._ready = False
+            self._clock.forget()
+        elif self.address is not None:
             self._reboot()
             self._battery_v = None
             self._clock.forget()
@@ -399,8 +430,8 @@ class VehicleWatch:
 
     def _heartbeat(self, message: Heartbeat, at_ns: int) -> tuple[VehicleStatus, ...]:
         address = (message.system, message.component)
-        wanted = self._system in (0, message.system)
-        if wanted and (self.address is None or (address != self.address and self._has_gone(at_ns))):
+        wanted = self._system in (0, message.system) and self._component in (0, message.component)
+        if wanted and (is_better(address, self.address) or (address != self.address and self._has_gone(at_ns))):
             self._begin(address, at_ns)
         if address != self.address:
             if self.address is None or message.system != self.address[0]:
@@ -431,6 +462,10 @@ class VehicleWatch:
             failsafe=message.system_status in _IN_FAILSAFE or self._has_told_of_failsafe(at_ns),
         )
         return (self._status,)
+
+
+def _text_event(text: Text, at_ns: int) -> Event:
+    return Event(at_ns=at_ns, severity=_severity(text.severity), code="vehicle-text", text=text.text)
 
 
 def _severity(mav_severity: int) -> Severity:
