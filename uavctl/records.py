@@ -348,8 +348,6 @@ class LinkStats(Record, frozen=True, kw_only=True):
     clock_drift_ppm: float | None = None  # gain of our clock on the peer's
     clock_rejected: int = 0  # answers that came too late, or deviated
     stamp_units: list[str] = msgspec.field(default_factory=list)  # of positions, other than us, or "constant"
-    inertial_used: int = 0  # inertial data that gave an acceleration
-    inertial_total: int = 0  # all that came with a new stamp
 
 
 class Truth(Record, frozen=True, kw_only=True):

@@ -302,7 +302,7 @@ def test_recorded_inertial_data_are_used(name: str) -> None:
         told += [event.code for event in events(link.receive(data, at_ns).items)]
     used, total = link.inertial
     assert total > 500 and used > 0.95 * total
-    assert "inertial-not-of-now" not in told
+    assert "inertial-not-of-now" not in told and told.count("dropped") <= 1
 
 
 @pytest.mark.parametrize("jump_s", [-900, 900])

@@ -230,7 +230,7 @@ _LOST = {
     WENT_SILENT: "nothing came over the connection any more; it is made again",
 }
 # Counted, not told: every flight has them, or they are told in another way.
-_USUAL = frozenset({BadBytes.UNKNOWN, OWN_ESTIMATE, UNPUNCTUAL, *_LOST})
+_USUAL = frozenset({BadBytes.UNKNOWN, OWN_ESTIMATE, *_LOST})
 
 Item = PositionSample | VehicleStatus | VehicleMotion | InertialSample | Event | Ack | Text
 
@@ -496,8 +496,6 @@ class MavlinkConnection:
             clock_drift_ppm=None if trips is None else trips.drift_ppm,
             clock_rejected=0 if trips is None else trips.rejected,
             stamp_units=sorted({str(unit) for unit in self._intake.units.values()}),
-            inertial_used=self._vehicle.inertial_used,
-            inertial_total=self._vehicle.inertial_total,
         )
 
     def _target(self) -> tuple[int, int]:
@@ -573,6 +571,9 @@ class MavlinkConnection:
         self._bad[reason] += count
         if reason == SLOW_ANSWER:
             self._slow += count
+        elif reason == UNPUNCTUAL:  # told once, and then by the share that is used
+            if self._bad[reason] == count:
+                self._untold[reason] += count
         elif reason not in _USUAL:
             self._untold[reason] += count
 

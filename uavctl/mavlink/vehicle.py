@@ -376,6 +376,8 @@ class VehicleWatch:
         kind = "quaternion" if message.quaternion else "angles"
         if self._streams.setdefault(kind, SensorStream()).takes(message.stamp_us, message.angles_rad, at_ns):
             self._turned = message.angles_rad, at_ns
+        else:
+            self._bad(UNPUNCTUAL)
 
     def _accelerates(self, message: Inertial, at_ns: int) -> tuple[InertialSample, ...]:
         """Its acceleration by a specific force and its newest attitude; nothing where either is old or unknown."""
@@ -384,9 +386,7 @@ class VehicleWatch:
         kind, frozen_us = ("raw", FROZEN_RAW_US) if message.raw else ("highres", FROZEN_US)
         stream = self._streams.setdefault(kind, SensorStream())
         new = stream.takes(message.stamp_us, message.specific_force_mps2, at_ns, frozen_us=frozen_us)
-        if new is None:
-            return ()
-        self.inertial_total += 1
+        self.inertial_total += new is not None
         if not new:
             self._bad(UNPUNCTUAL)
             return ()
