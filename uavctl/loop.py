@@ -17,7 +17,7 @@ from uavctl.errors import in_words
 from uavctl.flight.controller import Controller
 from uavctl.flight.decision import CONTROLLER_FAULT
 from uavctl.flight.step import BIAS_AT_BOUND, BIAS_FREE, StepOutput, disbelieves, initial_state, step
-from uavctl.mavlink.connection import HUNG_UP, OVERRUN, WENT_SILENT, MavlinkConnection
+from uavctl.mavlink.connection import HUNG_UP, NO_HEARTBEAT, OVERRUN, STAMP_UNIT, WENT_SILENT, MavlinkConnection
 from uavctl.mavlink.handover import HAND_OVER_ORDERS, HandOver, HandoverStep
 from uavctl.mavlink.handover_guards import HandoverView, against_moving
 from uavctl.mavlink.handover_states import LEAVES_NONE, HandoverState, Sending
@@ -49,6 +49,7 @@ from uavctl.records import (
     Timing,
     VehicleMotion,
     VehicleStatus,
+    moves_now,
     raw_topic,
 )
 from uavctl.smpc.plant import Plant
@@ -61,7 +62,7 @@ SECOND_NS = 1_000_000_000
 FAILED = "the controller has failed:"  # and what failed in it
 MAX_ORDERS = 16  # that wait for one tick
 FOR_A_PERSON = frozenset(
-    {"vehicle-text", BIAS_AT_BOUND, BIAS_FREE, CONTROLLER_FAULT, HUNG_UP, WENT_SILENT}
+    {"vehicle-text", BIAS_AT_BOUND, BIAS_FREE, CONTROLLER_FAULT, HUNG_UP, WENT_SILENT, NO_HEARTBEAT, STAMP_UNIT}
 )  # codes of the events that the console tells
 MISLED_NS = 3_000_000_000  # positions are held back for so long after they could not be the vehicle's own
 MAX_INERTIAL = 20  # newest of one tick: their mean is what counts
@@ -161,7 +162,15 @@ class ControlLoop:
         kept = {reason: count for reason, count in self._relay.kept.items() if count}
         at_ns = 0 if self._decision is None else self._decision.at_ns
         alone = bool(self.course.died) or (self._controlled_ns is not None and self._controlled_ns < at_ns)
-        return RelayStats(at_ns=at_ns, sent=self._relay.sent, kept=kept, last_ns=self._relay.last_ns, alone=alone)
+        relay = self._relay
+        return RelayStats(
+            at_ns=at_ns, sent=relay.sent, kept=kept, last_ns=relay.last_ns, alone=alone, silent_for=relay.silent_for
+        )
+
+    @property
+    def inertial(self) -> tuple[int, int] | None:
+        """Inertial data of the vehicle that are used, and all that came; None where none are used."""
+        return self._links[VEHICLE].inertial if self._feels else None
 
     @property
     def plant(self) -> Plant:
@@ -250,11 +259,17 @@ class ControlLoop:
         if out.astray and self._hand_over.has_begun:
             self._misled_ns = at_ns
         misled = self._misled_ns is not None and at_ns - self._misled_ns < MISLED_NS
-        if self._relays and not misled and not disbelieves(self._state):
+        held_back = misled or disbelieves(self._state)
+        if self._relays and not held_back:
             for data in self._links[VEHICLE].relay(
                 self._relay, at_ns, autopilot, refused=inp.samples if out.leaps else out.refused
             ):
                 send(self._outgoing(VEHICLE, data, at_ns))
+        if self._relays and self._vehicle is not None:
+            silence = self._relay.report(at_ns, held_back=held_back, armed=self._vehicle.armed)
+            if silence is not None:
+                self._put("/uavctl/event", at_ns, silence)
+                notices.append(silence)
         answers: tuple[tuple[Command, Event], ...] = ()
         if self._adrift:
             self._hand_over.look_up(at_ns, self._vehicle)
@@ -499,6 +514,7 @@ class ControlLoop:
             unsafe=out.unsafe,
             up_m=up_m,
             up_mps=up_mps,
+            moves=moves_now(self._motion, inp.at_ns),
             heard=self._heard,
             commands=inp.commands,
         )

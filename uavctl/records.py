@@ -193,6 +193,15 @@ class VehicleMotion(Record, frozen=True, kw_only=True):
     attitude_ns: int | None = None
 
 
+MOTION_OF_NOW_NS = 1_000_000_000
+
+
+def moves_now(motion: VehicleMotion | None, at_ns: int) -> bool:
+    """Whether the vehicle sends its velocity or attitude now: then it is present, though no heartbeat may come."""
+    newest_ns = None if motion is None else max(motion.velocity_ns or 0, motion.attitude_ns or 0)
+    return newest_ns is not None and at_ns - newest_ns <= MOTION_OF_NOW_NS
+
+
 class Severity(StrEnum):
     """Severity of an event."""
 
@@ -328,6 +337,7 @@ class RelayStats(Record, frozen=True, kw_only=True):
     kept: dict[str, int]  # positions not passed on, by reason
     last_ns: int | None  # time at which the last one went
     alone: bool  # nothing else is sent: control has ended, or failed
+    silent_for: str = ""  # reason why none has gone for half a second; empty while they go
 
 
 class LinkStats(Record, frozen=True, kw_only=True):
@@ -345,6 +355,7 @@ class LinkStats(Record, frozen=True, kw_only=True):
     clock_rtt_ns: int | None = None  # median of the last minute's round trips
     clock_drift_ppm: float | None = None  # gain of our clock on the peer's
     clock_rejected: int = 0  # answers that came too late, or deviated
+    stamp_units: list[str] = msgspec.field(default_factory=list)  # of positions, other than us, or "constant"
 
 
 class Truth(Record, frozen=True, kw_only=True):

@@ -25,7 +25,7 @@ from logs.recording.senders import ChosenVehicle, LogSender, Senders, choose_veh
 from logs.recording.summary import count
 from logs.recording.tlog import Tlog, TlogPacket, read_tlog
 from uavctl.errors import RecordingError
-from uavctl.mavlink.clocksync import ClockSync
+from uavctl.mavlink.clocksync import ClockSync, StampUnit, StampUnitWatch
 from uavctl.mavlink.codec import OWN_ESTIMATE, decoded
 from uavctl.mavlink.framing import MessageLayout, scan_one
 from uavctl.mavlink.messages import Attitude, Battery, Heartbeat, Message, Position, Text
@@ -74,6 +74,7 @@ class SentPositions(msgspec.Struct, frozen=True, kw_only=True):
     # from capture to arrival, beyond the quickest of the last ten seconds [ms]; None without stamps
     delay_ms: tuple[float, float, float] | None  # median, 95 %, largest
     largest_age_s: float | None  # of the newest position
+    stamp_unit: str = "us"  # as the stamps go on: us, ms, ns, s or constant; others than us are refused
 
 
 class MavlinkFlightInfo(msgspec.Struct, frozen=True, kw_only=True):
@@ -184,11 +185,14 @@ class SentSource:
     captured_ns: list[int | None] = field(default_factory=list)
     refused: int = 0
     clock: ClockSync = field(default_factory=lambda: ClockSync(_WINDOW_NS, 0, _AHEAD_NS))
+    units: StampUnitWatch = field(default_factory=StampUnitWatch)
 
     def take(self, position_m: Vec3, velocity_mps: Vec3 | None, stamp_us: int | None, at_ns: int) -> None:
         """Take a position in local NED, with the stamp of its source."""
         captured = None
-        if stamp_us is not None:
+        if stamp_us is not None and self.units.take(stamp_us, position_m, at_ns) is not StampUnit.MICROSECONDS:
+            self.refused += 1
+        elif stamp_us is not None:
             found = self.clock.captured_ns(stamp_us * 1000, at_ns)
             self.refused += isinstance(found, str)
             captured = None if isinstance(found, str) else found
@@ -465,6 +469,7 @@ def figures_of(name: str, source: SentSource, ages: Ages) -> SentPositions:
             else None
         ),
         largest_age_s=float(ages.age_s.max()) if len(ages.age_s) else None,
+        stamp_unit=str(source.units.unit),
     )
 
 
@@ -520,6 +525,10 @@ def longest_gap(sent: SentPositions) -> str:
 
 
 def _delays(sent: SentPositions) -> str:
+    if sent.stamp_unit == StampUnit.CONSTANT:
+        return "; stamps that do not go on"
+    if sent.stamp_unit != StampUnit.MICROSECONDS:
+        return f"; stamps in {sent.stamp_unit}, not in us"
     if sent.delay_ms is None:
         return "; without stamps"
     median, p95, most = sent.delay_ms

@@ -20,15 +20,6 @@ from uavctl.mavlink.profile import autopilot_name
 from uavctl.mavlink.vehicle import is_vehicle
 
 _AUTOPILOT = int(mavlink.MAV_COMP_ID_AUTOPILOT1)
-# Kinds of devices aboard, whose heartbeats may name the autopilot that they are made for.
-_DEVICES = frozenset(
-    {
-        mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_TYPE_GIMBAL, mavlink.MAV_TYPE_CAMERA, mavlink.MAV_TYPE_ADSB,
-        mavlink.MAV_TYPE_CHARGING_STATION, mavlink.MAV_TYPE_FLARM, mavlink.MAV_TYPE_SERVO, mavlink.MAV_TYPE_ODID,
-        mavlink.MAV_TYPE_BATTERY, mavlink.MAV_TYPE_PARACHUTE, mavlink.MAV_TYPE_LOG, mavlink.MAV_TYPE_OSD,
-        mavlink.MAV_TYPE_IMU, mavlink.MAV_TYPE_GPS, mavlink.MAV_TYPE_WINCH,
-    }
-)  # fmt: skip
 # What a vehicle alone tells, so that one is known even where no heartbeat is in the file.
 _STATES = frozenset(
     {
@@ -103,7 +94,7 @@ def choose_vehicle(packets: Sequence[TlogPacket], name: str, system: int | None 
     for packet in packets:
         if message_of(packet.data) == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
             for one in decode(packet.data).messages:
-                if isinstance(one, Heartbeat) and _may_be_vehicle(one):
+                if isinstance(one, Heartbeat) and is_vehicle(one):
                     first.setdefault((one.system, one.component), one)
     vehicles: dict[int, Heartbeat] = {}
     for one in sorted(first.values(), key=lambda one: one.component != _AUTOPILOT):  # in order else
@@ -119,10 +110,6 @@ def choose_vehicle(packets: Sequence[TlogPacket], name: str, system: int | None 
         system = next((one for one in told if one not in GROUND_SYSTEMS), None)
     others = tuple(one for number, one in sorted(vehicles.items()) if number != system)
     return ChosenVehicle(system, None if system is None else vehicles.get(system), others)
-
-
-def _may_be_vehicle(heartbeat: Heartbeat) -> bool:
-    return is_vehicle(heartbeat) and heartbeat.vehicle_type not in _DEVICES
 
 
 class Senders:

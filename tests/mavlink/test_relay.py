@@ -3,28 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from dataclasses import replace
 from statistics import median
 from typing import Any
 
 import pytest
-from loopback_rig import Memory, shared_loop
+from indoors_rig import Indoors
 from mavlink_rig import MS, SECOND, read
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import Client
 
 from sim.autopilot.autopilot import UPTIME_NS
-from sim.autopilot.profile import SIMULATED
-from sim.simulation import Peers
-from uavctl.config import load_config
 from uavctl.config.connections import RelayConfig
 from uavctl.frames import from_euler
-from uavctl.lab.own_loop import EXTERNAL_ONLY
 from uavctl.mavlink.codec import Encoder, UnsendableError
-from uavctl.mavlink.connection import MavlinkConnection
 from uavctl.mavlink.handover_states import HandoverState
+from uavctl.mavlink.profile import PROFILES
 from uavctl.mavlink.relay import MAX_AGE_NS, STUCK_AFTER, Pose, Relay
-from uavctl.records import Datagram, Event, LinkStats, PositionSample, Vec3
+from uavctl.records import Event, LinkStats, PositionSample, Vec3
 
 NOW = 1_000 * SECOND
 LEVEL = (1.0, 0.0, 0.0, 0.0)
@@ -51,45 +47,35 @@ def relay(**more: Any) -> Relay:
 def test_a_pose_carries_its_time_of_capture_in_the_vehicle_s_clock() -> None:
     one = relay()
     one.take(sample(NOW - 30 * MS), LEVEL)
-    (pose,) = one.due(NOW, offset_ns=900 * SECOND, asks=False, refused=())
+    (pose,) = one.due(NOW, offset_ns=900 * SECOND, refused=())
     assert pose == Pose("vision-position-estimate", 99_970_000, (1.0, 2.0, -0.5), LEVEL, None)
-
-
-def test_a_vehicle_that_asks_for_our_time_gets_stamps_of_our_clock() -> None:
-    """PX4 moves the stamps by what its own TIMESYNC found: moved here too they would be shifted twice."""
-    one = relay()
-    one.take(sample(NOW - 30 * MS), LEVEL)
-    (pose,) = one.due(NOW, offset_ns=900 * SECOND, asks=True, refused=())
-    assert pose.usec == (NOW - 30 * MS) // 1000
 
 
 def kept(one: Relay) -> dict[str, int]:
     return {reason: count for reason, count in one.kept.items() if count}
 
 
-def test_nothing_goes_without_a_clock_or_an_attitude_or_when_switched_off() -> None:
+def test_nothing_goes_without_an_attitude_or_when_switched_off() -> None:
     one = relay()
-    one.take(sample(NOW), LEVEL)
     one.take(sample(NOW), None)
-    assert one.due(NOW, offset_ns=None, asks=False, refused=()) == ()
     one.take(sample(NOW), LEVEL)
-    assert one.due(NOW, offset_ns=NOW, asks=False, refused=()) == ()  # before the vehicle's clock began
-    assert kept(one) == {"no clock": 2, "no attitude": 1}
+    assert one.due(NOW, offset_ns=NOW, refused=()) == ()  # before the vehicle's clock began
+    assert kept(one) == {"no clock": 1, "no attitude": 1}
     off = Relay(RelayConfig())
     off.take(sample(NOW), LEVEL)
-    assert off.due(NOW, offset_ns=0, asks=False, refused=()) == ()
+    assert off.due(NOW, offset_ns=0, refused=()) == ()
 
 
 def test_stale_late_and_refused_positions_stay_here() -> None:
     one = relay()
     one.take(sample(NOW - MAX_AGE_NS - 1), LEVEL)
     one.take(sample(NOW - 10 * MS, 1.0, 1.0, 0.0), LEVEL)
-    assert len(one.due(NOW, offset_ns=0, asks=False, refused=())) == 1
+    assert len(one.due(NOW, offset_ns=0, refused=())) == 1
     one.take(sample(NOW - 40 * MS, 1.1, 1.0, 0.0), LEVEL)  # captured before the one that went
-    assert one.due(NOW, offset_ns=0, asks=False, refused=()) == ()
+    assert one.due(NOW, offset_ns=0, refused=()) == ()
     refused = sample(NOW + 40 * MS, 1.2, 1.0, 0.0)
     one.take(refused, LEVEL)
-    assert one.due(NOW + 50 * MS, offset_ns=0, asks=False, refused=(refused,)) == ()
+    assert one.due(NOW + 50 * MS, offset_ns=0, refused=(refused,)) == ()
     assert kept(one) == {"stale": 1, "late": 1, "refused": 1}
 
 
@@ -98,11 +84,11 @@ def test_a_frozen_pose_is_stuck_until_it_changes() -> None:
     for n in range(60):
         at_ns = NOW + n * 50 * MS
         one.take(sample(at_ns, received_ns=at_ns), LEVEL)
-        sent += len(one.due(at_ns, offset_ns=0, asks=False, refused=()))
+        sent += len(one.due(at_ns, offset_ns=0, refused=()))
     assert (sent, kept(one)) == (STUCK_AFTER, {"stuck": 60 - STUCK_AFTER})
     at_ns = NOW + 60 * 50 * MS
     one.take(sample(at_ns, 1.0, 2.0, -0.51, received_ns=at_ns), LEVEL)
-    assert len(one.due(at_ns, offset_ns=0, asks=False, refused=())) == 1
+    assert len(one.due(at_ns, offset_ns=0, refused=())) == 1
 
 
 def test_the_rate_is_bounded_and_the_order_is_that_of_capture() -> None:
@@ -111,7 +97,7 @@ def test_the_rate_is_bounded_and_the_order_is_that_of_capture() -> None:
         at_ns = NOW + n * 10 * MS
         one.take(sample(at_ns, n * 1e-3, 0.0, 0.0, received_ns=at_ns), LEVEL)
         if n % 10 == 9:
-            poses += one.due(at_ns, offset_ns=0, asks=False, refused=())
+            poses += one.due(at_ns, offset_ns=0, refused=())
     stamps = [pose.usec for pose in poses]
     assert stamps == sorted(stamps) and 38 <= len(stamps) <= 41
 
@@ -119,8 +105,8 @@ def test_the_rate_is_bounded_and_the_order_is_that_of_capture() -> None:
 def test_what_arrives_after_the_tick_waits_for_the_next() -> None:
     one = relay()
     one.take(sample(NOW, received_ns=NOW + 1), LEVEL)
-    assert one.due(NOW, offset_ns=0, asks=False, refused=()) == ()
-    assert len(one.due(NOW + 50 * MS, offset_ns=0, asks=False, refused=())) == 1
+    assert one.due(NOW, offset_ns=0, refused=()) == ()
+    assert len(one.due(NOW + 50 * MS, offset_ns=0, refused=())) == 1
 
 
 def test_odometry_has_the_velocity_in_body_axes_and_without_one_it_is_a_position() -> None:
@@ -128,13 +114,13 @@ def test_odometry_has_the_velocity_in_body_axes_and_without_one_it_is_a_position
     assert east is not None
     one = relay(message="odometry")
     one.take(sample(NOW, velocity=(0.0, 2.0, 0.0)), east)
-    (pose,) = one.due(NOW, offset_ns=0, asks=False, refused=())
+    (pose,) = one.due(NOW, offset_ns=0, refused=())
     assert pose.body_mps == pytest.approx((2.0, 0.0, 0.0))
     (message,) = read(Encoder(245, 25).external_position(pose))
     assert (message.get_type(), message.frame_id, message.child_frame_id) == ("ODOMETRY", 20, 12)
     assert (message.x, message.y, message.z, message.vx) == pytest.approx((1.0, 2.0, -0.5, 2.0))
     one.take(sample(NOW + SECOND, received_ns=NOW + SECOND), east)
-    (pose,) = one.due(NOW + SECOND, offset_ns=0, asks=False, refused=())
+    (pose,) = one.due(NOW + SECOND, offset_ns=0, refused=())
     (message,) = read(Encoder(245, 25).external_position(pose))
     assert message.get_type() == "VISION_POSITION_ESTIMATE"
     assert (message.roll, message.pitch, message.yaw) == pytest.approx((0.0, 0.0, math.pi / 2))
@@ -155,62 +141,6 @@ def test_nothing_unsound_is_ever_sent(pose: Pose) -> None:
 
 
 # --- against the simulated vehicles, in lockstep ---------------------------------------------------------------------
-
-
-class Indoors:
-    """The whole loop, and a vehicle on the floor that knows its position only through us."""
-
-    def __init__(self, name: str, *more: str) -> None:
-        self.config = load_config(
-            "room-hahn-stursberg",
-            [
-                f"sim.autopilot={name}",
-                "sim.camera.rate_hz=30.0",
-                "relay.enabled=true",
-                "link.loss=0.0",
-                "sim.plant=quadrotor",
-                "solver.method=exact",
-                # a heading of its own, so that an attitude is told
-                "frame.yaw_deg=20",
-                *more,
-            ],
-        )
-        self.memory = Memory()
-        self.loop = shared_loop(self.config, self.memory)
-        self.peers = Peers(self.config, 0, airborne=False)
-        for parameter, value in EXTERNAL_ONLY[name].items():
-            assert self.peers.autopilot.parameters.set(parameter, value)
-        self.tick = 0
-
-    def run(self, seconds: float, *, stop: bool = False) -> None:
-        for _ in range(round(seconds * 20)):
-            if self.loop.finished:
-                return
-            at_ns = self.tick * 50 * MS
-            self.peers.converse(at_ns, self.loop.receive)
-            self.loop.tick(self.tick, at_ns, self.peers.receiver(at_ns), stop=stop)
-            self.tick += 1
-
-    def pilot_flies(self, external: str) -> None:
-        """The pilot takes off by hand, and switches at 1.2 m."""
-        pilot, kind = self.peers.autopilot.pilot, SIMULATED[self.config.sim.autopilot]
-        if kind.name == "ardupilot":
-            pilot.change(kind.mode(external), self.peers.now_ns)
-        assert pilot.arm(self.peers.now_ns) == 0 and pilot.take_off(1.2, self.peers.now_ns) == 0
-        self.run(5.0)
-        assert pilot.change(kind.mode(external), self.peers.now_ns) == 0
-        self.run(3.0)
-        assert self.loop.who_flies is HandoverState.ENGAGED and not self.loop.finished
-
-    def sent(self, *kinds: str) -> Iterator[tuple[int, Any]]:
-        for record in self.memory.of(Datagram):
-            if record.outgoing:
-                for message in read(record.data):
-                    if message.get_type() in kinds:
-                        yield record.at_ns, message
-
-    def relayed(self) -> Iterator[tuple[int, Any]]:
-        return self.sent("VISION_POSITION_ESTIMATE", "ODOMETRY")
 
 
 @BOTH
@@ -267,7 +197,7 @@ def test_px4_moves_stamps_once_its_timesync_has_converged_and_moved_here_too_the
     assert estimator.position_ok
     assert min(ages_ms[-20:]) > 45 and max(ages_ms[-20:]) < 200  # the cameras' time, and the wait for the tick
     # As if nobody had noticed that PX4 moves stamps itself.
-    monkeypatch.setattr(MavlinkConnection, "vehicle_asks_time", False)
+    monkeypatch.setitem(PROFILES, "px4", replace(PROFILES["px4"], moves_stamps=False))
     rig.run(7.0)
     assert len([at_ns for at_ns, _ in rig.relayed() if at_ns > 53 * SECOND]) > 90
     assert not estimator.position_ok

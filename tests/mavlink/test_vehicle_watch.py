@@ -13,7 +13,7 @@ from uavctl.config.connections import DaemonConfig
 from uavctl.config.types import EstimatorConfig
 from uavctl.mavlink.connection import MavlinkConnection
 from uavctl.mavlink.messages import Ack, Text
-from uavctl.mavlink.vehicle import ALONE_NS, GONE_NS, TURNED_NS, Punctual
+from uavctl.mavlink.vehicle import ALONE_NS, FROZEN_RAW_US, GONE_NS, TURNED_NS, SensorStream
 from uavctl.records import InertialSample, VehicleStatus
 
 NOW = 1000 * SECOND
@@ -276,13 +276,33 @@ def test_inertial_data_that_are_not_of_now_say_nothing(lies: Callable[[int], tup
     assert len(taken[100:]) <= 1 + TURNED_NS // (20 * MS)  # as long as the last attitude turns them
 
 
-@pytest.mark.parametrize("ppm", [-500, 500])
+@pytest.mark.parametrize("ppm", [-14_000, -500, 500, 14_000])
 def test_clocks_that_drift_apart_for_half_an_hour_lose_nothing(ppm: int) -> None:
-    stream_of_now = Punctual()
-    for second in range(1800):
-        at_ns = NOW + second * SECOND
-        stamp_us = (at_ns + second * ppm * 1000) // 1000
-        assert stream_of_now.takes(stamp_us, (0.01 * (second % 3), 0.0, 0.0), at_ns), second
+    stream_of_now = SensorStream()
+    for n in range(18_000):
+        at_ns = NOW + n * SECOND // 10
+        stamp_us = (at_ns + n * ppm * 100) // 1000
+        assert stream_of_now.takes(stamp_us, (0.01 * (n % 3), 0.0, 0.0), at_ns), n
+
+
+def test_a_new_stamp_is_a_new_measurement_and_the_same_stamp_is_none() -> None:
+    one = SensorStream()
+    for n in range(100):
+        at_ns, readings = NOW + n * 20 * MS, (float(n // 40), 0.0, -9.8)  # whole numbers repeat for 0.8 s
+        assert one.takes(at_ns // 1000, readings, at_ns, frozen_us=FROZEN_RAW_US)
+        assert one.takes(at_ns // 1000, readings, at_ns + MS, frozen_us=FROZEN_RAW_US) is None
+
+
+@pytest.mark.parametrize("name", ["px4-inertial-drift.tlog", "arducopter-inertial-integers.tlog"])
+def test_recorded_inertial_data_are_used(name: str) -> None:
+    """PX4's simulated clock ran 1.4 % slow; ArduPilot's whole numbers repeat. Both were dropped for it once."""
+    estimator = EstimatorConfig(position_std_m=0.005, inertial_std_mps2=0.1)
+    link, told = make_link(estimator=estimator), list[str]()
+    for at_ns, data in packets(name):
+        told += [event.code for event in events(link.receive(data, at_ns).items)]
+    used, total = link.inertial
+    assert total > 500 and used > 0.95 * total
+    assert "inertial-not-of-now" not in told and told.count("dropped") <= 1
 
 
 @pytest.mark.parametrize("jump_s", [-900, 900])
@@ -331,3 +351,61 @@ def test_inertial_data_are_asked_for_where_they_are_used_until_they_come(autopil
     assert [every <= one for one in silent] == [True] * 5 + [False]  # the last is for what is wanted of any vehicle
     assert [every <= one for one in asked(0.1, tells=True)][:4] == [True, True, True, False]
     assert not any(every & one for one in asked(0.0, tells=False))
+
+
+# --- Who is the vehicle
+
+GIMBAL, CAMERA, ONBOARD, QUADROTOR = 26, 30, 18, 2
+
+
+@pytest.mark.fault(16)
+@pytest.mark.parametrize("first", [True, False])
+@pytest.mark.parametrize(
+    ("component", "kind", "autopilot"),
+    [(154, GIMBAL, ARDUPILOT), (191, ONBOARD, 0), (100, CAMERA, PX4), (154, QUADROTOR, 0), (191, QUADROTOR, ARDUPILOT)],
+)
+def test_the_autopilot_is_the_vehicle_whatever_of_its_system_is_heard_first(
+    component: int, kind: int, autopilot: int, first: bool
+) -> None:
+    link, vehicle, device = make_link(), Peer(1, 1), Peer(1, component)
+    for n in range(4):
+        beats = [device.heartbeat(autopilot=autopilot, kind=kind), vehicle.heartbeat(OFFBOARD, 129, autopilot=PX4)]
+        for beat in beats if first else beats[::-1]:
+            found = statuses(link.receive(beat, NOW + n * SECOND).items)
+    assert link.vehicle == (1, 1)
+    status = newest(link, vehicle, NOW + 4 * SECOND)
+    assert (status.boots, status.alone) == (0, True)
+    assert {one.autopilot for one in found} <= {"px4"}
+
+
+@pytest.mark.fault(16)
+def test_a_component_that_is_configured_is_the_vehicle() -> None:
+    link = make_link(daemon=DaemonConfig(tick_s=0.05, vehicle_component_id=2))
+    for n in range(3):
+        link.receive(Peer(1, 1).heartbeat(), NOW + n * SECOND)
+        link.receive(Peer(1, 2).heartbeat(), NOW + n * SECOND)
+    assert link.vehicle == (1, 2)
+
+
+@pytest.mark.fault(16)
+def test_another_component_of_the_vehicles_system_says_nothing_of_the_vehicle() -> None:
+    link, vehicle = heard()
+    device = Peer(1, 191)
+    answer = device.send("command_ack", 400, 0, 0, 0, 245, 25)
+    landed = device.send("extended_sys_state", 0, 1)
+    moves = device.send("attitude", 60_000, 0.5, 0.0, 0.0, 0.0, 0.0, 0.0)
+    assert not [item for data in (answer, landed, moves) for item in link.receive(data, NOW).items]
+    (said,) = link.receive(device.send("statustext", 4, b"failsafe"), NOW).items  # shown, and nothing is made of it
+    assert not isinstance(said, Text)
+    status = newest(link, vehicle)
+    assert status.landed is None and not status.failsafe
+
+
+def test_a_vehicle_that_sends_its_position_but_no_heartbeat_is_reported_once() -> None:
+    link, told = make_link(), list[str]()
+    for n in range(100):
+        told += [
+            event.code
+            for event in events(link.receive(Peer(1, 1).local_position(60_000 + 100 * n), NOW + n * SECOND // 10).items)
+        ]
+    assert told == ["no-heartbeat"] and link.vehicle is None

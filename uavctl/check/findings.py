@@ -157,7 +157,7 @@ class Heard:
         if isinstance(message, Heartbeat) and is_vehicle(message) and vehicle in (None, _address(message)):
             self.heartbeat = message
             self.heartbeat_ns = at_ns
-        if vehicle is None or message.system != vehicle[0]:
+        if _address(message) != vehicle:
             return
         match message:
             case Position(local_ned=True):

@@ -36,10 +36,17 @@ def position_items(seen: Heard, config: Config, at_ns: int) -> list[Item]:
         return [_nothing(seen, config)]
     captured_s = sorted(one.captured_ns * 1e-9 for one in seen.samples)
     period_s = _period_s(captured_s)
-    items = [_rate(captured_s, period_s, config), _gaps(seen, config, at_ns), _age(seen, config)]
+    items = [_rate(seen.samples, period_s, config), _gaps(seen, config, at_ns), _age(seen, config)]
     items.append(_loss(captured_s, config))
     items += [_noise(seen.samples, config), _place(seen.samples, config), _stuck(seen)]
-    return items
+    units = sorted({unit for stats in seen.stats.values() for unit in stats.stamp_units})
+    return [*items, _units(units)] if units else items
+
+
+def _units(units: list[str]) -> Item:
+    value = ", ".join("they do not go on" if unit == "constant" else f"in {unit}" for unit in units)
+    hint = "set the source to stamp in microseconds; until then ages count from the arrival, less clock.latency_s"
+    return item("position stamps", ItemState.NOTE, value, "in us, of the capture", hint)
 
 
 def _nothing(seen: Heard, config: Config) -> Item:
@@ -71,16 +78,18 @@ def _period_s(captured_s: list[float]) -> float | None:
     return period_s if regular >= _MOSTLY * len(steps) else None
 
 
-def _rate(captured_s: list[float], period_s: float | None, config: Config) -> Item:
+def _rate(samples: list[Sample], period_s: float | None, config: Config) -> Item:
+    """Judge the rate of captures, and show that of arrivals, by our clock."""
+    arrivals_s = sorted(one.received_ns * 1e-9 for one in samples)
     wanted_hz = config.source.rate_hz or 1.0 / config.plant.dt_s
     least_hz, why = _RATE_PART * wanted_hz, f"{_RATE_PART:.0%} of source.rate_hz, or of one each plant.dt_s"
     if period_s is None:
         least_hz, why = least_hz * (1.0 - config.link.loss), f"{why}, less link.loss"
     want = f"at least {least_hz:.3g} Hz ({why})"
-    if len(captured_s) <= _ENOUGH:
-        value = f"only {len(captured_s)} positions came"
+    if len(arrivals_s) <= _ENOUGH:
+        value = f"only {len(arrivals_s)} positions came"
         return item("position rate", ItemState.BAD, value, want, "listen longer, or see why")
-    arrived_hz = (len(captured_s) - 1) / max(captured_s[-1] - captured_s[0], 1e-9)
+    arrived_hz = (len(arrivals_s) - 1) / max(arrivals_s[-1] - arrivals_s[0], 1e-9)
     if period_s is None:
         good, value = arrived_hz >= least_hz, "irregular captures"
     else:

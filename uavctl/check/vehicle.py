@@ -18,7 +18,7 @@ from uavctl.check.findings import Heard, Item, ItemState, item, judged
 from uavctl.config.checks import position_limits_m
 from uavctl.config.types import Config
 from uavctl.flight.envelope import MOTION_NS
-from uavctl.mavlink.clocksync import MAX_ROUND_TRIP_NS, RoundTrips
+from uavctl.mavlink.clocksync import NEAR_NS, RoundTrips
 from uavctl.mavlink.vehicle import SECOND_VEHICLE
 from uavctl.smpc.plant import AXES
 
@@ -27,7 +27,7 @@ from uavctl.smpc.plant import AXES
 
 _DRIFT_PPM = 500.0  # crystals keep 100; what is above is a simulator, or a broken clock
 _REJECTED = 0.5  # part of the answers
-_WANT = f"TIMESYNC answered within {MAX_ROUND_TRIP_NS * 1e-6:.0f} ms"
+_WANT = f"TIMESYNC answered within {NEAR_NS * 1e-6:.0f} ms"
 
 
 def clock_items(seen: Heard, config: Config) -> list[Item]:
@@ -43,10 +43,7 @@ def clock_items(seen: Heard, config: Config) -> list[Item]:
 def _of_vehicle(config: Config) -> tuple[ItemState, str]:
     """Return how bad it is that the vehicle does not answer, and what to do."""
     if config.relay.enabled:
-        return (
-            ItemState.BAD,
-            "[relay] needs the vehicle's clock for its stamps: does the link carry our messages to it?",
-        )
+        return (ItemState.BAD, "does the link carry our messages to the vehicle? Positions of [relay] go the same way")
     return ItemState.NOTE, "does the link carry our messages to the vehicle? Setpoints go the same way"
 
 
@@ -58,8 +55,8 @@ def _clock(name: str, trips: RoundTrips | None, unanswered: tuple[ItemState, str
     drift = trips.drift_ppm
     value = f"round trip median {middle_ms:.2g} ms, 95 % within {p95_ms:.2g} ms, {trips.rejected} rejected"
     value += "" if drift is None else f", drift {drift:+.0f} ppm"
-    if trips.rejected > _REJECTED * len(ordered):
-        hint = "a slow or busy link: offsets of such answers are not believed, ages are less certain"
+    if trips.rejected > _REJECTED * len(ordered) or middle_ms > NEAR_NS * 1e-6:
+        hint = "a slow or busy link: offsets and ages are uncertain by half of the round trip"
         return item(name, ItemState.NOTE, value, f"{_WANT}, and few answers rejected", hint)
     if drift is not None and abs(drift) > _DRIFT_PPM:
         hint = "the drift is followed; a real clock keeps 100 ppm, so this is a simulator, or a computer short of time"

@@ -201,6 +201,14 @@ class DaemonConfig(Section, frozen=True, kw_only=True):
     vehicle_system_id: Annotated[
         int, Meta(ge=0, le=255, description="MAVLink system id of the vehicle; 0 takes the first one that is heard")
     ] = 0
+    vehicle_component_id: Annotated[
+        int,
+        Meta(
+            ge=0,
+            le=255,
+            description="MAVLink component id of the vehicle's autopilot; 0 takes any, and 1 rather than another",
+        ),
+    ] = 0
     system_id: Annotated[int, Meta(ge=1, le=255, description="MAVLink system id of the daemon")] = 245
     component_id: Annotated[int, Meta(ge=1, le=255, description="MAVLink component id of the daemon (25 = user 1)")] = (
         25

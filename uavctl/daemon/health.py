@@ -55,6 +55,7 @@ class RelayHealth(msgspec.Struct, frozen=True, kw_only=True):
     kept: dict[str, int]  # positions not passed on, by reason
     last_s: float | None  # since the last one; None before the first
     alone: bool  # nothing else is sent any more: control has ended, or failed
+    silent_for: str = ""  # reason why the vehicle has got none for half a second; empty while it gets them
 
 
 class Health(msgspec.Struct, frozen=True, kw_only=True):
@@ -81,6 +82,8 @@ class Health(msgspec.Struct, frozen=True, kw_only=True):
     ending: str = ""  # end of the flight, under way or come, in words; empty while nothing ends it
     relay: RelayHealth | None = None  # None where no positions are passed on
     let_go: str = ""  # why the envelope has let the vehicle go; empty as long as it has not
+    # share of the vehicle's inertial data of the last second that are used; None where none came, or none are wanted
+    inertial: float | None = None
 
 
 class WatchedFlight(Protocol):
@@ -96,6 +99,11 @@ class WatchedFlight(Protocol):
     @property
     def relay(self) -> RelayStats | None:
         """Counts of the positions passed on to the vehicle; None where none are passed on."""
+        ...
+
+    @property
+    def inertial(self) -> tuple[int, int] | None:
+        """Inertial data of the vehicle that are used, and all that came; None where none are used."""
         ...
 
     @property
@@ -137,6 +145,8 @@ class HealthWatch:
         self._worst_before_ns = 0  # of the last one
         self._recording = "well"  # as last told
         self._let_go = ""  # the same
+        self._inertial = (0, 0)  # data used and all, by the last look of a second
+        self._inertial_share: float | None = None
         self._relayed = (0, 0.0)  # positions by the last look of a second, and how many a second came in it
 
     def after_tick(self, ticked: Ticked, lateness_ns: int) -> None:
@@ -160,6 +170,10 @@ class HealthWatch:
             relay = self._flight.relay
             if relay is not None:
                 self._relayed = relay.sent, float(relay.sent - self._relayed[0])
+            inertial = self._flight.inertial
+            if inertial is not None:
+                used, total = (now - before for now, before in zip(inertial, self._inertial, strict=True))
+                self._inertial, self._inertial_share = inertial, used / total if total else None
             health = self.look()
             self._alarm(health.recorder)
             self._tell(line(health))
@@ -209,6 +223,7 @@ class HealthWatch:
             ending=flight.course.told,
             relay=self._relay(),
             let_go=flight.let_go,
+            inertial=self._inertial_share,
         )
 
     def _relay(self) -> RelayHealth | None:
@@ -216,7 +231,14 @@ class HealthWatch:
         if stats is None:
             return None
         last_s = None if stats.last_ns is None else max(0.0, (self._now_ns - stats.last_ns) * 1e-9)
-        return RelayHealth(sent=stats.sent, sent_hz=self._relayed[1], kept=stats.kept, last_s=last_s, alone=stats.alone)
+        return RelayHealth(
+            sent=stats.sent,
+            sent_hz=self._relayed[1],
+            kept=stats.kept,
+            last_s=last_s,
+            alone=stats.alone,
+            silent_for=stats.silent_for,
+        )
 
 
 def line(health: Health) -> str:
@@ -232,7 +254,8 @@ def line(health: Health) -> str:
         f"missed {health.missed_ticks}",
         f"vehicle {mode}",
         f"battery {_number(battery, '.1f')} V",
-        *(() if relay is None else (f"relay {relay.sent_hz:.0f} /s{' alone' if relay.alone else ''}",)),
+        *(() if relay is None else (_relayed(relay),)),
+        *(() if health.inertial is None else (f"inertial {100 * health.inertial:.0f} %",)),
         f"dropped {health.recorder.dropped}" + (f" ({health.recorder.reason})" if health.recorder.reason else ""),
     )
     return "  ".join(fields)
@@ -252,6 +275,11 @@ def _vehicle(vehicle: VehicleStatus, now_ns: int) -> VehicleHealth:
         battery_v=vehicle.battery_v,
         heard_s=max(0.0, (now_ns - vehicle.at_ns) * 1e-9),
     )
+
+
+def _relayed(relay: RelayHealth) -> str:
+    silent = f" SILENT ({relay.silent_for})" if relay.silent_for else ""
+    return f"relay {relay.sent_hz:.0f} /s{' alone' if relay.alone else ''}{silent}"
 
 
 def _number(value: float | None, form: str) -> str:

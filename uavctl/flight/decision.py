@@ -35,6 +35,7 @@ from uavctl.records import (
     Vec3,
     Vector,
     VehicleStatus,
+    moves_now,
 )
 from uavctl.smpc.answer import Answer, Preview, Solver, all_finite
 from uavctl.smpc.plant import Plant
@@ -497,16 +498,17 @@ def _wait_out(state: ControlState, fallback: Fallback, tick: Tick, inp: StepInpu
     nothing is sent, so that a vehicle that still listens lands by its own failsafe.
     """
     later = _advanced(state, fallback, tick, inp, controller)
+    unheard = "the vehicle's heartbeats are missing" if moves_now(inp.motion, inp.at_ns) else "no vehicle is heard"
     state = replace(state, plan=None, fresh=0 if state.fallback is None else state.fresh)
     if later.ended:
-        reason = "no vehicle is heard, and the time to hold is over: its own failsafe is left to act"
+        reason = f"{unheard}, and the time to hold is over: its own failsafe is left to act"
         due = (
             fallback
             if fallback.final
             else Fallback(mode=fallback.mode, since_ns=fallback.since_ns, end=FallbackEnd.LAND)
         )
         return Choice(replace(state, fallback=due), reason, mute=True)
-    return Choice(replace(state, fallback=later), "no vehicle is heard; the fallback's time runs on")
+    return Choice(replace(state, fallback=later), f"{unheard}; the fallback's time runs on")
 
 
 def _advanced(state: ControlState, fallback: Fallback, tick: Tick, inp: StepInput, controller: Controller) -> Fallback:

@@ -1,8 +1,8 @@
 """A source's stamps to our monotonic clock; pure, time is an argument.
 
 Two estimates of (our time − its time): from TIMESYNC round trips if the source answers them, else the
-sliding minimum of (received − stamp), which is the true offset plus the smallest delay; `latency`, the
-smallest delay as configured, is taken off again.
+minimum of (received − stamp), which is the true offset plus the smallest delay; `latency`, the smallest delay as
+configured, is taken off again.
 """
 
 from __future__ import annotations
@@ -10,9 +10,15 @@ from __future__ import annotations
 from collections import deque
 from enum import StrEnum
 from itertools import combinations
-from statistics import median
+from statistics import median, median_low
 
-MAX_ROUND_TRIP_NS = 10_000_000
+from uavctl.records import Vec3
+
+MAX_ROUND_TRIP_NS = 1_000_000_000  # a slower answer bounds the offset by nothing of use
+NEAR_NS = 10_000_000  # a round trip that is so much longer than the shortest says as much
+# By which a clock's drift may change: real ones keep 1e-4, that of a simulator on a busy computer is followed so.
+DRIFT_CHANGE = 2e-3
+SECOND_NS = 1_000_000_000
 MAX_DEVIATION_NS = 100_000_000
 RESYNC_AFTER = 5  # deviating values in a row that are believed
 LEAP_NS = 1_000_000_000
@@ -40,6 +46,55 @@ class ClockSource(StrEnum):
     TIMESYNC = "timesync"
     MINIMUM = "minimum"
     NONE = "none"
+
+
+class StampUnit(StrEnum):
+    """Unit of a source's stamps; MAVLink wants microseconds."""
+
+    MICROSECONDS = "us"
+    MILLISECONDS = "ms"
+    NANOSECONDS = "ns"
+    SECONDS = "s"
+    CONSTANT = "constant"  # they do not go on at all
+
+
+_PER_SECOND = {
+    StampUnit.SECONDS: 1.0,
+    StampUnit.MILLISECONDS: 1e3,
+    StampUnit.MICROSECONDS: 1e6,
+    StampUnit.NANOSECONDS: 1e9,
+}
+UNIT_NS = 1_500_000_000  # over which stamps are compared with our clock: stamps in s go on in it
+
+
+class StampUnitWatch:
+    """Recognises the unit of a source's stamps by how fast they go on, against our clock.
+
+    Attributes:
+        unit: as recognised; microseconds until another one is.
+    """
+
+    def __init__(self) -> None:
+        self.unit = StampUnit.MICROSECONDS
+        self._begun: tuple[int, int, Vec3] | None = None  # stamp, arrival, position
+
+    def take(self, stamp: int, position_m: Vec3, at_ns: int) -> StampUnit:
+        """Take a stamp, and the position that has it; return the unit.
+
+        The same stamp with the same position is a repeated message, and says nothing of the unit.
+        """
+        if self._begun is None:
+            self._begun = stamp, at_ns, position_m
+        elif at_ns - self._begun[1] >= UNIT_NS:
+            advance, passed_s = stamp - self._begun[0], (at_ns - self._begun[1]) * 1e-9
+            if advance == 0 and position_m != self._begun[2]:
+                self.unit = StampUnit.CONSTANT
+            for unit, per_second in _PER_SECOND.items():
+                # Whole seconds may be one more or less than have passed.
+                if 0.5 * per_second * passed_s <= advance <= 2.0 * per_second * passed_s:
+                    self.unit = unit
+            self._begun = stamp, at_ns, position_m
+        return self.unit
 
 
 class SlidingMinimum:
@@ -71,30 +126,52 @@ class SlidingMinimum:
 class RoundTrips:
     """Offset and drift of a peer's clock from its answers to TIMESYNC requests.
 
-    The offset between answers is that of a robust line (Theil and Sen: median of the slopes between all pairs) through
-    the last few. Against the recorded flights, just before each next answer: a simulator whose clock ran 1.3 % slow is
-    followed to 2.8 ms (median; an average of the offsets alone was 47 ms behind), steady ones to 0.5 ms.
+    An answer bounds the offset: the peer read its clock between our sending and our receiving, so the middle is off by
+    half the round trip at most. The offset is that of a robust line (Theil and Sen: median of the slopes between all
+    pairs) through the last answers that are about as short as the shortest. A longer one counts like these once the
+    line may be off by as much, as its uncertainty grows with time; before that it only keeps the line in its bounds.
+    Without answers the line goes on. Against the recorded flights, just before each next answer: a simulator whose
+    clock ran 1.3 % slow is followed to 2.8 ms (median; an average of the offsets alone was 47 ms behind), steady ones
+    to 0.5 ms.
+
+    Attributes:
+        rejected: answers that were not used: too slow to say anything, or of another clock.
+        shortest_ns: the shortest round trip of those that the line goes through.
     """
 
     def __init__(self, lifetime_ns: int) -> None:
         self._lifetime_ns = lifetime_ns
-        self._trips: deque[tuple[int, int]] = deque(maxlen=FITTED)  # (received, offset)
+        self._trips: deque[tuple[int, int, int]] = deque(maxlen=FITTED)  # (received, offset, round trip)
         self._round_trips_ns: deque[int] = deque(maxlen=REMEMBERED_TRIPS)
+        self._drifts = False  # whether the slope is known
         self._slope = 0.0
         self._base_ns = 0
+        self._base_at_ns = 0
+        self._heard_ns = 0  # arrival of the last answer that was used
         self._deviating = 0
         self.rejected = 0
+        self.shortest_ns = 0
 
     def offset_ns(self, at_ns: int) -> int | None:
-        """(our time − its time), or None without a good answer in the last `lifetime_ns`."""
-        if not self._trips or at_ns - self._trips[-1][0] > self._lifetime_ns:
+        """(our time − its time), or None without a usable answer in the last `lifetime_ns`."""
+        if not self._trips or at_ns - self._heard_ns > self._lifetime_ns:
             return None
-        return self._base_ns + round(self._slope * (at_ns - self._trips[-1][0]))
+        return self.last_known_ns(at_ns)
+
+    def last_known_ns(self, at_ns: int) -> int | None:
+        """(our time − its time) by the answers so far, however long ago they came; None before the first."""
+        return self._base_ns + round(self._slope * (at_ns - self._base_at_ns)) if self._trips else None
+
+    def uncertainty_ns(self, at_ns: int) -> int | None:
+        """Largest error of the offset at that time; None before the first answer."""
+        if not self._trips:
+            return None
+        return self.shortest_ns // 2 + round(DRIFT_CHANGE * (at_ns - self._trips[-1][0]))
 
     @property
     def drift_ppm(self) -> float | None:
         """Gain of our clock on the peer's [millionths]; None before enough answers."""
-        return self._slope * 1e6 if self._settled else None
+        return self._slope * 1e6 if self._drifts else None
 
     @property
     def round_trips_ns(self) -> tuple[int, ...]:
@@ -108,7 +185,7 @@ class RoundTrips:
             sent_ns: our time when the request was sent.
 
         Returns:
-            Whether it was used; a slow or deviating one is not.
+            Whether it was used; a deviating one, or one that is too slow to say anything, is not.
         """
         used = self._take(sent_ns, remote_ns, received_ns)
         self.rejected += not used
@@ -120,35 +197,96 @@ class RoundTrips:
             self._round_trips_ns.append(round_trip_ns)
         if not 0 <= round_trip_ns <= MAX_ROUND_TRIP_NS:
             return False
-        measured_ns = sent_ns + round_trip_ns // 2 - remote_ns
-        old_ns = self.offset_ns(received_ns)
-        if old_ns is None:
-            self._trips.clear()
-        elif abs(measured_ns - old_ns) > MAX_DEVIATION_NS:
+        half_ns = round_trip_ns // 2
+        measured_ns = sent_ns + half_ns - remote_ns
+        known_ns, uncertain_ns = self.last_known_ns(received_ns), self.uncertainty_ns(received_ns)
+        if known_ns is not None and abs(measured_ns - known_ns) > max(MAX_DEVIATION_NS, half_ns):
             self._deviating += 1
-            if self._deviating < RESYNC_AFTER:
+            if self._deviating < RESYNC_AFTER and self.offset_ns(received_ns) is not None:
                 return False
-            self._trips.clear()
+            self._forget()
+            uncertain_ns = None
         self._deviating = 0
-        self._trips.append((received_ns, measured_ns))
+        self._heard_ns = received_ns
+        if known_ns is not None and uncertain_ns is not None and half_ns > uncertain_ns + NEAR_NS // 2:
+            within_ns = min(max(known_ns, measured_ns - half_ns), measured_ns + half_ns)
+            self._base_ns += within_ns - known_ns
+            return True
+        # Round trips of other lengths may be off by other amounts, which is no drift: the slope goes on without them.
+        alike = [trip for trip in self._trips if abs(round_trip_ns - trip[2]) <= 2 * NEAR_NS]
+        self._trips = deque([*alike, (received_ns, measured_ns, round_trip_ns)], maxlen=FITTED)
         self._fit()
         return True
 
-    @property
-    def _settled(self) -> bool:
-        return len(self._trips) >= MIN_FITTED and self._trips[-1][0] - self._trips[0][0] >= MIN_SPAN_NS
+    def _forget(self) -> None:
+        """Begin again: the peer has another clock now."""
+        self._trips.clear()
+        self._slope, self._drifts = 0.0, False
 
     def _fit(self) -> None:
         """The line through the last answers, as its slope and its value at the last one."""
+        self.shortest_ns = min(length_ns for _, _, length_ns in self._trips)
         last_ns = self._trips[-1][0]
-        self._slope = 0.0
-        if self._settled:
+        if len(self._trips) >= MIN_FITTED and last_ns - self._trips[0][0] >= MIN_SPAN_NS:
             pairs = combinations(self._trips, 2)
-            slope = median((o2 - o1) / (t2 - t1) for (t1, o1), (t2, o2) in pairs if t2 > t1)
-            self._slope = min(max(slope, -MAX_DRIFT), MAX_DRIFT)
+            slope = median((o2 - o1) / (t2 - t1) for (t1, o1, _), (t2, o2, _) in pairs if t2 > t1)
+            self._slope, self._drifts = min(max(slope, -MAX_DRIFT), MAX_DRIFT), True
         first_ns = self._trips[0][1]  # differences stay exact in floating point
-        levels = [offset - first_ns + self._slope * (last_ns - at_ns) for at_ns, offset in self._trips]
-        self._base_ns = first_ns + round(median(levels))
+        levels = [offset - first_ns + self._slope * (last_ns - at_ns) for at_ns, offset, _ in self._trips]
+        self._base_ns, self._base_at_ns = first_ns + round(median(levels)), last_ns
+
+
+class ArrivalClock:
+    """A sender's clock by the arrival of its stamps alone, whatever its drift: what came quickest counts.
+
+    (our time − its time) is never more than (arrival − stamp). The least of these goes on at the clock's drift, the
+    median of its rises from second to second: a link that becomes slower is one rise among many, and no drift.
+    """
+
+    def __init__(self) -> None:
+        self._least_ns: float = 0.0
+        self._at_ns: int | None = None  # time of the last stamp
+        self._second: tuple[int, int, int] = (0, 0, 0)  # its begin, least (arrival − stamp) in it, when that was
+        self._before: tuple[int, int] | None = None  # the last two of the second before
+        self._rises: deque[float] = deque(maxlen=FITTED)
+        self._slope = 0.0
+        self._ahead = 0  # stamps in a row that this clock cannot have given
+
+    def offset_ns(self, at_ns: int) -> int | None:
+        """(our time − its time) and the smallest delay; None before the first stamp."""
+        return None if self._at_ns is None else round(self._least_ns + self._slope * (at_ns - self._at_ns))
+
+    def delay_ns(self, stamp_ns: int, at_ns: int) -> int:
+        """Take a stamp; return by how much it came later than the quickest [ns]."""
+        behind_ns = at_ns - stamp_ns
+        if self._at_ns is None or self._ahead >= RESYNC_AFTER:
+            self._before, self._slope, self._ahead = None, 0.0, 0
+            self._rises.clear()
+            self._second, self._least_ns = (at_ns, behind_ns, at_ns), behind_ns
+        elif behind_ns < self._least_ns - LEAP_NS:
+            self._ahead += 1
+            return 0
+        else:
+            self._ahead = 0
+            self._follow(behind_ns, at_ns)
+            since_ns = at_ns - self._at_ns
+            self._least_ns = min(behind_ns, self._least_ns + (self._slope + DRIFT_CHANGE) * since_ns)
+        self._at_ns = at_ns
+        return round(behind_ns - self._least_ns)
+
+    def _follow(self, behind_ns: int, at_ns: int) -> None:
+        begun_ns, least_ns, least_at_ns = self._second
+        if at_ns - begun_ns < SECOND_NS:
+            if behind_ns < least_ns:
+                self._second = begun_ns, behind_ns, at_ns
+            return
+        if self._before is not None:
+            rise = (least_ns - self._before[0]) / (least_at_ns - self._before[1])
+            self._rises.append(min(max(rise, -MAX_DRIFT), MAX_DRIFT))
+            self._slope = median_low(self._rises)
+            if len(self._rises) == 1:  # the least of the first seconds did not know the drift
+                self._least_ns = least_ns + self._slope * (at_ns - least_at_ns)
+        self._before, self._second = (least_ns, least_at_ns), (at_ns, behind_ns, at_ns)
 
 
 class ClockSync:

@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from uavctl.config.connections import ClockConfig, DaemonConfig, FrameConfig, SourceConfig
 from uavctl.config.types import EstimatorConfig
 from uavctl.frames import Quaternion
-from uavctl.mavlink.clocksync import ClockSource, RoundTrips
+from uavctl.mavlink.clocksync import LEAP_NS, NEAR_NS, ArrivalClock, ClockSource, RoundTrips, StampUnit
 from uavctl.mavlink.codec import OWN_ESTIMATE, Encoder, StreamDecoder, UnsendableError, decode
 from uavctl.mavlink.framing import BadBytes
 from uavctl.mavlink.messages import (
@@ -33,7 +33,7 @@ from uavctl.mavlink.positions import SLOW_ANSWER, PositionDecoder
 from uavctl.mavlink.profile import PROFILES
 from uavctl.mavlink.relay import Relay
 from uavctl.mavlink.requests import COMMANDS, RequestKind
-from uavctl.mavlink.vehicle import SECOND_VEHICLE, Joiner, VehicleWatch
+from uavctl.mavlink.vehicle import ENOUGH, LOW_SHARE, SECOND_VEHICLE, UNPUNCTUAL, Joiner, VehicleWatch
 from uavctl.records import (
     Event,
     InertialSample,
@@ -222,6 +222,9 @@ OPEN_REQUESTS = 8  # requests whose answers are still taken
 MAX_ANSWERS, ANSWERS_NS = 8, 50_000_000
 STREAM_SCHEMES = ("tcp:", "serial:")
 SLOW_TOLD_NS = 10_000_000_000  # between two events of slow answers
+MUTE_NS = 3 * SECOND_NS  # three heartbeats that did not come
+NO_HEARTBEAT = "no-heartbeat"
+STAMP_UNIT = "stamp-unit"
 UNANSWERED = "timesync-flood"
 OVERRUN = "overrun"  # dropped by the system while nobody read, the vehicle's newest words perhaps
 HUNG_UP = "hung-up"  # times that the other side of a TCP connection has closed it
@@ -230,7 +233,8 @@ _LOST = {
     HUNG_UP: "the other side closed the connection; it is called again each second",
     WENT_SILENT: "nothing came over the connection any more; it is made again",
 }
-_USUAL = frozenset({BadBytes.UNKNOWN, OWN_ESTIMATE, *_LOST})  # counted, not told: every flight has them, or told else
+# Counted, not told: every flight has them, or they are told in another way.
+_USUAL = frozenset({BadBytes.UNKNOWN, OWN_ESTIMATE, *_LOST})
 
 Item = PositionSample | VehicleStatus | VehicleMotion | InertialSample | Event | Ack | Text
 
@@ -277,7 +281,9 @@ class MavlinkConnection:
         self._encoder = Encoder(*self._own)
         self._intake = PositionDecoder(frame, clock, source, estimator, self._count)
         feels = estimator.inertial_std_mps2 > 0.0
-        self._vehicle = VehicleWatch(self._count, self._own, daemon.vehicle_system_id, inertial=feels)
+        self._vehicle = VehicleWatch(
+            self._count, self._own, daemon.vehicle_system_id, daemon.vehicle_component_id, inertial=feels
+        )
         self._streams, self._globe, self._texts = Streams(inertial=feels), Globe(), Joiner()
         self._lists, self._parameters = daemon.parameters, ParameterList()
         self._bad: Counter[str] = Counter()
@@ -286,6 +292,12 @@ class MavlinkConnection:
         self._slow = 0  # answers to TIMESYNC that were not used, and not told yet
         self._slow_told_ns: int | None = None
         self._resyncs_told = 0
+        self._low_share_told = False
+        # A vehicle that sends its position, but no heartbeat: its address, since when, and whether that was reported
+        self._mute: tuple[int, int] | None = None
+        self._mute_since_ns: int | None = None
+        self._mute_told = False
+        self._units_told: set[tuple[int, int, StampUnit]] = set()
         self._datagrams = self._messages = 0
         self._heartbeat_ns: int | None = None
         self._request_ns: int | None = None
@@ -293,7 +305,7 @@ class MavlinkConnection:
         self._open: deque[int] = deque(maxlen=OPEN_REQUESTS)
         self._answered = False
         self._listen = listen
-        self._askers: set[int] = set()  # systems that ask for our time
+        self._vehicle_clock = ArrivalClock()
         self._answers: list[bytes] = []  # to requests of the datagram in hand
         self._answers_from_ns = 0
         self._answered_to: Counter[bool] = Counter()  # requests of the vehicle's, and of all others, in that time
@@ -316,9 +328,9 @@ class MavlinkConnection:
         self._intake.answer(address, sent_ns, remote_ns, received_ns)
 
     @property
-    def vehicle_asks_time(self) -> bool:
-        """Whether the vehicle has asked for our time."""
-        return self.vehicle is not None and self.vehicle[0] in self._askers
+    def inertial(self) -> tuple[int, int]:
+        """Inertial data of the vehicle that are used, and all that came."""
+        return self._vehicle.inertial_used, self._vehicle.inertial_total
 
     def vehicle_up_s(self, at_ns: int) -> float | None:
         """Return the time since the vehicle started, by its own clock [s]; None if it does not tell."""
@@ -447,16 +459,29 @@ class MavlinkConnection:
         """The positions that go to the vehicle's own estimator in the tick of `at_ns`.
 
         Args:
-            autopilot: the vehicle's kind; only PX4 moves stamps by what it has asked.
+            autopilot: the vehicle's kind; only PX4 moves stamps itself.
             refused: samples that the tick did not believe.
         """
         if not relay.enabled or self.vehicle is None:
             return ()
-        trips = self.trips(self.vehicle)
-        offset_ns = None if trips is None else trips.offset_ns(at_ns)
-        asks = autopilot in PROFILES and PROFILES[autopilot].moves_stamps and self.vehicle_asks_time
-        poses = relay.due(at_ns, offset_ns=offset_ns, asks=asks, refused=refused)
+        moves = autopilot in PROFILES and PROFILES[autopilot].moves_stamps
+        offset_ns = 0 if moves else self._vehicle_offset_ns(at_ns)
+        poses = relay.due(at_ns, offset_ns=offset_ns, refused=refused)
         return tuple(self._encoder.external_position(pose) for pose in poses)
+
+    def _vehicle_offset_ns(self, at_ns: int) -> int:
+        """(our time - the vehicle's) by its newest answers, or else by older ones as far as its messages agree.
+
+        A message arrives after its stamp, and no round trip was shorter than its way. A vehicle that neither answers
+        nor stamps its messages gets our own time: steady, so its own estimate of the delay works.
+        """
+        trips, arrival_ns = self.trips(self.vehicle), self._vehicle_clock.offset_ns(at_ns)
+        known_ns = None if trips is None else trips.last_known_ns(at_ns)
+        if trips is None or known_ns is None:
+            return arrival_ns or 0
+        if arrival_ns is None or trips.offset_ns(at_ns) is not None or abs(arrival_ns - known_ns) > LEAP_NS:
+            return known_ns
+        return min(max(known_ns, arrival_ns - trips.shortest_ns - NEAR_NS), arrival_ns)
 
     def stats(self, at_ns: int) -> LinkStats:
         """Counters since the start."""
@@ -474,6 +499,7 @@ class MavlinkConnection:
             clock_rtt_ns=round(median(round_trips_ns)) if round_trips_ns else None,
             clock_drift_ppm=None if trips is None else trips.drift_ppm,
             clock_rejected=0 if trips is None else trips.rejected,
+            stamp_units=sorted({str(unit) for unit in self._intake.units.values()}),
         )
 
     def _target(self) -> tuple[int, int]:
@@ -500,25 +526,38 @@ class MavlinkConnection:
         if isinstance(message, Text):
             whole = self._texts.take(message, at_ns)
             return tuple(item for text in whole for item in self._vehicle.take(text, at_ns))
-        boots, unready = self._vehicle.boots, self._vehicle.unready
+        boots, unready, address = self._vehicle.boots, self._vehicle.unready, self.vehicle
         items = self._vehicle.take(message, at_ns)
+        if address is None and self.vehicle is None:
+            self._look_for_one(message, at_ns)
+        elif self.vehicle != address:
+            self._streams.restart()
+            self._globe, self._parameters, self._vehicle_clock = Globe(), ParameterList(), ArrivalClock()
         if self._vehicle.boots != boots:
             self._streams.restart()
-            self._globe, self._parameters = Globe(), ParameterList()
+            self._globe, self._parameters, self._vehicle_clock = Globe(), ParameterList(), ArrivalClock()
             text = f"link {self._name}: the vehicle has started anew"
             return (*items, Event(at_ns=at_ns, severity=Severity.ERROR, code="vehicle-reboot", text=text))
         if self._vehicle.unready != unready:
             self._streams.restart()  # those that go on will have been seen by the time they would be asked for
-        if self.vehicle is not None and message.system == self.vehicle[0]:
+        if (message.system, message.component) == self.vehicle:
             self._streams.saw(message)
             self._globe.saw(message)
-            if message.component == self.vehicle[1]:
-                self._parameters.saw(message)
+            self._parameters.saw(message)
+            match message:
+                case Position(boot_ms=True, stamp_us=int(stamp_us)) | Attitude(stamp_us=stamp_us) if stamp_us:
+                    self._vehicle_clock.delay_ns(1000 * stamp_us, at_ns)
         return items
+
+    def _look_for_one(self, message: Message, at_ns: int) -> None:
+        """Note a vehicle that sends its position or attitude, and no heartbeat."""
+        if isinstance(message, Attitude) or (isinstance(message, Position) and message.boot_ms):
+            self._mute = (message.system, message.component)
+            if self._mute_since_ns is None:
+                self._mute_since_ns = at_ns
 
     def _timesync(self, message: TimeSync, at_ns: int) -> None:
         if message.tc1_ns == 0:
-            self._askers.add(message.system)
             if at_ns - self._answers_from_ns >= ANSWERS_NS:
                 self._answers_from_ns = at_ns
                 self._answered_to.clear()
@@ -536,6 +575,9 @@ class MavlinkConnection:
         self._bad[reason] += count
         if reason == SLOW_ANSWER:
             self._slow += count
+        elif reason == UNPUNCTUAL:  # told once, and then by the share that is used
+            if self._bad[reason] == count:
+                self._untold[reason] += count
         elif reason not in _USUAL:
             self._untold[reason] += count
 
@@ -546,6 +588,25 @@ class MavlinkConnection:
             self._resyncs_told = self._intake.resyncs
             text = f"link {self._name}: a source's clock has jumped; synchronised anew"
             events.append(Event(at_ns=at_ns, severity=Severity.WARNING, code="clock-resync", text=text))
+        for (system, component), unit in self._intake.units.items():
+            if (system, component, unit) not in self._units_told:
+                self._units_told.add((system, component, unit))
+                what = "do not go on" if unit is StampUnit.CONSTANT else f"are in {unit}, not in us"
+                text = f"link {self._name}: stamps of the positions of {system}/{component} {what}: "
+                text += "they count by their arrival, and their ages are not known"
+                events.append(Event(at_ns=at_ns, severity=Severity.WARNING, code=STAMP_UNIT, text=text))
+        since_ns = self._mute_since_ns
+        if since_ns is not None and self.vehicle is None and not self._mute_told and at_ns - since_ns >= MUTE_NS:
+            self._mute_told = True
+            text = f"link {self._name}: system {self._mute and self._mute[0]} sends its position or attitude, "
+            text += "but no heartbeat of an autopilot: its mode is not known, so it is not flown"
+            events.append(Event(at_ns=at_ns, severity=Severity.WARNING, code=NO_HEARTBEAT, text=text))
+        used, total = self._vehicle.inertial_used, self._vehicle.inertial_total
+        if not self._low_share_told and total >= ENOUGH and used < LOW_SHARE * total:
+            self._low_share_told = True
+            text = f"link {self._name}: {1 - used / total:.0%} of the inertial data are not used: late, frozen, "
+            text += "or without an attitude of now"
+            events.append(Event(at_ns=at_ns, severity=Severity.WARNING, code=UNPUNCTUAL, text=text, count=total - used))
         if self._slow and (self._slow_told_ns is None or at_ns - self._slow_told_ns >= SLOW_TOLD_NS):
             self._slow_told_ns = at_ns
             events.append(self._slow_answers(at_ns))

@@ -331,7 +331,8 @@ class HandOver:
         silence = self.state is HandoverState.ENGAGED and sight.seen is HandoverEvent.SILENCE
         if silence != self._silent:
             self._silent = silence
-            text = "heartbeat lost: braking and holding" if silence else "heartbeat is back"
+            only = ", though its other messages come" if view.moves else ", and nothing else comes"
+            text = f"heartbeat lost{only}: braking and holding" if silence else "heartbeat is back"
             events.append(Event(at_ns=view.at_ns, severity=Severity.ERROR, code="heartbeat", text=text))
         overdue = self._now.request.given_up(view.at_ns) if self.state is HandoverState.LANDING else ""
         if overdue and not self._overdue:

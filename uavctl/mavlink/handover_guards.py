@@ -63,6 +63,7 @@ class HandoverView(msgspec.Struct, frozen=True, kw_only=True):
     unsafe: str = ""  # why a vehicle in the air must not climb on by these positions; empty if it may
     up_m: float | None = None  # height of the estimate in local NED [m]; None without one
     up_mps: float = 0.0  # its rate of climb [m/s]
+    moves: bool = False  # the vehicle sends its velocity or attitude now, whatever its heartbeats do
     heard: tuple[Ack | Text, ...] = ()  # the vehicle's answers and words since the last tick
     commands: tuple[Command, ...] = ()  # the operator's orders
 
@@ -255,7 +256,8 @@ def _never_ready(progress: Progress, view: HandoverView) -> str:
         return f"take-off: {_ARMED}{_OR_ENGAGE if progress.stands_by else ''}"
     if view.at_ns - progress.ordered_ns < round(limit_s * 1e9):
         return ""
-    reason = "no vehicle is heard" if vehicle is None else view.unfit or "the vehicle is silent"
+    missing = "the vehicle's heartbeats are missing" if view.moves else "the vehicle is silent"
+    reason = "no vehicle is heard" if vehicle is None else view.unfit or missing
     return f"take-off: {reason} (waited {limit_s:g} s)"
 
 

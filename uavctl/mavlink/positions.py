@@ -10,7 +10,7 @@ from typing import Generic, TypeVar, get_args
 from uavctl.config.connections import ClockConfig, FrameConfig, SourceConfig
 from uavctl.config.types import EstimatorConfig
 from uavctl.frames import Convention, Frame, Quaternion
-from uavctl.mavlink.clocksync import ClockSource, ClockSync, RoundTrips, StampRefusal
+from uavctl.mavlink.clocksync import ClockSource, ClockSync, RoundTrips, StampRefusal, StampUnit, StampUnitWatch
 from uavctl.mavlink.codec import BOOT_MS_WRAP
 from uavctl.mavlink.messages import Position
 from uavctl.records import PositionSample, Vec3
@@ -112,6 +112,8 @@ class PositionDecoder:
             self._frames[axes] = replace(configured, convention=axes)
         self._clock, self._source, self._estimator, self._bad = clock, source, estimator, bad
         self._clocks: SourceTable[tuple[Address, bool], ClockSync] = SourceTable(MAX_SOURCES, self._lost_place)
+        self._units: SourceTable[Address, StampUnitWatch] = SourceTable(MAX_SOURCES, self._lost_place)
+        self.units: dict[Address, StampUnit] = {}  # of the sources whose stamps are in another than microseconds
         self._round_trips: SourceTable[Address, RoundTrips] = SourceTable(MAX_SOURCES, self._lost_place)
         self._newcomers_left, self._newcomers_ns = float(NEWCOMERS_BURST), 0
         self._settled_ns: int | None = None  # when a settled source was heard last
@@ -213,7 +215,7 @@ class PositionDecoder:
         stamp_ns: int | None = None
         if message.boot_ms and message.stamp_us is not None:
             stamp_ns = clock.unwrap(message.stamp_us // 1000, BOOT_MS_WRAP, 1_000_000)
-        elif message.stamp_us is not None:
+        elif message.stamp_us is not None and self._is_in_us(message, message.stamp_us, received_ns):
             stamp_ns = message.stamp_us * 1000
         trips, resyncs = self._round_trips.get(address), clock.resyncs
         captured = clock.captured_ns(stamp_ns, received_ns, None if trips is None else trips.offset_ns(received_ns))
@@ -221,6 +223,17 @@ class PositionDecoder:
         if not isinstance(captured, str):
             self._latest, self._latest_address = clock, address
         return captured
+
+    def _is_in_us(self, message: Position, stamp: int, received_ns: int) -> bool:
+        """Whether a stamp is in the unit that it has to be in; else the position counts by its arrival."""
+        address = (message.system, message.component)
+        watch = self._units.hear(address, received_ns, StampUnitWatch)
+        before, unit = watch.unit, watch.take(stamp, message.position_m, received_ns)
+        if unit is not before:
+            self.units.pop(address, None)
+            if unit is not StampUnit.MICROSECONDS and len(self.units) < MAX_SOURCES:
+                self.units[address] = unit
+        return unit is StampUnit.MICROSECONDS
 
 
 def _key(message: Position) -> tuple[Address, bool]:

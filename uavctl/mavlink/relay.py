@@ -3,22 +3,41 @@
 A vehicle stamps by its own clock. Two ways lead there, and taking both would shift a stamp twice:
 
 * PX4 asks us for our time (TIMESYNC) and moves the stamps of what it receives by the offset that it finds
-  (src/lib/timesync/Timesync.cpp, `sync_stamp`). Whoever asks so gets stamps of our clock, which is what we answered.
-* Else the stamp is moved here, by the offset that the vehicle's answers to our own requests gave.
+  (src/lib/timesync/Timesync.cpp, `sync_stamp`); until it has found one it does not look at them. It gets stamps of our
+  clock, which is what we answered.
+* Else the stamp is moved here, by the offset that the vehicle's answers to our own requests gave, and without any by
+  the arrival of its messages. A clock that is not known to the millisecond never stops the positions: an estimator
+  bears a stamp that is a little off, and no silence.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from uavctl.config.connections import RelayConfig
 from uavctl.frames import Quaternion, rotate
-from uavctl.records import PositionSample, Vec3
+from uavctl.records import Event, PositionSample, Severity, Vec3
 
 MAX_AGE_NS = 200_000_000  # an older position would be taken for a new one by estimators that cannot look back
 STUCK_AFTER = 25  # poses in a row, the same to the last bit
 _WAITING = 64  # poses of one tick
+SILENT_NS = 500_000_000  # an estimator without positions for longer drifts by more than a hand's breadth
+START_NS = 3_000_000_000  # cameras and vehicle may take that long to begin
+RELAY_SILENT, RELAY_RESUMED = "relay-silent", "relay-resumed"
+NOTHING_COMES, HELD_BACK = "nothing comes", "held back"
+REASONS = {
+    NOTHING_COMES: "no position comes",
+    HELD_BACK: "positions were found to be wrong, and are held back",
+    "no attitude": "positions come without an attitude",
+    "refused": "positions are not believed",
+    "stale": f"positions come later than {MAX_AGE_NS / 1e6:.0f} ms after their capture",
+    "stuck": "positions do not change any more, not by the last bit",
+    "late": "positions come that are older than those before",
+    "rate": "stamps of positions do not go on",
+    "no clock": "stamps of positions are from before the vehicle's start",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +58,7 @@ class Relay:
         sent: poses passed on.
         last_ns: time of the tick that passed the last one on; None before.
         kept: poses that were not, by reason.
+        silent_for: reason why the vehicle gets no position now, a key of `REASONS`; empty while it gets them.
     """
 
     def __init__(self, config: RelayConfig) -> None:
@@ -48,6 +68,11 @@ class Relay:
         self._newest_ns: int | None = None  # capture of the last pose sent
         self._last: tuple[Vec3, Quaternion] | None = None
         self._same = 0
+        self._begun_ns: int | None = None  # time of the first tick
+        self._kept_by_then: Counter[str] = Counter()  # poses kept back by the time that the last one went
+        self._reported = ""  # this silence, while the vehicle was armed or on the ground
+        self._reported_on_ground = False  # any
+        self.silent_for = ""
         self.sent = 0
         self.last_ns: int | None = None
         self.kept = dict.fromkeys(("no attitude", "refused", "stale", "stuck", "late", "rate", "no clock"), 0)
@@ -67,23 +92,16 @@ class Relay:
         self._waiting.append((sample, attitude))
         del self._waiting[:-_WAITING]
 
-    def due(
-        self, at_ns: int, *, offset_ns: int | None, asks: bool, refused: Sequence[PositionSample]
-    ) -> tuple[Pose, ...]:
+    def due(self, at_ns: int, *, offset_ns: int, refused: Sequence[PositionSample]) -> tuple[Pose, ...]:
         """Return the positions that go to the vehicle in this tick, in order of capture.
 
         Args:
-            offset_ns: (our time - the vehicle's) from round trips; None if it does not answer.
-            asks: the vehicle asks for our time, and so moves stamps itself.
+            offset_ns: (our time - the vehicle's), by which stamps are moved; 0 where the vehicle moves them itself.
             refused: samples that the tick did not believe.
         """
         arrived = [one for one in self._waiting if one[0].received_ns <= at_ns]
         self._waiting = [one for one in self._waiting if one[0].received_ns > at_ns]
         waiting = sorted(arrived, key=lambda one: one[0].captured_ns)
-        if offset_ns is None and not asks:
-            self.kept["no clock"] += len(waiting)
-            return ()
-        offset_ns = 0 if asks else offset_ns or 0
         out = []
         for sample, attitude in waiting:
             reason = "refused" if sample in refused else self._reason(sample, attitude, at_ns)
@@ -95,8 +113,42 @@ class Relay:
             self._newest_ns = sample.captured_ns
             out.append(self._pose(sample, attitude, offset_ns))
         self.sent += len(out)
-        self.last_ns = at_ns if out else self.last_ns
+        if out:
+            self.last_ns, self._kept_by_then = at_ns, Counter(self.kept)
         return tuple(out)
+
+    def report(self, at_ns: int, *, held_back: bool, armed: bool) -> Event | None:
+        """Report that the vehicle has got no position for `SILENT_NS`, with the reason, or that it gets them again.
+
+        Call it in each tick after `due`. Each silence in the air is reported once; of those on the ground the first,
+        and that it goes on when the vehicle is armed.
+
+        Args:
+            held_back: positions are not passed on in this tick, whatever comes.
+            armed: the vehicle may be in the air.
+        """
+        if not self.enabled:
+            return None
+        if self._begun_ns is None:
+            self._begun_ns = at_ns
+        since_ns = self._begun_ns + START_NS if self.last_ns is None else self.last_ns
+        silent = at_ns - since_ns >= SILENT_NS
+        self.silent_for = "" if not silent else HELD_BACK if held_back else self._reason_of_silence()
+        if not silent and self._reported:
+            self._reported = ""
+            text = "the vehicle gets positions again"
+            return Event(at_ns=at_ns, severity=Severity.INFO, code=RELAY_RESUMED, text=text)
+        if not silent or self._reported == "armed" or (not armed and (self._reported or self._reported_on_ground)):
+            return None
+        self._reported = "armed" if armed else "ground"
+        self._reported_on_ground = self._reported_on_ground or not armed
+        since_ns = self._begun_ns if self.last_ns is None else since_ns
+        text = f"the vehicle gets no position since {(at_ns - since_ns) * 1e-9:.1f} s: {REASONS[self.silent_for]}"
+        return Event(at_ns=at_ns, severity=Severity.WARNING, code=RELAY_SILENT, text=text)
+
+    def _reason_of_silence(self) -> str:
+        kept = (Counter(self.kept) - self._kept_by_then).most_common(1)
+        return kept[0][0] if kept else NOTHING_COMES
 
     def _reason(self, sample: PositionSample, attitude: Quaternion, at_ns: int) -> str | None:
         """Return why a pose is kept back; None if it goes."""

@@ -9,6 +9,7 @@ import msgspec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.frames import Quaternion, from_euler, rotate
+from uavctl.mavlink.clocksync import ArrivalClock
 from uavctl.mavlink.codec import MODE_COMMANDS
 from uavctl.mavlink.messages import (
     Ack,
@@ -238,6 +239,10 @@ class Evidence:
 
 SECOND_VEHICLE = "second-vehicle"
 UNPUNCTUAL = "inertial-not-of-now"  # late, repeated, or frozen
+# The same readings for longer are those of a frozen sensor. Whole thousandths of g repeat, in recorded flights of
+# ArduCopter for 0.7 s at most. Fractions have noise, and never did.
+FROZEN_RAW_US, FROZEN_US = 1_000_000, 100_000
+LOW_SHARE, ENOUGH = 0.8, 250  # part of so many inertial data under which it is reported that they are not used
 ALONE_NS = 5_000_000_000  # after that time of silence another vehicle counts as gone
 GONE_NS = 30_000_000_000  # and after that one its place is taken, if it stood on the ground
 BOOTING_NS = 3_000_000_000  # of silence before a heartbeat of booting, for that to be a restart
@@ -247,51 +252,72 @@ STICK_US = 100  # by which a channel of a remote control moves at least when a p
 TURNED_NS = 100_000_000  # an attitude that is older turns no specific force: at 1 rad/s it is 0.1 rad, 1 m/s², off
 GRAVITY_MPS2 = 9.80665
 LATE_NS = 60_000_000  # later than the quickest: a stream of 50 Hz is 20 ms apart
-CREEP = 1e-3  # by which two clocks may drift apart: ten times what bad oscillators do
 BACK_US = 1_000_000  # a stamp that goes back by more is of another clock
 _ROUTINE = frozenset({mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAV_CMD_REQUEST_MESSAGE})
 # PX4 stands by only while its pre-flight checks pass, and is uninitialised else: that comes and goes, no restart.
 _UNREADY = frozenset({mavlink.MAV_STATE_UNINIT, mavlink.MAV_STATE_BOOT, mavlink.MAV_STATE_CALIBRATING})
 _IN_FAILSAFE = frozenset({mavlink.MAV_STATE_CRITICAL, mavlink.MAV_STATE_EMERGENCY})
 _NO_AUTOPILOT = int(mavlink.MAV_AUTOPILOT_INVALID)
-_GROUND_STATION = int(mavlink.MAV_TYPE_GCS)
+_AUTOPILOT1 = int(mavlink.MAV_COMP_ID_AUTOPILOT1)
+# Types of what is no vehicle, whatever autopilot it names: its own, or the one that it is made for.
+_DEVICES = frozenset(
+    int(getattr(mavlink, f"MAV_TYPE_{name}"))
+    for name in (
+        *("GCS", "ANTENNA_TRACKER", "ONBOARD_CONTROLLER", "GIMBAL", "ADSB", "CAMERA", "CHARGING_STATION", "FLARM"),
+        *("SERVO", "ODID", "BATTERY", "LOG", "OSD", "IMU", "GPS", "WINCH"),
+    )
+)
 
 
 def is_vehicle(heartbeat: Heartbeat) -> bool:
-    """Whether a heartbeat is an autopilot's: not a ground station's, a camera's or a gimbal's."""
-    return heartbeat.autopilot != _NO_AUTOPILOT and heartbeat.vehicle_type != _GROUND_STATION
+    """Whether a heartbeat is an autopilot's: not that of a ground station, a companion computer, a gimbal, a camera."""
+    return heartbeat.autopilot != _NO_AUTOPILOT and heartbeat.vehicle_type not in _DEVICES
 
 
-class Punctual:
-    """Tells what is late, or says again what has been said, in one stream of one sender.
+def is_better(address: tuple[int, int], than: tuple[int, int] | None) -> bool:
+    """Whether of two that say that they are vehicles the first one is to be followed.
 
-    A message's delay is told against that of the quickest before it: clocks need not agree.
+    Of one system it is the component of autopilots; of two systems the one that is followed already.
+    """
+    if than is None:
+        return True
+    return address[0] == than[0] and address[1] == _AUTOPILOT1 != than[1]
+
+
+class SensorStream:
+    """Judges the messages of one stream of one sensor by their stamps and arrival.
+
+    A new stamp is a new measurement, as integer readings repeat; the same readings for long are a frozen sensor. The
+    delay counts from the quickest message, at the drift of the sender's clock: clocks need not agree.
     """
 
     def __init__(self) -> None:
-        self._least_ns: int | None = None  # arrival less stamp
-        self._heard_ns = 0  # the last that was taken
+        self._clock = ArrivalClock()
+        self._heard_ns = 0  # the last that was judged
         self._stamp_us = 0  # of that
         self._values: Vec3 | None = None
+        self._since_us = 0  # stamp of the first of the same readings in a row
 
-    def takes(self, stamp_us: int, values: Vec3, at_ns: int) -> bool:
-        """Whether a message is current.
+    def takes(self, stamp_us: int, values: Vec3, at_ns: int, *, frozen_us: int = 0) -> bool | None:
+        """Whether a message is a measurement of now; None for one that was there already.
 
         Args:
             stamp_us: when it was measured, by the sender's clock.
-            values: what was measured; the same to the last bit is no measurement.
+            values: the readings.
+            frozen_us: readings that are the same to the last bit for longer are those of a frozen sensor; 0 where noise
+                never repeats.
         """
-        if stamp_us < self._stamp_us - BACK_US:
-            self._least_ns, self._stamp_us = None, 0
-        behind_ns = at_ns - 1000 * stamp_us
-        least_ns = behind_ns
-        if self._least_ns is not None:
-            least_ns = min(behind_ns, self._least_ns + round(CREEP * (at_ns - self._heard_ns)))
-        if stamp_us <= self._stamp_us or values == self._values or behind_ns - least_ns > LATE_NS:
-            return False
-        self._least_ns, self._heard_ns = least_ns, at_ns
-        self._stamp_us, self._values = stamp_us, values
-        return True
+        advance_us = stamp_us - self._stamp_us
+        if advance_us < -BACK_US or advance_us > (at_ns - self._heard_ns) // 1000 + BACK_US:
+            self._clock, self._since_us = ArrivalClock(), stamp_us
+        elif advance_us <= 0:
+            return None
+        if values != self._values:
+            self._since_us = stamp_us
+        repeats = values == self._values
+        delay_ns = self._clock.delay_ns(1000 * stamp_us, at_ns)
+        self._stamp_us, self._heard_ns, self._values = stamp_us, at_ns, values
+        return delay_ns <= LATE_NS and not (repeats and stamp_us - self._since_us >= frozen_us)
 
 
 class VehicleWatch:
@@ -303,15 +329,22 @@ class VehicleWatch:
         bad: counter that heartbeats of other vehicles are added to.
         own: our system and component id; answers to others' commands are not ours.
         system: the vehicle's system id; 0 takes any.
+        component: its component id; 0 takes any, and that of autopilots rather than another.
     """
 
     def __init__(
-        self, bad: Callable[[str], None], own: tuple[int, int], system: int = 0, *, inertial: bool = False
+        self,
+        bad: Callable[[str], None],
+        own: tuple[int, int],
+        system: int = 0,
+        component: int = 0,
+        *,
+        inertial: bool = False,
     ) -> None:
         self._bad = bad
         self._inertial = inertial
         self._own = own
-        self._system = system
+        self._system, self._component = system, component
         self._landed: bool | None = None
         self._own_climb = False
         self._battery_v: float | None = None
@@ -323,8 +356,9 @@ class VehicleWatch:
         self._another_ns: int | None = None  # when another vehicle was heard last
         self._status: VehicleStatus | None = None
         self._motion = VehicleMotion()
-        self._punctual: dict[str, Punctual] = {}  # by stream
+        self._streams: dict[str, SensorStream] = {}  # by kind of message
         self._turned: tuple[Vec3, int] | None = None  # attitude, and when it was told
+        self.inertial_used = self.inertial_total = 0  # inertial data that gave an acceleration, and all
         self.boots = 0
         self.unready = 0  # times that it ceased to be ready: its streams may be gone
         self.address: tuple[int, int] | None = None  # system, component
@@ -349,13 +383,15 @@ class VehicleWatch:
             return self._is_ordered(message.system, message.target_system, at_ns)
         if self.address is None or message.system != self.address[0]:
             return ()
+        if message.component != self.address[1]:  # a companion computer or gimbal of the same system: its words only
+            return (_text_event(message, at_ns),) if isinstance(message, Text) else ()
         self._heard_ns = at_ns
         match message:
             case Landed(landed=landed, own_climb=own_climb):
                 return self._phase(landed, own_climb)
             case Battery():
                 self._battery_v = self._battery_v if message.voltage_v is None else message.voltage_v
-                if message.radio is None or message.component != self.address[1]:
+                if message.radio is None:
                     return ()
                 self._evidence.radio(heard=message.radio)
                 self._evidence.fence(at_ns, within=message.fenced)
@@ -363,13 +399,13 @@ class VehicleWatch:
             case FenceBreach(breached=breached):
                 self._evidence.fence(at_ns, within=not breached)
                 return self._proves(at_ns)
-            case RadioChannels(channels_us=channels_us) if message.component == self.address[1]:
+            case RadioChannels(channels_us=channels_us):
                 self._evidence.channels(channels_us, at_ns)
                 return self._proves(at_ns)
-            case Position(boot_ms=True, stamp_us=int(stamp_us)) if message.component == self.address[1]:
+            case Position(boot_ms=True, stamp_us=int(stamp_us)):
                 anew = self._tells_time("position", stamp_us, at_ns)
                 return (*anew, *self._moves(at_ns, velocity=message.velocity_mps))
-            case Attitude(angles_rad=angles_rad) if message.component == self.address[1]:
+            case Attitude(angles_rad=angles_rad):
                 kind = "quaternion" if message.quaternion else "angles"
                 anew = self._tells_time(kind, message.stamp_us, at_ns) if message.stamp_us else ()
                 # Beside inertial data both are of use; else a vehicle that streams both is believed by one.
@@ -377,13 +413,12 @@ class VehicleWatch:
                     return anew
                 self._turns(message, at_ns)
                 return (*anew, *self._moves(at_ns, attitude=angles_rad))
-            case Inertial(raw=raw) if message.component == self.address[1]:
+            case Inertial(raw=raw):
                 known = PROFILES.get(self.autopilot)
                 return self._accelerates(message, at_ns) if not raw or (known and known.reads_raw) else ()
-            case Text(severity=severity, text=text):
-                event = Event(at_ns=at_ns, severity=_severity(severity), code="vehicle-text", text=text)
+            case Text(text=text):
                 self._evidence.word(text, at_ns)
-                return message, event, *self._proves(at_ns)
+                return message, _text_event(message, at_ns), *self._proves(at_ns)
             case Ack() if self._is_ours(message):
                 return (message,) if message.command in _ROUTINE else (message, _ack_event(message, at_ns))
             case Ack(command=command, result=mavlink.MAV_RESULT_ACCEPTED) if command in MODE_COMMANDS:
@@ -446,7 +481,7 @@ class VehicleWatch:
         if not self._inertial:
             return
         kind = "quaternion" if message.quaternion else "angles"
-        if self._punctual.setdefault(kind, Punctual()).takes(message.stamp_us, message.angles_rad, at_ns):
+        if self._streams.setdefault(kind, SensorStream()).takes(message.stamp_us, message.angles_rad, at_ns):
             self._turned = message.angles_rad, at_ns
         else:
             self._bad(UNPUNCTUAL)
@@ -455,20 +490,24 @@ class VehicleWatch:
         """Its acceleration by a specific force and its newest attitude; nothing where either is old or unknown."""
         if not self._inertial:
             return ()
-        kind = "raw" if message.raw else "highres"
-        if not self._punctual.setdefault(kind, Punctual()).takes(message.stamp_us, message.specific_force_mps2, at_ns):
+        kind, frozen_us = ("raw", FROZEN_RAW_US) if message.raw else ("highres", FROZEN_US)
+        stream = self._streams.setdefault(kind, SensorStream())
+        new = stream.takes(message.stamp_us, message.specific_force_mps2, at_ns, frozen_us=frozen_us)
+        self.inertial_total += new is not None
+        if not new:
             self._bad(UNPUNCTUAL)
             return ()
         attitude = self.attitude(at_ns)
         turned = None if attitude is None else rotate(attitude, message.specific_force_mps2)
         if turned is None:
             return ()
+        self.inertial_used += 1
         north, east, down = turned
         return (InertialSample(at_ns=at_ns, accel_mps2=(north, east, down + GRAVITY_MPS2)),)
 
     def _reboot(self) -> tuple[VehicleStatus, ...]:
         self.boots += 1
-        self._punctual, self._turned = {}, None
+        self._streams, self._turned = {}, None
         self._landed, self._evidence = None, Evidence()
         if self._status is None:
             return ()
@@ -482,7 +521,11 @@ class VehicleWatch:
 
     def _begin(self, address: tuple[int, int], at_ns: int) -> None:
         """Follow a vehicle; if it is another one than before, forget the old one's state: nothing is armed yet."""
-        if self.address is not None:
+        if self.address is not None and self.address[0] == address[0]:  # it was a device of this one
+            self._streams, self._turned, self._battery_v, self._landed = {}, None, None, None
+            self._ready = False
+            self._clock.forget()
+        elif self.address is not None:
             self._reboot()
             self._battery_v = None
             self._clock.forget()
@@ -491,8 +534,8 @@ class VehicleWatch:
 
     def _heartbeat(self, message: Heartbeat, at_ns: int) -> tuple[VehicleStatus, ...]:
         address = (message.system, message.component)
-        wanted = self._system in (0, message.system)
-        if wanted and (self.address is None or (address != self.address and self._has_gone(at_ns))):
+        wanted = self._system in (0, message.system) and self._component in (0, message.component)
+        if wanted and (is_better(address, self.address) or (address != self.address and self._has_gone(at_ns))):
             self._begin(address, at_ns)
         if address != self.address:
             if self.address is None or message.system != self.address[0]:
@@ -524,6 +567,10 @@ class VehicleWatch:
         )
         self._status = self._evidence.on(status, at_ns, critical=self._critical)
         return (self._status,)
+
+
+def _text_event(text: Text, at_ns: int) -> Event:
+    return Event(at_ns=at_ns, severity=_severity(text.severity), code="vehicle-text", text=text.text)
 
 
 def _severity(mav_severity: int) -> Severity:

@@ -130,7 +130,9 @@ class InertialFrames:
 
     def __init__(self, daemon: DaemonConfig) -> None:
         own = daemon.system_id, daemon.component_id
-        self._watch = VehicleWatch(lambda _: None, own, daemon.vehicle_system_id, inertial=True)
+        self._watch = VehicleWatch(
+            lambda _: None, own, daemon.vehicle_system_id, daemon.vehicle_component_id, inertial=True
+        )
         self.moved = self.left_out = 0
 
     def heard(self, frame: RawFrame, at_ns: int, by_mps2: Vec3 | None) -> bytes:
