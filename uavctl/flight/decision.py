@@ -587,6 +587,7 @@ def seen_of(
     accepted: Sequence[PositionSample] = (),
     *,
     braking: bool = False,
+    inertial_mps2: Vec3 | None = None,
 ) -> envelope.Observation:
     """Return the data of a tick that the envelope is checked against."""
     position, speed = None, (math.nan, math.nan, math.nan)
@@ -601,6 +602,7 @@ def seen_of(
         velocity_mps=speed,
         motion=inp.motion,
         braking=braking,
+        inertial_mps2=inertial_mps2,
     )
 
 

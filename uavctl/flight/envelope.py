@@ -7,7 +7,8 @@ Each tick of a flight, four questions:
 2. Do positions show an acceleration that no setpoint asked for? A small observer of its own, a position, a velocity and
    an unexplained acceleration for each axis, is driven by what was sent and corrected by the positions that were
    believed. Drag explains what points against the velocity. A frame that is turned, mirrored or in another unit gives
-   the acceleration sent a wrong direction or size, a marker that came loose none at all.
+   the acceleration sent a wrong direction or size, a marker that came loose none at all. Where the vehicle's inertial
+   data show the same acceleration, it is wind, or a hit, and positions are right (`uavctl.flight.inertial_way`).
 3. Do positions move otherwise than the vehicle says it does (its own velocity, where it comes)? Over a second or so
    their velocities are compared; over half a minute the ways that both have come, which finds a frame that creeps.
 4. Does braking brake?
@@ -29,6 +30,7 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
+from uavctl.flight.inertial_way import InertialWay, carried, extended, push_text
 from uavctl.flight.limits import AXES, ZERO
 from uavctl.records import PositionSample, Vec3, Vector, VehicleMotion
 
@@ -110,6 +112,8 @@ class Observation(msgspec.Struct, frozen=True):
     velocity_mps: Vec3  # estimated velocity, the same
     motion: VehicleMotion | None  # motion by the vehicle's own estimate
     braking: bool  # whether the fallback brakes
+    # Acceleration that the vehicle's inertial data show, local NED; None where none are of now
+    inertial_mps2: Vec3 | None = None
 
 
 class Observer(msgspec.Struct, frozen=True, eq=False):
@@ -119,6 +123,8 @@ class Observer(msgspec.Struct, frozen=True, eq=False):
     mean: Array  # (3, 3): a row each for position, velocity, unexplained acceleration; a column an axis
     cov: Array  # (3, 3) of one axis; those of all axes are alike
     accel_mps2: Array  # acceleration that the setpoints so far give the vehicle, behind its lag (3,)
+    # The same as `mean`, driven by inertial data in place of setpoints; None before any
+    inertial: Array | None = None
 
 
 class Watching(msgspec.Struct, frozen=True, eq=False):
@@ -131,6 +137,9 @@ class Watching(msgspec.Struct, frozen=True, eq=False):
     flown_mps2: Vector = ZERO  # the acceleration (3,) that belongs to it
     sent: tuple[tuple[int, Vec3], ...] = ()  # setpoints, each with the tick from which it acted [ns], oldest first
     clipped: tuple[bool, ...] = ()  # whether each of the last innovations was clipped, newest last
+    inertial_way: InertialWay = ()  # the way that inertial data show; empty before any
+    push_mps2: Vec3 = ZERO  # acceleration beside what was sent, when inertial data last explained it
+    pushed: bool = False  # whether that is more than the unexplained acceleration may be
     # Size of the unexplained acceleration, when it was last looked at; None before
     unexplained_mps2: float | None = None
     # How far the velocities of positions and vehicle were apart then; None where that is not known
@@ -165,7 +174,9 @@ def watch(watching: Watching, seen: Observation, parameters: EnvelopeParameters)
         watching: State that the tick before left; `NOT_WATCHING` where a flight begins.
     """
     seen = _shown(seen, parameters)
-    watching = _flown_on(_told(watching, seen), watching.tick_ns, seen, parameters)
+    before_ns = watching.tick_ns
+    watching = _flown_on(_told(watching, seen), before_ns, seen, parameters)
+    watching = _pushed_on(watching, before_ns, seen)
     breach: Breach | None = None
     for sample in sorted(seen.samples, key=lambda one: min(one.captured_ns, one.received_ns)):
         watching, found = _position(watching, sample, seen, parameters)
@@ -293,6 +304,21 @@ def _flown_on(watching: Watching, tick_ns: int | None, seen: Observation, parame
     return replace(watching, flown_mps=tuple(flown), flown_mps2=tuple(accels))
 
 
+def _pushed_on(watching: Watching, tick_ns: int | None, seen: Observation) -> Watching:
+    """Let the acceleration that inertial data show act since the last tick.
+
+    A silence counts with what was sent and with the push that they showed last: wind lasts.
+    """
+    shown = seen.inertial_mps2
+    if shown is None:
+        if not watching.inertial_way:
+            return watching
+        north, east, down = (a + b for a, b in zip(watching.flown_mps2, watching.push_mps2, strict=True))
+        shown = north, east, down
+    begin_ns = seen.at_ns if tick_ns is None else tick_ns
+    return replace(watching, inertial_way=extended(watching.inertial_way, begin_ns, shown, seen.at_ns - TOLD_NS))
+
+
 def _position(
     watching: Watching, sample: PositionSample, seen: Observation, parameters: EnvelopeParameters
 ) -> tuple[Watching, Breach | None]:
@@ -305,12 +331,15 @@ def _position(
         return _compared(watching, at_ns, position, False, parameters)
     if at_ns - before.at_ns < SPACING_NS:
         return watching, None
-    observer, clipped = _corrected(_predicted(before, watching.sent, at_ns, parameters), position, sample.std_m)
+    observer, clipped = _corrected(_predicted(before, watching, at_ns, parameters), position, sample.std_m)
     recent = (*watching.clipped, clipped)[-OF:]
-    unexplained = _unexplained(observer)
-    unexplained_mps2 = max(math.hypot(unexplained[0], unexplained[1]), abs(float(unexplained[2])))
-    size = unexplained_mps2 / parameters.unexplained_mps2
-    known = unexplained_mps2 > KNOWN * math.sqrt(observer.cov[2, 2])
+    unexplained = _unexplained(observer.mean)
+    beside_mps2 = unexplained_mps2 = _size_mps2(unexplained)
+    if observer.inertial is not None:
+        beside_mps2 = min(beside_mps2, _size_mps2(_unexplained(observer.inertial)))
+        watching = _pushed(watching, observer, unexplained_mps2, beside_mps2, seen, parameters)
+    size = beside_mps2 / parameters.unexplained_mps2
+    known = beside_mps2 > KNOWN * math.sqrt(observer.cov[2, 2])
     over_ns = (watching.over_ns or at_ns) if size > 1.0 and known else None
     watching, velocity = _compared(watching, at_ns, position, size > HINT, parameters)
     quiet = size <= QUIET and not clipped and watching.apart_ns is None
@@ -331,6 +360,28 @@ def _position(
     return watching, None
 
 
+def _pushed(
+    watching: Watching,
+    observer: Observer,
+    beside_sent_mps2: float,
+    beside_mps2: float,
+    seen: Observation,
+    parameters: EnvelopeParameters,
+) -> Watching:
+    """Take note of a push that inertial data explain, and of whether it is more than positions alone may show.
+
+    Args:
+        beside_sent_mps2: Size of the acceleration that no setpoint asked for [m/s²].
+        beside_mps2: Size of what inertial data do not explain either [m/s²].
+    """
+    bound_mps2 = parameters.unexplained_mps2
+    pushed = beside_sent_mps2 > (QUIET if watching.pushed else 1.0) * bound_mps2 >= beside_mps2
+    if seen.inertial_mps2 is None or observer.inertial is None:
+        return replace(watching, pushed=pushed)
+    north, east, down = (observer.mean[2] - observer.inertial[2]).tolist()
+    return replace(watching, pushed=pushed, push_mps2=(north, east, down))
+
+
 # The observer
 
 
@@ -344,21 +395,20 @@ def _begun(at_ns: int, sample: PositionSample, watching: Watching, parameters: E
     if watching.observer is None:
         began_ns = min(watching.sent[0][0], at_ns)
         rest = Observer(at_ns=began_ns, mean=mean, cov=np.zeros((3, 3)), accel_mps2=accel)
-        flown = _predicted(rest, watching.sent, at_ns, parameters)
+        flown = _predicted(rest, watching, at_ns, parameters)
         mean[1], accel = flown.mean[1], flown.accel_mps2
         speed_mps = parameters.begins_mps + _gusts_mps((at_ns - began_ns) * 1e-9, parameters)
     mean[0] = sample.position_m
     if sample.velocity_mps is not None:
         mean[1], speed_mps = sample.velocity_mps, VELOCITY_STD_MPS
     deviations = (max(sample.std_m, POSITION_STD_M), speed_mps, parameters.unexplained_mps2 / 3.0)
-    return Observer(at_ns=at_ns, mean=mean, cov=np.diag(np.square(deviations)), accel_mps2=accel)
+    inertial = mean if watching.inertial_way else None
+    return Observer(at_ns=at_ns, mean=mean, cov=np.diag(np.square(deviations)), accel_mps2=accel, inertial=inertial)
 
 
-def _predicted(
-    observer: Observer, sent: tuple[tuple[int, Vec3], ...], at_ns: int, parameters: EnvelopeParameters
-) -> Observer:
+def _predicted(observer: Observer, watching: Watching, at_ns: int, parameters: EnvelopeParameters) -> Observer:
     """Fly on by what was sent, behind the vehicle's lag; the unexplained acceleration wanders."""
-    lag_s = np.maximum(parameters.lag_s, LEAST_LAG_S)
+    sent, lag_s = watching.sent, np.maximum(parameters.lag_s, LEAST_LAG_S)
     (position, velocity, unexplained), accel = observer.mean, observer.accel_mps2
     first = bisect_right(sent, observer.at_ns, key=_TIME)
     last = bisect_left(sent, at_ns, lo=first, key=_TIME)
@@ -376,7 +426,13 @@ def _predicted(
     f = np.array([[1.0, s, 0.5 * s * s], [0.0, 1.0, s], [0.0, 0.0, 1.0]])
     q = np.array([[s**5 / 20, s**4 / 8, s**3 / 6], [s**4 / 8, s**3 / 3, s**2 / 2], [s**3 / 6, s**2 / 2, s]])
     cov = f @ observer.cov @ f.T + parameters.unexplained_mps2**2 * q
-    return Observer(at_ns=at_ns, mean=np.array([position, velocity, unexplained]), cov=cov, accel_mps2=accel)
+    inertial = observer.inertial
+    if watching.inertial_way:
+        if inertial is None:  # they have just begun: from here on they explain all of it
+            inertial = np.array([observer.mean[0], observer.mean[1], np.zeros(3)])
+        inertial = carried(watching.inertial_way, inertial, observer.at_ns, at_ns)
+    mean = np.array([position, velocity, unexplained])
+    return Observer(at_ns=at_ns, mean=mean, cov=cov, accel_mps2=accel, inertial=inertial)
 
 
 def _spans(begin_ns: int, end_ns: int, acts: Vec3, sent: Sequence[tuple[int, Vec3]]) -> Iterator[tuple[int, int, Vec3]]:
@@ -388,7 +444,7 @@ def _spans(begin_ns: int, end_ns: int, acts: Vec3, sent: Sequence[tuple[int, Vec
 
 
 def _corrected(observer: Observer, position: Array, std_m: float) -> tuple[Observer, bool]:
-    """Take a position, its innovation clipped to a bound; return too whether it was beyond."""
+    """Take a position, its innovation clipped to a bound; return too whether it was beyond, whatever drives it."""
     noise = max(std_m, POSITION_STD_M) ** 2
     variance = float(observer.cov[0, 0]) + noise
     bound = CLIP * math.sqrt(variance)
@@ -399,12 +455,22 @@ def _corrected(observer: Observer, position: Array, std_m: float) -> tuple[Obser
     keep[:, 0] -= gain
     cov = keep @ observer.cov @ keep.T + noise * np.outer(gain, gain)
     clipped = bool((np.abs(innovation) > bound).any())
-    return Observer(at_ns=observer.at_ns, mean=mean, cov=cov, accel_mps2=observer.accel_mps2), clipped
+    inertial = observer.inertial
+    if inertial is not None:
+        innovation = position - inertial[0]
+        inertial = inertial + np.outer(gain, np.clip(innovation, -bound, bound))
+        clipped = clipped and bool((np.abs(innovation) > bound).any())
+    return replace(observer, mean=mean, cov=cov, inertial=inertial), clipped
 
 
-def _unexplained(observer: Observer) -> Array:
-    """Return the unexplained acceleration (3,) without the part that can be drag."""
-    _, velocity, unexplained = observer.mean
+def _size_mps2(accel_mps2: Array) -> float:
+    """Return the size of an acceleration (3,): horizontally, or vertically if that is more."""
+    return max(math.hypot(accel_mps2[0], accel_mps2[1]), abs(float(accel_mps2[2])))
+
+
+def _unexplained(mean: Array) -> Array:
+    """Return the unexplained acceleration (3,) without the part that can be drag, by the mean of an observer."""
+    _, velocity, unexplained = mean
     along = float(velocity @ velocity)
     drag_1ps = min(max(-float(unexplained @ velocity) / along, 0.0), DRAG_1PS) if along > 0.0 else 0.0
     rest: Array = unexplained + drag_1ps * velocity
@@ -416,12 +482,23 @@ def _response_text(observer: Observer, unexplained: Array, seen: Observation) ->
         f"positions show an acceleration of {_vector(unexplained)} m/s² that no setpoint asked for "
         f"({_vector(observer.accel_mps2)} m/s² was)"
     )
-    lean = None if seen.motion is None else lean_mps2(seen.motion, seen.at_ns)
+    leans = _leans(observer, unexplained, seen.motion, seen.at_ns)
+    return text if leans is None else f"{text}; the vehicle leans {'as' if leans else 'otherwise than'} it was told"
+
+
+def push_words(watching: Watching, motion: VehicleMotion | None, at_ns: int) -> str:
+    """Return the push that inertial data explain in words."""
+    observer, push = watching.observer, watching.push_mps2
+    return push_text(push, None if observer is None else _leans(observer, np.array(push), motion, at_ns))
+
+
+def _leans(observer: Observer, unexplained: Array, motion: VehicleMotion | None, at_ns: int) -> bool | None:
+    """Return whether the vehicle leans as it was told, as against an unexplained acceleration; None where unknown."""
+    lean = None if motion is None else lean_mps2(motion, at_ns)
     if lean is None:
-        return text
+        return None
     off = math.hypot(lean[0] - float(observer.accel_mps2[0]), lean[1] - float(observer.accel_mps2[1]))
-    as_told = off <= 0.5 * math.hypot(*unexplained)
-    return f"{text}; the vehicle leans {'as it was told' if as_told else 'otherwise than it was told'}"
+    return off <= 0.5 * math.hypot(*unexplained)
 
 
 def lean_mps2(motion: VehicleMotion, at_ns: int) -> tuple[float, float] | None:
