@@ -449,6 +449,7 @@ def _replan(
         late=late,
         cov=cov,
         sent=sent + np.array(base.bias) if base.bias else sent,
+        inputs=_left(base.bias, controller),
     )
     shape = (controller.horizon, controller.plant.n_u)
     asked = ask(controller.solver, tick.number, base, target, outlook, shape, controller.design_id)
@@ -456,6 +457,14 @@ def _replan(
         state = replace(state, fault=asked.fault)
         return Choice(state, "no new plan: the old one plays out", news, asked.status, None, asked.text)
     return Choice(replace(state, plan=asked.plan, fallback=None), reason, news, asked.status, asked.plan)
+
+
+def _left(bias: Vector, controller: Controller) -> tuple[Array, Array] | None:
+    """Return the inputs that a plan has beside a bias, in its own count; None where the design left room for it."""
+    if controller.inputs is None or not bias or max(map(abs, bias)) <= controller.estimator.bias_max:
+        return None
+    low, high = controller.inputs
+    return low + bias, high + bias
 
 
 def _unplanned(state: ControlState, tick: Tick, inp: StepInput, controller: Controller) -> Choice:
