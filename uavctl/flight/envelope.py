@@ -8,7 +8,7 @@ Each tick of a flight, four questions:
    an unexplained acceleration for each axis, is driven by what was sent and corrected by the positions that were
    believed. Drag explains what points against the velocity. A frame that is turned, mirrored or in another unit gives
    the acceleration sent a wrong direction or size, a marker that came loose none at all. Where the vehicle's inertial
-   data show the same acceleration, it is wind, or a hit, and positions are right (`uavctl.flight.inertial_way`).
+   data show the same acceleration, it is wind, or a hit, and positions are right (`uavctl.flight.observer`).
 3. Do positions move otherwise than the vehicle says it does (its own velocity, where it comes)? Over a second or so
    their velocities are compared; over half a minute the ways that both have come, which finds a frame that creeps.
 4. Does braking brake?
@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 
@@ -30,8 +30,19 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from uavctl.flight.inertial_way import InertialWay, carried, extended, push_text
 from uavctl.flight.limits import AXES, ZERO
+from uavctl.flight.observer import (
+    LEAST_LAG_S,
+    POSITION_STD_M,
+    InertialWay,
+    Observer,
+    beside_drag,
+    corrected,
+    extended,
+    predicted,
+    push_text,
+    size_mps2,
+)
 from uavctl.records import PositionSample, Vec3, Vector, VehicleMotion
 
 Array = NDArray[np.float64]
@@ -48,8 +59,6 @@ ANSWERS_NS = 2_000_000_000  # of a flight: positions that did not answer would h
 MOTION_NS = 300_000_000  # the vehicle's own words count for so long
 SPACING_NS = 40_000_000  # positions closer to one another add work and no knowledge
 TOLD_NS = 3_000_000_000  # setpoints and own velocities are remembered for so long
-DRAG_1PS = 1.2  # most drag that is taken for drag: PX4's simulated vehicles have 1.0
-CLIP = 6.0  # an innovation counts up to so many standard deviations: one reflection is no proof
 SCATTERED, OF = 3, 5  # clipped innovations of the last ones that are no chance
 PERSISTS_NS = 100_000_000  # for which it holds, over two positions at least; no time at all where it is beyond
 KNOWN = 1.5  # it is more than this many of its standard deviations
@@ -59,7 +68,6 @@ HINT = 0.4  # of the bound of the unexplained acceleration
 QUIET = 0.5  # of the bound: below, positions are clean
 OUTSIDE_NS = 100_000_000
 RETURNS_MPS = 0.3  # outside, towards the limit: it is on its way back
-POSITION_STD_M = 0.02  # at least, of a position: what gate and rounding may leave
 VELOCITY_STD_MPS = 0.1  # of a velocity that a position brings along, where the flight begins
 BRAKES_NS = 1_000_000_000  # after which braking must have shown
 BRAKED, BRAKED_MPS = 0.8, 0.3  # it has not where the speed is above this part of what it was, and this
@@ -72,7 +80,6 @@ WAYS_S, WAYS_PART = 2.0, 0.16  # of the disagreement: a way may be off by so lon
 MISLEADS = 4.0  # disagreements of a prediction that gusts alone do not make
 WITNESS_S = 10.0  # of a flight: as long as what was sent says something of the velocity
 GRAVITY_MPS2 = 9.81
-LEAST_LAG_S = 1e-3  # for a plant without one
 _TIME = itemgetter(0)  # of what is kept by its time, oldest first
 
 
@@ -116,23 +123,13 @@ class Observation(msgspec.Struct, frozen=True):
     inertial_mps2: Vec3 | None = None
 
 
-class Observer(msgspec.Struct, frozen=True, eq=False):
-    """Position, velocity and unexplained acceleration at the newest position that counted."""
-
-    at_ns: int  # its capture time [ns]
-    mean: Array  # (3, 3): a row each for position, velocity, unexplained acceleration; a column an axis
-    cov: Array  # (3, 3) of one axis; those of all axes are alike
-    accel_mps2: Array  # acceleration that the setpoints so far give the vehicle, behind its lag (3,)
-    # The same as `mean`, driven by inertial data in place of setpoints; None before any
-    inertial: Array | None = None
-
-
 class Watching(msgspec.Struct, frozen=True, eq=False):
     """State of the envelope check that one tick leaves to the next while we fly."""
 
     observer: Observer | None = None  # None before the first position
     tick_ns: int | None = None  # the last tick
     began_ns: int | None = None  # the first one
+    agreed: bool = False  # whether positions agreed with the vehicle's inertial data before it
     flown_mps: Vector = ZERO  # velocity (3,) that was sent since then, behind the vehicle's lag
     flown_mps2: Vector = ZERO  # the acceleration (3,) that belongs to it
     sent: tuple[tuple[int, Vec3], ...] = ()  # setpoints, each with the tick from which it acted [ns], oldest first
@@ -161,7 +158,7 @@ class Watching(msgspec.Struct, frozen=True, eq=False):
     def answered(self) -> bool:
         """Whether positions have agreed with the flight for so long that they must be those of this vehicle."""
         began_ns, tick_ns = self.began_ns, self.tick_ns
-        return began_ns is not None and tick_ns is not None and tick_ns - began_ns >= ANSWERS_NS
+        return self.agreed or (began_ns is not None and tick_ns is not None and tick_ns - began_ns >= ANSWERS_NS)
 
 
 NOT_WATCHING = Watching()
@@ -331,13 +328,13 @@ def _position(
         return _compared(watching, at_ns, position, False, parameters)
     if at_ns - before.at_ns < SPACING_NS:
         return watching, None
-    observer, clipped = _corrected(_predicted(before, watching, at_ns, parameters), position, sample.std_m)
+    observer, clipped = corrected(_predicted(before, watching, at_ns, parameters), position, sample.std_m)
     recent = (*watching.clipped, clipped)[-OF:]
-    unexplained = _unexplained(observer.mean)
-    beside_mps2 = unexplained_mps2 = _size_mps2(unexplained)
+    unexplained = beside_drag(observer.mean)
+    beside_mps2 = beside_sent_mps2 = size_mps2(unexplained)
     if observer.inertial is not None:
-        beside_mps2 = min(beside_mps2, _size_mps2(_unexplained(observer.inertial)))
-        watching = _pushed(watching, observer, unexplained_mps2, beside_mps2, seen, parameters)
+        beside_mps2 = min(beside_mps2, size_mps2(beside_drag(observer.inertial)))
+        watching = _pushed(watching, observer, beside_sent_mps2, beside_mps2, seen, parameters)
     size = beside_mps2 / parameters.unexplained_mps2
     known = beside_mps2 > KNOWN * math.sqrt(observer.cov[2, 2])
     over_ns = (watching.over_ns or at_ns) if size > 1.0 and known else None
@@ -347,7 +344,7 @@ def _position(
         watching,
         observer=observer,
         clipped=recent,
-        unexplained_mps2=unexplained_mps2,
+        unexplained_mps2=beside_sent_mps2,
         over_ns=over_ns,
         clean_ns=at_ns if quiet else watching.clean_ns,
     )
@@ -374,15 +371,19 @@ def _pushed(
         beside_sent_mps2: Size of the acceleration that no setpoint asked for [m/s²].
         beside_mps2: Size of what inertial data do not explain either [m/s²].
     """
-    bound_mps2 = parameters.unexplained_mps2
-    pushed = beside_sent_mps2 > (QUIET if watching.pushed else 1.0) * bound_mps2 >= beside_mps2
-    if seen.inertial_mps2 is None or observer.inertial is None:
-        return replace(watching, pushed=pushed)
-    north, east, down = (observer.mean[2] - observer.inertial[2]).tolist()
-    return replace(watching, pushed=pushed, push_mps2=(north, east, down))
+    bound_mps2, push = parameters.unexplained_mps2, watching.push_mps2
+    if seen.inertial_mps2 is not None and observer.inertial is not None:
+        north, east, down = (observer.mean[2] - observer.inertial[2]).tolist()
+        push = (north, east, down)
+    most_mps2 = (QUIET if watching.pushed else 1.0) * bound_mps2
+    pushed = beside_sent_mps2 > most_mps2 and beside_mps2 <= bound_mps2 and size_mps2(push) > QUIET * bound_mps2
+    return replace(watching, pushed=pushed, push_mps2=push)
 
 
-# The observer
+def _predicted(observer: Observer, watching: Watching, at_ns: int, parameters: EnvelopeParameters) -> Observer:
+    return predicted(
+        observer, watching.sent, watching.inertial_way, at_ns, parameters.lag_s, parameters.unexplained_mps2
+    )
 
 
 def _begun(at_ns: int, sample: PositionSample, watching: Watching, parameters: EnvelopeParameters) -> Observer:
@@ -404,77 +405,6 @@ def _begun(at_ns: int, sample: PositionSample, watching: Watching, parameters: E
     deviations = (max(sample.std_m, POSITION_STD_M), speed_mps, parameters.unexplained_mps2 / 3.0)
     inertial = mean if watching.inertial_way else None
     return Observer(at_ns=at_ns, mean=mean, cov=np.diag(np.square(deviations)), accel_mps2=accel, inertial=inertial)
-
-
-def _predicted(observer: Observer, watching: Watching, at_ns: int, parameters: EnvelopeParameters) -> Observer:
-    """Fly on by what was sent, behind the vehicle's lag; the unexplained acceleration wanders."""
-    sent, lag_s = watching.sent, np.maximum(parameters.lag_s, LEAST_LAG_S)
-    (position, velocity, unexplained), accel = observer.mean, observer.accel_mps2
-    first = bisect_right(sent, observer.at_ns, key=_TIME)
-    last = bisect_left(sent, at_ns, lo=first, key=_TIME)
-    acts = sent[first - 1][1] if first else ZERO
-    for begin_ns, end_ns, setpoint in _spans(observer.at_ns, at_ns, acts, sent[first:last]):
-        if end_ns <= begin_ns:
-            continue
-        s, u = (end_ns - begin_ns) * 1e-9, np.array(setpoint)
-        gone = np.exp(-s / lag_s)
-        behind = (accel - u) * lag_s * (1.0 - gone)  # velocity that the lag adds
-        position = position + s * velocity + 0.5 * s * s * (u + unexplained) + lag_s * ((accel - u) * s - behind)
-        velocity = velocity + s * (u + unexplained) + behind
-        accel = u + (accel - u) * gone
-    s = (at_ns - observer.at_ns) * 1e-9
-    f = np.array([[1.0, s, 0.5 * s * s], [0.0, 1.0, s], [0.0, 0.0, 1.0]])
-    q = np.array([[s**5 / 20, s**4 / 8, s**3 / 6], [s**4 / 8, s**3 / 3, s**2 / 2], [s**3 / 6, s**2 / 2, s]])
-    cov = f @ observer.cov @ f.T + parameters.unexplained_mps2**2 * q
-    inertial = observer.inertial
-    if watching.inertial_way:
-        if inertial is None:  # they have just begun: from here on they explain all of it
-            inertial = np.array([observer.mean[0], observer.mean[1], np.zeros(3)])
-        inertial = carried(watching.inertial_way, inertial, observer.at_ns, at_ns)
-    mean = np.array([position, velocity, unexplained])
-    return Observer(at_ns=at_ns, mean=mean, cov=cov, accel_mps2=accel, inertial=inertial)
-
-
-def _spans(begin_ns: int, end_ns: int, acts: Vec3, sent: Sequence[tuple[int, Vec3]]) -> Iterator[tuple[int, int, Vec3]]:
-    """Spans of a time, each with the setpoint that acts: one from before, then those sent within."""
-    for at_ns, setpoint in sent:
-        yield begin_ns, at_ns, acts
-        begin_ns, acts = at_ns, setpoint
-    yield begin_ns, end_ns, acts
-
-
-def _corrected(observer: Observer, position: Array, std_m: float) -> tuple[Observer, bool]:
-    """Take a position, its innovation clipped to a bound; return too whether it was beyond, whatever drives it."""
-    noise = max(std_m, POSITION_STD_M) ** 2
-    variance = float(observer.cov[0, 0]) + noise
-    bound = CLIP * math.sqrt(variance)
-    innovation = position - observer.mean[0]
-    gain = observer.cov[:, 0] / variance
-    mean = observer.mean + np.outer(gain, np.clip(innovation, -bound, bound))
-    keep = np.eye(3)
-    keep[:, 0] -= gain
-    cov = keep @ observer.cov @ keep.T + noise * np.outer(gain, gain)
-    clipped = bool((np.abs(innovation) > bound).any())
-    inertial = observer.inertial
-    if inertial is not None:
-        innovation = position - inertial[0]
-        inertial = inertial + np.outer(gain, np.clip(innovation, -bound, bound))
-        clipped = clipped and bool((np.abs(innovation) > bound).any())
-    return replace(observer, mean=mean, cov=cov, inertial=inertial), clipped
-
-
-def _size_mps2(accel_mps2: Array) -> float:
-    """Return the size of an acceleration (3,): horizontally, or vertically if that is more."""
-    return max(math.hypot(accel_mps2[0], accel_mps2[1]), abs(float(accel_mps2[2])))
-
-
-def _unexplained(mean: Array) -> Array:
-    """Return the unexplained acceleration (3,) without the part that can be drag, by the mean of an observer."""
-    _, velocity, unexplained = mean
-    along = float(velocity @ velocity)
-    drag_1ps = min(max(-float(unexplained @ velocity) / along, 0.0), DRAG_1PS) if along > 0.0 else 0.0
-    rest: Array = unexplained + drag_1ps * velocity
-    return rest
 
 
 def _response_text(observer: Observer, unexplained: Array, seen: Observation) -> str:

@@ -416,7 +416,10 @@ def _watched(
     )
     if recalled or tick.age_steps is None or tick.age_steps >= controller.horizon:
         seen = replace(seen, position_m=None)  # a prediction that is so old is held against nothing
-    return watch(state.watching, seen, controller.envelope)
+    watching, aloft = state.watching, state.aloft
+    if watching.began_ns is None and aloft.answered and felt is not None and not state.strayed:
+        watching = replace(watching, agreed=True)
+    return watch(watching, seen, controller.envelope)
 
 
 def _cleaned(intake: MeasurementUpdate, clean_ns: int, controller: Controller) -> MeasurementUpdate:
