@@ -257,7 +257,8 @@ def _shown(seen: Observation, parameters: EnvelopeParameters) -> Observation:
     motion = seen.motion
     if motion is not None and motion.velocity_mps is not None:
         motion = replace(motion, velocity_mps=shown(motion.velocity_mps))
-    return replace(seen, samples=samples, sent_mps2=shown(seen.sent_mps2), motion=motion)
+    inertial = None if seen.inertial_mps2 is None else shown(seen.inertial_mps2)
+    return replace(seen, samples=samples, sent_mps2=shown(seen.sent_mps2), motion=motion, inertial_mps2=inertial)
 
 
 def own_words(motion: VehicleMotion | None, at_ns: int) -> Vec3 | None:
@@ -331,10 +332,8 @@ def _position(
     observer, clipped = corrected(_predicted(before, watching, at_ns, parameters), position, sample.std_m)
     recent = (*watching.clipped, clipped)[-OF:]
     unexplained = beside_drag(observer.mean)
-    beside_mps2 = beside_sent_mps2 = size_mps2(unexplained)
-    if observer.inertial is not None:
-        beside_mps2 = min(beside_mps2, size_mps2(beside_drag(observer.inertial)))
-        watching = _pushed(watching, observer, beside_sent_mps2, beside_mps2, seen, parameters)
+    beside_sent_mps2 = size_mps2(unexplained)
+    watching, beside_mps2 = _pushed(watching, observer, beside_sent_mps2, seen, parameters)
     size = beside_mps2 / parameters.unexplained_mps2
     known = beside_mps2 > KNOWN * math.sqrt(observer.cov[2, 2])
     over_ns = (watching.over_ns or at_ns) if size > 1.0 and known else None
@@ -358,26 +357,26 @@ def _position(
 
 
 def _pushed(
-    watching: Watching,
-    observer: Observer,
-    beside_sent_mps2: float,
-    beside_mps2: float,
-    seen: Observation,
-    parameters: EnvelopeParameters,
-) -> Watching:
-    """Take note of a push that inertial data explain, and of whether it is more than positions alone may show.
+    watching: Watching, observer: Observer, beside_sent_mps2: float, seen: Observation, parameters: EnvelopeParameters
+) -> tuple[Watching, float]:
+    """Take note of a push that inertial data show; return too the acceleration that it leaves unexplained [m/s²].
+
+    A push of no more than half of what positions may show unexplained is no reason for more.
 
     Args:
         beside_sent_mps2: Size of the acceleration that no setpoint asked for [m/s²].
-        beside_mps2: Size of what inertial data do not explain either [m/s²].
     """
     bound_mps2, push = parameters.unexplained_mps2, watching.push_mps2
-    if seen.inertial_mps2 is not None and observer.inertial is not None:
+    if observer.inertial is None:
+        return watching, beside_sent_mps2
+    if seen.inertial_mps2 is not None:
         north, east, down = (observer.mean[2] - observer.inertial[2]).tolist()
         push = (north, east, down)
-    most_mps2 = (QUIET if watching.pushed else 1.0) * bound_mps2
-    pushed = beside_sent_mps2 > most_mps2 and beside_mps2 <= bound_mps2 and size_mps2(push) > QUIET * bound_mps2
-    return replace(watching, pushed=pushed, push_mps2=push)
+    beside_mps2, pushed = beside_sent_mps2, False
+    if size_mps2(push) > QUIET * bound_mps2:
+        beside_mps2 = min(beside_sent_mps2, size_mps2(beside_drag(observer.inertial)))
+        pushed = beside_sent_mps2 > (QUIET if watching.pushed else 1.0) * bound_mps2 >= beside_mps2
+    return replace(watching, pushed=pushed, push_mps2=push), beside_mps2
 
 
 def _predicted(observer: Observer, watching: Watching, at_ns: int, parameters: EnvelopeParameters) -> Observer:
