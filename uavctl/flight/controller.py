@@ -85,6 +85,8 @@ class ControlState(msgspec.Struct, frozen=True, eq=False):
     strayed: bool = False  # these could not be its own, at some time since it was armed
     felt: tuple[Vec3, int] | None = None  # acceleration that the vehicle felt last [m/s²], and when [ns]; None before
     breach: Breach | None = None  # the breach that it found; None for none
+    # Whether positions had just jumped, and were not believed again, when the fallback became final
+    suspected: bool = False
     # The operator has asked for a vehicle that is outside of the limits, and it has not been inside since
     recalled: bool = False
     biases: Biases = ()  # estimated biases of late

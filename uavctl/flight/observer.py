@@ -56,7 +56,7 @@ class InertialSpan(msgspec.Struct, frozen=True, eq=False):
 InertialWay = tuple[InertialSpan, ...]  # oldest first; empty where no inertial data have come
 
 
-def extended(way: InertialWay, begin_ns: int, accel_mps2: Sequence[float], horizon_ns: int) -> InertialWay:
+def extended(way: InertialWay, begin_ns: int, accel_mps2: Sequence[float] | Array, horizon_ns: int) -> InertialWay:
     """Return the way with one more span, without those that ended before the horizon."""
     accel = np.array(accel_mps2, dtype=np.float64)
     if not way:

@@ -154,8 +154,8 @@ def initial_state() -> ControlState:
 def disbelieves(state: ControlState) -> bool:
     """Whether positions are distrusted for good: then they are not passed on to the vehicle either."""
     jumped = state.fallback is not None and state.fallback.end is FallbackEnd.BARRED
-    if jumped or state.breach is None:
-        return jumped
+    if jumped or state.suspected or state.breach is None:
+        return jumped or state.suspected
     # An estimate that is outside right after the start may be so because positions are not what they say.
     return state.breach.code in OF_POSITIONS or not state.watching.answered
 
@@ -210,6 +210,9 @@ def step(
         ordered = replace(ordered, fallback=fb.request(ordered.fallback, FallbackEnd.BARRED, inp.at_ns))
     if breach is not None:
         ordered = replace(ordered, fallback=fb.request(ordered.fallback, FallbackEnd.LET_GO, inp.at_ns), breach=breach)
+    final, suspect = ordered.fallback is not None and ordered.fallback.final, state.trust.suspect
+    begins = final and not (state.fallback is not None and state.fallback.final)
+    suspected = final and (state.suspected or (begins and suspect is not None and suspect.likely))
     taken_back = state.taken_back if clean_ns is None and not lies else tick.number
     since = None if taken_back is None else tick.number - taken_back
     afresh = tick.boundary and since is not None and (0 < since <= AFRESH_STEPS or lies)
@@ -221,6 +224,7 @@ def step(
         decided_step=tick.number,
         fresh=0 if stale else intake.fresh,
         watching=watching,
+        suspected=suspected,
         recalled=recalled,
         plan=_outdated(ordered.plan, clean_ns, afresh=afresh),
         taken_back=taken_back,
