@@ -20,7 +20,7 @@ from uavctl.records import Event, Outgoing, Record, Send, Vec3
 MODEL_DRAG_1PS, DRAG_1PS = 0.24, 1.0  # of the simulated Crazyflie, and of PX4's own simulated vehicle
 BEGINS_S, OVER_S = 5.0, 16.0
 POSES = (b"\x66\x00\x00", b"\x4b\x01\x00")  # message ids of VISION_POSITION_ESTIMATE and ODOMETRY in a frame
-BACK_MPS, NEAR_M = 0.3, 0.1
+NEAR_M = 0.1
 
 
 @dataclass
@@ -137,7 +137,7 @@ def test_a_wind_that_it_cannot_hold_lets_it_land_by_its_positions(autopilot: str
     flight = blown(autopilot, (6.0, 0.0, 0.0))
     assert flight.let_go_s is not None and set(flight.codes) & {OUTSIDE, BRAKING}
     assert not OF_POSITIONS & set(flight.codes) and STRONG_PUSH in flight.codes
-    after = [at_s for at_s in flight.relayed_s if at_s > flight.let_go_s]
+    after = [at_s for at_s in flight.relayed_s if flight.let_go_s < at_s < flight.let_go_s + 3.0]
     assert len(after) > 20 and max(np.diff([flight.let_go_s, *after])) < 1.0
 
 
@@ -149,4 +149,4 @@ def test_positions_that_turn_in_a_wind_are_found_and_held_back(autopilot: str) -
     turns = 'sim.fault=[{at_s=8.0, kind="frame", name="turned-90"}]'
     flight = blown(autopilot, (1.5, 0.0, 0.0), turns)
     assert "fallback-land" in flight.codes
-    assert max(flight.relayed_s) < 9.0
+    assert max(flight.relayed_s) < 8.5

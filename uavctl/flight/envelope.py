@@ -183,6 +183,21 @@ def watch(watching: Watching, seen: Observation, parameters: EnvelopeParameters)
     return watching, breach or _unresolved(watching, seen) or outside or brakes
 
 
+def after_flight(watching: Watching, inertial_mps2: Vec3) -> Watching:
+    """Return the watch of a vehicle that others fly from now on, which goes on from what inertial data have shown.
+
+    Args:
+        inertial_mps2: Acceleration that they show now, local NED [m/s²].
+    """
+    last = watching.observer
+    if last is None or last.inertial is None or watching.tick_ns is None:
+        return NOT_WATCHING
+    observer = Observer(at_ns=last.at_ns, mean=last.inertial, cov=last.cov, accel_mps2=np.array(inertial_mps2))
+    return Watching(
+        observer=observer, tick_ns=watching.tick_ns, sent=((last.at_ns, inertial_mps2),), clean_ns=watching.clean_ns
+    )
+
+
 def own_velocity(watching: Watching, seen: Observation, age_s: float, parameters: EnvelopeParameters) -> Vec3 | None:
     """The vehicle's own velocity where it may be braked on; None where it does not come, or nothing speaks for it.
 

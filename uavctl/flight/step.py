@@ -39,6 +39,7 @@ from uavctl.flight.envelope import (
     VELOCITY,
     Breach,
     Watching,
+    after_flight,
     beyond,
     contradicts,
     is_outside,
@@ -336,7 +337,10 @@ def _aloft(
         return NOT_WATCHING, None
     known = felt is not None
     seen = seen_of(tick, inp, ZERO if felt is None else felt[0], controller.plant, intake.accepted)
-    watching, breach = watch(state.aloft, replace(seen, position_m=None), controller.envelope)
+    before = state.aloft
+    if before.tick_ns is None and felt is not None and not disbelieves(state):
+        before = after_flight(state.watching, felt[0])  # it moves: a watch that begins anew would not know how fast
+    watching, breach = watch(before, replace(seen, position_m=None), controller.envelope)
     # Once positions were wrong its own velocity may be, too: they are all that its estimate has.
     counts = breach is not None and (not state.strayed if breach.code == VELOCITY else known)
     return watching, breach if counts else None
