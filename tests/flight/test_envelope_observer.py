@@ -48,7 +48,7 @@ from uavctl.flight.envelope import (
     witness,
 )
 from uavctl.flight.limits import ZERO
-from uavctl.flight.observer import Observer
+from uavctl.flight.sensor_faults import Observer
 from uavctl.records import Vec3, VehicleMotion
 
 # The observer

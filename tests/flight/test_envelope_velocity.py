@@ -29,7 +29,7 @@ from scipy.optimize import minimize_scalar
 
 from uavctl.flight.envelope import NOT_WATCHING, VELOCITY, Breach, Watching, own_velocity, watch
 from uavctl.flight.limits import ZERO
-from uavctl.flight.observer import Observer
+from uavctl.flight.sensor_faults import Observer
 from uavctl.records import Vec3, VehicleMotion
 
 

@@ -12,7 +12,7 @@ from envelope_rig import PARAMETERS, TICK_NS, Array, S, vec3
 from flight_rig import MS, START_NS, sample
 
 from uavctl.flight.envelope import NOT_WATCHING, RESPONSE, Observation, Watching, watch
-from uavctl.flight.observer import InertialSpan, carried, extended, push_text
+from uavctl.flight.sensor_faults import InertialSpan, carried, extended, push_text
 from uavctl.records import Vec3
 
 BOUND_MPS2 = PARAMETERS.unexplained_mps2

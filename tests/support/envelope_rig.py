@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from uavctl.flight.envelope import Breach, EnvelopeParameters, Observation, Watching, watch
 from uavctl.flight.limits import ZERO
-from uavctl.flight.observer import Observer
+from uavctl.flight.sensor_faults import Observer
 from uavctl.records import PositionSample, Vec3, VehicleMotion
 
 Array = NDArray[np.float64]

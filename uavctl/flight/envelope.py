@@ -8,7 +8,7 @@ Each tick of a flight, four questions:
    an unexplained acceleration for each axis, is driven by what was sent and corrected by the positions that were
    believed. Drag explains what points against the velocity. A frame that is turned, mirrored or in another unit gives
    the acceleration sent a wrong direction or size, a marker that came loose none at all. Where the vehicle's inertial
-   data show the same acceleration, it is wind, or a hit, and positions are right (`uavctl.flight.observer`).
+   data show the same acceleration, it is wind, or a hit, and positions are right (`uavctl.flight.sensor_faults`).
 3. Do positions move otherwise than the vehicle says it does (its own velocity, where it comes)? Over a second or so
    their velocities are compared; over half a minute the ways that both have come, which finds a frame that creeps.
 4. Does braking brake?
@@ -31,7 +31,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from uavctl.flight.limits import AXES, ZERO
-from uavctl.flight.observer import (
+from uavctl.flight.sensor_faults import (
     LEAST_LAG_S,
     POSITION_STD_M,
     InertialWay,
