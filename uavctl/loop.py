@@ -16,7 +16,7 @@ from uavctl.config import Config
 from uavctl.errors import in_words
 from uavctl.flight.controller import Controller
 from uavctl.flight.decision import CONTROLLER_FAULT
-from uavctl.flight.step import BIAS_AT_BOUND, BIAS_FREE, StepOutput, disbelieves, initial_state, step
+from uavctl.flight.step import BIAS_AT_BOUND, BIAS_FREE, STRONG_PUSH, StepOutput, disbelieves, initial_state, step
 from uavctl.mavlink.connection import HUNG_UP, NO_HEARTBEAT, OVERRUN, STAMP_UNIT, WENT_SILENT, MavlinkConnection
 from uavctl.mavlink.handover import HAND_OVER_ORDERS, HandOver, HandoverStep
 from uavctl.mavlink.handover_guards import HandoverView, against_moving
@@ -62,7 +62,17 @@ SECOND_NS = 1_000_000_000
 FAILED = "the controller has failed:"  # and what failed in it
 MAX_ORDERS = 16  # that wait for one tick
 FOR_A_PERSON = frozenset(
-    {"vehicle-text", BIAS_AT_BOUND, BIAS_FREE, CONTROLLER_FAULT, HUNG_UP, WENT_SILENT, NO_HEARTBEAT, STAMP_UNIT}
+    {
+        "vehicle-text",
+        BIAS_AT_BOUND,
+        BIAS_FREE,
+        STRONG_PUSH,
+        CONTROLLER_FAULT,
+        HUNG_UP,
+        WENT_SILENT,
+        NO_HEARTBEAT,
+        STAMP_UNIT,
+    }
 )  # codes of the events that the console tells
 MISLED_NS = 3_000_000_000  # positions are held back for so long after they could not be the vehicle's own
 MAX_INERTIAL = 20  # newest of one tick: their mean is what counts

@@ -280,6 +280,7 @@ def test_axes_that_the_plant_has_not_are_not_looked_at() -> None:
                     velocity_mps=vec3(estimated),  # noqa: B023
                     motion=motion(vec3(own * only + other), at_ns),  # noqa: B023
                     braking=True,
+                    inertial_mps2=vec3(sent * only + other),  # noqa: B023
                 )
 
             one, breach = watch(one, tick(wild), parameters)

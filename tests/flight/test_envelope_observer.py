@@ -40,7 +40,6 @@ from uavctl.flight.envelope import (
     SCATTER,
     VELOCITY,
     Observation,
-    Observer,
     Watching,
     contradicts,
     misled,
@@ -49,6 +48,7 @@ from uavctl.flight.envelope import (
     witness,
 )
 from uavctl.flight.limits import ZERO
+from uavctl.flight.sensor_faults import Observer
 from uavctl.records import Vec3, VehicleMotion
 
 # The observer

@@ -27,8 +27,9 @@ from flight_rig import MS, START_NS, sample
 from msgspec import structs
 from scipy.optimize import minimize_scalar
 
-from uavctl.flight.envelope import NOT_WATCHING, VELOCITY, Breach, Observer, Watching, own_velocity, watch
+from uavctl.flight.envelope import NOT_WATCHING, VELOCITY, Breach, Watching, own_velocity, watch
 from uavctl.flight.limits import ZERO
+from uavctl.flight.sensor_faults import Observer
 from uavctl.records import Vec3, VehicleMotion
 
 

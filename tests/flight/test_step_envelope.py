@@ -32,7 +32,7 @@ from uavctl.flight.controller import Controller, ControlState
 from uavctl.flight.envelope import BRAKING, OUTSIDE, RESPONSE, SCATTER, VELOCITY, Breach, Watching
 from uavctl.flight.fallback import Fallback, FallbackEnd
 from uavctl.flight.step import disbelieves
-from uavctl.records import ControlMode, InertialSample, Vec3, VehicleStatus
+from uavctl.records import ControlMode, InertialSample, StepInput, Vec3, VehicleStatus
 
 MILLIMETRES: Vec3 = (-2400.0, -1900.0, -700.0)
 N_TICKS = 30  # 1.5 s; positions count as absurd after 0.5 s
@@ -152,6 +152,29 @@ def test_what_is_not_believed_is_told_to_nobody(code: str, for_ns: int | None, s
     began_ns = None if for_ns is None else START_NS - for_ns
     state = ControlState(breach=Breach(code, ""), watching=Watching(tick_ns=START_NS, began_ns=began_ns))
     assert disbelieves(state) == silent
+    agreed = replace(state, watching=replace(state.watching, agreed=True))
+    assert disbelieves(agreed) == (silent and code != OUTSIDE)
+
+
+@pytest.mark.parametrize("senses", [True, False])
+@pytest.mark.fault(72)
+def test_positions_that_agreed_with_inertial_data_before_we_fly_need_not_prove_themselves_again(senses: bool) -> None:
+    ours, state, n_others = controller(), ControlState(), 60
+    for n in range(n_others + 10):
+        at_ns = START_NS + n * TICK_NS
+        state, _ = step.step(
+            state,
+            StepInput(
+                tick=n,
+                at_ns=at_ns,
+                samples=(sample(at_ns, position_m=(1e-4 * (n % 3), 0.0, 0.0)),),
+                vehicle=vehicle(external=n >= n_others),
+                inertial=(InertialSample(at_ns=at_ns, accel_mps2=(1e-3 * (n % 2), 0.0, 0.0)),) if senses else (),
+            ),
+            ours,
+        )
+    assert state.watching.began_ns is not None and state.breach is None
+    assert state.watching.agreed == senses
 
 
 @pytest.mark.parametrize(

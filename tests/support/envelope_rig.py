@@ -11,8 +11,9 @@ from flight_rig import MS, START_NS, sample
 from msgspec import structs
 from numpy.typing import NDArray
 
-from uavctl.flight.envelope import Breach, EnvelopeParameters, Observation, Observer, Watching, watch
+from uavctl.flight.envelope import Breach, EnvelopeParameters, Observation, Watching, watch
 from uavctl.flight.limits import ZERO
+from uavctl.flight.sensor_faults import Observer
 from uavctl.records import PositionSample, Vec3, VehicleMotion
 
 Array = NDArray[np.float64]

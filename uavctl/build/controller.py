@@ -406,6 +406,7 @@ def build_controller(config: Config, design: AnyDesign | None = None, library: L
         late_steps=design.horizon if outside or isinstance(design, ConditionedDesign) else len(design.late),
         envelope=build_envelope(config, plant),
         estimator=build_estimator(config),
+        inputs=(np.array(config.sets.input_lower), np.array(config.sets.input_upper)),
         fallback=FallbackParameters(
             brake_gain_1ps=fallback.brake_gain_1ps,
             brake_s=fallback.brake_s,

@@ -10,7 +10,7 @@ from uavctl.flight.envelope import NOT_WATCHING, Breach, EnvelopeParameters, Wat
 from uavctl.flight.estimator import Coming, FilterHistory
 from uavctl.flight.fallback import Biases, Fallback, FallbackParameters
 from uavctl.flight.gating import SourceHealth
-from uavctl.flight.kalman import EstimatorParameters, Kalman, make_kalman
+from uavctl.flight.kalman import Array, EstimatorParameters, Kalman, make_kalman
 from uavctl.flight.limits import ZERO, LimitsParameters
 from uavctl.flight.link_estimate import NOTHING_SEEN, LinkBelief, LinkEstimateParameters
 from uavctl.flight.mission import Mission, MissionState
@@ -44,6 +44,8 @@ class Controller:
     dead_ns: int = 0  # from sending an input until it begins to act [ns]
     late_steps: int = 0  # age up to which the solver counts what it has not seen since [steps]
     outside: str = ""  # name of the controller of another package that is the solver; empty: it is one of ours
+    # Least and largest input (n_u,) that may be sent, bias and all; None: what the design says
+    inputs: tuple[Array, Array] | None = None
     envelope: EnvelopeParameters | None = None  # bounds of what is possible; None: nothing is checked against them
     ticks_per_step: int = field(init=False)  # ticks in a Δt
     kalman: Kalman = field(init=False, repr=False)  # the filter, made from the others
@@ -83,6 +85,8 @@ class ControlState(msgspec.Struct, frozen=True, eq=False):
     strayed: bool = False  # these could not be its own, at some time since it was armed
     felt: tuple[Vec3, int] | None = None  # acceleration that the vehicle felt last [m/s²], and when [ns]; None before
     breach: Breach | None = None  # the breach that it found; None for none
+    # Whether positions had just jumped, and were not believed again, when the fallback became final
+    suspected: bool = False
     # The operator has asked for a vehicle that is outside of the limits, and it has not been inside since
     recalled: bool = False
     biases: Biases = ()  # estimated biases of late

@@ -450,6 +450,7 @@ def _replan(
         late=late,
         cov=cov,
         sent=sent + np.array(base.bias) if base.bias else sent,
+        inputs=_left(base.bias, controller),
     )
     shape = (controller.horizon, controller.plant.n_u)
     asked = ask(controller.solver, tick.number, base, target, outlook, shape, controller.design_id)
@@ -457,6 +458,14 @@ def _replan(
         state = replace(state, fault=asked.fault)
         return Choice(state, "no new plan: the old one plays out", news, asked.status, None, asked.text)
     return Choice(replace(state, plan=asked.plan, fallback=None), reason, news, asked.status, asked.plan)
+
+
+def _left(bias: Vector, controller: Controller) -> tuple[Array, Array] | None:
+    """Return the inputs that a plan has beside a bias, in its own count; None where the design left room for it."""
+    if controller.inputs is None or not bias or max(map(abs, bias)) <= controller.estimator.bias_max:
+        return None
+    low, high = controller.inputs
+    return low + bias, high + bias
 
 
 def _unplanned(state: ControlState, tick: Tick, inp: StepInput, controller: Controller) -> Choice:
@@ -589,6 +598,7 @@ def seen_of(
     accepted: Sequence[PositionSample] = (),
     *,
     braking: bool = False,
+    inertial_mps2: Vec3 | None = None,
 ) -> envelope.Observation:
     """Return the data of a tick that the envelope is checked against."""
     position, speed = None, (math.nan, math.nan, math.nan)
@@ -603,6 +613,7 @@ def seen_of(
         velocity_mps=speed,
         motion=inp.motion,
         braking=braking,
+        inertial_mps2=inertial_mps2,
     )
 
 

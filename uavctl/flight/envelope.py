@@ -7,7 +7,8 @@ Each tick of a flight, four questions:
 2. Do positions show an acceleration that no setpoint asked for? A small observer of its own, a position, a velocity and
    an unexplained acceleration for each axis, is driven by what was sent and corrected by the positions that were
    believed. Drag explains what points against the velocity. A frame that is turned, mirrored or in another unit gives
-   the acceleration sent a wrong direction or size, a marker that came loose none at all.
+   the acceleration sent a wrong direction or size, a marker that came loose none at all. Where the vehicle's inertial
+   data show the same acceleration, it is wind, or a hit, and positions are right (`uavctl.flight.sensor_faults`).
 3. Do positions move otherwise than the vehicle says it does (its own velocity, where it comes)? Over a second or so
    their velocities are compared; over half a minute the ways that both have come, which finds a frame that creeps.
 4. Does braking brake?
@@ -20,7 +21,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 
@@ -30,6 +31,18 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from uavctl.flight.limits import AXES, ZERO
+from uavctl.flight.sensor_faults import (
+    LEAST_LAG_S,
+    POSITION_STD_M,
+    InertialWay,
+    Observer,
+    beside_drag,
+    corrected,
+    extended,
+    predicted,
+    push_text,
+    size_mps2,
+)
 from uavctl.records import PositionSample, Vec3, Vector, VehicleMotion
 
 Array = NDArray[np.float64]
@@ -46,8 +59,6 @@ ANSWERS_NS = 2_000_000_000  # of a flight: positions that did not answer would h
 MOTION_NS = 300_000_000  # the vehicle's own words count for so long
 SPACING_NS = 40_000_000  # positions closer to one another add work and no knowledge
 TOLD_NS = 3_000_000_000  # setpoints and own velocities are remembered for so long
-DRAG_1PS = 1.2  # most drag that is taken for drag: PX4's simulated vehicles have 1.0
-CLIP = 6.0  # an innovation counts up to so many standard deviations: one reflection is no proof
 SCATTERED, OF = 3, 5  # clipped innovations of the last ones that are no chance
 PERSISTS_NS = 100_000_000  # for which it holds, over two positions at least; no time at all where it is beyond
 KNOWN = 1.5  # it is more than this many of its standard deviations
@@ -57,7 +68,6 @@ HINT = 0.4  # of the bound of the unexplained acceleration
 QUIET = 0.5  # of the bound: below, positions are clean
 OUTSIDE_NS = 100_000_000
 RETURNS_MPS = 0.3  # outside, towards the limit: it is on its way back
-POSITION_STD_M = 0.02  # at least, of a position: what gate and rounding may leave
 VELOCITY_STD_MPS = 0.1  # of a velocity that a position brings along, where the flight begins
 BRAKES_NS = 1_000_000_000  # after which braking must have shown
 BRAKED, BRAKED_MPS = 0.8, 0.3  # it has not where the speed is above this part of what it was, and this
@@ -70,7 +80,6 @@ WAYS_S, WAYS_PART = 2.0, 0.16  # of the disagreement: a way may be off by so lon
 MISLEADS = 4.0  # disagreements of a prediction that gusts alone do not make
 WITNESS_S = 10.0  # of a flight: as long as what was sent says something of the velocity
 GRAVITY_MPS2 = 9.81
-LEAST_LAG_S = 1e-3  # for a plant without one
 _TIME = itemgetter(0)  # of what is kept by its time, oldest first
 
 
@@ -110,15 +119,8 @@ class Observation(msgspec.Struct, frozen=True):
     velocity_mps: Vec3  # estimated velocity, the same
     motion: VehicleMotion | None  # motion by the vehicle's own estimate
     braking: bool  # whether the fallback brakes
-
-
-class Observer(msgspec.Struct, frozen=True, eq=False):
-    """Position, velocity and unexplained acceleration at the newest position that counted."""
-
-    at_ns: int  # its capture time [ns]
-    mean: Array  # (3, 3): a row each for position, velocity, unexplained acceleration; a column an axis
-    cov: Array  # (3, 3) of one axis; those of all axes are alike
-    accel_mps2: Array  # acceleration that the setpoints so far give the vehicle, behind its lag (3,)
+    # Acceleration that the vehicle's inertial data show, local NED; None where none are of now
+    inertial_mps2: Vec3 | None = None
 
 
 class Watching(msgspec.Struct, frozen=True, eq=False):
@@ -127,10 +129,14 @@ class Watching(msgspec.Struct, frozen=True, eq=False):
     observer: Observer | None = None  # None before the first position
     tick_ns: int | None = None  # the last tick
     began_ns: int | None = None  # the first one
+    agreed: bool = False  # whether positions agreed with the vehicle's inertial data before it
     flown_mps: Vector = ZERO  # velocity (3,) that was sent since then, behind the vehicle's lag
     flown_mps2: Vector = ZERO  # the acceleration (3,) that belongs to it
     sent: tuple[tuple[int, Vec3], ...] = ()  # setpoints, each with the tick from which it acted [ns], oldest first
     clipped: tuple[bool, ...] = ()  # whether each of the last innovations was clipped, newest last
+    inertial_way: InertialWay = ()  # the way that inertial data show; empty before any
+    push_mps2: Vec3 = ZERO  # acceleration beside what was sent, when inertial data last explained it
+    pushed: bool = False  # whether that is more than the unexplained acceleration may be
     # Size of the unexplained acceleration, when it was last looked at; None before
     unexplained_mps2: float | None = None
     # How far the velocities of positions and vehicle were apart then; None where that is not known
@@ -152,7 +158,7 @@ class Watching(msgspec.Struct, frozen=True, eq=False):
     def answered(self) -> bool:
         """Whether positions have agreed with the flight for so long that they must be those of this vehicle."""
         began_ns, tick_ns = self.began_ns, self.tick_ns
-        return began_ns is not None and tick_ns is not None and tick_ns - began_ns >= ANSWERS_NS
+        return self.agreed or (began_ns is not None and tick_ns is not None and tick_ns - began_ns >= ANSWERS_NS)
 
 
 NOT_WATCHING = Watching()
@@ -165,7 +171,9 @@ def watch(watching: Watching, seen: Observation, parameters: EnvelopeParameters)
         watching: State that the tick before left; `NOT_WATCHING` where a flight begins.
     """
     seen = _shown(seen, parameters)
-    watching = _flown_on(_told(watching, seen), watching.tick_ns, seen, parameters)
+    before_ns = watching.tick_ns
+    watching = _flown_on(_told(watching, seen), before_ns, seen, parameters)
+    watching = _pushed_on(watching, before_ns, seen)
     breach: Breach | None = None
     for sample in sorted(seen.samples, key=lambda one: min(one.captured_ns, one.received_ns)):
         watching, found = _position(watching, sample, seen, parameters)
@@ -173,6 +181,21 @@ def watch(watching: Watching, seen: Observation, parameters: EnvelopeParameters)
     watching, outside = _place(watching, seen, parameters)
     watching, brakes = _braking(watching, seen)
     return watching, breach or _unresolved(watching, seen) or outside or brakes
+
+
+def after_flight(watching: Watching, inertial_mps2: Vec3) -> Watching:
+    """Return the watch of a vehicle that others fly from now on, which goes on from what inertial data have shown.
+
+    Args:
+        inertial_mps2: Acceleration that they show now, local NED [m/s²].
+    """
+    last = watching.observer
+    if last is None or last.inertial is None or watching.tick_ns is None:
+        return NOT_WATCHING
+    observer = Observer(at_ns=last.at_ns, mean=last.inertial, cov=last.cov, accel_mps2=np.array(inertial_mps2))
+    return Watching(
+        observer=observer, tick_ns=watching.tick_ns, sent=((last.at_ns, inertial_mps2),), clean_ns=watching.clean_ns
+    )
 
 
 def own_velocity(watching: Watching, seen: Observation, age_s: float, parameters: EnvelopeParameters) -> Vec3 | None:
@@ -249,7 +272,8 @@ def _shown(seen: Observation, parameters: EnvelopeParameters) -> Observation:
     motion = seen.motion
     if motion is not None and motion.velocity_mps is not None:
         motion = replace(motion, velocity_mps=shown(motion.velocity_mps))
-    return replace(seen, samples=samples, sent_mps2=shown(seen.sent_mps2), motion=motion)
+    inertial = None if seen.inertial_mps2 is None else shown(seen.inertial_mps2)
+    return replace(seen, samples=samples, sent_mps2=shown(seen.sent_mps2), motion=motion, inertial_mps2=inertial)
 
 
 def own_words(motion: VehicleMotion | None, at_ns: int) -> Vec3 | None:
@@ -293,6 +317,21 @@ def _flown_on(watching: Watching, tick_ns: int | None, seen: Observation, parame
     return replace(watching, flown_mps=tuple(flown), flown_mps2=tuple(accels))
 
 
+def _pushed_on(watching: Watching, tick_ns: int | None, seen: Observation) -> Watching:
+    """Let the acceleration that inertial data show act since the last tick.
+
+    A silence counts with what was sent and with the push that they showed last: wind lasts.
+    """
+    shown = seen.inertial_mps2
+    if shown is None:
+        if not watching.inertial_way:
+            return watching
+        north, east, down = (a + b for a, b in zip(watching.flown_mps2, watching.push_mps2, strict=True))
+        shown = north, east, down
+    begin_ns = seen.at_ns if tick_ns is None else tick_ns
+    return replace(watching, inertial_way=extended(watching.inertial_way, begin_ns, shown, seen.at_ns - TOLD_NS))
+
+
 def _position(
     watching: Watching, sample: PositionSample, seen: Observation, parameters: EnvelopeParameters
 ) -> tuple[Watching, Breach | None]:
@@ -305,12 +344,13 @@ def _position(
         return _compared(watching, at_ns, position, False, parameters)
     if at_ns - before.at_ns < SPACING_NS:
         return watching, None
-    observer, clipped = _corrected(_predicted(before, watching.sent, at_ns, parameters), position, sample.std_m)
+    observer, clipped = corrected(_predicted(before, watching, at_ns, parameters), position, sample.std_m)
     recent = (*watching.clipped, clipped)[-OF:]
-    unexplained = _unexplained(observer)
-    unexplained_mps2 = max(math.hypot(unexplained[0], unexplained[1]), abs(float(unexplained[2])))
-    size = unexplained_mps2 / parameters.unexplained_mps2
-    known = unexplained_mps2 > KNOWN * math.sqrt(observer.cov[2, 2])
+    unexplained = beside_drag(observer.mean)
+    beside_sent_mps2 = size_mps2(unexplained)
+    watching, beside_mps2 = _pushed(watching, observer, beside_sent_mps2, seen, parameters)
+    size = beside_mps2 / parameters.unexplained_mps2
+    known = beside_mps2 > KNOWN * math.sqrt(observer.cov[2, 2])
     over_ns = (watching.over_ns or at_ns) if size > 1.0 and known else None
     watching, velocity = _compared(watching, at_ns, position, size > HINT, parameters)
     quiet = size <= QUIET and not clipped and watching.apart_ns is None
@@ -318,7 +358,7 @@ def _position(
         watching,
         observer=observer,
         clipped=recent,
-        unexplained_mps2=unexplained_mps2,
+        unexplained_mps2=beside_sent_mps2,
         over_ns=over_ns,
         clean_ns=at_ns if quiet else watching.clean_ns,
     )
@@ -331,7 +371,33 @@ def _position(
     return watching, None
 
 
-# The observer
+def _pushed(
+    watching: Watching, observer: Observer, beside_sent_mps2: float, seen: Observation, parameters: EnvelopeParameters
+) -> tuple[Watching, float]:
+    """Take note of a push that inertial data show; return too the acceleration that it leaves unexplained [m/s²].
+
+    A push of no more than half of what positions may show unexplained is no reason for more.
+
+    Args:
+        beside_sent_mps2: Size of the acceleration that no setpoint asked for [m/s²].
+    """
+    bound_mps2, push = parameters.unexplained_mps2, watching.push_mps2
+    if observer.inertial is None:
+        return watching, beside_sent_mps2
+    if seen.inertial_mps2 is not None:
+        north, east, down = (observer.mean[2] - observer.inertial[2]).tolist()
+        push = (north, east, down)
+    beside_mps2, pushed = beside_sent_mps2, False
+    if size_mps2(push) > QUIET * bound_mps2:
+        beside_mps2 = min(beside_sent_mps2, size_mps2(beside_drag(observer.inertial)))
+        pushed = beside_sent_mps2 > (QUIET if watching.pushed else 1.0) * bound_mps2 >= beside_mps2
+    return replace(watching, pushed=pushed, push_mps2=push), beside_mps2
+
+
+def _predicted(observer: Observer, watching: Watching, at_ns: int, parameters: EnvelopeParameters) -> Observer:
+    return predicted(
+        observer, watching.sent, watching.inertial_way, at_ns, parameters.lag_s, parameters.unexplained_mps2
+    )
 
 
 def _begun(at_ns: int, sample: PositionSample, watching: Watching, parameters: EnvelopeParameters) -> Observer:
@@ -344,71 +410,15 @@ def _begun(at_ns: int, sample: PositionSample, watching: Watching, parameters: E
     if watching.observer is None:
         began_ns = min(watching.sent[0][0], at_ns)
         rest = Observer(at_ns=began_ns, mean=mean, cov=np.zeros((3, 3)), accel_mps2=accel)
-        flown = _predicted(rest, watching.sent, at_ns, parameters)
+        flown = _predicted(rest, watching, at_ns, parameters)
         mean[1], accel = flown.mean[1], flown.accel_mps2
         speed_mps = parameters.begins_mps + _gusts_mps((at_ns - began_ns) * 1e-9, parameters)
     mean[0] = sample.position_m
     if sample.velocity_mps is not None:
         mean[1], speed_mps = sample.velocity_mps, VELOCITY_STD_MPS
     deviations = (max(sample.std_m, POSITION_STD_M), speed_mps, parameters.unexplained_mps2 / 3.0)
-    return Observer(at_ns=at_ns, mean=mean, cov=np.diag(np.square(deviations)), accel_mps2=accel)
-
-
-def _predicted(
-    observer: Observer, sent: tuple[tuple[int, Vec3], ...], at_ns: int, parameters: EnvelopeParameters
-) -> Observer:
-    """Fly on by what was sent, behind the vehicle's lag; the unexplained acceleration wanders."""
-    lag_s = np.maximum(parameters.lag_s, LEAST_LAG_S)
-    (position, velocity, unexplained), accel = observer.mean, observer.accel_mps2
-    first = bisect_right(sent, observer.at_ns, key=_TIME)
-    last = bisect_left(sent, at_ns, lo=first, key=_TIME)
-    acts = sent[first - 1][1] if first else ZERO
-    for begin_ns, end_ns, setpoint in _spans(observer.at_ns, at_ns, acts, sent[first:last]):
-        if end_ns <= begin_ns:
-            continue
-        s, u = (end_ns - begin_ns) * 1e-9, np.array(setpoint)
-        gone = np.exp(-s / lag_s)
-        behind = (accel - u) * lag_s * (1.0 - gone)  # velocity that the lag adds
-        position = position + s * velocity + 0.5 * s * s * (u + unexplained) + lag_s * ((accel - u) * s - behind)
-        velocity = velocity + s * (u + unexplained) + behind
-        accel = u + (accel - u) * gone
-    s = (at_ns - observer.at_ns) * 1e-9
-    f = np.array([[1.0, s, 0.5 * s * s], [0.0, 1.0, s], [0.0, 0.0, 1.0]])
-    q = np.array([[s**5 / 20, s**4 / 8, s**3 / 6], [s**4 / 8, s**3 / 3, s**2 / 2], [s**3 / 6, s**2 / 2, s]])
-    cov = f @ observer.cov @ f.T + parameters.unexplained_mps2**2 * q
-    return Observer(at_ns=at_ns, mean=np.array([position, velocity, unexplained]), cov=cov, accel_mps2=accel)
-
-
-def _spans(begin_ns: int, end_ns: int, acts: Vec3, sent: Sequence[tuple[int, Vec3]]) -> Iterator[tuple[int, int, Vec3]]:
-    """Spans of a time, each with the setpoint that acts: one from before, then those sent within."""
-    for at_ns, setpoint in sent:
-        yield begin_ns, at_ns, acts
-        begin_ns, acts = at_ns, setpoint
-    yield begin_ns, end_ns, acts
-
-
-def _corrected(observer: Observer, position: Array, std_m: float) -> tuple[Observer, bool]:
-    """Take a position, its innovation clipped to a bound; return too whether it was beyond."""
-    noise = max(std_m, POSITION_STD_M) ** 2
-    variance = float(observer.cov[0, 0]) + noise
-    bound = CLIP * math.sqrt(variance)
-    innovation = position - observer.mean[0]
-    gain = observer.cov[:, 0] / variance
-    mean = observer.mean + np.outer(gain, np.clip(innovation, -bound, bound))
-    keep = np.eye(3)
-    keep[:, 0] -= gain
-    cov = keep @ observer.cov @ keep.T + noise * np.outer(gain, gain)
-    clipped = bool((np.abs(innovation) > bound).any())
-    return Observer(at_ns=observer.at_ns, mean=mean, cov=cov, accel_mps2=observer.accel_mps2), clipped
-
-
-def _unexplained(observer: Observer) -> Array:
-    """Return the unexplained acceleration (3,) without the part that can be drag."""
-    _, velocity, unexplained = observer.mean
-    along = float(velocity @ velocity)
-    drag_1ps = min(max(-float(unexplained @ velocity) / along, 0.0), DRAG_1PS) if along > 0.0 else 0.0
-    rest: Array = unexplained + drag_1ps * velocity
-    return rest
+    inertial = mean if watching.inertial_way else None
+    return Observer(at_ns=at_ns, mean=mean, cov=np.diag(np.square(deviations)), accel_mps2=accel, inertial=inertial)
 
 
 def _response_text(observer: Observer, unexplained: Array, seen: Observation) -> str:
@@ -416,12 +426,23 @@ def _response_text(observer: Observer, unexplained: Array, seen: Observation) ->
         f"positions show an acceleration of {_vector(unexplained)} m/s² that no setpoint asked for "
         f"({_vector(observer.accel_mps2)} m/s² was)"
     )
-    lean = None if seen.motion is None else lean_mps2(seen.motion, seen.at_ns)
+    leans = _leans(observer, unexplained, seen.motion, seen.at_ns)
+    return text if leans is None else f"{text}; the vehicle leans {'as' if leans else 'otherwise than'} it was told"
+
+
+def push_words(watching: Watching, motion: VehicleMotion | None, at_ns: int) -> str:
+    """Return the push that inertial data explain in words."""
+    observer, push = watching.observer, watching.push_mps2
+    return push_text(push, None if observer is None else _leans(observer, np.array(push), motion, at_ns))
+
+
+def _leans(observer: Observer, unexplained: Array, motion: VehicleMotion | None, at_ns: int) -> bool | None:
+    """Return whether the vehicle leans as it was told, as against an unexplained acceleration; None where unknown."""
+    lean = None if motion is None else lean_mps2(motion, at_ns)
     if lean is None:
-        return text
+        return None
     off = math.hypot(lean[0] - float(observer.accel_mps2[0]), lean[1] - float(observer.accel_mps2[1]))
-    as_told = off <= 0.5 * math.hypot(*unexplained)
-    return f"{text}; the vehicle leans {'as it was told' if as_told else 'otherwise than it was told'}"
+    return off <= 0.5 * math.hypot(*unexplained)
 
 
 def lean_mps2(motion: VehicleMotion, at_ns: int) -> tuple[float, float] | None:

@@ -39,9 +39,11 @@ from uavctl.flight.envelope import (
     VELOCITY,
     Breach,
     Watching,
+    after_flight,
     beyond,
     contradicts,
     is_outside,
+    push_words,
     watch,
 )
 from uavctl.flight.estimator import act, begin, belief_at, doubted, estimated, feel, set_input, without
@@ -77,6 +79,7 @@ from uavctl.smpc.plant import Plant
 
 
 BIAS_AT_BOUND, BIAS_FREE = "bias-at-bound", "bias-free"
+STRONG_PUSH = "strong-push"  # a wind or a hit, not a false position: inertial data explain what positions show
 FREE = 0.9  # share of its bound below which a bias no longer is at it: one that settles there is told once
 
 
@@ -152,8 +155,8 @@ def initial_state() -> ControlState:
 def disbelieves(state: ControlState) -> bool:
     """Whether positions are distrusted for good: then they are not passed on to the vehicle either."""
     jumped = state.fallback is not None and state.fallback.end is FallbackEnd.BARRED
-    if jumped or state.breach is None:
-        return jumped
+    if jumped or state.suspected or state.breach is None:
+        return jumped or state.suspected
     # An estimate that is outside right after the start may be so because positions are not what they say.
     return state.breach.code in OF_POSITIONS or not state.watching.answered
 
@@ -190,7 +193,8 @@ def step(
         intake = replace(intake, history=doubted(controller.kalman, intake.history, inp.at_ns))
         tick = place(state, inp, intake.history, controller)
     recalled = _recalled(state, tick, inp, controller)
-    watching, breach = _watched(state, tick, intake, inp, controller, recalled=recalled)
+    felt = _felt(state, inp)
+    watching, breach = _watched(state, tick, intake, inp, controller, felt, recalled=recalled)
     if before is ControlMode.WAIT and intake.absurd and _is_ours(inp.vehicle) and controller.envelope is not None:
         breach = ABSURD  # nothing will be flown on them, and whoever waits in the air lands
     clean_ns = intake.clean_ns
@@ -207,6 +211,9 @@ def step(
         ordered = replace(ordered, fallback=fb.request(ordered.fallback, FallbackEnd.BARRED, inp.at_ns))
     if breach is not None:
         ordered = replace(ordered, fallback=fb.request(ordered.fallback, FallbackEnd.LET_GO, inp.at_ns), breach=breach)
+    final, suspect = ordered.fallback is not None and ordered.fallback.final, state.trust.suspect
+    begins = final and not (state.fallback is not None and state.fallback.final)
+    suspected = final and (state.suspected or (begins and suspect is not None and suspect.likely))
     taken_back = state.taken_back if clean_ns is None and not lies else tick.number
     since = None if taken_back is None else tick.number - taken_back
     afresh = tick.boundary and since is not None and (0 < since <= AFRESH_STEPS or lies)
@@ -218,6 +225,7 @@ def step(
         decided_step=tick.number,
         fresh=0 if stale else intake.fresh,
         watching=watching,
+        suspected=suspected,
         recalled=recalled,
         plan=_outdated(ordered.plan, clean_ns, afresh=afresh),
         taken_back=taken_back,
@@ -233,16 +241,16 @@ def step(
         history, coming = intake.history, (*coming, (inp.at_ns + controller.dead_ns, acting))
     else:
         history = set_input(controller.kalman, intake.history, inp.at_ns, acting, tick.belief)
-    aloft, felt, strange, unsafe = NOT_WATCHING, state.felt, None, ""
+    aloft, strange, unsafe = NOT_WATCHING, None, ""
     if not_flown and (armed or carried):
-        aloft, felt, strange = _aloft(state, tick, intake, inp, controller)
+        aloft, strange = _aloft(state, tick, intake, inp, controller, felt)
         if jumped:
             unsafe = "positions have jumped further than the vehicle can have come"
         elif strange is not None:
             unsafe = strange.text
         elif armed and vehicle is not None and not vehicle.landed:
             unsafe = _unsafe(tick, inp, controller)
-    leaps = bool(intake.accepted) and aloft.clipped[-1:] == (True,) and _felt(state, inp) is not None
+    leaps = bool(intake.accepted) and aloft.clipped[-1:] == (True,) and felt is not None
     if strange is not None and carried:
         clean_ns = aloft.clean_ns or inp.at_ns
         history = without(controller.kalman, history, lambda sample: captured_ns(sample) > clean_ns)
@@ -302,6 +310,7 @@ def step(
             *_link_events(alarms, state.link_alarms, link),
             *_inertial_events(state.inertial, inertial, inp.at_ns),
             *_bias_events(bias, state.at_bounds, at_bounds, inp.at_ns, controller.plant),
+            *_push_events(state.watching, watching, inp),
         ),
         refused=tuple(sample for sample, _ in intake.refused),
         link=link,
@@ -313,21 +322,28 @@ def step(
 
 
 def _aloft(
-    state: ControlState, tick: Tick, intake: MeasurementUpdate, inp: StepInput, controller: Controller
-) -> tuple[Watching, tuple[Vec3, int] | None, Breach | None]:
+    state: ControlState,
+    tick: Tick,
+    intake: MeasurementUpdate,
+    inp: StepInput,
+    controller: Controller,
+    felt: tuple[Vec3, int] | None,
+) -> tuple[Watching, Breach | None]:
     """Hold the positions of an armed vehicle that others fly against its own senses.
 
     What its inertial sensors feel takes the place of what was sent. Without them its own velocity is all there is.
     """
     if controller.envelope is None:
-        return NOT_WATCHING, state.felt, None
-    felt = _felt(state, inp)
+        return NOT_WATCHING, None
     known = felt is not None
     seen = seen_of(tick, inp, ZERO if felt is None else felt[0], controller.plant, intake.accepted)
-    watching, breach = watch(state.aloft, replace(seen, position_m=None), controller.envelope)
+    before = state.aloft
+    if before.tick_ns is None and felt is not None and not disbelieves(state):
+        before = after_flight(state.watching, felt[0])  # it moves: a watch that begins anew would not know how fast
+    watching, breach = watch(before, replace(seen, position_m=None), controller.envelope)
     # Once positions were wrong its own velocity may be, too: they are all that its estimate has.
     counts = breach is not None and (not state.strayed if breach.code == VELOCITY else known)
-    return watching, felt, breach if counts else None
+    return watching, breach if counts else None
 
 
 def _felt(state: ControlState, inp: StepInput) -> tuple[Vec3, int] | None:
@@ -388,6 +404,7 @@ def _watched(
     intake: MeasurementUpdate,
     inp: StepInput,
     controller: Controller,
+    felt: tuple[Vec3, int] | None,
     *,
     recalled: bool,
 ) -> tuple[Watching, Breach | None]:
@@ -397,11 +414,20 @@ def _watched(
     if controller.envelope is None or mode_of(state) in _NOT_FLOWN or not _is_ours(inp.vehicle):
         return NOT_WATCHING, None
     seen = seen_of(
-        tick, inp, state.accel_mps2, controller.plant, intake.accepted, braking=mode_of(state) is ControlMode.BRAKE
+        tick,
+        inp,
+        state.accel_mps2,
+        controller.plant,
+        intake.accepted,
+        braking=mode_of(state) is ControlMode.BRAKE,
+        inertial_mps2=None if felt is None else felt[0],
     )
     if recalled or tick.age_steps is None or tick.age_steps >= controller.horizon:
         seen = replace(seen, position_m=None)  # a prediction that is so old is held against nothing
-    return watch(state.watching, seen, controller.envelope)
+    watching, aloft = state.watching, state.aloft
+    if watching.began_ns is None and aloft.answered and felt is not None and not state.strayed:
+        watching = replace(watching, agreed=True)
+    return watch(watching, seen, controller.envelope)
 
 
 def _cleaned(intake: MeasurementUpdate, clean_ns: int, controller: Controller) -> MeasurementUpdate:
@@ -452,6 +478,14 @@ def _bias_events(
     bias: tuple[float, ...], before: tuple[int, ...], now: tuple[int, ...], at_ns: int, plant: Plant
 ) -> tuple[Event, ...]:
     return bias_events(plant.to_accel(np.array(bias)), before, now, at_ns) if bias else ()
+
+
+def _push_events(before: Watching, now: Watching, inp: StepInput) -> tuple[Event, ...]:
+    """Return a warning where a push that the vehicle's inertial data explain begins to be a strong one."""
+    if before.pushed or not now.pushed:
+        return ()
+    text = push_words(now, inp.motion, inp.at_ns)
+    return (Event(at_ns=inp.at_ns, severity=Severity.WARNING, code=STRONG_PUSH, text=text),)
 
 
 _LINK_TEXTS = {

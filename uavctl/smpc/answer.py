@@ -43,6 +43,9 @@ class Preview:
     cov: Array | None = None
     # Input (n_u,) that acts until the plan begins, in the plan's own count; None: nothing is known of it
     sent: Array | None = None
+    # Least and largest inputs (n_u,), in the plan's own count, where the vehicle can do less than the design says;
+    # None: it can do all of that
+    inputs: tuple[Array, Array] | None = None
 
     @property
     def nominal(self) -> bool:
@@ -56,7 +59,7 @@ NOMINAL = Preview()
 def finite(x: Array, target: Array, outlook: Preview) -> bool:
     """Whether a question is made of finite numbers."""
     given = [x, target]
-    for one in (outlook.cov, outlook.limits, outlook.sent):
+    for one in (outlook.cov, outlook.limits, outlook.sent, *(outlook.inputs or ())):
         if one is not None:
             given.append(one)
     if outlook.path is not None:

@@ -216,7 +216,8 @@ class ConditionedSolver:
         hold = self._rests.u_eq @ reference[self._rests.held] if self._holds else None
         first = None if outlook.sent is None or not self._slew.axes.size else self._slew.first(outlook.sent)
         dx = x - reference
-        room, hard = self._regulated.room(dx, limits - self._c @ reference, hold, first)
+        low, high, less = self._reach(outlook)
+        room, hard = self._regulated.room(dx, limits - self._c @ reference, hold, first, less)
         along: list[tuple[PartProgram, Array]] = []
         if outlook.path is not None:
             along = [(one, one.along(outlook.path.states, outlook.path.inputs)) for one in self._parts]
@@ -235,7 +236,7 @@ class ConditionedSolver:
         states[0] = x
         if hold is not None:
             inputs += hold
-        inputs, kept = self._inside(inputs, bool(found.left))
+        inputs, kept = self._inside(inputs, bool(found.left), low, high)
         backoff_x = np.zeros((len(states), self.problem.state_set.b.size))
         backoff_x[1:, slice(None) if self._in_order else self._rows] = found.backoff
         offset = 0.0
@@ -400,11 +401,21 @@ class ConditionedSolver:
             for i in np.flatnonzero(over > KEPT)
         )
 
-    def _inside(self, inputs: Array, solved: bool) -> tuple[Array, bool]:
+    def _reach(self, outlook: Preview) -> tuple[Array, Array, Array | None]:
+        """Return the least and the largest inputs of each stage, and how much smaller the rows of U are for it (m,)."""
+        if outlook.inputs is None or not self._box:
+            return self._low, self._high, None
+        low, high = (side.clip(self._low[0], self._high[0]) for side in outlook.inputs)
+        c, b = self.problem.input_set.c, self.problem.input_set.b
+        column = (c != 0.0).argmax(axis=1)
+        each = c[np.arange(len(b)), column]
+        return low, high, np.where(np.isfinite(b), b - np.maximum(each * low[column], each * high[column]), 0.0)
+
+    def _inside(self, inputs: Array, solved: bool, low: Array, high: Array) -> tuple[Array, bool]:
         """Inputs (H, n_u) within their limits to the last bit, and whether they were but for rounding."""
         if not self._box:
             return inside(inputs, self.problem.input_set.c, self.problem.input_set.b)
-        cut: Array = np.minimum(np.maximum(inputs, self._low), self._high)
+        cut: Array = np.minimum(np.maximum(inputs, low), high)
         return cut, not solved or float(np.abs(cut - inputs).max()) <= INPUT_TOLERANCE
 
 

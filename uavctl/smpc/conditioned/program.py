@@ -307,6 +307,7 @@ class RegulatedRows:
         changes = np.diff(inputs, axis=0, prepend=0.0)
         hard: list[Array] = []
         of_hold: list[Array] = []
+        of_inputs: list[Index] = []
         sides: list[Array] = []
         first: list[Index] = []
         for part in parts:
@@ -316,6 +317,9 @@ class RegulatedRows:
             hard.append(np.concatenate([c @ inputs, d @ changes, -d @ changes], axis=1).reshape(-1, n_x))
             held = np.zeros((steps, len(c) + 2 * own.size, plant.n_u))
             held[:, : len(c)] = c
+            of_input = np.full((steps, len(c) + 2 * own.size), -1)
+            of_input[:, : len(c)] = part.rows_u
+            of_inputs.append(of_input.ravel())
             held[0, len(c) :] = np.concatenate([d, -d])
             of_hold.append(held.reshape(-1, plant.n_u))
             side = np.full((steps, len(c) + 2 * own.size), slew.side)
@@ -326,6 +330,10 @@ class RegulatedRows:
             first.append(np.stack([own, before + len(c) + np.arange(own.size)]))
         self.hard = _after_another([one.size for one in sides])  # of each part, which of the hard rows are its own
         self._hard_sides, self._of_hold = np.concatenate(sides), np.vstack(of_hold)
+        rows_u = np.concatenate(of_inputs)
+        # Where the rows of the input set are among the hard rows, and which row of the set each of them is
+        self._input_rows = np.flatnonzero(rows_u >= 0)
+        self._row_u = rows_u[self._input_rows]
         # Where the rows of u_0 - u_(-1) are, and behind those of their part the ones of u_(-1) - u_0.
         owner, above = np.hstack(first)
         below = above + np.concatenate([np.full(one.shape[1], one.shape[1]) for one in first])
@@ -335,7 +343,7 @@ class RegulatedRows:
         self._room = np.asfortranarray(-np.vstack([of_x.reshape(-1, n_x), *hard]))
 
     def room(
-        self, dx: Array, sides: Array, hold: Array | None, first: tuple[Array, Array] | None
+        self, dx: Array, sides: Array, hold: Array | None, first: tuple[Array, Array] | None, less: Array | None = None
     ) -> tuple[Array, Array]:
         """Room of the state rows (H, m) and of the hard rows.
 
@@ -344,11 +352,14 @@ class RegulatedRows:
             sides: Right sides of the state rows less their values at the reference, (H, m) or (m,).
             hold: Input at the reference (n_u,); None for zero.
             first: See `SlewRows.first`; None where nothing is known of what was sent.
+            less: What the right sides of the input set are less than the design's (m,); None: nothing.
         """
         room: Array = self._room.dot(dx)
         of_x, hard = room[: self._steps * self.rows.size].reshape(self._steps, -1), room[self._steps * self.rows.size :]
         of_x += sides
         hard += self._hard_sides
+        if less is not None:
+            hard[self._input_rows] -= less[self._row_u]
         if hold is not None:
             hard -= self._of_hold @ hold
         if first is None:

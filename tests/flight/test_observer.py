@@ -1,0 +1,229 @@
+"""Wind, hits and false positions held against inertial data, of vehicles that are integrated in small steps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from envelope_rig import PARAMETERS, TICK_NS, Array, S, vec3
+from flight_rig import MS, START_NS, sample
+
+from uavctl.flight.envelope import NOT_WATCHING, RESPONSE, Observation, Watching, watch
+from uavctl.flight.sensor_faults import InertialSpan, carried, extended, push_text
+from uavctl.records import Vec3
+
+BOUND_MPS2 = PARAMETERS.unexplained_mps2
+LAG_S, FINE_S = np.array(PARAMETERS.lag_s), 0.001
+NAN3: Vec3 = (math.nan, math.nan, math.nan)
+
+
+def steady(north: float, east: float = 0.0, down: float = 0.0, *, from_s: float = 3.0) -> Callable[[float], Array]:
+    return lambda t: np.array([north, east, down]) * (t >= from_s)
+
+
+def hit(north: float, *, at_s: float = 3.0) -> Callable[[float], Array]:
+    """A push of a tenth of a second."""
+    return lambda t: np.array([north, 0.0, 0.0]) * (at_s <= t < at_s + 0.1)
+
+
+def turned(degrees: float) -> Array:
+    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+@dataclass
+class Flown:
+    """What the envelope made of a flight of 9 s: the breach, when, and the truth."""
+
+    code: str
+    at_s: float
+    watching: Watching
+    pushed_s: list[float]
+
+
+def fly(
+    wind: Callable[[float], Array],
+    *,
+    drag_1ps: float = 1.0,
+    frame: Array | None = None,
+    from_s: float = 0.0,
+    shown: Callable[[float, Array], Array | None] = lambda t, accel: accel,
+    lost: float = 0.3,
+    seed: int = 1,
+) -> Flown:
+    """Setpoints swing to and fro and lean against a steady wind.
+
+    Args:
+        wind: Acceleration by the wind at rest at a time [m/s²].
+        frame: Of positions from `from_s` on, about where the vehicle is then; None: right.
+        shown: Inertial data of a tick, of its time and the true acceleration; None: there are none.
+    """
+    rng = np.random.default_rng(seed)
+    position, velocity, accel = np.zeros(3), np.zeros(3), np.zeros(3)
+    pivot: Array | None = None
+    watching, sent, pushed_s = NOT_WATCHING, np.zeros(3), []
+    for n in range(180):
+        t, at_ns = n * TICK_NS * 1e-9, START_NS + n * TICK_NS
+        if frame is not None and pivot is None and t >= from_s:
+            pivot = position.copy()
+        place = position if frame is None or pivot is None else pivot + frame @ (position - pivot)
+        camera = place + rng.normal(scale=0.003, size=3)
+        true = accel - drag_1ps * velocity + wind(t)
+        felt = shown(t, true + rng.normal(scale=0.1, size=3))
+        ours = Observation(
+            at_ns=at_ns,
+            samples=(sample(at_ns, at_ns, vec3(camera)),) if rng.random() >= lost else (),
+            sent_mps2=vec3(sent),
+            position_m=None,
+            velocity_mps=NAN3,
+            motion=None,
+            braking=False,
+            inertial_mps2=None if felt is None else vec3(felt),
+        )
+        watching, breach = watch(watching, ours, PARAMETERS)
+        if watching.pushed:
+            pushed_s.append(t)
+        if breach is not None:
+            return Flown(breach.code, t, watching, pushed_s)
+        swing = 1.5 * np.array([math.sin(2.0 * t), math.cos(1.3 * t), 0.0])
+        sent = swing - 0.5 * wind(t)
+        for _ in range(round(TICK_NS * 1e-9 / FINE_S)):
+            velocity = velocity + FINE_S * (accel - drag_1ps * velocity + wind(t))
+            position = position + FINE_S * velocity
+            accel = accel + FINE_S * (sent - accel) / LAG_S
+    return Flown("", math.inf, watching, pushed_s)
+
+
+WINDS = {
+    "north": steady(3.0),
+    "south-west": steady(-2.5, -2.5),
+    "down": steady(0.0, 0.0, 3.0),
+    "gale": steady(8.0),
+    "from-the-start": steady(3.0, from_s=0.0),
+    "rising": lambda t: np.array([0.6 * t, 0.0, 0.0]),
+    "gusts": lambda t: np.array([3.0 + 2.0 * math.sin(4.0 * t), 2.0 * math.sin(2.5 * t), 0.0]),
+    "turns-round": lambda t: np.array([3.5 if t < 5.0 else -3.5, 0.0, 0.0]),
+}
+
+
+@pytest.mark.parametrize("drag_1ps", [0.24, 1.0])
+@pytest.mark.parametrize("wind", WINDS)
+@pytest.mark.fault(71)
+def test_a_wind_that_inertial_data_show_is_no_false_position(wind: str, drag_1ps: float) -> None:
+    for seed in range(3):
+        flown = fly(WINDS[wind], drag_1ps=drag_1ps, seed=seed)
+        assert flown.code == ""
+    without = fly(WINDS[wind], drag_1ps=drag_1ps, shown=lambda t, accel: None)
+    assert without.code == RESPONSE
+
+
+@pytest.mark.fault(71)
+def test_a_hit_that_inertial_data_show_is_no_false_position() -> None:
+    assert fly(hit(25.0)).code == ""
+    assert fly(hit(25.0), shown=lambda t, accel: None).code == RESPONSE
+
+
+@pytest.mark.fault(71)
+def test_a_strong_push_is_told_with_its_size_and_a_weak_one_is_not() -> None:
+    flown = fly(steady(3.0))
+    assert flown.pushed_s and 3.0 < flown.pushed_s[0] < 4.0
+    assert fly(steady(0.5)).pushed_s == []
+    held = fly(steady(3.0), drag_1ps=0.0)  # without drag all of the push is wind
+    np.testing.assert_allclose(held.watching.push_mps2, (3.0, 0.0, 0.0), atol=0.3)
+
+
+@pytest.mark.parametrize("wind", ["calm", "north", "gusts"])
+@pytest.mark.parametrize("from_s", [0.0, 4.0])
+@pytest.mark.parametrize(
+    "frame",
+    [turned(180.0), turned(90.0), np.diag([-1.0, 1.0, 1.0]), 3.0 * np.eye(3), turned(90.0) @ np.diag([1.0, -1.0, 1.0])],
+    ids=["turned-180", "turned-90", "mirrored", "larger", "swapped"],
+)
+@pytest.mark.fault(42)
+def test_positions_of_a_wrong_frame_are_found_with_inertial_data_as_without(
+    frame: Array, from_s: float, wind: str
+) -> None:
+    blows = WINDS.get(wind, steady(0.0))
+    with_data = fly(blows, frame=frame, from_s=from_s)
+    assert with_data.code == RESPONSE
+    if wind == "calm":
+        without = fly(blows, frame=frame, from_s=from_s, shown=lambda t, accel: None)
+        assert without.code == RESPONSE and with_data.at_s <= without.at_s + 0.3
+    else:
+        assert from_s < with_data.at_s < from_s + 5.0
+
+
+@pytest.mark.parametrize(
+    "lie",
+    [
+        lambda t, accel: accel + np.array([1.5, 0.0, 0.0]),
+        lambda t, accel: np.zeros(3),
+        lambda t, accel: -accel,
+        lambda t, accel: accel + np.array([0.0, 0.5 * t, 0.0]),
+        lambda t, accel: np.array([math.nan, 0.0, 0.0]) if t > 4.0 else accel,
+    ],
+    ids=["offset", "frozen", "mirrored", "ramp", "nan"],
+)
+@pytest.mark.fault(42)
+@pytest.mark.fault(59)
+def test_inertial_data_that_are_wrong_let_no_flight_go_and_hide_no_wrong_frame(
+    lie: Callable[[float, Array], Array],
+) -> None:
+    assert fly(steady(0.5), shown=lie).code == ""
+    found = fly(steady(0.5), shown=lie, frame=turned(180.0), from_s=4.0)
+    assert found.code == RESPONSE and found.at_s < 9.0
+
+
+@pytest.mark.fault(71)
+def test_a_silence_of_inertial_data_goes_on_with_the_wind_that_they_showed() -> None:
+    def silent(t: float, accel: Array) -> Array | None:
+        return None if t > 5.0 else accel
+
+    assert fly(steady(3.0), shown=silent).code == ""
+    # Nothing else is excused by it: not a frame that turns, nor a wind that comes then.
+    assert fly(steady(3.0), shown=silent, frame=turned(180.0), from_s=5.5).code == RESPONSE
+    assert fly(steady(5.0, from_s=6.0), shown=silent).code == RESPONSE
+
+
+def test_the_way_is_the_double_integral_of_its_spans() -> None:
+    """Constant, then none, then another acceleration: closed forms."""
+    way = extended((), START_NS, (2.0, 0.0, 0.0), 0)
+    way = extended(way, START_NS + 1 * S, (0.0, 0.0, 0.0), 0)
+    way = extended(way, START_NS + 2 * S, (0.0, -1.0, 0.0), 0)
+    rest = np.zeros((3, 3))
+    moved = carried(way, rest, START_NS, START_NS + 3 * S)
+    np.testing.assert_allclose(moved, [(1.0 + 4.0, -0.5, 0.0), (2.0, -1.0, 0.0), (0.0, 0.0, 0.0)])
+    begun = np.array([(1.0, 0.0, 0.0), (0.5, 0.0, 0.0), (0.0, 0.0, 4.0)])
+    later = carried(way, begun, START_NS + 500 * MS, START_NS + 1500 * MS)
+    # A second: from rest it gains 1 m/s in the first half and keeps it.
+    np.testing.assert_allclose(later, [(1.0 + 0.5 + 0.25 + 0.5, 0.0, 2.0), (1.5, 0.0, 4.0), (0.0, 0.0, 4.0)])
+
+
+def test_spans_that_ended_before_the_horizon_are_dropped_and_change_nothing() -> None:
+    rng = np.random.default_rng(2)
+    whole: tuple[InertialSpan, ...] = ()
+    short: tuple[InertialSpan, ...] = ()
+    for n in range(200):
+        at_ns, accel = START_NS + n * TICK_NS, rng.normal(size=3)
+        whole, short = extended(whole, at_ns, accel, 0), extended(short, at_ns, accel, at_ns - S)
+    assert len(whole) == 200 and len(short) == S // TICK_NS + 1
+    mean = rng.normal(size=(3, 3))
+    since, until = at_ns - S + 7 * MS, at_ns + 20 * MS
+    np.testing.assert_array_equal(carried(whole, mean, since, until), carried(short, mean, since, until))
+
+
+@pytest.mark.parametrize(
+    ("push", "words"),
+    [
+        ((2.3, 0.0, 0.0), "2.3 m/s² north."),
+        ((-1.0, 1.0, 0.0), "1.4 m/s² south-east."),
+        ((0.0, -2.0, 1.0), "2.0 m/s² west."),
+        ((0.1, 0.0, -2.0), "2.0 m/s² up."),
+        ((-2.0, -1e-9, 0.0), "2.0 m/s² south."),
+    ],
+)
+def test_a_push_has_a_size_and_a_direction(push: Vec3, words: str) -> None:
+    assert words in push_text(push, None)
