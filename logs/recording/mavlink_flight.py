@@ -26,7 +26,7 @@ from uavctl.errors import RecordingError
 from uavctl.mavlink.clocksync import ClockSync
 from uavctl.mavlink.codec import OWN_ESTIMATE, decode
 from uavctl.mavlink.framing import MessageLayout, scan
-from uavctl.mavlink.messages import Heartbeat, Message, Position, Text
+from uavctl.mavlink.messages import Battery, Heartbeat, Message, Position, Text
 from uavctl.mavlink.profile import autopilot_name, describe_mode
 from uavctl.mavlink.vehicle import Joiner, is_vehicle
 from uavctl.records import Datagram, Vec3
@@ -121,6 +121,9 @@ class MavlinkFlight:
     setpoint_mps2: Floats  # (n, 3)
     attitude_t_s: Floats = field(default_factory=lambda: np.empty(0))
     attitude_deg: Floats = field(default_factory=lambda: np.empty((0, 3)))  # roll, pitch, yaw
+    battery_t_s: Floats = field(default_factory=lambda: np.empty(0))
+    battery_v: Floats = field(default_factory=lambda: np.empty(0))
+    beat_t_s: Floats = field(default_factory=lambda: np.empty(0))  # of the vehicle's heartbeats; none in a ULog
 
     @property
     def duration_s(self) -> float:
@@ -185,6 +188,8 @@ class _Reader:
         self._setpoints: list[tuple[int, list[float]]] = []
         self._modes: list[ModeBegin] = []
         self._texts: list[SpokenText] = []
+        self._battery: list[tuple[int, float]] = []
+        self._beats_ns: list[int] = []
         self._joined = Joiner()
         self._home_deg: tuple[float, float] | None = None
         self._parameters = ParameterReader()
@@ -212,6 +217,7 @@ class _Reader:
     def _take_message(self, message: Message, at_ns: int) -> None:
         match message:
             case Heartbeat() if is_vehicle(message) and self._is_vehicle(message.system):
+                self._beats_ns.append(at_ns)
                 self._take_mode(message, at_ns)
             case Position(local_ned=True) if self._is_vehicle(message.system):
                 track = self._own.setdefault(message.name, [])
@@ -222,6 +228,8 @@ class _Reader:
                 self._sources.setdefault(name, SentSource()).take(place, _velocity(message), message.stamp_us, at_ns)
             case Text() if self._is_vehicle(message.system):
                 self._take_text(message, at_ns)
+            case Battery() if self._is_vehicle(message.system):
+                self._battery.append((at_ns, message.voltage_v))
 
     def _is_vehicle(self, system: int) -> bool:
         """Return whether a system is the vehicle."""
@@ -301,6 +309,9 @@ class _Reader:
             setpoint_m=told[:, :3],
             setpoint_mps=told[:, 3:6],
             setpoint_mps2=told[:, 6:],
+            beat_t_s=seconds(self._beats_ns, self._origin_ns),
+            battery_t_s=seconds((at_ns for at_ns, _ in self._battery), self._origin_ns),
+            battery_v=np.array([volts for _, volts in self._battery], dtype=np.float64),
         )
 
     def _second(self, at_ns: int) -> float:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +11,15 @@ from markupsafe import Markup
 from logs.recording.design_view import AXIS_NUMBER, Floats
 from logs.recording.disk import write_whole
 from logs.recording.mavlink_flight import Ages, MavlinkFlight, MavlinkFlightInfo, facts_of, longest_gap
-from logs.recording.summary import BLIND_S, count
+from logs.recording.summary import count
 from logs.report import page
 from logs.report.figures import largest
-from logs.report.headline import BAD, GOOD, MIND, Headline, metres, seconds
 from logs.report.page import Mark, PageSection
 from logs.report.plots import DOTTED, RATE, SEEN, along, thin
 from logs.report.svg import Drawing, canvas, colour, dots
-from uavctl.mavlink.profile import PROFILES
+from logs.report.tlog_headline import headline_of
+
+__all__ = ["headline_of", "tlog_html", "write_tlog_page"]
 
 _OWN = Mark("line", "estimate", "position of the vehicle's own")
 _SENT = Mark("dot", "sample", "position sent to it")
@@ -48,136 +48,6 @@ def tlog_html(flight: MavlinkFlight) -> str:
         _sections(flight),
         top=page.banner(main.tone, main.word, main.text, main.why),
     )
-
-
-# What matters most in it: such a recording knows neither room nor mission, so it is what the vehicle itself alarmed of,
-# how far its own position and those that it was sent went apart, and how long none came.
-
-
-_ALARMS = ("emergency", "alert", "critical")  # of MAV_SEVERITY
-_APART_M = 0.5  # between its own position and those sent, beyond what their origins differ by
-_NEAR_S = 0.5  # between two of its own positions, to tell one in between
-_TOLD = 3  # sentences of a kind
-
-
-def headline_of(flight: MavlinkFlight) -> Headline:
-    """Return what matters most in a flight of a foreign recording, while the vehicle was armed."""
-    info = flight.info
-    if info.vehicle_system is None:
-        return Headline(MIND, "No vehicle", "no autopilot's heartbeat is in it.", ())
-    spans = armed_spans(info)
-    if not spans:
-        said = tuple(_alarms(flight, [(0.0, np.inf)]))
-        return Headline(MIND, "Not armed", "the vehicle was never armed in it.", said)
-    found = [(BAD, "The vehicle alarmed", text) for text in list(_alarms(flight, spans))[:_TOLD]]
-    apart_m, apart_s, of = _apart(flight, spans)
-    if apart_m > _APART_M:
-        where = f"{metres(apart_m)} off that of {of} at {seconds(apart_s)} ({_mode_at(info, apart_s)})"
-        tone = BAD if apart_m > 2 * _APART_M else MIND
-        found.append((tone, "Positions disagree", f"its own position was {where}."))
-    silent_s, since_s = _silence(flight, spans)
-    if silent_s > BLIND_S:
-        moved_m = _moved(flight, since_s, silent_s)
-        carried = f", while its own position moved by {metres(moved_m)}" if moved_m >= _APART_M else ""
-        when = f"for {seconds(silent_s)}, from {seconds(since_s)} on ({_mode_at(info, since_s)})"
-        found.append((MIND, "Blind", f"no position came {when}{carried}."))
-    if not found:
-        armed_s = sum(end_s - begin_s for begin_s, end_s in spans)
-        fed = (
-            f"no position was missing for longer than {seconds(silent_s)}" if flight.sent else "it was sent no position"
-        )
-        near = f", and its own kept within {metres(apart_m)} of them" if np.isfinite(apart_s) else ""
-        found.append((GOOD, "Nothing odd", f"armed for {seconds(armed_s)}; {fed}{near}."))
-    (tone, word, text), *others = found
-    return Headline(tone, word, text, (*(one[0].upper() + one[1:] for _, _, one in others), *_left(info)))
-
-
-def armed_spans(info: MavlinkFlightInfo) -> list[tuple[float, float]]:
-    """Return from when to when it was armed [s]."""
-    spans: list[tuple[float, float]] = []
-    since_s: float | None = None
-    for one in info.modes:
-        if one.armed and since_s is None:
-            since_s = one.at_s
-        elif not one.armed and since_s is not None:
-            spans.append((since_s, one.at_s))
-            since_s = None
-    return spans if since_s is None else [*spans, (since_s, info.duration_s)]
-
-
-def _within(at_s: float, spans: Sequence[tuple[float, float]]) -> bool:
-    return any(begin_s <= at_s <= end_s for begin_s, end_s in spans)
-
-
-def _mode_at(info: MavlinkFlightInfo, at_s: float) -> str:
-    return next((one.mode for one in reversed(info.modes) if one.at_s <= at_s), "no mode yet")
-
-
-def _alarms(flight: MavlinkFlight, spans: Sequence[tuple[float, float]]) -> Iterator[str]:
-    """Yield what it said, gravely, while it was armed; each text once."""
-    grave = [one for one in flight.info.texts if one.severity in _ALARMS and _within(one.at_s, spans)]
-    first = {one.text: one for one in reversed(grave)}
-    for one in sorted(first.values(), key=lambda text: text.at_s):
-        mode = _mode_at(flight.info, one.at_s)
-        yield f'it said "{one.text.strip()}" ({one.severity}) at {seconds(one.at_s)} ({mode}).'
-
-
-def _apart(flight: MavlinkFlight, spans: Sequence[tuple[float, float]]) -> tuple[float, float, str]:
-    """Return how far its own position was off one that it was sent [m], when [s], and which source's.
-
-    What they differ by at all times is that of their origins, and does not count. Where nothing is to be compared the
-    time is infinite.
-    """
-    worst = (0.0, np.inf, "")
-    own = flight.own
-    if len(own.t_s) < 2:
-        return worst
-    for source, track in flight.sent.items():
-        after = np.searchsorted(own.t_s, track.t_s).clip(1, len(own.t_s) - 1)
-        known = (
-            (own.t_s[after] - own.t_s[after - 1] <= _NEAR_S) & (track.t_s <= own.t_s[-1]) & (track.t_s >= own.t_s[0])
-        )
-        known &= np.array([_within(at_s, spans) for at_s in track.t_s], dtype=np.bool_)
-        if known.sum() < 2:
-            continue
-        at_s = track.t_s[known]
-        there_m = np.column_stack([np.interp(at_s, own.t_s, own.position_m[:, axis]) for axis in range(3)])
-        differs_m = track.position_m[known] - there_m
-        apart_m = np.linalg.norm(differs_m - np.median(differs_m, axis=0), axis=1)
-        most = int(apart_m.argmax())
-        if apart_m[most] > worst[0]:
-            worst = (float(apart_m[most]), float(at_s[most]), source)
-    return worst
-
-
-def _silence(flight: MavlinkFlight, spans: Sequence[tuple[float, float]]) -> tuple[float, float]:
-    """Return the longest time that it was sent no position while armed, and when that began [s]; 0 if it never was."""
-    came_s = np.sort(np.concatenate([track.t_s for track in flight.sent.values()] or [np.empty(0)]))
-    worst = (0.0, 0.0)
-    for begin_s, end_s in spans if len(came_s) else ():
-        edges = np.concatenate([[begin_s], came_s[(came_s > begin_s) & (came_s < end_s)], [end_s]])
-        longest = int(np.diff(edges).argmax())
-        worst = max(worst, (float(np.diff(edges)[longest]), float(edges[longest])))
-    return worst
-
-
-def _moved(flight: MavlinkFlight, since_s: float, for_s: float) -> float:
-    """Return how far its own position went in a time [m]."""
-    inside = (flight.own.t_s >= since_s) & (flight.own.t_s <= since_s + for_s)
-    places_m = flight.own.position_m[inside]
-    return float(np.linalg.norm(places_m - places_m[0], axis=1).max()) if len(places_m) else 0.0
-
-
-def _left(info: MavlinkFlightInfo) -> Iterator[str]:
-    """Yield where it left a mode that takes setpoints, whoever wanted that."""
-    external = {profile.external for profile in PROFILES.values()}
-    left = [
-        (one, then)
-        for one, then in pairwise(info.modes)
-        if one.armed and one.mode in external and then.mode != one.mode
-    ]
-    for one, then in left[:_TOLD]:
-        yield f"It left {one.mode} for {then.mode} at {seconds(then.at_s)}{'' if then.armed else ', disarmed'}."
 
 
 def story(info: MavlinkFlightInfo) -> Iterator[str]:

@@ -10,7 +10,7 @@ from contextlib import contextmanager, redirect_stdout
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, TextIO
+from typing import TYPE_CHECKING, Annotated, Any, TextIO
 
 import msgspec
 from cyclopts import Parameter, validators
@@ -20,10 +20,14 @@ from rich.markup import escape
 from rich.measure import Measurement
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
+from rich.text import Text
 
 from uavctl.config import LoadedConfig, explain, load
 from uavctl.config.document import LARGEST_SEED, LONGEST_S
 from uavctl.errors import ConfigError, DesignError
+
+if TYPE_CHECKING:
+    from logs.report.causes import Headline
 
 # What all commands share: --config, --set and --json, where output goes, and how a bad design is told.
 
@@ -260,6 +264,14 @@ def messages() -> Console:
 def warn(text: str) -> None:
     """Write a warning on a line of its own; nothing in it is markup."""
     messages().print(text, style="yellow", markup=False, soft_wrap=True)
+
+
+_STYLES = {"good": "bold green", "mind": "bold yellow", "bad": "bold red"}
+
+
+def first_line(main: Headline) -> Text:
+    """Return the first line of a recording's page, in its colour."""
+    return Text.assemble((f"{main.word}: ", _STYLES[main.tone]), main.text)
 
 
 @contextmanager

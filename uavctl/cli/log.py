@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Literal
 
+import msgspec
 from cyclopts import App, Parameter
 from rich.console import Group, RenderableType
 from rich.table import Table
@@ -25,7 +26,8 @@ from logs.recording.recover import recover as restore
 from logs.recording.summary import count
 from logs.recording.tlog import ExportedTlog, export_tlog
 from logs.recording.ulog import is_ulog, read_ulog
-from uavctl.cli.common import Common, Flight, Json, bars, columns, counted, two_columns, warn
+from logs.report.causes import Headline
+from uavctl.cli.common import Common, Flight, Json, bars, columns, counted, first_line, two_columns, warn
 from uavctl.errors import UsageError
 
 # `uavctl log export`: a recording for other programs.
@@ -226,15 +228,24 @@ for _name, (_path, _help) in _COMMANDS.items():
 
 @log_app.command
 def info(flight: Flight, /, *, json: Json = False) -> int:
-    """Say what a recording, a .tlog or a ULog holds: topics, rates, gaps, losses, and how it was made."""
+    """Say what a recording, a .tlog or a ULog holds: the page's first line, topics, rates, gaps, losses, its making."""
+    from logs.report import headline, tlog_headline  # not for the other commands: it takes SciPy
+
     if is_tlog(flight) or is_ulog(flight):
-        told = (read_ulog if is_ulog(flight) else read_flight)(flight).info
+        foreign = (read_ulog if is_ulog(flight) else read_flight)(flight)
+        told, main = foreign.info, tlog_headline.headline_of(foreign)
         kind = "ulog" if is_ulog(flight) else "tlog"
-        Common(json=json).show(f"log/info-{kind}", told, lambda: _tlog_info(told))
+        Common(json=json).show(f"log/info-{kind}", _with(main, told), lambda: Group(first_line(main), _tlog_info(told)))
         return 0
-    found = recording_info(flight)
-    Common(json=json).show("log/info", found, lambda: info_table(found))
+    found, ours = recording_info(flight), headline.headline_in(flight)
+    line = () if ours is None else (first_line(ours),)
+    Common(json=json).show("log/info", _with(ours, found), lambda: Group(*line, info_table(found)))
     return 0
+
+
+def _with(main: Headline | None, found: msgspec.Struct) -> dict[str, object]:
+    """Return the document of a recording, the page's first line before all else."""
+    return {"headline": None if main is None else main.document(), **msgspec.structs.asdict(found)}
 
 
 @log_app.command
