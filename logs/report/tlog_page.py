@@ -10,12 +10,11 @@ from markupsafe import Markup
 
 from logs.recording.design_view import AXIS_NUMBER, Floats
 from logs.recording.disk import write_whole
-from logs.recording.mavlink_flight import Ages, MavlinkFlight, MavlinkFlightInfo, facts_of, longest_gap
-from logs.recording.summary import count
+from logs.recording.mavlink_flight import Ages, MavlinkFlight, MavlinkFlightInfo, facts_of
 from logs.report import page
 from logs.report.figures import largest
 from logs.report.page import Mark, PageSection
-from logs.report.plots import DOTTED, RATE, SEEN, along, thin
+from logs.report.plots import DOTTED, RATE, SEEN, along, thin, varies
 from logs.report.svg import Drawing, canvas, colour, dots
 from logs.report.tlog_headline import headline_of
 
@@ -44,29 +43,21 @@ def tlog_html(flight: MavlinkFlight) -> str:
     return page.page(
         f"Flight in {Path(info.recording).name}",
         f"{info.begin_utc or 'no date'} · {info.duration_s:.1f} s · {who}",
-        story(info),
+        (),
         _sections(flight),
         top=page.banner(main.tone, main.word, main.text, main.why),
     )
 
 
 def story(info: MavlinkFlightInfo) -> Iterator[str]:
-    """Return what the recording tells, in sentences; what is odd about it comes last."""
+    """Return what the table does not have, in sentences: what is odd about the recording."""
     if info.vehicle_system is None:
-        yield "No autopilot's heartbeat is in it, so nobody knows what the vehicle did."
-    else:
-        told = f"by {info.own_source}" if info.own_positions else "and it told no position"
-        positions = f", {count(info.own_positions, 'position')} of its own" if info.own_positions else ","
-        yield f"System {info.vehicle_system} ({info.autopilot}){positions} {told}."
-    for sent in info.sent:
-        yield f"{sent.source}: {count(sent.positions, 'position')}, {sent.rate_hz:.1f}/s, {longest_gap(sent)}."
-    yield f"{count(info.setpoints, 'setpoint')} in local NED; {count(len(info.texts), 'text')} of the vehicle."
+        yield "No autopilot's heartbeat is in it, so it does not tell what the vehicle did."
     yield from (f"{note}." for note in info.notes)
 
 
 def _sections(flight: MavlinkFlight) -> Iterator[PageSection]:
     info = flight.info
-    yield PageSection("Summary", "", page.facts(facts_of(info)))
     marks = (*((_OWN,) if len(flight.own.t_s) else ()), *((_SENT,) if flight.sent else ()))
     if marks:
         yield PageSection("Path", "", page.grid(list(_paths(flight))), marks)
@@ -86,7 +77,7 @@ def _sections(flight: MavlinkFlight) -> Iterator[PageSection]:
         yield PageSection("Age of positions", note, page.grid(drawn))
     if info.setpoints:
         drawn = list(_setpoints(flight))
-        body = page.grid(drawn) if drawn else page.paragraph("They hold places and speeds alone, drawn above.")
+        body = page.grid(drawn) if drawn else page.paragraph("They ask for no acceleration that changes.")
         yield PageSection("Acceleration setpoints", "", body)
     modes = [(f"{one.at_s:.2f}", one.mode, "armed" if one.armed else "") for one in info.modes]
     yield PageSection("Modes", "", _table(("from [s]", "mode", "armed"), modes))
@@ -99,6 +90,7 @@ def _sections(flight: MavlinkFlight) -> Iterator[PageSection]:
         columns = ("parameter", "value", "type")
         folded += page.folded("Parameters of the vehicle", page.table(columns, parameters, frozenset({1})))
     yield PageSection("What is in it", "", folded)
+    yield PageSection("Summary", "", page.listed(story(info)) + page.facts(facts_of(info)))
 
 
 def _table(columns: Sequence[str], rows: Sequence[tuple[str, ...]]) -> Markup:
@@ -130,14 +122,16 @@ def _axes(flight: MavlinkFlight) -> Iterator[Drawing]:
     for axis, number in AXIS_NUMBER.items():
         name, sign = SEEN[axis]
         sent = [(track.t_s, track.position_m) for track in flight.sent.values()]
-        yield _over_time(
+        places = (flight.own.position_m, flight.setpoint_m, *(values for _, values in sent))
+        if any(varies(one[:, number]) for one in places):
+            yield _over_time(
             flight, f"position-{axis}", name.capitalize(), f"{name} [m]",
             [(t_s, sign * values[:, number]) for t_s, values in sent],
             (flight.own.t_s, sign * flight.own.position_m[:, number]),
             sign * flight.setpoint_m[:, number],
         )  # fmt: skip
         speed = sign * flight.own.velocity_mps[:, number]
-        if np.isfinite(speed).any():
+        if varies(speed):
             yield _over_time(
                 flight, f"velocity-{axis}", RATE[axis].capitalize(), f"{RATE[axis]} [m/s]", [],
                 (flight.own.t_s, speed), sign * flight.setpoint_mps[:, number],
@@ -165,6 +159,8 @@ def _over_time(
 
 def _attitude(flight: MavlinkFlight) -> Iterator[Drawing]:
     for number, angle in enumerate(("roll", "pitch", "yaw")):
+        if not varies(flight.attitude_deg[:, number]):
+            continue
         with canvas(f"attitude-{angle}", 2.3) as one:
             ax = one.axes(angle.capitalize(), "time [s]", f"{angle} [°]")
             ax.plot(*thin(flight.attitude_t_s, flight.attitude_deg[:, number]), color=colour("estimate"), lw=1.1)
@@ -187,7 +183,7 @@ def _setpoints(flight: MavlinkFlight) -> Iterator[Drawing]:
     for axis, number in AXIS_NUMBER.items():
         name, sign = SEEN[axis]
         values = sign * flight.setpoint_mps2[:, number]
-        if not np.isfinite(values).any():
+        if not varies(values):
             continue
         key, upwards = f"setpoint-{axis}", "upwards" if axis == "down" else name
         with canvas(key, 2.3) as one:
