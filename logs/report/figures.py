@@ -216,7 +216,7 @@ def _ages(flight: FlightData, verdict: LinkVerdict) -> Drawing:
     shown = max(len(verdict.ages), flight.design.horizon) + 1
     promised = np.array(verdict.promised_ages[:shown])
     with canvas("age-share", 2.5) as one:
-        ax = one.axes("Age of information", "age [steps]", "steps (log scale)")
+        ax = one.axes("Age of information", "age [steps]", "steps (log scale)", _DURATIONS_IN)
         ax.set_yscale("log")
         ax.bar(range(len(verdict.ages)), verdict.ages, color=colour("estimate"), alpha=0.6, width=0.8)
         if len(promised):

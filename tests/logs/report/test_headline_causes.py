@@ -25,7 +25,7 @@ from logs.report.headline import headline
 from logs.report.tlog_headline import headline_of
 from logs.report.verdicts import judge
 from uavctl.outcome import Cause, make_ending
-from uavctl.records import Event, LinkStats, RelayStats, Severity, StepInput, VehicleStatus
+from uavctl.records import ControlMode, Event, LinkStats, RelayStats, Severity, VehicleStatus
 
 C = HeadlineCause
 SECOND = 1_000_000_000
@@ -210,11 +210,16 @@ def test_a_relay_that_stops_is_told_by_its_counters(good: FlightData) -> None:
     assert C.RELAY_SILENT not in head(dataclasses.replace(plain, relays=whole)).causes
 
 
-def test_a_position_that_was_never_valid() -> None:
-    memory = lockstep("room", 3.0, "link.blackout=[[0, 9]]")
-    flight = FlightData.from_records(memory.entries)
-    assert not any(sample for one in memory.of(StepInput) for sample in one.samples)
-    assert head(flight).cause is C.POSITIONS_ABSENT
+@pytest.mark.parametrize(("came", "cause"), [(False, C.POSITIONS_ABSENT), (True, C.POSITIONS_INVALID)])
+def test_a_position_that_was_never_valid(good: FlightData, came: bool, cause: HeadlineCause) -> None:
+    """Nothing was ever estimated, as no position came, or none could be used."""
+    waited = tuple(
+        msgspec.structs.replace(one, mode=ControlMode.WAIT, accepted=0, plan_seq=None, input=None)
+        for one in good.decisions
+    )
+    inputs = tuple(one if came else msgspec.structs.replace(one, samples=()) for one in good.step_inputs)
+    never = dataclasses.replace(good, decisions=waited, estimates=(), plans=(), step_inputs=inputs)
+    assert head(never).cause is cause
 
 
 def test_all_well_is_said_of_a_flight_in_which_nothing_is_amiss(good: FlightData) -> None:

@@ -134,7 +134,7 @@ def test_a_part_of_a_flight_says_so(flight: FlightData) -> None:
     assert "Flight “room”, a part" in text and "a part of a flight" in text
     begins = [one for one in seen if "tick 80" in one]
     assert len(begins) == 1 and "tick 80, 4 s into" in begins[0]
-    assert any(one.startswith("40 steps;") for one in seen) and "took over" not in text
+    assert any(one.startswith("40 steps;") for one in seen) and "controller took over" not in text
 
 
 def note(text: str, segment: int = 1) -> RecorderNote:
