@@ -171,7 +171,7 @@ def test_the_page_is_whole_at_every_width(window: Browser, page: Path, width: in
     assert found["seen"] == width
     assert faults(found) == NONE
     assert found["hidden"] == []
-    assert len(found["figures"]) == 30
+    assert len(found["figures"]) == 31
     assert "nan" not in found["words"].lower().split()
 
 
@@ -302,7 +302,7 @@ def test_without_its_script_the_page_lacks_the_slider_only(window: Browser, page
     finally:
         window.call("Emulation.setScriptExecutionDisabled", value=False)
     assert console == "" and faults(found) == NONE
-    assert len(found["figures"]) == 30
+    assert len(found["figures"]) == 31
     sliders = "document.querySelectorAll('.cursor, .moment').length"
     assert window.call("Runtime.evaluate", expression=sliders, returnByValue=True)["result"]["value"] == 0
 
