@@ -65,10 +65,10 @@ def pictures(flight: FlightData) -> Iterator[tuple[str, Drawing]]:
     yield "timeline", timeline(flight)[0]
     deep = path_3d(flight)
     if deep is not None:
-        yield "path", deep[1]
+        yield "path", deep
     yield "axis", next(plots.axes_over_time(flight))
-    yield "age", plots_control.age(flight)[0]
-    yield "link", next(plots_link.link(flight, judged.verdicts.link))
+    yield "age", plots_control.age(flight)
+    yield "link", next(plots_link.link_ages(flight, judged.verdicts.link))
     model = judged.verdicts.model
     if model is not None:
         yield "white", plots_verdicts.whiteness(model.axes[0])

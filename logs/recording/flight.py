@@ -33,6 +33,7 @@ from uavctl.records import (
     Plan,
     PositionSample,
     Record,
+    RelayStats,
     Setpoint,
     SolveStatus,
     StepInput,
@@ -72,6 +73,7 @@ class FlightData:
     link_estimates: tuple[LinkEstimate, ...] = ()
     checks: tuple[Checked, ...] = ()  # before arming
     notes: tuple[RecorderNote, ...] = ()  # the recorder's own account
+    relays: tuple[RelayStats, ...] = ()  # counters of positions passed on to the vehicle, once a second
     endings: tuple[Ending, ...] = ()  # the daemon's last word; none in older recordings, and in torn ones
 
     @classmethod

@@ -136,6 +136,7 @@ class MavlinkFlight:
     height_m: Floats = field(default_factory=lambda: np.empty(0))  # where it tells no whole position
     battery_t_s: Floats = field(default_factory=lambda: np.empty(0))
     battery_v: Floats = field(default_factory=lambda: np.empty(0))
+    beat_t_s: Floats = field(default_factory=lambda: np.empty(0))  # of the vehicle's heartbeats; none in a ULog
 
     @property
     def duration_s(self) -> float:
@@ -216,6 +217,7 @@ class _Reader:
         self._setpoints: list[tuple[int, list[float]]] = []
         self._modes: list[ModeBegin] = []
         self._texts: list[SpokenText] = []
+        self._beats_ns: list[int] = []
         self._joined = Joiner()
         self._home_deg: tuple[float, float] | None = None
         self._parameters = ParameterReader()
@@ -264,6 +266,7 @@ class _Reader:
             case Heartbeat():
                 self._senders.take_heartbeat(message)
                 if self._beat is not None and (message.system, message.component) == self._address:
+                    self._beats_ns.append(at_ns)
                     self._take_mode(message, at_ns)
             case Position(local_ned=True) if own:
                 track = self._own.setdefault(message.name, [])
@@ -276,8 +279,10 @@ class _Reader:
                 self._take_text(message, at_ns)
             case Attitude() if own:
                 self._attitudes.setdefault(message.quaternion, []).append((at_ns, message.angles_rad))
-            case Battery(voltage_v=float(voltage_v)) if own and 0 < voltage_v < _LARGEST_V:
-                self._battery.append((at_ns, voltage_v))
+            # An autopilot without a battery's sensor sends 0 V from the start; a battery may fall to it.
+            case Battery(voltage_v=float(voltage_v)) if own and (voltage_v > 0 or self._battery):
+                if voltage_v < _LARGEST_V:
+                    self._battery.append((at_ns, voltage_v))
 
     @property
     def _address(self) -> tuple[int, int] | None:
@@ -388,6 +393,7 @@ class _Reader:
             attitude_deg=np.degrees(np.array([angles for _, angles in attitudes], dtype=np.float64).reshape(-1, 3)),
             height_t_s=seconds((at_ns for at_ns, _ in self._height), self._origin_ns),
             height_m=np.array([height_m for _, height_m in self._height], dtype=np.float64),
+            beat_t_s=seconds(self._beats_ns, self._origin_ns),
             battery_t_s=seconds((at_ns for at_ns, _ in self._battery), self._origin_ns),
             battery_v=np.array([voltage_v for _, voltage_v in self._battery], dtype=np.float64),
         )

@@ -7,9 +7,11 @@ import tomllib
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from itertools import pairwise
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 from rich.table import Table
 from rich.text import Text
 
@@ -128,6 +130,7 @@ RELATIVE_TOLERANCE = 1e-9
 WIRE_TOLERANCE = float(np.finfo(np.float32).eps)
 SLACK_TOLERANCE = 1e-6
 SETTLED_SHARE = 0.25
+ARRIVED_M = 0.3  # from the target: as near as `mission.accept_m` asks for, unless it is configured otherwise
 BLIND_S, BLIND_STEPS = 0.5, 2.0  # without a position for longer, what is told of the place is a prediction
 
 
@@ -175,6 +178,9 @@ class FlightSummary(msgspec.Struct, frozen=True, kw_only=True):
     trajectory: bool  # whether the target of the moment was a trajectory's; else a waypoint, or an ordered place
     settled_error_m: float | None  # root mean square distance from the target, last quarter of the steps
     final_error_m: float | None  # distance from the target at the last flown boundary
+    course_rms_m: float | None = None  # root mean square distance on the whole course, from each arrival on
+    course_worst_m: float | None = None  # the largest distance there
+    course_worst_s: float | None = None  # when that was, since the first tick
     final_age_s: float | None  # age of the newest position there
     final_std_m: float | None  # largest standard deviation of the estimated position there, in any direction
     recorder_dropped: int  # records that the disk was too slow for
@@ -208,6 +214,7 @@ def summarise(
     solves = [d.solve for d in flight.decisions if d.solve is not None]
     error_m = position_error_m(flight)
     settled = error_m[-max(1, round(SETTLED_SHARE * len(error_m))) :]
+    course = course_error(flight)
     return FlightSummary(
         steps=len(steps),
         duration_s=round(flight.duration_s, 9),
@@ -240,6 +247,9 @@ def summarise(
         trajectory=flight.moving_target,
         settled_error_m=float(np.sqrt(np.mean(settled**2))) if len(settled) else None,
         final_error_m=float(error_m[-1]) if len(error_m) else None,
+        course_rms_m=None if course is None else course.rms_m,
+        course_worst_m=None if course is None else course.worst_m,
+        course_worst_s=None if course is None else course.worst_s,
         final_age_s=None if flight.last_flown is None else flight.last_flown.age_s,
         final_std_m=_position_std_m(flight),
         recorder_dropped=recorder_dropped,
@@ -289,6 +299,44 @@ def position_error_m(flight: FlightData) -> Floats:
     """Return the distance from the target of the moment at each flown boundary (n,) [m]."""
     index = list(flight.design.position_index)
     return np.asarray(np.linalg.norm((flight.steps.state - flight.steps.target)[:, index], axis=1))
+
+
+class CourseError(NamedTuple):
+    """Distance from the target of the moment on the whole course [m], and when it was largest [s]."""
+
+    rms_m: float
+    worst_m: float
+    worst_s: float
+
+
+def course_error(flight: FlightData) -> CourseError | None:
+    """Return how far the vehicle was off its target once it had come there; None where it never came there.
+
+    On a trajectory all counts from the first arrival on. On the way to a waypoint, or to another place, the distance
+    is no error: of each place the time from the arrival there counts.
+    """
+    target = flight.steps.target
+    moved = np.zeros(len(target), dtype=np.bool_)  # to another place, with this step
+    if not flight.moving_target:
+        moved[1:] = np.any(target[1:] != target[:-1], axis=1)
+    return errors_from_arrival(flight.steps.t_s, position_error_m(flight), moved)
+
+
+def errors_from_arrival(t_s: Floats, error_m: Floats, moved: NDArray[np.bool_]) -> CourseError | None:
+    """Return what distances come to that count from each arrival on; None without one.
+
+    Args:
+        t_s: Times (n,) [s].
+        error_m: Distances from the target of the moment (n,) [m].
+        moved: At which of them another target has begun (n,).
+    """
+    near, place = error_m <= ARRIVED_M, np.cumsum(moved)
+    there = [np.logical_or.accumulate(near[place == one]) for one in np.unique(place)]
+    counts = np.concatenate(there) if there else np.zeros(0, dtype=np.bool_)
+    if not counts.any():
+        return None
+    kept, at_s = error_m[counts], t_s[counts]
+    return CourseError(float(np.sqrt(np.mean(kept**2))), float(kept.max()), float(at_s[kept.argmax()]))
 
 
 def state_outside(flight: FlightData) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
@@ -380,12 +428,15 @@ def _punctuality(s: FlightSummary) -> tuple[str, str]:
 
 
 def _distance(s: FlightSummary) -> str:
-    if s.final_error_m is None or s.settled_error_m is None:
+    if s.final_error_m is None:
         return "not flown"
-    final, settled = number(s.final_error_m), number(s.settled_error_m)
     blind = predicted_only(s)
-    final = f"{final} m at the last flown step{f' ({blind})' if blind else ''}"
-    return f"{final}; {settled} m over the last quarter (rms)"
+    final = f"{number(s.final_error_m)} m at the last flown step{f' ({blind})' if blind else ''}"
+    if s.course_rms_m is None or s.course_worst_m is None or s.course_worst_s is None:
+        return f"{final}; it never came within {ARRIVED_M:g} m"
+    where = "on the whole way" if s.trajectory else "from each arrival on"
+    worst = f"at most {number(s.course_worst_m)} m, at {number(s.course_worst_s)} s"
+    return f"{number(s.course_rms_m)} m {where} (rms), {worst}; {final}"
 
 
 def _share(part: int, whole: int) -> str:

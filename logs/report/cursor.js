@@ -22,11 +22,13 @@
   for (const svg of document.querySelectorAll("svg[data-time]")) {
     const [x0, x1, from, to, low, high] = svg.dataset.time.split(" ").map(Number);
     const line = add(svg, "path", {class: "moment", d: `M0 ${low}V${high}`});
+    const view = () => svg.view || [from, to]; // zoomed, it shows a part
     movers.push(t => {
-      line.style.display = t < from || t > to ? "none" : "";
-      line.setAttribute("transform", `translate(${x0 + (t - from) / (to - from) * (x1 - x0)} 0)`);
+      const [a, b] = view();
+      line.style.display = t < a || t > b ? "none" : "";
+      line.setAttribute("transform", `translate(${x0 + (t - a) / (b - a) * (x1 - x0)} 0)`);
     });
-    clicks.push([svg, x => from + (x - x0) / (x1 - x0) * (to - from)]);
+    clicks.push([svg, x => view()[0] + (x - x0) / (x1 - x0) * (view()[1] - view()[0])]);
   }
   for (const view in flight.views) {
     for (const svg of document.querySelectorAll(`svg[data-${view}]`)) {
@@ -82,6 +84,7 @@
   }
   bar.addEventListener("submit", event => event.preventDefault());
   input.addEventListener("input", show);
+  document.addEventListener("view", show);
   input.value = flight.at_s;
   show();
 })();

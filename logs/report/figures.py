@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from logs.recording.design_view import Floats
 from logs.recording.flight import FlightData
 from logs.recording.summary import SLACK_TOLERANCE, decision_times_us
-from logs.report.plots import DASHED, draw_path, input_beyond, shade_fallback, span, thin
+from logs.report.plots import DASHED, draw_path, input_beyond, shade_fallback, span, thin, varies
 from logs.report.statistics import normal_reach
-from logs.report.svg import PALETTE, WIDTH_IN, Drawing, canvas, colour, dots, power_of_ten, ramp, standalone, strokes
+from logs.report.svg import PALETTE, Drawing, canvas, colour, dots, power_of_ten, ramp, standalone, strokes
 from logs.report.verdict_model import AxisVerdict, LeadVerdict
 from logs.report.verdicts import ClockVerdict, LinkVerdict, delays_s, offsets
 from uavctl.records import Plan, duration
@@ -34,18 +34,15 @@ INPUT = {"north": ("north", 1.0), "east": ("east", 1.0), "down": ("up", -1.0)}
 PICTURE_LABEL = "A flight from above within its limits, and the age of its position information"
 
 
-def age(flight: FlightData) -> tuple[Drawing, Drawing]:
-    """Draw the age of information with the horizon H, losses and fallback, for a wide page and for a narrow one."""
+def age(flight: FlightData) -> Drawing:
+    """Draw the age of information with the horizon H, losses and fallback."""
     label = (
         f"Age of information over time in steps; the horizon is {flight.design.horizon} steps; "
         "lost positions and fallback spans are marked"
     )
-    drawings = []
-    for key, width_in in (("age-wide", WIDE_IN), ("age-narrow", WIDTH_IN)):
-        with canvas(key, 2.6, width_in) as one:
-            draw_age(one.axes("", "time [s]", "age [steps]"), flight)
-        drawings.append(Drawing(key, one.svg, label))
-    return drawings[0], drawings[1]
+    with canvas("age", 2.5) as one:
+        draw_age(one.axes("Age of information", "time [s]", "age [steps]"), flight)
+    return Drawing("age", one.svg, label)
 
 
 def draw_age(ax: Axes, flight: FlightData) -> None:
@@ -73,10 +70,11 @@ def draw_age(ax: Axes, flight: FlightData) -> None:
 def inputs(flight: FlightData) -> Iterator[Drawing]:
     """Draw each input against its limits, coloured by the plan index that was flown."""
     steps, design = flight.steps, flight.design
-    index = np.array([-1 if d.plan_index is None else d.plan_index for d in steps.decisions], dtype=np.int64)
-    yield _indices(flight, index)
+    index = _plan_index(flight)
     for number, (name, sign) in enumerate(INPUT[axis] for axis in design.axes):
         key = f"input-{number}"
+        if not varies(steps.input[:, number]):
+            continue
         with canvas(key, 2.3) as one:
             ax = one.axes(f"Input {name}", "time [s]", f"input {name} [{design.input_unit}]")
             shade_fallback(ax, flight)
@@ -95,16 +93,23 @@ def inputs(flight: FlightData) -> Iterator[Drawing]:
         yield Drawing(key, one.svg, f"Input {name} over time against its limits, coloured by the plan index flown")
 
 
-def _indices(flight: FlightData, index: NDArray[np.int64]) -> Drawing:
-    """Draw the share of steps in which each plan index was flown [%]; it is the key to the colours of inputs."""
-    horizon = flight.design.horizon
+def _plan_index(flight: FlightData) -> NDArray[np.int64]:
+    """Return the plan index of each flown boundary (n,), -1 where no plan was flown."""
+    return np.array([-1 if d.plan_index is None else d.plan_index for d in flight.steps.decisions], dtype=np.int64)
+
+
+def plan_indices(flight: FlightData) -> Iterator[Drawing]:
+    """Draw the share of steps in which each plan index was flown [%]; nothing where it is one index alone."""
+    horizon, index = flight.design.horizon, _plan_index(flight)
+    if len(np.unique(index)) < 2:
+        return
     share = np.array([np.count_nonzero(index == at) for at in range(horizon)]) / max(1, len(index)) * 100
     with canvas("plan-index", 2.3) as one:
         ax = one.axes("Plan index flown", "plan index [steps]", "steps flown [%]")
         ax.bar(range(horizon), share, color=[ramp(at, horizon) for at in range(horizon)], width=0.8)
         ax.xaxis.set_major_locator(MaxNLocator(12, integer=True))
         ax.grid(visible=False, axis="x")
-    return Drawing("plan-index", one.svg, "Share of the steps in which each plan index was flown, in percent")
+    yield Drawing("plan-index", one.svg, "Share of the steps in which each plan index was flown, in percent")
 
 
 def _draw_held(ax: Axes, t_s: Floats, values: Floats, dt_s: float, shade: str) -> None:
@@ -119,6 +124,8 @@ def timing(flight: FlightData) -> Iterator[Drawing]:
         return
     solved = {d.tick for d in flight.decisions if d.solve is not None}
     chosen = [t for t in flight.timings if t.tick in solved] or list(flight.timings)
+    if not varies(decision_times_us(flight)):
+        return
     yield _times(
         flight, "time-decision", "Decision time", flight.seconds([t.at_ns for t in chosen]), decision_times_us(flight)
     )
@@ -191,13 +198,17 @@ _LEAST_SHARE = 2e-5
 _LEAST_SPAN = 0.01  # of the axis: a delay configured without jitter is seen, too
 
 
-def link(flight: FlightData, verdict: LinkVerdict) -> Iterator[Drawing]:
-    """Draw histograms of the age and of the delay, and the estimated share of arrivals over time."""
-    if verdict.ages:
+def link_ages(flight: FlightData, verdict: LinkVerdict) -> Iterator[Drawing]:
+    """Draw a histogram of the age; nothing where it never changed."""
+    if sum(share > 0.0 for share in verdict.ages) > 1:
         yield _ages(flight, verdict)
-    if flight.link_estimates:
+
+
+def link_in_flight(flight: FlightData, verdict: LinkVerdict) -> Iterator[Drawing]:
+    """Draw the estimated share of arrivals over time, and a histogram of the delay; what never changed is left out."""
+    if varies(np.array([one.arrival_mean for one in flight.link_estimates])):
         yield _arrivals(flight)
-    if verdict.delay is not None:
+    if verdict.delay is not None and varies(delays_s(flight)):
         yield _delays(flight, verdict)
 
 
@@ -205,7 +216,7 @@ def _ages(flight: FlightData, verdict: LinkVerdict) -> Drawing:
     shown = max(len(verdict.ages), flight.design.horizon) + 1
     promised = np.array(verdict.promised_ages[:shown])
     with canvas("age-share", 2.5) as one:
-        ax = one.axes("Age of information", "age [steps]", "steps (log scale)")
+        ax = one.axes("Age of information", "age [steps]", "steps (log scale)", _DURATIONS_IN)
         ax.set_yscale("log")
         ax.bar(range(len(verdict.ages)), verdict.ages, color=colour("estimate"), alpha=0.6, width=0.8)
         if len(promised):
@@ -284,10 +295,10 @@ def ways(flight: FlightData) -> str:
 
 def certificates(flight: FlightData) -> Iterator[Drawing]:
     """Draw the certified gap of each plan, and the slack of those in which a constraint gave way."""
-    if any(np.isfinite(plan.gap) for plan in flight.plans):
+    if varies(np.array([plan.gap for plan in flight.plans])):
         yield _gaps(flight)
     gave = [plan for plan in flight.flown_plans.values() if max(plan.slack, plan.terminal_miss) > SLACK_TOLERANCE]
-    if gave:
+    if len(gave) > 1:
         yield _slack(flight, gave)
 
 
@@ -385,7 +396,7 @@ def errors(flight: FlightData, axis: str, t_s: Floats, normalised: Floats) -> Dr
 def clocks(flight: FlightData, verdicts: tuple[ClockVerdict, ...]) -> Iterator[Drawing]:
     """Draw clock offsets about their straight line, for clocks that strayed from it."""
     for number, verdict in enumerate(verdicts):
-        if not verdict.residual_us:
+        if not verdict.residual_us or not varies(offsets(flight, verdict.link)[1]):
             continue
         t_s, residual_s = offsets(flight, verdict.link)
         with canvas(f"clock-{number}", 2.3) as one:

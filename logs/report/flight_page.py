@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 import sys
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 from logs.recording.design_view import config_name
@@ -317,7 +318,7 @@ def report_html(flight: FlightData, summary: FlightSummary, judged: Judged | Non
     return page.page(
         title,
         subtitle,
-        story(flight, summary),
+        (),
         _sections(flight, summary, judged),
         top=page.banner(main.tone, main.word, main.text, main.why),
         script=script(flight, main.at_s),
@@ -325,24 +326,26 @@ def report_html(flight: FlightData, summary: FlightSummary, judged: Judged | Non
 
 
 def _sections(flight: FlightData, summary: FlightSummary, judged: Judged) -> Iterator[PageSection]:
-    begins = part_begins(flight)
-    part = [("Part of a flight", f"begins at {begins}")] if begins else []
-    yield PageSection("Summary", "", page.facts([*part, *rows(summary), *verdict_rows(judged.verdicts)]))
     wide, narrow, marks, meanings = timeline(flight)
     yield PageSection("Timeline", "", page.wide_or_narrow(wide, narrow) + page.note(meanings), marks)
     yield _path_section(flight)
     yield _axes_section(flight)
-    yield _age_section(flight)
-    yield _link_section(flight, judged.verdicts.link)
     yield _inputs_section(flight)
-    yield _plans_section(flight)
-    yield _certificates_section(flight)
-    yield _timing_section(flight)
+    yield _age_section(flight, judged.verdicts.link)
+    for section in (
+        _link_section(flight, judged.verdicts.link),
+        _plans_section(flight),
+        _certificates_section(flight),
+        _timing_section(flight),
+        _risk(judged.verdicts),
+        _model(flight, judged),
+        _clocks(flight, judged.verdicts),
+        *origin_sections(flight),
+    ):
+        yield replace(section, closed=True)
     yield _events_section(flight)
-    yield _risk(judged.verdicts)
-    yield _model(flight, judged)
-    yield _clocks(flight, judged.verdicts)
-    yield from origin_sections(flight)
+    facts = page.facts([*rows(summary), *verdict_rows(judged.verdicts)])
+    yield PageSection("Summary", "", page.listed(story(flight, summary)) + facts)
 
 
 def _path_section(flight: FlightData) -> PageSection:
@@ -350,7 +353,7 @@ def _path_section(flight: FlightData) -> PageSection:
     return PageSection(
         "Path",
         "",
-        ("" if deep is None else page.wide_or_narrow(*deep)) + page.grid(list(plots.path(flight))),
+        page.grid([*plots.path(flight), *(() if deep is None else (deep,))]),
         (
             *_truth_mark(flight),
             _ESTIMATE,
@@ -382,15 +385,18 @@ def _axes_section(flight: FlightData) -> PageSection:
     )
 
 
-def _age_section(flight: FlightData) -> PageSection:
+def _age_section(flight: FlightData, verdict: LinkVerdict) -> PageSection:
     lost = (Mark("tick", "lost", "position lost"),) if flight.truths else ()
+    bound = (Mark("thin", "estimate", "lower bound in flight"),) if flight.link_estimates else ()
     return PageSection(
         "Age of information",
         "How many steps old the newest position was. A plan lasts H steps; at age H the fallback takes over.",
-        page.wide_or_narrow(*figures.age(flight)),
+        page.grid([figures.age(flight), *figures.link_in_flight(flight, verdict)]),
         (
-            Mark("line", "estimate", "age"),
-            Mark("dashed", "limit", f"horizon H = {flight.design.horizon}"),
+            Mark("line", "estimate", "measured"),
+            *bound,
+            Mark("dashed", "limit", f"horizon H = {flight.design.horizon}; share of news that the design counts on"),
+            *((Mark("band", "limit", "delay configured"),) if verdict.delay is not None else ()),
             *lost,
             *_fallback_mark(flight),
         ),
@@ -398,8 +404,7 @@ def _age_section(flight: FlightData) -> PageSection:
 
 
 def _link_section(flight: FlightData, verdict: LinkVerdict) -> PageSection:
-    drawings = list(figures.link(flight, verdict))
-    bound = (Mark("thin", "estimate", "lower bound in flight"),) if flight.link_estimates else ()
+    drawings = list(figures.link_ages(flight, verdict))
     horizon = (Mark("dotted", "muted", f"horizon H = {flight.design.horizon}"),) if verdict.ages else ()
     note = "The dashed line is what the design counts on, by the link of the configuration."
     if verdict.delay is not None and verdict.delay.from_quickest:
@@ -408,15 +413,7 @@ def _link_section(flight: FlightData, verdict: LinkVerdict) -> PageSection:
         "The link, estimated against promised",
         note,
         page.paragraph(verdict.text) + (page.grid(drawings) if drawings else ""),
-        (
-            Mark("line", "estimate", "measured"),
-            *bound,
-            Mark("dashed", "limit", "promised"),
-            *horizon,
-            Mark("band", "limit", "delay configured"),
-        )
-        if drawings
-        else (),
+        (Mark("line", "estimate", "measured"), Mark("dashed", "limit", "promised"), *horizon) if drawings else (),
     )
 
 
@@ -454,14 +451,15 @@ def _certificates_section(flight: FlightData) -> PageSection:
 def _inputs_section(flight: FlightData) -> PageSection:
     return PageSection(
         "Inputs",
-        "The colour tells how far into its plan the controller was when it gave the input, as in the first figure.",
+        "The colour tells how far into its plan the controller was when it gave the input: from blue, the first step "
+        "of a plan, to orange, its last.",
         page.grid(list(figures.inputs(flight))),
         (_LIMIT, *((_OUTSIDE,) if input_outside(flight).any() else ()), *_fallback_mark(flight)),
     )
 
 
 def _plans_section(flight: FlightData) -> PageSection:
-    drawings = list(plots.plans_against_flown(flight))
+    drawings = [*plots.plans_against_flown(flight), *figures.plan_indices(flight)]
     flown = Mark("line", "truth", "flown" if flight.truths else "flown (estimate)")
     marks = (flown, Mark("planned", "plan", "plan, from its first state"), Mark("band", "plan", "back-off of the plan"))
     return PageSection(

@@ -43,6 +43,7 @@ class PageSection:
     note: str
     body: Markup
     legend: tuple[Mark, ...] = ()
+    closed: bool = False  # behind its title until it is opened, as what is rarely looked at
 
     @property
     def anchor(self) -> str:
@@ -80,12 +81,13 @@ def page(
     Args:
         title: Plain text, as are `subtitle`, `story` and its `heading`.
         top: HTML that stands before all else but the title.
-        script: JavaScript of the page's end; the page is whole without it.
+        script: JavaScript of the page's end, before that of zoom and pan; the page is whole without it.
     """
     css = Template(resources.files("logs.report").joinpath("page.css").read_text(encoding="utf-8"))
     style = Markup(css.substitute(light=css_variables(False), dark=css_variables(True), font=FONT))
-    shown = [PageSection(heading, "", listed(story)), *sections]
-    code = Markup(script)
+    sentences = list(story)
+    shown = [*([PageSection(heading, "", listed(sentences))] if sentences else ()), *sections]
+    code = Markup(script + resources.files("logs.report").joinpath("zoom.js").read_text(encoding="utf-8"))
     return str(_made("document", title, subtitle, top, shown, len(shown) >= _MANY, style, code)).lstrip()
 
 

@@ -16,7 +16,7 @@ from logs.recording.design_view import AXIS_NUMBER, DesignView, Floats
 from logs.recording.flight import FlightData
 from logs.recording.summary import RELATIVE_TOLERANCE, WIRE_TOLERANCE, box_at, limits_at, position_error_m
 from logs.report.excursion import Excursion, excursions, trusted
-from logs.report.svg import WIDTH_IN, Drawing, canvas, colour, dots
+from logs.report.svg import Drawing, canvas, colour, dots
 from uavctl.records import Plan
 
 # Where it flew: the path within its limits, each axis over time, and plans against what was flown.
@@ -122,9 +122,7 @@ def draw_path(ax: Axes, flight: FlightData, axes_shown: tuple[str, str]) -> None
 
 def _draw_fences(ax: Axes, flight: FlightData, axes_shown: tuple[str, str]) -> None:
     """Draw the limits that move: where each was at its tightest, and the space that it took away until then."""
-    for fence in fences(flight):
-        if fence.axis not in axes_shown:
-            continue
+    for number, fence in enumerate(one for one in fences(flight) if one.axis in axes_shown):
         up = axes_shown[1] == fence.axis
         sign, other = SEEN[fence.axis][1], axes_shown[0 if up else 1]
         begin, end = position_limits(flight.design, other)
@@ -137,9 +135,11 @@ def _draw_fences(ax: Axes, flight: FlightData, axes_shown: tuple[str, str]) -> N
         fill(along, tight, wide, color=colour("limit"), alpha=0.1, lw=0, zorder=0)
         ax.plot(*line, color=colour("limit"), lw=1.6, zorder=1)
         told, inwards = f"fence at {fence.at_s:.1f} s", -1 if wide > tight else 1
-        at, off = ((begin, tight), (3, 8 * inwards)) if up else ((tight, begin), (8 * inwards, 3))
-        how: dict[str, Any] = {"va": "center"} if up else {"ha": "center", "rotation": 90}
-        ax.annotate(told, at, off, textcoords="offset points", **how, **_MARKED)
+        # Each label lies along its own line, at a place of its own: fences that close in from two sides would meet.
+        part = begin + (0.06 + 0.24 * (number % 4)) * (end - begin)
+        at, off = ((part, tight), (0, 8 * inwards)) if up else ((tight, part), (8 * inwards, 0))
+        how: dict[str, Any] = {"va": "center", "ha": "left"} if up else {"ha": "center", "va": "bottom", "rotation": 90}
+        ax.annotate(told, at, off, textcoords="offset points", annotation_clip=False, zorder=9, **how, **_MARKED)
 
 
 def _draw_excursions(ax: Axes, flight: FlightData, seen: Callable[[Floats], Floats]) -> None:
@@ -196,13 +196,27 @@ def position_limits(design: DesignView, axis: str) -> tuple[float, float]:
     return float(sides[0]), float(sides[1])
 
 
+def varies(values: Floats) -> bool:
+    """Return whether there are two different finite values at least: one alone makes no plot."""
+    known = values[np.isfinite(values)]
+    return bool(len(known)) and float(np.ptp(known)) > 0.0
+
+
 def axes_over_time(flight: FlightData) -> Iterator[Drawing]:
-    """Draw position and velocity of each axis over time against their limits."""
-    for axis, position, velocity in zip(
-        flight.design.axes, flight.design.position_index, flight.design.velocity_index, strict=True
-    ):
-        yield _state_over_time(flight, axis, position, f"{SEEN[axis][0]} [m]", SEEN[axis][0].capitalize())
-        yield _state_over_time(flight, axis, velocity, f"{RATE[axis]} [m/s]", RATE[axis].capitalize())
+    """Draw position and velocity of each axis over time against their limits, the positions first."""
+    design = flight.design
+    for axis, index in zip(design.axes, design.position_index, strict=True):
+        if _moves(flight, index):
+            yield _state_over_time(flight, axis, index, f"{SEEN[axis][0]} [m]", SEEN[axis][0].capitalize())
+    for axis, index in zip(design.axes, design.velocity_index, strict=True):
+        if _moves(flight, index):
+            yield _state_over_time(flight, axis, index, f"{RATE[axis]} [m/s]", RATE[axis].capitalize())
+
+
+def _moves(flight: FlightData, index: int) -> bool:
+    """Return whether a state, believed or true, has more than one value."""
+    believed = np.array([one.mean[index] for one in trusted(flight)])
+    return varies(believed) or varies(np.array([one.state[index] for one in flight.truths]))
 
 
 def _state_over_time(flight: FlightData, axis: str, index: int, y_label: str, title: str) -> Drawing:
@@ -435,20 +449,16 @@ _DROPS = 12  # lines from the path to the floor
 _SHOWN = VIEWS["deep"][1]
 
 
-def path_3d(flight: FlightData) -> tuple[Drawing, Drawing] | None:
-    """Draw path, plans with their spread, limits and target in 3D, for a wide page and for a narrow one.
+def path_3d(flight: FlightData) -> Drawing | None:
+    """Draw path, plans with their spread, limits and target in 3D.
 
     None for a plant that does not move in three axes, or where no position is known.
     """
     if len(flight.design.axes) < 3 or not len(_flown_m(flight)):
         return None
-    return _view(flight, "path-3d-wide", 8.6, 4.6), _view(flight, "path-3d-narrow", WIDTH_IN, 3.5)
-
-
-def _view(flight: FlightData, key: str, width_in: float, height_in: float) -> Drawing:
-    path_m = _flown_m(flight)
+    path_m, key = _flown_m(flight), "path-3d"
     lower, upper = _room(flight.design, path_m)
-    with canvas(key, height_in, width_in) as one:
+    with canvas(key, 3.7) as one:
         ax = one.figure.add_axes((0.04, 0.05, 0.92, 0.93))
         one.seen = "deep"
         one.figure.set_layout_engine(None)

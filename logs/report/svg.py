@@ -204,6 +204,7 @@ def _inline(text: str, key: str) -> str:
     text = re.sub(r'\b(id=")', rf"\1{key}-", text)
     text = re.sub(r'(href="#|url\(#)', rf"\1{key}-", text)
     text = re.sub(r' d="([^"]*)"', lambda found: f' d="{compact(found.group(1))}"', text)
+    text = re.sub(r"font-family: [^;\"]*; ", "", text)  # the page says which
     text = re.sub(r' (?:x|y|transform)="[^"]*"', lambda found: _shorten(found.group()), text)
     text = re.sub(r"\s*\n\s*", "\n", text)
     roles = {light: f"var(--{role},{light})" for role, (light, _) in PALETTE.items()}

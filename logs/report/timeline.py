@@ -21,7 +21,7 @@ from logs.report.plots import SEEN, VIEWS, span
 from logs.report.svg import WIDTH_IN, Drawing, canvas, colour, strokes
 from uavctl.records import ControlMode, Decision, Severity, SolveStatus
 
-WIDE_IN = 8.6
+WIDE_IN = 11.0
 MARKS = 400  # of one lane: more would touch each other
 _LANE_IN = 0.3
 _LEFT_IN = 0.95  # for the lanes' names

@@ -171,7 +171,7 @@ def test_the_page_is_whole_at_every_width(window: Browser, page: Path, width: in
     assert found["seen"] == width
     assert faults(found) == NONE
     assert found["hidden"] == []
-    assert len(found["figures"]) == 32
+    assert len(found["figures"]) == 31
     assert "nan" not in found["words"].lower().split()
 
 
@@ -236,6 +236,65 @@ def test_the_slider_moves_one_moment_through_all_drawings(window: Browser, page:
     assert "5.0 s" in found["said"] and "track" in found["said"]
 
 
+def mouse(window: Browser, kind: str, x: float, y: float, **more: object) -> None:
+    window.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **more)
+
+
+def told(window: Browser, expression: str) -> Any:
+    return window.call("Runtime.evaluate", expression=expression, returnByValue=True)["result"]["value"]
+
+
+def middle(window: Browser, figure: str) -> tuple[float, float]:
+    """The middle of a figure's drawing, brought into sight."""
+    box = told(
+        window,
+        f"(() => {{ const one = document.querySelector('#{figure} svg'); one.scrollIntoView({{block: 'center'}});"
+        "const {x, y, width, height} = one.getBoundingClientRect(); return [x + width / 2, y + height / 2]; })()",
+    )
+    return float(box[0]), float(box[1])
+
+
+SPANS = "[...document.querySelectorAll('svg[data-time]')].map(one => one.view)"
+SETTLED = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))"
+
+
+def test_the_wheel_zooms_all_of_time_dragging_pans_and_a_double_click_resets(window: Browser, page: Path) -> None:
+    _, console = window.open(page, 1400)
+    whole = told(window, SPANS)
+    x, y = middle(window, "state-0")
+    mouse(window, "mouseWheel", x, y, deltaX=0, deltaY=-400)
+    window.call("Runtime.evaluate", expression=SETTLED, awaitPromise=True)
+    zoomed = told(window, SPANS)
+    assert len(zoomed) > 10 and all(one == zoomed[0] for one in zoomed)
+    (begin, end), (first, last) = zoomed[0], whole[0]
+    assert first < begin < end < last and end - begin < 0.6 * (last - first)
+    mouse(window, "mousePressed", x, y, button="left", clickCount=1)
+    for off in (30, 60):
+        mouse(window, "mouseMoved", x - off, y, button="left", buttons=1)
+    mouse(window, "mouseReleased", x - 60, y, button="left", clickCount=1)
+    panned = told(window, SPANS)[0]
+    assert panned[0] > begin and panned[1] - panned[0] == pytest.approx(end - begin)
+    found = told(window, f"({MOVE})({0.5 * sum(panned)})")
+    assert found["times"]  # the moment's line moves with what is shown
+    for clicks in (1, 2):
+        for kind in ("mousePressed", "mouseReleased"):
+            mouse(window, kind, x, y, button="left", clickCount=clicks)
+    assert told(window, SPANS) == whole
+    assert console == ""
+
+
+def test_a_path_zooms_within_its_frame(window: Browser, page: Path) -> None:
+    window.open(page, 1400)
+    view = "document.querySelector('#path-above svg').getAttribute('viewBox').split(' ').map(Number)"
+    whole = told(window, view)
+    x, y = middle(window, "path-above")
+    mouse(window, "mouseWheel", x, y, deltaX=0, deltaY=-400)
+    window.call("Runtime.evaluate", expression=SETTLED, awaitPromise=True)
+    zoomed = told(window, view)
+    assert zoomed[2] < 0.6 * whole[2] and zoomed[2] / zoomed[3] == pytest.approx(whole[2] / whole[3])
+    assert zoomed[0] + zoomed[2] / 2 == pytest.approx(whole[2] / 2, abs=1.0)
+
+
 def test_without_its_script_the_page_lacks_the_slider_only(window: Browser, page: Path) -> None:
     window.call("Emulation.setScriptExecutionDisabled", value=True)
     try:
@@ -243,7 +302,7 @@ def test_without_its_script_the_page_lacks_the_slider_only(window: Browser, page
     finally:
         window.call("Emulation.setScriptExecutionDisabled", value=False)
     assert console == "" and faults(found) == NONE
-    assert len(found["figures"]) == 32
+    assert len(found["figures"]) == 31
     sliders = "document.querySelectorAll('.cursor, .moment').length"
     assert window.call("Runtime.evaluate", expression=sliders, returnByValue=True)["result"]["value"] == 0
 

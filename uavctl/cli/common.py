@@ -10,7 +10,7 @@ from contextlib import contextmanager, redirect_stdout
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, TextIO
+from typing import TYPE_CHECKING, Annotated, Any, TextIO
 
 import msgspec
 from cyclopts import Parameter, validators
@@ -24,6 +24,9 @@ from rich.text import Text
 from uavctl.config import LoadedConfig, explain, load
 from uavctl.config.document import LARGEST_SEED, LONGEST_S
 from uavctl.errors import ConfigError, DesignError
+
+if TYPE_CHECKING:
+    from logs.report.causes import Headline
 
 # What all commands share: --config, --set and --json, where output goes, and how a bad design is told.
 # A string is never markup: paths, units and what vehicles say have brackets. Styles are those of `rich.text.Text`.
@@ -275,6 +278,14 @@ def labelled(label: str, text: str, style: str = "yellow") -> Text:
 def warn(text: str) -> None:
     """Write a warning on a line of its own."""
     messages().print(text, style="yellow", soft_wrap=True)
+
+
+_STYLES = {"good": "bold green", "mind": "bold yellow", "bad": "bold red"}
+
+
+def first_line(main: Headline) -> Text:
+    """Return the first line of a recording's page, in its colour."""
+    return Text.assemble((f"{main.word}: ", _STYLES[main.tone]), main.text)
 
 
 @contextmanager

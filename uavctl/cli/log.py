@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Literal
 
+import msgspec
 from cyclopts import App, Parameter
 from rich.console import Group, RenderableType
 from rich.table import Table
@@ -27,7 +28,8 @@ from logs.recording.recover import recover as restore
 from logs.recording.summary import count
 from logs.recording.tlog import ExportedTlog, export_tlog
 from logs.recording.ulog import is_ulog
-from uavctl.cli.common import Common, Flight, Json, System, bars, columns, counted, two_columns, warn
+from logs.report.causes import Headline
+from uavctl.cli.common import Common, Flight, Json, System, bars, columns, counted, first_line, two_columns, warn
 from uavctl.cli.usage import example
 from uavctl.errors import UsageError
 
@@ -234,16 +236,25 @@ for _name, (_path, _help) in _COMMANDS.items():
 
 @log_app.command(help_epilogue=example("log info"))
 def info(flight: Flight, /, *, system: System = None, json: Json = False) -> int:
-    """Say what a recording, a .tlog or a ULog holds: topics, rates, gaps, losses, and how it was made."""
+    """Say what a recording, a .tlog or a ULog holds: the page's first line, topics, rates, gaps, losses, its making."""
+    from logs.report import headline, tlog_headline  # not for the other commands: it takes SciPy
+
     if kind_of(flight) is not FileKind.MCAP or system is not None:
-        told = foreign_flight(flight, system)
-        assert told is not None  # only one of ours is none, of which there is no system
+        foreign = foreign_flight(flight, system)
+        assert foreign is not None  # only one of ours is none, of which there is no system
+        told, main = foreign.info, tlog_headline.headline_of(foreign)
         name = FileKind.ULOG if is_ulog(flight) else FileKind.TLOG
-        Common(json=json).show(f"log/info-{name}", told.info, lambda: _tlog_info(told.info))
+        Common(json=json).show(f"log/info-{name}", _with(main, told), lambda: Group(first_line(main), _tlog_info(told)))
         return 0
-    found = recording_info(flight)
-    Common(json=json).show("log/info", found, lambda: info_table(found))
+    found, ours = recording_info(flight), headline.headline_in(flight)
+    line = () if ours is None else (first_line(ours),)
+    Common(json=json).show("log/info", _with(ours, found), lambda: Group(*line, info_table(found)))
     return 0
+
+
+def _with(main: Headline | None, found: msgspec.Struct) -> dict[str, object]:
+    """Return the document of a recording, the page's first line before all else."""
+    return {"headline": None if main is None else main.document(), **msgspec.structs.asdict(found)}
 
 
 @log_app.command(help_epilogue=example("log recover"))

@@ -18,6 +18,7 @@ from logs.recording.mavlink_flight import MavlinkFlight, facts_of
 from logs.recording.reader import lacks_end, read
 from logs.recording.summary import names_and_values, render, summarise
 from logs.recording.ulog import is_ulog
+from logs.report.causes import Headline
 from logs.report.compare import (
     ComparedFlight,
     FlightComparison,
@@ -33,7 +34,7 @@ from logs.report.compare import (
 )
 from logs.report.figures import picture
 from logs.report.flight_page import verdict_rows, write_report
-from logs.report.headline import BAD, GOOD, MIND, Headline, headline
+from logs.report.headline import headline
 from logs.report.tlog_page import headline_of, write_tlog_page
 from logs.report.verdicts import judge
 from uavctl.cli.common import (
@@ -46,6 +47,7 @@ from uavctl.cli.common import (
     bars,
     can_be_read,
     columns,
+    first_line,
     two_columns,
     warn,
 )
@@ -144,22 +146,14 @@ def report(
     if cut := lacks_end(flight):
         warn(f"{cut}: shown up to there")
     main = headline(data, summary, judged)
-    document = {**msgspec.structs.asdict(summary), "verdicts": judged.verdicts, "headline": _document(main)}
+    document = {**msgspec.structs.asdict(summary), "verdicts": judged.verdicts, "headline": main.document()}
     Common(json=json).show("log/report", document, lambda: _told(main, render(summary, verdict_rows(judged.verdicts))))
     return 0
 
 
-_STYLES = {GOOD: "bold green", MIND: "bold yellow", BAD: "bold red"}
-
-
-def _document(main: Headline) -> dict[str, object]:
-    return {"tone": main.tone, "text": f"{main.word}: {main.text}", "why": main.why}
-
-
 def _told(main: Headline, summary: RenderableType) -> Group:
     """Return what a terminal shows: the page's first line and why, then the figures."""
-    why = [Text(f"  {sentence}") for sentence in main.why]
-    return Group(Text.assemble((f"{main.word}: ", _STYLES[main.tone]), main.text), *why, summary)
+    return Group(first_line(main), *(Text(f"  {sentence}") for sentence in main.why), summary)
 
 
 def _report_foreign(flight: Path, found: MavlinkFlight, out: Path, svg: Path | None, common: Common) -> int:
@@ -169,7 +163,7 @@ def _report_foreign(flight: Path, found: MavlinkFlight, out: Path, svg: Path | N
     for note in found.info.notes:
         warn(note)
     main = headline_of(found)
-    document = {**msgspec.to_builtins(found.info), "report": str(out), "headline": _document(main)}
+    document = {**msgspec.to_builtins(found.info), "report": str(out), "headline": main.document()}
     kind = FileKind.ULOG if is_ulog(flight) else FileKind.TLOG
     facts: list[tuple[str, object]] = [*facts_of(found.info), ("page", str(out))]
     common.show(f"log/report-{kind}", document, lambda: _told(main, two_columns("", facts)))

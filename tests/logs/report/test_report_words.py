@@ -70,7 +70,7 @@ def test_the_operators_stop_is_no_fallback() -> None:
     text = ended_in(HAND_OVER, stop_tick=40)
     assert f"Ended by the operator after {40 * TICK_S:g} s" in text
     assert "handed over to its own landing" in text
-    assert "fallback was never needed" in text
+    assert "took over" not in text
 
 
 def test_a_fallback_before_the_operators_stop_is_told() -> None:
@@ -98,7 +98,7 @@ def test_a_landing_is_told() -> None:
 def test_a_landing_that_was_wanted_is_told_as_such(ordered: bool, told: str) -> None:
     text = ended_in(HAND_OVER, order_tick=40 if ordered else None, due_tick=None if ordered else 40)
     assert told in text and f"{51 * TICK_S:g} s" in text
-    assert "fallback was never needed" in text
+    assert "took over" not in text
     assert "fallback had the vehicle land" not in text and "by the fallback" not in text
 
 
@@ -116,9 +116,9 @@ def test_a_recording_that_ends_otherwise(mode: ControlMode, told: str) -> None:
 
 
 def test_a_simulated_flight_that_never_began_has_a_page() -> None:
-    nothing = "Nothing was flown in 4 s: why not."  # with its reason
-    assert nothing in ended_in({0: ControlMode.WAIT})
-    assert nothing in ended_in({0: ControlMode.STOPPED}, stop_tick=0)
+    nothing = "Nothing was flown: why not."  # with its reason
+    assert nothing in " ".join(ended_in({0: ControlMode.WAIT}).split())
+    assert nothing in " ".join(ended_in({0: ControlMode.STOPPED}, stop_tick=0).split())
 
 
 def test_what_went_amiss_is_told() -> None:
@@ -181,8 +181,7 @@ def test_a_place_that_is_predicted_only_is_not_told_as_one_that_was_seen(
     assert summary.final_age_s == pytest.approx(last.age_s, abs=room().dt_s)
     text = predicted_only(summary)
     assert bool(text) == blind
-    for told in (story(flight, summary), [value for _, value in rows(summary)]):
-        assert any("predicted only" in one for one in told) == blind
+    assert any("predicted only" in value for _, value in rows(summary)) == blind
     if blind:
         assert summary.final_age_s is not None and summary.final_std_m is not None
         assert number(summary.final_age_s) in text and number(summary.final_std_m) in text

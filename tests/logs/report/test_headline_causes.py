@@ -1,0 +1,342 @@
+"""What a page names first: one flight for each cause, in the simulator or made from its records, judged by the code."""
+
+from __future__ import annotations
+
+import dataclasses
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from loopback_rig import lockstep
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from synthetic_flight import fly
+from synthetic_scene import room
+
+from logs.recording.flight import FlightData
+from logs.recording.mavlink_flight import read_flight
+from logs.recording.summary import course_error, position_error_m, summarise
+from logs.recording.topics import RECOVERED, RecorderNote
+from logs.report.causes import GOOD, Headline, HeadlineCause, cause_of_text, ranked
+from logs.report.headline import headline
+from logs.report.tlog_headline import headline_of
+from logs.report.verdicts import judge
+from uavctl.outcome import Cause, make_ending
+from uavctl.records import ControlMode, Event, LinkStats, RelayStats, Severity, VehicleStatus
+
+C = HeadlineCause
+SECOND = 1_000_000_000
+AUTOPILOTS = ("px4", "ardupilot")
+PILOTS = {"px4": "POSCTL", "ardupilot": "LOITER"}
+
+
+def head(flight: FlightData) -> Headline:
+    return headline(flight, summarise(flight, wall_s=None), judge(flight))
+
+
+def flown(autopilot: str, duration_s: float, *overrides: str) -> FlightData:
+    near = ("sim.seed=1", "target.position_m=[-1.5, -1.2, -1.2]")
+    return FlightData.from_records(lockstep(f"room-{autopilot}", duration_s, *near, *overrides).entries)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("autopilot", AUTOPILOTS)
+@pytest.mark.parametrize(
+    ("fault", "wanted"),
+    [
+        ('{at_s=5.0, kind="battery", charge=0.0}', {C.BATTERY_EMPTY}),
+        ('{at_s=4.0, kind="frozen", for_s=8.0}', {C.POSITIONS_FROZEN}),
+        ('{at_s=4.0, kind="drift", velocity_mps=[-0.15, 0.0, 0.0]}', {C.POSITIONS_DRIFTED}),
+        ('{at_s=4.0, kind="frame", name="turned-90"}', {C.POSITIONS_JUMPED}),
+        ('{at_s=4.0, kind="blackout", for_s=8.0}', {C.FLOWN_BLIND}),
+    ],
+)
+def test_a_fault_is_named_and_never_called_wind(autopilot: str, fault: str, wanted: set[HeadlineCause]) -> None:
+    flight = flown(autopilot, 12.0, f"sim.fault=[{fault}]")
+    found = head(flight)
+    assert found.cause in wanted
+    assert C.WIND not in found.causes and C.ALL_WELL not in found.causes
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("autopilot", AUTOPILOTS)
+def test_the_pilots_stick_is_named(autopilot: str) -> None:
+    fault = f'{{at_s=5.0, kind="mode", name="{PILOTS[autopilot]}"}}'
+    flight = flown(autopilot, 8.0, f"sim.fault=[{fault}]")
+    left = next(one for one in flight.vehicles if not one.external)
+    # Who switched is the ending's to say; a recording without one tells the mode alone.
+    assert head(flight).cause in (C.PILOT, C.MODE_LEFT)
+    ended = dataclasses.replace(flight, endings=(make_ending(Cause.PILOT, Cause.PILOT.value),))
+    found = head(ended)
+    assert found.cause is C.PILOT and found.at_s == pytest.approx((left.at_ns - flight.origin_ns) * 1e-9)
+
+
+# --- made from the records of one good flight ---
+
+
+@pytest.fixture(scope="module")
+def good() -> FlightData:
+    flight = FlightData.from_records(fly(room(), 12.0))
+    return dataclasses.replace(flight, endings=(make_ending(Cause.OPERATOR, Cause.OPERATOR.value),))
+
+
+def told(flight: FlightData, at_s: float, code: str, text: str, severity: Severity, count: int = 1) -> FlightData:
+    event = Event(at_ns=flight.origin_ns + round(at_s * SECOND), severity=severity, code=code, text=text, count=count)
+    return dataclasses.replace(flight, events=(*flight.events, event))
+
+
+def with_ending(flight: FlightData, cause: Cause) -> FlightData:
+    return dataclasses.replace(flight, endings=(make_ending(cause, cause.value),))
+
+
+def statuses(flight: FlightData, volts: Sequence[float | None], **more: Any) -> FlightData:
+    """The flight with a heartbeat each second, whose battery has these voltages."""
+    kept = [
+        VehicleStatus(
+            at_ns=flight.origin_ns + number * SECOND, autopilot="px4", armed=True, mode="OFFBOARD", external=True,
+            landed=False, battery_v=value, **more,
+        )
+        for number, value in enumerate(volts)
+    ]  # fmt: skip
+    return dataclasses.replace(flight, vehicles=tuple(kept))
+
+
+@pytest.mark.parametrize(
+    ("volts", "cause"),
+    [
+        ([4.2] * 6 + [0.0] * 6, C.BATTERY_EMPTY),
+        ([12.6 - 0.3 * n for n in range(12)], C.BATTERY_LOW),
+        ([4.2 - 0.02 * n for n in range(12)], None),
+        ([4.2] * 5 + [0.0] + [4.2] * 6, None),  # one reading is a glitch
+        ([0.0] * 12, None),  # a vehicle that measures none
+        ([None] * 12, None),
+    ],
+)
+def test_a_battery_that_falls(good: FlightData, volts: list[float | None], cause: HeadlineCause | None) -> None:
+    found = head(statuses(good, volts))
+    assert {C.BATTERY_EMPTY, C.BATTERY_LOW} & set(found.causes) == ({cause} if cause else set())
+    assert cause is None or found.cause is cause
+
+
+@pytest.mark.parametrize(
+    ("text", "severity", "cause"),
+    [
+        ("Radio Failsafe", Severity.WARNING, C.VEHICLE_FAILSAFE),
+        ("Battery Failsafe", Severity.WARNING, C.BATTERY_LOW),
+        ("Max Alt fence breached", Severity.INFO, C.VEHICLE_FENCE),
+        ("EKF variance", Severity.ERROR, C.VEHICLE_POSITION_LOST),
+        ("Crash: Disarming", Severity.ERROR, C.VEHICLE_ALARM),
+        ("Compass error", Severity.WARNING, C.VEHICLE_WARNED),
+        ("Fence breach cleared", Severity.INFO, None),
+        ("Takeoff detected", Severity.INFO, None),
+    ],
+)
+def test_what_the_vehicle_says(good: FlightData, text: str, severity: Severity, cause: HeadlineCause | None) -> None:
+    plain = statuses(good, [4.1] * 12)
+    found = head(told(plain, 6.0, "vehicle-text", text, severity))
+    assert found.causes == (head(plain).causes if cause is None else (cause, *set(found.causes) - {cause}))
+    disarmed = dataclasses.replace(
+        plain, vehicles=tuple(msgspec.structs.replace(one, armed=False) for one in plain.vehicles)
+    )
+    assert cause is None or cause not in head(told(disarmed, 6.0, "vehicle-text", text, severity)).causes
+
+
+@pytest.mark.parametrize(
+    ("ending", "cause"),
+    [
+        (Cause.FAILSAFE, C.VEHICLE_FAILSAFE),
+        (Cause.FAILSAFE_LANDED, C.VEHICLE_FAILSAFE),
+        (Cause.PILOT, C.PILOT),
+        (Cause.PILOT_LANDED, C.PILOT),
+        (Cause.SILENT, C.VEHICLE_SILENT),
+        (Cause.CONNECTION, C.VEHICLE_SILENT),
+        (Cause.RESTARTED, C.VEHICLE_RESTARTED),
+        (Cause.DISARMED, C.VEHICLE_DISARMED),
+        (Cause.CONTROL, C.CONTROL_FAILED),
+        (Cause.LANDING_FAILED, C.NOT_AS_ORDERED),
+    ],
+)
+def test_how_it_ended(good: FlightData, ending: Cause, cause: HeadlineCause) -> None:
+    assert head(with_ending(statuses(good, [4.1] * 12), ending)).cause is cause
+
+
+def test_every_end_that_was_not_ordered_has_a_headline(good: FlightData) -> None:
+    for cause in Cause:
+        ended = with_ending(good, cause)
+        assert ended.endings[0].as_ordered or head(ended).tone != GOOD
+
+
+def test_a_killed_process_is_told_with_what_is_left(good: FlightData) -> None:
+    note = RecorderNote(at_ns=good.decisions[-1].at_ns, text=f"{RECOVERED}flight.mcap: no end", segment=1, written=0,
+                        dropped=0, refused=0, failures=0)  # fmt: skip
+    cut = dataclasses.replace(statuses(good, [4.1] * 12), endings=(), notes=(note,))
+    assert head(cut).cause is C.RECORDING_CUT
+
+
+@pytest.mark.parametrize(
+    ("code", "cause"),
+    [
+        ("sample-frozen", C.POSITIONS_FROZEN),
+        ("sample-jump", C.POSITIONS_JUMPED),
+        ("sample-future", C.STAMPS_UNUSABLE),
+        ("sample-invalid", C.POSITIONS_INVALID),
+        ("relay-silent", C.RELAY_SILENT),
+        ("second-vehicle", C.SECOND_VEHICLE),
+    ],
+)
+def test_what_was_refused(good: FlightData, code: str, cause: HeadlineCause) -> None:
+    found = head(told(good, 5.0, code, "", Severity.WARNING, count=75))
+    assert cause in found.causes and C.ALL_WELL not in found.causes
+
+
+def test_stamps_without_a_time_of_capture(good: FlightData) -> None:
+    stats = LinkStats(at_ns=good.decisions[-1].at_ns, link="mocap", datagrams=200, messages=200, samples=0,
+                      bad={"duplicate": 200}, clock_offset_ns=None, clock_source="none")  # fmt: skip
+    assert C.STAMPS_UNUSABLE in head(dataclasses.replace(good, links=(stats,))).causes
+
+
+def test_a_relay_that_stops_is_told_by_its_counters(good: FlightData) -> None:
+    rows = tuple(
+        RelayStats(at_ns=good.origin_ns + n * SECOND, sent=min(20 * n, 100), kept={"no-clock": max(0, 20 * (n - 5))},
+                   last_ns=None, alone=False)
+        for n in range(1, 12)
+    )  # fmt: skip
+    plain = statuses(good, [4.1] * 12)
+    assert C.RELAY_SILENT in head(dataclasses.replace(plain, relays=rows)).causes
+    whole = tuple(msgspec.structs.replace(one, sent=20 * n) for n, one in enumerate(rows))
+    assert C.RELAY_SILENT not in head(dataclasses.replace(plain, relays=whole)).causes
+
+
+@pytest.mark.parametrize(("came", "cause"), [(False, C.POSITIONS_ABSENT), (True, C.POSITIONS_INVALID)])
+def test_a_position_that_was_never_valid(good: FlightData, came: bool, cause: HeadlineCause) -> None:
+    """Nothing was ever estimated, as no position came, or none could be used."""
+    waited = tuple(
+        msgspec.structs.replace(one, mode=ControlMode.WAIT, accepted=0, plan_seq=None, input=None)
+        for one in good.decisions
+    )
+    inputs = tuple(one if came else msgspec.structs.replace(one, samples=()) for one in good.step_inputs)
+    never = dataclasses.replace(good, decisions=waited, estimates=(), plans=(), step_inputs=inputs)
+    assert head(never).cause is cause
+
+
+def test_all_well_is_said_of_a_flight_in_which_nothing_is_amiss(good: FlightData) -> None:
+    found = head(good)
+    assert found.tone == GOOD and found.cause is C.ALL_WELL
+
+
+@pytest.mark.parametrize("off_m", [0.0, 0.36])
+def test_the_whole_course_counts_and_not_its_end(good: FlightData, off_m: float) -> None:
+    """A vehicle that is off its target for seconds, and stands on it at the end."""
+    steps = good.steps
+    state = steps.state.copy()
+    state[:, good.design.position_index[0]] += off_m * ((steps.t_s > 5.0) & (steps.t_s < 9.0))
+    moved = dataclasses.replace(good)
+    moved.__dict__["steps"] = dataclasses.replace(steps, state=state)
+    found, error = head(moved), course_error(moved)
+    assert error is not None and (C.OFF_TRACK in found.causes) == bool(off_m)
+    assert error.worst_m == pytest.approx(position_error_m(moved)[steps.t_s >= 5.0].max()) or not off_m
+    assert not off_m or 5.0 < error.worst_s < 9.0
+
+
+def test_the_gravest_comes_first_and_within_a_rank_the_earliest(good: FlightData) -> None:
+    found = head(told(told(statuses(good, [4.2] * 6 + [0.0] * 6), 2.0, "vehicle-text", "Radio Failsafe", Severity.INFO),
+                      1.0, "vehicle-text", "Max Alt fence breached", Severity.INFO))  # fmt: skip
+    assert found.causes[:3] == (C.BATTERY_EMPTY, C.VEHICLE_FENCE, C.VEHICLE_FAILSAFE)
+    assert ranked([]) == []
+    assert cause_of_text("PreArm: Battery Failsafe", grave=True, warns=True) is None
+
+
+# --- MAVLink of others ---
+
+
+def written(tmp_path: Path, packets: list[tuple[float, int, Any]]) -> Headline:
+    senders: dict[int, Any] = {}
+    data = bytearray()
+    for at_s, system, message in sorted(packets, key=lambda one: one[0]):
+        mav = senders.setdefault(system, mavlink.MAVLink(None, srcSystem=system, srcComponent=1))
+        data += struct.pack(">Q", 1_764_000_000_000_000 + round(at_s * 1e6)) + message.pack(mav)
+    path = tmp_path / "a.tlog"
+    path.write_bytes(data)
+    return headline_of(read_flight(path))
+
+
+def beat(mode: int = 4, *, armed: bool = True) -> Any:
+    flags = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | (mavlink.MAV_MODE_FLAG_SAFETY_ARMED if armed else 0)
+    return mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_QUADROTOR, 3, flags, mode, 4, 3)
+
+
+def course(duration_s: float = 12.0, *, system: int = 1) -> list[tuple[float, int, Any]]:
+    """A vehicle in GUIDED that moves north, and cameras that see it."""
+    out: list[tuple[float, int, Any]] = []
+    for n in range(round(10 * duration_s)):
+        t = 0.1 * n
+        own = mavlink.MAVLink_local_position_ned_message(100 * n, 0.05 * n, 0.0, -1.0, 0.5, 0.0, 0.0)
+        out.append((t, system, own))
+        seen = mavlink.MAVLink_vision_position_estimate_message(100_000 * n, 0.05 * n, 1e-3 * (n % 7), -1.0, 0, 0, 0)
+        out.append((t, 20, seen))
+        if n % 10 == 0:
+            out.append((t, system, beat()))
+    return out
+
+
+def status(at_s: float, volts: float) -> tuple[float, int, Any]:
+    return at_s, 1, mavlink.MAVLink_sys_status_message(0, 0, 0, 0, round(1e3 * volts), -1, -1, 0, 0, 0, 0, 0, 0)
+
+
+def spoken(at_s: float, text: bytes, severity: int) -> tuple[float, int, Any]:
+    return at_s, 1, mavlink.MAVLink_statustext_message(severity, text)
+
+
+def test_a_log_of_others_in_which_nothing_is_amiss(tmp_path: Path) -> None:
+    assert written(tmp_path, course()).cause is C.NOTHING_FOUND
+
+
+def frozen() -> list[tuple[float, int, Any]]:
+    stuck = mavlink.MAVLink_vision_position_estimate_message(0, 1.0, 0.0, -1.0, 0, 0, 0)
+    return [(t, s, stuck if s == 20 and 4.0 < t < 8.0 else m) for t, s, m in course()]
+
+
+def killed() -> list[tuple[float, int, Any]]:
+    return [one for one in course() if one[1] == 20 or one[0] < 6.0]
+
+
+def unstamped() -> list[tuple[float, int, Any]]:
+    same = mavlink.MAVLink_vision_position_estimate_message
+    return [(t, s, same(12345, m.x, m.y, m.z, 0, 0, 0) if s == 20 else m) for t, s, m in course()]
+
+
+@pytest.mark.parametrize(
+    ("packets", "cause"),
+    [
+        ([*course(), spoken(5.05, b"Radio Failsafe", 4)], C.VEHICLE_FAILSAFE),
+        ([*course(), spoken(5.05, b"Max Alt fence breached", 5)], C.VEHICLE_FENCE),
+        ([*course(), spoken(5.05, b"EKF variance", 2)], C.VEHICLE_POSITION_LOST),
+        ([*course(), *(status(t, 4.2 if t < 6 else 0.1) for t in range(12))], C.BATTERY_EMPTY),
+        (frozen(), C.POSITIONS_FROZEN),
+        (killed(), C.VEHICLE_SILENT),
+        (unstamped(), C.STAMPS_UNUSABLE),
+        ([one for one in course() if one[1] == 20 or isinstance(one[2], mavlink.MAVLink_heartbeat_message)],
+         C.POSITIONS_ABSENT),
+        ([one for one in course() if one[1] == 1 or not 3.0 < one[0] < 9.0], C.SILENCE),
+        ([*course(), *((t, s, m) for t, s, m in course(system=2) if s == 2)], C.SECOND_VEHICLE),
+    ],
+)  # fmt: skip
+def test_the_cause_in_a_log_of_others(
+    tmp_path: Path, packets: list[tuple[float, int, Any]], cause: HeadlineCause
+) -> None:
+    assert written(tmp_path, packets).cause is cause
+
+
+@pytest.mark.parametrize("off_m", [0.0, 0.36])
+def test_setpoints_that_were_not_followed(tmp_path: Path, off_m: float) -> None:
+    def wanted(n: int) -> Any:
+        north_m = 0.05 * n + (off_m if n > 20 else 0.0)
+        return mavlink.MAVLink_set_position_target_local_ned_message(
+            0, 1, 1, 1, 0xDF8, north_m, 0, -1, *np.zeros(8).tolist()
+        )
+
+    found = written(tmp_path, [*course(), *((0.1 * n, 245, wanted(n)) for n in range(120))])
+    assert (found.cause is C.OFF_TRACK) == bool(off_m)
