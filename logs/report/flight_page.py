@@ -344,8 +344,12 @@ def _sections(flight: FlightData, summary: FlightSummary, judged: Judged) -> Ite
     ):
         yield replace(section, closed=True)
     yield _events_section(flight)
+    yield _summary_section(flight, summary, judged)
+
+
+def _summary_section(flight: FlightData, summary: FlightSummary, judged: Judged) -> PageSection:
     facts = page.facts([*rows(summary), *verdict_rows(judged.verdicts)])
-    yield PageSection("Summary", "", page.listed(story(flight, summary)) + facts)
+    return PageSection("Summary", "", page.listed(story(flight, summary)) + facts)
 
 
 def _path_section(flight: FlightData) -> PageSection:

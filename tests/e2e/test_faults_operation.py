@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 from loopback_rig import Memory, shared_loop
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import decode
 
 from sim.simulation import Peers
@@ -64,9 +65,12 @@ def test_px4_that_hears_no_setpoints_leaves_offboard_by_itself_and_we_stop() -> 
     assert flight.ticked is not None and flight.ticked.vehicle is not None
     assert not flight.ticked.vehicle.external  # seen in its heartbeats
     # Nothing is streamed any more, and no mode is asked for: not even once the way is free again.
-    assert set(flight.run(5.0)) <= {"HEARTBEAT", "TIMESYNC"}
+    since = len(flight.outgoing())
+    assert SETPOINT not in flight.run(5.0)
+    commands = [one for d in flight.outgoing()[since:] for one in decode(d.data) if one.get_type() == "COMMAND_LONG"]
+    assert {one.command for one in commands} <= {mavlink.MAV_CMD_SET_MESSAGE_INTERVAL}
     assert flight.modes[-1] is ControlMode.WAIT
-    assert any(event.code == "hand-over" and "released" in event.text for event in flight.memory.of(Event))
+    assert any(event.code == "hand-over" and "engaged -> released" in event.text for event in flight.memory.of(Event))
 
 
 @pytest.mark.fault(8)

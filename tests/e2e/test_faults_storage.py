@@ -13,7 +13,7 @@ from flip_rig import Flips
 from loopback_rig import Memory, header, make_loop
 from mcap.reader import make_reader
 from places import ROOT
-from recording_fakes import Clock, Disk, Item, flight, own, record_flight
+from recording_fakes import Clock, Disk, Item, flight, own, record_flight, stored_byte
 
 from logs.recording.disk import DiskFile, OutputFile
 from logs.recording.info import info
@@ -319,7 +319,7 @@ def test_32_damaged_last_chunk_of_an_unfinished_file_is_no_torn_end(tmp_path: Pa
     record_flight(path, 30)
     data = path.read_bytes()
     end = data.rindex(b"\x0f\x04\0\0\0\0\0\0\0")
-    path.write_bytes(flipped(data[:end], data.rindex(b"number 29", 0, end), 0))
+    path.write_bytes(flipped(data[:end], stored_byte(path, b"number 29"), 0))
     got, stopped = readable(path)
     assert stopped
     assert 0 < len(got) < 31

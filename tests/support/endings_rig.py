@@ -252,7 +252,7 @@ class Told:
             assert self.status == sentence, (self.status, sentence)
         assert self.notified[-1] == f"ended: {sentence}"
         self._agrees_on_the_relay()
-        assert self.page.count(sentence) == 2  # first of what happened, and in the table
+        assert sentence in self.page
         assert self.ending["exit_code"] == self.code == (0 if self.ending["as_ordered"] else 1)
         assert self.ending["cause"] == self.summary["ended"]
         assert [one.sentence for one in self.recorded] == [sentence]
@@ -304,8 +304,7 @@ def in_virtual_time(rig: Endings) -> Iterator[None]:
         patch.setattr("uavctl.cli.check.checked_before_arming", lambda *_: ())
         patch.setattr("uavctl.cli.fly.HealthWatch", Watched)
         patch.setattr(Notifier, "status", lambda _, text: rig.notified.append(text))
-        sections = report._sections
-        patch.setattr(report, "_sections", lambda *given: [next(iter(sections(*given)))])  # its words, no drawings
+        patch.setattr(report, "_sections", lambda *given: [report._summary_section(*given)])  # no drawings
         patch.setattr(Sync, "full", False)
         yield
 

@@ -19,8 +19,9 @@ from uavctl.mavlink.handover_guards import (
     silent,
 )
 from uavctl.mavlink.handover_states import TRANSITIONS, HandoverEvent, HandoverState, Sending
+from uavctl.mavlink.profile import profile_of
 from uavctl.mavlink.requests import Patience, PendingRequest, RequestKind
-from uavctl.mavlink.switcher import Switcher, profile_of
+from uavctl.mavlink.switcher import Switcher
 from uavctl.records import ORDER_ACCEPTED, ORDER_REFUSED, Command, Event, Order, Severity, VehicleStatus
 
 LAND_TRIES = 5

@@ -13,9 +13,9 @@ import msgspec
 from uavctl.config.connections import HandOverConfig
 from uavctl.mavlink.handover_states import HandoverEvent, HandoverState
 from uavctl.mavlink.messages import Ack, Text
-from uavctl.mavlink.profile import PROFILES
+from uavctl.mavlink.profile import PROFILES, profile_of
 from uavctl.mavlink.requests import PendingRequest
-from uavctl.mavlink.switcher import OWN, Switcher, flies_itself, profile_of, who_switched
+from uavctl.mavlink.switcher import OWN, Switcher, flies_itself, who_switched
 from uavctl.records import Command, Order, VehicleStatus
 
 HEARTBEAT_TIMEOUT_NS = 3_000_000_000

@@ -12,6 +12,8 @@ from enum import Enum
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from uavctl.records import VehicleStatus
+
 
 class ModeChoice(Enum):
     """Who can have chosen a mode of an autopilot."""
@@ -169,6 +171,11 @@ PROFILES = {
         modes={"GUIDED": (4, 0)},
     ),
 }
+
+
+def profile_of(vehicle: VehicleStatus) -> AutopilotProfile:
+    """Return the autopilot's profile; that of PX4 for one that is not known, which is never asked for a mode."""
+    return PROFILES.get(vehicle.autopilot, PROFILES["px4"])
 
 
 def autopilot_name(autopilot: int) -> str:

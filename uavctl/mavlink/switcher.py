@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from enum import StrEnum
 
-from uavctl.mavlink.profile import PROFILES, AutopilotProfile, ModeChoice
+from uavctl.mavlink.profile import ModeChoice, profile_of
 from uavctl.records import VehicleStatus
 
 # Words of a failsafe that chooses a mode, in texts of any severity: PX4's commander; ArduCopter's events.cpp,
@@ -31,11 +31,6 @@ class Switcher(StrEnum):
 
 OWN = frozenset({Switcher.FAILSAFE, Switcher.FENCE})  # the vehicle itself
 PERSONS = frozenset({Switcher.PILOT, Switcher.GROUND_STATION})
-
-
-def profile_of(vehicle: VehicleStatus) -> AutopilotProfile:
-    """The autopilot's profile; that of PX4 for one that is not known, which is never asked for a mode."""
-    return PROFILES.get(vehicle.autopilot, PROFILES["px4"])
 
 
 def speaks_of_fence(text: str) -> bool:

@@ -82,7 +82,7 @@ def test_a_relative_name_is_beside_the_file_or_where_the_command_is_typed(
         ("", "trace.csv: has no packets"),
         ("delay_s\n", "trace.csv: has no packets"),
         ("0.1\n" * 20_001, "trace.csv: has 20001 packets, more than 20000"),
-        ("x\n" * 9, "trace.csv: 4 more"),
+        ("0.1\n" + "x\n" * 9, "trace.csv: 4 more"),
         ("inf\n\n", "trace.csv: link.trace_s: every packet is lost"),
     ],
 )

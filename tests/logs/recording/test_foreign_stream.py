@@ -276,6 +276,6 @@ def test_the_command_line_tells_what_was_left_out(tmp_path: Path, capsys: pytest
     told = capsys.readouterr().err.splitlines()
     assert told[0] == "MAVLink in /serial"
     assert told[1].startswith("/serial: ") and told[1].endswith("bytes left out that are no whole frame")
-    assert told[2] == "the recording is torn: replayed up to its end"
+    assert told[2] == "the recording is torn: read up to its end"
     with pytest.raises(UsageError, match=r"a \.tlog has no topics"):
         foreign_packets(tlog, ("/serial",))
