@@ -355,7 +355,7 @@ class LinkStats(Record, frozen=True, kw_only=True):
     clock_rtt_ns: int | None = None  # median of the last minute's round trips
     clock_drift_ppm: float | None = None  # gain of our clock on the peer's
     clock_rejected: int = 0  # answers that came too late, or deviated
-    stamp_units: list[str] = msgspec.field(default_factory=list)  # of positions, other than us, or "constant"
+    stamp_units: tuple[str, ...] = ()  # of positions, other than us, or "constant"
 
 
 class Truth(Record, frozen=True, kw_only=True):

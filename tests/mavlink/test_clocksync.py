@@ -481,5 +481,5 @@ def test_positions_with_stamps_of_another_unit_count_by_their_arrival_and_are_re
         told += events(items)
         ages_ms += [(one.received_ns - one.captured_ns) / MS for one in samples(items) if n > 40]
     assert [event.code for event in told if event.code == "stamp-unit"] == ["stamp-unit"]
-    assert link.stats(NOW_NS).stamp_units == [unit]
+    assert link.stats(NOW_NS).stamp_units == (unit,)
     assert ages_ms == [20.0] * 159

@@ -16,7 +16,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.frames import to_euler
 from uavctl.mavlink.codec import Encoder
-from uavctl.mavlink.framing import MessageLayout, text_of, with_checksum
+from uavctl.mavlink.framing import MessageLayout, with_checksum
 from uavctl.mavlink.relay import Pose
 from uavctl.records import Setpoint, SetpointSource
 
@@ -52,7 +52,8 @@ def is_read_alike(kind: Any, frame: bytes, sender: tuple[int, int]) -> None:
     assert (got.msgname, got.src_system, got.src_component) == (kind.msgname, *sender)
     for field in kind.fieldnames:
         value, wanted = getattr(got, field), getattr(want, field)
-        assert exact(text_of(value) if isinstance(value, bytes) else value) == exact(wanted), field
+        text = value.split(b"\0", 1)[0].decode("ascii", errors="replace") if isinstance(value, bytes) else value
+        assert exact(text) == exact(wanted), field
 
 
 def is_written_alike(kind: Any, payload: bytes, number: int) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from io import BytesIO
 from pathlib import Path
 
@@ -15,8 +15,9 @@ from zstandard import ZstdDecompressor
 
 from logs.recording.disk import DiskFile, OutputFile
 from logs.recording.recorder import SyncRecorder
+from logs.recording.topics import condense
 from uavctl.config.types import LogConfig
-from uavctl.records import Datagram, Event, Header, Record, Setpoint, SetpointSource, Severity, raw_topic
+from uavctl.records import Datagram, Event, Header, Plan, Record, Setpoint, SetpointSource, Severity, raw_topic
 
 HEADER = Header(
     started_ns=5,
@@ -30,6 +31,11 @@ HEADER = Header(
     cpu="x86-64",
 )
 Item = tuple[str, int, Record]
+
+
+def as_recorded(items: Sequence[Item]) -> list[Item]:
+    """Return records as a recording gives them back: of a plan's matrices it has four digits."""
+    return [(topic, at_ns, condense(one) if isinstance(one, Plan) else one) for topic, at_ns, one in items]
 
 
 def stored_byte(path: Path, needle: bytes) -> int:

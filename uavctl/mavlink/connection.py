@@ -499,7 +499,7 @@ class MavlinkConnection:
             clock_rtt_ns=round(median(round_trips_ns)) if round_trips_ns else None,
             clock_drift_ppm=None if trips is None else trips.drift_ppm,
             clock_rejected=0 if trips is None else trips.rejected,
-            stamp_units=sorted({str(unit) for unit in self._intake.units.values()}),
+            stamp_units=tuple(sorted({str(unit) for unit in self._intake.units.values()})),
         )
 
     def _target(self) -> tuple[int, int]:

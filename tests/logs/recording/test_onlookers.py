@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from recording_fakes import Clock, Disk, flight, own
+from recording_fakes import Clock, Disk, as_recorded, flight, own
 from view_rig import flown, record
 
 from logs.recording.derived_topics import VIEWS
@@ -21,7 +21,7 @@ from uavctl.records import Estimate, Record
 
 def test_the_records_read_back_as_if_there_were_no_views(tmp_path: Path) -> None:
     path = record(tmp_path / "flight.mcap")
-    assert own(list(read(path))) == flown().entries
+    assert own(list(read(path))) == as_recorded(flown().entries)
     found = info(path)
     assert found.finished and not found.missing and not found.refused
     assert sum(is_view(one.topic) for one in found.topics) == len(VIEWS)
@@ -48,7 +48,7 @@ def test_a_disk_full_at_every_operation_loses_neither_records_nor_views(tmp_path
         status = recorder.close()
         if disk.operations <= number:
             break
-        assert status.ok and own(list(read(path))) == items, number
+        assert status.ok and own(list(read(path))) == as_recorded(items), number
         messages = [m for file in segment_files(path) for m in scan(file) if isinstance(m, RecordedMessage)]
         assert [m.data for m in messages if is_view(m.definition.topic)] == want
         number += 1
@@ -63,7 +63,7 @@ def test_a_torn_file_is_recovered_with_its_views(tmp_path: Path) -> None:
     views = {one.topic for one in info(tmp_path / "again.mcap").topics if is_view(one.topic)}
     assert len(views) > len(VIEWS) - 3
     kept = own(list(read(tmp_path / "again.mcap")))
-    assert kept == flown().entries[: len(kept)] and len(kept) > 100
+    assert kept == as_recorded(flown().entries[: len(kept)]) and len(kept) > 100
 
 
 def test_what_has_no_view_is_recorded_and_counted(tmp_path: Path) -> None:

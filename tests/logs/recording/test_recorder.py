@@ -6,7 +6,7 @@ from pathlib import Path
 import msgspec
 import pytest
 from patience import until
-from recording_fakes import Clock, Disk, flight, own
+from recording_fakes import Clock, Disk, as_recorded, flight, own
 from view_rig import flown
 
 import logs.recording.recorder as recorder_module
@@ -222,7 +222,7 @@ def test_29_disk_full_at_every_operation_of_the_writing_thread_loses_neither_rec
         status = recorder.close(timeout_s=30.0)
         if 0 < disk.operations < number:
             break
-        assert status.ok and own(list(read(path))) == items, number
+        assert status.ok and own(list(read(path))) == as_recorded(items), number
         messages = [one for file in segment_files(path) for one in scan(file) if isinstance(one, RecordedMessage)]
         shown = [one.data for one in messages if is_view(one.definition.topic)]
         views = views or shown

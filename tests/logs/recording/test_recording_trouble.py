@@ -163,7 +163,7 @@ def test_a_file_that_is_taken_away_is_told_and_another_one_begun(tmp_path: Path,
 def test_a_closed_file_that_is_taken_away_is_told_too(tmp_path: Path) -> None:
     path = tmp_path / "flight.mcap"
     clock = Clock()
-    recorder = SyncRecorder(path, LogConfig(segment_bytes=100_000), clock=clock)
+    recorder = SyncRecorder(path, LogConfig(segment_bytes=20_000, chunk_bytes=4096), clock=clock)
     for item in flight(2000):
         clock.now_s += 0.01
         recorder.put(*item)

@@ -28,7 +28,7 @@ from uavctl.config.types import LogConfig
 from uavctl.errors import ConfigError, RecordingError
 from uavctl.records import PolicyLibrary
 
-SMALL = LogConfig(chunk_bytes=1024, segment_bytes=6000)
+SMALL = LogConfig(chunk_bytes=1024, segment_bytes=3000)
 LOW, STOP = 3000, 1000
 
 
@@ -128,7 +128,7 @@ def test_what_every_file_repeats_does_not_count_to_its_size(tmp_path: Path) -> N
     # Else a policy library larger than a file would make each record a file of its own.
     path = tmp_path / "flight.mcap"
     library = PolicyLibrary(library_id="l1", design_id="d1", data=bytes(range(256)) * 100)
-    items = flight(100)
+    items = flight(300)
     items.insert(1, ("/uavctl/library", 6, library))
     recorder = SyncRecorder(path, SMALL, clock=Clock())
     for item in items:

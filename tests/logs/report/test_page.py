@@ -40,7 +40,7 @@ PARTS: dict[str, Callable[[str], str]] = {
 @pytest.mark.parametrize("part", PARTS)
 def test_text_is_escaped_once_and_only_once(part: str) -> None:
     html = PARTS[part](HOSTILE)
-    assert "<script>" not in html
+    assert html.count("<script>") == html.count("// Zoom and pan.")  # the page's own
     shown = unescape(html)
     times = shown.count(HOSTILE)
     assert times >= 1 and shown.count("alert(") == times  # nothing of it is shown otherwise
@@ -52,12 +52,12 @@ def test_a_body_that_nobody_has_marked_as_html_is_text() -> None:
     assert isinstance(page.joined([page.note("a"), page.paragraph("b")]), Markup)
 
 
-@pytest.mark.parametrize("sections", [7, 8])
+@pytest.mark.parametrize("sections", [8, 9])
 def test_a_long_page_has_links_to_its_sections(sections: int) -> None:
     titles = [f"Section {number}: x & y" for number in range(sections)]
     html = page.page("t", "s", [], [PageSection(title, "", page.note("")) for title in titles])
     links = re.findall(r'<a href="#([^"]+)">', html)
-    assert len(links) == (0 if sections == 7 else 9)  # with what happened
+    assert len(links) == (0 if sections == 8 else 9)
     assert set(links) <= set(re.findall(r'<h2 id="([^"]+)">', html))
 
 
