@@ -511,7 +511,7 @@ class Rotation:
         self.at_ns = at_ns
         if topic in (HEADER, LIBRARY):
             self._repeats[topic] = data
-            self._repeats_bytes = sum(map(len, self._repeats.values()))
+            self._repeats_bytes = sum(map(len, map(ZstdCompressor(level=_LEVEL).compress, self._repeats.values())))
         self.write(topic, at_ns, data)
 
     def write_unwritten(self) -> None:

@@ -227,10 +227,11 @@ def test_all_land_together_and_have_never_been_near_each_other(how: str) -> None
 
 
 def test_a_daemon_that_refuses_to_arm_ends_with_its_own_exit_code(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Not with the interpreter's abort: its standard input stays open, and a thread waits on it."""
-    monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path / "control"))
+    short = tmp_path_factory.mktemp("c")  # a socket's path has 107 bytes at most
+    monkeypatch.setenv(FOLDER_VARIABLE, str(short))
     path = tmp_path / "fleet.toml"
     path.write_text(HEAD + entry("west", WEST, "udpin://127.0.0.1:0", "udpin://127.0.0.1:0", "check.seconds=0.2"))
     (one,) = read_fleet(path).members

@@ -180,7 +180,7 @@ def test_samples_that_do_not_fit_are_told_with_their_own_file_and_line(
     assert [one.split(";")[0] for one in lines] == [f"{tmp_path / 'way.csv'}:{one}" for one in told]
 
 
-@pytest.mark.parametrize(("samples", "words"), [("", "has no rows"), ("t,x\n", "has no rows")])
+@pytest.mark.parametrize(("samples", "words"), [("", "has no rows"), ("t,x,y,z\n", "has no rows")])
 def test_an_empty_file_is_told(tmp_path: Path, samples: str, words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         with_file(tmp_path, samples)

@@ -62,6 +62,7 @@ def test_ardupilot_answers_10_hz_and_1_hz_streams_alike() -> None:
     reached = []
     for period_s in (0.1, 1.0):
         one = Flight("ardupilot")
+        one.set(GUID_TIMEOUT=3.0)  # as recorded
         one.stream(3.0, 1.0, 0.0, 0.0, period_s=period_s)
         reached.append(one.level_mps)
     assert reached[0] == pytest.approx(reached[1], abs=0.02)
@@ -283,7 +284,7 @@ def test_px4_goes_on_with_the_last_acceleration_where_the_loss_of_the_stream_nee
 @pytest.mark.parametrize(("action", "mode"), [(5, "AUTO.LOITER"), (4, "AUTO.LAND")])
 def test_px4_acts_one_second_after_the_last_setpoint_as_configured(action: int, mode: str) -> None:
     one = Flight("px4")
-    one.set(COM_OBL_RC_ACT=action)
+    one.set(COM_OBL_RC_ACT=action, COM_OF_LOSS_T=1.0)  # as recorded
     one.stream(2.0, 1.0, 0.0, 0.0)
     last_ns = one.now_ns - 100_000_000
     one.wait(3.0)

@@ -41,6 +41,7 @@ def test_px4_takes_offboard_right_after_the_first_setpoint_while_it_is_fresh() -
 @pytest.mark.parametrize("number", [0.0, math.nan])
 def test_a_setpoint_that_sets_nothing_is_told_by_px4_and_counts_for_no_stream(number: float) -> None:
     one = bench("px4")
+    one.peers.autopilot.parameters.set("COM_OF_LOSS_T", 1.0)
     one.send(one.client.setpoint(1.0, 0.0, 0.0))
     mask = 0xFFF if number == 0.0 else 3135
     one.wait(0.9)

@@ -8,7 +8,7 @@ from mcap.data_stream import RecordBuilder
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.records import Chunk, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
-from recording_fakes import record_flight
+from recording_fakes import record_flight, stored_chunks
 
 from logs.recording.disk import DiskFile, check_room, later_segments, segment_path
 from logs.recording.segment import QueuedMessage, Segment
@@ -49,14 +49,16 @@ def test_index_points_at_the_messages(tmp_path: Path) -> None:
     with path.open("rb") as file:
         summary = make_reader(file).get_summary()
     assert summary is not None
+    # By the start of the chunk: opcode, length, and 32 bytes of fields, then the compression and the stored size.
+    contents = {begin - 9 - 32 - len("zstd") - 8: content for begin, _, content in stored_chunks(data)}
     seen = 0
     for index in summary.chunk_indexes:
-        content = index.chunk_start_offset + 9 + 40
+        content = contents[index.chunk_start_offset]
         for channel, at in index.message_index_offsets.items():
             opcode, _, named, size = struct.unpack_from("<BQHI", data, at)
             assert (opcode, named) == (7, channel)
             for log_time, offset in struct.iter_unpack("<QQ", data[at + 15 : at + 15 + size]):
-                opcode, _, owner, _, message_time = struct.unpack_from("<BQHIQ", data, content + offset)
+                opcode, _, owner, _, message_time = struct.unpack_from("<BQHIQ", content, offset)
                 assert (opcode, owner, message_time) == (5, channel, log_time)
                 seen += 1
     assert seen == 63
