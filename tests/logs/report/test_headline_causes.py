@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import struct
 from collections.abc import Sequence
 from pathlib import Path
@@ -239,6 +240,33 @@ def test_the_whole_course_counts_and_not_its_end(good: FlightData, off_m: float)
     assert error is not None and (C.OFF_TRACK in found.causes) == bool(off_m)
     assert error.worst_m == pytest.approx(position_error_m(moved)[steps.t_s >= 5.0].max()) or not off_m
     assert not off_m or 5.0 < error.worst_s < 9.0
+
+
+@pytest.mark.parametrize(
+    ("beyond_mps", "steps", "found"), [(0.04, 2, False), (0.2, 2, True), (0.04, 30, True), (math.nan, 1, True)]
+)
+def test_a_speed_slightly_beyond_its_limit_for_a_moment_is_as_promised(
+    good: FlightData, beyond_mps: float, steps: int, found: bool
+) -> None:
+    flown = good.steps
+    state, index = flown.state.copy(), good.design.velocity_index[0]
+    limit_mps = float(good.design.state_box.upper[index])
+    state[20 : 20 + steps, index] = limit_mps + beyond_mps
+    moved = dataclasses.replace(good)
+    moved.__dict__["steps"] = dataclasses.replace(flown, state=state)
+    assert (C.BEYOND_LIMIT in head(moved).causes) == found
+
+
+@pytest.mark.parametrize(("beyond_m", "cause"), [(0.01, C.ALL_WELL), (0.03, C.TOUCHED_LIMIT), (0.2, C.LEFT_LIMITS)])
+def test_a_wall_that_is_passed_by_less_than_a_position_is_off_is_no_headline(
+    good: FlightData, beyond_m: float, cause: HeadlineCause
+) -> None:
+    wall_m = float(good.design.state_box.upper[good.design.position_index[0]])
+    truths = list(good.truths)
+    middle = len(truths) // 2
+    _, *others = truths[middle].position_m
+    truths[middle] = msgspec.structs.replace(truths[middle], position_m=(wall_m + beyond_m, *others))
+    assert head(dataclasses.replace(good, truths=tuple(truths))).cause is cause
 
 
 def test_the_gravest_comes_first_and_within_a_rank_the_earliest(good: FlightData) -> None:
