@@ -58,6 +58,7 @@ from uavctl.records import ControlMode, Severity, number
 _C = HeadlineCause
 _LINK_OF_VEHICLE = "link vehicle: "  # begins what is told of the vehicle's connection
 _UNHEARD_S = 2.5  # a heartbeat comes each second
+_STALLED_S = 0.5  # between two ticks: the process stood still, and heard nothing
 _WRONG_M = 0.3  # between a position that was used and the true place: no noise of a camera
 _DRIFT_STEP_M = 0.1  # what a drifting source adds from one position to the next; a jump adds more
 _FEW = 0.05  # of positions, plans, or steps
@@ -192,7 +193,8 @@ def _lost(e: FlightEvidence) -> Iterator[Finding]:
     """Find a vehicle that was not heard, has started anew, or disarmed in flight; and a controller that failed."""
     flight, cause = e.flight, e.summary.ending.cause
     heard_s = flight.seconds([*(one.at_ns for one in flight.vehicles), flight.decisions[-1].at_ns])
-    gaps_s = np.diff(heard_s)
+    # A vehicle that is disarmed may be switched off.
+    gaps_s = np.diff(heard_s - _stalled_s(e, heard_s)) * [one.armed for one in flight.vehicles]
     end_s = float(heard_s[-1])
     if gaps_s.size and gaps_s.max() > _UNHEARD_S:
         begun_s, ended_s = (float(one) for one in heard_s[gaps_s.argmax() :][:2])
@@ -217,15 +219,23 @@ def _lost(e: FlightEvidence) -> Iterator[Finding]:
         yield Finding(_C.CONTROL_FAILED, at_s, f"{e.summary.ending.sentence.rstrip('.')}, at {seconds(at_s)}")
 
 
+def _stalled_s(e: FlightEvidence, at_s: Floats) -> Floats:
+    """Return for how long until each time (n,) we did not run [s]: what came then was heard later, all at once."""
+    ticks_s = e.flight.seconds([one.at_ns for one in e.flight.decisions])
+    pauses_s = np.diff(ticks_s)
+    return np.interp(at_s, ticks_s, np.append(0.0, np.cumsum(np.where(pauses_s > _STALLED_S, pauses_s, 0.0))))
+
+
 def _cut(e: FlightEvidence) -> Iterator[Finding]:
     """Find a recording that breaks off while the vehicle was flown, as one of a killed process does."""
     flight, last = e.flight, e.flight.decisions[-1]
     if not flight.breaks_off or flight.endings or flight.notes[-1].text.startswith(GOES_ON):
         return
-    down = bool(flight.vehicles) and (not flight.vehicles[-1].armed or flight.vehicles[-1].landed is True)
-    if last.mode is not ControlMode.WAIT and not down:
+    known = flight.vehicles[-1] if flight.vehicles else None
+    down = known is not None and (not known.armed or (known.landed is True and e.summary.steps > 0))
+    if (last.mode is not ControlMode.WAIT or known is not None) and not down:
         at_s = e.second(last.at_ns)
-        doing = "while it was flown" if last.mode in FLOWN else "before the vehicle was down"
+        doing = "while it was flown" if last.mode in FLOWN else "while the vehicle was armed"
         yield Finding(
             _C.RECORDING_CUT, at_s, f"at {seconds(at_s)}, {doing}: the process was killed, or the power failed"
         )

@@ -177,6 +177,28 @@ def test_a_killed_process_is_told_with_what_is_left(good: FlightData) -> None:
     assert head(cut).cause is C.RECORDING_CUT
 
 
+def test_a_process_that_is_killed_in_the_vehicles_own_climb_has_cut_the_recording(good: FlightData) -> None:
+    waited = tuple(msgspec.structs.replace(one, mode=ControlMode.WAIT) for one in good.decisions)
+    begun = RecorderNote(at_ns=good.origin_ns, text="begin", segment=1, written=0, dropped=0, refused=0, failures=0)
+    cut = dataclasses.replace(statuses(good, [4.1] * 12), decisions=waited, endings=(), notes=(begun,))
+    assert cut.breaks_off and head(cut).cause is C.RECORDING_CUT
+    down = tuple(msgspec.structs.replace(one, armed=False) for one in cut.vehicles)
+    assert C.RECORDING_CUT not in head(dataclasses.replace(cut, vehicles=down)).causes
+
+
+@pytest.mark.parametrize("ran", [True, False])
+def test_a_vehicle_is_not_silent_while_we_did_not_run(good: FlightData, ran: bool) -> None:
+    """Four seconds without a heartbeat, in which the process ran, or stood still."""
+    begun_ns, ended_ns = (good.origin_ns + n * SECOND for n in (4, 8))
+    plain = statuses(good, [4.1] * 12)
+    heard = tuple(one for one in plain.vehicles if not begun_ns < one.at_ns < ended_ns)
+    ticks = tuple(one for one in good.decisions if ran or not begun_ns < one.at_ns < ended_ns)
+    found = head(dataclasses.replace(plain, vehicles=heard, decisions=ticks))
+    assert (C.VEHICLE_SILENT in found.causes) == ran
+    off = tuple(msgspec.structs.replace(one, armed=False) for one in heard)
+    assert C.VEHICLE_SILENT not in head(dataclasses.replace(plain, vehicles=off)).causes
+
+
 @pytest.mark.parametrize(
     ("code", "cause"),
     [
