@@ -223,7 +223,8 @@ def _stalled_s(e: FlightEvidence, at_s: Floats) -> Floats:
     """Return for how long until each time (n,) we did not run [s]: what came then was heard later, all at once."""
     ticks_s = e.flight.seconds([one.at_ns for one in e.flight.decisions])
     pauses_s = np.diff(ticks_s)
-    return np.interp(at_s, ticks_s, np.append(0.0, np.cumsum(np.where(pauses_s > _STALLED_S, pauses_s, 0.0))))
+    stalled_s = np.append(0.0, np.cumsum(np.where(pauses_s > _STALLED_S, pauses_s, 0.0)))
+    return np.asarray(np.interp(at_s, ticks_s, stalled_s), dtype=np.float64)
 
 
 def _cut(e: FlightEvidence) -> Iterator[Finding]:
