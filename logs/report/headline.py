@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from logs.recording.design_view import Floats
 from logs.recording.flight import FLOWN, FlightData
 from logs.recording.reader import read
 from logs.recording.summary import (
@@ -19,6 +20,7 @@ from logs.recording.summary import (
     box_at,
     count,
     input_outside,
+    limits_at,
     position_error_m,
     state_outside,
     summarise,
@@ -41,7 +43,7 @@ from logs.report.causes import (
 from logs.report.evidence import FlightEvidence
 from logs.report.excursion import GRAVE_M, Excursion
 from logs.report.reasons import reasons
-from logs.report.verdicts import Judged, judge
+from logs.report.verdicts import Flags, Judged, judge
 from uavctl.errors import RecordingError
 from uavctl.flight.envelope import OF_POSITIONS
 from uavctl.flight.estimator import DUPLICATE, TOO_OLD
@@ -56,14 +58,17 @@ from uavctl.records import ControlMode, Severity, number
 _C = HeadlineCause
 _LINK_OF_VEHICLE = "link vehicle: "  # begins what is told of the vehicle's connection
 _UNHEARD_S = 2.5  # a heartbeat comes each second
+_STALLED_S = 0.5  # between two ticks: the process stood still, and heard nothing
 _WRONG_M = 0.3  # between a position that was used and the true place: no noise of a camera
 _DRIFT_STEP_M = 0.1  # what a drifting source adds from one position to the next; a jump adds more
-_FEW = 0.05  # of positions, or plans
+_FEW = 0.05  # of positions, plans, or steps
 _FEW_FROZEN = 3  # positions; some sources send each value twice
 _UNUSABLE = 0.2  # of positions: more than come out of order, or twice, on any link
 _OFF_SHARE = 0.5  # of the radius of arrival: root mean square distance that a mission of places may have on average
 _BEGUN_S = 1.0  # it is still about where it began
 _ARRIVED_SHARE = 0.1  # distance from the target at the end, of that at the beginning
+_SLIGHT_M = 0.02  # beyond a wall: no more than what a camera and the estimator are off by
+_SLIGHT = 0.05  # beyond a limit, of that limit: 7 cm/s of 1.5 m/s
 _PUSHED_S = 1.0  # with a bias at its bound: shorter ones are gusts
 _RELAY_S = 2.0  # without a position passed on: vehicles' estimators give up after 5 to 7 s
 
@@ -163,9 +168,10 @@ def _battery(e: FlightEvidence) -> Iterator[Finding]:
 def _excursion(e: FlightEvidence) -> Iterator[Finding]:
     """Find where it left the limits of its position."""
     for worst in e.excursions[:1]:
-        grave = worst.beyond_m >= GRAVE_M
+        if worst.beyond_m <= _SLIGHT_M:
+            return
+        cause = _C.LEFT_LIMITS if worst.beyond_m >= GRAVE_M else _C.TOUCHED_LIMIT
         text = f"went {metres(worst.beyond_m)} {worst.passage} at {seconds(worst.worst_s)}{_how(e, worst)}"
-        cause = _C.LEFT_LIMITS if grave else _C.TOUCHED_LIMIT
         yield Finding(cause, worst.left_s, f"{text}{_seen(e, worst.worst_s)}", worst.worst_s)
 
 
@@ -187,7 +193,8 @@ def _lost(e: FlightEvidence) -> Iterator[Finding]:
     """Find a vehicle that was not heard, has started anew, or disarmed in flight; and a controller that failed."""
     flight, cause = e.flight, e.summary.ending.cause
     heard_s = flight.seconds([*(one.at_ns for one in flight.vehicles), flight.decisions[-1].at_ns])
-    gaps_s = np.diff(heard_s)
+    # A vehicle that is disarmed may be switched off.
+    gaps_s = np.diff(heard_s - _stalled_s(e, heard_s)) * [one.armed for one in flight.vehicles]
     end_s = float(heard_s[-1])
     if gaps_s.size and gaps_s.max() > _UNHEARD_S:
         begun_s, ended_s = (float(one) for one in heard_s[gaps_s.argmax() :][:2])
@@ -212,15 +219,24 @@ def _lost(e: FlightEvidence) -> Iterator[Finding]:
         yield Finding(_C.CONTROL_FAILED, at_s, f"{e.summary.ending.sentence.rstrip('.')}, at {seconds(at_s)}")
 
 
+def _stalled_s(e: FlightEvidence, at_s: Floats) -> Floats:
+    """Return for how long until each time (n,) we did not run [s]: what came then was heard later, all at once."""
+    ticks_s = e.flight.seconds([one.at_ns for one in e.flight.decisions])
+    pauses_s = np.diff(ticks_s)
+    stalled_s = np.append(0.0, np.cumsum(np.where(pauses_s > _STALLED_S, pauses_s, 0.0)))
+    return np.asarray(np.interp(at_s, ticks_s, stalled_s), dtype=np.float64)
+
+
 def _cut(e: FlightEvidence) -> Iterator[Finding]:
     """Find a recording that breaks off while the vehicle was flown, as one of a killed process does."""
     flight, last = e.flight, e.flight.decisions[-1]
     if not flight.breaks_off or flight.endings or flight.notes[-1].text.startswith(GOES_ON):
         return
-    down = bool(flight.vehicles) and (not flight.vehicles[-1].armed or flight.vehicles[-1].landed is True)
-    if last.mode is not ControlMode.WAIT and not down:
+    known = flight.vehicles[-1] if flight.vehicles else None
+    down = known is not None and (not known.armed or (known.landed is True and e.summary.steps > 0))
+    if (last.mode is not ControlMode.WAIT or known is not None) and not down:
         at_s = e.second(last.at_ns)
-        doing = "while it was flown" if last.mode in FLOWN else "before the vehicle was down"
+        doing = "while it was flown" if last.mode in FLOWN else "while the vehicle was armed"
         yield Finding(
             _C.RECORDING_CUT, at_s, f"at {seconds(at_s)}, {doing}: the process was killed, or the power failed"
         )
@@ -449,25 +465,45 @@ def _ended_s(e: FlightEvidence) -> float | None:
 
 
 def _limits(e: FlightEvidence) -> Iterator[Finding]:
-    """Find states and inputs beyond limits that are not those of the position."""
-    s, flight = e.summary, e.flight
-    if s.state_violations and not e.excursions:
-        outside = state_outside(flight)
-        states, t_s = flight.steps.state[outside], flight.steps.t_s[outside]
-        lower, upper = box_at(flight, t_s)
-        beyond = np.nan_to_num(np.maximum(lower - states, states - upper), nan=0.0, neginf=0.0, posinf=0.0)
-        row, index = (int(one) for one in np.unravel_index(int(beyond.argmax()), beyond.shape))
-        at_s, text = float(t_s[0]), f"{len(t_s)} of {count(len(flight.steps), 'step')} outside"
-        if beyond[row, index] > 0.0:
-            design, at_s = flight.design, float(t_s[row])
-            unit = " m/s" if index in design.velocity_index else " m" if index in design.position_index else ""
-            most = f"{beyond[row, index]:.2g}{unit} beyond the limit of {design.state_name(index)}"
-            text = f"{most} at {seconds(at_s)} ({text})"
+    """Find states and inputs beyond limits that are not those of the position.
+
+    A plan keeps its limits with a probability. So a few steps that are slightly outside are as planned; the verdict on
+    the risk judges the promise.
+    """
+    flight, design, steps = e.flight, e.flight.design, e.flight.steps
+    normals, limits = np.array(design.c_x).reshape(-1, len(design.q_x)), limits_at(flight, steps.t_s)
+    others = np.flatnonzero((np.delete(normals, design.position_index, axis=1) != 0.0).any(axis=1))
+    beyond = (steps.state @ normals.T - limits)[:, others]
+    outside = state_outside(flight) & ~(beyond <= 0.0).all(axis=1)
+    if _matters(beyond, limits[:, others], outside):
+        at_s, text = float(steps.t_s[outside][0]), f"{outside.sum()} of {count(len(steps), 'step')} outside"
+        row, worst = np.unravel_index(int(np.nan_to_num(beyond, nan=-np.inf).argmax()), beyond.shape)
+        if beyond[row, worst] > 0.0:
+            index = int(np.abs(normals[others[worst]]).argmax())
+            at_s, most = float(steps.t_s[row]), float(beyond[row, worst] / np.abs(normals[others[worst], index]))
+            unit = " m/s" if index in design.velocity_index else ""
+            text = f"{most:.2g}{unit} beyond the limit of {design.state_name(index)} at {seconds(at_s)} ({text})"
         yield Finding(_C.BEYOND_LIMIT, at_s, text)
-    if s.input_violations:
-        at_s = float(flight.steps.t_s[input_outside(flight)][0])
-        text = f"an input was beyond its limits at {count(s.input_violations, 'step')}, first at {seconds(at_s)}"
+    outside = input_outside(flight)
+    given = np.fmax(steps.decided, steps.input), np.fmin(steps.decided, steps.input)
+    normals, bounds = np.array(design.c_u).reshape(-1, len(design.q_u)), np.array(design.b_u)
+    beyond = np.maximum(*(one @ normals.T - bounds for one in given))
+    if _matters(beyond, bounds, outside):
+        at_s = float(steps.t_s[outside][0])
+        text = f"an input was beyond its limits at {count(int(outside.sum()), 'step')}, first at {seconds(at_s)}"
         yield Finding(_C.BEYOND_LIMIT, at_s, text)
+
+
+def _matters(beyond: Floats, limits: Floats, outside: Flags) -> bool:
+    """Return whether more than a few steps are outside, or one is by more than slightly.
+
+    Args:
+        beyond: Of each step, by how much beyond each limit (n, rows); NaN where it is unknown.
+        limits: (n, rows) or (rows,).
+        outside: Which steps count (n,).
+    """
+    slight = (beyond[outside] <= np.broadcast_to(_SLIGHT * np.abs(limits), beyond.shape)[outside]).all()
+    return bool(outside.any() and (outside.mean() > _FEW or not slight))
 
 
 def _fell_back(e: FlightEvidence) -> Iterator[Finding]:

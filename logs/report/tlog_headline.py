@@ -28,6 +28,7 @@ from logs.report.causes import (
     seconds,
 )
 from uavctl.mavlink.profile import PROFILES
+from uavctl.records import number
 
 _C = HeadlineCause
 _GRAVE = ("emergency", "alert", "critical", "error")  # of MAV_SEVERITY
@@ -108,7 +109,7 @@ def _nothing_found(armed: ArmedFlight) -> Finding:
     flight = armed.flight
     texts = [f"armed for {seconds(sum(end - begin for begin, end in armed.spans))}"]
     if flight.sent:
-        texts.append(f"no position was missing for longer than {seconds(_silence(armed)[0])}")
+        texts.append(f"no position was missing for longer than {number(_silence(armed)[0], 2)} s")
         apart_m, apart_s, _ = _apart(armed)
         if np.isfinite(apart_s):
             texts.append(f"its own kept within {metres(apart_m)} of them")

@@ -1,5 +1,6 @@
-// Zoom and pan. Drawings over time share one span of time; all others move within their frame. The wheel or two fingers
-// zoom, dragging pans, a double click shows all again. Only x is stretched over time, so strokes keep their width.
+// Zoom and pan. Drawings over time share one span of time; all others move within their frame. The wheel with Ctrl (as a
+// pinch on a touch pad sends it), the wheel after a click, or two fingers zoom. Dragging pans, a double click shows all
+// again. Only x is stretched over time, so strokes keep their width.
 (() => {
   const LEAST = 1 / 500; // of a drawing's own span
   const timed = [];
@@ -112,16 +113,23 @@
       return [now.x + (event.clientX - box.left) * scale(), now.y + (event.clientY - box.top) * scale()];
     };
     const fingers = new Map();
-    let moved = 0;
+    let moved = 0, clicked = false;
+    const hint = shown => svg.parentNode.classList.toggle("hint", shown);
     svg.addEventListener("wheel", event => {
+      const zooms = clicked || event.ctrlKey || event.metaKey;
+      hint(!zooms);
+      if (!zooms) return; // the wheel scrolls the page
       event.preventDefault();
       const [x, y] = onto(event);
       view.zoom(x, Math.exp(-event.deltaY / 400), y);
     }, {passive: false});
+    svg.addEventListener("pointerleave", () => { clicked = false; hint(false); });
     svg.addEventListener("dblclick", () => view.reset());
     svg.addEventListener("pointerdown", event => {
       fingers.set(event.pointerId, event);
       moved = 0;
+      clicked = true;
+      hint(false);
     });
     svg.addEventListener("pointermove", event => {
       const before = fingers.get(event.pointerId);

@@ -258,12 +258,38 @@ SPANS = "[...document.querySelectorAll('svg[data-time]')].map(one => one.view)"
 SETTLED = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))"
 
 
+CTRL = 2  # of `modifiers`
+
+
+def wheel(window: Browser, x: float, y: float, **more: object) -> None:
+    mouse(window, "mouseWheel", x, y, deltaX=0, deltaY=-400, **more)
+    window.call("Runtime.evaluate", expression=SETTLED, awaitPromise=True)
+
+
+def test_the_wheel_alone_scrolls_and_zooms_after_a_click(window: Browser, page: Path) -> None:
+    window.open(page, 1400)
+    whole = told(window, SPANS)
+    x, y = middle(window, "state-0")
+    hint = "document.querySelector('#state-0').classList.contains('hint')"
+    wheel(window, x, y)
+    assert told(window, SPANS) == whole and told(window, hint)
+    x, y = middle(window, "state-0")
+    for kind in ("mousePressed", "mouseReleased"):
+        mouse(window, kind, x, y, button="left", clickCount=1)
+    wheel(window, x, y)
+    assert told(window, SPANS) != whole and not told(window, hint)
+    mouse(window, "mouseMoved", 2, 2)
+    x, y = middle(window, "state-1")
+    zoomed = told(window, SPANS)
+    wheel(window, x, y)
+    assert told(window, SPANS) == zoomed  # a click counts for its drawing, as long as the pointer stays in it
+
+
 def test_the_wheel_zooms_all_of_time_dragging_pans_and_a_double_click_resets(window: Browser, page: Path) -> None:
     _, console = window.open(page, 1400)
     whole = told(window, SPANS)
     x, y = middle(window, "state-0")
-    mouse(window, "mouseWheel", x, y, deltaX=0, deltaY=-400)
-    window.call("Runtime.evaluate", expression=SETTLED, awaitPromise=True)
+    wheel(window, x, y, modifiers=CTRL)
     zoomed = told(window, SPANS)
     assert len(zoomed) > 10 and all(one == zoomed[0] for one in zoomed)
     (begin, end), (first, last) = zoomed[0], whole[0]
@@ -288,8 +314,7 @@ def test_a_path_zooms_within_its_frame(window: Browser, page: Path) -> None:
     view = "document.querySelector('#path-above svg').getAttribute('viewBox').split(' ').map(Number)"
     whole = told(window, view)
     x, y = middle(window, "path-above")
-    mouse(window, "mouseWheel", x, y, deltaX=0, deltaY=-400)
-    window.call("Runtime.evaluate", expression=SETTLED, awaitPromise=True)
+    wheel(window, x, y, modifiers=CTRL)
     zoomed = told(window, view)
     assert zoomed[2] < 0.6 * whole[2] and zoomed[2] / zoomed[3] == pytest.approx(whole[2] / whole[3])
     assert zoomed[0] + zoomed[2] / 2 == pytest.approx(whole[2] / 2, abs=1.0)

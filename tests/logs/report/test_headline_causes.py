@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import struct
 from collections.abc import Sequence
 from pathlib import Path
@@ -176,6 +177,28 @@ def test_a_killed_process_is_told_with_what_is_left(good: FlightData) -> None:
     assert head(cut).cause is C.RECORDING_CUT
 
 
+def test_a_process_that_is_killed_in_the_vehicles_own_climb_has_cut_the_recording(good: FlightData) -> None:
+    waited = tuple(msgspec.structs.replace(one, mode=ControlMode.WAIT) for one in good.decisions)
+    begun = RecorderNote(at_ns=good.origin_ns, text="begin", segment=1, written=0, dropped=0, refused=0, failures=0)
+    cut = dataclasses.replace(statuses(good, [4.1] * 12), decisions=waited, endings=(), notes=(begun,))
+    assert cut.breaks_off and head(cut).cause is C.RECORDING_CUT
+    down = tuple(msgspec.structs.replace(one, armed=False) for one in cut.vehicles)
+    assert C.RECORDING_CUT not in head(dataclasses.replace(cut, vehicles=down)).causes
+
+
+@pytest.mark.parametrize("ran", [True, False])
+def test_a_vehicle_is_not_silent_while_we_did_not_run(good: FlightData, ran: bool) -> None:
+    """Four seconds without a heartbeat, in which the process ran, or stood still."""
+    begun_ns, ended_ns = (good.origin_ns + n * SECOND for n in (4, 8))
+    plain = statuses(good, [4.1] * 12)
+    heard = tuple(one for one in plain.vehicles if not begun_ns < one.at_ns < ended_ns)
+    ticks = tuple(one for one in good.decisions if ran or not begun_ns < one.at_ns < ended_ns)
+    found = head(dataclasses.replace(plain, vehicles=heard, decisions=ticks))
+    assert (C.VEHICLE_SILENT in found.causes) == ran
+    off = tuple(msgspec.structs.replace(one, armed=False) for one in heard)
+    assert C.VEHICLE_SILENT not in head(dataclasses.replace(plain, vehicles=off)).causes
+
+
 @pytest.mark.parametrize(
     ("code", "cause"),
     [
@@ -239,6 +262,33 @@ def test_the_whole_course_counts_and_not_its_end(good: FlightData, off_m: float)
     assert error is not None and (C.OFF_TRACK in found.causes) == bool(off_m)
     assert error.worst_m == pytest.approx(position_error_m(moved)[steps.t_s >= 5.0].max()) or not off_m
     assert not off_m or 5.0 < error.worst_s < 9.0
+
+
+@pytest.mark.parametrize(
+    ("beyond_mps", "steps", "found"), [(0.04, 2, False), (0.2, 2, True), (0.04, 30, True), (math.nan, 1, True)]
+)
+def test_a_speed_slightly_beyond_its_limit_for_a_moment_is_as_promised(
+    good: FlightData, beyond_mps: float, steps: int, found: bool
+) -> None:
+    flown = good.steps
+    state, index = flown.state.copy(), good.design.velocity_index[0]
+    limit_mps = float(good.design.state_box.upper[index])
+    state[20 : 20 + steps, index] = limit_mps + beyond_mps
+    moved = dataclasses.replace(good)
+    moved.__dict__["steps"] = dataclasses.replace(flown, state=state)
+    assert (C.BEYOND_LIMIT in head(moved).causes) == found
+
+
+@pytest.mark.parametrize(("beyond_m", "cause"), [(0.01, C.ALL_WELL), (0.03, C.TOUCHED_LIMIT), (0.2, C.LEFT_LIMITS)])
+def test_a_wall_that_is_passed_by_less_than_a_position_is_off_is_no_headline(
+    good: FlightData, beyond_m: float, cause: HeadlineCause
+) -> None:
+    wall_m = float(good.design.state_box.upper[good.design.position_index[0]])
+    truths = list(good.truths)
+    middle = len(truths) // 2
+    _, *others = truths[middle].position_m
+    truths[middle] = msgspec.structs.replace(truths[middle], position_m=(wall_m + beyond_m, *others))
+    assert head(dataclasses.replace(good, truths=tuple(truths))).cause is cause
 
 
 def test_the_gravest_comes_first_and_within_a_rank_the_earliest(good: FlightData) -> None:
