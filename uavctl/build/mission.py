@@ -80,29 +80,36 @@ def build_trajectory(given: TrajectoryConfig, design: AnyDesign, rests: Array, d
     Raises:
         DesignError: The motion leaves the state limits.
     """
-    plant = design.plant
-    times_s, places = np.array(given.times_s), np.array(given.positions_m)
-    last_s = plant.dt_s * np.ceil(times_s[-1] / plant.dt_s - _ROUNDING)
-    grid_s = dead_s + plant.dt_s * np.arange(round(last_s / plant.dt_s) + design.horizon + 1)
+    positions, velocities = wanted_positions(given, design, dead_s)
+    motion = follow(design.plant, positions, velocities)
+    _check_limits(motion, design)
+    places = resting_places(design.plant, design.state_set, rests)
+    return along(design.plant, motion, design.horizon, design.settles, *places)
+
+
+def wanted_positions(given: TrajectoryConfig, design: AnyDesign, dead_s: float) -> tuple[Array, Array | None]:
+    """Return positions (n, 3) [m] and velocities (n, 3) [m/s] of a trajectory each Δt, a horizon of rest at its end.
+
+    A line between samples has no velocities: None.
+    """
+    dt_s, times_s, places = design.plant.dt_s, np.array(given.times_s), np.array(given.positions_m)
+    last_s = dt_s * np.ceil(times_s[-1] / dt_s - _ROUNDING)
+    grid_s = dead_s + dt_s * np.arange(round(last_s / dt_s) + design.horizon + 1)
     within_s = np.clip(grid_s, times_s[0], times_s[-1])
     moves = ((grid_s >= times_s[0]) & (grid_s < times_s[-1]))[:, None]
     if given.interpolation == "linear":
-        positions = np.column_stack([np.interp(within_s, times_s, column) for column in places.T])
-        motion = follow(plant, positions, None)
-    else:
-        from scipy.interpolate import (
-            CubicHermiteSpline,  # takes long to load, and few flights need it
-            CubicSpline,  # takes long to load, and few flights need it
-        )
+        return np.column_stack([np.interp(within_s, times_s, column) for column in places.T]), None
+    from scipy.interpolate import (
+        CubicHermiteSpline,  # takes long to load, and few flights need it
+        CubicSpline,  # takes long to load, and few flights need it
+    )
 
-        spline = (
-            CubicHermiteSpline(times_s, places, np.array(given.velocities_mps))
-            if given.velocities_mps
-            else CubicSpline(times_s, places)
-        )
-        motion = follow(plant, spline(within_s), spline(within_s, nu=1) * moves)
-    _check_limits(motion, design)
-    return along(plant, motion, design.horizon, design.settles, *resting_places(design.plant, design.state_set, rests))
+    spline = (
+        CubicHermiteSpline(times_s, places, np.array(given.velocities_mps))
+        if given.velocities_mps
+        else CubicSpline(times_s, places)
+    )
+    return spline(within_s), spline(within_s, nu=1) * moves
 
 
 def build_rests(design: Design) -> Array:

@@ -17,6 +17,8 @@ from rich.text import Text
 
 from logs.recording.parameters import ParameterReader, told_records
 from logs.recording.topics import PARAMETER
+from uavctl.build.controller import Prepared, build_controller, design_of
+from uavctl.build.rehearsal import rehearse
 from uavctl.build.rest import check_axes
 from uavctl.check.findings import Item, ItemState, describe, item, judged, refusals
 from uavctl.check.preflight import Preflight
@@ -31,6 +33,7 @@ from uavctl.io.signed_connection import connected
 from uavctl.io.transport import wait
 from uavctl.loop import make_links
 from uavctl.records import Checked, Datagram, Sink
+from uavctl.smpc.conditioned.planner import ConditionedDesign
 
 # A check on real connections, bounded in time: what `uavctl check` runs, and `uavctl fly --arm` before it arms.
 
@@ -108,11 +111,13 @@ def checked_before_arming(
     stop: Callable[[], bool],
     take_off_m: float,
     told: ParameterReader,
+    planned: tuple[Item, ...] = (),
 ) -> tuple[Item, ...]:
     """Check vehicle and cameras for `check.seconds`, before a climb of `take_off_m` [m]; report what is not good.
 
     Args:
         told: takes the vehicle's parameters, for the recording that begins afterwards.
+        planned: items on the configuration, see `mission_items`.
 
     Returns:
         All items; none of them forbids arming.
@@ -121,7 +126,8 @@ def checked_before_arming(
         NotReadyError: an item forbids arming.
     """
     messages().print(f"checking for {config.check.seconds:g} s before arming", soft_wrap=True)
-    items = run_preflight(config, connections, config.check.seconds, take_off_m=take_off_m, stop=stop, told=told)
+    heard = run_preflight(config, connections, config.check.seconds, take_off_m=take_off_m, stop=stop, told=told)
+    items = (*planned, *heard)
     against = refusals(items, config.check)
     if against:
         raise NotReadyError("\n".join(("not armed, as the check before it failed:", *map(describe, against))))
@@ -189,7 +195,7 @@ def check(
     config = loaded.config
     with located(loaded):
         check_axes(config)
-    items = [*disk_items(out, config.log.free_bytes)]
+        items = [*mission_items(config), *disk_items(out, config.log.free_bytes)]
     items.append(_strangers(warnings(config.security, config.daemon)))
 
     def prompt(text: str) -> None:
@@ -206,6 +212,27 @@ def check(
     report = Report(ok=not refusals(items, config.check), items=tuple(items))
     common.show("check", report, lambda: Findings(report, config.check))
     return 0 if report.ok else 1
+
+
+def mission_items(config: Config, prepared: Prepared | None = None) -> tuple[Item, ...]:
+    """Rehearse the mission on the model; none with the paper's scheme, nor with a controller of another package.
+
+    Args:
+        prepared: The controller, if it is there already.
+
+    Raises:
+        DesignError: There is no controller of this configuration.
+    """
+    if not config.conditioned or config.smpc.controller:
+        return ()
+    design = design_of(config) if prepared is None else prepared.design
+    controller = build_controller(config, design) if prepared is None else prepared.controller
+    assert isinstance(design, ConditionedDesign)
+    found = rehearse(config, design, controller)
+    state = ItemState.BAD if found.relaxes or found.strays else ItemState.NOTE if found.saturates else ItemState.GOOD
+    value = ". ".join(found.sentences) or f"{found.seconds:g} s rehearsed, {found.relaxed:.0%} of the plans relax"
+    want = "plans keep their constraints, and the trajectory to mission.accept_m"
+    return (item("mission", state, value, want, found.hint),)
 
 
 def disk_items(folder: Path, free_bytes: int) -> list[Item]:

@@ -15,9 +15,18 @@ from numpy.typing import NDArray
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from uavctl.build.controller import build_conditioned, build_design, build_solver, build_spec, design_of, start_state
+from uavctl.build.controller import (
+    build_conditioned,
+    build_controller,
+    build_design,
+    build_solver,
+    build_spec,
+    design_of,
+    start_state,
+)
 from uavctl.build.library import StoredLibrary
 from uavctl.build.mission import build_names
+from uavctl.build.rehearsal import Rehearsal, rehearse
 from uavctl.cli.common import DEFAULTS, Column, Common, WideTable, bars, columns, located
 from uavctl.cli.prepare import ready_library
 from uavctl.config import Config
@@ -129,9 +138,14 @@ def design(
     if loaded.config.conditioned:
         with located(loaded):
             conditioned = build_conditioned(loaded.config)
-        figures = {**conditioned_record(conditioned), "wall_s": time.perf_counter() - start}
-        common.show("design/conditioned", figures, lambda: conditioned_picture(conditioned, loaded.config.name))
-        return 0
+            found = rehearsed(loaded.config, conditioned)
+        figures = {
+            **conditioned_record(conditioned),
+            "rehearsal": msgspec.to_builtins(found),
+            "wall_s": time.perf_counter() - start,
+        }
+        common.show("design/conditioned", figures, lambda: conditioned_picture(conditioned, loaded.config.name, found))
+        return 1 if found is not None and (found.relaxes or found.strays) else 0
     with located(loaded):
         made = build_design(loaded.config)
         stored = ready_library(loaded.config, made)
@@ -140,8 +154,19 @@ def design(
     return 0
 
 
-def conditioned_picture(made: ConditionedDesign, name: str) -> RenderableType:
-    """Return tables of ages with their risk, and of where a plan may rest."""
+def rehearsed(config: Config, made: ConditionedDesign) -> Rehearsal | None:
+    """Rehearse the mission; None for a plant without axes, or where a controller of another package flies.
+
+    Raises:
+        DesignError: The mission cannot be flown.
+    """
+    if not config.plant.axes or config.smpc.controller:
+        return None
+    return rehearse(config, made, build_controller(config, made))
+
+
+def conditioned_picture(made: ConditionedDesign, name: str, found: Rehearsal | None = None) -> RenderableType:
+    """Return tables of ages with their risk, and of where a plan may rest; and what is wrong with the mission."""
     title = f"Risk by the age of information, design {made.design_id} of {name}"
     ages = columns(title, ("age [steps]", "probability", "may be outside", "far from limits"), (), ())
     risk, transit, problem = made.solver.risk, made.solver.risk_in_transit, made.solver.problem
@@ -163,7 +188,9 @@ def conditioned_picture(made: ConditionedDesign, name: str) -> RenderableType:
         for (row, unit, _), size, side, rest in zip(names.rows, sizes, problem.state_set.b, made.rests, strict=True)
     )
     headings = ("limit", "at", "rests up to", "unit")
-    return Group(ages, columns("Where a plan may rest", headings, rows, ("limit", "unit")))
+    wrong = [] if found is None or not found.sentences else [*found.sentences, found.hint]
+    doubts = [Text(f"{one[:1].upper()}{one[1:]}.", style="bold yellow") for one in wrong]
+    return Group(ages, columns("Where a plan may rest", headings, rows, ("limit", "unit")), *doubts)
 
 
 def design_document(made: Design, stored: StoredLibrary | None, wall_s: float) -> dict[str, object]:

@@ -233,8 +233,9 @@ def fly_daemon(
             check_places(config, design, take_off_m, engagement.goal)
             prepared = prepare(config, design)
         # an eighth of what loading `fly` would take
-        from uavctl.cli.check import checked_before_arming, record_items, record_parameters
+        from uavctl.cli.check import checked_before_arming, mission_items, record_items, record_parameters
 
+        planned = () if take_off_m is None else mission_items(config, prepared)
         begun = time.perf_counter()
         with (
             as_realtime(as_realtime_process) as collect,
@@ -244,7 +245,7 @@ def fly_daemon(
             checked: tuple[Item, ...] = ()
             told = ParameterReader()
             if take_off_m is not None:
-                checked = checked_before_arming(config, connections, stopped, take_off_m, told)
+                checked = checked_before_arming(config, connections, stopped, take_off_m, told, planned)
             recorder = Recorder(path, config.log, onlookers=looking)
             loop = ControlLoop(config, prepared.controller, recorder, time.perf_counter_ns)
             engagement.begin(loop)

@@ -24,10 +24,13 @@ from uavctl.smpc.conditioned.planner import AnyDesign
 from uavctl.smpc.plant import AXES
 
 DOWN = 2
-RESERVE_M = 0.15  # between the fence's reserve and a waypoint: gusts, and what the model does not know yet
+RESERVE_M = 0.15  # between the fence's reserve and a waypoint: gusts
+# Share of the longest way that is kept as well: an unknown plant overshoots by more, the longer it has moved. A drag of
+# 1.0 1/s where 0.24 is assumed came within 0.07 m of the box without it.
+OVERSHOOT = 0.2
 LEAST_WAY_M = (0.6, 0.6, 0.4)  # between two waypoints; on a shorter one an axis hardly gets to move
 MOST_WAY_M = (2.4, 2.4, 1.2)  # a longer one takes time and tells no more
-STEPS = 4  # of each axis by itself
+SIZES = (0.5, 0.5, 1.0, 1.0)  # of the range, steps of each axis by itself: small ones first
 PAUSE_S = 0.5  # at a waypoint: the vehicle stops, and so its braking is seen
 HOLD_S = 20.0  # in the end, where it is seen how well the place is held
 SETTLES_S = 5.0  # of that, which does not count
@@ -146,14 +149,19 @@ def _sides(config: Config, design: AnyDesign, box: SafeBox) -> list[BoxAxis]:
         # What a plan that rests keeps from a wall it keeps from a fence, too.
         below = max(0.0, float(least[place]) - float(lower[axis])) + RESERVE_M
         above = max(0.0, float(upper[axis]) - float(most[place])) + RESERVE_M
-        if high - low < below + above + LEAST_WAY_M[axis]:
-            needed_m = math.ceil(100.0 * (below + above + LEAST_WAY_M[axis])) / 100.0
+        least_m = (1.0 + 2.0 * OVERSHOOT) * LEAST_WAY_M[axis]
+        if high - low < below + above + least_m:
+            needed_m = math.ceil(100.0 * (below + above + least_m)) / 100.0
             problems.append(
                 f"{name}: the box is {high - low:.2f} m long and must be at least {needed_m:.2f} m: "
-                f"{LEAST_WAY_M[axis]:g} m of way, {below:.2f} and {above:.2f} m that are kept from its sides"
+                f"{least_m:.2g} m of way and overshoot, {below:.2f} and {above:.2f} m that are kept from its sides"
             )
             continue
-        middle, half = (low + below + high - above) / 2.0, (high - above - low - below) / 2.0
+        # A step of `way` that overshoots by its share still ends as far inside: way + 2 OVERSHOOT way = room.
+        middle, half = (
+            (low + below + high - above) / 2.0,
+            (high - above - low - below) / (2.0 * (1.0 + 2.0 * OVERSHOOT)),
+        )
         half = min(half, MOST_WAY_M[axis] / 2.0)
         sides.append(BoxAxis(axis, middle - half, middle + half))
     if problems:
@@ -176,10 +184,15 @@ def _fenced(config: Config, lower: list[float], upper: list[float]) -> tuple[lis
 def _waypoints(sides: Sequence[BoxAxis], centre: Vec3) -> Iterator[Vec3]:
     """Return steps of each axis there and back, then of all axes together."""
     for side in sides:
-        for step in range(STEPS):
-            yield _moved(centre, [(side, step % 2 == 0)])
+        for step, size in enumerate(SIZES):
+            yield _moved(centre, [(_shrunk(side, size), step % 2 == 0)])
     for signs in ((1, 1, 1), (0, 0, 0), (1, 0, 1), (0, 1, 0), (1, 1, 0), (0, 0, 1)):
         yield _moved(centre, list(zip(sides, map(bool, signs), strict=True)))
+
+
+def _shrunk(side: BoxAxis, size: float) -> BoxAxis:
+    middle, half = 0.5 * (side.low_m + side.high_m), 0.5 * size * (side.high_m - side.low_m)
+    return BoxAxis(side.axis, middle - half, middle + half)
 
 
 def _moved(centre: Vec3, ends: Sequence[tuple[BoxAxis, bool]]) -> Vec3:

@@ -1,0 +1,67 @@
+"""Rehearsal of a mission on its own model: what it says before a flight is what a flight of the simulator shows."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+
+from sim.simulation import World
+from uavctl.build.controller import build_conditioned, build_controller
+from uavctl.build.rehearsal import Rehearsal, rehearse
+from uavctl.config import Config, load_config
+from uavctl.lab.trial import FlightTally, eight
+from uavctl.loop import ControlLoop
+
+BURSTS = ("link.model=gilbert-elliott", "link.loss=0.0", "link.burst_loss=1.0")
+LONG = (*BURSTS, "link.burst_enter=0.05", "link.burst_leave=0.1")  # a burst lasts half a second in the mean
+SHORT = (*BURSTS, "link.burst_enter=0.05", "link.burst_leave=0.5")
+
+
+def rehearsed(config: Config) -> Rehearsal:
+    design = build_conditioned(config)
+    return rehearse(config, design, build_controller(config, design))
+
+
+def flown(config: Config) -> float:
+    """Share of the plans of a simulated flight that relaxed a constraint."""
+    tally = FlightTally()
+    World(config, ControlLoop(config, build_controller(config), tally, lambda: 0)).run(config.duration_s)
+    return tally.gave_way / tally.plans
+
+
+def along_eight(preset: str, *overrides: str) -> Config:
+    config = load_config(preset, overrides)
+    replace = msgspec.structs.replace
+    return replace(config, mission=replace(config.mission, trajectory=eight()))
+
+
+def test_long_bursts_relax_most_plans_in_rehearsal_and_flight() -> None:
+    config = load_config("room", (*LONG, "duration_s=12"))
+    found = rehearsed(config)
+    assert found.relaxes
+    assert found.constraint.endswith("velocity")
+    assert found.relaxed == pytest.approx(flown(config), abs=0.15)
+    assert found.relaxed > 0.5
+
+
+@pytest.mark.parametrize("preset", ["room", "room-px4", "room-ardupilot"])
+@pytest.mark.parametrize("link", [(), SHORT])
+def test_presets_and_short_bursts_pass(preset: str, link: tuple[str, ...]) -> None:
+    found = rehearsed(load_config(preset, link))
+    assert not found.relaxes
+    assert not found.sentences
+    assert not found.hint
+
+
+def test_an_eight_that_the_inputs_do_not_allow_strays_by_its_figure() -> None:
+    wide, narrow = (
+        rehearsed(along_eight("room-px4", f"sets.input_lower=[-{m},-{m},-1.5]", f"sets.input_upper=[{m},{m},1.5]"))
+        for m in (4.0, 1.0)
+    )
+    assert not wide.strays
+    assert not wide.saturates
+    assert wide.tracking_max_m is not None and wide.tracking_max_m < 0.02
+    assert narrow.strays
+    assert narrow.saturates
+    assert narrow.left_mps2 == pytest.approx(0.4)  # less the 0.6 m/s² that are left to fly against wind
+    assert narrow.tracking_max_m is not None and narrow.tracking_max_m > narrow.accept_m

@@ -1,0 +1,183 @@
+"""Rehearsal of a mission before a flight: the closed loop of the plan's own model, without noise or disturbance.
+
+x(k+1) = A x(k) + B u(k), where u(k) is the first input of the plan from x(k). Each plan has the age of information that
+the configured link gives: the ages of all steps together have the link's long-run shares. So what goes wrong here is
+the configuration's fault alone: limits that leave a plan nothing, or a motion that needs more than the inputs.
+"""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from uavctl.build.controller import start_state
+from uavctl.build.mission import wanted_positions
+from uavctl.config.types import Config
+from uavctl.flight.controller import Controller
+from uavctl.flight.mission import Mission, advance, ask_for
+from uavctl.records import Vector
+from uavctl.smpc.answer import Preview
+from uavctl.smpc.conditioned.planner import ConditionedDesign
+from uavctl.smpc.plant import AXES
+
+Array = NDArray[np.float64]
+
+MOST_STEPS = 2400  # two minutes at steps of 0.05 s; a step takes milliseconds
+# Multiples of the golden ratio modulo 1 fill [0, 1) evenly in any number of steps (Weyl's equidistribution).
+_GOLDEN = 0.5 * (5.0**0.5 - 1.0)
+
+
+class Rehearsal(msgspec.Struct, frozen=True, kw_only=True):
+    """Outcome of a rehearsed mission; tracking figures are None where the mission has no trajectory."""
+
+    seconds: float  # that were rehearsed
+    plans: int
+    allowed: float  # 1 - delta_x: more relaxed plans than this are the configuration's fault
+    relaxed: float  # share of plans in which a constraint gave way
+    constraint: str  # that gave way most; empty where none did
+    unit: str  # of this constraint
+    amount: float  # by which it gave way at most
+    ahead_s: float  # stage of that plan, with the age of its information [s]
+    accept_m: float  # tracking error that is accepted
+    tracking_m: float | None = None  # distance from where the trajectory is at the time, mean
+    tracking_max_m: float | None = None
+    tracking_max_s: float | None = None  # time of the largest [s]
+    asked_mps2: float | None = None  # largest acceleration setpoint that the trajectory asks for, on the worst axis
+    asked_s: float | None = None  # its time
+    left_mps2: float | None = None  # that the inputs leave on this axis beside estimator.bias_max
+
+    @property
+    def relaxes(self) -> bool:
+        """Whether more plans relax a constraint than states may be outside of their limits."""
+        return self.relaxed > self.allowed
+
+    @property
+    def strays(self) -> bool:
+        """Whether the trajectory cannot be followed to the accepted distance."""
+        return self.tracking_max_m is not None and self.tracking_max_m > self.accept_m
+
+    @property
+    def saturates(self) -> bool:
+        """Whether the trajectory asks for more than the inputs leave."""
+        return self.asked_mps2 is not None and self.left_mps2 is not None and self.asked_mps2 > self.left_mps2
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What is wrong, in sentences with figures; empty where nothing is."""
+        found = []
+        if self.relaxes:
+            found.append(
+                f"{self.relaxed:.0%} of the plans relax a constraint without any disturbance ({self.allowed:.0%} may "
+                f"be outside): the {self.constraint} by up to {self.amount:.2g} {self.unit}".rstrip()
+                + f", for positions that are {self.ahead_s:.1f} s old"
+            )
+        if self.saturates:
+            found.append(
+                f"the trajectory asks for {self.asked_mps2:.1f} m/s² at {self.asked_s:.1f} s, the inputs leave "
+                f"{self.left_mps2:.1f} m/s²"
+            )
+        if self.strays or self.saturates:
+            found.append(
+                f"the model is up to {self.tracking_max_m:.2f} m from the trajectory ({self.tracking_m:.2f} m in the "
+                f"mean), mission.accept_m is {self.accept_m:g} m"
+            )
+        return tuple(found)
+
+    @property
+    def hint(self) -> str:
+        """What to do; empty where nothing is wrong."""
+        found = []
+        if self.relaxes:
+            found.append(
+                "the back-offs for old positions leave no room: improve the link, widen [sets], lower smpc.delta_x or "
+                "the plant's wind_std_mps2"
+            )
+        if self.strays or self.saturates:
+            found.append("fly the trajectory slower, or widen sets.input_* and limits.accel_mps2 if the vehicle can")
+        return "; ".join(found)
+
+
+def rehearse(config: Config, design: ConditionedDesign, controller: Controller) -> Rehearsal:
+    """Fly the mission on the plan's own model: a trajectory to its end, else `duration_s`."""
+    mission, plant, dt_ns = controller.mission, design.plant, controller.dt_ns
+    motion, index = mission.trajectory, list(plant.position_index)
+    x = _start(config, design, mission)
+    lates = _lates(config, design)
+    steps = min(MOST_STEPS, round(config.duration_s / plant.dt_s) if motion is None else len(motion.states))
+    sent, state = np.zeros(plant.n_u), None
+    worst, ahead_s, relaxed = ("", "", 0.0), 0.0, 0
+    passed: list[Array] = []
+    for k in range(steps):
+        state = advance(mission, state, _vector(x), k * dt_ns)
+        target, outlook = ask_for(mission, state, k * dt_ns)
+        late = int(lates[k])
+        ahead = Preview(limits=outlook.limits, path=outlook.path, late=late, cov=design.estimate_cov, sent=sent)
+        answer = design.solver.solve(k, x, target, ahead)
+        passed.append(x[index])
+        relaxed += bool(answer.gave_way)
+        for one in answer.gave_way:
+            name, unit, size = controller.names.rows[one.index] if one.constraint == "state" else ("slew", "m/s²", 1.0)
+            if one.amount / size > worst[2]:
+                worst, ahead_s = (name, unit, one.amount / size), (late + one.stage) * plant.dt_s
+        sent = answer.inputs[0] if len(answer.inputs) else sent
+        x = plant.a @ x + plant.b @ sent
+    found = Rehearsal(
+        seconds=round(len(passed) * plant.dt_s, 6),
+        plans=len(passed),
+        allowed=round(1.0 - config.smpc.delta_x, 9),
+        relaxed=relaxed / max(1, len(passed)),
+        constraint=worst[0],
+        unit=worst[1],
+        amount=worst[2],
+        ahead_s=ahead_s,
+        accept_m=config.mission.accept_m,
+    )
+    return found if motion is None else _tracked(found, config, design, mission, np.array(passed))
+
+
+def _tracked(found: Rehearsal, config: Config, design: ConditionedDesign, mission: Mission, passed: Array) -> Rehearsal:
+    """Return a rehearsal with the figures of its trajectory."""
+    assert mission.trajectory is not None
+    plant, motion = design.plant, mission.trajectory
+    wanted, _ = wanted_positions(config.mission.trajectory, design, config.plant.dead_time_s)
+    columns = [AXES.index(axis) for axis in plant.axes]
+    off = np.linalg.norm(passed - wanted[: len(passed), columns], axis=1)
+    low, high = (plant.accel_per_input * side for side in design.solver.problem.input_set.bounds)
+    asked = plant.accel_per_input * motion.path_inputs[:, 0]
+    left = np.where(asked < 0.0, -low, high)
+    step, axis = np.unravel_index(int((np.abs(asked) - left).argmax()), asked.shape)
+    return msgspec.structs.replace(
+        found,
+        tracking_m=float(off.mean()),
+        tracking_max_m=float(off.max()),
+        tracking_max_s=round(int(off.argmax()) * plant.dt_s, 6),
+        asked_mps2=float(abs(asked[step, axis])),
+        asked_s=round(int(step) * plant.dt_s, 6),
+        left_mps2=float(left[step, axis]),
+    )
+
+
+def _start(config: Config, design: ConditionedDesign, mission: Mission) -> Array:
+    """Return the state (n_x,) to begin with, at rest where a plan may rest."""
+    if mission.trajectory is not None:
+        return np.array(mission.trajectory.states[0])
+    begins = start_state(config, design.plant)
+    return np.array(begins if mission.room is None else mission.room.stopped(_vector(begins)))
+
+
+def _lates(config: Config, design: ConditionedDesign) -> NDArray[np.intp]:
+    """Return the age of the position that each plan is made from [steps].
+
+    With inertial data a plan is made in every step, so its position has any age of the link. Without them a plan is
+    made when a position comes, so it has the age that most positions have.
+    """
+    weights = design.solver.risk.weights
+    if not config.estimator.inertial_std_mps2:
+        return np.full(MOST_STEPS, int(weights.argmax()))
+    shares = np.cumsum(weights) / weights.sum()
+    return np.searchsorted(shares, (0.5 + _GOLDEN * np.arange(MOST_STEPS)) % 1.0)
+
+
+def _vector(x: Array) -> Vector:
+    return tuple(x.tolist())
