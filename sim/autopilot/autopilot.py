@@ -90,8 +90,8 @@ LOOK_NS = SECOND_NS // 10
 # ArduPilot: ten bad looks at 10 Hz before its estimator's failsafe acts, as recorded.
 EKF_CHECK_NS = SECOND_NS
 # Modes by GF_ACTION and FENCE_ACTION; the values that are not here only warn.
-PX4_FENCE_MODES = {2: "AUTO.LOITER", 3: "AUTO.RTL", 5: "AUTO.LAND"}
-ARDUPILOT_FENCE_MODES = {1: "RTL", 2: "LAND"}
+PX4_FENCE_MODES = {2.0: "AUTO.LOITER", 3.0: "AUTO.RTL", 5.0: "AUTO.LAND"}
+ARDUPILOT_FENCE_MODES = {1.0: "RTL", 2.0: "LAND"}
 
 
 class Failsafes:
