@@ -19,7 +19,7 @@ from sim.autopilot.commands import CommandRequest, Commands
 from sim.autopilot.estimator import Estimator
 from sim.autopilot.files import Files
 from sim.autopilot.inertial import ERRORS, InertialSensors
-from sim.autopilot.pilot import CRASHED, CRITICAL, WARNING, Phase, Pilot
+from sim.autopilot.pilot import CRASHED, CRITICAL, NOTICE, WARNING, Phase, Pilot
 from sim.autopilot.profile import (
     SIMULATED,
     Mode,
@@ -82,13 +82,16 @@ class Checks:
         return at_ns + round(1e9 * self._config.flicker_s * self._rng.exponential())
 
 
-# The vehicle's own failsafes, beside that on setpoints: position lost, battery low, ground station gone.
+# The vehicle's own failsafes, beside that on setpoints: position lost, fence, battery low, ground station gone.
 
 
 SECOND_NS = 1_000_000_000
 LOOK_NS = SECOND_NS // 10
 # ArduPilot: ten bad looks at 10 Hz before its estimator's failsafe acts, as recorded.
 EKF_CHECK_NS = SECOND_NS
+# Modes by GF_ACTION and FENCE_ACTION; the values that are not here only warn.
+PX4_FENCE_MODES = {2.0: "AUTO.LOITER", 3.0: "AUTO.RTL", 5.0: "AUTO.LAND"}
+ARDUPILOT_FENCE_MODES = {1.0: "RTL", 2.0: "LAND"}
 
 
 class Failsafes:
@@ -105,7 +108,7 @@ class Failsafes:
         clears: bool = False,
     ) -> None:
         self._px4 = kind.name == "px4"
-        self._mode = kind.by_role
+        self._mode, self._named = kind.by_role, kind.mode
         self._pilot = pilot
         self._parameters = parameters
         self._estimator = estimator
@@ -127,7 +130,7 @@ class Failsafes:
         """Look for the cause of a failsafe, if it is time."""
         if not self._pilot.armed:
             self._lost_ns = self._low_ns = self._meant = None
-            self._warned = False
+            self._warned = self._pilot.breaches = False
             return
         if self._look_ns > at_ns:
             return
@@ -136,6 +139,7 @@ class Failsafes:
             self._look_at_its_end(at_ns)
         if self._pilot.phase is not Phase.GROUND:
             self._look_at_position(at_ns)
+            self._look_at_fence(at_ns)
             self._look_at_battery(at_ns)
             self._look_at_station(at_ns)
 
@@ -158,15 +162,42 @@ class Failsafes:
             return
         first = self._lost_ns is None
         self._lost_ns = at_ns if self._lost_ns is None else self._lost_ns
-        if not self._pilot.mode.needs_position:
+        mode = self._pilot.mode
+        # As recorded: PX4's landing is content with a position that is not trusted. Without any it descends.
+        descends = self._px4 and not self._estimator.has_position
+        if not (mode.needs_position or (descends and mode is self._mode(Role.LAND))):
             return
         if self._px4:
-            self._meant = self._pilot.mode if self._clears else None
-            self._land(at_ns, "Failsafe activated")
+            self._meant = mode if self._clears else None
+            self._pilot.texts.append((CRITICAL, "Failsafe activated"))
+            self._pilot.fail(self._named("AUTO.DESCEND") if descends else self._mode(Role.LAND), at_ns)
         elif at_ns - self._lost_ns >= EKF_CHECK_NS and self._parameters["FS_EKF_ACTION"] == 1:
             self._land(at_ns, "EKF variance", "EKF Failsafe: changed to LAND Mode")
         elif first and self._parameters["FS_EKF_ACTION"] == 0:
             self._pilot.texts.append((CRITICAL, "EKF variance"))
+
+    def _look_at_fence(self, at_ns: int) -> None:
+        """Act as the vehicle first comes beyond the height of its fence; an ArduPilot's heartbeats show no failsafe."""
+        p, pilot = self._parameters, self._pilot
+        ceiling_m = p["GF_MAX_VER_DIST"] if self._px4 else p["FENCE_ALT_MAX"] * p["FENCE_ENABLE"]
+        action = p["GF_ACTION"] if self._px4 else p["FENCE_ACTION"]
+        before = pilot.breaches
+        pilot.breaches = 0.0 < ceiling_m < pilot.home_m[2] - self._estimator.position_m[2]
+        if not self._px4 and before and not pilot.breaches:
+            pilot.texts.append((NOTICE, "Fence breach cleared"))
+        if before or not pilot.breaches or (self._px4 and action == 0):
+            return
+        if self._px4:
+            pilot.texts.append((CRITICAL, "Geofence: exceeding maximum altitude above Home"))
+        else:
+            pilot.texts.append((NOTICE, "Max Alt fence breached"))
+        modes = PX4_FENCE_MODES if self._px4 else ARDUPILOT_FENCE_MODES
+        mode = self._named(modes[action]) if action in modes else None
+        if mode is None or pilot.mode.role is Role.LAND:
+            return
+        if self._px4:
+            pilot.texts.append((CRITICAL, "Failsafe activated"))
+        pilot.fail(mode if self._estimator.position_ok else self._mode(Role.LAND), at_ns, shown=self._px4)
 
     def _look_at_battery(self, at_ns: int) -> None:
         p = self._parameters

@@ -131,9 +131,14 @@ class Estimator:
         return self.uses_gps or self.origin or self._kind.name == "px4"
 
     @property
+    def has_position(self) -> bool:
+        """Whether there is a position, be it one that the vehicle does not trust."""
+        return self.uses_gps or (self._fusing and self._has_origin)
+
+    @property
     def position_ok(self) -> bool:
         """Whether the vehicle trusts its position."""
-        return self.valid and (self.uses_gps or (self._fusing and self._has_origin))
+        return self.valid and self.has_position
 
     @property
     def geographic(self) -> bool:

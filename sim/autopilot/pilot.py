@@ -142,7 +142,7 @@ TAKEOFF_DONE_M = 0.1
 PASSING = frozenset({Role.TAKEOFF, Role.LAND})  # modes that end by themselves
 LANDS = 4  # COM_OBL_RC_ACT; less leaves it to the stick
 CRASHED = "CRASHED"
-CRITICAL, WARNING, INFO = 2, 4, 6  # MAV_SEVERITY
+CRITICAL, WARNING, NOTICE, INFO = 2, 4, 5, 6  # MAV_SEVERITY
 SWITCH_US, SWITCH_STEP_US = 1000, 120  # of the switch of modes: before it was moved, and from mode to mode
 FORCED = 21196.0  # param2 of arming that skips the checks
 
@@ -166,6 +166,7 @@ class Pilot:
         texts: (severity, text) of what is to be said, in order; the caller empties it.
         crashed: why the autopilot's program died, None while it lives.
         failsafe: whether a failsafe chose the mode.
+        breaches: whether it is beyond its fence.
         radio: whether it hears a remote control.
         switch_us: where that one's switch of modes stands [µs].
         helm: knows which setpoint is flown.
@@ -203,7 +204,7 @@ class Pilot:
         self._returns = False  # whether setpoints that come again end the failsafe
         self.texts: list[tuple[int, str]] = []
         self.crashed: str | None = None
-        self.failsafe = False
+        self.failsafe = self.breaches = False
         self.armed = airborne
         self.phase = Phase.AIR if airborne else Phase.GROUND
         self.mode: Mode = kind.by_role(Role.EXTERNAL) if airborne else kind.mode(kind.ground)
@@ -354,12 +355,16 @@ class Pilot:
         self._enter(mode, at_ns)
         return ACCEPTED
 
-    def fail(self, mode: Mode, at_ns: int, *, returns: bool = False) -> None:
-        """Change the mode by a failsafe; with `returns`, setpoints that come again end it."""
+    def fail(self, mode: Mode, at_ns: int, *, returns: bool = False, shown: bool = True) -> None:
+        """Change the mode by a failsafe; with `returns`, setpoints that come again end it.
+
+        Args:
+            shown: heartbeats show it.
+        """
         meant = self._meant
         self._enter(mode, at_ns)
         self._meant = meant  # nobody chose this one
-        self.failsafe, self._returns = True, returns
+        self.failsafe, self._returns = shown, returns
 
     def recover(self, mode: Mode, at_ns: int) -> None:
         """End a failsafe and return to the mode of before; a take-off goes on."""

@@ -80,6 +80,8 @@ PX4_PARAMETERS = {
     "EKF2_HGT_REF": _int(1, 0, 1, 3),
     "EKF2_MAG_TYPE": _int(0, 0, 5),
     "EKF2_NOAID_TOUT": _int(5_000_000),
+    "GF_ACTION": _int(2, 0, 1, 2, 3, 5),  # nothing, warn, hold, return, land
+    "GF_MAX_VER_DIST": _real(0.0),  # above home; 0: no fence
     "MAV_SYS_ID": _told(1, ParameterType.INT32),
     "MIS_TAKEOFF_ALT": _real(2.5),
     "MPC_ACC_HOR": _told(REFERENCE_ACCEL_MPS2),
@@ -104,6 +106,9 @@ ARDUPILOT_PARAMETERS = {
     "EK3_SRC1_VELXY": _byte(3, 0, 3, 6),
     "EK3_SRC1_VELZ": _byte(3, 0, 3, 6),
     "EK3_SRC1_YAW": _byte(1, 0, 1, 6),  # None, compass, external
+    "FENCE_ACTION": _byte(1, 0, 1, 2),  # report, return, land
+    "FENCE_ALT_MAX": _real(100.0),  # above home
+    "FENCE_ENABLE": _byte(0, 0, 1),
     "FS_EKF_ACTION": _byte(1, 0, 1),  # nothing, land
     "FS_EKF_THRESH": _told(0.8),
     "FS_GCS_ENABLE": _byte(0, 0, 5),  # nothing, land

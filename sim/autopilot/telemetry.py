@@ -323,10 +323,11 @@ class Telemetry:
             healthy |= present & (AHRS | VISION)
         if self._may_arm(at_ns):
             healthy |= PREARM
-        # As recorded: an ArduPilot has a fence that is healthy while nobody enables it, a PX4 tells of none.
+        # As recorded: an ArduPilot has a fence that is healthy unless it is enabled and breached, a PX4 tells of none.
         fence = FENCE if v.kind.name == "ardupilot" else 0
+        enabled = fence if fence and v.parameters["FENCE_ENABLE"] else 0
         power = round(1000.0 * battery.voltage_v), round(100.0 * battery.current_a), round(100.0 * battery.remaining)
-        told = present | fence, present, healthy | fence
+        told = present | fence, present | enabled, healthy | (0 if v.pilot.breaches else fence)
         return mavlink.MAVLink_sys_status_message(*told, 250, *power, 0, 0, 0, 0, 0, 0)
 
     def _gps(self, at_ns: int) -> Message:

@@ -170,7 +170,7 @@ def test_px4_lands_five_seconds_after_the_loss() -> None:
     one.wait(4.8)
     assert one.mode == "AUTO.TAKEOFF"
     one.wait(0.5)
-    assert one.mode == "AUTO.LAND"
+    assert one.mode == "AUTO.DESCEND"
     assert one.texts[-1] == "Failsafe activated"
 
 
