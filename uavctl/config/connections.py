@@ -213,6 +213,9 @@ class DaemonConfig(Section, frozen=True, kw_only=True):
     component_id: Annotated[int, Meta(ge=1, le=255, description="MAVLink component id of the daemon (25 = user 1)")] = (
         25
     )
+    radio_channels: Annotated[
+        bool, Meta(description="ask the vehicle for RC_CHANNELS, which show whether a pilot moves a stick")
+    ] = True
     parameters: Annotated[
         bool, Meta(description="ask the vehicle for all its parameters before it is armed, for the recording")
     ] = True

@@ -275,7 +275,11 @@ def parse_recorded(text: str, file: str, overrides: Sequence[str] = ()) -> Loade
         ConfigError: With all problems found.
     """
     table = parse_toml(text, file)
-    before = {("daemon", "parameters"): "false", ("smpc", "scheme"): '"hahn-stursberg"'}
+    before = {
+        ("daemon", "parameters"): "false",
+        ("daemon", "radio_channels"): "false",
+        ("smpc", "scheme"): '"hahn-stursberg"',
+    }
     lacks = [
         f"{section}.{key}={value}" for (section, key), value in before.items() if key not in table.get(section, {})
     ]

@@ -77,10 +77,12 @@ class Streams:
 
     Args:
         inertial: ask for the vehicle's inertial data, too.
+        channels: ask for the channels of its remote control, too.
     """
 
-    def __init__(self, *, inertial: bool = False) -> None:
+    def __init__(self, *, inertial: bool = False, channels: bool = True) -> None:
         self._inertial = inertial
+        self._rates_hz = {number: hz for number, hz in RATES_HZ.items() if channels or number != RC_CHANNELS}
         self._feels = False  # inertial data have come since they were asked for
         self._seen: set[int] = set()
         self._next_ns: int | None = None
@@ -119,7 +121,7 @@ class Streams:
         if at_ns >= self._next_ns and self._tries < TRIES:
             self._next_ns = at_ns + AGAIN_NS
             self._tries += 1
-            wanted = {number: rate for number, rate in RATES_HZ.items() if number not in self._seen}
+            wanted = {number: rate for number, rate in self._rates_hz.items() if number not in self._seen}
         # Not waited for: but for a PX4 on an onboard link no vehicle sends them so often, and a flight may have begun.
         profile = PROFILES.get(autopilot) if self._inertial and not self._feels else None
         kinds = () if profile is None else profile.inertial
@@ -284,7 +286,11 @@ class MavlinkConnection:
         self._vehicle = VehicleWatch(
             self._count, self._own, daemon.vehicle_system_id, daemon.vehicle_component_id, inertial=feels
         )
-        self._streams, self._globe, self._texts = Streams(inertial=feels), Globe(), Joiner()
+        self._streams, self._globe, self._texts = (
+            Streams(inertial=feels, channels=daemon.radio_channels),
+            Globe(),
+            Joiner(),
+        )
         self._lists, self._parameters = daemon.parameters, ParameterList()
         self._bad: Counter[str] = Counter()
         self._untold: Counter[str] = Counter()
