@@ -284,7 +284,12 @@ class MavlinkConnection:
         self._intake = PositionDecoder(frame, clock, source, estimator, self._count)
         feels = estimator.inertial_std_mps2 > 0.0
         self._vehicle = VehicleWatch(
-            self._count, self._own, daemon.vehicle_system_id, daemon.vehicle_component_id, inertial=feels
+            self._count,
+            self._own,
+            daemon.vehicle_system_id,
+            daemon.vehicle_component_id,
+            inertial=feels,
+            channels=daemon.radio_channels,
         )
         self._streams, self._globe, self._texts = (
             Streams(inertial=feels, channels=daemon.radio_channels),

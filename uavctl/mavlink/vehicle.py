@@ -330,6 +330,7 @@ class VehicleWatch:
         own: our system and component id; answers to others' commands are not ours.
         system: the vehicle's system id; 0 takes any.
         component: its component id; 0 takes any, and that of autopilots rather than another.
+        channels: its remote control is heard of: what SYS_STATUS says of that and of a fence counts, too.
     """
 
     def __init__(
@@ -340,9 +341,10 @@ class VehicleWatch:
         component: int = 0,
         *,
         inertial: bool = False,
+        channels: bool = True,
     ) -> None:
         self._bad = bad
-        self._inertial = inertial
+        self._inertial, self._channels = inertial, channels
         self._own = own
         self._system, self._component = system, component
         self._landed: bool | None = None
@@ -391,7 +393,7 @@ class VehicleWatch:
                 return self._phase(landed, own_climb)
             case Battery():
                 self._battery_v = self._battery_v if message.voltage_v is None else message.voltage_v
-                if message.radio is None:
+                if message.radio is None or not self._channels:
                     return ()
                 self._evidence.radio(heard=message.radio)
                 self._evidence.fence(at_ns, within=message.fenced)
