@@ -20,7 +20,8 @@ from sim.simulation import Peers
 from uavctl.check.findings import ItemState, describe, refusals
 from uavctl.check.preflight import Preflight
 from uavctl.check.vehicle import RULES, ParameterVerdict
-from uavctl.config import Config, load_config
+from uavctl.cli.init import read_sizes, room_text
+from uavctl.config import Config, load_config, parse
 from uavctl.config.checks import position_limits_m
 from uavctl.lab.own_loop import EXTERNAL_ONLY
 from uavctl.loop import make_links
@@ -257,20 +258,34 @@ ROOMS: list[tuple[str, str, list[str]]] = [
         if FOR_ONE.get(name, autopilot) == autopilot
     ],
     *[(one["config"], "px4", one["set"]) for one in DUO],
-    (
-        "room-px4",
-        "px4",
-        [f"{table}.{key}={value}" for table, key, value in keys(blocks("docs/first-flight.md", "toml")[0])],
-    ),
+    *[  # those of `uavctl init`: its default, small and large ones, and the manual's
+        (room, autopilot, overrides)
+        for autopilot in ("px4", "ardupilot")
+        for room, overrides in (
+            ("6x5x2.5", []),
+            ("4.6x2.6x2.5", []),
+            ("12x9x4", []),
+            (
+                "5x5x2.7",
+                [f"{table}.{key}={value}" for table, key, value in keys(blocks("docs/first-flight.md", "toml")[0])],
+            ),
+        )
+    ],
 ]
+
+
+def loaded(name: str, autopilot: str, overrides: list[str]) -> Config:
+    if name[0].isdigit():
+        return parse(room_text(read_sizes(name), autopilot, "mine.toml"), "mine.toml", overrides).config
+    return load_config(name, overrides)
 
 
 @pytest.mark.parametrize(("name", "autopilot", "overrides"), ROOMS)
 def test_a_simulated_vehicle_passes_the_check_of_each_preset_and_of_the_manual_s_rooms(
     name: str, autopilot: str, overrides: list[str]
 ) -> None:
-    config = load_config(name, overrides)
-    simulated = load_config(name, [*overrides, f"sim.autopilot={autopilot}"])
+    config = loaded(name, autopilot, overrides)
+    simulated = loaded(name, autopilot, [*overrides, f"sim.autopilot={autopilot}"])
     place = [(a + b) / 2.0 for a, b in position_limits_m(config).values()]
     simulated = msgspec.structs.replace(
         simulated, sim=msgspec.structs.replace(simulated.sim, start_position_m=(*place[:2], -0.1), seed=1)

@@ -89,7 +89,7 @@ def test_limits_as_lists_beside_a_room_are_refused_with_both_lines() -> None:
 @pytest.mark.parametrize(
     ("old", "new", "key"),
     [
-        ("north_m = [-2.7, 2.7]", "north_m = [2.7, -2.7]", "room.north_m"),
+        ("north_m = [-2.5, 2.5]", "north_m = [2.5, -2.5]", "room.north_m"),
         ("speed_mps = 1.5", "speed_mps = -1.5", "room.speed_mps"),
         ("speed_mps = 1.5", "sped_mps = 1.5", "room.sped_mps"),
         ("target_north_m = 0.0", "target_north_m = 4.0", "target.position_m[0]"),

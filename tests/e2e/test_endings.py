@@ -482,7 +482,7 @@ def test_a_simulated_flight_that_is_still_flying_is_told_everywhere(
     ending, path = json.loads(out)["ending"], tmp_path / "flight.mcap"
     assert (code, ending["cause"], ending["exit_code"]) == (0, Cause.IN_FLIGHT, 0)
     assert f"ended: {ending['sentence']}" in " ".join(err.split())
-    assert words_of(path.with_suffix(".html")).count(ending["sentence"]) == 2
+    assert ending["sentence"] in words_of(path.with_suffix(".html"))
     flight = FlightData.from_records(read(path))
     assert [msgspec.to_builtins(one) for one in flight.endings] == [ending]
     assert summarise(flight, wall_s=None).ending.sentence == ending["sentence"]

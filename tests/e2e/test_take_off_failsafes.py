@@ -42,7 +42,7 @@ def test_px4_whose_failsafe_ends_in_the_climb_arrives_and_a_replay_says_so_too()
     assert flown(flight) == "engaged" and not flight.loop.failure
     assert "failsafe" in flight.states and flight.ticked is not None
     assert flight.ticked.decision.mode is ControlMode.TRACK
-    told = [event.text for event in flight.notices]
+    told = [event.text for event in flight.notices if event.code == "hand-over"]
     assert len(told) == 2 and all("failsafe" in text for text in told)  # in, and out again: for the console
     result = replay(flight.memory.entries, lambda sink: make_loop(flight.config, sink))
     assert result.identical, result.first_difference
@@ -95,7 +95,7 @@ def test_the_pilot_s_stick_in_the_climb_is_told_and_keeps_positions_until_the_gr
     flight.run(6.0)  # its rotors have spun up
     flight.stick("POSCTL")
     flight.run(3.0, until=HandoverState.RELEASED)
-    assert [event.severity for event in flight.notices] == [Severity.WARNING]
+    assert [one.severity for one in flight.notices if one.code == "hand-over"] == [Severity.WARNING]
     before = flight.commands()
     flight.run(10.0, stop=True)
     assert not flight.loop.finished and flight.commands() == before

@@ -136,6 +136,14 @@ class Runaway(NamedTuple):
         return math.sqrt(self.free_m / self.distance_m(1.0))  # d grows with t²
 
 
+def largest_accel_mps2(free_m: float, timeout_s: float) -> float:
+    """Return the acceleration [m/s²] with which a `Runaway` with this timeout [s] stands at a limit so far away [m].
+
+    a² + a b - 2 b d / t² = 0
+    """
+    return (math.sqrt(_BRAKING_MPS2**2 + 8.0 * _BRAKING_MPS2 * free_m / timeout_s**2) - _BRAKING_MPS2) / 2.0
+
+
 def _runaways(config: Config) -> list[Runaway]:
     """Return the axes that have limits, the one with the least room for its acceleration first."""
     limits = position_limits_m(config).items()

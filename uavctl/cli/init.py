@@ -11,13 +11,17 @@ from typing import Annotated, Literal
 import numpy as np
 from cyclopts import Parameter
 
-from uavctl.build.controller import design_of, resting
+from uavctl.build.controller import LEAST_OUTSIDE_M, design_of, resting
 from uavctl.build.mission import resting_places
+from uavctl.check.vehicle import largest_accel_mps2
 from uavctl.cli.common import messages
 from uavctl.config import parse
 from uavctl.errors import UsageError
 
-WALL_M = 0.3  # between a wall and the limit of the vehicle's centre: half a vehicle, and a hand
+WALL_M = LEAST_OUTSIDE_M  # between a wall and the limit of the vehicle's centre: so far the envelope lets it go
+TIMEOUT_S = 0.7  # COM_OF_LOSS_T and GUID_TIMEOUT of docs/first-flight.md: so long the last acceleration may go on
+MOST_MPS2 = {"px4": 4.0, "ardupilot": 2.0}  # of the presets
+LEAST_MPS2 = 1.0  # holds the wind that the presets count on (0.6 m/s²), and leaves something to fly with
 LEAST_M = 0.2  # between the places to rest in, so that there is somewhere to fly to
 LARGEST_M = 1000.0
 _WIDE_M = 3.0
@@ -36,6 +40,9 @@ base = "{base}"
 north_m = [{north[0]:g}, {north[1]:g}]
 east_m = [{east[0]:g}, {east[1]:g}]
 height_m = [0.0, {top:g}]
+# Largest acceleration north, and east. If setpoints stop, the vehicle keeps the last one until its own timeout:
+# from rest in the middle, with {timeout:g} s (COM_OF_LOSS_T or GUID_TIMEOUT), it stands before the limits with this.
+accel_mps2 = {accel:g}
 # Largest speed north and east, and up and down.
 speed_mps = 1.5
 climb_mps = 1.0
@@ -43,6 +50,10 @@ climb_mps = 1.0
 target_north_m = 0.0
 target_east_m = 0.0
 target_height_m = {target:g}
+
+[envelope]
+# How far beyond these limits it may be before it lands: to the walls.
+outside_m = {wall:g}
 
 [link]
 # Share of positions that are lost, and how long the others take: from delay_s to delay_s + jitter_s.
@@ -118,6 +129,7 @@ def room_text(sizes: tuple[float, float, float], autopilot: str, file: str) -> s
     length, width, height = sizes
     top = round(height - WALL_M, 3)
     north, east = (round(0.5 * size - WALL_M, 3) for size in (length, width))
+    allowed_mps2 = math.floor(largest_accel_mps2(max(min(north, east), 0.0), TIMEOUT_S) * 10.0) / 10.0
     return _TEXT.format(
         length=length,
         width=width,
@@ -126,6 +138,8 @@ def room_text(sizes: tuple[float, float, float], autopilot: str, file: str) -> s
         file=file,
         base=f"room-{autopilot}",
         wall=WALL_M,
+        timeout=TIMEOUT_S,
+        accel=max(min(allowed_mps2, MOST_MPS2[autopilot]), LEAST_MPS2),
         north=(-north, north),
         east=(-east, east),
         top=top,
