@@ -264,7 +264,6 @@ class ControlLoop:
         self.course.let_go = self.let_go
         self.course.see(at_ns, self._vehicle)
         self.course.decide(out.decision, out.events, estimated=out.estimate is not None)
-        autopilot = "" if self._vehicle is None else self._vehicle.autopilot
         # A vehicle that climbs or lands must not do so by positions that have just been found to be wrong.
         if out.astray and self._hand_over.has_begun:
             self._misled_ns = at_ns
@@ -272,7 +271,7 @@ class ControlLoop:
         held_back = misled or disbelieves(self._state)
         if self._relays and not held_back:
             for data in self._links[VEHICLE].relay(
-                self._relay, at_ns, autopilot, refused=inp.samples if out.leaps else out.refused
+                self._relay, at_ns, refused=inp.samples if out.leaps else out.refused
             ):
                 send(self._outgoing(VEHICLE, data, at_ns))
         if self._relays and self._vehicle is not None:

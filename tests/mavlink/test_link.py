@@ -177,6 +177,7 @@ def test_answers_of_many_peers_do_not_lose_the_vehicle_s_clock() -> None:
 def test_others_requests_for_the_time_leave_the_vehicle_its_answers() -> None:
     link, vehicle = make_link(), Peer(1, 1)
     link.receive(vehicle.heartbeat(), NOW)
+    link.receive(vehicle.send("local_position_ned", 5000, *[0.0] * 6), NOW)  # its clock is known
     answered = 0
     for n in range(1000):
         at_ns = NOW + n * MS

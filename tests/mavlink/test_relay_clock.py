@@ -79,7 +79,7 @@ def assert_they_flow(rig: Indoors, from_s: float, off_s: float) -> None:
     assert RELAY_SILENT not in {event.code for event in rig.memory.of(Event)}
     captured = {one.position_m[0]: one.captured_ns for inp in rig.memory.of(StepInput) for one in inp.samples}
     places = sorted(captured)
-    shift_ns = 0 if rig.config.sim.autopilot == "px4" else UPTIME_NS
+    shift_ns = UPTIME_NS
     for _, message in sent:
         nearest = min(places[max(bisect_left(places, message.x) - 1, 0) :][:2], key=lambda x: abs(x - message.x))
         assert abs(1000 * message.usec - shift_ns - captured[nearest]) < off_s * SECOND + MS

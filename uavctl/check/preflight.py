@@ -433,7 +433,6 @@ class Preflight:
         self._relay = Relay(config.relay)
         self._asked_ns: int | None = None
         self._rounds = 0
-        self._autopilot = ""
         self.guide = Guide(PROMPT_NS) if move else None  # the prompts, if they were asked for
 
     def receive(self, link: str, data: bytes, at_ns: int) -> Received:
@@ -449,7 +448,7 @@ class Preflight:
                     angles_rad = self._seen.angles_rad
                     self.guide.take(at_ns, one.position_m, angles_rad[-1][1][2] if angles_rad else None)
             elif isinstance(one, VehicleStatus):
-                from_vehicle, self._autopilot = True, one.autopilot
+                from_vehicle = True
         answers = tuple(Outgoing(link=link, data=answer) for answer in understood.answers)
         return Received(answers, from_vehicle, from_source)
 
@@ -460,7 +459,7 @@ class Preflight:
             for data in link.due(at_ns):
                 send(Outgoing(link=name, data=data))
         vehicle = self._links[VEHICLE]
-        for data in vehicle.relay(self._relay, at_ns, self._autopilot, refused=()):
+        for data in vehicle.relay(self._relay, at_ns, refused=()):
             send(Outgoing(link=VEHICLE, data=data))
         if vehicle.vehicle is not None:
             for data in vehicle.place_on_globe(at_ns, self._config.hand_over.origin_deg_m):

@@ -151,7 +151,7 @@ class OwnLoop:
             send(self._setpoint(vehicle, (at_ns - self.begun_ns) * 1e-9, at_ns))
 
     def _pass_on(self, at_ns: int) -> list[Outgoing]:
-        poses = self._links[VEHICLE].relay(self.relay, at_ns, self.config.sim.autopilot, refused=())
+        poses = self._links[VEHICLE].relay(self.relay, at_ns, refused=())
         return [Outgoing(link=VEHICLE, data=data) for data in poses]
 
     def _setpoint(self, vehicle: tuple[int, int], since_s: float, at_ns: int) -> Outgoing:

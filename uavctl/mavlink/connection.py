@@ -464,23 +464,28 @@ class MavlinkConnection:
             return self._encoder.request_message(message_id, *self._target())
         return self._encoder.request_interval(message_id, round(1e6 / rate_hz), *self._target())
 
-    def relay(
-        self, relay: Relay, at_ns: int, autopilot: str, *, refused: Sequence[PositionSample]
-    ) -> tuple[bytes, ...]:
+    def relay(self, relay: Relay, at_ns: int, *, refused: Sequence[PositionSample]) -> tuple[bytes, ...]:
         """The positions that go to the vehicle's own estimator in the tick of `at_ns`.
 
         Args:
-            autopilot: the vehicle's kind; only PX4 moves stamps itself.
             refused: samples that the tick did not believe.
         """
         if not relay.enabled or self.vehicle is None:
             return ()
-        moves = autopilot in PROFILES and PROFILES[autopilot].moves_stamps
-        offset_ns = 0 if moves else self._vehicle_offset_ns(at_ns)
-        poses = relay.due(at_ns, offset_ns=offset_ns, refused=refused)
+        poses = relay.due(at_ns, offset_ns=self._vehicle_offset_ns(at_ns) or 0, refused=refused)
         return tuple(self._encoder.external_position(pose) for pose in poses)
 
-    def _vehicle_offset_ns(self, at_ns: int) -> int:
+    def _vehicle_time_ns(self, at_ns: int) -> int | None:
+        """Return the time of the vehicle's clock as far as known; None before.
+
+        It is what a vehicle gets that asks for our time. PX4 moves the stamps of positions by the offset that it finds,
+        keeps that without end where round trips take longer than 10 ms (src/lib/timesync/Timesync.cpp), and so follows
+        no drift there. In its own clock there is none to find.
+        """
+        offset_ns = self._vehicle_offset_ns(at_ns)
+        return None if offset_ns is None else at_ns - offset_ns
+
+    def _vehicle_offset_ns(self, at_ns: int) -> int | None:
         """(our time - the vehicle's) by its newest answers, or else by older ones as far as its messages agree.
 
         A message arrives after its stamp, and no round trip was shorter than its way. A vehicle that neither answers
@@ -489,7 +494,7 @@ class MavlinkConnection:
         trips, arrival_ns = self.trips(self.vehicle), self._vehicle_clock.offset_ns(at_ns)
         known_ns = None if trips is None else trips.last_known_ns(at_ns)
         if trips is None or known_ns is None:
-            return arrival_ns or 0
+            return arrival_ns
         if arrival_ns is None or trips.offset_ns(at_ns) is not None or abs(arrival_ns - known_ns) > LEAP_NS:
             return known_ns
         return min(max(known_ns, arrival_ns - trips.shortest_ns - NEAR_NS), arrival_ns)
@@ -577,7 +582,9 @@ class MavlinkConnection:
                 self._count(UNANSWERED)
                 return
             self._answered_to[of_vehicle] += 1
-            self._answers.append(self._encoder.timesync(at_ns, message.ts1_ns))
+            time_ns = self._vehicle_time_ns(at_ns) if (message.system, message.component) == self.vehicle else at_ns
+            if time_ns is not None:
+                self._answers.append(self._encoder.timesync(time_ns, message.ts1_ns))
         elif message.ts1_ns in self._open:  # else it answers somebody else
             self._answered = True
             self._intake.answer((message.system, message.component), message.ts1_ns, message.tc1_ns, at_ns)

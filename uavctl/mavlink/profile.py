@@ -125,7 +125,6 @@ class AutopilotProfile:
     climbs_on_arming: bool
     reads_raw: bool  # its RAW_IMU is taken for its acceleration; else HIGHRES_IMU alone is
     wants_place: bool  # without GPS it has to be told a place on the globe before it arms
-    moves_stamps: bool  # it moves the stamps of positions by what it has asked with TIMESYNC
     number: int  # MAV_AUTOPILOT of its heartbeats
     inertial: tuple[int, int]  # the messages that show how it turns, and its acceleration
     # A mode's name, of MAV_TYPE and of a heartbeat's custom_mode; empty where the kind of vehicle is not known
@@ -146,7 +145,6 @@ PROFILES = {
         climbs_on_arming=True,
         reads_raw=False,
         wants_place=False,
-        moves_stamps=True,
         number=mavlink.MAV_AUTOPILOT_PX4,
         inertial=(mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, mavlink.MAVLINK_MSG_ID_HIGHRES_IMU),
         mode_name=_px4_mode,
@@ -164,7 +162,6 @@ PROFILES = {
         climbs_on_arming=False,
         reads_raw=True,
         wants_place=True,
-        moves_stamps=False,
         number=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
         inertial=(mavlink.MAVLINK_MSG_ID_ATTITUDE, mavlink.MAVLINK_MSG_ID_RAW_IMU),
         mode_name=_ardupilot_mode,

@@ -1,13 +1,10 @@
 """Positions on their way to the vehicle's own estimator: which ones go, and with what stamp. Pure; time is an argument.
 
-A vehicle stamps by its own clock. Two ways lead there, and taking both would shift a stamp twice:
-
-* PX4 asks us for our time (TIMESYNC) and moves the stamps of what it receives by the offset that it finds
-  (src/lib/timesync/Timesync.cpp, `sync_stamp`); until it has found one it does not look at them. It gets stamps of our
-  clock, which is what we answered.
-* Else the stamp is moved here, by the offset that the vehicle's answers to our own requests gave, and without any by
-  the arrival of its messages. A clock that is not known to the millisecond never stops the positions: an estimator
-  bears a stamp that is a little off, and no silence.
+Stamps are of the vehicle's clock: by its answers to our own requests for the time, and without any by the arrival of
+its messages. PX4 also asks us for our time (TIMESYNC) and moves the stamps of what it receives by the offset that it
+finds (src/lib/timesync/Timesync.cpp, `sync_stamp`). It is answered with the time of its own clock: that offset is zero.
+A clock that is not known to the millisecond never stops the positions: an estimator bears a stamp that is a little off,
+and no silence.
 """
 
 from __future__ import annotations
@@ -96,7 +93,7 @@ class Relay:
         """Return the positions that go to the vehicle in this tick, in order of capture.
 
         Args:
-            offset_ns: (our time - the vehicle's), by which stamps are moved; 0 where the vehicle moves them itself.
+            offset_ns: (our time - the vehicle's), by which stamps are moved.
             refused: samples that the tick did not believe.
         """
         arrived = [one for one in self._waiting if one[0].received_ns <= at_ns]
