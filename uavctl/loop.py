@@ -97,6 +97,7 @@ def make_links(config: Config, listen: Callable[[Message, int], None] | None = N
             source=config.source,
             estimator=config.estimator,
             listen=listen,
+            vehicle_time=config.relay.enabled and config.relay.vehicle_time,
         )
         for name, roles in names.items()
     }

@@ -415,6 +415,13 @@ class RelayConfig(Section, frozen=True, kw_only=True):
         Literal["vision-position-estimate", "odometry"],
         Meta(description="as which MAVLink message, in local NED; PX4 and ArduPilot take both"),
     ] = "vision-position-estimate"
+    vehicle_time: Annotated[
+        bool,
+        Meta(
+            description="a vehicle that asks for our time (PX4) gets that of its own clock, in which positions are "
+            "stamped; else it gets ours, and moves their stamps by the offset that it finds"
+        ),
+    ] = True
     rate_hz: Annotated[
         float, Meta(ge=0.1, le=1000, description="at most so many a second; the newest are sent [1/s]")
     ] = 50.0

@@ -278,6 +278,7 @@ def parse_recorded(text: str, file: str, overrides: Sequence[str] = ()) -> Loade
     before = {
         ("daemon", "parameters"): "false",
         ("daemon", "radio_channels"): "false",
+        ("relay", "vehicle_time"): "false",
         ("smpc", "scheme"): '"hahn-stursberg"',
     }
     lacks = [

@@ -262,6 +262,7 @@ class MavlinkConnection:
         estimator: standard deviation of a position, and what is absurd.
         listen: hears every message of others that is understood, with its time of arrival; for callers that want more
             than the items tell.
+        vehicle_time: a vehicle that asks for our time gets that of its own clock (`relay.vehicle_time`).
     """
 
     def __init__(
@@ -275,8 +276,9 @@ class MavlinkConnection:
         source: SourceConfig,
         estimator: EstimatorConfig,
         listen: Callable[[Message, int], None] | None = None,
+        vehicle_time: bool = False,
     ) -> None:
-        self._name, self._roles = name, roles
+        self._name, self._roles, self._gives_vehicle_time = name, roles, vehicle_time
         self._own = (daemon.system_id, daemon.component_id)
         url = daemon.vehicle if VEHICLE in roles else daemon.mocap
         self._stream = StreamDecoder() if url.startswith(STREAM_SCHEMES) else None
@@ -472,7 +474,10 @@ class MavlinkConnection:
         """
         if not relay.enabled or self.vehicle is None:
             return ()
-        poses = relay.due(at_ns, offset_ns=self._vehicle_offset_ns(at_ns) or 0, refused=refused)
+        # Only PX4 moves stamps by the offset that it has found to our time, where that is what it was given.
+        moves = not self._gives_vehicle_time and self._vehicle.autopilot == "px4"
+        offset_ns = 0 if moves else self._vehicle_offset_ns(at_ns) or 0
+        poses = relay.due(at_ns, offset_ns=offset_ns, refused=refused)
         return tuple(self._encoder.external_position(pose) for pose in poses)
 
     def _vehicle_time_ns(self, at_ns: int) -> int | None:
@@ -582,7 +587,8 @@ class MavlinkConnection:
                 self._count(UNANSWERED)
                 return
             self._answered_to[of_vehicle] += 1
-            time_ns = self._vehicle_time_ns(at_ns) if (message.system, message.component) == self.vehicle else at_ns
+            own = self._gives_vehicle_time and (message.system, message.component) == self.vehicle
+            time_ns = self._vehicle_time_ns(at_ns) if own else at_ns
             if time_ns is not None:
                 self._answers.append(self._encoder.timesync(time_ns, message.ts1_ns))
         elif message.ts1_ns in self._open:  # else it answers somebody else
