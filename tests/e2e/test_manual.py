@@ -12,7 +12,8 @@ import pytest
 from manual_rig import PAGES, Desk, blocks, commands, desk, edited, keys
 from places import DATA, ROOT
 
-from uavctl.config import load_config
+from uavctl.cli.init import read_sizes, room_text
+from uavctl.config import load_config, parse
 
 # Placeholders that are no names of files: what a reader has in their place.
 VALUES = {
@@ -119,10 +120,17 @@ def test_a_page_s_commands_do_what_they_say(page: str, at_desk: Desk, flown: Pat
 
 @pytest.mark.parametrize("page", [page for page in PAGES if page not in TOML_OF_OTHERS and blocks(page, "toml")])
 def test_a_page_s_configurations_load(page: str) -> None:
+    """Each block overrides a preset, or what `uavctl init` writes; one with a plant's matrices stands for itself."""
     for block in blocks(page, "toml"):
-        overrides = [f"{table}.{key}={value.split('   #')[0]}" for table, key, value in keys(block)]
+        found = keys(block)
+        overrides = [f"{table}.{key}={value.split('   #')[0]}" for table, key, value in found]
         assert overrides
-        load_config("room-px4", overrides)
+        if any((table, key) == ("plant", "a") for table, key, _ in found):
+            parse(block, page)
+        elif any(table == "room" for table, _, _ in found):
+            parse(room_text(read_sizes("5x5x2.7"), "px4", page), page, overrides)
+        else:
+            load_config("room-px4", overrides)
 
 
 def test_the_page_of_fleets_shows_its_example() -> None:

@@ -42,7 +42,7 @@ def words(folder: Path, *more: str) -> list[str]:
 def short_flights(steps: int = 2, hold_s: float = 8.0) -> Iterator[None]:
     """Fewer steps, and a third of the hold: enough to identify, in a third of the time."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(excitation, "STEPS", steps)
+        patch.setattr(excitation, "SIZES", excitation.SIZES[-steps:])
         patch.setattr(excitation, "HOLD_S", hold_s)
         yield
 
