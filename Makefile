@@ -10,7 +10,7 @@ STAMP := $(VENV)/.installed
 # MAVSDK 3 and 4 have one name, so each client has an environment of its own.
 CLIENTS := .venv-clients
 
-.PHONY: fly test test-all test-clients mutation docs clean
+.PHONY: fly test test-all test-manual test-clients mutation docs clean
 
 fly: $(FLIES)
 	$(VENV)/bin/uavctl loopback --udp --config room
@@ -21,6 +21,10 @@ test: $(STAMP)
 
 test-all: $(STAMP)
 	$(VENV)/bin/python tools/check.py --all
+
+# Types the commands of the manual's pages as a reader would, in real time, against simulated vehicles.
+test-manual: $(STAMP)
+	$(VENV)/bin/python -m pytest -n 0 -m manual tests/e2e/test_manual.py
 
 test-clients: $(STAMP) $(CLIENTS)/.installed
 	UAVCTL_MAVSDK_PYTHON=$(CURDIR)/$(CLIENTS)/mavsdk/bin/python \

@@ -106,7 +106,7 @@ def check_tests(failed: threading.Event, *, everything: bool) -> str:
     A file's tests stay in one process, so that what they share is made once; tests/conftest.py gives the order.
     """
     command = [str(BIN / "pytest"), "-n", "2", "--dist", "loadfile", "--no-loadscope-reorder"]
-    command += [] if everything else ["-m", "not slow"]
+    command += ["-m", "not manual" if everything else "not slow and not manual"]
     with subprocess.Popen(command, cwd=ROOT, env={**os.environ, **_PROCESSES, "UAVCTL_CACHE": str(CACHE)}) as process:
         while process.poll() is None:
             if failed.wait(0.2):

@@ -17,10 +17,16 @@ TARGETS: dict[str, tuple[str, ...]] = {
         "tests/flight/test_envelope_observer.py",
         "tests/flight/test_envelope_velocity.py",
         "tests/flight/test_envelope.py",
+        "tests/flight/test_observer.py",
     ),
     "uavctl/flight/fallback.py": ("tests/flight/test_fallback.py",),
     "uavctl/flight/limits.py": ("tests/flight/test_limits.py",),
-    "uavctl/flight/sensor_faults.py": ("tests/flight/test_reach_rules.py", "tests/flight/test_stuck_rules.py"),
+    "uavctl/flight/sensor_faults.py": (
+        "tests/flight/test_reach_rules.py",
+        "tests/flight/test_stuck_rules.py",
+        "tests/flight/test_envelope_observer.py",
+        "tests/flight/test_observer.py",
+    ),
     "uavctl/mavlink/handover_states.py": ("tests/mavlink/test_mode.py",),
     "uavctl/mavlink/signing.py": ("tests/mavlink/test_signing.py", "tests/mavlink/test_gate.py"),
 }

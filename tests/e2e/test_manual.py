@@ -100,7 +100,7 @@ def test_what_the_tables_name_is_in_the_manual() -> None:
     assert [row for row, _ in SHORTER if not any(re.search(row, command) for command in every)] == []
 
 
-@pytest.mark.slow
+@pytest.mark.manual
 @pytest.mark.parametrize("page", [page for page in PAGES if page not in WALKED and any(map(is_typed, commands(page)))])
 def test_a_page_s_commands_do_what_they_say(page: str, at_desk: Desk, flown: Path) -> None:
     shutil.copytree(flown, at_desk.folder, dirs_exist_ok=True)
@@ -142,7 +142,7 @@ FIRST = "docs/first-flight.md"
 AUTOPILOTS = {"px4": "udpin://0.0.0.0:14540", "ardupilot": "tcp://127.0.0.1:5760"}
 
 
-@pytest.mark.slow
+@pytest.mark.manual
 @pytest.mark.parametrize("autopilot", AUTOPILOTS)
 def test_the_first_flight_as_the_page_says(autopilot: str, at_desk: Desk) -> None:
     def on_page(section: str) -> list[str]:
@@ -181,7 +181,7 @@ def test_the_first_flight_as_the_page_says(autopilot: str, at_desk: Desk) -> Non
         at_desk.run(command)
 
 
-@pytest.mark.slow
+@pytest.mark.manual
 def test_a_fleet_flies_as_the_page_says(at_desk: Desk) -> None:
     page = "docs/fleet.md"
     (sim,) = commands(page, "Try it")
@@ -201,7 +201,7 @@ def test_a_fleet_flies_as_the_page_says(at_desk: Desk) -> None:
     at_desk.ends(flight, fly)
 
 
-@pytest.mark.slow
+@pytest.mark.manual
 def test_orders_do_what_the_page_says(at_desk: Desk) -> None:
     at_desk.until_said(at_desk.start(f"uavctl sim --config room-px4 {PATIENT}"), "system_id")
     accepted = f"--set 'check.accept={json.dumps(OF_TIME + TIMEOUTS)}'"

@@ -11,7 +11,7 @@ import pytest
 from envelope_rig import PARAMETERS, TICK_NS, Array, S, vec3
 from flight_rig import MS, START_NS, sample
 
-from uavctl.flight.envelope import NOT_WATCHING, RESPONSE, Observation, Watching, watch
+from uavctl.flight.envelope import NOT_WATCHING, RESPONSE, Observation, Watching, after_flight, push_words, watch
 from uavctl.flight.sensor_faults import InertialSpan, carried, extended, push_text
 from uavctl.records import Vec3
 
@@ -227,3 +227,21 @@ def test_spans_that_ended_before_the_horizon_are_dropped_and_change_nothing() ->
 )
 def test_a_push_has_a_size_and_a_direction(push: Vec3, words: str) -> None:
     assert words in push_text(push, None)
+
+
+def test_the_watch_of_others_flight_goes_on_from_what_inertial_data_have_shown() -> None:
+    flown = fly(steady(1.0)).watching
+    assert flown.observer is not None and flown.observer.inertial is not None
+    after = after_flight(flown, (0.1, 0.2, 0.0))
+    assert after.observer is not None
+    np.testing.assert_array_equal(after.observer.mean, flown.observer.inertial)
+    assert after.sent == ((flown.observer.at_ns, (0.1, 0.2, 0.0)),) and after.tick_ns == flown.tick_ns
+    without = fly(steady(0.0), shown=lambda t, accel: None).watching
+    assert after_flight(without, (0.0, 0.0, 0.0)) is NOT_WATCHING
+    assert after_flight(NOT_WATCHING, (0.0, 0.0, 0.0)) is NOT_WATCHING
+
+
+def test_a_push_is_described_with_and_without_an_attitude() -> None:
+    flown = fly(steady(2.0)).watching
+    assert push_words(flown, None, START_NS) == push_text(flown.push_mps2, None)
+    assert push_words(NOT_WATCHING, None, START_NS) == push_text(NOT_WATCHING.push_mps2, None)
