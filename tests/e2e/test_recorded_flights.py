@@ -455,7 +455,7 @@ def _rest(memory: Memory) -> None:
 
 
 def _land(memory: Memory) -> None:
-    assert any("-> released (AUTO.LAND" in text for text in told(memory))
+    assert any("-> unclear (AUTO.LAND" in text for text in told(memory))
 
 
 def _failsafe(memory: Memory) -> None:
