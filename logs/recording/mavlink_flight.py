@@ -21,7 +21,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from logs.recording.design_view import Floats
 from logs.recording.parameters import ParameterReader, VehicleParameter
-from logs.recording.senders import ChosenVehicle, LogSender, Senders, choose_vehicle, message_of, system_of
+from logs.recording.senders import ChosenVehicle, LogSender, SenderCounts, choose_vehicle, message_of, system_of
 from logs.recording.summary import count
 from logs.recording.tlog import Tlog, TlogPacket, read_tlog
 from uavctl.errors import RecordingError
@@ -207,7 +207,7 @@ class _Reader:
     def __init__(self, origin_ns: int, vehicle: ChosenVehicle) -> None:
         self._origin_ns = self._last_ns = origin_ns
         self._vehicle, self._beat = vehicle, vehicle.heartbeat
-        self._senders = Senders()
+        self._senders = SenderCounts()
         self._attitudes: dict[bool, list[tuple[int, Vec3]]] = {}  # of quaternions, and of angles
         self._battery: list[tuple[int, float]] = []
         self._height: list[tuple[int, float]] = []

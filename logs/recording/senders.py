@@ -112,7 +112,7 @@ def choose_vehicle(packets: Sequence[TlogPacket], name: str, system: int | None 
     return ChosenVehicle(system, None if system is None else vehicles.get(system), others)
 
 
-class Senders:
+class SenderCounts:
     """Counts what each component sent, by the frames that were right."""
 
     def __init__(self) -> None:

@@ -29,7 +29,7 @@ TRAJECTORY: Mapping[str, Mapping[str, float]] = {
 _NAME = re.compile(r"^(?P<name>[^\[(]*?)\s*(?:[\[(]\s*(?P<unit>[^\])]*?)\s*[\])])?$")
 
 
-class Column(NamedTuple):
+class StatedColumn(NamedTuple):
     """Place of a quantity in the rows, and what a number there is multiplied by."""
 
     place: int
@@ -62,7 +62,7 @@ def quantity(cell: str) -> tuple[str, float, str] | None:
 
 def read_header(
     cells: Sequence[str], units: Sequence[str] | None, wanted: Mapping[str, Mapping[str, float]]
-) -> tuple[dict[str, Column], list[str]]:
+) -> tuple[dict[str, StatedColumn], list[str]]:
     """The columns of a header by quantity, and what is wrong with it.
 
     Args:
@@ -70,7 +70,7 @@ def read_header(
         units: A row of units below them; None if there is none.
         wanted: Factor of each unit of each quantity that may be there; the first one is that of no statement.
     """
-    found: dict[str, Column] = {}
+    found: dict[str, StatedColumn] = {}
     wrong: list[str] = []
     for place, cell in enumerate(cells):
         what, shown = quantity(cell), f'column {place + 1}, "{cell.strip()[:40]}"'
@@ -86,5 +86,5 @@ def read_header(
         if name in found:
             wrong.append(f"{shown}, means the same as column {found[name].place + 1}; keep one of them")
             continue
-        found[name] = Column(place, sign * (wanted[name][unit] if unit else 1.0))
+        found[name] = StatedColumn(place, sign * (wanted[name][unit] if unit else 1.0))
     return found, wrong

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from uavctl.config.columns import TRAJECTORY, Column, quantity, read_header
+from uavctl.config.columns import TRAJECTORY, StatedColumn, quantity, read_header
 from uavctl.config.document import (
     LARGEST,
     LARGEST_PLANT,
@@ -178,11 +178,11 @@ def _rows(path: Path) -> list[tuple[int, Floats]]:
     ]
 
 
-def _in_order(width: int) -> list[Column]:
-    return [Column(place, 1.0) for place in range(width)]
+def _in_order(width: int) -> list[StatedColumn]:
+    return [StatedColumn(place, 1.0) for place in range(width)]
 
 
-def _columns(path: Path, rows: list[tuple[int, list[str]]]) -> tuple[list[Column], list[tuple[int, list[str]]]]:
+def _columns(path: Path, rows: list[tuple[int, list[str]]]) -> tuple[list[StatedColumn], list[tuple[int, list[str]]]]:
     """The columns by a header, none without one, and the rows below it.
 
     Raises:

@@ -173,7 +173,7 @@ def _plain(first: Text, text: str) -> Text:
     return Text(system=first.system, component=first.component, severity=first.severity, text=text.rstrip())
 
 
-class Evidence:
+class SwitchEvidence:
     """What the vehicle says, and shows, of who changes its modes: each counts for `EVIDENCE_NS`."""
 
     def __init__(self) -> None:
@@ -353,7 +353,7 @@ class VehicleWatch:
         self._clock = BootClock()
         self._ready = False  # by its last heartbeat
         self._heard_ns = 0  # any word of it
-        self._evidence = Evidence()
+        self._evidence = SwitchEvidence()
         self._critical = False  # by its last heartbeat
         self._another_ns: int | None = None  # when another vehicle was heard last
         self._status: VehicleStatus | None = None
@@ -510,7 +510,7 @@ class VehicleWatch:
     def _reboot(self) -> tuple[VehicleStatus, ...]:
         self.boots += 1
         self._streams, self._turned = {}, None
-        self._landed, self._evidence = None, Evidence()
+        self._landed, self._evidence = None, SwitchEvidence()
         if self._status is None:
             return ()
         self._status = msgspec.structs.replace(self._status, boots=self.boots)
