@@ -141,7 +141,7 @@ def test_what_every_file_repeats_does_not_count_to_its_size(tmp_path: Path) -> N
 @pytest.mark.slow
 def test_memory_does_not_grow_with_the_length_of_a_flight(tmp_path: Path) -> None:
     clock = Clock()
-    recorder = SyncRecorder(tmp_path / "flight.mcap", LogConfig(chunk_bytes=1024, segment_bytes=50_000), clock=clock)
+    recorder = SyncRecorder(tmp_path / "flight.mcap", LogConfig(chunk_bytes=1024, segment_bytes=30_000), clock=clock)
     record = flight(2)[2]
 
     def put(count: int) -> None:

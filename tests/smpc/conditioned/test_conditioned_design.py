@@ -62,7 +62,7 @@ def test_a_flight_is_flown_replayed_reported_and_told_otherwise(
     assert flown["steps"] > 80
     told = header(Path(flight))
     assert told.design_id == figures["design_id"] == told.design["design_id"]
-    assert {key: value for key, value in figures.items() if key not in ("schema", "wall_s")} == told.design
+    assert {key: value for key, value in figures.items() if key not in ("schema", "wall_s", "rehearsal")} == told.design
     assert design_view(told).horizon == 48
     assert main(["log", "replay", flight, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["identical"]

@@ -16,14 +16,14 @@ from uavctl.cli.app import run
 from uavctl.cli.replay import recorded_flyer
 from uavctl.config import Config
 
-SMALL = ("--config", "paper", "--set", "solver.method=exact", "--set", "log.segment_bytes=100000")
+SMALL = ("--config", "paper", "--set", "solver.method=exact", "--set", "log={segment_bytes=100000, chunk_bytes=4096}")
 
 
 @pytest.fixture(scope="module")
 def cuts(tmp_path_factory: pytest.TempPathFactory) -> Cuts:
     folder = tmp_path_factory.mktemp("flown")
     with unpaged():
-        assert run(["loopback", *SMALL, "--duration", "3", "--out", str(folder), "--json"]) == 0
+        assert run(["loopback", *SMALL, "--duration", "6", "--out", str(folder), "--json"]) == 0
     return Cuts(folder / NAME)
 
 
