@@ -484,19 +484,23 @@ def corrected(observer: Observer, position: Array, std_m: float) -> tuple[Observ
     noise = max(std_m, POSITION_STD_M) ** 2
     variance = float(observer.cov[0, 0]) + noise
     bound = CLIP * math.sqrt(variance)
-    innovation = position - observer.mean[0]
-    gain = observer.cov[:, 0] / variance
-    mean = observer.mean + np.outer(gain, np.clip(innovation, -bound, bound))
+    gain = observer.cov[:, :1] / variance  # (3, 1)
+    mean, clipped = _moved(observer.mean, position, gain, bound)
     keep = np.eye(3)
-    keep[:, 0] -= gain
-    cov = keep @ observer.cov @ keep.T + noise * np.outer(gain, gain)
-    clipped = bool((np.abs(innovation) > bound).any())
+    keep[:, :1] -= gain
+    cov = keep @ observer.cov @ keep.T + noise * (gain * gain.T)
     inertial = observer.inertial
     if inertial is not None:
-        innovation = position - inertial[0]
-        inertial = inertial + np.outer(gain, np.clip(innovation, -bound, bound))
-        clipped = clipped and bool((np.abs(innovation) > bound).any())
-    return replace(observer, mean=mean, cov=cov, inertial=inertial), clipped
+        inertial, is_far = _moved(inertial, position, gain, bound)
+        clipped = clipped and is_far
+    return Observer(observer.at_ns, mean, cov, observer.accel_mps2, inertial), clipped
+
+
+def _moved(mean: Array, position: Array, gain: Array, bound: float) -> tuple[Array, bool]:
+    """Correct a mean (3, 3) by an innovation clipped to a bound; return too whether it was beyond."""
+    innovation = position - mean[0]
+    inside = np.minimum(np.maximum(innovation, -bound), bound)
+    return mean + gain * inside, bool((inside != innovation).any())
 
 
 def size_mps2(accel_mps2: Array | Vec3) -> float:

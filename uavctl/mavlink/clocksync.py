@@ -268,18 +268,19 @@ class ArrivalClock:
             return 0
         else:
             self._ahead = 0
-            self._follow(behind_ns, at_ns)
+            begun_ns, least_ns, _ = self._second
+            if at_ns - begun_ns >= SECOND_NS:
+                self._begin_second(behind_ns, at_ns)
+            elif behind_ns < least_ns:
+                self._second = begun_ns, behind_ns, at_ns
             since_ns = at_ns - self._at_ns
             self._least_ns = min(behind_ns, self._least_ns + (self._slope + DRIFT_CHANGE) * since_ns)
         self._at_ns = at_ns
         return round(behind_ns - self._least_ns)
 
-    def _follow(self, behind_ns: int, at_ns: int) -> None:
-        begun_ns, least_ns, least_at_ns = self._second
-        if at_ns - begun_ns < SECOND_NS:
-            if behind_ns < least_ns:
-                self._second = begun_ns, behind_ns, at_ns
-            return
+    def _begin_second(self, behind_ns: int, at_ns: int) -> None:
+        """Learn the drift from the second that is over."""
+        _, least_ns, least_at_ns = self._second
         if self._before is not None:
             rise = (least_ns - self._before[0]) / (least_at_ns - self._before[1])
             self._rises.append(min(max(rise, -MAX_DRIFT), MAX_DRIFT))

@@ -169,6 +169,8 @@ PROFILES = {
     ),
 }
 
+_NAMES = {profile.number: name for name, profile in PROFILES.items()}
+
 
 def profile_of(vehicle: VehicleStatus) -> AutopilotProfile:
     """Return the autopilot's profile; that of PX4 for one that is not known, which is never asked for a mode."""
@@ -177,7 +179,7 @@ def profile_of(vehicle: VehicleStatus) -> AutopilotProfile:
 
 def autopilot_name(autopilot: int) -> str:
     """`px4`, `ardupilot` or `unknown` of MAV_AUTOPILOT."""
-    return next((name for name, profile in PROFILES.items() if profile.number == autopilot), "unknown")
+    return _NAMES.get(autopilot, "unknown")
 
 
 def describe_mode(autopilot: str, vehicle_type: int, custom_mode: int) -> tuple[str, bool]:
