@@ -30,7 +30,7 @@ from sim.autopilot.profile import (
     SimulatedProfile,
     interpret,
 )
-from sim.autopilot.telemetry import HOME_POSITION, GeodeticOrigin, Message, Telemetry, TelemetrySources
+from sim.autopilot.telemetry import HOME_POSITION, BoardClock, GeodeticOrigin, Message, Telemetry, TelemetrySources
 from sim.channel import earliest, within
 from sim.vehicle.interface import SteeredPlant, Supply, Vehicle
 from sim.vehicle.linear import LinearVehicle as Plant
@@ -344,7 +344,7 @@ class Autopilot:
     ) -> None:
         kind = self._kind = SIMULATED[config.sim.autopilot]
         craft: Vehicle = SteeredPlant(vehicle) if isinstance(vehicle, Plant) else vehicle
-        boot_ns = self._boot_ns = start_ns - UPTIME_NS
+        clock = self._clock = BoardClock(start_ns, UPTIME_NS, config.sim.clock_drift_ppm)
         self.craft = craft
         self._mav = mavlink.MAVLink(None, config.sim.system_id, COMPONENT_ID)
         self._out: list[bytes] = []
@@ -355,12 +355,14 @@ class Autopilot:
             self.parameters.set(kind.timeout, config.sim.setpoint_timeout_s)
         self._sync = PeerClock()
         self.estimator = Estimator(kind, self.parameters, craft, self._age_ns)
-        self.pilot = Pilot(kind, craft, self.parameters, self.estimator, boot_ns, airborne=airborne, radio=radio)
+        self.pilot = Pilot(
+            kind, craft, self.parameters, self.estimator, start_ns - UPTIME_NS, airborne=airborne, radio=radio
+        )
         origin = GeodeticOrigin(*kind.origin_deg_m)
         errors = ERRORS[kind.name].scaled(config.sim.inertial.errors)
         self.inertial = InertialSensors(errors, craft, seed, flown=config.sim.inertial.flown)
         parts = self.pilot, self.estimator, self.inertial, self.parameters
-        whole = TelemetrySources(kind, craft, *parts, origin, boot_ns, config.sim.streams)
+        whole = TelemetrySources(kind, craft, *parts, origin, clock, config.sim.streams)
         self.telemetry = Telemetry(whole, start_ns)
         self._commands = Commands(whole, self.telemetry, self._send)
         self._files = Files(self.parameters, packs=kind.name == "ardupilot")
@@ -465,14 +467,14 @@ class Autopilot:
 
     def _on_timesync(self, msg: Any, at_ns: int) -> None:
         if msg.tc1 == 0:
-            self._send(mavlink.MAVLink_timesync_message(at_ns - self._boot_ns, msg.ts1))
+            self._send(mavlink.MAVLink_timesync_message(self._clock.shown_ns(at_ns), msg.ts1))
         else:
-            self._sync.take(msg.ts1, msg.tc1, at_ns - self._boot_ns)
+            self._sync.take(msg.ts1, msg.tc1, self._clock.shown_ns(at_ns))
 
     def _age_ns(self, stamp_ns: int, at_ns: int) -> int:
-        """Return the age that PX4 takes an external position to have [ns]."""
-        now_ns = at_ns - self._boot_ns
-        return now_ns - self._sync.moved_ns(stamp_ns, now_ns)
+        """Return by how much the own clock is ahead of a position's stamp, which only PX4 moves to its clock [ns]."""
+        now_ns = self._clock.shown_ns(at_ns)
+        return now_ns - (self._sync.moved_ns(stamp_ns, now_ns) if self._kind.name == "px4" else stamp_ns)
 
     def _on_command(self, msg: Any, at_ns: int) -> None:
         if self._for_me(msg):

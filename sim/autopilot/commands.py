@@ -159,6 +159,6 @@ class Commands:
         v = self._v
         if v.pilot.armed:
             return FAILED
-        why = preflight(v.kind, v.parameters, v.estimator, v.craft.battery, at_ns - v.boot_ns)
+        why = preflight(v.kind, v.parameters, v.estimator, v.craft.battery, v.clock.shown_ns(at_ns))
         v.pilot.texts.extend((CRITICAL, text) for text in why)
         return ACCEPTED

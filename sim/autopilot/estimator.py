@@ -40,7 +40,8 @@ class Estimator:
 
     Args:
         kind: PX4 or ArduCopter.
-        age_ns: function of (stamp, time) [ns]: the age that PX4 takes a stamp to have, by the sender's clock [ns].
+        age_ns: function of (stamp, time) [ns]: by how much the own clock is ahead of a stamp, to PX4 one moved by what
+            TIMESYNC found [ns].
 
     Attributes:
         valid: whether its position may count as valid, whatever is known of it.
@@ -233,7 +234,7 @@ class Estimator:
         if px4:
             age_s = self._age_ns(1000 * stamp_us, at_ns) * 1e-9 + delay_s
             return age_s if PX4_AGES_S[0] <= age_s <= PX4_AGES_S[1] else None
-        offset_ns = at_ns - 1000 * stamp_us
+        offset_ns = self._age_ns(1000 * stamp_us, at_ns)
         if self._offset_ns is None or not self._offset_ns <= offset_ns <= self._offset_ns + SECOND_NS:
             self._offset_ns = offset_ns  # quicker than any before, or another clock
         return (offset_ns - self._offset_ns) * 1e-9 + delay_s

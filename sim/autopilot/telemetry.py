@@ -193,6 +193,26 @@ ONBOARD_MS = {
 
 
 @dataclass(frozen=True)
+class BoardClock:
+    """Clock of the autopilot's board: time since its boot, faster or slower than ours.
+
+    Attributes:
+        start_ns: our time when the simulation began.
+        uptime_ns: what the clock showed then.
+        drift_ppm: what it gains [millionths].
+    """
+
+    start_ns: int
+    uptime_ns: int
+    drift_ppm: float
+
+    def shown_ns(self, at_ns: int) -> int:
+        """Return what the clock shows at a time of ours [ns]."""
+        since_ns = at_ns - self.start_ns
+        return self.uptime_ns + since_ns + round(since_ns * self.drift_ppm * 1e-6)
+
+
+@dataclass(frozen=True)
 class TelemetrySources:
     """Objects whose state telemetry reports."""
 
@@ -203,7 +223,7 @@ class TelemetrySources:
     inertial: InertialSensors
     parameters: Parameters
     origin: GeodeticOrigin
-    boot_ns: int
+    clock: BoardClock
     streams: str  # `sim.streams`
 
 
@@ -291,10 +311,10 @@ class Telemetry:
     # What it tells
 
     def _boot_ms(self, at_ns: int) -> int:
-        return (at_ns - self._v.boot_ns) // 1_000_000 % 2**32
+        return self._v.clock.shown_ns(at_ns) // 1_000_000 % 2**32
 
     def _boot_us(self, at_ns: int) -> int:
-        return (at_ns - self._v.boot_ns) // 1000
+        return self._v.clock.shown_ns(at_ns) // 1000
 
     def _heartbeat(self, at_ns: int) -> Message:
         pilot = self._v.pilot
@@ -309,7 +329,7 @@ class Telemetry:
 
     def _may_arm(self, at_ns: int) -> bool:
         v = self._v
-        why = preflight(v.kind, v.parameters, v.estimator, v.craft.battery, at_ns - v.boot_ns)
+        why = preflight(v.kind, v.parameters, v.estimator, v.craft.battery, v.clock.shown_ns(at_ns))
         return not (why or v.pilot.lacks_stream(at_ns))
 
     def _status(self, at_ns: int) -> Message:
@@ -449,7 +469,7 @@ class Telemetry:
 
     def _timesync(self, at_ns: int) -> Message:
         """Return a TIMESYNC request of the autopilot's own."""
-        return mavlink.MAVLink_timesync_message(0, at_ns - self._v.boot_ns)
+        return mavlink.MAVLink_timesync_message(0, self._v.clock.shown_ns(at_ns))
 
     def _battery(self, _at_ns: int) -> Message:
         battery = self._v.craft.battery

@@ -231,6 +231,9 @@ class SimConfig(Section, frozen=True, kw_only=True):
     seed: Annotated[int, Meta(ge=0, le=LARGEST_SEED, description="seed of every random draw")] = 0
     start_position_m: Annotated[Position, Meta(description="position at the start, local NED [m]")] = (0.0, 0.0, 0.0)
     start_velocity_mps: Annotated[Wind, Meta(description="velocity at the start, local NED [m/s]")] = (0.0, 0.0, 0.0)
+    clock_drift_ppm: Annotated[
+        float, Meta(ge=-1e5, le=1e5, description="what the vehicle's clock gains [millionths]; recorded: -1.4e4")
+    ] = 0.0
     setpoint_timeout_s: Annotated[
         Annotated[float, Meta(ge=0.01, le=3600)] | None,
         Meta(
