@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import pytest
 
 from uavctl.build.controller import design_of
 from uavctl.cli.app import run
 from uavctl.cli.init import WALL_M, read_sizes, room_text
+from uavctl.cli.sim import VEHICLES
 from uavctl.config import dump_config, load, parse
 from uavctl.config.checks import position_limits_m
 from uavctl.errors import ConfigError, UsageError
@@ -39,6 +41,13 @@ def test_the_file_has_a_dozen_keys_and_is_the_room(autopilot: str, tmp_path: Pat
         assert low < config.target.position_m[place] < high
         assert low < config.sim.start_position_m[place] < high
     assert parse(dump_config(config), "recorded.toml").config == config
+
+
+@pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+def test_the_vehicle_of_the_file_is_the_simulated_one(autopilot: str) -> None:
+    own = urlsplit(parse(written(autopilot), "mine.toml").config.daemon.vehicle)
+    simulated = urlsplit(VEHICLES[autopilot].split(",")[0])
+    assert (own.scheme, simulated.scheme) in {("udpin", "udpout"), ("tcp", "tcpin")} and own.port == simulated.port
 
 
 def test_it_overwrites_nothing(tmp_path: Path) -> None:

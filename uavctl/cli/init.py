@@ -21,6 +21,7 @@ from uavctl.errors import UsageError
 WALL_M = LEAST_OUTSIDE_M  # between a wall and the limit of the vehicle's centre: so far the envelope lets it go
 TIMEOUT_S = 0.7  # COM_OF_LOSS_T and GUID_TIMEOUT of docs/first-flight.md: so long the last acceleration may go on
 MOST_MPS2 = {"px4": 4.0, "ardupilot": 2.0}  # of the presets
+SIMULATED_VEHICLES = {"px4": "udpin://0.0.0.0:14540", "ardupilot": "tcp://127.0.0.1:5760"}  # as of `uavctl sim`
 LEAST_MPS2 = 1.0  # holds the wind that the presets count on (0.6 m/s²), and leaves something to fly with
 LEAST_M = 0.2  # between the places to rest in, so that there is somewhere to fly to
 LARGEST_M = 1000.0
@@ -62,8 +63,8 @@ delay_s = 0.03
 jitter_s = 0.04
 
 [daemon]
-# Where the vehicle and the cameras are heard.
-vehicle = "udpin://0.0.0.0:14540"
+# Where the vehicle and the cameras are heard: the simulated ones of `uavctl sim`.
+vehicle = "{vehicle}"
 mocap = "udpin://0.0.0.0:14560"
 """
 
@@ -144,6 +145,7 @@ def room_text(sizes: tuple[float, float, float], autopilot: str, file: str) -> s
         east=(-east, east),
         top=top,
         target=round(0.5 * top, 2),
+        vehicle=SIMULATED_VEHICLES[autopilot],
     )
 
 
