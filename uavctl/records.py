@@ -180,7 +180,7 @@ class VehicleStatus(Record, frozen=True, kw_only=True):
     fence: bool = False  # it said within the last seconds that it had come beyond a fence of its own
     said: str = ""  # text in which it said so of a failsafe or a fence, within the last seconds
     stick: bool = False  # a stick or switch of its remote control has moved within the last seconds
-    radio: bool = False  # it hears a remote control
+    radio: bool = False  # it hears a remote control, and does not tell its channels
     station: int = 0  # system id of whom else it took an order for a mode from, within the last seconds; 0: nobody
 
 

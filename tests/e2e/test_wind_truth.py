@@ -2,25 +2,42 @@
 
 from __future__ import annotations
 
+import math
+import struct
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from recorded_rig import packets
 
 from sim.simulation import World
 from sim.vehicle.quadrotor import Quadrotor
+from uavctl.build.controller import build_envelope, build_plant
 from uavctl.config import load_config
-from uavctl.flight.envelope import BRAKING, BREACHES, OF_POSITIONS, OUTSIDE
+from uavctl.flight.envelope import (
+    BRAKING,
+    BREACHES,
+    NOT_WATCHING,
+    OF_POSITIONS,
+    OUTSIDE,
+    RESPONSE,
+    Observation,
+    Watching,
+    watch,
+)
+from uavctl.flight.limits import ZERO
 from uavctl.flight.step import STRONG_PUSH
 from uavctl.lab.own_loop import EXTERNAL_ONLY
 from uavctl.lab.trial import WatchedFlyer, beyond_m, controller_of, room_of
-from uavctl.loop import ControlLoop
-from uavctl.records import Event, Outgoing, Record, Send, Vec3
+from uavctl.loop import VEHICLE, ControlLoop, make_links
+from uavctl.mavlink.framing import scan
+from uavctl.records import Event, InertialSample, Outgoing, PositionSample, Record, Send, Vec3, VehicleMotion
 
 MODEL_DRAG_1PS, DRAG_1PS = 0.24, 1.0  # of the simulated Crazyflie, and of PX4's own simulated vehicle
 BEGINS_S, OVER_S = 5.0, 16.0
 POSES = (b"\x66\x00\x00", b"\x4b\x01\x00")  # message ids of VISION_POSITION_ESTIMATE and ODOMETRY in a frame
 NEAR_M = 0.1
+SETPOINT_ACCEL = 10 + 28  # of SET_POSITION_TARGET_LOCAL_NED: header, time, position, velocity
 
 
 @dataclass
@@ -31,6 +48,7 @@ class Blown:
     from_target_m: float  # in the last second
     worst_m: float  # since the wind began
     beyond_m: float  # a wall, at the end
+    furthest_beyond_m: float  # at any time
     relayed_s: list[float]  # when positions went to the vehicle
     let_go_s: float | None
     mode: str
@@ -68,7 +86,7 @@ class _Flyer(WatchedFlyer):
         super().tick(tick, at_ns, noting)
 
 
-def blown(autopilot: str, push_mps2: Vec3, *overrides: str, seed: int = 3) -> Blown:
+def blown(autopilot: str, push_mps2: Vec3, *overrides: str, seed: int = 3, over_s: float = OVER_S) -> Blown:
     """A vehicle at rest at the preset's target; the wind pushes it with so much while it stands still."""
     config = load_config(
         f"room-{autopilot}",
@@ -94,16 +112,18 @@ def blown(autopilot: str, push_mps2: Vec3, *overrides: str, seed: int = 3) -> Bl
         assert world.peers.autopilot.parameters.set(name, value)
     world.peers.autopilot.estimator.begin_in_flight()
     flyer.craft, flyer.where = craft, lambda: craft.position_m
-    world.run(OVER_S)
+    world.run(over_s)
     times, where = np.array(flyer.times_s), np.array(flyer.positions_m)
-    off = np.linalg.norm(where - np.array(config.target.position_m), axis=1)
+    goals = (config.target.position_m, *config.mission.waypoints)
+    off = np.linalg.norm(where - np.array(goals[-1]), axis=1)
     lower, upper = room_of(config)
     let_go = [event.at_ns * 1e-9 for event in told.events if event.code in BREACHES]
     return Blown(
         codes=[event.code for event in told.events],
-        from_target_m=float(off[times > OVER_S - 1.0].max()),
+        from_target_m=float(off[times > over_s - 1.0].max()),
         worst_m=float(off[times > BEGINS_S].max()),
         beyond_m=float(beyond_m(where[-1:, :2], lower[:2], upper[:2])[0]),
+        furthest_beyond_m=float(beyond_m(where[:, :2], lower[:2], upper[:2]).max()),
         relayed_s=flyer.relayed_s,
         let_go_s=min(let_go, default=None),
         mode=world.peers.autopilot.mode_name,
@@ -141,6 +161,29 @@ def test_a_wind_that_it_cannot_hold_lets_it_land_by_its_positions(autopilot: str
     assert len(after) > 20 and max(np.diff([flight.let_go_s, *after])) < 1.0
 
 
+CROSSES = "mission.waypoints=[[1.5,1.0,-1.2],[-1.5,-1.0,-1.0],[1.5,-1.5,-1.2]]"
+TURN_S = 9.0  # when it turns at the second waypoint
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("autopilot", "push_mps2", "overrides"),
+    [
+        ("px4", (1.5, 0.0, 0.0), ()),
+        ("ardupilot", (1.5, 0.0, 0.0), ()),
+        # In the turn its drag is the larger part of what pushes it; after it, the other way around.
+        ("px4", (1.0, 1.1, 0.0), (CROSSES, "sim.start_position_m=[-2.4, -1.9, -0.7]")),
+    ],
+)
+@pytest.mark.fault(71)
+def test_a_blackout_in_wind_is_flown_through(autopilot: str, push_mps2: Vec3, overrides: tuple[str, ...]) -> None:
+    """Positions that come back correct the vehicle's own velocity: that it moves, or does not brake, is not so."""
+    dark = f"link.blackout=[[{TURN_S}, {TURN_S + 4.0}]]"
+    flight = blown(autopilot, push_mps2, dark, *overrides, over_s=21.0)
+    assert "fallback-brake" in flight.codes and flight.let_go_s is None
+    assert flight.from_target_m < NEAR_M and flight.furthest_beyond_m < 0.0
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 @pytest.mark.fault(42)
@@ -150,3 +193,60 @@ def test_positions_that_turn_in_a_wind_are_found_and_held_back(autopilot: str) -
     flight = blown(autopilot, (1.5, 0.0, 0.0), turns)
     assert "fallback-land" in flight.codes
     assert max(flight.relayed_s) < 8.5
+
+
+# A real autopilot's software in wind: what was recorded of a flight that was let go.
+
+STEADY = "px4-sih-relay-steady-wind"
+TICK_NS = 50_000_000
+NO_VELOCITY: Vec3 = (math.nan, math.nan, math.nan)
+
+
+def watched(*, feels: bool) -> tuple[Watching, str | None, float]:
+    """The envelope's state, breach, and time [s] at the end of the recording, or where it finds a breach."""
+    config = load_config("room-px4", ["daemon.mocap=tlog", "daemon.vehicle=tlog", "relay.enabled=true"])
+    parameters, link = build_envelope(config, build_plant(config)), make_links(config)[VEHICLE]
+    watching, motion, felt = NOT_WATCHING, None, None
+    setpoint: Vec3 | None = None
+    acts, samples = ZERO, list[PositionSample]()
+    begin_ns = now_ns = packets(STEADY)[0].at_ns
+    for one in packets(STEADY):
+        if one.at_ns >= now_ns + TICK_NS:
+            now_ns += TICK_NS
+            if setpoint is not None:
+                seen = Observation(
+                    at_ns=now_ns,
+                    samples=tuple(samples),
+                    sent_mps2=acts,
+                    position_m=None,
+                    velocity_mps=NO_VELOCITY,
+                    motion=motion,
+                    braking=False,
+                    inertial_mps2=felt if feels else None,
+                )
+                watching, breach = watch(watching, seen, parameters)
+                if breach is not None:
+                    return watching, breach.code, (now_ns - begin_ns) * 1e-9
+            acts, samples = setpoint or ZERO, []
+        if one.outgoing:
+            (frame,) = scan(one.data, final=True).frames
+            setpoint = struct.unpack_from("<3f", frame.data, SETPOINT_ACCEL)
+            continue
+        for item in link.receive(one.data, one.at_ns).items:
+            if isinstance(item, PositionSample):
+                samples.append(item)
+            elif isinstance(item, VehicleMotion):
+                motion = item
+            elif isinstance(item, InertialSample):
+                felt = item.accel_mps2
+    return watching, None, (now_ns - begin_ns) * 1e-9
+
+
+@pytest.mark.fault(71)
+def test_a_recorded_wind_that_px4_held_is_no_false_position_by_its_inertial_data() -> None:
+    """Its client of then looked at positions and setpoints alone, and let it go after 13.4 s."""
+    blind, code, at_s = watched(feels=False)
+    assert code == RESPONSE and at_s == pytest.approx(13.4, abs=0.1) and not blind.pushed
+    felt, none, end_s = watched(feels=True)
+    assert none is None and end_s >= at_s
+    assert felt.pushed and felt.push_mps2[0] == pytest.approx(-1.7, abs=0.3)

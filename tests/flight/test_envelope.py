@@ -167,6 +167,24 @@ def test_braking_has_a_second_to_show(for_ns: int, breached: bool) -> None:
         assert (breach is not None) == (breached and fast)
 
 
+@pytest.mark.parametrize(("silent", "found"), [(False, [1500]), (True, [])])
+@pytest.mark.fault(43)
+def test_positions_that_come_back_correct_its_own_velocity_and_begin_braking_anew(
+    silent: bool, found: list[int]
+) -> None:
+    parameters = replace(PARAMETERS, disagreement_mps=100.0, unexplained_mps2=100.0)
+    watching, breaches = NOT_WATCHING, []
+    for now_ms in range(0, 2600, 50):
+        at_ns = START_NS + now_ms * MS
+        taken = () if silent and 0 < now_ms < 1500 else (sample(at_ns, at_ns, ZERO),)
+        own = motion((0.1 if now_ms < 1500 else 0.9, 0.0, 0.0), at_ns)
+        watching, breach = watch(watching, structs.replace(seen(at_ns, *taken, own=own), braking=True), parameters)
+        if breach is not None:
+            assert breach.code == BRAKING
+            breaches.append(now_ms)
+    assert breaches[:1] == found
+
+
 # Attitude
 
 

@@ -508,7 +508,7 @@ def later(watching: Watching, by_ns: int) -> Watching:
     def moved(pairs: tuple[tuple[int, Any], ...]) -> tuple[tuple[int, Any], ...]:
         return tuple((at_ns + by_ns, value) for at_ns, value in pairs)
 
-    names = ("tick_ns", "began_ns", "over_ns", "apart_ns", "clean_ns", "outside_ns")
+    names = ("tick_ns", "began_ns", "over_ns", "apart_ns", "resumed_ns", "clean_ns", "outside_ns")
     times = {name: at_ns + by_ns for name in names if (at_ns := getattr(watching, name)) is not None}
     rows = {name: moved(getattr(watching, name)) for name in ("sent", "way", "offsets", "places")}
     observer, braking = watching.observer, watching.braking

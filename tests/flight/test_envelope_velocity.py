@@ -364,3 +364,35 @@ def test_which_own_velocity_may_be_braked_on(
     ours = structs.replace(seen(AT_NS, own=motion(own, AT_NS)), velocity_mps=known)
     watching = Watching(contradicted=contradicted)
     assert own_velocity(watching, ours, age_s, PARAMETERS) == (own if believed else None)
+
+
+@pytest.mark.fault(42)
+@pytest.mark.parametrize(
+    ("silence_ms", "for_ms", "found"),
+    [
+        (4000, 500, False),  # what positions correct after a silence
+        (1050, 500, False),
+        (900, 500, True),  # it has hardly flown without them
+        (4000, 9000, True),  # they move otherwise for good
+    ],
+)
+def test_the_first_second_of_positions_after_a_silence_corrects_the_vehicle_s_own_velocity(
+    silence_ms: int, for_ms: int, found: bool
+) -> None:
+    """At rest by its positions; by its own word it moves at 1.5 times what is allowed from their return on."""
+    parameters = replace(PARAMETERS, unexplained_mps2=100.0)
+    watching, found_ms = NOT_WATCHING, []
+    back_ms = 3000 + silence_ms
+    for now_ms in range(0, back_ms + 3000, 50):
+        at_ns = START_NS + now_ms * MS
+        moves = back_ms <= now_ms < back_ms + for_ms
+        own = motion((1.5 * PARAMETERS.disagreement_mps if moves else 0.0, 0.0, 0.0), at_ns)
+        taken = () if 3000 < now_ms < back_ms else (sample(at_ns, at_ns, ZERO),)
+        watching, breach = watch(watching, seen(at_ns, *taken, own=own), parameters)
+        if breach is not None:
+            assert breach.code == VELOCITY
+            found_ms.append(now_ms - back_ms)
+    assert bool(found_ms) == found
+    if found:
+        late_ms = 2200 if silence_ms > 1000 else 0  # the window of comparison, 1.2 s, begins after that second
+        assert late_ms <= found_ms[0] <= late_ms + 1000

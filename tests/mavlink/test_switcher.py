@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.config.connections import HandOverConfig
 from uavctl.mavlink.handover_states import HandoverState
-from uavctl.mavlink.messages import Ack, FenceBreach, Heartbeat, RadioChannels, Text
+from uavctl.mavlink.messages import Ack, Battery, FenceBreach, Heartbeat, RadioChannels, Text
 from uavctl.mavlink.profile import PROFILES, describe_mode
 from uavctl.mavlink.requests import RequestKind
 from uavctl.mavlink.switcher import Switcher, who_switched
@@ -95,11 +95,11 @@ class Vehicle:
         self.status: VehicleStatus | None = None
         self.beat(EXTERNAL_NUMBER[autopilot])
 
-    def say(self, message: Ack | FenceBreach | Heartbeat | RadioChannels | Text) -> None:
+    def say(self, message: Ack | Battery | FenceBreach | Heartbeat | RadioChannels | Text) -> None:
         for item in self.watch.take(message, self.now_ns):
             self.status = item if isinstance(item, VehicleStatus) else self.status
 
-    def beat(self, mode: int) -> None:
+    def beat(self, mode: int, *, critical: bool = False) -> None:
         self.say(
             Heartbeat(
                 system=1,
@@ -108,9 +108,12 @@ class Vehicle:
                 autopilot=NUMBER[self.autopilot],
                 base_mode=128,
                 custom_mode=mode,
-                system_status=mavlink.MAV_STATE_ACTIVE,
+                system_status=mavlink.MAV_STATE_CRITICAL if critical else mavlink.MAV_STATE_ACTIVE,
             )
         )
+
+    def radio(self, *, heard: bool) -> None:
+        self.say(Battery(system=1, component=1, voltage_v=None, radio=heard))
 
     def text(self, text: str, severity: int = 6) -> None:
         self.say(Text(system=1, component=1, severity=severity, text=text))
@@ -172,6 +175,70 @@ def test_a_switch_of_the_remote_control_is_the_pilot_s_and_a_hand_that_rests_is_
     assert vehicle.who() is Switcher.PILOT
     vehicle.text("Radio Failsafe")  # its receiver moves them, and nobody's hand
     assert vehicle.who() is Switcher.FAILSAFE
+
+
+MANUAL = {"px4": px4(3), "ardupilot": 5}
+
+
+@BOTH
+@pytest.mark.parametrize("mode", [MANUAL, HOME])
+def test_channels_that_are_told_and_rest_are_no_pilot_s_switch_whatever_the_mode(
+    autopilot: str, mode: dict[str, int]
+) -> None:
+    vehicle = Vehicle(autopilot)
+    vehicle.radio(heard=True)
+    vehicle.channels(1500, 1500, 1500, 1500, 1800)
+    vehicle.beat(mode[autopilot])
+    assert vehicle.who() is Switcher.UNKNOWN  # a ground station over another link, perhaps
+    vehicle.channels(1500, 1500, 1500, 1500, 1300)
+    assert vehicle.who() is Switcher.PILOT
+
+
+@BOTH
+def test_a_receiver_that_has_lost_its_remote_control_moves_the_channels_by_itself(autopilot: str) -> None:
+    for mode in (MANUAL, HOME):
+        vehicle = Vehicle(autopilot)
+        vehicle.radio(heard=True)
+        vehicle.channels(1500, 1500, 1500, 1500, 1800)
+        vehicle.radio(heard=False)
+        vehicle.channels(1500, 1500, 950, 1500, 1300)
+        vehicle.beat(mode[autopilot])
+        assert vehicle.who() is Switcher.UNKNOWN
+        vehicle.beat(mode[autopilot], critical=True)
+        assert vehicle.who() in (Switcher.FAILSAFE, Switcher.UNKNOWN)
+
+
+@BOTH
+@pytest.mark.parametrize("gap_s", [1, 3, 8])
+def test_what_was_seen_since_the_last_heartbeat_counts_however_late_the_next_one_comes(
+    autopilot: str, gap_s: int
+) -> None:
+    for word, who in (("Max Alt fence breached", Switcher.FENCE), ("", Switcher.PILOT)):
+        vehicle = Vehicle(autopilot)
+        vehicle.channels(1500, 1800)
+        vehicle.now_ns += SECOND // 10
+        if word:
+            vehicle.text(word)
+        else:
+            vehicle.channels(1500, 1300)
+        vehicle.now_ns += gap_s * SECOND
+        vehicle.beat(HOME[autopilot])
+        assert vehicle.who() is who
+        vehicle.now_ns += SECOND
+        vehicle.beat(EXTERNAL_NUMBER[autopilot])
+        vehicle.now_ns += 2 * SECOND
+        vehicle.beat(HOME[autopilot])
+        assert vehicle.who() is Switcher.UNKNOWN  # that was another switch
+
+
+def test_a_px4_whose_words_are_events_only_shows_its_failsafe_by_its_heartbeats() -> None:
+    """An event is no text; `vehicle_status.failsafe` makes MAV_STATE_CRITICAL (streams/HEARTBEAT.hpp)."""
+    auto = [px4(4, sub) for sub in (3, 5, 6, 9, *range(11, 19), 20)]
+    for mode in [px4(main) for main in (1, 2, 3, 7, 10)] + auto:
+        vehicle = Vehicle("px4")
+        vehicle.radio(heard=True)
+        vehicle.beat(mode, critical=True)
+        assert vehicle.who() is Switcher.FAILSAFE, mode
 
 
 def test_a_fence_that_is_told_without_words_and_an_order_of_a_ground_station() -> None:

@@ -367,7 +367,7 @@ def choose(state: ControlState, tick: Tick, inp: StepInput, controller: Controll
     if state.plan is not None and controller.envelope is not None and _nonsense(state):
         why = "positions are further out than any can be: braking until they are believed again, or not any more"
         return _fall(state, fb.enter(inp.at_ns), tick, inp, controller, why)
-    if state.plan is not None and _misled(state, tick, inp, controller):
+    if state.plan is not None and is_misled(state, tick, inp, controller):
         why = "the vehicle moves otherwise than was predicted, and no position says why"
         return _fall(state, fb.enter(inp.at_ns), tick, inp, controller, why)
     if tick.boundary:
@@ -582,8 +582,8 @@ def _nonsense(state: ControlState) -> bool:
     return state.trust.absurd is not None and state.trust.absurd.likely
 
 
-def _misled(state: ControlState, tick: Tick, inp: StepInput, controller: Controller) -> bool:
-    """Whether a plan that plays out was made from an estimate that proved wrong."""
+def is_misled(state: ControlState, tick: Tick, inp: StepInput, controller: Controller) -> bool:
+    """Whether a prediction without positions proved wrong by the vehicle's own velocity."""
     if controller.envelope is None or tick.estimate is None or (tick.age_steps or 0) < PLAYED_OUT_STEPS:
         return False
     seen = seen_of(tick, inp, state.accel_mps2, controller.plant)

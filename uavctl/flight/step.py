@@ -23,6 +23,7 @@ from uavctl.flight.decision import (
     back_mps2,
     choose,
     held_mps2,
+    is_misled,
     judge_answer,
     mode_of,
     moving_mps,
@@ -422,8 +423,10 @@ def _watched(
         braking=mode_of(state) is ControlMode.BRAKE,
         inertial_mps2=None if felt is None else felt[0],
     )
-    if recalled or tick.age_steps is None or tick.age_steps >= controller.horizon:
-        seen = replace(seen, position_m=None)  # a prediction that is so old is held against nothing
+    old = tick.age_steps is None or tick.age_steps >= controller.horizon
+    # A prediction that is so old, or contradicted by the vehicle's own velocity, is held against nothing.
+    if recalled or old or is_misled(state, tick, inp, controller):
+        seen = replace(seen, position_m=None)
     watching, aloft = state.watching, state.aloft
     if watching.began_ns is None and aloft.answered and felt is not None and not state.strayed:
         watching = replace(watching, agreed=True)

@@ -140,7 +140,8 @@ PROFILES = {
         climbing=frozenset({"AUTO.TAKEOFF", "AUTO.LOITER"}),
         landing=frozenset({"AUTO.LAND", "AUTO.PRECLAND", "AUTO.DESCEND"}),
         choices=_PX4_CHOICES,
-        degrades=frozenset({"POSCTL", "ALTCTL", "STABILIZED", "MANUAL"}),  # COM_OBL_RC_ACT 0 to 2, COM_POSCTL_NAVL
+        # COM_OBL_RC_ACT 0 to 2, COM_POSCTL_NAVL; a mode of another program that stands for RTL or LAND
+        degrades=frozenset({"POSCTL", "ALTCTL", "STABILIZED", "MANUAL", *(f"AUTO.EXTERNAL{n}" for n in range(1, 9))}),
         returns=True,
         climbs_on_arming=True,
         reads_raw=False,

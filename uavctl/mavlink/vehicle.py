@@ -174,15 +174,23 @@ def _plain(first: Text, text: str) -> Text:
 
 
 class SwitchEvidence:
-    """What the vehicle says, and shows, of who changes its modes: each counts for `EVIDENCE_NS`."""
+    """What the vehicle says, and shows, of who changes its modes.
+
+    Each counts for `EVIDENCE_NS`, and longer where no heartbeat has come since: the mode may have changed right after.
+    """
 
     def __init__(self) -> None:
-        self._failsafe_ns = self._fence_ns = self._said_ns = self._stick_ns = self._station_ns = -EVIDENCE_NS
+        self._failsafe_ns = self._fence_ns = self._said_ns = self._stick_ns = self._station_ns = NEVER_NS
+        self._beats_ns = NEVER_NS, NEVER_NS  # the newest heartbeat, and the one before
         self._said = ""
         self._station = 0
         self._rest_us: list[int] = []  # of each channel, since it moved last; 0: not known
-        self._radio = False
+        self._radio: bool | None = None  # None before it says so
         self._fenced = True
+
+    def beat(self, at_ns: int) -> None:
+        """Take a heartbeat, which shows the mode."""
+        self._beats_ns = at_ns, self._beats_ns[0]
 
     def word(self, text: str, at_ns: int) -> None:
         """Take a text, of any severity."""
@@ -194,7 +202,7 @@ class SwitchEvidence:
         if failsafe:
             self._failsafe_ns = at_ns
         elif "failsafe" in text.lower() and "clear" in text.lower():
-            self._failsafe_ns = at_ns - EVIDENCE_NS
+            self._failsafe_ns = NEVER_NS
 
     def fence(self, at_ns: int, *, within: bool) -> None:
         """Take whether it is within its fence; that it comes beyond it counts."""
@@ -222,15 +230,20 @@ class SwitchEvidence:
 
     def on(self, status: VehicleStatus, at_ns: int, *, critical: bool) -> VehicleStatus:
         """Return a status with what counts at a time; `critical`: by its heartbeat a failsafe acts."""
-        said = self._said if at_ns - self._said_ns < EVIDENCE_NS else ""
+        since_ns = at_ns - EVIDENCE_NS
+        if self._beats_ns[1] > NEVER_NS:
+            since_ns = min(since_ns, self._beats_ns[1])
+        said = self._said if self._said_ns > since_ns else ""
+        # A receiver that has lost its remote control moves the channels by itself.
+        lost = self._radio is False or speaks_of_radio(said)
         return msgspec.structs.replace(
             status,
-            failsafe=critical or at_ns - self._failsafe_ns < EVIDENCE_NS,
-            fence=at_ns - self._fence_ns < EVIDENCE_NS,
+            failsafe=critical or self._failsafe_ns > since_ns,
+            fence=self._fence_ns > since_ns,
             said=said,
-            stick=at_ns - self._stick_ns < EVIDENCE_NS and not speaks_of_radio(said),
-            radio=self._radio,
-            station=self._station if at_ns - self._station_ns < EVIDENCE_NS else 0,
+            stick=self._stick_ns > since_ns and not lost,
+            radio=bool(self._radio) and not self._rest_us,
+            station=self._station if self._station_ns > since_ns else 0,
         )
 
 
@@ -248,6 +261,7 @@ GONE_NS = 30_000_000_000  # and after that one its place is taken, if it stood o
 BOOTING_NS = 3_000_000_000  # of silence before a heartbeat of booting, for that to be a restart
 # For which what it says of failsafes, fences and sticks speaks for its mode: heartbeats come once a second.
 EVIDENCE_NS = 2_000_000_000
+NEVER_NS = -(2**63)
 STICK_US = 100  # by which a channel of a remote control moves at least when a person moves it: a tenth of its way
 TURNED_NS = 100_000_000  # an attitude that is older turns no specific force: at 1 rad/s it is 0.1 rad, 1 m/s², off
 GRAVITY_MPS2 = 9.80665
@@ -567,6 +581,7 @@ class VehicleWatch:
             boots=self.boots,
             alone=self._another_ns is None or at_ns - self._another_ns > ALONE_NS,
         )
+        self._evidence.beat(at_ns)
         self._status = self._evidence.on(status, at_ns, critical=self._critical)
         return (self._status,)
 
