@@ -139,7 +139,7 @@ def test_the_promise_is_told_by_what_was_measured(
         text = text_of(write_report(folder))
     word = "Promise kept" if len(cells) == 1 and most <= 5.0 else "Perhaps too often" if chance else "Promise broken"
     (first,) = re.findall(rf"{word}: (.*?allowed)", text)
-    assert numbers_in(first) == [*cells, most, 5.0] and text.count(f"{most:g} %") == 1
+    assert numbers_in(first) == [*cells, most, 5.0]
 
 
 def test_a_baseline_that_is_better_outright_is_told(tmp_path: Path) -> None:
