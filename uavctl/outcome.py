@@ -262,9 +262,10 @@ class FlightCourse:
             cause = Cause.NO_TAKE_OFF if one.ask is RequestKind.TAKE_OFF and not one.granted else Cause.NO_CLIMB
         elif one.before is HandoverState.RETURNING:
             return  # the pilot has it still
+        elif silent(self._now_ns, vehicle):  # it has refused nothing, nor has the fallback landed it
+            self._found = None if self._found in (Cause.FALLBACK, Cause.NO_CLIMB) else self._found
+            self._find(Cause.SILENT, "")
         if cause is Cause.LANDING_FAILED:
-            if silent(self._now_ns, vehicle):
-                self._find(Cause.SILENT, "")
             self._failed = _reason(one)
         elif cause is Cause.FAILSAFE:
             self._found = self._found if self._found in _OWN else cause
@@ -339,12 +340,13 @@ class FlightCourse:
             flew = self._aloft and self._found is not Cause.DISARMED
             down = "it has landed and disarmed" if flew else "it is disarmed"
             return down if self._armed else "it was not armed"
-        heard = ""
         if silent(self._now_ns, vehicle):
-            heard = f", not heard for {(self._now_ns - vehicle.at_ns) / SECOND_NS:.0f} s"
+            since_s = (self._now_ns - vehicle.at_ns) / SECOND_NS
+            was = "stood on the ground" if vehicle.landed else "was in the air"
+            return f"when it was last heard, {since_s:.0f} s before, it {was}, armed, {mode}"
         if vehicle.landed:
-            return f"it stands on the ground, armed, {mode}{heard}"
-        return f"it is in the air, {mode}{heard}"
+            return f"it stands on the ground, armed, {mode}"
+        return f"it is in the air, {mode}"
 
 
 def _reason(one: Passage) -> str:

@@ -498,7 +498,7 @@ def _velocity(position: Position) -> Vec3 | None:
 def facts_of(info: MavlinkFlightInfo) -> Iterator[tuple[str, str]]:
     """Return names and values for a table, on a page or in a terminal."""
     yield "recording", info.recording
-    yield "begins at", info.begin_utc or "not told"
+    yield "begins at", info.begin_utc or "unknown"
     yield "duration", f"{info.duration_s:.1f} s"
     yield "autopilot", f"{info.autopilot}, system {info.vehicle_system}" if info.vehicle_system is not None else "none"
     own = f"{info.own_positions} ({info.own_source})" if info.own_positions else "none"

@@ -340,9 +340,17 @@ def errors_from_arrival(t_s: Floats, error_m: Floats, moved: NDArray[np.bool_]) 
 
 
 def state_outside(flight: FlightData) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Return at which flown boundaries the state violates its set or a fence (n,); NaN counts as outside."""
-    limits = limits_at(flight, flight.steps.t_s)
-    return _outside(flight.steps.state, flight.design.c_x, limits, RELATIVE_TOLERANCE)
+    """Return at which flown boundaries the state violates its set or a fence (n,); NaN counts as outside.
+
+    Where the truth is unknown, a state without a position that plans still reach from is a mere prediction, and no step
+    counts as outside by it.
+    """
+    steps = flight.steps
+    outside = _outside(steps.state, flight.design.c_x, limits_at(flight, steps.t_s), RELATIVE_TOLERANCE)
+    if not steps.from_truth:
+        ages = np.array([0 if one.age_steps is None else one.age_steps for one in steps.decisions])
+        outside &= ages <= flight.design.horizon
+    return outside
 
 
 def input_outside(flight: FlightData) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
@@ -409,22 +417,30 @@ def rows(summary: FlightSummary) -> list[tuple[str, str]]:
         _punctuality(s),
     ]
     if s.recorder_dropped:
-        found.append(("Recording", f"{s.recorder_dropped} records dropped: the disk was too slow"))
+        found.append(("Recording", _lack(s.recorder_dropped)))
     found += [(name, path) for name, path in (("Recorded in", s.recording), ("Report", s.report)) if path]
     return found
 
 
 def _pace(s: FlightSummary) -> str:
-    if s.wall_s is None:
+    if s.wall_s is None or not _in_virtual_time(s):
         return ""
     speed = "" if s.real_time_factor is None else f" ({number(s.real_time_factor, 1)} × real time)"
     return f" in {number(s.wall_s)} s{speed}"
 
 
 def _punctuality(s: FlightSummary) -> tuple[str, str]:
-    if s.tick_lateness_us.max == 0 and not s.missed_ticks:
+    if _in_virtual_time(s):
         return "Clock", "virtual time"
-    return "Tick lateness", f"{_times(s.tick_lateness_us)}; {s.missed_ticks} ticks missed"
+    return "Tick lateness", f"{_times(s.tick_lateness_us)}; {count(s.missed_ticks, 'tick')} missed"
+
+
+def _in_virtual_time(s: FlightSummary) -> bool:
+    return s.tick_lateness_us.max == 0 and not s.missed_ticks
+
+
+def _lack(records: int) -> str:
+    return f"{count(records, 'record')} dropped, and missing from all figures: the disk was too slow"
 
 
 def _distance(s: FlightSummary) -> str:

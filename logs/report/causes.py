@@ -25,6 +25,7 @@ class HeadlineCause(StrEnum):
     CONTROL_FAILED = "control-failed"
     RECORDING_CUT = "recording-cut"
     FLOWN_BLIND = "flown-blind"
+    STOOD_STILL = "stood-still"
     VEHICLE_FENCE = "vehicle-fence"
     BATTERY_LOW = "battery-low"
     VEHICLE_POSITION_LOST = "vehicle-position-lost"
@@ -88,6 +89,7 @@ _TABLE: dict[HeadlineCause, tuple[CauseRank, str, str]] = {
     _C.CONTROL_FAILED: (_R.LOST, BAD, "Controller failed"),
     _C.RECORDING_CUT: (_R.BLIND, BAD, "Recording breaks off"),
     _C.FLOWN_BLIND: (_R.BLIND, BAD, "Flown blind"),
+    _C.STOOD_STILL: (_R.BLIND, BAD, "Controller stood still"),
     _C.VEHICLE_FENCE: (_R.FAILSAFE, BAD, "The vehicle's own fence"),
     _C.BATTERY_LOW: (_R.FAILSAFE, BAD, "Battery low"),
     _C.VEHICLE_POSITION_LOST: (_R.FAILSAFE, BAD, "The vehicle lost its position"),
@@ -114,10 +116,10 @@ _TABLE: dict[HeadlineCause, tuple[CauseRank, str, str]] = {
     _C.NOT_REACHED: (_R.QUALITY, MIND, "Not there yet"),
     _C.OFF_TRACK: (_R.QUALITY, MIND, "Off its track"),
     _C.WIND: (_R.QUALITY, MIND, "Pushed off"),
-    _C.PLANS_RELAXED: (_R.QUALITY, MIND, "Plans relaxed"),
-    _C.LINK_WORSE: (_R.QUALITY, MIND, "Link worse than designed"),
-    _C.VEHICLE_WARNED: (_R.DETAIL, MIND, "The vehicle warned"),
-    _C.SECOND_VEHICLE: (_R.DETAIL, MIND, "Another vehicle"),
+    _C.PLANS_RELAXED: (_R.DETAIL, MIND, "Plans relaxed"),
+    _C.LINK_WORSE: (_R.DETAIL, MIND, "Link worse than designed"),
+    _C.VEHICLE_WARNED: (_R.QUALITY, MIND, "The vehicle warned"),
+    _C.SECOND_VEHICLE: (_R.QUALITY, MIND, "Another vehicle"),
     _C.NO_VEHICLE: (_R.DETAIL, MIND, "No vehicle"),
     _C.NOT_ARMED: (_R.DETAIL, MIND, "Not armed"),
     _C.ARMING_UNKNOWN: (_R.DETAIL, MIND, "Arming not known"),
@@ -129,12 +131,14 @@ _RANKS = tuple(CauseRank)
 _ROOTS = (
     _C.BATTERY_EMPTY,
     _C.BATTERY_LOW,
+    _C.STOOD_STILL,
     _C.RELAY_SILENT,
     _C.POSITIONS_FROZEN,
     _C.POSITIONS_JUMPED,
     _C.POSITIONS_DRIFTED,
     _C.STAMPS_UNUSABLE,
     _C.POSITIONS_INVALID,
+    _C.POSITIONS_ABSENT,
     _C.FLOWN_BLIND,
     _C.SILENCE,
     _C.POSITIONS_APART,
@@ -210,11 +214,16 @@ def make_headline(findings: Iterable[Finding], outcome: str = "", why: Iterable[
         tone=main.tone or tone,
         word=word,
         text=f"{'; '.join(told)}.",
-        why=(*(one.sentence for one in others if one is not root), *why),
+        why=(*(one.sentence for one in others if one is not root and not _in_outcome(one, outcome)), *why),
         at_s=main.at_s if main.look_s is None else main.look_s,
         cause=main.cause,
         causes=tuple(dict.fromkeys(one.cause for one in (main, *others))),
     )
+
+
+def _in_outcome(one: Finding, outcome: str) -> bool:
+    """Return whether the line itself says how the flight ended."""
+    return bool(outcome) and one.cause is _C.NOT_AS_ORDERED
 
 
 _MEANWHILE_S = 1.0  # a heartbeat: causes are known that much later than what they bring about

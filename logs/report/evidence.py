@@ -16,11 +16,12 @@ from logs.report.excursion import Clearance, Excursion, excursions
 from logs.report.verdicts import Judged, flown_config
 from uavctl.build.controller import build_estimator
 from uavctl.config import Config
-from uavctl.records import Decision
+from uavctl.records import Decision, LinkStats
 
 _PUSH_MPS2, _PUSH_MPS = 0.1, 0.3  # carries a vehicle off by as much as is worth telling, if it lasts
 _LOOKED_AT_S, _AFTER_S = 0.3, 3.0  # least time to tell a push in, and the longest until a limit is left for it
 
+STALLED_S = 0.5  # between two ticks: the process stood still, and heard nothing
 _BEAT_S = 1.0  # between two heartbeats
 
 
@@ -70,6 +71,11 @@ class FlightEvidence:
     def armed(self, at_s: float) -> bool:
         """Return whether the vehicle was armed at a time, to a heartbeat's period."""
         return any(begin - _BEAT_S <= at_s <= end + _BEAT_S for begin, end in self.armed_spans)
+
+    @cached_property
+    def last_links(self) -> tuple[LinkStats, ...]:
+        """The last counters of each connection, by its name."""
+        return tuple({one.link: one for one in sorted(self.flight.links, key=lambda one: one.link)}.values())
 
     @cached_property
     def battery_v(self) -> tuple[Floats, Floats]:
@@ -141,6 +147,13 @@ class FlightEvidence:
             taken_s = self.taken_s[self.taken_s <= at_s]
             return at_s - float(taken_s[-1]) if len(taken_s) else 0.0
         return self.flight.estimates[place].age_s + at_s - float(self.estimate_s[place])
+
+    def stalled_s(self, at_s: Floats) -> Floats:
+        """Return for how long until each time (n,) we did not run [s]: what came then was heard later, all at once."""
+        ticks_s = self.flight.seconds([one.at_ns for one in self.flight.decisions])
+        pauses_s = np.diff(ticks_s)
+        stalled_s = np.append(0.0, np.cumsum(np.where(pauses_s > STALLED_S, pauses_s, 0.0)))
+        return np.asarray(np.interp(at_s, ticks_s, stalled_s), dtype=np.float64)
 
     def blind_from_s(self) -> float:
         """Return the age of a position from which the vehicle counts as flown blind [s]."""

@@ -1,7 +1,7 @@
 """Excursions: where and when the vehicle was beyond a limit of its position, and by how much.
 
 Judged over all that was recorded of the vehicle in the air, its own climb and landing too: by the truth where that is
-known, else by the estimate, as long as it is flown by or positions come.
+known, else by the estimate, until its newest position is as old as plans reach.
 """
 
 from __future__ import annotations
@@ -134,13 +134,9 @@ def _runs(outside: NDArray[np.bool_], t_s: Floats) -> list[tuple[int, int]]:
 
 
 def trusted(flight: FlightData) -> tuple[Estimate, ...]:
-    """Return the estimates that say where the vehicle is: of flown ticks, and of later ones with a recent position.
-
-    Once it has been handed over, and no position comes, nothing in an estimate tells how it moves.
-    """
-    until_ns = max((one.at_ns for one in flight.flown if one.mode in FLOWN), default=flight.decisions[-1].at_ns)
+    """Return the estimates that say where the vehicle is: those with a position that plans still reach from."""
     reach_s = flight.design.horizon * flight.design.dt_s
-    return tuple(one for one in flight.estimates if one.at_ns <= until_ns or one.age_s <= reach_s)
+    return tuple(one for one in flight.estimates if one.age_s <= reach_s)
 
 
 def _course(flight: FlightData) -> tuple[Floats, Floats, NDArray[np.bool_]]:
@@ -154,7 +150,8 @@ def _course(flight: FlightData) -> tuple[Floats, Floats, NDArray[np.bool_]]:
         flown |= (t_s >= begun_s) & (t_s < ended_s)
     kept = (t_s >= _aloft_s(flight)) & np.isfinite(position_m).all(axis=1)
     if not flight.truths:
-        kept &= flown | np.array([one.age_s <= BLIND_S for one in flight.estimates], dtype=np.bool_)
+        age_s = np.array([one.age_s for one in flight.estimates])
+        kept &= (flown & (age_s <= flight.design.horizon * flight.design.dt_s)) | (age_s <= BLIND_S)
     return t_s[kept], position_m[kept], flown[kept]
 
 

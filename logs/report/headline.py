@@ -40,7 +40,7 @@ from logs.report.causes import (
     ranked,
     seconds,
 )
-from logs.report.evidence import FlightEvidence
+from logs.report.evidence import STALLED_S, FlightEvidence
 from logs.report.excursion import GRAVE_M, Excursion
 from logs.report.reasons import reasons
 from logs.report.verdicts import Flags, Judged, judge
@@ -50,6 +50,7 @@ from uavctl.flight.estimator import DUPLICATE, TOO_OLD
 from uavctl.flight.gating import FUTURE, INVALID
 from uavctl.flight.sensor_faults import FROZEN, JUMP
 from uavctl.mavlink.clocksync import StampRefusal
+from uavctl.mavlink.codec import BAD_FIELD
 from uavctl.mavlink.connection import HUNG_UP, WENT_SILENT
 from uavctl.mavlink.vehicle import SECOND_VEHICLE
 from uavctl.outcome import Cause
@@ -58,7 +59,6 @@ from uavctl.records import ControlMode, Severity, number
 _C = HeadlineCause
 _LINK_OF_VEHICLE = "link vehicle: "  # begins what is told of the vehicle's connection
 _UNHEARD_S = 2.5  # a heartbeat comes each second
-_STALLED_S = 0.5  # between two ticks: the process stood still, and heard nothing
 _WRONG_M = 0.3  # between a position that was used and the true place: no noise of a camera
 _DRIFT_STEP_M = 0.1  # what a drifting source adds from one position to the next; a jump adds more
 _FEW = 0.05  # of positions, plans, or steps
@@ -144,7 +144,9 @@ def _stayed(e: FlightEvidence) -> str:
     wall, free_m, at_s = nearest
     begun = at_s < float(e.clearance.t_s[0]) + _BEGUN_S
     near = f"{metres(free_m)} from the {wall} at the nearest, {'where it began' if begun else f'at {seconds(at_s)}'}"
-    return f"inside its walls throughout, {near}{_seen(e, at_s)}"
+    known_s, flown_s = float(e.clearance.t_s[-1]), max((end for _, end in e.flight.spans(FLOWN)), default=0.0)
+    until = f"until {seconds(known_s)}" if flown_s > known_s + STALLED_S else "throughout"
+    return f"inside its walls {until}, {near}{_seen(e, at_s)}"
 
 
 def _seen(e: FlightEvidence, at_s: float) -> str:
@@ -194,7 +196,7 @@ def _lost(e: FlightEvidence) -> Iterator[Finding]:
     flight, cause = e.flight, e.summary.ending.cause
     heard_s = flight.seconds([*(one.at_ns for one in flight.vehicles), flight.decisions[-1].at_ns])
     # A vehicle that is disarmed may be switched off.
-    gaps_s = np.diff(heard_s - _stalled_s(e, heard_s)) * [one.armed for one in flight.vehicles]
+    gaps_s = np.diff(heard_s - e.stalled_s(heard_s)) * [one.armed for one in flight.vehicles]
     end_s = float(heard_s[-1])
     if gaps_s.size and gaps_s.max() > _UNHEARD_S:
         begun_s, ended_s = (float(one) for one in heard_s[gaps_s.argmax() :][:2])
@@ -219,12 +221,18 @@ def _lost(e: FlightEvidence) -> Iterator[Finding]:
         yield Finding(_C.CONTROL_FAILED, at_s, f"{e.summary.ending.sentence.rstrip('.')}, at {seconds(at_s)}")
 
 
-def _stalled_s(e: FlightEvidence, at_s: Floats) -> Floats:
-    """Return for how long until each time (n,) we did not run [s]: what came then was heard later, all at once."""
-    ticks_s = e.flight.seconds([one.at_ns for one in e.flight.decisions])
-    pauses_s = np.diff(ticks_s)
-    stalled_s = np.append(0.0, np.cumsum(np.where(pauses_s > _STALLED_S, pauses_s, 0.0)))
-    return np.asarray(np.interp(at_s, ticks_s, stalled_s), dtype=np.float64)
+def _stood_still(e: FlightEvidence) -> Iterator[Finding]:
+    """Find the longest time in which the process did not run though the vehicle was flown."""
+    pauses = [
+        (after.at_ns - before.at_ns, before.at_ns)
+        for before, after in pairwise(e.flight.decisions)
+        if before.mode in FLOWN
+    ]
+    longest_ns, begun_ns = max(pauses, default=(0, 0))
+    if longest_ns > STALLED_S * 1e9:
+        at_s = e.second(begun_ns)
+        text = f"it did not run for {seconds(longest_ns * 1e-9)}, from {seconds(at_s)} on, and sent no setpoints"
+        yield Finding(_C.STOOD_STILL, at_s, text)
 
 
 def _cut(e: FlightEvidence) -> Iterator[Finding]:
@@ -236,7 +244,8 @@ def _cut(e: FlightEvidence) -> Iterator[Finding]:
     down = known is not None and (not known.armed or (known.landed is True and e.summary.steps > 0))
     if (last.mode is not ControlMode.WAIT or known is not None) and not down:
         at_s = e.second(last.at_ns)
-        doing = "while it was flown" if last.mode in FLOWN else "while the vehicle was armed"
+        mode = f" ({known.mode})" if known is not None else ""
+        doing = "while it was flown" if last.mode in FLOWN else f"while the vehicle was armed{mode}"
         yield Finding(
             _C.RECORDING_CUT, at_s, f"at {seconds(at_s)}, {doing}: the process was killed, or the power failed"
         )
@@ -376,14 +385,13 @@ def _refused(e: FlightEvidence) -> Iterator[Finding]:
 
 def _stamps(e: FlightEvidence) -> Iterator[Finding]:
     """Find a source whose stamps gave no times of capture, by the counters of its connection."""
-    for link in sorted({one.link for one in e.flight.links}):
-        last = [one for one in e.flight.links if one.link == link][-1]
+    for last in e.last_links:
         bad = {reason: last.bad.get(reason, 0) for reason in StampRefusal}
         refused = sum(bad.values())
         if refused > _UNUSABLE * (refused + last.samples):
             most = max(bad, key=lambda reason: bad[reason])
-            text = f"{refused} of {count(refused + last.samples, 'position')} on “{link}” had none that counts ({most})"
-            yield Finding(_C.STAMPS_UNUSABLE, 0.0, text)
+            share = f"{refused} of {count(refused + last.samples, 'position')} on “{last.link}”"
+            yield Finding(_C.STAMPS_UNUSABLE, 0.0, f"{share} had none that counts ({most})")
 
 
 def _wrong(e: FlightEvidence) -> Iterator[Finding]:
@@ -411,7 +419,9 @@ def _absent(e: FlightEvidence) -> Iterator[Finding]:
         kinds = sorted({one.code for one in e.flight.events if one.code.startswith("sample-")})
         why = f" ({', '.join(kinds)})" if kinds else ""
         yield Finding(_C.POSITIONS_INVALID, 0.0, f"none of {count(came, 'position')} could be used{why}")
-    else:
+    elif unread := sum(one.bad.get(BAD_FIELD, 0) for one in e.last_links):
+        yield Finding(_C.POSITIONS_INVALID, 0.0, f"{count(unread, 'message')} had values that are no finite numbers")
+    elif not any(_stamps(e)):
         yield Finding(_C.POSITIONS_ABSENT, 0.0, f"none came in {seconds(e.flight.duration_s)}")
 
 
@@ -446,7 +456,12 @@ def _ending(e: FlightEvidence) -> Iterator[Finding]:
     last = (flight.flown or flight.decisions)[-1]
     if not s.steps:
         tone = MIND if s.ending.as_ordered else BAD
-        yield Finding(_C.NOT_FLOWN, e.second(last.at_ns), last.reason, tone=tone)
+        text = s.ending.sentence.rstrip(".")
+        text = f"{text[:1].lower()}{text[1:]}" if flight.endings else last.reason
+        rose = any(one.armed and one.landed is False for one in flight.vehicles)
+        if rose and s.ending.cause == Cause.NOT_FLOWN:
+            text = f"the controller was never in charge ({last.reason})"
+        yield Finding(_C.NOT_AS_ORDERED if rose else _C.NOT_FLOWN, e.second(last.at_ns), text, tone=tone)
     elif flight.breach is not None or not s.ending.as_ordered:
         at_s = _ended_s(e)
         when = "" if at_s is None else f" at {seconds(at_s)}"
@@ -540,7 +555,8 @@ def _mission(e: FlightEvidence) -> Iterator[Finding]:
             yield Finding(_C.NOT_REACHED, last_s, f"{max(reached)} of {count(len(places), 'waypoint')} were reached")
     if s.course_rms_m is None or s.course_worst_m is None or s.course_worst_s is None:
         near_m, at_s = float(position_error_m(flight).min()), last_s
-        yield Finding(_C.OFF_TRACK, at_s, f"it never came nearer to its target than {metres(near_m)}")
+        cause = _C.OFF_TRACK if s.trajectory else _C.NOT_REACHED
+        yield Finding(cause, at_s, f"it never came nearer to its target than {metres(near_m)}")
     elif s.course_worst_m > accept_m or s.course_rms_m > _OFF_SHARE * accept_m:
         goal = "its trajectory on the whole way" if s.trajectory else "its target from its arrival on"
         text = (
@@ -610,6 +626,6 @@ def _link(e: FlightEvidence) -> Iterator[Finding]:
 
 
 RULES: tuple[Callable[[FlightEvidence], Iterator[Finding]], ...] = (
-    _battery, _excursion, _lost, _cut, _blind, _vehicle_texts, _failsafe, _taken_over, _refused, _wrong, _absent,
-    _relay, _ending, _limits, _fell_back, _mission, _pushed, _relaxed, _link,
+    _battery, _excursion, _lost, _cut, _blind, _stood_still, _vehicle_texts, _failsafe, _taken_over, _refused, _wrong,
+    _absent, _relay, _ending, _limits, _fell_back, _mission, _pushed, _relaxed, _link,
 )  # fmt: skip

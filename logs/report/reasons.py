@@ -27,8 +27,6 @@ def reasons(e: FlightEvidence, worst: Excursion | None) -> Iterator[str]:
     yield from _bias(e)
     yield from _model(e)
     yield from _solver(e)
-    if e.summary.missed_ticks:
-        yield f"{count(e.summary.missed_ticks, 'tick')} of {len(e.flight.decisions)} were missed."
 
 
 def _outside(e: FlightEvidence, worst: Excursion) -> Iterator[str]:

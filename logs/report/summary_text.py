@@ -7,9 +7,9 @@ from itertools import groupby, pairwise
 import numpy as np
 
 from logs.recording.flight import FLOWN, FlightData
-from logs.recording.summary import FlightSummary, count
+from logs.recording.summary import FlightSummary
 from logs.recording.topics import GOES_ON, RECOVERED
-from uavctl.records import duration, number, severity, tell, worst
+from uavctl.records import number, severity, tell, worst
 
 # A target that moves by less than this share of its longest step only settles.
 _STILL = 0.05
@@ -20,15 +20,7 @@ def story(flight: FlightData, summary: FlightSummary) -> list[str]:
     if summary.final_error_m is None:
         return [*_part(flight), *_cut(flight)]
     course = _trajectory(flight) if summary.trajectory else _waypoints(flight)
-    return [
-        *_part(flight),
-        *_begun(flight),
-        *course,
-        *_fallback(flight, summary),
-        *_gave_way(flight),
-        *_amiss(summary),
-        *_cut(flight),
-    ]
+    return [*_part(flight), *_begun(flight), *course, *_fallback(flight, summary), *_gave_way(flight), *_cut(flight)]
 
 
 def part_begins(flight: FlightData) -> str:
@@ -85,22 +77,6 @@ def _fallback(flight: FlightData, s: FlightSummary) -> list[str]:
     ]
 
 
-def _amiss(s: FlightSummary) -> list[str]:
-    """Return sentences on missed ticks and on records that were dropped."""
-    told = []
-    if s.missed_ticks:
-        late = (
-            "" if s.tick_lateness_us.max is None else f"; the latest tick began {duration(s.tick_lateness_us.max)} late"
-        )
-        told.append(f"{count(s.missed_ticks, 'tick')} {_were(s.missed_ticks)} missed{late}.")
-    if s.recorder_dropped:
-        lack = count(s.recorder_dropped, "record")
-        told.append(
-            f"{lack} {_were(s.recorder_dropped)} dropped because the disk was too slow, and missing from all figures."
-        )
-    return told
-
-
 def _gave_way(flight: FlightData) -> list[str]:
     """Return a sentence on the constraint that gave way most in any plan flown; none where none did."""
     names = flight.design.names
@@ -146,7 +122,3 @@ def _trajectory(flight: FlightData) -> list[str]:
 
 def _seconds(flight: FlightData, at_ns: int) -> str:
     return f"{number(float(flight.seconds([at_ns])[0]))} s"
-
-
-def _were(number: int) -> str:
-    return "was" if number == 1 else "were"

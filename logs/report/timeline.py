@@ -38,7 +38,7 @@ _NONE = np.zeros(0)
 _EVENTS = (
     (Severity.ERROR, "errors", "limit", "an error"),
     (Severity.WARNING, "warnings", "sample", "a warning"),
-    (Severity.INFO, "told", "muted", "what else was told"),
+    (Severity.INFO, "notes", "muted", "what else came"),
 )
 _HANDS = {"engaged": "estimate", "failed": "limit", "landing": "limit", "settling": "limit"}
 
@@ -83,6 +83,7 @@ def timeline(flight: FlightData) -> tuple[Drawing, Drawing, tuple[Mark, ...], st
             ax.set_yticks(range(len(rows)), [lane.name for lane in rows])
             ax.tick_params(axis="y", length=0)
             ax.grid(visible=False, axis="y")
+            ax.spines["left"].set_visible(False)  # it would cover marks of the first tick
         drawings.append(Drawing(key, one.svg, label))
     meanings = "; ".join(f"“{lane.name}”: {lane.meaning}" for lane in rows)
     return drawings[0], drawings[1], tuple(_untold(rows, flight)), f"What a lane shows: {meanings}."

@@ -54,8 +54,6 @@ def story(info: MavlinkFlightInfo) -> Iterator[str]:
     """Return what the table does not have, in sentences: what is odd about the recording."""
     if info.vehicle_system is None:
         yield "No autopilot's heartbeat is in it, so it does not tell what the vehicle did."
-    if info.missing:
-        yield f"Not in it, and so not shown: {', '.join(info.missing)}."
     yield from (f"{note}." for note in info.notes)
 
 
@@ -68,10 +66,10 @@ def _sections(flight: MavlinkFlight) -> Iterator[PageSection]:
         wanted = (_WANTED,) if asked else ()
         note = "Time counts from the recording's begin. All is in local NED, height upwards."
         yield PageSection("Axes over time", note, page.grid(list(_axes(flight))), (*marks, *wanted))
-    elif len(flight.height_t_s):
+    elif varies(flight.height_m):
         height = _course(flight, "height", "Height", "height [m]", flight.height_t_s, flight.height_m)
         yield PageSection("Height", "It told no place, and its height alone.", page.grid([height]))
-    if len(flight.battery_t_s):
+    if varies(flight.battery_v):
         battery = _course(flight, "battery", "Battery", "voltage [V]", flight.battery_t_s, flight.battery_v)
         yield PageSection("Battery", "", page.grid([battery]))
     if len(flight.attitude_t_s):
@@ -91,7 +89,8 @@ def _sections(flight: MavlinkFlight) -> Iterator[PageSection]:
     modes = [(f"{one.at_s:.2f}", one.mode, "armed" if one.armed else "") for one in info.modes]
     yield PageSection("Modes", "", _table(("from [s]", "mode", "armed"), modes))
     texts = [(f"{one.at_s:.2f}", one.severity, one.text) for one in info.texts]
-    yield PageSection("Texts of the vehicle", "", _table(("at [s]", "severity", "text"), texts))
+    if texts:
+        yield PageSection("Texts of the vehicle", "", _table(("at [s]", "severity", "text"), texts))
     messages = [(name, str(number), rate_of(info, name)) for name, number in info.messages.items()]
     parameters = [(name, str(one.value), one.type) for name, one in info.parameters.items()]
     folded = page.folded("Messages", page.table(("message", "number", "rate"), messages, frozenset({1, 2})))
@@ -113,6 +112,9 @@ def _paths(flight: MavlinkFlight) -> Iterator[Drawing]:
         ("path-side", "From the south", ("east", "down")),
     ):
         pick = [AXIS_NUMBER[axis] for axis in shown]
+        tracks = (flight.own.position_m, *(track.position_m for track in flight.sent.values()))
+        if not any(varies(track[:, number]) for track in tracks for number in pick):
+            continue
         signs = np.array([SEEN[axis][1] for axis in shown])
         names = [SEEN[axis][0] for axis in shown]
         with canvas(key, 3.7) as one:

@@ -15,6 +15,7 @@ import pytest
 from report_rig import unpaged
 from udp_rig import assert_in_order, fly_over_udp
 
+import uavctl
 from logs.recording.flight import FlightData
 from logs.recording.reader import RecordedMessage, read, records, walk
 from logs.recording.summary import summarise
@@ -192,3 +193,12 @@ def test_what_flies_loads_nothing_that_draws() -> None:
     names = "uavctl.cli.fly, uavctl.cli.loopback, uavctl.cli.ctl"
     script = f"import sys, {names}; print([name for name in sys.modules if name in ('matplotlib', 'jinja2')])"
     assert subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout == "[]\n"
+
+
+@pytest.mark.slow
+def test_a_minute_at_twenty_plans_a_second_takes_eight_megabytes_at_most(tmp_path: Path) -> None:
+    """By five seconds, with all that a recording has but once."""
+    flown_s = 5.0
+    recording = uavctl.fly("room-px4", tmp_path / "flight", duration_s=flown_s).recording
+    assert recording.summary.solves >= 19 * flown_s
+    assert recording.path.stat().st_size * 60.0 / flown_s <= 8e6

@@ -16,9 +16,10 @@ from rich.text import Text
 
 from logs.recording.disk import FileKind, kind_of, spare_recording, write_whole
 from logs.recording.reader import header, lacks_end, read
+from logs.recording.senders import choose_vehicle, system_of
 from logs.recording.tlog import read_tlog
 from uavctl.build.controller import design_of
-from uavctl.cli.common import DEFAULTS, Common, bars, can_be_read, warn
+from uavctl.cli.common import DEFAULTS, Common, System, bars, can_be_read, warn
 from uavctl.config import Config
 from uavctl.config.load import dump_config, parse
 from uavctl.errors import DesignError, UsageError
@@ -33,13 +34,14 @@ def identify_command(
     *,
     common: Common = DEFAULTS,
     out: Annotated[Path | None, Parameter(help="TOML file to write; else identified.toml beside the recording")] = None,
+    system: System = None,
 ) -> int:
     """Identify the vehicle and the link of a flight, and write them as a configuration with a page of plots.
 
     A recording of ours brings its configuration along; for a `.tlog`, --config and --set say which messages are
     positions and in what frame. Plant, link, rate and noise of that configuration are replaced, all else is kept.
     """
-    history, config = _history(flight, common)
+    history, config = _history(flight, common, system)
     target = out if out is not None else flight.with_name("identified.toml")
     if target == flight:
         raise UsageError(f"{target}: is the recording itself, which would be lost; choose another place with --out")
@@ -57,16 +59,25 @@ def identify_command(
     return 0
 
 
-def _history(flight: Path, common: Common) -> tuple[FlightHistory, Config]:
+def _history(flight: Path, common: Common, system: int | None) -> tuple[FlightHistory, Config]:
     """Return the flight, and the configuration that its result goes into."""
     if kind_of(flight) is FileKind.TLOG:
         config = common.load().config
-        one_link = msgspec.structs.replace(config.daemon, vehicle="tlog", mocap="tlog")
-        read_as = msgspec.structs.replace(config, daemon=one_link)
         recorded = read_tlog(flight)
         for note in recorded.notes:
             warn(note)
-        return from_tlog(recorded.packets, read_as), config
+        chosen = choose_vehicle(recorded.packets, str(flight), system or config.daemon.vehicle_system_id or None)
+        others = {one.system for one in chosen.others}
+        if others:
+            listed = ", ".join(map(str, sorted(others)))
+            warn(f"system {chosen.system} is identified; vehicles left out: {listed}; --system chooses another")
+        one_link = msgspec.structs.replace(
+            config.daemon, vehicle="tlog", mocap="tlog", vehicle_system_id=chosen.system or 0
+        )
+        read_as = msgspec.structs.replace(config, daemon=one_link)
+        return from_tlog([one for one in recorded.packets if system_of(one.data) not in others], read_as), config
+    if system is not None:
+        raise UsageError("--system is for a .tlog: a recording of ours is of one vehicle")
     if common.overrides or common.config != DEFAULTS.config:
         raise UsageError("--config and --set are for a .tlog: a recording of ours brings its own configuration")
     config = parse(header(flight).config_toml, f"{flight} (configuration)").config

@@ -130,4 +130,7 @@ class PendingRequest:
 
     def _effort(self, at_ns: int) -> str:
         seconds = f"{(at_ns - self._begun_ns) / SECOND_NS:.1f} s"
-        return seconds if self.ask is None else f"asked {self._tries} times in {seconds}"
+        if self.ask is None:
+            return seconds
+        times = "once" if self._tries == 1 else f"{self._tries} times"
+        return f"asked {times} in {seconds}" if self._tries else f"it could not be asked in {seconds}"

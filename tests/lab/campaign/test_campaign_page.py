@@ -135,16 +135,11 @@ def test_the_promise_is_told_by_what_was_measured(
 ) -> None:
     rows = runs(0, SMPC[: len(hits)].tolist(), state_violations=hits)
     folder = write(tmp_path, [cell(0, "ours", "smpc")], rows)
-    told = list(story(CampaignView.of(read_results(folder))))
-    (broke,) = [sentence for sentence in told if "broke state limits" in sentence]
-    assert (numbers_in(broke), "chance" in broke, broke.startswith("None")) == (cells, chance, len(cells) == 1)
-    measured, *_, allowed = numbers_in(told[-1])
-    assert (measured, allowed) == (most, 5.0)
     with unwritten():
         text = text_of(write_report(folder))
     word = "Promise kept" if len(cells) == 1 and most <= 5.0 else "Perhaps too often" if chance else "Promise broken"
     (first,) = re.findall(rf"{word}: (.*?allowed)", text)
-    assert numbers_in(first)[-2:] == [most, 5.0]
+    assert numbers_in(first) == [*cells, most, 5.0]
 
 
 def test_a_baseline_that_is_better_outright_is_told(tmp_path: Path) -> None:
@@ -220,7 +215,7 @@ def test_links_that_are_a_loss_make_a_line_and_others_dots(grid: Path) -> None:
     html = (grid / "report.html").read_text(encoding="utf-8")
     figures = set(re.findall(r'<figure id="([^"]*)"', html))
     assert {"cost-loss-s0", "states-loss-s0", "inputs-loss-s0", "cost-link-s0", "states-link-s0"} <= figures
-    assert {"difference-s0-0", "ages-wide", "ages-narrow"} <= figures
+    assert {"difference-s0-0", "ages"} <= figures
     (states,) = re.findall(r'<figure id="states-loss-s0".*?</figure>', html, re.DOTALL)
     assert "stroke-dasharray" in states
     assert "var(--limit" in states  # the promised risk

@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import io
 import re
+import struct
 from html import unescape
 from pathlib import Path
 
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from places import DATA
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from logs.recording.senders import message_of
+from logs.recording.tlog import read_tlog
 from uavctl.cli import identify as identify_cmd
+from uavctl.cli.common import Common
 from uavctl.config import load_config
-from uavctl.errors import DesignError
+from uavctl.errors import DesignError, UsageError
 from uavctl.lab.identify.fit import Prediction
 from uavctl.lab.identify.history import FlightHistory, PositionHistory, SetpointHistory
 from uavctl.lab.identify.page import _innovations, write_page
@@ -118,3 +124,30 @@ def test_what_speaks_against_a_design_is_on_the_page_too(
     shown = " ".join(capsys.readouterr().out.split())
     for text in (HARDLY, "the gain is too high"):
         assert sum(text in one for one in said) == shown.count(text) == 1
+
+
+@pytest.mark.parametrize("system", [None, 1])
+def test_a_second_vehicle_in_a_log_changes_nothing(tmp_path: Path, system: int | None) -> None:
+    """Each heartbeat comes from system 2, too, and each setpoint goes to it, too, with another acceleration."""
+    packets = read_tlog(DATA / "px4-relay.tlog").packets
+    parser, other = mavlink.MAVLink(None), mavlink.MAVLink(None, srcSystem=2, srcComponent=1)
+    rows = []
+    for packet in packets:
+        rows.append((packet.at_ns, packet.data))
+        message = parser.decode(bytearray(packet.data)) if message_of(packet.data) in (0, 84) else None
+        if message is not None and message.get_type() == "HEARTBEAT" and message.get_srcSystem() == 1:
+            rows.append((packet.at_ns, bytes(message.pack(other))))
+        elif message is not None and message.get_type() != "HEARTBEAT":
+            message.target_system, message.afx = 2, 5.0
+            client = mavlink.MAVLink(None, srcSystem=message.get_srcSystem(), srcComponent=message.get_srcComponent())
+            rows.append((packet.at_ns, bytes(message.pack(client))))
+    both = tmp_path / "both.tlog"
+    both.write_bytes(b"".join(struct.pack(">Q", at_ns // 1000) + data for at_ns, data in rows))
+    common = Common(config="room-px4")
+    alone, _ = identify_cmd._history(DATA / "px4-relay.tlog", common, None)
+    found, _ = identify_cmd._history(both, common, system)
+    assert len(rows) > len(packets) + 10 and len(alone.asked.times_s)
+    assert np.array_equal(found.asked.accel_mps2, alone.asked.accel_mps2)
+    assert np.array_equal(found.seen.times_s, alone.seen.times_s)
+    with pytest.raises(UsageError):
+        identify_cmd._history(both, common, 9)

@@ -312,7 +312,11 @@ def test_an_unknown_wall_time_is_left_out() -> None:
     assert msgspec.json.decode(msgspec.json.encode(s))["wall_s"] is None
     assert s.real_time_factor is None
     assert "2 steps; 2 s\n" in re.sub(r" +\n", "\n", shown(s))
-    assert "2 s in 1 s (2 × real time)" in shown(msgspec.structs.replace(s, wall_s=1.0, real_time_factor=2.0))
+    still = Percentiles(p50=0.0, p99=0.0, max=0.0)  # virtual time
+    timed = msgspec.structs.replace(s, wall_s=1.0, real_time_factor=2.0, tick_lateness_us=still)
+    assert "2 s in 1 s (2 × real time)" in shown(timed)
+    late = msgspec.structs.replace(timed, tick_lateness_us=Percentiles(p50=1.0, p99=2.0, max=3.0))
+    assert "real time" not in shown(late)
 
 
 @pytest.mark.parametrize(("late_ns", "virtual"), [((0, 0), True), ((0, 1), False)])

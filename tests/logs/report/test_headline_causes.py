@@ -25,6 +25,7 @@ from logs.report.causes import GOOD, Headline, HeadlineCause, cause_of_text, ran
 from logs.report.headline import headline
 from logs.report.tlog_headline import headline_of
 from logs.report.verdicts import judge
+from uavctl.mavlink.codec import BAD_FIELD
 from uavctl.outcome import Cause, make_ending
 from uavctl.records import ControlMode, Event, LinkStats, RelayStats, Severity, VehicleStatus
 
@@ -186,6 +187,27 @@ def test_a_process_that_is_killed_in_the_vehicles_own_climb_has_cut_the_recordin
     assert C.RECORDING_CUT not in head(dataclasses.replace(cut, vehicles=down)).causes
 
 
+@pytest.mark.parametrize("predicted", [True, False])
+def test_a_prediction_alone_says_of_no_wall_that_it_was_passed(good: FlightData, predicted: bool) -> None:
+    """Estimates from 6 s on are 20 m away: of recent positions, or of none since then."""
+    last_ns = good.origin_ns + 6 * SECOND
+    far = tuple(
+        msgspec.structs.replace(
+            one, mean=(20.0, *one.mean[1:]), captured_ns=last_ns - 90 * SECOND if predicted else one.captured_ns
+        )
+        if one.at_ns > last_ns
+        else one
+        for one in good.estimates
+    )
+    aged = tuple(
+        msgspec.structs.replace(one, age_steps=1000) if predicted and one.at_ns > last_ns else one
+        for one in good.decisions
+    )
+    flight = dataclasses.replace(good, truths=(), estimates=far, decisions=aged)
+    assert (C.LEFT_LIMITS in head(flight).causes) != predicted
+    assert (summarise(flight, wall_s=None).state_violations == 0) == predicted
+
+
 @pytest.mark.parametrize("ran", [True, False])
 def test_a_vehicle_is_not_silent_while_we_did_not_run(good: FlightData, ran: bool) -> None:
     """Four seconds without a heartbeat, in which the process ran, or stood still."""
@@ -194,7 +216,7 @@ def test_a_vehicle_is_not_silent_while_we_did_not_run(good: FlightData, ran: boo
     heard = tuple(one for one in plain.vehicles if not begun_ns < one.at_ns < ended_ns)
     ticks = tuple(one for one in good.decisions if ran or not begun_ns < one.at_ns < ended_ns)
     found = head(dataclasses.replace(plain, vehicles=heard, decisions=ticks))
-    assert (C.VEHICLE_SILENT in found.causes) == ran
+    assert (C.VEHICLE_SILENT in found.causes) == ran and (C.STOOD_STILL in found.causes) != ran
     off = tuple(msgspec.structs.replace(one, armed=False) for one in heard)
     assert C.VEHICLE_SILENT not in head(dataclasses.replace(plain, vehicles=off)).causes
 
@@ -215,10 +237,15 @@ def test_what_was_refused(good: FlightData, code: str, cause: HeadlineCause) -> 
     assert cause in found.causes and C.ALL_WELL not in found.causes
 
 
+def with_bad(flight: FlightData, reason: str, count: int) -> FlightData:
+    """The flight on a connection that used none of so many messages."""
+    stats = LinkStats(at_ns=flight.decisions[-1].at_ns, link="mocap", datagrams=200, messages=200, samples=0,
+                      bad={reason: count}, clock_offset_ns=None, clock_source="none")  # fmt: skip
+    return dataclasses.replace(flight, links=(stats,))
+
+
 def test_stamps_without_a_time_of_capture(good: FlightData) -> None:
-    stats = LinkStats(at_ns=good.decisions[-1].at_ns, link="mocap", datagrams=200, messages=200, samples=0,
-                      bad={"duplicate": 200}, clock_offset_ns=None, clock_source="none")  # fmt: skip
-    assert C.STAMPS_UNUSABLE in head(dataclasses.replace(good, links=(stats,))).causes
+    assert C.STAMPS_UNUSABLE in head(with_bad(good, "duplicate", 200)).causes
 
 
 def test_a_relay_that_stops_is_told_by_its_counters(good: FlightData) -> None:
@@ -233,16 +260,19 @@ def test_a_relay_that_stops_is_told_by_its_counters(good: FlightData) -> None:
     assert C.RELAY_SILENT not in head(dataclasses.replace(plain, relays=whole)).causes
 
 
-@pytest.mark.parametrize(("came", "cause"), [(False, C.POSITIONS_ABSENT), (True, C.POSITIONS_INVALID)])
-def test_a_position_that_was_never_valid(good: FlightData, came: bool, cause: HeadlineCause) -> None:
-    """Nothing was ever estimated, as no position came, or none could be used."""
+@pytest.mark.parametrize(
+    ("came", "unread", "cause"),
+    [(False, 0, C.POSITIONS_ABSENT), (True, 0, C.POSITIONS_INVALID), (False, 90, C.POSITIONS_INVALID)],
+)
+def test_a_position_that_was_never_valid(good: FlightData, came: bool, unread: int, cause: HeadlineCause) -> None:
+    """Nothing was ever estimated, as no position came, none was a number, or none could be used."""
     waited = tuple(
         msgspec.structs.replace(one, mode=ControlMode.WAIT, accepted=0, plan_seq=None, input=None)
         for one in good.decisions
     )
     inputs = tuple(one if came else msgspec.structs.replace(one, samples=()) for one in good.step_inputs)
     never = dataclasses.replace(good, decisions=waited, estimates=(), plans=(), step_inputs=inputs)
-    assert head(never).cause is cause
+    assert head(with_bad(never, BAD_FIELD, unread)).cause is cause
 
 
 def test_all_well_is_said_of_a_flight_in_which_nothing_is_amiss(good: FlightData) -> None:

@@ -121,15 +121,14 @@ def test_a_simulated_flight_that_never_began_has_a_page() -> None:
     assert nothing in " ".join(ended_in({0: ControlMode.STOPPED}, stop_tick=0).split())
 
 
-def test_what_went_amiss_is_told() -> None:
+def test_what_went_amiss_is_in_the_table_alone() -> None:
     flight = FlightData.from_records(fly(room(), 4.0))
     good = summarise(flight, wall_s=1.0)
-    assert not any("missed" in sentence or "dropped" in sentence for sentence in story(flight, good))
     times = Percentiles(p50=100.0, p99=900.0, max=73_400.0)
     bad = msgspec.structs.replace(good, missed_ticks=3, tick_lateness_us=times, recorder_dropped=1)
-    ticks, records = [one for one in story(flight, bad) if "missed" in one or "dropped" in one]
-    assert ticks.startswith("3 ticks were missed") and "73.4 ms late" in ticks
-    assert records.startswith("1 record was dropped") and "disk" in records
+    assert story(flight, bad) == story(flight, good)
+    cells = " ".join(text for _, text in rows(bad))
+    assert "73.4 ms" in cells and "3 ticks" in cells and "1 record " in cells
 
 
 @pytest.mark.slow

@@ -100,7 +100,7 @@ def story(view: CampaignView) -> Iterator[str]:
     judged = [verdict for verdict in view.verdicts if verdict.comparisons]
     if judged:
         yield _outcome(judged)
-    yield from _promise(view)
+    yield from _step_by_step(view)
 
 
 def _outcome(judged: Sequence[CampaignVerdict]) -> str:
@@ -125,13 +125,20 @@ def _judged(view: CampaignView) -> tuple[list[CellSummary], list[CellSummary], l
 
 
 def _main(view: CampaignView) -> Markup:
-    """Return the line on what matters most as HTML: failures, else whether promises were kept."""
-    kept, above, over = _judged(view)
+    """Return the line on what matters most as HTML: failures, and whether promises were kept."""
     failed, flown = sum(cell.failed for cell in view.cells), sum(cell.runs for cell in view.cells)
+    promise = _promise(view)
     if failed:
-        return page.banner("bad", "Runs failed", f"{failed} of {count(flown, 'run')}; they are in no figure.", ())
+        why = () if promise is None else (f"{promise[1]}: {promise[2]}",)
+        return page.banner("bad", "Runs failed", f"{failed} of {count(flown, 'run')}; they are in no figure.", why)
+    return page.NOTHING if promise is None else page.banner(*promise, ())
+
+
+def _promise(view: CampaignView) -> tuple[str, str, str] | None:
+    """Return whether the promised risk was kept: tone, word and text; None where nothing was promised."""
+    kept, above, over = _judged(view)
     if not kept:
-        return page.NOTHING
+        return None
     worst = max(kept, key=lambda cell: (cell.violation_rate or 0.0) / (cell.promised_x or 1.0))
     most = (
         f"the most was {percent(worst.violation_rate)} of steps where {percent(worst.promised_x)} are allowed "
@@ -139,29 +146,16 @@ def _main(view: CampaignView) -> Markup:
     )
     cells = count(len(kept), "cell")
     if over:
-        return page.banner("bad", "Promise broken", f"by {len(over)} of {cells}, beyond chance; {most}.", ())
+        more = f", and {len(above) - len(over)} within chance" if len(above) > len(over) else ""
+        return "bad", "Promise broken", f"by {len(over)} of {cells}, beyond chance{more}; {most}."
     if above:
-        return page.banner("mind", "Perhaps too often", f"in {len(above)} of {cells}, within chance; {most}.", ())
-    return page.banner("good", "Promise kept", f"by all of {cells}; {most}.", ())
+        return "mind", "Perhaps too often", f"in {len(above)} of {cells}, within chance; {most}."
+    return "good", "Promise kept", f"by all of {cells}; {most}."
 
 
-def _promise(view: CampaignView) -> Iterator[str]:
-    """Yield sentences on whether the promised risk was kept."""
-    kept, above, over = _judged(view)
-    if not kept:
-        return
-    worst = max(kept, key=lambda cell: cell.violation_rate or 0.0)
-    where = f"{worst.controller}, {view.place(group_of(worst))}"
-    if len(above) > len(over):
-        perhaps = count(len(above) - len(over), "cell")
-        yield (
-            f"{perhaps} of {len(kept)} broke state limits more often than the design allows, which may still be chance "
-            "at so few runs."
-        )
-    if over:
-        yield f"{count(len(over), 'cell')} of {len(kept)} broke state limits more often than the design allows."
-    if not above:
-        yield f"None of the {count(len(kept), 'cell')} with a promise broke state limits more often than it allows."
+def _step_by_step(view: CampaignView) -> Iterator[str]:
+    """Yield a sentence on whether the promised risk was kept in each step."""
+    kept, _, _ = _judged(view)
     stepped = [c for c in kept if c.worst_step_rate is not None and c.worst_step_ci is not None]
     if stepped:
         broke = sum(1 for c in stepped if c.worst_step_ci and c.worst_step_ci[0] > (c.promised_x or 0.0))
@@ -171,10 +165,6 @@ def _promise(view: CampaignView) -> Iterator[str]:
             f"step, beyond chance; the worst step of all had {percent(highest.worst_step_rate)} "
             f"({highest.controller}, {view.place(group_of(highest))})."
         )
-    yield (
-        f"The most was {percent(worst.violation_rate)} of steps ({where}), where {percent(worst.promised_x)} are "
-        "allowed."
-    )
 
 
 # The page of a campaign: one HTML file, complete in itself.
@@ -336,7 +326,7 @@ def _age_section(view: CampaignView) -> PageSection:
     note = "Every controller meets the same losses, so the ages are those of the link."
     if not any(cell.ages for cell in view.cells):
         return PageSection("Age of information", "", page.paragraph("No run ended in order."))
-    figures = page.wide_or_narrow(*plots.ages(view.cells, view.results))
+    figures = page.grid([plots.ages(view.cells, view.results)])
     return PageSection("Age of information", note, page.legend(plots.age_entries(view.cells)) + figures)
 
 

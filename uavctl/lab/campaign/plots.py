@@ -11,11 +11,10 @@ from matplotlib.axes import Axes
 from matplotlib.markers import CARETDOWNBASE, CARETLEFTBASE
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, SymmetricalLogLocator
 
-from logs.report.figures import WIDE_IN
 from logs.report.page import Mark
 from logs.report.plots import DASHED, DOTTED
 from logs.report.statistics import Pair
-from logs.report.svg import WIDTH_IN, Drawing, canvas, colour
+from logs.report.svg import Drawing, canvas, colour
 from uavctl.lab.campaign.results import BaselineComparison, CampaignVerdict, CellSummary, Results
 
 # Legends of a campaign's figures, with the markers that the figures have.
@@ -291,20 +290,17 @@ def _difference(ax: Axes, one: BaselineComparison, place: float, looks: Looks) -
     ax.plot(mean, place, ls="", marker=marker, ms=4.4, mew=width, color=paint, mfc=face)
 
 
-def ages(cells: Sequence[CellSummary], results: Results) -> tuple[Drawing, Drawing]:
-    """Draw the share of steps with an age of information of at least j, by link, for a wide and a narrow page."""
+def ages(cells: Sequence[CellSummary], results: Results) -> Drawing:
+    """Draw the share of steps with an age of information of at least j, by link."""
     by_link: dict[str, list[int]] = {}
     for cell in cells:
         if cell.ages and len(cell.ages) >= len(by_link.get(cell.link, [])):
             by_link[cell.link] = cell.ages
     steps = results.planned * results.steps
     label = f"Share of {steps} steps in which the age of information is at least j, by link"
-    drawings = []
-    for key, width_in in (("ages-wide", WIDE_IN), ("ages-narrow", WIDTH_IN)):
-        with canvas(key, 2.8, width_in) as one:
-            _tails(one.axes("", "age j [steps]", "steps with an age of j or more [%]"), list(by_link.values()))
-        drawings.append(Drawing(key, one.svg, label))
-    return drawings[0], drawings[1]
+    with canvas("ages", 2.8) as one:
+        _tails(one.axes("", "age j [steps]", "steps with an age of j or more [%]"), list(by_link.values()))
+    return Drawing("ages", one.svg, label)
 
 
 def _tails(ax: Axes, histograms: list[list[int]]) -> None:

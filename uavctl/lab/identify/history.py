@@ -340,17 +340,18 @@ def from_tlog(packets: Iterable[TlogPacket], config: Config) -> FlightHistory:
     """Make the history of a `.tlog`: positions as the daemon would take them, setpoints as they were sent.
 
     Args:
-        config: Says which messages count as positions, and how their frame and clock are turned into ours.
+        config: Says which messages count as positions, how their frame and clock are turned into ours, and whose
+            setpoints they are (`daemon.vehicle_system_id`; 0: any vehicle's).
 
     Raises:
         RecordingError: No position or no acceleration setpoint in it.
     """
-    whole = tuple(packets)
+    whole, system = tuple(packets), config.daemon.vehicle_system_id
     sent: list[tuple[int, tuple[float, float, float], bool]] = []
     senders, told = Senders(), VehicleWords()
     for packet in whole:
         if packet.outgoing:
-            sent.extend((packet.at_ns, accel, alone) for accel, alone in _accelerations(packet.data))
+            sent.extend((packet.at_ns, accel, alone) for accel, alone in _accelerations(packet.data, system))
         else:
             senders.take(packet.data, packet.at_ns)
             told.take(packet.data)
@@ -420,12 +421,14 @@ def _history(
     return FlightHistory(asked, seen_from(rows), senders.gaps(_source(samples)), told.autopilot, told.parameters)
 
 
-def _accelerations(data: bytes) -> Iterable[tuple[tuple[float, float, float], bool]]:
-    """Return the setpoints in a client's packet, with whether each asks for an acceleration and nothing else."""
+def _accelerations(data: bytes, system: int) -> Iterable[tuple[tuple[float, float, float], bool]]:
+    """Return the setpoints for a system in a client's packet, with whether each asks for an acceleration only."""
     parser = mavlink.MAVLink(None)
     for frame in scan(data, final=True).frames:
         if frame.message_id == mavlink.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED:
             message = parser.decode(bytearray(frame.data))
+            if system and message.target_system not in (0, system):
+                continue
             alone = message.type_mask & _MASK == _NO_POSITION_NO_VELOCITY and message.coordinate_frame in _LOCAL_NED
             accel = (message.afx, message.afy, message.afz)
             yield (accel, True) if alone and all(map(math.isfinite, accel)) else ((0.0, 0.0, 0.0), False)

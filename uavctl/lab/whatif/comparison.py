@@ -244,12 +244,12 @@ def side_by_side(found: WhatIf) -> Iterator[tuple[str, ...]]:
 
 
 def _sections(found: WhatIf, recorded: FlightData, other: FlightData) -> Iterator[PageSection]:
-    yield PageSection("Side by side", _WORTH, table(HEADINGS, side_by_side(found), frozenset()))
     index = recorded.design.position_index
     axes = [_axis(recorded, other, place, name) for place, name in zip(index, recorded.design.axes, strict=True)]
     yield PageSection("Motion", _MOTION, grid(axes), _MARKS)
     horizon = Mark("dashed", "limit", f"horizon H = {other.design.horizon}")
     yield PageSection("Link", _AGE, grid([_ages(recorded, other)]), (*_MARKS[:2], horizon))
+    yield PageSection("Side by side", _WORTH, table(HEADINGS, side_by_side(found), frozenset()))
 
 
 def _axis(recorded: FlightData, other: FlightData, place: int, name: str) -> Drawing:
