@@ -14,6 +14,7 @@ too. All of it are orders, as those of an operator: the recording has them, and 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 from uavctl.build.controller import build_envelope, build_plant
@@ -31,7 +32,6 @@ SMALLER = 0.5  # times the size of a motion that did not stay inside
 SMALLEST = 0.25  # of the least way, from the centre: the first step in the smallest box; a smaller one tells nothing
 _BACK_S = 3.0  # for the way to the last place, before the time to hold it
 _TAKEN_S = 1.0  # after which an order has been taken up
-_ROUNDING_M = 1e-3  # of places
 _MOVES = frozenset({Order.GOTO, Order.HOLD, Order.RESUME, Order.LAND})
 
 
@@ -51,7 +51,8 @@ class BoxMonitor:
         self._config, self._box, self._plant = config, box, build_plant(config)
         whole = replace(build_envelope(config, self._plant), lower_m=box.lower, upper_m=box.upper)
         north, east, down = (WEAKEST * one for one in whole.brake_mps2)
-        self._near = replace(whole, outside_m=(-RESERVE_M,) * 3, brake_mps2=(north, east, down))
+        near = replace(whole, outside_m=(-RESERVE_M,) * 3, brake_mps2=(north, east, down))
+        self._near = [replace(near, axes=(axis == 0, axis == 1, axis == 2)) for axis in range(3)]
         self._leaving = replace(whole, outside_m=ZERO)
         self._places, self._last = config.mission.waypoints, len(config.mission.waypoints) - 1
         self._scale = [1.0, 1.0, 1.0]
@@ -77,28 +78,26 @@ class BoxMonitor:
             self._number = decision.waypoint
         where, speed = position(estimate, self._plant), velocity(estimate, self._plant)
         seen = Observation(at_ns, (), ZERO, where, speed, None, braking=False)
-        near = is_outside(seen, self._near)
+        near = [axis for axis, one in enumerate(self._near) if is_outside(seen, one)]
         if is_outside(seen, self._leaving):
             self._end(loop, f"the vehicle was about to leave the box: {self._figures(seen)}")
         elif near and self._clear and self._number < self._last:
-            self._turn_back(loop, seen)
+            self._turn_back(loop, seen, near)
         elif self._goal is not None:
             self._go_on(loop, decision.waypoint, where, at_ns)
         self._clear = not near
 
-    def _turn_back(self, loop: ControlLoop, seen: Observation) -> None:
-        """End a motion: back to the centre, and then the same at half the size in the axes in which it moves."""
-        offset = self._offset(self._number)
-        for axis in range(3):
-            if abs(offset[axis]) > _ROUNDING_M:
-                self._scale[axis] *= SMALLER
-        smaller = self._offset(self._number)
-        if any(_ROUNDING_M < abs(one) < SMALLEST * least for one, least in zip(smaller, LEAST_WAY_M, strict=True)):
-            size = " and ".join(
-                f"{abs(one):.2f} m {axis}" for one, axis in zip(offset, AXES, strict=True) if abs(one) > _ROUNDING_M
-            )
-            self._end(loop, f"a motion of {size} came too near to a side of the box: {self._figures(seen)}")
-            return
+    def _turn_back(self, loop: ControlLoop, seen: Observation, near: Sequence[int]) -> None:
+        """End a motion: back to the centre, and then the same at half the size in the axes that came too near."""
+        for axis in near:
+            sizes = [abs(self._offset(number)[axis]) for number in range(self._last)]
+            # In an axis that only moves along, as where it swings from before, its smallest motion to come counts.
+            size_m = sizes[self._number] or min(filter(None, sizes), default=0.0)
+            self._scale[axis] *= SMALLER
+            if SMALLER * size_m < SMALLEST * LEAST_WAY_M[axis]:
+                name = f"a motion of {size_m:.2f} m {AXES[axis]}"
+                self._end(loop, f"{name} came too near to a side of the box: {self._figures(seen)}")
+                return
         self.repeated += 1
         self._returns = True
         self._go(loop, self._places[self._last], seen.at_ns)
@@ -155,7 +154,7 @@ class BoxMonitor:
     def _offset(self, number: int) -> Vec3:
         """Return a place of the mission from the centre, at its present size [m]."""
         rows = zip(self._places[number], self._places[self._last], self._scale, strict=True)
-        north, east, down = (scale * (place - centre) for place, centre, scale in rows)
+        north, east, down = (round(scale * (place - centre), 3) for place, centre, scale in rows)
         return north, east, down
 
     def _go(self, loop: ControlLoop, place: Vec3, at_ns: int) -> None:
