@@ -179,6 +179,15 @@ def test_what_cannot_stop_at_half_the_deceleration_is_turned_back_and_repeated_a
     assert orders.place == pytest.approx((0.5 * second[0], *CENTRE[1:]), abs=1e-3)
 
 
+def test_only_the_axis_that_came_too_near_gets_smaller(orders: Orders) -> None:
+    number = len(orders.config.mission.waypoints) - 3
+    orders.see(1.4, 0.0, waypoint=number)
+    orders.see(0.0, 0.0)
+    orders.see(0.0, 0.0, dt_s=PAUSE_S)
+    north, east, down = orders.config.mission.waypoints[number]
+    assert orders.place == pytest.approx((0.5 * north, east, down), abs=1e-3)
+
+
 def test_a_motion_too_small_to_tell_anything_ends_the_flight(orders: Orders) -> None:
     size = abs(orders.config.mission.waypoints[0][0])
     for _ in range(9):

@@ -35,6 +35,12 @@ _TAKEN_S = 1.0  # after which an order has been taken up
 _MOVES = frozenset({Order.GOTO, Order.HOLD, Order.RESUME, Order.LAND})
 
 
+def _only(axis: int, sides: Vec3, free: float) -> Vec3:
+    """Return the side of one axis; the others are free."""
+    north, east, down = (side if number == axis else free for number, side in enumerate(sides))
+    return north, east, down
+
+
 class BoxMonitor:
     """Follower of one flight; gives orders only once a motion has come too near to a side.
 
@@ -52,7 +58,10 @@ class BoxMonitor:
         whole = replace(build_envelope(config, self._plant), lower_m=box.lower, upper_m=box.upper)
         north, east, down = (WEAKEST * one for one in whole.brake_mps2)
         near = replace(whole, outside_m=(-RESERVE_M,) * 3, brake_mps2=(north, east, down))
-        self._near = [replace(near, axes=(axis == 0, axis == 1, axis == 2)) for axis in range(3)]
+        self._near = [
+            replace(near, lower_m=_only(axis, box.lower, -math.inf), upper_m=_only(axis, box.upper, math.inf))
+            for axis in range(3)
+        ]
         self._leaving = replace(whole, outside_m=ZERO)
         self._places, self._last = config.mission.waypoints, len(config.mission.waypoints) - 1
         self._scale = [1.0, 1.0, 1.0]
