@@ -22,7 +22,7 @@ from uavctl.config import Config
 from uavctl.flight.decision import position, velocity
 from uavctl.flight.envelope import REACTION_S, Observation, is_outside
 from uavctl.flight.limits import ZERO
-from uavctl.lab.tune.excitation import ACCEPT_M, HOLD_S, LEAST_WAY_M, PAUSE_S, RESERVE_M, SafeBox
+from uavctl.lab.tune.excitation import LEAST_WAY_M, RESERVE_M, SafeBox
 from uavctl.loop import ControlLoop
 from uavctl.records import Command, ControlMode, Order, Ticked, Vec3
 from uavctl.smpc.plant import AXES
@@ -64,6 +64,8 @@ class BoxMonitor:
         ]
         self._leaving = replace(whole, outside_m=ZERO)
         self._places, self._last = config.mission.waypoints, len(config.mission.waypoints) - 1
+        holds = config.mission.hold_s
+        self._holds_s = holds if isinstance(holds, tuple) else (holds,) * len(self._places)
         self._scale = [1.0, 1.0, 1.0]
         self._number = 0  # of the place that is flown to, or comes next
         self._goal: Vec3 | None = None  # of our last order; None while the mission flies
@@ -116,14 +118,13 @@ class BoxMonitor:
         assert self._goal is not None
         if waypoint is not None and at_ns - self._ordered_ns > _TAKEN_S * 1e9:
             self._go(loop, self._goal, at_ns)  # the mission has begun anew, as after a pilot
-        if self._arrived_ns is None and math.dist(where, self._goal) <= ACCEPT_M:
+        if self._arrived_ns is None and math.dist(where, self._goal) <= self._config.mission.accept_m:
             self._arrived_ns = at_ns
-        late = at_ns - self._begun_ns > (self._config.duration_s - HOLD_S - _BACK_S) * 1e9
+        late = at_ns - self._begun_ns > (self._config.duration_s - self._holds_s[-1] - _BACK_S) * 1e9
         if self._number < self._last and late:
             self._number, self._returns = self._last, False
             self._go(loop, self._places[self._last], at_ns)
-        pause_s = HOLD_S if self._number == self._last else PAUSE_S
-        if self._arrived_ns is None or at_ns - self._arrived_ns < pause_s * 1e9:
+        if self._arrived_ns is None or at_ns - self._arrived_ns < self._holds_s[self._number] * 1e9:
             return
         if self._number == self._last:
             if self._config.mission.then == "land":
