@@ -51,7 +51,7 @@ from uavctl.io.transport import wait
 from uavctl.lab.identify.history import from_records
 from uavctl.lab.identify.page import write_page as write_fit_page
 from uavctl.lab.identify.result import fits_of, flown_stretches, identify, kinds_of, ramp_of
-from uavctl.lab.tune.box_monitor import BoxMonitor
+from uavctl.lab.tune.box_monitor import KNOWN, WEAKEST, BoxMonitor
 from uavctl.lab.tune.change import (
     PinnedAxis,
     PredictionErrors,
@@ -119,19 +119,20 @@ class TuneFlown:
     repeated: int = 0  # motions that came too near to a side of the box, and were repeated smaller
 
 
-def fly_once(config: Config, out: Path, *, simulated: bool, take_off_m: float | None, box: SafeBox | None) -> TuneFlown:
+def fly_once(
+    config: Config, out: Path, *, simulated: bool, take_off_m: float | None, monitor: BoxMonitor | None = None
+) -> TuneFlown:
     """Fly a configuration's mission once; the pilot's stick and Ctrl-C end it as any flight.
 
     Args:
         config: The configuration, mission in it.
         simulated: In lockstep with the simulator, else on the configured links.
         take_off_m: Height of the climb, armed by us; None leaves arming and modes to the pilot.
-        box: Where it is to stay; None: nothing is looked after.
+        monitor: Monitor of the box where it is to stay; None for none.
 
     Raises:
         UavctlError: Nothing was flown, and why.
     """
-    monitor = None if box is None else BoxMonitor(config, box)
     follower = None if monitor is None else monitor.follow
     loaded: LoadedConfig = parse(dump_config(config), f"{out} (configuration)")
     if simulated:
@@ -532,12 +533,13 @@ class _TuneRun:
     def _fly(self, config: Config, name: str) -> tuple[int, str]:
         if not self._made.simulated and self._made.box is not None:
             check_start(self._made.box, where_it_stands(self._config), "where the vehicle stands", _LEVEL)
+        box, weakest = self._made.box, WEAKEST if name == BEFORE else KNOWN
         flown = fly_once(
             config,
             self.folder.free(name),
             simulated=self._made.simulated,
             take_off_m=self._made.take_off_m,
-            box=self._made.box,
+            monitor=None if box is None else BoxMonitor(config, box, weakest),
         )
         if flown.repeated:
             self._told(f"motions that came too near to a side of the box and were repeated smaller: {flown.repeated}")

@@ -3,7 +3,7 @@
 The controller plans inside the box with the model that it has, and an unknown vehicle does otherwise. So each tick asks
 of the estimate what the envelope asks of the limits (`uavctl.flight.envelope`): can the vehicle stop before?
 
-    out + v REACTION_S + v² / (2 WEAKEST a) > -RESERVE_M      the motion ends: back to the centre
+    out + v REACTION_S + v² / (2 weakest a) > -RESERVE_M      the motion ends: back to the centre
     out + v REACTION_S + v² / (2 a)         > 0               the flight ends: brake, and the vehicle's own landing
 
 out is how far it is beyond a side (negative inside), v the speed towards it, a the largest deceleration that is asked
@@ -28,6 +28,7 @@ from uavctl.records import Command, ControlMode, Order, Ticked, Vec3
 from uavctl.smpc.plant import AXES
 
 WEAKEST = 0.5  # of the deceleration that is asked for: the least gain that a tuning takes over
+KNOWN = 0.8  # the same of a tuned plant: a gain is taken over with a standard error of 0.1, and twice that is certain
 SMALLER = 0.5  # times the size of a motion that did not stay inside
 SMALLEST = 0.25  # of the least way, from the centre: the first step in the smallest box; a smaller one tells nothing
 _BACK_S = 3.0  # for the way to the last place, before the time to hold it
@@ -51,12 +52,13 @@ class BoxMonitor:
     Args:
         config: the configuration that is flown, with the excitation as its mission.
         box: where the vehicle is to stay.
+        weakest: share of the deceleration asked for that it surely has.
     """
 
-    def __init__(self, config: Config, box: SafeBox) -> None:
+    def __init__(self, config: Config, box: SafeBox, weakest: float = WEAKEST) -> None:
         self._config, self._box, self._plant = config, box, build_plant(config)
         whole = replace(build_envelope(config, self._plant), lower_m=box.lower, upper_m=box.upper)
-        north, east, down = (WEAKEST * one for one in whole.brake_mps2)
+        north, east, down = (weakest * one for one in whole.brake_mps2)
         near = replace(whole, outside_m=(-RESERVE_M,) * 3, brake_mps2=(north, east, down))
         self._near = [
             replace(near, lower_m=_only(axis, box.lower, -math.inf), upper_m=_only(axis, box.upper, math.inf))
