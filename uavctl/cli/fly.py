@@ -46,7 +46,7 @@ from uavctl.config.connections import warnings
 from uavctl.daemon.control_socket import ControlServer, control_folder, daemon_name, listening
 from uavctl.daemon.daemon import AfterTick, collected_between_ticks, realtime
 from uavctl.daemon.daemon import fly as run_daemon
-from uavctl.daemon.engagement import Engagement, check_places, stop_limit_s
+from uavctl.daemon.engagement import Engagement, TickFollower, check_places, stop_limit_s
 from uavctl.daemon.health import HealthWatch, Notifier, RecorderHealth
 from uavctl.daemon.lock import sole_daemon
 from uavctl.io.signed_connection import connected
@@ -202,6 +202,7 @@ def fly_daemon(
     control: Path | None = None,
     as_realtime_process: bool = False,
     view_port: int | None = None,
+    follower: TickFollower | None = None,
 ) -> FlightSummary:
     """Fly a vehicle until the end, record it, and say on the console how it ended.
 
@@ -214,12 +215,13 @@ def fly_daemon(
         control: folder of the socket for orders; None is the user's own.
         as_realtime_process: SCHED_FIFO and locked memory, as far as permitted.
         view_port: TCP port of a live view; None is none.
+        follower: looks at every tick, and may give orders.
 
     Raises:
         UavctlError: nothing was flown, and why.
     """
     config = loaded.config
-    engagement = Engagement(config, take_off_m=take_off_m, goto=goto)
+    engagement = Engagement(config, take_off_m=take_off_m, goto=goto, follower=follower)
     tick_ns, dt_ns = round(config.daemon.tick_s * 1e9), round(config.plant.dt_s * 1e9)
     # First of all, so that a second daemon is refused at once.
     with (

@@ -41,7 +41,7 @@ from uavctl.cli.sim import make_door
 from uavctl.clock import Ticker, monotonic_ns, zero_utc_ns
 from uavctl.config import Config, LoadedConfig
 from uavctl.daemon.daemon import collected_between_ticks, fly
-from uavctl.daemon.engagement import Engagement, check_places, stop_limit_s
+from uavctl.daemon.engagement import Engagement, TickFollower, check_places, stop_limit_s
 from uavctl.errors import UavctlError, UsageError
 from uavctl.io.signed_connection import connected
 from uavctl.lab.lockstep import TRUTH, LockstepFlight, check_length
@@ -98,6 +98,7 @@ def fly_simulated(
     goto: bool = False,
     out: Path | None = None,
     view_port: int | None = None,
+    follower: TickFollower | None = None,
 ) -> FlightSummary:
     """Fly the simulated vehicle for the configured time, record it, and say on the console how it ended.
 
@@ -108,6 +109,7 @@ def fly_simulated(
         goto: whether the mission is the place of `--goto`.
         out: folder of the recording; None makes a new one below `flights/`.
         view_port: TCP port of a live view; None is none.
+        follower: looks at every tick, and may give orders.
 
     Raises:
         UavctlError: nothing was flown, and why.
@@ -116,7 +118,7 @@ def fly_simulated(
     check_length(config)
     with located(loaded):
         design = design_of(config)
-    engagement = Engagement(config, take_off_m=take_off_m, goto=goto)
+    engagement = Engagement(config, take_off_m=take_off_m, goto=goto, follower=follower)
     with onlookers(view_port) as looking, new_recording(out, config.name, config.log.free_bytes) as path:
         with located(loaded):
             check_places(config, design, take_off_m, engagement.goal)

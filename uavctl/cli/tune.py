@@ -51,6 +51,7 @@ from uavctl.io.transport import wait
 from uavctl.lab.identify.history import from_records
 from uavctl.lab.identify.page import write_page as write_fit_page
 from uavctl.lab.identify.result import fits_of, flown_stretches, identify, kinds_of, ramp_of
+from uavctl.lab.tune.box_monitor import KNOWN, WEAKEST, BoxMonitor
 from uavctl.lab.tune.change import (
     PinnedAxis,
     PredictionErrors,
@@ -114,26 +115,36 @@ class TuneFlown:
     summary: FlightSummary  # its figures
     recording: Path  # where it is
     end: TuneEnd  # what became of it
+    ended: str = ""  # why the monitor of the box ended it; empty where it did not
+    repeated: int = 0  # motions that came too near to a side of the box, and were repeated smaller
 
 
-def fly_once(config: Config, out: Path, *, simulated: bool, take_off_m: float | None) -> TuneFlown:
+def fly_once(
+    config: Config, out: Path, *, simulated: bool, take_off_m: float | None, monitor: BoxMonitor | None = None
+) -> TuneFlown:
     """Fly a configuration's mission once; the pilot's stick and Ctrl-C end it as any flight.
 
     Args:
         config: The configuration, mission in it.
         simulated: In lockstep with the simulator, else on the configured links.
         take_off_m: Height of the climb, armed by us; None leaves arming and modes to the pilot.
+        monitor: Monitor of the box where it is to stay; None for none.
 
     Raises:
         UavctlError: Nothing was flown, and why.
     """
+    follower = None if monitor is None else monitor.follow
     loaded: LoadedConfig = parse(dump_config(config), f"{out} (configuration)")
     if simulated:
-        summary = fly_simulated(loaded, take_off_m=take_off_m, out=out)
+        summary = fly_simulated(loaded, take_off_m=take_off_m, out=out, follower=follower)
     else:
-        summary = fly_daemon(loaded, take_off_m=take_off_m, out=out)
+        summary = fly_daemon(loaded, take_off_m=take_off_m, out=out, follower=follower)
     recording = out / "flight.mcap"
-    return TuneFlown(summary, recording, _end(config, summary, recording))
+    end = _end(config, summary, recording)
+    if monitor is None:
+        return TuneFlown(summary, recording, end)
+    end = TuneEnd.FAILED if monitor.why and end is not TuneEnd.PILOT else end
+    return TuneFlown(summary, recording, end, monitor.why, monitor.repeated)
 
 
 def left_whole(config: Config, out: Path) -> Path | None:
@@ -522,9 +533,16 @@ class _TuneRun:
     def _fly(self, config: Config, name: str) -> tuple[int, str]:
         if not self._made.simulated and self._made.box is not None:
             check_start(self._made.box, where_it_stands(self._config), "where the vehicle stands", _LEVEL)
+        box, weakest = self._made.box, WEAKEST if name == BEFORE else KNOWN
         flown = fly_once(
-            config, self.folder.free(name), simulated=self._made.simulated, take_off_m=self._made.take_off_m
+            config,
+            self.folder.free(name),
+            simulated=self._made.simulated,
+            take_off_m=self._made.take_off_m,
+            monitor=None if box is None else BoxMonitor(config, box, weakest),
         )
+        if flown.repeated:
+            self._told(f"motions that came too near to a side of the box and were repeated smaller: {flown.repeated}")
         code, why = _stopped(flown)
         if not code:
             self.folder.note(**{name: self.folder.relative(flown.recording)})
@@ -554,6 +572,8 @@ def _stopped(flown: TuneFlown) -> tuple[int, str]:
     sentence = flown.summary.ending.sentence.removesuffix(".")
     codes = {TuneEnd.WHOLE: 0, TuneEnd.PILOT: PILOT, TuneEnd.OPERATOR: INTERRUPTED, TuneEnd.FAILED: FAILED}
     code = codes[flown.end]
+    if flown.ended and flown.end is TuneEnd.FAILED:
+        return code, f"{flown.ended} ({flown.recording})"
     told = flown.end is not TuneEnd.OPERATOR or "operator" in sentence
     who = "" if told else "Ended by the operator. "
     return code, "" if not code else f"{who}{sentence}. The flight did not come to its end ({flown.recording})"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from uavctl.build.controller import resting
 from uavctl.build.mission import build_mission
@@ -18,6 +18,7 @@ from uavctl.smpc.plant import AXES
 
 DOWN = 2
 LANDING_S = 10.0  # after braking: for asking the vehicle to land
+TickFollower = Callable[[ControlLoop, Ticked], None]
 
 
 def goto_keys(place_m: Sequence[float]) -> dict[str, object]:
@@ -48,11 +49,15 @@ class Engagement:
         config: the configuration, `--goto` in it.
         take_off_m: height of the climb above the ground [m]; None leaves arming and modes to the pilot.
         goto: whether the mission is the place of `--goto`.
+        follower: looks at every tick as well, and may give orders.
     """
 
-    def __init__(self, config: Config, *, take_off_m: float | None, goto: bool) -> None:
+    def __init__(
+        self, config: Config, *, take_off_m: float | None, goto: bool, follower: TickFollower | None = None
+    ) -> None:
         self._config = config
         self._take_off_m = take_off_m
+        self._follower = follower
         self.goal: Vec3 | None = config.mission.waypoints[0] if goto else None
         self._ordered = False
         self.engaged = False
@@ -75,6 +80,8 @@ class Engagement:
         loop.course.arrived = self.arrived
         if self._take_off_m is not None and not self._ordered:
             self._ordered = loop.order(Command(order=Order.TAKE_OFF, height_m=self._take_off_m))
+        if self._follower is not None:
+            self._follower(loop, ticked)
 
     def _look_for_arrival(self, loop: ControlLoop, ticked: Ticked) -> None:
         estimate = ticked.estimate
