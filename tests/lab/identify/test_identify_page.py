@@ -7,6 +7,7 @@ import re
 import struct
 from html import unescape
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -134,7 +135,7 @@ def test_a_second_vehicle_in_a_log_changes_nothing(tmp_path: Path, system: int |
     rows = []
     for packet in packets:
         rows.append((packet.at_ns, packet.data))
-        message = parser.decode(bytearray(packet.data)) if message_of(packet.data) in (0, 84) else None
+        message: Any = parser.decode(bytearray(packet.data)) if message_of(packet.data) in (0, 84) else None
         if message is not None and message.get_type() == "HEARTBEAT" and message.get_srcSystem() == 1:
             rows.append((packet.at_ns, bytes(message.pack(other))))
         elif message is not None and message.get_type() != "HEARTBEAT":
