@@ -29,7 +29,7 @@ from uavctl.errors import ConfigError
 from uavctl.lab.campaign.spec import read_campaign
 
 PAPER = dump_config(load_config("paper"))
-SEED, CONFIGS, LINES = 7, 120, 80
+SEED, CONFIGS, LINES = 7, 60, 80
 FENCE = '[[fence]]\nstate = "north"\nside = "upper"\ntimes_s = [0.0]\nvalues = [20.0]\n'
 
 

@@ -37,7 +37,7 @@ def furthest(flight: Flight) -> tuple[float, float]:
         if flight.loop.finished:
             break
         # An engaged flight is landed, to end it.
-        flight.run(0.05, stop=flight.is_in(HandoverState.ENGAGED) and flight.now_ns > 60 * 10**9)
+        flight.run(0.05, stop=flight.is_in(HandoverState.ENGAGED) and flight.now_ns > 40 * 10**9)
         north, east, down = flight.peers.autopilot.craft.position_m
         side_m = max(side_m, abs(north - START_M[0]), abs(east - START_M[1]))
         height_m = max(height_m, -down)
