@@ -24,6 +24,8 @@ from uavctl.records import ControlMode, Ending
 MODULE = "outside_controllers"
 FAILING = ("Raises", "RaisesSoon", "Leaves", "NotFinite", "WrongShape")
 WAY_S = 14.0
+# What fails is let go of by the same code, whatever flies: a linear plant adds nothing to a true vehicle.
+TRUE_WORLDS = pytest.mark.parametrize(("plant", "autopilot"), [world for world in WORLDS if world[0] == "quadrotor"])
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +117,7 @@ def test_a_good_one_flies_to_the_target(ready: Callable[[str], Prepared], plant:
 
 @pytest.mark.fault(69)
 @pytest.mark.slow
-@pytest.mark.parametrize(("plant", "autopilot"), WORLDS)
+@TRUE_WORLDS
 @pytest.mark.parametrize("name", FAILING)
 def test_one_that_fails_never_leaves_the_room(
     ready: Callable[[str], Prepared], name: str, plant: str, autopilot: str
@@ -127,7 +129,7 @@ def test_one_that_fails_never_leaves_the_room(
 
 @pytest.mark.fault(69)
 @pytest.mark.slow
-@pytest.mark.parametrize(("plant", "autopilot"), WORLDS)
+@TRUE_WORLDS
 @pytest.mark.parametrize("took_ns", [60_000_000, 700_000_000])
 def test_one_that_is_late_never_leaves_the_room_and_replays(
     ready: Callable[[str], Prepared],
@@ -143,7 +145,7 @@ def test_one_that_is_late_never_leaves_the_room_and_replays(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("plant", "autopilot"), WORLDS)
+@TRUE_WORLDS
 def test_one_that_flies_at_a_wall_is_braked_while_it_can_be(
     ready: Callable[[str], Prepared], plant: str, autopilot: str
 ) -> None:
