@@ -110,9 +110,9 @@ def test_each_frame_is_unwrapped_byte_by_byte(tmp_path: Path, name: str, encodin
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("encoding", WRITERS)
-def test_it_flies_as_the_tlog_does(tmp_path: Path, encoding: str) -> None:
-    path = WRITERS[encoding][0](tmp_path / "a.mcap", list(read_tlog(DATA / TLOGS[0]).packets))
+def test_it_flies_as_the_tlog_does(tmp_path: Path) -> None:
+    """The packets of either encoding are the same, as is shown above: a flight of one is enough."""
+    path = WRITERS["cdr"][0](tmp_path / "a.mcap", list(read_tlog(DATA / TLOGS[0]).packets))
     assert flown(read_mcap(path).packets) == by_tlog(TLOGS[0])
 
 
