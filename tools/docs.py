@@ -226,7 +226,7 @@ in `RETURNING`.
 * `other`: a person has it. A stick or switch of the remote control has moved at the time (RC_CHANNELS, by a tenth of
   its way); or a ground station has ordered a mode; or only a person chooses this mode,
   and a remote control is heard whose channels the vehicle does not tell.
-  What the vehicle says of a failsafe explains such a mode too, if nobody's stick has moved ({_degrades()}):
+  What the vehicle says of a failsafe explains such a mode too, if no stick has moved ({_degrades()}):
   then the exit code is 1, and nothing is sent.
 * `unclear`: none of these shows who it was. Nothing is sent, and word of it may still come. What we took off, and
   flies by itself in the air, is asked to land after `climb_s`, unless a stick moves. The exit code is 1.

@@ -7,7 +7,7 @@ import pytest
 
 from sim.simulation import World
 from uavctl.build.controller import build_conditioned, build_controller
-from uavctl.build.rehearsal import Rehearsal, rehearse
+from uavctl.build.rehearsal import RehearsalResult, rehearse
 from uavctl.config import Config, load_config
 from uavctl.lab.trial import FlightTally, eight
 from uavctl.loop import ControlLoop
@@ -17,7 +17,7 @@ LONG = (*BURSTS, "link.burst_enter=0.05", "link.burst_leave=0.1")  # a burst las
 SHORT = (*BURSTS, "link.burst_enter=0.05", "link.burst_leave=0.5")
 
 
-def rehearsed(config: Config) -> Rehearsal:
+def rehearsed(config: Config) -> RehearsalResult:
     design = build_conditioned(config)
     return rehearse(config, design, build_controller(config, design))
 

@@ -78,12 +78,12 @@ def test_a_flight_in_figures() -> None:
 def test_losses_are_those_of_the_link_whatever_the_age(latency_s: float) -> None:
     flight = Flight("room", "link.loss=0.3", "link.jitter_s=0.0", f"link.delay_s={latency_s}", "sim.seed=4")
     assert flight.run(20).loss is None  # a second is not over
-    told = []
+    losses = []
     for _ in range(4):
         loss = flight.run(200).loss
         assert loss is not None
-        told.append(loss)
-    assert sum(told) / len(told) == pytest.approx(0.3, abs=4.0 * math.sqrt(0.3 * 0.7 / 800))
+        losses.append(loss)
+    assert sum(losses) / len(losses) == pytest.approx(0.3, abs=4.0 * math.sqrt(0.3 * 0.7 / 800))
 
 
 @pytest.mark.slow

@@ -28,7 +28,7 @@ MOST_STEPS = 2400  # two minutes at steps of 0.05 s; a step takes milliseconds
 _GOLDEN = 0.5 * (5.0**0.5 - 1.0)
 
 
-class Rehearsal(msgspec.Struct, frozen=True, kw_only=True):
+class RehearsalResult(msgspec.Struct, frozen=True, kw_only=True):
     """Outcome of a rehearsed mission; tracking figures are None where the mission has no trajectory."""
 
     seconds: float  # that were rehearsed
@@ -98,7 +98,7 @@ class Rehearsal(msgspec.Struct, frozen=True, kw_only=True):
         return "; ".join(found)
 
 
-def rehearse(config: Config, design: ConditionedDesign, controller: Controller) -> Rehearsal:
+def rehearse(config: Config, design: ConditionedDesign, controller: Controller) -> RehearsalResult:
     """Fly the mission on the plan's own model: a trajectory to its end, else `duration_s`."""
     mission, plant, dt_ns = controller.mission, design.plant, controller.dt_ns
     motion, index = mission.trajectory, list(plant.position_index)
@@ -122,7 +122,7 @@ def rehearse(config: Config, design: ConditionedDesign, controller: Controller) 
                 worst, ahead_s = (name, unit, one.amount / size), (late + one.stage) * plant.dt_s
         sent = answer.inputs[0] if len(answer.inputs) else sent
         x = plant.a @ x + plant.b @ sent
-    found = Rehearsal(
+    found = RehearsalResult(
         seconds=round(len(passed) * plant.dt_s, 6),
         plans=len(passed),
         allowed=round(1.0 - config.smpc.delta_x, 9),
@@ -136,7 +136,9 @@ def rehearse(config: Config, design: ConditionedDesign, controller: Controller) 
     return found if motion is None else _tracked(found, config, design, mission, np.array(passed))
 
 
-def _tracked(found: Rehearsal, config: Config, design: ConditionedDesign, mission: Mission, passed: Array) -> Rehearsal:
+def _tracked(
+    found: RehearsalResult, config: Config, design: ConditionedDesign, mission: Mission, passed: Array
+) -> RehearsalResult:
     """Return a rehearsal with the figures of its trajectory."""
     assert mission.trajectory is not None
     plant, motion = design.plant, mission.trajectory

@@ -26,7 +26,7 @@ from uavctl.build.controller import (
 )
 from uavctl.build.library import StoredLibrary
 from uavctl.build.mission import build_names
-from uavctl.build.rehearsal import Rehearsal, rehearse
+from uavctl.build.rehearsal import RehearsalResult, rehearse
 from uavctl.cli.common import DEFAULTS, Column, Common, WideTable, bars, columns, located
 from uavctl.cli.prepare import ready_library
 from uavctl.config import Config
@@ -154,7 +154,7 @@ def design(
     return 0
 
 
-def rehearsed(config: Config, made: ConditionedDesign) -> Rehearsal | None:
+def rehearsed(config: Config, made: ConditionedDesign) -> RehearsalResult | None:
     """Rehearse the mission; None for a plant without axes, or where a controller of another package flies.
 
     Raises:
@@ -165,7 +165,7 @@ def rehearsed(config: Config, made: ConditionedDesign) -> Rehearsal | None:
     return rehearse(config, made, build_controller(config, made))
 
 
-def conditioned_picture(made: ConditionedDesign, name: str, found: Rehearsal | None = None) -> RenderableType:
+def conditioned_picture(made: ConditionedDesign, name: str, found: RehearsalResult | None = None) -> RenderableType:
     """Return tables of ages with their risk, and of where a plan may rest; and what is wrong with the mission."""
     title = f"Risk by the age of information, design {made.design_id} of {name}"
     ages = columns(title, ("age [steps]", "probability", "may be outside", "far from limits"), (), ())

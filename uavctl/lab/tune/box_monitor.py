@@ -1,6 +1,6 @@
 """Monitor of the box in a flight of `uavctl tune`: ends a motion that comes too near to a side, and repeats it smaller.
 
-The controller plans inside the box with the model that it has, and an unknown vehicle does otherwise. So each tick asks
+The controller plans inside the box with the model that it has, and an unknown vehicle may leave it. So each tick asks
 of the estimate what the envelope asks of the limits (`uavctl.flight.envelope`): can the vehicle stop before?
 
     out + v REACTION_S + v² / (2 weakest a) > -RESERVE_M      the motion ends: back to the centre
@@ -119,7 +119,7 @@ class BoxMonitor:
         """Fly the rest of the mission by orders, once a place has been reached and the pause there is over."""
         assert self._goal is not None
         if waypoint is not None and at_ns - self._ordered_ns > _TAKEN_S * 1e9:
-            self._go(loop, self._goal, at_ns)  # the mission has begun anew, as after a pilot
+            self._go(loop, self._goal, at_ns)  # the mission has started again, as after a pilot
         if self._arrived_ns is None and math.dist(where, self._goal) <= self._config.mission.accept_m:
             self._arrived_ns = at_ns
         late = at_ns - self._begun_ns > (self._config.duration_s - self._holds_s[-1] - _BACK_S) * 1e9
