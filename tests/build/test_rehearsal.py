@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import msgspec
+import numpy as np
 import pytest
 
 from sim.simulation import World
 from uavctl.build.controller import build_conditioned, build_controller
-from uavctl.build.rehearsal import RehearsalResult, rehearse
+from uavctl.build.rehearsal import LARGE_DRAG_1PS, RehearsalResult, rehearse
 from uavctl.config import Config, load_config
-from uavctl.lab.trial import FlightTally, eight
+from uavctl.lab.trial import FlightTally, WatchedFlyer, distances_m, eight, path_of
 from uavctl.loop import ControlLoop
 
 BURSTS = ("link.model=gilbert-elliott", "link.loss=0.0", "link.burst_loss=1.0")
@@ -65,3 +66,41 @@ def test_an_eight_that_the_inputs_do_not_allow_strays_by_its_figure() -> None:
     assert narrow.saturates
     assert narrow.left_mps2 == pytest.approx(0.4)  # less the 0.6 m/s² that are left to fly against wind
     assert narrow.tracking_max_m is not None and narrow.tracking_max_m > narrow.accept_m
+
+
+WIDE = ("sets.input_lower=[-4,-4,-1.5]", "sets.input_upper=[4,4,1.5]", "limits.accel_mps2=[4,4,1.5]")
+
+
+def eight_flown_m(config: Config, drag_1ps: float) -> float:
+    """Mean distance from the figure of eight in the linear simulator, with a vehicle of that drag."""
+    replace = msgspec.structs.replace
+    assert config.mission.trajectory is not None
+    path, end_s = path_of(config.mission.trajectory), config.mission.trajectory.times_s[-1]
+    start = replace(config.sim, start_position_m=config.mission.trajectory.positions_m[0])
+    vehicle = replace(config, sim=start, plant=replace(config.plant, drag_1ps=(drag_1ps,) * 3))
+    tally = FlightTally()
+    watched = WatchedFlyer(ControlLoop(config, build_controller(config), tally, lambda: 0))
+    world = World(vehicle, watched)
+    watched.where = lambda: world.peers.vehicle.position_m
+    world.run(end_s + 2.0)
+    assert tally.begun_ns is not None
+    times = np.array(watched.times_s) - tally.begun_ns * 1e-9
+    flies = (times >= 0.0) & (times <= end_s)
+    wanted = np.array([path(t)[0] for t in times[flies]])
+    return float(distances_m(np.array(watched.positions_m)[flies], wanted).mean())
+
+
+def test_the_cost_of_a_drag_that_nobody_identified_is_rehearsed_and_flown() -> None:
+    found = rehearsed(along_eight("room-px4", *WIDE))
+    assert found.large_drag_m is not None and found.tracking_m is not None
+    assert found.depends_on_drag
+    assert found.large_drag_m > 5.0 * found.tracking_m
+    flown_m = eight_flown_m(along_eight("room-px4", *WIDE, "sim.plant=linear"), LARGE_DRAG_1PS)
+    assert found.large_drag_m == pytest.approx(flown_m, rel=0.25)  # a flight has losses, noise and a bias, too
+
+
+def test_an_identified_large_drag_needs_no_second_figure() -> None:
+    found = rehearsed(along_eight("room-px4", *WIDE, f"plant.drag_1ps={[LARGE_DRAG_1PS] * 3}"))
+    assert found.large_drag_m is None
+    assert not found.depends_on_drag
+    assert not found.sentences

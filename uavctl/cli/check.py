@@ -229,7 +229,8 @@ def mission_items(config: Config, prepared: Prepared | None = None) -> tuple[Ite
     controller = build_controller(config, design) if prepared is None else prepared.controller
     assert isinstance(design, ConditionedDesign)
     found = rehearse(config, design, controller)
-    state = ItemState.BAD if found.relaxes or found.strays else ItemState.NOTE if found.saturates else ItemState.GOOD
+    bad, noted = found.relaxes or found.strays, found.saturates or found.depends_on_drag
+    state = ItemState.BAD if bad else ItemState.NOTE if noted else ItemState.GOOD
     value = ". ".join(found.sentences) or f"{found.seconds:g} s rehearsed, {found.relaxed:.0%} of the plans relax"
     want = "plans keep their constraints, and the trajectory to mission.accept_m"
     return (item("mission", state, value, want, found.hint),)
