@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 from itertools import pairwise
@@ -309,3 +310,17 @@ def test_a_slice_of_spoilt_command_lines_ends_in_an_answer(
             codes.add(run(case.words))
     capsys.readouterr()
     assert codes <= {0, 1, 2} and 2 in codes
+
+
+@pytest.mark.parametrize("preset", ["room", "room-px4", "room-ardupilot", "paper", "room-hahn-stursberg"])
+@pytest.mark.parametrize("key", ["input_lower", "input_upper"])
+def test_input_limits_that_leave_zero_out_are_refused(
+    preset: str, key: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The limit of each input alone is moved to the other side of zero."""
+    limits = [float(one) for one in getattr(load_config(preset).sets, key)]
+    for index in range(len(limits)):
+        moved = [-0.25 * one if i == index else one for i, one in enumerate(limits)]
+        assert run(["design", "--config", preset, "--json", "--set", f"sets.{key}={moved}"]) == 2
+        error = json.loads(capsys.readouterr().out)
+        assert "sets.input_" in error["message"]

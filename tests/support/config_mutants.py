@@ -340,8 +340,11 @@ class Mutants:
             new = rng.choice((*TEXTS, *ODD[:8]))
             return f"text {str(new)[:20]!r}", new
         if isinstance(value, list):
-            how = rng.choice(("longer", "shorter", "much longer", "odd", "nested", "bigger"))
-            if how == "bigger":
+            how = rng.choice(("longer", "shorter", "much longer", "odd", "nested", "bigger", "shifted"))
+            if how == "shifted" and all(isinstance(one, int | float) for one in value):
+                offset = rng.choice((-3.0, -0.7, 0.7, 3.0))  # limits that leave zero out, targets beyond a wall
+                return f"shifted by {offset:g}", [one + offset for one in value]
+            if how in ("bigger", "shifted"):
                 factor = rng.choice((*FACTORS, 1e9, 1e200))
                 return f"times {factor:g}", _scaled(value, factor)
             longer = [*value, *(value[-1:] or [1.0])]
