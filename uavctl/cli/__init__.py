@@ -34,7 +34,10 @@ def main() -> None:
 
 
 def _end(code: int) -> NoReturn:
-    """End the process, at once where a thread hangs in a write: the interpreter would abort on the stream's lock."""
+    """End the process, at once where a daemon thread is left.
+
+    A thread that waits for standard input holds the stream's lock, and the interpreter's own end aborts on it.
+    """
     if any(thread.daemon for thread in threading.enumerate()):
         sys.stdout.flush()
         os._exit(code)
