@@ -101,8 +101,8 @@ class RehearsalResult(msgspec.Struct, frozen=True, kw_only=True):
             )
         elif self.depends_on_drag:
             found.append(
-                f"the trajectory is followed to {self.tracking_m:.2f} m in the mean if the drag is plant.drag_1ps, "
-                f"{self.drag_1ps:g} 1/s; with {LARGE_DRAG_1PS:g} 1/s to {self.large_drag_m:.2f} m, "
+                f"with the configured drag of {self.drag_1ps:g} 1/s the model is {self.tracking_m:.3f} m from the "
+                f"trajectory in the mean; with a drag of {LARGE_DRAG_1PS:g} 1/s it is {self.large_drag_m:.2f} m, "
                 f"{self.large_drag_max_m:.2f} m at most"
             )
         return tuple(found)
