@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 from operation_rig import PATIENT_DAEMON, PATIENT_VEHICLE, ended, port
 from patience import until
-from places import ROOT
+from places import ROOT, without_pages
 
 from sim.server import Seat, serve_all
 from uavctl.cli.app import run
@@ -175,7 +175,7 @@ def flying() -> Iterator[tuple[Path, dict[str, list[Truth]], subprocess.Popen[st
         path.write_text(HEAD + "".join(tables))
         command = [sys.executable, "-m", "uavctl", "fleet", "fly", str(path), "--out", str(Path(folder) / "out")]
         try:
-            environ = os.environ | {FOLDER_VARIABLE: str(Path(folder) / "c")}
+            environ = without_pages() | {FOLDER_VARIABLE: str(Path(folder) / "c")}
             fleet = subprocess.Popen(
                 [*command, "--json"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=environ
             )

@@ -7,43 +7,41 @@ from functools import cache, partial
 
 import numpy as np
 import pytest
-from loopback_rig import flight, lockstep, make_loop
+from loopback_rig import Memory, flight, lockstep, make_loop
 
 from logs.recording.flight import FlightData
 from logs.recording.replay import replay
-from logs.recording.summary import FlightSummary, summarise
+from logs.recording.summary import summarise
 from uavctl.build.controller import build_design
 from uavctl.config import load_config
 from uavctl.records import ControlMode, Datagram, Decision, Estimate, Plan, Setpoint, SetpointSource, SolveStatus, Truth
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver
 
+LONG = range(4)  # seeds of flights of 200 steps
+
 
 @cache
-def paper_flight(seed: int) -> tuple[FlightSummary, FlightSummary]:
-    """What 200 steps of preset `paper` came to, and their first 50."""
-    memory = lockstep("paper", 200.0, f"sim.seed={seed}")
-    first = FlightData.from_records(entry for entry in memory.entries if entry[1] < 50_000_000_000)
-    return summarise(flight(memory), wall_s=1.0), summarise(first, wall_s=1.0)
+def paper_flight(seed: int, steps: int) -> Memory:
+    return lockstep("paper", float(steps), f"sim.seed={seed}")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("first", range(0, 20, 4))
-def test_paper_flies_200_steps_without_slack(first: int) -> None:
+def test_paper_flies_200_steps_without_slack() -> None:
     outside = 0
-    for seed in range(first, first + 4):
-        summary, _ = paper_flight(seed)
+    for seed in LONG:
+        summary = summarise(flight(paper_flight(seed, 200)), wall_s=1.0)
         assert summary.steps == 200
         assert summary.slack_used == 0
         assert summary.input_violations == 0
         assert summary.failed_solves == 0
         assert summary.fallbacks == 0
         outside += summary.state_violations
-    assert outside < 0.01 * 4 * 200
+    assert outside < 0.01 * len(LONG) * 200
 
 
 @pytest.mark.slow
 def test_a_flight_of_200_steps_replays_identically() -> None:
-    memory = lockstep("paper", 200.0, "sim.seed=3")
+    memory = paper_flight(3, 200)
     result = replay(memory.entries, partial(make_loop, load_config("paper", ["sim.seed=3"])))
     assert result.identical, result.first_difference
     assert result.decisions == 2000
@@ -52,7 +50,11 @@ def test_a_flight_of_200_steps_replays_identically() -> None:
 @pytest.mark.slow
 def test_paper_costs_what_the_paper_s_example_costs() -> None:
     # 60 runs of 50 steps: 56.2e3 on average (theory, section 7). Twenty runs scatter by a few percent.
-    flights = [paper_flight(seed)[1] for seed in range(20)]
+    flights = []
+    for seed in range(20):
+        entries = paper_flight(seed, 200 if seed in LONG else 50).entries
+        first = FlightData.from_records(entry for entry in entries if entry[1] < 50_000_000_000)
+        flights.append(summarise(first, wall_s=1.0))
     assert {one.steps for one in flights} == {50}
     assert np.mean([one.cost for one in flights]) == pytest.approx(56.2e3, rel=0.03)
 
@@ -99,10 +101,14 @@ def test_playout_flies_the_old_plan_s_next_input_in_every_step_of_silence() -> N
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("preset", "near_m"), [("room-hahn-stursberg", 0.25), ("room", 0.05)])
-def test_a_room_s_flight_settles_at_the_target_from_the_far_corner(preset: str, near_m: float) -> None:
+@pytest.mark.parametrize(
+    ("preset", "near_m", "duration_s"), [("room-hahn-stursberg", 0.25, 40.0), ("room", 0.05, 20.0)]
+)
+def test_a_room_s_flight_settles_at_the_target_from_the_far_corner(
+    preset: str, near_m: float, duration_s: float
+) -> None:
     for seed in range(3):
-        memory = lockstep(preset, 40.0, f"sim.seed={seed}")
+        memory = lockstep(preset, duration_s, f"sim.seed={seed}")
         summary = summarise(flight(memory), wall_s=1.0)
         assert summary.state_violations == 0
         assert summary.input_violations == 0

@@ -30,10 +30,19 @@ def prepared() -> Prepared:
 @pytest.fixture(params=WORLDS, ids=[f"{plant}-{autopilot}" for plant, autopilot in WORLDS])
 def world(request: pytest.FixtureRequest) -> Config:
     """The preset from its start, where plans begin at once; nothing is lost unless a fault says so."""
-    plant, autopilot = request.param
+    return world_of(*request.param)
+
+
+def world_of(plant: str, autopilot: str) -> Config:
     return load_config(
         "room-hahn-stursberg", [f"sim.plant={plant}", f"sim.autopilot={autopilot}", "sim.seed=3", "link.loss=0.0"]
     )
+
+
+@pytest.fixture(params=WORLDS[2:], ids=["px4", "ardupilot"])
+def quadrotor(request: pytest.FixtureRequest) -> Config:
+    """The worlds whose vehicle has to lean before it moves."""
+    return world_of(*request.param)
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +64,7 @@ def bounded(flight: TrueFlight) -> TrueFlight:
 
 
 @pytest.mark.slow
-@pytest.mark.fault(14)
+@pytest.mark.fault(3, 14)
 @pytest.mark.parametrize("at_s", [0.3, 2.0])
 def test_cameras_that_freeze_in_motion_are_no_worse_than_a_blackout(
     prepared: Prepared, world: Config, at_s: float
@@ -121,9 +130,9 @@ def test_as_delivered_the_preset_stays_near_the_room_too(
 @pytest.mark.fault(15, 45)
 @pytest.mark.parametrize("axes", IN_THE_AIR)
 def test_axes_that_are_others_in_the_air_let_it_go_before_it_has_moved_far(
-    prepared: Prepared, world: Config, axes: str
+    prepared: Prepared, quadrotor: Config, axes: str
 ) -> None:
-    flight = bounded(fly_true(prepared, with_faults(world, FaultConfig(at_s=2.0, kind="frame", name=axes))))
+    flight = bounded(fly_true(prepared, with_faults(quadrotor, FaultConfig(at_s=2.0, kind="frame", name=axes))))
     assert flight.moved_m < MOVED_M
     assert "LAND" in flight.ended
 
@@ -132,9 +141,9 @@ def test_axes_that_are_others_in_the_air_let_it_go_before_it_has_moved_far(
 @pytest.mark.fault(15, 42)
 @pytest.mark.parametrize("axes", AT_ONCE)
 def test_axes_that_are_others_from_the_start_let_it_go_before_it_has_moved_far(
-    prepared: Prepared, world: Config, axes: str
+    prepared: Prepared, quadrotor: Config, axes: str
 ) -> None:
-    flight = bounded(fly_true(prepared, with_faults(world, FaultConfig(at_s=0.0, kind="frame", name=axes))))
+    flight = bounded(fly_true(prepared, with_faults(quadrotor, FaultConfig(at_s=0.0, kind="frame", name=axes))))
     assert flight.moved_m < MOVED_M / 2
     assert any(alarm.split(": ")[1].startswith("envelope-") for alarm in flight.alarms)
     assert "LAND" in flight.ended
@@ -144,13 +153,13 @@ def test_axes_that_are_others_from_the_start_let_it_go_before_it_has_moved_far(
 @pytest.mark.fault(15, 42)
 @pytest.mark.parametrize("axes", ["turned-90", "mirrored-east"])
 def test_without_a_word_of_the_vehicle_itself_positions_against_setpoints_are_enough(
-    prepared: Prepared, world: Config, axes: str
+    prepared: Prepared, quadrotor: Config, axes: str
 ) -> None:
 
     limits = prepared.controller.envelope
     assert limits is not None
     deaf = changed(prepared, controller=changed(prepared.controller, envelope=changed(limits, disagreement_mps=1e3)))
-    flight = fly_true(deaf, with_faults(world, FaultConfig(at_s=0.0, kind="frame", name=axes)))
+    flight = fly_true(deaf, with_faults(quadrotor, FaultConfig(at_s=0.0, kind="frame", name=axes)))
     assert flight.moved_m < MOVED_M
     assert any("envelope-response" in alarm for alarm in flight.alarms)
 
@@ -160,11 +169,11 @@ def test_without_a_word_of_the_vehicle_itself_positions_against_setpoints_are_en
 @pytest.mark.parametrize("speed_mps", [0.1, 0.3])
 @pytest.mark.parametrize("axis", [0, 2])
 def test_positions_that_creep_away_from_the_vehicle(
-    prepared: Prepared, world: Config, speed_mps: float, axis: int
+    prepared: Prepared, quadrotor: Config, speed_mps: float, axis: int
 ) -> None:
     creeps = (-speed_mps, 0.0, 0.0) if axis == 0 else (0.0, 0.0, speed_mps)
     fault = FaultConfig(at_s=5.0, kind="drift", velocity_mps=creeps)
-    flight = bounded(fly_true(prepared, with_faults(world, fault)))
+    flight = bounded(fly_true(prepared, with_faults(quadrotor, fault)))
     assert flight.moved_m < MOVED_M
     assert any("envelope-velocity" in alarm for alarm in flight.alarms)
     assert "LAND" in flight.ended
@@ -187,17 +196,10 @@ def test_another_body_in_motion(prepared: Prepared, world: Config) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.fault(3)
-@pytest.mark.parametrize("at_s", [0.5, 2.5])
-def test_a_blackout_in_motion(prepared: Prepared, world: Config, at_s: float) -> None:
-    bounded(fly_true(prepared, with_faults(world, FaultConfig(at_s=at_s, kind="blackout", for_s=30.0))))
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("noise_m", [0.2, 0.7])
 @pytest.mark.fault(42)
-def test_positions_that_scatter(prepared: Prepared, world: Config, noise_m: float) -> None:
-    flight = bounded(fly_true(prepared, with_faults(world, FaultConfig(at_s=2.0, kind="noise", value=noise_m))))
+def test_positions_that_scatter(prepared: Prepared, quadrotor: Config, noise_m: float) -> None:
+    flight = bounded(fly_true(prepared, with_faults(quadrotor, FaultConfig(at_s=2.0, kind="noise", value=noise_m))))
     assert flight.alarms
     assert "LAND" in flight.ended
 

@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 from loopback_rig import make_loop
 from operation_rig import ended
-from places import TESTS
+from places import TESTS, without_pages
 
 from logs.recording.reader import read, records
 from logs.recording.replay import replay
@@ -50,7 +50,9 @@ def free_port() -> int:
 def daemon(port: int, out: Path, *options: str) -> Iterator[subprocess.Popen[str]]:
     url = f"udpin://127.0.0.1:{port}"
     command = [sys.executable, "-m", "uavctl", "fly", "--vehicle", url, "--mocap", url, "--out", str(out), "--json"]
-    process = subprocess.Popen([*command, *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [*command, *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=without_pages()
+    )
     with ended(process):
         assert process.stderr is not None
         for line in process.stderr:

@@ -155,7 +155,7 @@ def test_a_steady_push_leaves_no_offset_from_the_target(estimated: bool) -> None
     controller = build_controller(config)
     target = np.array(config.target.position_m)
     world = _Biased(controller, np.array([0.2, -0.15, 0.15]), controller.plant.equilibrium(config.target.position_m))
-    world.fly(100)
+    world.fly(60)
     away = np.abs(np.array(world.places[-20:]) - target).max(axis=0)
     assert np.all(away < 0.01) if estimated else np.all(away > 0.03)
     assert np.all(np.abs(world.inputs) <= np.array(config.sets.input_upper))
@@ -171,13 +171,13 @@ def test_a_push_within_the_authority_is_flown_against_and_one_at_its_bound_is_to
     assert bounds == tuple(max(0.4, share * high) for high in config.sets.input_upper)
     start = controller.plant.equilibrium(config.target.position_m)
     world = _Biased(controller, np.array([1.0, 0.0, 0.0]), start)
-    world.fly(150)
+    world.fly(75)
     away_m = abs(float(world.places[-1][0]) - config.target.position_m[0])
     told = share == 0.0
     assert (away_m > 0.05) == told and away_m < most_m
     assert world.events == [BIAS_AT_BOUND] * told
     world.bias = np.zeros(3)
-    world.fly(150)
+    world.fly(75)
     assert world.events == [BIAS_AT_BOUND, BIAS_FREE] * told
 
 

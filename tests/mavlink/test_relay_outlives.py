@@ -21,6 +21,9 @@ POSE, LAND = "VISION_POSITION_ESTIMATE", 21
 SECOND = 1_000_000_000
 
 
+LAND_S = 2.0
+
+
 def airborne(autopilot: str, *overrides: str, until: HandoverState = HandoverState.ENGAGED) -> Flight:
     flight = Flight(autopilot, *RELAYED, *overrides).relayed().take_off()
     flight.run(40.0, until=until)
@@ -90,7 +93,7 @@ def test_a_core_that_fails_while_the_pilot_flies_asks_for_nothing(monkeypatch: p
     flight.run(3.0, until=HandoverState.RELEASED)
     before, failed_ns = flight.commands(), flight.now_ns
     fail()
-    flight.run(20.0)
+    flight.run(8.0)
     assert not flight.loop.finished and flight.commands() == before
     assert len(poses_after(flight, failed_ns)) > 50
     flight.stick("AUTO.LAND")
@@ -125,10 +128,10 @@ def test_a_hand_over_that_fails_leaves_the_positions_until_the_vehicle_is_down(m
 @pytest.mark.fault(63)
 @BOTH
 def test_positions_go_on_as_long_as_the_pilot_has_the_vehicle_in_the_air(autopilot: str) -> None:
-    flight = airborne(autopilot, "hand_over.land_s=5.0")
+    flight = airborne(autopilot, f"hand_over.land_s={LAND_S}")
     flight.stick("POSCTL" if autopilot == "px4" else "LOITER")
     flight.run(3.0, until=HandoverState.RELEASED)
-    flight.run(40.0, stop=True)
+    flight.run(8.0 * LAND_S, stop=True)
     assert flight.loop.carries and not flight.loop.finished
     assert poses_after(flight, flight.now_ns - SECOND)
 
@@ -136,9 +139,9 @@ def test_positions_go_on_as_long_as_the_pilot_has_the_vehicle_in_the_air(autopil
 @pytest.mark.slow
 @pytest.mark.fault(63)
 def test_positions_go_on_for_a_vehicle_that_does_not_land() -> None:
-    flight = airborne("px4", "hand_over.land_s=5.0")
+    flight = airborne("px4", f"hand_over.land_s={LAND_S}")
     flight.hears = lambda data: b"VISION" in data or data[7:10] == bytes((102, 0, 0))  # positions alone get through
-    flight.run(MUST_LAND * 5.0 + 15.0, stop=True)
+    flight.run(MUST_LAND * LAND_S + 15.0, stop=True)
     assert flight.is_in(HandoverState.FAILED) and flight.loop.carries and not flight.loop.finished
     assert poses_after(flight, flight.now_ns - SECOND)
     assert flight.loop.ending.cause == Cause.LANDING_FAILED
@@ -149,7 +152,10 @@ def test_a_vehicle_that_is_not_heard_any_more_gets_them_for_the_time_of_a_landin
     flight = airborne("px4", "hand_over.land_s=5.0")
     flight.told = lambda data: False
     lost_ns = flight.now_ns
-    flight.run(90.0, stop=True)
+    for _ in range(90):
+        if flight.loop.finished:
+            break
+        flight.run(1.0, stop=True)
     assert flight.loop.finished
     last_ns = poses_after(flight, lost_ns)[-1]
     assert last_ns - lost_ns > 7 * SECOND

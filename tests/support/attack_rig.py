@@ -23,6 +23,7 @@ from typing import Any
 from mavlink_rig import OFFBOARD, Peer
 from operation_rig import port
 from patience import LIMIT_S
+from places import without_pages
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from signing_rig import EPOCH_S, KEY, SECOND, SignedPeer
 
@@ -217,7 +218,7 @@ class Flight:
             key.chmod(0o600)
             options += ["--set", f"security.key_file={key}"]
         self.log = folder / "messages"
-        environ = {**os.environ, "XDG_STATE_HOME": str(folder / "state"), "XDG_RUNTIME_DIR": str(folder)}
+        environ = {**without_pages(), "XDG_STATE_HOME": str(folder / "state"), "XDG_RUNTIME_DIR": str(folder)}
         command = [sys.executable, "-m", "uavctl", "fly", *options, "--json"]
         with self.log.open("w", encoding="utf-8") as stream:
             self.process = subprocess.Popen(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import select
 import socket
 import subprocess
@@ -17,6 +18,7 @@ from typing import Any
 
 import pytest
 from patience import LIMIT_S, until
+from places import without_pages
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import Client
 
@@ -121,7 +123,11 @@ class Scene:
         command = [sys.executable, "-m", "uavctl", "fly", *urls, *patience, "--json"]
         places = ["--out", str(self.folder / out), "--control", str(self.control)]
         return subprocess.Popen(
-            [*command, *places, *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environ
+            [*command, *places, *options],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=without_pages(environ or os.environ),
         )
 
     def ctl(self, *arguments: str) -> tuple[int, str, str]:
@@ -146,7 +152,7 @@ def scene(*overrides: str) -> Iterator[Scene]:
         tap = Tap(vehicle_port)
         found = Scene(Path(folder), tap, vehicle_port, mocap_port)
         done = threading.Event()
-        config = load_config("room-hahn-stursberg", [PATIENT_VEHICLE, *overrides])
+        config = load_config("room", [PATIENT_VEHICLE, *overrides])
 
         def serve_peers() -> None:
             serve(

@@ -151,7 +151,7 @@ def fly(
         after_tick: Called after each tick.
         take_off_m: Begin on the ground and climb so far; None: begin in the air.
         path: Recording; None for none.
-        lands: Look on when the controller is done, until the vehicle has landed.
+        lands: Look on when the controller is done, until the vehicle has landed and is disarmed.
     """
     recorder = None if path is None else SyncRecorder(path, config.log)
     if recorder is not None:
@@ -161,8 +161,13 @@ def fly(
     world = World(
         config, watch, on_truth=lambda truth: sink.put("/sim/truth", truth.at_ns, truth), airborne=take_off_m is None
     )
+
+    def is_over() -> bool:
+        autopilot = world.peers.autopilot
+        return watch.loop.finished and not (lands and (autopilot.pilot.armed or not autopilot.craft.landed))
+
     try:
-        world.run(config.duration_s, lambda: watch.loop.finished and not lands)
+        world.run(config.duration_s, is_over)
         if take_off_m is not None:
             watch.stop = True
             world.run(config.duration_s + stop_limit_s(config, takes_off=True), lambda: watch.loop.finished)

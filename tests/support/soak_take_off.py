@@ -15,7 +15,7 @@ from uavctl.mavlink.handover_states import HandoverState
 
 AUTOPILOTS = ("px4", "ardupilot")
 LIMIT_S = 60.0  # in which a vehicle is flown, or on the ground again with a reason told
-SETTLED_S = 20.0  # engaged for so long, past all that was to come
+SETTLED_S = 5.0  # engaged for so long, past all that was to come
 LANDING_S = 90.0  # more for one that lands at the limit
 HEIGHT_M = 1.2
 PLACE = (473977420, 85455940, 488000)  # latitude and longitude [1e-7 deg], altitude [mm]
@@ -94,11 +94,13 @@ def outcome(flight: Flight) -> str:
 def flown(flight: Flight) -> str:
     """The outcome by the limit; a flight that has ended is over."""
     flight.take_off(HEIGHT_M)
-    engaged_s = 0.0
+    to_come_s = max((end_s for _, end_s in flight.config.sim.checks.invalid), default=0.0)  # from arming on
+    armed_s = engaged_s = 0.0
     for _ in range(round(LIMIT_S)):
-        if flight.loop.finished or engaged_s > SETTLED_S:
+        if flight.loop.finished or (engaged_s > SETTLED_S and armed_s > to_come_s + SETTLED_S):
             break
         flight.run(1.0)
+        armed_s += flight.peers.autopilot.pilot.armed
         engaged_s = engaged_s + 1.0 if flight.is_in(HandoverState.ENGAGED) else 0.0
     return outcome(flight)
 

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from patience import LIMIT_S, until
+from places import without_pages
 
 from logs.recording.reader import records
 from uavctl.records import ControlMode, Decision, Setpoint, Truth
@@ -34,7 +35,9 @@ def fly_over_udp(out: Path, enough: Callable[[list[Truth]], bool], *options: str
         truths = list(records(recording, Truth))
         return planned >= 15 and bool(truths) and enough(truths)
 
-    with subprocess.Popen([*command, *PATIENT, *options], stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        [*command, *PATIENT, *options], stdout=subprocess.PIPE, text=True, env=without_pages()
+    ) as process:
         try:
             until(seen, "it flies")
             process.send_signal(signal.SIGINT)

@@ -17,7 +17,7 @@ from uavctl.cli import loopback as loopback_cmd
 from uavctl.cli import tune as tune_cmd
 from uavctl.cli.app import run
 from uavctl.cli.tune import left_whole
-from uavctl.config import load_config
+from uavctl.config import Config, load_config
 from uavctl.config.load import parse
 from uavctl.lab.tune.excitation import parse_box
 from uavctl.lab.tune.run_folder import (
@@ -141,17 +141,24 @@ def test_another_configuration_is_refused_by_its_key(begun: Path, capsys: pytest
 
 @pytest.mark.slow
 def test_the_pilots_stick_stops_the_run_and_the_next_try_is_a_new_flight(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = tmp_path / "run"
+    tries: list[Path] = []
+
+    def pressed(_: Config, out: Path, **__: object) -> None:
+        tries.append(out)
+        raise KeyboardInterrupt
+
     with short_flights():
         code, out, err = typed(capsys, *words(folder, "--set", PILOT, "--json"))
         document = json.loads(out)
         assert code == document["exit_code"] == tune_cmd.PILOT
         assert document["before"] == "" and document["config"] is None
         assert "pilot" in document["stopped"].lower() and str(folder) in err
-        assert run(words(folder, "--set", PILOT)) == tune_cmd.PILOT
-    assert (folder / BEFORE / "flight.mcap").exists() and (folder / f"{BEFORE}-2" / "flight.mcap").exists()
+        monkeypatch.setattr(tune_cmd, "fly_once", pressed)
+        assert run(words(folder, "--set", PILOT)) == tune_cmd.INTERRUPTED
+    assert (folder / BEFORE / "flight.mcap").exists() and tries == [folder / f"{BEFORE}-2"]
     assert not (folder / TUNED).exists()
 
 
@@ -176,18 +183,24 @@ def test_ctrl_c_ends_the_flight_and_the_run(
 
 @pytest.mark.slow
 def test_a_recording_takes_the_place_of_the_first_flight(
-    done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     flight, folder = done / BEFORE / "flight.mcap", tmp_path / "run"
+    asked: list[Config] = []
+
+    def pressed(config: Config, *_: object, **__: object) -> None:
+        asked.append(config)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(tune_cmd, "fly_once", pressed)
     arguments = ["tune", "room", "--flight", str(flight), "--folder", str(folder), "--loopback", "--set", START]
     code, out, _ = typed(capsys, *arguments, "--json")
-    assert code == 0
+    assert code == tune_cmd.INTERRUPTED
     document = json.loads(out)
-    assert Path(document["before"]) == flight.absolute()
+    assert Path(document["before"]) == flight.absolute() and document["config"] == str(folder / TUNED)
     assert not (folder / BEFORE).exists()
-    flown = [header(one).config_toml for one in (flight, folder / AFTER / "flight.mcap")]
-    missions = [parse(text, "flight").config.mission.waypoints for text in flown]
-    assert missions[0] == missions[1]
+    (second,) = asked
+    assert second.mission.waypoints == parse(header(flight).config_toml, "flight").config.mission.waypoints
 
 
 @pytest.mark.parametrize(
@@ -360,7 +373,7 @@ def test_corners_in_any_order_are_one_box() -> None:
 @pytest.mark.slow
 def test_a_run_on_the_simulated_ardupilot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "run"
-    with short_flights(steps=1, hold_s=7.5):
+    with short_flights():
         code, out, _ = typed(capsys, *words(folder, "--set", "sim.autopilot=ardupilot", "--json"))
     document = json.loads(out)
     assert (code, document["stopped"]) == (0, "")

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 from live_rig import Viewer
+from places import without_pages
 from view_rig import flown
 
 from logs.recording.derived_topics import VIEWS
@@ -148,7 +149,9 @@ def test_a_flight_in_real_time_is_the_same_beside_viewers_that_have_stalled(tmp_
     command = [sys.executable, "-m", "uavctl", "loopback", "--udp", "--config", "paper", "--duration", "4"]
     command += ["--set", "solver.method=exact"]  # it needs no policy library
     command += ["--live", "--live-port", "0", "--out", str(tmp_path), "--json"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as flight:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=without_pages()
+    ) as flight:
         try:
             assert flight.stderr is not None
             said = iter(flight.stderr.readline, "")

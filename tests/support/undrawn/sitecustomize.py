@@ -1,0 +1,7 @@
+"""Ends a process that would draw a flight's page, before it loads anything; see `places.without_pages`."""
+
+import os
+import sys
+
+if "logs.report.flight_page" in sys.orig_argv:
+    os._exit(0)
