@@ -286,6 +286,7 @@ _OF_FAILSAFES = frozenset({_C.VEHICLE_FENCE, _C.BATTERY_LOW, _C.VEHICLE_POSITION
 def _vehicle_texts(e: FlightEvidence) -> Iterator[Finding]:
     """Find what the vehicle said that a pilot must know, each cause once."""
     told: set[HeadlineCause] = set()
+    changed = ""  # the change of mode that was told last: one text after another tells of the same
     for one in e.flight.events:
         at_s = e.second(one.at_ns)
         if one.code != "vehicle-text" or not e.armed(at_s):
@@ -294,7 +295,9 @@ def _vehicle_texts(e: FlightEvidence) -> Iterator[Finding]:
         cause = cause_of_text(one.text, grave=grave, warns=grave or one.severity is Severity.WARNING)
         if cause is not None and cause not in told:
             told.add(cause)
-            yield Finding(cause, at_s, f'it said "{one.text.strip()}" at {seconds(at_s)}{_mode_after(e, at_s)}')
+            before, changed = changed, _mode_after(e, at_s)
+            mode = "" if changed == before else changed
+            yield Finding(cause, at_s, f'it said "{one.text.strip()}" at {seconds(at_s)}{mode}')
 
 
 def _mode_after(e: FlightEvidence, at_s: float) -> str:
