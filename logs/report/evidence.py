@@ -95,6 +95,13 @@ class FlightEvidence:
         inside = [any(begin <= t <= end for begin, end in spans) for t in at_s.tolist()]
         return np.asarray(at_s[np.array(inside, dtype=np.bool_)])
 
+    def armed_places_m(self) -> Floats:
+        """Return the positions that came while the vehicle was armed (n, 3), local NED."""
+        samples = [one for each in self.flight.step_inputs for one in each.samples]
+        at_s = self.flight.seconds([one.captured_ns for one in samples])
+        inside = np.array([any(begin <= t <= end for begin, end in self.armed_spans) for t in at_s.tolist()], np.bool_)
+        return np.array([one.position_m for one in samples], dtype=np.float64).reshape(-1, 3)[inside]
+
     def came_after(self, at_s: float) -> bool:
         """Return whether any position was captured after a time, used or not, flown or not."""
         inputs = self.flight.step_inputs

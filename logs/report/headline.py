@@ -71,6 +71,8 @@ _ARRIVED_SHARE = 0.1  # distance from the target at the end, of that at the begi
 _SLIGHT_M = 0.02  # beyond a wall: no more than what a camera and the estimator are off by
 _SLIGHT = 0.05  # beyond a limit, of that limit: 7 cm/s of 1.5 m/s
 _PUSHED_S = 1.0  # with a bias at its bound: shorter ones are gusts
+_RISEN_M = 0.15  # from where it stood: more than positions are off by, less than any take-off
+_ARMED_S, _FEW_PLACES = 3.0, 20  # time armed and positions in it: enough to tell that it did not move
 # Orders before a flight, as the vehicle's answers to them begin, and what each of them asks of it.
 _TO_BEGIN = {"DO_SET_MODE": "change its mode", "COMPONENT_ARM_DISARM": "arm"}
 _MOST_WORDS = 3  # texts of the vehicle in one sentence
@@ -141,7 +143,7 @@ def _stayed(e: FlightEvidence) -> str:
     """Return that it stayed inside the limits of its position, with how near it came to one of them."""
     if e.excursions:
         worst = e.excursions[0]
-        return f"{metres(worst.beyond_m)} {worst.passage} at {seconds(worst.worst_s)}{_seen(e, worst.worst_s)}"
+        return f"{_beyond(e, worst)} at {seconds(worst.worst_s)}{_seen(e, worst.worst_s)}"
     nearest = e.clearance.nearest()
     if nearest is None:
         return "its position has no limits"
@@ -151,6 +153,12 @@ def _stayed(e: FlightEvidence) -> str:
     known_s, flown_s = float(e.clearance.t_s[-1]), max((end for _, end in e.flight.spans(FLOWN)), default=0.0)
     until = f"until {seconds(known_s)}" if flown_s > known_s + STALLED_S else "throughout"
     return f"inside its walls {until}, {near}{_seen(e, at_s)}"
+
+
+def _beyond(e: FlightEvidence, one: Excursion) -> str:
+    """Return how far beyond a limit it was; a floor is the end of every fall, whatever the estimate puts below it."""
+    estimated = not e.flight.truths
+    return "down to the floor" if one.wall == "floor" and estimated else f"{metres(one.beyond_m)} {one.passage}"
 
 
 def _seen(e: FlightEvidence, at_s: float) -> str:
@@ -177,7 +185,7 @@ def _excursion(e: FlightEvidence) -> Iterator[Finding]:
         if worst.beyond_m <= _SLIGHT_M:
             return
         cause = _C.LEFT_LIMITS if worst.beyond_m >= GRAVE_M else _C.TOUCHED_LIMIT
-        text = f"went {metres(worst.beyond_m)} {worst.passage} at {seconds(worst.worst_s)}{_how(e, worst)}"
+        text = f"went {_beyond(e, worst)} at {seconds(worst.worst_s)}{_how(e, worst)}"
         yield Finding(cause, worst.left_s, f"{text}{_seen(e, worst.worst_s)}", worst.worst_s)
 
 
@@ -304,7 +312,9 @@ def _mode_after(e: FlightEvidence, at_s: float) -> str:
     """Return the mode that the vehicle is in within two heartbeats, if that is another one; else nothing."""
     before = [one for one in e.flight.vehicles if e.second(one.at_ns) < at_s]
     after = [one for one in e.flight.vehicles if at_s <= e.second(one.at_ns) <= at_s + _UNHEARD_S and one.armed]
-    if not after or not before or after[-1].mode == before[-1].mode or _asks_to_land(e, before[-1], after[-1]):
+    if not after or not before or after[-1].external or after[-1].mode == before[-1].mode:
+        return ""
+    if _asks_to_land(e, before[-1], after[-1]):
         return ""
     return f" and went from {before[-1].mode} to {after[-1].mode}"
 
@@ -494,6 +504,22 @@ def _ending(e: FlightEvidence) -> Iterator[Finding]:
             yield Finding(_C.NOT_AS_ORDERED, at_s or e.second(last.at_ns), f"{ended}{when}")
 
 
+def _not_risen(e: FlightEvidence) -> Iterator[Finding]:
+    """Find that the vehicle was armed on the ground and never left it, by the positions that came."""
+    began_landed = next((one.landed for one in e.flight.vehicles if one.landed is not None), False)
+    if not began_landed or not e.armed_spans or e.refused(FROZEN)[0]:
+        return
+    end_s = e.second(e.flight.decisions[-1].at_ns)
+    begun_s, lasted_s = e.armed_spans[0][0], sum(min(end, end_s) - begin for begin, end in e.armed_spans)
+    places_m = e.armed_places_m()
+    if lasted_s < _ARMED_S or len(places_m) < _FEW_PLACES:
+        return
+    moved_m = float(np.linalg.norm(places_m - places_m[0], axis=1).max())
+    if moved_m < _RISEN_M:
+        text = f"the vehicle was armed for {seconds(lasted_s)} and its position moved by {metres(moved_m)} at most"
+        yield Finding(_C.NOT_RISEN, begun_s, text)
+
+
 def _begin_refused(e: FlightEvidence) -> Iterator[Finding]:
     """Find that the vehicle was never armed, as it refused to be, or refused the mode for it."""
     answers = [
@@ -674,5 +700,5 @@ def _link(e: FlightEvidence) -> Iterator[Finding]:
 
 RULES: tuple[Callable[[FlightEvidence], Iterator[Finding]], ...] = (
     _battery, _excursion, _lost, _cut, _blind, _stood_still, _vehicle_texts, _failsafe, _taken_over, _refused, _wrong,
-    _absent, _relay, _begin_refused, _ending, _limits, _fell_back, _mission, _pushed, _relaxed, _link,
+    _absent, _relay, _begin_refused, _not_risen, _ending, _limits, _fell_back, _mission, _pushed, _relaxed, _link,
 )  # fmt: skip

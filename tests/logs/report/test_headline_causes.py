@@ -359,6 +359,30 @@ def test_what_pushes_once_the_vehicle_follows_setpoints_no_more_is_no_wind(
     assert (C.WIND in head(flight).causes) == windy
 
 
+@pytest.mark.parametrize(
+    ("landed", "moves_m", "risen"), [(True, 0.003, False), (True, 0.5, True), (False, 0.003, True)]
+)
+def test_a_vehicle_that_was_armed_and_stood_still_never_rose(
+    good: FlightData, landed: bool, moves_m: float, risen: bool
+) -> None:
+    """It stands at one place from its first heartbeat on, on the ground or in the air, or moves."""
+    plain = statuses(good, [4.1] * 12)
+    first, *later = plain.vehicles
+    vehicles = (msgspec.structs.replace(first, armed=False, landed=landed), *later)
+    inputs = tuple(
+        msgspec.structs.replace(
+            one,
+            samples=tuple(
+                msgspec.structs.replace(sample, position_m=(moves_m * (number // 20 % 2), 0.0, 0.0))
+                for sample in one.samples
+            ),
+        )
+        for number, one in enumerate(plain.step_inputs)
+    )
+    found = head(dataclasses.replace(plain, vehicles=vehicles, step_inputs=inputs))
+    assert (C.NOT_RISEN in found.causes) != risen
+
+
 @pytest.mark.parametrize("order", ["COMPONENT_ARM_DISARM", "DO_SET_MODE"])
 @pytest.mark.parametrize("armed", [False, True])
 def test_a_vehicle_that_never_armed_refused_it(good: FlightData, order: str, armed: bool) -> None:
