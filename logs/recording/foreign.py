@@ -30,13 +30,13 @@ from logs.recording.tlog import (
     TlogPacket,
     frame_length,
     in_order,
-    is_frame,
     next_marker,
     packet_of,
     read_tlog,
 )
 from logs.recording.ulog import is_ulog, read_ulog
 from uavctl.errors import RecordingError, UsageError
+from uavctl.mavlink.framing import is_frame
 
 # Messages of ROS read by the definition that their recording brings along, as far as it takes to unwrap MAVLink.
 #

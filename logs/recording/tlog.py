@@ -23,7 +23,7 @@ from logs.recording.topics import raw_link
 from uavctl.errors import RecordingError, UsageError
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.connection import STREAM_SCHEMES
-from uavctl.mavlink.framing import scan, scan_one
+from uavctl.mavlink.framing import is_frame
 from uavctl.records import Decision, Header, LinkStats, PositionSample, Record, Sink, StepInput, to_nobody
 
 # The clock of another program's recording, which may leap, stand still or run back: what that does to its times.
@@ -221,12 +221,13 @@ class _Cutter:
             begin = at + self._stamp.size
             length = frame_length(data, begin)
             end = begin + length
-            expected = bool(length) and self.clock.expects(self._stamp_us(at) * 1000)
+            stamp_us = self._stamp_us(at)
+            expected = bool(length) and self.clock.expects(stamp_us * 1000)
             if expected and end > len(data):
                 break
-            if expected or (length and self._is_believed(at, end)):
+            if expected or (length and self._is_believed(stamp_us, begin, end)):
                 self._first = self._first if self.packets else begin
-                self.packets.append(packet_of(self.clock.steady(self._stamp_us(at) * 1000), data[begin:end]))
+                self.packets.append(packet_of(self.clock.steady(stamp_us * 1000), data[begin:end]))
                 at = end
             else:
                 likely = _LIKELY[self._stamp].search(data, at + 1)
@@ -253,15 +254,15 @@ class _Cutter:
     def _stamp_us(self, at: int) -> int:
         return int(self._stamp.unpack_from(self._data, at)[0])
 
-    def _is_believed(self, at: int, end: int) -> bool:
-        """Return whether a packet with an unexpected stamp is real: by its checksum, or by the packet after it."""
-        data, begin = self._data, at + self._stamp.size
-        if end > len(data) or self._stamp_us(at) >= _LAST_STAMP_US:
+    def _is_believed(self, stamp_us: int, begin: int, end: int) -> bool:
+        """Return whether a packet with an unexpected stamp is real: by the packet after it, or by its checksum."""
+        data = self._data
+        if end > len(data) or stamp_us >= _LAST_STAMP_US:
             return False
-        if is_frame(data[begin:end]):
-            return True
         follows = frame_length(data, end + self._stamp.size) > 0
-        return follows and abs(self._stamp_us(end) - self._stamp_us(at)) * 1000 <= LONGEST_SILENCE_NS
+        if follows and abs(self._stamp_us(end) - stamp_us) * 1000 <= LONGEST_SILENCE_NS:
+            return True
+        return is_frame(data[begin:end])
 
 
 def next_marker(data: bytes, start: int) -> int:
@@ -290,12 +291,6 @@ def packet_of(at_ns: int, data: bytes) -> TlogPacket:
 def in_order(packets: list[TlogPacket]) -> tuple[TlogPacket, ...]:
     """Return packets in order of time; those of the same time keep their order."""
     return tuple(sorted(packets, key=lambda packet: packet.at_ns))
-
-
-def is_frame(data: bytes) -> bool:
-    """Return whether bytes are one frame of a known id with the right checksum."""
-    frames = scan_one(data).frames
-    return len(frames) == 1 and len(frames[0].data) == len(data)
 
 
 # The raw MAVLink of a recording as a `.tlog`: each packet after 8 bytes of big-endian microseconds since the epoch.
@@ -402,7 +397,7 @@ def _packet_end(data: bytes, at: int) -> int | None:
     end = at + frame_length(data, at)
     if end > len(data):
         return None
-    good = end == len(data) or data[end] in MARKERS or bool(scan(data[at:end], final=True).frames)
+    good = end == len(data) or data[end] in MARKERS or is_frame(data[at:end])
     return end if good else at
 
 

@@ -45,6 +45,8 @@ class HeadlineCause(StrEnum):
     SILENCE = "silence"
     LET_GO = "let-go"
     NOT_AS_ORDERED = "not-as-ordered"
+    BEGIN_REFUSED = "begin-refused"
+    NOT_RISEN = "not-risen"
     NOT_FLOWN = "not-flown"
     TOUCHED_LIMIT = "touched-limit"
     BEYOND_LIMIT = "beyond-limit"
@@ -109,6 +111,8 @@ _TABLE: dict[HeadlineCause, tuple[CauseRank, str, str]] = {
     _C.SILENCE: (_R.POSITIONS, MIND, "No positions for a while"),
     _C.LET_GO: (_R.ENDING, BAD, "Let go"),
     _C.NOT_AS_ORDERED: (_R.ENDING, BAD, "Not as ordered"),
+    _C.BEGIN_REFUSED: (_R.ENDING, BAD, "Refused by the vehicle"),
+    _C.NOT_RISEN: (_R.ENDING, BAD, "Never left the ground"),
     _C.NOT_FLOWN: (_R.ENDING, MIND, "Nothing was flown"),
     _C.TOUCHED_LIMIT: (_R.QUALITY, MIND, "Touched a limit"),
     _C.BEYOND_LIMIT: (_R.QUALITY, MIND, "Beyond a limit"),

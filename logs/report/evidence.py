@@ -22,7 +22,7 @@ _PUSH_MPS2, _PUSH_MPS = 0.1, 0.3  # carries a vehicle off by as much as is worth
 _LOOKED_AT_S, _AFTER_S = 0.3, 3.0  # least time to tell a push in, and the longest until a limit is left for it
 
 STALLED_S = 0.5  # between two ticks: the process stood still, and heard nothing
-_BEAT_S = 1.0  # between two heartbeats
+BEAT_S = 1.0  # between two heartbeats
 
 
 class Push(NamedTuple):
@@ -70,7 +70,7 @@ class FlightEvidence:
 
     def armed(self, at_s: float) -> bool:
         """Return whether the vehicle was armed at a time, to a heartbeat's period."""
-        return any(begin - _BEAT_S <= at_s <= end + _BEAT_S for begin, end in self.armed_spans)
+        return any(begin - BEAT_S <= at_s <= end + BEAT_S for begin, end in self.armed_spans)
 
     @cached_property
     def last_links(self) -> tuple[LinkStats, ...]:
@@ -94,6 +94,18 @@ class FlightEvidence:
         at_s = self.flight.seconds([one.captured_ns for each in self.flight.step_inputs for one in each.samples])
         inside = [any(begin <= t <= end for begin, end in spans) for t in at_s.tolist()]
         return np.asarray(at_s[np.array(inside, dtype=np.bool_)])
+
+    def armed_places_m(self) -> Floats:
+        """Return the positions that came while the vehicle was armed (n, 3), local NED."""
+        samples = [one for each in self.flight.step_inputs for one in each.samples]
+        at_s = self.flight.seconds([one.captured_ns for one in samples])
+        inside = np.array([any(begin <= t <= end for begin, end in self.armed_spans) for t in at_s.tolist()], np.bool_)
+        return np.array([one.position_m for one in samples], dtype=np.float64).reshape(-1, 3)[inside]
+
+    def came_after(self, at_s: float) -> bool:
+        """Return whether any position was captured after a time, used or not, flown or not."""
+        inputs = self.flight.step_inputs
+        return any(self.second(one.captured_ns) > at_s for each in inputs for one in each.samples)
 
     def refused(self, *codes: str) -> tuple[int, float]:
         """Return how many positions were refused for these reasons while it was flown, and when first [s]."""
@@ -160,7 +172,6 @@ class FlightEvidence:
         return max(BLIND_S, 0.5 * self.flight.design.horizon * self.flight.design.dt_s)
 
     def decision(self, at_s: float) -> Decision:
-        """Return the newest decision at a time [s]."""
         """Return the newest decision at a time [s]."""
         decisions, at_ns = self.flight.decisions, self.flight.origin_ns + round(at_s * 1e9)
         return decisions[max(0, bisect_right(decisions, at_ns, key=lambda one: one.at_ns) - 1)]

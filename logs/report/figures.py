@@ -334,6 +334,8 @@ def _slack(flight: FlightData, plans: list[Plan]) -> Drawing:
         ):
             dots(ax, *largest(t_s, values), role, 3.0)
         ax.axhline(0.0, color=colour("muted"), lw=0.6)
+        ax.margins(y=0.08)
+        ax.autoscale_view()
         span(ax, flight)
     return Drawing("plan-slack", one.svg, "Slack of the state limits and of the rest at the end of plans, over time")
 

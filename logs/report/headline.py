@@ -40,7 +40,7 @@ from logs.report.causes import (
     ranked,
     seconds,
 )
-from logs.report.evidence import STALLED_S, FlightEvidence
+from logs.report.evidence import BEAT_S, STALLED_S, FlightEvidence
 from logs.report.excursion import GRAVE_M, Excursion
 from logs.report.reasons import reasons
 from logs.report.verdicts import Flags, Judged, judge
@@ -52,9 +52,10 @@ from uavctl.flight.sensor_faults import FROZEN, JUMP
 from uavctl.mavlink.clocksync import StampRefusal
 from uavctl.mavlink.codec import BAD_FIELD
 from uavctl.mavlink.connection import HUNG_UP, WENT_SILENT
+from uavctl.mavlink.relay import HELD_BACK, REASONS, RELAY_RESUMED, RELAY_SILENT
 from uavctl.mavlink.vehicle import SECOND_VEHICLE
 from uavctl.outcome import Cause
-from uavctl.records import ControlMode, Severity, number
+from uavctl.records import ControlMode, Severity, VehicleStatus, number
 
 _C = HeadlineCause
 _LINK_OF_VEHICLE = "link vehicle: "  # begins what is told of the vehicle's connection
@@ -70,6 +71,11 @@ _ARRIVED_SHARE = 0.1  # distance from the target at the end, of that at the begi
 _SLIGHT_M = 0.02  # beyond a wall: no more than what a camera and the estimator are off by
 _SLIGHT = 0.05  # beyond a limit, of that limit: 7 cm/s of 1.5 m/s
 _PUSHED_S = 1.0  # with a bias at its bound: shorter ones are gusts
+_RISEN_M = 0.15  # from where it stood: more than positions are off by, less than any take-off
+_ARMED_S, _FEW_PLACES = 3.0, 20  # time armed and positions in it: enough to tell that it did not move
+# Orders before a flight, as the vehicle's answers to them begin, and what each of them asks of it.
+_TO_BEGIN = {"DO_SET_MODE": "change its mode", "COMPONENT_ARM_DISARM": "arm"}
+_MOST_WORDS = 3  # texts of the vehicle in one sentence
 _RELAY_S = 2.0  # without a position passed on: vehicles' estimators give up after 5 to 7 s
 
 
@@ -137,7 +143,7 @@ def _stayed(e: FlightEvidence) -> str:
     """Return that it stayed inside the limits of its position, with how near it came to one of them."""
     if e.excursions:
         worst = e.excursions[0]
-        return f"{metres(worst.beyond_m)} {worst.passage} at {seconds(worst.worst_s)}{_seen(e, worst.worst_s)}"
+        return f"{_beyond(e, worst)} at {seconds(worst.worst_s)}{_seen(e, worst.worst_s)}"
     nearest = e.clearance.nearest()
     if nearest is None:
         return "its position has no limits"
@@ -147,6 +153,12 @@ def _stayed(e: FlightEvidence) -> str:
     known_s, flown_s = float(e.clearance.t_s[-1]), max((end for _, end in e.flight.spans(FLOWN)), default=0.0)
     until = f"until {seconds(known_s)}" if flown_s > known_s + STALLED_S else "throughout"
     return f"inside its walls {until}, {near}{_seen(e, at_s)}"
+
+
+def _beyond(e: FlightEvidence, one: Excursion) -> str:
+    """Return how far beyond a limit it was; a floor is the end of every fall, whatever the estimate puts below it."""
+    estimated = not e.flight.truths
+    return "down to the floor" if one.wall == "floor" and estimated else f"{metres(one.beyond_m)} {one.passage}"
 
 
 def _seen(e: FlightEvidence, at_s: float) -> str:
@@ -173,7 +185,7 @@ def _excursion(e: FlightEvidence) -> Iterator[Finding]:
         if worst.beyond_m <= _SLIGHT_M:
             return
         cause = _C.LEFT_LIMITS if worst.beyond_m >= GRAVE_M else _C.TOUCHED_LIMIT
-        text = f"went {metres(worst.beyond_m)} {worst.passage} at {seconds(worst.worst_s)}{_how(e, worst)}"
+        text = f"went {_beyond(e, worst)} at {seconds(worst.worst_s)}{_how(e, worst)}"
         yield Finding(cause, worst.left_s, f"{text}{_seen(e, worst.worst_s)}", worst.worst_s)
 
 
@@ -262,9 +274,10 @@ def _blind(e: FlightEvidence) -> Iterator[Finding]:
     gave_up = any(one.mode is ControlMode.LAND for one in fell) or (
         not e.summary.ending.as_ordered and ended_s - begun_s >= reach_s
     )
+    until = f"to {seconds(ended_s)}" if e.came_after(ended_s) else "on to the last step flown"
     text = (
-        f"no position came for {seconds(ended_s - begun_s)}, from {seconds(begun_s)} to {seconds(ended_s)}, and plans "
-        f"reach {number(reach_s, 1)} s"
+        f"no position came for {seconds(ended_s - begun_s)}, from {seconds(begun_s)} {until}, and plans reach "
+        f"{number(reach_s, 1)} s"
     )
     drift_m = e.drift_m(begun_s, ended_s)
     if drift_m is not None and drift_m >= GRAVE_M:
@@ -281,6 +294,7 @@ _OF_FAILSAFES = frozenset({_C.VEHICLE_FENCE, _C.BATTERY_LOW, _C.VEHICLE_POSITION
 def _vehicle_texts(e: FlightEvidence) -> Iterator[Finding]:
     """Find what the vehicle said that a pilot must know, each cause once."""
     told: set[HeadlineCause] = set()
+    changed = ""  # the change of mode that was told last: one text after another tells of the same
     for one in e.flight.events:
         at_s = e.second(one.at_ns)
         if one.code != "vehicle-text" or not e.armed(at_s):
@@ -289,14 +303,18 @@ def _vehicle_texts(e: FlightEvidence) -> Iterator[Finding]:
         cause = cause_of_text(one.text, grave=grave, warns=grave or one.severity is Severity.WARNING)
         if cause is not None and cause not in told:
             told.add(cause)
-            yield Finding(cause, at_s, f'it said "{one.text.strip()}" at {seconds(at_s)}{_mode_after(e, at_s)}')
+            before, changed = changed, _mode_after(e, at_s)
+            mode = "" if changed == before else changed
+            yield Finding(cause, at_s, f'it said "{one.text.strip()}" at {seconds(at_s)}{mode}')
 
 
 def _mode_after(e: FlightEvidence, at_s: float) -> str:
     """Return the mode that the vehicle is in within two heartbeats, if that is another one; else nothing."""
     before = [one for one in e.flight.vehicles if e.second(one.at_ns) < at_s]
     after = [one for one in e.flight.vehicles if at_s <= e.second(one.at_ns) <= at_s + _UNHEARD_S and one.armed]
-    if not after or not before or after[-1].mode == before[-1].mode:
+    if not after or not before or after[-1].external or after[-1].mode == before[-1].mode:
+        return ""
+    if _asks_to_land(e, before[-1], after[-1]):
         return ""
     return f" and went from {before[-1].mode} to {after[-1].mode}"
 
@@ -348,14 +366,19 @@ def _left_external(e: FlightEvidence) -> tuple[float, str] | None:
     last_flown_s = max((at_s for at_s, mode in flying.items() if mode in FLOWN), default=-np.inf)
     for before, after in pairwise(e.flight.vehicles):
         at_s = e.second(after.at_ns)
-        ours = any(
-            one.code == "hand-over" and e.second(before.at_ns) - _UNHEARD_S <= e.second(one.at_ns) <= at_s
-            and "-> landing" in one.text for one in e.flight.events
-        )  # fmt: skip
         left = before.external and not after.external and before.armed and after.armed
-        if left and not ours and at_s <= last_flown_s + _UNHEARD_S:
+        if left and not _asks_to_land(e, before, after) and at_s <= last_flown_s + _UNHEARD_S:
             return at_s, after.mode
     return None
+
+
+def _asks_to_land(e: FlightEvidence, before: VehicleStatus, after: VehicleStatus) -> bool:
+    """Return whether the vehicle was asked to land between two of its heartbeats, or shortly before."""
+    begun_s, ended_s = e.second(before.at_ns) - _UNHEARD_S, e.second(after.at_ns)
+    return any(
+        one.code == "hand-over" and begun_s <= e.second(one.at_ns) <= ended_s and "-> landing" in one.text
+        for one in e.flight.events
+    )
 
 
 # Positions.
@@ -426,25 +449,34 @@ def _absent(e: FlightEvidence) -> Iterator[Finding]:
 
 
 def _relay(e: FlightEvidence) -> Iterator[Finding]:
-    """Find that positions came and were not passed on to the vehicle, which lives on them."""
-    silent_s = e.first_s("relay-silent")
+    """Find that the vehicle, which lives on the positions that are passed on to it, got none."""
+    silent_s = e.first_s(RELAY_SILENT)
     if silent_s is None:
-        counted = [(e.second(one.at_ns), one.sent, sum(one.kept.values())) for one in e.flight.relays]
-        for (begun_s, sent, _), (_, after, _) in pairwise(counted):
-            if sent and after == sent:
-                until_s = next((at_s for at_s, then, _ in counted if then > sent), counted[-1][0])
-                kept = [kept for at_s, _, kept in counted if begun_s <= at_s <= until_s]
-                if until_s - begun_s >= _RELAY_S and kept[-1] > kept[0] and e.armed(begun_s):
-                    silent_s = begun_s
-                    break
-    if silent_s is not None:
-        resumed_s = next(
-            (e.second(o.at_ns) for o in e.flight.events if o.code == "relay-resumed" and e.second(o.at_ns) > silent_s),
-            None,
-        )
-        until = "" if resumed_s is None else f" to {seconds(resumed_s)}"
-        text = f"positions came, and were not passed on to the vehicle from {seconds(silent_s)} on{until}"
-        yield Finding(_C.RELAY_SILENT, silent_s, text)
+        silent_s = _uncounted_s(e)
+    if silent_s is None:
+        return
+    told = next((one for one in e.flight.relays if one.silent_for and e.second(one.at_ns) >= silent_s), None)
+    reason = "" if told is None else told.silent_for
+    if reason == HELD_BACK and silent_s >= e.breach_s:
+        return  # it was let go, and so they were held back
+    begun_s = silent_s if told is None or told.last_ns is None else min(silent_s, e.second(told.last_ns))
+    again = (e.second(o.at_ns) for o in e.flight.events if o.code == RELAY_RESUMED)
+    resumed_s = next((at_s for at_s in again if at_s > silent_s), None)
+    until = "on" if resumed_s is None else f"to {seconds(resumed_s)}"
+    why = f" ({REASONS[reason]})" if reason in REASONS else ""
+    yield Finding(_C.RELAY_SILENT, begun_s, f"the vehicle got no position from us from {seconds(begun_s)} {until}{why}")
+
+
+def _uncounted_s(e: FlightEvidence) -> float | None:
+    """Return from when on positions were kept back and none was passed on, by the relay's counters [s]."""
+    counted = [(e.second(one.at_ns), one.sent, sum(one.kept.values())) for one in e.flight.relays]
+    for (begun_s, sent, _), (_, after, _) in pairwise(counted):
+        if sent and after == sent:
+            until_s = next((at_s for at_s, then, _ in counted if then > sent), counted[-1][0])
+            kept = [kept for at_s, _, kept in counted if begun_s <= at_s <= until_s]
+            if until_s - begun_s >= _RELAY_S and kept[-1] > kept[0] and e.armed(begun_s):
+                return begun_s
+    return None
 
 
 # The end, and the quality of the flight.
@@ -470,6 +502,46 @@ def _ending(e: FlightEvidence) -> Iterator[Finding]:
         else:
             ended = s.ending.cause if s.ending.cause != Cause.WAITING else f"at the end it was waiting ({last.reason})"
             yield Finding(_C.NOT_AS_ORDERED, at_s or e.second(last.at_ns), f"{ended}{when}")
+
+
+def _not_risen(e: FlightEvidence) -> Iterator[Finding]:
+    """Find that the vehicle was armed on the ground and never left it, by the positions that came."""
+    began_landed = next((one.landed for one in e.flight.vehicles if one.landed is not None), False)
+    if not began_landed or not e.armed_spans or e.refused(FROZEN)[0]:
+        return
+    end_s = e.second(e.flight.decisions[-1].at_ns)
+    begun_s, lasted_s = e.armed_spans[0][0], sum(min(end, end_s) - begin for begin, end in e.armed_spans)
+    places_m = e.armed_places_m()
+    if lasted_s < _ARMED_S or len(places_m) < _FEW_PLACES:
+        return
+    moved_m = float(np.linalg.norm(places_m - places_m[0], axis=1).max())
+    if moved_m < _RISEN_M:
+        text = f"the vehicle was armed for {seconds(lasted_s)} and its position moved by {metres(moved_m)} at most"
+        yield Finding(_C.NOT_RISEN, begun_s, text)
+
+
+def _begin_refused(e: FlightEvidence) -> Iterator[Finding]:
+    """Find that the vehicle was never armed, as it refused to be, or refused the mode for it."""
+    answers = [
+        (e.second(one.at_ns), order, one.severity)
+        for one in e.flight.events
+        for order in _TO_BEGIN
+        if one.code == "command-ack" and one.text.startswith(order)
+    ]
+    if not answers or answers[-1][2] is Severity.INFO or e.armed_spans:
+        return
+    order = answers[-1][1]
+    refused_s = [at_s for at_s, one, severity in answers if one == order and severity is not Severity.INFO]
+    said = [
+        f'"{one.text.strip()}"'
+        for one in e.flight.events
+        if one.code == "vehicle-text"
+        and one.severity is not Severity.INFO
+        and refused_s[0] - BEAT_S <= e.second(one.at_ns) <= refused_s[-1] + BEAT_S
+    ]
+    words = ", ".join(list(dict.fromkeys(said))[:_MOST_WORDS])
+    text = f"it refused {count(len(refused_s), 'time')} to {_TO_BEGIN[order]}{f' and said {words}' if words else ''}"
+    yield Finding(_C.BEGIN_REFUSED, refused_s[0], text)
 
 
 def _ended_s(e: FlightEvidence) -> float | None:
@@ -592,8 +664,9 @@ def _out_of_reach(e: FlightEvidence) -> str:
 
 def _pushed(e: FlightEvidence) -> Iterator[Finding]:
     """Find a lasting push as strong as may be flown against; a battery that gives in pushes down like a wind."""
-    at_s = e.first_s("bias-at-bound")
-    if at_s is None or at_s >= e.breach_s or any(_battery(e)):
+    at_s, left = e.first_s("bias-at-bound"), _left_external(e)
+    flown_until_s = e.breach_s if left is None else min(e.breach_s, left[0] - BEAT_S)  # its mode is told that late
+    if at_s is None or at_s >= flown_until_s or any(_battery(e)):
         return
     until_s = next(
         (e.second(o.at_ns) for o in e.flight.events if o.code == "bias-free" and e.second(o.at_ns) > at_s),
@@ -627,5 +700,5 @@ def _link(e: FlightEvidence) -> Iterator[Finding]:
 
 RULES: tuple[Callable[[FlightEvidence], Iterator[Finding]], ...] = (
     _battery, _excursion, _lost, _cut, _blind, _stood_still, _vehicle_texts, _failsafe, _taken_over, _refused, _wrong,
-    _absent, _relay, _ending, _limits, _fell_back, _mission, _pushed, _relaxed, _link,
+    _absent, _relay, _begin_refused, _not_risen, _ending, _limits, _fell_back, _mission, _pushed, _relaxed, _link,
 )  # fmt: skip

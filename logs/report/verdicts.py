@@ -331,7 +331,9 @@ def _link_text(found: LinkVerdict, independent: bool) -> str:
     if found.promised_news is None:
         return f"{seen}; what was promised is not known any more."
     least = f"{100 * found.promised_news:.3g} %"
-    if news.high < found.promised_news:
+    if found.promised_news == 0.0:
+        told = f"{seen}; the design counts on none."
+    elif news.high < found.promised_news:
         told = f"{seen}, where the design counts on {least}: fewer than promised."
     else:
         chance = "nothing speaks against it" if news.rate >= found.promised_news else "so few may still be chance"

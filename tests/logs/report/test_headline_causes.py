@@ -25,6 +25,7 @@ from logs.report.causes import GOOD, Headline, HeadlineCause, cause_of_text, ran
 from logs.report.headline import headline
 from logs.report.tlog_headline import headline_of
 from logs.report.verdicts import judge
+from uavctl.flight.envelope import OUTSIDE
 from uavctl.mavlink.codec import BAD_FIELD
 from uavctl.outcome import Cause, make_ending
 from uavctl.records import ControlMode, Event, LinkStats, RelayStats, Severity, VehicleStatus
@@ -327,6 +328,74 @@ def test_the_gravest_comes_first_and_within_a_rank_the_earliest(good: FlightData
     assert found.causes[:3] == (C.BATTERY_EMPTY, C.VEHICLE_FENCE, C.VEHICLE_FAILSAFE)
     assert ranked([]) == []
     assert cause_of_text("PreArm: Battery Failsafe", grave=True, warns=True) is None
+
+
+@pytest.mark.parametrize(("lets_go", "reason"), [(False, "held back"), (True, "held back"), (True, "nothing comes")])
+def test_a_relay_that_is_held_back_as_the_vehicle_was_let_go_is_no_cause(
+    good: FlightData, lets_go: bool, reason: str
+) -> None:
+    flight = told(good, 5.5, "relay-silent", "", Severity.WARNING)
+    row = RelayStats(at_ns=good.origin_ns + 6 * SECOND, sent=100, kept={}, last_ns=good.origin_ns + 5 * SECOND,
+                     alone=False, silent_for=reason)  # fmt: skip
+    if lets_go:
+        flight = told(flight, 5.0, OUTSIDE, "the estimate leaves a limit", Severity.ERROR)
+    found = head(dataclasses.replace(flight, relays=(row,)))
+    assert (C.RELAY_SILENT in found.causes) != (lets_go and reason == "held back")
+
+
+@pytest.mark.parametrize(("left_s", "windy"), [(None, True), (6, False), (11, True)])
+def test_what_pushes_once_the_vehicle_follows_setpoints_no_more_is_no_wind(
+    good: FlightData, left_s: int | None, windy: bool
+) -> None:
+    """The vehicle lands by itself from a time on; a push is told at 5.6 s."""
+    plain = statuses(good, [4.1] * 12)
+    modes = tuple(
+        one
+        if left_s is None or number < left_s
+        else msgspec.structs.replace(one, mode="AUTO.LAND", external=False, failsafe=True)
+        for number, one in enumerate(plain.vehicles)
+    )
+    flight = told(dataclasses.replace(plain, vehicles=modes), 5.6, "bias-at-bound", "", Severity.WARNING)
+    assert (C.WIND in head(flight).causes) == windy
+
+
+@pytest.mark.parametrize(
+    ("landed", "moves_m", "risen"), [(True, 0.003, False), (True, 0.5, True), (False, 0.003, True)]
+)
+def test_a_vehicle_that_was_armed_and_stood_still_never_rose(
+    good: FlightData, landed: bool, moves_m: float, risen: bool
+) -> None:
+    """It stands at one place from its first heartbeat on, on the ground or in the air, or moves."""
+    plain = statuses(good, [4.1] * 12)
+    first, *later = plain.vehicles
+    vehicles = (msgspec.structs.replace(first, armed=False, landed=landed), *later)
+    inputs = tuple(
+        msgspec.structs.replace(
+            one,
+            samples=tuple(
+                msgspec.structs.replace(sample, position_m=(moves_m * (number // 20 % 2), 0.0, 0.0))
+                for sample in one.samples
+            ),
+        )
+        for number, one in enumerate(plain.step_inputs)
+    )
+    found = head(dataclasses.replace(plain, vehicles=vehicles, step_inputs=inputs))
+    assert (C.NOT_RISEN in found.causes) != risen
+
+
+@pytest.mark.parametrize("order", ["COMPONENT_ARM_DISARM", "DO_SET_MODE"])
+@pytest.mark.parametrize("armed", [False, True])
+def test_a_vehicle_that_never_armed_refused_it(good: FlightData, order: str, armed: bool) -> None:
+    grounded = statuses(good, [4.1] * 12)
+    vehicles = tuple(
+        msgspec.structs.replace(one, armed=armed, external=False, landed=True) for one in grounded.vehicles
+    )
+    waited = tuple(msgspec.structs.replace(one, mode=ControlMode.WAIT, boundary=False) for one in good.decisions)
+    flight = dataclasses.replace(grounded, vehicles=vehicles, decisions=waited, setpoints=())
+    refused = told(flight, 3.0, "command-ack", f"{order}: DENIED", Severity.WARNING)
+    assert (head(refused).cause is C.BEGIN_REFUSED) != armed
+    granted = told(refused, 5.0, "command-ack", f"{order}: ACCEPTED", Severity.INFO)
+    assert C.BEGIN_REFUSED not in head(granted).causes
 
 
 # --- MAVLink of others ---

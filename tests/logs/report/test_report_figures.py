@@ -67,6 +67,16 @@ def test_what_is_too_small_to_count_is_no_slack(flight: FlightData) -> None:
     assert "No plan that was flown gave way" in " ".join(seen.text)
 
 
+@pytest.mark.parametrize("slack", [0.003, 20.0])
+def test_small_slack_fills_its_drawing(flight: FlightData, slack: float) -> None:
+    two = {one.seq for one in list(flight.flown_plans.values())[:2]}
+    plans = tuple(msgspec.structs.replace(one, slack=slack) if one.seq in two else one for one in flight.plans)
+    with drawn() as figures:
+        list(plots_solver.certificates(dataclasses.replace(flight, plans=plans)))
+    low, high = figures["What gave way in plans flown"].axes[0].get_ylim()
+    assert low <= 0.0 and slack < high < 2 * slack
+
+
 def test_gaps_that_are_alike_still_have_a_scale(flight: FlightData) -> None:
     gaps = np.geomspace(1.5e-9, 4e-9, len(flight.plans))
     plans = tuple(msgspec.structs.replace(plan, gap=gap) for plan, gap in zip(flight.plans, gaps, strict=True))
