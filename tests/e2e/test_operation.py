@@ -21,20 +21,12 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import decode
 
 from logs.recording.reader import records
-from uavctl.build.controller import build_design
-from uavctl.build.library import library_for
 from uavctl.config import load_config
 from uavctl.records import ControlMode, Datagram, Decision, Order, StepInput
 
 
-@pytest.fixture(scope="module")
-def _library() -> None:
-    """The daemons find the policy library in the cache, so that their time limits are for flying."""
-    library_for(build_design(load_config("room-hahn-stursberg")))
-
-
 @pytest.fixture
-def air(_library: None) -> Iterator[Scene]:
+def air() -> Iterator[Scene]:
     with scene() as found:
         yield found
 

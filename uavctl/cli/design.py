@@ -24,11 +24,9 @@ from uavctl.build.controller import (
     design_of,
     start_state,
 )
-from uavctl.build.library import StoredLibrary
 from uavctl.build.mission import build_names
 from uavctl.build.rehearsal import RehearsalResult, rehearse
 from uavctl.cli.common import DEFAULTS, Column, Common, WideTable, bars, columns, located
-from uavctl.cli.prepare import ready_library
 from uavctl.config import Config
 from uavctl.errors import UsageError
 from uavctl.lab.compare_designs import Costs, GainComparison, GainReport, compare_gains
@@ -130,7 +128,7 @@ def design(
     ] = 60,
     common: Common = DEFAULTS,
 ) -> int:
-    """Make a design and its policy library: schedule, terminal ingredients, Assumption 4 with figures."""
+    """Make a design: schedule, terminal ingredients, Assumption 4 with figures."""
     if synthesize:
         return gains_report(common, states)
     loaded = common.load()
@@ -148,9 +146,8 @@ def design(
         return 1 if found is not None and (found.relaxes or found.strays) else 0
     with located(loaded):
         made = build_design(loaded.config)
-        stored = ready_library(loaded.config, made)
-    document = design_document(made, stored, time.perf_counter() - start)
-    common.show("design", document, lambda: design_picture(made, stored, loaded.config.name))
+    document = design_document(made, time.perf_counter() - start)
+    common.show("design", document, lambda: design_picture(made, loaded.config.name))
     return 0
 
 
@@ -193,32 +190,13 @@ def conditioned_picture(made: ConditionedDesign, name: str, found: RehearsalResu
     return Group(ages, columns("Where a plan may rest", headings, rows, ("limit", "unit")), *doubts)
 
 
-def design_document(made: Design, stored: StoredLibrary | None, wall_s: float) -> dict[str, object]:
-    """Return the figures of a design and its policy library, for --json; without a library these are 0 and null."""
-    return {
-        **design_record(made),
-        "library_size": 0 if stored is None else sum(stored.sizes),
-        "gap_max": None if stored is None else stored.check.worst_gap,
-        "library": None if stored is None else library_document(stored),
-        "wall_s": wall_s,
-    }
+def design_document(made: Design, wall_s: float) -> dict[str, object]:
+    """Return the figures of a design, for --json."""
+    return {**design_record(made), "wall_s": wall_s}
 
 
-def library_document(stored: StoredLibrary) -> dict[str, object]:
-    """Return the figures of a policy library, for --json."""
-    return {
-        "library_id": stored.library_id,
-        "bytes": len(stored.data),
-        "file": None if stored.path is None else str(stored.path),
-        "cached": stored.cached,
-        "made_s": stored.made_s,
-        "components": [{"name": name, "policies": size} for name, size in zip(stored.names, stored.sizes, strict=True)],
-        "check": msgspec.to_builtins(stored.check),
-    }
-
-
-def design_picture(made: Design, stored: StoredLibrary | None, name: str) -> RenderableType:
-    """Return Assumption 4, the schedule and the policy library as tables."""
+def design_picture(made: Design, name: str) -> RenderableType:
+    """Return Assumption 4 and the schedule as tables."""
     headings = ("item", "holds", "value", "limit", "of what")
     checked = (
         (
@@ -241,26 +219,7 @@ def design_picture(made: Design, stored: StoredLibrary | None, name: str) -> Ren
         f"τ = {made.terminal.tau}, spectral radius of the terminal loop {made.terminal.spectral_radius:.4f}, "
         f"its stationary cost {stationary_cost(made.terminal):.4f} a step.\n"
     )
-    return Group(
-        checks,
-        terminal,
-        "Schedule: stage t counts on information that is d_t steps old.",
-        schedule,
-        *_library_picture(stored),
-    )
-
-
-def _library_picture(stored: StoredLibrary | None) -> list[RenderableType]:
-    if stored is None:
-        return []
-    sizes = zip(stored.names, map(str, stored.sizes), strict=True)
-    table = columns(f"Policy library {stored.library_id}", ("", "policies"), sizes)
-    check = stored.check
-    shares = ", ".join(f"{count / check.states:.0%} {name}" for name, count in check.methods.items())
-    answers = f"Answers from {check.states} states, most of them anywhere in the limits: {shares}; worst gap "
-    where = "kept nowhere" if stored.path is None else f"{'from' if stored.cached else 'kept in'} {stored.path}"
-    facts = f"{len(stored.data):,} bytes, made in {stored.made_s:.1f} s, {where}."
-    return [table, Text(f"{answers}{check.worst_gap:.1e}."), Text(facts)]
+    return Group(checks, terminal, "Schedule: stage t counts on information that is d_t steps old.", schedule)
 
 
 def solve(
@@ -269,7 +228,7 @@ def solve(
         str, Parameter(allow_leading_hyphen=True, help="state now, axis by axis, as in 35,-2,-20,-4", metavar="X,V,...")
     ],
     method: Annotated[
-        Literal["library", "exact", "printed"] | None,
+        Literal["exact", "printed"] | None,
         Parameter(
             help="overrides solver.method; `printed` knows no lower bound: cost_lower and gap are null in --json"
         ),
@@ -281,8 +240,7 @@ def solve(
     with located(loaded):
         design = design_of(loaded.config)
         x = parse_state(state, design.plant.n_x)
-        stored = ready_library(loaded.config, design)
-        solver = build_solver(design, loaded.config, None if stored is None else stored.library)
+        solver = build_solver(design, loaded.config)
     start = time.perf_counter()
     answer = solver.solve(0, x, design.target)
     solve_us = (time.perf_counter() - start) * 1e6
@@ -320,7 +278,7 @@ def solve_picture(answer: Answer, design: AnyDesign, config: Config, solve_us: f
     if not answer.inputs.size:
         hint = "is the state far beyond what numbers can hold? Give one nearer to the limits"
         if config.solver.method == "printed":
-            hint = "the printed problem has hard limits; `library` and `exact` soften those of the state"
+            hint = "the printed problem has hard limits; `exact` softens those of the state"
         return f"{head}; no plan: {hint}"
     bound = "no lower bound known"
     if math.isfinite(answer.gap):
