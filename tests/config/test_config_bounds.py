@@ -230,7 +230,6 @@ def test_keys_of_the_policy_library_are_named_with_what_to_do() -> None:
         ["paper", "--runs", "9" * 20],
         ["paper", "--steps", "9" * 20],
         ["bench", "--states", "9" * 20],
-        ["design", "--synthesize", "--states", "9" * 20],
         ["design", "--config", "a" * 5000],
         ["design", "--set", "a=" + "b" * 100_000],
         ["log", "info", "a" * 5000],

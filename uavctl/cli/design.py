@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
-from cyclopts import Parameter, validators
+from cyclopts import Parameter
 from numpy.typing import NDArray
 from rich.console import Group, RenderableType
 from rich.text import Text
@@ -26,10 +25,10 @@ from uavctl.build.controller import (
 )
 from uavctl.build.mission import build_names
 from uavctl.build.rehearsal import RehearsalResult, rehearse
-from uavctl.cli.common import DEFAULTS, Column, Common, WideTable, bars, columns, located
+from uavctl.cli.common import DEFAULTS, Column, Common, WideTable, columns, located, messages
 from uavctl.config import Config
 from uavctl.errors import UsageError
-from uavctl.lab.compare_designs import Costs, GainComparison, GainReport, compare_gains
+from uavctl.lab.terminal_gain import GainComparison, GainReport, compare_gains
 from uavctl.records import SolveStatus, tell_all
 from uavctl.smpc.answer import Answer
 from uavctl.smpc.conditioned.planner import AnyDesign, ConditionedDesign, conditioned_record
@@ -39,31 +38,16 @@ from uavctl.smpc.hahn_stursberg.terminal import stationary_cost
 # `uavctl design --synthesize`: the configured terminal gain beside the best one.
 
 
-SEED = 0
-
-
-def gains_report(common: Common, states: int) -> int:
+def gains_report(common: Common) -> int:
     """Synthesise the terminal gain and compare; return 1 if no complete design can be made with it."""
     loaded = common.load()
     begin = time.perf_counter()
-    with located(loaded):
+    with located(loaded), messages().status("synthesis and designs"):
         spec = build_spec(loaded.config)
-        with _progress(2 + 4 * states) as advance:
-            found = compare_gains(spec, start_state(loaded.config, spec.plant), states, SEED, advance)
+        found = compare_gains(spec, start_state(loaded.config, spec.plant))
     document = {**msgspec.to_builtins(found), "k_tau": found.after.k_tau, "wall_s": time.perf_counter() - begin}
     common.show("design/gains", document, lambda: _gains_picture(found, loaded.config.name))
     return 0 if found.after.refused is None else 1
-
-
-@contextmanager
-def _progress(steps: int) -> Iterator[Callable[[str], None]]:
-    with bars() as progress:
-        task = progress.add_task("designs", total=steps)
-
-        def advance(what: str) -> None:
-            progress.update(task, advance=1, description=what)
-
-        yield advance
 
 
 def _gains_picture(found: GainComparison, name: str) -> RenderableType:
@@ -74,28 +58,23 @@ def _gains_picture(found: GainComparison, name: str) -> RenderableType:
         for which, report in (("configured", found.before), ("synthesised", found.after))
         if report.refused is not None
     ]
-    return Group(table, *refusals, _basis(found), "To take the synthesised gain over:", "", Text(found.toml))
+    return Group(table, *refusals, _BASIS, "To take the synthesised gain over:", "", Text(found.toml))
 
 
-def _basis(found: GainComparison) -> str:
-    return (
-        "Infeasible: the target is not reached within the horizon with all constraints kept; a flight goes there by "
-        "way of nearer equilibria, or gives way where the limits are soft.\n"
-        f"Means over {found.compared} states on the way to the target, feasible for every design; shares of "
-        f"{found.states} states uniform in the box of the limits."
-    )
+_BASIS = (
+    "Infeasible: the target is not reached within the horizon with all constraints kept; a flight goes there by "
+    "way of nearer equilibria, or gives way where the limits are soft."
+)
 
 
 def _figure(value: float | None) -> str:
     return "-" if value is None else f"{value:.4g}"
 
 
-def _cost(value: float | None) -> str:
-    return "infeasible" if value is None else f"{value:.2f}"
-
-
-def _cost_row(pick: Callable[[Costs], str]) -> Callable[[GainReport], str]:
-    return lambda report: "-" if report.costs is None else pick(report.costs)
+def _start_cost(report: GainReport) -> str:
+    if report.refused is not None:
+        return "-"
+    return "infeasible" if report.start_cost is None else f"{report.start_cost:.2f}"
 
 
 _GAIN_ROWS: tuple[tuple[str, Callable[[GainReport], str]], ...] = (
@@ -104,9 +83,7 @@ _GAIN_ROWS: tuple[tuple[str, Callable[[GainReport], str]], ...] = (
     ("state room taken (4.3: at most 1)", lambda report: _figure(report.filled_x)),
     ("input room taken (4.4: at most 1)", lambda report: _figure(report.filled_u)),
     ("margin s* of the terminal condition", lambda report: _figure(report.margin)),
-    ("optimal cost from the simulator's start", _cost_row(lambda costs: _cost(costs.start))),
-    ("mean optimal cost", _cost_row(lambda costs: _cost(costs.mean))),
-    ("share of the box feasible", _cost_row(lambda costs: f"{costs.feasible:.1%}")),
+    ("optimal cost from the simulator's start", _start_cost),
 )
 
 
@@ -122,15 +99,11 @@ def design(
         bool,
         Parameter(negative=(), show_default=False, help="find the terminal gain of least stationary cost, and compare"),
     ] = False,
-    states: Annotated[
-        int,
-        Parameter(help="with --synthesize: seeded states to compare", validator=validators.Number(gte=1, lte=10_000)),
-    ] = 60,
     common: Common = DEFAULTS,
 ) -> int:
     """Make a design: schedule, terminal ingredients, Assumption 4 with figures."""
     if synthesize:
-        return gains_report(common, states)
+        return gains_report(common)
     loaded = common.load()
     start = time.perf_counter()
     if loaded.config.conditioned:
