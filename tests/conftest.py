@@ -1,10 +1,8 @@
-"""One cache of policy libraries for a whole test run, what is collected only when asked for, and in which order."""
+"""What a test run needs as a whole: what is collected only when asked for, and in which order."""
 
 from __future__ import annotations
 
 import os
-import shutil
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,8 +15,6 @@ from uavctl.arithmetic import ARITHMETIC  # loaded before numpy, so that tests c
 if TYPE_CHECKING:
     from logs.recording.summary import FlightSummary
 
-CACHE = "UAVCTL_CACHE"
-OWN = pytest.StashKey[str]()
 # Most of a run's time. They begin, so that no worker is left alone with one of them in the end.
 LONGEST = (
     "test_manual", "test_tune_cmd", "test_endings", "test_operation", "test_faults_truth", "test_take_off_failsafes",
@@ -27,14 +23,14 @@ LONGEST = (
     "test_campaign_cmd", "test_general_plants", "test_identify", "test_faults_storage", "test_bias", "test_python_docs",
     "test_inertial_errors", "test_late", "test_whatif", "test_fly", "test_report", "test_loopback", "test_cuts",
     "test_foreign_stream", "test_engagement", "test_check_cmd", "test_conic", "test_campaign_docs",
-    "test_sim_quadrotor_peers", "test_library_solver", "test_policies", "test_hand_over_restart", "test_whatif_cmd",
+    "test_sim_quadrotor_peers", "test_shortcut", "test_policy", "test_hand_over_restart", "test_whatif_cmd",
     "test_campaign_trials", "test_identify_jerk", "test_daemon", "test_sources", "test_scaling", "test_trial_fly",
     "test_report_words", "test_live", "test_build_link", "test_bench_loop", "test_campaign_positions",
     "test_report_figures", "test_flight_mission", "test_trial_own_loop", "test_natnet_flight", "test_config_bounds",
     "test_bench", "test_paper_cmd", "test_rest_backoffs", "test_outlook", "test_relay", "test_conditioned_flight",
     "test_replay", "test_difference", "test_conditioned_design", "test_foreign", "test_flat",
-    "test_sim_autopilot_bytes", "test_sim_fuzz", "test_library", "test_synthesis", "test_campaign_world", "test_loop",
-    "test_check_axes", "test_frozen", "test_take_off", "test_replay_soak", "test_foreign_ros", "test_paper_depth",
+    "test_sim_autopilot_bytes", "test_sim_fuzz", "test_synthesis", "test_campaign_world", "test_loop",
+    "test_check_axes", "test_take_off", "test_replay_soak", "test_foreign_ros", "test_paper_depth",
     "test_viewers", "test_sealed", "test_sim_observed",
 )  # fmt: skip
 
@@ -105,16 +101,6 @@ def no_page(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("uavctl.cli.flying.draw_page", lambda *_: None)
 
 
-def pytest_configure(config: pytest.Config) -> None:
+def pytest_configure() -> None:
     settings.register_profile("patient", deadline=None)  # how long an example takes is the machine's affair
     settings.load_profile("patient")
-    # Workers inherit the variable from the process that starts them; a cache that somebody chose is kept.
-    if CACHE not in os.environ:
-        config.stash[OWN] = os.environ[CACHE] = tempfile.mkdtemp(prefix="uavctl-test-cache-")
-
-
-def pytest_unconfigure(config: pytest.Config) -> None:
-    own = config.stash.get(OWN, None)
-    if own is not None:
-        shutil.rmtree(own, ignore_errors=True)
-        del os.environ[CACHE]

@@ -24,8 +24,6 @@ from safety_core import TARGETS, what_is_not_run
 from docs import PAGES, ROOT
 
 BIN = Path(sys.executable).parent
-# Policy libraries, each under the hash of its design and of the code that makes it: the next run makes none again.
-CACHE = ROOT / ".uavctl_cache"
 # Two test processes on two cores; and each of the processes that tests start would compile what it imports anew if no
 # bytecode were kept.
 _PROCESSES = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": ""}
@@ -82,7 +80,7 @@ def check_wheel() -> str:
         run([sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", site, wheel])
         # -P and PYTHONPATH: the installed package, not the checkout beside the working directory.
         flight = ("loopback", "--config", "paper", "--duration", "20", "--json", "--out", str(folder / "flights"))
-        outside = {"PYTHONPATH": str(site), "UAVCTL_CACHE": str(CACHE)}
+        outside = {"PYTHONPATH": str(site)}
         where = run([sys.executable, "-P", "-c", "import uavctl; print(uavctl.__file__)"], cwd=folder, extra=outside)
         if not Path(where.strip()).is_relative_to(site):
             raise StageError(f"the wheel was not what was imported, but {where.strip()}")
@@ -107,7 +105,7 @@ def check_tests(failed: threading.Event, *, everything: bool) -> str:
     """
     command = [str(BIN / "pytest"), "-n", "2", "--dist", "loadfile", "--no-loadscope-reorder"]
     command += ["-m", "not manual" if everything else "not slow and not manual"]
-    with subprocess.Popen(command, cwd=ROOT, env={**os.environ, **_PROCESSES, "UAVCTL_CACHE": str(CACHE)}) as process:
+    with subprocess.Popen(command, cwd=ROOT, env={**os.environ, **_PROCESSES}) as process:
         while process.poll() is None:
             if failed.wait(0.2):
                 process.send_signal(signal.SIGINT)

@@ -284,9 +284,6 @@ taken over; 130 interrupted.
 recordings, unless \\-\\-out names another folder
 .SH ENVIRONMENT
 .TP
-.B UAVCTL_CACHE
-folder of designs and policy libraries, which may be removed at any time
-.TP
 .B UAVCTL_CONTROL
 folder of the socket by which \\fBuavctl ctl\\fR reaches a flight
 .SH SEE ALSO

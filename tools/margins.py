@@ -91,7 +91,7 @@ class _Judge:
         ]
         own = one if margin is None else msgspec.structs.replace(one, margin=margin)
         alone = msgspec.structs.replace(spec, controller=(own,), link=(flown_link,), tuning=tuple(tuning))
-        (cell,) = cells_of(compose(alone, self.configuration), lambda *_: None)
+        (cell,) = cells_of(compose(alone, self.configuration))
         return self._figures(cell)
 
     def _figures(self, cell: Cell) -> tuple[float, float]:

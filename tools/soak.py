@@ -34,7 +34,6 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "support"))
 
 from chaos import soak_core
-from draw_controller import with_libraries
 from soak_faults import Batch, fly_faults  # the tests' own
 from soak_mission import AUTOPILOTS, MISSION, MissionFlight, fly_mission, summary
 from soak_pairs import TrueFlight, fly_pair
@@ -69,11 +68,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ[name] = "1"  # of the processes to come; the last bits would depend on it
     given.out.mkdir(parents=True, exist_ok=True)
-    # Policy libraries are made once, where they are not in the cache yet.
-    if given.scenario == "replay":
-        with_libraries()
-    elif given.scenario not in ("core", "take-off"):
-        prepared_for(*(MISSION if given.scenario == "mission" else ()))
     begun = time.monotonic()
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(PROCESSES, mp_context=context) as pool:

@@ -77,15 +77,6 @@ class RecordingError(UavctlError):
     """A recording cannot be read, or not without loss."""
 
 
-class LibraryError(UavctlError):
-    """A policy library cannot be used: damaged, of another format, or of another design."""
-
-    def __init__(self, reason: str, hint: str) -> None:
-        self.reason = reason
-        self.hint = hint
-        super().__init__(f"{reason}; {hint}")
-
-
 class VehicleTakenError(UavctlError):
     """Another daemon flies this vehicle, or answers under its name."""
 

@@ -384,7 +384,7 @@ class Header(Record, frozen=True, kw_only=True):
     design: dict[str, object]
     versions: dict[str, str]
     cpu: str
-    library_id: str | None = None  # hash of the policy library; None if none was flown with
+    library_id: str | None = None  # hash of the policy library, in recordings up to version 0.2
     # UTC of time 0 of our clock [ns since 1970]; log times are this much later than the records' own. None in
     # recordings of before: their log times are those of our clock
     zero_utc_ns: int | None = None
@@ -407,11 +407,11 @@ class LinkEstimate(Record, frozen=True, kw_only=True):
 
 
 class PolicyLibrary(Record, frozen=True, kw_only=True):
-    """The policy library that is decided with; second record of a recording, for a replay that decides alike."""
+    """The policy library that was decided with, in recordings up to version 0.2."""
 
     library_id: str
     design_id: str
-    data: bytes  # as `uavctl.build.library.encode` writes it
+    data: bytes
 
 
 class Sink(Protocol):

@@ -1,4 +1,4 @@
-"""Ends of a flight's recording: its path, header and policy library; how the flight ended, and what is missing."""
+"""Ends of a flight's recording: its path and header; how the flight ended, and what is missing."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from pathlib import Path
 
 from logs.recording.disk import check_room, no_empty_folders
 from logs.recording.recorder import RecorderStatus
-from logs.recording.topics import HEADER, LIBRARY
+from logs.recording.topics import HEADER
 from uavctl.build.controller import Prepared, cpu, record_of, versions
 from uavctl.clock import VIRTUAL_ZERO_UTC_NS
 from uavctl.config.load import dump_config
 from uavctl.outcome import lacking
-from uavctl.records import Ending, Header, PolicyLibrary, Sink
+from uavctl.records import Ending, Header, Sink
 
 
 def recording_path(out: Path | None, name: str) -> Path:
@@ -47,14 +47,14 @@ def put_header(
     zero_utc_ns: int | None = VIRTUAL_ZERO_UTC_NS,
     command: str | None = None,
 ) -> None:
-    """Begin a recording with its header and library: everything needed to decide alike in a replay.
+    """Begin a recording with its header: everything needed to decide alike in a replay.
 
     Args:
         started_ns: when it begins, by the flight's clock.
         zero_utc_ns: UTC of time 0 of that clock [ns since 1970]; that of virtual time unless it is given.
         command: what it was made by; None: the command line of this process.
     """
-    config, design, library = prepared.config, prepared.design, prepared.library
+    config, design = prepared.config, prepared.design
     header = Header(
         started_ns=started_ns,
         started_utc=datetime.now(UTC).isoformat(timespec="milliseconds"),
@@ -65,14 +65,10 @@ def put_header(
         design=record_of(design),
         versions=versions(config.smpc.controller),
         cpu=cpu(),
-        library_id=None if library is None else library.library_id,
         zero_utc_ns=zero_utc_ns,
         platform=platform.platform(),
     )
     recorder.put(HEADER, started_ns, header)
-    if library is not None:
-        record = PolicyLibrary(library_id=library.library_id, design_id=design.design_id, data=library.data)
-        recorder.put(LIBRARY, started_ns, record)
 
 
 def final(ending: Ending, status: RecorderStatus) -> Ending:

@@ -26,7 +26,6 @@ from logs.recording.topics import (
     END,
     GOES_ON,
     HEADER,
-    LIBRARY,
     RECORDER,
     Definition,
     RecorderNote,
@@ -304,7 +303,6 @@ class WriteQueue:
         self._files.write_record(topic, at_ns, data)
         if topic == HEADER:
             self._write_note("begin")
-        if topic in (HEADER, LIBRARY):
             self._files.commit()
         if isinstance(record, Header):
             utc_ns = at_ns + self._files.zero_utc_ns
@@ -368,7 +366,7 @@ STOP_S = 1.0  # for viewers to take their leave
 
 @contextmanager
 def live_view(port: int | None, *, on_open: Callable[[int], None] = lambda _: None) -> Iterator[Watcher | None]:
-    """Serve every message that the watcher is given to viewers, without raw bytes and the policy library.
+    """Serve every message that the watcher is given to viewers, without raw bytes.
 
     Args:
         port: TCP port on the loopback address, 0 for a free one; None: nobody looks, and nothing is imported.
@@ -405,7 +403,7 @@ def _watcher(foxglove: ModuleType, context: object) -> Watcher:
     logs: dict[str, Callable[..., None]] = {}  # a channel's entrance, by topic
 
     def watch(definition: Definition, at_ns: int, data: bytes) -> None:
-        if definition.schema_encoding == "" or definition.topic == LIBRARY:
+        if definition.schema_encoding == "":
             return
         if definition.topic not in logs:
             schema = foxglove.Schema(

@@ -14,13 +14,10 @@ from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import cache
-from pathlib import Path
 
 import msgspec
 
-from logs.recording.reader import records
 from logs.recording.topics import DIGITS, RecorderNote, alike, condense, decode, raw_link, record_type, says
-from uavctl.errors import RecordingError
 from uavctl.loop import ControlLoop
 from uavctl.records import (
     Command,
@@ -28,7 +25,6 @@ from uavctl.records import (
     Decision,
     Event,
     Plan,
-    PolicyLibrary,
     PositionSample,
     Record,
     Refused,
@@ -281,20 +277,6 @@ class ReplayResult(msgspec.Struct, frozen=True, kw_only=True):
     decisions_differing: int = 0
     course: tuple[FieldDivergence, ...] = ()  # field by field, in the order in which they began to differ
     dropped: int = 0  # records that the recorder had to drop: what came after the first of them cannot be compared
-
-
-def recorded_library(path: Path) -> PolicyLibrary:
-    """Return the policy library that a recording was flown with.
-
-    Raises:
-        RecordingError: it cannot be read, or carries none.
-    """
-    for record in records(path, PolicyLibrary):
-        return record
-    raise RecordingError(
-        f"{path}: flown with a policy library, but carries none, so it cannot be decided alike; "
-        "was it cut, or the chunk lost? `uavctl log info` tells"
-    )
 
 
 class _Produced:

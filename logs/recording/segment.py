@@ -43,7 +43,7 @@ from mcap.records import SummaryOffset as Group
 from zstandard import ZstdCompressor
 
 from logs.recording.disk import MAGIC, OutputFile, is_there, segment_path
-from logs.recording.topics import HEADER, LIBRARY, Definition, definition, is_view
+from logs.recording.topics import HEADER, Definition, definition, is_view
 from uavctl.config.types import LogConfig
 
 MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
@@ -399,8 +399,8 @@ class Rotation:
         self._path, self._log, self._open_file, self._clock = path, log, open_file, clock
         self._segment: Segment | None = None
         self._preface = 0  # records at the start of this segment that only repeat
-        self._repeats: dict[str, bytes] = {}  # header and library, for each segment
-        self._repeats_bytes = 0
+        self._header = b""  # the header record, which each segment repeats; empty before there is one
+        self._header_bytes = 0  # its size in a file
         self._attachments: tuple[Attachment | Metadata, ...] = ()  # for each segment
         self._retry_s = clock()
         self._opened: os.stat_result | None = None  # what the open file is
@@ -438,7 +438,7 @@ class Rotation:
         segment = self._segment
         if segment is None:
             return False
-        return segment.bytes - segment.attached_bytes < self._log.segment_bytes + self._repeats_bytes
+        return segment.bytes - segment.attached_bytes < self._log.segment_bytes + self._header_bytes
 
     @property
     def may_begin(self) -> bool:
@@ -476,7 +476,7 @@ class Rotation:
         self._retry_s = self._clock()
 
     def begin(self, tell: Callable[[str], object]) -> None:
-        """Open the next file; a later one than the first repeats header and library.
+        """Open the next file; a later one than the first repeats the header.
 
         Raises:
             OSError: it cannot be opened or written.
@@ -487,10 +487,10 @@ class Rotation:
         self._opened = path.stat()
         self._preface = 0
         if self.number > 1:
-            self._preface = 1 + len(self._repeats)
-            self._repeat(HEADER)
+            self._preface = 1 + bool(self._header)
+            if self._header:
+                self.write(HEADER, self.at_ns, self._header)
             tell(self.because)
-            self._repeat(LIBRARY)
             self._segment.attach(self._attachments)
 
     def write(self, topic: str, at_ns: int, data: bytes) -> None:
@@ -503,15 +503,15 @@ class Rotation:
         self._open_segment().add(QueuedMessage(definition(topic), self.written, at_ns, data))
 
     def write_record(self, topic: str, at_ns: int, data: bytes) -> None:
-        """Add a record's message; header and library are kept for later files.
+        """Add a record's message; the header is kept for later files.
 
         Raises:
             OSError: as `write`.
         """
         self.at_ns = at_ns
-        if topic in (HEADER, LIBRARY):
-            self._repeats[topic] = data
-            self._repeats_bytes = sum(map(len, map(ZstdCompressor(level=_LEVEL).compress, self._repeats.values())))
+        if topic == HEADER:
+            self._header = data
+            self._header_bytes = len(ZstdCompressor(level=_LEVEL).compress(data))
         self.write(topic, at_ns, data)
 
     def write_unwritten(self) -> None:
@@ -580,10 +580,6 @@ class Rotation:
         with contextlib.suppress(OSError):
             segment.abandon() if there else segment.leave()
         self._retire(segment, there=there)
-
-    def _repeat(self, topic: str) -> None:
-        if topic in self._repeats:
-            self.write(topic, self.at_ns, self._repeats[topic])
 
     def _open_segment(self) -> Segment:
         assert self._segment is not None  # who calls has asked is_open

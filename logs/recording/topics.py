@@ -112,7 +112,7 @@ class Topic:
 
 TOPICS: tuple[Topic, ...] = (
     Topic(HEADER, Header, "configuration, design, seed, versions; first message of every segment"),
-    Topic(LIBRARY, PolicyLibrary, "policies that are decided with, as base64; again in every segment"),
+    Topic(LIBRARY, PolicyLibrary, "policies that were decided with, as base64; up to version 0.2"),
     Topic("/uavctl/step_input", StepInput, "all that a tick knew; replay starts from here"),
     Topic("/uavctl/estimate", Estimate, "state estimate of a tick"),
     Topic("/uavctl/plan", Plan, "answer of the predictive controller, when one was made"),

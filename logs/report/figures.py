@@ -275,8 +275,8 @@ _ROLES = ("estimate", "sample", "target", "plan", "limit")
 _LEAST_GAP = 1e-12
 _PERCENT = 100.0
 _WAYS = {
-    "frozen": "with the policy that costs least of those made beforehand",
-    "mixture": "with another of them, or with several, weighed together",
+    "frozen": "with the policy that was made beforehand, which is the best there",
+    "mixture": "with several policies made beforehand, weighed together (up to version 0.2)",
     "exact": "with a policy found for this very plan",
 }
 

@@ -119,7 +119,7 @@ def test_a_configuration_can_be_changed_again_and_read_from_a_file(tmp_path: Pat
         ("room", [0.5, 0.1, 0.0, -1.0, 0.0, 0.2, -1.0, 0.0, 0.0], ()),
         ("room", [9.0, 5.0, 0.0, -1.0, 0.0, 0.2, -1.0, 0.0, 0.0], ()),
         ("paper", STATE, ("solver.method=exact",)),
-        pytest.param("paper", STATE, (), marks=pytest.mark.slow),  # the policy library may have to be made
+        pytest.param("paper", STATE, (), marks=pytest.mark.slow),
     ],
 )
 def test_a_decision_is_that_of_the_command_line(

@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 
 from uavctl.build.controller import build_controller, build_design, build_plant, build_solver, build_spec
-from uavctl.build.library import library_for
 from uavctl.config import load_config, presets
 from uavctl.errors import DesignError
 from uavctl.records import SolveStatus
-from uavctl.smpc.hahn_stursberg.exact import ConicSolver
-from uavctl.smpc.hahn_stursberg.library import LibrarySolver
+from uavctl.smpc.hahn_stursberg.frozen import ShortcutSolver
 from uavctl.smpc.hahn_stursberg.printed import PrintedSolver
 
 
@@ -45,38 +43,13 @@ def test_the_paper_s_cost_comes_out_of_the_composition() -> None:
     config = load_config("paper")
     design = build_design(config)
     state = np.array([35.0, -2.0, -20.0, -4.0])
-    exact = build_solver(design, load_config("paper", ["solver.method=exact"]))
-    assert isinstance(exact, ConicSolver)
-    answer = exact.solve(3, state, design.target)
+    flown = build_solver(design, config)
+    assert isinstance(flown, ShortcutSolver)
+    answer = flown.solve(3, state, design.target)
     assert (answer.seq, answer.status) == (3, SolveStatus.OPTIMAL)
     assert answer.cost == pytest.approx(61669.93, abs=0.01)
     printed = load_config("paper", ["solver.method=printed"])
     assert isinstance(build_solver(design, printed), PrintedSolver)
-    library = build_solver(design, config)
-    assert isinstance(library, LibrarySolver)
-    certified = library.solve(3, state, design.target)
-    assert certified.cost_lower - 0.01 <= answer.cost <= certified.cost + 0.01
-    assert certified.gap <= 1e-3
-
-
-def test_the_library_asks_the_exact_program_only_where_it_may() -> None:
-    config = load_config("paper")
-    design = build_design(config)
-    beyond = np.array([49.0, -2.0, -20.0, -14.0])  # slack needed: no policy of a library is certified there
-    stored = library_for(design).library
-    methods = {
-        exact: build_solver(design, load_config("paper", [f"solver.exact={exact}"]), stored)
-        .solve(0, beyond, design.target)
-        .method
-        for exact in ("true", "false")
-    }
-    assert methods == {"true": "exact", "false": "mixture"}
-
-
-def test_a_library_of_another_design_is_refused() -> None:
-    config = load_config("paper", ["smpc.delta_x=0.94"])
-    with pytest.raises(DesignError, match="uavctl design"):
-        build_solver(build_design(config), config, library_for(build_design(load_config("paper"))).library)
 
 
 def test_a_controller_holds_the_configuration_s_numbers() -> None:

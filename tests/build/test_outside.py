@@ -113,7 +113,6 @@ def test_it_takes_the_place_of_either_scheme_and_keeps_its_design(module: str, n
     assert answer.status is SolveStatus.OPTIMAL and answer.method == f"{module}:{name}"
     np.testing.assert_allclose(answer.states, np.tile(target, (design.horizon + 1, 1)), atol=1e-12)
     assert controller.late_steps == design.horizon and controller.design_id == design.design_id
-    assert not config.uses_library
 
 
 def test_its_identity_changes_with_its_code_and_with_nothing_else(

@@ -21,7 +21,7 @@ class Flight:
     """A flight in virtual time with somebody who watches."""
 
     def __init__(self, name: str = "room-hahn-stursberg", *overrides: str) -> None:
-        config = load_config(name, ['solver.method="exact"', *overrides])  # no library has to be made
+        config = load_config(name, overrides)
         self.loop = shared_loop(config, Memory())
         self.peers = Peers(config, 0)
         self.lines: list[str] = []

@@ -5,16 +5,6 @@ from __future__ import annotations
 import pytest
 from attack_rig import stalls
 
-from uavctl.build.controller import build_design
-from uavctl.build.library import library_for
-from uavctl.config import load_config
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _library() -> None:
-    """The daemon finds the policy library in the cache."""
-    library_for(build_design(load_config("room-hahn-stursberg")))
-
 
 @pytest.mark.slow
 @pytest.mark.fault(49)

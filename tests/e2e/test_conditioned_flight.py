@@ -142,7 +142,7 @@ set = ["link.loss=0.6"]
 def test_a_campaign_flies_it_where_the_printed_design_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "two.toml"
     file.write_text(CAMPAIGN, encoding="utf-8")
-    printed, *others = cells_of(read_campaign(file)[0], lambda config, design: None)
+    printed, *others = cells_of(read_campaign(file)[0])
     assert printed.refused.startswith("smpc.delta_x")
     costs = []
     for cell in others:
@@ -162,7 +162,7 @@ def test_a_campaign_s_links_carry_one_position_a_step(tmp_path: Path) -> None:
     text = CAMPAIGN.partition("[[controller]]")[0].replace("paper", "room")
     asked = f'{text}set = {given}\n[[controller]]\nname = "ours"\nkind = "smpc"\n'.replace("'", '"')
     file.write_text(asked, encoding="utf-8")
-    (cell,) = cells_of(read_campaign(file)[0], lambda config, design: None)
+    (cell,) = cells_of(read_campaign(file)[0])
     assert cell.recipe is not None
     # Where positions take longer than a step, none comes in its own, and each is lost with 30 %.
     ages = met(cell.setting, 0, 400).newest[:, 12:]

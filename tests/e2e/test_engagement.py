@@ -47,7 +47,7 @@ def test_what_cannot_be_is_refused_before_anything_is_made_or_sent(
     words: list[str],
     told: str,
 ) -> None:
-    monkeypatch.delattr("uavctl.build.library.library_for")
+    monkeypatch.delattr("uavctl.build.controller.build_solver")
     code, out, err = typed(capsys, command, *words, "--out", str(tmp_path / "flight"))
     assert code == 2 and told in err and not out
     assert not list(tmp_path.rglob("*.mcap"))

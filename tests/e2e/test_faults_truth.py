@@ -9,8 +9,7 @@ from msgspec.structs import replace
 from soak_pairs import OUTSIDE_M, SPEED_MPS, WORLDS, TrueFlight, fly_pair, fly_true
 from soak_rig import prepared_for
 
-from uavctl.build.controller import Prepared, design_of
-from uavctl.cli.prepare import prepare
+from uavctl.build.controller import Prepared, design_of, prepare
 from uavctl.config import Config, load_config
 from uavctl.config.sim import FaultConfig
 

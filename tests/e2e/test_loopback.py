@@ -19,11 +19,8 @@ import uavctl
 from logs.recording.flight import FlightData
 from logs.recording.reader import RecordedMessage, read, records, walk
 from logs.recording.summary import summarise
-from uavctl.build.controller import build_design
-from uavctl.build.library import library_for
 from uavctl.cli.app import run
 from uavctl.cli.flying import draw_page
-from uavctl.config import load_config
 from uavctl.errors import UavctlError
 from uavctl.records import Header
 
@@ -60,7 +57,6 @@ def test_loopback_sums_up_in_the_documented_keys(tmp_path: Path, capsys: pytest.
 
 @pytest.mark.slow
 def test_over_udp_the_same_peers_fly_in_real_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    library_for(build_design(load_config("room-hahn-stursberg")))
     found = fly_over_udp(tmp_path / "f", lambda truths: len(truths) >= 19, "--config", "room-hahn-stursberg")
     assert found["steps"] >= 15
     # Not its states: where the machine stood still, the vehicle flew on as it was told last.
@@ -86,8 +82,7 @@ def test_replay_is_identical_and_info_counts(flown: Path, capsys: pytest.Capture
 
 @pytest.mark.usefixtures("no_page")
 def test_a_replay_with_another_cost_decides_otherwise(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    exact = ("--set", "solver.method=exact")  # another cost would need a policy library of its own
-    document(capsys, "loopback", "--config", "paper", *exact, "--duration", "4", "--out", str(tmp_path / "f"))
+    document(capsys, "loopback", "--config", "paper", "--duration", "4", "--out", str(tmp_path / "f"))
     flight = str(tmp_path / "f" / "flight.mcap")
     assert document(capsys, "log", "replay", flight)["identical"]
     found = document(capsys, "log", "replay", flight, "--set", "cost.input=[1.0, 1.0]", code=1)

@@ -14,9 +14,8 @@ from soak_pairs import SPEED_MPS, WORLDS, beyond_m
 from soak_rig import Watch, fly
 
 from sim.simulation import World
-from uavctl.build.controller import Prepared, design_of
+from uavctl.build.controller import Prepared, design_of, prepare
 from uavctl.cli.app import run
-from uavctl.cli.prepare import prepare
 from uavctl.config import Config, load_config
 from uavctl.outcome import Cause
 from uavctl.records import ControlMode, Ending

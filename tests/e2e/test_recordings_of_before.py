@@ -1,4 +1,8 @@
-"""Recordings made by version 0.1 before modules were moved: what flies now decides as it did, bit for bit."""
+"""Recordings made by versions before: what flies now decides as it did, bit for bit.
+
+Those of scheme `age-conditioned` are of version 0.1. Those of scheme `hahn-stursberg` are later: before, it flew with a
+policy library.
+"""
 
 from __future__ import annotations
 

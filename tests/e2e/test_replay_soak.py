@@ -25,7 +25,6 @@ def test_flights_with_everything_amiss_replay_bit_for_bit(tmp_path: Path) -> Non
         "preset paper",
         "preset room-hahn-stursberg",
         "simulated quadrotor",
-        "solver library",
         "solver exact",
         "orders",
         "missed ticks",

@@ -185,8 +185,7 @@ def test_a_vehicle_that_starts_anew_is_not_flown_on() -> None:
 def test_an_ardupilot_without_gps_is_told_a_place_on_the_globe_and_one_with_gps_is_not() -> None:
     with_gps = Flight("ardupilot").take_off().run(4.0)
     assert not with_gps.sent("SET_GPS_GLOBAL_ORIGIN")
-    # The one flight of its design: no library is made for it.
-    relayed = ["relay.enabled=true", "sim.camera.rate_hz=20.0", "link.loss=0.0", "solver.method=exact"]
+    relayed = ["relay.enabled=true", "sim.camera.rate_hz=20.0", "link.loss=0.0"]
     flight = Flight("ardupilot", *relayed)
     for name, value in ARDUPILOT_EXTERNAL.items():
         flight.peers.autopilot.parameters.set(name, value)

@@ -19,17 +19,8 @@ from sim_rig import decode
 
 from logs.recording.reader import records
 from sim.cameras import UPTIME_S
-from uavctl.build.controller import build_design
-from uavctl.build.library import library_for
 from uavctl.cli.app import run
-from uavctl.config import load_config
 from uavctl.records import ControlMode, Decision, StepInput
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _library() -> None:
-    """The daemon finds the policy library in the cache."""
-    library_for(build_design(load_config("room-hahn-stursberg")))
 
 
 @contextmanager

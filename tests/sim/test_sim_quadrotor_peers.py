@@ -28,7 +28,6 @@ GUSTS = ["sim.wind.velocity_mps=[0.4, 0.5, 0.0]", "sim.wind.gust_wind_mps=3.0"]
 HIGH = [
     "sets.state_lower=[-3.0, -1.5, -inf, -2.5, -1.5, -inf, -100.0, -1.0, -inf]",
     "sim.start_position_m=[-2.4, -1.9, -50.0]", "target.position_m=[1.5, 1.0, -50.5]",
-    "solver.method=exact",  # no library to grow
 ]  # fmt: skip
 
 

@@ -4,33 +4,35 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from library_rig import case, near, small, uniform
 from numpy.typing import NDArray
+from question_rig import case, near, small, uniform
 
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import NOMINAL, Answer, Preview
 from uavctl.smpc.batch import BatchSmpc, News, OneByOne
-from uavctl.smpc.hahn_stursberg.frozen import FROZEN
-from uavctl.smpc.hahn_stursberg.library import LibrarySolver, make_library
+from uavctl.smpc.hahn_stursberg.frozen import FROZEN, ShortcutDecider, ShortcutSolver
 
 Array = NDArray[np.float64]
 
 
-def decider() -> OneByOne:
+def decider() -> ShortcutDecider:
     one = case("paper")
-    return OneByOne(one.solver, one.design.target, (one.design.horizon, one.design.plant.n_u))
+    return ShortcutDecider(one.solver, one.design.target)
 
 
 def test_answers_are_those_that_fly_bit_for_bit() -> None:
+    """Frozen answers, exact ones, and those where one axis needs the exact program."""
     one, rng = case("paper"), np.random.default_rng(11)
     x = np.array([uniform(one.design, rng) if i % 2 else near(one.design, rng) for i in range(40)])
-    found = decider().decide(x, 0)
+    found, methods = decider().decide(x, 0), []
     for i, state in enumerate(x):
         answer = one.solver.solve(0, state, one.design.target)
         assert found.solved[i] == (answer.status is SolveStatus.OPTIMAL)
         np.testing.assert_array_equal(found.inputs[i], answer.inputs)
         numbers = found.slack[i], found.cost[i], found.gap[i]
         assert numbers == (answer.slack, answer.cost, answer.gap)
+        methods.append(answer.method)
+    assert min(methods.count("frozen"), methods.count("exact")) > 5
 
 
 class Counting:
@@ -71,8 +73,8 @@ def test_the_order_and_the_company_of_states_change_nothing() -> None:
 @pytest.mark.slow
 def test_late_positions_are_answered_by_the_late_design() -> None:
     design = small(late=1)
-    solver = LibrarySolver(design, make_library(design, most=12))
-    one, rng = OneByOne(solver, design.target, (design.horizon, design.plant.n_u)), np.random.default_rng(19)
+    solver = ShortcutSolver(design)
+    one, rng = ShortcutDecider(solver, design.target), np.random.default_rng(19)
     x = np.array([uniform(design, rng) for _ in range(10)])
     for late in (0, 1):
         found = one.decide(x, late)

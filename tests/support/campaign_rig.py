@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from uavctl.cli.prepare import ready_library
 from uavctl.lab.campaign.spec import Campaign, read_campaign
 from uavctl.lab.campaign.tasks import Cell, cells_of
 
@@ -26,4 +25,4 @@ def read(folder: Path, *parts: str) -> Campaign:
 
 
 def cells(folder: Path, *parts: str) -> tuple[Cell, ...]:
-    return cells_of(read(folder, *parts), ready_library)
+    return cells_of(read(folder, *parts))

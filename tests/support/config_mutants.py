@@ -1,8 +1,8 @@
 """Valid configurations and command lines, spoilt: the same for a seed and a number.
 
-A case is files and the words of a command line. Every base is valid as it stands, and quick: the exact solver in place
-of a policy library, short flights, no waiting. What is spoilt is drawn from the kinds of mistakes that files and
-command lines have: types, magnitudes, lengths, nesting, syntax, names, what a path leads to.
+A case is files and the words of a command line. Every base is valid as it stands, and quick: short flights, no waiting.
+What is spoilt is drawn from the kinds of mistakes that files and command lines have: types, magnitudes, lengths,
+nesting, syntax, names, what a path leads to.
 """
 
 from __future__ import annotations

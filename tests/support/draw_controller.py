@@ -7,14 +7,13 @@ from functools import lru_cache
 
 import numpy as np
 
-from uavctl.build.controller import Prepared, design_of
-from uavctl.cli.prepare import prepare
+from uavctl.build.controller import Prepared, design_of, prepare
 from uavctl.config import Config, load_config
 from uavctl.errors import ConfigError, DesignError
 
 TRIES = 30  # draws of a design until there is one
-# Designs that have a policy library: it takes seconds to make one, so these are few, and kept in the cache.
-WITH_LIBRARY = (
+# Presets as they are, and one with bursts: a third of the draws.
+PRESETS = (
     ("room-hahn-stursberg",),
     (
         "room-hahn-stursberg",
@@ -24,7 +23,6 @@ WITH_LIBRARY = (
         "link.burst_leave=0.5",
         "link.burst_loss=0.8",
     ),
-    ("room-hahn-stursberg", "solver.exact=false", "link.loss=0.2"),
     ("paper",),
 )
 
@@ -32,7 +30,8 @@ WITH_LIBRARY = (
 def draw_controller(rng: np.random.Generator, seed: int) -> Config:
     """A controller for which there is a design."""
     if seed % 3 == 0:
-        return with_library(int(rng.integers(len(WITH_LIBRARY)))).config
+        name, *overrides = PRESETS[int(rng.integers(len(PRESETS)))]
+        return load_config(name, overrides)
     for _ in range(TRIES):
         try:
             config = load_config(*_controller(rng))
@@ -101,20 +100,6 @@ def _believed_link(rng: np.random.Generator) -> dict[str, object]:
         more["link.trace_s"] = [float(delay) for delay in delays]
         more["link.delay_s"] = 0.03
     return more
-
-
-@lru_cache(maxsize=len(WITH_LIBRARY))
-def with_library(number: int) -> Prepared:
-    """One of those that fly with a policy library."""
-    name, *overrides = WITH_LIBRARY[number]
-    config = load_config(name, overrides)
-    return prepare(config, design_of(config))
-
-
-def with_libraries() -> None:
-    """Make the policy libraries that the flights ask for, where they are not in the cache yet."""
-    for number in range(len(WITH_LIBRARY)):
-        with_library(number)
 
 
 @lru_cache(maxsize=2)

@@ -16,7 +16,6 @@ from uavctl.flight.controller import Controller
 from uavctl.loop import ControlLoop
 from uavctl.records import Header, Record, Sink
 from uavctl.smpc.conditioned.planner import AnyDesign
-from uavctl.smpc.hahn_stursberg.library import Library
 
 R = TypeVar("R", bound=Record)
 
@@ -34,24 +33,22 @@ class Memory:
         return [record for _, _, record in self.entries if isinstance(record, kind)]
 
 
-def make_loop(
-    config: Config, sink: Sink, design: AnyDesign | None = None, library: Library | None = None
-) -> ControlLoop:
-    return ControlLoop(config, build_controller(config, design, library), sink, lambda: 0)
+def make_loop(config: Config, sink: Sink, design: AnyDesign | None = None) -> ControlLoop:
+    return ControlLoop(config, build_controller(config, design), sink, lambda: 0)
 
 
-def shared(config: Config, library: Library | None = None) -> tuple[AnyDesign, Controller]:
+def shared(config: Config) -> tuple[AnyDesign, Controller]:
     """Design and controller, made once for flights that differ in length and simulator alone.
 
     A flight leaves nothing in its controller; a replay, which makes one of its own, would find out.
     """
-    return _made(msgspec.structs.replace(config, sim=load_config("paper").sim, duration_s=1.0), library)
+    return _made(msgspec.structs.replace(config, sim=load_config("paper").sim, duration_s=1.0))
 
 
 @lru_cache(maxsize=8)
-def _made(config: Config, library: Library | None) -> tuple[AnyDesign, Controller]:
+def _made(config: Config) -> tuple[AnyDesign, Controller]:
     design = design_of(config)
-    return design, build_controller(config, design, library)
+    return design, build_controller(config, design)
 
 
 def shared_loop(config: Config, sink: Sink) -> ControlLoop:
@@ -59,10 +56,10 @@ def shared_loop(config: Config, sink: Sink) -> ControlLoop:
     return ControlLoop(config, shared(config)[1], sink, lambda: 0)
 
 
-def lockstep(name: str, duration_s: float, *overrides: str, library: Library | None = None) -> Memory:
+def lockstep(name: str, duration_s: float, *overrides: str) -> Memory:
     """Fly a preset in virtual time."""
     config = load_config(name, [f"duration_s={duration_s}", *overrides])
-    design, controller = shared(config, library)
+    design, controller = shared(config)
     memory = Memory()
     memory.put("/uavctl/header", 0, header(config, design))
     loop = ControlLoop(config, controller, memory, lambda: 0)

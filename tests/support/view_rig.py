@@ -20,7 +20,7 @@ SECONDS = 6.0
 
 @cache
 def flown() -> Memory:
-    """Six seconds in the room, with times as a shell measures them; the exact solver needs no policy library."""
+    """Six seconds in the room, with times as a shell measures them."""
     memory = lockstep("room-hahn-stursberg", SECONDS, "solver.method=exact")
     for one in memory.of(Decision):
         timing = Timing(tick=one.tick, at_ns=one.at_ns, lateness_ns=1500, step_ns=250_000, send_ns=400_000)

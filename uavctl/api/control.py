@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sim.faults import check_faults
-from uavctl.build.controller import build_plant, build_problem, build_solver, design_of, ready_library
+from uavctl.build.controller import build_plant, build_problem, build_solver, design_of
 from uavctl.build.link import build_ages
 from uavctl.config import Config, dump_config, parse
 from uavctl.config import load as load_file
@@ -165,8 +165,7 @@ def solve(config: Source, state: ArrayLike, target: ArrayLike | None = None) -> 
 @lru_cache(maxsize=8)
 def _solver(config: Config) -> tuple[AnyDesign, Solver]:
     design = design_of(config)
-    stored = ready_library(config, design)
-    return design, build_solver(design, config, None if stored is None else stored.library)
+    return design, build_solver(design, config)
 
 
 def state_of(given: ArrayLike, n_x: int) -> Array:
@@ -281,7 +280,7 @@ def cell_of(config: Config, kind: str, **spec: object) -> tuple[Recipe, Setting]
     base = msgspec.structs.replace(config, mission=MissionConfig(), fence=())  # runs go to the target alone
     made = compose(campaign, dump_config(base))
     believed = made.believed_link(0, 0)
-    recipe = recipe_for(made.tuned(0, believed), made.believed[0, believed], campaign, ready_library)
+    recipe = recipe_for(made.tuned(0, believed), made.believed[0, believed], campaign)
     setting = Setting(campaign, made.base, made.flown_plant[0].plant, made.flown_link[0].link, campaign.disturbance[0])
     return recipe, setting
 

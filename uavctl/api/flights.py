@@ -19,7 +19,7 @@ from logs.recording.reader import header, lacks_end, records
 from logs.recording.reader import read as read_records
 from logs.recording.summary import FlightSummary, summarise
 from uavctl.api.control import Array, Plan, Runs, Signal, Source, limits_of, load, loaded, signals
-from uavctl.build.controller import build_problem, design_of, prepare, ready_library
+from uavctl.build.controller import build_problem, design_of, prepare
 from uavctl.config import Config
 from uavctl.config.load import parse_recorded
 from uavctl.daemon.engagement import Engagement, check_places, goto_keys, stop_limit_s
@@ -198,7 +198,7 @@ def fly(
     design = design_of(found)
     engagement = Engagement(found, take_off_m=take_off_m, goto=goto is not None)
     check_places(found, design, take_off_m, engagement.goal)
-    prepared = prepare(found, design, ready_library(found, design))
+    prepared = prepare(found, design)
     with new_recording(None if out is None else Path(out), found.name, found.log.free_bytes) as path:
         flight = LockstepFlight(prepared, path, command="uavctl.fly")
         engagement.begin(flight.loop)

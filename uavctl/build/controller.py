@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import platform
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
@@ -45,9 +44,7 @@ from uavctl.smpc.sets import Polytope
 
 # The paper's scheme is loaded only where it is flown: loading it takes a tenth of the time of all else.
 if TYPE_CHECKING:
-    from uavctl.build.library import Advance, StoredLibrary
     from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec
-    from uavctl.smpc.hahn_stursberg.library import Library
 
 NANOSECONDS = 1e9
 
@@ -262,37 +259,28 @@ def build_design(config: Config) -> Design:
     return with_late(design, spec, late_steps(config))
 
 
-def build_solver(design: AnyDesign, config: Config, library: Library | None = None) -> Solver:
+def build_solver(design: AnyDesign, config: Config) -> Solver:
     """The solver of a design: `smpc.controller`, that of scheme `age-conditioned`, or the one of `solver.method`.
 
     Args:
         config: The configuration that it is made from.
-        library: Its policy library, for method `library`; from the cache, or made, if it is not given.
 
     Raises:
-        DesignError: The design does not fit the solver, or the library does not fit the design.
+        DesignError: The design does not fit the solver.
     """
     if config.smpc.controller:
         return flown_outside(config, build_problem(config))
     if isinstance(design, ConditionedDesign):
         return design.solver
-    if config.solver.method == "library":
-        from uavctl.build.library import library_for
-        from uavctl.smpc.hahn_stursberg.library import LibrarySolver
-
-        found = library_for(design).library if library is None else library
-        solver = LibrarySolver(design, found, exact=config.solver.exact)
-        solver.prepare()
-        return solver
     if config.solver.method == "exact":
-        from uavctl.smpc.hahn_stursberg.exact import ConicSolver
+        from uavctl.smpc.hahn_stursberg.frozen import ShortcutSolver
 
-        return ConicSolver(design)
+        return ShortcutSolver(design)
     if design.late or design.estimate_cov.any():
         raise DesignError(
             "solver.method",
             "the printed problem knows neither late positions nor an estimate with an error",
-            "take `library` or `exact`; or risk.estimate = `exact`, schedule.late = 0 and delays below the step",
+            "take `exact`; or risk.estimate = `exact`, schedule.late = 0 and delays below the step",
         )
     from uavctl.smpc.hahn_stursberg.printed import (
         PrintedSolver,  # CVXPY takes long to load, and nothing else here needs it
@@ -384,8 +372,8 @@ def _vec3(values: list[float]) -> Vec3:
     return north, east, down
 
 
-def build_controller(config: Config, design: AnyDesign | None = None, library: Library | None = None) -> Controller:
-    """Everything constant that a control tick needs; design and policy library are made if they are not given.
+def build_controller(config: Config, design: AnyDesign | None = None) -> Controller:
+    """Everything constant that a control tick needs; the design is made if it is not given.
 
     Raises:
         DesignError: There is no design.
@@ -398,7 +386,7 @@ def build_controller(config: Config, design: AnyDesign | None = None, library: L
         plant=plant,  # the design's own may be the one that the estimator makes of it
         design_id=design.design_id,
         horizon=design.horizon,
-        solver=build_solver(design, config, library),
+        solver=build_solver(design, config),
         mission=build_mission(config, design, resting(design)),
         names=build_names(design),
         link=LinkEstimateParameters(promised=_promised(config)),
@@ -434,33 +422,16 @@ class Prepared:
 
     config: Config  # the configuration
     design: AnyDesign  # its design
-    library: StoredLibrary | None  # the design's policy library; None where scheme or `solver.method` ask for none
     controller: Controller  # the controller
 
 
-def prepare(config: Config, design: AnyDesign, library: StoredLibrary | None) -> Prepared:
-    """Make the controller of a design and its policy library.
+def prepare(config: Config, design: AnyDesign) -> Prepared:
+    """Make the controller of a design.
 
     Raises:
         DesignError: The configuration asks for what the design cannot do.
     """
-    controller = build_controller(config, design, None if library is None else library.library)
-    return Prepared(config, design, library, controller)
-
-
-def ready_library(
-    config: Config, design: AnyDesign, advance: Advance | None = None, tell: Callable[[str], None] | None = None
-) -> StoredLibrary | None:
-    """Return the policy library of a design that asks for one: from the cache, or made, which takes half a minute.
-
-    Args:
-        advance: See `uavctl.build.library.library_for`, as `tell`.
-    """
-    if isinstance(design, ConditionedDesign) or not config.uses_library:
-        return None
-    from uavctl.build.library import library_for
-
-    return library_for(design, advance, tell)
+    return Prepared(config, design, build_controller(config, design))
 
 
 # What decides a flight's last bits beside its configuration: code, libraries, arithmetic.

@@ -11,7 +11,7 @@ import inspect
 import sys
 from collections.abc import Callable, Collection
 from functools import cache
-from importlib import import_module, metadata, resources
+from importlib import import_module, resources
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TypeVar, cast
@@ -26,15 +26,6 @@ from uavctl.smpc.batch import BatchController
 from uavctl.smpc.nominal import ControlProblem
 from uavctl.smpc.outside import FlightPlanner, OutsideSolver, Rehearsal, moved
 from uavctl.smpc.plant import digest
-
-COMPUTES_WITH = ("numpy", "scipy", "clarabel", "daqp")
-
-
-@cache
-def maker_id() -> str:
-    """Hash of the code that makes libraries, and of the versions of what it computes with."""
-    versions = tuple((name, metadata.version(name)) for name in COMPUTES_WITH)
-    return digest((sources_of("uavctl.smpc"), versions))
 
 
 @cache

@@ -20,7 +20,6 @@ from rich.progress import MofNCompleteColumn, TextColumn, TimeElapsedColumn, Tim
 from uavctl.cli import INTERRUPTED
 from uavctl.cli.common import Common, bars, columns, messages
 from uavctl.cli.flying import stop_on_signals
-from uavctl.cli.prepare import ready_library
 from uavctl.errors import UsageError
 from uavctl.lab.campaign.page import write_report, write_trial_report
 from uavctl.lab.campaign.pool import Columns, Work, Workers, cluster, fly_tasks, processes
@@ -159,7 +158,7 @@ def _of_runs(spec: Path, runs: int | None) -> _Given[CellSummary]:
     read, text = read_campaign(spec, runs)
 
     def prepare() -> tuple[Mapping[str, object], Sequence[Work]]:
-        cells = cells_of(read, ready_library)
+        cells = cells_of(read)
         return document(read, cells), list(tasks_of(cells))
 
     return _Given(read.spec.name, text, SCHEMA, prepare, write_report, summarise, _picture)
@@ -170,7 +169,7 @@ def _of_trials(path: Path, runs: int | None) -> _Given[TrialSummary]:
     spec, text = read_trial(path, runs)
 
     def prepare() -> tuple[Mapping[str, object], Sequence[Work]]:
-        places = places_of(spec, ready_library)
+        places = places_of(spec)
         return trial_document(spec, places), list(trial_tasks(spec, places))
 
     return _Given(
@@ -210,7 +209,7 @@ def _progress(tasks: Sequence[Work], kept: set[str]) -> Iterator[Callable[[Work]
 def _interrupted(store: Store, spec: Path, runs: int | None) -> str:
     """Say after an interruption what is done, and how to go on."""
     if not store.begun():
-        return "interrupted before the first run; policy libraries that were finished are kept"
+        return "interrupted before the first run"
     number = () if runs is None else ("--runs", str(runs))
     again = shlex.join(["uavctl", "campaign", str(spec), *number, "--out", str(store.folder), "--resume"])
     return f"interrupted; the runs that were finished are kept. To go on:\n{again}"

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
-from cyclopts import Parameter, validators
+from cyclopts import Parameter
 from numpy.typing import NDArray
 from rich.console import Group, RenderableType
 from rich.text import Text
@@ -24,14 +23,12 @@ from uavctl.build.controller import (
     design_of,
     start_state,
 )
-from uavctl.build.library import StoredLibrary
 from uavctl.build.mission import build_names
 from uavctl.build.rehearsal import RehearsalResult, rehearse
-from uavctl.cli.common import DEFAULTS, Column, Common, WideTable, bars, columns, located
-from uavctl.cli.prepare import ready_library
+from uavctl.cli.common import DEFAULTS, Column, Common, WideTable, columns, located, messages
 from uavctl.config import Config
 from uavctl.errors import UsageError
-from uavctl.lab.compare_designs import Costs, GainComparison, GainReport, compare_gains
+from uavctl.lab.terminal_gain import GainComparison, GainReport, compare_gains
 from uavctl.records import SolveStatus, tell_all
 from uavctl.smpc.answer import Answer
 from uavctl.smpc.conditioned.planner import AnyDesign, ConditionedDesign, conditioned_record
@@ -41,31 +38,16 @@ from uavctl.smpc.hahn_stursberg.terminal import stationary_cost
 # `uavctl design --synthesize`: the configured terminal gain beside the best one.
 
 
-SEED = 0
-
-
-def gains_report(common: Common, states: int) -> int:
+def gains_report(common: Common) -> int:
     """Synthesise the terminal gain and compare; return 1 if no complete design can be made with it."""
     loaded = common.load()
     begin = time.perf_counter()
-    with located(loaded):
+    with located(loaded), messages().status("synthesis and designs"):
         spec = build_spec(loaded.config)
-        with _progress(2 + 4 * states) as advance:
-            found = compare_gains(spec, start_state(loaded.config, spec.plant), states, SEED, advance)
+        found = compare_gains(spec, start_state(loaded.config, spec.plant))
     document = {**msgspec.to_builtins(found), "k_tau": found.after.k_tau, "wall_s": time.perf_counter() - begin}
     common.show("design/gains", document, lambda: _gains_picture(found, loaded.config.name))
     return 0 if found.after.refused is None else 1
-
-
-@contextmanager
-def _progress(steps: int) -> Iterator[Callable[[str], None]]:
-    with bars() as progress:
-        task = progress.add_task("designs", total=steps)
-
-        def advance(what: str) -> None:
-            progress.update(task, advance=1, description=what)
-
-        yield advance
 
 
 def _gains_picture(found: GainComparison, name: str) -> RenderableType:
@@ -76,28 +58,23 @@ def _gains_picture(found: GainComparison, name: str) -> RenderableType:
         for which, report in (("configured", found.before), ("synthesised", found.after))
         if report.refused is not None
     ]
-    return Group(table, *refusals, _basis(found), "To take the synthesised gain over:", "", Text(found.toml))
+    return Group(table, *refusals, _BASIS, "To take the synthesised gain over:", "", Text(found.toml))
 
 
-def _basis(found: GainComparison) -> str:
-    return (
-        "Infeasible: the target is not reached within the horizon with all constraints kept; a flight goes there by "
-        "way of nearer equilibria, or gives way where the limits are soft.\n"
-        f"Means over {found.compared} states on the way to the target, feasible for every design; shares of "
-        f"{found.states} states uniform in the box of the limits."
-    )
+_BASIS = (
+    "Infeasible: the target is not reached within the horizon with all constraints kept; a flight goes there by "
+    "way of nearer equilibria, or gives way where the limits are soft."
+)
 
 
 def _figure(value: float | None) -> str:
     return "-" if value is None else f"{value:.4g}"
 
 
-def _cost(value: float | None) -> str:
-    return "infeasible" if value is None else f"{value:.2f}"
-
-
-def _cost_row(pick: Callable[[Costs], str]) -> Callable[[GainReport], str]:
-    return lambda report: "-" if report.costs is None else pick(report.costs)
+def _start_cost(report: GainReport) -> str:
+    if report.refused is not None:
+        return "-"
+    return "infeasible" if report.start_cost is None else f"{report.start_cost:.2f}"
 
 
 _GAIN_ROWS: tuple[tuple[str, Callable[[GainReport], str]], ...] = (
@@ -106,9 +83,7 @@ _GAIN_ROWS: tuple[tuple[str, Callable[[GainReport], str]], ...] = (
     ("state room taken (4.3: at most 1)", lambda report: _figure(report.filled_x)),
     ("input room taken (4.4: at most 1)", lambda report: _figure(report.filled_u)),
     ("margin s* of the terminal condition", lambda report: _figure(report.margin)),
-    ("optimal cost from the simulator's start", _cost_row(lambda costs: _cost(costs.start))),
-    ("mean optimal cost", _cost_row(lambda costs: _cost(costs.mean))),
-    ("share of the box feasible", _cost_row(lambda costs: f"{costs.feasible:.1%}")),
+    ("optimal cost from the simulator's start", _start_cost),
 )
 
 
@@ -124,15 +99,11 @@ def design(
         bool,
         Parameter(negative=(), show_default=False, help="find the terminal gain of least stationary cost, and compare"),
     ] = False,
-    states: Annotated[
-        int,
-        Parameter(help="with --synthesize: seeded states to compare", validator=validators.Number(gte=1, lte=10_000)),
-    ] = 60,
     common: Common = DEFAULTS,
 ) -> int:
-    """Make a design and its policy library: schedule, terminal ingredients, Assumption 4 with figures."""
+    """Make a design: schedule, terminal ingredients, Assumption 4 with figures."""
     if synthesize:
-        return gains_report(common, states)
+        return gains_report(common)
     loaded = common.load()
     start = time.perf_counter()
     if loaded.config.conditioned:
@@ -148,9 +119,8 @@ def design(
         return 1 if found is not None and (found.relaxes or found.strays) else 0
     with located(loaded):
         made = build_design(loaded.config)
-        stored = ready_library(loaded.config, made)
-    document = design_document(made, stored, time.perf_counter() - start)
-    common.show("design", document, lambda: design_picture(made, stored, loaded.config.name))
+    document = design_document(made, time.perf_counter() - start)
+    common.show("design", document, lambda: design_picture(made, loaded.config.name))
     return 0
 
 
@@ -193,32 +163,13 @@ def conditioned_picture(made: ConditionedDesign, name: str, found: RehearsalResu
     return Group(ages, columns("Where a plan may rest", headings, rows, ("limit", "unit")), *doubts)
 
 
-def design_document(made: Design, stored: StoredLibrary | None, wall_s: float) -> dict[str, object]:
-    """Return the figures of a design and its policy library, for --json; without a library these are 0 and null."""
-    return {
-        **design_record(made),
-        "library_size": 0 if stored is None else sum(stored.sizes),
-        "gap_max": None if stored is None else stored.check.worst_gap,
-        "library": None if stored is None else library_document(stored),
-        "wall_s": wall_s,
-    }
+def design_document(made: Design, wall_s: float) -> dict[str, object]:
+    """Return the figures of a design, for --json."""
+    return {**design_record(made), "wall_s": wall_s}
 
 
-def library_document(stored: StoredLibrary) -> dict[str, object]:
-    """Return the figures of a policy library, for --json."""
-    return {
-        "library_id": stored.library_id,
-        "bytes": len(stored.data),
-        "file": None if stored.path is None else str(stored.path),
-        "cached": stored.cached,
-        "made_s": stored.made_s,
-        "components": [{"name": name, "policies": size} for name, size in zip(stored.names, stored.sizes, strict=True)],
-        "check": msgspec.to_builtins(stored.check),
-    }
-
-
-def design_picture(made: Design, stored: StoredLibrary | None, name: str) -> RenderableType:
-    """Return Assumption 4, the schedule and the policy library as tables."""
+def design_picture(made: Design, name: str) -> RenderableType:
+    """Return Assumption 4 and the schedule as tables."""
     headings = ("item", "holds", "value", "limit", "of what")
     checked = (
         (
@@ -241,26 +192,7 @@ def design_picture(made: Design, stored: StoredLibrary | None, name: str) -> Ren
         f"τ = {made.terminal.tau}, spectral radius of the terminal loop {made.terminal.spectral_radius:.4f}, "
         f"its stationary cost {stationary_cost(made.terminal):.4f} a step.\n"
     )
-    return Group(
-        checks,
-        terminal,
-        "Schedule: stage t counts on information that is d_t steps old.",
-        schedule,
-        *_library_picture(stored),
-    )
-
-
-def _library_picture(stored: StoredLibrary | None) -> list[RenderableType]:
-    if stored is None:
-        return []
-    sizes = zip(stored.names, map(str, stored.sizes), strict=True)
-    table = columns(f"Policy library {stored.library_id}", ("", "policies"), sizes)
-    check = stored.check
-    shares = ", ".join(f"{count / check.states:.0%} {name}" for name, count in check.methods.items())
-    answers = f"Answers from {check.states} states, most of them anywhere in the limits: {shares}; worst gap "
-    where = "kept nowhere" if stored.path is None else f"{'from' if stored.cached else 'kept in'} {stored.path}"
-    facts = f"{len(stored.data):,} bytes, made in {stored.made_s:.1f} s, {where}."
-    return [table, Text(f"{answers}{check.worst_gap:.1e}."), Text(facts)]
+    return Group(checks, terminal, "Schedule: stage t counts on information that is d_t steps old.", schedule)
 
 
 def solve(
@@ -269,7 +201,7 @@ def solve(
         str, Parameter(allow_leading_hyphen=True, help="state now, axis by axis, as in 35,-2,-20,-4", metavar="X,V,...")
     ],
     method: Annotated[
-        Literal["library", "exact", "printed"] | None,
+        Literal["exact", "printed"] | None,
         Parameter(
             help="overrides solver.method; `printed` knows no lower bound: cost_lower and gap are null in --json"
         ),
@@ -281,8 +213,7 @@ def solve(
     with located(loaded):
         design = design_of(loaded.config)
         x = parse_state(state, design.plant.n_x)
-        stored = ready_library(loaded.config, design)
-        solver = build_solver(design, loaded.config, None if stored is None else stored.library)
+        solver = build_solver(design, loaded.config)
     start = time.perf_counter()
     answer = solver.solve(0, x, design.target)
     solve_us = (time.perf_counter() - start) * 1e6
@@ -320,7 +251,7 @@ def solve_picture(answer: Answer, design: AnyDesign, config: Config, solve_us: f
     if not answer.inputs.size:
         hint = "is the state far beyond what numbers can hold? Give one nearer to the limits"
         if config.solver.method == "printed":
-            hint = "the printed problem has hard limits; `library` and `exact` soften those of the state"
+            hint = "the printed problem has hard limits; `exact` softens those of the state"
         return f"{head}; no plan: {hint}"
     bound = "no lower bound known"
     if math.isfinite(answer.gap):

@@ -21,7 +21,7 @@ from logs.recording.parameters import ParameterReader
 from logs.recording.recorder import Recorder, RecorderStatus
 from logs.recording.summary import FlightSummary, render
 from logs.recording.topics import ENDED
-from uavctl.build.controller import design_of
+from uavctl.build.controller import design_of, prepare
 from uavctl.check.findings import Item
 from uavctl.cli.common import DEFAULTS, SPAN_S, Common, Mocap, TakeOff, given_keys, labelled, located, messages
 from uavctl.cli.flying import (
@@ -39,7 +39,6 @@ from uavctl.cli.flying import (
     tell_ending,
     wait_for_server,
 )
-from uavctl.cli.prepare import prepare
 from uavctl.clock import Ticker, monotonic_ns, zero_utc_ns
 from uavctl.config import Config, LoadedConfig
 from uavctl.config.connections import warnings

@@ -21,7 +21,7 @@ from logs.recording.recorder import DerivedTopics, Recorder
 from logs.recording.summary import FlightSummary, render
 from logs.recording.topics import ENDED
 from sim.server import Ready, serve_in_child
-from uavctl.build.controller import Prepared, design_of
+from uavctl.build.controller import Prepared, design_of, prepare
 from uavctl.cli.common import DEFAULTS, SEED, SPAN_S, Common, TakeOff, bars, given_keys, located
 from uavctl.cli.flying import (
     Live,
@@ -36,7 +36,6 @@ from uavctl.cli.flying import (
     stop_on_signals,
     tell_ending,
 )
-from uavctl.cli.prepare import prepare
 from uavctl.cli.sim import make_door
 from uavctl.clock import Ticker, monotonic_ns, zero_utc_ns
 from uavctl.config import Config, LoadedConfig

@@ -18,7 +18,6 @@ from rich.text import Text
 
 from uavctl.build.controller import build_design, build_spec
 from uavctl.cli.common import SEED, WORKERS, Common, QuietJson, bars, columns, located, messages
-from uavctl.cli.prepare import ready_library
 from uavctl.errors import UsageError
 from uavctl.lab.paper.claims import (
     PRESET,
@@ -106,13 +105,10 @@ def _make(out: Path) -> None:
 
 
 def _setup(variant: Variant) -> Setup:
-    """Return design and policy library of a variant, from the cache or made now."""
+    """Return the design of a variant."""
     loaded = Common(config=PRESET, overrides=variant.overrides).load()
     with located(loaded):
-        design = build_design(loaded.config)
-        stored = ready_library(loaded.config, design)
-    assert stored is not None  # the preset's solver is the library
-    return Setup(loaded.config, design, stored.library)
+        return Setup(loaded.config, build_design(loaded.config))
 
 
 @contextmanager
@@ -196,13 +192,12 @@ def _designs(tried: list[DesignTried]) -> Table:
 
 
 def _complexity(sizes: list[Complexity]) -> Table:
-    headings = ("τ", "H", "terminal states", "gains", "as printed", "exact", "library", "refused")
+    headings = ("τ", "H", "terminal states", "gains", "as printed", "exact", "refused")
     table = columns("One decision of one axis over τ, medians", headings, (), ("refused",))
     for one in sizes:
         times = (
             "" if one.printed_ms is None else f"{one.printed_ms:.0f} ms",
             "" if one.exact_ms is None else f"{one.exact_ms:.1f} ms",
-            "" if one.library_us is None else f"{one.library_us:.0f} µs",
         )
         table.add_row(str(one.tau), str(one.horizon), str(one.lifted), str(one.gains), *times, Text(one.refused))
     return table

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -16,84 +15,60 @@ from rich.table import Table
 
 from logs.recording.foreign import foreign_log
 from logs.recording.reader import good_messages, header, lacks_end, last_note, records
-from logs.recording.replay import (
-    LAST_BITS,
-    MAKERS,
-    Chosen,
-    Context,
-    FieldDivergence,
-    ReplayDifference,
-    ReplayResult,
-    recorded_library,
-)
+from logs.recording.replay import LAST_BITS, MAKERS, Chosen, Context, FieldDivergence, ReplayDifference, ReplayResult
 from logs.recording.replay import replay as replay_recording
 from logs.recording.senders import choose_vehicle
 from logs.recording.summary import count
 from logs.recording.tlog import ForeignReplay, TlogPacket, replay_tlog
 from logs.recording.topics import HOLES, RECOVERED, RecorderNote
 from uavctl.arithmetic import ARITHMETIC, OWN, without_choice
-from uavctl.build.controller import ARITHMETIC_NAME, CONTROLLER, Prepared, build_controller, cpu, design_of, versions
-from uavctl.build.library import check_fits, decode
+from uavctl.build.controller import ARITHMETIC_NAME, CONTROLLER, Prepared, cpu, design_of, prepare, versions
 from uavctl.build.outside import KEY
 from uavctl.cli import start_anew
 from uavctl.cli.common import DEFAULTS, Common, Flight, System, columns, counted, located, two_columns, warn
-from uavctl.cli.prepare import prepare
 from uavctl.config import Config, LoadedConfig
 from uavctl.config.load import parse_recorded
-from uavctl.errors import DesignError, LibraryError, RecordingError, UsageError
+from uavctl.errors import DesignError, RecordingError, UsageError
 from uavctl.loop import VEHICLE, ControlLoop, make_links
 from uavctl.records import Header, StepInput
-from uavctl.smpc.hahn_stursberg.design import Design
 
-# The controller of a recording: with the policy library that it carries, whatever the cache holds.
+# The controller of a recording.
+
+_WITH_LIBRARY = "uavctl 0.2.0, commit b5d416b"  # replays what it and version 0.1 have flown with a policy library
 
 
 def recorded_flyer(flight: Path, config: Config) -> Prepared:
     """Return the controller that flew in a recording.
 
     Raises:
-        RecordingError: It carries no policy library though it flew with one, or one that does not fit; or the
-            controller of another package that flew is not here.
+        RecordingError: It flew with a policy library, or the controller of another package that flew is not here.
     """
-    design = design_of(config)
-    if not isinstance(design, Design) or not config.uses_library:
-        try:
-            return prepare(config, design)
-        except DesignError as error:
-            if error.key != KEY:
-                raise
-            flown = header(flight).versions.get(CONTROLLER, config.smpc.controller)
-            raise RecordingError(
-                f"{flight}: was flown by a controller of another package, {flown}, which is not here: "
-                f"{error.reason}; {error.hint}"
-            ) from error
+    recorded = header(flight)
+    if recorded.library_id is not None:
+        raise RecordingError(
+            f"{flight}: was flown with a policy library, which this version does not have; replay it with "
+            f"{_WITH_LIBRARY}, or decide it anew with --set solver.method=exact"
+        )
     try:
-        return _with_library(flight, config, design)
-    except LibraryError as error:
-        made = "; ".join(other_versions(header(flight), config.smpc.controller)) or "the file was changed"
-        raise RecordingError(f"{flight}: {error.reason} ({made}); use the version that recorded it") from error
+        return prepare(config, design_of(config))
+    except DesignError as error:
+        if error.key != KEY:
+            raise
+        flown = recorded.versions.get(CONTROLLER, config.smpc.controller)
+        raise RecordingError(
+            f"{flight}: was flown by a controller of another package, {flown}, which is not here: "
+            f"{error.reason}; {error.hint}"
+        ) from error
 
 
-def changed_flyer(flight: Path, before: Config, loaded: LoadedConfig) -> Prepared:
-    """Return a controller of a changed configuration, with the recorded policy library if that fits, else its own.
+def changed_flyer(loaded: LoadedConfig) -> Prepared:
+    """Return a controller of a changed configuration.
 
     Raises:
         ConfigError: The configuration leaves no design.
-        RecordingError: The recording carries no policy library though it flew with one.
     """
-    config = loaded.config
     with located(loaded):
-        design = design_of(config)
-        if isinstance(design, Design) and config.uses_library and before.uses_library:
-            with suppress(LibraryError):
-                return _with_library(flight, config, design)
-        return prepare(config, design)
-
-
-def _with_library(flight: Path, config: Config, design: Design) -> Prepared:
-    library = decode(recorded_library(flight).data)
-    check_fits(library.library, design)
-    return Prepared(config, design, library, build_controller(config, design, library.library))
+        return prepare(loaded.config, design_of(loaded.config))
 
 
 # What is replayed: a recording of ours from its file alone, as recorded or otherwise; another program's packets.
@@ -138,7 +113,7 @@ def replay_flight(flight: Path, tolerance: float = 0.0, overrides: Sequence[str]
     name = f"{flight} (configuration)"
     config = flown = parse_recorded(recorded.config_toml, name).config
     cut, note = lacks_end(flight), last_note(flight)
-    if cut and next(records(flight, StepInput), None) is None:  # so early that the policy library may be missing
+    if cut and next(records(flight, StepInput), None) is None:
         nothing = ReplayResult(decisions=0, compared=0, identical=True, first_difference=None)
         return Replayed(nothing, cut, "", (), tuple(other_versions(recorded, flown.smpc.controller)), tolerance)
     if overrides:
@@ -148,7 +123,7 @@ def replay_flight(flight: Path, tolerance: float = 0.0, overrides: Sequence[str]
                 "daemon.vehicle and daemon.mocap say over which connections the recorded bytes came; leave them as "
                 "they are"
             )
-        controller = changed_flyer(flight, config, loaded).controller
+        controller = changed_flyer(loaded).controller
         changed = tuple(_changes(msgspec.to_builtins(config), msgspec.to_builtins(loaded.config), ""))
         config = loaded.config
     else:

@@ -26,10 +26,9 @@ from logs.recording.recorder import DerivedTopics, RecorderStatus, SyncRecorder
 from logs.recording.summary import count, summarise
 from logs.recording.topics import HEADER, RecorderNote
 from logs.recording.views import Views
-from uavctl.build.controller import Prepared, build_problem, design_of
+from uavctl.build.controller import Prepared, build_problem, design_of, prepare
 from uavctl.cli.common import SEED, Common, Flight, Json, bars, columns, located, warn
 from uavctl.cli.flying import conclude
-from uavctl.cli.prepare import prepare, ready_library
 from uavctl.cli.replay import changed_flyer, check_first, compute_as, other_versions, recorded_flyer
 from uavctl.config import Config, LoadedConfig, load
 from uavctl.config.checks import dimensions
@@ -143,13 +142,13 @@ def baseline_flyer(loaded: LoadedConfig, kind: str, start: Array) -> Prepared:
     """
     if loaded.config.mission.trajectory.times_s:
         raise UsageError(f"--controller {kind}: follows no trajectory; fly a recording of waypoints, or smpc")
-    # Its plans are its own: the design is for the mission's names and limits, and needs no policy library.
+    # Its plans are its own: the design is for the mission's names and limits.
     config = replace(loaded.config, solver=replace(loaded.config.solver, method="exact"))
     spec = ControllerSpec(name=kind, kind=kind)
     campaign = CampaignSpec(name="what-if", config=config.name, controller=(spec,), start=tuple(start.tolist()))
     with located(loaded):
         prepared = prepare(config, design_of(config))
-        recipe = recipe_for(spec, config, campaign, ready_library)
+        recipe = recipe_for(spec, config, campaign)
 
     def make(target: Array) -> tuple[ControlProblem, BatchController]:
         there = replace(config, target=TargetConfig(position_m=_place(config.plant.axes, prepared, target)))
@@ -237,7 +236,7 @@ def whatif(
         loaded = dataclasses.replace(loaded, config=replace(loaded.config, smpc=smpc))
     if controller == "smpc" or outside:
         same = config is None and not overrides and not outside
-        now = was if same else changed_flyer(flight, before, loaded)
+        now = was if same else changed_flyer(loaded)
     else:
         now = baseline_flyer(loaded, controller, _start(history))
     other = None

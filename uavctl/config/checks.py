@@ -20,7 +20,6 @@ from uavctl.config.document import LARGEST, ConfigProblem, Floats, Open, Positio
 from uavctl.config.link import LONGEST_DELAY_S, LinkConfig
 from uavctl.config.mission import FenceConfig, MissionConfig, TrajectoryConfig
 from uavctl.config.types import (
-    LIBRARY_HORIZON,
     PLANNED_HORIZON,
     Config,
     CostConfig,
@@ -186,13 +185,13 @@ def _increasing(key: str, times_s: Floats) -> Iterator[ConfigProblem]:
 def solver(given: SolverConfig, told: MissionConfig) -> Iterator[ConfigProblem]:
     """Check that no trajectory is given to the printed problem, which cannot follow one."""
     if given.method == "printed" and told.trajectory.times_s:
-        yield ConfigProblem("solver.method", '"printed" follows no trajectory', 'use "library" or "exact"')
+        yield ConfigProblem("solver.method", '"printed" follows no trajectory', 'use "exact"')
 
 
 def solver_fences(given: SolverConfig, told: Sequence[FenceConfig]) -> Iterator[ConfigProblem]:
     """Check that no moving limits are given to the printed problem, which cannot keep them."""
     if given.method == "printed" and told:
-        yield ConfigProblem("solver.method", '"printed" knows no limits that move', 'use "library" or "exact"')
+        yield ConfigProblem("solver.method", '"printed" knows no limits that move', 'use "exact"')
 
 
 _OF_AXES: tuple[str, ...] = ("position_index", "velocity_index", "accel_per_input")
@@ -405,15 +404,6 @@ def _schedule(plant: PlantConfig, smpc: SmpcConfig, schedule: ScheduleConfig) ->
         yield from _length(f"schedule.search_states[{i}]", state, n_x, "n_x")
 
 
-def _library(smpc: SmpcConfig, solver: SolverConfig) -> Iterator[ConfigProblem]:
-    if not smpc.conditioned and solver.method == "library" and LIBRARY_HORIZON < smpc.horizon <= PLANNED_HORIZON:
-        yield ConfigProblem(
-            "smpc.horizon",
-            f"{smpc.horizon} steps are more than a policy library is made for, {LIBRARY_HORIZON}",
-            'shorten it, or set solver.method = "exact"',
-        )
-
-
 def _target(plant: PlantConfig, sets: SetsConfig, target: TargetConfig) -> Iterator[ConfigProblem]:
     yield from outside(plant, sets, target.position_m, "target.position_m", "target")
 
@@ -506,7 +496,6 @@ _CHECKS: tuple[tuple[tuple[str, ...], _CheckFunction], ...] = (
     (("plant", "cost"), _cost),
     (("plant", "smpc"), _smpc),
     (("plant", "smpc", "schedule"), _schedule),
-    (("smpc", "solver"), _library),
     (("plant", "sets", "target"), _target),
     (("link",), _link),
     (("plant", "daemon"), _tick),

@@ -147,6 +147,9 @@ _WORDS = {
 _MAY_BE_INFINITE = ("sets.", "link.trace_s")  # an open side, a lost packet; everything else is finite
 _LONGEST_VALUE = 40
 _UNKNOWN = "unknown key"
+# Keys of before that have no meaning any more, and why; values of before, with why and what to write instead.
+_REMOVED = {"solver.exact": "it had a meaning with the policy library only, which is gone"}
+_REMOVED_VALUES = {("solver.method", "library"): ("the policy library is gone", 'remove the key, or write "exact"')}
 _MOST_NAMED = 3  # keys that a wrong one may have meant
 _MOST_UNKNOWN = 10  # keys of a table that are told one by one
 _MOST_PROBLEMS = 50
@@ -188,7 +191,11 @@ def parse(text: str, file: str, overrides: Sequence[str] = ()) -> LoadedConfig:
     Raises:
         ConfigError: With all problems found.
     """
-    table = parse_toml(text, file)
+    return _parse(parse_toml(text, file), text, file, overrides)
+
+
+def _parse(table: dict[str, Any], text: str, file: str, overrides: Sequence[str]) -> LoadedConfig:
+    """Load a configuration from the table of a TOML text."""
     problems: list[str] = []
     if len(overrides) > MOST_OVERRIDES:
         raise ConfigError((f"--set: is given {len(overrides)} times, at most {MOST_OVERRIDES} are taken; use a file",))
@@ -269,7 +276,7 @@ def _expand(
 
 
 def parse_recorded(text: str, file: str, overrides: Sequence[str] = ()) -> LoadedConfig:
-    """Load the configuration of a recording; one of before has no key for what was not done then.
+    """Load the configuration of a recording; of before, it lacks later keys and has removed ones.
 
     Raises:
         ConfigError: With all problems found.
@@ -284,7 +291,12 @@ def parse_recorded(text: str, file: str, overrides: Sequence[str] = ()) -> Loade
     lacks = [
         f"{section}.{key}={value}" for (section, key), value in before.items() if key not in table.get(section, {})
     ]
-    return parse(text, file, (*lacks, *overrides))
+    solver = table.get("solver")
+    if isinstance(solver, dict):  # of the policy library
+        solver.pop("exact", None)
+        if solver.get("method") == "library":
+            solver["method"] = "exact"
+    return _parse(table, text, file, (*lacks, *overrides))
 
 
 def explain(source: Source, error: DesignError) -> str:
@@ -484,6 +496,8 @@ def _decode_element(section: type[Section], value: object, path: str, found: lis
 
 
 def _unknown(path: str, key: str, names: Sequence[str], table: str) -> ConfigProblem:
+    if path in _REMOVED:
+        return ConfigProblem(path, f"{_UNKNOWN}: {_REMOVED[path]}", "remove it")
     nearest = find_nearest(key, names)
     where = f"[{table[:-1]}]" if table else "the top level"
     elsewhere = () if nearest else keys_named(path) or keys_named(key)
@@ -504,6 +518,9 @@ def _missing(key: str, field: FieldInfo) -> ConfigProblem:
 
 def _wrong(key: str, value: object, field: FieldInfo) -> Iterator[ConfigProblem]:
     """Yield the errors of a value by its type."""
+    if isinstance(value, str) and (key, value) in _REMOVED_VALUES:
+        yield ConfigProblem(key, *_REMOVED_VALUES[key, value])
+        return
     todo = f"give {type_text(field.type)}: {description(field)}"
     for path, number in _numbers(key, value):
         if not math.isfinite(number) and (math.isnan(number) or not key.startswith(_MAY_BE_INFINITE)):

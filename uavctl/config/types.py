@@ -78,8 +78,7 @@ def check(log: LogConfig) -> Iterator[ConfigProblem]:
         )
 
 
-LIBRARY_HORIZON = 24  # making the library takes minutes beyond
-PLANNED_HORIZON = 40  # so does solving the whole program with planned feedback
+PLANNED_HORIZON = 40  # solving the program with planned feedback takes seconds beyond
 # Keys with a default that scheme `hahn-stursberg` cannot do without.
 OF_HAHN_STURSBERG = frozenset(
     {"smpc.tau", "smpc.delta_u", "smpc.delta_tau", "smpc.k_tau", "smpc.offset_weight", "schedule"}
@@ -226,7 +225,7 @@ class SmpcConfig(Section, frozen=True, kw_only=True):
         Scheme,
         Meta(
             description="`age-conditioned`: plans without feedback, back-offs by the age of information, the "
-            "regulator's tail; `hahn-stursberg`: the paper's, with planned feedback, its library and terminal law"
+            "regulator's tail; `hahn-stursberg`: the paper's, with planned feedback and a terminal law"
         ),
     ] = "age-conditioned"
     controller: Annotated[
@@ -243,8 +242,7 @@ class SmpcConfig(Section, frozen=True, kw_only=True):
         Meta(
             ge=2,
             le=100,
-            description=f"prediction horizon H; with scheme `hahn-stursberg` at most {PLANNED_HORIZON}, and with "
-            f"solver.method `library` at most {LIBRARY_HORIZON} [steps]",
+            description=f"prediction horizon H; with scheme `hahn-stursberg` at most {PLANNED_HORIZON} [steps]",
         ),
     ]
     tau: Annotated[
@@ -334,16 +332,12 @@ class SolverConfig(Section, frozen=True, kw_only=True):
     """The solver of the decision problem."""
 
     method: Annotated[
-        Literal["library", "exact", "printed"],
+        Literal["exact", "printed"],
         Meta(
-            description="`library`: policies made in advance, each answer with its certificate; `exact`: reduced "
-            "program in Clarabel; `printed`: (19) through CVXPY (slow, hard constraints)"
+            description="`exact`: a frozen policy where it is proven optimal, else the reduced program in Clarabel; "
+            "`printed`: (19) through CVXPY (slow, hard constraints)"
         ),
-    ] = "library"
-    exact: Annotated[
-        bool,
-        Meta(description="with `library`: ask the exact program where the certified gap of an answer is above 1e-3"),
-    ] = True
+    ] = "exact"
     max_iterations: Annotated[
         int,
         Meta(
@@ -581,8 +575,3 @@ class Config(Section, frozen=True, kw_only=True):
     def conditioned(self) -> bool:
         """Whether plans are made by the scheme with risk conditioned on the age."""
         return self.smpc.conditioned
-
-    @property
-    def uses_library(self) -> bool:
-        """Whether plans come from a policy library."""
-        return self.solver.method == "library" and not (self.conditioned or self.smpc.controller)

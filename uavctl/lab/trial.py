@@ -16,8 +16,7 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.optimize import brentq
 
 from sim.simulation import World
-from uavctl.build.controller import build_conditioned, build_controller, build_plant, design_of, resting
-from uavctl.build.library import library_for
+from uavctl.build.controller import build_conditioned, build_controller, build_plant, resting
 from uavctl.build.mission import build_rests, resting_places
 from uavctl.config import Config, load_config, parse
 from uavctl.config.checks import position_limits_m
@@ -515,9 +514,7 @@ def controller_of(config: Config) -> Controller:
     Raises:
         DesignError: There is none.
     """
-    design = design_of(config)
-    library = library_for(design).library if config.uses_library and isinstance(design, Design) else None
-    return build_controller(config, design, library)
+    return build_controller(config)
 
 
 def path_of(motion: TrajectoryConfig) -> Path:

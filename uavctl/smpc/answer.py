@@ -145,7 +145,7 @@ def inside(inputs: Array, c: Array, b: Array) -> tuple[Array, bool]:
     cut = inputs.copy()
     for row, side in zip(c, b, strict=True):
         (used,) = np.nonzero(row)
-        excess = np.maximum(cut @ row - side, 0.0)
+        excess = np.maximum(np.sum(cut * row, axis=1) - side, 0.0)
         cut -= np.outer(excess, row / (row @ row))
         if used.size == 1:
             limit = side / row[used[0]]

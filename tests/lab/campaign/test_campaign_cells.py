@@ -9,7 +9,6 @@ import pytest
 from campaign_rig import cells, controller, read, table
 
 from uavctl.build.controller import build_problem
-from uavctl.cli.prepare import ready_library
 from uavctl.config import load_config
 from uavctl.lab.campaign.controllers import TUNING_FIRST, Met, build, built, met, start_of
 from uavctl.lab.campaign.spec import CHUNK
@@ -64,7 +63,7 @@ def test_what_is_flown_and_what_is_believed_are_two_things(tmp_path: Path) -> No
 def test_a_design_that_is_refused_costs_its_cells_only(tmp_path: Path) -> None:
     links = table("link", "as printed") + table("link", "bad", 'set = ["link.loss=0.6"]')
     campaign = read(tmp_path, controller("smpc"), controller("lqg"), links)
-    found = cells_of(campaign, ready_library)
+    found = cells_of(campaign)
     assert [bool(cell.refused) for cell in found] == [False, True, False, False]
     assert found[1].refused.startswith("smpc.delta_x: 0.95 is out of reach") and found[1].recipe is None
     assert {task.cell for task in tasks_of(found)} == {0, 2, 3}

@@ -12,7 +12,6 @@ import pyarrow.parquet as pq
 import pytest
 
 from uavctl.cli.app import run
-from uavctl.cli.prepare import ready_library
 from uavctl.errors import ConfigError
 from uavctl.lab.campaign import trials as trial_cells
 from uavctl.lab.campaign.page import trial_html
@@ -87,7 +86,7 @@ def test_what_is_wrong_with_a_file_is_told_with_its_place(tmp_path: Path, text: 
 
 def test_every_controller_meets_the_same_seeds_and_the_same_link(tmp_path: Path) -> None:
     spec, _ = read_trial(written(tmp_path, HEAD + OWN + OURS))
-    places = places_of(spec, lambda config, design: None)
+    places = places_of(spec)
     assert [(one.cell.scenario, one.cell.pilot.name) for one in places] == [
         ("hold", "own loop"), ("hold", "ours"), ("blackout", "own loop"), ("blackout", "ours")
     ]  # fmt: skip
@@ -108,7 +107,7 @@ def test_the_table_has_each_flight_as_it_is_flown_alone(flown: Path) -> None:
     assert [(row["cell"], row["run"]) for row in rows] == [(c, i) for c in (0, 1, 3, 4) for i in range(RUNS)]
     assert not any(row["error"] for row in rows)
     spec, _ = read_trial(flown.parent / "small.toml")
-    cell = places_of(spec, ready_library)[1].cell
+    cell = places_of(spec)[1].cell
     alone = fly(cell, seed_of(spec.master, 5), seconds=2.0, from_s=1.0)
     row = next(row for row in rows if (row["cell"], row["run"]) == (1, 5))
     for name in (*trial_cells.REAL, "positions", "mode", "seed"):
@@ -119,7 +118,7 @@ def test_the_table_has_each_flight_as_it_is_flown_alone(flown: Path) -> None:
 def test_one_that_was_interrupted_goes_on_to_the_same_bytes(flown: Path, tmp_path: Path) -> None:
     path = flown.parent / "small.toml"
     spec, text = read_trial(path)
-    places = places_of(spec, ready_library)
+    places = places_of(spec)
     tasks, store = list(trial_tasks(spec, places)), Store(tmp_path / "two", SCHEMA)
     with store.opened(trial_document(spec, places), text, resume=False):
         for task in tasks[3::-2]:
@@ -136,7 +135,7 @@ def test_a_flight_that_raises_is_told_and_stops_nothing(tmp_path: Path, monkeypa
         return TrialFlight(seed, hold_rms_m=0.5, mode="GUIDED")
 
     spec, _ = read_trial(written(tmp_path, HEAD + OWN))
-    task = next(trial_tasks(spec, places_of(spec, ready_library)))
+    task = next(trial_tasks(spec, places_of(spec)))
     monkeypatch.setattr(trial_cells, "fly", fails)
     rows = table_of(task.fly(), SCHEMA).to_pylist()
     assert [row["error"] for row in rows] == ["", "RuntimeError: no more", "", "", ""]

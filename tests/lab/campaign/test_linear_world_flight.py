@@ -17,14 +17,13 @@ from sim.channel import Channel
 from sim.simulation import World
 from sim.vehicle.linear import LinearVehicle
 from uavctl.build.controller import build_design, build_plant
-from uavctl.build.library import library_for
 from uavctl.config import Config, load_config
 from uavctl.config.connections import ClockConfig
 from uavctl.config.link import LinkConfig
 from uavctl.lab.campaign.world import Flown, Scene, draw, fly, newest
 from uavctl.records import Decision, Truth
-from uavctl.smpc.batch import BatchSmpc, Counts, OneByOne
-from uavctl.smpc.hahn_stursberg.library import LibrarySolver
+from uavctl.smpc.batch import BatchSmpc, Counts
+from uavctl.smpc.hahn_stursberg.frozen import ShortcutDecider, ShortcutSolver
 
 Array = NDArray[np.float64]
 
@@ -56,7 +55,7 @@ def in_the_linear_world(link: LinkConfig, number: int) -> Run:
     scene = Scene(
         plant, DESIGN.state_set, DESIGN.input_set, DESIGN.q_x, DESIGN.q_u, DESIGN.target, np.zeros(2), start[None]
     )
-    decider = OneByOne(LibrarySolver(DESIGN, library_for(DESIGN).library), DESIGN.target, (DESIGN.horizon, 2))
+    decider = ShortcutDecider(ShortcutSolver(DESIGN), DESIGN.target)
     controller = BatchSmpc(decider, plant, DESIGN.horizon, len(DESIGN.late), 0.5)
     return Run(start, known[0], w[0], fly(scene, controller, known, w))
 
@@ -139,7 +138,7 @@ def in_lockstep(run: Run) -> Memory:
     """The same run by controller, MAVLink and simulated autopilot."""
     config, memory = as_flown(run.start), Memory()
     assert build_design(config).design_id == DESIGN.design_id
-    loop = make_loop(config, memory, DESIGN, library_for(DESIGN).library)
+    loop = make_loop(config, memory, DESIGN)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(simulation, "LinearVehicle", lambda *given: GivenDisturbances(run, *given))
         patch.setattr(simulation, "Channel", lambda *given: GivenDelays(run, *given))

@@ -29,16 +29,10 @@ DEPTH = Depth(
         DesignTried(tau=4, schedule="d_t = 5", delays=[5, 5], gamma_h=0.97, cost=61670.0, refused=""),
     ],
     complexity=[
-        Complexity(
-            tau=tau, horizon=12, gains=36, lifted=8, exact_ms=10.0, printed_ms=printed, library_us=40.0, refused=""
-        )
+        Complexity(tau=tau, horizon=12, gains=36, lifted=8, exact_ms=10.0, printed_ms=printed, refused="")
         for tau, printed in ((3, 100.0), (4, 151.0))
     ]
-    + [
-        Complexity(
-            tau=6, horizon=12, gains=0, lifted=14, exact_ms=None, printed_ms=None, library_us=None, refused="unstable"
-        )
-    ],
+    + [Complexity(tau=6, horizon=12, gains=0, lifted=14, exact_ms=None, printed_ms=None, refused="unstable")],
     least_settled_cost=11.95,
 )
 

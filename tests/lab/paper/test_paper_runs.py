@@ -8,7 +8,6 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from uavctl.build.controller import build_design, build_plant, start_state
-from uavctl.build.library import library_for
 from uavctl.config import load_config
 from uavctl.lab.campaign.world import Flown, Scene, draw, fly, newest
 from uavctl.lab.paper import runs as run
@@ -23,8 +22,8 @@ from uavctl.lab.paper.claims import (
     claims_of,
 )
 from uavctl.lab.paper.runs import Chunk, ChunkRunner, Moments, Setup, Watched, fly_all, in_ellipsoid, together, total
-from uavctl.smpc.batch import BatchSmpc, Decisions, OneByOne
-from uavctl.smpc.hahn_stursberg.library import LibrarySolver
+from uavctl.smpc.batch import BatchSmpc, Decisions
+from uavctl.smpc.hahn_stursberg.frozen import ShortcutDecider, ShortcutSolver
 
 Array = NDArray[np.float64]
 
@@ -35,7 +34,7 @@ RUNS, STEPS, SEED = 20, 50, 3
 def setup() -> Setup:
     config = load_config("paper", PRINTED.overrides)
     design = build_design(config)
-    return Setup(config, design, library_for(design).library)
+    return Setup(config, design)
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +46,7 @@ def directly(setup: Setup) -> tuple[Flown, BatchSmpc]:
         plant, design.state_set, design.input_set, design.q_x, design.q_u, np.zeros(4), np.zeros(2),
         np.tile([35.0, -2.0, -20.0, -4.0], (RUNS, 1)),
     )  # fmt: skip
-    smpc = BatchSmpc(OneByOne(LibrarySolver(design, setup.library), np.zeros(4), (12, 2)), plant, 12, 0, 0.5)
+    smpc = BatchSmpc(ShortcutDecider(ShortcutSolver(design), np.zeros(4)), plant, 12, 0, 0.5)
     w = chances.normal * np.sqrt(0.6)
     return fly(scene, smpc, newest(setup.config.link, 1.0, chances.link), w), smpc
 
@@ -86,7 +85,7 @@ def test_chunks_change_nothing(setup: Setup, result: VariantResult, monkeypatch:
     (flights,) = fly_all([setup], RUNS, STEPS, SEED, 1, told.append)
     again = assess(setup, PRINTED.note, flights, SEED)
     assert told == [7, 7, 6]
-    assert flights.drawn.shape == (7, STEPS + 1, 4)  # of the first chunk
+    assert flights.drawn.shape == (RUNS, STEPS + 1, 4)
     for name in ("decisions", "state_violations", "max_age", "age_distribution", "aged_share", "runs_outside"):
         assert getattr(again, name) == getattr(result, name)
     assert again.closest == pytest.approx(result.closest, abs=1e-9)
@@ -160,7 +159,7 @@ def test_totals_of_made_up_runs(setup: Setup) -> None:
 
 def test_plans_that_end_elsewhere_are_counted(setup: Setup) -> None:
     design = setup.design
-    inner = OneByOne(LibrarySolver(design, setup.library), design.target, (12, 2))
+    inner = ShortcutDecider(ShortcutSolver(design), design.target)
 
     class Astray:
         """Adds a push in the last input of one plan, and gives up another one."""

@@ -23,7 +23,7 @@ def test_a_baseline_s_plan_is_what_it_does_in_silence(kind: str) -> None:
     config = config_of(PAPER)
     spec = ControllerSpec(name=kind, kind=kind)
     campaign = CampaignSpec(name="x", config="paper", controller=(spec,))
-    recipe = recipe_for(spec, config, campaign, lambda *_: None)
+    recipe = recipe_for(spec, config, campaign)
     solver = BaselineSolver(kind, lambda target: (build_problem(config), build(recipe)))
     alone, problem = build(recipe), build_problem(config)
     alone.begin(1)
@@ -50,7 +50,7 @@ def test_a_baseline_s_plan_is_what_it_does_in_silence(kind: str) -> None:
 def test_a_baseline_flies_and_its_plans_say_so() -> None:
     config = config_of(PAPER)
     spec = ControllerSpec(name="lqg", kind="lqg")
-    recipe = recipe_for(spec, config, CampaignSpec(name="x", config="paper", controller=(spec,)), lambda *_: None)
+    recipe = recipe_for(spec, config, CampaignSpec(name="x", config="paper", controller=(spec,)))
     controller = build_controller(config)
     solver = BaselineSolver("lqg", lambda target: (build_problem(config), build(recipe)))
     memory = Memory()

@@ -24,9 +24,6 @@ from uavctl.records import Decision, Event, LinkStats, Setpoint, SetpointSource,
 TICK = 57  # in which the rule of a test changes
 
 
-EXACT = "solver.method=exact"  # another likelihood would need a policy library of its own
-
-
 @pytest.fixture(scope="module")
 def flown() -> Memory:
     return lockstep("paper", 12.0)
@@ -74,7 +71,7 @@ def test_a_changed_rule_is_found_in_its_tick_and_followed(flown: Memory, monkeyp
 
 @pytest.mark.slow
 def test_a_changed_back_off_is_found_in_the_first_plan_that_differs() -> None:
-    result = replayed(lockstep("paper", 12.0, EXACT), EXACT, "smpc.delta_x=0.949")
+    result = replayed(lockstep("paper", 12.0), "smpc.delta_x=0.949")
     first, decision = result.first_difference, result.first_decision
     assert first is not None and decision is not None
     assert first.topic == "/uavctl/plan" and "design, target or solver" in first.stage
@@ -86,12 +83,12 @@ def test_a_changed_back_off_is_found_in_the_first_plan_that_differs() -> None:
 
 @pytest.mark.slow
 def test_of_another_solver_what_it_decides_is_compared_and_not_its_name(flown: Memory) -> None:
-    config = load_config("paper", ["solver.method=exact"])
+    config = load_config("paper", ["solver.method=printed"])
     named = replay(flown.entries, partial(make_loop, config)).first_difference
-    unnamed = replayed(flown, "solver.method=exact").first_difference
+    unnamed = replayed(flown, "solver.method=printed").first_difference
     assert named is not None and unnamed is not None
     assert {named.topic, unnamed.topic} == {"/uavctl/plan"}
-    assert "method" not in {one.field for one in replayed(flown, "solver.method=exact").course}
+    assert "method" not in {one.field for one in replayed(flown, "solver.method=printed").course}
 
 
 def test_what_does_not_reach_the_loop_changes_nothing(flown: Memory) -> None:
@@ -159,7 +156,7 @@ def test_fields_have_names_and_units() -> None:
     assert {key: places.meaning(*key) for key in told} == told
 
 
-SMALL = ("--config", "paper", "--set", "solver.method=exact", "--set", "log.segment_bytes=100000")
+SMALL = ("--config", "paper", "--set", "solver.method=printed", "--set", "log.segment_bytes=100000")
 
 
 @pytest.fixture(scope="module")

@@ -147,7 +147,6 @@ def test_the_end_does_not_wait_for_a_stalled_viewer() -> None:
 @pytest.mark.slow
 def test_a_flight_in_real_time_is_the_same_beside_viewers_that_have_stalled(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "uavctl", "loopback", "--udp", "--config", "paper", "--duration", "4"]
-    command += ["--set", "solver.method=exact"]  # it needs no policy library
     command += ["--live", "--live-port", "0", "--out", str(tmp_path), "--json"]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=without_pages()

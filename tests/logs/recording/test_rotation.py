@@ -7,6 +7,8 @@ import tracemalloc
 from dataclasses import dataclass
 from pathlib import Path
 
+import msgspec
+import numpy as np
 import pytest
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from loopback_rig import header as made_header
@@ -26,7 +28,7 @@ from uavctl.build.controller import build_design
 from uavctl.config import load_config
 from uavctl.config.types import LogConfig
 from uavctl.errors import ConfigError, RecordingError
-from uavctl.records import PolicyLibrary
+from uavctl.records import Header
 
 SMALL = LogConfig(chunk_bytes=1024, segment_bytes=3000)
 LOW, STOP = 3000, 1000
@@ -125,11 +127,12 @@ def test_29_disk_full_at_every_operation_loses_nothing_when_files_change(tmp_pat
 
 
 def test_what_every_file_repeats_does_not_count_to_its_size(tmp_path: Path) -> None:
-    # Else a policy library larger than a file would make each record a file of its own.
+    # Else a header larger than a file would make each record a file of its own.
     path = tmp_path / "flight.mcap"
-    library = PolicyLibrary(library_id="l1", design_id="d1", data=bytes(range(256)) * 100)
-    items = flight(100)
-    items.insert(1, ("/uavctl/library", 6, library))
+    noise = np.random.default_rng(1).bytes(20_000).hex()  # which hardly can be compressed
+    (topic, at_ns, header), *rest = flight(100)
+    assert isinstance(header, Header)
+    items = [(topic, at_ns, msgspec.structs.replace(header, config_toml=f'name = "{noise}"')), *rest]
     recorder = SyncRecorder(path, SMALL, clock=Clock())
     for item in items:
         recorder.put(*item)

@@ -25,8 +25,6 @@ from uavctl.records import Decision, Plan, SolveStatus
 from uavctl.smpc.answer import Preview
 from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec, make_design
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver, make_late, with_late
-from uavctl.smpc.hahn_stursberg.frozen import TOLERANCE
-from uavctl.smpc.hahn_stursberg.library import make_library
 from uavctl.smpc.link import LatePackets, gilbert_elliott
 from uavctl.smpc.sets import Polytope
 
@@ -355,23 +353,3 @@ def test_a_flight_on_late_positions_keeps_its_limits(late_flight: Memory) -> Non
 def test_a_flight_on_late_positions_replays(late_flight: Memory) -> None:
     config = load_config("room-hahn-stursberg", ["duration_s=12.0", *LATE_LINK])
     assert replay(late_flight.entries, lambda sink: make_loop(config, sink)).identical
-
-
-@pytest.mark.slow
-def test_a_flight_on_late_positions_with_a_library() -> None:
-    """Every plan comes from the late policies, with a certificate that the exact program confirms."""
-    design = build_design(load_config("room-hahn-stursberg", list(LATE)))
-    library = make_library(design, most=12)
-    assert [len(parts) for parts in library.variants] == [3, 3, 3]
-    memory, solver = lockstep("room-hahn-stursberg", 12.0, *LATE, library=library), ConicSolver(design)
-    plans = memory.of(Plan)
-    assert len(plans) > 40
-    assert {plan.method for plan in plans} == {"frozen", "mixture"}
-    assert all(0.0 <= plan.gap <= TOLERANCE for plan in plans)
-    for plan in plans[::4]:
-        exact = solver.solve(plan.seq, np.array(plan.states[0]), design.target, Preview(late=1))
-        assert exact.status is SolveStatus.OPTIMAL
-        assert plan.cost_lower <= exact.cost * (1.0 + 1e-7)
-        assert exact.cost <= plan.cost * (1.0 + 1e-7)
-    config = load_config("room-hahn-stursberg", ["duration_s=12.0", *LATE])
-    assert replay(memory.entries, lambda sink: make_loop(config, sink, design, library)).identical

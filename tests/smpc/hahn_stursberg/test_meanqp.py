@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from library_rig import EACH_PRESET, KINDS, PRESETS, Case, all_kinds, asked, design_of, exact_gains, mean_optimum
 from numpy.typing import NDArray
 from optimisation_cases import coupled
+from question_rig import EACH_PRESET, KINDS, PRESETS, Case, all_kinds, asked, design_of, exact_gains, mean_optimum
 from scipy.linalg import null_space
 
 from uavctl.smpc.answer import Preview
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.horizon import Component, decompose, horizon_of
 from uavctl.smpc.hahn_stursberg.mean import MeanProblem, Row, RowKind
-from uavctl.smpc.hahn_stursberg.policies import Covariance
+from uavctl.smpc.hahn_stursberg.policy import Covariance
 
 Array = NDArray[np.float64]
 
@@ -176,7 +176,7 @@ def test_limits_that_move_are_those_of_each_stage_and_the_least_of_the_last_ones
 def test_the_exact_program_s_answer_costs_the_same_here_and_is_the_best_under_its_policy(name: str) -> None:
     """Back-offs of the exact gains, the mean solved by another solver: the exact optimum, whatever is known ahead."""
     design = design_of(name)
-    one = Case(design, None)  # type: ignore[arg-type]  # no library is asked
+    one = Case(design)
     checked = 0
     for ask in all_kinds(design, 5, 3):
         for i in range(len(one.components)):

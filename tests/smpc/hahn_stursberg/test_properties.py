@@ -22,8 +22,8 @@ from uavctl.smpc.answer import Answer, Solver
 from uavctl.smpc.hahn_stursberg import exact as conic
 from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec, kappa, make_design
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver, optimal_cost
+from uavctl.smpc.hahn_stursberg.frozen import ShortcutSolver
 from uavctl.smpc.hahn_stursberg.horizon import Horizon, decompose, horizon_of, whole
-from uavctl.smpc.hahn_stursberg.library import Library, LibrarySolver, make_library
 from uavctl.smpc.link import bernoulli
 from uavctl.smpc.sets import Polytope
 
@@ -39,18 +39,7 @@ class Kind:
     plan: float
 
 
-MADE: dict[str, Library] = {}
-
-
-def from_library(design: Design) -> Solver:
-    """A small library, made once for a design: what it cannot certify, the exact program answers."""
-    if design.design_id not in MADE:
-        MADE[design.design_id] = make_library(design, most=12)
-    return LibrarySolver(design, MADE[design.design_id])
-
-
-# The library's plans are within its tolerance of the optimum; where a cost is flat they may be far apart.
-SOLVERS = {"exact": Kind(ConicSolver, cost=1e-7, plan=1e-4), "library": Kind(from_library, cost=1e-3, plan=np.inf)}
+SOLVERS = {"exact": Kind(ConicSolver, cost=1e-7, plan=1e-4), "flown": Kind(ShortcutSolver, cost=1e-7, plan=1e-4)}
 
 SYMMETRIC = Polytope.from_box([-40.0, -8.0, -25.0, -8.0], [40.0, 8.0, 25.0, 8.0])
 

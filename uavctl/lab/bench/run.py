@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import resource
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -18,13 +16,9 @@ from uavctl.build.controller import build_controller
 from uavctl.config import Config
 from uavctl.errors import UavctlError
 from uavctl.lab.bench.timing import (
-    EXACT,
-    FROZEN,
-    MIXTURE,
     BenchResult,
     Case,
     ConditionedTimes,
-    Memory,
     Quantiles,
     Shares,
     Timed,
@@ -38,10 +32,11 @@ from uavctl.records import Record, SolveStatus
 from uavctl.smpc.answer import KEPT, NOMINAL, Answer, Preview, Solver
 from uavctl.smpc.conditioned.planner import ConditionedSolver
 from uavctl.smpc.hahn_stursberg.design import Design
-from uavctl.smpc.hahn_stursberg.exact import ConicSolver, PartSolver
-from uavctl.smpc.hahn_stursberg.horizon import decompose
-from uavctl.smpc.hahn_stursberg.library import Library, LibrarySolver, make_library, state_box
+from uavctl.smpc.hahn_stursberg.exact import METHOD, ConicSolver, PartSolver
+from uavctl.smpc.hahn_stursberg.frozen import FROZEN, ShortcutSolver
+from uavctl.smpc.hahn_stursberg.horizon import Component, decompose
 from uavctl.smpc.hahn_stursberg.printed import SOLVERS_OWN, PrintedSolver
+from uavctl.smpc.sets import Polytope
 
 # The decision of scheme `age-conditioned` as a flight asks for it.
 
@@ -120,10 +115,7 @@ def _box_states(
     found = np.zeros((count, design.plant.n_x))
     share = 1.0
     for component in decompose(design):
-        solver, (lower, upper) = (
-            PartSolver(design, component),
-            state_box(component, design.target[component.states], _SPREAD),
-        )
+        solver, (lower, upper) = PartSolver(design, component), _box(component, design.target[component.states])
         tried, done, misses = 0, 0, 0
         while done < count:
             x = design.target.copy()
@@ -143,6 +135,13 @@ def _box_states(
                 )
         share *= done / tried
     return list(found), share
+
+
+def _box(component: Component, home: Array) -> tuple[Array, Array]:
+    """Return the box of a component's state set; _SPREAD standard deviations around `home` where it is open."""
+    around = _SPREAD * np.sqrt(np.diagonal(component.sigma_x + component.estimate_cov))
+    low, high = Polytope(component.c_x, component.b_x).bounds
+    return np.where(np.isfinite(low), low, home - around), np.where(np.isfinite(high), high, home + around)
 
 
 def closed_loops(
@@ -186,18 +185,16 @@ def closed_loops(
 # Told what is being done, how much of it is done, and of how much; None where nobody knows.
 Advance = Callable[[str, int, int | None], None]
 
-_MEGABYTE = 1e6
-
 
 @dataclass(frozen=True)
 class BenchSizes:
     """Numbers of states and runs of a benchmark."""
 
-    states: int = 1000  # asked of the library; the others are asked the first of them
+    states: int = 300  # asked as in flight; the slow methods are asked the first of them
     printed: int = 3  # asked of the joint problem as printed; it ends badly, and a few say so
     cvxpy: int = 20  # asked of the printed problem axis by axis
     exact: int = 50  # asked of the exact program
-    runs: int = 5  # of the library and of the exact program over their states; a state's time is the median
+    runs: int = 5  # but of the printed problem, over their states; a state's time is the median
 
 
 DEFAULT_SIZES = BenchSizes()
@@ -219,15 +216,10 @@ def run_bench(
 
     Raises:
         UavctlError: No state is feasible.
-        DesignError: The design has no library.
     """
     begin = time.perf_counter()
-    memory = [_peak_mb()]
-    library, library_s = _library(design, seed, advance)
-    start = time.perf_counter()
-    solver = LibrarySolver(design, library)
-    ready_s = time.perf_counter() - start
-    memory.append(_peak_mb())
+    solver = ShortcutSolver(design)
+    ready_s = time.perf_counter() - begin
 
     def phase(what: str, total: int) -> Callable[[int], None]:
         advance(what, 0, total)
@@ -244,17 +236,14 @@ def run_bench(
     if conditioned is not None:
         compared.append(Case(InFlight(conditioned), points, target))
     asked = sum(len(case.asked(run, sizes.runs)) for case in compared for run in range(sizes.runs))
-    by_library, exact, axes, *ours = timed(compared, sizes.runs, phase("all methods in turns", asked))
+    flown, exact, axes, *ours = timed(compared, sizes.runs, phase("all methods in turns", asked))
     few = points[: sizes.printed]
     whole = Case(PrintedSolver(design, joint=True, regularization=SOLVERS_OWN), few, target)
     (joint,) = timed([whole], 1, phase("printed, jointly", len(few)))
-    memory.append(_peak_mb())
 
     components = len(decompose(design))
-    library_us, gaps = Quantiles.of(by_library.us), np.array([answer.gap for answer in by_library.answers])
     exact_ms, axes_ms, joint_ms = (float(np.median(found.us)) / 1e3 for found in (exact, axes, joint))
     endings = [answer.status for answer in joint.answers]
-    parts = [part for variant in library.variants for part in variant]
     return BenchResult(
         states=count,
         components=components,
@@ -269,23 +258,17 @@ def run_bench(
         exact_axis_ms=exact_ms / components,
         exact_ms=exact_ms,
         exact_states=len(exact.answers),
-        library_us=library_us,
-        frozen_us=median(by_library.of(FROZEN)),
-        mixture_us=median(by_library.of(MIXTURE)),
-        fallback_us=median(by_library.of(EXACT)),
-        ratio_printed_library=joint_ms * 1e3 / library_us.p50,
-        ratio_cvxpy_library=axes_ms * 1e3 / library_us.p50,
-        ratio_exact_library=exact_ms * 1e3 / library_us.p50,
+        flown_us=Quantiles.of(flown.us),
+        frozen_us=median(flown.of(FROZEN)),
+        program_us=median(flown.of(METHOD)),
+        ratio_printed=joint_ms / exact_ms,
+        ratio_cvxpy=axes_ms / exact_ms,
         conditioned=_conditioned(ours[0], axes_ms) if ours else None,
-        shares=_shares(by_library),
-        gap=Quantiles.of(gaps),
-        certificate_excess=_excess(by_library.answers, exact.answers),
+        shares=_shares(flown),
+        gap=Quantiles.of(np.array([answer.gap for answer in flown.answers])),
+        certificate_excess=_excess(flown.answers, exact.answers),
         cost_difference=None if design.estimate_cov.any() else _cost_difference(axes.answers, exact.answers),
-        library_s=library_s,
-        library_policies=[len(part.level) for part in parts],
-        library_bytes=sum(part.theta.nbytes + part.level.nbytes + part.slope.nbytes for part in parts),
         ready_s=ready_s,
-        memory_mb=Memory(before=memory[0], library=memory[1], after=memory[2]),
         clock_us=clock_us(),
         wall_s=time.perf_counter() - begin,
     )
@@ -301,25 +284,9 @@ def _conditioned(found: Timed, axes_ms: float) -> ConditionedTimes:
     )
 
 
-def _library(design: Design, seed: int, advance: Advance) -> tuple[Library, float]:
-    """Make the library anew; return it with the time that took [s]."""
-    advance("making the library", 0, None)
-    start = time.perf_counter()
-    library = make_library(
-        design, seed, lambda name, policies, _: advance(f"making the library, {name}", policies, None)
-    )
-    return library, time.perf_counter() - start
-
-
-def _peak_mb() -> float:
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / _MEGABYTE if sys.platform == "darwin" else peak * 1024 / _MEGABYTE
-
-
 def _shares(found: Timed) -> Shares:
     methods = [answer.method for answer in found.answers]
-    frozen, mixture, exact = (methods.count(method) / len(methods) for method in (FROZEN, MIXTURE, EXACT))
-    return Shares(frozen=frozen, mixture=mixture, exact=exact)
+    return Shares(frozen=methods.count(FROZEN) / len(methods), exact=methods.count(METHOD) / len(methods))
 
 
 def _excess(certified: Sequence[Answer], exact: Sequence[Answer]) -> float:

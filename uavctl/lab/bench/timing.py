@@ -32,11 +32,10 @@ class Quantiles(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Shares(msgspec.Struct, frozen=True, kw_only=True):
-    """Shares of the states that were answered by each method of the library; a plan is named by its slowest axis."""
+    """Shares of the states that were answered by each method; a plan is named by its slowest axis."""
 
-    frozen: float
-    mixture: float
-    exact: float
+    frozen: float  # by the frozen policies alone
+    exact: float  # by the exact program for one axis or more
 
 
 class ConditionedTimes(msgspec.Struct, frozen=True, kw_only=True):
@@ -46,14 +45,6 @@ class ConditionedTimes(msgspec.Struct, frozen=True, kw_only=True):
     iterations: Quantiles  # of all its programs together
     left_alone: float  # share of the states from which the regulator's own plan keeps everything
     ratio_cvxpy: float  # the problem as printed, axis by axis, in the same run
-
-
-class Memory(msgspec.Struct, frozen=True, kw_only=True):
-    """Peak resident set of the process [MB]."""
-
-    before: float
-    library: float  # with the library made and ready
-    after: float
 
 
 class BenchResult(msgspec.Struct, frozen=True, kw_only=True):
@@ -72,23 +63,17 @@ class BenchResult(msgspec.Struct, frozen=True, kw_only=True):
     exact_axis_ms: float  # one axis
     exact_ms: float
     exact_states: int
-    library_us: Quantiles
+    flown_us: Quantiles  # as in flight: frozen policies where they are optimal, else the exact program
     frozen_us: float | None  # median where the frozen policies answered
-    mixture_us: float | None
-    fallback_us: float | None  # median where the library asked the exact program
-    ratio_printed_library: float  # as printed, jointly
-    ratio_cvxpy_library: float  # as printed, axis by axis
-    ratio_exact_library: float
+    program_us: float | None  # median where the exact program was needed
+    ratio_printed: float  # as printed, jointly, to the exact program
+    ratio_cvxpy: float  # as printed, axis by axis, to the exact program
     conditioned: ConditionedTimes | None  # null: silence outlasts the horizon too often for it
     shares: Shares
     gap: Quantiles  # certified
     certificate_excess: float  # most by which an exact optimum is outside the certified bounds, relative; 0: never
     cost_difference: float | None  # largest relative difference of printed and exact optima; null: not the same problem
-    library_s: float  # time to make the library
-    library_policies: list[int]  # of each component, fresh and late
-    library_bytes: int
-    ready_s: float  # from the library to a solver
-    memory_mb: Memory
+    ready_s: float  # from the design to a solver
     clock_us: float  # an empty measurement, which all times contain
     wall_s: float
 
@@ -97,9 +82,6 @@ class BenchResult(msgspec.Struct, frozen=True, kw_only=True):
 
 
 Array = NDArray[np.float64]
-
-# How a library's answer names its method.
-FROZEN, MIXTURE, EXACT = "frozen", "mixture", "exact"
 
 _EMPTY = 1000
 _WARM = 5

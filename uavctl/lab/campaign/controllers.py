@@ -22,7 +22,6 @@ from uavctl.build.controller import (
     needed,
     start_state,
 )
-from uavctl.build.library import StoredLibrary, decode
 from uavctl.build.rest import check_axes
 from uavctl.config import Config
 from uavctl.config.link import LinkConfig
@@ -43,10 +42,11 @@ from uavctl.smpc.baselines import (
     ZeroOnLoss,
     tune,
 )
-from uavctl.smpc.batch import BatchController, BatchSmpc, Counts, OneByOne
+from uavctl.smpc.batch import BatchController, BatchSmpc, Counts, Decider, OneByOne
 from uavctl.smpc.conditioned.planner import ConditionedDecider
 from uavctl.smpc.estimate import innovations
 from uavctl.smpc.hahn_stursberg.design import Design, kappa
+from uavctl.smpc.hahn_stursberg.frozen import ShortcutDecider, ShortcutSolver
 from uavctl.smpc.nominal import ControlProblem
 from uavctl.smpc.outside import Rehearsal, make_answer
 
@@ -177,8 +177,6 @@ TUNING_STEPS = 200  # longer runs show nothing new, and every candidate flies th
 
 _OF_POSITIONS = ("pid",)  # it goes by positions and velocities, whatever else a plant has
 
-LibraryFor = Callable[[Config, Design], StoredLibrary | None]
-
 
 @dataclass(frozen=True, eq=False)
 class Recipe:
@@ -188,21 +186,17 @@ class Recipe:
     kind: str  # one of `uavctl.lab.campaign.spec.KINDS`, or of another package
     config: Config  # the configuration that it believes in
     design: Design | None = None  # its design, of the SMPC with scheme `hahn-stursberg`
-    # Its policy library as `library_bytes.decode` reads it, of the SMPC with solver.method = `library`
-    library: bytes | None = None
-    library_id: str | None = None  # the library's hash
     gains: PidGains | None = None  # the gains of a PID
     margin: float = 0.0  # of an MPC without back-offs, see `ControllerSpec`
     # Covariance (n_x, n_x) that the simple margins begin with; None: the state is measured
     cov: NDArray[np.float64] | None = None
 
 
-def recipe_for(given: ControllerSpec, config: Config, spec: CampaignSpec, library_for: LibraryFor) -> Recipe:
-    """Make a recipe: design, library and gains, which take time or depend on chance.
+def recipe_for(given: ControllerSpec, config: Config, spec: CampaignSpec) -> Recipe:
+    """Make a recipe: design and gains, which take time or depend on chance.
 
     Args:
         config: The configuration that it believes in.
-        library_for: Gives the policy library of a design.
 
     Raises:
         DesignError: There is no such controller.
@@ -215,12 +209,7 @@ def recipe_for(given: ControllerSpec, config: Config, spec: CampaignSpec, librar
         sight = sight_of(config)
         made = replace(made, cov=innovations(sight.plant, sight.position_std_m, 0.0, 0).estimate_cov)
     if kind == "smpc" and not config.conditioned:
-        design = build_design(config)
-        stored = library_for(config, design)
-        if stored is None:
-            made = replace(made, design=design)
-        else:
-            made = replace(made, design=design, library=stored.data, library_id=stored.library_id)
+        made = replace(made, design=build_design(config))
     elif kind == "pid":
         made = replace(made, gains=_tuned(config, spec))
     made = replace(made, key=hashlib.sha256(pickle.dumps(made)).hexdigest())
@@ -283,12 +272,17 @@ def _smpc(recipe: Recipe) -> BatchSmpc:
     config, design, plant = recipe.config, recipe.design, build_plant(recipe.config)
     brake_gain_1ps = config.fallback.brake_gain_1ps
     if config.conditioned:
-        solver, steps = build_conditioned(config, flown=False, cov=recipe.cov).solver, config.smpc.horizon
-        return BatchSmpc(ConditionedDecider(solver, solver.problem.target), plant, steps, steps, brake_gain_1ps)
+        conditioned, steps = build_conditioned(config, flown=False, cov=recipe.cov).solver, config.smpc.horizon
+        return BatchSmpc(
+            ConditionedDecider(conditioned, conditioned.problem.target), plant, steps, steps, brake_gain_1ps
+        )
     if design is None:
         raise ValueError("an SMPC without a design")
-    library = None if recipe.library is None else decode(recipe.library).library
-    decider = OneByOne(build_solver(design, config, library), design.target, (design.horizon, design.plant.n_u))
+    solver = build_solver(design, config)
+    if isinstance(solver, ShortcutSolver):
+        decider: Decider = ShortcutDecider(solver, design.target)
+    else:
+        decider = OneByOne(solver, design.target, (design.horizon, design.plant.n_u))
     return BatchSmpc(decider, plant, design.horizon, len(design.late), brake_gain_1ps)
 
 

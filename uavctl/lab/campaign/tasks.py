@@ -16,7 +16,7 @@ from uavctl.config import Config
 from uavctl.config.checks import position_index
 from uavctl.config.link import LinkConfig
 from uavctl.errors import RAISED, DesignError, in_words
-from uavctl.lab.campaign.controllers import LibraryFor, Recipe, Setting, built, met, recipe_for, sight_of
+from uavctl.lab.campaign.controllers import Recipe, Setting, built, met, recipe_for, sight_of
 from uavctl.lab.campaign.pool import Columns, Work
 from uavctl.lab.campaign.results import SMPC
 from uavctl.lab.campaign.spec import CHUNK, Campaign
@@ -43,13 +43,9 @@ class Cell:
     refused: str  # why not
 
 
-def cells_of(campaign: Campaign, library_for: LibraryFor) -> tuple[Cell, ...]:
-    """Make every cell of a campaign, and each controller's recipe once.
-
-    Args:
-        library_for: Gives the policy library of a design.
-    """
-    recipes, spec = {key: _recipe(campaign, key, library_for) for key in campaign.believed}, campaign.spec
+def cells_of(campaign: Campaign) -> tuple[Cell, ...]:
+    """Make every cell of a campaign, and each controller's recipe once."""
+    recipes, spec = {key: _recipe(campaign, key) for key in campaign.believed}, campaign.spec
     i, j, k, m = (range(len(one)) for one in (spec.controller, spec.link, spec.disturbance, spec.plant))
     return tuple(
         _cell(campaign, index, which, recipes[which[0], campaign.believed_link(*which[:2])])
@@ -57,10 +53,10 @@ def cells_of(campaign: Campaign, library_for: LibraryFor) -> tuple[Cell, ...]:
     )
 
 
-def _recipe(campaign: Campaign, key: tuple[int, str], library_for: LibraryFor) -> Recipe | str:
+def _recipe(campaign: Campaign, key: tuple[int, str]) -> Recipe | str:
     """Return the recipe of a controller for the link that it believes in, or why there is none."""
     try:
-        return recipe_for(campaign.tuned(*key), campaign.believed[key], campaign.spec, library_for)
+        return recipe_for(campaign.tuned(*key), campaign.believed[key], campaign.spec)
     except DesignError as error:
         return str(error)
 
@@ -111,7 +107,6 @@ def told(cell: Cell) -> dict[str, object]:
         "plant": plant,
         "kind": cell.kind,
         "design_id": None if design is None else design.design_id,
-        "library_id": None if recipe is None else recipe.library_id,
         "promised_x": None if smpc is None else 1.0 - smpc.delta_x,
         "promised_u": None if delta_u is None else 1.0 - delta_u,
         "gains": None if gains is None else {one.name: getattr(gains, one.name).tolist() for one in fields(gains)},

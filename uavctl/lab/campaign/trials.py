@@ -22,7 +22,6 @@ from uavctl.config import Config, dump_config, load, load_config, parse
 from uavctl.config.document import LARGEST_SEED, ConfigProblem, Section
 from uavctl.config.load import parse_toml
 from uavctl.errors import RAISED, ConfigError, DesignError, in_words
-from uavctl.lab.campaign.controllers import LibraryFor
 from uavctl.lab.campaign.pool import Columns, Work
 from uavctl.lab.campaign.results import ToldCell, read_cells, read_document
 from uavctl.lab.campaign.spec import (
@@ -52,7 +51,6 @@ from uavctl.lab.trial import (
     fly,
     usable_room,
 )
-from uavctl.smpc.hahn_stursberg.design import Design
 
 # What a campaign in the world of the quadrotor is asked to fly, as its TOML file says it.
 
@@ -207,12 +205,8 @@ def seed_of(master: int, run: int) -> int:
     return int(np.random.SeedSequence([master, run]).generate_state(1)[0])
 
 
-def places_of(spec: TrialSpec, library_for: LibraryFor) -> tuple[TrialPlace, ...]:
-    """Return every cell of a campaign, with libraries made; a design that cannot be made is refused here.
-
-    Args:
-        library_for: Gives the policy library of a design.
-    """
+def places_of(spec: TrialSpec) -> tuple[TrialPlace, ...]:
+    """Return every cell of a campaign; a design that cannot be made is refused here."""
     text = dump_config(load_config(spec.config, spec.set))
     made: dict[Config, tuple[str | None, float | None, str]] = {}
     axes = (spec.scenario, spec.autopilot, spec.rate_hz, spec.air, spec.link, spec.controller)
@@ -224,7 +218,7 @@ def places_of(spec: TrialSpec, library_for: LibraryFor) -> tuple[TrialPlace, ...
         if pilot.own is None:
             config = believed(cell)
             if config not in made:
-                made[config] = _designed(config, library_for)
+                made[config] = _designed(config)
             found = made[config]
         places.append(TrialPlace(index, cell, controller.kind, *found))
     return tuple(places)
@@ -237,11 +231,10 @@ def _pilot(spec: TrialSpec, given: TrialControllerSpec, autopilot: AutopilotName
     return TrialPilot(given.name, spec.config, given.set, own, given.link == "true", text)
 
 
-def _designed(knows: Config, library_for: LibraryFor) -> tuple[str | None, float | None, str]:
+def _designed(knows: Config) -> tuple[str | None, float | None, str]:
     try:
         design = design_of(knows)
-        stored = library_for(knows, design) if isinstance(design, Design) else None
-        build_controller(knows, design, None if stored is None else stored.library)
+        build_controller(knows, design)
         return design.design_id, usable_room(knows, design), ""
     except DesignError as error:
         return None, None, str(error)

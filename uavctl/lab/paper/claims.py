@@ -121,7 +121,6 @@ class Complexity(msgspec.Struct, frozen=True, kw_only=True):
     lifted: int  # states of the terminal system of one axis, (τ+1) n_x
     exact_ms: float | None
     printed_ms: float | None
-    library_us: float | None
     refused: str
 
 
@@ -333,10 +332,10 @@ def _times(depth: Depth, method: str) -> list[float]:
 
 def _growth(depth: Depth) -> str:
     taus = [one.tau for one in depth.complexity if one.horizon == depth.complexity[0].horizon and not one.refused]
-    printed, exact, library = (_times(depth, method) for method in ("printed_ms", "exact_ms", "library_us"))
+    printed, exact = (_times(depth, method) for method in ("printed_ms", "exact_ms"))
     return (
         f"one axis, τ = {taus[0]} to {taus[-1]}: as printed {printed[0]:.0f} to {printed[-1]:.0f} ms, reduced "
-        f"{exact[0]:.0f} to {exact[-1]:.0f} ms, library {library[0]:.0f} to {library[-1]:.0f} µs"
+        f"{exact[0]:.0f} to {exact[-1]:.0f} ms"
     )
 
 

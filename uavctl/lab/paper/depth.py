@@ -28,9 +28,6 @@ from uavctl.lab.paper.claims import PRESET, PRINTED, Complexity, Depth, DesignTr
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver, optimal_cost
 from uavctl.smpc.hahn_stursberg.horizon import Component, decompose, horizon_of
-from uavctl.smpc.hahn_stursberg.library import Library, LibrarySolver, PartLibrary, Region
-from uavctl.smpc.hahn_stursberg.mean import MeanProblem
-from uavctl.smpc.hahn_stursberg.policies import PolicyProgram
 from uavctl.smpc.hahn_stursberg.printed import PrintedSolver
 from uavctl.smpc.hahn_stursberg.terminal import make_terminal
 from uavctl.smpc.nominal import lqr
@@ -157,8 +154,7 @@ _JOINT = "schedule.joint=true"
 _SEARCHED = "schedule.search_states=[[35,-2,-20,-4],[20,-5,-15,5],[5,-5,-5,5],[2,1,-2,-1]]"
 _TAUS = (2, 3, 4, 5, 6)
 _HORIZON, _FREE = 12, 8  # H as printed; N = H - τ as in the printed design
-_STATES, _RUNS, _POLICIES = 20, 3, 6
-_TRIES_PER_POLICY = 50
+_STATES, _RUNS = 20, 3
 
 
 def measure_depth(seed: int, told: Told) -> Depth:
@@ -213,13 +209,11 @@ def _complexity(seed: int, told: Told) -> list[Complexity]:
     for tau, horizon in sizes:
         told(f"complexity, τ = {tau}, H = {horizon}")
         design = _one_axis(tau, horizon)
-        library = None if isinstance(design, str) else few_policies(design, _POLICIES, np.random.default_rng(seed))
-        if isinstance(design, str) or library is None:
-            found.append((tau, horizon, design if isinstance(design, str) else "no policies", 0))
+        if isinstance(design, str):
+            found.append((tau, horizon, design, 0))
             continue
         found.append((tau, horizon, "", horizon_of(design, decompose(design)[0]).n_theta))
-        solvers = (ConicSolver(design), PrintedSolver(design), LibrarySolver(design, library[0], exact=False))
-        cases += [Case(solver, points, design.target) for solver in solvers]
+        cases += [Case(solver, points, design.target) for solver in (ConicSolver(design), PrintedSolver(design))]
     told("complexity, all in turns")
     times = iter([median(each.us) for each in timed(cases, _RUNS)])
     return [
@@ -230,7 +224,6 @@ def _complexity(seed: int, told: Told) -> list[Complexity]:
             lifted=(tau + 1) * points[0].size,
             exact_ms=None if refused else _ms(next(times)),
             printed_ms=None if refused else _ms(next(times)),
-            library_us=None if refused else next(times),
             refused=refused,
         )
         for tau, horizon, refused, gains in found
@@ -258,28 +251,6 @@ def _one_axis(tau: int, horizon: int) -> Design | str:
 
 def _ms(us: float | None) -> float | None:
     return None if us is None else us / 1e3
-
-
-def few_policies(design: Design, count: int, rng: np.random.Generator) -> tuple[Library, int] | None:
-    """Make a library of `count` policies for a one-component design; return it with its number of gains, or None."""
-    (component,) = decompose(design)
-    problem = MeanProblem(design, horizon_of(design, component))
-    program, region = PolicyProgram(problem, design.max_iterations), Region(design, component)
-    policies = [program.cheapest()]
-    for _ in range(_TRIES_PER_POLICY * count):
-        if len(policies) == count:
-            break
-        found = program.best(problem.question(*region.draw(rng)))
-        policies += [found] if found is not None else []
-    kept = [policy for policy in policies if policy is not None]
-    if len(kept) < len(policies):
-        return None
-    part = PartLibrary(
-        theta=np.array([policy.theta for policy in kept]),
-        level=np.array([policy.level for policy in kept]),
-        slope=np.array([policy.slope for policy in kept]),
-    )
-    return Library(design.design_id, ((part,),)), problem.horizon.n_theta
 
 
 def alone(design: Design, component: Component) -> Design:

@@ -21,9 +21,9 @@ from uavctl.config import Config
 from uavctl.errors import UavctlError
 from uavctl.lab.campaign.pool import processes
 from uavctl.lab.campaign.world import Flown, Scene, draw, fly, newest
-from uavctl.smpc.batch import BatchController, BatchSmpc, Decider, Decisions, OneByOne
+from uavctl.smpc.batch import BatchController, BatchSmpc, Decider, Decisions
 from uavctl.smpc.hahn_stursberg.design import Design
-from uavctl.smpc.hahn_stursberg.library import Library, LibrarySolver
+from uavctl.smpc.hahn_stursberg.frozen import ShortcutDecider, ShortcutSolver
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope
 
@@ -38,11 +38,10 @@ _MISS = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """Configuration, design, and the design's policy library."""
+    """Configuration and design of the runs."""
 
     config: Config
     design: Design
-    library: Library
 
 
 class Watched:
@@ -86,8 +85,7 @@ class ChunkRunner:
     def __init__(self, setup: Setup) -> None:
         config, design = setup.config, setup.design
         self._setup, self.design = setup, design
-        solver = LibrarySolver(design, setup.library, exact=config.solver.exact)
-        self._watched = Watched(OneByOne(solver, design.target, (design.horizon, design.plant.n_u)), design)
+        self._watched = Watched(ShortcutDecider(ShortcutSolver(design), design.target), design)
         self._smpc = BatchSmpc(
             self._watched, build_plant(config), design.horizon, len(design.late), config.fallback.brake_gain_1ps
         )
@@ -264,8 +262,8 @@ def in_ellipsoid(states: Array, design: Design) -> NDArray[np.bool_]:
 
 Advance = Callable[[int], None]
 
-CHUNK = 1000  # runs flown together; the same whoever flies them, so that workers change nothing
-HERE_UP_TO = 500  # runs that are not worth another process
+CHUNK = 100  # runs flown together; the same whoever flies them, so that workers change nothing
+HERE_UP_TO = 20  # runs that are not worth another process
 DRAWN = 200  # runs whose trajectories are kept, for the figures
 
 
@@ -313,7 +311,10 @@ def fly_all(setups: Sequence[Setup], runs: int, steps: int, seed: int, workers: 
         [result for task, result in zip(tasks, results, strict=True) if task.which == which]
         for which in range(len(setups))
     ]
-    return [Flights(together([part.totals for part in parts]), parts[0].drawn) for parts in by_design]
+    return [
+        Flights(together([part.totals for part in parts]), np.concatenate([part.drawn for part in parts]))
+        for parts in by_design
+    ]
 
 
 @contextmanager
@@ -325,7 +326,7 @@ def _flier(
         yield lambda tasks: map(partial(_flown, [ChunkRunner(setup) for setup in setups]), tasks)
         return
     with processes(workers) as pool, TemporaryDirectory() as folder:
-        # Not with each task: designs and libraries are larger than what a pipe holds.
+        # Not with each task: designs are larger than what a pipe holds.
         path = Path(folder) / "setups"
         path.write_bytes(pickle.dumps(list(setups)))
         try:
@@ -345,8 +346,8 @@ def _fly(path: Path, task: ChunkTask) -> Flights:
 
 
 def _flown(crew: Sequence[ChunkRunner], task: ChunkTask) -> Flights:
-    """The runs of one task; those of the first one are kept for the figures."""
+    """The runs of one task; the first of all runs are kept for the figures."""
     runner = crew[task.which]
     chunk = runner.fly(task.seed, task.first, task.runs, task.steps)
-    kept = 0 if task.first else DRAWN
+    kept = max(0, DRAWN - task.first)
     return Flights(total(chunk, runner.design), chunk.flown.states[:kept].copy())

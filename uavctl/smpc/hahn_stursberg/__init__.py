@@ -1,1 +1,1 @@
-"""The scheme of Hahn and Stursberg, whole: as printed, exact, and from a policy library."""
+"""The scheme of Hahn and Stursberg, whole: as printed, exact, and by a frozen policy where that is exact too."""

@@ -26,6 +26,7 @@ from uavctl.smpc.hahn_stursberg.horizon import (
     TerminalBound,
     decompose,
     horizon_of,
+    stack,
     terminal_bound,
 )
 from uavctl.smpc.hahn_stursberg.program import Program, terminal_backoff_x
@@ -214,13 +215,13 @@ class PartSolver:
 
     def __init__(self, design: Design, component: Component) -> None:
         self.component = component
-        self._design = design
-        self._horizon = horizon_of(design, component)
-        self._exact = Program(design, self._horizon, soft_terminal=False)
-        self._missing = Program(design, self._horizon, soft_terminal=True)
+        self.design = design
+        self.horizon = horizon_of(design, component)
+        self._exact = Program(design, self.horizon, soft_terminal=False)
+        self._missing = Program(design, self.horizon, soft_terminal=True)
         self._unseen = np.einsum("ij,jk,ik->i", component.c_x, component.estimate_cov, component.c_x)
-        self._noise_x = [self._horizon.state_noise(t, component.c_x) for t in range(design.horizon + 1)]
-        self._noise_u = [self._horizon.input_noise(t, component.c_u) for t in range(design.horizon)]
+        self._noise_x = stack([self.horizon.state_noise(t, component.c_x) for t in range(design.horizon + 1)])
+        self._noise_u = stack([self.horizon.input_noise(t, component.c_u) for t in range(design.horizon)])
 
     def solve(self, x: Array, target: Array, outlook: Preview = NOMINAL) -> PartAnswer:
         """Solve for the whole plant's state, target and outlook."""
@@ -237,10 +238,20 @@ class PartSolver:
             status = SolveStatus.FAILED
         return self._read(program, solution, status, iterations, x, target)
 
+    def backoffs(self, theta: Array) -> tuple[Array, Array]:
+        """Back-offs of the state rows (H+1, m_x) and of the input rows (H, m_u) under gains `theta`."""
+        # κ_t (‖noise_t(θ)‖² + cᵀ Cov c)^½
+        part, steps, width = self.component, self.horizon.steps, self.horizon.width
+        noise_x = self._noise_x.at(theta).reshape(steps + 1, part.b_x.size, width)
+        noise_u = self._noise_u.at(theta).reshape(steps, part.b_u.size, width)
+        backoff_x: Array = self.design.kappa_x[:, None] * np.sqrt((noise_x**2).sum(axis=2) + self._unseen)
+        backoff_u: Array = self.design.kappa_u[:, None] * np.sqrt((noise_u**2).sum(axis=2))
+        return backoff_x, backoff_u
+
     def _read(
         self, program: Program, solution: Solution, status: SolveStatus, iterations: int, x: Array, target: Array
     ) -> PartAnswer:
-        part, horizon, layout, values = self.component, self._horizon, program.layout, solution.variables
+        part, horizon, layout, values = self.component, self.horizon, program.layout, solution.variables
         here = part.coordinates @ x
         y = here + values[layout.y]
         wanted = np.repeat((part.u_eq @ y)[None], horizon.steps, axis=0)
@@ -249,13 +260,13 @@ class PartSolver:
         unproven = relative_gap(solution.cost, solution.cost_lower) > _PROVEN
         if (unproven or not kept) and status is SolveStatus.OPTIMAL:
             status = SolveStatus.INACCURATE
-        theta = values[layout.theta]
+        backoff_x, backoff_u = self.backoffs(values[layout.theta])
         return PartAnswer(
             status=status,
             iterations=iterations,
             inputs=inputs,
-            backoff_x=_backoff(self._noise_x, theta, self._design.kappa_x, self._unseen, horizon.width),
-            backoff_u=_backoff(self._noise_u, theta, self._design.kappa_u, np.zeros(part.b_u.size), horizon.width),
+            backoff_x=backoff_x,
+            backoff_u=backoff_u,
             reference=part.x_eq @ y,
             slack=_total(values[layout.slack]),
             offset=float(np.sum(np.abs(y - part.coordinates @ target))),
@@ -267,13 +278,6 @@ class PartSolver:
 
 def _total(values: Array) -> float:
     return float(np.sum(np.maximum(values, 0.0)))
-
-
-def _backoff(noise: list[Affine], theta: Array, kappa: Array, unseen: Array, width: int) -> Array:
-    """κ_t (‖·‖² + unseen)^½ of every row and stage (stages, rows)."""
-    squares = [np.sum(stage.at(theta).reshape(unseen.size, width) ** 2, axis=1) for stage in noise]
-    backoff: Array = kappa[:, None] * np.sqrt(np.array(squares) + unseen)
-    return backoff
 
 
 # Offline questions about a design: can its schedule meet the terminal condition, and at what cost is a state left?

@@ -256,7 +256,7 @@ class Horizon:
         """z of `sigma_z` as coefficients of the past + N older disturbances, row by row."""
         parts = [self.state_noise(self.free, np.eye(self.component.a.shape[0]))]
         parts += [self.input_noise(t, self.drive) for t in range(self.free, self.steps)]
-        stacked = _stack(parts)
+        stacked = stack(parts)
         columns = np.tile(np.arange(self.width), stacked.offset.size // max(1, self.width))
         # No gain acts on the newer ones, nor do they reach z.
         old = np.flatnonzero(columns < (self.past + self.free) * self._n_w)
@@ -302,9 +302,9 @@ class Horizon:
         n_x = part.a.shape[0]
         stacked = [self.state_noise(t, np.eye(n_x)) for t in range(self.free, self.steps + 1)]
         weight = sparse.kron(sparse.csr_array(terminal), sparse.eye_array(self.width), format="csr")
-        xi = _stack(stacked)
+        xi = stack(stacked)
         terms.append(Affine(np.asarray(weight @ xi.offset), sparse.csr_array(weight @ xi.matrix)))
-        everything = _stack(terms)
+        everything = stack(terms)
         gram = (everything.matrix.T @ everything.matrix).toarray()
         linear = everything.matrix.T @ everything.offset
         return 2.0 * gram, 2.0 * linear, float(everything.offset @ everything.offset)
@@ -369,7 +369,8 @@ def _root(matrix: Array) -> Array:
     return root
 
 
-def _stack(parts: list[Affine]) -> Affine:
+def stack(parts: list[Affine]) -> Affine:
+    """Affine maps below one another."""
     return Affine(
         np.concatenate([part.offset for part in parts]),
         sparse.csr_array(sparse.vstack([part.matrix for part in parts])),

@@ -55,14 +55,14 @@ class Row:
 
 @dataclass(frozen=True, eq=False)
 class Question:
-    """One question in the numbers of the QPs."""
+    """One question, or several with the same target and outlook, in the numbers of the QPs."""
 
-    f: Array  # linear term of the cost (n_q,)
-    constant: float  # its constant
-    offset: Array  # what p adds to every row, R p (m,)
+    f: Array  # linear term of the cost (…, n_q)
+    constant: Array  # its constant (…)
+    offset: Array  # what p adds to every row, R p (…, m)
     upper: Array  # right sides (m,), without back-offs, OPEN where there is none
     lower: Array  # left sides (m,) alike
-    p: Array  # parameters (n_p,)
+    p: Array  # parameters (…, n_p)
 
 
 class MeanProblem:
@@ -92,7 +92,6 @@ class MeanProblem:
         self.z, self.w, self.reachable = self._coordinates()
         self.residual_q, self.residual_p = self._residuals()
         self.h = 2.0 * self.residual_q.T @ self.residual_q  # Hessian (n_q, n_q): cost ½ qᵀHq + fᵀq + c
-        self.linear = 2.0 * self.residual_q.T @ self.residual_p  # (n_q, n_p): f = linear p, without a path
         # What each row is, in order: inputs, states, reference, offset
         offset = [Row(RowKind.OFFSET, horizon.free, c, -1, -1, 0.0) for c in np.eye(self.n_y)]
         self.rows = (*self._input_rows(), *self._state_rows(), *self._reference_rows(), *offset)
@@ -112,25 +111,21 @@ class MeanProblem:
         self.curve = np.where(kinds == RowKind.STATE, design.slack_quadratic, 0.0)
 
     def parameters(self, x: Array, target: Array) -> Array:
-        """p (n_p,) of a state (n_x,) and a target (n_x,) of this component."""
+        """p (…, n_p) of states (…, n_x) and a target (n_x,) of this component."""
         part = self.horizon.component
-        here, there = part.coordinates @ x, part.coordinates @ target
-        return np.concatenate([x - part.x_eq @ here, there - here, here])
-
-    def cost(self, p: Array, outlook: Preview) -> tuple[Array, float]:
-        """Linear term f (n_q,) and constant c of the cost."""
-        residual = self.residual(p, outlook)
-        return 2.0 * self.residual_q.T @ residual, float(residual @ residual)
+        here, there = by_rows(x, part.coordinates.T), part.coordinates @ target
+        return np.concatenate([x - by_rows(here, part.x_eq.T), there - here, here], axis=-1)
 
     def residual(self, p: Array, outlook: Preview) -> Array:
-        """The cost's residuals at q = 0 (n_r,)."""
+        """The cost's residuals at q = 0 (…, n_r)."""
+        residual = by_rows(p, self.residual_p.T)
         if outlook.path is None:
-            return np.asarray(self.residual_p @ p)
+            return residual
         part, free = self.horizon.component, self.horizon.free
         path = (outlook.path.states[:free, part.states], outlook.path.inputs[:free, part.inputs])
         roots = (factor(part.q_x), factor(part.q_u))
         wanted = np.concatenate([(values @ root.T).ravel() for values, root in zip(path, roots, strict=True)])
-        residual: Array = self.residual_p @ p - wanted
+        residual -= wanted
         return residual
 
     def sides(self, outlook: Preview) -> tuple[Array, Array]:
@@ -149,21 +144,27 @@ class MeanProblem:
         return upper, lower
 
     def question(self, x: Array, target: Array, outlook: Preview = NOMINAL) -> Question:
-        """A question in numbers: state (n_x,) and target (n_x,) of this component, outlook of the whole plant."""
-        return self.question_of(self.parameters(x, target), outlook)
-
-    def question_of(self, p: Array, outlook: Preview) -> Question:
-        """Return a question in numbers for parameters p (n_p,)."""
-        f, constant = self.cost(p, outlook)
+        """Questions in numbers: states (…, n_x) and target (n_x,) of this component, outlook of the whole plant."""
+        p = self.parameters(x, target)
+        # cost = ½ qᵀHq + fᵀq + c, with f = 2 R_qᵀ r, c = rᵀr and the residuals r at q = 0
+        residual = self.residual(p, outlook)
         upper, lower = self.sides(outlook)
-        return Question(f, constant, self.r @ p, np.minimum(upper, OPEN), np.maximum(lower, -OPEN), p)
+        return Question(
+            f=by_rows(2.0 * residual, self.residual_q),
+            constant=dot_rows(residual, residual),
+            offset=by_rows(p, self.r.T),
+            upper=np.minimum(upper, OPEN),
+            lower=np.maximum(lower, -OPEN),
+            p=p,
+        )
 
     def inputs(self, w: Array, here: Array) -> Array:
-        """Absolute mean inputs (H, n_u) of w = (v, y)."""
+        """Absolute mean inputs (…, H, n_u) of w = (v, y) (…, n_w), with the present equilibrium (…, n_y)."""
         part, horizon = self.horizon.component, self.horizon
-        inputs = np.empty((horizon.steps, self._n_u))
-        inputs[: horizon.free] = w[: self.n_v].reshape(horizon.free, self._n_u) + part.u_eq @ here
-        inputs[horizon.free :] = part.u_eq @ (w[self.n_v :] + here)
+        inputs = np.empty((*w.shape[:-1], horizon.steps, self._n_u))
+        free = w[..., : self.n_v].reshape(*w.shape[:-1], horizon.free, self._n_u)
+        inputs[..., : horizon.free, :] = free + by_rows(here, part.u_eq.T)[..., None, :]
+        inputs[..., horizon.free :, :] = by_rows(w[..., self.n_v :] + here, part.u_eq.T)[..., None, :]
         return inputs
 
     def _coordinates(self) -> tuple[Array, Array, bool]:
@@ -266,6 +267,18 @@ class MeanProblem:
             if row.lower >= 0:
                 lower[i] = -b[row.lower]
         return upper, lower
+
+
+def by_rows(values: Array, matrix: Array) -> Array:
+    """Product of rows (…, n) with a matrix (n, m), one by one: the bits of a row do not depend on the others."""
+    product: Array = (values[..., None, :] @ matrix)[..., 0, :]
+    return product
+
+
+def dot_rows(left: Array, right: Array) -> Array:
+    """Products (…) of rows (…, n) with rows (…, n), one by one."""
+    product: Array = (left[..., None, :] @ right[..., :, None])[..., 0, 0]
+    return product
 
 
 def _directions(c: Array) -> list[tuple[Array, tuple[int, int]]]:

@@ -1,4 +1,4 @@
-"""Presets with their libraries, questions to ask of them, and the policies that their answers stand for."""
+"""Designs of presets, questions to ask of them, and the policies that their answers stand for."""
 
 from __future__ import annotations
 
@@ -14,16 +14,14 @@ from full_problem import backoff_table, horizons
 from numpy.typing import NDArray
 
 from uavctl.build.controller import build_design
-from uavctl.build.library import library_for
 from uavctl.config import load_config
 from uavctl.smpc.answer import NOMINAL, Answer, Path, Preview
 from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec, make_design
 from uavctl.smpc.hahn_stursberg.exact import PartSolver, with_late
+from uavctl.smpc.hahn_stursberg.frozen import ShortcutSolver
 from uavctl.smpc.hahn_stursberg.horizon import Component, decompose, horizon_of
-from uavctl.smpc.hahn_stursberg.library import Library, LibrarySolver
 from uavctl.smpc.hahn_stursberg.mean import MeanProblem, Question
-from uavctl.smpc.hahn_stursberg.mixture import Mixture
-from uavctl.smpc.hahn_stursberg.policies import Policy
+from uavctl.smpc.hahn_stursberg.policy import Policy, cheapest_policy
 from uavctl.smpc.link import bernoulli
 from uavctl.smpc.sets import Polytope
 
@@ -38,10 +36,9 @@ KEPT = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A design with its library."""
+    """A design with all that answers its questions."""
 
     design: Design
-    library: Library
 
     @cached_property
     def components(self) -> tuple[Component, ...]:
@@ -52,32 +49,18 @@ class Case:
         return [MeanProblem(self.design, horizon_of(self.design, part)) for part in self.components]
 
     @cached_property
-    def policies(self) -> list[tuple[Policy, ...]]:
-        parts = zip(self.library.variants[0], self.problems, strict=True)
-        return [part.policies(problem) for part, problem in parts]
-
-    @cached_property
-    def mixtures(self) -> list[Mixture]:
-        return [Mixture(*pair) for pair in zip(self.problems, self.policies, strict=True)]
-
-    @cached_property
-    def backoffs(self) -> list[Array]:
-        """Back-offs of every policy of each component, see `backoff_table`."""
-        found = zip(self.components, self.library.variants[0], strict=True)
-        return [backoff_table(self.design, part, i, library.theta) for i, (part, library) in enumerate(found)]
+    def policies(self) -> list[Policy]:
+        """The frozen policy of each component."""
+        found = [cheapest_policy(problem, self.design.max_iterations) for problem in self.problems]
+        return [policy for policy in found if policy is not None]
 
     @cached_property
     def exact(self) -> list[PartSolver]:
         return [PartSolver(self.design, part) for part in self.components]
 
     @cached_property
-    def solver(self) -> LibrarySolver:
-        return LibrarySolver(self.design, self.library)
-
-    @cached_property
-    def alone(self) -> LibrarySolver:
-        """The library without the exact program."""
-        return LibrarySolver(self.design, self.library, exact=False)
+    def solver(self) -> ShortcutSolver:
+        return ShortcutSolver(self.design)
 
     def question(self, i: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Question:
         part = self.components[i]
@@ -91,8 +74,7 @@ def design_of(name: str) -> Design:
 
 @cache
 def case(name: str) -> Case:
-    design = design_of(name)
-    return Case(design, library_for(design).library)
+    return Case(design_of(name))
 
 
 # --- questions -------------------------------------------------------------------------------------------------------
@@ -213,20 +195,6 @@ def hard_questions(design: Design) -> list[Asked]:
     return found
 
 
-def closed_loop(one: Case, start: Array, loss: float, steps: int, rng: np.random.Generator) -> list[Array]:
-    """States in which plans are asked for: a share `loss` of the steps has no news, and the last plan is played out."""
-    plant, target = one.design.plant, one.design.target
-    root = np.linalg.cholesky(plant.w + 1e-15 * np.eye(plant.n_w))
-    x, plan, found = start, np.zeros((0, plant.n_u)), []
-    for k in range(steps):
-        if k == 0 or rng.random() >= loss:
-            found.append(x)
-            plan = one.solver.solve(k, x, target).inputs
-        u, plan = plan[0], np.vstack([plan[1:], plan[-1:]])
-        x = plant.a @ x + plant.b @ u + plant.e @ (root @ rng.standard_normal(plant.n_w))
-    return found
-
-
 # --- a mean under a given policy, in another solver -------------------------------------------------------------------
 
 
@@ -255,31 +223,18 @@ def mean_optimum(problem: MeanProblem, question: Question, backoff: Array) -> fl
 
 
 def flown(one: Case, ask: Asked, answer: Answer) -> list[Array]:
-    """Gains (n_θ,) of each component that an answer stands for: of the policies it may have, those with its back-offs.
-
-    A mixture is held to the mixture of its policies' back-offs, which its own never exceed.
-    """
+    """Gains (n_θ,) of each component that an answer stands for: the frozen or the exact ones, by its back-offs."""
     return [_flown(one, i, ask, answer) for i in range(len(one.components))]
 
 
 def _flown(one: Case, i: int, ask: Asked, answer: Answer) -> Array:
-    part, mixture = one.components[i], one.mixtures[i]
+    part = one.components[i]
     told = np.concatenate([answer.backoff_x[:, part.rows_x].ravel(), answer.backoff_u[:, part.rows_u].ravel()])
-
-    def same(backoffs: Array) -> bool:
-        return bool(np.allclose(told, backoffs, rtol=1e-9, atol=1e-9 * told.max()))
-
-    table = one.backoffs[i]
-    if same(table[0]):
-        return np.asarray(mixture.theta[0])
-    variant = one.solver._variants[ask.outlook.late]
-    p = variant._of_question @ np.concatenate([ask.x, ask.target])
-    mixed = variant._mixed_share(i, p, variant._numbers(p, ask.outlook))
-    if mixed is not None and same(mixed.weights @ table[mixed.policies]):
-        return np.asarray(mixed.weights @ mixture.theta[mixed.policies])
-    theta = exact_gains(one, i, ask)
-    assert same(backoff_table(one.design, part, i, theta[None])[0]), "no policy has the answer's back-offs"
-    return theta
+    for theta in (one.policies[i].theta, exact_gains(one, i, ask)):
+        table = backoff_table(one.design, part, i, theta[None])[0]
+        if np.allclose(told, table, rtol=1e-9, atol=1e-9 * told.max()):
+            return theta
+    raise AssertionError("no policy has the answer's back-offs")
 
 
 def exact_gains(one: Case, i: int, ask: Asked) -> Array:
