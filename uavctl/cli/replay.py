@@ -41,20 +41,14 @@ def recorded_flyer(flight: Path, config: Config) -> Prepared:
     """Return the controller that flew in a recording.
 
     Raises:
-        RecordingError: It flew with a policy library, or the controller of another package that flew is not here.
+        RecordingError: The controller of another package that flew is not here.
     """
-    recorded = header(flight)
-    if recorded.library_id is not None:
-        raise RecordingError(
-            f"{flight}: was flown with a policy library, which this version does not have; replay it with "
-            f"{_WITH_LIBRARY}, or decide it anew with --set solver.method=exact"
-        )
     try:
         return prepare(config, design_of(config))
     except DesignError as error:
         if error.key != KEY:
             raise
-        flown = recorded.versions.get(CONTROLLER, config.smpc.controller)
+        flown = header(flight).versions.get(CONTROLLER, config.smpc.controller)
         raise RecordingError(
             f"{flight}: was flown by a controller of another package, {flown}, which is not here: "
             f"{error.reason}; {error.hint}"
@@ -126,6 +120,11 @@ def replay_flight(flight: Path, tolerance: float = 0.0, overrides: Sequence[str]
         controller = changed_flyer(loaded).controller
         changed = tuple(_changes(msgspec.to_builtins(config), msgspec.to_builtins(loaded.config), ""))
         config = loaded.config
+    elif recorded.library_id is not None:
+        raise RecordingError(
+            f"{flight}: was flown with a policy library, which this version does not have; replay it with "
+            f"{_WITH_LIBRARY}, or decide it anew with --set solver.method=exact"
+        )
     else:
         controller, changed = recorded_flyer(flight, config).controller, ()
     holes = note.text if note is not None and note.text.startswith(RECOVERED) and HOLES in note.text else ""

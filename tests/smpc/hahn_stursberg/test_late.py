@@ -25,6 +25,7 @@ from uavctl.records import Decision, Plan, SolveStatus
 from uavctl.smpc.answer import Preview
 from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec, make_design
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver, make_late, with_late
+from uavctl.smpc.hahn_stursberg.frozen import ShortcutSolver
 from uavctl.smpc.link import LatePackets, gilbert_elliott
 from uavctl.smpc.sets import Polytope
 
@@ -309,19 +310,18 @@ def test_the_printed_solver_is_for_what_it_knows() -> None:
 
 # All plans go to the same target: no axis leads.
 LATE = ("link.delay_s=0.25", "link.loss=0.1", "clock.latency_s=0.25", "envelope.lead_s=0")
-LATE_LINK = (*LATE, "solver.method=exact")
 
 
 @pytest.fixture(scope="module")
 def late_flight() -> Memory:
-    return lockstep("room-hahn-stursberg", 12.0, *LATE_LINK)
+    return lockstep("room-hahn-stursberg", 12.0, *LATE)
 
 
 @pytest.mark.slow
 def test_a_flight_on_late_positions_plans_with_their_age(late_flight: Memory) -> None:
-    config = load_config("room-hahn-stursberg", list(LATE_LINK))
+    config = load_config("room-hahn-stursberg", list(LATE))
     design = build_design(config)
-    solver = ConicSolver(design)
+    solver = ShortcutSolver(design)
     ages = {decision.step: decision.age_steps for decision in late_flight.of(Decision) if decision.boundary}
     plans = late_flight.of(Plan)
     assert len(plans) > 40
@@ -339,7 +339,7 @@ def test_a_flight_on_late_positions_plans_with_their_age(late_flight: Memory) ->
 
 @pytest.mark.slow
 def test_a_flight_on_late_positions_keeps_its_limits(late_flight: Memory) -> None:
-    config = load_config("room-hahn-stursberg", list(LATE_LINK))
+    config = load_config("room-hahn-stursberg", list(LATE))
     lower, upper = np.array(config.sets.state_lower), np.array(config.sets.state_upper)
     data = flight(late_flight)
     positions = np.array([truth.position_m for truth in data.truths])
@@ -351,5 +351,5 @@ def test_a_flight_on_late_positions_keeps_its_limits(late_flight: Memory) -> Non
 
 @pytest.mark.slow
 def test_a_flight_on_late_positions_replays(late_flight: Memory) -> None:
-    config = load_config("room-hahn-stursberg", ["duration_s=12.0", *LATE_LINK])
+    config = load_config("room-hahn-stursberg", ["duration_s=12.0", *LATE])
     assert replay(late_flight.entries, lambda sink: make_loop(config, sink)).identical
