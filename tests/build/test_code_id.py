@@ -35,7 +35,7 @@ def test_a_hash_follows_the_sources(hash_of: Any, monkeypatch: pytest.MonkeyPatc
     ("changed", "maker", "decider"),
     [
         ("smpc/conic.py", True, True),
-        ("flight/step.py", False, True),
+        ("flight/tick.py", False, True),
         ("mavlink/codec.py", False, True),
         ("config/types.py", False, True),
         ("loop.py", False, True),
