@@ -11,22 +11,28 @@ import tempfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
+# The monitors of the vehicle's motion work on one state, and have their tests together.
+ENVELOPE = (
+    "tests/flight/test_envelope_observer.py",
+    "tests/flight/test_envelope_velocity.py",
+    "tests/flight/test_envelope.py",
+    "tests/flight/test_observer.py",
+)
 # The safety core, and the tests that must see every change of it.
 TARGETS: dict[str, tuple[str, ...]] = {
-    "uavctl/flight/envelope.py": (
-        "tests/flight/test_envelope_observer.py",
-        "tests/flight/test_envelope_velocity.py",
-        "tests/flight/test_envelope.py",
-        "tests/flight/test_observer.py",
-    ),
     "uavctl/flight/fallback.py": ("tests/flight/test_fallback.py",),
     "uavctl/flight/limits.py": ("tests/flight/test_limits.py",),
-    "uavctl/flight/sensor_faults.py": (
-        "tests/flight/test_reach_rules.py",
-        "tests/flight/test_stuck_rules.py",
-        "tests/flight/test_envelope_observer.py",
-        "tests/flight/test_observer.py",
-    ),
+    "uavctl/flight/monitors/acceleration.py": ENVELOPE,
+    "uavctl/flight/monitors/braking.py": ENVELOPE,
+    "uavctl/flight/monitors/engaged.py": ENVELOPE,
+    "uavctl/flight/monitors/motion.py": ENVELOPE,
+    "uavctl/flight/monitors/observation.py": ENVELOPE,
+    "uavctl/flight/monitors/observer.py": ENVELOPE,
+    "uavctl/flight/monitors/outside.py": ENVELOPE,
+    "uavctl/flight/monitors/vehicle_velocity.py": ENVELOPE,
+    "uavctl/flight/monitors/velocity.py": ENVELOPE,
+    "uavctl/flight/monitors/outliers.py": ("tests/flight/test_reach_rules.py",),
+    "uavctl/flight/monitors/stale.py": ("tests/flight/test_stuck_rules.py",),
     "uavctl/mavlink/handover_states.py": ("tests/mavlink/test_mode.py",),
     "uavctl/mavlink/signing.py": ("tests/mavlink/test_signing.py", "tests/mavlink/test_gate.py"),
 }

@@ -15,8 +15,11 @@ from msgspec.structs import replace
 from uavctl.config import Config
 from uavctl.errors import in_words
 from uavctl.flight.controller import Controller
-from uavctl.flight.decision import CONTROLLER_FAULT
-from uavctl.flight.step import BIAS_AT_BOUND, BIAS_FREE, STRONG_PUSH, StepOutput, disbelieves, initial_state, step
+from uavctl.flight.events import BIAS_AT_BOUND, BIAS_FREE, STRONG_PUSH
+from uavctl.flight.monitors.external import CONTROLLER_FAULT
+from uavctl.flight.supervise import distrusts_positions
+from uavctl.flight.tick import TickOutput, make_initial_state
+from uavctl.flight.tick import tick as run_tick
 from uavctl.mavlink.connection import HUNG_UP, NO_HEARTBEAT, OVERRUN, STAMP_UNIT, WENT_SILENT, MavlinkConnection
 from uavctl.mavlink.handover import HAND_OVER_ORDERS, HandOver, HandoverStep
 from uavctl.mavlink.handover_guards import HandoverView, against_moving
@@ -118,7 +121,7 @@ class ControlLoop:
         self._hand_over = HandOver(config.hand_over, sees_it_down=config.relay.enabled)
         self._config = config.hand_over
         self._heard: tuple[Ack | Text, ...] = ()
-        self._state = initial_state()
+        self._state = make_initial_state()
         self._inbox: deque[tuple[int, Heard]] = deque()
         self._feels = config.estimator.inertial_std_mps2 > 0.0
         self._inertial: tuple[InertialSample, ...] = ()
@@ -196,7 +199,7 @@ class ControlLoop:
     @property
     def let_go(self) -> str:
         """Reason why the envelope let the vehicle go: what was seen and cannot be; empty as long as nothing was."""
-        return "" if self._state.breach is None else self._state.breach.text
+        return "" if self._state.monitors.release is None else self._state.monitors.release.text
 
     @property
     def who_flies(self) -> HandoverState:
@@ -266,13 +269,13 @@ class ControlLoop:
         self.course.see(at_ns, self._vehicle)
         self.course.decide(out.decision, out.events, estimated=out.estimate is not None)
         # A vehicle that climbs or lands must not do so by positions that have just been found to be wrong.
-        if out.astray and self._hand_over.has_begun:
+        if out.position_inconsistent and self._hand_over.has_begun:
             self._misled_ns = at_ns
         misled = self._misled_ns is not None and at_ns - self._misled_ns < MISLED_NS
-        held_back = misled or disbelieves(self._state)
+        held_back = misled or distrusts_positions(self._state)
         if self._relays and not held_back:
             for data in self._links[VEHICLE].relay(
-                self._relay, at_ns, refused=inp.samples if out.leaps else out.refused
+                self._relay, at_ns, refused=inp.samples if out.newest_inconsistent else out.refused
             ):
                 send(self._outgoing(VEHICLE, data, at_ns))
         if self._relays and self._vehicle is not None:
@@ -308,18 +311,18 @@ class ControlLoop:
             step_ns=step_ns,
         )
 
-    def _decide(self, inp: StepInput, notices: list[Event]) -> StepOutput:
+    def _decide(self, inp: StepInput, notices: list[Event]) -> TickOutput:
         """Run the core for a tick; a core that has failed is not run again, and the vehicle it flew has to land."""
         if not self.course.died:
             try:
-                self._state, out = step(self._state, inp, self._controller, carried=self._hand_over.has_begun)
+                self._state, out = run_tick(self._state, inp, self._controller, carried=self._hand_over.has_begun)
             except Exception as error:  # noqa: BLE001 the vehicle may be in the air by the positions that it gets
                 notices.append(self._die(error, inp.at_ns))
                 return self._without_core(inp, land=self._lands or self._hand_over.ours)
             return out
         return self._without_core(inp, land=False)
 
-    def _without_core(self, inp: StepInput, *, land: bool) -> StepOutput:
+    def _without_core(self, inp: StepInput, *, land: bool) -> TickOutput:
         """A tick of a controller that has failed: nothing is decided; once, the vehicle's own landing is asked for."""
         decision = Decision(
             tick=inp.tick,
@@ -339,7 +342,7 @@ class ControlLoop:
             rejected=0,
             reason=f"{FAILED} {self.course.died}",
         )
-        return StepOutput(estimate=None, plan=None, decision=decision, setpoint=None, events=(), land=land)
+        return TickOutput(estimate=None, plan=None, decision=decision, setpoint=None, events=(), land=land)
 
     def _die(self, error: Exception, at_ns: int) -> Event:
         """Note that the controller has failed: no setpoint is sent any more; positions still go to the vehicle.
@@ -450,7 +453,7 @@ class ControlLoop:
             self._unsure_since_ns = None
         return _newest_of_each(samples), tuple(heard), tuple(words)
 
-    def _record(self, out: StepOutput, at_ns: int) -> None:
+    def _record(self, out: TickOutput, at_ns: int) -> None:
         if out.estimate is not None:
             self._put("/uavctl/estimate", at_ns, out.estimate)
         if out.link is not None:
@@ -470,7 +473,7 @@ class ControlLoop:
             if event.severity is not Severity.INFO and event.code != ORDER_REFUSED:
                 yield event
 
-    def _command(self, told: HandoverStep, out: StepOutput, at_ns: int, send: Send) -> None:
+    def _command(self, told: HandoverStep, out: TickOutput, at_ns: int, send: Send) -> None:
         """Send the vehicle what the hand-over wants: a setpoint, a request, or nothing."""
         link = self._links[VEHICLE]
         sure = self._unsure_since_ns is None
@@ -500,7 +503,7 @@ class ControlLoop:
             text = "land: the vehicle is asked for it"
             yield command, replace(event, severity=Severity.INFO, code=ORDER_ACCEPTED, text=text) if landing else event
 
-    def _view(self, inp: StepInput, out: StepOutput) -> HandoverView:
+    def _view(self, inp: StepInput, out: TickOutput) -> HandoverView:
         """Return the inputs of the hand-over in this tick."""
         plant, estimate = self._controller.plant, out.estimate
         up_m, up_mps = None, 0.0
@@ -521,7 +524,7 @@ class ControlLoop:
             stop=inp.stop,
             unsure=self._unsure_since_ns is not None,
             unfit=unfit,
-            unsafe=out.unsafe,
+            unsafe=out.unsafe_to_climb,
             up_m=up_m,
             up_mps=up_mps,
             moves=moves_now(self._motion, inp.at_ns),

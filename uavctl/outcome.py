@@ -10,7 +10,8 @@ from enum import StrEnum
 
 from msgspec.structs import replace
 
-from uavctl.flight.decision import CONTROLLER_FAULT, MISSION_OVER
+from uavctl.flight.decide import MISSION_OVER
+from uavctl.flight.monitors.external import CONTROLLER_FAULT
 from uavctl.mavlink.handover import Passage
 from uavctl.mavlink.handover_guards import BROKEN_OFF, fails, silent
 from uavctl.mavlink.handover_states import HandoverEvent, HandoverState

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from logs.recording.design_view import DesignView, Floats, design_view
 from logs.recording.topics import END, GOES_ON, RecorderNote
 from uavctl.errors import RecordingError
-from uavctl.flight.decision import MISSION_OVER
-from uavctl.flight.envelope import BREACHES
+from uavctl.flight.decide import MISSION_OVER
+from uavctl.flight.supervise import RELEASES
 from uavctl.records import (
     ORDER_ACCEPTED,
     Checked,
@@ -132,7 +132,7 @@ class FlightData:
     @cached_property
     def breach(self) -> Event | None:
         """Return the envelope's event on an impossible observation, for which the vehicle was let go; else None."""
-        return next((one for one in self.events if one.code in BREACHES), None)
+        return next((one for one in self.events if one.code in RELEASES), None)
 
     @cached_property
     def landing(self) -> Landing | None:

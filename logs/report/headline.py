@@ -45,10 +45,11 @@ from logs.report.excursion import GRAVE_M, Excursion
 from logs.report.reasons import reasons
 from logs.report.verdicts import Flags, Judged, judge
 from uavctl.errors import RecordingError
-from uavctl.flight.envelope import OF_POSITIONS
 from uavctl.flight.estimator import DUPLICATE, TOO_OLD
-from uavctl.flight.gating import FUTURE, INVALID
-from uavctl.flight.sensor_faults import FROZEN, JUMP
+from uavctl.flight.measure import FUTURE, INVALID
+from uavctl.flight.monitors.outliers import JUMP
+from uavctl.flight.monitors.stale import FROZEN
+from uavctl.flight.supervise import OF_POSITIONS
 from uavctl.mavlink.clocksync import StampRefusal
 from uavctl.mavlink.codec import BAD_FIELD
 from uavctl.mavlink.connection import HUNG_UP, WENT_SILENT

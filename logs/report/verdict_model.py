@@ -31,8 +31,17 @@ from logs.report.statistics import (
 )
 from uavctl.build.controller import build_estimator, build_plant
 from uavctl.config import Config
-from uavctl.flight.decision import unready
-from uavctl.flight.kalman import Belief, Kalman, captured_ns, first_belief, make_kalman, predicted, shown_by, updated
+from uavctl.flight.context import describe_unready
+from uavctl.flight.kalman import (
+    Belief,
+    Kalman,
+    make_first_belief,
+    make_kalman,
+    predict,
+    read_capture_ns,
+    read_measurement,
+    update_with_position,
+)
 from uavctl.records import PositionSample
 
 # The flight's own filter over all its positions in the order of capture: what it foretold, and what came.
@@ -94,8 +103,8 @@ class Track:
     def __init__(self, flight: FlightData, kalman: Kalman, dead_ns: int = 0) -> None:
         self.kalman = kalman
         self.origin_ns = flight.origin_ns - flight.decisions[0].tick * flight.tick_ns
-        self.samples = sorted({captured_ns(one): one for one in flight.samples}.items())[:MOST]
-        ready = {one.tick: not unready(one.vehicle) for one in flight.step_inputs}
+        self.samples = sorted({read_capture_ns(one): one for one in flight.samples}.items())[:MOST]
+        ready = {one.tick: not describe_unready(one.vehicle) for one in flight.step_inputs}
         self.input_ns: list[int] = []
         self.inputs: list[Floats | None] = []
         for decision in flight.decisions:
@@ -113,11 +122,11 @@ class Track:
         belief, since = None, 0
         for at_ns, sample in self.samples:
             if belief is None:
-                belief = first_belief(self.kalman, sample)
+                belief = make_first_belief(self.kalman, sample)
                 continue
             belief = self.to(belief, at_ns)
             error, cov = self._error(belief, sample)
-            belief = updated(self.kalman, belief, sample)
+            belief = update_with_position(self.kalman, belief, sample)
             since = since + 1 if self._flown(at_ns) else 0
             if since > SETTLING:
                 yield belief, error, np.sqrt(np.diagonal(cov))
@@ -139,7 +148,7 @@ class Track:
             chosen = {-(-(at_ns - begun_ns) // dt_ns): sample for at_ns, sample in self.samples[first:last]}
             now = belief
             for lead, sample in chosen.items():
-                at_ns = captured_ns(sample)
+                at_ns = read_capture_ns(sample)
                 if not self._flown(at_ns):
                     break
                 now, free_ns = self.to(now, at_ns), at_ns
@@ -151,16 +160,16 @@ class Track:
         place = bisect_right(self.input_ns, belief.at_ns)
         u = self.inputs[place - 1] if place else None
         while place < len(self.input_ns) and self.input_ns[place] < at_ns:
-            belief = predicted(self.kalman, self.origin_ns, belief, u, self.input_ns[place])
+            belief = predict(self.kalman, self.origin_ns, belief, u, self.input_ns[place])
             u = self.inputs[place]
             place += 1
-        return predicted(self.kalman, self.origin_ns, belief, u, at_ns)
+        return predict(self.kalman, self.origin_ns, belief, u, at_ns)
 
     def _error(self, belief: Belief, sample: PositionSample) -> tuple[Floats, Floats]:
         """Return position minus belief (axes,) [m], and the covariance that it should have (axes, axes) [m²]."""
-        values, variances = shown_by(self.kalman, sample)
+        values, variances = read_measurement(self.kalman, sample)
         axes = len(self.kalman.axes)
-        index = self.kalman.shown[:axes]
+        index = self.kalman.measured_index[:axes]
         cov = belief.cov[np.ix_(index, index)] + np.diag(variances[:axes])
         return np.asarray(values[:axes] - belief.mean[index]), np.asarray(cov)
 

@@ -19,7 +19,7 @@ from uavctl.build.link import build_ages, build_delayed_link, promised
 from uavctl.config import Config
 from uavctl.config.load import parse_recorded
 from uavctl.errors import ConfigError, DesignError
-from uavctl.flight.link_estimate import NOTHING_SEEN, LinkEstimateParameters, burst_statistic, observe
+from uavctl.flight.link_estimate import NO_COUNTS, LinkEstimateParameters, compute_burst_statistic, count_step
 from uavctl.records import ControlMode, LinkStats, PositionSample, Truth, duration
 
 # Verdict on the clocks: where capture times come from, how steady the offset was, and how true the stamps were.
@@ -253,10 +253,10 @@ def delays_s(flight: FlightData) -> Floats:
 
 
 def _bursts(arrived: list[bool]) -> float:
-    belief = NOTHING_SEEN
+    belief = NO_COUNTS
     for one in arrived:
-        belief = observe(belief, one, LinkEstimateParameters(promised=0.0, half_life_steps=float("inf")))
-    return burst_statistic(belief)
+        belief = count_step(belief, one, LinkEstimateParameters(promised=0.0, half_life_steps=float("inf")))
+    return compute_burst_statistic(belief)
 
 
 def _worth(arrived: list[bool]) -> float:

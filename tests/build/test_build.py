@@ -71,7 +71,9 @@ def test_a_controller_holds_the_configuration_s_numbers() -> None:
 )
 def test_a_velocity_that_is_made_of_our_positions_is_no_witness(overrides: list[str], asked: bool) -> None:
     config = load_config("room-hahn-stursberg", overrides)
-    assert (build_controller(config, build_design(load_config("room-hahn-stursberg"))).trust.at_rest_mps > 0.0) == asked
+    assert (
+        build_controller(config, build_design(load_config("room-hahn-stursberg"))).position_gate.at_rest_mps > 0.0
+    ) == asked
 
 
 @pytest.mark.slow

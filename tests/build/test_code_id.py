@@ -32,7 +32,7 @@ def test_the_hash_follows_the_sources(monkeypatch: pytest.MonkeyPatch, tmp_path:
     ("changed", "decides"),
     [
         ("smpc/conic.py", True),
-        ("flight/step.py", True),
+        ("flight/tick.py", True),
         ("mavlink/codec.py", True),
         ("config/types.py", True),
         ("loop.py", True),

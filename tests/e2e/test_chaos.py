@@ -43,6 +43,6 @@ def test_the_random_flights_see_every_mode_refusal_and_answer() -> None:
 @pytest.mark.parametrize("planted", [(2.1, 0.0, 0.0), (math.nan, 0.0, 0.0), (0.0, 0.0, -1.6)])
 def test_a_planted_bug_is_counted(planted: Vec3, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        "uavctl.flight.step.gate", lambda want, *_: (planted if want[0] < -1.0 else (0.0, 0.0, 0.0), ())
+        "uavctl.flight.act.limit_setpoint", lambda want, *_: (planted if want[0] < -1.0 else (0.0, 0.0, 0.0), ())
     )
     assert soak_core(500, seed=24, orders=False).unsound > 0

@@ -382,7 +382,7 @@ def test_the_controller_fails_and_the_relay_goes_on(
         raise ArithmeticError("the core is broken")
 
     rig = Endings(tmp_path, "relay.enabled=true", "sim.plant=quadrotor")
-    rig.at(HandoverState.ENGAGED, lambda _: monkeypatch.setattr(control, "step", broken), after_s=2.0)
+    rig.at(HandoverState.ENGAGED, lambda _: monkeypatch.setattr(control, "run_tick", broken), after_s=2.0)
     told = typed(rig, Cause.CONTROL, *TAKE_OFF)
     assert "the core is broken" in told.ending["sentence"] and "landed and disarmed" in told.ending["sentence"]
     assert "after the last setpoint" in told.ending["relay"] and told.ending["relay"] in told.console

@@ -53,7 +53,7 @@ def test_a_flight_whose_replay_differs_is_told(tmp_path: Path, monkeypatch: pyte
         memory += 1
         return (1e-9 * memory, 0.0, 0.0), ()
 
-    monkeypatch.setattr("uavctl.flight.step.gate", forgetful)
+    monkeypatch.setattr("uavctl.flight.act.limit_setpoint", forgetful)
     found = replayed(SEEDS[0], tmp_path)
     assert not found.good
     report = tally([found])

@@ -121,7 +121,7 @@ def test_the_faults_of_many_seeds_are_of_every_kind_and_the_same_each_time() -> 
 def test_a_planted_setpoint_is_found_and_its_flight_recorded(
     faulty: Prepared, planted: Vec3, text: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("uavctl.flight.step.gate", lambda *_: (planted, ()))
+    monkeypatch.setattr("uavctl.flight.act.limit_setpoint", lambda *_: (planted, ()))
     batch = fly_faults(faulty, 3, 1e-6, warm_up=0, out=tmp_path, flight_s=2.0)
     assert any(text in finding for finding in batch.wrong[3])
     assert any(isinstance(record, Truth) for _, _, record in read(tmp_path / "faults-3.mcap"))
@@ -131,7 +131,7 @@ def test_an_exception_is_a_finding(faulty: Prepared, monkeypatch: pytest.MonkeyP
     def broken(*_: object) -> None:
         raise ZeroDivisionError("planted")
 
-    monkeypatch.setattr("uavctl.flight.step.gate", broken)
+    monkeypatch.setattr("uavctl.flight.act.limit_setpoint", broken)
     assert fly_faults(faulty, 3, 1e-6, warm_up=0).wrong == {3: ("ZeroDivisionError: planted",)}
 
 

@@ -7,6 +7,7 @@ import re
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from inspect import getsource
 from types import FrameType
 from typing import TypeVar
 
@@ -16,6 +17,7 @@ from places import ROOT
 
 from sim.simulation import World
 from uavctl.config import load_config
+from uavctl.flight.tick import tick
 from uavctl.loop import ControlLoop
 from uavctl.records import LinkStats, Outgoing, Plan, Received, Send
 
@@ -81,12 +83,19 @@ def watched() -> Watched:
 
 def test_a_position_crosses_few_files(watched: Watched) -> None:
     assert len(watched.positions) > 30
-    assert max(map(len, watched.positions)) <= 20
+    assert max(map(len, watched.positions)) <= 12
 
 
-def test_a_planning_tick_crosses_few_files(watched: Watched) -> None:
+def test_the_phases_run_in_the_order_that_the_page_draws() -> None:
+    drawn = re.findall(r"uavctl/flight/(\w+)\.py +(\d):", PAGE)
+    assert [number for _, number in drawn] == list("123456")
+    calls = re.findall(r"^    \w+ = (\w+)\(", getsource(tick), re.MULTILINE)[1:-1]
+    modules = [getattr(sys.modules[tick.__module__], name).__module__ for name in calls]
+    assert modules == [f"uavctl.flight.{name}" for name, _ in drawn]
+
+
+def test_planning_ticks_were_watched(watched: Watched) -> None:
     assert len(watched.planning) > 30
-    assert max(map(len, watched.planning)) <= 27
 
 
 @pytest.mark.parametrize(("title", "of"), [("A position", "positions"), ("A planning tick", "planning")])

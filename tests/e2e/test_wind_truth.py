@@ -14,19 +14,12 @@ from sim.simulation import World
 from sim.vehicle.quadrotor import Quadrotor
 from uavctl.build.controller import build_envelope, build_plant
 from uavctl.config import load_config
-from uavctl.flight.envelope import (
-    BRAKING,
-    BREACHES,
-    NOT_WATCHING,
-    OF_POSITIONS,
-    OUTSIDE,
-    RESPONSE,
-    Observation,
-    Watching,
-    watch,
-)
+from uavctl.flight.events import STRONG_PUSH
 from uavctl.flight.limits import ZERO
-from uavctl.flight.step import STRONG_PUSH
+from uavctl.flight.monitors.engaged import INITIAL, MonitorState, update
+from uavctl.flight.monitors.observation import Observation
+from uavctl.flight.monitors.verdict import Cause
+from uavctl.flight.supervise import OF_POSITIONS, RELEASES
 from uavctl.lab.own_loop import EXTERNAL_ONLY
 from uavctl.lab.trial import WatchedFlyer, beyond_m, controller_of, room_of
 from uavctl.loop import VEHICLE, ControlLoop, make_links
@@ -117,7 +110,7 @@ def blown(autopilot: str, push_mps2: Vec3, *overrides: str, seed: int = 3, over_
     goals = (config.target.position_m, *config.mission.waypoints)
     off = np.linalg.norm(where - np.array(goals[-1]), axis=1)
     lower, upper = room_of(config)
-    let_go = [event.at_ns * 1e-9 for event in told.events if event.code in BREACHES]
+    let_go = [event.at_ns * 1e-9 for event in told.events if event.code in RELEASES]
     return Blown(
         codes=[event.code for event in told.events],
         from_target_m=float(off[times > over_s - 1.0].max()),
@@ -144,7 +137,7 @@ def blown(autopilot: str, push_mps2: Vec3, *overrides: str, seed: int = 3, over_
 @pytest.mark.fault(71)
 def test_a_wind_that_the_vehicle_can_hold_is_held(autopilot: str, push_mps2: Vec3) -> None:
     flight = blown(autopilot, push_mps2)
-    assert flight.let_go_s is None and not BREACHES & set(flight.codes)
+    assert flight.let_go_s is None and not RELEASES & set(flight.codes)
     assert flight.from_target_m < NEAR_M and flight.worst_m < 1.0
     assert max(flight.relayed_s) > OVER_S - 0.5
 
@@ -155,7 +148,7 @@ def test_a_wind_that_the_vehicle_can_hold_is_held(autopilot: str, push_mps2: Vec
 @pytest.mark.fault(72)
 def test_a_wind_that_it_cannot_hold_lets_it_land_by_its_positions(autopilot: str) -> None:
     flight = blown(autopilot, (6.0, 0.0, 0.0))
-    assert flight.let_go_s is not None and set(flight.codes) & {OUTSIDE, BRAKING}
+    assert flight.let_go_s is not None and set(flight.codes) & {Cause.OUTSIDE, Cause.BRAKING}
     assert not OF_POSITIONS & set(flight.codes) and STRONG_PUSH in flight.codes
     after = [at_s for at_s in flight.relayed_s if flight.let_go_s < at_s < flight.let_go_s + 3.0]
     assert len(after) > 20 and max(np.diff([flight.let_go_s, *after])) < 1.0
@@ -202,11 +195,11 @@ TICK_NS = 50_000_000
 NO_VELOCITY: Vec3 = (math.nan, math.nan, math.nan)
 
 
-def watched(*, feels: bool) -> tuple[Watching, str | None, float]:
+def watched(*, feels: bool) -> tuple[MonitorState, str | None, float]:
     """The envelope's state, breach, and time [s] at the end of the recording, or where it finds a breach."""
     config = load_config("room-px4", ["daemon.mocap=tlog", "daemon.vehicle=tlog", "relay.enabled=true"])
     parameters, link = build_envelope(config, build_plant(config)), make_links(config)[VEHICLE]
-    watching, motion, felt = NOT_WATCHING, None, None
+    watching, motion, felt = INITIAL, None, None
     setpoint: Vec3 | None = None
     acts, samples = ZERO, list[PositionSample]()
     begin_ns = now_ns = packets(STEADY)[0].at_ns
@@ -224,9 +217,9 @@ def watched(*, feels: bool) -> tuple[Watching, str | None, float]:
                     braking=False,
                     inertial_mps2=felt if feels else None,
                 )
-                watching, breach = watch(watching, seen, parameters)
-                if breach is not None:
-                    return watching, breach.code, (now_ns - begin_ns) * 1e-9
+                watching, breach = update(watching, seen, parameters)
+                if breach.cause is not None:
+                    return watching, breach.cause, (now_ns - begin_ns) * 1e-9
             acts, samples = setpoint or ZERO, []
         if one.outgoing:
             (frame,) = scan(one.data, final=True).frames
@@ -246,7 +239,7 @@ def watched(*, feels: bool) -> tuple[Watching, str | None, float]:
 def test_a_recorded_wind_that_px4_held_is_no_false_position_by_its_inertial_data() -> None:
     """Its client of then looked at positions and setpoints alone, and let it go after 13.4 s."""
     blind, code, at_s = watched(feels=False)
-    assert code == RESPONSE and at_s == pytest.approx(13.4, abs=0.1) and not blind.pushed
+    assert code == Cause.RESPONSE and at_s == pytest.approx(13.4, abs=0.1) and not blind.acceleration.is_pushed
     felt, none, end_s = watched(feels=True)
     assert none is None and end_s >= at_s
-    assert felt.pushed and felt.push_mps2[0] == pytest.approx(-1.7, abs=0.3)
+    assert felt.acceleration.is_pushed and felt.motion.push_mps2[0] == pytest.approx(-1.7, abs=0.3)

@@ -34,9 +34,11 @@ from uavctl.build.controller import build_controller, build_design, build_spec
 from uavctl.config import load_config
 from uavctl.errors import ConfigError
 from uavctl.flight.controller import Controller
-from uavctl.flight.estimator import absorb, begin, estimate, set_input
+from uavctl.flight.estimator import absorb_samples, begin_history, estimate_at, note_input
+from uavctl.flight.events import BIAS_AT_BOUND, BIAS_FREE
 from uavctl.flight.kalman import make_kalman
-from uavctl.flight.step import BIAS_AT_BOUND, BIAS_FREE, initial_state, step
+from uavctl.flight.tick import make_initial_state
+from uavctl.flight.tick import tick as run_tick
 from uavctl.records import ControlMode, PositionSample, StepInput, VehicleMotion
 from uavctl.smpc.answer import NOMINAL, Answer, Preview
 from uavctl.smpc.estimate import innovations, with_bias
@@ -76,13 +78,13 @@ def pushed(bias: float, steps: int) -> Array:
 def found(bias: float, *, others_until: int = 0, order: int = 1, **changes: float) -> tuple[float, ...]:
     """The bias that the filter has found after 60 s; others fly up to a step, and samples come in either order."""
     kalman = make_kalman(small_plant(), estimator_parameters(bias_drift=DRIFT, bias_max=MOST, **changes), DT_NS)
-    history = begin(kalman, START_NS, START_NS)
+    history = begin_history(kalman, START_NS, START_NS)
     places = pushed(bias, 300)
     for k in range(0, 300, 2):
         pair = [sample(START_NS + i * DT_NS, position_m=(float(places[i]), 0.0, 0.0)) for i in (k, k + 1)]
-        history, _, _ = absorb(kalman, history, START_NS + (k + 1) * DT_NS, pair[::order])
-        history = set_input(kalman, history, START_NS + (k + 1) * DT_NS, None if k < others_until else np.zeros(1))
-    now = estimate(kalman, history, START_NS + 299 * DT_NS)
+        history, _, _ = absorb_samples(kalman, history, START_NS + (k + 1) * DT_NS, pair[::order])
+        history = note_input(kalman, history, START_NS + (k + 1) * DT_NS, None if k < others_until else np.zeros(1))
+    now = estimate_at(kalman, history, START_NS + 299 * DT_NS)
     assert now is not None and len(now.mean) == 3
     return now.bias
 
@@ -102,11 +104,11 @@ def test_what_happens_while_others_fly_is_no_bias() -> None:
 def test_the_real_filter_settles_at_the_design_s_covariance() -> None:
     plant, parameters = small_plant(), estimator_parameters(bias_drift=DRIFT, bias_max=MOST)
     kalman = make_kalman(plant, parameters, DT_NS)
-    history = set_input(kalman, begin(kalman, START_NS, START_NS), START_NS, np.zeros(1))
+    history = note_input(kalman, begin_history(kalman, START_NS, START_NS), START_NS, np.zeros(1))
     for k in range(1, 400):
         at_ns = START_NS + k * DT_NS
-        history, _, _ = absorb(kalman, history, at_ns, [sample(at_ns - 150 * MS, at_ns)])
-    now = estimate(kalman, history, at_ns)
+        history, _, _ = absorb_samples(kalman, history, at_ns, [sample(at_ns - 150 * MS, at_ns)])
+    now = estimate_at(kalman, history, at_ns)
     assert now is not None
     form = innovations(plant, parameters.position_std_m, 0.15, 0, DRIFT)
     np.testing.assert_allclose(np.array(now.cov), form.estimate_cov, rtol=1e-6)
@@ -120,7 +122,7 @@ class _Biased:
 
     def __init__(self, controller: Controller, bias: Array, start: Array) -> None:
         self.controller, self.bias, self.x = controller, bias, start
-        self.state = initial_state()
+        self.state = make_initial_state()
         self.places: list[Array] = []
         self.inputs: list[Array] = []
         self.events: list[str] = []
@@ -138,7 +140,7 @@ class _Biased:
                 samples = (sample(at_ns, position_m=(float(north), float(east), float(down))),)
                 self.places.append(self.x[list(plant.position_index)])
             inp = StepInput(tick=tick, at_ns=at_ns, samples=samples, vehicle=vehicle())
-            self.state, output = step(self.state, inp, self.controller)
+            self.state, output = run_tick(self.state, inp, self.controller)
             self.events += [event.code for event in output.events if event.code in (BIAS_AT_BOUND, BIAS_FREE)]
             u = np.zeros(plant.n_u) if output.setpoint is None else plant.to_input(output.setpoint.accel_mps2)
             self.inputs.append(u)
@@ -257,24 +259,24 @@ def test_what_positions_that_are_taken_back_told_of_it_is_forgotten() -> None:
     """After 4 s positions go their own way, against the vehicle's word: it is let go, level, without what they told."""
     north = replace(PARAMETERS, axes=(True, False, False))
     controller = replace(make_controller(Steady(small_plant()), bias_drift=0.3, bias_max=MOST), envelope=north)
-    state, lies = initial_state(), 20 * TICKS
+    state, lies = make_initial_state(), 20 * TICKS
     for n in range(2 * lies):
         at_ns = START_NS + n * TICK_NS
         place = 0.33 * max(n - lies, 0) * TICK_NS * 1e-9
         said = sample(at_ns, position_m=(place, 0.0, 0.0))
         own = VehicleMotion(velocity_mps=(0.0, 0.0, 0.0), velocity_ns=at_ns)
         before = state
-        state, output = step(
+        state, output = run_tick(
             state, StepInput(tick=n, at_ns=at_ns, samples=(said,), vehicle=vehicle(), motion=own), controller
         )
-        if state.breach is not None:
+        if state.monitors.release is not None:
             break
-    assert state.breach is not None and n > lies + TICKS
-    clean_ns = state.watching.clean_ns
+    assert state.monitors.release is not None and n > lies + TICKS
+    clean_ns = state.monitors.engaged.clean_ns
     assert clean_ns is not None and lies * TICK_NS <= clean_ns - START_NS < n * TICK_NS
-    assert any(at_ns > clean_ns for at_ns, _ in before.biases)
-    assert state.biases == tuple(one for one in before.biases if one[0] <= clean_ns) != ()
-    assert state.history is not None and state.history.captured_ns == clean_ns
+    assert any(at_ns > clean_ns for at_ns, _ in before.fallback.biases)
+    assert state.fallback.biases == tuple(one for one in before.fallback.biases if one[0] <= clean_ns) != ()
+    assert state.estimator.history is not None and state.estimator.history.captured_ns == clean_ns
     assert output.estimate is not None and output.estimate.captured_ns == clean_ns
     assert output.decision.mode is ControlMode.HOLD and output.setpoint is not None
     assert output.setpoint.accel_mps2 == (0.0, 0.0, 0.0)

@@ -8,39 +8,42 @@ from dataclasses import FrozenInstanceError, replace
 
 import numpy as np
 import pytest
-from envelope_rig import AT_NS, PARAMETERS, TICK_NS, Array, just_less, just_more, look, motion, seen, vec3
+from envelope_rig import (
+    AT_NS,
+    PARAMETERS,
+    TICK_NS,
+    Array,
+    just_less,
+    just_more,
+    look,
+    monitors,
+    motion,
+    seen,
+    update,
+    vec3,
+)
 from flight_rig import MS, START_NS, drag_lag_generator, sample
 from msgspec import structs
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from uavctl.flight.envelope import (
-    BRAKING,
-    NOT_WATCHING,
-    OUTSIDE,
-    RESPONSE,
-    SCATTER,
-    VELOCITY,
-    Breach,
-    Observation,
-    Watching,
-    beyond,
-    is_outside,
-    lean_mps2,
-    watch,
-)
 from uavctl.flight.limits import ZERO
+from uavctl.flight.monitors.acceleration import compute_lean_mps2
+from uavctl.flight.monitors.engaged import INITIAL
+from uavctl.flight.monitors.observation import Observation, select_axes
+from uavctl.flight.monitors.outside import describe_beyond, is_outside
+from uavctl.flight.monitors.verdict import Cause, Verdict
 from uavctl.records import Vec3, VehicleMotion
 
 # The limits
 
 
-def at(position: Vec3 | None, velocity: Vec3 = ZERO, *, since_ns: int | None = AT_NS - 100 * MS) -> Breach | None:
+def at(position: Vec3 | None, velocity: Vec3 = ZERO, *, since_ns: int | None = AT_NS - 100 * MS) -> Verdict | None:
     """The answer to an estimate that has been outside since then."""
     ours = structs.replace(seen(AT_NS), position_m=position, velocity_mps=velocity)
-    watching, breach = watch(Watching(outside_ns=since_ns), ours, PARAMETERS)
-    assert is_outside(ours, PARAMETERS) == (watching.outside_ns is not None)
-    assert breach is None or (breach.code == OUTSIDE and watching.outside_ns == since_ns)
+    watching, breach = update(monitors(outside_ns=since_ns), ours, PARAMETERS)
+    assert is_outside(ours, PARAMETERS) == (watching.outside.since_ns is not None)
+    assert breach is None or (breach.cause == Cause.OUTSIDE and watching.outside.since_ns == since_ns)
     return breach
 
 
@@ -96,19 +99,19 @@ def test_an_estimate_that_comes_to_rest_at_the_margin_is_not_outside() -> None:
 def test_being_beyond_a_limit_is_without_what_braking_needs(beyond_m: float, speed: float) -> None:
     north = PARAMETERS.upper_m[0] + PARAMETERS.outside_m[0] + beyond_m
     ours = structs.replace(seen(AT_NS), position_m=(north, 0.0, -2.0), velocity_mps=(speed, 0.0, 0.0))
-    assert bool(beyond(ours, PARAMETERS)) == (beyond_m > 0.0 and speed > -0.3)
+    assert bool(describe_beyond(ours, PARAMETERS)) == (beyond_m > 0.0 and speed > -0.3)
 
 
 def test_being_outside_has_to_persist() -> None:
     out: Vec3 = (4.0, 0.0, -2.0)
     assert at(out, since_ns=None) is None
     assert at(out, since_ns=AT_NS - 100 * MS + 1) is None
-    watching = NOT_WATCHING
+    watching = INITIAL
     since = []
     for n, position in enumerate([out, out, (0.0, 0.0, -2.0), out, out, out, out]):
         ours = structs.replace(seen(START_NS + n * TICK_NS), position_m=position, velocity_mps=ZERO)
-        watching, breach = watch(watching, ours, PARAMETERS)
-        since.append(None if watching.outside_ns is None else (watching.outside_ns - START_NS) // TICK_NS)
+        watching, breach = update(watching, ours, PARAMETERS)
+        since.append(None if watching.outside.since_ns is None else (watching.outside.since_ns - START_NS) // TICK_NS)
         assert (breach is not None) == (n >= 5)
     assert since == [0, 0, None, 3, 3, 3, 3]
 
@@ -123,14 +126,14 @@ def test_an_estimate_that_is_no_number_is_outside() -> None:
 # Braking
 
 
-def braked(speeds: Iterator[tuple[int, float | None]], *, ends: Sequence[int] = ()) -> list[tuple[int, Breach]]:
+def braked(speeds: Iterator[tuple[int, float | None]], *, ends: Sequence[int] = ()) -> list[tuple[int, Verdict]]:
     """What comes of own velocities (north), each at a time [ms]; the fallback does not brake at those of `ends`."""
-    watching, found = NOT_WATCHING, []
+    watching, found = INITIAL, []
     for at_ms, speed in speeds:
         at_ns = START_NS + at_ms * MS
         own = None if speed is None else motion((0.6 * speed, 0.0, -0.8 * speed), at_ns)
         ours = structs.replace(seen(at_ns, own=own), braking=at_ms not in ends)
-        watching, breach = watch(watching, ours, PARAMETERS)
+        watching, breach = update(watching, ours, PARAMETERS)
         if breach is not None:
             found.append((at_ms, breach))
     return found
@@ -156,14 +159,14 @@ def braked(speeds: Iterator[tuple[int, float | None]], *, ends: Sequence[int] = 
 def test_braking_has_to_show(speeds: list[tuple[int, float | None]], ends: tuple[int, ...], found: list[int]) -> None:
     breaches = braked(iter(speeds), ends=ends)
     assert [at_ms for at_ms, _ in breaches] == found
-    assert {breach.code for _, breach in breaches} <= {BRAKING}
+    assert {breach.cause for _, breach in breaches} <= {Cause.BRAKING}
 
 
 @pytest.mark.parametrize(("for_ns", "breached"), [(10**9 - 1, False), (10**9, True), (10**9 + 1, True)])
 def test_braking_has_a_second_to_show(for_ns: int, breached: bool) -> None:
     for north, fast in ((0.3, False), (just_more(0.3), True)):
         ours = structs.replace(seen(AT_NS, own=motion((north, 0.0, 0.0), AT_NS)), braking=True)
-        _, breach = watch(Watching(braking=(AT_NS - for_ns, 0.0)), ours, PARAMETERS)
+        _, breach = update(monitors(braking=(AT_NS - for_ns, 0.0)), ours, PARAMETERS)
         assert (breach is not None) == (breached and fast)
 
 
@@ -173,14 +176,14 @@ def test_positions_that_come_back_correct_its_own_velocity_and_begin_braking_ane
     silent: bool, found: list[int]
 ) -> None:
     parameters = replace(PARAMETERS, disagreement_mps=100.0, unexplained_mps2=100.0)
-    watching, breaches = NOT_WATCHING, []
+    watching, breaches = INITIAL, []
     for now_ms in range(0, 2600, 50):
         at_ns = START_NS + now_ms * MS
         taken = () if silent and 0 < now_ms < 1500 else (sample(at_ns, at_ns, ZERO),)
         own = motion((0.1 if now_ms < 1500 else 0.9, 0.0, 0.0), at_ns)
-        watching, breach = watch(watching, structs.replace(seen(at_ns, *taken, own=own), braking=True), parameters)
+        watching, breach = update(watching, structs.replace(seen(at_ns, *taken, own=own), braking=True), parameters)
         if breach is not None:
-            assert breach.code == BRAKING
+            assert breach.cause == Cause.BRAKING
             breaches.append(now_ms)
     assert breaches[:1] == found
 
@@ -193,7 +196,7 @@ def test_the_lean_is_what_a_thrust_that_carries_the_vehicle_does_along_the_floor
     roll, pitch, yaw = np.random.default_rng(seed).uniform((-1.0, -1.0, -3.1), (1.0, 1.0, 3.1))
     thrust = Rotation.from_euler("ZYX", (yaw, pitch, roll)).apply([0.0, 0.0, -1.0])
     words = VehicleMotion(attitude_rad=(roll, pitch, yaw), attitude_ns=AT_NS)
-    lean = lean_mps2(words, AT_NS)
+    lean = compute_lean_mps2(words, AT_NS)
     assert lean == pytest.approx(tuple(9.81 * thrust[:2] / -thrust[2]))
 
 
@@ -212,14 +215,14 @@ def test_the_lean_is_what_a_thrust_that_carries_the_vehicle_does_along_the_floor
     ],
 )
 def test_an_attitude_that_is_old_or_on_its_side_says_nothing(words: VehicleMotion, known: bool) -> None:
-    assert (lean_mps2(words, AT_NS) is not None) == known
+    assert (compute_lean_mps2(words, AT_NS) is not None) == known
 
 
 def test_an_attitude_that_is_just_not_on_its_side_says_something() -> None:
     pitches = np.linspace(0.0, 0.5, 1001).tolist()
     leans = ((math.acos(0.1 / math.cos(pitch)), pitch, 0.0) for pitch in pitches)
     lean = next(one for one in leans if math.cos(one[0]) * math.cos(one[1]) == 0.1)
-    assert lean_mps2(VehicleMotion(attitude_rad=lean, attitude_ns=AT_NS), AT_NS) is not None
+    assert compute_lean_mps2(VehicleMotion(attitude_rad=lean, attitude_ns=AT_NS), AT_NS) is not None
 
 
 @pytest.mark.parametrize(
@@ -261,7 +264,7 @@ def test_a_breach_tells_whether_the_vehicle_leans_as_it_was_told(
         pitch = -math.atan(lean[0] / 9.81)
         own = VehicleMotion(attitude_rad=(math.atan(lean[1] / 9.81 * math.cos(pitch)), pitch, 0.0), attitude_ns=AT_NS)
     _, breach = look(unexplained, accel=(1.0, 0.0, 0.0), own=own)
-    assert breach is not None and breach.code == RESPONSE
+    assert breach is not None and breach.cause == Cause.RESPONSE
     north, east, down = unexplained
     assert f"({north:.1f}, {east:.1f}, {down:.1f}) m/s²" in breach.text and "(1.0, 0.0, 0.0) m/s²" in breach.text
     assert breach.text.endswith(words) and ("leans" in breach.text) == bool(words)
@@ -275,7 +278,7 @@ def test_axes_that_the_plant_has_not_are_not_looked_at() -> None:
     for axis in range(3):
         parameters = replace(PARAMETERS, axes=tuple(other == axis for other in range(3)))
         only = np.eye(3)[axis]
-        one = two = NOT_WATCHING
+        one = two = INITIAL
         for n in range(30):
             at_ns = START_NS + n * TICK_NS
             position, own, sent = (rng.normal(scale=0.01, size=3) for _ in range(3))
@@ -301,24 +304,33 @@ def test_axes_that_the_plant_has_not_are_not_looked_at() -> None:
                     inertial_mps2=vec3(sent * only + other),  # noqa: B023
                 )
 
-            one, breach = watch(one, tick(wild), parameters)
+            one, breach = update(one, tick(wild), parameters)
             assert breach is None
-            two, _ = watch(two, tick(np.zeros(3)), parameters)
+            two, _ = update(two, tick(np.zeros(3)), parameters)
             assert repr(one) == repr(two)
-        assert one.apart_mps is not None
+        assert one.velocity.apart_mps is not None
+
+
+def test_what_did_not_come_is_not_made_up_in_axes_that_the_plant_has_not() -> None:
+    parameters = replace(PARAMETERS, axes=(True, False, False))
+    silent = seen(AT_NS, sample(AT_NS, AT_NS, (1.0, 2.0, 3.0)))
+    for words in (None, VehicleMotion(), VehicleMotion(attitude_rad=ZERO, attitude_ns=AT_NS)):
+        selected = select_axes(structs.replace(silent, motion=words), parameters)
+        assert selected.motion == words and selected.inertial_mps2 is None
+        assert [(one.position_m, one.velocity_mps) for one in selected.samples] == [((1.0, 0.0, 0.0), None)]
 
 
 def test_a_tick_cannot_change_what_the_tick_before_left_nor_anybody_what_is_possible() -> None:
     watching, _ = look(ZERO)
-    assert watching.observer is not None
-    for thing in (watching, watching.observer, seen(AT_NS), Breach("", "")):
+    assert watching.motion.observer is not None
+    for thing in (watching, watching.motion.observer, seen(AT_NS), Verdict()):
         with pytest.raises(AttributeError):
             setattr(thing, thing.__struct_fields__[0], None)
     with pytest.raises(FrozenInstanceError):
         replace(PARAMETERS).begins_mps = 1.0  # type: ignore[misc]
     # Nor are they compared by their arrays, which have no one truth.
     assert watching != structs.replace(watching)
-    assert watching.observer != structs.replace(watching.observer)
+    assert watching.motion.observer != structs.replace(watching.motion.observer)
 
 
 # Vehicles that fly as they are told, and frames that do not fit
@@ -329,23 +341,23 @@ Camera = Callable[[float, Array], Array]  # time, true position -> what it says
 
 def fly(
     camera: Camera, *, drag_1ps: float = 0.3, own: bool = False, accel_mps2: float = 2.0, stall: range = range(0)
-) -> tuple[float, float, str] | None:
+) -> tuple[float, float, Cause | None] | None:
     """A vehicle is sent to and fro, by `expm`, for 10 s: (time, largest true distance so far, code) of a breach."""
     rng = np.random.default_rng(2)
     parameters = replace(PARAMETERS, unexplained_mps2=1.5, lag_s=(0.25, 0.25, 0.25), lower_m=(-99.0,) * 3)
     step = expm(drag_lag_generator(drag_1ps, 0.25) * TICK_NS * 1e-9)
-    x, watching, sent, far_m = np.zeros((5, 3)), NOT_WATCHING, ZERO, 0.0
+    x, watching, sent, far_m = np.zeros((5, 3)), INITIAL, ZERO, 0.0
     for n in range(200):
         t, at_ns = n * 0.05, START_NS + n * TICK_NS
         far_m = max(far_m, float(np.linalg.norm(x[0])))
         if n not in stall:
             said = camera(t, x[0]) + rng.normal(scale=0.003, size=3)
             words = motion(vec3(x[1] + rng.normal(scale=0.02, size=3)), at_ns) if own else None
-            watching, breach = watch(
+            watching, breach = update(
                 watching, seen(at_ns, sample(at_ns, None, vec3(said)), sent=sent, own=words), parameters
             )
             if breach is not None:
-                return t, far_m, breach.code
+                return t, far_m, breach.cause
             north = accel_mps2 if int(t / 0.8 + 0.5) % 2 else -accel_mps2
             sent = (north, -0.5 * north, -0.3 * north)
         x[4] = sent
@@ -393,7 +405,7 @@ def test_frames_that_do_not_fit_and_loose_markers_are_found_before_the_vehicle_i
     found = fly(camera, own=own)
     assert found is not None
     assert found[1] < 1.0
-    assert found[2] in {RESPONSE, VELOCITY, SCATTER}
+    assert found[2] in {Cause.RESPONSE, Cause.VELOCITY, Cause.SCATTER}
 
 
 @pytest.mark.fault(42)

@@ -19,36 +19,31 @@ from envelope_rig import (
     PARAMETERS,
     TICK_NS,
     S,
+    changed,
+    is_inertial_inconsistent,
+    is_prediction_inconsistent,
     just_less,
     just_more,
     look,
+    monitors,
     motion,
     offsets,
     seen,
+    trusted_velocity,
+    update,
     vec3,
 )
 from flight_rig import MS, START_NS, sample
 from msgspec import structs
 from scipy.linalg import expm
 
-from uavctl.flight.envelope import (
-    BRAKING,
-    BREACHES,
-    NOT_WATCHING,
-    OUTSIDE,
-    RESPONSE,
-    SCATTER,
-    VELOCITY,
-    Observation,
-    Watching,
-    contradicts,
-    misled,
-    own_velocity,
-    watch,
-    witness,
-)
 from uavctl.flight.limits import ZERO
-from uavctl.flight.sensor_faults import Observer
+from uavctl.flight.monitors.engaged import INITIAL, MonitorState
+from uavctl.flight.monitors.observation import Observation
+from uavctl.flight.monitors.observer import Observer
+from uavctl.flight.monitors.vehicle_velocity import find_confirmed_velocity
+from uavctl.flight.monitors.verdict import Cause
+from uavctl.flight.supervise import RELEASES
 from uavctl.records import Vec3, VehicleMotion
 
 # The observer
@@ -103,8 +98,8 @@ class Textbook:
         return bool(abs(innovation) > bound)
 
 
-def same(watching: Watching, want: Sequence[Textbook]) -> None:
-    observer = watching.observer
+def same(watching: MonitorState, want: Sequence[Textbook]) -> None:
+    observer = watching.motion.observer
     assert observer is not None
     assert {one.at_ns for one in want} == {observer.at_ns}
     for axis, one in enumerate(want):
@@ -123,7 +118,7 @@ def test_the_observer_is_the_textbook_s_whatever_comes_when(seed: int, lag_s: Ve
     parameters = replace(PARAMETERS, lag_s=lag_s, unexplained_mps2=unexplained_mps2)
     at_ns, captured_ns = START_NS, START_NS - 7 * MS
     inputs: list[list[tuple[int, float]]] = [[], [], []]
-    watching, sent, clipped = NOT_WATCHING, ZERO, 0
+    watching, sent, clipped = INITIAL, ZERO, 0
     books: list[Textbook] = []
     for _ in range(30):
         before_ns, at_ns = at_ns, at_ns + int(rng.integers(20, 120)) * MS
@@ -151,7 +146,7 @@ def test_the_observer_is_the_textbook_s_whatever_comes_when(seed: int, lag_s: Ve
                 for axis, book in enumerate(books):
                     book.predict(one.captured_ns, inputs[axis])
                     clipped += book.correct(one.position_m[axis])
-        watching, _ = watch(watching, seen(at_ns, *samples[::-1], sent=sent), parameters)
+        watching, _ = update(watching, seen(at_ns, *samples[::-1], sent=sent), parameters)
         if books:
             same(watching, books)
     assert clipped
@@ -168,7 +163,7 @@ def test_the_drag_that_explains_most_is_taken_away_up_to_a_bound(seed: int) -> N
     least = rests[np.argmin(np.sum(rests**2, axis=1))]
     watching, _ = look(vec3(d), vec3(v))
     want = max(math.hypot(least[0], least[1]), abs(least[2]))
-    assert watching.unexplained_mps2 == pytest.approx(want, abs=2e-3)
+    assert watching.acceleration.unexplained_mps2 == pytest.approx(want, abs=2e-3)
 
 
 @pytest.mark.parametrize(
@@ -186,7 +181,7 @@ def test_the_drag_that_explains_most_is_taken_away_up_to_a_bound(seed: int) -> N
 )
 def test_what_is_left_as_unexplained(unexplained: Vec3, velocity: Vec3, rest_mps2: float) -> None:
     watching, breach = look(unexplained, velocity)
-    assert watching.unexplained_mps2 == pytest.approx(rest_mps2, abs=1e-12)
+    assert watching.acceleration.unexplained_mps2 == pytest.approx(rest_mps2, abs=1e-12)
     assert breach is None
 
 
@@ -212,10 +207,10 @@ def test_an_acceleration_beyond_the_bound_has_to_persist_and_a_plain_one_has_not
         d = [0.0, 0.0, 0.0]
         d[axis] = unexplained_mps2
         watching, breach = look(vec3(d), over_ns=over_ns)
-        assert watching.unexplained_mps2 == abs(unexplained_mps2)
-        assert watching.over_ns == since_ns
+        assert watching.acceleration.unexplained_mps2 == abs(unexplained_mps2)
+        assert watching.acceleration.over_ns == since_ns
         assert (breach is not None) == breached
-        assert breach is None or breach.code == RESPONSE
+        assert breach is None or breach.cause == Cause.RESPONSE
 
 
 @pytest.mark.parametrize(
@@ -232,7 +227,7 @@ def test_an_acceleration_beyond_the_bound_has_to_persist_and_a_plain_one_has_not
 def test_clean_is_what_nothing_speaks_against(unexplained_mps2: float, off_m: float, apart: bool, clean: bool) -> None:
     known = offsets(0.3) if apart else {}
     watching, _ = look((unexplained_mps2, 0.0, 0.0), off_m=off_m, own=AT_REST, clean_ns=START_NS - 5, **known)
-    assert (watching.apart_ns is not None) == apart
+    assert (watching.velocity.apart_ns is not None) == apart
     assert watching.clean_ns == (AT_NS if clean else START_NS - 5)
 
 
@@ -253,8 +248,8 @@ def test_three_of_five_positions_that_are_far_off_are_no_chance(
     before: tuple[bool, ...], off_m: float, breached: bool
 ) -> None:
     watching, breach = look(ZERO, off_m=off_m, clipped=before)
-    assert watching.clipped == (*before, off_m > 0.15)[-5:]
-    assert (None if breach is None else breach.code) == (SCATTER if breached else None)
+    assert watching.acceleration.clipped == (*before, off_m > 0.15)[-5:]
+    assert (None if breach is None else breach.cause) == (Cause.SCATTER if breached else None)
 
 
 def test_an_innovation_counts_up_to_six_standard_deviations() -> None:
@@ -269,147 +264,149 @@ def test_an_innovation_counts_up_to_six_standard_deviations() -> None:
         for axis in range(3):
             place = [0.0, 0.0, 0.0]
             place[axis] = off_m
-            watching, _ = watch(
-                Watching(observer=at_rest), seen(at_ns, sample(at_ns, position_m=vec3(place))), PARAMETERS
+            watching, _ = update(
+                monitors(observer=at_rest), seen(at_ns, sample(at_ns, position_m=vec3(place))), PARAMETERS
             )
-            assert watching.clipped == (clipped,)
+            assert watching.acceleration.clipped == (clipped,)
 
 
 def test_an_innovation_at_its_bound_is_not_clipped() -> None:
     bound_m = 6.0 * math.sqrt(2.0**2 * ((LOOK_NS * 1e-9) ** 5 / 20) + 0.02**2)
     for off_m, clipped in ((bound_m, False), (just_more(bound_m), True)):
         watching, _ = look(ZERO, off_m=off_m)
-        assert watching.clipped == (clipped,)
+        assert watching.acceleration.clipped == (clipped,)
 
 
 @pytest.mark.parametrize(("since_ns", "counts"), [(40 * MS, True), (40 * MS - 1, False), (0, False), (-S, False)])
 def test_positions_that_are_late_or_close_to_one_another_say_nothing_new(since_ns: int, counts: bool) -> None:
-    watching, _ = watch(NOT_WATCHING, seen(START_NS, sample(START_NS)), PARAMETERS)
+    watching, _ = update(INITIAL, seen(START_NS, sample(START_NS)), PARAMETERS)
     at_ns = START_NS + 80 * MS
-    after, _ = watch(watching, seen(at_ns, sample(START_NS + since_ns, at_ns)), PARAMETERS)
-    assert after.observer is not None
-    assert (after.observer is not watching.observer) == counts
-    assert after.clean_ns == after.observer.at_ns == START_NS + (since_ns if counts else 0)
+    after, _ = update(watching, seen(at_ns, sample(START_NS + since_ns, at_ns)), PARAMETERS)
+    assert after.motion.observer is not None
+    assert (after.motion.observer is not watching.motion.observer) == counts
+    assert after.clean_ns == after.motion.observer.at_ns == START_NS + (since_ns if counts else 0)
 
 
 def test_a_stamp_after_the_arrival_counts_as_the_arrival() -> None:
-    watching, _ = watch(NOT_WATCHING, seen(START_NS, sample(START_NS + 9 * MS, START_NS - MS)), PARAMETERS)
-    assert watching.observer is not None and watching.observer.at_ns == START_NS - MS
+    watching, _ = update(INITIAL, seen(START_NS, sample(START_NS + 9 * MS, START_NS - MS)), PARAMETERS)
+    assert watching.motion.observer is not None and watching.motion.observer.at_ns == START_NS - MS
 
 
 @pytest.mark.parametrize(("silent_ns", "anew"), [(3 * S, True), (3 * S + MS, True), (3 * S - 1, False)])
 def test_after_a_long_silence_the_observer_begins_anew(silent_ns: int, anew: bool) -> None:
-    watching, _ = watch(NOT_WATCHING, seen(START_NS, sample(START_NS)), PARAMETERS)
-    watching = structs.replace(watching, clipped=(True, True), over_ns=START_NS, clean_ns=1)
+    watching, _ = update(INITIAL, seen(START_NS, sample(START_NS)), PARAMETERS)
+    watching = changed(watching, clipped=(True, True), over_ns=START_NS, clean_ns=1)
     captured_ns, at_ns = START_NS + silent_ns - 30 * MS, START_NS + silent_ns
     far = sample(captured_ns, at_ns, (0.5, 0.0, 0.0))
-    after, breach = watch(watching, seen(at_ns, far), PARAMETERS)
-    assert after.observer is not None and breach is None
+    after, breach = update(watching, seen(at_ns, far), PARAMETERS)
+    assert after.motion.observer is not None and breach is None
     if anew:
-        np.testing.assert_array_equal(after.observer.mean, [[0.5, 0.0, 0.0], ZERO, ZERO])
-        np.testing.assert_allclose(np.diagonal(after.observer.cov), [0.0004, 4.0, 4.0 / 9.0])
-        assert (after.clipped, after.over_ns, after.clean_ns) == ((), None, captured_ns)
+        np.testing.assert_array_equal(after.motion.observer.mean, [[0.5, 0.0, 0.0], ZERO, ZERO])
+        np.testing.assert_allclose(np.diagonal(after.motion.observer.cov), [0.0004, 4.0, 4.0 / 9.0])
+        assert (after.acceleration.clipped, after.acceleration.over_ns, after.clean_ns) == ((), None, captured_ns)
     else:
-        assert after.clipped == (True, True, False)
+        assert after.acceleration.clipped == (True, True, False)
 
 
 def test_what_was_sent_is_remembered_for_three_seconds_and_no_longer() -> None:
     rng = np.random.default_rng(1)
-    watching = NOT_WATCHING
+    watching = INITIAL
     all_sent: list[tuple[int, Vec3]] = []
     for n in range(200):
         at_ns = START_NS + n * TICK_NS
         sent = (float(rng.integers(0, 3)), 0.0, 0.0) if n > 90 else (float(n % 7 == 0), 0.0, 0.0)
-        watching, _ = watch(watching, seen(at_ns, sent=sent), PARAMETERS)
+        watching, _ = update(watching, seen(at_ns, sent=sent), PARAMETERS)
         if not all_sent or all_sent[-1][1] != sent:
             all_sent.append((at_ns - TICK_NS if n else at_ns, sent))
         old = [one for one in all_sent if one[0] <= at_ns - 3 * S]
-        assert watching.sent == (*old[-1:], *(one for one in all_sent if one[0] > at_ns - 3 * S))
-        assert watching.tick_ns == at_ns
+        assert watching.motion.sent == (*old[-1:], *(one for one in all_sent if one[0] > at_ns - 3 * S))
+        assert watching.motion.tick_ns == at_ns
 
 
 def test_of_what_was_sent_earlier_only_the_last_still_acts() -> None:
     sent = tuple((AT_NS - 5 * S + n * S, (float(n), 0.0, 0.0)) for n in range(5))
-    watching, _ = watch(Watching(tick_ns=START_NS, sent=sent), seen(AT_NS + 1, sent=sent[-1][1]), PARAMETERS)
-    assert watching.sent == sent[2:]
+    watching, _ = update(monitors(tick_ns=START_NS, sent=sent), seen(AT_NS + 1, sent=sent[-1][1]), PARAMETERS)
+    assert watching.motion.sent == sent[2:]
 
 
 # What is not known counts less
 
 
 def test_a_flight_that_began_before_its_first_position_has_the_velocity_that_was_sent() -> None:
-    watching, sent = NOT_WATCHING, (1.0, -0.5, 0.0)
+    watching, sent = INITIAL, (1.0, -0.5, 0.0)
     for n in range(21):
-        watching, _ = watch(watching, seen(START_NS + n * TICK_NS, sent=sent), PARAMETERS)
+        watching, _ = update(watching, seen(START_NS + n * TICK_NS, sent=sent), PARAMETERS)
     at_ns = START_NS + S
-    watching, breach = watch(watching, seen(at_ns, sample(at_ns, at_ns, (7.0, 8.0, -9.0)), sent=sent), PARAMETERS)
-    assert breach is None and watching.observer is not None
+    watching, breach = update(watching, seen(at_ns, sample(at_ns, at_ns, (7.0, 8.0, -9.0)), sent=sent), PARAMETERS)
+    assert breach is None and watching.motion.observer is not None
     left = [math.exp(-1.0 / lag_s) for lag_s in PARAMETERS.lag_s]
     velocity = [u * (1.0 - lag_s * (1.0 - e)) for u, lag_s, e in zip(sent, PARAMETERS.lag_s, left, strict=True)]
-    np.testing.assert_allclose(watching.observer.mean, [(7.0, 8.0, -9.0), velocity, ZERO], atol=1e-12)
-    np.testing.assert_allclose(watching.observer.accel_mps2, [u * (1.0 - e) for u, e in zip(sent, left, strict=True)])
+    np.testing.assert_allclose(watching.motion.observer.mean, [(7.0, 8.0, -9.0), velocity, ZERO], atol=1e-12)
+    np.testing.assert_allclose(
+        watching.motion.observer.accel_mps2, [u * (1.0 - e) for u, e in zip(sent, left, strict=True)]
+    )
     # Gusts have had a second for it.
-    assert watching.observer.cov[1, 1] == pytest.approx((0.3 + 0.3 * 2.0 * 1.0) ** 2)
+    assert watching.motion.observer.cov[1, 1] == pytest.approx((0.3 + 0.3 * 2.0 * 1.0) ** 2)
 
 
 def test_a_first_position_has_the_velocity_of_all_that_was_sent_before() -> None:
-    rng, watching = np.random.default_rng(6), NOT_WATCHING
+    rng, watching = np.random.default_rng(6), INITIAL
     for n in range(31):
         at_ns = START_NS + n * TICK_NS
         first = [sample(at_ns)] if n == 30 else []
-        watching, _ = watch(watching, seen(at_ns, *first, sent=vec3(rng.uniform(-2.0, 2.0, 3))), PARAMETERS)
-    assert watching.observer is not None
-    np.testing.assert_allclose(watching.observer.mean[1], watching.flown_mps, atol=1e-12)
-    np.testing.assert_allclose(watching.observer.accel_mps2, watching.flown_mps2, atol=1e-12)
+        watching, _ = update(watching, seen(at_ns, *first, sent=vec3(rng.uniform(-2.0, 2.0, 3))), PARAMETERS)
+    assert watching.motion.observer is not None
+    np.testing.assert_allclose(watching.motion.observer.mean[1], watching.motion.model_mps, atol=1e-12)
+    np.testing.assert_allclose(watching.motion.observer.accel_mps2, watching.motion.model_mps2, atol=1e-12)
     # Gusts have had a second and a half for it.
-    assert watching.observer.cov[1, 1] == pytest.approx((0.3 + 0.3 * 2.0 * 1.5) ** 2)
+    assert watching.motion.observer.cov[1, 1] == pytest.approx((0.3 + 0.3 * 2.0 * 1.5) ** 2)
 
 
 @pytest.mark.parametrize(("std_m", "noise_m"), [(0.005, 0.02), (0.02, 0.02), (0.1, 0.1)])
 def test_a_position_counts_by_its_own_standard_deviation(std_m: float, noise_m: float) -> None:
-    begun, _ = watch(NOT_WATCHING, seen(START_NS, sample(START_NS, std_m=std_m)), PARAMETERS)
-    assert begun.observer is not None
-    assert begun.observer.cov[0, 0] == pytest.approx(noise_m**2)
+    begun, _ = update(INITIAL, seen(START_NS, sample(START_NS, std_m=std_m)), PARAMETERS)
+    assert begun.motion.observer is not None
+    assert begun.motion.observer.cov[0, 0] == pytest.approx(noise_m**2)
     observer = Observer(START_NS, np.zeros((3, 3)), np.diag([0.01, 0.0, 0.0]), np.zeros(3))
     later = sample(AT_NS, AT_NS, (0.1, 0.0, 0.0), std_m=std_m)
-    watching, _ = watch(Watching(observer=observer, tick_ns=START_NS), seen(AT_NS, later), PARAMETERS)
-    assert watching.observer is not None
+    watching, _ = update(monitors(observer=observer, tick_ns=START_NS), seen(AT_NS, later), PARAMETERS)
+    assert watching.motion.observer is not None
     wanders = (PARAMETERS.unexplained_mps2 * math.sqrt((LOOK_NS * 1e-9) ** 5 / 20)) ** 2
     gain = (0.01 + wanders) / (0.01 + wanders + noise_m**2)
-    assert watching.observer.mean[0, 0] == pytest.approx(0.1 * gain)
+    assert watching.motion.observer.mean[0, 0] == pytest.approx(0.1 * gain)
 
 
-def unsure(unexplained_mps2: float, std_mps2: float) -> Watching:
+def unsure(unexplained_mps2: float, std_mps2: float) -> MonitorState:
     """What comes of a position that tells next to nothing, where the observer knows so much."""
     mean = np.array([ZERO, ZERO, (unexplained_mps2, 0.0, 0.0)])
     observer = Observer(START_NS, mean, np.diag([0.0, 0.0, std_mps2**2]), np.zeros(3))
     s = LOOK_NS * 1e-9
     there = sample(AT_NS, AT_NS, (0.5 * unexplained_mps2 * s * s, 0.0, 0.0), std_m=50.0)
-    watching, _ = watch(Watching(observer=observer, tick_ns=START_NS), seen(AT_NS, there), PARAMETERS)
-    assert watching.unexplained_mps2 == pytest.approx(unexplained_mps2, rel=1e-6)
+    watching, _ = update(monitors(observer=observer, tick_ns=START_NS), seen(AT_NS, there), PARAMETERS)
+    assert watching.acceleration.unexplained_mps2 == pytest.approx(unexplained_mps2, rel=1e-6)
     return watching
 
 
 @pytest.mark.parametrize(("std_mps2", "over"), [(0.0, True), (1.55, True), (1.6, False)])
 def test_an_acceleration_that_may_as_well_be_none_is_none(std_mps2: float, over: bool) -> None:
-    assert (unsure(2.5, std_mps2).over_ns is not None) == over
+    assert (unsure(2.5, std_mps2).acceleration.over_ns is not None) == over
 
 
 def test_an_acceleration_of_just_so_many_standard_deviations_is_none() -> None:
-    observer = unsure(0.0, 1.6).observer
+    observer = unsure(0.0, 1.6).motion.observer
     assert observer is not None
     bound_mps2 = 1.5 * math.sqrt(observer.cov[2, 2])
     assert bound_mps2 > PARAMETERS.unexplained_mps2
-    assert unsure(bound_mps2, 1.6).over_ns is None
-    assert unsure(just_more(bound_mps2), 1.6).over_ns is not None
+    assert unsure(bound_mps2, 1.6).acceleration.over_ns is None
+    assert unsure(just_more(bound_mps2), 1.6).acceleration.over_ns is not None
 
 
 # The vehicle's own velocity as a witness
 
 
-def told(velocity: Vec3, predicted: Vec3, **known: object) -> tuple[Watching, Observation]:
+def told(velocity: Vec3, predicted: Vec3, **known: object) -> tuple[MonitorState, Observation]:
     """Half a second into a flight by what was sent, the vehicle's word, and a prediction."""
-    watching = structs.replace(Watching(tick_ns=AT_NS, began_ns=AT_NS - 500 * MS), **known)
+    watching = changed(monitors(tick_ns=AT_NS, began_ns=AT_NS - 500 * MS), **known)
     return watching, structs.replace(seen(AT_NS, own=motion(velocity, AT_NS)), velocity_mps=predicted)
 
 
@@ -427,25 +424,27 @@ def told(velocity: Vec3, predicted: Vec3, **known: object) -> tuple[Watching, Ob
 def test_who_speaks_for_the_vehicle_s_own_velocity(
     velocity: Vec3, predicted: Vec3, flown: Vec3, apart_mps: float | None, braked_on: bool
 ) -> None:
-    watching, tick = told(velocity, predicted, flown_mps=flown, apart_mps=apart_mps)
-    assert own_velocity(watching, tick, 0.0, PARAMETERS) == (velocity if braked_on else None)
-    assert own_velocity(structs.replace(watching, contradicted=True), tick, 0.0, PARAMETERS) is None
+    watching, tick = told(velocity, predicted, model_mps=flown, apart_mps=apart_mps)
+    assert trusted_velocity(watching, tick, 0.0, PARAMETERS) == (velocity if braked_on else None)
+    assert trusted_velocity(changed(watching, is_contradicted=True), tick, 0.0, PARAMETERS) is None
 
 
 def test_what_was_sent_is_a_witness_for_ten_seconds() -> None:
     watching, tick = told(ZERO, (9.0, 0.0, 0.0))
-    assert own_velocity(structs.replace(watching, began_ns=AT_NS - 10 * S), tick, 0.0, PARAMETERS) == ZERO
-    assert own_velocity(structs.replace(watching, began_ns=AT_NS - 10 * S - 1), tick, 0.0, PARAMETERS) is None
-    assert own_velocity(structs.replace(watching, began_ns=None), tick, 0.0, PARAMETERS) is None
+    assert trusted_velocity(changed(watching, began_ns=AT_NS - 10 * S), tick, 0.0, PARAMETERS) == ZERO
+    assert trusted_velocity(changed(watching, began_ns=AT_NS - 10 * S - 1), tick, 0.0, PARAMETERS) is None
+    assert trusted_velocity(changed(watching, began_ns=None), tick, 0.0, PARAMETERS) is None
 
 
-@pytest.mark.parametrize(("apart_mps", "age_s", "is_misled"), [(1.0, 0.0, False), (1.01, 0.0, True), (1.6, 1.0, False)])
+@pytest.mark.parametrize(
+    ("apart_mps", "age_s", "inconsistent"), [(1.0, 0.0, False), (1.01, 0.0, True), (1.6, 1.0, False)]
+)
 def test_a_prediction_far_off_the_vehicle_s_own_velocity_misleads(
-    apart_mps: float, age_s: float, is_misled: bool
+    apart_mps: float, age_s: float, inconsistent: bool
 ) -> None:
     watching, tick = told(ZERO, (0.0, -apart_mps, 0.0), apart_mps=0.1)
-    assert misled(watching, tick, age_s, PARAMETERS) == is_misled
-    assert not misled(structs.replace(watching, contradicted=True), tick, age_s, PARAMETERS)
+    assert is_prediction_inconsistent(watching, tick, age_s, PARAMETERS) == inconsistent
+    assert not is_prediction_inconsistent(changed(watching, is_contradicted=True), tick, age_s, PARAMETERS)
 
 
 @pytest.mark.parametrize(
@@ -461,58 +460,72 @@ def test_a_prediction_far_off_the_vehicle_s_own_velocity_misleads(
 def test_inertial_data_are_contradicted_by_a_velocity_that_may_be_believed(
     apart_mps: float, agreed_mps: float | None, age_s: float, is_contradicted: bool
 ) -> None:
-    watching, tick = told(ZERO, (0.0, 0.0, apart_mps), apart_mps=agreed_mps, flown_mps=(9.0, 0.0, 0.0))
-    assert contradicts(watching, tick, age_s, PARAMETERS) == is_contradicted
-    assert not contradicts(structs.replace(watching, contradicted=True), tick, age_s, PARAMETERS)
-    assert not contradicts(watching, structs.replace(tick, motion=None), age_s, PARAMETERS)
+    watching, tick = told(ZERO, (0.0, 0.0, apart_mps), apart_mps=agreed_mps, model_mps=(9.0, 0.0, 0.0))
+    assert is_inertial_inconsistent(watching, tick, age_s, PARAMETERS) == is_contradicted
+    assert not is_inertial_inconsistent(changed(watching, is_contradicted=True), tick, age_s, PARAMETERS)
+    assert not is_inertial_inconsistent(watching, structs.replace(tick, motion=None), age_s, PARAMETERS)
 
 
 def test_a_witness_is_who_agreed_with_positions_and_still_speaks() -> None:
     velocity: Vec3 = (1.0, -2.0, 0.5)
-    words, agreed = motion(velocity, AT_NS), Watching(apart_mps=0.1)
-    assert witness(agreed, words, AT_NS) == velocity
-    assert witness(agreed, None, AT_NS) is None
-    assert witness(agreed, words, AT_NS + 60 * S) is None
-    assert witness(structs.replace(agreed, contradicted=True), words, AT_NS) is None
-    assert witness(Watching(), words, AT_NS) is None  # no position has been compared with it
+    words, agreed = motion(velocity, AT_NS), monitors(apart_mps=0.1)
+    assert find_confirmed_velocity(agreed, words, AT_NS) == velocity
+    assert find_confirmed_velocity(agreed, None, AT_NS) is None
+    assert find_confirmed_velocity(agreed, words, AT_NS + 60 * S) is None
+    assert find_confirmed_velocity(changed(agreed, is_contradicted=True), words, AT_NS) is None
+    assert find_confirmed_velocity(monitors(), words, AT_NS) is None  # no position has been compared with it
 
 
 def test_what_was_sent_acts_behind_the_lag_from_tick_to_tick() -> None:
-    rng, watching, at_ns = np.random.default_rng(4), NOT_WATCHING, START_NS
+    rng, watching, at_ns = np.random.default_rng(4), INITIAL, START_NS
     velocity, accel, sent = np.zeros(3), np.zeros(3), ZERO
     for n in range(30):
         for_ns = TICK_NS * (10 if n % 5 == 4 else 1)  # now and then one is late
         at_ns += for_ns if n else 0
-        watching, _ = watch(watching, seen(at_ns, sent=sent), PARAMETERS)
+        watching, _ = update(watching, seen(at_ns, sent=sent), PARAMETERS)
         if n:
             for axis, lag_s in enumerate(PARAMETERS.lag_s):
                 step = expm(np.array([[0, 1, 0], [0, -1 / lag_s, 1 / lag_s], [0, 0, 0]]) * for_ns * 1e-9)
                 velocity[axis], accel[axis], _ = step @ (velocity[axis], accel[axis], sent[axis])
-        np.testing.assert_allclose(watching.flown_mps, velocity, atol=1e-12)
-        np.testing.assert_allclose(watching.flown_mps2, accel, atol=1e-12)
+        np.testing.assert_allclose(watching.motion.model_mps, velocity, atol=1e-12)
+        np.testing.assert_allclose(watching.motion.model_mps2, accel, atol=1e-12)
         sent = vec3(rng.uniform(-2.0, 2.0, 3))
-    assert watching.began_ns == START_NS
+    assert watching.motion.began_ns == START_NS
 
 
 def test_what_is_recorded_of_it_is_plain_numbers() -> None:
     watching, _ = look((0.1, 0.2, -0.9), own=AT_REST, **offsets(0.1))
-    assert [type(watching.unexplained_mps2), type(watching.apart_mps)] == [float, float]
+    assert [type(watching.acceleration.unexplained_mps2), type(watching.velocity.apart_mps)] == [float, float]
 
 
 # No clock's zero says anything
 
 
-def later(watching: Watching, by_ns: int) -> Watching:
+def later(watching: MonitorState, by_ns: int) -> MonitorState:
     """The same, all of it so much later."""
 
     def moved(pairs: tuple[tuple[int, Any], ...]) -> tuple[tuple[int, Any], ...]:
         return tuple((at_ns + by_ns, value) for at_ns, value in pairs)
 
-    names = ("tick_ns", "began_ns", "over_ns", "apart_ns", "resumed_ns", "clean_ns", "outside_ns")
-    times = {name: at_ns + by_ns for name in names if (at_ns := getattr(watching, name)) is not None}
-    rows = {name: moved(getattr(watching, name)) for name in ("sent", "way", "offsets", "places")}
-    observer, braking = watching.observer, watching.braking
-    return structs.replace(
+    def at(group: str, name: str) -> Any:
+        return getattr(getattr(watching, group), name)
+
+    names = (
+        ("motion", "tick_ns"),
+        ("motion", "began_ns"),
+        ("motion", "resumed_ns"),
+        ("acceleration", "over_ns"),
+        ("velocity", "apart_ns"),
+    )
+    times = {name: at(group, name) + by_ns for group, name in names if at(group, name) is not None}
+    if watching.clean_ns is not None:
+        times["clean_ns"] = watching.clean_ns + by_ns
+    if watching.outside.since_ns is not None:
+        times["outside_ns"] = watching.outside.since_ns + by_ns
+    pairs = (("motion", "sent"), ("motion", "vehicle_path"), ("velocity", "offsets"), ("velocity", "places"))
+    rows = {name: moved(at(group, name)) for group, name in pairs}
+    observer, braking = watching.motion.observer, watching.braking.began
+    return changed(
         watching,
         observer=None if observer is None else structs.replace(observer, at_ns=observer.at_ns + by_ns),
         braking=None if braking is None else moved((braking,))[0],
@@ -567,29 +580,29 @@ def tick_later(tick: Observation, by_ns: int) -> Observation:
     )
 
 
-def plain(watching: Watching) -> Any:
+def plain(watching: MonitorState) -> Any:
     return msgspec.to_builtins(watching, enc_hook=lambda array: array.tolist())
 
 
 def test_what_time_it_is_makes_no_difference() -> None:
     """The same flights under a clock whose zero is long after them, and under one whose zero is as they begin."""
-    found: set[str] = set()
+    found: set[Cause | None] = set()
     for seed in range(6):
         by_ns = MS - START_NS if seed % 3 == 2 else -1000 * S
         rng, at_ns = np.random.default_rng(seed), START_NS + 1
-        one = two = NOT_WATCHING
+        one = two = INITIAL
         tick = seen(at_ns)
         for n in range(60):
             tick = random_tick(rng, at_ns, tick)
             tick = structs.replace(tick, samples=tick.samples if n > seed else ())  # the first ones come a little later
             same_tick = tick_later(tick, by_ns)
-            one, breach = watch(one, tick, PARAMETERS)
-            two, same_breach = watch(two, same_tick, PARAMETERS)
-            found |= {breach.code} if breach else set()
+            one, breach = update(one, tick, PARAMETERS)
+            two, same_breach = update(two, same_tick, PARAMETERS)
+            found |= {breach.cause} if breach else set()
             assert same_breach == breach
             assert plain(two) == plain(later(one, by_ns))
-            assert two.answered == one.answered
-            for says in (own_velocity, misled):
+            assert two.confirms_positions == one.confirms_positions
+            for says in (trusted_velocity, is_prediction_inconsistent):
                 assert says(two, same_tick, 0.1, PARAMETERS) == says(one, tick, 0.1, PARAMETERS)
             at_ns += int(rng.choice([int(rng.integers(30, 90)), 400, 3500], p=[0.96, 0.03, 0.01])) * MS
-    assert found == BREACHES == {RESPONSE, VELOCITY, SCATTER, OUTSIDE, BRAKING}
+    assert found == RELEASES == {Cause.RESPONSE, Cause.VELOCITY, Cause.SCATTER, Cause.OUTSIDE, Cause.BRAKING}

@@ -15,21 +15,26 @@ from envelope_rig import (
     PARAMETERS,
     Array,
     S,
+    changed,
     just_less,
     just_more,
     look,
+    monitors,
     motion,
     offsets,
     seen,
+    trusted_velocity,
+    update,
     vec3,
 )
 from flight_rig import MS, START_NS, sample
 from msgspec import structs
 from scipy.optimize import minimize_scalar
 
-from uavctl.flight.envelope import NOT_WATCHING, VELOCITY, Breach, Watching, own_velocity, watch
 from uavctl.flight.limits import ZERO
-from uavctl.flight.sensor_faults import Observer
+from uavctl.flight.monitors.engaged import INITIAL, MonitorState
+from uavctl.flight.monitors.observer import Observer
+from uavctl.flight.monitors.verdict import Cause, Verdict
 from uavctl.records import Vec3, VehicleMotion
 
 
@@ -37,7 +42,7 @@ from uavctl.records import Vec3, VehicleMotion
 def test_how_far_apart_two_velocities_are_is_a_line_through_what_is_between_them(seed: int) -> None:
     rng = np.random.default_rng(seed)
     parameters = replace(PARAMETERS, disagreement_mps=100.0)
-    watching, at_ns = NOT_WATCHING, START_NS
+    watching, at_ns = INITIAL, START_NS
     ticks_ns: list[int] = []
     flown: list[Array] = []
     taken: list[tuple[int, Array]] = []
@@ -51,13 +56,13 @@ def test_how_far_apart_two_velocities_are_is_a_line_through_what_is_between_them
         if captured_ns > ticks_ns[0] and (not taken or captured_ns - taken[-1][0] >= 40 * MS):
             distance = [np.interp(captured_ns, ticks_ns, axis) for axis in np.array(flown).T]
             taken.append((captured_ns, np.array(one.position_m) - distance))
-        watching, _ = watch(watching, seen(at_ns, one, own=motion(vec3(velocity), at_ns)), parameters)
+        watching, _ = update(watching, seen(at_ns, one, own=motion(vec3(velocity), at_ns)), parameters)
         if not taken or taken[-1][0] != captured_ns:
             continue
         window = [one for one in taken if one[0] > captured_ns - 1200 * MS]
-        assert [at for at, _ in watching.offsets] == [at for at, _ in window]
+        assert [at for at, _ in watching.velocity.offsets] == [at for at, _ in window]
         if len(window) < 3 or captured_ns - window[0][0] < 360 * MS:
-            assert watching.apart_mps is None
+            assert watching.velocity.apart_mps is None
             continue
         slope, _ = np.polyfit([(at - captured_ns) * 1e-9 for at, _ in window], [off for _, off in window], 1)
         # As much of it as stamps that are up to 0.15 s late or early make is no difference.
@@ -71,9 +76,9 @@ def test_how_far_apart_two_velocities_are_is_a_line_through_what_is_between_them
             method="bounded",
             options={"xatol": 1e-9},
         )
-        assert watching.apart_mps == pytest.approx(left.fun, rel=1e-6)
+        assert watching.velocity.apart_mps == pytest.approx(left.fun, rel=1e-6)
     kept = [at for at in ticks_ns if at > at_ns - 3 * S]
-    assert [at for at, _ in watching.way] == kept
+    assert [at for at, _ in watching.motion.vehicle_path] == kept
 
 
 @pytest.mark.parametrize(
@@ -90,9 +95,9 @@ def test_velocities_are_compared_over_three_positions_and_part_of_the_window(
     spans_ns: tuple[int, ...], compared: bool
 ) -> None:
     watching, _ = look(ZERO, own=AT_REST, **offsets(0.125, spans_ns=spans_ns, apart_mps=9.0, apart_ns=1))
-    assert watching.apart_mps == (pytest.approx(0.125) if compared else None)
-    assert watching.apart_ns is None
-    assert not watching.contradicted
+    assert watching.velocity.apart_mps == (pytest.approx(0.125) if compared else None)
+    assert watching.velocity.apart_ns is None
+    assert not watching.velocity.is_contradicted
 
 
 # 0.4375 m/s are exactly what is shown of 0.4375 m/s, and 1.5 times 0.4375 / 1.5.
@@ -105,8 +110,8 @@ def turning(accel: Vec3, slope: Vec3) -> tuple[float | None, bool]:
     nodes_ns = (times_ns[0] - 1, *times_ns, AT_NS - 1)
     way = tuple((at, 0.5 * ((at - AT_NS) * 1e-9) ** 2 * np.array(accel)) for at in nodes_ns)
     lines = tuple((at, (at - AT_NS) * 1e-9 * np.array(slope)) for at in times_ns)
-    watching, _ = look(ZERO, own=AT_REST, way=way, offsets=lines)
-    return watching.apart_mps, watching.contradicted
+    watching, _ = look(ZERO, own=AT_REST, vehicle_path=way, offsets=lines)
+    return watching.velocity.apart_mps, watching.velocity.is_contradicted
 
 
 @pytest.mark.parametrize(
@@ -134,22 +139,22 @@ def test_where_the_way_is_not_known_all_of_a_difference_counts() -> None:
         way = tuple(
             (at, np.array([((at - AT_NS) * 1e-9) ** 2, 0.0, 0.0])) for at in (begins_ns - 1, times_ns[1], AT_NS - 1)
         )
-        watching, _ = look(ZERO, own=AT_REST, way=way, offsets=lines)
-        assert watching.apart_mps == pytest.approx(0.2 if begins_ns > times_ns[0] else 0.0, abs=5e-3)
+        watching, _ = look(ZERO, own=AT_REST, vehicle_path=way, offsets=lines)
+        assert watching.velocity.apart_mps == pytest.approx(0.2 if begins_ns > times_ns[0] else 0.0, abs=5e-3)
 
 
 def test_where_the_observer_begins_anew_a_contradiction_has_to_persist() -> None:
     """A position that comes three seconds late may still be compared with those before."""
     captured_ns = AT_NS - 2900 * MS
-    state = Watching(
+    state = monitors(
         observer=Observer(AT_NS - 3 * S, np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)),
         tick_ns=START_NS,
-        way=((captured_ns - 50 * MS, np.zeros(3)), (START_NS, np.zeros(3))),
+        vehicle_path=((captured_ns - 50 * MS, np.zeros(3)), (START_NS, np.zeros(3))),
         offsets=tuple((captured_ns - ns * MS, np.array([-0.3e-3 * ns, 0.0, 0.0])) for ns in (500, 250)),
     )
-    watching, breach = watch(state, seen(AT_NS, sample(captured_ns, AT_NS), own=AT_REST), PARAMETERS)
-    assert watching.apart_mps == pytest.approx(0.3) and watching.contradicted
-    assert watching.apart_ns == captured_ns
+    watching, breach = update(state, seen(AT_NS, sample(captured_ns, AT_NS), own=AT_REST), PARAMETERS)
+    assert watching.velocity.apart_mps == pytest.approx(0.3) and watching.velocity.is_contradicted
+    assert watching.velocity.apart_ns == captured_ns
     assert breach is not None and breach.text.endswith("and none has come since")
 
 
@@ -166,15 +171,15 @@ def test_where_the_observer_begins_anew_a_contradiction_has_to_persist() -> None
 def test_velocities_that_contradicted_each_other_and_then_no_position_comes(
     since_ns: int | None, breached: bool
 ) -> None:
-    _, breach = watch(Watching(apart_ns=since_ns, tick_ns=START_NS), seen(AT_NS, own=AT_REST), PARAMETERS)
-    assert (None if breach is None else breach.code) == (VELOCITY if breached else None)
+    _, breach = update(monitors(apart_ns=since_ns, tick_ns=START_NS), seen(AT_NS, own=AT_REST), PARAMETERS)
+    assert (None if breach is None else breach.cause) == (Cause.VELOCITY if breached else None)
     assert breach is None or breach.text.endswith("and none has come since")
 
 
 # The ways of half a minute
 
 
-def creeping(off_m: float, age_ns: int, *, before: int = 0) -> tuple[Watching, Breach | None]:
+def creeping(off_m: float, age_ns: int, *, before: int = 0) -> tuple[MonitorState, Verdict | None]:
     """A position now, where the vehicle's own way had another place so long before the middle of the offsets."""
     known = offsets(0.0, spans_ns=(256 * MS, 512 * MS))
     middle_ns = AT_NS - 256 * MS
@@ -190,10 +195,10 @@ def test_positions_may_leave_the_vehicles_own_way_by_so_much(age_ns: int, within
     for off_m, breached in ((min(within_m, 99.0) - 1e-6, False), (within_m + 1e-6, True)):
         watching, breach = creeping(off_m if math.isfinite(off_m) else 99.0, age_ns)
         breached = breached and math.isfinite(within_m)
-        assert (None if breach is None else breach.code) == (VELOCITY if breached else None)
+        assert (None if breach is None else breach.cause) == (Cause.VELOCITY if breached else None)
         assert breach is None or breach.text.endswith(f"away from the vehicle's own way in {age_ns * 1e-9:.0f} s")
         assert breach is None or f"(0.0, {off_m:.1f}, 0.0) m" in breach.text
-        assert not watching.contradicted
+        assert not watching.velocity.is_contradicted
 
 
 def test_positions_may_leave_the_vehicles_own_way_by_just_so_much() -> None:
@@ -212,21 +217,21 @@ def test_any_place_of_the_way_that_is_too_far_off_is_enough() -> None:
 def test_a_place_of_the_way_is_remembered_each_second_for_half_a_minute(age_ns: int, kept: int) -> None:
     watching, breach = creeping(0.0, age_ns)
     assert breach is None
-    assert len(watching.places) == kept
+    assert len(watching.velocity.places) == kept
     if kept == 2 or age_ns >= 30 * S:
-        at_ns, place = watching.places[-1]
+        at_ns, place = watching.velocity.places[-1]
         assert at_ns == AT_NS - 256 * MS and isinstance(at_ns, int)
         np.testing.assert_allclose(place, ZERO, atol=1e-12)
 
 
 def test_a_place_of_the_way_is_remembered_a_second_after_the_last_one() -> None:
     watching, _ = creeping(0.0, S // 2, before=5)
-    assert len(watching.places) == 6
+    assert len(watching.velocity.places) == 6
 
 
 def test_the_place_of_the_way_is_the_mean_of_the_offsets() -> None:
     watching, _ = look(ZERO, own=AT_REST, **offsets(0.125, spans_ns=(100 * MS, 500 * MS)))
-    ((at_ns, place),) = watching.places
+    ((at_ns, place),) = watching.velocity.places
     assert at_ns == AT_NS - 200 * MS
     np.testing.assert_allclose(place, (-0.125 * 0.2, 0.0, 0.0), atol=1e-12)
 
@@ -236,13 +241,13 @@ def test_over_a_gap_the_way_is_not_compared() -> None:
     for spans_ns, kept in (((100 * MS,), True), ((1200 * MS,), False)):
         watching, breach = look(ZERO, own=AT_REST, places=places, **offsets(0.0, spans_ns=spans_ns))
         assert breach is None
-        assert watching.places == (places if kept else ())
+        assert watching.velocity.places == (places if kept else ())
     silent, _ = look(ZERO, places=places, **offsets(0.0))
-    missed, _ = look(ZERO, own=AT_REST, places=places, **offsets(0.0, way=((AT_NS - 301 * MS, np.zeros(3)),)))
-    assert silent.places == missed.places == ()
-    state = Watching(way=((START_NS, np.zeros(3)),), places=places)  # the way is not known so early
-    early, _ = watch(state, seen(AT_NS, sample(START_NS, AT_NS), own=AT_REST), PARAMETERS)
-    assert early.offsets == early.places == ()
+    missed, _ = look(ZERO, own=AT_REST, places=places, **offsets(0.0, vehicle_path=((AT_NS - 301 * MS, np.zeros(3)),)))
+    assert silent.velocity.places == missed.velocity.places == ()
+    state = monitors(vehicle_path=((START_NS, np.zeros(3)),), places=places)  # the way is not known so early
+    early, _ = update(state, seen(AT_NS, sample(START_NS, AT_NS), own=AT_REST), PARAMETERS)
+    assert early.velocity.offsets == early.velocity.places == ()
 
 
 def test_velocities_that_contradict_each_other_are_told_before_ways_that_do() -> None:
@@ -253,9 +258,9 @@ def test_velocities_that_contradict_each_other_are_told_before_ways_that_do() ->
 
 @pytest.mark.parametrize(("for_ns", "answered"), [(None, False), (2 * S - 1, False), (2 * S, True), (3 * S, True)])
 def test_positions_have_answered_after_two_seconds_of_a_flight(for_ns: int | None, answered: bool) -> None:
-    watching = Watching(tick_ns=AT_NS, began_ns=None if for_ns is None else AT_NS - for_ns)
-    assert watching.answered == answered
-    assert not structs.replace(watching, tick_ns=None).answered
+    watching = monitors(tick_ns=AT_NS, began_ns=None if for_ns is None else AT_NS - for_ns)
+    assert watching.confirms_positions == answered
+    assert not changed(watching, tick_ns=None).confirms_positions
 
 
 # What is compared how
@@ -286,30 +291,30 @@ def test_velocities_that_contradict_each_other_have_to_persist_unless_it_is_plai
     place = s * -(s * unexplained_mps2) + 0.5 * s * s * unexplained_mps2
     known = offsets(EXACT_MPS, place_m=place, apart_ns=apart_ns)
     watching, breach = look((unexplained_mps2, 0.0, 0.0), own=AT_REST, parameters=parameters, **known)
-    assert watching.apart_mps == EXACT_MPS
-    assert watching.apart_ns == since_ns
-    assert watching.contradicted == (since_ns is not None)
-    assert (None if breach is None else breach.code) == (VELOCITY if breached else None)
+    assert watching.velocity.apart_mps == EXACT_MPS
+    assert watching.velocity.apart_ns == since_ns
+    assert watching.velocity.is_contradicted == (since_ns is not None)
+    assert (None if breach is None else breach.cause) == (Cause.VELOCITY if breached else None)
 
 
 def test_the_way_is_known_between_ticks_and_not_before_the_first() -> None:
     for captured_ns, known in ((START_NS, False), (START_NS + 1, True), (AT_NS, True)):
-        state = Watching(way=((START_NS, np.zeros(3)),))
-        watching, _ = watch(state, seen(AT_NS, sample(captured_ns, AT_NS), own=AT_REST), PARAMETERS)
-        assert [at for at, _ in watching.offsets] == [captured_ns] * known
+        state = monitors(vehicle_path=((START_NS, np.zeros(3)),))
+        watching, _ = update(state, seen(AT_NS, sample(captured_ns, AT_NS), own=AT_REST), PARAMETERS)
+        assert [at for at, _ in watching.velocity.offsets] == [captured_ns] * known
 
 
 def test_the_way_is_not_known_after_the_last_tick() -> None:
     way = tuple((START_NS - n * MS, np.zeros(3)) for n in range(300, -1, -1))
     after = sample(AT_NS + 1, AT_NS + 1)
-    watching, _ = watch(Watching(way=way), seen(AT_NS, after, own=AT_REST), PARAMETERS)
-    assert len(watching.way) == 302 and watching.offsets == ()
+    watching, _ = update(monitors(vehicle_path=way), seen(AT_NS, after, own=AT_REST), PARAMETERS)
+    assert len(watching.motion.vehicle_path) == 302 and watching.velocity.offsets == ()
 
 
 def test_the_way_is_remembered_for_three_seconds() -> None:
     way = tuple((at, np.zeros(3)) for at in (AT_NS - 3 * S, AT_NS - 3 * S + 1, START_NS))
-    watching, _ = watch(Watching(way=way), seen(AT_NS, own=AT_REST), PARAMETERS)
-    assert [at for at, _ in watching.way] == [AT_NS - 3 * S + 1, START_NS, AT_NS]
+    watching, _ = update(monitors(vehicle_path=way), seen(AT_NS, own=AT_REST), PARAMETERS)
+    assert [at for at, _ in watching.motion.vehicle_path] == [AT_NS - 3 * S + 1, START_NS, AT_NS]
 
 
 @pytest.mark.parametrize(
@@ -327,20 +332,20 @@ def test_the_way_is_remembered_for_three_seconds() -> None:
 )
 def test_a_vehicle_that_says_nothing_of_late_is_not_compared(words: VehicleMotion | None, known: bool) -> None:
     watching, _ = look(ZERO, own=words, **offsets(0.125))
-    assert (watching.apart_mps is not None) == (len(watching.offsets) == 3) == known
-    assert len(watching.way) == (3 if known else 0)
+    assert (watching.velocity.apart_mps is not None) == (len(watching.velocity.offsets) == 3) == known
+    assert len(watching.motion.vehicle_path) == (3 if known else 0)
     ours = structs.replace(seen(AT_NS, own=words), velocity_mps=ZERO)
-    assert (own_velocity(watching, ours, 0.0, PARAMETERS) is not None) == known
+    assert (trusted_velocity(watching, ours, 0.0, PARAMETERS) is not None) == known
 
 
 @pytest.mark.parametrize(("gap_ns", "known"), [(300 * MS, True), (300 * MS + 1, False)])
 def test_how_far_it_flew_in_ticks_that_were_missed_is_not_known(gap_ns: int, known: bool) -> None:
-    before = offsets(0.0, way=((AT_NS - gap_ns, np.array([1.0, 2.0, 3.0])),))
+    before = offsets(0.0, vehicle_path=((AT_NS - gap_ns, np.array([1.0, 2.0, 3.0])),))
     watching, _ = look(ZERO, own=motion((1.0, 0.0, 0.0), AT_NS), **before)
-    assert watching.way[-1][0] == AT_NS
-    assert watching.way[-1][1].tolist() == ([1.0 + 0.3, 2.0, 3.0] if known else [0.0, 0.0, 0.0])
-    assert [at for at, _ in watching.way[:-1]] == [AT_NS - gap_ns] * known
-    assert len(watching.offsets) == (3 if known else 0)
+    assert watching.motion.vehicle_path[-1][0] == AT_NS
+    assert watching.motion.vehicle_path[-1][1].tolist() == ([1.0 + 0.3, 2.0, 3.0] if known else [0.0, 0.0, 0.0])
+    assert [at for at, _ in watching.motion.vehicle_path[:-1]] == [AT_NS - gap_ns] * known
+    assert len(watching.velocity.offsets) == (3 if known else 0)
 
 
 @pytest.mark.parametrize(
@@ -362,8 +367,8 @@ def test_which_own_velocity_may_be_braked_on(
     own: Vec3, known: Vec3, age_s: float, contradicted: bool, believed: bool
 ) -> None:
     ours = structs.replace(seen(AT_NS, own=motion(own, AT_NS)), velocity_mps=known)
-    watching = Watching(contradicted=contradicted)
-    assert own_velocity(watching, ours, age_s, PARAMETERS) == (own if believed else None)
+    watching = monitors(is_contradicted=contradicted)
+    assert trusted_velocity(watching, ours, age_s, PARAMETERS) == (own if believed else None)
 
 
 @pytest.mark.fault(42)
@@ -381,16 +386,16 @@ def test_the_first_second_of_positions_after_a_silence_corrects_the_vehicle_s_ow
 ) -> None:
     """At rest by its positions; by its own word it moves at 1.5 times what is allowed from their return on."""
     parameters = replace(PARAMETERS, unexplained_mps2=100.0)
-    watching, found_ms = NOT_WATCHING, []
+    watching, found_ms = INITIAL, []
     back_ms = 3000 + silence_ms
     for now_ms in range(0, back_ms + 3000, 50):
         at_ns = START_NS + now_ms * MS
         moves = back_ms <= now_ms < back_ms + for_ms
         own = motion((1.5 * PARAMETERS.disagreement_mps if moves else 0.0, 0.0, 0.0), at_ns)
         taken = () if 3000 < now_ms < back_ms else (sample(at_ns, at_ns, ZERO),)
-        watching, breach = watch(watching, seen(at_ns, *taken, own=own), parameters)
+        watching, breach = update(watching, seen(at_ns, *taken, own=own), parameters)
         if breach is not None:
-            assert breach.code == VELOCITY
+            assert breach.cause == Cause.VELOCITY
             found_ms.append(now_ms - back_ms)
     assert bool(found_ms) == found
     if found:

@@ -27,24 +27,24 @@ from uavctl.flight.estimator import (
     DUPLICATE,
     TOO_OLD,
     FilterHistory,
-    absorb,
-    begin,
-    belief_at,
-    estimate,
-    set_input,
-    without,
+    absorb_samples,
+    begin_history,
+    drop_samples,
+    estimate_at,
+    note_input,
+    predict_belief,
 )
 from uavctl.flight.kalman import (
-    CONTRADICTED,
     Belief,
     Kalman,
-    contradicted,
-    felt,
+    is_consistent,
     make_kalman,
-    make_propagation,
-    predicted,
-    updated,
+    predict,
+    update_with_inertial,
+    update_with_position,
 )
+from uavctl.flight.monitors.inertial import MOST_CHI2, InertialTrust
+from uavctl.flight.propagation import make_propagation
 from uavctl.records import Estimate, PositionSample
 from uavctl.smpc.plant import Plant
 
@@ -54,21 +54,21 @@ S = 1_000_000_000
 
 def make(axes: tuple[str, ...] = ("north",), wind_std: float = 0.15, **changes: float) -> tuple[Kalman, FilterHistory]:
     kalman = make_kalman(small_plant(axes, wind_std), estimator_parameters(**changes), DT_NS)
-    return kalman, begin(kalman, START_NS, START_NS)
+    return kalman, begin_history(kalman, START_NS, START_NS)
 
 
 def fly(
     kalman: Kalman, samples: Sequence[PositionSample], inputs: Sequence[float], ticks: int
 ) -> list[Estimate | None]:
     """Tick by tick: the samples that have arrived, then this tick's input; the estimate of each tick."""
-    history = begin(kalman, START_NS, START_NS)
+    history = begin_history(kalman, START_NS, START_NS)
     result = []
     for tick in range(ticks):
         at_ns = START_NS + tick * TICK_NS
         due = [one for one in samples if at_ns - TICK_NS < one.received_ns <= at_ns]
-        history, _, _ = absorb(kalman, history, at_ns, due)
-        result.append(estimate(kalman, history, at_ns))
-        history = set_input(kalman, history, at_ns, np.full(kalman.n_u, inputs[tick]))
+        history, _, _ = absorb_samples(kalman, history, at_ns, due)
+        result.append(estimate_at(kalman, history, at_ns))
+        history = note_input(kalman, history, at_ns, np.full(kalman.n_u, inputs[tick]))
     return result
 
 
@@ -103,8 +103,10 @@ def test_a_prediction_has_the_bits_of_its_formula_written_down(axes: tuple[str, 
         root, u = rng.normal(size=(n_z, n_z)), rng.normal(size=kalman.n_u)
         mean, cov = rng.normal(size=n_z), root @ root.T * 10.0 ** rng.uniform(-4, 0)
         begun_ns, at_ns = sorted((START_NS + rng.integers(0, 2 * DT_NS, 2)).tolist())
-        known = Belief(at_ns=begun_ns, captured_ns=begun_ns, mean=mean, cov=cov, felt_ns=begun_ns)
-        found = predicted(kalman, START_NS, known, u, at_ns)
+        known = Belief(
+            at_ns=begun_ns, captured_ns=begun_ns, mean=mean, cov=cov, inertial=InertialTrust(used_ns=begun_ns)
+        )
+        found = predict(kalman, START_NS, known, u, at_ns)
         now_ns = begun_ns
         while now_ns < at_ns:
             end_ns = min(at_ns, START_NS + ((now_ns - START_NS) // DT_NS + 1) * DT_NS)
@@ -133,18 +135,18 @@ def test_an_update_has_the_bits_of_its_formula_written_down(axes: tuple[str, ...
     for _ in range(200):
         root, u = rng.normal(size=(n_z, n_z)), rng.normal(size=kalman.n_u)
         belief = Belief(at_ns=START_NS, captured_ns=START_NS, mean=rng.normal(size=n_z), cov=root @ root.T)
-        belief = changed(belief, felt_ns=START_NS)  # not the first one
-        accel = kalman.felt_z @ belief.mean + kalman.felt_u @ u + 0.01 * rng.normal(size=kalman.n_felt)
-        off = accel - kalman.felt_z @ belief.mean - kalman.felt_u @ u
-        mean, cov = joseph(belief, kalman.felt_z, off, np.eye(kalman.n_felt) * 0.2**2)
-        found = felt(kalman, belief, accel, u)
+        belief = changed(belief, inertial=InertialTrust(used_ns=START_NS))  # not the first one
+        accel = kalman.inertial_z @ belief.mean + kalman.inertial_u @ u + 0.01 * rng.normal(size=kalman.n_inertial)
+        off = accel - kalman.inertial_z @ belief.mean - kalman.inertial_u @ u
+        mean, cov = joseph(belief, kalman.inertial_z, off, np.eye(kalman.n_inertial) * 0.2**2)
+        found = update_with_inertial(kalman, belief, accel, u)
         assert found.mean.tobytes() == mean.tobytes() and found.cov.tobytes() == cov.tobytes()
         one = sample(START_NS, position_m=tuple(rng.normal(size=3).tolist()))
         values = np.array(one.position_m)[list(kalman.axes)]
-        of_z = np.eye(n_z)[kalman.shown[: len(values)]]
+        of_z = np.eye(n_z)[kalman.measured_index[: len(values)]]
         noise = np.diag([max(one.std_m, kalman.parameters.position_std_m) ** 2] * len(values))
-        mean, cov = joseph(belief, of_z, values - belief.mean[kalman.shown[: len(values)]], noise)
-        found = updated(kalman, belief, one)
+        mean, cov = joseph(belief, of_z, values - belief.mean[kalman.measured_index[: len(values)]], noise)
+        found = update_with_position(kalman, belief, one)
         # Rows picked out of the covariance and a product with them differ in nothing either.
         assert found.mean.tobytes() == mean.tobytes() and found.cov.tobytes() == cov.tobytes()
 
@@ -153,7 +155,7 @@ def test_an_update_has_the_bits_of_its_formula_written_down(axes: tuple[str, ...
 def test_a_sample_contradicts_by_its_distance_whether_that_has_to_be_solved_for_or_not(axes: tuple[str, ...]) -> None:
     kalman, _ = make(axes, bias_drift=0.1, bias_max=0.4, inertial_std_mps2=0.2)
     rng, n_z, found = np.random.default_rng(7), len(kalman.identity), []
-    index = kalman.shown[: len(axes)]
+    index = kalman.measured_index[: len(axes)]
     for _ in range(2000):
         root = rng.normal(size=(n_z, n_z)) * 10.0 ** rng.uniform(-4, 0)
         belief = Belief(at_ns=START_NS, captured_ns=START_NS, mean=rng.normal(size=n_z), cov=root @ root.T)
@@ -161,12 +163,12 @@ def test_a_sample_contradicts_by_its_distance_whether_that_has_to_be_solved_for_
         of_values = belief.cov[np.ix_(index, index)] + np.diag(variances)
         off = np.linalg.cholesky(of_values) @ rng.normal(size=len(axes)) * 10.0 ** rng.uniform(-1, 1.5)
         distance = float(off @ np.linalg.inv(of_values) @ off)
-        assert contradicted(kalman, belief, belief.mean[index] + off, variances) == (distance > CONTRADICTED)
-        plain = off @ off <= 0.9 * CONTRADICTED * variances.min()
-        found.append((bool(plain), distance > CONTRADICTED))
+        assert is_consistent(kalman, belief, belief.mean[index] + off, variances) == (distance <= MOST_CHI2)
+        plain = off @ off <= 0.9 * MOST_CHI2 * variances.min()
+        found.append((bool(plain), distance > MOST_CHI2))
     assert all(found.count(one) > 50 for one in ((True, False), (False, False), (False, True)))
     broken = np.full(len(axes), np.nan)
-    assert not contradicted(kalman, belief, broken, variances)
+    assert is_consistent(kalman, belief, broken, variances)
 
 
 def test_the_belief_of_the_instant_may_be_given_with_an_input() -> None:
@@ -176,12 +178,12 @@ def test_the_belief_of_the_instant_may_be_given_with_an_input() -> None:
     for tick in range(4 * TICKS):  # boundaries with their marks among them
         at_ns = START_NS + tick * TICK_NS
         due = [sample(at_ns - 3 * MS, at_ns, position_m=(float(rng.normal()), 0.0, 0.0))] if tick % 3 == 1 else []
-        history, given = (absorb(kalman, one, at_ns, due)[0] for one in (history, given))
+        history, given = (absorb_samples(kalman, one, at_ns, due)[0] for one in (history, given))
         u = rng.normal(size=1)
-        history = set_input(kalman, history, at_ns, u)
-        given = set_input(kalman, given, at_ns, u, belief_at(kalman, given, at_ns))
+        history = note_input(kalman, history, at_ns, u)
+        given = note_input(kalman, given, at_ns, u, predict_belief(kalman, given, at_ns))
         later_ns = at_ns + TICK_NS // 2
-        assert repr(estimate(kalman, given, later_ns)) == repr(estimate(kalman, history, later_ns))
+        assert repr(estimate_at(kalman, given, later_ns)) == repr(estimate_at(kalman, history, later_ns))
 
 
 def test_the_belief_of_the_capture_time_may_be_given_with_a_sample() -> None:
@@ -198,14 +200,14 @@ def test_the_belief_of_the_capture_time_may_be_given_with_a_sample() -> None:
         at_ns = START_NS + tick * TICK_NS
         for since_ms, source in due.get(tick, ()):
             one = sample(START_NS + since_ms * MS, at_ns, position_m=(float(rng.normal()), 0.0, 0.0), source=source)
-            belief = belief_at(kalman, given, one.captured_ns)
-            history, _, _ = absorb(kalman, history, at_ns, (one,))
-            given, taken, _ = absorb(kalman, given, at_ns, (one,), belief)
+            belief = predict_belief(kalman, given, one.captured_ns)
+            history, _, _ = absorb_samples(kalman, history, at_ns, (one,))
+            given, taken, _ = absorb_samples(kalman, given, at_ns, (one,), belief)
             assert taken == (one,)
         u = rng.normal(size=1)
-        history, given = (set_input(kalman, known, at_ns, u) for known in (history, given))
+        history, given = (note_input(kalman, known, at_ns, u) for known in (history, given))
         later_ns = at_ns + TICK_NS // 2
-        assert repr(estimate(kalman, given, later_ns)) == repr(estimate(kalman, history, later_ns))
+        assert repr(estimate_at(kalman, given, later_ns)) == repr(estimate_at(kalman, history, later_ns))
 
 
 def brute_force(
@@ -272,11 +274,11 @@ def test_reaches_the_steady_state_of_the_riccati_equation() -> None:
     kalman, history = make()
     for number in range(200):
         at_ns = boundary_ns(number)
-        history, _, _ = absorb(kalman, history, at_ns, [sample(at_ns)])
+        history, _, _ = absorb_samples(kalman, history, at_ns, [sample(at_ns)])
     h = np.array([[1.0, 0.0, 0.0]])
     predicted = solve_discrete_are(plant.a.T, h.T, plant.e @ plant.w @ plant.e.T, np.array([[0.005**2]]))
     gain = predicted @ h.T / (predicted[0, 0] + 0.005**2)
-    steady = estimate(kalman, history, boundary_ns(199))
+    steady = estimate_at(kalman, history, boundary_ns(199))
     assert steady is not None
     np.testing.assert_allclose(steady.cov, predicted - gain @ h @ predicted, rtol=1e-6, atol=1e-12)
 
@@ -317,11 +319,11 @@ def test_a_late_sample_may_turn_out_to_be_the_first() -> None:
     kalman, history = make()
     early, later = sample(START_NS + 10 * MS, position_m=(1.0, 0, 0)), sample(START_NS + 90 * MS)
     at_ns = START_NS + 100 * MS
-    one, _, _ = absorb(kalman, history, at_ns, [later])
-    one, taken, _ = absorb(kalman, one, at_ns, [early])
-    both, _, _ = absorb(kalman, history, at_ns, [early, later])
+    one, _, _ = absorb_samples(kalman, history, at_ns, [later])
+    one, taken, _ = absorb_samples(kalman, one, at_ns, [early])
+    both, _, _ = absorb_samples(kalman, history, at_ns, [early, later])
     assert taken == (early,)
-    assert estimate(kalman, one, at_ns) == estimate(kalman, both, at_ns)
+    assert estimate_at(kalman, one, at_ns) == estimate_at(kalman, both, at_ns)
 
 
 def test_duplicates_and_samples_beyond_the_window_are_refused_with_the_reason() -> None:
@@ -331,27 +333,29 @@ def test_duplicates_and_samples_beyond_the_window_are_refused_with_the_reason() 
     same_time_elsewhere = sample(at_ns - 10 * MS, source="second")
     old = sample(at_ns - 2 * S)
     just_young_enough = sample(at_ns - 2 * S + 1)
-    history, taken, refused = absorb(kalman, history, at_ns, [good, good, same_time_elsewhere, old, just_young_enough])
+    history, taken, refused = absorb_samples(
+        kalman, history, at_ns, [good, good, same_time_elsewhere, old, just_young_enough]
+    )
     assert taken == (good, same_time_elsewhere, just_young_enough)
     assert refused == (DUPLICATE, TOO_OLD)
-    before = estimate(kalman, history, at_ns)
-    history, taken, refused = absorb(kalman, history, at_ns, [good])
+    before = estimate_at(kalman, history, at_ns)
+    history, taken, refused = absorb_samples(kalman, history, at_ns, [good])
     assert (taken, refused) == ((), (DUPLICATE,))
-    assert estimate(kalman, history, at_ns) == before
+    assert estimate_at(kalman, history, at_ns) == before
 
 
 def test_nothing_is_known_before_the_first_sample() -> None:
     kalman, history = make()
-    history, _, _ = absorb(kalman, history, START_NS, [])
-    history = set_input(kalman, history, START_NS, np.array([1.0]))
-    assert estimate(kalman, history, START_NS) is None
+    history, _, _ = absorb_samples(kalman, history, START_NS, [])
+    history = note_input(kalman, history, START_NS, np.array([1.0]))
+    assert estimate_at(kalman, history, START_NS) is None
     assert history.captured_ns is None
 
 
 def test_first_sample_sets_what_it_shows_and_leaves_the_rest_at_zero() -> None:
     kalman, history = make(("east", "down"))
-    history, _, _ = absorb(kalman, history, START_NS, [sample(START_NS, position_m=(7.0, 1.5, -0.5))])
-    first = estimate(kalman, history, START_NS)
+    history, _, _ = absorb_samples(kalman, history, START_NS, [sample(START_NS, position_m=(7.0, 1.5, -0.5))])
+    first = estimate_at(kalman, history, START_NS)
     assert first is not None
     assert first.mean == (1.5, 0.0, 0.0, -0.5, 0.0, 0.0)
     np.testing.assert_allclose(np.diag(first.cov), [0.005**2, 0.09, 0.09] * 2, rtol=1e-12)
@@ -371,18 +375,18 @@ def test_exact_samples_with_velocity_give_the_measured_state_back() -> None:
         accel_per_input=np.array([0.49429632181478]),
     )
     kalman = make_kalman(plant, estimator_parameters(position_std_m=1e-5, velocity_std_mps=1e-5), dt_ns)
-    history = begin(kalman, START_NS, START_NS)
+    history = begin_history(kalman, START_NS, START_NS)
     rng = np.random.default_rng(3)
     x = np.array([35.0, -2.0])
     for number in range(20):
         at_ns = START_NS + number * dt_ns
         one = sample(at_ns, position_m=(x[0], 0.0, 0.0), velocity_mps=(x[1], 0.0, 0.0), std_m=1e-5)
-        history, _, _ = absorb(kalman, history, at_ns, [one])
-        measured = estimate(kalman, history, at_ns)
+        history, _, _ = absorb_samples(kalman, history, at_ns, [one])
+        measured = estimate_at(kalman, history, at_ns)
         assert measured is not None
         np.testing.assert_allclose(measured.mean, x, rtol=0, atol=1e-5)
         u = rng.uniform(-7.5, 7.5, size=1)
-        history = set_input(kalman, history, at_ns, u)
+        history = note_input(kalman, history, at_ns, u)
         x = plant.a @ x + plant.b @ u + plant.e @ rng.normal(scale=0.6**0.5, size=1)
 
 
@@ -390,8 +394,8 @@ def test_a_sample_may_claim_to_be_worse_than_configured_but_not_better() -> None
     kalman, history = make()
     variances = []
     for std in (1e-12, 0.005, 0.5):
-        one, _, _ = absorb(kalman, history, START_NS, [sample(START_NS, std_m=std)])
-        result = estimate(kalman, one, START_NS)
+        one, _, _ = absorb_samples(kalman, history, START_NS, [sample(START_NS, std_m=std)])
+        result = estimate_at(kalman, one, START_NS)
         assert result is not None
         variances.append(result.cov[0][0])
     np.testing.assert_allclose(variances, [0.005**2, 0.005**2, 0.25])
@@ -403,8 +407,8 @@ def test_covariance_stays_symmetric_and_positive_semidefinite() -> None:
     for tick in range(400):
         at_ns = START_NS + tick * TICK_NS
         due = [sample(at_ns - int(rng.integers(0, 40)) * MS, at_ns, velocity_mps=(0, 0, 0), std_m=1e-6)]
-        history, _, _ = absorb(kalman, history, at_ns, due if rng.random() < 0.4 else [])
-        result = estimate(kalman, history, at_ns)
+        history, _, _ = absorb_samples(kalman, history, at_ns, due if rng.random() < 0.4 else [])
+        result = estimate_at(kalman, history, at_ns)
         if result is not None:
             cov = np.array(result.cov)
             assert (cov == cov.T).all()
@@ -413,11 +417,11 @@ def test_covariance_stays_symmetric_and_positive_semidefinite() -> None:
 
 def test_silence_is_prediction_and_the_history_stays_within_the_window() -> None:
     kalman, history = make()
-    history, _, _ = absorb(kalman, history, START_NS, [sample(START_NS, velocity_mps=(1.0, 0, 0))])
+    history, _, _ = absorb_samples(kalman, history, START_NS, [sample(START_NS, velocity_mps=(1.0, 0, 0))])
     for tick in range(1, 400):
-        history, _, _ = absorb(kalman, history, START_NS + tick * TICK_NS, [])
+        history, _, _ = absorb_samples(kalman, history, START_NS + tick * TICK_NS, [])
     assert len(history.entries) <= 2 * S // DT_NS
-    result = estimate(kalman, history, START_NS + 399 * TICK_NS)
+    result = estimate_at(kalman, history, START_NS + 399 * TICK_NS)
     assert result is not None
     want = expm(drag_lag_generator(0.3, 0.25) * 399 * TICK_NS * 1e-9)[:3, 1]
     np.testing.assert_allclose(result.mean, want, rtol=1e-8, atol=1e-9)
@@ -426,19 +430,19 @@ def test_silence_is_prediction_and_the_history_stays_within_the_window() -> None
 
 def test_an_estimate_of_an_earlier_time_leaves_out_what_came_after() -> None:
     kalman, history = make()
-    history, _, _ = absorb(kalman, history, START_NS, [sample(START_NS)])
+    history, _, _ = absorb_samples(kalman, history, START_NS, [sample(START_NS)])
     at_ns = boundary_ns(1) + TICK_NS
-    alone, _, _ = absorb(kalman, history, at_ns, [])
-    more, _, _ = absorb(kalman, history, at_ns, [sample(boundary_ns(1) + 1, position_m=(1.0, 0.0, 0.0))])
-    assert estimate(kalman, more, boundary_ns(1)) == estimate(kalman, alone, boundary_ns(1))
-    assert estimate(kalman, more, at_ns) != estimate(kalman, alone, at_ns)
-    assert estimate(kalman, more, START_NS - 1) is None
+    alone, _, _ = absorb_samples(kalman, history, at_ns, [])
+    more, _, _ = absorb_samples(kalman, history, at_ns, [sample(boundary_ns(1) + 1, position_m=(1.0, 0.0, 0.0))])
+    assert estimate_at(kalman, more, boundary_ns(1)) == estimate_at(kalman, alone, boundary_ns(1))
+    assert estimate_at(kalman, more, at_ns) != estimate_at(kalman, alone, at_ns)
+    assert estimate_at(kalman, more, START_NS - 1) is None
 
 
 def test_a_stamp_after_the_arrival_counts_from_the_arrival() -> None:
     kalman, history = make()
     at_ns = START_NS + TICKS * TICK_NS
-    history, _, _ = absorb(kalman, history, at_ns, [sample(at_ns + 5 * MS, at_ns - 3 * MS)])
+    history, _, _ = absorb_samples(kalman, history, at_ns, [sample(at_ns + 5 * MS, at_ns - 3 * MS)])
     assert history.captured_ns == at_ns - 3 * MS
 
 
@@ -474,20 +478,20 @@ def test_what_is_taken_back_is_as_if_it_had_never_come(seed: int, bias_drift: fl
             for _ in range(rng.integers(0, 3))
         ]
         taken_back += sum(map(poisoned, due))
-        history, _, _ = absorb(kalman, history, at_ns, due)
-        never, _, _ = absorb(kalman, never, at_ns, [one for one in due if not poisoned(one)])
+        history, _, _ = absorb_samples(kalman, history, at_ns, due)
+        never, _, _ = absorb_samples(kalman, never, at_ns, [one for one in due if not poisoned(one)])
         u = None if tick % 17 == 0 else rng.normal(size=1)
         if rng.random() < 0.6:
-            history, never = (set_input(kalman, known, at_ns, u) for known in (history, never))
+            history, never = (note_input(kalman, known, at_ns, u) for known in (history, never))
     assert taken_back > 3 and told(history) != told(never)
-    assert told(without(kalman, history, poisoned)) == told(never)
-    assert told(without(kalman, never, poisoned)) == told(never)
+    assert told(drop_samples(kalman, history, poisoned)) == told(never)
+    assert told(drop_samples(kalman, never, poisoned)) == told(never)
 
 
 def test_what_the_anchor_holds_is_not_taken_back() -> None:
     kalman, history = make()
-    history, _, _ = absorb(kalman, history, START_NS, [sample(START_NS)])
-    history, _, _ = absorb(kalman, history, START_NS + 3 * S, [sample(START_NS + 3 * S)])
-    history = without(kalman, history, lambda one: True)
+    history, _, _ = absorb_samples(kalman, history, START_NS, [sample(START_NS)])
+    history, _, _ = absorb_samples(kalman, history, START_NS + 3 * S, [sample(START_NS + 3 * S)])
+    history = drop_samples(kalman, history, lambda one: True)
     assert history.captured_ns == START_NS
     assert all(one.sample is None for one in history.entries)

@@ -7,21 +7,19 @@ from dataclasses import FrozenInstanceError, replace
 
 import pytest
 
+from uavctl.flight.bias import Biases, find_lasting_bias, remember_bias
 from uavctl.flight.fallback import (
-    Biases,
     Fallback,
     FallbackEnd,
     FallbackParameters,
-    acceleration,
-    advance,
-    back,
-    enter,
-    learnt,
-    request,
-    stop_m,
+    advance_fallback,
+    begin_fallback,
+    compute_brake_accel,
+    compute_return_accel,
+    compute_stop_m,
+    request_end,
 )
 from uavctl.flight.limits import ZERO
-from uavctl.flight.step import remember
 from uavctl.records import ControlMode, Vec3
 
 S = 1_000_000_000
@@ -31,11 +29,11 @@ PARAMETERS = FallbackParameters(
 STAY = replace(PARAMETERS, land=False)
 BRAKE, HOLD, LAND, STOPPED = ControlMode.BRAKE, ControlMode.HOLD, ControlMode.LAND, ControlMode.STOPPED
 FAST, STILL = 1.0, 0.019
-RECOVER, UNPLANNED, BARRED, LET_GO, STOP, TO_LAND = (
+RECOVER, CONTROLLER_FAILED, POSITIONS_DISTRUSTED, RELEASED, STOP, TO_LAND = (
     FallbackEnd.RECOVER,
-    FallbackEnd.UNPLANNED,
-    FallbackEnd.BARRED,
-    FallbackEnd.LET_GO,
+    FallbackEnd.CONTROLLER_FAILED,
+    FallbackEnd.POSITIONS_DISTRUSTED,
+    FallbackEnd.RELEASED,
     FallbackEnd.STOP,
     FallbackEnd.LAND,
 )
@@ -63,15 +61,15 @@ RECOVER, UNPLANNED, BARRED, LET_GO, STOP, TO_LAND = (
         (HOLD, RECOVER, 10 * S, FAST, PARAMETERS, LAND),
         (HOLD, RECOVER, 99 * S, STILL, STAY, HOLD),
         (HOLD, RECOVER, 3 * S - 1, FAST, STAY, HOLD),
-        (BRAKE, BARRED, 2 * S - 1, FAST, PARAMETERS, BRAKE),
-        (BRAKE, BARRED, 0, STILL, PARAMETERS, HOLD),
-        (HOLD, BARRED, 0, FAST, PARAMETERS, LAND),
-        (BRAKE, UNPLANNED, 2 * S - 1, FAST, PARAMETERS, BRAKE),
-        (HOLD, UNPLANNED, 0, FAST, PARAMETERS, LAND),
-        (HOLD, UNPLANNED, 99 * S, FAST, STAY, STOPPED),
-        (HOLD, BARRED, 99 * S, FAST, STAY, STOPPED),  # nothing that we left in the air is left to drift
-        (HOLD, LET_GO, 0, FAST, PARAMETERS, LAND),
-        (HOLD, LET_GO, 0, FAST, STAY, STOPPED),
+        (BRAKE, POSITIONS_DISTRUSTED, 2 * S - 1, FAST, PARAMETERS, BRAKE),
+        (BRAKE, POSITIONS_DISTRUSTED, 0, STILL, PARAMETERS, HOLD),
+        (HOLD, POSITIONS_DISTRUSTED, 0, FAST, PARAMETERS, LAND),
+        (BRAKE, CONTROLLER_FAILED, 2 * S - 1, FAST, PARAMETERS, BRAKE),
+        (HOLD, CONTROLLER_FAILED, 0, FAST, PARAMETERS, LAND),
+        (HOLD, CONTROLLER_FAILED, 99 * S, FAST, STAY, STOPPED),
+        (HOLD, POSITIONS_DISTRUSTED, 99 * S, FAST, STAY, STOPPED),  # nothing that we left in the air is left to drift
+        (HOLD, RELEASED, 0, FAST, PARAMETERS, LAND),
+        (HOLD, RELEASED, 0, FAST, STAY, STOPPED),
         (BRAKE, TO_LAND, 2 * S - 1, FAST, STAY, BRAKE),
         (BRAKE, TO_LAND, 2 * S, FAST, STAY, HOLD),
         (HOLD, TO_LAND, 0, FAST, PARAMETERS, LAND),
@@ -91,7 +89,7 @@ def test_transitions(
     wanted: ControlMode,
 ) -> None:
     before = Fallback(mode=mode, since_ns=5 * S, end=end)
-    after = advance(before, 5 * S + after_ns, speed_mps, ZERO, parameters)
+    after = advance_fallback(before, 5 * S + after_ns, speed_mps, ZERO, parameters)
     assert after.mode is wanted
     assert after.end is end
     assert after.since_ns == (5 * S if wanted is mode else 5 * S + after_ns)
@@ -110,20 +108,24 @@ def test_transitions(
 )
 def test_a_hand_over_waits_for_its_zero(end: FallbackEnd, after_ns: int, sent_mps2: Vec3, wanted: ControlMode) -> None:
     before = Fallback(mode=HOLD, since_ns=5 * S, end=end)
-    assert advance(before, 5 * S + after_ns, 0.0, sent_mps2, PARAMETERS).mode is wanted
+    assert advance_fallback(before, 5 * S + after_ns, 0.0, sent_mps2, PARAMETERS).mode is wanted
 
 
 def test_begins_with_braking() -> None:
-    assert enter(7) == Fallback(mode=BRAKE, since_ns=7, end=RECOVER)
+    assert begin_fallback(7) == Fallback(mode=BRAKE, since_ns=7, end=RECOVER)
 
 
 def test_braking_is_against_the_velocity_and_all_else_is_zero() -> None:
     velocity = (1.0, -2.0, 0.0)
-    assert acceleration(enter(5 * S), 7 * S - 1, velocity, PARAMETERS) == (-1.5, 3.0, 0.0)
+    assert compute_brake_accel(begin_fallback(5 * S), 7 * S - 1, velocity, PARAMETERS) == (-1.5, 3.0, 0.0)
     for over_ns in (7 * S, 7 * S + 1):
-        assert acceleration(enter(5 * S), over_ns, velocity, PARAMETERS) == (0.0, 0.0, 0.0)  # on the way to holding
+        assert compute_brake_accel(begin_fallback(5 * S), over_ns, velocity, PARAMETERS) == (
+            0.0,
+            0.0,
+            0.0,
+        )  # on the way to holding
     for mode in (HOLD, LAND, STOPPED):
-        assert acceleration(Fallback(mode=mode, since_ns=0), 0, velocity, PARAMETERS) == (0.0, 0.0, 0.0)
+        assert compute_brake_accel(Fallback(mode=mode, since_ns=0), 0, velocity, PARAMETERS) == (0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -137,7 +139,7 @@ def test_braking_is_against_the_velocity_and_all_else_is_zero() -> None:
     ],
 )
 def test_holding_by_inertial_data_goes_back_gently(off_m: Vec3, velocity_mps: Vec3, wanted: Vec3) -> None:
-    assert back(off_m, velocity_mps) == pytest.approx(wanted, abs=1e-12)
+    assert compute_return_accel(off_m, velocity_mps) == pytest.approx(wanted, abs=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -146,26 +148,26 @@ def test_holding_by_inertial_data_goes_back_gently(off_m: Vec3, velocity_mps: Ve
         (None, STOP, Fallback(BRAKE, 9, STOP)),
         (Fallback(BRAKE, 4), STOP, Fallback(BRAKE, 4, STOP)),  # the time of braking is not prolonged
         (Fallback(BRAKE, 4, STOP), STOP, Fallback(BRAKE, 4, STOP)),
-        (Fallback(HOLD, 4), BARRED, Fallback(BRAKE, 9, BARRED)),
-        (Fallback(HOLD, 4), UNPLANNED, Fallback(BRAKE, 9, UNPLANNED)),
-        (Fallback(BRAKE, 4, UNPLANNED), BARRED, Fallback(BRAKE, 4, BARRED)),
-        (Fallback(BRAKE, 4, BARRED), UNPLANNED, Fallback(BRAKE, 4, BARRED)),
+        (Fallback(HOLD, 4), POSITIONS_DISTRUSTED, Fallback(BRAKE, 9, POSITIONS_DISTRUSTED)),
+        (Fallback(HOLD, 4), CONTROLLER_FAILED, Fallback(BRAKE, 9, CONTROLLER_FAILED)),
+        (Fallback(BRAKE, 4, CONTROLLER_FAILED), POSITIONS_DISTRUSTED, Fallback(BRAKE, 4, POSITIONS_DISTRUSTED)),
+        (Fallback(BRAKE, 4, POSITIONS_DISTRUSTED), CONTROLLER_FAILED, Fallback(BRAKE, 4, POSITIONS_DISTRUSTED)),
         (Fallback(HOLD, 4, STOP), STOP, Fallback(HOLD, 4, STOP)),
-        (Fallback(HOLD, 4, BARRED), STOP, Fallback(BRAKE, 9, STOP)),
+        (Fallback(HOLD, 4, POSITIONS_DISTRUSTED), STOP, Fallback(BRAKE, 9, STOP)),
         (Fallback(HOLD, 4, STOP), TO_LAND, Fallback(BRAKE, 9, TO_LAND)),
         (Fallback(BRAKE, 4, TO_LAND), STOP, Fallback(BRAKE, 4, TO_LAND)),  # nobody takes a landing back
-        (Fallback(BRAKE, 4, STOP), BARRED, Fallback(BRAKE, 4, STOP)),
-        (Fallback(BRAKE, 4, BARRED), TO_LAND, Fallback(BRAKE, 4, TO_LAND)),
-        (None, LET_GO, Fallback(HOLD, 9, LET_GO)),  # nothing is braked on
-        (Fallback(BRAKE, 4, BARRED), LET_GO, Fallback(HOLD, 9, LET_GO)),
-        (Fallback(BRAKE, 4, STOP), LET_GO, Fallback(BRAKE, 4, STOP)),
-        (Fallback(HOLD, 4, LET_GO), TO_LAND, Fallback(HOLD, 4, TO_LAND)),
+        (Fallback(BRAKE, 4, STOP), POSITIONS_DISTRUSTED, Fallback(BRAKE, 4, STOP)),
+        (Fallback(BRAKE, 4, POSITIONS_DISTRUSTED), TO_LAND, Fallback(BRAKE, 4, TO_LAND)),
+        (None, RELEASED, Fallback(HOLD, 9, RELEASED)),  # nothing is braked on
+        (Fallback(BRAKE, 4, POSITIONS_DISTRUSTED), RELEASED, Fallback(HOLD, 9, RELEASED)),
+        (Fallback(BRAKE, 4, STOP), RELEASED, Fallback(BRAKE, 4, STOP)),
+        (Fallback(HOLD, 4, RELEASED), TO_LAND, Fallback(HOLD, 4, TO_LAND)),
         (Fallback(LAND, 4), TO_LAND, Fallback(LAND, 4)),
         (Fallback(STOPPED, 4), STOP, Fallback(STOPPED, 4)),
     ],
 )
 def test_an_end_that_is_asked_for(before: Fallback | None, end: FallbackEnd, after: Fallback) -> None:
-    assert request(before, end, 9) == after
+    assert request_end(before, end, 9) == after
 
 
 def test_there_is_a_way_back_from_one_end_only() -> None:
@@ -178,7 +180,7 @@ def test_what_has_been_handed_over_has_ended() -> None:
 
 def test_a_tick_cannot_change_what_the_tick_before_left() -> None:
     with pytest.raises(FrozenInstanceError):
-        enter(7).since_ns = 8  # type: ignore[misc]
+        begin_fallback(7).since_ns = 8  # type: ignore[misc]
     with pytest.raises(FrozenInstanceError):
         replace(PARAMETERS).brake_s = 9.0  # type: ignore[misc]
 
@@ -200,7 +202,7 @@ def test_holding_begins_once_the_setpoint_is_what_is_held(
     sent_mps2: Vec3, held_mps2: Vec3, after_ns: int, speed_mps: float, wanted: ControlMode
 ) -> None:
     before = Fallback(mode=BRAKE, since_ns=5 * S)
-    after = advance(before, 5 * S + after_ns, speed_mps, sent_mps2, PARAMETERS, held_mps2)
+    after = advance_fallback(before, 5 * S + after_ns, speed_mps, sent_mps2, PARAMETERS, held_mps2)
     assert after.mode is wanted
     assert after.held_ns == (5 * S + after_ns if wanted is HOLD else None)
 
@@ -215,17 +217,19 @@ def test_it_is_held_for_a_shorter_time_where_nothing_tells_whether_it_drifts(
     parameters = replace(PARAMETERS, hold_s=hold_s, blind_hold_s=blind_hold_s)
     before = Fallback(mode=HOLD, since_ns=5 * S, held_ns=5 * S)
     for after_ns, wanted in ((round(held_s * S) - 1, HOLD), (round(held_s * S), LAND)):
-        assert advance(before, 5 * S + after_ns, 0.0, ZERO, parameters, blind=blind).mode is wanted
+        assert advance_fallback(before, 5 * S + after_ns, 0.0, ZERO, parameters, blind=blind).mode is wanted
 
 
 def test_nobody_is_blind_unless_it_is_said() -> None:
     parameters = replace(PARAMETERS, blind_hold_s=0.5)
-    assert advance(Fallback(mode=HOLD, since_ns=5 * S, held_ns=5 * S), 6 * S, 0.0, ZERO, parameters).mode is HOLD
+    assert (
+        advance_fallback(Fallback(mode=HOLD, since_ns=5 * S, held_ns=5 * S), 6 * S, 0.0, ZERO, parameters).mode is HOLD
+    )
 
 
 def test_a_time_to_hold_that_ends_while_it_brakes_again_begins_no_braking_anew() -> None:
     before = Fallback(mode=BRAKE, since_ns=5 * S, held_ns=S)
-    after = advance(before, 6 * S, 9.0, (1.0, 0.0, 0.0), replace(PARAMETERS, land=False), measured=True)
+    after = advance_fallback(before, 6 * S, 9.0, (1.0, 0.0, 0.0), replace(PARAMETERS, land=False), measured=True)
     assert after == before
 
 
@@ -243,7 +247,7 @@ def test_what_drifts_by_its_own_word_is_braked_again(
     end: FallbackEnd, measured: bool, speed_mps: float, wanted: ControlMode
 ) -> None:
     before = Fallback(mode=HOLD, since_ns=5 * S, end=end, held_ns=4 * S)
-    after = advance(
+    after = advance_fallback(
         before, 6 * S, speed_mps, (1.0, 0.0, 0.0), replace(PARAMETERS, hold_s=9.0, blind_hold_s=9.0), measured=measured
     )
     if end is STOP:
@@ -256,33 +260,33 @@ def test_what_drifts_by_its_own_word_is_braked_again(
 @pytest.mark.parametrize(("after_ns", "over"), [(3 * S - 1, False), (3 * S, True)])
 def test_the_time_to_hold_runs_on_while_it_brakes_again(mode: ControlMode, after_ns: int, over: bool) -> None:
     before = Fallback(mode=mode, since_ns=5 * S + after_ns, held_ns=5 * S)
-    after = advance(before, 5 * S + after_ns, FAST, ZERO, PARAMETERS)
+    after = advance_fallback(before, 5 * S + after_ns, FAST, ZERO, PARAMETERS)
     assert after == (replace(before, mode=LAND) if over else before)
     # Where nothing is configured to land, it brakes for as long as it drifts.
-    assert advance(before, 5 * S + after_ns, FAST, ZERO, STAY, measured=True).mode is BRAKE
+    assert advance_fallback(before, 5 * S + after_ns, FAST, ZERO, STAY, measured=True).mode is BRAKE
 
 
 def test_a_bias_counts_as_far_as_it_has_been_there_all_the_time_of_late() -> None:
-    assert learnt(()) == ()
+    assert find_lasting_bias(()) == ()
     biases: Biases = ()
     for n, bias in enumerate([(0.3, 0.2, -0.1), (0.2, -0.1, -0.3), (0.4, 0.2, -0.2)]):
-        biases = remember(biases, n * S, bias)
-        assert (learnt(biases) == (0.0, 0.0, 0.0)) == (n < 2)
-    assert learnt(biases) == (0.2, 0.0, -0.1)
+        biases = remember_bias(biases, n * S, bias)
+        assert (find_lasting_bias(biases) == (0.0, 0.0, 0.0)) == (n < 2)
+    assert find_lasting_bias(biases) == (0.2, 0.0, -0.1)
     for after_ns, known in ((2 * S - 1, 0.0), (2 * S, 0.5), (2 * S + 1, 0.5)):
-        assert learnt(((5 * S, (0.5,)), (5 * S + after_ns, (0.5,)))) == (known,)
+        assert find_lasting_bias(((5 * S, (0.5,)), (5 * S + after_ns, (0.5,)))) == (known,)
     for after_ns, first_ns in ((3 * S - 1, 5 * S), (3 * S, 5 * S), (3 * S + 1, 6 * S)):
-        later = remember(((5 * S, (0.1,)), (6 * S, (0.2,))), 5 * S + after_ns, (0.3,))
+        later = remember_bias(((5 * S, (0.1,)), (6 * S, (0.2,))), 5 * S + after_ns, (0.3,))
         assert (later[0][0], later[-1]) == (first_ns, (5 * S + after_ns, (0.3,)))
 
 
 def test_what_does_not_fit_together_is_an_error_and_not_compared_in_part() -> None:
     with pytest.raises(ValueError, match="zip"):
-        advance(enter(0), 0, STILL, ZERO, PARAMETERS, (0.0, 0.0))  # type: ignore[arg-type]
+        advance_fallback(begin_fallback(0), 0, STILL, ZERO, PARAMETERS, (0.0, 0.0))  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="zip"):
-        learnt(((0, (0.1,)), (1, (0.1, 0.2))))
+        find_lasting_bias(((0, (0.1,)), (1, (0.1, 0.2))))
     with pytest.raises(TypeError):  # whose word it is has to be said
-        advance(enter(0), 0, STILL, ZERO, PARAMETERS, ZERO, True)  # type: ignore[call-arg]
+        advance_fallback(begin_fallback(0), 0, STILL, ZERO, PARAMETERS, ZERO, True)  # type: ignore[call-arg]
 
 
 @pytest.mark.parametrize("speed_mps", [0.1, 1.0, 4.0])
@@ -291,4 +295,4 @@ def test_the_distance_of_braking_is_that_of_its_law(speed_mps: float) -> None:
     for _ in range(200_000):
         way += speed * step_s
         speed -= min(PARAMETERS.brake_gain_1ps * speed, most) * step_s
-    assert stop_m(speed_mps, most, PARAMETERS) == pytest.approx(way, rel=1e-3)
+    assert compute_stop_m(speed_mps, most, PARAMETERS) == pytest.approx(way, rel=1e-3)

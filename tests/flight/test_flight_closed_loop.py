@@ -8,11 +8,12 @@ from numpy.typing import NDArray
 
 from uavctl.build.controller import build_controller
 from uavctl.config import load_config
-from uavctl.flight.step import StepOutput, initial_state, step
+from uavctl.flight.tick import TickOutput, make_initial_state
+from uavctl.flight.tick import tick as run_tick
 from uavctl.records import ControlMode, SolveStatus, StepInput
 
 
-def fly(seconds: float, seed: int) -> tuple[list[StepInput], list[StepOutput], NDArray[np.float64]]:
+def fly(seconds: float, seed: int) -> tuple[list[StepInput], list[TickOutput], NDArray[np.float64]]:
     """A camera sample a Δt with noise, 30 % loss, 30 to 70 ms of delay; truth (steps + 1, n_x) at the boundaries."""
     config = load_config("room-hahn-stursberg")
     controller = build_controller(config)
@@ -20,7 +21,7 @@ def fly(seconds: float, seed: int) -> tuple[list[StepInput], list[StepOutput], N
     rng = np.random.default_rng(seed)
     a, b, e = plant.transition(controller.tick_ns * 1e-9)
     x = plant.equilibrium(config.sim.start_position_m)
-    state = initial_state()
+    state = make_initial_state()
     waiting, inputs, outputs, truth = [], [], [], []
     w = np.zeros(plant.n_w)
     for tick in range(round(seconds * 1e9) // controller.tick_ns):
@@ -35,7 +36,7 @@ def fly(seconds: float, seed: int) -> tuple[list[StepInput], list[StepOutput], N
         arrived = tuple(one for one in waiting if one.received_ns <= at_ns)
         waiting = [one for one in waiting if one.received_ns > at_ns]
         inputs.append(StepInput(tick=tick, at_ns=at_ns, samples=arrived, vehicle=vehicle()))
-        state, output = step(state, inputs[-1], controller)
+        state, output = run_tick(state, inputs[-1], controller)
         outputs.append(output)
         u = np.zeros(plant.n_u) if output.setpoint is None else plant.to_input(output.setpoint.accel_mps2)
         x = a @ x + b @ u + e @ w

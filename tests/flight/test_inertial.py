@@ -32,35 +32,38 @@ from scipy.linalg import expm
 
 from uavctl.build.controller import build_estimator, build_plant
 from uavctl.config import load_config
-from uavctl.flight.controller import Controller, ControlState
-from uavctl.flight.decision import back_mps2, place, reckons
+from uavctl.flight.act import find_return_accel
+from uavctl.flight.context import locate_on_grid, view_filter
+from uavctl.flight.controller import Controller
+from uavctl.flight.decide import carries_estimate
 from uavctl.flight.estimator import (
-    Coming,
     FilterHistory,
-    absorb,
-    act,
-    begin,
-    belief_ahead,
-    belief_at,
-    doubted,
-    estimate,
-    feel,
-    set_input,
+    PendingInputs,
+    absorb_samples,
+    apply_due_inputs,
+    begin_history,
+    distrust_inertial,
+    estimate_at,
+    note_input,
+    predict_ahead,
+    predict_belief,
+    update_inertial,
 )
 from uavctl.flight.fallback import Fallback, FallbackEnd
 from uavctl.flight.kalman import (
-    DOUBTED_NS,
-    REFUSED,
-    UNFELT_DRIFT,
-    UNFELT_NS,
+    DRIFT_WITHOUT_INERTIAL,
+    INERTIAL_LASTS_NS,
     Belief,
     Kalman,
-    felt,
-    first_belief,
+    make_first_belief,
     make_kalman,
-    predicted,
+    predict,
+    update_with_inertial,
 )
-from uavctl.flight.step import StepOutput, initial_state, step
+from uavctl.flight.monitors.inertial import DISTRUST_NS, MOST_REFUSED, InertialTrust
+from uavctl.flight.state import ControlState
+from uavctl.flight.tick import TickOutput, make_initial_state
+from uavctl.flight.tick import tick as run_tick
 from uavctl.records import ControlMode, Decision, Estimate, InertialSample, PositionSample, StepInput, Vec3
 
 Array = NDArray[np.float64]
@@ -141,29 +144,29 @@ def conditioned(
 
 
 def known(kalman: Kalman, history: FilterHistory, at_ns: int) -> tuple[Array, Array]:
-    belief = belief_at(kalman, history, at_ns)
+    belief = predict_belief(kalman, history, at_ns)
     assert belief is not None
     return belief.mean[: kalman.n_x], belief.cov[: kalman.n_x, : kalman.n_x]
 
 
 def test_equals_conditioning_positions_and_accelerations_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("uavctl.flight.kalman.FELT_SIGMA", math.inf)  # all of them are to count
-    monkeypatch.setattr("uavctl.flight.kalman.UNFELT_DRIFT", 1.0)  # one noise throughout
+    monkeypatch.setattr("uavctl.flight.monitors.inertial.PLAUSIBLE_SIGMA", math.inf)  # all of them are to count
+    monkeypatch.setattr("uavctl.flight.kalman.DRIFT_WITHOUT_INERTIAL", 1.0)  # one noise throughout
     kalman = make()
     places = {START_NS + t * MS: p for t, p in ((30, 0.10), (200, 0.14), (415, 0.13), (700, 0.2))}
     accels = {START_NS + t * MS: a for t, a in ((75, 0.1), (130, 0.12), (260, -0.1), (350, 0.3), (610, 0.2))}
     inputs = {START_NS + t * MS: u for t, u in ((0, 0.2), (150, -0.4), (500, 0.3))}
-    history = begin(kalman, START_NS, START_NS)
+    history = begin_history(kalman, START_NS, START_NS)
     for tick in range(16):
         at_ns = START_NS + tick * TICK_NS
         samples = [sample(t, at_ns, (p, 0.0, 0.0)) for t, p in places.items() if at_ns - TICK_NS < t <= at_ns]
-        history, taken, _ = absorb(kalman, history, at_ns, samples)
+        history, taken, _ = absorb_samples(kalman, history, at_ns, samples)
         assert len(taken) == len(samples)
         for t, accel in accels.items():
             if at_ns - TICK_NS < t <= at_ns:
-                history = feel(kalman, history, felt_at(t, accel - 0.01, accel, accel + 0.01))
+                history = update_inertial(kalman, history, felt_at(t, accel - 0.01, accel, accel + 0.01))
         if at_ns in inputs:
-            history = set_input(kalman, history, at_ns, np.array([inputs[at_ns]]))
+            history = note_input(kalman, history, at_ns, np.array([inputs[at_ns]]))
     mean, cov = known(kalman, history, at_ns)
     want_mean, want_cov = conditioned(places, accels, inputs, at_ns)
     np.testing.assert_allclose(mean, want_mean, rtol=0, atol=1e-9)
@@ -179,7 +182,7 @@ def test_late_positions_among_inertial_data_give_the_same_bits_as_positions_in_o
     accels, inputs = rng.normal(0.0, 0.1, size=40), rng.normal(0.0, 0.3, size=40)
 
     def flown(late: bool) -> Estimate | None:
-        history = begin(kalman, START_NS, START_NS)
+        history = begin_history(kalman, START_NS, START_NS)
         samples = [
             sample(t, t + int(by) * late, (float(p), 0.0, 0.0))
             for t, by, p in zip(captured, late_ns, places, strict=True)
@@ -187,10 +190,10 @@ def test_late_positions_among_inertial_data_give_the_same_bits_as_positions_in_o
         for tick in range(40):
             at_ns = START_NS + tick * TICK_NS
             due = [one for one in samples if at_ns - TICK_NS < one.received_ns <= at_ns]
-            history, _, _ = absorb(kalman, history, at_ns, due)
-            history = feel(kalman, history, felt_at(at_ns - 20 * MS, accels[tick]))
-            history = set_input(kalman, history, at_ns, inputs[tick : tick + 1])
-        return estimate(kalman, history, at_ns)
+            history, _, _ = absorb_samples(kalman, history, at_ns, due)
+            history = update_inertial(kalman, history, felt_at(at_ns - 20 * MS, accels[tick]))
+            history = note_input(kalman, history, at_ns, inputs[tick : tick + 1])
+        return estimate_at(kalman, history, at_ns)
 
     assert flown(late=False) is not None
     # What comes before the first position says nothing, and that one may come late: so the first is in time.
@@ -208,20 +211,20 @@ def blind(
         h = TICK_NS * 1e-9
         accel = push_mps2 - DRAG * v
         p, v, at_ns = p + h * v + 0.5 * h * h * accel, v + h * accel, at_ns + TICK_NS
-        history, _, _ = absorb(kalman, history, at_ns, ())
+        history, _, _ = absorb_samples(kalman, history, at_ns, ())
         if feels:
-            history = feel(kalman, history, felt_at(at_ns - TICK_NS // 2, accel))
+            history = update_inertial(kalman, history, felt_at(at_ns - TICK_NS // 2, accel))
     mean, cov = known(kalman, history, at_ns)
     return mean[0] - p, math.sqrt(cov[0, 0])
 
 
 def test_a_force_that_begins_in_silence_is_felt_and_unfelt_is_not_known() -> None:
     kalman = make()
-    history = set_input(kalman, begin(kalman, START_NS, START_NS), START_NS, np.zeros(1))
+    history = note_input(kalman, begin_history(kalman, START_NS, START_NS), START_NS, np.zeros(1))
     for tick in range(81):
         at_ns = START_NS + tick * TICK_NS
-        history, _, _ = absorb(kalman, history, at_ns, [sample(at_ns)] if tick % 4 == 0 else [])
-        history = feel(kalman, history, felt_at(at_ns - TICK_NS // 2, 0.0))
+        history, _, _ = absorb_samples(kalman, history, at_ns, [sample(at_ns)] if tick % 4 == 0 else [])
+        history = update_inertial(kalman, history, felt_at(at_ns - TICK_NS // 2, 0.0))
     error_m, std_m = blind(history, kalman, 0.15, 2.0, feels=True)
     unfelt_m, unfelt_std_m = blind(history, kalman, 0.15, 2.0, feels=False)
     assert abs(unfelt_m) == pytest.approx(0.5 * 0.15 * 2.0**2, rel=0.2)  # it knows nothing of the force
@@ -231,26 +234,26 @@ def test_a_force_that_begins_in_silence_is_felt_and_unfelt_is_not_known() -> Non
 
 def test_what_the_sensors_are_off_for_long_is_learnt_from_positions() -> None:
     kalman = make()
-    history = set_input(kalman, begin(kalman, START_NS, START_NS), START_NS, np.zeros(1))
+    history = note_input(kalman, begin_history(kalman, START_NS, START_NS), START_NS, np.zeros(1))
     for tick in range(20 * 40):
         at_ns = START_NS + tick * TICK_NS
-        history, _, _ = absorb(kalman, history, at_ns, [sample(at_ns)] if tick % 4 == 0 else [])
-        history = feel(kalman, history, felt_at(at_ns - TICK_NS // 2, 0.12))
+        history, _, _ = absorb_samples(kalman, history, at_ns, [sample(at_ns)] if tick % 4 == 0 else [])
+        history = update_inertial(kalman, history, felt_at(at_ns - TICK_NS // 2, 0.12))
     mean, cov = known(kalman, history, at_ns)
     assert mean[4] == pytest.approx(0.12, abs=0.02)
     assert abs(mean[3]) < 0.02 and math.sqrt(cov[4, 4]) < 0.05
-    now = estimate(kalman, history, at_ns)
+    now = estimate_at(kalman, history, at_ns)
     assert now is not None and len(now.mean) == 3 and now.bias == (mean[3],)  # of the plant, and against what it flies
 
 
 def followed(kalman: Kalman, seconds: float, told_mps2: Callable[[int], float], every: int = 4) -> list[Belief]:
     """Beliefs, tick by tick, of a vehicle at rest whose positions say so and whose inertial data say something."""
-    history = set_input(kalman, begin(kalman, START_NS, START_NS), START_NS, np.zeros(1))
+    history = note_input(kalman, begin_history(kalman, START_NS, START_NS), START_NS, np.zeros(1))
     beliefs = []
     for tick in range(round(seconds * 1e9) // TICK_NS):
         at_ns = START_NS + tick * TICK_NS
-        history, _, _ = absorb(kalman, history, at_ns, [sample(at_ns)] if tick % every == 0 else [])
-        history = feel(kalman, history, felt_at(at_ns + MS, told_mps2(tick)))
+        history, _, _ = absorb_samples(kalman, history, at_ns, [sample(at_ns)] if tick % every == 0 else [])
+        history = update_inertial(kalman, history, felt_at(at_ns + MS, told_mps2(tick)))
         belief = history.newest.belief
         assert belief is not None
         beliefs.append(belief)
@@ -261,55 +264,57 @@ def test_a_flight_that_begins_in_a_wind_does_not_doubt_what_it_feels_first_but_l
     """A push of twice the largest bias that is counted on, from the first inertial data on, and all of a sudden."""
     first = followed(make(), 2.0, lambda tick: 2.0 * MOST)
     later = followed(make(), 2.0, lambda tick: 2.0 * MOST if tick >= 20 else 0.0)
-    assert all(belief.doubted_ns is None and not belief.refused for belief in first[:3])
+    assert all(belief.inertial.distrusted_ns is None and not belief.inertial.refused for belief in first[:3])
     assert first[2].mean[3] > MOST
-    assert later[20 + REFUSED - 1].doubted_ns is not None
+    assert later[20 + MOST_REFUSED - 1].inertial.distrusted_ns is not None
 
 
 def test_data_that_cannot_be_are_doubted_and_believed_again_when_positions_agree_for_long() -> None:
     kalman = make()
     beliefs = followed(kalman, 12.0, lambda tick: 3.0 if 40 <= tick < 60 else 0.0)
-    first = next(tick for tick, belief in enumerate(beliefs) if belief.doubted_ns is not None)
-    assert first == 40 + REFUSED - 1
-    again = next(tick for tick in range(first, len(beliefs)) if beliefs[tick].doubted_ns is None)
-    assert DOUBTED_NS <= beliefs[again].at_ns - beliefs[first].at_ns <= DOUBTED_NS + 4 * TICK_NS
-    assert all(belief.felt_ns == beliefs[39].felt_ns for belief in beliefs[first:again])  # nothing of them is in it
-    assert beliefs[-1].felt_ns == beliefs[-1].at_ns
+    first = next(tick for tick, belief in enumerate(beliefs) if belief.inertial.distrusted_ns is not None)
+    assert first == 40 + MOST_REFUSED - 1
+    again = next(tick for tick in range(first, len(beliefs)) if beliefs[tick].inertial.distrusted_ns is None)
+    assert DISTRUST_NS <= beliefs[again].at_ns - beliefs[first].at_ns <= DISTRUST_NS + 4 * TICK_NS
+    assert all(
+        belief.inertial.used_ns == beliefs[39].inertial.used_ns for belief in beliefs[first:again]
+    )  # nothing of them is in it
+    assert beliefs[-1].inertial.used_ns == beliefs[-1].at_ns
     assert max(abs(float(belief.mean[1])) for belief in beliefs) < 0.05
 
 
 def test_one_that_cannot_be_is_left_out_and_no_reason_for_doubt() -> None:
     beliefs = followed(make(), 6.0, lambda tick: 3.0 if tick % 10 == 5 else 0.0)
-    assert all(belief.doubted_ns is None for belief in beliefs)
+    assert all(belief.inertial.distrusted_ns is None for belief in beliefs)
     assert max(abs(float(belief.mean[1])) for belief in beliefs) < 0.05
 
 
 def test_a_doubt_outlives_positions_that_come_late_and_what_it_took_back_stays_so(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("uavctl.flight.kalman.UNFELT_DRIFT", 1.0)  # as fast in doubt as without
+    monkeypatch.setattr("uavctl.flight.kalman.DRIFT_WITHOUT_INERTIAL", 1.0)  # as fast in doubt as without
     kalman = make()
 
     def told(*, lies: bool, late: bool) -> Belief:
-        history = set_input(kalman, begin(kalman, START_NS, START_NS), START_NS, np.zeros(1))
+        history = note_input(kalman, begin_history(kalman, START_NS, START_NS), START_NS, np.zeros(1))
         for tick in range(20):
             at_ns = START_NS + tick * TICK_NS
             samples = [sample(at_ns)] if tick % 4 == 0 and tick <= 8 else []
-            history, _, _ = absorb(kalman, history, at_ns, samples)
+            history, _, _ = absorb_samples(kalman, history, at_ns, samples)
             if tick < 8 or (lies and tick > 8):
-                history = feel(kalman, history, felt_at(at_ns + MS, 0.1 if tick > 8 else 0.0))
-        history = doubted(kalman, history, at_ns + 2 * MS) if lies else history
+                history = update_inertial(kalman, history, felt_at(at_ns + MS, 0.1 if tick > 8 else 0.0))
+        history = distrust_inertial(kalman, history, at_ns + 2 * MS) if lies else history
         at_ns += TICK_NS
         if late:
-            history, taken, _ = absorb(kalman, history, at_ns, [sample(START_NS + 6 * TICK_NS, at_ns)])
+            history, taken, _ = absorb_samples(kalman, history, at_ns, [sample(START_NS + 6 * TICK_NS, at_ns)])
             assert taken
-        belief = belief_at(kalman, feel(kalman, history, felt_at(at_ns, 0.1) if lies else ()), at_ns)
+        belief = predict_belief(kalman, update_inertial(kalman, history, felt_at(at_ns, 0.1) if lies else ()), at_ns)
         assert belief is not None
         return belief
 
     for late in (False, True):
         lied, silent = told(lies=True, late=late), told(lies=False, late=late)
-        assert lied.doubted_ns is not None and silent.doubted_ns is None
+        assert lied.inertial.distrusted_ns is not None and silent.inertial.distrusted_ns is None
         np.testing.assert_allclose(lied.mean, silent.mean, rtol=0, atol=1e-12)
         np.testing.assert_allclose(lied.cov, silent.cov, rtol=0, atol=1e-12)
 
@@ -318,8 +323,10 @@ def test_a_doubt_outlives_positions_that_come_late_and_what_it_took_back_stays_s
 def test_positions_that_contradict_what_is_felt_make_it_doubted() -> None:
     kalman = make()
     beliefs = followed(kalman, 10.0, lambda tick: min(max(tick - 80, 0) * 0.02, 1.5), every=16)
-    contradicted = [belief for belief in beliefs if belief.doubted_ns is not None and not belief.refused]
-    assert contradicted and contradicted[0].doubted_ns == contradicted[0].captured_ns
+    contradicted = [
+        belief for belief in beliefs if belief.inertial.distrusted_ns is not None and not belief.inertial.refused
+    ]
+    assert contradicted and contradicted[0].inertial.distrusted_ns == contradicted[0].captured_ns
     off = [abs(float(belief.mean[0])) for belief in beliefs]
     believed = followed(make(), 10.0, lambda tick: 0.0, every=16)
     # It is less off once it is doubted than before, and hardly more than had nothing been said.
@@ -328,28 +335,30 @@ def test_positions_that_contradict_what_is_felt_make_it_doubted() -> None:
 
 def test_what_cannot_be_or_says_nothing_is_not_believed() -> None:
     kalman = make()
-    history, _, _ = absorb(kalman, begin(kalman, START_NS, START_NS), START_NS, [sample(START_NS)])
+    history, _, _ = absorb_samples(kalman, begin_history(kalman, START_NS, START_NS), START_NS, [sample(START_NS)])
     at_ns = START_NS + TICK_NS
-    fine = feel(kalman, history, felt_at(at_ns, 0.1))
+    fine = update_inertial(kalman, history, felt_at(at_ns, 0.1))
     assert repr(known(kalman, fine, at_ns)) != repr(known(kalman, history, at_ns))
     for told in ((40.0,), (math.nan,), (math.inf, -math.inf), ()):
-        unmoved = feel(kalman, history, felt_at(at_ns, *told))
+        unmoved = update_inertial(kalman, history, felt_at(at_ns, *told))
         assert repr(known(kalman, unmoved, at_ns)) == repr(known(kalman, history, at_ns))
     stuck = felt_at(at_ns, 0.1, 0.1, 0.1)
-    assert repr(known(kalman, feel(kalman, history, stuck), at_ns)) == repr(
-        known(kalman, feel(kalman, history, stuck[:1]), at_ns)
+    assert repr(known(kalman, update_inertial(kalman, history, stuck), at_ns)) == repr(
+        known(kalman, update_inertial(kalman, history, stuck[:1]), at_ns)
     )
     old_ns = START_NS - 3_000_000_000
-    assert feel(kalman, history, felt_at(old_ns, 0.1)) is history
+    assert update_inertial(kalman, history, felt_at(old_ns, 0.1)) is history
     deaf = make_kalman(small_plant(), estimator_parameters(), DT_NS)
-    assert feel(deaf, history, felt_at(at_ns, 0.1)) is history
-    belief = belief_at(deaf, absorb(deaf, begin(deaf, START_NS, START_NS), START_NS, [sample(START_NS)])[0], START_NS)
+    assert update_inertial(deaf, history, felt_at(at_ns, 0.1)) is history
+    belief = predict_belief(
+        deaf, absorb_samples(deaf, begin_history(deaf, START_NS, START_NS), START_NS, [sample(START_NS)])[0], START_NS
+    )
     assert belief is not None
     with pytest.raises(ValueError, match="inertial"):
-        felt(deaf, belief, np.zeros(1), None)
+        update_with_inertial(deaf, belief, np.zeros(1), None)
 
 
-def no_inputs() -> Coming:
+def no_inputs() -> PendingInputs:
     return ()
 
 
@@ -357,21 +366,21 @@ def test_an_input_acts_when_its_dead_time_is_over_and_counts_ahead_before() -> N
     kalman = make_kalman(small_plant(wind_std=WIND), estimator_parameters(), DT_NS)
     rng = np.random.default_rng(1)
     dead_ns, inputs = 130 * MS, rng.normal(size=12)
-    history, coming = begin(kalman, START_NS, START_NS), no_inputs()
+    history, pending_inputs = begin_history(kalman, START_NS, START_NS), no_inputs()
     for tick, u in enumerate(inputs):
         at_ns = START_NS + tick * TICK_NS
-        history, coming = act(kalman, history, coming, at_ns)
-        history, _, _ = absorb(kalman, history, at_ns, [sample(START_NS)] if tick == 0 else [])
-        ahead = belief_ahead(kalman, history, coming, at_ns, dead_ns)
+        history, pending_inputs = apply_due_inputs(kalman, history, pending_inputs, at_ns)
+        history, _, _ = absorb_samples(kalman, history, at_ns, [sample(START_NS)] if tick == 0 else [])
+        ahead = predict_ahead(kalman, history, pending_inputs, at_ns, dead_ns)
         mean, cuts = np.zeros(3), [START_NS, *(START_NS + n * TICK_NS + dead_ns for n in range(tick)), at_ns + dead_ns]
         for n, (earlier, later) in enumerate(itertools.pairwise(cuts)):
             moved = expm(drag_lag_generator(DRAG, LAG) * (later - earlier) * 1e-9)
             mean = moved[:3, :3] @ mean + moved[:3, 4] * (inputs[n - 1] if n else 0.0)
         assert ahead is not None and ahead.at_ns == at_ns + dead_ns
         np.testing.assert_allclose(ahead.mean[:3], mean, rtol=0, atol=1e-11)
-        coming = (*coming, (at_ns + dead_ns, np.array([u])))
-    past = belief_ahead(kalman, history, coming, at_ns - 3 * TICK_NS, dead_ns)  # of a boundary that was missed
-    then = belief_at(kalman, history, at_ns - 20 * MS)
+        pending_inputs = (*pending_inputs, (at_ns + dead_ns, np.array([u])))
+    past = predict_ahead(kalman, history, pending_inputs, at_ns - 3 * TICK_NS, dead_ns)  # of a boundary that was missed
+    then = predict_belief(kalman, history, at_ns - 20 * MS)
     assert past is not None and then is not None
     np.testing.assert_allclose(past.mean, then.mean, rtol=0, atol=1e-12)
 
@@ -386,19 +395,19 @@ def controller_that_feels(dead_ns: int = 0, **changes: float) -> Controller:
     return replace(controller, estimator=parameters, late_steps=HORIZON, dead_ns=dead_ns)
 
 
-def ticks_of(controller: Controller, samples: list[PositionSample], *, feels: bool, count: int) -> list[StepOutput]:
-    state, out = initial_state(), []
+def ticks_of(controller: Controller, samples: list[PositionSample], *, feels: bool, count: int) -> list[TickOutput]:
+    state, out = make_initial_state(), []
     for tick in range(count):
         at_ns = START_NS + tick * TICK_NS
         due = tuple(one for one in samples if at_ns - TICK_NS < one.received_ns <= at_ns)
         inertial = felt_at(at_ns - TICK_NS // 2, 0.001 * (tick % 7)) if feels else ()
         given = StepInput(tick=tick, at_ns=at_ns, samples=due, vehicle=vehicle(), inertial=inertial)
-        state, told = step(state, given, controller)
+        state, told = run_tick(state, given, controller)
         out.append(told)
     return out
 
 
-def boundaries(told: list[StepOutput]) -> list[Decision]:
+def boundaries(told: list[TickOutput]) -> list[Decision]:
     return [one.decision for one in told if one.decision.boundary]
 
 
@@ -444,7 +453,7 @@ def test_a_plan_begins_where_its_first_input_acts() -> None:
 def drifting(*, feels: bool, push_mps2: float = 0.2, seconds: float = 8.0) -> tuple[float, list[Decision]]:
     """How far a force carries the vehicle that held still when positions ended [m], and what was decided."""
     controller = controller_that_feels(bias_max=1.0)
-    plant, state, at_rest = small_plant(), initial_state(), np.zeros(3)
+    plant, state, at_rest = small_plant(), make_initial_state(), np.zeros(3)
     a, b, _ = plant.transition(TICK_NS * 1e-9)
     x, furthest, decided = at_rest, 0.0, []
     silent = 5 * TICKS
@@ -456,7 +465,7 @@ def drifting(*, feels: bool, push_mps2: float = 0.2, seconds: float = 8.0) -> tu
         slope = float(x[2] - DRAG * x[1] + push)
         inertial = felt_at(at_ns - MS, slope) if feels else ()
         given = StepInput(tick=tick, at_ns=at_ns, samples=samples, vehicle=vehicle(), inertial=inertial)
-        state, told = step(state, given, controller)
+        state, told = run_tick(state, given, controller)
         decided.append(told.decision)
         u = 0.0 if told.setpoint is None or tick < silent else told.setpoint.accel_mps2[0]
         h = TICK_NS * 1e-9
@@ -478,22 +487,22 @@ def test_a_fallback_holds_by_inertial_data_against_a_force_that_it_would_not_kno
 
 
 def test_a_fallback_that_ends_holds_by_nothing() -> None:
-    state = ControlState(fallback=Fallback(ControlMode.HOLD, START_NS, FallbackEnd.LET_GO), held_m=(0.0, 0.0, 0.0))
     controller = controller_that_feels()
-    kalman = controller.kalman
-    history, _, _ = absorb(kalman, begin(kalman, START_NS, START_NS), START_NS, [sample(START_NS)])
-    history = feel(kalman, history, felt_at(START_NS + MS, 0.3))
+    kalman, plant = controller.kalman, controller.plant
+    history, _, _ = absorb_samples(kalman, begin_history(kalman, START_NS, START_NS), START_NS, [sample(START_NS)])
+    history = update_inertial(kalman, history, felt_at(START_NS + MS, 0.3))
     given = StepInput(tick=1, at_ns=START_NS + TICK_NS, vehicle=vehicle())
-    tick = place(state, given, history, controller)
-    assert tick.estimate is not None and state.fallback is not None and not reckons(state.fallback, tick)
-    assert back_mps2(state, tick, controller) == (0.0, 0.0, 0.0)
-    recover = msgspec.structs.replace(state, fallback=Fallback(ControlMode.HOLD, START_NS), held_m=(1.0, 0.0, 0.0))
-    assert back_mps2(recover, tick, controller)[0] > 0.5
-    told = feel(kalman, history, felt_at(START_NS + TICK_NS, 50.0))  # cannot be, and so carries nothing on
-    lied = msgspec.structs.replace(tick, belief=belief_at(kalman, told, START_NS + 300 * MS))
-    assert back_mps2(recover, lied, controller) == (0.0, 0.0, 0.0)
-    later = msgspec.structs.replace(tick, belief=belief_at(kalman, history, START_NS + 300 * MS))
-    assert back_mps2(recover, later, controller) == (0.0, 0.0, 0.0)  # the data are too old
+    view = view_filter(history, locate_on_grid(ControlState(), given, controller, carried=False))
+    ended, origin = Fallback(ControlMode.HOLD, START_NS, FallbackEnd.RELEASED), (0.0, 0.0, 0.0)
+    assert view.estimate is not None and not carries_estimate(ended, view.belief)
+    assert find_return_accel(ended, origin, view, plant) == (0.0, 0.0, 0.0)
+    recover, point = Fallback(ControlMode.HOLD, START_NS), (1.0, 0.0, 0.0)
+    assert find_return_accel(recover, point, view, plant)[0] > 0.5
+    told = update_inertial(kalman, history, felt_at(START_NS + TICK_NS, 50.0))  # cannot be, and so carries nothing on
+    lied = msgspec.structs.replace(view, belief=predict_belief(kalman, told, START_NS + 300 * MS))
+    assert find_return_accel(recover, point, lied, plant) == (0.0, 0.0, 0.0)
+    later = msgspec.structs.replace(view, belief=predict_belief(kalman, history, START_NS + 300 * MS))
+    assert find_return_accel(recover, point, later, plant) == (0.0, 0.0, 0.0)  # the data are too old
 
 
 def test_a_bias_drifts_slowly_while_no_inertial_data_are_used() -> None:
@@ -501,17 +510,17 @@ def test_a_bias_drifts_slowly_while_no_inertial_data_are_used() -> None:
     config = load_config("room")
     believed, dt_ns = build_estimator(config), round(config.plant.dt_s * 1e9)
     kalman = make_kalman(build_plant(config), believed, dt_ns)
-    first = first_belief(kalman, sample(0))
+    first = make_first_belief(kalman, sample(0))
     step = believed.bias_drift**2 * config.plant.dt_s
-    quiet, seconds = UNFELT_DRIFT**2 * step, UNFELT_NS // dt_ns
+    quiet, seconds = DRIFT_WITHOUT_INERTIAL**2 * step, INERTIAL_LASTS_NS // dt_ns
 
     def gained(steps: int, **known: int) -> float:
         """By the variance of a bias in whole steps; the first of them has no drift of its own yet."""
-        belief = msgspec.structs.replace(first, **known)
-        after = predicted(kalman, 0, belief, np.zeros(kalman.n_u), steps * dt_ns)
+        belief = msgspec.structs.replace(first, inertial=InertialTrust(**known))
+        after = predict(kalman, 0, belief, np.zeros(kalman.n_u), steps * dt_ns)
         return float(after.cov[kalman.bias.start, kalman.bias.start] - (0.25 * believed.bias_max) ** 2)
 
     assert gained(11) == pytest.approx(11 * quiet)
-    assert gained(11, felt_ns=0) == pytest.approx(quiet + 10 * step)
-    assert gained(11, felt_ns=0, doubted_ns=0) == pytest.approx(11 * quiet)
-    assert gained(3 * seconds, felt_ns=0) == pytest.approx(quiet + seconds * step + (2 * seconds - 1) * quiet)
+    assert gained(11, used_ns=0) == pytest.approx(quiet + 10 * step)
+    assert gained(11, used_ns=0, distrusted_ns=0) == pytest.approx(11 * quiet)
+    assert gained(3 * seconds, used_ns=0) == pytest.approx(quiet + seconds * step + (2 * seconds - 1) * quiet)

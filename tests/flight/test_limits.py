@@ -8,7 +8,7 @@ from dataclasses import FrozenInstanceError, replace
 import numpy as np
 import pytest
 
-from uavctl.flight.limits import LimitsParameters, gate
+from uavctl.flight.limits import LimitsParameters, limit_setpoint
 from uavctl.records import Vec3
 
 LIMITS = LimitsParameters(accel_mps2=(2.0, 2.0, 1.5), slew_mps3=20.0)
@@ -18,7 +18,7 @@ ODD = (math.nan, math.inf, -math.inf, 1e308, -1e308, 5e-324, -0.0, 1e9)
 
 
 def test_what_is_within_the_limits_passes_unchanged() -> None:
-    assert gate((0.3, -0.9, 1.0), (0.1, 0.1, 0.1), TICK_S, LIMITS) == ((0.3, -0.9, 1.0), ())
+    assert limit_setpoint((0.3, -0.9, 1.0), (0.1, 0.1, 0.1), TICK_S, LIMITS) == ((0.3, -0.9, 1.0), ())
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
@@ -26,41 +26,47 @@ def test_what_is_within_the_limits_passes_unchanged() -> None:
 def test_one_value_that_is_not_finite_makes_all_axes_zero(bad: float, axis: int) -> None:
     want = [0.5, 0.5, 0.5]
     want[axis] = bad
-    assert gate((want[0], want[1], want[2]), (0.5, 0.5, 0.5), TICK_S, LIMITS) == (ZERO, ("non-finite",))
+    assert limit_setpoint((want[0], want[1], want[2]), (0.5, 0.5, 0.5), TICK_S, LIMITS) == (ZERO, ("non-finite",))
 
 
 def test_each_axis_is_clamped_at_its_own_limit_from_both_sides() -> None:
     near: Vec3 = (1.9, 1.9, 1.4)
-    assert gate((2.1, 9.0, 1e308), near, TICK_S, LIMITS) == (
+    assert limit_setpoint((2.1, 9.0, 1e308), near, TICK_S, LIMITS) == (
         (2.0, 2.0, 1.5),
         ("clamp-north", "clamp-east", "clamp-down"),
     )
     far: Vec3 = (-1.9, -1.9, -1.4)
-    assert gate((-2.1, 0.0 - 1.5, -1.6), far, TICK_S, LIMITS) == ((-2.0, -1.5, -1.5), ("clamp-north", "clamp-down"))
+    assert limit_setpoint((-2.1, 0.0 - 1.5, -1.6), far, TICK_S, LIMITS) == (
+        (-2.0, -1.5, -1.5),
+        ("clamp-north", "clamp-down"),
+    )
 
 
 def test_a_limit_itself_is_not_clamped() -> None:
-    assert gate((2.0, -2.0, 1.5), (1.5, -1.5, 1.0), TICK_S, LIMITS) == ((2.0, -2.0, 1.5), ())
+    assert limit_setpoint((2.0, -2.0, 1.5), (1.5, -1.5, 1.0), TICK_S, LIMITS) == ((2.0, -2.0, 1.5), ())
 
 
 def test_a_change_is_limited_in_each_axis_from_both_sides() -> None:
-    assert gate((1.5, -1.5, 0.9), ZERO, TICK_S, LIMITS) == ((1.0, -1.0, 0.9), ("slew-north", "slew-east"))
-    assert gate((0.0, 0.0, -1.5), (0.0, 0.0, 1.5), TICK_S, LIMITS) == ((0.0, 0.0, 0.5), ("slew-down",))
+    assert limit_setpoint((1.5, -1.5, 0.9), ZERO, TICK_S, LIMITS) == ((1.0, -1.0, 0.9), ("slew-north", "slew-east"))
+    assert limit_setpoint((0.0, 0.0, -1.5), (0.0, 0.0, 1.5), TICK_S, LIMITS) == ((0.0, 0.0, 0.5), ("slew-down",))
 
 
 def test_clamp_and_slew_are_both_told() -> None:
-    assert gate((50.0, 0.0, 0.0), ZERO, TICK_S, LIMITS) == ((1.0, 0.0, 0.0), ("clamp-north", "slew-north"))
+    assert limit_setpoint((50.0, 0.0, 0.0), ZERO, TICK_S, LIMITS) == ((1.0, 0.0, 0.0), ("clamp-north", "slew-north"))
 
 
 def test_zero_after_a_value_that_is_not_finite_is_slew_limited_too() -> None:
-    assert gate((math.nan, 0.0, 0.0), (2.0, 0.0, 0.0), TICK_S, LIMITS) == (
+    assert limit_setpoint((math.nan, 0.0, 0.0), (2.0, 0.0, 0.0), TICK_S, LIMITS) == (
         (1.0, 0.0, 0.0),
         ("non-finite", "slew-north"),
     )
 
 
 def test_an_impossible_previous_setpoint_does_not_lead_out_of_bounds() -> None:
-    assert gate((2.0, 2.0, 0.0), (50.0, math.nan, -math.inf), TICK_S, LIMITS) == ((2.0, 1.0, 0.0), ("slew-east",))
+    assert limit_setpoint((2.0, 2.0, 0.0), (50.0, math.nan, -math.inf), TICK_S, LIMITS) == (
+        (2.0, 1.0, 0.0),
+        ("slew-east",),
+    )
 
 
 @pytest.mark.parametrize("changed", ["want", "previous", "bounds"])
@@ -69,7 +75,7 @@ def test_vectors_that_are_no_triples_are_an_error_and_not_limited_in_part(change
     want, previous = (pair if changed == name else ZERO for name in ("want", "previous"))
     limits = replace(LIMITS, accel_mps2=pair) if changed == "bounds" else LIMITS
     with pytest.raises(ValueError, match="zip"):
-        gate(want, previous, TICK_S, limits)
+        limit_setpoint(want, previous, TICK_S, limits)
 
 
 def test_nobody_changes_the_limits_in_flight() -> None:
@@ -90,7 +96,7 @@ def test_every_setpoint_of_100000_random_steps_with_faults_is_finite_bounded_and
     for want, faulty in zip(wants.tolist(), previous_faults.tolist(), strict=True):
         # The memory of the last setpoint may be wrong as well: then only the bounds can be promised.
         before: Vec3 = (float(rng.choice(ODD)), sent[1], sent[2]) if faulty else sent
-        out, limited = gate((want[0], want[1], want[2]), before, TICK_S, LIMITS)
+        out, limited = limit_setpoint((want[0], want[1], want[2]), before, TICK_S, LIMITS)
         assert all(
             math.isfinite(value) and abs(value) <= bound for value, bound in zip(out, LIMITS.accel_mps2, strict=True)
         )

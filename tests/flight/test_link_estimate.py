@@ -14,7 +14,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.stats import beta, binom, chi2_contingency, norm
 
-from uavctl.flight.link_estimate import LinkBelief, LinkEstimateParameters, burst_statistic, observe, report
+from uavctl.flight.link_estimate import (
+    LinkBelief,
+    LinkEstimateParameters,
+    compute_burst_statistic,
+    count_step,
+    estimate_link,
+)
 from uavctl.records import LinkEstimate
 
 FOREVER = LinkEstimateParameters(promised=0.7, half_life_steps=1e12)
@@ -25,7 +31,7 @@ HISTORY = st.lists(st.booleans(), max_size=60)
 def after(arrived: Iterable[bool], parameters: LinkEstimateParameters) -> LinkBelief:
     belief = LinkBelief()
     for one in arrived:
-        belief = observe(belief, bool(one), parameters)
+        belief = count_step(belief, bool(one), parameters)
     return belief
 
 
@@ -40,7 +46,7 @@ def bursts(rng: np.random.Generator, steps: int, share: float, leave: float) -> 
 
 
 def test_before_the_first_observation_all_is_open() -> None:
-    estimate = report(LinkBelief(), DEFAULT, 7)
+    estimate = estimate_link(LinkBelief(), DEFAULT, 7)
     assert estimate == LinkEstimate(
         at_ns=7,
         arrived=0.0,
@@ -57,14 +63,16 @@ def test_before_the_first_observation_all_is_open() -> None:
 
 
 def test_the_posterior_is_that_of_the_counts() -> None:
-    estimate = report(after([True, True, False] * 20, FOREVER), FOREVER, 0)
+    estimate = estimate_link(after([True, True, False] * 20, FOREVER), FOREVER, 0)
     assert (estimate.arrived, estimate.lost) == pytest.approx((40.0, 20.0))
     assert estimate.arrival_mean == pytest.approx(beta(40.5, 20.5).mean())
     # Clopper and Pearson: with p at the bound, as many arrivals or more come with probability 0.05.
     assert binom.sf(39, 60, estimate.arrival_lower) == pytest.approx(0.05)
     assert not estimate.below_promise
     for promised in (0.7, 0.75, 0.8, 0.9):
-        told = report(after([True, True, False] * 20, FOREVER), replace(FOREVER, promised=promised), 0).below_promise
+        told = estimate_link(
+            after([True, True, False] * 20, FOREVER), replace(FOREVER, promised=promised), 0
+        ).below_promise
         assert told == (binom.cdf(40, 60, promised) <= 0.05)
 
 
@@ -87,9 +95,9 @@ def test_transitions_without_forgetting_are_counted(history: list[bool]) -> None
     table = np.array(counted).reshape(2, 2)
     if table.sum(axis=0).min(initial=1) and table.sum(axis=1).min(initial=1):
         g2 = chi2_contingency(table, correction=False, lambda_="log-likelihood").statistic
-        assert abs(burst_statistic(belief)) == pytest.approx(math.sqrt(max(0.0, g2)), abs=1e-5)
+        assert abs(compute_burst_statistic(belief)) == pytest.approx(math.sqrt(max(0.0, g2)), abs=1e-5)
     else:
-        assert burst_statistic(belief) == pytest.approx(0.0, abs=1e-5)
+        assert compute_burst_statistic(belief) == pytest.approx(0.0, abs=1e-5)
 
 
 @given(HISTORY, st.integers(0, 59), st.floats(0.5, 0.99))
@@ -98,7 +106,7 @@ def test_an_arrival_more_never_lowers_the_estimate(history: list[bool], where: i
     parameters = LinkEstimateParameters(promised=0.7, half_life_steps=20.0, credible=credible, false_alarm=1e-300)
     if where < len(history):
         better = [*history[:where], True, *history[where + 1 :]]
-        one, other = (report(after(arrived, parameters), parameters, 0) for arrived in (history, better))
+        one, other = (estimate_link(after(arrived, parameters), parameters, 0) for arrived in (history, better))
         assert other.arrival_mean >= one.arrival_mean - 1e-12
         assert other.arrival_lower >= one.arrival_lower - 1e-12
         assert one.below_promise or not other.below_promise
@@ -106,7 +114,7 @@ def test_an_arrival_more_never_lowers_the_estimate(history: list[bool], where: i
 
 @given(HISTORY)
 def test_numbers_stay_in_their_range(history: list[bool]) -> None:
-    estimate = report(after(history, DEFAULT), DEFAULT, 0)
+    estimate = estimate_link(after(history, DEFAULT), DEFAULT, 0)
     assert 0.0 <= estimate.arrival_lower < estimate.arrival_mean < 1.0
     assert math.isfinite(estimate.burst_statistic)
     assert estimate.arrived + estimate.lost <= 1.0 / (1.0 - DEFAULT.forgetting)
@@ -117,7 +125,7 @@ def test_numbers_stay_in_their_range(history: list[bool]) -> None:
 def test_on_independent_losses_the_bound_and_the_alarms_keep_their_levels(p: float, steps: int) -> None:
     rng, runs = np.random.default_rng(41), 400
     parameters = LinkEstimateParameters(promised=p, false_alarm=0.05)
-    estimates = [report(after(rng.random(steps) < p, parameters), parameters, 0) for _ in range(runs)]
+    estimates = [estimate_link(after(rng.random(steps) < p, parameters), parameters, 0) for _ in range(runs)]
     deviation = math.sqrt(0.05 * 0.95 / runs)
     assert np.mean([e.arrival_lower <= p for e in estimates]) >= 0.95 - 3.0 * deviation
     assert np.mean([e.below_promise for e in estimates]) <= 0.05 + 3.0 * deviation
@@ -130,7 +138,7 @@ def test_on_independent_losses_the_bound_and_the_alarms_keep_their_levels(p: flo
 
 def test_bursts_are_found_within_a_hundred_steps() -> None:
     rng, runs = np.random.default_rng(42), 300
-    found = [report(after(bursts(rng, 100, 0.3, 0.25), DEFAULT), DEFAULT, 0).bursts for _ in range(runs)]
+    found = [estimate_link(after(bursts(rng, 100, 0.3, 0.25), DEFAULT), DEFAULT, 0).bursts for _ in range(runs)]
     assert np.mean(found) > 0.95
 
 
@@ -140,8 +148,8 @@ def test_a_link_that_begins_to_come_in_bursts_is_found_out() -> None:
         belief = after(rng.random(300) < 0.7, DEFAULT)
         found = []
         for arrived in bursts(rng, 400, 0.3, 0.25):
-            belief = observe(belief, bool(arrived), DEFAULT)
-            found.append(report(belief, DEFAULT, 0).bursts)
+            belief = count_step(belief, bool(arrived), DEFAULT)
+            found.append(estimate_link(belief, DEFAULT, 0).bursts)
         waits.append(found.index(True))
     assert np.median(waits) < 120
 
@@ -150,7 +158,7 @@ def test_a_link_that_begins_to_come_in_bursts_is_found_out() -> None:
 def test_the_bound_holds_on_bursts_too_once_they_are_found(share: float) -> None:
     rng, runs = np.random.default_rng(44), 300
     parameters = LinkEstimateParameters(promised=1.0 - share)
-    estimates = [report(after(bursts(rng, 300, share, 0.25), parameters), parameters, 0) for _ in range(runs)]
+    estimates = [estimate_link(after(bursts(rng, 300, share, 0.25), parameters), parameters, 0) for _ in range(runs)]
     deviation = math.sqrt(0.05 * 0.95 / runs)
     assert np.mean([e.arrival_lower <= 1.0 - share for e in estimates]) >= 0.95 - 3.0 * deviation
     assert np.mean([e.below_promise for e in estimates]) <= 0.05 + 3.0 * deviation
@@ -159,22 +167,22 @@ def test_the_bound_holds_on_bursts_too_once_they_are_found(share: float) -> None
 def test_a_link_below_its_promise_is_told_and_one_that_recovers_is_believed_again() -> None:
     rng = np.random.default_rng(45)
     belief = after(rng.random(200) < 0.4, DEFAULT)
-    assert report(belief, DEFAULT, 0).below_promise
+    assert estimate_link(belief, DEFAULT, 0).below_promise
     for arrived in rng.random(400) < 0.9:
-        belief = observe(belief, bool(arrived), DEFAULT)
-    estimate = report(belief, DEFAULT, 0)
+        belief = count_step(belief, bool(arrived), DEFAULT)
+    estimate = estimate_link(belief, DEFAULT, 0)
     assert not estimate.below_promise
     assert abs(estimate.arrival_mean - 0.9) < 0.08
 
 
 def test_a_dead_link_is_below_its_promise_and_no_single_burst() -> None:
-    estimate = report(after([True] * 1000 + [False] * 50, DEFAULT), DEFAULT, 0)
+    estimate = estimate_link(after([True] * 1000 + [False] * 50, DEFAULT), DEFAULT, 0)
     assert estimate.bursts
-    assert report(after([True] * 1000 + [False] * 1000, DEFAULT), DEFAULT, 0).below_promise
-    assert report(after([False] * 20, DEFAULT), DEFAULT, 0).below_promise
+    assert estimate_link(after([True] * 1000 + [False] * 1000, DEFAULT), DEFAULT, 0).below_promise
+    assert estimate_link(after([False] * 20, DEFAULT), DEFAULT, 0).below_promise
 
 
 def test_losses_that_avoid_each_other_are_no_bursts() -> None:
-    estimate = report(after([True, False] * 200, DEFAULT), DEFAULT, 0)
+    estimate = estimate_link(after([True, False] * 200, DEFAULT), DEFAULT, 0)
     assert estimate.burst_statistic < -5.0
     assert not estimate.bursts

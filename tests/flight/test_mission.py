@@ -22,13 +22,13 @@ from uavctl.flight.mission import (
     Room,
     Trajectory,
     Waypoint,
-    advance,
-    ask_for,
-    lead,
-    over,
+    advance_mission,
+    find_target,
+    is_over,
+    lead_with_one_axis,
+    make_question,
     resume,
-    stay,
-    wanted,
+    stay_at,
 )
 from uavctl.records import GaveWay, Vec3, names_of, tell, tell_all
 from uavctl.smpc.hahn_stursberg.design import Design
@@ -58,7 +58,7 @@ def walk(mission: Mission, positions_m: list[float]) -> list[MissionState]:
     """The mission's states with the vehicle at these places, one a Δt from 7 s on."""
     state, states = None, []
     for step, position in enumerate(positions_m):
-        state = advance(mission, state, (position, 0.0), 7 * SECOND_NS + step * DT_NS)
+        state = advance_mission(mission, state, (position, 0.0), 7 * SECOND_NS + step * DT_NS)
         states.append(state)
     return states
 
@@ -84,10 +84,10 @@ def test_an_estimate_that_is_no_number_reaches_nothing() -> None:
 
 def test_the_target_is_the_waypoint_and_what_is_wanted() -> None:
     mission = on_a_line(0.3, 1.0)
-    target, outlook = ask_for(mission, MissionState(start_ns=0, waypoint=1), DT_NS)
+    target, outlook = make_question(mission, MissionState(start_ns=0, waypoint=1), DT_NS)
     assert target.tolist() == [1.0, 0.0]
     assert outlook.nominal
-    assert wanted(mission, MissionState(start_ns=0, waypoint=1), DT_NS) == (1.0, 0.0)
+    assert find_target(mission, MissionState(start_ns=0, waypoint=1), DT_NS) == (1.0, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -124,42 +124,42 @@ def test_one_axis_leads_for_a_time_where_the_first_motion_begins_and_never_again
     room = room_of(small_plant(("north", "east")))
     begin, end, back = (room.at(place) for place in ((0.0, 0.0, 0.0), (3.0, 2.0, 0.0), (-3.0, -2.0, 0.0)))
     mission = replace(on_a_line(0.0), room=room, lead_ns=2 * DT_NS)
-    at_rest = lead(mission, stay(MissionState(start_ns=0), begin, 0), begin, 0)
+    at_rest = lead_with_one_axis(mission, stay_at(MissionState(start_ns=0), begin, 0), begin, 0)
     assert at_rest.led is None  # there is no way to go
-    led = lead(mission, stay(at_rest, end, 3 * DT_NS), begin, 3 * DT_NS)
-    targets = [ask_for(mission, led, number * DT_NS)[0].tolist() for number in (3, 4, 5)]
+    led = lead_with_one_axis(mission, stay_at(at_rest, end, 3 * DT_NS), begin, 3 * DT_NS)
+    targets = [make_question(mission, led, number * DT_NS)[0].tolist() for number in (3, 4, 5)]
     assert targets == [list(room.at((0.0, 2.0, 0.0)))] * 2 + [list(end)]
-    assert wanted(mission, led, 3 * DT_NS) == end
-    ordered = stay(led, back, 4 * DT_NS)
-    assert lead(mission, ordered, begin, 4 * DT_NS) == ordered
-    assert ask_for(mission, ordered, 4 * DT_NS)[0].tolist() == list(back)  # an order is obeyed at once
-    assert ask_for(replace(mission, lead_ns=0), led, 3 * DT_NS)[0].tolist() == list(end)
+    assert find_target(mission, led, 3 * DT_NS) == end
+    ordered = stay_at(led, back, 4 * DT_NS)
+    assert lead_with_one_axis(mission, ordered, begin, 4 * DT_NS) == ordered
+    assert make_question(mission, ordered, 4 * DT_NS)[0].tolist() == list(back)  # an order is obeyed at once
+    assert make_question(replace(mission, lead_ns=0), led, 3 * DT_NS)[0].tolist() == list(end)
 
 
 def test_no_axis_leads_on_a_trajectory_or_without_a_room() -> None:
     state = MissionState(start_ns=0)
-    assert lead(moving_north(8), state, (0.0, 0.0), 0) == state
-    assert lead(on_a_line(1.0), state, (0.0, 0.0), 0) == state
+    assert lead_with_one_axis(moving_north(8), state, (0.0, 0.0), 0) == state
+    assert lead_with_one_axis(on_a_line(1.0), state, (0.0, 0.0), 0) == state
 
 
 def test_a_fence_is_a_line_between_its_samples_and_constant_outside() -> None:
     fence = Fence(row=1, times_ns=np.array([1.0, 2.0]) * SECOND_NS, values=np.array([4.0, 2.0]))
     mission = on_a_line(0.0, fences=(fence,))
-    _, outlook = ask_for(mission, MissionState(start_ns=7 * SECOND_NS), 8 * SECOND_NS)
+    _, outlook = make_question(mission, MissionState(start_ns=7 * SECOND_NS), 8 * SECOND_NS)
     assert outlook.limits is not None
     assert outlook.limits[:, 0].tolist() == [5.0] * 5
     assert outlook.limits[:, 1] == pytest.approx([4.0, 3.6, 3.2, 2.8, 2.4])
-    _, outlook = ask_for(mission, MissionState(start_ns=7 * SECOND_NS), 20 * SECOND_NS)
+    _, outlook = make_question(mission, MissionState(start_ns=7 * SECOND_NS), 20 * SECOND_NS)
     assert outlook.limits is not None
     assert outlook.limits[:, 1].tolist() == [2.0] * 5
 
 
 def test_a_fence_that_is_no_closer_than_the_limits_is_none_and_of_several_the_closest_counts() -> None:
     wide = Fence(row=0, times_ns=np.array([0.0]), values=np.array([9.0]))
-    _, outlook = ask_for(on_a_line(0.0, fences=(wide,)), MissionState(start_ns=0), 0)
+    _, outlook = make_question(on_a_line(0.0, fences=(wide,)), MissionState(start_ns=0), 0)
     assert outlook.limits is None
     near, nearer = (Fence(row=0, times_ns=np.array([0.0]), values=np.array([side])) for side in (3.0, 2.5))
-    _, outlook = ask_for(on_a_line(0.0, fences=(near, wide, nearer)), MissionState(start_ns=0), 0)
+    _, outlook = make_question(on_a_line(0.0, fences=(near, wide, nearer)), MissionState(start_ns=0), 0)
     assert outlook.limits is not None
     assert outlook.limits[:, 0].tolist() == [2.5] * 5
 
@@ -176,18 +176,18 @@ def moving_north(rows: int) -> Mission:
 
 def test_a_trajectory_stands_still_for_an_order_and_a_fence_does_not() -> None:
     mission, state = moving_north(8), MissionState(start_ns=0)
-    assert wanted(mission, state, 3 * DT_NS) == (3.0, 0.0)
-    left = stay(stay(state, (0.5, 0.0), 3 * DT_NS), (0.7, 0.0), 4 * DT_NS)
-    assert wanted(mission, left, 5 * DT_NS) == (0.7, 0.0)
-    assert advance(mission, left, (0.0, 0.0), 5 * DT_NS) == left
-    target, outlook = ask_for(mission, left, 5 * DT_NS)
+    assert find_target(mission, state, 3 * DT_NS) == (3.0, 0.0)
+    left = stay_at(stay_at(state, (0.5, 0.0), 3 * DT_NS), (0.7, 0.0), 4 * DT_NS)
+    assert find_target(mission, left, 5 * DT_NS) == (0.7, 0.0)
+    assert advance_mission(mission, left, (0.0, 0.0), 5 * DT_NS) == left
+    target, outlook = make_question(mission, left, 5 * DT_NS)
     assert target.tolist() == [0.7, 0.0]
     assert outlook.path is None
     assert outlook.limits is not None
     assert outlook.limits[0, 0] == pytest.approx(4.5)  # after 1 s of its own time
     again = resume(left, 8 * DT_NS)
-    assert [wanted(mission, again, n * DT_NS)[0] for n in (8, 9, 12, 13)] == [3.0, 4.0, 7.0, 7.0]
-    _, outlook = ask_for(mission, again, 10 * DT_NS)
+    assert [find_target(mission, again, n * DT_NS)[0] for n in (8, 9, 12, 13)] == [3.0, 4.0, 7.0, 7.0]
+    _, outlook = make_question(mission, again, 10 * DT_NS)
     assert outlook.limits is not None
     assert outlook.limits[0, 0] == pytest.approx(4.0)
     assert resume(again, 9 * DT_NS) == again
@@ -195,13 +195,13 @@ def test_a_trajectory_stands_still_for_an_order_and_a_fence_does_not() -> None:
 
 def test_a_mission_is_over_where_its_trajectory_ends_and_after_its_last_waypoint_s_time() -> None:
     mission, state = moving_north(8), MissionState(start_ns=0)
-    assert [over(mission, state, n * DT_NS) for n in (0, 6, 7, 8, 30)] == [False, False, True, True, True]
-    assert not over(mission, stay(state, (0.0, 0.0), 7 * DT_NS), 8 * DT_NS)
+    assert [is_over(mission, state, n * DT_NS) for n in (0, 6, 7, 8, 30)] == [False, False, True, True, True]
+    assert not is_over(mission, stay_at(state, (0.0, 0.0), 7 * DT_NS), 8 * DT_NS)
     line = on_a_line(0.0, 1.0, hold_s=0.4)
     arrived = MissionState(start_ns=0, waypoint=1, arrived_ns=5 * DT_NS)
-    assert [over(line, arrived, n * DT_NS) for n in (5, 6, 7, 8)] == [False, False, True, True]
-    assert not over(line, replace(arrived, waypoint=0), 8 * DT_NS)
-    assert not over(line, replace(arrived, arrived_ns=None), 8 * DT_NS)
+    assert [is_over(line, arrived, n * DT_NS) for n in (5, 6, 7, 8)] == [False, False, True, True]
+    assert not is_over(line, replace(arrived, waypoint=0), 8 * DT_NS)
+    assert not is_over(line, replace(arrived, arrived_ns=None), 8 * DT_NS)
 
 
 def test_the_end_of_a_mission_is_configured_and_needs_something_that_ends() -> None:
@@ -218,7 +218,7 @@ def test_a_configured_trajectory_is_over_at_its_last_sample() -> None:
     motion = "times_s=[1.0,5.0],positions_m=[[0,0,-1],[1,0.5,-1]]"
     config, design = room_with(f"mission={{trajectory={{{motion}}},then='land'}}")
     mission, state = build_mission(config, design, build_rests(design)), MissionState(start_ns=0)
-    ends = [n for n in range(40) if over(mission, state, n * DT_NS)]
+    ends = [n for n in range(40) if is_over(mission, state, n * DT_NS)]
     assert ends[0] == 25  # 5 s
 
 
@@ -310,7 +310,7 @@ def test_too_fast_a_motion_is_refused_with_the_figures() -> None:
 def test_without_a_mission_the_target_is_held() -> None:
     config, design = room_with()
     mission = build_controller(config, design).mission
-    target, outlook = ask_for(mission, MissionState(start_ns=0), 0)
+    target, outlook = make_question(mission, MissionState(start_ns=0), 0)
     assert target.tolist() == design.target.tolist()
     assert outlook.nominal
 

@@ -8,11 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from envelope_rig import PARAMETERS, TICK_NS, Array, S, vec3
+from envelope_rig import PARAMETERS, TICK_NS, Array, S, update, vec3
 from flight_rig import MS, START_NS, sample
 
-from uavctl.flight.envelope import NOT_WATCHING, RESPONSE, Observation, Watching, after_flight, push_words, watch
-from uavctl.flight.sensor_faults import InertialSpan, carried, extended, push_text
+from uavctl.flight.monitors.acceleration import describe_acceleration, describe_push
+from uavctl.flight.monitors.engaged import INITIAL, MonitorState, continue_unengaged
+from uavctl.flight.monitors.observation import Observation
+from uavctl.flight.monitors.observer import InertialSpan, extend_path, move_along
+from uavctl.flight.monitors.verdict import Cause
 from uavctl.records import Vec3
 
 BOUND_MPS2 = PARAMETERS.unexplained_mps2
@@ -38,9 +41,9 @@ def turned(degrees: float) -> Array:
 class Flown:
     """What the envelope made of a flight of 9 s: the breach, when, and the truth."""
 
-    code: str
+    code: str | None
     at_s: float
-    watching: Watching
+    watching: MonitorState
     pushed_s: list[float]
 
 
@@ -64,7 +67,7 @@ def fly(
     rng = np.random.default_rng(seed)
     position, velocity, accel = np.zeros(3), np.zeros(3), np.zeros(3)
     pivot: Array | None = None
-    watching, sent, pushed_s = NOT_WATCHING, np.zeros(3), []
+    watching, sent, pushed_s = INITIAL, np.zeros(3), []
     for n in range(180):
         t, at_ns = n * TICK_NS * 1e-9, START_NS + n * TICK_NS
         if frame is not None and pivot is None and t >= from_s:
@@ -83,11 +86,11 @@ def fly(
             braking=False,
             inertial_mps2=None if felt is None else vec3(felt),
         )
-        watching, breach = watch(watching, ours, PARAMETERS)
-        if watching.pushed:
+        watching, breach = update(watching, ours, PARAMETERS)
+        if watching.acceleration.is_pushed:
             pushed_s.append(t)
         if breach is not None:
-            return Flown(breach.code, t, watching, pushed_s)
+            return Flown(breach.cause, t, watching, pushed_s)
         swing = 1.5 * np.array([math.sin(2.0 * t), math.cos(1.3 * t), 0.0])
         sent = swing - 0.5 * wind(t)
         for _ in range(round(TICK_NS * 1e-9 / FINE_S)):
@@ -117,13 +120,13 @@ def test_a_wind_that_inertial_data_show_is_no_false_position(wind: str, drag_1ps
         flown = fly(WINDS[wind], drag_1ps=drag_1ps, seed=seed)
         assert flown.code == ""
     without = fly(WINDS[wind], drag_1ps=drag_1ps, shown=lambda t, accel: None)
-    assert without.code == RESPONSE
+    assert without.code == Cause.RESPONSE
 
 
 @pytest.mark.fault(71)
 def test_a_hit_that_inertial_data_show_is_no_false_position() -> None:
     assert fly(hit(25.0)).code == ""
-    assert fly(hit(25.0), shown=lambda t, accel: None).code == RESPONSE
+    assert fly(hit(25.0), shown=lambda t, accel: None).code == Cause.RESPONSE
 
 
 @pytest.mark.fault(71)
@@ -132,7 +135,7 @@ def test_a_strong_push_is_told_with_its_size_and_a_weak_one_is_not() -> None:
     assert flown.pushed_s and 3.0 < flown.pushed_s[0] < 4.0
     assert fly(steady(0.5)).pushed_s == []
     held = fly(steady(3.0), drag_1ps=0.0)  # without drag all of the push is wind
-    np.testing.assert_allclose(held.watching.push_mps2, (3.0, 0.0, 0.0), atol=0.3)
+    np.testing.assert_allclose(held.watching.motion.push_mps2, (3.0, 0.0, 0.0), atol=0.3)
 
 
 @pytest.mark.parametrize("wind", ["calm", "north", "gusts"])
@@ -148,10 +151,10 @@ def test_positions_of_a_wrong_frame_are_found_with_inertial_data_as_without(
 ) -> None:
     blows = WINDS.get(wind, steady(0.0))
     with_data = fly(blows, frame=frame, from_s=from_s)
-    assert with_data.code == RESPONSE
+    assert with_data.code == Cause.RESPONSE
     if wind == "calm":
         without = fly(blows, frame=frame, from_s=from_s, shown=lambda t, accel: None)
-        assert without.code == RESPONSE and with_data.at_s <= without.at_s + 0.3
+        assert without.code == Cause.RESPONSE and with_data.at_s <= without.at_s + 0.3
     else:
         assert from_s < with_data.at_s < from_s + 5.0
 
@@ -174,7 +177,7 @@ def test_inertial_data_that_are_wrong_let_no_flight_go_and_hide_no_wrong_frame(
 ) -> None:
     assert fly(steady(0.5), shown=lie).code == ""
     found = fly(steady(0.5), shown=lie, frame=turned(180.0), from_s=4.0)
-    assert found.code == RESPONSE and found.at_s < 9.0
+    assert found.code == Cause.RESPONSE and found.at_s < 9.0
 
 
 @pytest.mark.fault(71)
@@ -184,20 +187,20 @@ def test_a_silence_of_inertial_data_goes_on_with_the_wind_that_they_showed() -> 
 
     assert fly(steady(3.0), shown=silent).code == ""
     # Nothing else is excused by it: not a frame that turns, nor a wind that comes then.
-    assert fly(steady(3.0), shown=silent, frame=turned(180.0), from_s=5.5).code == RESPONSE
-    assert fly(steady(5.0, from_s=6.0), shown=silent).code == RESPONSE
+    assert fly(steady(3.0), shown=silent, frame=turned(180.0), from_s=5.5).code == Cause.RESPONSE
+    assert fly(steady(5.0, from_s=6.0), shown=silent).code == Cause.RESPONSE
 
 
 def test_the_way_is_the_double_integral_of_its_spans() -> None:
     """Constant, then none, then another acceleration: closed forms."""
-    way = extended((), START_NS, (2.0, 0.0, 0.0), 0)
-    way = extended(way, START_NS + 1 * S, (0.0, 0.0, 0.0), 0)
-    way = extended(way, START_NS + 2 * S, (0.0, -1.0, 0.0), 0)
+    way = extend_path((), START_NS, (2.0, 0.0, 0.0), 0)
+    way = extend_path(way, START_NS + 1 * S, (0.0, 0.0, 0.0), 0)
+    way = extend_path(way, START_NS + 2 * S, (0.0, -1.0, 0.0), 0)
     rest = np.zeros((3, 3))
-    moved = carried(way, rest, START_NS, START_NS + 3 * S)
+    moved = move_along(way, rest, START_NS, START_NS + 3 * S)
     np.testing.assert_allclose(moved, [(1.0 + 4.0, -0.5, 0.0), (2.0, -1.0, 0.0), (0.0, 0.0, 0.0)])
     begun = np.array([(1.0, 0.0, 0.0), (0.5, 0.0, 0.0), (0.0, 0.0, 4.0)])
-    later = carried(way, begun, START_NS + 500 * MS, START_NS + 1500 * MS)
+    later = move_along(way, begun, START_NS + 500 * MS, START_NS + 1500 * MS)
     # A second: from rest it gains 1 m/s in the first half and keeps it.
     np.testing.assert_allclose(later, [(1.0 + 0.5 + 0.25 + 0.5, 0.0, 2.0), (1.5, 0.0, 4.0), (0.0, 0.0, 4.0)])
 
@@ -208,11 +211,11 @@ def test_spans_that_ended_before_the_horizon_are_dropped_and_change_nothing() ->
     short: tuple[InertialSpan, ...] = ()
     for n in range(200):
         at_ns, accel = START_NS + n * TICK_NS, rng.normal(size=3)
-        whole, short = extended(whole, at_ns, accel, 0), extended(short, at_ns, accel, at_ns - S)
+        whole, short = extend_path(whole, at_ns, accel, 0), extend_path(short, at_ns, accel, at_ns - S)
     assert len(whole) == 200 and len(short) == S // TICK_NS + 1
     mean = rng.normal(size=(3, 3))
     since, until = at_ns - S + 7 * MS, at_ns + 20 * MS
-    np.testing.assert_array_equal(carried(whole, mean, since, until), carried(short, mean, since, until))
+    np.testing.assert_array_equal(move_along(whole, mean, since, until), move_along(short, mean, since, until))
 
 
 @pytest.mark.parametrize(
@@ -226,22 +229,25 @@ def test_spans_that_ended_before_the_horizon_are_dropped_and_change_nothing() ->
     ],
 )
 def test_a_push_has_a_size_and_a_direction(push: Vec3, words: str) -> None:
-    assert words in push_text(push, None)
+    assert words in describe_acceleration(push, None)
 
 
 def test_the_watch_of_others_flight_goes_on_from_what_inertial_data_have_shown() -> None:
     flown = fly(steady(1.0)).watching
-    assert flown.observer is not None and flown.observer.inertial is not None
-    after = after_flight(flown, (0.1, 0.2, 0.0))
-    assert after.observer is not None
-    np.testing.assert_array_equal(after.observer.mean, flown.observer.inertial)
-    assert after.sent == ((flown.observer.at_ns, (0.1, 0.2, 0.0)),) and after.tick_ns == flown.tick_ns
+    assert flown.motion.observer is not None and flown.motion.observer.inertial is not None
+    after = continue_unengaged(flown, (0.1, 0.2, 0.0))
+    assert after.motion.observer is not None
+    np.testing.assert_array_equal(after.motion.observer.mean, flown.motion.observer.inertial)
+    assert (
+        after.motion.sent == ((flown.motion.observer.at_ns, (0.1, 0.2, 0.0)),)
+        and after.motion.tick_ns == flown.motion.tick_ns
+    )
     without = fly(steady(0.0), shown=lambda t, accel: None).watching
-    assert after_flight(without, (0.0, 0.0, 0.0)) is NOT_WATCHING
-    assert after_flight(NOT_WATCHING, (0.0, 0.0, 0.0)) is NOT_WATCHING
+    assert continue_unengaged(without, (0.0, 0.0, 0.0)) is INITIAL
+    assert continue_unengaged(INITIAL, (0.0, 0.0, 0.0)) is INITIAL
 
 
 def test_a_push_is_described_with_and_without_an_attitude() -> None:
     flown = fly(steady(2.0)).watching
-    assert push_words(flown, None, START_NS) == push_text(flown.push_mps2, None)
-    assert push_words(NOT_WATCHING, None, START_NS) == push_text(NOT_WATCHING.push_mps2, None)
+    assert describe_push(flown.motion, None, START_NS) == describe_acceleration(flown.motion.push_mps2, None)
+    assert describe_push(INITIAL.motion, None, START_NS) == describe_acceleration(INITIAL.motion.push_mps2, None)

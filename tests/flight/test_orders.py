@@ -29,7 +29,7 @@ from uavctl.build.controller import build_controller
 from uavctl.config import load_config
 from uavctl.flight.controller import Controller
 from uavctl.flight.mission import Waypoint
-from uavctl.flight.step import StepOutput
+from uavctl.flight.tick import TickOutput
 from uavctl.records import ORDER_ACCEPTED, ORDER_REFUSED, Command, ControlMode, Order, Severity, Vec3, VehicleStatus
 
 WAIT, TRACK, BRAKE, HOLD, LAND, STOPPED = ControlMode
@@ -41,12 +41,12 @@ def goto(*position_m: float) -> Command:
     return Command(order=Order.GOTO, position_m=(north, east, down))
 
 
-def places(outputs: list[StepOutput]) -> list[float | None]:
+def places(outputs: list[TickOutput]) -> list[float | None]:
     """North of the target at each boundary."""
     return [None if one.decision.target is None else one.decision.target[0] for one in boundaries(outputs)]
 
 
-def answers(output: StepOutput) -> list[tuple[str, str]]:
+def answers(output: TickOutput) -> list[tuple[str, str]]:
     return [(event.code, event.text) for event in output.events if event.code in (ORDER_ACCEPTED, ORDER_REFUSED)]
 
 

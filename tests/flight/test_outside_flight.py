@@ -24,8 +24,8 @@ from flight_rig import (
 from msgspec import structs
 
 from uavctl.flight.controller import Controller
-from uavctl.flight.decision import CONTROLLER_FAULT, LATE_IN_A_ROW, LONGEST_ANSWER_NS
-from uavctl.flight.step import StepOutput
+from uavctl.flight.monitors.external import CONTROLLER_FAULT, LATE_IN_A_ROW, LONGEST_ANSWER_NS
+from uavctl.flight.tick import TickOutput
 from uavctl.records import ControlMode, SolveStatus, StepInput
 from uavctl.smpc.answer import Answer
 
@@ -41,7 +41,7 @@ def flown_by(solver: StubSolver) -> Controller:
     return replace(make_controller(solver), outside="ours")
 
 
-def told(outputs: list[StepOutput]) -> list[str]:
+def told(outputs: list[TickOutput]) -> list[str]:
     return [event.text for one in outputs for event in one.events if event.code == CONTROLLER_FAULT]
 
 

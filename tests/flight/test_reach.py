@@ -27,8 +27,8 @@ from flight_rig import (
 )
 
 from uavctl.flight.controller import Controller
-from uavctl.flight.sensor_faults import GateParameters
-from uavctl.flight.step import StepOutput
+from uavctl.flight.monitors.outliers import GateParameters
+from uavctl.flight.tick import TickOutput
 from uavctl.records import ControlMode, PositionSample
 from uavctl.smpc.answer import Answer
 
@@ -43,7 +43,7 @@ def gated(land: bool = True) -> Controller:
         return replace(answer, inputs=answer.inputs * 0.0)
 
     solver = StubSolver(small_plant(), faults=dict.fromkeys(range(5000), nothing))
-    return replace(make_controller(solver, land=land), trust=PARAMETERS)
+    return replace(make_controller(solver, land=land), position_gate=PARAMETERS)
 
 
 def noisy(samples: list[PositionSample], seed: int = 13) -> list[PositionSample]:
@@ -62,7 +62,7 @@ def shifted(samples: list[PositionSample], numbers: range, by_m: float) -> list[
     ]
 
 
-def jumps(outputs: list[StepOutput]) -> int:
+def jumps(outputs: list[TickOutput]) -> int:
     return sum(codes(output).get("sample-jump", 0) for output in outputs)
 
 

@@ -11,9 +11,20 @@ from flight_rig import DT_NS, HORIZON, MS, TICK_NS, TICKS, estimator_parameters,
 from msgspec import structs
 from scipy.integrate import quad
 
+from uavctl.arrays import Array
 from uavctl.flight.kalman import Belief, make_kalman
 from uavctl.flight.limits import LimitsParameters
-from uavctl.flight.sensor_faults import GateParameters, OutlierTrack, Reach, doubt, judge, make_reach, radius
+from uavctl.flight.monitors.outliers import (
+    GateParameters,
+    OutlierObservation,
+    OutlierTrack,
+    Reach,
+    bound_velocity_error,
+    compute_gate,
+    make_reach,
+    update,
+)
+from uavctl.flight.monitors.verdict import Action, Cause
 
 PARAMETERS = GateParameters(sigma=6.0, margin_m=0.1, jump_ns=500 * MS)
 LIMITS = LimitsParameters(accel_mps2=(2.0, 9.0, 1.5), slew_mps3=1.0)
@@ -48,25 +59,27 @@ def test_the_half_width_counts_begun_ticks_and_is_open_after_two_horizons(reach:
     variances, doubt_mps, far = np.array([0.0021, 0.0016]), np.array([0.7]), reach.far
     for age_ns, ticks in ((0, 0), (1, 1), (TICK_NS, 1), (TICK_NS + 1, 2)):
         aged = structs.replace(belief, captured_ns=-age_ns)
-        width = radius(reach, KALMAN, aged, variances, doubt_mps)
+        width = compute_gate(reach, KALMAN, aged, variances, doubt_mps)
         want = [6.0 * 0.05 + 0.1 + 0.7e-9 * age_ns + far[ticks, 0], 6.0 * 0.05 + 0.7 + far[ticks, 1]]
         assert width == pytest.approx(want)
-        positions = radius(reach, KALMAN, aged, variances[:1], doubt_mps)
+        positions = compute_gate(reach, KALMAN, aged, variances[:1], doubt_mps)
         assert positions == pytest.approx(want[:1])
     open_ns = 2 * HORIZON * DT_NS
     for age_ns, finite in ((open_ns, True), (open_ns + 1, False)):
         aged = structs.replace(belief, captured_ns=-age_ns)
-        width = radius(reach, KALMAN, aged, variances, doubt_mps)
+        width = compute_gate(reach, KALMAN, aged, variances, doubt_mps)
         assert np.isfinite(width).all() == finite
 
 
 def test_the_velocity_is_doubted_by_what_was_off_as_far_as_inputs_can_have_made_it(reach: Reach) -> None:
     belief = Belief(at_ns=0, captured_ns=0, mean=np.zeros(4), cov=np.eye(4))
     step = structs.replace(belief, captured_ns=-DT_NS)
-    assert doubt(reach, step, off(-0.01)) == pytest.approx([0.1])
-    assert doubt(reach, step, off(9.0)) == pytest.approx([reach.far[TICKS, 1]])
-    assert doubt(reach, structs.replace(belief, captured_ns=-4 * 10**9), off(9.0)) == pytest.approx([4.5])
-    assert doubt(reach, belief, off(9.0)).tolist() == [0.0]
+    assert bound_velocity_error(reach, step, off(-0.01)) == pytest.approx([0.1])
+    assert bound_velocity_error(reach, step, off(9.0)) == pytest.approx([reach.far[TICKS, 1]])
+    assert bound_velocity_error(reach, structs.replace(belief, captured_ns=-4 * 10**9), off(9.0)) == pytest.approx(
+        [4.5]
+    )
+    assert bound_velocity_error(reach, belief, off(9.0)).tolist() == [0.0]
 
 
 WIDTH = np.array([0.1])
@@ -74,6 +87,15 @@ WIDTH = np.array([0.1])
 
 def off(by_m: float) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
     return np.array([by_m])
+
+
+def judge(
+    track: OutlierTrack | None, at_ns: int, offset: Array, width: Array, n_axes: int
+) -> tuple[bool, OutlierTrack | None]:
+    """Whether a sample is believed, and the samples that are suspected after it."""
+    after, verdict = update(track, OutlierObservation(at_ns, offset, width, n_axes))
+    assert verdict.is_none or (verdict.action, verdict.cause) == (Action.DISTRUST_POSITIONS, Cause.JUMP)
+    return verdict.is_none, after
 
 
 def test_who_is_suspected() -> None:
@@ -129,7 +151,7 @@ def test_a_velocity_outside_suspects_and_the_offset_is_of_positions_only() -> No
 def test_a_source_has_moved_after_three_that_agree_and_the_configured_time(
     count: int, last_ns: int, moved: bool
 ) -> None:
-    assert OutlierTrack(7, 7 + last_ns, count, off(1.0)).moved(PARAMETERS) is moved
+    assert OutlierTrack(7, 7 + last_ns, count, off(1.0)).has_moved(PARAMETERS) is moved
 
 
 @pytest.mark.parametrize(
@@ -146,7 +168,7 @@ def test_a_source_has_moved_after_three_that_agree_and_the_configured_time(
 def test_a_source_may_well_have_moved_after_two_that_agree_and_a_tenth_of_a_second(
     count: int, last_ns: int, likely: bool
 ) -> None:
-    assert OutlierTrack(7 * MS, 7 * MS + last_ns, count, off(1.0)).likely is likely
+    assert OutlierTrack(7 * MS, 7 * MS + last_ns, count, off(1.0)).is_likely is likely
 
 
 def test_who_is_suspected_and_how_far_inputs_carry_are_objects_that_nobody_changes(reach: Reach) -> None:

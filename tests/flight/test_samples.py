@@ -10,30 +10,31 @@ import pytest
 from flight_rig import HORIZON, MS, START_NS, TICK_NS, make_controller, sample, vehicle
 from msgspec import structs
 
-from uavctl.flight.estimator import LATEST_STAMP_NS, begin, set_input
-from uavctl.flight.gating import MeasurementUpdate, SourceHealth, take
-from uavctl.flight.sensor_faults import FROZEN, REPEATED, GateParameters
+from uavctl.flight.estimator import LATEST_STAMP_NS, begin_history, note_input
+from uavctl.flight.measure import GatedSamples, gate_samples
+from uavctl.flight.monitors.outliers import GateParameters
+from uavctl.flight.monitors.stale import FROZEN, REPEATED
+from uavctl.flight.state import SourceHealth
 from uavctl.records import PositionSample, StepInput, Vec3, VehicleMotion
 
 CONTROLLER = make_controller()
 
 
-def taken(ticks: list[tuple[int, list[PositionSample]]], horizon: int = HORIZON) -> MeasurementUpdate:
+def taken(ticks: list[tuple[int, list[PositionSample]]], horizon: int = HORIZON) -> GatedSamples:
     """Intake after several ticks, each (time in ms, samples)."""
-    history = begin(CONTROLLER.kalman, START_NS, START_NS)
-    intake = MeasurementUpdate(
-        history=history,
-        trust=SourceHealth(),
-        moved=False,
-        absurd=False,
-        accepted=(),
-        refused=(),
-        clean_ns=None,
-        fresh=0,
-    )
+    history = begin_history(CONTROLLER.kalman, START_NS, START_NS)
+    intake = GatedSamples(history, SourceHealth())
     for at_ms, samples in ticks:
         inp = StepInput(tick=at_ms // 50, at_ns=START_NS + at_ms * MS, samples=tuple(samples))
-        intake = take(CONTROLLER.kalman, CONTROLLER.reach, intake.history, intake.trust, inp, horizon, intake.fresh)
+        intake = gate_samples(
+            CONTROLLER.kalman,
+            CONTROLLER.reach,
+            intake.history,
+            intake.sources,
+            inp,
+            horizon,
+            intake.consecutive_samples,
+        )
     return intake
 
 
@@ -43,17 +44,20 @@ def captured(at_ms: int, source: str = "camera", received_ms: int | None = None)
 
 
 def test_samples_of_one_a_step_are_in_a_row() -> None:
-    assert taken([(at, [captured(at)]) for at in (0, 200, 400, 600)]).fresh == 4
+    assert taken([(at, [captured(at)]) for at in (0, 200, 400, 600)]).consecutive_samples == 4
 
 
 def test_several_in_one_tick_count_each() -> None:
-    assert taken([(100, [captured(60), captured(20), captured(100)])]).fresh == 3
+    assert taken([(100, [captured(60), captured(20), captured(100)])]).consecutive_samples == 3
 
 
 # H = 4: at the boundary of 1000 ms the sample of 200 ms is H steps old, unless there is one from up to then.
 @pytest.mark.parametrize(("captured_ms", "fresh"), [(850, 3), (1000, 3), (1001, 1)])
 def test_a_boundary_at_which_the_age_reaches_the_horizon_begins_the_row_anew(captured_ms: int, fresh: int) -> None:
-    assert taken([(0, [captured(0)]), (200, [captured(200)]), (1050, [captured(captured_ms)])]).fresh == fresh
+    assert (
+        taken([(0, [captured(0)]), (200, [captured(200)]), (1050, [captured(captured_ms)])]).consecutive_samples
+        == fresh
+    )
 
 
 # A third of H = 4 steps of 200 ms is 266.7 ms, of H = 12 it is 800 ms; for H = 2 it is one step all the same.
@@ -62,23 +66,23 @@ def test_a_boundary_at_which_the_age_reaches_the_horizon_begins_the_row_anew(cap
 )
 def test_a_sample_older_than_a_third_of_the_horizon_breaks_the_row(horizon: int, age_ms: int, fresh: int) -> None:
     before = captured(1000 - age_ms - 50)
-    assert taken([(1000 - age_ms, [before]), (1000, [captured(1000 - age_ms)])], horizon).fresh == fresh
+    assert taken([(1000 - age_ms, [before]), (1000, [captured(1000 - age_ms)])], horizon).consecutive_samples == fresh
 
 
 def test_an_overtaken_sample_changes_nothing() -> None:
-    assert taken([(200, [captured(200)]), (250, [captured(150)])]).fresh == 1
+    assert taken([(200, [captured(200)]), (250, [captured(150)])]).consecutive_samples == 1
 
 
 def test_the_same_instant_from_a_second_source_counts_once() -> None:
     intake = taken([(200, [captured(200), captured(200, source="second")])])
-    assert (len(intake.accepted), intake.fresh) == (2, 1)
+    assert (len(intake.accepted), intake.consecutive_samples) == (2, 1)
 
 
 def test_refused_samples_do_not_count() -> None:
     again = captured(200)
     future = captured(471, received_ms=450)
     intake = taken([(200, [again]), (450, [again, future])])
-    assert (intake.fresh, intake.accepted) == (1, ())
+    assert (intake.consecutive_samples, intake.accepted) == (1, ())
     assert intake.refused == ((future, "sample-future"), (again, "sample-duplicate"))
 
 
@@ -96,27 +100,18 @@ def test_a_stamp_further_after_the_arrival_is_refused_though_it_is_less_than_a_t
 
 def pushed(
     says: dict[str, int], ticks: int, *, believes: bool = True, own: Vec3 | None = None, at_rest_mps: float = 0.0
-) -> list[MeasurementUpdate]:
+) -> list[GatedSamples]:
     """Cameras, some millimetres off, of a vehicle pushed north from tick 12 on; each says the same from a tick on.
 
     A tick of -1 is never. Where they are not to be believed, what is said again does not come. `own` is the velocity
     that the vehicle says it has.
     """
-    trust = GateParameters(sigma=6.0, margin_m=0.1, jump_ns=500 * MS, at_rest_mps=at_rest_mps)
-    controller = replace(make_controller(), trust=trust)
-    history = begin(controller.kalman, START_NS, START_NS)
+    gate = GateParameters(sigma=6.0, margin_m=0.1, jump_ns=500 * MS, at_rest_mps=at_rest_mps)
+    controller = replace(make_controller(), position_gate=gate)
+    history = begin_history(controller.kalman, START_NS, START_NS)
     a, b, _ = controller.plant.transition(TICK_NS * 1e-9)
     x, intakes, last = np.zeros(3), [], dict.fromkeys(says, 0.0)
-    intake = MeasurementUpdate(
-        history=history,
-        trust=SourceHealth(),
-        moved=False,
-        absurd=False,
-        accepted=(),
-        refused=(),
-        clean_ns=None,
-        fresh=0,
-    )
+    intake = GatedSamples(history, SourceHealth())
     for tick in range(ticks):
         at_ns, samples = START_NS + tick * TICK_NS, []
         for n, (source, freezes) in enumerate(says.items()):
@@ -126,15 +121,23 @@ def pushed(
                 samples.append(sample(at_ns - n * MS, at_ns, (last[source], 0.0, 0.0), source=source))
         told = None if own is None else VehicleMotion(velocity_mps=own, velocity_ns=at_ns)
         inp = StepInput(tick=tick, at_ns=at_ns, samples=tuple(samples), vehicle=vehicle(), motion=told)
-        intake = take(controller.kalman, controller.reach, intake.history, intake.trust, inp, HORIZON, intake.fresh)
+        intake = gate_samples(
+            controller.kalman,
+            controller.reach,
+            intake.history,
+            intake.sources,
+            inp,
+            HORIZON,
+            intake.consecutive_samples,
+        )
         u = np.full(1, float(tick >= 12))
-        intake = structs.replace(intake, history=set_input(controller.kalman, intake.history, at_ns, u))
+        intake = structs.replace(intake, history=note_input(controller.kalman, intake.history, at_ns, u))
         intakes.append(intake)
         x = a @ x + b @ u
     return intakes
 
 
-def refused_as(intake: MeasurementUpdate) -> set[str]:
+def refused_as(intake: GatedSamples) -> set[str]:
     return {why for _, why in intake.refused}
 
 
@@ -148,7 +151,7 @@ def test_what_a_stuck_source_said_again_is_taken_back() -> None:
     believed = [n for n in range(13, tick) if found[n].accepted]
     assert believed  # or there was nothing to take back
     assert found[tick].clean_ns == START_NS + 12 * TICK_NS
-    assert found[tick].fresh == 0
+    assert found[tick].consecutive_samples == 0
     assert found[tick - 1].history.captured_ns == START_NS + believed[-1] * TICK_NS
     never = pushed({"stuck": 12}, 40, believes=False)
     assert repr(found[tick].history) == repr(never[tick].history)
@@ -184,18 +187,18 @@ def test_what_others_said_meanwhile_is_kept() -> None:
     assert found[-1].history.captured_ns == START_NS + 39 * TICK_NS
 
 
-def flown_on(values: dict[int, float], ticks: int) -> list[MeasurementUpdate]:
+def flown_on(values: dict[int, float], ticks: int) -> list[GatedSamples]:
     """Ticks that push all the time, and what a camera says in some of them (north) [m]."""
-    controller = replace(make_controller(), trust=GateParameters(sigma=6.0, margin_m=0.1, jump_ns=500 * MS))
-    intakes: list[MeasurementUpdate] = []
-    history, trust = begin(controller.kalman, START_NS, START_NS), SourceHealth()
+    controller = replace(make_controller(), position_gate=GateParameters(sigma=6.0, margin_m=0.1, jump_ns=500 * MS))
+    intakes: list[GatedSamples] = []
+    history, sources = begin_history(controller.kalman, START_NS, START_NS), SourceHealth()
     for tick in range(ticks):
         at_ns = START_NS + tick * TICK_NS
         said = (sample(at_ns, position_m=(values[tick], 0.0, 0.0)),) if tick in values else ()
         inp = StepInput(tick=tick, at_ns=at_ns, samples=said, vehicle=vehicle())
-        intakes.append(take(controller.kalman, controller.reach, history, trust, inp, HORIZON, 0))
-        history = set_input(controller.kalman, intakes[-1].history, at_ns, np.ones(1))
-        trust = intakes[-1].trust
+        intakes.append(gate_samples(controller.kalman, controller.reach, history, sources, inp, HORIZON, 0))
+        history = note_input(controller.kalman, intakes[-1].history, at_ns, np.ones(1))
+        sources = intakes[-1].sources
     return intakes
 
 
@@ -225,7 +228,7 @@ def test_a_value_whose_first_sample_cannot_have_been_lost_stays() -> None:
 
 def test_the_first_value_of_all_is_watched_and_stays_where_nothing_else_is_known() -> None:
     found = flown_on({0: 0.0, 18: 0.0}, 19)
-    assert found[0].trust.watches["camera"].first_ns == START_NS
+    assert found[0].sources.records["camera"].first_ns == START_NS
     assert refused_as(found[18]) <= {REPEATED, FROZEN}
     assert refused_as(found[18])
     assert found[18].history.captured_ns == START_NS

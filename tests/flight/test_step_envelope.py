@@ -6,7 +6,7 @@ from dataclasses import replace as changed
 from typing import Any
 
 import pytest
-from envelope_rig import PARAMETERS, motion
+from envelope_rig import PARAMETERS, monitors, motion
 from flight_rig import (
     DT_NS,
     MS,
@@ -26,12 +26,13 @@ from flight_rig import (
 )
 from msgspec.structs import replace
 
-from uavctl.flight import gating as samples
-from uavctl.flight import step
-from uavctl.flight.controller import Controller, ControlState
-from uavctl.flight.envelope import BRAKING, OUTSIDE, RESPONSE, SCATTER, VELOCITY, Breach, Watching
+from uavctl.flight import measure
+from uavctl.flight.controller import Controller
 from uavctl.flight.fallback import Fallback, FallbackEnd
-from uavctl.flight.step import disbelieves
+from uavctl.flight.monitors.verdict import Cause, release
+from uavctl.flight.state import ControlState, FallbackGroup, MonitorGroup
+from uavctl.flight.supervise import distrusts_positions
+from uavctl.flight.tick import tick as run_tick
 from uavctl.records import ControlMode, InertialSample, StepInput, Vec3, VehicleStatus
 
 MILLIMETRES: Vec3 = (-2400.0, -1900.0, -700.0)
@@ -50,7 +51,7 @@ def fly(ours: Controller, status: VehicleStatus | None, position_m: Vec3 = MILLI
     times_ns = [START_NS + n * 2 * TICK_NS for n in range(N_TICKS // 2)]
     said = [sample(at_ns, position_m=position_m) for at_ns in times_ns]
     outputs = run(ours, inputs_of(range(N_TICKS), said, status=lambda tick: status))
-    found = [event.code for output in outputs for event in output.events if event.code == OUTSIDE]
+    found = [event.code for output in outputs for event in output.events if event.code == Cause.OUTSIDE]
     assert len(found) == (ControlMode.LAND in modes(outputs))
     assert sum(output.land for output in outputs) == len(found)
     return modes(outputs)
@@ -120,8 +121,10 @@ def test_where_nothing_tells_whether_it_drifts_it_is_not_held_for_long(
 def test_once_positions_were_taken_back_plans_are_made_anew_until_the_slew_limit_has_let_them_through(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def taking_back(*arguments: Any) -> samples.MeasurementUpdate:
-        intake = samples.take(*arguments)
+    gate_samples = measure.gate_samples
+
+    def taking_back(*arguments: Any) -> measure.GatedSamples:
+        intake = gate_samples(*arguments)
         tick = arguments[4].tick
         return replace(intake, clean_ns=START_NS + 3 * DT_NS - 60 * MS) if tick == 4 * TICKS + 1 else intake
 
@@ -130,30 +133,31 @@ def test_once_positions_were_taken_back_plans_are_made_anew_until_the_slew_limit
     run(make_controller(solver, horizon=20), inputs)
     asked = [number for number, _ in solver.asked]
     assert asked == [0, 1, 2, 3]  # as there is news
-    monkeypatch.setattr(step, "take", taking_back)
+    monkeypatch.setattr(measure, "gate_samples", taking_back)
     again = StubSolver(small_plant(), 20)
     run(make_controller(again, horizon=20), inputs)
     assert [number for number, _ in again.asked] == [0, 1, 2, 3, 5, 6, 7]
 
 
 @pytest.mark.parametrize(
-    ("code", "for_ns", "silent"),
+    ("cause", "for_ns", "silent"),
     [
-        (RESPONSE, 9_000 * MS, True),
-        (VELOCITY, 9_000 * MS, True),
-        (SCATTER, 9_000 * MS, True),
-        (OUTSIDE, 1_999 * MS, True),  # positions may be the reason
-        (OUTSIDE, 2_000 * MS, False),  # it is outside
-        (BRAKING, 2_000 * MS, False),
-        (OUTSIDE, None, True),
+        (Cause.RESPONSE, 9_000 * MS, True),
+        (Cause.VELOCITY, 9_000 * MS, True),
+        (Cause.SCATTER, 9_000 * MS, True),
+        (Cause.OUTSIDE, 1_999 * MS, True),  # positions may be the reason
+        (Cause.OUTSIDE, 2_000 * MS, False),  # it is outside
+        (Cause.BRAKING, 2_000 * MS, False),
+        (Cause.OUTSIDE, None, True),
     ],
 )
-def test_what_is_not_believed_is_told_to_nobody(code: str, for_ns: int | None, silent: bool) -> None:
+def test_what_is_not_believed_is_told_to_nobody(cause: Cause, for_ns: int | None, silent: bool) -> None:
     began_ns = None if for_ns is None else START_NS - for_ns
-    state = ControlState(breach=Breach(code, ""), watching=Watching(tick_ns=START_NS, began_ns=began_ns))
-    assert disbelieves(state) == silent
-    agreed = replace(state, watching=replace(state.watching, agreed=True))
-    assert disbelieves(agreed) == (silent and code != OUTSIDE)
+    engaged = monitors(tick_ns=START_NS, began_ns=began_ns)
+    group = MonitorGroup(engaged=engaged, release=release(cause, ""))
+    assert distrusts_positions(ControlState(monitors=group)) == silent
+    agreed = replace(group, engaged=replace(engaged, agreed=True))
+    assert distrusts_positions(ControlState(monitors=agreed)) == (silent and cause is not Cause.OUTSIDE)
 
 
 @pytest.mark.parametrize("senses", [True, False])
@@ -162,7 +166,7 @@ def test_positions_that_agreed_with_inertial_data_before_we_fly_need_not_prove_t
     ours, state, n_others = controller(), ControlState(), 60
     for n in range(n_others + 10):
         at_ns = START_NS + n * TICK_NS
-        state, _ = step.step(
+        state, _ = run_tick(
             state,
             StepInput(
                 tick=n,
@@ -173,20 +177,22 @@ def test_positions_that_agreed_with_inertial_data_before_we_fly_need_not_prove_t
             ),
             ours,
         )
-    assert state.watching.began_ns is not None and state.breach is None
-    assert state.watching.agreed == senses
+    assert state.monitors.engaged.motion.began_ns is not None and state.monitors.release is None
+    assert state.monitors.engaged.agreed == senses
 
 
 @pytest.mark.parametrize(
-    ("end", "silent"), [(FallbackEnd.RECOVER, False), (FallbackEnd.BARRED, True), (FallbackEnd.STOP, False)]
+    ("end", "silent"),
+    [(FallbackEnd.RECOVER, False), (FallbackEnd.POSITIONS_DISTRUSTED, True), (FallbackEnd.STOP, False)],
 )
 def test_what_jumped_is_told_to_nobody(end: FallbackEnd, silent: bool) -> None:
     fallback = Fallback(mode=ControlMode.BRAKE, since_ns=START_NS, end=end)
-    assert disbelieves(ControlState(fallback=fallback)) == silent
-    outside = Breach(OUTSIDE, "")
-    old = Watching(tick_ns=START_NS, began_ns=START_NS - 9_000 * MS)
-    assert disbelieves(ControlState(fallback=fallback, breach=outside, watching=old)) == silent
-    assert not disbelieves(ControlState())
+    flown = FallbackGroup(flown=fallback)
+    assert distrusts_positions(ControlState(fallback=flown)) == silent
+    old = monitors(tick_ns=START_NS, began_ns=START_NS - 9_000 * MS)
+    outside = MonitorGroup(engaged=old, release=release(Cause.OUTSIDE, ""))
+    assert distrusts_positions(ControlState(fallback=flown, monitors=outside)) == silent
+    assert not distrusts_positions(ControlState())
 
 
 def climbing(accel_mps2: Vec3 | None) -> list[str]:
@@ -196,7 +202,7 @@ def climbing(accel_mps2: Vec3 | None) -> list[str]:
     given = inputs_of(range(N_TICKS), said, status=lambda tick: vehicle(external=False))
     felt = () if accel_mps2 is None else (InertialSample(at_ns=START_NS, accel_mps2=accel_mps2),)
     outputs = run(ours, [replace(one, inertial=felt) for one in given])
-    return [output.unsafe for output in outputs]
+    return [output.unsafe_to_climb for output in outputs]
 
 
 @pytest.mark.fault(66)

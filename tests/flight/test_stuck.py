@@ -25,8 +25,9 @@ from flight_rig import (
 )
 from numpy.typing import NDArray
 
-from uavctl.flight.sensor_faults import GateParameters
-from uavctl.flight.step import StepOutput, initial_state, step
+from uavctl.flight.monitors.outliers import GateParameters
+from uavctl.flight.tick import TickOutput, make_initial_state
+from uavctl.flight.tick import tick as run_tick
 from uavctl.records import ControlMode, StepInput, Vec3, VehicleStatus
 from uavctl.smpc.answer import NOMINAL, Answer, Preview
 
@@ -60,14 +61,14 @@ def fly(
     steps: int = STEPS,
     status: VehicleStatus | None = None,
     seed: int = 14,
-) -> list[StepOutput]:
+) -> list[TickOutput]:
     """Ticks around a plant with disturbances; a sample each `every` ticks, as the camera says it."""
     rng = np.random.default_rng(seed)
     solver = Steering(want)
-    controller = replace(make_controller(solver, land=False), trust=PARAMETERS)
+    controller = replace(make_controller(solver, land=False), position_gate=PARAMETERS)
     plant = controller.plant
     a, b, e = plant.transition(TICK_NS * 1e-9)
-    x, w, state, outputs = np.zeros(3), np.zeros(1), initial_state(), []
+    x, w, state, outputs = np.zeros(3), np.zeros(1), make_initial_state(), []
     for tick in range(steps * TICKS):
         at_ns = START_NS + tick * TICK_NS
         if tick % TICKS == 0:
@@ -76,14 +77,14 @@ def fly(
         truth = (float(x[0]), 0.5 + 0.07 * gust * math.sin(0.11 * tick), -1.0 + 0.07 * gust * math.cos(0.08 * tick))
         samples = () if tick % every else (sample(at_ns, position_m=camera(tick, truth)),)
         inp = StepInput(tick=tick, at_ns=at_ns, samples=samples, vehicle=status or vehicle())
-        state, output = step(state, inp, controller)
+        state, output = run_tick(state, inp, controller)
         outputs.append(output)
         u = np.zeros(1) if output.setpoint is None or status else plant.to_input(output.setpoint.accel_mps2)
         x = a @ x + b @ u + e @ w
     return outputs
 
 
-def frozen(outputs: list[StepOutput]) -> list[int]:
+def frozen(outputs: list[TickOutput]) -> list[int]:
     return [tick for tick, one in enumerate(outputs) if "sample-frozen" in codes(one)]
 
 

@@ -9,9 +9,10 @@ import pytest
 from flight_rig import DT_NS, MS, START_NS, TICK_NS, estimator_parameters, sample, small_plant
 from msgspec.structs import replace
 
-from uavctl.flight.estimator import absorb, begin, set_input
+from uavctl.flight.estimator import absorb_samples, begin_history, note_input
 from uavctl.flight.kalman import Belief, make_kalman
-from uavctl.flight.sensor_faults import GateParameters, Moved, Watch, Watches, doubtful, observe, stuck
+from uavctl.flight.monitors.outliers import GateParameters
+from uavctl.flight.monitors.stale import MovedNs, SourceRecord, SourceRecords, is_doubtful, is_stuck, record_sample
 from uavctl.records import PositionSample
 
 PARAMETERS = GateParameters(sigma=6.0, margin_m=0.1, jump_ns=500 * MS)
@@ -19,23 +20,23 @@ PLANT = small_plant()
 KALMAN = make_kalman(PLANT, estimator_parameters(), DT_NS)
 
 
-def watched(values: list[float], source: str = "camera", watches: Watches | None = None) -> Watches:
+def watched(values: list[float], source: str = "camera", watches: SourceRecords | None = None) -> SourceRecords:
     """What is known of a source after these values, one each 50 ms, with what was off as 1 mm."""
     watches = watches or {}
-    history = begin(KALMAN, START_NS, START_NS)
+    history = begin_history(KALMAN, START_NS, START_NS)
     for n, value in enumerate(values):
         one = sample(START_NS + (n + 1) * TICK_NS, position_m=(value, 0.0, 0.0), source=source)
-        history, _, _ = absorb(KALMAN, history, one.received_ns, ())
-        watches = observe(watches, KALMAN, history, one, np.array([0.001]))
-        history, _, _ = absorb(KALMAN, history, one.received_ns, (one,))
-        history = set_input(KALMAN, history, one.received_ns, np.array([1.0]))
+        history, _, _ = absorb_samples(KALMAN, history, one.received_ns, ())
+        watches = record_sample(watches, KALMAN, history, one, np.array([0.001]))
+        history, _, _ = absorb_samples(KALMAN, history, one.received_ns, (one,))
+        history = note_input(KALMAN, history, one.received_ns, np.array([1.0]))
     return watches
 
 
 def test_the_resolution_is_the_smallest_change_and_repeats_are_counted_from_the_last_one() -> None:
     watch = watched([0.0, 0.5, 0.25, 0.75])["camera"]
     assert (watch.resolution_m, watch.repeats, watch.coasting) == (0.25, 0, None)
-    assert watch.news_m == pytest.approx(0.001)
+    assert watch.noise_m == pytest.approx(0.001)
     assert (watch.changes, watch.first_ns) == (3, START_NS + 4 * TICK_NS)
     watch = watched([0.0, 0.5, 0.5, 0.5])["camera"]
     assert (watch.resolution_m, watch.repeats, watch.first_ns) == (0.5, 2, START_NS + 2 * TICK_NS)
@@ -50,13 +51,13 @@ def test_the_resolution_is_the_smallest_change_and_repeats_are_counted_from_the_
 def test_a_position_that_is_no_triple_is_an_error_and_not_compared_in_part() -> None:
     short = sample(START_NS + 9 * TICK_NS, position_m=(0.0, 0.5))  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="zip"):
-        observe(watched([0.0]), KALMAN, begin(KALMAN, START_NS, START_NS), short, np.zeros(1))
+        record_sample(watched([0.0]), KALMAN, begin_history(KALMAN, START_NS, START_NS), short, np.zeros(1))
 
 
 def test_what_is_known_of_a_source_is_one_object_that_nobody_changes() -> None:
     watch = watched([0.0, 0.5, 0.5])["camera"]
     with pytest.raises(AttributeError):
-        watch.found = True  # type: ignore[misc]
+        watch.is_known_stuck = True  # type: ignore[misc]
     assert watch != replace(watch)  # and not compared by its arrays, which have no one truth
 
 
@@ -79,13 +80,13 @@ def test_sources_are_watched_apart() -> None:
 
 @pytest.mark.parametrize("late_ns", [0, 1, DT_NS])
 def test_late_samples_say_nothing(late_ns: int) -> None:
-    watches, history = watched([0.0, 0.5, 0.25]), begin(KALMAN, START_NS, START_NS)
+    watches, history = watched([0.0, 0.5, 0.25]), begin_history(KALMAN, START_NS, START_NS)
     late = sample(START_NS + 3 * TICK_NS - late_ns, position_m=(0.25, 0.0, 0.0))
-    assert observe(watches, KALMAN, history, late, np.zeros(1)) is watches
+    assert record_sample(watches, KALMAN, history, late, np.zeros(1)) is watches
 
 
 def test_eight_sources_are_watched_and_many_names_do_not_fill_the_memory() -> None:
-    watches: Watches = {}
+    watches: SourceRecords = {}
     for n in range(8):
         watches = watched([0.0], f"s{n}", watches)
     assert set(watches) == {f"s{n}" for n in range(8)}
@@ -99,24 +100,24 @@ def test_eight_sources_are_watched_and_many_names_do_not_fill_the_memory() -> No
 
 def test_each_axis_is_watched_for_moves_and_repeats_of_its_own() -> None:
     """The north moves and the down but twice; the east never does."""
-    watches: Watches = {}
-    history = begin(KALMAN, START_NS, START_NS)
+    watches: SourceRecords = {}
+    history = begin_history(KALMAN, START_NS, START_NS)
     values = [(0.0, 1.0, 5.0), (0.1, 1.0, 5.0), (0.3, 1.0, 6.0), (0.3, 1.0, 6.0), (0.4, 1.0, 7.0), (0.6, 1.0, 7.0)]
     for n, value in enumerate(values):
         one = sample(START_NS + (n + 1) * TICK_NS, position_m=value)
-        history, _, _ = absorb(KALMAN, history, one.received_ns, (one,))
-        watches = observe(watches, KALMAN, history, one, np.array([0.001]))
+        history, _, _ = absorb_samples(KALMAN, history, one.received_ns, (one,))
+        watches = record_sample(watches, KALMAN, history, one, np.array([0.001]))
     watch = watches["camera"]
     assert (watch.moves, watch.still) == ((4, 0, 2), (0, 5, 1))
     assert watch.still_ns == (START_NS + 6 * TICK_NS, START_NS + TICK_NS, START_NS + 5 * TICK_NS)
     for n in range(20):
         one = sample(START_NS + (n + 9) * TICK_NS, position_m=(0.1 * (n % 2), 1.0, 7.0))
-        watches = observe(watches, KALMAN, history, one, np.array([0.001]))
+        watches = record_sample(watches, KALMAN, history, one, np.array([0.001]))
     assert (watches["camera"].moves, watches["camera"].still) == ((10, 0, 2), (0, 25, 21))
 
 
 @pytest.mark.parametrize(
-    ("moves", "still", "news_m", "since"),
+    ("moves", "still", "noise_m", "since"),
     [
         ((10, 10, 10), (0, 0, 5), 0.02, 3),
         ((10, 10, 10), (0, 0, 4), 0.02, None),
@@ -129,36 +130,38 @@ def test_each_axis_is_watched_for_moves_and_repeats_of_its_own() -> None:
     ],
 )
 def test_an_axis_that_noise_has_moved_and_that_stands_still_is_stuck(
-    moves: tuple[int, ...], still: tuple[int, ...], news_m: float, since: int | None
+    moves: tuple[int, ...], still: tuple[int, ...], noise_m: float, since: int | None
 ) -> None:
-    watch = Watch(START_NS, (0.0, 0.0, 0.0), 0.001, news_m, moves=moves, still=still, still_ns=(1, 2, 3))
-    assert watch.still_since_ns(ALWAYS) == since
-    assert stuck(watch, KALMAN, sample(START_NS), PARAMETERS, ALWAYS) is (since is not None)
+    watch = SourceRecord(START_NS, (0.0, 0.0, 0.0), 0.001, noise_m, moves=moves, still=still, still_ns=(1, 2, 3))
+    assert watch.find_still_since_ns(ALWAYS) == since
+    assert is_stuck(watch, KALMAN, sample(START_NS), PARAMETERS, ALWAYS) is (since is not None)
 
 
-ALWAYS: Moved = (2**62,) * 3  # it moves all the time
+ALWAYS: MovedNs = (2**62,) * 3  # it moves all the time
 
 
 @pytest.mark.parametrize(
     ("moved_ns", "since"), [((1, 2, 3), 1), ((0, 2, 3), 3), ((0, 9, 2), None), ((0, 0, 9), 3), ((9, 0, 0), 1)]
 )
-def test_an_axis_that_has_rested_since_by_the_vehicles_word_may_stand_still(moved_ns: Moved, since: int | None) -> None:
-    watch = Watch(START_NS, (0.0, 0.0, 0.0), 0.001, 0.02, moves=(10,) * 3, still=(5, 0, 5), still_ns=(1, 2, 3))
-    assert watch.still_since_ns(moved_ns) == since
-    assert stuck(watch, KALMAN, sample(START_NS), PARAMETERS, moved_ns) is (since is not None)
+def test_an_axis_that_has_rested_since_by_the_vehicles_word_may_stand_still(
+    moved_ns: MovedNs, since: int | None
+) -> None:
+    watch = SourceRecord(START_NS, (0.0, 0.0, 0.0), 0.001, 0.02, moves=(10,) * 3, still=(5, 0, 5), still_ns=(1, 2, 3))
+    assert watch.find_still_since_ns(moved_ns) == since
+    assert is_stuck(watch, KALMAN, sample(START_NS), PARAMETERS, moved_ns) is (since is not None)
 
 
 @pytest.mark.parametrize(
     ("moved_ns", "rests"),
     [((6, 6, 6), True), ((7, 6, 6), False), ((6, 7, 6), False), ((6, 6, 7), False), ((9, 6, 6), False)],
 )
-def test_a_value_may_come_again_of_who_has_rested_all_the_time(moved_ns: Moved, rests: bool) -> None:
-    watch = Watch(START_NS, (0.0, 0.0, 0.0), 5e-5, first_ns=7)
+def test_a_value_may_come_again_of_who_has_rested_all_the_time(moved_ns: MovedNs, rests: bool) -> None:
+    watch = SourceRecord(START_NS, (0.0, 0.0, 0.0), 5e-5, first_ns=7)
     assert watch.may_rest(moved_ns) == rests
     assert replace(watch, resolution_m=1e-3).may_rest(moved_ns) == rests
     assert not replace(watch, resolution_m=4.99e-5).may_rest(moved_ns)  # noise to the last digit does not say it twice
-    assert not replace(watch, found=True).may_rest(moved_ns)
-    assert not replace(watch, doubted=True).may_rest(moved_ns)
+    assert not replace(watch, is_known_stuck=True).may_rest(moved_ns)
+    assert not replace(watch, is_doubted=True).may_rest(moved_ns)
 
 
 @pytest.mark.parametrize(
@@ -166,11 +169,11 @@ def test_a_value_may_come_again_of_who_has_rested_all_the_time(moved_ns: Moved, 
     [(10, 0.01, 0.01), (9, 0.01, 0.002), (9, 0.001, 0.001), (11, 0.01, 0.01), (0, 0.0, 0.0)],
 )
 def test_a_few_changes_do_not_tell_the_resolution(changes: int, resolution_m: float, grain_m: float) -> None:
-    assert Watch(START_NS, (0.0, 0.0, 0.0), resolution_m, changes=changes).grain_m == grain_m
+    assert SourceRecord(START_NS, (0.0, 0.0, 0.0), resolution_m, changes=changes).grain_m == grain_m
 
 
 @pytest.mark.parametrize(
-    ("repeats", "news_m", "resolution_m", "std_m", "far_m", "found"),
+    ("repeats", "noise_m", "resolution_m", "std_m", "far_m", "found"),
     [
         (3, 0.003, 1e-6, 0.01, 0.0, True),
         (2, 0.003, 1e-6, 0.01, 0.0, False),
@@ -190,7 +193,7 @@ def test_a_few_changes_do_not_tell_the_resolution(changes: int, resolution_m: fl
     ],
 )
 def test_what_counts_as_stuck(
-    repeats: int, news_m: float, resolution_m: float, std_m: float, far_m: float, found: bool
+    repeats: int, noise_m: float, resolution_m: float, std_m: float, far_m: float, found: bool
 ) -> None:
     one: PositionSample = sample(START_NS, position_m=(2.0, 0.0, 0.0))
     belief = Belief(
@@ -199,14 +202,14 @@ def test_what_counts_as_stuck(
         mean=np.array([2.0 + far_m, 9.0, 9.0, 9.0]),
         cov=np.diag([std_m**2, 9, 9, 9]),
     )
-    watch = Watch(START_NS, one.position_m, resolution_m, news_m, changes=10, repeats=repeats, coasting=belief)
-    assert stuck(watch, KALMAN, one, PARAMETERS, ALWAYS) is found
-    assert stuck(replace(watch, coasting=None), KALMAN, one, PARAMETERS, ALWAYS) is False
-    assert stuck(replace(watch, found=True), KALMAN, one, PARAMETERS, ALWAYS) is True
+    watch = SourceRecord(START_NS, one.position_m, resolution_m, noise_m, changes=10, repeats=repeats, coasting=belief)
+    assert is_stuck(watch, KALMAN, one, PARAMETERS, ALWAYS) is found
+    assert is_stuck(replace(watch, coasting=None), KALMAN, one, PARAMETERS, ALWAYS) is False
+    assert is_stuck(replace(watch, is_known_stuck=True), KALMAN, one, PARAMETERS, ALWAYS) is True
 
 
 @pytest.mark.parametrize(
-    ("news_m", "resolution_m", "far_m", "doubted"),
+    ("noise_m", "resolution_m", "far_m", "is_doubted"),
     [
         (0.004, 0.001, 0.0, True),  # noise of four resolutions
         (0.003999, 0.001, 0.0, False),
@@ -222,25 +225,25 @@ def test_what_counts_as_stuck(
     ],
 )
 def test_when_a_value_that_came_again_is_not_believed(
-    news_m: float, resolution_m: float, far_m: float, doubted: bool
+    noise_m: float, resolution_m: float, far_m: float, is_doubted: bool
 ) -> None:
     """However uncertain the prediction is, in the axis of the plant alone."""
     one = sample(START_NS, position_m=(2.0, 7.0, -7.0))
     for std_m in (0.0, 5.0):
         mean, cov = np.array([2.0 + far_m, 9.0, 9.0, 9.0]), np.eye(4) * std_m**2
         belief = Belief(at_ns=START_NS, captured_ns=START_NS, mean=mean, cov=cov)
-        watch = Watch(START_NS, one.position_m, resolution_m, news_m, changes=10, repeats=1, coasting=belief)
-        assert doubtful(watch, KALMAN, one, PARAMETERS) is doubted
-        assert doubtful(replace(watch, coasting=None), KALMAN, one, PARAMETERS) is False
+        watch = SourceRecord(START_NS, one.position_m, resolution_m, noise_m, changes=10, repeats=1, coasting=belief)
+        assert is_doubtful(watch, KALMAN, one, PARAMETERS) is is_doubted
+        assert is_doubtful(replace(watch, coasting=None), KALMAN, one, PARAMETERS) is False
 
 
 def test_what_is_near_enough_is_so_at_the_edge_as_well() -> None:
     parameters = GateParameters(sigma=0.0, margin_m=9.0, jump_ns=0)
     one = sample(START_NS, position_m=(2.0, 0.0, 0.0))
-    for north_m, doubted in ((2.125, False), (math.nextafter(2.125, 3.0), True)):
+    for north_m, is_doubted in ((2.125, False), (math.nextafter(2.125, 3.0), True)):
         belief = Belief(START_NS, START_NS, mean=np.array([north_m, 0.0, 0.0, 0.0]), cov=np.zeros((4, 4)))
-        watch = Watch(START_NS, one.position_m, changes=10, resolution_m=0.125, repeats=1, coasting=belief)
-        assert doubtful(watch, KALMAN, one, parameters) is doubted
+        watch = SourceRecord(START_NS, one.position_m, changes=10, resolution_m=0.125, repeats=1, coasting=belief)
+        assert is_doubtful(watch, KALMAN, one, parameters) is is_doubted
 
 
 def test_as_far_as_all_that_is_uncertain_is_not_yet_too_far() -> None:
@@ -248,18 +251,18 @@ def test_as_far_as_all_that_is_uncertain_is_not_yet_too_far() -> None:
     one = sample(START_NS, position_m=(2.0, 0.0, 0.0))
     for north_m, found in ((2.25, False), (math.nextafter(2.25, 3.0), True)):
         belief = Belief(START_NS, START_NS, mean=np.array([north_m, 0.0, 0.0, 0.0]), cov=np.zeros((4, 4)))
-        watch = Watch(START_NS, one.position_m, changes=10, resolution_m=0.125, repeats=1, coasting=belief)
-        assert stuck(watch, KALMAN, one, parameters, ALWAYS) is found
+        watch = SourceRecord(START_NS, one.position_m, changes=10, resolution_m=0.125, repeats=1, coasting=belief)
+        assert is_stuck(watch, KALMAN, one, parameters, ALWAYS) is found
 
 
 def test_how_far_apart_samples_are_and_how_long_none_came_before_a_value() -> None:
-    watches: Watches = {}
-    history = begin(KALMAN, START_NS, START_NS)
+    watches: SourceRecords = {}
+    history = begin_history(KALMAN, START_NS, START_NS)
     seen = []
     for ticks, value in ((1, 0.0), (4, 0.5), (6, 0.7), (9, 0.7), (10, 0.7), (14, 0.9)):
         one = sample(START_NS + ticks * TICK_NS, position_m=(value, 0.0, 0.0))
-        history, _, _ = absorb(KALMAN, history, one.received_ns, (one,))
-        watches = observe(watches, KALMAN, history, one, np.array([0.001]))
+        history, _, _ = absorb_samples(KALMAN, history, one.received_ns, (one,))
+        watches = record_sample(watches, KALMAN, history, one, np.array([0.001]))
         seen.append((watches["camera"].gap_ns // TICK_NS, watches["camera"].spacing_ns // TICK_NS))
     assert seen == [(0, 0), (3, 3), (2, 2), (2, 2), (2, 1), (4, 1)]
 
@@ -278,7 +281,9 @@ def test_how_far_apart_samples_are_and_how_long_none_came_before_a_value() -> No
 def test_the_value_that_first_came_may_be_stale_where_one_was_lost_before(
     changes: int, repeats: int, gap_ns: int, stale: bool
 ) -> None:
-    watch = Watch(9, (0.0, 0.0, 0.0), changes=changes, repeats=repeats, first_ns=7, gap_ns=gap_ns, spacing_ns=100)
+    watch = SourceRecord(
+        9, (0.0, 0.0, 0.0), changes=changes, repeats=repeats, first_ns=7, gap_ns=gap_ns, spacing_ns=100
+    )
     assert watch.stale_since_ns == (7 if stale else 8)
 
 
@@ -307,42 +312,42 @@ def test_the_part_of_values_that_come_again_is_learnt_of_one_repeat_or_two() -> 
     ],
 )
 def test_what_a_source_does_as_usual(usual: float, repeats: int, as_usual: bool, unlike_it: bool) -> None:
-    watch = Watch(9, (0.0, 0.0, 0.0), usual=usual, repeats=repeats)
-    assert (watch.as_usual, watch.unlike_it) == (as_usual, unlike_it)
+    watch = SourceRecord(9, (0.0, 0.0, 0.0), usual=usual, repeats=repeats)
+    assert (watch.repeats_as_usual, watch.is_unusual) == (as_usual, unlike_it)
 
 
 def test_a_source_that_says_values_twice_is_not_stuck_for_it_however_far_the_vehicle_flew() -> None:
     one = sample(START_NS, position_m=(2.0, 0.0, 0.0))
     belief = Belief(START_NS, START_NS, mean=np.array([3.0, 0.0, 0.0, 0.0]), cov=np.zeros((4, 4)))
-    watch = Watch(START_NS, one.position_m, repeats=2, usual=1.0, coasting=belief)
-    assert stuck(watch, KALMAN, one, PARAMETERS, ALWAYS) is False
-    assert doubtful(watch, KALMAN, one, PARAMETERS) is True
-    assert stuck(replace(watch, repeats=3), KALMAN, one, PARAMETERS, ALWAYS) is True
-    assert stuck(replace(watch, usual=0.0), KALMAN, one, PARAMETERS, ALWAYS) is True
+    watch = SourceRecord(START_NS, one.position_m, repeats=2, usual=1.0, coasting=belief)
+    assert is_stuck(watch, KALMAN, one, PARAMETERS, ALWAYS) is False
+    assert is_doubtful(watch, KALMAN, one, PARAMETERS) is True
+    assert is_stuck(replace(watch, repeats=3), KALMAN, one, PARAMETERS, ALWAYS) is True
+    assert is_stuck(replace(watch, usual=0.0), KALMAN, one, PARAMETERS, ALWAYS) is True
 
 
 def test_nothing_is_known_of_a_source_at_first() -> None:
-    watch = Watch(START_NS, (0.0, 0.0, 0.0))
-    assert (watch.resolution_m, watch.news_m, watch.changes, watch.first_ns, watch.repeats) == (0.0, 0.0, 0, 0, 0)
+    watch = SourceRecord(START_NS, (0.0, 0.0, 0.0))
+    assert (watch.resolution_m, watch.noise_m, watch.changes, watch.first_ns, watch.repeats) == (0.0, 0.0, 0, 0, 0)
     assert (watch.moves, watch.still, watch.still_ns) == ((0, 0, 0),) * 3
     assert (watch.usual, watch.gap_ns, watch.spacing_ns) == (0.0, 0, 0)
-    assert not (watch.doubted or watch.found or watch.coasting)
+    assert not (watch.is_doubted or watch.is_known_stuck or watch.coasting)
 
 
 def test_news_is_a_mean_of_which_the_first_values_are_equal_parts() -> None:
-    watches, history = watched([0.0]), begin(KALMAN, START_NS, START_NS)
+    watches, history = watched([0.0]), begin_history(KALMAN, START_NS, START_NS)
     means = []
     for n, off_m in enumerate((0.001, 0.004, 0.001)):
         one = sample(START_NS + (n + 2) * TICK_NS, position_m=(0.5 + 0.1 * n, 0.0, 0.0))
-        watches = observe(watches, KALMAN, history, one, np.array([-off_m]))
-        means.append(watches["camera"].news_m)
+        watches = record_sample(watches, KALMAN, history, one, np.array([-off_m]))
+        means.append(watches["camera"].noise_m)
     assert means == pytest.approx([0.001, 0.0025, 0.002])
 
 
 def test_the_time_between_two_values_does_not_go_by_when_it_was() -> None:
-    history = begin(KALMAN, 0, 0)
-    watches = observe({}, KALMAN, history, sample(10), np.array([0.001]))
-    watches = observe(watches, KALMAN, history, sample(50, position_m=(1.0, 0.0, 0.0)), np.array([0.001]))
+    history = begin_history(KALMAN, 0, 0)
+    watches = record_sample({}, KALMAN, history, sample(10), np.array([0.001]))
+    watches = record_sample(watches, KALMAN, history, sample(50, position_m=(1.0, 0.0, 0.0)), np.array([0.001]))
     assert (watches["camera"].gap_ns, watches["camera"].spacing_ns) == (40, 40)
 
 
@@ -360,30 +365,30 @@ def test_its_axes_do_not_stand_still_for_it() -> None:
 def test_a_value_that_was_taken_back_is_not_believed_until_another_comes() -> None:
     one = sample(START_NS, position_m=(2.0, 0.0, 0.0))
     belief = Belief(START_NS, START_NS, mean=np.array([2.0, 0.0, 0.0, 0.0]), cov=np.zeros((4, 4)))
-    watch = Watch(START_NS, one.position_m, repeats=1, coasting=belief)
-    assert doubtful(watch, KALMAN, one, PARAMETERS) is False
-    assert doubtful(replace(watch, doubted=True), KALMAN, one, PARAMETERS) is True
-    assert doubtful(replace(watch, doubted=True, coasting=None), KALMAN, one, PARAMETERS) is True
-    told = {"camera": replace(watch, doubted=True, at_ns=START_NS)}
-    history = begin(KALMAN, START_NS, START_NS)
+    watch = SourceRecord(START_NS, one.position_m, repeats=1, coasting=belief)
+    assert is_doubtful(watch, KALMAN, one, PARAMETERS) is False
+    assert is_doubtful(replace(watch, is_doubted=True), KALMAN, one, PARAMETERS) is True
+    assert is_doubtful(replace(watch, is_doubted=True, coasting=None), KALMAN, one, PARAMETERS) is True
+    told = {"camera": replace(watch, is_doubted=True, at_ns=START_NS)}
+    history = begin_history(KALMAN, START_NS, START_NS)
     again = sample(START_NS + 1, position_m=(2.0, 0.0, 0.0))
-    assert observe(told, KALMAN, history, again, np.zeros(1))["camera"].doubted
+    assert record_sample(told, KALMAN, history, again, np.zeros(1))["camera"].is_doubted
     other = sample(START_NS + 1, position_m=(2.1, 0.0, 0.0))
-    assert not observe(told, KALMAN, history, other, np.zeros(1))["camera"].doubted
+    assert not record_sample(told, KALMAN, history, other, np.zeros(1))["camera"].is_doubted
 
 
 def test_a_value_that_comes_again_after_the_window_is_held_against_the_inputs_too() -> None:
     """Else a repeat after a long silence would be believed."""
     watches = watched([0.0, 0.5])
-    history = begin(KALMAN, START_NS, START_NS)
+    history = begin_history(KALMAN, START_NS, START_NS)
     one = sample(START_NS + 2 * TICK_NS, position_m=(0.5, 0.0, 0.0))
-    history, _, _ = absorb(KALMAN, history, one.received_ns, (one,))
-    history = set_input(KALMAN, history, one.received_ns, np.array([1.0]))
+    history, _, _ = absorb_samples(KALMAN, history, one.received_ns, (one,))
+    history = note_input(KALMAN, history, one.received_ns, np.array([1.0]))
     late_ns = one.captured_ns + round(1.5e9 * KALMAN.parameters.window_s)
-    history, _, _ = absorb(KALMAN, history, late_ns, ())
+    history, _, _ = absorb_samples(KALMAN, history, late_ns, ())
     assert history.horizon_ns > one.captured_ns
     late = sample(late_ns, position_m=(0.5, 0.0, 0.0))
-    watch = observe(watches, KALMAN, history, late, np.zeros(1))["camera"]
+    watch = record_sample(watches, KALMAN, history, late, np.zeros(1))["camera"]
     assert watch.coasting is not None
     assert watch.coasting.at_ns == late_ns
-    assert doubtful(watch, KALMAN, late, PARAMETERS)
+    assert is_doubtful(watch, KALMAN, late, PARAMETERS)

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from uavctl.build.controller import build_controller, build_plant
 from uavctl.config import Config, load_config
-from uavctl.flight.mission import MissionState, along, ask_for, follow, wanted
+from uavctl.flight.mission import MissionState, find_target, make_question
+from uavctl.flight.trajectory import follow_positions, plan_along
 
 Array = NDArray[np.float64]
 
@@ -43,7 +44,7 @@ def acceleration(times_s: Array) -> Array:
 def test_the_inputs_of_a_motion_are_about_its_acceleration_at_any_step(preset: str, dt_s: float) -> None:
     plant = build_plant(load_config(preset, [f"plant.dt_s={dt_s}"]))
     t = times(dt_s, round((LENGTH_S + 2.4) / dt_s))
-    motion = follow(plant, place(t), None)
+    motion = follow_positions(plant, place(t), None)
     assert np.abs(motion.states[:, list(plant.position_index)] - place(t)).max() < 5e-3
     # Drag and lag ask for some more; steps that ring would ask for many times as much.
     largest = np.abs(acceleration(t)).max()
@@ -58,8 +59,8 @@ def test_plans_of_short_steps_leave_a_motion_late_and_brake_like_those_of_long_o
     for dt_s, horizon in ((0.05, 48), (0.2, 12)):
         plant = build_plant(load_config(preset, [f"plant.dt_s={dt_s}"]))
         t = times(dt_s, round((LENGTH_S + 4.8) / dt_s))
-        motion, rest = follow(plant, place(t), None), 2 * horizon // 3
-        path = along(plant, motion, horizon, rest, np.full(3, -9.0), np.full(3, 9.0))
+        motion, rest = follow_positions(plant, place(t), None), 2 * horizon // 3
+        path = plan_along(plant, motion, horizon, rest, np.full(3, -9.0), np.full(3, 9.0))
         index = list(plant.position_index)
         row, late = round(5.0 / dt_s), round(0.4 / dt_s)
         x = path.path_states[row] + path.anchors[row]
@@ -80,7 +81,7 @@ def test_plans_of_short_steps_leave_a_motion_late_and_brake_like_those_of_long_o
 def test_a_motion_begins_without_what_the_vehicles_own_loops_have_not_done_yet(preset: str) -> None:
     plant = build_plant(load_config(preset))
     t = times(plant.dt_s, 100)
-    motion = follow(plant, place(t + 3.0), None)  # it begins under way
+    motion = follow_positions(plant, place(t + 3.0), None)  # it begins under way
     loops = [i for i, (name, _) in enumerate(plant.further) if i > 0 and name]
     for velocity in plant.velocity_index:
         np.testing.assert_allclose(motion.states[0, [velocity + 1 + i for i in loops]], 0.0, atol=1e-6)
@@ -96,13 +97,13 @@ def test_what_is_sent_at_a_boundary_follows_the_motion_of_when_it_acts(preset: s
     state = MissionState(start_ns=begin_ns)
     for step in (0, 1, 57, 130):
         at_ns = begin_ns + round(step * dt_s * 1e9)
-        target, outlook = ask_for(mission, state, at_ns)
+        target, outlook = make_question(mission, state, at_ns)
         assert outlook.path is not None
         first = (outlook.path.states[0] + target)[index]
         np.testing.assert_allclose(first, place(np.array([step * dt_s + dead_s]))[0], atol=5e-3)
         # Judged is where it is to be now, between rows too.
         for later_ns in (0, 20_000_000):
-            now = np.array(wanted(mission, state, at_ns + later_ns))[index]
+            now = np.array(find_target(mission, state, at_ns + later_ns))[index]
             t = max(step * dt_s + later_ns * 1e-9, dead_s)
             np.testing.assert_allclose(now, place(np.array([t]))[0], atol=5e-3)
 
@@ -111,7 +112,7 @@ def test_a_fence_is_known_for_when_a_plan_acts() -> None:
     fence = "fence=[{state='north',side='upper',times_s=[0.0,10.0],values=[3.0,2.0]}]"
     for dead_s in (0.0, 0.1):
         mission = build_controller(load_config("room-px4", [fence, f"plant.dead_time_s={dead_s}"])).mission
-        _, outlook = ask_for(mission, MissionState(start_ns=0), 4_000_000_000)
+        _, outlook = make_question(mission, MissionState(start_ns=0), 4_000_000_000)
         assert outlook.limits is not None
         row = mission.fences[0].row
         np.testing.assert_allclose(outlook.limits[[0, 20], row], [2.6 - 0.1 * dead_s, 2.5 - 0.1 * dead_s], atol=1e-9)

@@ -61,7 +61,7 @@ def test_the_tree_keeps_every_contract(graph: grimp.ImportGraph) -> None:
         ("sim", "uavctl.smpc", "The simulator knows nothing of the controller"),
         ("sim", "uavctl.loop", "The simulator knows nothing of the controller"),
         (
-            "uavctl.flight.step",
+            "uavctl.flight.tick",
             "uavctl.smpc.hahn_stursberg.exact",
             "What flies by default stands without the paper's scheme",
         ),

@@ -12,7 +12,7 @@ from uavctl.build.controller import build_estimator
 from uavctl.config import load_config
 from uavctl.config.connections import ClockConfig, DaemonConfig, FrameConfig, SourceConfig
 from uavctl.config.types import EstimatorConfig
-from uavctl.flight.gating import refusal
+from uavctl.flight.measure import find_refusal
 from uavctl.mavlink.codec import UnsendableError
 from uavctl.mavlink.connection import MavlinkConnection
 from uavctl.mavlink.requests import RequestKind
@@ -91,7 +91,7 @@ def test_useless_samples_are_counted(data: bytes, reason: str) -> None:
     assert link.stats(NOW).bad == {reason: 1}
     # What is absurd is refused by the controller, which has to know how long a source says nothing else.
     limits = build_estimator(load_config("room-hahn-stursberg"))
-    assert [refusal(one, NOW, limits) for one in found] == (["sample-invalid"] if reason == "absurd" else [])
+    assert [find_refusal(one, NOW, limits) for one in found] == (["sample-invalid"] if reason == "absurd" else [])
 
 
 def test_limits_of_the_absurd_are_configured() -> None:

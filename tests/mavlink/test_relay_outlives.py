@@ -8,8 +8,10 @@ import pytest
 from take_off_rig import RELAYED, Flight
 
 from uavctl import loop as control
-from uavctl.flight.controller import Controller, ControlState
-from uavctl.flight.step import StepOutput, step
+from uavctl.flight.controller import Controller
+from uavctl.flight.state import ControlState
+from uavctl.flight.tick import TickOutput
+from uavctl.flight.tick import tick as run_tick
 from uavctl.mavlink.handover import HandOver, HandoverStep
 from uavctl.mavlink.handover_guards import MUST_LAND, HandoverView
 from uavctl.mavlink.handover_states import HandoverState
@@ -36,12 +38,12 @@ def failing(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
 
     def faulty(
         state: ControlState, inp: StepInput, controller: Controller, *, carried: bool
-    ) -> tuple[ControlState, StepOutput]:
+    ) -> tuple[ControlState, TickOutput]:
         if broken:
             raise ArithmeticError("the core is broken")
-        return step(state, inp, controller, carried=carried)
+        return run_tick(state, inp, controller, carried=carried)
 
-    monkeypatch.setattr(control, "step", faulty)
+    monkeypatch.setattr(control, "run_tick", faulty)
     return lambda: broken.append(True)
 
 

@@ -25,9 +25,9 @@ from flight_rig import (
 from numpy.typing import NDArray
 
 from uavctl.flight.controller import Controller
-from uavctl.flight.decision import mode_of
-from uavctl.flight.sensor_faults import GateParameters
-from uavctl.flight.step import StepOutput, initial_state, step
+from uavctl.flight.monitors.outliers import GateParameters
+from uavctl.flight.tick import TickOutput, make_initial_state
+from uavctl.flight.tick import tick as run_tick
 from uavctl.records import Command, ControlMode, Order, PositionSample, SolveStatus, StepInput, VehicleStatus
 from uavctl.smpc.answer import NOMINAL, Answer, Preview
 
@@ -96,7 +96,7 @@ class World:
         self._waiting: list[PositionSample] = []
         self._bad = False
 
-    def advance(self, tick: int, output: StepOutput | None) -> None:
+    def advance(self, tick: int, output: TickOutput | None) -> None:
         """One tick of the plant, by what was sent, and one look of the camera."""
         rng, at_ns = self.rng, START_NS + tick * TICK_NS
         if tick % TICKS == 0:
@@ -124,15 +124,15 @@ class World:
         return here
 
 
-def runs(rng: np.random.Generator, ticks: int, orders: bool) -> Iterator[tuple[StepInput, StepOutput, bool]]:
+def runs(rng: np.random.Generator, ticks: int, orders: bool) -> Iterator[tuple[StepInput, TickOutput, bool]]:
     """Inputs and outputs of that many ticks, and whether a flight begins; a new one follows each hand-over."""
     done = 0
     while done < ticks:
         controller = make_controller(WildSolver(rng), land=bool(rng.integers(2)))
-        controller = replace(controller, trust=GateParameters(sigma=6.0, margin_m=0.3, jump_ns=DT_NS))
-        world, state, output, begins = World(rng, controller), initial_state(), None, True
+        controller = replace(controller, position_gate=GateParameters(sigma=6.0, margin_m=0.3, jump_ns=DT_NS))
+        world, state, output, begins = World(rng, controller), make_initial_state(), None, True
         missed, silent_until, tick = 0, 0, -1
-        while done < ticks and mode_of(state) is not ControlMode.STOPPED:
+        while done < ticks and state.mode is not ControlMode.STOPPED:
             tick += 1
             world.advance(tick, output)
             if rng.random() < 0.02:
@@ -151,7 +151,7 @@ def runs(rng: np.random.Generator, ticks: int, orders: bool) -> Iterator[tuple[S
                 commands=_orders(rng) if orders else (),
             )
             missed = 0
-            state, output = step(state, inp, controller)
+            state, output = run_tick(state, inp, controller)
             yield inp, output, begins
             begins, done = False, done + 1
 

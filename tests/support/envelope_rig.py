@@ -11,9 +11,21 @@ from flight_rig import MS, START_NS, sample
 from msgspec import structs
 from numpy.typing import NDArray
 
-from uavctl.flight.envelope import Breach, EnvelopeParameters, Observation, Watching, watch
 from uavctl.flight.limits import ZERO
-from uavctl.flight.sensor_faults import Observer
+from uavctl.flight.monitors import engaged
+from uavctl.flight.monitors.braking import BrakingState
+from uavctl.flight.monitors.engaged import INITIAL, MonitorState
+from uavctl.flight.monitors.observation import EnvelopeParameters, Observation
+from uavctl.flight.monitors.observer import Observer
+from uavctl.flight.monitors.outside import OutsideState
+from uavctl.flight.monitors.vehicle_velocity import (
+    VelocityObservation,
+    find_trusted_velocity,
+    is_inertial_consistent,
+    judge_prediction,
+)
+from uavctl.flight.monitors.verdict import Action, Cause, Verdict
+from uavctl.flight.supervise import RELEASES
 from uavctl.records import PositionSample, Vec3, VehicleMotion
 
 Array = NDArray[np.float64]
@@ -33,6 +45,73 @@ PARAMETERS = EnvelopeParameters(
     window_ns=1200 * MS,
     begins_mps=0.3,
 )
+
+
+# Where each thing that the monitors know is kept in their state.
+GROUPS = {
+    "motion": (
+        "tick_ns",
+        "began_ns",
+        "model_mps",
+        "model_mps2",
+        "sent",
+        "vehicle_path",
+        "inertial_path",
+        "push_mps2",
+        "observer",
+        "resumed_ns",
+    ),
+    "acceleration": ("unexplained_mps2", "clipped", "is_pushed", "over_ns"),
+    "velocity": ("offsets", "places", "apart_mps", "apart_ns", "is_contradicted"),
+}
+
+
+def changed(state: MonitorState, **known: Any) -> MonitorState:
+    """The state of the monitors with other values, each named as in its group."""
+    for group, names in GROUPS.items():
+        values = {name: known.pop(name) for name in names if name in known}
+        if "resumed_ns" in values:  # known before this tick: the monitor of braking knows it, too
+            known["braking_resumed_ns"] = values["resumed_ns"]
+        state = structs.replace(state, **{group: structs.replace(getattr(state, group), **values)})
+    if "outside_ns" in known:
+        state = structs.replace(state, outside=OutsideState(known.pop("outside_ns")))
+    if "braking" in known or "braking_resumed_ns" in known:
+        began, resumed_ns = known.pop("braking", state.braking.began), known.pop("braking_resumed_ns", None)
+        state = structs.replace(state, braking=BrakingState(began, resumed_ns or state.braking.resumed_ns))
+    return structs.replace(state, **known)
+
+
+def monitors(**known: Any) -> MonitorState:
+    return changed(INITIAL, **known)
+
+
+def update(
+    state: MonitorState, observation: Observation, parameters: EnvelopeParameters
+) -> tuple[MonitorState, Verdict | None]:
+    """The monitors after a tick, and their verdict; None for none."""
+    state, verdict = engaged.update(state, observation, parameters)
+    assert verdict.is_none or (verdict.action is Action.RELEASE and verdict.cause in RELEASES)
+    return state, None if verdict.is_none else verdict
+
+
+def trusted_velocity(
+    state: MonitorState, tick: Observation, age_s: float, parameters: EnvelopeParameters
+) -> Vec3 | None:
+    return find_trusted_velocity(VelocityObservation(state, tick, age_s, parameters))
+
+
+def is_prediction_inconsistent(
+    state: MonitorState, tick: Observation, age_s: float, parameters: EnvelopeParameters
+) -> bool:
+    verdict = judge_prediction(VelocityObservation(state, tick, age_s, parameters))
+    assert verdict.is_none or (verdict.action, verdict.cause) == (Action.BRAKE, Cause.PREDICTION)
+    return not verdict.is_none
+
+
+def is_inertial_inconsistent(
+    state: MonitorState, tick: Observation, age_s: float, parameters: EnvelopeParameters
+) -> bool:
+    return not is_inertial_consistent(VelocityObservation(state, tick, age_s, parameters))
 
 
 def vec3(values: Sequence[float] | Array) -> Vec3:
@@ -63,16 +142,16 @@ def look(
     accel: Vec3 = ZERO,
     parameters: EnvelopeParameters = PARAMETERS,
     **known: Any,
-) -> tuple[Watching, Breach | None]:
+) -> tuple[MonitorState, Verdict | None]:
     """What comes of a position, by which the observer has, exactly, that velocity and unexplained acceleration."""
     s, d = LOOK_NS * 1e-9, np.array(unexplained)
     begun = np.array(velocity) - s * d
     observer = Observer(
         at_ns=START_NS, mean=np.array([np.zeros(3), begun, d]), cov=np.zeros((3, 3)), accel_mps2=np.array(accel)
     )
-    watching = structs.replace(Watching(observer=observer, tick_ns=START_NS, sent=((START_NS, accel),)), **known)
+    watching = changed(monitors(observer=observer, tick_ns=START_NS, sent=((START_NS, accel),)), **known)
     position = s * begun + 0.5 * s * s * (np.array(accel) + d) + np.array([off_m, 0.0, 0.0])
-    return watch(watching, seen(AT_NS, sample(AT_NS, AT_NS, vec3(position)), sent=accel, own=own), parameters)
+    return update(watching, seen(AT_NS, sample(AT_NS, AT_NS, vec3(position)), sent=accel, own=own), parameters)
 
 
 def just_more(value: float) -> float:
@@ -91,7 +170,7 @@ def offsets(
 ) -> dict[str, Any]:
     """Offsets so long before AT_NS that grow by so much in a second; the vehicle says that it is at rest."""
     return {
-        "way": ((START_NS, np.zeros(3)), (AT_NS - MS, np.zeros(3))),
+        "vehicle_path": ((START_NS, np.zeros(3)), (AT_NS - MS, np.zeros(3))),
         "offsets": tuple(
             (AT_NS - ns, np.array([place_m - speed_mps * ns * 1e-9, 0.0, 0.0])) for ns in sorted(spans_ns)[::-1]
         ),

@@ -11,14 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag, expm
 
-from uavctl.flight.controller import Controller, ControlState
+from uavctl.flight.controller import Controller
 from uavctl.flight.fallback import FallbackParameters
 from uavctl.flight.kalman import EstimatorParameters
 from uavctl.flight.limits import LimitsParameters
 from uavctl.flight.link_estimate import LinkEstimateParameters
-from uavctl.flight.mission import Room, hold
-from uavctl.flight.sensor_faults import GateParameters
-from uavctl.flight.step import StepOutput, initial_state, step
+from uavctl.flight.mission import Room, make_hold_mission
+from uavctl.flight.monitors.outliers import GateParameters
+from uavctl.flight.state import ControlState
+from uavctl.flight.tick import TickOutput, make_initial_state
+from uavctl.flight.tick import tick as run_tick
 from uavctl.records import Command, ControlMode, PositionSample, SolveStatus, StepInput, Vec3, VehicleStatus, names_of
 from uavctl.smpc.answer import NOMINAL, Answer, Preview
 from uavctl.smpc.plant import Plant
@@ -134,14 +136,14 @@ def make_controller(
         design_id="stub",
         horizon=horizon,
         solver=solver or StubSolver(plant, horizon),
-        mission=hold(
+        mission=make_hold_mission(
             np.zeros(plant.n_x), plant.position_index, np.zeros(0), horizon=horizon, dt_ns=DT_NS, room=room_of(plant)
         ),
         names=names_of((), plant.n_x, plant.axes, plant.position_index, plant.velocity_index),
         estimator=estimator_parameters(**changes),
         fallback=fallback,
         limits=LimitsParameters(accel_mps2=(2.0, 2.0, 1.5), slew_mps3=100.0),
-        trust=GateParameters(sigma=sigma, margin_m=0.0, jump_ns=500 * MS),
+        position_gate=GateParameters(sigma=sigma, margin_m=0.0, jump_ns=500 * MS),
         link=LinkEstimateParameters(promised=0.5),
         dt_ns=DT_NS,
         tick_ns=TICK_NS,
@@ -233,29 +235,29 @@ def inputs_of(
     return result
 
 
-def run(controller: Controller, inputs: Iterable[StepInput], state: ControlState | None = None) -> list[StepOutput]:
+def run(controller: Controller, inputs: Iterable[StepInput], state: ControlState | None = None) -> list[TickOutput]:
     outputs = []
-    state = initial_state() if state is None else state
+    state = make_initial_state() if state is None else state
     for inp in inputs:
-        state, output = step(state, inp, controller)
+        state, output = run_tick(state, inp, controller)
         outputs.append(output)
     return outputs
 
 
-def boundaries(outputs: list[StepOutput]) -> list[StepOutput]:
+def boundaries(outputs: list[TickOutput]) -> list[TickOutput]:
     return [output for output in outputs if output.decision.boundary]
 
 
-def modes(outputs: list[StepOutput]) -> list[ControlMode]:
+def modes(outputs: list[TickOutput]) -> list[ControlMode]:
     return [output.decision.mode for output in outputs]
 
 
-def flown(outputs: list[StepOutput]) -> list[tuple[int | None, int | None]]:
+def flown(outputs: list[TickOutput]) -> list[tuple[int | None, int | None]]:
     """(plan, index) at each boundary."""
     return [(output.decision.plan_seq, output.decision.plan_index) for output in boundaries(outputs)]
 
 
-def codes(output: StepOutput) -> dict[str, int]:
+def codes(output: TickOutput) -> dict[str, int]:
     return {event.code: event.count for event in output.events}
 
 
@@ -264,7 +266,7 @@ def with_faults(faults: Mapping[int, Fault], axes: tuple[str, ...] = ("north",))
     return make_controller(solver), solver
 
 
-def assert_sound(outputs: list[StepOutput], limits: tuple[float, ...] = (2.0, 2.0, 1.5), slew: float = 5.0) -> None:
+def assert_sound(outputs: list[TickOutput], limits: tuple[float, ...] = (2.0, 2.0, 1.5), slew: float = 5.0) -> None:
     """Every setpoint finite, bounded, slew-limited; every plan used within its horizon."""
     before = (0.0, 0.0, 0.0)
     for output in outputs:

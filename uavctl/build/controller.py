@@ -22,12 +22,12 @@ from uavctl.config.checks import position_limits_m
 from uavctl.config.types import Config
 from uavctl.errors import DesignError
 from uavctl.flight.controller import Controller
-from uavctl.flight.envelope import EnvelopeParameters
 from uavctl.flight.fallback import FallbackParameters
-from uavctl.flight.kalman import EstimatorParameters, make_kalman, settled_cov
+from uavctl.flight.kalman import EstimatorParameters, make_kalman, settle_covariance
 from uavctl.flight.limits import LimitsParameters
 from uavctl.flight.link_estimate import LinkEstimateParameters
-from uavctl.flight.sensor_faults import GateParameters
+from uavctl.flight.monitors.observation import EnvelopeParameters
+from uavctl.flight.monitors.outliers import GateParameters
 from uavctl.records import Vec3
 from uavctl.smpc.answer import Solver
 from uavctl.smpc.conditioned.planner import (
@@ -230,7 +230,7 @@ def _settled(config: Config, plant: Plant) -> NDArray[np.float64]:
     dt_ns = round(plant.dt_s * NANOSECONDS)
     kalman = make_kalman(plant, build_estimator(config), dt_ns)
     dead_ns = round(config.plant.dead_time_s * NANOSECONDS)
-    return settled_cov(kalman, dt_ns, round(_position_age_s(config) * NANOSECONDS), dead_ns)
+    return settle_covariance(kalman, dt_ns, round(_position_age_s(config) * NANOSECONDS), dead_ns)
 
 
 def design_of(config: Config) -> AnyDesign:
@@ -404,7 +404,7 @@ def build_controller(config: Config, design: AnyDesign | None = None) -> Control
             recover_samples=fallback.recover_samples,
         ),
         limits=LimitsParameters(accel_mps2=limits.accel_mps2, slew_mps3=limits.slew_mps3),
-        trust=GateParameters(
+        position_gate=GateParameters(
             sigma=estimator.gate_sigma,
             margin_m=estimator.gate_m,
             jump_ns=round(fallback.jump_s * NANOSECONDS),

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from uavctl.config.mission import FenceConfig, TrajectoryConfig
 from uavctl.config.types import Config
 from uavctl.errors import DesignError
-from uavctl.flight.mission import Fence, Mission, PlantMotion, Room, Trajectory, Waypoint, along, follow, hold, room
+from uavctl.flight.mission import Fence, Mission, Room, Trajectory, Waypoint, make_hold_mission
+from uavctl.flight.trajectory import PlantMotion, follow_positions, make_room, plan_along
 from uavctl.records import Names, names_of
 from uavctl.smpc.conditioned.planner import AnyDesign
 from uavctl.smpc.plant import Plant
@@ -37,7 +38,7 @@ def build_mission(config: Config, design: AnyDesign, rests: Array) -> Mission:
         DesignError: The plant cannot rest or move there, or a fence limits what has no limit.
     """
     given, plant = config.mission, design.plant
-    mission = hold(
+    mission = make_hold_mission(
         design.target,
         plant.position_index,
         design.state_set.b,
@@ -81,10 +82,10 @@ def build_trajectory(given: TrajectoryConfig, design: AnyDesign, rests: Array, d
         DesignError: The motion leaves the state limits.
     """
     positions, velocities = wanted_positions(given, design, dead_s)
-    motion = follow(design.plant, positions, velocities)
+    motion = follow_positions(design.plant, positions, velocities)
     _check_limits(motion, design)
     places = resting_places(design.plant, design.state_set, rests)
-    return along(design.plant, motion, design.horizon, design.settles, *places)
+    return plan_along(design.plant, motion, design.horizon, design.settles, *places)
 
 
 def wanted_positions(given: TrajectoryConfig, design: AnyDesign, dead_s: float) -> tuple[Array, Array | None]:
@@ -126,7 +127,7 @@ def build_rests(design: Design) -> Array:
 def _resting(design: AnyDesign, rests: Array) -> Room | None:
     try:
         places = resting_places(design.plant, design.state_set, rests)
-        return room(design.plant, design.settles, *places)
+        return make_room(design.plant, design.settles, *places)
     except DesignError:
         return None
 

@@ -20,7 +20,7 @@ from uavctl.build.controller import build_plant, start_state
 from uavctl.build.mission import wanted_positions
 from uavctl.config.types import Config
 from uavctl.flight.controller import Controller
-from uavctl.flight.mission import Mission, advance, ask_for
+from uavctl.flight.mission import Mission, advance_mission, make_question
 from uavctl.records import Vector
 from uavctl.smpc.answer import Preview
 from uavctl.smpc.conditioned.planner import ConditionedDesign
@@ -151,8 +151,8 @@ def _fly(
     worst, ahead_s, relaxed = ("", "", 0.0), 0.0, 0
     passed: list[Array] = []
     for k in range(steps):
-        state = advance(mission, state, _vector(x), k * dt_ns)
-        target, outlook = ask_for(mission, state, k * dt_ns)
+        state = advance_mission(mission, state, _vector(x), k * dt_ns)
+        target, outlook = make_question(mission, state, k * dt_ns)
         late = int(lates[k])
         ahead = Preview(limits=outlook.limits, path=outlook.path, late=late, cov=design.estimate_cov, sent=sent)
         answer = design.solver.solve(k, x, target, ahead)

@@ -12,7 +12,7 @@ from uavctl.check.findings import Heard, Item, ItemState, Sample, item, judged
 from uavctl.config.checks import position_limits_m
 from uavctl.config.connections import camera_scheme
 from uavctl.config.types import Config
-from uavctl.flight.link_estimate import loss_std
+from uavctl.flight.link_estimate import compute_loss_std
 from uavctl.records import Vec3
 from uavctl.smpc.plant import AXES
 
@@ -156,7 +156,7 @@ def _loss(captured_s: list[float], config: Config) -> Item:
     # Three standard deviations: a right set-up is refused once in seven hundred checks (with two, once in forty).
     # Losses in bursts vary more than that.
     alone = math.sqrt(max(expected * (1.0 - expected), 0.25 / count) / count)
-    in_runs = loss_std(np.diff(np.unique(steps)) - 1)
+    in_runs = compute_loss_std(np.diff(np.unique(steps)) - 1)
     surely = loss - 3.0 * max(alone, in_runs)
     hint = "design for the loss that is there (link.loss, link.model), or better the link"
     if surely <= expected < loss:

@@ -17,7 +17,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from uavctl.check.findings import Heard, Item, ItemState, item, judged
 from uavctl.config.checks import position_limits_m
 from uavctl.config.types import Config
-from uavctl.flight.envelope import MOTION_NS
+from uavctl.flight.monitors.observation import MOTION_NS
 from uavctl.mavlink.clocksync import NEAR_NS, RoundTrips
 from uavctl.mavlink.vehicle import SECOND_VEHICLE
 from uavctl.smpc.plant import AXES

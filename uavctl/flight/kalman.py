@@ -1,114 +1,39 @@
 """Kalman filter in continuous time over a piecewise constant disturbance: the Gaussian part, without a memory.
 
-Between two boundaries of the Δt grid the disturbance w is one draw of N(0, W); it is redrawn at each boundary. So
-the filter carries z = (x, w) with the covariance of both, and at a boundary forgets w: mean 0, covariance W,
-uncorrelated with x. With u piecewise constant this is exact at any instant.
-
-Where a bias of the input is estimated, x is (x, d) of the larger plant (`uavctl.smpc.estimate`). While others fly
-the vehicle, what accelerates it is no bias: d is drawn anew at each boundary, with the variance that it begins with.
-
-Where the vehicle's inertial data are used, x is (x, d, b): they show the acceleration of each axis plus b, which
-comes and goes slowly: a bias of the sensors, and an attitude that is not quite level.
+1. State z = (x, w). The disturbance w is one draw of N(0, W) in each interval of the Δt grid.
+2. Prediction to any instant is exact, as the input u is piecewise constant. At a boundary of the grid w is drawn anew:
+   mean 0, covariance W, independent of x.
+3. Where a bias d of the input is estimated, x is (x, d) of the larger plant (`uavctl.smpc.estimate`). While others fly
+   the vehicle, what accelerates it is no bias: d is drawn anew at each boundary, from its initial distribution.
+4. Where the vehicle's inertial data are used, x is (x, d, b). They show the acceleration of each axis plus b, which
+   comes and goes slowly: a bias of the sensors, and an attitude that is not quite level.
+5. Each update first asks whether inertial data may be used (`uavctl.flight.monitors.inertial`).
 """
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import msgspec
 import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.flight.limits import AXES
+from uavctl.flight.monitors import inertial
+from uavctl.flight.monitors.inertial import UNUSED, InertialObservation, InertialTrust, Source
+from uavctl.flight.propagation import Propagation, make_propagation
 from uavctl.records import PositionSample, Vec3
 from uavctl.smpc.estimate import at_once, with_bias, with_wander
 from uavctl.smpc.plant import Plant
 
-# Exact propagation of state and disturbance over any part of a Δt interval, fast enough for every tick.
-
-
-Array = NDArray[np.float64]
-
-# exp(G Δt s) is entire in s: this many Chebyshev terms on [0, 1] reach rounding for any plant whose
-# fastest time constant is above a twentieth of Δt.
-_TERMS = 32
-_MOST_PARTS = 64
-
-
-@dataclass(frozen=True, eq=False)
-class Propagation:
-    """z(t + dt) = F(dt) z(t) + G(dt) u for z = (x, w), u and w held; 0 < dt <= Δt."""
-
-    dt_ns: int  # δt [ns]
-    whole: Array  # F and G side by side over Δt (n_x + n_w, n_x + n_w + n_u)
-    series: Array  # chebyshev coefficients of the same in 2 dt/Δt - 1 (terms, its entries)
-    # F and G of the first spans that were asked for: the ticks' own, which come again and again
-    parts: dict[int, tuple[Array, Array]] = field(default_factory=dict, repr=False)
-
-    def over(self, dt_ns: int) -> tuple[Array, Array]:
-        """(F, G) over `dt_ns`, 0 < dt_ns <= Δt; each by itself in memory, as products want it."""
-        known = self.parts.get(dt_ns)
-        if known is None:
-            known = self._part(dt_ns)
-            if len(self.parts) < _MOST_PARTS:
-                self.parts[dt_ns] = known
-        return known
-
-    def _part(self, dt_ns: int) -> tuple[Array, Array]:
-        if dt_ns == self.dt_ns:
-            joint = self.whole
-        else:
-            angle = math.acos(2.0 * dt_ns / self.dt_ns - 1.0)
-            joint = (np.cos(angle * _ORDERS) @ self.series).reshape(self.whole.shape)
-        n_z = joint.shape[0]
-        part = joint[:, :n_z].copy(), joint[:, n_z:].copy()
-        for array in part:
-            array.flags.writeable = False
-        return part
-
-
-_ORDERS = np.arange(_TERMS, dtype=np.float64)
-
-
-def make_propagation(plant: Plant, dt_ns: int) -> Propagation:
-    """Sample `plant.transition` at the Chebyshev nodes of (0, Δt) and fit the series.
-
-    `plant.transition` takes a matrix exponential each time; a tick cannot afford that.
-    """
-    angles = (np.arange(_TERMS) + 0.5) * math.pi / _TERMS
-    samples = np.array([_joint(plant, plant.dt_s * 0.5 * (1.0 + math.cos(angle))).ravel() for angle in angles])
-    series = 2.0 / _TERMS * np.cos(np.outer(_ORDERS, angles)) @ samples
-    series[0] *= 0.5
-    whole = _joint(plant, plant.dt_s)
-    for array in (series, whole):
-        array.flags.writeable = False
-    return Propagation(dt_ns=dt_ns, whole=whole, series=series)
-
-
-def _joint(plant: Plant, dt_s: float) -> Array:
-    """[[A, E, B], [0, I, 0]] over dt_s."""
-    a, b, e = plant.transition(dt_s)
-    n_w = plant.n_w
-    return np.block([[a, e, b], [np.zeros((n_w, plant.n_x)), np.eye(n_w), np.zeros((n_w, plant.n_u))]])
-
-
-# Inertial data further from the prediction than this many standard deviations, in any axis, are not believed: twenty
-# come in a second, so one that is left out for nothing costs next to nothing.
-FELT_SIGMA = 3.0
-# So many of them in a row, or a position so far from where they carried the estimate (squared distance by covariance,
-# three axes: chance 1e-8), and they are doubted, until positions agree again and for this time at least.
-REFUSED, CONTRADICTED = 3, 40.0
-DOUBTED_NS = 3_000_000_000
-AGREES_NS = 1_000_000_000  # after the position before, a position that agrees says something
-# A bias that may drift fast is what inertial data show. Positions alone show it late and with their noise and the
-# model's errors in it: in a silence a vehicle that said nothing itself was flown 6 m out against a wind that was none.
-# So it drifts a tenth as fast while no inertial data are used, and from so long after the newest ones on.
-UNFELT_DRIFT, UNFELT_NS = 0.1, 1_000_000_000
-# The first ones are not refused for a bias that nobody can know yet: a flight that begins in wind would doubt them.
-SETTLES_NS = 40_000_000_000  # in which covariances settle
-RELEARNT_MPS = 0.2  # standard deviation of a velocity that doubted data may have left behind
+# Only inertial data show a bias that drifts fast. Positions alone show it late, with their noise and the model's
+# errors in it: in a silence this flew a vehicle 6 m out, against a wind that was none. So the bias drifts a tenth as
+# fast while no inertial data are used, and from this long after the newest ones on.
+DRIFT_WITHOUT_INERTIAL, INERTIAL_LASTS_NS = 0.1, 1_000_000_000
+SETTLES_NS = 40_000_000_000  # time in which covariances settle
+RELEARN_STD_MPS = 0.2  # standard deviation of a velocity error that inertial data may have left behind
 
 
 @dataclass(frozen=True)
@@ -139,18 +64,18 @@ class Kalman:
 
     propagation: Propagation  # F and G of z = (x, w)
     w: Array  # covariance W (n_w, n_w)
-    unfelt_w: Array  # the same while the filter could use inertial data and has none (n_w, n_w)
+    w_without_inertial: Array  # the same while the filter could use inertial data and has none (n_w, n_w)
     n_x: int  # number of states: the plant's, the biases, and what inertial data are off
     n_u: int  # number of inputs
     n_bias: int  # number of biases, behind the plant's states: n_u, or 0 where none is estimated
-    n_felt: int  # number of axes of inertial data, the last of the states: 0 where they are not used
+    n_inertial: int  # number of axes of inertial data, the last of the states: 0 where they are not used
     axes: tuple[int, ...]  # index (0 north, 1 east, 2 down) of each axis that the plant has
-    shown: NDArray[np.intp]  # state index of each axis' position, then of each axis' velocity
+    measured_index: NDArray[np.intp]  # state index of each axis' position, then of each axis' velocity
     parameters: EstimatorParameters  # noise and window
-    felt_z: Array  # measurement matrix of inertial data for z (n_felt, n_x + n_w)
-    felt_u: Array  # the same for the input (n_felt, n_u)
-    felt_noise: Array  # covariance of their noise (n_felt, n_felt)
-    pushed: Array  # covariance that a push of bias_max in each input's bias gives z at once (n_x + n_w, n_x + n_w)
+    inertial_z: Array  # measurement matrix of inertial data for z (n_inertial, n_x + n_w)
+    inertial_u: Array  # the same for the input (n_inertial, n_u)
+    inertial_noise: Array  # covariance of their noise (n_inertial, n_inertial)
+    push_cov: Array  # covariance that a push of bias_max in each input's bias gives z at once (n_x + n_w, n_x + n_w)
     identity: Array  # of the size of z
 
     @property
@@ -161,7 +86,7 @@ class Kalman:
     @property
     def bias(self) -> slice:
         """Slice of the biases among the states."""
-        return slice(self.n_x - self.n_felt - self.n_bias, self.n_x - self.n_felt)
+        return slice(self.n_x - self.n_inertial - self.n_bias, self.n_x - self.n_inertial)
 
 
 class Belief(msgspec.Struct, frozen=True, eq=False):
@@ -171,52 +96,58 @@ class Belief(msgspec.Struct, frozen=True, eq=False):
     captured_ns: int  # capture time of the newest sample in it [ns]
     mean: Array  # (n_x + n_w,)
     cov: Array  # (n_x + n_w, n_x + n_w)
-    felt_ns: int | None = None  # time of the newest inertial data in it [ns]; None without any
-    refused: int = 0  # inertial data in a row that were not believed
-    doubted_ns: int | None = None  # since when inertial data are doubted, and not used [ns]; None where they are not
+    inertial: InertialTrust = UNUSED  # whether inertial data are used
 
 
 def make_kalman(plant: Plant, parameters: EstimatorParameters, dt_ns: int) -> Kalman:
-    """The filter of a plant, with `dt_ns` the integer Δt of the grid [ns]."""
-    n_bias, feels = plant.n_u if parameters.bias_drift else 0, parameters.inertial_std_mps2 > 0.0
-    seen = with_bias(plant, parameters.bias_drift, force=feels) if n_bias else plant
-    n_felt = len(plant.axes) if feels else 0
-    if n_felt:
-        seen = with_wander(seen, np.full(n_felt, parameters.inertial_bias_mps2), parameters.inertial_bias_s)
-    # An acceleration is the slope of a velocity: z is (x, w), and w is held between boundaries.
-    slopes = seen.generator[list(plant.velocity_index)] if feels else np.zeros((0, seen.n_x + seen.n_u + seen.n_w))
-    felt_z = np.delete(slopes, slice(seen.n_x, seen.n_x + seen.n_u), axis=1)
-    felt_z[:, seen.n_x - n_felt : seen.n_x] += np.eye(n_felt)
-    n_z = seen.n_x + seen.n_w
-    push = np.zeros((n_z, n_bias))
-    if n_bias and n_felt:
+    """Make the filter of a plant, with `dt_ns` the integer Δt of the grid [ns]."""
+    n_bias, uses_inertial = plant.n_u if parameters.bias_drift else 0, parameters.inertial_std_mps2 > 0.0
+    model = with_bias(plant, parameters.bias_drift, force=uses_inertial) if n_bias else plant
+    n_inertial = len(plant.axes) if uses_inertial else 0
+    if n_inertial:
+        model = with_wander(model, np.full(n_inertial, parameters.inertial_bias_mps2), parameters.inertial_bias_s)
+    inertial_z, inertial_u = _make_inertial_model(plant, model, n_inertial)
+    push = np.zeros((model.n_x + model.n_w, n_bias))
+    if n_bias and n_inertial:
         push[: plant.n_x] = at_once(plant)
         push[plant.n_x : plant.n_x + n_bias] = np.eye(n_bias)
-    unfelt_w = seen.w.copy()
-    if n_felt and n_bias:
+    w_without_inertial = model.w.copy()
+    if n_inertial and n_bias:
         drift = slice(plant.n_w, plant.n_w + n_bias)
-        unfelt_w[drift, drift] *= UNFELT_DRIFT**2
+        w_without_inertial[drift, drift] *= DRIFT_WITHOUT_INERTIAL**2
     return Kalman(
-        propagation=make_propagation(seen, dt_ns),
-        w=seen.w,
-        unfelt_w=unfelt_w,
-        n_x=seen.n_x,
+        propagation=make_propagation(model, dt_ns),
+        w=model.w,
+        w_without_inertial=w_without_inertial,
+        n_x=model.n_x,
         n_u=plant.n_u,
         n_bias=n_bias,
-        n_felt=n_felt,
+        n_inertial=n_inertial,
         axes=tuple(AXES.index(axis) for axis in plant.axes),
-        shown=np.array(plant.position_index + plant.velocity_index, dtype=np.intp),
+        measured_index=np.array(plant.position_index + plant.velocity_index, dtype=np.intp),
         parameters=parameters,
-        felt_z=felt_z,
-        felt_u=slopes[:, seen.n_x : seen.n_x + seen.n_u],
-        felt_noise=np.eye(n_felt) * parameters.inertial_std_mps2**2,
-        pushed=parameters.bias_max**2 * push @ push.T,
-        identity=np.eye(n_z),
+        inertial_z=inertial_z,
+        inertial_u=inertial_u,
+        inertial_noise=np.eye(n_inertial) * parameters.inertial_std_mps2**2,
+        push_cov=parameters.bias_max**2 * push @ push.T,
+        identity=np.eye(model.n_x + model.n_w),
     )
 
 
-def settled_cov(kalman: Kalman, dt_ns: int, age_ns: int, dead_ns: int) -> Array:
-    """Covariance (n, n) of states and biases that a filter settles at, with a position and inertial data in every step.
+def _make_inertial_model(plant: Plant, model: Plant, n_inertial: int) -> tuple[Array, Array]:
+    """Make the measurement matrices of inertial data for z = (x, w) and for the input."""
+    n_x, n_u = model.n_x, model.n_u
+    # a = v' = M_z z + M_u u + b: the rows of the velocities in the generator, and the sensors' own bias b
+    slopes = model.generator[list(plant.velocity_index)] if n_inertial else np.zeros((0, n_x + n_u + model.n_w))
+    of_z = np.delete(slopes, slice(n_x, n_x + n_u), axis=1)
+    of_z[:, n_x - n_inertial : n_x] += np.eye(n_inertial)
+    return of_z, slopes[:, n_x : n_x + n_u]
+
+
+def settle_covariance(kalman: Kalman, dt_ns: int, age_ns: int, dead_ns: int) -> Array:
+    """Compute the covariance (n, n) at which a filter settles, with a position and inertial data in every step.
+
+    It is that of the states and, behind them, of the biases.
 
     Args:
         dt_ns: Δt [ns].
@@ -229,25 +160,25 @@ def settled_cov(kalman: Kalman, dt_ns: int, age_ns: int, dead_ns: int) -> Array:
             captured_ns=at_ns, received_ns=at_ns, position_m=(0.0, 0.0, 0.0), std_m=0.0, source="", seq=0
         )
 
-    still, belief = np.zeros(kalman.n_u), first_belief(kalman, position(0))
+    still, belief = np.zeros(kalman.n_u), make_first_belief(kalman, position(0))
     n, steps = kalman.bias.stop, SETTLES_NS // dt_ns
     for end_ns in range(dt_ns, (steps + 1) * dt_ns, dt_ns):
         at_ns = end_ns - age_ns
-        belief = predicted(kalman, 0, belief, still, at_ns)
-        belief = updated(kalman, belief, position(at_ns))
-        belief = predicted(kalman, 0, belief, still, end_ns)
-        if kalman.n_felt:
-            belief = felt(kalman, belief, kalman.felt_z.dot(belief.mean), still)
-    return predicted(kalman, 0, belief, still, steps * dt_ns + dead_ns).cov[:n, :n]
+        belief = predict(kalman, 0, belief, still, at_ns)
+        belief = update_with_position(kalman, belief, position(at_ns))
+        belief = predict(kalman, 0, belief, still, end_ns)
+        if kalman.n_inertial:
+            belief = update_with_inertial(kalman, belief, kalman.inertial_z.dot(belief.mean), still)
+    return predict(kalman, 0, belief, still, steps * dt_ns + dead_ns).cov[:n, :n]
 
 
-def captured_ns(sample: PositionSample) -> int:
-    """Capture time that counts: never after the arrival, where a clock offset's error may put the stamp."""
+def read_capture_ns(sample: PositionSample) -> int:
+    """Return the capture time that counts: never after the arrival, where a clock offset's error may put the stamp."""
     return min(sample.captured_ns, sample.received_ns)
 
 
-def predicted(kalman: Kalman, origin_ns: int, belief: Belief, u: Array | None, at_ns: int) -> Belief:
-    """The belief at `at_ns`; the grid's boundaries cut the way at the same places whatever came in.
+def predict(kalman: Kalman, origin_ns: int, belief: Belief, u: Array | None, at_ns: int) -> Belief:
+    """Predict a belief for `at_ns`. The grid's boundaries cut the time at the same places whatever came in.
 
     Args:
         origin_ns: A boundary of the grid [ns].
@@ -263,99 +194,112 @@ def predicted(kalman: Kalman, origin_ns: int, belief: Belief, u: Array | None, a
         boundary_ns = now_ns - (now_ns - origin_ns) % propagation.dt_ns + propagation.dt_ns
         stop_ns = min(at_ns, boundary_ns)
         f, g = propagation.over(stop_ns - now_ns)
+        # z = F z + G u
         mean = f.dot(mean)
         mean += g.dot(acting)
+        # P = F P F'
         cov = _symmetric(f.dot(cov).dot(f.T))
         if stop_ns == boundary_ns:
+            # w ~ N(0, W), independent of x
             mean[n_x:] = 0.0
             cov[:n_x, n_x:] = 0.0
             cov[n_x:, :n_x] = 0.0
-            cov[n_x:, n_x:] = kalman.w if _feels(belief, stop_ns) else kalman.unfelt_w
+            cov[n_x:, n_x:] = kalman.w if _uses_inertial(belief.inertial, stop_ns) else kalman.w_without_inertial
             if u is None and kalman.n_bias:
-                _forget_bias(kalman, mean, cov)
+                _reset_bias(kalman, mean, cov)
         now_ns = stop_ns
     return replace(belief, at_ns=now_ns, mean=mean, cov=cov)
 
 
-def _feels(belief: Belief, at_ns: int) -> bool:
+def _uses_inertial(trust: InertialTrust, at_ns: int) -> bool:
     """Whether inertial data are used at a time."""
-    return belief.doubted_ns is None and belief.felt_ns is not None and at_ns - belief.felt_ns <= UNFELT_NS
+    is_recent = trust.used_ns is not None and at_ns - trust.used_ns <= INERTIAL_LASTS_NS
+    return is_recent and trust.distrusted_ns is None
 
 
-def _forget_bias(kalman: Kalman, mean: Array, cov: Array) -> None:
-    """Put the biases of a belief back to what they begin with, in place."""
+def _reset_bias(kalman: Kalman, mean: Array, cov: Array) -> None:
+    """Set the biases of a belief to their initial distribution, in place."""
     bias = kalman.bias
     mean[bias] = 0.0
+    # d ~ N(0, (d_max / 4)²), independent of all else
     cov[bias] = 0.0
     cov[:, bias] = 0.0
     cov[bias, bias] = np.eye(kalman.n_bias) * (0.25 * kalman.parameters.bias_max) ** 2
 
 
-def first_belief(kalman: Kalman, sample: PositionSample) -> Belief:
-    """The belief after the first sample: what it shows, and zero for what it does not."""
+def make_first_belief(kalman: Kalman, sample: PositionSample) -> Belief:
+    """Make the belief after the first sample: its values, and zero for all that it does not show."""
     n_x, n_w = kalman.n_x, kalman.w.shape[0]
-    values, variances = shown_by(kalman, sample)
-    index = kalman.shown[: len(values)]
+    values, variances = read_measurement(kalman, sample)
+    index = kalman.measured_index[: len(values)]
     mean = np.zeros(n_x + n_w)
     mean[index] = values
     diagonal = np.full(n_x, kalman.parameters.initial_std**2)
     diagonal[index] = variances
     cov = np.zeros((n_x + n_w, n_x + n_w))
     cov[:n_x, :n_x] = np.diag(diagonal)
-    cov[n_x:, n_x:] = kalman.unfelt_w
+    cov[n_x:, n_x:] = kalman.w_without_inertial
     if kalman.n_bias:
-        _forget_bias(kalman, mean, cov)
-    if kalman.n_felt:
-        felt = slice(n_x - kalman.n_felt, n_x)
-        cov[felt, felt] = np.eye(kalman.n_felt) * kalman.parameters.inertial_bias_mps2**2
-    at_ns = captured_ns(sample)
+        _reset_bias(kalman, mean, cov)
+    if kalman.n_inertial:
+        sensor_bias = slice(n_x - kalman.n_inertial, n_x)
+        cov[sensor_bias, sensor_bias] = np.eye(kalman.n_inertial) * kalman.parameters.inertial_bias_mps2**2
+    at_ns = read_capture_ns(sample)
     return Belief(at_ns=at_ns, captured_ns=at_ns, mean=mean, cov=cov)
 
 
-def updated(kalman: Kalman, belief: Belief, sample: PositionSample) -> Belief:
-    """Kalman update; the covariance in Joseph's form, which stays symmetric and positive semidefinite."""
-    values, variances = shown_by(kalman, sample)
-    index = kalman.shown[: len(values)]
+def update_with_position(kalman: Kalman, belief: Belief, sample: PositionSample) -> Belief:
+    """Update a belief with a sample. Joseph's form keeps the covariance symmetric and positive semidefinite."""
+    values, variances = read_measurement(kalman, sample)
+    index = kalman.measured_index[: len(values)]
     noise = kalman.identity[: len(values), : len(values)] * variances
-    if kalman.n_felt:
-        belief = _confronted(kalman, belief, values, variances)
+    if kalman.n_inertial:
+        belief = _judge_inertial(kalman, belief, values, variances)
+    # P H'
     ph = belief.cov[:, index]
+    # K = P H' (H P H' + R)⁻¹
     gain = np.linalg.solve(ph[index] + noise, ph.T).T
+    # I - K H
     keep = kalman.identity.copy()
     keep[:, index] -= gain
-    return replace(
-        belief,
-        captured_ns=captured_ns(sample),
+    return Belief(
+        at_ns=belief.at_ns,
+        captured_ns=read_capture_ns(sample),
+        # z = z + K (y - H z)
         mean=belief.mean + gain.dot(values - belief.mean[index]),
+        # P = (I - K H) P (I - K H)' + K R K'
         cov=_symmetric(keep.dot(belief.cov).dot(keep.T) + gain.dot(noise).dot(gain.T)),
+        inertial=belief.inertial,
     )
 
 
-def contradicted(kalman: Kalman, belief: Belief, values: Array, variances: Array) -> bool:
-    """Whether the squared distance of what a sample shows from what is believed, by its covariance, is too large."""
-    index = kalman.shown[: len(values)]
-    off = values - belief.mean[index]
-    # By the sample's own noise alone it is larger yet: where even that is well within, nothing has to be solved.
-    if float(off.dot(off)) <= 0.9 * CONTRADICTED * float(variances.min()):
-        return False
+def is_consistent(kalman: Kalman, belief: Belief, values: Array, variances: Array) -> bool:
+    """Whether a sample's squared distance from a belief, by its covariance, is no larger than chance makes it."""
+    index = kalman.measured_index[: len(values)]
+    innovation = values - belief.mean[index]
+    # ν' S⁻¹ ν ≤ ν' ν / min R: where even that is well within, nothing has to be solved.
+    if float(innovation.dot(innovation)) <= 0.9 * inertial.MOST_CHI2 * float(variances.min()):
+        return True
     noise = kalman.identity[: len(values), : len(values)] * variances
-    return float(off @ np.linalg.solve(belief.cov[np.ix_(index, index)] + noise, off)) > CONTRADICTED
+    # χ² = ν' (H P H' + R)⁻¹ ν
+    chi2 = float(innovation @ np.linalg.solve(belief.cov[np.ix_(index, index)] + noise, innovation))
+    return inertial.is_consistent(chi2)
 
 
-def _confronted(kalman: Kalman, belief: Belief, values: Array, variances: Array) -> Belief:
-    """The belief before an update, with its inertial data doubted, or not any more, by what a sample shows."""
-    off = contradicted(kalman, belief, values, variances)
-    if belief.doubted_ns is not None:
-        knows = belief.at_ns - belief.captured_ns <= AGREES_NS  # with whatever came, nearly all agrees after a silence
-        ended = knows and not off and belief.at_ns - belief.doubted_ns >= DOUBTED_NS
-        return replace(belief, refused=0, doubted_ns=None) if ended else belief
-    if not off or belief.felt_ns is None or belief.felt_ns <= belief.captured_ns:
+def _judge_inertial(kalman: Kalman, belief: Belief, values: Array, variances: Array) -> Belief:
+    """Compare a belief with a sample: inertial data are distrusted, or are not any more."""
+    consistent = is_consistent(kalman, belief, values, variances)
+    observation = InertialObservation(Source.POSITION, consistent, belief.at_ns, belief.captured_ns)
+    trust, verdict = inertial.update(belief.inertial, observation)
+    if trust is belief.inertial:
         return belief
+    if verdict.is_none:
+        return replace(belief, inertial=trust)
     cov = belief.cov.copy()
-    _widen(cov, kalman.shown[len(kalman.axes) :], RELEARNT_MPS**2)
+    _widen(cov, kalman.measured_index[len(kalman.axes) :], RELEARN_STD_MPS**2)
     if kalman.n_bias:
         _widen(cov, np.arange(kalman.bias.start, kalman.bias.stop), (0.25 * kalman.parameters.bias_max) ** 2)
-    return replace(belief, cov=cov, doubted_ns=belief.at_ns)
+    return replace(belief, cov=cov, inertial=trust)
 
 
 def _widen(cov: Array, index: NDArray[np.intp], variance: float) -> None:
@@ -363,54 +307,64 @@ def _widen(cov: Array, index: NDArray[np.intp], variance: float) -> None:
     cov[index, index] += variance
 
 
-def felt(kalman: Kalman, belief: Belief, accel_mps2: Array, u: Array | None) -> Belief:
-    """Kalman update with an acceleration (n_felt,) under an input (n_u,); left out where it is implausible.
+def update_with_inertial(kalman: Kalman, belief: Belief, accel_mps2: Array, u: Array | None) -> Belief:
+    """Update a belief with an acceleration (n_inertial,) under an input (n_u,). An implausible one is left out.
 
     Raises:
         ValueError: The filter uses no inertial data.
     """
-    if not kalman.n_felt:
+    if not kalman.n_inertial:
         raise ValueError("this filter uses no inertial data")
-    if belief.doubted_ns is not None:
+    if belief.inertial.distrusted_ns is not None:
         return belief
-    of_z, noise, cov = kalman.felt_z, kalman.felt_noise, belief.cov
-    if belief.felt_ns is None and kalman.n_bias:
-        cov = cov + kalman.pushed
-    off = accel_mps2 - of_z.dot(belief.mean)
+    of_z, noise, cov = kalman.inertial_z, kalman.inertial_noise, belief.cov
+    if belief.inertial.used_ns is None and kalman.n_bias:
+        # The first reading is not refused for a bias that nobody can know yet: a flight may begin in wind.
+        cov = cov + kalman.push_cov
+    # ν = a - M_z z - M_u u
+    innovation = accel_mps2 - of_z.dot(belief.mean)
     if u is not None:
-        off -= kalman.felt_u.dot(u)
+        innovation -= kalman.inertial_u.dot(u)
+    # S = M_z P M_z' + R
     ph = cov.dot(of_z.T)
-    shown = of_z.dot(ph) + noise
-    if not bool((np.square(off) <= FELT_SIGMA**2 * np.diagonal(shown)).all()):
-        refused = belief.refused + 1
-        return replace(belief, refused=refused, doubted_ns=belief.at_ns if refused >= REFUSED else None)
-    gain = np.linalg.solve(shown, ph.T).T
+    spread = of_z.dot(ph) + noise
+    plausible = inertial.is_plausible(innovation, np.diagonal(spread))
+    observation = InertialObservation(Source.MODEL, plausible, belief.at_ns, belief.captured_ns)
+    trust, _ = inertial.update(belief.inertial, observation)
+    if not plausible:
+        return replace(belief, inertial=trust)
+    # K = P M_z' S⁻¹
+    gain = np.linalg.solve(spread, ph.T).T
+    # I - K M_z
     keep = kalman.identity - gain.dot(of_z)
-    return replace(
-        belief,
-        mean=belief.mean + gain.dot(off),
+    return Belief(
+        at_ns=belief.at_ns,
+        captured_ns=belief.captured_ns,
+        # z = z + K ν
+        mean=belief.mean + gain.dot(innovation),
+        # P = (I - K M_z) P (I - K M_z)' + K R K'
         cov=_symmetric(keep.dot(cov).dot(keep.T) + gain.dot(noise).dot(gain.T)),
-        felt_ns=belief.at_ns,
-        refused=0,
+        inertial=trust,
     )
 
 
-def shown_by(kalman: Kalman, sample: PositionSample) -> tuple[Array, Array]:
-    """Values that a sample shows (positions, then velocities if it has them) and their variances."""
+def read_measurement(kalman: Kalman, sample: PositionSample) -> tuple[Array, Array]:
+    """Return the values of a sample (positions, then velocities if it has them) and their variances."""
     parameters, axes = kalman.parameters, kalman.axes
-    values = _of_axes(sample.position_m, axes)
+    values = _select_axes(sample.position_m, axes)
     variances = [max(sample.std_m, parameters.position_std_m) ** 2] * len(axes)
     if sample.velocity_mps is not None:
-        values += _of_axes(sample.velocity_mps, axes)
+        values += _select_axes(sample.velocity_mps, axes)
         variances += [parameters.velocity_std_mps**2] * len(axes)
     return np.array(values), np.array(variances)
 
 
-def _of_axes(vector: Vec3, axes: tuple[int, ...]) -> list[float]:
+def _select_axes(vector: Vec3, axes: tuple[int, ...]) -> list[float]:
     return [vector[axis] for axis in axes]
 
 
 def _symmetric(matrix: Array) -> Array:
+    # (A + A') / 2
     both: Array = matrix + matrix.T
     both *= 0.5
     return both

@@ -20,7 +20,9 @@ class LimitsParameters:
     slew_mps3: float  # largest change in a second, each axis [m/s³]
 
 
-def gate(want_mps2: Vec3, previous_mps2: Vec3, tick_s: float, limits: LimitsParameters) -> tuple[Vec3, tuple[str, ...]]:
+def limit_setpoint(
+    want_mps2: Vec3, previous_mps2: Vec3, tick_s: float, limits: LimitsParameters
+) -> tuple[Vec3, tuple[str, ...]]:
     """Make any acceleration safe to send.
 
     Args:

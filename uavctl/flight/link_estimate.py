@@ -1,7 +1,9 @@
-"""The link as it shows in flight: did a step's news come in time? Pure; one observation each Δt boundary.
+"""Estimate of the link in flight: did a position of each step come in time?
 
-An observation is what p(k) is the probability of: at least one position captured in the Δt that ends at the boundary
-is there at the boundary. All counts are forgotten exponentially, so the estimate follows a link that drifts.
+1. At each Δt boundary one step is counted: at least one position captured in the Δt that ends there has come, or none.
+   Its probability is p(k) of the design.
+2. Old counts are forgotten exponentially, so the estimate follows a link that drifts.
+3. Losses in bursts say less than independent ones. The counts are reduced to those of independent steps.
 """
 
 from __future__ import annotations
@@ -43,10 +45,10 @@ class LinkBelief(msgspec.Struct, frozen=True):
     last: bool | None = None  # whether the last step had news; None before the first one
 
 
-NOTHING_SEEN = LinkBelief()
+NO_COUNTS = LinkBelief()
 
 
-def observe(belief: LinkBelief, arrived: bool, parameters: LinkEstimateParameters) -> LinkBelief:
+def count_step(belief: LinkBelief, arrived: bool, parameters: LinkEstimateParameters) -> LinkBelief:
     """Take the observation of one boundary.
 
     Args:
@@ -67,7 +69,7 @@ def observe(belief: LinkBelief, arrived: bool, parameters: LinkEstimateParameter
     )
 
 
-def report(belief: LinkBelief, parameters: LinkEstimateParameters, at_ns: int) -> LinkEstimate:
+def estimate_link(belief: LinkBelief, parameters: LinkEstimateParameters, at_ns: int) -> LinkEstimate:
     """Return the link estimate at `at_ns`.
 
     The mean is that of Jeffreys' prior, Beta(½, ½), and the counts' posterior, whose quantiles hold their level on
@@ -78,7 +80,7 @@ def report(belief: LinkBelief, parameters: LinkEstimateParameters, at_ns: int) -
     independent ones, by (1 - r) / (1 + r) with r the correlation of a step with the next (the variance of the mean
     of a two-state chain).
     """
-    statistic = burst_statistic(belief)
+    statistic = compute_burst_statistic(belief)
     bursts = statistic > -float(ndtri(parameters.false_alarm))
     share = (1.0 - _correlation(belief)) / (1.0 + _correlation(belief)) if bursts else 1.0
     arrived, lost = share * belief.arrived, share * belief.lost
@@ -96,7 +98,7 @@ def report(belief: LinkBelief, parameters: LinkEstimateParameters, at_ns: int) -
     )
 
 
-def burst_statistic(belief: LinkBelief) -> float:
+def compute_burst_statistic(belief: LinkBelief) -> float:
     """Signed root of the likelihood ratio of a first-order Markov chain against independence.
 
     G² = 2 Σ n_ij log(n_ij n / (n_i. n_.j)) of the transition counts is χ² with one degree of freedom without
@@ -122,10 +124,7 @@ def _correlation(belief: LinkBelief) -> float:
     return (n11 + 0.5) / (n10 + n11 + 1.0) - (n01 + 0.5) / (n00 + n01 + 1.0)
 
 
-# Precision of a share of losses where they come in runs.
-
-
-def loss_std(missing: NDArray[np.int64]) -> float:
+def compute_loss_std(missing: NDArray[np.int64]) -> float:
     """Standard error of the share of losses, each run of arrivals with the losses after it counted as one draw.
 
     Losses in bursts tell less than as many single ones.

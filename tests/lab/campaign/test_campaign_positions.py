@@ -15,7 +15,7 @@ from scipy.stats import binom
 from logs.report.statistics import worst_step
 from uavctl.build.controller import build_estimator, build_plant, build_problem
 from uavctl.config import Config, load_config
-from uavctl.flight.estimator import absorb, begin, estimate, set_input
+from uavctl.flight.estimator import absorb_samples, begin_history, estimate_at, note_input
 from uavctl.flight.kalman import make_kalman
 from uavctl.lab.campaign.controllers import met, sight_of
 from uavctl.lab.campaign.pool import Columns
@@ -69,18 +69,18 @@ def test_what_is_told_is_what_the_flight_s_filter_says_of_the_same_positions(pre
     overtaken = 0
     for run in range(RUNS):
         kalman = make_kalman(plant, build_estimator(config), dt_ns)
-        history = begin(kalman, 0, 0)
+        history = begin_history(kalman, 0, 0)
         for k in range(STEPS):
             come = [c for c in range(k + 1) if first_known[run, c] == k]
             overtaken += sum(c < newest[run, k] for c in come)
             samples = [sample(plant.axes, positions[run, c], c * dt_ns, k * dt_ns) for c in come]
-            history, _, refused = absorb(kalman, history, k * dt_ns, samples)
+            history, _, refused = absorb_samples(kalman, history, k * dt_ns, samples)
             assert not refused
-            said = estimate(kalman, history, int(newest[run, k]) * dt_ns)
+            said = estimate_at(kalman, history, int(newest[run, k]) * dt_ns)
             assert said is not None
             assert means[k][run] == pytest.approx(said.mean, abs=1e-8)
             assert covs[k][run] == pytest.approx(np.array(said.cov), rel=1e-7, abs=1e-10)
-            history = set_input(kalman, history, k * dt_ns, inputs[run, k])
+            history = note_input(kalman, history, k * dt_ns, inputs[run, k])
     assert (overtaken > 0) == (link != "losses")
 
 

@@ -18,7 +18,7 @@ from logs.recording.replay import MAKERS, FieldNames, ReplayResult, leaves, repl
 from uavctl.build.controller import build_plant
 from uavctl.cli.app import run
 from uavctl.config import load_config
-from uavctl.flight.limits import LimitsParameters, gate
+from uavctl.flight.limits import LimitsParameters, limit_setpoint
 from uavctl.records import Decision, Event, LinkStats, Setpoint, SetpointSource, StepInput, Vec3
 
 TICK = 57  # in which the rule of a test changes
@@ -41,12 +41,12 @@ def test_a_changed_rule_is_found_in_its_tick_and_followed(flown: Memory, monkeyp
     def pushed(want: Vec3, before: Vec3, tick_s: float, limits: LimitsParameters) -> tuple[Vec3, tuple[str, ...]]:
         nonlocal calls
         calls += 1
-        accel, limited = gate(want, before, tick_s, limits)
+        accel, limited = limit_setpoint(want, before, tick_s, limits)
         return (accel[0] + (0.25 if calls > of_setpoints else 0.0), *accel[1:]), limited
 
     ticks = [one.at_ns for one in flown.of(Setpoint)]
     of_setpoints = ticks.index(flown.of(Decision)[TICK].at_ns)
-    monkeypatch.setattr("uavctl.flight.step.gate", pushed)
+    monkeypatch.setattr("uavctl.flight.act.limit_setpoint", pushed)
     result = replayed(flown)
     first, context = result.first_difference, result.context
     assert first is not None and context is not None and first == result.first_decision

@@ -15,7 +15,7 @@ from synthetic_scene import paper, room
 from logs.recording.flight import FALLBACK, FlightData
 from logs.recording.summary import FlightSummary, Percentiles, render, spread, summarise
 from uavctl.errors import RecordingError
-from uavctl.flight.decision import MISSION_OVER
+from uavctl.flight.decide import MISSION_OVER
 from uavctl.records import (
     ORDER_ACCEPTED,
     ControlMode,

@@ -16,7 +16,7 @@ from logs.recording.summary import Percentiles, predicted_only, rows, summarise
 from logs.report.summary_text import story
 from uavctl.config import load_config
 from uavctl.config.load import dump_config
-from uavctl.flight.decision import MISSION_OVER
+from uavctl.flight.decide import MISSION_OVER
 from uavctl.records import (
     ORDER_ACCEPTED,
     ControlMode,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from uavctl.build.controller import build_conditioned, build_controller, build_estimator, build_problem
 from uavctl.config import load_config
-from uavctl.flight.kalman import make_kalman, settled_cov
+from uavctl.flight.kalman import make_kalman, settle_covariance
 from uavctl.smpc.conditioned.backoffs import Deviations
 from uavctl.smpc.estimate import innovations, with_bias
 from uavctl.smpc.nominal import parts
@@ -50,7 +50,7 @@ def test_a_filter_settles_at_the_riccati_solution() -> None:
     """With positions alone, against the filter in innovations form, which is another implementation."""
     config = load_config("room-hahn-stursberg")
     plant, estimator, dt_ns = build_problem(config).plant, build_estimator(config), 200_000_000
-    found = settled_cov(make_kalman(plant, estimator, dt_ns), dt_ns, 70_000_000, 0)
+    found = settle_covariance(make_kalman(plant, estimator, dt_ns), dt_ns, 70_000_000, 0)
     form = innovations(plant, estimator.position_std_m, 0.07, 0, estimator.bias_drift)
     np.testing.assert_allclose(found[: plant.n_x, : plant.n_x], form.estimate_cov, rtol=1e-6, atol=1e-12)
 
@@ -63,7 +63,7 @@ def test_a_design_rests_on_what_the_flight_s_filter_does_not_know(preset: str) -
     kalman = controller.kalman
     assert design.estimate_cov.shape == (kalman.bias.stop, kalman.bias.stop)
     assert (np.diagonal(design.estimate_cov)[kalman.bias] > 0.01**2).all()
-    deaf = settled_cov(
+    deaf = settle_covariance(
         make_kalman(controller.plant, replace(controller.estimator, inertial_std_mps2=0.0), controller.dt_ns),
         controller.dt_ns,
         50_000_000,

@@ -15,7 +15,15 @@ from scipy.linalg import solve_discrete_are
 from uavctl.build.controller import build_controller, build_design, build_plant, build_spec
 from uavctl.config import load_config
 from uavctl.errors import DesignError
-from uavctl.flight.kalman import Belief, EstimatorParameters, Kalman, first_belief, make_kalman, predicted, updated
+from uavctl.flight.kalman import (
+    Belief,
+    EstimatorParameters,
+    Kalman,
+    make_first_belief,
+    make_kalman,
+    predict,
+    update_with_position,
+)
 from uavctl.records import PositionSample
 from uavctl.smpc.estimate import innovations, with_bias
 from uavctl.smpc.hahn_stursberg.design import Design, make_design
@@ -102,19 +110,19 @@ def arrivals(loss: float, steps: int, phase_ns: int, seed: int) -> tuple[list[Be
     real = kalman(ROOM)
     first, second = ROOM.transition((STEP_NS - phase_ns) / 1e9), ROOM.transition(phase_ns / 1e9)
     x, u = np.zeros(9), np.zeros(3)
-    belief = first_belief(real, sample(x[[0, 3, 6]], 0))
+    belief = make_first_belief(real, sample(x[[0, 3, 6]], 0))
     beliefs, places, states = [], [], [x]
     for k in range(steps):
         w = rng.multivariate_normal(np.zeros(3), ROOM.w)
         x = first[0] @ x + first[2] @ w
         at_ns = k * STEP_NS + STEP_NS - phase_ns
-        belief = predicted(real, 0, belief, u, at_ns)
+        belief = predict(real, 0, belief, u, at_ns)
         noise = STD_M * rng.standard_normal(3)
         arrived = bool(rng.random() >= loss)
         if arrived:
-            belief = updated(real, belief, sample(x[[0, 3, 6]] + noise, at_ns))
+            belief = update_with_position(real, belief, sample(x[[0, 3, 6]] + noise, at_ns))
         x = second[0] @ x + second[2] @ w
-        belief = predicted(real, 0, belief, u, (k + 1) * STEP_NS)
+        belief = predict(real, 0, belief, u, (k + 1) * STEP_NS)
         states.append(x)
         if arrived:
             beliefs.append(belief)

@@ -14,7 +14,7 @@ from logs.report.statistics import finite
 from uavctl.config import Config
 from uavctl.config.link import LONGEST_RUN
 from uavctl.errors import RecordingError
-from uavctl.flight.link_estimate import loss_std
+from uavctl.flight.link_estimate import compute_loss_std
 from uavctl.lab.identify.fit import (
     AHEAD_S,
     TRIES,
@@ -79,7 +79,7 @@ def fit_link(seen: PositionHistory, missing: NDArray[np.int64]) -> LinkFit:
         received=came,
         lost=lost,
         loss=loss,
-        loss_std=loss_std(usual),
+        loss_std=compute_loss_std(usual),
         outages_s=tuple(round(float(n) / rate_hz, _ROUND) for n in missing[outages]),
         runs=tuple((counts / max(int(counts.sum()), 1)).tolist()),
         burst_statistic=statistic,

@@ -1,7 +1,7 @@
 """Monitor of the box in a flight of `uavctl tune`: ends a motion that comes too near to a side, and repeats it smaller.
 
 The controller plans inside the box with the model that it has, and an unknown vehicle may leave it. So each tick asks
-of the estimate what the envelope asks of the limits (`uavctl.flight.envelope`): can the vehicle stop before?
+of the estimate what a flight asks of the limits (`uavctl.flight.monitors.outside`): can the vehicle stop before?
 
     out + v REACTION_S + v² / (2 weakest a) > -RESERVE_M      the motion ends: back to the centre
     out + v REACTION_S + v² / (2 a)         > 0               the flight ends: brake, and the vehicle's own landing
@@ -19,9 +19,10 @@ from dataclasses import replace
 
 from uavctl.build.controller import build_envelope, build_plant
 from uavctl.config import Config
-from uavctl.flight.decision import position, velocity
-from uavctl.flight.envelope import REACTION_S, Observation, is_outside
+from uavctl.flight.context import read_position, read_velocity
 from uavctl.flight.limits import ZERO
+from uavctl.flight.monitors.observation import Observation
+from uavctl.flight.monitors.outside import REACTION_S, is_outside
 from uavctl.lab.tune.excitation import LEAST_WAY_M, RESERVE_M, SafeBox
 from uavctl.loop import ControlLoop
 from uavctl.records import Command, ControlMode, Order, Ticked, Vec3
@@ -89,7 +90,7 @@ class BoxMonitor:
         self._begun_ns = self._begun_ns or at_ns
         if self._goal is None and decision.waypoint is not None:
             self._number = decision.waypoint
-        where, speed = position(estimate, self._plant), velocity(estimate, self._plant)
+        where, speed = read_position(estimate, self._plant), read_velocity(estimate, self._plant)
         seen = Observation(at_ns, (), ZERO, where, speed, None, braking=False)
         near = [axis for axis, one in enumerate(self._near) if is_outside(seen, one)]
         if is_outside(seen, self._leaving):

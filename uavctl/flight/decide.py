@@ -1,0 +1,380 @@
+"""Phase 4 of a tick: make a new plan, continue the old one, or fall back.
+
+1. The ends that monitors ask for change the fallback, after the operator's orders did.
+2. A vehicle that is handed over, silent, or takes no setpoints: no plan.
+3. A final fallback, or a verdict to brake: the fallback flies on, or begins.
+4. Else, at a Δt boundary: an age of H is the fallback. A new measurement is a new plan, and so are new inertial data
+   where the solver counts the age. Else the old plan plays out.
+5. Between boundaries, what the last one decided is held.
+"""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import numpy as np
+from msgspec.structs import replace
+
+from uavctl.arrays import Array
+from uavctl.flight.bias import Biases, find_lasting_bias, remember_bias
+from uavctl.flight.context import FilterView, TickContext, read_position, read_velocity
+from uavctl.flight.controller import Controller
+from uavctl.flight.estimator import make_estimate, select_covariance
+from uavctl.flight.fallback import Fallback, FallbackEnd, advance_fallback, begin_fallback, request_end
+from uavctl.flight.kalman import Belief
+from uavctl.flight.limits import AXES, ZERO
+from uavctl.flight.mission import MissionState, advance_mission, is_over, lead_with_one_axis, make_question
+from uavctl.flight.monitors.vehicle_velocity import find_confirmed_velocity, find_trusted_velocity
+from uavctl.flight.orders import Ordered, describe_order, follow_order
+from uavctl.flight.solve import ask_solver
+from uavctl.flight.state import ControlState, find_mode
+from uavctl.flight.supervise import Supervised, observe_velocity
+from uavctl.records import Command, ControlMode, Estimate, Plan, SolveStatus, Vec3, Vector, moves_now
+from uavctl.smpc.answer import Preview
+
+MISSION_OVER = "the mission is over: landing"
+# Behind a position that is older, and without a velocity of the vehicle's own beside them, inertial data make no plans:
+# nothing would show that they err. With five positions a second and 60 % of them lost, one in ten is older.
+PLANNED_NS = 1_000_000_000
+CARRIES_NS = 200_000_000  # inertial data that are older do not carry the estimate on
+_FINAL = {
+    FallbackEnd.CONTROLLER_FAILED: "the controller has failed",
+    FallbackEnd.POSITIONS_DISTRUSTED: "positions jumped and are not believed any more",
+    FallbackEnd.RELEASED: "what is seen cannot be",
+    FallbackEnd.STOP: "the operator asked for the hand-over",
+    FallbackEnd.LAND: "landing is due",
+}
+
+
+class Decided(msgspec.Struct, frozen=True, eq=False):
+    """Result of phase 4: what flies, with the reason."""
+
+    plan: Plan | None
+    fallback: Fallback | None
+    mission: MissionState | None
+    order: Command | None  # order that still waits for a plan
+    consecutive_samples: int  # fresh samples in a row
+    hold_point_m: Vec3 | None
+    biases: Biases
+    jump_suspected: bool
+    fault: str  # why a controller of another package is given up; empty as long as it is not
+    reason: str = ""
+    new_measurement: bool = False  # whether a new position was there at the boundary
+    solve: SolveStatus | None = None  # outcome of the solve; None if none was asked
+    new_plan: Plan | None = None
+    trouble: str = ""  # why the answer does not fly
+    is_mute: bool = False  # whether nothing may be sent in this tick
+
+    @property
+    def mode(self) -> ControlMode:
+        """The control mode."""
+        return find_mode(self.plan, self.fallback)
+
+
+class _Phase(msgspec.Struct, frozen=True, eq=False):
+    """What the steps of this phase know."""
+
+    state: ControlState
+    context: TickContext
+    supervised: Supervised
+
+    @property
+    def controller(self) -> Controller:
+        return self.context.controller
+
+    @property
+    def view(self) -> FilterView:
+        return self.supervised.view
+
+
+def decide(state: ControlState, context: TickContext, supervised: Supervised, ordered: Ordered) -> Decided:
+    """Decide what flies: nothing yet, the plan, or the fallback."""
+    phase = _Phase(state, context, supervised)
+    begun = _begin(phase, ordered)
+    return _decide_handed_over(begun, phase) or _decide_fallback(begun, phase) or _decide_plan(begun, phase)
+
+
+def _begin(phase: _Phase, ordered: Ordered) -> Decided:
+    """Apply what orders, monitors and the operator's stop have changed."""
+    state, supervised, at_ns = phase.state, phase.supervised, phase.context.at_ns
+    fallback = ordered.fallback
+    for end in supervised.ends:
+        fallback = request_end(fallback, end, at_ns)
+    before, outliers = state.fallback.flown, state.estimator.sources.outliers
+    is_final = fallback is not None and fallback.final
+    becomes_final = is_final and not (before is not None and before.final)
+    jump_suspected = state.fallback.jump_suspected or (becomes_final and outliers is not None and outliers.is_likely)
+    if phase.context.inputs.stop:
+        fallback = request_end(fallback, FallbackEnd.STOP, at_ns)
+    return Decided(
+        plan=_age_plan(state.plan.flown, supervised),
+        fallback=fallback,
+        mission=state.mission.progress,
+        order=ordered.order,
+        consecutive_samples=supervised.consecutive_samples,
+        hold_point_m=state.fallback.hold_point_m,
+        biases=_update_biases(phase),
+        jump_suspected=is_final and jump_suspected,
+        fault=supervised.monitors.external.fault,
+    )
+
+
+def _age_plan(plan: Plan | None, supervised: Supervised) -> Plan | None:
+    """Return the plan that is flown; any estimate is new beside one that was made from samples now dropped.
+
+    So it is for some steps (`replan`): the setpoint was far from where the new plan begins, and is slew-limited.
+    """
+    if plan is None:
+        return None
+    if supervised.replan:
+        return replace(plan, captured_ns=plan.captured_ns - 1)
+    if supervised.clean_ns is None or plan.captured_ns <= supervised.clean_ns:
+        return plan
+    return replace(plan, captured_ns=supervised.clean_ns - 1)
+
+
+def _update_biases(phase: _Phase) -> Biases:
+    """Return the recent biases, without those from samples that were dropped, and with that of a new measurement."""
+    biases, context, view, clean_ns = phase.state.fallback.biases, phase.context, phase.view, phase.supervised.clean_ns
+    if clean_ns is not None:
+        biases = tuple(one for one in biases if one[0] <= clean_ns)
+    if context.mode is not ControlMode.TRACK:
+        return biases if phase.state.fallback.flown is not None else ()
+    if not context.is_boundary or view.age_steps or view.estimate is None or not view.estimate.bias:
+        return biases
+    return remember_bias(biases, context.boundary_ns, view.estimate.bias)
+
+
+def _decide_handed_over(begun: Decided, phase: _Phase) -> Decided | None:
+    """Decide for a vehicle that is handed over, stopped, silent, or takes no setpoints; None for any other."""
+    inputs, why_not, at_ns, fallback = phase.context.inputs, phase.context.unready, phase.context.at_ns, begun.fallback
+    if fallback is not None and fallback.ended:
+        return _fall_back(begun, fallback, phase, "handed over")
+    is_stopped = inputs.stop or (fallback is not None and fallback.end is FallbackEnd.STOP)
+    if why_not and is_stopped:
+        ended = Fallback(mode=ControlMode.STOPPED, since_ns=at_ns, end=FallbackEnd.STOP)
+        return replace(begun, plan=None, fallback=ended, reason=f"the operator stopped; {why_not}")
+    if inputs.vehicle is None and begun.mode is not ControlMode.WAIT:
+        return _wait_for_vehicle(begun, fallback or begin_fallback(at_ns), phase)
+    if why_not:
+        return replace(begun, plan=None, fallback=None, reason=why_not)
+    return None
+
+
+def _decide_fallback(begun: Decided, phase: _Phase) -> Decided | None:
+    """Decide for a final fallback, or a verdict to brake; None without either."""
+    supervised, fallback = phase.supervised, begun.fallback
+    if fallback is not None and fallback.final:
+        why, released = _FINAL[fallback.end], supervised.monitors.release
+        if fallback.end is FallbackEnd.RELEASED and released is not None:
+            why = released.text
+        elif fallback.end is FallbackEnd.CONTROLLER_FAILED:
+            why = begun.fault
+        return _fall_back(begun, fallback, phase, why)
+    if begun.plan is not None and not supervised.brake.is_none:
+        return _fall_back(begun, begin_fallback(phase.context.at_ns), phase, supervised.brake.text)
+    return None
+
+
+def _decide_plan(begun: Decided, phase: _Phase) -> Decided:
+    """Decide for a vehicle that takes setpoints, with nothing against a plan."""
+    if not phase.context.is_boundary:
+        if begun.fallback is not None:
+            return _fall_back(begun, begun.fallback, phase, "fallback goes on")
+        waiting = begun.plan is None
+        return replace(begun, reason="waits for the next boundary" if waiting else "held until the next boundary")
+    view, controller, at_ns = phase.view, phase.controller, phase.context.at_ns
+    if view.age_steps is None:
+        never = view.estimate is None
+        return replace(begun, reason="no position yet" if never else "no position from before this boundary yet")
+    if view.age_steps >= controller.horizon:
+        reason = f"age of information {view.age_steps} has reached H = {controller.horizon}"
+        return _fall_back(begun, begun.fallback or begin_fallback(at_ns), phase, reason)
+    wanted = controller.fallback.recover_samples
+    if begun.fallback is not None and begun.consecutive_samples < wanted:
+        reason = f"{begun.consecutive_samples} of {wanted} fresh samples in a row"
+        return _fall_back(begun, begun.fallback, phase, reason)
+    if phase.supervised.plan_base is None:
+        return replace(begun, reason="no estimate of this boundary")
+    return _plan_from(begun, phase.supervised.plan_base, phase)
+
+
+def _plan_from(begun: Decided, belief: Belief, phase: _Phase) -> Decided:
+    """Plan from the belief at which an input begins to act, unless the mission is over or the controller has failed."""
+    controller, context, supervised = phase.controller, phase.context, phase.supervised
+    base = make_estimate(controller.kalman, belief)
+    mission = advance_mission(controller.mission, begun.mission, base.mean, context.boundary_ns)
+    begun = replace(begun, mission=mission)
+    if controller.mission.land and begun.order is None and is_over(controller.mission, mission, context.boundary_ns):
+        landing = request_end(begun.fallback, FallbackEnd.LAND, context.at_ns)
+        return _fall_back(begun, landing, phase, MISSION_OVER)
+    if not begun.fault and not supervised.wall.is_none:
+        begun = replace(begun, fault=supervised.wall.text)
+    if begun.fault:  # found just now, or the vehicle is flown again after the pilot had it
+        return _give_up_controller(begun, phase)
+    planned = _replan(begun, mission, base, select_covariance(controller.kalman, belief), phase)
+    if planned.fault:
+        return _give_up_controller(planned, phase)
+    if planned.plan is not None and context.step - planned.plan.seq < controller.horizon:
+        return planned
+    return _fall_back(planned, begun.fallback or begin_fallback(context.at_ns), phase, "no plan is left to fly")
+
+
+def _replan(begun: Decided, mission: MissionState, base: Estimate, cov: Array, phase: _Phase) -> Decided:
+    """Ask for a plan if there is a new measurement, as ordered; else, or if that fails, the old one plays out."""
+    controller, context = phase.controller, phase.context
+    new_measurement = begun.plan is None or base.captured_ns > begun.plan.captured_ns
+    if not new_measurement and not _has_new_inertial(begun.plan, phase):
+        return replace(begun, reason="no news: the plan plays out")
+    reason = "news: a new plan" if new_measurement else "inertial data: a new plan"
+    if begun.order is not None:
+        reason = f"{reason}, as ordered: {describe_order(begun.order)}"
+    mission = follow_order(controller.mission, mission, begun.order, base.mean, context.boundary_ns)
+    mission = lead_with_one_axis(controller.mission, mission, base.mean, context.boundary_ns)
+    target, preview = make_question(controller.mission, mission, context.boundary_ns)
+    preview = _complete_preview(preview, base, cov, phase)
+    shape = (controller.horizon, controller.plant.n_u)
+    asked = ask_solver(controller.solver, context.step, base, target, preview, shape, controller.design_id)
+    begun = replace(begun, mission=mission, order=None, new_measurement=new_measurement, solve=asked.status)
+    if asked.plan is None:
+        reason = "no new plan: the old one plays out"
+        return replace(begun, reason=reason, fault=asked.fault, trouble=asked.text)
+    return replace(begun, plan=asked.plan, fallback=None, new_plan=asked.plan, reason=reason)
+
+
+def _complete_preview(preview: Preview, base: Estimate, cov: Array, phase: _Phase) -> Preview:
+    """Add what the solver has to know of the estimate and of the last input."""
+    controller = phase.controller
+    # u = u_sent + d: the solver counts what acts on the plant in all
+    sent = controller.plant.to_input(phase.state.plan.sent_mps2)
+    return Preview(
+        limits=preview.limits,
+        path=preview.path,
+        late=min(phase.view.age_steps or 0, controller.late_steps),
+        cov=cov,
+        sent=sent + np.array(base.bias) if base.bias else sent,
+        inputs=_shift_inputs(base.bias, controller),
+    )
+
+
+def _shift_inputs(bias: Vector, controller: Controller) -> tuple[Array, Array] | None:
+    """Return the inputs that a plan has beside a bias, in its own count; None where the design left room for it."""
+    if controller.inputs is None or not bias or max(map(abs, bias)) <= controller.estimator.bias_max:
+        return None
+    low, high = controller.inputs
+    return low + bias, high + bias
+
+
+def _has_new_inertial(plan: Plan | None, phase: _Phase) -> bool:
+    """Whether inertial data have come since the plan was made, and the solver counts the age of its position."""
+    view, controller, context = phase.view, phase.controller, phase.context
+    if plan is None or (view.age_steps or 0) > controller.late_steps:
+        return False
+    inputs, belief = context.inputs, view.belief
+    alone = find_confirmed_velocity(phase.supervised.monitors.engaged, inputs.motion, inputs.at_ns) is None
+    if alone and belief is not None and context.boundary_ns - belief.captured_ns > PLANNED_NS:
+        return False
+    newest_ns = None if belief is None else belief.inertial.used_ns
+    return newest_ns is not None and newest_ns > plan.base_ns - controller.dead_ns
+
+
+def _give_up_controller(begun: Decided, phase: _Phase) -> Decided:
+    """Let the fallback fly for good: the controller of another package has failed."""
+    fallback = request_end(begun.fallback, FallbackEnd.CONTROLLER_FAILED, phase.context.at_ns)
+    return _fall_back(begun, fallback, phase, begun.fault)
+
+
+def _fall_back(begun: Decided, fallback: Fallback, phase: _Phase, reason: str) -> Decided:
+    """Let the fallback fly, and advance it; the count of fresh samples starts anew where it begins."""
+    before, fallback = fallback, _advance(begun, fallback, phase)
+    if fallback.mode is ControlMode.LAND and not fallback.final:
+        held_s = (phase.context.at_ns - (before.held_ns or phase.context.at_ns)) * 1e-9
+        reason = f"held for {held_s:.1f} s, and positions did not come back: landing"
+    consecutive = 0 if begun.fallback is None else begun.consecutive_samples
+    hold_point_m = None
+    if fallback.mode is ControlMode.HOLD:
+        hold_point_m = begun.hold_point_m
+        if hold_point_m is None:
+            hold_point_m = read_position(phase.view.estimate, phase.controller.plant)
+    return replace(
+        begun, plan=None, fallback=fallback, consecutive_samples=consecutive, hold_point_m=hold_point_m, reason=reason
+    )
+
+
+def _wait_for_vehicle(begun: Decided, fallback: Fallback, phase: _Phase) -> Decided:
+    """Let the fallback's time run on while the vehicle is silent.
+
+    Landing waits until the vehicle is heard again: the pilot may have taken over in the meantime. Where it is due
+    nothing is sent, so that a vehicle that still listens lands by its own failsafe.
+    """
+    inputs = phase.context.inputs
+    later = _advance(begun, fallback, phase)
+    unheard = (
+        "the vehicle's heartbeats are missing" if moves_now(inputs.motion, inputs.at_ns) else "no vehicle is heard"
+    )
+    consecutive = 0 if begun.fallback is None else begun.consecutive_samples
+    if later.ended:
+        reason = f"{unheard}, and the time to hold is over: its own failsafe is left to act"
+        due = fallback
+        if not fallback.final:
+            due = Fallback(mode=fallback.mode, since_ns=fallback.since_ns, end=FallbackEnd.LAND)
+        return replace(begun, plan=None, fallback=due, consecutive_samples=consecutive, reason=reason, is_mute=True)
+    reason = f"{unheard}; the fallback's time runs on"
+    return replace(begun, plan=None, fallback=later, consecutive_samples=consecutive, reason=reason)
+
+
+def _advance(begun: Decided, fallback: Fallback, phase: _Phase) -> Fallback:
+    """Advance the fallback to this tick."""
+    state, context, view = phase.state, phase.context, phase.view
+    moving, measured = find_braking_velocity(state, context, phase.supervised)
+    carries = carries_estimate(fallback, view.belief)
+    return advance_fallback(
+        fallback,
+        context.at_ns,
+        math.hypot(*moving),
+        state.plan.sent_mps2,
+        context.controller.fallback,
+        find_hold_accel(fallback, begun.biases, context, phase.supervised),
+        measured=measured,
+        blind=not (measured or carries) and (view.age_steps is None or view.age_steps >= context.controller.horizon),
+    )
+
+
+def carries_estimate(fallback: Fallback, belief: Belief | None) -> bool:
+    """Whether the vehicle's own inertial data carry the estimate on, with nothing against it."""
+    if belief is None or belief.inertial.used_ns is None or belief.inertial.distrusted_ns is not None:
+        return False
+    return not fallback.final and belief.at_ns - belief.inertial.used_ns <= CARRIES_NS
+
+
+def find_hold_accel(fallback: Fallback, biases: Biases, context: TickContext, supervised: Supervised) -> Vec3:
+    """Find the setpoint [m/s²] at which the vehicle does not accelerate: against the bias, if known; else zero."""
+    inputs, view = context.inputs, supervised.view
+    bias = find_lasting_bias(biases)
+    # A bias learnt without positions may be an error of the inertial data, and would be flown for seconds: it counts
+    # where the vehicle's own velocity would contradict.
+    witnessed = find_confirmed_velocity(supervised.monitors.engaged, inputs.motion, inputs.at_ns) is not None
+    if witnessed and view.estimate is not None and carries_estimate(fallback, view.belief):
+        bias = view.estimate.bias
+    # The vehicle keeps zero itself when nothing more is sent.
+    is_last = fallback.final and fallback.mode is ControlMode.HOLD
+    if not bias or is_last or fallback.end is FallbackEnd.RELEASED:
+        return ZERO
+    # a = a(-d)
+    north, east, down = context.controller.plant.to_accel(-np.array(bias))
+    return north, east, down
+
+
+def find_braking_velocity(state: ControlState, context: TickContext, supervised: Supervised) -> tuple[Vec3, bool]:
+    """Find the velocity to brake on, and whether it is the vehicle's own; else it is the predicted one."""
+    estimate, plant = supervised.view.estimate, context.controller.plant
+    predicted = read_velocity(estimate, plant)
+    observation = None
+    if context.inputs.motion is not None:
+        observation = observe_velocity(state, supervised.monitors.engaged, estimate, context)
+    own = None if observation is None else find_trusted_velocity(observation)
+    if own is None:
+        return predicted, False
+    north, east, down = (v if axis in plant.axes else 0.0 for axis, v in zip(AXES, own, strict=True))
+    return (north, east, down), True

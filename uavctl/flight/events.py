@@ -1,0 +1,237 @@
+"""Phase 6 of a tick: events for people, from the states before and after.
+
+1. The link estimate counts the step that ends at a boundary.
+2. Alarms that last are reported once, when they begin: the link, inertial data, the bias, a strong push.
+3. Orders, a new start of the filter, a release, a failed controller, refused samples, missed ticks, the solver, relaxed
+   limits and a change of mode have an event each, in this order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import msgspec
+import numpy as np
+
+from uavctl.flight.context import TickContext
+from uavctl.flight.decide import Decided
+from uavctl.flight.fallback import FallbackEnd
+from uavctl.flight.link_estimate import LinkBelief, count_step, estimate_link
+from uavctl.flight.measure import Measured
+from uavctl.flight.monitors.acceleration import describe_push
+from uavctl.flight.monitors.engaged import MonitorState
+from uavctl.flight.monitors.external import CONTROLLER_FAULT
+from uavctl.flight.monitors.stale import REPEATED
+from uavctl.flight.monitors.verdict import Cause
+from uavctl.flight.orders import Ordered
+from uavctl.flight.state import AlarmGroup, ControlState
+from uavctl.flight.supervise import Supervised
+from uavctl.records import ControlMode, Event, LinkEstimate, Severity, Vec3, tell_all
+
+BIAS_AT_BOUND, BIAS_FREE = "bias-at-bound", "bias-free"
+STRONG_PUSH = "strong-push"  # a wind or a hit, not a false position: inertial data explain what positions show
+FREE = 0.9  # share of its bound below which a bias no longer is at it: one that settles there is reported once
+INERTIAL_DOUBTED, INERTIAL_SILENT, INERTIAL_USED = Cause.INERTIAL.value, "inertial-silent", "inertial-used"
+SILENT_NS = 1_000_000_000  # without inertial data
+ASKED_NS = 4_000_000_000  # from the first tick on, in which they are asked for and begin
+
+_LINK_TEXTS = {
+    "link-bursts": "positions are lost in bursts: silence is longer than independent losses would make it",
+    "link-below-promise": "fewer positions arrive in time than the design counts on; limits may be broken more often",
+}
+_INERTIAL_TEXTS = {
+    INERTIAL_DOUBTED: (
+        Severity.WARNING,
+        "the vehicle's inertial data contradict its positions, its own velocity or its model: they are not used",
+    ),
+    INERTIAL_SILENT: (Severity.WARNING, "no inertial data of the vehicle that are of now: flown by its model alone"),
+    INERTIAL_USED: (Severity.INFO, "the vehicle's inertial data are used"),
+}
+_ENTERED = {
+    ControlMode.WAIT: (Severity.WARNING, "disengaged"),
+    ControlMode.TRACK: (Severity.INFO, "track"),
+    ControlMode.BRAKE: (Severity.ERROR, "fallback-brake"),
+    ControlMode.HOLD: (Severity.WARNING, "fallback-hold"),
+    ControlMode.LAND: (Severity.ERROR, "fallback-land"),
+    ControlMode.STOPPED: (Severity.INFO, "stopped"),
+}
+
+
+class Reported(msgspec.Struct, frozen=True, eq=False):
+    """Result of phase 6."""
+
+    events: tuple[Event, ...]
+    alarms: AlarmGroup
+    link: LinkEstimate | None  # at boundaries that were not missed
+
+
+def report_events(
+    state: ControlState,
+    context: TickContext,
+    measured: Measured,
+    supervised: Supervised,
+    ordered: Ordered,
+    decided: Decided,
+) -> Reported:
+    """Report what has changed in a tick."""
+    before, at_ns = state.alarms, context.at_ns
+    belief, link = _count_link(before.link, context, supervised)
+    link_alarms = before.link_alarms if link is None else _find_link_alarms(link, before.link_alarms)
+    bias = _find_bias(context, supervised)
+    inputs_at_bound = before.inputs_at_bound
+    if bias:
+        inputs_at_bound = find_inputs_at_bound(bias, context.controller.kalman.bias_bounds, before.inputs_at_bound)
+    inertial = _find_inertial_use(context, supervised)
+    events = (
+        *ordered.answers,
+        *_report_faults(state, context, measured, supervised, decided),
+        *_report_samples(context, measured),
+        *_report_decision(context, decided),
+        *_report_link(link_alarms, before.link_alarms, link),
+        *_report_inertial(before.inertial, inertial, at_ns),
+    )
+    if bias:
+        push_mps2 = context.controller.plant.to_accel(np.array(bias))
+        events += report_bias(push_mps2, before.inputs_at_bound, inputs_at_bound, at_ns)
+    events += _report_push(state.monitors.engaged, supervised.monitors.engaged, context)
+    return Reported(events, AlarmGroup(belief, link_alarms, inertial, inputs_at_bound), link)
+
+
+def _make_event(at_ns: int, severity: Severity, code: str, text: str, count: int = 1) -> Event:
+    return Event(at_ns=at_ns, severity=severity, code=code, text=text, count=count)
+
+
+def _report_faults(
+    state: ControlState, context: TickContext, measured: Measured, supervised: Supervised, decided: Decided
+) -> Iterable[Event]:
+    """Report a new start of the filter, a release of the vehicle, and a controller that is given up."""
+    at_ns, released = context.at_ns, supervised.released
+    if measured.restarted:
+        text = "positions jumped while nobody flew on them; the estimate begins anew"
+        yield _make_event(at_ns, Severity.WARNING, "position-restart", text)
+    if released is not None and released.cause is not None:
+        yield _make_event(at_ns, Severity.ERROR, released.cause.value, released.text)
+    if decided.fault and not state.monitors.external.fault:
+        yield _make_event(at_ns, Severity.ERROR, CONTROLLER_FAULT, decided.fault)
+
+
+def _report_samples(context: TickContext, measured: Measured) -> Iterable[Event]:
+    """Report samples that were refused, and ticks that were missed."""
+    at_ns, refused = context.at_ns, [why for _, why in measured.samples.refused]
+    for code in sorted(set(refused) - {REPEATED}):  # some sources send each value twice
+        text = "the sample counts as lost"
+        yield _make_event(at_ns, Severity.WARNING, code, text, refused.count(code))
+    if context.inputs.missed_ticks:
+        text = "ticks were missed; they are not made up for"
+        yield _make_event(at_ns, Severity.WARNING, "missed-ticks", text, context.inputs.missed_ticks)
+
+
+def _report_decision(context: TickContext, decided: Decided) -> Iterable[Event]:
+    """Report trouble of the solver, limits that gave way, and a change of mode."""
+    at_ns, plan, mode = context.at_ns, decided.new_plan, decided.mode
+    if decided.solve is not None and decided.trouble:
+        yield _make_event(at_ns, Severity.WARNING, f"solve-{decided.solve.value}", decided.trouble)
+    if plan is not None and plan.gave_way:
+        text = tell_all(context.controller.names, plan.gave_way)
+        yield _make_event(at_ns, Severity.WARNING, "gave-way", text)
+    if mode is not context.mode:
+        severity, code = _ENTERED[mode]
+        if decided.fallback is not None and decided.fallback.end >= FallbackEnd.STOP:
+            severity = Severity.INFO  # somebody wanted it
+        yield _make_event(at_ns, severity, code, decided.reason)
+
+
+def _count_link(
+    belief: LinkBelief, context: TickContext, supervised: Supervised
+) -> tuple[LinkBelief, LinkEstimate | None]:
+    """Count the step that ends here for the link; return the counts, and the estimate if this is a boundary on time."""
+    age_steps, at_ns = supervised.view.age_steps, context.at_ns
+    if not context.is_boundary or age_steps is None or at_ns != context.boundary_ns:
+        return belief, None
+    belief = count_step(belief, age_steps == 0, context.controller.link)
+    return belief, estimate_link(belief, context.controller.link, at_ns)
+
+
+def _find_link_alarms(link: LinkEstimate, reported: tuple[str, ...]) -> tuple[str, ...]:
+    """Find the link alarms that hold; a reported one holds on until the estimate is on the good side again."""
+    holds = {
+        "link-bursts": (link.bursts, link.burst_statistic > 0.0),
+        "link-below-promise": (link.below_promise, link.arrival_mean < link.promised),
+    }
+    return tuple(code for code, (on, still) in holds.items() if on or (still and code in reported))
+
+
+def _report_link(alarms: tuple[str, ...], reported: tuple[str, ...], link: LinkEstimate | None) -> Iterable[Event]:
+    """Report each link alarm that did not hold before."""
+    if link is not None:
+        for code in alarms:
+            if code not in reported:
+                yield _make_event(link.at_ns, Severity.WARNING, code, _LINK_TEXTS[code])
+
+
+def _find_inertial_use(context: TickContext, supervised: Supervised) -> str:
+    """Find the use of the vehicle's inertial data as an event code; empty if none are used or we do not fly."""
+    history = supervised.view.history
+    belief, we_fly = history.newest.belief, context.is_flown and context.is_ours
+    if not context.controller.kalman.n_inertial or belief is None or not we_fly:
+        return ""
+    if belief.inertial.distrusted_ns is not None:
+        return INERTIAL_DOUBTED
+    newest_ns = belief.inertial.used_ns or history.origin_ns + ASKED_NS
+    return INERTIAL_SILENT if context.at_ns - newest_ns > SILENT_NS else INERTIAL_USED
+
+
+def _report_inertial(before: str, now: str, at_ns: int) -> Iterable[Event]:
+    """Report a change in the use of inertial data; their use only where they were not used before."""
+    if now not in ("", before) and (now != INERTIAL_USED or before):
+        severity, text = _INERTIAL_TEXTS[now]
+        yield _make_event(at_ns, severity, now, text)
+
+
+def _find_bias(context: TickContext, supervised: Supervised) -> tuple[float, ...]:
+    """Find the bias that is flown against; empty where there is none, or others fly."""
+    estimate = supervised.view.estimate
+    return estimate.bias if estimate is not None and context.is_flown and context.is_ours else ()
+
+
+def find_inputs_at_bound(bias: Sequence[float], bounds: Sequence[float], reported: Sequence[int]) -> tuple[int, ...]:
+    """Find the inputs whose bias is at its bound.
+
+    Args:
+        bias: estimated one, each input [input units].
+        bounds: largest bias of each input that is flown against [input units].
+        reported: inputs that were already reported to be at their bounds.
+    """
+    return tuple(
+        i
+        for i, (value, bound) in enumerate(zip(bias, bounds, strict=False))
+        if abs(value) >= (FREE * bound if i in reported else bound)
+    )
+
+
+def report_bias(push_mps2: Vec3, before: Sequence[int], now: Sequence[int], at_ns: int) -> tuple[Event, ...]:
+    """Report if the bias of a further input is at its bound, and once none is any more.
+
+    Args:
+        push_mps2: the bias as an acceleration, local NED [m/s²].
+        before: inputs that were already reported to be at their bounds.
+    """
+    if set(now) - set(before):
+        pushes = ", ".join(f"{value:+.2f}" for value in push_mps2)
+        text = (
+            f"a lasting push, as wind, is as large as what may be flown against it ({pushes} m/s² north, east, down): "
+            "what it is more carries the vehicle off its target"
+        )
+        return (_make_event(at_ns, Severity.WARNING, BIAS_AT_BOUND, text),)
+    if before and not now:
+        text = "the lasting push is again within what may be flown against it"
+        return (_make_event(at_ns, Severity.INFO, BIAS_FREE, text),)
+    return ()
+
+
+def _report_push(before: MonitorState, now: MonitorState, context: TickContext) -> tuple[Event, ...]:
+    """Report where a push that the vehicle's inertial data explain begins to be a strong one."""
+    if before.acceleration.is_pushed or not now.acceleration.is_pushed:
+        return ()
+    text = describe_push(now.motion, context.inputs.motion, context.at_ns)
+    return (_make_event(context.at_ns, Severity.WARNING, STRONG_PUSH, text),)

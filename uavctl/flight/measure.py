@@ -1,0 +1,323 @@
+"""Phase 1 of a tick: gate its position and inertial samples, and update the filter history.
+
+1. Inputs that begin to act are noted in the filter.
+2. A sample that is invalid is refused. Each other one is compared with what is known, in the order of capture: stale
+   sources first, then outliers (`uavctl.flight.monitors`). What is refused is as good as lost.
+3. A source that is found to be stuck: its samples since then are dropped again.
+4. A source has moved while nobody flew on its positions: the filter begins anew.
+5. Inertial data of the tick update the filter, as their mean.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import msgspec
+import numpy as np
+from msgspec.structs import replace
+
+from uavctl.flight.context import TickContext
+from uavctl.flight.estimator import (
+    LATEST_STAMP_NS,
+    FilterHistory,
+    PendingInputs,
+    absorb_samples,
+    advance_window,
+    apply_due_inputs,
+    begin_history,
+    drop_samples,
+    find_newest_capture_ns,
+    predict_belief,
+    update_inertial,
+)
+from uavctl.flight.kalman import Belief, EstimatorParameters, Kalman, read_capture_ns, read_measurement
+from uavctl.flight.monitors import outliers, stale
+from uavctl.flight.monitors.observation import MOTION_NS, read_vehicle_velocity
+from uavctl.flight.monitors.outliers import OutlierObservation, OutlierTrack, Reach
+from uavctl.flight.monitors.stale import MovedNs, StaleObservation
+from uavctl.flight.monitors.verdict import NO_VERDICT, Action, Cause, Verdict
+from uavctl.flight.state import ControlState, InertialReading, SourceHealth
+from uavctl.records import PositionSample, StepInput, Vec3, VehicleStatus
+
+INVALID = "sample-invalid"
+FUTURE = "sample-future"
+
+# A plan bridges H steps; a sample that used up no more than this part of them on its way leaves most of them to it.
+_FRESH_PART = 3
+
+
+class GatedSamples(msgspec.Struct, frozen=True, eq=False):
+    """Samples of a tick, gated one after another."""
+
+    history: FilterHistory  # the filter with those accepted
+    sources: SourceHealth
+    accepted: tuple[PositionSample, ...] = ()
+    refused: tuple[tuple[PositionSample, str], ...] = ()  # each with the reason (an event's code)
+    clean_ns: int | None = None  # samples captured after this have been dropped again [ns]; None if none were
+    consecutive_samples: int = 0  # fresh samples in a row, up to now
+    source_moved: bool = False  # whether a source has moved: no position may be believed any more
+    all_absurd: bool = False  # whether all positions are further out than any can be, for so long that the same holds
+
+
+class Measured(msgspec.Struct, frozen=True, eq=False):
+    """Result of phase 1."""
+
+    history: FilterHistory
+    pending_inputs: PendingInputs
+    samples: GatedSamples  # its history is the one before restart and inertial data
+    inertial: InertialReading | None
+    restarted: bool  # whether the filter began anew
+
+
+def measure(state: ControlState, context: TickContext) -> Measured:
+    """Gate the samples of a tick and update the filter history."""
+    inputs, controller, estimator = context.inputs, context.controller, state.estimator
+    kalman = controller.kalman
+    origin_ns = inputs.at_ns - inputs.tick * controller.tick_ns
+    history = estimator.history or begin_history(kalman, origin_ns, inputs.at_ns)
+    history, pending_inputs = apply_due_inputs(kalman, history, estimator.pending_inputs, inputs.at_ns)
+    samples = gate_samples(
+        kalman, controller.reach, history, estimator.sources, inputs, controller.horizon, estimator.consecutive_samples
+    )
+    restarted = samples.source_moved and not context.is_flown
+    if restarted:
+        samples = _restart(kalman, samples, inputs.at_ns)
+    history = samples.history
+    if inputs.inertial:
+        history = update_inertial(kalman, history, inputs.inertial)
+    return Measured(history, pending_inputs, samples, _read_inertial(estimator.inertial, inputs), restarted)
+
+
+def gate_samples(
+    kalman: Kalman,
+    reach: Reach,
+    history: FilterHistory,
+    sources: SourceHealth,
+    inputs: StepInput,
+    horizon: int,
+    consecutive_samples: int,
+) -> GatedSamples:
+    """Gate the position samples of a tick and give them to the filter.
+
+    A sample is fresh if it is newer than all before and at most H/3 steps (at least one) old when a tick takes it: a
+    link with a steady delay, or a camera slower than Δt, is enough for the way back to TRACK. A newer sample that is
+    older than that breaks the row, and so does a boundary at which the age reaches H: no plan bridges that. Here this
+    is counted for boundaries between two captures (their ticks may have been missed), in phase 2 for the last one.
+
+    Args:
+        sources: Health of the sources, before.
+        horizon: H, the steps that a plan bridges.
+        consecutive_samples: Fresh samples in a row, before.
+    """
+    newest_ns = history.captured_ns
+    history = advance_window(kalman, history, inputs.at_ns)
+    moved_ns = _find_moved_ns(sources.moved_ns, inputs, reach.parameters.at_rest_mps)
+    sources = replace(sources, moved_ns=moved_ns)
+    samples = GatedSamples(history, sources)
+    if inputs.samples:
+        samples = _gate_in_order(kalman, reach, history, sources, inputs)
+        sources = samples.sources
+        consecutive_samples = _count_fresh(
+            kalman, samples.history, newest_ns, inputs.at_ns, samples.accepted, horizon, consecutive_samples
+        )
+    return replace(
+        samples,
+        consecutive_samples=0 if samples.clean_ns is not None else consecutive_samples,
+        source_moved=sources.outliers is not None and sources.outliers.has_moved(reach.parameters),
+        all_absurd=sources.absurd is not None and sources.absurd.has_moved(reach.parameters),
+    )
+
+
+def _restart(kalman: Kalman, samples: GatedSamples, at_ns: int) -> GatedSamples:
+    """Forget all positions: the filter and the health of the sources begin anew."""
+    history = begin_history(kalman, samples.history.origin_ns, at_ns)
+    return replace(
+        samples, history=history, sources=SourceHealth(), source_moved=False, all_absurd=False, consecutive_samples=0
+    )
+
+
+def _count_fresh(
+    kalman: Kalman,
+    history: FilterHistory,
+    newest_ns: int | None,
+    now_ns: int,
+    accepted: Sequence[PositionSample],
+    horizon: int,
+    consecutive_samples: int,
+) -> int:
+    """Count the fresh samples in a row with those of a tick at `now_ns`; the newest before it is from `newest_ns`."""
+    dt_ns = kalman.propagation.dt_ns
+    late_ns = max(dt_ns, horizon * dt_ns // _FRESH_PART)
+    for at_ns in sorted(map(read_capture_ns, accepted)):
+        if newest_ns is None or at_ns > newest_ns:
+            boundary_ns = at_ns - 1 - (at_ns - 1 - history.origin_ns) % dt_ns  # the last one before the capture
+            in_row = newest_ns is not None and boundary_ns - newest_ns < horizon * dt_ns
+            is_fresh = now_ns - at_ns <= late_ns
+            consecutive_samples = (consecutive_samples + 1 if in_row else 1) if is_fresh else 0
+            newest_ns = at_ns
+    return consecutive_samples
+
+
+def _gate_in_order(
+    kalman: Kalman, reach: Reach, history: FilterHistory, sources: SourceHealth, inputs: StepInput
+) -> GatedSamples:
+    """Give samples to the filter in the order of their capture, each after it is compared with what is known."""
+    reasons = [find_refusal(sample, inputs.at_ns, kalman.parameters) for sample in inputs.samples]
+    valid = [sample for sample, reason in zip(inputs.samples, reasons, strict=True) if reason is None]
+    refused = [(sample, reason) for sample, reason in zip(inputs.samples, reasons, strict=True) if reason is not None]
+    accepted: list[PositionSample] = []
+    clean_ns: int | None = None
+    for sample in sorted(valid, key=read_capture_ns):
+        at_ns = read_capture_ns(sample)
+        belief = predict_belief(kalman, history, at_ns) if at_ns > history.horizon_ns else None
+        if history.captured_ns is None:
+            first = stale.record_sample(sources.records, kalman, history, sample, np.zeros(len(kalman.axes)))
+            sources = replace(sources, records=first)
+        if belief is not None:  # else it is the first one, or too old
+            sources, verdict = _judge_sample(kalman, reach, history, sources, inputs, sample, belief)
+            if verdict.cause is not None:
+                code = verdict.cause.value
+                if verdict.since_ns is not None:
+                    is_stale = _captured_since(sample.source, verdict.since_ns)
+                    history, clean_ns = _drop_stale(kalman, history, is_stale, verdict.since_ns, clean_ns)
+                    refused.extend((one, code) for one in accepted if is_stale(one))
+                    accepted = [one for one in accepted if not is_stale(one)]
+                refused.append((sample, code))
+                continue
+        history, taken, why = absorb_samples(kalman, history, inputs.at_ns, (sample,), belief)
+        accepted.extend(taken)
+        refused.extend((sample, reason) for reason in why)
+    sources = replace(sources, absurd=_track_absurd(sources.absurd, kalman, bool(accepted), refused))
+    return GatedSamples(history, sources, tuple(accepted), tuple(refused), clean_ns)
+
+
+def _track_absurd(
+    absurd: OutlierTrack | None, kalman: Kalman, any_accepted: bool, refused: Sequence[tuple[PositionSample, str]]
+) -> OutlierTrack | None:
+    """Track positions further out than any can be, since one was accepted."""
+    if any_accepted:
+        return None
+    far = [read_capture_ns(sample) for sample, reason in refused if reason == INVALID and _is_far_out(sample, kalman)]
+    if not far:
+        return absurd
+    first_ns, count = (far[0], 0) if absurd is None else (absurd.first_ns, absurd.count)
+    return OutlierTrack(first_ns, max(far), count + len(far), np.zeros(len(kalman.axes)))
+
+
+def _captured_since(source: str, first_ns: int) -> Callable[[PositionSample], bool]:
+    """Return a test for samples that `source` captured at `first_ns` or later."""
+    return lambda sample: sample.source == source and read_capture_ns(sample) >= first_ns
+
+
+def _drop_stale(
+    kalman: Kalman,
+    history: FilterHistory,
+    is_stale: Callable[[PositionSample], bool],
+    first_ns: int,
+    clean_ns: int | None,
+) -> tuple[FilterHistory, int | None]:
+    """Drop the samples of a stuck source since `first_ns`; return too the time after which any were dropped so far.
+
+    The value that first came then goes too: it may be an older one, which the link had lost when it was new. It stays
+    where nothing else is known.
+    """
+    cleaned = drop_samples(kalman, history, is_stale)
+    last_ns = find_newest_capture_ns(cleaned, first_ns)
+    if last_ns is None:
+        cleaned = drop_samples(kalman, history, lambda one: is_stale(one) and read_capture_ns(one) > first_ns)
+        last_ns = first_ns
+    if len(cleaned.entries) == len(history.entries):
+        return history, clean_ns
+    return cleaned, last_ns if clean_ns is None else min(last_ns, clean_ns)
+
+
+def _judge_sample(
+    kalman: Kalman,
+    reach: Reach,
+    history: FilterHistory,
+    sources: SourceHealth,
+    inputs: StepInput,
+    sample: PositionSample,
+    belief: Belief,
+) -> tuple[SourceHealth, Verdict]:
+    """Compare a sample with what is known; `belief` is the prediction for its capture time."""
+    at_ns, n_axes = read_capture_ns(sample), len(kalman.axes)
+    values, variances = read_measurement(kalman, sample)
+    # ν = y - H z
+    offset = values - belief.mean[kalman.measured_index[: len(values)]]
+    observation = StaleObservation(
+        sample, offset[:n_axes], kalman, history, _is_flying(inputs.vehicle), sources.moved_ns, reach.parameters
+    )
+    records, verdict = stale.update(sources.records, observation)
+    sources = replace(sources, records=records)
+    if not verdict.is_none:
+        return sources, verdict
+    error_mps = np.zeros(n_axes) if sources.velocity_error_mps is None else sources.velocity_error_mps
+    width = outliers.compute_gate(reach, kalman, belief, variances, error_mps)
+    track, verdict = outliers.update(sources.outliers, OutlierObservation(at_ns, offset, width, n_axes))
+    if verdict.is_none:
+        if at_ns > (history.captured_ns or at_ns):
+            error_mps = outliers.bound_velocity_error(reach, belief, offset[:n_axes])
+            sources = replace(sources, velocity_error_mps=error_mps)
+        return replace(sources, outliers=track), NO_VERDICT
+    record = records[sample.source]
+    if record.at_ns == at_ns and record.repeats:
+        return sources, Verdict(Action.DISTRUST_POSITIONS, Cause.FROZEN)  # a value that came before did not jump
+    return replace(sources, outliers=track), verdict
+
+
+def _is_flying(vehicle: VehicleStatus | None) -> bool:
+    """Whether the vehicle moves on its own, as far as it is known; one that is on the ground may stand still."""
+    return vehicle is None or (vehicle.armed and not vehicle.landed)
+
+
+def _find_moved_ns(before_ns: MovedNs, inputs: StepInput, at_rest_mps: float) -> MovedNs:
+    """Find when the vehicle last moved in each axis, by its own velocity; without one it counts as moving."""
+    velocity = read_vehicle_velocity(inputs.motion, inputs.at_ns) or (math.inf,) * 3
+    rows = zip(before_ns, velocity, strict=True)
+    north, east, down = (ns if abs(v) < at_rest_mps else inputs.at_ns for ns, v in rows)
+    return north, east, down
+
+
+def _read_inertial(before: InertialReading | None, inputs: StepInput) -> InertialReading | None:
+    """Return the mean inertial data of a tick, else the last ones; None where those are too old, or none came."""
+    accels = [one.accel_mps2 for one in inputs.inertial if all(map(math.isfinite, one.accel_mps2))]
+    if accels:
+        return InertialReading(_average(accels), inputs.at_ns)
+    return before if before is not None and inputs.at_ns - before.at_ns <= MOTION_NS else None
+
+
+def _average(vectors: Sequence[Vec3]) -> Vec3:
+    north, east, down = (sum(values) / len(vectors) for values in zip(*vectors, strict=True))
+    return north, east, down
+
+
+def find_refusal(sample: PositionSample, at_ns: int, parameters: EstimatorParameters) -> str | None:
+    """Return why a sample does not count, as an event's code; None if it does.
+
+    Args:
+        sample: The sample, after frame and clock conversion.
+        at_ns: The tick that takes it [ns].
+        parameters: Largest plausible position and velocity.
+    """
+    if not _is_plausible(sample.position_m, parameters.max_position_m):
+        return INVALID
+    if sample.velocity_mps is not None and not _is_plausible(sample.velocity_mps, parameters.max_velocity_mps):
+        return INVALID
+    # A standard deviation beyond the largest position says nothing, and its square may overflow.
+    if not 0.0 < sample.std_m <= parameters.max_position_m:
+        return INVALID
+    if sample.received_ns > at_ns or sample.captured_ns > sample.received_ns + LATEST_STAMP_NS:
+        return FUTURE
+    return None
+
+
+def _is_far_out(sample: PositionSample, kalman: Kalman) -> bool:
+    """Whether a position is finite, but further out than any can be, as in another unit."""
+    largest_m = kalman.parameters.max_position_m
+    return all(map(math.isfinite, sample.position_m)) and not _is_plausible(sample.position_m, largest_m)
+
+
+def _is_plausible(values: Vec3, limit: float) -> bool:
+    return all(math.isfinite(value) and abs(value) <= limit for value in values)

@@ -1,0 +1,48 @@
+"""Monitor: does braking slow the vehicle down, by its own velocity?
+
+1. The speed is noted when braking begins, and again where positions come back after a silence.
+2. A second later the speed is more than 0.8 of it, and 0.3 m/s. Then: release.
+
+False alarms (docs/soak.md): 0 of 200 missions.
+"""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+
+from uavctl.flight.monitors.motion import TickObservation
+from uavctl.flight.monitors.observation import read_vehicle_velocity
+from uavctl.flight.monitors.verdict import NO_VERDICT, Cause, Verdict, release
+
+SHOWS_NS = 1_000_000_000  # time after which braking must have shown
+BRAKED, BRAKED_MPS = 0.8, 0.3  # it has not where the speed is above this part of the first one, and this more
+
+
+class BrakingState(msgspec.Struct, frozen=True):
+    """State of the monitor."""
+
+    began: tuple[int, float] | None = None  # when braking began [ns], and the speed then [m/s]; None while it does not
+    resumed_ns: int | None = None  # capture time of the first position after the last silence before that [ns]
+
+
+def update(state: BrakingState, observation: TickObservation) -> tuple[BrakingState, Verdict]:
+    """Take a tick."""
+    tick, motion = observation.tick, observation.motion
+    if state.resumed_ns != motion.resumed_ns:  # positions that come back correct the vehicle's own velocity
+        state = BrakingState(resumed_ns=motion.resumed_ns)
+    velocity = read_vehicle_velocity(tick.motion, tick.at_ns)
+    if not tick.braking:
+        return (state if state.began is None else BrakingState(resumed_ns=state.resumed_ns)), NO_VERDICT
+    if velocity is None:
+        return state, NO_VERDICT
+    speed_mps = math.hypot(*velocity)
+    if state.began is None:
+        return BrakingState((tick.at_ns, speed_mps), state.resumed_ns), NO_VERDICT
+    since_ns, began_mps = state.began
+    # v > 0.8 v_0 + 0.3 m/s
+    if tick.at_ns - since_ns < SHOWS_NS or speed_mps <= BRAKED * began_mps + BRAKED_MPS:
+        return state, NO_VERDICT
+    text = f"braking does not brake: {began_mps:.1f} m/s then, {speed_mps:.1f} m/s now"
+    return state, release(Cause.BRAKING, text)

@@ -1,0 +1,113 @@
+"""Monitors of the vehicle's motion: run in each tick of a flight, and while others fly an armed vehicle.
+
+1. The shared record of motion takes the tick (`uavctl.flight.monitors.motion`).
+2. Each believed position goes through the monitors of acceleration and velocity.
+3. Then the monitors of the tick are asked: an open contradiction, outside the room, braking.
+4. The first verdict counts. A position is clean if all was quiet at it: what came later is dropped after a release.
+"""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+from msgspec.structs import replace
+
+from uavctl.flight.monitors import acceleration, braking, outside, velocity
+from uavctl.flight.monitors.acceleration import AccelerationState
+from uavctl.flight.monitors.braking import BrakingState
+from uavctl.flight.monitors.motion import Motion, TickObservation, take_position, update_motion
+from uavctl.flight.monitors.observation import EnvelopeParameters, Observation, select_axes
+from uavctl.flight.monitors.observer import Observer
+from uavctl.flight.monitors.outside import OutsideState
+from uavctl.flight.monitors.velocity import VelocityState
+from uavctl.flight.monitors.verdict import NO_VERDICT, Cause, Verdict
+from uavctl.records import PositionSample, Vec3
+
+# Time of a flight after which positions of another body or frame would have been found.
+CONFIRMS_NS = 2_000_000_000
+
+
+class MonitorState(msgspec.Struct, frozen=True, eq=False):
+    """State of the monitors that one tick leaves to the next."""
+
+    motion: Motion = Motion()
+    acceleration: AccelerationState = AccelerationState()
+    velocity: VelocityState = VelocityState()
+    outside: OutsideState = OutsideState()
+    braking: BrakingState = BrakingState()
+    clean_ns: int | None = None  # capture time of the last position at which all was quiet [ns]; None before any
+    agreed: bool = False  # whether positions agreed with the vehicle's inertial data before the flight
+
+    @property
+    def confirms_positions(self) -> bool:
+        """Whether positions have agreed with the flight for so long that they must be those of this vehicle."""
+        began_ns, tick_ns = self.motion.began_ns, self.motion.tick_ns
+        return self.agreed or (began_ns is not None and tick_ns is not None and tick_ns - began_ns >= CONFIRMS_NS)
+
+
+INITIAL = MonitorState()
+
+
+def update(
+    state: MonitorState, observation: Observation, parameters: EnvelopeParameters
+) -> tuple[MonitorState, Verdict]:
+    """Take a tick.
+
+    Args:
+        state: State that the tick before left; `INITIAL` where a flight begins.
+    """
+    observation = select_axes(observation, parameters)
+    state = replace(state, motion=update_motion(state.motion, observation, parameters))
+    first = NO_VERDICT
+    for sample in sorted(observation.samples, key=lambda one: min(one.captured_ns, one.received_ns)):
+        state, verdict = _update_with_position(state, sample, observation, parameters)
+        first = verdict if first.is_none else first
+    tick = TickObservation(observation, state.motion, parameters)
+    velocity_state, unresolved = velocity.update_silence(state.velocity, tick)
+    outside_state, is_out = outside.update(state.outside, tick)
+    braking_state, no_effect = braking.update(state.braking, tick)
+    state = replace(state, velocity=velocity_state, outside=outside_state, braking=braking_state)
+    return state, _select_first(first, unresolved, is_out, no_effect)
+
+
+def _update_with_position(
+    state: MonitorState, sample: PositionSample, tick: Observation, parameters: EnvelopeParameters
+) -> tuple[MonitorState, Verdict]:
+    motion, position = take_position(state.motion, sample, tick, parameters)
+    if position is None:
+        return replace(state, motion=motion), NO_VERDICT
+    acceleration_state, response = acceleration.update(state.acceleration, position)
+    if acceleration_state.is_hinted:
+        position = replace(position, is_hinted=True)
+    velocity_state, contradiction = velocity.update(state.velocity, position)
+    is_clean = acceleration_state.is_quiet and velocity_state.agrees(parameters)
+    state = MonitorState(
+        motion=motion,
+        acceleration=acceleration_state,
+        velocity=velocity_state,
+        outside=state.outside,
+        braking=state.braking,
+        clean_ns=position.at_ns if position.begins or is_clean else state.clean_ns,
+        agreed=state.agreed,
+    )
+    if response.cause is Cause.SCATTER:  # both others say more of what is wrong
+        return state, _select_first(contradiction, response)
+    return state, _select_first(response, contradiction)
+
+
+def _select_first(*verdicts: Verdict) -> Verdict:
+    return next((verdict for verdict in verdicts if not verdict.is_none), NO_VERDICT)
+
+
+def continue_unengaged(state: MonitorState, inertial_mps2: Vec3) -> MonitorState:
+    """Return the state for a vehicle that others fly from now on: it goes on from what inertial data have shown.
+
+    Args:
+        inertial_mps2: Acceleration that they show now, local NED [m/s²].
+    """
+    last = state.motion.observer
+    if last is None or last.inertial is None or state.motion.tick_ns is None:
+        return INITIAL
+    observer = Observer(at_ns=last.at_ns, mean=last.inertial, cov=last.cov, accel_mps2=np.array(inertial_mps2))
+    motion = Motion(observer=observer, tick_ns=state.motion.tick_ns, sent=((last.at_ns, inertial_mps2),))
+    return MonitorState(motion=motion, clean_ns=state.clean_ns)

@@ -1,0 +1,77 @@
+"""Monitor: is the estimate outside the room, or about to leave it faster than the vehicle can brake?
+
+1. Each side of each axis: is the estimate beyond the limit by more than the margin, and not on its way back?
+2. Would the distance to stop end beyond the margin?
+3. One of both holds for 0.1 s. Then: release.
+
+False alarms (docs/soak.md): 0 of 200 missions.
+"""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+
+from uavctl.flight.limits import AXES
+from uavctl.flight.monitors.motion import TickObservation
+from uavctl.flight.monitors.observation import EnvelopeParameters, Observation
+from uavctl.flight.monitors.verdict import NO_VERDICT, Cause, Verdict, release
+
+LASTS_NS = 100_000_000  # one estimate alone may be a late sample's fault
+RETURNS_MPS = 0.3  # a vehicle outside that moves so fast towards the limit is on its way back
+REACTION_S = 0.3  # from a setpoint to its effect: recorded autopilots need 0.18 to 0.32 s
+
+
+class OutsideState(msgspec.Struct, frozen=True):
+    """State of the monitor."""
+
+    since_ns: int | None = None  # since when the estimate has been outside [ns]; None while it is not
+
+
+def update(state: OutsideState, observation: TickObservation) -> tuple[OutsideState, Verdict]:
+    """Take a tick."""
+    text = _describe_outside(observation.tick, observation.parameters)
+    if text is None:
+        return OutsideState(), NO_VERDICT
+    since_ns = state.since_ns or observation.tick.at_ns
+    lasts = observation.tick.at_ns - since_ns >= LASTS_NS
+    return OutsideState(since_ns), release(Cause.OUTSIDE, text) if lasts else NO_VERDICT
+
+
+def is_outside(observation: Observation, parameters: EnvelopeParameters) -> bool:
+    """Whether the estimate is outside by more than the margin, or about to be."""
+    return _describe_outside(observation, parameters) is not None
+
+
+def describe_beyond(observation: Observation, parameters: EnvelopeParameters) -> str:
+    """Return the limit that the estimate is beyond by more than the margin, not on its way back; empty if none."""
+    return _describe_outside(observation, parameters, brakes=False) or ""
+
+
+def _describe_outside(observation: Observation, parameters: EnvelopeParameters, *, brakes: bool = True) -> str | None:
+    """Return how the estimate is outside, or about to be (`brakes`: it must be able to stop before); None if not."""
+    if observation.position_m is None:
+        return None
+    rows = zip(
+        AXES,
+        parameters.axes,
+        observation.position_m,
+        observation.velocity_mps,
+        parameters.lower_m,
+        parameters.upper_m,
+        parameters.outside_m,
+        parameters.brake_mps2,
+        strict=True,
+    )
+    for axis, has, position, velocity, lower, upper, margin, brake in rows:
+        if has and not math.isfinite(position + velocity):
+            return f"the estimate of {axis} is no number"
+        for out_m, outward in ((lower - position, -velocity), (position - upper, velocity)):
+            if out_m > margin and outward > -RETURNS_MPS:
+                return f"the estimate is {out_m:.1f} m beyond the limit of {axis}"
+            # s = v T + v² / 2 a
+            stop_m = outward * REACTION_S + outward * outward / (2.0 * brake)
+            if brakes and outward > 0.0 and out_m + stop_m > margin:
+                return f"the estimate leaves the limit of {axis} at {outward:.1f} m/s, faster than it can brake"
+    return None

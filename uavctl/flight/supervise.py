@@ -1,0 +1,377 @@
+"""Phase 2 of a tick: run the monitors, and turn their verdicts into actions.
+
+This is the only table from verdicts to actions:
+
+    monitor               verdict                     positions           inertial data       flight
+    engaged               release (`envelope-…`)      drop since clean    -                   RELEASED: level, land
+    sources               release, source moved       drop since clean    -                   POSITIONS_DISTRUSTED
+    sources               release, all absurd         drop since clean    -                   POSITIONS_DISTRUSTED
+    sources, in WAIT      release, all absurd         drop since clean    -                   RELEASED
+    external              release, too late           -                   -                   CONTROLLER_FAILED
+    external              release, near a wall        -                   -                   the same, in phase 4
+    inertial              distrust inertial data      -                   drop since the      -
+                                                                          newest position
+    outliers              brake, positions jumped     refused (phase 1)   -                   BRAKE while a plan flies
+    sources               brake, all absurd           refused (phase 1)   -                   BRAKE while a plan flies
+    prediction            brake                       -                   -                   BRAKE while a plan flies
+    stale                 distrust positions          drop (phase 1)      -                   -
+    vehicle_velocity      distrust its velocity       -                   -                   brake by the prediction
+    unengaged             release, while carried      drop after phase 5  -                   no climb on positions
+
+1. Inertial data are compared with the vehicle's own velocity.
+2. While we fly, the motion is watched; while others fly an armed vehicle, its positions are compared with its inertial
+   data, or with its own velocity.
+3. Data that are distrusted are dropped from the filter, and the estimate is made anew.
+"""
+
+from __future__ import annotations
+
+import msgspec
+from msgspec.structs import replace
+
+from uavctl.flight.context import FilterView, TickContext, observe_motion, read_position, read_velocity, view_filter
+from uavctl.flight.controller import Controller
+from uavctl.flight.estimator import (
+    FilterHistory,
+    distrust_inertial,
+    drop_samples,
+    make_estimate,
+    predict_ahead,
+    predict_belief,
+)
+from uavctl.flight.fallback import FallbackEnd
+from uavctl.flight.kalman import Belief, read_capture_ns
+from uavctl.flight.limits import ZERO
+from uavctl.flight.measure import Measured
+from uavctl.flight.monitors import engaged, external, inertial, outside, vehicle_velocity
+from uavctl.flight.monitors.engaged import INITIAL, MonitorState
+from uavctl.flight.monitors.external import AnswerObservation, ExternalState, WallObservation
+from uavctl.flight.monitors.inertial import InertialObservation, Source
+from uavctl.flight.monitors.outliers import OutlierTrack
+from uavctl.flight.monitors.vehicle_velocity import VelocityObservation
+from uavctl.flight.monitors.verdict import NO_VERDICT, Cause, Verdict, brake, release
+from uavctl.flight.state import ControlState, MonitorGroup, SourceHealth
+from uavctl.records import ControlMode, Estimate, Order
+
+# Causes after which no position is believed any more.
+OF_POSITIONS = frozenset({Cause.RESPONSE, Cause.VELOCITY, Cause.SCATTER})
+RELEASES = OF_POSITIONS.union({Cause.OUTSIDE, Cause.BRAKING})
+
+PLAYED_OUT_STEPS = 2  # without a position: from there on a prediction is compared with the vehicle's own velocity
+REPLAN_STEPS = 3  # for which a plan is made anew once positions were dropped: the setpoint is slew-limited
+
+_ABSURD = release(Cause.OUTSIDE, "all positions are further out than any can be, as if they were in another unit")
+_JUMPED = brake(Cause.JUMP, "positions jumped: braking until they are believed again, or not any more")
+_ABSURD_SO_FAR = brake(
+    Cause.ABSURD, "positions are further out than any can be: braking until they are believed again, or not any more"
+)
+_ENDS = {
+    Cause.CONTROLLER_LATE: FallbackEnd.CONTROLLER_FAILED,
+    Cause.SOURCE_MOVED: FallbackEnd.POSITIONS_DISTRUSTED,
+    Cause.ABSURD: FallbackEnd.POSITIONS_DISTRUSTED,
+    **dict.fromkeys(RELEASES, FallbackEnd.RELEASED),
+}
+
+
+class Supervised(msgspec.Struct, frozen=True, eq=False):
+    """Result of phase 2: what the verdicts make of the tick."""
+
+    view: FilterView  # the filter without what was dropped
+    monitors: MonitorGroup
+    consecutive_samples: int  # fresh samples in a row
+    released: Verdict | None  # the verdict that releases the vehicle in this tick; None for none
+    ends: tuple[FallbackEnd, ...]  # ends of the flight on plans that verdicts ask for, in this order
+    brake: Verdict  # verdict that brakes while a plan flies
+    plan_base: Belief | None  # belief that a plan begins with, at a boundary: for the time at which inputs begin to act
+    wall: Verdict  # verdict that gives up a controller of another package in place of its next plan
+    clean_ns: int | None  # capture time after which positions were dropped [ns]; None where none were
+    replan: bool  # whether a plan is made anew though no position is new
+    drop_after_ns: int | None  # capture time after which positions are dropped once the tick is over [ns]
+    unsafe_to_climb: str  # why a vehicle that others fly must not climb on by its positions; empty if it may
+    position_inconsistent: bool  # that is because positions cannot be its own
+    newest_inconsistent: bool  # the newest position is further off its inertial data than noise explains
+
+
+def distrusts_positions(state: ControlState) -> bool:
+    """Whether positions are distrusted for good: then they are not passed on to the vehicle either."""
+    flown, verdict = state.fallback.flown, state.monitors.release
+    moved = flown is not None and flown.end is FallbackEnd.POSITIONS_DISTRUSTED
+    if moved or state.fallback.jump_suspected or verdict is None:
+        return moved or state.fallback.jump_suspected
+    # An estimate that is outside right after the start may be so because positions are wrong.
+    return verdict.cause in OF_POSITIONS or not state.monitors.engaged.confirms_positions
+
+
+def supervise(state: ControlState, context: TickContext, measured: Measured) -> Supervised:
+    """Run the monitors, and turn their verdicts into actions."""
+    controller, at_ns, samples = context.controller, context.at_ns, measured.samples
+    view = view_filter(measured.history, context)
+    inertial_verdict = _judge_inertial(state, view, context)
+    if not inertial_verdict.is_none:
+        view = view_filter(distrust_inertial(controller.kalman, view.history, at_ns), context)
+    return_ordered = _is_return_ordered(state, view, context)
+    monitors, released = _watch_flight(state, view, measured, context, return_ordered)
+    sources = _judge_sources(measured, context)
+    clean_ns, consecutive = samples.clean_ns, samples.consecutive_samples
+    if not (released.is_none and sources.is_none):
+        clean_ns, consecutive = min(clean_ns or at_ns, monitors.clean_ns or at_ns), 0
+        view = view_filter(_drop_after(view.history, clean_ns, controller), context)
+    if context.is_boundary and view.age_steps is not None and view.age_steps >= controller.horizon:
+        consecutive = 0
+    external_state, late = _judge_answer(state, context)
+    rolled_back = clean_ns is not None or not inertial_verdict.is_none
+    rolled_back_step = context.step if rolled_back else state.monitors.rolled_back_step
+    since = None if rolled_back_step is None else context.step - rolled_back_step
+    replans = since is not None and (0 < since <= REPLAN_STEPS or not inertial_verdict.is_none)
+    plan_base = _predict_plan_base(view, measured, context) if context.is_boundary else None
+    unengaged = _watch_unengaged(state, view, measured, context)
+    return Supervised(
+        view=view,
+        monitors=MonitorGroup(
+            engaged=monitors,
+            unengaged=unengaged.state,
+            release=state.monitors.release if released.is_none else released,
+            position_inconsistent=unengaged.is_watched
+            and (state.monitors.position_inconsistent or unengaged.position_inconsistent),
+            return_ordered=return_ordered,
+            external=external_state,
+            rolled_back_step=rolled_back_step,
+        ),
+        consecutive_samples=consecutive,
+        released=None if released.is_none else released,
+        ends=tuple(_ENDS[one.cause] for one in (late, sources, released) if one.cause is not None),
+        brake=_judge_plan(state, monitors, samples.sources, view, context),
+        plan_base=plan_base,
+        wall=_judge_wall(state, plan_base, context),
+        clean_ns=clean_ns,
+        replan=context.is_boundary and replans,
+        drop_after_ns=unengaged.drop_after_ns,
+        unsafe_to_climb=unengaged.unsafe_to_climb,
+        position_inconsistent=unengaged.position_inconsistent,
+        newest_inconsistent=unengaged.newest_inconsistent,
+    )
+
+
+def _drop_after(history: FilterHistory, clean_ns: int, controller: Controller) -> FilterHistory:
+    """Drop what was captured after `clean_ns` and believed."""
+    return drop_samples(controller.kalman, history, lambda sample: read_capture_ns(sample) > clean_ns)
+
+
+def _judge_inertial(state: ControlState, view: FilterView, context: TickContext) -> Verdict:
+    """Compare what inertial data have carried on without a position with the vehicle's own velocity."""
+    belief, motion, controller = view.belief, context.inputs.motion, context.controller
+    if belief is None or controller.envelope is None or motion is None or motion.velocity_ns is None:
+        return NO_VERDICT
+    trust = belief.inertial
+    if trust.distrusted_ns is not None or trust.used_ns is None or trust.used_ns <= belief.captured_ns:
+        return NO_VERDICT
+    # Both at the same time: the vehicle's velocity of a quarter of a second ago does not show how it moves now.
+    then = predict_belief(controller.kalman, view.history, min(motion.velocity_ns, context.at_ns))
+    if then is None:
+        return NO_VERDICT
+    estimate = make_estimate(controller.kalman, then)
+    observation = observe_velocity(state, state.monitors.engaged, estimate, context)
+    consistent = observation is None or vehicle_velocity.is_inertial_consistent(observation)
+    comparison = InertialObservation(Source.VEHICLE_VELOCITY, consistent, context.at_ns, belief.captured_ns)
+    return inertial.update(trust, comparison)[1]
+
+
+def observe_velocity(
+    state: ControlState, monitors: MonitorState, estimate: Estimate | None, context: TickContext
+) -> VelocityObservation | None:
+    """Put together what the vehicle's own velocity is compared with; None where nothing is."""
+    bounds = context.controller.envelope
+    if bounds is None or estimate is None:
+        return None
+    tick = observe_motion(estimate, context, state.plan.sent_mps2)
+    return VelocityObservation(monitors, tick, estimate.age_s, bounds)
+
+
+def _is_return_ordered(state: ControlState, view: FilterView, context: TickContext) -> bool:
+    """Whether a vehicle is on its way back from outside the room because the operator has asked for it."""
+    bounds, inputs = context.controller.envelope, context.inputs
+    asked = state.monitors.return_ordered or any(command.order is Order.ENGAGE for command in inputs.commands)
+    if not asked or bounds is None:
+        return False
+    if context.unready:
+        return True
+    return outside.is_outside(observe_motion(view.estimate, context, state.plan.sent_mps2), bounds)
+
+
+def _watch_flight(
+    state: ControlState, view: FilterView, measured: Measured, context: TickContext, return_ordered: bool
+) -> tuple[MonitorState, Verdict]:
+    """Watch the vehicle's motion, as long as it is we who fly; return the verdict that releases it."""
+    monitors, verdict = _update_engaged(state, view, measured, context, return_ordered)
+    # No plan will be flown on them, and who waits in the air lands.
+    if (
+        context.mode is ControlMode.WAIT
+        and measured.samples.all_absurd
+        and context.is_ours
+        and context.controller.envelope is not None
+    ):
+        verdict = _ABSURD
+    return monitors, verdict
+
+
+def _update_engaged(
+    state: ControlState, view: FilterView, measured: Measured, context: TickContext, return_ordered: bool
+) -> tuple[MonitorState, Verdict]:
+    bounds, before = context.controller.envelope, state.monitors
+    if before.release is not None:
+        return before.engaged, NO_VERDICT
+    if bounds is None or not context.is_flown or not context.is_ours:
+        return INITIAL, NO_VERDICT
+    reading = measured.inertial
+    observation = observe_motion(
+        view.estimate,
+        context,
+        state.plan.sent_mps2,
+        measured.samples.accepted,
+        is_braking=context.mode is ControlMode.BRAKE,
+        inertial_mps2=None if reading is None else reading.accel_mps2,
+    )
+    # A prediction that is so old, or that the vehicle's own velocity contradicts, is compared with no limit.
+    is_old = view.age_steps is None or view.age_steps >= context.controller.horizon
+    if return_ordered or is_old or not _judge_prediction(state, before.engaged, view, context).is_none:
+        observation = replace(observation, position_m=None)
+    monitors = before.engaged
+    starts = monitors.motion.began_ns is None
+    if starts and before.unengaged.confirms_positions and reading is not None and not before.position_inconsistent:
+        monitors = replace(monitors, agreed=True)
+    return engaged.update(monitors, observation, bounds)
+
+
+def _judge_prediction(state: ControlState, monitors: MonitorState, view: FilterView, context: TickContext) -> Verdict:
+    """Compare a prediction without recent positions with the vehicle's own velocity."""
+    if (view.age_steps or 0) < PLAYED_OUT_STEPS:
+        return NO_VERDICT
+    observation = observe_velocity(state, monitors, view.estimate, context)
+    return NO_VERDICT if observation is None else vehicle_velocity.judge_prediction(observation)
+
+
+def _judge_sources(measured: Measured, context: TickContext) -> Verdict:
+    """Judge whether positions may be believed any more, while we fly."""
+    samples = measured.samples
+    if not context.is_flown or not (samples.source_moved or samples.all_absurd):
+        return NO_VERDICT
+    return release(Cause.SOURCE_MOVED if samples.source_moved else Cause.ABSURD, "")
+
+
+def _judge_plan(
+    state: ControlState, monitors: MonitorState, sources: SourceHealth, view: FilterView, context: TickContext
+) -> Verdict:
+    """Judge whether the plan that flies may fly on."""
+    if state.plan.flown is None:
+        return NO_VERDICT
+    if _is_likely(sources.outliers):
+        return _JUMPED
+    if context.controller.envelope is not None and _is_likely(sources.absurd):
+        return _ABSURD_SO_FAR
+    return _judge_prediction(state, monitors, view, context)
+
+
+def _is_likely(track: OutlierTrack | None) -> bool:
+    return track is not None and track.is_likely
+
+
+def _judge_answer(state: ControlState, context: TickContext) -> tuple[ExternalState, Verdict]:
+    """Judge the time that the last plan of a controller of another package took."""
+    took_ns, controller = context.inputs.answered_ns, context.controller
+    if not took_ns:
+        return state.monitors.external, NO_VERDICT
+    observation = AnswerObservation(controller.outside, took_ns, controller.tick_ns)
+    return external.update(state.monitors.external, observation)
+
+
+def _predict_plan_base(view: FilterView, measured: Measured, context: TickContext) -> Belief | None:
+    """Predict the belief that a plan begins with: for the time at which an input that is sent now begins to act."""
+    controller = context.controller
+    if context.at_ns == context.boundary_ns and not controller.dead_ns:
+        return view.belief
+    kalman, pending = controller.kalman, measured.pending_inputs
+    return predict_ahead(kalman, view.history, pending, context.boundary_ns, controller.dead_ns)
+
+
+def _judge_wall(state: ControlState, plan_base: Belief | None, context: TickContext) -> Verdict:
+    """Judge whether a controller of another package flies too fast towards a limit."""
+    controller = context.controller
+    if not controller.outside or state.plan.flown is None or plan_base is None or controller.envelope is None:
+        return NO_VERDICT
+    estimate = make_estimate(controller.kalman, plan_base)
+    missing = float("nan")
+    observation = WallObservation(
+        name=controller.outside,
+        position_m=read_position(estimate, controller.plant, missing),
+        velocity_mps=read_velocity(estimate, controller.plant, missing),
+        sent_mps2=state.plan.sent_mps2,
+        parameters=controller.envelope,
+        limits=controller.limits,
+        fallback=controller.fallback,
+    )
+    return external.judge_wall(observation)
+
+
+class _Unengaged(msgspec.Struct, frozen=True, eq=False):
+    """Result of watching an armed vehicle that others fly."""
+
+    state: MonitorState = INITIAL
+    is_watched: bool = False
+    drop_after_ns: int | None = None
+    unsafe_to_climb: str = ""
+    position_inconsistent: bool = False
+    newest_inconsistent: bool = False
+
+
+def _watch_unengaged(state: ControlState, view: FilterView, measured: Measured, context: TickContext) -> _Unengaged:
+    """Watch the positions of an armed vehicle that others fly."""
+    vehicle, reading = context.inputs.vehicle, measured.inertial
+    is_armed = vehicle is not None and vehicle.armed
+    if context.is_flown or not (is_armed or context.carried):
+        return _Unengaged()
+    monitors, verdict = _update_unengaged(state, measured, context)
+    jumped, inconsistent = measured.restarted and context.carried, not verdict.is_none
+    unsafe = ""
+    if jumped:
+        unsafe = "positions have jumped further than the vehicle can have come"
+    elif inconsistent:
+        unsafe = verdict.text
+    elif is_armed and vehicle is not None and not vehicle.landed:
+        unsafe = _describe_unsafe(view, context)
+    drops = inconsistent and context.carried
+    is_clipped = monitors.acceleration.clipped[-1:] == (True,)
+    return _Unengaged(
+        state=INITIAL if drops else monitors,
+        is_watched=True,
+        drop_after_ns=(monitors.clean_ns or context.at_ns) if drops else None,
+        unsafe_to_climb=unsafe,
+        position_inconsistent=jumped or inconsistent,
+        newest_inconsistent=bool(measured.samples.accepted) and is_clipped and reading is not None,
+    )
+
+
+def _update_unengaged(state: ControlState, measured: Measured, context: TickContext) -> tuple[MonitorState, Verdict]:
+    """Compare positions with inertial data in place of setpoints; without them, with the vehicle's own velocity."""
+    bounds, reading, before = context.controller.envelope, measured.inertial, state.monitors
+    if bounds is None:
+        return INITIAL, NO_VERDICT
+    accel_mps2 = ZERO if reading is None else reading.accel_mps2
+    monitors = before.unengaged
+    if monitors.motion.tick_ns is None and reading is not None and not distrusts_positions(state):
+        # The vehicle moves, and monitors that begin anew would not know how fast.
+        monitors = engaged.continue_unengaged(before.engaged, reading.accel_mps2)
+    observation = observe_motion(None, context, accel_mps2, measured.samples.accepted)
+    monitors, verdict = engaged.update(monitors, observation, bounds)
+    # Once positions were wrong the vehicle's own velocity may be, too: its estimate is made of them.
+    counts = not before.position_inconsistent if verdict.cause is Cause.VELOCITY else reading is not None
+    return monitors, verdict if counts else NO_VERDICT
+
+
+def _describe_unsafe(view: FilterView, context: TickContext) -> str:
+    """Return why a vehicle in the air that others fly must not climb on by what is known of its position."""
+    controller = context.controller
+    if view.age_steps is not None and view.age_steps >= controller.horizon:
+        return f"no position has come for {controller.horizon * controller.plant.dt_s:.1f} s"
+    if controller.envelope is None:
+        return ""
+    return outside.describe_beyond(observe_motion(view.estimate, context, ZERO), controller.envelope)

@@ -1,0 +1,179 @@
+"""A motion that the plant can make, nearest to positions over time, and plans along it that end at rest.
+
+1. `follow_positions` finds the motion by least squares over all of it; the model is kept exactly.
+2. `plan_along` makes a plan from each row: it follows the motion as long as it can, and then rests.
+3. `make_room` finds where the plant may rest, and where it comes to rest by the least inputs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from uavctl.arrays import Array
+from uavctl.flight.mission import Room, Trajectory
+from uavctl.smpc.plant import AXES, Plant
+
+# Cost of a change of input beside a miss of the position that it makes within a step. Without it the inputs
+# would ring: a sampled plant with more than two integrations cannot follow every sample with a steady hand.
+_CALM = 1e-2
+# Keeps the system regular where nothing shows a state; moves nothing that is shown.
+_REGULAR = 1e-12
+_FIRM = 1e3  # metres of a missed position that a unit of a state is worth that a motion begins without
+# A plan along a motion has to end at rest, and is to leave the motion late: what it does in a stage costs this many
+# times what the same does in the next. More would brake harder than a vehicle can, less would slow it down at once.
+_LATER = 2.0
+# Both are of steps of this length, or longer: of shorter ones an input does less and changes less, and braking takes
+# more of them.
+_STEP_S = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class PlantMotion:
+    """A motion of the plant, one row a Δt."""
+
+    states: Array  # (n, n_x), with x(k+1) = A x(k) + B u(k)
+    inputs: Array  # (n, n_u)
+
+
+def follow_positions(plant: Plant, positions_m: Array, velocities_mps: Array | None) -> PlantMotion:
+    """Motion of the plant nearest to positions (and velocities) given at each Δt, by least squares over all of it.
+
+    Args:
+        plant: The plant; its model without disturbances is kept exactly.
+        positions_m: (n, 3), local NED [m]; axes that the plant lacks are ignored.
+        velocities_mps: (n, 3) [m/s], or None.
+
+    """
+    n, n_x, n_u, dt_s = len(positions_m), plant.n_x, plant.n_u, plant.dt_s
+    columns = [AXES.index(axis) for axis in plant.axes]
+    position = np.eye(n_x)[list(plant.position_index)]
+    velocity = np.eye(n_x)[list(plant.velocity_index)]
+    rows = [sparse.kron(sparse.eye_array(n), position)]
+    right = [positions_m[:, columns].ravel()]
+    if velocities_mps is not None:
+        rows.append(sparse.kron(sparse.eye_array(n), dt_s * velocity))
+        right.append(dt_s * velocities_mps[:, columns].ravel())
+    loops = np.flatnonzero(_of_loops(plant))
+    if loops.size:
+        rows.append(sparse.kron(sparse.eye_array(1, n), _FIRM * np.eye(n_x)[loops]))
+        right.append(np.zeros(loops.size))
+    seen = sparse.vstack(rows)
+    now, then = sparse.eye_array(n - 1, n), sparse.eye_array(n - 1, n, k=1)
+    steps = max(2, round(2.0 * _STEP_S / plant.dt_s))
+    held = sum(np.linalg.matrix_power(plant.a, step) for step in range(steps)) @ plant.b
+    effect = np.linalg.norm(position @ held, axis=0) * max(_STEP_S / plant.dt_s, 1.0)
+    calm = sparse.kron(then - now, np.sqrt(_CALM) * np.diag(effect))
+    cost = sparse.block_diag([seen.T @ seen, calm.T @ calm])
+    model = sparse.hstack([sparse.kron(now, plant.a) - sparse.kron(then, np.eye(n_x)), sparse.kron(now, plant.b)])
+    regular = _REGULAR * sparse.eye_array(n * (n_x + n_u))
+    system = sparse.block_array([[cost + regular, model.T], [model, None]], format="csc")
+    given = np.concatenate([seen.T @ np.concatenate(right), np.zeros(n * n_u + (n - 1) * n_x)])
+    from scipy.sparse.linalg import spsolve  # loaded where a trajectory is flown, for it takes long
+
+    found = spsolve(system, given)
+    return PlantMotion(states=found[: n * n_x].reshape(n, n_x), inputs=found[n * n_x : n * (n_x + n_u)].reshape(n, n_u))
+
+
+def _of_loops(plant: Plant) -> NDArray[np.bool_]:
+    """Return which states (n_x,) belong to the vehicle's own loops.
+
+    They end by themselves: a motion cannot choose to begin with them, and inputs that made them zero at a given stage
+    would be large.
+    """
+    loops = np.zeros(plant.n_x, dtype=np.bool_)
+    for place in plant.velocity_index:
+        loops[place + 2 : place + 1 + len(plant.further)] = True  # behind position, velocity and acceleration
+    return loops
+
+
+def plan_along(plant: Plant, motion: PlantMotion, horizon: int, rest: int, lower: Array, upper: Array) -> Trajectory:
+    """For each row of a motion the plan that follows it from there as long as it can and rests from stage `rest` on.
+
+    The plan leaves the motion where inputs that grow from stage to stage bring it to rest; the place to rest at is
+    what comes of that, moved inside the limits.
+
+    Args:
+        motion: The motion; it ends with at least `rest` rows of rest.
+        horizon: H, stages of a plan [steps].
+        lower: Least place to rest at of each axis (n_axes,) [m].
+
+    Raises:
+        DesignError: The plant cannot rest everywhere.
+    """
+    n, n_x, n_u = len(motion.states), plant.n_x, plant.n_u
+    rows = np.minimum(np.arange(n)[:, None] + np.arange(rest + 1), n - 1)
+    states, inputs = motion.states[rows], motion.inputs[rows[:, :rest]]
+    reach = _reach(plant, rest)
+    later = _LATER ** min(plant.dt_s / _STEP_S, 1.0)
+    cost = np.asarray(np.kron(np.diag(later ** -np.arange(rest, dtype=np.float64)), np.eye(n_u)))
+    rest_x, rest_u = _equilibria(plant)
+    # At rest, wherever that is: the part of x_N that is no equilibrium has to vanish.
+    moving, seen = _moving(plant, rest_x), ~_of_loops(plant)
+    braked = states[:, rest] - states[:, rest] @ (reach[rest] @ _least(cost, moving @ reach[rest]) @ moving).T
+    places = np.clip(braked[:, list(plant.position_index)], lower, upper)
+    anchors, anchor_inputs = places @ rest_x, places @ rest_u
+    change = (anchors - states[:, rest])[:, seen] @ _least(cost, reach[rest][seen]).T
+    path_states, path_inputs = np.zeros((n, horizon, n_x)), np.zeros((n, horizon, n_u))
+    for t in range(rest):
+        path_states[:, t] = states[:, t] + change @ reach[t].T - anchors
+        path_inputs[:, t] = inputs[:, t] + change[:, t * n_u : (t + 1) * n_u] - anchor_inputs
+    return Trajectory(states=motion.states, anchors=anchors, path_states=path_states, path_inputs=path_inputs)
+
+
+def make_room(plant: Plant, rest: int, lower: Array, upper: Array) -> Room:
+    """Return where the plant may rest, and where it comes to rest by the least inputs of `rest` steps.
+
+    Args:
+        lower: Least place to rest at of each axis (n_axes,) [m].
+
+    Raises:
+        DesignError: The plant cannot rest everywhere.
+    """
+    rest_x, _ = _equilibria(plant)
+    moving, effect = _moving(plant, rest_x), _reach(plant, rest)[rest]
+    brakes = effect @ _least(np.eye(rest * plant.n_u), moving @ effect) @ moving
+    stopped = (np.eye(plant.n_x) - brakes) @ np.linalg.matrix_power(plant.a, rest)
+    return Room(
+        axes=tuple(AXES.index(axis) for axis in plant.axes),
+        lower=lower,
+        upper=upper,
+        rest=rest_x,
+        stop=stopped[list(plant.position_index)],
+    )
+
+
+def _reach(plant: Plant, steps: int) -> Array:
+    """Return how inputs u_0 … u_{steps-1} act on the states of stages 0 … steps (steps+1, n_x, steps n_u)."""
+    reach = np.zeros((steps + 1, plant.n_x, steps * plant.n_u))
+    for t in range(steps):
+        reach[t + 1] = plant.a @ reach[t]
+        reach[t + 1, :, t * plant.n_u : (t + 1) * plant.n_u] += plant.b
+    return reach
+
+
+def _least(cost: Array, effect: Array) -> Array:
+    """Matrix that gives the cheapest inputs with a wanted effect (in the span of `effect`)."""
+    cheap = np.linalg.solve(cost, effect.T)
+    least: Array = cheap @ np.linalg.pinv(effect @ cheap, rcond=1e-10)
+    return least
+
+
+def _moving(plant: Plant, rest_x: Array) -> Array:
+    """Rows (…, n_x) that vanish on equilibria, and elsewhere only by what ends by itself."""
+    loops = _of_loops(plant)
+    if not loops.any():
+        return np.asarray(np.linalg.svd(rest_x)[2][len(rest_x) :])
+    loops[list(plant.position_index)] = True
+    return np.asarray(np.eye(plant.n_x)[~loops])
+
+
+def _equilibria(plant: Plant) -> tuple[Array, Array]:
+    """State (n_axes, n_x) and input (n_axes, n_u) at rest, for each metre of each axis."""
+    units = [AXES.index(axis) for axis in plant.axes]
+    states = np.array([plant.equilibrium((float(i == 0), float(i == 1), float(i == 2))) for i in units])
+    drift = states @ (np.eye(plant.n_x) - plant.a).T
+    return states, np.asarray(np.linalg.lstsq(plant.b, drift.T, rcond=None)[0].T)
