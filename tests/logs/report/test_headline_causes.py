@@ -25,7 +25,7 @@ from logs.report.causes import GOOD, Headline, HeadlineCause, cause_of_text, ran
 from logs.report.headline import headline
 from logs.report.tlog_headline import headline_of
 from logs.report.verdicts import judge
-from uavctl.flight.envelope import OUTSIDE
+from uavctl.flight.monitors import verdict as monitor
 from uavctl.mavlink.codec import BAD_FIELD
 from uavctl.outcome import Cause, make_ending
 from uavctl.records import ControlMode, Event, LinkStats, RelayStats, Severity, VehicleStatus
@@ -338,7 +338,7 @@ def test_a_relay_that_is_held_back_as_the_vehicle_was_let_go_is_no_cause(
     row = RelayStats(at_ns=good.origin_ns + 6 * SECOND, sent=100, kept={}, last_ns=good.origin_ns + 5 * SECOND,
                      alone=False, silent_for=reason)  # fmt: skip
     if lets_go:
-        flight = told(flight, 5.0, OUTSIDE, "the estimate leaves a limit", Severity.ERROR)
+        flight = told(flight, 5.0, monitor.Cause.OUTSIDE, "the estimate leaves a limit", Severity.ERROR)
     found = head(dataclasses.replace(flight, relays=(row,)))
     assert (C.RELAY_SILENT in found.causes) != (lets_go and reason == "held back")
 
