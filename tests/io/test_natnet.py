@@ -10,7 +10,7 @@ from natnet_server import TICKS_PER_S, UPTIME_S, Body, descriptions, frame, mess
 from scipy.spatial.transform import Rotation
 
 from uavctl.errors import ConnectionSpecError
-from uavctl.frames import Frame, Up, levelled, rotate
+from uavctl.frames import Frame, Up, convert_pose_to_frd, rotate_vector
 from uavctl.io.camera import BodyPose, CameraError, CameraUrl, Echo, parse
 from uavctl.io.camera_host import Words, questions
 from uavctl.io.natnet import MISSING, NO_STAMP, SILENT, UNREADABLE, UNTRACKED, NatNet
@@ -150,11 +150,11 @@ def test_poses_agree_with_an_oracle_of_matrices(up: Up) -> None:
     axes = Rotation.from_matrix([list(row) for row in zip(forward, right, down, strict=True)])
     turned = Rotation.from_rotvec([0.3, -0.8, 0.5])
     x, y, z, w = turned.as_quat()
-    position_m, attitude = levelled((1.0, 2.0, 3.0), (w, x, y, z), up)
+    position_m, attitude = convert_pose_to_frd((1.0, 2.0, 3.0), (w, x, y, z), up)
     assert position_m == pytest.approx(axes.inv().apply([1.0, 2.0, 3.0]))
     want = axes.inv() * turned * axes
     for vector in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)):
-        assert rotate(attitude, vector) == pytest.approx(want.apply(vector))
+        assert rotate_vector(attitude, vector) == pytest.approx(want.apply(vector))
 
 
 @pytest.mark.parametrize(("up", "place"), [("y", (0.0, 1.5, 0.0)), ("z", (0.0, 0.0, 1.5))])
@@ -163,9 +163,9 @@ def test_a_raised_body_is_above_the_floor_and_a_nose_to_the_left_turns_left(
 ) -> None:
     half = math.radians(30.0) / 2  # about the axis that points up: to the left, seen from above
     axis = (0.0, math.sin(half), 0.0) if up == "y" else (0.0, 0.0, math.sin(half))
-    position_m, attitude = levelled(place, (math.cos(half), *axis), up)
+    position_m, attitude = convert_pose_to_frd(place, (math.cos(half), *axis), up)
     assert position_m == (0.0, 0.0, -1.5)
-    nose = rotate(Frame(yaw_deg=90.0).attitude_to_ned(attitude, euler=False), (1.0, 0.0, 0.0))
+    nose = rotate_vector(Frame(yaw_deg=90.0).attitude_to_ned(attitude, euler=False), (1.0, 0.0, 0.0))
     assert nose == pytest.approx((math.cos(math.radians(60)), math.sin(math.radians(60)), 0.0))
 
 

@@ -14,7 +14,7 @@ from sim_rig import Client
 
 from sim.autopilot.autopilot import UPTIME_NS
 from uavctl.config.connections import RelayConfig
-from uavctl.frames import from_euler
+from uavctl.frames import quaternion_from_euler
 from uavctl.mavlink.codec import Encoder, UnsendableError
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.mavlink.relay import MAX_AGE_NS, STUCK_AFTER, Pose, Relay
@@ -108,7 +108,7 @@ def test_what_arrives_after_the_tick_waits_for_the_next() -> None:
 
 
 def test_odometry_has_the_velocity_in_body_axes_and_without_one_it_is_a_position() -> None:
-    east = from_euler((0.0, 0.0, math.pi / 2))
+    east = quaternion_from_euler((0.0, 0.0, math.pi / 2))
     assert east is not None
     one = relay(message="odometry")
     one.take(sample(NOW, velocity=(0.0, 2.0, 0.0)), east)

@@ -14,7 +14,7 @@ from mavlink_rig import packets
 from places import DATA
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from uavctl.frames import to_euler
+from uavctl.frames import euler_from_quaternion
 from uavctl.mavlink.codec import Encoder
 from uavctl.mavlink.framing import MessageLayout, with_checksum
 from uavctl.mavlink.relay import Pose
@@ -163,7 +163,7 @@ POSITION, TURN = (1.0, -2.5, -0.0), (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))
         (
             "external_position",
             (Pose("vision-position-estimate", 5, POSITION, TURN, None),),
-            mavlink.MAVLink_vision_position_estimate_message(5, *POSITION, *to_euler(TURN), UNKNOWN),
+            mavlink.MAVLink_vision_position_estimate_message(5, *POSITION, *euler_from_quaternion(TURN), UNKNOWN),
         ),
         (
             "external_position",

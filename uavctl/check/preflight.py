@@ -18,7 +18,7 @@ from uavctl.check.findings import AIDED, HORIZONTAL, Heard, Item, ItemState, ite
 from uavctl.check.positions import CAMERA_AXES, extent_m, from_cameras, position_items, spread_m
 from uavctl.check.vehicle import clock_items, is_armed, parameter_items, vehicle_items, wanted
 from uavctl.config.types import Config
-from uavctl.frames import Quaternion, from_euler, multiply, to_euler
+from uavctl.frames import Quaternion, euler_from_quaternion, multiply_quaternions, quaternion_from_euler
 from uavctl.mavlink.connection import MavlinkConnection
 from uavctl.mavlink.messages import Message
 from uavctl.mavlink.relay import Relay
@@ -264,7 +264,7 @@ def _heading(seen: Heard, config: Config) -> tuple[Item, bool]:
         if _told(seen):
             told, hint = "the vehicle tells none", "let the vehicle stream ATTITUDE on this link"
         return item(name, ItemState.UNDETERMINED, told, want, hint), False
-    yaws = [to_euler(q)[2] for q in turns]
+    yaws = [euler_from_quaternion(q)[2] for q in turns]
     # Mean of directions: angles near 180 deg must not average to 0.
     yaw = math.degrees(math.atan2(sum(map(math.sin, yaws)), sum(map(math.cos, yaws))))
     tilt = float(np.median([math.degrees(math.acos(min(max(1 - 2 * (x * x + y * y), -1), 1))) for _, x, y, _ in turns]))
@@ -292,10 +292,10 @@ def _relative(seen: Heard) -> list[Quaternion]:
     times = [at_ns for at_ns, _ in seen.angles_rad]
     found = []
     for sample in seen.samples:
-        own = from_euler(seen.angles_rad[min(bisect_left(times, sample.captured_ns), len(times) - 1)][1])
+        own = quaternion_from_euler(seen.angles_rad[min(bisect_left(times, sample.captured_ns), len(times) - 1)][1])
         if sample.attitude is not None and own is not None:
             w, x, y, z = own
-            found.append(multiply(sample.attitude, (w, -x, -y, -z)))
+            found.append(multiply_quaternions(sample.attitude, (w, -x, -y, -z)))
     return found
 
 

@@ -199,7 +199,7 @@ def fly(
                     "the vehicle's own failsafe has it. See to the link and start again"
                 )
             reader.read_everything()
-            due = ticker.overslept(due)
+            due = ticker.update_after_wait(due)
             started_ns = now()
             first_ns = due.at_ns if first_ns is None else first_ns
             over = duration_s is not None and due.at_ns - first_ns >= duration_s * 1e9

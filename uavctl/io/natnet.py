@@ -19,7 +19,7 @@ from ipaddress import IPv4Address
 
 import natnet
 
-from uavctl.frames import Quaternion, Up, levelled, unit
+from uavctl.frames import Quaternion, Up, convert_pose_to_frd, normalise_quaternion
 from uavctl.io.camera import BodyPose, CameraError, Echo
 
 CONNECT, SERVER_INFO = 0, 1
@@ -154,7 +154,7 @@ class NatNet:
         if not exposed or not sent:  # a take that is played back, say
             return self._drop(NO_STAMP)
         x, y, z, w = body.rot
-        attitude = unit((w, x, y, z))
+        attitude = normalise_quaternion((w, x, y, z))
         if not 0 <= sent - exposed <= _MAX_EXPOSED_S * self._ticks_per_s:
             return self._drop(UNREADABLE)
         if not body.tracking_valid or attitude is None or not all(map(math.isfinite, body.pos)):
@@ -162,7 +162,7 @@ class NatNet:
         return (self._sight(exposed, body.pos, attitude),)
 
     def _sight(self, exposed_ticks: int, position_m: tuple[float, float, float], attitude: Quaternion) -> BodyPose:
-        return BodyPose(self._ns(exposed_ticks), *levelled(position_m, attitude, self._up))
+        return BodyPose(self._ns(exposed_ticks), *convert_pose_to_frd(position_m, attitude, self._up))
 
     def _drop(self, reason: str) -> tuple[BodyPose, ...]:
         self.dropped[reason] += 1

@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 
 from qtm_rt.packet import QRTComponentType, QRTPacket
 
-from uavctl.frames import Quaternion, Up, levelled, unit
+from uavctl.frames import Quaternion, Up, convert_pose_to_frd, normalise_quaternion
 from uavctl.io.camera import BodyPose, CameraError, Echo
 from uavctl.records import Vec3
 
@@ -141,7 +141,7 @@ class Qualisys:
         if attitude is None or not all(map(math.isfinite, place)):
             return self._drop(UNTRACKED)
         position_m: Vec3 = (place.x * 1e-3, place.y * 1e-3, place.z * 1e-3)
-        return (BodyPose(frame.timestamp * 1000, *levelled(position_m, attitude, self._up)),)
+        return (BodyPose(frame.timestamp * 1000, *convert_pose_to_frd(position_m, attitude, self._up)),)
 
     def _drop(self, reason: str) -> tuple[BodyPose, ...]:
         self.dropped[reason] += 1
@@ -173,4 +173,4 @@ def _turn(columns: tuple[float, ...]) -> Quaternion | None:
         (c - g, b + d, squares[2], f + h),
         (d - b, c + g, f + h, squares[3]),
     )
-    return unit(tuple(value / two for value in rows[largest]))
+    return normalise_quaternion(tuple(value / two for value in rows[largest]))

@@ -14,7 +14,14 @@ from typing import Any
 import msgspec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from uavctl.frames import Convention, Quaternion, from_euler, rotate, to_euler, unit
+from uavctl.frames import (
+    Convention,
+    Quaternion,
+    euler_from_quaternion,
+    normalise_quaternion,
+    quaternion_from_euler,
+    rotate_vector,
+)
 from uavctl.mavlink.framing import BadBytes, Fields, MessageLayout, Scan, scan, text_of
 from uavctl.mavlink.messages import (
     Ack,
@@ -63,13 +70,13 @@ def _attitude(raw: Fields) -> Attitude | None:
 
 
 def _attitude_quaternion(raw: Fields) -> Attitude | None:
-    turn = unit((raw.q1, raw.q2, raw.q3, raw.q4))
+    turn = normalise_quaternion((raw.q1, raw.q2, raw.q3, raw.q4))
     if turn is None:
         return None
     return Attitude(
         system=raw.src_system,
         component=raw.src_component,
-        angles_rad=to_euler(turn),
+        angles_rad=euler_from_quaternion(turn),
         quaternion=True,
         stamp_us=1000 * raw.time_boot_ms,
     )
@@ -226,11 +233,11 @@ def _from_usec(raw: Fields, usec: int, attitude: Quaternion | None, *, euler: bo
 
 
 def _with_angles(raw: Fields) -> Position:
-    return _from_usec(raw, raw.usec, from_euler((raw.roll, raw.pitch, raw.yaw)), euler=True)
+    return _from_usec(raw, raw.usec, quaternion_from_euler((raw.roll, raw.pitch, raw.yaw)), euler=True)
 
 
 def _with_quaternion(raw: Fields) -> Position:
-    return _from_usec(raw, raw.time_usec, unit(raw.q), euler=False)
+    return _from_usec(raw, raw.time_usec, normalise_quaternion(raw.q), euler=False)
 
 
 _ODOMETRY_AXES: dict[int, Convention] = {
@@ -258,7 +265,7 @@ def _odometry(raw: Fields) -> Position:
         position_m=_xyz(raw),
         velocity_mps=_odometry_velocity(raw),
         convention=axes,
-        attitude=unit(raw.q) if raw.child_frame_id in _BODY_AXES else None,
+        attitude=normalise_quaternion(raw.q) if raw.child_frame_id in _BODY_AXES else None,
     )
 
 
@@ -269,7 +276,7 @@ def _odometry_velocity(raw: Fields) -> Vec3 | None:
         return None
     if raw.child_frame_id in _BODY_AXES:
         q: Quaternion = (raw.q[0], raw.q[1], raw.q[2], raw.q[3])
-        return rotate(q, velocity)
+        return rotate_vector(q, velocity)
     return velocity if raw.child_frame_id == raw.frame_id else None
 
 
@@ -562,7 +569,7 @@ class Encoder:
         Raises:
             UnsendableError: a value is not finite, or the stamp does not fit.
         """
-        angles = to_euler(pose.attitude)
+        angles = euler_from_quaternion(pose.attitude)
         values = (*pose.position_m, *angles, *(pose.body_mps or ()))
         if not all(map(math.isfinite, values)) or not 0 < pose.usec < 2**64:
             raise UnsendableError(f"pose {values}, stamp {pose.usec} us: not finite, or no stamp")

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from uavctl.config.connections import RelayConfig
-from uavctl.frames import Quaternion, rotate
+from uavctl.frames import Quaternion, rotate_vector
 from uavctl.records import Event, PositionSample, Severity, Vec3
 
 MAX_AGE_NS = 200_000_000  # an older position would be taken for a new one by estimators that cannot look back
@@ -166,7 +166,7 @@ class Relay:
         body = None
         if self._config.message == "odometry" and sample.velocity_mps is not None:
             w, x, y, z = attitude
-            body = rotate((w, -x, -y, -z), sample.velocity_mps)
+            body = rotate_vector((w, -x, -y, -z), sample.velocity_mps)
         # A pose without a velocity goes as a position: an unknown one (NaN) is not safe to send to ArduPilot.
         message = "vision-position-estimate" if body is None else self._config.message
         return Pose(message, (sample.captured_ns - offset_ns) // 1000, sample.position_m, attitude, body)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import msgspec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from uavctl.frames import Quaternion, from_euler, rotate
+from uavctl.frames import Quaternion, quaternion_from_euler, rotate_vector
 from uavctl.mavlink.clocksync import ArrivalClock
 from uavctl.mavlink.codec import MODE_COMMANDS
 from uavctl.mavlink.messages import (
@@ -467,7 +467,7 @@ class VehicleWatch:
         """Return the rotation of a specific force at that time into local NED (w, x, y, z); None if old or unknown."""
         if self._turned is None or at_ns - self._turned[1] > TURNED_NS:
             return None
-        return from_euler(self._turned[0])
+        return quaternion_from_euler(self._turned[0])
 
     def _tells_time(self, kind: str, stamp_us: int, at_ns: int) -> tuple[VehicleStatus, ...]:
         """Watch its time since boot; a status tells at once that it has started anew."""
@@ -514,7 +514,7 @@ class VehicleWatch:
             self._bad(UNPUNCTUAL)
             return ()
         attitude = self.attitude(at_ns)
-        turned = None if attitude is None else rotate(attitude, message.specific_force_mps2)
+        turned = None if attitude is None else rotate_vector(attitude, message.specific_force_mps2)
         if turned is None:
             return ()
         self.inertial_used += 1

@@ -18,7 +18,7 @@ from whatif_rig import Case, again, config_of, flown, history
 
 from logs.recording.topics import encode
 from uavctl.build.controller import build_controller
-from uavctl.frames import Quaternion, from_euler, rotate
+from uavctl.frames import Quaternion, quaternion_from_euler, rotate_vector
 from uavctl.lab.whatif.comparison import model_fit
 from uavctl.lab.whatif.flight import Relinked, Response, fly, history_of, response_of
 from uavctl.lab.whatif.rewrite import InertialFrames, shifted
@@ -70,7 +70,7 @@ class Speaker:
 
 
 def turn(angles: Vec3) -> Quaternion:
-    found = from_euler(angles)
+    found = quaternion_from_euler(angles)
     assert found is not None
     return found
 
@@ -89,7 +89,7 @@ def test_a_shifted_specific_force_is_the_acceleration_more(kind: str, resolution
     speaker, attitude = Speaker(number=200), turn(LEANING)
     frame = speaker.feels(kind, 5_000_000, (0.31, -0.42, -9.77), first_version=first_version)
     moved = shifted(frame, attitude, BY)
-    was, now = (rotate(attitude, force_of(one)) for one in (frame.data, moved))
+    was, now = (rotate_vector(attitude, force_of(one)) for one in (frame.data, moved))
     assert was is not None and now is not None
     # The rounding of three fields, turned.
     np.testing.assert_allclose(np.subtract(now, was), BY, atol=math.sqrt(3.0) * resolution)

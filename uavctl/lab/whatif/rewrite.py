@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.config.connections import DaemonConfig, FrameConfig
-from uavctl.frames import Frame, Quaternion, rotate
+from uavctl.frames import Frame, Quaternion, rotate_vector
 from uavctl.mavlink.codec import decode
 from uavctl.mavlink.framing import RawFrame, scan
 from uavctl.mavlink.messages import Position
@@ -72,7 +72,7 @@ class SourceFrames:
             vx, vy, vz = self._from_ned(seen.position, by_mps)
             if seen.frame.message_id == mavlink.MAVLINK_MSG_ID_ODOMETRY and message.child_frame_id in _BODY_AXES:
                 turn: Quaternion = (message.q[0], -message.q[1], -message.q[2], -message.q[3])
-                vx, vy, vz = rotate(turn, (vx, vy, vz)) or NOWHERE  # a velocity is only read with a rotation
+                vx, vy, vz = rotate_vector(turn, (vx, vy, vz)) or NOWHERE  # a velocity is only read with a rotation
             message.vx, message.vy, message.vz = message.vx + vx, message.vy + vy, message.vz + vz
         if stamp_us is not None:
             _stamp(message, stamp_us)
@@ -169,7 +169,7 @@ def shifted(frame: RawFrame, attitude: Quaternion, by_mps2: Vec3) -> bytes:
         attitude: Body axes forward, right, down to local NED (w, x, y, z).
     """
     w, x, y, z = attitude
-    by = rotate((w, -x, -y, -z), by_mps2)
+    by = rotate_vector((w, -x, -y, -z), by_mps2)
     if by is None or by_mps2 == (0.0, 0.0, 0.0):
         return frame.data
     message: Any = mavlink.MAVLink(None).decode(bytearray(frame.data))
