@@ -17,10 +17,10 @@ from uavctl.errors import in_words
 from uavctl.flight.controller import Controller
 from uavctl.flight.decision import CONTROLLER_FAULT
 from uavctl.flight.step import BIAS_AT_BOUND, BIAS_FREE, STRONG_PUSH, StepOutput, disbelieves, initial_state, step
-from uavctl.mavlink.connection import HUNG_UP, NO_HEARTBEAT, OVERRUN, STAMP_UNIT, WENT_SILENT, MavlinkConnection
-from uavctl.mavlink.handover import HAND_OVER_ORDERS, HandOver, HandoverStep
-from uavctl.mavlink.handover_guards import HandoverView, against_moving
-from uavctl.mavlink.handover_states import LEAVES_NONE, HandoverState, Sending
+from uavctl.mavlink.connection import CONNECTION_SILENT, HUNG_UP, NO_HEARTBEAT, OVERRUN, STAMP_UNIT, MavlinkConnection
+from uavctl.mavlink.handover import HAND_OVER_ORDERS, HandoverOutput, HandoverStateMachine
+from uavctl.mavlink.handover_guards import HandoverInput, explain_move_refusal
+from uavctl.mavlink.handover_states import NOT_LEFT_IN_FLIGHT, HandoverState, SetpointMode
 from uavctl.mavlink.messages import Ack, Message, Text
 from uavctl.mavlink.relay import Relay
 from uavctl.outcome import Cause, FlightCourse
@@ -69,7 +69,7 @@ FOR_A_PERSON = frozenset(
         STRONG_PUSH,
         CONTROLLER_FAULT,
         HUNG_UP,
-        WENT_SILENT,
+        CONNECTION_SILENT,
         NO_HEARTBEAT,
         STAMP_UNIT,
     }
@@ -115,7 +115,7 @@ class ControlLoop:
         self._stopwatch = stopwatch
         self._links = make_links(config)
         self._relay, self._relays = Relay(config.relay), config.relay.enabled
-        self._hand_over = HandOver(config.hand_over, sees_it_down=config.relay.enabled)
+        self._hand_over = HandoverStateMachine(config.hand_over, sees_it_down=config.relay.enabled)
         self._config = config.hand_over
         self._heard: tuple[Ack | Text, ...] = ()
         self._state = initial_state()
@@ -206,7 +206,7 @@ class ControlLoop:
     @property
     def leaves_vehicle(self) -> bool | None:
         """Whether a vehicle would be left behind that has flown on our setpoints; None before one is heard."""
-        return None if self.who_flies is HandoverState.WAITING else self.who_flies not in LEAVES_NONE
+        return None if self.who_flies is HandoverState.WAITING else self.who_flies not in NOT_LEFT_IN_FLIGHT
 
     def receive(self, link: str, data: bytes, at_ns: int) -> Received:
         """Take one datagram that arrived at `at_ns`; of positions, ticks before that time see nothing."""
@@ -374,7 +374,7 @@ class ControlLoop:
     def against(self, order: Order) -> str:
         """Return why an order of where to fly would have no effect now; empty if it may be taken, or is another one."""
         moves = order in (Order.GOTO, Order.HOLD, Order.RESUME)
-        return against_moving(self.who_flies, self._vehicle) if moves else ""
+        return explain_move_refusal(self.who_flies, self._vehicle) if moves else ""
 
     def timing(self, ticked: Ticked, lateness_ns: int, send_ns: int) -> None:
         """Record what the shell measured around a tick."""
@@ -461,7 +461,7 @@ class ControlLoop:
         for event in out.events:
             self._put("/uavctl/event", at_ns, event)
 
-    def _noted(self, told: HandoverStep, at_ns: int) -> Iterator[Event]:
+    def _noted(self, told: HandoverOutput, at_ns: int) -> Iterator[Event]:
         """Note what the hand-over did; yields what a person has to be told of it: whoever ordered gets the answer."""
         if told.passage is not None:
             self.course.turn(told.passage, self._vehicle)
@@ -470,13 +470,13 @@ class ControlLoop:
             if event.severity is not Severity.INFO and event.code != ORDER_REFUSED:
                 yield event
 
-    def _command(self, told: HandoverStep, out: StepOutput, at_ns: int, send: Send) -> None:
+    def _command(self, told: HandoverOutput, out: StepOutput, at_ns: int, send: Send) -> None:
         """Send the vehicle what the hand-over wants: a setpoint, a request, or nothing."""
         link = self._links[VEHICLE]
         sure = self._unsure_since_ns is None
-        if sure and told.sending is not Sending.NOTHING and out.setpoint is not None:
+        if sure and told.sending is not SetpointMode.NOTHING and out.setpoint is not None:
             self._put("/uavctl/setpoint", at_ns, out.setpoint)
-            if told.sending is Sending.SETPOINTS:
+            if told.sending is SetpointMode.SETPOINTS:
                 self._controlled_ns = at_ns
             send(self._outgoing(VEHICLE, link.setpoint(out.setpoint), at_ns))
         if sure and told.ask is not None:
@@ -500,7 +500,7 @@ class ControlLoop:
             text = "land: the vehicle is asked for it"
             yield command, replace(event, severity=Severity.INFO, code=ORDER_ACCEPTED, text=text) if landing else event
 
-    def _view(self, inp: StepInput, out: StepOutput) -> HandoverView:
+    def _view(self, inp: StepInput, out: StepOutput) -> HandoverInput:
         """Return the inputs of the hand-over in this tick."""
         plant, estimate = self._controller.plant, out.estimate
         up_m, up_mps = None, 0.0
@@ -512,7 +512,7 @@ class ControlLoop:
             unfit = "the controller has no estimate of the position"
         elif estimate.age_s > self._config.fresh_s:
             unfit = f"the newest position is {estimate.age_s:.1f} s old"
-        return HandoverView(
+        return HandoverInput(
             at_ns=inp.at_ns,
             vehicle=self._vehicle,
             up_s=self._links[VEHICLE].vehicle_up_s(inp.at_ns),

@@ -11,11 +11,11 @@ from enum import StrEnum
 from msgspec.structs import replace
 
 from uavctl.flight.decision import CONTROLLER_FAULT, MISSION_OVER
-from uavctl.mavlink.handover import Passage
-from uavctl.mavlink.handover_guards import BROKEN_OFF, fails, silent
+from uavctl.mavlink.handover import StateTransition
+from uavctl.mavlink.handover_guards import CLIMB_ABORTED, is_in_failsafe, is_silent
 from uavctl.mavlink.handover_states import HandoverEvent, HandoverState
 from uavctl.mavlink.requests import RequestKind
-from uavctl.mavlink.switcher import PERSONS, Switcher
+from uavctl.mavlink.switcher import PERSON_REASONS, ModeReason
 from uavctl.records import ORDER_ACCEPTED, ControlMode, Decision, Ending, Event, Order, VehicleStatus
 
 SECOND_NS = 1_000_000_000
@@ -71,11 +71,11 @@ TAKEN = frozenset({Cause.PILOT, Cause.PILOT_LANDED, Cause.GROUND_STATION})
 # Ends that somebody wanted: the operator, the mission, or whoever has taken over.
 WANTED = TAKEN | {Cause.MISSION, Cause.ORDERED, Cause.OPERATOR, Cause.TIME, Cause.IN_FLIGHT}
 _SWITCHED = {
-    Switcher.PILOT: Cause.PILOT,
-    Switcher.GROUND_STATION: Cause.GROUND_STATION,
-    Switcher.FAILSAFE: Cause.FAILSAFE,
-    Switcher.FENCE: Cause.FENCE,
-    Switcher.UNKNOWN: Cause.UNKNOWN_SWITCH,
+    ModeReason.PILOT: Cause.PILOT,
+    ModeReason.GROUND_STATION: Cause.GROUND_STATION,
+    ModeReason.FAILSAFE: Cause.FAILSAFE,
+    ModeReason.FENCE: Cause.FENCE,
+    ModeReason.UNKNOWN: Cause.UNKNOWN_SWITCH,
 }
 _LANDED = {Cause.PILOT: Cause.PILOT_LANDED, Cause.FAILSAFE: Cause.FAILSAFE_LANDED, Cause.FENCE: Cause.FENCE_LANDED}
 _OWN = frozenset({Cause.FAILSAFE, Cause.FENCE})
@@ -162,7 +162,7 @@ class FlightCourse:
             return
         self._armed = self._armed or vehicle.armed
         self._aloft = self._aloft or (vehicle.armed and not vehicle.landed)
-        self._fails = self._fails or (self._state in _COMES_DOWN and vehicle.armed and fails(vehicle))
+        self._fails = self._fails or (self._state in _COMES_DOWN and vehicle.armed and is_in_failsafe(vehicle))
 
     def decide(self, decision: Decision, events: tuple[Event, ...], *, estimated: bool) -> None:
         """Note what the controller decided in a tick."""
@@ -180,11 +180,11 @@ class FlightCourse:
         self._fell = next((one.text for one in events if one.code == CONTROLLER_FAULT), self._fell)
         ends = decision.mode in (ControlMode.LAND, ControlMode.STOPPED) and before in _FLOWN
         if ends and self._stop is None and not (self.let_go or self.died):
-            lost = silent(decision.at_ns, self._vehicle)
+            lost = is_silent(decision.at_ns, self._vehicle)
             landed = Cause.FALLBACK if decision.mode is ControlMode.LAND else Cause.FALLBACK_STOPPED
             self._find(self._asked or (Cause.SILENT if lost else landed), "" if self._asked else self._fell)
 
-    def turn(self, one: Passage, vehicle: VehicleStatus | None) -> None:
+    def turn(self, one: StateTransition, vehicle: VehicleStatus | None) -> None:
         """Note a transition of the hand-over."""
         self._state = one.after
         if one.after is HandoverState.ENGAGED or (
@@ -208,11 +208,11 @@ class FlightCourse:
         elif one.seen is HandoverEvent.LAND and self._stop is None and not self.engaged and self._found is None:
             self._asked = Cause.ORDERED
 
-    def _switch(self, who: Switcher, vehicle: VehicleStatus | None) -> None:
+    def _switch(self, who: ModeReason, vehicle: VehicleStatus | None) -> None:
         """Note that somebody has changed the mode to one that is none of ours; the newest word of it counts."""
         cause = _SWITCHED[who]
         before = self._found
-        if before is Cause.UNKNOWN_SWITCH or before in WANTED or (who in PERSONS and before in _OWN):
+        if before is Cause.UNKNOWN_SWITCH or before in WANTED or (who in PERSON_REASONS and before in _OWN):
             self._found = None  # it is known now; or the landing that was asked for does not come
         self._taken = cause
         said = "" if vehicle is None or not vehicle.said else f', "{vehicle.said}"'
@@ -252,7 +252,7 @@ class FlightCourse:
         if self._found is None:
             self._found, self._why = cause, why
 
-    def _refuse(self, one: Passage, vehicle: VehicleStatus | None) -> None:
+    def _refuse(self, one: StateTransition, vehicle: VehicleStatus | None) -> None:
         cause = _REFUSED.get(one.before, Cause.NOT_BEGUN)
         if one.before in (HandoverState.MODE, HandoverState.ARMING) and vehicle is not None and not vehicle.alone:
             cause = Cause.NOT_ALONE
@@ -262,7 +262,7 @@ class FlightCourse:
             cause = Cause.NO_TAKE_OFF if one.ask is RequestKind.TAKE_OFF and not one.granted else Cause.NO_CLIMB
         elif one.before is HandoverState.RETURNING:
             return  # the pilot has it still
-        elif silent(self._now_ns, vehicle):  # it has refused nothing, nor has the fallback landed it
+        elif is_silent(self._now_ns, vehicle):  # it has refused nothing, nor has the fallback landed it
             self._found = None if self._found in (Cause.FALLBACK, Cause.NO_CLIMB) else self._found
             self._find(Cause.SILENT, "")
         if cause is Cause.LANDING_FAILED:
@@ -278,11 +278,11 @@ class FlightCourse:
             return Cause.NO_VEHICLE
         if not vehicle.alone:
             return Cause.NOT_ALONE
-        if vehicle.armed or self._positions or silent(self._now_ns, vehicle):
+        if vehicle.armed or self._positions or is_silent(self._now_ns, vehicle):
             return Cause.NOT_BEGUN
         return Cause.NO_POSITIONS
 
-    def _disarm(self, one: Passage) -> None:
+    def _disarm(self, one: StateTransition) -> None:
         if one.before in (HandoverState.CLIMBING, HandoverState.ENGAGING, HandoverState.ENGAGED):
             self._find(Cause.DISARMED if self._aloft else Cause.NOT_RISEN, "")
         elif one.before not in _COMES_DOWN and self._found is not None and (self._aloft or self._found in _OWN):
@@ -298,7 +298,7 @@ class FlightCourse:
             return Cause.CONTROL, self.died
         if self.let_go:
             return Cause.LET_GO, self.let_go
-        if self._found is None and self._state is HandoverState.ENGAGED and silent(self._now_ns, self._vehicle):
+        if self._found is None and self._state is HandoverState.ENGAGED and is_silent(self._now_ns, self._vehicle):
             return Cause.SILENT, ""
         wanted = self._found is None or self._found in WANTED
         if self._failed and (wanted or self._found is Cause.FALLBACK):
@@ -340,7 +340,7 @@ class FlightCourse:
             flew = self._aloft and self._found is not Cause.DISARMED
             down = "it has landed and disarmed" if flew else "it is disarmed"
             return down if self._armed else "it was not armed"
-        if silent(self._now_ns, vehicle):
+        if is_silent(self._now_ns, vehicle):
             since_s = (self._now_ns - vehicle.at_ns) / SECOND_NS
             was = "stood on the ground" if vehicle.landed else "was in the air"
             return f"when it was last heard, {since_s:.0f} s before, it {was}, armed, {mode}"
@@ -349,14 +349,14 @@ class FlightCourse:
         return f"it is in the air, {mode}"
 
 
-def _reason(one: Passage) -> str:
+def _reason(one: StateTransition) -> str:
     """Return why something was refused, without what the cause says already."""
     asked = "" if one.ask is None else f"{one.ask.value}: "
     text = one.why
     for said in (
         asked,
         "take-off: ",
-        BROKEN_OFF,
+        CLIMB_ABORTED,
         "another vehicle is heard on this link: ",
         "the vehicle's own failsafe ",
         "the vehicle's own fence ",

@@ -25,12 +25,12 @@ from logs.recording.senders import ChosenVehicle, LogSender, SenderCounts, choos
 from logs.recording.summary import count
 from logs.recording.tlog import Tlog, TlogPacket, read_tlog
 from uavctl.errors import RecordingError
-from uavctl.mavlink.clocksync import ClockSync, StampUnit, StampUnitWatch
-from uavctl.mavlink.codec import OWN_ESTIMATE, decoded
+from uavctl.mavlink.clocksync import ClockSync, StampUnit, StampUnitDetector
+from uavctl.mavlink.codec import AUTOPILOT_ESTIMATE, decode_scan
 from uavctl.mavlink.framing import MessageLayout, scan_one
 from uavctl.mavlink.messages import Attitude, Battery, Heartbeat, Message, Position, Text
 from uavctl.mavlink.profile import autopilot_name, describe_mode
-from uavctl.mavlink.vehicle import Joiner
+from uavctl.mavlink.vehicle import StatusTextAssembler
 from uavctl.records import Datagram, Vec3
 
 _SETPOINT, _GLOBAL = mavlink.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED, mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT
@@ -186,7 +186,7 @@ class SentSource:
     captured_ns: list[int | None] = field(default_factory=list)
     refused: int = 0
     clock: ClockSync = field(default_factory=lambda: ClockSync(_WINDOW_NS, 0, _AHEAD_NS))
-    units: StampUnitWatch = field(default_factory=StampUnitWatch)
+    units: StampUnitDetector = field(default_factory=StampUnitDetector)
 
     def take(self, position_m: Vec3, velocity_mps: Vec3 | None, stamp_us: int | None, at_ns: int) -> None:
         """Take a position in local NED, with the stamp of its source."""
@@ -218,7 +218,7 @@ class _Reader:
         self._modes: list[ModeBegin] = []
         self._texts: list[SpokenText] = []
         self._beats_ns: list[int] = []
-        self._joined = Joiner()
+        self._joined = StatusTextAssembler()
         self._home_deg: tuple[float, float] | None = None
         self._parameters = ParameterReader()
         self._bad: Counter[str] = Counter()
@@ -240,7 +240,7 @@ class _Reader:
                 self._take_own(frame.message_id, frame.data, packet.at_ns)
         if message_of(packet.data) in _LOOKED_INTO and self._is_vehicle(system_of(packet.data)):
             self._take_parameter(packet)
-        understood = decoded(found)
+        understood = decode_scan(found)
         self._bad.update(understood.bad)
         for message in understood.messages:
             self._take_message(message, packet.at_ns)
@@ -370,7 +370,7 @@ class _Reader:
             modes=tuple(self._modes),
             texts=tuple(self._texts),
             messages=dict(sorted(self.counted.items())),
-            bad={reason: number for reason, number in sorted(self._bad.items()) if reason != OWN_ESTIMATE},
+            bad={reason: number for reason, number in sorted(self._bad.items()) if reason != AUTOPILOT_ESTIMATE},
             parameters=self._parameters.parameters(),
             notes=(*self._vehicle.notes, *log.notes),
             rates_hz={

@@ -12,7 +12,7 @@ import pytest
 from ticked_rig import ticked
 
 from uavctl.daemon import daemon as module
-from uavctl.daemon.daemon import Collector, Outcome, collected_between_ticks, realtime
+from uavctl.daemon.daemon import GarbageCollector, RealtimeSetting, control_garbage_collection, enable_realtime
 
 SECOND = 1_000_000_000
 
@@ -25,12 +25,12 @@ def _as_before() -> Iterator[None]:
     assert gc.isenabled() and gc.get_freeze_count() == 0
 
 
-def outcomes(found: tuple[Outcome, ...]) -> dict[str, Outcome]:
+def outcomes(found: tuple[RealtimeSetting, ...]) -> dict[str, RealtimeSetting]:
     return {outcome.part: outcome for outcome in found}
 
 
 def test_what_it_says_is_what_holds() -> None:
-    with realtime() as found:
+    with enable_realtime() as found:
         told = outcomes(found)
         assert told["scheduling"].ok == (os.sched_getscheduler(0) == os.SCHED_FIFO)
 
@@ -40,9 +40,9 @@ def test_without_permission_it_flies_on_and_says_what_to_do(monkeypatch: pytest.
         raise PermissionError
 
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
-    monkeypatch.setattr(module, "_may_lock", lambda: False)
+    monkeypatch.setattr(module, "_may_lock_memory", lambda: False)
     monkeypatch.setattr(resource, "getrlimit", lambda _: (65536, 65536))
-    with realtime() as found:
+    with enable_realtime() as found:
         told = outcomes(found)
         assert not told["scheduling"].ok and "LimitRTPRIO=20" in told["scheduling"].text
         # A limit that the memory fits in today would make an allocation fail in flight.
@@ -57,13 +57,13 @@ class _Ring:
 
 
 def test_what_was_there_is_not_walked_in_a_flight_and_nothing_is_collected_of_itself() -> None:
-    with collected_between_ticks():
+    with control_garbage_collection():
         assert not gc.isenabled() and gc.get_freeze_count() > 0
     assert gc.isenabled() and gc.get_freeze_count() == 0
 
 
 def test_garbage_goes_once_a_second_and_only_after_a_tick() -> None:
-    collector = Collector()
+    collector = GarbageCollector()
     gc.disable()
     try:
         collector.after_tick(ticked(0), 0)

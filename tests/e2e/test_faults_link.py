@@ -20,9 +20,9 @@ from uavctl.flight.gating import refusal
 from uavctl.mavlink import codec
 from uavctl.mavlink.codec import Encoder, decode
 from uavctl.mavlink.connection import Item, MavlinkConnection
-from uavctl.mavlink.handover import HandOver
-from uavctl.mavlink.handover_guards import HandoverView
-from uavctl.mavlink.handover_states import HandoverState, Sending
+from uavctl.mavlink.handover import HandoverStateMachine
+from uavctl.mavlink.handover_guards import HandoverInput
+from uavctl.mavlink.handover_states import HandoverState, SetpointMode
 from uavctl.mavlink.requests import RequestKind
 from uavctl.records import PositionSample, Setpoint, SetpointSource, Severity
 
@@ -267,9 +267,9 @@ def test_row_20_the_restart_is_told_once() -> None:
 
 @pytest.mark.fault(20)
 def test_row_20_a_rebooted_vehicle_is_let_go() -> None:
-    link, vehicle, hand_over = make_link(), Peer(1, 1), HandOver()
+    link, vehicle, hand_over = make_link(), Peer(1, 1), HandoverStateMachine()
     (flying,) = statuses(link.receive(vehicle.heartbeat(OFFBOARD, 129), NOW).items)
-    assert hand_over.update(HandoverView(at_ns=NOW, vehicle=flying, ready=True)).sending is Sending.SETPOINTS
+    assert hand_over.update(HandoverInput(at_ns=NOW, vehicle=flying, ready=True)).sending is SetpointMode.SETPOINTS
     for n in range(3):
         link.receive(vehicle.local_position(60_000 + n * 100), NOW)
     later = NOW + 5 * SECOND
@@ -277,7 +277,7 @@ def test_row_20_a_rebooted_vehicle_is_let_go() -> None:
     items = link.receive(vehicle.local_position(800), later).items
     assert [event.code for event in events(items)] == ["vehicle-reboot"]
     (booted,) = statuses(items)
-    assert hand_over.update(HandoverView(at_ns=later, vehicle=booted, ready=True)).sending is Sending.NOTHING
+    assert hand_over.update(HandoverInput(at_ns=later, vehicle=booted, ready=True)).sending is SetpointMode.NOTHING
     assert hand_over.state is HandoverState.RELEASED  # though it says that it is armed, in OFFBOARD
     items = link.receive(vehicle.heartbeat(OFFBOARD, 129, status=1), later + SECOND).items
     assert not events(items)  # told once, and a heartbeat's status alone tells nothing

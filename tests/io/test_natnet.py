@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from uavctl.errors import ConnectionSpecError
 from uavctl.frames import Frame, Up, convert_pose_to_frd, rotate_vector
 from uavctl.io.camera import BodyPose, CameraError, CameraUrl, Echo, parse
-from uavctl.io.camera_host import Words, questions
+from uavctl.io.camera_host import CameraMessageEncoder, parse_time_requests
 from uavctl.io.natnet import MISSING, NO_STAMP, SILENT, UNREADABLE, UNTRACKED, NatNet
 from uavctl.mavlink.codec import decode
 from uavctl.mavlink.messages import Position, TimeSync
@@ -170,7 +170,7 @@ def test_a_raised_body_is_above_the_floor_and_a_nose_to_the_left_turns_left(
 
 
 def test_what_is_said_is_mavlink_that_declares_its_axes() -> None:
-    words = Words()
+    words = CameraMessageEncoder()
     said = words.say(BodyPose(5_000_000_123_000, (1.0, 2.0, -3.0), (1.0, 0.0, 0.0, 0.0)))
     (position,) = decode(said).messages
     assert isinstance(position, Position)
@@ -187,7 +187,7 @@ def test_an_echo_is_the_servers_clock() -> None:
     assert camera.ask_time(77) == message(12, struct.pack("<Q", 77))
     answer = message(13, struct.pack("<QQ", 77, 3 * TICKS_PER_S + 1))
     assert camera.receive(answer, 0) == (Echo(77, 3 * SECOND + 100),)
-    assert questions(b"\x00" * 30) == ()
+    assert parse_time_requests(b"\x00" * 30) == ()
 
 
 def test_urls() -> None:

@@ -17,7 +17,7 @@ from transport_rig import FRAME, LIMIT_NS, Clock, port_of
 from uavctl.errors import ConnectionSpecError
 from uavctl.io.base import Connection
 from uavctl.io.transport import PEER_SILENCE_NS, RETRY_NS, open_connection, wait
-from uavctl.mavlink.connection import HUNG_UP, WENT_SILENT
+from uavctl.mavlink.connection import CONNECTION_SILENT, HUNG_UP
 
 
 @contextmanager
@@ -221,7 +221,7 @@ def test_tcp_makes_a_connection_again_that_has_fallen_silent() -> None:
                 clock[0] += PEER_SILENCE_NS
                 assert connection.receive() == [] and not connection.refused
                 clock[0] += 1
-                assert connection.receive() == [] and connection.refused == {WENT_SILENT: 1}
+                assert connection.receive() == [] and connection.refused == {CONNECTION_SILENT: 1}
                 peer.settimeout(LIMIT_S)
                 with pytest.raises(ConnectionResetError):  # an end that is still there knows at once
                     while peer.recv(100):
@@ -232,9 +232,9 @@ def test_tcp_makes_a_connection_again_that_has_fallen_silent() -> None:
                 peer, _ = server.accept()
                 with peer:
                     clock[0] += PEER_SILENCE_NS
-                    assert connection.receive() == [] and connection.refused == {WENT_SILENT: again - 1}
+                    assert connection.receive() == [] and connection.refused == {CONNECTION_SILENT: again - 1}
                     clock[0] += 1
-                    assert connection.receive() == [] and connection.refused == {WENT_SILENT: again}
+                    assert connection.receive() == [] and connection.refused == {CONNECTION_SILENT: again}
 
 
 def test_tcp_never_cuts_a_frame_when_the_peer_does_not_read() -> None:

@@ -25,10 +25,10 @@ from uavctl.io.admission import (
     VEHICLE_BURST,
     VEHICLE_TIMES,
     Address,
+    AdmissionRules,
     AllowList,
-    Budgets,
-    Rules,
-    frames_in,
+    RateLimiter,
+    count_frames,
 )
 from uavctl.io.base import Connection
 from uavctl.io.transport import PEER_SILENCE_NS, open_connection, wait
@@ -88,15 +88,15 @@ def test_forged_addresses_do_not_fill_the_memory() -> None:
     assert len(rules._known) <= MAX_KNOWN
 
 
-def budgets(per_s: float = 1000.0, frames_per_s: float = 1000.0) -> tuple[Budgets, Counter[str]]:
+def budgets(per_s: float = 1000.0, frames_per_s: float = 1000.0) -> tuple[RateLimiter, Counter[str]]:
     """Budgets in flight: somebody is known whom it needs."""
     refused: Counter[str] = Counter()
-    one = Budgets(Rules((), per_s, frames_per_s), refused)
+    one = RateLimiter(AdmissionRules((), per_s, frames_per_s), refused)
     one.trust(("192.0.2.9", 1), 0)
     return one, refused
 
 
-def take(one: Budgets, senders: Sequence[Address], at_ns: int, data: bytes = b"x") -> list[bool]:
+def take(one: RateLimiter, senders: Sequence[Address], at_ns: int, data: bytes = b"x") -> list[bool]:
     return one.take(senders, [data] * len(senders), at_ns)
 
 
@@ -119,7 +119,7 @@ def test_nothing_is_dropped_of_what_a_px4_says_before_it_is_known(gap_s: float) 
     packets = [one for one in read_tlog(DATA / "px4-rest.tlog").packets if one.data[5] == 1]
     for known in (False, True):
         refused: Counter[str] = Counter()
-        cap = Budgets(Rules(), refused)
+        cap = RateLimiter(AdmissionRules(), refused)
         if known:
             cap.answer(VEHICLE, 0)
         gap_ns = round(gap_s * SECOND)
@@ -134,12 +134,12 @@ def test_nothing_is_dropped_of_what_a_px4_says_before_it_is_known(gap_s: float) 
 @pytest.mark.fault(39)
 @pytest.mark.fault(46)
 def test_before_anybody_is_known_a_flood_of_strangers_is_bounded_too() -> None:
-    cap = Budgets(Rules(), Counter())
+    cap = RateLimiter(AdmissionRules(), Counter())
     passed = 0
     for n in range(1000):  # a second, twenty new ports a millisecond
         batch: list[Address] = [("192.0.2.1", 20_000 + 20 * n + port) for port in range(20)]
         passed += sum(take(cap, batch, n * 1_000_000))
-    assert passed <= 2 * FIRST_BURST[0] + Rules().max_per_s
+    assert passed <= 2 * FIRST_BURST[0] + AdmissionRules().max_per_s
     cap.answer(VEHICLE, SECOND)  # and nothing of it is left then
     strangers: list[Address] = [("192.0.2.2", port) for port in range(2000)]
     assert sum(take(cap, strangers, SECOND)) <= 2 * BURST
@@ -154,7 +154,7 @@ def test_frames_and_bytes_are_counted_and_not_datagrams_alone() -> None:
         frames = size = 0
         for n in range(2000):  # a second
             if take(cap, [ONE], n * 500_000, data) == [True]:
-                frames, size = frames + frames_in(data), size + len(data)
+                frames, size = frames + count_frames(data), size + len(data)
         assert frames <= 1000 + STRANGER_BURST[1] and size <= 200_000 + STRANGER_BURST[2]
         assert set(refused) == {"too-much"}
 
@@ -184,7 +184,7 @@ def test_no_checksum_and_no_hash_is_taken_more_often_than_was_counted(
         looks.clear()
         framing.scan(data, final=True)
         framing.scan(data, final=True, verify=verify)
-        assert max(looks["checksum"], looks["hash"], 1) <= frames_in(data) <= len(data) // 8 + 65
+        assert max(looks["checksum"], looks["hash"], 1) <= count_frames(data) <= len(data) // 8 + 65
 
 
 @pytest.mark.fault(39)
@@ -240,7 +240,9 @@ def test_a_backlog_of_the_vehicle_s_is_read_whole_and_ends_with_its_newest_state
     assert taken[0] and not taken[1] and taken[-1]
     assert sum(taken) <= VEHICLE_BURST[1]
     assert refused["too-many"] + refused["too-much"] == len(words) - sum(taken)
-    assert VEHICLE_TIMES * Rules().max_frames_per_s >= 3 * 600.0  # a real one says so much; bytes may look like frames
+    assert (
+        VEHICLE_TIMES * AdmissionRules().max_frames_per_s >= 3 * 600.0
+    )  # a real one says so much; bytes may look like frames
 
 
 @pytest.mark.fault(39)
@@ -259,7 +261,7 @@ def test_those_who_are_trusted_share_their_budget_fairly() -> None:
 
 @pytest.mark.fault(39)
 def test_who_is_not_listed_is_counted_and_gets_nothing() -> None:
-    rules = Rules(("127.0.0.1", "127.0.0.3"))
+    rules = AdmissionRules(("127.0.0.1", "127.0.0.3"))
     with (
         closing(open_connection("udpin://0.0.0.0:0", rules=rules)) as connection,
         peer("127.0.0.2") as stranger,
@@ -362,7 +364,7 @@ def test_a_connected_socket_has_its_cap_too() -> None:
         connection.send(b"hello")
         _, address = vehicle.recvfrom(64)
         data = b"\xfd" * 4096
-        most = int(VEHICLE_BURST[1]) // frames_in(data)
+        most = int(VEHICLE_BURST[1]) // count_frames(data)
         for _ in range(most + 10):
             vehicle.sendto(data, address)
             connection.receive()
@@ -399,7 +401,7 @@ def test_a_flood_does_not_fill_the_buffer_of_the_vehicle() -> None:
 
 @pytest.mark.fault(39)
 def test_what_the_system_dropped_of_the_vehicle_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("uavctl.io.transport.OWN_BUFFER_BYTES", 4096)
+    monkeypatch.setattr("uavctl.io.transport.PEER_BUFFER_BYTES", 4096)
     with closing(open_connection("udpin://127.0.0.1:0")) as connection, peer() as vehicle:
         known(connection, vehicle)
         for _ in range(1000):

@@ -8,7 +8,7 @@ from signing_rig import KEY, OTHER_KEY, STAMP, SignedPeer, make_gate, seal, unkn
 
 from uavctl.mavlink.codec import MAX_DATAGRAM_BYTES, StreamDecoder
 from uavctl.mavlink.framing import MAX_FAILED
-from uavctl.mavlink.signing import NEWEST_STAMP, SignatureRefusal, Signing
+from uavctl.mavlink.signing import MAX_TIMESTAMP, FrameSigner, SignatureRefusal
 
 UNKNOWN = unknown()
 
@@ -53,7 +53,7 @@ def test_a_datagram_of_the_largest_size_is_looked_at() -> None:
 @pytest.mark.fault(36, 38)
 def test_a_forged_frame_of_an_unknown_id_moves_no_stamp() -> None:
     gate, genuine = make_gate(), SignedPeer()
-    assert gate.admit(seal(UNKNOWN, NEWEST_STAMP, OTHER_KEY), 0) == b""
+    assert gate.admit(seal(UNKNOWN, MAX_TIMESTAMP, OTHER_KEY), 0) == b""
     assert sum(bool(gate.admit(genuine.heartbeat(), 0)) for _ in range(1000)) == 1000
 
 
@@ -79,11 +79,11 @@ def test_a_hostile_datagram_costs_a_bounded_number_of_hashes(monkeypatch: pytest
     gate = make_gate()
     hashes: list[bytes] = []
 
-    def verify(signing: Signing, frame: bytes, at_ns: int) -> SignatureRefusal:
+    def verify(signing: FrameSigner, frame: bytes, at_ns: int) -> SignatureRefusal:
         hashes.append(frame)
         return SignatureRefusal.FORGED
 
-    monkeypatch.setattr(Signing, "verify", verify)
+    monkeypatch.setattr(FrameSigner, "verify", verify)
     gate.admit(bytes((0xFD, 0, 1)) * 1300, 0)
     assert len(hashes) <= MAX_FAILED + 1
 

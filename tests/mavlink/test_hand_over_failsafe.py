@@ -7,8 +7,8 @@ from hand_over_rig import ACCEPTED, ENGAGE, FLY, NEUTRAL, NOTHING, SECOND, TAKE_
 from msgspec.structs import replace
 
 from uavctl.config.connections import HandOverConfig
-from uavctl.mavlink.handover import HandOver
-from uavctl.mavlink.handover_guards import MUST_LAND
+from uavctl.mavlink.handover import HandoverStateMachine
+from uavctl.mavlink.handover_guards import LAND_PERIODS
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.mavlink.messages import Text
 from uavctl.mavlink.requests import RequestKind
@@ -181,7 +181,7 @@ def test_a_flight_that_the_pilot_began_is_the_pilot_s_in_a_failsafe_too(autopilo
 
 def over_a_relay(state: HandoverState) -> Rig:
     rig = Rig(config=HandOverConfig(climb_s=5.0, land_s=10.0))
-    rig.hand_over = HandOver(HandOverConfig(climb_s=5.0, land_s=10.0), sees_it_down=True)
+    rig.hand_over = HandoverStateMachine(HandOverConfig(climb_s=5.0, land_s=10.0), sees_it_down=True)
     rig.to(state)
     rig.be(landed=False)
     rig.tick()
@@ -192,7 +192,7 @@ def over_a_relay(state: HandoverState) -> Rig:
 def test_who_lands_by_our_positions_gets_them_when_nothing_more_is_asked_for() -> None:
     rig = over_a_relay(HandoverState.CLIMBING)
     rig.tick(stop=True)
-    rig.run(MUST_LAND * 10.0 + 2.0, until=HandoverState.FAILED)  # it does not land
+    rig.run(LAND_PERIODS * 10.0 + 2.0, until=HandoverState.FAILED)  # it does not land
     assert not rig.hand_over.finished
     rig.run(30.0)
     assert not rig.hand_over.finished  # it would be blind, and nobody else has it

@@ -12,7 +12,7 @@ from logs.recording.replay import replay
 from sim.simulation import Peers
 from uavctl.config import load_config
 from uavctl.loop import ControlLoop
-from uavctl.mavlink.handover_guards import CLOCK_NS
+from uavctl.mavlink.handover_guards import BOOT_TIME_WAIT_NS
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.mavlink.requests import RequestKind
 from uavctl.records import ORDER_ACCEPTED, ORDER_REFUSED, Command, ControlMode, Decision, Order, Setpoint
@@ -112,7 +112,7 @@ def test_a_vehicle_that_has_started_since_is_another_one(since_s: float, up_s: f
 @pytest.mark.fault(31)
 def test_its_clock_is_waited_for_with_nothing_sent() -> None:
     rig = found_armed(None, FLOWN_NS + 60 * SECOND)
-    for _ in range(CLOCK_NS // RIG_TICK_NS - 1):
+    for _ in range(BOOT_TIME_WAIT_NS // RIG_TICK_NS - 1):
         assert rig.is_in(HandoverState.WAITING) and rig.tick().sending is NOTHING
         seen = rig.hand_over.flown(rig.view.at_ns, rig.vehicle)
         assert seen is not None and not seen.external

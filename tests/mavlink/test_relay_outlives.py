@@ -10,8 +10,8 @@ from take_off_rig import RELAYED, Flight
 from uavctl import loop as control
 from uavctl.flight.controller import Controller, ControlState
 from uavctl.flight.step import StepOutput, step
-from uavctl.mavlink.handover import HandOver, HandoverStep
-from uavctl.mavlink.handover_guards import MUST_LAND, HandoverView
+from uavctl.mavlink.handover import HandoverOutput, HandoverStateMachine
+from uavctl.mavlink.handover_guards import LAND_PERIODS, HandoverInput
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.outcome import Cause
 from uavctl.records import Event, RelayStats, StepInput
@@ -104,10 +104,10 @@ def test_a_core_that_fails_while_the_pilot_flies_asks_for_nothing(monkeypatch: p
 def test_a_hand_over_that_fails_leaves_the_positions_until_the_vehicle_is_down(monkeypatch: pytest.MonkeyPatch) -> None:
     flight = airborne("px4")
 
-    def faulty(hand_over: HandOver, view: HandoverView) -> HandoverStep:
+    def faulty(hand_over: HandoverStateMachine, view: HandoverInput) -> HandoverOutput:
         raise LookupError("no such state")
 
-    monkeypatch.setattr(HandOver, "update", faulty)
+    monkeypatch.setattr(HandoverStateMachine, "update", faulty)
     failed_ns = flight.now_ns
     flight.run(10.0)
     assert not flight.loop.finished and poses_after(flight, flight.now_ns - SECOND)
@@ -138,7 +138,7 @@ def test_positions_go_on_as_long_as_the_pilot_has_the_vehicle_in_the_air(autopil
 def test_positions_go_on_for_a_vehicle_that_does_not_land() -> None:
     flight = airborne("px4", "hand_over.land_s=5.0")
     flight.hears = lambda data: b"VISION" in data or data[7:10] == bytes((102, 0, 0))  # positions alone get through
-    flight.run(MUST_LAND * 5.0 + 15.0, stop=True)
+    flight.run(LAND_PERIODS * 5.0 + 15.0, stop=True)
     assert flight.is_in(HandoverState.FAILED) and flight.loop.carries and not flight.loop.finished
     assert poses_after(flight, flight.now_ns - SECOND)
     assert flight.loop.ending.cause == Cause.LANDING_FAILED

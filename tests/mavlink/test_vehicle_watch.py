@@ -13,7 +13,7 @@ from uavctl.config.connections import DaemonConfig
 from uavctl.config.types import EstimatorConfig
 from uavctl.mavlink.connection import MavlinkConnection
 from uavctl.mavlink.messages import Ack, Text
-from uavctl.mavlink.vehicle import ALONE_NS, FROZEN_RAW_US, GONE_NS, TURNED_NS, SensorStream
+from uavctl.mavlink.vehicle import ALONE_NS, FROZEN_RAW_US, GONE_NS, MAX_ATTITUDE_AGE_NS, SensorStreamMonitor
 from uavctl.records import InertialSample, VehicleStatus
 
 NOW = 1000 * SECOND
@@ -222,10 +222,10 @@ def test_a_specific_force_is_turned_into_an_acceleration_by_the_newest_attitude(
     else:
         link.receive(vehicle.send("attitude", NOW // MS, 0.1, -0.2, 2.0, 0.0, 0.0, 0.0), NOW)
     force = (0.5, -0.25, -9.5)
-    (sample,) = felt(link, vehicle, force, NOW + TURNED_NS)
-    assert sample.at_ns == NOW + TURNED_NS
+    (sample,) = felt(link, vehicle, force, NOW + MAX_ATTITUDE_AGE_NS)
+    assert sample.at_ns == NOW + MAX_ATTITUDE_AGE_NS
     assert sample.accel_mps2 == pytest.approx(turn.apply(force) + np.array([0.0, 0.0, 9.80665]), abs=1e-6)
-    assert felt(link, vehicle, (0.5, -0.25, -9.4), NOW + TURNED_NS + 1_000) == []  # the attitude is too old
+    assert felt(link, vehicle, (0.5, -0.25, -9.4), NOW + MAX_ATTITUDE_AGE_NS + 1_000) == []  # the attitude is too old
     assert felt(link, vehicle, (float("nan"), 0.0, 0.0), NOW) == []
     assert felt(link, Peer(1, 100), force, NOW) == felt(link, Peer(9, 1), force, NOW) == []  # a camera, another one
 
@@ -273,12 +273,12 @@ def test_inertial_data_that_are_of_now_are_all_taken_whatever_the_clocks() -> No
 def test_inertial_data_that_are_not_of_now_say_nothing(lies: Callable[[int], tuple[int, int, bool, bool]]) -> None:
     taken = stream(lies, count=190)
     assert taken[:100] == list(range(100))
-    assert len(taken[100:]) <= 1 + TURNED_NS // (20 * MS)  # as long as the last attitude turns them
+    assert len(taken[100:]) <= 1 + MAX_ATTITUDE_AGE_NS // (20 * MS)  # as long as the last attitude turns them
 
 
 @pytest.mark.parametrize("ppm", [-14_000, -500, 500, 14_000])
 def test_clocks_that_drift_apart_for_half_an_hour_lose_nothing(ppm: int) -> None:
-    stream_of_now = SensorStream()
+    stream_of_now = SensorStreamMonitor()
     for n in range(18_000):
         at_ns = NOW + n * SECOND // 10
         stamp_us = (at_ns + n * ppm * 100) // 1000
@@ -286,7 +286,7 @@ def test_clocks_that_drift_apart_for_half_an_hour_lose_nothing(ppm: int) -> None
 
 
 def test_a_new_stamp_is_a_new_measurement_and_the_same_stamp_is_none() -> None:
-    one = SensorStream()
+    one = SensorStreamMonitor()
     for n in range(100):
         at_ns, readings = NOW + n * 20 * MS, (float(n // 40), 0.0, -9.8)  # whole numbers repeat for 0.8 s
         assert one.takes(at_ns // 1000, readings, at_ns, frozen_us=FROZEN_RAW_US)

@@ -36,7 +36,7 @@ from uavctl.clock import Ticker
 from uavctl.config import load_config
 from uavctl.daemon import control_socket
 from uavctl.daemon.daemon import fly
-from uavctl.daemon.health import HealthWatch, Notifier
+from uavctl.daemon.health import HealthMonitor, Notifier
 from uavctl.daemon.lock import lock_paths
 from uavctl.io.base import Connection
 from uavctl.loop import ControlLoop
@@ -142,7 +142,7 @@ class Endings:
         self.listener: socket.socket | None = None
         self._asking: list[subprocess.Popen[str]] = []
         self.loop: ControlLoop | None = None
-        self.watch: HealthWatch | None = None
+        self.watch: HealthMonitor | None = None
         self.notified: list[str] = []
 
     # What a step may look at, and do
@@ -282,14 +282,14 @@ def in_virtual_time(rig: Endings) -> Iterator[None]:
     def connected(*given: object) -> Iterator[dict[str, Line]]:
         yield rig.lines
 
-    class Watched(HealthWatch):
+    class Watched(HealthMonitor):
         def __init__(self, *given: Any) -> None:
             super().__init__(*given)
             rig.watch = self
 
     @contextmanager
-    def listening(*given: Any) -> Iterator[socket.socket]:
-        with control_socket.listening(*given) as rig.listener:
+    def open_listener(*given: Any) -> Iterator[socket.socket]:
+        with control_socket.open_listener(*given) as rig.listener:
             yield rig.listener
 
     with pytest.MonkeyPatch.context() as patch:
@@ -297,12 +297,12 @@ def in_virtual_time(rig: Endings) -> Iterator[None]:
             patch.setattr(module, "connected", connected)
             patch.setattr(module, "monotonic_ns", lambda: rig.now_ns)
         patch.setattr(tune_flight, "wait", rig.wait)
-        patch.setattr(fly_cmd, "listening", listening)
+        patch.setattr(fly_cmd, "open_listener", open_listener)
         patch.setattr(fly_cmd, "run_daemon", rig.fly)
         patch.setattr(fly_cmd, "Ticker", lambda tick_ns, dt_ns: Ticker(tick_ns, dt_ns, lambda: rig.now_ns))
         patch.setattr(fly_cmd, "Recorder", Sync)
         patch.setattr("uavctl.cli.check.checked_before_arming", lambda *_: ())
-        patch.setattr("uavctl.cli.fly.HealthWatch", Watched)
+        patch.setattr("uavctl.cli.fly.HealthMonitor", Watched)
         patch.setattr(Notifier, "status", lambda _, text: rig.notified.append(text))
         patch.setattr(report, "_sections", lambda *given: [report._summary_section(*given)])  # no drawings
         patch.setattr(Sync, "full", False)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from msgspec.structs import replace
 
 from uavctl.config.connections import HandOverConfig
-from uavctl.mavlink.handover import HandOver, HandoverStep
-from uavctl.mavlink.handover_guards import HandoverView
-from uavctl.mavlink.handover_states import HandoverState, Sending
+from uavctl.mavlink.handover import HandoverOutput, HandoverStateMachine
+from uavctl.mavlink.handover_guards import HandoverInput
+from uavctl.mavlink.handover_states import HandoverState, SetpointMode
 from uavctl.mavlink.messages import Ack, Text
 from uavctl.mavlink.requests import COMMANDS, RequestKind
 from uavctl.records import Command, Event, Order, VehicleStatus
@@ -21,20 +21,20 @@ TAKE_OFF, ENGAGE, LAND, STAND_BY = (
     Command(order=Order.LAND),
     Command(order=Order.STAND_BY),
 )
-NOTHING, NEUTRAL, FLY = Sending.NOTHING, Sending.NEUTRAL, Sending.SETPOINTS
+NOTHING, NEUTRAL, FLY = SetpointMode.NOTHING, SetpointMode.NEUTRAL, SetpointMode.SETPOINTS
 
 
 class Rig:
     """A hand-over and a vehicle whose words are put into its mouth; it says every tick who it is, unless it is mute."""
 
     def __init__(self, autopilot: str = "px4", config: HandOverConfig | None = None) -> None:
-        self.hand_over = HandOver(config)
+        self.hand_over = HandoverStateMachine(config)
         ground = "AUTO.LOITER" if autopilot == "px4" else "STABILIZE"
         self.vehicle: VehicleStatus | None = VehicleStatus(
             at_ns=NOW, autopilot=autopilot, armed=False, mode=ground, external=False, landed=True, radio=True
         )
         self.mute = False
-        self.view = HandoverView(at_ns=NOW, vehicle=None, ready=True, up_m=0.0)
+        self.view = HandoverInput(at_ns=NOW, vehicle=None, ready=True, up_m=0.0)
         self.asked: list[tuple[int, RequestKind]] = []
         self.events: list[Event] = []
 
@@ -55,7 +55,7 @@ class Rig:
     def asked_last(self, ask: RequestKind) -> bool:
         return self.asked[-1][1] is ask
 
-    def tick(self, *heard: Ack | Text, commands: tuple[Command, ...] = (), **fields: object) -> HandoverStep:
+    def tick(self, *heard: Ack | Text, commands: tuple[Command, ...] = (), **fields: object) -> HandoverOutput:
         at_ns = self.view.at_ns + TICK_NS
         if self.vehicle is not None and not self.mute:
             self.vehicle = replace(self.vehicle, at_ns=at_ns)
@@ -73,7 +73,7 @@ class Rig:
             self.tick()
         assert until is None or self.state is until
 
-    def answer(self, result: int, ask: RequestKind | None = None, text: str = "") -> HandoverStep:
+    def answer(self, result: int, ask: RequestKind | None = None, text: str = "") -> HandoverOutput:
         """The vehicle answers the last request, or this one."""
         words = (Text(system=1, component=1, severity=2, text=text),) if text else ()
         return self.tick(ack(result, ask or self.asked[-1][1]), *words)
@@ -121,7 +121,7 @@ class Rig:
         self.tick(up_m=1.9)
         return self
 
-    def fail(self, mode: str = "") -> HandoverStep:
+    def fail(self, mode: str = "") -> HandoverOutput:
         """A failsafe of the vehicle's own lands it, or chooses this mode."""
         px4 = self.vehicle is not None and self.vehicle.autopilot == "px4"
         self.be(mode=mode or ("AUTO.LAND" if px4 else "LAND"), failsafe=True)

@@ -27,7 +27,7 @@ from uavctl.cli.replay import replay_flight
 from uavctl.config import Config
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.framing import scan
-from uavctl.mavlink.signing import Gate, Signing, SigningKey, Stamps
+from uavctl.mavlink.signing import FrameAuthenticator, FrameSigner, SigningKey, SigningTimestamps
 from uavctl.records import Command, Order, Received, Record, Send, Sink
 
 SECOND_NS = 1_000_000_000
@@ -37,9 +37,9 @@ class Doors:
     """Signatures put on and taken off again, with what the channel has damaged left damaged."""
 
     def __init__(self, links: tuple[str, ...]) -> None:
-        key, theirs, ours = SigningKey(KEY), Stamps(), Stamps()
-        self.peers = {name: Gate(Signing(key, 3, theirs, OFFSET_NS), stream=False) for name in links}
-        self.gates = {name: Gate(Signing(key, 7, ours, OFFSET_NS), stream=False) for name in links}
+        key, theirs, ours = SigningKey(KEY), SigningTimestamps(), SigningTimestamps()
+        self.peers = {name: FrameAuthenticator(FrameSigner(key, 3, theirs, OFFSET_NS), stream=False) for name in links}
+        self.gates = {name: FrameAuthenticator(FrameSigner(key, 7, ours, OFFSET_NS), stream=False) for name in links}
         self.told: dict[str, Counter[str]] = {name: Counter() for name in links}
 
     def take(self, link: str, data: bytes, at_ns: int) -> bytes:

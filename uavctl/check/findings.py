@@ -12,7 +12,7 @@ import msgspec
 
 from uavctl.config.connections import CheckConfig
 from uavctl.frames import Quaternion
-from uavctl.mavlink.clocksync import ClockSync, RoundTrips
+from uavctl.mavlink.clocksync import ClockSync, TimesyncClock
 from uavctl.mavlink.codec import BOOT_MS_WRAP
 from uavctl.mavlink.messages import (
     Attitude,
@@ -135,7 +135,7 @@ class Heard:
     parameters: dict[str, ParamValue] = field(default_factory=dict)  # values of the vehicle's parameters
     stats: dict[str, LinkStats] = field(default_factory=dict)  # counters of each link at the end
     # TIMESYNC with the vehicle and with the source of positions; None where nothing answered
-    trips: dict[str, RoundTrips | None] = field(default_factory=dict)
+    trips: dict[str, TimesyncClock | None] = field(default_factory=dict)
     _clock: ClockSync = field(default_factory=lambda: ClockSync(10_000_000_000, 0, 20_000_000))
 
     def add(self, sample: PositionSample, attitude: Quaternion | None) -> None:

@@ -29,7 +29,7 @@ from uavctl.config import Config
 from uavctl.config.connections import CheckConfig, warnings
 from uavctl.errors import ConnectionSpecError, KeyFileError, NotReadyError
 from uavctl.io.base import Connection
-from uavctl.io.signed_connection import connected
+from uavctl.io.signed_connection import open_links
 from uavctl.io.transport import wait
 from uavctl.loop import make_links
 from uavctl.records import Checked, Datagram, Sink
@@ -202,7 +202,7 @@ def check(
         messages().print(text or "good; let it rest for a moment", style="bold")
 
     try:
-        with connected(config) as connections, stop_on_signals() as stopped:
+        with open_links(config) as connections, stop_on_signals() as stopped:
             seconds_s = config.check.seconds
             items += run_preflight(config, connections, seconds_s, move=move, prompt=prompt, stop=stopped)
     except (ConnectionSpecError, KeyFileError) as error:

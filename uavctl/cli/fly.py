@@ -43,13 +43,13 @@ from uavctl.cli.prepare import prepare
 from uavctl.clock import Ticker, monotonic_ns, zero_utc_ns
 from uavctl.config import Config, LoadedConfig
 from uavctl.config.connections import warnings
-from uavctl.daemon.control_socket import ControlServer, control_folder, daemon_name, listening
-from uavctl.daemon.daemon import AfterTick, collected_between_ticks, realtime
+from uavctl.daemon.control_socket import ControlServer, control_folder, daemon_name, open_listener
+from uavctl.daemon.daemon import AfterTick, control_garbage_collection, enable_realtime
 from uavctl.daemon.daemon import fly as run_daemon
 from uavctl.daemon.engagement import Engagement, TickFollower, check_places, stop_limit_s
-from uavctl.daemon.health import HealthWatch, Notifier, RecorderHealth
-from uavctl.daemon.lock import sole_daemon
-from uavctl.io.signed_connection import connected
+from uavctl.daemon.health import HealthMonitor, Notifier, RecorderHealth
+from uavctl.daemon.lock import lock_vehicle
+from uavctl.io.signed_connection import open_links
 from uavctl.loop import ControlLoop
 
 # What stands beside the control loop of `uavctl fly`: orders, health lines, the service manager, real time.
@@ -78,7 +78,7 @@ def operation(
             return recorder_health(status(), path)
 
         identity = (daemon_name(config), config.daemon.vehicle, os.getpid())
-        watch = HealthWatch(loop, config, identity, recorder, tell)
+        watch = HealthMonitor(loop, config, identity, recorder, tell)
         server = ControlServer(listener, config, loop, watch.look)
         try:
             # The sign of life comes last: it stands for all that a tick has to do.
@@ -93,10 +93,10 @@ def operation(
 def as_realtime(wanted: bool) -> Iterator[Sequence[AfterTick]]:
     """Set real-time scheduling and memory if wanted; return the function to call after each tick."""
     with ExitStack() as stack:
-        for outcome in stack.enter_context(realtime()) if wanted else ():
+        for outcome in stack.enter_context(enable_realtime()) if wanted else ():
             told = Text(f"--realtime: {outcome.part}: {outcome.text}")
             messages().print(told if outcome.ok else labelled("warning", told.plain, "bold yellow"), soft_wrap=True)
-        yield (stack.enter_context(collected_between_ticks()).after_tick,)
+        yield (stack.enter_context(control_garbage_collection()).after_tick,)
 
 
 @contextmanager
@@ -225,8 +225,8 @@ def fly_daemon(
     tick_ns, dt_ns = round(config.daemon.tick_s * 1e9), round(config.plant.dt_s * 1e9)
     # First of all, so that a second daemon is refused at once.
     with (
-        sole_daemon(config.daemon.vehicle) as tenure,
-        listening(control_folder(control), daemon_name(config)) as listener,
+        lock_vehicle(config.daemon.vehicle) as tenure,
+        open_listener(control_folder(control), daemon_name(config)) as listener,
         onlookers(view_port) as looking,
         new_recording(out, config.name, config.log.free_bytes) as path,
     ):
@@ -242,7 +242,7 @@ def fly_daemon(
         with (
             as_realtime(as_realtime_process) as collect,
             stop_on_signals() as stopped,
-            connected(config, wait_for_server(stopped)) as connections,
+            open_links(config, wait_for_server(stopped)) as connections,
         ):
             checked: tuple[Item, ...] = ()
             told = ParameterReader()

@@ -40,10 +40,10 @@ from uavctl.cli.prepare import prepare
 from uavctl.cli.sim import make_door
 from uavctl.clock import Ticker, monotonic_ns, zero_utc_ns
 from uavctl.config import Config, LoadedConfig
-from uavctl.daemon.daemon import collected_between_ticks, fly
+from uavctl.daemon.daemon import control_garbage_collection, fly
 from uavctl.daemon.engagement import Engagement, TickFollower, check_places, stop_limit_s
 from uavctl.errors import UavctlError, UsageError
-from uavctl.io.signed_connection import connected
+from uavctl.io.signed_connection import open_links
 from uavctl.lab.lockstep import TRUTH, LockstepFlight, check_length
 from uavctl.loop import ControlLoop
 from uavctl.records import Sink, Truth
@@ -156,7 +156,7 @@ def _real_time(prepared: Prepared, path: Path, engagement: Engagement, looking: 
     tick_ns, dt_ns = round(config.daemon.tick_s * 1e9), round(config.plant.dt_s * 1e9)
     with ExitStack() as stack:
         stopped = stack.enter_context(stop_on_signals())
-        connections = stack.enter_context(connected(config))
+        connections = stack.enter_context(open_links(config))
         recorder = Recorder(path, config.log, onlookers=looking)
         loop = ControlLoop(config, prepared.controller, recorder, time.perf_counter_ns)
         engagement.begin(loop)
@@ -167,7 +167,7 @@ def _real_time(prepared: Prepared, path: Path, engagement: Engagement, looking: 
             simulator = stack.enter_context(ExitStack())
             simulator.enter_context(_simulator(config, recorder, airborne=not takes_off))
             shown = simulator.enter_context(live_line(loop, recorder, config.duration_s, config.daemon.tick_s))
-            collector = simulator.enter_context(collected_between_ticks())
+            collector = simulator.enter_context(control_garbage_collection())
             begun = time.perf_counter()
             with ending_noted(loop):
                 fly(

@@ -23,7 +23,7 @@ import msgspec
 from uavctl.config import Config
 from uavctl.config.checks import outside
 from uavctl.daemon.health import Health
-from uavctl.daemon.lock import runtime_folders
+from uavctl.daemon.lock import find_runtime_folders
 from uavctl.errors import UsageError, VehicleTakenError
 from uavctl.records import ORDER_ACCEPTED, Command, Event, Order, Ticked, Vec3
 
@@ -78,7 +78,7 @@ def control_folder(chosen: Path | None, environ: Mapping[str, str] = os.environ)
         return chosen
     if environ.get(FOLDER_VARIABLE):
         return Path(environ[FOLDER_VARIABLE])
-    return runtime_folders(environ)[0]
+    return find_runtime_folders(environ)[0]
 
 
 def socket_path(folder: Path, name: str) -> Path:
@@ -101,7 +101,7 @@ _CREDENTIALS = struct.Struct("3i")  # pid, uid, gid
 _REQUEST = msgspec.json.Decoder(ControlRequest)
 
 
-class Orderly(Protocol):
+class OrderReceiver(Protocol):
     """Receiver of orders: the control loop."""
 
     def order(self, command: Command) -> bool:
@@ -127,7 +127,9 @@ class ControlServer:
         config: for the limits that a place has to keep.
     """
 
-    def __init__(self, listener: socket.socket, config: Config, flight: Orderly, look: Callable[[], Health]) -> None:
+    def __init__(
+        self, listener: socket.socket, config: Config, flight: OrderReceiver, look: Callable[[], Health]
+    ) -> None:
         self._listener, self._config, self._flight, self._look = listener, config, flight, look
         self._clients: list[_Client] = []
         self._waiting: list[tuple[_Client, Command]] = []  # for the next tick's answers
@@ -239,7 +241,7 @@ class ControlServer:
 
 
 @contextmanager
-def listening(folder: Path, name: str) -> Iterator[socket.socket]:
+def open_listener(folder: Path, name: str) -> Iterator[socket.socket]:
     """The listening socket of a daemon, gone at the end.
 
     Args:
@@ -249,7 +251,7 @@ def listening(folder: Path, name: str) -> Iterator[socket.socket]:
         UsageError: the folder is not ours alone, or the path too long.
         VehicleTakenError: a daemon of this name is running.
     """
-    _own(folder)
+    _prepare_folder(folder)
     path = socket_path(folder, name)
     listener = _listen(path, name)
     try:
@@ -259,7 +261,7 @@ def listening(folder: Path, name: str) -> Iterator[socket.socket]:
         path.unlink(missing_ok=True)
 
 
-def _own(folder: Path) -> None:
+def _prepare_folder(folder: Path) -> None:
     """See to a folder that only this user can enter."""
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -276,7 +278,7 @@ def _listen(path: Path, name: str) -> socket.socket:
     """Bind and listen; a socket that a dead daemon left is taken over."""
     if path.is_socket():
         try:
-            alive = _alive(path)
+            alive = _is_listening(path)
         except OSError as error:
             raise UsageError(
                 f"{path}: {error.strerror}: another user, root it may be, left it; if no daemon of theirs flies, "
@@ -299,7 +301,7 @@ def _listen(path: Path, name: str) -> socket.socket:
     return listener
 
 
-def _alive(path: Path) -> bool:
+def _is_listening(path: Path) -> bool:
     """Whether somebody listens there.
 
     Raises:

@@ -31,7 +31,7 @@ _CAP_IPC_LOCK = 14
 
 
 @dataclass(frozen=True)
-class Outcome:
+class RealtimeSetting:
     """One part of it: whether it holds, and what a person should know."""
 
     part: str
@@ -39,7 +39,7 @@ class Outcome:
     text: str
 
 
-class Collector:
+class GarbageCollector:
     """Collects garbage once a second, right after a tick; what was there at the start is frozen and never walked."""
 
     def after_tick(self, ticked: Ticked, lateness_ns: int) -> None:
@@ -56,20 +56,20 @@ class Collector:
 
 
 @contextmanager
-def collected_between_ticks() -> Iterator[Collector]:
+def control_garbage_collection() -> Iterator[GarbageCollector]:
     """Keep garbage collection out of the ticks: it is for the collector's caller to say when; undone at the end."""
     gc.collect()
     gc.freeze()
     gc.disable()
     try:
-        yield Collector()
+        yield GarbageCollector()
     finally:
         gc.enable()
         gc.unfreeze()
 
 
 @contextmanager
-def realtime(priority: int = PRIORITY) -> Iterator[tuple[Outcome, ...]]:
+def enable_realtime(priority: int = PRIORITY) -> Iterator[tuple[RealtimeSetting, ...]]:
     """Make this thread, and the threads and memory that come later, real-time as far as permitted; undone at the end.
 
     Threads that it begins inherit the class: the recorder's holds the interpreter now and then, and must not lose the
@@ -87,24 +87,24 @@ def realtime(priority: int = PRIORITY) -> Iterator[tuple[Outcome, ...]]:
             os.sched_setscheduler(0, *before)
 
 
-def _schedule(priority: int) -> Outcome:
+def _schedule(priority: int) -> RealtimeSetting:
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     except PermissionError:
-        return Outcome(
+        return RealtimeSetting(
             "scheduling",
             False,
             f"SCHED_FIFO is not permitted, the normal class stays; allow it with LimitRTPRIO={priority} in the unit, "
             f"`rtprio {priority}` in /etc/security/limits.conf, or CAP_SYS_NICE",
         )
-    return Outcome("scheduling", True, f"SCHED_FIFO, priority {priority}")
+    return RealtimeSetting("scheduling", True, f"SCHED_FIFO, priority {priority}")
 
 
-def _lock_memory() -> Outcome:
+def _lock_memory() -> RealtimeSetting:
     """Keep every page that was touched in memory. Only without a limit: with one, a later allocation would fail."""
     _, hard = resource.getrlimit(resource.RLIMIT_MEMLOCK)
-    if hard != resource.RLIM_INFINITY and not _may_lock():
-        return Outcome(
+    if hard != resource.RLIM_INFINITY and not _may_lock_memory():
+        return RealtimeSetting(
             "memory",
             False,
             f"locking more than {hard >> 10} KiB is not permitted, memory may be paged out; allow it with "
@@ -115,23 +115,23 @@ def _lock_memory() -> Outcome:
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT):
         reason = os.strerror(ctypes.get_errno())
-        return Outcome(
+        return RealtimeSetting(
             "memory", False, f"cannot be locked ({reason}) and may be paged out; is this Linux 4.4 or later?"
         )
-    return Outcome("memory", True, "locked: what was touched once is never paged out")
+    return RealtimeSetting("memory", True, "locked: what was touched once is never paged out")
 
 
-def _may_lock() -> bool:
+def _may_lock_memory() -> bool:
     """Whether the limit on locked memory does not bind this process."""
     lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
     effective = next((int(line.split()[1], 16) for line in lines if line.startswith("CapEff:")), 0)
     return bool(effective >> _CAP_IPC_LOCK & 1)
 
 
-PAUSE_NS = 2_000_000  # after a read that gave nothing that the flight needs
+READ_PAUSE_NS = 2_000_000  # after a read that gave nothing that the flight needs
 STALL_NS = 200_000_000  # without a look: what the system dropped meanwhile may have been the vehicle's newest state
-FRESH_NS = 150_000_000  # a look is so old at most when a setpoint goes out
-MAX_LOOKS = 10  # at a backlog, before a tick
+MAX_READ_AGE_NS = 150_000_000  # a look is so old at most when a setpoint goes out
+MAX_READ_ROUNDS = 10  # at a backlog, before a tick
 WITHHELD = "withheld"
 
 AfterTick = Callable[[Ticked, int], None]
@@ -172,7 +172,7 @@ def fly(
     """
     first_ns: int | None = None
     stop_ns: int | None = None
-    refusals = _Refusals(loop, connections, on_news)
+    refusals = _RefusalReporter(loop, connections, on_news)
     reader = _Reader(loop, connections, now, on_news)
     withheld = 0
 
@@ -191,7 +191,7 @@ def fly(
                 if now() >= due.at_ns:
                     break
                 if not heard:  # a flood: take what comes by the handful, not each by itself
-                    wait_for({}, min(due.at_ns, now() + PAUSE_NS))
+                    wait_for({}, min(due.at_ns, now() + READ_PAUSE_NS))
             if connections[VEHICLE].closed:
                 loop.course.close(f"{connections[VEHICLE].url}; nothing can be sent, and its own failsafe has it")
                 raise ConnectionClosedError(
@@ -242,7 +242,7 @@ class _Reader:
     @property
     def fresh(self) -> bool:
         """Whether everything has been read that the vehicle had said a moment ago."""
-        return self._whole_ns is not None and self._now() - self._whole_ns <= FRESH_NS
+        return self._whole_ns is not None and self._now() - self._whole_ns <= MAX_READ_AGE_NS
 
     def read(self, names: Iterable[str], *, everything: bool = False) -> bool:
         """Hand on what has arrived on the named connections; False if the flight needs nothing of it."""
@@ -261,7 +261,7 @@ class _Reader:
 
     def read_everything(self) -> None:
         """Read what has come until now, before something goes out: a backlog ends with the vehicle's newest state."""
-        for _ in range(MAX_LOOKS):
+        for _ in range(MAX_READ_ROUNDS):
             began_ns = self._now()
             self.read(self._connections, everything=True)
             if not self._connections[VEHICLE].unread:
@@ -290,7 +290,7 @@ class _Reader:
                 self._loop.refused(name, {OVERRUN: lost - before}, self._now())
 
 
-class _Refusals:
+class _RefusalReporter:
     """Tells the loop once a second what the connections dropped."""
 
     def __init__(

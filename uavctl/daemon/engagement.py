@@ -10,7 +10,7 @@ from uavctl.build.mission import build_mission
 from uavctl.config import Config
 from uavctl.errors import UsageError
 from uavctl.loop import ControlLoop
-from uavctl.mavlink.handover_guards import MUST_LAND
+from uavctl.mavlink.handover_guards import LAND_PERIODS
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.records import Command, ControlMode, Order, Ticked, Vec3
 from uavctl.smpc.conditioned.planner import AnyDesign
@@ -119,5 +119,5 @@ def check_places(config: Config, design: AnyDesign, take_off_m: float | None, go
 
 def stop_limit_s(config: Config, *, takes_off: bool) -> float:
     """Return how long a hand-over may take [s]; it ends on the ground if we took off, or land by our positions."""
-    landings = 1 + MUST_LAND if takes_off else int(config.relay.enabled)
+    landings = 1 + LAND_PERIODS if takes_off else int(config.relay.enabled)
     return config.fallback.brake_s + LANDING_S + landings * config.hand_over.land_s

@@ -86,7 +86,7 @@ class Health(msgspec.Struct, frozen=True, kw_only=True):
     inertial: float | None = None
 
 
-class WatchedFlight(Protocol):
+class MonitoredFlight(Protocol):
     """Control loop as far as its health is looked at."""
 
     course: FlightCourse
@@ -112,7 +112,7 @@ class WatchedFlight(Protocol):
         ...
 
 
-class HealthWatch:
+class HealthMonitor:
     """Watches the control loop from its own thread; looks are cheap and take no lock.
 
     Args:
@@ -122,7 +122,7 @@ class HealthWatch:
 
     def __init__(
         self,
-        flight: WatchedFlight,
+        flight: MonitoredFlight,
         config: Config,
         identity: tuple[str, str, int],
         recorder: Callable[[], RecorderHealth],
@@ -176,7 +176,7 @@ class HealthWatch:
                 self._inertial, self._inertial_share = inertial, used / total if total else None
             health = self.look()
             self._alarm(health.recorder)
-            self._tell(line(health))
+            self._tell(format_health(health))
 
     def _count_losses(self) -> None:
         since_ns, before = self._came_by[0]
@@ -241,7 +241,7 @@ class HealthWatch:
         )
 
 
-def line(health: Health) -> str:
+def format_health(health: Health) -> str:
     """One line for a log: the same fields in the same order, `-` for what is not known."""
     vehicle, relay = health.vehicle, health.relay
     battery = None if vehicle is None else vehicle.battery_v
@@ -291,7 +291,7 @@ def _number(value: float | None, form: str) -> str:
 # The sign of life comes from the control loop and from nowhere else: a loop that hangs is a daemon that hangs.
 
 
-_FEEDS = 4  # signs of life in one watchdog time
+_WATCHDOG_SIGNALS = 4  # signs of life in one watchdog time
 _LONGEST = 2000  # characters of a status
 
 
@@ -324,7 +324,7 @@ class Notifier:
         at_ns = ticked.decision.at_ns
         if self._fed_ns is None:
             self._tell("READY=1")
-        elif self.watchdog_ns is None or at_ns - self._fed_ns < self.watchdog_ns // _FEEDS:
+        elif self.watchdog_ns is None or at_ns - self._fed_ns < self.watchdog_ns // _WATCHDOG_SIGNALS:
             return
         self._fed_ns = at_ns
         self._tell("WATCHDOG=1")

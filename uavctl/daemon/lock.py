@@ -35,7 +35,7 @@ RUN = Path("/run")
 TEMPORARY = Path("/tmp")
 
 
-def is_own(folder: Path) -> bool:
+def is_private_folder(folder: Path) -> bool:
     """Whether this is a folder of this user, that no other one may enter; a link to one is none."""
     try:
         found = folder.lstat()
@@ -44,7 +44,7 @@ def is_own(folder: Path) -> bool:
     return stat.S_ISDIR(found.st_mode) and found.st_uid == os.geteuid() and not found.st_mode & 0o077
 
 
-def runtime_folders(environ: Mapping[str, str] = os.environ) -> tuple[Path, ...]:
+def find_runtime_folders(environ: Mapping[str, str] = os.environ) -> tuple[Path, ...]:
     """This user's folders for locks and sockets, those that can be had, the preferred one first; made if need be.
 
     Below $XDG_RUNTIME_DIR and /run/user/UID if these are the user's own; /run/uavctl, which a service has; and one
@@ -57,11 +57,11 @@ def runtime_folders(environ: Mapping[str, str] = os.environ) -> tuple[Path, ...]
     given = Path(environ.get("XDG_RUNTIME_DIR") or "/")
     bases = [base for base in (given, RUN / "user" / str(user)) if base.is_absolute() and base != Path("/")]
     last = TEMPORARY / f"uavctl-{user}"
-    wanted = [*(base / "uavctl" for base in bases if is_own(base)), last]
+    wanted = [*(base / "uavctl" for base in bases if is_private_folder(base)), last]
     for folder in wanted:
         with suppress(OSError):
             folder.mkdir(mode=0o700, exist_ok=True)
-    found = tuple(dict.fromkeys(one for one in (*wanted[:-1], RUN / "uavctl", last) if is_own(one)))
+    found = tuple(dict.fromkeys(one for one in (*wanted[:-1], RUN / "uavctl", last) if is_private_folder(one)))
     if not found:
         raise UsageError(
             f"{last}: not a folder of this user alone, and XDG_RUNTIME_DIR names none, so there is no safe place for "
@@ -76,7 +76,7 @@ _FLOWN = "flown at"  # the second line, with the time since the machine's start 
 LONGEST_FLIGHT_NS = 3600 * 10**9  # a vehicle that was left longer ago than a battery lasts has landed
 
 
-def identity(url: str) -> str:
+def identify_connection(url: str) -> str:
     """Return the identity of what a connection URL leads to, in one form for all URLs that mean the same.
 
     Args:
@@ -160,13 +160,13 @@ def _left_ns(text: bytes, now_ns: int) -> int | None:
 
 
 def lock_paths(url: str, folder: Path | None = None) -> tuple[Path, ...]:
-    """Files of the lock of the vehicle behind a URL; arguments and errors are those of `sole_daemon`."""
-    name = f"uavctl-{hashlib.sha256(identity(url).encode()).hexdigest()[:16]}.lock"
-    return tuple(one / name for one in (runtime_folders() if folder is None else (folder,)))
+    """Files of the lock of the vehicle behind a URL; arguments and errors are those of `lock_vehicle`."""
+    name = f"uavctl-{hashlib.sha256(identify_connection(url).encode()).hexdigest()[:16]}.lock"
+    return tuple(one / name for one in (find_runtime_folders() if folder is None else (folder,)))
 
 
 @contextmanager
-def sole_daemon(url: str, folder: Path | None = None) -> Iterator[VehicleLock]:
+def lock_vehicle(url: str, folder: Path | None = None) -> Iterator[VehicleLock]:
     """Hold the lock of the vehicle behind a URL; its files stay if the vehicle is left in flight.
 
     Args:
@@ -185,7 +185,7 @@ def sole_daemon(url: str, folder: Path | None = None) -> Iterator[VehicleLock]:
             stack.callback(os.close, descriptors[-1])
         tenure: VehicleLock | None = None
         try:
-            tenure = _tenure(descriptors, url, paths[0])
+            tenure = _make_vehicle_lock(descriptors, url, paths[0])
             yield tenure
         finally:
             if tenure is None or not tenure.leaves:
@@ -194,7 +194,7 @@ def sole_daemon(url: str, folder: Path | None = None) -> Iterator[VehicleLock]:
                         path.unlink()
 
 
-def _tenure(descriptors: Sequence[int], url: str, path: Path) -> VehicleLock:
+def _make_vehicle_lock(descriptors: Sequence[int], url: str, path: Path) -> VehicleLock:
     try:
         return VehicleLock(descriptors, url)
     except OSError as error:
@@ -222,8 +222,8 @@ def _lock(path: Path, url: str) -> int:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise _taken(descriptor, url) from None
-        if _is_still(path, descriptor):
+            raise _describe_holder(descriptor, url) from None
+        if _is_same_file(path, descriptor):
             return descriptor
         os.close(descriptor)
     raise VehicleTakenError(f"{url}: another daemon is just starting or ending on it; try again")
@@ -242,7 +242,7 @@ def _open(path: Path) -> int:
     raise PermissionError if stat.S_ISREG(found.st_mode) else OSError(0, "not a regular file")
 
 
-def _is_still(path: Path, descriptor: int) -> bool:
+def _is_same_file(path: Path, descriptor: int) -> bool:
     """Whether the name still means the file that was locked; its last holder may have removed it."""
     try:
         return os.path.samestat(os.stat(path), os.fstat(descriptor))  # noqa: PTH116 (stat of a path beside one of an fd)
@@ -250,7 +250,7 @@ def _is_still(path: Path, descriptor: int) -> bool:
         return False
 
 
-def _taken(descriptor: int, url: str) -> VehicleTakenError:
+def _describe_holder(descriptor: int, url: str) -> VehicleTakenError:
     first_line, _, _ = os.pread(descriptor, _LONGEST, 0).decode(errors="replace").partition("\n")
     pid, _, theirs = first_line.strip().partition(" ")
     os.close(descriptor)

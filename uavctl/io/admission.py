@@ -23,7 +23,7 @@ _HEARTBEATS = 8  # of a backlog of the vehicle's; what looks like one may be non
 
 
 @dataclass(frozen=True)
-class Rules:
+class AdmissionRules:
     """Rules for what a UDP connection lets in."""
 
     allow: tuple[str, ...] = ()  # addresses and networks; none lets anybody in
@@ -61,7 +61,7 @@ class AllowList:
         return any(address in network for network in self._networks)
 
 
-def frames_in(data: bytes) -> int:
+def count_frames(data: bytes) -> int:
     """Return the most frames that a datagram can make us look at: no checksum and no hash is taken more often.
 
     Each frame begins at one of the magic bytes; those that fit are not shorter than a frame, and the others are given
@@ -71,16 +71,16 @@ def frames_in(data: bytes) -> int:
 
 
 @dataclass(frozen=True)
-class Allowance:
+class RateLimit:
     """Amount that a sender may send: datagrams, frames and bytes."""
 
     per_s: tuple[float, float, float]  # of each, a second
     burst: tuple[float, float, float]  # of each, at once
 
     @staticmethod
-    def of(rules: Rules, times: float, burst: tuple[float, float, float]) -> Allowance:
+    def of(rules: AdmissionRules, times: float, burst: tuple[float, float, float]) -> RateLimit:
         """Return `times` times what the rules give one sender."""
-        return Allowance(_times(times, (rules.max_per_s, rules.max_frames_per_s, rules.max_bytes_per_s)), burst)
+        return RateLimit(_scale(times, (rules.max_per_s, rules.max_frames_per_s, rules.max_bytes_per_s)), burst)
 
 
 # A link that was held up delivers what it kept. Of strangers little is taken, of what the flight needs a stall's worth.
@@ -95,16 +95,16 @@ FAIR_TIMES = 1.0 / 16.0  # of what one may send; who sends less has sent little
 RESERVED = 0.5  # share of what all have together that is left to those who have sent little
 
 
-def _times(factor: float, those: tuple[float, float, float]) -> tuple[float, float, float]:
+def _scale(factor: float, those: tuple[float, float, float]) -> tuple[float, float, float]:
     return factor * those[0], factor * those[1], factor * those[2]
 
 
-class _Budget:
+class _TokenBucket:
     """Budget of what a sender may still send now."""
 
     __slots__ = ("_allowance", "_at_ns", "bytes", "datagrams", "frames")
 
-    def __init__(self, allowance: Allowance, now_ns: int) -> None:
+    def __init__(self, allowance: RateLimit, now_ns: int) -> None:
         self._allowance, self._at_ns = allowance, now_ns
         self.datagrams, self.frames, self.bytes = allowance.burst
 
@@ -146,16 +146,16 @@ class _Sender:
 
     __slots__ = ("budget", "fair")
 
-    def __init__(self, allowance: Allowance, now_ns: int) -> None:
-        self.budget = _Budget(allowance, now_ns)
-        self.fair = _Budget(Allowance(_times(FAIR_TIMES, allowance.per_s), allowance.burst), now_ns)
+    def __init__(self, allowance: RateLimit, now_ns: int) -> None:
+        self.budget = _TokenBucket(allowance, now_ns)
+        self.fair = _TokenBucket(RateLimit(_scale(FAIR_TIMES, allowance.per_s), allowance.burst), now_ns)
 
     def refill(self, now_ns: int) -> None:
-        """See `_Budget`."""
+        """See `_TokenBucket`."""
         self.budget.refill(now_ns)
         self.fair.refill(now_ns)
 
-    def take(self, frames: int, size: int, joint: _Budget | None) -> str | None:
+    def take(self, frames: int, size: int, joint: _TokenBucket | None) -> str | None:
         """Take a datagram, or say why not."""
         refusal = self.budget.refusal(frames, size)
         if joint is not None and refusal is None:
@@ -170,7 +170,7 @@ class _Sender:
         return refusal
 
 
-class Budgets:
+class RateLimiter:
     """Keep each sender from taking the time that the others and the control loop need.
 
     The flown vehicle has a budget of its own that nobody else can use up. Senders of what the flight needs have one
@@ -183,22 +183,22 @@ class Budgets:
         refused: counter that refusals are added to, by reason.
     """
 
-    def __init__(self, rules: Rules, refused: Counter[str]) -> None:
+    def __init__(self, rules: AdmissionRules, refused: Counter[str]) -> None:
         self._refused = refused
         self._rules = rules
-        self._trusted = Allowance.of(rules, 1.0, TRUSTED_BURST)
-        self._of_vehicle = Allowance.of(rules, VEHICLE_TIMES, VEHICLE_BURST)
+        self._trusted = RateLimit.of(rules, 1.0, TRUSTED_BURST)
+        self._of_vehicle = RateLimit.of(rules, VEHICLE_TIMES, VEHICLE_BURST)
         self._vehicle: tuple[Address, _Sender] | None = None
         self._known: OrderedDict[Address, _Sender] = OrderedDict()  # trusted; who was so last is last
         self._strangers: OrderedDict[Address, _Sender] = OrderedDict()  # who was heard last is last
-        self._all_trusted = _Budget(Allowance.of(rules, ALL_TRUSTED_TIMES, _times(2.0, TRUSTED_BURST)), 0)
+        self._all_trusted = _TokenBucket(RateLimit.of(rules, ALL_TRUSTED_TIMES, _scale(2.0, TRUSTED_BURST)), 0)
         self._meet_strangers(FIRST_BURST)
 
     def _meet_strangers(self, burst: tuple[float, float, float]) -> None:
         """Give unknown senders budgets with this burst, and twice that together."""
         self._strangers.clear()
-        self._stranger = Allowance.of(self._rules, 1.0, burst)
-        self._all_strangers = _Budget(Allowance.of(self._rules, 1.0, _times(2.0, burst)), 0)
+        self._stranger = RateLimit.of(self._rules, 1.0, burst)
+        self._all_strangers = _TokenBucket(RateLimit.of(self._rules, 1.0, _scale(2.0, burst)), 0)
 
     def _know_somebody(self) -> None:
         """Accept little from strangers from now on, if this is the first sender that is known."""
@@ -259,7 +259,7 @@ class Budgets:
     def _share(
         self,
         group: Iterable[tuple[_Sender, list[int]]],
-        joint: _Budget | None,
+        joint: _TokenBucket | None,
         data: Sequence[bytes],
         taken: list[bool],
     ) -> None:
@@ -272,7 +272,7 @@ class Budgets:
                 if index is None:
                     continue
                 others.append((one, newest))
-                refusal = one.take(frames_in(data[index]), len(data[index]), joint)
+                refusal = one.take(count_frames(data[index]), len(data[index]), joint)
                 if refusal is None:
                     taken[index] = True
                 else:

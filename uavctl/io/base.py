@@ -86,7 +86,7 @@ class Connection(Protocol):
         ...
 
 
-class Base(ABC):
+class BaseConnection(ABC):
     """Counters and clock of every connection."""
 
     max_reads = MAX_READS

@@ -38,7 +38,7 @@ COMPONENT_ID = mavlink.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
 _UNKNOWN = [math.nan, *([0.0] * 20)]
 
 
-class Words:
+class CameraMessageEncoder:
     """Frames of one source, numbered modulo 256."""
 
     def __init__(self) -> None:
@@ -69,7 +69,7 @@ class Words:
         return data
 
 
-def questions(data: bytes) -> tuple[int, ...]:
+def parse_time_requests(data: bytes) -> tuple[int, ...]:
     """The times that the requests for TIMESYNC in some MAVLink hold [ns]."""
     return tuple(
         message.ts1_ns
@@ -89,7 +89,7 @@ _COUNTS_S = 0.5
 _MEMORY = 2**30
 
 
-class Host:
+class CameraHost:
     """Passes on between a server of cameras and the daemon.
 
     Args:
@@ -99,7 +99,7 @@ class Host:
 
     def __init__(self, camera: Camera, pipe: socket.socket, server: tuple[str, int], interface: str) -> None:
         self._camera, self._pipe, self._server, self._interface = camera, pipe, server, interface
-        self._words = Words()
+        self._words = CameraMessageEncoder()
         self._waiting: deque[bytes] = deque()
         self._lost: Counter[str] = Counter()
         self._told: Counter[str] = Counter()
@@ -220,7 +220,7 @@ class Host:
             return True
         except OSError:
             return False
-        for token in questions(data):
+        for token in parse_time_requests(data):
             self._send(self._camera.ask_time(token))
         return bool(data)
 
@@ -254,10 +254,10 @@ class Host:
             self._group_socket.close()
             self._group_socket = None
         if self._group is not None:
-            self._group_socket = _joined(self._group, self._interface)
+            self._group_socket = _join_group(self._group, self._interface)
 
 
-def _joined(group: tuple[str, int], interface: str) -> socket.socket:
+def _join_group(group: tuple[str, int], interface: str) -> socket.socket:
     joined = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     joined.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # others on this computer may listen too
     member = struct.pack("4s4s", socket.inet_aton(group[0]), socket.inet_aton(interface))
@@ -274,7 +274,7 @@ def _joined(group: tuple[str, int], interface: str) -> socket.socket:
     return joined
 
 
-def _made(camera: str, body: str, up: Up) -> Camera:
+def _make_camera(camera: str, body: str, up: Up) -> Camera:
     """Make the class of a camera system, `module:Class`; modules of the working directory count last.
 
     Raises:
@@ -302,7 +302,7 @@ def main(arguments: list[str]) -> int:
     with socket.socket(fileno=int(descriptor)) as pipe:
         pipe.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _PIPE_BYTES)
         try:
-            host = Host(_made(camera, body, cast(Up, up)), pipe, (address, int(port)), interface)
+            host = CameraHost(_make_camera(camera, body, cast(Up, up)), pipe, (address, int(port)), interface)
             try:
                 host.run()
             finally:

@@ -24,11 +24,19 @@ from uavctl.clock import monotonic_ns
 from uavctl.config import Config
 from uavctl.config.connections import MOCAP_LINK, SecurityConfig
 from uavctl.errors import ConnectionSpecError, KeyFileError
-from uavctl.io.admission import Rules
+from uavctl.io.admission import AdmissionRules
 from uavctl.io.base import Connection
 from uavctl.io.sources import open_source
 from uavctl.mavlink.connection import MOCAP, STREAM_SCHEMES, VEHICLE
-from uavctl.mavlink.signing import KEY_BYTES, NEWEST_STAMP, Gate, Signing, SigningKey, Stamps, stamp_at
+from uavctl.mavlink.signing import (
+    KEY_BYTES,
+    MAX_TIMESTAMP,
+    FrameAuthenticator,
+    FrameSigner,
+    SigningKey,
+    SigningTimestamps,
+    signing_timestamp,
+)
 
 # Files of signing keys: made, and read with a check of who else can read them.
 #
@@ -110,13 +118,13 @@ def new_key(path: Path) -> SigningKey:
     return read_key(path)
 
 
-AHEAD = 200_000  # units of 10 µs: written ahead of what was seen, 2 s
-RENEW = 100_000  # written anew when less than this is left
+WRITE_AHEAD = 200_000  # units of 10 µs: written ahead of what was seen, 2 s
+RENEW_MARGIN = 100_000  # written anew when less than this is left
 PERIOD_S = 0.25
 LOCK_TRIES, LOCK_PAUSE_S = 40, 0.05  # to lock the file: a stamp is written in much less
 
 
-def state_folder(environment: Mapping[str, str] = os.environ) -> Path:
+def find_state_folder(environment: Mapping[str, str] = os.environ) -> Path:
     """Return the folder where stamps are kept: systemd's state directory, else the user's."""
     systemd, xdg = environment.get("STATE_DIRECTORY"), environment.get("XDG_STATE_HOME")
     if systemd:
@@ -124,7 +132,7 @@ def state_folder(environment: Mapping[str, str] = os.environ) -> Path:
     return (Path(xdg) if xdg else Path("~/.local/state").expanduser()) / "uavctl"
 
 
-def load(path: Path) -> int:
+def load_timestamp(path: Path) -> int:
     """The stamp in a file; 0 if there is no file.
 
     Raises:
@@ -145,12 +153,12 @@ def load(path: Path) -> int:
             f"stamp {path}: holds no number; remove the file, and share a new key, since frames of the old one could "
             "be replayed"
         ) from error
-    if not 0 <= stamp <= NEWEST_STAMP:
+    if not 0 <= stamp <= MAX_TIMESTAMP:
         raise KeyFileError(f"stamp {path}: {stamp} does not fit into 48 bits; remove the file, and share a new key")
     return stamp
 
 
-def save(path: Path, stamp: int) -> None:
+def save_timestamp(path: Path, stamp: int) -> None:
     """Write a stamp, whole or not at all; a larger one that is there stays, whoever wrote it.
 
     Raises:
@@ -163,7 +171,7 @@ def save(path: Path, stamp: int) -> None:
         draft = path.with_suffix(".new")
         draft.unlink(missing_ok=True)  # of a process that was killed, another user's it may be
         with _private(draft, os.O_EXCL) as file:
-            file.write(f"{max(stamp, load(path))}\n")
+            file.write(f"{max(stamp, load_timestamp(path))}\n")
             file.flush()
             os.fsync(file.fileno())
         draft.replace(path)
@@ -195,7 +203,7 @@ def _take(lock: int) -> None:
     fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
-class StampKeeper:
+class TimestampFile:
     """Writes the newest stamp to a file from a thread of its own, while a flight goes on.
 
     A disk that fails does not stop the flight: `failure` says so.
@@ -211,11 +219,11 @@ class StampKeeper:
         KeyFileError: the file cannot be read or written.
     """
 
-    def __init__(self, path: Path, now: int, write: Callable[[Path, int], None] = save) -> None:
+    def __init__(self, path: Path, now: int, write: Callable[[Path, int], None] = save_timestamp) -> None:
         self._path, self._write = path, write
-        floor = load(path)
-        self.stamps = Stamps(floor=floor, own=max(floor, now))
-        self._written = min(self.stamps.own + AHEAD, NEWEST_STAMP)
+        floor = load_timestamp(path)
+        self.stamps = SigningTimestamps(floor=floor, own=max(floor, now))
+        self._written = min(self.stamps.own + WRITE_AHEAD, MAX_TIMESTAMP)
         try:
             write(path, self._written)
         except OSError as error:
@@ -231,9 +239,9 @@ class StampKeeper:
     def renew(self) -> None:
         """Write ahead of all that has been seen, if what is written will not last."""
         seen = self.stamps.own
-        if seen + RENEW <= self._written:
+        if seen + RENEW_MARGIN <= self._written:
             return
-        ahead = min(seen + AHEAD, NEWEST_STAMP)
+        ahead = min(seen + WRITE_AHEAD, MAX_TIMESTAMP)
         try:
             self._write(self._path, ahead)
         except (OSError, KeyFileError) as error:
@@ -255,10 +263,10 @@ class StampKeeper:
 # Connections with a door: keys, stamps and rules of `[security]` put around the plain ones.
 
 
-class Sealed:
+class SignedConnection:
     """A connection whose frames are signed both ways; implements `uavctl.io.transport.Connection`."""
 
-    def __init__(self, inner: Connection, gate: Gate, now: Callable[[], int] = monotonic_ns) -> None:
+    def __init__(self, inner: Connection, gate: FrameAuthenticator, now: Callable[[], int] = monotonic_ns) -> None:
         self._inner, self._gate, self._now = inner, gate, now
         self._indices: list[int] = []
 
@@ -337,9 +345,9 @@ class Sealed:
         self._inner.close()
 
 
-def rules(security: SecurityConfig) -> Rules:
+def make_admission_rules(security: SecurityConfig) -> AdmissionRules:
     """Return the rules of the UDP connections: whom they listen to, and how much."""
-    return Rules(
+    return AdmissionRules(
         security.allow,
         float(security.max_datagrams_per_s),
         float(security.max_frames_per_s),
@@ -347,13 +355,13 @@ def rules(security: SecurityConfig) -> Rules:
     )
 
 
-Waits = Callable[[str], bool]
+ServerWait = Callable[[str], bool]
 # A computer that starts, or a program on it that does
 _NOT_UP = (errno.ECONNREFUSED, errno.EHOSTUNREACH, errno.EHOSTDOWN, errno.ECONNRESET)
 
 
 @contextmanager
-def connected(config: Config, waits: Waits | None = None) -> Iterator[dict[str, Connection]]:
+def open_links(config: Config, waits: ServerWait | None = None) -> Iterator[dict[str, Connection]]:
     """The daemon's connections by link name, open, with the doors that `[security]` asks for; one if both URLs are one.
 
     Args:
@@ -369,15 +377,15 @@ def connected(config: Config, waits: Waits | None = None) -> Iterator[dict[str, 
     with ExitStack() as stack:
         plain: dict[str, Connection] = {}
         for name, url in urls.items():
-            plain[name] = _opened(url, config.security, waits)
+            plain[name] = _open_link(url, config.security, waits)
             stack.callback(plain[name].close)
-        yield stack.enter_context(sealed(plain, config.security))
+        yield stack.enter_context(sign_connections(plain, config.security))
 
 
-def _opened(url: str, security: SecurityConfig, waits: Waits | None) -> Connection:
+def _open_link(url: str, security: SecurityConfig, waits: ServerWait | None) -> Connection:
     while True:
         try:
-            return open_source(url, monotonic_ns, rules(security))
+            return open_source(url, monotonic_ns, make_admission_rules(security))
         except ConnectionSpecError as error:
             cause = error.__cause__
             absent = isinstance(cause, OSError) and (isinstance(cause, TimeoutError) or cause.errno in _NOT_UP)
@@ -386,7 +394,9 @@ def _opened(url: str, security: SecurityConfig, waits: Waits | None) -> Connecti
 
 
 @contextmanager
-def sealed(connections: Mapping[str, Connection], security: SecurityConfig) -> Iterator[dict[str, Connection]]:
+def sign_connections(
+    connections: Mapping[str, Connection], security: SecurityConfig
+) -> Iterator[dict[str, Connection]]:
     """The connections, those that `security.require` names behind doors if there is a key.
 
     Raises:
@@ -398,16 +408,16 @@ def sealed(connections: Mapping[str, Connection], security: SecurityConfig) -> I
     key = read_key(Path(security.key_file).expanduser())
     wall_ns = time.time_ns()
     wall_offset_ns = wall_ns - monotonic_ns()
-    keeper = StampKeeper(state_folder() / f"{key.name}.stamp", stamp_at(wall_ns))
+    keeper = TimestampFile(find_state_folder() / f"{key.name}.stamp", signing_timestamp(wall_ns))
     peers = frozenset(security.peer_link_ids)
     try:
         doors = dict(connections)
         for name in security.require:
             if name in connections:
                 link_id = security.link_id + (MOCAP_LINK if name == MOCAP else 0)
-                signing = Signing(key, link_id, keeper.stamps, wall_offset_ns, peers)
+                signing = FrameSigner(key, link_id, keeper.stamps, wall_offset_ns, peers)
                 stream = connections[name].url.startswith(STREAM_SCHEMES)
-                doors[name] = Sealed(connections[name], Gate(signing, stream=stream))
+                doors[name] = SignedConnection(connections[name], FrameAuthenticator(signing, stream=stream))
         yield doors
     finally:
         keeper.close()

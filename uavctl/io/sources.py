@@ -14,10 +14,10 @@ from importlib.util import find_spec
 
 from uavctl.config.connections import camera_scheme, camera_system
 from uavctl.errors import ConnectionSpecError, ExtraMissingError
-from uavctl.io.admission import AllowList, Budgets, Rules
-from uavctl.io.base import Base, Connection
+from uavctl.io.admission import AdmissionRules, AllowList, RateLimiter
+from uavctl.io.base import BaseConnection, Connection
 from uavctl.io.camera import ANSWER_S, COUNTS, LARGEST, READY, REFUSED, parse
-from uavctl.io.transport import ANYBODY, open_connection
+from uavctl.io.transport import DEFAULT_RULES, open_connection
 
 # The daemon's end of a process that listens to cameras.
 
@@ -27,7 +27,7 @@ _START_S = 60.0  # for the interpreter of the process, on a busy computer
 _END_S = 2.0
 
 
-class Piped(Base):
+class CameraProcessConnection(BaseConnection):
     """A process that gives MAVLink; see `uavctl.io.sources`. Implements `uavctl.io.transport.Connection`.
 
     When the process ends, the connection shows as `closed`; while only its server is gone it asks on, and nothing
@@ -40,11 +40,13 @@ class Piped(Base):
         rules: how many messages a second are taken.
     """
 
-    def __init__(self, url: str, arguments: list[str], advice: str, now: Callable[[], int], rules: Rules) -> None:
+    def __init__(
+        self, url: str, arguments: list[str], advice: str, now: Callable[[], int], rules: AdmissionRules
+    ) -> None:
         super().__init__(url, now)
         self._advice = advice
         self._over: Counter[str] = Counter()
-        self._budgets, self._sender = Budgets(rules, self._over), (url, 0)
+        self._budgets, self._sender = RateLimiter(rules, self._over), (url, 0)
         self._budgets.trust(self._sender, now())
         self._theirs: Counter[str] = Counter()  # what the process counted
         self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -122,7 +124,7 @@ class Piped(Base):
         return None
 
 
-def _open_camera(url: str, now: Callable[[], int], rules: Rules) -> Connection:
+def _open_camera(url: str, now: Callable[[], int], rules: AdmissionRules) -> Connection:
     """Open a body of a camera system; see `open_source`.
 
     Raises:
@@ -142,7 +144,7 @@ def _open_camera(url: str, now: Callable[[], int], rules: Rules) -> Connection:
     if not AllowList(rules.allow).lets_in(address):
         raise ConnectionSpecError(f"connection {url!r}: {address} is not in security.allow; add it there")
     arguments = [system.camera, address, str(place.port), place.body, place.up, place.interface]
-    piped = Piped(url, arguments, system.advice, now, rules)
+    piped = CameraProcessConnection(url, arguments, system.advice, now, rules)
     with ExitStack() as stack:
         stack.callback(piped.close)
         piped.wait_until_ready()
@@ -167,7 +169,9 @@ def _open_camera(url: str, now: Callable[[], int], rules: Rules) -> Connection:
 # lost, which the controller knows how to bear, and nothing else happens.
 
 
-def open_source(url: str, now: Callable[[], int] = time.monotonic_ns, rules: Rules = ANYBODY) -> Connection:
+def open_source(
+    url: str, now: Callable[[], int] = time.monotonic_ns, rules: AdmissionRules = DEFAULT_RULES
+) -> Connection:
     """Open a source of positions.
 
     Args:

@@ -17,9 +17,9 @@ from urllib.parse import urlsplit
 import serial
 
 from uavctl.errors import ConnectionSpecError
-from uavctl.io.admission import MAGIC, NOT_LISTED, SILENCE_NS, Address, AllowList, Budgets, Rules
-from uavctl.io.base import BACKLOG_READS, MAX_READS, Base, Connection
-from uavctl.mavlink.connection import HUNG_UP, WENT_SILENT
+from uavctl.io.admission import MAGIC, NOT_LISTED, SILENCE_NS, Address, AdmissionRules, AllowList, RateLimiter
+from uavctl.io.base import BACKLOG_READS, MAX_READS, BaseConnection, Connection
+from uavctl.mavlink.connection import CONNECTION_SILENT, HUNG_UP
 
 # UDP: an allow-list and budgets come before anything that looks into a datagram.
 
@@ -28,14 +28,14 @@ PEER_SILENCE_NS = SILENCE_NS
 SECOND_ADDRESS = "second-address"
 LARGEST = 8192  # bytes that are read of a datagram; none of MAVLink is as long
 COMMON_BUFFER_BYTES = 2**20  # of the kernel's, for all who are not known yet
-OWN_BUFFER_BYTES = 2**22  # for one who is: some seconds of a vehicle's words, small ones too
+PEER_BUFFER_BYTES = 2**22  # for one who is: some seconds of a vehicle's words, small ones too
 COMMON_READS = 64  # datagrams of strangers in one call
-MAX_OWN = 8  # senders with a socket of their own
+MAX_PEER_SOCKETS = 8  # senders with a socket of their own
 _SO_RCVBUFFORCE, _SO_MEMINFO = 33, 55  # Linux
 _MEMINFO = struct.Struct("9I")
 
 
-class Socket(Base):
+class SocketConnection(BaseConnection):
     """A connection on a socket."""
 
     def __init__(self, url: str, family: socket.AddressFamily, kind: socket.SocketKind, now: Callable[[], int]) -> None:
@@ -59,15 +59,15 @@ class Socket(Base):
             raise ConnectionSpecError(f"connection {self.url!r}: {error.strerror or error}; {advice}") from error
 
 
-class _Udp(Socket):
+class _UdpConnection(SocketConnection):
     """Datagrams within the rules."""
 
     def __init__(
-        self, url: str, family: socket.AddressFamily, address: Address, now: Callable[[], int], rules: Rules
+        self, url: str, family: socket.AddressFamily, address: Address, now: Callable[[], int], rules: AdmissionRules
     ) -> None:
         super().__init__(url, family, socket.SOCK_DGRAM, now)
         self._family = family
-        self._allow, self._budgets = AllowList(rules.allow), Budgets(rules, self.refused)
+        self._allow, self._budgets = AllowList(rules.allow), RateLimiter(rules, self.refused)
         self._senders: list[Address] = []
         self._join(address)
         self._socket.setblocking(False)
@@ -98,10 +98,10 @@ class _Udp(Socket):
 
     def lost(self) -> int:
         """See `Connection`."""
-        return _dropped(self._socket)
+        return _count_dropped(self._socket)
 
 
-class UdpIn(_Udp):
+class UdpInConnection(_UdpConnection):
     """Bound UDP socket. It answers the peer that it was told to, and until then the first one that speaks MAVLink.
 
     What others send is handed on too: cameras and vehicle may share a port. Only a peer that has fallen silent is
@@ -118,7 +118,7 @@ class UdpIn(_Udp):
         self._own: dict[Address, socket.socket] = {}
         self._trusted_ns: dict[Address, int] = {}
         self._earlier: list[tuple[bytes, Address, int]] = []  # read from the common socket when an own one was made
-        _enlarge(self._socket, COMMON_BUFFER_BYTES)
+        _set_buffer_size(self._socket, COMMON_BUFFER_BYTES)
         self._attempt(
             self._socket.bind, address, "is another program on this port? end it, or take another port or address"
         )
@@ -130,7 +130,7 @@ class UdpIn(_Udp):
     def lost(self) -> int:
         """See `Connection`."""
         own = None if self._peer is None else self._own.get(self._peer)
-        return _dropped(self._socket if own is None else own)
+        return _count_dropped(self._socket if own is None else own)
 
     def close(self) -> None:
         """See `Connection`."""
@@ -206,9 +206,9 @@ class UdpIn(_Udp):
                 del self._trusted_ns[one]
                 if one in self._own:
                     self._own.pop(one).close()
-        if len(self._own) >= MAX_OWN and sender != self._peer:
+        if len(self._own) >= MAX_PEER_SOCKETS and sender != self._peer:
             return
-        own = _connected_beside((self._socket, *self._own.values()), self._family, sender)
+        own = _open_peer_socket((self._socket, *self._own.values()), self._family, sender)
         if own is None:
             return
         self._own[sender] = own
@@ -229,12 +229,12 @@ class UdpIn(_Udp):
             self.send_errors += 1
 
 
-class UdpOut(_Udp):
+class UdpOutConnection(_UdpConnection):
     """Connected UDP socket: the system hands on what its one peer sends."""
 
     def _join(self, address: Address) -> None:
         self._to = address
-        _enlarge(self._socket, OWN_BUFFER_BYTES)
+        _set_buffer_size(self._socket, PEER_BUFFER_BYTES)
         self._attempt(self._socket.connect, address, "check host, port and network")
         self._budgets.answer(address, self._now())
 
@@ -254,7 +254,7 @@ class UdpOut(_Udp):
             self.send_errors += 1
 
 
-def _enlarge(one: socket.socket, size: int) -> None:
+def _set_buffer_size(one: socket.socket, size: int) -> None:
     """Ask for a buffer of the system's; it may grant less."""
     with suppress(OSError):
         one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, size)
@@ -262,7 +262,7 @@ def _enlarge(one: socket.socket, size: int) -> None:
         one.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, size)
 
 
-def _dropped(one: socket.socket) -> int:
+def _count_dropped(one: socket.socket) -> int:
     """Datagrams that the system has dropped for want of room; 0 where it does not tell."""
     try:
         told = one.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size)
@@ -271,7 +271,7 @@ def _dropped(one: socket.socket) -> int:
     return int(_MEMINFO.unpack(told)[-1]) if len(told) == _MEMINFO.size else 0
 
 
-def _connected_beside(
+def _open_peer_socket(
     bound: Sequence[socket.socket], family: socket.AddressFamily, sender: Address
 ) -> socket.socket | None:
     """Another socket on the port of those that are bound, which gets what one sender sends; None if none can be had."""
@@ -280,7 +280,7 @@ def _connected_beside(
     own = socket.socket(family, socket.SOCK_DGRAM)
     try:
         _share_port((*bound, own), shared=True)
-        _enlarge(own, OWN_BUFFER_BYTES)
+        _set_buffer_size(own, PEER_BUFFER_BYTES)
         own.bind(bound[0].getsockname())
         own.connect(sender)
         own.setblocking(False)
@@ -311,7 +311,7 @@ _DROP_UNSENT = struct.pack("ii", 1, 0)  # of SO_LINGER: closed at once, by a res
 _PENDING_LIMIT = 4096  # bytes that wait for a stream that does not drain
 
 
-class _Pending:
+class _SendBuffer:
     """Bytes of whole frames that a stream has not taken yet; a frame is never cut by dropping."""
 
     def __init__(self) -> None:
@@ -326,7 +326,7 @@ class _Pending:
         return not dropped
 
 
-class Tcp(Socket):
+class TcpConnection(SocketConnection):
     """TCP client; a peer that has hung up or fallen silent is called again each second, and nobody waits for it."""
 
     max_reads = MAX_CHUNKS
@@ -335,7 +335,7 @@ class Tcp(Socket):
     def __init__(self, url: str, family: socket.AddressFamily, address: Address, now: Callable[[], int]) -> None:
         super().__init__(url, family, socket.SOCK_STREAM, now)
         self._family, self._address = family, address
-        self._pending = _Pending()
+        self._pending = _SendBuffer()
         self._up = True
         self._tried_ns = 0  # when the last attempt began, or the connection ended
         self._heard_ns: int | None = None  # when something came last, or the connection was made again
@@ -356,7 +356,7 @@ class Tcp(Socket):
         except BlockingIOError:
             # A network that went and came back may have forgotten the connection, and neither end is told.
             if self._heard_ns is not None and self._now() - self._heard_ns > PEER_SILENCE_NS:
-                self._hang_up(WENT_SILENT)
+                self._hang_up(CONNECTION_SILENT)
             raise
         except OSError:
             self._hang_up(HUNG_UP)
@@ -372,7 +372,7 @@ class Tcp(Socket):
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _DROP_UNSENT)
         self._socket.close()
         self._up, self._tried_ns = False, self._now()
-        self._pending = _Pending()  # a frame of which the peer has had the beginning
+        self._pending = _SendBuffer()  # a frame of which the peer has had the beginning
         self.refused[why] += 1
 
     def _call(self) -> None:
@@ -402,7 +402,7 @@ class Tcp(Socket):
             self.send_errors += 1
 
 
-class SerialConnection(Base):
+class SerialConnection(BaseConnection):
     """Serial port, 8N1, without flow control."""
 
     ends_on_error = True
@@ -411,7 +411,7 @@ class SerialConnection(Base):
 
     def __init__(self, url: str, device: str, baud: int, now: Callable[[], int]) -> None:
         super().__init__(url, now)
-        self._pending = _Pending()
+        self._pending = _SendBuffer()
         self._full = 0  # times that it was found full
         try:
             self._port = serial.Serial(device, baud, timeout=0, write_timeout=0, exclusive=True)
@@ -462,10 +462,12 @@ class SerialConnection(Base):
 
 
 FORMS = "udpin://HOST:PORT, udpout://HOST:PORT, tcp://HOST:PORT or serial:///dev/NAME:BAUD"
-ANYBODY = Rules()
+DEFAULT_RULES = AdmissionRules()
 
 
-def open_connection(url: str, now: Callable[[], int] = time.monotonic_ns, rules: Rules = ANYBODY) -> Connection:
+def open_connection(
+    url: str, now: Callable[[], int] = time.monotonic_ns, rules: AdmissionRules = DEFAULT_RULES
+) -> Connection:
     """Open a connection.
 
     Args:
@@ -483,10 +485,10 @@ def open_connection(url: str, now: Callable[[], int] = time.monotonic_ns, rules:
     kind = socket.SOCK_STREAM if scheme == "tcp" else socket.SOCK_DGRAM
     family, address = _resolve(url, kind)
     if scheme == "udpin":
-        return UdpIn(url, family, address, now, rules)
+        return UdpInConnection(url, family, address, now, rules)
     if scheme == "udpout":
-        return UdpOut(url, family, address, now, rules)
-    return Tcp(url, family, address, now)
+        return UdpOutConnection(url, family, address, now, rules)
+    return TcpConnection(url, family, address, now)
 
 
 def wait(

@@ -15,21 +15,21 @@ from statistics import median, median_low
 from uavctl.records import Vec3
 
 MAX_ROUND_TRIP_NS = 1_000_000_000  # a slower answer bounds the offset by nothing of use
-NEAR_NS = 10_000_000  # a round trip that is so much longer than the shortest says as much
+ROUND_TRIP_MARGIN_NS = 10_000_000  # a round trip that is so much longer than the shortest says as much
 # By which a clock's drift may change: real ones keep 1e-4, that of a simulator on a busy computer is followed so.
 DRIFT_CHANGE = 2e-3
 SECOND_NS = 1_000_000_000
 MAX_DEVIATION_NS = 100_000_000
 RESYNC_AFTER = 5  # deviating values in a row that are believed
-LEAP_NS = 1_000_000_000
-SETTLED_AFTER = 20  # samples before the minimum is trusted to judge the next stamp
-AGREE_NS = 200_000_000  # spread of the delays of one new clock
-REMEMBERED_STAMPS = 64
-FITTED = 5  # round trips that the line of a clock goes through: few, as a busy computer's clock changes its pace
-MIN_FITTED = 3
-MIN_SPAN_NS = 2_000_000_000  # between the first and the last of them: nearer ones say nothing of a drift
+MAX_CLOCK_STEP_NS = 1_000_000_000
+MIN_SAMPLES = 20  # samples before the minimum is trusted to judge the next stamp
+MAX_DELAY_SPREAD_NS = 200_000_000  # spread of the delays of one new clock
+STAMP_HISTORY = 64
+FIT_POINTS = 5  # round trips that the line of a clock goes through: few, as a busy computer's clock changes its pace
+MIN_FIT_POINTS = 3
+MIN_FIT_SPAN_NS = 2_000_000_000  # between the first and the last of them: nearer ones say nothing of a drift
 MAX_DRIFT = 0.05  # recorded: up to 0.034
-REMEMBERED_TRIPS = 60
+ROUND_TRIP_HISTORY = 60
 
 
 class StampRefusal(StrEnum):
@@ -58,16 +58,16 @@ class StampUnit(StrEnum):
     CONSTANT = "constant"  # they do not go on at all
 
 
-_PER_SECOND = {
+_UNITS_PER_SECOND = {
     StampUnit.SECONDS: 1.0,
     StampUnit.MILLISECONDS: 1e3,
     StampUnit.MICROSECONDS: 1e6,
     StampUnit.NANOSECONDS: 1e9,
 }
-UNIT_NS = 1_500_000_000  # over which stamps are compared with our clock: stamps in s go on in it
+UNIT_WINDOW_NS = 1_500_000_000  # over which stamps are compared with our clock: stamps in s go on in it
 
 
-class StampUnitWatch:
+class StampUnitDetector:
     """Recognises the unit of a source's stamps by how fast they go on, against our clock.
 
     Attributes:
@@ -85,11 +85,11 @@ class StampUnitWatch:
         """
         if self._begun is None:
             self._begun = stamp, at_ns, position_m
-        elif at_ns - self._begun[1] >= UNIT_NS:
+        elif at_ns - self._begun[1] >= UNIT_WINDOW_NS:
             advance, passed_s = stamp - self._begun[0], (at_ns - self._begun[1]) * 1e-9
             if advance == 0 and position_m != self._begun[2]:
                 self.unit = StampUnit.CONSTANT
-            for unit, per_second in _PER_SECOND.items():
+            for unit, per_second in _UNITS_PER_SECOND.items():
                 # Whole seconds may be one more or less than have passed.
                 if 0.5 * per_second * passed_s <= advance <= 2.0 * per_second * passed_s:
                     self.unit = unit
@@ -123,7 +123,7 @@ class SlidingMinimum:
         self._queue.clear()
 
 
-class RoundTrips:
+class TimesyncClock:
     """Offset and drift of a peer's clock from its answers to TIMESYNC requests.
 
     An answer bounds the offset: the peer read its clock between our sending and our receiving, so the middle is off by
@@ -141,8 +141,8 @@ class RoundTrips:
 
     def __init__(self, lifetime_ns: int) -> None:
         self._lifetime_ns = lifetime_ns
-        self._trips: deque[tuple[int, int, int]] = deque(maxlen=FITTED)  # (received, offset, round trip)
-        self._round_trips_ns: deque[int] = deque(maxlen=REMEMBERED_TRIPS)
+        self._trips: deque[tuple[int, int, int]] = deque(maxlen=FIT_POINTS)  # (received, offset, round trip)
+        self._round_trips_ns: deque[int] = deque(maxlen=ROUND_TRIP_HISTORY)
         self._drifts = False  # whether the slope is known
         self._slope = 0.0
         self._base_ns = 0
@@ -208,13 +208,13 @@ class RoundTrips:
             uncertain_ns = None
         self._deviating = 0
         self._heard_ns = received_ns
-        if known_ns is not None and uncertain_ns is not None and half_ns > uncertain_ns + NEAR_NS // 2:
+        if known_ns is not None and uncertain_ns is not None and half_ns > uncertain_ns + ROUND_TRIP_MARGIN_NS // 2:
             within_ns = min(max(known_ns, measured_ns - half_ns), measured_ns + half_ns)
             self._base_ns += within_ns - known_ns
             return True
         # Round trips of other lengths may be off by other amounts, which is no drift: the slope goes on without them.
-        alike = [trip for trip in self._trips if abs(round_trip_ns - trip[2]) <= 2 * NEAR_NS]
-        self._trips = deque([*alike, (received_ns, measured_ns, round_trip_ns)], maxlen=FITTED)
+        alike = [trip for trip in self._trips if abs(round_trip_ns - trip[2]) <= 2 * ROUND_TRIP_MARGIN_NS]
+        self._trips = deque([*alike, (received_ns, measured_ns, round_trip_ns)], maxlen=FIT_POINTS)
         self._fit()
         return True
 
@@ -227,7 +227,7 @@ class RoundTrips:
         """The line through the last answers, as its slope and its value at the last one."""
         self.shortest_ns = min(length_ns for _, _, length_ns in self._trips)
         last_ns = self._trips[-1][0]
-        if len(self._trips) >= MIN_FITTED and last_ns - self._trips[0][0] >= MIN_SPAN_NS:
+        if len(self._trips) >= MIN_FIT_POINTS and last_ns - self._trips[0][0] >= MIN_FIT_SPAN_NS:
             pairs = combinations(self._trips, 2)
             slope = median((o2 - o1) / (t2 - t1) for (t1, o1, _), (t2, o2, _) in pairs if t2 > t1)
             self._slope, self._drifts = min(max(slope, -MAX_DRIFT), MAX_DRIFT), True
@@ -248,7 +248,7 @@ class ArrivalClock:
         self._at_ns: int | None = None  # time of the last stamp
         self._second: tuple[int, int, int] = (0, 0, 0)  # its begin, least (arrival − stamp) in it, when that was
         self._before: tuple[int, int] | None = None  # the last two of the second before
-        self._rises: deque[float] = deque(maxlen=FITTED)
+        self._rises: deque[float] = deque(maxlen=FIT_POINTS)
         self._slope = 0.0
         self._ahead = 0  # stamps in a row that this clock cannot have given
 
@@ -263,7 +263,7 @@ class ArrivalClock:
             self._before, self._slope, self._ahead = None, 0.0, 0
             self._rises.clear()
             self._second, self._least_ns = (at_ns, behind_ns, at_ns), behind_ns
-        elif behind_ns < self._least_ns - LEAP_NS:
+        elif behind_ns < self._least_ns - MAX_CLOCK_STEP_NS:
             self._ahead += 1
             return 0
         else:
@@ -305,7 +305,7 @@ class ClockSync:
         self._shortest = SlidingMinimum(window_ns)  # delay by the offset from round trips
         self._newest_ns = 0
         self._count = 0
-        self._stamps: deque[int] = deque(maxlen=REMEMBERED_STAMPS)
+        self._stamps: deque[int] = deque(maxlen=STAMP_HISTORY)
         self._leaps: deque[int] = deque(maxlen=RESYNC_AFTER)
         self.resyncs = 0
         self.offset_ns: int | None = None
@@ -345,7 +345,7 @@ class ClockSync:
         """
         shortest_ns = self._shortest.push(received_ns, received_ns - stamp_ns - offset_ns)
         least_ns = -self._future_tolerance_ns
-        return any(least_ns <= delay_ns <= LEAP_NS for delay_ns in (minimum_ns - offset_ns, shortest_ns))
+        return any(least_ns <= delay_ns <= MAX_CLOCK_STEP_NS for delay_ns in (minimum_ns - offset_ns, shortest_ns))
 
     def unwrap(self, stamp: int, modulus: int, unit_ns: int) -> int:
         """Nanoseconds of a counter that wraps, as the value nearest to the newest stamp."""
@@ -361,16 +361,16 @@ class ClockSync:
         if stamp_ns in self._stamps:
             return StampRefusal.DUPLICATE
         delay_ns = received_ns - stamp_ns
-        ahead_ns = self._future_tolerance_ns if self._count >= SETTLED_AFTER else LEAP_NS
+        ahead_ns = self._future_tolerance_ns if self._count >= MIN_SAMPLES else MAX_CLOCK_STEP_NS
         if minimum_ns - delay_ns > ahead_ns:
             refusal = StampRefusal.FUTURE
-        elif self._newest_ns - stamp_ns > LEAP_NS:
+        elif self._newest_ns - stamp_ns > MAX_CLOCK_STEP_NS:
             refusal = StampRefusal.LEAP
         else:
             self._leaps.clear()
             return None
         self._leaps.append(delay_ns)
-        if len(self._leaps) < RESYNC_AFTER or max(self._leaps) - min(self._leaps) > AGREE_NS:
+        if len(self._leaps) < RESYNC_AFTER or max(self._leaps) - min(self._leaps) > MAX_DELAY_SPREAD_NS:
             return refusal
         self._restart()
         return None

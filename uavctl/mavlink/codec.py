@@ -35,7 +35,7 @@ from uavctl.mavlink.messages import (
     Inertial,
     Landed,
     Message,
-    ModeOrder,
+    ModeCommand,
     ParamValue,
     Position,
     RadioChannels,
@@ -133,7 +133,7 @@ def _version(raw: Fields) -> AutopilotVersion:
     )
 
 
-STATE_READERS: dict[int, Callable[[Fields], Message | None]] = {
+STATE_PARSERS: dict[int, Callable[[Fields], Message | None]] = {
     mavlink.MAVLINK_MSG_ID_ATTITUDE: _attitude,
     mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: _attitude_quaternion,
     mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: _highres_imu,
@@ -150,10 +150,10 @@ MAX_DATAGRAM_BYTES = 4096
 BAD_FIELD = "non-finite"
 BAD_FRAME = "frame-id"
 BAD_QUALITY = "quality"
-OWN_ESTIMATE = "own-estimate"  # an autopilot's ODOMETRY of itself is no external position
+AUTOPILOT_ESTIMATE = "own-estimate"  # an autopilot's ODOMETRY of itself is no external position
 
 
-class Decoded(msgspec.Struct, frozen=True):
+class DecodedMessages(msgspec.Struct, frozen=True):
     """Result of decoding some bytes."""
 
     messages: tuple[Message, ...]  # those that are understood, in order
@@ -161,19 +161,19 @@ class Decoded(msgspec.Struct, frozen=True):
     bad: dict[str, int]  # what was skipped, by reason
 
 
-class _RefusedError(Exception):
+class _UnusableError(Exception):
     """A message's content cannot be used; the argument is the reason."""
 
 
-def decode(data: bytes) -> Decoded:
+def decode(data: bytes) -> DecodedMessages:
     """Decode one datagram by itself, so that a broken one spoils no other.
 
     Args:
         data: a datagram; longer ones than `MAX_DATAGRAM_BYTES` are dropped whole.
     """
     if len(data) > MAX_DATAGRAM_BYTES:
-        return Decoded((), 0, {BadBytes.OVERSIZE: 1})
-    return decoded(scan(data, final=True))
+        return DecodedMessages((), 0, {BadBytes.OVERSIZE: 1})
+    return decode_scan(scan(data, final=True))
 
 
 class StreamDecoder:
@@ -183,30 +183,30 @@ class StreamDecoder:
         self._rest = b""
         self._in_step = True
 
-    def push(self, chunk: bytes) -> Decoded:
+    def push(self, chunk: bytes) -> DecodedMessages:
         """Take the next bytes; what they begin and do not end waits for the next chunk."""
         data = self._rest + chunk
         found = scan(data, final=False, in_step=self._in_step)
         self._rest, self._in_step = data[found.consumed :], found.in_step
-        return decoded(found)
+        return decode_scan(found)
 
 
-def decoded(found: Scan) -> Decoded:
+def decode_scan(found: Scan) -> DecodedMessages:
     """Decode the frames that a scan has found."""
     messages = []
     for frame in found.frames:
-        understood = _UNDERSTOOD.get(frame.message_id)
+        understood = _DECODERS.get(frame.message_id)
         if understood is None:
             continue
         layout, reader = understood
         try:
             message = reader(layout.read(frame.data))
-        except _RefusedError as refused:
+        except _UnusableError as refused:
             found.skip(str(refused))
         else:
             if message is not None:
                 messages.append(message)
-    return Decoded(tuple(messages), len(found.frames), found.bad)
+    return DecodedMessages(tuple(messages), len(found.frames), found.bad)
 
 
 def _finite(*values: float) -> bool:
@@ -216,7 +216,7 @@ def _finite(*values: float) -> bool:
 def _xyz(raw: Fields) -> Vec3:
     position = (raw.x, raw.y, raw.z)
     if not _finite(*position):
-        raise _RefusedError(BAD_FIELD)
+        raise _UnusableError(BAD_FIELD)
     return position
 
 
@@ -251,12 +251,12 @@ _BODY_AXES = (mavlink.MAV_FRAME_BODY_FRD, mavlink.MAV_FRAME_BODY_NED)
 
 def _odometry(raw: Fields) -> Position:
     if raw.estimator_type == mavlink.MAV_ESTIMATOR_TYPE_AUTOPILOT:
-        raise _RefusedError(OWN_ESTIMATE)
+        raise _UnusableError(AUTOPILOT_ESTIMATE)
     axes = _ODOMETRY_AXES.get(raw.frame_id)
     if axes is None:
-        raise _RefusedError(BAD_FRAME)
+        raise _UnusableError(BAD_FRAME)
     if raw.quality < 0:  # "odometry has failed"
-        raise _RefusedError(BAD_QUALITY)
+        raise _UnusableError(BAD_QUALITY)
     return Position(
         system=raw.src_system,
         component=raw.src_component,
@@ -376,12 +376,12 @@ MODE_COMMANDS = frozenset(
 )
 
 
-def _command(raw: Fields) -> ModeOrder | None:
+def _command(raw: Fields) -> ModeCommand | None:
     return _set_mode(raw) if raw.command in MODE_COMMANDS else None
 
 
-def _set_mode(raw: Fields) -> ModeOrder:
-    return ModeOrder(system=raw.src_system, component=raw.src_component, target_system=raw.target_system)
+def _set_mode(raw: Fields) -> ModeCommand:
+    return ModeCommand(system=raw.src_system, component=raw.src_component, target_system=raw.target_system)
 
 
 def _battery_status(raw: Fields) -> Battery | None:
@@ -425,7 +425,7 @@ def _origin(raw: Fields) -> GlobalOrigin:
     return GlobalOrigin(system=raw.src_system, component=raw.src_component)
 
 
-_READERS: dict[int, Callable[[Fields], Message | None]] = {
+_PARSERS: dict[int, Callable[[Fields], Message | None]] = {
     mavlink.MAVLINK_MSG_ID_VISION_POSITION_ESTIMATE: _with_angles,
     mavlink.MAVLINK_MSG_ID_VICON_POSITION_ESTIMATE: _with_angles,
     mavlink.MAVLINK_MSG_ID_ATT_POS_MOCAP: _with_quaternion,
@@ -444,9 +444,9 @@ _READERS: dict[int, Callable[[Fields], Message | None]] = {
     mavlink.MAVLINK_MSG_ID_RC_CHANNELS_RAW: _raw_channels,
     mavlink.MAVLINK_MSG_ID_SET_MODE: _set_mode,
     mavlink.MAVLINK_MSG_ID_COMMAND_LONG: _command,
-    **STATE_READERS,
+    **STATE_PARSERS,
 }
-_UNDERSTOOD = {number: (MessageLayout(mavlink.mavlink_map[number]), reader) for number, reader in _READERS.items()}
+_DECODERS = {number: (MessageLayout(mavlink.mavlink_map[number]), reader) for number, reader in _PARSERS.items()}
 
 
 # Typed messages to MAVLink bytes; what a vehicle must not get is refused.

@@ -12,8 +12,15 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from uavctl.config.connections import ClockConfig, DaemonConfig, FrameConfig, SourceConfig
 from uavctl.config.types import EstimatorConfig
 from uavctl.frames import Quaternion
-from uavctl.mavlink.clocksync import LEAP_NS, NEAR_NS, ArrivalClock, ClockSource, RoundTrips, StampUnit
-from uavctl.mavlink.codec import OWN_ESTIMATE, Encoder, StreamDecoder, UnsendableError, decode
+from uavctl.mavlink.clocksync import (
+    MAX_CLOCK_STEP_NS,
+    ROUND_TRIP_MARGIN_NS,
+    ArrivalClock,
+    ClockSource,
+    StampUnit,
+    TimesyncClock,
+)
+from uavctl.mavlink.codec import AUTOPILOT_ESTIMATE, Encoder, StreamDecoder, UnsendableError, decode
 from uavctl.mavlink.framing import BadBytes
 from uavctl.mavlink.messages import (
     Ack,
@@ -33,7 +40,14 @@ from uavctl.mavlink.positions import SLOW_ANSWER, PositionDecoder
 from uavctl.mavlink.profile import PROFILES
 from uavctl.mavlink.relay import Relay
 from uavctl.mavlink.requests import COMMANDS, RequestKind
-from uavctl.mavlink.vehicle import ENOUGH, LOW_SHARE, SECOND_VEHICLE, UNPUNCTUAL, Joiner, VehicleWatch
+from uavctl.mavlink.vehicle import (
+    MIN_INERTIAL,
+    MIN_INERTIAL_SHARE,
+    SECOND_VEHICLE,
+    STALE_INERTIAL,
+    StatusTextAssembler,
+    VehicleMonitor,
+)
 from uavctl.records import (
     Event,
     InertialSample,
@@ -50,10 +64,10 @@ from uavctl.records import (
 
 
 SECOND_NS = 1_000_000_000
-SETTLE_NS = 2 * SECOND_NS  # many vehicles stream by themselves
-AGAIN_NS = 2 * SECOND_NS
-TRIES = 5
-ORIGIN_TRIES = 30  # once a second: its estimator may take that long to begin
+STREAM_SETTLE_NS = 2 * SECOND_NS  # many vehicles stream by themselves
+RETRY_NS = 2 * SECOND_NS
+MAX_TRIES = 5
+MAX_ORIGIN_TRIES = 30  # once a second: its estimator may take that long to begin
 
 LOCAL_POSITION_NED, ATTITUDE, EXTENDED_SYS_STATE, SYS_STATUS = 32, 30, 245, 1
 RC_CHANNELS = 65
@@ -64,15 +78,15 @@ RATES_HZ = {LOCAL_POSITION_NED: 10.0, ATTITUDE: 10.0, EXTENDED_SYS_STATE: 5.0, S
 INERTIAL_HZ = 50.0  # of what shows how it turns, and its acceleration
 
 # Of the list of all parameters: 50 a second are asked for again at most, which a telemetry radio bears.
-MOST_PARAMETERS, ROUNDS = 5000, 10
-READS, READS_NS = 10, SECOND_NS // 5
-QUIET_NS = SECOND_NS // 2  # without a parameter: the list has ended
+MAX_PARAMETERS, MAX_READ_ROUNDS = 5000, 10
+READS_PER_BATCH, BATCH_NS = 10, SECOND_NS // 5
+LIST_END_NS = SECOND_NS // 2  # without a parameter: the list has ended
 
 SOURCE_PARAMETER = "EK3_SRC1_POSXY"
-EXTERNAL = 6.0  # of the source: external positions
+EXTERNAL_SOURCE = 6.0  # of the source: external positions
 
 
-class Streams:
+class StreamRequests:
     """Asks for the messages that do not come by themselves, a few times.
 
     Args:
@@ -117,22 +131,22 @@ class Streams:
         """Return (message id, rate [1/s]) of what is to be asked for now; call it once a vehicle is heard."""
         wanted: dict[int, float] = {}
         if self._next_ns is None:
-            self._next_ns = at_ns + SETTLE_NS
-        if at_ns >= self._next_ns and self._tries < TRIES:
-            self._next_ns = at_ns + AGAIN_NS
+            self._next_ns = at_ns + STREAM_SETTLE_NS
+        if at_ns >= self._next_ns and self._tries < MAX_TRIES:
+            self._next_ns = at_ns + RETRY_NS
             self._tries += 1
             wanted = {number: rate for number, rate in self._rates_hz.items() if number not in self._seen}
         # Not waited for: but for a PX4 on an onboard link no vehicle sends them so often, and a flight may have begun.
         profile = PROFILES.get(autopilot) if self._inertial and not self._feels else None
         kinds = () if profile is None else profile.inertial
-        if kinds and at_ns >= self._felt_next_ns and self._felt_tries < TRIES:
-            self._felt_next_ns = at_ns + AGAIN_NS
+        if kinds and at_ns >= self._felt_next_ns and self._felt_tries < MAX_TRIES:
+            self._felt_next_ns = at_ns + RETRY_NS
             self._felt_tries += 1
             wanted.update(dict.fromkeys(kinds, INERTIAL_HZ))
         return tuple(wanted.items())
 
 
-class ParameterList:
+class ParameterDownload:
     """Schedule of asking a vehicle that has not been armed yet for all its parameters: the list, then what was lost."""
 
     def __init__(self) -> None:
@@ -145,7 +159,7 @@ class ParameterList:
 
     def saw(self, message: Message) -> None:
         """Take a message of the vehicle."""
-        if isinstance(message, ParamValue) and message.index < message.count <= MOST_PARAMETERS:
+        if isinstance(message, ParamValue) and message.index < message.count <= MAX_PARAMETERS:
             if self._missing is None:
                 self._missing = set(range(message.count))
             self._missing.discard(message.index)
@@ -157,27 +171,27 @@ class ParameterList:
         if self._over:
             return ()
         if self._news and not self._rounds:  # the list is on its way
-            self._news, self._next_ns = False, at_ns + QUIET_NS
+            self._news, self._next_ns = False, at_ns + LIST_END_NS
         if at_ns < self._next_ns:
             return ()
         if self._missing is None:
             self._lists += 1
-            self._next_ns = at_ns + AGAIN_NS
-            self._over = self._lists > TRIES
+            self._next_ns = at_ns + RETRY_NS
+            self._over = self._lists > MAX_TRIES
             return () if self._over else (-1,)
-        self._next_ns = at_ns + READS_NS
+        self._next_ns = at_ns + BATCH_NS
         if not self._round:
             self._rounds += 1
-            self._over = self._rounds > ROUNDS
+            self._over = self._rounds > MAX_READ_ROUNDS
             self._round = [] if self._over else sorted(self._missing, reverse=True)
-        asked = self._round[-READS:][::-1]
-        del self._round[-READS:]
+        asked = self._round[-READS_PER_BATCH:][::-1]
+        del self._round[-READS_PER_BATCH:]
         if not self._round:  # the last answers of a round are waited for
-            self._next_ns = at_ns + QUIET_NS
+            self._next_ns = at_ns + LIST_END_NS
         return tuple(index for index in asked if index in self._missing)
 
 
-class Globe:
+class GlobalOriginSetup:
     """Schedule of sending a place on the globe to an ArduPilot on external positions, which does not arm without one.
 
     Its source of positions is read first: with GPS a place of ours would be wrong.
@@ -195,14 +209,14 @@ class Globe:
             case GlobalOrigin():
                 self._known = True
             case ParamValue(name=name, cast=cast) if name == SOURCE_PARAMETER:
-                self._external = cast == EXTERNAL
+                self._external = cast == EXTERNAL_SOURCE
 
     def due(self, at_ns: int) -> tuple[bool, bool]:
         """Whether to ask now (for the parameter and the origin), and whether to tell the origin.
 
         The place is sent from the second time on: by then a vehicle that has an origin has answered with it.
         """
-        if self._known or at_ns < self._next_ns or self._tries >= ORIGIN_TRIES:
+        if self._known or at_ns < self._next_ns or self._tries >= MAX_ORIGIN_TRIES:
             return False, False
         self._next_ns = at_ns + SECOND_NS
         self._tries += 1
@@ -217,31 +231,31 @@ HEARTBEAT_NS = SECOND_NS
 # A little off one second, so that requests do not always wait behind the same step's solve.
 TIMESYNC_NS = 950_000_000
 FIRST_TIMESYNC_NS = 200_000_000
-FIRST_REQUESTS = 10  # sent faster, until the first answer
-OPEN_REQUESTS = 8  # requests whose answers are still taken
+MAX_FIRST_REQUESTS = 10  # sent faster, until the first answer
+MAX_OPEN_REQUESTS = 8  # requests whose answers are still taken
 # Requests that are answered within a time, for the vehicle and for others each: a flood of them neither makes a flood
 # of answers nor costs a tick its time.
-MAX_ANSWERS, ANSWERS_NS = 8, 50_000_000
+MAX_ANSWERS, ANSWER_WINDOW_NS = 8, 50_000_000
 STREAM_SCHEMES = ("tcp:", "serial:")
-SLOW_TOLD_NS = 10_000_000_000  # between two events of slow answers
-MUTE_NS = 3 * SECOND_NS  # three heartbeats that did not come
+SLOW_EVENT_NS = 10_000_000_000  # between two events of slow answers
+MISSING_HEARTBEAT_NS = 3 * SECOND_NS  # three heartbeats that did not come
 NO_HEARTBEAT = "no-heartbeat"
 STAMP_UNIT = "stamp-unit"
-UNANSWERED = "timesync-flood"
+TIMESYNC_FLOOD = "timesync-flood"
 OVERRUN = "overrun"  # dropped by the system while nobody read, the vehicle's newest words perhaps
 HUNG_UP = "hung-up"  # times that the other side of a TCP connection has closed it
-WENT_SILENT = "went-silent"  # times that nothing came over a TCP connection for so long that it is made again
-_LOST = {
+CONNECTION_SILENT = "went-silent"  # times that nothing came over a TCP connection for so long that it is made again
+_DISCONNECT_TEXTS = {
     HUNG_UP: "the other side closed the connection; it is called again each second",
-    WENT_SILENT: "nothing came over the connection any more; it is made again",
+    CONNECTION_SILENT: "nothing came over the connection any more; it is made again",
 }
 # Counted, not told: every flight has them, or they are told in another way.
-_USUAL = frozenset({BadBytes.UNKNOWN, OWN_ESTIMATE, *_LOST})
+_NOT_REPORTED = frozenset({BadBytes.UNKNOWN, AUTOPILOT_ESTIMATE, *_DISCONNECT_TEXTS})
 
 Item = PositionSample | VehicleStatus | VehicleMotion | InertialSample | Event | Ack | Text
 
 
-class Understood(NamedTuple):
+class ReceiveResult(NamedTuple):
     """Content of one datagram, and the origin of the newest sample by then, which may be of a datagram before."""
 
     items: tuple[Item, ...]
@@ -285,7 +299,7 @@ class MavlinkConnection:
         self._encoder = Encoder(*self._own)
         self._intake = PositionDecoder(frame, clock, source, estimator, self._count)
         feels = estimator.inertial_std_mps2 > 0.0
-        self._vehicle = VehicleWatch(
+        self._vehicle = VehicleMonitor(
             self._count,
             self._own,
             daemon.vehicle_system_id,
@@ -294,11 +308,11 @@ class MavlinkConnection:
             channels=daemon.radio_channels,
         )
         self._streams, self._globe, self._texts = (
-            Streams(inertial=feels, channels=daemon.radio_channels),
-            Globe(),
-            Joiner(),
+            StreamRequests(inertial=feels, channels=daemon.radio_channels),
+            GlobalOriginSetup(),
+            StatusTextAssembler(),
         )
-        self._lists, self._parameters = daemon.parameters, ParameterList()
+        self._lists, self._parameters = daemon.parameters, ParameterDownload()
         self._bad: Counter[str] = Counter()
         self._untold: Counter[str] = Counter()
         self._told_ns: int | None = None
@@ -315,7 +329,7 @@ class MavlinkConnection:
         self._heartbeat_ns: int | None = None
         self._request_ns: int | None = None
         self._requests = 0
-        self._open: deque[int] = deque(maxlen=OPEN_REQUESTS)
+        self._open: deque[int] = deque(maxlen=MAX_OPEN_REQUESTS)
         self._answered = False
         self._listen = listen
         self._vehicle_clock = ArrivalClock()
@@ -328,7 +342,7 @@ class MavlinkConnection:
         """System and component of the vehicle; None before its first heartbeat."""
         return self._vehicle.address
 
-    def trips(self, address: tuple[int, int] | None = None) -> RoundTrips | None:
+    def trips(self, address: tuple[int, int] | None = None) -> TimesyncClock | None:
         """Round trips to a peer that answers TIMESYNC; without an address, to the source of the newest sample."""
         return self._intake.trips(address)
 
@@ -349,7 +363,7 @@ class MavlinkConnection:
         """Return the time since the vehicle started, by its own clock [s]; None if it does not tell."""
         return self._vehicle.up_s(at_ns)
 
-    def receive(self, data: bytes, at_ns: int) -> Understood:
+    def receive(self, data: bytes, at_ns: int) -> ReceiveResult:
         """Take one datagram, or one chunk of a stream, that arrived at `at_ns`; never raises."""
         self._answers.clear()
         decoded = decode(data) if self._stream is None else self._stream.push(data)
@@ -361,7 +375,7 @@ class MavlinkConnection:
         items += [item for text in self._texts.overdue(at_ns) for item in self._vehicle.take(text, at_ns)]
         intake = self._intake
         told = (*items, *self._tell(at_ns))
-        return Understood(told, tuple(self._answers), intake.settled, intake.attitude, intake.clock_source)
+        return ReceiveResult(told, tuple(self._answers), intake.settled, intake.attitude, intake.clock_source)
 
     def refused(self, counts: Mapping[str, int], at_ns: int) -> tuple[Event, ...]:
         """Take the counts of what the connection dropped unread: addresses, rates, signatures."""
@@ -369,7 +383,7 @@ class MavlinkConnection:
             self._count(reason, count)
         lost = tuple(
             Event(at_ns=at_ns, severity=Severity.ERROR, code=reason, text=f"link {self._name}: {text}")
-            for reason, text in _LOST.items()
+            for reason, text in _DISCONNECT_TEXTS.items()
             if reason in counts
         )
         return lost + self._tell(at_ns)
@@ -380,7 +394,7 @@ class MavlinkConnection:
         if self._heartbeat_ns is None or at_ns - self._heartbeat_ns >= HEARTBEAT_NS:
             self._heartbeat_ns = at_ns
             out.append(self._encoder.heartbeat())
-        eager = not self._answered and self._requests < FIRST_REQUESTS
+        eager = not self._answered and self._requests < MAX_FIRST_REQUESTS
         interval_ns = FIRST_TIMESYNC_NS if eager else TIMESYNC_NS
         if self._request_ns is None or at_ns - self._request_ns >= interval_ns:
             self._request_ns = at_ns
@@ -500,9 +514,9 @@ class MavlinkConnection:
         known_ns = None if trips is None else trips.last_known_ns(at_ns)
         if trips is None or known_ns is None:
             return arrival_ns
-        if arrival_ns is None or trips.offset_ns(at_ns) is not None or abs(arrival_ns - known_ns) > LEAP_NS:
+        if arrival_ns is None or trips.offset_ns(at_ns) is not None or abs(arrival_ns - known_ns) > MAX_CLOCK_STEP_NS:
             return known_ns
-        return min(max(known_ns, arrival_ns - trips.shortest_ns - NEAR_NS), arrival_ns)
+        return min(max(known_ns, arrival_ns - trips.shortest_ns - ROUND_TRIP_MARGIN_NS), arrival_ns)
 
     def stats(self, at_ns: int) -> LinkStats:
         """Counters since the start."""
@@ -553,10 +567,18 @@ class MavlinkConnection:
             self._look_for_one(message, at_ns)
         elif self.vehicle != address:
             self._streams.restart()
-            self._globe, self._parameters, self._vehicle_clock = Globe(), ParameterList(), ArrivalClock()
+            self._globe, self._parameters, self._vehicle_clock = (
+                GlobalOriginSetup(),
+                ParameterDownload(),
+                ArrivalClock(),
+            )
         if self._vehicle.boots != boots:
             self._streams.restart()
-            self._globe, self._parameters, self._vehicle_clock = Globe(), ParameterList(), ArrivalClock()
+            self._globe, self._parameters, self._vehicle_clock = (
+                GlobalOriginSetup(),
+                ParameterDownload(),
+                ArrivalClock(),
+            )
             text = f"link {self._name}: the vehicle has started anew"
             return (*items, Event(at_ns=at_ns, severity=Severity.ERROR, code="vehicle-reboot", text=text))
         if self._vehicle.unready != unready:
@@ -579,12 +601,12 @@ class MavlinkConnection:
 
     def _timesync(self, message: TimeSync, at_ns: int) -> None:
         if message.tc1_ns == 0:
-            if at_ns - self._answers_from_ns >= ANSWERS_NS:
+            if at_ns - self._answers_from_ns >= ANSWER_WINDOW_NS:
                 self._answers_from_ns = at_ns
                 self._answered_to.clear()
             of_vehicle = self.vehicle is not None and message.system == self.vehicle[0]
             if self._answered_to[of_vehicle] >= MAX_ANSWERS:
-                self._count(UNANSWERED)
+                self._count(TIMESYNC_FLOOD)
                 return
             self._answered_to[of_vehicle] += 1
             own = self._gives_vehicle_time and (message.system, message.component) == self.vehicle
@@ -599,10 +621,10 @@ class MavlinkConnection:
         self._bad[reason] += count
         if reason == SLOW_ANSWER:
             self._slow += count
-        elif reason == UNPUNCTUAL:  # told once, and then by the share that is used
+        elif reason == STALE_INERTIAL:  # told once, and then by the share that is used
             if self._bad[reason] == count:
                 self._untold[reason] += count
-        elif reason not in _USUAL:
+        elif reason not in _NOT_REPORTED:
             self._untold[reason] += count
 
     def _tell(self, at_ns: int) -> tuple[Event, ...]:
@@ -620,18 +642,25 @@ class MavlinkConnection:
                 text += "they count by their arrival, and their ages are not known"
                 events.append(Event(at_ns=at_ns, severity=Severity.WARNING, code=STAMP_UNIT, text=text))
         since_ns = self._mute_since_ns
-        if since_ns is not None and self.vehicle is None and not self._mute_told and at_ns - since_ns >= MUTE_NS:
+        if (
+            since_ns is not None
+            and self.vehicle is None
+            and not self._mute_told
+            and at_ns - since_ns >= MISSING_HEARTBEAT_NS
+        ):
             self._mute_told = True
             text = f"link {self._name}: system {self._mute and self._mute[0]} sends its position or attitude, "
             text += "but no heartbeat of an autopilot: its mode is not known, so it is not flown"
             events.append(Event(at_ns=at_ns, severity=Severity.WARNING, code=NO_HEARTBEAT, text=text))
         used, total = self._vehicle.inertial_used, self._vehicle.inertial_total
-        if not self._low_share_told and total >= ENOUGH and used < LOW_SHARE * total:
+        if not self._low_share_told and total >= MIN_INERTIAL and used < MIN_INERTIAL_SHARE * total:
             self._low_share_told = True
             text = f"link {self._name}: {1 - used / total:.0%} of the inertial data are not used: late, frozen, "
             text += "or without an attitude of now"
-            events.append(Event(at_ns=at_ns, severity=Severity.WARNING, code=UNPUNCTUAL, text=text, count=total - used))
-        if self._slow and (self._slow_told_ns is None or at_ns - self._slow_told_ns >= SLOW_TOLD_NS):
+            events.append(
+                Event(at_ns=at_ns, severity=Severity.WARNING, code=STALE_INERTIAL, text=text, count=total - used)
+            )
+        if self._slow and (self._slow_told_ns is None or at_ns - self._slow_told_ns >= SLOW_EVENT_NS):
             self._slow_told_ns = at_ns
             events.append(self._slow_answers(at_ns))
             self._slow = 0

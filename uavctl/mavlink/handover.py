@@ -6,27 +6,27 @@ import msgspec
 
 from uavctl.config.connections import HandOverConfig
 from uavctl.mavlink.handover_guards import (
-    ASKING,
-    LEAVING,
-    MUST_LAND,
+    LAND_PERIODS,
+    REQUESTING,
+    TAKING_OFF,
     GuardResult,
-    HandoverView,
-    Progress,
-    against_engaging,
+    HandoverInput,
+    HandoverProgress,
     evaluate,
-    fails,
-    nobody_s,
-    silent,
+    explain_engage_refusal,
+    is_in_failsafe,
+    is_silent,
+    is_without_pilot,
 )
-from uavctl.mavlink.handover_states import TRANSITIONS, HandoverEvent, HandoverState, Sending
+from uavctl.mavlink.handover_states import TRANSITIONS, HandoverEvent, HandoverState, SetpointMode
 from uavctl.mavlink.profile import profile_of
-from uavctl.mavlink.requests import Patience, PendingRequest, RequestKind
-from uavctl.mavlink.switcher import Switcher
+from uavctl.mavlink.requests import PendingRequest, RequestKind, RequestLimits
+from uavctl.mavlink.switcher import ModeReason
 from uavctl.records import ORDER_ACCEPTED, ORDER_REFUSED, Command, Event, Order, Severity, VehicleStatus
 
 LAND_TRIES = 5
-NEWS_NS = 100_000_000  # a heartbeat is news for so long: two ticks
-MISSED_NS = 1_500_000_000  # one that was due is missing
+NEW_HEARTBEAT_NS = 100_000_000  # a heartbeat is news for so long: two ticks
+MISSING_HEARTBEAT_NS = 1_500_000_000  # one that was due is missing
 FOREVER_NS = 2**62
 _OVER = frozenset({HandoverState.DONE, HandoverState.FAILED})
 _ON_THE_GROUND = frozenset({HandoverState.MODE, HandoverState.ARMING})
@@ -50,7 +50,7 @@ _PLAIN = frozenset(HandoverState) - {
 # In these it counts which mode the vehicle was in as they were entered.
 _NOTES_MODE = frozenset({HandoverState.MODE, HandoverState.RETURNING, HandoverState.FAILSAFE, HandoverState.LANDING})
 # A failsafe that ends one of these, and ends itself, has interrupted the climb only.
-_CLIMBS = frozenset({HandoverState.ARMING, HandoverState.CLIMBING, HandoverState.ENGAGING})
+_CLIMB_STATES = frozenset({HandoverState.ARMING, HandoverState.CLIMBING, HandoverState.ENGAGING})
 _TAKEN = frozenset({HandoverState.FAILSAFE, HandoverState.UNCLEAR})
 _PROMISES = {
     Order.TAKE_OFF: "will take off",
@@ -60,7 +60,7 @@ _PROMISES = {
 HAND_OVER_ORDERS = frozenset(_PROMISES)  # the others are the controller's
 
 
-class Passage(msgspec.Struct, frozen=True):
+class StateTransition(msgspec.Struct, frozen=True):
     """Transition of the table that was made."""
 
     before: HandoverState  # the state that was left
@@ -69,19 +69,19 @@ class Passage(msgspec.Struct, frozen=True):
     why: str = ""  # more about it, where something failed
     ask: RequestKind | None = None  # request to the vehicle at that time
     granted: bool = False  # it had said yes to that
-    who: Switcher | None = None  # who has changed the mode, where it is none of ours
+    who: ModeReason | None = None  # who has changed the mode, where it is none of ours
 
 
-class HandoverStep(msgspec.Struct, frozen=True):
+class HandoverOutput(msgspec.Struct, frozen=True):
     """Result of a tick of the hand-over."""
 
-    sending: Sending  # setpoints that may be streamed
+    sending: SetpointMode  # setpoints that may be streamed
     ask: RequestKind | None = None  # request to make now, if any
     events: tuple[Event, ...] = ()  # events to tell
-    passage: Passage | None = None  # transition that was made, if one was
+    passage: StateTransition | None = None  # transition that was made, if one was
 
 
-class HandOver:
+class HandoverStateMachine:
     """State machine that decides who flies one vehicle.
 
     Args:
@@ -94,7 +94,9 @@ class HandOver:
 
     def __init__(self, config: HandOverConfig | None = None, *, sees_it_down: bool = False) -> None:
         self._config = HandOverConfig() if config is None else config
-        self._now = Progress(config=self._config, request=PendingRequest(None, 0, Patience(0, 0, 0, FOREVER_NS)))
+        self._now = HandoverProgress(
+            config=self._config, request=PendingRequest(None, 0, RequestLimits(0, 0, 0, FOREVER_NS))
+        )
         self._sees_it_down = sees_it_down
         self._landed_ns: int | None = None  # since when it stands on the ground, armed
         self._disarms = False
@@ -144,11 +146,11 @@ class HandOver:
             return True
         if self.state is HandoverState.UNCLEAR:
             return self._waits_for_nobody
-        return self.state in ASKING or (self.state is HandoverState.SETTLING and (self.ours or self._sees_it_down))
+        return self.state in REQUESTING or (self.state is HandoverState.SETTLING and (self.ours or self._sees_it_down))
 
     def flown(self, at_ns: int, vehicle: VehicleStatus | None) -> VehicleStatus | None:
         """The vehicle as far as the controller may fly it: none when it is silent, external only when it is ours."""
-        if vehicle is None or silent(at_ns, vehicle):
+        if vehicle is None or is_silent(at_ns, vehicle):
             return None
         if self.state in (HandoverState.WAITING, HandoverState.READY) and not self._now.stands_by:
             return vehicle
@@ -164,7 +166,7 @@ class HandOver:
         """Whether a heartbeat says that the vehicle is no longer in the external mode."""
         return not (vehicle.external and vehicle.armed) and not self._now.shows_the_past(vehicle)
 
-    def update(self, view: HandoverView) -> HandoverStep:
+    def update(self, view: HandoverInput) -> HandoverOutput:
         """Decide what one tick may send, and what it asks the vehicle for."""
         now, before = self._now, self.state
         for message in view.heard:
@@ -175,8 +177,8 @@ class HandOver:
         self.look_up(view.at_ns, view.vehicle)
         sight = evaluate(now, view)
         if view.vehicle is not None and view.vehicle.mode in profile_of(view.vehicle).landing:
-            now.lands_failing = fails(view.vehicle)
-        if before is HandoverState.FAILSAFE and view.vehicle is not None and fails(view.vehicle):
+            now.lands_failing = is_in_failsafe(view.vehicle)
+        if before is HandoverState.FAILSAFE and view.vehicle is not None and is_in_failsafe(view.vehicle):
             now.left_mode = view.vehicle.mode  # one failsafe may follow another, and ArduPilot stays in its mode
         now.boots = 0 if view.vehicle is None else view.vehicle.boots
         now.state, sending = TRANSITIONS[before, sight.seen]
@@ -184,13 +186,15 @@ class HandOver:
         late = now.state is before is HandoverState.RELEASED and sight.who is not now.who
         if now.state is not before or late:
             was = now.request
-            passage = Passage(before, sight.seen, now.state, sight.why, was.ask, was.granted_ns is not None, sight.who)
+            passage = StateTransition(
+                before, sight.seen, now.state, sight.why, was.ask, was.granted_ns is not None, sight.who
+            )
             now.who = sight.who
         if now.state is not before:
             self._enter(before, sight, view)
-        self._waits_for_nobody = now.state is HandoverState.UNCLEAR and nobody_s(now, view.vehicle)
-        if sending is Sending.NEUTRAL and not (view.ready and self._may_warm_up(view)):
-            sending = Sending.NOTHING
+        self._waits_for_nobody = now.state is HandoverState.UNCLEAR and is_without_pilot(now, view.vehicle)
+        if sending is SetpointMode.NEUTRAL and not (view.ready and self._may_warm_up(view)):
+            sending = SetpointMode.NOTHING
         self._see_to_disarming(view)
         held = view.unfit if now.state in _ON_THE_GROUND else ""
         ask = None
@@ -198,18 +202,18 @@ class HandOver:
             ask = now.request.due(view.at_ns, held, blind=self._may_be_the_pilot_s(view))
         if now.state is HandoverState.FAILED and before is HandoverState.ARMING:
             ask = RequestKind.DISARM  # arming may have been granted after all
-        return HandoverStep(
+        return HandoverOutput(
             sending, ask, (*events, *self._tell(view, before, sight, passed=passage is not None)), passage
         )
 
     def look_up(self, at_ns: int, vehicle: VehicleStatus | None) -> None:
         """See whether the vehicle is in the air; the last word of it counts for the time of a landing."""
-        if vehicle is not None and not silent(at_ns, vehicle):
+        if vehicle is not None and not is_silent(at_ns, vehicle):
             self._aloft_ns = at_ns if vehicle.armed and not vehicle.landed else None
         elif self._aloft_ns is not None and at_ns - self._aloft_ns >= _ns(self._config.land_s):
             self._aloft_ns = None
 
-    def _take_orders(self, view: HandoverView) -> list[Event]:
+    def _take_orders(self, view: HandoverInput) -> list[Event]:
         events = []
         for command in view.commands:
             if command.order not in _PROMISES:
@@ -224,10 +228,10 @@ class HandOver:
             events.append(Event(at_ns=view.at_ns, severity=severity, code=code, text=text))
         return events
 
-    def _against(self, command: Command, view: HandoverView) -> str:
+    def _against(self, command: Command, view: HandoverInput) -> str:
         """Return why an order is refused; empty if it is taken."""
         if command.order is Order.ENGAGE:
-            return against_engaging(self.state, view)
+            return explain_engage_refusal(self.state, view)
         if command.order is Order.STAND_BY:
             return "" if self.state is HandoverState.WAITING else f"the vehicle has been heard; now: {self.state}"
         if not (command.height_m or 0.0) > 0.0:
@@ -235,7 +239,7 @@ class HandOver:
         early = self.state in (HandoverState.WAITING, HandoverState.READY) and not self.ours
         return "" if early else f"take-off is ordered once, on the ground; now: {self.state}"
 
-    def _may_be_the_pilot_s(self, view: HandoverView) -> bool:
+    def _may_be_the_pilot_s(self, view: HandoverInput) -> bool:
         """Whether the pilot may have changed the mode since the last heartbeat: then no request of one is repeated.
 
         Heartbeats show a mode up to a second late, and a request that is repeated meanwhile would take it back. So
@@ -245,19 +249,19 @@ class HandOver:
         if ask not in (RequestKind.EXTERNAL_MODE, RequestKind.LAND) or vehicle is None:
             return False
         age_ns = view.at_ns - vehicle.at_ns
-        return age_ns > NEWS_NS and not (ask is RequestKind.LAND and age_ns > MISSED_NS)
+        return age_ns > NEW_HEARTBEAT_NS and not (ask is RequestKind.LAND and age_ns > MISSING_HEARTBEAT_NS)
 
-    def _may_warm_up(self, view: HandoverView) -> bool:
+    def _may_warm_up(self, view: HandoverInput) -> bool:
         """Whether neutral setpoints do no harm: they would end ArduPilot's climb."""
-        if self.state not in LEAVING or view.vehicle is None:
+        if self.state not in TAKING_OFF or view.vehicle is None:
             return True
         return profile_of(view.vehicle).climbs_on_arming
 
-    def _enter(self, before: HandoverState, sight: GuardResult, view: HandoverView) -> None:
+    def _enter(self, before: HandoverState, sight: GuardResult, view: HandoverInput) -> None:
         now = self._now
         now.since_ns, now.stands_by = view.at_ns, False
         if now.state in _TAKEN and before not in _TAKEN:
-            now.resumes = before in _CLIMBS
+            now.resumes = before in _CLIMB_STATES
         if now.state is HandoverState.FAILSAFE:
             said = "" if view.vehicle is None else view.vehicle.said
             now.words = now.request.words + (f', "{said}"' if said and said not in now.request.words else "")
@@ -278,7 +282,7 @@ class HandOver:
         if before is not HandoverState.RETURNING:
             self.failure = self.failure or sight.why
 
-    def _ask(self, view: HandoverView) -> RequestKind | None:
+    def _ask(self, view: HandoverInput) -> RequestKind | None:
         climbs = view.vehicle is not None and profile_of(view.vehicle).climbs_on_arming
         external = view.vehicle is not None and view.vehicle.external
         asks = {
@@ -291,7 +295,7 @@ class HandOver:
         }
         return asks.get(self.state)
 
-    def _patience(self, state: HandoverState, at_ns: int) -> Patience:
+    def _patience(self, state: HandoverState, at_ns: int) -> RequestLimits:
         c = self._config
         climbed_s = 0.0 if self._now.climb_ns is None else (at_ns - self._now.climb_ns) / 1e9
         limits_s = {
@@ -308,13 +312,13 @@ class HandOver:
         limit_ns = _ns(limits_s[state]) if state in limits_s else FOREVER_NS
         if state is HandoverState.LANDING:
             # What we took off is asked on: nobody else would.
-            tries = max(LAND_TRIES, round(MUST_LAND * c.land_s / c.answer_s)) if self.ours else LAND_TRIES
-            return Patience(_ns(c.answer_s), _ns(c.answer_s), tries, limit_ns)
+            tries = max(LAND_TRIES, round(LAND_PERIODS * c.land_s / c.answer_s)) if self.ours else LAND_TRIES
+            return RequestLimits(_ns(c.answer_s), _ns(c.answer_s), tries, limit_ns)
         # In the air there is no time for long pauses.
         retry_s = c.retry_s if state in _ON_THE_GROUND else c.answer_s / 2
-        return Patience(_ns(c.answer_s), _ns(retry_s), c.tries, limit_ns)
+        return RequestLimits(_ns(c.answer_s), _ns(retry_s), c.tries, limit_ns)
 
-    def _see_to_disarming(self, view: HandoverView) -> None:
+    def _see_to_disarming(self, view: HandoverInput) -> None:
         """Ask a vehicle to disarm that stands on the ground after a flight of ours and stays armed."""
         vehicle = view.vehicle
         if not (self.ours and self.state is HandoverState.SETTLING and vehicle is not None and vehicle.landed):
@@ -327,7 +331,7 @@ class HandOver:
                 RequestKind.DISARM, view.at_ns, self._patience(HandoverState.SETTLING, view.at_ns)
             )
 
-    def _tell(self, view: HandoverView, before: HandoverState, sight: GuardResult, *, passed: bool) -> list[Event]:
+    def _tell(self, view: HandoverInput, before: HandoverState, sight: GuardResult, *, passed: bool) -> list[Event]:
         events = []
         silence = self.state is HandoverState.ENGAGED and sight.seen is HandoverEvent.SILENCE
         if silence != self._silent:

@@ -51,7 +51,7 @@ class HandoverEvent(StrEnum):
     PENDING = "pending"  # what was asked for is not there yet
 
 
-class Sending(Enum):
+class SetpointMode(Enum):
     """Setpoints that a tick may stream to the vehicle."""
 
     NOTHING = "nothing"
@@ -59,7 +59,7 @@ class Sending(Enum):
     SETPOINTS = "setpoints"
 
 
-Target = tuple[HandoverState, Sending]
+Target = tuple[HandoverState, SetpointMode]
 _W, _R, _M, _A, _C = (
     HandoverState.WAITING,
     HandoverState.READY,
@@ -76,7 +76,7 @@ _G, _B, _E, _X, _L = (
 )
 _S, _D, _F, _V = HandoverState.SETTLING, HandoverState.DONE, HandoverState.FAILED, HandoverState.FAILSAFE
 _U = HandoverState.UNCLEAR
-_NOTHING, _NEUTRAL, _FLY = Sending.NOTHING, Sending.NEUTRAL, Sending.SETPOINTS
+_NOTHING, _NEUTRAL, _FLY = SetpointMode.NOTHING, SetpointMode.NEUTRAL, SetpointMode.SETPOINTS
 
 # What is not here changes nothing, and nothing is sent.
 _CHANGES: dict[HandoverState, dict[HandoverEvent, Target]] = {
@@ -202,7 +202,7 @@ _CHANGES: dict[HandoverState, dict[HandoverEvent, Target]] = {
     _F: {},
 }
 # Where a daemon that ends leaves no vehicle behind that has flown on its setpoints, or may still.
-LEAVES_NONE = frozenset({HandoverState.READY, HandoverState.SETTLING, HandoverState.DONE})
+NOT_LEFT_IN_FLIGHT = frozenset({HandoverState.READY, HandoverState.SETTLING, HandoverState.DONE})
 TRANSITIONS: dict[tuple[HandoverState, HandoverEvent], Target] = {
     (state, seen): _CHANGES[state].get(seen, (state, _NOTHING)) for state in HandoverState for seen in HandoverEvent
 }

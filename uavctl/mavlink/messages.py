@@ -76,7 +76,7 @@ class RadioChannels(Message, frozen=True, kw_only=True):
     channels_us: tuple[int, ...]  # pulse of each channel, from the first [µs]; 0 where there is none
 
 
-class ModeOrder(Message, frozen=True, kw_only=True):
+class ModeCommand(Message, frozen=True, kw_only=True):
     """SET_MODE or COMMAND_LONG that changes the mode, from whomever."""
 
     target_system: int

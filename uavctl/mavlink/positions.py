@@ -10,34 +10,34 @@ from typing import Generic, TypeVar, get_args
 from uavctl.config.connections import ClockConfig, FrameConfig, SourceConfig
 from uavctl.config.types import EstimatorConfig
 from uavctl.frames import Convention, Frame, Quaternion
-from uavctl.mavlink.clocksync import ClockSource, ClockSync, RoundTrips, StampRefusal, StampUnit, StampUnitWatch
+from uavctl.mavlink.clocksync import ClockSource, ClockSync, StampRefusal, StampUnit, StampUnitDetector, TimesyncClock
 from uavctl.mavlink.codec import BOOT_MS_WRAP
 from uavctl.mavlink.messages import Position
 from uavctl.records import PositionSample, Vec3
 
 MAX_SOURCES = 32
 SILENCE_NS = 10_000_000_000  # after which a source gives its place to any other
-SETTLED = 20  # samples after which a source is no newcomer any more
+SETTLED_SAMPLES = 20  # samples after which a source is no newcomer any more
 # Samples of all newcomers together, while no settled source speaks, and while one does: each costs the estimator its
 # time, and nobody knows yet whose it is.
-NEWCOMERS_PER_S, NEWCOMERS_BESIDE_PER_S = 100, 10
-NEWCOMERS_BURST = 50
-SPEAKS_NS = 1_000_000_000
+NEW_SOURCE_PER_S, NEW_SOURCE_BESIDE_PER_S = 100, 10
+NEW_SOURCE_BURST = 50
+SOURCE_ACTIVE_NS = 1_000_000_000
 
 WRONG_SYSTEM = "system-id"
 NEW_SOURCE = "new-source"  # more samples of sources that nobody has heard before than are looked at
-MANY_SOURCES = "sources"  # more than there is room for: the history of one is lost
-ABSURD = "absurd"
+TOO_MANY_SOURCES = "sources"  # more than there is room for: the history of one is lost
+IMPLAUSIBLE = "absurd"
 SLOW_ANSWER = "timesync"
 
 Address = tuple[int, int]
 
 
 Key = TypeVar("Key")
-Kept = TypeVar("Kept")
+State = TypeVar("State")
 
 
-class SourceTable(Generic[Key, Kept]):
+class SourceTable(Generic[Key, State]):
     """Table of what is kept of each source. A new one always finds room: the one that has said least gives way.
 
     So no source is kept out by others, and one that has spoken for a while loses nothing to those that come and go.
@@ -48,12 +48,12 @@ class SourceTable(Generic[Key, Kept]):
 
     def __init__(self, most: int, bad: Callable[[], None]) -> None:
         self._most, self._bad = most, bad
-        self._entries: dict[Key, tuple[Kept, int, int]] = {}  # what is kept, times that it spoke, when last
+        self._entries: dict[Key, tuple[State, int, int]] = {}  # what is kept, times that it spoke, when last
 
     def __len__(self) -> int:
         return len(self._entries)
 
-    def get(self, key: Key) -> Kept | None:
+    def get(self, key: Key) -> State | None:
         """Return what is kept of a source; None if it is not there."""
         found = self._entries.get(key)
         return None if found is None else found[0]
@@ -63,11 +63,11 @@ class SourceTable(Generic[Key, Kept]):
         found = self._entries.get(key)
         return 0 if found is None else found[1]
 
-    def values(self) -> Iterator[Kept]:
+    def values(self) -> Iterator[State]:
         """Iterate over what is kept of all sources."""
         return (kept for kept, _, _ in self._entries.values())
 
-    def hear(self, key: Key, at_ns: int, make: Callable[[], Kept]) -> Kept:
+    def hear(self, key: Key, at_ns: int, make: Callable[[], State]) -> State:
         """Note that a source speaks now, and return what is kept of it; for a new one, `make` makes it."""
         found = self._entries.get(key)
         if found is None and len(self._entries) >= self._most:
@@ -112,10 +112,10 @@ class PositionDecoder:
             self._frames[axes] = replace(configured, convention=axes)
         self._clock, self._source, self._estimator, self._bad = clock, source, estimator, bad
         self._clocks: SourceTable[tuple[Address, bool], ClockSync] = SourceTable(MAX_SOURCES, self._lost_place)
-        self._units: SourceTable[Address, StampUnitWatch] = SourceTable(MAX_SOURCES, self._lost_place)
+        self._units: SourceTable[Address, StampUnitDetector] = SourceTable(MAX_SOURCES, self._lost_place)
         self.units: dict[Address, StampUnit] = {}  # of the sources whose stamps are in another than microseconds
-        self._round_trips: SourceTable[Address, RoundTrips] = SourceTable(MAX_SOURCES, self._lost_place)
-        self._newcomers_left, self._newcomers_ns = float(NEWCOMERS_BURST), 0
+        self._round_trips: SourceTable[Address, TimesyncClock] = SourceTable(MAX_SOURCES, self._lost_place)
+        self._newcomers_left, self._newcomers_ns = float(NEW_SOURCE_BURST), 0
         self._settled_ns: int | None = None  # when a settled source was heard last
         self.settled = False  # whether the newest sample is of one
         self._latest: ClockSync | None = None
@@ -134,7 +134,7 @@ class PositionDecoder:
         """Source of that offset."""
         return ClockSource.NONE if self._latest is None else self._latest.source
 
-    def trips(self, address: Address | None = None) -> RoundTrips | None:
+    def trips(self, address: Address | None = None) -> TimesyncClock | None:
         """Round trips to a peer that answers; without an address, to the newest sample's source."""
         wanted = self._latest_address if address is None else address
         return None if wanted is None else self._round_trips.get(wanted)
@@ -145,7 +145,7 @@ class PositionDecoder:
 
     def answer(self, address: Address, sent_ns: int, remote_ns: int, received_ns: int) -> None:
         """Take an answer to a TIMESYNC request."""
-        trips = self._round_trips.hear(address, received_ns, lambda: RoundTrips(_ns(self._clock.window_s)))
+        trips = self._round_trips.hear(address, received_ns, lambda: TimesyncClock(_ns(self._clock.window_s)))
         if not trips.answer(sent_ns, remote_ns, received_ns):
             self._bad(SLOW_ANSWER)
 
@@ -162,7 +162,7 @@ class PositionDecoder:
             position_m = frame.to_ned(position_m)
             velocity_mps = None if velocity_mps is None else frame.velocity_to_ned(velocity_mps)
         if self._absurd(position_m, velocity_mps):
-            self._bad(ABSURD)  # the controller refuses it too, and looks at how long a source says nothing else
+            self._bad(IMPLAUSIBLE)  # the controller refuses it too, and looks at how long a source says nothing else
         if not self._has_room(message, received_ns):
             self._bad(NEW_SOURCE)
             return None
@@ -188,14 +188,14 @@ class PositionDecoder:
 
     def _has_room(self, message: Position, received_ns: int) -> bool:
         """Whether one more sample is looked at; each sample of a settled source is."""
-        self.settled = self._clocks.times(_key(message)) >= SETTLED
+        self.settled = self._clocks.times(_key(message)) >= SETTLED_SAMPLES
         if self.settled:
             self._settled_ns = received_ns
             return True
-        beside = self._settled_ns is not None and received_ns - self._settled_ns <= SPEAKS_NS
-        per_s = NEWCOMERS_BESIDE_PER_S if beside else NEWCOMERS_PER_S
+        beside = self._settled_ns is not None and received_ns - self._settled_ns <= SOURCE_ACTIVE_NS
+        per_s = NEW_SOURCE_BESIDE_PER_S if beside else NEW_SOURCE_PER_S
         earned = (received_ns - self._newcomers_ns) * 1e-9 * per_s
-        burst = NEWCOMERS_BESIDE_PER_S if beside else NEWCOMERS_BURST
+        burst = NEW_SOURCE_BESIDE_PER_S if beside else NEW_SOURCE_BURST
         self._newcomers_left, self._newcomers_ns = min(burst, self._newcomers_left + earned), received_ns
         if self._newcomers_left < 1.0:
             return False
@@ -207,7 +207,7 @@ class PositionDecoder:
         return ClockSync(_ns(clock.window_s), _ns(clock.latency_s), _ns(clock.future_tolerance_s))
 
     def _lost_place(self) -> None:
-        self._bad(MANY_SOURCES)
+        self._bad(TOO_MANY_SOURCES)
 
     def _captured(self, message: Position, received_ns: int) -> int | StampRefusal:
         address = (message.system, message.component)
@@ -227,7 +227,7 @@ class PositionDecoder:
     def _is_in_us(self, message: Position, stamp: int, received_ns: int) -> bool:
         """Whether a stamp is in the unit that it has to be in; else the position counts by its arrival."""
         address = (message.system, message.component)
-        watch = self._units.hear(address, received_ns, StampUnitWatch)
+        watch = self._units.hear(address, received_ns, StampUnitDetector)
         before, unit = watch.unit, watch.take(stamp, message.position_m, received_ns)
         if unit is not before:
             self.units.pop(address, None)

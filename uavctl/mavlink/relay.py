@@ -19,13 +19,13 @@ from uavctl.records import Event, PositionSample, Severity, Vec3
 
 MAX_AGE_NS = 200_000_000  # an older position would be taken for a new one by estimators that cannot look back
 STUCK_AFTER = 25  # poses in a row, the same to the last bit
-_WAITING = 64  # poses of one tick
+_MAX_QUEUE = 64  # poses of one tick
 SILENT_NS = 500_000_000  # an estimator without positions for longer drifts by more than a hand's breadth
 START_NS = 3_000_000_000  # cameras and vehicle may take that long to begin
 RELAY_SILENT, RELAY_RESUMED = "relay-silent", "relay-resumed"
-NOTHING_COMES, HELD_BACK = "nothing comes", "held back"
+NO_POSITION, HELD_BACK = "nothing comes", "held back"
 REASONS = {
-    NOTHING_COMES: "no position comes",
+    NO_POSITION: "no position comes",
     HELD_BACK: "positions were found to be wrong, and are held back",
     "no attitude": "positions come without an attitude",
     "refused": "positions are not believed",
@@ -87,7 +87,7 @@ class Relay:
             self.kept["no attitude"] += 1
             return
         self._waiting.append((sample, attitude))
-        del self._waiting[:-_WAITING]
+        del self._waiting[:-_MAX_QUEUE]
 
     def due(self, at_ns: int, *, offset_ns: int, refused: Sequence[PositionSample]) -> tuple[Pose, ...]:
         """Return the positions that go to the vehicle in this tick, in order of capture.
@@ -145,7 +145,7 @@ class Relay:
 
     def _reason_of_silence(self) -> str:
         kept = (Counter(self.kept) - self._kept_by_then).most_common(1)
-        return kept[0][0] if kept else NOTHING_COMES
+        return kept[0][0] if kept else NO_POSITION
 
     def _reason(self, sample: PositionSample, attitude: Quaternion, at_ns: int) -> str | None:
         """Return why a pose is kept back; None if it goes."""

@@ -37,7 +37,7 @@ COMMANDS = {
 
 
 @dataclass(frozen=True)
-class Patience:
+class RequestLimits:
     """Bounds of a request."""
 
     answer_ns: int  # without an effect it is made again after this time [ns]
@@ -53,7 +53,7 @@ class PendingRequest:
         ask: What is asked for; None for a wait in which nothing is said.
     """
 
-    def __init__(self, ask: RequestKind | None, at_ns: int, patience: Patience) -> None:
+    def __init__(self, ask: RequestKind | None, at_ns: int, patience: RequestLimits) -> None:
         self.ask = ask  # the request; None for a wait in which nothing is sent
         self._patience = patience
         self._begun_ns = at_ns

@@ -20,11 +20,13 @@ from uavctl.mavlink.framing import CHECKSUM, BadBytes, scan, with_checksum
 
 KEY_BYTES = 32
 EPOCH_NS = 1_420_070_400_000_000_000  # 1st January 2015, UTC
-UNIT_NS = 10_000  # of a stamp
-NEWEST_STAMP = 2**48 - 1
-FIRST_BEHIND = 6_000_000  # units: a stream that is new may begin one minute behind our own stamp
+TIMESTAMP_UNIT_NS = 10_000  # of a stamp
+MAX_TIMESTAMP = 2**48 - 1
+MAX_NEW_STREAM_LAG = 6_000_000  # units: a stream that is new may begin one minute behind our own stamp
 MAX_STREAMS = 64  # of one connection; a flight has a handful
-SKEW = 500_000  # units: no frame is taken that is five seconds behind what its stream has said on another connection
+MAX_LINK_SKEW = (
+    500_000  # units: no frame is taken that is five seconds behind what its stream has said on another connection
+)
 SIGNATURE = int(mavlink.MAVLINK_SIGNATURE_BLOCK_LEN)
 _HASH = 6
 _FLAGS = 2  # index of the incompatibility flags
@@ -70,7 +72,7 @@ class SigningKey:
 
 
 @dataclass
-class Stamps:
+class SigningTimestamps:
     """Stamps of one key."""
 
     floor: int = 0  # newest of all before the start; it has to be kept, so that nothing older is taken ever again
@@ -86,7 +88,7 @@ class Stamps:
         self.streams[stream] = max(stamp, self.streams.get(stream, stamp))
 
 
-class Signing:
+class FrameSigner:
     """Signs and verifies the frames of one connection.
 
     Args:
@@ -102,7 +104,7 @@ class Signing:
         self,
         key: SigningKey,
         link_id: int,
-        stamps: Stamps,
+        stamps: SigningTimestamps,
         wall_offset_ns: int,
         peer_link_ids: frozenset[int] = frozenset(),
     ) -> None:
@@ -115,7 +117,7 @@ class Signing:
 
     def sign(self, frame: bytes, at_ns: int) -> bytes:
         """An unsigned frame of MAVLink 2 with flag, checksum and signature; each stamp is larger than the last."""
-        self._stamps.own = min(max(self._now(at_ns), self._stamps.own + 1), NEWEST_STAMP)
+        self._stamps.own = min(max(self._now(at_ns), self._stamps.own + 1), MAX_TIMESTAMP)
         body = bytearray(frame[:-CHECKSUM])
         body[_FLAGS] |= _SIGNED
         signed = with_checksum(bytes(body)) + bytes((self._link_id,)) + self._stamps.own.to_bytes(6, "little")
@@ -155,7 +157,7 @@ class Signing:
         return self._links.get(address) in (None, link_id)
 
     def _too_old(self, stream: Stream, stamp: int, at_ns: int) -> SignatureRefusal | None:
-        if stamp + SKEW < self._stamps.streams.get(stream, stamp):
+        if stamp + MAX_LINK_SKEW < self._stamps.streams.get(stream, stamp):
             return SignatureRefusal.REPLAYED
         newest = self._newest.get(stream)
         if newest is not None:
@@ -163,18 +165,18 @@ class Signing:
         if stamp <= self._floor:
             return SignatureRefusal.REPLAYED
         ours = max(self._now(at_ns), self._stamps.own)
-        return SignatureRefusal.STALE if stamp + FIRST_BEHIND < ours else None
+        return SignatureRefusal.STALE if stamp + MAX_NEW_STREAM_LAG < ours else None
 
     def _now(self, at_ns: int) -> int:
-        return stamp_at(at_ns + self._offset_ns)
+        return signing_timestamp(at_ns + self._offset_ns)
 
 
-def stamp_at(wall_ns: int) -> int:
+def signing_timestamp(wall_ns: int) -> int:
     """The stamp of a time of the wall clock (UTC, since 1970) [ns]."""
-    return max(0, (wall_ns - EPOCH_NS) // UNIT_NS)
+    return max(0, (wall_ns - EPOCH_NS) // TIMESTAMP_UNIT_NS)
 
 
-def without_signature(frame: bytes) -> bytes:
+def remove_signature(frame: bytes) -> bytes:
     """A signed frame as it would be without: what recordings hold, since signatures help to guess a key.
 
     Raises:
@@ -191,7 +193,7 @@ def without_signature(frame: bytes) -> bytes:
 # signatures, and a replay needs no key and no wall clock.
 
 
-class Gate:
+class FrameAuthenticator:
     """Verifies and signs what crosses one connection.
 
     Args:
@@ -201,7 +203,7 @@ class Gate:
         refused: what was dropped, by reason.
     """
 
-    def __init__(self, signing: Signing, *, stream: bool) -> None:
+    def __init__(self, signing: FrameSigner, *, stream: bool) -> None:
         self._signing, self._is_stream = signing, stream
         self._rest, self._in_step = b"", True
         self.refused: Counter[str] = Counter()
@@ -221,7 +223,7 @@ class Gate:
         if self._is_stream:
             self._rest, self._in_step = data[found.consumed :], found.in_step
         self.refused.update(found.bad)
-        return b"".join(without_signature(frame.data) for frame in found.frames)
+        return b"".join(remove_signature(frame.data) for frame in found.frames)
 
     def seal(self, frame: bytes, at_ns: int) -> bytes:
         """One of our frames, signed."""

@@ -19,7 +19,7 @@ _OTHER = re.compile(
 _RADIO = re.compile(r"\b(radio|rc|manual control|remote)\b", re.IGNORECASE)
 
 
-class Switcher(StrEnum):
+class ModeReason(StrEnum):
     """Who has changed the mode; the value is how a person would say it."""
 
     PILOT = "the pilot"
@@ -29,31 +29,31 @@ class Switcher(StrEnum):
     UNKNOWN = "not known by whom"
 
 
-OWN = frozenset({Switcher.FAILSAFE, Switcher.FENCE})  # the vehicle itself
-PERSONS = frozenset({Switcher.PILOT, Switcher.GROUND_STATION})
+VEHICLE_REASONS = frozenset({ModeReason.FAILSAFE, ModeReason.FENCE})  # the vehicle itself
+PERSON_REASONS = frozenset({ModeReason.PILOT, ModeReason.GROUND_STATION})
 
 
-def speaks_of_fence(text: str) -> bool:
+def reports_fence_breach(text: str) -> bool:
     """Whether a text of the vehicle says that it is beyond a fence of its own."""
     return bool(_FENCE.search(text)) and not _OTHER.search(text)
 
 
-def speaks_of_failsafe(text: str) -> bool:
+def reports_failsafe(text: str) -> bool:
     """Whether a text of the vehicle says that a failsafe of its own acts."""
     return bool(_FAILSAFE.search(text)) and not _OTHER.search(text)
 
 
-def speaks_of_radio(text: str) -> bool:
+def mentions_radio(text: str) -> bool:
     """Whether a text that speaks of a failsafe speaks of the remote control: then its sticks move by themselves."""
     return bool(_RADIO.search(text))
 
 
-def flies_itself(vehicle: VehicleStatus) -> bool:
+def is_autonomous_mode(vehicle: VehicleStatus) -> bool:
     """Whether its mode is one that needs no person: nobody may be there."""
     return profile_of(vehicle).choices.get(vehicle.mode, ModeChoice.PERSON) is not ModeChoice.PERSON
 
 
-def who_switched(vehicle: VehicleStatus, *, had_failed: bool = False) -> Switcher:
+def determine_mode_reason(vehicle: VehicleStatus, *, had_failed: bool = False) -> ModeReason:
     """Decide who has changed the mode to the one that the vehicle shows.
 
     Args:
@@ -62,17 +62,17 @@ def who_switched(vehicle: VehicleStatus, *, had_failed: bool = False) -> Switche
     """
     profile = profile_of(vehicle)
     choice = profile.choices.get(vehicle.mode)
-    own = Switcher.FENCE if vehicle.fence else Switcher.FAILSAFE if vehicle.failsafe else None
+    own = ModeReason.FENCE if vehicle.fence else ModeReason.FAILSAFE if vehicle.failsafe else None
     if choice is ModeChoice.FAILSAFE:
-        return own or Switcher.FAILSAFE
+        return own or ModeReason.FAILSAFE
     if choice is ModeChoice.PERSON:
         # An ArduPilot is in a failsafe by its heartbeats also after a person has chosen another mode.
         now = vehicle.mode in profile.degrades and not had_failed and (profile.returns or bool(vehicle.said))
         own = own if now and not vehicle.stick else None
     if own is not None:
-        return Switcher.UNKNOWN if vehicle.stick else own
+        return ModeReason.UNKNOWN if vehicle.stick else own
     if vehicle.stick:
-        return Switcher.PILOT
+        return ModeReason.PILOT
     if vehicle.station:
-        return Switcher.GROUND_STATION
-    return Switcher.PILOT if choice is ModeChoice.PERSON and vehicle.radio else Switcher.UNKNOWN
+        return ModeReason.GROUND_STATION
+    return ModeReason.PILOT if choice is ModeChoice.PERSON and vehicle.radio else ModeReason.UNKNOWN

@@ -20,21 +20,21 @@ from uavctl.mavlink.messages import (
     Inertial,
     Landed,
     Message,
-    ModeOrder,
+    ModeCommand,
     Position,
     RadioChannels,
     Text,
 )
 from uavctl.mavlink.profile import PROFILES, autopilot_name, describe_mode
-from uavctl.mavlink.switcher import speaks_of_failsafe, speaks_of_fence, speaks_of_radio
+from uavctl.mavlink.switcher import mentions_radio, reports_failsafe, reports_fence_breach
 from uavctl.records import Event, InertialSample, Severity, Vec3, VehicleMotion, VehicleStatus
 
 # A vehicle's time since boot: how long it has been up, and whether it has started anew. Pure: time is an argument.
 
 
-BACK_MS = 1000  # a clock that goes back by more is another one; disorder on a link is less
-AHEAD_MS = 30_000  # more than time has passed: late messages, and simulated clocks that run fast
-AGREE_NS = 5_000_000_000  # within which another clock's second message has to come
+MAX_BACKSTEP_MS = 1000  # a clock that goes back by more is another one; disorder on a link is less
+MAX_ADVANCE_MS = 30_000  # more than time has passed: late messages, and simulated clocks that run fast
+MAX_DELAY_SPREAD_NS = 5_000_000_000  # within which another clock's second message has to come
 _WRAP_MS = 2**32
 
 
@@ -73,11 +73,11 @@ class BootClock:
         """
         known, doubted = self._known.get(kind), self._doubted.get(kind)
         reading = _Reading(boot_ms, at_ns)
-        if known is None or _goes_on(known, reading):
+        if known is None or _is_same_clock(known, reading):
             self._adopt(kind, _Reading(boot_ms, at_ns, confirmed=known is not None))
-        elif doubted is not None and at_ns - doubted.at_ns <= AGREE_NS and _goes_on(doubted, reading):
+        elif doubted is not None and at_ns - doubted.at_ns <= MAX_DELAY_SPREAD_NS and _is_same_clock(doubted, reading):
             del self._doubted[kind]
-            anew = known.confirmed and (_advance_ms(known, reading) < 0 or _is_young(known, reading))
+            anew = known.confirmed and (_advance_ms(known, reading) < 0 or _may_have_restarted(known, reading))
             if anew:  # the others' readings are from before the restart
                 self._known.clear()
                 self._doubted.clear()
@@ -106,25 +106,25 @@ def _passed_ms(before: _Reading, after: _Reading) -> int:
     return (after.at_ns - before.at_ns) // 1_000_000
 
 
-def _goes_on(before: _Reading, after: _Reading) -> bool:
+def _is_same_clock(before: _Reading, after: _Reading) -> bool:
     """Whether two readings may be of one clock."""
-    return -BACK_MS <= _advance_ms(before, after) <= _passed_ms(before, after) + AHEAD_MS
+    return -MAX_BACKSTEP_MS <= _advance_ms(before, after) <= _passed_ms(before, after) + MAX_ADVANCE_MS
 
 
-def _is_young(before: _Reading, after: _Reading) -> bool:
+def _may_have_restarted(before: _Reading, after: _Reading) -> bool:
     """Whether a vehicle may have started between two readings: up for more than 24 days its clock seems to leap."""
-    return after.boot_ms <= _passed_ms(before, after) + AHEAD_MS
+    return after.boot_ms <= _passed_ms(before, after) + MAX_ADVANCE_MS
 
 
 # STATUSTEXT joined again: a vehicle sends what is longer than 50 characters in several pieces.
 
 
-WAIT_NS = 1_000_000_000  # for the pieces that are to come; PX4 sends them at once
-MOST = 16  # texts under way
-LOST = "…"  # stands for a piece that did not come
+CHUNK_WAIT_NS = 1_000_000_000  # for the pieces that are to come; PX4 sends them at once
+MAX_PARTIAL_TEXTS = 16  # texts under way
+MISSING_CHUNK = "…"  # stands for a piece that did not come
 
 
-class _Begun(msgspec.Struct):
+class _PartialText(msgspec.Struct):
     """Text of which more pieces are to come."""
 
     first: Text
@@ -134,14 +134,14 @@ class _Begun(msgspec.Struct):
 
     def so_far(self) -> Text:
         """Return the text as far as it has come, with a mark for the part that is missing."""
-        return _plain(self.first, self.said + LOST)
+        return _make_text(self.first, self.said + MISSING_CHUNK)
 
 
-class Joiner:
+class StatusTextAssembler:
     """Joins the pieces of texts, by their sender."""
 
     def __init__(self) -> None:
-        self._begun: dict[tuple[int, int], _Begun] = {}
+        self._begun: dict[tuple[int, int], _PartialText] = {}
 
     def take(self, text: Text, at_ns: int) -> tuple[Text, ...]:
         """Take a piece, or a whole text; the texts that are whole now."""
@@ -152,28 +152,28 @@ class Joiner:
             told = (self._begun.pop(sender).so_far(),)
             begun = None
         if begun is None:
-            begun = _Begun(text, LOST if text.chunk else "", text.chunk, at_ns)
-        begun.said += ("" if text.chunk == begun.next_chunk else LOST) + text.text
+            begun = _PartialText(text, MISSING_CHUNK if text.chunk else "", text.chunk, at_ns)
+        begun.said += ("" if text.chunk == begun.next_chunk else MISSING_CHUNK) + text.text
         begun.next_chunk = text.chunk + 1
         if not text.more:
             self._begun.pop(sender, None)
-            return (*told, _plain(begun.first, begun.said))
-        if sender in self._begun or len(self._begun) < MOST:
+            return (*told, _make_text(begun.first, begun.said))
+        if sender in self._begun or len(self._begun) < MAX_PARTIAL_TEXTS:
             self._begun[sender] = begun
             return told
         return (*told, begun.so_far())
 
     def overdue(self, at_ns: int) -> tuple[Text, ...]:
         """The texts whose rest has not come."""
-        late = [sender for sender, begun in self._begun.items() if at_ns - begun.at_ns > WAIT_NS]
+        late = [sender for sender, begun in self._begun.items() if at_ns - begun.at_ns > CHUNK_WAIT_NS]
         return tuple(self._begun.pop(sender).so_far() for sender in late)
 
 
-def _plain(first: Text, text: str) -> Text:
+def _make_text(first: Text, text: str) -> Text:
     return Text(system=first.system, component=first.component, severity=first.severity, text=text.rstrip())
 
 
-class SwitchEvidence:
+class ModeReasonEvidence:
     """What the vehicle says, and shows, of who changes its modes.
 
     Each counts for `EVIDENCE_NS`, and longer where no heartbeat has come since: the mode may have changed right after.
@@ -194,7 +194,7 @@ class SwitchEvidence:
 
     def word(self, text: str, at_ns: int) -> None:
         """Take a text, of any severity."""
-        fence, failsafe = speaks_of_fence(text), speaks_of_failsafe(text)
+        fence, failsafe = reports_fence_breach(text), reports_failsafe(text)
         if fence or failsafe:
             self._said, self._said_ns = text, at_ns
         if fence:
@@ -235,7 +235,7 @@ class SwitchEvidence:
             since_ns = min(since_ns, self._beats_ns[1])
         said = self._said if self._said_ns > since_ns else ""
         # A receiver that has lost its remote control moves the channels by itself.
-        lost = self._radio is False or speaks_of_radio(said)
+        lost = self._radio is False or mentions_radio(said)
         return msgspec.structs.replace(
             status,
             failsafe=critical or self._failsafe_ns > since_ns,
@@ -251,11 +251,14 @@ class SwitchEvidence:
 
 
 SECOND_VEHICLE = "second-vehicle"
-UNPUNCTUAL = "inertial-not-of-now"  # late, repeated, or frozen
+STALE_INERTIAL = "inertial-not-of-now"  # late, repeated, or frozen
 # The same readings for longer are those of a frozen sensor. Whole thousandths of g repeat, in recorded flights of
 # ArduCopter for 0.7 s at most. Fractions have noise, and never did.
 FROZEN_RAW_US, FROZEN_US = 1_000_000, 100_000
-LOW_SHARE, ENOUGH = 0.8, 250  # part of so many inertial data under which it is reported that they are not used
+MIN_INERTIAL_SHARE, MIN_INERTIAL = (
+    0.8,
+    250,
+)  # part of so many inertial data under which it is reported that they are not used
 ALONE_NS = 5_000_000_000  # after that time of silence another vehicle counts as gone
 GONE_NS = 30_000_000_000  # and after that one its place is taken, if it stood on the ground
 BOOTING_NS = 3_000_000_000  # of silence before a heartbeat of booting, for that to be a restart
@@ -263,14 +266,16 @@ BOOTING_NS = 3_000_000_000  # of silence before a heartbeat of booting, for that
 EVIDENCE_NS = 2_000_000_000
 NEVER_NS = -(2**63)
 STICK_US = 100  # by which a channel of a remote control moves at least when a person moves it: a tenth of its way
-TURNED_NS = 100_000_000  # an attitude that is older turns no specific force: at 1 rad/s it is 0.1 rad, 1 m/s², off
+MAX_ATTITUDE_AGE_NS = (
+    100_000_000  # an attitude that is older turns no specific force: at 1 rad/s it is 0.1 rad, 1 m/s², off
+)
 GRAVITY_MPS2 = 9.80665
-LATE_NS = 60_000_000  # later than the quickest: a stream of 50 Hz is 20 ms apart
-BACK_US = 1_000_000  # a stamp that goes back by more is of another clock
-_ROUTINE = frozenset({mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAV_CMD_REQUEST_MESSAGE})
+MAX_DELAY_NS = 60_000_000  # later than the quickest: a stream of 50 Hz is 20 ms apart
+MAX_BACKSTEP_US = 1_000_000  # a stamp that goes back by more is of another clock
+_UNREPORTED_COMMANDS = frozenset({mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAV_CMD_REQUEST_MESSAGE})
 # PX4 stands by only while its pre-flight checks pass, and is uninitialised else: that comes and goes, no restart.
-_UNREADY = frozenset({mavlink.MAV_STATE_UNINIT, mavlink.MAV_STATE_BOOT, mavlink.MAV_STATE_CALIBRATING})
-_IN_FAILSAFE = frozenset({mavlink.MAV_STATE_CRITICAL, mavlink.MAV_STATE_EMERGENCY})
+_NOT_READY_STATES = frozenset({mavlink.MAV_STATE_UNINIT, mavlink.MAV_STATE_BOOT, mavlink.MAV_STATE_CALIBRATING})
+_FAILSAFE_STATES = frozenset({mavlink.MAV_STATE_CRITICAL, mavlink.MAV_STATE_EMERGENCY})
 _NO_AUTOPILOT = int(mavlink.MAV_AUTOPILOT_INVALID)
 _AUTOPILOT1 = int(mavlink.MAV_COMP_ID_AUTOPILOT1)
 # Types of what is no vehicle, whatever autopilot it names: its own, or the one that it is made for.
@@ -288,7 +293,7 @@ def is_vehicle(heartbeat: Heartbeat) -> bool:
     return heartbeat.autopilot != _NO_AUTOPILOT and heartbeat.vehicle_type not in _DEVICES
 
 
-def is_better(address: tuple[int, int], than: tuple[int, int] | None) -> bool:
+def is_preferred(address: tuple[int, int], than: tuple[int, int] | None) -> bool:
     """Whether of two that say that they are vehicles the first one is to be followed.
 
     Of one system it is the component of autopilots; of two systems the one that is followed already.
@@ -298,7 +303,7 @@ def is_better(address: tuple[int, int], than: tuple[int, int] | None) -> bool:
     return address[0] == than[0] and address[1] == _AUTOPILOT1 != than[1]
 
 
-class SensorStream:
+class SensorStreamMonitor:
     """Judges the messages of one stream of one sensor by their stamps and arrival.
 
     A new stamp is a new measurement, as integer readings repeat; the same readings for long are a frozen sensor. The
@@ -322,7 +327,7 @@ class SensorStream:
                 never repeats.
         """
         advance_us = stamp_us - self._stamp_us
-        if advance_us < -BACK_US or advance_us > (at_ns - self._heard_ns) // 1000 + BACK_US:
+        if advance_us < -MAX_BACKSTEP_US or advance_us > (at_ns - self._heard_ns) // 1000 + MAX_BACKSTEP_US:
             self._clock, self._since_us = ArrivalClock(), stamp_us
         elif advance_us <= 0:
             return None
@@ -331,10 +336,10 @@ class SensorStream:
         repeats = values == self._values
         delay_ns = self._clock.delay_ns(1000 * stamp_us, at_ns)
         self._stamp_us, self._heard_ns, self._values = stamp_us, at_ns, values
-        return delay_ns <= LATE_NS and not (repeats and stamp_us - self._since_us >= frozen_us)
+        return delay_ns <= MAX_DELAY_NS and not (repeats and stamp_us - self._since_us >= frozen_us)
 
 
-class VehicleWatch:
+class VehicleMonitor:
     """Follows the first vehicle that is heard; others are counted and ignored.
 
     A vehicle that has fallen silent on the ground, disarmed, gives way to another.
@@ -367,12 +372,12 @@ class VehicleWatch:
         self._clock = BootClock()
         self._ready = False  # by its last heartbeat
         self._heard_ns = 0  # any word of it
-        self._evidence = SwitchEvidence()
+        self._evidence = ModeReasonEvidence()
         self._critical = False  # by its last heartbeat
         self._another_ns: int | None = None  # when another vehicle was heard last
         self._status: VehicleStatus | None = None
         self._motion = VehicleMotion()
-        self._streams: dict[str, SensorStream] = {}  # by kind of message
+        self._streams: dict[str, SensorStreamMonitor] = {}  # by kind of message
         self._turned: tuple[Vec3, int] | None = None  # attitude, and when it was told
         self.inertial_used = self.inertial_total = 0  # inertial data that gave an acceleration, and all
         self.boots = 0
@@ -395,7 +400,7 @@ class VehicleWatch:
         """Take any message; only the vehicle's count."""
         if isinstance(message, Heartbeat) and is_vehicle(message):
             return self._heartbeat(message, at_ns)
-        if isinstance(message, ModeOrder):
+        if isinstance(message, ModeCommand):
             return self._is_ordered(message.system, message.target_system, at_ns)
         if self.address is None or message.system != self.address[0]:
             return ()
@@ -436,7 +441,7 @@ class VehicleWatch:
                 self._evidence.word(text, at_ns)
                 return message, _text_event(message, at_ns), *self._proves(at_ns)
             case Ack() if self._is_ours(message):
-                return (message,) if message.command in _ROUTINE else (message, _ack_event(message, at_ns))
+                return (message,) if message.command in _UNREPORTED_COMMANDS else (message, _ack_event(message, at_ns))
             case Ack(command=command, result=mavlink.MAV_RESULT_ACCEPTED) if command in MODE_COMMANDS:
                 return self._is_ordered(message.target_system, message.system, at_ns)
         return ()
@@ -465,7 +470,7 @@ class VehicleWatch:
 
     def attitude(self, at_ns: int) -> Quaternion | None:
         """Return the rotation of a specific force at that time into local NED (w, x, y, z); None if old or unknown."""
-        if self._turned is None or at_ns - self._turned[1] > TURNED_NS:
+        if self._turned is None or at_ns - self._turned[1] > MAX_ATTITUDE_AGE_NS:
             return None
         return quaternion_from_euler(self._turned[0])
 
@@ -497,21 +502,21 @@ class VehicleWatch:
         if not self._inertial:
             return
         kind = "quaternion" if message.quaternion else "angles"
-        if self._streams.setdefault(kind, SensorStream()).takes(message.stamp_us, message.angles_rad, at_ns):
+        if self._streams.setdefault(kind, SensorStreamMonitor()).takes(message.stamp_us, message.angles_rad, at_ns):
             self._turned = message.angles_rad, at_ns
         else:
-            self._bad(UNPUNCTUAL)
+            self._bad(STALE_INERTIAL)
 
     def _accelerates(self, message: Inertial, at_ns: int) -> tuple[InertialSample, ...]:
         """Its acceleration by a specific force and its newest attitude; nothing where either is old or unknown."""
         if not self._inertial:
             return ()
         kind, frozen_us = ("raw", FROZEN_RAW_US) if message.raw else ("highres", FROZEN_US)
-        stream = self._streams.setdefault(kind, SensorStream())
+        stream = self._streams.setdefault(kind, SensorStreamMonitor())
         new = stream.takes(message.stamp_us, message.specific_force_mps2, at_ns, frozen_us=frozen_us)
         self.inertial_total += new is not None
         if not new:
-            self._bad(UNPUNCTUAL)
+            self._bad(STALE_INERTIAL)
             return ()
         attitude = self.attitude(at_ns)
         turned = None if attitude is None else rotate_vector(attitude, message.specific_force_mps2)
@@ -524,7 +529,7 @@ class VehicleWatch:
     def _reboot(self) -> tuple[VehicleStatus, ...]:
         self.boots += 1
         self._streams, self._turned = {}, None
-        self._landed, self._evidence = None, SwitchEvidence()
+        self._landed, self._evidence = None, ModeReasonEvidence()
         if self._status is None:
             return ()
         self._status = msgspec.structs.replace(self._status, boots=self.boots)
@@ -551,7 +556,7 @@ class VehicleWatch:
     def _heartbeat(self, message: Heartbeat, at_ns: int) -> tuple[VehicleStatus, ...]:
         address = (message.system, message.component)
         wanted = self._system in (0, message.system) and self._component in (0, message.component)
-        if wanted and (is_better(address, self.address) or (address != self.address and self._has_gone(at_ns))):
+        if wanted and (is_preferred(address, self.address) or (address != self.address and self._has_gone(at_ns))):
             self._begin(address, at_ns)
         if address != self.address:
             if self.address is None or message.system != self.address[0]:
@@ -563,12 +568,12 @@ class VehicleWatch:
             self._reboot()
             self._clock.forget()
         self._heard_ns = at_ns
-        ready = message.system_status not in _UNREADY
+        ready = message.system_status not in _NOT_READY_STATES
         self.unready += self._ready and not ready
         self._ready = ready
         autopilot = autopilot_name(message.autopilot)
         mode, external = describe_mode(autopilot, message.vehicle_type, message.custom_mode)
-        self._critical = message.system_status in _IN_FAILSAFE
+        self._critical = message.system_status in _FAILSAFE_STATES
         status = VehicleStatus(
             at_ns=at_ns,
             autopilot=autopilot,

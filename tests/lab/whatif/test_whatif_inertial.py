@@ -24,7 +24,7 @@ from uavctl.lab.whatif.flight import Relinked, Response, fly, history_of, respon
 from uavctl.lab.whatif.rewrite import InertialFrames, shifted
 from uavctl.mavlink.codec import decode
 from uavctl.mavlink.framing import RawFrame, scan
-from uavctl.mavlink.vehicle import VehicleWatch
+from uavctl.mavlink.vehicle import VehicleMonitor
 from uavctl.records import Datagram, Decision, Event, InertialSample, Plan, Setpoint, StepInput, Truth, Vec3
 
 MILLI_G_MPS2 = 9.80665e-3
@@ -120,7 +120,7 @@ def test_the_controller_reads_the_acceleration_more(
 ) -> None:
     speaker = Speaker(autopilot)
     frames = InertialFrames(config_of(LINEAR).daemon)
-    recorded, other = (VehicleWatch(lambda _: None, (245, 191), inertial=True) for _ in range(2))
+    recorded, other = (VehicleMonitor(lambda _: None, (245, 191), inertial=True) for _ in range(2))
     read: tuple[list[InertialSample], list[InertialSample]] = ([], [])
     said = [speaker.beat()]
     for i in range(20):

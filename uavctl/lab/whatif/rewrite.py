@@ -17,7 +17,7 @@ from uavctl.frames import Frame, Quaternion, rotate_vector
 from uavctl.mavlink.codec import decode
 from uavctl.mavlink.framing import RawFrame, scan
 from uavctl.mavlink.messages import Position
-from uavctl.mavlink.vehicle import GRAVITY_MPS2, VehicleWatch
+from uavctl.mavlink.vehicle import GRAVITY_MPS2, VehicleMonitor
 from uavctl.records import InertialSample, Vec3
 
 # Position messages moved to where the vehicle would have been: all other bytes of a datagram stay as they came.
@@ -130,7 +130,7 @@ class InertialFrames:
 
     def __init__(self, daemon: DaemonConfig) -> None:
         own = daemon.system_id, daemon.component_id
-        self._watch = VehicleWatch(
+        self._watch = VehicleMonitor(
             lambda _: None, own, daemon.vehicle_system_id, daemon.vehicle_component_id, inertial=True
         )
         self.moved = self.left_out = 0
