@@ -193,19 +193,19 @@ class FlightCourse:
             self._failsafes += self._found in _OWN
             self._found, self._why, self._taken = None, "", None
         self.engaged = self.engaged or one.after is HandoverState.ENGAGED
-        if one.seen is HandoverEvent.REBOOT:
+        if one.event is HandoverEvent.REBOOT:
             self._find(Cause.RESTARTED, "")
-        elif one.seen is HandoverEvent.REFUSED:
+        elif one.event is HandoverEvent.REFUSED:
             self._refuse(one, vehicle)
-        elif one.seen is HandoverEvent.UNSAFE:
+        elif one.event is HandoverEvent.UNSAFE:
             self._find(Cause.BROKEN_OFF, _reason(one))
-        elif one.seen is HandoverEvent.LEFT:
+        elif one.event is HandoverEvent.LEFT:
             self._find(Cause.LEFT, "")
-        elif one.who is not None:
-            self._switch(one.who, vehicle)
-        elif one.seen is HandoverEvent.DISARMED:
+        elif one.mode_reason is not None:
+            self._switch(one.mode_reason, vehicle)
+        elif one.event is HandoverEvent.DISARMED:
             self._disarm(one)
-        elif one.seen is HandoverEvent.LAND and self._stop is None and not self.engaged and self._found is None:
+        elif one.event is HandoverEvent.LAND and self._stop is None and not self.engaged and self._found is None:
             self._asked = Cause.ORDERED
 
     def _switch(self, who: ModeReason, vehicle: VehicleStatus | None) -> None:
@@ -259,7 +259,7 @@ class FlightCourse:
         elif one.before in (HandoverState.WAITING, HandoverState.READY):
             cause = self._against_beginning(vehicle)
         elif one.before is HandoverState.CLIMBING:
-            cause = Cause.NO_TAKE_OFF if one.ask is RequestKind.TAKE_OFF and not one.granted else Cause.NO_CLIMB
+            cause = Cause.NO_TAKE_OFF if one.request is RequestKind.TAKE_OFF and not one.is_granted else Cause.NO_CLIMB
         elif one.before is HandoverState.RETURNING:
             return  # the pilot has it still
         elif is_silent(self._now_ns, vehicle):  # it has refused nothing, nor has the fallback landed it
@@ -351,8 +351,8 @@ class FlightCourse:
 
 def _reason(one: StateTransition) -> str:
     """Return why something was refused, without what the cause says already."""
-    asked = "" if one.ask is None else f"{one.ask.value}: "
-    text = one.why
+    asked = "" if one.request is None else f"{one.request.value}: "
+    text = one.reason
     for said in (
         asked,
         "take-off: ",
@@ -362,7 +362,7 @@ def _reason(one: StateTransition) -> str:
         "the vehicle's own fence ",
     ):
         text = text.removeprefix(said)
-    if one.ask is None and text.startswith("("):  # the failsafe's mode
+    if one.request is None and text.startswith("("):  # the failsafe's mode
         text = text.replace("(", "", 1).replace(")", "", 1)
     return text.replace("it took too long (", "not done in ").removesuffix(")") if "too long" in text else text
 

@@ -191,10 +191,10 @@ class SentSource:
     def take(self, position_m: Vec3, velocity_mps: Vec3 | None, stamp_us: int | None, at_ns: int) -> None:
         """Take a position in local NED, with the stamp of its source."""
         captured = None
-        if stamp_us is not None and self.units.take(stamp_us, position_m, at_ns) is not StampUnit.MICROSECONDS:
+        if stamp_us is not None and self.units.update(stamp_us, position_m, at_ns) is not StampUnit.MICROSECONDS:
             self.refused += 1
         elif stamp_us is not None:
-            found = self.clock.captured_ns(stamp_us * 1000, at_ns)
+            found = self.clock.estimate_capture_ns(stamp_us * 1000, at_ns)
             self.refused += isinstance(found, str)
             captured = None if isinstance(found, str) else found
         self.track.append((at_ns, position_m, velocity_mps))
@@ -304,12 +304,12 @@ class _Reader:
             self._modes.append(ModeBegin(at_s=self._second(at_ns), mode=mode, armed=armed))
 
     def _take_text(self, piece: Text, at_ns: int) -> None:
-        for whole in self._joined.take(piece, at_ns):
+        for whole in self._joined.add_chunk(piece, at_ns):
             severity = mavlink.enums["MAV_SEVERITY"][min(whole.severity, 7)].name.removeprefix("MAV_SEVERITY_").lower()
             self._texts.append(SpokenText(at_s=self._second(at_ns), severity=severity, text=whole.text))
 
     def _take_setpoint(self, frame: bytes, at_ns: int) -> None:
-        raw = _SETPOINT_LAYOUT.read(frame)
+        raw = _SETPOINT_LAYOUT.unpack(frame)
         if raw.coordinate_frame != mavlink.MAV_FRAME_LOCAL_NED:
             return  # counted, but no place or direction in local NED
         if self._vehicle.system is not None and raw.target_system not in (0, self._vehicle.system):
@@ -321,7 +321,7 @@ class _Reader:
         )
 
     def _take_global(self, frame: bytes, at_ns: int) -> None:
-        raw = _GLOBAL_LAYOUT.read(frame)
+        raw = _GLOBAL_LAYOUT.unpack(frame)
         down_m = -raw.relative_alt / 1000
         if (raw.lat, raw.lon) == (0, 0):  # it has no position yet
             self._height.append((at_ns, -down_m))
@@ -330,7 +330,7 @@ class _Reader:
         self._take_place(raw.msgname, raw.lat, raw.lon, down_m, velocity_mps, at_ns)
 
     def _take_gps(self, frame: bytes, at_ns: int) -> None:
-        raw = _GPS_LAYOUT.read(frame)
+        raw = _GPS_LAYOUT.unpack(frame)
         if raw.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX:
             self._take_place(raw.msgname, raw.lat, raw.lon, -raw.alt / 1000, None, at_ns)
 
@@ -343,7 +343,7 @@ class _Reader:
 
     def _take_odometry(self, frame: bytes, at_ns: int) -> None:
         """Take the vehicle's own estimate, as PX4 sends it where it sends no LOCAL_POSITION_NED."""
-        raw = _ODOMETRY_LAYOUT.read(frame)
+        raw = _ODOMETRY_LAYOUT.unpack(frame)
         position_m = (raw.x, raw.y, raw.z)
         own = raw.estimator_type == mavlink.MAV_ESTIMATOR_TYPE_AUTOPILOT and raw.frame_id == mavlink.MAV_FRAME_LOCAL_NED
         if own and all(map(math.isfinite, position_m)):

@@ -98,7 +98,7 @@ class ParameterReader:
     def _read(self, message_id: int, frame: bytes) -> None:
         if message_id not in _LAYOUTS:
             return
-        fields = _LAYOUTS[message_id].read(frame)
+        fields = _LAYOUTS[message_id].unpack(frame)
         if message_id == _HEARTBEAT:
             if fields.autopilot != mavlink.MAV_AUTOPILOT_INVALID:
                 self._autopilots.setdefault(fields.src_system, fields.autopilot)

@@ -63,7 +63,7 @@ class Flight:
         self.orders.append(command)
         return True
 
-    def against(self, order: Order) -> str:
+    def explain_refusal(self, order: Order) -> str:
         return f"{order} is for nothing" if order in self.idle else ""
 
     def tick(self, at_ns: int) -> tuple[tuple[Command, Event], ...]:
@@ -348,4 +348,6 @@ def test_names_and_folders() -> None:
     assert control_folder(None, {"UAVCTL_CONTROL": "/y", "XDG_RUNTIME_DIR": "/z"}) == Path("/y")
     with tempfile.TemporaryDirectory(prefix="uavctl-") as own:
         assert control_folder(None, {"XDG_RUNTIME_DIR": own}) == Path(own) / "uavctl"
-    assert ControlRequest(ask="goto", position_m=(float("inf"), 0.0, 0.0)).problem() == "position_m has to be finite"
+    assert (
+        ControlRequest(ask="goto", position_m=(float("inf"), 0.0, 0.0)).find_problem() == "position_m has to be finite"
+    )

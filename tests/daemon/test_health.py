@@ -45,11 +45,11 @@ class Flight:
             self.ticked = self.loop.tick(self.tick, at_ns, self.peers.receiver(at_ns), missed)
             self.watch.after_tick(self.ticked, lateness_ns)
             self.tick += 1
-        return self.watch.look()
+        return self.watch.make_health()
 
 
 def test_before_the_first_tick_nothing_is_known_and_nothing_fails() -> None:
-    health = Flight().watch.look()
+    health = Flight().watch.make_health()
     assert (health.mode, health.age_s, health.position_m, health.vehicle) == (None, None, None, None)
     assert format_health(health).startswith("-  age - s  loss - %")
 
@@ -133,7 +133,7 @@ def test_a_disk_that_gets_low_is_told_once_in_a_line_of_its_own() -> None:
 
 def test_a_relay_that_goes_on_alone_is_told_apart() -> None:
     relay = RelayHealth(sent=90, sent_hz=30.0, kept={}, last_s=0.1, alone=False)
-    health = msgspec.structs.replace(Flight().watch.look(), relay=relay)
+    health = msgspec.structs.replace(Flight().watch.make_health(), relay=relay)
     alone = msgspec.structs.replace(health, relay=msgspec.structs.replace(relay, alone=True))
     without = msgspec.structs.replace(health, relay=None)
     fields = [format_health(one).split("  ") for one in (health, alone, without)]

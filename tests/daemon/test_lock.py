@@ -104,8 +104,8 @@ def test_the_next_holder_is_told_of_a_vehicle_that_was_left_in_flight(tmp_path: 
 
     def found() -> bool:
         with lock_vehicle(URL, tmp_path) as tenure:
-            leaves = tenure.leaves
-            tenure.note(False)
+            leaves = tenure.is_left_in_flight
+            tenure.update(False)
         return leaves
 
     killed("unheard", "no")
@@ -121,10 +121,10 @@ def test_the_next_holder_is_told_of_a_vehicle_that_was_left_in_flight(tmp_path: 
 @pytest.mark.fault(31)
 def test_a_flight_that_ends_in_the_air_is_left_too(tmp_path: Path) -> None:
     with pytest.raises(ZeroDivisionError), lock_vehicle(URL, tmp_path) as tenure:
-        tenure.note(True)
+        tenure.update(True)
         raise ZeroDivisionError
     with lock_vehicle(URL, tmp_path) as tenure:
-        assert tenure.leaves
+        assert tenure.is_left_in_flight
     with pytest.raises(VehicleTakenError, match=f"process {os.getpid()} flies this vehicle already;"):  # noqa: SIM117
         with lock_vehicle(URL, tmp_path), lock_vehicle(URL, tmp_path):
             pytest.fail("two daemons for one vehicle")
@@ -153,12 +153,12 @@ def test_what_the_last_holder_wrote_counts_for_as_long_as_a_battery_lasts(
     file.write_bytes(f"123 {URL}\n{word.format(**times)}\n".encode("latin-1"))
     with file.open("r+b") as one:
         tenure = VehicleLock([one.fileno()], URL, lambda: now)
-        assert tenure.leaves is leaves
-        tenure.note(True)
-        tenure.note(True)
+        assert tenure.is_left_in_flight is leaves
+        tenure.update(True)
+        tenure.update(True)
         again = VehicleLock([one.fileno()], URL, lambda: now)
-        assert again.leaves
-        again.note(False)
+        assert again.is_left_in_flight
+        again.update(False)
     assert file.read_text() == f"{os.getpid()} {URL}\n"
 
 

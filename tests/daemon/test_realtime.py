@@ -26,13 +26,13 @@ def _as_before() -> Iterator[None]:
 
 
 def outcomes(found: tuple[RealtimeSetting, ...]) -> dict[str, RealtimeSetting]:
-    return {outcome.part: outcome for outcome in found}
+    return {outcome.name: outcome for outcome in found}
 
 
 def test_what_it_says_is_what_holds() -> None:
     with enable_realtime() as found:
         told = outcomes(found)
-        assert told["scheduling"].ok == (os.sched_getscheduler(0) == os.SCHED_FIFO)
+        assert told["scheduling"].is_applied == (os.sched_getscheduler(0) == os.SCHED_FIFO)
 
 
 def test_without_permission_it_flies_on_and_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -44,9 +44,9 @@ def test_without_permission_it_flies_on_and_says_what_to_do(monkeypatch: pytest.
     monkeypatch.setattr(resource, "getrlimit", lambda _: (65536, 65536))
     with enable_realtime() as found:
         told = outcomes(found)
-        assert not told["scheduling"].ok and "LimitRTPRIO=20" in told["scheduling"].text
+        assert not told["scheduling"].is_applied and "LimitRTPRIO=20" in told["scheduling"].text
         # A limit that the memory fits in today would make an allocation fail in flight.
-        assert not told["memory"].ok and "LimitMEMLOCK=infinity" in told["memory"].text
+        assert not told["memory"].is_applied and "LimitMEMLOCK=infinity" in told["memory"].text
 
 
 class _Ring:

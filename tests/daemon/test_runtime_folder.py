@@ -123,14 +123,14 @@ def test_processes_of_one_user_meet_whatever_their_environment_says(
         with pytest.raises(VehicleTakenError, match=f"process {os.getpid()} flies"), lock_vehicle(URL):
             pytest.fail("two daemons for one vehicle")
     with lock_vehicle(URL) as tenure:
-        tenure.note(True)
+        tenure.update(True)
         (machine / "run" / "user" / str(ME) / "uavctl").rename(machine / "gone")  # the session ends
         monkeypatch.delenv("XDG_RUNTIME_DIR")
         with pytest.raises(VehicleTakenError, match=f"process {os.getpid()} flies"), lock_vehicle(URL):
             pytest.fail("two daemons for one vehicle")
     with lock_vehicle(URL) as tenure:
-        assert tenure.leaves  # whatever folder the next one finds, the word is there
-        tenure.note(False)
+        assert tenure.is_left_in_flight  # whatever folder the next one finds, the word is there
+        tenure.update(False)
     assert not any(path.exists() for path in lock_paths(URL))
 
 

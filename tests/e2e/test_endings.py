@@ -525,4 +525,4 @@ def test_the_table_of_the_documentation_has_every_cause_with_its_exit_code() -> 
 def test_the_lock_is_free_again(tmp_path: Path, typed: Type) -> None:
     typed(Endings(tmp_path).at(HandoverState.ENGAGED, interrupt, after_s=1.0), Cause.OPERATOR, *TAKE_OFF, good=True)
     with lock_vehicle("udpin://127.0.0.1:1") as tenure:
-        assert not tenure.leaves
+        assert not tenure.is_left_in_flight

@@ -80,7 +80,7 @@ def test_it_can_be_left_out() -> None:
 def test_the_lost_ones_are_asked_for_at_a_bounded_rate_and_not_for_ever() -> None:
     asking, asked = ParameterDownload(), []
     assert asking.due(0, armed=False) == (-1,)
-    asking.saw(value(0, 1001))  # and of the others none comes, ever
+    asking.handle_message(value(0, 1001))  # and of the others none comes, ever
     for at_ns in range(0, 400 * SECOND, SECOND // 20):
         asked += [(at_ns, index) for index in asking.due(at_ns, armed=False)]
     assert sorted(index for _, index in asked) == sorted(MAX_READ_ROUNDS * [*range(1, 1001)])
@@ -92,7 +92,7 @@ def test_the_list_is_waited_for_while_it_comes_and_armed_ends_it_for_good() -> N
     asking = ParameterDownload()
     assert asking.due(0, armed=False) == (-1,)
     for index in range(0, 40, 2):
-        asking.saw(value(index, 41))
+        asking.handle_message(value(index, 41))
         assert asking.due((index + 1) * SECOND // 10, armed=False) == ()
     assert asking.due(5 * SECOND, armed=False) == tuple(range(1, 20, 2))
     assert asking.due(6 * SECOND, armed=True) == ()
@@ -102,5 +102,5 @@ def test_the_list_is_waited_for_while_it_comes_and_armed_ends_it_for_good() -> N
 def test_what_is_no_place_in_a_list_counts_for_nothing() -> None:
     asking = ParameterDownload()
     for odd in (value(65_535, 3), value(60_000, 65_535)):
-        asking.saw(odd)
+        asking.handle_message(odd)
     assert asking.due(0, armed=False) == (-1,)

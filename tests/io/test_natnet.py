@@ -171,13 +171,13 @@ def test_a_raised_body_is_above_the_floor_and_a_nose_to_the_left_turns_left(
 
 def test_what_is_said_is_mavlink_that_declares_its_axes() -> None:
     words = CameraMessageEncoder()
-    said = words.say(BodyPose(5_000_000_123_000, (1.0, 2.0, -3.0), (1.0, 0.0, 0.0, 0.0)))
+    said = words.encode(BodyPose(5_000_000_123_000, (1.0, 2.0, -3.0), (1.0, 0.0, 0.0, 0.0)))
     (position,) = decode(said).messages
     assert isinstance(position, Position)
     assert (position.name, position.system, position.stamp_us) == ("ODOMETRY", 246, 5_000_000_123)
     assert (position.position_m, position.convention, position.velocity_mps) == ((1.0, 2.0, -3.0), "ned", None)
     assert position.attitude == (1.0, 0.0, 0.0, 0.0)
-    (answer,) = decode(words.say(Echo(77, 88))).messages
+    (answer,) = decode(words.encode(Echo(77, 88))).messages
     assert isinstance(answer, TimeSync)
     assert (answer.tc1_ns, answer.ts1_ns) == (88, 77)
 

@@ -43,7 +43,7 @@ class SignedWire(Wire):
         self._signed: list[tuple[bytes, int]] = []
         self.unsigned = self.copied = 0
 
-    def receive(self, *, everything: bool = False) -> list[tuple[bytes, int]]:
+    def receive(self, *, read_all: bool = False) -> list[tuple[bytes, int]]:
         self.speaks()
         genuine, self._signed = self._signed, []
         return self._attack(self, genuine)
@@ -51,7 +51,7 @@ class SignedWire(Wire):
     def speaks(self) -> list[bytes]:
         """What is on the wire and has not been read, as it will be."""
         fresh = []
-        for data, at_ns in super().receive(everything=True):
+        for data, at_ns in super().receive(read_all=True):
             signed = b"".join(self._sign(frame) for frame in frames(data))
             self.heard.append(signed)
             fresh.append(signed)
@@ -64,7 +64,7 @@ class SignedWire(Wire):
         return sign(frame, self._stamp, link_id=self._link_id)
 
     def send(self, data: bytes) -> None:
-        plain = self._their_door.admit(data, self._bench.now_ns)
+        plain = self._their_door.verify_frames(data, self._bench.now_ns)
         if not plain:
             self.unsigned += 1
             return
@@ -219,7 +219,7 @@ class Canned:
         self.refused: Counter[str] = Counter()
         self.answered: list[int] = []
 
-    known, unread = True, False
+    has_known_sender, has_unread = True, False
 
     def fileno(self) -> int:
         return -1
@@ -227,16 +227,16 @@ class Canned:
     def filenos(self) -> tuple[int, ...]:
         return ()
 
-    def lost(self) -> int:
+    def count_lost(self) -> int:
         return 0
 
-    def trust(self, index: int) -> None:
+    def trust_sender(self, index: int) -> None:
         pass
 
-    def receive(self, *, everything: bool = False) -> list[tuple[bytes, int]]:
+    def receive(self, *, read_all: bool = False) -> list[tuple[bytes, int]]:
         return [(data, n) for n, data in enumerate(self._data)]
 
-    def answer(self, index: int) -> None:
+    def select_peer(self, index: int) -> None:
         self.answered.append(index)
 
     def send(self, data: bytes) -> None:
@@ -331,7 +331,7 @@ def test_a_door_passes_on_what_concerns_the_connection_alone() -> None:
     assert (door.url, door.fileno(), door.send_errors, door.receive_errors) == ("test://vehicle", -1, 3, 4)
     wire.refused["not-listed"] = 5
     assert [at_ns for _, at_ns in door.receive()] == [1, 3]
-    door.answer(1)
+    door.select_peer(1)
     assert wire.answered == [3]
     assert door.refused == {"not-listed": 5, "garbage": 1, "unsigned": 1}
     assert not door.closed

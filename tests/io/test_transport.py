@@ -339,7 +339,7 @@ def test_setpoints_go_to_the_vehicle_and_not_to_cameras_that_spoke_first_on_the_
                 arrived += [data for data, _ in batch]
                 for index, (data, _) in enumerate(batch):
                     if data == b"\xfdvehicle":
-                        connection.answer(index)
+                        connection.select_peer(index)
             connection.send(b"setpoint")
             assert vehicle.recv(64) == b"setpoint"
         finally:

@@ -44,7 +44,7 @@ class Source:
         """One sample; its time of capture as mapped, relative to the truth, or the refusal."""
         self.true_ns += PERIOD
         stamp_ns = self.true_ns - self.offset_ns + error_ns
-        captured = self.clock.captured_ns(stamp_ns, self.true_ns + delay_ns, **more)
+        captured = self.clock.estimate_capture_ns(stamp_ns, self.true_ns + delay_ns, **more)
         return captured if isinstance(captured, str) else captured - self.true_ns
 
     def settle(self, delay_ns: int = 30 * MS, count: int = 30) -> None:
@@ -83,16 +83,16 @@ def test_reordered_samples_keep_their_times() -> None:
     clock = make()
     base = 5_000 * SECOND
     for n in range(30):
-        clock.captured_ns(base + n * PERIOD, base + n * PERIOD + OFFSET + 20 * MS)
+        clock.estimate_capture_ns(base + n * PERIOD, base + n * PERIOD + OFFSET + 20 * MS)
     newer, older = base + 31 * PERIOD, base + 30 * PERIOD
     received = newer + OFFSET + 50 * MS
-    assert clock.captured_ns(newer, received) == newer + OFFSET + 20 * MS
-    assert clock.captured_ns(older, received) == older + OFFSET + 20 * MS
+    assert clock.estimate_capture_ns(newer, received) == newer + OFFSET + 20 * MS
+    assert clock.estimate_capture_ns(older, received) == older + OFFSET + 20 * MS
 
 
 def test_without_stamps_the_latency_is_all_that_is_known() -> None:
     clock = make(latency_ns=7 * MS)
-    assert clock.captured_ns(None, 100 * SECOND) == 100 * SECOND - 7 * MS
+    assert clock.estimate_capture_ns(None, 100 * SECOND) == 100 * SECOND - 7 * MS
     assert clock.source is ClockSource.NONE
 
 
@@ -108,7 +108,7 @@ def test_a_drifting_clock_is_followed() -> None:
     worst = 0
     for n in range(2000):  # 1.3 % slow, as recorded from a simulator on a busy computer
         true_ns = 1_000 * SECOND + n * PERIOD
-        captured = clock.captured_ns(round(true_ns * 0.987), true_ns + 10 * MS)
+        captured = clock.estimate_capture_ns(round(true_ns * 0.987), true_ns + 10 * MS)
         assert not isinstance(captured, str)
         worst = max(worst, abs(captured - true_ns))
     assert worst <= 10 * MS + 2 * SECOND * 0.0131
@@ -131,8 +131,8 @@ def test_first_samples_may_lower_the_minimum_by_more_than_the_tolerance() -> Non
 
 def test_a_duplicate_is_refused() -> None:
     clock = make()
-    assert clock.captured_ns(5 * SECOND, 6 * SECOND) == 6 * SECOND
-    assert clock.captured_ns(5 * SECOND, 6 * SECOND + MS) is StampRefusal.DUPLICATE
+    assert clock.estimate_capture_ns(5 * SECOND, 6 * SECOND) == 6 * SECOND
+    assert clock.estimate_capture_ns(5 * SECOND, 6 * SECOND + MS) is StampRefusal.DUPLICATE
 
 
 @pytest.mark.parametrize("leap_ns", [-2 * SECOND, -1_500_000 * SECOND, 2 * SECOND, 4_000_000 * SECOND, 500 * MS])
@@ -169,10 +169,10 @@ def test_a_backlog_keeps_its_ages() -> None:
     clock = make()
     base = 5_000 * SECOND
     for n in range(30):
-        clock.captured_ns(base + n * PERIOD, base + n * PERIOD + OFFSET)
+        clock.estimate_capture_ns(base + n * PERIOD, base + n * PERIOD + OFFSET)
     received = base + 100 * PERIOD + OFFSET  # 2.8 s of silence, then all of it at once
     for n in range(30, 101):
-        assert clock.captured_ns(base + n * PERIOD, received) == base + n * PERIOD + OFFSET
+        assert clock.estimate_capture_ns(base + n * PERIOD, received) == base + n * PERIOD + OFFSET
     assert clock.resyncs == 0
 
 
@@ -181,11 +181,11 @@ def test_the_boot_clock_wraps(start_ms: int) -> None:
     clock = make(latency_ns=0)
     for n in range(100):
         received = 77 * SECOND + n * PERIOD
-        stamp = clock.unwrap((start_ms + 40 * n) % WRAP, WRAP, MS)
-        assert clock.captured_ns(stamp, received) == received
+        stamp = clock.unwrap_ns((start_ms + 40 * n) % WRAP, WRAP, MS)
+        assert clock.estimate_capture_ns(stamp, received) == received
     assert clock.resyncs == 0
-    late = clock.unwrap((start_ms + 40 * 98 + 1) % WRAP, WRAP, MS)
-    assert clock.captured_ns(late, received) == received - 39 * MS
+    late = clock.unwrap_ns((start_ms + 40 * 98 + 1) % WRAP, WRAP, MS)
+    assert clock.estimate_capture_ns(late, received) == received - 39 * MS
 
 
 # --- round trips -------------------------------------------------------------------------------------
@@ -194,7 +194,7 @@ def test_the_boot_clock_wraps(start_ms: int) -> None:
 def trip(
     trips: TimesyncClock, at_ns: int, offset_ns: int = OFFSET, there_ns: int = 2 * MS, back_ns: int = 2 * MS
 ) -> bool:
-    return trips.answer(at_ns, at_ns + there_ns - offset_ns, at_ns + there_ns + back_ns)
+    return trips.add_answer(at_ns, at_ns + there_ns - offset_ns, at_ns + there_ns + back_ns)
 
 
 def test_a_round_trip_gives_the_offset() -> None:
@@ -358,7 +358,7 @@ def test_recorded_clocks_are_foretold_until_the_next_answer(name: str, median_ms
         foretold = trips.offset_ns(received_ns)
         if foretold is not None and received_ns - sent_ns <= 10 * MS:
             errors.append(abs(foretold - ((sent_ns + received_ns) // 2 - remote_ns)) / MS)
-        trips.answer(sent_ns, remote_ns, received_ns)
+        trips.add_answer(sent_ns, remote_ns, received_ns)
     errors.sort()
     assert len(errors) > 90
     assert errors[len(errors) // 2] < median_ms and errors[int(0.95 * len(errors))] < p95_ms
@@ -403,7 +403,7 @@ def test_a_drifting_clock_is_followed_by_the_arrival_of_its_stamps(drift_ppm: in
         true_ns = n * 20 * MS
         stamp_ns = true_ns - true_ns * drift_ppm // 10**6 - OFFSET
         at_ns = true_ns + 5 * MS + round(numbers.expovariate(1 / 4) * MS)
-        late_ms.append(clock.delay_ns(stamp_ns, at_ns) / MS)
+        late_ms.append(clock.measure_delay_ns(stamp_ns, at_ns) / MS)
         if n > 200:
             known = clock.offset_ns(at_ns)
             assert known is not None and -8 * MS < known - (true_ns - stamp_ns) - 5 * MS < 20 * MS
@@ -417,7 +417,7 @@ def test_a_stream_that_becomes_late_is_no_drift(drift_ppm: int) -> None:
     for n in range(1000):
         true_ns = n * 20 * MS
         at_ns = true_ns + (500 * MS if n >= 500 else 5 * MS)
-        late_ns = clock.delay_ns(true_ns - true_ns * drift_ppm // 10**6, at_ns)
+        late_ns = clock.measure_delay_ns(true_ns - true_ns * drift_ppm // 10**6, at_ns)
         assert (late_ns > 400 * MS) == (n >= 500), n
 
 
@@ -435,7 +435,7 @@ def test_recorded_camera_delays() -> None:
         if raw.get_type() == "TIMESYNC" and raw.tc1:
             trips.append((at_ns - raw.ts1, (at_ns + raw.ts1) // 2 - raw.tc1))
         if raw.get_type() == "VISION_POSITION_ESTIMATE":
-            captured = clock.captured_ns(raw.usec * 1000, at_ns)
+            captured = clock.estimate_capture_ns(raw.usec * 1000, at_ns)
             assert isinstance(captured, int) and not isinstance(captured, bool)
             delays.append(at_ns - captured)
             received_of.append((at_ns, raw.usec * 1000))
@@ -458,14 +458,14 @@ def test_recorded_camera_delays() -> None:
 def test_the_unit_of_stamps_is_recognised_by_how_fast_they_go_on(per_second: float, unit: str) -> None:
     watch = StampUnitDetector()
     for n in range(100):
-        got = watch.take(50_000 + round(per_second * n / 20), (0.001 * (n % 3), 0.0, float(n)), n * 50 * MS)
+        got = watch.update(50_000 + round(per_second * n / 20), (0.001 * (n % 3), 0.0, float(n)), n * 50 * MS)
     assert got.value == unit
 
 
 def test_a_message_that_is_repeated_has_no_constant_stamp() -> None:
     watch = StampUnitDetector()
     for n in range(100):
-        got = watch.take(1_000_000 + 50_000 * min(n, 40), (0.0, 0.0, float(min(n, 40))), n * 50 * MS)
+        got = watch.update(1_000_000 + 50_000 * min(n, 40), (0.0, 0.0, float(min(n, 40))), n * 50 * MS)
     assert got is StampUnit.MICROSECONDS
 
 

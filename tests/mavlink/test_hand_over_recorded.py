@@ -78,28 +78,28 @@ def fly(
                 HandoverInput(
                     at_ns=tick_ns,
                     vehicle=vehicle,
-                    ready=where is not None,
-                    land="land" in wanted,
-                    unfit="" if where is not None else "no position",
-                    up_m=None if where is None else -where.position_m[2],
-                    up_mps=0.0 if where is None or where.velocity_mps is None else -where.velocity_mps[2],
-                    heard=tuple(heard),
+                    has_setpoint=where is not None,
+                    is_landing_requested="land" in wanted,
+                    arming_refusal="" if where is not None else "no position",
+                    estimated_height_m=None if where is None else -where.position_m[2],
+                    climb_rate_mps=0.0 if where is None or where.velocity_mps is None else -where.velocity_mps[2],
+                    messages=tuple(heard),
                     commands=commands,
                 )
             )
             heard.clear()
             wanted.clear()
             course.see(tick_ns, vehicle)
-            if told.passage is not None:
-                course.turn(told.passage, vehicle)
-                flown.who += [] if told.passage.who is None else [told.passage.who]
+            if told.transition is not None:
+                course.turn(told.transition, vehicle)
+                flown.who += [] if told.transition.mode_reason is None else [told.transition.mode_reason]
             if hand_over.state is not state:
                 state = hand_over.state
                 flown.states.append((state, boot_s))
-            if told.ask is not None:
-                flown.asked.append((told.ask, boot_s))
-            if not flown.sent or flown.sent[-1][0] is not told.sending:
-                flown.sent.append((told.sending, boot_s))
+            if told.request is not None:
+                flown.asked.append((told.request, boot_s))
+            if not flown.sent or flown.sent[-1][0] is not told.setpoint_mode:
+                flown.sent.append((told.setpoint_mode, boot_s))
         (message,) = read(data)
         if message.get_srcSystem() == client:
             if message.get_type() == "COMMAND_LONG" and message.command in (SET_MODE, LAND):

@@ -49,10 +49,10 @@ def test_autopilots(number: int, name: str) -> None:
 @pytest.mark.parametrize("autopilot", PROFILES)
 def test_the_modes_that_are_asked_for_are_those_that_are_shown(autopilot: str) -> None:
     profile = PROFILES[autopilot]
-    assert {profile.external, profile.take_off} == set(profile.modes)
-    for name, (first, second) in profile.modes.items():
+    assert {profile.external_mode, profile.take_off_mode} == set(profile.mode_parameters)
+    for name, (first, second) in profile.mode_parameters.items():
         custom = px4_custom(first, second) if autopilot == "px4" else first
-        assert describe_mode(autopilot, 2, custom) == (name, name == profile.external)
+        assert describe_mode(autopilot, 2, custom) == (name, name == profile.external_mode)
         shown = SIMULATED[autopilot].by_number(custom)
         assert shown is not None and shown.name == name
-    assert not profile.climbing & profile.landing
+    assert not profile.climb_modes & profile.landing_modes

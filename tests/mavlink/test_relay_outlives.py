@@ -129,7 +129,7 @@ def test_positions_go_on_as_long_as_the_pilot_has_the_vehicle_in_the_air(autopil
     flight.stick("POSCTL" if autopilot == "px4" else "LOITER")
     flight.run(3.0, until=HandoverState.RELEASED)
     flight.run(40.0, stop=True)
-    assert flight.loop.carries and not flight.loop.finished
+    assert flight.loop.is_relay_needed and not flight.loop.finished
     assert poses_after(flight, flight.now_ns - SECOND)
 
 
@@ -139,7 +139,7 @@ def test_positions_go_on_for_a_vehicle_that_does_not_land() -> None:
     flight = airborne("px4", "hand_over.land_s=5.0")
     flight.hears = lambda data: b"VISION" in data or data[7:10] == bytes((102, 0, 0))  # positions alone get through
     flight.run(LAND_PERIODS * 5.0 + 15.0, stop=True)
-    assert flight.is_in(HandoverState.FAILED) and flight.loop.carries and not flight.loop.finished
+    assert flight.is_in(HandoverState.FAILED) and flight.loop.is_relay_needed and not flight.loop.finished
     assert poses_after(flight, flight.now_ns - SECOND)
     assert flight.loop.ending.cause == Cause.LANDING_FAILED
 

@@ -99,5 +99,5 @@ def test_texts_that_never_end_fill_no_memory() -> None:
         link.receive(Peer(1, component).send("statustext", 2, DENIED[0], 7, 0), SECOND)
     for n in range(1000):
         link.receive(vehicle.send("statustext", 2, DENIED[0], 7, n % 250), SECOND)
-    assert len(link._texts._begun) <= MAX_PARTIAL_TEXTS
-    assert all(len(begun.said) < 15_000 for begun in link._texts._begun.values())
+    assert len(link._text_assembler._partial_texts) <= MAX_PARTIAL_TEXTS
+    assert all(len(begun.text) < 15_000 for begun in link._text_assembler._partial_texts.values())

@@ -53,7 +53,7 @@ def test_stamps_are_ten_microseconds_since_2015_and_always_grow() -> None:
 
 def test_stamps_never_outgrow_their_48_bits_and_never_fall_below_zero() -> None:
     frame = Peer().heartbeat()
-    full = FrameSigner(SigningKey(KEY), 7, SigningTimestamps(own=2**48 - 2), OFFSET_NS)
+    full = FrameSigner(SigningKey(KEY), 7, SigningTimestamps(newest=2**48 - 2), OFFSET_NS)
     assert [stamp_of(full.sign(frame, 0)) for _ in range(2)] == [2**48 - 1] * 2
     early = FrameSigner(SigningKey(KEY), 7, SigningTimestamps(), 0)  # a machine that believes it is 1970
     assert [stamp_of(early.sign(frame, 0)) for _ in range(2)] == [1, 2]
@@ -193,7 +193,7 @@ def test_nothing_from_before_the_start_is_taken() -> None:
     first = make_signing(before)
     old = [peer.heartbeat() for _ in range(20)] + [camera.vision(5)]
     assert [first.verify(frame, 0) for frame in old] == [None] * 21
-    again = make_signing(SigningTimestamps(floor=before.own, own=before.own))
+    again = make_signing(SigningTimestamps(floor=before.newest, newest=before.newest))
     assert {again.verify(frame, 0) for frame in old} == {SignatureRefusal.REPLAYED}
     assert again.verify(camera.vision(6), 0) is SignatureRefusal.REPLAYED  # behind the others: it has to hear us first
     assert again.verify(peer.heartbeat(), 0) is None
@@ -247,7 +247,7 @@ def test_streams_are_bounded_and_keep_no_later_one_out() -> None:
     }  # also of those that are not kept
     late = SignedPeer(system=1, component=1, stamp=STAMP + 1000, link_id=9)
     assert signing.verify(late.heartbeat(), 0) is None  # one that was not kept may have another link id
-    assert len(signing._links) <= 64
+    assert len(signing._link_ids) <= 64
 
 
 @pytest.mark.parametrize("secret", [b"", KEY[:-1], KEY + b"x", bytes(32)])

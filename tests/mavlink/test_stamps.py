@@ -97,7 +97,7 @@ def test_a_kill_at_any_moment_lets_no_old_frame_in_again(tmp_path: Path) -> None
     path = tmp_path / "key.stamp"
     keeper = TimestampFile(path, STAMP)
     try:
-        signing = make_signing(keeper.stamps)
+        signing = make_signing(keeper.timestamps)
         taken: list[bytes] = []
         for second in range(20):
             keeper.renew()  # as its thread does, four times a second
@@ -108,7 +108,7 @@ def test_a_kill_at_any_moment_lets_no_old_frame_in_again(tmp_path: Path) -> None
                 taken.append(frame)
             again = TimestampFile(path, 0, write=lambda path, stamp: None)
             again.close()
-            restarted = make_signing(again.stamps)
+            restarted = make_signing(again.timestamps)
             assert {restarted.verify(frame, at_ns) for frame in taken} == {SignatureRefusal.REPLAYED}
             later = STAMP + (at_ns + 3 * 10**9) // 10_000
             assert restarted.verify(SignedPeer(stamp=later).heartbeat(), at_ns) is None
@@ -120,12 +120,12 @@ def test_a_kill_at_any_moment_lets_no_old_frame_in_again(tmp_path: Path) -> None
 def test_a_restart_sends_no_stamp_twice_even_if_the_clock_went_back(tmp_path: Path) -> None:
     path, frame = tmp_path / "key.stamp", Peer(245, 25).heartbeat()
     keeper = TimestampFile(path, STAMP)
-    sent = make_signing(keeper.stamps).sign(frame, 0)
+    sent = make_signing(keeper.timestamps).sign(frame, 0)
     keeper.renew()
     keeper.close()
     again = TimestampFile(path, STAMP)
     again.close()
-    late = make_signing(again.stamps).sign(frame, -3600 * 10**9)
+    late = make_signing(again.timestamps).sign(frame, -3600 * 10**9)
     assert int.from_bytes(late[-12:-6], "little") > int.from_bytes(sent[-12:-6], "little")
 
 
@@ -135,7 +135,7 @@ def test_it_is_written_only_when_it_has_to_be(tmp_path: Path) -> None:
     keeper.close()
     assert writes == [WRITE_AHEAD]
     for stamp in range(0, 4 * RENEW_MARGIN, RENEW_MARGIN // 10):
-        keeper.stamps.own = stamp
+        keeper.timestamps.newest = stamp
         keeper.renew()
     assert writes[1:] == [
         stamp + WRITE_AHEAD
@@ -152,7 +152,7 @@ def test_a_disk_that_fails_is_told_and_stops_nothing(tmp_path: Path) -> None:
             raise OSError(28, "No space left on device")
 
     keeper = TimestampFile(tmp_path / "key.stamp", 0, write=write)
-    keeper.stamps.own = STAMP
+    keeper.timestamps.newest = STAMP
     broken[0] = True
     keeper.renew()
     assert "No space" in str(keeper.failure)
@@ -170,7 +170,7 @@ def test_its_thread_writes_by_itself(tmp_path: Path) -> None:
             written.set()
 
     keeper = TimestampFile(tmp_path / "key.stamp", 0, write=write)
-    keeper.stamps.own = STAMP
+    keeper.timestamps.newest = STAMP
     try:
         assert written.wait(LIMIT_S)
     finally:

@@ -35,9 +35,9 @@ def test_every_mode_of_both_autopilots_has_its_name_and_who_can_have_chosen_it()
     }
     for autopilot, all_of_it in numbers.items():
         names = [describe_mode(autopilot, mavlink.MAV_TYPE_QUADROTOR, number)[0] for number in all_of_it]
-        assert set(names) == set(PROFILES[autopilot].choices)
+        assert set(names) == set(PROFILES[autopilot].mode_choices)
     assert describe_mode("px4", 2, px4(4, 20))[0] == "AUTO.DESCEND"
-    assert describe_mode("px4", 2, px4(4, 33))[0] not in PROFILES["px4"].choices
+    assert describe_mode("px4", 2, px4(4, 33))[0] not in PROFILES["px4"].mode_choices
 
 
 def status(mode: str, autopilot: str, **said: object) -> VehicleStatus:
@@ -80,7 +80,7 @@ def test_who_it_was(autopilot: str, mode: str, said: dict[str, object], who: Mod
 
 def test_who_takes_over_from_a_failsafe_by_stick_is_the_pilot() -> None:
     shown = status("POSCTL", "px4", failsafe=True, radio=True, said="Failsafe activated")
-    assert determine_mode_reason(shown, had_failed=True) is ModeReason.PILOT
+    assert determine_mode_reason(shown, was_in_failsafe=True) is ModeReason.PILOT
 
 
 # From messages
@@ -96,7 +96,7 @@ class Vehicle:
         self.beat(EXTERNAL_NUMBER[autopilot])
 
     def say(self, message: Ack | Battery | FenceBreach | Heartbeat | RadioChannels | Text) -> None:
-        for item in self.watch.take(message, self.now_ns):
+        for item in self.watch.handle_message(message, self.now_ns):
             self.status = item if isinstance(item, VehicleStatus) else self.status
 
     def beat(self, mode: int, *, critical: bool = False) -> None:
@@ -113,7 +113,7 @@ class Vehicle:
         )
 
     def radio(self, *, heard: bool) -> None:
-        self.say(Battery(system=1, component=1, voltage_v=None, radio=heard))
+        self.say(Battery(system=1, component=1, voltage_v=None, has_radio=heard))
 
     def text(self, text: str, severity: int = 6) -> None:
         self.say(Text(system=1, component=1, severity=severity, text=text))
@@ -248,7 +248,7 @@ def test_a_fence_that_is_told_without_words_and_an_order_of_a_ground_station() -
         Ack(system=1, component=1, command=mavlink.MAV_CMD_DO_SET_MODE, result=0, target_system=255, target_component=0)
     )
     assert vehicle.who() is ModeReason.GROUND_STATION
-    vehicle.say(FenceBreach(system=1, component=1, breached=True))
+    vehicle.say(FenceBreach(system=1, component=1, is_breached=True))
     assert vehicle.who() is ModeReason.FENCE
 
 
@@ -273,7 +273,7 @@ def test_unknown_in_a_mode_that_flies_by_itself_is_landed_in_bounded_time_unless
     rig = engaged(autopilot)
     rig.be(mode=home)
     rig.run(9.0)
-    assert rig.is_in(HandoverState.UNCLEAR) and not landings(rig) and rig.hand_over.busy
+    assert rig.is_in(HandoverState.UNCLEAR) and not landings(rig) and rig.hand_over.is_busy
     rig.run(2.0)
     assert landings(rig)
     pilots = engaged(autopilot)
@@ -300,8 +300,8 @@ def test_word_of_the_fence_that_comes_after_its_mode_counts() -> None:
 @pytest.mark.fault(28, 61)
 def test_px4_s_descend_while_landing_is_asked_for_is_a_landing() -> None:
     rig = engaged("px4")
-    rig.tick(land=True)
-    rig.tick(land=False)
+    rig.tick(is_landing_requested=True)
+    rig.tick(is_landing_requested=False)
     rig.be(mode="AUTO.DESCEND", failsafe=True)
     rig.run(3.0)
     assert rig.is_in(HandoverState.LANDING) and landings(rig) > 1  # not for us: it is asked on
@@ -318,13 +318,13 @@ def test_whoever_it_was_nothing_flies_it_and_by_order_only_is_it_asked_for(autop
     """Every mode that is none of ours, in every state of a flight, with and without each kind of word."""
     profile = PROFILES[autopilot]
     states = (HandoverState.CLIMBING, HandoverState.ENGAGING, HandoverState.ENGAGED)
-    modes = [*sorted(set(profile.choices) - {profile.external} - profile.climbing), "MODE_99"]
+    modes = [*sorted(set(profile.mode_choices) - {profile.external_mode} - profile.climb_modes), "MODE_99"]
     words: tuple[dict[str, Any], ...] = ({}, {"failsafe": True}, {"fence": True, "said": "Circle fence breached"})
     for state, mode, stick, said in product(states, modes, (False, True), words):
         rig = engaged(autopilot) if state is HandoverState.ENGAGED else Rig(autopilot).to(state)
         asked = len(rig.asked)
         rig.be(mode=mode, stick=stick, landed=False, **said)
-        sent = {rig.tick().sending for _ in range(80)}
+        sent = {rig.tick().setpoint_mode for _ in range(80)}
         assert sent == {NOTHING} and len(rig.asked) == asked, (state, mode, stick, said)
         assert rig.is_in(HandoverState.RELEASED, HandoverState.FAILSAFE, HandoverState.UNCLEAR), (
             rig.state,

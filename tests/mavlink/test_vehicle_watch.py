@@ -75,9 +75,9 @@ def test_a_ground_station_and_a_camera_are_no_vehicles() -> None:
 def test_how_long_it_has_been_up_is_told_by_its_clock_and_goes_on_between_its_messages() -> None:
     link, vehicle = make_link(daemon=DaemonConfig(tick_s=0.05)), Peer(1, 1)
     link.receive(vehicle.heartbeat(), NOW)
-    assert link.vehicle_up_s(NOW) is None
+    assert link.vehicle_uptime_s(NOW) is None
     link.receive(vehicle.local_position(60_000), NOW)
-    assert link.vehicle_up_s(NOW) == 60.0 and link.vehicle_up_s(NOW + 2 * SECOND) == 62.0
+    assert link.vehicle_uptime_s(NOW) == 60.0 and link.vehicle_uptime_s(NOW + 2 * SECOND) == 62.0
 
 
 @pytest.mark.fault(20)
@@ -282,15 +282,15 @@ def test_clocks_that_drift_apart_for_half_an_hour_lose_nothing(ppm: int) -> None
     for n in range(18_000):
         at_ns = NOW + n * SECOND // 10
         stamp_us = (at_ns + n * ppm * 100) // 1000
-        assert stream_of_now.takes(stamp_us, (0.01 * (n % 3), 0.0, 0.0), at_ns), n
+        assert stream_of_now.is_current(stamp_us, (0.01 * (n % 3), 0.0, 0.0), at_ns), n
 
 
 def test_a_new_stamp_is_a_new_measurement_and_the_same_stamp_is_none() -> None:
     one = SensorStreamMonitor()
     for n in range(100):
         at_ns, readings = NOW + n * 20 * MS, (float(n // 40), 0.0, -9.8)  # whole numbers repeat for 0.8 s
-        assert one.takes(at_ns // 1000, readings, at_ns, frozen_us=FROZEN_RAW_US)
-        assert one.takes(at_ns // 1000, readings, at_ns + MS, frozen_us=FROZEN_RAW_US) is None
+        assert one.is_current(at_ns // 1000, readings, at_ns, frozen_us=FROZEN_RAW_US)
+        assert one.is_current(at_ns // 1000, readings, at_ns + MS, frozen_us=FROZEN_RAW_US) is None
 
 
 @pytest.mark.parametrize("name", ["px4-inertial-drift.tlog", "arducopter-inertial-integers.tlog"])
@@ -300,7 +300,7 @@ def test_recorded_inertial_data_are_used(name: str) -> None:
     link, told = make_link(estimator=estimator), list[str]()
     for at_ns, data in packets(name):
         told += [event.code for event in events(link.receive(data, at_ns).items)]
-    used, total = link.inertial
+    used, total = link.inertial_counts
     assert total > 500 and used > 0.95 * total
     assert "inertial-not-of-now" not in told and told.count("dropped") <= 1
 

@@ -48,7 +48,7 @@ def exact(value: Any) -> Any:
 
 
 def is_read_alike(kind: Any, frame: bytes, sender: tuple[int, int]) -> None:
-    got, want = LAYOUTS[kind.id].read(frame), mavlink.MAVLink(None).decode(bytearray(frame))
+    got, want = LAYOUTS[kind.id].unpack(frame), mavlink.MAVLink(None).decode(bytearray(frame))
     assert (got.msgname, got.src_system, got.src_component) == (kind.msgname, *sender)
     for field in kind.fieldnames:
         value, wanted = getattr(got, field), getattr(want, field)
@@ -61,7 +61,7 @@ def is_written_alike(kind: Any, payload: bytes, number: int) -> None:
     message: Any = sender.decode(bytearray(framed(kind, payload, ADDRESS)))
     sender.seq = number
     fields = [getattr(message, f"_{field}_raw", getattr(message, field)) for field in kind.fieldnames]
-    assert LAYOUTS[kind.id].frame(ADDRESS, number, *fields) == message.pack(sender)
+    assert LAYOUTS[kind.id].pack(ADDRESS, number, *fields) == message.pack(sender)
 
 
 @given(kind=ANY, payload=PAYLOADS, sender=st.tuples(BYTES, BYTES), v1=st.booleans(), signed=st.booleans())
@@ -86,12 +86,12 @@ def test_every_kind_is_read_and_written_alike(kind: Any) -> None:
 def test_numbers_that_are_not_given_at_the_end_are_zero() -> None:
     whole = mavlink.MAVLink_set_gps_global_origin_message(1, 2, 3, 4, 0).pack(mavlink.MAVLink(None, *ADDRESS))
     layout = MessageLayout(mavlink.MAVLink_set_gps_global_origin_message)
-    assert layout.frame(ADDRESS, 0, 1, 2, 3, 4) == whole
+    assert layout.pack(ADDRESS, 0, 1, 2, 3, 4) == whole
 
 
 def test_a_number_that_does_not_fit_is_refused() -> None:
     with pytest.raises(struct.error):
-        MessageLayout(mavlink.MAVLink_timesync_message).frame(ADDRESS, 0, 2**63, 0)
+        MessageLayout(mavlink.MAVLink_timesync_message).pack(ADDRESS, 0, 2**63, 0)
 
 
 @pytest.mark.parametrize("name", sorted(path.name for path in DATA.glob("*.tlog")))
@@ -100,12 +100,12 @@ def test_recorded_frames_are_read_and_written_again(name: str) -> None:
     known = [(frame, number) for frame, number in frames if number in LAYOUTS]
     assert len(known) > 60
     for frame, number in known:
-        got = LAYOUTS[number].read(frame)
+        got = LAYOUTS[number].unpack(frame)
         names = mavlink.mavlink_map[number].fieldnames
         fields = (getattr(got, field) for field in names)
-        written = LAYOUTS[number].frame((got.src_system, got.src_component), frame[4], *fields)
+        written = LAYOUTS[number].pack((got.src_system, got.src_component), frame[4], *fields)
         if written[1] < frame[1]:  # extensions of the message: who a TIMESYNC is for
-            again = LAYOUTS[number].read(written)
+            again = LAYOUTS[number].unpack(written)
             assert [getattr(again, field) for field in names] == [getattr(got, field) for field in names]
         else:
             assert written == frame
@@ -122,7 +122,7 @@ def test_a_setpoint_has_pymavlinks_bytes(at_ns: int, accel: tuple[float, float, 
     want = mavlink.MAVLink_set_position_target_local_ned_message(
         at_ns // 1_000_000 % 2**32, 1, 2, 1, mask, *(0.0,) * 6, *accel, yaw or 0.0, 0.0
     )
-    assert Encoder(*ADDRESS).setpoint(setpoint, 1, 2) == want.pack(mavlink.MAVLink(None, *ADDRESS))
+    assert Encoder(*ADDRESS).encode_setpoint(setpoint, 1, 2) == want.pack(mavlink.MAVLink(None, *ADDRESS))
 
 
 POSITION, TURN = (1.0, -2.5, -0.0), (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))

@@ -56,7 +56,7 @@ Step = tuple[Callable[["Endings"], bool], Callable[["Endings"], None]]
 class Line:
     """A connection to the simulated peers."""
 
-    known, unread, send_errors, receive_errors = True, False, 0, 0
+    has_known_sender, has_unread, send_errors, receive_errors = True, False, 0, 0
 
     def __init__(self, rig: Endings, name: str) -> None:
         self.url, self.closed = f"test://{name}", False
@@ -70,16 +70,16 @@ class Line:
     def filenos(self) -> tuple[int, ...]:
         return ()
 
-    def lost(self) -> int:
+    def count_lost(self) -> int:
         return 0
 
-    def trust(self, index: int) -> None:
+    def trust_sender(self, index: int) -> None:
         pass
 
-    def answer(self, index: int) -> None:
+    def select_peer(self, index: int) -> None:
         pass
 
-    def receive(self, *, everything: bool = False) -> list[tuple[bytes, int]]:
+    def receive(self, *, read_all: bool = False) -> list[tuple[bytes, int]]:
         taken, self.arrived = self.arrived, []
         return taken
 
@@ -148,7 +148,7 @@ class Endings:
     # What a step may look at, and do
 
     def is_in(self, state: HandoverState) -> bool:
-        return self.loop is not None and self.loop.who_flies is state
+        return self.loop is not None and self.loop.handover_state is state
 
     @property
     def flying(self) -> ControlLoop:
@@ -234,7 +234,7 @@ class Told:
         self.recorded = [one for one in self.records if isinstance(one, Ending)]
         page = self.path.with_suffix(".html")
         self.page = words_of(page) if page.exists() else ""
-        health = None if rig.watch is None else rig.watch.look()
+        health = None if rig.watch is None else rig.watch.make_health()
         self.status = "" if health is None else health.ending
         self.relay = None if health is None else health.relay
         self.notified = rig.notified

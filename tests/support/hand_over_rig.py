@@ -34,7 +34,7 @@ class Rig:
             at_ns=NOW, autopilot=autopilot, armed=False, mode=ground, external=False, landed=True, radio=True
         )
         self.mute = False
-        self.view = HandoverInput(at_ns=NOW, vehicle=None, ready=True, up_m=0.0)
+        self.view = HandoverInput(at_ns=NOW, vehicle=None, has_setpoint=True, estimated_height_m=0.0)
         self.asked: list[tuple[int, RequestKind]] = []
         self.events: list[Event] = []
 
@@ -59,10 +59,10 @@ class Rig:
         at_ns = self.view.at_ns + TICK_NS
         if self.vehicle is not None and not self.mute:
             self.vehicle = replace(self.vehicle, at_ns=at_ns)
-        self.view = replace(self.view, at_ns=at_ns, vehicle=self.vehicle, heard=heard, commands=commands, **fields)
+        self.view = replace(self.view, at_ns=at_ns, vehicle=self.vehicle, messages=heard, commands=commands, **fields)
         told = self.hand_over.update(self.view)
-        if told.ask is not None:
-            self.asked.append((at_ns, told.ask))
+        if told.request is not None:
+            self.asked.append((at_ns, told.request))
         self.events += told.events
         return told
 
@@ -118,7 +118,7 @@ class Rig:
             self.be(mode="AUTO.RTL" if px4 else "RTL")
             self.tick()
             return self
-        self.tick(up_m=1.9)
+        self.tick(estimated_height_m=1.9)
         return self
 
     def fail(self, mode: str = "") -> HandoverOutput:
@@ -134,8 +134,8 @@ class Rig:
         if state is HandoverState.RETURNING:
             self.tick(commands=(ENGAGE,))
         if state in (HandoverState.LANDING, HandoverState.SETTLING):
-            self.tick(land=True)
-            self.view = replace(self.view, land=False)
+            self.tick(is_landing_requested=True)
+            self.view = replace(self.view, is_landing_requested=False)
         if state is HandoverState.SETTLING:
             self.be(mode="AUTO.LAND")
             self.tick()

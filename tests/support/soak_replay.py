@@ -46,8 +46,8 @@ class Doors:
         """What of a datagram passes."""
         found = scan(data, final=True)
         if found.frames and not found.bad:
-            data = b"".join(self.peers[link].seal(frame.data, at_ns) for frame in found.frames)
-        return self.gates[link].admit(data, at_ns)
+            data = b"".join(self.peers[link].sign_frame(frame.data, at_ns) for frame in found.frames)
+        return self.gates[link].verify_frames(data, at_ns)
 
     def tell(self, loop: ControlLoop, at_ns: int) -> None:
         """What did not, since this was last told."""
@@ -129,7 +129,7 @@ class Rig:
         if self._doors is None:
             self.loop.receive(link, bytes(data), at_ns)
         else:
-            data = bytearray(self._doors.gates[link].admit(bytes(data), at_ns))
+            data = bytearray(self._doors.gates[link].verify_frames(bytes(data), at_ns))
             if data:
                 self.loop.receive(link, bytes(data), at_ns)
 

@@ -179,8 +179,8 @@ class Heard:
     def _add_own(self, message: Position, at_ns: int, offset_ns: int | None) -> None:
         if message.stamp_us is None or len(self.own) >= MOST or max(map(abs, message.position_m)) > _FAR_M:
             return
-        stamp_ns = self._clock.unwrap(message.stamp_us // 1000, BOOT_MS_WRAP, 1_000_000)
-        captured = self._clock.captured_ns(stamp_ns, at_ns, offset_ns)
+        stamp_ns = self._clock.unwrap_ns(message.stamp_us // 1000, BOOT_MS_WRAP, 1_000_000)
+        captured = self._clock.estimate_capture_ns(stamp_ns, at_ns, offset_ns)
         if not isinstance(captured, str) and (not self.own or captured > self.own[-1][0]):
             self.own.append((captured, message.position_m))
 

@@ -95,9 +95,9 @@ def _receive(flight: Preflight, name: str, connection: Connection, told: Paramet
             told.take(Datagram(at_ns=received_ns, link=name, outgoing=False, data=data))
         received = flight.receive(name, data, received_ns)
         if received.from_vehicle:  # cameras or a ground station may share the port
-            connection.answer(index)
+            connection.select_peer(index)
         elif received.from_source:
-            connection.trust(index)
+            connection.trust_sender(index)
         for answer in received.answers:
             connection.send(answer.data)
 

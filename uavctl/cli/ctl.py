@@ -96,8 +96,8 @@ def _place(text: str) -> Vec3:
             raise UsageError(f'Unknown option: "{unknown[0]}"; see uavctl ctl goto --help') from None
         raise UsageError(f"goto {text}: write three numbers, north,east,down [m], as in 2,1,-2") from None
     request = ControlRequest(ask="goto", position_m=(north, east, down))
-    if request.problem() is not None:
-        raise UsageError(f"goto {text}: {request.problem()}")
+    if request.find_problem() is not None:
+        raise UsageError(f"goto {text}: {request.find_problem()}")
     return north, east, down
 
 

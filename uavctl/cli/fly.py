@@ -71,7 +71,7 @@ def operation(
     with _health_lines() as show:
 
         def tell(line: str) -> None:
-            notifier.status(line)
+            notifier.send_status(line)
             show(line)
 
         def recorder() -> RecorderHealth:
@@ -79,12 +79,12 @@ def operation(
 
         identity = (daemon_name(config), config.daemon.vehicle, os.getpid())
         watch = HealthMonitor(loop, config, identity, recorder, tell)
-        server = ControlServer(listener, config, loop, watch.look)
+        server = ControlServer(listener, config, loop, watch.make_health)
         try:
             # The sign of life comes last: it stands for all that a tick has to do.
             yield watch.after_tick, server.after_tick, notifier.after_tick
         finally:
-            notifier.status(f"ended: {loop.ending.sentence}")
+            notifier.send_status(f"ended: {loop.ending.sentence}")
             server.close()
             notifier.close()
 
@@ -94,8 +94,10 @@ def as_realtime(wanted: bool) -> Iterator[Sequence[AfterTick]]:
     """Set real-time scheduling and memory if wanted; return the function to call after each tick."""
     with ExitStack() as stack:
         for outcome in stack.enter_context(enable_realtime()) if wanted else ():
-            told = Text(f"--realtime: {outcome.part}: {outcome.text}")
-            messages().print(told if outcome.ok else labelled("warning", told.plain, "bold yellow"), soft_wrap=True)
+            told = Text(f"--realtime: {outcome.name}: {outcome.text}")
+            messages().print(
+                told if outcome.is_applied else labelled("warning", told.plain, "bold yellow"), soft_wrap=True
+            )
         yield (stack.enter_context(control_garbage_collection()).after_tick,)
 
 
@@ -258,8 +260,8 @@ def fly_daemon(
                 record_parameters(recorder, told, monotonic_ns())
                 for warning in warnings(config.security, config.daemon):
                     messages().print(labelled("warning", warning), soft_wrap=True)
-                if tenure.left_ns is not None:
-                    stand_by(loop, tenure.left_ns)
+                if tenure.left_flight_ns is not None:
+                    stand_by(loop, tenure.left_flight_ns)
                 messages().print(f"recording to {path}; Ctrl-C hands over", soft_wrap=True)
                 with (
                     live_line(loop, recorder, duration_s, config.daemon.tick_s) as shown,
@@ -275,16 +277,16 @@ def fly_daemon(
                         stop_limit_s=stop_limit_s(config, takes_off=engagement.takes_off),
                         after_tick=(
                             shown.after_tick,
-                            lambda *_: tenure.note(loop.leaves_vehicle),
+                            lambda *_: tenure.update(loop.leaves_vehicle),
                             lambda *_: recorder.catch_up(),
                             lambda ticked, _: engagement.follow(loop, ticked),
                             *beside,
                             *collect,
                         ),
-                        on_news=shown.news.extend,
+                        on_events=shown.news.extend,
                     )
                 if asked_for:
-                    tenure.note(False)
+                    tenure.update(False)
             finally:
                 ending = loop.ending
                 recorder.put(ENDED, monotonic_ns(), ending)

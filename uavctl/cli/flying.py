@@ -364,7 +364,7 @@ def live_line(
 
         def tell() -> None:
             while feed.news:
-                line = said.line(feed.news.popleft(), loop.who_flies)
+                line = said.line(feed.news.popleft(), loop.handover_state)
                 if line is not None:
                     console.print(Text(line, style="yellow"), soft_wrap=True)
 
@@ -377,7 +377,7 @@ def live_line(
                     told.set()
                     console.print(labelled("letting go", loop.let_go, "bold red"), soft_wrap=True)
                 if ticked is not None:
-                    line = _line(ticked, loop.who_flies) + _alarm(recorder.status())
+                    line = _line(ticked, loop.handover_state) + _alarm(recorder.status())
                     progress.update(task, completed=ticked.decision.tick * tick_s, line=line)
 
         thread = threading.Thread(target=show, name="live", daemon=True)

@@ -183,7 +183,7 @@ def _real_time(prepared: Prepared, path: Path, engagement: Engagement, looking: 
                         lambda ticked, _: engagement.follow(loop, ticked),
                         collector.after_tick,
                     ),
-                    on_news=shown.news.extend,
+                    on_events=shown.news.extend,
                 )
             wall_s = time.perf_counter() - begun
             simulator.close()  # its last words go into the recording

@@ -63,7 +63,7 @@ class SignedPort:
     def read(self) -> list[bytes]:
         """See `Port`; bytes without a verified frame are dropped."""
         at_ns = monotonic_ns()
-        admitted = (self._gate.admit(data, at_ns) for data in self._inner.read())
+        admitted = (self._gate.verify_frames(data, at_ns) for data in self._inner.read())
         return [data for data in admitted if data]
 
     def write(self, data: bytes) -> None:
@@ -71,7 +71,7 @@ class SignedPort:
         found = scan(data, final=True)
         if found.frames and not found.bad:
             at_ns = monotonic_ns()
-            data = b"".join(self._gate.seal(frame.data, at_ns) for frame in found.frames)
+            data = b"".join(self._gate.sign_frame(frame.data, at_ns) for frame in found.frames)
         self._inner.write(data)
 
     def close(self) -> None:

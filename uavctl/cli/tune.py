@@ -233,9 +233,9 @@ def _heard(link: MavlinkConnection, connection: Connection) -> Iterator[Position
     for index, (data, at_ns) in enumerate(connection.receive()):
         found, answers, settled, *_ = link.receive(data, at_ns)
         if any(isinstance(one, VehicleStatus) for one in found):
-            connection.answer(index)
+            connection.select_peer(index)
         elif settled and any(isinstance(one, PositionSample) for one in found):
-            connection.trust(index)
+            connection.trust_sender(index)
         for answer in answers:
             connection.send(answer)
         yield from (one for one in found if isinstance(one, PositionSample))

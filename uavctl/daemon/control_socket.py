@@ -45,7 +45,7 @@ class ControlRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     ask: Literal["goto", "hold", "resume", "land", "engage", "status"]
     position_m: Vec3 | None = None  # local NED; with goto only
 
-    def problem(self) -> str | None:
+    def find_problem(self) -> str | None:
         """Error in the request by itself; None if there is none."""
         if (self.ask == "goto") != (self.position_m is not None):
             return "goto needs a position_m" if self.position_m is None else f"{self.ask} takes no position_m"
@@ -108,7 +108,7 @@ class OrderReceiver(Protocol):
         """Queue an order for the next tick; False if too many wait."""
         ...
 
-    def against(self, order: Order) -> str:
+    def explain_refusal(self, order: Order) -> str:
         """Return why an order would have no effect now; empty if it may be given."""
         ...
 
@@ -130,30 +130,30 @@ class ControlServer:
     def __init__(
         self, listener: socket.socket, config: Config, flight: OrderReceiver, look: Callable[[], Health]
     ) -> None:
-        self._listener, self._config, self._flight, self._look = listener, config, flight, look
+        self._listener, self._config, self._order_receiver, self._make_health = listener, config, flight, look
         self._clients: list[_Client] = []
-        self._waiting: list[tuple[_Client, Command]] = []  # for the next tick's answers
+        self._pending: list[tuple[_Client, Command]] = []  # for the next tick's answers
 
     def after_tick(self, ticked: Ticked, lateness_ns: int) -> None:
         """Answer the orders that the tick took, then take what has come; bounded work, no waiting."""
         del lateness_ns
-        self._answer(list(ticked.answers))
+        self._send_answers(list(ticked.answers))
         self._accept(ticked.decision.at_ns)
-        waiting = [client for client, _ in self._waiting]
+        waiting = [client for client, _ in self._pending]
         for client in [one for one in self._clients if one not in waiting]:
             self._serve(client, ticked.decision.at_ns)
 
     def close(self) -> None:
         """End the service; clients that still wait are told so."""
-        for client, _ in self._waiting:
+        for client, _ in self._pending:
             self._reply(client, Reply(ok=False, text="the flight ended before it decided on this"))
         for client in self._clients:
             client.socket.close()
         self._clients.clear()
-        self._waiting.clear()
+        self._pending.clear()
 
-    def _answer(self, answers: list[tuple[Command, Event]]) -> None:
-        waiting, self._waiting = self._waiting, []
+    def _send_answers(self, answers: list[tuple[Command, Event]]) -> None:
+        waiting, self._pending = self._pending, []
         for client, command in waiting:
             found = next((one for one in answers if one[0] == command), None)
             if found is None:
@@ -191,33 +191,38 @@ class ControlServer:
         line, whole, rest = client.buffer.partition(b"\n")
         if whole and len(line) <= MAX_LINE:
             client.buffer = rest
-            self._act(client, line)
+            self._handle_request(client, line)
         elif len(client.buffer) > MAX_LINE:
             self._reply(client, Reply(ok=False, text=f"a request has {MAX_LINE} bytes at most"))
             self._drop(client)
         elif data == b"" or now_ns - client.heard_ns > IDLE_NS:
             self._drop(client)
 
-    def _act(self, client: _Client, line: bytes) -> None:
+    def _handle_request(self, client: _Client, line: bytes) -> None:
         try:
             request = _REQUEST.decode(line)
         except msgspec.MsgspecError as error:  # of msgspec's own, a subclass of ValueError
             self._reply(client, Reply(ok=False, text=f"not understood: {error}"))
             return
         if request.ask == "status":
-            self._reply(client, Reply(ok=True, text="", status=self._look()))
+            self._reply(client, Reply(ok=True, text="", status=self._make_health()))
             return
-        problem = request.problem() or self._misplaced(request) or self._flight.against(Order(request.ask)) or None
+        problem = (
+            request.find_problem()
+            or self._check_position(request)
+            or self._order_receiver.explain_refusal(Order(request.ask))
+            or None
+        )
         if problem is not None:
             self._reply(client, Reply(ok=False, text=problem))
             return
         command = Command(order=Order(request.ask), position_m=request.position_m)
-        if self._flight.order(command):
-            self._waiting.append((client, command))
+        if self._order_receiver.order(command):
+            self._pending.append((client, command))
         else:
             self._reply(client, Reply(ok=False, text="too many orders at once; try again"))
 
-    def _misplaced(self, request: ControlRequest) -> str | None:
+    def _check_position(self, request: ControlRequest) -> str | None:
         """Return in which coordinates a place is outside the limits; None if it is inside, or there is none."""
         if request.position_m is None:
             return None

@@ -34,8 +34,8 @@ _CAP_IPC_LOCK = 14
 class RealtimeSetting:
     """One part of it: whether it holds, and what a person should know."""
 
-    part: str
-    ok: bool
+    name: str
+    is_applied: bool
     text: str
 
 
@@ -81,9 +81,9 @@ def enable_realtime(priority: int = PRIORITY) -> Iterator[tuple[RealtimeSetting,
     try:
         yield scheduling, memory
     finally:
-        if memory.ok:
+        if memory.is_applied:
             ctypes.CDLL(None).munlockall()
-        if scheduling.ok:
+        if scheduling.is_applied:
             os.sched_setscheduler(0, *before)
 
 
@@ -147,7 +147,7 @@ def fly(
     duration_s: float | None = None,
     stop_limit_s: float,
     after_tick: Sequence[AfterTick] = (),
-    on_news: Callable[[tuple[Event, ...]], None] = lambda _: None,
+    on_events: Callable[[tuple[Event, ...]], None] = lambda _: None,
     wait_for: Callable[[Mapping[str, Connection], int], list[str]] = wait,
     now: Callable[[], int] = monotonic_ns,
 ) -> bool:
@@ -172,13 +172,13 @@ def fly(
     """
     first_ns: int | None = None
     stop_ns: int | None = None
-    refusals = _RefusalReporter(loop, connections, on_news)
-    reader = _Reader(loop, connections, now, on_news)
+    refusals = _RefusalReporter(loop, connections, on_events)
+    reader = _Reader(loop, connections, now, on_events)
     withheld = 0
 
     def send(message: Outgoing) -> None:
         nonlocal withheld
-        if message.link == VEHICLE and not reader.fresh:
+        if message.link == VEHICLE and not reader.is_fresh:
             withheld += 1  # who has the vehicle may have changed since the look
         else:
             connections[message.link].send(message.data)
@@ -198,7 +198,7 @@ def fly(
                     f"{connections[VEHICLE].url}: closed by the other side, so nothing can be sent; "
                     "the vehicle's own failsafe has it. See to the link and start again"
                 )
-            reader.read_everything()
+            reader.read_backlog()
             due = ticker.update_after_wait(due)
             started_ns = now()
             first_ns = due.at_ns if first_ns is None else first_ns
@@ -207,7 +207,7 @@ def fly(
                 stop_ns = due.at_ns
                 loop.course.stop(Cause.TIME if over else Cause.OPERATOR)
             late = stop_ns is not None and due.at_ns - stop_ns >= stop_limit_s * 1e9
-            if late and not (stop_limit_s and loop.carries):
+            if late and not (stop_limit_s and loop.is_relay_needed):
                 break
             withheld = 0
             ticked = loop.tick(due.tick, due.at_ns, send, due.missed, stop=stop_ns is not None)
@@ -216,11 +216,11 @@ def fly(
             loop.timing(ticked, started_ns - due.at_ns, now() - due.at_ns)
             if loop.outside and ticked.decision.solve is not None:
                 loop.answered(ticked.step_ns)
-            refusals.tell(due.at_ns)
+            refusals.report(due.at_ns)
             for follow in after_tick:
                 follow(ticked, started_ns - due.at_ns)
     finally:
-        refusals.tell(now(), last=True)
+        refusals.report(now(), last=True)
     return stop_ns is not None
 
 
@@ -232,59 +232,59 @@ class _Reader:
         loop: ControlLoop,
         connections: Mapping[str, Connection],
         now: Callable[[], int],
-        on_news: Callable[[tuple[Event, ...]], None],
+        on_events: Callable[[tuple[Event, ...]], None],
     ) -> None:
-        self._loop, self._connections, self._now, self._on_news = loop, connections, now, on_news
-        self._looked_ns = now()  # when the last read ended
-        self._whole_ns: int | None = None  # when the last read began after which nothing was left
+        self._loop, self._connections, self._now, self._on_events = loop, connections, now, on_events
+        self._read_ns = now()  # when the last read ended
+        self._complete_read_ns: int | None = None  # when the last read began after which nothing was left
         self._lost = dict.fromkeys(connections, 0)
 
     @property
-    def fresh(self) -> bool:
+    def is_fresh(self) -> bool:
         """Whether everything has been read that the vehicle had said a moment ago."""
-        return self._whole_ns is not None and self._now() - self._whole_ns <= MAX_READ_AGE_NS
+        return self._complete_read_ns is not None and self._now() - self._complete_read_ns <= MAX_READ_AGE_NS
 
-    def read(self, names: Iterable[str], *, everything: bool = False) -> bool:
+    def read(self, names: Iterable[str], *, read_all: bool = False) -> bool:
         """Hand on what has arrived on the named connections; False if the flight needs nothing of it."""
         began_ns = self._now()
-        stalled = began_ns - self._looked_ns > STALL_NS
+        stalled = began_ns - self._read_ns > STALL_NS
         heard = False
         for name in names:
             connection = self._connections[name]
-            arrived = connection.receive(everything=everything or stalled)
-            heard = heard or (bool(arrived) and connection.known)
+            arrived = connection.receive(read_all=read_all or stalled)
+            heard = heard or (bool(arrived) and connection.has_known_sender)
             for index, (data, received_ns) in enumerate(arrived):
-                self._hand_on(name, index, data, received_ns)
-        self._look_at_losses(stalled)
-        self._looked_ns = self._now()
+                self._handle_data(name, index, data, received_ns)
+        self._report_losses(stalled)
+        self._read_ns = self._now()
         return heard
 
-    def read_everything(self) -> None:
+    def read_backlog(self) -> None:
         """Read what has come until now, before something goes out: a backlog ends with the vehicle's newest state."""
         for _ in range(MAX_READ_ROUNDS):
             began_ns = self._now()
-            self.read(self._connections, everything=True)
-            if not self._connections[VEHICLE].unread:
-                self._whole_ns = began_ns
-                if self.fresh:
+            self.read(self._connections, read_all=True)
+            if not self._connections[VEHICLE].has_unread:
+                self._complete_read_ns = began_ns
+                if self.is_fresh:
                     return
 
-    def _hand_on(self, name: str, index: int, data: bytes, received_ns: int) -> None:
+    def _handle_data(self, name: str, index: int, data: bytes, received_ns: int) -> None:
         connection = self._connections[name]
         received = self._loop.receive(name, data, received_ns)
         if received.from_vehicle:  # cameras or a ground station may share the port
-            connection.answer(index)
+            connection.select_peer(index)
         elif received.from_source:
-            connection.trust(index)
+            connection.trust_sender(index)
         if received.news:
-            self._on_news(received.news)
+            self._on_events(received.news)
         for answer in received.answers:
             self._connections[answer.link].send(answer.data)
 
-    def _look_at_losses(self, stalled: bool) -> None:
+    def _report_losses(self, stalled: bool) -> None:
         """Tell what the system dropped while nobody looked. Losses in a flood are not told, and change nothing."""
         for name, connection in self._connections.items():
-            before, lost = self._lost[name], connection.lost()
+            before, lost = self._lost[name], connection.count_lost()
             self._lost[name] = lost
             if stalled and lost > before:
                 self._loop.refused(name, {OVERRUN: lost - before}, self._now())
@@ -294,21 +294,21 @@ class _RefusalReporter:
     """Tells the loop once a second what the connections dropped."""
 
     def __init__(
-        self, loop: ControlLoop, connections: Mapping[str, Connection], on_news: Callable[[tuple[Event, ...]], None]
+        self, loop: ControlLoop, connections: Mapping[str, Connection], on_events: Callable[[tuple[Event, ...]], None]
     ) -> None:
-        self._loop, self._connections, self._on_news = loop, connections, on_news
-        self._told: dict[str, Counter[str]] = {name: Counter() for name in connections}
+        self._loop, self._connections, self._on_events = loop, connections, on_events
+        self._reported: dict[str, Counter[str]] = {name: Counter() for name in connections}
         self._next_ns = 0
 
-    def tell(self, at_ns: int, *, last: bool = False) -> None:
+    def report(self, at_ns: int, *, last: bool = False) -> None:
         """Tell what is new if a second has passed, a peer has hung up, or this is the last call."""
-        hung_up = any(one.refused[HUNG_UP] > self._told[name][HUNG_UP] for name, one in self._connections.items())
+        hung_up = any(one.refused[HUNG_UP] > self._reported[name][HUNG_UP] for name, one in self._connections.items())
         if at_ns < self._next_ns and not hung_up and not last:
             return
         self._next_ns = at_ns + SECOND_NS
         for name, connection in self._connections.items():
             refused = Counter(connection.refused)
-            new = refused - self._told[name]
+            new = refused - self._reported[name]
             if new:
-                self._told[name] = refused
-                self._on_news(self._loop.refused(name, dict(new), at_ns))
+                self._reported[name] = refused
+                self._on_events(self._loop.refused(name, dict(new), at_ns))

@@ -59,9 +59,9 @@ class Engagement:
         self._take_off_m = take_off_m
         self._follower = follower
         self.goal: Vec3 | None = config.mission.waypoints[0] if goto else None
-        self._ordered = False
-        self.engaged = False
-        self.arrived = False
+        self._is_take_off_ordered = False
+        self.has_engaged = False
+        self.has_arrived = False
 
     @property
     def takes_off(self) -> bool:
@@ -75,22 +75,22 @@ class Engagement:
 
     def follow(self, loop: ControlLoop, ticked: Ticked) -> None:
         """Look at the tick that has just run; the first one gives the order to take off."""
-        self.engaged = self.engaged or loop.who_flies is HandoverState.ENGAGED
-        self._look_for_arrival(loop, ticked)
-        loop.course.arrived = self.arrived
-        if self._take_off_m is not None and not self._ordered:
-            self._ordered = loop.order(Command(order=Order.TAKE_OFF, height_m=self._take_off_m))
+        self.has_engaged = self.has_engaged or loop.handover_state is HandoverState.ENGAGED
+        self._check_arrival(loop, ticked)
+        loop.course.arrived = self.has_arrived
+        if self._take_off_m is not None and not self._is_take_off_ordered:
+            self._is_take_off_ordered = loop.order(Command(order=Order.TAKE_OFF, height_m=self._take_off_m))
         if self._follower is not None:
             self._follower(loop, ticked)
 
-    def _look_for_arrival(self, loop: ControlLoop, ticked: Ticked) -> None:
+    def _check_arrival(self, loop: ControlLoop, ticked: Ticked) -> None:
         estimate = ticked.estimate
         if self.goal is None or estimate is None or ticked.decision.mode is not ControlMode.TRACK:
             return
         plant = loop.plant
         where = [estimate.mean[index] for index in plant.position_index]
         goal = [self.goal[AXES.index(axis)] for axis in plant.axes]
-        self.arrived = self.arrived or math.dist(where, goal) <= self._config.mission.accept_m
+        self.has_arrived = self.has_arrived or math.dist(where, goal) <= self._config.mission.accept_m
 
 
 def check_places(config: Config, design: AnyDesign, take_off_m: float | None, goal: Vec3 | None) -> None:

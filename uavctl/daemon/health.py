@@ -92,7 +92,7 @@ class MonitoredFlight(Protocol):
     course: FlightCourse
 
     @property
-    def who_flies(self) -> HandoverState:
+    def handover_state(self) -> HandoverState:
         """State of the hand-over."""
         ...
 
@@ -128,72 +128,72 @@ class HealthMonitor:
         recorder: Callable[[], RecorderHealth],
         tell: Callable[[str], None],
     ) -> None:
-        self._flight, self._identity, self._recorder, self._tell = flight, identity, recorder, tell
+        self._flight, self._identity, self._recorder, self._write_line = flight, identity, recorder, tell
         self._axes = tuple(zip(config.plant.axes, position_index(config.plant), strict=True))
         speeds = config.plant.velocity_index if config.plant.model == "matrices" else [i + 1 for _, i in self._axes]
         self._speed_axes = tuple(zip(config.plant.axes, speeds, strict=True))
         self._ticked: Ticked | None = None  # the last tick
         self._rate_hz = config.source.rate_hz or 1.0 / config.plant.dt_s
-        self._came = 0  # positions, since the start
-        self._came_by: deque[tuple[int, int]] = deque(maxlen=LOSS_PERIODS + 1)  # at_ns, came; once a period
+        self._position_count = 0  # positions, since the start
+        self._count_history: deque[tuple[int, int]] = deque(maxlen=LOSS_PERIODS + 1)  # at_ns, came; once a period
         self._loss: float | None = None
-        self._begun_ns: int | None = None
+        self._start_ns: int | None = None
         self._now_ns = 0
-        self._told_ns = 0
+        self._reported_ns = 0
         self._missed = 0
-        self._worst_ns = 0  # of this second
-        self._worst_before_ns = 0  # of the last one
-        self._recording = "well"  # as last told
+        self._max_lateness_ns = 0  # of this second
+        self._previous_max_lateness_ns = 0  # of the last one
+        self._recording_state = "well"  # as last told
         self._let_go = ""  # the same
         self._inertial = (0, 0)  # data used and all, by the last look of a second
         self._inertial_share: float | None = None
-        self._relayed = (0, 0.0)  # positions by the last look of a second, and how many a second came in it
+        self._relay_rate = (0, 0.0)  # positions by the last look of a second, and how many a second came in it
 
     def after_tick(self, ticked: Ticked, lateness_ns: int) -> None:
         """The control loop has run a tick."""
         self._ticked = ticked
         at_ns = ticked.decision.at_ns
-        if self._begun_ns is None:
-            self._begun_ns = self._told_ns = at_ns
-            self._came_by.append((at_ns, 0))
+        if self._start_ns is None:
+            self._start_ns = self._reported_ns = at_ns
+            self._count_history.append((at_ns, 0))
         self._now_ns = at_ns
-        self._came += ticked.decision.accepted + ticked.decision.rejected
+        self._position_count += ticked.decision.accepted + ticked.decision.rejected
         self._missed += ticked.decision.missed_ticks
-        self._worst_ns = max(self._worst_ns, lateness_ns)
+        self._max_lateness_ns = max(self._max_lateness_ns, lateness_ns)
         if self._flight.let_go and not self._let_go:
             self._let_go = self._flight.let_go
-            self._tell(f"error: the vehicle is let go: {self._let_go}")
-        if at_ns - self._told_ns >= PERIOD_NS:
-            self._told_ns = at_ns
+            self._write_line(f"error: the vehicle is let go: {self._let_go}")
+        if at_ns - self._reported_ns >= PERIOD_NS:
+            self._reported_ns = at_ns
             self._count_losses()
-            self._worst_before_ns, self._worst_ns = self._worst_ns, 0
+            self._previous_max_lateness_ns, self._max_lateness_ns = self._max_lateness_ns, 0
             relay = self._flight.relay
             if relay is not None:
-                self._relayed = relay.sent, float(relay.sent - self._relayed[0])
+                self._relay_rate = relay.sent, float(relay.sent - self._relay_rate[0])
             inertial = self._flight.inertial
             if inertial is not None:
                 used, total = (now - before for now, before in zip(inertial, self._inertial, strict=True))
                 self._inertial, self._inertial_share = inertial, used / total if total else None
-            health = self.look()
-            self._alarm(health.recorder)
-            self._tell(format_health(health))
+            health = self.make_health()
+            self._report_recorder(health.recorder)
+            self._write_line(format_health(health))
 
     def _count_losses(self) -> None:
-        since_ns, before = self._came_by[0]
+        since_ns, before = self._count_history[0]
         expected = self._rate_hz * (self._now_ns - since_ns) * 1e-9
-        self._loss = max(0.0, 1.0 - (self._came - before) / expected)
-        self._came_by.append((self._now_ns, self._came))
+        self._loss = max(0.0, 1.0 - (self._position_count - before) / expected)
+        self._count_history.append((self._now_ns, self._position_count))
 
-    def _alarm(self, recorder: RecorderHealth) -> None:
+    def _report_recorder(self, recorder: RecorderHealth) -> None:
         """Report each change of the recording's health once, in a line of its own."""
         now = "in trouble" if not recorder.ok else "may not go on for long" if recorder.reason else "well"
-        if now == self._recording:
+        if now == self._recording_state:
             return
-        self._recording = now
+        self._recording_state = now
         why = recorder.reason or f"{recorder.dropped} records dropped"
-        self._tell("recording is well again" if now == "well" else f"warning: recording {now}: {why}")
+        self._write_line("recording is well again" if now == "well" else f"warning: recording {now}: {why}")
 
-    def look(self) -> Health:
+    def make_health(self) -> Health:
         """The flight as it is now."""
         flight, recorder, ticked = self._flight, self._recorder(), self._ticked
         decision, estimate, vehicle = (
@@ -205,7 +205,7 @@ class HealthMonitor:
             name=name,
             url=url,
             pid=pid,
-            running_s=0.0 if self._begun_ns is None else (self._now_ns - self._begun_ns) * 1e-9,
+            running_s=0.0 if self._start_ns is None else (self._now_ns - self._start_ns) * 1e-9,
             mode=None if decision is None else decision.mode,
             reason="waiting for the first tick" if decision is None else decision.reason,
             age_s=None if estimate is None else max(0.0, (self._now_ns - estimate.captured_ns) * 1e-9),
@@ -215,25 +215,25 @@ class HealthMonitor:
             target_m=None if decision is None else _along(self._axes, decision.target),
             waypoint=None if decision is None else decision.waypoint,
             loss=self._loss,
-            lateness_us=max(self._worst_ns, self._worst_before_ns) * 1e-3,
+            lateness_us=max(self._max_lateness_ns, self._previous_max_lateness_ns) * 1e-3,
             missed_ticks=self._missed,
             vehicle=None if vehicle is None else _vehicle(vehicle, self._now_ns),
             recorder=recorder,
-            who_flies=flight.who_flies.value,
+            who_flies=flight.handover_state.value,
             ending=flight.course.told,
-            relay=self._relay(),
+            relay=self._make_relay_health(),
             let_go=flight.let_go,
             inertial=self._inertial_share,
         )
 
-    def _relay(self) -> RelayHealth | None:
+    def _make_relay_health(self) -> RelayHealth | None:
         stats = self._flight.relay
         if stats is None:
             return None
         last_s = None if stats.last_ns is None else max(0.0, (self._now_ns - stats.last_ns) * 1e-9)
         return RelayHealth(
             sent=stats.sent,
-            sent_hz=self._relayed[1],
+            sent_hz=self._relay_rate[1],
             kept=stats.kept,
             last_s=last_s,
             alone=stats.alone,
@@ -316,31 +316,31 @@ class Notifier:
             self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
             self._socket.setblocking(False)
         self.watchdog_ns = _watchdog_ns(environ, os.getpid() if pid is None else pid)
-        self._fed_ns: int | None = None
+        self._signalled_ns: int | None = None
 
     def after_tick(self, ticked: Ticked, lateness_ns: int) -> None:
         """The control loop has run a tick: ready with the first one, then signs of life."""
         del lateness_ns
         at_ns = ticked.decision.at_ns
-        if self._fed_ns is None:
-            self._tell("READY=1")
-        elif self.watchdog_ns is None or at_ns - self._fed_ns < self.watchdog_ns // _WATCHDOG_SIGNALS:
+        if self._signalled_ns is None:
+            self._send("READY=1")
+        elif self.watchdog_ns is None or at_ns - self._signalled_ns < self.watchdog_ns // _WATCHDOG_SIGNALS:
             return
-        self._fed_ns = at_ns
-        self._tell("WATCHDOG=1")
+        self._signalled_ns = at_ns
+        self._send("WATCHDOG=1")
 
-    def status(self, text: str) -> None:
+    def send_status(self, text: str) -> None:
         """One line for `systemctl status`."""
-        self._tell("STATUS=" + text.replace("\n", " ")[:_LONGEST])
+        self._send("STATUS=" + text.replace("\n", " ")[:_LONGEST])
 
     def close(self) -> None:
         """Say that the daemon ends, which no watchdog has to see."""
-        self._tell("STOPPING=1")
+        self._send("STOPPING=1")
         if self._socket is not None:
             self._socket.close()
             self._socket = None
 
-    def _tell(self, line: str) -> None:
+    def _send(self, line: str) -> None:
         if self._socket is not None:
             with suppress(OSError):  # full or gone: the manager's own watchdog draws the conclusion
                 self._socket.sendto(line.encode(), self._address)

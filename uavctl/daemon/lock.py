@@ -122,29 +122,29 @@ class VehicleLock:
         self._descriptors, self._now = descriptors, now
         self._first_line = f"{os.getpid()} {url}\n"
         found = [_left_ns(os.pread(one, _LONGEST, 0), now()) for one in descriptors]
-        self._left_ns = max((one for one in found if one is not None), default=None)
+        self._left_flight_ns = max((one for one in found if one is not None), default=None)
         self._write()
 
     @property
-    def left_ns(self) -> int | None:
+    def left_flight_ns(self) -> int | None:
         """Start of the flight that would now be left, time since the machine's start [ns]; None if none would."""
-        return self._left_ns
+        return self._left_flight_ns
 
     @property
-    def leaves(self) -> bool:
+    def is_left_in_flight(self) -> bool:
         """Whether the vehicle would now be left in flight; before anything is noted, whether it was found so."""
-        return self._left_ns is not None
+        return self._left_flight_ns is not None
 
-    def note(self, leaves: bool | None) -> None:
+    def update(self, leaves: bool | None) -> None:
         """Write down whether the vehicle would be left in flight; None changes nothing."""
-        if leaves is None or leaves == self.leaves:
+        if leaves is None or leaves == self.is_left_in_flight:
             return
-        self._left_ns = self._now() if leaves else None
+        self._left_flight_ns = self._now() if leaves else None
         with suppress(OSError):  # no flight ends because a word to the next one does not fit on the disk
             self._write()
 
     def _write(self) -> None:
-        second_line = "" if self._left_ns is None else f"{_FLOWN} {self._left_ns}\n"
+        second_line = "" if self._left_flight_ns is None else f"{_FLOWN} {self._left_flight_ns}\n"
         text = (self._first_line + second_line).encode()
         for descriptor in self._descriptors:
             os.pwrite(descriptor, text, 0)
@@ -188,7 +188,7 @@ def lock_vehicle(url: str, folder: Path | None = None) -> Iterator[VehicleLock]:
             tenure = _make_vehicle_lock(descriptors, url, paths[0])
             yield tenure
         finally:
-            if tenure is None or not tenure.leaves:
+            if tenure is None or not tenure.is_left_in_flight:
                 for path in paths:
                     with suppress(OSError):  # gone with its folder, at the end of a login session
                         path.unlink()

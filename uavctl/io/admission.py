@@ -41,20 +41,20 @@ class AllowList:
 
     def __init__(self, allow: Sequence[str]) -> None:
         self._networks: list[IPv4Network | IPv6Network] = [ip_network(text, strict=False) for text in allow]
-        self._known: dict[str, bool] = {}
+        self._verdicts: dict[str, bool] = {}
 
-    def lets_in(self, host: str) -> bool:
+    def allows(self, host: str) -> bool:
         """Whether a numeric address is listed; a look into a table for one that has been seen."""
         if not self._networks:
             return True
-        verdict = self._known.get(host)
+        verdict = self._verdicts.get(host)
         if verdict is None:
-            if len(self._known) >= MAX_KNOWN:  # forged senders must not fill the memory
-                self._known.clear()
-            verdict = self._known[host] = self._look_up(host)
+            if len(self._verdicts) >= MAX_KNOWN:  # forged senders must not fill the memory
+                self._verdicts.clear()
+            verdict = self._verdicts[host] = self._is_listed(host)
         return verdict
 
-    def _look_up(self, host: str) -> bool:
+    def _is_listed(self, host: str) -> bool:
         address = ip_address(host.partition("%")[0])  # a link-local address has its interface behind a "%"
         if isinstance(address, IPv6Address) and address.ipv4_mapped is not None:
             address = address.ipv4_mapped
@@ -78,7 +78,7 @@ class RateLimit:
     burst: tuple[float, float, float]  # of each, at once
 
     @staticmethod
-    def of(rules: AdmissionRules, times: float, burst: tuple[float, float, float]) -> RateLimit:
+    def from_rules(rules: AdmissionRules, times: float, burst: tuple[float, float, float]) -> RateLimit:
         """Return `times` times what the rules give one sender."""
         return RateLimit(_scale(times, (rules.max_per_s, rules.max_frames_per_s, rules.max_bytes_per_s)), burst)
 
@@ -102,39 +102,39 @@ def _scale(factor: float, those: tuple[float, float, float]) -> tuple[float, flo
 class _TokenBucket:
     """Budget of what a sender may still send now."""
 
-    __slots__ = ("_allowance", "_at_ns", "bytes", "datagrams", "frames")
+    __slots__ = ("_at_ns", "_limit", "bytes", "datagrams", "frames")
 
-    def __init__(self, allowance: RateLimit, now_ns: int) -> None:
-        self._allowance, self._at_ns = allowance, now_ns
-        self.datagrams, self.frames, self.bytes = allowance.burst
+    def __init__(self, limit: RateLimit, now_ns: int) -> None:
+        self._limit, self._at_ns = limit, now_ns
+        self.datagrams, self.frames, self.bytes = limit.burst
 
     def refill(self, now_ns: int) -> None:
         """Earn what the time since the last call gives."""
         seconds, self._at_ns = (now_ns - self._at_ns) * 1e-9, now_ns
-        per_s, burst = self._allowance.per_s, self._allowance.burst
+        per_s, burst = self._limit.per_s, self._limit.burst
         self.datagrams = min(burst[0], self.datagrams + seconds * per_s[0])
         self.frames = min(burst[1], self.frames + seconds * per_s[1])
         self.bytes = min(burst[2], self.bytes + seconds * per_s[2])
 
     @property
-    def spent(self) -> float:
+    def used_share(self) -> float:
         """Share of the burst that is used, of whichever is scarcest; the least for whoever has sent least lately."""
-        burst = self._allowance.burst
+        burst = self._limit.burst
         return 1.0 - min(self.datagrams / burst[0], self.frames / burst[1], self.bytes / burst[2])
 
-    def refusal(self, frames: int, size: int, keep: float = 0.0) -> str | None:
+    def find_refusal(self, frames: int, size: int, keep: float = 0.0) -> str | None:
         """Return why a datagram does not fit; None if it does.
 
         Args:
             keep: share of the burst that has to be left afterwards.
         """
-        burst = self._allowance.burst
+        burst = self._limit.burst
         if self.datagrams - 1.0 < keep * burst[0]:
             return TOO_MANY
         poor = self.frames - frames < keep * burst[1] or self.bytes - size < keep * burst[2]
         return TOO_MUCH if poor else None
 
-    def pay(self, frames: int, size: int) -> None:
+    def consume(self, frames: int, size: int) -> None:
         """Take a datagram."""
         self.datagrams -= 1.0
         self.frames -= frames
@@ -144,29 +144,29 @@ class _TokenBucket:
 class _Sender:
     """One sender's budget, and what it may send before it has sent much."""
 
-    __slots__ = ("budget", "fair")
+    __slots__ = ("bucket", "fair_bucket")
 
-    def __init__(self, allowance: RateLimit, now_ns: int) -> None:
-        self.budget = _TokenBucket(allowance, now_ns)
-        self.fair = _TokenBucket(RateLimit(_scale(FAIR_TIMES, allowance.per_s), allowance.burst), now_ns)
+    def __init__(self, limit: RateLimit, now_ns: int) -> None:
+        self.bucket = _TokenBucket(limit, now_ns)
+        self.fair_bucket = _TokenBucket(RateLimit(_scale(FAIR_TIMES, limit.per_s), limit.burst), now_ns)
 
     def refill(self, now_ns: int) -> None:
         """See `_TokenBucket`."""
-        self.budget.refill(now_ns)
-        self.fair.refill(now_ns)
+        self.bucket.refill(now_ns)
+        self.fair_bucket.refill(now_ns)
 
-    def take(self, frames: int, size: int, joint: _TokenBucket | None) -> str | None:
+    def admit(self, frames: int, size: int, joint: _TokenBucket | None) -> str | None:
         """Take a datagram, or say why not."""
-        refusal = self.budget.refusal(frames, size)
+        refusal = self.bucket.find_refusal(frames, size)
         if joint is not None and refusal is None:
-            little = self.fair.refusal(frames, size) is None
-            refusal = joint.refusal(frames, size, 0.0 if little else RESERVED)
+            little = self.fair_bucket.find_refusal(frames, size) is None
+            refusal = joint.find_refusal(frames, size, 0.0 if little else RESERVED)
             if refusal is None:
-                joint.pay(frames, size)
+                joint.consume(frames, size)
                 if little:
-                    self.fair.pay(frames, size)
+                    self.fair_bucket.consume(frames, size)
         if refusal is None:
-            self.budget.pay(frames, size)
+            self.bucket.consume(frames, size)
         return refusal
 
 
@@ -186,40 +186,42 @@ class RateLimiter:
     def __init__(self, rules: AdmissionRules, refused: Counter[str]) -> None:
         self._refused = refused
         self._rules = rules
-        self._trusted = RateLimit.of(rules, 1.0, TRUSTED_BURST)
-        self._of_vehicle = RateLimit.of(rules, VEHICLE_TIMES, VEHICLE_BURST)
+        self._trusted_limit = RateLimit.from_rules(rules, 1.0, TRUSTED_BURST)
+        self._vehicle_limit = RateLimit.from_rules(rules, VEHICLE_TIMES, VEHICLE_BURST)
         self._vehicle: tuple[Address, _Sender] | None = None
-        self._known: OrderedDict[Address, _Sender] = OrderedDict()  # trusted; who was so last is last
+        self._trusted_senders: OrderedDict[Address, _Sender] = OrderedDict()  # trusted; who was so last is last
         self._strangers: OrderedDict[Address, _Sender] = OrderedDict()  # who was heard last is last
-        self._all_trusted = _TokenBucket(RateLimit.of(rules, ALL_TRUSTED_TIMES, _scale(2.0, TRUSTED_BURST)), 0)
-        self._meet_strangers(FIRST_BURST)
+        self._trusted_bucket = _TokenBucket(
+            RateLimit.from_rules(rules, ALL_TRUSTED_TIMES, _scale(2.0, TRUSTED_BURST)), 0
+        )
+        self._reset_strangers(FIRST_BURST)
 
-    def _meet_strangers(self, burst: tuple[float, float, float]) -> None:
+    def _reset_strangers(self, burst: tuple[float, float, float]) -> None:
         """Give unknown senders budgets with this burst, and twice that together."""
         self._strangers.clear()
-        self._stranger = RateLimit.of(self._rules, 1.0, burst)
-        self._all_strangers = _TokenBucket(RateLimit.of(self._rules, 1.0, _scale(2.0, burst)), 0)
+        self._stranger_limit = RateLimit.from_rules(self._rules, 1.0, burst)
+        self._stranger_bucket = _TokenBucket(RateLimit.from_rules(self._rules, 1.0, _scale(2.0, burst)), 0)
 
-    def _know_somebody(self) -> None:
+    def _limit_strangers(self) -> None:
         """Accept little from strangers from now on, if this is the first sender that is known."""
-        if self._vehicle is None and not self._known:
-            self._meet_strangers(STRANGER_BURST)
+        if self._vehicle is None and not self._trusted_senders:
+            self._reset_strangers(STRANGER_BURST)
 
-    def answer(self, sender: Address, now_ns: int) -> None:
+    def set_vehicle(self, sender: Address, now_ns: int) -> None:
         """Note that a sender is the flown vehicle."""
-        self._know_somebody()
+        self._limit_strangers()
         if self._vehicle is None or self._vehicle[0] != sender:
-            self._vehicle = sender, _Sender(self._of_vehicle, now_ns)
+            self._vehicle = sender, _Sender(self._vehicle_limit, now_ns)
 
-    def trust(self, sender: Address, now_ns: int) -> None:
+    def trust_sender(self, sender: Address, now_ns: int) -> None:
         """Note that the flight needs a sender; the one noted longest ago makes room."""
-        self._know_somebody()
-        known = self._known.pop(sender, None) or _Sender(self._trusted, now_ns)
-        if len(self._known) >= MAX_TRUSTED:
-            self._known.popitem(last=False)
-        self._known[sender] = known
+        self._limit_strangers()
+        known = self._trusted_senders.pop(sender, None) or _Sender(self._trusted_limit, now_ns)
+        if len(self._trusted_senders) >= MAX_TRUSTED:
+            self._trusted_senders.popitem(last=False)
+        self._trusted_senders[sender] = known
 
-    def take(self, senders: Sequence[Address], data: Sequence[bytes], now_ns: int) -> list[bool]:
+    def admit(self, senders: Sequence[Address], data: Sequence[bytes], now_ns: int) -> list[bool]:
         """Return which datagrams of a batch to hand on: of each sender the newest ones that its budget pays.
 
         Args:
@@ -233,30 +235,30 @@ class RateLimiter:
         for sender, indices in queues.items():
             if self._vehicle is not None and sender == self._vehicle[0]:
                 self._vehicle[1].refill(now_ns)
-                self._share([(self._vehicle[1], self._state_last(indices, data))], None, data, taken)
-            elif sender in self._known:
-                trusted.append((self._known[sender], indices))
+                self._admit_in_turn([(self._vehicle[1], self._put_heartbeats_last(indices, data))], None, data, taken)
+            elif sender in self._trusted_senders:
+                trusted.append((self._trusted_senders[sender], indices))
             else:
-                strangers.append((self._of_stranger(sender, now_ns), indices))
-        for group, joint in ((trusted, self._all_trusted), (strangers, self._all_strangers)):
+                strangers.append((self._find_stranger(sender, now_ns), indices))
+        for group, joint in ((trusted, self._trusted_bucket), (strangers, self._stranger_bucket)):
             if group:
                 joint.refill(now_ns)
                 for one, _ in group:
                     one.refill(now_ns)
-                group.sort(key=lambda one: one[0].fair.spent)
-                self._share(group, joint, data, taken)
+                group.sort(key=lambda one: one[0].fair_bucket.used_share)
+                self._admit_in_turn(group, joint, data, taken)
         return taken
 
-    def _of_stranger(self, sender: Address, now_ns: int) -> _Sender:
+    def _find_stranger(self, sender: Address, now_ns: int) -> _Sender:
         stranger = self._strangers.pop(sender, None)
         if stranger is None:
             if len(self._strangers) >= MAX_SENDERS:
                 self._strangers.popitem(last=False)
-            stranger = _Sender(self._stranger, now_ns)
+            stranger = _Sender(self._stranger_limit, now_ns)
         self._strangers[sender] = stranger
         return stranger
 
-    def _share(
+    def _admit_in_turn(
         self,
         group: Iterable[tuple[_Sender, list[int]]],
         joint: _TokenBucket | None,
@@ -272,7 +274,7 @@ class RateLimiter:
                 if index is None:
                     continue
                 others.append((one, newest))
-                refusal = one.take(count_frames(data[index]), len(data[index]), joint)
+                refusal = one.admit(count_frames(data[index]), len(data[index]), joint)
                 if refusal is None:
                     taken[index] = True
                 else:
@@ -280,7 +282,7 @@ class RateLimiter:
             waiting = others
 
     @staticmethod
-    def _state_last(indices: Sequence[int], data: Sequence[bytes]) -> list[int]:
+    def _put_heartbeats_last(indices: Sequence[int], data: Sequence[bytes]) -> list[int]:
         """The newest datagrams that may hold the vehicle's heartbeat behind all others, so that they count first."""
         found: list[int] = []
         for index in reversed(indices):

@@ -40,12 +40,12 @@ class Connection(Protocol):
         ...
 
     @property
-    def unread(self) -> bool:
+    def has_unread(self) -> bool:
         """Whether the last `receive` has left something of the vehicle's behind that had come before it."""
         ...
 
     @property
-    def known(self) -> bool:
+    def has_known_sender(self) -> bool:
         """Whether the last `receive` had something of a sender that the flight needs; True while none is known."""
         ...
 
@@ -57,11 +57,11 @@ class Connection(Protocol):
         """File descriptors to wait for."""
         ...
 
-    def lost(self) -> int:
+    def count_lost(self) -> int:
         """Return how much of the vehicle's data the system dropped, for want of room, before it could be read."""
         ...
 
-    def receive(self, *, everything: bool = False) -> list[tuple[bytes, int]]:
+    def receive(self, *, read_all: bool = False) -> list[tuple[bytes, int]]:
         """Return what has arrived: (data, monotonic time of reading [ns]); empty if nothing has.
 
         Args:
@@ -69,11 +69,11 @@ class Connection(Protocol):
         """
         ...
 
-    def answer(self, index: int) -> None:
+    def select_peer(self, index: int) -> None:
         """Send to the sender of the `index`-th datagram of the last `receive`, where a connection has several peers."""
         ...
 
-    def trust(self, index: int) -> None:
+    def trust_sender(self, index: int) -> None:
         """Keep room for the sender of the `index`-th datagram of the last `receive`: the flight needs what it says."""
         ...
 
@@ -96,18 +96,18 @@ class BaseConnection(ABC):
     def __init__(self, url: str, now: Callable[[], int]) -> None:
         self.url = url
         self.closed = False
-        self.unread = False
-        self.known = True
+        self.has_unread = False
+        self.has_known_sender = True
         self.send_errors = 0
         self.receive_errors = 0
         self.refused: Counter[str] = Counter()
         self._now = now
 
-    def receive(self, *, everything: bool = False) -> list[tuple[bytes, int]]:
+    def receive(self, *, read_all: bool = False) -> list[tuple[bytes, int]]:
         """See `Connection`."""
         arrived: list[tuple[bytes, int]] = []
-        self.unread = False
-        for _ in range(self.backlog_reads if everything else self.max_reads):
+        self.has_unread = False
+        for _ in range(self.backlog_reads if read_all else self.max_reads):
             if self.closed:
                 return arrived
             try:
@@ -121,7 +121,7 @@ class BaseConnection(ABC):
                 continue
             if data is not None:
                 arrived.append((data, self._now()))
-        self.unread = True
+        self.has_unread = True
         return arrived
 
     @abstractmethod
@@ -132,15 +132,15 @@ class BaseConnection(ABC):
         """See `Connection`."""
         return (self.fileno(),)
 
-    def lost(self) -> int:
+    def count_lost(self) -> int:
         """See `Connection`."""
         return 0
 
-    def answer(self, index: int) -> None:
+    def select_peer(self, index: int) -> None:
         """See `Connection`."""
         del index  # there is only one peer
 
-    def trust(self, index: int) -> None:
+    def trust_sender(self, index: int) -> None:
         """See `Connection`."""
         del index
 

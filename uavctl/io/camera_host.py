@@ -44,7 +44,7 @@ class CameraMessageEncoder:
     def __init__(self) -> None:
         self._mav = mavlink.MAVLink(None, srcSystem=CAMERA_SYSTEM_ID, srcComponent=COMPONENT_ID)
 
-    def say(self, told: BodyPose | Echo) -> bytes:
+    def encode(self, told: BodyPose | Echo) -> bytes:
         """ODOMETRY of a sight, in axes forward, right, down; TIMESYNC of an echo, whose token is our time."""
         if isinstance(told, Echo):
             return self._pack(mavlink.MAVLink_timesync_message(told.clock_ns, told.token))
@@ -99,25 +99,25 @@ class CameraHost:
 
     def __init__(self, camera: Camera, pipe: socket.socket, server: tuple[str, int], interface: str) -> None:
         self._camera, self._pipe, self._server, self._interface = camera, pipe, server, interface
-        self._words = CameraMessageEncoder()
-        self._waiting: deque[bytes] = deque()
-        self._lost: Counter[str] = Counter()
-        self._told: Counter[str] = Counter()
-        self._told_s = 0.0
-        self._ready = False
+        self._encoder = CameraMessageEncoder()
+        self._queue: deque[bytes] = deque()
+        self._dropped: Counter[str] = Counter()
+        self._reported_counts: Counter[str] = Counter()
+        self._reported_s = 0.0
+        self._is_ready = False
         self._group: tuple[str, int] | None = None
         self._group_socket: socket.socket | None = None
-        self._stream: bool = getattr(camera, "stream", False)
+        self._is_stream: bool = getattr(camera, "stream", False)
         self._connected_s = time.monotonic()  # of the last attempt
-        self._command: socket.socket | None = self._reach(ANSWER_S)
+        self._server_socket: socket.socket | None = self._connect(ANSWER_S)
         pipe.setblocking(False)
 
-    def _reach(self, patience_s: float) -> socket.socket:
+    def _connect(self, patience_s: float) -> socket.socket:
         """Open the socket to the server."""
-        reached = socket.socket(socket.AF_INET, socket.SOCK_STREAM if self._stream else socket.SOCK_DGRAM)
+        reached = socket.socket(socket.AF_INET, socket.SOCK_STREAM if self._is_stream else socket.SOCK_DGRAM)
         try:
             reached.bind((self._interface, 0))
-            if self._stream:
+            if self._is_stream:
                 reached.settimeout(patience_s)
                 reached.connect(self._server)
                 reached.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -128,19 +128,19 @@ class CameraHost:
         reached.setblocking(False)
         return reached
 
-    def _reach_again(self) -> None:
+    def _reconnect(self) -> None:
         """Connect a lost stream again, if it is time."""
         if time.monotonic() - self._connected_s < _AGAIN_S:
             return
         self._connected_s = time.monotonic()
         with suppress(OSError):
-            self._command = self._reach(_PAUSE_S)
+            self._server_socket = self._connect(_PAUSE_S)
 
-    def _lose(self) -> None:
-        self._lost["connection-lost"] += 1
-        if self._command is not None:
-            self._command.close()
-        self._command = None
+    def _disconnect(self) -> None:
+        self._dropped["connection-lost"] += 1
+        if self._server_socket is not None:
+            self._server_socket.close()
+        self._server_socket = None
 
     def run(self) -> None:
         """Serve until the daemon has gone.
@@ -150,69 +150,69 @@ class CameraHost:
             TimeoutError: it did not answer.
         """
         began_s = time.monotonic()
-        while self._turn():
-            if not self._ready and time.monotonic() - began_s > ANSWER_S:
+        while self._poll():
+            if not self._is_ready and time.monotonic() - began_s > ANSWER_S:
                 raise TimeoutError(f"no {self._camera.awaits} within {ANSWER_S:g} s")
-            self._count()
+            self._report_counts()
 
     def close(self) -> None:
         """Release the sockets to the server."""
-        if self._command is not None:
-            self._command.close()
+        if self._server_socket is not None:
+            self._server_socket.close()
         if self._group_socket is not None:
             self._group_socket.close()
 
-    def _turn(self) -> bool:
+    def _poll(self) -> bool:
         """Wait for something and pass it on; False once the daemon has gone."""
-        if self._command is None:
-            self._reach_again()
+        if self._server_socket is None:
+            self._reconnect()
         for data in self._camera.due(time.monotonic_ns()):
             self._send(data)
         self._follow_group()
-        sources = [one for one in (self._command, self._group_socket) if one is not None]
-        readable, _, _ = select.select([self._pipe, *sources], [self._pipe] if self._waiting else [], [], _PAUSE_S)
+        sources = [one for one in (self._server_socket, self._group_socket) if one is not None]
+        readable, _, _ = select.select([self._pipe, *sources], [self._pipe] if self._queue else [], [], _PAUSE_S)
         for one in sources:
             if one in readable:
-                self._hear(one)
+                self._receive(one)
         self._flush()
-        return self._pipe not in readable or self._ask()
+        return self._pipe not in readable or self._forward_time_requests()
 
     def _send(self, data: bytes) -> None:
-        if self._command is None or not data:
+        if self._server_socket is None or not data:
             return
         try:
-            if self._stream:  # a handful of short words, for which there is room
-                self._command.sendall(data)
+            if self._is_stream:  # a handful of short words, for which there is room
+                self._server_socket.sendall(data)
             else:
-                self._command.sendto(data, self._server)
+                self._server_socket.sendto(data, self._server)
         except OSError:  # no route for now: asked again
-            self._lost["unsent"] += 1
+            self._dropped["unsent"] += 1
 
-    def _hear(self, source: socket.socket) -> None:
+    def _receive(self, source: socket.socket) -> None:
         for _ in range(_READS):
             try:
                 data, sender = source.recvfrom(LARGEST)
             except BlockingIOError:
                 return
             except OSError:  # the server's port is closed
-                if self._stream:
-                    self._lose()
+                if self._is_stream:
+                    self._disconnect()
                     return
                 continue
-            if self._stream and not data:
-                self._lose()
+            if self._is_stream and not data:
+                self._disconnect()
                 return
-            if not self._stream and sender[0] != self._server[0]:
-                self._lost[NOT_SERVER] += 1
+            if not self._is_stream and sender[0] != self._server[0]:
+                self._dropped[NOT_SERVER] += 1
                 continue
             heard = self._camera.receive(data, time.monotonic_ns())
-            if self._camera.ready and not self._ready:  # before any position: the daemon waits for this word
-                self._ready = True
-                self._post(READY)
+            if self._camera.ready and not self._is_ready:  # before any position: the daemon waits for this word
+                self._is_ready = True
+                self._queue_message(READY)
             for told in heard:
-                self._post(self._words.say(told))
+                self._queue_message(self._encoder.encode(told))
 
-    def _ask(self) -> bool:
+    def _forward_time_requests(self) -> bool:
         """Pass on the daemon's questions for the time; False if it has gone."""
         try:
             data = self._pipe.recv(LARGEST)
@@ -224,26 +224,26 @@ class CameraHost:
             self._send(self._camera.ask_time(token))
         return bool(data)
 
-    def _post(self, message: bytes) -> None:
-        if len(self._waiting) >= WAITING:
-            self._waiting.popleft()
-            self._lost[OVERRUN] += 1
-        self._waiting.append(message)
+    def _queue_message(self, message: bytes) -> None:
+        if len(self._queue) >= WAITING:
+            self._queue.popleft()
+            self._dropped[OVERRUN] += 1
+        self._queue.append(message)
         self._flush()
 
     def _flush(self) -> None:
-        while self._waiting:
+        while self._queue:
             try:
-                self._pipe.send(self._waiting[0])
+                self._pipe.send(self._queue[0])
             except OSError:  # full: later. Gone: seen when it is read
                 return
-            self._waiting.popleft()
+            self._queue.popleft()
 
-    def _count(self) -> None:
-        counts = self._camera.dropped + self._lost
-        if counts != self._told and time.monotonic() - self._told_s >= _COUNTS_S:
-            self._told, self._told_s = counts, time.monotonic()
-            self._post(COUNTS + json.dumps(counts).encode())
+    def _report_counts(self) -> None:
+        counts = self._camera.dropped + self._dropped
+        if counts != self._reported_counts and time.monotonic() - self._reported_s >= _COUNTS_S:
+            self._reported_counts, self._reported_s = counts, time.monotonic()
+            self._queue_message(COUNTS + json.dumps(counts).encode())
 
     def _follow_group(self) -> None:
         """Join the group that the server streams to, if it streams to one."""

@@ -49,9 +49,9 @@ class Qualisys:
 
     def __init__(self, body: str, up: Up) -> None:
         self._body, self._up = body, up
-        self._place: int | None = None  # of the body among those of a frame
-        self._rest = bytearray()
-        self._say: list[bytes] = []
+        self._body_index: int | None = None  # of the body among those of a frame
+        self._buffer = bytearray()
+        self._outgoing: list[bytes] = []
         self._heard_ns = 0
         self.ready, self.awaits = False, "answer"
         self.group: tuple[str, int] | None = None
@@ -61,37 +61,37 @@ class Qualisys:
         """See `Camera`; no bytes at all are a connection that begins."""
         self._heard_ns = at_ns
         if not data:
-            self._rest.clear()
-            self._say.clear()
-            self._place = None
+            self._buffer.clear()
+            self._outgoing.clear()
+            self._body_index = None
             return ()
-        self._rest += data
+        self._buffer += data
         found: list[BodyPose | Echo] = []
-        while len(self._rest) >= _HEAD.size:
-            size, kind = _HEAD.unpack_from(self._rest)
+        while len(self._buffer) >= _HEAD.size:
+            size, kind = _HEAD.unpack_from(self._buffer)
             if not _HEAD.size <= size <= LARGEST:  # the stream is out of step: it has to begin anew
                 self.dropped[UNREADABLE] += 1
-                self._rest.clear()
-                self._say.append(_command("Quit"))
+                self._buffer.clear()
+                self._outgoing.append(_command("Quit"))
                 break
-            if len(self._rest) < size:
+            if len(self._buffer) < size:
                 break
-            payload = bytes(self._rest[_HEAD.size : size])
-            del self._rest[:size]
+            payload = bytes(self._buffer[_HEAD.size : size])
+            del self._buffer[:size]
             try:
-                found += self._packet(kind, payload)
+                found += self._handle_packet(kind, payload)
             except _UNREADABLE:
                 self.dropped[UNREADABLE] += 1
         return tuple(found)
 
     def due(self, at_ns: int) -> tuple[bytes, ...]:
         """See `Camera`: what is to be said, and the wish for frames again when none have come for a second."""
-        if self._place is not None and at_ns - self._heard_ns >= _SILENT_NS:
+        if self._body_index is not None and at_ns - self._heard_ns >= _SILENT_NS:
             self._heard_ns = at_ns
             self.dropped[SILENT] += 1
-            self._ask()
-        said = tuple(self._say)
-        self._say.clear()
+            self._request_bodies()
+        said = tuple(self._outgoing)
+        self._outgoing.clear()
         return said
 
     def ask_time(self, token: int) -> bytes:
@@ -99,51 +99,51 @@ class Qualisys:
         del token
         return b""
 
-    def _ask(self) -> None:
-        self._say.append(_command("GetParameters 6D"))
+    def _request_bodies(self) -> None:
+        self._outgoing.append(_command("GetParameters 6D"))
 
-    def _packet(self, kind: int, payload: bytes) -> tuple[BodyPose, ...]:
+    def _handle_packet(self, kind: int, payload: bytes) -> tuple[BodyPose, ...]:
         if kind == COMMAND and payload.startswith(WELCOME):
-            self._say.append(_command(f"Version {VERSION}"))
+            self._outgoing.append(_command(f"Version {VERSION}"))
         elif kind == COMMAND and payload.startswith(b"Version set"):
             self.awaits = "names of rigid bodies, though the server answers,"
-            self._ask()
+            self._request_bodies()
         elif kind == ERROR:
             self._refuse(f"refused a request: {payload.rstrip(bytes(1)).decode(errors='replace')}")
         elif kind == XML:
-            self._describe(payload.rstrip(b"\0"))
-        elif kind == EVENT and payload and payload[0] in CHANGED and self._place is not None:
-            self._ask()
+            self._handle_bodies(payload.rstrip(b"\0"))
+        elif kind == EVENT and payload and payload[0] in CHANGED and self._body_index is not None:
+            self._request_bodies()
         elif kind == NO_DATA:
             self.dropped[NO_MEASUREMENT] += 1
-        elif kind == DATA and self._place is not None:
-            return self._frame(QRTPacket(payload))
+        elif kind == DATA and self._body_index is not None:
+            return self._handle_frame(QRTPacket(payload))
         return ()
 
-    def _describe(self, text: bytes) -> None:
+    def _handle_bodies(self, text: bytes) -> None:
         names = [(name.text or "").strip() for name in ElementTree.fromstring(text).iterfind("./The_6D/Body/Name")]
         if self._body not in names:
-            self._place = None
+            self._body_index = None
             seen = ", ".join(map(repr, sorted(names))) or "none"
             self._refuse(f"has no rigid body {self._body!r}; it has: {seen}. Write one of them behind its address")
             return
-        self._place, self.ready = names.index(self._body), True
-        self._say.append(_command("StreamFrames AllFrames 6D"))
+        self._body_index, self.ready = names.index(self._body), True
+        self._outgoing.append(_command("StreamFrames AllFrames 6D"))
 
-    def _frame(self, frame: QRTPacket) -> tuple[BodyPose, ...]:
+    def _handle_frame(self, frame: QRTPacket) -> tuple[BodyPose, ...]:
         if QRTComponentType.Component6d not in frame.components:
-            return self._drop(NO_MEASUREMENT)
+            return self._count_dropped(NO_MEASUREMENT)
         _, bodies = frame.get_6d()
-        if self._place is None or self._place >= len(bodies):
-            return self._drop(MISSING)
-        place, rotation = bodies[self._place]
+        if self._body_index is None or self._body_index >= len(bodies):
+            return self._count_dropped(MISSING)
+        place, rotation = bodies[self._body_index]
         attitude = _turn(rotation.matrix)
         if attitude is None or not all(map(math.isfinite, place)):
-            return self._drop(UNTRACKED)
+            return self._count_dropped(UNTRACKED)
         position_m: Vec3 = (place.x * 1e-3, place.y * 1e-3, place.z * 1e-3)
         return (BodyPose(frame.timestamp * 1000, *convert_pose_to_frd(position_m, attitude, self._up)),)
 
-    def _drop(self, reason: str) -> tuple[BodyPose, ...]:
+    def _count_dropped(self, reason: str) -> tuple[BodyPose, ...]:
         self.dropped[reason] += 1
         return ()
 

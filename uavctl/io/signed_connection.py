@@ -222,10 +222,10 @@ class TimestampFile:
     def __init__(self, path: Path, now: int, write: Callable[[Path, int], None] = save_timestamp) -> None:
         self._path, self._write = path, write
         floor = load_timestamp(path)
-        self.stamps = SigningTimestamps(floor=floor, own=max(floor, now))
-        self._written = min(self.stamps.own + WRITE_AHEAD, MAX_TIMESTAMP)
+        self.timestamps = SigningTimestamps(floor=floor, newest=max(floor, now))
+        self._written_timestamp = min(self.timestamps.newest + WRITE_AHEAD, MAX_TIMESTAMP)
         try:
-            write(path, self._written)
+            write(path, self._written_timestamp)
         except OSError as error:
             raise KeyFileError(
                 f"stamp {path}: {error.strerror}, so that a restart would take old frames again; see to the folder: it "
@@ -238,8 +238,8 @@ class TimestampFile:
 
     def renew(self) -> None:
         """Write ahead of all that has been seen, if what is written will not last."""
-        seen = self.stamps.own
-        if seen + RENEW_MARGIN <= self._written:
+        seen = self.timestamps.newest
+        if seen + RENEW_MARGIN <= self._written_timestamp:
             return
         ahead = min(seen + WRITE_AHEAD, MAX_TIMESTAMP)
         try:
@@ -247,7 +247,7 @@ class TimestampFile:
         except (OSError, KeyFileError) as error:
             self.failure = str(error)
         else:
-            self._written, self.failure = ahead, None
+            self._written_timestamp, self.failure = ahead, None
 
     def close(self) -> None:
         """Write once more, and end."""
@@ -267,7 +267,7 @@ class SignedConnection:
     """A connection whose frames are signed both ways; implements `uavctl.io.transport.Connection`."""
 
     def __init__(self, inner: Connection, gate: FrameAuthenticator, now: Callable[[], int] = monotonic_ns) -> None:
-        self._inner, self._gate, self._now = inner, gate, now
+        self._inner, self._authenticator, self._now = inner, gate, now
         self._indices: list[int] = []
 
     @property
@@ -293,17 +293,17 @@ class SignedConnection:
     @property
     def refused(self) -> Counter[str]:
         """See `Connection`."""
-        return self._inner.refused + self._gate.refused
+        return self._inner.refused + self._authenticator.refused
 
     @property
-    def unread(self) -> bool:
+    def has_unread(self) -> bool:
         """See `Connection`."""
-        return self._inner.unread
+        return self._inner.has_unread
 
     @property
-    def known(self) -> bool:
+    def has_known_sender(self) -> bool:
         """See `Connection`."""
-        return self._inner.known
+        return self._inner.has_known_sender
 
     def fileno(self) -> int:
         """See `Connection`."""
@@ -313,32 +313,32 @@ class SignedConnection:
         """See `Connection`."""
         return self._inner.filenos()
 
-    def lost(self) -> int:
+    def count_lost(self) -> int:
         """See `Connection`."""
-        return self._inner.lost()
+        return self._inner.count_lost()
 
-    def receive(self, *, everything: bool = False) -> list[tuple[bytes, int]]:
+    def receive(self, *, read_all: bool = False) -> list[tuple[bytes, int]]:
         """See `Connection`; what holds no verified frame is dropped."""
         arrived = []
         self._indices.clear()
-        for index, (data, at_ns) in enumerate(self._inner.receive(everything=everything)):
-            genuine = self._gate.admit(data, at_ns)
+        for index, (data, at_ns) in enumerate(self._inner.receive(read_all=read_all)):
+            genuine = self._authenticator.verify_frames(data, at_ns)
             if genuine:
                 self._indices.append(index)
                 arrived.append((genuine, at_ns))
         return arrived
 
-    def answer(self, index: int) -> None:
+    def select_peer(self, index: int) -> None:
         """See `Connection`."""
-        self._inner.answer(self._indices[index])
+        self._inner.select_peer(self._indices[index])
 
-    def trust(self, index: int) -> None:
+    def trust_sender(self, index: int) -> None:
         """See `Connection`."""
-        self._inner.trust(self._indices[index])
+        self._inner.trust_sender(self._indices[index])
 
     def send(self, data: bytes) -> None:
         """See `Connection`."""
-        self._inner.send(self._gate.seal(data, self._now()))
+        self._inner.send(self._authenticator.sign_frame(data, self._now()))
 
     def close(self) -> None:
         """See `Connection`."""
@@ -415,7 +415,7 @@ def sign_connections(
         for name in security.require:
             if name in connections:
                 link_id = security.link_id + (MOCAP_LINK if name == MOCAP else 0)
-                signing = FrameSigner(key, link_id, keeper.stamps, wall_offset_ns, peers)
+                signing = FrameSigner(key, link_id, keeper.timestamps, wall_offset_ns, peers)
                 stream = connections[name].url.startswith(STREAM_SCHEMES)
                 doors[name] = SignedConnection(connections[name], FrameAuthenticator(signing, stream=stream))
         yield doors

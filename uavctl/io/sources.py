@@ -45,10 +45,10 @@ class CameraProcessConnection(BaseConnection):
     ) -> None:
         super().__init__(url, now)
         self._advice = advice
-        self._over: Counter[str] = Counter()
-        self._budgets, self._sender = RateLimiter(rules, self._over), (url, 0)
-        self._budgets.trust(self._sender, now())
-        self._theirs: Counter[str] = Counter()  # what the process counted
+        self._refused_here: Counter[str] = Counter()
+        self._rate_limiter, self._sender = RateLimiter(rules, self._refused_here), (url, 0)
+        self._rate_limiter.trust_sender(self._sender, now())
+        self._refused_there: Counter[str] = Counter()  # what the process counted
         self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
             command = [sys.executable, "-P", "-m", "uavctl.io.camera_host", str(theirs.fileno()), *arguments]
@@ -89,11 +89,11 @@ class CameraProcessConnection(BaseConnection):
         """See `Connection`."""
         return self._socket.fileno()
 
-    def receive(self, *, everything: bool = False) -> list[tuple[bytes, int]]:
+    def receive(self, *, read_all: bool = False) -> list[tuple[bytes, int]]:
         """See `Connection`; more than the rules allow is dropped, the oldest first."""
-        arrived = super().receive(everything=everything)
-        taken = self._budgets.take([self._sender] * len(arrived), [data for data, _ in arrived], self._now())
-        self.refused = self._theirs + self._over
+        arrived = super().receive(read_all=read_all)
+        taken = self._rate_limiter.admit([self._sender] * len(arrived), [data for data, _ in arrived], self._now())
+        self.refused = self._refused_there + self._refused_here
         return [one for one, fits in zip(arrived, taken, strict=True) if fits]
 
     def send(self, data: bytes) -> None:
@@ -120,7 +120,7 @@ class CameraProcessConnection(BaseConnection):
         elif data[0] in _MAVLINK:
             return data
         elif data[:1] == COUNTS:
-            self._theirs = Counter(json.loads(data[1:]))
+            self._refused_there = Counter(json.loads(data[1:]))
         return None
 
 
@@ -141,7 +141,7 @@ def _open_camera(url: str, now: Callable[[], int], rules: AdmissionRules) -> Con
         raise ConnectionSpecError(
             f"connection {url!r}: host {place.host!r} is unknown ({error}); check the name"
         ) from error
-    if not AllowList(rules.allow).lets_in(address):
+    if not AllowList(rules.allow).allows(address):
         raise ConnectionSpecError(f"connection {url!r}: {address} is not in security.allow; add it there")
     arguments = [system.camera, address, str(place.port), place.body, place.up, place.interface]
     piped = CameraProcessConnection(url, arguments, system.advice, now, rules)

@@ -67,36 +67,36 @@ class _UdpConnection(SocketConnection):
     ) -> None:
         super().__init__(url, family, socket.SOCK_DGRAM, now)
         self._family = family
-        self._allow, self._budgets = AllowList(rules.allow), RateLimiter(rules, self.refused)
+        self._allow_list, self._rate_limiter = AllowList(rules.allow), RateLimiter(rules, self.refused)
         self._senders: list[Address] = []
-        self._join(address)
+        self._bind_or_connect(address)
         self._socket.setblocking(False)
 
     @abstractmethod
-    def _join(self, address: Address) -> None:
+    def _bind_or_connect(self, address: Address) -> None:
         """Bind or connect."""
 
     def _read(self) -> bytes | None:
         data, sender = self._socket.recvfrom(LARGEST)
-        return self._let_in(data, sender)
+        return self._admit_sender(data, sender)
 
-    def _let_in(self, data: bytes, sender: Address) -> bytes | None:
-        if not self._allow.lets_in(sender[0]):
+    def _admit_sender(self, data: bytes, sender: Address) -> bytes | None:
+        if not self._allow_list.allows(sender[0]):
             self.refused[NOT_LISTED] += 1
             return None
         if data:
             self._senders.append(sender)
         return data or None
 
-    def _within_budgets(self, arrived: list[tuple[bytes, int]]) -> list[tuple[bytes, int]]:
+    def _apply_rate_limits(self, arrived: list[tuple[bytes, int]]) -> list[tuple[bytes, int]]:
         """Drop more than the rules allow, the oldest first; `_senders` are those of what is left."""
-        taken = self._budgets.take(self._senders, [data for data, _ in arrived], self._now())
+        taken = self._rate_limiter.admit(self._senders, [data for data, _ in arrived], self._now())
         if all(taken):
             return arrived
         self._senders = [sender for sender, fits in zip(self._senders, taken, strict=True) if fits]
         return [one for one, fits in zip(arrived, taken, strict=True) if fits]
 
-    def lost(self) -> int:
+    def count_lost(self) -> int:
         """See `Connection`."""
         return _count_dropped(self._socket)
 
@@ -111,13 +111,15 @@ class UdpInConnection(_UdpConnection):
     keeps what they send apart from what others do, and a flood fills only the buffer of the others.
     """
 
-    def _join(self, address: Address) -> None:
+    def _bind_or_connect(self, address: Address) -> None:
         self._peer: Address | None = None
-        self._chosen = False
+        self._is_peer_confirmed = False
         self._heard_ns = 0
-        self._own: dict[Address, socket.socket] = {}
+        self._peer_sockets: dict[Address, socket.socket] = {}
         self._trusted_ns: dict[Address, int] = {}
-        self._earlier: list[tuple[bytes, Address, int]] = []  # read from the common socket when an own one was made
+        self._early_datagrams: list[
+            tuple[bytes, Address, int]
+        ] = []  # read from the common socket when an own one was made
         _set_buffer_size(self._socket, COMMON_BUFFER_BYTES)
         self._attempt(
             self._socket.bind, address, "is another program on this port? end it, or take another port or address"
@@ -125,46 +127,46 @@ class UdpInConnection(_UdpConnection):
 
     def filenos(self) -> tuple[int, ...]:
         """See `Connection`."""
-        return (self._socket.fileno(), *(one.fileno() for one in self._own.values()))
+        return (self._socket.fileno(), *(one.fileno() for one in self._peer_sockets.values()))
 
-    def lost(self) -> int:
+    def count_lost(self) -> int:
         """See `Connection`."""
-        own = None if self._peer is None else self._own.get(self._peer)
+        own = None if self._peer is None else self._peer_sockets.get(self._peer)
         return _count_dropped(self._socket if own is None else own)
 
     def close(self) -> None:
         """See `Connection`."""
-        for one in self._own.values():
+        for one in self._peer_sockets.values():
             one.close()
         super().close()
 
-    def receive(self, *, everything: bool = False) -> list[tuple[bytes, int]]:
+    def receive(self, *, read_all: bool = False) -> list[tuple[bytes, int]]:
         """See `Connection`; more than the rules allow is dropped, the oldest first."""
         self._senders = []
         arrived: list[tuple[bytes, int]] = []
-        earlier, self._earlier = self._earlier, []
+        earlier, self._early_datagrams = self._early_datagrams, []
         for data, sender, at_ns in earlier:
-            if self._let_in(data, sender) is not None:
+            if self._admit_sender(data, sender) is not None:
                 arrived.append((data, at_ns))
-        has_own = self._peer in self._own
+        has_own = self._peer in self._peer_sockets
         # Strangers get a handful of looks; whoever shares their socket is found by reading all that it can hold.
-        most = BACKLOG_READS if everything and not has_own else COMMON_READS
-        self.unread = not self._pull(self._socket, most, arrived) and not has_own
+        most = BACKLOG_READS if read_all and not has_own else COMMON_READS
+        self.has_unread = not self._read_socket(self._socket, most, arrived) and not has_own
         common = len(arrived)
-        for sender, own in self._own.items():
-            emptied = self._pull(own, BACKLOG_READS if everything else MAX_READS, arrived)
-            self.unread = self.unread or (sender == self._peer and not emptied)
-        self.known = len(arrived) > common or not self._own
-        arrived = self._within_budgets(arrived)
+        for sender, own in self._peer_sockets.items():
+            emptied = self._read_socket(own, BACKLOG_READS if read_all else MAX_READS, arrived)
+            self.has_unread = self.has_unread or (sender == self._peer and not emptied)
+        self.has_known_sender = len(arrived) > common or not self._peer_sockets
+        arrived = self._apply_rate_limits(arrived)
         for (data, at_ns), sender in zip(arrived, self._senders, strict=True):
-            if sender == self._peer and not self._chosen:
+            if sender == self._peer and not self._is_peer_confirmed:
                 self._heard_ns = at_ns
-            silent = at_ns - self._heard_ns > PEER_SILENCE_NS and not self._chosen
+            silent = at_ns - self._heard_ns > PEER_SILENCE_NS and not self._is_peer_confirmed
             if data[0] in MAGIC and (self._peer is None or silent):
                 self._peer, self._heard_ns = sender, at_ns
         return arrived
 
-    def _pull(self, one: socket.socket, most: int, arrived: list[tuple[bytes, int]]) -> bool:
+    def _read_socket(self, one: socket.socket, most: int, arrived: list[tuple[bytes, int]]) -> bool:
         """Read a socket; whether it is empty now."""
         for _ in range(most):
             try:
@@ -174,48 +176,48 @@ class UdpInConnection(_UdpConnection):
             except OSError:
                 self.receive_errors += 1
                 continue
-            if self._let_in(data, sender) is not None:
+            if self._admit_sender(data, sender) is not None:
                 arrived.append((data, self._now()))
         return False
 
-    def answer(self, index: int) -> None:
+    def select_peer(self, index: int) -> None:
         """See `Connection`; another peer than the one that was told before only when that has fallen silent."""
         sender = self._senders[index]
         now_ns = self._now()
-        if self._chosen and sender != self._peer and now_ns - self._heard_ns <= PEER_SILENCE_NS:
+        if self._is_peer_confirmed and sender != self._peer and now_ns - self._heard_ns <= PEER_SILENCE_NS:
             self.refused[SECOND_ADDRESS] += 1
             return
         # Only the vehicle's own words keep its place: noise, forgeries and replays from an address do not.
-        self._peer, self._chosen, self._heard_ns = sender, True, now_ns
-        self._budgets.answer(sender, now_ns)
-        self._keep(sender, now_ns)
+        self._peer, self._is_peer_confirmed, self._heard_ns = sender, True, now_ns
+        self._rate_limiter.set_vehicle(sender, now_ns)
+        self._open_socket_for(sender, now_ns)
 
-    def trust(self, index: int) -> None:
+    def trust_sender(self, index: int) -> None:
         """See `Connection`."""
         sender, now_ns = self._senders[index], self._now()
-        self._budgets.trust(sender, now_ns)
-        self._keep(sender, now_ns)
+        self._rate_limiter.trust_sender(sender, now_ns)
+        self._open_socket_for(sender, now_ns)
 
-    def _keep(self, sender: Address, now_ns: int) -> None:
+    def _open_socket_for(self, sender: Address, now_ns: int) -> None:
         """Give a sender a socket of its own, if there is room; a sender that has fallen silent makes room."""
         self._trusted_ns[sender] = now_ns
-        if sender in self._own:
+        if sender in self._peer_sockets:
             return
         for one, at_ns in list(self._trusted_ns.items()):
             if now_ns - at_ns > PEER_SILENCE_NS and one != self._peer:
                 del self._trusted_ns[one]
-                if one in self._own:
-                    self._own.pop(one).close()
-        if len(self._own) >= MAX_PEER_SOCKETS and sender != self._peer:
+                if one in self._peer_sockets:
+                    self._peer_sockets.pop(one).close()
+        if len(self._peer_sockets) >= MAX_PEER_SOCKETS and sender != self._peer:
             return
-        own = _open_peer_socket((self._socket, *self._own.values()), self._family, sender)
+        own = _open_peer_socket((self._socket, *self._peer_sockets.values()), self._family, sender)
         if own is None:
             return
-        self._own[sender] = own
+        self._peer_sockets[sender] = own
         # What had come before counts before what the new socket gets.
         for _ in range(BACKLOG_READS):
             try:
-                self._earlier.append((*self._socket.recvfrom(LARGEST), now_ns))
+                self._early_datagrams.append((*self._socket.recvfrom(LARGEST), now_ns))
             except OSError:
                 break
 
@@ -232,19 +234,19 @@ class UdpInConnection(_UdpConnection):
 class UdpOutConnection(_UdpConnection):
     """Connected UDP socket: the system hands on what its one peer sends."""
 
-    def _join(self, address: Address) -> None:
+    def _bind_or_connect(self, address: Address) -> None:
         self._to = address
         _set_buffer_size(self._socket, PEER_BUFFER_BYTES)
         self._attempt(self._socket.connect, address, "check host, port and network")
-        self._budgets.answer(address, self._now())
+        self._rate_limiter.set_vehicle(address, self._now())
 
     def _read(self) -> bytes | None:
-        return self._let_in(self._socket.recv(LARGEST), self._to)
+        return self._admit_sender(self._socket.recv(LARGEST), self._to)
 
-    def receive(self, *, everything: bool = False) -> list[tuple[bytes, int]]:
+    def receive(self, *, read_all: bool = False) -> list[tuple[bytes, int]]:
         """See `Connection`; more than the rules allow is dropped, the oldest first."""
         self._senders = []
-        return self._within_budgets(super().receive(everything=everything))
+        return self._apply_rate_limits(super().receive(read_all=read_all))
 
     def send(self, data: bytes) -> None:
         """See `Connection`; a peer that is not there yet shows as an error."""
@@ -336,8 +338,8 @@ class TcpConnection(SocketConnection):
         super().__init__(url, family, socket.SOCK_STREAM, now)
         self._family, self._address = family, address
         self._pending = _SendBuffer()
-        self._up = True
-        self._tried_ns = 0  # when the last attempt began, or the connection ended
+        self._is_connected = True
+        self._attempt_ns = 0  # when the last attempt began, or the connection ended
         self._heard_ns: int | None = None  # when something came last, or the connection was made again
         self._socket.settimeout(CONNECT_TIMEOUT_S)
         self._attempt(self._socket.connect, address, "is the vehicle or simulator running and listening there?")
@@ -346,48 +348,48 @@ class TcpConnection(SocketConnection):
 
     def filenos(self) -> tuple[int, ...]:
         """See `Connection`; none while there is no connection, which would count as something to read."""
-        return (self._socket.fileno(),) if self._up else ()
+        return (self._socket.fileno(),) if self._is_connected else ()
 
     def _read(self) -> bytes | None:
-        if not self._up:
-            self._call()
+        if not self._is_connected:
+            self._connect()
         try:
             data = self._socket.recv(CHUNK_BYTES)
         except BlockingIOError:
             # A network that went and came back may have forgotten the connection, and neither end is told.
             if self._heard_ns is not None and self._now() - self._heard_ns > PEER_SILENCE_NS:
-                self._hang_up(CONNECTION_SILENT)
+                self._disconnect(CONNECTION_SILENT)
             raise
         except OSError:
-            self._hang_up(HUNG_UP)
+            self._disconnect(HUNG_UP)
             raise
         if not data:
-            self._hang_up(HUNG_UP)
+            self._disconnect(HUNG_UP)
             return None
         self._heard_ns = self._now()
         return data
 
-    def _hang_up(self, why: str) -> None:
+    def _disconnect(self, why: str) -> None:
         with suppress(OSError):  # what still waits in the system for a peer that does not answer is old by then
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _DROP_UNSENT)
         self._socket.close()
-        self._up, self._tried_ns = False, self._now()
+        self._is_connected, self._attempt_ns = False, self._now()
         self._pending = _SendBuffer()  # a frame of which the peer has had the beginning
         self.refused[why] += 1
 
-    def _call(self) -> None:
+    def _connect(self) -> None:
         """Begin an attempt to connect, or go on with it; BlockingIOError while there is no connection."""
-        late = self._now() - self._tried_ns >= RETRY_NS
+        late = self._now() - self._attempt_ns >= RETRY_NS
         if self._socket.fileno() < 0:
             if not late:
                 raise BlockingIOError
-            self._tried_ns, late = self._now(), False
+            self._attempt_ns, late = self._now(), False
             self._socket = socket.socket(self._family, socket.SOCK_STREAM)
             self._socket.setblocking(False)
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         state = self._socket.connect_ex(self._address)
-        self._up = state in (0, errno.EISCONN)
-        if self._up:
+        self._is_connected = state in (0, errno.EISCONN)
+        if self._is_connected:
             self._heard_ns = self._now()
         else:
             if late or state not in (errno.EINPROGRESS, errno.EALREADY):
@@ -412,7 +414,7 @@ class SerialConnection(BaseConnection):
     def __init__(self, url: str, device: str, baud: int, now: Callable[[], int]) -> None:
         super().__init__(url, now)
         self._pending = _SendBuffer()
-        self._full = 0  # times that it was found full
+        self._full_reads = 0  # times that it was found full
         try:
             self._port = serial.Serial(device, baud, timeout=0, write_timeout=0, exclusive=True)
         except (OSError, ValueError) as error:  # SerialException is an OSError
@@ -433,12 +435,12 @@ class SerialConnection(BaseConnection):
         data = self._port.read(CHUNK_BYTES)
         if not data:
             raise BlockingIOError
-        self._full += len(data) >= PORT_BYTES
+        self._full_reads += len(data) >= PORT_BYTES
         return data
 
-    def lost(self) -> int:
+    def count_lost(self) -> int:
         """See `Connection`."""
-        return self._full
+        return self._full_reads
 
     def send(self, data: bytes) -> None:
         """See `Connection`."""

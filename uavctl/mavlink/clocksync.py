@@ -76,24 +76,24 @@ class StampUnitDetector:
 
     def __init__(self) -> None:
         self.unit = StampUnit.MICROSECONDS
-        self._begun: tuple[int, int, Vec3] | None = None  # stamp, arrival, position
+        self._reference: tuple[int, int, Vec3] | None = None  # stamp, arrival, position
 
-    def take(self, stamp: int, position_m: Vec3, at_ns: int) -> StampUnit:
+    def update(self, stamp: int, position_m: Vec3, at_ns: int) -> StampUnit:
         """Take a stamp, and the position that has it; return the unit.
 
         The same stamp with the same position is a repeated message, and says nothing of the unit.
         """
-        if self._begun is None:
-            self._begun = stamp, at_ns, position_m
-        elif at_ns - self._begun[1] >= UNIT_WINDOW_NS:
-            advance, passed_s = stamp - self._begun[0], (at_ns - self._begun[1]) * 1e-9
-            if advance == 0 and position_m != self._begun[2]:
+        if self._reference is None:
+            self._reference = stamp, at_ns, position_m
+        elif at_ns - self._reference[1] >= UNIT_WINDOW_NS:
+            advance, passed_s = stamp - self._reference[0], (at_ns - self._reference[1]) * 1e-9
+            if advance == 0 and position_m != self._reference[2]:
                 self.unit = StampUnit.CONSTANT
             for unit, per_second in _UNITS_PER_SECOND.items():
                 # Whole seconds may be one more or less than have passed.
                 if 0.5 * per_second * passed_s <= advance <= 2.0 * per_second * passed_s:
                     self.unit = unit
-            self._begun = stamp, at_ns, position_m
+            self._reference = stamp, at_ns, position_m
         return self.unit
 
 
@@ -141,44 +141,44 @@ class TimesyncClock:
 
     def __init__(self, lifetime_ns: int) -> None:
         self._lifetime_ns = lifetime_ns
-        self._trips: deque[tuple[int, int, int]] = deque(maxlen=FIT_POINTS)  # (received, offset, round trip)
+        self._answers: deque[tuple[int, int, int]] = deque(maxlen=FIT_POINTS)  # (received, offset, round trip)
         self._round_trips_ns: deque[int] = deque(maxlen=ROUND_TRIP_HISTORY)
-        self._drifts = False  # whether the slope is known
+        self._has_drift = False  # whether the slope is known
         self._slope = 0.0
         self._base_ns = 0
         self._base_at_ns = 0
-        self._heard_ns = 0  # arrival of the last answer that was used
-        self._deviating = 0
+        self._used_ns = 0  # arrival of the last answer that was used
+        self._deviating_count = 0
         self.rejected = 0
-        self.shortest_ns = 0
+        self.shortest_round_trip_ns = 0
 
     def offset_ns(self, at_ns: int) -> int | None:
         """(our time − its time), or None without a usable answer in the last `lifetime_ns`."""
-        if not self._trips or at_ns - self._heard_ns > self._lifetime_ns:
+        if not self._answers or at_ns - self._used_ns > self._lifetime_ns:
             return None
         return self.last_known_ns(at_ns)
 
     def last_known_ns(self, at_ns: int) -> int | None:
         """(our time − its time) by the answers so far, however long ago they came; None before the first."""
-        return self._base_ns + round(self._slope * (at_ns - self._base_at_ns)) if self._trips else None
+        return self._base_ns + round(self._slope * (at_ns - self._base_at_ns)) if self._answers else None
 
     def uncertainty_ns(self, at_ns: int) -> int | None:
         """Largest error of the offset at that time; None before the first answer."""
-        if not self._trips:
+        if not self._answers:
             return None
-        return self.shortest_ns // 2 + round(DRIFT_CHANGE * (at_ns - self._trips[-1][0]))
+        return self.shortest_round_trip_ns // 2 + round(DRIFT_CHANGE * (at_ns - self._answers[-1][0]))
 
     @property
     def drift_ppm(self) -> float | None:
         """Gain of our clock on the peer's [millionths]; None before enough answers."""
-        return self._slope * 1e6 if self._drifts else None
+        return self._slope * 1e6 if self._has_drift else None
 
     @property
     def round_trips_ns(self) -> tuple[int, ...]:
         """The last round trips, rejected ones too, in order."""
         return tuple(self._round_trips_ns)
 
-    def answer(self, sent_ns: int, remote_ns: int, received_ns: int) -> bool:
+    def add_answer(self, sent_ns: int, remote_ns: int, received_ns: int) -> bool:
         """Take one answer.
 
         Args:
@@ -187,11 +187,11 @@ class TimesyncClock:
         Returns:
             Whether it was used; a deviating one, or one that is too slow to say anything, is not.
         """
-        used = self._take(sent_ns, remote_ns, received_ns)
+        used = self._use_answer(sent_ns, remote_ns, received_ns)
         self.rejected += not used
         return used
 
-    def _take(self, sent_ns: int, remote_ns: int, received_ns: int) -> bool:
+    def _use_answer(self, sent_ns: int, remote_ns: int, received_ns: int) -> bool:
         round_trip_ns = received_ns - sent_ns
         if round_trip_ns >= 0:
             self._round_trips_ns.append(round_trip_ns)
@@ -201,38 +201,38 @@ class TimesyncClock:
         measured_ns = sent_ns + half_ns - remote_ns
         known_ns, uncertain_ns = self.last_known_ns(received_ns), self.uncertainty_ns(received_ns)
         if known_ns is not None and abs(measured_ns - known_ns) > max(MAX_DEVIATION_NS, half_ns):
-            self._deviating += 1
-            if self._deviating < RESYNC_AFTER and self.offset_ns(received_ns) is not None:
+            self._deviating_count += 1
+            if self._deviating_count < RESYNC_AFTER and self.offset_ns(received_ns) is not None:
                 return False
-            self._forget()
+            self._reset()
             uncertain_ns = None
-        self._deviating = 0
-        self._heard_ns = received_ns
+        self._deviating_count = 0
+        self._used_ns = received_ns
         if known_ns is not None and uncertain_ns is not None and half_ns > uncertain_ns + ROUND_TRIP_MARGIN_NS // 2:
             within_ns = min(max(known_ns, measured_ns - half_ns), measured_ns + half_ns)
             self._base_ns += within_ns - known_ns
             return True
         # Round trips of other lengths may be off by other amounts, which is no drift: the slope goes on without them.
-        alike = [trip for trip in self._trips if abs(round_trip_ns - trip[2]) <= 2 * ROUND_TRIP_MARGIN_NS]
-        self._trips = deque([*alike, (received_ns, measured_ns, round_trip_ns)], maxlen=FIT_POINTS)
-        self._fit()
+        alike = [trip for trip in self._answers if abs(round_trip_ns - trip[2]) <= 2 * ROUND_TRIP_MARGIN_NS]
+        self._answers = deque([*alike, (received_ns, measured_ns, round_trip_ns)], maxlen=FIT_POINTS)
+        self._fit_line()
         return True
 
-    def _forget(self) -> None:
+    def _reset(self) -> None:
         """Begin again: the peer has another clock now."""
-        self._trips.clear()
-        self._slope, self._drifts = 0.0, False
+        self._answers.clear()
+        self._slope, self._has_drift = 0.0, False
 
-    def _fit(self) -> None:
+    def _fit_line(self) -> None:
         """The line through the last answers, as its slope and its value at the last one."""
-        self.shortest_ns = min(length_ns for _, _, length_ns in self._trips)
-        last_ns = self._trips[-1][0]
-        if len(self._trips) >= MIN_FIT_POINTS and last_ns - self._trips[0][0] >= MIN_FIT_SPAN_NS:
-            pairs = combinations(self._trips, 2)
+        self.shortest_round_trip_ns = min(length_ns for _, _, length_ns in self._answers)
+        last_ns = self._answers[-1][0]
+        if len(self._answers) >= MIN_FIT_POINTS and last_ns - self._answers[0][0] >= MIN_FIT_SPAN_NS:
+            pairs = combinations(self._answers, 2)
             slope = median((o2 - o1) / (t2 - t1) for (t1, o1, _), (t2, o2, _) in pairs if t2 > t1)
-            self._slope, self._drifts = min(max(slope, -MAX_DRIFT), MAX_DRIFT), True
-        first_ns = self._trips[0][1]  # differences stay exact in floating point
-        levels = [offset - first_ns + self._slope * (last_ns - at_ns) for at_ns, offset, _ in self._trips]
+            self._slope, self._has_drift = min(max(slope, -MAX_DRIFT), MAX_DRIFT), True
+        first_ns = self._answers[0][1]  # differences stay exact in floating point
+        levels = [offset - first_ns + self._slope * (last_ns - at_ns) for at_ns, offset, _ in self._answers]
         self._base_ns, self._base_at_ns = first_ns + round(median(levels)), last_ns
 
 
@@ -244,50 +244,54 @@ class ArrivalClock:
     """
 
     def __init__(self) -> None:
-        self._least_ns: float = 0.0
+        self._min_offset_ns: float = 0.0
         self._at_ns: int | None = None  # time of the last stamp
-        self._second: tuple[int, int, int] = (0, 0, 0)  # its begin, least (arrival − stamp) in it, when that was
-        self._before: tuple[int, int] | None = None  # the last two of the second before
-        self._rises: deque[float] = deque(maxlen=FIT_POINTS)
+        self._current_second: tuple[int, int, int] = (
+            0,
+            0,
+            0,
+        )  # its begin, least (arrival − stamp) in it, when that was
+        self._previous_second: tuple[int, int] | None = None  # the last two of the second before
+        self._slopes: deque[float] = deque(maxlen=FIT_POINTS)
         self._slope = 0.0
-        self._ahead = 0  # stamps in a row that this clock cannot have given
+        self._impossible_count = 0  # stamps in a row that this clock cannot have given
 
     def offset_ns(self, at_ns: int) -> int | None:
         """(our time − its time) and the smallest delay; None before the first stamp."""
-        return None if self._at_ns is None else round(self._least_ns + self._slope * (at_ns - self._at_ns))
+        return None if self._at_ns is None else round(self._min_offset_ns + self._slope * (at_ns - self._at_ns))
 
-    def delay_ns(self, stamp_ns: int, at_ns: int) -> int:
+    def measure_delay_ns(self, stamp_ns: int, at_ns: int) -> int:
         """Take a stamp; return by how much it came later than the quickest [ns]."""
         behind_ns = at_ns - stamp_ns
-        if self._at_ns is None or self._ahead >= RESYNC_AFTER:
-            self._before, self._slope, self._ahead = None, 0.0, 0
-            self._rises.clear()
-            self._second, self._least_ns = (at_ns, behind_ns, at_ns), behind_ns
-        elif behind_ns < self._least_ns - MAX_CLOCK_STEP_NS:
-            self._ahead += 1
+        if self._at_ns is None or self._impossible_count >= RESYNC_AFTER:
+            self._previous_second, self._slope, self._impossible_count = None, 0.0, 0
+            self._slopes.clear()
+            self._current_second, self._min_offset_ns = (at_ns, behind_ns, at_ns), behind_ns
+        elif behind_ns < self._min_offset_ns - MAX_CLOCK_STEP_NS:
+            self._impossible_count += 1
             return 0
         else:
-            self._ahead = 0
-            begun_ns, least_ns, _ = self._second
+            self._impossible_count = 0
+            begun_ns, least_ns, _ = self._current_second
             if at_ns - begun_ns >= SECOND_NS:
-                self._begin_second(behind_ns, at_ns)
+                self._start_second(behind_ns, at_ns)
             elif behind_ns < least_ns:
-                self._second = begun_ns, behind_ns, at_ns
+                self._current_second = begun_ns, behind_ns, at_ns
             since_ns = at_ns - self._at_ns
-            self._least_ns = min(behind_ns, self._least_ns + (self._slope + DRIFT_CHANGE) * since_ns)
+            self._min_offset_ns = min(behind_ns, self._min_offset_ns + (self._slope + DRIFT_CHANGE) * since_ns)
         self._at_ns = at_ns
-        return round(behind_ns - self._least_ns)
+        return round(behind_ns - self._min_offset_ns)
 
-    def _begin_second(self, behind_ns: int, at_ns: int) -> None:
+    def _start_second(self, behind_ns: int, at_ns: int) -> None:
         """Learn the drift from the second that is over."""
-        _, least_ns, least_at_ns = self._second
-        if self._before is not None:
-            rise = (least_ns - self._before[0]) / (least_at_ns - self._before[1])
-            self._rises.append(min(max(rise, -MAX_DRIFT), MAX_DRIFT))
-            self._slope = median_low(self._rises)
-            if len(self._rises) == 1:  # the least of the first seconds did not know the drift
-                self._least_ns = least_ns + self._slope * (at_ns - least_at_ns)
-        self._before, self._second = (least_ns, least_at_ns), (at_ns, behind_ns, at_ns)
+        _, least_ns, least_at_ns = self._current_second
+        if self._previous_second is not None:
+            rise = (least_ns - self._previous_second[0]) / (least_at_ns - self._previous_second[1])
+            self._slopes.append(min(max(rise, -MAX_DRIFT), MAX_DRIFT))
+            self._slope = median_low(self._slopes)
+            if len(self._slopes) == 1:  # the least of the first seconds did not know the drift
+                self._min_offset_ns = least_ns + self._slope * (at_ns - least_at_ns)
+        self._previous_second, self._current_second = (least_ns, least_at_ns), (at_ns, behind_ns, at_ns)
 
 
 class ClockSync:
@@ -302,16 +306,18 @@ class ClockSync:
         self._latency_ns = latency_ns
         self._future_tolerance_ns = future_tolerance_ns
         self._minimum = SlidingMinimum(window_ns)
-        self._shortest = SlidingMinimum(window_ns)  # delay by the offset from round trips
+        self._min_delay = SlidingMinimum(window_ns)  # delay by the offset from round trips
         self._newest_ns = 0
-        self._count = 0
+        self._stamp_count = 0
         self._stamps: deque[int] = deque(maxlen=STAMP_HISTORY)
-        self._leaps: deque[int] = deque(maxlen=RESYNC_AFTER)
+        self._new_delays_ns: deque[int] = deque(maxlen=RESYNC_AFTER)
         self.resyncs = 0
         self.offset_ns: int | None = None
         self.source = ClockSource.NONE
 
-    def captured_ns(self, stamp_ns: int | None, received_ns: int, offset_ns: int | None = None) -> int | StampRefusal:
+    def estimate_capture_ns(
+        self, stamp_ns: int | None, received_ns: int, offset_ns: int | None = None
+    ) -> int | StampRefusal:
         """Time of capture in our clock.
 
         Args:
@@ -324,11 +330,11 @@ class ClockSync:
         """
         if stamp_ns is None:
             return received_ns - self._latency_ns
-        refusal = self._judge(stamp_ns, received_ns)
+        refusal = self._check_stamp(stamp_ns, received_ns)
         if refusal is not None:
             return refusal
-        self._count += 1
-        self._newest_ns = stamp_ns if self._count == 1 else max(self._newest_ns, stamp_ns)
+        self._stamp_count += 1
+        self._newest_ns = stamp_ns if self._stamp_count == 1 else max(self._newest_ns, stamp_ns)
         self._stamps.append(stamp_ns)
         minimum_ns = self._minimum.push(received_ns, received_ns - stamp_ns)
         if offset_ns is not None and self._is_plausible(offset_ns, minimum_ns, stamp_ns, received_ns):
@@ -343,17 +349,17 @@ class ClockSync:
         The minimum of a clock that runs slow is that of a while ago, and too small for now: so each delay is also
         judged by the offset of its own time.
         """
-        shortest_ns = self._shortest.push(received_ns, received_ns - stamp_ns - offset_ns)
+        shortest_ns = self._min_delay.push(received_ns, received_ns - stamp_ns - offset_ns)
         least_ns = -self._future_tolerance_ns
         return any(least_ns <= delay_ns <= MAX_CLOCK_STEP_NS for delay_ns in (minimum_ns - offset_ns, shortest_ns))
 
-    def unwrap(self, stamp: int, modulus: int, unit_ns: int) -> int:
+    def unwrap_ns(self, stamp: int, modulus: int, unit_ns: int) -> int:
         """Nanoseconds of a counter that wraps, as the value nearest to the newest stamp."""
         half = modulus // 2
-        newest = self._newest_ns // unit_ns if self._count else stamp
+        newest = self._newest_ns // unit_ns if self._stamp_count else stamp
         return (newest + (stamp - newest + half) % modulus - half) * unit_ns
 
-    def _judge(self, stamp_ns: int, received_ns: int) -> StampRefusal | None:
+    def _check_stamp(self, stamp_ns: int, received_ns: int) -> StampRefusal | None:
         """Refuse stamps that the clock so far cannot have given, until several in a row agree on a new clock."""
         minimum_ns = self._minimum.value
         if minimum_ns is None:
@@ -361,25 +367,28 @@ class ClockSync:
         if stamp_ns in self._stamps:
             return StampRefusal.DUPLICATE
         delay_ns = received_ns - stamp_ns
-        ahead_ns = self._future_tolerance_ns if self._count >= MIN_SAMPLES else MAX_CLOCK_STEP_NS
+        ahead_ns = self._future_tolerance_ns if self._stamp_count >= MIN_SAMPLES else MAX_CLOCK_STEP_NS
         if minimum_ns - delay_ns > ahead_ns:
             refusal = StampRefusal.FUTURE
         elif self._newest_ns - stamp_ns > MAX_CLOCK_STEP_NS:
             refusal = StampRefusal.LEAP
         else:
-            self._leaps.clear()
+            self._new_delays_ns.clear()
             return None
-        self._leaps.append(delay_ns)
-        if len(self._leaps) < RESYNC_AFTER or max(self._leaps) - min(self._leaps) > MAX_DELAY_SPREAD_NS:
+        self._new_delays_ns.append(delay_ns)
+        if (
+            len(self._new_delays_ns) < RESYNC_AFTER
+            or max(self._new_delays_ns) - min(self._new_delays_ns) > MAX_DELAY_SPREAD_NS
+        ):
             return refusal
-        self._restart()
+        self._reset()
         return None
 
-    def _restart(self) -> None:
+    def _reset(self) -> None:
         """Begin anew: the source has another clock now."""
         self._minimum.clear()
-        self._shortest.clear()
+        self._min_delay.clear()
         self._stamps.clear()
-        self._leaps.clear()
-        self._count = 0
+        self._new_delays_ns.clear()
+        self._stamp_count = 0
         self.resyncs += 1

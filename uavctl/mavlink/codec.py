@@ -187,7 +187,7 @@ class StreamDecoder:
         """Take the next bytes; what they begin and do not end waits for the next chunk."""
         data = self._rest + chunk
         found = scan(data, final=False, in_step=self._in_step)
-        self._rest, self._in_step = data[found.consumed :], found.in_step
+        self._rest, self._in_step = data[found.consumed :], found.is_aligned
         return decode_scan(found)
 
 
@@ -200,9 +200,9 @@ def decode_scan(found: Scan) -> DecodedMessages:
             continue
         layout, reader = understood
         try:
-            message = reader(layout.read(frame.data))
+            message = reader(layout.unpack(frame.data))
         except _UnusableError as refused:
-            found.skip(str(refused))
+            found.count_skip(str(refused))
         else:
             if message is not None:
                 messages.append(message)
@@ -332,13 +332,13 @@ def _sys_status(raw: Fields) -> Battery:
         system=raw.src_system,
         component=raw.src_component,
         voltage_v=raw.voltage_battery / 1000 if known else None,
-        radio=bool(works & mavlink.MAV_SYS_STATUS_SENSOR_RC_RECEIVER),
-        fenced=not beyond & mavlink.MAV_SYS_STATUS_GEOFENCE,
+        has_radio=bool(works & mavlink.MAV_SYS_STATUS_SENSOR_RC_RECEIVER),
+        is_within_fence=not beyond & mavlink.MAV_SYS_STATUS_GEOFENCE,
     )
 
 
 def _fence(raw: Fields) -> FenceBreach:
-    return FenceBreach(system=raw.src_system, component=raw.src_component, breached=raw.breach_status != 0)
+    return FenceBreach(system=raw.src_system, component=raw.src_component, is_breached=raw.breach_status != 0)
 
 
 _NO_CHANNEL_US = 0xFFFF
@@ -404,9 +404,9 @@ def _text(raw: Fields) -> Text:
         component=raw.src_component,
         severity=raw.severity,
         text=shown,
-        number=raw.id,
+        text_id=raw.id,
         chunk=raw.chunk_seq,
-        more=more,
+        has_more=more,
     )
 
 
@@ -479,9 +479,9 @@ class Encoder:
 
     def __init__(self, system_id: int, component_id: int) -> None:
         self._address = (system_id, component_id)
-        self._number = 0
+        self._sequence = 0
 
-    def heartbeat(self) -> bytes:
+    def encode_heartbeat(self) -> bytes:
         """HEARTBEAT of an onboard controller."""
         return self._pack(
             _HEARTBEAT,
@@ -493,7 +493,7 @@ class Encoder:
             3,
         )
 
-    def timesync(self, tc1_ns: int, ts1_ns: int) -> bytes:
+    def encode_timesync(self, tc1_ns: int, ts1_ns: int) -> bytes:
         """TIMESYNC: request with tc1 = 0, answer with our time in tc1 and the request's ts1.
 
         Raises:
@@ -503,7 +503,7 @@ class Encoder:
             raise UnsendableError(f"TIMESYNC of {tc1_ns}, {ts1_ns}: not signed 64-bit numbers")
         return self._pack(_TIMESYNC, tc1_ns, ts1_ns)
 
-    def setpoint(self, setpoint: Setpoint, target_system: int, target_component: int) -> bytes:
+    def encode_setpoint(self, setpoint: Setpoint, target_system: int, target_component: int) -> bytes:
         """SET_POSITION_TARGET_LOCAL_NED with the acceleration, and the yaw if there is one.
 
         Raises:
@@ -529,41 +529,45 @@ class Encoder:
             0.0,
         )
 
-    def command(self, command: int, parameters: Sequence[float], target_system: int, target_component: int) -> bytes:
+    def encode_command(
+        self, command: int, parameters: Sequence[float], target_system: int, target_component: int
+    ) -> bytes:
         """COMMAND_LONG; parameters that are not given are 0."""
         seven = (*parameters, *(0.0,) * (7 - len(parameters)))
         return self._pack(_COMMAND_LONG, target_system, target_component, command, 0, *seven)
 
-    def origin(self, place_deg_m: Vec3, target_system: int) -> bytes:
+    def encode_global_origin(self, place_deg_m: Vec3, target_system: int) -> bytes:
         """SET_GPS_GLOBAL_ORIGIN: latitude and longitude [deg], altitude above the sea [m] of local zero."""
         latitude, longitude, altitude = place_deg_m
         return self._pack(
             _SET_GPS_GLOBAL_ORIGIN, target_system, round(latitude * 1e7), round(longitude * 1e7), round(altitude * 1e3)
         )
 
-    def request_parameter(self, name: str, target_system: int, target_component: int) -> bytes:
+    def encode_parameter_request(self, name: str, target_system: int, target_component: int) -> bytes:
         """PARAM_REQUEST_READ by name."""
         return self._pack(_PARAM_REQUEST_READ, target_system, target_component, name.encode(), -1)
 
-    def request_parameters(self, index: int, target_system: int, target_component: int) -> bytes:
+    def encode_parameter_list_request(self, index: int, target_system: int, target_component: int) -> bytes:
         """PARAM_REQUEST_READ by index, or with -1 PARAM_REQUEST_LIST."""
         if index < 0:
             return self._pack(_PARAM_REQUEST_LIST, target_system, target_component)
         return self._pack(_PARAM_REQUEST_READ, target_system, target_component, b"", index)
 
-    def request_interval(self, message_id: int, interval_us: int, target_system: int, target_component: int) -> bytes:
+    def encode_interval_request(
+        self, message_id: int, interval_us: int, target_system: int, target_component: int
+    ) -> bytes:
         """COMMAND_LONG MAV_CMD_SET_MESSAGE_INTERVAL: send this message so often."""
         wanted = (float(message_id), float(interval_us), *(0.0,) * 5)
         return self._pack(
             _COMMAND_LONG, target_system, target_component, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 0, *wanted
         )
 
-    def request_message(self, message_id: int, target_system: int, target_component: int) -> bytes:
+    def encode_message_request(self, message_id: int, target_system: int, target_component: int) -> bytes:
         """COMMAND_LONG MAV_CMD_REQUEST_MESSAGE: send this message once."""
         wanted = (float(message_id), *(0.0,) * 6)
         return self._pack(_COMMAND_LONG, target_system, target_component, mavlink.MAV_CMD_REQUEST_MESSAGE, 0, *wanted)
 
-    def external_position(self, pose: Pose) -> bytes:
+    def encode_external_position(self, pose: Pose) -> bytes:
         """VISION_POSITION_ESTIMATE or ODOMETRY in local NED; covariances unknown.
 
         Raises:
@@ -592,6 +596,6 @@ class Encoder:
         )
 
     def _pack(self, layout: MessageLayout, *fields: Any) -> bytes:
-        data = layout.frame(self._address, self._number, *fields)
-        self._number = (self._number + 1) % 256
+        data = layout.pack(self._address, self._sequence, *fields)
+        self._sequence = (self._sequence + 1) % 256
         return data

@@ -95,37 +95,37 @@ class StreamRequests:
     """
 
     def __init__(self, *, inertial: bool = False, channels: bool = True) -> None:
-        self._inertial = inertial
+        self._wants_inertial = inertial
         self._rates_hz = {number: hz for number, hz in RATES_HZ.items() if channels or number != RC_CHANNELS}
-        self._feels = False  # inertial data have come since they were asked for
-        self._seen: set[int] = set()
+        self._has_inertial = False  # inertial data have come since they were asked for
+        self._received: set[int] = set()
         self._next_ns: int | None = None
         self._tries = 0
-        self._felt_next_ns = 0
-        self._felt_tries = 0
+        self._inertial_next_ns = 0
+        self._inertial_tries = 0
 
-    def saw(self, message: Message) -> None:
+    def handle_message(self, message: Message) -> None:
         """Take a message of the vehicle."""
         match message:
             case Position(local_ned=True):
-                self._seen.add(LOCAL_POSITION_NED)
+                self._received.add(LOCAL_POSITION_NED)
             case Attitude(quaternion=False):
-                self._seen.add(ATTITUDE)
+                self._received.add(ATTITUDE)
             case Landed():
-                self._seen.add(EXTENDED_SYS_STATE)
+                self._received.add(EXTENDED_SYS_STATE)
             case Battery():
-                self._seen.add(SYS_STATUS)
+                self._received.add(SYS_STATUS)
             case RadioChannels() if self._tries:  # as often as is asked for: it shows a pilot's hand
-                self._seen.add(RC_CHANNELS)
+                self._received.add(RC_CHANNELS)
             case Inertial():
-                self._feels = self._felt_tries > 0
+                self._has_inertial = self._inertial_tries > 0
 
     def restart(self) -> None:
         """Ask anew: the vehicle has restarted and may have forgotten the requests."""
-        self._seen.clear()
-        self._feels = False
+        self._received.clear()
+        self._has_inertial = False
         self._next_ns, self._tries = None, 0
-        self._felt_next_ns, self._felt_tries = 0, 0
+        self._inertial_next_ns, self._inertial_tries = 0, 0
 
     def due(self, at_ns: int, autopilot: str = "") -> tuple[tuple[int, float], ...]:
         """Return (message id, rate [1/s]) of what is to be asked for now; call it once a vehicle is heard."""
@@ -135,13 +135,13 @@ class StreamRequests:
         if at_ns >= self._next_ns and self._tries < MAX_TRIES:
             self._next_ns = at_ns + RETRY_NS
             self._tries += 1
-            wanted = {number: rate for number, rate in self._rates_hz.items() if number not in self._seen}
+            wanted = {number: rate for number, rate in self._rates_hz.items() if number not in self._received}
         # Not waited for: but for a PX4 on an onboard link no vehicle sends them so often, and a flight may have begun.
-        profile = PROFILES.get(autopilot) if self._inertial and not self._feels else None
-        kinds = () if profile is None else profile.inertial
-        if kinds and at_ns >= self._felt_next_ns and self._felt_tries < MAX_TRIES:
-            self._felt_next_ns = at_ns + RETRY_NS
-            self._felt_tries += 1
+        profile = PROFILES.get(autopilot) if self._wants_inertial and not self._has_inertial else None
+        kinds = () if profile is None else profile.inertial_messages
+        if kinds and at_ns >= self._inertial_next_ns and self._inertial_tries < MAX_TRIES:
+            self._inertial_next_ns = at_ns + RETRY_NS
+            self._inertial_tries += 1
             wanted.update(dict.fromkeys(kinds, INERTIAL_HZ))
         return tuple(wanted.items())
 
@@ -151,42 +151,42 @@ class ParameterDownload:
 
     def __init__(self) -> None:
         self._missing: set[int] | None = None  # indices not told yet; None before the vehicle says how many it has
-        self._news = False  # one was told since the last look
+        self._has_new_value = False  # one was told since the last look
         self._next_ns = 0
-        self._lists = self._rounds = 0
-        self._round: list[int] = []  # indices of this round that are still to be asked for
-        self._over = False
+        self._list_requests = self._read_rounds = 0
+        self._round_indices: list[int] = []  # indices of this round that are still to be asked for
+        self._is_finished = False
 
-    def saw(self, message: Message) -> None:
+    def handle_message(self, message: Message) -> None:
         """Take a message of the vehicle."""
         if isinstance(message, ParamValue) and message.index < message.count <= MAX_PARAMETERS:
             if self._missing is None:
                 self._missing = set(range(message.count))
             self._missing.discard(message.index)
-            self._news = True
+            self._has_new_value = True
 
     def due(self, at_ns: int, *, armed: bool) -> tuple[int, ...]:
         """Return the indices to ask for now, -1 for the whole list; nothing any more once the vehicle was armed."""
-        self._over = self._over or armed or self._missing == set()
-        if self._over:
+        self._is_finished = self._is_finished or armed or self._missing == set()
+        if self._is_finished:
             return ()
-        if self._news and not self._rounds:  # the list is on its way
-            self._news, self._next_ns = False, at_ns + LIST_END_NS
+        if self._has_new_value and not self._read_rounds:  # the list is on its way
+            self._has_new_value, self._next_ns = False, at_ns + LIST_END_NS
         if at_ns < self._next_ns:
             return ()
         if self._missing is None:
-            self._lists += 1
+            self._list_requests += 1
             self._next_ns = at_ns + RETRY_NS
-            self._over = self._lists > MAX_TRIES
-            return () if self._over else (-1,)
+            self._is_finished = self._list_requests > MAX_TRIES
+            return () if self._is_finished else (-1,)
         self._next_ns = at_ns + BATCH_NS
-        if not self._round:
-            self._rounds += 1
-            self._over = self._rounds > MAX_READ_ROUNDS
-            self._round = [] if self._over else sorted(self._missing, reverse=True)
-        asked = self._round[-READS_PER_BATCH:][::-1]
-        del self._round[-READS_PER_BATCH:]
-        if not self._round:  # the last answers of a round are waited for
+        if not self._round_indices:
+            self._read_rounds += 1
+            self._is_finished = self._read_rounds > MAX_READ_ROUNDS
+            self._round_indices = [] if self._is_finished else sorted(self._missing, reverse=True)
+        asked = self._round_indices[-READS_PER_BATCH:][::-1]
+        del self._round_indices[-READS_PER_BATCH:]
+        if not self._round_indices:  # the last answers of a round are waited for
             self._next_ns = at_ns + LIST_END_NS
         return tuple(index for index in asked if index in self._missing)
 
@@ -198,29 +198,29 @@ class GlobalOriginSetup:
     """
 
     def __init__(self) -> None:
-        self._external = False
-        self._known = False
+        self._has_external_source = False
+        self._is_origin_known = False
         self._next_ns = 0
         self._tries = 0
 
-    def saw(self, message: Message) -> None:
+    def handle_message(self, message: Message) -> None:
         """Take a message of the vehicle."""
         match message:
             case GlobalOrigin():
-                self._known = True
+                self._is_origin_known = True
             case ParamValue(name=name, cast=cast) if name == SOURCE_PARAMETER:
-                self._external = cast == EXTERNAL_SOURCE
+                self._has_external_source = cast == EXTERNAL_SOURCE
 
     def due(self, at_ns: int) -> tuple[bool, bool]:
         """Whether to ask now (for the parameter and the origin), and whether to tell the origin.
 
         The place is sent from the second time on: by then a vehicle that has an origin has answered with it.
         """
-        if self._known or at_ns < self._next_ns or self._tries >= MAX_ORIGIN_TRIES:
+        if self._is_origin_known or at_ns < self._next_ns or self._tries >= MAX_ORIGIN_TRIES:
             return False, False
         self._next_ns = at_ns + SECOND_NS
         self._tries += 1
-        return True, self._external and self._tries > 1
+        return True, self._has_external_source and self._tries > 1
 
 
 # One connection's MAVLink state, without input or output of its own: bytes in, events out, and back.
@@ -259,8 +259,8 @@ class ReceiveResult(NamedTuple):
     """Content of one datagram, and the origin of the newest sample by then, which may be of a datagram before."""
 
     items: tuple[Item, ...]
-    answers: tuple[bytes, ...]  # to requests for our time, to be sent at once: a TIMESYNC that waits measures the wait
-    settled: bool  # whether the newest sample is of a source that has spoken for a while
+    replies: tuple[bytes, ...]  # to requests for our time, to be sent at once: a TIMESYNC that waits measures the wait
+    is_source_settled: bool  # whether the newest sample is of a source that has spoken for a while
     attitude: Quaternion | None  # of the body in it: body axes forward, right, down to NED (w, x, y, z)
     clock_source: ClockSource  # of its capture time
 
@@ -289,134 +289,138 @@ class MavlinkConnection:
         clock: ClockConfig,
         source: SourceConfig,
         estimator: EstimatorConfig,
-        listen: Callable[[Message, int], None] | None = None,
+        on_message: Callable[[Message, int], None] | None = None,
         vehicle_time: bool = False,
     ) -> None:
-        self._name, self._roles, self._gives_vehicle_time = name, roles, vehicle_time
-        self._own = (daemon.system_id, daemon.component_id)
+        self._name, self._roles, self._uses_vehicle_time = name, roles, vehicle_time
+        self._own_address = (daemon.system_id, daemon.component_id)
         url = daemon.vehicle if VEHICLE in roles else daemon.mocap
         self._stream = StreamDecoder() if url.startswith(STREAM_SCHEMES) else None
-        self._encoder = Encoder(*self._own)
-        self._intake = PositionDecoder(frame, clock, source, estimator, self._count)
+        self._encoder = Encoder(*self._own_address)
+        self._positions = PositionDecoder(frame, clock, source, estimator, self._count_bad)
         feels = estimator.inertial_std_mps2 > 0.0
         self._vehicle = VehicleMonitor(
-            self._count,
-            self._own,
+            self._count_bad,
+            self._own_address,
             daemon.vehicle_system_id,
             daemon.vehicle_component_id,
             inertial=feels,
             channels=daemon.radio_channels,
         )
-        self._streams, self._globe, self._texts = (
+        self._streams, self._origin_setup, self._text_assembler = (
             StreamRequests(inertial=feels, channels=daemon.radio_channels),
             GlobalOriginSetup(),
             StatusTextAssembler(),
         )
-        self._lists, self._parameters = daemon.parameters, ParameterDownload()
+        self._wants_parameters, self._parameters = daemon.parameters, ParameterDownload()
         self._bad: Counter[str] = Counter()
-        self._untold: Counter[str] = Counter()
-        self._told_ns: int | None = None
-        self._slow = 0  # answers to TIMESYNC that were not used, and not told yet
-        self._slow_told_ns: int | None = None
-        self._resyncs_told = 0
-        self._low_share_told = False
+        self._unreported: Counter[str] = Counter()
+        self._reported_ns: int | None = None
+        self._slow_count = 0  # answers to TIMESYNC that were not used, and not told yet
+        self._slow_reported_ns: int | None = None
+        self._reported_resyncs = 0
+        self._is_low_share_reported = False
         # A vehicle that sends its position, but no heartbeat: its address, since when, and whether that was reported
-        self._mute: tuple[int, int] | None = None
-        self._mute_since_ns: int | None = None
-        self._mute_told = False
-        self._units_told: set[tuple[int, int, StampUnit]] = set()
+        self._no_heartbeat_address: tuple[int, int] | None = None
+        self._no_heartbeat_since_ns: int | None = None
+        self._is_no_heartbeat_reported = False
+        self._reported_units: set[tuple[int, int, StampUnit]] = set()
         self._datagrams = self._messages = 0
         self._heartbeat_ns: int | None = None
         self._request_ns: int | None = None
         self._requests = 0
-        self._open: deque[int] = deque(maxlen=MAX_OPEN_REQUESTS)
-        self._answered = False
-        self._listen = listen
+        self._open_requests_ns: deque[int] = deque(maxlen=MAX_OPEN_REQUESTS)
+        self._has_answer = False
+        self._on_message = on_message
         self._vehicle_clock = ArrivalClock()
-        self._answers: list[bytes] = []  # to requests of the datagram in hand
-        self._answers_from_ns = 0
-        self._answered_to: Counter[bool] = Counter()  # requests of the vehicle's, and of all others, in that time
+        self._replies: list[bytes] = []  # to requests of the datagram in hand
+        self._reply_window_ns = 0
+        self._reply_counts: Counter[bool] = Counter()  # requests of the vehicle's, and of all others, in that time
 
     @property
     def vehicle(self) -> tuple[int, int] | None:
         """System and component of the vehicle; None before its first heartbeat."""
         return self._vehicle.address
 
-    def trips(self, address: tuple[int, int] | None = None) -> TimesyncClock | None:
+    def timesync_clock(self, address: tuple[int, int] | None = None) -> TimesyncClock | None:
         """Round trips to a peer that answers TIMESYNC; without an address, to the source of the newest sample."""
-        return self._intake.trips(address)
+        return self._positions.timesync_clock(address)
 
-    def answered(self, address: tuple[int, int], sent_ns: int, remote_ns: int, received_ns: int) -> None:
+    def add_timesync_answer(self, address: tuple[int, int], sent_ns: int, remote_ns: int, received_ns: int) -> None:
         """Take the answer to a TIMESYNC request that another client has sent, as a recording shows it.
 
         Args:
             address: system and component whose stamps it tells of.
         """
-        self._intake.answer(address, sent_ns, remote_ns, received_ns)
+        self._positions.add_timesync_answer(address, sent_ns, remote_ns, received_ns)
 
     @property
-    def inertial(self) -> tuple[int, int]:
+    def inertial_counts(self) -> tuple[int, int]:
         """Inertial data of the vehicle that are used, and all that came."""
         return self._vehicle.inertial_used, self._vehicle.inertial_total
 
-    def vehicle_up_s(self, at_ns: int) -> float | None:
+    def vehicle_uptime_s(self, at_ns: int) -> float | None:
         """Return the time since the vehicle started, by its own clock [s]; None if it does not tell."""
-        return self._vehicle.up_s(at_ns)
+        return self._vehicle.uptime_s(at_ns)
 
     def receive(self, data: bytes, at_ns: int) -> ReceiveResult:
         """Take one datagram, or one chunk of a stream, that arrived at `at_ns`; never raises."""
-        self._answers.clear()
+        self._replies.clear()
         decoded = decode(data) if self._stream is None else self._stream.push(data)
         self._datagrams += 1
         self._messages += decoded.total
         for reason, count in decoded.bad.items():
-            self._count(reason, count)
-        items = [item for message in decoded.messages for item in self._take(message, at_ns)]
-        items += [item for text in self._texts.overdue(at_ns) for item in self._vehicle.take(text, at_ns)]
-        intake = self._intake
-        told = (*items, *self._tell(at_ns))
-        return ReceiveResult(told, tuple(self._answers), intake.settled, intake.attitude, intake.clock_source)
+            self._count_bad(reason, count)
+        items = [item for message in decoded.messages for item in self._handle_message(message, at_ns)]
+        items += [
+            item
+            for text in self._text_assembler.flush_overdue(at_ns)
+            for item in self._vehicle.handle_message(text, at_ns)
+        ]
+        intake = self._positions
+        told = (*items, *self._make_events(at_ns))
+        return ReceiveResult(told, tuple(self._replies), intake.is_settled, intake.attitude, intake.clock_source)
 
-    def refused(self, counts: Mapping[str, int], at_ns: int) -> tuple[Event, ...]:
+    def add_refusals(self, counts: Mapping[str, int], at_ns: int) -> tuple[Event, ...]:
         """Take the counts of what the connection dropped unread: addresses, rates, signatures."""
         for reason, count in counts.items():
-            self._count(reason, count)
+            self._count_bad(reason, count)
         lost = tuple(
             Event(at_ns=at_ns, severity=Severity.ERROR, code=reason, text=f"link {self._name}: {text}")
             for reason, text in _DISCONNECT_TEXTS.items()
             if reason in counts
         )
-        return lost + self._tell(at_ns)
+        return lost + self._make_events(at_ns)
 
     def due(self, at_ns: int) -> tuple[bytes, ...]:
         """Return what is to be sent at `at_ns` besides setpoints: heartbeat, TIMESYNC, requests for streams."""
         out = []
         if self._heartbeat_ns is None or at_ns - self._heartbeat_ns >= HEARTBEAT_NS:
             self._heartbeat_ns = at_ns
-            out.append(self._encoder.heartbeat())
-        eager = not self._answered and self._requests < MAX_FIRST_REQUESTS
+            out.append(self._encoder.encode_heartbeat())
+        eager = not self._has_answer and self._requests < MAX_FIRST_REQUESTS
         interval_ns = FIRST_TIMESYNC_NS if eager else TIMESYNC_NS
         if self._request_ns is None or at_ns - self._request_ns >= interval_ns:
             self._request_ns = at_ns
             self._requests += 1
-            self._open.append(at_ns)
-            out.append(self._encoder.timesync(0, at_ns))
+            self._open_requests_ns.append(at_ns)
+            out.append(self._encoder.encode_timesync(0, at_ns))
         if VEHICLE in self._roles and self._vehicle.address is not None:
             wanted = self._streams.due(at_ns, self._vehicle.autopilot)
-            out += [self.request_stream(number, rate_hz) for number, rate_hz in wanted]
-            indices = self._parameters.due(at_ns, armed=self._vehicle.armed) if self._lists else ()
-            out += [self._encoder.request_parameters(index, *self._target()) for index in indices]
+            out += [self.encode_stream_request(number, rate_hz) for number, rate_hz in wanted]
+            indices = self._parameters.due(at_ns, armed=self._vehicle.is_armed) if self._wants_parameters else ()
+            out += [self._encoder.encode_parameter_list_request(index, *self._target_address()) for index in indices]
         return tuple(out)
 
-    def setpoint(self, setpoint: Setpoint) -> bytes:
+    def encode_setpoint(self, setpoint: Setpoint) -> bytes:
         """The setpoint, addressed to the vehicle.
 
         Raises:
             UnsendableError: a value is not finite, or no vehicle has been heard.
         """
-        return self._encoder.setpoint(setpoint, *self._target())
+        return self._encoder.encode_setpoint(setpoint, *self._target_address())
 
-    def ask(self, ask: RequestKind, height_m: float) -> bytes:
+    def encode_request(self, ask: RequestKind, height_m: float) -> bytes:
         """A request to the vehicle.
 
         Args:
@@ -428,71 +432,71 @@ class MavlinkConnection:
         parameters: tuple[float, ...] = ()  # of landing where it is, and of disarming
         match ask:
             case RequestKind.TAKE_OFF_MODE | RequestKind.EXTERNAL_MODE:
-                parameters = self._mode(ask)
+                parameters = self._choose_mode_parameters(ask)
             case RequestKind.ARM:
                 parameters = (1.0,)
             case RequestKind.TAKE_OFF:
                 parameters = (*(0.0,) * 6, height_m)
-        return self._encoder.command(COMMANDS[ask], parameters, *self._target())
+        return self._encoder.encode_command(COMMANDS[ask], parameters, *self._target_address())
 
-    def _mode(self, ask: RequestKind) -> tuple[float, ...]:
+    def _choose_mode_parameters(self, ask: RequestKind) -> tuple[float, ...]:
         """DO_SET_MODE's parameters; PX4 wants main and sub mode, ArduPilot the number of the mode."""
         profile = PROFILES.get(self._vehicle.autopilot)
         if profile is None:
             raise UnsendableError(f"link {self._name}: modes of autopilot {self._vehicle.autopilot!r} are not known")
-        name = profile.external if ask is RequestKind.EXTERNAL_MODE else profile.take_off
-        return (float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED), *map(float, profile.modes[name]))
+        name = profile.external_mode if ask is RequestKind.EXTERNAL_MODE else profile.take_off_mode
+        return (float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED), *map(float, profile.mode_parameters[name]))
 
-    def place_on_globe(self, at_ns: int, place_deg_m: Vec3) -> tuple[bytes, ...]:
+    def setup_global_origin(self, at_ns: int, place_deg_m: Vec3) -> tuple[bytes, ...]:
         """Return the messages that an ArduPilot without GPS needs before it arms; call it while it is to be armed.
 
         Args:
             place_deg_m: latitude, longitude [deg] and altitude [m] of local zero.
         """
         profile = PROFILES.get(self._vehicle.autopilot)
-        if profile is None or not profile.wants_place:
+        if profile is None or not profile.needs_global_origin:
             return ()
-        asks, tells = self._globe.due(at_ns)
+        asks, tells = self._origin_setup.due(at_ns)
         if not asks:
             return ()
-        system, component = self._target()
+        system, component = self._target_address()
         out = (
-            self._encoder.request_parameter(SOURCE_PARAMETER, system, component),
-            self._encoder.request_message(GPS_GLOBAL_ORIGIN, system, component),
+            self._encoder.encode_parameter_request(SOURCE_PARAMETER, system, component),
+            self._encoder.encode_message_request(GPS_GLOBAL_ORIGIN, system, component),
         )
-        return (self._encoder.origin(place_deg_m, system), *out) if tells else out
+        return (self._encoder.encode_global_origin(place_deg_m, system), *out) if tells else out
 
-    def request_parameter(self, name: str) -> bytes:
+    def encode_parameter_request(self, name: str) -> bytes:
         """The request for one parameter, addressed to the vehicle.
 
         Raises:
             UnsendableError: no vehicle has been heard.
         """
-        return self._encoder.request_parameter(name, *self._target())
+        return self._encoder.encode_parameter_request(name, *self._target_address())
 
-    def request_stream(self, message_id: int, rate_hz: float) -> bytes:
+    def encode_stream_request(self, message_id: int, rate_hz: float) -> bytes:
         """The request to send a message so often, or once with rate 0, addressed to the vehicle.
 
         Raises:
             UnsendableError: no vehicle has been heard.
         """
         if rate_hz == 0.0:
-            return self._encoder.request_message(message_id, *self._target())
-        return self._encoder.request_interval(message_id, round(1e6 / rate_hz), *self._target())
+            return self._encoder.encode_message_request(message_id, *self._target_address())
+        return self._encoder.encode_interval_request(message_id, round(1e6 / rate_hz), *self._target_address())
 
-    def relay(self, relay: Relay, at_ns: int, *, refused: Sequence[PositionSample]) -> tuple[bytes, ...]:
+    def encode_relayed_poses(self, relay: Relay, at_ns: int, *, refused: Sequence[PositionSample]) -> tuple[bytes, ...]:
         """The positions that go to the vehicle's own estimator in the tick of `at_ns`.
 
         Args:
             refused: samples that the tick did not believe.
         """
-        if not relay.enabled or self.vehicle is None:
+        if not relay.is_enabled or self.vehicle is None:
             return ()
         # Only PX4 moves stamps by the offset that it has found to our time, where that is what it was given.
-        moves = not self._gives_vehicle_time and self._vehicle.autopilot == "px4"
+        moves = not self._uses_vehicle_time and self._vehicle.autopilot == "px4"
         offset_ns = 0 if moves else self._vehicle_offset_ns(at_ns) or 0
         poses = relay.due(at_ns, offset_ns=offset_ns, refused=refused)
-        return tuple(self._encoder.external_position(pose) for pose in poses)
+        return tuple(self._encoder.encode_external_position(pose) for pose in poses)
 
     def _vehicle_time_ns(self, at_ns: int) -> int | None:
         """Return the time of the vehicle's clock as far as known; None before.
@@ -510,184 +514,187 @@ class MavlinkConnection:
         A message arrives after its stamp, and no round trip was shorter than its way. A vehicle that neither answers
         nor stamps its messages gets our own time: steady, so its own estimate of the delay works.
         """
-        trips, arrival_ns = self.trips(self.vehicle), self._vehicle_clock.offset_ns(at_ns)
+        trips, arrival_ns = self.timesync_clock(self.vehicle), self._vehicle_clock.offset_ns(at_ns)
         known_ns = None if trips is None else trips.last_known_ns(at_ns)
         if trips is None or known_ns is None:
             return arrival_ns
         if arrival_ns is None or trips.offset_ns(at_ns) is not None or abs(arrival_ns - known_ns) > MAX_CLOCK_STEP_NS:
             return known_ns
-        return min(max(known_ns, arrival_ns - trips.shortest_ns - ROUND_TRIP_MARGIN_NS), arrival_ns)
+        return min(max(known_ns, arrival_ns - trips.shortest_round_trip_ns - ROUND_TRIP_MARGIN_NS), arrival_ns)
 
     def stats(self, at_ns: int) -> LinkStats:
         """Counters since the start."""
-        trips = self.trips() or (None if self.vehicle is None else self.trips(self.vehicle))
+        trips = self.timesync_clock() or (None if self.vehicle is None else self.timesync_clock(self.vehicle))
         round_trips_ns = () if trips is None else trips.round_trips_ns
         return LinkStats(
             at_ns=at_ns,
             link=self._name,
             datagrams=self._datagrams,
             messages=self._messages,
-            samples=self._intake.samples,
+            samples=self._positions.samples,
             bad={str(reason): count for reason, count in self._bad.items()},
-            clock_offset_ns=self._intake.clock_offset_ns,
-            clock_source=str(self._intake.clock_source),
+            clock_offset_ns=self._positions.clock_offset_ns,
+            clock_source=str(self._positions.clock_source),
             clock_rtt_ns=round(median(round_trips_ns)) if round_trips_ns else None,
             clock_drift_ppm=None if trips is None else trips.drift_ppm,
             clock_rejected=0 if trips is None else trips.rejected,
-            stamp_units=tuple(sorted({str(unit) for unit in self._intake.units.values()})),
+            stamp_units=tuple(sorted({str(unit) for unit in self._positions.units.values()})),
         )
 
-    def _target(self) -> tuple[int, int]:
+    def _target_address(self) -> tuple[int, int]:
         if self._vehicle.address is None:
             raise UnsendableError(f"link {self._name}: no vehicle has been heard, so there is nobody to send to")
         return self._vehicle.address
 
-    def _take(self, message: Message, at_ns: int) -> tuple[Item, ...]:
-        if (message.system, message.component) == self._own:  # our own words, sent back by a router
+    def _handle_message(self, message: Message, at_ns: int) -> tuple[Item, ...]:
+        if (message.system, message.component) == self._own_address:  # our own words, sent back by a router
             return ()
-        if self._listen is not None:
-            self._listen(message, at_ns)
+        if self._on_message is not None:
+            self._on_message(message, at_ns)
         if isinstance(message, TimeSync):
-            self._timesync(message, at_ns)
+            self._handle_timesync(message, at_ns)
             return ()
-        items: tuple[Item, ...] = self._follow(message, at_ns) if VEHICLE in self._roles else ()
+        items: tuple[Item, ...] = self._handle_vehicle_message(message, at_ns) if VEHICLE in self._roles else ()
         if isinstance(message, Position) and MOCAP in self._roles:
-            sample = self._intake.take(message, at_ns)
+            sample = self._positions.make_sample(message, at_ns)
             return items if sample is None else (*items, sample)
         return items
 
-    def _follow(self, message: Message, at_ns: int) -> tuple[Item, ...]:
+    def _handle_vehicle_message(self, message: Message, at_ns: int) -> tuple[Item, ...]:
         """Take a message of the vehicle and return what it tells of itself."""
         if isinstance(message, Text):
-            whole = self._texts.take(message, at_ns)
-            return tuple(item for text in whole for item in self._vehicle.take(text, at_ns))
-        boots, unready, address = self._vehicle.boots, self._vehicle.unready, self.vehicle
-        items = self._vehicle.take(message, at_ns)
+            whole = self._text_assembler.add_chunk(message, at_ns)
+            return tuple(item for text in whole for item in self._vehicle.handle_message(text, at_ns))
+        boots, unready, address = self._vehicle.boots, self._vehicle.not_ready_count, self.vehicle
+        items = self._vehicle.handle_message(message, at_ns)
         if address is None and self.vehicle is None:
-            self._look_for_one(message, at_ns)
+            self._note_missing_heartbeat(message, at_ns)
         elif self.vehicle != address:
             self._streams.restart()
-            self._globe, self._parameters, self._vehicle_clock = (
+            self._origin_setup, self._parameters, self._vehicle_clock = (
                 GlobalOriginSetup(),
                 ParameterDownload(),
                 ArrivalClock(),
             )
         if self._vehicle.boots != boots:
             self._streams.restart()
-            self._globe, self._parameters, self._vehicle_clock = (
+            self._origin_setup, self._parameters, self._vehicle_clock = (
                 GlobalOriginSetup(),
                 ParameterDownload(),
                 ArrivalClock(),
             )
             text = f"link {self._name}: the vehicle has started anew"
             return (*items, Event(at_ns=at_ns, severity=Severity.ERROR, code="vehicle-reboot", text=text))
-        if self._vehicle.unready != unready:
+        if self._vehicle.not_ready_count != unready:
             self._streams.restart()  # those that go on will have been seen by the time they would be asked for
         if (message.system, message.component) == self.vehicle:
-            self._streams.saw(message)
-            self._globe.saw(message)
-            self._parameters.saw(message)
+            self._streams.handle_message(message)
+            self._origin_setup.handle_message(message)
+            self._parameters.handle_message(message)
             match message:
                 case Position(boot_ms=True, stamp_us=int(stamp_us)) | Attitude(stamp_us=stamp_us) if stamp_us:
-                    self._vehicle_clock.delay_ns(1000 * stamp_us, at_ns)
+                    self._vehicle_clock.measure_delay_ns(1000 * stamp_us, at_ns)
         return items
 
-    def _look_for_one(self, message: Message, at_ns: int) -> None:
+    def _note_missing_heartbeat(self, message: Message, at_ns: int) -> None:
         """Note a vehicle that sends its position or attitude, and no heartbeat."""
         if isinstance(message, Attitude) or (isinstance(message, Position) and message.boot_ms):
-            self._mute = (message.system, message.component)
-            if self._mute_since_ns is None:
-                self._mute_since_ns = at_ns
+            self._no_heartbeat_address = (message.system, message.component)
+            if self._no_heartbeat_since_ns is None:
+                self._no_heartbeat_since_ns = at_ns
 
-    def _timesync(self, message: TimeSync, at_ns: int) -> None:
+    def _handle_timesync(self, message: TimeSync, at_ns: int) -> None:
         if message.tc1_ns == 0:
-            if at_ns - self._answers_from_ns >= ANSWER_WINDOW_NS:
-                self._answers_from_ns = at_ns
-                self._answered_to.clear()
+            if at_ns - self._reply_window_ns >= ANSWER_WINDOW_NS:
+                self._reply_window_ns = at_ns
+                self._reply_counts.clear()
             of_vehicle = self.vehicle is not None and message.system == self.vehicle[0]
-            if self._answered_to[of_vehicle] >= MAX_ANSWERS:
-                self._count(TIMESYNC_FLOOD)
+            if self._reply_counts[of_vehicle] >= MAX_ANSWERS:
+                self._count_bad(TIMESYNC_FLOOD)
                 return
-            self._answered_to[of_vehicle] += 1
-            own = self._gives_vehicle_time and (message.system, message.component) == self.vehicle
+            self._reply_counts[of_vehicle] += 1
+            own = self._uses_vehicle_time and (message.system, message.component) == self.vehicle
             time_ns = self._vehicle_time_ns(at_ns) if own else at_ns
             if time_ns is not None:
-                self._answers.append(self._encoder.timesync(time_ns, message.ts1_ns))
-        elif message.ts1_ns in self._open:  # else it answers somebody else
-            self._answered = True
-            self._intake.answer((message.system, message.component), message.ts1_ns, message.tc1_ns, at_ns)
+                self._replies.append(self._encoder.encode_timesync(time_ns, message.ts1_ns))
+        elif message.ts1_ns in self._open_requests_ns:  # else it answers somebody else
+            self._has_answer = True
+            self._positions.add_timesync_answer(
+                (message.system, message.component), message.ts1_ns, message.tc1_ns, at_ns
+            )
 
-    def _count(self, reason: str, count: int = 1) -> None:
+    def _count_bad(self, reason: str, count: int = 1) -> None:
         self._bad[reason] += count
         if reason == SLOW_ANSWER:
-            self._slow += count
+            self._slow_count += count
         elif reason == STALE_INERTIAL:  # told once, and then by the share that is used
             if self._bad[reason] == count:
-                self._untold[reason] += count
+                self._unreported[reason] += count
         elif reason not in _NOT_REPORTED:
-            self._untold[reason] += count
+            self._unreported[reason] += count
 
-    def _tell(self, at_ns: int) -> tuple[Event, ...]:
+    def _make_events(self, at_ns: int) -> tuple[Event, ...]:
         """Return events: what was dropped, one a second, and new clocks as they are found."""
         events = []
-        if self._intake.resyncs > self._resyncs_told:
-            self._resyncs_told = self._intake.resyncs
+        if self._positions.resyncs > self._reported_resyncs:
+            self._reported_resyncs = self._positions.resyncs
             text = f"link {self._name}: a source's clock has jumped; synchronised anew"
             events.append(Event(at_ns=at_ns, severity=Severity.WARNING, code="clock-resync", text=text))
-        for (system, component), unit in self._intake.units.items():
-            if (system, component, unit) not in self._units_told:
-                self._units_told.add((system, component, unit))
+        for (system, component), unit in self._positions.units.items():
+            if (system, component, unit) not in self._reported_units:
+                self._reported_units.add((system, component, unit))
                 what = "do not go on" if unit is StampUnit.CONSTANT else f"are in {unit}, not in us"
                 text = f"link {self._name}: stamps of the positions of {system}/{component} {what}: "
                 text += "they count by their arrival, and their ages are not known"
                 events.append(Event(at_ns=at_ns, severity=Severity.WARNING, code=STAMP_UNIT, text=text))
-        since_ns = self._mute_since_ns
+        since_ns = self._no_heartbeat_since_ns
         if (
             since_ns is not None
             and self.vehicle is None
-            and not self._mute_told
+            and not self._is_no_heartbeat_reported
             and at_ns - since_ns >= MISSING_HEARTBEAT_NS
         ):
-            self._mute_told = True
-            text = f"link {self._name}: system {self._mute and self._mute[0]} sends its position or attitude, "
+            self._is_no_heartbeat_reported = True
+            system = self._no_heartbeat_address and self._no_heartbeat_address[0]
+            text = f"link {self._name}: system {system} sends its position or attitude, "
             text += "but no heartbeat of an autopilot: its mode is not known, so it is not flown"
             events.append(Event(at_ns=at_ns, severity=Severity.WARNING, code=NO_HEARTBEAT, text=text))
         used, total = self._vehicle.inertial_used, self._vehicle.inertial_total
-        if not self._low_share_told and total >= MIN_INERTIAL and used < MIN_INERTIAL_SHARE * total:
-            self._low_share_told = True
+        if not self._is_low_share_reported and total >= MIN_INERTIAL and used < MIN_INERTIAL_SHARE * total:
+            self._is_low_share_reported = True
             text = f"link {self._name}: {1 - used / total:.0%} of the inertial data are not used: late, frozen, "
             text += "or without an attitude of now"
             events.append(
                 Event(at_ns=at_ns, severity=Severity.WARNING, code=STALE_INERTIAL, text=text, count=total - used)
             )
-        if self._slow and (self._slow_told_ns is None or at_ns - self._slow_told_ns >= SLOW_EVENT_NS):
-            self._slow_told_ns = at_ns
-            events.append(self._slow_answers(at_ns))
-            self._slow = 0
-        if self._untold and (self._told_ns is None or at_ns - self._told_ns >= SECOND_NS):
-            self._told_ns = at_ns
-            events.extend(self._dropped(at_ns))
-            self._untold.clear()
+        if self._slow_count and (self._slow_reported_ns is None or at_ns - self._slow_reported_ns >= SLOW_EVENT_NS):
+            self._slow_reported_ns = at_ns
+            events.append(self._make_slow_answer_event(at_ns))
+            self._slow_count = 0
+        if self._unreported and (self._reported_ns is None or at_ns - self._reported_ns >= SECOND_NS):
+            self._reported_ns = at_ns
+            events.extend(self._make_drop_events(at_ns))
+            self._unreported.clear()
         return tuple(events)
 
-    def _slow_answers(self, at_ns: int) -> Event:
+    def _make_slow_answer_event(self, at_ns: int) -> Event:
         """Answers to TIMESYNC that a busy machine or link made too slow to measure by: no trouble while others do."""
-        known = self._intake.knows_clocks(at_ns)
+        known = self._positions.are_clocks_known(at_ns)
         text = f"link {self._name}: answers to TIMESYNC came too slow to be used; the clock " + (
             "stays known by the others" if known else "is not known by them any more"
         )
         severity = Severity.INFO if known else Severity.WARNING
-        return Event(at_ns=at_ns, severity=severity, code=SLOW_ANSWER, text=text, count=self._slow)
+        return Event(at_ns=at_ns, severity=severity, code=SLOW_ANSWER, text=text, count=self._slow_count)
 
-    def _dropped(self, at_ns: int) -> list[Event]:
+    def _make_drop_events(self, at_ns: int) -> list[Event]:
         events = []
-        vehicles = self._untold.pop(SECOND_VEHICLE, 0)
+        vehicles = self._unreported.pop(SECOND_VEHICLE, 0)
         if vehicles and self._vehicle.address is not None:
             text = f"link {self._name}: another vehicle than system {self._vehicle.address[0]} is heard, and ignored"
             events.append(Event(at_ns=at_ns, severity=Severity.ERROR, code=SECOND_VEHICLE, text=text, count=vehicles))
-        if self._untold:
-            reasons = ", ".join(f"{count} {reason}" for reason, count in sorted(self._untold.items()))
+        if self._unreported:
+            reasons = ", ".join(f"{count} {reason}" for reason, count in sorted(self._unreported.items()))
             text = f"link {self._name}: dropped {reasons}"
-            count = self._untold.total()
+            count = self._unreported.total()
             events.append(Event(at_ns=at_ns, severity=Severity.WARNING, code="dropped", text=text, count=count))
         return events

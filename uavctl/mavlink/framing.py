@@ -53,9 +53,9 @@ class Scan(msgspec.Struct):
     frames: list[RawFrame] = []  # whole frames in order
     bad: dict[str, int] = {}  # skips by reason
     consumed: int = 0  # number of bytes that need not be seen again
-    in_step: bool = True  # whether the last bytes seen were a frame, so that the next byte should begin one
+    is_aligned: bool = True  # whether the last bytes seen were a frame, so that the next byte should begin one
 
-    def skip(self, reason: str) -> None:
+    def count_skip(self, reason: str) -> None:
         """Count a skip."""
         self.bad[reason] = self.bad.get(reason, 0) + 1
 
@@ -121,18 +121,18 @@ def scan(data: bytes, *, final: bool, in_step: bool = True, verify: Verify | Non
         What was found. One broken frame, or one run of garbage, counts once. A datagram, or what has come of a stream,
         in which nothing fits any more after `MAX_FAILED` tries is dropped from there on.
     """
-    result = Scan(in_step=in_step)
+    result = Scan(is_aligned=in_step)
     failed = 0
     while result.consumed < len(data):
         end, reason = _try_frame(data, result, verify, final=final)
         if reason is _WAIT:
             break
         if end is None:
-            if result.in_step:
-                result.skip(reason)
+            if result.is_aligned:
+                result.count_skip(reason)
             failed += 1
             end = len(data) if failed > MAX_FAILED else _next_magic(data, result.consumed + 1)
-        result.in_step = reason is _TAKEN
+        result.is_aligned = reason is _TAKEN
         result.consumed = end
     return result
 
@@ -142,7 +142,7 @@ def scan_one(data: bytes) -> Scan:
     result = Scan(consumed=0)
     end, reason = _try_frame(data, result, None, final=True) if data else (None, BadBytes.TRUNCATED)
     if end is None:
-        result.skip(reason)
+        result.count_skip(reason)
     result.consumed = len(data)
     return result
 
@@ -165,7 +165,7 @@ def _try_frame(data: bytes, result: Scan, verify: Verify | None, *, final: bool)
         # Nothing but the length can be checked.
         if not _between_frames(data, result, end):
             return None, BadBytes.GARBAGE
-        result.skip(BadBytes.UNKNOWN)
+        result.count_skip(BadBytes.UNKNOWN)
         return end, _TAKEN
     frame = data[at:end]
     if not _checksum_fits(frame, shape):
@@ -183,9 +183,9 @@ def _try_signed(data: bytes, result: Scan, shape: _Shape, verify: Verify) -> tup
     if refusal is not None:
         if not _between_frames(data, result, end):
             return None, refusal
-        result.skip(refusal)
+        result.count_skip(refusal)
     elif shape.message_id not in mavlink.mavlink_map:
-        result.skip(BadBytes.UNKNOWN)
+        result.count_skip(BadBytes.UNKNOWN)
     else:
         result.frames.append(RawFrame(frame, shape.message_id))
     return end, _TAKEN
@@ -193,7 +193,7 @@ def _try_signed(data: bytes, result: Scan, shape: _Shape, verify: Verify) -> tup
 
 def _between_frames(data: bytes, result: Scan, end: int) -> bool:
     """Whether an unchecked length can be believed: a frame came before, and another seems to follow."""
-    return result.in_step and (end >= len(data) or data[end] in _MAGIC)
+    return result.is_aligned and (end >= len(data) or data[end] in _MAGIC)
 
 
 def _next_magic(data: bytes, start: int) -> int:
@@ -236,7 +236,7 @@ class MessageLayout:
             ends = accumulate((1, 1, 1, *kind.lengths), initial=0)
             self._grouped = itemgetter(*(i if j - i == 1 else slice(i, j) for i, j in pairwise(ends)))
 
-    def read(self, frame: bytes) -> Fields:
+    def unpack(self, frame: bytes) -> Fields:
         """The fields of a whole frame of this kind; bytes that its payload lacks are 0, those too many dropped."""
         start, sender = (HEADER_V2, _SENDER_V2) if frame[0] == mavlink.PROTOCOL_MARKER_V2 else (HEADER_V1, _SENDER_V1)
         payload = frame[start : start + frame[1]].ljust(self._struct.size, b"\0")
@@ -244,7 +244,7 @@ class MessageLayout:
         fields: Fields = self._make(values if self._grouped is None else self._grouped(values))
         return fields
 
-    def frame(self, address: tuple[int, int], number: int, *fields: Any) -> bytes:
+    def pack(self, address: tuple[int, int], number: int, *fields: Any) -> bytes:
         """A frame of MAVLink 2.
 
         Args:

@@ -64,21 +64,21 @@ class StateTransition(msgspec.Struct, frozen=True):
     """Transition of the table that was made."""
 
     before: HandoverState  # the state that was left
-    seen: HandoverEvent  # why
+    event: HandoverEvent  # why
     after: HandoverState  # the state that was entered
-    why: str = ""  # more about it, where something failed
-    ask: RequestKind | None = None  # request to the vehicle at that time
-    granted: bool = False  # it had said yes to that
-    who: ModeReason | None = None  # who has changed the mode, where it is none of ours
+    reason: str = ""  # more about it, where something failed
+    request: RequestKind | None = None  # request to the vehicle at that time
+    is_granted: bool = False  # it had said yes to that
+    mode_reason: ModeReason | None = None  # who has changed the mode, where it is none of ours
 
 
 class HandoverOutput(msgspec.Struct, frozen=True):
     """Result of a tick of the hand-over."""
 
-    sending: SetpointMode  # setpoints that may be streamed
-    ask: RequestKind | None = None  # request to make now, if any
+    setpoint_mode: SetpointMode  # setpoints that may be streamed
+    request: RequestKind | None = None  # request to make now, if any
     events: tuple[Event, ...] = ()  # events to tell
-    passage: StateTransition | None = None  # transition that was made, if one was
+    transition: StateTransition | None = None  # transition that was made, if one was
 
 
 class HandoverStateMachine:
@@ -92,34 +92,34 @@ class HandoverStateMachine:
         failure: Why a request failed; empty while none has.
     """
 
-    def __init__(self, config: HandOverConfig | None = None, *, sees_it_down: bool = False) -> None:
+    def __init__(self, config: HandOverConfig | None = None, *, waits_for_landing: bool = False) -> None:
         self._config = HandOverConfig() if config is None else config
-        self._now = HandoverProgress(
+        self._progress = HandoverProgress(
             config=self._config, request=PendingRequest(None, 0, RequestLimits(0, 0, 0, FOREVER_NS))
         )
-        self._sees_it_down = sees_it_down
+        self._waits_for_landing = waits_for_landing
         self._landed_ns: int | None = None  # since when it stands on the ground, armed
-        self._disarms = False
-        self._silent = False
-        self._waits_for_nobody = False  # what we took off flies by itself, and nothing shows that a person has it
-        self._overdue = False  # a landing that is asked for has not begun in the time for it
-        self._aloft_ns: int | None = None  # the last tick in which the vehicle was heard, and in the air
+        self._is_disarm_requested = False
+        self._is_heartbeat_lost = False
+        self._is_without_pilot = False  # what we took off flies by itself, and nothing shows that a person has it
+        self._is_landing_overdue = False  # a landing that is asked for has not begun in the time for it
+        self._airborne_ns: int | None = None  # the last tick in which the vehicle was heard, and in the air
         self.failure = ""
 
     @property
     def state(self) -> HandoverState:
         """Place in the table."""
-        return self._now.state
+        return self._progress.state
 
     @property
-    def ours(self) -> bool:
+    def is_ordered_flight(self) -> bool:
         """Whether this flight was begun by an order to take off."""
-        return self._now.ordered_ns is not None
+        return self._progress.take_off_ordered_ns is not None
 
     @property
     def height_m(self) -> float:
         """Height of the climb that was ordered [m]."""
-        return self._now.height_m
+        return self._progress.height_m
 
     @property
     def has_begun(self) -> bool:
@@ -127,108 +127,110 @@ class HandoverStateMachine:
         return self.state in _BEGUN
 
     @property
-    def finished(self) -> bool:
+    def is_finished(self) -> bool:
         """Whether nothing more will be sent, whatever comes."""
-        return self.state in _OVER and not self.carries
+        return self.state in _OVER and not self.is_relay_needed
 
     @property
-    def carries(self) -> bool:
+    def is_relay_needed(self) -> bool:
         """Whether a vehicle is in the air by the positions that it gets from here, which are never the first to end.
 
         A vehicle that is not heard any more gets them for the time of a landing.
         """
-        return self._sees_it_down and self._aloft_ns is not None
+        return self._waits_for_landing and self._airborne_ns is not None
 
     @property
-    def busy(self) -> bool:
+    def is_busy(self) -> bool:
         """Whether an answer of the vehicle is waited for, or it is in the air by the positions it gets from here."""
-        if self.carries:
+        if self.is_relay_needed:
             return True
         if self.state is HandoverState.UNCLEAR:
-            return self._waits_for_nobody
-        return self.state in REQUESTING or (self.state is HandoverState.SETTLING and (self.ours or self._sees_it_down))
+            return self._is_without_pilot
+        return self.state in REQUESTING or (
+            self.state is HandoverState.SETTLING and (self.is_ordered_flight or self._waits_for_landing)
+        )
 
-    def flown(self, at_ns: int, vehicle: VehicleStatus | None) -> VehicleStatus | None:
+    def select_controlled_status(self, at_ns: int, vehicle: VehicleStatus | None) -> VehicleStatus | None:
         """The vehicle as far as the controller may fly it: none when it is silent, external only when it is ours."""
         if vehicle is None or is_silent(at_ns, vehicle):
             return None
-        if self.state in (HandoverState.WAITING, HandoverState.READY) and not self._now.stands_by:
+        if self.state in (HandoverState.WAITING, HandoverState.READY) and not self._progress.is_standing_by:
             return vehicle
         if self.state is HandoverState.ENGAGED:
-            if self.ours:
+            if self.is_ordered_flight:
                 # It tells once a second whether it climbs by itself, and it was we who ended that.
                 vehicle = msgspec.structs.replace(vehicle, own_climb=False)
-            past = self._now.shows_the_past(vehicle)
+            past = self._progress.may_be_outdated(vehicle)
             return msgspec.structs.replace(vehicle, armed=True, external=True) if past else vehicle
         return msgspec.structs.replace(vehicle, external=False, mode=f"{vehicle.mode} ({self.state})")
 
-    def has_left(self, vehicle: VehicleStatus) -> bool:
+    def has_left_external_mode(self, vehicle: VehicleStatus) -> bool:
         """Whether a heartbeat says that the vehicle is no longer in the external mode."""
-        return not (vehicle.external and vehicle.armed) and not self._now.shows_the_past(vehicle)
+        return not (vehicle.external and vehicle.armed) and not self._progress.may_be_outdated(vehicle)
 
     def update(self, view: HandoverInput) -> HandoverOutput:
         """Decide what one tick may send, and what it asks the vehicle for."""
-        now, before = self._now, self.state
-        for message in view.heard:
-            now.request.hear(message, view.at_ns)
-        events = self._take_orders(view)
-        if now.heard_ns is None and view.vehicle is not None:
-            now.heard_ns = view.at_ns
-        self.look_up(view.at_ns, view.vehicle)
+        now, before = self._progress, self.state
+        for message in view.messages:
+            now.request.handle_message(message, view.at_ns)
+        events = self._accept_orders(view)
+        if now.first_heard_ns is None and view.vehicle is not None:
+            now.first_heard_ns = view.at_ns
+        self.update_airborne(view.at_ns, view.vehicle)
         sight = evaluate(now, view)
-        if view.vehicle is not None and view.vehicle.mode in profile_of(view.vehicle).landing:
-            now.lands_failing = is_in_failsafe(view.vehicle)
+        if view.vehicle is not None and view.vehicle.mode in profile_of(view.vehicle).landing_modes:
+            now.is_failsafe_landing = is_in_failsafe(view.vehicle)
         if before is HandoverState.FAILSAFE and view.vehicle is not None and is_in_failsafe(view.vehicle):
-            now.left_mode = view.vehicle.mode  # one failsafe may follow another, and ArduPilot stays in its mode
+            now.previous_mode = view.vehicle.mode  # one failsafe may follow another, and ArduPilot stays in its mode
         now.boots = 0 if view.vehicle is None else view.vehicle.boots
-        now.state, sending = TRANSITIONS[before, sight.seen]
+        now.state, sending = TRANSITIONS[before, sight.event]
         passage = None
-        late = now.state is before is HandoverState.RELEASED and sight.who is not now.who
+        late = now.state is before is HandoverState.RELEASED and sight.mode_reason is not now.mode_reason
         if now.state is not before or late:
             was = now.request
             passage = StateTransition(
-                before, sight.seen, now.state, sight.why, was.ask, was.granted_ns is not None, sight.who
+                before, sight.event, now.state, sight.reason, was.kind, was.granted_ns is not None, sight.mode_reason
             )
-            now.who = sight.who
+            now.mode_reason = sight.mode_reason
         if now.state is not before:
-            self._enter(before, sight, view)
-        self._waits_for_nobody = now.state is HandoverState.UNCLEAR and is_without_pilot(now, view.vehicle)
-        if sending is SetpointMode.NEUTRAL and not (view.ready and self._may_warm_up(view)):
+            self._enter_state(before, sight, view)
+        self._is_without_pilot = now.state is HandoverState.UNCLEAR and is_without_pilot(now, view.vehicle)
+        if sending is SetpointMode.NEUTRAL and not (view.has_setpoint and self._may_send_neutral(view)):
             sending = SetpointMode.NOTHING
-        self._see_to_disarming(view)
-        held = view.unfit if now.state in _ON_THE_GROUND else ""
+        self._request_disarming(view)
+        held = view.arming_refusal if now.state in _ON_THE_GROUND else ""
         ask = None
-        if now.request.ask is not None and not view.unsure:
-            ask = now.request.due(view.at_ns, held, blind=self._may_be_the_pilot_s(view))
+        if now.request.kind is not None and not view.may_have_lost_messages:
+            ask = now.request.due(view.at_ns, held, blind=self._may_be_pilot_mode_change(view))
         if now.state is HandoverState.FAILED and before is HandoverState.ARMING:
             ask = RequestKind.DISARM  # arming may have been granted after all
         return HandoverOutput(
-            sending, ask, (*events, *self._tell(view, before, sight, passed=passage is not None)), passage
+            sending, ask, (*events, *self._make_events(view, before, sight, passed=passage is not None)), passage
         )
 
-    def look_up(self, at_ns: int, vehicle: VehicleStatus | None) -> None:
+    def update_airborne(self, at_ns: int, vehicle: VehicleStatus | None) -> None:
         """See whether the vehicle is in the air; the last word of it counts for the time of a landing."""
         if vehicle is not None and not is_silent(at_ns, vehicle):
-            self._aloft_ns = at_ns if vehicle.armed and not vehicle.landed else None
-        elif self._aloft_ns is not None and at_ns - self._aloft_ns >= _ns(self._config.land_s):
-            self._aloft_ns = None
+            self._airborne_ns = at_ns if vehicle.armed and not vehicle.landed else None
+        elif self._airborne_ns is not None and at_ns - self._airborne_ns >= _ns(self._config.land_s):
+            self._airborne_ns = None
 
-    def _take_orders(self, view: HandoverInput) -> list[Event]:
+    def _accept_orders(self, view: HandoverInput) -> list[Event]:
         events = []
         for command in view.commands:
             if command.order not in _PROMISES:
                 continue
-            refused = self._against(command, view)
+            refused = self._explain_refusal(command, view)
             if not refused and command.order is Order.TAKE_OFF:
-                self._now.ordered_ns, self._now.height_m = view.at_ns, command.height_m or 0.0
+                self._progress.take_off_ordered_ns, self._progress.height_m = view.at_ns, command.height_m or 0.0
             elif not refused and command.order is Order.STAND_BY:
-                self._now.stands_by, self._now.flown_ns = True, command.flown_ns
+                self._progress.is_standing_by, self._progress.previous_flight_ns = True, command.flown_ns
             code, severity = (ORDER_REFUSED, Severity.WARNING) if refused else (ORDER_ACCEPTED, Severity.INFO)
             text = refused or _PROMISES[command.order]
             events.append(Event(at_ns=view.at_ns, severity=severity, code=code, text=text))
         return events
 
-    def _against(self, command: Command, view: HandoverInput) -> str:
+    def _explain_refusal(self, command: Command, view: HandoverInput) -> str:
         """Return why an order is refused; empty if it is taken."""
         if command.order is Order.ENGAGE:
             return explain_engage_refusal(self.state, view)
@@ -236,53 +238,55 @@ class HandoverStateMachine:
             return "" if self.state is HandoverState.WAITING else f"the vehicle has been heard; now: {self.state}"
         if not (command.height_m or 0.0) > 0.0:
             return f"a climb to {command.height_m} m is none"
-        early = self.state in (HandoverState.WAITING, HandoverState.READY) and not self.ours
+        early = self.state in (HandoverState.WAITING, HandoverState.READY) and not self.is_ordered_flight
         return "" if early else f"take-off is ordered once, on the ground; now: {self.state}"
 
-    def _may_be_the_pilot_s(self, view: HandoverInput) -> bool:
+    def _may_be_pilot_mode_change(self, view: HandoverInput) -> bool:
         """Whether the pilot may have changed the mode since the last heartbeat: then no request of one is repeated.
 
         Heartbeats show a mode up to a second late, and a request that is repeated meanwhile would take it back. So
         it is made again right after a heartbeat; landing also where none has come.
         """
-        vehicle, ask = view.vehicle, self._now.request.ask
+        vehicle, ask = view.vehicle, self._progress.request.kind
         if ask not in (RequestKind.EXTERNAL_MODE, RequestKind.LAND) or vehicle is None:
             return False
         age_ns = view.at_ns - vehicle.at_ns
         return age_ns > NEW_HEARTBEAT_NS and not (ask is RequestKind.LAND and age_ns > MISSING_HEARTBEAT_NS)
 
-    def _may_warm_up(self, view: HandoverInput) -> bool:
+    def _may_send_neutral(self, view: HandoverInput) -> bool:
         """Whether neutral setpoints do no harm: they would end ArduPilot's climb."""
         if self.state not in TAKING_OFF or view.vehicle is None:
             return True
         return profile_of(view.vehicle).climbs_on_arming
 
-    def _enter(self, before: HandoverState, sight: GuardResult, view: HandoverInput) -> None:
-        now = self._now
-        now.since_ns, now.stands_by = view.at_ns, False
+    def _enter_state(self, before: HandoverState, sight: GuardResult, view: HandoverInput) -> None:
+        now = self._progress
+        now.state_start_ns, now.is_standing_by = view.at_ns, False
         if now.state in _TAKEN and before not in _TAKEN:
-            now.resumes = before in _CLIMB_STATES
+            now.is_climb_interrupted = before in _CLIMB_STATES
         if now.state is HandoverState.FAILSAFE:
             said = "" if view.vehicle is None else view.vehicle.said
-            now.words = now.request.words + (f', "{said}"' if said and said not in now.request.words else "")
-        if now.state is HandoverState.CLIMBING and now.climb_ns is None:
-            now.climb_ns = view.at_ns
+            now.failsafe_texts = now.request.quoted_texts + (
+                f', "{said}"' if said and said not in now.request.quoted_texts else ""
+            )
+        if now.state is HandoverState.CLIMBING and now.climb_start_ns is None:
+            now.climb_start_ns = view.at_ns
         if now.state is HandoverState.CLIMBING:
-            now.left_mode = ""  # that of the ground would be the pilot's by now
-        now.request = PendingRequest(self._ask(view), view.at_ns, self._patience(now.state, view.at_ns))
+            now.previous_mode = ""  # that of the ground would be the pilot's by now
+        now.request = PendingRequest(self._choose_request(view), view.at_ns, self._choose_limits(now.state, view.at_ns))
         if now.state is HandoverState.ARMING:
-            now.ground_up_m = view.up_m
+            now.ground_height_m = view.estimated_height_m
         takes_back = now.state is HandoverState.ENGAGING and before is HandoverState.FAILSAFE
         if (takes_back or now.state in _NOTES_MODE) and view.vehicle is not None:
-            now.left_mode = view.vehicle.mode
+            now.previous_mode = view.vehicle.mode
         if sight.granted_ns is not None:
             now.granted_ns = sight.granted_ns
         elif now.state not in (HandoverState.CLIMBING, HandoverState.ENGAGING):
             now.granted_ns = None
         if before is not HandoverState.RETURNING:
-            self.failure = self.failure or sight.why
+            self.failure = self.failure or sight.reason
 
-    def _ask(self, view: HandoverInput) -> RequestKind | None:
+    def _choose_request(self, view: HandoverInput) -> RequestKind | None:
         climbs = view.vehicle is not None and profile_of(view.vehicle).climbs_on_arming
         external = view.vehicle is not None and view.vehicle.external
         asks = {
@@ -295,9 +299,9 @@ class HandoverStateMachine:
         }
         return asks.get(self.state)
 
-    def _patience(self, state: HandoverState, at_ns: int) -> RequestLimits:
+    def _choose_limits(self, state: HandoverState, at_ns: int) -> RequestLimits:
         c = self._config
-        climbed_s = 0.0 if self._now.climb_ns is None else (at_ns - self._now.climb_ns) / 1e9
+        climbed_s = 0.0 if self._progress.climb_start_ns is None else (at_ns - self._progress.climb_start_ns) / 1e9
         limits_s = {
             HandoverState.MODE: c.ground_s,
             HandoverState.ARMING: c.ground_s,
@@ -312,50 +316,56 @@ class HandoverStateMachine:
         limit_ns = _ns(limits_s[state]) if state in limits_s else FOREVER_NS
         if state is HandoverState.LANDING:
             # What we took off is asked on: nobody else would.
-            tries = max(LAND_TRIES, round(LAND_PERIODS * c.land_s / c.answer_s)) if self.ours else LAND_TRIES
+            tries = (
+                max(LAND_TRIES, round(LAND_PERIODS * c.land_s / c.answer_s)) if self.is_ordered_flight else LAND_TRIES
+            )
             return RequestLimits(_ns(c.answer_s), _ns(c.answer_s), tries, limit_ns)
         # In the air there is no time for long pauses.
         retry_s = c.retry_s if state in _ON_THE_GROUND else c.answer_s / 2
         return RequestLimits(_ns(c.answer_s), _ns(retry_s), c.tries, limit_ns)
 
-    def _see_to_disarming(self, view: HandoverInput) -> None:
+    def _request_disarming(self, view: HandoverInput) -> None:
         """Ask a vehicle to disarm that stands on the ground after a flight of ours and stays armed."""
         vehicle = view.vehicle
-        if not (self.ours and self.state is HandoverState.SETTLING and vehicle is not None and vehicle.landed):
+        if not (
+            self.is_ordered_flight and self.state is HandoverState.SETTLING and vehicle is not None and vehicle.landed
+        ):
             self._landed_ns = None
         elif self._landed_ns is None:
             self._landed_ns = view.at_ns
-        elif not self._disarms and view.at_ns - self._landed_ns >= _ns(self._config.disarm_s):
-            self._disarms = True
-            self._now.request = PendingRequest(
-                RequestKind.DISARM, view.at_ns, self._patience(HandoverState.SETTLING, view.at_ns)
+        elif not self._is_disarm_requested and view.at_ns - self._landed_ns >= _ns(self._config.disarm_s):
+            self._is_disarm_requested = True
+            self._progress.request = PendingRequest(
+                RequestKind.DISARM, view.at_ns, self._choose_limits(HandoverState.SETTLING, view.at_ns)
             )
 
-    def _tell(self, view: HandoverInput, before: HandoverState, sight: GuardResult, *, passed: bool) -> list[Event]:
+    def _make_events(
+        self, view: HandoverInput, before: HandoverState, sight: GuardResult, *, passed: bool
+    ) -> list[Event]:
         events = []
-        silence = self.state is HandoverState.ENGAGED and sight.seen is HandoverEvent.SILENCE
-        if silence != self._silent:
-            self._silent = silence
-            only = ", though its other messages come" if view.moves else ", and nothing else comes"
+        silence = self.state is HandoverState.ENGAGED and sight.event is HandoverEvent.SILENCE
+        if silence != self._is_heartbeat_lost:
+            self._is_heartbeat_lost = silence
+            only = ", though its other messages come" if view.has_motion else ", and nothing else comes"
             text = f"heartbeat lost{only}: braking and holding" if silence else "heartbeat is back"
             events.append(Event(at_ns=view.at_ns, severity=Severity.ERROR, code="heartbeat", text=text))
-        overdue = self._now.request.given_up(view.at_ns) if self.state is HandoverState.LANDING else ""
-        if overdue and not self._overdue:
+        overdue = self._progress.request.describe_failure(view.at_ns) if self.state is HandoverState.LANDING else ""
+        if overdue and not self._is_landing_overdue:
             text = f"{overdue}; it is asked on, as it is heard in the air"
             events.append(Event(at_ns=view.at_ns, severity=Severity.ERROR, code="refused", text=text))
-        self._overdue = bool(overdue)
+        self._is_landing_overdue = bool(overdue)
         if passed:
             vehicle = view.vehicle
             mode = "" if vehicle is None else f" ({vehicle.mode}, {'armed' if vehicle.armed else 'disarmed'})"
             plain = self.state in _PLAIN and before is not HandoverState.FAILSAFE
             severity = Severity.INFO if plain else Severity.WARNING
             text = f"{before} -> {self.state}{mode}"
-            if sight.who is not None:
+            if sight.mode_reason is not None:
                 said = "" if vehicle is None or not vehicle.said else f', "{vehicle.said}"'
-                text += f": {sight.who}{said}"
+                text += f": {sight.mode_reason}{said}"
             events.append(Event(at_ns=view.at_ns, severity=severity, code="hand-over", text=text))
-            if sight.why:
-                events.append(Event(at_ns=view.at_ns, severity=Severity.ERROR, code="refused", text=sight.why))
+            if sight.reason:
+                events.append(Event(at_ns=view.at_ns, severity=Severity.ERROR, code="refused", text=sight.reason))
         return events
 
 

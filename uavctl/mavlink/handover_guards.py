@@ -54,17 +54,17 @@ class HandoverInput(msgspec.Struct, frozen=True, kw_only=True):
 
     at_ns: int  # time of the tick
     vehicle: VehicleStatus | None  # the vehicle's latest status; None before the first
-    ready: bool  # the controller has a setpoint; without one no neutral stream invites the pilot
-    up_s: float | None = None  # time since it started [s]; None if it does not tell
-    land: bool = False  # the controller asks for landing
-    stop: bool = False  # the operator asks for the end
-    unsure: bool = False  # the pilot may have taken over unheard: nothing is asked of the vehicle
-    unfit: str = ""  # why nothing may be armed now; empty if it may
-    unsafe: str = ""  # why a vehicle in the air must not climb on by these positions; empty if it may
-    up_m: float | None = None  # height of the estimate in local NED [m]; None without one
-    up_mps: float = 0.0  # its rate of climb [m/s]
-    moves: bool = False  # the vehicle sends its velocity or attitude now, whatever its heartbeats do
-    heard: tuple[Ack | Text, ...] = ()  # the vehicle's answers and words since the last tick
+    has_setpoint: bool  # the controller has a setpoint; without one no neutral stream invites the pilot
+    uptime_s: float | None = None  # time since it started [s]; None if it does not tell
+    is_landing_requested: bool = False  # the controller asks for landing
+    is_stop_requested: bool = False  # the operator asks for the end
+    may_have_lost_messages: bool = False  # the pilot may have taken over unheard: nothing is asked of the vehicle
+    arming_refusal: str = ""  # why nothing may be armed now; empty if it may
+    climb_hazard: str = ""  # why a vehicle in the air must not climb on by these positions; empty if it may
+    estimated_height_m: float | None = None  # height of the estimate in local NED [m]; None without one
+    climb_rate_mps: float = 0.0  # its rate of climb [m/s]
+    has_motion: bool = False  # the vehicle sends its velocity or attitude now, whatever its heartbeats do
+    messages: tuple[Ack | Text, ...] = ()  # the vehicle's answers and words since the last tick
     commands: tuple[Command, ...] = ()  # the operator's orders
 
 
@@ -75,23 +75,23 @@ class HandoverProgress:
     config: HandOverConfig  # times and bounds
     request: PendingRequest  # request that is made, or waited for
     state: HandoverState = HandoverState.WAITING  # place in the table
-    since_ns: int = 0  # when it was entered [ns]
-    ordered_ns: int | None = None  # when take-off was ordered [ns]; None if it was not
+    state_start_ns: int = 0  # when it was entered [ns]
+    take_off_ordered_ns: int | None = None  # when take-off was ordered [ns]; None if it was not
     height_m: float = 0.0  # height of the climb that was ordered [m]
-    ground_up_m: float | None = None  # height of the estimate before it was armed [m]
-    left_mode: str = ""  # the mode that a request is to end; or, in a failsafe, that it chose
-    climb_ns: int | None = None  # time at which the climb first began [ns]; None before
-    resumes: bool = False  # the failsafe that acts ended the climb, not the flight
-    words: str = ""  # texts of the vehicle from before its failsafe acted
-    who: ModeReason | None = None  # who has the vehicle, where it is not we; None while it is we, or nobody
-    lands_failing: bool = False  # the landing that is waited for was last seen as a failsafe's
+    ground_height_m: float | None = None  # height of the estimate before it was armed [m]
+    previous_mode: str = ""  # the mode that a request is to end; or, in a failsafe, that it chose
+    climb_start_ns: int | None = None  # time at which the climb first began [ns]; None before
+    is_climb_interrupted: bool = False  # the failsafe that acts ended the climb, not the flight
+    failsafe_texts: str = ""  # texts of the vehicle from before its failsafe acted
+    mode_reason: ModeReason | None = None  # who has the vehicle, where it is not we; None while it is we, or nobody
+    is_failsafe_landing: bool = False  # the landing that is waited for was last seen as a failsafe's
     granted_ns: int | None = None  # when arming or the external mode was granted, ahead of the heartbeat [ns]
     boots: int = 0  # times that the vehicle had started anew by the last tick
-    stands_by: bool = False  # A vehicle that is found armed is left alone
-    flown_ns: int | None = None  # start of the flight that it was left in [ns]; None if not known
-    heard_ns: int | None = None  # when the vehicle was heard first [ns]; None if it was not
+    is_standing_by: bool = False  # A vehicle that is found armed is left alone
+    previous_flight_ns: int | None = None  # start of the flight that it was left in [ns]; None if not known
+    first_heard_ns: int | None = None  # when the vehicle was heard first [ns]; None if it was not
 
-    def shows_the_past(self, vehicle: VehicleStatus) -> bool:
+    def may_be_outdated(self, vehicle: VehicleStatus) -> bool:
         """Whether the last heartbeat may be from before arming or the external mode was granted."""
         return self.granted_ns is not None and vehicle.at_ns <= self.granted_ns + GRACE_NS
 
@@ -99,10 +99,10 @@ class HandoverProgress:
 class GuardResult(msgspec.Struct, frozen=True):
     """Event that is seen, with the reason where that has to be told."""
 
-    seen: HandoverEvent  # in the words of the table
-    why: str = ""  # why something failed
+    event: HandoverEvent  # in the words of the table
+    reason: str = ""  # why something failed
     granted_ns: int | None = None  # when it was granted, if a heartbeat does not show it yet [ns]
-    who: ModeReason | None = None  # who has changed the mode, where it is none of ours
+    mode_reason: ModeReason | None = None  # who has changed the mode, where it is none of ours
 
 
 def is_silent(at_ns: int, vehicle: VehicleStatus | None) -> bool:
@@ -125,11 +125,11 @@ def _classify_takeover(progress: HandoverProgress, vehicle: VehicleStatus) -> Gu
 
     A failsafe is waited for on a flight that we began, unless a person flies in its mode: the stick always wins.
     """
-    who = determine_mode_reason(vehicle, had_failed=progress.state is HandoverState.FAILSAFE)
+    who = determine_mode_reason(vehicle, was_in_failsafe=progress.state is HandoverState.FAILSAFE)
     if who is ModeReason.UNKNOWN:
-        return GuardResult(HandoverEvent.UNCLEAR, who=who)
-    waits = who in VEHICLE_REASONS and progress.ordered_ns is not None and is_autonomous_mode(vehicle)
-    return GuardResult(HandoverEvent.FAILSAFE if waits else HandoverEvent.OTHER, who=who)
+        return GuardResult(HandoverEvent.UNCLEAR, mode_reason=who)
+    waits = who in VEHICLE_REASONS and progress.take_off_ordered_ns is not None and is_autonomous_mode(vehicle)
+    return GuardResult(HandoverEvent.FAILSAFE if waits else HandoverEvent.OTHER, mode_reason=who)
 
 
 def explain_engage_refusal(state: HandoverState, view: HandoverInput) -> str:
@@ -141,7 +141,7 @@ def explain_engage_refusal(state: HandoverState, view: HandoverInput) -> str:
         return "no vehicle is heard that could be flown"
     if not vehicle.armed or vehicle.landed:
         return "the vehicle is not in the air"
-    return view.unfit
+    return view.arming_refusal
 
 
 def explain_move_refusal(state: HandoverState, vehicle: VehicleStatus | None) -> str:
@@ -168,22 +168,29 @@ def evaluate(progress: HandoverProgress, view: HandoverInput) -> GuardResult:
     there = GuardResult(HandoverEvent.SILENCE)
     if vehicle is not None and not is_silent(view.at_ns, vehicle):
         there = _GUARDS.get(state, _guard_standby)(progress, view, vehicle)
-    lands = vehicle is not None and vehicle.mode in profile_of(vehicle).landing
-    taken = there.seen in (HandoverEvent.UNCLEAR, HandoverEvent.OTHER)
+    lands = vehicle is not None and vehicle.mode in profile_of(vehicle).landing_modes
+    taken = there.event in (HandoverEvent.UNCLEAR, HandoverEvent.OTHER)
     if taken and not lands and state not in (HandoverState.WAITING, HandoverState.READY):
         return there  # whatever ends the flight: what the pilot has taken is asked for nothing
-    if view.land and state is not HandoverState.UNCLEAR:
+    if view.is_landing_requested and state is not HandoverState.UNCLEAR:
         return GuardResult(HandoverEvent.LAND)
-    if (state in _IN_PROGRESS and (view.stop or is_ordered(view, Order.LAND))) or _is_landing_ordered(progress, view):
+    if (state in _IN_PROGRESS and (view.is_stop_requested or is_ordered(view, Order.LAND))) or _is_landing_ordered(
+        progress, view
+    ):
         return GuardResult(HandoverEvent.LAND)
-    if state is HandoverState.ENGAGED and view.stop and not view.ready and progress.ordered_ns is not None:
+    if (
+        state is HandoverState.ENGAGED
+        and view.is_stop_requested
+        and not view.has_setpoint
+        and progress.take_off_ordered_ns is not None
+    ):
         # The controller has ended without a landing, and nobody else has what we took off.
         return GuardResult(HandoverEvent.LAND)
-    if state in _CLIMB_STATES and view.unsafe:
-        return GuardResult(HandoverEvent.UNSAFE, f"{CLIMB_ABORTED}{view.unsafe}")
-    if there.seen in (HandoverEvent.GRANTED, HandoverEvent.REFUSED):
+    if state in _CLIMB_STATES and view.climb_hazard:
+        return GuardResult(HandoverEvent.UNSAFE, f"{CLIMB_ABORTED}{view.climb_hazard}")
+    if there.event in (HandoverEvent.GRANTED, HandoverEvent.REFUSED):
         return there
-    if there.seen is HandoverEvent.DISARMED and state is HandoverState.LANDING:
+    if there.event is HandoverEvent.DISARMED and state is HandoverState.LANDING:
         return there  # whatever it answered, it is down
     why = _find_failure(progress, view)
     return GuardResult(HandoverEvent.REFUSED, why) if why else there
@@ -198,23 +205,23 @@ def _find_failure(progress: HandoverProgress, view: HandoverInput) -> str:
     if state in (HandoverState.FAILSAFE, HandoverState.UNCLEAR):
         return _find_wait_timeout(progress, view)
     waits = (state in REQUESTING or state is HandoverState.SETTLING) and not _must_keep_landing(progress, view)
-    return progress.request.given_up(view.at_ns) if waits else ""
+    return progress.request.describe_failure(view.at_ns) if waits else ""
 
 
 def _must_keep_landing(progress: HandoverProgress, view: HandoverInput) -> bool:
     """Whether it is asked to land, whatever it answers: what we took off, or armed for that, has nobody else."""
     vehicle = view.vehicle
-    if progress.state is not HandoverState.LANDING or progress.ordered_ns is None or vehicle is None:
+    if progress.state is not HandoverState.LANDING or progress.take_off_ordered_ns is None or vehicle is None:
         return False
     heard = vehicle.armed and not is_silent(view.at_ns, vehicle)
-    return heard and view.at_ns - progress.since_ns < round(LAND_PERIODS * progress.config.land_s * 1e9)
+    return heard and view.at_ns - progress.state_start_ns < round(LAND_PERIODS * progress.config.land_s * 1e9)
 
 
 def is_without_pilot(progress: HandoverProgress, vehicle: VehicleStatus | None) -> bool:
     """Whether a vehicle that we took off flies by itself, and nothing shows that a person has it."""
-    if progress.ordered_ns is None or vehicle is None or vehicle.landed or vehicle.stick:
+    if progress.take_off_ordered_ns is None or vehicle is None or vehicle.landed or vehicle.stick:
         return False
-    return is_autonomous_mode(vehicle) or vehicle.external or vehicle.mode in profile_of(vehicle).climbing
+    return is_autonomous_mode(vehicle) or vehicle.external or vehicle.mode in profile_of(vehicle).climb_modes
 
 
 def _is_landing_ordered(progress: HandoverProgress, view: HandoverInput) -> bool:
@@ -229,10 +236,10 @@ def _find_wait_timeout(progress: HandoverProgress, view: HandoverInput) -> str:
     unclear = progress.state is HandoverState.UNCLEAR
     if unclear and not is_without_pilot(progress, vehicle):
         return ""
-    lands = vehicle is not None and vehicle.mode in profile_of(vehicle).landing
-    begun_ns, limit_s = progress.since_ns, config.land_s if lands else config.climb_s
-    if progress.resumes and not lands and progress.climb_ns is not None:
-        begun_ns = progress.climb_ns
+    lands = vehicle is not None and vehicle.mode in profile_of(vehicle).landing_modes
+    begun_ns, limit_s = progress.state_start_ns, config.land_s if lands else config.climb_s
+    if progress.is_climb_interrupted and not lands and progress.climb_start_ns is not None:
+        begun_ns = progress.climb_start_ns
     if view.at_ns - begun_ns < round(limit_s * 1e9):
         return ""
     if unclear:
@@ -240,31 +247,36 @@ def _find_wait_timeout(progress: HandoverProgress, view: HandoverInput) -> str:
         return f"nobody has shown in {limit_s:g} s that he has the vehicle, which flies by itself ({mode})"
     acts = vehicle is None or is_in_failsafe(vehicle)
     became = "has not ended" if acts else "has ended, and nobody has taken the flight up again,"
-    return f"{progress.who or ModeReason.FAILSAFE} ({progress.left_mode}) {became} in {limit_s:g} s{progress.words}"
+    return f"{_describe_failsafe(progress)} {became} in {limit_s:g} s{progress.failsafe_texts}"
+
+
+def _describe_failsafe(progress: HandoverProgress) -> str:
+    """Return the text of the failsafe that acts, and its mode."""
+    return f"{progress.mode_reason or ModeReason.FAILSAFE} ({progress.previous_mode})"
 
 
 def _find_take_off_failure(progress: HandoverProgress, view: HandoverInput) -> str:
     """Return why an ordered take-off will not begin; empty if it may, or none was ordered."""
     vehicle, limit_s = view.vehicle, progress.config.ground_s
-    if progress.ordered_ns is None:
+    if progress.take_off_ordered_ns is None:
         return ""
     if vehicle is not None and vehicle.autopilot not in PROFILES:
         return f"take-off: how autopilot {vehicle.autopilot!r} takes off is not known; PX4 and ArduCopter are"
     if vehicle is not None and not vehicle.alone:
         return _SECOND_VEHICLE
     if vehicle is not None and vehicle.armed:
-        return f"take-off: {_ALREADY_ARMED}{_ENGAGE_HINT if progress.stands_by else ''}"
-    if view.at_ns - progress.ordered_ns < round(limit_s * 1e9):
+        return f"take-off: {_ALREADY_ARMED}{_ENGAGE_HINT if progress.is_standing_by else ''}"
+    if view.at_ns - progress.take_off_ordered_ns < round(limit_s * 1e9):
         return ""
-    missing = "the vehicle's heartbeats are missing" if view.moves else "the vehicle is silent"
-    reason = "no vehicle is heard" if vehicle is None else view.unfit or missing
+    missing = "the vehicle's heartbeats are missing" if view.has_motion else "the vehicle is silent"
+    reason = "no vehicle is heard" if vehicle is None else view.arming_refusal or missing
     return f"take-off: {reason} (waited {limit_s:g} s)"
 
 
 def _guard_standby(progress: HandoverProgress, view: HandoverInput, vehicle: VehicleStatus) -> GuardResult:
     """Return the event seen before, between and after flights."""
-    ready = progress.state is HandoverState.READY and not (view.unfit or view.stop)
-    if ready and progress.ordered_ns is not None and not vehicle.armed and vehicle.alone:
+    ready = progress.state is HandoverState.READY and not (view.arming_refusal or view.is_stop_requested)
+    if ready and progress.take_off_ordered_ns is not None and not vehicle.armed and vehicle.alone:
         return (
             GuardResult(HandoverEvent.TAKE_OFF)
             if vehicle.autopilot in PROFILES
@@ -272,43 +284,48 @@ def _guard_standby(progress: HandoverProgress, view: HandoverInput, vehicle: Veh
         )
     if is_ordered(view, Order.ENGAGE) and not explain_engage_refusal(progress.state, view):
         return GuardResult(HandoverEvent.ENGAGE)
-    if progress.state is HandoverState.ENGAGED and progress.shows_the_past(vehicle):
+    if progress.state is HandoverState.ENGAGED and progress.may_be_outdated(vehicle):
         return GuardResult(HandoverEvent.EXTERNAL)
     if not vehicle.armed:
         return GuardResult(HandoverEvent.DISARMED)
-    if progress.stands_by and not _has_started_since(progress, view):
-        heard_ns = view.at_ns if progress.heard_ns is None else progress.heard_ns
-        tells_not_yet = view.up_s is None and view.at_ns - heard_ns < BOOT_TIME_WAIT_NS
+    if progress.is_standing_by and not _has_started_since(progress, view):
+        heard_ns = view.at_ns if progress.first_heard_ns is None else progress.first_heard_ns
+        tells_not_yet = view.uptime_s is None and view.at_ns - heard_ns < BOOT_TIME_WAIT_NS
         return GuardResult(HandoverEvent.SILENCE) if tells_not_yet else GuardResult(HandoverEvent.LEFT, _LEFT_IN_FLIGHT)
     if vehicle.external:
         return GuardResult(HandoverEvent.EXTERNAL)
     if progress.state is HandoverState.ENGAGED:
         return _classify_takeover(progress, vehicle)
     # A text that says of a failsafe comes after the heartbeat that shows its mode, sometimes.
-    guessed = progress.who in (ModeReason.PILOT, ModeReason.UNKNOWN) and view.at_ns - progress.since_ns < LATE_TEXT_NS
-    who = determine_mode_reason(vehicle) if guessed and progress.state is HandoverState.RELEASED else progress.who
-    return GuardResult(HandoverEvent.OTHER, who=progress.who if who is ModeReason.UNKNOWN else who)
+    guessed = (
+        progress.mode_reason in (ModeReason.PILOT, ModeReason.UNKNOWN)
+        and view.at_ns - progress.state_start_ns < LATE_TEXT_NS
+    )
+    who = (
+        determine_mode_reason(vehicle) if guessed and progress.state is HandoverState.RELEASED else progress.mode_reason
+    )
+    return GuardResult(HandoverEvent.OTHER, mode_reason=progress.mode_reason if who is ModeReason.UNKNOWN else who)
 
 
 def _has_started_since(progress: HandoverProgress, view: HandoverInput) -> bool:
     """Whether the vehicle has started after the flight that an earlier daemon left: it is on another one."""
-    if progress.flown_ns is None or view.up_s is None:
+    if progress.previous_flight_ns is None or view.uptime_s is None:
         return False
-    return view.up_s / MIN_CLOCK_RATE + BOOT_TIME_MARGIN_S < (view.at_ns - progress.flown_ns) / 1e9
+    return view.uptime_s / MIN_CLOCK_RATE + BOOT_TIME_MARGIN_S < (view.at_ns - progress.previous_flight_ns) / 1e9
 
 
 def _guard_mode(progress: HandoverProgress, view: HandoverInput, vehicle: VehicleStatus) -> GuardResult:
     profile = profile_of(vehicle)
     if vehicle.armed:
         return _classify_takeover(progress, vehicle)
-    if vehicle.alone and vehicle.mode == profile.take_off:
+    if vehicle.alone and vehicle.mode == profile.take_off_mode:
         return GuardResult(HandoverEvent.GRANTED)
     # A mode that nobody here asked for is the pilot's; the one of before may be that of a vehicle that is slow.
-    if vehicle.alone and vehicle.mode not in (profile.take_off, progress.left_mode):
+    if vehicle.alone and vehicle.mode not in (profile.take_off_mode, progress.previous_mode):
         return _classify_takeover(progress, vehicle)
     if _is_after_grant(progress, vehicle, MODE_SHOWN_NS):
         return GuardResult(
-            HandoverEvent.REFUSED, f"{progress.request.given_up(view.at_ns, at_once=True)}; {_SLOW_OR_PILOT}"
+            HandoverEvent.REFUSED, f"{progress.request.describe_failure(view.at_ns, at_once=True)}; {_SLOW_OR_PILOT}"
         )
     return GuardResult(HandoverEvent.PENDING)
 
@@ -322,7 +339,7 @@ def _is_after_grant(progress: HandoverProgress, vehicle: VehicleStatus, after_ns
 def _guard_arming(progress: HandoverProgress, _view: HandoverInput, vehicle: VehicleStatus) -> GuardResult:
     profile, granted_ns = profile_of(vehicle), progress.request.granted_ns
     # Disarmed it has not climbed, so it is not where PX4's climb ends.
-    if vehicle.mode != profile.take_off and not (vehicle.armed and vehicle.mode in profile.climbing):
+    if vehicle.mode != profile.take_off_mode and not (vehicle.armed and vehicle.mode in profile.climb_modes):
         return _classify_takeover(progress, vehicle)
     if profile.climbs_on_arming and granted_ns is not None:  # it climbs already
         return GuardResult(HandoverEvent.GRANTED, granted_ns=granted_ns)
@@ -330,19 +347,19 @@ def _guard_arming(progress: HandoverProgress, _view: HandoverInput, vehicle: Veh
 
 
 def _guard_climbing(progress: HandoverProgress, view: HandoverInput, vehicle: VehicleStatus) -> GuardResult:
-    if not (vehicle.armed or progress.shows_the_past(vehicle)):
+    if not (vehicle.armed or progress.may_be_outdated(vehicle)):
         return GuardResult(HandoverEvent.DISARMED, _DISARMED)
     profile = profile_of(vehicle)
-    if vehicle.mode not in profile.climbing:
+    if vehicle.mode not in profile.climb_modes:
         return _classify_takeover(progress, vehicle)
     if (
-        vehicle.mode != profile.take_off
+        vehicle.mode != profile.take_off_mode
         and vehicle.landed
         and _predict_climb_share(progress, view, 0.0) < NO_CLIMB_SHARE
     ):
         return _classify_takeover(progress, vehicle)  # no climb has ended on the ground
     share = _predict_climb_share(progress, view, LOOK_AHEAD_S if profile.climbs_on_arming else 0.0)
-    ended = profile.climbs_on_arming and vehicle.mode != profile.take_off  # below the height: as high as it goes
+    ended = profile.climbs_on_arming and vehicle.mode != profile.take_off_mode  # below the height: as high as it goes
     return GuardResult(
         HandoverEvent.GRANTED
         if share >= (MIN_CLIMB_SHARE if ended else progress.config.reached)
@@ -352,19 +369,19 @@ def _guard_climbing(progress: HandoverProgress, view: HandoverInput, vehicle: Ve
 
 def _predict_climb_share(progress: HandoverProgress, view: HandoverInput, ahead_s: float) -> float:
     """Return the share of the height that will be reached `ahead_s` from now, by fresh positions."""
-    if view.up_m is None or progress.ground_up_m is None or view.unfit:
+    if view.estimated_height_m is None or progress.ground_height_m is None or view.arming_refusal:
         return 0.0
-    return (view.up_m + ahead_s * view.up_mps - progress.ground_up_m) / progress.height_m
+    return (view.estimated_height_m + ahead_s * view.climb_rate_mps - progress.ground_height_m) / progress.height_m
 
 
 def _guard_external(progress: HandoverProgress, _view: HandoverInput, vehicle: VehicleStatus) -> GuardResult:
-    if not (vehicle.armed or progress.shows_the_past(vehicle)):
+    if not (vehicle.armed or progress.may_be_outdated(vehicle)):
         return GuardResult(HandoverEvent.DISARMED, _DISARMED)
     granted_ns = progress.request.granted_ns
     if vehicle.external or granted_ns is not None:
         return GuardResult(HandoverEvent.GRANTED, granted_ns=granted_ns)
     engaging = progress.state is HandoverState.ENGAGING
-    if vehicle.mode == progress.left_mode or (engaging and vehicle.mode in profile_of(vehicle).climbing):
+    if vehicle.mode == progress.previous_mode or (engaging and vehicle.mode in profile_of(vehicle).climb_modes):
         return GuardResult(HandoverEvent.PENDING)
     return _classify_takeover(progress, vehicle)
 
@@ -373,15 +390,14 @@ def _guard_failsafe(progress: HandoverProgress, view: HandoverInput, vehicle: Ve
     """Return the event seen in a failsafe on a flight that we began; the pilot may take over as at any other time."""
     if not vehicle.armed:
         return GuardResult(
-            HandoverEvent.DISARMED,
-            f"{progress.who or ModeReason.FAILSAFE} ({progress.left_mode}) has landed it{progress.words}",
+            HandoverEvent.DISARMED, f"{_describe_failsafe(progress)} has landed it{progress.failsafe_texts}"
         )
     if is_ordered(view, Order.ENGAGE) and not explain_engage_refusal(progress.state, view):
         return GuardResult(HandoverEvent.ENGAGE)
     profile = profile_of(vehicle)
-    if progress.resumes and vehicle.mode in profile.climbing:
+    if progress.is_climb_interrupted and vehicle.mode in profile.climb_modes:
         return GuardResult(HandoverEvent.GRANTED)
-    stays = not profile.returns and vehicle.mode == progress.left_mode and not vehicle.stick
+    stays = not profile.restores_mode and vehicle.mode == progress.previous_mode and not vehicle.stick
     # The external mode is not taken up again unasked: nobody knows whose doing it is.
     if vehicle.external or is_in_failsafe(vehicle) or stays:
         return GuardResult(HandoverEvent.PENDING)
@@ -395,16 +411,16 @@ def _guard_unclear(progress: HandoverProgress, view: HandoverInput, vehicle: Veh
     if is_ordered(view, Order.ENGAGE) and not explain_engage_refusal(progress.state, view):
         return GuardResult(HandoverEvent.ENGAGE)
     seen = GuardResult(HandoverEvent.PENDING) if vehicle.external else _classify_takeover(progress, vehicle)
-    return GuardResult(HandoverEvent.PENDING) if seen.seen is HandoverEvent.UNCLEAR else seen
+    return GuardResult(HandoverEvent.PENDING) if seen.event is HandoverEvent.UNCLEAR else seen
 
 
 def _guard_landing(progress: HandoverProgress, _view: HandoverInput, vehicle: VehicleStatus) -> GuardResult:
     """Return the event seen while the vehicle is asked to land (LANDING), and once it has shown that it does."""
-    news, asking = vehicle.at_ns > progress.since_ns, progress.state is HandoverState.LANDING
+    news, asking = vehicle.at_ns > progress.state_start_ns, progress.state is HandoverState.LANDING
     if not vehicle.armed:
         return GuardResult(HandoverEvent.DISARMED if news else HandoverEvent.PENDING)
-    profile, ours = profile_of(vehicle), progress.ordered_ns is not None
-    if vehicle.mode in profile.landing:
+    profile, ours = profile_of(vehicle), progress.take_off_ordered_ns is not None
+    if vehicle.mode in profile.landing_modes:
         # A failsafe lands only until it ends: what we took off is to land whatever comes.
         for_us = not (ours and is_in_failsafe(vehicle)) or progress.request.granted_ns is not None
         return GuardResult(HandoverEvent.GRANTED if asking and for_us else HandoverEvent.PENDING)
@@ -413,12 +429,12 @@ def _guard_landing(progress: HandoverProgress, _view: HandoverInput, vehicle: Ve
     if asking:
         # Asked for in the middle of a climb, any mode of the climb may still be shown; after it was granted, only the
         # one of before may, for a while, by a vehicle that has not begun to land.
-        passing = vehicle.external or vehicle.mode in profile.climbing
-        for_ns = MODE_SHOWN_NS if vehicle.mode == progress.left_mode else GRACE_NS
+        passing = vehicle.external or vehicle.mode in profile.climb_modes
+        for_ns = MODE_SHOWN_NS if vehicle.mode == progress.previous_mode else GRACE_NS
         taken = not passing or _is_after_grant(progress, vehicle, for_ns)
         return _classify_takeover(progress, vehicle) if taken else GuardResult(HandoverEvent.PENDING)
-    if ours and progress.lands_failing and profile.climbs_on_arming and vehicle.mode == profile.take_off:
-        shown = vehicle.at_ns > progress.since_ns + MODE_SHOWN_NS
+    if ours and progress.is_failsafe_landing and profile.climbs_on_arming and vehicle.mode == profile.take_off_mode:
+        shown = vehicle.at_ns > progress.state_start_ns + MODE_SHOWN_NS
         return GuardResult(HandoverEvent.FAILSAFE if shown else HandoverEvent.PENDING)
     return _classify_takeover(progress, vehicle)
 

@@ -60,14 +60,14 @@ class Battery(Message, frozen=True, kw_only=True):
     """SYS_STATUS or BATTERY_STATUS."""
 
     voltage_v: float | None  # None if it is not measured
-    radio: bool | None = None  # a remote control is heard; None if the message does not tell
-    fenced: bool = True  # it is not beyond a fence of its own
+    has_radio: bool | None = None  # a remote control is heard; None if the message does not tell
+    is_within_fence: bool = True  # it is not beyond a fence of its own
 
 
 class FenceBreach(Message, frozen=True, kw_only=True):
     """FENCE_STATUS."""
 
-    breached: bool  # it is beyond a fence of its own
+    is_breached: bool  # it is beyond a fence of its own
 
 
 class RadioChannels(Message, frozen=True, kw_only=True):
@@ -87,9 +87,9 @@ class Text(Message, frozen=True, kw_only=True):
 
     severity: int  # MAV_SEVERITY, 0 the worst, 7 the least
     text: str  # what it says
-    number: int = 0  # of the long text that it is a piece of; 0: it is whole
+    text_id: int = 0  # of the long text that it is a piece of; 0: it is whole
     chunk: int = 0  # which piece, from 0
-    more: bool = False  # another piece follows
+    has_more: bool = False  # another piece follows
 
 
 class Ack(Message, frozen=True, kw_only=True):

@@ -111,62 +111,64 @@ def _ardupilot_mode(vehicle_type: int, custom_mode: int) -> str:
 class AutopilotProfile:
     """Profile of one autopilot: its modes for take-off, flight and landing, by its own names, and its habits."""
 
-    external: str  # the mode that takes our setpoints
-    take_off: str  # the mode that take-off begins in, asked for on the ground
-    climbing: frozenset[str]  # modes that it is in during its own climb and right after
-    landing: frozenset[str]  # modes in which it lands by itself
-    choices: dict[str, ModeChoice]  # its modes, and who can have chosen each
+    external_mode: str  # the mode that takes our setpoints
+    take_off_mode: str  # the mode that take-off begins in, asked for on the ground
+    climb_modes: frozenset[str]  # modes that it is in during its own climb and right after
+    landing_modes: frozenset[str]  # modes in which it lands by itself
+    mode_choices: dict[str, ModeChoice]  # its modes, and who can have chosen each
     # Modes of a person that a failsafe chooses all the same where the one of before cannot go on
-    degrades: frozenset[str]
+    degraded_modes: frozenset[str]
     # A failsafe that ends gives back the mode of before, and ends what the vehicle says of it; else its mode stays
-    returns: bool
+    restores_mode: bool
     # Arming in `take_off` starts the climb, to a height of its own; else MAV_CMD_NAV_TAKEOFF does, to a height above
     # the place of arming
     climbs_on_arming: bool
-    reads_raw: bool  # its RAW_IMU is taken for its acceleration; else HIGHRES_IMU alone is
-    wants_place: bool  # without GPS it has to be told a place on the globe before it arms
+    uses_raw_imu: bool  # its RAW_IMU is taken for its acceleration; else HIGHRES_IMU alone is
+    needs_global_origin: bool  # without GPS it has to be told a place on the globe before it arms
     number: int  # MAV_AUTOPILOT of its heartbeats
-    inertial: tuple[int, int]  # the messages that show how it turns, and its acceleration
+    inertial_messages: tuple[int, int]  # the messages that show how it turns, and its acceleration
     # A mode's name, of MAV_TYPE and of a heartbeat's custom_mode; empty where the kind of vehicle is not known
     mode_name: Callable[[int, int], str]
-    modes: dict[str, tuple[int, int]]  # DO_SET_MODE's parameters 2 and 3 of the modes that are asked for
+    mode_parameters: dict[str, tuple[int, int]]  # DO_SET_MODE's parameters 2 and 3 of the modes that are asked for
 
 
 PROFILES = {
     # Recorded: AUTO.TAKEOFF is given on the ground, arming starts the climb to MIS_TAKEOFF_ALT, then it holds.
     "px4": AutopilotProfile(
-        external="OFFBOARD",
-        take_off="AUTO.TAKEOFF",
-        climbing=frozenset({"AUTO.TAKEOFF", "AUTO.LOITER"}),
-        landing=frozenset({"AUTO.LAND", "AUTO.PRECLAND", "AUTO.DESCEND"}),
-        choices=_PX4_CHOICES,
+        external_mode="OFFBOARD",
+        take_off_mode="AUTO.TAKEOFF",
+        climb_modes=frozenset({"AUTO.TAKEOFF", "AUTO.LOITER"}),
+        landing_modes=frozenset({"AUTO.LAND", "AUTO.PRECLAND", "AUTO.DESCEND"}),
+        mode_choices=_PX4_CHOICES,
         # COM_OBL_RC_ACT 0 to 2, COM_POSCTL_NAVL; a mode of another program that stands for RTL or LAND
-        degrades=frozenset({"POSCTL", "ALTCTL", "STABILIZED", "MANUAL", *(f"AUTO.EXTERNAL{n}" for n in range(1, 9))}),
-        returns=True,
+        degraded_modes=frozenset(
+            {"POSCTL", "ALTCTL", "STABILIZED", "MANUAL", *(f"AUTO.EXTERNAL{n}" for n in range(1, 9))}
+        ),
+        restores_mode=True,
         climbs_on_arming=True,
-        reads_raw=False,
-        wants_place=False,
+        uses_raw_imu=False,
+        needs_global_origin=False,
         number=mavlink.MAV_AUTOPILOT_PX4,
-        inertial=(mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, mavlink.MAVLINK_MSG_ID_HIGHRES_IMU),
+        inertial_messages=(mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, mavlink.MAVLINK_MSG_ID_HIGHRES_IMU),
         mode_name=_px4_mode,
-        modes={"OFFBOARD": (6, 0), "AUTO.TAKEOFF": (4, 2)},
+        mode_parameters={"OFFBOARD": (6, 0), "AUTO.TAKEOFF": (4, 2)},
     ),
     # It climbs in GUIDED; a setpoint would end the climb.
     "ardupilot": AutopilotProfile(
-        external="GUIDED",
-        take_off="GUIDED",
-        climbing=frozenset({"GUIDED"}),
-        landing=frozenset({"LAND"}),
-        choices=_COPTER_CHOICES,
-        degrades=frozenset({"ALT_HOLD", "LOITER"}),  # FS_EKF_ACTION 2, and where BRAKE ends
-        returns=False,
+        external_mode="GUIDED",
+        take_off_mode="GUIDED",
+        climb_modes=frozenset({"GUIDED"}),
+        landing_modes=frozenset({"LAND"}),
+        mode_choices=_COPTER_CHOICES,
+        degraded_modes=frozenset({"ALT_HOLD", "LOITER"}),  # FS_EKF_ACTION 2, and where BRAKE ends
+        restores_mode=False,
         climbs_on_arming=False,
-        reads_raw=True,
-        wants_place=True,
+        uses_raw_imu=True,
+        needs_global_origin=True,
         number=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
-        inertial=(mavlink.MAVLINK_MSG_ID_ATTITUDE, mavlink.MAVLINK_MSG_ID_RAW_IMU),
+        inertial_messages=(mavlink.MAVLINK_MSG_ID_ATTITUDE, mavlink.MAVLINK_MSG_ID_RAW_IMU),
         mode_name=_ardupilot_mode,
-        modes={"GUIDED": (4, 0)},
+        mode_parameters={"GUIDED": (4, 0)},
     ),
 }
 
@@ -194,4 +196,4 @@ def describe_mode(autopilot: str, vehicle_type: int, custom_mode: int) -> tuple[
     if profile is None or not name:
         return f"MODE_{custom_mode}", False
     # GUIDED of a plane, a rover or a submarine is not the mode that a copter takes setpoints in.
-    return name, name == profile.external and (autopilot != "ardupilot" or vehicle_type in _COPTER_TYPES)
+    return name, name == profile.external_mode and (autopilot != "ardupilot" or vehicle_type in _COPTER_TYPES)

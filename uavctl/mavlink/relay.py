@@ -61,33 +61,33 @@ class Relay:
     def __init__(self, config: RelayConfig) -> None:
         self._config = config
         self._period_ns = round(1e9 / config.rate_hz)
-        self._waiting: list[tuple[PositionSample, Quaternion]] = []
+        self._queue: list[tuple[PositionSample, Quaternion]] = []
         self._newest_ns: int | None = None  # capture of the last pose sent
         self._last: tuple[Vec3, Quaternion] | None = None
-        self._same = 0
-        self._begun_ns: int | None = None  # time of the first tick
-        self._kept_by_then: Counter[str] = Counter()  # poses kept back by the time that the last one went
+        self._repeat_count = 0
+        self._start_ns: int | None = None  # time of the first tick
+        self._kept_before: Counter[str] = Counter()  # poses kept back by the time that the last one went
         self._reported = ""  # this silence, while the vehicle was armed or on the ground
-        self._reported_on_ground = False  # any
+        self._is_reported_on_ground = False  # any
         self.silent_for = ""
         self.sent = 0
         self.last_ns: int | None = None
         self.kept = dict.fromkeys(("no attitude", "refused", "stale", "stuck", "late", "rate", "no clock"), 0)
 
     @property
-    def enabled(self) -> bool:
+    def is_enabled(self) -> bool:
         """Whether positions are passed on."""
         return self._config.enabled
 
-    def take(self, sample: PositionSample, attitude: Quaternion | None) -> None:
+    def add_sample(self, sample: PositionSample, attitude: Quaternion | None) -> None:
         """Take a sample as it arrives, with the body's attitude in NED, which an estimator of yaw cannot do without."""
-        if not self.enabled:
+        if not self.is_enabled:
             return
         if attitude is None:
             self.kept["no attitude"] += 1
             return
-        self._waiting.append((sample, attitude))
-        del self._waiting[:-_MAX_QUEUE]
+        self._queue.append((sample, attitude))
+        del self._queue[:-_MAX_QUEUE]
 
     def due(self, at_ns: int, *, offset_ns: int, refused: Sequence[PositionSample]) -> tuple[Pose, ...]:
         """Return the positions that go to the vehicle in this tick, in order of capture.
@@ -96,25 +96,25 @@ class Relay:
             offset_ns: (our time - the vehicle's), by which stamps are moved.
             refused: samples that the tick did not believe.
         """
-        arrived = [one for one in self._waiting if one[0].received_ns <= at_ns]
-        self._waiting = [one for one in self._waiting if one[0].received_ns > at_ns]
+        arrived = [one for one in self._queue if one[0].received_ns <= at_ns]
+        self._queue = [one for one in self._queue if one[0].received_ns > at_ns]
         waiting = sorted(arrived, key=lambda one: one[0].captured_ns)
         out = []
         for sample, attitude in waiting:
-            reason = "refused" if sample in refused else self._reason(sample, attitude, at_ns)
+            reason = "refused" if sample in refused else self._find_reason(sample, attitude, at_ns)
             if reason is None and sample.captured_ns - offset_ns < 1000:
                 reason = "no clock"  # before the vehicle's clock began
             if reason is not None:
                 self.kept[reason] += 1
                 continue
             self._newest_ns = sample.captured_ns
-            out.append(self._pose(sample, attitude, offset_ns))
+            out.append(self._make_pose(sample, attitude, offset_ns))
         self.sent += len(out)
         if out:
-            self.last_ns, self._kept_by_then = at_ns, Counter(self.kept)
+            self.last_ns, self._kept_before = at_ns, Counter(self.kept)
         return tuple(out)
 
-    def report(self, at_ns: int, *, held_back: bool, armed: bool) -> Event | None:
+    def make_event(self, at_ns: int, *, held_back: bool, armed: bool) -> Event | None:
         """Report that the vehicle has got no position for `SILENT_NS`, with the reason, or that it gets them again.
 
         Call it in each tick after `due`. Each silence in the air is reported once; of those on the ground the first,
@@ -124,37 +124,37 @@ class Relay:
             held_back: positions are not passed on in this tick, whatever comes.
             armed: the vehicle may be in the air.
         """
-        if not self.enabled:
+        if not self.is_enabled:
             return None
-        if self._begun_ns is None:
-            self._begun_ns = at_ns
-        since_ns = self._begun_ns + START_NS if self.last_ns is None else self.last_ns
+        if self._start_ns is None:
+            self._start_ns = at_ns
+        since_ns = self._start_ns + START_NS if self.last_ns is None else self.last_ns
         silent = at_ns - since_ns >= SILENT_NS
-        self.silent_for = "" if not silent else HELD_BACK if held_back else self._reason_of_silence()
+        self.silent_for = "" if not silent else HELD_BACK if held_back else self._find_silence_reason()
         if not silent and self._reported:
             self._reported = ""
             text = "the vehicle gets positions again"
             return Event(at_ns=at_ns, severity=Severity.INFO, code=RELAY_RESUMED, text=text)
-        if not silent or self._reported == "armed" or (not armed and (self._reported or self._reported_on_ground)):
+        if not silent or self._reported == "armed" or (not armed and (self._reported or self._is_reported_on_ground)):
             return None
         self._reported = "armed" if armed else "ground"
-        self._reported_on_ground = self._reported_on_ground or not armed
-        since_ns = self._begun_ns if self.last_ns is None else since_ns
+        self._is_reported_on_ground = self._is_reported_on_ground or not armed
+        since_ns = self._start_ns if self.last_ns is None else since_ns
         text = f"the vehicle gets no position since {(at_ns - since_ns) * 1e-9:.1f} s: {REASONS[self.silent_for]}"
         return Event(at_ns=at_ns, severity=Severity.WARNING, code=RELAY_SILENT, text=text)
 
-    def _reason_of_silence(self) -> str:
-        kept = (Counter(self.kept) - self._kept_by_then).most_common(1)
+    def _find_silence_reason(self) -> str:
+        kept = (Counter(self.kept) - self._kept_before).most_common(1)
         return kept[0][0] if kept else NO_POSITION
 
-    def _reason(self, sample: PositionSample, attitude: Quaternion, at_ns: int) -> str | None:
+    def _find_reason(self, sample: PositionSample, attitude: Quaternion, at_ns: int) -> str | None:
         """Return why a pose is kept back; None if it goes."""
         same = self._last == (sample.position_m, attitude)
-        self._last, self._same = (sample.position_m, attitude), self._same + 1 if same else 0
+        self._last, self._repeat_count = (sample.position_m, attitude), self._repeat_count + 1 if same else 0
         newest_ns = self._newest_ns
         if at_ns - sample.captured_ns > MAX_AGE_NS:
             return "stale"
-        if self._same >= STUCK_AFTER:
+        if self._repeat_count >= STUCK_AFTER:
             return "stuck"
         if newest_ns is not None and sample.captured_ns <= newest_ns:
             return "late"
@@ -162,7 +162,7 @@ class Relay:
             return "rate"
         return None
 
-    def _pose(self, sample: PositionSample, attitude: Quaternion, offset_ns: int) -> Pose:
+    def _make_pose(self, sample: PositionSample, attitude: Quaternion, offset_ns: int) -> Pose:
         body = None
         if self._config.message == "odometry" and sample.velocity_mps is not None:
             w, x, y, z = attitude

@@ -54,67 +54,69 @@ class PendingRequest:
     """
 
     def __init__(self, ask: RequestKind | None, at_ns: int, patience: RequestLimits) -> None:
-        self.ask = ask  # the request; None for a wait in which nothing is sent
-        self._patience = patience
-        self._begun_ns = at_ns
+        self.kind = ask  # the request; None for a wait in which nothing is sent
+        self._limits = patience
+        self._start_ns = at_ns
         self._next_ns = at_ns
         self._tries = 0
         self._result: int | None = None
         self._texts: list[str] = []
-        self._held = ""
-        self._waits = False  # for the time after a refusal
-        self.asked_ns: int | None = None  # when it was made last
+        self._blocked_reason = ""
+        self._is_retry_delayed = False  # for the time after a refusal
+        self.requested_ns: int | None = None  # when it was made last
         self.granted_ns: int | None = None  # when it was accepted last
 
-    def hear(self, message: Ack | Text, at_ns: int) -> None:
+    def handle_message(self, message: Ack | Text, at_ns: int) -> None:
         """Take what the vehicle says."""
         if isinstance(message, Text):
             if message.severity <= mavlink.MAV_SEVERITY_WARNING and message.text not in self._texts:
                 self._texts = [*self._texts, message.text][-_MAX_TEXTS:]
-        elif self.ask is not None and self._tries and message.command == COMMANDS[self.ask]:
+        elif self.kind is not None and self._tries and message.command == COMMANDS[self.kind]:
             again, self._result = self._result == message.result, message.result
             if message.result == mavlink.MAV_RESULT_ACCEPTED:
                 self.granted_ns = at_ns
                 self._next_ns = at_ns + SHOWN_NS
             elif message.result == mavlink.MAV_RESULT_IN_PROGRESS:
-                self._next_ns = max(self._next_ns, at_ns + self._patience.retry_ns)
-            elif not (again and self._waits):  # said twice, it is not waited for twice
-                self._waits = True
-                self._next_ns = at_ns + self._patience.retry_ns
+                self._next_ns = max(self._next_ns, at_ns + self._limits.retry_ns)
+            elif not (again and self._is_retry_delayed):  # said twice, it is not waited for twice
+                self._is_retry_delayed = True
+                self._next_ns = at_ns + self._limits.retry_ns
 
     def due(self, at_ns: int, held: str = "", *, blind: bool = False) -> RequestKind | None:
         """Return the request to send now, if any; `held` says why it must not be sent yet.
 
         `blind`: nothing is asked again now, as it is not known what the vehicle does meanwhile.
         """
-        self._held = held
+        self._blocked_reason = held
         if blind and self._tries:
             return None
-        if self.ask is None or held or at_ns < self._next_ns or self._tries >= self._patience.tries:
+        if self.kind is None or held or at_ns < self._next_ns or self._tries >= self._limits.tries:
             return None
-        if self.ask is RequestKind.TAKE_OFF and self.granted_ns is not None:  # it would begin again
+        if self.kind is RequestKind.TAKE_OFF and self.granted_ns is not None:  # it would begin again
             return None
         self._tries += 1
-        self._waits, self.asked_ns = False, at_ns
-        self._next_ns = at_ns + self._patience.answer_ns
-        return self.ask
+        self._is_retry_delayed, self.requested_ns = False, at_ns
+        self._next_ns = at_ns + self._limits.answer_ns
+        return self.kind
 
-    def given_up(self, at_ns: int, *, at_once: bool = False) -> str:
+    def describe_failure(self, at_ns: int, *, at_once: bool = False) -> str:
         """Return why the request is given up; empty while it may still succeed (`at_once`: it may not)."""
-        over = at_once or at_ns - self._begun_ns >= self._patience.limit_ns
-        out_of_tries = self.ask is not None and self._tries >= self._patience.tries and at_ns >= self._next_ns
+        over = at_once or at_ns - self._start_ns >= self._limits.limit_ns
+        out_of_tries = self.kind is not None and self._tries >= self._limits.tries and at_ns >= self._next_ns
         if not (over or out_of_tries or (self._result is not None and self._result in _FINAL)):
             return ""
-        return f"{self._what()}{self._why()}{self.words} ({self._effort(at_ns)})"
+        return (
+            f"{self._describe_request()}{self._describe_reason()}{self.quoted_texts} ({self._describe_effort(at_ns)})"
+        )
 
-    def _what(self) -> str:
-        return "" if self.ask is None else f"{self.ask.value}: "
+    def _describe_request(self) -> str:
+        return "" if self.kind is None else f"{self.kind.value}: "
 
-    def _why(self) -> str:
-        if self.ask is None:
+    def _describe_reason(self) -> str:
+        if self.kind is None:
             return "it took too long"
-        if self._held and self._result is None:
-            return f"not asked for, because {self._held}"
+        if self._blocked_reason and self._result is None:
+            return f"not asked for, because {self._blocked_reason}"
         if self._result is None:
             return "the vehicle did not answer"
         name = mavlink.enums["MAV_RESULT"].get(self._result)
@@ -124,13 +126,13 @@ class PendingRequest:
         return f"the vehicle answered {result}"
 
     @property
-    def words(self) -> str:
+    def quoted_texts(self) -> str:
         """The vehicle's texts since the request, quoted, to be added to a reason."""
         return "".join(f', "{text}"' for text in self._texts)
 
-    def _effort(self, at_ns: int) -> str:
-        seconds = f"{(at_ns - self._begun_ns) / SECOND_NS:.1f} s"
-        if self.ask is None:
+    def _describe_effort(self, at_ns: int) -> str:
+        seconds = f"{(at_ns - self._start_ns) / SECOND_NS:.1f} s"
+        if self.kind is None:
             return seconds
         times = "once" if self._tries == 1 else f"{self._tries} times"
         return f"asked {times} in {seconds}" if self._tries else f"it could not be asked in {seconds}"

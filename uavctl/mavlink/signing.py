@@ -76,13 +76,13 @@ class SigningTimestamps:
     """Stamps of one key."""
 
     floor: int = 0  # newest of all before the start; it has to be kept, so that nothing older is taken ever again
-    own: int = 0  # newest that was sent or verified since, on any connection
+    newest: int = 0  # newest that was sent or verified since, on any connection
     # newest that was verified of each stream, on any connection
     streams: dict[Stream, int] = field(default_factory=dict)
 
-    def note(self, stream: Stream, stamp: int) -> None:
+    def update(self, stream: Stream, stamp: int) -> None:
         """Take a stamp that was verified."""
-        self.own = max(self.own, stamp)
+        self.newest = max(self.newest, stamp)
         if stream not in self.streams and len(self.streams) >= MAX_STREAMS:
             del self.streams[min(self.streams, key=lambda one: self.streams[one])]
         self.streams[stream] = max(stamp, self.streams.get(stream, stamp))
@@ -108,19 +108,19 @@ class FrameSigner:
         wall_offset_ns: int,
         peer_link_ids: frozenset[int] = frozenset(),
     ) -> None:
-        self._key, self._link_id, self._stamps = key, link_id, stamps
+        self._key, self._link_id, self._timestamps = key, link_id, stamps
         self._offset_ns = wall_offset_ns
         self._peer_link_ids = peer_link_ids
         self._newest: dict[Stream, int] = {}  # stamp of each stream, here
         self._floor = stamps.floor  # nothing older begins a stream; rises with the streams that are not kept any more
-        self._links: dict[tuple[int, int], int] = {}  # link id of each (system, component) that has been heard
+        self._link_ids: dict[tuple[int, int], int] = {}  # link id of each (system, component) that has been heard
 
     def sign(self, frame: bytes, at_ns: int) -> bytes:
         """An unsigned frame of MAVLink 2 with flag, checksum and signature; each stamp is larger than the last."""
-        self._stamps.own = min(max(self._now(at_ns), self._stamps.own + 1), MAX_TIMESTAMP)
+        self._timestamps.newest = min(max(self._current_timestamp(at_ns), self._timestamps.newest + 1), MAX_TIMESTAMP)
         body = bytearray(frame[:-CHECKSUM])
         body[_FLAGS] |= _SIGNED
-        signed = with_checksum(bytes(body)) + bytes((self._link_id,)) + self._stamps.own.to_bytes(6, "little")
+        signed = with_checksum(bytes(body)) + bytes((self._link_id,)) + self._timestamps.newest.to_bytes(6, "little")
         return signed + self._key.hash(signed)
 
     def verify(self, frame: bytes, at_ns: int) -> SignatureRefusal | None:
@@ -133,41 +133,41 @@ class FrameSigner:
             return SignatureRefusal.FORGED
         address, link_id = (frame[5], frame[6]), frame[-SIGNATURE]
         stamp = int.from_bytes(frame[-SIGNATURE + 1 : -_HASH], "little")
-        if not self._expects(address, link_id):
+        if not self._is_link_allowed(address, link_id):
             return SignatureRefusal.LINK_ID
         stream = (*address, link_id)
-        refusal = self._too_old(stream, stamp, at_ns)
+        refusal = self._check_age(stream, stamp, at_ns)
         if refusal is None:
-            self._links.setdefault(address, link_id)
-            self._keep(stream, stamp)
-            self._stamps.note(stream, stamp)
+            self._link_ids.setdefault(address, link_id)
+            self._store_timestamp(stream, stamp)
+            self._timestamps.update(stream, stamp)
         return refusal
 
-    def _keep(self, stream: Stream, stamp: int) -> None:
+    def _store_timestamp(self, stream: Stream, stamp: int) -> None:
         """Keep a stream's stamp. The oldest one makes room, and nothing that is older is taken for new again."""
         if stream not in self._newest and len(self._newest) >= MAX_STREAMS:
             oldest = min(self._newest, key=lambda one: self._newest[one])
             self._floor = max(self._floor, self._newest.pop(oldest))
-            self._links.pop(oldest[:2], None)
+            self._link_ids.pop(oldest[:2], None)
         self._newest[stream] = stamp
 
-    def _expects(self, address: tuple[int, int], link_id: int) -> bool:
+    def _is_link_allowed(self, address: tuple[int, int], link_id: int) -> bool:
         if self._peer_link_ids:
             return link_id in self._peer_link_ids
-        return self._links.get(address) in (None, link_id)
+        return self._link_ids.get(address) in (None, link_id)
 
-    def _too_old(self, stream: Stream, stamp: int, at_ns: int) -> SignatureRefusal | None:
-        if stamp + MAX_LINK_SKEW < self._stamps.streams.get(stream, stamp):
+    def _check_age(self, stream: Stream, stamp: int, at_ns: int) -> SignatureRefusal | None:
+        if stamp + MAX_LINK_SKEW < self._timestamps.streams.get(stream, stamp):
             return SignatureRefusal.REPLAYED
         newest = self._newest.get(stream)
         if newest is not None:
             return SignatureRefusal.REPLAYED if stamp <= newest else None
         if stamp <= self._floor:
             return SignatureRefusal.REPLAYED
-        ours = max(self._now(at_ns), self._stamps.own)
+        ours = max(self._current_timestamp(at_ns), self._timestamps.newest)
         return SignatureRefusal.STALE if stamp + MAX_NEW_STREAM_LAG < ours else None
 
-    def _now(self, at_ns: int) -> int:
+    def _current_timestamp(self, at_ns: int) -> int:
         return signing_timestamp(at_ns + self._offset_ns)
 
 
@@ -204,27 +204,27 @@ class FrameAuthenticator:
     """
 
     def __init__(self, signing: FrameSigner, *, stream: bool) -> None:
-        self._signing, self._is_stream = signing, stream
-        self._rest, self._in_step = b"", True
+        self._signer, self._is_stream = signing, stream
+        self._buffer, self._is_aligned = b"", True
         self.refused: Counter[str] = Counter()
 
-    def admit(self, data: bytes, at_ns: int) -> bytes:
+    def verify_frames(self, data: bytes, at_ns: int) -> bytes:
         """The verified frames of a datagram or chunk, without their signatures; empty if there are none."""
         if not self._is_stream and len(data) > MAX_DATAGRAM_BYTES:
             self.refused[BadBytes.OVERSIZE] += 1
             return b""
-        data = self._rest + data
+        data = self._buffer + data
         found = scan(
             data,
             final=not self._is_stream,
-            in_step=self._in_step,
-            verify=lambda frame: self._signing.verify(frame, at_ns),
+            in_step=self._is_aligned,
+            verify=lambda frame: self._signer.verify(frame, at_ns),
         )
         if self._is_stream:
-            self._rest, self._in_step = data[found.consumed :], found.in_step
+            self._buffer, self._is_aligned = data[found.consumed :], found.is_aligned
         self.refused.update(found.bad)
         return b"".join(remove_signature(frame.data) for frame in found.frames)
 
-    def seal(self, frame: bytes, at_ns: int) -> bytes:
+    def sign_frame(self, frame: bytes, at_ns: int) -> bytes:
         """One of our frames, signed."""
-        return self._signing.sign(frame, at_ns)
+        return self._signer.sign(frame, at_ns)

@@ -50,10 +50,10 @@ def mentions_radio(text: str) -> bool:
 
 def is_autonomous_mode(vehicle: VehicleStatus) -> bool:
     """Whether its mode is one that needs no person: nobody may be there."""
-    return profile_of(vehicle).choices.get(vehicle.mode, ModeChoice.PERSON) is not ModeChoice.PERSON
+    return profile_of(vehicle).mode_choices.get(vehicle.mode, ModeChoice.PERSON) is not ModeChoice.PERSON
 
 
-def determine_mode_reason(vehicle: VehicleStatus, *, had_failed: bool = False) -> ModeReason:
+def determine_mode_reason(vehicle: VehicleStatus, *, was_in_failsafe: bool = False) -> ModeReason:
     """Decide who has changed the mode to the one that the vehicle shows.
 
     Args:
@@ -61,13 +61,17 @@ def determine_mode_reason(vehicle: VehicleStatus, *, had_failed: bool = False) -
         had_failed: a failsafe had chosen the mode of before; what it said may be of then.
     """
     profile = profile_of(vehicle)
-    choice = profile.choices.get(vehicle.mode)
+    choice = profile.mode_choices.get(vehicle.mode)
     own = ModeReason.FENCE if vehicle.fence else ModeReason.FAILSAFE if vehicle.failsafe else None
     if choice is ModeChoice.FAILSAFE:
         return own or ModeReason.FAILSAFE
     if choice is ModeChoice.PERSON:
         # An ArduPilot is in a failsafe by its heartbeats also after a person has chosen another mode.
-        now = vehicle.mode in profile.degrades and not had_failed and (profile.returns or bool(vehicle.said))
+        now = (
+            vehicle.mode in profile.degraded_modes
+            and not was_in_failsafe
+            and (profile.restores_mode or bool(vehicle.said))
+        )
         own = own if now and not vehicle.stick else None
     if own is not None:
         return ModeReason.UNKNOWN if vehicle.stick else own

@@ -55,46 +55,46 @@ class BootClock:
     """
 
     def __init__(self) -> None:
-        self._known: dict[str, _Reading] = {}  # by kind of message
-        self._doubted: dict[str, _Reading] = {}  # does not go on from what is known
+        self._readings: dict[str, _Reading] = {}  # by kind of message
+        self._candidates: dict[str, _Reading] = {}  # does not go on from what is known
         self._newest: _Reading | None = None
 
-    def up_s(self, at_ns: int) -> float | None:
+    def uptime_s(self, at_ns: int) -> float | None:
         """Return the time since the vehicle started, by its own clock [s]; None if it does not tell."""
         newest = self._newest
         return None if newest is None else newest.boot_ms / 1e3 + (at_ns - newest.at_ns) / 1e9
 
-    def take(self, kind: str, boot_ms: int, at_ns: int) -> bool:
+    def update(self, kind: str, boot_ms: int, at_ns: int) -> bool:
         """Take a time since boot; whether it shows that the vehicle has started anew.
 
         Args:
             kind: of message; the clocks of two need not agree.
             boot_ms: its time since boot, modulo 2**32 ms.
         """
-        known, doubted = self._known.get(kind), self._doubted.get(kind)
+        known, doubted = self._readings.get(kind), self._candidates.get(kind)
         reading = _Reading(boot_ms, at_ns)
         if known is None or _is_same_clock(known, reading):
-            self._adopt(kind, _Reading(boot_ms, at_ns, confirmed=known is not None))
+            self._accept(kind, _Reading(boot_ms, at_ns, confirmed=known is not None))
         elif doubted is not None and at_ns - doubted.at_ns <= MAX_DELAY_SPREAD_NS and _is_same_clock(doubted, reading):
-            del self._doubted[kind]
+            del self._candidates[kind]
             anew = known.confirmed and (_advance_ms(known, reading) < 0 or _may_have_restarted(known, reading))
             if anew:  # the others' readings are from before the restart
-                self._known.clear()
-                self._doubted.clear()
-            self._adopt(kind, _Reading(boot_ms, at_ns, confirmed=True))
+                self._readings.clear()
+                self._candidates.clear()
+            self._accept(kind, _Reading(boot_ms, at_ns, confirmed=True))
             return anew
         else:
-            self._doubted[kind] = reading
+            self._candidates[kind] = reading
         return False
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Begin anew, with another vehicle."""
-        self._known.clear()
-        self._doubted.clear()
+        self._readings.clear()
+        self._candidates.clear()
         self._newest = None
 
-    def _adopt(self, kind: str, reading: _Reading) -> None:
-        self._known[kind] = self._newest = reading
+    def _accept(self, kind: str, reading: _Reading) -> None:
+        self._readings[kind] = self._newest = reading
 
 
 def _advance_ms(before: _Reading, after: _Reading) -> int:
@@ -128,45 +128,45 @@ class _PartialText(msgspec.Struct):
     """Text of which more pieces are to come."""
 
     first: Text
-    said: str
+    text: str
     next_chunk: int
     at_ns: int
 
-    def so_far(self) -> Text:
+    def finish(self) -> Text:
         """Return the text as far as it has come, with a mark for the part that is missing."""
-        return _make_text(self.first, self.said + MISSING_CHUNK)
+        return _make_text(self.first, self.text + MISSING_CHUNK)
 
 
 class StatusTextAssembler:
     """Joins the pieces of texts, by their sender."""
 
     def __init__(self) -> None:
-        self._begun: dict[tuple[int, int], _PartialText] = {}
+        self._partial_texts: dict[tuple[int, int], _PartialText] = {}
 
-    def take(self, text: Text, at_ns: int) -> tuple[Text, ...]:
+    def add_chunk(self, text: Text, at_ns: int) -> tuple[Text, ...]:
         """Take a piece, or a whole text; the texts that are whole now."""
         sender = text.system, text.component
-        begun = self._begun.get(sender)
+        begun = self._partial_texts.get(sender)
         told: tuple[Text, ...] = ()
-        if begun is not None and (begun.first.number != text.number or text.chunk < begun.next_chunk):
-            told = (self._begun.pop(sender).so_far(),)
+        if begun is not None and (begun.first.text_id != text.text_id or text.chunk < begun.next_chunk):
+            told = (self._partial_texts.pop(sender).finish(),)
             begun = None
         if begun is None:
             begun = _PartialText(text, MISSING_CHUNK if text.chunk else "", text.chunk, at_ns)
-        begun.said += ("" if text.chunk == begun.next_chunk else MISSING_CHUNK) + text.text
+        begun.text += ("" if text.chunk == begun.next_chunk else MISSING_CHUNK) + text.text
         begun.next_chunk = text.chunk + 1
-        if not text.more:
-            self._begun.pop(sender, None)
-            return (*told, _make_text(begun.first, begun.said))
-        if sender in self._begun or len(self._begun) < MAX_PARTIAL_TEXTS:
-            self._begun[sender] = begun
+        if not text.has_more:
+            self._partial_texts.pop(sender, None)
+            return (*told, _make_text(begun.first, begun.text))
+        if sender in self._partial_texts or len(self._partial_texts) < MAX_PARTIAL_TEXTS:
+            self._partial_texts[sender] = begun
             return told
-        return (*told, begun.so_far())
+        return (*told, begun.finish())
 
-    def overdue(self, at_ns: int) -> tuple[Text, ...]:
+    def flush_overdue(self, at_ns: int) -> tuple[Text, ...]:
         """The texts whose rest has not come."""
-        late = [sender for sender, begun in self._begun.items() if at_ns - begun.at_ns > CHUNK_WAIT_NS]
-        return tuple(self._begun.pop(sender).so_far() for sender in late)
+        late = [sender for sender, begun in self._partial_texts.items() if at_ns - begun.at_ns > CHUNK_WAIT_NS]
+        return tuple(self._partial_texts.pop(sender).finish() for sender in late)
 
 
 def _make_text(first: Text, text: str) -> Text:
@@ -180,23 +180,23 @@ class ModeReasonEvidence:
     """
 
     def __init__(self) -> None:
-        self._failsafe_ns = self._fence_ns = self._said_ns = self._stick_ns = self._station_ns = NEVER_NS
-        self._beats_ns = NEVER_NS, NEVER_NS  # the newest heartbeat, and the one before
-        self._said = ""
+        self._failsafe_ns = self._fence_ns = self._failsafe_text_ns = self._stick_ns = self._station_ns = NEVER_NS
+        self._heartbeats_ns = NEVER_NS, NEVER_NS  # the newest heartbeat, and the one before
+        self._failsafe_text = ""
         self._station = 0
-        self._rest_us: list[int] = []  # of each channel, since it moved last; 0: not known
-        self._radio: bool | None = None  # None before it says so
-        self._fenced = True
+        self._reference_us: list[int] = []  # of each channel, since it moved last; 0: not known
+        self._has_radio: bool | None = None  # None before it says so
+        self._is_within_fence = True
 
-    def beat(self, at_ns: int) -> None:
+    def add_heartbeat(self, at_ns: int) -> None:
         """Take a heartbeat, which shows the mode."""
-        self._beats_ns = at_ns, self._beats_ns[0]
+        self._heartbeats_ns = at_ns, self._heartbeats_ns[0]
 
-    def word(self, text: str, at_ns: int) -> None:
+    def add_text(self, text: str, at_ns: int) -> None:
         """Take a text, of any severity."""
         fence, failsafe = reports_fence_breach(text), reports_failsafe(text)
         if fence or failsafe:
-            self._said, self._said_ns = text, at_ns
+            self._failsafe_text, self._failsafe_text_ns = text, at_ns
         if fence:
             self._fence_ns = at_ns
         if failsafe:
@@ -204,45 +204,45 @@ class ModeReasonEvidence:
         elif "failsafe" in text.lower() and "clear" in text.lower():
             self._failsafe_ns = NEVER_NS
 
-    def fence(self, at_ns: int, *, within: bool) -> None:
+    def update_fence(self, at_ns: int, *, within: bool) -> None:
         """Take whether it is within its fence; that it comes beyond it counts."""
-        if self._fenced and not within:
+        if self._is_within_fence and not within:
             self._fence_ns = at_ns
-        self._fenced = within
+        self._is_within_fence = within
 
-    def radio(self, *, heard: bool) -> None:
+    def update_radio(self, *, heard: bool) -> None:
         """Take whether a remote control is heard."""
-        self._radio = heard
+        self._has_radio = heard
 
-    def channels(self, pulses_us: tuple[int, ...], at_ns: int) -> None:
+    def update_channels(self, pulses_us: tuple[int, ...], at_ns: int) -> None:
         """Take the channels of a remote control."""
-        if len(pulses_us) != len(self._rest_us):
-            self._rest_us = [0] * len(pulses_us)
+        if len(pulses_us) != len(self._reference_us):
+            self._reference_us = [0] * len(pulses_us)
         for i, pulse in enumerate(pulses_us):
-            rest = self._rest_us[i]
+            rest = self._reference_us[i]
             if not rest or abs(pulse - rest) >= STICK_US:
-                self._rest_us[i] = pulse
+                self._reference_us[i] = pulse
                 self._stick_ns = at_ns if rest and pulse else self._stick_ns
 
-    def ordered(self, station: int, at_ns: int) -> None:
+    def add_mode_command(self, station: int, at_ns: int) -> None:
         """Take an order of a mode that another than us has given."""
         self._station, self._station_ns = station, at_ns
 
-    def on(self, status: VehicleStatus, at_ns: int, *, critical: bool) -> VehicleStatus:
+    def apply_to(self, status: VehicleStatus, at_ns: int, *, critical: bool) -> VehicleStatus:
         """Return a status with what counts at a time; `critical`: by its heartbeat a failsafe acts."""
         since_ns = at_ns - EVIDENCE_NS
-        if self._beats_ns[1] > NEVER_NS:
-            since_ns = min(since_ns, self._beats_ns[1])
-        said = self._said if self._said_ns > since_ns else ""
+        if self._heartbeats_ns[1] > NEVER_NS:
+            since_ns = min(since_ns, self._heartbeats_ns[1])
+        said = self._failsafe_text if self._failsafe_text_ns > since_ns else ""
         # A receiver that has lost its remote control moves the channels by itself.
-        lost = self._radio is False or mentions_radio(said)
+        lost = self._has_radio is False or mentions_radio(said)
         return msgspec.structs.replace(
             status,
             failsafe=critical or self._failsafe_ns > since_ns,
             fence=self._fence_ns > since_ns,
             said=said,
             stick=self._stick_ns > since_ns and not lost,
-            radio=bool(self._radio) and not self._rest_us,
+            radio=bool(self._has_radio) and not self._reference_us,
             station=self._station if self._station_ns > since_ns else 0,
         )
 
@@ -312,12 +312,12 @@ class SensorStreamMonitor:
 
     def __init__(self) -> None:
         self._clock = ArrivalClock()
-        self._heard_ns = 0  # the last that was judged
+        self._checked_ns = 0  # the last that was judged
         self._stamp_us = 0  # of that
         self._values: Vec3 | None = None
         self._since_us = 0  # stamp of the first of the same readings in a row
 
-    def takes(self, stamp_us: int, values: Vec3, at_ns: int, *, frozen_us: int = 0) -> bool | None:
+    def is_current(self, stamp_us: int, values: Vec3, at_ns: int, *, frozen_us: int = 0) -> bool | None:
         """Whether a message is a measurement of now; None for one that was there already.
 
         Args:
@@ -327,15 +327,15 @@ class SensorStreamMonitor:
                 never repeats.
         """
         advance_us = stamp_us - self._stamp_us
-        if advance_us < -MAX_BACKSTEP_US or advance_us > (at_ns - self._heard_ns) // 1000 + MAX_BACKSTEP_US:
+        if advance_us < -MAX_BACKSTEP_US or advance_us > (at_ns - self._checked_ns) // 1000 + MAX_BACKSTEP_US:
             self._clock, self._since_us = ArrivalClock(), stamp_us
         elif advance_us <= 0:
             return None
         if values != self._values:
             self._since_us = stamp_us
         repeats = values == self._values
-        delay_ns = self._clock.delay_ns(1000 * stamp_us, at_ns)
-        self._stamp_us, self._heard_ns, self._values = stamp_us, at_ns, values
+        delay_ns = self._clock.measure_delay_ns(1000 * stamp_us, at_ns)
+        self._stamp_us, self._checked_ns, self._values = stamp_us, at_ns, values
         return delay_ns <= MAX_DELAY_NS and not (repeats and stamp_us - self._since_us >= frozen_us)
 
 
@@ -362,26 +362,26 @@ class VehicleMonitor:
         inertial: bool = False,
         channels: bool = True,
     ) -> None:
-        self._bad = bad
-        self._inertial, self._channels = inertial, channels
-        self._own = own
+        self._count_bad = bad
+        self._wants_inertial, self._uses_channels = inertial, channels
+        self._own_address = own
         self._system, self._component = system, component
         self._landed: bool | None = None
         self._own_climb = False
         self._battery_v: float | None = None
-        self._clock = BootClock()
-        self._ready = False  # by its last heartbeat
+        self._boot_clock = BootClock()
+        self._is_ready = False  # by its last heartbeat
         self._heard_ns = 0  # any word of it
         self._evidence = ModeReasonEvidence()
-        self._critical = False  # by its last heartbeat
-        self._another_ns: int | None = None  # when another vehicle was heard last
+        self._is_in_failsafe = False  # by its last heartbeat
+        self._other_vehicle_ns: int | None = None  # when another vehicle was heard last
         self._status: VehicleStatus | None = None
         self._motion = VehicleMotion()
-        self._streams: dict[str, SensorStreamMonitor] = {}  # by kind of message
-        self._turned: tuple[Vec3, int] | None = None  # attitude, and when it was told
+        self._sensor_streams: dict[str, SensorStreamMonitor] = {}  # by kind of message
+        self._attitude: tuple[Vec3, int] | None = None  # attitude, and when it was told
         self.inertial_used = self.inertial_total = 0  # inertial data that gave an acceleration, and all
         self.boots = 0
-        self.unready = 0  # times that it ceased to be ready: its streams may be gone
+        self.not_ready_count = 0  # times that it ceased to be ready: its streams may be gone
         self.address: tuple[int, int] | None = None  # system, component
 
     @property
@@ -390,18 +390,18 @@ class VehicleMonitor:
         return "" if self._status is None else self._status.autopilot
 
     @property
-    def armed(self) -> bool:
+    def is_armed(self) -> bool:
         """Whether it says that it is armed."""
         return self._status is not None and self._status.armed
 
-    def take(
+    def handle_message(
         self, message: Message, at_ns: int
     ) -> tuple[VehicleStatus | VehicleMotion | InertialSample | Event | Ack | Text, ...]:
         """Take any message; only the vehicle's count."""
         if isinstance(message, Heartbeat) and is_vehicle(message):
-            return self._heartbeat(message, at_ns)
+            return self._handle_heartbeat(message, at_ns)
         if isinstance(message, ModeCommand):
-            return self._is_ordered(message.system, message.target_system, at_ns)
+            return self._handle_mode_command(message.system, message.target_system, at_ns)
         if self.address is None or message.system != self.address[0]:
             return ()
         if message.component != self.address[1]:  # a companion computer or gimbal of the same system: its words only
@@ -409,76 +409,80 @@ class VehicleMonitor:
         self._heard_ns = at_ns
         match message:
             case Landed(landed=landed, own_climb=own_climb):
-                return self._phase(landed, own_climb)
+                return self._update_landed(landed, own_climb)
             case Battery():
                 self._battery_v = self._battery_v if message.voltage_v is None else message.voltage_v
-                if message.radio is None or not self._channels:
+                if message.has_radio is None or not self._uses_channels:
                     return ()
-                self._evidence.radio(heard=message.radio)
-                self._evidence.fence(at_ns, within=message.fenced)
-                return self._proves(at_ns)
-            case FenceBreach(breached=breached):
-                self._evidence.fence(at_ns, within=not breached)
-                return self._proves(at_ns)
+                self._evidence.update_radio(heard=message.has_radio)
+                self._evidence.update_fence(at_ns, within=message.is_within_fence)
+                return self._update_evidence(at_ns)
+            case FenceBreach(is_breached=breached):
+                self._evidence.update_fence(at_ns, within=not breached)
+                return self._update_evidence(at_ns)
             case RadioChannels(channels_us=channels_us):
-                self._evidence.channels(channels_us, at_ns)
-                return self._proves(at_ns)
+                self._evidence.update_channels(channels_us, at_ns)
+                return self._update_evidence(at_ns)
             case Position(boot_ms=True, stamp_us=int(stamp_us)):
-                anew = self._tells_time("position", stamp_us, at_ns)
-                return (*anew, *self._moves(at_ns, velocity=message.velocity_mps))
+                anew = self._update_boot_clock("position", stamp_us, at_ns)
+                return (*anew, *self._update_motion(at_ns, velocity=message.velocity_mps))
             case Attitude(angles_rad=angles_rad):
                 kind = "quaternion" if message.quaternion else "angles"
-                anew = self._tells_time(kind, message.stamp_us, at_ns) if message.stamp_us else ()
+                anew = self._update_boot_clock(kind, message.stamp_us, at_ns) if message.stamp_us else ()
                 # Beside inertial data both are of use; else a vehicle that streams both is believed by one.
-                if message.quaternion and not self._inertial:
+                if message.quaternion and not self._wants_inertial:
                     return anew
-                self._turns(message, at_ns)
-                return (*anew, *self._moves(at_ns, attitude=angles_rad))
+                self._update_attitude(message, at_ns)
+                return (*anew, *self._update_motion(at_ns, attitude=angles_rad))
             case Inertial(raw=raw):
                 known = PROFILES.get(self.autopilot)
-                return self._accelerates(message, at_ns) if not raw or (known and known.reads_raw) else ()
+                return self._make_inertial_sample(message, at_ns) if not raw or (known and known.uses_raw_imu) else ()
             case Text(text=text):
-                self._evidence.word(text, at_ns)
-                return message, _text_event(message, at_ns), *self._proves(at_ns)
-            case Ack() if self._is_ours(message):
+                self._evidence.add_text(text, at_ns)
+                return message, _text_event(message, at_ns), *self._update_evidence(at_ns)
+            case Ack() if self._is_for_us(message):
                 return (message,) if message.command in _UNREPORTED_COMMANDS else (message, _ack_event(message, at_ns))
             case Ack(command=command, result=mavlink.MAV_RESULT_ACCEPTED) if command in MODE_COMMANDS:
-                return self._is_ordered(message.target_system, message.system, at_ns)
+                return self._handle_mode_command(message.target_system, message.system, at_ns)
         return ()
 
-    def _is_ordered(self, station: int, target: int, at_ns: int) -> tuple[VehicleStatus, ...]:
+    def _handle_mode_command(self, station: int, target: int, at_ns: int) -> tuple[VehicleStatus, ...]:
         """Take note that somebody orders a mode of a vehicle; only others' orders of this one count."""
-        if self.address is None or target not in (0, self.address[0]) or station in (self._own[0], self.address[0]):
+        if (
+            self.address is None
+            or target not in (0, self.address[0])
+            or station in (self._own_address[0], self.address[0])
+        ):
             return ()
-        self._evidence.ordered(station, at_ns)
-        return self._proves(at_ns)
+        self._evidence.add_mode_command(station, at_ns)
+        return self._update_evidence(at_ns)
 
-    def _proves(self, at_ns: int) -> tuple[VehicleStatus, ...]:
+    def _update_evidence(self, at_ns: int) -> tuple[VehicleStatus, ...]:
         """Return a status at once where there is new evidence of who has changed its mode."""
         if self._status is None:
             return ()
-        before, self._status = self._status, self._evidence.on(self._status, at_ns, critical=self._critical)
+        before, self._status = self._status, self._evidence.apply_to(self._status, at_ns, critical=self._is_in_failsafe)
         return () if self._status == before else (self._status,)
 
-    def _is_ours(self, ack: Ack) -> bool:
-        system, component = self._own
+    def _is_for_us(self, ack: Ack) -> bool:
+        system, component = self._own_address
         return ack.target_system in (0, system) and ack.target_component in (0, component)
 
-    def up_s(self, at_ns: int) -> float | None:
+    def uptime_s(self, at_ns: int) -> float | None:
         """Return the time since it started, by its own clock [s]; None if it does not tell."""
-        return self._clock.up_s(at_ns)
+        return self._boot_clock.uptime_s(at_ns)
 
     def attitude(self, at_ns: int) -> Quaternion | None:
         """Return the rotation of a specific force at that time into local NED (w, x, y, z); None if old or unknown."""
-        if self._turned is None or at_ns - self._turned[1] > MAX_ATTITUDE_AGE_NS:
+        if self._attitude is None or at_ns - self._attitude[1] > MAX_ATTITUDE_AGE_NS:
             return None
-        return quaternion_from_euler(self._turned[0])
+        return quaternion_from_euler(self._attitude[0])
 
-    def _tells_time(self, kind: str, stamp_us: int, at_ns: int) -> tuple[VehicleStatus, ...]:
+    def _update_boot_clock(self, kind: str, stamp_us: int, at_ns: int) -> tuple[VehicleStatus, ...]:
         """Watch its time since boot; a status tells at once that it has started anew."""
-        return self._reboot() if self._clock.take(kind, stamp_us // 1000, at_ns) else ()
+        return self._reset_after_reboot() if self._boot_clock.update(kind, stamp_us // 1000, at_ns) else ()
 
-    def _phase(self, landed: bool | None, own_climb: bool) -> tuple[VehicleStatus, ...]:
+    def _update_landed(self, landed: bool | None, own_climb: bool) -> tuple[VehicleStatus, ...]:
         """Whether it stands, climbs or lands by itself; a status tells at once when that changes in flight."""
         changed = own_climb != self._own_climb
         self._landed, self._own_climb = landed, own_climb
@@ -487,7 +491,7 @@ class VehicleMonitor:
         self._status = msgspec.structs.replace(self._status, landed=landed, own_climb=own_climb)
         return (self._status,)
 
-    def _moves(
+    def _update_motion(
         self, at_ns: int, *, velocity: Vec3 | None = None, attitude: Vec3 | None = None
     ) -> tuple[VehicleMotion, ...]:
         """Return the vehicle's motion, updated with what it has just said of it."""
@@ -497,26 +501,28 @@ class VehicleMonitor:
             self._motion = msgspec.structs.replace(self._motion, attitude_rad=attitude, attitude_ns=at_ns)
         return (self._motion,)
 
-    def _turns(self, message: Attitude, at_ns: int) -> None:
+    def _update_attitude(self, message: Attitude, at_ns: int) -> None:
         """Remember the attitude that specific forces are turned by, if it is of now."""
-        if not self._inertial:
+        if not self._wants_inertial:
             return
         kind = "quaternion" if message.quaternion else "angles"
-        if self._streams.setdefault(kind, SensorStreamMonitor()).takes(message.stamp_us, message.angles_rad, at_ns):
-            self._turned = message.angles_rad, at_ns
+        if self._sensor_streams.setdefault(kind, SensorStreamMonitor()).is_current(
+            message.stamp_us, message.angles_rad, at_ns
+        ):
+            self._attitude = message.angles_rad, at_ns
         else:
-            self._bad(STALE_INERTIAL)
+            self._count_bad(STALE_INERTIAL)
 
-    def _accelerates(self, message: Inertial, at_ns: int) -> tuple[InertialSample, ...]:
+    def _make_inertial_sample(self, message: Inertial, at_ns: int) -> tuple[InertialSample, ...]:
         """Its acceleration by a specific force and its newest attitude; nothing where either is old or unknown."""
-        if not self._inertial:
+        if not self._wants_inertial:
             return ()
         kind, frozen_us = ("raw", FROZEN_RAW_US) if message.raw else ("highres", FROZEN_US)
-        stream = self._streams.setdefault(kind, SensorStreamMonitor())
-        new = stream.takes(message.stamp_us, message.specific_force_mps2, at_ns, frozen_us=frozen_us)
+        stream = self._sensor_streams.setdefault(kind, SensorStreamMonitor())
+        new = stream.is_current(message.stamp_us, message.specific_force_mps2, at_ns, frozen_us=frozen_us)
         self.inertial_total += new is not None
         if not new:
-            self._bad(STALE_INERTIAL)
+            self._count_bad(STALE_INERTIAL)
             return ()
         attitude = self.attitude(at_ns)
         turned = None if attitude is None else rotate_vector(attitude, message.specific_force_mps2)
@@ -526,54 +532,56 @@ class VehicleMonitor:
         north, east, down = turned
         return (InertialSample(at_ns=at_ns, accel_mps2=(north, east, down + GRAVITY_MPS2)),)
 
-    def _reboot(self) -> tuple[VehicleStatus, ...]:
+    def _reset_after_reboot(self) -> tuple[VehicleStatus, ...]:
         self.boots += 1
-        self._streams, self._turned = {}, None
+        self._sensor_streams, self._attitude = {}, None
         self._landed, self._evidence = None, ModeReasonEvidence()
         if self._status is None:
             return ()
         self._status = msgspec.structs.replace(self._status, boots=self.boots)
         return (self._status,)
 
-    def _has_gone(self, at_ns: int) -> bool:
+    def _is_lost_on_ground(self, at_ns: int) -> bool:
         """Whether the vehicle that is followed is silent and was on the ground: nothing of ours can be flying it."""
         status = self._status
         return status is not None and not status.armed and at_ns - status.at_ns > GONE_NS
 
-    def _begin(self, address: tuple[int, int], at_ns: int) -> None:
+    def _follow_vehicle(self, address: tuple[int, int], at_ns: int) -> None:
         """Follow a vehicle; if it is another one than before, forget the old one's state: nothing is armed yet."""
         if self.address is not None and self.address[0] == address[0]:  # it was a device of this one
-            self._streams, self._turned, self._battery_v, self._landed = {}, None, None, None
-            self._ready = False
-            self._clock.forget()
+            self._sensor_streams, self._attitude, self._battery_v, self._landed = {}, None, None, None
+            self._is_ready = False
+            self._boot_clock.reset()
         elif self.address is not None:
-            self._reboot()
+            self._reset_after_reboot()
             self._battery_v = None
-            self._clock.forget()
-            self._another_ns = at_ns
+            self._boot_clock.reset()
+            self._other_vehicle_ns = at_ns
         self.address, self._status = address, None
 
-    def _heartbeat(self, message: Heartbeat, at_ns: int) -> tuple[VehicleStatus, ...]:
+    def _handle_heartbeat(self, message: Heartbeat, at_ns: int) -> tuple[VehicleStatus, ...]:
         address = (message.system, message.component)
         wanted = self._system in (0, message.system) and self._component in (0, message.component)
-        if wanted and (is_preferred(address, self.address) or (address != self.address and self._has_gone(at_ns))):
-            self._begin(address, at_ns)
+        if wanted and (
+            is_preferred(address, self.address) or (address != self.address and self._is_lost_on_ground(at_ns))
+        ):
+            self._follow_vehicle(address, at_ns)
         if address != self.address:
             if self.address is None or message.system != self.address[0]:
-                self._bad(SECOND_VEHICLE)
-                self._another_ns = at_ns
+                self._count_bad(SECOND_VEHICLE)
+                self._other_vehicle_ns = at_ns
             return ()
         booting = message.system_status == mavlink.MAV_STATE_BOOT and self._status is not None
-        if booting and self._ready and at_ns - self._heard_ns > BOOTING_NS:
-            self._reboot()
-            self._clock.forget()
+        if booting and self._is_ready and at_ns - self._heard_ns > BOOTING_NS:
+            self._reset_after_reboot()
+            self._boot_clock.reset()
         self._heard_ns = at_ns
         ready = message.system_status not in _NOT_READY_STATES
-        self.unready += self._ready and not ready
-        self._ready = ready
+        self.not_ready_count += self._is_ready and not ready
+        self._is_ready = ready
         autopilot = autopilot_name(message.autopilot)
         mode, external = describe_mode(autopilot, message.vehicle_type, message.custom_mode)
-        self._critical = message.system_status in _FAILSAFE_STATES
+        self._is_in_failsafe = message.system_status in _FAILSAFE_STATES
         status = VehicleStatus(
             at_ns=at_ns,
             autopilot=autopilot,
@@ -584,10 +592,10 @@ class VehicleMonitor:
             own_climb=self._own_climb,
             battery_v=self._battery_v,
             boots=self.boots,
-            alone=self._another_ns is None or at_ns - self._another_ns > ALONE_NS,
+            alone=self._other_vehicle_ns is None or at_ns - self._other_vehicle_ns > ALONE_NS,
         )
-        self._evidence.beat(at_ns)
-        self._status = self._evidence.on(status, at_ns, critical=self._critical)
+        self._evidence.add_heartbeat(at_ns)
+        self._status = self._evidence.apply_to(status, at_ns, critical=self._is_in_failsafe)
         return (self._status,)
 
 

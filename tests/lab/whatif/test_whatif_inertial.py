@@ -131,7 +131,7 @@ def test_the_controller_reads_the_acceleration_more(
         data = frames.heard(frame, at_ns, BY)
         for bytes_of, watch, heard in ((frame.data, recorded, read[0]), (data, other, read[1])):
             for message in decode(bytes_of).messages:
-                heard += [one for one in watch.take(message, at_ns) if isinstance(one, InertialSample)]
+                heard += [one for one in watch.handle_message(message, at_ns) if isinstance(one, InertialSample)]
     assert len(read[0]) == len(read[1]) == frames.moved == 20 and frames.left_out == 0
     more = [np.subtract(now.accel_mps2, was.accel_mps2) for was, now in zip(*read, strict=True)]
     np.testing.assert_allclose(more, [BY] * 20, atol=math.sqrt(3.0) * resolution)

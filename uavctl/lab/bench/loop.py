@@ -326,7 +326,7 @@ def empty_loop(pipe: Pipe, tick_ns: int, seconds: float, real: bool) -> None:
     """Wait for ticks as the daemon does, and do nothing; send how late they were [ns] and what was permitted."""
     if real:
         with enable_realtime() as outcomes:
-            pipe.send((_lateness(tick_ns, seconds), all(outcome.ok for outcome in outcomes)))
+            pipe.send((_lateness(tick_ns, seconds), all(outcome.is_applied for outcome in outcomes)))
     else:
         pipe.send((_lateness(tick_ns, seconds), True))
 

@@ -379,7 +379,7 @@ def _samples(packets: Sequence[TlogPacket], config: Config) -> tuple[list[Positi
     for one in packets:
         for trip in exchange.take(one.data, one.at_ns, outgoing=one.outgoing):
             for address in senders:
-                link.answered(address, trip.sent_ns, trip.remote_ns, one.at_ns)
+                link.add_timesync_answer(address, trip.sent_ns, trip.remote_ns, one.at_ns)
         if one.outgoing:
             continue
         understood = link.receive(one.data, one.at_ns)

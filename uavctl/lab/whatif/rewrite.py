@@ -145,7 +145,7 @@ class InertialFrames:
         samples = [
             item
             for message in decode(frame.data).messages
-            for item in self._watch.take(message, at_ns)
+            for item in self._watch.handle_message(message, at_ns)
             if isinstance(item, InertialSample)
         ]
         address = self._watch.address
