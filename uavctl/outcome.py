@@ -14,8 +14,8 @@ from uavctl.flight.decision import CONTROLLER_FAULT, MISSION_OVER
 from uavctl.mavlink.handover import StateTransition
 from uavctl.mavlink.handover_guards import CLIMB_ABORTED, is_in_failsafe, is_silent
 from uavctl.mavlink.handover_states import HandoverEvent, HandoverState
+from uavctl.mavlink.mode_reason import PERSON_REASONS, ModeReason
 from uavctl.mavlink.requests import RequestKind
-from uavctl.mavlink.switcher import PERSON_REASONS, ModeReason
 from uavctl.records import ORDER_ACCEPTED, ControlMode, Decision, Ending, Event, Order, VehicleStatus
 
 SECOND_NS = 1_000_000_000

@@ -27,10 +27,11 @@ from logs.recording.tlog import Tlog, TlogPacket, read_tlog
 from uavctl.errors import RecordingError
 from uavctl.mavlink.clocksync import ClockSync, StampUnit, StampUnitDetector
 from uavctl.mavlink.codec import AUTOPILOT_ESTIMATE, decode_scan
-from uavctl.mavlink.framing import MessageLayout, scan_one
+from uavctl.mavlink.framing import scan_one
+from uavctl.mavlink.message_layout import MessageLayout
 from uavctl.mavlink.messages import Attitude, Battery, Heartbeat, Message, Position, Text
 from uavctl.mavlink.profile import autopilot_name, describe_mode
-from uavctl.mavlink.vehicle import StatusTextAssembler
+from uavctl.mavlink.statustext import StatusTextAssembler
 from uavctl.records import Datagram, Vec3
 
 _SETPOINT, _GLOBAL = mavlink.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED, mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT

@@ -14,7 +14,8 @@ import msgspec
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from uavctl.mavlink.framing import MessageLayout, scan, text_of
+from uavctl.mavlink.framing import scan
+from uavctl.mavlink.message_layout import MessageLayout, text_of
 from uavctl.records import Datagram, Record, ToldParameter
 
 _HEARTBEAT, _PARAM_VALUE = mavlink.MAVLINK_MSG_ID_HEARTBEAT, mavlink.MAVLINK_MSG_ID_PARAM_VALUE

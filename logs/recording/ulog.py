@@ -25,7 +25,7 @@ from logs.recording.parameters import VehicleParameter
 from logs.recording.summary import count
 from logs.recording.tlog import LONGEST_SILENCE_NS
 from uavctl.errors import RecordingError, need
-from uavctl.mavlink.framing import plain_text
+from uavctl.mavlink.message_layout import plain_text
 
 _HEAD_BYTES = 16  # magic, version, time of the start
 _OWN, _SENT = "vehicle_local_position", ("vehicle_visual_odometry", "vehicle_mocap_odometry")

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from ticked_rig import ticked
 
-from uavctl.daemon.health import Notifier
+from uavctl.daemon.notifier import Notifier
 from uavctl.errors import UsageError
 
 TICK_NS = 50_000_000

@@ -11,8 +11,8 @@ from collections.abc import Iterator
 import pytest
 from ticked_rig import ticked
 
-from uavctl.daemon import daemon as module
-from uavctl.daemon.daemon import GarbageCollector, RealtimeSetting, control_garbage_collection, enable_realtime
+from uavctl.daemon import realtime as module
+from uavctl.daemon.realtime import GarbageCollector, RealtimeSetting, control_garbage_collection, enable_realtime
 
 SECOND = 1_000_000_000
 

@@ -10,8 +10,9 @@ from pathlib import Path
 import pytest
 from user_rig import OTHER, as_other, shared_folder
 
-from uavctl.daemon import lock as runtime_folder
-from uavctl.daemon.lock import find_runtime_folders, is_private_folder, lock_paths, lock_vehicle
+from uavctl.daemon import runtime_folder
+from uavctl.daemon.lock import lock_paths, lock_vehicle
+from uavctl.daemon.runtime_folder import find_runtime_folders, is_private_folder
 from uavctl.errors import UsageError, VehicleTakenError
 
 URL = "udpin://127.0.0.1:14540"

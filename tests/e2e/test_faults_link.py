@@ -18,8 +18,9 @@ from uavctl.config import load_config
 from uavctl.config.connections import SourceConfig
 from uavctl.flight.gating import refusal
 from uavctl.mavlink import codec
-from uavctl.mavlink.codec import Encoder, decode
+from uavctl.mavlink.codec import decode
 from uavctl.mavlink.connection import Item, MavlinkConnection
+from uavctl.mavlink.encoder import Encoder
 from uavctl.mavlink.handover import HandoverStateMachine
 from uavctl.mavlink.handover_guards import HandoverInput
 from uavctl.mavlink.handover_states import HandoverState, SetpointMode

@@ -14,8 +14,8 @@ from logs.recording.replay import replay
 from sim.simulation import Peers
 from uavctl.config import load_config
 from uavctl.loop import MAX_SAMPLES
-from uavctl.mavlink.codec import UnsendableError
 from uavctl.mavlink.connection import MavlinkConnection
+from uavctl.mavlink.encoder import UnsendableError
 from uavctl.mavlink.handover import HandoverOutput, HandoverStateMachine
 from uavctl.mavlink.handover_guards import HandoverInput
 from uavctl.records import (

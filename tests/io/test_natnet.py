@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from uavctl.errors import ConnectionSpecError
 from uavctl.frames import Frame, Up, convert_pose_to_frd, rotate_vector
-from uavctl.io.camera import BodyPose, CameraError, CameraUrl, Echo, parse
+from uavctl.io.camera import BodyPose, CameraError, Echo
 from uavctl.io.camera_host import CameraMessageEncoder, parse_time_requests
+from uavctl.io.camera_url import CameraUrl, parse
 from uavctl.io.natnet import MISSING, NO_STAMP, SILENT, UNREADABLE, UNTRACKED, NatNet
 from uavctl.mavlink.codec import decode
 from uavctl.mavlink.messages import Position, TimeSync

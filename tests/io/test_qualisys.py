@@ -17,7 +17,8 @@ from scipy.spatial.transform import Rotation
 from uavctl.errors import ConnectionSpecError
 from uavctl.frames import Up
 from uavctl.io.base import Connection
-from uavctl.io.camera import BodyPose, CameraError, parse
+from uavctl.io.camera import BodyPose, CameraError
+from uavctl.io.camera_url import parse
 from uavctl.io.qualisys import MISSING, NO_MEASUREMENT, SILENT, UNREADABLE, UNTRACKED, Qualisys
 from uavctl.io.sources import open_source
 from uavctl.mavlink.codec import decode

@@ -287,7 +287,7 @@ def test_what_is_wrong_before_anything_is_started(monkeypatch: pytest.MonkeyPatc
         open_source("natnet://127.0.0.1")
     with pytest.raises(ConnectionSpecError, match=r"not in security\.allow"):
         open_source("natnet://127.0.0.1/drone", rules=AdmissionRules(allow=("10.0.0.0/8",)))
-    monkeypatch.setattr("uavctl.io.sources.find_spec", lambda name: None)
+    monkeypatch.setattr("uavctl.io.camera_process.find_spec", lambda name: None)
     with pytest.raises(ExtraMissingError) as caught:
         open_source("natnet://127.0.0.1/drone")
     assert (caught.value.package, caught.value.extra) == ("natnet", "optitrack")

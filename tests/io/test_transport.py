@@ -16,7 +16,9 @@ from transport_rig import FRAME, LIMIT_NS, Clock, port_of
 
 from uavctl.errors import ConnectionSpecError
 from uavctl.io.base import Connection
-from uavctl.io.transport import PEER_SILENCE_NS, RETRY_NS, open_connection, wait
+from uavctl.io.byte_stream import RETRY_NS
+from uavctl.io.transport import open_connection, wait
+from uavctl.io.udp import PEER_SILENCE_NS
 from uavctl.mavlink.connection import CONNECTION_SILENT, HUNG_UP
 
 

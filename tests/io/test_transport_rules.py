@@ -31,7 +31,8 @@ from uavctl.io.admission import (
     count_frames,
 )
 from uavctl.io.base import Connection
-from uavctl.io.transport import PEER_SILENCE_NS, open_connection, wait
+from uavctl.io.transport import open_connection, wait
+from uavctl.io.udp import PEER_SILENCE_NS
 from uavctl.mavlink import framing
 
 SECOND = 1_000_000_000
@@ -401,7 +402,7 @@ def test_a_flood_does_not_fill_the_buffer_of_the_vehicle() -> None:
 
 @pytest.mark.fault(39)
 def test_what_the_system_dropped_of_the_vehicle_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("uavctl.io.transport.PEER_BUFFER_BYTES", 4096)
+    monkeypatch.setattr("uavctl.io.udp.PEER_BUFFER_BYTES", 4096)
     with closing(open_connection("udpin://127.0.0.1:0")) as connection, peer() as vehicle:
         known(connection, vehicle)
         for _ in range(1000):
@@ -451,7 +452,7 @@ def test_the_port_stays_ours_and_one_who_is_silent_gives_up_the_own_socket() -> 
 
 
 def test_where_the_system_does_not_tell_nothing_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("uavctl.io.transport._SO_MEMINFO", 9999)
+    monkeypatch.setattr("uavctl.io.udp._SO_MEMINFO", 9999)
     monkeypatch.delattr("socket.SO_REUSEPORT")
     with closing(open_connection("udpin://127.0.0.1:0")) as connection, peer() as vehicle, peer() as flooder:
         known(connection, vehicle)

@@ -10,7 +10,8 @@ from mavlink_rig import NO_COVARIANCE, Peer, packets, read
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.frames import Convention
-from uavctl.mavlink.codec import MAX_DATAGRAM_BYTES, Encoder, StreamDecoder, UnsendableError, decode
+from uavctl.mavlink.codec import MAX_DATAGRAM_BYTES, StreamDecoder, decode
+from uavctl.mavlink.encoder import Encoder, UnsendableError
 from uavctl.mavlink.messages import (
     Ack,
     Attitude,

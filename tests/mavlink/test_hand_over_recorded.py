@@ -18,8 +18,8 @@ from uavctl.mavlink.handover import HandoverStateMachine
 from uavctl.mavlink.handover_guards import HandoverInput
 from uavctl.mavlink.handover_states import HandoverState, SetpointMode
 from uavctl.mavlink.messages import Ack, Text
+from uavctl.mavlink.mode_reason import ModeReason
 from uavctl.mavlink.requests import RequestKind
-from uavctl.mavlink.switcher import ModeReason
 from uavctl.outcome import Cause, FlightCourse
 from uavctl.records import Command, Ending, Event, Order, PositionSample, VehicleStatus
 

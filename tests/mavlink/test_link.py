@@ -13,8 +13,8 @@ from uavctl.config import load_config
 from uavctl.config.connections import ClockConfig, DaemonConfig, FrameConfig, SourceConfig
 from uavctl.config.types import EstimatorConfig
 from uavctl.flight.gating import refusal
-from uavctl.mavlink.codec import UnsendableError
 from uavctl.mavlink.connection import MavlinkConnection
+from uavctl.mavlink.encoder import UnsendableError
 from uavctl.mavlink.requests import RequestKind
 from uavctl.records import Setpoint, SetpointSource, Severity
 

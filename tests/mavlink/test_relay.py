@@ -15,7 +15,7 @@ from sim_rig import Client
 from sim.autopilot.autopilot import UPTIME_NS
 from uavctl.config.connections import RelayConfig
 from uavctl.frames import quaternion_from_euler
-from uavctl.mavlink.codec import Encoder, UnsendableError
+from uavctl.mavlink.encoder import Encoder, UnsendableError
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.mavlink.relay import MAX_AGE_NS, STUCK_AFTER, Pose, Relay
 from uavctl.records import Event, LinkStats, PositionSample, Vec3

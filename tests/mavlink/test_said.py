@@ -9,7 +9,7 @@ from mavlink_rig import Peer, events, make_link, packets
 from uavctl.cli.flying import AGAIN_NS, Said, waits_for
 from uavctl.config import load_config
 from uavctl.mavlink.handover_states import HandoverState
-from uavctl.mavlink.vehicle import CHUNK_WAIT_NS, MAX_PARTIAL_TEXTS, MISSING_CHUNK
+from uavctl.mavlink.statustext import CHUNK_WAIT_NS, MAX_PARTIAL_TEXTS, MISSING_CHUNK
 from uavctl.records import Event, Severity
 
 SECOND = 1_000_000_000

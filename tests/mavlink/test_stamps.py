@@ -13,7 +13,7 @@ from patience import LIMIT_S
 from signing_rig import OFFSET_NS, STAMP, SignedPeer, make_signing
 
 from uavctl.errors import KeyFileError
-from uavctl.io.signed_connection import (
+from uavctl.io.timestamp_file import (
     LOCK_TRIES,
     RENEW_MARGIN,
     WRITE_AHEAD,
@@ -70,7 +70,7 @@ def test_a_write_that_fails_leaves_what_was_there(tmp_path: Path, monkeypatch: p
     def full(descriptor: int) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("uavctl.io.signed_connection.os.fsync", full)
+    monkeypatch.setattr("uavctl.io.timestamp_file.os.fsync", full)
     with pytest.raises(OSError, match="No space"):
         save_timestamp(path, STAMP + 1)
     assert load_timestamp(path) == STAMP
@@ -202,7 +202,7 @@ def test_no_other_user_can_open_the_files_and_what_one_left_half_written_is_not_
 def test_a_lock_that_somebody_holds_keeps_no_daemon_waiting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "key.stamp"
     pauses: list[float] = []
-    monkeypatch.setattr("uavctl.io.signed_connection.time.sleep", pauses.append)
+    monkeypatch.setattr("uavctl.io.timestamp_file.time.sleep", pauses.append)
     with path.with_suffix(".lock").open("w") as held:
         fcntl.flock(held, fcntl.LOCK_EX)
         with pytest.raises(KeyFileError, match="Resource temporarily unavailable"):

@@ -12,9 +12,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from uavctl.config.connections import HandOverConfig
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.mavlink.messages import Ack, Battery, FenceBreach, Heartbeat, RadioChannels, Text
+from uavctl.mavlink.mode_reason import ModeReason, determine_mode_reason
 from uavctl.mavlink.profile import PROFILES, describe_mode
 from uavctl.mavlink.requests import RequestKind
-from uavctl.mavlink.switcher import ModeReason, determine_mode_reason
 from uavctl.mavlink.vehicle import VehicleMonitor
 from uavctl.records import VehicleStatus
 

@@ -15,8 +15,9 @@ from places import DATA
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.frames import euler_from_quaternion
-from uavctl.mavlink.codec import Encoder
-from uavctl.mavlink.framing import MessageLayout, with_checksum
+from uavctl.mavlink.encoder import Encoder
+from uavctl.mavlink.framing import with_checksum
+from uavctl.mavlink.message_layout import MessageLayout
 from uavctl.mavlink.relay import Pose
 from uavctl.records import Setpoint, SetpointSource
 

@@ -36,8 +36,9 @@ from uavctl.clock import Ticker
 from uavctl.config import load_config
 from uavctl.daemon import control_socket
 from uavctl.daemon.daemon import fly
-from uavctl.daemon.health import HealthMonitor, Notifier
+from uavctl.daemon.health import HealthMonitor
 from uavctl.daemon.lock import lock_paths
+from uavctl.daemon.notifier import Notifier
 from uavctl.io.base import Connection
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.handover_states import HandoverState

@@ -13,7 +13,7 @@ import msgspec
 from uavctl.config.connections import CheckConfig
 from uavctl.frames import Quaternion
 from uavctl.mavlink.clocksync import ClockSync, TimesyncClock
-from uavctl.mavlink.codec import BOOT_MS_WRAP
+from uavctl.mavlink.encoder import BOOT_MS_WRAP
 from uavctl.mavlink.messages import (
     Attitude,
     AutopilotVersion,

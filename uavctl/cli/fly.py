@@ -44,11 +44,13 @@ from uavctl.clock import Ticker, monotonic_ns, zero_utc_ns
 from uavctl.config import Config, LoadedConfig
 from uavctl.config.connections import warnings
 from uavctl.daemon.control_socket import ControlServer, control_folder, daemon_name, open_listener
-from uavctl.daemon.daemon import AfterTick, control_garbage_collection, enable_realtime
+from uavctl.daemon.daemon import AfterTick
 from uavctl.daemon.daemon import fly as run_daemon
 from uavctl.daemon.engagement import Engagement, TickFollower, check_places, stop_limit_s
-from uavctl.daemon.health import HealthMonitor, Notifier, RecorderHealth
+from uavctl.daemon.health import HealthMonitor, RecorderHealth
 from uavctl.daemon.lock import lock_vehicle
+from uavctl.daemon.notifier import Notifier
+from uavctl.daemon.realtime import control_garbage_collection, enable_realtime
 from uavctl.io.signed_connection import open_links
 from uavctl.loop import ControlLoop
 

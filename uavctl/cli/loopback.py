@@ -40,8 +40,9 @@ from uavctl.cli.prepare import prepare
 from uavctl.cli.sim import make_door
 from uavctl.clock import Ticker, monotonic_ns, zero_utc_ns
 from uavctl.config import Config, LoadedConfig
-from uavctl.daemon.daemon import control_garbage_collection, fly
+from uavctl.daemon.daemon import fly
 from uavctl.daemon.engagement import Engagement, TickFollower, check_places, stop_limit_s
+from uavctl.daemon.realtime import control_garbage_collection
 from uavctl.errors import UavctlError, UsageError
 from uavctl.io.signed_connection import open_links
 from uavctl.lab.lockstep import TRUTH, LockstepFlight, check_length

@@ -29,7 +29,7 @@ from uavctl.config import Config
 from uavctl.config.checks import position_limits_m
 from uavctl.config.connections import MOCAP_LINK, SecurityConfig
 from uavctl.config.load import with_faults
-from uavctl.io.signed_connection import read_key
+from uavctl.io.key_file import read_key
 from uavctl.mavlink.connection import MOCAP
 from uavctl.mavlink.framing import scan
 from uavctl.mavlink.signing import FrameAuthenticator, FrameSigner, SigningKey, SigningTimestamps

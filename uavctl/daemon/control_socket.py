@@ -1,7 +1,8 @@
-"""The operator's orders while flying: a Unix socket that the daemon looks at after each tick and never waits for.
+"""Orders of the operator in flight: a Unix socket that the daemon reads after each tick without waiting.
 
-An order is answered with what the tick after it decided. Who may ask is decided by the file permissions (folder 0700,
-socket 0600) and again by the kernel's word on who is at the other end.
+Each direction carries one JSON object a line: a `ControlRequest`, then its `Reply`. The reply to an order tells what
+the next tick decided. File permissions protect the socket (folder 0700, socket 0600). The kernel also tells the user
+at the other end.
 """
 
 from __future__ import annotations
@@ -23,14 +24,9 @@ import msgspec
 from uavctl.config import Config
 from uavctl.config.checks import outside
 from uavctl.daemon.health import Health
-from uavctl.daemon.lock import find_runtime_folders
+from uavctl.daemon.runtime_folder import find_runtime_folders
 from uavctl.errors import UsageError, VehicleTakenError
 from uavctl.records import ORDER_ACCEPTED, Command, Event, Order, Ticked, Vec3
-
-# Messages on a daemon's control socket, and the path of the socket.
-#
-# One JSON object a line in each direction: a `ControlRequest`, then its `Reply`.
-
 
 FOLDER_VARIABLE = "UAVCTL_CONTROL"
 SUFFIX = ".sock"

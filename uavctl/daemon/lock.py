@@ -18,57 +18,13 @@ import os
 import socket
 import stat
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from uavctl.errors import ConnectionSpecError, UsageError, VehicleTakenError
-
-# The user's own runtime folders: locks and control sockets are there, out of every other user's reach.
-#
-# The first one is that of the login session, as a rule; but a process of the same user may have none (a service,
-# cron). So there is one more that every process of the user finds, whatever its environment says.
-
-
-RUN = Path("/run")
-TEMPORARY = Path("/tmp")
-
-
-def is_private_folder(folder: Path) -> bool:
-    """Whether this is a folder of this user, that no other one may enter; a link to one is none."""
-    try:
-        found = folder.lstat()
-    except OSError:
-        return False
-    return stat.S_ISDIR(found.st_mode) and found.st_uid == os.geteuid() and not found.st_mode & 0o077
-
-
-def find_runtime_folders(environ: Mapping[str, str] = os.environ) -> tuple[Path, ...]:
-    """This user's folders for locks and sockets, those that can be had, the preferred one first; made if need be.
-
-    Below $XDG_RUNTIME_DIR and /run/user/UID if these are the user's own; /run/uavctl, which a service has; and one
-    below /tmp. What another user has put into the way, root included, is passed over.
-
-    Raises:
-        UsageError: there is none.
-    """
-    user = os.geteuid()
-    given = Path(environ.get("XDG_RUNTIME_DIR") or "/")
-    bases = [base for base in (given, RUN / "user" / str(user)) if base.is_absolute() and base != Path("/")]
-    last = TEMPORARY / f"uavctl-{user}"
-    wanted = [*(base / "uavctl" for base in bases if is_private_folder(base)), last]
-    for folder in wanted:
-        with suppress(OSError):
-            folder.mkdir(mode=0o700, exist_ok=True)
-    found = tuple(dict.fromkeys(one for one in (*wanted[:-1], RUN / "uavctl", last) if is_private_folder(one)))
-    if not found:
-        raise UsageError(
-            f"{last}: not a folder of this user alone, and XDG_RUNTIME_DIR names none, so there is no safe place for "
-            f"lock and socket; see whose it is, and remove it (sudo rm -r {last}) or run: chmod 700 {last}"
-        )
-    return found
-
+from uavctl.daemon.runtime_folder import find_runtime_folders
+from uavctl.errors import ConnectionSpecError, VehicleTakenError
 
 _LONGEST = 500  # bytes of a lock file that are looked at
 _TRIES = 10  # to lock a file that its last holder is just removing

@@ -1,4 +1,10 @@
-"""Admission to a connection: who may send, and how much work each may make, before anything looks into a datagram."""
+"""Admission to a connection: allowed senders, and the rate of each, before anything decodes a datagram.
+
+1. `AllowList` tests the address of the sender.
+2. Each sender has a token bucket for datagrams, frames and bytes.
+3. The vehicle has a bucket of its own. Trusted senders share one more bucket, and so do all strangers.
+4. Senders that sent little come first. Only they can use the last half of a shared bucket.
+"""
 
 from __future__ import annotations
 

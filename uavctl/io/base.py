@@ -1,11 +1,15 @@
-"""Protocol of a connection as the daemon needs it, and what all connections share."""
+"""Interface of a connection for the daemon, and the common part of all connections."""
 
 from __future__ import annotations
 
+import socket
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable
 from typing import Protocol
+
+from uavctl.errors import ConnectionSpecError
+from uavctl.io.admission import Address
 
 MAX_READS = 256  # datagrams of one call, so that a flood cannot hold the loop
 BACKLOG_READS = 16_384  # of a call that is to read everything: more than any buffer of the system's holds
@@ -147,3 +151,27 @@ class BaseConnection(ABC):
     @abstractmethod
     def _read(self) -> bytes | None:
         """Read once; None if what came is not to be handed on. BlockingIOError if nothing is there."""
+
+
+class SocketConnection(BaseConnection):
+    """A connection on a socket."""
+
+    def __init__(self, url: str, family: socket.AddressFamily, kind: socket.SocketKind, now: Callable[[], int]) -> None:
+        super().__init__(url, now)
+        self._socket = socket.socket(family, kind)
+
+    def fileno(self) -> int:
+        """See `Connection`."""
+        return self._socket.fileno()
+
+    def close(self) -> None:
+        """See `Connection`."""
+        self.closed = True
+        self._socket.close()
+
+    def _attempt(self, action: Callable[[Address], None], address: Address, advice: str) -> None:
+        try:
+            action(address)
+        except OSError as error:
+            self.close()
+            raise ConnectionSpecError(f"connection {self.url!r}: {error.strerror or error}; {advice}") from error

@@ -31,9 +31,6 @@ from uavctl.io.camera import ANSWER_S, COUNTS, LARGEST, READY, REFUSED, UNREACHA
 from uavctl.mavlink.codec import decode
 from uavctl.mavlink.messages import TimeSync
 
-# A camera system's sights and clock as MAVLink.
-
-
 COMPONENT_ID = mavlink.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
 _UNKNOWN = [math.nan, *([0.0] * 20)]
 

@@ -1,8 +1,9 @@
-"""A source's stamps to our monotonic clock; pure, time is an argument.
+"""Time stamps of a source to our monotonic clock. Pure; time is an argument.
 
-Two estimates of (our time − its time): from TIMESYNC round trips if the source answers them, else the
-minimum of (received − stamp), which is the true offset plus the smallest delay; `latency`, the smallest delay as
-configured, is taken off again.
+1. If the source answers TIMESYNC, the middle of a round trip gives the offset: (t_sent + t_received)/2 − t_remote.
+2. `TimesyncClock` fits a robust line through the last offsets, because simulated clocks drift by up to 3 %.
+3. Otherwise the minimum of (received − stamp) gives the offset plus the smallest delay; `latency` is subtracted.
+4. `ClockSync` refuses stamps that its clock cannot have given. After a few that agree, it starts a new clock.
 """
 
 from __future__ import annotations
@@ -12,16 +13,16 @@ from enum import StrEnum
 from itertools import combinations
 from statistics import median, median_low
 
+from uavctl.arrays import SECOND_NS
 from uavctl.records import Vec3
 
-MAX_ROUND_TRIP_NS = 1_000_000_000  # a slower answer bounds the offset by nothing of use
+MAX_ROUND_TRIP_NS = SECOND_NS  # a slower answer bounds the offset by nothing of use
 ROUND_TRIP_MARGIN_NS = 10_000_000  # a round trip that is so much longer than the shortest says as much
 # By which a clock's drift may change: real ones keep 1e-4, that of a simulator on a busy computer is followed so.
 DRIFT_CHANGE = 2e-3
-SECOND_NS = 1_000_000_000
 MAX_DEVIATION_NS = 100_000_000
 RESYNC_AFTER = 5  # deviating values in a row that are believed
-MAX_CLOCK_STEP_NS = 1_000_000_000
+MAX_CLOCK_STEP_NS = SECOND_NS
 MIN_SAMPLES = 20  # samples before the minimum is trusted to judge the next stamp
 MAX_DELAY_SPREAD_NS = 200_000_000  # spread of the delays of one new clock
 STAMP_HISTORY = 64

@@ -1,4 +1,11 @@
-"""One connection sans IO; stream requests."""
+"""Protocol state of one MAVLink connection, sans IO: bytes in; items, replies and requests out.
+
+1. Decode the bytes and pass each message on by the roles of the connection.
+2. Role `vehicle`: `VehicleMonitor` makes status, motion and inertial samples; `stream_requests` asks for messages.
+3. Role `mocap`: `PositionDecoder` makes position samples with a capture time in our clock.
+4. Answer TIMESYNC requests at once. A late answer would make the measured round trip longer.
+5. Count everything that is dropped, and report it in events: at most one in a second.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +16,7 @@ from typing import NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from uavctl.arrays import SECOND_NS
 from uavctl.config.connections import ClockConfig, DaemonConfig, FrameConfig, SourceConfig
 from uavctl.config.types import EstimatorConfig
 from uavctl.frames import Quaternion
@@ -20,34 +28,23 @@ from uavctl.mavlink.clocksync import (
     StampUnit,
     TimesyncClock,
 )
-from uavctl.mavlink.codec import AUTOPILOT_ESTIMATE, Encoder, StreamDecoder, UnsendableError, decode
+from uavctl.mavlink.codec import AUTOPILOT_ESTIMATE, StreamDecoder, decode
+from uavctl.mavlink.encoder import Encoder, UnsendableError
 from uavctl.mavlink.framing import BadBytes
-from uavctl.mavlink.messages import (
-    Ack,
-    Attitude,
-    Battery,
-    GlobalOrigin,
-    Inertial,
-    Landed,
-    Message,
-    ParamValue,
-    Position,
-    RadioChannels,
-    Text,
-    TimeSync,
-)
+from uavctl.mavlink.messages import Ack, Attitude, Message, Position, Text, TimeSync
 from uavctl.mavlink.positions import SLOW_ANSWER, PositionDecoder
 from uavctl.mavlink.profile import PROFILES
 from uavctl.mavlink.relay import Relay
 from uavctl.mavlink.requests import COMMANDS, RequestKind
-from uavctl.mavlink.vehicle import (
-    MIN_INERTIAL,
-    MIN_INERTIAL_SHARE,
-    SECOND_VEHICLE,
-    STALE_INERTIAL,
-    StatusTextAssembler,
-    VehicleMonitor,
+from uavctl.mavlink.statustext import StatusTextAssembler
+from uavctl.mavlink.stream_requests import (
+    GPS_GLOBAL_ORIGIN,
+    SOURCE_PARAMETER,
+    GlobalOriginSetup,
+    ParameterDownload,
+    StreamRequests,
 )
+from uavctl.mavlink.vehicle import MIN_INERTIAL, MIN_INERTIAL_SHARE, SECOND_VEHICLE, STALE_INERTIAL, VehicleMonitor
 from uavctl.records import (
     Event,
     InertialSample,
@@ -59,172 +56,6 @@ from uavctl.records import (
     VehicleMotion,
     VehicleStatus,
 )
-
-# Requests and messages that a real vehicle needs before it can be flown: its streams, and a place on the globe.
-
-
-SECOND_NS = 1_000_000_000
-STREAM_SETTLE_NS = 2 * SECOND_NS  # many vehicles stream by themselves
-RETRY_NS = 2 * SECOND_NS
-MAX_TRIES = 5
-MAX_ORIGIN_TRIES = 30  # once a second: its estimator may take that long to begin
-
-LOCAL_POSITION_NED, ATTITUDE, EXTENDED_SYS_STATE, SYS_STATUS = 32, 30, 245, 1
-RC_CHANNELS = 65
-ATTITUDE_QUATERNION, HIGHRES_IMU, RAW_IMU = 31, 105, 27
-GPS_GLOBAL_ORIGIN = 49
-RATES_HZ = {LOCAL_POSITION_NED: 10.0, ATTITUDE: 10.0, EXTENDED_SYS_STATE: 5.0, SYS_STATUS: 1.0, RC_CHANNELS: 5.0}
-
-INERTIAL_HZ = 50.0  # of what shows how it turns, and its acceleration
-
-# Of the list of all parameters: 50 a second are asked for again at most, which a telemetry radio bears.
-MAX_PARAMETERS, MAX_READ_ROUNDS = 5000, 10
-READS_PER_BATCH, BATCH_NS = 10, SECOND_NS // 5
-LIST_END_NS = SECOND_NS // 2  # without a parameter: the list has ended
-
-SOURCE_PARAMETER = "EK3_SRC1_POSXY"
-EXTERNAL_SOURCE = 6.0  # of the source: external positions
-
-
-class StreamRequests:
-    """Asks for the messages that do not come by themselves, a few times.
-
-    Args:
-        inertial: ask for the vehicle's inertial data, too.
-        channels: ask for the channels of its remote control, too.
-    """
-
-    def __init__(self, *, inertial: bool = False, channels: bool = True) -> None:
-        self._wants_inertial = inertial
-        self._rates_hz = {number: hz for number, hz in RATES_HZ.items() if channels or number != RC_CHANNELS}
-        self._has_inertial = False  # inertial data have come since they were asked for
-        self._received: set[int] = set()
-        self._next_ns: int | None = None
-        self._tries = 0
-        self._inertial_next_ns = 0
-        self._inertial_tries = 0
-
-    def handle_message(self, message: Message) -> None:
-        """Take a message of the vehicle."""
-        match message:
-            case Position(local_ned=True):
-                self._received.add(LOCAL_POSITION_NED)
-            case Attitude(quaternion=False):
-                self._received.add(ATTITUDE)
-            case Landed():
-                self._received.add(EXTENDED_SYS_STATE)
-            case Battery():
-                self._received.add(SYS_STATUS)
-            case RadioChannels() if self._tries:  # as often as is asked for: it shows a pilot's hand
-                self._received.add(RC_CHANNELS)
-            case Inertial():
-                self._has_inertial = self._inertial_tries > 0
-
-    def restart(self) -> None:
-        """Ask anew: the vehicle has restarted and may have forgotten the requests."""
-        self._received.clear()
-        self._has_inertial = False
-        self._next_ns, self._tries = None, 0
-        self._inertial_next_ns, self._inertial_tries = 0, 0
-
-    def due(self, at_ns: int, autopilot: str = "") -> tuple[tuple[int, float], ...]:
-        """Return (message id, rate [1/s]) of what is to be asked for now; call it once a vehicle is heard."""
-        wanted: dict[int, float] = {}
-        if self._next_ns is None:
-            self._next_ns = at_ns + STREAM_SETTLE_NS
-        if at_ns >= self._next_ns and self._tries < MAX_TRIES:
-            self._next_ns = at_ns + RETRY_NS
-            self._tries += 1
-            wanted = {number: rate for number, rate in self._rates_hz.items() if number not in self._received}
-        # Not waited for: but for a PX4 on an onboard link no vehicle sends them so often, and a flight may have begun.
-        profile = PROFILES.get(autopilot) if self._wants_inertial and not self._has_inertial else None
-        kinds = () if profile is None else profile.inertial_messages
-        if kinds and at_ns >= self._inertial_next_ns and self._inertial_tries < MAX_TRIES:
-            self._inertial_next_ns = at_ns + RETRY_NS
-            self._inertial_tries += 1
-            wanted.update(dict.fromkeys(kinds, INERTIAL_HZ))
-        return tuple(wanted.items())
-
-
-class ParameterDownload:
-    """Schedule of asking a vehicle that has not been armed yet for all its parameters: the list, then what was lost."""
-
-    def __init__(self) -> None:
-        self._missing: set[int] | None = None  # indices not told yet; None before the vehicle says how many it has
-        self._has_new_value = False  # one was told since the last look
-        self._next_ns = 0
-        self._list_requests = self._read_rounds = 0
-        self._round_indices: list[int] = []  # indices of this round that are still to be asked for
-        self._is_finished = False
-
-    def handle_message(self, message: Message) -> None:
-        """Take a message of the vehicle."""
-        if isinstance(message, ParamValue) and message.index < message.count <= MAX_PARAMETERS:
-            if self._missing is None:
-                self._missing = set(range(message.count))
-            self._missing.discard(message.index)
-            self._has_new_value = True
-
-    def due(self, at_ns: int, *, armed: bool) -> tuple[int, ...]:
-        """Return the indices to ask for now, -1 for the whole list; nothing any more once the vehicle was armed."""
-        self._is_finished = self._is_finished or armed or self._missing == set()
-        if self._is_finished:
-            return ()
-        if self._has_new_value and not self._read_rounds:  # the list is on its way
-            self._has_new_value, self._next_ns = False, at_ns + LIST_END_NS
-        if at_ns < self._next_ns:
-            return ()
-        if self._missing is None:
-            self._list_requests += 1
-            self._next_ns = at_ns + RETRY_NS
-            self._is_finished = self._list_requests > MAX_TRIES
-            return () if self._is_finished else (-1,)
-        self._next_ns = at_ns + BATCH_NS
-        if not self._round_indices:
-            self._read_rounds += 1
-            self._is_finished = self._read_rounds > MAX_READ_ROUNDS
-            self._round_indices = [] if self._is_finished else sorted(self._missing, reverse=True)
-        asked = self._round_indices[-READS_PER_BATCH:][::-1]
-        del self._round_indices[-READS_PER_BATCH:]
-        if not self._round_indices:  # the last answers of a round are waited for
-            self._next_ns = at_ns + LIST_END_NS
-        return tuple(index for index in asked if index in self._missing)
-
-
-class GlobalOriginSetup:
-    """Schedule of sending a place on the globe to an ArduPilot on external positions, which does not arm without one.
-
-    Its source of positions is read first: with GPS a place of ours would be wrong.
-    """
-
-    def __init__(self) -> None:
-        self._has_external_source = False
-        self._is_origin_known = False
-        self._next_ns = 0
-        self._tries = 0
-
-    def handle_message(self, message: Message) -> None:
-        """Take a message of the vehicle."""
-        match message:
-            case GlobalOrigin():
-                self._is_origin_known = True
-            case ParamValue(name=name, cast=cast) if name == SOURCE_PARAMETER:
-                self._has_external_source = cast == EXTERNAL_SOURCE
-
-    def due(self, at_ns: int) -> tuple[bool, bool]:
-        """Whether to ask now (for the parameter and the origin), and whether to tell the origin.
-
-        The place is sent from the second time on: by then a vehicle that has an origin has answered with it.
-        """
-        if self._is_origin_known or at_ns < self._next_ns or self._tries >= MAX_ORIGIN_TRIES:
-            return False, False
-        self._next_ns = at_ns + SECOND_NS
-        self._tries += 1
-        return True, self._has_external_source and self._tries > 1
-
-
-# One connection's MAVLink state, without input or output of its own: bytes in, events out, and back.
-
 
 VEHICLE, MOCAP = "vehicle", "mocap"
 HEARTBEAT_NS = SECOND_NS
@@ -655,8 +486,8 @@ class MavlinkConnection:
             and at_ns - since_ns >= MISSING_HEARTBEAT_NS
         ):
             self._is_no_heartbeat_reported = True
-            system = self._no_heartbeat_address and self._no_heartbeat_address[0]
-            text = f"link {self._name}: system {system} sends its position or attitude, "
+            sender = self._no_heartbeat_address and self._no_heartbeat_address[0]
+            text = f"link {self._name}: system {sender} sends its position or attitude, "
             text += "but no heartbeat of an autopilot: its mode is not known, so it is not flown"
             events.append(Event(at_ns=at_ns, severity=Severity.WARNING, code=NO_HEARTBEAT, text=text))
         used, total = self._vehicle.inertial_used, self._vehicle.inertial_total

@@ -1,18 +1,18 @@
-"""Raw MAVLink frames in bytes: where one begins and ends, and whether its checksum is right.
+"""MAVLink frames in raw bytes: where they begin and end, and whether their checksums are right.
 
-Frame layout: https://mavlink.io/en/guide/serialization.html. Whatever is no frame is skipped and
-counted by reason, and the search goes on at the next byte that could begin one.
+Frame layout: https://mavlink.io/en/guide/serialization.html.
+
+1. Look for a magic byte (0xFE or 0xFD) and read the frame's length and message id.
+2. Compare the checksum, or verify the signature where signatures are required.
+3. If one of these fails, count the reason and go on at the next magic byte.
+4. After `MAX_FAILED` failures drop the rest, so that hostile data cannot take the time of a tick.
+5. A frame of an unknown message has no known checksum. Its length counts only between two frames.
 """
 
 from __future__ import annotations
 
-import re
-from collections import namedtuple
 from collections.abc import Callable
 from enum import StrEnum
-from itertools import accumulate, pairwise
-from operator import itemgetter
-from typing import Any, Protocol
 
 import msgspec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -200,84 +200,3 @@ def _next_magic(data: bytes, start: int) -> int:
     """Index of the next byte that could begin a frame, or the end."""
     found = [index for magic in _MAGIC if (index := data.find(magic, start)) >= 0]
     return min(found, default=len(data))
-
-
-# The content of frames by pymavlink's definitions: the fields and bytes that its `decode` and `pack` give.
-#
-# Those make a header and a dozen lists for each message, and take once more the checksum that the scan has taken:
-# several times the work, for a hundred messages a second.
-
-
-_SENDER_V1, _SENDER_V2 = 3, 5  # index of the system id; the component's follows
-
-
-class Fields(Protocol):
-    """Decoded frame: the fields of its message by their names, an array as a tuple, a text as its bytes."""
-
-    msgname: str
-    src_system: int
-    src_component: int
-
-    def __getattr__(self, name: str) -> Any: ...
-
-
-class MessageLayout:
-    """Layout of one kind of message in a frame."""
-
-    def __init__(self, kind: Any) -> None:
-        self._name, self._id = kind.msgname, kind.id.to_bytes(3, "little")
-        self._struct = kind.unpacker
-        self._order = [kind.orders.index(place) for place in range(len(kind.orders))]
-        sender = ("msgname", "src_system", "src_component")
-        # Its names are those of the definition, which no type checker knows.
-        self._make: Any = namedtuple(kind.msgname, (*sender, *kind.ordered_fieldnames))._make  # type: ignore[attr-defined]
-        self._grouped: Callable[[tuple[Any, ...]], tuple[Any, ...]] | None = None  # None: no arrays
-        if max(kind.lengths) > 1:
-            ends = accumulate((1, 1, 1, *kind.lengths), initial=0)
-            self._grouped = itemgetter(*(i if j - i == 1 else slice(i, j) for i, j in pairwise(ends)))
-
-    def unpack(self, frame: bytes) -> Fields:
-        """The fields of a whole frame of this kind; bytes that its payload lacks are 0, those too many dropped."""
-        start, sender = (HEADER_V2, _SENDER_V2) if frame[0] == mavlink.PROTOCOL_MARKER_V2 else (HEADER_V1, _SENDER_V1)
-        payload = frame[start : start + frame[1]].ljust(self._struct.size, b"\0")
-        values = (self._name, frame[sender], frame[sender + 1], *self._struct.unpack_from(payload))
-        fields: Fields = self._make(values if self._grouped is None else self._grouped(values))
-        return fields
-
-    def pack(self, address: tuple[int, int], number: int, *fields: Any) -> bytes:
-        """A frame of MAVLink 2.
-
-        Args:
-            address: system and component that send it.
-            number: its place in their sequence, 0 to 255.
-            fields: in the order of pymavlink's class; numbers that are not given at the end are 0.
-
-        Raises:
-            struct.error: a number does not fit.
-        """
-        given = (*fields, *(0,) * (len(self._order) - len(fields)))
-        values = [given[index] for index in self._order]
-        if self._grouped is not None:
-            values = [part for value in values for part in (value if isinstance(value, list | tuple) else (value,))]
-        payload = self._struct.pack(*values).rstrip(b"\0") or b"\0"
-        header = bytes((mavlink.PROTOCOL_MARKER_V2, len(payload), 0, 0, number, *address)) + self._id
-        return with_checksum(header + payload)
-
-
-# Escape sequences of a terminal, ECMA-48: CSI with its parameters, OSC up to its end, and those of two characters.
-_ESCAPES = re.compile(
-    r"(?:\x1b\[|\x9b)[0-?]*[ -/]*[@-~]?|(?:\x1b\]|\x9d)[^\x07\x1b\x9c]*(?:\x07|\x1b\\|\x9c)?|\x1b[ -/]*[0-~]?"
-)
-
-
-def plain_text(text: str) -> str:
-    """A text that somebody else wrote, without what would act on the terminal that shows it.
-
-    Escape sequences go, as PX4's colours; any other character that is not printable becomes a question mark.
-    """
-    return "".join(character if character.isprintable() else "?" for character in _ESCAPES.sub("", text))
-
-
-def text_of(raw: bytes) -> str:
-    """A text of a fixed length, up to its first zero, as it may be shown."""
-    return plain_text(raw.split(b"\0", 1)[0].decode("utf-8", errors="replace"))

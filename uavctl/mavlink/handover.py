@@ -1,4 +1,11 @@
-"""The hand-over from tick to tick: walks the table of its states, makes requests of the vehicle, tells what happens."""
+"""State machine of the hand-over between pilot and controller, one update in each tick.
+
+1. Accept or refuse the orders of the operator.
+2. Evaluate the guards (`handover_guards`): one event for this tick.
+3. Look up the next state and the allowed setpoints (`handover_states.TRANSITIONS`).
+4. On entry of a state, choose the request to the vehicle and its limits.
+5. Return the request that is due, the setpoint mode, and the events for people.
+"""
 
 from __future__ import annotations
 
@@ -19,9 +26,9 @@ from uavctl.mavlink.handover_guards import (
     is_without_pilot,
 )
 from uavctl.mavlink.handover_states import TRANSITIONS, HandoverEvent, HandoverState, SetpointMode
+from uavctl.mavlink.mode_reason import ModeReason
 from uavctl.mavlink.profile import profile_of
 from uavctl.mavlink.requests import PendingRequest, RequestKind, RequestLimits
-from uavctl.mavlink.switcher import ModeReason
 from uavctl.records import ORDER_ACCEPTED, ORDER_REFUSED, Command, Event, Order, Severity, VehicleStatus
 
 LAND_TRIES = 5

@@ -1,6 +1,12 @@
-"""Guards of the hand-over: the event that a tick sees, in the words of the table of `handover_states.py`.
+"""Guards of the hand-over: they find the one event of a tick for the table in `handover_states.py`.
 
-Pure: all that it goes by is an argument.
+Pure: all inputs are arguments. `evaluate` tests in this order:
+
+1. A restart of the vehicle.
+2. A mode that another person or a failsafe has chosen: the pilot can take over at any time.
+3. A landing that the controller or the operator asks for, and a climb that is not safe.
+4. The guard of the current state (`_GUARDS`).
+5. A request that the vehicle has refused, or a wait that took too long.
 """
 
 from __future__ import annotations
@@ -13,9 +19,9 @@ import msgspec
 from uavctl.config.connections import HandOverConfig
 from uavctl.mavlink.handover_states import HandoverEvent, HandoverState
 from uavctl.mavlink.messages import Ack, Text
+from uavctl.mavlink.mode_reason import VEHICLE_REASONS, ModeReason, determine_mode_reason, is_autonomous_mode
 from uavctl.mavlink.profile import PROFILES, profile_of
 from uavctl.mavlink.requests import PendingRequest
-from uavctl.mavlink.switcher import VEHICLE_REASONS, ModeReason, determine_mode_reason, is_autonomous_mode
 from uavctl.records import Command, Order, VehicleStatus
 
 HEARTBEAT_TIMEOUT_NS = 3_000_000_000

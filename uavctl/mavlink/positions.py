@@ -1,4 +1,10 @@
-"""Position messages to samples: source filter, checks, frame, clock."""
+"""Position messages to position samples: source filter, plausibility, frame and clock.
+
+1. Ignore messages and systems that the configuration does not name.
+2. Convert the position to local NED.
+3. Limit the rate of new sources. Settled sources are never limited.
+4. Convert the stamp to our clock (`clocksync`). If the stamp is not usable, drop the sample and count the reason.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +17,7 @@ from uavctl.config.connections import ClockConfig, FrameConfig, SourceConfig
 from uavctl.config.types import EstimatorConfig
 from uavctl.frames import Convention, Frame, Quaternion
 from uavctl.mavlink.clocksync import ClockSource, ClockSync, StampRefusal, StampUnit, StampUnitDetector, TimesyncClock
-from uavctl.mavlink.codec import BOOT_MS_WRAP
+from uavctl.mavlink.encoder import BOOT_MS_WRAP
 from uavctl.mavlink.messages import Position
 from uavctl.records import PositionSample, Vec3
 

@@ -1,10 +1,12 @@
-"""Positions on their way to the vehicle's own estimator: which ones go, and with what stamp. Pure; time is an argument.
+"""Relay of positions to the vehicle's own estimator: selection and time stamps. Pure; time is an argument.
 
-Stamps are of the vehicle's clock: by its answers to our own requests for the time, and without any by the arrival of
-its messages. PX4 also asks us for our time (TIMESYNC) and moves the stamps of what it receives by the offset that it
-finds (src/lib/timesync/Timesync.cpp, `sync_stamp`). It is answered with the time of its own clock: that offset is zero.
-A clock that is not known to the millisecond never stops the positions: an estimator bears a stamp that is a little off,
-and no silence.
+1. Keep back positions that are refused, old, frozen, out of order or too frequent; count each by reason.
+2. Convert the capture time to the vehicle's clock: by its TIMESYNC answers, or else by the arrival of its messages.
+3. Report silence with its reason.
+
+PX4 also requests our time and moves the stamps that it receives by the offset that it finds
+(src/lib/timesync/Timesync.cpp, `sync_stamp`). We answer with the time of its own clock, so that offset is zero. An
+unknown clock never stops the positions. An estimator tolerates a small error of a stamp, but no silence.
 """
 
 from __future__ import annotations

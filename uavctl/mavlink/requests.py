@@ -1,4 +1,11 @@
-"""One request to the vehicle: when to make it again, what came back, when to give up. Pure: time is an argument."""
+"""One request to the vehicle: when to repeat it, what the vehicle answered, when to give up.
+
+Pure: time is an argument.
+
+1. Send the request, and wait `answer_ns` for its effect.
+2. If the vehicle refuses it for now, repeat it after `retry_ns`.
+3. Give up after a final refusal, after `tries` requests, or after `limit_ns`.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +14,9 @@ from enum import StrEnum
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from uavctl.arrays import SECOND_NS
 from uavctl.mavlink.messages import Ack, Text
 
-SECOND_NS = 1_000_000_000
 SHOWN_NS = 3 * SECOND_NS  # heartbeats, at 1 Hz, show by then what was granted
 _FINAL = frozenset({mavlink.MAV_RESULT_DENIED, mavlink.MAV_RESULT_UNSUPPORTED})
 _MAX_TEXTS = 4  # of the vehicle's last words that are told with a refusal

@@ -1,8 +1,12 @@
-"""MAVLink 2 signing, sans IO: who holds the key, and whether a frame is newer than the last one.
+"""MAVLink 2 signing, sans IO: keys, timestamps, and the authentication of frames.
 
-Format and rules: https://mavlink.io/en/guide/message_signing.html. The hash is verified before any stamp is looked at,
-so that nobody without the key changes anything here: in the other order one forged frame with a stamp from the future
-locks the true peer out.
+Format and rules: https://mavlink.io/en/guide/message_signing.html.
+
+1. `FrameAuthenticator` finds the frames and gives each to `FrameSigner.verify`.
+2. Verify the hash first. Without the key, nobody can change the state here. In the other order, one forged frame with
+   a future timestamp would lock the true peer out.
+3. Then compare the timestamp with the newest one of the same stream (system, component, link id).
+4. Pass frames on without their signatures. Recordings hold no signatures, and a replay needs no key.
 """
 
 from __future__ import annotations
@@ -185,12 +189,6 @@ def remove_signature(frame: bytes) -> bytes:
     body = bytearray(frame[:-SIGNATURE][:-CHECKSUM])
     body[_FLAGS] &= ~_SIGNED
     return with_checksum(bytes(body))
-
-
-# The door of a signed connection: only verified frames come in, only signed ones go out.
-#
-# What passes is handed on without its signature, so nothing behind the door knows of keys: recordings hold no
-# signatures, and a replay needs no key and no wall clock.
 
 
 class FrameAuthenticator:

@@ -1,14 +1,20 @@
-"""The vehicle by its messages: status, boot clock, STATUSTEXT."""
+"""State of the vehicle from its messages: status, motion and inertial samples.
+
+1. Follow the first autopilot that sends a heartbeat. Count and ignore other vehicles.
+2. Keep landed state, battery, boot clock and the evidence for a mode change between heartbeats.
+3. Return a `VehicleStatus` at each heartbeat, and at once if the evidence or the boot count changes.
+4. Rotate each specific force with the newest attitude: a = R f + g. Ignore old, repeated and frozen data.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import msgspec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.frames import Quaternion, quaternion_from_euler, rotate_vector
+from uavctl.mavlink.boot_clock import BootClock
 from uavctl.mavlink.clocksync import ArrivalClock
 from uavctl.mavlink.codec import MODE_COMMANDS
 from uavctl.mavlink.messages import (
@@ -25,230 +31,9 @@ from uavctl.mavlink.messages import (
     RadioChannels,
     Text,
 )
+from uavctl.mavlink.mode_reason import ModeReasonEvidence
 from uavctl.mavlink.profile import PROFILES, autopilot_name, describe_mode
-from uavctl.mavlink.switcher import mentions_radio, reports_failsafe, reports_fence_breach
 from uavctl.records import Event, InertialSample, Severity, Vec3, VehicleMotion, VehicleStatus
-
-# A vehicle's time since boot: how long it has been up, and whether it has started anew. Pure: time is an argument.
-
-
-MAX_BACKSTEP_MS = 1000  # a clock that goes back by more is another one; disorder on a link is less
-MAX_ADVANCE_MS = 30_000  # more than time has passed: late messages, and simulated clocks that run fast
-MAX_DELAY_SPREAD_NS = 5_000_000_000  # within which another clock's second message has to come
-_WRAP_MS = 2**32
-
-
-@dataclass(frozen=True)
-class _Reading:
-    """A time since boot [ms] and when it came [ns]; confirmed by the message after it that agrees."""
-
-    boot_ms: int
-    at_ns: int
-    confirmed: bool = False
-
-
-class BootClock:
-    """Takes `time_boot_ms` of several kinds of messages, each against its own kind.
-
-    One message is no evidence, as a field may hold garbage: a clock counts once two agree, be it between those of
-    another vehicle with the same id.
-    """
-
-    def __init__(self) -> None:
-        self._readings: dict[str, _Reading] = {}  # by kind of message
-        self._candidates: dict[str, _Reading] = {}  # does not go on from what is known
-        self._newest: _Reading | None = None
-
-    def uptime_s(self, at_ns: int) -> float | None:
-        """Return the time since the vehicle started, by its own clock [s]; None if it does not tell."""
-        newest = self._newest
-        return None if newest is None else newest.boot_ms / 1e3 + (at_ns - newest.at_ns) / 1e9
-
-    def update(self, kind: str, boot_ms: int, at_ns: int) -> bool:
-        """Take a time since boot; whether it shows that the vehicle has started anew.
-
-        Args:
-            kind: of message; the clocks of two need not agree.
-            boot_ms: its time since boot, modulo 2**32 ms.
-        """
-        known, doubted = self._readings.get(kind), self._candidates.get(kind)
-        reading = _Reading(boot_ms, at_ns)
-        if known is None or _is_same_clock(known, reading):
-            self._accept(kind, _Reading(boot_ms, at_ns, confirmed=known is not None))
-        elif doubted is not None and at_ns - doubted.at_ns <= MAX_DELAY_SPREAD_NS and _is_same_clock(doubted, reading):
-            del self._candidates[kind]
-            anew = known.confirmed and (_advance_ms(known, reading) < 0 or _may_have_restarted(known, reading))
-            if anew:  # the others' readings are from before the restart
-                self._readings.clear()
-                self._candidates.clear()
-            self._accept(kind, _Reading(boot_ms, at_ns, confirmed=True))
-            return anew
-        else:
-            self._candidates[kind] = reading
-        return False
-
-    def reset(self) -> None:
-        """Begin anew, with another vehicle."""
-        self._readings.clear()
-        self._candidates.clear()
-        self._newest = None
-
-    def _accept(self, kind: str, reading: _Reading) -> None:
-        self._readings[kind] = self._newest = reading
-
-
-def _advance_ms(before: _Reading, after: _Reading) -> int:
-    """Return by how much a clock went on, the shorter way around its wrap [ms]."""
-    return (after.boot_ms - before.boot_ms + _WRAP_MS // 2) % _WRAP_MS - _WRAP_MS // 2
-
-
-def _passed_ms(before: _Reading, after: _Reading) -> int:
-    return (after.at_ns - before.at_ns) // 1_000_000
-
-
-def _is_same_clock(before: _Reading, after: _Reading) -> bool:
-    """Whether two readings may be of one clock."""
-    return -MAX_BACKSTEP_MS <= _advance_ms(before, after) <= _passed_ms(before, after) + MAX_ADVANCE_MS
-
-
-def _may_have_restarted(before: _Reading, after: _Reading) -> bool:
-    """Whether a vehicle may have started between two readings: up for more than 24 days its clock seems to leap."""
-    return after.boot_ms <= _passed_ms(before, after) + MAX_ADVANCE_MS
-
-
-# STATUSTEXT joined again: a vehicle sends what is longer than 50 characters in several pieces.
-
-
-CHUNK_WAIT_NS = 1_000_000_000  # for the pieces that are to come; PX4 sends them at once
-MAX_PARTIAL_TEXTS = 16  # texts under way
-MISSING_CHUNK = "…"  # stands for a piece that did not come
-
-
-class _PartialText(msgspec.Struct):
-    """Text of which more pieces are to come."""
-
-    first: Text
-    text: str
-    next_chunk: int
-    at_ns: int
-
-    def finish(self) -> Text:
-        """Return the text as far as it has come, with a mark for the part that is missing."""
-        return _make_text(self.first, self.text + MISSING_CHUNK)
-
-
-class StatusTextAssembler:
-    """Joins the pieces of texts, by their sender."""
-
-    def __init__(self) -> None:
-        self._partial_texts: dict[tuple[int, int], _PartialText] = {}
-
-    def add_chunk(self, text: Text, at_ns: int) -> tuple[Text, ...]:
-        """Take a piece, or a whole text; the texts that are whole now."""
-        sender = text.system, text.component
-        begun = self._partial_texts.get(sender)
-        told: tuple[Text, ...] = ()
-        if begun is not None and (begun.first.text_id != text.text_id or text.chunk < begun.next_chunk):
-            told = (self._partial_texts.pop(sender).finish(),)
-            begun = None
-        if begun is None:
-            begun = _PartialText(text, MISSING_CHUNK if text.chunk else "", text.chunk, at_ns)
-        begun.text += ("" if text.chunk == begun.next_chunk else MISSING_CHUNK) + text.text
-        begun.next_chunk = text.chunk + 1
-        if not text.has_more:
-            self._partial_texts.pop(sender, None)
-            return (*told, _make_text(begun.first, begun.text))
-        if sender in self._partial_texts or len(self._partial_texts) < MAX_PARTIAL_TEXTS:
-            self._partial_texts[sender] = begun
-            return told
-        return (*told, begun.finish())
-
-    def flush_overdue(self, at_ns: int) -> tuple[Text, ...]:
-        """The texts whose rest has not come."""
-        late = [sender for sender, begun in self._partial_texts.items() if at_ns - begun.at_ns > CHUNK_WAIT_NS]
-        return tuple(self._partial_texts.pop(sender).finish() for sender in late)
-
-
-def _make_text(first: Text, text: str) -> Text:
-    return Text(system=first.system, component=first.component, severity=first.severity, text=text.rstrip())
-
-
-class ModeReasonEvidence:
-    """What the vehicle says, and shows, of who changes its modes.
-
-    Each counts for `EVIDENCE_NS`, and longer where no heartbeat has come since: the mode may have changed right after.
-    """
-
-    def __init__(self) -> None:
-        self._failsafe_ns = self._fence_ns = self._failsafe_text_ns = self._stick_ns = self._station_ns = NEVER_NS
-        self._heartbeats_ns = NEVER_NS, NEVER_NS  # the newest heartbeat, and the one before
-        self._failsafe_text = ""
-        self._station = 0
-        self._reference_us: list[int] = []  # of each channel, since it moved last; 0: not known
-        self._has_radio: bool | None = None  # None before it says so
-        self._is_within_fence = True
-
-    def add_heartbeat(self, at_ns: int) -> None:
-        """Take a heartbeat, which shows the mode."""
-        self._heartbeats_ns = at_ns, self._heartbeats_ns[0]
-
-    def add_text(self, text: str, at_ns: int) -> None:
-        """Take a text, of any severity."""
-        fence, failsafe = reports_fence_breach(text), reports_failsafe(text)
-        if fence or failsafe:
-            self._failsafe_text, self._failsafe_text_ns = text, at_ns
-        if fence:
-            self._fence_ns = at_ns
-        if failsafe:
-            self._failsafe_ns = at_ns
-        elif "failsafe" in text.lower() and "clear" in text.lower():
-            self._failsafe_ns = NEVER_NS
-
-    def update_fence(self, at_ns: int, *, within: bool) -> None:
-        """Take whether it is within its fence; that it comes beyond it counts."""
-        if self._is_within_fence and not within:
-            self._fence_ns = at_ns
-        self._is_within_fence = within
-
-    def update_radio(self, *, heard: bool) -> None:
-        """Take whether a remote control is heard."""
-        self._has_radio = heard
-
-    def update_channels(self, pulses_us: tuple[int, ...], at_ns: int) -> None:
-        """Take the channels of a remote control."""
-        if len(pulses_us) != len(self._reference_us):
-            self._reference_us = [0] * len(pulses_us)
-        for i, pulse in enumerate(pulses_us):
-            rest = self._reference_us[i]
-            if not rest or abs(pulse - rest) >= STICK_US:
-                self._reference_us[i] = pulse
-                self._stick_ns = at_ns if rest and pulse else self._stick_ns
-
-    def add_mode_command(self, station: int, at_ns: int) -> None:
-        """Take an order of a mode that another than us has given."""
-        self._station, self._station_ns = station, at_ns
-
-    def apply_to(self, status: VehicleStatus, at_ns: int, *, critical: bool) -> VehicleStatus:
-        """Return a status with what counts at a time; `critical`: by its heartbeat a failsafe acts."""
-        since_ns = at_ns - EVIDENCE_NS
-        if self._heartbeats_ns[1] > NEVER_NS:
-            since_ns = min(since_ns, self._heartbeats_ns[1])
-        said = self._failsafe_text if self._failsafe_text_ns > since_ns else ""
-        # A receiver that has lost its remote control moves the channels by itself.
-        lost = self._has_radio is False or mentions_radio(said)
-        return msgspec.structs.replace(
-            status,
-            failsafe=critical or self._failsafe_ns > since_ns,
-            fence=self._fence_ns > since_ns,
-            said=said,
-            stick=self._stick_ns > since_ns and not lost,
-            radio=bool(self._has_radio) and not self._reference_us,
-            station=self._station if self._station_ns > since_ns else 0,
-        )
-
-
-# The vehicle as its messages tell: status, and its own words.
-
 
 SECOND_VEHICLE = "second-vehicle"
 STALE_INERTIAL = "inertial-not-of-now"  # late, repeated, or frozen
@@ -262,10 +47,6 @@ MIN_INERTIAL_SHARE, MIN_INERTIAL = (
 ALONE_NS = 5_000_000_000  # after that time of silence another vehicle counts as gone
 GONE_NS = 30_000_000_000  # and after that one its place is taken, if it stood on the ground
 BOOTING_NS = 3_000_000_000  # of silence before a heartbeat of booting, for that to be a restart
-# For which what it says of failsafes, fences and sticks speaks for its mode: heartbeats come once a second.
-EVIDENCE_NS = 2_000_000_000
-NEVER_NS = -(2**63)
-STICK_US = 100  # by which a channel of a remote control moves at least when a person moves it: a tenth of its way
 MAX_ATTITUDE_AGE_NS = (
     100_000_000  # an attitude that is older turns no specific force: at 1 rad/s it is 0.1 rad, 1 m/s², off
 )

@@ -19,7 +19,7 @@ from logs.recording.tlog import read_tlog
 from logs.recording.ulog import read_ulog
 from uavctl.cli.app import run
 from uavctl.errors import RecordingError, UsageError
-from uavctl.mavlink.framing import plain_text
+from uavctl.mavlink.message_layout import plain_text
 
 BEGIN_US = 1_764_000_000_000_000
 OFFBOARD = 6 << 16

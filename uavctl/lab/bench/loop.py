@@ -29,7 +29,7 @@ from logs.recording.reader import read
 from logs.recording.topics import RecorderNote
 from uavctl.clock import Ticker, monotonic_ns
 from uavctl.config import Config
-from uavctl.daemon.daemon import enable_realtime
+from uavctl.daemon.realtime import enable_realtime
 from uavctl.errors import UavctlError
 from uavctl.io.transport import open_connection, wait
 from uavctl.records import Decision, Timing

@@ -1,0 +1,263 @@
+"""UDP connections. The allow-list and the rate limits come before anything decodes a datagram."""
+
+from __future__ import annotations
+
+import socket
+import struct
+from abc import abstractmethod
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+
+from uavctl.io.admission import MAGIC, NOT_LISTED, SILENCE_NS, Address, AdmissionRules, AllowList, RateLimiter
+from uavctl.io.base import BACKLOG_READS, MAX_READS, SocketConnection
+
+PEER_SILENCE_NS = SILENCE_NS
+SECOND_ADDRESS = "second-address"
+LARGEST = 8192  # bytes that are read of a datagram; none of MAVLink is as long
+COMMON_BUFFER_BYTES = 2**20  # of the kernel's, for all who are not known yet
+PEER_BUFFER_BYTES = 2**22  # for one who is: some seconds of a vehicle's words, small ones too
+COMMON_READS = 64  # datagrams of strangers in one call
+MAX_PEER_SOCKETS = 8  # senders with a socket of their own
+_SO_RCVBUFFORCE, _SO_MEMINFO = 33, 55  # Linux
+_MEMINFO = struct.Struct("9I")
+
+
+class _UdpConnection(SocketConnection):
+    """Datagrams within the rules."""
+
+    def __init__(
+        self, url: str, family: socket.AddressFamily, address: Address, now: Callable[[], int], rules: AdmissionRules
+    ) -> None:
+        super().__init__(url, family, socket.SOCK_DGRAM, now)
+        self._family = family
+        self._allow_list, self._rate_limiter = AllowList(rules.allow), RateLimiter(rules, self.refused)
+        self._senders: list[Address] = []
+        self._bind_or_connect(address)
+        self._socket.setblocking(False)
+
+    @abstractmethod
+    def _bind_or_connect(self, address: Address) -> None:
+        """Bind or connect."""
+
+    def _read(self) -> bytes | None:
+        data, sender = self._socket.recvfrom(LARGEST)
+        return self._admit_sender(data, sender)
+
+    def _admit_sender(self, data: bytes, sender: Address) -> bytes | None:
+        if not self._allow_list.allows(sender[0]):
+            self.refused[NOT_LISTED] += 1
+            return None
+        if data:
+            self._senders.append(sender)
+        return data or None
+
+    def _apply_rate_limits(self, arrived: list[tuple[bytes, int]]) -> list[tuple[bytes, int]]:
+        """Drop more than the rules allow, the oldest first; `_senders` are those of what is left."""
+        taken = self._rate_limiter.admit(self._senders, [data for data, _ in arrived], self._now())
+        if all(taken):
+            return arrived
+        self._senders = [sender for sender, fits in zip(self._senders, taken, strict=True) if fits]
+        return [one for one, fits in zip(arrived, taken, strict=True) if fits]
+
+    def count_lost(self) -> int:
+        """See `Connection`."""
+        return _count_dropped(self._socket)
+
+
+class UdpInConnection(_UdpConnection):
+    """Bound UDP socket. It answers the peer that it was told to, and until then the first one that speaks MAVLink.
+
+    What others send is handed on too: cameras and vehicle may share a port. Only a peer that has fallen silent is
+    followed by another one, so that nobody can draw the setpoints to themselves while it speaks.
+
+    Vehicle and cameras get sockets of their own once they are known, on the same port and connected to them: the system
+    keeps what they send apart from what others do, and a flood fills only the buffer of the others.
+    """
+
+    def _bind_or_connect(self, address: Address) -> None:
+        self._peer: Address | None = None
+        self._is_peer_confirmed = False
+        self._heard_ns = 0
+        self._peer_sockets: dict[Address, socket.socket] = {}
+        self._trusted_ns: dict[Address, int] = {}
+        self._early_datagrams: list[
+            tuple[bytes, Address, int]
+        ] = []  # read from the common socket when an own one was made
+        _set_buffer_size(self._socket, COMMON_BUFFER_BYTES)
+        self._attempt(
+            self._socket.bind, address, "is another program on this port? end it, or take another port or address"
+        )
+
+    def filenos(self) -> tuple[int, ...]:
+        """See `Connection`."""
+        return (self._socket.fileno(), *(one.fileno() for one in self._peer_sockets.values()))
+
+    def count_lost(self) -> int:
+        """See `Connection`."""
+        own = None if self._peer is None else self._peer_sockets.get(self._peer)
+        return _count_dropped(self._socket if own is None else own)
+
+    def close(self) -> None:
+        """See `Connection`."""
+        for one in self._peer_sockets.values():
+            one.close()
+        super().close()
+
+    def receive(self, *, read_all: bool = False) -> list[tuple[bytes, int]]:
+        """See `Connection`; more than the rules allow is dropped, the oldest first."""
+        self._senders = []
+        arrived: list[tuple[bytes, int]] = []
+        earlier, self._early_datagrams = self._early_datagrams, []
+        for data, sender, at_ns in earlier:
+            if self._admit_sender(data, sender) is not None:
+                arrived.append((data, at_ns))
+        has_own = self._peer in self._peer_sockets
+        # Strangers get a handful of looks; whoever shares their socket is found by reading all that it can hold.
+        most = BACKLOG_READS if read_all and not has_own else COMMON_READS
+        self.has_unread = not self._read_socket(self._socket, most, arrived) and not has_own
+        common = len(arrived)
+        for sender, own in self._peer_sockets.items():
+            emptied = self._read_socket(own, BACKLOG_READS if read_all else MAX_READS, arrived)
+            self.has_unread = self.has_unread or (sender == self._peer and not emptied)
+        self.has_known_sender = len(arrived) > common or not self._peer_sockets
+        arrived = self._apply_rate_limits(arrived)
+        for (data, at_ns), sender in zip(arrived, self._senders, strict=True):
+            if sender == self._peer and not self._is_peer_confirmed:
+                self._heard_ns = at_ns
+            silent = at_ns - self._heard_ns > PEER_SILENCE_NS and not self._is_peer_confirmed
+            if data[0] in MAGIC and (self._peer is None or silent):
+                self._peer, self._heard_ns = sender, at_ns
+        return arrived
+
+    def _read_socket(self, one: socket.socket, most: int, arrived: list[tuple[bytes, int]]) -> bool:
+        """Read a socket; whether it is empty now."""
+        for _ in range(most):
+            try:
+                data, sender = one.recvfrom(LARGEST)
+            except BlockingIOError:
+                return True
+            except OSError:
+                self.receive_errors += 1
+                continue
+            if self._admit_sender(data, sender) is not None:
+                arrived.append((data, self._now()))
+        return False
+
+    def select_peer(self, index: int) -> None:
+        """See `Connection`; another peer than the one that was told before only when that has fallen silent."""
+        sender = self._senders[index]
+        now_ns = self._now()
+        if self._is_peer_confirmed and sender != self._peer and now_ns - self._heard_ns <= PEER_SILENCE_NS:
+            self.refused[SECOND_ADDRESS] += 1
+            return
+        # Only the vehicle's own words keep its place: noise, forgeries and replays from an address do not.
+        self._peer, self._is_peer_confirmed, self._heard_ns = sender, True, now_ns
+        self._rate_limiter.set_vehicle(sender, now_ns)
+        self._open_socket_for(sender, now_ns)
+
+    def trust_sender(self, index: int) -> None:
+        """See `Connection`."""
+        sender, now_ns = self._senders[index], self._now()
+        self._rate_limiter.trust_sender(sender, now_ns)
+        self._open_socket_for(sender, now_ns)
+
+    def _open_socket_for(self, sender: Address, now_ns: int) -> None:
+        """Give a sender a socket of its own, if there is room; a sender that has fallen silent makes room."""
+        self._trusted_ns[sender] = now_ns
+        if sender in self._peer_sockets:
+            return
+        for one, at_ns in list(self._trusted_ns.items()):
+            if now_ns - at_ns > PEER_SILENCE_NS and one != self._peer:
+                del self._trusted_ns[one]
+                if one in self._peer_sockets:
+                    self._peer_sockets.pop(one).close()
+        if len(self._peer_sockets) >= MAX_PEER_SOCKETS and sender != self._peer:
+            return
+        own = _open_peer_socket((self._socket, *self._peer_sockets.values()), self._family, sender)
+        if own is None:
+            return
+        self._peer_sockets[sender] = own
+        # What had come before counts before what the new socket gets.
+        for _ in range(BACKLOG_READS):
+            try:
+                self._early_datagrams.append((*self._socket.recvfrom(LARGEST), now_ns))
+            except OSError:
+                break
+
+    def send(self, data: bytes) -> None:
+        """See `Connection`; without a peer there is nobody to send to, which is no error."""
+        if self._peer is None:
+            return
+        try:
+            self._socket.sendto(data, self._peer)
+        except OSError:
+            self.send_errors += 1
+
+
+class UdpOutConnection(_UdpConnection):
+    """Connected UDP socket: the system hands on what its one peer sends."""
+
+    def _bind_or_connect(self, address: Address) -> None:
+        self._to = address
+        _set_buffer_size(self._socket, PEER_BUFFER_BYTES)
+        self._attempt(self._socket.connect, address, "check host, port and network")
+        self._rate_limiter.set_vehicle(address, self._now())
+
+    def _read(self) -> bytes | None:
+        return self._admit_sender(self._socket.recv(LARGEST), self._to)
+
+    def receive(self, *, read_all: bool = False) -> list[tuple[bytes, int]]:
+        """See `Connection`; more than the rules allow is dropped, the oldest first."""
+        self._senders = []
+        return self._apply_rate_limits(super().receive(read_all=read_all))
+
+    def send(self, data: bytes) -> None:
+        """See `Connection`; a peer that is not there yet shows as an error."""
+        try:
+            self._socket.send(data)
+        except OSError:
+            self.send_errors += 1
+
+
+def _set_buffer_size(one: socket.socket, size: int) -> None:
+    """Ask for a buffer of the system's; it may grant less."""
+    with suppress(OSError):
+        one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, size)
+    with suppress(OSError):  # whoever may, gets all of it
+        one.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, size)
+
+
+def _count_dropped(one: socket.socket) -> int:
+    """Datagrams that the system has dropped for want of room; 0 where it does not tell."""
+    try:
+        told = one.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size)
+    except OSError:
+        return 0
+    return int(_MEMINFO.unpack(told)[-1]) if len(told) == _MEMINFO.size else 0
+
+
+def _open_peer_socket(
+    bound: Sequence[socket.socket], family: socket.AddressFamily, sender: Address
+) -> socket.socket | None:
+    """Another socket on the port of those that are bound, which gets what one sender sends; None if none can be had."""
+    if not hasattr(socket, "SO_REUSEPORT"):
+        return None
+    own = socket.socket(family, socket.SOCK_DGRAM)
+    try:
+        _share_port((*bound, own), shared=True)
+        _set_buffer_size(own, PEER_BUFFER_BYTES)
+        own.bind(bound[0].getsockname())
+        own.connect(sender)
+        own.setblocking(False)
+    except OSError:
+        own.close()
+        return None
+    finally:
+        _share_port(bound, shared=False)  # only for the moment: another program must not get hold of the port
+    _share_port((own,), shared=False)
+    return own
+
+
+def _share_port(sockets: Iterable[socket.socket], *, shared: bool) -> None:
+    for one in sockets:
+        one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, int(shared))

@@ -1,0 +1,169 @@
+"""Reason of a mode change: the pilot, a ground station, or a failsafe or fence of the vehicle.
+
+The name follows `ModeReason` of ArduPilot. MAVLink does not send this reason, so it is inferred:
+
+1. The profile of the autopilot tells whether a person, a failsafe, or either one chooses a mode.
+2. `ModeReasonEvidence` collects texts, fence state, remote control and mode commands of the last seconds.
+3. `determine_mode_reason` combines both. If they disagree, the reason is `UNKNOWN`.
+"""
+
+from __future__ import annotations
+
+import re
+from enum import StrEnum
+
+import msgspec
+
+from uavctl.mavlink.profile import ModeChoice, profile_of
+from uavctl.records import VehicleStatus
+
+# How long texts, fence, stick and mode commands count as evidence: two periods of the heartbeat.
+EVIDENCE_NS = 2_000_000_000
+NEVER_NS = -(2**63)
+STICK_US = 100  # smallest movement of a channel by a person: a tenth of its range
+# Words of a failsafe that chooses a mode, in texts of any severity: PX4's commander; ArduCopter's events.cpp,
+# ekf_check.cpp, crash_check.cpp.
+_FAILSAFE = re.compile(r"failsafe|terminat|parachute|\bcrash|dead.?reckon", re.IGNORECASE)
+_FENCE = re.compile(r"fence.*(breach|violat|exceed)|(breach|violat|exceed|outside|beyond).*fence", re.IGNORECASE)
+# What speaks of an end, of a setting, or of why the vehicle does not arm, is no failsafe of a vehicle in flight.
+_OTHER = re.compile(
+    r"clear|resolved|recovered|\bended|enabled|disabled|^(pre-?arm|arm|arming|preflight)\b", re.IGNORECASE
+)
+_RADIO = re.compile(r"\b(radio|rc|manual control|remote)\b", re.IGNORECASE)
+
+
+class ModeReason(StrEnum):
+    """Who has changed the mode; the value is how a person would say it."""
+
+    PILOT = "the pilot"
+    GROUND_STATION = "a ground station"
+    FAILSAFE = "the vehicle's own failsafe"
+    FENCE = "the vehicle's own fence"
+    UNKNOWN = "not known by whom"
+
+
+VEHICLE_REASONS = frozenset({ModeReason.FAILSAFE, ModeReason.FENCE})  # the vehicle itself
+PERSON_REASONS = frozenset({ModeReason.PILOT, ModeReason.GROUND_STATION})
+
+
+def reports_fence_breach(text: str) -> bool:
+    """Whether a text of the vehicle says that it is beyond a fence of its own."""
+    return bool(_FENCE.search(text)) and not _OTHER.search(text)
+
+
+def reports_failsafe(text: str) -> bool:
+    """Whether a text of the vehicle says that a failsafe of its own acts."""
+    return bool(_FAILSAFE.search(text)) and not _OTHER.search(text)
+
+
+def mentions_radio(text: str) -> bool:
+    """Whether a text that speaks of a failsafe speaks of the remote control: then its sticks move by themselves."""
+    return bool(_RADIO.search(text))
+
+
+def is_autonomous_mode(vehicle: VehicleStatus) -> bool:
+    """Whether its mode is one that needs no person: nobody may be there."""
+    return profile_of(vehicle).mode_choices.get(vehicle.mode, ModeChoice.PERSON) is not ModeChoice.PERSON
+
+
+def determine_mode_reason(vehicle: VehicleStatus, *, was_in_failsafe: bool = False) -> ModeReason:
+    """Decide who has changed the mode to the one that the vehicle shows.
+
+    Args:
+        vehicle: its status, with what it said within the last seconds.
+        had_failed: a failsafe had chosen the mode of before; what it said may be of then.
+    """
+    profile = profile_of(vehicle)
+    choice = profile.mode_choices.get(vehicle.mode)
+    own = ModeReason.FENCE if vehicle.fence else ModeReason.FAILSAFE if vehicle.failsafe else None
+    if choice is ModeChoice.FAILSAFE:
+        return own or ModeReason.FAILSAFE
+    if choice is ModeChoice.PERSON:
+        # An ArduPilot is in a failsafe by its heartbeats also after a person has chosen another mode.
+        now = (
+            vehicle.mode in profile.degraded_modes
+            and not was_in_failsafe
+            and (profile.restores_mode or bool(vehicle.said))
+        )
+        own = own if now and not vehicle.stick else None
+    if own is not None:
+        return ModeReason.UNKNOWN if vehicle.stick else own
+    if vehicle.stick:
+        return ModeReason.PILOT
+    if vehicle.station:
+        return ModeReason.GROUND_STATION
+    return ModeReason.PILOT if choice is ModeChoice.PERSON and vehicle.radio else ModeReason.UNKNOWN
+
+
+class ModeReasonEvidence:
+    """What the vehicle says, and shows, of who changes its modes.
+
+    Each counts for `EVIDENCE_NS`, and longer where no heartbeat has come since: the mode may have changed right after.
+    """
+
+    def __init__(self) -> None:
+        self._failsafe_ns = self._fence_ns = self._failsafe_text_ns = self._stick_ns = self._station_ns = NEVER_NS
+        self._heartbeats_ns = NEVER_NS, NEVER_NS  # the newest heartbeat, and the one before
+        self._failsafe_text = ""
+        self._station = 0
+        self._reference_us: list[int] = []  # of each channel, since it moved last; 0: not known
+        self._has_radio: bool | None = None  # None before it says so
+        self._is_within_fence = True
+
+    def add_heartbeat(self, at_ns: int) -> None:
+        """Take a heartbeat, which shows the mode."""
+        self._heartbeats_ns = at_ns, self._heartbeats_ns[0]
+
+    def add_text(self, text: str, at_ns: int) -> None:
+        """Take a text, of any severity."""
+        fence, failsafe = reports_fence_breach(text), reports_failsafe(text)
+        if fence or failsafe:
+            self._failsafe_text, self._failsafe_text_ns = text, at_ns
+        if fence:
+            self._fence_ns = at_ns
+        if failsafe:
+            self._failsafe_ns = at_ns
+        elif "failsafe" in text.lower() and "clear" in text.lower():
+            self._failsafe_ns = NEVER_NS
+
+    def update_fence(self, at_ns: int, *, within: bool) -> None:
+        """Take whether it is within its fence; that it comes beyond it counts."""
+        if self._is_within_fence and not within:
+            self._fence_ns = at_ns
+        self._is_within_fence = within
+
+    def update_radio(self, *, heard: bool) -> None:
+        """Take whether a remote control is heard."""
+        self._has_radio = heard
+
+    def update_channels(self, pulses_us: tuple[int, ...], at_ns: int) -> None:
+        """Take the channels of a remote control."""
+        if len(pulses_us) != len(self._reference_us):
+            self._reference_us = [0] * len(pulses_us)
+        for i, pulse in enumerate(pulses_us):
+            rest = self._reference_us[i]
+            if not rest or abs(pulse - rest) >= STICK_US:
+                self._reference_us[i] = pulse
+                self._stick_ns = at_ns if rest and pulse else self._stick_ns
+
+    def add_mode_command(self, station: int, at_ns: int) -> None:
+        """Take an order of a mode that another than us has given."""
+        self._station, self._station_ns = station, at_ns
+
+    def apply_to(self, status: VehicleStatus, at_ns: int, *, critical: bool) -> VehicleStatus:
+        """Return a status with what counts at a time; `critical`: by its heartbeat a failsafe acts."""
+        since_ns = at_ns - EVIDENCE_NS
+        if self._heartbeats_ns[1] > NEVER_NS:
+            since_ns = min(since_ns, self._heartbeats_ns[1])
+        said = self._failsafe_text if self._failsafe_text_ns > since_ns else ""
+        # A receiver that has lost its remote control moves the channels by itself.
+        lost = self._has_radio is False or mentions_radio(said)
+        return msgspec.structs.replace(
+            status,
+            failsafe=critical or self._failsafe_ns > since_ns,
+            fence=self._fence_ns > since_ns,
+            said=said,
+            stick=self._stick_ns > since_ns and not lost,
+            radio=bool(self._has_radio) and not self._reference_us,
+            station=self._station if self._station_ns > since_ns else 0,
+        )

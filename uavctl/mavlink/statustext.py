@@ -1,0 +1,60 @@
+"""Reassembly of STATUSTEXT: a vehicle sends a text of more than 50 characters in chunks."""
+
+from __future__ import annotations
+
+import msgspec
+
+from uavctl.mavlink.messages import Text
+
+CHUNK_WAIT_NS = 1_000_000_000  # for the pieces that are to come; PX4 sends them at once
+MAX_PARTIAL_TEXTS = 16  # texts under way
+MISSING_CHUNK = "…"  # stands for a piece that did not come
+
+
+class _PartialText(msgspec.Struct):
+    """Text of which more pieces are to come."""
+
+    first: Text
+    text: str
+    next_chunk: int
+    at_ns: int
+
+    def finish(self) -> Text:
+        """Return the text as far as it has come, with a mark for the part that is missing."""
+        return _make_text(self.first, self.text + MISSING_CHUNK)
+
+
+class StatusTextAssembler:
+    """Joins the pieces of texts, by their sender."""
+
+    def __init__(self) -> None:
+        self._partial_texts: dict[tuple[int, int], _PartialText] = {}
+
+    def add_chunk(self, text: Text, at_ns: int) -> tuple[Text, ...]:
+        """Take a piece, or a whole text; the texts that are whole now."""
+        sender = text.system, text.component
+        begun = self._partial_texts.get(sender)
+        told: tuple[Text, ...] = ()
+        if begun is not None and (begun.first.text_id != text.text_id or text.chunk < begun.next_chunk):
+            told = (self._partial_texts.pop(sender).finish(),)
+            begun = None
+        if begun is None:
+            begun = _PartialText(text, MISSING_CHUNK if text.chunk else "", text.chunk, at_ns)
+        begun.text += ("" if text.chunk == begun.next_chunk else MISSING_CHUNK) + text.text
+        begun.next_chunk = text.chunk + 1
+        if not text.has_more:
+            self._partial_texts.pop(sender, None)
+            return (*told, _make_text(begun.first, begun.text))
+        if sender in self._partial_texts or len(self._partial_texts) < MAX_PARTIAL_TEXTS:
+            self._partial_texts[sender] = begun
+            return told
+        return (*told, begun.finish())
+
+    def flush_overdue(self, at_ns: int) -> tuple[Text, ...]:
+        """The texts whose rest has not come."""
+        late = [sender for sender, begun in self._partial_texts.items() if at_ns - begun.at_ns > CHUNK_WAIT_NS]
+        return tuple(self._partial_texts.pop(sender).finish() for sender in late)
+
+
+def _make_text(first: Text, text: str) -> Text:
+    return Text(system=first.system, component=first.component, severity=first.severity, text=text.rstrip())
