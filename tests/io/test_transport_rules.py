@@ -241,9 +241,8 @@ def test_a_backlog_of_the_vehicle_s_is_read_whole_and_ends_with_its_newest_state
     assert taken[0] and not taken[1] and taken[-1]
     assert sum(taken) <= VEHICLE_BURST[1]
     assert refused["too-many"] + refused["too-much"] == len(words) - sum(taken)
-    assert (
-        VEHICLE_TIMES * AdmissionRules().max_frames_per_s >= 3 * 600.0
-    )  # a real one says so much; bytes may look like frames
+    # a real one says so much; bytes may look like frames
+    assert VEHICLE_TIMES * AdmissionRules().max_frames_per_s >= 3 * 600.0
 
 
 @pytest.mark.fault(39)

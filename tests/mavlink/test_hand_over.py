@@ -61,9 +61,8 @@ def test_silence_while_engaged_is_told_once_and_the_controller_s_braking_is_sent
     assert not rig.codes("heartbeat")
     for _ in range(20):
         assert rig.tick().setpoint_mode is FLY
-        assert (
-            rig.hand_over.select_controlled_status(rig.view.at_ns, rig.vehicle) is None
-        )  # so that it brakes and holds, then lands
+        # so that it brakes and holds, then lands
+        assert rig.hand_over.select_controlled_status(rig.view.at_ns, rig.vehicle) is None
     rig.mute = False
     assert rig.tick().setpoint_mode is FLY
     lost, back = rig.codes("heartbeat")

@@ -16,7 +16,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.frames import euler_from_quaternion
 from uavctl.mavlink.encoder import Encoder
-from uavctl.mavlink.framing import with_checksum
+from uavctl.mavlink.framing import add_checksum
 from uavctl.mavlink.message_layout import MessageLayout
 from uavctl.mavlink.relay import Pose
 from uavctl.records import Setpoint, SetpointSource
@@ -38,7 +38,7 @@ def framed(kind: Any, payload: bytes, sender: tuple[int, int], *, v1: bool = Fal
         body = bytes((len(payload), number, *sender, kind.id)) + payload
         return b"\xfe" + body + int(mavlink.x25crc(body + bytes((kind.crc_extra,))).crc).to_bytes(2, "little")
     head = bytes((0xFD, len(payload), int(signed), 0, number, *sender)) + int(kind.id).to_bytes(3, "little")
-    return with_checksum(head + payload) + bytes(13 * signed)
+    return add_checksum(head + payload) + bytes(13 * signed)
 
 
 def exact(value: Any) -> Any:

@@ -124,9 +124,14 @@ class ControlServer:
     """
 
     def __init__(
-        self, listener: socket.socket, config: Config, flight: OrderReceiver, look: Callable[[], Health]
+        self, listener: socket.socket, config: Config, order_receiver: OrderReceiver, make_health: Callable[[], Health]
     ) -> None:
-        self._listener, self._config, self._order_receiver, self._make_health = listener, config, flight, look
+        self._listener, self._config, self._order_receiver, self._make_health = (
+            listener,
+            config,
+            order_receiver,
+            make_health,
+        )
         self._clients: list[_Client] = []
         self._pending: list[tuple[_Client, Command]] = []  # for the next tick's answers
 
@@ -136,8 +141,8 @@ class ControlServer:
         self._send_answers(list(ticked.answers))
         self._accept(ticked.decision.at_ns)
         waiting = [client for client, _ in self._pending]
-        for client in [one for one in self._clients if one not in waiting]:
-            self._serve(client, ticked.decision.at_ns)
+        for idle in [client for client in self._clients if client not in waiting]:
+            self._serve(idle, ticked.decision.at_ns)
 
     def close(self) -> None:
         """End the service; clients that still wait are told so."""
@@ -151,12 +156,12 @@ class ControlServer:
     def _send_answers(self, answers: list[tuple[Command, Event]]) -> None:
         waiting, self._pending = self._pending, []
         for client, command in waiting:
-            found = next((one for one in answers if one[0] == command), None)
-            if found is None:
+            answer = next((pair for pair in answers if pair[0] == command), None)
+            if answer is None:
                 self._reply(client, Reply(ok=False, text="the flight gave no answer to this"))
             else:
-                answers.remove(found)
-                self._reply(client, Reply(ok=found[1].code == ORDER_ACCEPTED, text=found[1].text))
+                answers.remove(answer)
+                self._reply(client, Reply(ok=answer[1].code == ORDER_ACCEPTED, text=answer[1].text))
 
     def _accept(self, now_ns: int) -> None:
         while len(self._clients) < MAX_CLIENTS:
@@ -184,8 +189,8 @@ class ControlServer:
         if data:
             client.heard_ns = now_ns
             client.buffer += data
-        line, whole, rest = client.buffer.partition(b"\n")
-        if whole and len(line) <= MAX_LINE:
+        line, separator, rest = client.buffer.partition(b"\n")
+        if separator and len(line) <= MAX_LINE:
             client.buffer = rest
             self._handle_request(client, line)
         elif len(client.buffer) > MAX_LINE:
@@ -223,8 +228,8 @@ class ControlServer:
         if request.position_m is None:
             return None
         config = self._config
-        found = outside(config.plant, config.sets, request.position_m, "position_m", "place")
-        return "; ".join(problem.reason for problem in found) or None
+        answer = outside(config.plant, config.sets, request.position_m, "position_m", "place")
+        return "; ".join(problem.reason for problem in answer) or None
 
     def _reply(self, client: _Client, reply: Reply) -> None:
         data = msgspec.json.encode(reply) + b"\n"
@@ -266,12 +271,12 @@ def _prepare_folder(folder: Path) -> None:
     """See to a folder that only this user can enter."""
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        found = folder.lstat()
+        answer = folder.lstat()
     except OSError as error:
         raise UsageError(f"{folder}: {error.strerror}; choose another folder with --control") from error
-    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid():
+    if not stat.S_ISDIR(answer.st_mode) or answer.st_uid != os.geteuid():
         raise UsageError(f"{folder}: not a folder of this user; choose another one with --control")
-    if found.st_mode & 0o077:
+    if answer.st_mode & 0o077:
         raise UsageError(f"{folder}: others may enter it, and could give orders; run: chmod 700 {folder}")
 
 
@@ -279,13 +284,13 @@ def _listen(path: Path, name: str) -> socket.socket:
     """Bind and listen; a socket that a dead daemon left is taken over."""
     if path.is_socket():
         try:
-            alive = _is_listening(path)
+            is_listening = _is_listening(path)
         except OSError as error:
             raise UsageError(
                 f"{path}: {error.strerror}: another user, root it may be, left it; if no daemon of theirs flies, "
                 f"run: sudo rm {path}"
             ) from error
-        if alive:
+        if is_listening:
             raise VehicleTakenError(
                 f"{path}: a daemon named {name} is running; end it, or give this one another --set 'name=\"...\"'"
             )

@@ -62,7 +62,7 @@ def fly(
     """
     first_ns: int | None = None
     stop_ns: int | None = None
-    refusals = _RefusalReporter(loop, connections, on_events)
+    reporter = _RefusalReporter(loop, connections, on_events)
     reader = _Reader(loop, connections, now, on_events)
     withheld = 0
 
@@ -77,10 +77,10 @@ def fly(
         while not loop.finished:
             due = ticker.next()
             while True:
-                heard = reader.read(wait_for(connections, due.at_ns))
+                has_received = reader.read(wait_for(connections, due.at_ns))
                 if now() >= due.at_ns:
                     break
-                if not heard:  # a flood: take what comes by the handful, not each by itself
+                if not has_received:  # a flood: take what comes by the handful, not each by itself
                     wait_for({}, min(due.at_ns, now() + READ_PAUSE_NS))
             if connections[VEHICLE].closed:
                 loop.course.close(f"{connections[VEHICLE].url}; nothing can be sent, and its own failsafe has it")
@@ -92,12 +92,12 @@ def fly(
             due = ticker.update_after_wait(due)
             started_ns = now()
             first_ns = due.at_ns if first_ns is None else first_ns
-            over = duration_s is not None and due.at_ns - first_ns >= duration_s * 1e9
-            if stop_ns is None and (over or stop_requested()):
+            is_time_over = duration_s is not None and due.at_ns - first_ns >= duration_s * 1e9
+            if stop_ns is None and (is_time_over or stop_requested()):
                 stop_ns = due.at_ns
-                loop.course.stop(Cause.TIME if over else Cause.OPERATOR)
-            late = stop_ns is not None and due.at_ns - stop_ns >= stop_limit_s * 1e9
-            if late and not (stop_limit_s and loop.is_relay_needed):
+                loop.course.stop(Cause.TIME if is_time_over else Cause.OPERATOR)
+            is_overdue = stop_ns is not None and due.at_ns - stop_ns >= stop_limit_s * 1e9
+            if is_overdue and not (stop_limit_s and loop.is_relay_needed):
                 break
             withheld = 0
             ticked = loop.tick(due.tick, due.at_ns, send, due.missed, stop=stop_ns is not None)
@@ -106,11 +106,11 @@ def fly(
             loop.timing(ticked, started_ns - due.at_ns, now() - due.at_ns)
             if loop.outside and ticked.decision.solve is not None:
                 loop.answered(ticked.step_ns)
-            refusals.report(due.at_ns)
-            for follow in after_tick:
-                follow(ticked, started_ns - due.at_ns)
+            reporter.report(due.at_ns)
+            for callback in after_tick:
+                callback(ticked, started_ns - due.at_ns)
     finally:
-        refusals.report(now(), last=True)
+        reporter.report(now(), is_last=True)
     return stop_ns is not None
 
 
@@ -136,26 +136,26 @@ class _Reader:
 
     def read(self, names: Iterable[str], *, read_all: bool = False) -> bool:
         """Hand on what has arrived on the named connections; False if the flight needs nothing of it."""
-        began_ns = self._now()
-        stalled = began_ns - self._read_ns > STALL_NS
-        heard = False
+        start_ns = self._now()
+        has_stalled = start_ns - self._read_ns > STALL_NS
+        has_received = False
         for name in names:
             connection = self._connections[name]
-            arrived = connection.receive(read_all=read_all or stalled)
-            heard = heard or (bool(arrived) and connection.has_known_sender)
+            arrived = connection.receive(read_all=read_all or has_stalled)
+            has_received = has_received or (bool(arrived) and connection.has_known_sender)
             for index, (data, received_ns) in enumerate(arrived):
                 self._handle_data(name, index, data, received_ns)
-        self._report_losses(stalled)
+        self._report_losses(has_stalled)
         self._read_ns = self._now()
-        return heard
+        return has_received
 
     def read_backlog(self) -> None:
         """Read what has come until now, before something goes out: a backlog ends with the vehicle's newest state."""
         for _ in range(MAX_READ_ROUNDS):
-            began_ns = self._now()
+            start_ns = self._now()
             self.read(self._connections, read_all=True)
             if not self._connections[VEHICLE].has_unread:
-                self._complete_read_ns = began_ns
+                self._complete_read_ns = start_ns
                 if self.is_fresh:
                     return
 
@@ -171,12 +171,12 @@ class _Reader:
         for answer in received.answers:
             self._connections[answer.link].send(answer.data)
 
-    def _report_losses(self, stalled: bool) -> None:
+    def _report_losses(self, has_stalled: bool) -> None:
         """Tell what the system dropped while nobody looked. Losses in a flood are not told, and change nothing."""
         for name, connection in self._connections.items():
             before, lost = self._lost[name], connection.count_lost()
             self._lost[name] = lost
-            if stalled and lost > before:
+            if has_stalled and lost > before:
                 self._loop.refused(name, {OVERRUN: lost - before}, self._now())
 
 
@@ -190,15 +190,18 @@ class _RefusalReporter:
         self._reported: dict[str, Counter[str]] = {name: Counter() for name in connections}
         self._next_ns = 0
 
-    def report(self, at_ns: int, *, last: bool = False) -> None:
+    def report(self, at_ns: int, *, is_last: bool = False) -> None:
         """Tell what is new if a second has passed, a peer has hung up, or this is the last call."""
-        hung_up = any(one.refused[HUNG_UP] > self._reported[name][HUNG_UP] for name, one in self._connections.items())
-        if at_ns < self._next_ns and not hung_up and not last:
+        hung_up = any(
+            connection.refused[HUNG_UP] > self._reported[name][HUNG_UP]
+            for name, connection in self._connections.items()
+        )
+        if at_ns < self._next_ns and not hung_up and not is_last:
             return
         self._next_ns = at_ns + SECOND_NS
         for name, connection in self._connections.items():
             refused = Counter(connection.refused)
-            new = refused - self._reported[name]
-            if new:
+            new_counts = refused - self._reported[name]
+            if new_counts:
                 self._reported[name] = refused
-                self._on_events(self._loop.refused(name, dict(new), at_ns))
+                self._on_events(self._loop.refused(name, dict(new_counts), at_ns))

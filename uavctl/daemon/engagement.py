@@ -30,7 +30,7 @@ def goto_keys(place_m: Sequence[float]) -> dict[str, object]:
     if len(place_m) != 3 or not all(map(math.isfinite, place_m)):
         raise UsageError(f"goto {place_m}: give north, east and down in local NED [m], as in 2, 1, -2 (up is < 0)")
     return {
-        "mission.waypoints": [[float(one) for one in place_m]],
+        "mission.waypoints": [[float(coordinate) for coordinate in place_m]],
         "mission.hold_s": 0.0,
         "mission.trajectory": {},
         "mission.then": "hold",
@@ -88,9 +88,9 @@ class Engagement:
         if self.goal is None or estimate is None or ticked.decision.mode is not ControlMode.TRACK:
             return
         plant = loop.plant
-        where = [estimate.mean[index] for index in plant.position_index]
+        position = [estimate.mean[index] for index in plant.position_index]
         goal = [self.goal[AXES.index(axis)] for axis in plant.axes]
-        self.has_arrived = self.has_arrived or math.dist(where, goal) <= self._config.mission.accept_m
+        self.has_arrived = self.has_arrived or math.dist(position, goal) <= self._config.mission.accept_m
 
 
 def check_places(config: Config, design: AnyDesign, take_off_m: float | None, goal: Vec3 | None) -> None:
@@ -107,9 +107,9 @@ def check_places(config: Config, design: AnyDesign, take_off_m: float | None, go
     room = build_mission(config, design, resting(design)).room
     if room is None:
         raise UsageError("take-off, goto: this plant cannot rest wherever it is sent; see plant")
-    why = "" if goal is None else room.refusal(goal)
-    if why:
-        raise UsageError(f"goto: {why}")
+    refusal = "" if goal is None else room.refusal(goal)
+    if refusal:
+        raise UsageError(f"goto: {refusal}")
     if take_off_m is None:
         return
     highest_m = -float(room.lower[room.axes.index(DOWN)])

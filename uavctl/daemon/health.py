@@ -119,12 +119,14 @@ class HealthMonitor:
         config: Config,
         identity: tuple[str, str, int],
         recorder: Callable[[], RecorderHealth],
-        tell: Callable[[str], None],
+        write_line: Callable[[str], None],
     ) -> None:
-        self._flight, self._identity, self._recorder, self._write_line = flight, identity, recorder, tell
+        self._flight, self._identity, self._recorder, self._write_line = flight, identity, recorder, write_line
         self._axes = tuple(zip(config.plant.axes, position_index(config.plant), strict=True))
-        speeds = config.plant.velocity_index if config.plant.model == "matrices" else [i + 1 for _, i in self._axes]
-        self._speed_axes = tuple(zip(config.plant.axes, speeds, strict=True))
+        speed_indices = (
+            config.plant.velocity_index if config.plant.model == "matrices" else [i + 1 for _, i in self._axes]
+        )
+        self._speed_axes = tuple(zip(config.plant.axes, speed_indices, strict=True))
         self._ticked: Ticked | None = None  # the last tick
         self._rate_hz = config.source.rate_hz or 1.0 / config.plant.dt_s
         self._position_count = 0  # positions, since the start
@@ -165,7 +167,7 @@ class HealthMonitor:
                 self._relay_rate = relay.sent, float(relay.sent - self._relay_rate[0])
             inertial = self._flight.inertial
             if inertial is not None:
-                used, total = (now - before for now, before in zip(inertial, self._inertial, strict=True))
+                used, total = (state - before for state, before in zip(inertial, self._inertial, strict=True))
                 self._inertial, self._inertial_share = inertial, used / total if total else None
             health = self.make_health()
             self._report_recorder(health.recorder)
@@ -179,12 +181,12 @@ class HealthMonitor:
 
     def _report_recorder(self, recorder: RecorderHealth) -> None:
         """Report each change of the recording's health once, in a line of its own."""
-        now = "in trouble" if not recorder.ok else "may not go on for long" if recorder.reason else "well"
-        if now == self._recording_state:
+        state = "in trouble" if not recorder.ok else "may not go on for long" if recorder.reason else "well"
+        if state == self._recording_state:
             return
-        self._recording_state = now
-        why = recorder.reason or f"{recorder.dropped} records dropped"
-        self._write_line("recording is well again" if now == "well" else f"warning: recording {now}: {why}")
+        self._recording_state = state
+        reason = recorder.reason or f"{recorder.dropped} records dropped"
+        self._write_line("recording is well again" if state == "well" else f"warning: recording {state}: {reason}")
 
     def make_health(self) -> Health:
         """The flight as it is now."""
@@ -275,5 +277,5 @@ def _relayed(relay: RelayHealth) -> str:
     return f"relay {relay.sent_hz:.0f} /s{' alone' if relay.alone else ''}{silent}"
 
 
-def _number(value: float | None, form: str) -> str:
-    return "-" if value is None else format(value, form)
+def _number(value: float | None, spec: str) -> str:
+    return "-" if value is None else format(value, spec)

@@ -46,20 +46,20 @@ def identify_connection(url: str) -> str:
         return f"serial {os.path.realpath(rest.rpartition(':')[0])}"  # the rate does not make another device
     try:
         parts = urlsplit(url)
-        found = socket.getaddrinfo(parts.hostname, parts.port)[0][4]
+        status = socket.getaddrinfo(parts.hostname, parts.port)[0][4]
     except (ValueError, OSError) as error:
         raise ConnectionSpecError(f"connection {url!r}: {error}; check host and port") from error
-    host, port = str(found[0]), int(found[1])
-    return f"{scheme} {_host(host, local=scheme == 'udpin')} {port}"
+    host, port = str(status[0]), int(status[1])
+    return f"{scheme} {_host(host, is_local=scheme == 'udpin')} {port}"
 
 
-def _host(text: str, *, local: bool) -> str:
+def _host(text: str, *, is_local: bool) -> str:
     """One form of an address: the loopback of both families is the same machine, and so is "any" as a destination."""
     address = ipaddress.ip_address(text.partition("%")[0])
     if isinstance(address, ipaddress.IPv6Address):
         address = address.ipv4_mapped or address
     if address.is_unspecified:
-        return "any" if local else "127.0.0.1"
+        return "any" if is_local else "127.0.0.1"
     return "127.0.0.1" if address == ipaddress.IPv6Address("::1") else str(address)
 
 
@@ -77,8 +77,8 @@ class VehicleLock:
     def __init__(self, descriptors: Sequence[int], url: str, now: Callable[[], int] = time.monotonic_ns) -> None:
         self._descriptors, self._now = descriptors, now
         self._first_line = f"{os.getpid()} {url}\n"
-        found = [_left_ns(os.pread(one, _LONGEST, 0), now()) for one in descriptors]
-        self._left_flight_ns = max((one for one in found if one is not None), default=None)
+        status = [_left_ns(os.pread(descriptor, _LONGEST, 0), now()) for descriptor in descriptors]
+        self._left_flight_ns = max((descriptor for descriptor in status if descriptor is not None), default=None)
         self._write()
 
     @property
@@ -91,11 +91,11 @@ class VehicleLock:
         """Whether the vehicle would now be left in flight; before anything is noted, whether it was found so."""
         return self._left_flight_ns is not None
 
-    def update(self, leaves: bool | None) -> None:
+    def update(self, is_left_in_flight: bool | None) -> None:
         """Write down whether the vehicle would be left in flight; None changes nothing."""
-        if leaves is None or leaves == self.is_left_in_flight:
+        if is_left_in_flight is None or is_left_in_flight == self.is_left_in_flight:
             return
-        self._left_flight_ns = self._now() if leaves else None
+        self._left_flight_ns = self._now() if is_left_in_flight else None
         with suppress(OSError):  # no flight ends because a word to the next one does not fit on the disk
             self._write()
 
@@ -109,8 +109,8 @@ class VehicleLock:
 
 def _left_ns(text: bytes, now_ns: int) -> int | None:
     """Return when the file's last holder began a flight that it then left [ns]; None if there is none to find."""
-    _, _, flown = text.decode(errors="replace").partition(f"\n{_FLOWN} ")
-    at_ns = int(flown.strip()) if flown.strip().isdecimal() else None
+    _, _, flight_ns = text.decode(errors="replace").partition(f"\n{_FLOWN} ")
+    at_ns = int(flight_ns.strip()) if flight_ns.strip().isdecimal() else None
     # A time to come is one of before the machine's last start.
     return at_ns if at_ns is not None and 0 <= now_ns - at_ns <= LONGEST_FLIGHT_NS else None
 
@@ -118,7 +118,7 @@ def _left_ns(text: bytes, now_ns: int) -> int | None:
 def lock_paths(url: str, folder: Path | None = None) -> tuple[Path, ...]:
     """Files of the lock of the vehicle behind a URL; arguments and errors are those of `lock_vehicle`."""
     name = f"uavctl-{hashlib.sha256(identify_connection(url).encode()).hexdigest()[:16]}.lock"
-    return tuple(one / name for one in (find_runtime_folders() if folder is None else (folder,)))
+    return tuple(descriptor / name for descriptor in (find_runtime_folders() if folder is None else (folder,)))
 
 
 @contextmanager
@@ -139,12 +139,12 @@ def lock_vehicle(url: str, folder: Path | None = None) -> Iterator[VehicleLock]:
         for path in paths:
             descriptors.append(_lock(path, url))
             stack.callback(os.close, descriptors[-1])
-        tenure: VehicleLock | None = None
+        vehicle_lock: VehicleLock | None = None
         try:
-            tenure = _make_vehicle_lock(descriptors, url, paths[0])
-            yield tenure
+            vehicle_lock = _make_vehicle_lock(descriptors, url, paths[0])
+            yield vehicle_lock
         finally:
-            if tenure is None or not tenure.is_left_in_flight:
+            if vehicle_lock is None or not vehicle_lock.is_left_in_flight:
                 for path in paths:
                     with suppress(OSError):  # gone with its folder, at the end of a login session
                         path.unlink()
@@ -190,12 +190,12 @@ def _open(path: Path) -> int:
         descriptor = os.open(path, os.O_RDWR | os.O_NOFOLLOW)
     except FileNotFoundError:
         descriptor = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_CREAT | os.O_EXCL, 0o600)
-    found = os.fstat(descriptor)
-    if stat.S_ISREG(found.st_mode) and found.st_uid == os.geteuid():
+    status = os.fstat(descriptor)
+    if stat.S_ISREG(status.st_mode) and status.st_uid == os.geteuid():
         os.fchmod(descriptor, 0o600)
         return descriptor
     os.close(descriptor)
-    raise PermissionError if stat.S_ISREG(found.st_mode) else OSError(0, "not a regular file")
+    raise PermissionError if stat.S_ISREG(status.st_mode) else OSError(0, "not a regular file")
 
 
 def _is_same_file(path: Path, descriptor: int) -> bool:
@@ -208,10 +208,10 @@ def _is_same_file(path: Path, descriptor: int) -> bool:
 
 def _describe_holder(descriptor: int, url: str) -> VehicleTakenError:
     first_line, _, _ = os.pread(descriptor, _LONGEST, 0).decode(errors="replace").partition("\n")
-    pid, _, theirs = first_line.strip().partition(" ")
+    pid, _, their_url = first_line.strip().partition(" ")
     os.close(descriptor)
     holder = f"process {pid}" if pid.isdecimal() else "another process"
-    same = f" (as {theirs})" if theirs and theirs != url else ""
+    alias = f" (as {their_url})" if their_url and their_url != url else ""
     return VehicleTakenError(
-        f"{url}: {holder} flies this vehicle already{same}; end it first, or fly another vehicle with --vehicle"
+        f"{url}: {holder} flies this vehicle already{alias}; end it first, or fly another vehicle with --vehicle"
     )

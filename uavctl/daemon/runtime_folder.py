@@ -21,10 +21,10 @@ TEMPORARY = Path("/tmp")
 def is_private_folder(folder: Path) -> bool:
     """Whether this is a folder of this user, that no other one may enter; a link to one is none."""
     try:
-        found = folder.lstat()
+        folders = folder.lstat()
     except OSError:
         return False
-    return stat.S_ISDIR(found.st_mode) and found.st_uid == os.geteuid() and not found.st_mode & 0o077
+    return stat.S_ISDIR(folders.st_mode) and folders.st_uid == os.geteuid() and not folders.st_mode & 0o077
 
 
 def find_runtime_folders(environ: Mapping[str, str] = os.environ) -> tuple[Path, ...]:
@@ -36,18 +36,23 @@ def find_runtime_folders(environ: Mapping[str, str] = os.environ) -> tuple[Path,
     Raises:
         UsageError: there is none.
     """
-    user = os.geteuid()
-    given = Path(environ.get("XDG_RUNTIME_DIR") or "/")
-    bases = [base for base in (given, RUN / "user" / str(user)) if base.is_absolute() and base != Path("/")]
-    last = TEMPORARY / f"uavctl-{user}"
-    wanted = [*(base / "uavctl" for base in bases if is_private_folder(base)), last]
-    for folder in wanted:
+    user_id = os.geteuid()
+    xdg_folder = Path(environ.get("XDG_RUNTIME_DIR") or "/")
+    bases = [base for base in (xdg_folder, RUN / "user" / str(user_id)) if base.is_absolute() and base != Path("/")]
+    temporary_folder = TEMPORARY / f"uavctl-{user_id}"
+    candidates = [*(base / "uavctl" for base in bases if is_private_folder(base)), temporary_folder]
+    for folder in candidates:
         with suppress(OSError):
             folder.mkdir(mode=0o700, exist_ok=True)
-    found = tuple(dict.fromkeys(one for one in (*wanted[:-1], RUN / "uavctl", last) if is_private_folder(one)))
-    if not found:
-        raise UsageError(
-            f"{last}: not a folder of this user alone, and XDG_RUNTIME_DIR names none, so there is no safe place for "
-            f"lock and socket; see whose it is, and remove it (sudo rm -r {last}) or run: chmod 700 {last}"
+    folders = tuple(
+        dict.fromkeys(
+            folder for folder in (*candidates[:-1], RUN / "uavctl", temporary_folder) if is_private_folder(folder)
         )
-    return found
+    )
+    if not folders:
+        raise UsageError(
+            f"{temporary_folder}: not a folder of this user alone, and XDG_RUNTIME_DIR names none, so there is no safe "
+            f"place for lock and socket; see whose it is, and remove it (sudo rm -r {temporary_folder}) or run: "
+            f"chmod 700 {temporary_folder}"
+        )
+    return folders

@@ -101,8 +101,8 @@ FAIR_TIMES = 1.0 / 16.0  # of what one may send; who sends less has sent little
 RESERVED = 0.5  # share of what all have together that is left to those who have sent little
 
 
-def _scale(factor: float, those: tuple[float, float, float]) -> tuple[float, float, float]:
-    return factor * those[0], factor * those[1], factor * those[2]
+def _scale(factor: float, amounts: tuple[float, float, float]) -> tuple[float, float, float]:
+    return factor * amounts[0], factor * amounts[1], factor * amounts[2]
 
 
 class _TokenBucket:
@@ -128,17 +128,17 @@ class _TokenBucket:
         burst = self._limit.burst
         return 1.0 - min(self.datagrams / burst[0], self.frames / burst[1], self.bytes / burst[2])
 
-    def find_refusal(self, frames: int, size: int, keep: float = 0.0) -> str | None:
+    def find_refusal(self, frames: int, size: int, reserve: float = 0.0) -> str | None:
         """Return why a datagram does not fit; None if it does.
 
         Args:
             keep: share of the burst that has to be left afterwards.
         """
         burst = self._limit.burst
-        if self.datagrams - 1.0 < keep * burst[0]:
+        if self.datagrams - 1.0 < reserve * burst[0]:
             return TOO_MANY
-        poor = self.frames - frames < keep * burst[1] or self.bytes - size < keep * burst[2]
-        return TOO_MUCH if poor else None
+        is_short = self.frames - frames < reserve * burst[1] or self.bytes - size < reserve * burst[2]
+        return TOO_MUCH if is_short else None
 
     def consume(self, frames: int, size: int) -> None:
         """Take a datagram."""
@@ -161,15 +161,15 @@ class _Sender:
         self.bucket.refill(now_ns)
         self.fair_bucket.refill(now_ns)
 
-    def admit(self, frames: int, size: int, joint: _TokenBucket | None) -> str | None:
+    def admit(self, frames: int, size: int, shared_bucket: _TokenBucket | None) -> str | None:
         """Take a datagram, or say why not."""
         refusal = self.bucket.find_refusal(frames, size)
-        if joint is not None and refusal is None:
-            little = self.fair_bucket.find_refusal(frames, size) is None
-            refusal = joint.find_refusal(frames, size, 0.0 if little else RESERVED)
+        if shared_bucket is not None and refusal is None:
+            is_fair = self.fair_bucket.find_refusal(frames, size) is None
+            refusal = shared_bucket.find_refusal(frames, size, 0.0 if is_fair else RESERVED)
             if refusal is None:
-                joint.consume(frames, size)
-                if little:
+                shared_bucket.consume(frames, size)
+                if is_fair:
                     self.fair_bucket.consume(frames, size)
         if refusal is None:
             self.bucket.consume(frames, size)
@@ -222,10 +222,10 @@ class RateLimiter:
     def trust_sender(self, sender: Address, now_ns: int) -> None:
         """Note that the flight needs a sender; the one noted longest ago makes room."""
         self._limit_strangers()
-        known = self._trusted_senders.pop(sender, None) or _Sender(self._trusted_limit, now_ns)
+        sender_state = self._trusted_senders.pop(sender, None) or _Sender(self._trusted_limit, now_ns)
         if len(self._trusted_senders) >= MAX_TRUSTED:
             self._trusted_senders.popitem(last=False)
-        self._trusted_senders[sender] = known
+        self._trusted_senders[sender] = sender_state
 
     def admit(self, senders: Sequence[Address], data: Sequence[bytes], now_ns: int) -> list[bool]:
         """Return which datagrams of a batch to hand on: of each sender the newest ones that its budget pays.
@@ -233,7 +233,7 @@ class RateLimiter:
         Args:
             senders: of the datagrams, in the order in which they came.
         """
-        taken = [False] * len(data)
+        admitted = [False] * len(data)
         queues: dict[Address, list[int]] = {}
         for index, sender in enumerate(senders):
             queues.setdefault(sender, []).append(index)
@@ -241,19 +241,21 @@ class RateLimiter:
         for sender, indices in queues.items():
             if self._vehicle is not None and sender == self._vehicle[0]:
                 self._vehicle[1].refill(now_ns)
-                self._admit_in_turn([(self._vehicle[1], self._put_heartbeats_last(indices, data))], None, data, taken)
+                self._admit_in_turn(
+                    [(self._vehicle[1], self._put_heartbeats_last(indices, data))], None, data, admitted
+                )
             elif sender in self._trusted_senders:
                 trusted.append((self._trusted_senders[sender], indices))
             else:
                 strangers.append((self._find_stranger(sender, now_ns), indices))
-        for group, joint in ((trusted, self._trusted_bucket), (strangers, self._stranger_bucket)):
+        for group, shared_bucket in ((trusted, self._trusted_bucket), (strangers, self._stranger_bucket)):
             if group:
-                joint.refill(now_ns)
-                for one, _ in group:
-                    one.refill(now_ns)
-                group.sort(key=lambda one: one[0].fair_bucket.used_share)
-                self._admit_in_turn(group, joint, data, taken)
-        return taken
+                shared_bucket.refill(now_ns)
+                for sender_state, _ in group:
+                    sender_state.refill(now_ns)
+                group.sort(key=lambda sender_state: sender_state[0].fair_bucket.used_share)
+                self._admit_in_turn(group, shared_bucket, data, admitted)
+        return admitted
 
     def _find_stranger(self, sender: Address, now_ns: int) -> _Sender:
         stranger = self._strangers.pop(sender, None)
@@ -267,31 +269,31 @@ class RateLimiter:
     def _admit_in_turn(
         self,
         group: Iterable[tuple[_Sender, list[int]]],
-        joint: _TokenBucket | None,
+        shared_bucket: _TokenBucket | None,
         data: Sequence[bytes],
-        taken: list[bool],
+        admitted: list[bool],
     ) -> None:
         """Take the newest datagram of each sender in turn, as long as its budget and the joint one pay."""
-        waiting = [(one, reversed(indices)) for one, indices in group]
+        waiting = [(sender_state, reversed(indices)) for sender_state, indices in group]
         while waiting:
-            others = []
-            for one, newest in waiting:
+            remaining = []
+            for sender_state, newest in waiting:
                 index = next(newest, None)
                 if index is None:
                     continue
-                others.append((one, newest))
-                refusal = one.admit(count_frames(data[index]), len(data[index]), joint)
+                remaining.append((sender_state, newest))
+                refusal = sender_state.admit(count_frames(data[index]), len(data[index]), shared_bucket)
                 if refusal is None:
-                    taken[index] = True
+                    admitted[index] = True
                 else:
                     self._refused[refusal] += 1
-            waiting = others
+            waiting = remaining
 
     @staticmethod
     def _put_heartbeats_last(indices: Sequence[int], data: Sequence[bytes]) -> list[int]:
         """The newest datagrams that may hold the vehicle's heartbeat behind all others, so that they count first."""
-        found: list[int] = []
+        heartbeats: list[int] = []
         for index in reversed(indices):
-            if len(found) < _HEARTBEATS and _HEARTBEAT.search(data[index]):
-                found.append(index)
-        return [index for index in indices if index not in found] + found[::-1]
+            if len(heartbeats) < _HEARTBEATS and _HEARTBEAT.search(data[index]):
+                heartbeats.append(index)
+        return [index for index in indices if index not in heartbeats] + heartbeats[::-1]

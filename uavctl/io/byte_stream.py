@@ -35,11 +35,11 @@ class _SendBuffer:
 
     def push(self, data: bytes, write: Callable[[bytes], int]) -> bool:
         """Write what waits, then the data; False if the data had to be dropped whole."""
-        dropped = len(self._rest) + len(data) > _PENDING_LIMIT
-        self._rest += b"" if dropped else data
+        is_dropped = len(self._rest) + len(data) > _PENDING_LIMIT
+        self._rest += b"" if is_dropped else data
         with suppress(BlockingIOError):  # full: what waits is written with the next frame
             self._rest = self._rest[write(self._rest) :]
-        return not dropped
+        return not is_dropped
 
 
 class TcpConnection(SocketConnection):
@@ -83,21 +83,21 @@ class TcpConnection(SocketConnection):
         self._heard_ns = self._now()
         return data
 
-    def _disconnect(self, why: str) -> None:
+    def _disconnect(self, reason: str) -> None:
         with suppress(OSError):  # what still waits in the system for a peer that does not answer is old by then
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _DROP_UNSENT)
         self._socket.close()
         self._is_connected, self._attempt_ns = False, self._now()
         self._pending = _SendBuffer()  # a frame of which the peer has had the beginning
-        self.refused[why] += 1
+        self.refused[reason] += 1
 
     def _connect(self) -> None:
         """Begin an attempt to connect, or go on with it; BlockingIOError while there is no connection."""
-        late = self._now() - self._attempt_ns >= RETRY_NS
+        is_overdue = self._now() - self._attempt_ns >= RETRY_NS
         if self._socket.fileno() < 0:
-            if not late:
+            if not is_overdue:
                 raise BlockingIOError
-            self._attempt_ns, late = self._now(), False
+            self._attempt_ns, is_overdue = self._now(), False
             self._socket = socket.socket(self._family, socket.SOCK_STREAM)
             self._socket.setblocking(False)
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -106,7 +106,7 @@ class TcpConnection(SocketConnection):
         if self._is_connected:
             self._heard_ns = self._now()
         else:
-            if late or state not in (errno.EINPROGRESS, errno.EALREADY):
+            if is_overdue or state not in (errno.EINPROGRESS, errno.EALREADY):
                 self._socket.close()
             raise BlockingIOError
 

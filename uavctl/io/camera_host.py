@@ -41,17 +41,17 @@ class CameraMessageEncoder:
     def __init__(self) -> None:
         self._mav = mavlink.MAVLink(None, srcSystem=CAMERA_SYSTEM_ID, srcComponent=COMPONENT_ID)
 
-    def encode(self, told: BodyPose | Echo) -> bytes:
+    def encode(self, item: BodyPose | Echo) -> bytes:
         """ODOMETRY of a sight, in axes forward, right, down; TIMESYNC of an echo, whose token is our time."""
-        if isinstance(told, Echo):
-            return self._pack(mavlink.MAVLink_timesync_message(told.clock_ns, told.token))
+        if isinstance(item, Echo):
+            return self._pack(mavlink.MAVLink_timesync_message(item.clock_ns, item.token))
         return self._pack(
             mavlink.MAVLink_odometry_message(
-                told.exposed_ns // 1000,
+                item.exposed_ns // 1000,
                 mavlink.MAV_FRAME_LOCAL_FRD,
                 mavlink.MAV_FRAME_BODY_FRD,
-                *told.position_m,
-                list(told.attitude),
+                *item.position_m,
+                list(item.attitude),
                 *(math.nan,) * 6,  # rates are not measured
                 _UNKNOWN,
                 _UNKNOWN,
@@ -109,21 +109,21 @@ class CameraHost:
         self._server_socket: socket.socket | None = self._connect(ANSWER_S)
         pipe.setblocking(False)
 
-    def _connect(self, patience_s: float) -> socket.socket:
+    def _connect(self, timeout_s: float) -> socket.socket:
         """Open the socket to the server."""
-        reached = socket.socket(socket.AF_INET, socket.SOCK_STREAM if self._is_stream else socket.SOCK_DGRAM)
+        server_socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM if self._is_stream else socket.SOCK_DGRAM)
         try:
-            reached.bind((self._interface, 0))
+            server_socket.bind((self._interface, 0))
             if self._is_stream:
-                reached.settimeout(patience_s)
-                reached.connect(self._server)
-                reached.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                server_socket.settimeout(timeout_s)
+                server_socket.connect(self._server)
+                server_socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                 self._camera.receive(b"", time.monotonic_ns())
         except OSError:
-            reached.close()
+            server_socket.close()
             raise
-        reached.setblocking(False)
-        return reached
+        server_socket.setblocking(False)
+        return server_socket
 
     def _reconnect(self) -> None:
         """Connect a lost stream again, if it is time."""
@@ -146,9 +146,9 @@ class CameraHost:
             CameraError: the server cannot be used as it is set up.
             TimeoutError: it did not answer.
         """
-        began_s = time.monotonic()
+        start_s = time.monotonic()
         while self._poll():
-            if not self._is_ready and time.monotonic() - began_s > ANSWER_S:
+            if not self._is_ready and time.monotonic() - start_s > ANSWER_S:
                 raise TimeoutError(f"no {self._camera.awaits} within {ANSWER_S:g} s")
             self._report_counts()
 
@@ -166,11 +166,11 @@ class CameraHost:
         for data in self._camera.due(time.monotonic_ns()):
             self._send(data)
         self._follow_group()
-        sources = [one for one in (self._server_socket, self._group_socket) if one is not None]
+        sources = [source for source in (self._server_socket, self._group_socket) if source is not None]
         readable, _, _ = select.select([self._pipe, *sources], [self._pipe] if self._queue else [], [], _PAUSE_S)
-        for one in sources:
-            if one in readable:
-                self._receive(one)
+        for source in sources:
+            if source in readable:
+                self._receive(source)
         self._flush()
         return self._pipe not in readable or self._forward_time_requests()
 
@@ -202,12 +202,12 @@ class CameraHost:
             if not self._is_stream and sender[0] != self._server[0]:
                 self._dropped[NOT_SERVER] += 1
                 continue
-            heard = self._camera.receive(data, time.monotonic_ns())
+            items = self._camera.receive(data, time.monotonic_ns())
             if self._camera.ready and not self._is_ready:  # before any position: the daemon waits for this word
                 self._is_ready = True
                 self._queue_message(READY)
-            for told in heard:
-                self._queue_message(self._encoder.encode(told))
+            for item in items:
+                self._queue_message(self._encoder.encode(item))
 
     def _forward_time_requests(self) -> bool:
         """Pass on the daemon's questions for the time; False if it has gone."""
@@ -255,20 +255,20 @@ class CameraHost:
 
 
 def _join_group(group: tuple[str, int], interface: str) -> socket.socket:
-    joined = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    joined.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # others on this computer may listen too
+    group_socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    group_socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # others on this computer may listen too
     member = struct.pack("4s4s", socket.inet_aton(group[0]), socket.inet_aton(interface))
     try:
-        joined.bind(group)
-        joined.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, member)
+        group_socket.bind(group)
+        group_socket.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, member)
     except OSError as error:
-        joined.close()
+        group_socket.close()
         raise CameraError(
             f"the server streams to group {group[0]}, which cannot be joined ({error.strerror}); "
             "write interface=ADDRESS with this computer's address in the cameras' network, or stream unicast"
         ) from error
-    joined.setblocking(False)
-    return joined
+    group_socket.setblocking(False)
+    return group_socket
 
 
 def _make_camera(camera: str, body: str, up: Up) -> Camera:
@@ -280,8 +280,8 @@ def _make_camera(camera: str, body: str, up: Up) -> Camera:
     module, _, name = camera.partition(":")
     sys.path.append(os.getcwd())  # noqa: PTH109 as text
     try:
-        make: Callable[[str, Up], Camera] = getattr(import_module(module), name)
-        return make(body, up)
+        create: Callable[[str, Up], Camera] = getattr(import_module(module), name)
+        return create(body, up)
     except CameraError:
         raise
     except Exception as error:

@@ -45,13 +45,13 @@ class CameraProcessConnection(BaseConnection):
         self._rate_limiter, self._sender = RateLimiter(rules, self._refused_here), (url, 0)
         self._rate_limiter.trust_sender(self._sender, now())
         self._refused_there: Counter[str] = Counter()  # what the process counted
-        self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        with theirs:
-            command = [sys.executable, "-P", "-m", "uavctl.io.camera_host", str(theirs.fileno()), *arguments]
+        self._socket, peer_socket = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with peer_socket:
+            command = [sys.executable, "-P", "-m", "uavctl.io.camera_host", str(peer_socket.fileno()), *arguments]
             try:
                 self._process = subprocess.Popen(
                     command,
-                    pass_fds=(theirs.fileno(),),
+                    pass_fds=(peer_socket.fileno(),),
                     stdin=subprocess.DEVNULL,
                     stdout=subprocess.DEVNULL,
                     start_new_session=True,  # an interrupt is for the daemon; this process ends with the pipe
@@ -90,7 +90,7 @@ class CameraProcessConnection(BaseConnection):
         arrived = super().receive(read_all=read_all)
         taken = self._rate_limiter.admit([self._sender] * len(arrived), [data for data, _ in arrived], self._now())
         self.refused = self._refused_there + self._refused_here
-        return [one for one, fits in zip(arrived, taken, strict=True) if fits]
+        return [item for item, fits in zip(arrived, taken, strict=True) if fits]
 
     def send(self, data: bytes) -> None:
         """See `Connection`; only questions for the time go on to the cameras."""
@@ -127,22 +127,22 @@ def _open_camera(url: str, now: Callable[[], int], rules: AdmissionRules) -> Con
         ConnectionSpecError: the URL, the server or the body is not as it has to be.
         ExtraMissingError: the camera system's package is not installed.
     """
-    place = parse(url)
-    system = camera_system(place.system)
+    camera_url = parse(url)
+    system = camera_system(camera_url.system)
     if system.package and find_spec(system.package) is None:  # not imported: the camera has a process of its own
         raise ExtraMissingError(system.package, system.extra)
     try:
-        address = socket.gethostbyname(place.host)
+        address = socket.gethostbyname(camera_url.host)
     except OSError as error:
         raise ConnectionSpecError(
-            f"connection {url!r}: host {place.host!r} is unknown ({error}); check the name"
+            f"connection {url!r}: host {camera_url.host!r} is unknown ({error}); check the name"
         ) from error
     if not AllowList(rules.allow).allows(address):
         raise ConnectionSpecError(f"connection {url!r}: {address} is not in security.allow; add it there")
-    arguments = [system.camera, address, str(place.port), place.body, place.up, place.interface]
-    piped = CameraProcessConnection(url, arguments, system.advice, now, rules)
+    arguments = [system.camera, address, str(camera_url.port), camera_url.body, camera_url.up, camera_url.interface]
+    connection = CameraProcessConnection(url, arguments, system.advice, now, rules)
     with ExitStack() as stack:
-        stack.callback(piped.close)
-        piped.wait_until_ready()
+        stack.callback(connection.close)
+        connection.wait_until_ready()
         stack.pop_all()
-    return piped
+    return connection

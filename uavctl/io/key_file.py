@@ -48,13 +48,13 @@ def _parse(path: Path, data: bytes) -> SigningKey:
     text = data.strip()
     try:
         if text.startswith(PASSPHRASE):
-            words = text.removeprefix(PASSPHRASE).strip()
-            if len(words) < MIN_PASSPHRASE:
+            passphrase = text.removeprefix(PASSPHRASE).strip()
+            if len(passphrase) < MIN_PASSPHRASE:
                 raise KeyFileError(
                     f"key file {path}: a passphrase of fewer than {MIN_PASSPHRASE} characters is guessed from one "
                     "signed frame; `uavctl key new FILE` makes a good one"
                 )
-            return SigningKey(hashlib.sha256(words).digest())
+            return SigningKey(hashlib.sha256(passphrase).digest())
         if len(text) == 2 * KEY_BYTES:
             return SigningKey(bytes.fromhex(text.decode("ascii")))
         # 32 letters would be a passphrase that somebody forgot to mark; random bytes never look like it.
@@ -75,11 +75,11 @@ def new_key(path: Path) -> SigningKey:
         KeyFileError: the file is there already, or cannot be written.
     """
     letters = base64.b32encode(os.urandom(_RANDOM_BYTES)).decode("ascii").lower()
-    words = "-".join(letters[i : i + _GROUP] for i in range(0, len(letters), _GROUP))
+    passphrase = "-".join(letters[i : i + _GROUP] for i in range(0, len(letters), _GROUP))
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
         with os.fdopen(descriptor, "w", encoding="ascii") as file:
-            file.write(f"{PASSPHRASE.decode('ascii')} {words}\n")
+            file.write(f"{PASSPHRASE.decode('ascii')} {passphrase}\n")
             file.flush()
             os.fsync(file.fileno())
     except FileExistsError as error:

@@ -99,13 +99,13 @@ class NatNet:
 
     def due(self, at_ns: int) -> tuple[bytes, ...]:
         """See `Camera`: until it answers, and again when it is silent, twice a second at most."""
-        silent = at_ns - self._heard_ns >= _SILENT_NS
-        if (silent or not self._is_complete) and at_ns - self._asked_ns >= _RETRY_NS:
+        is_silent = at_ns - self._heard_ns >= _SILENT_NS
+        if (is_silent or not self._is_complete) and at_ns - self._asked_ns >= _RETRY_NS:
             self._asked_ns = at_ns
-            if silent and self.ready:
+            if is_silent and self.ready:
                 self.dropped[SILENT] += 1
                 self._is_complete = False  # another server may come back, with other numbers for its bodies
-            if silent or self._version is None:
+            if is_silent or self._version is None:
                 return (_message(CONNECT, b"Ping\0"),)
             self._requests += 1
             return (_message(REQUEST_DESCRIPTIONS, struct.pack("<I", RIGID_BODIES) if self._requests % 2 else b""),)
@@ -142,16 +142,18 @@ class NatNet:
         self.group = (str(IPv4Address(group)), port) if multicast else None
 
     def _handle_descriptions(self, descriptions: natnet.DataDescriptions) -> None:
-        bodies = {one.name: one.id_num for one in descriptions.rigid_bodies}
+        bodies = {candidate.name: candidate.id_num for candidate in descriptions.rigid_bodies}
         self._body_id = bodies.get(self._body)
         if self._body_id is None:
-            seen = ", ".join(repr(name) for name in sorted(filter(None, bodies))) or "none"
-            self._refuse(f"no rigid body {self._body!r}; it has: {seen}. Write one of them behind the server's address")
+            names = ", ".join(repr(name) for name in sorted(filter(None, bodies))) or "none"
+            self._refuse(
+                f"no rigid body {self._body!r}; it has: {names}. Write one of them behind the server's address"
+            )
             return
         self._is_complete = self.ready = True
 
     def _handle_frame(self, frame: natnet.DataFrame) -> tuple[BodyPose, ...]:
-        body = next((one for one in frame.rigid_bodies if one.id_num == self._body_id), None)
+        body = next((candidate for candidate in frame.rigid_bodies if candidate.id_num == self._body_id), None)
         exposed, sent = frame.suffix.stamp_camera_mid_exposure, frame.suffix.stamp_transmit
         if body is None:
             return self._count_dropped(MISSING)

@@ -66,23 +66,23 @@ class Qualisys:
             self._body_index = None
             return ()
         self._buffer += data
-        found: list[BodyPose | Echo] = []
+        results: list[BodyPose | Echo] = []
         while len(self._buffer) >= _HEAD.size:
             size, kind = _HEAD.unpack_from(self._buffer)
             if not _HEAD.size <= size <= LARGEST:  # the stream is out of step: it has to begin anew
                 self.dropped[UNREADABLE] += 1
                 self._buffer.clear()
-                self._outgoing.append(_command("Quit"))
+                self._outgoing.append(_encode_command("Quit"))
                 break
             if len(self._buffer) < size:
                 break
             payload = bytes(self._buffer[_HEAD.size : size])
             del self._buffer[:size]
             try:
-                found += self._handle_packet(kind, payload)
+                results += self._handle_packet(kind, payload)
             except _UNREADABLE:
                 self.dropped[UNREADABLE] += 1
-        return tuple(found)
+        return tuple(results)
 
     def due(self, at_ns: int) -> tuple[bytes, ...]:
         """See `Camera`: what is to be said, and the wish for frames again when none have come for a second."""
@@ -90,9 +90,9 @@ class Qualisys:
             self._heard_ns = at_ns
             self.dropped[SILENT] += 1
             self._request_bodies()
-        said = tuple(self._outgoing)
+        outgoing = tuple(self._outgoing)
         self._outgoing.clear()
-        return said
+        return outgoing
 
     def ask_time(self, token: int) -> bytes:
         """See `Camera`: QTM tells its time with frames alone."""
@@ -100,11 +100,11 @@ class Qualisys:
         return b""
 
     def _request_bodies(self) -> None:
-        self._outgoing.append(_command("GetParameters 6D"))
+        self._outgoing.append(_encode_command("GetParameters 6D"))
 
     def _handle_packet(self, kind: int, payload: bytes) -> tuple[BodyPose, ...]:
         if kind == COMMAND and payload.startswith(WELCOME):
-            self._outgoing.append(_command(f"Version {VERSION}"))
+            self._outgoing.append(_encode_command(f"Version {VERSION}"))
         elif kind == COMMAND and payload.startswith(b"Version set"):
             self.awaits = "names of rigid bodies, though the server answers,"
             self._request_bodies()
@@ -124,11 +124,13 @@ class Qualisys:
         names = [(name.text or "").strip() for name in ElementTree.fromstring(text).iterfind("./The_6D/Body/Name")]
         if self._body not in names:
             self._body_index = None
-            seen = ", ".join(map(repr, sorted(names))) or "none"
-            self._refuse(f"has no rigid body {self._body!r}; it has: {seen}. Write one of them behind its address")
+            names_text = ", ".join(map(repr, sorted(names))) or "none"
+            self._refuse(
+                f"has no rigid body {self._body!r}; it has: {names_text}. Write one of them behind its address"
+            )
             return
         self._body_index, self.ready = names.index(self._body), True
-        self._outgoing.append(_command("StreamFrames AllFrames 6D"))
+        self._outgoing.append(_encode_command("StreamFrames AllFrames 6D"))
 
     def _handle_frame(self, frame: QRTPacket) -> tuple[BodyPose, ...]:
         if QRTComponentType.Component6d not in frame.components:
@@ -154,9 +156,9 @@ class Qualisys:
         self.dropped[MISSING] += 1
 
 
-def _command(words: str) -> bytes:
-    text = words.encode() + b"\0"
-    return _HEAD.pack(_HEAD.size + len(text), COMMAND) + text
+def _encode_command(command: str) -> bytes:
+    payload = command.encode() + b"\0"
+    return _HEAD.pack(_HEAD.size + len(payload), COMMAND) + payload
 
 
 def _turn(columns: tuple[float, ...]) -> Quaternion | None:

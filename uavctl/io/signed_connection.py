@@ -25,8 +25,10 @@ from uavctl.mavlink.signing import FrameAuthenticator, FrameSigner, signing_time
 class SignedConnection:
     """A connection whose frames are signed both ways; implements `uavctl.io.transport.Connection`."""
 
-    def __init__(self, inner: Connection, gate: FrameAuthenticator, now: Callable[[], int] = monotonic_ns) -> None:
-        self._inner, self._authenticator, self._now = inner, gate, now
+    def __init__(
+        self, inner: Connection, authenticator: FrameAuthenticator, now: Callable[[], int] = monotonic_ns
+    ) -> None:
+        self._inner, self._authenticator, self._now = inner, authenticator, now
         self._indices: list[int] = []
 
     @property
@@ -81,10 +83,10 @@ class SignedConnection:
         arrived = []
         self._indices.clear()
         for index, (data, at_ns) in enumerate(self._inner.receive(read_all=read_all)):
-            genuine = self._authenticator.verify_frames(data, at_ns)
-            if genuine:
+            verified = self._authenticator.verify_frames(data, at_ns)
+            if verified:
                 self._indices.append(index)
-                arrived.append((genuine, at_ns))
+                arrived.append((verified, at_ns))
         return arrived
 
     def select_peer(self, index: int) -> None:
@@ -134,11 +136,11 @@ def open_links(config: Config, waits: ServerWait | None = None) -> Iterator[dict
     if config.daemon.mocap != config.daemon.vehicle:
         urls[MOCAP] = config.daemon.mocap
     with ExitStack() as stack:
-        plain: dict[str, Connection] = {}
+        connections: dict[str, Connection] = {}
         for name, url in urls.items():
-            plain[name] = _open_link(url, config.security, waits)
-            stack.callback(plain[name].close)
-        yield stack.enter_context(sign_connections(plain, config.security))
+            connections[name] = _open_link(url, config.security, waits)
+            stack.callback(connections[name].close)
+        yield stack.enter_context(sign_connections(connections, config.security))
 
 
 def _open_link(url: str, security: SecurityConfig, waits: ServerWait | None) -> Connection:
@@ -147,8 +149,8 @@ def _open_link(url: str, security: SecurityConfig, waits: ServerWait | None) -> 
             return open_source(url, monotonic_ns, make_admission_rules(security))
         except ConnectionSpecError as error:
             cause = error.__cause__
-            absent = isinstance(cause, OSError) and (isinstance(cause, TimeoutError) or cause.errno in _NOT_UP)
-            if waits is None or not url.startswith("tcp:") or not absent or not waits(url):
+            is_absent = isinstance(cause, OSError) and (isinstance(cause, TimeoutError) or cause.errno in _NOT_UP)
+            if waits is None or not url.startswith("tcp:") or not is_absent or not waits(url):
                 raise
 
 
@@ -170,13 +172,13 @@ def sign_connections(
     keeper = TimestampFile(find_state_folder() / f"{key.name}.stamp", signing_timestamp(wall_ns))
     peers = frozenset(security.peer_link_ids)
     try:
-        doors = dict(connections)
+        signed = dict(connections)
         for name in security.require:
             if name in connections:
                 link_id = security.link_id + (MOCAP_LINK if name == MOCAP else 0)
-                signing = FrameSigner(key, link_id, keeper.timestamps, wall_offset_ns, peers)
+                signer = FrameSigner(key, link_id, keeper.timestamps, wall_offset_ns, peers)
                 stream = connections[name].url.startswith(STREAM_SCHEMES)
-                doors[name] = SignedConnection(connections[name], FrameAuthenticator(signing, stream=stream))
-        yield doors
+                signed[name] = SignedConnection(connections[name], FrameAuthenticator(signer, stream=stream))
+        yield signed
     finally:
         keeper.close()

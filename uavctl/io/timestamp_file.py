@@ -138,10 +138,10 @@ class TimestampFile:
 
     def renew(self) -> None:
         """Write ahead of all that has been seen, if what is written will not last."""
-        seen = self.timestamps.newest
-        if seen + RENEW_MARGIN <= self._written_timestamp:
+        newest = self.timestamps.newest
+        if newest + RENEW_MARGIN <= self._written_timestamp:
             return
-        ahead = min(seen + WRITE_AHEAD, MAX_TIMESTAMP)
+        ahead = min(newest + WRITE_AHEAD, MAX_TIMESTAMP)
         try:
             self._write(self._path, ahead)
         except (OSError, KeyFileError) as error:

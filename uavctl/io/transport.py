@@ -71,7 +71,7 @@ def wait(
             names.update(dict.fromkeys(connection.filenos(), name))
     # select() takes microseconds; epoll would round the deadline up to a millisecond.
     ready, _, _ = select.select(list(names), [], [], max(0.0, (deadline_ns - now()) * 1e-9))
-    return list(dict.fromkeys(names[one] for one in ready))
+    return list(dict.fromkeys(names[descriptor] for descriptor in ready))
 
 
 def _resolve(url: str, kind: socket.SocketKind) -> tuple[socket.AddressFamily, Address]:

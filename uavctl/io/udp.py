@@ -53,11 +53,11 @@ class _UdpConnection(SocketConnection):
 
     def _apply_rate_limits(self, arrived: list[tuple[bytes, int]]) -> list[tuple[bytes, int]]:
         """Drop more than the rules allow, the oldest first; `_senders` are those of what is left."""
-        taken = self._rate_limiter.admit(self._senders, [data for data, _ in arrived], self._now())
-        if all(taken):
+        admitted = self._rate_limiter.admit(self._senders, [data for data, _ in arrived], self._now())
+        if all(admitted):
             return arrived
-        self._senders = [sender for sender, fits in zip(self._senders, taken, strict=True) if fits]
-        return [one for one, fits in zip(arrived, taken, strict=True) if fits]
+        self._senders = [sender for sender, fits in zip(self._senders, admitted, strict=True) if fits]
+        return [sock for sock, fits in zip(arrived, admitted, strict=True) if fits]
 
     def count_lost(self) -> int:
         """See `Connection`."""
@@ -90,50 +90,50 @@ class UdpInConnection(_UdpConnection):
 
     def filenos(self) -> tuple[int, ...]:
         """See `Connection`."""
-        return (self._socket.fileno(), *(one.fileno() for one in self._peer_sockets.values()))
+        return (self._socket.fileno(), *(sock.fileno() for sock in self._peer_sockets.values()))
 
     def count_lost(self) -> int:
         """See `Connection`."""
-        own = None if self._peer is None else self._peer_sockets.get(self._peer)
-        return _count_dropped(self._socket if own is None else own)
+        peer_socket = None if self._peer is None else self._peer_sockets.get(self._peer)
+        return _count_dropped(self._socket if peer_socket is None else peer_socket)
 
     def close(self) -> None:
         """See `Connection`."""
-        for one in self._peer_sockets.values():
-            one.close()
+        for sock in self._peer_sockets.values():
+            sock.close()
         super().close()
 
     def receive(self, *, read_all: bool = False) -> list[tuple[bytes, int]]:
         """See `Connection`; more than the rules allow is dropped, the oldest first."""
         self._senders = []
         arrived: list[tuple[bytes, int]] = []
-        earlier, self._early_datagrams = self._early_datagrams, []
-        for data, sender, at_ns in earlier:
+        early, self._early_datagrams = self._early_datagrams, []
+        for data, sender, at_ns in early:
             if self._admit_sender(data, sender) is not None:
                 arrived.append((data, at_ns))
-        has_own = self._peer in self._peer_sockets
+        has_peer_socket = self._peer in self._peer_sockets
         # Strangers get a handful of looks; whoever shares their socket is found by reading all that it can hold.
-        most = BACKLOG_READS if read_all and not has_own else COMMON_READS
-        self.has_unread = not self._read_socket(self._socket, most, arrived) and not has_own
-        common = len(arrived)
-        for sender, own in self._peer_sockets.items():
-            emptied = self._read_socket(own, BACKLOG_READS if read_all else MAX_READS, arrived)
-            self.has_unread = self.has_unread or (sender == self._peer and not emptied)
-        self.has_known_sender = len(arrived) > common or not self._peer_sockets
+        max_reads = BACKLOG_READS if read_all and not has_peer_socket else COMMON_READS
+        self.has_unread = not self._read_socket(self._socket, max_reads, arrived) and not has_peer_socket
+        common_count = len(arrived)
+        for sender, peer_socket in self._peer_sockets.items():
+            is_empty = self._read_socket(peer_socket, BACKLOG_READS if read_all else MAX_READS, arrived)
+            self.has_unread = self.has_unread or (sender == self._peer and not is_empty)
+        self.has_known_sender = len(arrived) > common_count or not self._peer_sockets
         arrived = self._apply_rate_limits(arrived)
         for (data, at_ns), sender in zip(arrived, self._senders, strict=True):
             if sender == self._peer and not self._is_peer_confirmed:
                 self._heard_ns = at_ns
-            silent = at_ns - self._heard_ns > PEER_SILENCE_NS and not self._is_peer_confirmed
-            if data[0] in MAGIC and (self._peer is None or silent):
+            is_silent = at_ns - self._heard_ns > PEER_SILENCE_NS and not self._is_peer_confirmed
+            if data[0] in MAGIC and (self._peer is None or is_silent):
                 self._peer, self._heard_ns = sender, at_ns
         return arrived
 
-    def _read_socket(self, one: socket.socket, most: int, arrived: list[tuple[bytes, int]]) -> bool:
+    def _read_socket(self, sock: socket.socket, max_reads: int, arrived: list[tuple[bytes, int]]) -> bool:
         """Read a socket; whether it is empty now."""
-        for _ in range(most):
+        for _ in range(max_reads):
             try:
-                data, sender = one.recvfrom(LARGEST)
+                data, sender = sock.recvfrom(LARGEST)
             except BlockingIOError:
                 return True
             except OSError:
@@ -166,17 +166,17 @@ class UdpInConnection(_UdpConnection):
         self._trusted_ns[sender] = now_ns
         if sender in self._peer_sockets:
             return
-        for one, at_ns in list(self._trusted_ns.items()):
-            if now_ns - at_ns > PEER_SILENCE_NS and one != self._peer:
-                del self._trusted_ns[one]
-                if one in self._peer_sockets:
-                    self._peer_sockets.pop(one).close()
+        for sock, at_ns in list(self._trusted_ns.items()):
+            if now_ns - at_ns > PEER_SILENCE_NS and sock != self._peer:
+                del self._trusted_ns[sock]
+                if sock in self._peer_sockets:
+                    self._peer_sockets.pop(sock).close()
         if len(self._peer_sockets) >= MAX_PEER_SOCKETS and sender != self._peer:
             return
-        own = _open_peer_socket((self._socket, *self._peer_sockets.values()), self._family, sender)
-        if own is None:
+        peer_socket = _open_peer_socket((self._socket, *self._peer_sockets.values()), self._family, sender)
+        if peer_socket is None:
             return
-        self._peer_sockets[sender] = own
+        self._peer_sockets[sender] = peer_socket
         # What had come before counts before what the new socket gets.
         for _ in range(BACKLOG_READS):
             try:
@@ -219,21 +219,21 @@ class UdpOutConnection(_UdpConnection):
             self.send_errors += 1
 
 
-def _set_buffer_size(one: socket.socket, size: int) -> None:
+def _set_buffer_size(sock: socket.socket, size: int) -> None:
     """Ask for a buffer of the system's; it may grant less."""
     with suppress(OSError):
-        one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, size)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, size)
     with suppress(OSError):  # whoever may, gets all of it
-        one.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, size)
+        sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, size)
 
 
-def _count_dropped(one: socket.socket) -> int:
+def _count_dropped(sock: socket.socket) -> int:
     """Datagrams that the system has dropped for want of room; 0 where it does not tell."""
     try:
-        told = one.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size)
+        raw = sock.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size)
     except OSError:
         return 0
-    return int(_MEMINFO.unpack(told)[-1]) if len(told) == _MEMINFO.size else 0
+    return int(_MEMINFO.unpack(raw)[-1]) if len(raw) == _MEMINFO.size else 0
 
 
 def _open_peer_socket(
@@ -242,22 +242,22 @@ def _open_peer_socket(
     """Another socket on the port of those that are bound, which gets what one sender sends; None if none can be had."""
     if not hasattr(socket, "SO_REUSEPORT"):
         return None
-    own = socket.socket(family, socket.SOCK_DGRAM)
+    peer_socket = socket.socket(family, socket.SOCK_DGRAM)
     try:
-        _share_port((*bound, own), shared=True)
-        _set_buffer_size(own, PEER_BUFFER_BYTES)
-        own.bind(bound[0].getsockname())
-        own.connect(sender)
-        own.setblocking(False)
+        _share_port((*bound, peer_socket), is_shared=True)
+        _set_buffer_size(peer_socket, PEER_BUFFER_BYTES)
+        peer_socket.bind(bound[0].getsockname())
+        peer_socket.connect(sender)
+        peer_socket.setblocking(False)
     except OSError:
-        own.close()
+        peer_socket.close()
         return None
     finally:
-        _share_port(bound, shared=False)  # only for the moment: another program must not get hold of the port
-    _share_port((own,), shared=False)
-    return own
+        _share_port(bound, is_shared=False)  # only for the moment: another program must not get hold of the port
+    _share_port((peer_socket,), is_shared=False)
+    return peer_socket
 
 
-def _share_port(sockets: Iterable[socket.socket], *, shared: bool) -> None:
-    for one in sockets:
-        one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, int(shared))
+def _share_port(sockets: Iterable[socket.socket], *, is_shared: bool) -> None:
+    for sock in sockets:
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, int(is_shared))

@@ -49,18 +49,18 @@ class BootClock:
             kind: of message; the clocks of two need not agree.
             boot_ms: its time since boot, modulo 2**32 ms.
         """
-        known, doubted = self._readings.get(kind), self._candidates.get(kind)
+        known, candidate = self._readings.get(kind), self._candidates.get(kind)
         reading = _Reading(boot_ms, at_ns)
         if known is None or _is_same_clock(known, reading):
             self._accept(kind, _Reading(boot_ms, at_ns, confirmed=known is not None))
-        elif doubted is not None and at_ns - doubted.at_ns <= CONFIRM_NS and _is_same_clock(doubted, reading):
+        elif candidate is not None and at_ns - candidate.at_ns <= CONFIRM_NS and _is_same_clock(candidate, reading):
             del self._candidates[kind]
-            anew = known.confirmed and (_advance_ms(known, reading) < 0 or _may_have_restarted(known, reading))
-            if anew:  # the others' readings are from before the restart
+            has_restarted = known.confirmed and (_advance_ms(known, reading) < 0 or _may_have_restarted(known, reading))
+            if has_restarted:  # the others' readings are from before the restart
                 self._readings.clear()
                 self._candidates.clear()
             self._accept(kind, _Reading(boot_ms, at_ns, confirmed=True))
-            return anew
+            return has_restarted
         else:
             self._candidates[kind] = reading
         return False

@@ -200,22 +200,26 @@ class TimesyncClock:
             return False
         half_ns = round_trip_ns // 2
         measured_ns = sent_ns + half_ns - remote_ns
-        known_ns, uncertain_ns = self.last_known_ns(received_ns), self.uncertainty_ns(received_ns)
-        if known_ns is not None and abs(measured_ns - known_ns) > max(MAX_DEVIATION_NS, half_ns):
+        expected_ns, uncertainty_ns = self.last_known_ns(received_ns), self.uncertainty_ns(received_ns)
+        if expected_ns is not None and abs(measured_ns - expected_ns) > max(MAX_DEVIATION_NS, half_ns):
             self._deviating_count += 1
             if self._deviating_count < RESYNC_AFTER and self.offset_ns(received_ns) is not None:
                 return False
             self._reset()
-            uncertain_ns = None
+            uncertainty_ns = None
         self._deviating_count = 0
         self._used_ns = received_ns
-        if known_ns is not None and uncertain_ns is not None and half_ns > uncertain_ns + ROUND_TRIP_MARGIN_NS // 2:
-            within_ns = min(max(known_ns, measured_ns - half_ns), measured_ns + half_ns)
-            self._base_ns += within_ns - known_ns
+        if (
+            expected_ns is not None
+            and uncertainty_ns is not None
+            and half_ns > uncertainty_ns + ROUND_TRIP_MARGIN_NS // 2
+        ):
+            clamped_ns = min(max(expected_ns, measured_ns - half_ns), measured_ns + half_ns)
+            self._base_ns += clamped_ns - expected_ns
             return True
         # Round trips of other lengths may be off by other amounts, which is no drift: the slope goes on without them.
-        alike = [trip for trip in self._answers if abs(round_trip_ns - trip[2]) <= 2 * ROUND_TRIP_MARGIN_NS]
-        self._answers = deque([*alike, (received_ns, measured_ns, round_trip_ns)], maxlen=FIT_POINTS)
+        similar = [trip for trip in self._answers if abs(round_trip_ns - trip[2]) <= 2 * ROUND_TRIP_MARGIN_NS]
+        self._answers = deque([*similar, (received_ns, measured_ns, round_trip_ns)], maxlen=FIT_POINTS)
         self._fit_line()
         return True
 
@@ -247,11 +251,8 @@ class ArrivalClock:
     def __init__(self) -> None:
         self._min_offset_ns: float = 0.0
         self._at_ns: int | None = None  # time of the last stamp
-        self._current_second: tuple[int, int, int] = (
-            0,
-            0,
-            0,
-        )  # its begin, least (arrival − stamp) in it, when that was
+        # start of the second, smallest (arrival − stamp) in it, and its time of arrival
+        self._current_second: tuple[int, int, int] = (0, 0, 0)
         self._previous_second: tuple[int, int] | None = None  # the last two of the second before
         self._slopes: deque[float] = deque(maxlen=FIT_POINTS)
         self._slope = 0.0
@@ -263,36 +264,36 @@ class ArrivalClock:
 
     def measure_delay_ns(self, stamp_ns: int, at_ns: int) -> int:
         """Take a stamp; return by how much it came later than the quickest [ns]."""
-        behind_ns = at_ns - stamp_ns
+        offset_ns = at_ns - stamp_ns
         if self._at_ns is None or self._impossible_count >= RESYNC_AFTER:
             self._previous_second, self._slope, self._impossible_count = None, 0.0, 0
             self._slopes.clear()
-            self._current_second, self._min_offset_ns = (at_ns, behind_ns, at_ns), behind_ns
-        elif behind_ns < self._min_offset_ns - MAX_CLOCK_STEP_NS:
+            self._current_second, self._min_offset_ns = (at_ns, offset_ns, at_ns), offset_ns
+        elif offset_ns < self._min_offset_ns - MAX_CLOCK_STEP_NS:
             self._impossible_count += 1
             return 0
         else:
             self._impossible_count = 0
-            begun_ns, least_ns, _ = self._current_second
-            if at_ns - begun_ns >= SECOND_NS:
-                self._start_second(behind_ns, at_ns)
-            elif behind_ns < least_ns:
-                self._current_second = begun_ns, behind_ns, at_ns
+            second_start_ns, min_offset_ns, _ = self._current_second
+            if at_ns - second_start_ns >= SECOND_NS:
+                self._start_second(offset_ns, at_ns)
+            elif offset_ns < min_offset_ns:
+                self._current_second = second_start_ns, offset_ns, at_ns
             since_ns = at_ns - self._at_ns
-            self._min_offset_ns = min(behind_ns, self._min_offset_ns + (self._slope + DRIFT_CHANGE) * since_ns)
+            self._min_offset_ns = min(offset_ns, self._min_offset_ns + (self._slope + DRIFT_CHANGE) * since_ns)
         self._at_ns = at_ns
-        return round(behind_ns - self._min_offset_ns)
+        return round(offset_ns - self._min_offset_ns)
 
-    def _start_second(self, behind_ns: int, at_ns: int) -> None:
+    def _start_second(self, offset_ns: int, at_ns: int) -> None:
         """Learn the drift from the second that is over."""
-        _, least_ns, least_at_ns = self._current_second
+        _, min_offset_ns, min_offset_at_ns = self._current_second
         if self._previous_second is not None:
-            rise = (least_ns - self._previous_second[0]) / (least_at_ns - self._previous_second[1])
-            self._slopes.append(min(max(rise, -MAX_DRIFT), MAX_DRIFT))
+            slope = (min_offset_ns - self._previous_second[0]) / (min_offset_at_ns - self._previous_second[1])
+            self._slopes.append(min(max(slope, -MAX_DRIFT), MAX_DRIFT))
             self._slope = median_low(self._slopes)
             if len(self._slopes) == 1:  # the least of the first seconds did not know the drift
-                self._min_offset_ns = least_ns + self._slope * (at_ns - least_at_ns)
-        self._previous_second, self._current_second = (least_ns, least_at_ns), (at_ns, behind_ns, at_ns)
+                self._min_offset_ns = min_offset_ns + self._slope * (at_ns - min_offset_at_ns)
+        self._previous_second, self._current_second = (min_offset_ns, min_offset_at_ns), (at_ns, offset_ns, at_ns)
 
 
 class ClockSync:
@@ -351,8 +352,8 @@ class ClockSync:
         judged by the offset of its own time.
         """
         shortest_ns = self._min_delay.push(received_ns, received_ns - stamp_ns - offset_ns)
-        least_ns = -self._future_tolerance_ns
-        return any(least_ns <= delay_ns <= MAX_CLOCK_STEP_NS for delay_ns in (minimum_ns - offset_ns, shortest_ns))
+        min_offset_ns = -self._future_tolerance_ns
+        return any(min_offset_ns <= delay_ns <= MAX_CLOCK_STEP_NS for delay_ns in (minimum_ns - offset_ns, shortest_ns))
 
     def unwrap_ns(self, stamp: int, modulus: int, unit_ns: int) -> int:
         """Nanoseconds of a counter that wraps, as the value nearest to the newest stamp."""

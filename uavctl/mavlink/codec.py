@@ -70,13 +70,13 @@ def _attitude(raw: Fields) -> Attitude | None:
 
 
 def _attitude_quaternion(raw: Fields) -> Attitude | None:
-    turn = normalise_quaternion((raw.q1, raw.q2, raw.q3, raw.q4))
-    if turn is None:
+    attitude = normalise_quaternion((raw.q1, raw.q2, raw.q3, raw.q4))
+    if attitude is None:
         return None
     return Attitude(
         system=raw.src_system,
         component=raw.src_component,
-        angles_rad=euler_from_quaternion(turn),
+        angles_rad=euler_from_quaternion(attitude),
         quaternion=True,
         stamp_us=1000 * raw.time_boot_ms,
     )
@@ -186,27 +186,27 @@ class StreamDecoder:
     def push(self, chunk: bytes) -> DecodedMessages:
         """Take the next bytes; what they begin and do not end waits for the next chunk."""
         data = self._rest + chunk
-        found = scan(data, final=False, in_step=self._in_step)
-        self._rest, self._in_step = data[found.consumed :], found.is_aligned
-        return decode_scan(found)
+        result = scan(data, final=False, is_aligned=self._in_step)
+        self._rest, self._in_step = data[result.consumed :], result.is_aligned
+        return decode_scan(result)
 
 
-def decode_scan(found: Scan) -> DecodedMessages:
+def decode_scan(result: Scan) -> DecodedMessages:
     """Decode the frames that a scan has found."""
     messages = []
-    for frame in found.frames:
-        understood = _DECODERS.get(frame.message_id)
-        if understood is None:
+    for frame in result.frames:
+        decoder = _DECODERS.get(frame.message_id)
+        if decoder is None:
             continue
-        layout, reader = understood
+        layout, reader = decoder
         try:
             message = reader(layout.unpack(frame.data))
         except _UnusableError as refused:
-            found.count_skip(str(refused))
+            result.count_skip(str(refused))
         else:
             if message is not None:
                 messages.append(message)
-    return DecodedMessages(tuple(messages), len(found.frames), found.bad)
+    return DecodedMessages(tuple(messages), len(result.frames), result.bad)
 
 
 def _finite(*values: float) -> bool:
@@ -325,15 +325,15 @@ _NO_VOLTAGE_MV = 0xFFFF
 
 
 def _sys_status(raw: Fields) -> Battery:
-    works = raw.onboard_control_sensors_enabled & raw.onboard_control_sensors_health
-    beyond = raw.onboard_control_sensors_enabled & ~raw.onboard_control_sensors_health
+    healthy = raw.onboard_control_sensors_enabled & raw.onboard_control_sensors_health
+    unhealthy = raw.onboard_control_sensors_enabled & ~raw.onboard_control_sensors_health
     known = raw.voltage_battery != _NO_VOLTAGE_MV
     return Battery(
         system=raw.src_system,
         component=raw.src_component,
         voltage_v=raw.voltage_battery / 1000 if known else None,
-        has_radio=bool(works & mavlink.MAV_SYS_STATUS_SENSOR_RC_RECEIVER),
-        is_within_fence=not beyond & mavlink.MAV_SYS_STATUS_GEOFENCE,
+        has_radio=bool(healthy & mavlink.MAV_SYS_STATUS_SENSOR_RC_RECEIVER),
+        is_within_fence=not unhealthy & mavlink.MAV_SYS_STATUS_GEOFENCE,
     )
 
 
@@ -398,12 +398,12 @@ def _battery(raw: Fields, voltages_mv: list[int]) -> Battery | None:
 
 def _text(raw: Fields) -> Text:
     more = raw.id != 0 and b"\0" not in raw.text
-    shown = text_of(raw.text if more else raw.text.split(b"\0", 1)[0].rstrip())  # PX4 ends its texts with a tab
+    text = text_of(raw.text if more else raw.text.split(b"\0", 1)[0].rstrip())  # PX4 ends its texts with a tab
     return Text(
         system=raw.src_system,
         component=raw.src_component,
         severity=raw.severity,
-        text=shown,
+        text=text,
         text_id=raw.id,
         chunk=raw.chunk_seq,
         has_more=more,

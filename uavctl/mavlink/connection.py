@@ -129,17 +129,17 @@ class MavlinkConnection:
         self._stream = StreamDecoder() if url.startswith(STREAM_SCHEMES) else None
         self._encoder = Encoder(*self._own_address)
         self._positions = PositionDecoder(frame, clock, source, estimator, self._count_bad)
-        feels = estimator.inertial_std_mps2 > 0.0
+        wants_inertial = estimator.inertial_std_mps2 > 0.0
         self._vehicle = VehicleMonitor(
             self._count_bad,
             self._own_address,
             daemon.vehicle_system_id,
             daemon.vehicle_component_id,
-            inertial=feels,
+            inertial=wants_inertial,
             channels=daemon.radio_channels,
         )
         self._streams, self._origin_setup, self._text_assembler = (
-            StreamRequests(inertial=feels, channels=daemon.radio_channels),
+            StreamRequests(inertial=wants_inertial, channels=daemon.radio_channels),
             GlobalOriginSetup(),
             StatusTextAssembler(),
         )
@@ -208,40 +208,42 @@ class MavlinkConnection:
             for text in self._text_assembler.flush_overdue(at_ns)
             for item in self._vehicle.handle_message(text, at_ns)
         ]
-        intake = self._positions
-        told = (*items, *self._make_events(at_ns))
-        return ReceiveResult(told, tuple(self._replies), intake.is_settled, intake.attitude, intake.clock_source)
+        positions = self._positions
+        items_and_events = (*items, *self._make_events(at_ns))
+        return ReceiveResult(
+            items_and_events, tuple(self._replies), positions.is_settled, positions.attitude, positions.clock_source
+        )
 
     def add_refusals(self, counts: Mapping[str, int], at_ns: int) -> tuple[Event, ...]:
         """Take the counts of what the connection dropped unread: addresses, rates, signatures."""
         for reason, count in counts.items():
             self._count_bad(reason, count)
-        lost = tuple(
+        events = tuple(
             Event(at_ns=at_ns, severity=Severity.ERROR, code=reason, text=f"link {self._name}: {text}")
             for reason, text in _DISCONNECT_TEXTS.items()
             if reason in counts
         )
-        return lost + self._make_events(at_ns)
+        return events + self._make_events(at_ns)
 
     def due(self, at_ns: int) -> tuple[bytes, ...]:
         """Return what is to be sent at `at_ns` besides setpoints: heartbeat, TIMESYNC, requests for streams."""
-        out = []
+        frames = []
         if self._heartbeat_ns is None or at_ns - self._heartbeat_ns >= HEARTBEAT_NS:
             self._heartbeat_ns = at_ns
-            out.append(self._encoder.encode_heartbeat())
-        eager = not self._has_answer and self._requests < MAX_FIRST_REQUESTS
-        interval_ns = FIRST_TIMESYNC_NS if eager else TIMESYNC_NS
+            frames.append(self._encoder.encode_heartbeat())
+        is_first_phase = not self._has_answer and self._requests < MAX_FIRST_REQUESTS
+        interval_ns = FIRST_TIMESYNC_NS if is_first_phase else TIMESYNC_NS
         if self._request_ns is None or at_ns - self._request_ns >= interval_ns:
             self._request_ns = at_ns
             self._requests += 1
             self._open_requests_ns.append(at_ns)
-            out.append(self._encoder.encode_timesync(0, at_ns))
+            frames.append(self._encoder.encode_timesync(0, at_ns))
         if VEHICLE in self._roles and self._vehicle.address is not None:
-            wanted = self._streams.due(at_ns, self._vehicle.autopilot)
-            out += [self.encode_stream_request(number, rate_hz) for number, rate_hz in wanted]
+            streams = self._streams.due(at_ns, self._vehicle.autopilot)
+            frames += [self.encode_stream_request(number, rate_hz) for number, rate_hz in streams]
             indices = self._parameters.due(at_ns, armed=self._vehicle.is_armed) if self._wants_parameters else ()
-            out += [self._encoder.encode_parameter_list_request(index, *self._target_address()) for index in indices]
-        return tuple(out)
+            frames += [self._encoder.encode_parameter_list_request(index, *self._target_address()) for index in indices]
+        return tuple(frames)
 
     def encode_setpoint(self, setpoint: Setpoint) -> bytes:
         """The setpoint, addressed to the vehicle.
@@ -251,7 +253,7 @@ class MavlinkConnection:
         """
         return self._encoder.encode_setpoint(setpoint, *self._target_address())
 
-    def encode_request(self, ask: RequestKind, height_m: float) -> bytes:
+    def encode_request(self, kind: RequestKind, height_m: float) -> bytes:
         """A request to the vehicle.
 
         Args:
@@ -261,24 +263,24 @@ class MavlinkConnection:
             UnsendableError: no vehicle has been heard, or it is of a kind that cannot be asked for this.
         """
         parameters: tuple[float, ...] = ()  # of landing where it is, and of disarming
-        match ask:
+        match kind:
             case RequestKind.TAKE_OFF_MODE | RequestKind.EXTERNAL_MODE:
-                parameters = self._choose_mode_parameters(ask)
+                parameters = self._choose_mode_parameters(kind)
             case RequestKind.ARM:
                 parameters = (1.0,)
             case RequestKind.TAKE_OFF:
                 parameters = (*(0.0,) * 6, height_m)
-        return self._encoder.encode_command(COMMANDS[ask], parameters, *self._target_address())
+        return self._encoder.encode_command(COMMANDS[kind], parameters, *self._target_address())
 
-    def _choose_mode_parameters(self, ask: RequestKind) -> tuple[float, ...]:
+    def _choose_mode_parameters(self, kind: RequestKind) -> tuple[float, ...]:
         """DO_SET_MODE's parameters; PX4 wants main and sub mode, ArduPilot the number of the mode."""
         profile = PROFILES.get(self._vehicle.autopilot)
         if profile is None:
             raise UnsendableError(f"link {self._name}: modes of autopilot {self._vehicle.autopilot!r} are not known")
-        name = profile.external_mode if ask is RequestKind.EXTERNAL_MODE else profile.take_off_mode
+        name = profile.external_mode if kind is RequestKind.EXTERNAL_MODE else profile.take_off_mode
         return (float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED), *map(float, profile.mode_parameters[name]))
 
-    def setup_global_origin(self, at_ns: int, place_deg_m: Vec3) -> tuple[bytes, ...]:
+    def setup_global_origin(self, at_ns: int, origin_deg_m: Vec3) -> tuple[bytes, ...]:
         """Return the messages that an ArduPilot without GPS needs before it arms; call it while it is to be armed.
 
         Args:
@@ -287,15 +289,15 @@ class MavlinkConnection:
         profile = PROFILES.get(self._vehicle.autopilot)
         if profile is None or not profile.needs_global_origin:
             return ()
-        asks, tells = self._origin_setup.due(at_ns)
-        if not asks:
+        is_request_due, is_origin_due = self._origin_setup.due(at_ns)
+        if not is_request_due:
             return ()
         system, component = self._target_address()
-        out = (
+        frames = (
             self._encoder.encode_parameter_request(SOURCE_PARAMETER, system, component),
             self._encoder.encode_message_request(GPS_GLOBAL_ORIGIN, system, component),
         )
-        return (self._encoder.encode_global_origin(place_deg_m, system), *out) if tells else out
+        return (self._encoder.encode_global_origin(origin_deg_m, system), *frames) if is_origin_due else frames
 
     def encode_parameter_request(self, name: str) -> bytes:
         """The request for one parameter, addressed to the vehicle.
@@ -324,8 +326,8 @@ class MavlinkConnection:
         if not relay.is_enabled or self.vehicle is None:
             return ()
         # Only PX4 moves stamps by the offset that it has found to our time, where that is what it was given.
-        moves = not self._uses_vehicle_time and self._vehicle.autopilot == "px4"
-        offset_ns = 0 if moves else self._vehicle_offset_ns(at_ns) or 0
+        moves_stamps = not self._uses_vehicle_time and self._vehicle.autopilot == "px4"
+        offset_ns = 0 if moves_stamps else self._vehicle_offset_ns(at_ns) or 0
         poses = relay.due(at_ns, offset_ns=offset_ns, refused=refused)
         return tuple(self._encoder.encode_external_position(pose) for pose in poses)
 
@@ -345,18 +347,22 @@ class MavlinkConnection:
         A message arrives after its stamp, and no round trip was shorter than its way. A vehicle that neither answers
         nor stamps its messages gets our own time: steady, so its own estimate of the delay works.
         """
-        trips, arrival_ns = self.timesync_clock(self.vehicle), self._vehicle_clock.offset_ns(at_ns)
-        known_ns = None if trips is None else trips.last_known_ns(at_ns)
-        if trips is None or known_ns is None:
+        timesync, arrival_ns = self.timesync_clock(self.vehicle), self._vehicle_clock.offset_ns(at_ns)
+        known_ns = None if timesync is None else timesync.last_known_ns(at_ns)
+        if timesync is None or known_ns is None:
             return arrival_ns
-        if arrival_ns is None or trips.offset_ns(at_ns) is not None or abs(arrival_ns - known_ns) > MAX_CLOCK_STEP_NS:
+        if (
+            arrival_ns is None
+            or timesync.offset_ns(at_ns) is not None
+            or abs(arrival_ns - known_ns) > MAX_CLOCK_STEP_NS
+        ):
             return known_ns
-        return min(max(known_ns, arrival_ns - trips.shortest_round_trip_ns - ROUND_TRIP_MARGIN_NS), arrival_ns)
+        return min(max(known_ns, arrival_ns - timesync.shortest_round_trip_ns - ROUND_TRIP_MARGIN_NS), arrival_ns)
 
     def stats(self, at_ns: int) -> LinkStats:
         """Counters since the start."""
-        trips = self.timesync_clock() or (None if self.vehicle is None else self.timesync_clock(self.vehicle))
-        round_trips_ns = () if trips is None else trips.round_trips_ns
+        timesync = self.timesync_clock() or (None if self.vehicle is None else self.timesync_clock(self.vehicle))
+        round_trips_ns = () if timesync is None else timesync.round_trips_ns
         return LinkStats(
             at_ns=at_ns,
             link=self._name,
@@ -367,8 +373,8 @@ class MavlinkConnection:
             clock_offset_ns=self._positions.clock_offset_ns,
             clock_source=str(self._positions.clock_source),
             clock_rtt_ns=round(median(round_trips_ns)) if round_trips_ns else None,
-            clock_drift_ppm=None if trips is None else trips.drift_ppm,
-            clock_rejected=0 if trips is None else trips.rejected,
+            clock_drift_ppm=None if timesync is None else timesync.drift_ppm,
+            clock_rejected=0 if timesync is None else timesync.rejected,
             stamp_units=tuple(sorted({str(unit) for unit in self._positions.units.values()})),
         )
 
@@ -394,9 +400,9 @@ class MavlinkConnection:
     def _handle_vehicle_message(self, message: Message, at_ns: int) -> tuple[Item, ...]:
         """Take a message of the vehicle and return what it tells of itself."""
         if isinstance(message, Text):
-            whole = self._text_assembler.add_chunk(message, at_ns)
-            return tuple(item for text in whole for item in self._vehicle.handle_message(text, at_ns))
-        boots, unready, address = self._vehicle.boots, self._vehicle.not_ready_count, self.vehicle
+            texts = self._text_assembler.add_chunk(message, at_ns)
+            return tuple(item for text in texts for item in self._vehicle.handle_message(text, at_ns))
+        boots, not_ready_count, address = self._vehicle.boots, self._vehicle.not_ready_count, self.vehicle
         items = self._vehicle.handle_message(message, at_ns)
         if address is None and self.vehicle is None:
             self._note_missing_heartbeat(message, at_ns)
@@ -416,7 +422,7 @@ class MavlinkConnection:
             )
             text = f"link {self._name}: the vehicle has started anew"
             return (*items, Event(at_ns=at_ns, severity=Severity.ERROR, code="vehicle-reboot", text=text))
-        if self._vehicle.not_ready_count != unready:
+        if self._vehicle.not_ready_count != not_ready_count:
             self._streams.restart()  # those that go on will have been seen by the time they would be asked for
         if (message.system, message.component) == self.vehicle:
             self._streams.handle_message(message)
@@ -439,13 +445,13 @@ class MavlinkConnection:
             if at_ns - self._reply_window_ns >= ANSWER_WINDOW_NS:
                 self._reply_window_ns = at_ns
                 self._reply_counts.clear()
-            of_vehicle = self.vehicle is not None and message.system == self.vehicle[0]
-            if self._reply_counts[of_vehicle] >= MAX_ANSWERS:
+            is_from_vehicle = self.vehicle is not None and message.system == self.vehicle[0]
+            if self._reply_counts[is_from_vehicle] >= MAX_ANSWERS:
                 self._count_bad(TIMESYNC_FLOOD)
                 return
-            self._reply_counts[of_vehicle] += 1
-            own = self._uses_vehicle_time and (message.system, message.component) == self.vehicle
-            time_ns = self._vehicle_time_ns(at_ns) if own else at_ns
+            self._reply_counts[is_from_vehicle] += 1
+            is_vehicle = self._uses_vehicle_time and (message.system, message.component) == self.vehicle
+            time_ns = self._vehicle_time_ns(at_ns) if is_vehicle else at_ns
             if time_ns is not None:
                 self._replies.append(self._encoder.encode_timesync(time_ns, message.ts1_ns))
         elif message.ts1_ns in self._open_requests_ns:  # else it answers somebody else
@@ -474,8 +480,8 @@ class MavlinkConnection:
         for (system, component), unit in self._positions.units.items():
             if (system, component, unit) not in self._reported_units:
                 self._reported_units.add((system, component, unit))
-                what = "do not go on" if unit is StampUnit.CONSTANT else f"are in {unit}, not in us"
-                text = f"link {self._name}: stamps of the positions of {system}/{component} {what}: "
+                fault = "do not go on" if unit is StampUnit.CONSTANT else f"are in {unit}, not in us"
+                text = f"link {self._name}: stamps of the positions of {system}/{component} {fault}: "
                 text += "they count by their arrival, and their ages are not known"
                 events.append(Event(at_ns=at_ns, severity=Severity.WARNING, code=STAMP_UNIT, text=text))
         since_ns = self._no_heartbeat_since_ns
@@ -490,13 +496,13 @@ class MavlinkConnection:
             text = f"link {self._name}: system {sender} sends its position or attitude, "
             text += "but no heartbeat of an autopilot: its mode is not known, so it is not flown"
             events.append(Event(at_ns=at_ns, severity=Severity.WARNING, code=NO_HEARTBEAT, text=text))
-        used, total = self._vehicle.inertial_used, self._vehicle.inertial_total
-        if not self._is_low_share_reported and total >= MIN_INERTIAL and used < MIN_INERTIAL_SHARE * total:
+        used_count, total = self._vehicle.inertial_used, self._vehicle.inertial_total
+        if not self._is_low_share_reported and total >= MIN_INERTIAL and used_count < MIN_INERTIAL_SHARE * total:
             self._is_low_share_reported = True
-            text = f"link {self._name}: {1 - used / total:.0%} of the inertial data are not used: late, frozen, "
+            text = f"link {self._name}: {1 - used_count / total:.0%} of the inertial data are not used: late, frozen, "
             text += "or without an attitude of now"
             events.append(
-                Event(at_ns=at_ns, severity=Severity.WARNING, code=STALE_INERTIAL, text=text, count=total - used)
+                Event(at_ns=at_ns, severity=Severity.WARNING, code=STALE_INERTIAL, text=text, count=total - used_count)
             )
         if self._slow_count and (self._slow_reported_ns is None or at_ns - self._slow_reported_ns >= SLOW_EVENT_NS):
             self._slow_reported_ns = at_ns

@@ -78,8 +78,8 @@ class Encoder:
         yaw = setpoint.yaw_rad
         north, east, down = map(abs, setpoint.accel_mps2)
         limit = _ABSURD_ACCEL_MPS2
-        sane = north <= limit and east <= limit and down <= limit  # NaN is not
-        if not sane or not math.isfinite(yaw or 0.0):
+        is_plausible = north <= limit and east <= limit and down <= limit  # NaN is not
+        if not is_plausible or not math.isfinite(yaw or 0.0):
             raise UnsendableError(f"acceleration {setpoint.accel_mps2} m/s², yaw {yaw} rad: not finite, or absurd")
         return self._pack(
             _SET_POSITION_TARGET_LOCAL_NED,
@@ -99,12 +99,12 @@ class Encoder:
         self, command: int, parameters: Sequence[float], target_system: int, target_component: int
     ) -> bytes:
         """COMMAND_LONG; parameters that are not given are 0."""
-        seven = (*parameters, *(0.0,) * (7 - len(parameters)))
-        return self._pack(_COMMAND_LONG, target_system, target_component, command, 0, *seven)
+        padded = (*parameters, *(0.0,) * (7 - len(parameters)))
+        return self._pack(_COMMAND_LONG, target_system, target_component, command, 0, *padded)
 
-    def encode_global_origin(self, place_deg_m: Vec3, target_system: int) -> bytes:
+    def encode_global_origin(self, origin_deg_m: Vec3, target_system: int) -> bytes:
         """SET_GPS_GLOBAL_ORIGIN: latitude and longitude [deg], altitude above the sea [m] of local zero."""
-        latitude, longitude, altitude = place_deg_m
+        latitude, longitude, altitude = origin_deg_m
         return self._pack(
             _SET_GPS_GLOBAL_ORIGIN, target_system, round(latitude * 1e7), round(longitude * 1e7), round(altitude * 1e3)
         )
@@ -123,15 +123,17 @@ class Encoder:
         self, message_id: int, interval_us: int, target_system: int, target_component: int
     ) -> bytes:
         """COMMAND_LONG MAV_CMD_SET_MESSAGE_INTERVAL: send this message so often."""
-        wanted = (float(message_id), float(interval_us), *(0.0,) * 5)
+        parameters = (float(message_id), float(interval_us), *(0.0,) * 5)
         return self._pack(
-            _COMMAND_LONG, target_system, target_component, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 0, *wanted
+            _COMMAND_LONG, target_system, target_component, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 0, *parameters
         )
 
     def encode_message_request(self, message_id: int, target_system: int, target_component: int) -> bytes:
         """COMMAND_LONG MAV_CMD_REQUEST_MESSAGE: send this message once."""
-        wanted = (float(message_id), *(0.0,) * 6)
-        return self._pack(_COMMAND_LONG, target_system, target_component, mavlink.MAV_CMD_REQUEST_MESSAGE, 0, *wanted)
+        parameters = (float(message_id), *(0.0,) * 6)
+        return self._pack(
+            _COMMAND_LONG, target_system, target_component, mavlink.MAV_CMD_REQUEST_MESSAGE, 0, *parameters
+        )
 
     def encode_external_position(self, pose: Pose) -> bytes:
         """VISION_POSITION_ESTIMATE or ODOMETRY in local NED; covariances unknown.

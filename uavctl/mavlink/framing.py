@@ -60,7 +60,7 @@ class Scan(msgspec.Struct):
         self.bad[reason] = self.bad.get(reason, 0) + 1
 
 
-class _Shape(msgspec.Struct, frozen=True):
+class _FrameHeader(msgspec.Struct, frozen=True):
     """Length and kind of a frame, as its first bytes announce them."""
 
     length: int
@@ -68,46 +68,46 @@ class _Shape(msgspec.Struct, frozen=True):
     signature: int  # bytes after the checksum
 
 
-def _shape(data: bytes, at: int) -> _Shape | None:
+def _parse_header(data: bytes, at: int) -> _FrameHeader | None:
     """Shape of the frame at `at`; None while too few bytes are there to tell. `data[at]` is a magic byte."""
     if data[at] == mavlink.PROTOCOL_MARKER_V1:
         if len(data) - at < HEADER_V1:
             return None
-        return _Shape(HEADER_V1 + data[at + 1] + CHECKSUM, data[at + 5], 0)
+        return _FrameHeader(HEADER_V1 + data[at + 1] + CHECKSUM, data[at + 5], 0)
     if len(data) - at < HEADER_V2:
         return None
     signature = mavlink.MAVLINK_SIGNATURE_BLOCK_LEN if data[at + 2] & mavlink.MAVLINK_IFLAG_SIGNED else 0
     message_id = int.from_bytes(data[at + 7 : at + 10], "little")
-    return _Shape(HEADER_V2 + data[at + 1] + CHECKSUM + signature, message_id, signature)
+    return _FrameHeader(HEADER_V2 + data[at + 1] + CHECKSUM + signature, message_id, signature)
 
 
-def _is_foreign(data: bytes, at: int) -> bool:
+def _has_unknown_flags(data: bytes, at: int) -> bool:
     """Whether a version 2 header has incompatibility flags that nobody has defined."""
     return data[at] == mavlink.PROTOCOL_MARKER_V2 and len(data) - at > 2 and bool(data[at + 2] & ~_INCOMPAT_KNOWN)
 
 
-def _checksum(body: bytes, message_id: int) -> int:
+def _compute_checksum(body: bytes, message_id: int) -> int:
     """Checksum of what follows a frame's first byte, up to its payload's end."""
     return mavlink.x25crc(body + _CRC_EXTRA[message_id]).crc
 
 
-def _checksum_fits(frame: bytes, shape: _Shape) -> bool:
+def _checksum_fits(frame: bytes, header: _FrameHeader) -> bool:
     """Whether the checksum of a frame of a known id is right."""
-    end = shape.length - shape.signature - CHECKSUM
-    return _checksum(frame[1:end], shape.message_id) == int.from_bytes(frame[end : end + CHECKSUM], "little")
+    end = header.length - header.signature - CHECKSUM
+    return _compute_checksum(frame[1:end], header.message_id) == int.from_bytes(frame[end : end + CHECKSUM], "little")
 
 
-def with_checksum(head: bytes) -> bytes:
+def add_checksum(head: bytes) -> bytes:
     """Header and payload of a frame of MAVLink 2, with its checksum.
 
     Raises:
         KeyError: the message id is unknown to the dialect.
     """
     message_id = int.from_bytes(head[7:HEADER_V2], "little")
-    return head + _checksum(head[1:], message_id).to_bytes(CHECKSUM, "little")
+    return head + _compute_checksum(head[1:], message_id).to_bytes(CHECKSUM, "little")
 
 
-def scan(data: bytes, *, final: bool, in_step: bool = True, verify: Verify | None = None) -> Scan:
+def scan(data: bytes, *, final: bool, is_aligned: bool = True, verify: Verify | None = None) -> Scan:
     """Find the frames in some bytes.
 
     Args:
@@ -121,8 +121,8 @@ def scan(data: bytes, *, final: bool, in_step: bool = True, verify: Verify | Non
         What was found. One broken frame, or one run of garbage, counts once. A datagram, or what has come of a stream,
         in which nothing fits any more after `MAX_FAILED` tries is dropped from there on.
     """
-    result = Scan(is_aligned=in_step)
-    failed = 0
+    result = Scan(is_aligned=is_aligned)
+    failures = 0
     while result.consumed < len(data):
         end, reason = _try_frame(data, result, verify, final=final)
         if reason is _WAIT:
@@ -130,8 +130,8 @@ def scan(data: bytes, *, final: bool, in_step: bool = True, verify: Verify | Non
         if end is None:
             if result.is_aligned:
                 result.count_skip(reason)
-            failed += 1
-            end = len(data) if failed > MAX_FAILED else _next_magic(data, result.consumed + 1)
+            failures += 1
+            end = len(data) if failures > MAX_FAILED else _find_next_magic(data, result.consumed + 1)
         result.is_aligned = reason is _TAKEN
         result.consumed = end
     return result
@@ -153,50 +153,50 @@ _TAKEN, _WAIT = "taken", "wait"
 def _try_frame(data: bytes, result: Scan, verify: Verify | None, *, final: bool) -> tuple[int | None, str]:
     """Try for a frame at `result.consumed`: (its end, `_TAKEN`), or (None, why not)."""
     at = result.consumed
-    if data[at] not in _MAGIC or _is_foreign(data, at):
+    if data[at] not in _MAGIC or _has_unknown_flags(data, at):
         return None, BadBytes.GARBAGE
-    shape = _shape(data, at)
-    if shape is None or at + shape.length > len(data):
+    header = _parse_header(data, at)
+    if header is None or at + header.length > len(data):
         return None, BadBytes.TRUNCATED if final else _WAIT
-    end = at + shape.length
+    end = at + header.length
     if verify is not None:
-        return _try_signed(data, result, shape, verify)
-    if shape.message_id not in mavlink.mavlink_map:
+        return _try_signed(data, result, header, verify)
+    if header.message_id not in mavlink.mavlink_map:
         # Nothing but the length can be checked.
-        if not _between_frames(data, result, end):
+        if not _is_length_credible(data, result, end):
             return None, BadBytes.GARBAGE
         result.count_skip(BadBytes.UNKNOWN)
         return end, _TAKEN
     frame = data[at:end]
-    if not _checksum_fits(frame, shape):
+    if not _checksum_fits(frame, header):
         return None, BadBytes.CRC
-    result.frames.append(RawFrame(frame, shape.message_id))
+    result.frames.append(RawFrame(frame, header.message_id))
     return end, _TAKEN
 
 
-def _try_signed(data: bytes, result: Scan, shape: _Shape, verify: Verify) -> tuple[int | None, str]:
+def _try_signed(data: bytes, result: Scan, header: _FrameHeader, verify: Verify) -> tuple[int | None, str]:
     """Try for a frame where signatures are required: of a frame without one only the length is believed."""
     at = result.consumed
-    end = at + shape.length
+    end = at + header.length
     frame = data[at:end]
-    refusal = verify(frame) if shape.signature else UNSIGNED
+    refusal = verify(frame) if header.signature else UNSIGNED
     if refusal is not None:
-        if not _between_frames(data, result, end):
+        if not _is_length_credible(data, result, end):
             return None, refusal
         result.count_skip(refusal)
-    elif shape.message_id not in mavlink.mavlink_map:
+    elif header.message_id not in mavlink.mavlink_map:
         result.count_skip(BadBytes.UNKNOWN)
     else:
-        result.frames.append(RawFrame(frame, shape.message_id))
+        result.frames.append(RawFrame(frame, header.message_id))
     return end, _TAKEN
 
 
-def _between_frames(data: bytes, result: Scan, end: int) -> bool:
+def _is_length_credible(data: bytes, result: Scan, end: int) -> bool:
     """Whether an unchecked length can be believed: a frame came before, and another seems to follow."""
     return result.is_aligned and (end >= len(data) or data[end] in _MAGIC)
 
 
-def _next_magic(data: bytes, start: int) -> int:
+def _find_next_magic(data: bytes, start: int) -> int:
     """Index of the next byte that could begin a frame, or the end."""
-    found = [index for magic in _MAGIC if (index := data.find(magic, start)) >= 0]
-    return min(found, default=len(data))
+    candidates = [index for magic in _MAGIC if (index := data.find(magic, start)) >= 0]
+    return min(candidates, default=len(data))

@@ -175,44 +175,58 @@ class HandoverStateMachine:
         """Whether a heartbeat says that the vehicle is no longer in the external mode."""
         return not (vehicle.external and vehicle.armed) and not self._progress.may_be_outdated(vehicle)
 
-    def update(self, view: HandoverInput) -> HandoverOutput:
+    def update(self, inputs: HandoverInput) -> HandoverOutput:
         """Decide what one tick may send, and what it asks the vehicle for."""
-        now, before = self._progress, self.state
-        for message in view.messages:
-            now.request.handle_message(message, view.at_ns)
-        events = self._accept_orders(view)
-        if now.first_heard_ns is None and view.vehicle is not None:
-            now.first_heard_ns = view.at_ns
-        self.update_airborne(view.at_ns, view.vehicle)
-        sight = evaluate(now, view)
-        if view.vehicle is not None and view.vehicle.mode in profile_of(view.vehicle).landing_modes:
-            now.is_failsafe_landing = is_in_failsafe(view.vehicle)
-        if before is HandoverState.FAILSAFE and view.vehicle is not None and is_in_failsafe(view.vehicle):
-            now.previous_mode = view.vehicle.mode  # one failsafe may follow another, and ArduPilot stays in its mode
-        now.boots = 0 if view.vehicle is None else view.vehicle.boots
-        now.state, sending = TRANSITIONS[before, sight.event]
-        passage = None
-        late = now.state is before is HandoverState.RELEASED and sight.mode_reason is not now.mode_reason
-        if now.state is not before or late:
-            was = now.request
-            passage = StateTransition(
-                before, sight.event, now.state, sight.reason, was.kind, was.granted_ns is not None, sight.mode_reason
+        progress, before = self._progress, self.state
+        for message in inputs.messages:
+            progress.request.handle_message(message, inputs.at_ns)
+        events = self._accept_orders(inputs)
+        if progress.first_heard_ns is None and inputs.vehicle is not None:
+            progress.first_heard_ns = inputs.at_ns
+        self.update_airborne(inputs.at_ns, inputs.vehicle)
+        result = evaluate(progress, inputs)
+        if inputs.vehicle is not None and inputs.vehicle.mode in profile_of(inputs.vehicle).landing_modes:
+            progress.is_failsafe_landing = is_in_failsafe(inputs.vehicle)
+        if before is HandoverState.FAILSAFE and inputs.vehicle is not None and is_in_failsafe(inputs.vehicle):
+            # One failsafe may follow another, and ArduPilot stays in its mode.
+            progress.previous_mode = inputs.vehicle.mode
+        progress.boots = 0 if inputs.vehicle is None else inputs.vehicle.boots
+        progress.state, setpoint_mode = TRANSITIONS[before, result.event]
+        transition = None
+        is_late_reason = (
+            progress.state is before is HandoverState.RELEASED and result.mode_reason is not progress.mode_reason
+        )
+        if progress.state is not before or is_late_reason:
+            previous_request = progress.request
+            transition = StateTransition(
+                before,
+                result.event,
+                progress.state,
+                result.reason,
+                previous_request.kind,
+                previous_request.granted_ns is not None,
+                result.mode_reason,
             )
-            now.mode_reason = sight.mode_reason
-        if now.state is not before:
-            self._enter_state(before, sight, view)
-        self._is_without_pilot = now.state is HandoverState.UNCLEAR and is_without_pilot(now, view.vehicle)
-        if sending is SetpointMode.NEUTRAL and not (view.has_setpoint and self._may_send_neutral(view)):
-            sending = SetpointMode.NOTHING
-        self._request_disarming(view)
-        held = view.arming_refusal if now.state in _ON_THE_GROUND else ""
-        ask = None
-        if now.request.kind is not None and not view.may_have_lost_messages:
-            ask = now.request.due(view.at_ns, held, blind=self._may_be_pilot_mode_change(view))
-        if now.state is HandoverState.FAILED and before is HandoverState.ARMING:
-            ask = RequestKind.DISARM  # arming may have been granted after all
+            progress.mode_reason = result.mode_reason
+        if progress.state is not before:
+            self._enter_state(before, result, inputs)
+        self._is_without_pilot = progress.state is HandoverState.UNCLEAR and is_without_pilot(progress, inputs.vehicle)
+        if setpoint_mode is SetpointMode.NEUTRAL and not (inputs.has_setpoint and self._may_send_neutral(inputs)):
+            setpoint_mode = SetpointMode.NOTHING
+        self._request_disarming(inputs)
+        blocked_reason = inputs.arming_refusal if progress.state in _ON_THE_GROUND else ""
+        kind = None
+        if progress.request.kind is not None and not inputs.may_have_lost_messages:
+            kind = progress.request.due(
+                inputs.at_ns, blocked_reason, is_mode_uncertain=self._may_be_pilot_mode_change(inputs)
+            )
+        if progress.state is HandoverState.FAILED and before is HandoverState.ARMING:
+            kind = RequestKind.DISARM  # arming may have been granted after all
         return HandoverOutput(
-            sending, ask, (*events, *self._make_events(view, before, sight, passed=passage is not None)), passage
+            setpoint_mode,
+            kind,
+            (*events, *self._make_events(inputs, before, result, has_changed=transition is not None)),
+            transition,
         )
 
     def update_airborne(self, at_ns: int, vehicle: VehicleStatus | None) -> None:
@@ -222,157 +236,163 @@ class HandoverStateMachine:
         elif self._airborne_ns is not None and at_ns - self._airborne_ns >= _ns(self._config.land_s):
             self._airborne_ns = None
 
-    def _accept_orders(self, view: HandoverInput) -> list[Event]:
+    def _accept_orders(self, inputs: HandoverInput) -> list[Event]:
         events = []
-        for command in view.commands:
+        for command in inputs.commands:
             if command.order not in _PROMISES:
                 continue
-            refused = self._explain_refusal(command, view)
-            if not refused and command.order is Order.TAKE_OFF:
-                self._progress.take_off_ordered_ns, self._progress.height_m = view.at_ns, command.height_m or 0.0
-            elif not refused and command.order is Order.STAND_BY:
+            refusal = self._explain_refusal(command, inputs)
+            if not refusal and command.order is Order.TAKE_OFF:
+                self._progress.take_off_ordered_ns, self._progress.height_m = inputs.at_ns, command.height_m or 0.0
+            elif not refusal and command.order is Order.STAND_BY:
                 self._progress.is_standing_by, self._progress.previous_flight_ns = True, command.flown_ns
-            code, severity = (ORDER_REFUSED, Severity.WARNING) if refused else (ORDER_ACCEPTED, Severity.INFO)
-            text = refused or _PROMISES[command.order]
-            events.append(Event(at_ns=view.at_ns, severity=severity, code=code, text=text))
+            code, severity = (ORDER_REFUSED, Severity.WARNING) if refusal else (ORDER_ACCEPTED, Severity.INFO)
+            text = refusal or _PROMISES[command.order]
+            events.append(Event(at_ns=inputs.at_ns, severity=severity, code=code, text=text))
         return events
 
-    def _explain_refusal(self, command: Command, view: HandoverInput) -> str:
+    def _explain_refusal(self, command: Command, inputs: HandoverInput) -> str:
         """Return why an order is refused; empty if it is taken."""
         if command.order is Order.ENGAGE:
-            return explain_engage_refusal(self.state, view)
+            return explain_engage_refusal(self.state, inputs)
         if command.order is Order.STAND_BY:
             return "" if self.state is HandoverState.WAITING else f"the vehicle has been heard; now: {self.state}"
         if not (command.height_m or 0.0) > 0.0:
             return f"a climb to {command.height_m} m is none"
-        early = self.state in (HandoverState.WAITING, HandoverState.READY) and not self.is_ordered_flight
-        return "" if early else f"take-off is ordered once, on the ground; now: {self.state}"
+        is_on_ground = self.state in (HandoverState.WAITING, HandoverState.READY) and not self.is_ordered_flight
+        return "" if is_on_ground else f"take-off is ordered once, on the ground; now: {self.state}"
 
-    def _may_be_pilot_mode_change(self, view: HandoverInput) -> bool:
+    def _may_be_pilot_mode_change(self, inputs: HandoverInput) -> bool:
         """Whether the pilot may have changed the mode since the last heartbeat: then no request of one is repeated.
 
         Heartbeats show a mode up to a second late, and a request that is repeated meanwhile would take it back. So
         it is made again right after a heartbeat; landing also where none has come.
         """
-        vehicle, ask = view.vehicle, self._progress.request.kind
-        if ask not in (RequestKind.EXTERNAL_MODE, RequestKind.LAND) or vehicle is None:
+        vehicle, kind = inputs.vehicle, self._progress.request.kind
+        if kind not in (RequestKind.EXTERNAL_MODE, RequestKind.LAND) or vehicle is None:
             return False
-        age_ns = view.at_ns - vehicle.at_ns
-        return age_ns > NEW_HEARTBEAT_NS and not (ask is RequestKind.LAND and age_ns > MISSING_HEARTBEAT_NS)
+        age_ns = inputs.at_ns - vehicle.at_ns
+        return age_ns > NEW_HEARTBEAT_NS and not (kind is RequestKind.LAND and age_ns > MISSING_HEARTBEAT_NS)
 
-    def _may_send_neutral(self, view: HandoverInput) -> bool:
+    def _may_send_neutral(self, inputs: HandoverInput) -> bool:
         """Whether neutral setpoints do no harm: they would end ArduPilot's climb."""
-        if self.state not in TAKING_OFF or view.vehicle is None:
+        if self.state not in TAKING_OFF or inputs.vehicle is None:
             return True
-        return profile_of(view.vehicle).climbs_on_arming
+        return profile_of(inputs.vehicle).climbs_on_arming
 
-    def _enter_state(self, before: HandoverState, sight: GuardResult, view: HandoverInput) -> None:
-        now = self._progress
-        now.state_start_ns, now.is_standing_by = view.at_ns, False
-        if now.state in _TAKEN and before not in _TAKEN:
-            now.is_climb_interrupted = before in _CLIMB_STATES
-        if now.state is HandoverState.FAILSAFE:
-            said = "" if view.vehicle is None else view.vehicle.said
-            now.failsafe_texts = now.request.quoted_texts + (
-                f', "{said}"' if said and said not in now.request.quoted_texts else ""
+    def _enter_state(self, before: HandoverState, result: GuardResult, inputs: HandoverInput) -> None:
+        progress = self._progress
+        progress.state_start_ns, progress.is_standing_by = inputs.at_ns, False
+        if progress.state in _TAKEN and before not in _TAKEN:
+            progress.is_climb_interrupted = before in _CLIMB_STATES
+        if progress.state is HandoverState.FAILSAFE:
+            failsafe_text = "" if inputs.vehicle is None else inputs.vehicle.said
+            progress.failsafe_texts = progress.request.quoted_texts + (
+                f', "{failsafe_text}"' if failsafe_text and failsafe_text not in progress.request.quoted_texts else ""
             )
-        if now.state is HandoverState.CLIMBING and now.climb_start_ns is None:
-            now.climb_start_ns = view.at_ns
-        if now.state is HandoverState.CLIMBING:
-            now.previous_mode = ""  # that of the ground would be the pilot's by now
-        now.request = PendingRequest(self._choose_request(view), view.at_ns, self._choose_limits(now.state, view.at_ns))
-        if now.state is HandoverState.ARMING:
-            now.ground_height_m = view.estimated_height_m
-        takes_back = now.state is HandoverState.ENGAGING and before is HandoverState.FAILSAFE
-        if (takes_back or now.state in _NOTES_MODE) and view.vehicle is not None:
-            now.previous_mode = view.vehicle.mode
-        if sight.granted_ns is not None:
-            now.granted_ns = sight.granted_ns
-        elif now.state not in (HandoverState.CLIMBING, HandoverState.ENGAGING):
-            now.granted_ns = None
+        if progress.state is HandoverState.CLIMBING and progress.climb_start_ns is None:
+            progress.climb_start_ns = inputs.at_ns
+        if progress.state is HandoverState.CLIMBING:
+            progress.previous_mode = ""  # that of the ground would be the pilot's by now
+        progress.request = PendingRequest(
+            self._choose_request(inputs), inputs.at_ns, self._choose_limits(progress.state, inputs.at_ns)
+        )
+        if progress.state is HandoverState.ARMING:
+            progress.ground_height_m = inputs.estimated_height_m
+        takes_control_back = progress.state is HandoverState.ENGAGING and before is HandoverState.FAILSAFE
+        if (takes_control_back or progress.state in _NOTES_MODE) and inputs.vehicle is not None:
+            progress.previous_mode = inputs.vehicle.mode
+        if result.granted_ns is not None:
+            progress.granted_ns = result.granted_ns
+        elif progress.state not in (HandoverState.CLIMBING, HandoverState.ENGAGING):
+            progress.granted_ns = None
         if before is not HandoverState.RETURNING:
-            self.failure = self.failure or sight.reason
+            self.failure = self.failure or result.reason
 
-    def _choose_request(self, view: HandoverInput) -> RequestKind | None:
-        climbs = view.vehicle is not None and profile_of(view.vehicle).climbs_on_arming
-        external = view.vehicle is not None and view.vehicle.external
-        asks = {
+    def _choose_request(self, inputs: HandoverInput) -> RequestKind | None:
+        climbs_on_arming = inputs.vehicle is not None and profile_of(inputs.vehicle).climbs_on_arming
+        is_external = inputs.vehicle is not None and inputs.vehicle.external
+        requests = {
             HandoverState.MODE: RequestKind.TAKE_OFF_MODE,
             HandoverState.ARMING: RequestKind.ARM,
-            HandoverState.CLIMBING: None if climbs else RequestKind.TAKE_OFF,
-            HandoverState.ENGAGING: None if external else RequestKind.EXTERNAL_MODE,
-            HandoverState.RETURNING: None if external else RequestKind.EXTERNAL_MODE,
+            HandoverState.CLIMBING: None if climbs_on_arming else RequestKind.TAKE_OFF,
+            HandoverState.ENGAGING: None if is_external else RequestKind.EXTERNAL_MODE,
+            HandoverState.RETURNING: None if is_external else RequestKind.EXTERNAL_MODE,
             HandoverState.LANDING: RequestKind.LAND,
         }
-        return asks.get(self.state)
+        return requests.get(self.state)
 
     def _choose_limits(self, state: HandoverState, at_ns: int) -> RequestLimits:
-        c = self._config
+        config = self._config
         climbed_s = 0.0 if self._progress.climb_start_ns is None else (at_ns - self._progress.climb_start_ns) / 1e9
         limits_s = {
-            HandoverState.MODE: c.ground_s,
-            HandoverState.ARMING: c.ground_s,
+            HandoverState.MODE: config.ground_s,
+            HandoverState.ARMING: config.ground_s,
             HandoverState.CLIMBING: max(
-                c.climb_s - climbed_s, 0.0
+                config.climb_s - climbed_s, 0.0
             ),  # one time for the climb, however often it is interrupted
-            HandoverState.ENGAGING: c.engage_s,
-            HandoverState.RETURNING: c.engage_s,
-            HandoverState.LANDING: c.land_s,
-            HandoverState.SETTLING: c.land_s,
+            HandoverState.ENGAGING: config.engage_s,
+            HandoverState.RETURNING: config.engage_s,
+            HandoverState.LANDING: config.land_s,
+            HandoverState.SETTLING: config.land_s,
         }
         limit_ns = _ns(limits_s[state]) if state in limits_s else FOREVER_NS
         if state is HandoverState.LANDING:
             # What we took off is asked on: nobody else would.
             tries = (
-                max(LAND_TRIES, round(LAND_PERIODS * c.land_s / c.answer_s)) if self.is_ordered_flight else LAND_TRIES
+                max(LAND_TRIES, round(LAND_PERIODS * config.land_s / config.answer_s))
+                if self.is_ordered_flight
+                else LAND_TRIES
             )
-            return RequestLimits(_ns(c.answer_s), _ns(c.answer_s), tries, limit_ns)
+            return RequestLimits(_ns(config.answer_s), _ns(config.answer_s), tries, limit_ns)
         # In the air there is no time for long pauses.
-        retry_s = c.retry_s if state in _ON_THE_GROUND else c.answer_s / 2
-        return RequestLimits(_ns(c.answer_s), _ns(retry_s), c.tries, limit_ns)
+        retry_s = config.retry_s if state in _ON_THE_GROUND else config.answer_s / 2
+        return RequestLimits(_ns(config.answer_s), _ns(retry_s), config.tries, limit_ns)
 
-    def _request_disarming(self, view: HandoverInput) -> None:
+    def _request_disarming(self, inputs: HandoverInput) -> None:
         """Ask a vehicle to disarm that stands on the ground after a flight of ours and stays armed."""
-        vehicle = view.vehicle
+        vehicle = inputs.vehicle
         if not (
             self.is_ordered_flight and self.state is HandoverState.SETTLING and vehicle is not None and vehicle.landed
         ):
             self._landed_ns = None
         elif self._landed_ns is None:
-            self._landed_ns = view.at_ns
-        elif not self._is_disarm_requested and view.at_ns - self._landed_ns >= _ns(self._config.disarm_s):
+            self._landed_ns = inputs.at_ns
+        elif not self._is_disarm_requested and inputs.at_ns - self._landed_ns >= _ns(self._config.disarm_s):
             self._is_disarm_requested = True
             self._progress.request = PendingRequest(
-                RequestKind.DISARM, view.at_ns, self._choose_limits(HandoverState.SETTLING, view.at_ns)
+                RequestKind.DISARM, inputs.at_ns, self._choose_limits(HandoverState.SETTLING, inputs.at_ns)
             )
 
     def _make_events(
-        self, view: HandoverInput, before: HandoverState, sight: GuardResult, *, passed: bool
+        self, inputs: HandoverInput, before: HandoverState, result: GuardResult, *, has_changed: bool
     ) -> list[Event]:
         events = []
-        silence = self.state is HandoverState.ENGAGED and sight.event is HandoverEvent.SILENCE
-        if silence != self._is_heartbeat_lost:
-            self._is_heartbeat_lost = silence
-            only = ", though its other messages come" if view.has_motion else ", and nothing else comes"
-            text = f"heartbeat lost{only}: braking and holding" if silence else "heartbeat is back"
-            events.append(Event(at_ns=view.at_ns, severity=Severity.ERROR, code="heartbeat", text=text))
-        overdue = self._progress.request.describe_failure(view.at_ns) if self.state is HandoverState.LANDING else ""
-        if overdue and not self._is_landing_overdue:
-            text = f"{overdue}; it is asked on, as it is heard in the air"
-            events.append(Event(at_ns=view.at_ns, severity=Severity.ERROR, code="refused", text=text))
-        self._is_landing_overdue = bool(overdue)
-        if passed:
-            vehicle = view.vehicle
+        is_heartbeat_lost = self.state is HandoverState.ENGAGED and result.event is HandoverEvent.SILENCE
+        if is_heartbeat_lost != self._is_heartbeat_lost:
+            self._is_heartbeat_lost = is_heartbeat_lost
+            suffix = ", though its other messages come" if inputs.has_motion else ", and nothing else comes"
+            text = f"heartbeat lost{suffix}: braking and holding" if is_heartbeat_lost else "heartbeat is back"
+            events.append(Event(at_ns=inputs.at_ns, severity=Severity.ERROR, code="heartbeat", text=text))
+        overdue_reason = (
+            self._progress.request.describe_failure(inputs.at_ns) if self.state is HandoverState.LANDING else ""
+        )
+        if overdue_reason and not self._is_landing_overdue:
+            text = f"{overdue_reason}; it is asked on, as it is heard in the air"
+            events.append(Event(at_ns=inputs.at_ns, severity=Severity.ERROR, code="refused", text=text))
+        self._is_landing_overdue = bool(overdue_reason)
+        if has_changed:
+            vehicle = inputs.vehicle
             mode = "" if vehicle is None else f" ({vehicle.mode}, {'armed' if vehicle.armed else 'disarmed'})"
-            plain = self.state in _PLAIN and before is not HandoverState.FAILSAFE
-            severity = Severity.INFO if plain else Severity.WARNING
+            is_routine = self.state in _PLAIN and before is not HandoverState.FAILSAFE
+            severity = Severity.INFO if is_routine else Severity.WARNING
             text = f"{before} -> {self.state}{mode}"
-            if sight.mode_reason is not None:
-                said = "" if vehicle is None or not vehicle.said else f', "{vehicle.said}"'
-                text += f": {sight.mode_reason}{said}"
-            events.append(Event(at_ns=view.at_ns, severity=severity, code="hand-over", text=text))
-            if sight.reason:
-                events.append(Event(at_ns=view.at_ns, severity=Severity.ERROR, code="refused", text=sight.reason))
+            if result.mode_reason is not None:
+                failsafe_text = "" if vehicle is None or not vehicle.said else f', "{vehicle.said}"'
+                text += f": {result.mode_reason}{failsafe_text}"
+            events.append(Event(at_ns=inputs.at_ns, severity=severity, code="hand-over", text=text))
+            if result.reason:
+                events.append(Event(at_ns=inputs.at_ns, severity=Severity.ERROR, code="refused", text=result.reason))
         return events
 
 

@@ -116,9 +116,9 @@ def is_silent(at_ns: int, vehicle: VehicleStatus | None) -> bool:
     return vehicle is None or at_ns - vehicle.at_ns > HEARTBEAT_TIMEOUT_NS
 
 
-def is_ordered(view: HandoverInput, order: Order) -> bool:
+def is_ordered(inputs: HandoverInput, order: Order) -> bool:
     """Whether this tick brings an order."""
-    return any(command.order is order for command in view.commands)
+    return any(command.order is order for command in inputs.commands)
 
 
 def is_in_failsafe(vehicle: VehicleStatus) -> bool:
@@ -131,23 +131,25 @@ def _classify_takeover(progress: HandoverProgress, vehicle: VehicleStatus) -> Gu
 
     A failsafe is waited for on a flight that we began, unless a person flies in its mode: the stick always wins.
     """
-    who = determine_mode_reason(vehicle, was_in_failsafe=progress.state is HandoverState.FAILSAFE)
-    if who is ModeReason.UNKNOWN:
-        return GuardResult(HandoverEvent.UNCLEAR, mode_reason=who)
-    waits = who in VEHICLE_REASONS and progress.take_off_ordered_ns is not None and is_autonomous_mode(vehicle)
-    return GuardResult(HandoverEvent.FAILSAFE if waits else HandoverEvent.OTHER, mode_reason=who)
+    mode_reason = determine_mode_reason(vehicle, was_in_failsafe=progress.state is HandoverState.FAILSAFE)
+    if mode_reason is ModeReason.UNKNOWN:
+        return GuardResult(HandoverEvent.UNCLEAR, mode_reason=mode_reason)
+    is_waiting = (
+        mode_reason in VEHICLE_REASONS and progress.take_off_ordered_ns is not None and is_autonomous_mode(vehicle)
+    )
+    return GuardResult(HandoverEvent.FAILSAFE if is_waiting else HandoverEvent.OTHER, mode_reason=mode_reason)
 
 
-def explain_engage_refusal(state: HandoverState, view: HandoverInput) -> str:
+def explain_engage_refusal(state: HandoverState, inputs: HandoverInput) -> str:
     """Return why the external mode must not be asked for again; empty if it may."""
-    vehicle = view.vehicle
+    vehicle = inputs.vehicle
     if state not in (HandoverState.READY, HandoverState.RELEASED, HandoverState.UNCLEAR, HandoverState.FAILSAFE):
         return f"there is nothing to engage; now: {state}"
-    if vehicle is None or is_silent(view.at_ns, vehicle) or vehicle.autopilot not in PROFILES:
+    if vehicle is None or is_silent(inputs.at_ns, vehicle) or vehicle.autopilot not in PROFILES:
         return "no vehicle is heard that could be flown"
     if not vehicle.armed or vehicle.landed:
         return "the vehicle is not in the air"
-    return view.arming_refusal
+    return inputs.arming_refusal
 
 
 def explain_move_refusal(state: HandoverState, vehicle: VehicleStatus | None) -> str:
@@ -166,61 +168,61 @@ def explain_move_refusal(state: HandoverState, vehicle: VehicleStatus | None) ->
     return f"the vehicle has been handed over ({state})"
 
 
-def evaluate(progress: HandoverProgress, view: HandoverInput) -> GuardResult:
+def evaluate(progress: HandoverProgress, inputs: HandoverInput) -> GuardResult:
     """Return the event that a tick sees; of several the first in the order of `HandoverEvent`."""
-    vehicle, state = view.vehicle, progress.state
+    vehicle, state = inputs.vehicle, progress.state
     if vehicle is not None and vehicle.boots > progress.boots and state is not HandoverState.WAITING:
         return GuardResult(HandoverEvent.REBOOT, "the vehicle has started anew")
-    there = GuardResult(HandoverEvent.SILENCE)
-    if vehicle is not None and not is_silent(view.at_ns, vehicle):
-        there = _GUARDS.get(state, _guard_standby)(progress, view, vehicle)
-    lands = vehicle is not None and vehicle.mode in profile_of(vehicle).landing_modes
-    taken = there.event in (HandoverEvent.UNCLEAR, HandoverEvent.OTHER)
-    if taken and not lands and state not in (HandoverState.WAITING, HandoverState.READY):
-        return there  # whatever ends the flight: what the pilot has taken is asked for nothing
-    if view.is_landing_requested and state is not HandoverState.UNCLEAR:
+    result = GuardResult(HandoverEvent.SILENCE)
+    if vehicle is not None and not is_silent(inputs.at_ns, vehicle):
+        result = _GUARDS.get(state, _guard_standby)(progress, inputs, vehicle)
+    is_landing = vehicle is not None and vehicle.mode in profile_of(vehicle).landing_modes
+    is_taken_over = result.event in (HandoverEvent.UNCLEAR, HandoverEvent.OTHER)
+    if is_taken_over and not is_landing and state not in (HandoverState.WAITING, HandoverState.READY):
+        return result  # whatever ends the flight: what the pilot has taken is asked for nothing
+    if inputs.is_landing_requested and state is not HandoverState.UNCLEAR:
         return GuardResult(HandoverEvent.LAND)
-    if (state in _IN_PROGRESS and (view.is_stop_requested or is_ordered(view, Order.LAND))) or _is_landing_ordered(
-        progress, view
+    if (state in _IN_PROGRESS and (inputs.is_stop_requested or is_ordered(inputs, Order.LAND))) or _is_landing_ordered(
+        progress, inputs
     ):
         return GuardResult(HandoverEvent.LAND)
     if (
         state is HandoverState.ENGAGED
-        and view.is_stop_requested
-        and not view.has_setpoint
+        and inputs.is_stop_requested
+        and not inputs.has_setpoint
         and progress.take_off_ordered_ns is not None
     ):
         # The controller has ended without a landing, and nobody else has what we took off.
         return GuardResult(HandoverEvent.LAND)
-    if state in _CLIMB_STATES and view.climb_hazard:
-        return GuardResult(HandoverEvent.UNSAFE, f"{CLIMB_ABORTED}{view.climb_hazard}")
-    if there.event in (HandoverEvent.GRANTED, HandoverEvent.REFUSED):
-        return there
-    if there.event is HandoverEvent.DISARMED and state is HandoverState.LANDING:
-        return there  # whatever it answered, it is down
-    why = _find_failure(progress, view)
-    return GuardResult(HandoverEvent.REFUSED, why) if why else there
+    if state in _CLIMB_STATES and inputs.climb_hazard:
+        return GuardResult(HandoverEvent.UNSAFE, f"{CLIMB_ABORTED}{inputs.climb_hazard}")
+    if result.event in (HandoverEvent.GRANTED, HandoverEvent.REFUSED):
+        return result
+    if result.event is HandoverEvent.DISARMED and state is HandoverState.LANDING:
+        return result  # whatever it answered, it is down
+    reason = _find_failure(progress, inputs)
+    return GuardResult(HandoverEvent.REFUSED, reason) if reason else result
 
 
-def _find_failure(progress: HandoverProgress, view: HandoverInput) -> str:
-    state, vehicle = progress.state, view.vehicle
+def _find_failure(progress: HandoverProgress, inputs: HandoverInput) -> str:
+    state, vehicle = progress.state, inputs.vehicle
     if state in (HandoverState.WAITING, HandoverState.READY):
-        return _find_take_off_failure(progress, view)
+        return _find_take_off_failure(progress, inputs)
     if state in (HandoverState.MODE, HandoverState.ARMING) and vehicle is not None and not vehicle.alone:
         return _SECOND_VEHICLE
     if state in (HandoverState.FAILSAFE, HandoverState.UNCLEAR):
-        return _find_wait_timeout(progress, view)
-    waits = (state in REQUESTING or state is HandoverState.SETTLING) and not _must_keep_landing(progress, view)
-    return progress.request.describe_failure(view.at_ns) if waits else ""
+        return _find_wait_timeout(progress, inputs)
+    is_waiting = (state in REQUESTING or state is HandoverState.SETTLING) and not _must_keep_landing(progress, inputs)
+    return progress.request.describe_failure(inputs.at_ns) if is_waiting else ""
 
 
-def _must_keep_landing(progress: HandoverProgress, view: HandoverInput) -> bool:
+def _must_keep_landing(progress: HandoverProgress, inputs: HandoverInput) -> bool:
     """Whether it is asked to land, whatever it answers: what we took off, or armed for that, has nobody else."""
-    vehicle = view.vehicle
+    vehicle = inputs.vehicle
     if progress.state is not HandoverState.LANDING or progress.take_off_ordered_ns is None or vehicle is None:
         return False
-    heard = vehicle.armed and not is_silent(view.at_ns, vehicle)
-    return heard and view.at_ns - progress.state_start_ns < round(LAND_PERIODS * progress.config.land_s * 1e9)
+    is_heard = vehicle.armed and not is_silent(inputs.at_ns, vehicle)
+    return is_heard and inputs.at_ns - progress.state_start_ns < round(LAND_PERIODS * progress.config.land_s * 1e9)
 
 
 def is_without_pilot(progress: HandoverProgress, vehicle: VehicleStatus | None) -> bool:
@@ -230,30 +232,30 @@ def is_without_pilot(progress: HandoverProgress, vehicle: VehicleStatus | None) 
     return is_autonomous_mode(vehicle) or vehicle.external or vehicle.mode in profile_of(vehicle).climb_modes
 
 
-def _is_landing_ordered(progress: HandoverProgress, view: HandoverInput) -> bool:
+def _is_landing_ordered(progress: HandoverProgress, inputs: HandoverInput) -> bool:
     """Whether the operator orders a landing of what is nobody's."""
-    unclear = progress.state is HandoverState.UNCLEAR and is_ordered(view, Order.LAND)
-    return unclear and is_without_pilot(progress, view.vehicle)
+    is_unclear = progress.state is HandoverState.UNCLEAR and is_ordered(inputs, Order.LAND)
+    return is_unclear and is_without_pilot(progress, inputs.vehicle)
 
 
-def _find_wait_timeout(progress: HandoverProgress, view: HandoverInput) -> str:
+def _find_wait_timeout(progress: HandoverProgress, inputs: HandoverInput) -> str:
     """Return why the vehicle's failsafe, or who has it, is not waited for any longer; empty while it is."""
-    vehicle, config = view.vehicle, progress.config
-    unclear = progress.state is HandoverState.UNCLEAR
-    if unclear and not is_without_pilot(progress, vehicle):
+    vehicle, config = inputs.vehicle, progress.config
+    is_unclear = progress.state is HandoverState.UNCLEAR
+    if is_unclear and not is_without_pilot(progress, vehicle):
         return ""
-    lands = vehicle is not None and vehicle.mode in profile_of(vehicle).landing_modes
-    begun_ns, limit_s = progress.state_start_ns, config.land_s if lands else config.climb_s
-    if progress.is_climb_interrupted and not lands and progress.climb_start_ns is not None:
-        begun_ns = progress.climb_start_ns
-    if view.at_ns - begun_ns < round(limit_s * 1e9):
+    is_landing = vehicle is not None and vehicle.mode in profile_of(vehicle).landing_modes
+    start_ns, limit_s = progress.state_start_ns, config.land_s if is_landing else config.climb_s
+    if progress.is_climb_interrupted and not is_landing and progress.climb_start_ns is not None:
+        start_ns = progress.climb_start_ns
+    if inputs.at_ns - start_ns < round(limit_s * 1e9):
         return ""
-    if unclear:
+    if is_unclear:
         mode = "" if vehicle is None else vehicle.mode
         return f"nobody has shown in {limit_s:g} s that he has the vehicle, which flies by itself ({mode})"
-    acts = vehicle is None or is_in_failsafe(vehicle)
-    became = "has not ended" if acts else "has ended, and nobody has taken the flight up again,"
-    return f"{_describe_failsafe(progress)} {became} in {limit_s:g} s{progress.failsafe_texts}"
+    is_failsafe_active = vehicle is None or is_in_failsafe(vehicle)
+    outcome = "has not ended" if is_failsafe_active else "has ended, and nobody has taken the flight up again,"
+    return f"{_describe_failsafe(progress)} {outcome} in {limit_s:g} s{progress.failsafe_texts}"
 
 
 def _describe_failsafe(progress: HandoverProgress) -> str:
@@ -261,9 +263,9 @@ def _describe_failsafe(progress: HandoverProgress) -> str:
     return f"{progress.mode_reason or ModeReason.FAILSAFE} ({progress.previous_mode})"
 
 
-def _find_take_off_failure(progress: HandoverProgress, view: HandoverInput) -> str:
+def _find_take_off_failure(progress: HandoverProgress, inputs: HandoverInput) -> str:
     """Return why an ordered take-off will not begin; empty if it may, or none was ordered."""
-    vehicle, limit_s = view.vehicle, progress.config.ground_s
+    vehicle, limit_s = inputs.vehicle, progress.config.ground_s
     if progress.take_off_ordered_ns is None:
         return ""
     if vehicle is not None and vehicle.autopilot not in PROFILES:
@@ -272,55 +274,63 @@ def _find_take_off_failure(progress: HandoverProgress, view: HandoverInput) -> s
         return _SECOND_VEHICLE
     if vehicle is not None and vehicle.armed:
         return f"take-off: {_ALREADY_ARMED}{_ENGAGE_HINT if progress.is_standing_by else ''}"
-    if view.at_ns - progress.take_off_ordered_ns < round(limit_s * 1e9):
+    if inputs.at_ns - progress.take_off_ordered_ns < round(limit_s * 1e9):
         return ""
-    missing = "the vehicle's heartbeats are missing" if view.has_motion else "the vehicle is silent"
-    reason = "no vehicle is heard" if vehicle is None else view.arming_refusal or missing
+    silence = "the vehicle's heartbeats are missing" if inputs.has_motion else "the vehicle is silent"
+    reason = "no vehicle is heard" if vehicle is None else inputs.arming_refusal or silence
     return f"take-off: {reason} (waited {limit_s:g} s)"
 
 
-def _guard_standby(progress: HandoverProgress, view: HandoverInput, vehicle: VehicleStatus) -> GuardResult:
+def _guard_standby(progress: HandoverProgress, inputs: HandoverInput, vehicle: VehicleStatus) -> GuardResult:
     """Return the event seen before, between and after flights."""
-    ready = progress.state is HandoverState.READY and not (view.arming_refusal or view.is_stop_requested)
-    if ready and progress.take_off_ordered_ns is not None and not vehicle.armed and vehicle.alone:
+    is_ready = progress.state is HandoverState.READY and not (inputs.arming_refusal or inputs.is_stop_requested)
+    if is_ready and progress.take_off_ordered_ns is not None and not vehicle.armed and vehicle.alone:
         return (
             GuardResult(HandoverEvent.TAKE_OFF)
             if vehicle.autopilot in PROFILES
             else GuardResult(HandoverEvent.DISARMED)
         )
-    if is_ordered(view, Order.ENGAGE) and not explain_engage_refusal(progress.state, view):
+    if is_ordered(inputs, Order.ENGAGE) and not explain_engage_refusal(progress.state, inputs):
         return GuardResult(HandoverEvent.ENGAGE)
     if progress.state is HandoverState.ENGAGED and progress.may_be_outdated(vehicle):
         return GuardResult(HandoverEvent.EXTERNAL)
     if not vehicle.armed:
         return GuardResult(HandoverEvent.DISARMED)
-    if progress.is_standing_by and not _has_started_since(progress, view):
-        heard_ns = view.at_ns if progress.first_heard_ns is None else progress.first_heard_ns
-        tells_not_yet = view.uptime_s is None and view.at_ns - heard_ns < BOOT_TIME_WAIT_NS
-        return GuardResult(HandoverEvent.SILENCE) if tells_not_yet else GuardResult(HandoverEvent.LEFT, _LEFT_IN_FLIGHT)
+    if progress.is_standing_by and not _has_started_since(progress, inputs):
+        heard_ns = inputs.at_ns if progress.first_heard_ns is None else progress.first_heard_ns
+        is_uptime_pending = inputs.uptime_s is None and inputs.at_ns - heard_ns < BOOT_TIME_WAIT_NS
+        return (
+            GuardResult(HandoverEvent.SILENCE)
+            if is_uptime_pending
+            else GuardResult(HandoverEvent.LEFT, _LEFT_IN_FLIGHT)
+        )
     if vehicle.external:
         return GuardResult(HandoverEvent.EXTERNAL)
     if progress.state is HandoverState.ENGAGED:
         return _classify_takeover(progress, vehicle)
     # A text that says of a failsafe comes after the heartbeat that shows its mode, sometimes.
-    guessed = (
+    is_reason_uncertain = (
         progress.mode_reason in (ModeReason.PILOT, ModeReason.UNKNOWN)
-        and view.at_ns - progress.state_start_ns < LATE_TEXT_NS
+        and inputs.at_ns - progress.state_start_ns < LATE_TEXT_NS
     )
-    who = (
-        determine_mode_reason(vehicle) if guessed and progress.state is HandoverState.RELEASED else progress.mode_reason
+    mode_reason = (
+        determine_mode_reason(vehicle)
+        if is_reason_uncertain and progress.state is HandoverState.RELEASED
+        else progress.mode_reason
     )
-    return GuardResult(HandoverEvent.OTHER, mode_reason=progress.mode_reason if who is ModeReason.UNKNOWN else who)
+    return GuardResult(
+        HandoverEvent.OTHER, mode_reason=progress.mode_reason if mode_reason is ModeReason.UNKNOWN else mode_reason
+    )
 
 
-def _has_started_since(progress: HandoverProgress, view: HandoverInput) -> bool:
+def _has_started_since(progress: HandoverProgress, inputs: HandoverInput) -> bool:
     """Whether the vehicle has started after the flight that an earlier daemon left: it is on another one."""
-    if progress.previous_flight_ns is None or view.uptime_s is None:
+    if progress.previous_flight_ns is None or inputs.uptime_s is None:
         return False
-    return view.uptime_s / MIN_CLOCK_RATE + BOOT_TIME_MARGIN_S < (view.at_ns - progress.previous_flight_ns) / 1e9
+    return inputs.uptime_s / MIN_CLOCK_RATE + BOOT_TIME_MARGIN_S < (inputs.at_ns - progress.previous_flight_ns) / 1e9
 
 
-def _guard_mode(progress: HandoverProgress, view: HandoverInput, vehicle: VehicleStatus) -> GuardResult:
+def _guard_mode(progress: HandoverProgress, inputs: HandoverInput, vehicle: VehicleStatus) -> GuardResult:
     profile = profile_of(vehicle)
     if vehicle.armed:
         return _classify_takeover(progress, vehicle)
@@ -331,7 +341,7 @@ def _guard_mode(progress: HandoverProgress, view: HandoverInput, vehicle: Vehicl
         return _classify_takeover(progress, vehicle)
     if _is_after_grant(progress, vehicle, MODE_SHOWN_NS):
         return GuardResult(
-            HandoverEvent.REFUSED, f"{progress.request.describe_failure(view.at_ns, at_once=True)}; {_SLOW_OR_PILOT}"
+            HandoverEvent.REFUSED, f"{progress.request.describe_failure(inputs.at_ns, is_final=True)}; {_SLOW_OR_PILOT}"
         )
     return GuardResult(HandoverEvent.PENDING)
 
@@ -342,7 +352,7 @@ def _is_after_grant(progress: HandoverProgress, vehicle: VehicleStatus, after_ns
     return granted_ns is not None and vehicle.at_ns > granted_ns + after_ns
 
 
-def _guard_arming(progress: HandoverProgress, _view: HandoverInput, vehicle: VehicleStatus) -> GuardResult:
+def _guard_arming(progress: HandoverProgress, _inputs: HandoverInput, vehicle: VehicleStatus) -> GuardResult:
     profile, granted_ns = profile_of(vehicle), progress.request.granted_ns
     # Disarmed it has not climbed, so it is not where PX4's climb ends.
     if vehicle.mode != profile.take_off_mode and not (vehicle.armed and vehicle.mode in profile.climb_modes):
@@ -352,7 +362,7 @@ def _guard_arming(progress: HandoverProgress, _view: HandoverInput, vehicle: Veh
     return GuardResult(HandoverEvent.GRANTED if vehicle.armed else HandoverEvent.PENDING)
 
 
-def _guard_climbing(progress: HandoverProgress, view: HandoverInput, vehicle: VehicleStatus) -> GuardResult:
+def _guard_climbing(progress: HandoverProgress, inputs: HandoverInput, vehicle: VehicleStatus) -> GuardResult:
     if not (vehicle.armed or progress.may_be_outdated(vehicle)):
         return GuardResult(HandoverEvent.DISARMED, _DISARMED)
     profile = profile_of(vehicle)
@@ -361,87 +371,93 @@ def _guard_climbing(progress: HandoverProgress, view: HandoverInput, vehicle: Ve
     if (
         vehicle.mode != profile.take_off_mode
         and vehicle.landed
-        and _predict_climb_share(progress, view, 0.0) < NO_CLIMB_SHARE
+        and _predict_climb_share(progress, inputs, 0.0) < NO_CLIMB_SHARE
     ):
         return _classify_takeover(progress, vehicle)  # no climb has ended on the ground
-    share = _predict_climb_share(progress, view, LOOK_AHEAD_S if profile.climbs_on_arming else 0.0)
-    ended = profile.climbs_on_arming and vehicle.mode != profile.take_off_mode  # below the height: as high as it goes
+    share = _predict_climb_share(progress, inputs, LOOK_AHEAD_S if profile.climbs_on_arming else 0.0)
+    # A climb that has ended below the height goes no higher.
+    is_climb_over = profile.climbs_on_arming and vehicle.mode != profile.take_off_mode
     return GuardResult(
         HandoverEvent.GRANTED
-        if share >= (MIN_CLIMB_SHARE if ended else progress.config.reached)
+        if share >= (MIN_CLIMB_SHARE if is_climb_over else progress.config.reached)
         else HandoverEvent.PENDING
     )
 
 
-def _predict_climb_share(progress: HandoverProgress, view: HandoverInput, ahead_s: float) -> float:
+def _predict_climb_share(progress: HandoverProgress, inputs: HandoverInput, ahead_s: float) -> float:
     """Return the share of the height that will be reached `ahead_s` from now, by fresh positions."""
-    if view.estimated_height_m is None or progress.ground_height_m is None or view.arming_refusal:
+    if inputs.estimated_height_m is None or progress.ground_height_m is None or inputs.arming_refusal:
         return 0.0
-    return (view.estimated_height_m + ahead_s * view.climb_rate_mps - progress.ground_height_m) / progress.height_m
+    return (inputs.estimated_height_m + ahead_s * inputs.climb_rate_mps - progress.ground_height_m) / progress.height_m
 
 
-def _guard_external(progress: HandoverProgress, _view: HandoverInput, vehicle: VehicleStatus) -> GuardResult:
+def _guard_external(progress: HandoverProgress, _inputs: HandoverInput, vehicle: VehicleStatus) -> GuardResult:
     if not (vehicle.armed or progress.may_be_outdated(vehicle)):
         return GuardResult(HandoverEvent.DISARMED, _DISARMED)
     granted_ns = progress.request.granted_ns
     if vehicle.external or granted_ns is not None:
         return GuardResult(HandoverEvent.GRANTED, granted_ns=granted_ns)
-    engaging = progress.state is HandoverState.ENGAGING
-    if vehicle.mode == progress.previous_mode or (engaging and vehicle.mode in profile_of(vehicle).climb_modes):
+    is_engaging = progress.state is HandoverState.ENGAGING
+    if vehicle.mode == progress.previous_mode or (is_engaging and vehicle.mode in profile_of(vehicle).climb_modes):
         return GuardResult(HandoverEvent.PENDING)
     return _classify_takeover(progress, vehicle)
 
 
-def _guard_failsafe(progress: HandoverProgress, view: HandoverInput, vehicle: VehicleStatus) -> GuardResult:
+def _guard_failsafe(progress: HandoverProgress, inputs: HandoverInput, vehicle: VehicleStatus) -> GuardResult:
     """Return the event seen in a failsafe on a flight that we began; the pilot may take over as at any other time."""
     if not vehicle.armed:
         return GuardResult(
             HandoverEvent.DISARMED, f"{_describe_failsafe(progress)} has landed it{progress.failsafe_texts}"
         )
-    if is_ordered(view, Order.ENGAGE) and not explain_engage_refusal(progress.state, view):
+    if is_ordered(inputs, Order.ENGAGE) and not explain_engage_refusal(progress.state, inputs):
         return GuardResult(HandoverEvent.ENGAGE)
     profile = profile_of(vehicle)
     if progress.is_climb_interrupted and vehicle.mode in profile.climb_modes:
         return GuardResult(HandoverEvent.GRANTED)
-    stays = not profile.restores_mode and vehicle.mode == progress.previous_mode and not vehicle.stick
+    stays_in_failsafe = not profile.restores_mode and vehicle.mode == progress.previous_mode and not vehicle.stick
     # The external mode is not taken up again unasked: nobody knows whose doing it is.
-    if vehicle.external or is_in_failsafe(vehicle) or stays:
+    if vehicle.external or is_in_failsafe(vehicle) or stays_in_failsafe:
         return GuardResult(HandoverEvent.PENDING)
     return _classify_takeover(progress, vehicle)
 
 
-def _guard_unclear(progress: HandoverProgress, view: HandoverInput, vehicle: VehicleStatus) -> GuardResult:
+def _guard_unclear(progress: HandoverProgress, inputs: HandoverInput, vehicle: VehicleStatus) -> GuardResult:
     """Return the event seen while it is not known who has changed the mode: word of that may still come."""
     if not vehicle.armed:
         return GuardResult(HandoverEvent.DISARMED)
-    if is_ordered(view, Order.ENGAGE) and not explain_engage_refusal(progress.state, view):
+    if is_ordered(inputs, Order.ENGAGE) and not explain_engage_refusal(progress.state, inputs):
         return GuardResult(HandoverEvent.ENGAGE)
-    seen = GuardResult(HandoverEvent.PENDING) if vehicle.external else _classify_takeover(progress, vehicle)
-    return GuardResult(HandoverEvent.PENDING) if seen.event is HandoverEvent.UNCLEAR else seen
+    result = GuardResult(HandoverEvent.PENDING) if vehicle.external else _classify_takeover(progress, vehicle)
+    return GuardResult(HandoverEvent.PENDING) if result.event is HandoverEvent.UNCLEAR else result
 
 
-def _guard_landing(progress: HandoverProgress, _view: HandoverInput, vehicle: VehicleStatus) -> GuardResult:
+def _guard_landing(progress: HandoverProgress, _inputs: HandoverInput, vehicle: VehicleStatus) -> GuardResult:
     """Return the event seen while the vehicle is asked to land (LANDING), and once it has shown that it does."""
-    news, asking = vehicle.at_ns > progress.state_start_ns, progress.state is HandoverState.LANDING
+    is_new_heartbeat, is_requesting = vehicle.at_ns > progress.state_start_ns, progress.state is HandoverState.LANDING
     if not vehicle.armed:
-        return GuardResult(HandoverEvent.DISARMED if news else HandoverEvent.PENDING)
-    profile, ours = profile_of(vehicle), progress.take_off_ordered_ns is not None
+        return GuardResult(HandoverEvent.DISARMED if is_new_heartbeat else HandoverEvent.PENDING)
+    profile, is_ordered_flight = profile_of(vehicle), progress.take_off_ordered_ns is not None
     if vehicle.mode in profile.landing_modes:
         # A failsafe lands only until it ends: what we took off is to land whatever comes.
-        for_us = not (ours and is_in_failsafe(vehicle)) or progress.request.granted_ns is not None
-        return GuardResult(HandoverEvent.GRANTED if asking and for_us else HandoverEvent.PENDING)
-    if not news or (ours and is_in_failsafe(vehicle)):
+        is_our_landing = not (is_ordered_flight and is_in_failsafe(vehicle)) or progress.request.granted_ns is not None
+        return GuardResult(HandoverEvent.GRANTED if is_requesting and is_our_landing else HandoverEvent.PENDING)
+    if not is_new_heartbeat or (is_ordered_flight and is_in_failsafe(vehicle)):
         return GuardResult(HandoverEvent.PENDING)
-    if asking:
+    if is_requesting:
         # Asked for in the middle of a climb, any mode of the climb may still be shown; after it was granted, only the
         # one of before may, for a while, by a vehicle that has not begun to land.
-        passing = vehicle.external or vehicle.mode in profile.climb_modes
-        for_ns = MODE_SHOWN_NS if vehicle.mode == progress.previous_mode else GRACE_NS
-        taken = not passing or _is_after_grant(progress, vehicle, for_ns)
-        return _classify_takeover(progress, vehicle) if taken else GuardResult(HandoverEvent.PENDING)
-    if ours and progress.is_failsafe_landing and profile.climbs_on_arming and vehicle.mode == profile.take_off_mode:
-        shown = vehicle.at_ns > progress.state_start_ns + MODE_SHOWN_NS
-        return GuardResult(HandoverEvent.FAILSAFE if shown else HandoverEvent.PENDING)
+        is_climb_mode = vehicle.external or vehicle.mode in profile.climb_modes
+        grace_ns = MODE_SHOWN_NS if vehicle.mode == progress.previous_mode else GRACE_NS
+        is_taken_over = not is_climb_mode or _is_after_grant(progress, vehicle, grace_ns)
+        return _classify_takeover(progress, vehicle) if is_taken_over else GuardResult(HandoverEvent.PENDING)
+    if (
+        is_ordered_flight
+        and progress.is_failsafe_landing
+        and profile.climbs_on_arming
+        and vehicle.mode == profile.take_off_mode
+    ):
+        is_mode_shown = vehicle.at_ns > progress.state_start_ns + MODE_SHOWN_NS
+        return GuardResult(HandoverEvent.FAILSAFE if is_mode_shown else HandoverEvent.PENDING)
     return _classify_takeover(progress, vehicle)
 
 

@@ -204,5 +204,5 @@ _CHANGES: dict[HandoverState, dict[HandoverEvent, Target]] = {
 # Where a daemon that ends leaves no vehicle behind that has flown on its setpoints, or may still.
 NOT_LEFT_IN_FLIGHT = frozenset({HandoverState.READY, HandoverState.SETTLING, HandoverState.DONE})
 TRANSITIONS: dict[tuple[HandoverState, HandoverEvent], Target] = {
-    (state, seen): _CHANGES[state].get(seen, (state, _NOTHING)) for state in HandoverState for seen in HandoverEvent
+    (state, event): _CHANGES[state].get(event, (state, _NOTHING)) for state in HandoverState for event in HandoverEvent
 }

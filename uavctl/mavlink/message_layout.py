@@ -19,7 +19,7 @@ from typing import Any, Protocol
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from uavctl.mavlink.framing import HEADER_V1, HEADER_V2, with_checksum
+from uavctl.mavlink.framing import HEADER_V1, HEADER_V2, add_checksum
 
 _SENDER_V1, _SENDER_V2 = 3, 5  # index of the system id; the component's follows
 
@@ -74,7 +74,7 @@ class MessageLayout:
             values = [part for value in values for part in (value if isinstance(value, list | tuple) else (value,))]
         payload = self._struct.pack(*values).rstrip(b"\0") or b"\0"
         header = bytes((mavlink.PROTOCOL_MARKER_V2, len(payload), 0, 0, number, *address)) + self._id
-        return with_checksum(header + payload)
+        return add_checksum(header + payload)
 
 
 # Escape sequences of a terminal, ECMA-48: CSI with its parameters, OSC up to its end, and those of two characters.

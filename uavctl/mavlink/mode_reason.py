@@ -75,19 +75,19 @@ def determine_mode_reason(vehicle: VehicleStatus, *, was_in_failsafe: bool = Fal
     """
     profile = profile_of(vehicle)
     choice = profile.mode_choices.get(vehicle.mode)
-    own = ModeReason.FENCE if vehicle.fence else ModeReason.FAILSAFE if vehicle.failsafe else None
+    vehicle_reason = ModeReason.FENCE if vehicle.fence else ModeReason.FAILSAFE if vehicle.failsafe else None
     if choice is ModeChoice.FAILSAFE:
-        return own or ModeReason.FAILSAFE
+        return vehicle_reason or ModeReason.FAILSAFE
     if choice is ModeChoice.PERSON:
         # An ArduPilot is in a failsafe by its heartbeats also after a person has chosen another mode.
-        now = (
+        is_degraded = (
             vehicle.mode in profile.degraded_modes
             and not was_in_failsafe
             and (profile.restores_mode or bool(vehicle.said))
         )
-        own = own if now and not vehicle.stick else None
-    if own is not None:
-        return ModeReason.UNKNOWN if vehicle.stick else own
+        vehicle_reason = vehicle_reason if is_degraded and not vehicle.stick else None
+    if vehicle_reason is not None:
+        return ModeReason.UNKNOWN if vehicle.stick else vehicle_reason
     if vehicle.stick:
         return ModeReason.PILOT
     if vehicle.station:
@@ -141,10 +141,10 @@ class ModeReasonEvidence:
         if len(pulses_us) != len(self._reference_us):
             self._reference_us = [0] * len(pulses_us)
         for i, pulse in enumerate(pulses_us):
-            rest = self._reference_us[i]
-            if not rest or abs(pulse - rest) >= STICK_US:
+            reference_us = self._reference_us[i]
+            if not reference_us or abs(pulse - reference_us) >= STICK_US:
                 self._reference_us[i] = pulse
-                self._stick_ns = at_ns if rest and pulse else self._stick_ns
+                self._stick_ns = at_ns if reference_us and pulse else self._stick_ns
 
     def add_mode_command(self, station: int, at_ns: int) -> None:
         """Take an order of a mode that another than us has given."""
@@ -157,13 +157,13 @@ class ModeReasonEvidence:
             since_ns = min(since_ns, self._heartbeats_ns[1])
         said = self._failsafe_text if self._failsafe_text_ns > since_ns else ""
         # A receiver that has lost its remote control moves the channels by itself.
-        lost = self._has_radio is False or mentions_radio(said)
+        is_radio_lost = self._has_radio is False or mentions_radio(said)
         return msgspec.structs.replace(
             status,
             failsafe=critical or self._failsafe_ns > since_ns,
             fence=self._fence_ns > since_ns,
             said=said,
-            stick=self._stick_ns > since_ns and not lost,
+            stick=self._stick_ns > since_ns and not is_radio_lost,
             radio=bool(self._has_radio) and not self._reference_us,
             station=self._station if self._station_ns > since_ns else 0,
         )

@@ -78,14 +78,14 @@ class SourceTable(Generic[Key, State]):
         entry = self._entries.get(key)
         if entry is None and len(self._entries) >= self._max_sources:
             self._evict(at_ns)
-        state, times = (make_state(), 0) if entry is None else entry[:2]
-        self._entries[key] = state, times + 1, at_ns
+        state, count = (make_state(), 0) if entry is None else entry[:2]
+        self._entries[key] = state, count + 1, at_ns
         return state
 
     def _evict(self, at_ns: int) -> None:
         def weight(key: Key) -> tuple[int, int]:
-            _, times, last_ns = self._entries[key]
-            return (times if at_ns - last_ns <= SILENCE_NS else 0), last_ns
+            _, count, last_ns = self._entries[key]
+            return (count if at_ns - last_ns <= SILENCE_NS else 0), last_ns
 
         oldest = min(self._entries, key=weight)
         if weight(oldest)[0]:
@@ -111,11 +111,11 @@ class PositionDecoder:
         estimator: EstimatorConfig,
         count_bad: Callable[[str], None],
     ) -> None:
-        configured = Frame(frame.convention, frame.origin_m, frame.yaw_deg)
+        frame_config = Frame(frame.convention, frame.origin_m, frame.yaw_deg)
         # A message that declares its axes is believed; the vehicle's own estimate needs no conversion.
-        self._frames: dict[Convention | None, Frame] = {None: configured}
+        self._frames: dict[Convention | None, Frame] = {None: frame_config}
         for axes in get_args(Convention):
-            self._frames[axes] = replace(configured, convention=axes)
+            self._frames[axes] = replace(frame_config, convention=axes)
         self._clock, self._source, self._estimator, self._count_bad = clock, source, estimator, count_bad
         self._clocks: SourceTable[tuple[Address, bool], ClockSync] = SourceTable(MAX_SOURCES, self._count_eviction)
         self._units: SourceTable[Address, StampUnitDetector] = SourceTable(MAX_SOURCES, self._count_eviction)
@@ -147,14 +147,14 @@ class PositionDecoder:
 
     def are_clocks_known(self, at_ns: int) -> bool:
         """Whether every peer that answers has given an answer lately by which its clock is known."""
-        return all(trips.offset_ns(at_ns) is not None for trips in self._timesync_clocks.values())
+        return all(timesync.offset_ns(at_ns) is not None for timesync in self._timesync_clocks.values())
 
     def add_timesync_answer(self, address: Address, sent_ns: int, remote_ns: int, received_ns: int) -> None:
         """Take an answer to a TIMESYNC request."""
-        trips = self._timesync_clocks.record_message(
+        timesync = self._timesync_clocks.record_message(
             address, received_ns, lambda: TimesyncClock(_ns(self._clock.window_s))
         )
-        if not trips.add_answer(sent_ns, remote_ns, received_ns):
+        if not timesync.add_answer(sent_ns, remote_ns, received_ns):
             self._count_bad(SLOW_ANSWER)
 
     def make_sample(self, message: Position, received_ns: int) -> PositionSample | None:
@@ -170,9 +170,8 @@ class PositionDecoder:
             position_m = frame.to_ned(position_m)
             velocity_mps = None if velocity_mps is None else frame.velocity_to_ned(velocity_mps)
         if self._is_implausible(position_m, velocity_mps):
-            self._count_bad(
-                IMPLAUSIBLE
-            )  # the controller refuses it too, and looks at how long a source says nothing else
+            # The controller refuses it too, and measures how long a source sends nothing else.
+            self._count_bad(IMPLAUSIBLE)
         if not self._is_within_budget(message, received_ns):
             self._count_bad(NEW_SOURCE)
             return None
@@ -193,8 +192,8 @@ class PositionDecoder:
         )
 
     def _is_implausible(self, position_m: Vec3, velocity_mps: Vec3 | None) -> bool:
-        far = max(map(abs, position_m)) > self._estimator.max_position_m
-        return far or (velocity_mps is not None and max(map(abs, velocity_mps)) > self._estimator.max_velocity_mps)
+        is_far = max(map(abs, position_m)) > self._estimator.max_position_m
+        return is_far or (velocity_mps is not None and max(map(abs, velocity_mps)) > self._estimator.max_velocity_mps)
 
     def _is_within_budget(self, message: Position, received_ns: int) -> bool:
         """Whether one more sample is looked at; each sample of a settled source is."""
@@ -202,11 +201,11 @@ class PositionDecoder:
         if self.is_settled:
             self._settled_ns = received_ns
             return True
-        beside = self._settled_ns is not None and received_ns - self._settled_ns <= SOURCE_ACTIVE_NS
-        per_s = NEW_SOURCE_BESIDE_PER_S if beside else NEW_SOURCE_PER_S
-        earned = (received_ns - self._new_source_budget_ns) * 1e-9 * per_s
-        burst = NEW_SOURCE_BESIDE_PER_S if beside else NEW_SOURCE_BURST
-        self._new_source_budget, self._new_source_budget_ns = min(burst, self._new_source_budget + earned), received_ns
+        is_beside_settled = self._settled_ns is not None and received_ns - self._settled_ns <= SOURCE_ACTIVE_NS
+        per_s = NEW_SOURCE_BESIDE_PER_S if is_beside_settled else NEW_SOURCE_PER_S
+        refill = (received_ns - self._new_source_budget_ns) * 1e-9 * per_s
+        burst = NEW_SOURCE_BESIDE_PER_S if is_beside_settled else NEW_SOURCE_BURST
+        self._new_source_budget, self._new_source_budget_ns = min(burst, self._new_source_budget + refill), received_ns
         if self._new_source_budget < 1.0:
             return False
         self._new_source_budget -= 1.0
@@ -227,9 +226,9 @@ class PositionDecoder:
             stamp_ns = clock.unwrap_ns(message.stamp_us // 1000, BOOT_MS_WRAP, 1_000_000)
         elif message.stamp_us is not None and self._is_stamp_in_us(message, message.stamp_us, received_ns):
             stamp_ns = message.stamp_us * 1000
-        trips, resyncs = self._timesync_clocks.get(address), clock.resyncs
+        timesync, resyncs = self._timesync_clocks.get(address), clock.resyncs
         captured = clock.estimate_capture_ns(
-            stamp_ns, received_ns, None if trips is None else trips.offset_ns(received_ns)
+            stamp_ns, received_ns, None if timesync is None else timesync.offset_ns(received_ns)
         )
         self.resyncs += clock.resyncs - resyncs
         if not isinstance(captured, str):
@@ -239,8 +238,8 @@ class PositionDecoder:
     def _is_stamp_in_us(self, message: Position, stamp: int, received_ns: int) -> bool:
         """Whether a stamp is in the unit that it has to be in; else the position counts by its arrival."""
         address = (message.system, message.component)
-        watch = self._units.record_message(address, received_ns, StampUnitDetector)
-        before, unit = watch.unit, watch.update(stamp, message.position_m, received_ns)
+        detector = self._units.record_message(address, received_ns, StampUnitDetector)
+        before, unit = detector.unit, detector.update(stamp, message.position_m, received_ns)
         if unit is not before:
             self.units.pop(address, None)
             if unit is not StampUnit.MICROSECONDS and len(self.units) < MAX_SOURCES:

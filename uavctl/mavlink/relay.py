@@ -98,10 +98,10 @@ class Relay:
             offset_ns: (our time - the vehicle's), by which stamps are moved.
             refused: samples that the tick did not believe.
         """
-        arrived = [one for one in self._queue if one[0].received_ns <= at_ns]
-        self._queue = [one for one in self._queue if one[0].received_ns > at_ns]
-        waiting = sorted(arrived, key=lambda one: one[0].captured_ns)
-        out = []
+        arrived = [entry for entry in self._queue if entry[0].received_ns <= at_ns]
+        self._queue = [entry for entry in self._queue if entry[0].received_ns > at_ns]
+        waiting = sorted(arrived, key=lambda entry: entry[0].captured_ns)
+        poses = []
         for sample, attitude in waiting:
             reason = "refused" if sample in refused else self._find_reason(sample, attitude, at_ns)
             if reason is None and sample.captured_ns - offset_ns < 1000:
@@ -110,11 +110,11 @@ class Relay:
                 self.kept[reason] += 1
                 continue
             self._newest_ns = sample.captured_ns
-            out.append(self._make_pose(sample, attitude, offset_ns))
-        self.sent += len(out)
-        if out:
+            poses.append(self._make_pose(sample, attitude, offset_ns))
+        self.sent += len(poses)
+        if poses:
             self.last_ns, self._kept_before = at_ns, Counter(self.kept)
-        return tuple(out)
+        return tuple(poses)
 
     def make_event(self, at_ns: int, *, held_back: bool, armed: bool) -> Event | None:
         """Report that the vehicle has got no position for `SILENT_NS`, with the reason, or that it gets them again.
@@ -131,13 +131,17 @@ class Relay:
         if self._start_ns is None:
             self._start_ns = at_ns
         since_ns = self._start_ns + START_NS if self.last_ns is None else self.last_ns
-        silent = at_ns - since_ns >= SILENT_NS
-        self.silent_for = "" if not silent else HELD_BACK if held_back else self._find_silence_reason()
-        if not silent and self._reported:
+        is_silent = at_ns - since_ns >= SILENT_NS
+        self.silent_for = "" if not is_silent else HELD_BACK if held_back else self._find_silence_reason()
+        if not is_silent and self._reported:
             self._reported = ""
             text = "the vehicle gets positions again"
             return Event(at_ns=at_ns, severity=Severity.INFO, code=RELAY_RESUMED, text=text)
-        if not silent or self._reported == "armed" or (not armed and (self._reported or self._is_reported_on_ground)):
+        if (
+            not is_silent
+            or self._reported == "armed"
+            or (not armed and (self._reported or self._is_reported_on_ground))
+        ):
             return None
         self._reported = "armed" if armed else "ground"
         self._is_reported_on_ground = self._is_reported_on_ground or not armed
@@ -146,13 +150,13 @@ class Relay:
         return Event(at_ns=at_ns, severity=Severity.WARNING, code=RELAY_SILENT, text=text)
 
     def _find_silence_reason(self) -> str:
-        kept = (Counter(self.kept) - self._kept_before).most_common(1)
-        return kept[0][0] if kept else NO_POSITION
+        counts = (Counter(self.kept) - self._kept_before).most_common(1)
+        return counts[0][0] if counts else NO_POSITION
 
     def _find_reason(self, sample: PositionSample, attitude: Quaternion, at_ns: int) -> str | None:
         """Return why a pose is kept back; None if it goes."""
-        same = self._last == (sample.position_m, attitude)
-        self._last, self._repeat_count = (sample.position_m, attitude), self._repeat_count + 1 if same else 0
+        is_same = self._last == (sample.position_m, attitude)
+        self._last, self._repeat_count = (sample.position_m, attitude), self._repeat_count + 1 if is_same else 0
         newest_ns = self._newest_ns
         if at_ns - sample.captured_ns > MAX_AGE_NS:
             return "stale"
@@ -165,10 +169,10 @@ class Relay:
         return None
 
     def _make_pose(self, sample: PositionSample, attitude: Quaternion, offset_ns: int) -> Pose:
-        body = None
+        velocity_body = None
         if self._config.message == "odometry" and sample.velocity_mps is not None:
             w, x, y, z = attitude
-            body = rotate_vector((w, -x, -y, -z), sample.velocity_mps)
+            velocity_body = rotate_vector((w, -x, -y, -z), sample.velocity_mps)
         # A pose without a velocity goes as a position: an unknown one (NaN) is not safe to send to ArduPilot.
-        message = "vision-position-estimate" if body is None else self._config.message
-        return Pose(message, (sample.captured_ns - offset_ns) // 1000, sample.position_m, attitude, body)
+        message = "vision-position-estimate" if velocity_body is None else self._config.message
+        return Pose(message, (sample.captured_ns - offset_ns) // 1000, sample.position_m, attitude, velocity_body)

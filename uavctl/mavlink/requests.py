@@ -60,9 +60,9 @@ class PendingRequest:
         ask: What is asked for; None for a wait in which nothing is said.
     """
 
-    def __init__(self, ask: RequestKind | None, at_ns: int, patience: RequestLimits) -> None:
-        self.kind = ask  # the request; None for a wait in which nothing is sent
-        self._limits = patience
+    def __init__(self, kind: RequestKind | None, at_ns: int, limits: RequestLimits) -> None:
+        self.kind = kind  # the request; None for a wait in which nothing is sent
+        self._limits = limits
         self._start_ns = at_ns
         self._next_ns = at_ns
         self._tries = 0
@@ -79,25 +79,25 @@ class PendingRequest:
             if message.severity <= mavlink.MAV_SEVERITY_WARNING and message.text not in self._texts:
                 self._texts = [*self._texts, message.text][-_MAX_TEXTS:]
         elif self.kind is not None and self._tries and message.command == COMMANDS[self.kind]:
-            again, self._result = self._result == message.result, message.result
+            is_repeated, self._result = self._result == message.result, message.result
             if message.result == mavlink.MAV_RESULT_ACCEPTED:
                 self.granted_ns = at_ns
                 self._next_ns = at_ns + SHOWN_NS
             elif message.result == mavlink.MAV_RESULT_IN_PROGRESS:
                 self._next_ns = max(self._next_ns, at_ns + self._limits.retry_ns)
-            elif not (again and self._is_retry_delayed):  # said twice, it is not waited for twice
+            elif not (is_repeated and self._is_retry_delayed):  # said twice, it is not waited for twice
                 self._is_retry_delayed = True
                 self._next_ns = at_ns + self._limits.retry_ns
 
-    def due(self, at_ns: int, held: str = "", *, blind: bool = False) -> RequestKind | None:
-        """Return the request to send now, if any; `held` says why it must not be sent yet.
+    def due(self, at_ns: int, blocked_reason: str = "", *, is_mode_uncertain: bool = False) -> RequestKind | None:
+        """Return the request to send now, if any; `blocked_reason` says why it must not be sent yet.
 
-        `blind`: nothing is asked again now, as it is not known what the vehicle does meanwhile.
+        `is_mode_uncertain`: nothing is asked again now, as it is not known what the vehicle does meanwhile.
         """
-        self._blocked_reason = held
-        if blind and self._tries:
+        self._blocked_reason = blocked_reason
+        if is_mode_uncertain and self._tries:
             return None
-        if self.kind is None or held or at_ns < self._next_ns or self._tries >= self._limits.tries:
+        if self.kind is None or blocked_reason or at_ns < self._next_ns or self._tries >= self._limits.tries:
             return None
         if self.kind is RequestKind.TAKE_OFF and self.granted_ns is not None:  # it would begin again
             return None
@@ -106,11 +106,11 @@ class PendingRequest:
         self._next_ns = at_ns + self._limits.answer_ns
         return self.kind
 
-    def describe_failure(self, at_ns: int, *, at_once: bool = False) -> str:
-        """Return why the request is given up; empty while it may still succeed (`at_once`: it may not)."""
-        over = at_once or at_ns - self._start_ns >= self._limits.limit_ns
+    def describe_failure(self, at_ns: int, *, is_final: bool = False) -> str:
+        """Return why the request is given up; empty while it may still succeed (`is_final`: it may not)."""
+        is_over_time = is_final or at_ns - self._start_ns >= self._limits.limit_ns
         out_of_tries = self.kind is not None and self._tries >= self._limits.tries and at_ns >= self._next_ns
-        if not (over or out_of_tries or (self._result is not None and self._result in _FINAL)):
+        if not (is_over_time or out_of_tries or (self._result is not None and self._result in _FINAL)):
             return ""
         return (
             f"{self._describe_request()}{self._describe_reason()}{self.quoted_texts} ({self._describe_effort(at_ns)})"

@@ -20,7 +20,7 @@ from enum import StrEnum
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.mavlink.codec import MAX_DATAGRAM_BYTES
-from uavctl.mavlink.framing import CHECKSUM, BadBytes, scan, with_checksum
+from uavctl.mavlink.framing import CHECKSUM, BadBytes, add_checksum, scan
 
 KEY_BYTES = 32
 EPOCH_NS = 1_420_070_400_000_000_000  # 1st January 2015, UTC
@@ -36,7 +36,7 @@ _HASH = 6
 _FLAGS = 2  # index of the incompatibility flags
 _SIGNED = int(mavlink.MAVLINK_IFLAG_SIGNED)
 
-Stream = tuple[int, int, int]
+StreamId = tuple[int, int, int]
 """(system, component, link id)"""
 
 
@@ -82,13 +82,13 @@ class SigningTimestamps:
     floor: int = 0  # newest of all before the start; it has to be kept, so that nothing older is taken ever again
     newest: int = 0  # newest that was sent or verified since, on any connection
     # newest that was verified of each stream, on any connection
-    streams: dict[Stream, int] = field(default_factory=dict)
+    streams: dict[StreamId, int] = field(default_factory=dict)
 
-    def update(self, stream: Stream, stamp: int) -> None:
+    def update(self, stream: StreamId, stamp: int) -> None:
         """Take a stamp that was verified."""
         self.newest = max(self.newest, stamp)
         if stream not in self.streams and len(self.streams) >= MAX_STREAMS:
-            del self.streams[min(self.streams, key=lambda one: self.streams[one])]
+            del self.streams[min(self.streams, key=lambda stream: self.streams[stream])]
         self.streams[stream] = max(stamp, self.streams.get(stream, stamp))
 
 
@@ -108,15 +108,16 @@ class FrameSigner:
         self,
         key: SigningKey,
         link_id: int,
-        stamps: SigningTimestamps,
+        timestamps: SigningTimestamps,
         wall_offset_ns: int,
         peer_link_ids: frozenset[int] = frozenset(),
     ) -> None:
-        self._key, self._link_id, self._timestamps = key, link_id, stamps
+        self._key, self._link_id, self._timestamps = key, link_id, timestamps
         self._offset_ns = wall_offset_ns
         self._peer_link_ids = peer_link_ids
-        self._newest: dict[Stream, int] = {}  # stamp of each stream, here
-        self._floor = stamps.floor  # nothing older begins a stream; rises with the streams that are not kept any more
+        self._newest: dict[StreamId, int] = {}  # stamp of each stream, here
+        # Nothing older begins a stream; rises with the streams that are not kept any more.
+        self._floor = timestamps.floor
         self._link_ids: dict[tuple[int, int], int] = {}  # link id of each (system, component) that has been heard
 
     def sign(self, frame: bytes, at_ns: int) -> bytes:
@@ -124,7 +125,7 @@ class FrameSigner:
         self._timestamps.newest = min(max(self._current_timestamp(at_ns), self._timestamps.newest + 1), MAX_TIMESTAMP)
         body = bytearray(frame[:-CHECKSUM])
         body[_FLAGS] |= _SIGNED
-        signed = with_checksum(bytes(body)) + bytes((self._link_id,)) + self._timestamps.newest.to_bytes(6, "little")
+        signed = add_checksum(bytes(body)) + bytes((self._link_id,)) + self._timestamps.newest.to_bytes(6, "little")
         return signed + self._key.hash(signed)
 
     def verify(self, frame: bytes, at_ns: int) -> SignatureRefusal | None:
@@ -147,10 +148,10 @@ class FrameSigner:
             self._timestamps.update(stream, stamp)
         return refusal
 
-    def _store_timestamp(self, stream: Stream, stamp: int) -> None:
+    def _store_timestamp(self, stream: StreamId, stamp: int) -> None:
         """Keep a stream's stamp. The oldest one makes room, and nothing that is older is taken for new again."""
         if stream not in self._newest and len(self._newest) >= MAX_STREAMS:
-            oldest = min(self._newest, key=lambda one: self._newest[one])
+            oldest = min(self._newest, key=lambda stream: self._newest[stream])
             self._floor = max(self._floor, self._newest.pop(oldest))
             self._link_ids.pop(oldest[:2], None)
         self._newest[stream] = stamp
@@ -160,7 +161,7 @@ class FrameSigner:
             return link_id in self._peer_link_ids
         return self._link_ids.get(address) in (None, link_id)
 
-    def _check_age(self, stream: Stream, stamp: int, at_ns: int) -> SignatureRefusal | None:
+    def _check_age(self, stream: StreamId, stamp: int, at_ns: int) -> SignatureRefusal | None:
         if stamp + MAX_LINK_SKEW < self._timestamps.streams.get(stream, stamp):
             return SignatureRefusal.REPLAYED
         newest = self._newest.get(stream)
@@ -168,8 +169,8 @@ class FrameSigner:
             return SignatureRefusal.REPLAYED if stamp <= newest else None
         if stamp <= self._floor:
             return SignatureRefusal.REPLAYED
-        ours = max(self._current_timestamp(at_ns), self._timestamps.newest)
-        return SignatureRefusal.STALE if stamp + MAX_NEW_STREAM_LAG < ours else None
+        current = max(self._current_timestamp(at_ns), self._timestamps.newest)
+        return SignatureRefusal.STALE if stamp + MAX_NEW_STREAM_LAG < current else None
 
     def _current_timestamp(self, at_ns: int) -> int:
         return signing_timestamp(at_ns + self._offset_ns)
@@ -188,7 +189,7 @@ def remove_signature(frame: bytes) -> bytes:
     """
     body = bytearray(frame[:-SIGNATURE][:-CHECKSUM])
     body[_FLAGS] &= ~_SIGNED
-    return with_checksum(bytes(body))
+    return add_checksum(bytes(body))
 
 
 class FrameAuthenticator:
@@ -201,8 +202,8 @@ class FrameAuthenticator:
         refused: what was dropped, by reason.
     """
 
-    def __init__(self, signing: FrameSigner, *, stream: bool) -> None:
-        self._signer, self._is_stream = signing, stream
+    def __init__(self, signer: FrameSigner, *, stream: bool) -> None:
+        self._signer, self._is_stream = signer, stream
         self._buffer, self._is_aligned = b"", True
         self.refused: Counter[str] = Counter()
 
@@ -212,16 +213,16 @@ class FrameAuthenticator:
             self.refused[BadBytes.OVERSIZE] += 1
             return b""
         data = self._buffer + data
-        found = scan(
+        result = scan(
             data,
             final=not self._is_stream,
-            in_step=self._is_aligned,
+            is_aligned=self._is_aligned,
             verify=lambda frame: self._signer.verify(frame, at_ns),
         )
         if self._is_stream:
-            self._buffer, self._is_aligned = data[found.consumed :], found.is_aligned
-        self.refused.update(found.bad)
-        return b"".join(remove_signature(frame.data) for frame in found.frames)
+            self._buffer, self._is_aligned = data[result.consumed :], result.is_aligned
+        self.refused.update(result.bad)
+        return b"".join(remove_signature(frame.data) for frame in result.frames)
 
     def sign_frame(self, frame: bytes, at_ns: int) -> bytes:
         """One of our frames, signed."""

@@ -33,27 +33,27 @@ class StatusTextAssembler:
     def add_chunk(self, text: Text, at_ns: int) -> tuple[Text, ...]:
         """Take a piece, or a whole text; the texts that are whole now."""
         sender = text.system, text.component
-        begun = self._partial_texts.get(sender)
-        told: tuple[Text, ...] = ()
-        if begun is not None and (begun.first.text_id != text.text_id or text.chunk < begun.next_chunk):
-            told = (self._partial_texts.pop(sender).finish(),)
-            begun = None
-        if begun is None:
-            begun = _PartialText(text, MISSING_CHUNK if text.chunk else "", text.chunk, at_ns)
-        begun.text += ("" if text.chunk == begun.next_chunk else MISSING_CHUNK) + text.text
-        begun.next_chunk = text.chunk + 1
+        partial = self._partial_texts.get(sender)
+        finished: tuple[Text, ...] = ()
+        if partial is not None and (partial.first.text_id != text.text_id or text.chunk < partial.next_chunk):
+            finished = (self._partial_texts.pop(sender).finish(),)
+            partial = None
+        if partial is None:
+            partial = _PartialText(text, MISSING_CHUNK if text.chunk else "", text.chunk, at_ns)
+        partial.text += ("" if text.chunk == partial.next_chunk else MISSING_CHUNK) + text.text
+        partial.next_chunk = text.chunk + 1
         if not text.has_more:
             self._partial_texts.pop(sender, None)
-            return (*told, _make_text(begun.first, begun.text))
+            return (*finished, _make_text(partial.first, partial.text))
         if sender in self._partial_texts or len(self._partial_texts) < MAX_PARTIAL_TEXTS:
-            self._partial_texts[sender] = begun
-            return told
-        return (*told, begun.finish())
+            self._partial_texts[sender] = partial
+            return finished
+        return (*finished, partial.finish())
 
     def flush_overdue(self, at_ns: int) -> tuple[Text, ...]:
         """The texts whose rest has not come."""
-        late = [sender for sender, begun in self._partial_texts.items() if at_ns - begun.at_ns > CHUNK_WAIT_NS]
-        return tuple(self._partial_texts.pop(sender).finish() for sender in late)
+        overdue = [sender for sender, partial in self._partial_texts.items() if at_ns - partial.at_ns > CHUNK_WAIT_NS]
+        return tuple(self._partial_texts.pop(sender).finish() for sender in overdue)
 
 
 def _make_text(first: Text, text: str) -> Text:

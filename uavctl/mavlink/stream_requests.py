@@ -84,21 +84,21 @@ class StreamRequests:
 
     def due(self, at_ns: int, autopilot: str = "") -> tuple[tuple[int, float], ...]:
         """Return (message id, rate [1/s]) of what is to be asked for now; call it once a vehicle is heard."""
-        wanted: dict[int, float] = {}
+        rates_hz: dict[int, float] = {}
         if self._next_ns is None:
             self._next_ns = at_ns + STREAM_SETTLE_NS
         if at_ns >= self._next_ns and self._tries < MAX_TRIES:
             self._next_ns = at_ns + RETRY_NS
             self._tries += 1
-            wanted = {number: rate for number, rate in self._rates_hz.items() if number not in self._received}
+            rates_hz = {number: rate for number, rate in self._rates_hz.items() if number not in self._received}
         # Not waited for: but for a PX4 on an onboard link no vehicle sends them so often, and a flight may have begun.
         profile = PROFILES.get(autopilot) if self._wants_inertial and not self._has_inertial else None
         kinds = () if profile is None else profile.inertial_messages
         if kinds and at_ns >= self._inertial_next_ns and self._inertial_tries < MAX_TRIES:
             self._inertial_next_ns = at_ns + RETRY_NS
             self._inertial_tries += 1
-            wanted.update(dict.fromkeys(kinds, INERTIAL_HZ))
-        return tuple(wanted.items())
+            rates_hz.update(dict.fromkeys(kinds, INERTIAL_HZ))
+        return tuple(rates_hz.items())
 
 
 class ParameterDownload:
@@ -139,11 +139,11 @@ class ParameterDownload:
             self._read_rounds += 1
             self._is_finished = self._read_rounds > MAX_READ_ROUNDS
             self._round_indices = [] if self._is_finished else sorted(self._missing, reverse=True)
-        asked = self._round_indices[-READS_PER_BATCH:][::-1]
+        indices = self._round_indices[-READS_PER_BATCH:][::-1]
         del self._round_indices[-READS_PER_BATCH:]
         if not self._round_indices:  # the last answers of a round are waited for
             self._next_ns = at_ns + LIST_END_NS
-        return tuple(index for index in asked if index in self._missing)
+        return tuple(index for index in indices if index in self._missing)
 
 
 class GlobalOriginSetup:

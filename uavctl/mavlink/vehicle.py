@@ -74,14 +74,14 @@ def is_vehicle(heartbeat: Heartbeat) -> bool:
     return heartbeat.autopilot != _NO_AUTOPILOT and heartbeat.vehicle_type not in _DEVICES
 
 
-def is_preferred(address: tuple[int, int], than: tuple[int, int] | None) -> bool:
+def is_preferred(address: tuple[int, int], other: tuple[int, int] | None) -> bool:
     """Whether of two that say that they are vehicles the first one is to be followed.
 
     Of one system it is the component of autopilots; of two systems the one that is followed already.
     """
-    if than is None:
+    if other is None:
         return True
-    return address[0] == than[0] and address[1] == _AUTOPILOT1 != than[1]
+    return address[0] == other[0] and address[1] == _AUTOPILOT1 != other[1]
 
 
 class SensorStreamMonitor:
@@ -114,10 +114,10 @@ class SensorStreamMonitor:
             return None
         if values != self._values:
             self._since_us = stamp_us
-        repeats = values == self._values
+        is_repeated = values == self._values
         delay_ns = self._clock.measure_delay_ns(1000 * stamp_us, at_ns)
         self._stamp_us, self._checked_ns, self._values = stamp_us, at_ns, values
-        return delay_ns <= MAX_DELAY_NS and not (repeats and stamp_us - self._since_us >= frozen_us)
+        return delay_ns <= MAX_DELAY_NS and not (is_repeated and stamp_us - self._since_us >= frozen_us)
 
 
 class VehicleMonitor:
@@ -135,17 +135,17 @@ class VehicleMonitor:
 
     def __init__(
         self,
-        bad: Callable[[str], None],
-        own: tuple[int, int],
+        count_bad: Callable[[str], None],
+        own_address: tuple[int, int],
         system: int = 0,
         component: int = 0,
         *,
         inertial: bool = False,
         channels: bool = True,
     ) -> None:
-        self._count_bad = bad
+        self._count_bad = count_bad
         self._wants_inertial, self._uses_channels = inertial, channels
-        self._own_address = own
+        self._own_address = own_address
         self._system, self._component = system, component
         self._landed: bool | None = None
         self._own_climb = False
@@ -205,19 +205,21 @@ class VehicleMonitor:
                 self._evidence.update_channels(channels_us, at_ns)
                 return self._update_evidence(at_ns)
             case Position(boot_ms=True, stamp_us=int(stamp_us)):
-                anew = self._update_boot_clock("position", stamp_us, at_ns)
-                return (*anew, *self._update_motion(at_ns, velocity=message.velocity_mps))
+                status = self._update_boot_clock("position", stamp_us, at_ns)
+                return (*status, *self._update_motion(at_ns, velocity=message.velocity_mps))
             case Attitude(angles_rad=angles_rad):
                 kind = "quaternion" if message.quaternion else "angles"
-                anew = self._update_boot_clock(kind, message.stamp_us, at_ns) if message.stamp_us else ()
+                status = self._update_boot_clock(kind, message.stamp_us, at_ns) if message.stamp_us else ()
                 # Beside inertial data both are of use; else a vehicle that streams both is believed by one.
                 if message.quaternion and not self._wants_inertial:
-                    return anew
+                    return status
                 self._update_attitude(message, at_ns)
-                return (*anew, *self._update_motion(at_ns, attitude=angles_rad))
+                return (*status, *self._update_motion(at_ns, attitude=angles_rad))
             case Inertial(raw=raw):
-                known = PROFILES.get(self.autopilot)
-                return self._make_inertial_sample(message, at_ns) if not raw or (known and known.uses_raw_imu) else ()
+                profile = PROFILES.get(self.autopilot)
+                return (
+                    self._make_inertial_sample(message, at_ns) if not raw or (profile and profile.uses_raw_imu) else ()
+                )
             case Text(text=text):
                 self._evidence.add_text(text, at_ns)
                 return message, _text_event(message, at_ns), *self._update_evidence(at_ns)
@@ -300,17 +302,17 @@ class VehicleMonitor:
             return ()
         kind, frozen_us = ("raw", FROZEN_RAW_US) if message.raw else ("highres", FROZEN_US)
         stream = self._sensor_streams.setdefault(kind, SensorStreamMonitor())
-        new = stream.is_current(message.stamp_us, message.specific_force_mps2, at_ns, frozen_us=frozen_us)
-        self.inertial_total += new is not None
-        if not new:
+        is_new = stream.is_current(message.stamp_us, message.specific_force_mps2, at_ns, frozen_us=frozen_us)
+        self.inertial_total += is_new is not None
+        if not is_new:
             self._count_bad(STALE_INERTIAL)
             return ()
         attitude = self.attitude(at_ns)
-        turned = None if attitude is None else rotate_vector(attitude, message.specific_force_mps2)
-        if turned is None:
+        force_ned = None if attitude is None else rotate_vector(attitude, message.specific_force_mps2)
+        if force_ned is None:
             return ()
         self.inertial_used += 1
-        north, east, down = turned
+        north, east, down = force_ned
         return (InertialSample(at_ns=at_ns, accel_mps2=(north, east, down + GRAVITY_MPS2)),)
 
     def _reset_after_reboot(self) -> tuple[VehicleStatus, ...]:
@@ -342,8 +344,8 @@ class VehicleMonitor:
 
     def _handle_heartbeat(self, message: Heartbeat, at_ns: int) -> tuple[VehicleStatus, ...]:
         address = (message.system, message.component)
-        wanted = self._system in (0, message.system) and self._component in (0, message.component)
-        if wanted and (
+        is_wanted = self._system in (0, message.system) and self._component in (0, message.component)
+        if is_wanted and (
             is_preferred(address, self.address) or (address != self.address and self._is_lost_on_ground(at_ns))
         ):
             self._follow_vehicle(address, at_ns)
@@ -352,14 +354,14 @@ class VehicleMonitor:
                 self._count_bad(SECOND_VEHICLE)
                 self._other_vehicle_ns = at_ns
             return ()
-        booting = message.system_status == mavlink.MAV_STATE_BOOT and self._status is not None
-        if booting and self._is_ready and at_ns - self._heard_ns > BOOTING_NS:
+        is_booting = message.system_status == mavlink.MAV_STATE_BOOT and self._status is not None
+        if is_booting and self._is_ready and at_ns - self._heard_ns > BOOTING_NS:
             self._reset_after_reboot()
             self._boot_clock.reset()
         self._heard_ns = at_ns
-        ready = message.system_status not in _NOT_READY_STATES
-        self.not_ready_count += self._is_ready and not ready
-        self._is_ready = ready
+        is_ready = message.system_status not in _NOT_READY_STATES
+        self.not_ready_count += self._is_ready and not is_ready
+        self._is_ready = is_ready
         autopilot = autopilot_name(message.autopilot)
         mode, external = describe_mode(autopilot, message.vehicle_type, message.custom_mode)
         self._is_in_failsafe = message.system_status in _FAILSAFE_STATES
@@ -391,10 +393,10 @@ def _severity(mav_severity: int) -> Severity:
 
 
 def _ack_event(ack: Ack, at_ns: int) -> Event:
-    good = ack.result in (mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_IN_PROGRESS)
+    is_accepted = ack.result in (mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_IN_PROGRESS)
     return Event(
         at_ns=at_ns,
-        severity=Severity.INFO if good else Severity.WARNING,
+        severity=Severity.INFO if is_accepted else Severity.WARNING,
         code="command-ack",
         text=f"{_enum_name('MAV_CMD', ack.command)}: {_enum_name('MAV_RESULT', ack.result)}",
     )

@@ -231,7 +231,7 @@ class _Stream:
     def whole(self, chunk: bytes) -> bytes:
         """Return the whole frames so far; an incomplete one waits for the rest."""
         data = self._rest + chunk
-        found = scan(data, final=False, in_step=self._in_step)
+        found = scan(data, final=False, is_aligned=self._in_step)
         self._rest, self._in_step = data[found.consumed :], found.is_aligned
         return data[: found.consumed]
 
