@@ -13,7 +13,7 @@ VIRTUAL_ZERO_UTC_NS = 946_684_800 * 1_000_000_000
 """UTC of time 0 in virtual time [ns since 1970]: 2000-01-01, so that a repeated flight has the same times."""
 
 
-def zero_utc_ns() -> int:
+def read_zero_utc_ns() -> int:
     """Read the UTC of time 0 of the monotonic clock [ns since 1970]; called once in a flight."""
     # wall - (before + after) / 2
     before_ns, wall_ns, after_ns = monotonic_ns(), time.time_ns(), monotonic_ns()

@@ -49,7 +49,7 @@ Up = Literal["y", "z"]
 _AXES_TO_FRD: dict[Up, Callable[[Vec3], Vec3]] = {"y": lambda v: (v[0], v[2], -v[1]), "z": _AXES_TO_NED["flu"]}
 
 
-def _cos_sin(yaw_deg: float) -> tuple[float, float]:
+def _compute_cos_sin(yaw_deg: float) -> tuple[float, float]:
     """Compute cosine and sine, exact at quarter turns."""
     angle_deg = yaw_deg % 360.0
     return _QUADRANTS.get(angle_deg) or (math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg)))
@@ -76,7 +76,7 @@ class Frame:
             raise ValueError(
                 f"origin_m {self.origin_m} and yaw_deg {self.yaw_deg} must be three and one finite numbers"
             )
-        object.__setattr__(self, "_rotation", _cos_sin(self.yaw_deg))
+        object.__setattr__(self, "_rotation", _compute_cos_sin(self.yaw_deg))
 
     def to_ned(self, position_m: Vec3) -> Vec3:
         """Convert a position in this frame [m] to local NED [m]."""

@@ -21,7 +21,7 @@ from uavctl.mavlink.connection import CONNECTION_SILENT, HUNG_UP, NO_HEARTBEAT, 
 from uavctl.mavlink.handover import HAND_OVER_ORDERS, HandoverOutput, HandoverStateMachine
 from uavctl.mavlink.handover_guards import HandoverInput, explain_move_refusal
 from uavctl.mavlink.handover_states import NOT_LEFT_IN_FLIGHT, HandoverState, SetpointMode
-from uavctl.mavlink.messages import Ack, Message, Text
+from uavctl.mavlink.messages import CommandAck, Message, StatusText
 from uavctl.mavlink.relay import Relay
 from uavctl.outcome import Cause, FlightCourse
 from uavctl.records import (
@@ -54,7 +54,7 @@ from uavctl.records import (
 )
 from uavctl.smpc.plant import Plant
 
-Heard = PositionSample | VehicleStatus | VehicleMotion | InertialSample | Ack | Text
+Heard = PositionSample | VehicleStatus | VehicleMotion | InertialSample | CommandAck | StatusText
 
 VEHICLE = "vehicle"
 MOCAP = "mocap"
@@ -119,7 +119,7 @@ class ControlLoop:
         self._relay, self._relays = Relay(config.relay), config.relay.enabled
         self._hand_over = HandoverStateMachine(config.hand_over, waits_for_landing=config.relay.enabled)
         self._config = config.hand_over
-        self._heard: tuple[Ack | Text, ...] = ()
+        self._heard: tuple[CommandAck | StatusText, ...] = ()
         self._state = initial_state()
         self._inbox: deque[tuple[int, Heard]] = deque()
         self._feels = config.estimator.inertial_std_mps2 > 0.0
@@ -418,7 +418,7 @@ class ControlLoop:
 
     def _take_due(
         self, at_ns: int
-    ) -> tuple[tuple[PositionSample, ...], tuple[VehicleStatus, ...], tuple[Ack | Text, ...]]:
+    ) -> tuple[tuple[PositionSample, ...], tuple[VehicleStatus, ...], tuple[CommandAck | StatusText, ...]]:
         """Samples that arrived up to `at_ns`, and all that the vehicle has said: its newest state is taken over.
 
         What it says counts in a late tick too, when it came after the time of the tick: it may be that the pilot flies.
@@ -426,7 +426,7 @@ class ControlLoop:
         """
         samples: list[PositionSample] = []
         heard: list[VehicleStatus] = []
-        words: list[Ack | Text] = []
+        words: list[CommandAck | StatusText] = []
         felt: list[InertialSample] = []
         waiting: deque[tuple[int, Heard]] = deque()
         for received_ns, item in self._inbox:

@@ -27,10 +27,10 @@ from logs.recording.tlog import Tlog, TlogPacket, read_tlog
 from uavctl.errors import RecordingError
 from uavctl.mavlink.clocksync import ClockSync, StampUnit, StampUnitDetector
 from uavctl.mavlink.codec import AUTOPILOT_ESTIMATE, decode_scan
-from uavctl.mavlink.framing import scan_one
+from uavctl.mavlink.framing import scan_single_frame
 from uavctl.mavlink.message_layout import MessageLayout
-from uavctl.mavlink.messages import Attitude, Battery, Heartbeat, Message, Position, Text
-from uavctl.mavlink.profile import autopilot_name, describe_mode
+from uavctl.mavlink.messages import Attitude, Battery, Heartbeat, Message, Position, StatusText
+from uavctl.mavlink.profile import describe_mode, find_autopilot_name
 from uavctl.mavlink.statustext import StatusTextAssembler
 from uavctl.records import Datagram, Vec3
 
@@ -228,7 +228,7 @@ class _Reader:
     def take(self, packet: TlogPacket) -> None:
         """Take one packet."""
         self._last_ns = packet.at_ns
-        found = scan_one(packet.data)
+        found = scan_single_frame(packet.data)
         for frame in found.frames:
             system = system_of(frame.data)
             name = f"{mavlink.mavlink_map[frame.message_id].msgname} of system {system}"
@@ -276,7 +276,7 @@ class _Reader:
                 name = f"{message.name} of system {message.system}"
                 place = _ned(message, message.position_m)
                 self._sources.setdefault(name, SentSource()).take(place, _velocity(message), message.stamp_us, at_ns)
-            case Text() if own:
+            case StatusText() if own:
                 self._take_text(message, at_ns)
             case Attitude() if own:
                 self._attitudes.setdefault(message.quaternion, []).append((at_ns, message.angles_rad))
@@ -299,12 +299,12 @@ class _Reader:
         return any(system == one.system for one in self._vehicle.others)
 
     def _take_mode(self, beat: Heartbeat, at_ns: int) -> None:
-        mode, _ = describe_mode(autopilot_name(beat.autopilot), beat.vehicle_type, beat.custom_mode)
+        mode, _ = describe_mode(find_autopilot_name(beat.autopilot), beat.vehicle_type, beat.custom_mode)
         armed = bool(beat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
         if not self._modes or (self._modes[-1].mode, self._modes[-1].armed) != (mode, armed):
             self._modes.append(ModeBegin(at_s=self._second(at_ns), mode=mode, armed=armed))
 
-    def _take_text(self, piece: Text, at_ns: int) -> None:
+    def _take_text(self, piece: StatusText, at_ns: int) -> None:
         for whole in self._joined.add_chunk(piece, at_ns):
             severity = mavlink.enums["MAV_SEVERITY"][min(whole.severity, 7)].name.removeprefix("MAV_SEVERITY_").lower()
             self._texts.append(SpokenText(at_s=self._second(at_ns), severity=severity, text=whole.text))
@@ -362,7 +362,7 @@ class _Reader:
             recording=name,
             begin_utc=begin.isoformat(timespec="milliseconds"),
             duration_s=self._second(self._last_ns),
-            autopilot="" if beat is None else autopilot_name(beat.autopilot),
+            autopilot="" if beat is None else find_autopilot_name(beat.autopilot),
             vehicle_system=None if beat is None else beat.system,
             own_positions=len(self._own.get(own_source, ())),
             own_source=own_source,

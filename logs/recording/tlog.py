@@ -23,7 +23,7 @@ from logs.recording.topics import raw_link
 from uavctl.errors import RecordingError, UsageError
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.connection import STREAM_SCHEMES
-from uavctl.mavlink.framing import scan, scan_one
+from uavctl.mavlink.framing import scan_frames, scan_single_frame
 from uavctl.records import Decision, Header, LinkStats, PositionSample, Record, Sink, StepInput, to_nobody
 
 # The clock of another program's recording, which may leap, stand still or run back: what that does to its times.
@@ -294,7 +294,7 @@ def in_order(packets: list[TlogPacket]) -> tuple[TlogPacket, ...]:
 
 def is_frame(data: bytes) -> bool:
     """Return whether bytes are one frame of a known id with the right checksum."""
-    frames = scan_one(data).frames
+    frames = scan_single_frame(data).frames
     return len(frames) == 1 and len(frames[0].data) == len(data)
 
 
@@ -402,7 +402,7 @@ def _packet_end(data: bytes, at: int) -> int | None:
     end = at + frame_length(data, at)
     if end > len(data):
         return None
-    good = end == len(data) or data[end] in MARKERS or bool(scan(data[at:end], final=True).frames)
+    good = end == len(data) or data[end] in MARKERS or bool(scan_frames(data[at:end], final=True).frames)
     return end if good else at
 
 

@@ -21,10 +21,10 @@ from uavctl.daemon.control_socket import (
     MAX_LINE,
     ControlRequest,
     ControlServer,
-    control_folder,
-    daemon_name,
+    find_control_folder,
+    make_daemon_name,
+    make_socket_path,
     open_listener,
-    socket_path,
 )
 from uavctl.daemon.health import Health, RecorderHealth
 from uavctl.errors import UsageError, VehicleTakenError
@@ -321,7 +321,7 @@ def test_what_is_no_socket_stays(folder: Path) -> None:
         pytest.fail("bound over a file")
     assert (folder / "one.sock").read_text() == "notes"
     with pytest.raises(UsageError, match="shorter folder"):
-        socket_path(folder / ("x" * 120), "one")
+        make_socket_path(folder / ("x" * 120), "one")
     with pytest.raises(UsageError, match="choose another"), open_listener(folder / "one.sock" / "below", "one"):
         pytest.fail("a folder below a file")
 
@@ -341,13 +341,13 @@ def test_a_socket_of_another_user_in_the_way_is_told_in_a_line(folder: Path, mon
 
 
 def test_names_and_folders() -> None:
-    assert daemon_name(CONFIG) == "room-udpin-0.0.0.0-14540"
+    assert make_daemon_name(CONFIG) == "room-udpin-0.0.0.0-14540"
     odd = load_config("room", ['name="a/../b c"', 'daemon.vehicle="serial:///dev/ttyACM0:57600"'])
-    assert daemon_name(odd) == "a-..-b-c-serial-dev-ttyACM0-57600"
-    assert control_folder(Path("/x"), {"UAVCTL_CONTROL": "/y"}) == Path("/x")
-    assert control_folder(None, {"UAVCTL_CONTROL": "/y", "XDG_RUNTIME_DIR": "/z"}) == Path("/y")
+    assert make_daemon_name(odd) == "a-..-b-c-serial-dev-ttyACM0-57600"
+    assert find_control_folder(Path("/x"), {"UAVCTL_CONTROL": "/y"}) == Path("/x")
+    assert find_control_folder(None, {"UAVCTL_CONTROL": "/y", "XDG_RUNTIME_DIR": "/z"}) == Path("/y")
     with tempfile.TemporaryDirectory(prefix="uavctl-") as own:
-        assert control_folder(None, {"XDG_RUNTIME_DIR": own}) == Path(own) / "uavctl"
+        assert find_control_folder(None, {"XDG_RUNTIME_DIR": own}) == Path(own) / "uavctl"
     assert (
         ControlRequest(ask="goto", position_m=(float("inf"), 0.0, 0.0)).find_problem() == "position_m has to be finite"
     )

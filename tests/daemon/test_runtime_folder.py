@@ -11,7 +11,7 @@ import pytest
 from user_rig import OTHER, as_other, shared_folder
 
 from uavctl.daemon import runtime_folder
-from uavctl.daemon.lock import lock_paths, lock_vehicle
+from uavctl.daemon.lock import find_lock_paths, lock_vehicle
 from uavctl.daemon.runtime_folder import find_runtime_folders, is_private_folder
 from uavctl.errors import UsageError, VehicleTakenError
 
@@ -112,7 +112,7 @@ def test_a_place_that_is_taken_is_told_in_a_line_and_does_not_matter_beside_a_se
     folder = session(machine)
     assert find_runtime_folders({}) == (folder / "uavctl",)
     with lock_vehicle(URL):
-        assert [path.parent for path in lock_paths(URL)] == [folder / "uavctl"]
+        assert [path.parent for path in find_lock_paths(URL)] == [folder / "uavctl"]
 
 
 @pytest.mark.fault(57)
@@ -132,7 +132,7 @@ def test_processes_of_one_user_meet_whatever_their_environment_says(
     with lock_vehicle(URL) as tenure:
         assert tenure.is_left_in_flight  # whatever folder the next one finds, the word is there
         tenure.update(False)
-    assert not any(path.exists() for path in lock_paths(URL))
+    assert not any(path.exists() for path in find_lock_paths(URL))
 
 
 @pytest.mark.fault(56)
@@ -153,7 +153,7 @@ def test_another_user_can_neither_rewrite_nor_hold_a_lock(machine: Path) -> None
             return "flies, too"
 
     with lock_vehicle(URL):
-        paths = lock_paths(URL)
+        paths = find_lock_paths(URL)
         assert [stat.S_IMODE(path.stat().st_mode) for path in paths] == [0o600]
         second = as_other(flies)
         if OTHER == ME:  # the same user: there is one daemon
@@ -166,7 +166,7 @@ def test_another_user_can_neither_rewrite_nor_hold_a_lock(machine: Path) -> None
 
 @pytest.mark.fault(56)
 def test_what_root_left_behind_is_told_in_a_line(machine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (path,) = lock_paths(URL)
+    (path,) = find_lock_paths(URL)
     path.touch(mode=0o666)
     if OTHER == ME:
         path.chmod(0)  # a file that this user cannot open; no other user's can be made

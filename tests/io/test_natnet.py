@@ -13,7 +13,7 @@ from uavctl.errors import ConnectionSpecError
 from uavctl.frames import Frame, Up, convert_pose_to_frd, rotate_vector
 from uavctl.io.camera import BodyPose, CameraError, Echo
 from uavctl.io.camera_host import CameraMessageEncoder, parse_time_requests
-from uavctl.io.camera_url import CameraUrl, parse
+from uavctl.io.camera_url import CameraUrl, parse_camera_url
 from uavctl.io.natnet import MISSING, NO_STAMP, SILENT, UNREADABLE, UNTRACKED, NatNet
 from uavctl.mavlink.codec import decode
 from uavctl.mavlink.messages import Position, TimeSync
@@ -192,8 +192,8 @@ def test_an_echo_is_the_servers_clock() -> None:
 
 
 def test_urls() -> None:
-    assert parse("natnet://10.0.0.5/drone%201") == CameraUrl("natnet", "10.0.0.5", 1510, "drone 1")
-    given = parse("natnet://motive:1600/a/b?up=z&interface=10.0.0.9")
+    assert parse_camera_url("natnet://10.0.0.5/drone%201") == CameraUrl("natnet", "10.0.0.5", 1510, "drone 1")
+    given = parse_camera_url("natnet://motive:1600/a/b?up=z&interface=10.0.0.9")
     assert given == CameraUrl("natnet", "motive", 1600, "a/b", "z", "10.0.0.9")
 
 
@@ -213,7 +213,7 @@ def test_urls() -> None:
 )
 def test_urls_that_are_wrong(url: str, words: str) -> None:
     with pytest.raises(ConnectionSpecError, match=words):
-        parse(url)
+        parse_camera_url(url)
 
 
 def test_a_server_that_began_anew_is_asked_to_stream_though_it_answers_questions() -> None:

@@ -176,15 +176,15 @@ def test_no_checksum_and_no_hash_is_taken_more_often_than_was_counted(
         looks["hash"] += 1
         return "forged"
 
-    real: Callable[..., bool] = framing._checksum_fits
-    monkeypatch.setattr(framing, "_checksum_fits", fits)
+    real: Callable[..., bool] = framing._is_checksum_right
+    monkeypatch.setattr(framing, "_is_checksum_right", fits)
     monkeypatch.setattr("attacker.MANY", 3)
     say = WORDS[kind]()
     for _ in range(3):
         data = say()
         looks.clear()
-        framing.scan(data, final=True)
-        framing.scan(data, final=True, verify=verify)
+        framing.scan_frames(data, final=True)
+        framing.scan_frames(data, final=True, verify=verify)
         assert max(looks["checksum"], looks["hash"], 1) <= count_frames(data) <= len(data) // 8 + 65
 
 

@@ -13,15 +13,15 @@ from uavctl.frames import Convention
 from uavctl.mavlink.codec import MAX_DATAGRAM_BYTES, StreamDecoder, decode
 from uavctl.mavlink.encoder import Encoder, UnsendableError
 from uavctl.mavlink.messages import (
-    Ack,
     Attitude,
     Battery,
+    CommandAck,
     GlobalOrigin,
     Heartbeat,
-    Landed,
+    LandedState,
     Message,
     Position,
-    Text,
+    StatusText,
     TimeSync,
 )
 from uavctl.records import Setpoint, SetpointSource, Vec3
@@ -139,9 +139,9 @@ VEHICLE = Peer(1, 1)
             ),
         ),
         (VEHICLE.send("timesync", 0, -5), TimeSync(system=1, component=1, tc1_ns=0, ts1_ns=-5)),
-        (VEHICLE.send("extended_sys_state", 0, 1), Landed(system=1, component=1, landed=True)),
-        (VEHICLE.send("extended_sys_state", 0, 2), Landed(system=1, component=1, landed=False)),
-        (VEHICLE.send("extended_sys_state", 0, 0), Landed(system=1, component=1, landed=None)),
+        (VEHICLE.send("extended_sys_state", 0, 1), LandedState(system=1, component=1, landed=True)),
+        (VEHICLE.send("extended_sys_state", 0, 2), LandedState(system=1, component=1, landed=False)),
+        (VEHICLE.send("extended_sys_state", 0, 0), LandedState(system=1, component=1, landed=None)),
         (
             VEHICLE.send("sys_status", 0, 0, 0, 0, 12_600, 0, 0, 0, 0, 0, 0, 0, 0),
             Battery(system=1, component=1, voltage_v=12.6, has_radio=False),
@@ -157,11 +157,11 @@ VEHICLE = Peer(1, 1)
         (VEHICLE.send("battery_status", 1, 0, 0, 0, [4_000] + [65_535] * 9, 0, 0, 0, 0), None),
         (
             VEHICLE.send("statustext", 4, b"\x1b[32mbad\x1b[0m \xc2\xb0\xff\x07 text\t"),
-            Text(system=1, component=1, severity=4, text="bad °\ufffd? text"),
+            StatusText(system=1, component=1, severity=4, text="bad °\ufffd? text"),
         ),
         (
             VEHICLE.send("command_ack", 21, 4, 0, 0, 245, 25),
-            Ack(system=1, component=1, command=21, result=4, target_system=245, target_component=25),
+            CommandAck(system=1, component=1, command=21, result=4, target_system=245, target_component=25),
         ),
         (VEHICLE.send("gps_global_origin", 1, 2, 3), GlobalOrigin(system=1, component=1)),
         (

@@ -99,7 +99,7 @@ def test_a_hostile_stream_costs_a_bounded_number_of_checksums(monkeypatch: pytes
 
     decoder, data = StreamDecoder(), b"\xfe" * 65_536
     with monkeypatch.context() as patch:
-        patch.setattr("uavctl.mavlink.framing._checksum_fits", fits)
+        patch.setattr("uavctl.mavlink.framing._is_checksum_right", fits)
         for at in range(0, len(data), size):
             decoder.push(data[at : at + size])
     assert looks <= (MAX_FAILED + 1) * len(data) // size

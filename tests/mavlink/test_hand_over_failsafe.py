@@ -10,12 +10,12 @@ from uavctl.config.connections import HandOverConfig
 from uavctl.mavlink.handover import HandoverStateMachine
 from uavctl.mavlink.handover_guards import LAND_PERIODS
 from uavctl.mavlink.handover_states import HandoverState
-from uavctl.mavlink.messages import Text
+from uavctl.mavlink.messages import StatusText
 from uavctl.mavlink.requests import RequestKind
 from uavctl.records import Severity
 
 BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
-WORDS = Text(system=1, component=1, severity=2, text="Failsafe activated")
+WORDS = StatusText(system=1, component=1, severity=2, text="Failsafe activated")
 
 
 def engaged(autopilot: str = "px4", config: HandOverConfig | None = None) -> Rig:

@@ -17,7 +17,7 @@ from uavctl.mavlink.connection import MavlinkConnection
 from uavctl.mavlink.handover import HandoverStateMachine
 from uavctl.mavlink.handover_guards import HandoverInput
 from uavctl.mavlink.handover_states import HandoverState, SetpointMode
-from uavctl.mavlink.messages import Ack, Text
+from uavctl.mavlink.messages import CommandAck, StatusText
 from uavctl.mavlink.mode_reason import ModeReason
 from uavctl.mavlink.requests import RequestKind
 from uavctl.outcome import Cause, FlightCourse
@@ -61,7 +61,7 @@ def fly(
     hand_over, flown, course = HandoverStateMachine(config), Flown(), FlightCourse(takes_off=True, flown=True)
     vehicle: VehicleStatus | None = None
     where: PositionSample | None = None
-    heard: list[Ack | Text] = []
+    heard: list[CommandAck | StatusText] = []
     wanted: list[str] = []
     tick_ns, booted_ns, state = 0, 0, HandoverState.WAITING
     for at_ns, data in packets(name):
@@ -115,7 +115,7 @@ def fly(
                     vehicle = item
                 case PositionSample():
                     where = item
-                case Ack() | Text():
+                case CommandAck() | StatusText():
                     heard.append(item)
                 case Event():
                     pass

@@ -23,7 +23,7 @@ from hand_over_rig import (
 from uavctl.config.connections import HandOverConfig
 from uavctl.mavlink.handover_guards import GRACE_NS
 from uavctl.mavlink.handover_states import HandoverState
-from uavctl.mavlink.messages import Text
+from uavctl.mavlink.messages import StatusText
 from uavctl.mavlink.requests import RequestKind
 from uavctl.records import ORDER_REFUSED, Command, Order
 
@@ -90,7 +90,7 @@ def test_in_progress_is_waited_for() -> None:
 
 def test_answers_to_others_and_chatter_change_nothing() -> None:
     rig = Rig().to(HandoverState.MODE)
-    rig.tick(ack(DENIED, RequestKind.LAND), Text(system=1, component=1, severity=6, text="chatter"))
+    rig.tick(ack(DENIED, RequestKind.LAND), StatusText(system=1, component=1, severity=6, text="chatter"))
     assert rig.is_in(HandoverState.MODE)
     rig = Rig().to(HandoverState.READY)
     rig.tick(ack(DENIED, RequestKind.ARM), commands=(TAKE_OFF,))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from sim.autopilot.profile import SIMULATED, px4_custom
-from uavctl.mavlink.profile import PROFILES, autopilot_name, describe_mode
+from uavctl.mavlink.profile import PROFILES, describe_mode, find_autopilot_name
 
 
 @pytest.mark.parametrize(
@@ -43,7 +43,7 @@ def test_mode_names(autopilot: str, kind: int, custom: int, name: str, external:
 
 @pytest.mark.parametrize(("number", "name"), [(12, "px4"), (3, "ardupilot"), (0, "unknown"), (8, "unknown")])
 def test_autopilots(number: int, name: str) -> None:
-    assert autopilot_name(number) == name
+    assert find_autopilot_name(number) == name
 
 
 @pytest.mark.parametrize("autopilot", PROFILES)

@@ -14,8 +14,8 @@ from uavctl.mavlink.signing import (
     SignatureRefusal,
     SigningKey,
     SigningTimestamps,
+    make_timestamp,
     remove_signature,
-    signing_timestamp,
 )
 
 MINUTE = 60 * SECOND
@@ -70,7 +70,7 @@ def test_stamps_never_outgrow_their_48_bits_and_never_fall_below_zero() -> None:
     ],
 )
 def test_a_stamp_counts_whole_units_since_2015_and_none_before(wall_ns: int, stamp: int) -> None:
-    assert signing_timestamp(wall_ns) == stamp
+    assert make_timestamp(wall_ns) == stamp
 
 
 @pytest.mark.fault(37)

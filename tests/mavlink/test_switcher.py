@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.config.connections import HandOverConfig
 from uavctl.mavlink.handover_states import HandoverState
-from uavctl.mavlink.messages import Ack, Battery, FenceBreach, Heartbeat, RadioChannels, Text
+from uavctl.mavlink.messages import Battery, CommandAck, FenceBreach, Heartbeat, RadioChannels, StatusText
 from uavctl.mavlink.mode_reason import ModeReason, determine_mode_reason
 from uavctl.mavlink.profile import PROFILES, describe_mode
 from uavctl.mavlink.requests import RequestKind
@@ -95,7 +95,7 @@ class Vehicle:
         self.status: VehicleStatus | None = None
         self.beat(EXTERNAL_NUMBER[autopilot])
 
-    def say(self, message: Ack | Battery | FenceBreach | Heartbeat | RadioChannels | Text) -> None:
+    def say(self, message: CommandAck | Battery | FenceBreach | Heartbeat | RadioChannels | StatusText) -> None:
         for item in self.watch.handle_message(message, self.now_ns):
             self.status = item if isinstance(item, VehicleStatus) else self.status
 
@@ -116,7 +116,7 @@ class Vehicle:
         self.say(Battery(system=1, component=1, voltage_v=None, has_radio=heard))
 
     def text(self, text: str, severity: int = 6) -> None:
-        self.say(Text(system=1, component=1, severity=severity, text=text))
+        self.say(StatusText(system=1, component=1, severity=severity, text=text))
 
     def channels(self, *pulses_us: int) -> None:
         self.say(RadioChannels(system=1, component=1, channels_us=pulses_us))
@@ -245,7 +245,9 @@ def test_a_fence_that_is_told_without_words_and_an_order_of_a_ground_station() -
     vehicle = Vehicle("ardupilot")
     vehicle.beat(HOME["ardupilot"])
     vehicle.say(
-        Ack(system=1, component=1, command=mavlink.MAV_CMD_DO_SET_MODE, result=0, target_system=255, target_component=0)
+        CommandAck(
+            system=1, component=1, command=mavlink.MAV_CMD_DO_SET_MODE, result=0, target_system=255, target_component=0
+        )
     )
     assert vehicle.who() is ModeReason.GROUND_STATION
     vehicle.say(FenceBreach(system=1, component=1, is_breached=True))

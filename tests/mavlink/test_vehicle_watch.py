@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from uavctl.config.connections import DaemonConfig
 from uavctl.config.types import EstimatorConfig
 from uavctl.mavlink.connection import MavlinkConnection
-from uavctl.mavlink.messages import Ack, Text
+from uavctl.mavlink.messages import CommandAck, StatusText
 from uavctl.mavlink.vehicle import ALONE_NS, FROZEN_RAW_US, GONE_NS, MAX_ATTITUDE_AGE_NS, SensorStreamMonitor
 from uavctl.records import InertialSample, VehicleStatus
 
@@ -41,7 +41,7 @@ def newest(link: MavlinkConnection, vehicle: Peer, at_ns: int = NOW + SECOND) ->
 def test_answers_to_others_are_not_ours(system: int, component: int, counts: bool) -> None:
     link, vehicle = heard()
     items = link.receive(vehicle.send("command_ack", 400, 4, 0, 0, system, component), NOW).items
-    assert bool([item for item in items if isinstance(item, Ack)]) == counts == bool(events(items))
+    assert bool([item for item in items if isinstance(item, CommandAck)]) == counts == bool(events(items))
 
 
 def test_answers_about_streams_are_not_told_of() -> None:
@@ -52,7 +52,7 @@ def test_answers_about_streams_are_not_told_of() -> None:
 def test_words_of_the_vehicle_are_told_and_handed_on() -> None:
     link, vehicle = heard()
     items = link.receive(vehicle.send("statustext", 2, b"PreArm: no"), NOW).items
-    assert [type(item) for item in items] == [Text, type(events(items)[0])]
+    assert [type(item) for item in items] == [StatusText, type(events(items)[0])]
     assert not link.receive(Peer(9, 1).send("statustext", 2, b"not mine"), NOW).items
 
 
@@ -396,7 +396,7 @@ def test_another_component_of_the_vehicles_system_says_nothing_of_the_vehicle() 
     moves = device.send("attitude", 60_000, 0.5, 0.0, 0.0, 0.0, 0.0, 0.0)
     assert not [item for data in (answer, landed, moves) for item in link.receive(data, NOW).items]
     (said,) = link.receive(device.send("statustext", 4, b"failsafe"), NOW).items  # shown, and nothing is made of it
-    assert not isinstance(said, Text)
+    assert not isinstance(said, StatusText)
     status = newest(link, vehicle)
     assert status.landed is None and not status.failsafe
 

@@ -37,7 +37,7 @@ from uavctl.config import load_config
 from uavctl.daemon import control_socket
 from uavctl.daemon.daemon import fly
 from uavctl.daemon.health import HealthMonitor
-from uavctl.daemon.lock import lock_paths
+from uavctl.daemon.lock import find_lock_paths
 from uavctl.daemon.notifier import Notifier
 from uavctl.io.base import Connection
 from uavctl.loop import ControlLoop
@@ -315,7 +315,7 @@ def flown(rig: Endings, capsys: pytest.CaptureFixture[str], *words: str) -> Told
     with socket.socket(type=socket.SOCK_DGRAM) as one:
         one.bind(("127.0.0.1", 0))
         url = f"udpin://127.0.0.1:{one.getsockname()[1]}"
-    for path in lock_paths(url):  # what a daemon of another test has left on this port
+    for path in find_lock_paths(url):  # what a daemon of another test has left on this port
         path.unlink(missing_ok=True)
     sets = [word for setting in rig.overrides for word in ("--set", setting)]
     places = ["--vehicle", url, "--out", str(rig.folder), "--json"]
@@ -326,7 +326,7 @@ def flown(rig: Endings, capsys: pytest.CaptureFixture[str], *words: str) -> Told
     except SystemExit as ended:
         code = int(ended.code or 0)
     finally:
-        for path in lock_paths(url):
+        for path in find_lock_paths(url):
             path.unlink(missing_ok=True)
     out, err = capsys.readouterr()
     assert (rig.folder / "flight.mcap").exists(), err

@@ -8,7 +8,7 @@ from uavctl.config.connections import HandOverConfig
 from uavctl.mavlink.handover import HandoverOutput, HandoverStateMachine
 from uavctl.mavlink.handover_guards import HandoverInput
 from uavctl.mavlink.handover_states import HandoverState, SetpointMode
-from uavctl.mavlink.messages import Ack, Text
+from uavctl.mavlink.messages import CommandAck, StatusText
 from uavctl.mavlink.requests import COMMANDS, RequestKind
 from uavctl.records import Command, Event, Order, VehicleStatus
 
@@ -55,7 +55,9 @@ class Rig:
     def asked_last(self, ask: RequestKind) -> bool:
         return self.asked[-1][1] is ask
 
-    def tick(self, *heard: Ack | Text, commands: tuple[Command, ...] = (), **fields: object) -> HandoverOutput:
+    def tick(
+        self, *heard: CommandAck | StatusText, commands: tuple[Command, ...] = (), **fields: object
+    ) -> HandoverOutput:
         at_ns = self.view.at_ns + TICK_NS
         if self.vehicle is not None and not self.mute:
             self.vehicle = replace(self.vehicle, at_ns=at_ns)
@@ -75,7 +77,7 @@ class Rig:
 
     def answer(self, result: int, ask: RequestKind | None = None, text: str = "") -> HandoverOutput:
         """The vehicle answers the last request, or this one."""
-        words = (Text(system=1, component=1, severity=2, text=text),) if text else ()
+        words = (StatusText(system=1, component=1, severity=2, text=text),) if text else ()
         return self.tick(ack(result, ask or self.asked[-1][1]), *words)
 
     def to(self, state: HandoverState) -> Rig:
@@ -145,5 +147,7 @@ class Rig:
         return [event.text for event in self.events if event.code == code]
 
 
-def ack(result: int, ask: RequestKind) -> Ack:
-    return Ack(system=1, component=1, command=COMMANDS[ask], result=result, target_system=245, target_component=25)
+def ack(result: int, ask: RequestKind) -> CommandAck:
+    return CommandAck(
+        system=1, component=1, command=COMMANDS[ask], result=result, target_system=245, target_component=25
+    )

@@ -26,7 +26,7 @@ from uavctl.build.controller import Prepared
 from uavctl.cli.replay import replay_flight
 from uavctl.config import Config
 from uavctl.loop import ControlLoop
-from uavctl.mavlink.framing import scan
+from uavctl.mavlink.framing import scan_frames
 from uavctl.mavlink.signing import FrameAuthenticator, FrameSigner, SigningKey, SigningTimestamps
 from uavctl.records import Command, Order, Received, Record, Send, Sink
 
@@ -44,7 +44,7 @@ class Doors:
 
     def take(self, link: str, data: bytes, at_ns: int) -> bytes:
         """What of a datagram passes."""
-        found = scan(data, final=True)
+        found = scan_frames(data, final=True)
         if found.frames and not found.bad:
             data = b"".join(self.peers[link].sign_frame(frame.data, at_ns) for frame in found.frames)
         return self.gates[link].verify_frames(data, at_ns)

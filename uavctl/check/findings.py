@@ -20,7 +20,7 @@ from uavctl.mavlink.messages import (
     Battery,
     EstimatorFlags,
     Heartbeat,
-    Landed,
+    LandedState,
     Message,
     ParamValue,
     Position,
@@ -164,7 +164,7 @@ class Heard:
                 self._add_own(message, at_ns, offset_ns)
             case Attitude(angles_rad=angles) if len(self.angles_rad) < MOST:
                 self.angles_rad.append((at_ns, angles))
-            case Landed(landed=landed):
+            case LandedState(landed=landed):
                 self.landed = landed
             case Battery(voltage_v=float(voltage_v)):
                 self.battery_v = voltage_v

@@ -40,13 +40,13 @@ from uavctl.cli.flying import (
     wait_for_server,
 )
 from uavctl.cli.prepare import prepare
-from uavctl.clock import Ticker, monotonic_ns, zero_utc_ns
+from uavctl.clock import Ticker, monotonic_ns, read_zero_utc_ns
 from uavctl.config import Config, LoadedConfig
 from uavctl.config.connections import warnings
-from uavctl.daemon.control_socket import ControlServer, control_folder, daemon_name, open_listener
+from uavctl.daemon.control_socket import ControlServer, find_control_folder, make_daemon_name, open_listener
 from uavctl.daemon.daemon import AfterTick
 from uavctl.daemon.daemon import fly as run_daemon
-from uavctl.daemon.engagement import Engagement, TickFollower, check_places, stop_limit_s
+from uavctl.daemon.engagement import Engagement, TickFollower, check_places, compute_stop_limit_s
 from uavctl.daemon.health import HealthMonitor, RecorderHealth
 from uavctl.daemon.lock import lock_vehicle
 from uavctl.daemon.notifier import Notifier
@@ -79,7 +79,7 @@ def operation(
         def recorder() -> RecorderHealth:
             return recorder_health(status(), path)
 
-        identity = (daemon_name(config), config.daemon.vehicle, os.getpid())
+        identity = (make_daemon_name(config), config.daemon.vehicle, os.getpid())
         watch = HealthMonitor(loop, config, identity, recorder, tell)
         server = ControlServer(listener, config, loop, watch.make_health)
         try:
@@ -230,7 +230,7 @@ def fly_daemon(
     # First of all, so that a second daemon is refused at once.
     with (
         lock_vehicle(config.daemon.vehicle) as tenure,
-        open_listener(control_folder(control), daemon_name(config)) as listener,
+        open_listener(find_control_folder(control), make_daemon_name(config)) as listener,
         onlookers(view_port) as looking,
         new_recording(out, config.name, config.log.free_bytes) as path,
     ):
@@ -257,7 +257,7 @@ def fly_daemon(
             engagement.begin(loop)
             asked_for = False
             try:
-                put_header(recorder, prepared, monotonic_ns(), zero_utc_ns())
+                put_header(recorder, prepared, monotonic_ns(), read_zero_utc_ns())
                 record_items(recorder, checked, monotonic_ns())
                 record_parameters(recorder, told, monotonic_ns())
                 for warning in warnings(config.security, config.daemon):
@@ -276,7 +276,7 @@ def fly_daemon(
                         Ticker(tick_ns, dt_ns),
                         stopped,
                         duration_s=duration_s,
-                        stop_limit_s=stop_limit_s(config, takes_off=engagement.takes_off),
+                        stop_limit_s=compute_stop_limit_s(config, takes_off=engagement.takes_off),
                         after_tick=(
                             shown.after_tick,
                             lambda *_: tenure.update(loop.leaves_vehicle),

@@ -38,10 +38,10 @@ from uavctl.cli.flying import (
 )
 from uavctl.cli.prepare import prepare
 from uavctl.cli.sim import make_door
-from uavctl.clock import Ticker, monotonic_ns, zero_utc_ns
+from uavctl.clock import Ticker, monotonic_ns, read_zero_utc_ns
 from uavctl.config import Config, LoadedConfig
 from uavctl.daemon.daemon import fly
-from uavctl.daemon.engagement import Engagement, TickFollower, check_places, stop_limit_s
+from uavctl.daemon.engagement import Engagement, TickFollower, check_places, compute_stop_limit_s
 from uavctl.daemon.realtime import control_garbage_collection
 from uavctl.errors import UavctlError, UsageError
 from uavctl.io.signed_connection import open_links
@@ -144,7 +144,7 @@ def lockstep(prepared: Prepared, path: Path, engagement: Engagement) -> FlightSu
                 progress.update(task, completed=flown_s)
                 return not stopped()
 
-            landing_s = stop_limit_s(config, takes_off=True) if engagement.takes_off else None
+            landing_s = compute_stop_limit_s(config, takes_off=True) if engagement.takes_off else None
             flight.fly(show, follower=engagement, landing_s=landing_s)
     finally:
         status = flight.close()
@@ -164,7 +164,7 @@ def _real_time(prepared: Prepared, path: Path, engagement: Engagement, looking: 
         loop.course.in_flight = not takes_off
         wall_s = 0.0
         try:
-            put_header(recorder, prepared, monotonic_ns(), zero_utc_ns())
+            put_header(recorder, prepared, monotonic_ns(), read_zero_utc_ns())
             simulator = stack.enter_context(ExitStack())
             simulator.enter_context(_simulator(config, recorder, airborne=not takes_off))
             shown = simulator.enter_context(live_line(loop, recorder, config.duration_s, config.daemon.tick_s))
@@ -177,7 +177,7 @@ def _real_time(prepared: Prepared, path: Path, engagement: Engagement, looking: 
                     Ticker(tick_ns, dt_ns),
                     stopped,
                     duration_s=config.duration_s,
-                    stop_limit_s=stop_limit_s(config, takes_off=True) if takes_off else 0.0,
+                    stop_limit_s=compute_stop_limit_s(config, takes_off=True) if takes_off else 0.0,
                     after_tick=(
                         shown.after_tick,
                         lambda *_: recorder.catch_up(),

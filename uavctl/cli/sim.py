@@ -31,7 +31,7 @@ from uavctl.config.connections import MOCAP_LINK, SecurityConfig
 from uavctl.config.load import with_faults
 from uavctl.io.key_file import read_key
 from uavctl.mavlink.connection import MOCAP
-from uavctl.mavlink.framing import scan
+from uavctl.mavlink.framing import scan_frames
 from uavctl.mavlink.signing import FrameAuthenticator, FrameSigner, SigningKey, SigningTimestamps
 from uavctl.records import Truth, Vec3
 from uavctl.smpc.plant import AXES
@@ -68,7 +68,7 @@ class SignedPort:
 
     def write(self, data: bytes) -> None:
         """See `Port`; what the channel has damaged goes out damaged."""
-        found = scan(data, final=True)
+        found = scan_frames(data, final=True)
         if found.frames and not found.bad:
             at_ns = monotonic_ns()
             data = b"".join(self._gate.sign_frame(frame.data, at_ns) for frame in found.frames)

@@ -58,13 +58,13 @@ class Reply(msgspec.Struct, frozen=True, kw_only=True):
     status: Health | None = None
 
 
-def daemon_name(config: Config) -> str:
+def make_daemon_name(config: Config) -> str:
     """Name of the daemon that flies a configuration: that of the configuration, and the vehicle's URL."""
     url = config.daemon.vehicle.replace("://", "-")
     return re.sub(r"[^A-Za-z0-9.]+", "-", f"{config.name}-{url}").strip("-.")[:_LONGEST_NAME]
 
 
-def control_folder(chosen: Path | None, environ: Mapping[str, str] = os.environ) -> Path:
+def find_control_folder(chosen: Path | None, environ: Mapping[str, str] = os.environ) -> Path:
     """Folder of the sockets: as chosen, else $UAVCTL_CONTROL, else the user's own runtime folder.
 
     Raises:
@@ -77,7 +77,7 @@ def control_folder(chosen: Path | None, environ: Mapping[str, str] = os.environ)
     return find_runtime_folders(environ)[0]
 
 
-def socket_path(folder: Path, name: str) -> Path:
+def make_socket_path(folder: Path, name: str) -> Path:
     """Return the path of the socket on which the daemon of this name listens.
 
     Raises:
@@ -258,7 +258,7 @@ def open_listener(folder: Path, name: str) -> Iterator[socket.socket]:
         VehicleTakenError: a daemon of this name is running.
     """
     _prepare_folder(folder)
-    path = socket_path(folder, name)
+    path = make_socket_path(folder, name)
     listener = _listen(path, name)
     try:
         yield listener

@@ -21,7 +21,7 @@ LANDING_S = 10.0  # after braking: for asking the vehicle to land
 TickFollower = Callable[[ControlLoop, Ticked], None]
 
 
-def goto_keys(place_m: Sequence[float]) -> dict[str, object]:
+def make_goto_keys(place_m: Sequence[float]) -> dict[str, object]:
     """Return configuration keys that make a place in local NED [m] the mission, checked and recorded as one.
 
     Raises:
@@ -117,7 +117,7 @@ def check_places(config: Config, design: AnyDesign, take_off_m: float | None, go
         raise UsageError(f"take-off to {take_off_m:g} m: above {highest_m:.2f} m it may not rest (sets.state_lower)")
 
 
-def stop_limit_s(config: Config, *, takes_off: bool) -> float:
+def compute_stop_limit_s(config: Config, *, takes_off: bool) -> float:
     """Return how long a hand-over may take [s]; it ends on the ground if we took off, or land by our positions."""
     landings = 1 + LAND_PERIODS if takes_off else int(config.relay.enabled)
     return config.fallback.brake_s + LANDING_S + landings * config.hand_over.land_s

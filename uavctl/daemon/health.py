@@ -205,14 +205,14 @@ class HealthMonitor:
             reason="waiting for the first tick" if decision is None else decision.reason,
             age_s=None if estimate is None else max(0.0, (self._now_ns - estimate.captured_ns) * 1e-9),
             age_steps=None if decision is None else decision.age_steps,
-            position_m=_along(self._axes, mean),
-            velocity_mps=_along(self._speed_axes, mean),
-            target_m=None if decision is None else _along(self._axes, decision.target),
+            position_m=_select_axes(self._axes, mean),
+            velocity_mps=_select_axes(self._speed_axes, mean),
+            target_m=None if decision is None else _select_axes(self._axes, decision.target),
             waypoint=None if decision is None else decision.waypoint,
             loss=self._loss,
             lateness_us=max(self._max_lateness_ns, self._previous_max_lateness_ns) * 1e-3,
             missed_ticks=self._missed,
-            vehicle=None if vehicle is None else _vehicle(vehicle, self._now_ns),
+            vehicle=None if vehicle is None else _make_vehicle_health(vehicle, self._now_ns),
             recorder=recorder,
             who_flies=flight.handover_state.value,
             ending=flight.course.told,
@@ -243,24 +243,24 @@ def format_health(health: Health) -> str:
     mode = "-" if vehicle is None else f"{vehicle.mode} {'armed' if vehicle.armed else 'disarmed'}"
     fields = (
         "-" if health.mode is None else health.mode.value,
-        f"age {_number(health.age_s, '.2f')} s",
-        f"loss {_number(None if health.loss is None else 100 * health.loss, '.0f')} %",
+        f"age {_format_number(health.age_s, '.2f')} s",
+        f"loss {_format_number(None if health.loss is None else 100 * health.loss, '.0f')} %",
         f"late {health.lateness_us / 1e3:.2f} ms",
         f"missed {health.missed_ticks}",
         f"vehicle {mode}",
-        f"battery {_number(battery, '.1f')} V",
-        *(() if relay is None else (_relayed(relay),)),
+        f"battery {_format_number(battery, '.1f')} V",
+        *(() if relay is None else (_format_relay(relay),)),
         *(() if health.inertial is None else (f"inertial {100 * health.inertial:.0f} %",)),
         f"dropped {health.recorder.dropped}" + (f" ({health.recorder.reason})" if health.recorder.reason else ""),
     )
     return "  ".join(fields)
 
 
-def _along(axes: tuple[tuple[str, int], ...], state: Vector | None) -> dict[str, float] | None:
+def _select_axes(axes: tuple[tuple[str, int], ...], state: Vector | None) -> dict[str, float] | None:
     return None if state is None else {axis: state[i] for axis, i in axes}
 
 
-def _vehicle(vehicle: VehicleStatus, now_ns: int) -> VehicleHealth:
+def _make_vehicle_health(vehicle: VehicleStatus, now_ns: int) -> VehicleHealth:
     return VehicleHealth(
         autopilot=vehicle.autopilot,
         mode=vehicle.mode,
@@ -272,10 +272,10 @@ def _vehicle(vehicle: VehicleStatus, now_ns: int) -> VehicleHealth:
     )
 
 
-def _relayed(relay: RelayHealth) -> str:
+def _format_relay(relay: RelayHealth) -> str:
     silent = f" SILENT ({relay.silent_for})" if relay.silent_for else ""
     return f"relay {relay.sent_hz:.0f} /s{' alone' if relay.alone else ''}{silent}"
 
 
-def _number(value: float | None, spec: str) -> str:
+def _format_number(value: float | None, spec: str) -> str:
     return "-" if value is None else format(value, spec)

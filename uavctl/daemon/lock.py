@@ -28,7 +28,7 @@ from uavctl.errors import ConnectionSpecError, VehicleTakenError
 
 _LONGEST = 500  # bytes of a lock file that are looked at
 _TRIES = 10  # to lock a file that its last holder is just removing
-_FLOWN = "flown at"  # the second line, with the time since the machine's start [ns]
+_FLIGHT_LINE = "flown at"  # the second line, with the time since the machine's start [ns]
 LONGEST_FLIGHT_NS = 3600 * 10**9  # a vehicle that was left longer ago than a battery lasts has landed
 
 
@@ -50,10 +50,10 @@ def identify_connection(url: str) -> str:
     except (ValueError, OSError) as error:
         raise ConnectionSpecError(f"connection {url!r}: {error}; check host and port") from error
     host, port = str(status[0]), int(status[1])
-    return f"{scheme} {_host(host, is_local=scheme == 'udpin')} {port}"
+    return f"{scheme} {_normalise_host(host, is_local=scheme == 'udpin')} {port}"
 
 
-def _host(text: str, *, is_local: bool) -> str:
+def _normalise_host(text: str, *, is_local: bool) -> str:
     """One form of an address: the loopback of both families is the same machine, and so is "any" as a destination."""
     address = ipaddress.ip_address(text.partition("%")[0])
     if isinstance(address, ipaddress.IPv6Address):
@@ -77,7 +77,7 @@ class VehicleLock:
     def __init__(self, descriptors: Sequence[int], url: str, now: Callable[[], int] = time.monotonic_ns) -> None:
         self._descriptors, self._now = descriptors, now
         self._first_line = f"{os.getpid()} {url}\n"
-        status = [_left_ns(os.pread(descriptor, _LONGEST, 0), now()) for descriptor in descriptors]
+        status = [_parse_left_flight_ns(os.pread(descriptor, _LONGEST, 0), now()) for descriptor in descriptors]
         self._left_flight_ns = max((descriptor for descriptor in status if descriptor is not None), default=None)
         self._write()
 
@@ -100,22 +100,22 @@ class VehicleLock:
             self._write()
 
     def _write(self) -> None:
-        second_line = "" if self._left_flight_ns is None else f"{_FLOWN} {self._left_flight_ns}\n"
+        second_line = "" if self._left_flight_ns is None else f"{_FLIGHT_LINE} {self._left_flight_ns}\n"
         text = (self._first_line + second_line).encode()
         for descriptor in self._descriptors:
             os.pwrite(descriptor, text, 0)
             os.ftruncate(descriptor, len(text))
 
 
-def _left_ns(text: bytes, now_ns: int) -> int | None:
+def _parse_left_flight_ns(text: bytes, now_ns: int) -> int | None:
     """Return when the file's last holder began a flight that it then left [ns]; None if there is none to find."""
-    _, _, flight_ns = text.decode(errors="replace").partition(f"\n{_FLOWN} ")
+    _, _, flight_ns = text.decode(errors="replace").partition(f"\n{_FLIGHT_LINE} ")
     at_ns = int(flight_ns.strip()) if flight_ns.strip().isdecimal() else None
     # A time to come is one of before the machine's last start.
     return at_ns if at_ns is not None and 0 <= now_ns - at_ns <= LONGEST_FLIGHT_NS else None
 
 
-def lock_paths(url: str, folder: Path | None = None) -> tuple[Path, ...]:
+def find_lock_paths(url: str, folder: Path | None = None) -> tuple[Path, ...]:
     """Files of the lock of the vehicle behind a URL; arguments and errors are those of `lock_vehicle`."""
     name = f"uavctl-{hashlib.sha256(identify_connection(url).encode()).hexdigest()[:16]}.lock"
     return tuple(descriptor / name for descriptor in (find_runtime_folders() if folder is None else (folder,)))
@@ -133,11 +133,11 @@ def lock_vehicle(url: str, folder: Path | None = None) -> Iterator[VehicleLock]:
         ConnectionSpecError: the URL cannot be understood.
         UsageError: the user has no runtime folder.
     """
-    paths = lock_paths(url, folder)
+    paths = find_lock_paths(url, folder)
     with ExitStack() as stack:
         descriptors = []
         for path in paths:
-            descriptors.append(_lock(path, url))
+            descriptors.append(_lock_file(path, url))
             stack.callback(os.close, descriptors[-1])
         vehicle_lock: VehicleLock | None = None
         try:
@@ -159,11 +159,11 @@ def _make_vehicle_lock(descriptors: Sequence[int], url: str, path: Path) -> Vehi
         ) from error
 
 
-def _lock(path: Path, url: str) -> int:
+def _lock_file(path: Path, url: str) -> int:
     """Descriptor of the locked file."""
     for _ in range(_TRIES):
         try:
-            descriptor = _open(path)
+            descriptor = _open_lock_file(path)
         except FileExistsError:
             continue  # made by another one in between
         except PermissionError as error:
@@ -185,7 +185,7 @@ def _lock(path: Path, url: str) -> int:
     raise VehicleTakenError(f"{url}: another daemon is just starting or ending on it; try again")
 
 
-def _open(path: Path) -> int:
+def _open_lock_file(path: Path) -> int:
     try:
         descriptor = os.open(path, os.O_RDWR | os.O_NOFOLLOW)
     except FileNotFoundError:

@@ -37,7 +37,7 @@ class Notifier:
         if address:
             self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
             self._socket.setblocking(False)
-        self.watchdog_ns = _watchdog_ns(environ, os.getpid() if pid is None else pid)
+        self.watchdog_ns = _read_watchdog_ns(environ, os.getpid() if pid is None else pid)
         self._signalled_ns: int | None = None
 
     def after_tick(self, ticked: Ticked, lateness_ns: int) -> None:
@@ -68,7 +68,7 @@ class Notifier:
                 self._socket.sendto(line.encode(), self._address)
 
 
-def _watchdog_ns(environ: Mapping[str, str], pid: int) -> int | None:
+def _read_watchdog_ns(environ: Mapping[str, str], pid: int) -> int | None:
     """Time within which the manager wants a sign of life [ns]; None if it wants none of this process."""
     usec, owner = environ.get("WATCHDOG_USEC"), environ.get("WATCHDOG_PID")
     if usec is None or (owner is not None and owner != str(pid)):

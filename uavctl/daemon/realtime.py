@@ -65,7 +65,7 @@ def enable_realtime(priority: int = PRIORITY) -> Iterator[tuple[RealtimeSetting,
     processor to another program while the control loop waits for it.
     """
     before = os.sched_getscheduler(0), os.sched_getparam(0)
-    scheduling = _schedule(priority)
+    scheduling = _set_scheduler(priority)
     memory = _lock_memory()
     try:
         yield scheduling, memory
@@ -76,7 +76,7 @@ def enable_realtime(priority: int = PRIORITY) -> Iterator[tuple[RealtimeSetting,
             os.sched_setscheduler(0, *before)
 
 
-def _schedule(priority: int) -> RealtimeSetting:
+def _set_scheduler(priority: int) -> RealtimeSetting:
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     except PermissionError:

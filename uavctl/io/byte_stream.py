@@ -31,14 +31,14 @@ class _SendBuffer:
     """Bytes of whole frames that a stream has not taken yet; a frame is never cut by dropping."""
 
     def __init__(self) -> None:
-        self._rest = b""
+        self._buffer = b""
 
     def push(self, data: bytes, write: Callable[[bytes], int]) -> bool:
         """Write what waits, then the data; False if the data had to be dropped whole."""
-        is_dropped = len(self._rest) + len(data) > _PENDING_LIMIT
-        self._rest += b"" if is_dropped else data
+        is_dropped = len(self._buffer) + len(data) > _PENDING_LIMIT
+        self._buffer += b"" if is_dropped else data
         with suppress(BlockingIOError):  # full: what waits is written with the next frame
-            self._rest = self._rest[write(self._rest) :]
+            self._buffer = self._buffer[write(self._buffer) :]
         return not is_dropped
 
 
@@ -51,7 +51,7 @@ class TcpConnection(SocketConnection):
     def __init__(self, url: str, family: socket.AddressFamily, address: Address, now: Callable[[], int]) -> None:
         super().__init__(url, family, socket.SOCK_STREAM, now)
         self._family, self._address = family, address
-        self._pending = _SendBuffer()
+        self._send_buffer = _SendBuffer()
         self._is_connected = True
         self._attempt_ns = 0  # when the last attempt began, or the connection ended
         self._heard_ns: int | None = None  # when something came last, or the connection was made again
@@ -88,7 +88,7 @@ class TcpConnection(SocketConnection):
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _DROP_UNSENT)
         self._socket.close()
         self._is_connected, self._attempt_ns = False, self._now()
-        self._pending = _SendBuffer()  # a frame of which the peer has had the beginning
+        self._send_buffer = _SendBuffer()  # a frame of which the peer has had the beginning
         self.refused[reason] += 1
 
     def _connect(self) -> None:
@@ -113,7 +113,7 @@ class TcpConnection(SocketConnection):
     def send(self, data: bytes) -> None:
         """See `Connection`."""
         try:
-            self.send_errors += not self._pending.push(data, self._socket.send)
+            self.send_errors += not self._send_buffer.push(data, self._socket.send)
         except OSError:
             self.send_errors += 1
 
@@ -127,7 +127,7 @@ class SerialConnection(BaseConnection):
 
     def __init__(self, url: str, device: str, baud: int, now: Callable[[], int]) -> None:
         super().__init__(url, now)
-        self._pending = _SendBuffer()
+        self._send_buffer = _SendBuffer()
         self._full_reads = 0  # times that it was found full
         try:
             self._port = serial.Serial(device, baud, timeout=0, write_timeout=0, exclusive=True)
@@ -159,7 +159,7 @@ class SerialConnection(BaseConnection):
     def send(self, data: bytes) -> None:
         """See `Connection`."""
         try:
-            self.send_errors += not self._pending.push(data, self._write)
+            self.send_errors += not self._send_buffer.push(data, self._write)
         except OSError:
             self.send_errors += 1
 

@@ -75,15 +75,15 @@ def parse_time_requests(data: bytes) -> tuple[int, ...]:
     )
 
 
-WAITING = 64  # messages that wait for a daemon that does not read; the newest are kept
+MAX_QUEUE = 64  # messages that wait for a daemon that does not read; the newest are kept
 OVERRUN = "source-queue"
 NOT_SERVER = "not-listed"
 _PIPE_BYTES = 8192  # asked of the kernel: what waits there cannot be replaced by newer
-_READS = 64
-_PAUSE_S = 0.1
-_AGAIN_S = 0.5  # between two attempts to connect a lost stream
-_COUNTS_S = 0.5
-_MEMORY = 2**30
+_MAX_READS = 64
+_POLL_S = 0.1
+_RECONNECT_S = 0.5  # between two attempts to connect a lost stream
+_COUNTS_PERIOD_S = 0.5
+_MEMORY_LIMIT = 2**30
 
 
 class CameraHost:
@@ -127,11 +127,11 @@ class CameraHost:
 
     def _reconnect(self) -> None:
         """Connect a lost stream again, if it is time."""
-        if time.monotonic() - self._connected_s < _AGAIN_S:
+        if time.monotonic() - self._connected_s < _RECONNECT_S:
             return
         self._connected_s = time.monotonic()
         with suppress(OSError):
-            self._server_socket = self._connect(_PAUSE_S)
+            self._server_socket = self._connect(_POLL_S)
 
     def _disconnect(self) -> None:
         self._dropped["connection-lost"] += 1
@@ -167,7 +167,7 @@ class CameraHost:
             self._send(data)
         self._follow_group()
         sources = [source for source in (self._server_socket, self._group_socket) if source is not None]
-        readable, _, _ = select.select([self._pipe, *sources], [self._pipe] if self._queue else [], [], _PAUSE_S)
+        readable, _, _ = select.select([self._pipe, *sources], [self._pipe] if self._queue else [], [], _POLL_S)
         for source in sources:
             if source in readable:
                 self._receive(source)
@@ -186,7 +186,7 @@ class CameraHost:
             self._dropped["unsent"] += 1
 
     def _receive(self, source: socket.socket) -> None:
-        for _ in range(_READS):
+        for _ in range(_MAX_READS):
             try:
                 data, sender = source.recvfrom(LARGEST)
             except BlockingIOError:
@@ -222,7 +222,7 @@ class CameraHost:
         return bool(data)
 
     def _queue_message(self, message: bytes) -> None:
-        if len(self._queue) >= WAITING:
+        if len(self._queue) >= MAX_QUEUE:
             self._queue.popleft()
             self._dropped[OVERRUN] += 1
         self._queue.append(message)
@@ -238,7 +238,7 @@ class CameraHost:
 
     def _report_counts(self) -> None:
         counts = self._camera.dropped + self._dropped
-        if counts != self._reported_counts and time.monotonic() - self._reported_s >= _COUNTS_S:
+        if counts != self._reported_counts and time.monotonic() - self._reported_s >= _COUNTS_PERIOD_S:
             self._reported_counts, self._reported_s = counts, time.monotonic()
             self._queue_message(COUNTS + json.dumps(counts).encode())
 
@@ -294,7 +294,7 @@ def _make_camera(camera: str, body: str, up: Up) -> Camera:
 def main(arguments: list[str]) -> int:
     """Run for the daemon that started this process."""
     descriptor, camera, address, port, body, up, interface = arguments
-    resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
+    resource.setrlimit(resource.RLIMIT_AS, (_MEMORY_LIMIT, _MEMORY_LIMIT))
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # never beside the control loop of a --realtime daemon
     with socket.socket(fileno=int(descriptor)) as pipe:
         pipe.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _PIPE_BYTES)

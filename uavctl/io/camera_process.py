@@ -16,7 +16,7 @@ from uavctl.errors import ConnectionSpecError, ExtraMissingError
 from uavctl.io.admission import AdmissionRules, AllowList, RateLimiter
 from uavctl.io.base import BaseConnection, Connection
 from uavctl.io.camera import ANSWER_S, COUNTS, LARGEST, READY, REFUSED
-from uavctl.io.camera_url import parse
+from uavctl.io.camera_url import parse_camera_url
 
 _MAVLINK = (0xFD, 0xFE)
 _START_S = 60.0  # for the interpreter of the process, on a busy computer
@@ -127,7 +127,7 @@ def _open_camera(url: str, now: Callable[[], int], rules: AdmissionRules) -> Con
         ConnectionSpecError: the URL, the server or the body is not as it has to be.
         ExtraMissingError: the camera system's package is not installed.
     """
-    camera_url = parse(url)
+    camera_url = parse_camera_url(url)
     system = camera_system(camera_url.system)
     if system.package and find_spec(system.package) is None:  # not imported: the camera has a process of its own
         raise ExtraMissingError(system.package, system.extra)

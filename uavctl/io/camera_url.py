@@ -28,7 +28,7 @@ class CameraUrl:
     interface: str = "0.0.0.0"  # address of our network interface to the cameras
 
 
-def parse(url: str) -> CameraUrl:
+def parse_camera_url(url: str) -> CameraUrl:
     """Read a URL.
 
     Raises:
@@ -53,11 +53,11 @@ def parse(url: str) -> CameraUrl:
             port = camera_system(scheme).port if port is None else port
             if not port:
                 raise ConnectionSpecError(f"connection {url!r} needs the server's port too; {form}")
-            return CameraUrl(scheme, host, port, body, axis, _address(url, interface))
+            return CameraUrl(scheme, host, port, body, axis, _parse_address(url, interface))
     raise ConnectionSpecError(f"connection {url!r}: up={up!r} is neither y nor z; see the cameras' streaming settings")
 
 
-def _address(url: str, text: str) -> str:
+def _parse_address(url: str, text: str) -> str:
     try:
         return str(IPv4Address(text))
     except ValueError as error:

@@ -41,10 +41,10 @@ def read_key(path: Path) -> SigningKey:
             f"key file {path}: others than its owner may use it (mode {mode:04o}); run `chmod 600 {path}`, and make a "
             "new key if somebody may have read it"
         )
-    return _parse(path, data)
+    return _parse_key(path, data)
 
 
-def _parse(path: Path, data: bytes) -> SigningKey:
+def _parse_key(path: Path, data: bytes) -> SigningKey:
     text = data.strip()
     try:
         if text.startswith(PASSPHRASE):

@@ -106,17 +106,19 @@ class NatNet:
                 self.dropped[SILENT] += 1
                 self._is_complete = False  # another server may come back, with other numbers for its bodies
             if is_silent or self._version is None:
-                return (_message(CONNECT, b"Ping\0"),)
+                return (_encode_message(CONNECT, b"Ping\0"),)
             self._requests += 1
-            return (_message(REQUEST_DESCRIPTIONS, struct.pack("<I", RIGID_BODIES) if self._requests % 2 else b""),)
+            return (
+                _encode_message(REQUEST_DESCRIPTIONS, struct.pack("<I", RIGID_BODIES) if self._requests % 2 else b""),
+            )
         if self._version is not None and at_ns - self._keep_alive_ns >= _KEEP_NS:
             self._keep_alive_ns = at_ns
-            return (_message(KEEP_ALIVE, b""),)
+            return (_encode_message(KEEP_ALIVE, b""),)
         return ()
 
     def ask_time(self, token: int) -> bytes:
         """See `Camera`."""
-        return _message(ECHO_REQUEST, struct.pack("<Q", token))
+        return _encode_message(ECHO_REQUEST, struct.pack("<Q", token))
 
     def _ticks_to_ns(self, ticks: int) -> int:
         return ticks * 1_000_000_000 // self._ticks_per_s
@@ -181,5 +183,5 @@ class NatNet:
         self.dropped[MISSING] += 1
 
 
-def _message(kind: int, payload: bytes) -> bytes:
+def _encode_message(kind: int, payload: bytes) -> bytes:
     return _HEAD.pack(kind, len(payload)) + payload

@@ -139,7 +139,7 @@ class Qualisys:
         if self._body_index is None or self._body_index >= len(bodies):
             return self._count_dropped(MISSING)
         place, rotation = bodies[self._body_index]
-        attitude = _turn(rotation.matrix)
+        attitude = _quaternion_from_matrix(rotation.matrix)
         if attitude is None or not all(map(math.isfinite, place)):
             return self._count_dropped(UNTRACKED)
         position_m: Vec3 = (place.x * 1e-3, place.y * 1e-3, place.z * 1e-3)
@@ -161,7 +161,7 @@ def _encode_command(command: str) -> bytes:
     return _HEAD.pack(_HEAD.size + len(payload), COMMAND) + payload
 
 
-def _turn(columns: tuple[float, ...]) -> Quaternion | None:
+def _quaternion_from_matrix(columns: tuple[float, ...]) -> Quaternion | None:
     """Return the quaternion (w, x, y, z) of a rotation matrix given by columns; None if it is none."""
     a, d, g, b, e, h, c, f, i = columns  # rows are a b c, d e f, g h i
     squares = 1.0 + a + e + i, 1.0 + a - e - i, 1.0 - a + e - i, 1.0 - a - e + i

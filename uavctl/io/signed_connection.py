@@ -19,7 +19,7 @@ from uavctl.io.key_file import read_key
 from uavctl.io.sources import open_source
 from uavctl.io.timestamp_file import TimestampFile, find_state_folder
 from uavctl.mavlink.connection import MOCAP, STREAM_SCHEMES, VEHICLE
-from uavctl.mavlink.signing import FrameAuthenticator, FrameSigner, signing_timestamp
+from uavctl.mavlink.signing import FrameAuthenticator, FrameSigner, make_timestamp
 
 
 class SignedConnection:
@@ -169,7 +169,7 @@ def sign_connections(
     key = read_key(Path(security.key_file).expanduser())
     wall_ns = time.time_ns()
     wall_offset_ns = wall_ns - monotonic_ns()
-    keeper = TimestampFile(find_state_folder() / f"{key.name}.stamp", signing_timestamp(wall_ns))
+    keeper = TimestampFile(find_state_folder() / f"{key.name}.stamp", make_timestamp(wall_ns))
     peers = frozenset(security.peer_link_ids)
     try:
         signed = dict(connections)

@@ -66,11 +66,11 @@ def save_timestamp(path: Path, stamp: int) -> None:
         KeyFileError: what is there is damaged.
     """
     path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-    with _private(path.with_suffix(".lock"), 0) as lock:
-        _take(lock.fileno())
+    with _open_private(path.with_suffix(".lock"), 0) as lock:
+        _lock_file(lock.fileno())
         draft = path.with_suffix(".new")
         draft.unlink(missing_ok=True)  # of a process that was killed, another user's it may be
-        with _private(draft, os.O_EXCL) as file:
+        with _open_private(draft, os.O_EXCL) as file:
             file.write(f"{max(stamp, load_timestamp(path))}\n")
             file.flush()
             os.fsync(file.fileno())
@@ -82,14 +82,14 @@ def save_timestamp(path: Path, stamp: int) -> None:
             os.close(folder)
 
 
-def _private(path: Path, flags: int) -> TextIO:
+def _open_private(path: Path, flags: int) -> TextIO:
     """Open a file for writing that no other user can open, made if need be."""
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC | flags, 0o600)
     os.fchmod(descriptor, 0o600)
     return os.fdopen(descriptor, "w", encoding="ascii")
 
 
-def _take(lock: int) -> None:
+def _lock_file(lock: int) -> None:
     """Lock a file; a daemon that writes its stamp holds it only briefly.
 
     Raises:

@@ -43,9 +43,9 @@ def open_connection(
     if not separator or scheme not in ("udpin", "udpout", "tcp", "serial"):
         raise ConnectionSpecError(f"connection {url!r} has no known form; write {FORMS}")
     if scheme == "serial":
-        return SerialConnection(url, *_device_and_baud(url, rest), now)
+        return SerialConnection(url, *_parse_serial_url(url, rest), now)
     kind = socket.SOCK_STREAM if scheme == "tcp" else socket.SOCK_DGRAM
-    family, address = _resolve(url, kind)
+    family, address = _resolve_address(url, kind)
     if scheme == "udpin":
         return UdpInConnection(url, family, address, now, rules)
     if scheme == "udpout":
@@ -74,7 +74,7 @@ def wait(
     return list(dict.fromkeys(names[descriptor] for descriptor in ready))
 
 
-def _resolve(url: str, kind: socket.SocketKind) -> tuple[socket.AddressFamily, Address]:
+def _resolve_address(url: str, kind: socket.SocketKind) -> tuple[socket.AddressFamily, Address]:
     try:
         parts = urlsplit(url)
         host, port = parts.hostname, parts.port
@@ -89,7 +89,7 @@ def _resolve(url: str, kind: socket.SocketKind) -> tuple[socket.AddressFamily, A
     return family, cast(Address, address)  # (int, bytes) only for families that were not asked for
 
 
-def _device_and_baud(url: str, rest: str) -> tuple[str, int]:
+def _parse_serial_url(url: str, rest: str) -> tuple[str, int]:
     device, separator, baud = rest.rpartition(":")
     if not separator or not device.startswith("/") or not baud.isdecimal() or int(baud) == 0:
         raise ConnectionSpecError(

@@ -198,13 +198,13 @@ class UdpOutConnection(_UdpConnection):
     """Connected UDP socket: the system hands on what its one peer sends."""
 
     def _bind_or_connect(self, address: Address) -> None:
-        self._to = address
+        self._peer_address = address
         _set_buffer_size(self._socket, PEER_BUFFER_BYTES)
         self._attempt(self._socket.connect, address, "check host, port and network")
         self._rate_limiter.set_vehicle(address, self._now())
 
     def _read(self) -> bytes | None:
-        return self._admit_sender(self._socket.recv(LARGEST), self._to)
+        return self._admit_sender(self._socket.recv(LARGEST), self._peer_address)
 
     def receive(self, *, read_all: bool = False) -> list[tuple[bytes, int]]:
         """See `Connection`; more than the rules allow is dropped, the oldest first."""

@@ -22,7 +22,7 @@ class _Reading:
 
     boot_ms: int
     at_ns: int
-    confirmed: bool = False
+    is_confirmed: bool = False
 
 
 class BootClock:
@@ -52,14 +52,16 @@ class BootClock:
         known, candidate = self._readings.get(kind), self._candidates.get(kind)
         reading = _Reading(boot_ms, at_ns)
         if known is None or _is_same_clock(known, reading):
-            self._accept(kind, _Reading(boot_ms, at_ns, confirmed=known is not None))
+            self._accept(kind, _Reading(boot_ms, at_ns, is_confirmed=known is not None))
         elif candidate is not None and at_ns - candidate.at_ns <= CONFIRM_NS and _is_same_clock(candidate, reading):
             del self._candidates[kind]
-            has_restarted = known.confirmed and (_advance_ms(known, reading) < 0 or _may_have_restarted(known, reading))
+            has_restarted = known.is_confirmed and (
+                _compute_advance_ms(known, reading) < 0 or _may_have_restarted(known, reading)
+            )
             if has_restarted:  # the others' readings are from before the restart
                 self._readings.clear()
                 self._candidates.clear()
-            self._accept(kind, _Reading(boot_ms, at_ns, confirmed=True))
+            self._accept(kind, _Reading(boot_ms, at_ns, is_confirmed=True))
             return has_restarted
         else:
             self._candidates[kind] = reading
@@ -75,20 +77,20 @@ class BootClock:
         self._readings[kind] = self._newest = reading
 
 
-def _advance_ms(before: _Reading, after: _Reading) -> int:
+def _compute_advance_ms(before: _Reading, after: _Reading) -> int:
     """Return by how much a clock went on, the shorter way around its wrap [ms]."""
     return (after.boot_ms - before.boot_ms + _WRAP_MS // 2) % _WRAP_MS - _WRAP_MS // 2
 
 
-def _passed_ms(before: _Reading, after: _Reading) -> int:
+def _compute_elapsed_ms(before: _Reading, after: _Reading) -> int:
     return (after.at_ns - before.at_ns) // 1_000_000
 
 
 def _is_same_clock(before: _Reading, after: _Reading) -> bool:
     """Whether two readings may be of one clock."""
-    return -MAX_BACKSTEP_MS <= _advance_ms(before, after) <= _passed_ms(before, after) + MAX_ADVANCE_MS
+    return -MAX_BACKSTEP_MS <= _compute_advance_ms(before, after) <= _compute_elapsed_ms(before, after) + MAX_ADVANCE_MS
 
 
 def _may_have_restarted(before: _Reading, after: _Reading) -> bool:
     """Whether a vehicle may have started between two readings: up for more than 24 days its clock seems to leap."""
-    return after.boot_ms <= _passed_ms(before, after) + MAX_ADVANCE_MS
+    return after.boot_ms <= _compute_elapsed_ms(before, after) + MAX_ADVANCE_MS

@@ -146,8 +146,8 @@ class TimesyncClock:
         self._round_trips_ns: deque[int] = deque(maxlen=ROUND_TRIP_HISTORY)
         self._has_drift = False  # whether the slope is known
         self._slope = 0.0
-        self._base_ns = 0
-        self._base_at_ns = 0
+        self._line_ns = 0
+        self._line_at_ns = 0
         self._used_ns = 0  # arrival of the last answer that was used
         self._deviating_count = 0
         self.rejected = 0
@@ -161,7 +161,7 @@ class TimesyncClock:
 
     def last_known_ns(self, at_ns: int) -> int | None:
         """(our time − its time) by the answers so far, however long ago they came; None before the first."""
-        return self._base_ns + round(self._slope * (at_ns - self._base_at_ns)) if self._answers else None
+        return self._line_ns + round(self._slope * (at_ns - self._line_at_ns)) if self._answers else None
 
     def uncertainty_ns(self, at_ns: int) -> int | None:
         """Largest error of the offset at that time; None before the first answer."""
@@ -215,7 +215,7 @@ class TimesyncClock:
             and half_ns > uncertainty_ns + ROUND_TRIP_MARGIN_NS // 2
         ):
             clamped_ns = min(max(expected_ns, measured_ns - half_ns), measured_ns + half_ns)
-            self._base_ns += clamped_ns - expected_ns
+            self._line_ns += clamped_ns - expected_ns
             return True
         # Round trips of other lengths may be off by other amounts, which is no drift: the slope goes on without them.
         similar = [trip for trip in self._answers if abs(round_trip_ns - trip[2]) <= 2 * ROUND_TRIP_MARGIN_NS]
@@ -238,7 +238,7 @@ class TimesyncClock:
             self._slope, self._has_drift = min(max(slope, -MAX_DRIFT), MAX_DRIFT), True
         first_ns = self._answers[0][1]  # differences stay exact in floating point
         levels = [offset - first_ns + self._slope * (last_ns - at_ns) for at_ns, offset, _ in self._answers]
-        self._base_ns, self._base_at_ns = first_ns + round(median(levels)), last_ns
+        self._line_ns, self._line_at_ns = first_ns + round(median(levels)), last_ns
 
 
 class ArrivalClock:

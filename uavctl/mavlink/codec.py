@@ -25,25 +25,25 @@ from uavctl.frames import (
     quaternion_from_euler,
     rotate_vector,
 )
-from uavctl.mavlink.framing import BadBytes, Scan, scan
-from uavctl.mavlink.message_layout import Fields, MessageLayout, text_of
+from uavctl.mavlink.framing import Scan, SkipReason, scan_frames
+from uavctl.mavlink.message_layout import MessageFields, MessageLayout, decode_text
 from uavctl.mavlink.messages import (
-    Ack,
     Attitude,
     AutopilotVersion,
     Battery,
+    CommandAck,
     EstimatorFlags,
     FenceBreach,
     GlobalOrigin,
     Heartbeat,
     Inertial,
-    Landed,
+    LandedState,
     Message,
     ModeCommand,
     ParamValue,
     Position,
     RadioChannels,
-    Text,
+    StatusText,
     TimeSync,
 )
 from uavctl.records import Vec3
@@ -60,7 +60,7 @@ _INTEGERS = {
 }
 
 
-def _attitude(raw: Fields) -> Attitude | None:
+def _parse_attitude(raw: MessageFields) -> Attitude | None:
     angles = (raw.roll, raw.pitch, raw.yaw)
     if not all(map(math.isfinite, angles)):
         return None
@@ -69,7 +69,7 @@ def _attitude(raw: Fields) -> Attitude | None:
     )
 
 
-def _attitude_quaternion(raw: Fields) -> Attitude | None:
+def _parse_attitude_quaternion(raw: MessageFields) -> Attitude | None:
     attitude = normalise_quaternion((raw.q1, raw.q2, raw.q3, raw.q4))
     if attitude is None:
         return None
@@ -82,15 +82,15 @@ def _attitude_quaternion(raw: Fields) -> Attitude | None:
     )
 
 
-def _highres_imu(raw: Fields) -> Inertial | None:
-    return _inertial(raw, 1.0)
+def _parse_highres_imu(raw: MessageFields) -> Inertial | None:
+    return _make_inertial(raw, 1.0)
 
 
-def _raw_imu(raw: Fields) -> Inertial | None:
-    return _inertial(raw, _MILLI_G_MPS2)
+def _parse_raw_imu(raw: MessageFields) -> Inertial | None:
+    return _make_inertial(raw, _MILLI_G_MPS2)
 
 
-def _inertial(raw: Fields, unit_mps2: float) -> Inertial | None:
+def _make_inertial(raw: MessageFields, unit_mps2: float) -> Inertial | None:
     force = (unit_mps2 * raw.xacc, unit_mps2 * raw.yacc, unit_mps2 * raw.zacc)
     if not all(map(math.isfinite, force)):
         return None
@@ -103,7 +103,7 @@ def _inertial(raw: Fields, unit_mps2: float) -> Inertial | None:
     )
 
 
-def _param_value(raw: Fields) -> ParamValue:
+def _parse_param_value(raw: MessageFields) -> ParamValue:
     form = _INTEGERS.get(raw.param_type)
     bytewise = raw.param_value
     if form is not None:
@@ -111,7 +111,7 @@ def _param_value(raw: Fields) -> ParamValue:
     return ParamValue(
         system=raw.src_system,
         component=raw.src_component,
-        name=text_of(raw.param_id),
+        name=decode_text(raw.param_id),
         cast=raw.param_value,
         bytewise=float(bytewise),
         index=raw.param_index,
@@ -119,11 +119,11 @@ def _param_value(raw: Fields) -> ParamValue:
     )
 
 
-def _estimator(raw: Fields) -> EstimatorFlags:
+def _parse_estimator_flags(raw: MessageFields) -> EstimatorFlags:
     return EstimatorFlags(system=raw.src_system, component=raw.src_component, flags=raw.flags)
 
 
-def _version(raw: Fields) -> AutopilotVersion:
+def _parse_version(raw: MessageFields) -> AutopilotVersion:
     number = raw.flight_sw_version
     return AutopilotVersion(
         system=raw.src_system,
@@ -133,15 +133,15 @@ def _version(raw: Fields) -> AutopilotVersion:
     )
 
 
-STATE_PARSERS: dict[int, Callable[[Fields], Message | None]] = {
-    mavlink.MAVLINK_MSG_ID_ATTITUDE: _attitude,
-    mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: _attitude_quaternion,
-    mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: _highres_imu,
-    mavlink.MAVLINK_MSG_ID_RAW_IMU: _raw_imu,
-    mavlink.MAVLINK_MSG_ID_PARAM_VALUE: _param_value,
-    mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: _estimator,
-    mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: _estimator,
-    mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: _version,
+STATE_PARSERS: dict[int, Callable[[MessageFields], Message | None]] = {
+    mavlink.MAVLINK_MSG_ID_ATTITUDE: _parse_attitude,
+    mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: _parse_attitude_quaternion,
+    mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: _parse_highres_imu,
+    mavlink.MAVLINK_MSG_ID_RAW_IMU: _parse_raw_imu,
+    mavlink.MAVLINK_MSG_ID_PARAM_VALUE: _parse_param_value,
+    mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: _parse_estimator_flags,
+    mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: _parse_estimator_flags,
+    mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: _parse_version,
 }
 
 
@@ -172,22 +172,22 @@ def decode(data: bytes) -> DecodedMessages:
         data: a datagram; longer ones than `MAX_DATAGRAM_BYTES` are dropped whole.
     """
     if len(data) > MAX_DATAGRAM_BYTES:
-        return DecodedMessages((), 0, {BadBytes.OVERSIZE: 1})
-    return decode_scan(scan(data, final=True))
+        return DecodedMessages((), 0, {SkipReason.OVERSIZE: 1})
+    return decode_scan(scan_frames(data, final=True))
 
 
 class StreamDecoder:
     """Reassembles messages from the chunks of a byte stream (TCP, serial)."""
 
     def __init__(self) -> None:
-        self._rest = b""
-        self._in_step = True
+        self._buffer = b""
+        self._is_aligned = True
 
     def push(self, chunk: bytes) -> DecodedMessages:
         """Take the next bytes; what they begin and do not end waits for the next chunk."""
-        data = self._rest + chunk
-        result = scan(data, final=False, is_aligned=self._in_step)
-        self._rest, self._in_step = data[result.consumed :], result.is_aligned
+        data = self._buffer + chunk
+        result = scan_frames(data, final=False, is_aligned=self._is_aligned)
+        self._buffer, self._is_aligned = data[result.consumed :], result.is_aligned
         return decode_scan(result)
 
 
@@ -209,35 +209,35 @@ def decode_scan(result: Scan) -> DecodedMessages:
     return DecodedMessages(tuple(messages), len(result.frames), result.bad)
 
 
-def _finite(*values: float) -> bool:
+def _is_finite(*values: float) -> bool:
     return all(map(math.isfinite, values))
 
 
-def _xyz(raw: Fields) -> Vec3:
+def _parse_xyz(raw: MessageFields) -> Vec3:
     position = (raw.x, raw.y, raw.z)
-    if not _finite(*position):
+    if not _is_finite(*position):
         raise _UnusableError(BAD_FIELD)
     return position
 
 
-def _from_usec(raw: Fields, usec: int, attitude: Quaternion | None, *, euler: bool) -> Position:
+def _make_position(raw: MessageFields, usec: int, attitude: Quaternion | None, *, euler: bool) -> Position:
     return Position(
         system=raw.src_system,
         component=raw.src_component,
         name=raw.msgname,
         stamp_us=usec or None,
-        position_m=_xyz(raw),
+        position_m=_parse_xyz(raw),
         attitude=attitude,
         euler=euler,
     )
 
 
-def _with_angles(raw: Fields) -> Position:
-    return _from_usec(raw, raw.usec, quaternion_from_euler((raw.roll, raw.pitch, raw.yaw)), euler=True)
+def _parse_euler_position(raw: MessageFields) -> Position:
+    return _make_position(raw, raw.usec, quaternion_from_euler((raw.roll, raw.pitch, raw.yaw)), euler=True)
 
 
-def _with_quaternion(raw: Fields) -> Position:
-    return _from_usec(raw, raw.time_usec, normalise_quaternion(raw.q), euler=False)
+def _parse_quaternion_position(raw: MessageFields) -> Position:
+    return _make_position(raw, raw.time_usec, normalise_quaternion(raw.q), euler=False)
 
 
 _ODOMETRY_AXES: dict[int, Convention] = {
@@ -249,7 +249,7 @@ _ODOMETRY_AXES: dict[int, Convention] = {
 _BODY_AXES = (mavlink.MAV_FRAME_BODY_FRD, mavlink.MAV_FRAME_BODY_NED)
 
 
-def _odometry(raw: Fields) -> Position:
+def _parse_odometry(raw: MessageFields) -> Position:
     if raw.estimator_type == mavlink.MAV_ESTIMATOR_TYPE_AUTOPILOT:
         raise _UnusableError(AUTOPILOT_ESTIMATE)
     axes = _ODOMETRY_AXES.get(raw.frame_id)
@@ -262,17 +262,17 @@ def _odometry(raw: Fields) -> Position:
         component=raw.src_component,
         name=raw.msgname,
         stamp_us=raw.time_usec or None,
-        position_m=_xyz(raw),
-        velocity_mps=_odometry_velocity(raw),
+        position_m=_parse_xyz(raw),
+        velocity_mps=_parse_odometry_velocity(raw),
         convention=axes,
         attitude=normalise_quaternion(raw.q) if raw.child_frame_id in _BODY_AXES else None,
     )
 
 
-def _odometry_velocity(raw: Fields) -> Vec3 | None:
+def _parse_odometry_velocity(raw: MessageFields) -> Vec3 | None:
     """Velocity in the axes of the position; None if it is not given (NaN) or its axes are not known."""
     velocity: Vec3 = (raw.vx, raw.vy, raw.vz)
-    if not _finite(*velocity):
+    if not _is_finite(*velocity):
         return None
     if raw.child_frame_id in _BODY_AXES:
         q: Quaternion = (raw.q[0], raw.q[1], raw.q[2], raw.q[3])
@@ -280,7 +280,7 @@ def _odometry_velocity(raw: Fields) -> Vec3 | None:
     return velocity if raw.child_frame_id == raw.frame_id else None
 
 
-def _local_position(raw: Fields) -> Position:
+def _parse_local_position(raw: MessageFields) -> Position:
     velocity: Vec3 = (raw.vx, raw.vy, raw.vz)
     return Position(
         system=raw.src_system,
@@ -288,13 +288,13 @@ def _local_position(raw: Fields) -> Position:
         name=raw.msgname,
         stamp_us=raw.time_boot_ms * 1000,
         boot_ms=True,
-        position_m=_xyz(raw),
-        velocity_mps=velocity if _finite(*velocity) else None,
+        position_m=_parse_xyz(raw),
+        velocity_mps=velocity if _is_finite(*velocity) else None,
         local_ned=True,
     )
 
 
-def _heartbeat(raw: Fields) -> Heartbeat:
+def _parse_heartbeat(raw: MessageFields) -> Heartbeat:
     return Heartbeat(
         system=raw.src_system,
         component=raw.src_component,
@@ -306,14 +306,14 @@ def _heartbeat(raw: Fields) -> Heartbeat:
     )
 
 
-def _timesync(raw: Fields) -> TimeSync:
+def _parse_timesync(raw: MessageFields) -> TimeSync:
     return TimeSync(system=raw.src_system, component=raw.src_component, tc1_ns=raw.tc1, ts1_ns=raw.ts1)
 
 
-def _landed(raw: Fields) -> Landed:
+def _parse_extended_sys_state(raw: MessageFields) -> LandedState:
     state = raw.landed_state
     undefined = state == mavlink.MAV_LANDED_STATE_UNDEFINED
-    return Landed(
+    return LandedState(
         system=raw.src_system,
         component=raw.src_component,
         landed=None if undefined else state == mavlink.MAV_LANDED_STATE_ON_GROUND,
@@ -324,7 +324,7 @@ def _landed(raw: Fields) -> Landed:
 _NO_VOLTAGE_MV = 0xFFFF
 
 
-def _sys_status(raw: Fields) -> Battery:
+def _parse_sys_status(raw: MessageFields) -> Battery:
     healthy = raw.onboard_control_sensors_enabled & raw.onboard_control_sensors_health
     unhealthy = raw.onboard_control_sensors_enabled & ~raw.onboard_control_sensors_health
     known = raw.voltage_battery != _NO_VOLTAGE_MV
@@ -337,14 +337,14 @@ def _sys_status(raw: Fields) -> Battery:
     )
 
 
-def _fence(raw: Fields) -> FenceBreach:
+def _parse_fence_status(raw: MessageFields) -> FenceBreach:
     return FenceBreach(system=raw.src_system, component=raw.src_component, is_breached=raw.breach_status != 0)
 
 
 _NO_CHANNEL_US = 0xFFFF
 
 
-def _channels(raw: Fields, count: int) -> RadioChannels:
+def _make_channels(raw: MessageFields, count: int) -> RadioChannels:
     pulses = (getattr(raw, f"chan{number}_raw") for number in range(1, count + 1))
     return RadioChannels(
         system=raw.src_system,
@@ -353,12 +353,12 @@ def _channels(raw: Fields, count: int) -> RadioChannels:
     )
 
 
-def _all_channels(raw: Fields) -> RadioChannels:
-    return _channels(raw, min(raw.chancount, 18))
+def _parse_rc_channels(raw: MessageFields) -> RadioChannels:
+    return _make_channels(raw, min(raw.chancount, 18))
 
 
-def _raw_channels(raw: Fields) -> RadioChannels | None:
-    return _channels(raw, 8) if raw.port == 0 else None
+def _parse_rc_channels_raw(raw: MessageFields) -> RadioChannels | None:
+    return _make_channels(raw, 8) if raw.port == 0 else None
 
 
 # Commands that change the mode of a vehicle in the air
@@ -376,19 +376,19 @@ MODE_COMMANDS = frozenset(
 )
 
 
-def _command(raw: Fields) -> ModeCommand | None:
-    return _set_mode(raw) if raw.command in MODE_COMMANDS else None
+def _parse_command_long(raw: MessageFields) -> ModeCommand | None:
+    return _parse_set_mode(raw) if raw.command in MODE_COMMANDS else None
 
 
-def _set_mode(raw: Fields) -> ModeCommand:
+def _parse_set_mode(raw: MessageFields) -> ModeCommand:
     return ModeCommand(system=raw.src_system, component=raw.src_component, target_system=raw.target_system)
 
 
-def _battery_status(raw: Fields) -> Battery | None:
-    return _battery(raw, raw.voltages) if raw.id == 0 else None
+def _parse_battery_status(raw: MessageFields) -> Battery | None:
+    return _sum_cells(raw, raw.voltages) if raw.id == 0 else None
 
 
-def _battery(raw: Fields, voltages_mv: list[int]) -> Battery | None:
+def _sum_cells(raw: MessageFields, voltages_mv: list[int]) -> Battery | None:
     """Sum of the cells that are known (the first may stand for all of them)."""
     known = [voltage for voltage in voltages_mv if voltage != _NO_VOLTAGE_MV]
     if not known:
@@ -396,10 +396,10 @@ def _battery(raw: Fields, voltages_mv: list[int]) -> Battery | None:
     return Battery(system=raw.src_system, component=raw.src_component, voltage_v=sum(known) / 1000)
 
 
-def _text(raw: Fields) -> Text:
+def _parse_statustext(raw: MessageFields) -> StatusText:
     more = raw.id != 0 and b"\0" not in raw.text
-    text = text_of(raw.text if more else raw.text.split(b"\0", 1)[0].rstrip())  # PX4 ends its texts with a tab
-    return Text(
+    text = decode_text(raw.text if more else raw.text.split(b"\0", 1)[0].rstrip())  # PX4 ends its texts with a tab
+    return StatusText(
         system=raw.src_system,
         component=raw.src_component,
         severity=raw.severity,
@@ -410,8 +410,8 @@ def _text(raw: Fields) -> Text:
     )
 
 
-def _ack(raw: Fields) -> Ack:
-    return Ack(
+def _parse_command_ack(raw: MessageFields) -> CommandAck:
+    return CommandAck(
         system=raw.src_system,
         component=raw.src_component,
         command=raw.command,
@@ -421,29 +421,29 @@ def _ack(raw: Fields) -> Ack:
     )
 
 
-def _origin(raw: Fields) -> GlobalOrigin:
+def _parse_gps_global_origin(raw: MessageFields) -> GlobalOrigin:
     return GlobalOrigin(system=raw.src_system, component=raw.src_component)
 
 
-_PARSERS: dict[int, Callable[[Fields], Message | None]] = {
-    mavlink.MAVLINK_MSG_ID_VISION_POSITION_ESTIMATE: _with_angles,
-    mavlink.MAVLINK_MSG_ID_VICON_POSITION_ESTIMATE: _with_angles,
-    mavlink.MAVLINK_MSG_ID_ATT_POS_MOCAP: _with_quaternion,
-    mavlink.MAVLINK_MSG_ID_ODOMETRY: _odometry,
-    mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: _local_position,
-    mavlink.MAVLINK_MSG_ID_HEARTBEAT: _heartbeat,
-    mavlink.MAVLINK_MSG_ID_TIMESYNC: _timesync,
-    mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: _landed,
-    mavlink.MAVLINK_MSG_ID_SYS_STATUS: _sys_status,
-    mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: _battery_status,
-    mavlink.MAVLINK_MSG_ID_STATUSTEXT: _text,
-    mavlink.MAVLINK_MSG_ID_COMMAND_ACK: _ack,
-    mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN: _origin,
-    mavlink.MAVLINK_MSG_ID_FENCE_STATUS: _fence,
-    mavlink.MAVLINK_MSG_ID_RC_CHANNELS: _all_channels,
-    mavlink.MAVLINK_MSG_ID_RC_CHANNELS_RAW: _raw_channels,
-    mavlink.MAVLINK_MSG_ID_SET_MODE: _set_mode,
-    mavlink.MAVLINK_MSG_ID_COMMAND_LONG: _command,
+_PARSERS: dict[int, Callable[[MessageFields], Message | None]] = {
+    mavlink.MAVLINK_MSG_ID_VISION_POSITION_ESTIMATE: _parse_euler_position,
+    mavlink.MAVLINK_MSG_ID_VICON_POSITION_ESTIMATE: _parse_euler_position,
+    mavlink.MAVLINK_MSG_ID_ATT_POS_MOCAP: _parse_quaternion_position,
+    mavlink.MAVLINK_MSG_ID_ODOMETRY: _parse_odometry,
+    mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: _parse_local_position,
+    mavlink.MAVLINK_MSG_ID_HEARTBEAT: _parse_heartbeat,
+    mavlink.MAVLINK_MSG_ID_TIMESYNC: _parse_timesync,
+    mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: _parse_extended_sys_state,
+    mavlink.MAVLINK_MSG_ID_SYS_STATUS: _parse_sys_status,
+    mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: _parse_battery_status,
+    mavlink.MAVLINK_MSG_ID_STATUSTEXT: _parse_statustext,
+    mavlink.MAVLINK_MSG_ID_COMMAND_ACK: _parse_command_ack,
+    mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN: _parse_gps_global_origin,
+    mavlink.MAVLINK_MSG_ID_FENCE_STATUS: _parse_fence_status,
+    mavlink.MAVLINK_MSG_ID_RC_CHANNELS: _parse_rc_channels,
+    mavlink.MAVLINK_MSG_ID_RC_CHANNELS_RAW: _parse_rc_channels_raw,
+    mavlink.MAVLINK_MSG_ID_SET_MODE: _parse_set_mode,
+    mavlink.MAVLINK_MSG_ID_COMMAND_LONG: _parse_command_long,
     **STATE_PARSERS,
 }
 _DECODERS = {number: (MessageLayout(mavlink.mavlink_map[number]), reader) for number, reader in _PARSERS.items()}

@@ -30,8 +30,8 @@ from uavctl.mavlink.clocksync import (
 )
 from uavctl.mavlink.codec import AUTOPILOT_ESTIMATE, StreamDecoder, decode
 from uavctl.mavlink.encoder import Encoder, UnsendableError
-from uavctl.mavlink.framing import BadBytes
-from uavctl.mavlink.messages import Ack, Attitude, Message, Position, Text, TimeSync
+from uavctl.mavlink.framing import SkipReason
+from uavctl.mavlink.messages import Attitude, CommandAck, Message, Position, StatusText, TimeSync
 from uavctl.mavlink.positions import SLOW_ANSWER, PositionDecoder
 from uavctl.mavlink.profile import PROFILES
 from uavctl.mavlink.relay import Relay
@@ -81,9 +81,9 @@ _DISCONNECT_TEXTS = {
     CONNECTION_SILENT: "nothing came over the connection any more; it is made again",
 }
 # Counted, not told: every flight has them, or they are told in another way.
-_NOT_REPORTED = frozenset({BadBytes.UNKNOWN, AUTOPILOT_ESTIMATE, *_DISCONNECT_TEXTS})
+_NOT_REPORTED = frozenset({SkipReason.UNKNOWN, AUTOPILOT_ESTIMATE, *_DISCONNECT_TEXTS})
 
-Item = PositionSample | VehicleStatus | VehicleMotion | InertialSample | Event | Ack | Text
+Item = PositionSample | VehicleStatus | VehicleMotion | InertialSample | Event | CommandAck | StatusText
 
 
 class ReceiveResult(NamedTuple):
@@ -399,7 +399,7 @@ class MavlinkConnection:
 
     def _handle_vehicle_message(self, message: Message, at_ns: int) -> tuple[Item, ...]:
         """Take a message of the vehicle and return what it tells of itself."""
-        if isinstance(message, Text):
+        if isinstance(message, StatusText):
             texts = self._text_assembler.add_chunk(message, at_ns)
             return tuple(item for text in texts for item in self._vehicle.handle_message(text, at_ns))
         boots, not_ready_count, address = self._vehicle.boots, self._vehicle.not_ready_count, self.vehicle

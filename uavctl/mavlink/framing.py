@@ -25,7 +25,7 @@ _CRC_EXTRA = {number: bytes((kind.crc_extra,)) for number, kind in mavlink.mavli
 _MAGIC = (mavlink.PROTOCOL_MARKER_V1, mavlink.PROTOCOL_MARKER_V2)
 
 
-class BadBytes(StrEnum):
+class SkipReason(StrEnum):
     """Reason why bytes were skipped."""
 
     CRC = "crc"  # a frame with a wrong checksum
@@ -91,7 +91,7 @@ def _compute_checksum(body: bytes, message_id: int) -> int:
     return mavlink.x25crc(body + _CRC_EXTRA[message_id]).crc
 
 
-def _checksum_fits(frame: bytes, header: _FrameHeader) -> bool:
+def _is_checksum_right(frame: bytes, header: _FrameHeader) -> bool:
     """Whether the checksum of a frame of a known id is right."""
     end = header.length - header.signature - CHECKSUM
     return _compute_checksum(frame[1:end], header.message_id) == int.from_bytes(frame[end : end + CHECKSUM], "little")
@@ -107,7 +107,7 @@ def add_checksum(head: bytes) -> bytes:
     return head + _compute_checksum(head[1:], message_id).to_bytes(CHECKSUM, "little")
 
 
-def scan(data: bytes, *, final: bool, is_aligned: bool = True, verify: Verify | None = None) -> Scan:
+def scan_frames(data: bytes, *, final: bool, is_aligned: bool = True, verify: Verify | None = None) -> Scan:
     """Find the frames in some bytes.
 
     Args:
@@ -132,46 +132,46 @@ def scan(data: bytes, *, final: bool, is_aligned: bool = True, verify: Verify | 
                 result.count_skip(reason)
             failures += 1
             end = len(data) if failures > MAX_FAILED else _find_next_magic(data, result.consumed + 1)
-        result.is_aligned = reason is _TAKEN
+        result.is_aligned = reason is _ACCEPTED
         result.consumed = end
     return result
 
 
-def scan_one(data: bytes) -> Scan:
+def scan_single_frame(data: bytes) -> Scan:
     """Look at bytes that should be one whole frame; others are not searched for in them."""
     result = Scan(consumed=0)
-    end, reason = _try_frame(data, result, None, final=True) if data else (None, BadBytes.TRUNCATED)
+    end, reason = _try_frame(data, result, None, final=True) if data else (None, SkipReason.TRUNCATED)
     if end is None:
         result.count_skip(reason)
     result.consumed = len(data)
     return result
 
 
-_TAKEN, _WAIT = "taken", "wait"
+_ACCEPTED, _WAIT = "taken", "wait"
 
 
 def _try_frame(data: bytes, result: Scan, verify: Verify | None, *, final: bool) -> tuple[int | None, str]:
-    """Try for a frame at `result.consumed`: (its end, `_TAKEN`), or (None, why not)."""
+    """Try for a frame at `result.consumed`: (its end, `_ACCEPTED`), or (None, why not)."""
     at = result.consumed
     if data[at] not in _MAGIC or _has_unknown_flags(data, at):
-        return None, BadBytes.GARBAGE
+        return None, SkipReason.GARBAGE
     header = _parse_header(data, at)
     if header is None or at + header.length > len(data):
-        return None, BadBytes.TRUNCATED if final else _WAIT
+        return None, SkipReason.TRUNCATED if final else _WAIT
     end = at + header.length
     if verify is not None:
         return _try_signed(data, result, header, verify)
     if header.message_id not in mavlink.mavlink_map:
         # Nothing but the length can be checked.
         if not _is_length_credible(data, result, end):
-            return None, BadBytes.GARBAGE
-        result.count_skip(BadBytes.UNKNOWN)
-        return end, _TAKEN
+            return None, SkipReason.GARBAGE
+        result.count_skip(SkipReason.UNKNOWN)
+        return end, _ACCEPTED
     frame = data[at:end]
-    if not _checksum_fits(frame, header):
-        return None, BadBytes.CRC
+    if not _is_checksum_right(frame, header):
+        return None, SkipReason.CRC
     result.frames.append(RawFrame(frame, header.message_id))
-    return end, _TAKEN
+    return end, _ACCEPTED
 
 
 def _try_signed(data: bytes, result: Scan, header: _FrameHeader, verify: Verify) -> tuple[int | None, str]:
@@ -185,10 +185,10 @@ def _try_signed(data: bytes, result: Scan, header: _FrameHeader, verify: Verify)
             return None, refusal
         result.count_skip(refusal)
     elif header.message_id not in mavlink.mavlink_map:
-        result.count_skip(BadBytes.UNKNOWN)
+        result.count_skip(SkipReason.UNKNOWN)
     else:
         result.frames.append(RawFrame(frame, header.message_id))
-    return end, _TAKEN
+    return end, _ACCEPTED
 
 
 def _is_length_credible(data: bytes, result: Scan, end: int) -> bool:

@@ -27,7 +27,7 @@ from uavctl.mavlink.handover_guards import (
 )
 from uavctl.mavlink.handover_states import TRANSITIONS, HandoverEvent, HandoverState, SetpointMode
 from uavctl.mavlink.mode_reason import ModeReason
-from uavctl.mavlink.profile import profile_of
+from uavctl.mavlink.profile import find_profile
 from uavctl.mavlink.requests import PendingRequest, RequestKind, RequestLimits
 from uavctl.records import ORDER_ACCEPTED, ORDER_REFUSED, Command, Event, Order, Severity, VehicleStatus
 
@@ -35,9 +35,9 @@ LAND_TRIES = 5
 NEW_HEARTBEAT_NS = 100_000_000  # a heartbeat is news for so long: two ticks
 MISSING_HEARTBEAT_NS = 1_500_000_000  # one that was due is missing
 FOREVER_NS = 2**62
-_OVER = frozenset({HandoverState.DONE, HandoverState.FAILED})
+_END_STATES = frozenset({HandoverState.DONE, HandoverState.FAILED})
 _ON_THE_GROUND = frozenset({HandoverState.MODE, HandoverState.ARMING})
-_BEGUN = frozenset(
+_MOVING_STATES = frozenset(
     {
         HandoverState.CLIMBING,
         HandoverState.ENGAGING,
@@ -47,7 +47,7 @@ _BEGUN = frozenset(
         HandoverState.SETTLING,
     }
 )
-_PLAIN = frozenset(HandoverState) - {
+_ROUTINE_STATES = frozenset(HandoverState) - {
     HandoverState.FAILSAFE,
     HandoverState.UNCLEAR,
     HandoverState.RELEASED,
@@ -55,16 +55,18 @@ _PLAIN = frozenset(HandoverState) - {
     HandoverState.FAILED,
 }
 # In these it counts which mode the vehicle was in as they were entered.
-_NOTES_MODE = frozenset({HandoverState.MODE, HandoverState.RETURNING, HandoverState.FAILSAFE, HandoverState.LANDING})
+_STATES_STORING_MODE = frozenset(
+    {HandoverState.MODE, HandoverState.RETURNING, HandoverState.FAILSAFE, HandoverState.LANDING}
+)
 # A failsafe that ends one of these, and ends itself, has interrupted the climb only.
 _CLIMB_STATES = frozenset({HandoverState.ARMING, HandoverState.CLIMBING, HandoverState.ENGAGING})
-_TAKEN = frozenset({HandoverState.FAILSAFE, HandoverState.UNCLEAR})
-_PROMISES = {
+_TAKEN_OVER_STATES = frozenset({HandoverState.FAILSAFE, HandoverState.UNCLEAR})
+_ORDER_TEXTS = {
     Order.TAKE_OFF: "will take off",
     Order.ENGAGE: "asks for the mode that takes setpoints",
     Order.STAND_BY: "leaves a vehicle alone that is found armed",
 }
-HAND_OVER_ORDERS = frozenset(_PROMISES)  # the others are the controller's
+HAND_OVER_ORDERS = frozenset(_ORDER_TEXTS)  # the others are the controller's
 
 
 class StateTransition(msgspec.Struct, frozen=True):
@@ -131,12 +133,12 @@ class HandoverStateMachine:
     @property
     def has_begun(self) -> bool:
         """Whether the vehicle is on its way up or down at our request, or by a failsafe on a flight that we began."""
-        return self.state in _BEGUN
+        return self.state in _MOVING_STATES
 
     @property
     def is_finished(self) -> bool:
         """Whether nothing more will be sent, whatever comes."""
-        return self.state in _OVER and not self.is_relay_needed
+        return self.state in _END_STATES and not self.is_relay_needed
 
     @property
     def is_relay_needed(self) -> bool:
@@ -185,7 +187,7 @@ class HandoverStateMachine:
             progress.first_heard_ns = inputs.at_ns
         self.update_airborne(inputs.at_ns, inputs.vehicle)
         result = evaluate(progress, inputs)
-        if inputs.vehicle is not None and inputs.vehicle.mode in profile_of(inputs.vehicle).landing_modes:
+        if inputs.vehicle is not None and inputs.vehicle.mode in find_profile(inputs.vehicle).landing_modes:
             progress.is_failsafe_landing = is_in_failsafe(inputs.vehicle)
         if before is HandoverState.FAILSAFE and inputs.vehicle is not None and is_in_failsafe(inputs.vehicle):
             # One failsafe may follow another, and ArduPilot stays in its mode.
@@ -239,7 +241,7 @@ class HandoverStateMachine:
     def _accept_orders(self, inputs: HandoverInput) -> list[Event]:
         events = []
         for command in inputs.commands:
-            if command.order not in _PROMISES:
+            if command.order not in _ORDER_TEXTS:
                 continue
             refusal = self._explain_refusal(command, inputs)
             if not refusal and command.order is Order.TAKE_OFF:
@@ -247,7 +249,7 @@ class HandoverStateMachine:
             elif not refusal and command.order is Order.STAND_BY:
                 self._progress.is_standing_by, self._progress.previous_flight_ns = True, command.flown_ns
             code, severity = (ORDER_REFUSED, Severity.WARNING) if refusal else (ORDER_ACCEPTED, Severity.INFO)
-            text = refusal or _PROMISES[command.order]
+            text = refusal or _ORDER_TEXTS[command.order]
             events.append(Event(at_ns=inputs.at_ns, severity=severity, code=code, text=text))
         return events
 
@@ -278,12 +280,12 @@ class HandoverStateMachine:
         """Whether neutral setpoints do no harm: they would end ArduPilot's climb."""
         if self.state not in TAKING_OFF or inputs.vehicle is None:
             return True
-        return profile_of(inputs.vehicle).climbs_on_arming
+        return find_profile(inputs.vehicle).climbs_on_arming
 
     def _enter_state(self, before: HandoverState, result: GuardResult, inputs: HandoverInput) -> None:
         progress = self._progress
         progress.state_start_ns, progress.is_standing_by = inputs.at_ns, False
-        if progress.state in _TAKEN and before not in _TAKEN:
+        if progress.state in _TAKEN_OVER_STATES and before not in _TAKEN_OVER_STATES:
             progress.is_climb_interrupted = before in _CLIMB_STATES
         if progress.state is HandoverState.FAILSAFE:
             failsafe_text = "" if inputs.vehicle is None else inputs.vehicle.said
@@ -300,7 +302,7 @@ class HandoverStateMachine:
         if progress.state is HandoverState.ARMING:
             progress.ground_height_m = inputs.estimated_height_m
         takes_control_back = progress.state is HandoverState.ENGAGING and before is HandoverState.FAILSAFE
-        if (takes_control_back or progress.state in _NOTES_MODE) and inputs.vehicle is not None:
+        if (takes_control_back or progress.state in _STATES_STORING_MODE) and inputs.vehicle is not None:
             progress.previous_mode = inputs.vehicle.mode
         if result.granted_ns is not None:
             progress.granted_ns = result.granted_ns
@@ -310,7 +312,7 @@ class HandoverStateMachine:
             self.failure = self.failure or result.reason
 
     def _choose_request(self, inputs: HandoverInput) -> RequestKind | None:
-        climbs_on_arming = inputs.vehicle is not None and profile_of(inputs.vehicle).climbs_on_arming
+        climbs_on_arming = inputs.vehicle is not None and find_profile(inputs.vehicle).climbs_on_arming
         is_external = inputs.vehicle is not None and inputs.vehicle.external
         requests = {
             HandoverState.MODE: RequestKind.TAKE_OFF_MODE,
@@ -384,7 +386,7 @@ class HandoverStateMachine:
         if has_changed:
             vehicle = inputs.vehicle
             mode = "" if vehicle is None else f" ({vehicle.mode}, {'armed' if vehicle.armed else 'disarmed'})"
-            is_routine = self.state in _PLAIN and before is not HandoverState.FAILSAFE
+            is_routine = self.state in _ROUTINE_STATES and before is not HandoverState.FAILSAFE
             severity = Severity.INFO if is_routine else Severity.WARNING
             text = f"{before} -> {self.state}{mode}"
             if result.mode_reason is not None:

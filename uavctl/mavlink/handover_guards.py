@@ -18,9 +18,9 @@ import msgspec
 
 from uavctl.config.connections import HandOverConfig
 from uavctl.mavlink.handover_states import HandoverEvent, HandoverState
-from uavctl.mavlink.messages import Ack, Text
+from uavctl.mavlink.messages import CommandAck, StatusText
 from uavctl.mavlink.mode_reason import VEHICLE_REASONS, ModeReason, determine_mode_reason, is_autonomous_mode
-from uavctl.mavlink.profile import PROFILES, profile_of
+from uavctl.mavlink.profile import PROFILES, find_profile
 from uavctl.mavlink.requests import PendingRequest
 from uavctl.records import Command, Order, VehicleStatus
 
@@ -70,7 +70,7 @@ class HandoverInput(msgspec.Struct, frozen=True, kw_only=True):
     estimated_height_m: float | None = None  # height of the estimate in local NED [m]; None without one
     climb_rate_mps: float = 0.0  # its rate of climb [m/s]
     has_motion: bool = False  # the vehicle sends its velocity or attitude now, whatever its heartbeats do
-    messages: tuple[Ack | Text, ...] = ()  # the vehicle's answers and words since the last tick
+    messages: tuple[CommandAck | StatusText, ...] = ()  # the vehicle's answers and words since the last tick
     commands: tuple[Command, ...] = ()  # the operator's orders
 
 
@@ -176,7 +176,7 @@ def evaluate(progress: HandoverProgress, inputs: HandoverInput) -> GuardResult:
     result = GuardResult(HandoverEvent.SILENCE)
     if vehicle is not None and not is_silent(inputs.at_ns, vehicle):
         result = _GUARDS.get(state, _guard_standby)(progress, inputs, vehicle)
-    is_landing = vehicle is not None and vehicle.mode in profile_of(vehicle).landing_modes
+    is_landing = vehicle is not None and vehicle.mode in find_profile(vehicle).landing_modes
     is_taken_over = result.event in (HandoverEvent.UNCLEAR, HandoverEvent.OTHER)
     if is_taken_over and not is_landing and state not in (HandoverState.WAITING, HandoverState.READY):
         return result  # whatever ends the flight: what the pilot has taken is asked for nothing
@@ -229,7 +229,7 @@ def is_without_pilot(progress: HandoverProgress, vehicle: VehicleStatus | None) 
     """Whether a vehicle that we took off flies by itself, and nothing shows that a person has it."""
     if progress.take_off_ordered_ns is None or vehicle is None or vehicle.landed or vehicle.stick:
         return False
-    return is_autonomous_mode(vehicle) or vehicle.external or vehicle.mode in profile_of(vehicle).climb_modes
+    return is_autonomous_mode(vehicle) or vehicle.external or vehicle.mode in find_profile(vehicle).climb_modes
 
 
 def _is_landing_ordered(progress: HandoverProgress, inputs: HandoverInput) -> bool:
@@ -244,7 +244,7 @@ def _find_wait_timeout(progress: HandoverProgress, inputs: HandoverInput) -> str
     is_unclear = progress.state is HandoverState.UNCLEAR
     if is_unclear and not is_without_pilot(progress, vehicle):
         return ""
-    is_landing = vehicle is not None and vehicle.mode in profile_of(vehicle).landing_modes
+    is_landing = vehicle is not None and vehicle.mode in find_profile(vehicle).landing_modes
     start_ns, limit_s = progress.state_start_ns, config.land_s if is_landing else config.climb_s
     if progress.is_climb_interrupted and not is_landing and progress.climb_start_ns is not None:
         start_ns = progress.climb_start_ns
@@ -331,7 +331,7 @@ def _has_started_since(progress: HandoverProgress, inputs: HandoverInput) -> boo
 
 
 def _guard_mode(progress: HandoverProgress, inputs: HandoverInput, vehicle: VehicleStatus) -> GuardResult:
-    profile = profile_of(vehicle)
+    profile = find_profile(vehicle)
     if vehicle.armed:
         return _classify_takeover(progress, vehicle)
     if vehicle.alone and vehicle.mode == profile.take_off_mode:
@@ -353,7 +353,7 @@ def _is_after_grant(progress: HandoverProgress, vehicle: VehicleStatus, after_ns
 
 
 def _guard_arming(progress: HandoverProgress, _inputs: HandoverInput, vehicle: VehicleStatus) -> GuardResult:
-    profile, granted_ns = profile_of(vehicle), progress.request.granted_ns
+    profile, granted_ns = find_profile(vehicle), progress.request.granted_ns
     # Disarmed it has not climbed, so it is not where PX4's climb ends.
     if vehicle.mode != profile.take_off_mode and not (vehicle.armed and vehicle.mode in profile.climb_modes):
         return _classify_takeover(progress, vehicle)
@@ -365,7 +365,7 @@ def _guard_arming(progress: HandoverProgress, _inputs: HandoverInput, vehicle: V
 def _guard_climbing(progress: HandoverProgress, inputs: HandoverInput, vehicle: VehicleStatus) -> GuardResult:
     if not (vehicle.armed or progress.may_be_outdated(vehicle)):
         return GuardResult(HandoverEvent.DISARMED, _DISARMED)
-    profile = profile_of(vehicle)
+    profile = find_profile(vehicle)
     if vehicle.mode not in profile.climb_modes:
         return _classify_takeover(progress, vehicle)
     if (
@@ -398,7 +398,7 @@ def _guard_external(progress: HandoverProgress, _inputs: HandoverInput, vehicle:
     if vehicle.external or granted_ns is not None:
         return GuardResult(HandoverEvent.GRANTED, granted_ns=granted_ns)
     is_engaging = progress.state is HandoverState.ENGAGING
-    if vehicle.mode == progress.previous_mode or (is_engaging and vehicle.mode in profile_of(vehicle).climb_modes):
+    if vehicle.mode == progress.previous_mode or (is_engaging and vehicle.mode in find_profile(vehicle).climb_modes):
         return GuardResult(HandoverEvent.PENDING)
     return _classify_takeover(progress, vehicle)
 
@@ -411,7 +411,7 @@ def _guard_failsafe(progress: HandoverProgress, inputs: HandoverInput, vehicle: 
         )
     if is_ordered(inputs, Order.ENGAGE) and not explain_engage_refusal(progress.state, inputs):
         return GuardResult(HandoverEvent.ENGAGE)
-    profile = profile_of(vehicle)
+    profile = find_profile(vehicle)
     if progress.is_climb_interrupted and vehicle.mode in profile.climb_modes:
         return GuardResult(HandoverEvent.GRANTED)
     stays_in_failsafe = not profile.restores_mode and vehicle.mode == progress.previous_mode and not vehicle.stick
@@ -436,7 +436,7 @@ def _guard_landing(progress: HandoverProgress, _inputs: HandoverInput, vehicle: 
     is_new_heartbeat, is_requesting = vehicle.at_ns > progress.state_start_ns, progress.state is HandoverState.LANDING
     if not vehicle.armed:
         return GuardResult(HandoverEvent.DISARMED if is_new_heartbeat else HandoverEvent.PENDING)
-    profile, is_ordered_flight = profile_of(vehicle), progress.take_off_ordered_ns is not None
+    profile, is_ordered_flight = find_profile(vehicle), progress.take_off_ordered_ns is not None
     if vehicle.mode in profile.landing_modes:
         # A failsafe lands only until it ends: what we took off is to land whatever comes.
         is_our_landing = not (is_ordered_flight and is_in_failsafe(vehicle)) or progress.request.granted_ns is not None

@@ -24,7 +24,7 @@ from uavctl.mavlink.framing import HEADER_V1, HEADER_V2, add_checksum
 _SENDER_V1, _SENDER_V2 = 3, 5  # index of the system id; the component's follows
 
 
-class Fields(Protocol):
+class MessageFields(Protocol):
     """Decoded frame: the fields of its message by their names, an array as a tuple, a text as its bytes."""
 
     msgname: str
@@ -49,12 +49,12 @@ class MessageLayout:
             ends = accumulate((1, 1, 1, *kind.lengths), initial=0)
             self._grouped = itemgetter(*(i if j - i == 1 else slice(i, j) for i, j in pairwise(ends)))
 
-    def unpack(self, frame: bytes) -> Fields:
+    def unpack(self, frame: bytes) -> MessageFields:
         """The fields of a whole frame of this kind; bytes that its payload lacks are 0, those too many dropped."""
         start, sender = (HEADER_V2, _SENDER_V2) if frame[0] == mavlink.PROTOCOL_MARKER_V2 else (HEADER_V1, _SENDER_V1)
         payload = frame[start : start + frame[1]].ljust(self._struct.size, b"\0")
         values = (self._name, frame[sender], frame[sender + 1], *self._struct.unpack_from(payload))
-        fields: Fields = self._make(values if self._grouped is None else self._grouped(values))
+        fields: MessageFields = self._make(values if self._grouped is None else self._grouped(values))
         return fields
 
     def pack(self, address: tuple[int, int], number: int, *fields: Any) -> bytes:
@@ -83,7 +83,7 @@ _ESCAPES = re.compile(
 )
 
 
-def plain_text(text: str) -> str:
+def strip_escapes(text: str) -> str:
     """A text that somebody else wrote, without what would act on the terminal that shows it.
 
     Escape sequences go, as PX4's colours; any other character that is not printable becomes a question mark.
@@ -91,6 +91,6 @@ def plain_text(text: str) -> str:
     return "".join(character if character.isprintable() else "?" for character in _ESCAPES.sub("", text))
 
 
-def text_of(raw: bytes) -> str:
+def decode_text(raw: bytes) -> str:
     """A text of a fixed length, up to its first zero, as it may be shown."""
-    return plain_text(raw.split(b"\0", 1)[0].decode("utf-8", errors="replace"))
+    return strip_escapes(raw.split(b"\0", 1)[0].decode("utf-8", errors="replace"))

@@ -49,7 +49,7 @@ class TimeSync(Message, frozen=True, kw_only=True):
     ts1_ns: int
 
 
-class Landed(Message, frozen=True, kw_only=True):
+class LandedState(Message, frozen=True, kw_only=True):
     """EXTENDED_SYS_STATE; None while the vehicle does not know. `own_climb`: it takes off, or lands, by itself."""
 
     landed: bool | None
@@ -82,7 +82,7 @@ class ModeCommand(Message, frozen=True, kw_only=True):
     target_system: int
 
 
-class Text(Message, frozen=True, kw_only=True):
+class StatusText(Message, frozen=True, kw_only=True):
     """STATUSTEXT, or a piece of a long one."""
 
     severity: int  # MAV_SEVERITY, 0 the worst, 7 the least
@@ -92,7 +92,7 @@ class Text(Message, frozen=True, kw_only=True):
     has_more: bool = False  # another piece follows
 
 
-class Ack(Message, frozen=True, kw_only=True):
+class CommandAck(Message, frozen=True, kw_only=True):
     """COMMAND_ACK; `result` is MAV_RESULT, 0 accepted; target 0 is for everybody."""
 
     command: int

@@ -14,7 +14,7 @@ from enum import StrEnum
 
 import msgspec
 
-from uavctl.mavlink.profile import ModeChoice, profile_of
+from uavctl.mavlink.profile import ModeChoice, find_profile
 from uavctl.records import VehicleStatus
 
 # How long texts, fence, stick and mode commands count as evidence: two periods of the heartbeat.
@@ -23,13 +23,13 @@ NEVER_NS = -(2**63)
 STICK_US = 100  # smallest movement of a channel by a person: a tenth of its range
 # Words of a failsafe that chooses a mode, in texts of any severity: PX4's commander; ArduCopter's events.cpp,
 # ekf_check.cpp, crash_check.cpp.
-_FAILSAFE = re.compile(r"failsafe|terminat|parachute|\bcrash|dead.?reckon", re.IGNORECASE)
-_FENCE = re.compile(r"fence.*(breach|violat|exceed)|(breach|violat|exceed|outside|beyond).*fence", re.IGNORECASE)
+_FAILSAFE_TEXT = re.compile(r"failsafe|terminat|parachute|\bcrash|dead.?reckon", re.IGNORECASE)
+_FENCE_TEXT = re.compile(r"fence.*(breach|violat|exceed)|(breach|violat|exceed|outside|beyond).*fence", re.IGNORECASE)
 # What speaks of an end, of a setting, or of why the vehicle does not arm, is no failsafe of a vehicle in flight.
-_OTHER = re.compile(
+_OTHER_TEXT = re.compile(
     r"clear|resolved|recovered|\bended|enabled|disabled|^(pre-?arm|arm|arming|preflight)\b", re.IGNORECASE
 )
-_RADIO = re.compile(r"\b(radio|rc|manual control|remote)\b", re.IGNORECASE)
+_RADIO_TEXT = re.compile(r"\b(radio|rc|manual control|remote)\b", re.IGNORECASE)
 
 
 class ModeReason(StrEnum):
@@ -48,22 +48,22 @@ PERSON_REASONS = frozenset({ModeReason.PILOT, ModeReason.GROUND_STATION})
 
 def reports_fence_breach(text: str) -> bool:
     """Whether a text of the vehicle says that it is beyond a fence of its own."""
-    return bool(_FENCE.search(text)) and not _OTHER.search(text)
+    return bool(_FENCE_TEXT.search(text)) and not _OTHER_TEXT.search(text)
 
 
 def reports_failsafe(text: str) -> bool:
     """Whether a text of the vehicle says that a failsafe of its own acts."""
-    return bool(_FAILSAFE.search(text)) and not _OTHER.search(text)
+    return bool(_FAILSAFE_TEXT.search(text)) and not _OTHER_TEXT.search(text)
 
 
 def mentions_radio(text: str) -> bool:
     """Whether a text that speaks of a failsafe speaks of the remote control: then its sticks move by themselves."""
-    return bool(_RADIO.search(text))
+    return bool(_RADIO_TEXT.search(text))
 
 
 def is_autonomous_mode(vehicle: VehicleStatus) -> bool:
     """Whether its mode is one that needs no person: nobody may be there."""
-    return profile_of(vehicle).mode_choices.get(vehicle.mode, ModeChoice.PERSON) is not ModeChoice.PERSON
+    return find_profile(vehicle).mode_choices.get(vehicle.mode, ModeChoice.PERSON) is not ModeChoice.PERSON
 
 
 def determine_mode_reason(vehicle: VehicleStatus, *, was_in_failsafe: bool = False) -> ModeReason:
@@ -73,7 +73,7 @@ def determine_mode_reason(vehicle: VehicleStatus, *, was_in_failsafe: bool = Fal
         vehicle: its status, with what it said within the last seconds.
         had_failed: a failsafe had chosen the mode of before; what it said may be of then.
     """
-    profile = profile_of(vehicle)
+    profile = find_profile(vehicle)
     choice = profile.mode_choices.get(vehicle.mode)
     vehicle_reason = ModeReason.FENCE if vehicle.fence else ModeReason.FAILSAFE if vehicle.failsafe else None
     if choice is ModeChoice.FAILSAFE:

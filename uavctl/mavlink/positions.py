@@ -197,7 +197,7 @@ class PositionDecoder:
 
     def _is_within_budget(self, message: Position, received_ns: int) -> bool:
         """Whether one more sample is looked at; each sample of a settled source is."""
-        self.is_settled = self._clocks.message_count(_key(message)) >= SETTLED_SAMPLES
+        self.is_settled = self._clocks.message_count(_find_key(message)) >= SETTLED_SAMPLES
         if self.is_settled:
             self._settled_ns = received_ns
             return True
@@ -220,7 +220,7 @@ class PositionDecoder:
 
     def _estimate_capture_ns(self, message: Position, received_ns: int) -> int | StampRefusal:
         address = (message.system, message.component)
-        clock = self._clocks.record_message(_key(message), received_ns, self._make_clock)
+        clock = self._clocks.record_message(_find_key(message), received_ns, self._make_clock)
         stamp_ns: int | None = None
         if message.boot_ms and message.stamp_us is not None:
             stamp_ns = clock.unwrap_ns(message.stamp_us // 1000, BOOT_MS_WRAP, 1_000_000)
@@ -247,7 +247,7 @@ class PositionDecoder:
         return unit is StampUnit.MICROSECONDS
 
 
-def _key(message: Position) -> tuple[Address, bool]:
+def _find_key(message: Position) -> tuple[Address, bool]:
     """Return whose clock stamps a message, and which of its clocks."""
     return (message.system, message.component), message.boot_ms
 

@@ -68,22 +68,22 @@ _COPTER_TYPES = frozenset(
 )
 
 
-def _mode_names(prefix: str) -> dict[int, str]:
+def _read_mode_names(prefix: str) -> dict[int, str]:
     """Return the names of an enum of modes by their numbers."""
     named = {name.removeprefix(prefix): int(getattr(mavlink, name)) for name in dir(mavlink) if name.startswith(prefix)}
     return {number: name for name, number in named.items() if name != "ENUM_END"}
 
 
 # ArduPilot: the enum of modes of each kind of vehicle; ArduPlane's is that of a plane that can hover, too
-_COPTER, _PLANE, _ROVER = map(_mode_names, ("COPTER_MODE_", "PLANE_MODE_", "ROVER_MODE_"))
+_COPTER, _PLANE, _ROVER = map(_read_mode_names, ("COPTER_MODE_", "PLANE_MODE_", "ROVER_MODE_"))
 _ARDUPILOT = {
     **dict.fromkeys(_COPTER_TYPES, _COPTER),
     mavlink.MAV_TYPE_FIXED_WING: _PLANE,
     **dict.fromkeys(range(mavlink.MAV_TYPE_VTOL_DUOROTOR, mavlink.MAV_TYPE_VTOL_RESERVED5 + 1), _PLANE),
     mavlink.MAV_TYPE_GROUND_ROVER: _ROVER,
     mavlink.MAV_TYPE_SURFACE_BOAT: _ROVER,
-    mavlink.MAV_TYPE_SUBMARINE: _mode_names("SUB_MODE_"),
-    mavlink.MAV_TYPE_ANTENNA_TRACKER: _mode_names("TRACKER_MODE_"),
+    mavlink.MAV_TYPE_SUBMARINE: _read_mode_names("SUB_MODE_"),
+    mavlink.MAV_TYPE_ANTENNA_TRACKER: _read_mode_names("TRACKER_MODE_"),
 }
 # Who chooses the modes of a copter: ArduCopter/events.cpp, fence.cpp, avoidance_adsb.cpp.
 _COPTER_EITHER = frozenset({"AUTO", "AUTO_RTL", "AUTOROTATE", "BRAKE", "LAND", "RTL", "SMART_RTL"})
@@ -93,7 +93,7 @@ _PX4_CHOICES = {name: choice for name, choice in _PX4_MAIN.values() if name != "
 _COPTER_CHOICES = {name: _E if name in _COPTER_EITHER else _P for name in _COPTER.values()} | {"AVOID_ADSB": _F}
 
 
-def _px4_mode(vehicle_type: int, custom_mode: int) -> str:
+def _name_px4_mode(vehicle_type: int, custom_mode: int) -> str:
     del vehicle_type
     main, sub = custom_mode >> 16 & 0xFF, custom_mode >> 24 & 0xFF
     name = _PX4_MAIN[main][0] if main in _PX4_MAIN else f"MODE_{main}"
@@ -102,7 +102,7 @@ def _px4_mode(vehicle_type: int, custom_mode: int) -> str:
     return f"AUTO.{_PX4_AUTO[sub][0] if sub in _PX4_AUTO else sub}"
 
 
-def _ardupilot_mode(vehicle_type: int, custom_mode: int) -> str:
+def _name_ardupilot_mode(vehicle_type: int, custom_mode: int) -> str:
     names = _ARDUPILOT.get(vehicle_type)
     return "" if names is None else names.get(custom_mode, f"MODE_{custom_mode}")
 
@@ -150,7 +150,7 @@ PROFILES = {
         needs_global_origin=False,
         number=mavlink.MAV_AUTOPILOT_PX4,
         inertial_messages=(mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, mavlink.MAVLINK_MSG_ID_HIGHRES_IMU),
-        mode_name=_px4_mode,
+        mode_name=_name_px4_mode,
         mode_parameters={"OFFBOARD": (6, 0), "AUTO.TAKEOFF": (4, 2)},
     ),
     # It climbs in GUIDED; a setpoint would end the climb.
@@ -167,7 +167,7 @@ PROFILES = {
         needs_global_origin=True,
         number=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
         inertial_messages=(mavlink.MAVLINK_MSG_ID_ATTITUDE, mavlink.MAVLINK_MSG_ID_RAW_IMU),
-        mode_name=_ardupilot_mode,
+        mode_name=_name_ardupilot_mode,
         mode_parameters={"GUIDED": (4, 0)},
     ),
 }
@@ -175,12 +175,12 @@ PROFILES = {
 _NAMES = {profile.number: name for name, profile in PROFILES.items()}
 
 
-def profile_of(vehicle: VehicleStatus) -> AutopilotProfile:
+def find_profile(vehicle: VehicleStatus) -> AutopilotProfile:
     """Return the autopilot's profile; that of PX4 for one that is not known, which is never asked for a mode."""
     return PROFILES.get(vehicle.autopilot, PROFILES["px4"])
 
 
-def autopilot_name(autopilot: int) -> str:
+def find_autopilot_name(autopilot: int) -> str:
     """`px4`, `ardupilot` or `unknown` of MAV_AUTOPILOT."""
     return _NAMES.get(autopilot, "unknown")
 

@@ -15,7 +15,7 @@ from enum import StrEnum
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.arrays import SECOND_NS
-from uavctl.mavlink.messages import Ack, Text
+from uavctl.mavlink.messages import CommandAck, StatusText
 
 SHOWN_NS = 3 * SECOND_NS  # heartbeats, at 1 Hz, show by then what was granted
 _FINAL = frozenset({mavlink.MAV_RESULT_DENIED, mavlink.MAV_RESULT_UNSUPPORTED})
@@ -73,9 +73,9 @@ class PendingRequest:
         self.requested_ns: int | None = None  # when it was made last
         self.granted_ns: int | None = None  # when it was accepted last
 
-    def handle_message(self, message: Ack | Text, at_ns: int) -> None:
+    def handle_message(self, message: CommandAck | StatusText, at_ns: int) -> None:
         """Take what the vehicle says."""
-        if isinstance(message, Text):
+        if isinstance(message, StatusText):
             if message.severity <= mavlink.MAV_SEVERITY_WARNING and message.text not in self._texts:
                 self._texts = [*self._texts, message.text][-_MAX_TEXTS:]
         elif self.kind is not None and self._tries and message.command == COMMANDS[self.kind]:

@@ -20,7 +20,7 @@ from enum import StrEnum
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.mavlink.codec import MAX_DATAGRAM_BYTES
-from uavctl.mavlink.framing import CHECKSUM, BadBytes, add_checksum, scan
+from uavctl.mavlink.framing import CHECKSUM, SkipReason, add_checksum, scan_frames
 
 KEY_BYTES = 32
 EPOCH_NS = 1_420_070_400_000_000_000  # 1st January 2015, UTC
@@ -173,10 +173,10 @@ class FrameSigner:
         return SignatureRefusal.STALE if stamp + MAX_NEW_STREAM_LAG < current else None
 
     def _current_timestamp(self, at_ns: int) -> int:
-        return signing_timestamp(at_ns + self._offset_ns)
+        return make_timestamp(at_ns + self._offset_ns)
 
 
-def signing_timestamp(wall_ns: int) -> int:
+def make_timestamp(wall_ns: int) -> int:
     """The stamp of a time of the wall clock (UTC, since 1970) [ns]."""
     return max(0, (wall_ns - EPOCH_NS) // TIMESTAMP_UNIT_NS)
 
@@ -210,10 +210,10 @@ class FrameAuthenticator:
     def verify_frames(self, data: bytes, at_ns: int) -> bytes:
         """The verified frames of a datagram or chunk, without their signatures; empty if there are none."""
         if not self._is_stream and len(data) > MAX_DATAGRAM_BYTES:
-            self.refused[BadBytes.OVERSIZE] += 1
+            self.refused[SkipReason.OVERSIZE] += 1
             return b""
         data = self._buffer + data
-        result = scan(
+        result = scan_frames(
             data,
             final=not self._is_stream,
             is_aligned=self._is_aligned,

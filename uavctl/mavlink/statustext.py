@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
-from uavctl.mavlink.messages import Text
+from uavctl.mavlink.messages import StatusText
 
 CHUNK_WAIT_NS = 1_000_000_000  # for the pieces that are to come; PX4 sends them at once
 MAX_PARTIAL_TEXTS = 16  # texts under way
@@ -14,12 +14,12 @@ MISSING_CHUNK = "…"  # stands for a piece that did not come
 class _PartialText(msgspec.Struct):
     """Text of which more pieces are to come."""
 
-    first: Text
+    first: StatusText
     text: str
     next_chunk: int
     at_ns: int
 
-    def finish(self) -> Text:
+    def finish(self) -> StatusText:
         """Return the text as far as it has come, with a mark for the part that is missing."""
         return _make_text(self.first, self.text + MISSING_CHUNK)
 
@@ -30,11 +30,11 @@ class StatusTextAssembler:
     def __init__(self) -> None:
         self._partial_texts: dict[tuple[int, int], _PartialText] = {}
 
-    def add_chunk(self, text: Text, at_ns: int) -> tuple[Text, ...]:
+    def add_chunk(self, text: StatusText, at_ns: int) -> tuple[StatusText, ...]:
         """Take a piece, or a whole text; the texts that are whole now."""
         sender = text.system, text.component
         partial = self._partial_texts.get(sender)
-        finished: tuple[Text, ...] = ()
+        finished: tuple[StatusText, ...] = ()
         if partial is not None and (partial.first.text_id != text.text_id or text.chunk < partial.next_chunk):
             finished = (self._partial_texts.pop(sender).finish(),)
             partial = None
@@ -50,11 +50,11 @@ class StatusTextAssembler:
             return finished
         return (*finished, partial.finish())
 
-    def flush_overdue(self, at_ns: int) -> tuple[Text, ...]:
+    def flush_overdue(self, at_ns: int) -> tuple[StatusText, ...]:
         """The texts whose rest has not come."""
         overdue = [sender for sender, partial in self._partial_texts.items() if at_ns - partial.at_ns > CHUNK_WAIT_NS]
         return tuple(self._partial_texts.pop(sender).finish() for sender in overdue)
 
 
-def _make_text(first: Text, text: str) -> Text:
-    return Text(system=first.system, component=first.component, severity=first.severity, text=text.rstrip())
+def _make_text(first: StatusText, text: str) -> StatusText:
+    return StatusText(system=first.system, component=first.component, severity=first.severity, text=text.rstrip())

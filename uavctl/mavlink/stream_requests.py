@@ -15,7 +15,7 @@ from uavctl.mavlink.messages import (
     Battery,
     GlobalOrigin,
     Inertial,
-    Landed,
+    LandedState,
     Message,
     ParamValue,
     Position,
@@ -66,7 +66,7 @@ class StreamRequests:
                 self._received.add(LOCAL_POSITION_NED)
             case Attitude(quaternion=False):
                 self._received.add(ATTITUDE)
-            case Landed():
+            case LandedState():
                 self._received.add(EXTENDED_SYS_STATE)
             case Battery():
                 self._received.add(SYS_STATUS)

@@ -18,21 +18,21 @@ from uavctl.mavlink.boot_clock import BootClock
 from uavctl.mavlink.clocksync import ArrivalClock
 from uavctl.mavlink.codec import MODE_COMMANDS
 from uavctl.mavlink.messages import (
-    Ack,
     Attitude,
     Battery,
+    CommandAck,
     FenceBreach,
     Heartbeat,
     Inertial,
-    Landed,
+    LandedState,
     Message,
     ModeCommand,
     Position,
     RadioChannels,
-    Text,
+    StatusText,
 )
 from uavctl.mavlink.mode_reason import ModeReasonEvidence
-from uavctl.mavlink.profile import PROFILES, autopilot_name, describe_mode
+from uavctl.mavlink.profile import PROFILES, describe_mode, find_autopilot_name
 from uavctl.records import Event, InertialSample, Severity, Vec3, VehicleMotion, VehicleStatus
 
 SECOND_VEHICLE = "second-vehicle"
@@ -177,7 +177,7 @@ class VehicleMonitor:
 
     def handle_message(
         self, message: Message, at_ns: int
-    ) -> tuple[VehicleStatus | VehicleMotion | InertialSample | Event | Ack | Text, ...]:
+    ) -> tuple[VehicleStatus | VehicleMotion | InertialSample | Event | CommandAck | StatusText, ...]:
         """Take any message; only the vehicle's count."""
         if isinstance(message, Heartbeat) and is_vehicle(message):
             return self._handle_heartbeat(message, at_ns)
@@ -186,10 +186,10 @@ class VehicleMonitor:
         if self.address is None or message.system != self.address[0]:
             return ()
         if message.component != self.address[1]:  # a companion computer or gimbal of the same system: its words only
-            return (_text_event(message, at_ns),) if isinstance(message, Text) else ()
+            return (_make_text_event(message, at_ns),) if isinstance(message, StatusText) else ()
         self._heard_ns = at_ns
         match message:
-            case Landed(landed=landed, own_climb=own_climb):
+            case LandedState(landed=landed, own_climb=own_climb):
                 return self._update_landed(landed, own_climb)
             case Battery():
                 self._battery_v = self._battery_v if message.voltage_v is None else message.voltage_v
@@ -220,12 +220,16 @@ class VehicleMonitor:
                 return (
                     self._make_inertial_sample(message, at_ns) if not raw or (profile and profile.uses_raw_imu) else ()
                 )
-            case Text(text=text):
+            case StatusText(text=text):
                 self._evidence.add_text(text, at_ns)
-                return message, _text_event(message, at_ns), *self._update_evidence(at_ns)
-            case Ack() if self._is_for_us(message):
-                return (message,) if message.command in _UNREPORTED_COMMANDS else (message, _ack_event(message, at_ns))
-            case Ack(command=command, result=mavlink.MAV_RESULT_ACCEPTED) if command in MODE_COMMANDS:
+                return message, _make_text_event(message, at_ns), *self._update_evidence(at_ns)
+            case CommandAck() if self._is_for_us(message):
+                return (
+                    (message,)
+                    if message.command in _UNREPORTED_COMMANDS
+                    else (message, _make_ack_event(message, at_ns))
+                )
+            case CommandAck(command=command, result=mavlink.MAV_RESULT_ACCEPTED) if command in MODE_COMMANDS:
                 return self._handle_mode_command(message.target_system, message.system, at_ns)
         return ()
 
@@ -247,7 +251,7 @@ class VehicleMonitor:
         before, self._status = self._status, self._evidence.apply_to(self._status, at_ns, critical=self._is_in_failsafe)
         return () if self._status == before else (self._status,)
 
-    def _is_for_us(self, ack: Ack) -> bool:
+    def _is_for_us(self, ack: CommandAck) -> bool:
         system, component = self._own_address
         return ack.target_system in (0, system) and ack.target_component in (0, component)
 
@@ -362,7 +366,7 @@ class VehicleMonitor:
         is_ready = message.system_status not in _NOT_READY_STATES
         self.not_ready_count += self._is_ready and not is_ready
         self._is_ready = is_ready
-        autopilot = autopilot_name(message.autopilot)
+        autopilot = find_autopilot_name(message.autopilot)
         mode, external = describe_mode(autopilot, message.vehicle_type, message.custom_mode)
         self._is_in_failsafe = message.system_status in _FAILSAFE_STATES
         status = VehicleStatus(
@@ -382,26 +386,26 @@ class VehicleMonitor:
         return (self._status,)
 
 
-def _text_event(text: Text, at_ns: int) -> Event:
-    return Event(at_ns=at_ns, severity=_severity(text.severity), code="vehicle-text", text=text.text)
+def _make_text_event(text: StatusText, at_ns: int) -> Event:
+    return Event(at_ns=at_ns, severity=_convert_severity(text.severity), code="vehicle-text", text=text.text)
 
 
-def _severity(mav_severity: int) -> Severity:
+def _convert_severity(mav_severity: int) -> Severity:
     if mav_severity <= mavlink.MAV_SEVERITY_ERROR:
         return Severity.ERROR
     return Severity.WARNING if mav_severity == mavlink.MAV_SEVERITY_WARNING else Severity.INFO
 
 
-def _ack_event(ack: Ack, at_ns: int) -> Event:
+def _make_ack_event(ack: CommandAck, at_ns: int) -> Event:
     is_accepted = ack.result in (mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_IN_PROGRESS)
     return Event(
         at_ns=at_ns,
         severity=Severity.INFO if is_accepted else Severity.WARNING,
         code="command-ack",
-        text=f"{_enum_name('MAV_CMD', ack.command)}: {_enum_name('MAV_RESULT', ack.result)}",
+        text=f"{_find_enum_name('MAV_CMD', ack.command)}: {_find_enum_name('MAV_RESULT', ack.result)}",
     )
 
 
-def _enum_name(enum: str, value: int) -> str:
+def _find_enum_name(enum: str, value: int) -> str:
     entry = mavlink.enums[enum].get(value)
     return str(value) if entry is None else str(entry.name).removeprefix(f"{enum}_")

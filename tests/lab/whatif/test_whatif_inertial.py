@@ -23,7 +23,7 @@ from uavctl.lab.whatif.comparison import model_fit
 from uavctl.lab.whatif.flight import Relinked, Response, fly, history_of, response_of
 from uavctl.lab.whatif.rewrite import InertialFrames, shifted
 from uavctl.mavlink.codec import decode
-from uavctl.mavlink.framing import RawFrame, scan
+from uavctl.mavlink.framing import RawFrame, scan_frames
 from uavctl.mavlink.vehicle import VehicleMonitor
 from uavctl.records import Datagram, Decision, Event, InertialSample, Plan, Setpoint, StepInput, Truth, Vec3
 
@@ -50,7 +50,7 @@ class Speaker:
         mav = mavlink.MAVLink(None, 1, 1)
         mav.seq, self.number = self.number, self.number + 1
         packed = getattr(mavlink, f"MAVLink_{name}_message")(*fields).pack(mav, force_mavlink1=first_version)
-        (frame,) = scan(bytes(packed), final=True).frames
+        (frame,) = scan_frames(bytes(packed), final=True).frames
         return frame
 
     def beat(self) -> RawFrame:
@@ -153,7 +153,7 @@ def test_frames_that_cannot_be_mended_are_left_out_once_the_courses_part() -> No
     assert not heard(speaker.feels("highres_imu", 200_000, (0.5, 0.0, math.nan)), 200)
     assert (frames.moved, frames.left_out) == (1, 5)
     other = mavlink.MAVLink_raw_imu_message(220_000, 9, 9, 9, 0, 0, 0, 0, 0, 0).pack(mavlink.MAVLink(None, 2, 1))
-    (frame,) = scan(bytes(other), final=True).frames  # nobody follows that vehicle
+    (frame,) = scan_frames(bytes(other), final=True).frames  # nobody follows that vehicle
     assert frames.heard(frame, 220_000_000, BY) == frame.data and (frames.moved, frames.left_out) == (1, 5)
 
 
@@ -215,7 +215,7 @@ def test_the_true_quadrotor_holds_as_it_then_really_does(
 def test_without_an_attitude_inertial_data_are_left_out_and_positions_fly_on() -> None:
     def blind(data: bytes) -> bytes:
         return b"".join(
-            one.data for one in scan(data, final=True).frames if one.message_id not in (ATTITUDE, QUATERNION)
+            one.data for one in scan_frames(data, final=True).frames if one.message_id not in (ATTITUDE, QUATERNION)
         )
 
     entries = [
@@ -226,7 +226,9 @@ def test_without_an_attitude_inertial_data_are_left_out_and_positions_fly_on() -
     recorded = history_of(entries, config_of(PX4), "x")
     course = fly(recorded, config, build_controller(config), response_of(recorded, config.plant), memory, lambda: 0)
     assert course.inertial_moved == 0 and course.inertial_left_out > 500
-    came = [frame for one in memory.of(Datagram) if not one.outgoing for frame in scan(one.data, final=True).frames]
+    came = [
+        frame for one in memory.of(Datagram) if not one.outgoing for frame in scan_frames(one.data, final=True).frames
+    ]
     parted_ns = course.departure.begun_ns
     assert parted_ns is not None and sum(frame.message_id == HIGHRES for frame in came) < 20
     assert not any(one.inertial for one in memory.of(StepInput))

@@ -15,7 +15,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from uavctl.config.connections import DaemonConfig, FrameConfig
 from uavctl.frames import Frame, Quaternion, rotate_vector
 from uavctl.mavlink.codec import decode
-from uavctl.mavlink.framing import RawFrame, scan
+from uavctl.mavlink.framing import RawFrame, scan_frames
 from uavctl.mavlink.messages import Position
 from uavctl.mavlink.vehicle import GRAVITY_MPS2, VehicleMonitor
 from uavctl.records import InertialSample, Vec3
@@ -43,7 +43,7 @@ class SourceFrames:
 
     def seen(self, data: bytes) -> Iterator[PositionFrame]:
         """Return the positions in some bytes, in order."""
-        for frame in scan(data, final=True).frames:
+        for frame in scan_frames(data, final=True).frames:
             seen = self.position(frame)
             if seen is not None:
                 yield seen
