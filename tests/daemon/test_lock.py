@@ -77,8 +77,8 @@ def test_two_vehicles_do_not_meet(tmp_path: Path) -> None:
 @pytest.mark.fault(31, 35)
 def test_a_killed_holder_lets_go(tmp_path: Path) -> None:
     program = (
-        "import sys, time; from pathlib import Path; from uavctl.daemon.lock import sole_daemon\n"
-        "with sole_daemon(sys.argv[1], Path(sys.argv[2])): print('held', flush=True); time.sleep(60)"
+        "import sys, time; from pathlib import Path; from uavctl.daemon.lock import lock_vehicle\n"
+        "with lock_vehicle(sys.argv[1], Path(sys.argv[2])): print('held', flush=True); time.sleep(60)"
     )
     with subprocess.Popen([sys.executable, "-c", program, URL, str(tmp_path)], stdout=subprocess.PIPE) as process:
         assert process.stdout is not None and process.stdout.readline() == b"held\n"
@@ -92,9 +92,9 @@ def test_a_killed_holder_lets_go(tmp_path: Path) -> None:
 @pytest.mark.fault(31)
 def test_the_next_holder_is_told_of_a_vehicle_that_was_left_in_flight(tmp_path: Path) -> None:
     program = (
-        "import os, sys; from pathlib import Path; from uavctl.daemon.lock import sole_daemon\n"
-        "with sole_daemon(sys.argv[1], Path(sys.argv[2])) as tenure:\n"
-        "    for word in sys.argv[3:]: tenure.note({'yes': True, 'no': False, 'unheard': None}[word])\n"
+        "import os, sys; from pathlib import Path; from uavctl.daemon.lock import lock_vehicle\n"
+        "with lock_vehicle(sys.argv[1], Path(sys.argv[2])) as tenure:\n"
+        "    for word in sys.argv[3:]: tenure.update({'yes': True, 'no': False, 'unheard': None}[word])\n"
         "    os.abort()"
     )
 

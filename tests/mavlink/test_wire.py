@@ -132,42 +132,46 @@ POSITION, TURN = (1.0, -2.5, -0.0), (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))
 @pytest.mark.parametrize(
     ("method", "arguments", "want"),
     [
-        ("heartbeat", (), mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3)),
-        ("timesync", (-5, 2**63 - 1), mavlink.MAVLink_timesync_message(-5, 2**63 - 1)),
-        ("command", (21, (), 1, 2), mavlink.MAVLink_command_long_message(1, 2, 21, 0, *(0.0,) * 7)),
+        ("encode_heartbeat", (), mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3)),
+        ("encode_timesync", (-5, 2**63 - 1), mavlink.MAVLink_timesync_message(-5, 2**63 - 1)),
+        ("encode_command", (21, (), 1, 2), mavlink.MAVLink_command_long_message(1, 2, 21, 0, *(0.0,) * 7)),
         (
-            "command",
+            "encode_command",
             (400, (1.0, 21196.0), 1, 2),
             mavlink.MAVLink_command_long_message(1, 2, 400, 0, 1, 21196, 0, 0, 0, 0, 0),
         ),
         (
-            "origin",
+            "encode_global_origin",
             ((47.5, -8.25, 460.5), 3),
             mavlink.MAVLink_set_gps_global_origin_message(3, 475000000, -82500000, 460500),
         ),
         (
-            "request_parameter",
+            "encode_parameter_request",
             ("EKF2_EV_CTRL", 1, 2),
             mavlink.MAVLink_param_request_read_message(1, 2, b"EKF2_EV_CTRL", -1),
         ),
         (
-            "request_parameter",
+            "encode_parameter_request",
             ("SIXTEEN_LETTERS_", 1, 2),
             mavlink.MAVLink_param_request_read_message(1, 2, b"SIXTEEN_LETTERS_", -1),
         ),
         (
-            "request_interval",
+            "encode_interval_request",
             (32, 100_000, 1, 2),
             mavlink.MAVLink_command_long_message(1, 2, 511, 0, 32, 1e5, 0, 0, 0, 0, 0),
         ),
-        ("request_message", (49, 1, 2), mavlink.MAVLink_command_long_message(1, 2, 512, 0, 49, 0, 0, 0, 0, 0, 0)),
         (
-            "external_position",
+            "encode_message_request",
+            (49, 1, 2),
+            mavlink.MAVLink_command_long_message(1, 2, 512, 0, 49, 0, 0, 0, 0, 0, 0),
+        ),
+        (
+            "encode_external_position",
             (Pose("vision-position-estimate", 5, POSITION, TURN, None),),
             mavlink.MAVLink_vision_position_estimate_message(5, *POSITION, *euler_from_quaternion(TURN), UNKNOWN),
         ),
         (
-            "external_position",
+            "encode_external_position",
             (Pose("odometry", 2**64 - 1, POSITION, TURN, (0.5, 0.0, -0.5)),),
             mavlink.MAVLink_odometry_message(
                 2**64 - 1, 20, 12, *POSITION, TURN, 0.5, 0.0, -0.5, *(0.0,) * 3, UNKNOWN, UNKNOWN, 0, 6

@@ -145,7 +145,7 @@ class ControlServer:
             self._serve(idle, ticked.decision.at_ns)
 
     def close(self) -> None:
-        """End the service; clients that still wait are told so."""
+        """End the service; clients that still wait get a refusal."""
         for client, _ in self._pending:
             self._reply(client, Reply(ok=False, text="the flight ended before it decided on this"))
         for client in self._clients:
@@ -168,7 +168,7 @@ class ControlServer:
             try:
                 connection, _ = self._listener.accept()
             except OSError:
-                return  # nobody, or gone again
+                return  # no client, or it has gone
             connection.setblocking(False)
             _, uid, _ = _CREDENTIALS.unpack(
                 connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
@@ -179,7 +179,7 @@ class ControlServer:
                 connection.close()
 
     def _serve(self, client: _Client, now_ns: int) -> None:
-        """Read what a client has said and act on its first whole line."""
+        """Read from a client and handle its first complete line."""
         try:
             data = client.socket.recv(MAX_LINE)
         except BlockingIOError:
@@ -308,7 +308,7 @@ def _listen(path: Path, name: str) -> socket.socket:
 
 
 def _is_listening(path: Path) -> bool:
-    """Whether somebody listens there.
+    """Return whether a process listens on the socket.
 
     Raises:
         OSError: it is not ours.

@@ -18,14 +18,14 @@ from uavctl.mavlink.connection import HUNG_UP, OVERRUN
 from uavctl.outcome import Cause
 from uavctl.records import Event, Outgoing, Ticked
 
-READ_PAUSE_NS = 2_000_000  # after a read that gave nothing that the flight needs
-STALL_NS = 200_000_000  # without a look: what the system dropped meanwhile may have been the vehicle's newest state
-MAX_READ_AGE_NS = 150_000_000  # a look is so old at most when a setpoint goes out
+READ_PAUSE_NS = 2_000_000  # after a read without data for the flight
+STALL_NS = 200_000_000  # between reads: the system may have dropped the vehicle's newest state
+MAX_READ_AGE_NS = 150_000_000  # largest age of the last complete read at a setpoint
 MAX_READ_ROUNDS = 10  # at a backlog, before a tick
 WITHHELD = "withheld"
 
 AfterTick = Callable[[Ticked, int], None]
-"""Called with what a tick gave and its lateness [ns], once its setpoint is out; may neither wait nor raise."""
+"""Called with the result of a tick and its lateness [ns], after its setpoint; must neither wait nor raise."""
 
 
 def fly(
@@ -44,13 +44,13 @@ def fly(
     """Run the control loop in real time until it has handed the vehicle over.
 
     Args:
-        loop: the loop, which records whatever it sees and does.
+        loop: the loop, which records all its inputs and outputs.
         stop_requested: asked once a tick; the first True begins the hand-over.
         duration_s: the hand-over begins by itself after this time [s]; None flies on.
         stop_limit_s: the hand-over is cut off after this time [s], unless the vehicle is in the air by the positions
             that are relayed to it; 0 ends without one.
         after_tick: called in this order after each tick.
-        on_news: called with what a datagram or a lost connection brings for a person; may neither wait nor raise.
+        on_events: called with the events for people from a datagram or a lost connection; must neither wait nor raise.
         wait_for: sleeps until a deadline or the first arrival; gives the names of connections to read.
         now: the clock [ns].
 
@@ -69,7 +69,7 @@ def fly(
     def send(message: Outgoing) -> None:
         nonlocal withheld
         if message.link == VEHICLE and not reader.is_fresh:
-            withheld += 1  # who has the vehicle may have changed since the look
+            withheld += 1  # a pilot may have taken over since the last read
         else:
             connections[message.link].send(message.data)
 
@@ -80,7 +80,7 @@ def fly(
                 has_received = reader.read(wait_for(connections, due.at_ns))
                 if now() >= due.at_ns:
                     break
-                if not has_received:  # a flood: take what comes by the handful, not each by itself
+                if not has_received:  # a flood: read several datagrams at once
                     wait_for({}, min(due.at_ns, now() + READ_PAUSE_NS))
             if connections[VEHICLE].closed:
                 loop.course.close(f"{connections[VEHICLE].url}; nothing can be sent, and its own failsafe has it")
@@ -115,7 +115,7 @@ def fly(
 
 
 class _Reader:
-    """Hands on what arrives, and knows how old the last look is at what the vehicle says."""
+    """Passes arrivals to the loop, and knows the age of the last complete read."""
 
     def __init__(
         self,
@@ -131,11 +131,11 @@ class _Reader:
 
     @property
     def is_fresh(self) -> bool:
-        """Whether everything has been read that the vehicle had said a moment ago."""
+        """Whether the last complete read is recent enough to send a setpoint."""
         return self._complete_read_ns is not None and self._now() - self._complete_read_ns <= MAX_READ_AGE_NS
 
     def read(self, names: Iterable[str], *, read_all: bool = False) -> bool:
-        """Hand on what has arrived on the named connections; False if the flight needs nothing of it."""
+        """Pass on arrivals of the named connections; False if the flight needs none of them."""
         start_ns = self._now()
         has_stalled = start_ns - self._read_ns > STALL_NS
         has_received = False
@@ -172,7 +172,7 @@ class _Reader:
             self._connections[answer.link].send(answer.data)
 
     def _report_losses(self, has_stalled: bool) -> None:
-        """Tell what the system dropped while nobody looked. Losses in a flood are not told, and change nothing."""
+        """Report data that the system dropped during a stall. Losses in a flood are not reported."""
         for name, connection in self._connections.items():
             before, lost = self._lost[name], connection.count_lost()
             self._lost[name] = lost
@@ -181,7 +181,7 @@ class _Reader:
 
 
 class _RefusalReporter:
-    """Tells the loop once a second what the connections dropped."""
+    """Reports to the loop once a second what the connections dropped."""
 
     def __init__(
         self, loop: ControlLoop, connections: Mapping[str, Connection], on_events: Callable[[tuple[Event, ...]], None]
@@ -191,7 +191,7 @@ class _RefusalReporter:
         self._next_ns = 0
 
     def report(self, at_ns: int, *, is_last: bool = False) -> None:
-        """Tell what is new if a second has passed, a peer has hung up, or this is the last call."""
+        """Report new counts if a second has passed, a peer has hung up, or this is the last call."""
         hung_up = any(
             connection.refused[HUNG_UP] > self._reported[name][HUNG_UP]
             for name, connection in self._connections.items()

@@ -1,4 +1,4 @@
-"""What a flight is asked for: whether to arm and take off, where to go, and how long its end may take."""
+"""Orders of the command line: take-off, a position to go to, and the time limit of the end."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def make_goto_keys(place_m: Sequence[float]) -> dict[str, object]:
 
 
 class Engagement:
-    """Order of the command line (take-off, place to go to), and what became of it.
+    """Order of the command line (take-off, position to go to), and its progress.
 
     Attributes:
         goal: the place of `--goto`, local NED [m].
@@ -49,7 +49,7 @@ class Engagement:
         config: the configuration, `--goto` in it.
         take_off_m: height of the climb above the ground [m]; None leaves arming and modes to the pilot.
         goto: whether the mission is the place of `--goto`.
-        follower: looks at every tick as well, and may give orders.
+        follower: called after each tick; it may give orders.
     """
 
     def __init__(
@@ -69,12 +69,12 @@ class Engagement:
         return self._take_off_m is not None
 
     def begin(self, loop: ControlLoop) -> None:
-        """Say before the first tick what the flight is to do."""
+        """Note the order in the course of the flight, before the first tick."""
         loop.course.takes_off = self.takes_off
         loop.course.goal = "" if self.goal is None else f"--goto {','.join(f'{x:g}' for x in self.goal)}"
 
     def follow(self, loop: ControlLoop, ticked: Ticked) -> None:
-        """Look at the tick that has just run; the first one gives the order to take off."""
+        """Update after a tick; after the first one, order the take-off."""
         self.has_engaged = self.has_engaged or loop.handover_state is HandoverState.ENGAGED
         self._check_arrival(loop, ticked)
         loop.course.arrived = self.has_arrived

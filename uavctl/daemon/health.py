@@ -29,7 +29,7 @@ class RecorderHealth(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class VehicleHealth(msgspec.Struct, frozen=True, kw_only=True):
-    """The vehicle, as its own messages tell."""
+    """State of the vehicle from its own messages."""
 
     autopilot: str
     mode: str
@@ -41,7 +41,7 @@ class VehicleHealth(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class RelayHealth(msgspec.Struct, frozen=True, kw_only=True):
-    """The positions that are passed on to the vehicle: a part of its own, which may go on when control has ended."""
+    """Relay of positions to the vehicle, which may continue after the control has ended."""
 
     sent: int  # since the start
     sent_hz: float  # in the last second
@@ -66,13 +66,13 @@ class Health(msgspec.Struct, frozen=True, kw_only=True):
     velocity_mps: dict[str, float] | None
     target_m: dict[str, float] | None
     waypoint: int | None
-    loss: float | None  # share of the positions counted on that did not come lately; None in the first second
+    loss: float | None  # share of the expected positions that did not come; None in the first second
     lateness_us: float  # largest of the last second
     missed_ticks: int  # since the start
     vehicle: VehicleHealth | None
     recorder: RecorderHealth
     who_flies: str = ""  # state of the hand-over
-    ending: str = ""  # end of the flight, under way or come, in words; empty while nothing ends it
+    ending: str = ""  # text on the end of the flight, begun or done; empty before
     relay: RelayHealth | None = None  # None where no positions are passed on
     let_go: str = ""  # why the envelope has let the vehicle go; empty as long as it has not
     # share of the vehicle's inertial data of the last second that are used; None where none came, or none are wanted
@@ -80,7 +80,7 @@ class Health(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MonitoredFlight(Protocol):
-    """Control loop as far as its health is looked at."""
+    """Control loop for the health monitor."""
 
     course: FlightCourse
 
@@ -101,16 +101,16 @@ class MonitoredFlight(Protocol):
 
     @property
     def let_go(self) -> str:
-        """Reason why the envelope let the vehicle go: what was seen and cannot be; empty as long as nothing was."""
+        """Reason why the envelope has released the vehicle; empty if it has not."""
         ...
 
 
 class HealthMonitor:
-    """Watches the control loop from its own thread; looks are cheap and take no lock.
+    """Monitors the control loop in its own thread, without locks.
 
     Args:
-        name: of the daemon, url of its vehicle, pid of its process.
-        tell: called with each second's line, from the control loop's thread: it must not wait.
+        identity: name of the daemon, URL of its vehicle, pid of its process.
+        write_line: called with the line of each second, in the control loop's thread; it must not wait.
     """
 
     def __init__(
@@ -138,11 +138,11 @@ class HealthMonitor:
         self._missed = 0
         self._max_lateness_ns = 0  # of this second
         self._previous_max_lateness_ns = 0  # of the last one
-        self._recording_state = "well"  # as last told
+        self._recording_state = "well"  # as last reported
         self._let_go = ""  # the same
-        self._inertial = (0, 0)  # data used and all, by the last look of a second
+        self._inertial = (0, 0)  # data used and all, at the last second
         self._inertial_share: float | None = None
-        self._relay_rate = (0, 0.0)  # positions by the last look of a second, and how many a second came in it
+        self._relay_rate = (0, 0.0)  # positions at the last second, and their rate in it
 
     def after_tick(self, ticked: Ticked, lateness_ns: int) -> None:
         """The control loop has run a tick."""

@@ -26,7 +26,7 @@ from urllib.parse import urlsplit
 from uavctl.daemon.runtime_folder import find_runtime_folders
 from uavctl.errors import ConnectionSpecError, VehicleTakenError
 
-_LONGEST = 500  # bytes of a lock file that are looked at
+_LONGEST = 500  # bytes of a lock file that are read
 _TRIES = 10  # to lock a file that its last holder is just removing
 _FLIGHT_LINE = "flown at"  # the second line, with the time since the machine's start [ns]
 LONGEST_FLIGHT_NS = 3600 * 10**9  # a vehicle that was left longer ago than a battery lasts has landed
@@ -67,7 +67,7 @@ class VehicleLock:
     """A vehicle, from its lock's taking to its letting go.
 
     Args:
-        descriptors: of the locked files, which say the same; of what others left in them the newest counts.
+        descriptors: of the locked files, which have the same content; the newest older content counts.
         now: time since the machine's start [ns].
 
     Raises:
@@ -96,7 +96,7 @@ class VehicleLock:
         if is_left_in_flight is None or is_left_in_flight == self.is_left_in_flight:
             return
         self._left_flight_ns = self._now() if is_left_in_flight else None
-        with suppress(OSError):  # no flight ends because a word to the next one does not fit on the disk
+        with suppress(OSError):  # a full disk must not end the flight
             self._write()
 
     def _write(self) -> None:
@@ -129,7 +129,7 @@ def lock_vehicle(url: str, folder: Path | None = None) -> Iterator[VehicleLock]:
         folder: where the lock file is; by default there is one in each of the user's runtime folders.
 
     Raises:
-        VehicleTakenError: another process holds it, or the lock cannot be made; says which and what to do.
+        VehicleTakenError: another process holds it, or the lock cannot be made; names it and the remedy.
         ConnectionSpecError: the URL cannot be understood.
         UsageError: the user has no runtime folder.
     """

@@ -21,7 +21,7 @@ _CAP_IPC_LOCK = 14
 
 @dataclass(frozen=True)
 class RealtimeSetting:
-    """One part of it: whether it holds, and what a person should know."""
+    """Result of one setting, with a text for people."""
 
     name: str
     is_applied: bool
@@ -46,7 +46,7 @@ class GarbageCollector:
 
 @contextmanager
 def control_garbage_collection() -> Iterator[GarbageCollector]:
-    """Keep garbage collection out of the ticks: it is for the collector's caller to say when; undone at the end."""
+    """Collect garbage only when the collector is called, between ticks; undone at the end."""
     gc.collect()
     gc.freeze()
     gc.disable()

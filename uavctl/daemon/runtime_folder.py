@@ -28,7 +28,7 @@ def is_private_folder(folder: Path) -> bool:
 
 
 def find_runtime_folders(environ: Mapping[str, str] = os.environ) -> tuple[Path, ...]:
-    """This user's folders for locks and sockets, those that can be had, the preferred one first; made if need be.
+    """Find, or make, this user's folders for locks and sockets; the preferred one is first.
 
     Below $XDG_RUNTIME_DIR and /run/user/UID if these are the user's own; /run/uavctl, which a service has; and one
     below /tmp. What another user has put into the way, root included, is passed over.

@@ -18,14 +18,14 @@ Address = tuple[str, int] | tuple[str, int, int, int]
 NOT_LISTED = "not-listed"
 TOO_MANY = "too-many"
 TOO_MUCH = "too-much"
-MAX_SENDERS = 64  # strangers with a budget of their own; who is heard longest ago gives its place to another
+MAX_SENDERS = 64  # strangers with a bucket of their own; a new one replaces the one with the oldest message
 MAX_TRUSTED = 16  # senders of what the flight needs, beside the vehicle
 MAX_KNOWN = 1024  # addresses whose verdict is kept
 SILENCE_NS = 5_000_000_000  # a sender that has not been heard for so long makes room for another
 MAGIC = (0xFD, 0xFE)  # the first byte of a frame of MAVLink 2, and 1
 SHORTEST_FRAME, MAX_TRIES = 8, 64  # bytes; tries after which a datagram is given up (`uavctl.mavlink.framing`)
 _HEARTBEAT = re.compile(rb"\xfd.{6}\0\0\0|\xfe.{4}\0", re.DOTALL)
-_HEARTBEATS = 8  # of a backlog of the vehicle's; what looks like one may be none
+_HEARTBEATS = 8  # in a backlog of the vehicle; some may only look like one
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class AllowList:
         self._verdicts: dict[str, bool] = {}
 
     def allows(self, host: str) -> bool:
-        """Whether a numeric address is listed; a look into a table for one that has been seen."""
+        """Return whether a numeric address is listed; the verdict on a known one is cached."""
         if not self._networks:
             return True
         verdict = self._verdicts.get(host)
@@ -68,7 +68,7 @@ class AllowList:
 
 
 def count_frames(data: bytes) -> int:
-    """Return the most frames that a datagram can make us look at: no checksum and no hash is taken more often.
+    """Return the largest number of checksums or hashes that a datagram can cause.
 
     Each frame begins at one of the magic bytes; those that fit are not shorter than a frame, and the others are given
     up.
@@ -89,16 +89,16 @@ class RateLimit:
         return RateLimit(_scale(times, (rules.max_per_s, rules.max_frames_per_s, rules.max_bytes_per_s)), burst)
 
 
-# A link that was held up delivers what it kept. Of strangers little is taken, of what the flight needs a stall's worth.
+# A stalled link delivers its backlog. Little is admitted of strangers; of trusted senders the backlog of a stall.
 STRANGER_BURST = (64.0, 128.0, 32_768.0)
-# Of the one that will turn out to be the vehicle much is taken, until anybody is known whom the flight needs: a PX4
-# says up to 420 messages in a second, and which of them is its first heartbeat shows only a look into them.
+# Before any trusted sender is known, a stranger may be the vehicle. A PX4 sends up to 420 messages a second, and only
+# decoding shows which one is its first heartbeat.
 FIRST_BURST = (1024.0, 2048.0, 131_072.0)
 TRUSTED_BURST = (512.0, 1024.0, 131_072.0)
 VEHICLE_BURST = (16_384.0, 16_384.0, 2_097_152.0)
 VEHICLE_TIMES, ALL_TRUSTED_TIMES = 4.0, 2.0
-FAIR_TIMES = 1.0 / 16.0  # of what one may send; who sends less has sent little
-RESERVED = 0.5  # share of what all have together that is left to those who have sent little
+FAIR_TIMES = 1.0 / 16.0  # of the rate of one sender; below it, a sender counts as fair
+RESERVED = 0.5  # share of the shared bucket that only fair senders can use
 
 
 def _scale(factor: float, amounts: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -124,7 +124,7 @@ class _TokenBucket:
 
     @property
     def used_share(self) -> float:
-        """Share of the burst that is used, of whichever is scarcest; the least for whoever has sent least lately."""
+        """Largest used share of the burst, over datagrams, frames and bytes."""
         burst = self._limit.burst
         return 1.0 - min(self.datagrams / burst[0], self.frames / burst[1], self.bytes / burst[2])
 
@@ -132,7 +132,7 @@ class _TokenBucket:
         """Return why a datagram does not fit; None if it does.
 
         Args:
-            keep: share of the burst that has to be left afterwards.
+            reserve: share of the burst that has to be left afterwards.
         """
         burst = self._limit.burst
         if self.datagrams - 1.0 < reserve * burst[0]:
@@ -162,7 +162,7 @@ class _Sender:
         self.fair_bucket.refill(now_ns)
 
     def admit(self, frames: int, size: int, shared_bucket: _TokenBucket | None) -> str | None:
-        """Take a datagram, or say why not."""
+        """Admit a datagram, or return the reason why not."""
         refusal = self.bucket.find_refusal(frames, size)
         if shared_bucket is not None and refusal is None:
             is_fair = self.fair_bucket.find_refusal(frames, size) is None
@@ -179,10 +179,9 @@ class _Sender:
 class RateLimiter:
     """Keep each sender from taking the time that the others and the control loop need.
 
-    The flown vehicle has a budget of its own that nobody else can use up. Senders of what the flight needs have one
-    each and one together, and so have all others. Those who have sent least come first, and of what is there together
-    only they can use the last half: so who comes later is heard beside any flood. As long as nobody is known whom the
-    flight needs, a stranger may be the vehicle, and what a stall has kept of its words is taken.
+    The vehicle has a bucket of its own. Trusted senders have one each and a shared one, and so have strangers. Senders
+    that sent least come first, and only they can use the last half of a shared bucket. So a new sender is heard beside
+    any flood. Before a trusted sender is known, a stranger may be the vehicle, and the backlog of a stall is admitted.
 
     Args:
         rules: datagrams, frames and bytes a second of one sender (address and port).
@@ -195,8 +194,9 @@ class RateLimiter:
         self._trusted_limit = RateLimit.from_rules(rules, 1.0, TRUSTED_BURST)
         self._vehicle_limit = RateLimit.from_rules(rules, VEHICLE_TIMES, VEHICLE_BURST)
         self._vehicle: tuple[Address, _Sender] | None = None
-        self._trusted_senders: OrderedDict[Address, _Sender] = OrderedDict()  # trusted; who was so last is last
-        self._strangers: OrderedDict[Address, _Sender] = OrderedDict()  # who was heard last is last
+        # in order of the last call of `trust_sender`
+        self._trusted_senders: OrderedDict[Address, _Sender] = OrderedDict()
+        self._strangers: OrderedDict[Address, _Sender] = OrderedDict()  # in order of the last datagram
         self._trusted_bucket = _TokenBucket(
             RateLimit.from_rules(rules, ALL_TRUSTED_TIMES, _scale(2.0, TRUSTED_BURST)), 0
         )

@@ -69,7 +69,7 @@ class Connection(Protocol):
         """Return what has arrived: (data, monotonic time of reading [ns]); empty if nothing has.
 
         Args:
-            everything: also a long backlog of the vehicle's.
+            read_all: also a long backlog of the vehicle's.
         """
         ...
 
@@ -78,7 +78,7 @@ class Connection(Protocol):
         ...
 
     def trust_sender(self, index: int) -> None:
-        """Keep room for the sender of the `index`-th datagram of the last `receive`: the flight needs what it says."""
+        """Trust the sender of the `index`-th datagram of the last `receive`: the flight needs its data."""
         ...
 
     def send(self, data: bytes) -> None:

@@ -43,7 +43,7 @@ class _SendBuffer:
 
 
 class TcpConnection(SocketConnection):
-    """TCP client; a peer that has hung up or fallen silent is called again each second, and nobody waits for it."""
+    """TCP client; it reconnects once a second after a hang-up or a silence, without waiting."""
 
     max_reads = MAX_CHUNKS
     backlog_reads = BACKLOG_CHUNKS
@@ -70,7 +70,7 @@ class TcpConnection(SocketConnection):
         try:
             data = self._socket.recv(CHUNK_BYTES)
         except BlockingIOError:
-            # A network that went and came back may have forgotten the connection, and neither end is told.
+            # After a network failure neither end may notice that the connection is lost.
             if self._heard_ns is not None and self._now() - self._heard_ns > PEER_SILENCE_NS:
                 self._disconnect(CONNECTION_SILENT)
             raise
@@ -92,7 +92,7 @@ class TcpConnection(SocketConnection):
         self.refused[reason] += 1
 
     def _connect(self) -> None:
-        """Begin an attempt to connect, or go on with it; BlockingIOError while there is no connection."""
+        """Begin or continue an attempt to connect; BlockingIOError while there is no connection."""
         is_overdue = self._now() - self._attempt_ns >= RETRY_NS
         if self._socket.fileno() < 0:
             if not is_overdue:

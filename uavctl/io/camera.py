@@ -12,12 +12,12 @@ from uavctl.records import Vec3
 
 
 class CameraError(UavctlError):
-    """The cameras answer, and cannot be used as they are set up; says what to do."""
+    """The cameras answer but cannot be used with their settings; the text names the remedy."""
 
 
 @dataclass(frozen=True, slots=True)
 class BodyPose:
-    """A body as the cameras saw it."""
+    """Pose of a body by the cameras."""
 
     exposed_ns: int  # middle of the exposure in the cameras' clock [ns]
     position_m: Vec3  # in the room's axes forward, right, down [m]
@@ -26,17 +26,16 @@ class BodyPose:
 
 @dataclass(frozen=True, slots=True)
 class Echo:
-    """The answer to a question for the time."""
+    """Answer to a time request."""
 
-    token: int  # what the question held
+    token: int  # token of the request
     clock_ns: int  # the cameras' clock when they answered [ns]
 
 
 class Camera(Protocol):
-    """One camera system and the body to follow, without input or output of its own: datagrams in, sights out.
+    """One camera system and the body to follow, sans IO: datagrams in, poses out.
 
-    A class with an attribute `stream` that is true is given a TCP connection in pieces as they come, and an empty one
-    where a connection begins.
+    A class with a true attribute `stream` gets the chunks of a TCP connection, and an empty chunk at its begin.
     """
 
     @property
@@ -51,7 +50,7 @@ class Camera(Protocol):
 
     @property
     def group(self) -> tuple[str, int] | None:
-        """Multicast address and port that it sends to; None where it sends to who asks."""
+        """Multicast address and port that it sends to; None if it sends to its clients."""
         ...
 
     @property
@@ -72,7 +71,7 @@ class Camera(Protocol):
         ...
 
     def ask_time(self, token: int) -> bytes:
-        """The question for the cameras' time."""
+        """Return the request for the cameras' time."""
         ...
 
 

@@ -42,7 +42,7 @@ class CameraMessageEncoder:
         self._mav = mavlink.MAVLink(None, srcSystem=CAMERA_SYSTEM_ID, srcComponent=COMPONENT_ID)
 
     def encode(self, item: BodyPose | Echo) -> bytes:
-        """ODOMETRY of a sight, in axes forward, right, down; TIMESYNC of an echo, whose token is our time."""
+        """Encode a pose as ODOMETRY in axes forward, right, down; an echo as TIMESYNC with our time as token."""
         if isinstance(item, Echo):
             return self._pack(mavlink.MAVLink_timesync_message(item.clock_ns, item.token))
         return self._pack(
@@ -67,7 +67,7 @@ class CameraMessageEncoder:
 
 
 def parse_time_requests(data: bytes) -> tuple[int, ...]:
-    """The times that the requests for TIMESYNC in some MAVLink hold [ns]."""
+    """Return the times in the TIMESYNC requests of some MAVLink data [ns]."""
     return tuple(
         message.ts1_ns
         for message in decode(data).messages
@@ -87,7 +87,7 @@ _MEMORY_LIMIT = 2**30
 
 
 class CameraHost:
-    """Passes on between a server of cameras and the daemon.
+    """Passes data between a camera server and the daemon.
 
     Args:
         pipe: our end of the pair of sockets.
@@ -178,7 +178,7 @@ class CameraHost:
         if self._server_socket is None or not data:
             return
         try:
-            if self._is_stream:  # a handful of short words, for which there is room
+            if self._is_stream:  # a few short commands: they fit into the buffer
                 self._server_socket.sendall(data)
             else:
                 self._server_socket.sendto(data, self._server)
@@ -203,14 +203,14 @@ class CameraHost:
                 self._dropped[NOT_SERVER] += 1
                 continue
             items = self._camera.receive(data, time.monotonic_ns())
-            if self._camera.ready and not self._is_ready:  # before any position: the daemon waits for this word
+            if self._camera.ready and not self._is_ready:  # before any position: the daemon waits for this message
                 self._is_ready = True
                 self._queue_message(READY)
             for item in items:
                 self._queue_message(self._encoder.encode(item))
 
     def _forward_time_requests(self) -> bool:
-        """Pass on the daemon's questions for the time; False if it has gone."""
+        """Pass on the daemon's time requests; False if it has gone."""
         try:
             data = self._pipe.recv(LARGEST)
         except BlockingIOError:
@@ -232,7 +232,7 @@ class CameraHost:
         while self._queue:
             try:
                 self._pipe.send(self._queue[0])
-            except OSError:  # full: later. Gone: seen when it is read
+            except OSError:  # full: sent later; closed: found at the next read
                 return
             self._queue.popleft()
 

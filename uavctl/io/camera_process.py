@@ -93,7 +93,7 @@ class CameraProcessConnection(BaseConnection):
         return [item for item, fits in zip(arrived, taken, strict=True) if fits]
 
     def send(self, data: bytes) -> None:
-        """See `Connection`; only questions for the time go on to the cameras."""
+        """See `Connection`; only time requests reach the cameras."""
         try:
             self._socket.send(data)
         except OSError:

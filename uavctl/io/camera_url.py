@@ -18,13 +18,13 @@ FORM = (
 
 @dataclass(frozen=True)
 class CameraUrl:
-    """A body that a server of cameras tells of."""
+    """Body of a camera server."""
 
     system: str  # its scheme, see `uavctl.config.connections.camera_scheme`
     host: str  # name or address of the server
-    port: int  # where it takes questions
-    body: str  # name of the body, as the cameras have it
-    up: Up = "y"  # the axis that they call up
+    port: int  # its port for commands
+    body: str  # name of the body in the camera system
+    up: Up = "y"  # the axis of the cameras that points up
     interface: str = "0.0.0.0"  # address of our network interface to the cameras
 
 

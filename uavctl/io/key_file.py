@@ -27,7 +27,7 @@ def read_key(path: Path) -> SigningKey:
     """The key in a file.
 
     Raises:
-        KeyFileError: it cannot be read, others can read it, or it holds no key; says what to do.
+        KeyFileError: it cannot be read, others can read it, or it holds no key; names the remedy.
     """
     try:
         with path.open("rb") as file:
@@ -57,11 +57,11 @@ def _parse_key(path: Path, data: bytes) -> SigningKey:
             return SigningKey(hashlib.sha256(passphrase).digest())
         if len(text) == 2 * KEY_BYTES:
             return SigningKey(bytes.fromhex(text.decode("ascii")))
-        # 32 letters would be a passphrase that somebody forgot to mark; random bytes never look like it.
+        # 32 letters are probably a passphrase without its mark; random bytes contain others.
         if len(data) == KEY_BYTES and not data.isascii():
             return SigningKey(data)
     except ValueError:
-        pass  # told below, without a word of what the file holds
+        pass  # reported below, without the content of the file
     raise KeyFileError(
         f"key file {path}: holds no key; give {KEY_BYTES} random bytes, {2 * KEY_BYTES} hexadecimal digits, or a line "
         "`passphrase: …`"

@@ -124,7 +124,7 @@ class NatNet:
         return ticks * 1_000_000_000 // self._ticks_per_s
 
     def _handle_server_info(self, payload: bytes) -> None:
-        """Learn version, clock and group; a server that began anew is asked for its bodies again."""
+        """Store version, clock and group; a restarted server is asked for its bodies again."""
         if len(payload) < _SERVER.size:  # as before 3.0
             self._refuse("an older NatNet than 3.0, whose frames have no time of exposure; use Motive 2.0 or newer")
             return
@@ -159,7 +159,7 @@ class NatNet:
         exposed, sent = frame.suffix.stamp_camera_mid_exposure, frame.suffix.stamp_transmit
         if body is None:
             return self._count_dropped(MISSING)
-        if not exposed or not sent:  # a take that is played back, say
+        if not exposed or not sent:  # for example a recorded take
             return self._count_dropped(NO_STAMP)
         x, y, z, w = body.rot
         attitude = normalise_quaternion((w, x, y, z))
@@ -177,7 +177,7 @@ class NatNet:
         return ()
 
     def _refuse(self, text: str) -> None:
-        """End the start with an error; a flight goes on without positions, and counts."""
+        """End the start with an error; in flight, only count."""
         if not self.ready:
             raise CameraError(f"the server has {text}")
         self.dropped[MISSING] += 1

@@ -69,7 +69,7 @@ class Qualisys:
         results: list[BodyPose | Echo] = []
         while len(self._buffer) >= _HEAD.size:
             size, kind = _HEAD.unpack_from(self._buffer)
-            if not _HEAD.size <= size <= LARGEST:  # the stream is out of step: it has to begin anew
+            if not _HEAD.size <= size <= LARGEST:  # the stream is out of step: it has to restart
                 self.dropped[UNREADABLE] += 1
                 self._buffer.clear()
                 self._outgoing.append(_encode_command("Quit"))
@@ -85,7 +85,7 @@ class Qualisys:
         return tuple(results)
 
     def due(self, at_ns: int) -> tuple[bytes, ...]:
-        """See `Camera`: what is to be said, and the wish for frames again when none have come for a second."""
+        """See `Camera`: queued commands, and a request for frames after one second without any."""
         if self._body_index is not None and at_ns - self._heard_ns >= _SILENT_NS:
             self._heard_ns = at_ns
             self.dropped[SILENT] += 1
@@ -95,7 +95,7 @@ class Qualisys:
         return outgoing
 
     def ask_time(self, token: int) -> bytes:
-        """See `Camera`: QTM tells its time with frames alone."""
+        """See `Camera`: QTM sends its time only with frames."""
         del token
         return b""
 
@@ -150,7 +150,7 @@ class Qualisys:
         return ()
 
     def _refuse(self, text: str) -> None:
-        """End the start with an error; a flight goes on without positions, and counts."""
+        """End the start with an error; in flight, only count."""
         if not self.ready:
             raise CameraError(f"the server {text}")
         self.dropped[MISSING] += 1

@@ -107,7 +107,7 @@ class SignedConnection:
 
 
 def make_admission_rules(security: SecurityConfig) -> AdmissionRules:
-    """Return the rules of the UDP connections: whom they listen to, and how much."""
+    """Return the admission rules of the UDP connections."""
     return AdmissionRules(
         security.allow,
         float(security.max_datagrams_per_s),
@@ -123,10 +123,10 @@ _NOT_UP = (errno.ECONNREFUSED, errno.EHOSTUNREACH, errno.EHOSTDOWN, errno.ECONNR
 
 @contextmanager
 def open_links(config: Config, waits: ServerWait | None = None) -> Iterator[dict[str, Connection]]:
-    """The daemon's connections by link name, open, with the doors that `[security]` asks for; one if both URLs are one.
+    """Open the daemon's connections by link name, signed as `[security]` requires; one if both URLs are the same.
 
     Args:
-        waits: waits a while for a TCP server that is not up yet, and says whether to try again; None gives up at once.
+        waits: waits for a TCP server that is not up yet, and returns whether to try again; None gives up at once.
 
     Raises:
         ConnectionSpecError: a URL cannot be understood or opened.
@@ -158,7 +158,7 @@ def _open_link(url: str, security: SecurityConfig, waits: ServerWait | None) -> 
 def sign_connections(
     connections: Mapping[str, Connection], security: SecurityConfig
 ) -> Iterator[dict[str, Connection]]:
-    """The connections, those that `security.require` names behind doors if there is a key.
+    """Sign the connections that `security.require` names, if there is a key.
 
     Raises:
         KeyFileError: the key or its stamp cannot be used.

@@ -36,7 +36,7 @@ def open_source(
         now: clock for the times of arrival [ns].
 
     Raises:
-        ConnectionSpecError: the URL cannot be understood or opened, or the cameras cannot be used; says what to do.
+        ConnectionSpecError: the URL cannot be understood or opened, or the cameras cannot be used; names the remedy.
     """
     opener = _open_camera if camera_scheme(url) else open_connection
     return opener(url, now, rules)

@@ -18,8 +18,8 @@ from typing import TextIO
 from uavctl.errors import KeyFileError
 from uavctl.mavlink.signing import MAX_TIMESTAMP, SigningTimestamps
 
-WRITE_AHEAD = 200_000  # units of 10 µs: written ahead of what was seen, 2 s
-RENEW_MARGIN = 100_000  # written anew when less than this is left
+WRITE_AHEAD = 200_000  # units of 10 µs: 2 s ahead of the newest timestamp
+RENEW_MARGIN = 100_000  # written again when less than this is left
 PERIOD_S = 0.25
 LOCK_TRIES, LOCK_PAUSE_S = 40, 0.05  # to lock the file: a stamp is written in much less
 
@@ -59,7 +59,7 @@ def load_timestamp(path: Path) -> int:
 
 
 def save_timestamp(path: Path, stamp: int) -> None:
-    """Write a stamp, whole or not at all; a larger one that is there stays, whoever wrote it.
+    """Write a timestamp atomically; a larger one in the file stays.
 
     Raises:
         OSError: it cannot be written.
@@ -104,7 +104,7 @@ def _lock_file(lock: int) -> None:
 
 
 class TimestampFile:
-    """Writes the newest stamp to a file from a thread of its own, while a flight goes on.
+    """Writes the newest timestamp to a file in a thread of its own, during a flight.
 
     A disk that fails does not stop the flight: `failure` says so.
 
@@ -137,7 +137,7 @@ class TimestampFile:
         self._thread.start()
 
     def renew(self) -> None:
-        """Write ahead of all that has been seen, if what is written will not last."""
+        """Write ahead of the newest timestamp, if the written one will not last."""
         newest = self.timestamps.newest
         if newest + RENEW_MARGIN <= self._written_timestamp:
             return

@@ -34,10 +34,10 @@ def open_connection(
 
     Args:
         now: clock for the times of arrival [ns].
-        rules: who may speak, and how much (UDP; a stream has one peer, and its flow control).
+        rules: admission of senders (UDP only; a stream has one peer, and its flow control).
 
     Raises:
-        ConnectionSpecError: the URL cannot be understood or opened; says what to do.
+        ConnectionSpecError: the URL cannot be understood or opened; names the remedy.
     """
     scheme, separator, rest = url.partition("://")
     if not separator or scheme not in ("udpin", "udpout", "tcp", "serial"):

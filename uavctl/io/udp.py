@@ -14,8 +14,8 @@ from uavctl.io.base import BACKLOG_READS, MAX_READS, SocketConnection
 PEER_SILENCE_NS = SILENCE_NS
 SECOND_ADDRESS = "second-address"
 LARGEST = 8192  # bytes that are read of a datagram; none of MAVLink is as long
-COMMON_BUFFER_BYTES = 2**20  # of the kernel's, for all who are not known yet
-PEER_BUFFER_BYTES = 2**22  # for one who is: some seconds of a vehicle's words, small ones too
+COMMON_BUFFER_BYTES = 2**20  # kernel buffer for all unknown senders
+PEER_BUFFER_BYTES = 2**22  # for a known one: some seconds of a vehicle's messages
 COMMON_READS = 64  # datagrams of strangers in one call
 MAX_PEER_SOCKETS = 8  # senders with a socket of their own
 _SO_RCVBUFFORCE, _SO_MEMINFO = 33, 55  # Linux
@@ -65,10 +65,10 @@ class _UdpConnection(SocketConnection):
 
 
 class UdpInConnection(_UdpConnection):
-    """Bound UDP socket. It answers the peer that it was told to, and until then the first one that speaks MAVLink.
+    """Bound UDP socket. It sends to the selected peer; before that, to the first sender of MAVLink.
 
-    What others send is handed on too: cameras and vehicle may share a port. Only a peer that has fallen silent is
-    followed by another one, so that nobody can draw the setpoints to themselves while it speaks.
+    Data of other senders is passed on too: cameras and vehicle may share a port. Another peer replaces only a silent
+    one, so nobody can take the setpoints of an active peer.
 
     Vehicle and cameras get sockets of their own once they are known, on the same port and connected to them: the system
     keeps what they send apart from what others do, and a flood fills only the buffer of the others.
@@ -112,7 +112,7 @@ class UdpInConnection(_UdpConnection):
             if self._admit_sender(data, sender) is not None:
                 arrived.append((data, at_ns))
         has_peer_socket = self._peer in self._peer_sockets
-        # Strangers get a handful of looks; whoever shares their socket is found by reading all that it can hold.
+        # Few datagrams of strangers are read. A vehicle on the common socket is found by reading its whole backlog.
         max_reads = BACKLOG_READS if read_all and not has_peer_socket else COMMON_READS
         self.has_unread = not self._read_socket(self._socket, max_reads, arrived) and not has_peer_socket
         common_count = len(arrived)
@@ -144,13 +144,13 @@ class UdpInConnection(_UdpConnection):
         return False
 
     def select_peer(self, index: int) -> None:
-        """See `Connection`; another peer than the one that was told before only when that has fallen silent."""
+        """See `Connection`; another peer replaces the present one only after its silence."""
         sender = self._senders[index]
         now_ns = self._now()
         if self._is_peer_confirmed and sender != self._peer and now_ns - self._heard_ns <= PEER_SILENCE_NS:
             self.refused[SECOND_ADDRESS] += 1
             return
-        # Only the vehicle's own words keep its place: noise, forgeries and replays from an address do not.
+        # Only messages of the vehicle itself keep its place; noise, forgeries and replays do not.
         self._peer, self._is_peer_confirmed, self._heard_ns = sender, True, now_ns
         self._rate_limiter.set_vehicle(sender, now_ns)
         self._open_socket_for(sender, now_ns)
@@ -185,7 +185,7 @@ class UdpInConnection(_UdpConnection):
                 break
 
     def send(self, data: bytes) -> None:
-        """See `Connection`; without a peer there is nobody to send to, which is no error."""
+        """See `Connection`; without a peer nothing is sent, which is no error."""
         if self._peer is None:
             return
         try:
@@ -223,12 +223,12 @@ def _set_buffer_size(sock: socket.socket, size: int) -> None:
     """Ask for a buffer of the system's; it may grant less."""
     with suppress(OSError):
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, size)
-    with suppress(OSError):  # whoever may, gets all of it
+    with suppress(OSError):  # with permission, the whole size
         sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, size)
 
 
 def _count_dropped(sock: socket.socket) -> int:
-    """Datagrams that the system has dropped for want of room; 0 where it does not tell."""
+    """Return the number of datagrams that the system has dropped; 0 if unknown."""
     try:
         raw = sock.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size)
     except OSError:
@@ -239,7 +239,7 @@ def _count_dropped(sock: socket.socket) -> int:
 def _open_peer_socket(
     bound: Sequence[socket.socket], family: socket.AddressFamily, sender: Address
 ) -> socket.socket | None:
-    """Another socket on the port of those that are bound, which gets what one sender sends; None if none can be had."""
+    """Open another socket on the same port, connected to one sender; None if that is not possible."""
     if not hasattr(socket, "SO_REUSEPORT"):
         return None
     peer_socket = socket.socket(family, socket.SOCK_DGRAM)

@@ -34,16 +34,16 @@ class BootClock:
 
     def __init__(self) -> None:
         self._readings: dict[str, _Reading] = {}  # by kind of message
-        self._candidates: dict[str, _Reading] = {}  # does not go on from what is known
+        self._candidates: dict[str, _Reading] = {}  # inconsistent with the last reading; by kind
         self._newest: _Reading | None = None
 
     def uptime_s(self, at_ns: int) -> float | None:
-        """Return the time since the vehicle started, by its own clock [s]; None if it does not tell."""
+        """Return the vehicle's uptime by its own clock [s]; None if unknown."""
         newest = self._newest
         return None if newest is None else newest.boot_ms / 1e3 + (at_ns - newest.at_ns) / 1e9
 
     def update(self, kind: str, boot_ms: int, at_ns: int) -> bool:
-        """Take a time since boot; whether it shows that the vehicle has started anew.
+        """Add a time since boot; return whether it shows a restart of the vehicle.
 
         Args:
             kind: of message; the clocks of two need not agree.
@@ -68,7 +68,7 @@ class BootClock:
         return False
 
     def reset(self) -> None:
-        """Begin anew, with another vehicle."""
+        """Forget all readings: another vehicle is followed now."""
         self._readings.clear()
         self._candidates.clear()
         self._newest = None
@@ -78,7 +78,7 @@ class BootClock:
 
 
 def _compute_advance_ms(before: _Reading, after: _Reading) -> int:
-    """Return by how much a clock went on, the shorter way around its wrap [ms]."""
+    """Return the advance of a clock [ms], modulo its wrap."""
     return (after.boot_ms - before.boot_ms + _WRAP_MS // 2) % _WRAP_MS - _WRAP_MS // 2
 
 

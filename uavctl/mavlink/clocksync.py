@@ -16,8 +16,8 @@ from statistics import median, median_low
 from uavctl.arrays import SECOND_NS
 from uavctl.records import Vec3
 
-MAX_ROUND_TRIP_NS = SECOND_NS  # a slower answer bounds the offset by nothing of use
-ROUND_TRIP_MARGIN_NS = 10_000_000  # a round trip that is so much longer than the shortest says as much
+MAX_ROUND_TRIP_NS = SECOND_NS  # a longer round trip gives no useful bound
+ROUND_TRIP_MARGIN_NS = 10_000_000  # more than the shortest: as good as the shortest
 # By which a clock's drift may change: real ones keep 1e-4, that of a simulator on a busy computer is followed so.
 DRIFT_CHANGE = 2e-3
 MAX_DEVIATION_NS = 100_000_000
@@ -28,7 +28,7 @@ MAX_DELAY_SPREAD_NS = 200_000_000  # spread of the delays of one new clock
 STAMP_HISTORY = 64
 FIT_POINTS = 5  # round trips that the line of a clock goes through: few, as a busy computer's clock changes its pace
 MIN_FIT_POINTS = 3
-MIN_FIT_SPAN_NS = 2_000_000_000  # between the first and the last of them: nearer ones say nothing of a drift
+MIN_FIT_SPAN_NS = 2_000_000_000  # from first to last: a shorter span shows no drift
 MAX_DRIFT = 0.05  # recorded: up to 0.034
 ROUND_TRIP_HISTORY = 60
 
@@ -56,7 +56,7 @@ class StampUnit(StrEnum):
     MILLISECONDS = "ms"
     NANOSECONDS = "ns"
     SECONDS = "s"
-    CONSTANT = "constant"  # they do not go on at all
+    CONSTANT = "constant"  # they do not advance
 
 
 _UNITS_PER_SECOND = {
@@ -65,11 +65,11 @@ _UNITS_PER_SECOND = {
     StampUnit.MICROSECONDS: 1e6,
     StampUnit.NANOSECONDS: 1e9,
 }
-UNIT_WINDOW_NS = 1_500_000_000  # over which stamps are compared with our clock: stamps in s go on in it
+UNIT_WINDOW_NS = 1_500_000_000  # comparison of stamps with our clock: stamps in s advance within it
 
 
 class StampUnitDetector:
-    """Recognises the unit of a source's stamps by how fast they go on, against our clock.
+    """Detects the unit of a source's stamps from their rate against our clock.
 
     Attributes:
         unit: as recognised; microseconds until another one is.
@@ -82,7 +82,7 @@ class StampUnitDetector:
     def update(self, stamp: int, position_m: Vec3, at_ns: int) -> StampUnit:
         """Take a stamp, and the position that has it; return the unit.
 
-        The same stamp with the same position is a repeated message, and says nothing of the unit.
+        The same stamp with the same position is a repeated message and does not show the unit.
         """
         if self._reference is None:
             self._reference = stamp, at_ns, position_m
@@ -131,12 +131,13 @@ class TimesyncClock:
     half the round trip at most. The offset is that of a robust line (Theil and Sen: median of the slopes between all
     pairs) through the last answers that are about as short as the shortest. A longer one counts like these once the
     line may be off by as much, as its uncertainty grows with time; before that it only keeps the line in its bounds.
-    Without answers the line goes on. Against the recorded flights, just before each next answer: a simulator whose
+    Without answers the line is extrapolated. Against the recorded flights, just before each next answer: a simulator
+    whose
     clock ran 1.3 % slow is followed to 2.8 ms (median; an average of the offsets alone was 47 ms behind), steady ones
     to 0.5 ms.
 
     Attributes:
-        rejected: answers that were not used: too slow to say anything, or of another clock.
+        rejected: answers that were not used: too slow, or of another clock.
         shortest_ns: the shortest round trip of those that the line goes through.
     """
 
@@ -186,7 +187,7 @@ class TimesyncClock:
             sent_ns: our time when the request was sent.
 
         Returns:
-            Whether it was used; a deviating one, or one that is too slow to say anything, is not.
+            Whether it was used; a deviating or too slow one is not.
         """
         used = self._use_answer(sent_ns, remote_ns, received_ns)
         self.rejected += not used
@@ -217,7 +218,7 @@ class TimesyncClock:
             clamped_ns = min(max(expected_ns, measured_ns - half_ns), measured_ns + half_ns)
             self._line_ns += clamped_ns - expected_ns
             return True
-        # Round trips of other lengths may be off by other amounts, which is no drift: the slope goes on without them.
+        # Round trips of other lengths have other errors, which are no drift: the slope ignores them.
         similar = [trip for trip in self._answers if abs(round_trip_ns - trip[2]) <= 2 * ROUND_TRIP_MARGIN_NS]
         self._answers = deque([*similar, (received_ns, measured_ns, round_trip_ns)], maxlen=FIT_POINTS)
         self._fit_line()
@@ -291,7 +292,7 @@ class ArrivalClock:
             slope = (min_offset_ns - self._previous_second[0]) / (min_offset_at_ns - self._previous_second[1])
             self._slopes.append(min(max(slope, -MAX_DRIFT), MAX_DRIFT))
             self._slope = median_low(self._slopes)
-            if len(self._slopes) == 1:  # the least of the first seconds did not know the drift
+            if len(self._slopes) == 1:  # the minimum of the first seconds was without drift
                 self._min_offset_ns = min_offset_ns + self._slope * (at_ns - min_offset_at_ns)
         self._previous_second, self._current_second = (min_offset_ns, min_offset_at_ns), (at_ns, offset_ns, at_ns)
 
@@ -348,7 +349,7 @@ class ClockSync:
     def _is_plausible(self, offset_ns: int, minimum_ns: int, stamp_ns: int, received_ns: int) -> bool:
         """Whether an offset makes the smallest delay neither negative nor long.
 
-        The minimum of a clock that runs slow is that of a while ago, and too small for now: so each delay is also
+        The minimum of a slow clock is old and too small for now. So each delay is also
         judged by the offset of its own time.
         """
         shortest_ns = self._min_delay.push(received_ns, received_ns - stamp_ns - offset_ns)
@@ -387,7 +388,7 @@ class ClockSync:
         return None
 
     def _reset(self) -> None:
-        """Begin anew: the source has another clock now."""
+        """Reset all estimates: the source has another clock now."""
         self._minimum.clear()
         self._min_delay.clear()
         self._stamps.clear()

@@ -73,14 +73,14 @@ MISSING_HEARTBEAT_NS = 3 * SECOND_NS  # three heartbeats that did not come
 NO_HEARTBEAT = "no-heartbeat"
 STAMP_UNIT = "stamp-unit"
 TIMESYNC_FLOOD = "timesync-flood"
-OVERRUN = "overrun"  # dropped by the system while nobody read, the vehicle's newest words perhaps
+OVERRUN = "overrun"  # dropped by the system before it was read; perhaps the newest state of the vehicle
 HUNG_UP = "hung-up"  # times that the other side of a TCP connection has closed it
-CONNECTION_SILENT = "went-silent"  # times that nothing came over a TCP connection for so long that it is made again
+CONNECTION_SILENT = "went-silent"  # reconnections of a silent TCP connection
 _DISCONNECT_TEXTS = {
     HUNG_UP: "the other side closed the connection; it is called again each second",
     CONNECTION_SILENT: "nothing came over the connection any more; it is made again",
 }
-# Counted, not told: every flight has them, or they are told in another way.
+# Counted but not reported: every flight has them, or another event reports them.
 _NOT_REPORTED = frozenset({SkipReason.UNKNOWN, AUTOPILOT_ESTIMATE, *_DISCONNECT_TEXTS})
 
 Item = PositionSample | VehicleStatus | VehicleMotion | InertialSample | Event | CommandAck | StatusText
@@ -91,7 +91,7 @@ class ReceiveResult(NamedTuple):
 
     items: tuple[Item, ...]
     replies: tuple[bytes, ...]  # to requests for our time, to be sent at once: a TIMESYNC that waits measures the wait
-    is_source_settled: bool  # whether the newest sample is of a source that has spoken for a while
+    is_source_settled: bool  # whether the source of the newest sample is settled
     attitude: Quaternion | None  # of the body in it: body axes forward, right, down to NED (w, x, y, z)
     clock_source: ClockSource  # of its capture time
 
@@ -105,8 +105,8 @@ class MavlinkConnection:
         daemon: our ids; the connection's URL tells a byte stream from datagrams.
         source: which messages and which system count as positions.
         estimator: standard deviation of a position, and what is absurd.
-        listen: hears every message of others that is understood, with its time of arrival; for callers that want more
-            than the items tell.
+        on_message: called with every decoded message of others and its time of arrival; for callers that need more
+            than the items.
         vehicle_time: a vehicle that asks for our time gets that of its own clock (`relay.vehicle_time`).
     """
 
@@ -147,7 +147,7 @@ class MavlinkConnection:
         self._bad: Counter[str] = Counter()
         self._unreported: Counter[str] = Counter()
         self._reported_ns: int | None = None
-        self._slow_count = 0  # answers to TIMESYNC that were not used, and not told yet
+        self._slow_count = 0  # unused answers to TIMESYNC, not reported yet
         self._slow_reported_ns: int | None = None
         self._reported_resyncs = 0
         self._is_low_share_reported = False
@@ -181,7 +181,7 @@ class MavlinkConnection:
         """Take the answer to a TIMESYNC request that another client has sent, as a recording shows it.
 
         Args:
-            address: system and component whose stamps it tells of.
+            address: system and component whose clock it shows.
         """
         self._positions.add_timesync_answer(address, sent_ns, remote_ns, received_ns)
 
@@ -191,7 +191,7 @@ class MavlinkConnection:
         return self._vehicle.inertial_used, self._vehicle.inertial_total
 
     def vehicle_uptime_s(self, at_ns: int) -> float | None:
-        """Return the time since the vehicle started, by its own clock [s]; None if it does not tell."""
+        """Return the vehicle's uptime by its own clock [s]; None if unknown."""
         return self._vehicle.uptime_s(at_ns)
 
     def receive(self, data: bytes, at_ns: int) -> ReceiveResult:
@@ -284,7 +284,7 @@ class MavlinkConnection:
         """Return the messages that an ArduPilot without GPS needs before it arms; call it while it is to be armed.
 
         Args:
-            place_deg_m: latitude, longitude [deg] and altitude [m] of local zero.
+            origin_deg_m: latitude, longitude [deg] and altitude [m] of local zero.
         """
         profile = PROFILES.get(self._vehicle.autopilot)
         if profile is None or not profile.needs_global_origin:
@@ -384,7 +384,7 @@ class MavlinkConnection:
         return self._vehicle.address
 
     def _handle_message(self, message: Message, at_ns: int) -> tuple[Item, ...]:
-        if (message.system, message.component) == self._own_address:  # our own words, sent back by a router
+        if (message.system, message.component) == self._own_address:  # our own message, sent back by a router
             return ()
         if self._on_message is not None:
             self._on_message(message, at_ns)
@@ -398,7 +398,7 @@ class MavlinkConnection:
         return items
 
     def _handle_vehicle_message(self, message: Message, at_ns: int) -> tuple[Item, ...]:
-        """Take a message of the vehicle and return what it tells of itself."""
+        """Handle a message for the vehicle monitor; return its items."""
         if isinstance(message, StatusText):
             texts = self._text_assembler.add_chunk(message, at_ns)
             return tuple(item for text in texts for item in self._vehicle.handle_message(text, at_ns))
@@ -423,7 +423,7 @@ class MavlinkConnection:
             text = f"link {self._name}: the vehicle has started anew"
             return (*items, Event(at_ns=at_ns, severity=Severity.ERROR, code="vehicle-reboot", text=text))
         if self._vehicle.not_ready_count != not_ready_count:
-            self._streams.restart()  # those that go on will have been seen by the time they would be asked for
+            self._streams.restart()  # streams that continue are received again before the next request
         if (message.system, message.component) == self.vehicle:
             self._streams.handle_message(message)
             self._origin_setup.handle_message(message)
@@ -454,7 +454,7 @@ class MavlinkConnection:
             time_ns = self._vehicle_time_ns(at_ns) if is_vehicle else at_ns
             if time_ns is not None:
                 self._replies.append(self._encoder.encode_timesync(time_ns, message.ts1_ns))
-        elif message.ts1_ns in self._open_requests_ns:  # else it answers somebody else
+        elif message.ts1_ns in self._open_requests_ns:  # else it answers another client
             self._has_answer = True
             self._positions.add_timesync_answer(
                 (message.system, message.component), message.ts1_ns, message.tc1_ns, at_ns
@@ -464,7 +464,7 @@ class MavlinkConnection:
         self._bad[reason] += count
         if reason == SLOW_ANSWER:
             self._slow_count += count
-        elif reason == STALE_INERTIAL:  # told once, and then by the share that is used
+        elif reason == STALE_INERTIAL:  # reported once; then the used share is reported
             if self._bad[reason] == count:
                 self._unreported[reason] += count
         elif reason not in _NOT_REPORTED:

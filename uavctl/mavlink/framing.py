@@ -52,8 +52,8 @@ class Scan(msgspec.Struct):
 
     frames: list[RawFrame] = []  # whole frames in order
     bad: dict[str, int] = {}  # skips by reason
-    consumed: int = 0  # number of bytes that need not be seen again
-    is_aligned: bool = True  # whether the last bytes seen were a frame, so that the next byte should begin one
+    consumed: int = 0  # number of bytes that are done
+    is_aligned: bool = True  # whether the last bytes were a frame, so that the next byte should begin one
 
     def count_skip(self, reason: str) -> None:
         """Count a skip."""
@@ -69,7 +69,7 @@ class _FrameHeader(msgspec.Struct, frozen=True):
 
 
 def _parse_header(data: bytes, at: int) -> _FrameHeader | None:
-    """Shape of the frame at `at`; None while too few bytes are there to tell. `data[at]` is a magic byte."""
+    """Parse the header at `at`; None if bytes are missing. `data[at]` is a magic byte."""
     if data[at] == mavlink.PROTOCOL_MARKER_V1:
         if len(data) - at < HEADER_V1:
             return None
@@ -82,7 +82,7 @@ def _parse_header(data: bytes, at: int) -> _FrameHeader | None:
 
 
 def _has_unknown_flags(data: bytes, at: int) -> bool:
-    """Whether a version 2 header has incompatibility flags that nobody has defined."""
+    """Return whether a version 2 header has undefined incompatibility flags."""
     return data[at] == mavlink.PROTOCOL_MARKER_V2 and len(data) - at > 2 and bool(data[at + 2] & ~_INCOMPAT_KNOWN)
 
 
@@ -113,7 +113,7 @@ def scan_frames(data: bytes, *, final: bool, is_aligned: bool = True, verify: Ve
     Args:
         data: a datagram, or what has come of a stream.
         final: whether the data ends here. If not, a frame that it ends in is left for later.
-        in_step: whether the first byte should begin a frame (see `Scan`).
+        is_aligned: whether the first byte should begin a frame (see `Scan`).
         verify: takes only frames whose signature it accepts, in place of the checksum; frames of ids that the dialect
             has not are verified too, and then counted and dropped.
 

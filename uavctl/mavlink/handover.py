@@ -77,8 +77,8 @@ class StateTransition(msgspec.Struct, frozen=True):
     after: HandoverState  # the state that was entered
     reason: str = ""  # more about it, where something failed
     request: RequestKind | None = None  # request to the vehicle at that time
-    is_granted: bool = False  # it had said yes to that
-    mode_reason: ModeReason | None = None  # who has changed the mode, where it is none of ours
+    is_granted: bool = False  # the vehicle had accepted the request
+    mode_reason: ModeReason | None = None  # reason of a mode that is not ours
 
 
 class HandoverOutput(msgspec.Struct, frozen=True):
@@ -86,16 +86,16 @@ class HandoverOutput(msgspec.Struct, frozen=True):
 
     setpoint_mode: SetpointMode  # setpoints that may be streamed
     request: RequestKind | None = None  # request to make now, if any
-    events: tuple[Event, ...] = ()  # events to tell
+    events: tuple[Event, ...] = ()  # events for people
     transition: StateTransition | None = None  # transition that was made, if one was
 
 
 class HandoverStateMachine:
-    """State machine that decides who flies one vehicle.
+    """State machine of the hand-over of one vehicle.
 
     Args:
-        sees_it_down: Wait for the end of every landing, not only of flights that were begun by an order: the vehicle
-            lands by the positions that it gets from here.
+        waits_for_landing: Wait for the end of every landing, not only of ordered flights: the vehicle lands on relayed
+            positions.
 
     Attributes:
         failure: Why a request failed; empty while none has.
@@ -111,7 +111,7 @@ class HandoverStateMachine:
         self._is_disarm_requested = False
         self._is_heartbeat_lost = False
         self._is_without_pilot = False  # what we took off flies by itself, and nothing shows that a person has it
-        self._is_landing_overdue = False  # a landing that is asked for has not begun in the time for it
+        self._is_landing_overdue = False  # the vehicle has not begun a requested landing in time
         self._airborne_ns: int | None = None  # the last tick in which the vehicle was heard, and in the air
         self.failure = ""
 
@@ -122,7 +122,7 @@ class HandoverStateMachine:
 
     @property
     def is_ordered_flight(self) -> bool:
-        """Whether this flight was begun by an order to take off."""
+        """Whether an order to take off began this flight."""
         return self._progress.take_off_ordered_ns is not None
 
     @property
@@ -167,14 +167,14 @@ class HandoverStateMachine:
             return vehicle
         if self.state is HandoverState.ENGAGED:
             if self.is_ordered_flight:
-                # It tells once a second whether it climbs by itself, and it was we who ended that.
+                # EXTENDED_SYS_STATE comes once a second and may still show the climb that we have ended.
                 vehicle = msgspec.structs.replace(vehicle, own_climb=False)
             past = self._progress.may_be_outdated(vehicle)
             return msgspec.structs.replace(vehicle, armed=True, external=True) if past else vehicle
         return msgspec.structs.replace(vehicle, external=False, mode=f"{vehicle.mode} ({self.state})")
 
     def has_left_external_mode(self, vehicle: VehicleStatus) -> bool:
-        """Whether a heartbeat says that the vehicle is no longer in the external mode."""
+        """Return whether a heartbeat shows that the vehicle has left the external mode."""
         return not (vehicle.external and vehicle.armed) and not self._progress.may_be_outdated(vehicle)
 
     def update(self, inputs: HandoverInput) -> HandoverOutput:
@@ -232,7 +232,7 @@ class HandoverStateMachine:
         )
 
     def update_airborne(self, at_ns: int, vehicle: VehicleStatus | None) -> None:
-        """See whether the vehicle is in the air; the last word of it counts for the time of a landing."""
+        """Update whether the vehicle is in the air; without messages, the last state counts for `land_s`."""
         if vehicle is not None and not is_silent(at_ns, vehicle):
             self._airborne_ns = at_ns if vehicle.armed and not vehicle.landed else None
         elif self._airborne_ns is not None and at_ns - self._airborne_ns >= _ns(self._config.land_s):
@@ -340,7 +340,7 @@ class HandoverStateMachine:
         }
         limit_ns = _ns(limits_s[state]) if state in limits_s else FOREVER_NS
         if state is HandoverState.LANDING:
-            # What we took off is asked on: nobody else would.
+            # Nobody else would land what we took off: the request is repeated for longer.
             tries = (
                 max(LAND_TRIES, round(LAND_PERIODS * config.land_s / config.answer_s))
                 if self.is_ordered_flight

@@ -27,7 +27,7 @@ from uavctl.records import Command, Order, VehicleStatus
 HEARTBEAT_TIMEOUT_NS = 3_000_000_000
 # A heartbeat may have been under way when arming or the external mode was granted: PX4 shows it up to a second later.
 GRACE_NS = 300_000_000
-LATE_TEXT_NS = 1_000_000_000  # from the heartbeat that shows a mode to the text that says why
+LATE_TEXT_NS = 1_000_000_000  # from the heartbeat with a mode to the text with its reason
 LOOK_AHEAD_S = 0.5  # from asking for the external mode in a climb to the first braking: answer, news, the vehicle's lag
 MODE_SHOWN_NS = 2_000_000_000  # a heartbeat shows by then that landing was asked for
 LAND_PERIODS = 10  # times `land_s` for which landing is asked for: as long as a battery lasts
@@ -40,7 +40,7 @@ _IN_PROGRESS = TAKING_OFF | {
 }  # here the operator's end of the flight asks for landing, too
 _CLIMB_STATES = frozenset({HandoverState.CLIMBING, HandoverState.ENGAGING})
 REQUESTING = _IN_PROGRESS | {HandoverState.LANDING}
-BOOT_TIME_WAIT_NS = 5_000_000_000  # in which a vehicle that is found armed tells how long ago it started
+BOOT_TIME_WAIT_NS = 5_000_000_000  # wait for the uptime of a vehicle that is armed at the start
 # A simulated vehicle's clock may be slow, so that it seems to have started later than it has.
 MIN_CLOCK_RATE, BOOT_TIME_MARGIN_S = 0.8, 1.0
 _SECOND_VEHICLE = "another vehicle is heard on this link: nothing is armed; give each its own link"
@@ -61,7 +61,7 @@ class HandoverInput(msgspec.Struct, frozen=True, kw_only=True):
     at_ns: int  # time of the tick
     vehicle: VehicleStatus | None  # the vehicle's latest status; None before the first
     has_setpoint: bool  # the controller has a setpoint; without one no neutral stream invites the pilot
-    uptime_s: float | None = None  # time since it started [s]; None if it does not tell
+    uptime_s: float | None = None  # time since its start [s]; None if unknown
     is_landing_requested: bool = False  # the controller asks for landing
     is_stop_requested: bool = False  # the operator asks for the end
     may_have_lost_messages: bool = False  # the pilot may have taken over unheard: nothing is asked of the vehicle
@@ -70,7 +70,7 @@ class HandoverInput(msgspec.Struct, frozen=True, kw_only=True):
     estimated_height_m: float | None = None  # height of the estimate in local NED [m]; None without one
     climb_rate_mps: float = 0.0  # its rate of climb [m/s]
     has_motion: bool = False  # the vehicle sends its velocity or attitude now, whatever its heartbeats do
-    messages: tuple[CommandAck | StatusText, ...] = ()  # the vehicle's answers and words since the last tick
+    messages: tuple[CommandAck | StatusText, ...] = ()  # the vehicle's answers and texts since the last tick
     commands: tuple[Command, ...] = ()  # the operator's orders
 
 
@@ -89,10 +89,10 @@ class HandoverProgress:
     climb_start_ns: int | None = None  # time at which the climb first began [ns]; None before
     is_climb_interrupted: bool = False  # the failsafe that acts ended the climb, not the flight
     failsafe_texts: str = ""  # texts of the vehicle from before its failsafe acted
-    mode_reason: ModeReason | None = None  # who has the vehicle, where it is not we; None while it is we, or nobody
-    is_failsafe_landing: bool = False  # the landing that is waited for was last seen as a failsafe's
+    mode_reason: ModeReason | None = None  # reason of a mode that is not ours; None without one
+    is_failsafe_landing: bool = False  # a failsafe has begun the landing that is waited for
     granted_ns: int | None = None  # when arming or the external mode was granted, ahead of the heartbeat [ns]
-    boots: int = 0  # times that the vehicle had started anew by the last tick
+    boots: int = 0  # restarts of the vehicle by the last tick
     is_standing_by: bool = False  # A vehicle that is found armed is left alone
     previous_flight_ns: int | None = None  # start of the flight that it was left in [ns]; None if not known
     first_heard_ns: int | None = None  # when the vehicle was heard first [ns]; None if it was not
@@ -103,12 +103,12 @@ class HandoverProgress:
 
 
 class GuardResult(msgspec.Struct, frozen=True):
-    """Event that is seen, with the reason where that has to be told."""
+    """Event of a tick, with its reason."""
 
-    event: HandoverEvent  # in the words of the table
+    event: HandoverEvent  # column of the transition table
     reason: str = ""  # why something failed
     granted_ns: int | None = None  # when it was granted, if a heartbeat does not show it yet [ns]
-    mode_reason: ModeReason | None = None  # who has changed the mode, where it is none of ours
+    mode_reason: ModeReason | None = None  # reason of a mode that is not ours
 
 
 def is_silent(at_ns: int, vehicle: VehicleStatus | None) -> bool:
@@ -127,7 +127,7 @@ def is_in_failsafe(vehicle: VehicleStatus) -> bool:
 
 
 def _classify_takeover(progress: HandoverProgress, vehicle: VehicleStatus) -> GuardResult:
-    """Return the event seen in a mode that is none of ours, by who has chosen it.
+    """Return the event for a mode that is not ours, by its reason.
 
     A failsafe is waited for on a flight that we began, unless a person flies in its mode: the stick always wins.
     """
@@ -153,7 +153,7 @@ def explain_engage_refusal(state: HandoverState, inputs: HandoverInput) -> str:
 
 
 def explain_move_refusal(state: HandoverState, vehicle: VehicleStatus | None) -> str:
-    """Return why an order of where to fly would have no effect; empty if it is we who fly."""
+    """Return the reason why an order to move would have no effect; empty while the controller flies."""
     if state is HandoverState.ENGAGED:
         return ""
     if state is HandoverState.WAITING or vehicle is None:
@@ -169,7 +169,7 @@ def explain_move_refusal(state: HandoverState, vehicle: VehicleStatus | None) ->
 
 
 def evaluate(progress: HandoverProgress, inputs: HandoverInput) -> GuardResult:
-    """Return the event that a tick sees; of several the first in the order of `HandoverEvent`."""
+    """Return the event of a tick; of several, the first in the order of `HandoverEvent`."""
     vehicle, state = inputs.vehicle, progress.state
     if vehicle is not None and vehicle.boots > progress.boots and state is not HandoverState.WAITING:
         return GuardResult(HandoverEvent.REBOOT, "the vehicle has started anew")
@@ -192,7 +192,7 @@ def evaluate(progress: HandoverProgress, inputs: HandoverInput) -> GuardResult:
         and not inputs.has_setpoint
         and progress.take_off_ordered_ns is not None
     ):
-        # The controller has ended without a landing, and nobody else has what we took off.
+        # The controller has ended without a landing, and no pilot has the vehicle that we took off.
         return GuardResult(HandoverEvent.LAND)
     if state in _CLIMB_STATES and inputs.climb_hazard:
         return GuardResult(HandoverEvent.UNSAFE, f"{CLIMB_ABORTED}{inputs.climb_hazard}")
@@ -217,7 +217,7 @@ def _find_failure(progress: HandoverProgress, inputs: HandoverInput) -> str:
 
 
 def _must_keep_landing(progress: HandoverProgress, inputs: HandoverInput) -> bool:
-    """Whether it is asked to land, whatever it answers: what we took off, or armed for that, has nobody else."""
+    """Return whether the landing request is repeated after a refusal: no pilot has a vehicle that we took off."""
     vehicle = inputs.vehicle
     if progress.state is not HandoverState.LANDING or progress.take_off_ordered_ns is None or vehicle is None:
         return False
@@ -233,13 +233,13 @@ def is_without_pilot(progress: HandoverProgress, vehicle: VehicleStatus | None) 
 
 
 def _is_landing_ordered(progress: HandoverProgress, inputs: HandoverInput) -> bool:
-    """Whether the operator orders a landing of what is nobody's."""
+    """Return whether the operator orders a landing of a vehicle without a pilot."""
     is_unclear = progress.state is HandoverState.UNCLEAR and is_ordered(inputs, Order.LAND)
     return is_unclear and is_without_pilot(progress, inputs.vehicle)
 
 
 def _find_wait_timeout(progress: HandoverProgress, inputs: HandoverInput) -> str:
-    """Return why the vehicle's failsafe, or who has it, is not waited for any longer; empty while it is."""
+    """Return the reason to end the wait for a failsafe or an unknown pilot; empty while it lasts."""
     vehicle, config = inputs.vehicle, progress.config
     is_unclear = progress.state is HandoverState.UNCLEAR
     if is_unclear and not is_without_pilot(progress, vehicle):
@@ -282,7 +282,7 @@ def _find_take_off_failure(progress: HandoverProgress, inputs: HandoverInput) ->
 
 
 def _guard_standby(progress: HandoverProgress, inputs: HandoverInput, vehicle: VehicleStatus) -> GuardResult:
-    """Return the event seen before, between and after flights."""
+    """Return the event before, between and after flights."""
     is_ready = progress.state is HandoverState.READY and not (inputs.arming_refusal or inputs.is_stop_requested)
     if is_ready and progress.take_off_ordered_ns is not None and not vehicle.armed and vehicle.alone:
         return (
@@ -308,7 +308,7 @@ def _guard_standby(progress: HandoverProgress, inputs: HandoverInput, vehicle: V
         return GuardResult(HandoverEvent.EXTERNAL)
     if progress.state is HandoverState.ENGAGED:
         return _classify_takeover(progress, vehicle)
-    # A text that says of a failsafe comes after the heartbeat that shows its mode, sometimes.
+    # The text of a failsafe may come after the heartbeat with its mode.
     is_reason_uncertain = (
         progress.mode_reason in (ModeReason.PILOT, ModeReason.UNKNOWN)
         and inputs.at_ns - progress.state_start_ns < LATE_TEXT_NS
@@ -336,7 +336,7 @@ def _guard_mode(progress: HandoverProgress, inputs: HandoverInput, vehicle: Vehi
         return _classify_takeover(progress, vehicle)
     if vehicle.alone and vehicle.mode == profile.take_off_mode:
         return GuardResult(HandoverEvent.GRANTED)
-    # A mode that nobody here asked for is the pilot's; the one of before may be that of a vehicle that is slow.
+    # A mode that we did not request is the pilot's. A slow vehicle may still be in the previous mode.
     if vehicle.alone and vehicle.mode not in (profile.take_off_mode, progress.previous_mode):
         return _classify_takeover(progress, vehicle)
     if _is_after_grant(progress, vehicle, MODE_SHOWN_NS):
@@ -404,7 +404,7 @@ def _guard_external(progress: HandoverProgress, _inputs: HandoverInput, vehicle:
 
 
 def _guard_failsafe(progress: HandoverProgress, inputs: HandoverInput, vehicle: VehicleStatus) -> GuardResult:
-    """Return the event seen in a failsafe on a flight that we began; the pilot may take over as at any other time."""
+    """Return the event in a failsafe of an ordered flight; the pilot can take over at any time."""
     if not vehicle.armed:
         return GuardResult(
             HandoverEvent.DISARMED, f"{_describe_failsafe(progress)} has landed it{progress.failsafe_texts}"
@@ -415,14 +415,14 @@ def _guard_failsafe(progress: HandoverProgress, inputs: HandoverInput, vehicle: 
     if progress.is_climb_interrupted and vehicle.mode in profile.climb_modes:
         return GuardResult(HandoverEvent.GRANTED)
     stays_in_failsafe = not profile.restores_mode and vehicle.mode == progress.previous_mode and not vehicle.stick
-    # The external mode is not taken up again unasked: nobody knows whose doing it is.
+    # The external mode is not used again without an order: its reason is unknown.
     if vehicle.external or is_in_failsafe(vehicle) or stays_in_failsafe:
         return GuardResult(HandoverEvent.PENDING)
     return _classify_takeover(progress, vehicle)
 
 
 def _guard_unclear(progress: HandoverProgress, inputs: HandoverInput, vehicle: VehicleStatus) -> GuardResult:
-    """Return the event seen while it is not known who has changed the mode: word of that may still come."""
+    """Return the event while the reason of a mode is unknown: evidence may still come."""
     if not vehicle.armed:
         return GuardResult(HandoverEvent.DISARMED)
     if is_ordered(inputs, Order.ENGAGE) and not explain_engage_refusal(progress.state, inputs):
@@ -432,7 +432,7 @@ def _guard_unclear(progress: HandoverProgress, inputs: HandoverInput, vehicle: V
 
 
 def _guard_landing(progress: HandoverProgress, _inputs: HandoverInput, vehicle: VehicleStatus) -> GuardResult:
-    """Return the event seen while the vehicle is asked to land (LANDING), and once it has shown that it does."""
+    """Return the event while landing is requested (LANDING), and after the vehicle has begun it (SETTLING)."""
     is_new_heartbeat, is_requesting = vehicle.at_ns > progress.state_start_ns, progress.state is HandoverState.LANDING
     if not vehicle.armed:
         return GuardResult(HandoverEvent.DISARMED if is_new_heartbeat else HandoverEvent.PENDING)
@@ -444,8 +444,8 @@ def _guard_landing(progress: HandoverProgress, _inputs: HandoverInput, vehicle: 
     if not is_new_heartbeat or (is_ordered_flight and is_in_failsafe(vehicle)):
         return GuardResult(HandoverEvent.PENDING)
     if is_requesting:
-        # Asked for in the middle of a climb, any mode of the climb may still be shown; after it was granted, only the
-        # one of before may, for a while, by a vehicle that has not begun to land.
+        # If landing is requested in a climb, heartbeats may still show any mode of the climb. After the grant, only
+        # the previous mode may appear, for `MODE_SHOWN_NS`.
         is_climb_mode = vehicle.external or vehicle.mode in profile.climb_modes
         grace_ns = MODE_SHOWN_NS if vehicle.mode == progress.previous_mode else GRACE_NS
         is_taken_over = not is_climb_mode or _is_after_grant(progress, vehicle, grace_ns)

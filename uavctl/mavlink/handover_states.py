@@ -12,7 +12,7 @@ from enum import Enum, StrEnum
 
 
 class HandoverState(StrEnum):
-    """State of the hand-over: who flies, or what is under way."""
+    """State of the hand-over."""
 
     WAITING = "waiting"  # no vehicle is heard
     READY = "ready"  # heard; neutral setpoints warm the stream up
@@ -23,8 +23,8 @@ class HandoverState(StrEnum):
     RETURNING = "returning"  # the same from `released`, ordered to
     ENGAGED = "engaged"  # armed and in the external mode: setpoints
     FAILSAFE = "failsafe"  # what we took off is flown by a failsafe of its own: nothing is sent; in bounded time
-    UNCLEAR = "unclear"  # in a mode that is none of ours, and it is not known by whom: nothing is sent; in bounded time
-    RELEASED = "released"  # somebody else has taken over: nothing is sent unless ordered to
+    UNCLEAR = "unclear"  # another mode for an unknown reason: nothing is sent, in bounded time
+    RELEASED = "released"  # another pilot has taken over: nothing is sent without an order
     LANDING = "landing"  # landing was asked for: no setpoints any more, for good
     SETTLING = "settling"  # the vehicle lands by itself
     DONE = "done"  # disarmed after all: nothing is sent, for good
@@ -32,20 +32,20 @@ class HandoverState(StrEnum):
 
 
 class HandoverEvent(StrEnum):
-    """Event that a tick of the hand-over sees; of several the first in this order."""
+    """Event of a tick of the hand-over; of several, the first in this order counts."""
 
-    REBOOT = "reboot"  # the vehicle has started anew
+    REBOOT = "reboot"  # the vehicle has restarted
     LAND = "land"  # the controller, or the operator, asks for landing
     UNSAFE = "unsafe"  # it climbs by positions that cannot be, without any, or out of the room
     GRANTED = "granted"  # what was asked for is there
     REFUSED = "refused"  # what was asked for will not come
     SILENCE = "silence"  # no heartbeat, or the last one is too old
-    TAKE_OFF = "take-off"  # ordered, and nothing speaks against it
+    TAKE_OFF = "take-off"  # ordered, and allowed
     ENGAGE = "engage"  # ordered, and the vehicle is in the air
     LEFT = "left"  # found armed, and a daemon before this one ended while it had it
     DISARMED = "disarmed"
     FAILSAFE = "failsafe"  # armed, in a mode that a failsafe of its own has chosen, on a flight that we began
-    UNCLEAR = "unclear"  # in a mode that is none of ours, and nothing shows who has chosen it
+    UNCLEAR = "unclear"  # another mode, for an unknown reason
     OTHER = "other"  # in a mode that is none of ours: a person's, or on the pilot's flight a failsafe's
     EXTERNAL = "external"  # armed, in the external mode
     PENDING = "pending"  # what was asked for is not there yet
@@ -78,7 +78,7 @@ _S, _D, _F, _V = HandoverState.SETTLING, HandoverState.DONE, HandoverState.FAILE
 _U = HandoverState.UNCLEAR
 _NOTHING, _NEUTRAL, _FLY = SetpointMode.NOTHING, SetpointMode.NEUTRAL, SetpointMode.SETPOINTS
 
-# What is not here changes nothing, and nothing is sent.
+# An event that is missing here keeps the state, and nothing is sent.
 _CHANGES: dict[HandoverState, dict[HandoverEvent, Target]] = {
     _W: {
         HandoverEvent.REFUSED: (_F, _NOTHING),

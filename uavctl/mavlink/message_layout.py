@@ -84,13 +84,13 @@ _ESCAPES = re.compile(
 
 
 def strip_escapes(text: str) -> str:
-    """A text that somebody else wrote, without what would act on the terminal that shows it.
+    """Remove everything from a foreign text that would act on a terminal.
 
-    Escape sequences go, as PX4's colours; any other character that is not printable becomes a question mark.
+    Escape sequences (such as PX4's colours) are removed. Other characters that are not printable become "?".
     """
     return "".join(character if character.isprintable() else "?" for character in _ESCAPES.sub("", text))
 
 
 def decode_text(raw: bytes) -> str:
-    """A text of a fixed length, up to its first zero, as it may be shown."""
+    """Decode a text of fixed length up to its first zero, without escape sequences."""
     return strip_escapes(raw.split(b"\0", 1)[0].decode("utf-8", errors="replace"))

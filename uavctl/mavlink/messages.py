@@ -60,7 +60,7 @@ class Battery(Message, frozen=True, kw_only=True):
     """SYS_STATUS or BATTERY_STATUS."""
 
     voltage_v: float | None  # None if it is not measured
-    has_radio: bool | None = None  # a remote control is heard; None if the message does not tell
+    has_radio: bool | None = None  # a remote control is received; None if unknown
     is_within_fence: bool = True  # it is not beyond a fence of its own
 
 
@@ -85,8 +85,8 @@ class ModeCommand(Message, frozen=True, kw_only=True):
 class StatusText(Message, frozen=True, kw_only=True):
     """STATUSTEXT, or a piece of a long one."""
 
-    severity: int  # MAV_SEVERITY, 0 the worst, 7 the least
-    text: str  # what it says
+    severity: int  # MAV_SEVERITY, from 0 (emergency) to 7 (debug)
+    text: str
     text_id: int = 0  # of the long text that it is a piece of; 0: it is whole
     chunk: int = 0  # which piece, from 0
     has_more: bool = False  # another piece follows
@@ -110,7 +110,7 @@ class Attitude(Message, frozen=True, kw_only=True):
 
     angles_rad: Vec3  # roll, pitch, yaw of body axes forward, right, down in NED
     quaternion: bool = False  # it is ATTITUDE_QUATERNION
-    stamp_us: int = 0  # by the sender's clock, since boot; 0: it does not tell
+    stamp_us: int = 0  # by the sender's clock, since boot; 0 if unknown
 
 
 class Inertial(Message, frozen=True, kw_only=True):
@@ -118,7 +118,7 @@ class Inertial(Message, frozen=True, kw_only=True):
 
     specific_force_mps2: Vec3  # that; (0, 0, -g) at rest
     raw: bool = False  # it is RAW_IMU, whose unit is the sender's own: read as ArduPilot's, thousandths of g
-    stamp_us: int = 0  # by the sender's clock, since boot or of an epoch; 0: it does not tell
+    stamp_us: int = 0  # by the sender's clock, since boot or an epoch; 0 if unknown
 
 
 class ParamValue(Message, frozen=True, kw_only=True):
@@ -127,8 +127,8 @@ class ParamValue(Message, frozen=True, kw_only=True):
     name: str  # of the parameter
     cast: float  # the value as a number, as ArduPilot means it
     bytewise: float  # the value as PX4 means it: the bytes of an integer, if the type is one
-    index: int = 65535  # its place in the list; 65535 where that is not told
-    count: int = 0  # parameters that the vehicle says it has
+    index: int = 65535  # its index in the list; 65535 if unknown
+    count: int = 0  # number of parameters of the vehicle
 
 
 class EstimatorFlags(Message, frozen=True, kw_only=True):

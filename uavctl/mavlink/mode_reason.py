@@ -25,7 +25,7 @@ STICK_US = 100  # smallest movement of a channel by a person: a tenth of its ran
 # ekf_check.cpp, crash_check.cpp.
 _FAILSAFE_TEXT = re.compile(r"failsafe|terminat|parachute|\bcrash|dead.?reckon", re.IGNORECASE)
 _FENCE_TEXT = re.compile(r"fence.*(breach|violat|exceed)|(breach|violat|exceed|outside|beyond).*fence", re.IGNORECASE)
-# What speaks of an end, of a setting, or of why the vehicle does not arm, is no failsafe of a vehicle in flight.
+# Texts about an end, a setting or a refusal to arm do not report a failsafe in flight.
 _OTHER_TEXT = re.compile(
     r"clear|resolved|recovered|\bended|enabled|disabled|^(pre-?arm|arm|arming|preflight)\b", re.IGNORECASE
 )
@@ -33,7 +33,7 @@ _RADIO_TEXT = re.compile(r"\b(radio|rc|manual control|remote)\b", re.IGNORECASE)
 
 
 class ModeReason(StrEnum):
-    """Who has changed the mode; the value is how a person would say it."""
+    """Reason of a mode change; the value is its text for people."""
 
     PILOT = "the pilot"
     GROUND_STATION = "a ground station"
@@ -47,31 +47,31 @@ PERSON_REASONS = frozenset({ModeReason.PILOT, ModeReason.GROUND_STATION})
 
 
 def reports_fence_breach(text: str) -> bool:
-    """Whether a text of the vehicle says that it is beyond a fence of its own."""
+    """Return whether a text of the vehicle reports a breach of its fence."""
     return bool(_FENCE_TEXT.search(text)) and not _OTHER_TEXT.search(text)
 
 
 def reports_failsafe(text: str) -> bool:
-    """Whether a text of the vehicle says that a failsafe of its own acts."""
+    """Return whether a text of the vehicle reports an active failsafe."""
     return bool(_FAILSAFE_TEXT.search(text)) and not _OTHER_TEXT.search(text)
 
 
 def mentions_radio(text: str) -> bool:
-    """Whether a text that speaks of a failsafe speaks of the remote control: then its sticks move by themselves."""
+    """Return whether the text of a failsafe names the remote control; then its channels move without a pilot."""
     return bool(_RADIO_TEXT.search(text))
 
 
 def is_autonomous_mode(vehicle: VehicleStatus) -> bool:
-    """Whether its mode is one that needs no person: nobody may be there."""
+    """Return whether the vehicle's mode needs no pilot."""
     return find_profile(vehicle).mode_choices.get(vehicle.mode, ModeChoice.PERSON) is not ModeChoice.PERSON
 
 
 def determine_mode_reason(vehicle: VehicleStatus, *, was_in_failsafe: bool = False) -> ModeReason:
-    """Decide who has changed the mode to the one that the vehicle shows.
+    """Determine the reason of the vehicle's present mode.
 
     Args:
-        vehicle: its status, with what it said within the last seconds.
-        had_failed: a failsafe had chosen the mode of before; what it said may be of then.
+        vehicle: its status, with the evidence of the last seconds.
+        was_in_failsafe: a failsafe had chosen the previous mode; its text may still count.
     """
     profile = find_profile(vehicle)
     choice = profile.mode_choices.get(vehicle.mode)
@@ -96,7 +96,7 @@ def determine_mode_reason(vehicle: VehicleStatus, *, was_in_failsafe: bool = Fal
 
 
 class ModeReasonEvidence:
-    """What the vehicle says, and shows, of who changes its modes.
+    """Evidence for the reason of a mode change.
 
     Each counts for `EVIDENCE_NS`, and longer where no heartbeat has come since: the mode may have changed right after.
     """
@@ -107,7 +107,7 @@ class ModeReasonEvidence:
         self._failsafe_text = ""
         self._station = 0
         self._reference_us: list[int] = []  # of each channel, since it moved last; 0: not known
-        self._has_radio: bool | None = None  # None before it says so
+        self._has_radio: bool | None = None  # None before the first report
         self._is_within_fence = True
 
     def add_heartbeat(self, at_ns: int) -> None:

@@ -24,14 +24,14 @@ from uavctl.records import PositionSample, Vec3
 MAX_SOURCES = 32
 SILENCE_NS = 10_000_000_000  # after which a source gives its place to any other
 SETTLED_SAMPLES = 20  # samples after which a source is no newcomer any more
-# Samples of all newcomers together, while no settled source speaks, and while one does: each costs the estimator its
-# time, and nobody knows yet whose it is.
+# Samples of all new sources together: without a settled source that is active, and beside one. Each sample costs the
+# estimator time, and a new source may be hostile.
 NEW_SOURCE_PER_S, NEW_SOURCE_BESIDE_PER_S = 100, 10
 NEW_SOURCE_BURST = 50
 SOURCE_ACTIVE_NS = 1_000_000_000
 
 WRONG_SYSTEM = "system-id"
-NEW_SOURCE = "new-source"  # more samples of sources that nobody has heard before than are looked at
+NEW_SOURCE = "new-source"  # more samples of new sources than the limit
 TOO_MANY_SOURCES = "sources"  # more than there is room for: the history of one is lost
 IMPLAUSIBLE = "absurd"
 SLOW_ANSWER = "timesync"
@@ -44,12 +44,12 @@ State = TypeVar("State")
 
 
 class SourceTable(Generic[Key, State]):
-    """Table of what is kept of each source. A new one always finds room: the one that has said least gives way.
+    """Table of states by source. A new source replaces the one with the fewest messages.
 
-    So no source is kept out by others, and one that has spoken for a while loses nothing to those that come and go.
+    So other sources cannot keep one out, and a settled source keeps its state.
 
     Args:
-        bad: called when a source that is not silent loses its place.
+        count_bad: called when an active source is removed.
     """
 
     def __init__(self, max_sources: int, count_bad: Callable[[], None]) -> None:
@@ -65,7 +65,7 @@ class SourceTable(Generic[Key, State]):
         return None if entry is None else entry[0]
 
     def message_count(self, key: Key) -> int:
-        """Return how often a source has spoken; 0 if it is not there."""
+        """Return the number of messages of a source; 0 if it is not in the table."""
         entry = self._entries.get(key)
         return 0 if entry is None else entry[1]
 
@@ -74,7 +74,7 @@ class SourceTable(Generic[Key, State]):
         return (state for state, _, _ in self._entries.values())
 
     def record_message(self, key: Key, at_ns: int, make_state: Callable[[], State]) -> State:
-        """Note that a source speaks now, and return what is kept of it; for a new one, `make_state` makes it."""
+        """Count a message of a source and return its state; `make_state` makes that of a new source."""
         entry = self._entries.get(key)
         if entry is None and len(self._entries) >= self._max_sources:
             self._evict(at_ns)
@@ -100,7 +100,7 @@ class PositionDecoder:
         clock: window, latency and tolerance of the sources' clocks.
         source: which messages and which system count.
         estimator: standard deviation of a sample, and what is absurd.
-        bad: counter that refusals are added to.
+        count_bad: counts refusals, by reason.
     """
 
     def __init__(
@@ -146,7 +146,7 @@ class PositionDecoder:
         return None if address is None else self._timesync_clocks.get(address)
 
     def are_clocks_known(self, at_ns: int) -> bool:
-        """Whether every peer that answers has given an answer lately by which its clock is known."""
+        """Return whether the clock of every peer that answers is known now."""
         return all(timesync.offset_ns(at_ns) is not None for timesync in self._timesync_clocks.values())
 
     def add_timesync_answer(self, address: Address, sent_ns: int, remote_ns: int, received_ns: int) -> None:
@@ -196,7 +196,7 @@ class PositionDecoder:
         return is_far or (velocity_mps is not None and max(map(abs, velocity_mps)) > self._estimator.max_velocity_mps)
 
     def _is_within_budget(self, message: Position, received_ns: int) -> bool:
-        """Whether one more sample is looked at; each sample of a settled source is."""
+        """Return whether to use one more sample; those of a settled source always pass."""
         self.is_settled = self._clocks.message_count(_find_key(message)) >= SETTLED_SAMPLES
         if self.is_settled:
             self._settled_ns = received_ns

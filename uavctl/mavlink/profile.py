@@ -18,7 +18,7 @@ from uavctl.records import VehicleStatus
 class ModeChoice(Enum):
     """Who can have chosen a mode of an autopilot."""
 
-    PERSON = "a person, with a stick or at a ground station"  # also what the autopilot gives such a person back to
+    PERSON = "a person, with a stick or at a ground station"  # also a mode that the autopilot restores
     EITHER = "a person, or a failsafe"  # it flies by itself
     FAILSAFE = "a failsafe only"
 
@@ -115,16 +115,16 @@ class AutopilotProfile:
     take_off_mode: str  # the mode that take-off begins in, asked for on the ground
     climb_modes: frozenset[str]  # modes that it is in during its own climb and right after
     landing_modes: frozenset[str]  # modes in which it lands by itself
-    mode_choices: dict[str, ModeChoice]  # its modes, and who can have chosen each
-    # Modes of a person that a failsafe chooses all the same where the one of before cannot go on
+    mode_choices: dict[str, ModeChoice]  # its modes, and the possible choosers of each
+    # Modes of a person that a failsafe also chooses if the previous mode is not possible any more
     degraded_modes: frozenset[str]
-    # A failsafe that ends gives back the mode of before, and ends what the vehicle says of it; else its mode stays
+    # The end of a failsafe restores the previous mode; otherwise the mode of the failsafe stays
     restores_mode: bool
     # Arming in `take_off` starts the climb, to a height of its own; else MAV_CMD_NAV_TAKEOFF does, to a height above
     # the place of arming
     climbs_on_arming: bool
     uses_raw_imu: bool  # its RAW_IMU is taken for its acceleration; else HIGHRES_IMU alone is
-    needs_global_origin: bool  # without GPS it has to be told a place on the globe before it arms
+    needs_global_origin: bool  # without GPS it needs a global origin before it arms
     number: int  # MAV_AUTOPILOT of its heartbeats
     inertial_messages: tuple[int, int]  # the messages that show how it turns, and its acceleration
     # A mode's name, of MAV_TYPE and of a heartbeat's custom_mode; empty where the kind of vehicle is not known

@@ -19,7 +19,7 @@ from uavctl.config.connections import RelayConfig
 from uavctl.frames import Quaternion, rotate_vector
 from uavctl.records import Event, PositionSample, Severity, Vec3
 
-MAX_AGE_NS = 200_000_000  # an older position would be taken for a new one by estimators that cannot look back
+MAX_AGE_NS = 200_000_000  # some estimators use an older position as a new one
 STUCK_AFTER = 25  # poses in a row, the same to the last bit
 _MAX_QUEUE = 64  # poses of one tick
 SILENT_NS = 500_000_000  # an estimator without positions for longer drifts by more than a hand's breadth
@@ -68,7 +68,7 @@ class Relay:
         self._last: tuple[Vec3, Quaternion] | None = None
         self._repeat_count = 0
         self._start_ns: int | None = None  # time of the first tick
-        self._kept_before: Counter[str] = Counter()  # poses kept back by the time that the last one went
+        self._kept_before: Counter[str] = Counter()  # counts of `kept` when the last pose was sent
         self._reported = ""  # this silence, while the vehicle was armed or on the ground
         self._is_reported_on_ground = False  # any
         self.silent_for = ""

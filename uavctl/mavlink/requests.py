@@ -19,11 +19,11 @@ from uavctl.mavlink.messages import CommandAck, StatusText
 
 SHOWN_NS = 3 * SECOND_NS  # heartbeats, at 1 Hz, show by then what was granted
 _FINAL = frozenset({mavlink.MAV_RESULT_DENIED, mavlink.MAV_RESULT_UNSUPPORTED})
-_MAX_TEXTS = 4  # of the vehicle's last words that are told with a refusal
+_MAX_TEXTS = 4  # texts of the vehicle that are reported with a refusal
 
 
 class RequestKind(StrEnum):
-    """Request to the vehicle; the value is how a person would say it."""
+    """Request to the vehicle; the value is its text for people."""
 
     TAKE_OFF_MODE = "the mode to take off in"
     ARM = "arming"
@@ -49,7 +49,7 @@ class RequestLimits:
 
     answer_ns: int  # without an effect it is made again after this time [ns]
     retry_ns: int  # refused for now, it is made again after this time [ns]
-    tries: int  # times that it is made at most
+    tries: int  # largest number of attempts
     limit_ns: int  # after this time it has failed [ns]
 
 
@@ -57,7 +57,7 @@ class PendingRequest:
     """A request from its first time to its effect, or its end.
 
     Args:
-        ask: What is asked for; None for a wait in which nothing is said.
+        kind: The request; None for a wait in which nothing is sent.
     """
 
     def __init__(self, kind: RequestKind | None, at_ns: int, limits: RequestLimits) -> None:
@@ -74,7 +74,7 @@ class PendingRequest:
         self.granted_ns: int | None = None  # when it was accepted last
 
     def handle_message(self, message: CommandAck | StatusText, at_ns: int) -> None:
-        """Take what the vehicle says."""
+        """Handle an answer or a text of the vehicle."""
         if isinstance(message, StatusText):
             if message.severity <= mavlink.MAV_SEVERITY_WARNING and message.text not in self._texts:
                 self._texts = [*self._texts, message.text][-_MAX_TEXTS:]
@@ -85,12 +85,12 @@ class PendingRequest:
                 self._next_ns = at_ns + SHOWN_NS
             elif message.result == mavlink.MAV_RESULT_IN_PROGRESS:
                 self._next_ns = max(self._next_ns, at_ns + self._limits.retry_ns)
-            elif not (is_repeated and self._is_retry_delayed):  # said twice, it is not waited for twice
+            elif not (is_repeated and self._is_retry_delayed):  # a repeated refusal does not extend the wait
                 self._is_retry_delayed = True
                 self._next_ns = at_ns + self._limits.retry_ns
 
     def due(self, at_ns: int, blocked_reason: str = "", *, is_mode_uncertain: bool = False) -> RequestKind | None:
-        """Return the request to send now, if any; `blocked_reason` says why it must not be sent yet.
+        """Return the request to send now, if any; `blocked_reason` tells why not to send it yet.
 
         `is_mode_uncertain`: nothing is asked again now, as it is not known what the vehicle does meanwhile.
         """

@@ -27,7 +27,7 @@ EPOCH_NS = 1_420_070_400_000_000_000  # 1st January 2015, UTC
 TIMESTAMP_UNIT_NS = 10_000  # of a stamp
 MAX_TIMESTAMP = 2**48 - 1
 MAX_NEW_STREAM_LAG = 6_000_000  # units: a stream that is new may begin one minute behind our own stamp
-MAX_STREAMS = 64  # of one connection; a flight has a handful
+MAX_STREAMS = 64  # of one connection; a flight has a few
 MAX_LINK_SKEW = (
     500_000  # units: no frame is taken that is five seconds behind what its stream has said on another connection
 )
@@ -62,7 +62,7 @@ class SigningKey:
         if len(secret) != KEY_BYTES or not any(secret):
             raise ValueError(f"a key is {KEY_BYTES} bytes, not all zero")
         self._seed = hashlib.sha256(secret)
-        #: says which key it is, and nothing of its bytes
+        #: identifies the key and reveals none of its bytes
         self.name = hashlib.sha256(b"uavctl: name of a key" + secret).hexdigest()[:16]
 
     def __repr__(self) -> str:
@@ -79,7 +79,7 @@ class SigningKey:
 class SigningTimestamps:
     """Stamps of one key."""
 
-    floor: int = 0  # newest of all before the start; it has to be kept, so that nothing older is taken ever again
+    floor: int = 0  # newest before the start; it is stored, so that no older frame is accepted again
     newest: int = 0  # newest that was sent or verified since, on any connection
     # newest that was verified of each stream, on any connection
     streams: dict[StreamId, int] = field(default_factory=dict)
@@ -97,8 +97,8 @@ class FrameSigner:
 
     Args:
         key: the secret that is shared with the peers.
-        stamps: of this key, shared by all connections. What is new is decided by each for itself: a frame that somebody
-            brings to another connection first is not old on its own.
+        timestamps: of this key, shared by all connections. Each connection decides for itself whether a frame is new: a
+            copy on another connection does not make it old.
         wall_offset_ns: wall clock (UTC, since 1970) − the clock of `at_ns`. It is read once: a step of the wall clock
             during a flight has no effect.
         peer_link_ids: link ids that peers may use; none takes the first of each (system, component).

@@ -33,7 +33,7 @@ ATTITUDE_QUATERNION, HIGHRES_IMU, RAW_IMU = 31, 105, 27
 GPS_GLOBAL_ORIGIN = 49
 RATES_HZ = {LOCAL_POSITION_NED: 10.0, ATTITUDE: 10.0, EXTENDED_SYS_STATE: 5.0, SYS_STATUS: 1.0, RC_CHANNELS: 5.0}
 INERTIAL_HZ = 50.0  # of what shows how it turns, and its acceleration
-# Of the list of all parameters: 50 a second are asked for again at most, which a telemetry radio bears.
+# Limits of the download. A telemetry radio can carry 50 parameters a second.
 MAX_PARAMETERS, MAX_READ_ROUNDS = 5000, 10
 READS_PER_BATCH, BATCH_NS = 10, SECOND_NS // 5
 LIST_END_NS = SECOND_NS // 2  # without a parameter: the list has ended
@@ -76,7 +76,7 @@ class StreamRequests:
                 self._has_inertial = self._inertial_tries > 0
 
     def restart(self) -> None:
-        """Ask anew: the vehicle has restarted and may have forgotten the requests."""
+        """Repeat all requests: the vehicle has restarted and may have forgotten them."""
         self._received.clear()
         self._has_inertial = False
         self._next_ns, self._tries = None, 0
@@ -91,7 +91,7 @@ class StreamRequests:
             self._next_ns = at_ns + RETRY_NS
             self._tries += 1
             rates_hz = {number: rate for number, rate in self._rates_hz.items() if number not in self._received}
-        # Not waited for: but for a PX4 on an onboard link no vehicle sends them so often, and a flight may have begun.
+        # Requested at once: only a PX4 on an onboard link sends them at this rate by itself.
         profile = PROFILES.get(autopilot) if self._wants_inertial and not self._has_inertial else None
         kinds = () if profile is None else profile.inertial_messages
         if kinds and at_ns >= self._inertial_next_ns and self._inertial_tries < MAX_TRIES:
@@ -105,8 +105,8 @@ class ParameterDownload:
     """Schedule of asking a vehicle that has not been armed yet for all its parameters: the list, then what was lost."""
 
     def __init__(self) -> None:
-        self._missing: set[int] | None = None  # indices not told yet; None before the vehicle says how many it has
-        self._has_new_value = False  # one was told since the last look
+        self._missing: set[int] | None = None  # missing indices; None before the number of parameters is known
+        self._has_new_value = False  # a parameter has come since the last call
         self._next_ns = 0
         self._list_requests = self._read_rounds = 0
         self._round_indices: list[int] = []  # indices of this round that are still to be asked for
@@ -167,7 +167,7 @@ class GlobalOriginSetup:
                 self._has_external_source = cast == EXTERNAL_SOURCE
 
     def due(self, at_ns: int) -> tuple[bool, bool]:
-        """Whether to ask now (for the parameter and the origin), and whether to tell the origin.
+        """Return whether to request the parameter and the origin now, and whether to send our origin.
 
         The place is sent from the second time on: by then a vehicle that has an origin has answered with it.
         """

@@ -75,7 +75,7 @@ def is_vehicle(heartbeat: Heartbeat) -> bool:
 
 
 def is_preferred(address: tuple[int, int], other: tuple[int, int] | None) -> bool:
-    """Whether of two that say that they are vehicles the first one is to be followed.
+    """Return whether to follow the first of two vehicles instead of the second.
 
     Of one system it is the component of autopilots; of two systems the one that is followed already.
     """
@@ -99,7 +99,7 @@ class SensorStreamMonitor:
         self._since_us = 0  # stamp of the first of the same readings in a row
 
     def is_current(self, stamp_us: int, values: Vec3, at_ns: int, *, frozen_us: int = 0) -> bool | None:
-        """Whether a message is a measurement of now; None for one that was there already.
+        """Return whether a message is a current measurement; None for a repeated one.
 
         Args:
             stamp_us: when it was measured, by the sender's clock.
@@ -126,11 +126,11 @@ class VehicleMonitor:
     A vehicle that has fallen silent on the ground, disarmed, gives way to another.
 
     Args:
-        bad: counter that heartbeats of other vehicles are added to.
-        own: our system and component id; answers to others' commands are not ours.
+        count_bad: counts heartbeats of other vehicles, by reason.
+        own_address: our system and component id; answers to others' commands are not ours.
         system: the vehicle's system id; 0 takes any.
         component: its component id; 0 takes any, and that of autopilots rather than another.
-        channels: its remote control is heard of: what SYS_STATUS says of that and of a fence counts, too.
+        channels: use the remote control and fence flags of SYS_STATUS.
     """
 
     def __init__(
@@ -152,15 +152,15 @@ class VehicleMonitor:
         self._battery_v: float | None = None
         self._boot_clock = BootClock()
         self._is_ready = False  # by its last heartbeat
-        self._heard_ns = 0  # any word of it
+        self._heard_ns = 0  # any message of it
         self._evidence = ModeReasonEvidence()
         self._is_in_failsafe = False  # by its last heartbeat
         self._other_vehicle_ns: int | None = None  # when another vehicle was heard last
         self._status: VehicleStatus | None = None
         self._motion = VehicleMotion()
         self._sensor_streams: dict[str, SensorStreamMonitor] = {}  # by kind of message
-        self._attitude: tuple[Vec3, int] | None = None  # attitude, and when it was told
-        self.inertial_used = self.inertial_total = 0  # inertial data that gave an acceleration, and all
+        self._attitude: tuple[Vec3, int] | None = None  # attitude, and its time of arrival
+        self.inertial_used = self.inertial_total = 0  # inertial data: used, and all
         self.boots = 0
         self.not_ready_count = 0  # times that it ceased to be ready: its streams may be gone
         self.address: tuple[int, int] | None = None  # system, component
@@ -172,7 +172,7 @@ class VehicleMonitor:
 
     @property
     def is_armed(self) -> bool:
-        """Whether it says that it is armed."""
+        """Whether the last heartbeat shows an armed vehicle."""
         return self._status is not None and self._status.armed
 
     def handle_message(
@@ -185,7 +185,7 @@ class VehicleMonitor:
             return self._handle_mode_command(message.system, message.target_system, at_ns)
         if self.address is None or message.system != self.address[0]:
             return ()
-        if message.component != self.address[1]:  # a companion computer or gimbal of the same system: its words only
+        if message.component != self.address[1]:  # a companion computer or gimbal: only its texts
             return (_make_text_event(message, at_ns),) if isinstance(message, StatusText) else ()
         self._heard_ns = at_ns
         match message:
@@ -234,7 +234,7 @@ class VehicleMonitor:
         return ()
 
     def _handle_mode_command(self, station: int, target: int, at_ns: int) -> tuple[VehicleStatus, ...]:
-        """Take note that somebody orders a mode of a vehicle; only others' orders of this one count."""
+        """Note a mode command of another station to this vehicle."""
         if (
             self.address is None
             or target not in (0, self.address[0])
@@ -245,7 +245,7 @@ class VehicleMonitor:
         return self._update_evidence(at_ns)
 
     def _update_evidence(self, at_ns: int) -> tuple[VehicleStatus, ...]:
-        """Return a status at once where there is new evidence of who has changed its mode."""
+        """Return a status at once if the evidence has changed."""
         if self._status is None:
             return ()
         before, self._status = self._status, self._evidence.apply_to(self._status, at_ns, critical=self._is_in_failsafe)
@@ -256,7 +256,7 @@ class VehicleMonitor:
         return ack.target_system in (0, system) and ack.target_component in (0, component)
 
     def uptime_s(self, at_ns: int) -> float | None:
-        """Return the time since it started, by its own clock [s]; None if it does not tell."""
+        """Return the vehicle's uptime by its own clock [s]; None if unknown."""
         return self._boot_clock.uptime_s(at_ns)
 
     def attitude(self, at_ns: int) -> Quaternion | None:
@@ -266,11 +266,11 @@ class VehicleMonitor:
         return quaternion_from_euler(self._attitude[0])
 
     def _update_boot_clock(self, kind: str, stamp_us: int, at_ns: int) -> tuple[VehicleStatus, ...]:
-        """Watch its time since boot; a status tells at once that it has started anew."""
+        """Update the boot clock; return a status at once after a restart."""
         return self._reset_after_reboot() if self._boot_clock.update(kind, stamp_us // 1000, at_ns) else ()
 
     def _update_landed(self, landed: bool | None, own_climb: bool) -> tuple[VehicleStatus, ...]:
-        """Whether it stands, climbs or lands by itself; a status tells at once when that changes in flight."""
+        """Update the landed state; return a status at once if the vehicle's own climb begins or ends."""
         changed = own_climb != self._own_climb
         self._landed, self._own_climb = landed, own_climb
         if self._status is None or not changed:
@@ -281,7 +281,7 @@ class VehicleMonitor:
     def _update_motion(
         self, at_ns: int, *, velocity: Vec3 | None = None, attitude: Vec3 | None = None
     ) -> tuple[VehicleMotion, ...]:
-        """Return the vehicle's motion, updated with what it has just said of it."""
+        """Update and return the vehicle's motion."""
         if velocity is not None:
             self._motion = msgspec.structs.replace(self._motion, velocity_mps=velocity, velocity_ns=at_ns)
         if attitude is not None:
@@ -289,7 +289,7 @@ class VehicleMonitor:
         return (self._motion,)
 
     def _update_attitude(self, message: Attitude, at_ns: int) -> None:
-        """Remember the attitude that specific forces are turned by, if it is of now."""
+        """Store the attitude that rotates specific forces, if it is current."""
         if not self._wants_inertial:
             return
         kind = "quaternion" if message.quaternion else "angles"
@@ -329,7 +329,7 @@ class VehicleMonitor:
         return (self._status,)
 
     def _is_lost_on_ground(self, at_ns: int) -> bool:
-        """Whether the vehicle that is followed is silent and was on the ground: nothing of ours can be flying it."""
+        """Return whether the followed vehicle is silent and was disarmed: it cannot be in flight."""
         status = self._status
         return status is not None and not status.armed and at_ns - status.at_ns > GONE_NS
 
