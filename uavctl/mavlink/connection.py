@@ -59,22 +59,22 @@ from uavctl.records import (
 
 VEHICLE, MOCAP = "vehicle", "mocap"
 HEARTBEAT_NS = SECOND_NS
-# A little off one second, so that requests do not always wait behind the same step's solve.
+# Not quite one second, so that requests do not always wait for the solve of the same step.
 TIMESYNC_NS = 950_000_000
 FIRST_TIMESYNC_NS = 200_000_000
-MAX_FIRST_REQUESTS = 10  # sent faster, until the first answer
-MAX_OPEN_REQUESTS = 8  # requests whose answers are still taken
-# Requests that are answered within a time, for the vehicle and for others each: a flood of them neither makes a flood
-# of answers nor costs a tick its time.
+MAX_FIRST_REQUESTS = 10  # at the faster rate, until the first answer
+MAX_OPEN_REQUESTS = 8  # requests that still accept an answer
+# Limit of answers to TIMESYNC in a time window; one for the vehicle, one for all others. A flood of requests must not
+# make a flood of answers, or take the time of a tick.
 MAX_ANSWERS, ANSWER_WINDOW_NS = 8, 50_000_000
 STREAM_SCHEMES = ("tcp:", "serial:")
-SLOW_EVENT_NS = 10_000_000_000  # between two events of slow answers
-MISSING_HEARTBEAT_NS = 3 * SECOND_NS  # three heartbeats that did not come
+SLOW_EVENT_NS = 10_000_000_000  # between two events about slow answers
+MISSING_HEARTBEAT_NS = 3 * SECOND_NS  # three missing heartbeats
 NO_HEARTBEAT = "no-heartbeat"
 STAMP_UNIT = "stamp-unit"
 TIMESYNC_FLOOD = "timesync-flood"
 OVERRUN = "overrun"  # dropped by the system before it was read; perhaps the newest state of the vehicle
-HUNG_UP = "hung-up"  # times that the other side of a TCP connection has closed it
+HUNG_UP = "hung-up"  # times that the other side has closed a TCP connection
 CONNECTION_SILENT = "went-silent"  # reconnections of a silent TCP connection
 _DISCONNECT_TEXTS = {
     HUNG_UP: "the other side closed the connection; it is called again each second",
@@ -87,13 +87,13 @@ Item = PositionSample | VehicleStatus | VehicleMotion | InertialSample | Event |
 
 
 class ReceiveResult(NamedTuple):
-    """Content of one datagram, and the origin of the newest sample by then, which may be of a datagram before."""
+    """Content of one datagram, and the source state of the newest sample, which may be of an earlier datagram."""
 
     items: tuple[Item, ...]
-    replies: tuple[bytes, ...]  # to requests for our time, to be sent at once: a TIMESYNC that waits measures the wait
+    replies: tuple[bytes, ...]  # answers to TIMESYNC requests, to be sent at once: a delay would count as round trip
     is_source_settled: bool  # whether the source of the newest sample is settled
-    attitude: Quaternion | None  # of the body in it: body axes forward, right, down to NED (w, x, y, z)
-    clock_source: ClockSource  # of its capture time
+    attitude: Quaternion | None  # of its body: body axes forward, right, down to NED (w, x, y, z)
+    clock_source: ClockSource  # source of its capture time
 
 
 class MavlinkConnection:
@@ -104,7 +104,7 @@ class MavlinkConnection:
         roles: `vehicle` (heartbeats, status, setpoints), `mocap` (positions), or both.
         daemon: our ids; the connection's URL tells a byte stream from datagrams.
         source: which messages and which system count as positions.
-        estimator: standard deviation of a position, and what is absurd.
+        estimator: standard deviation of a position, and the limits of plausible ones.
         on_message: called with every decoded message of others and its time of arrival; for callers that need more
             than the items.
         vehicle_time: a vehicle that asks for our time gets that of its own clock (`relay.vehicle_time`).
@@ -151,7 +151,7 @@ class MavlinkConnection:
         self._slow_reported_ns: int | None = None
         self._reported_resyncs = 0
         self._is_low_share_reported = False
-        # A vehicle that sends its position, but no heartbeat: its address, since when, and whether that was reported
+        # A vehicle that sends its position, but no heartbeat: address, start, and whether it was reported
         self._no_heartbeat_address: tuple[int, int] | None = None
         self._no_heartbeat_since_ns: int | None = None
         self._is_no_heartbeat_reported = False
@@ -164,9 +164,9 @@ class MavlinkConnection:
         self._has_answer = False
         self._on_message = on_message
         self._vehicle_clock = ArrivalClock()
-        self._replies: list[bytes] = []  # to requests of the datagram in hand
+        self._replies: list[bytes] = []  # to requests of the present datagram
         self._reply_window_ns = 0
-        self._reply_counts: Counter[bool] = Counter()  # requests of the vehicle's, and of all others, in that time
+        self._reply_counts: Counter[bool] = Counter()  # requests of the vehicle (True) and of all others in the window
 
     @property
     def vehicle(self) -> tuple[int, int] | None:
@@ -174,11 +174,11 @@ class MavlinkConnection:
         return self._vehicle.address
 
     def timesync_clock(self, address: tuple[int, int] | None = None) -> TimesyncClock | None:
-        """Round trips to a peer that answers TIMESYNC; without an address, to the source of the newest sample."""
+        """Return the clock of a peer that answers TIMESYNC; without an address, of the newest sample's source."""
         return self._positions.timesync_clock(address)
 
     def add_timesync_answer(self, address: tuple[int, int], sent_ns: int, remote_ns: int, received_ns: int) -> None:
-        """Take the answer to a TIMESYNC request that another client has sent, as a recording shows it.
+        """Add an answer to the TIMESYNC request of another client, from a recording.
 
         Args:
             address: system and component whose clock it shows.
@@ -187,7 +187,7 @@ class MavlinkConnection:
 
     @property
     def inertial_counts(self) -> tuple[int, int]:
-        """Inertial data of the vehicle that are used, and all that came."""
+        """Numbers of inertial data: used, and all."""
         return self._vehicle.inertial_used, self._vehicle.inertial_total
 
     def vehicle_uptime_s(self, at_ns: int) -> float | None:
@@ -195,7 +195,7 @@ class MavlinkConnection:
         return self._vehicle.uptime_s(at_ns)
 
     def receive(self, data: bytes, at_ns: int) -> ReceiveResult:
-        """Take one datagram, or one chunk of a stream, that arrived at `at_ns`; never raises."""
+        """Decode one datagram, or one chunk of a stream, that arrived at `at_ns`; never raises."""
         self._replies.clear()
         decoded = decode(data) if self._stream is None else self._stream.push(data)
         self._datagrams += 1
@@ -215,7 +215,7 @@ class MavlinkConnection:
         )
 
     def add_refusals(self, counts: Mapping[str, int], at_ns: int) -> tuple[Event, ...]:
-        """Take the counts of what the connection dropped unread: addresses, rates, signatures."""
+        """Add counts of data that the connection dropped before decoding: by address, rate or signature."""
         for reason, count in counts.items():
             self._count_bad(reason, count)
         events = tuple(
@@ -226,7 +226,7 @@ class MavlinkConnection:
         return events + self._make_events(at_ns)
 
     def due(self, at_ns: int) -> tuple[bytes, ...]:
-        """Return what is to be sent at `at_ns` besides setpoints: heartbeat, TIMESYNC, requests for streams."""
+        """Return the frames that are due at `at_ns`: heartbeat, TIMESYNC, requests for streams and parameters."""
         frames = []
         if self._heartbeat_ns is None or at_ns - self._heartbeat_ns >= HEARTBEAT_NS:
             self._heartbeat_ns = at_ns
@@ -246,7 +246,7 @@ class MavlinkConnection:
         return tuple(frames)
 
     def encode_setpoint(self, setpoint: Setpoint) -> bytes:
-        """The setpoint, addressed to the vehicle.
+        """Encode a setpoint for the vehicle.
 
         Raises:
             UnsendableError: a value is not finite, or no vehicle has been heard.
@@ -254,15 +254,15 @@ class MavlinkConnection:
         return self._encoder.encode_setpoint(setpoint, *self._target_address())
 
     def encode_request(self, kind: RequestKind, height_m: float) -> bytes:
-        """A request to the vehicle.
+        """Encode a request to the vehicle.
 
         Args:
             height_m: of the climb above the ground [m], for a take-off.
 
         Raises:
-            UnsendableError: no vehicle has been heard, or it is of a kind that cannot be asked for this.
+            UnsendableError: no vehicle has been heard, or its modes are not known.
         """
-        parameters: tuple[float, ...] = ()  # of landing where it is, and of disarming
+        parameters: tuple[float, ...] = ()  # zeros: land here, disarm
         match kind:
             case RequestKind.TAKE_OFF_MODE | RequestKind.EXTERNAL_MODE:
                 parameters = self._choose_mode_parameters(kind)
@@ -273,7 +273,7 @@ class MavlinkConnection:
         return self._encoder.encode_command(COMMANDS[kind], parameters, *self._target_address())
 
     def _choose_mode_parameters(self, kind: RequestKind) -> tuple[float, ...]:
-        """DO_SET_MODE's parameters; PX4 wants main and sub mode, ArduPilot the number of the mode."""
+        """Return the parameters of DO_SET_MODE: main and sub mode for PX4, the mode number for ArduPilot."""
         profile = PROFILES.get(self._vehicle.autopilot)
         if profile is None:
             raise UnsendableError(f"link {self._name}: modes of autopilot {self._vehicle.autopilot!r} are not known")
@@ -281,7 +281,7 @@ class MavlinkConnection:
         return (float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED), *map(float, profile.mode_parameters[name]))
 
     def setup_global_origin(self, at_ns: int, origin_deg_m: Vec3) -> tuple[bytes, ...]:
-        """Return the messages that an ArduPilot without GPS needs before it arms; call it while it is to be armed.
+        """Return the messages that an ArduPilot without GPS needs before it arms; called until it is armed.
 
         Args:
             origin_deg_m: latitude, longitude [deg] and altitude [m] of local zero.
@@ -300,7 +300,7 @@ class MavlinkConnection:
         return (self._encoder.encode_global_origin(origin_deg_m, system), *frames) if is_origin_due else frames
 
     def encode_parameter_request(self, name: str) -> bytes:
-        """The request for one parameter, addressed to the vehicle.
+        """Encode the request for one parameter.
 
         Raises:
             UnsendableError: no vehicle has been heard.
@@ -308,7 +308,7 @@ class MavlinkConnection:
         return self._encoder.encode_parameter_request(name, *self._target_address())
 
     def encode_stream_request(self, message_id: int, rate_hz: float) -> bytes:
-        """The request to send a message so often, or once with rate 0, addressed to the vehicle.
+        """Encode the request for a message at a rate, or once for rate 0.
 
         Raises:
             UnsendableError: no vehicle has been heard.
@@ -318,34 +318,34 @@ class MavlinkConnection:
         return self._encoder.encode_interval_request(message_id, round(1e6 / rate_hz), *self._target_address())
 
     def encode_relayed_poses(self, relay: Relay, at_ns: int, *, refused: Sequence[PositionSample]) -> tuple[bytes, ...]:
-        """The positions that go to the vehicle's own estimator in the tick of `at_ns`.
+        """Encode the positions for the vehicle's own estimator in the tick of `at_ns`.
 
         Args:
-            refused: samples that the tick did not believe.
+            refused: samples that the tick has refused.
         """
         if not relay.is_enabled or self.vehicle is None:
             return ()
-        # Only PX4 moves stamps by the offset that it has found to our time, where that is what it was given.
+        # Only PX4 moves stamps by its offset to our time. That offset is zero if we answer with its own time.
         moves_stamps = not self._uses_vehicle_time and self._vehicle.autopilot == "px4"
         offset_ns = 0 if moves_stamps else self._vehicle_offset_ns(at_ns) or 0
         poses = relay.due(at_ns, offset_ns=offset_ns, refused=refused)
         return tuple(self._encoder.encode_external_position(pose) for pose in poses)
 
     def _vehicle_time_ns(self, at_ns: int) -> int | None:
-        """Return the time of the vehicle's clock as far as known; None before.
+        """Return the time of the vehicle's clock; None if unknown.
 
-        It is what a vehicle gets that asks for our time. PX4 moves the stamps of positions by the offset that it finds,
-        keeps that without end where round trips take longer than 10 ms (src/lib/timesync/Timesync.cpp), and so follows
-        no drift there. In its own clock there is none to find.
+        It is the answer to a vehicle that requests our time. PX4 moves the stamps of positions by its offset to the
+        answers. With round trips of more than 10 ms it keeps an old offset (src/lib/timesync/Timesync.cpp) and does
+        not follow a drift. With its own time as answer there is no offset and no drift.
         """
         offset_ns = self._vehicle_offset_ns(at_ns)
         return None if offset_ns is None else at_ns - offset_ns
 
     def _vehicle_offset_ns(self, at_ns: int) -> int | None:
-        """(our time - the vehicle's) by its newest answers, or else by older ones as far as its messages agree.
+        """Return (our time − the vehicle's time); without new answers, an older offset within the bounds of arrivals.
 
-        A message arrives after its stamp, and no round trip was shorter than its way. A vehicle that neither answers
-        nor stamps its messages gets our own time: steady, so its own estimate of the delay works.
+        A message arrives after its stamp, and no delay is longer than the shortest round trip. A vehicle without
+        answers and stamps gets our own time. That is steady, so its own delay estimate works.
         """
         timesync, arrival_ns = self.timesync_clock(self.vehicle), self._vehicle_clock.offset_ns(at_ns)
         known_ns = None if timesync is None else timesync.last_known_ns(at_ns)
@@ -360,7 +360,7 @@ class MavlinkConnection:
         return min(max(known_ns, arrival_ns - timesync.shortest_round_trip_ns - ROUND_TRIP_MARGIN_NS), arrival_ns)
 
     def stats(self, at_ns: int) -> LinkStats:
-        """Counters since the start."""
+        """Return the counters since the start."""
         timesync = self.timesync_clock() or (None if self.vehicle is None else self.timesync_clock(self.vehicle))
         round_trips_ns = () if timesync is None else timesync.round_trips_ns
         return LinkStats(
@@ -434,7 +434,7 @@ class MavlinkConnection:
         return items
 
     def _note_missing_heartbeat(self, message: Message, at_ns: int) -> None:
-        """Note a vehicle that sends its position or attitude, and no heartbeat."""
+        """Note a vehicle that sends its position or attitude, but no heartbeat."""
         if isinstance(message, Attitude) or (isinstance(message, Position) and message.boot_ms):
             self._no_heartbeat_address = (message.system, message.component)
             if self._no_heartbeat_since_ns is None:
@@ -471,7 +471,7 @@ class MavlinkConnection:
             self._unreported[reason] += count
 
     def _make_events(self, at_ns: int) -> tuple[Event, ...]:
-        """Return events: what was dropped, one a second, and new clocks as they are found."""
+        """Return events: dropped data once a second; new clocks, units and other findings once each."""
         events = []
         if self._positions.resyncs > self._reported_resyncs:
             self._reported_resyncs = self._positions.resyncs
@@ -515,7 +515,7 @@ class MavlinkConnection:
         return tuple(events)
 
     def _make_slow_answer_event(self, at_ns: int) -> Event:
-        """Answers to TIMESYNC that a busy machine or link made too slow to measure by: no trouble while others do."""
+        """Return the event about answers to TIMESYNC that were too slow; harmless while other answers are used."""
         known = self._positions.are_clocks_known(at_ns)
         text = f"link {self._name}: answers to TIMESYNC came too slow to be used; the clock " + (
             "stays known by the others" if known else "is not known by them any more"

@@ -32,8 +32,8 @@ from uavctl.mavlink.requests import PendingRequest, RequestKind, RequestLimits
 from uavctl.records import ORDER_ACCEPTED, ORDER_REFUSED, Command, Event, Order, Severity, VehicleStatus
 
 LAND_TRIES = 5
-NEW_HEARTBEAT_NS = 100_000_000  # a heartbeat is news for so long: two ticks
-MISSING_HEARTBEAT_NS = 1_500_000_000  # one that was due is missing
+NEW_HEARTBEAT_NS = 100_000_000  # a heartbeat counts as new for two ticks
+MISSING_HEARTBEAT_NS = 1_500_000_000  # a heartbeat is missing
 FOREVER_NS = 2**62
 _END_STATES = frozenset({HandoverState.DONE, HandoverState.FAILED})
 _ON_THE_GROUND = frozenset({HandoverState.MODE, HandoverState.ARMING})
@@ -54,11 +54,11 @@ _ROUTINE_STATES = frozenset(HandoverState) - {
     HandoverState.LANDING,
     HandoverState.FAILED,
 }
-# In these it counts which mode the vehicle was in as they were entered.
+# States that store the vehicle's mode on entry.
 _STATES_STORING_MODE = frozenset(
     {HandoverState.MODE, HandoverState.RETURNING, HandoverState.FAILSAFE, HandoverState.LANDING}
 )
-# A failsafe that ends one of these, and ends itself, has interrupted the climb only.
+# A failsafe in one of these states, which ends itself, has only interrupted the climb.
 _CLIMB_STATES = frozenset({HandoverState.ARMING, HandoverState.CLIMBING, HandoverState.ENGAGING})
 _TAKEN_OVER_STATES = frozenset({HandoverState.FAILSAFE, HandoverState.UNCLEAR})
 _ORDER_TEXTS = {
@@ -66,16 +66,16 @@ _ORDER_TEXTS = {
     Order.ENGAGE: "asks for the mode that takes setpoints",
     Order.STAND_BY: "leaves a vehicle alone that is found armed",
 }
-HAND_OVER_ORDERS = frozenset(_ORDER_TEXTS)  # the others are the controller's
+HAND_OVER_ORDERS = frozenset(_ORDER_TEXTS)  # all other orders are for the controller
 
 
 class StateTransition(msgspec.Struct, frozen=True):
-    """Transition of the table that was made."""
+    """Transition between two states."""
 
     before: HandoverState  # the state that was left
-    event: HandoverEvent  # why
+    event: HandoverEvent
     after: HandoverState  # the state that was entered
-    reason: str = ""  # more about it, where something failed
+    reason: str = ""  # reason of a failure
     request: RequestKind | None = None  # request to the vehicle at that time
     is_granted: bool = False  # the vehicle had accepted the request
     mode_reason: ModeReason | None = None  # reason of a mode that is not ours
@@ -107,17 +107,17 @@ class HandoverStateMachine:
             config=self._config, request=PendingRequest(None, 0, RequestLimits(0, 0, 0, FOREVER_NS))
         )
         self._waits_for_landing = waits_for_landing
-        self._landed_ns: int | None = None  # since when it stands on the ground, armed
+        self._landed_ns: int | None = None  # since then it stands on the ground, armed
         self._is_disarm_requested = False
         self._is_heartbeat_lost = False
-        self._is_without_pilot = False  # what we took off flies by itself, and nothing shows that a person has it
+        self._is_without_pilot = False  # a vehicle that we took off flies by itself without a pilot
         self._is_landing_overdue = False  # the vehicle has not begun a requested landing in time
-        self._airborne_ns: int | None = None  # the last tick in which the vehicle was heard, and in the air
+        self._airborne_ns: int | None = None  # the last tick with a vehicle that is heard and in the air
         self.failure = ""
 
     @property
     def state(self) -> HandoverState:
-        """Place in the table."""
+        """Present state."""
         return self._progress.state
 
     @property
@@ -132,25 +132,25 @@ class HandoverStateMachine:
 
     @property
     def has_begun(self) -> bool:
-        """Whether the vehicle is on its way up or down at our request, or by a failsafe on a flight that we began."""
+        """Whether the vehicle climbs or lands at our request, or by a failsafe on an ordered flight."""
         return self.state in _MOVING_STATES
 
     @property
     def is_finished(self) -> bool:
-        """Whether nothing more will be sent, whatever comes."""
+        """Whether nothing will be sent any more."""
         return self.state in _END_STATES and not self.is_relay_needed
 
     @property
     def is_relay_needed(self) -> bool:
-        """Whether a vehicle is in the air by the positions that it gets from here, which are never the first to end.
+        """Whether a vehicle is in the air on relayed positions, so that the relay must go on.
 
-        A vehicle that is not heard any more gets them for the time of a landing.
+        A silent vehicle gets positions for the time of a landing.
         """
         return self._waits_for_landing and self._airborne_ns is not None
 
     @property
     def is_busy(self) -> bool:
-        """Whether an answer of the vehicle is waited for, or it is in the air by the positions it gets from here."""
+        """Whether an answer of the vehicle is pending, or it is in the air on relayed positions."""
         if self.is_relay_needed:
             return True
         if self.state is HandoverState.UNCLEAR:
@@ -160,7 +160,7 @@ class HandoverStateMachine:
         )
 
     def select_controlled_status(self, at_ns: int, vehicle: VehicleStatus | None) -> VehicleStatus | None:
-        """The vehicle as far as the controller may fly it: none when it is silent, external only when it is ours."""
+        """Return the status for the controller: None if the vehicle is silent, external only while we control it."""
         if vehicle is None or is_silent(at_ns, vehicle):
             return None
         if self.state in (HandoverState.WAITING, HandoverState.READY) and not self._progress.is_standing_by:
@@ -178,7 +178,7 @@ class HandoverStateMachine:
         return not (vehicle.external and vehicle.armed) and not self._progress.may_be_outdated(vehicle)
 
     def update(self, inputs: HandoverInput) -> HandoverOutput:
-        """Decide what one tick may send, and what it asks the vehicle for."""
+        """Decide the setpoint mode and the request of one tick."""
         progress, before = self._progress, self.state
         for message in inputs.messages:
             progress.request.handle_message(message, inputs.at_ns)
@@ -254,7 +254,7 @@ class HandoverStateMachine:
         return events
 
     def _explain_refusal(self, command: Command, inputs: HandoverInput) -> str:
-        """Return why an order is refused; empty if it is taken."""
+        """Return why an order is refused; empty if it is accepted."""
         if command.order is Order.ENGAGE:
             return explain_engage_refusal(self.state, inputs)
         if command.order is Order.STAND_BY:
@@ -265,10 +265,10 @@ class HandoverStateMachine:
         return "" if is_on_ground else f"take-off is ordered once, on the ground; now: {self.state}"
 
     def _may_be_pilot_mode_change(self, inputs: HandoverInput) -> bool:
-        """Whether the pilot may have changed the mode since the last heartbeat: then no request of one is repeated.
+        """Return whether the pilot may have changed the mode since the last heartbeat.
 
-        Heartbeats show a mode up to a second late, and a request that is repeated meanwhile would take it back. So
-        it is made again right after a heartbeat; landing also where none has come.
+        Heartbeats show a mode up to one second late. A repeated request would override the pilot meanwhile. So it is
+        repeated only right after a heartbeat; a landing request also if heartbeats are missing.
         """
         vehicle, kind = inputs.vehicle, self._progress.request.kind
         if kind not in (RequestKind.EXTERNAL_MODE, RequestKind.LAND) or vehicle is None:
@@ -277,7 +277,7 @@ class HandoverStateMachine:
         return age_ns > NEW_HEARTBEAT_NS and not (kind is RequestKind.LAND and age_ns > MISSING_HEARTBEAT_NS)
 
     def _may_send_neutral(self, inputs: HandoverInput) -> bool:
-        """Whether neutral setpoints do no harm: they would end ArduPilot's climb."""
+        """Return whether neutral setpoints are safe: they would end the climb of an ArduPilot."""
         if self.state not in TAKING_OFF or inputs.vehicle is None:
             return True
         return find_profile(inputs.vehicle).climbs_on_arming
@@ -295,7 +295,7 @@ class HandoverStateMachine:
         if progress.state is HandoverState.CLIMBING and progress.climb_start_ns is None:
             progress.climb_start_ns = inputs.at_ns
         if progress.state is HandoverState.CLIMBING:
-            progress.previous_mode = ""  # that of the ground would be the pilot's by now
+            progress.previous_mode = ""  # the mode on the ground would now be a choice of the pilot
         progress.request = PendingRequest(
             self._choose_request(inputs), inputs.at_ns, self._choose_limits(progress.state, inputs.at_ns)
         )
@@ -347,12 +347,12 @@ class HandoverStateMachine:
                 else LAND_TRIES
             )
             return RequestLimits(_ns(config.answer_s), _ns(config.answer_s), tries, limit_ns)
-        # In the air there is no time for long pauses.
+        # In the air, long pauses cost too much time.
         retry_s = config.retry_s if state in _ON_THE_GROUND else config.answer_s / 2
         return RequestLimits(_ns(config.answer_s), _ns(retry_s), config.tries, limit_ns)
 
     def _request_disarming(self, inputs: HandoverInput) -> None:
-        """Ask a vehicle to disarm that stands on the ground after a flight of ours and stays armed."""
+        """Request disarming if the vehicle stays armed on the ground after an ordered flight."""
         vehicle = inputs.vehicle
         if not (
             self.is_ordered_flight and self.state is HandoverState.SETTLING and vehicle is not None and vehicle.landed

@@ -25,23 +25,23 @@ from uavctl.mavlink.requests import PendingRequest
 from uavctl.records import Command, Order, VehicleStatus
 
 HEARTBEAT_TIMEOUT_NS = 3_000_000_000
-# A heartbeat may have been under way when arming or the external mode was granted: PX4 shows it up to a second later.
+# Heartbeats may be in transit when arming or the external mode is granted. PX4 shows the grant up to 1 s later.
 GRACE_NS = 300_000_000
 LATE_TEXT_NS = 1_000_000_000  # from the heartbeat with a mode to the text with its reason
-LOOK_AHEAD_S = 0.5  # from asking for the external mode in a climb to the first braking: answer, news, the vehicle's lag
-MODE_SHOWN_NS = 2_000_000_000  # a heartbeat shows by then that landing was asked for
-LAND_PERIODS = 10  # times `land_s` for which landing is asked for: as long as a battery lasts
-NO_CLIMB_SHARE = 0.1  # share below which there was no climb yet
-MIN_CLIMB_SHARE = 0.3  # share of the take-off height below which a climb that has ended was none
+LOOK_AHEAD_S = 0.5  # from the request of the external mode to the first braking: answer, new position, vehicle lag
+MODE_SHOWN_NS = 2_000_000_000  # a heartbeat shows a requested landing by then
+LAND_PERIODS = 10  # multiples of `land_s` for which landing is requested: as long as a battery lasts
+NO_CLIMB_SHARE = 0.1  # share of the climb below which it has not begun
+MIN_CLIMB_SHARE = 0.3  # share of the climb that an ended climb must have reached
 TAKING_OFF = frozenset({HandoverState.MODE, HandoverState.ARMING, HandoverState.CLIMBING, HandoverState.ENGAGING})
 _IN_PROGRESS = TAKING_OFF | {
     HandoverState.RETURNING,
     HandoverState.FAILSAFE,
-}  # here the operator's end of the flight asks for landing, too
+}  # in these states the operator's end of the flight also requests landing
 _CLIMB_STATES = frozenset({HandoverState.CLIMBING, HandoverState.ENGAGING})
 REQUESTING = _IN_PROGRESS | {HandoverState.LANDING}
 BOOT_TIME_WAIT_NS = 5_000_000_000  # wait for the uptime of a vehicle that is armed at the start
-# A simulated vehicle's clock may be slow, so that it seems to have started later than it has.
+# The clock of a simulated vehicle may be slow, so its uptime may be too short.
 MIN_CLOCK_RATE, BOOT_TIME_MARGIN_S = 0.8, 1.0
 _SECOND_VEHICLE = "another vehicle is heard on this link: nothing is armed; give each its own link"
 _ALREADY_ARMED = (
@@ -60,16 +60,16 @@ class HandoverInput(msgspec.Struct, frozen=True, kw_only=True):
 
     at_ns: int  # time of the tick
     vehicle: VehicleStatus | None  # the vehicle's latest status; None before the first
-    has_setpoint: bool  # the controller has a setpoint; without one no neutral stream invites the pilot
+    has_setpoint: bool  # the controller has a setpoint; only then neutral setpoints are streamed
     uptime_s: float | None = None  # time since its start [s]; None if unknown
     is_landing_requested: bool = False  # the controller asks for landing
     is_stop_requested: bool = False  # the operator asks for the end
-    may_have_lost_messages: bool = False  # the pilot may have taken over unheard: nothing is asked of the vehicle
-    arming_refusal: str = ""  # why nothing may be armed now; empty if it may
-    climb_hazard: str = ""  # why a vehicle in the air must not climb on by these positions; empty if it may
+    may_have_lost_messages: bool = False  # messages about a takeover may be lost: no request is made
+    arming_refusal: str = ""  # reason not to arm now; empty if arming is allowed
+    climb_hazard: str = ""  # reason to end a climb in the air; empty if it may continue
     estimated_height_m: float | None = None  # height of the estimate in local NED [m]; None without one
     climb_rate_mps: float = 0.0  # its rate of climb [m/s]
-    has_motion: bool = False  # the vehicle sends its velocity or attitude now, whatever its heartbeats do
+    has_motion: bool = False  # the vehicle sends its velocity or attitude, with or without heartbeats
     messages: tuple[CommandAck | StatusText, ...] = ()  # the vehicle's answers and texts since the last tick
     commands: tuple[Command, ...] = ()  # the operator's orders
 
@@ -79,26 +79,26 @@ class HandoverProgress:
     """Progress of the hand-over."""
 
     config: HandOverConfig  # times and bounds
-    request: PendingRequest  # request that is made, or waited for
-    state: HandoverState = HandoverState.WAITING  # place in the table
+    request: PendingRequest  # present request, or wait
+    state: HandoverState = HandoverState.WAITING  # present state
     state_start_ns: int = 0  # when it was entered [ns]
     take_off_ordered_ns: int | None = None  # when take-off was ordered [ns]; None if it was not
     height_m: float = 0.0  # height of the climb that was ordered [m]
     ground_height_m: float | None = None  # height of the estimate before it was armed [m]
-    previous_mode: str = ""  # the mode that a request is to end; or, in a failsafe, that it chose
+    previous_mode: str = ""  # the mode before a request; in a failsafe, the mode of the failsafe
     climb_start_ns: int | None = None  # time at which the climb first began [ns]; None before
-    is_climb_interrupted: bool = False  # the failsafe that acts ended the climb, not the flight
-    failsafe_texts: str = ""  # texts of the vehicle from before its failsafe acted
+    is_climb_interrupted: bool = False  # the active failsafe has interrupted a climb
+    failsafe_texts: str = ""  # texts of the vehicle before its failsafe
     mode_reason: ModeReason | None = None  # reason of a mode that is not ours; None without one
     is_failsafe_landing: bool = False  # a failsafe has begun the landing that is waited for
     granted_ns: int | None = None  # when arming or the external mode was granted, ahead of the heartbeat [ns]
     boots: int = 0  # restarts of the vehicle by the last tick
-    is_standing_by: bool = False  # A vehicle that is found armed is left alone
-    previous_flight_ns: int | None = None  # start of the flight that it was left in [ns]; None if not known
+    is_standing_by: bool = False  # a vehicle that is armed at the start is left alone
+    previous_flight_ns: int | None = None  # start of the flight that an earlier daemon left [ns]; None if unknown
     first_heard_ns: int | None = None  # when the vehicle was heard first [ns]; None if it was not
 
     def may_be_outdated(self, vehicle: VehicleStatus) -> bool:
-        """Whether the last heartbeat may be from before arming or the external mode was granted."""
+        """Return whether the last heartbeat may be older than the grant of arming or of the external mode."""
         return self.granted_ns is not None and vehicle.at_ns <= self.granted_ns + GRACE_NS
 
 
@@ -112,24 +112,24 @@ class GuardResult(msgspec.Struct, frozen=True):
 
 
 def is_silent(at_ns: int, vehicle: VehicleStatus | None) -> bool:
-    """Whether there is no heartbeat, or the last one is too old."""
+    """Return whether there is no heartbeat, or the last one is too old."""
     return vehicle is None or at_ns - vehicle.at_ns > HEARTBEAT_TIMEOUT_NS
 
 
 def is_ordered(inputs: HandoverInput, order: Order) -> bool:
-    """Whether this tick brings an order."""
+    """Return whether this tick has an order of this kind."""
     return any(command.order is order for command in inputs.commands)
 
 
 def is_in_failsafe(vehicle: VehicleStatus) -> bool:
-    """Whether a failsafe or a fence of its own has chosen its mode, which needs no person."""
+    """Return whether a failsafe or fence of the vehicle has chosen its mode, which needs no pilot."""
     return is_autonomous_mode(vehicle) and determine_mode_reason(vehicle) in VEHICLE_REASONS
 
 
 def _classify_takeover(progress: HandoverProgress, vehicle: VehicleStatus) -> GuardResult:
     """Return the event for a mode that is not ours, by its reason.
 
-    A failsafe is waited for on a flight that we began, unless a person flies in its mode: the stick always wins.
+    On an ordered flight the hand-over waits for a failsafe, unless a pilot flies in its mode: the pilot has priority.
     """
     mode_reason = determine_mode_reason(vehicle, was_in_failsafe=progress.state is HandoverState.FAILSAFE)
     if mode_reason is ModeReason.UNKNOWN:
@@ -141,7 +141,7 @@ def _classify_takeover(progress: HandoverProgress, vehicle: VehicleStatus) -> Gu
 
 
 def explain_engage_refusal(state: HandoverState, inputs: HandoverInput) -> str:
-    """Return why the external mode must not be asked for again; empty if it may."""
+    """Return why the external mode must not be requested again; empty if it may."""
     vehicle = inputs.vehicle
     if state not in (HandoverState.READY, HandoverState.RELEASED, HandoverState.UNCLEAR, HandoverState.FAILSAFE):
         return f"there is nothing to engage; now: {state}"
@@ -179,7 +179,7 @@ def evaluate(progress: HandoverProgress, inputs: HandoverInput) -> GuardResult:
     is_landing = vehicle is not None and vehicle.mode in find_profile(vehicle).landing_modes
     is_taken_over = result.event in (HandoverEvent.UNCLEAR, HandoverEvent.OTHER)
     if is_taken_over and not is_landing and state not in (HandoverState.WAITING, HandoverState.READY):
-        return result  # whatever ends the flight: what the pilot has taken is asked for nothing
+        return result  # the pilot has the vehicle: no request is made, whatever ends the flight
     if inputs.is_landing_requested and state is not HandoverState.UNCLEAR:
         return GuardResult(HandoverEvent.LAND)
     if (state in _IN_PROGRESS and (inputs.is_stop_requested or is_ordered(inputs, Order.LAND))) or _is_landing_ordered(
@@ -199,7 +199,7 @@ def evaluate(progress: HandoverProgress, inputs: HandoverInput) -> GuardResult:
     if result.event in (HandoverEvent.GRANTED, HandoverEvent.REFUSED):
         return result
     if result.event is HandoverEvent.DISARMED and state is HandoverState.LANDING:
-        return result  # whatever it answered, it is down
+        return result  # it has landed, whatever it answered
     reason = _find_failure(progress, inputs)
     return GuardResult(HandoverEvent.REFUSED, reason) if reason else result
 
@@ -226,7 +226,7 @@ def _must_keep_landing(progress: HandoverProgress, inputs: HandoverInput) -> boo
 
 
 def is_without_pilot(progress: HandoverProgress, vehicle: VehicleStatus | None) -> bool:
-    """Whether a vehicle that we took off flies by itself, and nothing shows that a person has it."""
+    """Return whether a vehicle that we took off flies by itself, without evidence of a pilot."""
     if progress.take_off_ordered_ns is None or vehicle is None or vehicle.landed or vehicle.stick:
         return False
     return is_autonomous_mode(vehicle) or vehicle.external or vehicle.mode in find_profile(vehicle).climb_modes
@@ -259,12 +259,12 @@ def _find_wait_timeout(progress: HandoverProgress, inputs: HandoverInput) -> str
 
 
 def _describe_failsafe(progress: HandoverProgress) -> str:
-    """Return the text of the failsafe that acts, and its mode."""
+    """Return the name of the active failsafe, and its mode."""
     return f"{progress.mode_reason or ModeReason.FAILSAFE} ({progress.previous_mode})"
 
 
 def _find_take_off_failure(progress: HandoverProgress, inputs: HandoverInput) -> str:
-    """Return why an ordered take-off will not begin; empty if it may, or none was ordered."""
+    """Return why an ordered take-off cannot begin; empty if it can, or without an order."""
     vehicle, limit_s = inputs.vehicle, progress.config.ground_s
     if progress.take_off_ordered_ns is None:
         return ""
@@ -324,7 +324,7 @@ def _guard_standby(progress: HandoverProgress, inputs: HandoverInput, vehicle: V
 
 
 def _has_started_since(progress: HandoverProgress, inputs: HandoverInput) -> bool:
-    """Whether the vehicle has started after the flight that an earlier daemon left: it is on another one."""
+    """Return whether the vehicle has restarted since the flight that an earlier daemon left."""
     if progress.previous_flight_ns is None or inputs.uptime_s is None:
         return False
     return inputs.uptime_s / MIN_CLOCK_RATE + BOOT_TIME_MARGIN_S < (inputs.at_ns - progress.previous_flight_ns) / 1e9
@@ -347,14 +347,14 @@ def _guard_mode(progress: HandoverProgress, inputs: HandoverInput, vehicle: Vehi
 
 
 def _is_after_grant(progress: HandoverProgress, vehicle: VehicleStatus, after_ns: int = GRACE_NS) -> bool:
-    """Whether the last heartbeat is from after the request was granted, and so shows what became of it."""
+    """Return whether the last heartbeat is newer than the grant of the request, and so shows its effect."""
     granted_ns = progress.request.granted_ns
     return granted_ns is not None and vehicle.at_ns > granted_ns + after_ns
 
 
 def _guard_arming(progress: HandoverProgress, _inputs: HandoverInput, vehicle: VehicleStatus) -> GuardResult:
     profile, granted_ns = find_profile(vehicle), progress.request.granted_ns
-    # Disarmed it has not climbed, so it is not where PX4's climb ends.
+    # A disarmed vehicle has not climbed, so its mode is not the end of PX4's climb.
     if vehicle.mode != profile.take_off_mode and not (vehicle.armed and vehicle.mode in profile.climb_modes):
         return _classify_takeover(progress, vehicle)
     if profile.climbs_on_arming and granted_ns is not None:  # it climbs already
@@ -373,7 +373,7 @@ def _guard_climbing(progress: HandoverProgress, inputs: HandoverInput, vehicle: 
         and vehicle.landed
         and _predict_climb_share(progress, inputs, 0.0) < NO_CLIMB_SHARE
     ):
-        return _classify_takeover(progress, vehicle)  # no climb has ended on the ground
+        return _classify_takeover(progress, vehicle)  # a climb cannot end on the ground
     share = _predict_climb_share(progress, inputs, LOOK_AHEAD_S if profile.climbs_on_arming else 0.0)
     # A climb that has ended below the height goes no higher.
     is_climb_over = profile.climbs_on_arming and vehicle.mode != profile.take_off_mode
@@ -385,7 +385,7 @@ def _guard_climbing(progress: HandoverProgress, inputs: HandoverInput, vehicle: 
 
 
 def _predict_climb_share(progress: HandoverProgress, inputs: HandoverInput, ahead_s: float) -> float:
-    """Return the share of the height that will be reached `ahead_s` from now, by fresh positions."""
+    """Return the share of the height that will be reached `ahead_s` from now, by new positions."""
     if inputs.estimated_height_m is None or progress.ground_height_m is None or inputs.arming_refusal:
         return 0.0
     return (inputs.estimated_height_m + ahead_s * inputs.climb_rate_mps - progress.ground_height_m) / progress.height_m
@@ -438,7 +438,7 @@ def _guard_landing(progress: HandoverProgress, _inputs: HandoverInput, vehicle: 
         return GuardResult(HandoverEvent.DISARMED if is_new_heartbeat else HandoverEvent.PENDING)
     profile, is_ordered_flight = find_profile(vehicle), progress.take_off_ordered_ns is not None
     if vehicle.mode in profile.landing_modes:
-        # A failsafe lands only until it ends: what we took off is to land whatever comes.
+        # A failsafe may end its landing. An ordered flight must land in any case.
         is_our_landing = not (is_ordered_flight and is_in_failsafe(vehicle)) or progress.request.granted_ns is not None
         return GuardResult(HandoverEvent.GRANTED if is_requesting and is_our_landing else HandoverEvent.PENDING)
     if not is_new_heartbeat or (is_ordered_flight and is_in_failsafe(vehicle)):

@@ -21,7 +21,7 @@ from uavctl.records import VehicleStatus
 EVIDENCE_NS = 2_000_000_000
 NEVER_NS = -(2**63)
 STICK_US = 100  # smallest movement of a channel by a person: a tenth of its range
-# Words of a failsafe that chooses a mode, in texts of any severity: PX4's commander; ArduCopter's events.cpp,
+# Texts of a failsafe that chooses a mode, of any severity. Sources: PX4's commander; ArduCopter's events.cpp,
 # ekf_check.cpp, crash_check.cpp.
 _FAILSAFE_TEXT = re.compile(r"failsafe|terminat|parachute|\bcrash|dead.?reckon", re.IGNORECASE)
 _FENCE_TEXT = re.compile(r"fence.*(breach|violat|exceed)|(breach|violat|exceed|outside|beyond).*fence", re.IGNORECASE)
@@ -79,7 +79,7 @@ def determine_mode_reason(vehicle: VehicleStatus, *, was_in_failsafe: bool = Fal
     if choice is ModeChoice.FAILSAFE:
         return vehicle_reason or ModeReason.FAILSAFE
     if choice is ModeChoice.PERSON:
-        # An ArduPilot is in a failsafe by its heartbeats also after a person has chosen another mode.
+        # The heartbeats of an ArduPilot show a failsafe even after a person has chosen another mode.
         is_degraded = (
             vehicle.mode in profile.degraded_modes
             and not was_in_failsafe
@@ -98,24 +98,24 @@ def determine_mode_reason(vehicle: VehicleStatus, *, was_in_failsafe: bool = Fal
 class ModeReasonEvidence:
     """Evidence for the reason of a mode change.
 
-    Each counts for `EVIDENCE_NS`, and longer where no heartbeat has come since: the mode may have changed right after.
+    Evidence counts for `EVIDENCE_NS`, and longer without a heartbeat since: the mode may have changed right after it.
     """
 
     def __init__(self) -> None:
         self._failsafe_ns = self._fence_ns = self._failsafe_text_ns = self._stick_ns = self._station_ns = NEVER_NS
-        self._heartbeats_ns = NEVER_NS, NEVER_NS  # the newest heartbeat, and the one before
+        self._heartbeats_ns = NEVER_NS, NEVER_NS  # the last two heartbeats, the newer first
         self._failsafe_text = ""
         self._station = 0
-        self._reference_us: list[int] = []  # of each channel, since it moved last; 0: not known
+        self._reference_us: list[int] = []  # of each channel, since its last movement; 0: unknown
         self._has_radio: bool | None = None  # None before the first report
         self._is_within_fence = True
 
     def add_heartbeat(self, at_ns: int) -> None:
-        """Take a heartbeat, which shows the mode."""
+        """Note the time of a heartbeat, which shows the mode."""
         self._heartbeats_ns = at_ns, self._heartbeats_ns[0]
 
     def add_text(self, text: str, at_ns: int) -> None:
-        """Take a text, of any severity."""
+        """Evaluate a text of any severity."""
         fence, failsafe = reports_fence_breach(text), reports_failsafe(text)
         if fence or failsafe:
             self._failsafe_text, self._failsafe_text_ns = text, at_ns
@@ -127,17 +127,17 @@ class ModeReasonEvidence:
             self._failsafe_ns = NEVER_NS
 
     def update_fence(self, at_ns: int, *, within: bool) -> None:
-        """Take whether it is within its fence; that it comes beyond it counts."""
+        """Update whether the vehicle is within its fence; leaving it is evidence."""
         if self._is_within_fence and not within:
             self._fence_ns = at_ns
         self._is_within_fence = within
 
     def update_radio(self, *, heard: bool) -> None:
-        """Take whether a remote control is heard."""
+        """Update whether a remote control is received."""
         self._has_radio = heard
 
     def update_channels(self, pulses_us: tuple[int, ...], at_ns: int) -> None:
-        """Take the channels of a remote control."""
+        """Update the channels of a remote control; a movement is evidence of a pilot."""
         if len(pulses_us) != len(self._reference_us):
             self._reference_us = [0] * len(pulses_us)
         for i, pulse in enumerate(pulses_us):
@@ -147,16 +147,16 @@ class ModeReasonEvidence:
                 self._stick_ns = at_ns if reference_us and pulse else self._stick_ns
 
     def add_mode_command(self, station: int, at_ns: int) -> None:
-        """Take an order of a mode that another than us has given."""
+        """Note a mode command of another station."""
         self._station, self._station_ns = station, at_ns
 
     def apply_to(self, status: VehicleStatus, at_ns: int, *, critical: bool) -> VehicleStatus:
-        """Return a status with what counts at a time; `critical`: by its heartbeat a failsafe acts."""
+        """Return a status with the evidence of now; `critical`: its heartbeat shows a failsafe."""
         since_ns = at_ns - EVIDENCE_NS
         if self._heartbeats_ns[1] > NEVER_NS:
             since_ns = min(since_ns, self._heartbeats_ns[1])
         said = self._failsafe_text if self._failsafe_text_ns > since_ns else ""
-        # A receiver that has lost its remote control moves the channels by itself.
+        # A receiver without its remote control moves the channels by itself.
         is_radio_lost = self._has_radio is False or mentions_radio(said)
         return msgspec.structs.replace(
             status,

@@ -20,10 +20,10 @@ from uavctl.frames import Quaternion, rotate_vector
 from uavctl.records import Event, PositionSample, Severity, Vec3
 
 MAX_AGE_NS = 200_000_000  # some estimators use an older position as a new one
-STUCK_AFTER = 25  # poses in a row, the same to the last bit
+STUCK_AFTER = 25  # identical poses in a row
 _MAX_QUEUE = 64  # poses of one tick
-SILENT_NS = 500_000_000  # an estimator without positions for longer drifts by more than a hand's breadth
-START_NS = 3_000_000_000  # cameras and vehicle may take that long to begin
+SILENT_NS = 500_000_000  # without positions for longer, an estimator drifts by more than 0.1 m
+START_NS = 3_000_000_000  # start time of cameras and vehicle
 RELAY_SILENT, RELAY_RESUMED = "relay-silent", "relay-resumed"
 NO_POSITION, HELD_BACK = "nothing comes", "held back"
 REASONS = {
@@ -43,7 +43,7 @@ REASONS = {
 class Pose:
     """Pose of a body as sent to the vehicle's estimator."""
 
-    message: str  # as which message
+    message: str  # name of the MAVLink message
     usec: int  # time of capture, in the clock that the vehicle expects [us]
     position_m: Vec3  # local NED [m]
     attitude: Quaternion  # body axes forward, right, down to NED (w, x, y, z)
@@ -51,12 +51,12 @@ class Pose:
 
 
 class Relay:
-    """Passes positions on; stale, stuck and refused ones stay here, and are counted.
+    """Passes positions on; counts those that it keeps back.
 
     Attributes:
         sent: poses passed on.
         last_ns: time of the tick that passed the last one on; None before.
-        kept: poses that were not, by reason.
+        kept: poses that were kept back, by reason.
         silent_for: reason why the vehicle gets no position now, a key of `REASONS`; empty while it gets them.
     """
 
@@ -69,8 +69,8 @@ class Relay:
         self._repeat_count = 0
         self._start_ns: int | None = None  # time of the first tick
         self._kept_before: Counter[str] = Counter()  # counts of `kept` when the last pose was sent
-        self._reported = ""  # this silence, while the vehicle was armed or on the ground
-        self._is_reported_on_ground = False  # any
+        self._reported = ""  # report of this silence: `armed`, `ground`, or empty
+        self._is_reported_on_ground = False  # any silence
         self.silent_for = ""
         self.sent = 0
         self.last_ns: int | None = None
@@ -82,7 +82,7 @@ class Relay:
         return self._config.enabled
 
     def add_sample(self, sample: PositionSample, attitude: Quaternion | None) -> None:
-        """Take a sample as it arrives, with the body's attitude in NED, which an estimator of yaw cannot do without."""
+        """Queue a new sample with the body's attitude in NED; an estimator of yaw needs it."""
         if not self.is_enabled:
             return
         if attitude is None:
@@ -92,11 +92,11 @@ class Relay:
         del self._queue[:-_MAX_QUEUE]
 
     def due(self, at_ns: int, *, offset_ns: int, refused: Sequence[PositionSample]) -> tuple[Pose, ...]:
-        """Return the positions that go to the vehicle in this tick, in order of capture.
+        """Return the poses for the vehicle in this tick, in order of capture.
 
         Args:
             offset_ns: (our time - the vehicle's), by which stamps are moved.
-            refused: samples that the tick did not believe.
+            refused: samples that the tick has refused.
         """
         arrived = [entry for entry in self._queue if entry[0].received_ns <= at_ns]
         self._queue = [entry for entry in self._queue if entry[0].received_ns > at_ns]
@@ -117,13 +117,13 @@ class Relay:
         return tuple(poses)
 
     def make_event(self, at_ns: int, *, held_back: bool, armed: bool) -> Event | None:
-        """Report that the vehicle has got no position for `SILENT_NS`, with the reason, or that it gets them again.
+        """Return an event if the vehicle gets no positions for `SILENT_NS`, or gets them again.
 
-        Call it in each tick after `due`. Each silence in the air is reported once; of those on the ground the first,
-        and that it goes on when the vehicle is armed.
+        Called in each tick after `due`. Each silence in the air is reported once. Of those on the ground only the
+        first one is reported, and once more if the vehicle is armed meanwhile.
 
         Args:
-            held_back: positions are not passed on in this tick, whatever comes.
+            held_back: no position is passed on in this tick.
             armed: the vehicle may be in the air.
         """
         if not self.is_enabled:
@@ -154,7 +154,7 @@ class Relay:
         return counts[0][0] if counts else NO_POSITION
 
     def _find_reason(self, sample: PositionSample, attitude: Quaternion, at_ns: int) -> str | None:
-        """Return why a pose is kept back; None if it goes."""
+        """Return the reason to keep a pose back; None if it is sent."""
         is_same = self._last == (sample.position_m, attitude)
         self._last, self._repeat_count = (sample.position_m, attitude), self._repeat_count + 1 if is_same else 0
         newest_ns = self._newest_ns

@@ -17,7 +17,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from uavctl.arrays import SECOND_NS
 from uavctl.mavlink.messages import CommandAck, StatusText
 
-SHOWN_NS = 3 * SECOND_NS  # heartbeats, at 1 Hz, show by then what was granted
+SHOWN_NS = 3 * SECOND_NS  # heartbeats, at 1 Hz, show a grant by then
 _FINAL = frozenset({mavlink.MAV_RESULT_DENIED, mavlink.MAV_RESULT_UNSUPPORTED})
 _MAX_TEXTS = 4  # texts of the vehicle that are reported with a refusal
 
@@ -45,16 +45,16 @@ COMMANDS = {
 
 @dataclass(frozen=True)
 class RequestLimits:
-    """Bounds of a request."""
+    """Time limits and number of attempts of a request."""
 
-    answer_ns: int  # without an effect it is made again after this time [ns]
-    retry_ns: int  # refused for now, it is made again after this time [ns]
+    answer_ns: int  # without an effect it is repeated after this time [ns]
+    retry_ns: int  # refused for now, it is repeated after this time [ns]
     tries: int  # largest number of attempts
     limit_ns: int  # after this time it has failed [ns]
 
 
 class PendingRequest:
-    """A request from its first time to its effect, or its end.
+    """Request from its first attempt to its effect or end.
 
     Args:
         kind: The request; None for a wait in which nothing is sent.
@@ -69,9 +69,9 @@ class PendingRequest:
         self._result: int | None = None
         self._texts: list[str] = []
         self._blocked_reason = ""
-        self._is_retry_delayed = False  # for the time after a refusal
-        self.requested_ns: int | None = None  # when it was made last
-        self.granted_ns: int | None = None  # when it was accepted last
+        self._is_retry_delayed = False  # a refusal has delayed the next attempt
+        self.requested_ns: int | None = None  # last attempt
+        self.granted_ns: int | None = None  # last acceptance
 
     def handle_message(self, message: CommandAck | StatusText, at_ns: int) -> None:
         """Handle an answer or a text of the vehicle."""
@@ -92,14 +92,14 @@ class PendingRequest:
     def due(self, at_ns: int, blocked_reason: str = "", *, is_mode_uncertain: bool = False) -> RequestKind | None:
         """Return the request to send now, if any; `blocked_reason` tells why not to send it yet.
 
-        `is_mode_uncertain`: nothing is asked again now, as it is not known what the vehicle does meanwhile.
+        `is_mode_uncertain`: the vehicle's mode may have changed, so nothing is repeated now.
         """
         self._blocked_reason = blocked_reason
         if is_mode_uncertain and self._tries:
             return None
         if self.kind is None or blocked_reason or at_ns < self._next_ns or self._tries >= self._limits.tries:
             return None
-        if self.kind is RequestKind.TAKE_OFF and self.granted_ns is not None:  # it would begin again
+        if self.kind is RequestKind.TAKE_OFF and self.granted_ns is not None:  # the climb would start again
             return None
         self._tries += 1
         self._is_retry_delayed, self.requested_ns = False, at_ns
@@ -107,7 +107,7 @@ class PendingRequest:
         return self.kind
 
     def describe_failure(self, at_ns: int, *, is_final: bool = False) -> str:
-        """Return why the request is given up; empty while it may still succeed (`is_final`: it may not)."""
+        """Return why the request has failed; empty while it may still succeed (`is_final`: it may not)."""
         is_over_time = is_final or at_ns - self._start_ns >= self._limits.limit_ns
         out_of_tries = self.kind is not None and self._tries >= self._limits.tries and at_ns >= self._next_ns
         if not (is_over_time or out_of_tries or (self._result is not None and self._result in _FINAL)):
@@ -134,7 +134,7 @@ class PendingRequest:
 
     @property
     def quoted_texts(self) -> str:
-        """The vehicle's texts since the request, quoted, to be added to a reason."""
+        """Texts of the vehicle since the request, quoted, for a reason."""
         return "".join(f', "{text}"' for text in self._texts)
 
     def _describe_effort(self, at_ns: int) -> str:
