@@ -199,7 +199,7 @@ def _open_lock_file(path: Path) -> int:
 
 
 def _is_same_file(path: Path, descriptor: int) -> bool:
-    """Whether the name still means the file that was locked; its last holder may have removed it."""
+    """Return whether the name still means the file that was locked; its last holder may have removed it."""
     try:
         return os.path.samestat(os.stat(path), os.fstat(descriptor))  # noqa: PTH116 (stat of a path beside one of an fd)
     except FileNotFoundError:

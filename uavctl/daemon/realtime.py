@@ -111,7 +111,7 @@ def _lock_memory() -> RealtimeSetting:
 
 
 def _may_lock_memory() -> bool:
-    """Whether the limit on locked memory does not bind this process."""
+    """Return whether the limit on locked memory does not bind this process."""
     lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
     effective = next((int(line.split()[1], 16) for line in lines if line.startswith("CapEff:")), 0)
     return bool(effective >> _CAP_IPC_LOCK & 1)

@@ -19,7 +19,7 @@ TEMPORARY = Path("/tmp")
 
 
 def is_private_folder(folder: Path) -> bool:
-    """Whether this is a folder of this user, that no other one may enter; a link to one is none."""
+    """Return whether this is a folder of this user, that no other one may enter; a link to one is none."""
     try:
         folders = folder.lstat()
     except OSError:

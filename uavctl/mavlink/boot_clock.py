@@ -10,15 +10,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-MAX_BACKSTEP_MS = 1000  # a clock that goes back by more is another one; disorder on a link is less
-MAX_ADVANCE_MS = 30_000  # more than time has passed: late messages, and simulated clocks that run fast
-CONFIRM_NS = 5_000_000_000  # within which another clock's second message has to come
+MAX_BACKSTEP_MS = 1000  # a clock that goes back by more is another one; reordering on a link is less
+MAX_ADVANCE_MS = 30_000  # more than our clock: late messages, and fast simulated clocks
+CONFIRM_NS = 5_000_000_000  # time limit for the second message of another clock
 _WRAP_MS = 2**32
 
 
 @dataclass(frozen=True)
 class _Reading:
-    """A time since boot [ms] and when it came [ns]; confirmed by the message after it that agrees."""
+    """Time since boot [ms] and its arrival [ns]; a consistent message after it confirms it."""
 
     boot_ms: int
     at_ns: int
@@ -26,10 +26,10 @@ class _Reading:
 
 
 class BootClock:
-    """Takes `time_boot_ms` of several kinds of messages, each against its own kind.
+    """Uptime from `time_boot_ms` of several kinds of messages, each compared with its own kind.
 
-    One message is no evidence, as a field may hold garbage: a clock counts once two agree, be it between those of
-    another vehicle with the same id.
+    One message is no evidence, because a field may hold garbage. A clock counts once two messages agree, even between
+    those of another vehicle with the same id.
     """
 
     def __init__(self) -> None:
@@ -46,7 +46,7 @@ class BootClock:
         """Add a time since boot; return whether it shows a restart of the vehicle.
 
         Args:
-            kind: of message; the clocks of two need not agree.
+            kind: kind of message; two kinds may have different clocks.
             boot_ms: its time since boot, modulo 2**32 ms.
         """
         known, candidate = self._readings.get(kind), self._candidates.get(kind)
@@ -58,7 +58,7 @@ class BootClock:
             has_restarted = known.is_confirmed and (
                 _compute_advance_ms(known, reading) < 0 or _may_have_restarted(known, reading)
             )
-            if has_restarted:  # the others' readings are from before the restart
+            if has_restarted:  # readings of other kinds are older than the restart
                 self._readings.clear()
                 self._candidates.clear()
             self._accept(kind, _Reading(boot_ms, at_ns, is_confirmed=True))
@@ -87,10 +87,10 @@ def _compute_elapsed_ms(before: _Reading, after: _Reading) -> int:
 
 
 def _is_same_clock(before: _Reading, after: _Reading) -> bool:
-    """Whether two readings may be of one clock."""
+    """Return whether two readings may be of one clock."""
     return -MAX_BACKSTEP_MS <= _compute_advance_ms(before, after) <= _compute_elapsed_ms(before, after) + MAX_ADVANCE_MS
 
 
 def _may_have_restarted(before: _Reading, after: _Reading) -> bool:
-    """Whether a vehicle may have started between two readings: up for more than 24 days its clock seems to leap."""
+    """Return whether a restart between two readings is possible; after 24 days of uptime a clock seems to jump."""
     return after.boot_ms <= _compute_elapsed_ms(before, after) + MAX_ADVANCE_MS

@@ -18,15 +18,15 @@ from uavctl.records import Vec3
 
 MAX_ROUND_TRIP_NS = SECOND_NS  # a longer round trip gives no useful bound
 ROUND_TRIP_MARGIN_NS = 10_000_000  # more than the shortest: as good as the shortest
-# By which a clock's drift may change: real ones keep 1e-4, that of a simulator on a busy computer is followed so.
+# Largest change of a drift. Real clocks keep 1e-4; this value follows a simulator on a busy computer.
 DRIFT_CHANGE = 2e-3
 MAX_DEVIATION_NS = 100_000_000
-RESYNC_AFTER = 5  # deviating values in a row that are believed
+RESYNC_AFTER = 5  # deviating values in a row that show a new clock
 MAX_CLOCK_STEP_NS = SECOND_NS
-MIN_SAMPLES = 20  # samples before the minimum is trusted to judge the next stamp
+MIN_SAMPLES = 20  # samples before the minimum may refuse a stamp
 MAX_DELAY_SPREAD_NS = 200_000_000  # spread of the delays of one new clock
 STAMP_HISTORY = 64
-FIT_POINTS = 5  # round trips that the line of a clock goes through: few, as a busy computer's clock changes its pace
+FIT_POINTS = 5  # round trips of a line: few, because the drift of a busy computer's clock changes
 MIN_FIT_POINTS = 3
 MIN_FIT_SPAN_NS = 2_000_000_000  # from first to last: a shorter span shows no drift
 MAX_DRIFT = 0.05  # recorded: up to 0.034
@@ -50,7 +50,7 @@ class ClockSource(StrEnum):
 
 
 class StampUnit(StrEnum):
-    """Unit of a source's stamps; MAVLink wants microseconds."""
+    """Unit of a source's stamps; MAVLink requires microseconds."""
 
     MICROSECONDS = "us"
     MILLISECONDS = "ms"
@@ -72,7 +72,7 @@ class StampUnitDetector:
     """Detects the unit of a source's stamps from their rate against our clock.
 
     Attributes:
-        unit: as recognised; microseconds until another one is.
+        unit: the detected unit; microseconds before a detection.
     """
 
     def __init__(self) -> None:
@@ -80,7 +80,7 @@ class StampUnitDetector:
         self._reference: tuple[int, int, Vec3] | None = None  # stamp, arrival, position
 
     def update(self, stamp: int, position_m: Vec3, at_ns: int) -> StampUnit:
-        """Take a stamp, and the position that has it; return the unit.
+        """Add a stamp and its position; return the unit.
 
         The same stamp with the same position is a repeated message and does not show the unit.
         """
@@ -99,7 +99,7 @@ class StampUnitDetector:
 
 
 class SlidingMinimum:
-    """Minimum over a window of time, amortised O(1): values that a later, smaller one outlives are dropped."""
+    """Minimum over a sliding time window, amortised O(1): a new value removes all larger ones before it."""
 
     def __init__(self, window_ns: int) -> None:
         self._window_ns = window_ns
@@ -127,18 +127,17 @@ class SlidingMinimum:
 class TimesyncClock:
     """Offset and drift of a peer's clock from its answers to TIMESYNC requests.
 
-    An answer bounds the offset: the peer read its clock between our sending and our receiving, so the middle is off by
-    half the round trip at most. The offset is that of a robust line (Theil and Sen: median of the slopes between all
-    pairs) through the last answers that are about as short as the shortest. A longer one counts like these once the
-    line may be off by as much, as its uncertainty grows with time; before that it only keeps the line in its bounds.
-    Without answers the line is extrapolated. Against the recorded flights, just before each next answer: a simulator
-    whose
-    clock ran 1.3 % slow is followed to 2.8 ms (median; an average of the offsets alone was 47 ms behind), steady ones
-    to 0.5 ms.
+    The peer reads its clock between our sending and our receiving. So the middle is wrong by half the round trip at
+    most. The offset is that of a robust line (Theil and Sen: median of the slopes between all pairs) through the last
+    short round trips. The uncertainty of the line grows with time. A longer round trip joins the line once it is as
+    certain as the line; before that it only bounds the line. Without answers the line is extrapolated.
+
+    Errors in recorded flights, just before each next answer (median): 2.8 ms for a simulator whose clock ran 1.3 %
+    slow (47 ms for an average of the offsets), 0.5 ms for steady clocks.
 
     Attributes:
         rejected: answers that were not used: too slow, or of another clock.
-        shortest_ns: the shortest round trip of those that the line goes through.
+        shortest_round_trip_ns: the shortest round trip of the line.
     """
 
     def __init__(self, lifetime_ns: int) -> None:
@@ -155,17 +154,17 @@ class TimesyncClock:
         self.shortest_round_trip_ns = 0
 
     def offset_ns(self, at_ns: int) -> int | None:
-        """(our time − its time), or None without a usable answer in the last `lifetime_ns`."""
+        """Return (our time − its time); None without a used answer in the last `lifetime_ns`."""
         if not self._answers or at_ns - self._used_ns > self._lifetime_ns:
             return None
         return self.last_known_ns(at_ns)
 
     def last_known_ns(self, at_ns: int) -> int | None:
-        """(our time − its time) by the answers so far, however long ago they came; None before the first."""
+        """Return (our time − its time) by all answers, old ones too; None before the first."""
         return self._line_ns + round(self._slope * (at_ns - self._line_at_ns)) if self._answers else None
 
     def uncertainty_ns(self, at_ns: int) -> int | None:
-        """Largest error of the offset at that time; None before the first answer."""
+        """Return the largest error of the offset at a time; None before the first answer."""
         if not self._answers:
             return None
         return self.shortest_round_trip_ns // 2 + round(DRIFT_CHANGE * (at_ns - self._answers[-1][0]))
@@ -181,7 +180,7 @@ class TimesyncClock:
         return tuple(self._round_trips_ns)
 
     def add_answer(self, sent_ns: int, remote_ns: int, received_ns: int) -> bool:
-        """Take one answer.
+        """Add one answer.
 
         Args:
             sent_ns: our time when the request was sent.
@@ -225,12 +224,12 @@ class TimesyncClock:
         return True
 
     def _reset(self) -> None:
-        """Begin again: the peer has another clock now."""
+        """Forget the line: the peer has another clock now."""
         self._answers.clear()
         self._slope, self._has_drift = 0.0, False
 
     def _fit_line(self) -> None:
-        """The line through the last answers, as its slope and its value at the last one."""
+        """Fit the line through the last answers: its slope, and its value at the last one."""
         self.shortest_round_trip_ns = min(length_ns for _, _, length_ns in self._answers)
         last_ns = self._answers[-1][0]
         if len(self._answers) >= MIN_FIT_POINTS and last_ns - self._answers[0][0] >= MIN_FIT_SPAN_NS:
@@ -243,10 +242,10 @@ class TimesyncClock:
 
 
 class ArrivalClock:
-    """A sender's clock by the arrival of its stamps alone, whatever its drift: what came quickest counts.
+    """Clock of a sender by the arrival of its stamps alone: the quickest message counts.
 
-    (our time − its time) is never more than (arrival − stamp). The least of these goes on at the clock's drift, the
-    median of its rises from second to second: a link that becomes slower is one rise among many, and no drift.
+    (our time − its time) is at most (arrival − stamp). The minimum of these follows the clock's drift. The drift is the
+    median of the slopes from second to second: a slower link is one slope among many, and no drift.
     """
 
     def __init__(self) -> None:
@@ -254,17 +253,17 @@ class ArrivalClock:
         self._at_ns: int | None = None  # time of the last stamp
         # start of the second, smallest (arrival − stamp) in it, and its time of arrival
         self._current_second: tuple[int, int, int] = (0, 0, 0)
-        self._previous_second: tuple[int, int] | None = None  # the last two of the second before
+        self._previous_second: tuple[int, int] | None = None  # minimum and arrival of the previous second
         self._slopes: deque[float] = deque(maxlen=FIT_POINTS)
         self._slope = 0.0
         self._impossible_count = 0  # stamps in a row that this clock cannot have given
 
     def offset_ns(self, at_ns: int) -> int | None:
-        """(our time − its time) and the smallest delay; None before the first stamp."""
+        """Return (our time − its time) plus the smallest delay; None before the first stamp."""
         return None if self._at_ns is None else round(self._min_offset_ns + self._slope * (at_ns - self._at_ns))
 
     def measure_delay_ns(self, stamp_ns: int, at_ns: int) -> int:
-        """Take a stamp; return by how much it came later than the quickest [ns]."""
+        """Add a stamp; return its delay behind the quickest one [ns]."""
         offset_ns = at_ns - stamp_ns
         if self._at_ns is None or self._impossible_count >= RESYNC_AFTER:
             self._previous_second, self._slope, self._impossible_count = None, 0.0, 0
@@ -286,7 +285,7 @@ class ArrivalClock:
         return round(offset_ns - self._min_offset_ns)
 
     def _start_second(self, offset_ns: int, at_ns: int) -> None:
-        """Learn the drift from the second that is over."""
+        """Update the drift from the finished second."""
         _, min_offset_ns, min_offset_at_ns = self._current_second
         if self._previous_second is not None:
             slope = (min_offset_ns - self._previous_second[0]) / (min_offset_at_ns - self._previous_second[1])
@@ -298,7 +297,7 @@ class ArrivalClock:
 
 
 class ClockSync:
-    """The clock of one source, identified by system, component and kind of stamp.
+    """Clock of one source, identified by system, component and kind of stamp.
 
     Args:
         latency_ns: smallest delay from capture to arrival.
@@ -321,12 +320,12 @@ class ClockSync:
     def estimate_capture_ns(
         self, stamp_ns: int | None, received_ns: int, offset_ns: int | None = None
     ) -> int | StampRefusal:
-        """Time of capture in our clock.
+        """Convert a stamp to the time of capture in our clock.
 
         Args:
             stamp_ns: the source's stamp; None if it gives none.
-            offset_ns: offset from round trips, if there is one. It is used if it makes the smallest
-                delay plausible: answers and stamps may come from different clocks.
+            offset_ns: offset from round trips, if known. It is used if the smallest delay is plausible with it: answers
+                and stamps may come from different clocks.
 
         Returns:
             The time of capture, never after the arrival, or why the stamp is refused.
@@ -347,17 +346,17 @@ class ClockSync:
         return min(stamp_ns + self.offset_ns, received_ns)
 
     def _is_plausible(self, offset_ns: int, minimum_ns: int, stamp_ns: int, received_ns: int) -> bool:
-        """Whether an offset makes the smallest delay neither negative nor long.
+        """Return whether the smallest delay with an offset is neither negative nor long.
 
-        The minimum of a slow clock is old and too small for now. So each delay is also
-        judged by the offset of its own time.
+        The minimum of a slow clock is old and too small for now. So each delay is also tested with the offset of its
+        own time.
         """
         shortest_ns = self._min_delay.push(received_ns, received_ns - stamp_ns - offset_ns)
         min_offset_ns = -self._future_tolerance_ns
         return any(min_offset_ns <= delay_ns <= MAX_CLOCK_STEP_NS for delay_ns in (minimum_ns - offset_ns, shortest_ns))
 
     def unwrap_ns(self, stamp: int, modulus: int, unit_ns: int) -> int:
-        """Nanoseconds of a counter that wraps, as the value nearest to the newest stamp."""
+        """Convert a counter that wraps to nanoseconds: the value nearest to the newest stamp."""
         half = modulus // 2
         newest = self._newest_ns // unit_ns if self._stamp_count else stamp
         return (newest + (stamp - newest + half) % modulus - half) * unit_ns

@@ -156,8 +156,8 @@ AUTOPILOT_ESTIMATE = "own-estimate"  # an autopilot's ODOMETRY of itself is no e
 class DecodedMessages(msgspec.Struct, frozen=True):
     """Result of decoding some bytes."""
 
-    messages: tuple[Message, ...]  # those that are understood, in order
-    total: int  # number of messages, also of kinds that are passed over
+    messages: tuple[Message, ...]  # decoded messages, in order
+    total: int  # number of all messages, decoded or not
     bad: dict[str, int]  # what was skipped, by reason
 
 
@@ -184,7 +184,7 @@ class StreamDecoder:
         self._is_aligned = True
 
     def push(self, chunk: bytes) -> DecodedMessages:
-        """Take the next bytes; what they begin and do not end waits for the next chunk."""
+        """Decode the next bytes; an incomplete frame waits for the next chunk."""
         data = self._buffer + chunk
         result = scan_frames(data, final=False, is_aligned=self._is_aligned)
         self._buffer, self._is_aligned = data[result.consumed :], result.is_aligned
@@ -192,7 +192,7 @@ class StreamDecoder:
 
 
 def decode_scan(result: Scan) -> DecodedMessages:
-    """Decode the frames that a scan has found."""
+    """Decode the frames of a scan."""
     messages = []
     for frame in result.frames:
         decoder = _DECODERS.get(frame.message_id)
@@ -270,7 +270,7 @@ def _parse_odometry(raw: MessageFields) -> Position:
 
 
 def _parse_odometry_velocity(raw: MessageFields) -> Vec3 | None:
-    """Velocity in the axes of the position; None if it is not given (NaN) or its axes are not known."""
+    """Return the velocity in the axes of the position; None if it is not given (NaN) or its axes are unknown."""
     velocity: Vec3 = (raw.vx, raw.vy, raw.vz)
     if not _is_finite(*velocity):
         return None
@@ -389,7 +389,7 @@ def _parse_battery_status(raw: MessageFields) -> Battery | None:
 
 
 def _sum_cells(raw: MessageFields, voltages_mv: list[int]) -> Battery | None:
-    """Sum of the cells that are known (the first may stand for all of them)."""
+    """Return the sum of the known cells (the first may stand for all of them)."""
     known = [voltage for voltage in voltages_mv if voltage != _NO_VOLTAGE_MV]
     if not known:
         return None

@@ -37,11 +37,11 @@ _INT64 = 2**63
 
 
 class UnsendableError(ValueError):
-    """A message must not be sent as it is; a NaN, for one, aborts ArduPilot."""
+    """Refusal to send a message; a NaN, for example, aborts ArduPilot."""
 
 
 class Encoder:
-    """Messages to frames, numbered modulo 256 as one sequence."""
+    """Encoder of messages; numbers the frames modulo 256 as one sequence."""
 
     def __init__(self, system_id: int, component_id: int) -> None:
         self._address = (system_id, component_id)
@@ -73,12 +73,12 @@ class Encoder:
         """SET_POSITION_TARGET_LOCAL_NED with the acceleration, and the yaw if there is one.
 
         Raises:
-            UnsendableError: a value is not finite, or absurd.
+            UnsendableError: a value is not finite, or too large.
         """
         yaw = setpoint.yaw_rad
         north, east, down = map(abs, setpoint.accel_mps2)
         limit = _ABSURD_ACCEL_MPS2
-        is_plausible = north <= limit and east <= limit and down <= limit  # NaN is not
+        is_plausible = north <= limit and east <= limit and down <= limit  # False for NaN
         if not is_plausible or not math.isfinite(yaw or 0.0):
             raise UnsendableError(f"acceleration {setpoint.accel_mps2} m/s², yaw {yaw} rad: not finite, or absurd")
         return self._pack(

@@ -19,8 +19,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 HEADER_V1, HEADER_V2, CHECKSUM = 6, 10, 2  # bytes
 _INCOMPAT_KNOWN = mavlink.MAVLINK_IFLAG_SIGNED
-MAX_FAILED = 64  # tries in one datagram or chunk; a hostile one must not cost the loop its tick
-# A byte of each message's definition, that is summed up after the frame's own.
+MAX_FAILED = 64  # in one datagram or chunk; a hostile one must not take the time of a tick
+# CRC_EXTRA of each message definition, which the checksum includes.
 _CRC_EXTRA = {number: bytes((kind.crc_extra,)) for number, kind in mavlink.mavlink_map.items()}
 _MAGIC = (mavlink.PROTOCOL_MARKER_V1, mavlink.PROTOCOL_MARKER_V2)
 
@@ -32,10 +32,10 @@ class SkipReason(StrEnum):
     TRUNCATED = "truncated"  # a frame that the data ends in
     GARBAGE = "garbage"  # a run of bytes that no frame begins in
     OVERSIZE = "oversize"  # a datagram longer than any that peers send
-    UNKNOWN = "unknown-message"  # an id that the dialect has not: passed over by its length
+    UNKNOWN = "unknown-message"  # an id that the dialect does not have: skipped by its length
 
 
-UNSIGNED = "unsigned"  # a frame without the signature that is asked for
+UNSIGNED = "unsigned"  # a frame without the required signature
 Verify = Callable[[bytes], str | None]
 """Takes a whole frame that has a signature; gives the reason not to take it, or None."""
 
@@ -61,7 +61,7 @@ class Scan(msgspec.Struct):
 
 
 class _FrameHeader(msgspec.Struct, frozen=True):
-    """Length and kind of a frame, as its first bytes announce them."""
+    """Length and message id of a frame, from its header."""
 
     length: int
     message_id: int
@@ -87,18 +87,18 @@ def _has_unknown_flags(data: bytes, at: int) -> bool:
 
 
 def _compute_checksum(body: bytes, message_id: int) -> int:
-    """Checksum of what follows a frame's first byte, up to its payload's end."""
+    """Compute the checksum of a frame from its second byte to the end of its payload."""
     return mavlink.x25crc(body + _CRC_EXTRA[message_id]).crc
 
 
 def _is_checksum_right(frame: bytes, header: _FrameHeader) -> bool:
-    """Whether the checksum of a frame of a known id is right."""
+    """Return whether the checksum of a frame of a known id is right."""
     end = header.length - header.signature - CHECKSUM
     return _compute_checksum(frame[1:end], header.message_id) == int.from_bytes(frame[end : end + CHECKSUM], "little")
 
 
 def add_checksum(head: bytes) -> bytes:
-    """Header and payload of a frame of MAVLink 2, with its checksum.
+    """Add the checksum to header and payload of a MAVLink 2 frame.
 
     Raises:
         KeyError: the message id is unknown to the dialect.
@@ -108,18 +108,18 @@ def add_checksum(head: bytes) -> bytes:
 
 
 def scan_frames(data: bytes, *, final: bool, is_aligned: bool = True, verify: Verify | None = None) -> Scan:
-    """Find the frames in some bytes.
+    """Find the frames in bytes.
 
     Args:
-        data: a datagram, or what has come of a stream.
-        final: whether the data ends here. If not, a frame that it ends in is left for later.
+        data: a datagram, or the received part of a stream.
+        final: whether the data ends here. If not, an incomplete frame at its end is left for later.
         is_aligned: whether the first byte should begin a frame (see `Scan`).
-        verify: takes only frames whose signature it accepts, in place of the checksum; frames of ids that the dialect
-            has not are verified too, and then counted and dropped.
+        verify: verifies the signature instead of the checksum; only accepted frames pass. Frames of unknown messages
+            are verified too, then counted and dropped.
 
     Returns:
-        What was found. One broken frame, or one run of garbage, counts once. A datagram, or what has come of a stream,
-        in which nothing fits any more after `MAX_FAILED` tries is dropped from there on.
+        The frames and counts. One broken frame, or one run of garbage, counts once. After `MAX_FAILED` failures the
+        rest of the data is dropped.
     """
     result = Scan(is_aligned=is_aligned)
     failures = 0
@@ -138,7 +138,7 @@ def scan_frames(data: bytes, *, final: bool, is_aligned: bool = True, verify: Ve
 
 
 def scan_single_frame(data: bytes) -> Scan:
-    """Look at bytes that should be one whole frame; others are not searched for in them."""
+    """Parse bytes that should be one whole frame, without a search."""
     result = Scan(consumed=0)
     end, reason = _try_frame(data, result, None, final=True) if data else (None, SkipReason.TRUNCATED)
     if end is None:
@@ -151,7 +151,7 @@ _ACCEPTED, _WAIT = "taken", "wait"
 
 
 def _try_frame(data: bytes, result: Scan, verify: Verify | None, *, final: bool) -> tuple[int | None, str]:
-    """Try for a frame at `result.consumed`: (its end, `_ACCEPTED`), or (None, why not)."""
+    """Try to read a frame at `result.consumed`; return (its end, `_ACCEPTED`), or (None, reason)."""
     at = result.consumed
     if data[at] not in _MAGIC or _has_unknown_flags(data, at):
         return None, SkipReason.GARBAGE
@@ -162,7 +162,7 @@ def _try_frame(data: bytes, result: Scan, verify: Verify | None, *, final: bool)
     if verify is not None:
         return _try_signed(data, result, header, verify)
     if header.message_id not in mavlink.mavlink_map:
-        # Nothing but the length can be checked.
+        # Only the length can be checked.
         if not _is_length_credible(data, result, end):
             return None, SkipReason.GARBAGE
         result.count_skip(SkipReason.UNKNOWN)
@@ -175,7 +175,7 @@ def _try_frame(data: bytes, result: Scan, verify: Verify | None, *, final: bool)
 
 
 def _try_signed(data: bytes, result: Scan, header: _FrameHeader, verify: Verify) -> tuple[int | None, str]:
-    """Try for a frame where signatures are required: of a frame without one only the length is believed."""
+    """Try to read a frame where signatures are required; of one without a signature only the length counts."""
     at = result.consumed
     end = at + header.length
     frame = data[at:end]
@@ -192,11 +192,11 @@ def _try_signed(data: bytes, result: Scan, header: _FrameHeader, verify: Verify)
 
 
 def _is_length_credible(data: bytes, result: Scan, end: int) -> bool:
-    """Whether an unchecked length can be believed: a frame came before, and another seems to follow."""
+    """Return whether an unchecked length is credible: a frame came before, and another one seems to follow."""
     return result.is_aligned and (end >= len(data) or data[end] in _MAGIC)
 
 
 def _find_next_magic(data: bytes, start: int) -> int:
-    """Index of the next byte that could begin a frame, or the end."""
+    """Return the index of the next byte that could begin a frame, or the end."""
     candidates = [index for magic in _MAGIC if (index := data.find(magic, start)) >= 0]
     return min(candidates, default=len(data))

@@ -330,9 +330,8 @@ class HandoverStateMachine:
         limits_s = {
             HandoverState.MODE: config.ground_s,
             HandoverState.ARMING: config.ground_s,
-            HandoverState.CLIMBING: max(
-                config.climb_s - climbed_s, 0.0
-            ),  # one time for the climb, however often it is interrupted
+            # One limit for the climb, also after interruptions.
+            HandoverState.CLIMBING: max(config.climb_s - climbed_s, 0.0),
             HandoverState.ENGAGING: config.engage_s,
             HandoverState.RETURNING: config.engage_s,
             HandoverState.LANDING: config.land_s,

@@ -25,7 +25,7 @@ _SENDER_V1, _SENDER_V2 = 3, 5  # index of the system id; the component's follows
 
 
 class MessageFields(Protocol):
-    """Decoded frame: the fields of its message by their names, an array as a tuple, a text as its bytes."""
+    """Fields of a decoded message by name; an array is a tuple, a text is bytes."""
 
     msgname: str
     src_system: int
@@ -35,7 +35,7 @@ class MessageFields(Protocol):
 
 
 class MessageLayout:
-    """Layout of one kind of message in a frame."""
+    """Layout of one message in a frame."""
 
     def __init__(self, kind: Any) -> None:
         self._name, self._id = kind.msgname, kind.id.to_bytes(3, "little")
@@ -50,7 +50,7 @@ class MessageLayout:
             self._grouped = itemgetter(*(i if j - i == 1 else slice(i, j) for i, j in pairwise(ends)))
 
     def unpack(self, frame: bytes) -> MessageFields:
-        """The fields of a whole frame of this kind; bytes that its payload lacks are 0, those too many dropped."""
+        """Unpack the fields of a whole frame; missing bytes of its payload are 0, extra ones are dropped."""
         start, sender = (HEADER_V2, _SENDER_V2) if frame[0] == mavlink.PROTOCOL_MARKER_V2 else (HEADER_V1, _SENDER_V1)
         payload = frame[start : start + frame[1]].ljust(self._struct.size, b"\0")
         values = (self._name, frame[sender], frame[sender + 1], *self._struct.unpack_from(payload))
@@ -58,12 +58,12 @@ class MessageLayout:
         return fields
 
     def pack(self, address: tuple[int, int], number: int, *fields: Any) -> bytes:
-        """A frame of MAVLink 2.
+        """Pack a frame of MAVLink 2.
 
         Args:
             address: system and component that send it.
-            number: its place in their sequence, 0 to 255.
-            fields: in the order of pymavlink's class; numbers that are not given at the end are 0.
+            number: its sequence number, 0 to 255.
+            fields: in the order of pymavlink's class; missing numbers at the end are 0.
 
         Raises:
             struct.error: a number does not fit.

@@ -22,8 +22,8 @@ from uavctl.mavlink.messages import Position
 from uavctl.records import PositionSample, Vec3
 
 MAX_SOURCES = 32
-SILENCE_NS = 10_000_000_000  # after which a source gives its place to any other
-SETTLED_SAMPLES = 20  # samples after which a source is no newcomer any more
+SILENCE_NS = 10_000_000_000  # after which any other source may replace one
+SETTLED_SAMPLES = 20  # samples after which a source is settled
 # Samples of all new sources together: without a settled source that is active, and beside one. Each sample costs the
 # estimator time, and a new source may be hostile.
 NEW_SOURCE_PER_S, NEW_SOURCE_BESIDE_PER_S = 100, 10
@@ -32,7 +32,7 @@ SOURCE_ACTIVE_NS = 1_000_000_000
 
 WRONG_SYSTEM = "system-id"
 NEW_SOURCE = "new-source"  # more samples of new sources than the limit
-TOO_MANY_SOURCES = "sources"  # more than there is room for: the history of one is lost
+TOO_MANY_SOURCES = "sources"  # more than `MAX_SOURCES`: the state of one is lost
 IMPLAUSIBLE = "absurd"
 SLOW_ANSWER = "timesync"
 
@@ -54,13 +54,13 @@ class SourceTable(Generic[Key, State]):
 
     def __init__(self, max_sources: int, count_bad: Callable[[], None]) -> None:
         self._max_sources, self._on_eviction = max_sources, count_bad
-        self._entries: dict[Key, tuple[State, int, int]] = {}  # what is kept, times that it spoke, when last
+        self._entries: dict[Key, tuple[State, int, int]] = {}  # state, number of messages, time of the last one
 
     def __len__(self) -> int:
         return len(self._entries)
 
     def get(self, key: Key) -> State | None:
-        """Return what is kept of a source; None if it is not there."""
+        """Return the state of a source; None if it is not in the table."""
         entry = self._entries.get(key)
         return None if entry is None else entry[0]
 
@@ -70,7 +70,7 @@ class SourceTable(Generic[Key, State]):
         return 0 if entry is None else entry[1]
 
     def values(self) -> Iterator[State]:
-        """Iterate over what is kept of all sources."""
+        """Iterate over the states of all sources."""
         return (state for state, _, _ in self._entries.values())
 
     def record_message(self, key: Key, at_ns: int, make_state: Callable[[], State]) -> State:
@@ -98,8 +98,8 @@ class PositionDecoder:
 
     Args:
         clock: window, latency and tolerance of the sources' clocks.
-        source: which messages and which system count.
-        estimator: standard deviation of a sample, and what is absurd.
+        source: accepted messages and system.
+        estimator: standard deviation of a sample, and the limits of plausible ones.
         count_bad: counts refusals, by reason.
     """
 
@@ -112,22 +112,22 @@ class PositionDecoder:
         count_bad: Callable[[str], None],
     ) -> None:
         frame_config = Frame(frame.convention, frame.origin_m, frame.yaw_deg)
-        # A message that declares its axes is believed; the vehicle's own estimate needs no conversion.
+        # The axes that a message declares count. The vehicle's own estimate needs no conversion.
         self._frames: dict[Convention | None, Frame] = {None: frame_config}
         for axes in get_args(Convention):
             self._frames[axes] = replace(frame_config, convention=axes)
         self._clock, self._source, self._estimator, self._count_bad = clock, source, estimator, count_bad
         self._clocks: SourceTable[tuple[Address, bool], ClockSync] = SourceTable(MAX_SOURCES, self._count_eviction)
         self._units: SourceTable[Address, StampUnitDetector] = SourceTable(MAX_SOURCES, self._count_eviction)
-        self.units: dict[Address, StampUnit] = {}  # of the sources whose stamps are in another than microseconds
+        self.units: dict[Address, StampUnit] = {}  # of sources with stamps that are not in microseconds
         self._timesync_clocks: SourceTable[Address, TimesyncClock] = SourceTable(MAX_SOURCES, self._count_eviction)
         self._new_source_budget, self._new_source_budget_ns = float(NEW_SOURCE_BURST), 0
-        self._settled_ns: int | None = None  # when a settled source was heard last
-        self.is_settled = False  # whether the newest sample is of one
+        self._settled_ns: int | None = None  # last sample of a settled source
+        self.is_settled = False  # whether the source of the newest sample is settled
         self._latest: ClockSync | None = None
         self._latest_address: Address | None = None
         self.samples = 0
-        self.resyncs = 0  # times that a source turned out to have a new clock
+        self.resyncs = 0  # number of new clocks of sources
         self.attitude: Quaternion | None = None  # of the newest sample: body axes forward, right, down to NED
 
     @property
@@ -141,7 +141,7 @@ class PositionDecoder:
         return ClockSource.NONE if self._latest is None else self._latest.source
 
     def timesync_clock(self, address: Address | None = None) -> TimesyncClock | None:
-        """Round trips to a peer that answers; without an address, to the newest sample's source."""
+        """Return the clock of a peer that answers TIMESYNC; without an address, of the newest sample's source."""
         address = self._latest_address if address is None else address
         return None if address is None else self._timesync_clocks.get(address)
 
@@ -150,7 +150,7 @@ class PositionDecoder:
         return all(timesync.offset_ns(at_ns) is not None for timesync in self._timesync_clocks.values())
 
     def add_timesync_answer(self, address: Address, sent_ns: int, remote_ns: int, received_ns: int) -> None:
-        """Take an answer to a TIMESYNC request."""
+        """Add an answer to a TIMESYNC request."""
         timesync = self._timesync_clocks.record_message(
             address, received_ns, lambda: TimesyncClock(_ns(self._clock.window_s))
         )
@@ -158,7 +158,7 @@ class PositionDecoder:
             self._count_bad(SLOW_ANSWER)
 
     def make_sample(self, message: Position, received_ns: int) -> PositionSample | None:
-        """Make a sample of a message, or count why not; None also for messages that are not asked for."""
+        """Make a sample of a message, or count the reason why not; None also for messages that are not configured."""
         if message.name not in self._source.messages:
             return None
         if self._source.system_id not in (0, message.system):
@@ -236,7 +236,7 @@ class PositionDecoder:
         return captured
 
     def _is_stamp_in_us(self, message: Position, stamp: int, received_ns: int) -> bool:
-        """Whether a stamp is in the unit that it has to be in; else the position counts by its arrival."""
+        """Return whether a stamp is in microseconds; otherwise the position counts by its arrival."""
         address = (message.system, message.component)
         detector = self._units.record_message(address, received_ns, StampUnitDetector)
         before, unit = detector.unit, detector.update(stamp, message.position_m, received_ns)
@@ -248,7 +248,7 @@ class PositionDecoder:
 
 
 def _find_key(message: Position) -> tuple[Address, bool]:
-    """Return whose clock stamps a message, and which of its clocks."""
+    """Return the key of the clock that stamps a message: sender, and kind of stamp."""
     return (message.system, message.component), message.boot_ms
 
 

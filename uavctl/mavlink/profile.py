@@ -16,7 +16,7 @@ from uavctl.records import VehicleStatus
 
 
 class ModeChoice(Enum):
-    """Who can have chosen a mode of an autopilot."""
+    """Possible choosers of a mode of an autopilot."""
 
     PERSON = "a person, with a stick or at a ground station"  # also a mode that the autopilot restores
     EITHER = "a person, or a failsafe"  # it flies by itself
@@ -69,7 +69,7 @@ _COPTER_TYPES = frozenset(
 
 
 def _read_mode_names(prefix: str) -> dict[int, str]:
-    """Return the names of an enum of modes by their numbers."""
+    """Return the names of a mode enum by number."""
     named = {name.removeprefix(prefix): int(getattr(mavlink, name)) for name in dir(mavlink) if name.startswith(prefix)}
     return {number: name for name, number in named.items() if name != "ENUM_END"}
 
@@ -109,27 +109,27 @@ def _name_ardupilot_mode(vehicle_type: int, custom_mode: int) -> str:
 
 @dataclass(frozen=True)
 class AutopilotProfile:
-    """Profile of one autopilot: its modes for take-off, flight and landing, by its own names, and its habits."""
+    """Profile of one autopilot: its modes by its own names, and its behaviour."""
 
     external_mode: str  # the mode that takes our setpoints
-    take_off_mode: str  # the mode that take-off begins in, asked for on the ground
-    climb_modes: frozenset[str]  # modes that it is in during its own climb and right after
-    landing_modes: frozenset[str]  # modes in which it lands by itself
+    take_off_mode: str  # the mode in which take-off begins, requested on the ground
+    climb_modes: frozenset[str]  # its modes in its own climb and right after
+    landing_modes: frozenset[str]  # its modes in its own landing
     mode_choices: dict[str, ModeChoice]  # its modes, and the possible choosers of each
     # Modes of a person that a failsafe also chooses if the previous mode is not possible any more
     degraded_modes: frozenset[str]
     # The end of a failsafe restores the previous mode; otherwise the mode of the failsafe stays
     restores_mode: bool
-    # Arming in `take_off` starts the climb, to a height of its own; else MAV_CMD_NAV_TAKEOFF does, to a height above
-    # the place of arming
+    # Arming in `take_off_mode` starts the climb, to its own height. Otherwise MAV_CMD_NAV_TAKEOFF starts it, to a
+    # height above the place of arming.
     climbs_on_arming: bool
-    uses_raw_imu: bool  # its RAW_IMU is taken for its acceleration; else HIGHRES_IMU alone is
+    uses_raw_imu: bool  # use RAW_IMU for its acceleration; otherwise only HIGHRES_IMU
     needs_global_origin: bool  # without GPS it needs a global origin before it arms
     number: int  # MAV_AUTOPILOT of its heartbeats
-    inertial_messages: tuple[int, int]  # the messages that show how it turns, and its acceleration
-    # A mode's name, of MAV_TYPE and of a heartbeat's custom_mode; empty where the kind of vehicle is not known
+    inertial_messages: tuple[int, int]  # its messages of attitude and acceleration
+    # Name of a mode by MAV_TYPE and custom_mode of a heartbeat; empty for an unknown kind of vehicle.
     mode_name: Callable[[int, int], str]
-    mode_parameters: dict[str, tuple[int, int]]  # DO_SET_MODE's parameters 2 and 3 of the modes that are asked for
+    mode_parameters: dict[str, tuple[int, int]]  # parameters 2 and 3 of DO_SET_MODE for the requested modes
 
 
 PROFILES = {
@@ -176,20 +176,19 @@ _NAMES = {profile.number: name for name, profile in PROFILES.items()}
 
 
 def find_profile(vehicle: VehicleStatus) -> AutopilotProfile:
-    """Return the autopilot's profile; that of PX4 for one that is not known, which is never asked for a mode."""
+    """Return the profile of the autopilot; PX4's for an unknown one, which never gets a mode request."""
     return PROFILES.get(vehicle.autopilot, PROFILES["px4"])
 
 
 def find_autopilot_name(autopilot: int) -> str:
-    """`px4`, `ardupilot` or `unknown` of MAV_AUTOPILOT."""
+    """Return the name of a MAV_AUTOPILOT: `px4`, `ardupilot` or `unknown`."""
     return _NAMES.get(autopilot, "unknown")
 
 
 def describe_mode(autopilot: str, vehicle_type: int, custom_mode: int) -> tuple[str, bool]:
-    """A mode by the autopilot's own name, and whether it takes our setpoints.
+    """Return a mode by the autopilot's own name, and whether it takes our setpoints.
 
-    Numbers mean something else on every autopilot, and on ArduPilot on every kind of vehicle; what is
-    not known here never counts as external.
+    Mode numbers differ by autopilot, and on ArduPilot by kind of vehicle. An unknown mode never counts as external.
     """
     profile = PROFILES.get(autopilot)
     name = "" if profile is None else profile.mode_name(vehicle_type, custom_mode)

@@ -24,9 +24,9 @@ from uavctl.mavlink.framing import CHECKSUM, SkipReason, add_checksum, scan_fram
 
 KEY_BYTES = 32
 EPOCH_NS = 1_420_070_400_000_000_000  # 1st January 2015, UTC
-TIMESTAMP_UNIT_NS = 10_000  # of a stamp
+TIMESTAMP_UNIT_NS = 10_000
 MAX_TIMESTAMP = 2**48 - 1
-MAX_NEW_STREAM_LAG = 6_000_000  # units: a stream that is new may begin one minute behind our own stamp
+MAX_NEW_STREAM_LAG = 6_000_000  # units: a new stream may begin one minute behind our own timestamp
 MAX_STREAMS = 64  # of one connection; a flight has a few
 MAX_LINK_SKEW = (
     500_000  # units: no frame is taken that is five seconds behind what its stream has said on another connection
@@ -41,12 +41,12 @@ StreamId = tuple[int, int, int]
 
 
 class SignatureRefusal(StrEnum):
-    """Reason why a frame is not taken."""
+    """Reason why a frame is refused."""
 
     FORGED = "forged"  # made without the key, or damaged
     REPLAYED = "replayed"  # not newer than the newest of its stream, or than all before the start
     STALE = "stale"  # begins a stream more than a minute behind
-    LINK_ID = "link-id"  # another link's, carried over to this one
+    LINK_ID = "link-id"  # of another link, copied to this one
 
 
 class SigningKey:
@@ -77,7 +77,7 @@ class SigningKey:
 
 @dataclass
 class SigningTimestamps:
-    """Stamps of one key."""
+    """Timestamps of one key."""
 
     floor: int = 0  # newest before the start; it is stored, so that no older frame is accepted again
     newest: int = 0  # newest that was sent or verified since, on any connection
@@ -129,7 +129,7 @@ class FrameSigner:
         return signed + self._key.hash(signed)
 
     def verify(self, frame: bytes, at_ns: int) -> SignatureRefusal | None:
-        """Whether to take a frame that has a signature; None takes it, and none of its kind that is older.
+        """Return whether to take a frame that has a signature; None takes it, and none of its kind that is older.
 
         Args:
             frame: the whole frame, signature included; its checksum is covered by the hash.
@@ -177,12 +177,12 @@ class FrameSigner:
 
 
 def make_timestamp(wall_ns: int) -> int:
-    """The stamp of a time of the wall clock (UTC, since 1970) [ns]."""
+    """Convert a time of the wall clock (UTC, since 1970) [ns] to a timestamp."""
     return max(0, (wall_ns - EPOCH_NS) // TIMESTAMP_UNIT_NS)
 
 
 def remove_signature(frame: bytes) -> bytes:
-    """A signed frame as it would be without: what recordings hold, since signatures help to guess a key.
+    """Return a signed frame without its signature, for recordings: signatures help to guess a key.
 
     Raises:
         KeyError: its message id is unknown to the dialect, so that it has no checksum without its signature.
@@ -193,7 +193,7 @@ def remove_signature(frame: bytes) -> bytes:
 
 
 class FrameAuthenticator:
-    """Verifies and signs what crosses one connection.
+    """Verifies and signs the frames of one connection.
 
     Args:
         stream: the connection carries a stream of bytes, not datagrams.
@@ -208,7 +208,7 @@ class FrameAuthenticator:
         self.refused: Counter[str] = Counter()
 
     def verify_frames(self, data: bytes, at_ns: int) -> bytes:
-        """The verified frames of a datagram or chunk, without their signatures; empty if there are none."""
+        """Return the verified frames of a datagram or chunk, without their signatures; empty if there are none."""
         if not self._is_stream and len(data) > MAX_DATAGRAM_BYTES:
             self.refused[SkipReason.OVERSIZE] += 1
             return b""
@@ -225,5 +225,5 @@ class FrameAuthenticator:
         return b"".join(remove_signature(frame.data) for frame in result.frames)
 
     def sign_frame(self, frame: bytes, at_ns: int) -> bytes:
-        """One of our frames, signed."""
+        """Sign one of our frames."""
         return self._signer.sign(frame, at_ns)

@@ -6,13 +6,13 @@ import msgspec
 
 from uavctl.mavlink.messages import StatusText
 
-CHUNK_WAIT_NS = 1_000_000_000  # for the pieces that are to come; PX4 sends them at once
-MAX_PARTIAL_TEXTS = 16  # texts under way
-MISSING_CHUNK = "…"  # stands for a piece that did not come
+CHUNK_WAIT_NS = 1_000_000_000  # for the next chunk; PX4 sends all chunks at once
+MAX_PARTIAL_TEXTS = 16  # incomplete texts
+MISSING_CHUNK = "…"  # replaces a missing chunk
 
 
 class _PartialText(msgspec.Struct):
-    """Text of which more pieces are to come."""
+    """Incomplete text."""
 
     first: StatusText
     text: str
@@ -20,18 +20,18 @@ class _PartialText(msgspec.Struct):
     at_ns: int
 
     def finish(self) -> StatusText:
-        """Return the text as far as it has come, with a mark for the part that is missing."""
+        """Return the received part of the text, with a mark for the missing one."""
         return _make_text(self.first, self.text + MISSING_CHUNK)
 
 
 class StatusTextAssembler:
-    """Joins the pieces of texts, by their sender."""
+    """Joins the chunks of texts, by sender."""
 
     def __init__(self) -> None:
         self._partial_texts: dict[tuple[int, int], _PartialText] = {}
 
     def add_chunk(self, text: StatusText, at_ns: int) -> tuple[StatusText, ...]:
-        """Take a piece, or a whole text; the texts that are whole now."""
+        """Add a chunk, or a whole text; return the texts that are complete now."""
         sender = text.system, text.component
         partial = self._partial_texts.get(sender)
         finished: tuple[StatusText, ...] = ()
@@ -51,7 +51,7 @@ class StatusTextAssembler:
         return (*finished, partial.finish())
 
     def flush_overdue(self, at_ns: int) -> tuple[StatusText, ...]:
-        """The texts whose rest has not come."""
+        """Return the texts whose next chunk has not come in time."""
         overdue = [sender for sender, partial in self._partial_texts.items() if at_ns - partial.at_ns > CHUNK_WAIT_NS]
         return tuple(self._partial_texts.pop(sender).finish() for sender in overdue)
 

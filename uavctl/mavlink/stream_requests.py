@@ -26,33 +26,33 @@ from uavctl.mavlink.profile import PROFILES
 STREAM_SETTLE_NS = 2 * SECOND_NS  # many vehicles stream by themselves
 RETRY_NS = 2 * SECOND_NS
 MAX_TRIES = 5
-MAX_ORIGIN_TRIES = 30  # once a second: its estimator may take that long to begin
+MAX_ORIGIN_TRIES = 30  # once a second: the vehicle's estimator may take that long to start
 LOCAL_POSITION_NED, ATTITUDE, EXTENDED_SYS_STATE, SYS_STATUS = 32, 30, 245, 1
 RC_CHANNELS = 65
 ATTITUDE_QUATERNION, HIGHRES_IMU, RAW_IMU = 31, 105, 27
 GPS_GLOBAL_ORIGIN = 49
 RATES_HZ = {LOCAL_POSITION_NED: 10.0, ATTITUDE: 10.0, EXTENDED_SYS_STATE: 5.0, SYS_STATUS: 1.0, RC_CHANNELS: 5.0}
-INERTIAL_HZ = 50.0  # of what shows how it turns, and its acceleration
+INERTIAL_HZ = 50.0  # of attitude and acceleration messages
 # Limits of the download. A telemetry radio can carry 50 parameters a second.
 MAX_PARAMETERS, MAX_READ_ROUNDS = 5000, 10
 READS_PER_BATCH, BATCH_NS = 10, SECOND_NS // 5
 LIST_END_NS = SECOND_NS // 2  # without a parameter: the list has ended
 SOURCE_PARAMETER = "EK3_SRC1_POSXY"
-EXTERNAL_SOURCE = 6.0  # of the source: external positions
+EXTERNAL_SOURCE = 6.0  # value of this parameter for external positions
 
 
 class StreamRequests:
-    """Asks for the messages that do not come by themselves, a few times.
+    """Requests missing messages, a few times.
 
     Args:
-        inertial: ask for the vehicle's inertial data, too.
-        channels: ask for the channels of its remote control, too.
+        inertial: also request inertial data.
+        channels: also request the channels of the remote control.
     """
 
     def __init__(self, *, inertial: bool = False, channels: bool = True) -> None:
         self._wants_inertial = inertial
         self._rates_hz = {number: hz for number, hz in RATES_HZ.items() if channels or number != RC_CHANNELS}
-        self._has_inertial = False  # inertial data have come since they were asked for
+        self._has_inertial = False  # inertial data have come since the request
         self._received: set[int] = set()
         self._next_ns: int | None = None
         self._tries = 0
@@ -60,7 +60,7 @@ class StreamRequests:
         self._inertial_tries = 0
 
     def handle_message(self, message: Message) -> None:
-        """Take a message of the vehicle."""
+        """Handle a message of the vehicle."""
         match message:
             case Position(local_ned=True):
                 self._received.add(LOCAL_POSITION_NED)
@@ -70,7 +70,7 @@ class StreamRequests:
                 self._received.add(EXTENDED_SYS_STATE)
             case Battery():
                 self._received.add(SYS_STATUS)
-            case RadioChannels() if self._tries:  # as often as is asked for: it shows a pilot's hand
+            case RadioChannels() if self._tries:  # always requested at our rate: it shows a pilot's stick
                 self._received.add(RC_CHANNELS)
             case Inertial():
                 self._has_inertial = self._inertial_tries > 0
@@ -83,7 +83,7 @@ class StreamRequests:
         self._inertial_next_ns, self._inertial_tries = 0, 0
 
     def due(self, at_ns: int, autopilot: str = "") -> tuple[tuple[int, float], ...]:
-        """Return (message id, rate [1/s]) of what is to be asked for now; call it once a vehicle is heard."""
+        """Return the requests that are due now: (message id, rate [1/s]). Called once a vehicle is heard."""
         rates_hz: dict[int, float] = {}
         if self._next_ns is None:
             self._next_ns = at_ns + STREAM_SETTLE_NS
@@ -102,18 +102,18 @@ class StreamRequests:
 
 
 class ParameterDownload:
-    """Schedule of asking a vehicle that has not been armed yet for all its parameters: the list, then what was lost."""
+    """Download of all parameters before the first arming: the list, then the missing ones."""
 
     def __init__(self) -> None:
         self._missing: set[int] | None = None  # missing indices; None before the number of parameters is known
         self._has_new_value = False  # a parameter has come since the last call
         self._next_ns = 0
         self._list_requests = self._read_rounds = 0
-        self._round_indices: list[int] = []  # indices of this round that are still to be asked for
+        self._round_indices: list[int] = []  # indices of this round that are not requested yet
         self._is_finished = False
 
     def handle_message(self, message: Message) -> None:
-        """Take a message of the vehicle."""
+        """Handle a message of the vehicle."""
         if isinstance(message, ParamValue) and message.index < message.count <= MAX_PARAMETERS:
             if self._missing is None:
                 self._missing = set(range(message.count))
@@ -121,11 +121,11 @@ class ParameterDownload:
             self._has_new_value = True
 
     def due(self, at_ns: int, *, armed: bool) -> tuple[int, ...]:
-        """Return the indices to ask for now, -1 for the whole list; nothing any more once the vehicle was armed."""
+        """Return the indices to request now, -1 for the whole list; none once the vehicle was armed."""
         self._is_finished = self._is_finished or armed or self._missing == set()
         if self._is_finished:
             return ()
-        if self._has_new_value and not self._read_rounds:  # the list is on its way
+        if self._has_new_value and not self._read_rounds:  # the list is being sent
             self._has_new_value, self._next_ns = False, at_ns + LIST_END_NS
         if at_ns < self._next_ns:
             return ()
@@ -141,15 +141,15 @@ class ParameterDownload:
             self._round_indices = [] if self._is_finished else sorted(self._missing, reverse=True)
         indices = self._round_indices[-READS_PER_BATCH:][::-1]
         del self._round_indices[-READS_PER_BATCH:]
-        if not self._round_indices:  # the last answers of a round are waited for
+        if not self._round_indices:  # wait for the last answers of a round
             self._next_ns = at_ns + LIST_END_NS
         return tuple(index for index in indices if index in self._missing)
 
 
 class GlobalOriginSetup:
-    """Schedule of sending a place on the globe to an ArduPilot on external positions, which does not arm without one.
+    """Sends a global origin to an ArduPilot on external positions, which does not arm without one.
 
-    Its source of positions is read first: with GPS a place of ours would be wrong.
+    The parameter of its position source is read first: with GPS our origin would be wrong.
     """
 
     def __init__(self) -> None:
@@ -159,7 +159,7 @@ class GlobalOriginSetup:
         self._tries = 0
 
     def handle_message(self, message: Message) -> None:
-        """Take a message of the vehicle."""
+        """Handle a message of the vehicle."""
         match message:
             case GlobalOrigin():
                 self._is_origin_known = True
@@ -169,7 +169,7 @@ class GlobalOriginSetup:
     def due(self, at_ns: int) -> tuple[bool, bool]:
         """Return whether to request the parameter and the origin now, and whether to send our origin.
 
-        The place is sent from the second time on: by then a vehicle that has an origin has answered with it.
+        The origin is sent from the second time on: by then a vehicle with an origin has answered.
         """
         if self._is_origin_known or at_ns < self._next_ns or self._tries >= MAX_ORIGIN_TRIES:
             return False, False

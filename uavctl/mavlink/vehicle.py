@@ -37,29 +37,25 @@ from uavctl.records import Event, InertialSample, Severity, Vec3, VehicleMotion,
 
 SECOND_VEHICLE = "second-vehicle"
 STALE_INERTIAL = "inertial-not-of-now"  # late, repeated, or frozen
-# The same readings for longer are those of a frozen sensor. Whole thousandths of g repeat, in recorded flights of
-# ArduCopter for 0.7 s at most. Fractions have noise, and never did.
+# Identical readings for longer come from a frozen sensor. Whole thousandths of g repeat for 0.7 s at most in recorded
+# flights of ArduCopter. Fractions have noise and never repeated.
 FROZEN_RAW_US, FROZEN_US = 1_000_000, 100_000
-MIN_INERTIAL_SHARE, MIN_INERTIAL = (
-    0.8,
-    250,
-)  # part of so many inertial data under which it is reported that they are not used
-ALONE_NS = 5_000_000_000  # after that time of silence another vehicle counts as gone
-GONE_NS = 30_000_000_000  # and after that one its place is taken, if it stood on the ground
-BOOTING_NS = 3_000_000_000  # of silence before a heartbeat of booting, for that to be a restart
-MAX_ATTITUDE_AGE_NS = (
-    100_000_000  # an attitude that is older turns no specific force: at 1 rad/s it is 0.1 rad, 1 m/s², off
-)
+# Less than this share of so many inertial data used: it is reported.
+MIN_INERTIAL_SHARE, MIN_INERTIAL = 0.8, 250
+ALONE_NS = 5_000_000_000  # silence after which another vehicle counts as gone
+GONE_NS = 30_000_000_000  # silence after which another vehicle replaces a disarmed one
+BOOTING_NS = 3_000_000_000  # silence before a heartbeat of booting that shows a restart
+MAX_ATTITUDE_AGE_NS = 100_000_000  # at 1 rad/s the attitude is then 0.1 rad off, and the acceleration 1 m/s²
 GRAVITY_MPS2 = 9.80665
-MAX_DELAY_NS = 60_000_000  # later than the quickest: a stream of 50 Hz is 20 ms apart
+MAX_DELAY_NS = 60_000_000  # later than the quickest message: a stream of 50 Hz has 20 ms between messages
 MAX_BACKSTEP_US = 1_000_000  # a stamp that goes back by more is of another clock
 _UNREPORTED_COMMANDS = frozenset({mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAV_CMD_REQUEST_MESSAGE})
-# PX4 stands by only while its pre-flight checks pass, and is uninitialised else: that comes and goes, no restart.
+# PX4 is in standby only while its pre-flight checks pass, else uninitialised. That changes without a restart.
 _NOT_READY_STATES = frozenset({mavlink.MAV_STATE_UNINIT, mavlink.MAV_STATE_BOOT, mavlink.MAV_STATE_CALIBRATING})
 _FAILSAFE_STATES = frozenset({mavlink.MAV_STATE_CRITICAL, mavlink.MAV_STATE_EMERGENCY})
 _NO_AUTOPILOT = int(mavlink.MAV_AUTOPILOT_INVALID)
 _AUTOPILOT1 = int(mavlink.MAV_COMP_ID_AUTOPILOT1)
-# Types of what is no vehicle, whatever autopilot it names: its own, or the one that it is made for.
+# Types of devices that are no vehicle, whatever autopilot they name.
 _DEVICES = frozenset(
     int(getattr(mavlink, f"MAV_TYPE_{name}"))
     for name in (
@@ -70,14 +66,14 @@ _DEVICES = frozenset(
 
 
 def is_vehicle(heartbeat: Heartbeat) -> bool:
-    """Whether a heartbeat is an autopilot's: not that of a ground station, a companion computer, a gimbal, a camera."""
+    """Return whether a heartbeat is an autopilot's, not that of a ground station, companion computer or gimbal."""
     return heartbeat.autopilot != _NO_AUTOPILOT and heartbeat.vehicle_type not in _DEVICES
 
 
 def is_preferred(address: tuple[int, int], other: tuple[int, int] | None) -> bool:
     """Return whether to follow the first of two vehicles instead of the second.
 
-    Of one system it is the component of autopilots; of two systems the one that is followed already.
+    In one system the autopilot component is preferred; of two systems the followed one.
     """
     if other is None:
         return True
@@ -85,27 +81,26 @@ def is_preferred(address: tuple[int, int], other: tuple[int, int] | None) -> boo
 
 
 class SensorStreamMonitor:
-    """Judges the messages of one stream of one sensor by their stamps and arrival.
+    """Checks the messages of one sensor stream by their stamps and arrival.
 
-    A new stamp is a new measurement, as integer readings repeat; the same readings for long are a frozen sensor. The
-    delay counts from the quickest message, at the drift of the sender's clock: clocks need not agree.
+    A new stamp is a new measurement, because integer readings repeat. Identical readings for long come from a frozen
+    sensor. The delay counts from the quickest message and follows the drift of the sender's clock.
     """
 
     def __init__(self) -> None:
         self._clock = ArrivalClock()
-        self._checked_ns = 0  # the last that was judged
-        self._stamp_us = 0  # of that
+        self._checked_ns = 0  # arrival of the last checked message
+        self._stamp_us = 0  # its stamp
         self._values: Vec3 | None = None
-        self._since_us = 0  # stamp of the first of the same readings in a row
+        self._since_us = 0  # stamp of the first of identical readings
 
     def is_current(self, stamp_us: int, values: Vec3, at_ns: int, *, frozen_us: int = 0) -> bool | None:
         """Return whether a message is a current measurement; None for a repeated one.
 
         Args:
-            stamp_us: when it was measured, by the sender's clock.
+            stamp_us: time of measurement by the sender's clock.
             values: the readings.
-            frozen_us: readings that are the same to the last bit for longer are those of a frozen sensor; 0 where noise
-                never repeats.
+            frozen_us: identical readings for longer come from a frozen sensor; 0 if noise never repeats.
         """
         advance_us = stamp_us - self._stamp_us
         if advance_us < -MAX_BACKSTEP_US or advance_us > (at_ns - self._checked_ns) // 1000 + MAX_BACKSTEP_US:
@@ -123,13 +118,13 @@ class SensorStreamMonitor:
 class VehicleMonitor:
     """Follows the first vehicle that is heard; others are counted and ignored.
 
-    A vehicle that has fallen silent on the ground, disarmed, gives way to another.
+    Another vehicle replaces a silent and disarmed one.
 
     Args:
         count_bad: counts heartbeats of other vehicles, by reason.
-        own_address: our system and component id; answers to others' commands are not ours.
-        system: the vehicle's system id; 0 takes any.
-        component: its component id; 0 takes any, and that of autopilots rather than another.
+        own_address: our system and component id; answers to other stations are ignored.
+        system: the vehicle's system id; 0 accepts any.
+        component: its component id; 0 accepts any and prefers that of autopilots.
         channels: use the remote control and fence flags of SYS_STATUS.
     """
 
@@ -155,14 +150,14 @@ class VehicleMonitor:
         self._heard_ns = 0  # any message of it
         self._evidence = ModeReasonEvidence()
         self._is_in_failsafe = False  # by its last heartbeat
-        self._other_vehicle_ns: int | None = None  # when another vehicle was heard last
+        self._other_vehicle_ns: int | None = None  # last message of another vehicle
         self._status: VehicleStatus | None = None
         self._motion = VehicleMotion()
         self._sensor_streams: dict[str, SensorStreamMonitor] = {}  # by kind of message
         self._attitude: tuple[Vec3, int] | None = None  # attitude, and its time of arrival
         self.inertial_used = self.inertial_total = 0  # inertial data: used, and all
         self.boots = 0
-        self.not_ready_count = 0  # times that it ceased to be ready: its streams may be gone
+        self.not_ready_count = 0  # times that it was no longer ready: its streams may have stopped
         self.address: tuple[int, int] | None = None  # system, component
 
     @property
@@ -178,7 +173,7 @@ class VehicleMonitor:
     def handle_message(
         self, message: Message, at_ns: int
     ) -> tuple[VehicleStatus | VehicleMotion | InertialSample | Event | CommandAck | StatusText, ...]:
-        """Take any message; only the vehicle's count."""
+        """Handle any message; only those of the vehicle count."""
         if isinstance(message, Heartbeat) and is_vehicle(message):
             return self._handle_heartbeat(message, at_ns)
         if isinstance(message, ModeCommand):
@@ -210,7 +205,7 @@ class VehicleMonitor:
             case Attitude(angles_rad=angles_rad):
                 kind = "quaternion" if message.quaternion else "angles"
                 status = self._update_boot_clock(kind, message.stamp_us, at_ns) if message.stamp_us else ()
-                # Beside inertial data both are of use; else a vehicle that streams both is believed by one.
+                # Inertial data use both attitude messages. Without them, one of two streams is enough.
                 if message.quaternion and not self._wants_inertial:
                     return status
                 self._update_attitude(message, at_ns)
@@ -301,7 +296,7 @@ class VehicleMonitor:
             self._count_bad(STALE_INERTIAL)
 
     def _make_inertial_sample(self, message: Inertial, at_ns: int) -> tuple[InertialSample, ...]:
-        """Its acceleration by a specific force and its newest attitude; nothing where either is old or unknown."""
+        """Make a sample from a specific force and the newest attitude; nothing if either is old or unknown."""
         if not self._wants_inertial:
             return ()
         kind, frozen_us = ("raw", FROZEN_RAW_US) if message.raw else ("highres", FROZEN_US)
@@ -316,6 +311,7 @@ class VehicleMonitor:
         if force_ned is None:
             return ()
         self.inertial_used += 1
+        # a = R f + g
         north, east, down = force_ned
         return (InertialSample(at_ns=at_ns, accel_mps2=(north, east, down + GRAVITY_MPS2)),)
 
@@ -334,8 +330,10 @@ class VehicleMonitor:
         return status is not None and not status.armed and at_ns - status.at_ns > GONE_NS
 
     def _follow_vehicle(self, address: tuple[int, int], at_ns: int) -> None:
-        """Follow a vehicle; if it is another one than before, forget the old one's state: nothing is armed yet."""
-        if self.address is not None and self.address[0] == address[0]:  # it was a device of this one
+        """Follow a vehicle; forget the state of another one before: nothing is armed yet."""
+        if (
+            self.address is not None and self.address[0] == address[0]
+        ):  # the followed component was another device of it
             self._sensor_streams, self._attitude, self._battery_v, self._landed = {}, None, None, None
             self._is_ready = False
             self._boot_clock.reset()
