@@ -36,13 +36,13 @@ _LONGEST_PATH = 107  # bytes that the kernel takes for the path of a socket
 
 
 class ControlRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
-    """A question or an order."""
+    """Status request or order."""
 
     ask: Literal["goto", "hold", "resume", "land", "engage", "status"]
     position_m: Vec3 | None = None  # local NED; with goto only
 
     def find_problem(self) -> str | None:
-        """Error in the request by itself; None if there is none."""
+        """Return the error in the request itself; None without one."""
         if (self.ask == "goto") != (self.position_m is not None):
             return "goto needs a position_m" if self.position_m is None else f"{self.ask} takes no position_m"
         if self.position_m is not None and not all(map(math.isfinite, self.position_m)):
@@ -51,7 +51,7 @@ class ControlRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
 
 
 class Reply(msgspec.Struct, frozen=True, kw_only=True):
-    """Reply to a request: what was decided on an order, or the flight as it is."""
+    """Reply to a request: the decision on an order, or the state of the flight."""
 
     ok: bool
     text: str
@@ -59,13 +59,13 @@ class Reply(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def make_daemon_name(config: Config) -> str:
-    """Name of the daemon that flies a configuration: that of the configuration, and the vehicle's URL."""
+    """Make the name of a daemon from the names of its configuration and the vehicle's URL."""
     url = config.daemon.vehicle.replace("://", "-")
     return re.sub(r"[^A-Za-z0-9.]+", "-", f"{config.name}-{url}").strip("-.")[:_LONGEST_NAME]
 
 
 def find_control_folder(chosen: Path | None, environ: Mapping[str, str] = os.environ) -> Path:
-    """Folder of the sockets: as chosen, else $UAVCTL_CONTROL, else the user's own runtime folder.
+    """Find the folder of the sockets: as chosen, else $UAVCTL_CONTROL, else the user's runtime folder.
 
     Raises:
         UsageError: the user has none.
@@ -120,7 +120,7 @@ class ControlServer:
     """Serves one listening socket; its `after_tick` is for the daemon.
 
     Args:
-        config: for the limits that a place has to keep.
+        config: for the limits of a position.
     """
 
     def __init__(
@@ -136,7 +136,7 @@ class ControlServer:
         self._pending: list[tuple[_Client, Command]] = []  # for the next tick's answers
 
     def after_tick(self, ticked: Ticked, lateness_ns: int) -> None:
-        """Answer the orders that the tick took, then take what has come; bounded work, no waiting."""
+        """Answer the orders of the tick, then read new requests; bounded work, no waiting."""
         del lateness_ns
         self._send_answers(list(ticked.answers))
         self._accept(ticked.decision.at_ns)
@@ -224,7 +224,7 @@ class ControlServer:
             self._reply(client, Reply(ok=False, text="too many orders at once; try again"))
 
     def _check_position(self, request: ControlRequest) -> str | None:
-        """Return in which coordinates a place is outside the limits; None if it is inside, or there is none."""
+        """Return the coordinates of a position outside the limits; None if it is inside, or there is none."""
         if request.position_m is None:
             return None
         config = self._config
@@ -248,10 +248,10 @@ class ControlServer:
 
 @contextmanager
 def open_listener(folder: Path, name: str) -> Iterator[socket.socket]:
-    """The listening socket of a daemon, gone at the end.
+    """Open the listening socket of a daemon; remove it at the end.
 
     Args:
-        folder: where it is; made if there is none.
+        folder: its folder; made if missing.
 
     Raises:
         UsageError: the folder is not ours alone, or the path too long.
@@ -268,7 +268,7 @@ def open_listener(folder: Path, name: str) -> Iterator[socket.socket]:
 
 
 def _prepare_folder(folder: Path) -> None:
-    """See to a folder that only this user can enter."""
+    """Make a folder that only this user can enter, or check it."""
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         answer = folder.lstat()
@@ -281,7 +281,7 @@ def _prepare_folder(folder: Path) -> None:
 
 
 def _listen(path: Path, name: str) -> socket.socket:
-    """Bind and listen; a socket that a dead daemon left is taken over."""
+    """Bind and listen; replace the socket of a dead daemon."""
     if path.is_socket():
         try:
             is_listening = _is_listening(path)

@@ -45,13 +45,13 @@ def fly(
 
     Args:
         loop: the loop, which records all its inputs and outputs.
-        stop_requested: asked once a tick; the first True begins the hand-over.
+        stop_requested: called once a tick; the first True begins the hand-over.
         duration_s: the hand-over begins by itself after this time [s]; None flies on.
-        stop_limit_s: the hand-over is cut off after this time [s], unless the vehicle is in the air by the positions
-            that are relayed to it; 0 ends without one.
+        stop_limit_s: the hand-over ends after this time [s] at the latest, unless the vehicle is in the air on relayed
+            positions; 0 ends without one.
         after_tick: called in this order after each tick.
         on_events: called with the events for people from a datagram or a lost connection; must neither wait nor raise.
-        wait_for: sleeps until a deadline or the first arrival; gives the names of connections to read.
+        wait_for: sleeps until a deadline or the first arrival; returns the names of connections to read.
         now: the clock [ns].
 
     Returns:
@@ -125,8 +125,8 @@ class _Reader:
         on_events: Callable[[tuple[Event, ...]], None],
     ) -> None:
         self._loop, self._connections, self._now, self._on_events = loop, connections, now, on_events
-        self._read_ns = now()  # when the last read ended
-        self._complete_read_ns: int | None = None  # when the last read began after which nothing was left
+        self._read_ns = now()  # end of the last read
+        self._complete_read_ns: int | None = None  # start of the last read that left nothing
         self._lost = dict.fromkeys(connections, 0)
 
     @property
@@ -150,7 +150,7 @@ class _Reader:
         return has_received
 
     def read_backlog(self) -> None:
-        """Read what has come until now, before something goes out: a backlog ends with the vehicle's newest state."""
+        """Read everything before a setpoint: a backlog ends with the vehicle's newest state."""
         for _ in range(MAX_READ_ROUNDS):
             start_ns = self._now()
             self.read(self._connections, read_all=True)

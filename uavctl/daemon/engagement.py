@@ -17,12 +17,12 @@ from uavctl.smpc.conditioned.planner import AnyDesign
 from uavctl.smpc.plant import AXES
 
 DOWN = 2
-LANDING_S = 10.0  # after braking: for asking the vehicle to land
+LANDING_S = 10.0  # after braking: for the landing request
 TickFollower = Callable[[ControlLoop, Ticked], None]
 
 
 def make_goto_keys(place_m: Sequence[float]) -> dict[str, object]:
-    """Return configuration keys that make a place in local NED [m] the mission, checked and recorded as one.
+    """Return configuration keys that make a position in local NED [m] the mission, checked and recorded like one.
 
     Raises:
         UsageError: it is not three finite numbers.
@@ -41,14 +41,14 @@ class Engagement:
     """Order of the command line (take-off, position to go to), and its progress.
 
     Attributes:
-        goal: the place of `--goto`, local NED [m].
-        arrived: whether it has been reached.
-        engaged: whether the controller has been in charge.
+        goal: the position of `--goto`, local NED [m].
+        has_arrived: whether the vehicle has reached it.
+        has_engaged: whether the controller has been in control.
 
     Args:
         config: the configuration, `--goto` in it.
         take_off_m: height of the climb above the ground [m]; None leaves arming and modes to the pilot.
-        goto: whether the mission is the place of `--goto`.
+        goto: whether the mission is the position of `--goto`.
         follower: called after each tick; it may give orders.
     """
 
@@ -65,7 +65,7 @@ class Engagement:
 
     @property
     def takes_off(self) -> bool:
-        """Whether the vehicle is to be armed."""
+        """Whether the flight arms the vehicle and takes off."""
         return self._take_off_m is not None
 
     def begin(self, loop: ControlLoop) -> None:
@@ -94,7 +94,7 @@ class Engagement:
 
 
 def check_places(config: Config, design: AnyDesign, take_off_m: float | None, goal: Vec3 | None) -> None:
-    """Refuse places outside the room, before anything is made for the flight, or sent.
+    """Refuse positions outside the room, before the flight is prepared.
 
     Raises:
         UsageError: the plant may not rest at the goal, or the climb would end above the room.
@@ -118,6 +118,6 @@ def check_places(config: Config, design: AnyDesign, take_off_m: float | None, go
 
 
 def compute_stop_limit_s(config: Config, *, takes_off: bool) -> float:
-    """Return how long a hand-over may take [s]; it ends on the ground if we took off, or land by our positions."""
+    """Return the time limit of a hand-over [s]; it includes the landing of an ordered or relayed flight."""
     landings = 1 + LAND_PERIODS if takes_off else int(config.relay.enabled)
     return config.fallback.brake_s + LANDING_S + landings * config.hand_over.land_s

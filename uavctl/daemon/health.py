@@ -19,11 +19,11 @@ LOSS_PERIODS = 10  # over which losses are counted
 
 
 class RecorderHealth(msgspec.Struct, frozen=True, kw_only=True):
-    """Whether the recording is whole so far."""
+    """State of the recording."""
 
     ok: bool
-    dropped: int  # records that are not in it
-    reason: str  # why it is not, or that the disk gets low; empty if all is well
+    dropped: int  # missing records
+    reason: str  # reason of a problem, or of a low disk; empty if all is well
     path: str
     unwritten_s: float  # since the last completed write, while something waits for the disk
 
@@ -96,7 +96,7 @@ class MonitoredFlight(Protocol):
 
     @property
     def inertial(self) -> tuple[int, int] | None:
-        """Inertial data of the vehicle that are used, and all that came; None where none are used."""
+        """Numbers of inertial data: used, and all; None if they are not used."""
         ...
 
     @property
@@ -130,7 +130,7 @@ class HealthMonitor:
         self._ticked: Ticked | None = None  # the last tick
         self._rate_hz = config.source.rate_hz or 1.0 / config.plant.dt_s
         self._position_count = 0  # positions, since the start
-        self._count_history: deque[tuple[int, int]] = deque(maxlen=LOSS_PERIODS + 1)  # at_ns, came; once a period
+        self._count_history: deque[tuple[int, int]] = deque(maxlen=LOSS_PERIODS + 1)  # at_ns, count; once a period
         self._loss: float | None = None
         self._start_ns: int | None = None
         self._now_ns = 0
@@ -145,7 +145,7 @@ class HealthMonitor:
         self._relay_rate = (0, 0.0)  # positions at the last second, and their rate in it
 
     def after_tick(self, ticked: Ticked, lateness_ns: int) -> None:
-        """The control loop has run a tick."""
+        """Update after a tick of the control loop."""
         self._ticked = ticked
         at_ns = ticked.decision.at_ns
         if self._start_ns is None:
@@ -189,7 +189,7 @@ class HealthMonitor:
         self._write_line("recording is well again" if state == "well" else f"warning: recording {state}: {reason}")
 
     def make_health(self) -> Health:
-        """The flight as it is now."""
+        """Make the present state of the flight."""
         flight, recorder, ticked = self._flight, self._recorder(), self._ticked
         decision, estimate, vehicle = (
             (None, None, None) if ticked is None else (ticked.decision, ticked.estimate, ticked.vehicle)
@@ -237,7 +237,7 @@ class HealthMonitor:
 
 
 def format_health(health: Health) -> str:
-    """One line for a log: the same fields in the same order, `-` for what is not known."""
+    """Format one line for a log: always the same fields, `-` for unknown ones."""
     vehicle, relay = health.vehicle, health.relay
     battery = None if vehicle is None else vehicle.battery_v
     mode = "-" if vehicle is None else f"{vehicle.mode} {'armed' if vehicle.armed else 'disarmed'}"

@@ -1,12 +1,12 @@
-"""One daemon a vehicle: a lock on what the connection's URL means.
+"""Lock of a vehicle: one daemon for each vehicle.
 
-The lock is the kernel's (flock); it goes when its holder dies, however that happens. It is one among the processes of
-one user: its files are where no other user can touch them, so that none can hold the vehicle, or rewrite the word that
-it was left in flight. They are in each of the user's runtime folders, since not every process of the user finds the
-same one. Two URLs that mean the same (a name and its address, a serial port and a link to it) are one vehicle. That
-two different connections lead to the same vehicle cannot be seen before they are opened.
+1. Reduce the URL to an identity: a name and its address, or a serial port and a link to it, are one vehicle.
+2. Lock a file of this identity in each runtime folder of the user (flock). The kernel releases it when the holder dies.
+3. Write into the file whether the vehicle would be left in flight, for the next holder.
 
-Its file also tells the next holder that this one has ended, or was killed, and left the vehicle in flight.
+Other users cannot reach the files. So they can neither hold the vehicle nor change that note. Not every process of a
+user finds the same runtime folder, so there is a file in each. Two different connections to the same vehicle cannot be
+recognised before they are opened.
 """
 
 from __future__ import annotations
@@ -27,23 +27,23 @@ from uavctl.daemon.runtime_folder import find_runtime_folders
 from uavctl.errors import ConnectionSpecError, VehicleTakenError
 
 _LONGEST = 500  # bytes of a lock file that are read
-_TRIES = 10  # to lock a file that its last holder is just removing
+_TRIES = 10  # attempts while the last holder removes the file
 _FLIGHT_LINE = "flown at"  # the second line, with the time since the machine's start [ns]
 LONGEST_FLIGHT_NS = 3600 * 10**9  # a vehicle that was left longer ago than a battery lasts has landed
 
 
 def identify_connection(url: str) -> str:
-    """Return the identity of what a connection URL leads to, in one form for all URLs that mean the same.
+    """Return the identity behind a connection URL; the same for all URLs with the same meaning.
 
     Args:
-        url: as `uavctl.io.transport.open_connection` takes it.
+        url: of a connection, see `uavctl.io.transport.open_connection`.
 
     Raises:
         ConnectionSpecError: the host is unknown, or the URL cannot be understood.
     """
     scheme, _, rest = url.partition("://")
     if scheme == "serial":
-        return f"serial {os.path.realpath(rest.rpartition(':')[0])}"  # the rate does not make another device
+        return f"serial {os.path.realpath(rest.rpartition(':')[0])}"  # the rate is not part of the identity
     try:
         parts = urlsplit(url)
         status = socket.getaddrinfo(parts.hostname, parts.port)[0][4]
@@ -54,7 +54,7 @@ def identify_connection(url: str) -> str:
 
 
 def _normalise_host(text: str, *, is_local: bool) -> str:
-    """One form of an address: the loopback of both families is the same machine, and so is "any" as a destination."""
+    """Normalise an address: loopback of both families, and "any" as a destination, are the same machine."""
     address = ipaddress.ip_address(text.partition("%")[0])
     if isinstance(address, ipaddress.IPv6Address):
         address = address.ipv4_mapped or address
@@ -64,7 +64,7 @@ def _normalise_host(text: str, *, is_local: bool) -> str:
 
 
 class VehicleLock:
-    """A vehicle, from its lock's taking to its letting go.
+    """Lock of a vehicle that this process holds.
 
     Args:
         descriptors: of the locked files, which have the same content; the newest older content counts.
@@ -83,16 +83,16 @@ class VehicleLock:
 
     @property
     def left_flight_ns(self) -> int | None:
-        """Start of the flight that would now be left, time since the machine's start [ns]; None if none would."""
+        """Start of the flight that would be left now [ns since the machine's start]; None without one."""
         return self._left_flight_ns
 
     @property
     def is_left_in_flight(self) -> bool:
-        """Whether the vehicle would now be left in flight; before anything is noted, whether it was found so."""
+        """Whether the vehicle would be left in flight now; before the first update, as the last holder left it."""
         return self._left_flight_ns is not None
 
     def update(self, is_left_in_flight: bool | None) -> None:
-        """Write down whether the vehicle would be left in flight; None changes nothing."""
+        """Store whether the vehicle would be left in flight; None changes nothing."""
         if is_left_in_flight is None or is_left_in_flight == self.is_left_in_flight:
             return
         self._left_flight_ns = self._now() if is_left_in_flight else None
@@ -108,15 +108,15 @@ class VehicleLock:
 
 
 def _parse_left_flight_ns(text: bytes, now_ns: int) -> int | None:
-    """Return when the file's last holder began a flight that it then left [ns]; None if there is none to find."""
+    """Parse the start of the flight that the last holder left [ns]; None without one."""
     _, _, flight_ns = text.decode(errors="replace").partition(f"\n{_FLIGHT_LINE} ")
     at_ns = int(flight_ns.strip()) if flight_ns.strip().isdecimal() else None
-    # A time to come is one of before the machine's last start.
+    # A time in the future is from before the machine's last start.
     return at_ns if at_ns is not None and 0 <= now_ns - at_ns <= LONGEST_FLIGHT_NS else None
 
 
 def find_lock_paths(url: str, folder: Path | None = None) -> tuple[Path, ...]:
-    """Files of the lock of the vehicle behind a URL; arguments and errors are those of `lock_vehicle`."""
+    """Find the lock files of the vehicle behind a URL; arguments and errors as in `lock_vehicle`."""
     name = f"uavctl-{hashlib.sha256(identify_connection(url).encode()).hexdigest()[:16]}.lock"
     return tuple(descriptor / name for descriptor in (find_runtime_folders() if folder is None else (folder,)))
 
@@ -126,7 +126,7 @@ def lock_vehicle(url: str, folder: Path | None = None) -> Iterator[VehicleLock]:
     """Hold the lock of the vehicle behind a URL; its files stay if the vehicle is left in flight.
 
     Args:
-        folder: where the lock file is; by default there is one in each of the user's runtime folders.
+        folder: folder of the lock file; by default there is one in each of the user's runtime folders.
 
     Raises:
         VehicleTakenError: another process holds it, or the lock cannot be made; names it and the remedy.
@@ -160,7 +160,7 @@ def _make_vehicle_lock(descriptors: Sequence[int], url: str, path: Path) -> Vehi
 
 
 def _lock_file(path: Path, url: str) -> int:
-    """Descriptor of the locked file."""
+    """Lock a file and return its descriptor."""
     for _ in range(_TRIES):
         try:
             descriptor = _open_lock_file(path)
@@ -199,7 +199,7 @@ def _open_lock_file(path: Path) -> int:
 
 
 def _is_same_file(path: Path, descriptor: int) -> bool:
-    """Return whether the name still means the file that was locked; its last holder may have removed it."""
+    """Return whether the path is still the locked file; its last holder may have removed it."""
     try:
         return os.path.samestat(os.stat(path), os.fstat(descriptor))  # noqa: PTH116 (stat of a path beside one of an fd)
     except FileNotFoundError:

@@ -13,16 +13,16 @@ from contextlib import suppress
 from uavctl.errors import UsageError
 from uavctl.records import Ticked
 
-_WATCHDOG_SIGNALS = 4  # signs of life in one watchdog time
-_LONGEST = 2000  # characters of a status
+_WATCHDOG_SIGNALS = 4  # watchdog signals in one watchdog time
+_LONGEST = 2000  # characters of a status text
 
 
 class Notifier:
-    """Tells the service manager, if there is one; never blocks, never raises once it is made.
+    """Notifies the service manager, if there is one; never blocks, and never raises after its creation.
 
     Args:
         environ: the environment: NOTIFY_SOCKET, WATCHDOG_USEC, WATCHDOG_PID as systemd sets them.
-        pid: of this process; a watchdog that is meant for another one is not fed.
+        pid: of this process; the watchdog of another process gets no signals.
 
     Raises:
         UsageError: one of the variables cannot be understood.
@@ -41,7 +41,7 @@ class Notifier:
         self._signalled_ns: int | None = None
 
     def after_tick(self, ticked: Ticked, lateness_ns: int) -> None:
-        """The control loop has run a tick: ready with the first one, then signs of life."""
+        """Send `ready` after the first tick, then watchdog signals."""
         del lateness_ns
         at_ns = ticked.decision.at_ns
         if self._signalled_ns is None:
@@ -52,11 +52,11 @@ class Notifier:
         self._send("WATCHDOG=1")
 
     def send_status(self, text: str) -> None:
-        """One line for `systemctl status`."""
+        """Send a line for `systemctl status`."""
         self._send("STATUS=" + text.replace("\n", " ")[:_LONGEST])
 
     def close(self) -> None:
-        """Say that the daemon ends, which no watchdog has to see."""
+        """Send that the daemon stops; then the watchdog needs no signals."""
         self._send("STOPPING=1")
         if self._socket is not None:
             self._socket.close()
@@ -64,12 +64,12 @@ class Notifier:
 
     def _send(self, line: str) -> None:
         if self._socket is not None:
-            with suppress(OSError):  # full or gone: the manager's own watchdog draws the conclusion
+            with suppress(OSError):  # full or gone: the manager's watchdog reacts
                 self._socket.sendto(line.encode(), self._address)
 
 
 def _read_watchdog_ns(environ: Mapping[str, str], pid: int) -> int | None:
-    """Time within which the manager wants a sign of life [ns]; None if it wants none of this process."""
+    """Read the watchdog time of the service manager [ns]; None if this process has no watchdog."""
     usec, owner = environ.get("WATCHDOG_USEC"), environ.get("WATCHDOG_PID")
     if usec is None or (owner is not None and owner != str(pid)):
         return None

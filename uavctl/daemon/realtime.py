@@ -29,10 +29,10 @@ class RealtimeSetting:
 
 
 class GarbageCollector:
-    """Collects garbage once a second, right after a tick; what was there at the start is frozen and never walked."""
+    """Collects garbage once a second, right after a tick; objects of the start are frozen and never visited."""
 
     def after_tick(self, ticked: Ticked, lateness_ns: int) -> None:
-        """Collect if it is time to."""
+        """Collect garbage once a second."""
         del lateness_ns
         at_ns = ticked.decision.at_ns
         if self._collected_ns is None:
@@ -59,10 +59,10 @@ def control_garbage_collection() -> Iterator[GarbageCollector]:
 
 @contextmanager
 def enable_realtime(priority: int = PRIORITY) -> Iterator[tuple[RealtimeSetting, ...]]:
-    """Make this thread, and the threads and memory that come later, real-time as far as permitted; undone at the end.
+    """Make this thread real-time, and lock memory, as far as permitted; undone at the end.
 
-    Threads that it begins inherit the class: the recorder's holds the interpreter now and then, and must not lose the
-    processor to another program while the control loop waits for it.
+    Later threads inherit the scheduling class. The recorder's thread sometimes holds the interpreter, and must not lose
+    the processor to another program while the control loop waits for it.
     """
     before = os.sched_getscheduler(0), os.sched_getparam(0)
     scheduling = _set_scheduler(priority)
@@ -90,7 +90,7 @@ def _set_scheduler(priority: int) -> RealtimeSetting:
 
 
 def _lock_memory() -> RealtimeSetting:
-    """Keep every page that was touched in memory. Only without a limit: with one, a later allocation would fail."""
+    """Lock every used page in memory. Only without a limit: with one, a later allocation would fail."""
     _, hard = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     if hard != resource.RLIM_INFINITY and not _may_lock_memory():
         return RealtimeSetting(

@@ -19,30 +19,30 @@ NOT_LISTED = "not-listed"
 TOO_MANY = "too-many"
 TOO_MUCH = "too-much"
 MAX_SENDERS = 64  # strangers with a bucket of their own; a new one replaces the one with the oldest message
-MAX_TRUSTED = 16  # senders of what the flight needs, beside the vehicle
-MAX_KNOWN = 1024  # addresses whose verdict is kept
-SILENCE_NS = 5_000_000_000  # a sender that has not been heard for so long makes room for another
-MAGIC = (0xFD, 0xFE)  # the first byte of a frame of MAVLink 2, and 1
-SHORTEST_FRAME, MAX_TRIES = 8, 64  # bytes; tries after which a datagram is given up (`uavctl.mavlink.framing`)
+MAX_TRUSTED = 16  # trusted senders beside the vehicle
+MAX_KNOWN = 1024  # cached verdicts on addresses
+SILENCE_NS = 5_000_000_000  # another sender may replace one after this silence
+MAGIC = (0xFD, 0xFE)  # first byte of a frame of MAVLink 2, and of MAVLink 1
+SHORTEST_FRAME, MAX_TRIES = 8, 64  # bytes; failures after which a datagram is dropped (`uavctl.mavlink.framing`)
 _HEARTBEAT = re.compile(rb"\xfd.{6}\0\0\0|\xfe.{4}\0", re.DOTALL)
 _HEARTBEATS = 8  # in a backlog of the vehicle; some may only look like one
 
 
 @dataclass(frozen=True)
 class AdmissionRules:
-    """Rules for what a UDP connection lets in."""
+    """Admission rules of a UDP connection."""
 
-    allow: tuple[str, ...] = ()  # addresses and networks; none lets anybody in
+    allow: tuple[str, ...] = ()  # addresses and networks; empty allows all
     max_per_s: float = 2000.0  # datagrams a second of one sender
     max_frames_per_s: float = 800.0  # frames a second of one sender
     max_bytes_per_s: float = 200_000.0  # bytes a second of one sender
 
 
 class AllowList:
-    """Addresses that are listened to.
+    """Allowed addresses.
 
     Args:
-        allow: addresses and networks, of IP version 4 or 6; none lets anybody in.
+        allow: addresses and networks, of IP version 4 or 6; empty allows all.
     """
 
     def __init__(self, allow: Sequence[str]) -> None:
@@ -70,22 +70,21 @@ class AllowList:
 def count_frames(data: bytes) -> int:
     """Return the largest number of checksums or hashes that a datagram can cause.
 
-    Each frame begins at one of the magic bytes; those that fit are not shorter than a frame, and the others are given
-    up.
+    Each frame begins at a magic byte. Valid frames have a smallest length; after some failures the rest is dropped.
     """
     return max(1, min(data.count(MAGIC[0]) + data.count(MAGIC[1]), len(data) // SHORTEST_FRAME + MAX_TRIES + 1))
 
 
 @dataclass(frozen=True)
 class RateLimit:
-    """Amount that a sender may send: datagrams, frames and bytes."""
+    """Rate limit of a sender: datagrams, frames and bytes."""
 
     per_s: tuple[float, float, float]  # of each, a second
     burst: tuple[float, float, float]  # of each, at once
 
     @staticmethod
     def from_rules(rules: AdmissionRules, times: float, burst: tuple[float, float, float]) -> RateLimit:
-        """Return `times` times what the rules give one sender."""
+        """Return the limit of one sender by the rules, multiplied by `times`."""
         return RateLimit(_scale(times, (rules.max_per_s, rules.max_frames_per_s, rules.max_bytes_per_s)), burst)
 
 
@@ -106,7 +105,7 @@ def _scale(factor: float, amounts: tuple[float, float, float]) -> tuple[float, f
 
 
 class _TokenBucket:
-    """Budget of what a sender may still send now."""
+    """Token bucket: what a sender may still send now."""
 
     __slots__ = ("_at_ns", "_limit", "bytes", "datagrams", "frames")
 
@@ -115,7 +114,7 @@ class _TokenBucket:
         self.datagrams, self.frames, self.bytes = limit.burst
 
     def refill(self, now_ns: int) -> None:
-        """Earn what the time since the last call gives."""
+        """Add the tokens for the time since the last call."""
         seconds, self._at_ns = (now_ns - self._at_ns) * 1e-9, now_ns
         per_s, burst = self._limit.per_s, self._limit.burst
         self.datagrams = min(burst[0], self.datagrams + seconds * per_s[0])
@@ -132,7 +131,7 @@ class _TokenBucket:
         """Return why a datagram does not fit; None if it does.
 
         Args:
-            reserve: share of the burst that has to be left afterwards.
+            reserve: share of the burst that must be left.
         """
         burst = self._limit.burst
         if self.datagrams - 1.0 < reserve * burst[0]:
@@ -141,14 +140,14 @@ class _TokenBucket:
         return TOO_MUCH if is_short else None
 
     def consume(self, frames: int, size: int) -> None:
-        """Take a datagram."""
+        """Remove the tokens of a datagram."""
         self.datagrams -= 1.0
         self.frames -= frames
         self.bytes -= size
 
 
 class _Sender:
-    """One sender's budget, and what it may send before it has sent much."""
+    """Buckets of one sender; `fair_bucket` is empty once it has sent much."""
 
     __slots__ = ("bucket", "fair_bucket")
 
@@ -177,7 +176,7 @@ class _Sender:
 
 
 class RateLimiter:
-    """Keep each sender from taking the time that the others and the control loop need.
+    """Limits each sender, so that the others and the control loop have their time.
 
     The vehicle has a bucket of its own. Trusted senders have one each and a shared one, and so have strangers. Senders
     that sent least come first, and only they can use the last half of a shared bucket. So a new sender is heard beside
@@ -185,7 +184,7 @@ class RateLimiter:
 
     Args:
         rules: datagrams, frames and bytes a second of one sender (address and port).
-        refused: counter that refusals are added to, by reason.
+        refused: counter of refusals by reason.
     """
 
     def __init__(self, rules: AdmissionRules, refused: Counter[str]) -> None:
@@ -203,13 +202,13 @@ class RateLimiter:
         self._reset_strangers(FIRST_BURST)
 
     def _reset_strangers(self, burst: tuple[float, float, float]) -> None:
-        """Give unknown senders budgets with this burst, and twice that together."""
+        """Give unknown senders buckets with this burst, and a shared one with twice that."""
         self._strangers.clear()
         self._stranger_limit = RateLimit.from_rules(self._rules, 1.0, burst)
         self._stranger_bucket = _TokenBucket(RateLimit.from_rules(self._rules, 1.0, _scale(2.0, burst)), 0)
 
     def _limit_strangers(self) -> None:
-        """Accept little from strangers from now on, if this is the first sender that is known."""
+        """Limit strangers from now on, if this is the first known sender."""
         if self._vehicle is None and not self._trusted_senders:
             self._reset_strangers(STRANGER_BURST)
 
@@ -220,7 +219,7 @@ class RateLimiter:
             self._vehicle = sender, _Sender(self._vehicle_limit, now_ns)
 
     def trust_sender(self, sender: Address, now_ns: int) -> None:
-        """Note that the flight needs a sender; the one noted longest ago makes room."""
+        """Trust a sender; it replaces the one that was trusted longest ago."""
         self._limit_strangers()
         sender_state = self._trusted_senders.pop(sender, None) or _Sender(self._trusted_limit, now_ns)
         if len(self._trusted_senders) >= MAX_TRUSTED:
@@ -228,10 +227,10 @@ class RateLimiter:
         self._trusted_senders[sender] = sender_state
 
     def admit(self, senders: Sequence[Address], data: Sequence[bytes], now_ns: int) -> list[bool]:
-        """Return which datagrams of a batch to hand on: of each sender the newest ones that its budget pays.
+        """Return which datagrams of a batch to pass on: of each sender the newest ones within its limit.
 
         Args:
-            senders: of the datagrams, in the order in which they came.
+            senders: of the datagrams, in order of arrival.
         """
         admitted = [False] * len(data)
         queues: dict[Address, list[int]] = {}
@@ -273,7 +272,7 @@ class RateLimiter:
         data: Sequence[bytes],
         admitted: list[bool],
     ) -> None:
-        """Take the newest datagram of each sender in turn, as long as its budget and the joint one pay."""
+        """Admit the newest datagram of each sender in turn, within its bucket and the shared one."""
         waiting = [(sender_state, reversed(indices)) for sender_state, indices in group]
         while waiting:
             remaining = []
@@ -291,7 +290,7 @@ class RateLimiter:
 
     @staticmethod
     def _put_heartbeats_last(indices: Sequence[int], data: Sequence[bytes]) -> list[int]:
-        """The newest datagrams that may hold the vehicle's heartbeat behind all others, so that they count first."""
+        """Move the newest datagrams with a possible heartbeat to the end, so that they are admitted first."""
         heartbeats: list[int] = []
         for index in reversed(indices):
             if len(heartbeats) < _HEARTBEATS and _HEARTBEAT.search(data[index]):

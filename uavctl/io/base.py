@@ -12,11 +12,11 @@ from uavctl.errors import ConnectionSpecError
 from uavctl.io.admission import Address
 
 MAX_READS = 256  # datagrams of one call, so that a flood cannot hold the loop
-BACKLOG_READS = 16_384  # of a call that is to read everything: more than any buffer of the system's holds
+BACKLOG_READS = 16_384  # of a call with `read_all`: more than any system buffer holds
 
 
 class Connection(Protocol):
-    """Connection as the daemon needs it."""
+    """Interface of a connection for the daemon."""
 
     @property
     def url(self) -> str:
@@ -25,32 +25,32 @@ class Connection(Protocol):
 
     @property
     def closed(self) -> bool:
-        """Whether nothing will come any more."""
+        """Whether the connection has ended."""
         ...
 
     @property
     def send_errors(self) -> int:
-        """Sends that failed."""
+        """Number of failed sends."""
         ...
 
     @property
     def receive_errors(self) -> int:
-        """Reads that failed."""
+        """Number of failed reads."""
         ...
 
     @property
     def refused(self) -> Counter[str]:
-        """Counts of what came and was not handed on, by reason."""
+        """Counts of data that were not passed on, by reason."""
         ...
 
     @property
     def has_unread(self) -> bool:
-        """Whether the last `receive` has left something of the vehicle's behind that had come before it."""
+        """Whether the last `receive` has left older data of the vehicle unread."""
         ...
 
     @property
     def has_known_sender(self) -> bool:
-        """Whether the last `receive` had something of a sender that the flight needs; True while none is known."""
+        """Whether the last `receive` had data of a trusted sender; True while none is known."""
         ...
 
     def fileno(self) -> int:
@@ -62,19 +62,19 @@ class Connection(Protocol):
         ...
 
     def count_lost(self) -> int:
-        """Return how much of the vehicle's data the system dropped, for want of room, before it could be read."""
+        """Return the count of the vehicle's data that the system dropped, because its buffer was full."""
         ...
 
     def receive(self, *, read_all: bool = False) -> list[tuple[bytes, int]]:
-        """Return what has arrived: (data, monotonic time of reading [ns]); empty if nothing has.
+        """Return the arrivals: (data, monotonic time of reading [ns]).
 
         Args:
-            read_all: also a long backlog of the vehicle's.
+            read_all: also read a long backlog of the vehicle.
         """
         ...
 
     def select_peer(self, index: int) -> None:
-        """Send to the sender of the `index`-th datagram of the last `receive`, where a connection has several peers."""
+        """Send to the sender of the `index`-th datagram of the last `receive` from now on, if there are several."""
         ...
 
     def trust_sender(self, index: int) -> None:
@@ -150,11 +150,11 @@ class BaseConnection(ABC):
 
     @abstractmethod
     def _read(self) -> bytes | None:
-        """Read once; None if what came is not to be handed on. BlockingIOError if nothing is there."""
+        """Read once; None if the data are not passed on. BlockingIOError without data."""
 
 
 class SocketConnection(BaseConnection):
-    """A connection on a socket."""
+    """Connection on a socket."""
 
     def __init__(self, url: str, family: socket.AddressFamily, kind: socket.SocketKind, now: Callable[[], int]) -> None:
         super().__init__(url, now)

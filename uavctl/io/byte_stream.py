@@ -20,24 +20,24 @@ from uavctl.mavlink.connection import CONNECTION_SILENT, HUNG_UP
 CONNECT_TIMEOUT_S = 5.0
 RETRY_NS = 1_000_000_000  # from the end of a connection, or of an attempt, to the next attempt
 CHUNK_BYTES = 4096
-MAX_CHUNKS = 4  # of one call, so that a flood cannot hold the loop; what waits is read in the next one
-BACKLOG_CHUNKS = 128  # of a call that is to read everything; the other side waits, and loses nothing
+MAX_CHUNKS = 4  # of one call, so that a flood cannot hold the loop; the next call reads the rest
+BACKLOG_CHUNKS = 128  # of a call with `read_all`; the other side waits and loses nothing
 PORT_BYTES = 4095  # capacity of a Linux port's buffer; a serial line does not wait
 _DROP_UNSENT = struct.pack("ii", 1, 0)  # of SO_LINGER: closed at once, by a reset
 _PENDING_LIMIT = 4096  # bytes that wait for a stream that does not drain
 
 
 class _SendBuffer:
-    """Bytes of whole frames that a stream has not taken yet; a frame is never cut by dropping."""
+    """Buffer of unsent bytes; it drops only whole frames."""
 
     def __init__(self) -> None:
         self._buffer = b""
 
     def push(self, data: bytes, write: Callable[[bytes], int]) -> bool:
-        """Write what waits, then the data; False if the data had to be dropped whole."""
+        """Write the buffer, then the data; False if the data were dropped."""
         is_dropped = len(self._buffer) + len(data) > _PENDING_LIMIT
         self._buffer += b"" if is_dropped else data
-        with suppress(BlockingIOError):  # full: what waits is written with the next frame
+        with suppress(BlockingIOError):  # full: the buffer is written with the next frame
             self._buffer = self._buffer[write(self._buffer) :]
         return not is_dropped
 
@@ -53,8 +53,8 @@ class TcpConnection(SocketConnection):
         self._family, self._address = family, address
         self._send_buffer = _SendBuffer()
         self._is_connected = True
-        self._attempt_ns = 0  # when the last attempt began, or the connection ended
-        self._heard_ns: int | None = None  # when something came last, or the connection was made again
+        self._attempt_ns = 0  # start of the last attempt, or end of the connection
+        self._heard_ns: int | None = None  # last data, or reconnection
         self._socket.settimeout(CONNECT_TIMEOUT_S)
         self._attempt(self._socket.connect, address, "is the vehicle or simulator running and listening there?")
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -84,11 +84,11 @@ class TcpConnection(SocketConnection):
         return data
 
     def _disconnect(self, reason: str) -> None:
-        with suppress(OSError):  # what still waits in the system for a peer that does not answer is old by then
+        with suppress(OSError):  # unsent data would be too old for a new connection
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _DROP_UNSENT)
         self._socket.close()
         self._is_connected, self._attempt_ns = False, self._now()
-        self._send_buffer = _SendBuffer()  # a frame of which the peer has had the beginning
+        self._send_buffer = _SendBuffer()  # it may begin within a frame
         self.refused[reason] += 1
 
     def _connect(self) -> None:
@@ -128,7 +128,7 @@ class SerialConnection(BaseConnection):
     def __init__(self, url: str, device: str, baud: int, now: Callable[[], int]) -> None:
         super().__init__(url, now)
         self._send_buffer = _SendBuffer()
-        self._full_reads = 0  # times that it was found full
+        self._full_reads = 0  # number of reads with a full buffer
         try:
             self._port = serial.Serial(device, baud, timeout=0, write_timeout=0, exclusive=True)
         except (OSError, ValueError) as error:  # SerialException is an OSError

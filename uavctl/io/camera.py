@@ -59,7 +59,7 @@ class Camera(Protocol):
         ...
 
     def receive(self, data: bytes, at_ns: int) -> tuple[BodyPose | Echo, ...]:
-        """Take a datagram of the server.
+        """Handle a datagram of the server.
 
         Raises:
             CameraError: it cannot be used; only before it is `ready`.
@@ -77,4 +77,4 @@ class Camera(Protocol):
 
 READY, REFUSED, UNREACHABLE, COUNTS = b"R", b"E", b"T", b"C"
 LARGEST = 65536
-ANSWER_S = 5.0  # within which the server has to answer and to name the body
+ANSWER_S = 5.0  # limit for the server's answer and the name of the body

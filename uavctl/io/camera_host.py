@@ -1,8 +1,11 @@
-"""The process that listens to cameras for one daemon.
+"""Process that listens to cameras for one daemon.
 
-Started as `python -m uavctl.io.camera_host FD CAMERA SERVER PORT BODY UP INTERFACE`. It ends when the daemon's end of
-the pipe is gone, however the daemon died. The pipe is a pair of sockets that keep the bounds of messages; what a
-message is, its first byte says (MAVLink has its own).
+The daemon starts it as `python -m uavctl.io.camera_host FD CAMERA SERVER PORT BODY UP INTERFACE`.
+
+1. Receive data of the camera server, and encode poses and time answers as MAVLink.
+2. Send them to the daemon through a pair of sockets that keeps message bounds. The first byte is the kind of message.
+3. Pass time requests of the daemon on to the cameras.
+4. End when the daemon has closed its end, or has died.
 """
 
 from __future__ import annotations
@@ -36,7 +39,7 @@ _UNKNOWN = [math.nan, *([0.0] * 20)]
 
 
 class CameraMessageEncoder:
-    """Frames of one source, numbered modulo 256."""
+    """Encoder of camera messages; numbers the frames modulo 256."""
 
     def __init__(self) -> None:
         self._mav = mavlink.MAVLink(None, srcSystem=CAMERA_SYSTEM_ID, srcComponent=COMPONENT_ID)
@@ -75,10 +78,10 @@ def parse_time_requests(data: bytes) -> tuple[int, ...]:
     )
 
 
-MAX_QUEUE = 64  # messages that wait for a daemon that does not read; the newest are kept
+MAX_QUEUE = 64  # newest messages that are kept while the daemon does not read
 OVERRUN = "source-queue"
 NOT_SERVER = "not-listed"
-_PIPE_BYTES = 8192  # asked of the kernel: what waits there cannot be replaced by newer
+_PIPE_BYTES = 8192  # small kernel buffer: newer messages cannot replace those in it
 _MAX_READS = 64
 _POLL_S = 0.1
 _RECONNECT_S = 0.5  # between two attempts to connect a lost stream
@@ -126,7 +129,7 @@ class CameraHost:
         return server_socket
 
     def _reconnect(self) -> None:
-        """Connect a lost stream again, if it is time."""
+        """Reconnect a lost stream after a pause."""
         if time.monotonic() - self._connected_s < _RECONNECT_S:
             return
         self._connected_s = time.monotonic()
@@ -140,7 +143,7 @@ class CameraHost:
         self._server_socket = None
 
     def run(self) -> None:
-        """Serve until the daemon has gone.
+        """Run until the daemon has gone.
 
         Raises:
             CameraError: the server cannot be used as it is set up.
@@ -160,7 +163,7 @@ class CameraHost:
             self._group_socket.close()
 
     def _poll(self) -> bool:
-        """Wait for something and pass it on; False once the daemon has gone."""
+        """Wait for data and pass them on; False once the daemon has gone."""
         if self._server_socket is None:
             self._reconnect()
         for data in self._camera.due(time.monotonic_ns()):
@@ -182,7 +185,7 @@ class CameraHost:
                 self._server_socket.sendall(data)
             else:
                 self._server_socket.sendto(data, self._server)
-        except OSError:  # no route for now: asked again
+        except OSError:  # no route for now: sent again later
             self._dropped["unsent"] += 1
 
     def _receive(self, source: socket.socket) -> None:
@@ -243,7 +246,7 @@ class CameraHost:
             self._queue_message(COUNTS + json.dumps(counts).encode())
 
     def _follow_group(self) -> None:
-        """Join the group that the server streams to, if it streams to one."""
+        """Join the multicast group of the server, if there is one."""
         if self._camera.group == self._group:
             return
         self._group = self._camera.group
@@ -272,10 +275,10 @@ def _join_group(group: tuple[str, int], interface: str) -> socket.socket:
 
 
 def _make_camera(camera: str, body: str, up: Up) -> Camera:
-    """Make the class of a camera system, `module:Class`; modules of the working directory count last.
+    """Import and create a camera class, `module:Class`; modules of the working directory count last.
 
     Raises:
-        CameraError: it cannot be.
+        CameraError: that fails.
     """
     module, _, name = camera.partition(":")
     sys.path.append(os.getcwd())  # noqa: PTH109 as text

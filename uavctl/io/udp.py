@@ -13,7 +13,7 @@ from uavctl.io.base import BACKLOG_READS, MAX_READS, SocketConnection
 
 PEER_SILENCE_NS = SILENCE_NS
 SECOND_ADDRESS = "second-address"
-LARGEST = 8192  # bytes that are read of a datagram; none of MAVLink is as long
+LARGEST = 8192  # bytes read of a datagram; MAVLink needs fewer
 COMMON_BUFFER_BYTES = 2**20  # kernel buffer for all unknown senders
 PEER_BUFFER_BYTES = 2**22  # for a known one: some seconds of a vehicle's messages
 COMMON_READS = 64  # datagrams of strangers in one call
@@ -23,7 +23,7 @@ _MEMINFO = struct.Struct("9I")
 
 
 class _UdpConnection(SocketConnection):
-    """Datagrams within the rules."""
+    """UDP connection with admission rules."""
 
     def __init__(
         self, url: str, family: socket.AddressFamily, address: Address, now: Callable[[], int], rules: AdmissionRules
@@ -52,7 +52,7 @@ class _UdpConnection(SocketConnection):
         return data or None
 
     def _apply_rate_limits(self, arrived: list[tuple[bytes, int]]) -> list[tuple[bytes, int]]:
-        """Drop more than the rules allow, the oldest first; `_senders` are those of what is left."""
+        """Drop what exceeds the limits, the oldest first, with its entries in `_senders`."""
         admitted = self._rate_limiter.admit(self._senders, [data for data, _ in arrived], self._now())
         if all(admitted):
             return arrived
@@ -70,8 +70,8 @@ class UdpInConnection(_UdpConnection):
     Data of other senders is passed on too: cameras and vehicle may share a port. Another peer replaces only a silent
     one, so nobody can take the setpoints of an active peer.
 
-    Vehicle and cameras get sockets of their own once they are known, on the same port and connected to them: the system
-    keeps what they send apart from what others do, and a flood fills only the buffer of the others.
+    Once known, vehicle and cameras get connected sockets of their own on the same port. The system separates their data
+    from others, so a flood fills only the buffer of the common socket.
     """
 
     def _bind_or_connect(self, address: Address) -> None:
@@ -130,7 +130,7 @@ class UdpInConnection(_UdpConnection):
         return arrived
 
     def _read_socket(self, sock: socket.socket, max_reads: int, arrived: list[tuple[bytes, int]]) -> bool:
-        """Read a socket; whether it is empty now."""
+        """Read a socket; return whether it is empty now."""
         for _ in range(max_reads):
             try:
                 data, sender = sock.recvfrom(LARGEST)
@@ -162,7 +162,7 @@ class UdpInConnection(_UdpConnection):
         self._open_socket_for(sender, now_ns)
 
     def _open_socket_for(self, sender: Address, now_ns: int) -> None:
-        """Give a sender a socket of its own, if there is room; a sender that has fallen silent makes room."""
+        """Open a socket for a sender, if there is room; close those of silent senders."""
         self._trusted_ns[sender] = now_ns
         if sender in self._peer_sockets:
             return
@@ -177,7 +177,7 @@ class UdpInConnection(_UdpConnection):
         if peer_socket is None:
             return
         self._peer_sockets[sender] = peer_socket
-        # What had come before counts before what the new socket gets.
+        # Earlier data come before those of the new socket.
         for _ in range(BACKLOG_READS):
             try:
                 self._early_datagrams.append((*self._socket.recvfrom(LARGEST), now_ns))
@@ -195,7 +195,7 @@ class UdpInConnection(_UdpConnection):
 
 
 class UdpOutConnection(_UdpConnection):
-    """Connected UDP socket: the system hands on what its one peer sends."""
+    """Connected UDP socket: the system passes on only the data of its peer."""
 
     def _bind_or_connect(self, address: Address) -> None:
         self._peer_address = address
@@ -220,7 +220,7 @@ class UdpOutConnection(_UdpConnection):
 
 
 def _set_buffer_size(sock: socket.socket, size: int) -> None:
-    """Ask for a buffer of the system's; it may grant less."""
+    """Request a system buffer; the system may grant less."""
     with suppress(OSError):
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, size)
     with suppress(OSError):  # with permission, the whole size
@@ -253,7 +253,7 @@ def _open_peer_socket(
         peer_socket.close()
         return None
     finally:
-        _share_port(bound, is_shared=False)  # only for the moment: another program must not get hold of the port
+        _share_port(bound, is_shared=False)  # only briefly: no other program may use the port
     _share_port((peer_socket,), is_shared=False)
     return peer_socket
 
