@@ -24,7 +24,7 @@ _END_S = 2.0
 
 
 class CameraProcessConnection(BaseConnection):
-    """A process that gives MAVLink; see `uavctl.io.sources`. Implements `uavctl.io.transport.Connection`.
+    """A process that gives MAVLink; see `uavctl.io.sources`. Implements `uavctl.io.base.Connection`.
 
     When the process ends, the connection shows as `closed`; while only its server is gone it asks on, and nothing
     comes.

@@ -23,7 +23,7 @@ from uavctl.mavlink.signing import FrameAuthenticator, FrameSigner, make_timesta
 
 
 class SignedConnection:
-    """A connection whose frames are signed both ways; implements `uavctl.io.transport.Connection`."""
+    """A connection whose frames are signed both ways; implements `uavctl.io.base.Connection`."""
 
     def __init__(
         self, inner: Connection, authenticator: FrameAuthenticator, now: Callable[[], int] = monotonic_ns
