@@ -393,7 +393,7 @@ def test_mutated_messages_raise_nothing() -> None:
 
 
 def test_the_fuzzer_finds_a_planted_bug(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(codec, "_finite", lambda *values: True)
+    monkeypatch.setattr(codec, "_is_finite", lambda *values: True)
     with pytest.raises((AssertionError, ValueError, OverflowError)):
         fuzz(make_link(), 20_000, seed=1)
 

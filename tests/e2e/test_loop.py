@@ -295,7 +295,7 @@ def test_what_the_hand_over_answered_stands_if_its_request_cannot_be_sent(monkey
     def faulty(link: MavlinkConnection, setpoint: Setpoint) -> bytes:
         raise UnsendableError("not finite")
 
-    monkeypatch.setattr(MavlinkConnection, "setpoint", faulty)
+    monkeypatch.setattr(MavlinkConnection, "encode_setpoint", faulty)
     assert rig.loop.order(land)
     assert SETPOINT not in rig.run(1)
     assert [(command, event.code) for command, event in rig.answers] == [(land, ORDER_ACCEPTED)]

@@ -280,7 +280,7 @@ def in_virtual_time(rig: Endings) -> Iterator[None]:
     """The command's clock, connections and threads in our hands."""
 
     @contextmanager
-    def connected(*given: object) -> Iterator[dict[str, Line]]:
+    def open_links(*given: object) -> Iterator[dict[str, Line]]:
         yield rig.lines
 
     class Watched(HealthMonitor):
@@ -295,7 +295,7 @@ def in_virtual_time(rig: Endings) -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         for module in (fly_cmd, tune_flight):
-            patch.setattr(module, "connected", connected)
+            patch.setattr(module, "open_links", open_links)
             patch.setattr(module, "monotonic_ns", lambda: rig.now_ns)
         patch.setattr(tune_flight, "wait", rig.wait)
         patch.setattr(fly_cmd, "open_listener", open_listener)
@@ -304,7 +304,7 @@ def in_virtual_time(rig: Endings) -> Iterator[None]:
         patch.setattr(fly_cmd, "Recorder", Sync)
         patch.setattr("uavctl.cli.check.checked_before_arming", lambda *_: ())
         patch.setattr("uavctl.cli.fly.HealthMonitor", Watched)
-        patch.setattr(Notifier, "status", lambda _, text: rig.notified.append(text))
+        patch.setattr(Notifier, "send_status", lambda _, text: rig.notified.append(text))
         patch.setattr(report, "_sections", lambda *given: [report._summary_section(*given)])  # no drawings
         patch.setattr(Sync, "full", False)
         yield
