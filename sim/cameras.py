@@ -17,7 +17,7 @@ from sim.vehicle.interface import LEVEL, Quaternion, heading_rad, in_body
 from uavctl.config.connections import FrameConfig
 from uavctl.config.sim import CameraConfig
 from uavctl.errors import ConfigError
-from uavctl.frames import Frame, multiply
+from uavctl.frames import Frame, multiply_quaternions
 from uavctl.records import Vec3
 
 SYSTEM_ID, COMPONENT_ID = 17, 197  # 197: MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
@@ -164,7 +164,7 @@ class Cameras:
 
     def _message(self, usec: int, pose: _Pose) -> mavlink.MAVLink_message:
         msg: mavlink.MAVLink_message
-        where, turned = self._frame.from_ned(pose.position_m), multiply(self._turn, pose.attitude)
+        where, turned = self._frame.from_ned(pose.position_m), multiply_quaternions(self._turn, pose.attitude)
         match self._camera.message:
             case "vision":
                 angles = self._angles(turned)
@@ -181,7 +181,7 @@ class Cameras:
         return msg
 
     def _angles(self, turned: Quaternion) -> Vec3:
-        return euler(turned if self._convention == "ned" else multiply(turned, HALF_ROLL))
+        return euler(turned if self._convention == "ned" else multiply_quaternions(turned, HALF_ROLL))
 
 
 def _in_axes(axes: tuple[Vec3, Vec3, Vec3], ned: Vec3) -> Vec3:

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from uavctl.frames import Convention, Frame, axes_turn, from_axes, rotate
+from uavctl.frames import Convention, Frame, quaternion_from_axes, rotate_vector, rotation_to_ned
 from uavctl.records import Vec3
 
 CONVENTIONS: tuple[Convention, ...] = ("ned", "enu", "flu")
@@ -97,37 +97,39 @@ def test_rotation_agrees_with_scipy(q: tuple[float, float, float, float], vector
     length = math.hypot(*q)
     normed = (q[0] / length, q[1] / length, q[2] / length, q[3] / length)
     want = Rotation.from_quat(normed, scalar_first=True).apply(vector)
-    assert rotate(normed, vector) == pytest.approx(tuple(want), abs=1e-9)
+    assert rotate_vector(normed, vector) == pytest.approx(tuple(want), abs=1e-9)
 
 
 @pytest.mark.parametrize(
     "q", [(0.0, 0.0, 0.0, 0.0), (math.nan, 0.0, 0.0, 0.0), (math.inf, 0.0, 0.0, 0.0), (2.0, 0, 0, 0)]
 )
 def test_what_is_no_rotation_gives_none(q: tuple[float, float, float, float]) -> None:
-    assert rotate(q, (1.0, 0.0, 0.0)) is None
+    assert rotate_vector(q, (1.0, 0.0, 0.0)) is None
 
 
 def test_a_body_at_heading_east_moves_east() -> None:
     half = math.sqrt(0.5)
-    assert rotate((half, 0.0, 0.0, half), (1.0, 0.0, 0.0)) == pytest.approx((0.0, 1.0, 0.0))
+    assert rotate_vector((half, 0.0, 0.0, half), (1.0, 0.0, 0.0)) == pytest.approx((0.0, 1.0, 0.0))
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_the_turn_of_a_convention_is_its_change_of_axes(convention: Convention) -> None:
     for vector in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.5, -2.0, 3.0)):
-        assert rotate(axes_turn(convention), vector) == pytest.approx(Frame(convention).to_ned(vector), abs=1e-12)
+        assert rotate_vector(rotation_to_ned(convention), vector) == pytest.approx(
+            Frame(convention).to_ned(vector), abs=1e-12
+        )
 
 
 @pytest.mark.parametrize("seed", range(40))
 def test_a_turn_onto_directions_takes_the_axes_there(seed: int) -> None:
     directions = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0].T
     right_handed = np.linalg.det(directions) > 0
-    turn = from_axes(directions.tolist())
+    turn = quaternion_from_axes(directions.tolist())
     for number, axis in enumerate(((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))):
         sign = 1.0 if right_handed or number < 2 else -1.0
-        assert rotate(turn, axis) == pytest.approx(tuple(sign * directions[number]), abs=1e-12)
+        assert rotate_vector(turn, axis) == pytest.approx(tuple(sign * directions[number]), abs=1e-12)
 
 
 def test_half_turns_lose_no_digits() -> None:
-    assert from_axes([(1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0)]) == (0.0, 1.0, 0.0, 0.0)
-    assert from_axes([(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)]) == (1.0, 0.0, 0.0, 0.0)
+    assert quaternion_from_axes([(1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0)]) == (0.0, 1.0, 0.0, 0.0)
+    assert quaternion_from_axes([(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)]) == (1.0, 0.0, 0.0, 0.0)

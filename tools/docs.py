@@ -252,14 +252,15 @@ in `RETURNING`.
 def _modes(choice: ModeChoice) -> str:
     """The modes that such a one can have chosen, by autopilot."""
     chosen = {
-        name: sorted(mode for mode, by in profile.choices.items() if by is choice) for name, profile in PROFILES.items()
+        name: sorted(mode for mode, by in profile.mode_choices.items() if by is choice)
+        for name, profile in PROFILES.items()
     }
     return "; ".join(f"{name}: {', '.join(modes)}" for name, modes in chosen.items())
 
 
 def _degrades() -> str:
     """The modes of a person that a failsafe chooses as well, by autopilot."""
-    return "; ".join(f"{name}: {', '.join(sorted(profile.degrades))}" for name, profile in PROFILES.items())
+    return "; ".join(f"{name}: {', '.join(sorted(profile.degraded_modes))}" for name, profile in PROFILES.items())
 
 
 def drawing() -> str:

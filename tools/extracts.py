@@ -18,7 +18,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from logs.recording.tlog import TlogPacket, read_tlog
 from uavctl.errors import UavctlError
-from uavctl.mavlink.framing import scan
+from uavctl.mavlink.framing import scan_frames
 
 OUT = Path(__file__).parents[1] / "tests" / "data" / "flights"
 TRUTH_S = 0.1
@@ -58,7 +58,7 @@ def kept(name: str, packets: Sequence[TlogPacket]) -> Iterator[TlogPacket]:
     relayed = "-relay-" in name
     seen = dict.fromkeys(THINNED, 0)
     for packet in packets:
-        frames = scan(packet.data, final=True).frames
+        frames = scan_frames(packet.data, final=True).frames
         if whole:
             yield packet
             continue

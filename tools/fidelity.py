@@ -210,7 +210,7 @@ def simulated(autopilot: str, *overrides: str, ends_s: float = LONGEST_S) -> Wat
             loop.order(Command(order=Order.TAKE_OFF, height_m=HEIGHT_M))
         loop.tick(tick, at_ns, peers.receiver(at_ns), stop=tick >= land)
         truth.append((at_ns * S, -peers.vehicle.position_m[2]))
-        if loop.who_flies is HandoverState.DONE:
+        if loop.handover_state is HandoverState.DONE:
             break
     for arrival_ns, link, data in peers.advance(peers.now_ns + AFTER_NS):
         sink.put("", arrival_ns, Datagram(at_ns=arrival_ns, link=link, outgoing=False, data=data))

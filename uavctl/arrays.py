@@ -1,4 +1,4 @@
-"""The array type of all numerical code: 64-bit floating point numbers of any shape."""
+"""Array type and time unit of all numerical code."""
 
 from __future__ import annotations
 
@@ -6,3 +6,4 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+SECOND_NS = 1_000_000_000

@@ -1,4 +1,4 @@
-"""Monotonic time and the grid of control ticks."""
+"""Monotonic clock and the time grid of control ticks."""
 
 from __future__ import annotations
 
@@ -7,21 +7,22 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 monotonic_ns: Callable[[], int] = time.monotonic_ns
-"""Nanoseconds of the clock that no adjustment of the wall clock moves; shared by all processes of a machine."""
+"""Monotonic clock [ns]. Adjustments of the wall clock do not move it. All processes of a machine share it."""
 
 VIRTUAL_ZERO_UTC_NS = 946_684_800 * 1_000_000_000
-"""UTC of time 0 in virtual time [ns since 1970]: 2000-01-01, so that the same flight has the same times."""
+"""UTC of time 0 in virtual time [ns since 1970]: 2000-01-01, so that a repeated flight has the same times."""
 
 
-def zero_utc_ns() -> int:
-    """UTC of time 0 of our clock by the wall clock as it is now [ns since 1970]; asked once a flight."""
+def read_zero_utc_ns() -> int:
+    """Read the UTC of time 0 of the monotonic clock [ns since 1970]; called once in a flight."""
+    # wall - (before + after) / 2
     before_ns, wall_ns, after_ns = monotonic_ns(), time.time_ns(), monotonic_ns()
     return wall_ns - (before_ns + after_ns) // 2
 
 
 @dataclass(frozen=True, slots=True)
-class Due:
-    """One tick: its number, its absolute deadline on the grid, and the ticks skipped before it."""
+class TickDeadline:
+    """Number of a tick, its absolute deadline on the grid, and the number of skipped ticks before it."""
 
     tick: int
     at_ns: int
@@ -29,11 +30,10 @@ class Due:
 
 
 class Ticker:
-    """Absolute deadlines on a grid.
+    """Generator of absolute deadlines on a time grid.
 
-    The grid begins at the first multiple of `align_ns` after the first call of `next()`, so that
-    processes on one machine share it. Who oversleeps gets the newest tick that is due, once; the
-    ones before it are counted as missed and never made up.
+    The grid begins at the first multiple of `align_ns` after the first call of `next()`. So all processes of a
+    machine share it. A late caller gets the newest tick that is due. Earlier ticks count as missed and are skipped.
 
     Args:
         align_ns: the grid's origin is a multiple of it; itself a multiple of `period_ns`.
@@ -52,17 +52,17 @@ class Ticker:
         self._start_ns: int | None = None
         self._tick = -1
 
-    def next(self) -> Due:
-        """The next tick; its deadline may be in the past by less than a period, never by more."""
+    def next(self) -> TickDeadline:
+        """Return the next tick; its deadline is less than one period in the past."""
         now_ns = self._now()
         if self._start_ns is None:
             self._start_ns = (now_ns // self._align_ns + 1) * self._align_ns
-        return self._newest(self._start_ns, self._tick + 1, now_ns)
+        return self._latest_due(self._start_ns, self._tick + 1, now_ns)
 
-    def overslept(self, due: Due) -> Due:
-        """The tick to do after the wait for `due`: itself, unless the wait lasted until a later one was due."""
-        return self._newest(due.at_ns - due.tick * self._period_ns, due.tick - due.missed, self._now())
+    def update_after_wait(self, due: TickDeadline) -> TickDeadline:
+        """Return the tick to run after the wait for `due`: a later one if the wait took too long."""
+        return self._latest_due(due.at_ns - due.tick * self._period_ns, due.tick - due.missed, self._now())
 
-    def _newest(self, start_ns: int, expected: int, now_ns: int) -> Due:
-        self._tick = max(self._tick, expected, (now_ns - start_ns) // self._period_ns)
-        return Due(self._tick, start_ns + self._tick * self._period_ns, self._tick - expected)
+    def _latest_due(self, start_ns: int, expected_tick: int, now_ns: int) -> TickDeadline:
+        self._tick = max(self._tick, expected_tick, (now_ns - start_ns) // self._period_ns)
+        return TickDeadline(self._tick, start_ns + self._tick * self._period_ns, self._tick - expected_tick)

@@ -20,11 +20,11 @@ from uavctl.flight.monitors.external import CONTROLLER_FAULT
 from uavctl.flight.supervise import distrusts_positions
 from uavctl.flight.tick import TickOutput, make_initial_state
 from uavctl.flight.tick import tick as run_tick
-from uavctl.mavlink.connection import HUNG_UP, NO_HEARTBEAT, OVERRUN, STAMP_UNIT, WENT_SILENT, MavlinkConnection
-from uavctl.mavlink.handover import HAND_OVER_ORDERS, HandOver, HandoverStep
-from uavctl.mavlink.handover_guards import HandoverView, against_moving
-from uavctl.mavlink.handover_states import LEAVES_NONE, HandoverState, Sending
-from uavctl.mavlink.messages import Ack, Message, Text
+from uavctl.mavlink.connection import CONNECTION_SILENT, HUNG_UP, NO_HEARTBEAT, OVERRUN, STAMP_UNIT, MavlinkConnection
+from uavctl.mavlink.handover import HAND_OVER_ORDERS, HandoverOutput, HandoverStateMachine
+from uavctl.mavlink.handover_guards import HandoverInput, explain_move_refusal
+from uavctl.mavlink.handover_states import NOT_LEFT_IN_FLIGHT, HandoverState, SetpointMode
+from uavctl.mavlink.messages import CommandAck, Message, StatusText
 from uavctl.mavlink.relay import Relay
 from uavctl.outcome import Cause, FlightCourse
 from uavctl.records import (
@@ -57,7 +57,7 @@ from uavctl.records import (
 )
 from uavctl.smpc.plant import Plant
 
-Heard = PositionSample | VehicleStatus | VehicleMotion | InertialSample | Ack | Text
+Heard = PositionSample | VehicleStatus | VehicleMotion | InertialSample | CommandAck | StatusText
 
 VEHICLE = "vehicle"
 MOCAP = "mocap"
@@ -72,7 +72,7 @@ FOR_A_PERSON = frozenset(
         STRONG_PUSH,
         CONTROLLER_FAULT,
         HUNG_UP,
-        WENT_SILENT,
+        CONNECTION_SILENT,
         NO_HEARTBEAT,
         STAMP_UNIT,
     }
@@ -82,7 +82,9 @@ MAX_INERTIAL = 20  # newest of one tick: their mean is what counts
 MAX_SAMPLES = 20  # of one tick, the newest of each source in turn: each costs the estimator its time
 
 
-def make_links(config: Config, listen: Callable[[Message, int], None] | None = None) -> dict[str, MavlinkConnection]:
+def make_links(
+    config: Config, on_message: Callable[[Message, int], None] | None = None
+) -> dict[str, MavlinkConnection]:
     """The connections' protocol states: one for both roles when the two URLs are the same.
 
     Args:
@@ -99,7 +101,7 @@ def make_links(config: Config, listen: Callable[[Message, int], None] | None = N
             clock=config.clock,
             source=config.source,
             estimator=config.estimator,
-            listen=listen,
+            on_message=on_message,
             vehicle_time=config.relay.enabled and config.relay.vehicle_time,
         )
         for name, roles in names.items()
@@ -118,9 +120,9 @@ class ControlLoop:
         self._stopwatch = stopwatch
         self._links = make_links(config)
         self._relay, self._relays = Relay(config.relay), config.relay.enabled
-        self._hand_over = HandOver(config.hand_over, sees_it_down=config.relay.enabled)
+        self._hand_over = HandoverStateMachine(config.hand_over, waits_for_landing=config.relay.enabled)
         self._config = config.hand_over
-        self._heard: tuple[Ack | Text, ...] = ()
+        self._heard: tuple[CommandAck | StatusText, ...] = ()
         self._state = make_initial_state()
         self._inbox: deque[tuple[int, Heard]] = deque()
         self._feels = config.estimator.inertial_std_mps2 > 0.0
@@ -159,14 +161,14 @@ class ControlLoop:
     def finished(self) -> bool:
         """Whether the vehicle has been handed over and nothing more will be sent."""
         if self._adrift:
-            return not self._hand_over.carries
+            return not self._hand_over.is_relay_needed
         over = self._decision is not None and self._decision.mode in (ControlMode.LAND, ControlMode.STOPPED)
-        return self._hand_over.finished or (over and not self._hand_over.busy)
+        return self._hand_over.is_finished or (over and not self._hand_over.is_busy)
 
     @property
-    def carries(self) -> bool:
+    def is_relay_needed(self) -> bool:
         """Whether a vehicle is in the air by the positions that are relayed to it."""
-        return self._hand_over.carries
+        return self._hand_over.is_relay_needed
 
     @property
     def relay(self) -> RelayStats | None:
@@ -184,7 +186,7 @@ class ControlLoop:
     @property
     def inertial(self) -> tuple[int, int] | None:
         """Inertial data of the vehicle that are used, and all that came; None where none are used."""
-        return self._links[VEHICLE].inertial if self._feels else None
+        return self._links[VEHICLE].inertial_counts if self._feels else None
 
     @property
     def plant(self) -> Plant:
@@ -202,14 +204,14 @@ class ControlLoop:
         return "" if self._state.monitors.release is None else self._state.monitors.release.text
 
     @property
-    def who_flies(self) -> HandoverState:
+    def handover_state(self) -> HandoverState:
         """State of the hand-over."""
         return self._hand_over.state
 
     @property
     def leaves_vehicle(self) -> bool | None:
         """Whether a vehicle would be left behind that has flown on our setpoints; None before one is heard."""
-        return None if self.who_flies is HandoverState.WAITING else self.who_flies not in LEAVES_NONE
+        return None if self.handover_state is HandoverState.WAITING else self.handover_state not in NOT_LEFT_IN_FLIGHT
 
     def receive(self, link: str, data: bytes, at_ns: int) -> Received:
         """Take one datagram that arrived at `at_ns`; of positions, ticks before that time see nothing."""
@@ -225,10 +227,10 @@ class ControlLoop:
             elif self._feels or not isinstance(item, InertialSample):
                 self._inbox.append((at_ns, item))
             if isinstance(item, PositionSample):
-                from_source = understood.settled
+                from_source = understood.is_source_settled
                 if self._relays:
-                    self._relay.take(item, understood.attitude)
-        asked = understood.answers
+                    self._relay.add_sample(item, understood.attitude)
+        asked = understood.replies
         answers = tuple([self._outgoing(link, answer, at_ns) for answer in asked]) if asked else ()
         return Received(answers, from_vehicle, from_source, news)
 
@@ -241,7 +243,7 @@ class ControlLoop:
         self._put("/uavctl/refused", at_ns, Refused(at_ns=at_ns, link=link, counts=counts))
         if link == VEHICLE and counts.keys() & {HUNG_UP, OVERRUN}:
             self._unsure_since_ns = at_ns
-        events = self._links[link].refused(counts, at_ns)
+        events = self._links[link].add_refusals(counts, at_ns)
         for event in events:
             self._put("/uavctl/event", at_ns, event)
         return tuple([event for event in events if event.code in FOR_A_PERSON])
@@ -274,18 +276,18 @@ class ControlLoop:
         misled = self._misled_ns is not None and at_ns - self._misled_ns < MISLED_NS
         held_back = misled or distrusts_positions(self._state)
         if self._relays and not held_back:
-            for data in self._links[VEHICLE].relay(
+            for data in self._links[VEHICLE].encode_relayed_poses(
                 self._relay, at_ns, refused=inp.samples if out.newest_inconsistent else out.refused
             ):
                 send(self._outgoing(VEHICLE, data, at_ns))
         if self._relays and self._vehicle is not None:
-            silence = self._relay.report(at_ns, held_back=held_back, armed=self._vehicle.armed)
+            silence = self._relay.make_event(at_ns, held_back=held_back, armed=self._vehicle.armed)
             if silence is not None:
                 self._put("/uavctl/event", at_ns, silence)
                 notices.append(silence)
         answers: tuple[tuple[Command, Event], ...] = ()
         if self._adrift:
-            self._hand_over.look_up(at_ns, self._vehicle)
+            self._hand_over.update_airborne(at_ns, self._vehicle)
         else:
             outgoing: list[Outgoing] = []  # what fails in `send` is no failure of the controller
             try:
@@ -318,7 +320,7 @@ class ControlLoop:
                 self._state, out = run_tick(self._state, inp, self._controller, carried=self._hand_over.has_begun)
             except Exception as error:  # noqa: BLE001 the vehicle may be in the air by the positions that it gets
                 notices.append(self._die(error, inp.at_ns))
-                return self._without_core(inp, land=self._lands or self._hand_over.ours)
+                return self._without_core(inp, land=self._lands or self._hand_over.is_ordered_flight)
             return out
         return self._without_core(inp, land=False)
 
@@ -374,10 +376,10 @@ class ControlLoop:
         """Take note of how long that one took for the plan of the last tick; the next one judges it."""
         self._answered_ns = took_ns
 
-    def against(self, order: Order) -> str:
+    def explain_refusal(self, order: Order) -> str:
         """Return why an order of where to fly would have no effect now; empty if it may be taken, or is another one."""
         moves = order in (Order.GOTO, Order.HOLD, Order.RESUME)
-        return against_moving(self.who_flies, self._vehicle) if moves else ""
+        return explain_move_refusal(self.handover_state, self._vehicle) if moves else ""
 
     def timing(self, ticked: Ticked, lateness_ns: int, send_ns: int) -> None:
         """Record what the shell measured around a tick."""
@@ -402,7 +404,7 @@ class ControlLoop:
             tick=tick,
             at_ns=at_ns,
             samples=samples,
-            vehicle=self._hand_over.flown(at_ns, self._vehicle),
+            vehicle=self._hand_over.select_controlled_status(at_ns, self._vehicle),
             motion=self._motion,
             inertial=self._inertial,
             missed_ticks=missed_ticks,
@@ -419,7 +421,7 @@ class ControlLoop:
 
     def _take_due(
         self, at_ns: int
-    ) -> tuple[tuple[PositionSample, ...], tuple[VehicleStatus, ...], tuple[Ack | Text, ...]]:
+    ) -> tuple[tuple[PositionSample, ...], tuple[VehicleStatus, ...], tuple[CommandAck | StatusText, ...]]:
         """Samples that arrived up to `at_ns`, and all that the vehicle has said: its newest state is taken over.
 
         What it says counts in a late tick too, when it came after the time of the tick: it may be that the pilot flies.
@@ -427,7 +429,7 @@ class ControlLoop:
         """
         samples: list[PositionSample] = []
         heard: list[VehicleStatus] = []
-        words: list[Ack | Text] = []
+        words: list[CommandAck | StatusText] = []
         felt: list[InertialSample] = []
         waiting: deque[tuple[int, Heard]] = deque()
         for received_ns, item in self._inbox:
@@ -445,7 +447,7 @@ class ControlLoop:
                 waiting.append((received_ns, item))
         self._inbox, self._inertial = waiting, tuple(felt[-MAX_INERTIAL:])
         flown = self._hand_over.state is HandoverState.ENGAGED
-        left = [status for status in heard if flown and self._hand_over.has_left(status)]
+        left = [status for status in heard if flown and self._hand_over.has_left_external_mode(status)]
         # Of the mode that it left for the newest word counts: it may say who has chosen it.
         left = [status for status in left if status.mode == left[0].mode]
         self._vehicle = next(iter((left or heard)[::-1]), self._vehicle)
@@ -464,32 +466,32 @@ class ControlLoop:
         for event in out.events:
             self._put("/uavctl/event", at_ns, event)
 
-    def _noted(self, told: HandoverStep, at_ns: int) -> Iterator[Event]:
+    def _noted(self, told: HandoverOutput, at_ns: int) -> Iterator[Event]:
         """Note what the hand-over did; yields what a person has to be told of it: whoever ordered gets the answer."""
-        if told.passage is not None:
-            self.course.turn(told.passage, self._vehicle)
+        if told.transition is not None:
+            self.course.turn(told.transition, self._vehicle)
         for event in told.events:
             self._put("/uavctl/event", at_ns, event)
             if event.severity is not Severity.INFO and event.code != ORDER_REFUSED:
                 yield event
 
-    def _command(self, told: HandoverStep, out: TickOutput, at_ns: int, send: Send) -> None:
+    def _command(self, told: HandoverOutput, out: TickOutput, at_ns: int, send: Send) -> None:
         """Send the vehicle what the hand-over wants: a setpoint, a request, or nothing."""
         link = self._links[VEHICLE]
         sure = self._unsure_since_ns is None
-        if sure and told.sending is not Sending.NOTHING and out.setpoint is not None:
+        if sure and told.setpoint_mode is not SetpointMode.NOTHING and out.setpoint is not None:
             self._put("/uavctl/setpoint", at_ns, out.setpoint)
-            if told.sending is Sending.SETPOINTS:
+            if told.setpoint_mode is SetpointMode.SETPOINTS:
                 self._controlled_ns = at_ns
-            send(self._outgoing(VEHICLE, link.setpoint(out.setpoint), at_ns))
-        if sure and told.ask is not None:
-            send(self._outgoing(VEHICLE, link.ask(told.ask, self._hand_over.height_m), at_ns))
-        if self._hand_over.ours and self._hand_over.state in (
+            send(self._outgoing(VEHICLE, link.encode_setpoint(out.setpoint), at_ns))
+        if sure and told.request is not None:
+            send(self._outgoing(VEHICLE, link.encode_request(told.request, self._hand_over.height_m), at_ns))
+        if self._hand_over.is_ordered_flight and self._hand_over.state in (
             HandoverState.READY,
             HandoverState.MODE,
             HandoverState.ARMING,
         ):
-            for data in link.place_on_globe(at_ns, self._config.origin_deg_m):
+            for data in link.setup_global_origin(at_ns, self._config.origin_deg_m):
                 send(self._outgoing(VEHICLE, data, at_ns))
 
     def _answers(
@@ -498,12 +500,14 @@ class ControlLoop:
         """Each order with its answer; a landing that the core does not fly, and the hand-over asks for, is accepted."""
         for command, event in _answered(commands, core, hand_over):
             landing = (
-                command.order is Order.LAND and event.code == ORDER_REFUSED and self.who_flies is HandoverState.LANDING
+                command.order is Order.LAND
+                and event.code == ORDER_REFUSED
+                and self.handover_state is HandoverState.LANDING
             )
             text = "land: the vehicle is asked for it"
             yield command, replace(event, severity=Severity.INFO, code=ORDER_ACCEPTED, text=text) if landing else event
 
-    def _view(self, inp: StepInput, out: TickOutput) -> HandoverView:
+    def _view(self, inp: StepInput, out: TickOutput) -> HandoverInput:
         """Return the inputs of the hand-over in this tick."""
         plant, estimate = self._controller.plant, out.estimate
         up_m, up_mps = None, 0.0
@@ -515,20 +519,20 @@ class ControlLoop:
             unfit = "the controller has no estimate of the position"
         elif estimate.age_s > self._config.fresh_s:
             unfit = f"the newest position is {estimate.age_s:.1f} s old"
-        return HandoverView(
+        return HandoverInput(
             at_ns=inp.at_ns,
             vehicle=self._vehicle,
-            up_s=self._links[VEHICLE].vehicle_up_s(inp.at_ns),
-            ready=out.setpoint is not None,
-            land=out.land,
-            stop=inp.stop,
-            unsure=self._unsure_since_ns is not None,
-            unfit=unfit,
-            unsafe=out.unsafe_to_climb,
-            up_m=up_m,
-            up_mps=up_mps,
-            moves=moves_now(self._motion, inp.at_ns),
-            heard=self._heard,
+            uptime_s=self._links[VEHICLE].vehicle_uptime_s(inp.at_ns),
+            has_setpoint=out.setpoint is not None,
+            is_landing_requested=out.land,
+            is_stop_requested=inp.stop,
+            may_have_lost_messages=self._unsure_since_ns is not None,
+            arming_refusal=unfit,
+            climb_hazard=out.unsafe_to_climb,
+            estimated_height_m=up_m,
+            climb_rate_mps=up_mps,
+            has_motion=moves_now(self._motion, inp.at_ns),
+            messages=self._heard,
             commands=inp.commands,
         )
 

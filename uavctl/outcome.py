@@ -12,11 +12,11 @@ from msgspec.structs import replace
 
 from uavctl.flight.decide import MISSION_OVER
 from uavctl.flight.monitors.external import CONTROLLER_FAULT
-from uavctl.mavlink.handover import Passage
-from uavctl.mavlink.handover_guards import BROKEN_OFF, fails, silent
+from uavctl.mavlink.handover import StateTransition
+from uavctl.mavlink.handover_guards import CLIMB_ABORTED, is_in_failsafe, is_silent
 from uavctl.mavlink.handover_states import HandoverEvent, HandoverState
+from uavctl.mavlink.mode_reason import PERSON_REASONS, ModeReason
 from uavctl.mavlink.requests import RequestKind
-from uavctl.mavlink.switcher import PERSONS, Switcher
 from uavctl.records import ORDER_ACCEPTED, ControlMode, Decision, Ending, Event, Order, VehicleStatus
 
 SECOND_NS = 1_000_000_000
@@ -72,11 +72,11 @@ TAKEN = frozenset({Cause.PILOT, Cause.PILOT_LANDED, Cause.GROUND_STATION})
 # Ends that somebody wanted: the operator, the mission, or whoever has taken over.
 WANTED = TAKEN | {Cause.MISSION, Cause.ORDERED, Cause.OPERATOR, Cause.TIME, Cause.IN_FLIGHT}
 _SWITCHED = {
-    Switcher.PILOT: Cause.PILOT,
-    Switcher.GROUND_STATION: Cause.GROUND_STATION,
-    Switcher.FAILSAFE: Cause.FAILSAFE,
-    Switcher.FENCE: Cause.FENCE,
-    Switcher.UNKNOWN: Cause.UNKNOWN_SWITCH,
+    ModeReason.PILOT: Cause.PILOT,
+    ModeReason.GROUND_STATION: Cause.GROUND_STATION,
+    ModeReason.FAILSAFE: Cause.FAILSAFE,
+    ModeReason.FENCE: Cause.FENCE,
+    ModeReason.UNKNOWN: Cause.UNKNOWN_SWITCH,
 }
 _LANDED = {Cause.PILOT: Cause.PILOT_LANDED, Cause.FAILSAFE: Cause.FAILSAFE_LANDED, Cause.FENCE: Cause.FENCE_LANDED}
 _OWN = frozenset({Cause.FAILSAFE, Cause.FENCE})
@@ -163,7 +163,7 @@ class FlightCourse:
             return
         self._armed = self._armed or vehicle.armed
         self._aloft = self._aloft or (vehicle.armed and not vehicle.landed)
-        self._fails = self._fails or (self._state in _COMES_DOWN and vehicle.armed and fails(vehicle))
+        self._fails = self._fails or (self._state in _COMES_DOWN and vehicle.armed and is_in_failsafe(vehicle))
 
     def decide(self, decision: Decision, events: tuple[Event, ...], *, estimated: bool) -> None:
         """Note what the controller decided in a tick."""
@@ -181,11 +181,11 @@ class FlightCourse:
         self._fell = next((one.text for one in events if one.code == CONTROLLER_FAULT), self._fell)
         ends = decision.mode in (ControlMode.LAND, ControlMode.STOPPED) and before in _FLOWN
         if ends and self._stop is None and not (self.let_go or self.died):
-            lost = silent(decision.at_ns, self._vehicle)
+            lost = is_silent(decision.at_ns, self._vehicle)
             landed = Cause.FALLBACK if decision.mode is ControlMode.LAND else Cause.FALLBACK_STOPPED
             self._find(self._asked or (Cause.SILENT if lost else landed), "" if self._asked else self._fell)
 
-    def turn(self, one: Passage, vehicle: VehicleStatus | None) -> None:
+    def turn(self, one: StateTransition, vehicle: VehicleStatus | None) -> None:
         """Note a transition of the hand-over."""
         self._state = one.after
         if one.after is HandoverState.ENGAGED or (
@@ -194,26 +194,26 @@ class FlightCourse:
             self._failsafes += self._found in _OWN
             self._found, self._why, self._taken = None, "", None
         self.engaged = self.engaged or one.after is HandoverState.ENGAGED
-        if one.seen is HandoverEvent.REBOOT:
+        if one.event is HandoverEvent.REBOOT:
             self._find(Cause.RESTARTED, "")
-        elif one.seen is HandoverEvent.REFUSED:
+        elif one.event is HandoverEvent.REFUSED:
             self._refuse(one, vehicle)
-        elif one.seen is HandoverEvent.UNSAFE:
+        elif one.event is HandoverEvent.UNSAFE:
             self._find(Cause.BROKEN_OFF, _reason(one))
-        elif one.seen is HandoverEvent.LEFT:
+        elif one.event is HandoverEvent.LEFT:
             self._find(Cause.LEFT, "")
-        elif one.who is not None:
-            self._switch(one.who, vehicle)
-        elif one.seen is HandoverEvent.DISARMED:
+        elif one.mode_reason is not None:
+            self._switch(one.mode_reason, vehicle)
+        elif one.event is HandoverEvent.DISARMED:
             self._disarm(one)
-        elif one.seen is HandoverEvent.LAND and self._stop is None and not self.engaged and self._found is None:
+        elif one.event is HandoverEvent.LAND and self._stop is None and not self.engaged and self._found is None:
             self._asked = Cause.ORDERED
 
-    def _switch(self, who: Switcher, vehicle: VehicleStatus | None) -> None:
+    def _switch(self, who: ModeReason, vehicle: VehicleStatus | None) -> None:
         """Note that somebody has changed the mode to one that is none of ours; the newest word of it counts."""
         cause = _SWITCHED[who]
         before = self._found
-        if before is Cause.UNKNOWN_SWITCH or before in WANTED or (who in PERSONS and before in _OWN):
+        if before is Cause.UNKNOWN_SWITCH or before in WANTED or (who in PERSON_REASONS and before in _OWN):
             self._found = None  # it is known now; or the landing that was asked for does not come
         self._taken = cause
         said = "" if vehicle is None or not vehicle.said else f', "{vehicle.said}"'
@@ -253,17 +253,17 @@ class FlightCourse:
         if self._found is None:
             self._found, self._why = cause, why
 
-    def _refuse(self, one: Passage, vehicle: VehicleStatus | None) -> None:
+    def _refuse(self, one: StateTransition, vehicle: VehicleStatus | None) -> None:
         cause = _REFUSED.get(one.before, Cause.NOT_BEGUN)
         if one.before in (HandoverState.MODE, HandoverState.ARMING) and vehicle is not None and not vehicle.alone:
             cause = Cause.NOT_ALONE
         elif one.before in (HandoverState.WAITING, HandoverState.READY):
             cause = self._against_beginning(vehicle)
         elif one.before is HandoverState.CLIMBING:
-            cause = Cause.NO_TAKE_OFF if one.ask is RequestKind.TAKE_OFF and not one.granted else Cause.NO_CLIMB
+            cause = Cause.NO_TAKE_OFF if one.request is RequestKind.TAKE_OFF and not one.is_granted else Cause.NO_CLIMB
         elif one.before is HandoverState.RETURNING:
             return  # the pilot has it still
-        elif silent(self._now_ns, vehicle):  # it has refused nothing, nor has the fallback landed it
+        elif is_silent(self._now_ns, vehicle):  # it has refused nothing, nor has the fallback landed it
             self._found = None if self._found in (Cause.FALLBACK, Cause.NO_CLIMB) else self._found
             self._find(Cause.SILENT, "")
         if cause is Cause.LANDING_FAILED:
@@ -279,11 +279,11 @@ class FlightCourse:
             return Cause.NO_VEHICLE
         if not vehicle.alone:
             return Cause.NOT_ALONE
-        if vehicle.armed or self._positions or silent(self._now_ns, vehicle):
+        if vehicle.armed or self._positions or is_silent(self._now_ns, vehicle):
             return Cause.NOT_BEGUN
         return Cause.NO_POSITIONS
 
-    def _disarm(self, one: Passage) -> None:
+    def _disarm(self, one: StateTransition) -> None:
         if one.before in (HandoverState.CLIMBING, HandoverState.ENGAGING, HandoverState.ENGAGED):
             self._find(Cause.DISARMED if self._aloft else Cause.NOT_RISEN, "")
         elif one.before not in _COMES_DOWN and self._found is not None and (self._aloft or self._found in _OWN):
@@ -299,7 +299,7 @@ class FlightCourse:
             return Cause.CONTROL, self.died
         if self.let_go:
             return Cause.LET_GO, self.let_go
-        if self._found is None and self._state is HandoverState.ENGAGED and silent(self._now_ns, self._vehicle):
+        if self._found is None and self._state is HandoverState.ENGAGED and is_silent(self._now_ns, self._vehicle):
             return Cause.SILENT, ""
         wanted = self._found is None or self._found in WANTED
         if self._failed and (wanted or self._found is Cause.FALLBACK):
@@ -341,7 +341,7 @@ class FlightCourse:
             flew = self._aloft and self._found is not Cause.DISARMED
             down = "it has landed and disarmed" if flew else "it is disarmed"
             return down if self._armed else "it was not armed"
-        if silent(self._now_ns, vehicle):
+        if is_silent(self._now_ns, vehicle):
             since_s = (self._now_ns - vehicle.at_ns) / SECOND_NS
             was = "stood on the ground" if vehicle.landed else "was in the air"
             return f"when it was last heard, {since_s:.0f} s before, it {was}, armed, {mode}"
@@ -350,20 +350,20 @@ class FlightCourse:
         return f"it is in the air, {mode}"
 
 
-def _reason(one: Passage) -> str:
+def _reason(one: StateTransition) -> str:
     """Return why something was refused, without what the cause says already."""
-    asked = "" if one.ask is None else f"{one.ask.value}: "
-    text = one.why
+    asked = "" if one.request is None else f"{one.request.value}: "
+    text = one.reason
     for said in (
         asked,
         "take-off: ",
-        BROKEN_OFF,
+        CLIMB_ABORTED,
         "another vehicle is heard on this link: ",
         "the vehicle's own failsafe ",
         "the vehicle's own fence ",
     ):
         text = text.removeprefix(said)
-    if one.ask is None and text.startswith("("):  # the failsafe's mode
+    if one.request is None and text.startswith("("):  # the failsafe's mode
         text = text.replace("(", "", 1).replace(")", "", 1)
     return text.replace("it took too long (", "not done in ").removesuffix(")") if "too long" in text else text
 

@@ -25,12 +25,13 @@ from logs.recording.senders import ChosenVehicle, LogSender, SenderCounts, choos
 from logs.recording.summary import count
 from logs.recording.tlog import Tlog, TlogPacket, read_tlog
 from uavctl.errors import RecordingError
-from uavctl.mavlink.clocksync import ClockSync, StampUnit, StampUnitWatch
-from uavctl.mavlink.codec import OWN_ESTIMATE, decoded
-from uavctl.mavlink.framing import MessageLayout, scan_one
-from uavctl.mavlink.messages import Attitude, Battery, Heartbeat, Message, Position, Text
-from uavctl.mavlink.profile import autopilot_name, describe_mode
-from uavctl.mavlink.vehicle import Joiner
+from uavctl.mavlink.clocksync import ClockSync, StampUnit, StampUnitDetector
+from uavctl.mavlink.codec import AUTOPILOT_ESTIMATE, decode_scan
+from uavctl.mavlink.framing import scan_single_frame
+from uavctl.mavlink.message_layout import MessageLayout
+from uavctl.mavlink.messages import Attitude, Battery, Heartbeat, Message, Position, StatusText
+from uavctl.mavlink.profile import describe_mode, find_autopilot_name
+from uavctl.mavlink.statustext import StatusTextAssembler
 from uavctl.records import Datagram, Vec3
 
 _SETPOINT, _GLOBAL = mavlink.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED, mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT
@@ -186,15 +187,15 @@ class SentSource:
     captured_ns: list[int | None] = field(default_factory=list)
     refused: int = 0
     clock: ClockSync = field(default_factory=lambda: ClockSync(_WINDOW_NS, 0, _AHEAD_NS))
-    units: StampUnitWatch = field(default_factory=StampUnitWatch)
+    units: StampUnitDetector = field(default_factory=StampUnitDetector)
 
     def take(self, position_m: Vec3, velocity_mps: Vec3 | None, stamp_us: int | None, at_ns: int) -> None:
         """Take a position in local NED, with the stamp of its source."""
         captured = None
-        if stamp_us is not None and self.units.take(stamp_us, position_m, at_ns) is not StampUnit.MICROSECONDS:
+        if stamp_us is not None and self.units.update(stamp_us, position_m, at_ns) is not StampUnit.MICROSECONDS:
             self.refused += 1
         elif stamp_us is not None:
-            found = self.clock.captured_ns(stamp_us * 1000, at_ns)
+            found = self.clock.estimate_capture_ns(stamp_us * 1000, at_ns)
             self.refused += isinstance(found, str)
             captured = None if isinstance(found, str) else found
         self.track.append((at_ns, position_m, velocity_mps))
@@ -218,7 +219,7 @@ class _Reader:
         self._modes: list[ModeBegin] = []
         self._texts: list[SpokenText] = []
         self._beats_ns: list[int] = []
-        self._joined = Joiner()
+        self._joined = StatusTextAssembler()
         self._home_deg: tuple[float, float] | None = None
         self._parameters = ParameterReader()
         self._bad: Counter[str] = Counter()
@@ -227,7 +228,7 @@ class _Reader:
     def take(self, packet: TlogPacket) -> None:
         """Take one packet."""
         self._last_ns = packet.at_ns
-        found = scan_one(packet.data)
+        found = scan_single_frame(packet.data)
         for frame in found.frames:
             system = system_of(frame.data)
             name = f"{mavlink.mavlink_map[frame.message_id].msgname} of system {system}"
@@ -240,7 +241,7 @@ class _Reader:
                 self._take_own(frame.message_id, frame.data, packet.at_ns)
         if message_of(packet.data) in _LOOKED_INTO and self._is_vehicle(system_of(packet.data)):
             self._take_parameter(packet)
-        understood = decoded(found)
+        understood = decode_scan(found)
         self._bad.update(understood.bad)
         for message in understood.messages:
             self._take_message(message, packet.at_ns)
@@ -275,7 +276,7 @@ class _Reader:
                 name = f"{message.name} of system {message.system}"
                 place = _ned(message, message.position_m)
                 self._sources.setdefault(name, SentSource()).take(place, _velocity(message), message.stamp_us, at_ns)
-            case Text() if own:
+            case StatusText() if own:
                 self._take_text(message, at_ns)
             case Attitude() if own:
                 self._attitudes.setdefault(message.quaternion, []).append((at_ns, message.angles_rad))
@@ -298,18 +299,18 @@ class _Reader:
         return any(system == one.system for one in self._vehicle.others)
 
     def _take_mode(self, beat: Heartbeat, at_ns: int) -> None:
-        mode, _ = describe_mode(autopilot_name(beat.autopilot), beat.vehicle_type, beat.custom_mode)
+        mode, _ = describe_mode(find_autopilot_name(beat.autopilot), beat.vehicle_type, beat.custom_mode)
         armed = bool(beat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
         if not self._modes or (self._modes[-1].mode, self._modes[-1].armed) != (mode, armed):
             self._modes.append(ModeBegin(at_s=self._second(at_ns), mode=mode, armed=armed))
 
-    def _take_text(self, piece: Text, at_ns: int) -> None:
-        for whole in self._joined.take(piece, at_ns):
+    def _take_text(self, piece: StatusText, at_ns: int) -> None:
+        for whole in self._joined.add_chunk(piece, at_ns):
             severity = mavlink.enums["MAV_SEVERITY"][min(whole.severity, 7)].name.removeprefix("MAV_SEVERITY_").lower()
             self._texts.append(SpokenText(at_s=self._second(at_ns), severity=severity, text=whole.text))
 
     def _take_setpoint(self, frame: bytes, at_ns: int) -> None:
-        raw = _SETPOINT_LAYOUT.read(frame)
+        raw = _SETPOINT_LAYOUT.unpack(frame)
         if raw.coordinate_frame != mavlink.MAV_FRAME_LOCAL_NED:
             return  # counted, but no place or direction in local NED
         if self._vehicle.system is not None and raw.target_system not in (0, self._vehicle.system):
@@ -321,7 +322,7 @@ class _Reader:
         )
 
     def _take_global(self, frame: bytes, at_ns: int) -> None:
-        raw = _GLOBAL_LAYOUT.read(frame)
+        raw = _GLOBAL_LAYOUT.unpack(frame)
         down_m = -raw.relative_alt / 1000
         if (raw.lat, raw.lon) == (0, 0):  # it has no position yet
             self._height.append((at_ns, -down_m))
@@ -330,7 +331,7 @@ class _Reader:
         self._take_place(raw.msgname, raw.lat, raw.lon, down_m, velocity_mps, at_ns)
 
     def _take_gps(self, frame: bytes, at_ns: int) -> None:
-        raw = _GPS_LAYOUT.read(frame)
+        raw = _GPS_LAYOUT.unpack(frame)
         if raw.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX:
             self._take_place(raw.msgname, raw.lat, raw.lon, -raw.alt / 1000, None, at_ns)
 
@@ -343,7 +344,7 @@ class _Reader:
 
     def _take_odometry(self, frame: bytes, at_ns: int) -> None:
         """Take the vehicle's own estimate, as PX4 sends it where it sends no LOCAL_POSITION_NED."""
-        raw = _ODOMETRY_LAYOUT.read(frame)
+        raw = _ODOMETRY_LAYOUT.unpack(frame)
         position_m = (raw.x, raw.y, raw.z)
         own = raw.estimator_type == mavlink.MAV_ESTIMATOR_TYPE_AUTOPILOT and raw.frame_id == mavlink.MAV_FRAME_LOCAL_NED
         if own and all(map(math.isfinite, position_m)):
@@ -361,7 +362,7 @@ class _Reader:
             recording=name,
             begin_utc=begin.isoformat(timespec="milliseconds"),
             duration_s=self._second(self._last_ns),
-            autopilot="" if beat is None else autopilot_name(beat.autopilot),
+            autopilot="" if beat is None else find_autopilot_name(beat.autopilot),
             vehicle_system=None if beat is None else beat.system,
             own_positions=len(self._own.get(own_source, ())),
             own_source=own_source,
@@ -370,7 +371,7 @@ class _Reader:
             modes=tuple(self._modes),
             texts=tuple(self._texts),
             messages=dict(sorted(self.counted.items())),
-            bad={reason: number for reason, number in sorted(self._bad.items()) if reason != OWN_ESTIMATE},
+            bad={reason: number for reason, number in sorted(self._bad.items()) if reason != AUTOPILOT_ESTIMATE},
             parameters=self._parameters.parameters(),
             notes=(*self._vehicle.notes, *log.notes),
             rates_hz={

@@ -14,7 +14,8 @@ import msgspec
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from uavctl.mavlink.framing import MessageLayout, scan, text_of
+from uavctl.mavlink.framing import scan_frames
+from uavctl.mavlink.message_layout import MessageLayout, decode_text
 from uavctl.records import Datagram, Record, ToldParameter
 
 _HEARTBEAT, _PARAM_VALUE = mavlink.MAVLINK_MSG_ID_HEARTBEAT, mavlink.MAVLINK_MSG_ID_PARAM_VALUE
@@ -86,7 +87,7 @@ class ParameterReader:
             message = data[begin + 5] if data[begin] == _V1 else int.from_bytes(data[begin + 7 : begin + 10], "little")
             # Checksums take time: where frame follows frame, only those that are read need theirs.
             looked_at = message in _LAYOUTS or datagram.link in self._lost
-            frames = scan(data[begin:end], final=True).frames if looked_at else []
+            frames = scan_frames(data[begin:end], final=True).frames if looked_at else []
             if frames and len(frames[0].data) == length:
                 self._read(message, frames[0].data)
                 self._lost.discard(datagram.link)
@@ -98,12 +99,12 @@ class ParameterReader:
     def _read(self, message_id: int, frame: bytes) -> None:
         if message_id not in _LAYOUTS:
             return
-        fields = _LAYOUTS[message_id].read(frame)
+        fields = _LAYOUTS[message_id].unpack(frame)
         if message_id == _HEARTBEAT:
             if fields.autopilot != mavlink.MAV_AUTOPILOT_INVALID:
                 self._autopilots.setdefault(fields.src_system, fields.autopilot)
             return
-        key = fields.src_system, fields.src_component, text_of(fields.param_id)
+        key = fields.src_system, fields.src_component, decode_text(fields.param_id)
         if key[2] != _HASH and (len(self._told) < _MOST or key in self._told):
             self._told[key] = fields.param_value, fields.param_type
             self._counts[key[:2]] = fields.param_count

@@ -16,7 +16,7 @@ from logs.recording.tlog import GROUND_SYSTEMS, TlogPacket
 from uavctl.errors import UsageError
 from uavctl.mavlink.codec import decode
 from uavctl.mavlink.messages import Heartbeat
-from uavctl.mavlink.profile import autopilot_name
+from uavctl.mavlink.profile import find_autopilot_name
 from uavctl.mavlink.vehicle import is_vehicle
 
 _AUTOPILOT = int(mavlink.MAV_COMP_ID_AUTOPILOT1)
@@ -56,7 +56,7 @@ class ChosenVehicle:
         if self.system is not None and self.heartbeat is None:
             found.append(f"system {self.system} sends no heartbeat of an autopilot: its mode and arming are not known")
         if self.others:
-            names = ", ".join(f"system {one.system} ({autopilot_name(one.autopilot)})" for one in self.others)
+            names = ", ".join(f"system {one.system} ({find_autopilot_name(one.autopilot)})" for one in self.others)
             found.append(
                 f"another vehicle is in it: {names}; system {self.system} is shown, `--system` chooses another"
                 if len(self.others) == 1

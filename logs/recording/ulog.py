@@ -25,7 +25,7 @@ from logs.recording.parameters import VehicleParameter
 from logs.recording.summary import count
 from logs.recording.tlog import LONGEST_SILENCE_NS
 from uavctl.errors import RecordingError, need
-from uavctl.mavlink.framing import plain_text
+from uavctl.mavlink.message_layout import strip_escapes
 
 _HEAD_BYTES = 16  # magic, version, time of the start
 _OWN, _SENT = "vehicle_local_position", ("vehicle_visual_odometry", "vehicle_mocap_odometry")
@@ -151,7 +151,7 @@ class _Reader:
             recording=str(self._path),
             begin_utc=self._begin_utc(),
             duration_s=self._second(self._last_us),
-            autopilot=plain_text(str(log.msg_info_dict.get("sys_name", "PX4"))).lower(),
+            autopilot=strip_escapes(str(log.msg_info_dict.get("sys_name", "PX4"))).lower(),
             vehicle_system=system,
             own_positions=len(own),
             own_source=own_source if own else "",
@@ -162,7 +162,7 @@ class _Reader:
             messages={name: len(at_us) for name, at_us in stamps.items()},
             bad=dict(self._bad),
             parameters={
-                plain_text(name): _parameter(value, system)
+                strip_escapes(name): _parameter(value, system)
                 for name, value in log.initial_parameters.items()
                 if isinstance(value, int | float)
             },
@@ -335,7 +335,7 @@ class _Reader:
         tagged = [one for some in self._log.logged_messages_tagged.values() for one in some]
         for one in sorted([*self._log.logged_messages, *tagged], key=lambda one: int(one.timestamp)):
             severity = _SEVERITIES[min(max(one.log_level - ord("0"), 0), 7)]
-            yield SpokenText(at_s=self._second(one.timestamp), severity=severity, text=plain_text(one.message))
+            yield SpokenText(at_s=self._second(one.timestamp), severity=severity, text=strip_escapes(one.message))
 
     def _begin_utc(self) -> str:
         """Return when the log began, by the first GPS time; `time_ref_utc` is but the offset of a time zone."""
@@ -353,7 +353,7 @@ class _Reader:
             yield f"{count(len(dropouts), 'dropout')} of the log, {total_s:.2f} s in all, the longest {longest_s:.2f} s"
         for at_us, name, value in self._log.changed_parameters:
             if isinstance(value, int | float):
-                yield f"parameter {plain_text(name)} became {value:g} at {self._second(at_us):.2f} s"
+                yield f"parameter {strip_escapes(name)} became {value:g} at {self._second(at_us):.2f} s"
         if self._log.file_corruption:
             yield "parts of the file are damaged; left out"
         if self._short:
@@ -368,7 +368,7 @@ def _parameter(value: Any, system: int) -> VehicleParameter:
 
 
 def _name(topic: Any) -> str:
-    name = plain_text(topic.name)
+    name = strip_escapes(topic.name)
     return f"{name} {topic.multi_id}" if topic.multi_id else name
 
 

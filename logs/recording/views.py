@@ -28,7 +28,7 @@ from logs.recording import derived_topics as topics
 from logs.recording.derived_topics import pack, tightened
 from logs.recording.design_view import AXIS_NUMBER, DesignView, design_view
 from logs.recording.topics import RecorderNote
-from uavctl.frames import axes_turn, from_axes
+from uavctl.frames import quaternion_from_axes, rotation_to_ned
 from uavctl.records import (
     ControlMode,
     Datagram,
@@ -151,7 +151,7 @@ def frames(at_ns: int) -> FrameTransforms:
         "parent_frame_id": ROOM,
         "child_frame_id": NED,
         "translation": {},
-        "rotation": quaternion(axes_turn("enu")),
+        "rotation": quaternion(rotation_to_ned("enu")),
     }
     return _made(FrameTransforms, transforms=[turned])
 
@@ -297,7 +297,7 @@ def _estimate_sphere(design: DesignView, estimate: Estimate) -> Fields:
             cov[row][column] = estimate.cov[i][j]
     variances, directions = np.linalg.eigh(cov)
     semi_axes_m = STD_95 * np.sqrt(np.maximum(variances, 0.0))
-    turn = quaternion(from_axes(directions.T.tolist()))
+    turn = quaternion(quaternion_from_axes(directions.T.tolist()))
     at = pose(design.position_of(estimate.mean), turn)
     return {"pose": at, "size": vector([2 * one for one in semi_axes_m.tolist()]), "color": _SPREAD}
 

@@ -32,7 +32,7 @@ from logs.report.plots import DASHED, DOTTED, SEEN, along, course, position_limi
 from logs.report.svg import Canvas, Drawing, canvas, colour
 from uavctl.config.load import dotted
 from uavctl.errors import RecordingError, UsageError
-from uavctl.mavlink.framing import scan
+from uavctl.mavlink.framing import scan_frames
 from uavctl.records import Header
 
 # The recordings of a comparison, in memory.
@@ -289,7 +289,7 @@ def _parting(left: RecordedMessage | None, right: RecordedMessage | None, origin
 
 def _frame(data: bytes) -> str:
     """Return raw bytes in words: the name of their first MAVLink message, and their number."""
-    frames = scan(data, final=True).frames
+    frames = scan_frames(data, final=True).frames
     name = mavlink.mavlink_map[frames[0].message_id].msgname if frames else "no whole packet"
     return f"{name}, {len(data)} bytes"
 

@@ -52,7 +52,7 @@ from uavctl.flight.monitors.stale import FROZEN
 from uavctl.flight.supervise import OF_POSITIONS
 from uavctl.mavlink.clocksync import StampRefusal
 from uavctl.mavlink.codec import BAD_FIELD
-from uavctl.mavlink.connection import HUNG_UP, WENT_SILENT
+from uavctl.mavlink.connection import CONNECTION_SILENT, HUNG_UP
 from uavctl.mavlink.relay import HELD_BACK, REASONS, RELAY_RESUMED, RELAY_SILENT
 from uavctl.mavlink.vehicle import SECOND_VEHICLE
 from uavctl.outcome import Cause
@@ -214,7 +214,9 @@ def _lost(e: FlightEvidence) -> Iterator[Finding]:
     if gaps_s.size and gaps_s.max() > _UNHEARD_S:
         begun_s, ended_s = (float(one) for one in heard_s[gaps_s.argmax() :][:2])
         text = f"no heartbeat of it came for {seconds(ended_s - begun_s)}, from {seconds(begun_s)} on"
-        lost = [o for o in flight.events if o.code in (HUNG_UP, WENT_SILENT) and o.text.startswith(_LINK_OF_VEHICLE)]
+        lost = [
+            o for o in flight.events if o.code in (HUNG_UP, CONNECTION_SILENT) and o.text.startswith(_LINK_OF_VEHICLE)
+        ]
         if lost:
             told = lost[0].text.removeprefix(_LINK_OF_VEHICLE).partition(";")[0]
             text += f"; at {seconds(e.second(lost[0].at_ns))} {told}"

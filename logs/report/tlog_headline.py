@@ -301,7 +301,7 @@ def _off_track(armed: ArmedFlight) -> Iterator[Finding]:
     before, as a trajectory's do; else each place counts from the arrival there on.
     """
     flight = armed.flight
-    external = {profile.external for profile in PROFILES.values()}
+    external = {profile.external_mode for profile in PROFILES.values()}
     t_s = flight.setpoint_t_s
     kept = np.isfinite(flight.setpoint_m).all(axis=1) & armed.inside(t_s).astype(np.bool_)
     kept &= np.array([armed.mode_at(at_s) in external for at_s in t_s], dtype=np.bool_)
@@ -325,8 +325,8 @@ def _off_track(armed: ArmedFlight) -> Iterator[Finding]:
 
 def _mode_left(armed: ArmedFlight) -> Iterator[Finding]:
     """Find where it left the mode that takes setpoints for one that is no landing; who asked is not in it."""
-    external = {profile.external for profile in PROFILES.values()}
-    landing = {mode for profile in PROFILES.values() for mode in profile.landing}
+    external = {profile.external_mode for profile in PROFILES.values()}
+    landing = {mode for profile in PROFILES.values() for mode in profile.landing_modes}
     failsafe = {_C.VEHICLE_FENCE, _C.BATTERY_LOW, _C.VEHICLE_POSITION_LOST, _C.VEHICLE_FAILSAFE}
     if any(one.cause in failsafe for one in (*_texts(armed), *_failsafe_mode(armed))):
         return
@@ -350,7 +350,7 @@ def _second_vehicle(armed: ArmedFlight) -> Iterator[Finding]:
 
 def _left(info: MavlinkFlightInfo, told_s: Container[float]) -> Iterator[str]:
     """Yield where it left a mode that takes setpoints, whoever wanted that, but for the times that are told above."""
-    external = {profile.external for profile in PROFILES.values()}
+    external = {profile.external_mode for profile in PROFILES.values()}
     left = [
         (one, then)
         for one, then in pairwise(info.modes)

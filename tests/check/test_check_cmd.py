@@ -169,7 +169,7 @@ class Wire:
         self._bench, self._name = bench, name
         self.answered = 0
 
-    known, unread = True, False
+    has_known_sender, has_unread = True, False
 
     def fileno(self) -> int:
         return -1
@@ -177,17 +177,17 @@ class Wire:
     def filenos(self) -> tuple[int, ...]:
         return ()
 
-    def lost(self) -> int:
+    def count_lost(self) -> int:
         return 0
 
-    def trust(self, index: int) -> None:
+    def trust_sender(self, index: int) -> None:
         pass
 
-    def receive(self, *, everything: bool = False) -> list[tuple[bytes, int]]:
+    def receive(self, *, read_all: bool = False) -> list[tuple[bytes, int]]:
         taken, self._bench.arrived[self._name] = self._bench.arrived[self._name], []
         return taken
 
-    def answer(self, index: int) -> None:
+    def select_peer(self, index: int) -> None:
         self.answered += 1
 
     def send(self, data: bytes) -> None:

@@ -20,7 +20,7 @@ from uavctl.cli.app import app, run
 from uavctl.cli.common import columns, labelled, messages, pictures, two_columns
 from uavctl.cli.usage import EXAMPLES, commands_of, example
 from uavctl.config.load import keys_named
-from uavctl.frames import up_hint
+from uavctl.frames import suggest_height_sign
 
 COMMANDS = {" ".join(chain): one for chain, one in commands_of(app)}
 EXIT_CODES = "130 interrupted"  # told once, by `uavctl --help`
@@ -127,9 +127,9 @@ def test_a_positive_height_is_told_with_the_number_to_write(capsys: pytest.Captu
     [("down", 1.1, "-1.1"), ("down", 5.0, ""), ("down", -5.0, ""), ("north", 1.1, ""), ("down", -1.0, "")],
 )
 def test_up_is_hinted_at_only_where_it_would_be_inside(axis: str, value_m: float, meant: str) -> None:
-    hint = up_hint(axis, value_m, -2.5, 0.0)
+    hint = suggest_height_sign(axis, value_m, -2.5, 0.0)
     assert (meant in hint) if meant else hint == ""
-    assert up_hint("down", 1.1, -2.5, 2.0) == ""  # a room that goes below its origin
+    assert suggest_height_sign("down", 1.1, -2.5, 2.0) == ""  # a room that goes below its origin
 
 
 def extras() -> set[str]:

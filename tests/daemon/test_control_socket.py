@@ -21,10 +21,10 @@ from uavctl.daemon.control_socket import (
     MAX_LINE,
     ControlRequest,
     ControlServer,
-    control_folder,
-    daemon_name,
-    listening,
-    socket_path,
+    find_control_folder,
+    make_daemon_name,
+    make_socket_path,
+    open_listener,
 )
 from uavctl.daemon.health import Health, RecorderHealth
 from uavctl.errors import UsageError, VehicleTakenError
@@ -63,7 +63,7 @@ class Flight:
         self.orders.append(command)
         return True
 
-    def against(self, order: Order) -> str:
+    def explain_refusal(self, order: Order) -> str:
         return f"{order} is for nothing" if order in self.idle else ""
 
     def tick(self, at_ns: int) -> tuple[tuple[Command, Event], ...]:
@@ -114,7 +114,7 @@ class Rig:
 
 @pytest.fixture
 def rig(folder: Path) -> Iterator[Rig]:
-    with listening(folder, "one") as listener:
+    with open_listener(folder, "one") as listener:
         rig = Rig(folder, listener)
         yield rig
         rig.close()
@@ -247,7 +247,7 @@ def test_a_client_that_goes_before_its_answer_disturbs_nobody(rig: Rig) -> None:
 
 
 def test_too_many_orders_for_one_tick_are_refused(folder: Path) -> None:
-    with listening(folder, "one") as listener:
+    with open_listener(folder, "one") as listener:
         rig = Rig(folder, listener, room=1)
         first, second = rig.say(ask(ask="hold"), ask(ask="land"))
         rig.ticks(2)
@@ -294,12 +294,12 @@ class Stranger:
 
 def test_folder_and_socket_are_for_one_user(folder: Path) -> None:
     inner = folder / "uavctl"
-    with listening(inner, "one"):
+    with open_listener(inner, "one"):
         assert stat.S_IMODE(inner.stat().st_mode) == 0o700
         assert stat.S_IMODE((inner / "one.sock").stat().st_mode) == 0o600
     assert not (inner / "one.sock").exists()
     inner.chmod(0o750)
-    with pytest.raises(UsageError, match="chmod 700"), listening(inner, "one"):
+    with pytest.raises(UsageError, match="chmod 700"), open_listener(inner, "one"):
         pytest.fail("others may enter")
 
 
@@ -308,21 +308,21 @@ def test_a_dead_daemon_s_socket_is_taken_over_and_a_live_one_s_is_not(folder: Pa
     dead.bind(str(folder / "one.sock"))
     dead.listen()
     dead.close()  # the file stays, as after SIGKILL
-    with listening(folder, "one"):
-        with pytest.raises(VehicleTakenError, match="a daemon named one is running"), listening(folder, "one"):
+    with open_listener(folder, "one"):
+        with pytest.raises(VehicleTakenError, match="a daemon named one is running"), open_listener(folder, "one"):
             pytest.fail("two of one name")
-        with listening(folder, "two"):
+        with open_listener(folder, "two"):
             pass
 
 
 def test_what_is_no_socket_stays(folder: Path) -> None:
     (folder / "one.sock").write_text("notes")
-    with pytest.raises(UsageError, match="another folder"), listening(folder, "one"):
+    with pytest.raises(UsageError, match="another folder"), open_listener(folder, "one"):
         pytest.fail("bound over a file")
     assert (folder / "one.sock").read_text() == "notes"
     with pytest.raises(UsageError, match="shorter folder"):
-        socket_path(folder / ("x" * 120), "one")
-    with pytest.raises(UsageError, match="choose another"), listening(folder / "one.sock" / "below", "one"):
+        make_socket_path(folder / ("x" * 120), "one")
+    with pytest.raises(UsageError, match="choose another"), open_listener(folder / "one.sock" / "below", "one"):
         pytest.fail("a folder below a file")
 
 
@@ -335,17 +335,19 @@ def test_a_socket_of_another_user_in_the_way_is_told_in_a_line(folder: Path, mon
         raise PermissionError(13, "Permission denied", address)
 
     monkeypatch.setattr("uavctl.daemon.control_socket.socket.socket.connect", connect)
-    with pytest.raises(UsageError, match=f"run: sudo rm {folder}/one.sock$"), listening(folder, "one"):
+    with pytest.raises(UsageError, match=f"run: sudo rm {folder}/one.sock$"), open_listener(folder, "one"):
         pytest.fail("bound over another one's socket")
     assert (folder / "one.sock").is_socket()
 
 
 def test_names_and_folders() -> None:
-    assert daemon_name(CONFIG) == "room-udpin-0.0.0.0-14540"
+    assert make_daemon_name(CONFIG) == "room-udpin-0.0.0.0-14540"
     odd = load_config("room", ['name="a/../b c"', 'daemon.vehicle="serial:///dev/ttyACM0:57600"'])
-    assert daemon_name(odd) == "a-..-b-c-serial-dev-ttyACM0-57600"
-    assert control_folder(Path("/x"), {"UAVCTL_CONTROL": "/y"}) == Path("/x")
-    assert control_folder(None, {"UAVCTL_CONTROL": "/y", "XDG_RUNTIME_DIR": "/z"}) == Path("/y")
+    assert make_daemon_name(odd) == "a-..-b-c-serial-dev-ttyACM0-57600"
+    assert find_control_folder(Path("/x"), {"UAVCTL_CONTROL": "/y"}) == Path("/x")
+    assert find_control_folder(None, {"UAVCTL_CONTROL": "/y", "XDG_RUNTIME_DIR": "/z"}) == Path("/y")
     with tempfile.TemporaryDirectory(prefix="uavctl-") as own:
-        assert control_folder(None, {"XDG_RUNTIME_DIR": own}) == Path(own) / "uavctl"
-    assert ControlRequest(ask="goto", position_m=(float("inf"), 0.0, 0.0)).problem() == "position_m has to be finite"
+        assert find_control_folder(None, {"XDG_RUNTIME_DIR": own}) == Path(own) / "uavctl"
+    assert (
+        ControlRequest(ask="goto", position_m=(float("inf"), 0.0, 0.0)).find_problem() == "position_m has to be finite"
+    )

@@ -223,7 +223,7 @@ def test_where_the_system_kept_the_oldest_words_only_nothing_goes_out_until_the_
 @pytest.mark.fault(50)
 def test_a_backlog_that_is_never_read_to_its_end_lets_nothing_out() -> None:
     bench = Bench()
-    bench.connections["vehicle"].unread = True
+    bench.connections["vehicle"].has_unread = True
     bench.fly(duration_s=3.0, stop_limit_s=0.0)
     assert {name for _, name in bench.connections["vehicle"].words} <= {"TIMESYNC"}  # answers alone
     assert sum(one.counts.get("withheld", 0) for one in bench.memory.of(Refused)) > 20

@@ -11,7 +11,7 @@ from loopback_rig import Memory, shared_loop
 from sim.simulation import Peers
 from uavctl.cli.ctl import _relay
 from uavctl.config import load_config
-from uavctl.daemon.health import Health, HealthWatch, RecorderHealth, RelayHealth, line
+from uavctl.daemon.health import Health, HealthMonitor, RecorderHealth, RelayHealth, format_health
 from uavctl.records import ControlMode, Ticked
 
 TICK_NS = 50_000_000
@@ -27,7 +27,7 @@ class Flight:
         self.lines: list[str] = []
         self.dropped = 0
         self.warning = ""
-        self.watch = HealthWatch(self.loop, config, ("one", "udpin://x:1", 7), self._recorder, self.lines.append)
+        self.watch = HealthMonitor(self.loop, config, ("one", "udpin://x:1", 7), self._recorder, self.lines.append)
         self.tick = 0
         self.ticked: Ticked | None = None  # the last one
 
@@ -45,13 +45,13 @@ class Flight:
             self.ticked = self.loop.tick(self.tick, at_ns, self.peers.receiver(at_ns), missed)
             self.watch.after_tick(self.ticked, lateness_ns)
             self.tick += 1
-        return self.watch.look()
+        return self.watch.make_health()
 
 
 def test_before_the_first_tick_nothing_is_known_and_nothing_fails() -> None:
-    health = Flight().watch.look()
+    health = Flight().watch.make_health()
     assert (health.mode, health.age_s, health.position_m, health.vehicle) == (None, None, None, None)
-    assert line(health).startswith("-  age - s  loss - %")
+    assert format_health(health).startswith("-  age - s  loss - %")
 
 
 @pytest.mark.slow
@@ -133,10 +133,10 @@ def test_a_disk_that_gets_low_is_told_once_in_a_line_of_its_own() -> None:
 
 def test_a_relay_that_goes_on_alone_is_told_apart() -> None:
     relay = RelayHealth(sent=90, sent_hz=30.0, kept={}, last_s=0.1, alone=False)
-    health = msgspec.structs.replace(Flight().watch.look(), relay=relay)
+    health = msgspec.structs.replace(Flight().watch.make_health(), relay=relay)
     alone = msgspec.structs.replace(health, relay=msgspec.structs.replace(relay, alone=True))
     without = msgspec.structs.replace(health, relay=None)
-    fields = [line(one).split("  ") for one in (health, alone, without)]
+    fields = [format_health(one).split("  ") for one in (health, alone, without)]
     assert "relay 30 /s" in fields[0] and "relay 30 /s alone" in fields[1]
     assert not any(one.startswith("relay") for one in fields[2])
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from uavctl.daemon.lock import LONGEST_FLIGHT_NS, VehicleLock, identity, sole_daemon
+from uavctl.daemon.lock import LONGEST_FLIGHT_NS, VehicleLock, identify_connection, lock_vehicle
 from uavctl.errors import ConnectionSpecError, VehicleTakenError
 
 URL = "udpin://127.0.0.1:14540"
@@ -28,7 +28,7 @@ URL = "udpin://127.0.0.1:14540"
     ],
 )
 def test_urls_that_mean_the_same_are_one_vehicle(one: str, other: str) -> None:
-    assert identity(one) == identity(other)
+    assert identify_connection(one) == identify_connection(other)
 
 
 @pytest.mark.parametrize(
@@ -41,58 +41,60 @@ def test_urls_that_mean_the_same_are_one_vehicle(one: str, other: str) -> None:
     ],
 )
 def test_other_vehicles_are_others(one: str, other: str) -> None:
-    assert identity(one) != identity(other)
+    assert identify_connection(one) != identify_connection(other)
 
 
 def test_a_link_to_a_serial_device_is_the_device(tmp_path: Path) -> None:
     (tmp_path / "tty").touch()
     (tmp_path / "by-id").symlink_to(tmp_path / "tty")
-    assert identity(f"serial://{tmp_path}/by-id:57600") == identity(f"serial://{tmp_path}/tty:57600")
+    assert identify_connection(f"serial://{tmp_path}/by-id:57600") == identify_connection(
+        f"serial://{tmp_path}/tty:57600"
+    )
 
 
 @pytest.mark.parametrize("url", ["tcp://127.0.0.1:port", "udpin://no.such.host.invalid:14540"])
 def test_what_leads_nowhere_is_told(url: str) -> None:
     with pytest.raises(ConnectionSpecError, match=url):
-        identity(url)
+        identify_connection(url)
 
 
 @pytest.mark.fault(35)
 def test_the_second_one_is_refused_with_the_first_one_s_pid(tmp_path: Path) -> None:
     taken = pytest.raises(VehicleTakenError, match=f"process {os.getpid()} flies")
-    with sole_daemon(URL, tmp_path), taken, sole_daemon("udpin://localhost:14540", tmp_path):
+    with lock_vehicle(URL, tmp_path), taken, lock_vehicle("udpin://localhost:14540", tmp_path):
         pytest.fail("two daemons for one vehicle")
-    with sole_daemon(URL, tmp_path):  # free again
+    with lock_vehicle(URL, tmp_path):  # free again
         pass
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.fault(35)
 def test_two_vehicles_do_not_meet(tmp_path: Path) -> None:
-    with sole_daemon(URL, tmp_path), sole_daemon("udpin://127.0.0.1:14541", tmp_path):
+    with lock_vehicle(URL, tmp_path), lock_vehicle("udpin://127.0.0.1:14541", tmp_path):
         assert len(list(tmp_path.iterdir())) == 2
 
 
 @pytest.mark.fault(31, 35)
 def test_a_killed_holder_lets_go(tmp_path: Path) -> None:
     program = (
-        "import sys, time; from pathlib import Path; from uavctl.daemon.lock import sole_daemon\n"
-        "with sole_daemon(sys.argv[1], Path(sys.argv[2])): print('held', flush=True); time.sleep(60)"
+        "import sys, time; from pathlib import Path; from uavctl.daemon.lock import lock_vehicle\n"
+        "with lock_vehicle(sys.argv[1], Path(sys.argv[2])): print('held', flush=True); time.sleep(60)"
     )
     with subprocess.Popen([sys.executable, "-c", program, URL, str(tmp_path)], stdout=subprocess.PIPE) as process:
         assert process.stdout is not None and process.stdout.readline() == b"held\n"
-        with pytest.raises(VehicleTakenError, match=f"process {process.pid}"), sole_daemon(URL, tmp_path):
+        with pytest.raises(VehicleTakenError, match=f"process {process.pid}"), lock_vehicle(URL, tmp_path):
             pytest.fail("two daemons for one vehicle")
         process.send_signal(signal.SIGKILL)
-    with sole_daemon(URL, tmp_path):
+    with lock_vehicle(URL, tmp_path):
         pass
 
 
 @pytest.mark.fault(31)
 def test_the_next_holder_is_told_of_a_vehicle_that_was_left_in_flight(tmp_path: Path) -> None:
     program = (
-        "import os, sys; from pathlib import Path; from uavctl.daemon.lock import sole_daemon\n"
-        "with sole_daemon(sys.argv[1], Path(sys.argv[2])) as tenure:\n"
-        "    for word in sys.argv[3:]: tenure.note({'yes': True, 'no': False, 'unheard': None}[word])\n"
+        "import os, sys; from pathlib import Path; from uavctl.daemon.lock import lock_vehicle\n"
+        "with lock_vehicle(sys.argv[1], Path(sys.argv[2])) as tenure:\n"
+        "    for word in sys.argv[3:]: tenure.update({'yes': True, 'no': False, 'unheard': None}[word])\n"
         "    os.abort()"
     )
 
@@ -101,9 +103,9 @@ def test_the_next_holder_is_told_of_a_vehicle_that_was_left_in_flight(tmp_path: 
         assert done.returncode == -signal.SIGABRT
 
     def found() -> bool:
-        with sole_daemon(URL, tmp_path) as tenure:
-            leaves = tenure.leaves
-            tenure.note(False)
+        with lock_vehicle(URL, tmp_path) as tenure:
+            leaves = tenure.is_left_in_flight
+            tenure.update(False)
         return leaves
 
     killed("unheard", "no")
@@ -118,13 +120,13 @@ def test_the_next_holder_is_told_of_a_vehicle_that_was_left_in_flight(tmp_path: 
 
 @pytest.mark.fault(31)
 def test_a_flight_that_ends_in_the_air_is_left_too(tmp_path: Path) -> None:
-    with pytest.raises(ZeroDivisionError), sole_daemon(URL, tmp_path) as tenure:
-        tenure.note(True)
+    with pytest.raises(ZeroDivisionError), lock_vehicle(URL, tmp_path) as tenure:
+        tenure.update(True)
         raise ZeroDivisionError
-    with sole_daemon(URL, tmp_path) as tenure:
-        assert tenure.leaves
+    with lock_vehicle(URL, tmp_path) as tenure:
+        assert tenure.is_left_in_flight
     with pytest.raises(VehicleTakenError, match=f"process {os.getpid()} flies this vehicle already;"):  # noqa: SIM117
-        with sole_daemon(URL, tmp_path), sole_daemon(URL, tmp_path):
+        with lock_vehicle(URL, tmp_path), lock_vehicle(URL, tmp_path):
             pytest.fail("two daemons for one vehicle")
 
 
@@ -151,27 +153,27 @@ def test_what_the_last_holder_wrote_counts_for_as_long_as_a_battery_lasts(
     file.write_bytes(f"123 {URL}\n{word.format(**times)}\n".encode("latin-1"))
     with file.open("r+b") as one:
         tenure = VehicleLock([one.fileno()], URL, lambda: now)
-        assert tenure.leaves is leaves
-        tenure.note(True)
-        tenure.note(True)
+        assert tenure.is_left_in_flight is leaves
+        tenure.update(True)
+        tenure.update(True)
         again = VehicleLock([one.fileno()], URL, lambda: now)
-        assert again.leaves
-        again.note(False)
+        assert again.is_left_in_flight
+        again.update(False)
     assert file.read_text() == f"{os.getpid()} {URL}\n"
 
 
 @pytest.mark.fault(35)
 def test_a_lock_file_that_is_none_is_not_followed(tmp_path: Path) -> None:
-    with sole_daemon(URL, tmp_path):
+    with lock_vehicle(URL, tmp_path):
         name = next(tmp_path.iterdir())
     target = tmp_path / "precious"
     target.write_text("kept")
     name.symlink_to(target)
-    with pytest.raises(VehicleTakenError, match="see to the file"), sole_daemon(URL, tmp_path):
+    with pytest.raises(VehicleTakenError, match="see to the file"), lock_vehicle(URL, tmp_path):
         pytest.fail("the link was followed")
     assert target.read_text() == "kept"
 
 
 def test_without_a_folder_nothing_is_locked(tmp_path: Path) -> None:
-    with pytest.raises(VehicleTakenError, match="nothing shows"), sole_daemon(URL, tmp_path / "gone"):
+    with pytest.raises(VehicleTakenError, match="nothing shows"), lock_vehicle(URL, tmp_path / "gone"):
         pytest.fail("locked in no folder")

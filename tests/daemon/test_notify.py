@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from ticked_rig import ticked
 
-from uavctl.daemon.health import Notifier
+from uavctl.daemon.notifier import Notifier
 from uavctl.errors import UsageError
 
 TICK_NS = 50_000_000
@@ -60,7 +60,7 @@ def test_ready_with_the_first_tick_then_four_signs_of_life_a_watchdog_time(
     ticks(notifier, 1, 41)  # two seconds
     assert one.heard() == ["WATCHDOG=1"] * 8
     assert one.heard() == []  # no tick, no sign of life
-    notifier.status("track\nage 0.05 s")
+    notifier.send_status("track\nage 0.05 s")
     notifier.close()
     assert one.heard() == ["STATUS=track age 0.05 s", "STOPPING=1"]
 
@@ -85,7 +85,7 @@ def test_a_manager_that_is_gone_or_full_disturbs_nothing(manager: tuple[Manager,
     one, environ = manager
     notifier = Notifier(environ)
     for _ in range(10_000):
-        notifier.status("x" * 2000)
+        notifier.send_status("x" * 2000)
     one.close()
     ticks(notifier, 0, 10)
     notifier.close()

@@ -11,8 +11,8 @@ from collections.abc import Iterator
 import pytest
 from ticked_rig import ticked
 
-from uavctl.daemon import daemon as module
-from uavctl.daemon.daemon import Collector, Outcome, collected_between_ticks, realtime
+from uavctl.daemon import realtime as module
+from uavctl.daemon.realtime import GarbageCollector, RealtimeSetting, control_garbage_collection, enable_realtime
 
 SECOND = 1_000_000_000
 
@@ -25,14 +25,14 @@ def _as_before() -> Iterator[None]:
     assert gc.isenabled() and gc.get_freeze_count() == 0
 
 
-def outcomes(found: tuple[Outcome, ...]) -> dict[str, Outcome]:
-    return {outcome.part: outcome for outcome in found}
+def outcomes(found: tuple[RealtimeSetting, ...]) -> dict[str, RealtimeSetting]:
+    return {outcome.name: outcome for outcome in found}
 
 
 def test_what_it_says_is_what_holds() -> None:
-    with realtime() as found:
+    with enable_realtime() as found:
         told = outcomes(found)
-        assert told["scheduling"].ok == (os.sched_getscheduler(0) == os.SCHED_FIFO)
+        assert told["scheduling"].is_applied == (os.sched_getscheduler(0) == os.SCHED_FIFO)
 
 
 def test_without_permission_it_flies_on_and_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -40,13 +40,13 @@ def test_without_permission_it_flies_on_and_says_what_to_do(monkeypatch: pytest.
         raise PermissionError
 
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
-    monkeypatch.setattr(module, "_may_lock", lambda: False)
+    monkeypatch.setattr(module, "_may_lock_memory", lambda: False)
     monkeypatch.setattr(resource, "getrlimit", lambda _: (65536, 65536))
-    with realtime() as found:
+    with enable_realtime() as found:
         told = outcomes(found)
-        assert not told["scheduling"].ok and "LimitRTPRIO=20" in told["scheduling"].text
+        assert not told["scheduling"].is_applied and "LimitRTPRIO=20" in told["scheduling"].text
         # A limit that the memory fits in today would make an allocation fail in flight.
-        assert not told["memory"].ok and "LimitMEMLOCK=infinity" in told["memory"].text
+        assert not told["memory"].is_applied and "LimitMEMLOCK=infinity" in told["memory"].text
 
 
 class _Ring:
@@ -57,13 +57,13 @@ class _Ring:
 
 
 def test_what_was_there_is_not_walked_in_a_flight_and_nothing_is_collected_of_itself() -> None:
-    with collected_between_ticks():
+    with control_garbage_collection():
         assert not gc.isenabled() and gc.get_freeze_count() > 0
     assert gc.isenabled() and gc.get_freeze_count() == 0
 
 
 def test_garbage_goes_once_a_second_and_only_after_a_tick() -> None:
-    collector = Collector()
+    collector = GarbageCollector()
     gc.disable()
     try:
         collector.after_tick(ticked(0), 0)

@@ -23,7 +23,7 @@ from sim.autopilot.profile import FAILED, SIMULATED, Role
 from uavctl import loop as control
 from uavctl.cli.app import run
 from uavctl.daemon import engagement
-from uavctl.daemon.lock import sole_daemon
+from uavctl.daemon.lock import lock_vehicle
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.outcome import Cause, FlightCourse, make_ending
@@ -524,5 +524,5 @@ def test_the_table_of_the_documentation_has_every_cause_with_its_exit_code() -> 
 @pytest.mark.slow
 def test_the_lock_is_free_again(tmp_path: Path, typed: Type) -> None:
     typed(Endings(tmp_path).at(HandoverState.ENGAGED, interrupt, after_s=1.0), Cause.OPERATOR, *TAKE_OFF, good=True)
-    with sole_daemon("udpin://127.0.0.1:1") as tenure:
-        assert not tenure.leaves
+    with lock_vehicle("udpin://127.0.0.1:1") as tenure:
+        assert not tenure.is_left_in_flight

@@ -18,11 +18,12 @@ from uavctl.config import load_config
 from uavctl.config.connections import SourceConfig
 from uavctl.flight.measure import find_refusal
 from uavctl.mavlink import codec
-from uavctl.mavlink.codec import Encoder, decode
+from uavctl.mavlink.codec import decode
 from uavctl.mavlink.connection import Item, MavlinkConnection
-from uavctl.mavlink.handover import HandOver
-from uavctl.mavlink.handover_guards import HandoverView
-from uavctl.mavlink.handover_states import HandoverState, Sending
+from uavctl.mavlink.encoder import Encoder
+from uavctl.mavlink.handover import HandoverStateMachine
+from uavctl.mavlink.handover_guards import HandoverInput
+from uavctl.mavlink.handover_states import HandoverState, SetpointMode
 from uavctl.mavlink.requests import RequestKind
 from uavctl.records import PositionSample, Setpoint, SetpointSource, Severity
 
@@ -119,7 +120,7 @@ def test_row_16_a_second_vehicle_is_told_and_ignored() -> None:
         told += events(items)
     assert [(event.code, event.severity) for event in told] == [("second-vehicle", Severity.ERROR)] * 2
     assert link.stats(NOW).bad == {"second-vehicle": 10}
-    assert read(link.ask(RequestKind.LAND, 0.0))[0].target_system == 1
+    assert read(link.encode_request(RequestKind.LAND, 0.0))[0].target_system == 1
     assert len(statuses(link.receive(ours.heartbeat(), NOW).items)) == 1
 
 
@@ -179,7 +180,7 @@ def test_row_18_our_own_boot_clock_wraps() -> None:
     link.receive(Peer(1, 1).heartbeat(), NOW)
     wrap_ns = 2**32 * MS
     for at_ns, want in ((wrap_ns - 1, 2**32 - 1), (wrap_ns, 0), (7 * wrap_ns + 5 * MS, 5)):
-        data = link.setpoint(Setpoint(at_ns=at_ns, accel_mps2=(0.0, 0.0, 1.0), source=SetpointSource.PLAN))
+        data = link.encode_setpoint(Setpoint(at_ns=at_ns, accel_mps2=(0.0, 0.0, 1.0), source=SetpointSource.PLAN))
         assert struct.unpack_from("<I", data, 10)[0] == want
 
 
@@ -267,9 +268,12 @@ def test_row_20_the_restart_is_told_once() -> None:
 
 @pytest.mark.fault(20)
 def test_row_20_a_rebooted_vehicle_is_let_go() -> None:
-    link, vehicle, hand_over = make_link(), Peer(1, 1), HandOver()
+    link, vehicle, hand_over = make_link(), Peer(1, 1), HandoverStateMachine()
     (flying,) = statuses(link.receive(vehicle.heartbeat(OFFBOARD, 129), NOW).items)
-    assert hand_over.update(HandoverView(at_ns=NOW, vehicle=flying, ready=True)).sending is Sending.SETPOINTS
+    assert (
+        hand_over.update(HandoverInput(at_ns=NOW, vehicle=flying, has_setpoint=True)).setpoint_mode
+        is SetpointMode.SETPOINTS
+    )
     for n in range(3):
         link.receive(vehicle.local_position(60_000 + n * 100), NOW)
     later = NOW + 5 * SECOND
@@ -277,7 +281,10 @@ def test_row_20_a_rebooted_vehicle_is_let_go() -> None:
     items = link.receive(vehicle.local_position(800), later).items
     assert [event.code for event in events(items)] == ["vehicle-reboot"]
     (booted,) = statuses(items)
-    assert hand_over.update(HandoverView(at_ns=later, vehicle=booted, ready=True)).sending is Sending.NOTHING
+    assert (
+        hand_over.update(HandoverInput(at_ns=later, vehicle=booted, has_setpoint=True)).setpoint_mode
+        is SetpointMode.NOTHING
+    )
     assert hand_over.state is HandoverState.RELEASED  # though it says that it is armed, in OFFBOARD
     items = link.receive(vehicle.heartbeat(OFFBOARD, 129, status=1), later + SECOND).items
     assert not events(items)  # told once, and a heartbeat's status alone tells nothing
@@ -386,7 +393,7 @@ def test_mutated_messages_raise_nothing() -> None:
 
 
 def test_the_fuzzer_finds_a_planted_bug(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(codec, "_finite", lambda *values: True)
+    monkeypatch.setattr(codec, "_is_finite", lambda *values: True)
     with pytest.raises((AssertionError, ValueError, OverflowError)):
         fuzz(make_link(), 20_000, seed=1)
 
@@ -403,6 +410,6 @@ def test_random_bytes_cost_nothing_but_themselves() -> None:
 
 def test_our_own_output_survives_our_own_input() -> None:
     encoder = Encoder(99, 1)
-    data = encoder.heartbeat() + encoder.timesync(0, 5) + encoder.command(21, (), 1, 1)
+    data = encoder.encode_heartbeat() + encoder.encode_timesync(0, 5) + encoder.encode_command(21, (), 1, 1)
     assert decode(data).bad == {}
     assert decode(data).total == 3

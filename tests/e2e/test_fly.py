@@ -25,8 +25,8 @@ from logs.recording.replay import replay
 from uavctl.cli.app import run
 from uavctl.config import load_config
 from uavctl.config.load import parse
-from uavctl.daemon.control_socket import daemon_name, listening
-from uavctl.daemon.lock import lock_paths, sole_daemon
+from uavctl.daemon.control_socket import make_daemon_name, open_listener
+from uavctl.daemon.lock import find_lock_paths, lock_vehicle
 from uavctl.records import ControlMode, Decision, Event, Header, Setpoint, SetpointSource
 
 FALLBACK = (ControlMode.BRAKE, ControlMode.HOLD)
@@ -112,20 +112,20 @@ def test_a_second_daemon_is_refused_before_it_makes_anything(
     monkeypatch.delattr("uavctl.cli.fly.design_of")
     url = f"udpin://127.0.0.1:{free_port()}"
     words = ["fly", "--vehicle", url, "--control", control, "--out", str(tmp_path / "flight")]
-    with sole_daemon(url):
+    with lock_vehicle(url):
         assert run(words) == 1
     assert "flies this vehicle already" in " ".join(capsys.readouterr().err.split())
-    with listening(Path(control), daemon_name(load_config("room", [f'daemon.vehicle="{url}"']))):
+    with open_listener(Path(control), make_daemon_name(load_config("room", [f'daemon.vehicle="{url}"']))):
         assert run(words) == 1
     assert "is running" in " ".join(capsys.readouterr().err.split())
-    assert not list(tmp_path.rglob("*.mcap")) and not any(one.exists() for one in lock_paths(url))
+    assert not list(tmp_path.rglob("*.mcap")) and not any(one.exists() for one in find_lock_paths(url))
 
 
 @pytest.mark.slow
 def test_an_end_that_was_asked_for_leaves_no_word_for_the_next_daemon(flown: Flown) -> None:
     """The source neither lands nor disarms; yet the next one on this port is flown like any other."""
     url = next(iter(records(flown[3], Header))).command.split("--vehicle ")[1].split()[0]
-    assert not any(one.exists() for one in lock_paths(url))
+    assert not any(one.exists() for one in find_lock_paths(url))
 
 
 def test_age_rises_in_the_pause_fallback_at_h_recovery_after(flown: Flown) -> None:

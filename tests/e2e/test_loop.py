@@ -14,10 +14,10 @@ from logs.recording.replay import replay
 from sim.simulation import Peers
 from uavctl.config import load_config
 from uavctl.loop import MAX_SAMPLES
-from uavctl.mavlink.codec import UnsendableError
 from uavctl.mavlink.connection import MavlinkConnection
-from uavctl.mavlink.handover import HandOver, HandoverStep
-from uavctl.mavlink.handover_guards import HandoverView
+from uavctl.mavlink.encoder import UnsendableError
+from uavctl.mavlink.handover import HandoverOutput, HandoverStateMachine
+from uavctl.mavlink.handover_guards import HandoverInput
 from uavctl.records import (
     ORDER_ACCEPTED,
     Command,
@@ -277,10 +277,10 @@ def test_an_order_that_no_hand_over_took_is_not_answered_with_what_the_tick_befo
     rig.run(1)
     assert [(command, event.code) for command, event in rig.answers] == [(hold, ORDER_ACCEPTED)]
 
-    def faulty(hand_over: HandOver, view: HandoverView) -> HandoverStep:
+    def faulty(hand_over: HandoverStateMachine, view: HandoverInput) -> HandoverOutput:
         raise LookupError("no such state")
 
-    monkeypatch.setattr(HandOver, "update", faulty)
+    monkeypatch.setattr(HandoverStateMachine, "update", faulty)
     for notices in (["control"], []):  # the failure is told once
         assert rig.loop.order(hold)
         assert SETPOINT not in rig.run(1)
@@ -295,7 +295,7 @@ def test_what_the_hand_over_answered_stands_if_its_request_cannot_be_sent(monkey
     def faulty(link: MavlinkConnection, setpoint: Setpoint) -> bytes:
         raise UnsendableError("not finite")
 
-    monkeypatch.setattr(MavlinkConnection, "setpoint", faulty)
+    monkeypatch.setattr(MavlinkConnection, "encode_setpoint", faulty)
     assert rig.loop.order(land)
     assert SETPOINT not in rig.run(1)
     assert [(command, event.code) for command, event in rig.answers] == [(land, ORDER_ACCEPTED)]

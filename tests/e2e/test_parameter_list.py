@@ -12,9 +12,9 @@ from take_off_rig import Flight
 from logs.recording.parameters import ParameterReader, listed
 from logs.recording.replay import replay
 from sim.autopilot.profile import TABLES
-from uavctl.mavlink.connection import READS, ROUNDS, TRIES, ParameterList
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.mavlink.messages import ParamValue
+from uavctl.mavlink.stream_requests import MAX_READ_ROUNDS, MAX_TRIES, READS_PER_BATCH, ParameterDownload
 from uavctl.records import Datagram
 
 SECOND = 1_000_000_000
@@ -56,7 +56,7 @@ def test_a_vehicle_that_never_answers_is_asked_a_few_times() -> None:
     flight = Flight("px4")
     flight.hears = lambda data: not asks(data)
     flight.run(15.0)
-    assert len(flight.sent("PARAM_REQUEST_LIST")) == TRIES and not flight.sent("PARAM_REQUEST_READ")
+    assert len(flight.sent("PARAM_REQUEST_LIST")) == MAX_TRIES and not flight.sent("PARAM_REQUEST_READ")
 
 
 @BOTH
@@ -78,21 +78,21 @@ def test_it_can_be_left_out() -> None:
 
 
 def test_the_lost_ones_are_asked_for_at_a_bounded_rate_and_not_for_ever() -> None:
-    asking, asked = ParameterList(), []
+    asking, asked = ParameterDownload(), []
     assert asking.due(0, armed=False) == (-1,)
-    asking.saw(value(0, 1001))  # and of the others none comes, ever
+    asking.handle_message(value(0, 1001))  # and of the others none comes, ever
     for at_ns in range(0, 400 * SECOND, SECOND // 20):
         asked += [(at_ns, index) for index in asking.due(at_ns, armed=False)]
-    assert sorted(index for _, index in asked) == sorted(ROUNDS * [*range(1, 1001)])
+    assert sorted(index for _, index in asked) == sorted(MAX_READ_ROUNDS * [*range(1, 1001)])
     for begin in range(0, 200 * SECOND, SECOND):
-        assert sum(begin <= at < begin + SECOND for at, _ in asked) <= 5 * READS
+        assert sum(begin <= at < begin + SECOND for at, _ in asked) <= 5 * READS_PER_BATCH
 
 
 def test_the_list_is_waited_for_while_it_comes_and_armed_ends_it_for_good() -> None:
-    asking = ParameterList()
+    asking = ParameterDownload()
     assert asking.due(0, armed=False) == (-1,)
     for index in range(0, 40, 2):
-        asking.saw(value(index, 41))
+        asking.handle_message(value(index, 41))
         assert asking.due((index + 1) * SECOND // 10, armed=False) == ()
     assert asking.due(5 * SECOND, armed=False) == tuple(range(1, 20, 2))
     assert asking.due(6 * SECOND, armed=True) == ()
@@ -100,7 +100,7 @@ def test_the_list_is_waited_for_while_it_comes_and_armed_ends_it_for_good() -> N
 
 
 def test_what_is_no_place_in_a_list_counts_for_nothing() -> None:
-    asking = ParameterList()
+    asking = ParameterDownload()
     for odd in (value(65_535, 3), value(60_000, 65_535)):
-        asking.saw(odd)
+        asking.handle_message(odd)
     assert asking.due(0, armed=False) == (-1,)

@@ -38,7 +38,7 @@ from uavctl.lab.identify.fit import choose_dead_time
 from uavctl.lab.identify.history import Exchange, FlightHistory, from_tlog
 from uavctl.lab.identify.result import LinkFit, fit_link, flown_stretches, identify, kinds_of
 from uavctl.lab.trial import room_of
-from uavctl.mavlink.clocksync import RoundTrips
+from uavctl.mavlink.clocksync import TimesyncClock
 from uavctl.records import Command, ControlMode, Decision, Event, Order
 
 GPS, VICON, OFFBOARD = OF_OTHERS
@@ -106,12 +106,12 @@ def test_a_recorded_failsafe_that_holds_is_told_from_a_pilot_who_holds() -> None
 @pytest.mark.parametrize("name", [*OF_OTHERS, *RELAYED])
 def test_the_client_s_exchange_foretells_the_vehicle_s_clock_until_the_next_answer(name: str) -> None:
     """To half of the longest round trip that counts; simulated clocks run up to 3.4 % slow, and unevenly."""
-    exchange, trips, off_ms = Exchange(), RoundTrips(10_000_000_000), []
+    exchange, trips, off_ms = Exchange(), TimesyncClock(10_000_000_000), []
     for one in packets(name):
         for trip in exchange.take(one.data, one.at_ns, outgoing=one.outgoing):
             foretold = trips.offset_ns(one.at_ns)
             measured = (trip.sent_ns + one.at_ns) // 2 - trip.remote_ns
-            if trips.answer(trip.sent_ns, trip.remote_ns, one.at_ns) and foretold is not None:
+            if trips.add_answer(trip.sent_ns, trip.remote_ns, one.at_ns) and foretold is not None:
                 off_ms.append(abs(measured - foretold) * 1e-6)
     assert len(off_ms) > 40
     assert np.median(off_ms) < (3.0 if name in OF_OTHERS else 5.0)

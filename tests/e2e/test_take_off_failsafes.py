@@ -109,16 +109,16 @@ def test_the_pilot_s_stick_in_the_climb_is_told_and_keeps_positions_until_the_gr
 def test_orders_of_where_to_fly_are_refused_while_it_is_not_we_who_fly(autopilot: str) -> None:
     flight = Flight(autopilot)
     moves = (Order.GOTO, Order.HOLD, Order.RESUME)
-    assert all(flight.loop.against(order) for order in moves)
+    assert all(flight.loop.explain_refusal(order) for order in moves)
     flight.run(1.0).take_off()
     flight.run(10.0, until=HandoverState.CLIMBING)
-    assert all("on its way up" in flight.loop.against(order) for order in moves)
+    assert all("on its way up" in flight.loop.explain_refusal(order) for order in moves)
     flight.run(10.0, until=HandoverState.ENGAGED)
-    assert not any(flight.loop.against(order) for order in Order)
+    assert not any(flight.loop.explain_refusal(order) for order in Order)
     flight.stick("POSCTL" if autopilot == "px4" else "LOITER")
     flight.run(3.0, until=HandoverState.RELEASED)
-    assert all("uavctl ctl engage" in flight.loop.against(order) for order in moves)
-    assert not flight.loop.against(Order.ENGAGE) and not flight.loop.against(Order.LAND)
+    assert all("uavctl ctl engage" in flight.loop.explain_refusal(order) for order in moves)
+    assert not flight.loop.explain_refusal(Order.ENGAGE) and not flight.loop.explain_refusal(Order.LAND)
 
 
 SET_MODE = 176

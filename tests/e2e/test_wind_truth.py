@@ -23,7 +23,7 @@ from uavctl.flight.supervise import OF_POSITIONS, RELEASES
 from uavctl.lab.own_loop import EXTERNAL_ONLY
 from uavctl.lab.trial import WatchedFlyer, beyond_m, controller_of, room_of
 from uavctl.loop import VEHICLE, ControlLoop, make_links
-from uavctl.mavlink.framing import scan
+from uavctl.mavlink.framing import scan_frames
 from uavctl.records import Event, InertialSample, Outgoing, PositionSample, Record, Send, Vec3, VehicleMotion
 
 MODEL_DRAG_1PS, DRAG_1PS = 0.24, 1.0  # of the simulated Crazyflie, and of PX4's own simulated vehicle
@@ -222,7 +222,7 @@ def watched(*, feels: bool) -> tuple[MonitorState, str | None, float]:
                     return watching, breach.cause, (now_ns - begin_ns) * 1e-9
             acts, samples = setpoint or ZERO, []
         if one.outgoing:
-            (frame,) = scan(one.data, final=True).frames
+            (frame,) = scan_frames(one.data, final=True).frames
             setpoint = struct.unpack_from("<3f", frame.data, SETPOINT_ACCEL)
             continue
         for item in link.receive(one.data, one.at_ns).items:

@@ -10,9 +10,10 @@ from natnet_server import TICKS_PER_S, UPTIME_S, Body, descriptions, frame, mess
 from scipy.spatial.transform import Rotation
 
 from uavctl.errors import ConnectionSpecError
-from uavctl.frames import Frame, Up, levelled, rotate
-from uavctl.io.camera import BodyPose, CameraError, CameraUrl, Echo, parse
-from uavctl.io.camera_host import Words, questions
+from uavctl.frames import Frame, Up, convert_pose_to_frd, rotate_vector
+from uavctl.io.camera import BodyPose, CameraError, Echo
+from uavctl.io.camera_host import CameraMessageEncoder, parse_time_requests
+from uavctl.io.camera_url import CameraUrl, parse_camera_url
 from uavctl.io.natnet import MISSING, NO_STAMP, SILENT, UNREADABLE, UNTRACKED, NatNet
 from uavctl.mavlink.codec import decode
 from uavctl.mavlink.messages import Position, TimeSync
@@ -150,11 +151,11 @@ def test_poses_agree_with_an_oracle_of_matrices(up: Up) -> None:
     axes = Rotation.from_matrix([list(row) for row in zip(forward, right, down, strict=True)])
     turned = Rotation.from_rotvec([0.3, -0.8, 0.5])
     x, y, z, w = turned.as_quat()
-    position_m, attitude = levelled((1.0, 2.0, 3.0), (w, x, y, z), up)
+    position_m, attitude = convert_pose_to_frd((1.0, 2.0, 3.0), (w, x, y, z), up)
     assert position_m == pytest.approx(axes.inv().apply([1.0, 2.0, 3.0]))
     want = axes.inv() * turned * axes
     for vector in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)):
-        assert rotate(attitude, vector) == pytest.approx(want.apply(vector))
+        assert rotate_vector(attitude, vector) == pytest.approx(want.apply(vector))
 
 
 @pytest.mark.parametrize(("up", "place"), [("y", (0.0, 1.5, 0.0)), ("z", (0.0, 0.0, 1.5))])
@@ -163,21 +164,21 @@ def test_a_raised_body_is_above_the_floor_and_a_nose_to_the_left_turns_left(
 ) -> None:
     half = math.radians(30.0) / 2  # about the axis that points up: to the left, seen from above
     axis = (0.0, math.sin(half), 0.0) if up == "y" else (0.0, 0.0, math.sin(half))
-    position_m, attitude = levelled(place, (math.cos(half), *axis), up)
+    position_m, attitude = convert_pose_to_frd(place, (math.cos(half), *axis), up)
     assert position_m == (0.0, 0.0, -1.5)
-    nose = rotate(Frame(yaw_deg=90.0).attitude_to_ned(attitude, euler=False), (1.0, 0.0, 0.0))
+    nose = rotate_vector(Frame(yaw_deg=90.0).attitude_to_ned(attitude, euler=False), (1.0, 0.0, 0.0))
     assert nose == pytest.approx((math.cos(math.radians(60)), math.sin(math.radians(60)), 0.0))
 
 
 def test_what_is_said_is_mavlink_that_declares_its_axes() -> None:
-    words = Words()
-    said = words.say(BodyPose(5_000_000_123_000, (1.0, 2.0, -3.0), (1.0, 0.0, 0.0, 0.0)))
+    words = CameraMessageEncoder()
+    said = words.encode(BodyPose(5_000_000_123_000, (1.0, 2.0, -3.0), (1.0, 0.0, 0.0, 0.0)))
     (position,) = decode(said).messages
     assert isinstance(position, Position)
     assert (position.name, position.system, position.stamp_us) == ("ODOMETRY", 246, 5_000_000_123)
     assert (position.position_m, position.convention, position.velocity_mps) == ((1.0, 2.0, -3.0), "ned", None)
     assert position.attitude == (1.0, 0.0, 0.0, 0.0)
-    (answer,) = decode(words.say(Echo(77, 88))).messages
+    (answer,) = decode(words.encode(Echo(77, 88))).messages
     assert isinstance(answer, TimeSync)
     assert (answer.tc1_ns, answer.ts1_ns) == (88, 77)
 
@@ -187,12 +188,12 @@ def test_an_echo_is_the_servers_clock() -> None:
     assert camera.ask_time(77) == message(12, struct.pack("<Q", 77))
     answer = message(13, struct.pack("<QQ", 77, 3 * TICKS_PER_S + 1))
     assert camera.receive(answer, 0) == (Echo(77, 3 * SECOND + 100),)
-    assert questions(b"\x00" * 30) == ()
+    assert parse_time_requests(b"\x00" * 30) == ()
 
 
 def test_urls() -> None:
-    assert parse("natnet://10.0.0.5/drone%201") == CameraUrl("natnet", "10.0.0.5", 1510, "drone 1")
-    given = parse("natnet://motive:1600/a/b?up=z&interface=10.0.0.9")
+    assert parse_camera_url("natnet://10.0.0.5/drone%201") == CameraUrl("natnet", "10.0.0.5", 1510, "drone 1")
+    given = parse_camera_url("natnet://motive:1600/a/b?up=z&interface=10.0.0.9")
     assert given == CameraUrl("natnet", "motive", 1600, "a/b", "z", "10.0.0.9")
 
 
@@ -212,7 +213,7 @@ def test_urls() -> None:
 )
 def test_urls_that_are_wrong(url: str, words: str) -> None:
     with pytest.raises(ConnectionSpecError, match=words):
-        parse(url)
+        parse_camera_url(url)
 
 
 def test_a_server_that_began_anew_is_asked_to_stream_though_it_answers_questions() -> None:

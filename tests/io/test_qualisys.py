@@ -17,7 +17,8 @@ from scipy.spatial.transform import Rotation
 from uavctl.errors import ConnectionSpecError
 from uavctl.frames import Up
 from uavctl.io.base import Connection
-from uavctl.io.camera import BodyPose, CameraError, parse
+from uavctl.io.camera import BodyPose, CameraError
+from uavctl.io.camera_url import parse_camera_url
 from uavctl.io.qualisys import MISSING, NO_MEASUREMENT, SILENT, UNREADABLE, UNTRACKED, Qualisys
 from uavctl.io.sources import open_source
 from uavctl.mavlink.codec import decode
@@ -130,9 +131,12 @@ def test_a_wrong_name_and_a_refused_version_are_told() -> None:
 
 
 def test_z_is_up_where_the_url_says_nothing() -> None:
-    assert (parse("qualisys://10.0.0.5/drone").up, parse("qualisys://10.0.0.5/drone").port) == ("z", 22223)
-    assert parse("qualisys://10.0.0.5/drone?up=y").up == "y"
-    assert parse("natnet://10.0.0.5/drone").up == "y"
+    assert (parse_camera_url("qualisys://10.0.0.5/drone").up, parse_camera_url("qualisys://10.0.0.5/drone").port) == (
+        "z",
+        22223,
+    )
+    assert parse_camera_url("qualisys://10.0.0.5/drone?up=y").up == "y"
+    assert parse_camera_url("natnet://10.0.0.5/drone").up == "y"
 
 
 def url(server: QtmServer, body: str = "drone%201") -> str:

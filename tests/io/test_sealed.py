@@ -22,8 +22,8 @@ from uavctl.config import load_config
 from uavctl.daemon.daemon import fly
 from uavctl.errors import ConnectionSpecError, KeyFileError
 from uavctl.io.base import Connection
-from uavctl.io.signed_connection import Sealed, connected, sealed
-from uavctl.mavlink.signing import NEWEST_STAMP, Gate, Signing, SigningKey, Stamps
+from uavctl.io.signed_connection import SignedConnection, open_links, sign_connections
+from uavctl.mavlink.signing import MAX_TIMESTAMP, FrameAuthenticator, FrameSigner, SigningKey, SigningTimestamps
 from uavctl.records import ControlMode, Datagram, Decision, Event, LinkStats, Refused, Setpoint
 
 VEHICLE_ON_HOLD = {"custom_mode": (4 << 16) | (3 << 24)}
@@ -36,12 +36,14 @@ class SignedWire(Wire):
         super().__init__(bench, name)
         self._attack, self._link_id = bench.attack, link_id
         self._stamp = STAMP
-        self._their_door = Gate(Signing(SigningKey(KEY), 0, Stamps(), OFFSET_NS), stream=False)
+        self._their_door = FrameAuthenticator(
+            FrameSigner(SigningKey(KEY), 0, SigningTimestamps(), OFFSET_NS), stream=False
+        )
         self.heard: deque[bytes] = deque(maxlen=5000)
         self._signed: list[tuple[bytes, int]] = []
         self.unsigned = self.copied = 0
 
-    def receive(self, *, everything: bool = False) -> list[tuple[bytes, int]]:
+    def receive(self, *, read_all: bool = False) -> list[tuple[bytes, int]]:
         self.speaks()
         genuine, self._signed = self._signed, []
         return self._attack(self, genuine)
@@ -49,7 +51,7 @@ class SignedWire(Wire):
     def speaks(self) -> list[bytes]:
         """What is on the wire and has not been read, as it will be."""
         fresh = []
-        for data, at_ns in super().receive(everything=True):
+        for data, at_ns in super().receive(read_all=True):
             signed = b"".join(self._sign(frame) for frame in frames(data))
             self.heard.append(signed)
             fresh.append(signed)
@@ -62,7 +64,7 @@ class SignedWire(Wire):
         return sign(frame, self._stamp, link_id=self._link_id)
 
     def send(self, data: bytes) -> None:
-        plain = self._their_door.admit(data, self._bench.now_ns)
+        plain = self._their_door.verify_frames(data, self._bench.now_ns)
         if not plain:
             self.unsigned += 1
             return
@@ -74,17 +76,17 @@ class AttackBench(Bench):
 
     def __init__(self) -> None:
         super().__init__()
-        self.stamps = Stamps()
+        self.stamps = SigningTimestamps()
         wires = {name: SignedWire(self, name, link_id) for link_id, name in enumerate(("vehicle", "mocap"), 3)}
         self.wires = wires
         self.doors = {
-            name: Sealed(wire, Gate(self.signing(n), stream=False), now=lambda: self.now_ns)
+            name: SignedConnection(wire, FrameAuthenticator(self.signing(n), stream=False), now=lambda: self.now_ns)
             for n, (name, wire) in enumerate(wires.items())
         }
         self.connections: dict[str, Any] = dict(self.doors)
 
-    def signing(self, link_id: int) -> Signing:
-        return Signing(SigningKey(KEY), link_id, self.stamps, OFFSET_NS)
+    def signing(self, link_id: int) -> FrameSigner:
+        return FrameSigner(SigningKey(KEY), link_id, self.stamps, OFFSET_NS)
 
     def attack(self, wire: SignedWire, genuine: list[tuple[bytes, int]]) -> list[tuple[bytes, int]]:
         return genuine
@@ -132,7 +134,7 @@ def test_a_signed_flight_is_the_same_flight(plain_flight: list[Any]) -> None:
 
 
 _PEER = Peer()
-_FORGER = SignedPeer(OTHER_KEY, NEWEST_STAMP - 10**6)
+_FORGER = SignedPeer(OTHER_KEY, MAX_TIMESTAMP - 10**6)
 
 
 @pytest.mark.slow
@@ -181,7 +183,9 @@ def test_genuine_frames_that_are_delivered_first_at_the_other_port_change_nothin
 def test_who_signs_nothing_is_never_flown() -> None:
     bench = AttackBench()
     bench.connections = {
-        name: Sealed(Wire(bench, name), Gate(bench.signing(0), stream=False), now=lambda: bench.now_ns)
+        name: SignedConnection(
+            Wire(bench, name), FrameAuthenticator(bench.signing(0), stream=False), now=lambda: bench.now_ns
+        )
         for name in ("vehicle", "mocap")
     }
     bench.fly(duration_s=2.0, stop_limit_s=0.0)
@@ -215,7 +219,7 @@ class Canned:
         self.refused: Counter[str] = Counter()
         self.answered: list[int] = []
 
-    known, unread = True, False
+    has_known_sender, has_unread = True, False
 
     def fileno(self) -> int:
         return -1
@@ -223,16 +227,16 @@ class Canned:
     def filenos(self) -> tuple[int, ...]:
         return ()
 
-    def lost(self) -> int:
+    def count_lost(self) -> int:
         return 0
 
-    def trust(self, index: int) -> None:
+    def trust_sender(self, index: int) -> None:
         pass
 
-    def receive(self, *, everything: bool = False) -> list[tuple[bytes, int]]:
+    def receive(self, *, read_all: bool = False) -> list[tuple[bytes, int]]:
         return [(data, n) for n, data in enumerate(self._data)]
 
-    def answer(self, index: int) -> None:
+    def select_peer(self, index: int) -> None:
         self.answered.append(index)
 
     def send(self, data: bytes) -> None:
@@ -263,8 +267,8 @@ def test_connections_get_the_doors_that_are_asked_for(tmp_path: Path, state: Pat
     config = load_config(
         "room-hahn-stursberg", (*ON_FREE_PORTS, f"security.key_file={key_file(tmp_path)}", "security.link_id=9")
     )
-    with connected(config) as connections:
-        assert [type(one) for one in connections.values()] == [Sealed, Sealed]
+    with open_links(config) as connections:
+        assert [type(one) for one in connections.values()] == [SignedConnection, SignedConnection]
         assert connections["vehicle"].url == config.daemon.vehicle
         assert connections["vehicle"].fileno() > 0
     assert all(connection.closed for connection in connections.values())
@@ -272,15 +276,15 @@ def test_connections_get_the_doors_that_are_asked_for(tmp_path: Path, state: Pat
     now = int((time.time() - EPOCH_S) * SECOND)
     assert now - 60 * SECOND < int(stamp.read_text()) < now + 60 * SECOND
     only = msgspec.structs.replace(config.security, require=("mocap",))
-    with connected(msgspec.structs.replace(config, security=only)) as connections:
-        assert [type(one) is Sealed for one in connections.values()] == [False, True]
+    with open_links(msgspec.structs.replace(config, security=only)) as connections:
+        assert [type(one) is SignedConnection for one in connections.values()] == [False, True]
 
 
 def test_without_a_key_nothing_is_put_around_and_nothing_written(state: Path) -> None:
-    with connected(load_config("room-hahn-stursberg", ON_FREE_PORTS)) as connections:
-        assert not any(isinstance(one, Sealed) for one in connections.values())
+    with open_links(load_config("room-hahn-stursberg", ON_FREE_PORTS)) as connections:
+        assert not any(isinstance(one, SignedConnection) for one in connections.values())
     one = ("daemon.vehicle=udpin://127.0.0.1:0", "daemon.mocap=udpin://127.0.0.1:0")
-    with connected(load_config("room-hahn-stursberg", one)) as connections:
+    with open_links(load_config("room-hahn-stursberg", one)) as connections:
         assert list(connections) == ["vehicle"]
     assert not state.exists()
 
@@ -291,12 +295,12 @@ def test_a_bad_key_or_url_opens_nothing(tmp_path: Path, state: Path) -> None:
     path.chmod(0o644)
     with (
         pytest.raises(KeyFileError, match="chmod 600"),
-        connected(load_config("room-hahn-stursberg", (*ON_FREE_PORTS, f"security.key_file={path}"))),
+        open_links(load_config("room-hahn-stursberg", (*ON_FREE_PORTS, f"security.key_file={path}"))),
     ):
         raise AssertionError("opened")
     with (
         pytest.raises(ConnectionSpecError),
-        connected(load_config("room-hahn-stursberg", (ON_FREE_PORTS[0], "daemon.mocap=udpin://127.0.0.1:x"))),
+        open_links(load_config("room-hahn-stursberg", (ON_FREE_PORTS[0], "daemon.mocap=udpin://127.0.0.1:x"))),
     ):
         raise AssertionError("opened")
     assert not state.exists()
@@ -311,7 +315,7 @@ def test_what_one_run_took_the_next_one_refuses(tmp_path: Path, state: Path) -> 
 
     def run(data: list[bytes]) -> tuple[int, Counter[str]]:
         wire = Canned(data)
-        with sealed({"vehicle": wire}, config.security) as doors:
+        with sign_connections({"vehicle": wire}, config.security) as doors:
             return len(doors["vehicle"].receive()), doors["vehicle"].refused
 
     assert run(words) == (10, Counter())
@@ -323,11 +327,11 @@ def test_what_one_run_took_the_next_one_refuses(tmp_path: Path, state: Path) -> 
 def test_a_door_passes_on_what_concerns_the_connection_alone() -> None:
     signed = SignedPeer()
     wire = Canned([b"x", signed.heartbeat(), Peer().heartbeat(), signed.heartbeat()])
-    door = Sealed(wire, Gate(make_signing(), stream=False), now=lambda: 0)
+    door = SignedConnection(wire, FrameAuthenticator(make_signing(), stream=False), now=lambda: 0)
     assert (door.url, door.fileno(), door.send_errors, door.receive_errors) == ("test://vehicle", -1, 3, 4)
     wire.refused["not-listed"] = 5
     assert [at_ns for _, at_ns in door.receive()] == [1, 3]
-    door.answer(1)
+    door.select_peer(1)
     assert wire.answered == [3]
     assert door.refused == {"not-listed": 5, "garbage": 1, "unsigned": 1}
     assert not door.closed

@@ -23,11 +23,11 @@ from patience import LIMIT_S, until
 from uavctl.config import Config, load_config
 from uavctl.config.connections import warnings
 from uavctl.errors import ConfigError, ConnectionSpecError, ExtraMissingError
-from uavctl.io.admission import Rules
+from uavctl.io.admission import AdmissionRules
 from uavctl.io.base import Connection
 from uavctl.io.camera import COUNTS, READY, BodyPose, Echo
-from uavctl.io.camera_host import OVERRUN, Host
-from uavctl.io.signed_connection import connected
+from uavctl.io.camera_host import OVERRUN, CameraHost
+from uavctl.io.signed_connection import open_links
 from uavctl.io.sources import open_source
 from uavctl.mavlink.codec import decode
 from uavctl.mavlink.connection import MavlinkConnection
@@ -257,7 +257,7 @@ def test_a_daemon_that_does_not_read_finds_the_newest_and_how_many_were_dropped(
         server.bind(("127.0.0.1", 0))
         theirs.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 8192)
         camera = Counting()
-        host = Host(camera, theirs, server.getsockname(), "127.0.0.1")
+        host = CameraHost(camera, theirs, server.getsockname(), "127.0.0.1")
         thread = threading.Thread(target=host.run)
         thread.start()
         with ours, closing(host):
@@ -286,8 +286,8 @@ def test_what_is_wrong_before_anything_is_started(monkeypatch: pytest.MonkeyPatc
     with pytest.raises(ConnectionSpecError, match="needs a server"):
         open_source("natnet://127.0.0.1")
     with pytest.raises(ConnectionSpecError, match=r"not in security\.allow"):
-        open_source("natnet://127.0.0.1/drone", rules=Rules(allow=("10.0.0.0/8",)))
-    monkeypatch.setattr("uavctl.io.sources.find_spec", lambda name: None)
+        open_source("natnet://127.0.0.1/drone", rules=AdmissionRules(allow=("10.0.0.0/8",)))
+    monkeypatch.setattr("uavctl.io.camera_process.find_spec", lambda name: None)
     with pytest.raises(ExtraMissingError) as caught:
         open_source("natnet://127.0.0.1/drone")
     assert (caught.value.package, caught.value.extra) == ("natnet", "optitrack")
@@ -324,6 +324,6 @@ def test_the_daemon_opens_it_by_its_configuration() -> None:
         config = load_config(
             "room-hahn-stursberg", ("daemon.vehicle=udpin://127.0.0.1:0", f"daemon.mocap={url(server)}")
         )
-        with connected(config) as connections:
+        with open_links(config) as connections:
             desk = Desk(connections["mocap"], config)
             desk.until(lambda: bool(desk.samples))

@@ -16,8 +16,10 @@ from transport_rig import FRAME, LIMIT_NS, Clock, port_of
 
 from uavctl.errors import ConnectionSpecError
 from uavctl.io.base import Connection
-from uavctl.io.transport import PEER_SILENCE_NS, RETRY_NS, open_connection, wait
-from uavctl.mavlink.connection import HUNG_UP, WENT_SILENT
+from uavctl.io.byte_stream import RETRY_NS
+from uavctl.io.transport import open_connection, wait
+from uavctl.io.udp import PEER_SILENCE_NS
+from uavctl.mavlink.connection import CONNECTION_SILENT, HUNG_UP
 
 
 @contextmanager
@@ -221,7 +223,7 @@ def test_tcp_makes_a_connection_again_that_has_fallen_silent() -> None:
                 clock[0] += PEER_SILENCE_NS
                 assert connection.receive() == [] and not connection.refused
                 clock[0] += 1
-                assert connection.receive() == [] and connection.refused == {WENT_SILENT: 1}
+                assert connection.receive() == [] and connection.refused == {CONNECTION_SILENT: 1}
                 peer.settimeout(LIMIT_S)
                 with pytest.raises(ConnectionResetError):  # an end that is still there knows at once
                     while peer.recv(100):
@@ -232,9 +234,9 @@ def test_tcp_makes_a_connection_again_that_has_fallen_silent() -> None:
                 peer, _ = server.accept()
                 with peer:
                     clock[0] += PEER_SILENCE_NS
-                    assert connection.receive() == [] and connection.refused == {WENT_SILENT: again - 1}
+                    assert connection.receive() == [] and connection.refused == {CONNECTION_SILENT: again - 1}
                     clock[0] += 1
-                    assert connection.receive() == [] and connection.refused == {WENT_SILENT: again}
+                    assert connection.receive() == [] and connection.refused == {CONNECTION_SILENT: again}
 
 
 def test_tcp_never_cuts_a_frame_when_the_peer_does_not_read() -> None:
@@ -339,7 +341,7 @@ def test_setpoints_go_to_the_vehicle_and_not_to_cameras_that_spoke_first_on_the_
                 arrived += [data for data, _ in batch]
                 for index, (data, _) in enumerate(batch):
                     if data == b"\xfdvehicle":
-                        connection.answer(index)
+                        connection.select_peer(index)
             connection.send(b"setpoint")
             assert vehicle.recv(64) == b"setpoint"
         finally:

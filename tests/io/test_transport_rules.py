@@ -25,13 +25,14 @@ from uavctl.io.admission import (
     VEHICLE_BURST,
     VEHICLE_TIMES,
     Address,
+    AdmissionRules,
     AllowList,
-    Budgets,
-    Rules,
-    frames_in,
+    RateLimiter,
+    count_frames,
 )
 from uavctl.io.base import Connection
-from uavctl.io.transport import PEER_SILENCE_NS, open_connection, wait
+from uavctl.io.transport import open_connection, wait
+from uavctl.io.udp import PEER_SILENCE_NS
 from uavctl.mavlink import framing
 
 SECOND = 1_000_000_000
@@ -77,27 +78,27 @@ def taken(connection: Connection, until: bytes) -> list[bytes]:
 )
 def test_addresses_and_networks(allow: tuple[str, ...], host: str, wanted: bool) -> None:
     rules = AllowList(allow)
-    assert [rules.lets_in(host) for _ in range(2)] == [wanted] * 2
+    assert [rules.allows(host) for _ in range(2)] == [wanted] * 2
 
 
 def test_forged_addresses_do_not_fill_the_memory() -> None:
     rules = AllowList(("192.0.2.1",))
     for n in range(5 * MAX_KNOWN):
-        assert not rules.lets_in(f"10.{n >> 16}.{n >> 8 & 255}.{n & 255}")
-    assert rules.lets_in("192.0.2.1")
-    assert len(rules._known) <= MAX_KNOWN
+        assert not rules.allows(f"10.{n >> 16}.{n >> 8 & 255}.{n & 255}")
+    assert rules.allows("192.0.2.1")
+    assert len(rules._verdicts) <= MAX_KNOWN
 
 
-def budgets(per_s: float = 1000.0, frames_per_s: float = 1000.0) -> tuple[Budgets, Counter[str]]:
+def budgets(per_s: float = 1000.0, frames_per_s: float = 1000.0) -> tuple[RateLimiter, Counter[str]]:
     """Budgets in flight: somebody is known whom it needs."""
     refused: Counter[str] = Counter()
-    one = Budgets(Rules((), per_s, frames_per_s), refused)
-    one.trust(("192.0.2.9", 1), 0)
+    one = RateLimiter(AdmissionRules((), per_s, frames_per_s), refused)
+    one.trust_sender(("192.0.2.9", 1), 0)
     return one, refused
 
 
-def take(one: Budgets, senders: Sequence[Address], at_ns: int, data: bytes = b"x") -> list[bool]:
-    return one.take(senders, [data] * len(senders), at_ns)
+def take(one: RateLimiter, senders: Sequence[Address], at_ns: int, data: bytes = b"x") -> list[bool]:
+    return one.admit(senders, [data] * len(senders), at_ns)
 
 
 @pytest.mark.fault(39)
@@ -119,28 +120,28 @@ def test_nothing_is_dropped_of_what_a_px4_says_before_it_is_known(gap_s: float) 
     packets = [one for one in read_tlog(DATA / "px4-rest.tlog").packets if one.data[5] == 1]
     for known in (False, True):
         refused: Counter[str] = Counter()
-        cap = Budgets(Rules(), refused)
+        cap = RateLimiter(AdmissionRules(), refused)
         if known:
-            cap.answer(VEHICLE, 0)
+            cap.set_vehicle(VEHICLE, 0)
         gap_ns = round(gap_s * SECOND)
         batches = Counter((one.at_ns - packets[0].at_ns) // gap_ns for one in packets)
         words = iter(packets)
         for number in sorted(batches):
             data = [next(words).data for _ in range(batches[number])]
-            assert all(cap.take([VEHICLE] * len(data), data, (number + 1) * gap_ns))
+            assert all(cap.admit([VEHICLE] * len(data), data, (number + 1) * gap_ns))
         assert not refused and len(packets) > 700
 
 
 @pytest.mark.fault(39)
 @pytest.mark.fault(46)
 def test_before_anybody_is_known_a_flood_of_strangers_is_bounded_too() -> None:
-    cap = Budgets(Rules(), Counter())
+    cap = RateLimiter(AdmissionRules(), Counter())
     passed = 0
     for n in range(1000):  # a second, twenty new ports a millisecond
         batch: list[Address] = [("192.0.2.1", 20_000 + 20 * n + port) for port in range(20)]
         passed += sum(take(cap, batch, n * 1_000_000))
-    assert passed <= 2 * FIRST_BURST[0] + Rules().max_per_s
-    cap.answer(VEHICLE, SECOND)  # and nothing of it is left then
+    assert passed <= 2 * FIRST_BURST[0] + AdmissionRules().max_per_s
+    cap.set_vehicle(VEHICLE, SECOND)  # and nothing of it is left then
     strangers: list[Address] = [("192.0.2.2", port) for port in range(2000)]
     assert sum(take(cap, strangers, SECOND)) <= 2 * BURST
 
@@ -154,7 +155,7 @@ def test_frames_and_bytes_are_counted_and_not_datagrams_alone() -> None:
         frames = size = 0
         for n in range(2000):  # a second
             if take(cap, [ONE], n * 500_000, data) == [True]:
-                frames, size = frames + frames_in(data), size + len(data)
+                frames, size = frames + count_frames(data), size + len(data)
         assert frames <= 1000 + STRANGER_BURST[1] and size <= 200_000 + STRANGER_BURST[2]
         assert set(refused) == {"too-much"}
 
@@ -175,16 +176,16 @@ def test_no_checksum_and_no_hash_is_taken_more_often_than_was_counted(
         looks["hash"] += 1
         return "forged"
 
-    real: Callable[..., bool] = framing._checksum_fits
-    monkeypatch.setattr(framing, "_checksum_fits", fits)
+    real: Callable[..., bool] = framing._is_checksum_right
+    monkeypatch.setattr(framing, "_is_checksum_right", fits)
     monkeypatch.setattr("attacker.MANY", 3)
     say = WORDS[kind]()
     for _ in range(3):
         data = say()
         looks.clear()
-        framing.scan(data, final=True)
-        framing.scan(data, final=True, verify=verify)
-        assert max(looks["checksum"], looks["hash"], 1) <= frames_in(data) <= len(data) // 8 + 65
+        framing.scan_frames(data, final=True)
+        framing.scan_frames(data, final=True, verify=verify)
+        assert max(looks["checksum"], looks["hash"], 1) <= count_frames(data) <= len(data) // 8 + 65
 
 
 @pytest.mark.fault(39)
@@ -202,8 +203,8 @@ def test_a_flooder_takes_nothing_of_another_sender_s_share() -> None:
 @pytest.mark.fault(46)
 def test_strangers_share_what_one_has_and_take_nothing_of_vehicle_and_cameras() -> None:
     cap, refused = budgets()
-    cap.answer(VEHICLE, 0)
-    cap.trust(CAMERAS, 0)
+    cap.set_vehicle(VEHICLE, 0)
+    cap.trust_sender(CAMERAS, 0)
     passed = 0
     for n in range(1000):  # a second, twenty new ports a millisecond
         strangers: list[Address] = [("192.0.2.1", 20_000 + 20 * n + port) for port in range(20)]
@@ -232,15 +233,16 @@ def test_a_later_vehicle_is_heard_beside_sixteen_flooders() -> None:
 @pytest.mark.fault(39)
 def test_a_backlog_of_the_vehicle_s_is_read_whole_and_ends_with_its_newest_state() -> None:
     cap, refused = budgets()
-    cap.answer(VEHICLE, 0)
+    cap.set_vehicle(VEHICLE, 0)
     assert all(take(cap, [VEHICLE] * 1500, 0, Peer().send("attitude", 1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)))
     # Beyond any stall: what may be its state counts before all else, the newest first.
     words = [Peer().heartbeat(), *[bytes((0xFD, 9, 0, 0, 0, 1, 1, 30, 0, 0)) + bytes(11)] * 100_000]
-    taken = cap.take([VEHICLE] * len(words), words, 1)
+    taken = cap.admit([VEHICLE] * len(words), words, 1)
     assert taken[0] and not taken[1] and taken[-1]
     assert sum(taken) <= VEHICLE_BURST[1]
     assert refused["too-many"] + refused["too-much"] == len(words) - sum(taken)
-    assert VEHICLE_TIMES * Rules().max_frames_per_s >= 3 * 600.0  # a real one says so much; bytes may look like frames
+    # a real one says so much; bytes may look like frames
+    assert VEHICLE_TIMES * AdmissionRules().max_frames_per_s >= 3 * 600.0
 
 
 @pytest.mark.fault(39)
@@ -248,18 +250,18 @@ def test_those_who_are_trusted_share_their_budget_fairly() -> None:
     cap, _ = budgets()
     loud: list[Address] = [("192.0.2.1", port) for port in range(8)]
     for one in (*loud, CAMERAS):
-        cap.trust(one, 0)
+        cap.trust_sender(one, 0)
     take(cap, loud * 1000, 0)
     assert all(take(cap, [*loud * 50, CAMERAS], n * 10_000_000)[-1] for n in range(1, 100))
     for port in range(100):  # forged ones, each of which passed once for a source
-        cap.trust(("192.0.2.2", port), SECOND)
+        cap.trust_sender(("192.0.2.2", port), SECOND)
     assert take(cap, [CAMERAS], SECOND) == [True]
     assert TRUSTED_BURST > STRANGER_BURST
 
 
 @pytest.mark.fault(39)
 def test_who_is_not_listed_is_counted_and_gets_nothing() -> None:
-    rules = Rules(("127.0.0.1", "127.0.0.3"))
+    rules = AdmissionRules(("127.0.0.1", "127.0.0.3"))
     with (
         closing(open_connection("udpin://0.0.0.0:0", rules=rules)) as connection,
         peer("127.0.0.2") as stranger,
@@ -293,7 +295,7 @@ def test_a_flood_is_cut_and_counted_and_the_other_sender_is_heard() -> None:
         to = ("127.0.0.1", port_of(connection))
         cameras.sendto(FRAME, to)
         assert wait({"it": connection}, time.monotonic_ns() + LIMIT_NS) and connection.receive()
-        connection.trust(0)
+        connection.trust_sender(0)
         got: list[bytes] = []
         for n in range(40):
             for k in range(25):
@@ -318,7 +320,7 @@ def test_a_second_address_draws_no_setpoints_while_the_first_one_speaks() -> Non
             who.sendto(FRAME, to)
             assert wait({"it": connection}, time.monotonic_ns() + LIMIT_NS)
             assert [data for data, _ in connection.receive()] == [FRAME]
-            connection.answer(0)
+            connection.select_peer(0)
 
         hears(vehicle)
         hears(thief)  # a whole valid heartbeat of the same system
@@ -342,14 +344,14 @@ def test_noise_does_not_keep_the_place_of_a_vehicle() -> None:
         to = ("127.0.0.1", port_of(connection))
         thief.sendto(FRAME, to)
         assert wait({"it": connection}, time.monotonic_ns() + LIMIT_NS) and connection.receive()
-        connection.answer(0)
+        connection.select_peer(0)
         for _ in range(6):
             clock.now_ns += 1_000_000_000
             thief.sendto(FRAME, to)
             assert wait({"it": connection}, time.monotonic_ns() + LIMIT_NS) and connection.receive()
         vehicle.sendto(FRAME, to)
         assert wait({"it": connection}, time.monotonic_ns() + LIMIT_NS) and connection.receive()
-        connection.answer(0)
+        connection.select_peer(0)
         connection.send(b"setpoint")
         assert vehicle.recv(64) == b"setpoint"
 
@@ -362,7 +364,7 @@ def test_a_connected_socket_has_its_cap_too() -> None:
         connection.send(b"hello")
         _, address = vehicle.recvfrom(64)
         data = b"\xfd" * 4096
-        most = int(VEHICLE_BURST[1]) // frames_in(data)
+        most = int(VEHICLE_BURST[1]) // count_frames(data)
         for _ in range(most + 10):
             vehicle.sendto(data, address)
             connection.receive()
@@ -376,7 +378,7 @@ def known(connection: Connection, who: socket.socket) -> None:
     who.sendto(FRAME, ("127.0.0.1", port_of(connection)))
     assert wait({"it": connection}, time.monotonic_ns() + LIMIT_NS)
     assert connection.receive()
-    connection.answer(0)
+    connection.select_peer(0)
 
 
 @pytest.mark.fault(39)
@@ -389,23 +391,23 @@ def test_a_flood_does_not_fill_the_buffer_of_the_vehicle() -> None:
             flooder.sendto(FRAME, to)
         for n in range(200):
             vehicle.sendto(b"%d" % n, to)
-        got = [data for data, _ in connection.receive(everything=True)]
+        got = [data for data, _ in connection.receive(read_all=True)]
         assert [data for data in got if data != FRAME] == [b"%d" % n for n in range(200)]
-        assert not connection.unread and connection.known
-        assert connection.lost() == 0
+        assert not connection.has_unread and connection.has_known_sender
+        assert connection.count_lost() == 0
         connection.send(b"setpoint")
         assert vehicle.recv(64) == b"setpoint"
 
 
 @pytest.mark.fault(39)
 def test_what_the_system_dropped_of_the_vehicle_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("uavctl.io.transport.OWN_BUFFER_BYTES", 4096)
+    monkeypatch.setattr("uavctl.io.udp.PEER_BUFFER_BYTES", 4096)
     with closing(open_connection("udpin://127.0.0.1:0")) as connection, peer() as vehicle:
         known(connection, vehicle)
         for _ in range(1000):
             vehicle.sendto(FRAME, ("127.0.0.1", port_of(connection)))
-        got = len(connection.receive(everything=True))
-        assert connection.lost() == 1000 - got > 0
+        got = len(connection.receive(read_all=True))
+        assert connection.count_lost() == 1000 - got > 0
 
 
 def test_what_came_before_the_own_socket_counts_first() -> None:
@@ -414,9 +416,9 @@ def test_what_came_before_the_own_socket_counts_first() -> None:
         for n in range(300):
             vehicle.sendto(b"\xfd%d" % n, to)
         got = connection.receive()
-        connection.answer(0)
+        connection.select_peer(0)
         vehicle.sendto(b"\xfdlast", to)
-        got += connection.receive(everything=True)
+        got += connection.receive(read_all=True)
         numbers = [data for data, _ in got]
         assert numbers[-1] == b"\xfdlast"
         assert numbers[:-1] == sorted(numbers[:-1], key=lambda one: int(one[1:]))
@@ -436,7 +438,7 @@ def test_the_port_stays_ours_and_one_who_is_silent_gives_up_the_own_socket() -> 
                 camera.sendto(FRAME, ("127.0.0.1", port_of(connection)))
                 assert wait({"it": connection}, time.monotonic_ns() + LIMIT_NS)
                 assert connection.receive()
-                connection.trust(0)
+                connection.trust_sender(0)
             assert len(connection.filenos()) <= 9
             clock.now_ns += SECOND
         clock.now_ns += 10 * SECOND
@@ -444,19 +446,19 @@ def test_the_port_stays_ours_and_one_who_is_silent_gives_up_the_own_socket() -> 
             camera.sendto(FRAME, ("127.0.0.1", port_of(connection)))
             assert wait({"it": connection}, time.monotonic_ns() + LIMIT_NS)
             assert connection.receive()
-            connection.trust(0)
+            connection.trust_sender(0)
         assert len(connection.filenos()) == 3  # vehicle and camera
 
 
 def test_where_the_system_does_not_tell_nothing_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("uavctl.io.transport._SO_MEMINFO", 9999)
+    monkeypatch.setattr("uavctl.io.udp._SO_MEMINFO", 9999)
     monkeypatch.delattr("socket.SO_REUSEPORT")
     with closing(open_connection("udpin://127.0.0.1:0")) as connection, peer() as vehicle, peer() as flooder:
         known(connection, vehicle)
-        assert len(connection.filenos()) == 1 and connection.lost() == 0
+        assert len(connection.filenos()) == 1 and connection.count_lost() == 0
         to = ("127.0.0.1", port_of(connection))
         for _ in range(200):
             flooder.sendto(b"x", to)
         vehicle.sendto(b"\xfdlast", to)
-        assert connection.receive(everything=True)[-1][0] == b"\xfdlast"
-        assert not connection.unread
+        assert connection.receive(read_all=True)[-1][0] == b"\xfdlast"
+        assert not connection.has_unread

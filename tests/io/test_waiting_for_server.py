@@ -11,7 +11,7 @@ import pytest
 from uavctl.cli.flying import wait_for_server
 from uavctl.config import load_config
 from uavctl.errors import ConnectionSpecError
-from uavctl.io.signed_connection import connected
+from uavctl.io.signed_connection import open_links
 from uavctl.mavlink.connection import VEHICLE
 
 
@@ -35,7 +35,7 @@ def test_a_server_that_comes_up_later_is_connected_to() -> None:
             servers.append(socket.create_server(("127.0.0.1", port)))
         return len(waited) < 5
 
-    with connected(config, waits) as connections, closing(servers[0]) as server:
+    with open_links(config, waits) as connections, closing(servers[0]) as server:
         peer, _ = server.accept()
         with peer:
             connections[VEHICLE].send(b"hello")
@@ -54,7 +54,7 @@ def test_nobody_waits_who_was_told_not_to_or_for_what_cannot_come(url: str) -> N
         return False
 
     for waits in (None, never):
-        with pytest.raises(ConnectionSpecError, match=r"tcp://"), connected(config, waits):
+        with pytest.raises(ConnectionSpecError, match=r"tcp://"), open_links(config, waits):
             pytest.fail("nobody listens there")
     assert len(asked) == ("127.0.0.1:" in url)
 

@@ -15,11 +15,11 @@ from uavctl.mavlink.clocksync import (
     ArrivalClock,
     ClockSource,
     ClockSync,
-    RoundTrips,
     SlidingMinimum,
     StampRefusal,
     StampUnit,
-    StampUnitWatch,
+    StampUnitDetector,
+    TimesyncClock,
 )
 from uavctl.records import Event
 
@@ -44,7 +44,7 @@ class Source:
         """One sample; its time of capture as mapped, relative to the truth, or the refusal."""
         self.true_ns += PERIOD
         stamp_ns = self.true_ns - self.offset_ns + error_ns
-        captured = self.clock.captured_ns(stamp_ns, self.true_ns + delay_ns, **more)
+        captured = self.clock.estimate_capture_ns(stamp_ns, self.true_ns + delay_ns, **more)
         return captured if isinstance(captured, str) else captured - self.true_ns
 
     def settle(self, delay_ns: int = 30 * MS, count: int = 30) -> None:
@@ -83,16 +83,16 @@ def test_reordered_samples_keep_their_times() -> None:
     clock = make()
     base = 5_000 * SECOND
     for n in range(30):
-        clock.captured_ns(base + n * PERIOD, base + n * PERIOD + OFFSET + 20 * MS)
+        clock.estimate_capture_ns(base + n * PERIOD, base + n * PERIOD + OFFSET + 20 * MS)
     newer, older = base + 31 * PERIOD, base + 30 * PERIOD
     received = newer + OFFSET + 50 * MS
-    assert clock.captured_ns(newer, received) == newer + OFFSET + 20 * MS
-    assert clock.captured_ns(older, received) == older + OFFSET + 20 * MS
+    assert clock.estimate_capture_ns(newer, received) == newer + OFFSET + 20 * MS
+    assert clock.estimate_capture_ns(older, received) == older + OFFSET + 20 * MS
 
 
 def test_without_stamps_the_latency_is_all_that_is_known() -> None:
     clock = make(latency_ns=7 * MS)
-    assert clock.captured_ns(None, 100 * SECOND) == 100 * SECOND - 7 * MS
+    assert clock.estimate_capture_ns(None, 100 * SECOND) == 100 * SECOND - 7 * MS
     assert clock.source is ClockSource.NONE
 
 
@@ -108,7 +108,7 @@ def test_a_drifting_clock_is_followed() -> None:
     worst = 0
     for n in range(2000):  # 1.3 % slow, as recorded from a simulator on a busy computer
         true_ns = 1_000 * SECOND + n * PERIOD
-        captured = clock.captured_ns(round(true_ns * 0.987), true_ns + 10 * MS)
+        captured = clock.estimate_capture_ns(round(true_ns * 0.987), true_ns + 10 * MS)
         assert not isinstance(captured, str)
         worst = max(worst, abs(captured - true_ns))
     assert worst <= 10 * MS + 2 * SECOND * 0.0131
@@ -131,8 +131,8 @@ def test_first_samples_may_lower_the_minimum_by_more_than_the_tolerance() -> Non
 
 def test_a_duplicate_is_refused() -> None:
     clock = make()
-    assert clock.captured_ns(5 * SECOND, 6 * SECOND) == 6 * SECOND
-    assert clock.captured_ns(5 * SECOND, 6 * SECOND + MS) is StampRefusal.DUPLICATE
+    assert clock.estimate_capture_ns(5 * SECOND, 6 * SECOND) == 6 * SECOND
+    assert clock.estimate_capture_ns(5 * SECOND, 6 * SECOND + MS) is StampRefusal.DUPLICATE
 
 
 @pytest.mark.parametrize("leap_ns", [-2 * SECOND, -1_500_000 * SECOND, 2 * SECOND, 4_000_000 * SECOND, 500 * MS])
@@ -169,10 +169,10 @@ def test_a_backlog_keeps_its_ages() -> None:
     clock = make()
     base = 5_000 * SECOND
     for n in range(30):
-        clock.captured_ns(base + n * PERIOD, base + n * PERIOD + OFFSET)
+        clock.estimate_capture_ns(base + n * PERIOD, base + n * PERIOD + OFFSET)
     received = base + 100 * PERIOD + OFFSET  # 2.8 s of silence, then all of it at once
     for n in range(30, 101):
-        assert clock.captured_ns(base + n * PERIOD, received) == base + n * PERIOD + OFFSET
+        assert clock.estimate_capture_ns(base + n * PERIOD, received) == base + n * PERIOD + OFFSET
     assert clock.resyncs == 0
 
 
@@ -181,22 +181,24 @@ def test_the_boot_clock_wraps(start_ms: int) -> None:
     clock = make(latency_ns=0)
     for n in range(100):
         received = 77 * SECOND + n * PERIOD
-        stamp = clock.unwrap((start_ms + 40 * n) % WRAP, WRAP, MS)
-        assert clock.captured_ns(stamp, received) == received
+        stamp = clock.unwrap_ns((start_ms + 40 * n) % WRAP, WRAP, MS)
+        assert clock.estimate_capture_ns(stamp, received) == received
     assert clock.resyncs == 0
-    late = clock.unwrap((start_ms + 40 * 98 + 1) % WRAP, WRAP, MS)
-    assert clock.captured_ns(late, received) == received - 39 * MS
+    late = clock.unwrap_ns((start_ms + 40 * 98 + 1) % WRAP, WRAP, MS)
+    assert clock.estimate_capture_ns(late, received) == received - 39 * MS
 
 
 # --- round trips -------------------------------------------------------------------------------------
 
 
-def trip(trips: RoundTrips, at_ns: int, offset_ns: int = OFFSET, there_ns: int = 2 * MS, back_ns: int = 2 * MS) -> bool:
-    return trips.answer(at_ns, at_ns + there_ns - offset_ns, at_ns + there_ns + back_ns)
+def trip(
+    trips: TimesyncClock, at_ns: int, offset_ns: int = OFFSET, there_ns: int = 2 * MS, back_ns: int = 2 * MS
+) -> bool:
+    return trips.add_answer(at_ns, at_ns + there_ns - offset_ns, at_ns + there_ns + back_ns)
 
 
 def test_a_round_trip_gives_the_offset() -> None:
-    trips = RoundTrips(10 * SECOND)
+    trips = TimesyncClock(10 * SECOND)
     assert trips.offset_ns(0) is None
     assert trip(trips, 5 * SECOND)
     assert trips.offset_ns(6 * SECOND) == OFFSET
@@ -204,7 +206,7 @@ def test_a_round_trip_gives_the_offset() -> None:
 
 @pytest.mark.parametrize(("there_ms", "back_ms"), [(9, 0), (0, 9), (5, 5)])
 def test_asymmetry_costs_at_most_half_the_round_trip(there_ms: int, back_ms: int) -> None:
-    trips = RoundTrips(10 * SECOND)
+    trips = TimesyncClock(10 * SECOND)
     assert trip(trips, 5 * SECOND, there_ns=there_ms * MS, back_ns=back_ms * MS)
     offset = trips.offset_ns(5 * SECOND)
     assert offset is not None
@@ -213,7 +215,7 @@ def test_asymmetry_costs_at_most_half_the_round_trip(there_ms: int, back_ms: int
 
 @pytest.mark.parametrize(("there_ms", "back_ms"), [(0, 1001), (-3, 2)])
 def test_impossible_round_trips_and_those_that_say_nothing_are_dropped(there_ms: int, back_ms: int) -> None:
-    trips = RoundTrips(10 * SECOND)
+    trips = TimesyncClock(10 * SECOND)
     assert not trip(trips, 5 * SECOND, there_ns=there_ms * MS, back_ns=back_ms * MS)
     assert trips.offset_ns(5 * SECOND) is None
 
@@ -229,7 +231,7 @@ def test_the_clock_stays_known_within_half_the_longest_round_trip(
     lengths_ms: tuple[int, ...], lost: float, drift_ppm: int, there_part: float
 ) -> None:
     """Each length for 20 s, in turns; with another length the error of its asymmetry may be that one's."""
-    trips, numbers, worst_ns = RoundTrips(10 * SECOND), random.Random(3), 0.0
+    trips, numbers, worst_ns = TimesyncClock(10 * SECOND), random.Random(3), 0.0
     for n in range(20 * len(lengths_ms)):
         at_ns, length_ns = n * SECOND, lengths_ms[n // 20] * MS
         there_ns = round(there_part * length_ns)
@@ -245,7 +247,7 @@ def test_the_clock_stays_known_within_half_the_longest_round_trip(
 
 @pytest.mark.fault(19)
 def test_long_round_trips_for_a_while_do_not_spoil_what_short_ones_said() -> None:
-    trips = RoundTrips(10 * SECOND)
+    trips = TimesyncClock(10 * SECOND)
     for n in range(10):
         trip(trips, n * SECOND)
     for n in range(10, 25):
@@ -258,7 +260,7 @@ def test_long_round_trips_for_a_while_do_not_spoil_what_short_ones_said() -> Non
 
 @pytest.mark.fault(19)
 def test_without_answers_the_last_drift_goes_on_and_the_uncertainty_grows() -> None:
-    trips = RoundTrips(10 * SECOND)
+    trips = TimesyncClock(10 * SECOND)
     for n in range(20):
         trip(trips, n * SECOND, OFFSET + n * 14 * MS)
     for later_s in (5, 30, 60):
@@ -270,7 +272,7 @@ def test_without_answers_the_last_drift_goes_on_and_the_uncertainty_grows() -> N
 
 
 def test_a_deviating_clock_is_believed_after_five_in_a_row() -> None:
-    trips = RoundTrips(100 * SECOND)
+    trips = TimesyncClock(100 * SECOND)
     trip(trips, SECOND)
     new = OFFSET + 101 * MS
     assert [trip(trips, n * SECOND, new) for n in range(2, 6)] == [False] * 4
@@ -280,7 +282,7 @@ def test_a_deviating_clock_is_believed_after_five_in_a_row() -> None:
 
 
 def test_deviations_that_are_not_in_a_row_are_never_believed() -> None:
-    trips = RoundTrips(100 * SECOND)
+    trips = TimesyncClock(100 * SECOND)
     trip(trips, SECOND)
     for n in range(2, 200):
         in_order = n % 5 == 0
@@ -289,7 +291,7 @@ def test_deviations_that_are_not_in_a_row_are_never_believed() -> None:
 
 
 def test_a_small_step_is_followed_within_five_answers() -> None:
-    trips = RoundTrips(100 * SECOND)
+    trips = TimesyncClock(100 * SECOND)
     for n in range(1, 6):
         trip(trips, n * SECOND)
     for n in range(6, 11):
@@ -303,7 +305,7 @@ def test_a_small_step_is_followed_within_five_answers() -> None:
 @pytest.mark.fault(19)
 @pytest.mark.parametrize("drift_ppm", [-40_000, -100, 0, 25, 13_000, 49_000])
 def test_a_steady_drift_is_measured_and_the_offset_is_right_between_answers(drift_ppm: int) -> None:
-    trips = RoundTrips(10 * SECOND)
+    trips = TimesyncClock(10 * SECOND)
     for n in range(1, 20):
         assert trip(trips, n * SECOND, OFFSET + n * drift_ppm * 1000)
     assert trips.drift_ppm == pytest.approx(drift_ppm, abs=0.1)
@@ -313,7 +315,7 @@ def test_a_steady_drift_is_measured_and_the_offset_is_right_between_answers(drif
 
 @pytest.mark.fault(19)
 def test_one_asymmetric_answer_in_five_moves_neither_offset_nor_drift() -> None:
-    trips = RoundTrips(10 * SECOND)
+    trips = TimesyncClock(10 * SECOND)
     for n in range(1, 60):
         slow = n % 5 == 0
         assert trip(trips, n * SECOND, there_ns=9 * MS if slow else 2 * MS, back_ns=0 if slow else 2 * MS)
@@ -322,21 +324,21 @@ def test_one_asymmetric_answer_in_five_moves_neither_offset_nor_drift() -> None:
 
 
 def test_a_drift_beyond_belief_is_bounded() -> None:
-    trips = RoundTrips(10 * SECOND)
+    trips = TimesyncClock(10 * SECOND)
     for n in range(1, 6):
         assert trip(trips, n * SECOND, OFFSET + n * 60 * MS)
     assert trips.drift_ppm == 50_000.0
 
 
 def test_two_answers_at_one_time_give_no_slope() -> None:
-    trips = RoundTrips(10 * SECOND)
+    trips = TimesyncClock(10 * SECOND)
     for at_s in (1, 1, 1, 5):
         assert trip(trips, at_s * SECOND)
     assert trips.drift_ppm == 0.0 and trips.offset_ns(5 * SECOND) == OFFSET
 
 
 def test_rejected_answers_and_round_trips_are_kept_count_of() -> None:
-    trips = RoundTrips(10 * SECOND)
+    trips = TimesyncClock(10 * SECOND)
     assert trips.drift_ppm is None and not trips.round_trips_ns
     trip(trips, SECOND)
     trip(trips, 2 * SECOND, there_ns=20 * MS)
@@ -350,20 +352,20 @@ def test_rejected_answers_and_round_trips_are_kept_count_of() -> None:
 )
 def test_recorded_clocks_are_foretold_until_the_next_answer(name: str, median_ms: float, p95_ms: float) -> None:
     """PX4's simulator ran 1.3 % slow, unevenly: an average of the offsets was 47 ms behind (median), 102 ms (95 %)."""
-    trips, errors = RoundTrips(10 * SECOND), []
+    trips, errors = TimesyncClock(10 * SECOND), []
     for line in (DATA / name).read_text().splitlines()[1:]:
         sent_ns, remote_ns, received_ns = map(int, line.split(","))
         foretold = trips.offset_ns(received_ns)
         if foretold is not None and received_ns - sent_ns <= 10 * MS:
             errors.append(abs(foretold - ((sent_ns + received_ns) // 2 - remote_ns)) / MS)
-        trips.answer(sent_ns, remote_ns, received_ns)
+        trips.add_answer(sent_ns, remote_ns, received_ns)
     errors.sort()
     assert len(errors) > 90
     assert errors[len(errors) // 2] < median_ms and errors[int(0.95 * len(errors))] < p95_ms
 
 
 def test_an_old_answer_counts_no_more() -> None:
-    trips = RoundTrips(10 * SECOND)
+    trips = TimesyncClock(10 * SECOND)
     trip(trips, SECOND)
     assert trips.offset_ns(11 * SECOND) == OFFSET
     assert trips.offset_ns(12 * SECOND) is None
@@ -401,7 +403,7 @@ def test_a_drifting_clock_is_followed_by_the_arrival_of_its_stamps(drift_ppm: in
         true_ns = n * 20 * MS
         stamp_ns = true_ns - true_ns * drift_ppm // 10**6 - OFFSET
         at_ns = true_ns + 5 * MS + round(numbers.expovariate(1 / 4) * MS)
-        late_ms.append(clock.delay_ns(stamp_ns, at_ns) / MS)
+        late_ms.append(clock.measure_delay_ns(stamp_ns, at_ns) / MS)
         if n > 200:
             known = clock.offset_ns(at_ns)
             assert known is not None and -8 * MS < known - (true_ns - stamp_ns) - 5 * MS < 20 * MS
@@ -415,7 +417,7 @@ def test_a_stream_that_becomes_late_is_no_drift(drift_ppm: int) -> None:
     for n in range(1000):
         true_ns = n * 20 * MS
         at_ns = true_ns + (500 * MS if n >= 500 else 5 * MS)
-        late_ns = clock.delay_ns(true_ns - true_ns * drift_ppm // 10**6, at_ns)
+        late_ns = clock.measure_delay_ns(true_ns - true_ns * drift_ppm // 10**6, at_ns)
         assert (late_ns > 400 * MS) == (n >= 500), n
 
 
@@ -433,7 +435,7 @@ def test_recorded_camera_delays() -> None:
         if raw.get_type() == "TIMESYNC" and raw.tc1:
             trips.append((at_ns - raw.ts1, (at_ns + raw.ts1) // 2 - raw.tc1))
         if raw.get_type() == "VISION_POSITION_ESTIMATE":
-            captured = clock.captured_ns(raw.usec * 1000, at_ns)
+            captured = clock.estimate_capture_ns(raw.usec * 1000, at_ns)
             assert isinstance(captured, int) and not isinstance(captured, bool)
             delays.append(at_ns - captured)
             received_of.append((at_ns, raw.usec * 1000))
@@ -454,16 +456,16 @@ def test_recorded_camera_delays() -> None:
     [(1e6, "us"), (0.986e6, "us"), (1e3, "ms"), (1e9, "ns"), (1.0, "s"), (0.0, "constant"), (3e7, "us")],
 )
 def test_the_unit_of_stamps_is_recognised_by_how_fast_they_go_on(per_second: float, unit: str) -> None:
-    watch = StampUnitWatch()
+    watch = StampUnitDetector()
     for n in range(100):
-        got = watch.take(50_000 + round(per_second * n / 20), (0.001 * (n % 3), 0.0, float(n)), n * 50 * MS)
+        got = watch.update(50_000 + round(per_second * n / 20), (0.001 * (n % 3), 0.0, float(n)), n * 50 * MS)
     assert got.value == unit
 
 
 def test_a_message_that_is_repeated_has_no_constant_stamp() -> None:
-    watch = StampUnitWatch()
+    watch = StampUnitDetector()
     for n in range(100):
-        got = watch.take(1_000_000 + 50_000 * min(n, 40), (0.0, 0.0, float(min(n, 40))), n * 50 * MS)
+        got = watch.update(1_000_000 + 50_000 * min(n, 40), (0.0, 0.0, float(min(n, 40))), n * 50 * MS)
     assert got is StampUnit.MICROSECONDS
 
 

@@ -10,17 +10,18 @@ from mavlink_rig import NO_COVARIANCE, Peer, packets, read
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.frames import Convention
-from uavctl.mavlink.codec import MAX_DATAGRAM_BYTES, Encoder, StreamDecoder, UnsendableError, decode
+from uavctl.mavlink.codec import MAX_DATAGRAM_BYTES, StreamDecoder, decode
+from uavctl.mavlink.encoder import Encoder, UnsendableError
 from uavctl.mavlink.messages import (
-    Ack,
     Attitude,
     Battery,
+    CommandAck,
     GlobalOrigin,
     Heartbeat,
-    Landed,
+    LandedState,
     Message,
     Position,
-    Text,
+    StatusText,
     TimeSync,
 )
 from uavctl.records import Setpoint, SetpointSource, Vec3
@@ -138,16 +139,16 @@ VEHICLE = Peer(1, 1)
             ),
         ),
         (VEHICLE.send("timesync", 0, -5), TimeSync(system=1, component=1, tc1_ns=0, ts1_ns=-5)),
-        (VEHICLE.send("extended_sys_state", 0, 1), Landed(system=1, component=1, landed=True)),
-        (VEHICLE.send("extended_sys_state", 0, 2), Landed(system=1, component=1, landed=False)),
-        (VEHICLE.send("extended_sys_state", 0, 0), Landed(system=1, component=1, landed=None)),
+        (VEHICLE.send("extended_sys_state", 0, 1), LandedState(system=1, component=1, landed=True)),
+        (VEHICLE.send("extended_sys_state", 0, 2), LandedState(system=1, component=1, landed=False)),
+        (VEHICLE.send("extended_sys_state", 0, 0), LandedState(system=1, component=1, landed=None)),
         (
             VEHICLE.send("sys_status", 0, 0, 0, 0, 12_600, 0, 0, 0, 0, 0, 0, 0, 0),
-            Battery(system=1, component=1, voltage_v=12.6, radio=False),
+            Battery(system=1, component=1, voltage_v=12.6, has_radio=False),
         ),
         (
             VEHICLE.send("sys_status", 0, 1 << 16 | 1 << 20, 1 << 16, 0, 65_535, 0, 0, 0, 0, 0, 0, 0, 0),
-            Battery(system=1, component=1, voltage_v=None, radio=True, fenced=False),
+            Battery(system=1, component=1, voltage_v=None, has_radio=True, is_within_fence=False),
         ),
         (
             VEHICLE.send("battery_status", 0, 0, 0, 0, [4_000, 4_100] + [65_535] * 8, 0, 0, 0, 0),
@@ -156,11 +157,11 @@ VEHICLE = Peer(1, 1)
         (VEHICLE.send("battery_status", 1, 0, 0, 0, [4_000] + [65_535] * 9, 0, 0, 0, 0), None),
         (
             VEHICLE.send("statustext", 4, b"\x1b[32mbad\x1b[0m \xc2\xb0\xff\x07 text\t"),
-            Text(system=1, component=1, severity=4, text="bad °\ufffd? text"),
+            StatusText(system=1, component=1, severity=4, text="bad °\ufffd? text"),
         ),
         (
             VEHICLE.send("command_ack", 21, 4, 0, 0, 245, 25),
-            Ack(system=1, component=1, command=21, result=4, target_system=245, target_component=25),
+            CommandAck(system=1, component=1, command=21, result=4, target_system=245, target_component=25),
         ),
         (VEHICLE.send("gps_global_origin", 1, 2, 3), GlobalOrigin(system=1, component=1)),
         (
@@ -300,7 +301,7 @@ def test_recorded_messages_agree_with_pymavlink() -> None:
 
 def test_acceleration_setpoint() -> None:
     encoder = Encoder(245, 25)
-    (raw,) = read(encoder.setpoint(setpoint(at_ns=12_345_678_901), 1, 2))
+    (raw,) = read(encoder.encode_setpoint(setpoint(at_ns=12_345_678_901), 1, 2))
     assert raw.get_type() == "SET_POSITION_TARGET_LOCAL_NED"
     assert (raw.target_system, raw.target_component, raw.coordinate_frame) == (1, 2, 1)
     assert (raw.type_mask, raw.time_boot_ms) == (3135, 12_345)
@@ -310,15 +311,15 @@ def test_acceleration_setpoint() -> None:
 
 
 def test_yaw_is_sent_with_its_own_mask() -> None:
-    (raw,) = read(Encoder(245, 25).setpoint(setpoint(yaw=0.5), 1, 1))
+    (raw,) = read(Encoder(245, 25).encode_setpoint(setpoint(yaw=0.5), 1, 1))
     assert (raw.type_mask, raw.yaw) == (2111, 0.5)
-    (raw,) = read(Encoder(245, 25).setpoint(setpoint(yaw=0.0), 1, 1))
+    (raw,) = read(Encoder(245, 25).encode_setpoint(setpoint(yaw=0.0), 1, 1))
     assert (raw.type_mask, raw.yaw) == (2111, 0.0)
 
 
 @pytest.mark.parametrize("ms", [0, 2**32 - 1, 2**32, 2**32 + 5, 2**40])
 def test_time_boot_ms_wraps(ms: int) -> None:
-    (raw,) = read(Encoder(245, 25).setpoint(setpoint(at_ns=ms * 1_000_000 + 999_999), 1, 1))
+    (raw,) = read(Encoder(245, 25).encode_setpoint(setpoint(at_ns=ms * 1_000_000 + 999_999), 1, 1))
     assert raw.time_boot_ms == ms % 2**32
 
 
@@ -335,12 +336,14 @@ def test_time_boot_ms_wraps(ms: int) -> None:
 )
 def test_what_would_harm_a_vehicle_is_not_encoded(accel: Vec3, yaw: float | None) -> None:
     with pytest.raises(UnsendableError, match="not finite, or absurd"):
-        Encoder(245, 25).setpoint(setpoint(accel, yaw), 1, 1)
+        Encoder(245, 25).encode_setpoint(setpoint(accel, yaw), 1, 1)
 
 
 def test_other_outgoing_messages() -> None:
     encoder = Encoder(245, 25)
-    beat, request, land = read(encoder.heartbeat() + encoder.timesync(0, 77) + encoder.command(21, (), 3, 4))
+    beat, request, land = read(
+        encoder.encode_heartbeat() + encoder.encode_timesync(0, 77) + encoder.encode_command(21, (), 3, 4)
+    )
     assert (beat.type, beat.autopilot, beat.base_mode) == (18, 8, 0)
     assert (request.tc1, request.ts1) == (0, 77)
     assert (land.get_type(), land.command, land.target_system, land.target_component) == ("COMMAND_LONG", 21, 3, 4)
@@ -349,12 +352,14 @@ def test_other_outgoing_messages() -> None:
 
 def test_timesync_beyond_64_bits_is_refused() -> None:
     with pytest.raises(UnsendableError, match="64-bit"):
-        Encoder(245, 25).timesync(2**63, 0)
+        Encoder(245, 25).encode_timesync(2**63, 0)
 
 
 def test_the_sequence_counts_modulo_256_across_kinds() -> None:
     encoder = Encoder(245, 25)
-    numbers = [data[4] for _ in range(200) for data in (encoder.heartbeat(), encoder.setpoint(setpoint(), 1, 1))]
+    numbers = [
+        data[4] for _ in range(200) for data in (encoder.encode_heartbeat(), encoder.encode_setpoint(setpoint(), 1, 1))
+    ]
     assert numbers == [n % 256 for n in range(400)]
 
 

@@ -23,18 +23,18 @@ def test_the_rig_gets_everywhere(state: HandoverState) -> None:
 
 def test_nothing_is_asked_for_without_an_order() -> None:
     rig = Rig()
-    assert rig.tick().sending is NEUTRAL
+    assert rig.tick().setpoint_mode is NEUTRAL
     rig.run(10.0)
     rig.be(armed=True, landed=False, mode="OFFBOARD")
-    assert rig.tick().sending is FLY
+    assert rig.tick().setpoint_mode is FLY
     rig.run(10.0)
-    assert not rig.asked and not rig.hand_over.ours and not rig.hand_over.failure
+    assert not rig.asked and not rig.hand_over.is_ordered_flight and not rig.hand_over.failure
 
 
 def test_no_neutral_stream_before_the_controller_is_ready() -> None:
     rig = Rig()
-    assert rig.tick(ready=False).sending is NOTHING
-    assert rig.tick(ready=True).sending is NEUTRAL
+    assert rig.tick(has_setpoint=False).setpoint_mode is NOTHING
+    assert rig.tick(has_setpoint=True).setpoint_mode is NEUTRAL
 
 
 @pytest.mark.fault(25)
@@ -44,11 +44,11 @@ def test_no_neutral_stream_before_the_controller_is_ready() -> None:
 def test_the_pilot_takes_over_for_good(mode: str, armed: bool, after: HandoverState) -> None:
     rig = Rig().to(HandoverState.ENGAGED)
     rig.be(mode=mode, armed=armed)
-    assert rig.tick().sending is NOTHING and rig.is_in(after)
+    assert rig.tick().setpoint_mode is NOTHING and rig.is_in(after)
     assert mode in rig.codes("hand-over")[-1]
     rig.be(mode="OFFBOARD", armed=True)  # PX4 goes back by itself as soon as setpoints come again
     for _ in range(20):
-        assert rig.tick().sending is NOTHING
+        assert rig.tick().setpoint_mode is NOTHING
     assert not rig.asked
 
 
@@ -57,13 +57,14 @@ def test_silence_while_engaged_is_told_once_and_the_controller_s_braking_is_sent
     rig = Rig().to(HandoverState.ENGAGED)
     rig.mute = True
     for _ in range(HEARTBEAT_TIMEOUT_NS // TICK_NS):
-        assert rig.tick().sending is FLY
+        assert rig.tick().setpoint_mode is FLY
     assert not rig.codes("heartbeat")
     for _ in range(20):
-        assert rig.tick().sending is FLY
-        assert rig.hand_over.flown(rig.view.at_ns, rig.vehicle) is None  # so that it brakes and holds, then lands
+        assert rig.tick().setpoint_mode is FLY
+        # so that it brakes and holds, then lands
+        assert rig.hand_over.select_controlled_status(rig.view.at_ns, rig.vehicle) is None
     rig.mute = False
-    assert rig.tick().sending is FLY
+    assert rig.tick().setpoint_mode is FLY
     lost, back = rig.codes("heartbeat")
     assert "lost" in lost and "back" in back
 
@@ -72,12 +73,12 @@ def test_landing_is_asked_for_in_silence_too() -> None:
     rig = Rig().to(HandoverState.ENGAGED)
     rig.mute = True
     rig.run(10.0)
-    assert rig.tick(land=True).ask is RequestKind.LAND
+    assert rig.tick(is_landing_requested=True).request is RequestKind.LAND
 
 
 def test_what_the_controller_may_fly() -> None:
     rig = Rig()
-    flown = rig.hand_over.flown
+    flown = rig.hand_over.select_controlled_status
     assert flown(NOW, None) is None
     assert rig.vehicle is not None and flown(NOW, rig.vehicle) == rig.vehicle
     assert flown(NOW + HEARTBEAT_TIMEOUT_NS + 1, rig.vehicle) is None
@@ -94,21 +95,21 @@ def test_px4_goes_by_its_own_climb_and_offboard() -> None:
     rig = Rig("px4")
     told = rig.tick()
     told = rig.tick(commands=(TAKE_OFF,))
-    assert (rig.state, told.ask, told.sending) == (HandoverState.MODE, RequestKind.TAKE_OFF_MODE, NEUTRAL)
+    assert (rig.state, told.request, told.setpoint_mode) == (HandoverState.MODE, RequestKind.TAKE_OFF_MODE, NEUTRAL)
     rig.answer(ACCEPTED)
     assert rig.is_in(HandoverState.MODE)  # the heartbeat has to show it
     rig.be(mode="AUTO.TAKEOFF")
-    assert rig.tick().ask is RequestKind.ARM
+    assert rig.tick().request is RequestKind.ARM
     rig.answer(ACCEPTED)
     assert rig.is_in(HandoverState.CLIMBING)  # arming starts the climb; the heartbeat may be a second behind
-    rig.tick(up_m=0.5)
+    rig.tick(estimated_height_m=0.5)
     rig.be(armed=True)
-    assert rig.tick(up_m=1.0, up_mps=1.0).ask is None and rig.is_in(HandoverState.CLIMBING)
-    told = rig.tick(up_m=1.4, up_mps=1.0)  # 0.5 s ahead: 1.9 of 2 m
-    assert (rig.state, told.ask, told.sending) == (HandoverState.ENGAGING, RequestKind.EXTERNAL_MODE, NEUTRAL)
+    assert rig.tick(estimated_height_m=1.0, climb_rate_mps=1.0).request is None and rig.is_in(HandoverState.CLIMBING)
+    told = rig.tick(estimated_height_m=1.4, climb_rate_mps=1.0)  # 0.5 s ahead: 1.9 of 2 m
+    assert (rig.state, told.request, told.setpoint_mode) == (HandoverState.ENGAGING, RequestKind.EXTERNAL_MODE, NEUTRAL)
     told = rig.answer(ACCEPTED)
-    assert (rig.state, told.sending) == (HandoverState.ENGAGED, FLY)
-    seen = rig.hand_over.flown(rig.view.at_ns, rig.vehicle)  # which still says AUTO.TAKEOFF
+    assert (rig.state, told.setpoint_mode) == (HandoverState.ENGAGED, FLY)
+    seen = rig.hand_over.select_controlled_status(rig.view.at_ns, rig.vehicle)  # which still says AUTO.TAKEOFF
     assert seen is not None and seen.external and seen.armed
     rig.be(mode="OFFBOARD")
     rig.run(3.0)
@@ -119,19 +120,19 @@ def test_px4_goes_by_its_own_climb_and_offboard() -> None:
 def test_ardupilot_climbs_in_guided_and_gets_no_setpoint_before_it_is_up() -> None:
     rig = Rig("ardupilot")
     rig.tick()
-    sent = [rig.tick(commands=(TAKE_OFF,)).sending]
+    sent = [rig.tick(commands=(TAKE_OFF,)).setpoint_mode]
     rig.be(mode="GUIDED")
-    sent.append(rig.tick().sending)
+    sent.append(rig.tick().setpoint_mode)
     rig.be(armed=True)
     told = rig.tick()
-    assert told.ask is RequestKind.TAKE_OFF and rig.is_in(HandoverState.CLIMBING)
-    sent += [told.sending, rig.answer(ACCEPTED).sending]
-    sent += [rig.tick(up_m=0.01 * n, up_mps=1.0).sending for n in range(180)]
+    assert told.request is RequestKind.TAKE_OFF and rig.is_in(HandoverState.CLIMBING)
+    sent += [told.setpoint_mode, rig.answer(ACCEPTED).setpoint_mode]
+    sent += [rig.tick(estimated_height_m=0.01 * n, climb_rate_mps=1.0).setpoint_mode for n in range(180)]
     assert rig.is_in(HandoverState.CLIMBING) and set(sent) == {NOTHING}
-    seen = rig.hand_over.flown(rig.view.at_ns, rig.vehicle)
+    seen = rig.hand_over.select_controlled_status(rig.view.at_ns, rig.vehicle)
     assert seen is not None and not seen.external  # though it is in GUIDED
-    rig.tick(up_m=1.81)
-    assert rig.tick().sending is FLY and rig.is_in(HandoverState.ENGAGED)
+    rig.tick(estimated_height_m=1.81)
+    assert rig.tick().setpoint_mode is FLY and rig.is_in(HandoverState.ENGAGED)
     assert [ask for _, ask in rig.asked] == [RequestKind.TAKE_OFF_MODE, RequestKind.ARM, RequestKind.TAKE_OFF]
 
 
@@ -140,22 +141,22 @@ def test_after_our_own_flight_landing_ends_disarmed() -> None:
     rig = Rig("px4").to(HandoverState.ENGAGING)
     rig.be(mode="OFFBOARD", landed=False)
     rig.tick()
-    assert rig.tick(land=True).ask is RequestKind.LAND
-    rig.view = replace(rig.view, land=False)
+    assert rig.tick(is_landing_requested=True).request is RequestKind.LAND
+    rig.view = replace(rig.view, is_landing_requested=False)
     rig.be(mode="AUTO.LAND")
     rig.run(10.0)
-    assert rig.is_in(HandoverState.SETTLING) and rig.hand_over.busy
+    assert rig.is_in(HandoverState.SETTLING) and rig.hand_over.is_busy
     rig.be(armed=False, mode="OFFBOARD", landed=True)  # as recorded: PX4 shows the mode of before after disarming
     rig.tick()
-    assert rig.is_in(HandoverState.DONE) and rig.hand_over.finished and not rig.hand_over.failure
+    assert rig.is_in(HandoverState.DONE) and rig.hand_over.is_finished and not rig.hand_over.failure
 
 
 def test_a_vehicle_that_stays_armed_on_the_ground_is_disarmed() -> None:
     rig = Rig("px4").to(HandoverState.ENGAGING)
     rig.be(mode="OFFBOARD", landed=False)
     rig.tick()
-    rig.tick(land=True)
-    rig.view = replace(rig.view, land=False)
+    rig.tick(is_landing_requested=True)
+    rig.view = replace(rig.view, is_landing_requested=False)
     rig.be(mode="AUTO.LAND")
     rig.run(1.0)
     rig.be(landed=True)
@@ -172,8 +173,8 @@ def test_a_vehicle_that_never_lands_is_told_of() -> None:
     rig = Rig("px4", HandOverConfig(land_s=20.0)).to(HandoverState.ENGAGING)
     rig.be(mode="OFFBOARD", landed=False)
     rig.tick()
-    rig.tick(land=True)
-    rig.view = replace(rig.view, land=False)
+    rig.tick(is_landing_requested=True)
+    rig.view = replace(rig.view, is_landing_requested=False)
     rig.be(mode="AUTO.LAND")
     rig.run(21.0)
     assert rig.is_in(HandoverState.FAILED) and "took too long" in rig.hand_over.failure
@@ -182,9 +183,9 @@ def test_a_vehicle_that_never_lands_is_told_of() -> None:
 def test_px4_that_stops_below_the_height_is_flown_from_there_and_one_that_never_rose_is_not() -> None:
     rig = Rig("px4").to(HandoverState.CLIMBING)
     rig.be(mode="AUTO.LOITER")
-    rig.tick(up_m=0.4)
+    rig.tick(estimated_height_m=0.4)
     assert rig.is_in(HandoverState.CLIMBING)
-    rig.tick(up_m=1.0)
+    rig.tick(estimated_height_m=1.0)
     assert rig.is_in(HandoverState.ENGAGING)
 
 
@@ -236,7 +237,7 @@ def test_a_vehicle_that_must_not_be_armed_ends_it_at_once(fields: dict[str, obje
 def test_readiness_is_waited_for_with_a_bound(vehicle: bool, unfit: str, why: str) -> None:
     rig = Rig(config=HandOverConfig(ground_s=5.0))
     rig.vehicle = rig.vehicle if vehicle else None
-    rig.tick(commands=(TAKE_OFF,), unfit=unfit)
+    rig.tick(commands=(TAKE_OFF,), arming_refusal=unfit)
     rig.run(4.8)
     assert rig.is_in(HandoverState.WAITING, HandoverState.READY)
     rig.run(0.5)
@@ -254,7 +255,7 @@ def test_a_silent_vehicle_is_waited_for_with_a_bound() -> None:
 
 def test_positions_that_grow_old_hold_arming_back() -> None:
     rig = Rig(config=HandOverConfig(ground_s=5.0)).to(HandoverState.MODE)
-    rig.view = replace(rig.view, unfit="the newest position is 1.2 s old")
+    rig.view = replace(rig.view, arming_refusal="the newest position is 1.2 s old")
     rig.be(mode="AUTO.TAKEOFF")
     rig.run(4.9)
     assert rig.is_in(HandoverState.ARMING) and RequestKind.ARM not in [ask for _, ask in rig.asked]
@@ -275,24 +276,28 @@ def test_a_second_vehicle_on_the_way_ends_it(state: HandoverState) -> None:
 def test_engaging_again_takes_an_order_and_a_vehicle_in_the_air() -> None:
     rig = Rig().to(HandoverState.RELEASED)
     told = rig.tick(commands=(ENGAGE,))
-    assert (rig.state, told.ask, told.sending) == (HandoverState.RETURNING, RequestKind.EXTERNAL_MODE, NEUTRAL)
+    assert (rig.state, told.request, told.setpoint_mode) == (
+        HandoverState.RETURNING,
+        RequestKind.EXTERNAL_MODE,
+        NEUTRAL,
+    )
     assert [event.code for event in told.events if event.code.startswith("order")] == [ORDER_ACCEPTED]
     rig.be(mode="OFFBOARD")
-    assert rig.tick().sending is FLY
+    assert rig.tick().setpoint_mode is FLY
 
 
 def test_engaging_a_vehicle_that_is_back_by_itself_asks_for_nothing() -> None:
     rig = Rig().to(HandoverState.RELEASED)
     rig.be(mode="OFFBOARD")
     rig.tick(commands=(ENGAGE,))
-    assert rig.tick().sending is FLY and not rig.asked
+    assert rig.tick().setpoint_mode is FLY and not rig.asked
 
 
 @pytest.mark.parametrize(
     ("state", "fields", "view", "why"),
     [
         (HandoverState.RELEASED, {"landed": True}, {}, "not in the air"),
-        (HandoverState.RELEASED, {}, {"unfit": "no position"}, "no position"),
+        (HandoverState.RELEASED, {}, {"arming_refusal": "no position"}, "no position"),
         (HandoverState.ENGAGED, {}, {}, "nothing to engage"),
         (HandoverState.READY, {}, {}, "not in the air"),
         (HandoverState.RELEASED, {"autopilot": "unknown"}, {}, "no vehicle"),
@@ -323,7 +328,7 @@ def test_the_pilot_may_break_off_the_return(mode: str, armed: bool, after: Hando
 def test_a_return_that_is_refused_leaves_the_pilot_in_charge() -> None:
     rig = Rig().to(HandoverState.RETURNING)
     rig.answer(DENIED, text="no way")
-    assert rig.is_in(HandoverState.RELEASED) and not rig.hand_over.failure and not rig.hand_over.finished
+    assert rig.is_in(HandoverState.RELEASED) and not rig.hand_over.failure and not rig.hand_over.is_finished
     assert "DENIED" in rig.codes("refused")[0] and "no way" in rig.codes("refused")[0]
 
 

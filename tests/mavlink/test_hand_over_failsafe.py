@@ -7,15 +7,15 @@ from hand_over_rig import ACCEPTED, ENGAGE, FLY, NEUTRAL, NOTHING, SECOND, TAKE_
 from msgspec.structs import replace
 
 from uavctl.config.connections import HandOverConfig
-from uavctl.mavlink.handover import HandOver
-from uavctl.mavlink.handover_guards import MUST_LAND
+from uavctl.mavlink.handover import HandoverStateMachine
+from uavctl.mavlink.handover_guards import LAND_PERIODS
 from uavctl.mavlink.handover_states import HandoverState
-from uavctl.mavlink.messages import Text
+from uavctl.mavlink.messages import StatusText
 from uavctl.mavlink.requests import RequestKind
 from uavctl.records import Severity
 
 BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
-WORDS = Text(system=1, component=1, severity=2, text="Failsafe activated")
+WORDS = StatusText(system=1, component=1, severity=2, text="Failsafe activated")
 
 
 def engaged(autopilot: str = "px4", config: HandOverConfig | None = None) -> Rig:
@@ -31,15 +31,15 @@ def engaged(autopilot: str = "px4", config: HandOverConfig | None = None) -> Rig
 def test_a_failsafe_that_ends_on_the_way_up_is_waited_for_and_the_climb_goes_on(state: HandoverState) -> None:
     rig = Rig().to(state)
     rig.be(armed=True)
-    rig.tick(WORDS, up_m=0.0)
-    assert rig.fail().sending is NOTHING and rig.is_in(HandoverState.FAILSAFE)
+    rig.tick(WORDS, estimated_height_m=0.0)
+    assert rig.fail().setpoint_mode is NOTHING and rig.is_in(HandoverState.FAILSAFE)
     rig.run(1.0)
     rig.be(mode="AUTO.TAKEOFF", failsafe=False)
-    assert rig.tick().sending is NEUTRAL and rig.is_in(HandoverState.CLIMBING)
-    rig.tick(up_m=1.9)
+    assert rig.tick().setpoint_mode is NEUTRAL and rig.is_in(HandoverState.CLIMBING)
+    rig.tick(estimated_height_m=1.9)
     assert rig.is_in(HandoverState.ENGAGING)
     rig.be(mode="OFFBOARD")
-    assert rig.tick().sending is FLY
+    assert rig.tick().setpoint_mode is FLY
     told = [event for event in rig.events if event.code == "hand-over" and "failsafe" in event.text]
     assert {event.severity for event in told} == {Severity.WARNING} and len(told) == 2
 
@@ -54,7 +54,7 @@ def test_with_his_switch_or_in_a_mode_that_a_person_flies_it_is_not_waited_for(
 ) -> None:
     rig = Rig().to(state)
     rig.be(mode=mode, failsafe=failsafe, stick=not failsafe)
-    assert rig.tick().sending is NOTHING and rig.is_in(HandoverState.RELEASED)
+    assert rig.tick().setpoint_mode is NOTHING and rig.is_in(HandoverState.RELEASED)
     rig.be(mode="AUTO.TAKEOFF", failsafe=False)
     rig.run(60.0)
     assert rig.is_in(HandoverState.RELEASED)  # for good
@@ -83,7 +83,7 @@ def test_a_failsafe_that_lands_is_left_to_it_and_told_of(autopilot: str) -> None
     rig.run(30.0)
     assert (
         rig.is_in(HandoverState.FAILSAFE)
-        and rig.hand_over.busy
+        and rig.hand_over.is_busy
         and RequestKind.LAND not in [ask for _, ask in rig.asked]
     )
     rig.be(armed=False, failsafe=False)
@@ -124,8 +124,8 @@ def test_an_engaged_flight_is_taken_up_again_by_order_only() -> None:
     rig.be(mode="OFFBOARD", failsafe=False)
     rig.run(3.0)
     assert rig.is_in(HandoverState.FAILSAFE)
-    assert rig.tick(commands=(ENGAGE,)).sending is NEUTRAL
-    assert rig.tick().sending is FLY
+    assert rig.tick(commands=(ENGAGE,)).setpoint_mode is NEUTRAL
+    assert rig.tick().setpoint_mode is FLY
 
 
 @pytest.mark.fault(61)
@@ -141,7 +141,7 @@ def test_offboard_that_is_not_given_after_a_failsafe_ends_in_a_landing() -> None
 def test_px4_that_takes_its_climb_up_after_landing_was_asked_for_is_asked_again() -> None:
     rig = Rig().to(HandoverState.CLIMBING)
     rig.fail()
-    rig.tick(stop=True)
+    rig.tick(is_stop_requested=True)
     rig.tick()
     assert rig.is_in(HandoverState.LANDING)  # it lands, but not for us
     rig.answer(ACCEPTED, RequestKind.LAND)
@@ -181,7 +181,7 @@ def test_a_flight_that_the_pilot_began_is_the_pilot_s_in_a_failsafe_too(autopilo
 
 def over_a_relay(state: HandoverState) -> Rig:
     rig = Rig(config=HandOverConfig(climb_s=5.0, land_s=10.0))
-    rig.hand_over = HandOver(HandOverConfig(climb_s=5.0, land_s=10.0), sees_it_down=True)
+    rig.hand_over = HandoverStateMachine(HandOverConfig(climb_s=5.0, land_s=10.0), waits_for_landing=True)
     rig.to(state)
     rig.be(landed=False)
     rig.tick()
@@ -191,21 +191,21 @@ def over_a_relay(state: HandoverState) -> Rig:
 @pytest.mark.fault(63)
 def test_who_lands_by_our_positions_gets_them_when_nothing_more_is_asked_for() -> None:
     rig = over_a_relay(HandoverState.CLIMBING)
-    rig.tick(stop=True)
-    rig.run(MUST_LAND * 10.0 + 2.0, until=HandoverState.FAILED)  # it does not land
-    assert not rig.hand_over.finished
+    rig.tick(is_stop_requested=True)
+    rig.run(LAND_PERIODS * 10.0 + 2.0, until=HandoverState.FAILED)  # it does not land
+    assert not rig.hand_over.is_finished
     rig.run(30.0)
-    assert not rig.hand_over.finished  # it would be blind, and nobody else has it
+    assert not rig.hand_over.is_finished  # it would be blind, and nobody else has it
     rig.be(armed=False)
     rig.tick()
-    assert rig.hand_over.finished
+    assert rig.hand_over.is_finished
 
 
 @pytest.mark.fault(67)
 def test_what_we_took_off_is_asked_to_land_until_it_does() -> None:
     rig = Rig(config=HandOverConfig(land_s=5.0)).to(HandoverState.CLIMBING)
     rig.be(landed=False)
-    rig.tick(stop=True)
+    rig.tick(is_stop_requested=True)
     rig.run(30.0)  # it hears nothing
     assert rig.is_in(HandoverState.LANDING) and len(rig.asked) > 25
     assert len([text for text in rig.codes("refused") if "asked on" in text]) == 1
@@ -217,7 +217,7 @@ def test_what_we_took_off_is_asked_to_land_until_it_does() -> None:
 def test_a_vehicle_that_falls_silent_is_not_asked_to_land_for_longer() -> None:
     rig = Rig(config=HandOverConfig(land_s=5.0)).to(HandoverState.CLIMBING)
     rig.be(landed=False)
-    rig.tick(stop=True)
+    rig.tick(is_stop_requested=True)
     rig.mute = True
     rig.run(9.0)
     assert rig.is_in(HandoverState.FAILED)
@@ -228,19 +228,19 @@ def test_a_pilot_who_flies_by_our_positions_keeps_them_until_the_ground() -> Non
     rig = over_a_relay(HandoverState.CLIMBING)
     rig.be(mode="POSCTL")
     rig.tick()
-    assert rig.is_in(HandoverState.RELEASED) and rig.hand_over.busy
+    assert rig.is_in(HandoverState.RELEASED) and rig.hand_over.is_busy
     rig.be(landed=True)
     rig.tick()
-    assert not rig.hand_over.busy
+    assert not rig.hand_over.is_busy
 
 
 @pytest.mark.fault(63)
 def test_a_controller_that_ends_without_a_landing_leaves_nothing_of_ours_in_the_air() -> None:
     rig = engaged()
-    rig.tick(stop=True, ready=False)
+    rig.tick(is_stop_requested=True, has_setpoint=False)
     assert rig.is_in(HandoverState.LANDING) and rig.asked_last(RequestKind.LAND)
     pilots = Rig().to(HandoverState.ENGAGED)
-    pilots.tick(stop=True, ready=False)
+    pilots.tick(is_stop_requested=True, has_setpoint=False)
     assert pilots.is_in(HandoverState.ENGAGED)
 
 

@@ -55,7 +55,7 @@ def engaged(autopilot: str) -> Rig:
     """A flight of ours in the mode that takes setpoints."""
     rig = Rig(autopilot)
     rig.to(HandoverState.CLIMBING).be(landed=False)
-    rig.tick(up_m=1.9)
+    rig.tick(estimated_height_m=1.9)
     rig.be(mode="OFFBOARD" if autopilot == "px4" else "GUIDED")
     rig.run(1.0, until=HandoverState.ENGAGED)
     return rig
@@ -64,8 +64,8 @@ def engaged(autopilot: str) -> Rig:
 def landing(autopilot: str) -> Rig:
     """A flight of ours that is asked to land, from the mode that takes setpoints."""
     rig = engaged(autopilot)
-    rig.tick(land=True)
-    rig.tick(land=False)
+    rig.tick(is_landing_requested=True)
+    rig.tick(is_landing_requested=False)
     assert rig.is_in(HandoverState.LANDING) and rig.asked_last(RequestKind.LAND)
     return rig
 
@@ -136,14 +136,14 @@ def test_px4_s_hold_on_the_ground_is_no_end_of_a_climb() -> None:
 def test_a_climb_by_positions_that_cannot_be_is_broken_off(state: HandoverState) -> None:
     rig = Rig("ardupilot").to(state)
     assert rig.is_in(state)
-    rig.tick(unsafe="it is 0.7 m beyond the limit of down")
+    rig.tick(climb_hazard="it is 0.7 m beyond the limit of down")
     assert rig.is_in(HandoverState.LANDING) and rig.asked_last(RequestKind.LAND)
     assert rig.codes("refused") == ["the climb is broken off: it is 0.7 m beyond the limit of down"]
 
 
 def test_nothing_is_broken_off_while_nothing_climbs() -> None:
     rig = Rig().to(HandoverState.ENGAGED)
-    rig.tick(unsafe="it is 0.7 m beyond the limit of down")
+    rig.tick(climb_hazard="it is 0.7 m beyond the limit of down")
     assert rig.is_in(HandoverState.ENGAGED) and not rig.codes("refused")
 
 
@@ -159,7 +159,7 @@ def test_an_end_that_comes_with_the_pilot_s_switch_asks_for_nothing(
     rig = Rig(autopilot).to(HandoverState.CLIMBING)
     rig.be(landed=False)
     if state is not HandoverState.CLIMBING:
-        rig.tick(up_m=1.9)
+        rig.tick(estimated_height_m=1.9)
     if state is HandoverState.ENGAGED:
         rig.be(mode="OFFBOARD" if autopilot == "px4" else "GUIDED")
         rig.run(1.0, until=HandoverState.ENGAGED)
@@ -168,9 +168,9 @@ def test_an_end_that_comes_with_the_pilot_s_switch_asks_for_nothing(
     asked = len(rig.asked)
     rig.be(mode=mode, stick=True)
     if end == "controller":
-        rig.tick(land=True, ready=False)
+        rig.tick(is_landing_requested=True, has_setpoint=False)
     elif end == "time":
-        rig.tick(stop=True, ready=False)
+        rig.tick(is_stop_requested=True, has_setpoint=False)
     else:
         rig.tick(commands=(LAND,))
     rig.run(5.0)
@@ -186,7 +186,7 @@ def test_what_is_armed_for_a_take_off_is_asked_to_land_until_it_is_disarmed(auto
     for _ in range(100):
         rig.answer(DENIED, RequestKind.LAND)
         rig.run(0.3)
-    assert rig.is_in(HandoverState.LANDING) and not rig.hand_over.finished
+    assert rig.is_in(HandoverState.LANDING) and not rig.hand_over.is_finished
     assert rig.asked[-1][0] > rig.view.at_ns - 2 * SECOND
     rig.be(armed=False)
     rig.run(1.0)
@@ -197,10 +197,10 @@ def test_what_is_armed_for_a_take_off_is_asked_to_land_until_it_is_disarmed(auto
 def test_a_climb_that_is_told_late_does_not_keep_the_controller_from_watching_what_it_flies(ours: bool) -> None:
     rig = Rig("ardupilot").to(HandoverState.CLIMBING if ours else HandoverState.READY)
     if ours:
-        rig.tick(up_m=1.9)
+        rig.tick(estimated_height_m=1.9)
     rig.be(mode="GUIDED", armed=True, landed=False, own_climb=True)
     rig.run(1.0, until=HandoverState.ENGAGED)
-    flown = rig.hand_over.flown(rig.view.at_ns, rig.vehicle)
+    flown = rig.hand_over.select_controlled_status(rig.view.at_ns, rig.vehicle)
     assert flown is not None and flown.own_climb is not ours  # of another one's climb nobody knows when it ends
 
 
@@ -209,8 +209,8 @@ def test_a_climb_that_is_told_late_does_not_keep_the_controller_from_watching_wh
 def test_a_landing_waits_for_the_first_word_after_a_lost_connection_and_no_longer(autopilot: str) -> None:
     rig = engaged(autopilot)
     asked = len(rig.asked)
-    rig.tick(land=True, unsure=True)
+    rig.tick(is_landing_requested=True, may_have_lost_messages=True)
     rig.run(3.2)
     assert rig.is_in(HandoverState.LANDING) and len(rig.asked) == asked
-    rig.tick(unsure=False)
+    rig.tick(may_have_lost_messages=False)
     assert rig.asked[asked:] == [(rig.view.at_ns, RequestKind.LAND)]

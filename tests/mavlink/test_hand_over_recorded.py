@@ -14,12 +14,12 @@ from mavlink_rig import packets, read
 from uavctl.config.connections import ClockConfig, DaemonConfig, FrameConfig, HandOverConfig, SourceConfig
 from uavctl.config.types import EstimatorConfig
 from uavctl.mavlink.connection import MavlinkConnection
-from uavctl.mavlink.handover import HandOver
-from uavctl.mavlink.handover_guards import HandoverView
-from uavctl.mavlink.handover_states import HandoverState, Sending
-from uavctl.mavlink.messages import Ack, Text
+from uavctl.mavlink.handover import HandoverStateMachine
+from uavctl.mavlink.handover_guards import HandoverInput
+from uavctl.mavlink.handover_states import HandoverState, SetpointMode
+from uavctl.mavlink.messages import CommandAck, StatusText
+from uavctl.mavlink.mode_reason import ModeReason
 from uavctl.mavlink.requests import RequestKind
-from uavctl.mavlink.switcher import Switcher
 from uavctl.outcome import Cause, FlightCourse
 from uavctl.records import Command, Ending, Event, Order, PositionSample, VehicleStatus
 
@@ -33,8 +33,8 @@ class Flown:
 
     states: list[tuple[HandoverState, float]] = field(default_factory=list)
     asked: list[tuple[RequestKind, float]] = field(default_factory=list)
-    sent: list[tuple[Sending, float]] = field(default_factory=list)
-    who: list[Switcher] = field(default_factory=list)  # has changed the mode to one that is none of ours
+    sent: list[tuple[SetpointMode, float]] = field(default_factory=list)
+    who: list[ModeReason] = field(default_factory=list)  # has changed the mode to one that is none of ours
     ending: Ending | None = None
 
     def at(self, state: HandoverState, number: int = 0) -> float:
@@ -58,10 +58,10 @@ def fly(
         source=SourceConfig(messages=("LOCAL_POSITION_NED",)),
         estimator=EstimatorConfig(position_std_m=0.005),
     )
-    hand_over, flown, course = HandOver(config), Flown(), FlightCourse(takes_off=True, flown=True)
+    hand_over, flown, course = HandoverStateMachine(config), Flown(), FlightCourse(takes_off=True, flown=True)
     vehicle: VehicleStatus | None = None
     where: PositionSample | None = None
-    heard: list[Ack | Text] = []
+    heard: list[CommandAck | StatusText] = []
     wanted: list[str] = []
     tick_ns, booted_ns, state = 0, 0, HandoverState.WAITING
     for at_ns, data in packets(name):
@@ -75,31 +75,31 @@ def fly(
                 if one != "land"
             )
             told = hand_over.update(
-                HandoverView(
+                HandoverInput(
                     at_ns=tick_ns,
                     vehicle=vehicle,
-                    ready=where is not None,
-                    land="land" in wanted,
-                    unfit="" if where is not None else "no position",
-                    up_m=None if where is None else -where.position_m[2],
-                    up_mps=0.0 if where is None or where.velocity_mps is None else -where.velocity_mps[2],
-                    heard=tuple(heard),
+                    has_setpoint=where is not None,
+                    is_landing_requested="land" in wanted,
+                    arming_refusal="" if where is not None else "no position",
+                    estimated_height_m=None if where is None else -where.position_m[2],
+                    climb_rate_mps=0.0 if where is None or where.velocity_mps is None else -where.velocity_mps[2],
+                    messages=tuple(heard),
                     commands=commands,
                 )
             )
             heard.clear()
             wanted.clear()
             course.see(tick_ns, vehicle)
-            if told.passage is not None:
-                course.turn(told.passage, vehicle)
-                flown.who += [] if told.passage.who is None else [told.passage.who]
+            if told.transition is not None:
+                course.turn(told.transition, vehicle)
+                flown.who += [] if told.transition.mode_reason is None else [told.transition.mode_reason]
             if hand_over.state is not state:
                 state = hand_over.state
                 flown.states.append((state, boot_s))
-            if told.ask is not None:
-                flown.asked.append((told.ask, boot_s))
-            if not flown.sent or flown.sent[-1][0] is not told.sending:
-                flown.sent.append((told.sending, boot_s))
+            if told.request is not None:
+                flown.asked.append((told.request, boot_s))
+            if not flown.sent or flown.sent[-1][0] is not told.setpoint_mode:
+                flown.sent.append((told.setpoint_mode, boot_s))
         (message,) = read(data)
         if message.get_srcSystem() == client:
             if message.get_type() == "COMMAND_LONG" and message.command in (SET_MODE, LAND):
@@ -115,7 +115,7 @@ def fly(
                     vehicle = item
                 case PositionSample():
                     where = item
-                case Ack() | Text():
+                case CommandAck() | StatusText():
                     heard.append(item)
                 case Event():
                     pass
@@ -177,9 +177,9 @@ def test_arducopter_with_gps_flies_to_its_landing(gps: Flown) -> None:
 
 
 def test_arducopter_gets_no_neutral_stream_between_the_order_and_the_height(gps: Flown) -> None:
-    (began,) = [time_s for sending, time_s in gps.sent if sending is Sending.SETPOINTS]
+    (began,) = [time_s for sending, time_s in gps.sent if sending is SetpointMode.SETPOINTS]
     assert began == gps.at(E)
-    quiet = [time_s for sending, time_s in gps.sent if sending is Sending.NOTHING]
+    quiet = [time_s for sending, time_s in gps.sent if sending is SetpointMode.NOTHING]
     assert any(abs(time_s - gps.at(M)) < 0.3 for time_s in quiet)
 
 
@@ -202,7 +202,7 @@ def test_px4_fails_over_when_setpoints_stop_and_comes_back_by_order_only(px4: Fl
     assert (px4.at(E), px4.at(HandoverState.FAILSAFE)) == near(27.2, 78.3, within_s=0.6)
     # HEARTBEAT shows OFFBOARD again at 87.3 s, because the stream came back: not for us, until ordered to at 88.2 s.
     assert (px4.at(G, 1), px4.at(E, 1)) == near(88.2, 88.2, within_s=0.6)
-    assert not [sending for sending, time_s in px4.sent if sending is not Sending.NOTHING and 78.5 < time_s < 87.8]
+    assert not [sending for sending, time_s in px4.sent if sending is not SetpointMode.NOTHING and 78.5 < time_s < 87.8]
     assert (px4.at(HandoverState.LANDING), px4.at(HandoverState.DONE)) == near(94.2, 112.9)
 
 
@@ -226,7 +226,7 @@ def test_px4_whose_failsafe_ends_in_the_climb_is_flown_after_all_and_the_pilot_s
     pilot_s = [flown.at(HandoverState.RELEASED, number) - failed_s for number in (0, 1)]
     assert pilot_s == pytest.approx([41.0, 56.0], abs=0.3)
     between = [sending for sending, time_s in flown.sent if failed_s <= time_s < back_s]
-    assert between == [Sending.NOTHING] and RequestKind.LAND not in [ask for ask, _ in flown.asked]
+    assert between == [SetpointMode.NOTHING] and RequestKind.LAND not in [ask for ask, _ in flown.asked]
 
 
 @pytest.mark.fault(61)
@@ -249,7 +249,7 @@ def test_arducopter_s_own_fence_is_not_the_pilot() -> None:
     """Its heartbeat says ACTIVE, and its text is a mere notice; two seconds later its estimator fails, too."""
     flown = fly("arducopter-fence.tlog", 1.2, {(4.0, 0.0, 0.0): "take off"}, HandOverConfig(), client=245)
     assert [state for state, _ in flown.states] == [R, M, A, C, G, E, HandoverState.FAILSAFE]
-    assert flown.who[-1] is Switcher.FENCE
+    assert flown.who[-1] is ModeReason.FENCE
     assert flown.ending is not None and (flown.ending.cause, flown.ending.exit_code) == (Cause.FENCE, 1)
     assert "Max Alt fence breached" in flown.ending.sentence
     assert RequestKind.LAND not in [ask for ask, _ in flown.asked]
@@ -263,7 +263,7 @@ def test_px4_s_descend_is_its_failsafe(asks: bool) -> None:
     flown = fly("px4-descend.tlog", 1.2, orders, HandOverConfig(engage_s=30.0), client=245)
     down = HandoverState.LANDING if asks else HandoverState.FAILSAFE
     assert [state for state, _ in flown.states] == [R, M, A, C, G, E, down]
-    assert flown.who == ([] if asks else [Switcher.FAILSAFE])
+    assert flown.who == ([] if asks else [ModeReason.FAILSAFE])
     landings = [ask for ask, _ in flown.asked if ask is RequestKind.LAND]
     assert len(landings) > 1 if asks else not landings  # asked on; its failsafe has precedence
     assert flown.ending is not None and (asks or flown.ending.cause == Cause.FAILSAFE)
@@ -274,5 +274,5 @@ def test_px4_s_descend_is_its_failsafe(asks: bool) -> None:
 def test_arducopter_s_pilot_who_takes_loiter_is_the_pilot() -> None:
     flown = fly("arducopter-pilot.tlog", 1.2, {(4.0, 0.0, 0.0): "take off"}, HandOverConfig(), client=245)
     assert [state for state, _ in flown.states][:7] == [R, M, A, C, G, E, HandoverState.RELEASED]
-    assert set(flown.who) == {Switcher.PILOT} and RequestKind.LAND not in [ask for ask, _ in flown.asked]
+    assert set(flown.who) == {ModeReason.PILOT} and RequestKind.LAND not in [ask for ask, _ in flown.asked]
     assert flown.ending is not None and (flown.ending.cause, flown.ending.exit_code) == (Cause.PILOT, 0)

@@ -23,7 +23,7 @@ from hand_over_rig import (
 from uavctl.config.connections import HandOverConfig
 from uavctl.mavlink.handover_guards import GRACE_NS
 from uavctl.mavlink.handover_states import HandoverState
-from uavctl.mavlink.messages import Text
+from uavctl.mavlink.messages import StatusText
 from uavctl.mavlink.requests import RequestKind
 from uavctl.records import ORDER_REFUSED, Command, Order
 
@@ -90,7 +90,7 @@ def test_in_progress_is_waited_for() -> None:
 
 def test_answers_to_others_and_chatter_change_nothing() -> None:
     rig = Rig().to(HandoverState.MODE)
-    rig.tick(ack(DENIED, RequestKind.LAND), Text(system=1, component=1, severity=6, text="chatter"))
+    rig.tick(ack(DENIED, RequestKind.LAND), StatusText(system=1, component=1, severity=6, text="chatter"))
     assert rig.is_in(HandoverState.MODE)
     rig = Rig().to(HandoverState.READY)
     rig.tick(ack(DENIED, RequestKind.ARM), commands=(TAKE_OFF,))
@@ -113,11 +113,11 @@ def test_a_climb_that_does_not_come_ends_in_a_landing_and_a_failure() -> None:
 
 def test_height_counts_by_fresh_positions_only() -> None:
     rig = Rig("px4").to(HandoverState.CLIMBING)
-    rig.tick(up_m=3.0, unfit="the newest position is 2.0 s old")
+    rig.tick(estimated_height_m=3.0, arming_refusal="the newest position is 2.0 s old")
     assert rig.is_in(HandoverState.CLIMBING)
-    rig.tick(up_m=None, unfit="")
+    rig.tick(estimated_height_m=None, arming_refusal="")
     assert rig.is_in(HandoverState.CLIMBING)
-    rig.tick(up_m=3.0)
+    rig.tick(estimated_height_m=3.0)
     assert rig.is_in(HandoverState.ENGAGING)
 
 
@@ -159,7 +159,7 @@ def test_the_pilot_may_take_over_at_any_time(state: HandoverState, mode: str, ar
     rig = Rig("px4").to(state)
     rig.be(mode=mode, armed=armed, stick=True)
     told = rig.tick()
-    assert (rig.state, told.sending, told.ask) == (HandoverState.RELEASED, NOTHING, None)
+    assert (rig.state, told.setpoint_mode, told.request) == (HandoverState.RELEASED, NOTHING, None)
 
 
 @pytest.mark.fault(25)
@@ -168,10 +168,14 @@ def test_a_heartbeat_of_before_the_grant_is_no_pilot_and_a_later_one_is() -> Non
     rig.answer(ACCEPTED)
     granted_ns = rig.view.at_ns
     while rig.view.at_ns < granted_ns + GRACE_NS:
-        assert rig.vehicle is not None and not rig.hand_over.has_left(rig.vehicle)
-        assert rig.tick().sending is FLY
-    assert rig.tick().sending is NOTHING
-    assert rig.is_in(HandoverState.RELEASED) and rig.vehicle is not None and rig.hand_over.has_left(rig.vehicle)
+        assert rig.vehicle is not None and not rig.hand_over.has_left_external_mode(rig.vehicle)
+        assert rig.tick().setpoint_mode is FLY
+    assert rig.tick().setpoint_mode is NOTHING
+    assert (
+        rig.is_in(HandoverState.RELEASED)
+        and rig.vehicle is not None
+        and rig.hand_over.has_left_external_mode(rig.vehicle)
+    )
 
 
 # Stopping
@@ -194,14 +198,14 @@ def test_the_operator_stops_on_the_way(
     state: HandoverState, after: HandoverState, ask: RequestKind | None, how: str
 ) -> None:
     rig = Rig().to(state)
-    told = rig.tick(stop=True) if how == "stop" else rig.tick(commands=(LAND,))
-    assert (rig.state, told.ask, told.sending) == (after, ask, NOTHING)
+    told = rig.tick(is_stop_requested=True) if how == "stop" else rig.tick(commands=(LAND,))
+    assert (rig.state, told.request, told.setpoint_mode) == (after, ask, NOTHING)
 
 
 def test_an_arming_that_is_stopped_is_over_when_a_later_heartbeat_says_disarmed() -> None:
     rig = Rig().to(HandoverState.ARMING)
     rig.mute = True
-    rig.tick(stop=True)
+    rig.tick(is_stop_requested=True)
     rig.tick()
     assert rig.is_in(HandoverState.LANDING)  # the heartbeat is from before
     rig.mute = False
@@ -239,7 +243,7 @@ def test_a_reboot_disengages(state: HandoverState, after: HandoverState) -> None
     rig = Rig().to(state)
     rig.be(boots=1)
     told = rig.tick()
-    assert (rig.state, told.sending) == (after, NOTHING)
+    assert (rig.state, told.setpoint_mode) == (after, NOTHING)
     if after is not state:
         assert "started anew" in rig.codes("refused")[-1]
     rig.tick()
@@ -270,4 +274,4 @@ def test_a_climb_to_nowhere_is_refused(height_m: float | None) -> None:
     rig = Rig().to(HandoverState.READY)
     told = rig.tick(commands=(Command(order=Order.TAKE_OFF, height_m=height_m),))
     assert [event.code for event in told.events] == [ORDER_REFUSED] and rig.hand_over.height_m == 0.0
-    assert rig.is_in(HandoverState.READY) and not rig.hand_over.ours
+    assert rig.is_in(HandoverState.READY) and not rig.hand_over.is_ordered_flight

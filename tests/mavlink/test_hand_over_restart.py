@@ -12,7 +12,7 @@ from logs.recording.replay import replay
 from sim.simulation import Peers
 from uavctl.config import load_config
 from uavctl.loop import ControlLoop
-from uavctl.mavlink.handover_guards import CLOCK_NS
+from uavctl.mavlink.handover_guards import BOOT_TIME_WAIT_NS
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.mavlink.requests import RequestKind
 from uavctl.records import ORDER_ACCEPTED, ORDER_REFUSED, Command, ControlMode, Decision, Order, Setpoint
@@ -38,27 +38,27 @@ def restarted(autopilot: str = "px4", **fields: object) -> Rig:
 )
 def test_a_vehicle_that_was_left_in_flight_gets_nothing_until_ordered(autopilot: str, mode: str) -> None:
     rig = restarted(autopilot, armed=True, landed=False, mode=mode)
-    seen = rig.hand_over.flown(rig.view.at_ns, rig.vehicle)
+    seen = rig.hand_over.select_controlled_status(rig.view.at_ns, rig.vehicle)
     assert seen is not None and not seen.external  # not for the controller, either
     for _ in range(200):
-        assert rig.tick().sending is NOTHING
+        assert rig.tick().setpoint_mode is NOTHING
     assert rig.is_in(HandoverState.RELEASED) and not rig.asked
     assert "uavctl ctl engage" in rig.codes("refused")[0] and len(rig.codes("refused")) == 1
     told = rig.tick(commands=(ENGAGE,))
     external = mode in ("OFFBOARD", "GUIDED")
-    assert told.sending is NEUTRAL and [ask for _, ask in rig.asked] == (
+    assert told.setpoint_mode is NEUTRAL and [ask for _, ask in rig.asked] == (
         [] if external else [RequestKind.EXTERNAL_MODE]
     )
     rig.be(mode="OFFBOARD" if autopilot == "px4" else "GUIDED")
-    assert rig.tick().sending is FLY
+    assert rig.tick().setpoint_mode is FLY
 
 
 @pytest.mark.fault(31)
 def test_one_that_has_landed_and_disarmed_meanwhile_is_a_vehicle_like_any_other() -> None:
     rig = restarted(armed=False)
-    assert rig.tick().sending is NEUTRAL and rig.is_in(HandoverState.READY)
+    assert rig.tick().setpoint_mode is NEUTRAL and rig.is_in(HandoverState.READY)
     rig.be(armed=True, landed=False, mode="OFFBOARD")  # the pilot took off, and switched
-    assert rig.tick().sending is FLY
+    assert rig.tick().setpoint_mode is FLY
 
 
 @pytest.mark.fault(31)
@@ -74,7 +74,7 @@ def test_once_the_vehicle_is_heard_it_is_too_late_to_stand_by() -> None:
     told = rig.tick(commands=(STAND_BY,))
     assert [event.code for event in told.events] == [ORDER_REFUSED]
     rig.be(armed=True, landed=False, mode="OFFBOARD")
-    assert rig.tick().sending is FLY
+    assert rig.tick().setpoint_mode is FLY
 
 
 FLOWN_NS = 100 * SECOND
@@ -89,7 +89,7 @@ def found_armed(up_s: float | None, at_ns: int) -> Rig:
     rig.tick(commands=(SINCE,))
     rig.vehicle = vehicle
     rig.be(armed=True, landed=False, mode="OFFBOARD")
-    rig.tick(up_s=up_s)
+    rig.tick(uptime_s=up_s)
     return rig
 
 
@@ -112,14 +112,14 @@ def test_a_vehicle_that_has_started_since_is_another_one(since_s: float, up_s: f
 @pytest.mark.fault(31)
 def test_its_clock_is_waited_for_with_nothing_sent() -> None:
     rig = found_armed(None, FLOWN_NS + 60 * SECOND)
-    for _ in range(CLOCK_NS // RIG_TICK_NS - 1):
-        assert rig.is_in(HandoverState.WAITING) and rig.tick().sending is NOTHING
-        seen = rig.hand_over.flown(rig.view.at_ns, rig.vehicle)
+    for _ in range(BOOT_TIME_WAIT_NS // RIG_TICK_NS - 1):
+        assert rig.is_in(HandoverState.WAITING) and rig.tick().setpoint_mode is NOTHING
+        seen = rig.hand_over.select_controlled_status(rig.view.at_ns, rig.vehicle)
         assert seen is not None and not seen.external
     rig.tick()
     assert rig.is_in(HandoverState.RELEASED) and not rig.asked
     rig = found_armed(None, FLOWN_NS + 60 * SECOND)
-    rig.tick(up_s=10.0)
+    rig.tick(uptime_s=10.0)
     assert rig.is_in(HandoverState.ENGAGED)
 
 
@@ -134,7 +134,7 @@ def test_the_next_vehicle_on_the_connection_of_a_killed_flight_is_flown(autopilo
     another = Air(autopilot, begins_s=32.0)
     loop, memory = another.begin(Command(order=Order.STAND_BY, flown_ns=0))
     another.run(loop, 5.0)
-    assert loop.who_flies is HandoverState.ENGAGED and memory.of(Setpoint)
+    assert loop.handover_state is HandoverState.ENGAGED and memory.of(Setpoint)
     result = replay(iter(memory.entries), lambda sink: make_loop(another.config, sink))
     assert result.identical, result.first_difference
 
@@ -179,7 +179,7 @@ def test_a_killed_flight_is_not_taken_up_by_the_next_loop_and_is_when_asked(auto
     air.run(None, dead_s)
     loop, memory = air.begin(Command(order=Order.STAND_BY, flown_ns=0))
     air.run(loop, 5.0)
-    assert not memory.of(Setpoint) and loop.who_flies is HandoverState.RELEASED
+    assert not memory.of(Setpoint) and loop.handover_state is HandoverState.RELEASED
     if autopilot == "px4":
         assert air.peers.autopilot.mode_name != "OFFBOARD"  # its failsafe has it
     loop.order(Command(order=Order.ENGAGE))

@@ -12,7 +12,7 @@ from signing_rig import KEY
 
 from uavctl.cli.app import run
 from uavctl.errors import KeyFileError
-from uavctl.io.signed_connection import new_key, read_key
+from uavctl.io.key_file import new_key, read_key
 from uavctl.mavlink.signing import SigningKey
 
 WORDS = "correct horse battery staple"

@@ -13,8 +13,8 @@ from uavctl.config import load_config
 from uavctl.config.connections import ClockConfig, DaemonConfig, FrameConfig, SourceConfig
 from uavctl.config.types import EstimatorConfig
 from uavctl.flight.measure import find_refusal
-from uavctl.mavlink.codec import UnsendableError
 from uavctl.mavlink.connection import MavlinkConnection
+from uavctl.mavlink.encoder import UnsendableError
 from uavctl.mavlink.requests import RequestKind
 from uavctl.records import Setpoint, SetpointSource, Severity
 
@@ -168,7 +168,7 @@ def test_answers_of_many_peers_do_not_lose_the_vehicle_s_clock() -> None:
                 if message.get_type() == "TIMESYNC":
                     for peer in (vehicle, Peer(2, 1 + n)):
                         link.receive(peer.send("timesync", at_ns - 5 * SECOND, message.ts1), at_ns)
-    trips = link.trips((1, 1))
+    trips = link.timesync_clock((1, 1))
     assert trips is not None and len(trips.round_trips_ns) == 60
     assert trips.offset_ns(NOW + 100 * SECOND) == 5 * SECOND
 
@@ -183,7 +183,7 @@ def test_others_requests_for_the_time_leave_the_vehicle_its_answers() -> None:
         at_ns = NOW + n * MS
         link.receive(b"".join(Peer(99).send("timesync", 0, -k - 1) for k in range(20)), at_ns)
         if n % 100 == 0:
-            answered += len(link.receive(vehicle.send("timesync", 0, 7), at_ns).answers)
+            answered += len(link.receive(vehicle.send("timesync", 0, 7), at_ns).replies)
     assert answered == 10
     assert link.stats(NOW).bad["timesync-flood"] > 19_000
 
@@ -221,7 +221,7 @@ def test_only_autopilots_are_vehicles() -> None:
     station_with_autopilot = Peer(255, 190).heartbeat(autopilot=3, kind=6)
     assert link.receive(station + camera + station_with_autopilot, NOW).items == ()
     with pytest.raises(UnsendableError, match="no vehicle has been heard"):
-        link.setpoint(SETPOINT)
+        link.encode_setpoint(SETPOINT)
 
 
 def test_another_component_of_the_vehicle_is_no_vehicle() -> None:
@@ -256,7 +256,7 @@ def test_the_vehicles_words_are_events() -> None:
 def test_setpoint_and_landing_go_to_the_vehicle() -> None:
     link = make_link(daemon=DaemonConfig(tick_s=0.05, system_id=200, component_id=30))
     link.receive(Peer(7, 3).heartbeat(), NOW)
-    setpoint, land = read(link.setpoint(SETPOINT) + link.ask(RequestKind.LAND, 0.0))
+    setpoint, land = read(link.encode_setpoint(SETPOINT) + link.encode_request(RequestKind.LAND, 0.0))
     assert (setpoint.get_type(), setpoint.target_system, setpoint.target_component) == (
         "SET_POSITION_TARGET_LOCAL_NED",
         7,
@@ -337,10 +337,10 @@ def test_requests_are_answered_with_our_time() -> None:
     link = make_link()
     link.due(NOW)
     asked = Peer(1, 1).send("timesync", 0, -77) + Peer(1, 1).send("timesync", 0, 78)
-    answers = [read(data)[0] for data in link.receive(asked, NOW + 3 * MS).answers]
+    answers = [read(data)[0] for data in link.receive(asked, NOW + 3 * MS).replies]
     assert [(raw.tc1, raw.ts1) for raw in answers] == [(NOW + 3 * MS, -77), (NOW + 3 * MS, 78)]
     assert link.due(NOW + 51 * MS) == ()
-    assert link.receive(Peer(1, 1).heartbeat(), NOW + 52 * MS).answers == ()  # to its own requests only
+    assert link.receive(Peer(1, 1).heartbeat(), NOW + 52 * MS).replies == ()  # to its own requests only
 
 
 def test_a_flood_of_requests_is_answered_in_part() -> None:
@@ -350,7 +350,7 @@ def test_a_flood_of_requests_is_answered_in_part() -> None:
         answers: list[bytes] = []
         for n in range(1000):
             at_ns = NOW + window * 50 * MS + n * MS // 25
-            answers += link.receive(Peer(1, 1).send("timesync", 0, n), at_ns).answers
+            answers += link.receive(Peer(1, 1).send("timesync", 0, n), at_ns).replies
         assert [read(data)[0].ts1 for data in answers] == list(range(8))
     assert link.stats(NOW).bad == {"timesync-flood": 3 * 992}
 
@@ -358,7 +358,7 @@ def test_a_flood_of_requests_is_answered_in_part() -> None:
 def test_a_flood_of_requests_in_one_datagram_is_too() -> None:
     link = make_link()
     asked = b"".join(Peer(1, 1).send("timesync", 0, n) for n in range(100))
-    assert len(link.receive(asked, NOW).answers) == 8
+    assert len(link.receive(asked, NOW).replies) == 8
 
 
 def test_our_own_words_sent_back_are_ignored() -> None:

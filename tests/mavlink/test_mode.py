@@ -6,7 +6,7 @@ from itertools import product
 
 import pytest
 
-from uavctl.mavlink.handover_states import LEAVES_NONE, TRANSITIONS, HandoverEvent, HandoverState, Sending
+from uavctl.mavlink.handover_states import NOT_LEFT_IN_FLIGHT, TRANSITIONS, HandoverEvent, HandoverState, SetpointMode
 
 # W waiting, R ready, M mode, A arming, C climbing, G engaging, B returning, E engaged, V failsafe, U unclear,
 # X released, L landing, S settling, D done, F failed; + neutral setpoints, * setpoints, nothing else is sent.
@@ -29,10 +29,10 @@ D D      D    D      D       D       D        D      D    D        D        D   
 F F      F    F      F       F       F        F      F    F        F        F       F     F       F        F
 """
 LETTERS = dict(zip("WRMACGBEVUXLSDF", HandoverState, strict=True))
-SENDING = {"": Sending.NOTHING, "+": Sending.NEUTRAL, "*": Sending.SETPOINTS}
+SENDING = {"": SetpointMode.NOTHING, "+": SetpointMode.NEUTRAL, "*": SetpointMode.SETPOINTS}
 
 
-def wanted() -> dict[tuple[HandoverState, HandoverEvent], tuple[HandoverState, Sending]]:
+def wanted() -> dict[tuple[HandoverState, HandoverEvent], tuple[HandoverState, SetpointMode]]:
     head, *rows = (line.split() for line in GRID.strip().splitlines())
     return {
         (LETTERS[letter], HandoverEvent(seen)): (LETTERS[cell[0]], SENDING[cell[1:]])
@@ -54,18 +54,18 @@ def test_the_grid_and_the_table_are_complete() -> None:
 
 @pytest.mark.fault(25)
 def test_setpoints_are_sent_by_who_is_engaged_only() -> None:
-    flying = {(after, seen) for (_, seen), (after, sending) in TRANSITIONS.items() if sending is Sending.SETPOINTS}
+    flying = {(after, seen) for (_, seen), (after, sending) in TRANSITIONS.items() if sending is SetpointMode.SETPOINTS}
     assert flying == {
         (HandoverState.ENGAGED, seen) for seen in (HandoverEvent.EXTERNAL, HandoverEvent.GRANTED, HandoverEvent.SILENCE)
     }
-    assert TRANSITIONS[HandoverState.ENGAGED, HandoverEvent.OTHER] == (HandoverState.RELEASED, Sending.NOTHING)
+    assert TRANSITIONS[HandoverState.ENGAGED, HandoverEvent.OTHER] == (HandoverState.RELEASED, SetpointMode.NOTHING)
 
 
 @pytest.mark.fault(25)
 def test_only_an_order_leads_out_of_released_and_towards_arming() -> None:
     out = {seen for seen in HandoverEvent if TRANSITIONS[HandoverState.RELEASED, seen][0] is not HandoverState.RELEASED}
     assert out == {HandoverEvent.ENGAGE, HandoverEvent.DISARMED}
-    assert TRANSITIONS[HandoverState.WAITING, HandoverEvent.LEFT] == (HandoverState.RELEASED, Sending.NOTHING)
+    assert TRANSITIONS[HandoverState.WAITING, HandoverEvent.LEFT] == (HandoverState.RELEASED, SetpointMode.NOTHING)
     towards = {seen for (before, seen), (after, _) in TRANSITIONS.items() if before is not after is HandoverState.MODE}
     assert towards == {HandoverEvent.TAKE_OFF}
 
@@ -89,9 +89,9 @@ def test_no_way_leads_back_from_landing_into_flight() -> None:
 
 @pytest.mark.fault(31)
 def test_what_a_daemon_that_ends_leaves_behind_has_had_setpoints_or_may_have() -> None:
-    left = set(HandoverState) - LEAVES_NONE
+    left = set(HandoverState) - NOT_LEFT_IN_FLIGHT
     assert left == {*LETTERS.values()} - {HandoverState.READY, HandoverState.SETTLING, HandoverState.DONE}
-    assert {after for after, sending in TRANSITIONS.values() if sending is Sending.SETPOINTS} <= left
+    assert {after for after, sending in TRANSITIONS.values() if sending is SetpointMode.SETPOINTS} <= left
 
 
 def test_every_state_has_an_end() -> None:

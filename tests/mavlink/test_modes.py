@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from sim.autopilot.profile import SIMULATED, px4_custom
-from uavctl.mavlink.profile import PROFILES, autopilot_name, describe_mode
+from uavctl.mavlink.profile import PROFILES, describe_mode, find_autopilot_name
 
 
 @pytest.mark.parametrize(
@@ -43,16 +43,16 @@ def test_mode_names(autopilot: str, kind: int, custom: int, name: str, external:
 
 @pytest.mark.parametrize(("number", "name"), [(12, "px4"), (3, "ardupilot"), (0, "unknown"), (8, "unknown")])
 def test_autopilots(number: int, name: str) -> None:
-    assert autopilot_name(number) == name
+    assert find_autopilot_name(number) == name
 
 
 @pytest.mark.parametrize("autopilot", PROFILES)
 def test_the_modes_that_are_asked_for_are_those_that_are_shown(autopilot: str) -> None:
     profile = PROFILES[autopilot]
-    assert {profile.external, profile.take_off} == set(profile.modes)
-    for name, (first, second) in profile.modes.items():
+    assert {profile.external_mode, profile.take_off_mode} == set(profile.mode_parameters)
+    for name, (first, second) in profile.mode_parameters.items():
         custom = px4_custom(first, second) if autopilot == "px4" else first
-        assert describe_mode(autopilot, 2, custom) == (name, name == profile.external)
+        assert describe_mode(autopilot, 2, custom) == (name, name == profile.external_mode)
         shown = SIMULATED[autopilot].by_number(custom)
         assert shown is not None and shown.name == name
-    assert not profile.climbing & profile.landing
+    assert not profile.climb_modes & profile.landing_modes

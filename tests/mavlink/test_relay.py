@@ -14,8 +14,8 @@ from sim_rig import Client
 
 from sim.autopilot.autopilot import UPTIME_NS
 from uavctl.config.connections import RelayConfig
-from uavctl.frames import from_euler
-from uavctl.mavlink.codec import Encoder, UnsendableError
+from uavctl.frames import quaternion_from_euler
+from uavctl.mavlink.encoder import Encoder, UnsendableError
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.mavlink.relay import MAX_AGE_NS, STUCK_AFTER, Pose, Relay
 from uavctl.records import Event, LinkStats, PositionSample, Vec3
@@ -44,7 +44,7 @@ def relay(**more: Any) -> Relay:
 
 def test_a_pose_carries_its_time_of_capture_in_the_vehicle_s_clock() -> None:
     one = relay()
-    one.take(sample(NOW - 30 * MS), LEVEL)
+    one.add_sample(sample(NOW - 30 * MS), LEVEL)
     (pose,) = one.due(NOW, offset_ns=900 * SECOND, refused=())
     assert pose == Pose("vision-position-estimate", 99_970_000, (1.0, 2.0, -0.5), LEVEL, None)
 
@@ -55,24 +55,24 @@ def kept(one: Relay) -> dict[str, int]:
 
 def test_nothing_goes_without_an_attitude_or_when_switched_off() -> None:
     one = relay()
-    one.take(sample(NOW), None)
-    one.take(sample(NOW), LEVEL)
+    one.add_sample(sample(NOW), None)
+    one.add_sample(sample(NOW), LEVEL)
     assert one.due(NOW, offset_ns=NOW, refused=()) == ()  # before the vehicle's clock began
     assert kept(one) == {"no clock": 1, "no attitude": 1}
     off = Relay(RelayConfig())
-    off.take(sample(NOW), LEVEL)
+    off.add_sample(sample(NOW), LEVEL)
     assert off.due(NOW, offset_ns=0, refused=()) == ()
 
 
 def test_stale_late_and_refused_positions_stay_here() -> None:
     one = relay()
-    one.take(sample(NOW - MAX_AGE_NS - 1), LEVEL)
-    one.take(sample(NOW - 10 * MS, 1.0, 1.0, 0.0), LEVEL)
+    one.add_sample(sample(NOW - MAX_AGE_NS - 1), LEVEL)
+    one.add_sample(sample(NOW - 10 * MS, 1.0, 1.0, 0.0), LEVEL)
     assert len(one.due(NOW, offset_ns=0, refused=())) == 1
-    one.take(sample(NOW - 40 * MS, 1.1, 1.0, 0.0), LEVEL)  # captured before the one that went
+    one.add_sample(sample(NOW - 40 * MS, 1.1, 1.0, 0.0), LEVEL)  # captured before the one that went
     assert one.due(NOW, offset_ns=0, refused=()) == ()
     refused = sample(NOW + 40 * MS, 1.2, 1.0, 0.0)
-    one.take(refused, LEVEL)
+    one.add_sample(refused, LEVEL)
     assert one.due(NOW + 50 * MS, offset_ns=0, refused=(refused,)) == ()
     assert kept(one) == {"stale": 1, "late": 1, "refused": 1}
 
@@ -81,11 +81,11 @@ def test_a_frozen_pose_is_stuck_until_it_changes() -> None:
     one, sent = relay(), 0
     for n in range(60):
         at_ns = NOW + n * 50 * MS
-        one.take(sample(at_ns, received_ns=at_ns), LEVEL)
+        one.add_sample(sample(at_ns, received_ns=at_ns), LEVEL)
         sent += len(one.due(at_ns, offset_ns=0, refused=()))
     assert (sent, kept(one)) == (STUCK_AFTER, {"stuck": 60 - STUCK_AFTER})
     at_ns = NOW + 60 * 50 * MS
-    one.take(sample(at_ns, 1.0, 2.0, -0.51, received_ns=at_ns), LEVEL)
+    one.add_sample(sample(at_ns, 1.0, 2.0, -0.51, received_ns=at_ns), LEVEL)
     assert len(one.due(at_ns, offset_ns=0, refused=())) == 1
 
 
@@ -93,7 +93,7 @@ def test_the_rate_is_bounded_and_the_order_is_that_of_capture() -> None:
     one, poses = relay(rate_hz=20.0), list[Pose]()
     for n in range(200):  # 100 Hz, by tens and from back to front
         at_ns = NOW + n * 10 * MS
-        one.take(sample(at_ns, n * 1e-3, 0.0, 0.0, received_ns=at_ns), LEVEL)
+        one.add_sample(sample(at_ns, n * 1e-3, 0.0, 0.0, received_ns=at_ns), LEVEL)
         if n % 10 == 9:
             poses += one.due(at_ns, offset_ns=0, refused=())
     stamps = [pose.usec for pose in poses]
@@ -102,24 +102,24 @@ def test_the_rate_is_bounded_and_the_order_is_that_of_capture() -> None:
 
 def test_what_arrives_after_the_tick_waits_for_the_next() -> None:
     one = relay()
-    one.take(sample(NOW, received_ns=NOW + 1), LEVEL)
+    one.add_sample(sample(NOW, received_ns=NOW + 1), LEVEL)
     assert one.due(NOW, offset_ns=0, refused=()) == ()
     assert len(one.due(NOW + 50 * MS, offset_ns=0, refused=())) == 1
 
 
 def test_odometry_has_the_velocity_in_body_axes_and_without_one_it_is_a_position() -> None:
-    east = from_euler((0.0, 0.0, math.pi / 2))
+    east = quaternion_from_euler((0.0, 0.0, math.pi / 2))
     assert east is not None
     one = relay(message="odometry")
-    one.take(sample(NOW, velocity=(0.0, 2.0, 0.0)), east)
+    one.add_sample(sample(NOW, velocity=(0.0, 2.0, 0.0)), east)
     (pose,) = one.due(NOW, offset_ns=0, refused=())
     assert pose.body_mps == pytest.approx((2.0, 0.0, 0.0))
-    (message,) = read(Encoder(245, 25).external_position(pose))
+    (message,) = read(Encoder(245, 25).encode_external_position(pose))
     assert (message.get_type(), message.frame_id, message.child_frame_id) == ("ODOMETRY", 20, 12)
     assert (message.x, message.y, message.z, message.vx) == pytest.approx((1.0, 2.0, -0.5, 2.0))
-    one.take(sample(NOW + SECOND, received_ns=NOW + SECOND), east)
+    one.add_sample(sample(NOW + SECOND, received_ns=NOW + SECOND), east)
     (pose,) = one.due(NOW + SECOND, offset_ns=0, refused=())
-    (message,) = read(Encoder(245, 25).external_position(pose))
+    (message,) = read(Encoder(245, 25).encode_external_position(pose))
     assert message.get_type() == "VISION_POSITION_ESTIMATE"
     assert (message.roll, message.pitch, message.yaw) == pytest.approx((0.0, 0.0, math.pi / 2))
     assert math.isnan(message.covariance[0])
@@ -135,7 +135,7 @@ def test_odometry_has_the_velocity_in_body_axes_and_without_one_it_is_a_position
 )
 def test_nothing_unsound_is_ever_sent(pose: Pose) -> None:
     with pytest.raises(UnsendableError):
-        Encoder(245, 25).external_position(pose)
+        Encoder(245, 25).encode_external_position(pose)
 
 
 # --- against the simulated vehicles, in lockstep ---------------------------------------------------------------------
@@ -202,7 +202,7 @@ def test_a_vehicle_that_the_pilot_took_off_lands_by_our_positions_to_the_end(nam
     rig.run(8.0)
     rig.pilot_flies(external)
     rig.run(40.0, stop=True)
-    assert rig.loop.finished and rig.loop.who_flies is HandoverState.DONE
+    assert rig.loop.finished and rig.loop.handover_state is HandoverState.DONE
     assert not rig.peers.autopilot.pilot.armed and rig.peers.autopilot.estimator.position_ok
     assert not any("Failsafe" in event.text for event in rig.memory.of(Event))
     end_ns = rig.peers.now_ns
@@ -217,7 +217,7 @@ def test_without_the_relay_a_vehicle_that_the_pilot_took_off_is_left_as_soon_as_
     rig.run(3.0)
     rig.pilot_flies("OFFBOARD")
     rig.run(40.0, stop=True)
-    assert rig.loop.finished and rig.loop.who_flies is HandoverState.SETTLING and rig.peers.autopilot.pilot.armed
+    assert rig.loop.finished and rig.loop.handover_state is HandoverState.SETTLING and rig.peers.autopilot.pilot.armed
 
 
 def test_frozen_cameras_are_not_passed_on() -> None:

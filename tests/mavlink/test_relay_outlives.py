@@ -12,8 +12,8 @@ from uavctl.flight.controller import Controller
 from uavctl.flight.state import ControlState
 from uavctl.flight.tick import TickOutput
 from uavctl.flight.tick import tick as run_tick
-from uavctl.mavlink.handover import HandOver, HandoverStep
-from uavctl.mavlink.handover_guards import MUST_LAND, HandoverView
+from uavctl.mavlink.handover import HandoverOutput, HandoverStateMachine
+from uavctl.mavlink.handover_guards import LAND_PERIODS, HandoverInput
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.outcome import Cause
 from uavctl.records import Event, RelayStats, StepInput
@@ -109,10 +109,10 @@ def test_a_core_that_fails_while_the_pilot_flies_asks_for_nothing(monkeypatch: p
 def test_a_hand_over_that_fails_leaves_the_positions_until_the_vehicle_is_down(monkeypatch: pytest.MonkeyPatch) -> None:
     flight = airborne("px4")
 
-    def faulty(hand_over: HandOver, view: HandoverView) -> HandoverStep:
+    def faulty(hand_over: HandoverStateMachine, view: HandoverInput) -> HandoverOutput:
         raise LookupError("no such state")
 
-    monkeypatch.setattr(HandOver, "update", faulty)
+    monkeypatch.setattr(HandoverStateMachine, "update", faulty)
     failed_ns = flight.now_ns
     flight.run(10.0)
     assert not flight.loop.finished and poses_after(flight, flight.now_ns - SECOND)
@@ -134,7 +134,7 @@ def test_positions_go_on_as_long_as_the_pilot_has_the_vehicle_in_the_air(autopil
     flight.stick("POSCTL" if autopilot == "px4" else "LOITER")
     flight.run(3.0, until=HandoverState.RELEASED)
     flight.run(8.0 * LAND_S, stop=True)
-    assert flight.loop.carries and not flight.loop.finished
+    assert flight.loop.is_relay_needed and not flight.loop.finished
     assert poses_after(flight, flight.now_ns - SECOND)
 
 
@@ -143,8 +143,8 @@ def test_positions_go_on_as_long_as_the_pilot_has_the_vehicle_in_the_air(autopil
 def test_positions_go_on_for_a_vehicle_that_does_not_land() -> None:
     flight = airborne("px4", f"hand_over.land_s={LAND_S}")
     flight.hears = lambda data: b"VISION" in data or data[7:10] == bytes((102, 0, 0))  # positions alone get through
-    flight.run(MUST_LAND * LAND_S + 15.0, stop=True)
-    assert flight.is_in(HandoverState.FAILED) and flight.loop.carries and not flight.loop.finished
+    flight.run(LAND_PERIODS * LAND_S + 15.0, stop=True)
+    assert flight.is_in(HandoverState.FAILED) and flight.loop.is_relay_needed and not flight.loop.finished
     assert poses_after(flight, flight.now_ns - SECOND)
     assert flight.loop.ending.cause == Cause.LANDING_FAILED
 

@@ -9,7 +9,7 @@ from mavlink_rig import Peer, events, make_link, packets
 from uavctl.cli.flying import AGAIN_NS, Said, waits_for
 from uavctl.config import load_config
 from uavctl.mavlink.handover_states import HandoverState
-from uavctl.mavlink.vehicle import LOST, MOST, WAIT_NS
+from uavctl.mavlink.statustext import CHUNK_WAIT_NS, MAX_PARTIAL_TEXTS, MISSING_CHUNK
 from uavctl.records import Event, Severity
 
 SECOND = 1_000_000_000
@@ -83,13 +83,13 @@ def test_what_has_come_of_a_text_is_told_when_the_rest_stays_out() -> None:
     link, vehicle = make_link(), Peer(1, 1)
     link.receive(vehicle.heartbeat(), 0)
     assert events(link.receive(vehicle.send("statustext", 2, first, 7, 0), SECOND).items) == []
-    late = events(link.receive(vehicle.heartbeat(), SECOND + WAIT_NS + 1).items)
-    assert [event.text for event in late] == [first.decode() + LOST]
+    late = events(link.receive(vehicle.heartbeat(), SECOND + CHUNK_WAIT_NS + 1).items)
+    assert [event.text for event in late] == [first.decode() + MISSING_CHUNK]
     only_rest = events(link.receive(vehicle.send("statustext", 2, rest, 8, 1), 5 * SECOND).items)
-    assert [event.text for event in only_rest] == [LOST + "t"]
+    assert [event.text for event in only_rest] == [MISSING_CHUNK + "t"]
     link.receive(vehicle.send("statustext", 2, first, 9, 0), 6 * SECOND)
     both = events(link.receive(vehicle.send("statustext", 4, b"another", 0, 0), 6 * SECOND).items)
-    assert [event.text for event in both] == [first.decode() + LOST, "another"]
+    assert [event.text for event in both] == [first.decode() + MISSING_CHUNK, "another"]
 
 
 def test_texts_that_never_end_fill_no_memory() -> None:
@@ -99,5 +99,5 @@ def test_texts_that_never_end_fill_no_memory() -> None:
         link.receive(Peer(1, component).send("statustext", 2, DENIED[0], 7, 0), SECOND)
     for n in range(1000):
         link.receive(vehicle.send("statustext", 2, DENIED[0], 7, n % 250), SECOND)
-    assert len(link._texts._begun) <= MOST
-    assert all(len(begun.said) < 15_000 for begun in link._texts._begun.values())
+    assert len(link._text_assembler._partial_texts) <= MAX_PARTIAL_TEXTS
+    assert all(len(begun.text) < 15_000 for begun in link._text_assembler._partial_texts.values())

@@ -8,14 +8,14 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from signing_rig import EPOCH_S, KEY, NOW_S, OFFSET_NS, OTHER_KEY, SECOND, STAMP, SignedPeer, make_signing, seal, sign
 
 from uavctl.mavlink.signing import (
-    NEWEST_STAMP,
-    SKEW,
+    MAX_LINK_SKEW,
+    MAX_TIMESTAMP,
+    FrameSigner,
     SignatureRefusal,
-    Signing,
     SigningKey,
-    Stamps,
-    stamp_at,
-    without_signature,
+    SigningTimestamps,
+    make_timestamp,
+    remove_signature,
 )
 
 MINUTE = 60 * SECOND
@@ -53,9 +53,9 @@ def test_stamps_are_ten_microseconds_since_2015_and_always_grow() -> None:
 
 def test_stamps_never_outgrow_their_48_bits_and_never_fall_below_zero() -> None:
     frame = Peer().heartbeat()
-    full = Signing(SigningKey(KEY), 7, Stamps(own=2**48 - 2), OFFSET_NS)
+    full = FrameSigner(SigningKey(KEY), 7, SigningTimestamps(newest=2**48 - 2), OFFSET_NS)
     assert [stamp_of(full.sign(frame, 0)) for _ in range(2)] == [2**48 - 1] * 2
-    early = Signing(SigningKey(KEY), 7, Stamps(), 0)  # a machine that believes it is 1970
+    early = FrameSigner(SigningKey(KEY), 7, SigningTimestamps(), 0)  # a machine that believes it is 1970
     assert [stamp_of(early.sign(frame, 0)) for _ in range(2)] == [1, 2]
 
 
@@ -70,12 +70,12 @@ def test_stamps_never_outgrow_their_48_bits_and_never_fall_below_zero() -> None:
     ],
 )
 def test_a_stamp_counts_whole_units_since_2015_and_none_before(wall_ns: int, stamp: int) -> None:
-    assert stamp_at(wall_ns) == stamp
+    assert make_timestamp(wall_ns) == stamp
 
 
 @pytest.mark.fault(37)
 def test_where_nothing_was_kept_only_a_stamp_of_zero_is_old() -> None:
-    early = Signing(SigningKey(KEY), 7, Stamps(), 0)
+    early = FrameSigner(SigningKey(KEY), 7, SigningTimestamps(), 0)
     assert early.verify(sign(Peer().heartbeat(), 0), 0) is SignatureRefusal.REPLAYED
     assert early.verify(sign(Peer().heartbeat(), 1), 0) is None
 
@@ -86,12 +86,12 @@ def test_what_pymavlink_signs_is_taken_and_loses_nothing_but_its_signature(v: st
     arguments = () if v == "heartbeat" else (5,)
     frame = getattr(peer, v)(*arguments)
     assert make_signing().verify(frame, 0) is None
-    assert without_signature(frame) == getattr(plain, v)(*arguments)
+    assert remove_signature(frame) == getattr(plain, v)(*arguments)
 
 
 def test_other_flags_than_that_of_the_signature_stay() -> None:
     plain = Peer().heartbeat()
-    bare = without_signature(seal(plain[:2] + b"\x05" + plain[3:], STAMP))
+    bare = remove_signature(seal(plain[:2] + b"\x05" + plain[3:], STAMP))
     assert bare[:-2] == plain[:2] + b"\x04" + plain[3:-2]
 
 
@@ -145,7 +145,7 @@ def test_link_ids_of_peers_can_be_given() -> None:
 @pytest.mark.fault(37)
 @pytest.mark.fault(51)
 def test_genuine_frames_that_somebody_brings_elsewhere_first_are_not_old_here() -> None:
-    stamps = Stamps()
+    stamps = SigningTimestamps()
     here, elsewhere = make_signing(stamps), make_signing(stamps)
     peer = SignedPeer()
     for _ in range(100):
@@ -157,9 +157,9 @@ def test_genuine_frames_that_somebody_brings_elsewhere_first_are_not_old_here() 
 
 @pytest.mark.fault(37)
 def test_old_frames_of_one_connection_are_none_of_another() -> None:
-    stamps = Stamps()
+    stamps = SigningTimestamps()
     here, elsewhere = make_signing(stamps), make_signing(stamps)
-    old, new = SignedPeer(), SignedPeer(stamp=STAMP + SKEW + 100)
+    old, new = SignedPeer(), SignedPeer(stamp=STAMP + MAX_LINK_SKEW + 100)
     kept = [old.heartbeat() for _ in range(10)]
     assert here.verify(new.heartbeat(), 0) is None
     assert {elsewhere.verify(frame, 0) for frame in kept} == {SignatureRefusal.REPLAYED}
@@ -169,7 +169,7 @@ def test_old_frames_of_one_connection_are_none_of_another() -> None:
 @pytest.mark.fault(37)
 @pytest.mark.parametrize(("behind", "refusal"), [(500_000, None), (500_001, SignatureRefusal.REPLAYED)])
 def test_a_frame_may_be_five_seconds_behind_another_connection(behind: int, refusal: SignatureRefusal | None) -> None:
-    stamps = Stamps()
+    stamps = SigningTimestamps()
     here, elsewhere = make_signing(stamps), make_signing(stamps)
     assert here.verify(SignedPeer().heartbeat(), 0) is None
     assert elsewhere.verify(SignedPeer(stamp=STAMP - behind).heartbeat(), 0) is refusal
@@ -188,12 +188,12 @@ def test_a_stream_begins_at_most_a_minute_behind() -> None:
 
 @pytest.mark.fault(37)
 def test_nothing_from_before_the_start_is_taken() -> None:
-    before = Stamps()
+    before = SigningTimestamps()
     peer, camera = SignedPeer(), SignedPeer(system=17, stamp=STAMP - SECOND)
     first = make_signing(before)
     old = [peer.heartbeat() for _ in range(20)] + [camera.vision(5)]
     assert [first.verify(frame, 0) for frame in old] == [None] * 21
-    again = make_signing(Stamps(floor=before.own, own=before.own))
+    again = make_signing(SigningTimestamps(floor=before.newest, newest=before.newest))
     assert {again.verify(frame, 0) for frame in old} == {SignatureRefusal.REPLAYED}
     assert again.verify(camera.vision(6), 0) is SignatureRefusal.REPLAYED  # behind the others: it has to hear us first
     assert again.verify(peer.heartbeat(), 0) is None
@@ -213,7 +213,7 @@ def test_our_stamp_follows_the_newest_that_was_verified() -> None:
 @pytest.mark.fault(38)
 def test_a_forged_stamp_from_the_future_locks_nobody_out() -> None:
     genuine, signing = SignedPeer(), make_signing()
-    forged = SignedPeer(OTHER_KEY, NEWEST_STAMP - 5).heartbeat()
+    forged = SignedPeer(OTHER_KEY, MAX_TIMESTAMP - 5).heartbeat()
     assert signing.verify(genuine.heartbeat(), 0) is None
     assert signing.verify(forged, 0) is SignatureRefusal.FORGED
     assert [signing.verify(genuine.heartbeat(), n * 10**6) for n in range(1000)] == [None] * 1000
@@ -231,13 +231,13 @@ def test_pymavlink_is_locked_out_by_it() -> None:
         return sum(message.get_type() == "HEARTBEAT" for message in receiver.parse_buffer(frame) or [])
 
     assert taken(genuine.heartbeat()) == 1
-    assert taken(SignedPeer(OTHER_KEY, NEWEST_STAMP - 5).heartbeat()) == 0
+    assert taken(SignedPeer(OTHER_KEY, MAX_TIMESTAMP - 5).heartbeat()) == 0
     assert sum(taken(genuine.heartbeat()) for _ in range(1000)) == 0
 
 
 @pytest.mark.fault(37)
 def test_streams_are_bounded_and_keep_no_later_one_out() -> None:
-    stamps = Stamps()
+    stamps = SigningTimestamps()
     signing = make_signing(stamps)
     first = [SignedPeer(system=1 + n // 250, component=1 + n % 250, stamp=STAMP + n).heartbeat() for n in range(300)]
     assert {signing.verify(frame, 0) for frame in first} == {None}
@@ -247,7 +247,7 @@ def test_streams_are_bounded_and_keep_no_later_one_out() -> None:
     }  # also of those that are not kept
     late = SignedPeer(system=1, component=1, stamp=STAMP + 1000, link_id=9)
     assert signing.verify(late.heartbeat(), 0) is None  # one that was not kept may have another link id
-    assert len(signing._links) <= 64
+    assert len(signing._link_ids) <= 64
 
 
 @pytest.mark.parametrize("secret", [b"", KEY[:-1], KEY + b"x", bytes(32)])

@@ -14,7 +14,15 @@ from scipy.spatial.transform import Rotation
 
 from sim.cameras import HALF_ROLL, euler, turn
 from uavctl.config.connections import FrameConfig
-from uavctl.frames import Convention, Frame, Quaternion, from_euler, multiply, rotate, to_euler
+from uavctl.frames import (
+    Convention,
+    Frame,
+    Quaternion,
+    euler_from_quaternion,
+    multiply_quaternions,
+    quaternion_from_euler,
+    rotate_vector,
+)
 from uavctl.mavlink.codec import decode
 from uavctl.mavlink.messages import AutopilotVersion, EstimatorFlags, Message, ParamValue, Position
 
@@ -81,16 +89,16 @@ ANGLES = st.tuples(st.floats(-3.1, 3.1), st.floats(-1.5, 1.5), st.floats(-3.1, 3
 
 @given(ANGLES, st.tuples(*[st.floats(-1, 1)] * 3))
 def test_euler_angles_turn_about_z_y_x(angles: tuple[float, float, float], vector: tuple[float, float, float]) -> None:
-    q = from_euler(angles)
+    q = quaternion_from_euler(angles)
     assert q is not None
-    got = rotate(q, vector)
+    got = rotate_vector(q, vector)
     for axis in (0, 1, 2):  # one turn after the other
         turned = tuple(angle if i == axis else 0.0 for i, angle in enumerate(angles))
-        single = from_euler(turned)  # type: ignore[arg-type]
+        single = quaternion_from_euler(turned)  # type: ignore[arg-type]
         assert single is not None
-        vector = rotate(single, vector) or vector
+        vector = rotate_vector(single, vector) or vector
     assert got == pytest.approx(vector, abs=1e-9)
-    again = from_euler(to_euler(q))
+    again = quaternion_from_euler(euler_from_quaternion(q))
     assert again is not None and abs(sum(a * b for a, b in zip(q, again, strict=True))) == pytest.approx(1.0)
 
 
@@ -100,20 +108,20 @@ def test_attitudes_come_back_from_the_simulated_cameras_axes(
     convention: Convention, angles: tuple[float, float, float], yaw_deg: float
 ) -> None:
     """The cameras' side is the simulator's own code."""
-    truth = from_euler(angles)
+    truth = quaternion_from_euler(angles)
     assert truth is not None
     frame = Frame(convention, (0.0, 0.0, 0.0), yaw_deg)
     turned = product(turn(FrameConfig(convention=convention, yaw_deg=yaw_deg)), truth)  # type: ignore[arg-type]
-    told = from_euler(euler(turned if convention == "ned" else product(turned, HALF_ROLL)))
+    told = quaternion_from_euler(euler(turned if convention == "ned" else product(turned, HALF_ROLL)))
     assert told is not None
     for got in (frame.attitude_to_ned(turned, euler=False), frame.attitude_to_ned(told, euler=True)):
         assert abs(sum(a * b for a, b in zip(got, truth, strict=True))) == pytest.approx(1.0, abs=1e-6)
 
 
 def test_a_product_of_turns_is_one_after_the_other() -> None:
-    p, q = from_euler((0.3, -0.2, 1.0)), from_euler((-1.0, 0.4, 0.1))
+    p, q = quaternion_from_euler((0.3, -0.2, 1.0)), quaternion_from_euler((-1.0, 0.4, 0.1))
     assert p is not None and q is not None
-    inner: tuple[float, float, float] | None = rotate(q, (1.0, 2.0, 3.0))
+    inner: tuple[float, float, float] | None = rotate_vector(q, (1.0, 2.0, 3.0))
     assert inner is not None
-    product: Quaternion = multiply(p, q)
-    assert rotate(product, (1.0, 2.0, 3.0)) == pytest.approx(rotate(p, inner))
+    product: Quaternion = multiply_quaternions(p, q)
+    assert rotate_vector(product, (1.0, 2.0, 3.0)) == pytest.approx(rotate_vector(p, inner))

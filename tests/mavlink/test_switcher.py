@@ -11,11 +11,11 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.config.connections import HandOverConfig
 from uavctl.mavlink.handover_states import HandoverState
-from uavctl.mavlink.messages import Ack, Battery, FenceBreach, Heartbeat, RadioChannels, Text
+from uavctl.mavlink.messages import Battery, CommandAck, FenceBreach, Heartbeat, RadioChannels, StatusText
+from uavctl.mavlink.mode_reason import ModeReason, determine_mode_reason
 from uavctl.mavlink.profile import PROFILES, describe_mode
 from uavctl.mavlink.requests import RequestKind
-from uavctl.mavlink.switcher import Switcher, who_switched
-from uavctl.mavlink.vehicle import VehicleWatch
+from uavctl.mavlink.vehicle import VehicleMonitor
 from uavctl.records import VehicleStatus
 
 SECOND = 1_000_000_000
@@ -35,9 +35,9 @@ def test_every_mode_of_both_autopilots_has_its_name_and_who_can_have_chosen_it()
     }
     for autopilot, all_of_it in numbers.items():
         names = [describe_mode(autopilot, mavlink.MAV_TYPE_QUADROTOR, number)[0] for number in all_of_it]
-        assert set(names) == set(PROFILES[autopilot].choices)
+        assert set(names) == set(PROFILES[autopilot].mode_choices)
     assert describe_mode("px4", 2, px4(4, 20))[0] == "AUTO.DESCEND"
-    assert describe_mode("px4", 2, px4(4, 33))[0] not in PROFILES["px4"].choices
+    assert describe_mode("px4", 2, px4(4, 33))[0] not in PROFILES["px4"].mode_choices
 
 
 def status(mode: str, autopilot: str, **said: object) -> VehicleStatus:
@@ -48,39 +48,39 @@ def status(mode: str, autopilot: str, **said: object) -> VehicleStatus:
 @pytest.mark.parametrize(
     ("autopilot", "mode", "said", "who"),
     [
-        ("px4", "AUTO.DESCEND", {}, Switcher.FAILSAFE),
-        ("px4", "TERMINATION", {"radio": True}, Switcher.FAILSAFE),
-        ("px4", "AUTO.DESCEND", {"stick": True}, Switcher.FAILSAFE),
-        ("px4", "AUTO.RTL", {"failsafe": True, "radio": True}, Switcher.FAILSAFE),
-        ("px4", "AUTO.RTL", {"fence": True, "failsafe": True}, Switcher.FENCE),
-        ("px4", "AUTO.LOITER", {"radio": True}, Switcher.UNKNOWN),
-        ("px4", "AUTO.LOITER", {"radio": True, "stick": True}, Switcher.PILOT),
-        ("px4", "AUTO.LOITER", {"station": 255}, Switcher.GROUND_STATION),
-        ("px4", "AUTO.21", {"radio": True}, Switcher.UNKNOWN),
-        ("px4", "AUTO.21", {"failsafe": True}, Switcher.FAILSAFE),
-        ("px4", "POSCTL", {"radio": True}, Switcher.PILOT),
-        ("px4", "POSCTL", {}, Switcher.UNKNOWN),
-        ("px4", "POSCTL", {"failsafe": True, "radio": True}, Switcher.FAILSAFE),  # COM_OBL_RC_ACT 0
-        ("px4", "POSCTL", {"failsafe": True, "stick": True}, Switcher.PILOT),
-        ("px4", "ACRO", {"failsafe": True, "radio": True}, Switcher.PILOT),
-        ("ardupilot", "RTL", {"radio": True}, Switcher.UNKNOWN),
-        ("ardupilot", "RTL", {"radio": True, "fence": True, "said": "Max Alt fence breached"}, Switcher.FENCE),
-        ("ardupilot", "BRAKE", {"stick": True}, Switcher.PILOT),
-        ("ardupilot", "AVOID_ADSB", {"radio": True}, Switcher.FAILSAFE),
-        ("ardupilot", "LOITER", {"radio": True}, Switcher.PILOT),
-        ("ardupilot", "LOITER", {"radio": True, "failsafe": True}, Switcher.PILOT),  # it says so of before
-        ("ardupilot", "ALT_HOLD", {"radio": True, "failsafe": True, "said": "EKF Failsafe"}, Switcher.FAILSAFE),
-        ("ardupilot", "LAND", {"stick": True, "failsafe": True}, Switcher.UNKNOWN),
-        ("ardupilot", "MODE_77", {"radio": True}, Switcher.UNKNOWN),
+        ("px4", "AUTO.DESCEND", {}, ModeReason.FAILSAFE),
+        ("px4", "TERMINATION", {"radio": True}, ModeReason.FAILSAFE),
+        ("px4", "AUTO.DESCEND", {"stick": True}, ModeReason.FAILSAFE),
+        ("px4", "AUTO.RTL", {"failsafe": True, "radio": True}, ModeReason.FAILSAFE),
+        ("px4", "AUTO.RTL", {"fence": True, "failsafe": True}, ModeReason.FENCE),
+        ("px4", "AUTO.LOITER", {"radio": True}, ModeReason.UNKNOWN),
+        ("px4", "AUTO.LOITER", {"radio": True, "stick": True}, ModeReason.PILOT),
+        ("px4", "AUTO.LOITER", {"station": 255}, ModeReason.GROUND_STATION),
+        ("px4", "AUTO.21", {"radio": True}, ModeReason.UNKNOWN),
+        ("px4", "AUTO.21", {"failsafe": True}, ModeReason.FAILSAFE),
+        ("px4", "POSCTL", {"radio": True}, ModeReason.PILOT),
+        ("px4", "POSCTL", {}, ModeReason.UNKNOWN),
+        ("px4", "POSCTL", {"failsafe": True, "radio": True}, ModeReason.FAILSAFE),  # COM_OBL_RC_ACT 0
+        ("px4", "POSCTL", {"failsafe": True, "stick": True}, ModeReason.PILOT),
+        ("px4", "ACRO", {"failsafe": True, "radio": True}, ModeReason.PILOT),
+        ("ardupilot", "RTL", {"radio": True}, ModeReason.UNKNOWN),
+        ("ardupilot", "RTL", {"radio": True, "fence": True, "said": "Max Alt fence breached"}, ModeReason.FENCE),
+        ("ardupilot", "BRAKE", {"stick": True}, ModeReason.PILOT),
+        ("ardupilot", "AVOID_ADSB", {"radio": True}, ModeReason.FAILSAFE),
+        ("ardupilot", "LOITER", {"radio": True}, ModeReason.PILOT),
+        ("ardupilot", "LOITER", {"radio": True, "failsafe": True}, ModeReason.PILOT),  # it says so of before
+        ("ardupilot", "ALT_HOLD", {"radio": True, "failsafe": True, "said": "EKF Failsafe"}, ModeReason.FAILSAFE),
+        ("ardupilot", "LAND", {"stick": True, "failsafe": True}, ModeReason.UNKNOWN),
+        ("ardupilot", "MODE_77", {"radio": True}, ModeReason.UNKNOWN),
     ],
 )
-def test_who_it_was(autopilot: str, mode: str, said: dict[str, object], who: Switcher) -> None:
-    assert who_switched(status(mode, autopilot, **said)) is who
+def test_who_it_was(autopilot: str, mode: str, said: dict[str, object], who: ModeReason) -> None:
+    assert determine_mode_reason(status(mode, autopilot, **said)) is who
 
 
 def test_who_takes_over_from_a_failsafe_by_stick_is_the_pilot() -> None:
     shown = status("POSCTL", "px4", failsafe=True, radio=True, said="Failsafe activated")
-    assert who_switched(shown, had_failed=True) is Switcher.PILOT
+    assert determine_mode_reason(shown, was_in_failsafe=True) is ModeReason.PILOT
 
 
 # From messages
@@ -90,13 +90,13 @@ class Vehicle:
     """A vehicle's words to the watch."""
 
     def __init__(self, autopilot: str) -> None:
-        self.watch = VehicleWatch(lambda _: None, (245, 25))
+        self.watch = VehicleMonitor(lambda _: None, (245, 25))
         self.autopilot, self.now_ns = autopilot, 100 * SECOND
         self.status: VehicleStatus | None = None
         self.beat(EXTERNAL_NUMBER[autopilot])
 
-    def say(self, message: Ack | Battery | FenceBreach | Heartbeat | RadioChannels | Text) -> None:
-        for item in self.watch.take(message, self.now_ns):
+    def say(self, message: CommandAck | Battery | FenceBreach | Heartbeat | RadioChannels | StatusText) -> None:
+        for item in self.watch.handle_message(message, self.now_ns):
             self.status = item if isinstance(item, VehicleStatus) else self.status
 
     def beat(self, mode: int, *, critical: bool = False) -> None:
@@ -113,17 +113,17 @@ class Vehicle:
         )
 
     def radio(self, *, heard: bool) -> None:
-        self.say(Battery(system=1, component=1, voltage_v=None, radio=heard))
+        self.say(Battery(system=1, component=1, voltage_v=None, has_radio=heard))
 
     def text(self, text: str, severity: int = 6) -> None:
-        self.say(Text(system=1, component=1, severity=severity, text=text))
+        self.say(StatusText(system=1, component=1, severity=severity, text=text))
 
     def channels(self, *pulses_us: int) -> None:
         self.say(RadioChannels(system=1, component=1, channels_us=pulses_us))
 
-    def who(self) -> Switcher:
+    def who(self) -> ModeReason:
         assert self.status is not None
-        return who_switched(self.status)
+        return determine_mode_reason(self.status)
 
 
 EXTERNAL_NUMBER = {"px4": px4(6), "ardupilot": 4}
@@ -136,20 +136,20 @@ HOME = {"px4": px4(4, 5), "ardupilot": 6}
 @pytest.mark.parametrize(
     ("text", "who"),
     [
-        ("Max Alt fence breached", Switcher.FENCE),
-        ("Circle fence breached", Switcher.FENCE),
-        ("Geofence violation", Switcher.FENCE),
-        ("Radio Failsafe", Switcher.FAILSAFE),
-        ("Battery Failsafe", Switcher.FAILSAFE),
-        ("Failsafe: Terrain data missing", Switcher.FAILSAFE),
-        ("Fence breach cleared", Switcher.UNKNOWN),
-        ("EKF Failsafe Cleared", Switcher.UNKNOWN),
-        ("PreArm: Radio failsafe on", Switcher.UNKNOWN),
-        ("Takeoff detected", Switcher.UNKNOWN),
+        ("Max Alt fence breached", ModeReason.FENCE),
+        ("Circle fence breached", ModeReason.FENCE),
+        ("Geofence violation", ModeReason.FENCE),
+        ("Radio Failsafe", ModeReason.FAILSAFE),
+        ("Battery Failsafe", ModeReason.FAILSAFE),
+        ("Failsafe: Terrain data missing", ModeReason.FAILSAFE),
+        ("Fence breach cleared", ModeReason.UNKNOWN),
+        ("EKF Failsafe Cleared", ModeReason.UNKNOWN),
+        ("PreArm: Radio failsafe on", ModeReason.UNKNOWN),
+        ("Takeoff detected", ModeReason.UNKNOWN),
     ],
 )
 def test_its_own_words_of_any_severity_before_and_after_the_mode(
-    autopilot: str, severity: int, late: bool, text: str, who: Switcher
+    autopilot: str, severity: int, late: bool, text: str, who: ModeReason
 ) -> None:
     vehicle = Vehicle(autopilot)
     if not late:
@@ -161,7 +161,7 @@ def test_its_own_words_of_any_severity_before_and_after_the_mode(
     assert vehicle.who() is who
     vehicle.now_ns += 3 * SECOND
     vehicle.beat(HOME[autopilot])
-    assert vehicle.who() is Switcher.UNKNOWN  # that was another time
+    assert vehicle.who() is ModeReason.UNKNOWN  # that was another time
 
 
 @BOTH
@@ -170,11 +170,11 @@ def test_a_switch_of_the_remote_control_is_the_pilot_s_and_a_hand_that_rests_is_
     vehicle.channels(1500, 1500, 1500, 1500, 1800)
     vehicle.channels(1512, 1490, 1500, 1500, 1800)
     vehicle.beat(HOME[autopilot])
-    assert vehicle.who() is Switcher.UNKNOWN
+    assert vehicle.who() is ModeReason.UNKNOWN
     vehicle.channels(1512, 1490, 1500, 1500, 1300)
-    assert vehicle.who() is Switcher.PILOT
+    assert vehicle.who() is ModeReason.PILOT
     vehicle.text("Radio Failsafe")  # its receiver moves them, and nobody's hand
-    assert vehicle.who() is Switcher.FAILSAFE
+    assert vehicle.who() is ModeReason.FAILSAFE
 
 
 MANUAL = {"px4": px4(3), "ardupilot": 5}
@@ -189,9 +189,9 @@ def test_channels_that_are_told_and_rest_are_no_pilot_s_switch_whatever_the_mode
     vehicle.radio(heard=True)
     vehicle.channels(1500, 1500, 1500, 1500, 1800)
     vehicle.beat(mode[autopilot])
-    assert vehicle.who() is Switcher.UNKNOWN  # a ground station over another link, perhaps
+    assert vehicle.who() is ModeReason.UNKNOWN  # a ground station over another link, perhaps
     vehicle.channels(1500, 1500, 1500, 1500, 1300)
-    assert vehicle.who() is Switcher.PILOT
+    assert vehicle.who() is ModeReason.PILOT
 
 
 @BOTH
@@ -203,9 +203,9 @@ def test_a_receiver_that_has_lost_its_remote_control_moves_the_channels_by_itsel
         vehicle.radio(heard=False)
         vehicle.channels(1500, 1500, 950, 1500, 1300)
         vehicle.beat(mode[autopilot])
-        assert vehicle.who() is Switcher.UNKNOWN
+        assert vehicle.who() is ModeReason.UNKNOWN
         vehicle.beat(mode[autopilot], critical=True)
-        assert vehicle.who() in (Switcher.FAILSAFE, Switcher.UNKNOWN)
+        assert vehicle.who() in (ModeReason.FAILSAFE, ModeReason.UNKNOWN)
 
 
 @BOTH
@@ -213,7 +213,7 @@ def test_a_receiver_that_has_lost_its_remote_control_moves_the_channels_by_itsel
 def test_what_was_seen_since_the_last_heartbeat_counts_however_late_the_next_one_comes(
     autopilot: str, gap_s: int
 ) -> None:
-    for word, who in (("Max Alt fence breached", Switcher.FENCE), ("", Switcher.PILOT)):
+    for word, who in (("Max Alt fence breached", ModeReason.FENCE), ("", ModeReason.PILOT)):
         vehicle = Vehicle(autopilot)
         vehicle.channels(1500, 1800)
         vehicle.now_ns += SECOND // 10
@@ -228,7 +228,7 @@ def test_what_was_seen_since_the_last_heartbeat_counts_however_late_the_next_one
         vehicle.beat(EXTERNAL_NUMBER[autopilot])
         vehicle.now_ns += 2 * SECOND
         vehicle.beat(HOME[autopilot])
-        assert vehicle.who() is Switcher.UNKNOWN  # that was another switch
+        assert vehicle.who() is ModeReason.UNKNOWN  # that was another switch
 
 
 def test_a_px4_whose_words_are_events_only_shows_its_failsafe_by_its_heartbeats() -> None:
@@ -238,18 +238,20 @@ def test_a_px4_whose_words_are_events_only_shows_its_failsafe_by_its_heartbeats(
         vehicle = Vehicle("px4")
         vehicle.radio(heard=True)
         vehicle.beat(mode, critical=True)
-        assert vehicle.who() is Switcher.FAILSAFE, mode
+        assert vehicle.who() is ModeReason.FAILSAFE, mode
 
 
 def test_a_fence_that_is_told_without_words_and_an_order_of_a_ground_station() -> None:
     vehicle = Vehicle("ardupilot")
     vehicle.beat(HOME["ardupilot"])
     vehicle.say(
-        Ack(system=1, component=1, command=mavlink.MAV_CMD_DO_SET_MODE, result=0, target_system=255, target_component=0)
+        CommandAck(
+            system=1, component=1, command=mavlink.MAV_CMD_DO_SET_MODE, result=0, target_system=255, target_component=0
+        )
     )
-    assert vehicle.who() is Switcher.GROUND_STATION
-    vehicle.say(FenceBreach(system=1, component=1, breached=True))
-    assert vehicle.who() is Switcher.FENCE
+    assert vehicle.who() is ModeReason.GROUND_STATION
+    vehicle.say(FenceBreach(system=1, component=1, is_breached=True))
+    assert vehicle.who() is ModeReason.FENCE
 
 
 # What the hand-over does
@@ -273,7 +275,7 @@ def test_unknown_in_a_mode_that_flies_by_itself_is_landed_in_bounded_time_unless
     rig = engaged(autopilot)
     rig.be(mode=home)
     rig.run(9.0)
-    assert rig.is_in(HandoverState.UNCLEAR) and not landings(rig) and rig.hand_over.busy
+    assert rig.is_in(HandoverState.UNCLEAR) and not landings(rig) and rig.hand_over.is_busy
     rig.run(2.0)
     assert landings(rig)
     pilots = engaged(autopilot)
@@ -300,8 +302,8 @@ def test_word_of_the_fence_that_comes_after_its_mode_counts() -> None:
 @pytest.mark.fault(28, 61)
 def test_px4_s_descend_while_landing_is_asked_for_is_a_landing() -> None:
     rig = engaged("px4")
-    rig.tick(land=True)
-    rig.tick(land=False)
+    rig.tick(is_landing_requested=True)
+    rig.tick(is_landing_requested=False)
     rig.be(mode="AUTO.DESCEND", failsafe=True)
     rig.run(3.0)
     assert rig.is_in(HandoverState.LANDING) and landings(rig) > 1  # not for us: it is asked on
@@ -318,13 +320,13 @@ def test_whoever_it_was_nothing_flies_it_and_by_order_only_is_it_asked_for(autop
     """Every mode that is none of ours, in every state of a flight, with and without each kind of word."""
     profile = PROFILES[autopilot]
     states = (HandoverState.CLIMBING, HandoverState.ENGAGING, HandoverState.ENGAGED)
-    modes = [*sorted(set(profile.choices) - {profile.external} - profile.climbing), "MODE_99"]
+    modes = [*sorted(set(profile.mode_choices) - {profile.external_mode} - profile.climb_modes), "MODE_99"]
     words: tuple[dict[str, Any], ...] = ({}, {"failsafe": True}, {"fence": True, "said": "Circle fence breached"})
     for state, mode, stick, said in product(states, modes, (False, True), words):
         rig = engaged(autopilot) if state is HandoverState.ENGAGED else Rig(autopilot).to(state)
         asked = len(rig.asked)
         rig.be(mode=mode, stick=stick, landed=False, **said)
-        sent = {rig.tick().sending for _ in range(80)}
+        sent = {rig.tick().setpoint_mode for _ in range(80)}
         assert sent == {NOTHING} and len(rig.asked) == asked, (state, mode, stick, said)
         assert rig.is_in(HandoverState.RELEASED, HandoverState.FAILSAFE, HandoverState.UNCLEAR), (
             rig.state,

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from uavctl.config.connections import DaemonConfig
 from uavctl.config.types import EstimatorConfig
 from uavctl.mavlink.connection import MavlinkConnection
-from uavctl.mavlink.messages import Ack, Text
-from uavctl.mavlink.vehicle import ALONE_NS, FROZEN_RAW_US, GONE_NS, TURNED_NS, SensorStream
+from uavctl.mavlink.messages import CommandAck, StatusText
+from uavctl.mavlink.vehicle import ALONE_NS, FROZEN_RAW_US, GONE_NS, MAX_ATTITUDE_AGE_NS, SensorStreamMonitor
 from uavctl.records import InertialSample, VehicleStatus
 
 NOW = 1000 * SECOND
@@ -41,7 +41,7 @@ def newest(link: MavlinkConnection, vehicle: Peer, at_ns: int = NOW + SECOND) ->
 def test_answers_to_others_are_not_ours(system: int, component: int, counts: bool) -> None:
     link, vehicle = heard()
     items = link.receive(vehicle.send("command_ack", 400, 4, 0, 0, system, component), NOW).items
-    assert bool([item for item in items if isinstance(item, Ack)]) == counts == bool(events(items))
+    assert bool([item for item in items if isinstance(item, CommandAck)]) == counts == bool(events(items))
 
 
 def test_answers_about_streams_are_not_told_of() -> None:
@@ -52,7 +52,7 @@ def test_answers_about_streams_are_not_told_of() -> None:
 def test_words_of_the_vehicle_are_told_and_handed_on() -> None:
     link, vehicle = heard()
     items = link.receive(vehicle.send("statustext", 2, b"PreArm: no"), NOW).items
-    assert [type(item) for item in items] == [Text, type(events(items)[0])]
+    assert [type(item) for item in items] == [StatusText, type(events(items)[0])]
     assert not link.receive(Peer(9, 1).send("statustext", 2, b"not mine"), NOW).items
 
 
@@ -75,9 +75,9 @@ def test_a_ground_station_and_a_camera_are_no_vehicles() -> None:
 def test_how_long_it_has_been_up_is_told_by_its_clock_and_goes_on_between_its_messages() -> None:
     link, vehicle = make_link(daemon=DaemonConfig(tick_s=0.05)), Peer(1, 1)
     link.receive(vehicle.heartbeat(), NOW)
-    assert link.vehicle_up_s(NOW) is None
+    assert link.vehicle_uptime_s(NOW) is None
     link.receive(vehicle.local_position(60_000), NOW)
-    assert link.vehicle_up_s(NOW) == 60.0 and link.vehicle_up_s(NOW + 2 * SECOND) == 62.0
+    assert link.vehicle_uptime_s(NOW) == 60.0 and link.vehicle_uptime_s(NOW + 2 * SECOND) == 62.0
 
 
 @pytest.mark.fault(20)
@@ -222,10 +222,10 @@ def test_a_specific_force_is_turned_into_an_acceleration_by_the_newest_attitude(
     else:
         link.receive(vehicle.send("attitude", NOW // MS, 0.1, -0.2, 2.0, 0.0, 0.0, 0.0), NOW)
     force = (0.5, -0.25, -9.5)
-    (sample,) = felt(link, vehicle, force, NOW + TURNED_NS)
-    assert sample.at_ns == NOW + TURNED_NS
+    (sample,) = felt(link, vehicle, force, NOW + MAX_ATTITUDE_AGE_NS)
+    assert sample.at_ns == NOW + MAX_ATTITUDE_AGE_NS
     assert sample.accel_mps2 == pytest.approx(turn.apply(force) + np.array([0.0, 0.0, 9.80665]), abs=1e-6)
-    assert felt(link, vehicle, (0.5, -0.25, -9.4), NOW + TURNED_NS + 1_000) == []  # the attitude is too old
+    assert felt(link, vehicle, (0.5, -0.25, -9.4), NOW + MAX_ATTITUDE_AGE_NS + 1_000) == []  # the attitude is too old
     assert felt(link, vehicle, (float("nan"), 0.0, 0.0), NOW) == []
     assert felt(link, Peer(1, 100), force, NOW) == felt(link, Peer(9, 1), force, NOW) == []  # a camera, another one
 
@@ -273,24 +273,24 @@ def test_inertial_data_that_are_of_now_are_all_taken_whatever_the_clocks() -> No
 def test_inertial_data_that_are_not_of_now_say_nothing(lies: Callable[[int], tuple[int, int, bool, bool]]) -> None:
     taken = stream(lies, count=190)
     assert taken[:100] == list(range(100))
-    assert len(taken[100:]) <= 1 + TURNED_NS // (20 * MS)  # as long as the last attitude turns them
+    assert len(taken[100:]) <= 1 + MAX_ATTITUDE_AGE_NS // (20 * MS)  # as long as the last attitude turns them
 
 
 @pytest.mark.parametrize("ppm", [-14_000, -500, 500, 14_000])
 def test_clocks_that_drift_apart_for_half_an_hour_lose_nothing(ppm: int) -> None:
-    stream_of_now = SensorStream()
+    stream_of_now = SensorStreamMonitor()
     for n in range(18_000):
         at_ns = NOW + n * SECOND // 10
         stamp_us = (at_ns + n * ppm * 100) // 1000
-        assert stream_of_now.takes(stamp_us, (0.01 * (n % 3), 0.0, 0.0), at_ns), n
+        assert stream_of_now.is_current(stamp_us, (0.01 * (n % 3), 0.0, 0.0), at_ns), n
 
 
 def test_a_new_stamp_is_a_new_measurement_and_the_same_stamp_is_none() -> None:
-    one = SensorStream()
+    one = SensorStreamMonitor()
     for n in range(100):
         at_ns, readings = NOW + n * 20 * MS, (float(n // 40), 0.0, -9.8)  # whole numbers repeat for 0.8 s
-        assert one.takes(at_ns // 1000, readings, at_ns, frozen_us=FROZEN_RAW_US)
-        assert one.takes(at_ns // 1000, readings, at_ns + MS, frozen_us=FROZEN_RAW_US) is None
+        assert one.is_current(at_ns // 1000, readings, at_ns, frozen_us=FROZEN_RAW_US)
+        assert one.is_current(at_ns // 1000, readings, at_ns + MS, frozen_us=FROZEN_RAW_US) is None
 
 
 @pytest.mark.parametrize("name", ["px4-inertial-drift.tlog", "arducopter-inertial-integers.tlog"])
@@ -300,7 +300,7 @@ def test_recorded_inertial_data_are_used(name: str) -> None:
     link, told = make_link(estimator=estimator), list[str]()
     for at_ns, data in packets(name):
         told += [event.code for event in events(link.receive(data, at_ns).items)]
-    used, total = link.inertial
+    used, total = link.inertial_counts
     assert total > 500 and used > 0.95 * total
     assert "inertial-not-of-now" not in told and told.count("dropped") <= 1
 
@@ -396,7 +396,7 @@ def test_another_component_of_the_vehicles_system_says_nothing_of_the_vehicle() 
     moves = device.send("attitude", 60_000, 0.5, 0.0, 0.0, 0.0, 0.0, 0.0)
     assert not [item for data in (answer, landed, moves) for item in link.receive(data, NOW).items]
     (said,) = link.receive(device.send("statustext", 4, b"failsafe"), NOW).items  # shown, and nothing is made of it
-    assert not isinstance(said, Text)
+    assert not isinstance(said, StatusText)
     status = newest(link, vehicle)
     assert status.landed is None and not status.failsafe
 

@@ -14,9 +14,10 @@ from mavlink_rig import packets
 from places import DATA
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from uavctl.frames import to_euler
-from uavctl.mavlink.codec import Encoder
-from uavctl.mavlink.framing import MessageLayout, with_checksum
+from uavctl.frames import euler_from_quaternion
+from uavctl.mavlink.encoder import Encoder
+from uavctl.mavlink.framing import add_checksum
+from uavctl.mavlink.message_layout import MessageLayout
 from uavctl.mavlink.relay import Pose
 from uavctl.records import Setpoint, SetpointSource
 
@@ -37,7 +38,7 @@ def framed(kind: Any, payload: bytes, sender: tuple[int, int], *, v1: bool = Fal
         body = bytes((len(payload), number, *sender, kind.id)) + payload
         return b"\xfe" + body + int(mavlink.x25crc(body + bytes((kind.crc_extra,))).crc).to_bytes(2, "little")
     head = bytes((0xFD, len(payload), int(signed), 0, number, *sender)) + int(kind.id).to_bytes(3, "little")
-    return with_checksum(head + payload) + bytes(13 * signed)
+    return add_checksum(head + payload) + bytes(13 * signed)
 
 
 def exact(value: Any) -> Any:
@@ -48,7 +49,7 @@ def exact(value: Any) -> Any:
 
 
 def is_read_alike(kind: Any, frame: bytes, sender: tuple[int, int]) -> None:
-    got, want = LAYOUTS[kind.id].read(frame), mavlink.MAVLink(None).decode(bytearray(frame))
+    got, want = LAYOUTS[kind.id].unpack(frame), mavlink.MAVLink(None).decode(bytearray(frame))
     assert (got.msgname, got.src_system, got.src_component) == (kind.msgname, *sender)
     for field in kind.fieldnames:
         value, wanted = getattr(got, field), getattr(want, field)
@@ -61,7 +62,7 @@ def is_written_alike(kind: Any, payload: bytes, number: int) -> None:
     message: Any = sender.decode(bytearray(framed(kind, payload, ADDRESS)))
     sender.seq = number
     fields = [getattr(message, f"_{field}_raw", getattr(message, field)) for field in kind.fieldnames]
-    assert LAYOUTS[kind.id].frame(ADDRESS, number, *fields) == message.pack(sender)
+    assert LAYOUTS[kind.id].pack(ADDRESS, number, *fields) == message.pack(sender)
 
 
 @given(kind=ANY, payload=PAYLOADS, sender=st.tuples(BYTES, BYTES), v1=st.booleans(), signed=st.booleans())
@@ -86,12 +87,12 @@ def test_every_kind_is_read_and_written_alike(kind: Any) -> None:
 def test_numbers_that_are_not_given_at_the_end_are_zero() -> None:
     whole = mavlink.MAVLink_set_gps_global_origin_message(1, 2, 3, 4, 0).pack(mavlink.MAVLink(None, *ADDRESS))
     layout = MessageLayout(mavlink.MAVLink_set_gps_global_origin_message)
-    assert layout.frame(ADDRESS, 0, 1, 2, 3, 4) == whole
+    assert layout.pack(ADDRESS, 0, 1, 2, 3, 4) == whole
 
 
 def test_a_number_that_does_not_fit_is_refused() -> None:
     with pytest.raises(struct.error):
-        MessageLayout(mavlink.MAVLink_timesync_message).frame(ADDRESS, 0, 2**63, 0)
+        MessageLayout(mavlink.MAVLink_timesync_message).pack(ADDRESS, 0, 2**63, 0)
 
 
 @pytest.mark.parametrize("name", sorted(path.name for path in DATA.glob("*.tlog")))
@@ -100,12 +101,12 @@ def test_recorded_frames_are_read_and_written_again(name: str) -> None:
     known = [(frame, number) for frame, number in frames if number in LAYOUTS]
     assert len(known) > 60
     for frame, number in known:
-        got = LAYOUTS[number].read(frame)
+        got = LAYOUTS[number].unpack(frame)
         names = mavlink.mavlink_map[number].fieldnames
         fields = (getattr(got, field) for field in names)
-        written = LAYOUTS[number].frame((got.src_system, got.src_component), frame[4], *fields)
+        written = LAYOUTS[number].pack((got.src_system, got.src_component), frame[4], *fields)
         if written[1] < frame[1]:  # extensions of the message: who a TIMESYNC is for
-            again = LAYOUTS[number].read(written)
+            again = LAYOUTS[number].unpack(written)
             assert [getattr(again, field) for field in names] == [getattr(got, field) for field in names]
         else:
             assert written == frame
@@ -122,7 +123,7 @@ def test_a_setpoint_has_pymavlinks_bytes(at_ns: int, accel: tuple[float, float, 
     want = mavlink.MAVLink_set_position_target_local_ned_message(
         at_ns // 1_000_000 % 2**32, 1, 2, 1, mask, *(0.0,) * 6, *accel, yaw or 0.0, 0.0
     )
-    assert Encoder(*ADDRESS).setpoint(setpoint, 1, 2) == want.pack(mavlink.MAVLink(None, *ADDRESS))
+    assert Encoder(*ADDRESS).encode_setpoint(setpoint, 1, 2) == want.pack(mavlink.MAVLink(None, *ADDRESS))
 
 
 POSITION, TURN = (1.0, -2.5, -0.0), (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))
@@ -131,42 +132,46 @@ POSITION, TURN = (1.0, -2.5, -0.0), (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))
 @pytest.mark.parametrize(
     ("method", "arguments", "want"),
     [
-        ("heartbeat", (), mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3)),
-        ("timesync", (-5, 2**63 - 1), mavlink.MAVLink_timesync_message(-5, 2**63 - 1)),
-        ("command", (21, (), 1, 2), mavlink.MAVLink_command_long_message(1, 2, 21, 0, *(0.0,) * 7)),
+        ("encode_heartbeat", (), mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3)),
+        ("encode_timesync", (-5, 2**63 - 1), mavlink.MAVLink_timesync_message(-5, 2**63 - 1)),
+        ("encode_command", (21, (), 1, 2), mavlink.MAVLink_command_long_message(1, 2, 21, 0, *(0.0,) * 7)),
         (
-            "command",
+            "encode_command",
             (400, (1.0, 21196.0), 1, 2),
             mavlink.MAVLink_command_long_message(1, 2, 400, 0, 1, 21196, 0, 0, 0, 0, 0),
         ),
         (
-            "origin",
+            "encode_global_origin",
             ((47.5, -8.25, 460.5), 3),
             mavlink.MAVLink_set_gps_global_origin_message(3, 475000000, -82500000, 460500),
         ),
         (
-            "request_parameter",
+            "encode_parameter_request",
             ("EKF2_EV_CTRL", 1, 2),
             mavlink.MAVLink_param_request_read_message(1, 2, b"EKF2_EV_CTRL", -1),
         ),
         (
-            "request_parameter",
+            "encode_parameter_request",
             ("SIXTEEN_LETTERS_", 1, 2),
             mavlink.MAVLink_param_request_read_message(1, 2, b"SIXTEEN_LETTERS_", -1),
         ),
         (
-            "request_interval",
+            "encode_interval_request",
             (32, 100_000, 1, 2),
             mavlink.MAVLink_command_long_message(1, 2, 511, 0, 32, 1e5, 0, 0, 0, 0, 0),
         ),
-        ("request_message", (49, 1, 2), mavlink.MAVLink_command_long_message(1, 2, 512, 0, 49, 0, 0, 0, 0, 0, 0)),
         (
-            "external_position",
-            (Pose("vision-position-estimate", 5, POSITION, TURN, None),),
-            mavlink.MAVLink_vision_position_estimate_message(5, *POSITION, *to_euler(TURN), UNKNOWN),
+            "encode_message_request",
+            (49, 1, 2),
+            mavlink.MAVLink_command_long_message(1, 2, 512, 0, 49, 0, 0, 0, 0, 0, 0),
         ),
         (
-            "external_position",
+            "encode_external_position",
+            (Pose("vision-position-estimate", 5, POSITION, TURN, None),),
+            mavlink.MAVLink_vision_position_estimate_message(5, *POSITION, *euler_from_quaternion(TURN), UNKNOWN),
+        ),
+        (
+            "encode_external_position",
             (Pose("odometry", 2**64 - 1, POSITION, TURN, (0.5, 0.0, -0.5)),),
             mavlink.MAVLink_odometry_message(
                 2**64 - 1, 20, 12, *POSITION, TURN, 0.5, 0.0, -0.5, *(0.0,) * 3, UNKNOWN, UNKNOWN, 0, 6

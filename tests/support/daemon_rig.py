@@ -53,7 +53,7 @@ class Bench:
             duration_s=duration_s,
             stop_limit_s=stop_limit_s,
             after_tick=(lambda ticked, _: self.told.extend((e.text, self.now_ns) for e in ticked.news),),
-            on_news=lambda news: self.told.extend((e.text, self.now_ns) for e in news),
+            on_events=lambda news: self.told.extend((e.text, self.now_ns) for e in news),
             wait_for=self.wait,
             now=lambda: self.now_ns,
         )
@@ -71,7 +71,7 @@ class Wire:
         self.dropped = 0
         self.refused: Counter[str] = Counter()
 
-    known, unread = True, False
+    has_known_sender, has_unread = True, False
 
     def fileno(self) -> int:
         return -1
@@ -79,17 +79,17 @@ class Wire:
     def filenos(self) -> tuple[int, ...]:
         return ()
 
-    def lost(self) -> int:
+    def count_lost(self) -> int:
         return self.dropped
 
-    def trust(self, index: int) -> None:
+    def trust_sender(self, index: int) -> None:
         pass
 
-    def receive(self, *, everything: bool = False) -> list[tuple[bytes, int]]:
+    def receive(self, *, read_all: bool = False) -> list[tuple[bytes, int]]:
         taken, self._bench.arrived[self._name] = self._bench.arrived[self._name], []
         return taken
 
-    def answer(self, index: int) -> None:
+    def select_peer(self, index: int) -> None:
         self.answered.append(index)
 
     def send(self, data: bytes) -> None:

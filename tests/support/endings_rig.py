@@ -36,8 +36,9 @@ from uavctl.clock import Ticker
 from uavctl.config import load_config
 from uavctl.daemon import control_socket
 from uavctl.daemon.daemon import fly
-from uavctl.daemon.health import HealthWatch, Notifier
-from uavctl.daemon.lock import lock_paths
+from uavctl.daemon.health import HealthMonitor
+from uavctl.daemon.lock import find_lock_paths
+from uavctl.daemon.notifier import Notifier
 from uavctl.io.base import Connection
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.handover_states import HandoverState
@@ -56,7 +57,7 @@ Step = tuple[Callable[["Endings"], bool], Callable[["Endings"], None]]
 class Line:
     """A connection to the simulated peers."""
 
-    known, unread, send_errors, receive_errors = True, False, 0, 0
+    has_known_sender, has_unread, send_errors, receive_errors = True, False, 0, 0
 
     def __init__(self, rig: Endings, name: str) -> None:
         self.url, self.closed = f"test://{name}", False
@@ -70,16 +71,16 @@ class Line:
     def filenos(self) -> tuple[int, ...]:
         return ()
 
-    def lost(self) -> int:
+    def count_lost(self) -> int:
         return 0
 
-    def trust(self, index: int) -> None:
+    def trust_sender(self, index: int) -> None:
         pass
 
-    def answer(self, index: int) -> None:
+    def select_peer(self, index: int) -> None:
         pass
 
-    def receive(self, *, everything: bool = False) -> list[tuple[bytes, int]]:
+    def receive(self, *, read_all: bool = False) -> list[tuple[bytes, int]]:
         taken, self.arrived = self.arrived, []
         return taken
 
@@ -142,13 +143,13 @@ class Endings:
         self.listener: socket.socket | None = None
         self._asking: list[subprocess.Popen[str]] = []
         self.loop: ControlLoop | None = None
-        self.watch: HealthWatch | None = None
+        self.watch: HealthMonitor | None = None
         self.notified: list[str] = []
 
     # What a step may look at, and do
 
     def is_in(self, state: HandoverState) -> bool:
-        return self.loop is not None and self.loop.who_flies is state
+        return self.loop is not None and self.loop.handover_state is state
 
     @property
     def flying(self) -> ControlLoop:
@@ -234,7 +235,7 @@ class Told:
         self.recorded = [one for one in self.records if isinstance(one, Ending)]
         page = self.path.with_suffix(".html")
         self.page = words_of(page) if page.exists() else ""
-        health = None if rig.watch is None else rig.watch.look()
+        health = None if rig.watch is None else rig.watch.make_health()
         self.status = "" if health is None else health.ending
         self.relay = None if health is None else health.relay
         self.notified = rig.notified
@@ -279,31 +280,31 @@ def in_virtual_time(rig: Endings) -> Iterator[None]:
     """The command's clock, connections and threads in our hands."""
 
     @contextmanager
-    def connected(*given: object) -> Iterator[dict[str, Line]]:
+    def open_links(*given: object) -> Iterator[dict[str, Line]]:
         yield rig.lines
 
-    class Watched(HealthWatch):
+    class Watched(HealthMonitor):
         def __init__(self, *given: Any) -> None:
             super().__init__(*given)
             rig.watch = self
 
     @contextmanager
-    def listening(*given: Any) -> Iterator[socket.socket]:
-        with control_socket.listening(*given) as rig.listener:
+    def open_listener(*given: Any) -> Iterator[socket.socket]:
+        with control_socket.open_listener(*given) as rig.listener:
             yield rig.listener
 
     with pytest.MonkeyPatch.context() as patch:
         for module in (fly_cmd, tune_flight):
-            patch.setattr(module, "connected", connected)
+            patch.setattr(module, "open_links", open_links)
             patch.setattr(module, "monotonic_ns", lambda: rig.now_ns)
         patch.setattr(tune_flight, "wait", rig.wait)
-        patch.setattr(fly_cmd, "listening", listening)
+        patch.setattr(fly_cmd, "open_listener", open_listener)
         patch.setattr(fly_cmd, "run_daemon", rig.fly)
         patch.setattr(fly_cmd, "Ticker", lambda tick_ns, dt_ns: Ticker(tick_ns, dt_ns, lambda: rig.now_ns))
         patch.setattr(fly_cmd, "Recorder", Sync)
         patch.setattr("uavctl.cli.check.checked_before_arming", lambda *_: ())
-        patch.setattr("uavctl.cli.fly.HealthWatch", Watched)
-        patch.setattr(Notifier, "status", lambda _, text: rig.notified.append(text))
+        patch.setattr("uavctl.cli.fly.HealthMonitor", Watched)
+        patch.setattr(Notifier, "send_status", lambda _, text: rig.notified.append(text))
         patch.setattr(report, "_sections", lambda *given: [report._summary_section(*given)])  # no drawings
         patch.setattr(Sync, "full", False)
         yield
@@ -314,7 +315,7 @@ def flown(rig: Endings, capsys: pytest.CaptureFixture[str], *words: str) -> Told
     with socket.socket(type=socket.SOCK_DGRAM) as one:
         one.bind(("127.0.0.1", 0))
         url = f"udpin://127.0.0.1:{one.getsockname()[1]}"
-    for path in lock_paths(url):  # what a daemon of another test has left on this port
+    for path in find_lock_paths(url):  # what a daemon of another test has left on this port
         path.unlink(missing_ok=True)
     sets = [word for setting in rig.overrides for word in ("--set", setting)]
     places = ["--vehicle", url, "--out", str(rig.folder), "--json"]
@@ -325,7 +326,7 @@ def flown(rig: Endings, capsys: pytest.CaptureFixture[str], *words: str) -> Told
     except SystemExit as ended:
         code = int(ended.code or 0)
     finally:
-        for path in lock_paths(url):
+        for path in find_lock_paths(url):
             path.unlink(missing_ok=True)
     out, err = capsys.readouterr()
     assert (rig.folder / "flight.mcap").exists(), err

@@ -5,10 +5,10 @@ from __future__ import annotations
 from msgspec.structs import replace
 
 from uavctl.config.connections import HandOverConfig
-from uavctl.mavlink.handover import HandOver, HandoverStep
-from uavctl.mavlink.handover_guards import HandoverView
-from uavctl.mavlink.handover_states import HandoverState, Sending
-from uavctl.mavlink.messages import Ack, Text
+from uavctl.mavlink.handover import HandoverOutput, HandoverStateMachine
+from uavctl.mavlink.handover_guards import HandoverInput
+from uavctl.mavlink.handover_states import HandoverState, SetpointMode
+from uavctl.mavlink.messages import CommandAck, StatusText
 from uavctl.mavlink.requests import COMMANDS, RequestKind
 from uavctl.records import Command, Event, Order, VehicleStatus
 
@@ -21,20 +21,20 @@ TAKE_OFF, ENGAGE, LAND, STAND_BY = (
     Command(order=Order.LAND),
     Command(order=Order.STAND_BY),
 )
-NOTHING, NEUTRAL, FLY = Sending.NOTHING, Sending.NEUTRAL, Sending.SETPOINTS
+NOTHING, NEUTRAL, FLY = SetpointMode.NOTHING, SetpointMode.NEUTRAL, SetpointMode.SETPOINTS
 
 
 class Rig:
     """A hand-over and a vehicle whose words are put into its mouth; it says every tick who it is, unless it is mute."""
 
     def __init__(self, autopilot: str = "px4", config: HandOverConfig | None = None) -> None:
-        self.hand_over = HandOver(config)
+        self.hand_over = HandoverStateMachine(config)
         ground = "AUTO.LOITER" if autopilot == "px4" else "STABILIZE"
         self.vehicle: VehicleStatus | None = VehicleStatus(
             at_ns=NOW, autopilot=autopilot, armed=False, mode=ground, external=False, landed=True, radio=True
         )
         self.mute = False
-        self.view = HandoverView(at_ns=NOW, vehicle=None, ready=True, up_m=0.0)
+        self.view = HandoverInput(at_ns=NOW, vehicle=None, has_setpoint=True, estimated_height_m=0.0)
         self.asked: list[tuple[int, RequestKind]] = []
         self.events: list[Event] = []
 
@@ -55,14 +55,16 @@ class Rig:
     def asked_last(self, ask: RequestKind) -> bool:
         return self.asked[-1][1] is ask
 
-    def tick(self, *heard: Ack | Text, commands: tuple[Command, ...] = (), **fields: object) -> HandoverStep:
+    def tick(
+        self, *heard: CommandAck | StatusText, commands: tuple[Command, ...] = (), **fields: object
+    ) -> HandoverOutput:
         at_ns = self.view.at_ns + TICK_NS
         if self.vehicle is not None and not self.mute:
             self.vehicle = replace(self.vehicle, at_ns=at_ns)
-        self.view = replace(self.view, at_ns=at_ns, vehicle=self.vehicle, heard=heard, commands=commands, **fields)
+        self.view = replace(self.view, at_ns=at_ns, vehicle=self.vehicle, messages=heard, commands=commands, **fields)
         told = self.hand_over.update(self.view)
-        if told.ask is not None:
-            self.asked.append((at_ns, told.ask))
+        if told.request is not None:
+            self.asked.append((at_ns, told.request))
         self.events += told.events
         return told
 
@@ -73,9 +75,9 @@ class Rig:
             self.tick()
         assert until is None or self.state is until
 
-    def answer(self, result: int, ask: RequestKind | None = None, text: str = "") -> HandoverStep:
+    def answer(self, result: int, ask: RequestKind | None = None, text: str = "") -> HandoverOutput:
         """The vehicle answers the last request, or this one."""
-        words = (Text(system=1, component=1, severity=2, text=text),) if text else ()
+        words = (StatusText(system=1, component=1, severity=2, text=text),) if text else ()
         return self.tick(ack(result, ask or self.asked[-1][1]), *words)
 
     def to(self, state: HandoverState) -> Rig:
@@ -118,10 +120,10 @@ class Rig:
             self.be(mode="AUTO.RTL" if px4 else "RTL")
             self.tick()
             return self
-        self.tick(up_m=1.9)
+        self.tick(estimated_height_m=1.9)
         return self
 
-    def fail(self, mode: str = "") -> HandoverStep:
+    def fail(self, mode: str = "") -> HandoverOutput:
         """A failsafe of the vehicle's own lands it, or chooses this mode."""
         px4 = self.vehicle is not None and self.vehicle.autopilot == "px4"
         self.be(mode=mode or ("AUTO.LAND" if px4 else "LAND"), failsafe=True)
@@ -134,8 +136,8 @@ class Rig:
         if state is HandoverState.RETURNING:
             self.tick(commands=(ENGAGE,))
         if state in (HandoverState.LANDING, HandoverState.SETTLING):
-            self.tick(land=True)
-            self.view = replace(self.view, land=False)
+            self.tick(is_landing_requested=True)
+            self.view = replace(self.view, is_landing_requested=False)
         if state is HandoverState.SETTLING:
             self.be(mode="AUTO.LAND")
             self.tick()
@@ -145,5 +147,7 @@ class Rig:
         return [event.text for event in self.events if event.code == code]
 
 
-def ack(result: int, ask: RequestKind) -> Ack:
-    return Ack(system=1, component=1, command=COMMANDS[ask], result=result, target_system=245, target_component=25)
+def ack(result: int, ask: RequestKind) -> CommandAck:
+    return CommandAck(
+        system=1, component=1, command=COMMANDS[ask], result=result, target_system=245, target_component=25
+    )

@@ -109,7 +109,7 @@ class Indoors:
         self.run(5.0)
         assert pilot.change(kind.mode(external), self.peers.now_ns) == 0
         self.run(3.0)
-        assert self.loop.who_flies is HandoverState.ENGAGED and not self.loop.finished
+        assert self.loop.handover_state is HandoverState.ENGAGED and not self.loop.finished
 
     def sent(self, *kinds: str) -> Iterator[tuple[int, Any]]:
         for record in self.memory.of(Datagram):

@@ -25,7 +25,7 @@ from sim_rig import Client
 from sim.server import serve
 from uavctl.cli.app import run
 from uavctl.config import load_config
-from uavctl.daemon.lock import lock_paths
+from uavctl.daemon.lock import find_lock_paths
 from uavctl.records import Truth
 
 # The machine may stand still for a while, and then neither side has failed: the vehicle bears with a pause in the
@@ -176,7 +176,7 @@ def scene(*overrides: str) -> Iterator[Scene]:
             done.set()
             peers.join()
             tap.close()
-            for path in lock_paths(found.vehicle):
+            for path in find_lock_paths(found.vehicle):
                 path.unlink(missing_ok=True)  # the port's next vehicle was not left in flight
 
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from mavlink_rig import Peer
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from uavctl.mavlink.signing import Gate, Signing, SigningKey, Stamps
+from uavctl.mavlink.signing import FrameAuthenticator, FrameSigner, SigningKey, SigningTimestamps
 
 KEY, OTHER_KEY = bytes(range(1, 33)), bytes(range(2, 34))
 EPOCH_S = 1_420_070_400  # 2015-01-01 in seconds since 1970
@@ -57,9 +57,11 @@ def unknown(length: int = 9) -> bytes:
     return bytes((0xFD, length, 1, 0, 0, 1, 1)) + (60_000).to_bytes(3, "little") + bytes(length) + b"\x12\x34"
 
 
-def make_signing(stamps: Stamps | None = None, *, key: bytes = KEY, peer_link_ids: tuple[int, ...] = ()) -> Signing:
-    return Signing(SigningKey(key), 7, stamps or Stamps(), OFFSET_NS, frozenset(peer_link_ids))
+def make_signing(
+    stamps: SigningTimestamps | None = None, *, key: bytes = KEY, peer_link_ids: tuple[int, ...] = ()
+) -> FrameSigner:
+    return FrameSigner(SigningKey(key), 7, stamps or SigningTimestamps(), OFFSET_NS, frozenset(peer_link_ids))
 
 
-def make_gate(stamps: Stamps | None = None, *, stream: bool = False) -> Gate:
-    return Gate(make_signing(stamps), stream=stream)
+def make_gate(stamps: SigningTimestamps | None = None, *, stream: bool = False) -> FrameAuthenticator:
+    return FrameAuthenticator(make_signing(stamps), stream=stream)

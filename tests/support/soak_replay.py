@@ -26,8 +26,8 @@ from uavctl.build.controller import Prepared
 from uavctl.cli.replay import replay_flight
 from uavctl.config import Config
 from uavctl.loop import ControlLoop
-from uavctl.mavlink.framing import scan
-from uavctl.mavlink.signing import Gate, Signing, SigningKey, Stamps
+from uavctl.mavlink.framing import scan_frames
+from uavctl.mavlink.signing import FrameAuthenticator, FrameSigner, SigningKey, SigningTimestamps
 from uavctl.records import Command, Order, Received, Record, Send, Sink
 
 SECOND_NS = 1_000_000_000
@@ -37,17 +37,17 @@ class Doors:
     """Signatures put on and taken off again, with what the channel has damaged left damaged."""
 
     def __init__(self, links: tuple[str, ...]) -> None:
-        key, theirs, ours = SigningKey(KEY), Stamps(), Stamps()
-        self.peers = {name: Gate(Signing(key, 3, theirs, OFFSET_NS), stream=False) for name in links}
-        self.gates = {name: Gate(Signing(key, 7, ours, OFFSET_NS), stream=False) for name in links}
+        key, theirs, ours = SigningKey(KEY), SigningTimestamps(), SigningTimestamps()
+        self.peers = {name: FrameAuthenticator(FrameSigner(key, 3, theirs, OFFSET_NS), stream=False) for name in links}
+        self.gates = {name: FrameAuthenticator(FrameSigner(key, 7, ours, OFFSET_NS), stream=False) for name in links}
         self.told: dict[str, Counter[str]] = {name: Counter() for name in links}
 
     def take(self, link: str, data: bytes, at_ns: int) -> bytes:
         """What of a datagram passes."""
-        found = scan(data, final=True)
+        found = scan_frames(data, final=True)
         if found.frames and not found.bad:
-            data = b"".join(self.peers[link].seal(frame.data, at_ns) for frame in found.frames)
-        return self.gates[link].admit(data, at_ns)
+            data = b"".join(self.peers[link].sign_frame(frame.data, at_ns) for frame in found.frames)
+        return self.gates[link].verify_frames(data, at_ns)
 
     def tell(self, loop: ControlLoop, at_ns: int) -> None:
         """What did not, since this was last told."""
@@ -129,7 +129,7 @@ class Rig:
         if self._doors is None:
             self.loop.receive(link, bytes(data), at_ns)
         else:
-            data = bytearray(self._doors.gates[link].admit(bytes(data), at_ns))
+            data = bytearray(self._doors.gates[link].verify_frames(bytes(data), at_ns))
             if data:
                 self.loop.receive(link, bytes(data), at_ns)
 

@@ -12,7 +12,7 @@ from logs.recording.recorder import SyncRecorder
 from sim.simulation import World
 from uavctl.build.controller import Prepared, design_of, prepare
 from uavctl.config import Config, load_config
-from uavctl.daemon.engagement import stop_limit_s
+from uavctl.daemon.engagement import compute_stop_limit_s
 from uavctl.loop import ControlLoop
 from uavctl.records import (
     Command,
@@ -169,7 +169,7 @@ def fly(
         world.run(config.duration_s, is_over)
         if take_off_m is not None:
             watch.stop = True
-            world.run(config.duration_s + stop_limit_s(config, takes_off=True), lambda: watch.loop.finished)
+            world.run(config.duration_s + compute_stop_limit_s(config, takes_off=True), lambda: watch.loop.finished)
     finally:
         if recorder is not None:
             recorder.close()

@@ -57,7 +57,7 @@ class Flight:
 
     @property
     def state(self) -> HandoverState:
-        return self.loop.who_flies
+        return self.loop.handover_state
 
     def is_in(self, *states: HandoverState) -> bool:
         return self.state in states

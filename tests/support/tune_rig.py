@@ -16,7 +16,7 @@ from endings_rig import ON_THE_FLOOR, TAKE_OFF, Endings, in_virtual_time
 from sim_rig import decode
 
 from uavctl.cli.app import run
-from uavctl.daemon.lock import lock_paths
+from uavctl.daemon.lock import find_lock_paths
 from uavctl.lab.tune import excitation
 
 BOX = "--box=-1.2,-1.1,-2,1.2,1.1,-0.4"
@@ -102,7 +102,7 @@ def fly_real(rig: Endings, folder: Path, *more: str, enter: str | type[BaseExcep
             patch.setattr("sys.stdin.readline", readline, raising=False)
             code = run(arguments)
     finally:
-        for path in lock_paths(VEHICLE):
+        for path in find_lock_paths(VEHICLE):
             path.unlink(missing_ok=True)
     text = out.getvalue()
     return Tuned(code, json.loads(text) if text else {}, err.getvalue(), rig, folder)

@@ -22,7 +22,7 @@ from uavctl.api.control import Array, Plan, Runs, Signal, Source, limits_of, loa
 from uavctl.build.controller import build_problem, design_of, prepare
 from uavctl.config import Config
 from uavctl.config.load import parse_recorded
-from uavctl.daemon.engagement import Engagement, check_places, goto_keys, stop_limit_s
+from uavctl.daemon.engagement import Engagement, check_places, compute_stop_limit_s, make_goto_keys
 from uavctl.errors import RecordingError, UsageError, in_words, need
 from uavctl.lab.lockstep import LockstepFlight, check_length
 from uavctl.records import Ending, Truth
@@ -190,7 +190,7 @@ def fly(
         RecordingError: The recording cannot be written, or is there already.
         UsageError: The flight is shorter than a tick, or the vehicle may not rest where it is to climb or go.
     """
-    given = {"sim.seed": seed, "duration_s": duration_s, **({} if goto is None else goto_keys(goto))}
+    given = {"sim.seed": seed, "duration_s": duration_s, **({} if goto is None else make_goto_keys(goto))}
     if take_off_m is not None and not take_off_m > 0:
         raise UsageError(f"take_off_m {take_off_m}: give a height above the ground [m]")
     found = load(loaded(config), {key: value for key, value in given.items() if value is not None})
@@ -202,7 +202,7 @@ def fly(
     with new_recording(None if out is None else Path(out), found.name, found.log.free_bytes) as path:
         flight = LockstepFlight(prepared, path, command="uavctl.fly")
         engagement.begin(flight.loop)
-        landing_s = None if take_off_m is None else stop_limit_s(found, takes_off=True)
+        landing_s = None if take_off_m is None else compute_stop_limit_s(found, takes_off=True)
         try:
             flight.fly(lambda _: True, follower=engagement, landing_s=landing_s)
         except Exception as error:

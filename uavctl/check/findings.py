@@ -12,15 +12,15 @@ import msgspec
 
 from uavctl.config.connections import CheckConfig
 from uavctl.frames import Quaternion
-from uavctl.mavlink.clocksync import ClockSync, RoundTrips
-from uavctl.mavlink.codec import BOOT_MS_WRAP
+from uavctl.mavlink.clocksync import ClockSync, TimesyncClock
+from uavctl.mavlink.encoder import BOOT_MS_WRAP
 from uavctl.mavlink.messages import (
     Attitude,
     AutopilotVersion,
     Battery,
     EstimatorFlags,
     Heartbeat,
-    Landed,
+    LandedState,
     Message,
     ParamValue,
     Position,
@@ -135,7 +135,7 @@ class Heard:
     parameters: dict[str, ParamValue] = field(default_factory=dict)  # values of the vehicle's parameters
     stats: dict[str, LinkStats] = field(default_factory=dict)  # counters of each link at the end
     # TIMESYNC with the vehicle and with the source of positions; None where nothing answered
-    trips: dict[str, RoundTrips | None] = field(default_factory=dict)
+    trips: dict[str, TimesyncClock | None] = field(default_factory=dict)
     _clock: ClockSync = field(default_factory=lambda: ClockSync(10_000_000_000, 0, 20_000_000))
 
     def add(self, sample: PositionSample, attitude: Quaternion | None) -> None:
@@ -164,7 +164,7 @@ class Heard:
                 self._add_own(message, at_ns, offset_ns)
             case Attitude(angles_rad=angles) if len(self.angles_rad) < MOST:
                 self.angles_rad.append((at_ns, angles))
-            case Landed(landed=landed):
+            case LandedState(landed=landed):
                 self.landed = landed
             case Battery(voltage_v=float(voltage_v)):
                 self.battery_v = voltage_v
@@ -179,8 +179,8 @@ class Heard:
     def _add_own(self, message: Position, at_ns: int, offset_ns: int | None) -> None:
         if message.stamp_us is None or len(self.own) >= MOST or max(map(abs, message.position_m)) > _FAR_M:
             return
-        stamp_ns = self._clock.unwrap(message.stamp_us // 1000, BOOT_MS_WRAP, 1_000_000)
-        captured = self._clock.captured_ns(stamp_ns, at_ns, offset_ns)
+        stamp_ns = self._clock.unwrap_ns(message.stamp_us // 1000, BOOT_MS_WRAP, 1_000_000)
+        captured = self._clock.estimate_capture_ns(stamp_ns, at_ns, offset_ns)
         if not isinstance(captured, str) and (not self.own or captured > self.own[-1][0]):
             self.own.append((captured, message.position_m))
 

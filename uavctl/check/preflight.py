@@ -18,7 +18,7 @@ from uavctl.check.findings import AIDED, HORIZONTAL, Heard, Item, ItemState, ite
 from uavctl.check.positions import CAMERA_AXES, extent_m, from_cameras, position_items, spread_m
 from uavctl.check.vehicle import clock_items, is_armed, parameter_items, vehicle_items, wanted
 from uavctl.config.types import Config
-from uavctl.frames import Quaternion, from_euler, multiply, to_euler
+from uavctl.frames import Quaternion, euler_from_quaternion, multiply_quaternions, quaternion_from_euler
 from uavctl.mavlink.connection import MavlinkConnection
 from uavctl.mavlink.messages import Message
 from uavctl.mavlink.relay import Relay
@@ -264,7 +264,7 @@ def _heading(seen: Heard, config: Config) -> tuple[Item, bool]:
         if _told(seen):
             told, hint = "the vehicle tells none", "let the vehicle stream ATTITUDE on this link"
         return item(name, ItemState.UNDETERMINED, told, want, hint), False
-    yaws = [to_euler(q)[2] for q in turns]
+    yaws = [euler_from_quaternion(q)[2] for q in turns]
     # Mean of directions: angles near 180 deg must not average to 0.
     yaw = math.degrees(math.atan2(sum(map(math.sin, yaws)), sum(map(math.cos, yaws))))
     tilt = float(np.median([math.degrees(math.acos(min(max(1 - 2 * (x * x + y * y), -1), 1))) for _, x, y, _ in turns]))
@@ -292,10 +292,10 @@ def _relative(seen: Heard) -> list[Quaternion]:
     times = [at_ns for at_ns, _ in seen.angles_rad]
     found = []
     for sample in seen.samples:
-        own = from_euler(seen.angles_rad[min(bisect_left(times, sample.captured_ns), len(times) - 1)][1])
+        own = quaternion_from_euler(seen.angles_rad[min(bisect_left(times, sample.captured_ns), len(times) - 1)][1])
         if sample.attitude is not None and own is not None:
             w, x, y, z = own
-            found.append(multiply(sample.attitude, (w, -x, -y, -z)))
+            found.append(multiply_quaternions(sample.attitude, (w, -x, -y, -z)))
     return found
 
 
@@ -441,15 +441,15 @@ class Preflight:
         understood = self._links[link].receive(data, at_ns)
         for one in understood.items:
             if isinstance(one, PositionSample):
-                from_source = understood.settled
+                from_source = understood.is_source_settled
                 self._seen.add(one, understood.attitude)
-                self._relay.take(one, understood.attitude)
+                self._relay.add_sample(one, understood.attitude)
                 if self.guide is not None and self._is_safe:
                     angles_rad = self._seen.angles_rad
                     self.guide.take(at_ns, one.position_m, angles_rad[-1][1][2] if angles_rad else None)
             elif isinstance(one, VehicleStatus):
                 from_vehicle = True
-        answers = tuple(Outgoing(link=link, data=answer) for answer in understood.answers)
+        answers = tuple(Outgoing(link=link, data=answer) for answer in understood.replies)
         return Received(answers, from_vehicle, from_source)
 
     def tick(self, tick: int, at_ns: int, send: Send) -> None:
@@ -459,10 +459,10 @@ class Preflight:
             for data in link.due(at_ns):
                 send(Outgoing(link=name, data=data))
         vehicle = self._links[VEHICLE]
-        for data in vehicle.relay(self._relay, at_ns, refused=()):
+        for data in vehicle.encode_relayed_poses(self._relay, at_ns, refused=()):
             send(Outgoing(link=VEHICLE, data=data))
         if vehicle.vehicle is not None:
-            for data in vehicle.place_on_globe(at_ns, self._config.hand_over.origin_deg_m):
+            for data in vehicle.setup_global_origin(at_ns, self._config.hand_over.origin_deg_m):
                 send(Outgoing(link=VEHICLE, data=data))
         due = self._asked_ns is None or at_ns - self._asked_ns >= ASK_NS
         if vehicle.vehicle is not None and due and self._rounds < ROUNDS:
@@ -476,19 +476,19 @@ class Preflight:
         kind = self._seen.autopilot
         if self._rounds <= 2:  # a lost request is repeated once; a vehicle that ignores it is not pestered
             for message_id, rate_hz in _STREAMS_HZ.get(kind or 0, {}).items():
-                yield vehicle.request_stream(message_id, rate_hz)
+                yield vehicle.encode_stream_request(message_id, rate_hz)
         for name in wanted(kind):
             if name not in self._seen.parameters:
-                yield vehicle.request_parameter(name)
+                yield vehicle.encode_parameter_request(name)
 
     def items(self, at_ns: int) -> tuple[Item, ...]:
         """Return the items of the check as known by `at_ns`."""
         seen, config = self._seen, self._config
         seen.stats = {name: link.stats(at_ns) for name, link in self._links.items()}
         vehicle = self._links[VEHICLE].vehicle
-        sources = [trips for link in self._links.values() if (trips := link.trips()) is not None]
+        sources = [trips for link in self._links.values() if (trips := link.timesync_clock()) is not None]
         seen.trips = {
-            "vehicle": None if vehicle is None else self._links[VEHICLE].trips(vehicle),
+            "vehicle": None if vehicle is None else self._links[VEHICLE].timesync_clock(vehicle),
             "source": sources[0] if sources else None,
         }
         found = [*vehicle_items(seen, config, at_ns, self._take_off_m), *position_items(seen, config, at_ns)]
@@ -496,7 +496,7 @@ class Preflight:
         return (*found, *self._relayed(), *self._moves(), *parameter_items(seen, config, self._take_off_m))
 
     def _relayed(self) -> list[Item]:
-        if not self._relay.enabled:
+        if not self._relay.is_enabled:
             return []
         kept = ", ".join(f"{count} {reason}" for reason, count in self._relay.kept.items() if count)
         value = f"{self._relay.sent} positions passed on" + (f", kept: {kept}" if kept else "")
@@ -533,5 +533,5 @@ class Preflight:
 
     def _hear(self, message: Message, at_ns: int) -> None:
         link = self._links[VEHICLE]
-        trips = None if link.vehicle is None else link.trips(link.vehicle)
+        trips = None if link.vehicle is None else link.timesync_clock(link.vehicle)
         self._seen.take(message, at_ns, link.vehicle, None if trips is None else trips.offset_ns(at_ns))

@@ -18,7 +18,7 @@ from uavctl.check.findings import Heard, Item, ItemState, item, judged
 from uavctl.config.checks import position_limits_m
 from uavctl.config.types import Config
 from uavctl.flight.monitors.observation import MOTION_NS
-from uavctl.mavlink.clocksync import NEAR_NS, RoundTrips
+from uavctl.mavlink.clocksync import ROUND_TRIP_MARGIN_NS, TimesyncClock
 from uavctl.mavlink.vehicle import SECOND_VEHICLE
 from uavctl.smpc.plant import AXES
 
@@ -27,7 +27,7 @@ from uavctl.smpc.plant import AXES
 
 _DRIFT_PPM = 500.0  # crystals keep 100; what is above is a simulator, or a broken clock
 _REJECTED = 0.5  # part of the answers
-_WANT = f"TIMESYNC answered within {NEAR_NS * 1e-6:.0f} ms"
+_WANT = f"TIMESYNC answered within {ROUND_TRIP_MARGIN_NS * 1e-6:.0f} ms"
 
 
 def clock_items(seen: Heard, config: Config) -> list[Item]:
@@ -47,7 +47,7 @@ def _of_vehicle(config: Config) -> tuple[ItemState, str]:
     return ItemState.NOTE, "does the link carry our messages to the vehicle? Setpoints go the same way"
 
 
-def _clock(name: str, trips: RoundTrips | None, unanswered: tuple[ItemState, str]) -> Item:
+def _clock(name: str, trips: TimesyncClock | None, unanswered: tuple[ItemState, str]) -> Item:
     if trips is None or not trips.round_trips_ns:
         return item(name, unanswered[0], "TIMESYNC is not answered", _WANT, unanswered[1])
     ordered = sorted(trips.round_trips_ns)
@@ -55,7 +55,7 @@ def _clock(name: str, trips: RoundTrips | None, unanswered: tuple[ItemState, str
     drift = trips.drift_ppm
     value = f"round trip median {middle_ms:.2g} ms, 95 % within {p95_ms:.2g} ms, {trips.rejected} rejected"
     value += "" if drift is None else f", drift {drift:+.0f} ppm"
-    if trips.rejected > _REJECTED * len(ordered) or middle_ms > NEAR_NS * 1e-6:
+    if trips.rejected > _REJECTED * len(ordered) or middle_ms > ROUND_TRIP_MARGIN_NS * 1e-6:
         hint = "a slow or busy link: offsets and ages are uncertain by half of the round trip"
         return item(name, ItemState.NOTE, value, f"{_WANT}, and few answers rejected", hint)
     if drift is not None and abs(drift) > _DRIFT_PPM:

@@ -29,7 +29,7 @@ from uavctl.config import Config
 from uavctl.config.connections import CheckConfig, warnings
 from uavctl.errors import ConnectionSpecError, KeyFileError, NotReadyError
 from uavctl.io.base import Connection
-from uavctl.io.signed_connection import connected
+from uavctl.io.signed_connection import open_links
 from uavctl.io.transport import wait
 from uavctl.loop import make_links
 from uavctl.records import Checked, Datagram, Sink
@@ -95,9 +95,9 @@ def _receive(flight: Preflight, name: str, connection: Connection, told: Paramet
             told.take(Datagram(at_ns=received_ns, link=name, outgoing=False, data=data))
         received = flight.receive(name, data, received_ns)
         if received.from_vehicle:  # cameras or a ground station may share the port
-            connection.answer(index)
+            connection.select_peer(index)
         elif received.from_source:
-            connection.trust(index)
+            connection.trust_sender(index)
         for answer in received.answers:
             connection.send(answer.data)
 
@@ -202,7 +202,7 @@ def check(
         messages().print(text or "good; let it rest for a moment", style="bold")
 
     try:
-        with connected(config) as connections, stop_on_signals() as stopped:
+        with open_links(config) as connections, stop_on_signals() as stopped:
             seconds_s = config.check.seconds
             items += run_preflight(config, connections, seconds_s, move=move, prompt=prompt, stop=stopped)
     except (ConnectionSpecError, KeyFileError) as error:

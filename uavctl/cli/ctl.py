@@ -14,7 +14,7 @@ from rich.table import Table
 
 from uavctl.cli.common import Common, QuietJson, messages, two_columns
 from uavctl.cli.usage import example
-from uavctl.daemon.control_socket import SUFFIX, ControlRequest, Reply, control_folder
+from uavctl.daemon.control_socket import SUFFIX, ControlRequest, Reply, find_control_folder
 from uavctl.daemon.health import Health, RecorderHealth, RelayHealth
 from uavctl.errors import NotReachedError, UsageError
 from uavctl.records import Vec3
@@ -79,7 +79,7 @@ for _name, _help in _ORDERS.items():
 @ctl_app.command(help_epilogue=example("ctl status"))
 def status(*, which: Which = ANY) -> int:
     """Say how the flight is doing. Exit code 1: no daemon answers."""
-    reply = ask(ControlRequest(ask="status"), control_folder(which.control), which.vehicle)
+    reply = ask(ControlRequest(ask="status"), find_control_folder(which.control), which.vehicle)
     if reply.status is None:
         raise NotReachedError(f"the daemon gave no status: {reply.text}; is it of this version?")
     found = reply.status
@@ -96,13 +96,13 @@ def _place(text: str) -> Vec3:
             raise UsageError(f'Unknown option: "{unknown[0]}"; see uavctl ctl goto --help') from None
         raise UsageError(f"goto {text}: write three numbers, north,east,down [m], as in 2,1,-2") from None
     request = ControlRequest(ask="goto", position_m=(north, east, down))
-    if request.problem() is not None:
-        raise UsageError(f"goto {text}: {request.problem()}")
+    if request.find_problem() is not None:
+        raise UsageError(f"goto {text}: {request.find_problem()}")
     return north, east, down
 
 
 def _order(request: ControlRequest, which: Which) -> int:
-    reply = ask(request, control_folder(which.control), which.vehicle)
+    reply = ask(request, find_control_folder(which.control), which.vehicle)
     if which.json:
         Common(json=True).show("ctl/order", {"ok": reply.ok, "text": reply.text}, str)
     else:

@@ -35,7 +35,7 @@ from uavctl.config import Config, load
 from uavctl.config.checks import position_limits_m
 from uavctl.config.document import ConfigProblem, Section
 from uavctl.config.load import read_document
-from uavctl.daemon.control_socket import ControlRequest, control_folder, daemon_name
+from uavctl.daemon.control_socket import ControlRequest, find_control_folder, make_daemon_name
 from uavctl.daemon.health import Health
 from uavctl.errors import ConfigError, NotReachedError
 from uavctl.flight.limits import AXES
@@ -81,7 +81,7 @@ class Member:
     @property
     def daemon(self) -> str:
         """Name of its daemon."""
-        return daemon_name(self.config)
+        return make_daemon_name(self.config)
 
     def limits_m(self, axis: str) -> tuple[float, float]:
         """Limits of its position along an axis; infinite where there are none."""
@@ -229,7 +229,7 @@ def status(
     file: File, /, *, control: Annotated[Path | None, Parameter(show=False)] = None, json: QuietJson = False
 ) -> int:
     """Say how all vehicles of a file are doing, in one table. Exit code 1: not all daemons answer."""
-    fleet, folder = read_fleet(file), control_folder(control)
+    fleet, folder = read_fleet(file), find_control_folder(control)
     found = {one.name: _health(one, folder) for one in fleet.members}
     Common(json=json).show("fleet/status", {"vehicles": found}, lambda: _table(found))
     return 0 if all(found.values()) else 1
@@ -238,7 +238,7 @@ def status(
 @fleet_app.command(help_epilogue=example("fleet land"))
 def land(file: File, /, *, control: Annotated[Path | None, Parameter(show=False)] = None) -> int:
     """Land all vehicles of a file. Exit code 1: not all of them take the order."""
-    fleet, folder, good = read_fleet(file), control_folder(control), True
+    fleet, folder, good = read_fleet(file), find_control_folder(control), True
     for one in fleet.members:
         try:
             reply = ask(ControlRequest(ask="land"), folder, one.daemon)
@@ -344,7 +344,7 @@ def _astray(flights: Sequence[FleetFlight], looks: Looks) -> str:
 @contextmanager
 def _shown(flights: Sequence[FleetFlight]) -> Iterator[Looks]:
     """Look at all vehicles while they fly, and show them, from a thread of its own; yields the newest look."""
-    done, console, folder, looks = threading.Event(), messages(), control_folder(None), Looks()
+    done, console, folder, looks = threading.Event(), messages(), find_control_folder(None), Looks()
 
     def look() -> Table:
         for one in flights:

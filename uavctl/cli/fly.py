@@ -39,16 +39,18 @@ from uavctl.cli.flying import (
     tell_ending,
     wait_for_server,
 )
-from uavctl.clock import Ticker, monotonic_ns, zero_utc_ns
+from uavctl.clock import Ticker, monotonic_ns, read_zero_utc_ns
 from uavctl.config import Config, LoadedConfig
 from uavctl.config.connections import warnings
-from uavctl.daemon.control_socket import ControlServer, control_folder, daemon_name, listening
-from uavctl.daemon.daemon import AfterTick, collected_between_ticks, realtime
+from uavctl.daemon.control_socket import ControlServer, find_control_folder, make_daemon_name, open_listener
+from uavctl.daemon.daemon import AfterTick
 from uavctl.daemon.daemon import fly as run_daemon
-from uavctl.daemon.engagement import Engagement, TickFollower, check_places, stop_limit_s
-from uavctl.daemon.health import HealthWatch, Notifier, RecorderHealth
-from uavctl.daemon.lock import sole_daemon
-from uavctl.io.signed_connection import connected
+from uavctl.daemon.engagement import Engagement, TickFollower, check_places, compute_stop_limit_s
+from uavctl.daemon.health import HealthMonitor, RecorderHealth
+from uavctl.daemon.lock import lock_vehicle
+from uavctl.daemon.notifier import Notifier
+from uavctl.daemon.realtime import control_garbage_collection, enable_realtime
+from uavctl.io.signed_connection import open_links
 from uavctl.loop import ControlLoop
 
 # What stands beside the control loop of `uavctl fly`: orders, health lines, the service manager, real time.
@@ -70,20 +72,20 @@ def operation(
     with _health_lines() as show:
 
         def tell(line: str) -> None:
-            notifier.status(line)
+            notifier.send_status(line)
             show(line)
 
         def recorder() -> RecorderHealth:
             return recorder_health(status(), path)
 
-        identity = (daemon_name(config), config.daemon.vehicle, os.getpid())
-        watch = HealthWatch(loop, config, identity, recorder, tell)
-        server = ControlServer(listener, config, loop, watch.look)
+        identity = (make_daemon_name(config), config.daemon.vehicle, os.getpid())
+        watch = HealthMonitor(loop, config, identity, recorder, tell)
+        server = ControlServer(listener, config, loop, watch.make_health)
         try:
             # The sign of life comes last: it stands for all that a tick has to do.
             yield watch.after_tick, server.after_tick, notifier.after_tick
         finally:
-            notifier.status(f"ended: {loop.ending.sentence}")
+            notifier.send_status(f"ended: {loop.ending.sentence}")
             server.close()
             notifier.close()
 
@@ -92,10 +94,12 @@ def operation(
 def as_realtime(wanted: bool) -> Iterator[Sequence[AfterTick]]:
     """Set real-time scheduling and memory if wanted; return the function to call after each tick."""
     with ExitStack() as stack:
-        for outcome in stack.enter_context(realtime()) if wanted else ():
-            told = Text(f"--realtime: {outcome.part}: {outcome.text}")
-            messages().print(told if outcome.ok else labelled("warning", told.plain, "bold yellow"), soft_wrap=True)
-        yield (stack.enter_context(collected_between_ticks()).after_tick,)
+        for outcome in stack.enter_context(enable_realtime()) if wanted else ():
+            told = Text(f"--realtime: {outcome.name}: {outcome.text}")
+            messages().print(
+                told if outcome.is_applied else labelled("warning", told.plain, "bold yellow"), soft_wrap=True
+            )
+        yield (stack.enter_context(control_garbage_collection()).after_tick,)
 
 
 @contextmanager
@@ -224,8 +228,8 @@ def fly_daemon(
     tick_ns, dt_ns = round(config.daemon.tick_s * 1e9), round(config.plant.dt_s * 1e9)
     # First of all, so that a second daemon is refused at once.
     with (
-        sole_daemon(config.daemon.vehicle) as tenure,
-        listening(control_folder(control), daemon_name(config)) as listener,
+        lock_vehicle(config.daemon.vehicle) as tenure,
+        open_listener(find_control_folder(control), make_daemon_name(config)) as listener,
         onlookers(view_port) as looking,
         new_recording(out, config.name, config.log.free_bytes) as path,
     ):
@@ -241,7 +245,7 @@ def fly_daemon(
         with (
             as_realtime(as_realtime_process) as collect,
             stop_on_signals() as stopped,
-            connected(config, wait_for_server(stopped)) as connections,
+            open_links(config, wait_for_server(stopped)) as connections,
         ):
             checked: tuple[Item, ...] = ()
             told = ParameterReader()
@@ -252,13 +256,13 @@ def fly_daemon(
             engagement.begin(loop)
             asked_for = False
             try:
-                put_header(recorder, prepared, monotonic_ns(), zero_utc_ns())
+                put_header(recorder, prepared, monotonic_ns(), read_zero_utc_ns())
                 record_items(recorder, checked, monotonic_ns())
                 record_parameters(recorder, told, monotonic_ns())
                 for warning in warnings(config.security, config.daemon):
                     messages().print(labelled("warning", warning), soft_wrap=True)
-                if tenure.left_ns is not None:
-                    stand_by(loop, tenure.left_ns)
+                if tenure.left_flight_ns is not None:
+                    stand_by(loop, tenure.left_flight_ns)
                 messages().print(f"recording to {path}; Ctrl-C hands over", soft_wrap=True)
                 with (
                     live_line(loop, recorder, duration_s, config.daemon.tick_s) as shown,
@@ -271,19 +275,19 @@ def fly_daemon(
                         Ticker(tick_ns, dt_ns),
                         stopped,
                         duration_s=duration_s,
-                        stop_limit_s=stop_limit_s(config, takes_off=engagement.takes_off),
+                        stop_limit_s=compute_stop_limit_s(config, takes_off=engagement.takes_off),
                         after_tick=(
                             shown.after_tick,
-                            lambda *_: tenure.note(loop.leaves_vehicle),
+                            lambda *_: tenure.update(loop.leaves_vehicle),
                             lambda *_: recorder.catch_up(),
                             lambda ticked, _: engagement.follow(loop, ticked),
                             *beside,
                             *collect,
                         ),
-                        on_news=shown.news.extend,
+                        on_events=shown.news.extend,
                     )
                 if asked_for:
-                    tenure.note(False)
+                    tenure.update(False)
             finally:
                 ending = loop.ending
                 recorder.put(ENDED, monotonic_ns(), ending)

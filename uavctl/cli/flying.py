@@ -28,7 +28,7 @@ from logs.recording.recorder import DerivedTopics, RecorderStatus, live_view
 from logs.recording.summary import FlightSummary, summarise
 from logs.recording.views import Views
 from uavctl.cli.common import FREE_PORT, labelled, messages
-from uavctl.daemon.engagement import goto_keys
+from uavctl.daemon.engagement import make_goto_keys
 from uavctl.errors import ConnectionClosedError, EndedBySignal, RecordingError, UavctlError, UsageError, in_words
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.handover_states import HandoverState
@@ -46,7 +46,7 @@ def goto_overrides(goto: str | None) -> tuple[str, ...]:
     if goto is None:
         return ()
     try:
-        keys = goto_keys([float(number) for number in goto.split(",")])
+        keys = make_goto_keys([float(number) for number in goto.split(",")])
     except (ValueError, UsageError) as error:
         raise UsageError(
             f"--goto {goto}: give north, east and down in local NED [m], as in --goto 2,1,-2 (up is < 0)"
@@ -364,7 +364,7 @@ def live_line(
 
         def tell() -> None:
             while feed.news:
-                line = said.line(feed.news.popleft(), loop.who_flies)
+                line = said.line(feed.news.popleft(), loop.handover_state)
                 if line is not None:
                     console.print(Text(line, style="yellow"), soft_wrap=True)
 
@@ -377,7 +377,7 @@ def live_line(
                     told.set()
                     console.print(labelled("letting go", loop.let_go, "bold red"), soft_wrap=True)
                 if ticked is not None:
-                    line = _line(ticked, loop.who_flies) + _alarm(recorder.status())
+                    line = _line(ticked, loop.handover_state) + _alarm(recorder.status())
                     progress.update(task, completed=ticked.decision.tick * tick_s, line=line)
 
         thread = threading.Thread(target=show, name="live", daemon=True)

@@ -10,7 +10,7 @@ from rich.table import Table
 
 from uavctl.cli.common import Common, Json
 from uavctl.cli.usage import example
-from uavctl.io.signed_connection import new_key, read_key
+from uavctl.io.key_file import new_key, read_key
 
 key_app = App(name="key", help="Make and look at keys of MAVLink 2 signing.", help_epilogue=example("key"))
 

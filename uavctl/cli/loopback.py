@@ -37,12 +37,13 @@ from uavctl.cli.flying import (
     tell_ending,
 )
 from uavctl.cli.sim import make_door
-from uavctl.clock import Ticker, monotonic_ns, zero_utc_ns
+from uavctl.clock import Ticker, monotonic_ns, read_zero_utc_ns
 from uavctl.config import Config, LoadedConfig
-from uavctl.daemon.daemon import collected_between_ticks, fly
-from uavctl.daemon.engagement import Engagement, TickFollower, check_places, stop_limit_s
+from uavctl.daemon.daemon import fly
+from uavctl.daemon.engagement import Engagement, TickFollower, check_places, compute_stop_limit_s
+from uavctl.daemon.realtime import control_garbage_collection
 from uavctl.errors import UavctlError, UsageError
-from uavctl.io.signed_connection import connected
+from uavctl.io.signed_connection import open_links
 from uavctl.lab.lockstep import TRUTH, LockstepFlight, check_length
 from uavctl.loop import ControlLoop
 from uavctl.records import Sink, Truth
@@ -142,7 +143,7 @@ def lockstep(prepared: Prepared, path: Path, engagement: Engagement) -> FlightSu
                 progress.update(task, completed=flown_s)
                 return not stopped()
 
-            landing_s = stop_limit_s(config, takes_off=True) if engagement.takes_off else None
+            landing_s = compute_stop_limit_s(config, takes_off=True) if engagement.takes_off else None
             flight.fly(show, follower=engagement, landing_s=landing_s)
     finally:
         status = flight.close()
@@ -155,18 +156,18 @@ def _real_time(prepared: Prepared, path: Path, engagement: Engagement, looking: 
     tick_ns, dt_ns = round(config.daemon.tick_s * 1e9), round(config.plant.dt_s * 1e9)
     with ExitStack() as stack:
         stopped = stack.enter_context(stop_on_signals())
-        connections = stack.enter_context(connected(config))
+        connections = stack.enter_context(open_links(config))
         recorder = Recorder(path, config.log, onlookers=looking)
         loop = ControlLoop(config, prepared.controller, recorder, time.perf_counter_ns)
         engagement.begin(loop)
         loop.course.in_flight = not takes_off
         wall_s = 0.0
         try:
-            put_header(recorder, prepared, monotonic_ns(), zero_utc_ns())
+            put_header(recorder, prepared, monotonic_ns(), read_zero_utc_ns())
             simulator = stack.enter_context(ExitStack())
             simulator.enter_context(_simulator(config, recorder, airborne=not takes_off))
             shown = simulator.enter_context(live_line(loop, recorder, config.duration_s, config.daemon.tick_s))
-            collector = simulator.enter_context(collected_between_ticks())
+            collector = simulator.enter_context(control_garbage_collection())
             begun = time.perf_counter()
             with ending_noted(loop):
                 fly(
@@ -175,14 +176,14 @@ def _real_time(prepared: Prepared, path: Path, engagement: Engagement, looking: 
                     Ticker(tick_ns, dt_ns),
                     stopped,
                     duration_s=config.duration_s,
-                    stop_limit_s=stop_limit_s(config, takes_off=True) if takes_off else 0.0,
+                    stop_limit_s=compute_stop_limit_s(config, takes_off=True) if takes_off else 0.0,
                     after_tick=(
                         shown.after_tick,
                         lambda *_: recorder.catch_up(),
                         lambda ticked, _: engagement.follow(loop, ticked),
                         collector.after_tick,
                     ),
-                    on_news=shown.news.extend,
+                    on_events=shown.news.extend,
                 )
             wall_s = time.perf_counter() - begun
             simulator.close()  # its last words go into the recording

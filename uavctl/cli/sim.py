@@ -29,10 +29,10 @@ from uavctl.config import Config
 from uavctl.config.checks import position_limits_m
 from uavctl.config.connections import MOCAP_LINK, SecurityConfig
 from uavctl.config.load import with_faults
-from uavctl.io.signed_connection import read_key
+from uavctl.io.key_file import read_key
 from uavctl.mavlink.connection import MOCAP
-from uavctl.mavlink.framing import scan
-from uavctl.mavlink.signing import Gate, Signing, SigningKey, Stamps
+from uavctl.mavlink.framing import scan_frames
+from uavctl.mavlink.signing import FrameAuthenticator, FrameSigner, SigningKey, SigningTimestamps
 from uavctl.records import Truth, Vec3
 from uavctl.smpc.plant import AXES
 
@@ -48,7 +48,7 @@ LINK_ID = 100  # of the simulated vehicle; its cameras' is one more
 class SignedPort:
     """Port whose frames are signed both ways; implements `sim.server.Port`."""
 
-    def __init__(self, inner: Port, gate: Gate) -> None:
+    def __init__(self, inner: Port, gate: FrameAuthenticator) -> None:
         self._inner, self._gate = inner, gate
 
     @property
@@ -63,15 +63,15 @@ class SignedPort:
     def read(self) -> list[bytes]:
         """See `Port`; bytes without a verified frame are dropped."""
         at_ns = monotonic_ns()
-        admitted = (self._gate.admit(data, at_ns) for data in self._inner.read())
+        admitted = (self._gate.verify_frames(data, at_ns) for data in self._inner.read())
         return [data for data in admitted if data]
 
     def write(self, data: bytes) -> None:
         """See `Port`; what the channel has damaged goes out damaged."""
-        found = scan(data, final=True)
+        found = scan_frames(data, final=True)
         if found.frames and not found.bad:
             at_ns = monotonic_ns()
-            data = b"".join(self._gate.seal(frame.data, at_ns) for frame in found.frames)
+            data = b"".join(self._gate.sign_frame(frame.data, at_ns) for frame in found.frames)
         self._inner.write(data)
 
     def close(self) -> None:
@@ -96,8 +96,8 @@ def _behind_door(security: SecurityConfig, name: str, port: Port) -> Port:
         return port
     key: SigningKey = read_key(Path(security.key_file).expanduser())
     link_id = LINK_ID + (MOCAP_LINK if name == MOCAP else 0)
-    signing = Signing(key, link_id, Stamps(), time.time_ns() - monotonic_ns())
-    return SignedPort(port, Gate(signing, stream=False))
+    signing = FrameSigner(key, link_id, SigningTimestamps(), time.time_ns() - monotonic_ns())
+    return SignedPort(port, FrameAuthenticator(signing, stream=False))
 
 
 # `uavctl sim --view`: what the simulated vehicles do, while they do it.

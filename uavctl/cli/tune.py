@@ -43,10 +43,10 @@ from uavctl.cli.loopback import fly_simulated
 from uavctl.clock import Ticker, monotonic_ns
 from uavctl.config import Config, LoadedConfig
 from uavctl.config.load import dump_config, parse, parse_recorded, parse_toml
-from uavctl.daemon.lock import sole_daemon
+from uavctl.daemon.lock import lock_vehicle
 from uavctl.errors import NotReachedError, RecordingError, UsageError
 from uavctl.io.base import Connection
-from uavctl.io.signed_connection import connected
+from uavctl.io.signed_connection import open_links
 from uavctl.io.transport import wait
 from uavctl.lab.identify.history import from_records
 from uavctl.lab.identify.page import write_page as write_fit_page
@@ -203,7 +203,7 @@ def where_it_stands(config: Config) -> Vec3:
     """
     samples: list[PositionSample] = []
     # The lock comes first: nothing is said to a vehicle that another daemon flies.
-    with sole_daemon(config.daemon.vehicle), connected(config) as connections:
+    with lock_vehicle(config.daemon.vehicle), open_links(config) as connections:
         links = make_links(config)
         ticker = Ticker(round(config.daemon.tick_s * 1e9), round(config.plant.dt_s * 1e9), monotonic_ns)
         due = ticker.next()
@@ -233,9 +233,9 @@ def _heard(link: MavlinkConnection, connection: Connection) -> Iterator[Position
     for index, (data, at_ns) in enumerate(connection.receive()):
         found, answers, settled, *_ = link.receive(data, at_ns)
         if any(isinstance(one, VehicleStatus) for one in found):
-            connection.answer(index)
+            connection.select_peer(index)
         elif settled and any(isinstance(one, PositionSample) for one in found):
-            connection.trust(index)
+            connection.trust_sender(index)
         for answer in answers:
             connection.send(answer)
         yield from (one for one in found if isinstance(one, PositionSample))

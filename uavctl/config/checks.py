@@ -32,7 +32,7 @@ from uavctl.config.types import (
     SolverConfig,
     TargetConfig,
 )
-from uavctl.frames import up_hint
+from uavctl.frames import suggest_height_sign
 
 # Checks of a mission and its fences: lengths, times, and whether the places are inside the limits.
 
@@ -65,7 +65,7 @@ def outside(plant: PlantConfig, sets: SetsConfig, place: Position, key: str, wha
             yield ConfigProblem(
                 f"{key}[{_AXES.index(axis)}]",
                 f"{axis} {value:g} m is outside the admissible box [{low:g}, {high:g}]",
-                up_hint(axis, value, low, high)
+                suggest_height_sign(axis, value, low, high)
                 or f"move the {what} inside, or widen sets.state_lower and sets.state_upper",
             )
 

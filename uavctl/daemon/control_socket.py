@@ -1,7 +1,8 @@
-"""The operator's orders while flying: a Unix socket that the daemon looks at after each tick and never waits for.
+"""Orders of the operator in flight: a Unix socket that the daemon reads after each tick without waiting.
 
-An order is answered with what the tick after it decided. Who may ask is decided by the file permissions (folder 0700,
-socket 0600) and again by the kernel's word on who is at the other end.
+Each direction carries one JSON object a line: a `ControlRequest`, then its `Reply`. The reply to an order tells what
+the next tick decided. File permissions protect the socket (folder 0700, socket 0600). The kernel also tells the user
+at the other end.
 """
 
 from __future__ import annotations
@@ -23,14 +24,9 @@ import msgspec
 from uavctl.config import Config
 from uavctl.config.checks import outside
 from uavctl.daemon.health import Health
-from uavctl.daemon.lock import runtime_folders
+from uavctl.daemon.runtime_folder import find_runtime_folders
 from uavctl.errors import UsageError, VehicleTakenError
 from uavctl.records import ORDER_ACCEPTED, Command, Event, Order, Ticked, Vec3
-
-# Messages on a daemon's control socket, and the path of the socket.
-#
-# One JSON object a line in each direction: a `ControlRequest`, then its `Reply`.
-
 
 FOLDER_VARIABLE = "UAVCTL_CONTROL"
 SUFFIX = ".sock"
@@ -40,13 +36,13 @@ _LONGEST_PATH = 107  # bytes that the kernel takes for the path of a socket
 
 
 class ControlRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
-    """A question or an order."""
+    """Status request or order."""
 
     ask: Literal["goto", "hold", "resume", "land", "engage", "status"]
     position_m: Vec3 | None = None  # local NED; with goto only
 
-    def problem(self) -> str | None:
-        """Error in the request by itself; None if there is none."""
+    def find_problem(self) -> str | None:
+        """Return the error in the request itself; None without one."""
         if (self.ask == "goto") != (self.position_m is not None):
             return "goto needs a position_m" if self.position_m is None else f"{self.ask} takes no position_m"
         if self.position_m is not None and not all(map(math.isfinite, self.position_m)):
@@ -55,21 +51,21 @@ class ControlRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
 
 
 class Reply(msgspec.Struct, frozen=True, kw_only=True):
-    """Reply to a request: what was decided on an order, or the flight as it is."""
+    """Reply to a request: the decision on an order, or the state of the flight."""
 
     ok: bool
     text: str
     status: Health | None = None
 
 
-def daemon_name(config: Config) -> str:
-    """Name of the daemon that flies a configuration: that of the configuration, and the vehicle's URL."""
+def make_daemon_name(config: Config) -> str:
+    """Make the name of a daemon from the names of its configuration and the vehicle's URL."""
     url = config.daemon.vehicle.replace("://", "-")
     return re.sub(r"[^A-Za-z0-9.]+", "-", f"{config.name}-{url}").strip("-.")[:_LONGEST_NAME]
 
 
-def control_folder(chosen: Path | None, environ: Mapping[str, str] = os.environ) -> Path:
-    """Folder of the sockets: as chosen, else $UAVCTL_CONTROL, else the user's own runtime folder.
+def find_control_folder(chosen: Path | None, environ: Mapping[str, str] = os.environ) -> Path:
+    """Find the folder of the sockets: as chosen, else $UAVCTL_CONTROL, else the user's runtime folder.
 
     Raises:
         UsageError: the user has none.
@@ -78,10 +74,10 @@ def control_folder(chosen: Path | None, environ: Mapping[str, str] = os.environ)
         return chosen
     if environ.get(FOLDER_VARIABLE):
         return Path(environ[FOLDER_VARIABLE])
-    return runtime_folders(environ)[0]
+    return find_runtime_folders(environ)[0]
 
 
-def socket_path(folder: Path, name: str) -> Path:
+def make_socket_path(folder: Path, name: str) -> Path:
     """Return the path of the socket on which the daemon of this name listens.
 
     Raises:
@@ -101,14 +97,14 @@ _CREDENTIALS = struct.Struct("3i")  # pid, uid, gid
 _REQUEST = msgspec.json.Decoder(ControlRequest)
 
 
-class Orderly(Protocol):
+class OrderReceiver(Protocol):
     """Receiver of orders: the control loop."""
 
     def order(self, command: Command) -> bool:
         """Queue an order for the next tick; False if too many wait."""
         ...
 
-    def against(self, order: Order) -> str:
+    def explain_refusal(self, order: Order) -> str:
         """Return why an order would have no effect now; empty if it may be given."""
         ...
 
@@ -124,48 +120,55 @@ class ControlServer:
     """Serves one listening socket; its `after_tick` is for the daemon.
 
     Args:
-        config: for the limits that a place has to keep.
+        config: for the limits of a position.
     """
 
-    def __init__(self, listener: socket.socket, config: Config, flight: Orderly, look: Callable[[], Health]) -> None:
-        self._listener, self._config, self._flight, self._look = listener, config, flight, look
+    def __init__(
+        self, listener: socket.socket, config: Config, order_receiver: OrderReceiver, make_health: Callable[[], Health]
+    ) -> None:
+        self._listener, self._config, self._order_receiver, self._make_health = (
+            listener,
+            config,
+            order_receiver,
+            make_health,
+        )
         self._clients: list[_Client] = []
-        self._waiting: list[tuple[_Client, Command]] = []  # for the next tick's answers
+        self._pending: list[tuple[_Client, Command]] = []  # for the next tick's answers
 
     def after_tick(self, ticked: Ticked, lateness_ns: int) -> None:
-        """Answer the orders that the tick took, then take what has come; bounded work, no waiting."""
+        """Answer the orders of the tick, then read new requests; bounded work, no waiting."""
         del lateness_ns
-        self._answer(list(ticked.answers))
+        self._send_answers(list(ticked.answers))
         self._accept(ticked.decision.at_ns)
-        waiting = [client for client, _ in self._waiting]
-        for client in [one for one in self._clients if one not in waiting]:
-            self._serve(client, ticked.decision.at_ns)
+        waiting = [client for client, _ in self._pending]
+        for idle in [client for client in self._clients if client not in waiting]:
+            self._serve(idle, ticked.decision.at_ns)
 
     def close(self) -> None:
-        """End the service; clients that still wait are told so."""
-        for client, _ in self._waiting:
+        """End the service; clients that still wait get a refusal."""
+        for client, _ in self._pending:
             self._reply(client, Reply(ok=False, text="the flight ended before it decided on this"))
         for client in self._clients:
             client.socket.close()
         self._clients.clear()
-        self._waiting.clear()
+        self._pending.clear()
 
-    def _answer(self, answers: list[tuple[Command, Event]]) -> None:
-        waiting, self._waiting = self._waiting, []
+    def _send_answers(self, answers: list[tuple[Command, Event]]) -> None:
+        waiting, self._pending = self._pending, []
         for client, command in waiting:
-            found = next((one for one in answers if one[0] == command), None)
-            if found is None:
+            answer = next((pair for pair in answers if pair[0] == command), None)
+            if answer is None:
                 self._reply(client, Reply(ok=False, text="the flight gave no answer to this"))
             else:
-                answers.remove(found)
-                self._reply(client, Reply(ok=found[1].code == ORDER_ACCEPTED, text=found[1].text))
+                answers.remove(answer)
+                self._reply(client, Reply(ok=answer[1].code == ORDER_ACCEPTED, text=answer[1].text))
 
     def _accept(self, now_ns: int) -> None:
         while len(self._clients) < MAX_CLIENTS:
             try:
                 connection, _ = self._listener.accept()
             except OSError:
-                return  # nobody, or gone again
+                return  # no client, or it has gone
             connection.setblocking(False)
             _, uid, _ = _CREDENTIALS.unpack(
                 connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
@@ -176,7 +179,7 @@ class ControlServer:
                 connection.close()
 
     def _serve(self, client: _Client, now_ns: int) -> None:
-        """Read what a client has said and act on its first whole line."""
+        """Read from a client and handle its first complete line."""
         try:
             data = client.socket.recv(MAX_LINE)
         except BlockingIOError:
@@ -186,42 +189,47 @@ class ControlServer:
         if data:
             client.heard_ns = now_ns
             client.buffer += data
-        line, whole, rest = client.buffer.partition(b"\n")
-        if whole and len(line) <= MAX_LINE:
+        line, separator, rest = client.buffer.partition(b"\n")
+        if separator and len(line) <= MAX_LINE:
             client.buffer = rest
-            self._act(client, line)
+            self._handle_request(client, line)
         elif len(client.buffer) > MAX_LINE:
             self._reply(client, Reply(ok=False, text=f"a request has {MAX_LINE} bytes at most"))
             self._drop(client)
         elif data == b"" or now_ns - client.heard_ns > IDLE_NS:
             self._drop(client)
 
-    def _act(self, client: _Client, line: bytes) -> None:
+    def _handle_request(self, client: _Client, line: bytes) -> None:
         try:
             request = _REQUEST.decode(line)
         except msgspec.MsgspecError as error:  # of msgspec's own, a subclass of ValueError
             self._reply(client, Reply(ok=False, text=f"not understood: {error}"))
             return
         if request.ask == "status":
-            self._reply(client, Reply(ok=True, text="", status=self._look()))
+            self._reply(client, Reply(ok=True, text="", status=self._make_health()))
             return
-        problem = request.problem() or self._misplaced(request) or self._flight.against(Order(request.ask)) or None
+        problem = (
+            request.find_problem()
+            or self._check_position(request)
+            or self._order_receiver.explain_refusal(Order(request.ask))
+            or None
+        )
         if problem is not None:
             self._reply(client, Reply(ok=False, text=problem))
             return
         command = Command(order=Order(request.ask), position_m=request.position_m)
-        if self._flight.order(command):
-            self._waiting.append((client, command))
+        if self._order_receiver.order(command):
+            self._pending.append((client, command))
         else:
             self._reply(client, Reply(ok=False, text="too many orders at once; try again"))
 
-    def _misplaced(self, request: ControlRequest) -> str | None:
-        """Return in which coordinates a place is outside the limits; None if it is inside, or there is none."""
+    def _check_position(self, request: ControlRequest) -> str | None:
+        """Return the coordinates of a position outside the limits; None if it is inside, or there is none."""
         if request.position_m is None:
             return None
         config = self._config
-        found = outside(config.plant, config.sets, request.position_m, "position_m", "place")
-        return "; ".join(problem.reason for problem in found) or None
+        answer = outside(config.plant, config.sets, request.position_m, "position_m", "place")
+        return "; ".join(problem.reason for problem in answer) or None
 
     def _reply(self, client: _Client, reply: Reply) -> None:
         data = msgspec.json.encode(reply) + b"\n"
@@ -239,18 +247,18 @@ class ControlServer:
 
 
 @contextmanager
-def listening(folder: Path, name: str) -> Iterator[socket.socket]:
-    """The listening socket of a daemon, gone at the end.
+def open_listener(folder: Path, name: str) -> Iterator[socket.socket]:
+    """Open the listening socket of a daemon; remove it at the end.
 
     Args:
-        folder: where it is; made if there is none.
+        folder: its folder; made if missing.
 
     Raises:
         UsageError: the folder is not ours alone, or the path too long.
         VehicleTakenError: a daemon of this name is running.
     """
-    _own(folder)
-    path = socket_path(folder, name)
+    _prepare_folder(folder)
+    path = make_socket_path(folder, name)
     listener = _listen(path, name)
     try:
         yield listener
@@ -259,30 +267,30 @@ def listening(folder: Path, name: str) -> Iterator[socket.socket]:
         path.unlink(missing_ok=True)
 
 
-def _own(folder: Path) -> None:
-    """See to a folder that only this user can enter."""
+def _prepare_folder(folder: Path) -> None:
+    """Make a folder that only this user can enter, or check it."""
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        found = folder.lstat()
+        answer = folder.lstat()
     except OSError as error:
         raise UsageError(f"{folder}: {error.strerror}; choose another folder with --control") from error
-    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid():
+    if not stat.S_ISDIR(answer.st_mode) or answer.st_uid != os.geteuid():
         raise UsageError(f"{folder}: not a folder of this user; choose another one with --control")
-    if found.st_mode & 0o077:
+    if answer.st_mode & 0o077:
         raise UsageError(f"{folder}: others may enter it, and could give orders; run: chmod 700 {folder}")
 
 
 def _listen(path: Path, name: str) -> socket.socket:
-    """Bind and listen; a socket that a dead daemon left is taken over."""
+    """Bind and listen; replace the socket of a dead daemon."""
     if path.is_socket():
         try:
-            alive = _alive(path)
+            is_listening = _is_listening(path)
         except OSError as error:
             raise UsageError(
                 f"{path}: {error.strerror}: another user, root it may be, left it; if no daemon of theirs flies, "
                 f"run: sudo rm {path}"
             ) from error
-        if alive:
+        if is_listening:
             raise VehicleTakenError(
                 f"{path}: a daemon named {name} is running; end it, or give this one another --set 'name=\"...\"'"
             )
@@ -299,8 +307,8 @@ def _listen(path: Path, name: str) -> socket.socket:
     return listener
 
 
-def _alive(path: Path) -> bool:
-    """Whether somebody listens there.
+def _is_listening(path: Path) -> bool:
+    """Return whether a process listens on the socket.
 
     Raises:
         OSError: it is not ours.

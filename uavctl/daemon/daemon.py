@@ -1,141 +1,31 @@
-"""The flight daemon: wait, receive, step, send, record; nothing else. What its process is set to.
+"""Flight daemon: wait, receive, step, send, record.
 
-The loop stops sending when it dies: there is no other thread that could re-send a setpoint.
+No other thread sends setpoints. If the loop ends, the setpoints end too.
 """
 
 from __future__ import annotations
 
-import ctypes
-import gc
-import os
-import resource
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
+from uavctl.arrays import SECOND_NS
 from uavctl.clock import Ticker, monotonic_ns
 from uavctl.errors import ConnectionClosedError
 from uavctl.io.base import Connection
 from uavctl.io.transport import wait
-from uavctl.loop import SECOND_NS, VEHICLE, ControlLoop
+from uavctl.loop import VEHICLE, ControlLoop
 from uavctl.mavlink.connection import HUNG_UP, OVERRUN
 from uavctl.outcome import Cause
 from uavctl.records import Event, Outgoing, Ticked
 
-PRIORITY = 20  # of SCHED_FIFO: above everything normal, below the kernel's interrupt threads (50)
-COLLECT_NS = 1_000_000_000
-_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
-_CAP_IPC_LOCK = 14
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """One part of it: whether it holds, and what a person should know."""
-
-    part: str
-    ok: bool
-    text: str
-
-
-class Collector:
-    """Collects garbage once a second, right after a tick; what was there at the start is frozen and never walked."""
-
-    def after_tick(self, ticked: Ticked, lateness_ns: int) -> None:
-        """Collect if it is time to."""
-        del lateness_ns
-        at_ns = ticked.decision.at_ns
-        if self._collected_ns is None:
-            self._collected_ns = at_ns
-        elif at_ns - self._collected_ns >= COLLECT_NS:
-            self._collected_ns = at_ns
-            gc.collect()
-
-    _collected_ns: int | None = None
-
-
-@contextmanager
-def collected_between_ticks() -> Iterator[Collector]:
-    """Keep garbage collection out of the ticks: it is for the collector's caller to say when; undone at the end."""
-    gc.collect()
-    gc.freeze()
-    gc.disable()
-    try:
-        yield Collector()
-    finally:
-        gc.enable()
-        gc.unfreeze()
-
-
-@contextmanager
-def realtime(priority: int = PRIORITY) -> Iterator[tuple[Outcome, ...]]:
-    """Make this thread, and the threads and memory that come later, real-time as far as permitted; undone at the end.
-
-    Threads that it begins inherit the class: the recorder's holds the interpreter now and then, and must not lose the
-    processor to another program while the control loop waits for it.
-    """
-    before = os.sched_getscheduler(0), os.sched_getparam(0)
-    scheduling = _schedule(priority)
-    memory = _lock_memory()
-    try:
-        yield scheduling, memory
-    finally:
-        if memory.ok:
-            ctypes.CDLL(None).munlockall()
-        if scheduling.ok:
-            os.sched_setscheduler(0, *before)
-
-
-def _schedule(priority: int) -> Outcome:
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
-    except PermissionError:
-        return Outcome(
-            "scheduling",
-            False,
-            f"SCHED_FIFO is not permitted, the normal class stays; allow it with LimitRTPRIO={priority} in the unit, "
-            f"`rtprio {priority}` in /etc/security/limits.conf, or CAP_SYS_NICE",
-        )
-    return Outcome("scheduling", True, f"SCHED_FIFO, priority {priority}")
-
-
-def _lock_memory() -> Outcome:
-    """Keep every page that was touched in memory. Only without a limit: with one, a later allocation would fail."""
-    _, hard = resource.getrlimit(resource.RLIMIT_MEMLOCK)
-    if hard != resource.RLIM_INFINITY and not _may_lock():
-        return Outcome(
-            "memory",
-            False,
-            f"locking more than {hard >> 10} KiB is not permitted, memory may be paged out; allow it with "
-            "LimitMEMLOCK=infinity in the unit, `memlock unlimited` in /etc/security/limits.conf, or CAP_IPC_LOCK",
-        )
-    if hard == resource.RLIM_INFINITY:
-        resource.setrlimit(resource.RLIMIT_MEMLOCK, (hard, hard))
-    libc = ctypes.CDLL(None, use_errno=True)
-    if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT):
-        reason = os.strerror(ctypes.get_errno())
-        return Outcome(
-            "memory", False, f"cannot be locked ({reason}) and may be paged out; is this Linux 4.4 or later?"
-        )
-    return Outcome("memory", True, "locked: what was touched once is never paged out")
-
-
-def _may_lock() -> bool:
-    """Whether the limit on locked memory does not bind this process."""
-    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
-    effective = next((int(line.split()[1], 16) for line in lines if line.startswith("CapEff:")), 0)
-    return bool(effective >> _CAP_IPC_LOCK & 1)
-
-
-PAUSE_NS = 2_000_000  # after a read that gave nothing that the flight needs
-STALL_NS = 200_000_000  # without a look: what the system dropped meanwhile may have been the vehicle's newest state
-FRESH_NS = 150_000_000  # a look is so old at most when a setpoint goes out
-MAX_LOOKS = 10  # at a backlog, before a tick
+READ_PAUSE_NS = 2_000_000  # after a read without data for the flight
+STALL_NS = 200_000_000  # between reads: the system may have dropped the vehicle's newest state
+MAX_READ_AGE_NS = 150_000_000  # largest age of the last complete read at a setpoint
+MAX_READ_ROUNDS = 10  # at a backlog, before a tick
 WITHHELD = "withheld"
 
 AfterTick = Callable[[Ticked, int], None]
-"""Called with what a tick gave and its lateness [ns], once its setpoint is out; may neither wait nor raise."""
+"""Called with the result of a tick and its lateness [ns], after its setpoint; must neither wait nor raise."""
 
 
 def fly(
@@ -147,21 +37,21 @@ def fly(
     duration_s: float | None = None,
     stop_limit_s: float,
     after_tick: Sequence[AfterTick] = (),
-    on_news: Callable[[tuple[Event, ...]], None] = lambda _: None,
+    on_events: Callable[[tuple[Event, ...]], None] = lambda _: None,
     wait_for: Callable[[Mapping[str, Connection], int], list[str]] = wait,
     now: Callable[[], int] = monotonic_ns,
 ) -> bool:
     """Run the control loop in real time until it has handed the vehicle over.
 
     Args:
-        loop: the loop, which records whatever it sees and does.
-        stop_requested: asked once a tick; the first True begins the hand-over.
+        loop: the loop, which records all its inputs and outputs.
+        stop_requested: called once a tick; the first True begins the hand-over.
         duration_s: the hand-over begins by itself after this time [s]; None flies on.
-        stop_limit_s: the hand-over is cut off after this time [s], unless the vehicle is in the air by the positions
-            that are relayed to it; 0 ends without one.
+        stop_limit_s: the hand-over ends after this time [s] at the latest, unless the vehicle is in the air on relayed
+            positions; 0 ends without one.
         after_tick: called in this order after each tick.
-        on_news: called with what a datagram or a lost connection brings for a person; may neither wait nor raise.
-        wait_for: sleeps until a deadline or the first arrival; gives the names of connections to read.
+        on_events: called with the events for people from a datagram or a lost connection; must neither wait nor raise.
+        wait_for: sleeps until a deadline or the first arrival; returns the names of connections to read.
         now: the clock [ns].
 
     Returns:
@@ -172,14 +62,14 @@ def fly(
     """
     first_ns: int | None = None
     stop_ns: int | None = None
-    refusals = _Refusals(loop, connections, on_news)
-    reader = _Reader(loop, connections, now, on_news)
+    reporter = _RefusalReporter(loop, connections, on_events)
+    reader = _Reader(loop, connections, now, on_events)
     withheld = 0
 
     def send(message: Outgoing) -> None:
         nonlocal withheld
-        if message.link == VEHICLE and not reader.fresh:
-            withheld += 1  # who has the vehicle may have changed since the look
+        if message.link == VEHICLE and not reader.is_fresh:
+            withheld += 1  # a pilot may have taken over since the last read
         else:
             connections[message.link].send(message.data)
 
@@ -187,27 +77,27 @@ def fly(
         while not loop.finished:
             due = ticker.next()
             while True:
-                heard = reader.read(wait_for(connections, due.at_ns))
+                has_received = reader.read(wait_for(connections, due.at_ns))
                 if now() >= due.at_ns:
                     break
-                if not heard:  # a flood: take what comes by the handful, not each by itself
-                    wait_for({}, min(due.at_ns, now() + PAUSE_NS))
+                if not has_received:  # a flood: read several datagrams at once
+                    wait_for({}, min(due.at_ns, now() + READ_PAUSE_NS))
             if connections[VEHICLE].closed:
                 loop.course.close(f"{connections[VEHICLE].url}; nothing can be sent, and its own failsafe has it")
                 raise ConnectionClosedError(
                     f"{connections[VEHICLE].url}: closed by the other side, so nothing can be sent; "
                     "the vehicle's own failsafe has it. See to the link and start again"
                 )
-            reader.read_everything()
-            due = ticker.overslept(due)
+            reader.read_backlog()
+            due = ticker.update_after_wait(due)
             started_ns = now()
             first_ns = due.at_ns if first_ns is None else first_ns
-            over = duration_s is not None and due.at_ns - first_ns >= duration_s * 1e9
-            if stop_ns is None and (over or stop_requested()):
+            is_time_over = duration_s is not None and due.at_ns - first_ns >= duration_s * 1e9
+            if stop_ns is None and (is_time_over or stop_requested()):
                 stop_ns = due.at_ns
-                loop.course.stop(Cause.TIME if over else Cause.OPERATOR)
-            late = stop_ns is not None and due.at_ns - stop_ns >= stop_limit_s * 1e9
-            if late and not (stop_limit_s and loop.carries):
+                loop.course.stop(Cause.TIME if is_time_over else Cause.OPERATOR)
+            is_overdue = stop_ns is not None and due.at_ns - stop_ns >= stop_limit_s * 1e9
+            if is_overdue and not (stop_limit_s and loop.is_relay_needed):
                 break
             withheld = 0
             ticked = loop.tick(due.tick, due.at_ns, send, due.missed, stop=stop_ns is not None)
@@ -216,99 +106,102 @@ def fly(
             loop.timing(ticked, started_ns - due.at_ns, now() - due.at_ns)
             if loop.outside and ticked.decision.solve is not None:
                 loop.answered(ticked.step_ns)
-            refusals.tell(due.at_ns)
-            for follow in after_tick:
-                follow(ticked, started_ns - due.at_ns)
+            reporter.report(due.at_ns)
+            for callback in after_tick:
+                callback(ticked, started_ns - due.at_ns)
     finally:
-        refusals.tell(now(), last=True)
+        reporter.report(now(), is_last=True)
     return stop_ns is not None
 
 
 class _Reader:
-    """Hands on what arrives, and knows how old the last look is at what the vehicle says."""
+    """Passes arrivals to the loop, and knows the age of the last complete read."""
 
     def __init__(
         self,
         loop: ControlLoop,
         connections: Mapping[str, Connection],
         now: Callable[[], int],
-        on_news: Callable[[tuple[Event, ...]], None],
+        on_events: Callable[[tuple[Event, ...]], None],
     ) -> None:
-        self._loop, self._connections, self._now, self._on_news = loop, connections, now, on_news
-        self._looked_ns = now()  # when the last read ended
-        self._whole_ns: int | None = None  # when the last read began after which nothing was left
+        self._loop, self._connections, self._now, self._on_events = loop, connections, now, on_events
+        self._read_ns = now()  # end of the last read
+        self._complete_read_ns: int | None = None  # start of the last read that left nothing
         self._lost = dict.fromkeys(connections, 0)
 
     @property
-    def fresh(self) -> bool:
-        """Whether everything has been read that the vehicle had said a moment ago."""
-        return self._whole_ns is not None and self._now() - self._whole_ns <= FRESH_NS
+    def is_fresh(self) -> bool:
+        """Whether the last complete read is recent enough to send a setpoint."""
+        return self._complete_read_ns is not None and self._now() - self._complete_read_ns <= MAX_READ_AGE_NS
 
-    def read(self, names: Iterable[str], *, everything: bool = False) -> bool:
-        """Hand on what has arrived on the named connections; False if the flight needs nothing of it."""
-        began_ns = self._now()
-        stalled = began_ns - self._looked_ns > STALL_NS
-        heard = False
+    def read(self, names: Iterable[str], *, read_all: bool = False) -> bool:
+        """Pass on arrivals of the named connections; False if the flight needs none of them."""
+        start_ns = self._now()
+        has_stalled = start_ns - self._read_ns > STALL_NS
+        has_received = False
         for name in names:
             connection = self._connections[name]
-            arrived = connection.receive(everything=everything or stalled)
-            heard = heard or (bool(arrived) and connection.known)
+            arrived = connection.receive(read_all=read_all or has_stalled)
+            has_received = has_received or (bool(arrived) and connection.has_known_sender)
             for index, (data, received_ns) in enumerate(arrived):
-                self._hand_on(name, index, data, received_ns)
-        self._look_at_losses(stalled)
-        self._looked_ns = self._now()
-        return heard
+                self._handle_data(name, index, data, received_ns)
+        self._report_losses(has_stalled)
+        self._read_ns = self._now()
+        return has_received
 
-    def read_everything(self) -> None:
-        """Read what has come until now, before something goes out: a backlog ends with the vehicle's newest state."""
-        for _ in range(MAX_LOOKS):
-            began_ns = self._now()
-            self.read(self._connections, everything=True)
-            if not self._connections[VEHICLE].unread:
-                self._whole_ns = began_ns
-                if self.fresh:
+    def read_backlog(self) -> None:
+        """Read everything before a setpoint: a backlog ends with the vehicle's newest state."""
+        for _ in range(MAX_READ_ROUNDS):
+            start_ns = self._now()
+            self.read(self._connections, read_all=True)
+            if not self._connections[VEHICLE].has_unread:
+                self._complete_read_ns = start_ns
+                if self.is_fresh:
                     return
 
-    def _hand_on(self, name: str, index: int, data: bytes, received_ns: int) -> None:
+    def _handle_data(self, name: str, index: int, data: bytes, received_ns: int) -> None:
         connection = self._connections[name]
         received = self._loop.receive(name, data, received_ns)
         if received.from_vehicle:  # cameras or a ground station may share the port
-            connection.answer(index)
+            connection.select_peer(index)
         elif received.from_source:
-            connection.trust(index)
+            connection.trust_sender(index)
         if received.news:
-            self._on_news(received.news)
+            self._on_events(received.news)
         for answer in received.answers:
             self._connections[answer.link].send(answer.data)
 
-    def _look_at_losses(self, stalled: bool) -> None:
-        """Tell what the system dropped while nobody looked. Losses in a flood are not told, and change nothing."""
+    def _report_losses(self, has_stalled: bool) -> None:
+        """Report data that the system dropped during a stall. Losses in a flood are not reported."""
         for name, connection in self._connections.items():
-            before, lost = self._lost[name], connection.lost()
+            before, lost = self._lost[name], connection.count_lost()
             self._lost[name] = lost
-            if stalled and lost > before:
+            if has_stalled and lost > before:
                 self._loop.refused(name, {OVERRUN: lost - before}, self._now())
 
 
-class _Refusals:
-    """Tells the loop once a second what the connections dropped."""
+class _RefusalReporter:
+    """Reports to the loop once a second what the connections dropped."""
 
     def __init__(
-        self, loop: ControlLoop, connections: Mapping[str, Connection], on_news: Callable[[tuple[Event, ...]], None]
+        self, loop: ControlLoop, connections: Mapping[str, Connection], on_events: Callable[[tuple[Event, ...]], None]
     ) -> None:
-        self._loop, self._connections, self._on_news = loop, connections, on_news
-        self._told: dict[str, Counter[str]] = {name: Counter() for name in connections}
+        self._loop, self._connections, self._on_events = loop, connections, on_events
+        self._reported: dict[str, Counter[str]] = {name: Counter() for name in connections}
         self._next_ns = 0
 
-    def tell(self, at_ns: int, *, last: bool = False) -> None:
-        """Tell what is new if a second has passed, a peer has hung up, or this is the last call."""
-        hung_up = any(one.refused[HUNG_UP] > self._told[name][HUNG_UP] for name, one in self._connections.items())
-        if at_ns < self._next_ns and not hung_up and not last:
+    def report(self, at_ns: int, *, is_last: bool = False) -> None:
+        """Report new counts if a second has passed, a peer has hung up, or this is the last call."""
+        hung_up = any(
+            connection.refused[HUNG_UP] > self._reported[name][HUNG_UP]
+            for name, connection in self._connections.items()
+        )
+        if at_ns < self._next_ns and not hung_up and not is_last:
             return
         self._next_ns = at_ns + SECOND_NS
         for name, connection in self._connections.items():
             refused = Counter(connection.refused)
-            new = refused - self._told[name]
-            if new:
-                self._told[name] = refused
-                self._on_news(self._loop.refused(name, dict(new), at_ns))
+            new_counts = refused - self._reported[name]
+            if new_counts:
+                self._reported[name] = refused
+                self._on_events(self._loop.refused(name, dict(new_counts), at_ns))

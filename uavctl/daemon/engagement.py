@@ -1,4 +1,4 @@
-"""What a flight is asked for: whether to arm and take off, where to go, and how long its end may take."""
+"""Orders of the command line: take-off, a position to go to, and the time limit of the end."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from uavctl.build.mission import build_mission
 from uavctl.config import Config
 from uavctl.errors import UsageError
 from uavctl.loop import ControlLoop
-from uavctl.mavlink.handover_guards import MUST_LAND
+from uavctl.mavlink.handover_guards import LAND_PERIODS
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.records import Command, ControlMode, Order, Ticked, Vec3
 from uavctl.smpc.conditioned.planner import AnyDesign
 from uavctl.smpc.plant import AXES
 
 DOWN = 2
-LANDING_S = 10.0  # after braking: for asking the vehicle to land
+LANDING_S = 10.0  # after braking: for the landing request
 TickFollower = Callable[[ControlLoop, Ticked], None]
 
 
-def goto_keys(place_m: Sequence[float]) -> dict[str, object]:
-    """Return configuration keys that make a place in local NED [m] the mission, checked and recorded as one.
+def make_goto_keys(place_m: Sequence[float]) -> dict[str, object]:
+    """Return configuration keys that make a position in local NED [m] the mission, checked and recorded like one.
 
     Raises:
         UsageError: it is not three finite numbers.
@@ -30,7 +30,7 @@ def goto_keys(place_m: Sequence[float]) -> dict[str, object]:
     if len(place_m) != 3 or not all(map(math.isfinite, place_m)):
         raise UsageError(f"goto {place_m}: give north, east and down in local NED [m], as in 2, 1, -2 (up is < 0)")
     return {
-        "mission.waypoints": [[float(one) for one in place_m]],
+        "mission.waypoints": [[float(coordinate) for coordinate in place_m]],
         "mission.hold_s": 0.0,
         "mission.trajectory": {},
         "mission.then": "hold",
@@ -38,18 +38,18 @@ def goto_keys(place_m: Sequence[float]) -> dict[str, object]:
 
 
 class Engagement:
-    """Order of the command line (take-off, place to go to), and what became of it.
+    """Order of the command line (take-off, position to go to), and its progress.
 
     Attributes:
-        goal: the place of `--goto`, local NED [m].
-        arrived: whether it has been reached.
-        engaged: whether the controller has been in charge.
+        goal: the position of `--goto`, local NED [m].
+        has_arrived: whether the vehicle has reached it.
+        has_engaged: whether the controller has been in control.
 
     Args:
         config: the configuration, `--goto` in it.
         take_off_m: height of the climb above the ground [m]; None leaves arming and modes to the pilot.
-        goto: whether the mission is the place of `--goto`.
-        follower: looks at every tick as well, and may give orders.
+        goto: whether the mission is the position of `--goto`.
+        follower: called after each tick; it may give orders.
     """
 
     def __init__(
@@ -59,42 +59,42 @@ class Engagement:
         self._take_off_m = take_off_m
         self._follower = follower
         self.goal: Vec3 | None = config.mission.waypoints[0] if goto else None
-        self._ordered = False
-        self.engaged = False
-        self.arrived = False
+        self._is_take_off_ordered = False
+        self.has_engaged = False
+        self.has_arrived = False
 
     @property
     def takes_off(self) -> bool:
-        """Whether the vehicle is to be armed."""
+        """Whether the flight arms the vehicle and takes off."""
         return self._take_off_m is not None
 
     def begin(self, loop: ControlLoop) -> None:
-        """Say before the first tick what the flight is to do."""
+        """Note the order in the course of the flight, before the first tick."""
         loop.course.takes_off = self.takes_off
         loop.course.goal = "" if self.goal is None else f"--goto {','.join(f'{x:g}' for x in self.goal)}"
 
     def follow(self, loop: ControlLoop, ticked: Ticked) -> None:
-        """Look at the tick that has just run; the first one gives the order to take off."""
-        self.engaged = self.engaged or loop.who_flies is HandoverState.ENGAGED
-        self._look_for_arrival(loop, ticked)
-        loop.course.arrived = self.arrived
-        if self._take_off_m is not None and not self._ordered:
-            self._ordered = loop.order(Command(order=Order.TAKE_OFF, height_m=self._take_off_m))
+        """Update after a tick; after the first one, order the take-off."""
+        self.has_engaged = self.has_engaged or loop.handover_state is HandoverState.ENGAGED
+        self._check_arrival(loop, ticked)
+        loop.course.arrived = self.has_arrived
+        if self._take_off_m is not None and not self._is_take_off_ordered:
+            self._is_take_off_ordered = loop.order(Command(order=Order.TAKE_OFF, height_m=self._take_off_m))
         if self._follower is not None:
             self._follower(loop, ticked)
 
-    def _look_for_arrival(self, loop: ControlLoop, ticked: Ticked) -> None:
+    def _check_arrival(self, loop: ControlLoop, ticked: Ticked) -> None:
         estimate = ticked.estimate
         if self.goal is None or estimate is None or ticked.decision.mode is not ControlMode.TRACK:
             return
         plant = loop.plant
-        where = [estimate.mean[index] for index in plant.position_index]
+        position = [estimate.mean[index] for index in plant.position_index]
         goal = [self.goal[AXES.index(axis)] for axis in plant.axes]
-        self.arrived = self.arrived or math.dist(where, goal) <= self._config.mission.accept_m
+        self.has_arrived = self.has_arrived or math.dist(position, goal) <= self._config.mission.accept_m
 
 
 def check_places(config: Config, design: AnyDesign, take_off_m: float | None, goal: Vec3 | None) -> None:
-    """Refuse places outside the room, before anything is made for the flight, or sent.
+    """Refuse positions outside the room, before the flight is prepared.
 
     Raises:
         UsageError: the plant may not rest at the goal, or the climb would end above the room.
@@ -107,9 +107,9 @@ def check_places(config: Config, design: AnyDesign, take_off_m: float | None, go
     room = build_mission(config, design, resting(design)).room
     if room is None:
         raise UsageError("take-off, goto: this plant cannot rest wherever it is sent; see plant")
-    why = "" if goal is None else room.refusal(goal)
-    if why:
-        raise UsageError(f"goto: {why}")
+    refusal = "" if goal is None else room.refusal(goal)
+    if refusal:
+        raise UsageError(f"goto: {refusal}")
     if take_off_m is None:
         return
     highest_m = -float(room.lower[room.axes.index(DOWN)])
@@ -117,7 +117,7 @@ def check_places(config: Config, design: AnyDesign, take_off_m: float | None, go
         raise UsageError(f"take-off to {take_off_m:g} m: above {highest_m:.2f} m it may not rest (sets.state_lower)")
 
 
-def stop_limit_s(config: Config, *, takes_off: bool) -> float:
-    """Return how long a hand-over may take [s]; it ends on the ground if we took off, or land by our positions."""
-    landings = 1 + MUST_LAND if takes_off else int(config.relay.enabled)
+def compute_stop_limit_s(config: Config, *, takes_off: bool) -> float:
+    """Return the time limit of a hand-over [s]; it includes the landing of an ordered or relayed flight."""
+    landings = 1 + LAND_PERIODS if takes_off else int(config.relay.enabled)
     return config.fallback.brake_s + LANDING_S + landings * config.hand_over.land_s

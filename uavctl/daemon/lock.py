@@ -1,12 +1,12 @@
-"""One daemon a vehicle: a lock on what the connection's URL means.
+"""Lock of a vehicle: one daemon for each vehicle.
 
-The lock is the kernel's (flock); it goes when its holder dies, however that happens. It is one among the processes of
-one user: its files are where no other user can touch them, so that none can hold the vehicle, or rewrite the word that
-it was left in flight. They are in each of the user's runtime folders, since not every process of the user finds the
-same one. Two URLs that mean the same (a name and its address, a serial port and a link to it) are one vehicle. That
-two different connections lead to the same vehicle cannot be seen before they are opened.
+1. Reduce the URL to an identity: a name and its address, or a serial port and a link to it, are one vehicle.
+2. Lock a file of this identity in each runtime folder of the user (flock). The kernel releases it when the holder dies.
+3. Write into the file whether the vehicle would be left in flight, for the next holder.
 
-Its file also tells the next holder that this one has ended, or was killed, and left the vehicle in flight.
+Other users cannot reach the files. So they can neither hold the vehicle nor change that note. Not every process of a
+user finds the same runtime folder, so there is a file in each. Two different connections to the same vehicle cannot be
+recognised before they are opened.
 """
 
 from __future__ import annotations
@@ -18,100 +18,56 @@ import os
 import socket
 import stat
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from uavctl.errors import ConnectionSpecError, UsageError, VehicleTakenError
+from uavctl.daemon.runtime_folder import find_runtime_folders
+from uavctl.errors import ConnectionSpecError, VehicleTakenError
 
-# The user's own runtime folders: locks and control sockets are there, out of every other user's reach.
-#
-# The first one is that of the login session, as a rule; but a process of the same user may have none (a service,
-# cron). So there is one more that every process of the user finds, whatever its environment says.
-
-
-RUN = Path("/run")
-TEMPORARY = Path("/tmp")
-
-
-def is_own(folder: Path) -> bool:
-    """Whether this is a folder of this user, that no other one may enter; a link to one is none."""
-    try:
-        found = folder.lstat()
-    except OSError:
-        return False
-    return stat.S_ISDIR(found.st_mode) and found.st_uid == os.geteuid() and not found.st_mode & 0o077
-
-
-def runtime_folders(environ: Mapping[str, str] = os.environ) -> tuple[Path, ...]:
-    """This user's folders for locks and sockets, those that can be had, the preferred one first; made if need be.
-
-    Below $XDG_RUNTIME_DIR and /run/user/UID if these are the user's own; /run/uavctl, which a service has; and one
-    below /tmp. What another user has put into the way, root included, is passed over.
-
-    Raises:
-        UsageError: there is none.
-    """
-    user = os.geteuid()
-    given = Path(environ.get("XDG_RUNTIME_DIR") or "/")
-    bases = [base for base in (given, RUN / "user" / str(user)) if base.is_absolute() and base != Path("/")]
-    last = TEMPORARY / f"uavctl-{user}"
-    wanted = [*(base / "uavctl" for base in bases if is_own(base)), last]
-    for folder in wanted:
-        with suppress(OSError):
-            folder.mkdir(mode=0o700, exist_ok=True)
-    found = tuple(dict.fromkeys(one for one in (*wanted[:-1], RUN / "uavctl", last) if is_own(one)))
-    if not found:
-        raise UsageError(
-            f"{last}: not a folder of this user alone, and XDG_RUNTIME_DIR names none, so there is no safe place for "
-            f"lock and socket; see whose it is, and remove it (sudo rm -r {last}) or run: chmod 700 {last}"
-        )
-    return found
-
-
-_LONGEST = 500  # bytes of a lock file that are looked at
-_TRIES = 10  # to lock a file that its last holder is just removing
-_FLOWN = "flown at"  # the second line, with the time since the machine's start [ns]
+_LONGEST = 500  # bytes of a lock file that are read
+_TRIES = 10  # attempts while the last holder removes the file
+_FLIGHT_LINE = "flown at"  # the second line, with the time since the machine's start [ns]
 LONGEST_FLIGHT_NS = 3600 * 10**9  # a vehicle that was left longer ago than a battery lasts has landed
 
 
-def identity(url: str) -> str:
-    """Return the identity of what a connection URL leads to, in one form for all URLs that mean the same.
+def identify_connection(url: str) -> str:
+    """Return the identity behind a connection URL; the same for all URLs with the same meaning.
 
     Args:
-        url: as `uavctl.io.transport.open_connection` takes it.
+        url: of a connection, see `uavctl.io.transport.open_connection`.
 
     Raises:
         ConnectionSpecError: the host is unknown, or the URL cannot be understood.
     """
     scheme, _, rest = url.partition("://")
     if scheme == "serial":
-        return f"serial {os.path.realpath(rest.rpartition(':')[0])}"  # the rate does not make another device
+        return f"serial {os.path.realpath(rest.rpartition(':')[0])}"  # the rate is not part of the identity
     try:
         parts = urlsplit(url)
-        found = socket.getaddrinfo(parts.hostname, parts.port)[0][4]
+        status = socket.getaddrinfo(parts.hostname, parts.port)[0][4]
     except (ValueError, OSError) as error:
         raise ConnectionSpecError(f"connection {url!r}: {error}; check host and port") from error
-    host, port = str(found[0]), int(found[1])
-    return f"{scheme} {_host(host, local=scheme == 'udpin')} {port}"
+    host, port = str(status[0]), int(status[1])
+    return f"{scheme} {_normalise_host(host, is_local=scheme == 'udpin')} {port}"
 
 
-def _host(text: str, *, local: bool) -> str:
-    """One form of an address: the loopback of both families is the same machine, and so is "any" as a destination."""
+def _normalise_host(text: str, *, is_local: bool) -> str:
+    """Normalise an address: loopback of both families, and "any" as a destination, are the same machine."""
     address = ipaddress.ip_address(text.partition("%")[0])
     if isinstance(address, ipaddress.IPv6Address):
         address = address.ipv4_mapped or address
     if address.is_unspecified:
-        return "any" if local else "127.0.0.1"
+        return "any" if is_local else "127.0.0.1"
     return "127.0.0.1" if address == ipaddress.IPv6Address("::1") else str(address)
 
 
 class VehicleLock:
-    """A vehicle, from its lock's taking to its letting go.
+    """Lock of a vehicle that this process holds.
 
     Args:
-        descriptors: of the locked files, which say the same; of what others left in them the newest counts.
+        descriptors: of the locked files, which have the same content; the newest older content counts.
         now: time since the machine's start [ns].
 
     Raises:
@@ -121,80 +77,80 @@ class VehicleLock:
     def __init__(self, descriptors: Sequence[int], url: str, now: Callable[[], int] = time.monotonic_ns) -> None:
         self._descriptors, self._now = descriptors, now
         self._first_line = f"{os.getpid()} {url}\n"
-        found = [_left_ns(os.pread(one, _LONGEST, 0), now()) for one in descriptors]
-        self._left_ns = max((one for one in found if one is not None), default=None)
+        status = [_parse_left_flight_ns(os.pread(descriptor, _LONGEST, 0), now()) for descriptor in descriptors]
+        self._left_flight_ns = max((descriptor for descriptor in status if descriptor is not None), default=None)
         self._write()
 
     @property
-    def left_ns(self) -> int | None:
-        """Start of the flight that would now be left, time since the machine's start [ns]; None if none would."""
-        return self._left_ns
+    def left_flight_ns(self) -> int | None:
+        """Start of the flight that would be left now [ns since the machine's start]; None without one."""
+        return self._left_flight_ns
 
     @property
-    def leaves(self) -> bool:
-        """Whether the vehicle would now be left in flight; before anything is noted, whether it was found so."""
-        return self._left_ns is not None
+    def is_left_in_flight(self) -> bool:
+        """Whether the vehicle would be left in flight now; before the first update, as the last holder left it."""
+        return self._left_flight_ns is not None
 
-    def note(self, leaves: bool | None) -> None:
-        """Write down whether the vehicle would be left in flight; None changes nothing."""
-        if leaves is None or leaves == self.leaves:
+    def update(self, is_left_in_flight: bool | None) -> None:
+        """Store whether the vehicle would be left in flight; None changes nothing."""
+        if is_left_in_flight is None or is_left_in_flight == self.is_left_in_flight:
             return
-        self._left_ns = self._now() if leaves else None
-        with suppress(OSError):  # no flight ends because a word to the next one does not fit on the disk
+        self._left_flight_ns = self._now() if is_left_in_flight else None
+        with suppress(OSError):  # a full disk must not end the flight
             self._write()
 
     def _write(self) -> None:
-        second_line = "" if self._left_ns is None else f"{_FLOWN} {self._left_ns}\n"
+        second_line = "" if self._left_flight_ns is None else f"{_FLIGHT_LINE} {self._left_flight_ns}\n"
         text = (self._first_line + second_line).encode()
         for descriptor in self._descriptors:
             os.pwrite(descriptor, text, 0)
             os.ftruncate(descriptor, len(text))
 
 
-def _left_ns(text: bytes, now_ns: int) -> int | None:
-    """Return when the file's last holder began a flight that it then left [ns]; None if there is none to find."""
-    _, _, flown = text.decode(errors="replace").partition(f"\n{_FLOWN} ")
-    at_ns = int(flown.strip()) if flown.strip().isdecimal() else None
-    # A time to come is one of before the machine's last start.
+def _parse_left_flight_ns(text: bytes, now_ns: int) -> int | None:
+    """Parse the start of the flight that the last holder left [ns]; None without one."""
+    _, _, flight_ns = text.decode(errors="replace").partition(f"\n{_FLIGHT_LINE} ")
+    at_ns = int(flight_ns.strip()) if flight_ns.strip().isdecimal() else None
+    # A time in the future is from before the machine's last start.
     return at_ns if at_ns is not None and 0 <= now_ns - at_ns <= LONGEST_FLIGHT_NS else None
 
 
-def lock_paths(url: str, folder: Path | None = None) -> tuple[Path, ...]:
-    """Files of the lock of the vehicle behind a URL; arguments and errors are those of `sole_daemon`."""
-    name = f"uavctl-{hashlib.sha256(identity(url).encode()).hexdigest()[:16]}.lock"
-    return tuple(one / name for one in (runtime_folders() if folder is None else (folder,)))
+def find_lock_paths(url: str, folder: Path | None = None) -> tuple[Path, ...]:
+    """Find the lock files of the vehicle behind a URL; arguments and errors as in `lock_vehicle`."""
+    name = f"uavctl-{hashlib.sha256(identify_connection(url).encode()).hexdigest()[:16]}.lock"
+    return tuple(descriptor / name for descriptor in (find_runtime_folders() if folder is None else (folder,)))
 
 
 @contextmanager
-def sole_daemon(url: str, folder: Path | None = None) -> Iterator[VehicleLock]:
+def lock_vehicle(url: str, folder: Path | None = None) -> Iterator[VehicleLock]:
     """Hold the lock of the vehicle behind a URL; its files stay if the vehicle is left in flight.
 
     Args:
-        folder: where the lock file is; by default there is one in each of the user's runtime folders.
+        folder: folder of the lock file; by default there is one in each of the user's runtime folders.
 
     Raises:
-        VehicleTakenError: another process holds it, or the lock cannot be made; says which and what to do.
+        VehicleTakenError: another process holds it, or the lock cannot be made; names it and the remedy.
         ConnectionSpecError: the URL cannot be understood.
         UsageError: the user has no runtime folder.
     """
-    paths = lock_paths(url, folder)
+    paths = find_lock_paths(url, folder)
     with ExitStack() as stack:
         descriptors = []
         for path in paths:
-            descriptors.append(_lock(path, url))
+            descriptors.append(_lock_file(path, url))
             stack.callback(os.close, descriptors[-1])
-        tenure: VehicleLock | None = None
+        vehicle_lock: VehicleLock | None = None
         try:
-            tenure = _tenure(descriptors, url, paths[0])
-            yield tenure
+            vehicle_lock = _make_vehicle_lock(descriptors, url, paths[0])
+            yield vehicle_lock
         finally:
-            if tenure is None or not tenure.leaves:
+            if vehicle_lock is None or not vehicle_lock.is_left_in_flight:
                 for path in paths:
                     with suppress(OSError):  # gone with its folder, at the end of a login session
                         path.unlink()
 
 
-def _tenure(descriptors: Sequence[int], url: str, path: Path) -> VehicleLock:
+def _make_vehicle_lock(descriptors: Sequence[int], url: str, path: Path) -> VehicleLock:
     try:
         return VehicleLock(descriptors, url)
     except OSError as error:
@@ -203,11 +159,11 @@ def _tenure(descriptors: Sequence[int], url: str, path: Path) -> VehicleLock:
         ) from error
 
 
-def _lock(path: Path, url: str) -> int:
-    """Descriptor of the locked file."""
+def _lock_file(path: Path, url: str) -> int:
+    """Lock a file and return its descriptor."""
     for _ in range(_TRIES):
         try:
-            descriptor = _open(path)
+            descriptor = _open_lock_file(path)
         except FileExistsError:
             continue  # made by another one in between
         except PermissionError as error:
@@ -222,40 +178,40 @@ def _lock(path: Path, url: str) -> int:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise _taken(descriptor, url) from None
-        if _is_still(path, descriptor):
+            raise _describe_holder(descriptor, url) from None
+        if _is_same_file(path, descriptor):
             return descriptor
         os.close(descriptor)
     raise VehicleTakenError(f"{url}: another daemon is just starting or ending on it; try again")
 
 
-def _open(path: Path) -> int:
+def _open_lock_file(path: Path) -> int:
     try:
         descriptor = os.open(path, os.O_RDWR | os.O_NOFOLLOW)
     except FileNotFoundError:
         descriptor = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_CREAT | os.O_EXCL, 0o600)
-    found = os.fstat(descriptor)
-    if stat.S_ISREG(found.st_mode) and found.st_uid == os.geteuid():
+    status = os.fstat(descriptor)
+    if stat.S_ISREG(status.st_mode) and status.st_uid == os.geteuid():
         os.fchmod(descriptor, 0o600)
         return descriptor
     os.close(descriptor)
-    raise PermissionError if stat.S_ISREG(found.st_mode) else OSError(0, "not a regular file")
+    raise PermissionError if stat.S_ISREG(status.st_mode) else OSError(0, "not a regular file")
 
 
-def _is_still(path: Path, descriptor: int) -> bool:
-    """Whether the name still means the file that was locked; its last holder may have removed it."""
+def _is_same_file(path: Path, descriptor: int) -> bool:
+    """Return whether the path is still the locked file; its last holder may have removed it."""
     try:
         return os.path.samestat(os.stat(path), os.fstat(descriptor))  # noqa: PTH116 (stat of a path beside one of an fd)
     except FileNotFoundError:
         return False
 
 
-def _taken(descriptor: int, url: str) -> VehicleTakenError:
+def _describe_holder(descriptor: int, url: str) -> VehicleTakenError:
     first_line, _, _ = os.pread(descriptor, _LONGEST, 0).decode(errors="replace").partition("\n")
-    pid, _, theirs = first_line.strip().partition(" ")
+    pid, _, their_url = first_line.strip().partition(" ")
     os.close(descriptor)
     holder = f"process {pid}" if pid.isdecimal() else "another process"
-    same = f" (as {theirs})" if theirs and theirs != url else ""
+    alias = f" (as {their_url})" if their_url and their_url != url else ""
     return VehicleTakenError(
-        f"{url}: {holder} flies this vehicle already{same}; end it first, or fly another vehicle with --vehicle"
+        f"{url}: {holder} flies this vehicle already{alias}; end it first, or fly another vehicle with --vehicle"
     )

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from uavctl.arrays import Array
-from uavctl.frames import up_hint
+from uavctl.frames import suggest_height_sign
 from uavctl.records import Vec3, Vector
 from uavctl.smpc.answer import Path, Preview
 from uavctl.smpc.plant import AXES
@@ -61,7 +61,7 @@ class Room:
         """Return why nothing may rest at a place; empty if it may."""
         for axis, lower, upper in zip(self.axes, self.lower, self.upper, strict=True):
             if not lower <= position_m[axis] <= upper:
-                hint = up_hint(AXES[axis], position_m[axis], lower, upper)
+                hint = suggest_height_sign(AXES[axis], position_m[axis], lower, upper)
                 text = f"{AXES[axis]} {position_m[axis]:g} m is outside [{lower:.2f}, {upper:.2f}] m, where it may rest"
                 return f"{text}; {hint}" if hint else text
         return ""

@@ -1,18 +1,22 @@
-"""Protocol of a connection as the daemon needs it, and what all connections share."""
+"""Interface of a connection for the daemon, and the common part of all connections."""
 
 from __future__ import annotations
 
+import socket
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable
 from typing import Protocol
 
+from uavctl.errors import ConnectionSpecError
+from uavctl.io.admission import Address
+
 MAX_READS = 256  # datagrams of one call, so that a flood cannot hold the loop
-BACKLOG_READS = 16_384  # of a call that is to read everything: more than any buffer of the system's holds
+BACKLOG_READS = 16_384  # of a call with `read_all`: more than any system buffer holds
 
 
 class Connection(Protocol):
-    """Connection as the daemon needs it."""
+    """Interface of a connection for the daemon."""
 
     @property
     def url(self) -> str:
@@ -21,32 +25,32 @@ class Connection(Protocol):
 
     @property
     def closed(self) -> bool:
-        """Whether nothing will come any more."""
+        """Whether the connection has ended."""
         ...
 
     @property
     def send_errors(self) -> int:
-        """Sends that failed."""
+        """Number of failed sends."""
         ...
 
     @property
     def receive_errors(self) -> int:
-        """Reads that failed."""
+        """Number of failed reads."""
         ...
 
     @property
     def refused(self) -> Counter[str]:
-        """Counts of what came and was not handed on, by reason."""
+        """Counts of data that were not passed on, by reason."""
         ...
 
     @property
-    def unread(self) -> bool:
-        """Whether the last `receive` has left something of the vehicle's behind that had come before it."""
+    def has_unread(self) -> bool:
+        """Whether the last `receive` has left older data of the vehicle unread."""
         ...
 
     @property
-    def known(self) -> bool:
-        """Whether the last `receive` had something of a sender that the flight needs; True while none is known."""
+    def has_known_sender(self) -> bool:
+        """Whether the last `receive` had data of a trusted sender; True while none is known."""
         ...
 
     def fileno(self) -> int:
@@ -57,24 +61,24 @@ class Connection(Protocol):
         """File descriptors to wait for."""
         ...
 
-    def lost(self) -> int:
-        """Return how much of the vehicle's data the system dropped, for want of room, before it could be read."""
+    def count_lost(self) -> int:
+        """Return the count of the vehicle's data that the system dropped, because its buffer was full."""
         ...
 
-    def receive(self, *, everything: bool = False) -> list[tuple[bytes, int]]:
-        """Return what has arrived: (data, monotonic time of reading [ns]); empty if nothing has.
+    def receive(self, *, read_all: bool = False) -> list[tuple[bytes, int]]:
+        """Return the arrivals: (data, monotonic time of reading [ns]).
 
         Args:
-            everything: also a long backlog of the vehicle's.
+            read_all: also read a long backlog of the vehicle.
         """
         ...
 
-    def answer(self, index: int) -> None:
-        """Send to the sender of the `index`-th datagram of the last `receive`, where a connection has several peers."""
+    def select_peer(self, index: int) -> None:
+        """Send to the sender of the `index`-th datagram of the last `receive` from now on, if there are several."""
         ...
 
-    def trust(self, index: int) -> None:
-        """Keep room for the sender of the `index`-th datagram of the last `receive`: the flight needs what it says."""
+    def trust_sender(self, index: int) -> None:
+        """Trust the sender of the `index`-th datagram of the last `receive`: the flight needs its data."""
         ...
 
     def send(self, data: bytes) -> None:
@@ -86,7 +90,7 @@ class Connection(Protocol):
         ...
 
 
-class Base(ABC):
+class BaseConnection(ABC):
     """Counters and clock of every connection."""
 
     max_reads = MAX_READS
@@ -96,18 +100,18 @@ class Base(ABC):
     def __init__(self, url: str, now: Callable[[], int]) -> None:
         self.url = url
         self.closed = False
-        self.unread = False
-        self.known = True
+        self.has_unread = False
+        self.has_known_sender = True
         self.send_errors = 0
         self.receive_errors = 0
         self.refused: Counter[str] = Counter()
         self._now = now
 
-    def receive(self, *, everything: bool = False) -> list[tuple[bytes, int]]:
+    def receive(self, *, read_all: bool = False) -> list[tuple[bytes, int]]:
         """See `Connection`."""
         arrived: list[tuple[bytes, int]] = []
-        self.unread = False
-        for _ in range(self.backlog_reads if everything else self.max_reads):
+        self.has_unread = False
+        for _ in range(self.backlog_reads if read_all else self.max_reads):
             if self.closed:
                 return arrived
             try:
@@ -121,7 +125,7 @@ class Base(ABC):
                 continue
             if data is not None:
                 arrived.append((data, self._now()))
-        self.unread = True
+        self.has_unread = True
         return arrived
 
     @abstractmethod
@@ -132,18 +136,42 @@ class Base(ABC):
         """See `Connection`."""
         return (self.fileno(),)
 
-    def lost(self) -> int:
+    def count_lost(self) -> int:
         """See `Connection`."""
         return 0
 
-    def answer(self, index: int) -> None:
+    def select_peer(self, index: int) -> None:
         """See `Connection`."""
         del index  # there is only one peer
 
-    def trust(self, index: int) -> None:
+    def trust_sender(self, index: int) -> None:
         """See `Connection`."""
         del index
 
     @abstractmethod
     def _read(self) -> bytes | None:
-        """Read once; None if what came is not to be handed on. BlockingIOError if nothing is there."""
+        """Read once; None if the data are not passed on. BlockingIOError without data."""
+
+
+class SocketConnection(BaseConnection):
+    """Connection on a socket."""
+
+    def __init__(self, url: str, family: socket.AddressFamily, kind: socket.SocketKind, now: Callable[[], int]) -> None:
+        super().__init__(url, now)
+        self._socket = socket.socket(family, kind)
+
+    def fileno(self) -> int:
+        """See `Connection`."""
+        return self._socket.fileno()
+
+    def close(self) -> None:
+        """See `Connection`."""
+        self.closed = True
+        self._socket.close()
+
+    def _attempt(self, action: Callable[[Address], None], address: Address, advice: str) -> None:
+        try:
+            action(address)
+        except OSError as error:
+            self.close()
+            raise ConnectionSpecError(f"connection {self.url!r}: {error.strerror or error}; {advice}") from error

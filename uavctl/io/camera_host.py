@@ -1,8 +1,11 @@
-"""The process that listens to cameras for one daemon.
+"""Process that listens to cameras for one daemon.
 
-Started as `python -m uavctl.io.camera_host FD CAMERA SERVER PORT BODY UP INTERFACE`. It ends when the daemon's end of
-the pipe is gone, however the daemon died. The pipe is a pair of sockets that keep the bounds of messages; what a
-message is, its first byte says (MAVLink has its own).
+The daemon starts it as `python -m uavctl.io.camera_host FD CAMERA SERVER PORT BODY UP INTERFACE`.
+
+1. Receive data of the camera server, and encode poses and time answers as MAVLink.
+2. Send them to the daemon through a pair of sockets that keeps message bounds. The first byte is the kind of message.
+3. Pass time requests of the daemon on to the cameras.
+4. End when the daemon has closed its end, or has died.
 """
 
 from __future__ import annotations
@@ -31,30 +34,27 @@ from uavctl.io.camera import ANSWER_S, COUNTS, LARGEST, READY, REFUSED, UNREACHA
 from uavctl.mavlink.codec import decode
 from uavctl.mavlink.messages import TimeSync
 
-# A camera system's sights and clock as MAVLink.
-
-
 COMPONENT_ID = mavlink.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
 _UNKNOWN = [math.nan, *([0.0] * 20)]
 
 
-class Words:
-    """Frames of one source, numbered modulo 256."""
+class CameraMessageEncoder:
+    """Encoder of camera messages; numbers the frames modulo 256."""
 
     def __init__(self) -> None:
         self._mav = mavlink.MAVLink(None, srcSystem=CAMERA_SYSTEM_ID, srcComponent=COMPONENT_ID)
 
-    def say(self, told: BodyPose | Echo) -> bytes:
-        """ODOMETRY of a sight, in axes forward, right, down; TIMESYNC of an echo, whose token is our time."""
-        if isinstance(told, Echo):
-            return self._pack(mavlink.MAVLink_timesync_message(told.clock_ns, told.token))
+    def encode(self, item: BodyPose | Echo) -> bytes:
+        """Encode a pose as ODOMETRY in axes forward, right, down; an echo as TIMESYNC with our time as token."""
+        if isinstance(item, Echo):
+            return self._pack(mavlink.MAVLink_timesync_message(item.clock_ns, item.token))
         return self._pack(
             mavlink.MAVLink_odometry_message(
-                told.exposed_ns // 1000,
+                item.exposed_ns // 1000,
                 mavlink.MAV_FRAME_LOCAL_FRD,
                 mavlink.MAV_FRAME_BODY_FRD,
-                *told.position_m,
-                list(told.attitude),
+                *item.position_m,
+                list(item.attitude),
                 *(math.nan,) * 6,  # rates are not measured
                 _UNKNOWN,
                 _UNKNOWN,
@@ -69,8 +69,8 @@ class Words:
         return data
 
 
-def questions(data: bytes) -> tuple[int, ...]:
-    """The times that the requests for TIMESYNC in some MAVLink hold [ns]."""
+def parse_time_requests(data: bytes) -> tuple[int, ...]:
+    """Return the times in the TIMESYNC requests of some MAVLink data [ns]."""
     return tuple(
         message.ts1_ns
         for message in decode(data).messages
@@ -78,19 +78,19 @@ def questions(data: bytes) -> tuple[int, ...]:
     )
 
 
-WAITING = 64  # messages that wait for a daemon that does not read; the newest are kept
+MAX_QUEUE = 64  # newest messages that are kept while the daemon does not read
 OVERRUN = "source-queue"
 NOT_SERVER = "not-listed"
-_PIPE_BYTES = 8192  # asked of the kernel: what waits there cannot be replaced by newer
-_READS = 64
-_PAUSE_S = 0.1
-_AGAIN_S = 0.5  # between two attempts to connect a lost stream
-_COUNTS_S = 0.5
-_MEMORY = 2**30
+_PIPE_BYTES = 8192  # small kernel buffer: newer messages cannot replace those in it
+_MAX_READS = 64
+_POLL_S = 0.1
+_RECONNECT_S = 0.5  # between two attempts to connect a lost stream
+_COUNTS_PERIOD_S = 0.5
+_MEMORY_LIMIT = 2**30
 
 
-class Host:
-    """Passes on between a server of cameras and the daemon.
+class CameraHost:
+    """Passes data between a camera server and the daemon.
 
     Args:
         pipe: our end of the pair of sockets.
@@ -99,154 +99,154 @@ class Host:
 
     def __init__(self, camera: Camera, pipe: socket.socket, server: tuple[str, int], interface: str) -> None:
         self._camera, self._pipe, self._server, self._interface = camera, pipe, server, interface
-        self._words = Words()
-        self._waiting: deque[bytes] = deque()
-        self._lost: Counter[str] = Counter()
-        self._told: Counter[str] = Counter()
-        self._told_s = 0.0
-        self._ready = False
+        self._encoder = CameraMessageEncoder()
+        self._queue: deque[bytes] = deque()
+        self._dropped: Counter[str] = Counter()
+        self._reported_counts: Counter[str] = Counter()
+        self._reported_s = 0.0
+        self._is_ready = False
         self._group: tuple[str, int] | None = None
         self._group_socket: socket.socket | None = None
-        self._stream: bool = getattr(camera, "stream", False)
+        self._is_stream: bool = getattr(camera, "stream", False)
         self._connected_s = time.monotonic()  # of the last attempt
-        self._command: socket.socket | None = self._reach(ANSWER_S)
+        self._server_socket: socket.socket | None = self._connect(ANSWER_S)
         pipe.setblocking(False)
 
-    def _reach(self, patience_s: float) -> socket.socket:
+    def _connect(self, timeout_s: float) -> socket.socket:
         """Open the socket to the server."""
-        reached = socket.socket(socket.AF_INET, socket.SOCK_STREAM if self._stream else socket.SOCK_DGRAM)
+        server_socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM if self._is_stream else socket.SOCK_DGRAM)
         try:
-            reached.bind((self._interface, 0))
-            if self._stream:
-                reached.settimeout(patience_s)
-                reached.connect(self._server)
-                reached.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            server_socket.bind((self._interface, 0))
+            if self._is_stream:
+                server_socket.settimeout(timeout_s)
+                server_socket.connect(self._server)
+                server_socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                 self._camera.receive(b"", time.monotonic_ns())
         except OSError:
-            reached.close()
+            server_socket.close()
             raise
-        reached.setblocking(False)
-        return reached
+        server_socket.setblocking(False)
+        return server_socket
 
-    def _reach_again(self) -> None:
-        """Connect a lost stream again, if it is time."""
-        if time.monotonic() - self._connected_s < _AGAIN_S:
+    def _reconnect(self) -> None:
+        """Reconnect a lost stream after a pause."""
+        if time.monotonic() - self._connected_s < _RECONNECT_S:
             return
         self._connected_s = time.monotonic()
         with suppress(OSError):
-            self._command = self._reach(_PAUSE_S)
+            self._server_socket = self._connect(_POLL_S)
 
-    def _lose(self) -> None:
-        self._lost["connection-lost"] += 1
-        if self._command is not None:
-            self._command.close()
-        self._command = None
+    def _disconnect(self) -> None:
+        self._dropped["connection-lost"] += 1
+        if self._server_socket is not None:
+            self._server_socket.close()
+        self._server_socket = None
 
     def run(self) -> None:
-        """Serve until the daemon has gone.
+        """Run until the daemon has gone.
 
         Raises:
             CameraError: the server cannot be used as it is set up.
             TimeoutError: it did not answer.
         """
-        began_s = time.monotonic()
-        while self._turn():
-            if not self._ready and time.monotonic() - began_s > ANSWER_S:
+        start_s = time.monotonic()
+        while self._poll():
+            if not self._is_ready and time.monotonic() - start_s > ANSWER_S:
                 raise TimeoutError(f"no {self._camera.awaits} within {ANSWER_S:g} s")
-            self._count()
+            self._report_counts()
 
     def close(self) -> None:
         """Release the sockets to the server."""
-        if self._command is not None:
-            self._command.close()
+        if self._server_socket is not None:
+            self._server_socket.close()
         if self._group_socket is not None:
             self._group_socket.close()
 
-    def _turn(self) -> bool:
-        """Wait for something and pass it on; False once the daemon has gone."""
-        if self._command is None:
-            self._reach_again()
+    def _poll(self) -> bool:
+        """Wait for data and pass them on; False once the daemon has gone."""
+        if self._server_socket is None:
+            self._reconnect()
         for data in self._camera.due(time.monotonic_ns()):
             self._send(data)
         self._follow_group()
-        sources = [one for one in (self._command, self._group_socket) if one is not None]
-        readable, _, _ = select.select([self._pipe, *sources], [self._pipe] if self._waiting else [], [], _PAUSE_S)
-        for one in sources:
-            if one in readable:
-                self._hear(one)
+        sources = [source for source in (self._server_socket, self._group_socket) if source is not None]
+        readable, _, _ = select.select([self._pipe, *sources], [self._pipe] if self._queue else [], [], _POLL_S)
+        for source in sources:
+            if source in readable:
+                self._receive(source)
         self._flush()
-        return self._pipe not in readable or self._ask()
+        return self._pipe not in readable or self._forward_time_requests()
 
     def _send(self, data: bytes) -> None:
-        if self._command is None or not data:
+        if self._server_socket is None or not data:
             return
         try:
-            if self._stream:  # a handful of short words, for which there is room
-                self._command.sendall(data)
+            if self._is_stream:  # a few short commands: they fit into the buffer
+                self._server_socket.sendall(data)
             else:
-                self._command.sendto(data, self._server)
-        except OSError:  # no route for now: asked again
-            self._lost["unsent"] += 1
+                self._server_socket.sendto(data, self._server)
+        except OSError:  # no route for now: sent again later
+            self._dropped["unsent"] += 1
 
-    def _hear(self, source: socket.socket) -> None:
-        for _ in range(_READS):
+    def _receive(self, source: socket.socket) -> None:
+        for _ in range(_MAX_READS):
             try:
                 data, sender = source.recvfrom(LARGEST)
             except BlockingIOError:
                 return
             except OSError:  # the server's port is closed
-                if self._stream:
-                    self._lose()
+                if self._is_stream:
+                    self._disconnect()
                     return
                 continue
-            if self._stream and not data:
-                self._lose()
+            if self._is_stream and not data:
+                self._disconnect()
                 return
-            if not self._stream and sender[0] != self._server[0]:
-                self._lost[NOT_SERVER] += 1
+            if not self._is_stream and sender[0] != self._server[0]:
+                self._dropped[NOT_SERVER] += 1
                 continue
-            heard = self._camera.receive(data, time.monotonic_ns())
-            if self._camera.ready and not self._ready:  # before any position: the daemon waits for this word
-                self._ready = True
-                self._post(READY)
-            for told in heard:
-                self._post(self._words.say(told))
+            items = self._camera.receive(data, time.monotonic_ns())
+            if self._camera.ready and not self._is_ready:  # before any position: the daemon waits for this message
+                self._is_ready = True
+                self._queue_message(READY)
+            for item in items:
+                self._queue_message(self._encoder.encode(item))
 
-    def _ask(self) -> bool:
-        """Pass on the daemon's questions for the time; False if it has gone."""
+    def _forward_time_requests(self) -> bool:
+        """Pass on the daemon's time requests; False if it has gone."""
         try:
             data = self._pipe.recv(LARGEST)
         except BlockingIOError:
             return True
         except OSError:
             return False
-        for token in questions(data):
+        for token in parse_time_requests(data):
             self._send(self._camera.ask_time(token))
         return bool(data)
 
-    def _post(self, message: bytes) -> None:
-        if len(self._waiting) >= WAITING:
-            self._waiting.popleft()
-            self._lost[OVERRUN] += 1
-        self._waiting.append(message)
+    def _queue_message(self, message: bytes) -> None:
+        if len(self._queue) >= MAX_QUEUE:
+            self._queue.popleft()
+            self._dropped[OVERRUN] += 1
+        self._queue.append(message)
         self._flush()
 
     def _flush(self) -> None:
-        while self._waiting:
+        while self._queue:
             try:
-                self._pipe.send(self._waiting[0])
-            except OSError:  # full: later. Gone: seen when it is read
+                self._pipe.send(self._queue[0])
+            except OSError:  # full: sent later; closed: found at the next read
                 return
-            self._waiting.popleft()
+            self._queue.popleft()
 
-    def _count(self) -> None:
-        counts = self._camera.dropped + self._lost
-        if counts != self._told and time.monotonic() - self._told_s >= _COUNTS_S:
-            self._told, self._told_s = counts, time.monotonic()
-            self._post(COUNTS + json.dumps(counts).encode())
+    def _report_counts(self) -> None:
+        counts = self._camera.dropped + self._dropped
+        if counts != self._reported_counts and time.monotonic() - self._reported_s >= _COUNTS_PERIOD_S:
+            self._reported_counts, self._reported_s = counts, time.monotonic()
+            self._queue_message(COUNTS + json.dumps(counts).encode())
 
     def _follow_group(self) -> None:
-        """Join the group that the server streams to, if it streams to one."""
+        """Join the multicast group of the server, if there is one."""
         if self._camera.group == self._group:
             return
         self._group = self._camera.group
@@ -254,37 +254,37 @@ class Host:
             self._group_socket.close()
             self._group_socket = None
         if self._group is not None:
-            self._group_socket = _joined(self._group, self._interface)
+            self._group_socket = _join_group(self._group, self._interface)
 
 
-def _joined(group: tuple[str, int], interface: str) -> socket.socket:
-    joined = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    joined.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # others on this computer may listen too
+def _join_group(group: tuple[str, int], interface: str) -> socket.socket:
+    group_socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    group_socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # others on this computer may listen too
     member = struct.pack("4s4s", socket.inet_aton(group[0]), socket.inet_aton(interface))
     try:
-        joined.bind(group)
-        joined.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, member)
+        group_socket.bind(group)
+        group_socket.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, member)
     except OSError as error:
-        joined.close()
+        group_socket.close()
         raise CameraError(
             f"the server streams to group {group[0]}, which cannot be joined ({error.strerror}); "
             "write interface=ADDRESS with this computer's address in the cameras' network, or stream unicast"
         ) from error
-    joined.setblocking(False)
-    return joined
+    group_socket.setblocking(False)
+    return group_socket
 
 
-def _made(camera: str, body: str, up: Up) -> Camera:
-    """Make the class of a camera system, `module:Class`; modules of the working directory count last.
+def _make_camera(camera: str, body: str, up: Up) -> Camera:
+    """Import and create a camera class, `module:Class`; modules of the working directory count last.
 
     Raises:
-        CameraError: it cannot be.
+        CameraError: that fails.
     """
     module, _, name = camera.partition(":")
     sys.path.append(os.getcwd())  # noqa: PTH109 as text
     try:
-        make: Callable[[str, Up], Camera] = getattr(import_module(module), name)
-        return make(body, up)
+        create: Callable[[str, Up], Camera] = getattr(import_module(module), name)
+        return create(body, up)
     except CameraError:
         raise
     except Exception as error:
@@ -297,12 +297,12 @@ def _made(camera: str, body: str, up: Up) -> Camera:
 def main(arguments: list[str]) -> int:
     """Run for the daemon that started this process."""
     descriptor, camera, address, port, body, up, interface = arguments
-    resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
+    resource.setrlimit(resource.RLIMIT_AS, (_MEMORY_LIMIT, _MEMORY_LIMIT))
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # never beside the control loop of a --realtime daemon
     with socket.socket(fileno=int(descriptor)) as pipe:
         pipe.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _PIPE_BYTES)
         try:
-            host = Host(_made(camera, body, cast(Up, up)), pipe, (address, int(port)), interface)
+            host = CameraHost(_make_camera(camera, body, cast(Up, up)), pipe, (address, int(port)), interface)
             try:
                 host.run()
             finally:

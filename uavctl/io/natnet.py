@@ -19,7 +19,7 @@ from ipaddress import IPv4Address
 
 import natnet
 
-from uavctl.frames import Quaternion, Up, levelled, unit
+from uavctl.frames import Quaternion, Up, convert_pose_to_frd, normalise_quaternion
 from uavctl.io.camera import BodyPose, CameraError, Echo
 
 CONNECT, SERVER_INFO = 0, 1
@@ -58,9 +58,9 @@ class NatNet:
         self._version: natnet.Version | None = None
         self._ticks_per_s = 0
         self._body_id: int | None = None
-        self._heard_ns = self._asked_ns = self._kept_ns = -_SILENT_NS
+        self._heard_ns = self._asked_ns = self._keep_alive_ns = -_SILENT_NS
         self._requests = 0
-        self._complete = False
+        self._is_complete = False
         self._info = b""
         self.ready = False
         self.group: tuple[str, int] | None = None
@@ -81,48 +81,54 @@ class NatNet:
             self._heard_ns = at_ns
         try:
             if kind == SERVER_INFO:
-                self._server(payload)
+                self._handle_server_info(payload)
             elif kind == ECHO and self._ticks_per_s:
                 token, ticks = _ECHO.unpack_from(payload)
-                return (Echo(token, self._ns(ticks)),)
+                return (Echo(token, self._ticks_to_ns(ticks)),)
             elif kind == DESCRIPTIONS and self._version is not None:
-                self._describe(natnet.DataDescriptions.read_from_buffer(natnet.PacketBuffer(payload), self._version))
-            elif kind == FRAME and self._version is not None and self._complete:
-                return self._frame(natnet.DataFrame.read_from_buffer(natnet.PacketBuffer(payload), self._version))
+                self._handle_descriptions(
+                    natnet.DataDescriptions.read_from_buffer(natnet.PacketBuffer(payload), self._version)
+                )
+            elif kind == FRAME and self._version is not None and self._is_complete:
+                return self._handle_frame(
+                    natnet.DataFrame.read_from_buffer(natnet.PacketBuffer(payload), self._version)
+                )
         except _UNREADABLE:
             self.dropped[UNREADABLE] += 1
         return ()
 
     def due(self, at_ns: int) -> tuple[bytes, ...]:
         """See `Camera`: until it answers, and again when it is silent, twice a second at most."""
-        silent = at_ns - self._heard_ns >= _SILENT_NS
-        if (silent or not self._complete) and at_ns - self._asked_ns >= _RETRY_NS:
+        is_silent = at_ns - self._heard_ns >= _SILENT_NS
+        if (is_silent or not self._is_complete) and at_ns - self._asked_ns >= _RETRY_NS:
             self._asked_ns = at_ns
-            if silent and self.ready:
+            if is_silent and self.ready:
                 self.dropped[SILENT] += 1
-                self._complete = False  # another server may come back, with other numbers for its bodies
-            if silent or self._version is None:
-                return (_message(CONNECT, b"Ping\0"),)
+                self._is_complete = False  # another server may come back, with other numbers for its bodies
+            if is_silent or self._version is None:
+                return (_encode_message(CONNECT, b"Ping\0"),)
             self._requests += 1
-            return (_message(REQUEST_DESCRIPTIONS, struct.pack("<I", RIGID_BODIES) if self._requests % 2 else b""),)
-        if self._version is not None and at_ns - self._kept_ns >= _KEEP_NS:
-            self._kept_ns = at_ns
-            return (_message(KEEP_ALIVE, b""),)
+            return (
+                _encode_message(REQUEST_DESCRIPTIONS, struct.pack("<I", RIGID_BODIES) if self._requests % 2 else b""),
+            )
+        if self._version is not None and at_ns - self._keep_alive_ns >= _KEEP_NS:
+            self._keep_alive_ns = at_ns
+            return (_encode_message(KEEP_ALIVE, b""),)
         return ()
 
     def ask_time(self, token: int) -> bytes:
         """See `Camera`."""
-        return _message(ECHO_REQUEST, struct.pack("<Q", token))
+        return _encode_message(ECHO_REQUEST, struct.pack("<Q", token))
 
-    def _ns(self, ticks: int) -> int:
+    def _ticks_to_ns(self, ticks: int) -> int:
         return ticks * 1_000_000_000 // self._ticks_per_s
 
-    def _server(self, payload: bytes) -> None:
-        """Learn version, clock and group; a server that began anew is asked for its bodies again."""
+    def _handle_server_info(self, payload: bytes) -> None:
+        """Store version, clock and group; a restarted server is asked for its bodies again."""
         if len(payload) < _SERVER.size:  # as before 3.0
             self._refuse("an older NatNet than 3.0, whose frames have no time of exposure; use Motive 2.0 or newer")
             return
-        if payload == self._info and self._complete:  # nothing new
+        if payload == self._info and self._is_complete:  # nothing new
             return
         fields = _SERVER.unpack_from(payload)
         version, (ticks_per_s, port, multicast, group) = fields[5:9], fields[9:]
@@ -134,46 +140,48 @@ class NatNet:
             self._refuse(f"NatNet {text} without the rate of its clock, so nobody could tell how old its frames are")
             return
         self._info, self._version, self._ticks_per_s = payload, natnet.Version(*version), ticks_per_s
-        self._complete = False
+        self._is_complete = False
         self.group = (str(IPv4Address(group)), port) if multicast else None
 
-    def _describe(self, descriptions: natnet.DataDescriptions) -> None:
-        bodies = {one.name: one.id_num for one in descriptions.rigid_bodies}
+    def _handle_descriptions(self, descriptions: natnet.DataDescriptions) -> None:
+        bodies = {candidate.name: candidate.id_num for candidate in descriptions.rigid_bodies}
         self._body_id = bodies.get(self._body)
         if self._body_id is None:
-            seen = ", ".join(repr(name) for name in sorted(filter(None, bodies))) or "none"
-            self._refuse(f"no rigid body {self._body!r}; it has: {seen}. Write one of them behind the server's address")
+            names = ", ".join(repr(name) for name in sorted(filter(None, bodies))) or "none"
+            self._refuse(
+                f"no rigid body {self._body!r}; it has: {names}. Write one of them behind the server's address"
+            )
             return
-        self._complete = self.ready = True
+        self._is_complete = self.ready = True
 
-    def _frame(self, frame: natnet.DataFrame) -> tuple[BodyPose, ...]:
-        body = next((one for one in frame.rigid_bodies if one.id_num == self._body_id), None)
+    def _handle_frame(self, frame: natnet.DataFrame) -> tuple[BodyPose, ...]:
+        body = next((candidate for candidate in frame.rigid_bodies if candidate.id_num == self._body_id), None)
         exposed, sent = frame.suffix.stamp_camera_mid_exposure, frame.suffix.stamp_transmit
         if body is None:
-            return self._drop(MISSING)
-        if not exposed or not sent:  # a take that is played back, say
-            return self._drop(NO_STAMP)
+            return self._count_dropped(MISSING)
+        if not exposed or not sent:  # for example a recorded take
+            return self._count_dropped(NO_STAMP)
         x, y, z, w = body.rot
-        attitude = unit((w, x, y, z))
+        attitude = normalise_quaternion((w, x, y, z))
         if not 0 <= sent - exposed <= _MAX_EXPOSED_S * self._ticks_per_s:
-            return self._drop(UNREADABLE)
+            return self._count_dropped(UNREADABLE)
         if not body.tracking_valid or attitude is None or not all(map(math.isfinite, body.pos)):
-            return self._drop(UNTRACKED)
-        return (self._sight(exposed, body.pos, attitude),)
+            return self._count_dropped(UNTRACKED)
+        return (self._make_pose(exposed, body.pos, attitude),)
 
-    def _sight(self, exposed_ticks: int, position_m: tuple[float, float, float], attitude: Quaternion) -> BodyPose:
-        return BodyPose(self._ns(exposed_ticks), *levelled(position_m, attitude, self._up))
+    def _make_pose(self, exposed_ticks: int, position_m: tuple[float, float, float], attitude: Quaternion) -> BodyPose:
+        return BodyPose(self._ticks_to_ns(exposed_ticks), *convert_pose_to_frd(position_m, attitude, self._up))
 
-    def _drop(self, reason: str) -> tuple[BodyPose, ...]:
+    def _count_dropped(self, reason: str) -> tuple[BodyPose, ...]:
         self.dropped[reason] += 1
         return ()
 
     def _refuse(self, text: str) -> None:
-        """End the start with an error; a flight goes on without positions, and counts."""
+        """End the start with an error; in flight, only count."""
         if not self.ready:
             raise CameraError(f"the server has {text}")
         self.dropped[MISSING] += 1
 
 
-def _message(kind: int, payload: bytes) -> bytes:
+def _encode_message(kind: int, payload: bytes) -> bytes:
     return _HEAD.pack(kind, len(payload)) + payload

@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 
 from qtm_rt.packet import QRTComponentType, QRTPacket
 
-from uavctl.frames import Quaternion, Up, levelled, unit
+from uavctl.frames import Quaternion, Up, convert_pose_to_frd, normalise_quaternion
 from uavctl.io.camera import BodyPose, CameraError, Echo
 from uavctl.records import Vec3
 
@@ -49,9 +49,9 @@ class Qualisys:
 
     def __init__(self, body: str, up: Up) -> None:
         self._body, self._up = body, up
-        self._place: int | None = None  # of the body among those of a frame
-        self._rest = bytearray()
-        self._say: list[bytes] = []
+        self._body_index: int | None = None  # of the body among those of a frame
+        self._buffer = bytearray()
+        self._outgoing: list[bytes] = []
         self._heard_ns = 0
         self.ready, self.awaits = False, "answer"
         self.group: tuple[str, int] | None = None
@@ -61,105 +61,107 @@ class Qualisys:
         """See `Camera`; no bytes at all are a connection that begins."""
         self._heard_ns = at_ns
         if not data:
-            self._rest.clear()
-            self._say.clear()
-            self._place = None
+            self._buffer.clear()
+            self._outgoing.clear()
+            self._body_index = None
             return ()
-        self._rest += data
-        found: list[BodyPose | Echo] = []
-        while len(self._rest) >= _HEAD.size:
-            size, kind = _HEAD.unpack_from(self._rest)
-            if not _HEAD.size <= size <= LARGEST:  # the stream is out of step: it has to begin anew
+        self._buffer += data
+        results: list[BodyPose | Echo] = []
+        while len(self._buffer) >= _HEAD.size:
+            size, kind = _HEAD.unpack_from(self._buffer)
+            if not _HEAD.size <= size <= LARGEST:  # the stream is out of step: it has to restart
                 self.dropped[UNREADABLE] += 1
-                self._rest.clear()
-                self._say.append(_command("Quit"))
+                self._buffer.clear()
+                self._outgoing.append(_encode_command("Quit"))
                 break
-            if len(self._rest) < size:
+            if len(self._buffer) < size:
                 break
-            payload = bytes(self._rest[_HEAD.size : size])
-            del self._rest[:size]
+            payload = bytes(self._buffer[_HEAD.size : size])
+            del self._buffer[:size]
             try:
-                found += self._packet(kind, payload)
+                results += self._handle_packet(kind, payload)
             except _UNREADABLE:
                 self.dropped[UNREADABLE] += 1
-        return tuple(found)
+        return tuple(results)
 
     def due(self, at_ns: int) -> tuple[bytes, ...]:
-        """See `Camera`: what is to be said, and the wish for frames again when none have come for a second."""
-        if self._place is not None and at_ns - self._heard_ns >= _SILENT_NS:
+        """See `Camera`: queued commands, and a request for frames after one second without any."""
+        if self._body_index is not None and at_ns - self._heard_ns >= _SILENT_NS:
             self._heard_ns = at_ns
             self.dropped[SILENT] += 1
-            self._ask()
-        said = tuple(self._say)
-        self._say.clear()
-        return said
+            self._request_bodies()
+        outgoing = tuple(self._outgoing)
+        self._outgoing.clear()
+        return outgoing
 
     def ask_time(self, token: int) -> bytes:
-        """See `Camera`: QTM tells its time with frames alone."""
+        """See `Camera`: QTM sends its time only with frames."""
         del token
         return b""
 
-    def _ask(self) -> None:
-        self._say.append(_command("GetParameters 6D"))
+    def _request_bodies(self) -> None:
+        self._outgoing.append(_encode_command("GetParameters 6D"))
 
-    def _packet(self, kind: int, payload: bytes) -> tuple[BodyPose, ...]:
+    def _handle_packet(self, kind: int, payload: bytes) -> tuple[BodyPose, ...]:
         if kind == COMMAND and payload.startswith(WELCOME):
-            self._say.append(_command(f"Version {VERSION}"))
+            self._outgoing.append(_encode_command(f"Version {VERSION}"))
         elif kind == COMMAND and payload.startswith(b"Version set"):
             self.awaits = "names of rigid bodies, though the server answers,"
-            self._ask()
+            self._request_bodies()
         elif kind == ERROR:
             self._refuse(f"refused a request: {payload.rstrip(bytes(1)).decode(errors='replace')}")
         elif kind == XML:
-            self._describe(payload.rstrip(b"\0"))
-        elif kind == EVENT and payload and payload[0] in CHANGED and self._place is not None:
-            self._ask()
+            self._handle_bodies(payload.rstrip(b"\0"))
+        elif kind == EVENT and payload and payload[0] in CHANGED and self._body_index is not None:
+            self._request_bodies()
         elif kind == NO_DATA:
             self.dropped[NO_MEASUREMENT] += 1
-        elif kind == DATA and self._place is not None:
-            return self._frame(QRTPacket(payload))
+        elif kind == DATA and self._body_index is not None:
+            return self._handle_frame(QRTPacket(payload))
         return ()
 
-    def _describe(self, text: bytes) -> None:
+    def _handle_bodies(self, text: bytes) -> None:
         names = [(name.text or "").strip() for name in ElementTree.fromstring(text).iterfind("./The_6D/Body/Name")]
         if self._body not in names:
-            self._place = None
-            seen = ", ".join(map(repr, sorted(names))) or "none"
-            self._refuse(f"has no rigid body {self._body!r}; it has: {seen}. Write one of them behind its address")
+            self._body_index = None
+            names_text = ", ".join(map(repr, sorted(names))) or "none"
+            self._refuse(
+                f"has no rigid body {self._body!r}; it has: {names_text}. Write one of them behind its address"
+            )
             return
-        self._place, self.ready = names.index(self._body), True
-        self._say.append(_command("StreamFrames AllFrames 6D"))
+        self._body_index, self.ready = names.index(self._body), True
+        self._outgoing.append(_encode_command("StreamFrames AllFrames 6D"))
 
-    def _frame(self, frame: QRTPacket) -> tuple[BodyPose, ...]:
+    def _handle_frame(self, frame: QRTPacket) -> tuple[BodyPose, ...]:
         if QRTComponentType.Component6d not in frame.components:
-            return self._drop(NO_MEASUREMENT)
+            return self._count_dropped(NO_MEASUREMENT)
         _, bodies = frame.get_6d()
-        if self._place is None or self._place >= len(bodies):
-            return self._drop(MISSING)
-        place, rotation = bodies[self._place]
-        attitude = _turn(rotation.matrix)
+        if self._body_index is None or self._body_index >= len(bodies):
+            return self._count_dropped(MISSING)
+        place, rotation = bodies[self._body_index]
+        attitude = _quaternion_from_matrix(rotation.matrix)
         if attitude is None or not all(map(math.isfinite, place)):
-            return self._drop(UNTRACKED)
+            return self._count_dropped(UNTRACKED)
         position_m: Vec3 = (place.x * 1e-3, place.y * 1e-3, place.z * 1e-3)
-        return (BodyPose(frame.timestamp * 1000, *levelled(position_m, attitude, self._up)),)
+        return (BodyPose(frame.timestamp * 1000, *convert_pose_to_frd(position_m, attitude, self._up)),)
 
-    def _drop(self, reason: str) -> tuple[BodyPose, ...]:
+    def _count_dropped(self, reason: str) -> tuple[BodyPose, ...]:
         self.dropped[reason] += 1
         return ()
 
     def _refuse(self, text: str) -> None:
-        """End the start with an error; a flight goes on without positions, and counts."""
+        """End the start with an error; in flight, only count."""
         if not self.ready:
             raise CameraError(f"the server {text}")
         self.dropped[MISSING] += 1
 
 
-def _command(words: str) -> bytes:
-    text = words.encode() + b"\0"
-    return _HEAD.pack(_HEAD.size + len(text), COMMAND) + text
+def _encode_command(command: str) -> bytes:
+    payload = command.encode() + b"\0"
+    return _HEAD.pack(_HEAD.size + len(payload), COMMAND) + payload
 
 
-def _turn(columns: tuple[float, ...]) -> Quaternion | None:
+def _quaternion_from_matrix(columns: tuple[float, ...]) -> Quaternion | None:
     """Return the quaternion (w, x, y, z) of a rotation matrix given by columns; None if it is none."""
     a, d, g, b, e, h, c, f, i = columns  # rows are a b c, d e f, g h i
     squares = 1.0 + a + e + i, 1.0 + a - e - i, 1.0 - a + e - i, 1.0 - a - e + i
@@ -173,4 +175,4 @@ def _turn(columns: tuple[float, ...]) -> Quaternion | None:
         (c - g, b + d, squares[2], f + h),
         (d - b, c + g, f + h, squares[3]),
     )
-    return unit(tuple(value / two for value in rows[largest]))
+    return normalise_quaternion(tuple(value / two for value in rows[largest]))

@@ -133,8 +133,8 @@ class OwnLoop:
         for item in understood.items:
             if isinstance(item, PositionSample):
                 self.samples.append(item)
-                self.relay.take(item, understood.attitude or LEVEL)  # of a body that is quite level none is told
-        answers = tuple(Outgoing(link=link, data=answer) for answer in understood.answers)
+                self.relay.add_sample(item, understood.attitude or LEVEL)  # of a body that is quite level none is told
+        answers = tuple(Outgoing(link=link, data=answer) for answer in understood.replies)
         return Received((*answers, *self._pass_on(at_ns)) if self.tuning.at_once else answers, True, True)
 
     def tick(self, tick: int, at_ns: int, send: Send) -> None:
@@ -151,7 +151,7 @@ class OwnLoop:
             send(self._setpoint(vehicle, (at_ns - self.begun_ns) * 1e-9, at_ns))
 
     def _pass_on(self, at_ns: int) -> list[Outgoing]:
-        poses = self._links[VEHICLE].relay(self.relay, at_ns, refused=())
+        poses = self._links[VEHICLE].encode_relayed_poses(self.relay, at_ns, refused=())
         return [Outgoing(link=VEHICLE, data=data) for data in poses]
 
     def _setpoint(self, vehicle: tuple[int, int], since_s: float, at_ns: int) -> Outgoing:

@@ -1,8 +1,9 @@
-"""A source's stamps to our monotonic clock; pure, time is an argument.
+"""Time stamps of a source to our monotonic clock. Pure; time is an argument.
 
-Two estimates of (our time − its time): from TIMESYNC round trips if the source answers them, else the
-minimum of (received − stamp), which is the true offset plus the smallest delay; `latency`, the smallest delay as
-configured, is taken off again.
+1. If the source answers TIMESYNC, the middle of a round trip gives the offset: (t_sent + t_received)/2 − t_remote.
+2. `TimesyncClock` fits a robust line through the last offsets, because simulated clocks drift by up to 3 %.
+3. Otherwise the minimum of (received − stamp) gives the offset plus the smallest delay; `latency` is subtracted.
+4. `ClockSync` refuses stamps that its clock cannot have given. After a few that agree, it starts a new clock.
 """
 
 from __future__ import annotations
@@ -12,24 +13,24 @@ from enum import StrEnum
 from itertools import combinations
 from statistics import median, median_low
 
+from uavctl.arrays import SECOND_NS
 from uavctl.records import Vec3
 
-MAX_ROUND_TRIP_NS = 1_000_000_000  # a slower answer bounds the offset by nothing of use
-NEAR_NS = 10_000_000  # a round trip that is so much longer than the shortest says as much
-# By which a clock's drift may change: real ones keep 1e-4, that of a simulator on a busy computer is followed so.
+MAX_ROUND_TRIP_NS = SECOND_NS  # a longer round trip gives no useful bound
+ROUND_TRIP_MARGIN_NS = 10_000_000  # more than the shortest: as good as the shortest
+# Largest change of a drift. Real clocks keep 1e-4; this value follows a simulator on a busy computer.
 DRIFT_CHANGE = 2e-3
-SECOND_NS = 1_000_000_000
 MAX_DEVIATION_NS = 100_000_000
-RESYNC_AFTER = 5  # deviating values in a row that are believed
-LEAP_NS = 1_000_000_000
-SETTLED_AFTER = 20  # samples before the minimum is trusted to judge the next stamp
-AGREE_NS = 200_000_000  # spread of the delays of one new clock
-REMEMBERED_STAMPS = 64
-FITTED = 5  # round trips that the line of a clock goes through: few, as a busy computer's clock changes its pace
-MIN_FITTED = 3
-MIN_SPAN_NS = 2_000_000_000  # between the first and the last of them: nearer ones say nothing of a drift
+RESYNC_AFTER = 5  # deviating values in a row that show a new clock
+MAX_CLOCK_STEP_NS = SECOND_NS
+MIN_SAMPLES = 20  # samples before the minimum may refuse a stamp
+MAX_DELAY_SPREAD_NS = 200_000_000  # spread of the delays of one new clock
+STAMP_HISTORY = 64
+FIT_POINTS = 5  # round trips of a line: few, because the drift of a busy computer's clock changes
+MIN_FIT_POINTS = 3
+MIN_FIT_SPAN_NS = 2_000_000_000  # from first to last: a shorter span shows no drift
 MAX_DRIFT = 0.05  # recorded: up to 0.034
-REMEMBERED_TRIPS = 60
+ROUND_TRIP_HISTORY = 60
 
 
 class StampRefusal(StrEnum):
@@ -49,56 +50,56 @@ class ClockSource(StrEnum):
 
 
 class StampUnit(StrEnum):
-    """Unit of a source's stamps; MAVLink wants microseconds."""
+    """Unit of a source's stamps; MAVLink requires microseconds."""
 
     MICROSECONDS = "us"
     MILLISECONDS = "ms"
     NANOSECONDS = "ns"
     SECONDS = "s"
-    CONSTANT = "constant"  # they do not go on at all
+    CONSTANT = "constant"  # they do not advance
 
 
-_PER_SECOND = {
+_UNITS_PER_SECOND = {
     StampUnit.SECONDS: 1.0,
     StampUnit.MILLISECONDS: 1e3,
     StampUnit.MICROSECONDS: 1e6,
     StampUnit.NANOSECONDS: 1e9,
 }
-UNIT_NS = 1_500_000_000  # over which stamps are compared with our clock: stamps in s go on in it
+UNIT_WINDOW_NS = 1_500_000_000  # comparison of stamps with our clock: stamps in s advance within it
 
 
-class StampUnitWatch:
-    """Recognises the unit of a source's stamps by how fast they go on, against our clock.
+class StampUnitDetector:
+    """Detects the unit of a source's stamps from their rate against our clock.
 
     Attributes:
-        unit: as recognised; microseconds until another one is.
+        unit: the detected unit; microseconds before a detection.
     """
 
     def __init__(self) -> None:
         self.unit = StampUnit.MICROSECONDS
-        self._begun: tuple[int, int, Vec3] | None = None  # stamp, arrival, position
+        self._reference: tuple[int, int, Vec3] | None = None  # stamp, arrival, position
 
-    def take(self, stamp: int, position_m: Vec3, at_ns: int) -> StampUnit:
-        """Take a stamp, and the position that has it; return the unit.
+    def update(self, stamp: int, position_m: Vec3, at_ns: int) -> StampUnit:
+        """Add a stamp and its position; return the unit.
 
-        The same stamp with the same position is a repeated message, and says nothing of the unit.
+        The same stamp with the same position is a repeated message and does not show the unit.
         """
-        if self._begun is None:
-            self._begun = stamp, at_ns, position_m
-        elif at_ns - self._begun[1] >= UNIT_NS:
-            advance, passed_s = stamp - self._begun[0], (at_ns - self._begun[1]) * 1e-9
-            if advance == 0 and position_m != self._begun[2]:
+        if self._reference is None:
+            self._reference = stamp, at_ns, position_m
+        elif at_ns - self._reference[1] >= UNIT_WINDOW_NS:
+            advance, passed_s = stamp - self._reference[0], (at_ns - self._reference[1]) * 1e-9
+            if advance == 0 and position_m != self._reference[2]:
                 self.unit = StampUnit.CONSTANT
-            for unit, per_second in _PER_SECOND.items():
+            for unit, per_second in _UNITS_PER_SECOND.items():
                 # Whole seconds may be one more or less than have passed.
                 if 0.5 * per_second * passed_s <= advance <= 2.0 * per_second * passed_s:
                     self.unit = unit
-            self._begun = stamp, at_ns, position_m
+            self._reference = stamp, at_ns, position_m
         return self.unit
 
 
 class SlidingMinimum:
-    """Minimum over a window of time, amortised O(1): values that a later, smaller one outlives are dropped."""
+    """Minimum over a sliding time window, amortised O(1): a new value removes all larger ones before it."""
 
     def __init__(self, window_ns: int) -> None:
         self._window_ns = window_ns
@@ -123,75 +124,75 @@ class SlidingMinimum:
         self._queue.clear()
 
 
-class RoundTrips:
+class TimesyncClock:
     """Offset and drift of a peer's clock from its answers to TIMESYNC requests.
 
-    An answer bounds the offset: the peer read its clock between our sending and our receiving, so the middle is off by
-    half the round trip at most. The offset is that of a robust line (Theil and Sen: median of the slopes between all
-    pairs) through the last answers that are about as short as the shortest. A longer one counts like these once the
-    line may be off by as much, as its uncertainty grows with time; before that it only keeps the line in its bounds.
-    Without answers the line goes on. Against the recorded flights, just before each next answer: a simulator whose
-    clock ran 1.3 % slow is followed to 2.8 ms (median; an average of the offsets alone was 47 ms behind), steady ones
-    to 0.5 ms.
+    The peer reads its clock between our sending and our receiving. So the middle is wrong by half the round trip at
+    most. The offset is that of a robust line (Theil and Sen: median of the slopes between all pairs) through the last
+    short round trips. The uncertainty of the line grows with time. A longer round trip joins the line once it is as
+    certain as the line; before that it only bounds the line. Without answers the line is extrapolated.
+
+    Errors in recorded flights, just before each next answer (median): 2.8 ms for a simulator whose clock ran 1.3 %
+    slow (47 ms for an average of the offsets), 0.5 ms for steady clocks.
 
     Attributes:
-        rejected: answers that were not used: too slow to say anything, or of another clock.
-        shortest_ns: the shortest round trip of those that the line goes through.
+        rejected: answers that were not used: too slow, or of another clock.
+        shortest_round_trip_ns: the shortest round trip of the line.
     """
 
     def __init__(self, lifetime_ns: int) -> None:
         self._lifetime_ns = lifetime_ns
-        self._trips: deque[tuple[int, int, int]] = deque(maxlen=FITTED)  # (received, offset, round trip)
-        self._round_trips_ns: deque[int] = deque(maxlen=REMEMBERED_TRIPS)
-        self._drifts = False  # whether the slope is known
+        self._answers: deque[tuple[int, int, int]] = deque(maxlen=FIT_POINTS)  # (received, offset, round trip)
+        self._round_trips_ns: deque[int] = deque(maxlen=ROUND_TRIP_HISTORY)
+        self._has_drift = False  # whether the slope is known
         self._slope = 0.0
-        self._base_ns = 0
-        self._base_at_ns = 0
-        self._heard_ns = 0  # arrival of the last answer that was used
-        self._deviating = 0
+        self._line_ns = 0
+        self._line_at_ns = 0
+        self._used_ns = 0  # arrival of the last answer that was used
+        self._deviating_count = 0
         self.rejected = 0
-        self.shortest_ns = 0
+        self.shortest_round_trip_ns = 0
 
     def offset_ns(self, at_ns: int) -> int | None:
-        """(our time − its time), or None without a usable answer in the last `lifetime_ns`."""
-        if not self._trips or at_ns - self._heard_ns > self._lifetime_ns:
+        """Return (our time − its time); None without a used answer in the last `lifetime_ns`."""
+        if not self._answers or at_ns - self._used_ns > self._lifetime_ns:
             return None
         return self.last_known_ns(at_ns)
 
     def last_known_ns(self, at_ns: int) -> int | None:
-        """(our time − its time) by the answers so far, however long ago they came; None before the first."""
-        return self._base_ns + round(self._slope * (at_ns - self._base_at_ns)) if self._trips else None
+        """Return (our time − its time) by all answers, old ones too; None before the first."""
+        return self._line_ns + round(self._slope * (at_ns - self._line_at_ns)) if self._answers else None
 
     def uncertainty_ns(self, at_ns: int) -> int | None:
-        """Largest error of the offset at that time; None before the first answer."""
-        if not self._trips:
+        """Return the largest error of the offset at a time; None before the first answer."""
+        if not self._answers:
             return None
-        return self.shortest_ns // 2 + round(DRIFT_CHANGE * (at_ns - self._trips[-1][0]))
+        return self.shortest_round_trip_ns // 2 + round(DRIFT_CHANGE * (at_ns - self._answers[-1][0]))
 
     @property
     def drift_ppm(self) -> float | None:
         """Gain of our clock on the peer's [millionths]; None before enough answers."""
-        return self._slope * 1e6 if self._drifts else None
+        return self._slope * 1e6 if self._has_drift else None
 
     @property
     def round_trips_ns(self) -> tuple[int, ...]:
         """The last round trips, rejected ones too, in order."""
         return tuple(self._round_trips_ns)
 
-    def answer(self, sent_ns: int, remote_ns: int, received_ns: int) -> bool:
-        """Take one answer.
+    def add_answer(self, sent_ns: int, remote_ns: int, received_ns: int) -> bool:
+        """Add one answer.
 
         Args:
             sent_ns: our time when the request was sent.
 
         Returns:
-            Whether it was used; a deviating one, or one that is too slow to say anything, is not.
+            Whether it was used; a deviating or too slow one is not.
         """
-        used = self._take(sent_ns, remote_ns, received_ns)
+        used = self._use_answer(sent_ns, remote_ns, received_ns)
         self.rejected += not used
         return used
 
-    def _take(self, sent_ns: int, remote_ns: int, received_ns: int) -> bool:
+    def _use_answer(self, sent_ns: int, remote_ns: int, received_ns: int) -> bool:
         round_trip_ns = received_ns - sent_ns
         if round_trip_ns >= 0:
             self._round_trips_ns.append(round_trip_ns)
@@ -199,99 +200,104 @@ class RoundTrips:
             return False
         half_ns = round_trip_ns // 2
         measured_ns = sent_ns + half_ns - remote_ns
-        known_ns, uncertain_ns = self.last_known_ns(received_ns), self.uncertainty_ns(received_ns)
-        if known_ns is not None and abs(measured_ns - known_ns) > max(MAX_DEVIATION_NS, half_ns):
-            self._deviating += 1
-            if self._deviating < RESYNC_AFTER and self.offset_ns(received_ns) is not None:
+        expected_ns, uncertainty_ns = self.last_known_ns(received_ns), self.uncertainty_ns(received_ns)
+        if expected_ns is not None and abs(measured_ns - expected_ns) > max(MAX_DEVIATION_NS, half_ns):
+            self._deviating_count += 1
+            if self._deviating_count < RESYNC_AFTER and self.offset_ns(received_ns) is not None:
                 return False
-            self._forget()
-            uncertain_ns = None
-        self._deviating = 0
-        self._heard_ns = received_ns
-        if known_ns is not None and uncertain_ns is not None and half_ns > uncertain_ns + NEAR_NS // 2:
-            within_ns = min(max(known_ns, measured_ns - half_ns), measured_ns + half_ns)
-            self._base_ns += within_ns - known_ns
+            self._reset()
+            uncertainty_ns = None
+        self._deviating_count = 0
+        self._used_ns = received_ns
+        if (
+            expected_ns is not None
+            and uncertainty_ns is not None
+            and half_ns > uncertainty_ns + ROUND_TRIP_MARGIN_NS // 2
+        ):
+            clamped_ns = min(max(expected_ns, measured_ns - half_ns), measured_ns + half_ns)
+            self._line_ns += clamped_ns - expected_ns
             return True
-        # Round trips of other lengths may be off by other amounts, which is no drift: the slope goes on without them.
-        alike = [trip for trip in self._trips if abs(round_trip_ns - trip[2]) <= 2 * NEAR_NS]
-        self._trips = deque([*alike, (received_ns, measured_ns, round_trip_ns)], maxlen=FITTED)
-        self._fit()
+        # Round trips of other lengths have other errors, which are no drift: the slope ignores them.
+        similar = [trip for trip in self._answers if abs(round_trip_ns - trip[2]) <= 2 * ROUND_TRIP_MARGIN_NS]
+        self._answers = deque([*similar, (received_ns, measured_ns, round_trip_ns)], maxlen=FIT_POINTS)
+        self._fit_line()
         return True
 
-    def _forget(self) -> None:
-        """Begin again: the peer has another clock now."""
-        self._trips.clear()
-        self._slope, self._drifts = 0.0, False
+    def _reset(self) -> None:
+        """Forget the line: the peer has another clock now."""
+        self._answers.clear()
+        self._slope, self._has_drift = 0.0, False
 
-    def _fit(self) -> None:
-        """The line through the last answers, as its slope and its value at the last one."""
-        self.shortest_ns = min(length_ns for _, _, length_ns in self._trips)
-        last_ns = self._trips[-1][0]
-        if len(self._trips) >= MIN_FITTED and last_ns - self._trips[0][0] >= MIN_SPAN_NS:
-            pairs = combinations(self._trips, 2)
+    def _fit_line(self) -> None:
+        """Fit the line through the last answers: its slope, and its value at the last one."""
+        self.shortest_round_trip_ns = min(length_ns for _, _, length_ns in self._answers)
+        last_ns = self._answers[-1][0]
+        if len(self._answers) >= MIN_FIT_POINTS and last_ns - self._answers[0][0] >= MIN_FIT_SPAN_NS:
+            pairs = combinations(self._answers, 2)
             slope = median((o2 - o1) / (t2 - t1) for (t1, o1, _), (t2, o2, _) in pairs if t2 > t1)
-            self._slope, self._drifts = min(max(slope, -MAX_DRIFT), MAX_DRIFT), True
-        first_ns = self._trips[0][1]  # differences stay exact in floating point
-        levels = [offset - first_ns + self._slope * (last_ns - at_ns) for at_ns, offset, _ in self._trips]
-        self._base_ns, self._base_at_ns = first_ns + round(median(levels)), last_ns
+            self._slope, self._has_drift = min(max(slope, -MAX_DRIFT), MAX_DRIFT), True
+        first_ns = self._answers[0][1]  # differences stay exact in floating point
+        levels = [offset - first_ns + self._slope * (last_ns - at_ns) for at_ns, offset, _ in self._answers]
+        self._line_ns, self._line_at_ns = first_ns + round(median(levels)), last_ns
 
 
 class ArrivalClock:
-    """A sender's clock by the arrival of its stamps alone, whatever its drift: what came quickest counts.
+    """Clock of a sender by the arrival of its stamps alone: the quickest message counts.
 
-    (our time − its time) is never more than (arrival − stamp). The least of these goes on at the clock's drift, the
-    median of its rises from second to second: a link that becomes slower is one rise among many, and no drift.
+    (our time − its time) is at most (arrival − stamp). The minimum of these follows the clock's drift. The drift is the
+    median of the slopes from second to second: a slower link is one slope among many, and no drift.
     """
 
     def __init__(self) -> None:
-        self._least_ns: float = 0.0
+        self._min_offset_ns: float = 0.0
         self._at_ns: int | None = None  # time of the last stamp
-        self._second: tuple[int, int, int] = (0, 0, 0)  # its begin, least (arrival − stamp) in it, when that was
-        self._before: tuple[int, int] | None = None  # the last two of the second before
-        self._rises: deque[float] = deque(maxlen=FITTED)
+        # start of the second, smallest (arrival − stamp) in it, and its time of arrival
+        self._current_second: tuple[int, int, int] = (0, 0, 0)
+        self._previous_second: tuple[int, int] | None = None  # minimum and arrival of the previous second
+        self._slopes: deque[float] = deque(maxlen=FIT_POINTS)
         self._slope = 0.0
-        self._ahead = 0  # stamps in a row that this clock cannot have given
+        self._impossible_count = 0  # stamps in a row that this clock cannot have given
 
     def offset_ns(self, at_ns: int) -> int | None:
-        """(our time − its time) and the smallest delay; None before the first stamp."""
-        return None if self._at_ns is None else round(self._least_ns + self._slope * (at_ns - self._at_ns))
+        """Return (our time − its time) plus the smallest delay; None before the first stamp."""
+        return None if self._at_ns is None else round(self._min_offset_ns + self._slope * (at_ns - self._at_ns))
 
-    def delay_ns(self, stamp_ns: int, at_ns: int) -> int:
-        """Take a stamp; return by how much it came later than the quickest [ns]."""
-        behind_ns = at_ns - stamp_ns
-        if self._at_ns is None or self._ahead >= RESYNC_AFTER:
-            self._before, self._slope, self._ahead = None, 0.0, 0
-            self._rises.clear()
-            self._second, self._least_ns = (at_ns, behind_ns, at_ns), behind_ns
-        elif behind_ns < self._least_ns - LEAP_NS:
-            self._ahead += 1
+    def measure_delay_ns(self, stamp_ns: int, at_ns: int) -> int:
+        """Add a stamp; return its delay behind the quickest one [ns]."""
+        offset_ns = at_ns - stamp_ns
+        if self._at_ns is None or self._impossible_count >= RESYNC_AFTER:
+            self._previous_second, self._slope, self._impossible_count = None, 0.0, 0
+            self._slopes.clear()
+            self._current_second, self._min_offset_ns = (at_ns, offset_ns, at_ns), offset_ns
+        elif offset_ns < self._min_offset_ns - MAX_CLOCK_STEP_NS:
+            self._impossible_count += 1
             return 0
         else:
-            self._ahead = 0
-            begun_ns, least_ns, _ = self._second
-            if at_ns - begun_ns >= SECOND_NS:
-                self._begin_second(behind_ns, at_ns)
-            elif behind_ns < least_ns:
-                self._second = begun_ns, behind_ns, at_ns
+            self._impossible_count = 0
+            second_start_ns, min_offset_ns, _ = self._current_second
+            if at_ns - second_start_ns >= SECOND_NS:
+                self._start_second(offset_ns, at_ns)
+            elif offset_ns < min_offset_ns:
+                self._current_second = second_start_ns, offset_ns, at_ns
             since_ns = at_ns - self._at_ns
-            self._least_ns = min(behind_ns, self._least_ns + (self._slope + DRIFT_CHANGE) * since_ns)
+            self._min_offset_ns = min(offset_ns, self._min_offset_ns + (self._slope + DRIFT_CHANGE) * since_ns)
         self._at_ns = at_ns
-        return round(behind_ns - self._least_ns)
+        return round(offset_ns - self._min_offset_ns)
 
-    def _begin_second(self, behind_ns: int, at_ns: int) -> None:
-        """Learn the drift from the second that is over."""
-        _, least_ns, least_at_ns = self._second
-        if self._before is not None:
-            rise = (least_ns - self._before[0]) / (least_at_ns - self._before[1])
-            self._rises.append(min(max(rise, -MAX_DRIFT), MAX_DRIFT))
-            self._slope = median_low(self._rises)
-            if len(self._rises) == 1:  # the least of the first seconds did not know the drift
-                self._least_ns = least_ns + self._slope * (at_ns - least_at_ns)
-        self._before, self._second = (least_ns, least_at_ns), (at_ns, behind_ns, at_ns)
+    def _start_second(self, offset_ns: int, at_ns: int) -> None:
+        """Update the drift from the finished second."""
+        _, min_offset_ns, min_offset_at_ns = self._current_second
+        if self._previous_second is not None:
+            slope = (min_offset_ns - self._previous_second[0]) / (min_offset_at_ns - self._previous_second[1])
+            self._slopes.append(min(max(slope, -MAX_DRIFT), MAX_DRIFT))
+            self._slope = median_low(self._slopes)
+            if len(self._slopes) == 1:  # the minimum of the first seconds was without drift
+                self._min_offset_ns = min_offset_ns + self._slope * (at_ns - min_offset_at_ns)
+        self._previous_second, self._current_second = (min_offset_ns, min_offset_at_ns), (at_ns, offset_ns, at_ns)
 
 
 class ClockSync:
-    """The clock of one source, identified by system, component and kind of stamp.
+    """Clock of one source, identified by system, component and kind of stamp.
 
     Args:
         latency_ns: smallest delay from capture to arrival.
@@ -302,33 +308,35 @@ class ClockSync:
         self._latency_ns = latency_ns
         self._future_tolerance_ns = future_tolerance_ns
         self._minimum = SlidingMinimum(window_ns)
-        self._shortest = SlidingMinimum(window_ns)  # delay by the offset from round trips
+        self._min_delay = SlidingMinimum(window_ns)  # delay by the offset from round trips
         self._newest_ns = 0
-        self._count = 0
-        self._stamps: deque[int] = deque(maxlen=REMEMBERED_STAMPS)
-        self._leaps: deque[int] = deque(maxlen=RESYNC_AFTER)
+        self._stamp_count = 0
+        self._stamps: deque[int] = deque(maxlen=STAMP_HISTORY)
+        self._new_delays_ns: deque[int] = deque(maxlen=RESYNC_AFTER)
         self.resyncs = 0
         self.offset_ns: int | None = None
         self.source = ClockSource.NONE
 
-    def captured_ns(self, stamp_ns: int | None, received_ns: int, offset_ns: int | None = None) -> int | StampRefusal:
-        """Time of capture in our clock.
+    def estimate_capture_ns(
+        self, stamp_ns: int | None, received_ns: int, offset_ns: int | None = None
+    ) -> int | StampRefusal:
+        """Convert a stamp to the time of capture in our clock.
 
         Args:
             stamp_ns: the source's stamp; None if it gives none.
-            offset_ns: offset from round trips, if there is one. It is used if it makes the smallest
-                delay plausible: answers and stamps may come from different clocks.
+            offset_ns: offset from round trips, if known. It is used if the smallest delay is plausible with it: answers
+                and stamps may come from different clocks.
 
         Returns:
             The time of capture, never after the arrival, or why the stamp is refused.
         """
         if stamp_ns is None:
             return received_ns - self._latency_ns
-        refusal = self._judge(stamp_ns, received_ns)
+        refusal = self._check_stamp(stamp_ns, received_ns)
         if refusal is not None:
             return refusal
-        self._count += 1
-        self._newest_ns = stamp_ns if self._count == 1 else max(self._newest_ns, stamp_ns)
+        self._stamp_count += 1
+        self._newest_ns = stamp_ns if self._stamp_count == 1 else max(self._newest_ns, stamp_ns)
         self._stamps.append(stamp_ns)
         minimum_ns = self._minimum.push(received_ns, received_ns - stamp_ns)
         if offset_ns is not None and self._is_plausible(offset_ns, minimum_ns, stamp_ns, received_ns):
@@ -338,22 +346,22 @@ class ClockSync:
         return min(stamp_ns + self.offset_ns, received_ns)
 
     def _is_plausible(self, offset_ns: int, minimum_ns: int, stamp_ns: int, received_ns: int) -> bool:
-        """Whether an offset makes the smallest delay neither negative nor long.
+        """Return whether the smallest delay with an offset is neither negative nor long.
 
-        The minimum of a clock that runs slow is that of a while ago, and too small for now: so each delay is also
-        judged by the offset of its own time.
+        The minimum of a slow clock is old and too small for now. So each delay is also tested with the offset of its
+        own time.
         """
-        shortest_ns = self._shortest.push(received_ns, received_ns - stamp_ns - offset_ns)
-        least_ns = -self._future_tolerance_ns
-        return any(least_ns <= delay_ns <= LEAP_NS for delay_ns in (minimum_ns - offset_ns, shortest_ns))
+        shortest_ns = self._min_delay.push(received_ns, received_ns - stamp_ns - offset_ns)
+        min_offset_ns = -self._future_tolerance_ns
+        return any(min_offset_ns <= delay_ns <= MAX_CLOCK_STEP_NS for delay_ns in (minimum_ns - offset_ns, shortest_ns))
 
-    def unwrap(self, stamp: int, modulus: int, unit_ns: int) -> int:
-        """Nanoseconds of a counter that wraps, as the value nearest to the newest stamp."""
+    def unwrap_ns(self, stamp: int, modulus: int, unit_ns: int) -> int:
+        """Convert a counter that wraps to nanoseconds: the value nearest to the newest stamp."""
         half = modulus // 2
-        newest = self._newest_ns // unit_ns if self._count else stamp
+        newest = self._newest_ns // unit_ns if self._stamp_count else stamp
         return (newest + (stamp - newest + half) % modulus - half) * unit_ns
 
-    def _judge(self, stamp_ns: int, received_ns: int) -> StampRefusal | None:
+    def _check_stamp(self, stamp_ns: int, received_ns: int) -> StampRefusal | None:
         """Refuse stamps that the clock so far cannot have given, until several in a row agree on a new clock."""
         minimum_ns = self._minimum.value
         if minimum_ns is None:
@@ -361,25 +369,28 @@ class ClockSync:
         if stamp_ns in self._stamps:
             return StampRefusal.DUPLICATE
         delay_ns = received_ns - stamp_ns
-        ahead_ns = self._future_tolerance_ns if self._count >= SETTLED_AFTER else LEAP_NS
+        ahead_ns = self._future_tolerance_ns if self._stamp_count >= MIN_SAMPLES else MAX_CLOCK_STEP_NS
         if minimum_ns - delay_ns > ahead_ns:
             refusal = StampRefusal.FUTURE
-        elif self._newest_ns - stamp_ns > LEAP_NS:
+        elif self._newest_ns - stamp_ns > MAX_CLOCK_STEP_NS:
             refusal = StampRefusal.LEAP
         else:
-            self._leaps.clear()
+            self._new_delays_ns.clear()
             return None
-        self._leaps.append(delay_ns)
-        if len(self._leaps) < RESYNC_AFTER or max(self._leaps) - min(self._leaps) > AGREE_NS:
+        self._new_delays_ns.append(delay_ns)
+        if (
+            len(self._new_delays_ns) < RESYNC_AFTER
+            or max(self._new_delays_ns) - min(self._new_delays_ns) > MAX_DELAY_SPREAD_NS
+        ):
             return refusal
-        self._restart()
+        self._reset()
         return None
 
-    def _restart(self) -> None:
-        """Begin anew: the source has another clock now."""
+    def _reset(self) -> None:
+        """Reset all estimates: the source has another clock now."""
         self._minimum.clear()
-        self._shortest.clear()
+        self._min_delay.clear()
         self._stamps.clear()
-        self._leaps.clear()
-        self._count = 0
+        self._new_delays_ns.clear()
+        self._stamp_count = 0
         self.resyncs += 1

@@ -1,4 +1,11 @@
-"""One connection sans IO; stream requests."""
+"""Protocol state of one MAVLink connection, sans IO: bytes in; items, replies and requests out.
+
+1. Decode the bytes and pass each message on by the roles of the connection.
+2. Role `vehicle`: `VehicleMonitor` makes status, motion and inertial samples; `stream_requests` asks for messages.
+3. Role `mocap`: `PositionDecoder` makes position samples with a capture time in our clock.
+4. Answer TIMESYNC requests at once. A late answer would make the measured round trip longer.
+5. Count everything that is dropped, and report it in events: at most one in a second.
+"""
 
 from __future__ import annotations
 
@@ -9,31 +16,35 @@ from typing import NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from uavctl.arrays import SECOND_NS
 from uavctl.config.connections import ClockConfig, DaemonConfig, FrameConfig, SourceConfig
 from uavctl.config.types import EstimatorConfig
 from uavctl.frames import Quaternion
-from uavctl.mavlink.clocksync import LEAP_NS, NEAR_NS, ArrivalClock, ClockSource, RoundTrips, StampUnit
-from uavctl.mavlink.codec import OWN_ESTIMATE, Encoder, StreamDecoder, UnsendableError, decode
-from uavctl.mavlink.framing import BadBytes
-from uavctl.mavlink.messages import (
-    Ack,
-    Attitude,
-    Battery,
-    GlobalOrigin,
-    Inertial,
-    Landed,
-    Message,
-    ParamValue,
-    Position,
-    RadioChannels,
-    Text,
-    TimeSync,
+from uavctl.mavlink.clocksync import (
+    MAX_CLOCK_STEP_NS,
+    ROUND_TRIP_MARGIN_NS,
+    ArrivalClock,
+    ClockSource,
+    StampUnit,
+    TimesyncClock,
 )
+from uavctl.mavlink.codec import AUTOPILOT_ESTIMATE, StreamDecoder, decode
+from uavctl.mavlink.encoder import Encoder, UnsendableError
+from uavctl.mavlink.framing import SkipReason
+from uavctl.mavlink.messages import Attitude, CommandAck, Message, Position, StatusText, TimeSync
 from uavctl.mavlink.positions import SLOW_ANSWER, PositionDecoder
 from uavctl.mavlink.profile import PROFILES
 from uavctl.mavlink.relay import Relay
 from uavctl.mavlink.requests import COMMANDS, RequestKind
-from uavctl.mavlink.vehicle import ENOUGH, LOW_SHARE, SECOND_VEHICLE, UNPUNCTUAL, Joiner, VehicleWatch
+from uavctl.mavlink.statustext import StatusTextAssembler
+from uavctl.mavlink.stream_requests import (
+    GPS_GLOBAL_ORIGIN,
+    SOURCE_PARAMETER,
+    GlobalOriginSetup,
+    ParameterDownload,
+    StreamRequests,
+)
+from uavctl.mavlink.vehicle import MIN_INERTIAL, MIN_INERTIAL_SHARE, SECOND_VEHICLE, STALE_INERTIAL, VehicleMonitor
 from uavctl.records import (
     Event,
     InertialSample,
@@ -46,209 +57,43 @@ from uavctl.records import (
     VehicleStatus,
 )
 
-# Requests and messages that a real vehicle needs before it can be flown: its streams, and a place on the globe.
-
-
-SECOND_NS = 1_000_000_000
-SETTLE_NS = 2 * SECOND_NS  # many vehicles stream by themselves
-AGAIN_NS = 2 * SECOND_NS
-TRIES = 5
-ORIGIN_TRIES = 30  # once a second: its estimator may take that long to begin
-
-LOCAL_POSITION_NED, ATTITUDE, EXTENDED_SYS_STATE, SYS_STATUS = 32, 30, 245, 1
-RC_CHANNELS = 65
-ATTITUDE_QUATERNION, HIGHRES_IMU, RAW_IMU = 31, 105, 27
-GPS_GLOBAL_ORIGIN = 49
-RATES_HZ = {LOCAL_POSITION_NED: 10.0, ATTITUDE: 10.0, EXTENDED_SYS_STATE: 5.0, SYS_STATUS: 1.0, RC_CHANNELS: 5.0}
-
-INERTIAL_HZ = 50.0  # of what shows how it turns, and its acceleration
-
-# Of the list of all parameters: 50 a second are asked for again at most, which a telemetry radio bears.
-MOST_PARAMETERS, ROUNDS = 5000, 10
-READS, READS_NS = 10, SECOND_NS // 5
-QUIET_NS = SECOND_NS // 2  # without a parameter: the list has ended
-
-SOURCE_PARAMETER = "EK3_SRC1_POSXY"
-EXTERNAL = 6.0  # of the source: external positions
-
-
-class Streams:
-    """Asks for the messages that do not come by themselves, a few times.
-
-    Args:
-        inertial: ask for the vehicle's inertial data, too.
-        channels: ask for the channels of its remote control, too.
-    """
-
-    def __init__(self, *, inertial: bool = False, channels: bool = True) -> None:
-        self._inertial = inertial
-        self._rates_hz = {number: hz for number, hz in RATES_HZ.items() if channels or number != RC_CHANNELS}
-        self._feels = False  # inertial data have come since they were asked for
-        self._seen: set[int] = set()
-        self._next_ns: int | None = None
-        self._tries = 0
-        self._felt_next_ns = 0
-        self._felt_tries = 0
-
-    def saw(self, message: Message) -> None:
-        """Take a message of the vehicle."""
-        match message:
-            case Position(local_ned=True):
-                self._seen.add(LOCAL_POSITION_NED)
-            case Attitude(quaternion=False):
-                self._seen.add(ATTITUDE)
-            case Landed():
-                self._seen.add(EXTENDED_SYS_STATE)
-            case Battery():
-                self._seen.add(SYS_STATUS)
-            case RadioChannels() if self._tries:  # as often as is asked for: it shows a pilot's hand
-                self._seen.add(RC_CHANNELS)
-            case Inertial():
-                self._feels = self._felt_tries > 0
-
-    def restart(self) -> None:
-        """Ask anew: the vehicle has restarted and may have forgotten the requests."""
-        self._seen.clear()
-        self._feels = False
-        self._next_ns, self._tries = None, 0
-        self._felt_next_ns, self._felt_tries = 0, 0
-
-    def due(self, at_ns: int, autopilot: str = "") -> tuple[tuple[int, float], ...]:
-        """Return (message id, rate [1/s]) of what is to be asked for now; call it once a vehicle is heard."""
-        wanted: dict[int, float] = {}
-        if self._next_ns is None:
-            self._next_ns = at_ns + SETTLE_NS
-        if at_ns >= self._next_ns and self._tries < TRIES:
-            self._next_ns = at_ns + AGAIN_NS
-            self._tries += 1
-            wanted = {number: rate for number, rate in self._rates_hz.items() if number not in self._seen}
-        # Not waited for: but for a PX4 on an onboard link no vehicle sends them so often, and a flight may have begun.
-        profile = PROFILES.get(autopilot) if self._inertial and not self._feels else None
-        kinds = () if profile is None else profile.inertial
-        if kinds and at_ns >= self._felt_next_ns and self._felt_tries < TRIES:
-            self._felt_next_ns = at_ns + AGAIN_NS
-            self._felt_tries += 1
-            wanted.update(dict.fromkeys(kinds, INERTIAL_HZ))
-        return tuple(wanted.items())
-
-
-class ParameterList:
-    """Schedule of asking a vehicle that has not been armed yet for all its parameters: the list, then what was lost."""
-
-    def __init__(self) -> None:
-        self._missing: set[int] | None = None  # indices not told yet; None before the vehicle says how many it has
-        self._news = False  # one was told since the last look
-        self._next_ns = 0
-        self._lists = self._rounds = 0
-        self._round: list[int] = []  # indices of this round that are still to be asked for
-        self._over = False
-
-    def saw(self, message: Message) -> None:
-        """Take a message of the vehicle."""
-        if isinstance(message, ParamValue) and message.index < message.count <= MOST_PARAMETERS:
-            if self._missing is None:
-                self._missing = set(range(message.count))
-            self._missing.discard(message.index)
-            self._news = True
-
-    def due(self, at_ns: int, *, armed: bool) -> tuple[int, ...]:
-        """Return the indices to ask for now, -1 for the whole list; nothing any more once the vehicle was armed."""
-        self._over = self._over or armed or self._missing == set()
-        if self._over:
-            return ()
-        if self._news and not self._rounds:  # the list is on its way
-            self._news, self._next_ns = False, at_ns + QUIET_NS
-        if at_ns < self._next_ns:
-            return ()
-        if self._missing is None:
-            self._lists += 1
-            self._next_ns = at_ns + AGAIN_NS
-            self._over = self._lists > TRIES
-            return () if self._over else (-1,)
-        self._next_ns = at_ns + READS_NS
-        if not self._round:
-            self._rounds += 1
-            self._over = self._rounds > ROUNDS
-            self._round = [] if self._over else sorted(self._missing, reverse=True)
-        asked = self._round[-READS:][::-1]
-        del self._round[-READS:]
-        if not self._round:  # the last answers of a round are waited for
-            self._next_ns = at_ns + QUIET_NS
-        return tuple(index for index in asked if index in self._missing)
-
-
-class Globe:
-    """Schedule of sending a place on the globe to an ArduPilot on external positions, which does not arm without one.
-
-    Its source of positions is read first: with GPS a place of ours would be wrong.
-    """
-
-    def __init__(self) -> None:
-        self._external = False
-        self._known = False
-        self._next_ns = 0
-        self._tries = 0
-
-    def saw(self, message: Message) -> None:
-        """Take a message of the vehicle."""
-        match message:
-            case GlobalOrigin():
-                self._known = True
-            case ParamValue(name=name, cast=cast) if name == SOURCE_PARAMETER:
-                self._external = cast == EXTERNAL
-
-    def due(self, at_ns: int) -> tuple[bool, bool]:
-        """Whether to ask now (for the parameter and the origin), and whether to tell the origin.
-
-        The place is sent from the second time on: by then a vehicle that has an origin has answered with it.
-        """
-        if self._known or at_ns < self._next_ns or self._tries >= ORIGIN_TRIES:
-            return False, False
-        self._next_ns = at_ns + SECOND_NS
-        self._tries += 1
-        return True, self._external and self._tries > 1
-
-
-# One connection's MAVLink state, without input or output of its own: bytes in, events out, and back.
-
-
 VEHICLE, MOCAP = "vehicle", "mocap"
 HEARTBEAT_NS = SECOND_NS
-# A little off one second, so that requests do not always wait behind the same step's solve.
+# Not quite one second, so that requests do not always wait for the solve of the same step.
 TIMESYNC_NS = 950_000_000
 FIRST_TIMESYNC_NS = 200_000_000
-FIRST_REQUESTS = 10  # sent faster, until the first answer
-OPEN_REQUESTS = 8  # requests whose answers are still taken
-# Requests that are answered within a time, for the vehicle and for others each: a flood of them neither makes a flood
-# of answers nor costs a tick its time.
-MAX_ANSWERS, ANSWERS_NS = 8, 50_000_000
+MAX_FIRST_REQUESTS = 10  # at the faster rate, until the first answer
+MAX_OPEN_REQUESTS = 8  # requests that still accept an answer
+# Limit of answers to TIMESYNC in a time window; one for the vehicle, one for all others. A flood of requests must not
+# make a flood of answers, or take the time of a tick.
+MAX_ANSWERS, ANSWER_WINDOW_NS = 8, 50_000_000
 STREAM_SCHEMES = ("tcp:", "serial:")
-SLOW_TOLD_NS = 10_000_000_000  # between two events of slow answers
-MUTE_NS = 3 * SECOND_NS  # three heartbeats that did not come
+SLOW_EVENT_NS = 10_000_000_000  # between two events about slow answers
+MISSING_HEARTBEAT_NS = 3 * SECOND_NS  # three missing heartbeats
 NO_HEARTBEAT = "no-heartbeat"
 STAMP_UNIT = "stamp-unit"
-UNANSWERED = "timesync-flood"
-OVERRUN = "overrun"  # dropped by the system while nobody read, the vehicle's newest words perhaps
-HUNG_UP = "hung-up"  # times that the other side of a TCP connection has closed it
-WENT_SILENT = "went-silent"  # times that nothing came over a TCP connection for so long that it is made again
-_LOST = {
+TIMESYNC_FLOOD = "timesync-flood"
+OVERRUN = "overrun"  # dropped by the system before it was read; perhaps the newest state of the vehicle
+HUNG_UP = "hung-up"  # times that the other side has closed a TCP connection
+CONNECTION_SILENT = "went-silent"  # reconnections of a silent TCP connection
+_DISCONNECT_TEXTS = {
     HUNG_UP: "the other side closed the connection; it is called again each second",
-    WENT_SILENT: "nothing came over the connection any more; it is made again",
+    CONNECTION_SILENT: "nothing came over the connection any more; it is made again",
 }
-# Counted, not told: every flight has them, or they are told in another way.
-_USUAL = frozenset({BadBytes.UNKNOWN, OWN_ESTIMATE, *_LOST})
+# Counted but not reported: every flight has them, or another event reports them.
+_NOT_REPORTED = frozenset({SkipReason.UNKNOWN, AUTOPILOT_ESTIMATE, *_DISCONNECT_TEXTS})
 
-Item = PositionSample | VehicleStatus | VehicleMotion | InertialSample | Event | Ack | Text
+Item = PositionSample | VehicleStatus | VehicleMotion | InertialSample | Event | CommandAck | StatusText
 
 
-class Understood(NamedTuple):
-    """Content of one datagram, and the origin of the newest sample by then, which may be of a datagram before."""
+class ReceiveResult(NamedTuple):
+    """Content of one datagram, and the source state of the newest sample, which may be of an earlier datagram."""
 
     items: tuple[Item, ...]
-    answers: tuple[bytes, ...]  # to requests for our time, to be sent at once: a TIMESYNC that waits measures the wait
-    settled: bool  # whether the newest sample is of a source that has spoken for a while
-    attitude: Quaternion | None  # of the body in it: body axes forward, right, down to NED (w, x, y, z)
-    clock_source: ClockSource  # of its capture time
+    replies: tuple[bytes, ...]  # answers to TIMESYNC requests, to be sent at once: a delay would count as round trip
+    is_source_settled: bool  # whether the source of the newest sample is settled
+    attitude: Quaternion | None  # of its body: body axes forward, right, down to NED (w, x, y, z)
+    clock_source: ClockSource  # source of its capture time
 
 
 class MavlinkConnection:
@@ -259,9 +104,9 @@ class MavlinkConnection:
         roles: `vehicle` (heartbeats, status, setpoints), `mocap` (positions), or both.
         daemon: our ids; the connection's URL tells a byte stream from datagrams.
         source: which messages and which system count as positions.
-        estimator: standard deviation of a position, and what is absurd.
-        listen: hears every message of others that is understood, with its time of arrival; for callers that want more
-            than the items tell.
+        estimator: standard deviation of a position, and the limits of plausible ones.
+        on_message: called with every decoded message of others and its time of arrival; for callers that need more
+            than the items.
         vehicle_time: a vehicle that asks for our time gets that of its own clock (`relay.vehicle_time`).
     """
 
@@ -275,390 +120,418 @@ class MavlinkConnection:
         clock: ClockConfig,
         source: SourceConfig,
         estimator: EstimatorConfig,
-        listen: Callable[[Message, int], None] | None = None,
+        on_message: Callable[[Message, int], None] | None = None,
         vehicle_time: bool = False,
     ) -> None:
-        self._name, self._roles, self._gives_vehicle_time = name, roles, vehicle_time
-        self._own = (daemon.system_id, daemon.component_id)
+        self._name, self._roles, self._uses_vehicle_time = name, roles, vehicle_time
+        self._own_address = (daemon.system_id, daemon.component_id)
         url = daemon.vehicle if VEHICLE in roles else daemon.mocap
         self._stream = StreamDecoder() if url.startswith(STREAM_SCHEMES) else None
-        self._encoder = Encoder(*self._own)
-        self._intake = PositionDecoder(frame, clock, source, estimator, self._count)
-        feels = estimator.inertial_std_mps2 > 0.0
-        self._vehicle = VehicleWatch(
-            self._count,
-            self._own,
+        self._encoder = Encoder(*self._own_address)
+        self._positions = PositionDecoder(frame, clock, source, estimator, self._count_bad)
+        wants_inertial = estimator.inertial_std_mps2 > 0.0
+        self._vehicle = VehicleMonitor(
+            self._count_bad,
+            self._own_address,
             daemon.vehicle_system_id,
             daemon.vehicle_component_id,
-            inertial=feels,
+            inertial=wants_inertial,
             channels=daemon.radio_channels,
         )
-        self._streams, self._globe, self._texts = (
-            Streams(inertial=feels, channels=daemon.radio_channels),
-            Globe(),
-            Joiner(),
+        self._streams, self._origin_setup, self._text_assembler = (
+            StreamRequests(inertial=wants_inertial, channels=daemon.radio_channels),
+            GlobalOriginSetup(),
+            StatusTextAssembler(),
         )
-        self._lists, self._parameters = daemon.parameters, ParameterList()
+        self._wants_parameters, self._parameters = daemon.parameters, ParameterDownload()
         self._bad: Counter[str] = Counter()
-        self._untold: Counter[str] = Counter()
-        self._told_ns: int | None = None
-        self._slow = 0  # answers to TIMESYNC that were not used, and not told yet
-        self._slow_told_ns: int | None = None
-        self._resyncs_told = 0
-        self._low_share_told = False
-        # A vehicle that sends its position, but no heartbeat: its address, since when, and whether that was reported
-        self._mute: tuple[int, int] | None = None
-        self._mute_since_ns: int | None = None
-        self._mute_told = False
-        self._units_told: set[tuple[int, int, StampUnit]] = set()
+        self._unreported: Counter[str] = Counter()
+        self._reported_ns: int | None = None
+        self._slow_count = 0  # unused answers to TIMESYNC, not reported yet
+        self._slow_reported_ns: int | None = None
+        self._reported_resyncs = 0
+        self._is_low_share_reported = False
+        # A vehicle that sends its position, but no heartbeat: address, start, and whether it was reported
+        self._no_heartbeat_address: tuple[int, int] | None = None
+        self._no_heartbeat_since_ns: int | None = None
+        self._is_no_heartbeat_reported = False
+        self._reported_units: set[tuple[int, int, StampUnit]] = set()
         self._datagrams = self._messages = 0
         self._heartbeat_ns: int | None = None
         self._request_ns: int | None = None
         self._requests = 0
-        self._open: deque[int] = deque(maxlen=OPEN_REQUESTS)
-        self._answered = False
-        self._listen = listen
+        self._open_requests_ns: deque[int] = deque(maxlen=MAX_OPEN_REQUESTS)
+        self._has_answer = False
+        self._on_message = on_message
         self._vehicle_clock = ArrivalClock()
-        self._answers: list[bytes] = []  # to requests of the datagram in hand
-        self._answers_from_ns = 0
-        self._answered_to: Counter[bool] = Counter()  # requests of the vehicle's, and of all others, in that time
+        self._replies: list[bytes] = []  # to requests of the present datagram
+        self._reply_window_ns = 0
+        self._reply_counts: Counter[bool] = Counter()  # requests of the vehicle (True) and of all others in the window
 
     @property
     def vehicle(self) -> tuple[int, int] | None:
         """System and component of the vehicle; None before its first heartbeat."""
         return self._vehicle.address
 
-    def trips(self, address: tuple[int, int] | None = None) -> RoundTrips | None:
-        """Round trips to a peer that answers TIMESYNC; without an address, to the source of the newest sample."""
-        return self._intake.trips(address)
+    def timesync_clock(self, address: tuple[int, int] | None = None) -> TimesyncClock | None:
+        """Return the clock of a peer that answers TIMESYNC; without an address, of the newest sample's source."""
+        return self._positions.timesync_clock(address)
 
-    def answered(self, address: tuple[int, int], sent_ns: int, remote_ns: int, received_ns: int) -> None:
-        """Take the answer to a TIMESYNC request that another client has sent, as a recording shows it.
+    def add_timesync_answer(self, address: tuple[int, int], sent_ns: int, remote_ns: int, received_ns: int) -> None:
+        """Add an answer to the TIMESYNC request of another client, from a recording.
 
         Args:
-            address: system and component whose stamps it tells of.
+            address: system and component whose clock it shows.
         """
-        self._intake.answer(address, sent_ns, remote_ns, received_ns)
+        self._positions.add_timesync_answer(address, sent_ns, remote_ns, received_ns)
 
     @property
-    def inertial(self) -> tuple[int, int]:
-        """Inertial data of the vehicle that are used, and all that came."""
+    def inertial_counts(self) -> tuple[int, int]:
+        """Numbers of inertial data: used, and all."""
         return self._vehicle.inertial_used, self._vehicle.inertial_total
 
-    def vehicle_up_s(self, at_ns: int) -> float | None:
-        """Return the time since the vehicle started, by its own clock [s]; None if it does not tell."""
-        return self._vehicle.up_s(at_ns)
+    def vehicle_uptime_s(self, at_ns: int) -> float | None:
+        """Return the vehicle's uptime by its own clock [s]; None if unknown."""
+        return self._vehicle.uptime_s(at_ns)
 
-    def receive(self, data: bytes, at_ns: int) -> Understood:
-        """Take one datagram, or one chunk of a stream, that arrived at `at_ns`; never raises."""
-        self._answers.clear()
+    def receive(self, data: bytes, at_ns: int) -> ReceiveResult:
+        """Decode one datagram, or one chunk of a stream, that arrived at `at_ns`; never raises."""
+        self._replies.clear()
         decoded = decode(data) if self._stream is None else self._stream.push(data)
         self._datagrams += 1
         self._messages += decoded.total
         for reason, count in decoded.bad.items():
-            self._count(reason, count)
-        items = [item for message in decoded.messages for item in self._take(message, at_ns)]
-        items += [item for text in self._texts.overdue(at_ns) for item in self._vehicle.take(text, at_ns)]
-        intake = self._intake
-        told = (*items, *self._tell(at_ns))
-        return Understood(told, tuple(self._answers), intake.settled, intake.attitude, intake.clock_source)
+            self._count_bad(reason, count)
+        items = [item for message in decoded.messages for item in self._handle_message(message, at_ns)]
+        items += [
+            item
+            for text in self._text_assembler.flush_overdue(at_ns)
+            for item in self._vehicle.handle_message(text, at_ns)
+        ]
+        positions = self._positions
+        items_and_events = (*items, *self._make_events(at_ns))
+        return ReceiveResult(
+            items_and_events, tuple(self._replies), positions.is_settled, positions.attitude, positions.clock_source
+        )
 
-    def refused(self, counts: Mapping[str, int], at_ns: int) -> tuple[Event, ...]:
-        """Take the counts of what the connection dropped unread: addresses, rates, signatures."""
+    def add_refusals(self, counts: Mapping[str, int], at_ns: int) -> tuple[Event, ...]:
+        """Add counts of data that the connection dropped before decoding: by address, rate or signature."""
         for reason, count in counts.items():
-            self._count(reason, count)
-        lost = tuple(
+            self._count_bad(reason, count)
+        events = tuple(
             Event(at_ns=at_ns, severity=Severity.ERROR, code=reason, text=f"link {self._name}: {text}")
-            for reason, text in _LOST.items()
+            for reason, text in _DISCONNECT_TEXTS.items()
             if reason in counts
         )
-        return lost + self._tell(at_ns)
+        return events + self._make_events(at_ns)
 
     def due(self, at_ns: int) -> tuple[bytes, ...]:
-        """Return what is to be sent at `at_ns` besides setpoints: heartbeat, TIMESYNC, requests for streams."""
-        out = []
+        """Return the frames that are due at `at_ns`: heartbeat, TIMESYNC, requests for streams and parameters."""
+        frames = []
         if self._heartbeat_ns is None or at_ns - self._heartbeat_ns >= HEARTBEAT_NS:
             self._heartbeat_ns = at_ns
-            out.append(self._encoder.heartbeat())
-        eager = not self._answered and self._requests < FIRST_REQUESTS
-        interval_ns = FIRST_TIMESYNC_NS if eager else TIMESYNC_NS
+            frames.append(self._encoder.encode_heartbeat())
+        is_first_phase = not self._has_answer and self._requests < MAX_FIRST_REQUESTS
+        interval_ns = FIRST_TIMESYNC_NS if is_first_phase else TIMESYNC_NS
         if self._request_ns is None or at_ns - self._request_ns >= interval_ns:
             self._request_ns = at_ns
             self._requests += 1
-            self._open.append(at_ns)
-            out.append(self._encoder.timesync(0, at_ns))
+            self._open_requests_ns.append(at_ns)
+            frames.append(self._encoder.encode_timesync(0, at_ns))
         if VEHICLE in self._roles and self._vehicle.address is not None:
-            wanted = self._streams.due(at_ns, self._vehicle.autopilot)
-            out += [self.request_stream(number, rate_hz) for number, rate_hz in wanted]
-            indices = self._parameters.due(at_ns, armed=self._vehicle.armed) if self._lists else ()
-            out += [self._encoder.request_parameters(index, *self._target()) for index in indices]
-        return tuple(out)
+            streams = self._streams.due(at_ns, self._vehicle.autopilot)
+            frames += [self.encode_stream_request(number, rate_hz) for number, rate_hz in streams]
+            indices = self._parameters.due(at_ns, armed=self._vehicle.is_armed) if self._wants_parameters else ()
+            frames += [self._encoder.encode_parameter_list_request(index, *self._target_address()) for index in indices]
+        return tuple(frames)
 
-    def setpoint(self, setpoint: Setpoint) -> bytes:
-        """The setpoint, addressed to the vehicle.
+    def encode_setpoint(self, setpoint: Setpoint) -> bytes:
+        """Encode a setpoint for the vehicle.
 
         Raises:
             UnsendableError: a value is not finite, or no vehicle has been heard.
         """
-        return self._encoder.setpoint(setpoint, *self._target())
+        return self._encoder.encode_setpoint(setpoint, *self._target_address())
 
-    def ask(self, ask: RequestKind, height_m: float) -> bytes:
-        """A request to the vehicle.
+    def encode_request(self, kind: RequestKind, height_m: float) -> bytes:
+        """Encode a request to the vehicle.
 
         Args:
             height_m: of the climb above the ground [m], for a take-off.
 
         Raises:
-            UnsendableError: no vehicle has been heard, or it is of a kind that cannot be asked for this.
+            UnsendableError: no vehicle has been heard, or its modes are not known.
         """
-        parameters: tuple[float, ...] = ()  # of landing where it is, and of disarming
-        match ask:
+        parameters: tuple[float, ...] = ()  # zeros: land here, disarm
+        match kind:
             case RequestKind.TAKE_OFF_MODE | RequestKind.EXTERNAL_MODE:
-                parameters = self._mode(ask)
+                parameters = self._choose_mode_parameters(kind)
             case RequestKind.ARM:
                 parameters = (1.0,)
             case RequestKind.TAKE_OFF:
                 parameters = (*(0.0,) * 6, height_m)
-        return self._encoder.command(COMMANDS[ask], parameters, *self._target())
+        return self._encoder.encode_command(COMMANDS[kind], parameters, *self._target_address())
 
-    def _mode(self, ask: RequestKind) -> tuple[float, ...]:
-        """DO_SET_MODE's parameters; PX4 wants main and sub mode, ArduPilot the number of the mode."""
+    def _choose_mode_parameters(self, kind: RequestKind) -> tuple[float, ...]:
+        """Return the parameters of DO_SET_MODE: main and sub mode for PX4, the mode number for ArduPilot."""
         profile = PROFILES.get(self._vehicle.autopilot)
         if profile is None:
             raise UnsendableError(f"link {self._name}: modes of autopilot {self._vehicle.autopilot!r} are not known")
-        name = profile.external if ask is RequestKind.EXTERNAL_MODE else profile.take_off
-        return (float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED), *map(float, profile.modes[name]))
+        name = profile.external_mode if kind is RequestKind.EXTERNAL_MODE else profile.take_off_mode
+        return (float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED), *map(float, profile.mode_parameters[name]))
 
-    def place_on_globe(self, at_ns: int, place_deg_m: Vec3) -> tuple[bytes, ...]:
-        """Return the messages that an ArduPilot without GPS needs before it arms; call it while it is to be armed.
+    def setup_global_origin(self, at_ns: int, origin_deg_m: Vec3) -> tuple[bytes, ...]:
+        """Return the messages that an ArduPilot without GPS needs before it arms; called until it is armed.
 
         Args:
-            place_deg_m: latitude, longitude [deg] and altitude [m] of local zero.
+            origin_deg_m: latitude, longitude [deg] and altitude [m] of local zero.
         """
         profile = PROFILES.get(self._vehicle.autopilot)
-        if profile is None or not profile.wants_place:
+        if profile is None or not profile.needs_global_origin:
             return ()
-        asks, tells = self._globe.due(at_ns)
-        if not asks:
+        is_request_due, is_origin_due = self._origin_setup.due(at_ns)
+        if not is_request_due:
             return ()
-        system, component = self._target()
-        out = (
-            self._encoder.request_parameter(SOURCE_PARAMETER, system, component),
-            self._encoder.request_message(GPS_GLOBAL_ORIGIN, system, component),
+        system, component = self._target_address()
+        frames = (
+            self._encoder.encode_parameter_request(SOURCE_PARAMETER, system, component),
+            self._encoder.encode_message_request(GPS_GLOBAL_ORIGIN, system, component),
         )
-        return (self._encoder.origin(place_deg_m, system), *out) if tells else out
+        return (self._encoder.encode_global_origin(origin_deg_m, system), *frames) if is_origin_due else frames
 
-    def request_parameter(self, name: str) -> bytes:
-        """The request for one parameter, addressed to the vehicle.
+    def encode_parameter_request(self, name: str) -> bytes:
+        """Encode the request for one parameter.
 
         Raises:
             UnsendableError: no vehicle has been heard.
         """
-        return self._encoder.request_parameter(name, *self._target())
+        return self._encoder.encode_parameter_request(name, *self._target_address())
 
-    def request_stream(self, message_id: int, rate_hz: float) -> bytes:
-        """The request to send a message so often, or once with rate 0, addressed to the vehicle.
+    def encode_stream_request(self, message_id: int, rate_hz: float) -> bytes:
+        """Encode the request for a message at a rate, or once for rate 0.
 
         Raises:
             UnsendableError: no vehicle has been heard.
         """
         if rate_hz == 0.0:
-            return self._encoder.request_message(message_id, *self._target())
-        return self._encoder.request_interval(message_id, round(1e6 / rate_hz), *self._target())
+            return self._encoder.encode_message_request(message_id, *self._target_address())
+        return self._encoder.encode_interval_request(message_id, round(1e6 / rate_hz), *self._target_address())
 
-    def relay(self, relay: Relay, at_ns: int, *, refused: Sequence[PositionSample]) -> tuple[bytes, ...]:
-        """The positions that go to the vehicle's own estimator in the tick of `at_ns`.
+    def encode_relayed_poses(self, relay: Relay, at_ns: int, *, refused: Sequence[PositionSample]) -> tuple[bytes, ...]:
+        """Encode the positions for the vehicle's own estimator in the tick of `at_ns`.
 
         Args:
-            refused: samples that the tick did not believe.
+            refused: samples that the tick has refused.
         """
-        if not relay.enabled or self.vehicle is None:
+        if not relay.is_enabled or self.vehicle is None:
             return ()
-        # Only PX4 moves stamps by the offset that it has found to our time, where that is what it was given.
-        moves = not self._gives_vehicle_time and self._vehicle.autopilot == "px4"
-        offset_ns = 0 if moves else self._vehicle_offset_ns(at_ns) or 0
+        # Only PX4 moves stamps by its offset to our time. That offset is zero if we answer with its own time.
+        moves_stamps = not self._uses_vehicle_time and self._vehicle.autopilot == "px4"
+        offset_ns = 0 if moves_stamps else self._vehicle_offset_ns(at_ns) or 0
         poses = relay.due(at_ns, offset_ns=offset_ns, refused=refused)
-        return tuple(self._encoder.external_position(pose) for pose in poses)
+        return tuple(self._encoder.encode_external_position(pose) for pose in poses)
 
     def _vehicle_time_ns(self, at_ns: int) -> int | None:
-        """Return the time of the vehicle's clock as far as known; None before.
+        """Return the time of the vehicle's clock; None if unknown.
 
-        It is what a vehicle gets that asks for our time. PX4 moves the stamps of positions by the offset that it finds,
-        keeps that without end where round trips take longer than 10 ms (src/lib/timesync/Timesync.cpp), and so follows
-        no drift there. In its own clock there is none to find.
+        It is the answer to a vehicle that requests our time. PX4 moves the stamps of positions by its offset to the
+        answers. With round trips of more than 10 ms it keeps an old offset (src/lib/timesync/Timesync.cpp) and does
+        not follow a drift. With its own time as answer there is no offset and no drift.
         """
         offset_ns = self._vehicle_offset_ns(at_ns)
         return None if offset_ns is None else at_ns - offset_ns
 
     def _vehicle_offset_ns(self, at_ns: int) -> int | None:
-        """(our time - the vehicle's) by its newest answers, or else by older ones as far as its messages agree.
+        """Return (our time − the vehicle's time); without new answers, an older offset within the bounds of arrivals.
 
-        A message arrives after its stamp, and no round trip was shorter than its way. A vehicle that neither answers
-        nor stamps its messages gets our own time: steady, so its own estimate of the delay works.
+        A message arrives after its stamp, and no delay is longer than the shortest round trip. A vehicle without
+        answers and stamps gets our own time. That is steady, so its own delay estimate works.
         """
-        trips, arrival_ns = self.trips(self.vehicle), self._vehicle_clock.offset_ns(at_ns)
-        known_ns = None if trips is None else trips.last_known_ns(at_ns)
-        if trips is None or known_ns is None:
+        timesync, arrival_ns = self.timesync_clock(self.vehicle), self._vehicle_clock.offset_ns(at_ns)
+        known_ns = None if timesync is None else timesync.last_known_ns(at_ns)
+        if timesync is None or known_ns is None:
             return arrival_ns
-        if arrival_ns is None or trips.offset_ns(at_ns) is not None or abs(arrival_ns - known_ns) > LEAP_NS:
+        if (
+            arrival_ns is None
+            or timesync.offset_ns(at_ns) is not None
+            or abs(arrival_ns - known_ns) > MAX_CLOCK_STEP_NS
+        ):
             return known_ns
-        return min(max(known_ns, arrival_ns - trips.shortest_ns - NEAR_NS), arrival_ns)
+        return min(max(known_ns, arrival_ns - timesync.shortest_round_trip_ns - ROUND_TRIP_MARGIN_NS), arrival_ns)
 
     def stats(self, at_ns: int) -> LinkStats:
-        """Counters since the start."""
-        trips = self.trips() or (None if self.vehicle is None else self.trips(self.vehicle))
-        round_trips_ns = () if trips is None else trips.round_trips_ns
+        """Return the counters since the start."""
+        timesync = self.timesync_clock() or (None if self.vehicle is None else self.timesync_clock(self.vehicle))
+        round_trips_ns = () if timesync is None else timesync.round_trips_ns
         return LinkStats(
             at_ns=at_ns,
             link=self._name,
             datagrams=self._datagrams,
             messages=self._messages,
-            samples=self._intake.samples,
+            samples=self._positions.samples,
             bad={str(reason): count for reason, count in self._bad.items()},
-            clock_offset_ns=self._intake.clock_offset_ns,
-            clock_source=str(self._intake.clock_source),
+            clock_offset_ns=self._positions.clock_offset_ns,
+            clock_source=str(self._positions.clock_source),
             clock_rtt_ns=round(median(round_trips_ns)) if round_trips_ns else None,
-            clock_drift_ppm=None if trips is None else trips.drift_ppm,
-            clock_rejected=0 if trips is None else trips.rejected,
-            stamp_units=tuple(sorted({str(unit) for unit in self._intake.units.values()})),
+            clock_drift_ppm=None if timesync is None else timesync.drift_ppm,
+            clock_rejected=0 if timesync is None else timesync.rejected,
+            stamp_units=tuple(sorted({str(unit) for unit in self._positions.units.values()})),
         )
 
-    def _target(self) -> tuple[int, int]:
+    def _target_address(self) -> tuple[int, int]:
         if self._vehicle.address is None:
             raise UnsendableError(f"link {self._name}: no vehicle has been heard, so there is nobody to send to")
         return self._vehicle.address
 
-    def _take(self, message: Message, at_ns: int) -> tuple[Item, ...]:
-        if (message.system, message.component) == self._own:  # our own words, sent back by a router
+    def _handle_message(self, message: Message, at_ns: int) -> tuple[Item, ...]:
+        if (message.system, message.component) == self._own_address:  # our own message, sent back by a router
             return ()
-        if self._listen is not None:
-            self._listen(message, at_ns)
+        if self._on_message is not None:
+            self._on_message(message, at_ns)
         if isinstance(message, TimeSync):
-            self._timesync(message, at_ns)
+            self._handle_timesync(message, at_ns)
             return ()
-        items: tuple[Item, ...] = self._follow(message, at_ns) if VEHICLE in self._roles else ()
+        items: tuple[Item, ...] = self._handle_vehicle_message(message, at_ns) if VEHICLE in self._roles else ()
         if isinstance(message, Position) and MOCAP in self._roles:
-            sample = self._intake.take(message, at_ns)
+            sample = self._positions.make_sample(message, at_ns)
             return items if sample is None else (*items, sample)
         return items
 
-    def _follow(self, message: Message, at_ns: int) -> tuple[Item, ...]:
-        """Take a message of the vehicle and return what it tells of itself."""
-        if isinstance(message, Text):
-            whole = self._texts.take(message, at_ns)
-            return tuple(item for text in whole for item in self._vehicle.take(text, at_ns))
-        boots, unready, address = self._vehicle.boots, self._vehicle.unready, self.vehicle
-        items = self._vehicle.take(message, at_ns)
+    def _handle_vehicle_message(self, message: Message, at_ns: int) -> tuple[Item, ...]:
+        """Handle a message for the vehicle monitor; return its items."""
+        if isinstance(message, StatusText):
+            texts = self._text_assembler.add_chunk(message, at_ns)
+            return tuple(item for text in texts for item in self._vehicle.handle_message(text, at_ns))
+        boots, not_ready_count, address = self._vehicle.boots, self._vehicle.not_ready_count, self.vehicle
+        items = self._vehicle.handle_message(message, at_ns)
         if address is None and self.vehicle is None:
-            self._look_for_one(message, at_ns)
+            self._note_missing_heartbeat(message, at_ns)
         elif self.vehicle != address:
             self._streams.restart()
-            self._globe, self._parameters, self._vehicle_clock = Globe(), ParameterList(), ArrivalClock()
+            self._origin_setup, self._parameters, self._vehicle_clock = (
+                GlobalOriginSetup(),
+                ParameterDownload(),
+                ArrivalClock(),
+            )
         if self._vehicle.boots != boots:
             self._streams.restart()
-            self._globe, self._parameters, self._vehicle_clock = Globe(), ParameterList(), ArrivalClock()
+            self._origin_setup, self._parameters, self._vehicle_clock = (
+                GlobalOriginSetup(),
+                ParameterDownload(),
+                ArrivalClock(),
+            )
             text = f"link {self._name}: the vehicle has started anew"
             return (*items, Event(at_ns=at_ns, severity=Severity.ERROR, code="vehicle-reboot", text=text))
-        if self._vehicle.unready != unready:
-            self._streams.restart()  # those that go on will have been seen by the time they would be asked for
+        if self._vehicle.not_ready_count != not_ready_count:
+            self._streams.restart()  # streams that continue are received again before the next request
         if (message.system, message.component) == self.vehicle:
-            self._streams.saw(message)
-            self._globe.saw(message)
-            self._parameters.saw(message)
+            self._streams.handle_message(message)
+            self._origin_setup.handle_message(message)
+            self._parameters.handle_message(message)
             match message:
                 case Position(boot_ms=True, stamp_us=int(stamp_us)) | Attitude(stamp_us=stamp_us) if stamp_us:
-                    self._vehicle_clock.delay_ns(1000 * stamp_us, at_ns)
+                    self._vehicle_clock.measure_delay_ns(1000 * stamp_us, at_ns)
         return items
 
-    def _look_for_one(self, message: Message, at_ns: int) -> None:
-        """Note a vehicle that sends its position or attitude, and no heartbeat."""
+    def _note_missing_heartbeat(self, message: Message, at_ns: int) -> None:
+        """Note a vehicle that sends its position or attitude, but no heartbeat."""
         if isinstance(message, Attitude) or (isinstance(message, Position) and message.boot_ms):
-            self._mute = (message.system, message.component)
-            if self._mute_since_ns is None:
-                self._mute_since_ns = at_ns
+            self._no_heartbeat_address = (message.system, message.component)
+            if self._no_heartbeat_since_ns is None:
+                self._no_heartbeat_since_ns = at_ns
 
-    def _timesync(self, message: TimeSync, at_ns: int) -> None:
+    def _handle_timesync(self, message: TimeSync, at_ns: int) -> None:
         if message.tc1_ns == 0:
-            if at_ns - self._answers_from_ns >= ANSWERS_NS:
-                self._answers_from_ns = at_ns
-                self._answered_to.clear()
-            of_vehicle = self.vehicle is not None and message.system == self.vehicle[0]
-            if self._answered_to[of_vehicle] >= MAX_ANSWERS:
-                self._count(UNANSWERED)
+            if at_ns - self._reply_window_ns >= ANSWER_WINDOW_NS:
+                self._reply_window_ns = at_ns
+                self._reply_counts.clear()
+            is_from_vehicle = self.vehicle is not None and message.system == self.vehicle[0]
+            if self._reply_counts[is_from_vehicle] >= MAX_ANSWERS:
+                self._count_bad(TIMESYNC_FLOOD)
                 return
-            self._answered_to[of_vehicle] += 1
-            own = self._gives_vehicle_time and (message.system, message.component) == self.vehicle
-            time_ns = self._vehicle_time_ns(at_ns) if own else at_ns
+            self._reply_counts[is_from_vehicle] += 1
+            is_vehicle = self._uses_vehicle_time and (message.system, message.component) == self.vehicle
+            time_ns = self._vehicle_time_ns(at_ns) if is_vehicle else at_ns
             if time_ns is not None:
-                self._answers.append(self._encoder.timesync(time_ns, message.ts1_ns))
-        elif message.ts1_ns in self._open:  # else it answers somebody else
-            self._answered = True
-            self._intake.answer((message.system, message.component), message.ts1_ns, message.tc1_ns, at_ns)
+                self._replies.append(self._encoder.encode_timesync(time_ns, message.ts1_ns))
+        elif message.ts1_ns in self._open_requests_ns:  # else it answers another client
+            self._has_answer = True
+            self._positions.add_timesync_answer(
+                (message.system, message.component), message.ts1_ns, message.tc1_ns, at_ns
+            )
 
-    def _count(self, reason: str, count: int = 1) -> None:
+    def _count_bad(self, reason: str, count: int = 1) -> None:
         self._bad[reason] += count
         if reason == SLOW_ANSWER:
-            self._slow += count
-        elif reason == UNPUNCTUAL:  # told once, and then by the share that is used
+            self._slow_count += count
+        elif reason == STALE_INERTIAL:  # reported once; then the used share is reported
             if self._bad[reason] == count:
-                self._untold[reason] += count
-        elif reason not in _USUAL:
-            self._untold[reason] += count
+                self._unreported[reason] += count
+        elif reason not in _NOT_REPORTED:
+            self._unreported[reason] += count
 
-    def _tell(self, at_ns: int) -> tuple[Event, ...]:
-        """Return events: what was dropped, one a second, and new clocks as they are found."""
+    def _make_events(self, at_ns: int) -> tuple[Event, ...]:
+        """Return events: dropped data once a second; new clocks, units and other findings once each."""
         events = []
-        if self._intake.resyncs > self._resyncs_told:
-            self._resyncs_told = self._intake.resyncs
+        if self._positions.resyncs > self._reported_resyncs:
+            self._reported_resyncs = self._positions.resyncs
             text = f"link {self._name}: a source's clock has jumped; synchronised anew"
             events.append(Event(at_ns=at_ns, severity=Severity.WARNING, code="clock-resync", text=text))
-        for (system, component), unit in self._intake.units.items():
-            if (system, component, unit) not in self._units_told:
-                self._units_told.add((system, component, unit))
-                what = "do not go on" if unit is StampUnit.CONSTANT else f"are in {unit}, not in us"
-                text = f"link {self._name}: stamps of the positions of {system}/{component} {what}: "
+        for (system, component), unit in self._positions.units.items():
+            if (system, component, unit) not in self._reported_units:
+                self._reported_units.add((system, component, unit))
+                fault = "do not go on" if unit is StampUnit.CONSTANT else f"are in {unit}, not in us"
+                text = f"link {self._name}: stamps of the positions of {system}/{component} {fault}: "
                 text += "they count by their arrival, and their ages are not known"
                 events.append(Event(at_ns=at_ns, severity=Severity.WARNING, code=STAMP_UNIT, text=text))
-        since_ns = self._mute_since_ns
-        if since_ns is not None and self.vehicle is None and not self._mute_told and at_ns - since_ns >= MUTE_NS:
-            self._mute_told = True
-            text = f"link {self._name}: system {self._mute and self._mute[0]} sends its position or attitude, "
+        since_ns = self._no_heartbeat_since_ns
+        if (
+            since_ns is not None
+            and self.vehicle is None
+            and not self._is_no_heartbeat_reported
+            and at_ns - since_ns >= MISSING_HEARTBEAT_NS
+        ):
+            self._is_no_heartbeat_reported = True
+            sender = self._no_heartbeat_address and self._no_heartbeat_address[0]
+            text = f"link {self._name}: system {sender} sends its position or attitude, "
             text += "but no heartbeat of an autopilot: its mode is not known, so it is not flown"
             events.append(Event(at_ns=at_ns, severity=Severity.WARNING, code=NO_HEARTBEAT, text=text))
-        used, total = self._vehicle.inertial_used, self._vehicle.inertial_total
-        if not self._low_share_told and total >= ENOUGH and used < LOW_SHARE * total:
-            self._low_share_told = True
-            text = f"link {self._name}: {1 - used / total:.0%} of the inertial data are not used: late, frozen, "
+        used_count, total = self._vehicle.inertial_used, self._vehicle.inertial_total
+        if not self._is_low_share_reported and total >= MIN_INERTIAL and used_count < MIN_INERTIAL_SHARE * total:
+            self._is_low_share_reported = True
+            text = f"link {self._name}: {1 - used_count / total:.0%} of the inertial data are not used: late, frozen, "
             text += "or without an attitude of now"
-            events.append(Event(at_ns=at_ns, severity=Severity.WARNING, code=UNPUNCTUAL, text=text, count=total - used))
-        if self._slow and (self._slow_told_ns is None or at_ns - self._slow_told_ns >= SLOW_TOLD_NS):
-            self._slow_told_ns = at_ns
-            events.append(self._slow_answers(at_ns))
-            self._slow = 0
-        if self._untold and (self._told_ns is None or at_ns - self._told_ns >= SECOND_NS):
-            self._told_ns = at_ns
-            events.extend(self._dropped(at_ns))
-            self._untold.clear()
+            events.append(
+                Event(at_ns=at_ns, severity=Severity.WARNING, code=STALE_INERTIAL, text=text, count=total - used_count)
+            )
+        if self._slow_count and (self._slow_reported_ns is None or at_ns - self._slow_reported_ns >= SLOW_EVENT_NS):
+            self._slow_reported_ns = at_ns
+            events.append(self._make_slow_answer_event(at_ns))
+            self._slow_count = 0
+        if self._unreported and (self._reported_ns is None or at_ns - self._reported_ns >= SECOND_NS):
+            self._reported_ns = at_ns
+            events.extend(self._make_drop_events(at_ns))
+            self._unreported.clear()
         return tuple(events)
 
-    def _slow_answers(self, at_ns: int) -> Event:
-        """Answers to TIMESYNC that a busy machine or link made too slow to measure by: no trouble while others do."""
-        known = self._intake.knows_clocks(at_ns)
+    def _make_slow_answer_event(self, at_ns: int) -> Event:
+        """Return the event about answers to TIMESYNC that were too slow; harmless while other answers are used."""
+        known = self._positions.are_clocks_known(at_ns)
         text = f"link {self._name}: answers to TIMESYNC came too slow to be used; the clock " + (
             "stays known by the others" if known else "is not known by them any more"
         )
         severity = Severity.INFO if known else Severity.WARNING
-        return Event(at_ns=at_ns, severity=severity, code=SLOW_ANSWER, text=text, count=self._slow)
+        return Event(at_ns=at_ns, severity=severity, code=SLOW_ANSWER, text=text, count=self._slow_count)
 
-    def _dropped(self, at_ns: int) -> list[Event]:
+    def _make_drop_events(self, at_ns: int) -> list[Event]:
         events = []
-        vehicles = self._untold.pop(SECOND_VEHICLE, 0)
+        vehicles = self._unreported.pop(SECOND_VEHICLE, 0)
         if vehicles and self._vehicle.address is not None:
             text = f"link {self._name}: another vehicle than system {self._vehicle.address[0]} is heard, and ignored"
             events.append(Event(at_ns=at_ns, severity=Severity.ERROR, code=SECOND_VEHICLE, text=text, count=vehicles))
-        if self._untold:
-            reasons = ", ".join(f"{count} {reason}" for reason, count in sorted(self._untold.items()))
+        if self._unreported:
+            reasons = ", ".join(f"{count} {reason}" for reason, count in sorted(self._unreported.items()))
             text = f"link {self._name}: dropped {reasons}"
-            count = self._untold.total()
+            count = self._unreported.total()
             events.append(Event(at_ns=at_ns, severity=Severity.WARNING, code="dropped", text=text, count=count))
         return events

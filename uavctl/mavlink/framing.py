@@ -1,44 +1,44 @@
-"""Raw MAVLink frames in bytes: where one begins and ends, and whether its checksum is right.
+"""MAVLink frames in raw bytes: where they begin and end, and whether their checksums are right.
 
-Frame layout: https://mavlink.io/en/guide/serialization.html. Whatever is no frame is skipped and
-counted by reason, and the search goes on at the next byte that could begin one.
+Frame layout: https://mavlink.io/en/guide/serialization.html.
+
+1. Look for a magic byte (0xFE or 0xFD) and read the frame's length and message id.
+2. Compare the checksum, or verify the signature where signatures are required.
+3. If one of these fails, count the reason and go on at the next magic byte.
+4. After `MAX_FAILED` failures drop the rest, so that hostile data cannot take the time of a tick.
+5. A frame of an unknown message has no known checksum. Its length counts only between two frames.
 """
 
 from __future__ import annotations
 
-import re
 from binascii import crc_hqx
-from collections import namedtuple
 from collections.abc import Callable
 from enum import StrEnum
-from itertools import accumulate, pairwise
-from operator import itemgetter
-from typing import Any, Protocol
 
 import msgspec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 HEADER_V1, HEADER_V2, CHECKSUM = 6, 10, 2  # bytes
 _INCOMPAT_KNOWN = mavlink.MAVLINK_IFLAG_SIGNED
-MAX_FAILED = 64  # tries in one datagram or chunk; a hostile one must not cost the loop its tick
-# A byte of each message's definition, that is summed up after the frame's own.
+MAX_FAILED = 64  # in one datagram or chunk; a hostile one must not take the time of a tick
+# CRC_EXTRA of each message definition, which the checksum includes.
 _CRC_EXTRA = {number: bytes((kind.crc_extra,)) for number, kind in mavlink.mavlink_map.items()}
 _REVERSED = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))  # each byte with its bits in reverse order
 _CRC_START = 0xFFFF
 _MAGIC = (mavlink.PROTOCOL_MARKER_V1, mavlink.PROTOCOL_MARKER_V2)
 
 
-class BadBytes(StrEnum):
+class SkipReason(StrEnum):
     """Reason why bytes were skipped."""
 
     CRC = "crc"  # a frame with a wrong checksum
     TRUNCATED = "truncated"  # a frame that the data ends in
     GARBAGE = "garbage"  # a run of bytes that no frame begins in
     OVERSIZE = "oversize"  # a datagram longer than any that peers send
-    UNKNOWN = "unknown-message"  # an id that the dialect has not: passed over by its length
+    UNKNOWN = "unknown-message"  # an id that the dialect does not have: skipped by its length
 
 
-UNSIGNED = "unsigned"  # a frame without the signature that is asked for
+UNSIGNED = "unsigned"  # a frame without the required signature
 Verify = Callable[[bytes], str | None]
 """Takes a whole frame that has a signature; gives the reason not to take it, or None."""
 
@@ -55,42 +55,42 @@ class Scan(msgspec.Struct):
 
     frames: list[RawFrame] = []  # whole frames in order
     bad: dict[str, int] = {}  # skips by reason
-    consumed: int = 0  # number of bytes that need not be seen again
-    in_step: bool = True  # whether the last bytes seen were a frame, so that the next byte should begin one
+    consumed: int = 0  # number of bytes that are done
+    is_aligned: bool = True  # whether the last bytes were a frame, so that the next byte should begin one
 
-    def skip(self, reason: str) -> None:
+    def count_skip(self, reason: str) -> None:
         """Count a skip."""
         self.bad[reason] = self.bad.get(reason, 0) + 1
 
 
-class _Shape(msgspec.Struct, frozen=True):
-    """Length and kind of a frame, as its first bytes announce them."""
+class _FrameHeader(msgspec.Struct, frozen=True):
+    """Length and message id of a frame, from its header."""
 
     length: int
     message_id: int
     signature: int  # bytes after the checksum
 
 
-def _shape(data: bytes, at: int) -> _Shape | None:
-    """Shape of the frame at `at`; None while too few bytes are there to tell. `data[at]` is a magic byte."""
+def _parse_header(data: bytes, at: int) -> _FrameHeader | None:
+    """Parse the header at `at`; None if bytes are missing. `data[at]` is a magic byte."""
     if data[at] == mavlink.PROTOCOL_MARKER_V1:
         if len(data) - at < HEADER_V1:
             return None
-        return _Shape(HEADER_V1 + data[at + 1] + CHECKSUM, data[at + 5], 0)
+        return _FrameHeader(HEADER_V1 + data[at + 1] + CHECKSUM, data[at + 5], 0)
     if len(data) - at < HEADER_V2:
         return None
     signature = mavlink.MAVLINK_SIGNATURE_BLOCK_LEN if data[at + 2] & mavlink.MAVLINK_IFLAG_SIGNED else 0
     message_id = int.from_bytes(data[at + 7 : at + 10], "little")
-    return _Shape(HEADER_V2 + data[at + 1] + CHECKSUM + signature, message_id, signature)
+    return _FrameHeader(HEADER_V2 + data[at + 1] + CHECKSUM + signature, message_id, signature)
 
 
-def _is_foreign(data: bytes, at: int) -> bool:
-    """Whether a version 2 header has incompatibility flags that nobody has defined."""
+def _has_unknown_flags(data: bytes, at: int) -> bool:
+    """Return whether a version 2 header has undefined incompatibility flags."""
     return data[at] == mavlink.PROTOCOL_MARKER_V2 and len(data) - at > 2 and bool(data[at + 2] & ~_INCOMPAT_KNOWN)
 
 
-def _checksum(body: bytes, message_id: int) -> int:
-    """Checksum of what follows a frame's first byte, up to its payload's end: CRC-16/MCRF4XX.
+def _compute_checksum(body: bytes, message_id: int) -> int:
+    """Compute the checksum of a frame from its second byte to the end of its payload: CRC-16/MCRF4XX.
 
     That is the CRC of `binascii` with the bits of all bytes reversed. pymavlink's own takes 70 times as long where the
     package fastcrc is missing.
@@ -99,206 +99,125 @@ def _checksum(body: bytes, message_id: int) -> int:
     return _REVERSED[crc >> 8] | _REVERSED[crc & 0xFF] << 8
 
 
-def _checksum_fits(frame: bytes, shape: _Shape) -> bool:
-    """Whether the checksum of a frame of a known id is right."""
-    end = shape.length - shape.signature - CHECKSUM
-    return _checksum(frame[1:end], shape.message_id) == int.from_bytes(frame[end : end + CHECKSUM], "little")
+def _is_checksum_right(frame: bytes, header: _FrameHeader) -> bool:
+    """Return whether the checksum of a frame of a known id is right."""
+    end = header.length - header.signature - CHECKSUM
+    return _compute_checksum(frame[1:end], header.message_id) == int.from_bytes(frame[end : end + CHECKSUM], "little")
 
 
 def is_frame(data: bytes) -> bool:
-    """Whether bytes are one whole frame of a known id with the right checksum."""
-    if not data or data[0] not in _MAGIC or _is_foreign(data, 0):
+    """Return whether bytes are one whole frame of a known id with the right checksum."""
+    if not data or data[0] not in _MAGIC or _has_unknown_flags(data, 0):
         return False
-    shape = _shape(data, 0)
+    header = _parse_header(data, 0)
     return (
-        shape is not None
-        and shape.length == len(data)
-        and shape.message_id in mavlink.mavlink_map
-        and _checksum_fits(data, shape)
+        header is not None
+        and header.length == len(data)
+        and header.message_id in mavlink.mavlink_map
+        and _is_checksum_right(data, header)
     )
 
 
-def with_checksum(head: bytes) -> bytes:
-    """Header and payload of a frame of MAVLink 2, with its checksum.
+def add_checksum(head: bytes) -> bytes:
+    """Add the checksum to header and payload of a MAVLink 2 frame.
 
     Raises:
         KeyError: the message id is unknown to the dialect.
     """
     message_id = int.from_bytes(head[7:HEADER_V2], "little")
-    return head + _checksum(head[1:], message_id).to_bytes(CHECKSUM, "little")
+    return head + _compute_checksum(head[1:], message_id).to_bytes(CHECKSUM, "little")
 
 
-def scan(data: bytes, *, final: bool, in_step: bool = True, verify: Verify | None = None) -> Scan:
-    """Find the frames in some bytes.
+def scan_frames(data: bytes, *, final: bool, is_aligned: bool = True, verify: Verify | None = None) -> Scan:
+    """Find the frames in bytes.
 
     Args:
-        data: a datagram, or what has come of a stream.
-        final: whether the data ends here. If not, a frame that it ends in is left for later.
-        in_step: whether the first byte should begin a frame (see `Scan`).
-        verify: takes only frames whose signature it accepts, in place of the checksum; frames of ids that the dialect
-            has not are verified too, and then counted and dropped.
+        data: a datagram, or the received part of a stream.
+        final: whether the data ends here. If not, an incomplete frame at its end is left for later.
+        is_aligned: whether the first byte should begin a frame (see `Scan`).
+        verify: verifies the signature instead of the checksum; only accepted frames pass. Frames of unknown messages
+            are verified too, then counted and dropped.
 
     Returns:
-        What was found. One broken frame, or one run of garbage, counts once. A datagram, or what has come of a stream,
-        in which nothing fits any more after `MAX_FAILED` tries is dropped from there on.
+        The frames and counts. One broken frame, or one run of garbage, counts once. After `MAX_FAILED` failures the
+        rest of the data is dropped.
     """
-    result = Scan(in_step=in_step)
-    failed = 0
+    result = Scan(is_aligned=is_aligned)
+    failures = 0
     while result.consumed < len(data):
         end, reason = _try_frame(data, result, verify, final=final)
         if reason is _WAIT:
             break
         if end is None:
-            if result.in_step:
-                result.skip(reason)
-            failed += 1
-            end = len(data) if failed > MAX_FAILED else _next_magic(data, result.consumed + 1)
-        result.in_step = reason is _TAKEN
+            if result.is_aligned:
+                result.count_skip(reason)
+            failures += 1
+            end = len(data) if failures > MAX_FAILED else _find_next_magic(data, result.consumed + 1)
+        result.is_aligned = reason is _ACCEPTED
         result.consumed = end
     return result
 
 
-def scan_one(data: bytes) -> Scan:
-    """Look at bytes that should be one whole frame; others are not searched for in them."""
+def scan_single_frame(data: bytes) -> Scan:
+    """Parse bytes that should be one whole frame, without a search."""
     result = Scan(consumed=0)
-    end, reason = _try_frame(data, result, None, final=True) if data else (None, BadBytes.TRUNCATED)
+    end, reason = _try_frame(data, result, None, final=True) if data else (None, SkipReason.TRUNCATED)
     if end is None:
-        result.skip(reason)
+        result.count_skip(reason)
     result.consumed = len(data)
     return result
 
 
-_TAKEN, _WAIT = "taken", "wait"
+_ACCEPTED, _WAIT = "taken", "wait"
 
 
 def _try_frame(data: bytes, result: Scan, verify: Verify | None, *, final: bool) -> tuple[int | None, str]:
-    """Try for a frame at `result.consumed`: (its end, `_TAKEN`), or (None, why not)."""
+    """Try to read a frame at `result.consumed`; return (its end, `_ACCEPTED`), or (None, reason)."""
     at = result.consumed
-    if data[at] not in _MAGIC or _is_foreign(data, at):
-        return None, BadBytes.GARBAGE
-    shape = _shape(data, at)
-    if shape is None or at + shape.length > len(data):
-        return None, BadBytes.TRUNCATED if final else _WAIT
-    end = at + shape.length
+    if data[at] not in _MAGIC or _has_unknown_flags(data, at):
+        return None, SkipReason.GARBAGE
+    header = _parse_header(data, at)
+    if header is None or at + header.length > len(data):
+        return None, SkipReason.TRUNCATED if final else _WAIT
+    end = at + header.length
     if verify is not None:
-        return _try_signed(data, result, shape, verify)
-    if shape.message_id not in mavlink.mavlink_map:
-        # Nothing but the length can be checked.
-        if not _between_frames(data, result, end):
-            return None, BadBytes.GARBAGE
-        result.skip(BadBytes.UNKNOWN)
-        return end, _TAKEN
+        return _try_signed(data, result, header, verify)
+    if header.message_id not in mavlink.mavlink_map:
+        # Only the length can be checked.
+        if not _is_length_credible(data, result, end):
+            return None, SkipReason.GARBAGE
+        result.count_skip(SkipReason.UNKNOWN)
+        return end, _ACCEPTED
     frame = data[at:end]
-    if not _checksum_fits(frame, shape):
-        return None, BadBytes.CRC
-    result.frames.append(RawFrame(frame, shape.message_id))
-    return end, _TAKEN
+    if not _is_checksum_right(frame, header):
+        return None, SkipReason.CRC
+    result.frames.append(RawFrame(frame, header.message_id))
+    return end, _ACCEPTED
 
 
-def _try_signed(data: bytes, result: Scan, shape: _Shape, verify: Verify) -> tuple[int | None, str]:
-    """Try for a frame where signatures are required: of a frame without one only the length is believed."""
+def _try_signed(data: bytes, result: Scan, header: _FrameHeader, verify: Verify) -> tuple[int | None, str]:
+    """Try to read a frame where signatures are required; of one without a signature only the length counts."""
     at = result.consumed
-    end = at + shape.length
+    end = at + header.length
     frame = data[at:end]
-    refusal = verify(frame) if shape.signature else UNSIGNED
+    refusal = verify(frame) if header.signature else UNSIGNED
     if refusal is not None:
-        if not _between_frames(data, result, end):
+        if not _is_length_credible(data, result, end):
             return None, refusal
-        result.skip(refusal)
-    elif shape.message_id not in mavlink.mavlink_map:
-        result.skip(BadBytes.UNKNOWN)
+        result.count_skip(refusal)
+    elif header.message_id not in mavlink.mavlink_map:
+        result.count_skip(SkipReason.UNKNOWN)
     else:
-        result.frames.append(RawFrame(frame, shape.message_id))
-    return end, _TAKEN
+        result.frames.append(RawFrame(frame, header.message_id))
+    return end, _ACCEPTED
 
 
-def _between_frames(data: bytes, result: Scan, end: int) -> bool:
-    """Whether an unchecked length can be believed: a frame came before, and another seems to follow."""
-    return result.in_step and (end >= len(data) or data[end] in _MAGIC)
+def _is_length_credible(data: bytes, result: Scan, end: int) -> bool:
+    """Return whether an unchecked length is credible: a frame came before, and another one seems to follow."""
+    return result.is_aligned and (end >= len(data) or data[end] in _MAGIC)
 
 
-def _next_magic(data: bytes, start: int) -> int:
-    """Index of the next byte that could begin a frame, or the end."""
-    found = [index for magic in _MAGIC if (index := data.find(magic, start)) >= 0]
-    return min(found, default=len(data))
-
-
-# The content of frames by pymavlink's definitions: the fields and bytes that its `decode` and `pack` give.
-#
-# Those make a header and a dozen lists for each message, and take once more the checksum that the scan has taken:
-# several times the work, for a hundred messages a second.
-
-
-_SENDER_V1, _SENDER_V2 = 3, 5  # index of the system id; the component's follows
-
-
-class Fields(Protocol):
-    """Decoded frame: the fields of its message by their names, an array as a tuple, a text as its bytes."""
-
-    msgname: str
-    src_system: int
-    src_component: int
-
-    def __getattr__(self, name: str) -> Any: ...
-
-
-class MessageLayout:
-    """Layout of one kind of message in a frame."""
-
-    def __init__(self, kind: Any) -> None:
-        self._name, self._id = kind.msgname, kind.id.to_bytes(3, "little")
-        self._struct = kind.unpacker
-        self._order = [kind.orders.index(place) for place in range(len(kind.orders))]
-        sender = ("msgname", "src_system", "src_component")
-        # Its names are those of the definition, which no type checker knows.
-        self._make: Any = namedtuple(kind.msgname, (*sender, *kind.ordered_fieldnames))._make  # type: ignore[attr-defined]
-        self._grouped: Callable[[tuple[Any, ...]], tuple[Any, ...]] | None = None  # None: no arrays
-        if max(kind.lengths) > 1:
-            ends = accumulate((1, 1, 1, *kind.lengths), initial=0)
-            self._grouped = itemgetter(*(i if j - i == 1 else slice(i, j) for i, j in pairwise(ends)))
-
-    def read(self, frame: bytes) -> Fields:
-        """The fields of a whole frame of this kind; bytes that its payload lacks are 0, those too many dropped."""
-        start, sender = (HEADER_V2, _SENDER_V2) if frame[0] == mavlink.PROTOCOL_MARKER_V2 else (HEADER_V1, _SENDER_V1)
-        payload = frame[start : start + frame[1]].ljust(self._struct.size, b"\0")
-        values = (self._name, frame[sender], frame[sender + 1], *self._struct.unpack_from(payload))
-        fields: Fields = self._make(values if self._grouped is None else self._grouped(values))
-        return fields
-
-    def frame(self, address: tuple[int, int], number: int, *fields: Any) -> bytes:
-        """A frame of MAVLink 2.
-
-        Args:
-            address: system and component that send it.
-            number: its place in their sequence, 0 to 255.
-            fields: in the order of pymavlink's class; numbers that are not given at the end are 0.
-
-        Raises:
-            struct.error: a number does not fit.
-        """
-        given = (*fields, *(0,) * (len(self._order) - len(fields)))
-        values = [given[index] for index in self._order]
-        if self._grouped is not None:
-            values = [part for value in values for part in (value if isinstance(value, list | tuple) else (value,))]
-        payload = self._struct.pack(*values).rstrip(b"\0") or b"\0"
-        header = bytes((mavlink.PROTOCOL_MARKER_V2, len(payload), 0, 0, number, *address)) + self._id
-        return with_checksum(header + payload)
-
-
-# Escape sequences of a terminal, ECMA-48: CSI with its parameters, OSC up to its end, and those of two characters.
-_ESCAPES = re.compile(
-    r"(?:\x1b\[|\x9b)[0-?]*[ -/]*[@-~]?|(?:\x1b\]|\x9d)[^\x07\x1b\x9c]*(?:\x07|\x1b\\|\x9c)?|\x1b[ -/]*[0-~]?"
-)
-
-
-def plain_text(text: str) -> str:
-    """A text that somebody else wrote, without what would act on the terminal that shows it.
-
-    Escape sequences go, as PX4's colours; any other character that is not printable becomes a question mark.
-    """
-    return "".join(character if character.isprintable() else "?" for character in _ESCAPES.sub("", text))
-
-
-def text_of(raw: bytes) -> str:
-    """A text of a fixed length, up to its first zero, as it may be shown."""
-    return plain_text(raw.split(b"\0", 1)[0].decode("utf-8", errors="replace"))
+def _find_next_magic(data: bytes, start: int) -> int:
+    """Return the index of the next byte that could begin a frame, or the end."""
+    candidates = [index for magic in _MAGIC if (index := data.find(magic, start)) >= 0]
+    return min(candidates, default=len(data))

@@ -1,4 +1,11 @@
-"""The hand-over from tick to tick: walks the table of its states, makes requests of the vehicle, tells what happens."""
+"""State machine of the hand-over between pilot and controller, one update in each tick.
+
+1. Accept or refuse the orders of the operator.
+2. Evaluate the guards (`handover_guards`): one event for this tick.
+3. Look up the next state and the allowed setpoints (`handover_states.TRANSITIONS`).
+4. On entry of a state, choose the request to the vehicle and its limits.
+5. Return the request that is due, the setpoint mode, and the events for people.
+"""
 
 from __future__ import annotations
 
@@ -6,31 +13,31 @@ import msgspec
 
 from uavctl.config.connections import HandOverConfig
 from uavctl.mavlink.handover_guards import (
-    ASKING,
-    LEAVING,
-    MUST_LAND,
+    LAND_PERIODS,
+    REQUESTING,
+    TAKING_OFF,
     GuardResult,
-    HandoverView,
-    Progress,
-    against_engaging,
+    HandoverInput,
+    HandoverProgress,
     evaluate,
-    fails,
-    nobody_s,
-    silent,
+    explain_engage_refusal,
+    is_in_failsafe,
+    is_silent,
+    is_without_pilot,
 )
-from uavctl.mavlink.handover_states import TRANSITIONS, HandoverEvent, HandoverState, Sending
-from uavctl.mavlink.profile import profile_of
-from uavctl.mavlink.requests import Patience, PendingRequest, RequestKind
-from uavctl.mavlink.switcher import Switcher
+from uavctl.mavlink.handover_states import TRANSITIONS, HandoverEvent, HandoverState, SetpointMode
+from uavctl.mavlink.mode_reason import ModeReason
+from uavctl.mavlink.profile import find_profile
+from uavctl.mavlink.requests import PendingRequest, RequestKind, RequestLimits
 from uavctl.records import ORDER_ACCEPTED, ORDER_REFUSED, Command, Event, Order, Severity, VehicleStatus
 
 LAND_TRIES = 5
-NEWS_NS = 100_000_000  # a heartbeat is news for so long: two ticks
-MISSED_NS = 1_500_000_000  # one that was due is missing
+NEW_HEARTBEAT_NS = 100_000_000  # a heartbeat counts as new for two ticks
+MISSING_HEARTBEAT_NS = 1_500_000_000  # a heartbeat is missing
 FOREVER_NS = 2**62
-_OVER = frozenset({HandoverState.DONE, HandoverState.FAILED})
+_END_STATES = frozenset({HandoverState.DONE, HandoverState.FAILED})
 _ON_THE_GROUND = frozenset({HandoverState.MODE, HandoverState.ARMING})
-_BEGUN = frozenset(
+_MOVING_STATES = frozenset(
     {
         HandoverState.CLIMBING,
         HandoverState.ENGAGING,
@@ -40,318 +47,353 @@ _BEGUN = frozenset(
         HandoverState.SETTLING,
     }
 )
-_PLAIN = frozenset(HandoverState) - {
+_ROUTINE_STATES = frozenset(HandoverState) - {
     HandoverState.FAILSAFE,
     HandoverState.UNCLEAR,
     HandoverState.RELEASED,
     HandoverState.LANDING,
     HandoverState.FAILED,
 }
-# In these it counts which mode the vehicle was in as they were entered.
-_NOTES_MODE = frozenset({HandoverState.MODE, HandoverState.RETURNING, HandoverState.FAILSAFE, HandoverState.LANDING})
-# A failsafe that ends one of these, and ends itself, has interrupted the climb only.
-_CLIMBS = frozenset({HandoverState.ARMING, HandoverState.CLIMBING, HandoverState.ENGAGING})
-_TAKEN = frozenset({HandoverState.FAILSAFE, HandoverState.UNCLEAR})
-_PROMISES = {
+# States that store the vehicle's mode on entry.
+_STATES_STORING_MODE = frozenset(
+    {HandoverState.MODE, HandoverState.RETURNING, HandoverState.FAILSAFE, HandoverState.LANDING}
+)
+# A failsafe in one of these states, which ends itself, has only interrupted the climb.
+_CLIMB_STATES = frozenset({HandoverState.ARMING, HandoverState.CLIMBING, HandoverState.ENGAGING})
+_TAKEN_OVER_STATES = frozenset({HandoverState.FAILSAFE, HandoverState.UNCLEAR})
+_ORDER_TEXTS = {
     Order.TAKE_OFF: "will take off",
     Order.ENGAGE: "asks for the mode that takes setpoints",
     Order.STAND_BY: "leaves a vehicle alone that is found armed",
 }
-HAND_OVER_ORDERS = frozenset(_PROMISES)  # the others are the controller's
+HAND_OVER_ORDERS = frozenset(_ORDER_TEXTS)  # all other orders are for the controller
 
 
-class Passage(msgspec.Struct, frozen=True):
-    """Transition of the table that was made."""
+class StateTransition(msgspec.Struct, frozen=True):
+    """Transition between two states."""
 
     before: HandoverState  # the state that was left
-    seen: HandoverEvent  # why
+    event: HandoverEvent
     after: HandoverState  # the state that was entered
-    why: str = ""  # more about it, where something failed
-    ask: RequestKind | None = None  # request to the vehicle at that time
-    granted: bool = False  # it had said yes to that
-    who: Switcher | None = None  # who has changed the mode, where it is none of ours
+    reason: str = ""  # reason of a failure
+    request: RequestKind | None = None  # request to the vehicle at that time
+    is_granted: bool = False  # the vehicle had accepted the request
+    mode_reason: ModeReason | None = None  # reason of a mode that is not ours
 
 
-class HandoverStep(msgspec.Struct, frozen=True):
+class HandoverOutput(msgspec.Struct, frozen=True):
     """Result of a tick of the hand-over."""
 
-    sending: Sending  # setpoints that may be streamed
-    ask: RequestKind | None = None  # request to make now, if any
-    events: tuple[Event, ...] = ()  # events to tell
-    passage: Passage | None = None  # transition that was made, if one was
+    setpoint_mode: SetpointMode  # setpoints that may be streamed
+    request: RequestKind | None = None  # request to make now, if any
+    events: tuple[Event, ...] = ()  # events for people
+    transition: StateTransition | None = None  # transition that was made, if one was
 
 
-class HandOver:
-    """State machine that decides who flies one vehicle.
+class HandoverStateMachine:
+    """State machine of the hand-over of one vehicle.
 
     Args:
-        sees_it_down: Wait for the end of every landing, not only of flights that were begun by an order: the vehicle
-            lands by the positions that it gets from here.
+        waits_for_landing: Wait for the end of every landing, not only of ordered flights: the vehicle lands on relayed
+            positions.
 
     Attributes:
         failure: Why a request failed; empty while none has.
     """
 
-    def __init__(self, config: HandOverConfig | None = None, *, sees_it_down: bool = False) -> None:
+    def __init__(self, config: HandOverConfig | None = None, *, waits_for_landing: bool = False) -> None:
         self._config = HandOverConfig() if config is None else config
-        self._now = Progress(config=self._config, request=PendingRequest(None, 0, Patience(0, 0, 0, FOREVER_NS)))
-        self._sees_it_down = sees_it_down
-        self._landed_ns: int | None = None  # since when it stands on the ground, armed
-        self._disarms = False
-        self._silent = False
-        self._waits_for_nobody = False  # what we took off flies by itself, and nothing shows that a person has it
-        self._overdue = False  # a landing that is asked for has not begun in the time for it
-        self._aloft_ns: int | None = None  # the last tick in which the vehicle was heard, and in the air
+        self._progress = HandoverProgress(
+            config=self._config, request=PendingRequest(None, 0, RequestLimits(0, 0, 0, FOREVER_NS))
+        )
+        self._waits_for_landing = waits_for_landing
+        self._landed_ns: int | None = None  # since then it stands on the ground, armed
+        self._is_disarm_requested = False
+        self._is_heartbeat_lost = False
+        self._is_without_pilot = False  # a vehicle that we took off flies by itself without a pilot
+        self._is_landing_overdue = False  # the vehicle has not begun a requested landing in time
+        self._airborne_ns: int | None = None  # the last tick with a vehicle that is heard and in the air
         self.failure = ""
 
     @property
     def state(self) -> HandoverState:
-        """Place in the table."""
-        return self._now.state
+        """Present state."""
+        return self._progress.state
 
     @property
-    def ours(self) -> bool:
-        """Whether this flight was begun by an order to take off."""
-        return self._now.ordered_ns is not None
+    def is_ordered_flight(self) -> bool:
+        """Whether an order to take off began this flight."""
+        return self._progress.take_off_ordered_ns is not None
 
     @property
     def height_m(self) -> float:
         """Height of the climb that was ordered [m]."""
-        return self._now.height_m
+        return self._progress.height_m
 
     @property
     def has_begun(self) -> bool:
-        """Whether the vehicle is on its way up or down at our request, or by a failsafe on a flight that we began."""
-        return self.state in _BEGUN
+        """Whether the vehicle climbs or lands at our request, or by a failsafe on an ordered flight."""
+        return self.state in _MOVING_STATES
 
     @property
-    def finished(self) -> bool:
-        """Whether nothing more will be sent, whatever comes."""
-        return self.state in _OVER and not self.carries
+    def is_finished(self) -> bool:
+        """Whether nothing will be sent any more."""
+        return self.state in _END_STATES and not self.is_relay_needed
 
     @property
-    def carries(self) -> bool:
-        """Whether a vehicle is in the air by the positions that it gets from here, which are never the first to end.
+    def is_relay_needed(self) -> bool:
+        """Whether a vehicle is in the air on relayed positions, so that the relay must go on.
 
-        A vehicle that is not heard any more gets them for the time of a landing.
+        A silent vehicle gets positions for the time of a landing.
         """
-        return self._sees_it_down and self._aloft_ns is not None
+        return self._waits_for_landing and self._airborne_ns is not None
 
     @property
-    def busy(self) -> bool:
-        """Whether an answer of the vehicle is waited for, or it is in the air by the positions it gets from here."""
-        if self.carries:
+    def is_busy(self) -> bool:
+        """Whether an answer of the vehicle is pending, or it is in the air on relayed positions."""
+        if self.is_relay_needed:
             return True
         if self.state is HandoverState.UNCLEAR:
-            return self._waits_for_nobody
-        return self.state in ASKING or (self.state is HandoverState.SETTLING and (self.ours or self._sees_it_down))
+            return self._is_without_pilot
+        return self.state in REQUESTING or (
+            self.state is HandoverState.SETTLING and (self.is_ordered_flight or self._waits_for_landing)
+        )
 
-    def flown(self, at_ns: int, vehicle: VehicleStatus | None) -> VehicleStatus | None:
-        """The vehicle as far as the controller may fly it: none when it is silent, external only when it is ours."""
-        if vehicle is None or silent(at_ns, vehicle):
+    def select_controlled_status(self, at_ns: int, vehicle: VehicleStatus | None) -> VehicleStatus | None:
+        """Return the status for the controller: None if the vehicle is silent, external only while we control it."""
+        if vehicle is None or is_silent(at_ns, vehicle):
             return None
-        if self.state in (HandoverState.WAITING, HandoverState.READY) and not self._now.stands_by:
+        if self.state in (HandoverState.WAITING, HandoverState.READY) and not self._progress.is_standing_by:
             return vehicle
         if self.state is HandoverState.ENGAGED:
-            if self.ours:
-                # It tells once a second whether it climbs by itself, and it was we who ended that.
+            if self.is_ordered_flight:
+                # EXTENDED_SYS_STATE comes once a second and may still show the climb that we have ended.
                 vehicle = msgspec.structs.replace(vehicle, own_climb=False)
-            past = self._now.shows_the_past(vehicle)
+            past = self._progress.may_be_outdated(vehicle)
             return msgspec.structs.replace(vehicle, armed=True, external=True) if past else vehicle
         return msgspec.structs.replace(vehicle, external=False, mode=f"{vehicle.mode} ({self.state})")
 
-    def has_left(self, vehicle: VehicleStatus) -> bool:
-        """Whether a heartbeat says that the vehicle is no longer in the external mode."""
-        return not (vehicle.external and vehicle.armed) and not self._now.shows_the_past(vehicle)
+    def has_left_external_mode(self, vehicle: VehicleStatus) -> bool:
+        """Return whether a heartbeat shows that the vehicle has left the external mode."""
+        return not (vehicle.external and vehicle.armed) and not self._progress.may_be_outdated(vehicle)
 
-    def update(self, view: HandoverView) -> HandoverStep:
-        """Decide what one tick may send, and what it asks the vehicle for."""
-        now, before = self._now, self.state
-        for message in view.heard:
-            now.request.hear(message, view.at_ns)
-        events = self._take_orders(view)
-        if now.heard_ns is None and view.vehicle is not None:
-            now.heard_ns = view.at_ns
-        self.look_up(view.at_ns, view.vehicle)
-        sight = evaluate(now, view)
-        if view.vehicle is not None and view.vehicle.mode in profile_of(view.vehicle).landing:
-            now.lands_failing = fails(view.vehicle)
-        if before is HandoverState.FAILSAFE and view.vehicle is not None and fails(view.vehicle):
-            now.left_mode = view.vehicle.mode  # one failsafe may follow another, and ArduPilot stays in its mode
-        now.boots = 0 if view.vehicle is None else view.vehicle.boots
-        now.state, sending = TRANSITIONS[before, sight.seen]
-        passage = None
-        late = now.state is before is HandoverState.RELEASED and sight.who is not now.who
-        if now.state is not before or late:
-            was = now.request
-            passage = Passage(before, sight.seen, now.state, sight.why, was.ask, was.granted_ns is not None, sight.who)
-            now.who = sight.who
-        if now.state is not before:
-            self._enter(before, sight, view)
-        self._waits_for_nobody = now.state is HandoverState.UNCLEAR and nobody_s(now, view.vehicle)
-        if sending is Sending.NEUTRAL and not (view.ready and self._may_warm_up(view)):
-            sending = Sending.NOTHING
-        self._see_to_disarming(view)
-        held = view.unfit if now.state in _ON_THE_GROUND else ""
-        ask = None
-        if now.request.ask is not None and not view.unsure:
-            ask = now.request.due(view.at_ns, held, blind=self._may_be_the_pilot_s(view))
-        if now.state is HandoverState.FAILED and before is HandoverState.ARMING:
-            ask = RequestKind.DISARM  # arming may have been granted after all
-        return HandoverStep(
-            sending, ask, (*events, *self._tell(view, before, sight, passed=passage is not None)), passage
+    def update(self, inputs: HandoverInput) -> HandoverOutput:
+        """Decide the setpoint mode and the request of one tick."""
+        progress, before = self._progress, self.state
+        for message in inputs.messages:
+            progress.request.handle_message(message, inputs.at_ns)
+        events = self._accept_orders(inputs)
+        if progress.first_heard_ns is None and inputs.vehicle is not None:
+            progress.first_heard_ns = inputs.at_ns
+        self.update_airborne(inputs.at_ns, inputs.vehicle)
+        result = evaluate(progress, inputs)
+        if inputs.vehicle is not None and inputs.vehicle.mode in find_profile(inputs.vehicle).landing_modes:
+            progress.is_failsafe_landing = is_in_failsafe(inputs.vehicle)
+        if before is HandoverState.FAILSAFE and inputs.vehicle is not None and is_in_failsafe(inputs.vehicle):
+            # One failsafe may follow another, and ArduPilot stays in its mode.
+            progress.previous_mode = inputs.vehicle.mode
+        progress.boots = 0 if inputs.vehicle is None else inputs.vehicle.boots
+        progress.state, setpoint_mode = TRANSITIONS[before, result.event]
+        transition = None
+        is_late_reason = (
+            progress.state is before is HandoverState.RELEASED and result.mode_reason is not progress.mode_reason
+        )
+        if progress.state is not before or is_late_reason:
+            previous_request = progress.request
+            transition = StateTransition(
+                before,
+                result.event,
+                progress.state,
+                result.reason,
+                previous_request.kind,
+                previous_request.granted_ns is not None,
+                result.mode_reason,
+            )
+            progress.mode_reason = result.mode_reason
+        if progress.state is not before:
+            self._enter_state(before, result, inputs)
+        self._is_without_pilot = progress.state is HandoverState.UNCLEAR and is_without_pilot(progress, inputs.vehicle)
+        if setpoint_mode is SetpointMode.NEUTRAL and not (inputs.has_setpoint and self._may_send_neutral(inputs)):
+            setpoint_mode = SetpointMode.NOTHING
+        self._request_disarming(inputs)
+        blocked_reason = inputs.arming_refusal if progress.state in _ON_THE_GROUND else ""
+        kind = None
+        if progress.request.kind is not None and not inputs.may_have_lost_messages:
+            kind = progress.request.due(
+                inputs.at_ns, blocked_reason, is_mode_uncertain=self._may_be_pilot_mode_change(inputs)
+            )
+        if progress.state is HandoverState.FAILED and before is HandoverState.ARMING:
+            kind = RequestKind.DISARM  # arming may have been granted after all
+        return HandoverOutput(
+            setpoint_mode,
+            kind,
+            (*events, *self._make_events(inputs, before, result, has_changed=transition is not None)),
+            transition,
         )
 
-    def look_up(self, at_ns: int, vehicle: VehicleStatus | None) -> None:
-        """See whether the vehicle is in the air; the last word of it counts for the time of a landing."""
-        if vehicle is not None and not silent(at_ns, vehicle):
-            self._aloft_ns = at_ns if vehicle.armed and not vehicle.landed else None
-        elif self._aloft_ns is not None and at_ns - self._aloft_ns >= _ns(self._config.land_s):
-            self._aloft_ns = None
+    def update_airborne(self, at_ns: int, vehicle: VehicleStatus | None) -> None:
+        """Update whether the vehicle is in the air; without messages, the last state counts for `land_s`."""
+        if vehicle is not None and not is_silent(at_ns, vehicle):
+            self._airborne_ns = at_ns if vehicle.armed and not vehicle.landed else None
+        elif self._airborne_ns is not None and at_ns - self._airborne_ns >= _ns(self._config.land_s):
+            self._airborne_ns = None
 
-    def _take_orders(self, view: HandoverView) -> list[Event]:
+    def _accept_orders(self, inputs: HandoverInput) -> list[Event]:
         events = []
-        for command in view.commands:
-            if command.order not in _PROMISES:
+        for command in inputs.commands:
+            if command.order not in _ORDER_TEXTS:
                 continue
-            refused = self._against(command, view)
-            if not refused and command.order is Order.TAKE_OFF:
-                self._now.ordered_ns, self._now.height_m = view.at_ns, command.height_m or 0.0
-            elif not refused and command.order is Order.STAND_BY:
-                self._now.stands_by, self._now.flown_ns = True, command.flown_ns
-            code, severity = (ORDER_REFUSED, Severity.WARNING) if refused else (ORDER_ACCEPTED, Severity.INFO)
-            text = refused or _PROMISES[command.order]
-            events.append(Event(at_ns=view.at_ns, severity=severity, code=code, text=text))
+            refusal = self._explain_refusal(command, inputs)
+            if not refusal and command.order is Order.TAKE_OFF:
+                self._progress.take_off_ordered_ns, self._progress.height_m = inputs.at_ns, command.height_m or 0.0
+            elif not refusal and command.order is Order.STAND_BY:
+                self._progress.is_standing_by, self._progress.previous_flight_ns = True, command.flown_ns
+            code, severity = (ORDER_REFUSED, Severity.WARNING) if refusal else (ORDER_ACCEPTED, Severity.INFO)
+            text = refusal or _ORDER_TEXTS[command.order]
+            events.append(Event(at_ns=inputs.at_ns, severity=severity, code=code, text=text))
         return events
 
-    def _against(self, command: Command, view: HandoverView) -> str:
-        """Return why an order is refused; empty if it is taken."""
+    def _explain_refusal(self, command: Command, inputs: HandoverInput) -> str:
+        """Return why an order is refused; empty if it is accepted."""
         if command.order is Order.ENGAGE:
-            return against_engaging(self.state, view)
+            return explain_engage_refusal(self.state, inputs)
         if command.order is Order.STAND_BY:
             return "" if self.state is HandoverState.WAITING else f"the vehicle has been heard; now: {self.state}"
         if not (command.height_m or 0.0) > 0.0:
             return f"a climb to {command.height_m} m is none"
-        early = self.state in (HandoverState.WAITING, HandoverState.READY) and not self.ours
-        return "" if early else f"take-off is ordered once, on the ground; now: {self.state}"
+        is_on_ground = self.state in (HandoverState.WAITING, HandoverState.READY) and not self.is_ordered_flight
+        return "" if is_on_ground else f"take-off is ordered once, on the ground; now: {self.state}"
 
-    def _may_be_the_pilot_s(self, view: HandoverView) -> bool:
-        """Whether the pilot may have changed the mode since the last heartbeat: then no request of one is repeated.
+    def _may_be_pilot_mode_change(self, inputs: HandoverInput) -> bool:
+        """Return whether the pilot may have changed the mode since the last heartbeat.
 
-        Heartbeats show a mode up to a second late, and a request that is repeated meanwhile would take it back. So
-        it is made again right after a heartbeat; landing also where none has come.
+        Heartbeats show a mode up to one second late. A repeated request would override the pilot meanwhile. So it is
+        repeated only right after a heartbeat; a landing request also if heartbeats are missing.
         """
-        vehicle, ask = view.vehicle, self._now.request.ask
-        if ask not in (RequestKind.EXTERNAL_MODE, RequestKind.LAND) or vehicle is None:
+        vehicle, kind = inputs.vehicle, self._progress.request.kind
+        if kind not in (RequestKind.EXTERNAL_MODE, RequestKind.LAND) or vehicle is None:
             return False
-        age_ns = view.at_ns - vehicle.at_ns
-        return age_ns > NEWS_NS and not (ask is RequestKind.LAND and age_ns > MISSED_NS)
+        age_ns = inputs.at_ns - vehicle.at_ns
+        return age_ns > NEW_HEARTBEAT_NS and not (kind is RequestKind.LAND and age_ns > MISSING_HEARTBEAT_NS)
 
-    def _may_warm_up(self, view: HandoverView) -> bool:
-        """Whether neutral setpoints do no harm: they would end ArduPilot's climb."""
-        if self.state not in LEAVING or view.vehicle is None:
+    def _may_send_neutral(self, inputs: HandoverInput) -> bool:
+        """Return whether neutral setpoints are safe: they would end the climb of an ArduPilot."""
+        if self.state not in TAKING_OFF or inputs.vehicle is None:
             return True
-        return profile_of(view.vehicle).climbs_on_arming
+        return find_profile(inputs.vehicle).climbs_on_arming
 
-    def _enter(self, before: HandoverState, sight: GuardResult, view: HandoverView) -> None:
-        now = self._now
-        now.since_ns, now.stands_by = view.at_ns, False
-        if now.state in _TAKEN and before not in _TAKEN:
-            now.resumes = before in _CLIMBS
-        if now.state is HandoverState.FAILSAFE:
-            said = "" if view.vehicle is None else view.vehicle.said
-            now.words = now.request.words + (f', "{said}"' if said and said not in now.request.words else "")
-        if now.state is HandoverState.CLIMBING and now.climb_ns is None:
-            now.climb_ns = view.at_ns
-        if now.state is HandoverState.CLIMBING:
-            now.left_mode = ""  # that of the ground would be the pilot's by now
-        now.request = PendingRequest(self._ask(view), view.at_ns, self._patience(now.state, view.at_ns))
-        if now.state is HandoverState.ARMING:
-            now.ground_up_m = view.up_m
-        takes_back = now.state is HandoverState.ENGAGING and before is HandoverState.FAILSAFE
-        if (takes_back or now.state in _NOTES_MODE) and view.vehicle is not None:
-            now.left_mode = view.vehicle.mode
-        if sight.granted_ns is not None:
-            now.granted_ns = sight.granted_ns
-        elif now.state not in (HandoverState.CLIMBING, HandoverState.ENGAGING):
-            now.granted_ns = None
+    def _enter_state(self, before: HandoverState, result: GuardResult, inputs: HandoverInput) -> None:
+        progress = self._progress
+        progress.state_start_ns, progress.is_standing_by = inputs.at_ns, False
+        if progress.state in _TAKEN_OVER_STATES and before not in _TAKEN_OVER_STATES:
+            progress.is_climb_interrupted = before in _CLIMB_STATES
+        if progress.state is HandoverState.FAILSAFE:
+            failsafe_text = "" if inputs.vehicle is None else inputs.vehicle.said
+            progress.failsafe_texts = progress.request.quoted_texts + (
+                f', "{failsafe_text}"' if failsafe_text and failsafe_text not in progress.request.quoted_texts else ""
+            )
+        if progress.state is HandoverState.CLIMBING and progress.climb_start_ns is None:
+            progress.climb_start_ns = inputs.at_ns
+        if progress.state is HandoverState.CLIMBING:
+            progress.previous_mode = ""  # the mode on the ground would now be a choice of the pilot
+        progress.request = PendingRequest(
+            self._choose_request(inputs), inputs.at_ns, self._choose_limits(progress.state, inputs.at_ns)
+        )
+        if progress.state is HandoverState.ARMING:
+            progress.ground_height_m = inputs.estimated_height_m
+        takes_control_back = progress.state is HandoverState.ENGAGING and before is HandoverState.FAILSAFE
+        if (takes_control_back or progress.state in _STATES_STORING_MODE) and inputs.vehicle is not None:
+            progress.previous_mode = inputs.vehicle.mode
+        if result.granted_ns is not None:
+            progress.granted_ns = result.granted_ns
+        elif progress.state not in (HandoverState.CLIMBING, HandoverState.ENGAGING):
+            progress.granted_ns = None
         if before is not HandoverState.RETURNING:
-            self.failure = self.failure or sight.why
+            self.failure = self.failure or result.reason
 
-    def _ask(self, view: HandoverView) -> RequestKind | None:
-        climbs = view.vehicle is not None and profile_of(view.vehicle).climbs_on_arming
-        external = view.vehicle is not None and view.vehicle.external
-        asks = {
+    def _choose_request(self, inputs: HandoverInput) -> RequestKind | None:
+        climbs_on_arming = inputs.vehicle is not None and find_profile(inputs.vehicle).climbs_on_arming
+        is_external = inputs.vehicle is not None and inputs.vehicle.external
+        requests = {
             HandoverState.MODE: RequestKind.TAKE_OFF_MODE,
             HandoverState.ARMING: RequestKind.ARM,
-            HandoverState.CLIMBING: None if climbs else RequestKind.TAKE_OFF,
-            HandoverState.ENGAGING: None if external else RequestKind.EXTERNAL_MODE,
-            HandoverState.RETURNING: None if external else RequestKind.EXTERNAL_MODE,
+            HandoverState.CLIMBING: None if climbs_on_arming else RequestKind.TAKE_OFF,
+            HandoverState.ENGAGING: None if is_external else RequestKind.EXTERNAL_MODE,
+            HandoverState.RETURNING: None if is_external else RequestKind.EXTERNAL_MODE,
             HandoverState.LANDING: RequestKind.LAND,
         }
-        return asks.get(self.state)
+        return requests.get(self.state)
 
-    def _patience(self, state: HandoverState, at_ns: int) -> Patience:
-        c = self._config
-        climbed_s = 0.0 if self._now.climb_ns is None else (at_ns - self._now.climb_ns) / 1e9
+    def _choose_limits(self, state: HandoverState, at_ns: int) -> RequestLimits:
+        config = self._config
+        climbed_s = 0.0 if self._progress.climb_start_ns is None else (at_ns - self._progress.climb_start_ns) / 1e9
         limits_s = {
-            HandoverState.MODE: c.ground_s,
-            HandoverState.ARMING: c.ground_s,
-            HandoverState.CLIMBING: max(
-                c.climb_s - climbed_s, 0.0
-            ),  # one time for the climb, however often it is interrupted
-            HandoverState.ENGAGING: c.engage_s,
-            HandoverState.RETURNING: c.engage_s,
-            HandoverState.LANDING: c.land_s,
-            HandoverState.SETTLING: c.land_s,
+            HandoverState.MODE: config.ground_s,
+            HandoverState.ARMING: config.ground_s,
+            # One limit for the climb, also after interruptions.
+            HandoverState.CLIMBING: max(config.climb_s - climbed_s, 0.0),
+            HandoverState.ENGAGING: config.engage_s,
+            HandoverState.RETURNING: config.engage_s,
+            HandoverState.LANDING: config.land_s,
+            HandoverState.SETTLING: config.land_s,
         }
         limit_ns = _ns(limits_s[state]) if state in limits_s else FOREVER_NS
         if state is HandoverState.LANDING:
-            # What we took off is asked on: nobody else would.
-            tries = max(LAND_TRIES, round(MUST_LAND * c.land_s / c.answer_s)) if self.ours else LAND_TRIES
-            return Patience(_ns(c.answer_s), _ns(c.answer_s), tries, limit_ns)
-        # In the air there is no time for long pauses.
-        retry_s = c.retry_s if state in _ON_THE_GROUND else c.answer_s / 2
-        return Patience(_ns(c.answer_s), _ns(retry_s), c.tries, limit_ns)
+            # Nobody else would land what we took off: the request is repeated for longer.
+            tries = (
+                max(LAND_TRIES, round(LAND_PERIODS * config.land_s / config.answer_s))
+                if self.is_ordered_flight
+                else LAND_TRIES
+            )
+            return RequestLimits(_ns(config.answer_s), _ns(config.answer_s), tries, limit_ns)
+        # In the air, long pauses cost too much time.
+        retry_s = config.retry_s if state in _ON_THE_GROUND else config.answer_s / 2
+        return RequestLimits(_ns(config.answer_s), _ns(retry_s), config.tries, limit_ns)
 
-    def _see_to_disarming(self, view: HandoverView) -> None:
-        """Ask a vehicle to disarm that stands on the ground after a flight of ours and stays armed."""
-        vehicle = view.vehicle
-        if not (self.ours and self.state is HandoverState.SETTLING and vehicle is not None and vehicle.landed):
+    def _request_disarming(self, inputs: HandoverInput) -> None:
+        """Request disarming if the vehicle stays armed on the ground after an ordered flight."""
+        vehicle = inputs.vehicle
+        if not (
+            self.is_ordered_flight and self.state is HandoverState.SETTLING and vehicle is not None and vehicle.landed
+        ):
             self._landed_ns = None
         elif self._landed_ns is None:
-            self._landed_ns = view.at_ns
-        elif not self._disarms and view.at_ns - self._landed_ns >= _ns(self._config.disarm_s):
-            self._disarms = True
-            self._now.request = PendingRequest(
-                RequestKind.DISARM, view.at_ns, self._patience(HandoverState.SETTLING, view.at_ns)
+            self._landed_ns = inputs.at_ns
+        elif not self._is_disarm_requested and inputs.at_ns - self._landed_ns >= _ns(self._config.disarm_s):
+            self._is_disarm_requested = True
+            self._progress.request = PendingRequest(
+                RequestKind.DISARM, inputs.at_ns, self._choose_limits(HandoverState.SETTLING, inputs.at_ns)
             )
 
-    def _tell(self, view: HandoverView, before: HandoverState, sight: GuardResult, *, passed: bool) -> list[Event]:
+    def _make_events(
+        self, inputs: HandoverInput, before: HandoverState, result: GuardResult, *, has_changed: bool
+    ) -> list[Event]:
         events = []
-        silence = self.state is HandoverState.ENGAGED and sight.seen is HandoverEvent.SILENCE
-        if silence != self._silent:
-            self._silent = silence
-            only = ", though its other messages come" if view.moves else ", and nothing else comes"
-            text = f"heartbeat lost{only}: braking and holding" if silence else "heartbeat is back"
-            events.append(Event(at_ns=view.at_ns, severity=Severity.ERROR, code="heartbeat", text=text))
-        overdue = self._now.request.given_up(view.at_ns) if self.state is HandoverState.LANDING else ""
-        if overdue and not self._overdue:
-            text = f"{overdue}; it is asked on, as it is heard in the air"
-            events.append(Event(at_ns=view.at_ns, severity=Severity.ERROR, code="refused", text=text))
-        self._overdue = bool(overdue)
-        if passed:
-            vehicle = view.vehicle
+        is_heartbeat_lost = self.state is HandoverState.ENGAGED and result.event is HandoverEvent.SILENCE
+        if is_heartbeat_lost != self._is_heartbeat_lost:
+            self._is_heartbeat_lost = is_heartbeat_lost
+            suffix = ", though its other messages come" if inputs.has_motion else ", and nothing else comes"
+            text = f"heartbeat lost{suffix}: braking and holding" if is_heartbeat_lost else "heartbeat is back"
+            events.append(Event(at_ns=inputs.at_ns, severity=Severity.ERROR, code="heartbeat", text=text))
+        overdue_reason = (
+            self._progress.request.describe_failure(inputs.at_ns) if self.state is HandoverState.LANDING else ""
+        )
+        if overdue_reason and not self._is_landing_overdue:
+            text = f"{overdue_reason}; it is asked on, as it is heard in the air"
+            events.append(Event(at_ns=inputs.at_ns, severity=Severity.ERROR, code="refused", text=text))
+        self._is_landing_overdue = bool(overdue_reason)
+        if has_changed:
+            vehicle = inputs.vehicle
             mode = "" if vehicle is None else f" ({vehicle.mode}, {'armed' if vehicle.armed else 'disarmed'})"
-            plain = self.state in _PLAIN and before is not HandoverState.FAILSAFE
-            severity = Severity.INFO if plain else Severity.WARNING
+            is_routine = self.state in _ROUTINE_STATES and before is not HandoverState.FAILSAFE
+            severity = Severity.INFO if is_routine else Severity.WARNING
             text = f"{before} -> {self.state}{mode}"
-            if sight.who is not None:
-                said = "" if vehicle is None or not vehicle.said else f', "{vehicle.said}"'
-                text += f": {sight.who}{said}"
-            events.append(Event(at_ns=view.at_ns, severity=severity, code="hand-over", text=text))
-            if sight.why:
-                events.append(Event(at_ns=view.at_ns, severity=Severity.ERROR, code="refused", text=sight.why))
+            if result.mode_reason is not None:
+                failsafe_text = "" if vehicle is None or not vehicle.said else f', "{vehicle.said}"'
+                text += f": {result.mode_reason}{failsafe_text}"
+            events.append(Event(at_ns=inputs.at_ns, severity=severity, code="hand-over", text=text))
+            if result.reason:
+                events.append(Event(at_ns=inputs.at_ns, severity=Severity.ERROR, code="refused", text=result.reason))
         return events
 
 

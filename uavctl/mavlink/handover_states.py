@@ -12,46 +12,46 @@ from enum import Enum, StrEnum
 
 
 class HandoverState(StrEnum):
-    """State of the hand-over: who flies, or what is under way."""
+    """State of the hand-over."""
 
     WAITING = "waiting"  # no vehicle is heard
-    READY = "ready"  # heard; neutral setpoints warm the stream up
+    READY = "ready"  # heard; neutral setpoints are streamed
     MODE = "asking for the mode"  # on the ground, ordered to take off
     ARMING = "arming"
     CLIMBING = "climbing"  # the vehicle climbs by itself
-    ENGAGING = "engaging"  # at height: the external mode is asked for
-    RETURNING = "returning"  # the same from `released`, ordered to
+    ENGAGING = "engaging"  # at height: the external mode is requested
+    RETURNING = "returning"  # the same from `released`, by an order
     ENGAGED = "engaged"  # armed and in the external mode: setpoints
-    FAILSAFE = "failsafe"  # what we took off is flown by a failsafe of its own: nothing is sent; in bounded time
-    UNCLEAR = "unclear"  # in a mode that is none of ours, and it is not known by whom: nothing is sent; in bounded time
-    RELEASED = "released"  # somebody else has taken over: nothing is sent unless ordered to
-    LANDING = "landing"  # landing was asked for: no setpoints any more, for good
+    FAILSAFE = "failsafe"  # a failsafe of the vehicle flies it on an ordered flight: nothing is sent, in bounded time
+    UNCLEAR = "unclear"  # another mode for an unknown reason: nothing is sent, in bounded time
+    RELEASED = "released"  # another pilot has taken over: nothing is sent without an order
+    LANDING = "landing"  # landing is requested: no setpoints any more
     SETTLING = "settling"  # the vehicle lands by itself
-    DONE = "done"  # disarmed after all: nothing is sent, for good
-    FAILED = "failed"  # the vehicle does not do what was asked: nothing is sent, for good
+    DONE = "done"  # disarmed: nothing is sent any more
+    FAILED = "failed"  # the vehicle has not carried out a request: nothing is sent any more
 
 
 class HandoverEvent(StrEnum):
-    """Event that a tick of the hand-over sees; of several the first in this order."""
+    """Event of a tick of the hand-over; of several, the first in this order counts."""
 
-    REBOOT = "reboot"  # the vehicle has started anew
-    LAND = "land"  # the controller, or the operator, asks for landing
-    UNSAFE = "unsafe"  # it climbs by positions that cannot be, without any, or out of the room
-    GRANTED = "granted"  # what was asked for is there
-    REFUSED = "refused"  # what was asked for will not come
+    REBOOT = "reboot"  # the vehicle has restarted
+    LAND = "land"  # the controller or the operator requests landing
+    UNSAFE = "unsafe"  # it climbs on impossible positions, without positions, or out of the room
+    GRANTED = "granted"  # the request has taken effect
+    REFUSED = "refused"  # the request will not take effect
     SILENCE = "silence"  # no heartbeat, or the last one is too old
-    TAKE_OFF = "take-off"  # ordered, and nothing speaks against it
+    TAKE_OFF = "take-off"  # ordered, and allowed
     ENGAGE = "engage"  # ordered, and the vehicle is in the air
-    LEFT = "left"  # found armed, and a daemon before this one ended while it had it
+    LEFT = "left"  # armed at the start, and an earlier daemon has left it in flight
     DISARMED = "disarmed"
-    FAILSAFE = "failsafe"  # armed, in a mode that a failsafe of its own has chosen, on a flight that we began
-    UNCLEAR = "unclear"  # in a mode that is none of ours, and nothing shows who has chosen it
-    OTHER = "other"  # in a mode that is none of ours: a person's, or on the pilot's flight a failsafe's
+    FAILSAFE = "failsafe"  # armed, in the mode of a failsafe, on an ordered flight
+    UNCLEAR = "unclear"  # another mode, for an unknown reason
+    OTHER = "other"  # another mode: of a person, or of a failsafe on a flight of the pilot
     EXTERNAL = "external"  # armed, in the external mode
-    PENDING = "pending"  # what was asked for is not there yet
+    PENDING = "pending"  # the request has not taken effect yet
 
 
-class Sending(Enum):
+class SetpointMode(Enum):
     """Setpoints that a tick may stream to the vehicle."""
 
     NOTHING = "nothing"
@@ -59,7 +59,7 @@ class Sending(Enum):
     SETPOINTS = "setpoints"
 
 
-Target = tuple[HandoverState, Sending]
+Target = tuple[HandoverState, SetpointMode]
 _W, _R, _M, _A, _C = (
     HandoverState.WAITING,
     HandoverState.READY,
@@ -76,13 +76,13 @@ _G, _B, _E, _X, _L = (
 )
 _S, _D, _F, _V = HandoverState.SETTLING, HandoverState.DONE, HandoverState.FAILED, HandoverState.FAILSAFE
 _U = HandoverState.UNCLEAR
-_NOTHING, _NEUTRAL, _FLY = Sending.NOTHING, Sending.NEUTRAL, Sending.SETPOINTS
+_NOTHING, _NEUTRAL, _FLY = SetpointMode.NOTHING, SetpointMode.NEUTRAL, SetpointMode.SETPOINTS
 
-# What is not here changes nothing, and nothing is sent.
+# An event that is missing here keeps the state, and nothing is sent.
 _CHANGES: dict[HandoverState, dict[HandoverEvent, Target]] = {
     _W: {
         HandoverEvent.REFUSED: (_F, _NOTHING),
-        HandoverEvent.LEFT: (_X, _NOTHING),  # setpoints would end PX4's failsafe, and so take over
+        HandoverEvent.LEFT: (_X, _NOTHING),  # setpoints would end PX4's failsafe
         HandoverEvent.DISARMED: (_R, _NEUTRAL),
         HandoverEvent.OTHER: (_R, _NEUTRAL),
         HandoverEvent.EXTERNAL: (_E, _FLY),
@@ -108,7 +108,7 @@ _CHANGES: dict[HandoverState, dict[HandoverEvent, Target]] = {
     },
     _A: {
         HandoverEvent.REBOOT: (_F, _NOTHING),
-        HandoverEvent.LAND: (_L, _NOTHING),  # arming may have been granted, and starts PX4's climb
+        HandoverEvent.LAND: (_L, _NOTHING),  # arming may have been granted and starts PX4's climb
         HandoverEvent.REFUSED: (_F, _NOTHING),
         HandoverEvent.FAILSAFE: (_V, _NOTHING),
         HandoverEvent.UNCLEAR: (_U, _NOTHING),
@@ -142,7 +142,7 @@ _CHANGES: dict[HandoverState, dict[HandoverEvent, Target]] = {
     },
     _B: {
         HandoverEvent.REBOOT: (_X, _NOTHING),
-        HandoverEvent.LAND: (_X, _NOTHING),  # the pilot flies still
+        HandoverEvent.LAND: (_X, _NOTHING),  # the pilot still flies
         HandoverEvent.REFUSED: (_X, _NOTHING),
         HandoverEvent.DISARMED: (_D, _NOTHING),
         HandoverEvent.FAILSAFE: (_V, _NOTHING),
@@ -154,10 +154,7 @@ _CHANGES: dict[HandoverState, dict[HandoverEvent, Target]] = {
     _E: {
         HandoverEvent.REBOOT: (_X, _NOTHING),
         HandoverEvent.LAND: (_L, _NOTHING),
-        HandoverEvent.SILENCE: (
-            _E,
-            _FLY,
-        ),  # the controller brakes and holds, for a while: the vehicle may hear us still
+        HandoverEvent.SILENCE: (_E, _FLY),  # the controller brakes and holds: the vehicle may still receive setpoints
         HandoverEvent.DISARMED: (_D, _NOTHING),
         HandoverEvent.FAILSAFE: (_V, _NOTHING),
         HandoverEvent.UNCLEAR: (_U, _NOTHING),
@@ -167,7 +164,7 @@ _CHANGES: dict[HandoverState, dict[HandoverEvent, Target]] = {
     _V: {
         HandoverEvent.REBOOT: (_F, _NOTHING),
         HandoverEvent.LAND: (_L, _NOTHING),
-        HandoverEvent.GRANTED: (_C, _NEUTRAL),  # it has ended by itself, and the climb goes on
+        HandoverEvent.GRANTED: (_C, _NEUTRAL),  # the failsafe has ended, and the climb continues
         HandoverEvent.REFUSED: (_L, _NOTHING),
         HandoverEvent.ENGAGE: (_G, _NEUTRAL),
         HandoverEvent.DISARMED: (_D, _NOTHING),
@@ -177,7 +174,7 @@ _CHANGES: dict[HandoverState, dict[HandoverEvent, Target]] = {
     _U: {
         HandoverEvent.REBOOT: (_X, _NOTHING),
         HandoverEvent.LAND: (_L, _NOTHING),  # the operator's order
-        HandoverEvent.REFUSED: (_L, _NOTHING),  # it flies by itself, and nobody has shown in time that he has it
+        HandoverEvent.REFUSED: (_L, _NOTHING),  # it flies by itself, and no pilot has shown control in time
         HandoverEvent.ENGAGE: (_B, _NEUTRAL),
         HandoverEvent.DISARMED: (_D, _NOTHING),
         HandoverEvent.FAILSAFE: (_V, _NOTHING),
@@ -194,15 +191,15 @@ _CHANGES: dict[HandoverState, dict[HandoverEvent, Target]] = {
     _S: {
         HandoverEvent.REFUSED: (_F, _NOTHING),
         HandoverEvent.DISARMED: (_D, _NOTHING),
-        HandoverEvent.FAILSAFE: (_L, _NOTHING),  # it only seemed to land for us: its climb goes on
+        HandoverEvent.FAILSAFE: (_L, _NOTHING),  # the landing was the failsafe's and has ended: its climb continues
         HandoverEvent.UNCLEAR: (_X, _NOTHING),
         HandoverEvent.OTHER: (_X, _NOTHING),
     },
     _D: {},
     _F: {},
 }
-# Where a daemon that ends leaves no vehicle behind that has flown on its setpoints, or may still.
-LEAVES_NONE = frozenset({HandoverState.READY, HandoverState.SETTLING, HandoverState.DONE})
+# States in which the end of the daemon leaves no vehicle in flight.
+NOT_LEFT_IN_FLIGHT = frozenset({HandoverState.READY, HandoverState.SETTLING, HandoverState.DONE})
 TRANSITIONS: dict[tuple[HandoverState, HandoverEvent], Target] = {
-    (state, seen): _CHANGES[state].get(seen, (state, _NOTHING)) for state in HandoverState for seen in HandoverEvent
+    (state, event): _CHANGES[state].get(event, (state, _NOTHING)) for state in HandoverState for event in HandoverEvent
 }

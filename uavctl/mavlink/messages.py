@@ -49,7 +49,7 @@ class TimeSync(Message, frozen=True, kw_only=True):
     ts1_ns: int
 
 
-class Landed(Message, frozen=True, kw_only=True):
+class LandedState(Message, frozen=True, kw_only=True):
     """EXTENDED_SYS_STATE; None while the vehicle does not know. `own_climb`: it takes off, or lands, by itself."""
 
     landed: bool | None
@@ -60,14 +60,14 @@ class Battery(Message, frozen=True, kw_only=True):
     """SYS_STATUS or BATTERY_STATUS."""
 
     voltage_v: float | None  # None if it is not measured
-    radio: bool | None = None  # a remote control is heard; None if the message does not tell
-    fenced: bool = True  # it is not beyond a fence of its own
+    has_radio: bool | None = None  # a remote control is received; None if unknown
+    is_within_fence: bool = True  # it is not beyond a fence of its own
 
 
 class FenceBreach(Message, frozen=True, kw_only=True):
     """FENCE_STATUS."""
 
-    breached: bool  # it is beyond a fence of its own
+    is_breached: bool  # it is beyond a fence of its own
 
 
 class RadioChannels(Message, frozen=True, kw_only=True):
@@ -76,23 +76,23 @@ class RadioChannels(Message, frozen=True, kw_only=True):
     channels_us: tuple[int, ...]  # pulse of each channel, from the first [µs]; 0 where there is none
 
 
-class ModeOrder(Message, frozen=True, kw_only=True):
+class ModeCommand(Message, frozen=True, kw_only=True):
     """SET_MODE or COMMAND_LONG that changes the mode, from whomever."""
 
     target_system: int
 
 
-class Text(Message, frozen=True, kw_only=True):
+class StatusText(Message, frozen=True, kw_only=True):
     """STATUSTEXT, or a piece of a long one."""
 
-    severity: int  # MAV_SEVERITY, 0 the worst, 7 the least
-    text: str  # what it says
-    number: int = 0  # of the long text that it is a piece of; 0: it is whole
+    severity: int  # MAV_SEVERITY, from 0 (emergency) to 7 (debug)
+    text: str
+    text_id: int = 0  # of the long text that it is a piece of; 0: it is whole
     chunk: int = 0  # which piece, from 0
-    more: bool = False  # another piece follows
+    has_more: bool = False  # another piece follows
 
 
-class Ack(Message, frozen=True, kw_only=True):
+class CommandAck(Message, frozen=True, kw_only=True):
     """COMMAND_ACK; `result` is MAV_RESULT, 0 accepted; target 0 is for everybody."""
 
     command: int
@@ -110,7 +110,7 @@ class Attitude(Message, frozen=True, kw_only=True):
 
     angles_rad: Vec3  # roll, pitch, yaw of body axes forward, right, down in NED
     quaternion: bool = False  # it is ATTITUDE_QUATERNION
-    stamp_us: int = 0  # by the sender's clock, since boot; 0: it does not tell
+    stamp_us: int = 0  # by the sender's clock, since boot; 0 if unknown
 
 
 class Inertial(Message, frozen=True, kw_only=True):
@@ -118,7 +118,7 @@ class Inertial(Message, frozen=True, kw_only=True):
 
     specific_force_mps2: Vec3  # that; (0, 0, -g) at rest
     raw: bool = False  # it is RAW_IMU, whose unit is the sender's own: read as ArduPilot's, thousandths of g
-    stamp_us: int = 0  # by the sender's clock, since boot or of an epoch; 0: it does not tell
+    stamp_us: int = 0  # by the sender's clock, since boot or an epoch; 0 if unknown
 
 
 class ParamValue(Message, frozen=True, kw_only=True):
@@ -127,8 +127,8 @@ class ParamValue(Message, frozen=True, kw_only=True):
     name: str  # of the parameter
     cast: float  # the value as a number, as ArduPilot means it
     bytewise: float  # the value as PX4 means it: the bytes of an integer, if the type is one
-    index: int = 65535  # its place in the list; 65535 where that is not told
-    count: int = 0  # parameters that the vehicle says it has
+    index: int = 65535  # its index in the list; 65535 if unknown
+    count: int = 0  # number of parameters of the vehicle
 
 
 class EstimatorFlags(Message, frozen=True, kw_only=True):

@@ -1,4 +1,10 @@
-"""Position messages to samples: source filter, checks, frame, clock."""
+"""Position messages to position samples: source filter, plausibility, frame and clock.
+
+1. Ignore messages and systems that the configuration does not name.
+2. Convert the position to local NED.
+3. Limit the rate of new sources. Settled sources are never limited.
+4. Convert the stamp to our clock (`clocksync`). If the stamp is not usable, drop the sample and count the reason.
+"""
 
 from __future__ import annotations
 
@@ -10,81 +16,81 @@ from typing import Generic, TypeVar, get_args
 from uavctl.config.connections import ClockConfig, FrameConfig, SourceConfig
 from uavctl.config.types import EstimatorConfig
 from uavctl.frames import Convention, Frame, Quaternion
-from uavctl.mavlink.clocksync import ClockSource, ClockSync, RoundTrips, StampRefusal, StampUnit, StampUnitWatch
-from uavctl.mavlink.codec import BOOT_MS_WRAP
+from uavctl.mavlink.clocksync import ClockSource, ClockSync, StampRefusal, StampUnit, StampUnitDetector, TimesyncClock
+from uavctl.mavlink.encoder import BOOT_MS_WRAP
 from uavctl.mavlink.messages import Position
 from uavctl.records import PositionSample, Vec3
 
 MAX_SOURCES = 32
-SILENCE_NS = 10_000_000_000  # after which a source gives its place to any other
-SETTLED = 20  # samples after which a source is no newcomer any more
-# Samples of all newcomers together, while no settled source speaks, and while one does: each costs the estimator its
-# time, and nobody knows yet whose it is.
-NEWCOMERS_PER_S, NEWCOMERS_BESIDE_PER_S = 100, 10
-NEWCOMERS_BURST = 50
-SPEAKS_NS = 1_000_000_000
+SILENCE_NS = 10_000_000_000  # after which any other source may replace one
+SETTLED_SAMPLES = 20  # samples after which a source is settled
+# Samples of all new sources together: without a settled source that is active, and beside one. Each sample costs the
+# estimator time, and a new source may be hostile.
+NEW_SOURCE_PER_S, NEW_SOURCE_BESIDE_PER_S = 100, 10
+NEW_SOURCE_BURST = 50
+SOURCE_ACTIVE_NS = 1_000_000_000
 
 WRONG_SYSTEM = "system-id"
-NEW_SOURCE = "new-source"  # more samples of sources that nobody has heard before than are looked at
-MANY_SOURCES = "sources"  # more than there is room for: the history of one is lost
-ABSURD = "absurd"
+NEW_SOURCE = "new-source"  # more samples of new sources than the limit
+TOO_MANY_SOURCES = "sources"  # more than `MAX_SOURCES`: the state of one is lost
+IMPLAUSIBLE = "absurd"
 SLOW_ANSWER = "timesync"
 
 Address = tuple[int, int]
 
 
 Key = TypeVar("Key")
-Kept = TypeVar("Kept")
+State = TypeVar("State")
 
 
-class SourceTable(Generic[Key, Kept]):
-    """Table of what is kept of each source. A new one always finds room: the one that has said least gives way.
+class SourceTable(Generic[Key, State]):
+    """Table of states by source. A new source replaces the one with the fewest messages.
 
-    So no source is kept out by others, and one that has spoken for a while loses nothing to those that come and go.
+    So other sources cannot keep one out, and a settled source keeps its state.
 
     Args:
-        bad: called when a source that is not silent loses its place.
+        count_bad: called when an active source is removed.
     """
 
-    def __init__(self, most: int, bad: Callable[[], None]) -> None:
-        self._most, self._bad = most, bad
-        self._entries: dict[Key, tuple[Kept, int, int]] = {}  # what is kept, times that it spoke, when last
+    def __init__(self, max_sources: int, count_bad: Callable[[], None]) -> None:
+        self._max_sources, self._on_eviction = max_sources, count_bad
+        self._entries: dict[Key, tuple[State, int, int]] = {}  # state, number of messages, time of the last one
 
     def __len__(self) -> int:
         return len(self._entries)
 
-    def get(self, key: Key) -> Kept | None:
-        """Return what is kept of a source; None if it is not there."""
-        found = self._entries.get(key)
-        return None if found is None else found[0]
+    def get(self, key: Key) -> State | None:
+        """Return the state of a source; None if it is not in the table."""
+        entry = self._entries.get(key)
+        return None if entry is None else entry[0]
 
-    def times(self, key: Key) -> int:
-        """Return how often a source has spoken; 0 if it is not there."""
-        found = self._entries.get(key)
-        return 0 if found is None else found[1]
+    def message_count(self, key: Key) -> int:
+        """Return the number of messages of a source; 0 if it is not in the table."""
+        entry = self._entries.get(key)
+        return 0 if entry is None else entry[1]
 
-    def values(self) -> Iterator[Kept]:
-        """Iterate over what is kept of all sources."""
-        return (kept for kept, _, _ in self._entries.values())
+    def values(self) -> Iterator[State]:
+        """Iterate over the states of all sources."""
+        return (state for state, _, _ in self._entries.values())
 
-    def hear(self, key: Key, at_ns: int, make: Callable[[], Kept]) -> Kept:
-        """Note that a source speaks now, and return what is kept of it; for a new one, `make` makes it."""
-        found = self._entries.get(key)
-        if found is None and len(self._entries) >= self._most:
-            self._make_room(at_ns)
-        kept, times = (make(), 0) if found is None else found[:2]
-        self._entries[key] = kept, times + 1, at_ns
-        return kept
+    def record_message(self, key: Key, at_ns: int, make_state: Callable[[], State]) -> State:
+        """Count a message of a source and return its state; `make_state` makes that of a new source."""
+        entry = self._entries.get(key)
+        if entry is None and len(self._entries) >= self._max_sources:
+            self._evict(at_ns)
+        state, count = (make_state(), 0) if entry is None else entry[:2]
+        self._entries[key] = state, count + 1, at_ns
+        return state
 
-    def _make_room(self, at_ns: int) -> None:
+    def _evict(self, at_ns: int) -> None:
         def weight(key: Key) -> tuple[int, int]:
-            _, times, last_ns = self._entries[key]
-            return (times if at_ns - last_ns <= SILENCE_NS else 0), last_ns
+            _, count, last_ns = self._entries[key]
+            return (count if at_ns - last_ns <= SILENCE_NS else 0), last_ns
 
-        least = min(self._entries, key=weight)
-        if weight(least)[0]:
-            self._bad()
-        del self._entries[least]
+        oldest = min(self._entries, key=weight)
+        if weight(oldest)[0]:
+            self._on_eviction()
+        del self._entries[oldest]
 
 
 class PositionDecoder:
@@ -92,9 +98,9 @@ class PositionDecoder:
 
     Args:
         clock: window, latency and tolerance of the sources' clocks.
-        source: which messages and which system count.
-        estimator: standard deviation of a sample, and what is absurd.
-        bad: counter that refusals are added to.
+        source: accepted messages and system.
+        estimator: standard deviation of a sample, and the limits of plausible ones.
+        count_bad: counts refusals, by reason.
     """
 
     def __init__(
@@ -103,25 +109,25 @@ class PositionDecoder:
         clock: ClockConfig,
         source: SourceConfig,
         estimator: EstimatorConfig,
-        bad: Callable[[str], None],
+        count_bad: Callable[[str], None],
     ) -> None:
-        configured = Frame(frame.convention, frame.origin_m, frame.yaw_deg)
-        # A message that declares its axes is believed; the vehicle's own estimate needs no conversion.
-        self._frames: dict[Convention | None, Frame] = {None: configured}
+        frame_config = Frame(frame.convention, frame.origin_m, frame.yaw_deg)
+        # The axes that a message declares count. The vehicle's own estimate needs no conversion.
+        self._frames: dict[Convention | None, Frame] = {None: frame_config}
         for axes in get_args(Convention):
-            self._frames[axes] = replace(configured, convention=axes)
-        self._clock, self._source, self._estimator, self._bad = clock, source, estimator, bad
-        self._clocks: SourceTable[tuple[Address, bool], ClockSync] = SourceTable(MAX_SOURCES, self._lost_place)
-        self._units: SourceTable[Address, StampUnitWatch] = SourceTable(MAX_SOURCES, self._lost_place)
-        self.units: dict[Address, StampUnit] = {}  # of the sources whose stamps are in another than microseconds
-        self._round_trips: SourceTable[Address, RoundTrips] = SourceTable(MAX_SOURCES, self._lost_place)
-        self._newcomers_left, self._newcomers_ns = float(NEWCOMERS_BURST), 0
-        self._settled_ns: int | None = None  # when a settled source was heard last
-        self.settled = False  # whether the newest sample is of one
+            self._frames[axes] = replace(frame_config, convention=axes)
+        self._clock, self._source, self._estimator, self._count_bad = clock, source, estimator, count_bad
+        self._clocks: SourceTable[tuple[Address, bool], ClockSync] = SourceTable(MAX_SOURCES, self._count_eviction)
+        self._units: SourceTable[Address, StampUnitDetector] = SourceTable(MAX_SOURCES, self._count_eviction)
+        self.units: dict[Address, StampUnit] = {}  # of sources with stamps that are not in microseconds
+        self._timesync_clocks: SourceTable[Address, TimesyncClock] = SourceTable(MAX_SOURCES, self._count_eviction)
+        self._new_source_budget, self._new_source_budget_ns = float(NEW_SOURCE_BURST), 0
+        self._settled_ns: int | None = None  # last sample of a settled source
+        self.is_settled = False  # whether the source of the newest sample is settled
         self._latest: ClockSync | None = None
         self._latest_address: Address | None = None
         self.samples = 0
-        self.resyncs = 0  # times that a source turned out to have a new clock
+        self.resyncs = 0  # number of new clocks of sources
         self.attitude: Quaternion | None = None  # of the newest sample: body axes forward, right, down to NED
 
     @property
@@ -134,41 +140,44 @@ class PositionDecoder:
         """Source of that offset."""
         return ClockSource.NONE if self._latest is None else self._latest.source
 
-    def trips(self, address: Address | None = None) -> RoundTrips | None:
-        """Round trips to a peer that answers; without an address, to the newest sample's source."""
-        wanted = self._latest_address if address is None else address
-        return None if wanted is None else self._round_trips.get(wanted)
+    def timesync_clock(self, address: Address | None = None) -> TimesyncClock | None:
+        """Return the clock of a peer that answers TIMESYNC; without an address, of the newest sample's source."""
+        address = self._latest_address if address is None else address
+        return None if address is None else self._timesync_clocks.get(address)
 
-    def knows_clocks(self, at_ns: int) -> bool:
-        """Whether every peer that answers has given an answer lately by which its clock is known."""
-        return all(trips.offset_ns(at_ns) is not None for trips in self._round_trips.values())
+    def are_clocks_known(self, at_ns: int) -> bool:
+        """Return whether the clock of every peer that answers is known now."""
+        return all(timesync.offset_ns(at_ns) is not None for timesync in self._timesync_clocks.values())
 
-    def answer(self, address: Address, sent_ns: int, remote_ns: int, received_ns: int) -> None:
-        """Take an answer to a TIMESYNC request."""
-        trips = self._round_trips.hear(address, received_ns, lambda: RoundTrips(_ns(self._clock.window_s)))
-        if not trips.answer(sent_ns, remote_ns, received_ns):
-            self._bad(SLOW_ANSWER)
+    def add_timesync_answer(self, address: Address, sent_ns: int, remote_ns: int, received_ns: int) -> None:
+        """Add an answer to a TIMESYNC request."""
+        timesync = self._timesync_clocks.record_message(
+            address, received_ns, lambda: TimesyncClock(_ns(self._clock.window_s))
+        )
+        if not timesync.add_answer(sent_ns, remote_ns, received_ns):
+            self._count_bad(SLOW_ANSWER)
 
-    def take(self, message: Position, received_ns: int) -> PositionSample | None:
-        """Make a sample of a message, or count why not; None also for messages that are not asked for."""
+    def make_sample(self, message: Position, received_ns: int) -> PositionSample | None:
+        """Make a sample of a message, or count the reason why not; None also for messages that are not configured."""
         if message.name not in self._source.messages:
             return None
         if self._source.system_id not in (0, message.system):
-            self._bad(WRONG_SYSTEM)
+            self._count_bad(WRONG_SYSTEM)
             return None
         frame = self._frames[message.convention]
         position_m, velocity_mps = message.position_m, message.velocity_mps
         if not message.local_ned:
             position_m = frame.to_ned(position_m)
             velocity_mps = None if velocity_mps is None else frame.velocity_to_ned(velocity_mps)
-        if self._absurd(position_m, velocity_mps):
-            self._bad(ABSURD)  # the controller refuses it too, and looks at how long a source says nothing else
-        if not self._has_room(message, received_ns):
-            self._bad(NEW_SOURCE)
+        if self._is_implausible(position_m, velocity_mps):
+            # The controller refuses it too, and measures how long a source sends nothing else.
+            self._count_bad(IMPLAUSIBLE)
+        if not self._is_within_budget(message, received_ns):
+            self._count_bad(NEW_SOURCE)
             return None
-        captured = self._captured(message, received_ns)
+        captured = self._estimate_capture_ns(message, received_ns)
         if isinstance(captured, str):
-            self._bad(captured)
+            self._count_bad(captured)
             return None
         self.samples += 1
         self.attitude = message.attitude and frame.attitude_to_ned(message.attitude, euler=message.euler)
@@ -182,53 +191,55 @@ class PositionDecoder:
             seq=self.samples,
         )
 
-    def _absurd(self, position_m: Vec3, velocity_mps: Vec3 | None) -> bool:
-        far = max(map(abs, position_m)) > self._estimator.max_position_m
-        return far or (velocity_mps is not None and max(map(abs, velocity_mps)) > self._estimator.max_velocity_mps)
+    def _is_implausible(self, position_m: Vec3, velocity_mps: Vec3 | None) -> bool:
+        is_far = max(map(abs, position_m)) > self._estimator.max_position_m
+        return is_far or (velocity_mps is not None and max(map(abs, velocity_mps)) > self._estimator.max_velocity_mps)
 
-    def _has_room(self, message: Position, received_ns: int) -> bool:
-        """Whether one more sample is looked at; each sample of a settled source is."""
-        self.settled = self._clocks.times(_key(message)) >= SETTLED
-        if self.settled:
+    def _is_within_budget(self, message: Position, received_ns: int) -> bool:
+        """Return whether to use one more sample; those of a settled source always pass."""
+        self.is_settled = self._clocks.message_count(_find_key(message)) >= SETTLED_SAMPLES
+        if self.is_settled:
             self._settled_ns = received_ns
             return True
-        beside = self._settled_ns is not None and received_ns - self._settled_ns <= SPEAKS_NS
-        per_s = NEWCOMERS_BESIDE_PER_S if beside else NEWCOMERS_PER_S
-        earned = (received_ns - self._newcomers_ns) * 1e-9 * per_s
-        burst = NEWCOMERS_BESIDE_PER_S if beside else NEWCOMERS_BURST
-        self._newcomers_left, self._newcomers_ns = min(burst, self._newcomers_left + earned), received_ns
-        if self._newcomers_left < 1.0:
+        is_beside_settled = self._settled_ns is not None and received_ns - self._settled_ns <= SOURCE_ACTIVE_NS
+        per_s = NEW_SOURCE_BESIDE_PER_S if is_beside_settled else NEW_SOURCE_PER_S
+        refill = (received_ns - self._new_source_budget_ns) * 1e-9 * per_s
+        burst = NEW_SOURCE_BESIDE_PER_S if is_beside_settled else NEW_SOURCE_BURST
+        self._new_source_budget, self._new_source_budget_ns = min(burst, self._new_source_budget + refill), received_ns
+        if self._new_source_budget < 1.0:
             return False
-        self._newcomers_left -= 1.0
+        self._new_source_budget -= 1.0
         return True
 
-    def _new_clock(self) -> ClockSync:
+    def _make_clock(self) -> ClockSync:
         clock = self._clock
         return ClockSync(_ns(clock.window_s), _ns(clock.latency_s), _ns(clock.future_tolerance_s))
 
-    def _lost_place(self) -> None:
-        self._bad(MANY_SOURCES)
+    def _count_eviction(self) -> None:
+        self._count_bad(TOO_MANY_SOURCES)
 
-    def _captured(self, message: Position, received_ns: int) -> int | StampRefusal:
+    def _estimate_capture_ns(self, message: Position, received_ns: int) -> int | StampRefusal:
         address = (message.system, message.component)
-        clock = self._clocks.hear(_key(message), received_ns, self._new_clock)
+        clock = self._clocks.record_message(_find_key(message), received_ns, self._make_clock)
         stamp_ns: int | None = None
         if message.boot_ms and message.stamp_us is not None:
-            stamp_ns = clock.unwrap(message.stamp_us // 1000, BOOT_MS_WRAP, 1_000_000)
-        elif message.stamp_us is not None and self._is_in_us(message, message.stamp_us, received_ns):
+            stamp_ns = clock.unwrap_ns(message.stamp_us // 1000, BOOT_MS_WRAP, 1_000_000)
+        elif message.stamp_us is not None and self._is_stamp_in_us(message, message.stamp_us, received_ns):
             stamp_ns = message.stamp_us * 1000
-        trips, resyncs = self._round_trips.get(address), clock.resyncs
-        captured = clock.captured_ns(stamp_ns, received_ns, None if trips is None else trips.offset_ns(received_ns))
+        timesync, resyncs = self._timesync_clocks.get(address), clock.resyncs
+        captured = clock.estimate_capture_ns(
+            stamp_ns, received_ns, None if timesync is None else timesync.offset_ns(received_ns)
+        )
         self.resyncs += clock.resyncs - resyncs
         if not isinstance(captured, str):
             self._latest, self._latest_address = clock, address
         return captured
 
-    def _is_in_us(self, message: Position, stamp: int, received_ns: int) -> bool:
-        """Whether a stamp is in the unit that it has to be in; else the position counts by its arrival."""
+    def _is_stamp_in_us(self, message: Position, stamp: int, received_ns: int) -> bool:
+        """Return whether a stamp is in microseconds; otherwise the position counts by its arrival."""
         address = (message.system, message.component)
-        watch = self._units.hear(address, received_ns, StampUnitWatch)
-        before, unit = watch.unit, watch.take(stamp, message.position_m, received_ns)
+        detector = self._units.record_message(address, received_ns, StampUnitDetector)
+        before, unit = detector.unit, detector.update(stamp, message.position_m, received_ns)
         if unit is not before:
             self.units.pop(address, None)
             if unit is not StampUnit.MICROSECONDS and len(self.units) < MAX_SOURCES:
@@ -236,8 +247,8 @@ class PositionDecoder:
         return unit is StampUnit.MICROSECONDS
 
 
-def _key(message: Position) -> tuple[Address, bool]:
-    """Return whose clock stamps a message, and which of its clocks."""
+def _find_key(message: Position) -> tuple[Address, bool]:
+    """Return the key of the clock that stamps a message: sender, and kind of stamp."""
     return (message.system, message.component), message.boot_ms
 
 

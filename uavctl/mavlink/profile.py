@@ -16,9 +16,9 @@ from uavctl.records import VehicleStatus
 
 
 class ModeChoice(Enum):
-    """Who can have chosen a mode of an autopilot."""
+    """Possible choosers of a mode of an autopilot."""
 
-    PERSON = "a person, with a stick or at a ground station"  # also what the autopilot gives such a person back to
+    PERSON = "a person, with a stick or at a ground station"  # also a mode that the autopilot restores
     EITHER = "a person, or a failsafe"  # it flies by itself
     FAILSAFE = "a failsafe only"
 
@@ -68,22 +68,22 @@ _COPTER_TYPES = frozenset(
 )
 
 
-def _mode_names(prefix: str) -> dict[int, str]:
-    """Return the names of an enum of modes by their numbers."""
+def _read_mode_names(prefix: str) -> dict[int, str]:
+    """Return the names of a mode enum by number."""
     named = {name.removeprefix(prefix): int(getattr(mavlink, name)) for name in dir(mavlink) if name.startswith(prefix)}
     return {number: name for name, number in named.items() if name != "ENUM_END"}
 
 
 # ArduPilot: the enum of modes of each kind of vehicle; ArduPlane's is that of a plane that can hover, too
-_COPTER, _PLANE, _ROVER = map(_mode_names, ("COPTER_MODE_", "PLANE_MODE_", "ROVER_MODE_"))
+_COPTER, _PLANE, _ROVER = map(_read_mode_names, ("COPTER_MODE_", "PLANE_MODE_", "ROVER_MODE_"))
 _ARDUPILOT = {
     **dict.fromkeys(_COPTER_TYPES, _COPTER),
     mavlink.MAV_TYPE_FIXED_WING: _PLANE,
     **dict.fromkeys(range(mavlink.MAV_TYPE_VTOL_DUOROTOR, mavlink.MAV_TYPE_VTOL_RESERVED5 + 1), _PLANE),
     mavlink.MAV_TYPE_GROUND_ROVER: _ROVER,
     mavlink.MAV_TYPE_SURFACE_BOAT: _ROVER,
-    mavlink.MAV_TYPE_SUBMARINE: _mode_names("SUB_MODE_"),
-    mavlink.MAV_TYPE_ANTENNA_TRACKER: _mode_names("TRACKER_MODE_"),
+    mavlink.MAV_TYPE_SUBMARINE: _read_mode_names("SUB_MODE_"),
+    mavlink.MAV_TYPE_ANTENNA_TRACKER: _read_mode_names("TRACKER_MODE_"),
 }
 # Who chooses the modes of a copter: ArduCopter/events.cpp, fence.cpp, avoidance_adsb.cpp.
 _COPTER_EITHER = frozenset({"AUTO", "AUTO_RTL", "AUTOROTATE", "BRAKE", "LAND", "RTL", "SMART_RTL"})
@@ -93,7 +93,7 @@ _PX4_CHOICES = {name: choice for name, choice in _PX4_MAIN.values() if name != "
 _COPTER_CHOICES = {name: _E if name in _COPTER_EITHER else _P for name in _COPTER.values()} | {"AVOID_ADSB": _F}
 
 
-def _px4_mode(vehicle_type: int, custom_mode: int) -> str:
+def _name_px4_mode(vehicle_type: int, custom_mode: int) -> str:
     del vehicle_type
     main, sub = custom_mode >> 16 & 0xFF, custom_mode >> 24 & 0xFF
     name = _PX4_MAIN[main][0] if main in _PX4_MAIN else f"MODE_{main}"
@@ -102,96 +102,97 @@ def _px4_mode(vehicle_type: int, custom_mode: int) -> str:
     return f"AUTO.{_PX4_AUTO[sub][0] if sub in _PX4_AUTO else sub}"
 
 
-def _ardupilot_mode(vehicle_type: int, custom_mode: int) -> str:
+def _name_ardupilot_mode(vehicle_type: int, custom_mode: int) -> str:
     names = _ARDUPILOT.get(vehicle_type)
     return "" if names is None else names.get(custom_mode, f"MODE_{custom_mode}")
 
 
 @dataclass(frozen=True)
 class AutopilotProfile:
-    """Profile of one autopilot: its modes for take-off, flight and landing, by its own names, and its habits."""
+    """Profile of one autopilot: its modes by its own names, and its behaviour."""
 
-    external: str  # the mode that takes our setpoints
-    take_off: str  # the mode that take-off begins in, asked for on the ground
-    climbing: frozenset[str]  # modes that it is in during its own climb and right after
-    landing: frozenset[str]  # modes in which it lands by itself
-    choices: dict[str, ModeChoice]  # its modes, and who can have chosen each
-    # Modes of a person that a failsafe chooses all the same where the one of before cannot go on
-    degrades: frozenset[str]
-    # A failsafe that ends gives back the mode of before, and ends what the vehicle says of it; else its mode stays
-    returns: bool
-    # Arming in `take_off` starts the climb, to a height of its own; else MAV_CMD_NAV_TAKEOFF does, to a height above
-    # the place of arming
+    external_mode: str  # the mode that takes our setpoints
+    take_off_mode: str  # the mode in which take-off begins, requested on the ground
+    climb_modes: frozenset[str]  # its modes in its own climb and right after
+    landing_modes: frozenset[str]  # its modes in its own landing
+    mode_choices: dict[str, ModeChoice]  # its modes, and the possible choosers of each
+    # Modes of a person that a failsafe also chooses if the previous mode is not possible any more
+    degraded_modes: frozenset[str]
+    # The end of a failsafe restores the previous mode; otherwise the mode of the failsafe stays
+    restores_mode: bool
+    # Arming in `take_off_mode` starts the climb, to its own height. Otherwise MAV_CMD_NAV_TAKEOFF starts it, to a
+    # height above the place of arming.
     climbs_on_arming: bool
-    reads_raw: bool  # its RAW_IMU is taken for its acceleration; else HIGHRES_IMU alone is
-    wants_place: bool  # without GPS it has to be told a place on the globe before it arms
+    uses_raw_imu: bool  # use RAW_IMU for its acceleration; otherwise only HIGHRES_IMU
+    needs_global_origin: bool  # without GPS it needs a global origin before it arms
     number: int  # MAV_AUTOPILOT of its heartbeats
-    inertial: tuple[int, int]  # the messages that show how it turns, and its acceleration
-    # A mode's name, of MAV_TYPE and of a heartbeat's custom_mode; empty where the kind of vehicle is not known
+    inertial_messages: tuple[int, int]  # its messages of attitude and acceleration
+    # Name of a mode by MAV_TYPE and custom_mode of a heartbeat; empty for an unknown kind of vehicle.
     mode_name: Callable[[int, int], str]
-    modes: dict[str, tuple[int, int]]  # DO_SET_MODE's parameters 2 and 3 of the modes that are asked for
+    mode_parameters: dict[str, tuple[int, int]]  # parameters 2 and 3 of DO_SET_MODE for the requested modes
 
 
 PROFILES = {
     # Recorded: AUTO.TAKEOFF is given on the ground, arming starts the climb to MIS_TAKEOFF_ALT, then it holds.
     "px4": AutopilotProfile(
-        external="OFFBOARD",
-        take_off="AUTO.TAKEOFF",
-        climbing=frozenset({"AUTO.TAKEOFF", "AUTO.LOITER"}),
-        landing=frozenset({"AUTO.LAND", "AUTO.PRECLAND", "AUTO.DESCEND"}),
-        choices=_PX4_CHOICES,
+        external_mode="OFFBOARD",
+        take_off_mode="AUTO.TAKEOFF",
+        climb_modes=frozenset({"AUTO.TAKEOFF", "AUTO.LOITER"}),
+        landing_modes=frozenset({"AUTO.LAND", "AUTO.PRECLAND", "AUTO.DESCEND"}),
+        mode_choices=_PX4_CHOICES,
         # COM_OBL_RC_ACT 0 to 2, COM_POSCTL_NAVL; a mode of another program that stands for RTL or LAND
-        degrades=frozenset({"POSCTL", "ALTCTL", "STABILIZED", "MANUAL", *(f"AUTO.EXTERNAL{n}" for n in range(1, 9))}),
-        returns=True,
+        degraded_modes=frozenset(
+            {"POSCTL", "ALTCTL", "STABILIZED", "MANUAL", *(f"AUTO.EXTERNAL{n}" for n in range(1, 9))}
+        ),
+        restores_mode=True,
         climbs_on_arming=True,
-        reads_raw=False,
-        wants_place=False,
+        uses_raw_imu=False,
+        needs_global_origin=False,
         number=mavlink.MAV_AUTOPILOT_PX4,
-        inertial=(mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, mavlink.MAVLINK_MSG_ID_HIGHRES_IMU),
-        mode_name=_px4_mode,
-        modes={"OFFBOARD": (6, 0), "AUTO.TAKEOFF": (4, 2)},
+        inertial_messages=(mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, mavlink.MAVLINK_MSG_ID_HIGHRES_IMU),
+        mode_name=_name_px4_mode,
+        mode_parameters={"OFFBOARD": (6, 0), "AUTO.TAKEOFF": (4, 2)},
     ),
     # It climbs in GUIDED; a setpoint would end the climb.
     "ardupilot": AutopilotProfile(
-        external="GUIDED",
-        take_off="GUIDED",
-        climbing=frozenset({"GUIDED"}),
-        landing=frozenset({"LAND"}),
-        choices=_COPTER_CHOICES,
-        degrades=frozenset({"ALT_HOLD", "LOITER"}),  # FS_EKF_ACTION 2, and where BRAKE ends
-        returns=False,
+        external_mode="GUIDED",
+        take_off_mode="GUIDED",
+        climb_modes=frozenset({"GUIDED"}),
+        landing_modes=frozenset({"LAND"}),
+        mode_choices=_COPTER_CHOICES,
+        degraded_modes=frozenset({"ALT_HOLD", "LOITER"}),  # FS_EKF_ACTION 2, and where BRAKE ends
+        restores_mode=False,
         climbs_on_arming=False,
-        reads_raw=True,
-        wants_place=True,
+        uses_raw_imu=True,
+        needs_global_origin=True,
         number=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
-        inertial=(mavlink.MAVLINK_MSG_ID_ATTITUDE, mavlink.MAVLINK_MSG_ID_RAW_IMU),
-        mode_name=_ardupilot_mode,
-        modes={"GUIDED": (4, 0)},
+        inertial_messages=(mavlink.MAVLINK_MSG_ID_ATTITUDE, mavlink.MAVLINK_MSG_ID_RAW_IMU),
+        mode_name=_name_ardupilot_mode,
+        mode_parameters={"GUIDED": (4, 0)},
     ),
 }
 
 _NAMES = {profile.number: name for name, profile in PROFILES.items()}
 
 
-def profile_of(vehicle: VehicleStatus) -> AutopilotProfile:
-    """Return the autopilot's profile; that of PX4 for one that is not known, which is never asked for a mode."""
+def find_profile(vehicle: VehicleStatus) -> AutopilotProfile:
+    """Return the profile of the autopilot; PX4's for an unknown one, which never gets a mode request."""
     return PROFILES.get(vehicle.autopilot, PROFILES["px4"])
 
 
-def autopilot_name(autopilot: int) -> str:
-    """`px4`, `ardupilot` or `unknown` of MAV_AUTOPILOT."""
+def find_autopilot_name(autopilot: int) -> str:
+    """Return the name of a MAV_AUTOPILOT: `px4`, `ardupilot` or `unknown`."""
     return _NAMES.get(autopilot, "unknown")
 
 
 def describe_mode(autopilot: str, vehicle_type: int, custom_mode: int) -> tuple[str, bool]:
-    """A mode by the autopilot's own name, and whether it takes our setpoints.
+    """Return a mode by the autopilot's own name, and whether it takes our setpoints.
 
-    Numbers mean something else on every autopilot, and on ArduPilot on every kind of vehicle; what is
-    not known here never counts as external.
+    Mode numbers differ by autopilot, and on ArduPilot by kind of vehicle. An unknown mode never counts as external.
     """
     profile = PROFILES.get(autopilot)
     name = "" if profile is None else profile.mode_name(vehicle_type, custom_mode)
     if profile is None or not name:
         return f"MODE_{custom_mode}", False
     # GUIDED of a plane, a rover or a submarine is not the mode that a copter takes setpoints in.
-    return name, name == profile.external and (autopilot != "ardupilot" or vehicle_type in _COPTER_TYPES)
+    return name, name == profile.external_mode and (autopilot != "ardupilot" or vehicle_type in _COPTER_TYPES)

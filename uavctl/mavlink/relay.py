@@ -1,10 +1,12 @@
-"""Positions on their way to the vehicle's own estimator: which ones go, and with what stamp. Pure; time is an argument.
+"""Relay of positions to the vehicle's own estimator: selection and time stamps. Pure; time is an argument.
 
-Stamps are of the vehicle's clock: by its answers to our own requests for the time, and without any by the arrival of
-its messages. PX4 also asks us for our time (TIMESYNC) and moves the stamps of what it receives by the offset that it
-finds (src/lib/timesync/Timesync.cpp, `sync_stamp`). It is answered with the time of its own clock: that offset is zero.
-A clock that is not known to the millisecond never stops the positions: an estimator bears a stamp that is a little off,
-and no silence.
+1. Keep back positions that are refused, old, frozen, out of order or too frequent; count each by reason.
+2. Convert the capture time to the vehicle's clock: by its TIMESYNC answers, or else by the arrival of its messages.
+3. Report silence with its reason.
+
+PX4 also requests our time and moves the stamps that it receives by the offset that it finds
+(src/lib/timesync/Timesync.cpp, `sync_stamp`). We answer with the time of its own clock, so that offset is zero. An
+unknown clock never stops the positions. An estimator tolerates a small error of a stamp, but no silence.
 """
 
 from __future__ import annotations
@@ -14,18 +16,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from uavctl.config.connections import RelayConfig
-from uavctl.frames import Quaternion, rotate
+from uavctl.frames import Quaternion, rotate_vector
 from uavctl.records import Event, PositionSample, Severity, Vec3
 
-MAX_AGE_NS = 200_000_000  # an older position would be taken for a new one by estimators that cannot look back
-STUCK_AFTER = 25  # poses in a row, the same to the last bit
-_WAITING = 64  # poses of one tick
-SILENT_NS = 500_000_000  # an estimator without positions for longer drifts by more than a hand's breadth
-START_NS = 3_000_000_000  # cameras and vehicle may take that long to begin
+MAX_AGE_NS = 200_000_000  # some estimators use an older position as a new one
+STUCK_AFTER = 25  # identical poses in a row
+_MAX_QUEUE = 64  # poses of one tick
+SILENT_NS = 500_000_000  # without positions for longer, an estimator drifts by more than 0.1 m
+START_NS = 3_000_000_000  # start time of cameras and vehicle
 RELAY_SILENT, RELAY_RESUMED = "relay-silent", "relay-resumed"
-NOTHING_COMES, HELD_BACK = "nothing comes", "held back"
+NO_POSITION, HELD_BACK = "nothing comes", "held back"
 REASONS = {
-    NOTHING_COMES: "no position comes",
+    NO_POSITION: "no position comes",
     HELD_BACK: "positions were found to be wrong, and are held back",
     "no attitude": "positions come without an attitude",
     "refused": "positions are not believed",
@@ -41,7 +43,7 @@ REASONS = {
 class Pose:
     """Pose of a body as sent to the vehicle's estimator."""
 
-    message: str  # as which message
+    message: str  # name of the MAVLink message
     usec: int  # time of capture, in the clock that the vehicle expects [us]
     position_m: Vec3  # local NED [m]
     attitude: Quaternion  # body axes forward, right, down to NED (w, x, y, z)
@@ -49,112 +51,116 @@ class Pose:
 
 
 class Relay:
-    """Passes positions on; stale, stuck and refused ones stay here, and are counted.
+    """Passes positions on; counts those that it keeps back.
 
     Attributes:
         sent: poses passed on.
         last_ns: time of the tick that passed the last one on; None before.
-        kept: poses that were not, by reason.
+        kept: poses that were kept back, by reason.
         silent_for: reason why the vehicle gets no position now, a key of `REASONS`; empty while it gets them.
     """
 
     def __init__(self, config: RelayConfig) -> None:
         self._config = config
         self._period_ns = round(1e9 / config.rate_hz)
-        self._waiting: list[tuple[PositionSample, Quaternion]] = []
+        self._queue: list[tuple[PositionSample, Quaternion]] = []
         self._newest_ns: int | None = None  # capture of the last pose sent
         self._last: tuple[Vec3, Quaternion] | None = None
-        self._same = 0
-        self._begun_ns: int | None = None  # time of the first tick
-        self._kept_by_then: Counter[str] = Counter()  # poses kept back by the time that the last one went
-        self._reported = ""  # this silence, while the vehicle was armed or on the ground
-        self._reported_on_ground = False  # any
+        self._repeat_count = 0
+        self._start_ns: int | None = None  # time of the first tick
+        self._kept_before: Counter[str] = Counter()  # counts of `kept` when the last pose was sent
+        self._reported = ""  # report of this silence: `armed`, `ground`, or empty
+        self._is_reported_on_ground = False  # any silence
         self.silent_for = ""
         self.sent = 0
         self.last_ns: int | None = None
         self.kept = dict.fromkeys(("no attitude", "refused", "stale", "stuck", "late", "rate", "no clock"), 0)
 
     @property
-    def enabled(self) -> bool:
+    def is_enabled(self) -> bool:
         """Whether positions are passed on."""
         return self._config.enabled
 
-    def take(self, sample: PositionSample, attitude: Quaternion | None) -> None:
-        """Take a sample as it arrives, with the body's attitude in NED, which an estimator of yaw cannot do without."""
-        if not self.enabled:
+    def add_sample(self, sample: PositionSample, attitude: Quaternion | None) -> None:
+        """Queue a new sample with the body's attitude in NED; an estimator of yaw needs it."""
+        if not self.is_enabled:
             return
         if attitude is None:
             self.kept["no attitude"] += 1
             return
-        self._waiting.append((sample, attitude))
-        del self._waiting[:-_WAITING]
+        self._queue.append((sample, attitude))
+        del self._queue[:-_MAX_QUEUE]
 
     def due(self, at_ns: int, *, offset_ns: int, refused: Sequence[PositionSample]) -> tuple[Pose, ...]:
-        """Return the positions that go to the vehicle in this tick, in order of capture.
+        """Return the poses for the vehicle in this tick, in order of capture.
 
         Args:
             offset_ns: (our time - the vehicle's), by which stamps are moved.
-            refused: samples that the tick did not believe.
+            refused: samples that the tick has refused.
         """
-        arrived = [one for one in self._waiting if one[0].received_ns <= at_ns]
-        self._waiting = [one for one in self._waiting if one[0].received_ns > at_ns]
-        waiting = sorted(arrived, key=lambda one: one[0].captured_ns)
-        out = []
+        arrived = [entry for entry in self._queue if entry[0].received_ns <= at_ns]
+        self._queue = [entry for entry in self._queue if entry[0].received_ns > at_ns]
+        waiting = sorted(arrived, key=lambda entry: entry[0].captured_ns)
+        poses = []
         for sample, attitude in waiting:
-            reason = "refused" if sample in refused else self._reason(sample, attitude, at_ns)
+            reason = "refused" if sample in refused else self._find_reason(sample, attitude, at_ns)
             if reason is None and sample.captured_ns - offset_ns < 1000:
                 reason = "no clock"  # before the vehicle's clock began
             if reason is not None:
                 self.kept[reason] += 1
                 continue
             self._newest_ns = sample.captured_ns
-            out.append(self._pose(sample, attitude, offset_ns))
-        self.sent += len(out)
-        if out:
-            self.last_ns, self._kept_by_then = at_ns, Counter(self.kept)
-        return tuple(out)
+            poses.append(self._make_pose(sample, attitude, offset_ns))
+        self.sent += len(poses)
+        if poses:
+            self.last_ns, self._kept_before = at_ns, Counter(self.kept)
+        return tuple(poses)
 
-    def report(self, at_ns: int, *, held_back: bool, armed: bool) -> Event | None:
-        """Report that the vehicle has got no position for `SILENT_NS`, with the reason, or that it gets them again.
+    def make_event(self, at_ns: int, *, held_back: bool, armed: bool) -> Event | None:
+        """Return an event if the vehicle gets no positions for `SILENT_NS`, or gets them again.
 
-        Call it in each tick after `due`. Each silence in the air is reported once; of those on the ground the first,
-        and that it goes on when the vehicle is armed.
+        Called in each tick after `due`. Each silence in the air is reported once. Of those on the ground only the
+        first one is reported, and once more if the vehicle is armed meanwhile.
 
         Args:
-            held_back: positions are not passed on in this tick, whatever comes.
+            held_back: no position is passed on in this tick.
             armed: the vehicle may be in the air.
         """
-        if not self.enabled:
+        if not self.is_enabled:
             return None
-        if self._begun_ns is None:
-            self._begun_ns = at_ns
-        since_ns = self._begun_ns + START_NS if self.last_ns is None else self.last_ns
-        silent = at_ns - since_ns >= SILENT_NS
-        self.silent_for = "" if not silent else HELD_BACK if held_back else self._reason_of_silence()
-        if not silent and self._reported:
+        if self._start_ns is None:
+            self._start_ns = at_ns
+        since_ns = self._start_ns + START_NS if self.last_ns is None else self.last_ns
+        is_silent = at_ns - since_ns >= SILENT_NS
+        self.silent_for = "" if not is_silent else HELD_BACK if held_back else self._find_silence_reason()
+        if not is_silent and self._reported:
             self._reported = ""
             text = "the vehicle gets positions again"
             return Event(at_ns=at_ns, severity=Severity.INFO, code=RELAY_RESUMED, text=text)
-        if not silent or self._reported == "armed" or (not armed and (self._reported or self._reported_on_ground)):
+        if (
+            not is_silent
+            or self._reported == "armed"
+            or (not armed and (self._reported or self._is_reported_on_ground))
+        ):
             return None
         self._reported = "armed" if armed else "ground"
-        self._reported_on_ground = self._reported_on_ground or not armed
-        since_ns = self._begun_ns if self.last_ns is None else since_ns
+        self._is_reported_on_ground = self._is_reported_on_ground or not armed
+        since_ns = self._start_ns if self.last_ns is None else since_ns
         text = f"the vehicle gets no position since {(at_ns - since_ns) * 1e-9:.1f} s: {REASONS[self.silent_for]}"
         return Event(at_ns=at_ns, severity=Severity.WARNING, code=RELAY_SILENT, text=text)
 
-    def _reason_of_silence(self) -> str:
-        kept = (Counter(self.kept) - self._kept_by_then).most_common(1)
-        return kept[0][0] if kept else NOTHING_COMES
+    def _find_silence_reason(self) -> str:
+        counts = (Counter(self.kept) - self._kept_before).most_common(1)
+        return counts[0][0] if counts else NO_POSITION
 
-    def _reason(self, sample: PositionSample, attitude: Quaternion, at_ns: int) -> str | None:
-        """Return why a pose is kept back; None if it goes."""
-        same = self._last == (sample.position_m, attitude)
-        self._last, self._same = (sample.position_m, attitude), self._same + 1 if same else 0
+    def _find_reason(self, sample: PositionSample, attitude: Quaternion, at_ns: int) -> str | None:
+        """Return the reason to keep a pose back; None if it is sent."""
+        is_same = self._last == (sample.position_m, attitude)
+        self._last, self._repeat_count = (sample.position_m, attitude), self._repeat_count + 1 if is_same else 0
         newest_ns = self._newest_ns
         if at_ns - sample.captured_ns > MAX_AGE_NS:
             return "stale"
-        if self._same >= STUCK_AFTER:
+        if self._repeat_count >= STUCK_AFTER:
             return "stuck"
         if newest_ns is not None and sample.captured_ns <= newest_ns:
             return "late"
@@ -162,11 +168,11 @@ class Relay:
             return "rate"
         return None
 
-    def _pose(self, sample: PositionSample, attitude: Quaternion, offset_ns: int) -> Pose:
-        body = None
+    def _make_pose(self, sample: PositionSample, attitude: Quaternion, offset_ns: int) -> Pose:
+        velocity_body = None
         if self._config.message == "odometry" and sample.velocity_mps is not None:
             w, x, y, z = attitude
-            body = rotate((w, -x, -y, -z), sample.velocity_mps)
+            velocity_body = rotate_vector((w, -x, -y, -z), sample.velocity_mps)
         # A pose without a velocity goes as a position: an unknown one (NaN) is not safe to send to ArduPilot.
-        message = "vision-position-estimate" if body is None else self._config.message
-        return Pose(message, (sample.captured_ns - offset_ns) // 1000, sample.position_m, attitude, body)
+        message = "vision-position-estimate" if velocity_body is None else self._config.message
+        return Pose(message, (sample.captured_ns - offset_ns) // 1000, sample.position_m, attitude, velocity_body)

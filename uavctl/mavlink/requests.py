@@ -1,4 +1,11 @@
-"""One request to the vehicle: when to make it again, what came back, when to give up. Pure: time is an argument."""
+"""One request to the vehicle: when to repeat it, what the vehicle answered, when to give up.
+
+Pure: time is an argument.
+
+1. Send the request, and wait `answer_ns` for its effect.
+2. If the vehicle refuses it for now, repeat it after `retry_ns`.
+3. Give up after a final refusal, after `tries` requests, or after `limit_ns`.
+"""
 
 from __future__ import annotations
 
@@ -7,16 +14,16 @@ from enum import StrEnum
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from uavctl.mavlink.messages import Ack, Text
+from uavctl.arrays import SECOND_NS
+from uavctl.mavlink.messages import CommandAck, StatusText
 
-SECOND_NS = 1_000_000_000
-SHOWN_NS = 3 * SECOND_NS  # heartbeats, at 1 Hz, show by then what was granted
+SHOWN_NS = 3 * SECOND_NS  # heartbeats, at 1 Hz, show a grant by then
 _FINAL = frozenset({mavlink.MAV_RESULT_DENIED, mavlink.MAV_RESULT_UNSUPPORTED})
-_MAX_TEXTS = 4  # of the vehicle's last words that are told with a refusal
+_MAX_TEXTS = 4  # texts of the vehicle that are reported with a refusal
 
 
 class RequestKind(StrEnum):
-    """Request to the vehicle; the value is how a person would say it."""
+    """Request to the vehicle; the value is its text for people."""
 
     TAKE_OFF_MODE = "the mode to take off in"
     ARM = "arming"
@@ -37,84 +44,86 @@ COMMANDS = {
 
 
 @dataclass(frozen=True)
-class Patience:
-    """Bounds of a request."""
+class RequestLimits:
+    """Time limits and number of attempts of a request."""
 
-    answer_ns: int  # without an effect it is made again after this time [ns]
-    retry_ns: int  # refused for now, it is made again after this time [ns]
-    tries: int  # times that it is made at most
+    answer_ns: int  # without an effect it is repeated after this time [ns]
+    retry_ns: int  # refused for now, it is repeated after this time [ns]
+    tries: int  # largest number of attempts
     limit_ns: int  # after this time it has failed [ns]
 
 
 class PendingRequest:
-    """A request from its first time to its effect, or its end.
+    """Request from its first attempt to its effect or end.
 
     Args:
-        ask: What is asked for; None for a wait in which nothing is said.
+        kind: The request; None for a wait in which nothing is sent.
     """
 
-    def __init__(self, ask: RequestKind | None, at_ns: int, patience: Patience) -> None:
-        self.ask = ask  # the request; None for a wait in which nothing is sent
-        self._patience = patience
-        self._begun_ns = at_ns
+    def __init__(self, kind: RequestKind | None, at_ns: int, limits: RequestLimits) -> None:
+        self.kind = kind  # the request; None for a wait in which nothing is sent
+        self._limits = limits
+        self._start_ns = at_ns
         self._next_ns = at_ns
         self._tries = 0
         self._result: int | None = None
         self._texts: list[str] = []
-        self._held = ""
-        self._waits = False  # for the time after a refusal
-        self.asked_ns: int | None = None  # when it was made last
-        self.granted_ns: int | None = None  # when it was accepted last
+        self._blocked_reason = ""
+        self._is_retry_delayed = False  # a refusal has delayed the next attempt
+        self.requested_ns: int | None = None  # last attempt
+        self.granted_ns: int | None = None  # last acceptance
 
-    def hear(self, message: Ack | Text, at_ns: int) -> None:
-        """Take what the vehicle says."""
-        if isinstance(message, Text):
+    def handle_message(self, message: CommandAck | StatusText, at_ns: int) -> None:
+        """Handle an answer or a text of the vehicle."""
+        if isinstance(message, StatusText):
             if message.severity <= mavlink.MAV_SEVERITY_WARNING and message.text not in self._texts:
                 self._texts = [*self._texts, message.text][-_MAX_TEXTS:]
-        elif self.ask is not None and self._tries and message.command == COMMANDS[self.ask]:
-            again, self._result = self._result == message.result, message.result
+        elif self.kind is not None and self._tries and message.command == COMMANDS[self.kind]:
+            is_repeated, self._result = self._result == message.result, message.result
             if message.result == mavlink.MAV_RESULT_ACCEPTED:
                 self.granted_ns = at_ns
                 self._next_ns = at_ns + SHOWN_NS
             elif message.result == mavlink.MAV_RESULT_IN_PROGRESS:
-                self._next_ns = max(self._next_ns, at_ns + self._patience.retry_ns)
-            elif not (again and self._waits):  # said twice, it is not waited for twice
-                self._waits = True
-                self._next_ns = at_ns + self._patience.retry_ns
+                self._next_ns = max(self._next_ns, at_ns + self._limits.retry_ns)
+            elif not (is_repeated and self._is_retry_delayed):  # a repeated refusal does not extend the wait
+                self._is_retry_delayed = True
+                self._next_ns = at_ns + self._limits.retry_ns
 
-    def due(self, at_ns: int, held: str = "", *, blind: bool = False) -> RequestKind | None:
-        """Return the request to send now, if any; `held` says why it must not be sent yet.
+    def due(self, at_ns: int, blocked_reason: str = "", *, is_mode_uncertain: bool = False) -> RequestKind | None:
+        """Return the request to send now, if any; `blocked_reason` tells why not to send it yet.
 
-        `blind`: nothing is asked again now, as it is not known what the vehicle does meanwhile.
+        `is_mode_uncertain`: the vehicle's mode may have changed, so nothing is repeated now.
         """
-        self._held = held
-        if blind and self._tries:
+        self._blocked_reason = blocked_reason
+        if is_mode_uncertain and self._tries:
             return None
-        if self.ask is None or held or at_ns < self._next_ns or self._tries >= self._patience.tries:
+        if self.kind is None or blocked_reason or at_ns < self._next_ns or self._tries >= self._limits.tries:
             return None
-        if self.ask is RequestKind.TAKE_OFF and self.granted_ns is not None:  # it would begin again
+        if self.kind is RequestKind.TAKE_OFF and self.granted_ns is not None:  # the climb would start again
             return None
         self._tries += 1
-        self._waits, self.asked_ns = False, at_ns
-        self._next_ns = at_ns + self._patience.answer_ns
-        return self.ask
+        self._is_retry_delayed, self.requested_ns = False, at_ns
+        self._next_ns = at_ns + self._limits.answer_ns
+        return self.kind
 
-    def given_up(self, at_ns: int, *, at_once: bool = False) -> str:
-        """Return why the request is given up; empty while it may still succeed (`at_once`: it may not)."""
-        over = at_once or at_ns - self._begun_ns >= self._patience.limit_ns
-        out_of_tries = self.ask is not None and self._tries >= self._patience.tries and at_ns >= self._next_ns
-        if not (over or out_of_tries or (self._result is not None and self._result in _FINAL)):
+    def describe_failure(self, at_ns: int, *, is_final: bool = False) -> str:
+        """Return why the request has failed; empty while it may still succeed (`is_final`: it may not)."""
+        is_over_time = is_final or at_ns - self._start_ns >= self._limits.limit_ns
+        out_of_tries = self.kind is not None and self._tries >= self._limits.tries and at_ns >= self._next_ns
+        if not (is_over_time or out_of_tries or (self._result is not None and self._result in _FINAL)):
             return ""
-        return f"{self._what()}{self._why()}{self.words} ({self._effort(at_ns)})"
+        return (
+            f"{self._describe_request()}{self._describe_reason()}{self.quoted_texts} ({self._describe_effort(at_ns)})"
+        )
 
-    def _what(self) -> str:
-        return "" if self.ask is None else f"{self.ask.value}: "
+    def _describe_request(self) -> str:
+        return "" if self.kind is None else f"{self.kind.value}: "
 
-    def _why(self) -> str:
-        if self.ask is None:
+    def _describe_reason(self) -> str:
+        if self.kind is None:
             return "it took too long"
-        if self._held and self._result is None:
-            return f"not asked for, because {self._held}"
+        if self._blocked_reason and self._result is None:
+            return f"not asked for, because {self._blocked_reason}"
         if self._result is None:
             return "the vehicle did not answer"
         name = mavlink.enums["MAV_RESULT"].get(self._result)
@@ -124,13 +133,13 @@ class PendingRequest:
         return f"the vehicle answered {result}"
 
     @property
-    def words(self) -> str:
-        """The vehicle's texts since the request, quoted, to be added to a reason."""
+    def quoted_texts(self) -> str:
+        """Texts of the vehicle since the request, quoted, for a reason."""
         return "".join(f', "{text}"' for text in self._texts)
 
-    def _effort(self, at_ns: int) -> str:
-        seconds = f"{(at_ns - self._begun_ns) / SECOND_NS:.1f} s"
-        if self.ask is None:
+    def _describe_effort(self, at_ns: int) -> str:
+        seconds = f"{(at_ns - self._start_ns) / SECOND_NS:.1f} s"
+        if self.kind is None:
             return seconds
         times = "once" if self._tries == 1 else f"{self._tries} times"
         return f"asked {times} in {seconds}" if self._tries else f"it could not be asked in {seconds}"

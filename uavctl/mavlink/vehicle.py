@@ -1,279 +1,61 @@
-"""The vehicle by its messages: status, boot clock, STATUSTEXT."""
+"""State of the vehicle from its messages: status, motion and inertial samples.
+
+1. Follow the first autopilot that sends a heartbeat. Count and ignore other vehicles.
+2. Keep landed state, battery, boot clock and the evidence for a mode change between heartbeats.
+3. Return a `VehicleStatus` at each heartbeat, and at once if the evidence or the boot count changes.
+4. Rotate each specific force with the newest attitude: a = R f + g. Ignore old, repeated and frozen data.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import msgspec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from uavctl.frames import Quaternion, from_euler, rotate
+from uavctl.frames import Quaternion, quaternion_from_euler, rotate_vector
+from uavctl.mavlink.boot_clock import BootClock
 from uavctl.mavlink.clocksync import ArrivalClock
 from uavctl.mavlink.codec import MODE_COMMANDS
 from uavctl.mavlink.messages import (
-    Ack,
     Attitude,
     Battery,
+    CommandAck,
     FenceBreach,
     Heartbeat,
     Inertial,
-    Landed,
+    LandedState,
     Message,
-    ModeOrder,
+    ModeCommand,
     Position,
     RadioChannels,
-    Text,
+    StatusText,
 )
-from uavctl.mavlink.profile import PROFILES, autopilot_name, describe_mode
-from uavctl.mavlink.switcher import speaks_of_failsafe, speaks_of_fence, speaks_of_radio
+from uavctl.mavlink.mode_reason import ModeReasonEvidence
+from uavctl.mavlink.profile import PROFILES, describe_mode, find_autopilot_name
 from uavctl.records import Event, InertialSample, Severity, Vec3, VehicleMotion, VehicleStatus
 
-# A vehicle's time since boot: how long it has been up, and whether it has started anew. Pure: time is an argument.
-
-
-BACK_MS = 1000  # a clock that goes back by more is another one; disorder on a link is less
-AHEAD_MS = 30_000  # more than time has passed: late messages, and simulated clocks that run fast
-AGREE_NS = 5_000_000_000  # within which another clock's second message has to come
-_WRAP_MS = 2**32
-
-
-@dataclass(frozen=True)
-class _Reading:
-    """A time since boot [ms] and when it came [ns]; confirmed by the message after it that agrees."""
-
-    boot_ms: int
-    at_ns: int
-    confirmed: bool = False
-
-
-class BootClock:
-    """Takes `time_boot_ms` of several kinds of messages, each against its own kind.
-
-    One message is no evidence, as a field may hold garbage: a clock counts once two agree, be it between those of
-    another vehicle with the same id.
-    """
-
-    def __init__(self) -> None:
-        self._known: dict[str, _Reading] = {}  # by kind of message
-        self._doubted: dict[str, _Reading] = {}  # does not go on from what is known
-        self._newest: _Reading | None = None
-
-    def up_s(self, at_ns: int) -> float | None:
-        """Return the time since the vehicle started, by its own clock [s]; None if it does not tell."""
-        newest = self._newest
-        return None if newest is None else newest.boot_ms / 1e3 + (at_ns - newest.at_ns) / 1e9
-
-    def take(self, kind: str, boot_ms: int, at_ns: int) -> bool:
-        """Take a time since boot; whether it shows that the vehicle has started anew.
-
-        Args:
-            kind: of message; the clocks of two need not agree.
-            boot_ms: its time since boot, modulo 2**32 ms.
-        """
-        known, doubted = self._known.get(kind), self._doubted.get(kind)
-        reading = _Reading(boot_ms, at_ns)
-        if known is None or _goes_on(known, reading):
-            self._adopt(kind, _Reading(boot_ms, at_ns, confirmed=known is not None))
-        elif doubted is not None and at_ns - doubted.at_ns <= AGREE_NS and _goes_on(doubted, reading):
-            del self._doubted[kind]
-            anew = known.confirmed and (_advance_ms(known, reading) < 0 or _is_young(known, reading))
-            if anew:  # the others' readings are from before the restart
-                self._known.clear()
-                self._doubted.clear()
-            self._adopt(kind, _Reading(boot_ms, at_ns, confirmed=True))
-            return anew
-        else:
-            self._doubted[kind] = reading
-        return False
-
-    def forget(self) -> None:
-        """Begin anew, with another vehicle."""
-        self._known.clear()
-        self._doubted.clear()
-        self._newest = None
-
-    def _adopt(self, kind: str, reading: _Reading) -> None:
-        self._known[kind] = self._newest = reading
-
-
-def _advance_ms(before: _Reading, after: _Reading) -> int:
-    """Return by how much a clock went on, the shorter way around its wrap [ms]."""
-    return (after.boot_ms - before.boot_ms + _WRAP_MS // 2) % _WRAP_MS - _WRAP_MS // 2
-
-
-def _passed_ms(before: _Reading, after: _Reading) -> int:
-    return (after.at_ns - before.at_ns) // 1_000_000
-
-
-def _goes_on(before: _Reading, after: _Reading) -> bool:
-    """Whether two readings may be of one clock."""
-    return -BACK_MS <= _advance_ms(before, after) <= _passed_ms(before, after) + AHEAD_MS
-
-
-def _is_young(before: _Reading, after: _Reading) -> bool:
-    """Whether a vehicle may have started between two readings: up for more than 24 days its clock seems to leap."""
-    return after.boot_ms <= _passed_ms(before, after) + AHEAD_MS
-
-
-# STATUSTEXT joined again: a vehicle sends what is longer than 50 characters in several pieces.
-
-
-WAIT_NS = 1_000_000_000  # for the pieces that are to come; PX4 sends them at once
-MOST = 16  # texts under way
-LOST = "…"  # stands for a piece that did not come
-
-
-class _Begun(msgspec.Struct):
-    """Text of which more pieces are to come."""
-
-    first: Text
-    said: str
-    next_chunk: int
-    at_ns: int
-
-    def so_far(self) -> Text:
-        """Return the text as far as it has come, with a mark for the part that is missing."""
-        return _plain(self.first, self.said + LOST)
-
-
-class Joiner:
-    """Joins the pieces of texts, by their sender."""
-
-    def __init__(self) -> None:
-        self._begun: dict[tuple[int, int], _Begun] = {}
-
-    def take(self, text: Text, at_ns: int) -> tuple[Text, ...]:
-        """Take a piece, or a whole text; the texts that are whole now."""
-        sender = text.system, text.component
-        begun = self._begun.get(sender)
-        told: tuple[Text, ...] = ()
-        if begun is not None and (begun.first.number != text.number or text.chunk < begun.next_chunk):
-            told = (self._begun.pop(sender).so_far(),)
-            begun = None
-        if begun is None:
-            begun = _Begun(text, LOST if text.chunk else "", text.chunk, at_ns)
-        begun.said += ("" if text.chunk == begun.next_chunk else LOST) + text.text
-        begun.next_chunk = text.chunk + 1
-        if not text.more:
-            self._begun.pop(sender, None)
-            return (*told, _plain(begun.first, begun.said))
-        if sender in self._begun or len(self._begun) < MOST:
-            self._begun[sender] = begun
-            return told
-        return (*told, begun.so_far())
-
-    def overdue(self, at_ns: int) -> tuple[Text, ...]:
-        """The texts whose rest has not come."""
-        late = [sender for sender, begun in self._begun.items() if at_ns - begun.at_ns > WAIT_NS]
-        return tuple(self._begun.pop(sender).so_far() for sender in late)
-
-
-def _plain(first: Text, text: str) -> Text:
-    return Text(system=first.system, component=first.component, severity=first.severity, text=text.rstrip())
-
-
-class SwitchEvidence:
-    """What the vehicle says, and shows, of who changes its modes.
-
-    Each counts for `EVIDENCE_NS`, and longer where no heartbeat has come since: the mode may have changed right after.
-    """
-
-    def __init__(self) -> None:
-        self._failsafe_ns = self._fence_ns = self._said_ns = self._stick_ns = self._station_ns = NEVER_NS
-        self._beats_ns = NEVER_NS, NEVER_NS  # the newest heartbeat, and the one before
-        self._said = ""
-        self._station = 0
-        self._rest_us: list[int] = []  # of each channel, since it moved last; 0: not known
-        self._radio: bool | None = None  # None before it says so
-        self._fenced = True
-
-    def beat(self, at_ns: int) -> None:
-        """Take a heartbeat, which shows the mode."""
-        self._beats_ns = at_ns, self._beats_ns[0]
-
-    def word(self, text: str, at_ns: int) -> None:
-        """Take a text, of any severity."""
-        fence, failsafe = speaks_of_fence(text), speaks_of_failsafe(text)
-        if fence or failsafe:
-            self._said, self._said_ns = text, at_ns
-        if fence:
-            self._fence_ns = at_ns
-        if failsafe:
-            self._failsafe_ns = at_ns
-        elif "failsafe" in text.lower() and "clear" in text.lower():
-            self._failsafe_ns = NEVER_NS
-
-    def fence(self, at_ns: int, *, within: bool) -> None:
-        """Take whether it is within its fence; that it comes beyond it counts."""
-        if self._fenced and not within:
-            self._fence_ns = at_ns
-        self._fenced = within
-
-    def radio(self, *, heard: bool) -> None:
-        """Take whether a remote control is heard."""
-        self._radio = heard
-
-    def channels(self, pulses_us: tuple[int, ...], at_ns: int) -> None:
-        """Take the channels of a remote control."""
-        if len(pulses_us) != len(self._rest_us):
-            self._rest_us = [0] * len(pulses_us)
-        for i, pulse in enumerate(pulses_us):
-            rest = self._rest_us[i]
-            if not rest or abs(pulse - rest) >= STICK_US:
-                self._rest_us[i] = pulse
-                self._stick_ns = at_ns if rest and pulse else self._stick_ns
-
-    def ordered(self, station: int, at_ns: int) -> None:
-        """Take an order of a mode that another than us has given."""
-        self._station, self._station_ns = station, at_ns
-
-    def on(self, status: VehicleStatus, at_ns: int, *, critical: bool) -> VehicleStatus:
-        """Return a status with what counts at a time; `critical`: by its heartbeat a failsafe acts."""
-        since_ns = at_ns - EVIDENCE_NS
-        if self._beats_ns[1] > NEVER_NS:
-            since_ns = min(since_ns, self._beats_ns[1])
-        said = self._said if self._said_ns > since_ns else ""
-        # A receiver that has lost its remote control moves the channels by itself.
-        lost = self._radio is False or speaks_of_radio(said)
-        return msgspec.structs.replace(
-            status,
-            failsafe=critical or self._failsafe_ns > since_ns,
-            fence=self._fence_ns > since_ns,
-            said=said,
-            stick=self._stick_ns > since_ns and not lost,
-            radio=bool(self._radio) and not self._rest_us,
-            station=self._station if self._station_ns > since_ns else 0,
-        )
-
-
-# The vehicle as its messages tell: status, and its own words.
-
-
 SECOND_VEHICLE = "second-vehicle"
-UNPUNCTUAL = "inertial-not-of-now"  # late, repeated, or frozen
-# The same readings for longer are those of a frozen sensor. Whole thousandths of g repeat, in recorded flights of
-# ArduCopter for 0.7 s at most. Fractions have noise, and never did.
+STALE_INERTIAL = "inertial-not-of-now"  # late, repeated, or frozen
+# Identical readings for longer come from a frozen sensor. Whole thousandths of g repeat for 0.7 s at most in recorded
+# flights of ArduCopter. Fractions have noise and never repeated.
 FROZEN_RAW_US, FROZEN_US = 1_000_000, 100_000
-LOW_SHARE, ENOUGH = 0.8, 250  # part of so many inertial data under which it is reported that they are not used
-ALONE_NS = 5_000_000_000  # after that time of silence another vehicle counts as gone
-GONE_NS = 30_000_000_000  # and after that one its place is taken, if it stood on the ground
-BOOTING_NS = 3_000_000_000  # of silence before a heartbeat of booting, for that to be a restart
-# For which what it says of failsafes, fences and sticks speaks for its mode: heartbeats come once a second.
-EVIDENCE_NS = 2_000_000_000
-NEVER_NS = -(2**63)
-STICK_US = 100  # by which a channel of a remote control moves at least when a person moves it: a tenth of its way
-TURNED_NS = 100_000_000  # an attitude that is older turns no specific force: at 1 rad/s it is 0.1 rad, 1 m/s², off
+# Less than this share of so many inertial data used: it is reported.
+MIN_INERTIAL_SHARE, MIN_INERTIAL = 0.8, 250
+ALONE_NS = 5_000_000_000  # silence after which another vehicle counts as gone
+GONE_NS = 30_000_000_000  # silence after which another vehicle replaces a disarmed one
+BOOTING_NS = 3_000_000_000  # silence before a heartbeat of booting that shows a restart
+MAX_ATTITUDE_AGE_NS = 100_000_000  # at 1 rad/s the attitude is then 0.1 rad off, and the acceleration 1 m/s²
 GRAVITY_MPS2 = 9.80665
-LATE_NS = 60_000_000  # later than the quickest: a stream of 50 Hz is 20 ms apart
-BACK_US = 1_000_000  # a stamp that goes back by more is of another clock
-_ROUTINE = frozenset({mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAV_CMD_REQUEST_MESSAGE})
-# PX4 stands by only while its pre-flight checks pass, and is uninitialised else: that comes and goes, no restart.
-_UNREADY = frozenset({mavlink.MAV_STATE_UNINIT, mavlink.MAV_STATE_BOOT, mavlink.MAV_STATE_CALIBRATING})
-_IN_FAILSAFE = frozenset({mavlink.MAV_STATE_CRITICAL, mavlink.MAV_STATE_EMERGENCY})
+MAX_DELAY_NS = 60_000_000  # later than the quickest message: a stream of 50 Hz has 20 ms between messages
+MAX_BACKSTEP_US = 1_000_000  # a stamp that goes back by more is of another clock
+_UNREPORTED_COMMANDS = frozenset({mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAV_CMD_REQUEST_MESSAGE})
+# PX4 is in standby only while its pre-flight checks pass, else uninitialised. That changes without a restart.
+_NOT_READY_STATES = frozenset({mavlink.MAV_STATE_UNINIT, mavlink.MAV_STATE_BOOT, mavlink.MAV_STATE_CALIBRATING})
+_FAILSAFE_STATES = frozenset({mavlink.MAV_STATE_CRITICAL, mavlink.MAV_STATE_EMERGENCY})
 _NO_AUTOPILOT = int(mavlink.MAV_AUTOPILOT_INVALID)
 _AUTOPILOT1 = int(mavlink.MAV_COMP_ID_AUTOPILOT1)
-# Types of what is no vehicle, whatever autopilot it names: its own, or the one that it is made for.
+# Types of devices that are no vehicle, whatever autopilot they name.
 _DEVICES = frozenset(
     int(getattr(mavlink, f"MAV_TYPE_{name}"))
     for name in (
@@ -284,99 +66,98 @@ _DEVICES = frozenset(
 
 
 def is_vehicle(heartbeat: Heartbeat) -> bool:
-    """Whether a heartbeat is an autopilot's: not that of a ground station, a companion computer, a gimbal, a camera."""
+    """Return whether a heartbeat is an autopilot's, not that of a ground station, companion computer or gimbal."""
     return heartbeat.autopilot != _NO_AUTOPILOT and heartbeat.vehicle_type not in _DEVICES
 
 
-def is_better(address: tuple[int, int], than: tuple[int, int] | None) -> bool:
-    """Whether of two that say that they are vehicles the first one is to be followed.
+def is_preferred(address: tuple[int, int], other: tuple[int, int] | None) -> bool:
+    """Return whether to follow the first of two vehicles instead of the second.
 
-    Of one system it is the component of autopilots; of two systems the one that is followed already.
+    In one system the autopilot component is preferred; of two systems the followed one.
     """
-    if than is None:
+    if other is None:
         return True
-    return address[0] == than[0] and address[1] == _AUTOPILOT1 != than[1]
+    return address[0] == other[0] and address[1] == _AUTOPILOT1 != other[1]
 
 
-class SensorStream:
-    """Judges the messages of one stream of one sensor by their stamps and arrival.
+class SensorStreamMonitor:
+    """Checks the messages of one sensor stream by their stamps and arrival.
 
-    A new stamp is a new measurement, as integer readings repeat; the same readings for long are a frozen sensor. The
-    delay counts from the quickest message, at the drift of the sender's clock: clocks need not agree.
+    A new stamp is a new measurement, because integer readings repeat. Identical readings for long come from a frozen
+    sensor. The delay counts from the quickest message and follows the drift of the sender's clock.
     """
 
     def __init__(self) -> None:
         self._clock = ArrivalClock()
-        self._heard_ns = 0  # the last that was judged
-        self._stamp_us = 0  # of that
+        self._checked_ns = 0  # arrival of the last checked message
+        self._stamp_us = 0  # its stamp
         self._values: Vec3 | None = None
-        self._since_us = 0  # stamp of the first of the same readings in a row
+        self._since_us = 0  # stamp of the first of identical readings
 
-    def takes(self, stamp_us: int, values: Vec3, at_ns: int, *, frozen_us: int = 0) -> bool | None:
-        """Whether a message is a measurement of now; None for one that was there already.
+    def is_current(self, stamp_us: int, values: Vec3, at_ns: int, *, frozen_us: int = 0) -> bool | None:
+        """Return whether a message is a current measurement; None for a repeated one.
 
         Args:
-            stamp_us: when it was measured, by the sender's clock.
+            stamp_us: time of measurement by the sender's clock.
             values: the readings.
-            frozen_us: readings that are the same to the last bit for longer are those of a frozen sensor; 0 where noise
-                never repeats.
+            frozen_us: identical readings for longer come from a frozen sensor; 0 if noise never repeats.
         """
         advance_us = stamp_us - self._stamp_us
-        if advance_us < -BACK_US or advance_us > (at_ns - self._heard_ns) // 1000 + BACK_US:
+        if advance_us < -MAX_BACKSTEP_US or advance_us > (at_ns - self._checked_ns) // 1000 + MAX_BACKSTEP_US:
             self._clock, self._since_us = ArrivalClock(), stamp_us
         elif advance_us <= 0:
             return None
         if values != self._values:
             self._since_us = stamp_us
-        repeats = values == self._values
-        delay_ns = self._clock.delay_ns(1000 * stamp_us, at_ns)
-        self._stamp_us, self._heard_ns, self._values = stamp_us, at_ns, values
-        return delay_ns <= LATE_NS and not (repeats and stamp_us - self._since_us >= frozen_us)
+        is_repeated = values == self._values
+        delay_ns = self._clock.measure_delay_ns(1000 * stamp_us, at_ns)
+        self._stamp_us, self._checked_ns, self._values = stamp_us, at_ns, values
+        return delay_ns <= MAX_DELAY_NS and not (is_repeated and stamp_us - self._since_us >= frozen_us)
 
 
-class VehicleWatch:
+class VehicleMonitor:
     """Follows the first vehicle that is heard; others are counted and ignored.
 
-    A vehicle that has fallen silent on the ground, disarmed, gives way to another.
+    Another vehicle replaces a silent and disarmed one.
 
     Args:
-        bad: counter that heartbeats of other vehicles are added to.
-        own: our system and component id; answers to others' commands are not ours.
-        system: the vehicle's system id; 0 takes any.
-        component: its component id; 0 takes any, and that of autopilots rather than another.
-        channels: its remote control is heard of: what SYS_STATUS says of that and of a fence counts, too.
+        count_bad: counts heartbeats of other vehicles, by reason.
+        own_address: our system and component id; answers to other stations are ignored.
+        system: the vehicle's system id; 0 accepts any.
+        component: its component id; 0 accepts any and prefers that of autopilots.
+        channels: use the remote control and fence flags of SYS_STATUS.
     """
 
     def __init__(
         self,
-        bad: Callable[[str], None],
-        own: tuple[int, int],
+        count_bad: Callable[[str], None],
+        own_address: tuple[int, int],
         system: int = 0,
         component: int = 0,
         *,
         inertial: bool = False,
         channels: bool = True,
     ) -> None:
-        self._bad = bad
-        self._inertial, self._channels = inertial, channels
-        self._own = own
+        self._count_bad = count_bad
+        self._wants_inertial, self._uses_channels = inertial, channels
+        self._own_address = own_address
         self._system, self._component = system, component
         self._landed: bool | None = None
         self._own_climb = False
         self._battery_v: float | None = None
-        self._clock = BootClock()
-        self._ready = False  # by its last heartbeat
-        self._heard_ns = 0  # any word of it
-        self._evidence = SwitchEvidence()
-        self._critical = False  # by its last heartbeat
-        self._another_ns: int | None = None  # when another vehicle was heard last
+        self._boot_clock = BootClock()
+        self._is_ready = False  # by its last heartbeat
+        self._heard_ns = 0  # any message of it
+        self._evidence = ModeReasonEvidence()
+        self._is_in_failsafe = False  # by its last heartbeat
+        self._other_vehicle_ns: int | None = None  # last message of another vehicle
         self._status: VehicleStatus | None = None
         self._motion = VehicleMotion()
-        self._streams: dict[str, SensorStream] = {}  # by kind of message
-        self._turned: tuple[Vec3, int] | None = None  # attitude, and when it was told
-        self.inertial_used = self.inertial_total = 0  # inertial data that gave an acceleration, and all
+        self._sensor_streams: dict[str, SensorStreamMonitor] = {}  # by kind of message
+        self._attitude: tuple[Vec3, int] | None = None  # attitude, and its time of arrival
+        self.inertial_used = self.inertial_total = 0  # inertial data: used, and all
         self.boots = 0
-        self.unready = 0  # times that it ceased to be ready: its streams may be gone
+        self.not_ready_count = 0  # times that it was no longer ready: its streams may have stopped
         self.address: tuple[int, int] | None = None  # system, component
 
     @property
@@ -385,96 +166,106 @@ class VehicleWatch:
         return "" if self._status is None else self._status.autopilot
 
     @property
-    def armed(self) -> bool:
-        """Whether it says that it is armed."""
+    def is_armed(self) -> bool:
+        """Whether the last heartbeat shows an armed vehicle."""
         return self._status is not None and self._status.armed
 
-    def take(
+    def handle_message(
         self, message: Message, at_ns: int
-    ) -> tuple[VehicleStatus | VehicleMotion | InertialSample | Event | Ack | Text, ...]:
-        """Take any message; only the vehicle's count."""
+    ) -> tuple[VehicleStatus | VehicleMotion | InertialSample | Event | CommandAck | StatusText, ...]:
+        """Handle any message; only those of the vehicle count."""
         if isinstance(message, Heartbeat) and is_vehicle(message):
-            return self._heartbeat(message, at_ns)
-        if isinstance(message, ModeOrder):
-            return self._is_ordered(message.system, message.target_system, at_ns)
+            return self._handle_heartbeat(message, at_ns)
+        if isinstance(message, ModeCommand):
+            return self._handle_mode_command(message.system, message.target_system, at_ns)
         if self.address is None or message.system != self.address[0]:
             return ()
-        if message.component != self.address[1]:  # a companion computer or gimbal of the same system: its words only
-            return (_text_event(message, at_ns),) if isinstance(message, Text) else ()
+        if message.component != self.address[1]:  # a companion computer or gimbal: only its texts
+            return (_make_text_event(message, at_ns),) if isinstance(message, StatusText) else ()
         self._heard_ns = at_ns
         match message:
-            case Landed(landed=landed, own_climb=own_climb):
-                return self._phase(landed, own_climb)
+            case LandedState(landed=landed, own_climb=own_climb):
+                return self._update_landed(landed, own_climb)
             case Battery():
                 self._battery_v = self._battery_v if message.voltage_v is None else message.voltage_v
-                if message.radio is None or not self._channels:
+                if message.has_radio is None or not self._uses_channels:
                     return ()
-                self._evidence.radio(heard=message.radio)
-                self._evidence.fence(at_ns, within=message.fenced)
-                return self._proves(at_ns)
-            case FenceBreach(breached=breached):
-                self._evidence.fence(at_ns, within=not breached)
-                return self._proves(at_ns)
+                self._evidence.update_radio(heard=message.has_radio)
+                self._evidence.update_fence(at_ns, within=message.is_within_fence)
+                return self._update_evidence(at_ns)
+            case FenceBreach(is_breached=breached):
+                self._evidence.update_fence(at_ns, within=not breached)
+                return self._update_evidence(at_ns)
             case RadioChannels(channels_us=channels_us):
-                self._evidence.channels(channels_us, at_ns)
-                return self._proves(at_ns)
+                self._evidence.update_channels(channels_us, at_ns)
+                return self._update_evidence(at_ns)
             case Position(boot_ms=True, stamp_us=int(stamp_us)):
-                anew = self._tells_time("position", stamp_us, at_ns)
-                return (*anew, *self._moves(at_ns, velocity=message.velocity_mps))
+                status = self._update_boot_clock("position", stamp_us, at_ns)
+                return (*status, *self._update_motion(at_ns, velocity=message.velocity_mps))
             case Attitude(angles_rad=angles_rad):
                 kind = "quaternion" if message.quaternion else "angles"
-                anew = self._tells_time(kind, message.stamp_us, at_ns) if message.stamp_us else ()
-                # Beside inertial data both are of use; else a vehicle that streams both is believed by one.
-                if message.quaternion and not self._inertial:
-                    return anew
-                self._turns(message, at_ns)
-                return (*anew, *self._moves(at_ns, attitude=angles_rad))
+                status = self._update_boot_clock(kind, message.stamp_us, at_ns) if message.stamp_us else ()
+                # Inertial data use both attitude messages. Without them, one of two streams is enough.
+                if message.quaternion and not self._wants_inertial:
+                    return status
+                self._update_attitude(message, at_ns)
+                return (*status, *self._update_motion(at_ns, attitude=angles_rad))
             case Inertial(raw=raw):
-                known = PROFILES.get(self.autopilot)
-                return self._accelerates(message, at_ns) if not raw or (known and known.reads_raw) else ()
-            case Text(text=text):
-                self._evidence.word(text, at_ns)
-                return message, _text_event(message, at_ns), *self._proves(at_ns)
-            case Ack() if self._is_ours(message):
-                return (message,) if message.command in _ROUTINE else (message, _ack_event(message, at_ns))
-            case Ack(command=command, result=mavlink.MAV_RESULT_ACCEPTED) if command in MODE_COMMANDS:
-                return self._is_ordered(message.target_system, message.system, at_ns)
+                profile = PROFILES.get(self.autopilot)
+                return (
+                    self._make_inertial_sample(message, at_ns) if not raw or (profile and profile.uses_raw_imu) else ()
+                )
+            case StatusText(text=text):
+                self._evidence.add_text(text, at_ns)
+                return message, _make_text_event(message, at_ns), *self._update_evidence(at_ns)
+            case CommandAck() if self._is_for_us(message):
+                return (
+                    (message,)
+                    if message.command in _UNREPORTED_COMMANDS
+                    else (message, _make_ack_event(message, at_ns))
+                )
+            case CommandAck(command=command, result=mavlink.MAV_RESULT_ACCEPTED) if command in MODE_COMMANDS:
+                return self._handle_mode_command(message.target_system, message.system, at_ns)
         return ()
 
-    def _is_ordered(self, station: int, target: int, at_ns: int) -> tuple[VehicleStatus, ...]:
-        """Take note that somebody orders a mode of a vehicle; only others' orders of this one count."""
-        if self.address is None or target not in (0, self.address[0]) or station in (self._own[0], self.address[0]):
+    def _handle_mode_command(self, station: int, target: int, at_ns: int) -> tuple[VehicleStatus, ...]:
+        """Note a mode command of another station to this vehicle."""
+        if (
+            self.address is None
+            or target not in (0, self.address[0])
+            or station in (self._own_address[0], self.address[0])
+        ):
             return ()
-        self._evidence.ordered(station, at_ns)
-        return self._proves(at_ns)
+        self._evidence.add_mode_command(station, at_ns)
+        return self._update_evidence(at_ns)
 
-    def _proves(self, at_ns: int) -> tuple[VehicleStatus, ...]:
-        """Return a status at once where there is new evidence of who has changed its mode."""
+    def _update_evidence(self, at_ns: int) -> tuple[VehicleStatus, ...]:
+        """Return a status at once if the evidence has changed."""
         if self._status is None:
             return ()
-        before, self._status = self._status, self._evidence.on(self._status, at_ns, critical=self._critical)
+        before, self._status = self._status, self._evidence.apply_to(self._status, at_ns, critical=self._is_in_failsafe)
         return () if self._status == before else (self._status,)
 
-    def _is_ours(self, ack: Ack) -> bool:
-        system, component = self._own
+    def _is_for_us(self, ack: CommandAck) -> bool:
+        system, component = self._own_address
         return ack.target_system in (0, system) and ack.target_component in (0, component)
 
-    def up_s(self, at_ns: int) -> float | None:
-        """Return the time since it started, by its own clock [s]; None if it does not tell."""
-        return self._clock.up_s(at_ns)
+    def uptime_s(self, at_ns: int) -> float | None:
+        """Return the vehicle's uptime by its own clock [s]; None if unknown."""
+        return self._boot_clock.uptime_s(at_ns)
 
     def attitude(self, at_ns: int) -> Quaternion | None:
         """Return the rotation of a specific force at that time into local NED (w, x, y, z); None if old or unknown."""
-        if self._turned is None or at_ns - self._turned[1] > TURNED_NS:
+        if self._attitude is None or at_ns - self._attitude[1] > MAX_ATTITUDE_AGE_NS:
             return None
-        return from_euler(self._turned[0])
+        return quaternion_from_euler(self._attitude[0])
 
-    def _tells_time(self, kind: str, stamp_us: int, at_ns: int) -> tuple[VehicleStatus, ...]:
-        """Watch its time since boot; a status tells at once that it has started anew."""
-        return self._reboot() if self._clock.take(kind, stamp_us // 1000, at_ns) else ()
+    def _update_boot_clock(self, kind: str, stamp_us: int, at_ns: int) -> tuple[VehicleStatus, ...]:
+        """Update the boot clock; return a status at once after a restart."""
+        return self._reset_after_reboot() if self._boot_clock.update(kind, stamp_us // 1000, at_ns) else ()
 
-    def _phase(self, landed: bool | None, own_climb: bool) -> tuple[VehicleStatus, ...]:
-        """Whether it stands, climbs or lands by itself; a status tells at once when that changes in flight."""
+    def _update_landed(self, landed: bool | None, own_climb: bool) -> tuple[VehicleStatus, ...]:
+        """Update the landed state; return a status at once if the vehicle's own climb begins or ends."""
         changed = own_climb != self._own_climb
         self._landed, self._own_climb = landed, own_climb
         if self._status is None or not changed:
@@ -482,93 +273,100 @@ class VehicleWatch:
         self._status = msgspec.structs.replace(self._status, landed=landed, own_climb=own_climb)
         return (self._status,)
 
-    def _moves(
+    def _update_motion(
         self, at_ns: int, *, velocity: Vec3 | None = None, attitude: Vec3 | None = None
     ) -> tuple[VehicleMotion, ...]:
-        """Return the vehicle's motion, updated with what it has just said of it."""
+        """Update and return the vehicle's motion."""
         if velocity is not None:
             self._motion = msgspec.structs.replace(self._motion, velocity_mps=velocity, velocity_ns=at_ns)
         if attitude is not None:
             self._motion = msgspec.structs.replace(self._motion, attitude_rad=attitude, attitude_ns=at_ns)
         return (self._motion,)
 
-    def _turns(self, message: Attitude, at_ns: int) -> None:
-        """Remember the attitude that specific forces are turned by, if it is of now."""
-        if not self._inertial:
+    def _update_attitude(self, message: Attitude, at_ns: int) -> None:
+        """Store the attitude that rotates specific forces, if it is current."""
+        if not self._wants_inertial:
             return
         kind = "quaternion" if message.quaternion else "angles"
-        if self._streams.setdefault(kind, SensorStream()).takes(message.stamp_us, message.angles_rad, at_ns):
-            self._turned = message.angles_rad, at_ns
+        if self._sensor_streams.setdefault(kind, SensorStreamMonitor()).is_current(
+            message.stamp_us, message.angles_rad, at_ns
+        ):
+            self._attitude = message.angles_rad, at_ns
         else:
-            self._bad(UNPUNCTUAL)
+            self._count_bad(STALE_INERTIAL)
 
-    def _accelerates(self, message: Inertial, at_ns: int) -> tuple[InertialSample, ...]:
-        """Its acceleration by a specific force and its newest attitude; nothing where either is old or unknown."""
-        if not self._inertial:
+    def _make_inertial_sample(self, message: Inertial, at_ns: int) -> tuple[InertialSample, ...]:
+        """Make a sample from a specific force and the newest attitude; nothing if either is old or unknown."""
+        if not self._wants_inertial:
             return ()
         kind, frozen_us = ("raw", FROZEN_RAW_US) if message.raw else ("highres", FROZEN_US)
-        stream = self._streams.setdefault(kind, SensorStream())
-        new = stream.takes(message.stamp_us, message.specific_force_mps2, at_ns, frozen_us=frozen_us)
-        self.inertial_total += new is not None
-        if not new:
-            self._bad(UNPUNCTUAL)
+        stream = self._sensor_streams.setdefault(kind, SensorStreamMonitor())
+        is_new = stream.is_current(message.stamp_us, message.specific_force_mps2, at_ns, frozen_us=frozen_us)
+        self.inertial_total += is_new is not None
+        if not is_new:
+            self._count_bad(STALE_INERTIAL)
             return ()
         attitude = self.attitude(at_ns)
-        turned = None if attitude is None else rotate(attitude, message.specific_force_mps2)
-        if turned is None:
+        force_ned = None if attitude is None else rotate_vector(attitude, message.specific_force_mps2)
+        if force_ned is None:
             return ()
         self.inertial_used += 1
-        north, east, down = turned
+        # a = R f + g
+        north, east, down = force_ned
         return (InertialSample(at_ns=at_ns, accel_mps2=(north, east, down + GRAVITY_MPS2)),)
 
-    def _reboot(self) -> tuple[VehicleStatus, ...]:
+    def _reset_after_reboot(self) -> tuple[VehicleStatus, ...]:
         self.boots += 1
-        self._streams, self._turned = {}, None
-        self._landed, self._evidence = None, SwitchEvidence()
+        self._sensor_streams, self._attitude = {}, None
+        self._landed, self._evidence = None, ModeReasonEvidence()
         if self._status is None:
             return ()
         self._status = msgspec.structs.replace(self._status, boots=self.boots)
         return (self._status,)
 
-    def _has_gone(self, at_ns: int) -> bool:
-        """Whether the vehicle that is followed is silent and was on the ground: nothing of ours can be flying it."""
+    def _is_lost_on_ground(self, at_ns: int) -> bool:
+        """Return whether the followed vehicle is silent and was disarmed: it cannot be in flight."""
         status = self._status
         return status is not None and not status.armed and at_ns - status.at_ns > GONE_NS
 
-    def _begin(self, address: tuple[int, int], at_ns: int) -> None:
-        """Follow a vehicle; if it is another one than before, forget the old one's state: nothing is armed yet."""
-        if self.address is not None and self.address[0] == address[0]:  # it was a device of this one
-            self._streams, self._turned, self._battery_v, self._landed = {}, None, None, None
-            self._ready = False
-            self._clock.forget()
+    def _follow_vehicle(self, address: tuple[int, int], at_ns: int) -> None:
+        """Follow a vehicle; forget the state of another one before: nothing is armed yet."""
+        if (
+            self.address is not None and self.address[0] == address[0]
+        ):  # the followed component was another device of it
+            self._sensor_streams, self._attitude, self._battery_v, self._landed = {}, None, None, None
+            self._is_ready = False
+            self._boot_clock.reset()
         elif self.address is not None:
-            self._reboot()
+            self._reset_after_reboot()
             self._battery_v = None
-            self._clock.forget()
-            self._another_ns = at_ns
+            self._boot_clock.reset()
+            self._other_vehicle_ns = at_ns
         self.address, self._status = address, None
 
-    def _heartbeat(self, message: Heartbeat, at_ns: int) -> tuple[VehicleStatus, ...]:
+    def _handle_heartbeat(self, message: Heartbeat, at_ns: int) -> tuple[VehicleStatus, ...]:
         address = (message.system, message.component)
-        wanted = self._system in (0, message.system) and self._component in (0, message.component)
-        if wanted and (is_better(address, self.address) or (address != self.address and self._has_gone(at_ns))):
-            self._begin(address, at_ns)
+        is_wanted = self._system in (0, message.system) and self._component in (0, message.component)
+        if is_wanted and (
+            is_preferred(address, self.address) or (address != self.address and self._is_lost_on_ground(at_ns))
+        ):
+            self._follow_vehicle(address, at_ns)
         if address != self.address:
             if self.address is None or message.system != self.address[0]:
-                self._bad(SECOND_VEHICLE)
-                self._another_ns = at_ns
+                self._count_bad(SECOND_VEHICLE)
+                self._other_vehicle_ns = at_ns
             return ()
-        booting = message.system_status == mavlink.MAV_STATE_BOOT and self._status is not None
-        if booting and self._ready and at_ns - self._heard_ns > BOOTING_NS:
-            self._reboot()
-            self._clock.forget()
+        is_booting = message.system_status == mavlink.MAV_STATE_BOOT and self._status is not None
+        if is_booting and self._is_ready and at_ns - self._heard_ns > BOOTING_NS:
+            self._reset_after_reboot()
+            self._boot_clock.reset()
         self._heard_ns = at_ns
-        ready = message.system_status not in _UNREADY
-        self.unready += self._ready and not ready
-        self._ready = ready
-        autopilot = autopilot_name(message.autopilot)
+        is_ready = message.system_status not in _NOT_READY_STATES
+        self.not_ready_count += self._is_ready and not is_ready
+        self._is_ready = is_ready
+        autopilot = find_autopilot_name(message.autopilot)
         mode, external = describe_mode(autopilot, message.vehicle_type, message.custom_mode)
-        self._critical = message.system_status in _IN_FAILSAFE
+        self._is_in_failsafe = message.system_status in _FAILSAFE_STATES
         status = VehicleStatus(
             at_ns=at_ns,
             autopilot=autopilot,
@@ -579,33 +377,33 @@ class VehicleWatch:
             own_climb=self._own_climb,
             battery_v=self._battery_v,
             boots=self.boots,
-            alone=self._another_ns is None or at_ns - self._another_ns > ALONE_NS,
+            alone=self._other_vehicle_ns is None or at_ns - self._other_vehicle_ns > ALONE_NS,
         )
-        self._evidence.beat(at_ns)
-        self._status = self._evidence.on(status, at_ns, critical=self._critical)
+        self._evidence.add_heartbeat(at_ns)
+        self._status = self._evidence.apply_to(status, at_ns, critical=self._is_in_failsafe)
         return (self._status,)
 
 
-def _text_event(text: Text, at_ns: int) -> Event:
-    return Event(at_ns=at_ns, severity=_severity(text.severity), code="vehicle-text", text=text.text)
+def _make_text_event(text: StatusText, at_ns: int) -> Event:
+    return Event(at_ns=at_ns, severity=_convert_severity(text.severity), code="vehicle-text", text=text.text)
 
 
-def _severity(mav_severity: int) -> Severity:
+def _convert_severity(mav_severity: int) -> Severity:
     if mav_severity <= mavlink.MAV_SEVERITY_ERROR:
         return Severity.ERROR
     return Severity.WARNING if mav_severity == mavlink.MAV_SEVERITY_WARNING else Severity.INFO
 
 
-def _ack_event(ack: Ack, at_ns: int) -> Event:
-    good = ack.result in (mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_IN_PROGRESS)
+def _make_ack_event(ack: CommandAck, at_ns: int) -> Event:
+    is_accepted = ack.result in (mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_IN_PROGRESS)
     return Event(
         at_ns=at_ns,
-        severity=Severity.INFO if good else Severity.WARNING,
+        severity=Severity.INFO if is_accepted else Severity.WARNING,
         code="command-ack",
-        text=f"{_enum_name('MAV_CMD', ack.command)}: {_enum_name('MAV_RESULT', ack.result)}",
+        text=f"{_find_enum_name('MAV_CMD', ack.command)}: {_find_enum_name('MAV_RESULT', ack.result)}",
     )
 
 
-def _enum_name(enum: str, value: int) -> str:
+def _find_enum_name(enum: str, value: int) -> str:
     entry = mavlink.enums[enum].get(value)
     return str(value) if entry is None else str(entry.name).removeprefix(f"{enum}_")

@@ -14,7 +14,7 @@ from uavctl.cli import tune as tune_cmd
 from uavctl.cli import tune as tune_flight
 from uavctl.config import load_config
 from uavctl.config.load import parse
-from uavctl.daemon.lock import sole_daemon
+from uavctl.daemon.lock import lock_vehicle
 from uavctl.errors import NotReachedError, VehicleTakenError
 from uavctl.lab.tune.run_folder import AFTER, BEFORE, FIT_PAGE, PAGE, STATE, TUNED
 from uavctl.mavlink.handover_states import HandoverState
@@ -147,7 +147,7 @@ def test_without_positions_nothing_is_flown(tmp_path: Path) -> None:
 
 def test_a_vehicle_that_another_daemon_flies_is_not_spoken_to() -> None:
     config = load_config("room", ["daemon.vehicle='udpin://127.0.0.1:1'"])
-    with sole_daemon(config.daemon.vehicle), pytest.raises(VehicleTakenError):
+    with lock_vehicle(config.daemon.vehicle), pytest.raises(VehicleTakenError):
         tune_flight.where_it_stands(config)
 
 

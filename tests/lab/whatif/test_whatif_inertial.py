@@ -18,13 +18,13 @@ from whatif_rig import Case, again, config_of, flown, history
 
 from logs.recording.topics import encode
 from uavctl.build.controller import build_controller
-from uavctl.frames import Quaternion, from_euler, rotate
+from uavctl.frames import Quaternion, quaternion_from_euler, rotate_vector
 from uavctl.lab.whatif.comparison import model_fit
 from uavctl.lab.whatif.flight import Relinked, Response, fly, history_of, response_of
 from uavctl.lab.whatif.rewrite import InertialFrames, shifted
 from uavctl.mavlink.codec import decode
-from uavctl.mavlink.framing import RawFrame, scan
-from uavctl.mavlink.vehicle import VehicleWatch
+from uavctl.mavlink.framing import RawFrame, scan_frames
+from uavctl.mavlink.vehicle import VehicleMonitor
 from uavctl.records import Datagram, Decision, Event, InertialSample, Plan, Setpoint, StepInput, Truth, Vec3
 
 MILLI_G_MPS2 = 9.80665e-3
@@ -50,7 +50,7 @@ class Speaker:
         mav = mavlink.MAVLink(None, 1, 1)
         mav.seq, self.number = self.number, self.number + 1
         packed = getattr(mavlink, f"MAVLink_{name}_message")(*fields).pack(mav, force_mavlink1=first_version)
-        (frame,) = scan(bytes(packed), final=True).frames
+        (frame,) = scan_frames(bytes(packed), final=True).frames
         return frame
 
     def beat(self) -> RawFrame:
@@ -70,7 +70,7 @@ class Speaker:
 
 
 def turn(angles: Vec3) -> Quaternion:
-    found = from_euler(angles)
+    found = quaternion_from_euler(angles)
     assert found is not None
     return found
 
@@ -89,7 +89,7 @@ def test_a_shifted_specific_force_is_the_acceleration_more(kind: str, resolution
     speaker, attitude = Speaker(number=200), turn(LEANING)
     frame = speaker.feels(kind, 5_000_000, (0.31, -0.42, -9.77), first_version=first_version)
     moved = shifted(frame, attitude, BY)
-    was, now = (rotate(attitude, force_of(one)) for one in (frame.data, moved))
+    was, now = (rotate_vector(attitude, force_of(one)) for one in (frame.data, moved))
     assert was is not None and now is not None
     # The rounding of three fields, turned.
     np.testing.assert_allclose(np.subtract(now, was), BY, atol=math.sqrt(3.0) * resolution)
@@ -120,7 +120,7 @@ def test_the_controller_reads_the_acceleration_more(
 ) -> None:
     speaker = Speaker(autopilot)
     frames = InertialFrames(config_of(LINEAR).daemon)
-    recorded, other = (VehicleWatch(lambda _: None, (245, 191), inertial=True) for _ in range(2))
+    recorded, other = (VehicleMonitor(lambda _: None, (245, 191), inertial=True) for _ in range(2))
     read: tuple[list[InertialSample], list[InertialSample]] = ([], [])
     said = [speaker.beat()]
     for i in range(20):
@@ -131,7 +131,7 @@ def test_the_controller_reads_the_acceleration_more(
         data = frames.heard(frame, at_ns, BY)
         for bytes_of, watch, heard in ((frame.data, recorded, read[0]), (data, other, read[1])):
             for message in decode(bytes_of).messages:
-                heard += [one for one in watch.take(message, at_ns) if isinstance(one, InertialSample)]
+                heard += [one for one in watch.handle_message(message, at_ns) if isinstance(one, InertialSample)]
     assert len(read[0]) == len(read[1]) == frames.moved == 20 and frames.left_out == 0
     more = [np.subtract(now.accel_mps2, was.accel_mps2) for was, now in zip(*read, strict=True)]
     np.testing.assert_allclose(more, [BY] * 20, atol=math.sqrt(3.0) * resolution)
@@ -153,7 +153,7 @@ def test_frames_that_cannot_be_mended_are_left_out_once_the_courses_part() -> No
     assert not heard(speaker.feels("highres_imu", 200_000, (0.5, 0.0, math.nan)), 200)
     assert (frames.moved, frames.left_out) == (1, 5)
     other = mavlink.MAVLink_raw_imu_message(220_000, 9, 9, 9, 0, 0, 0, 0, 0, 0).pack(mavlink.MAVLink(None, 2, 1))
-    (frame,) = scan(bytes(other), final=True).frames  # nobody follows that vehicle
+    (frame,) = scan_frames(bytes(other), final=True).frames  # nobody follows that vehicle
     assert frames.heard(frame, 220_000_000, BY) == frame.data and (frames.moved, frames.left_out) == (1, 5)
 
 
@@ -218,7 +218,7 @@ def test_the_true_quadrotor_holds_as_it_then_really_does(case: Case, change: str
 def test_without_an_attitude_inertial_data_are_left_out_and_positions_fly_on() -> None:
     def blind(data: bytes) -> bytes:
         return b"".join(
-            one.data for one in scan(data, final=True).frames if one.message_id not in (ATTITUDE, QUATERNION)
+            one.data for one in scan_frames(data, final=True).frames if one.message_id not in (ATTITUDE, QUATERNION)
         )
 
     entries = [
@@ -229,7 +229,9 @@ def test_without_an_attitude_inertial_data_are_left_out_and_positions_fly_on() -
     recorded = history_of(entries, config_of(PX4), "x")
     course = fly(recorded, config, build_controller(config), response_of(recorded, config.plant), memory, lambda: 0)
     assert course.inertial_moved == 0 and course.inertial_left_out > 500
-    came = [frame for one in memory.of(Datagram) if not one.outgoing for frame in scan(one.data, final=True).frames]
+    came = [
+        frame for one in memory.of(Datagram) if not one.outgoing for frame in scan_frames(one.data, final=True).frames
+    ]
     parted_ns = course.departure.begun_ns
     assert parted_ns is not None and sum(frame.message_id == HIGHRES for frame in came) < 20
     assert not any(one.inertial for one in memory.of(StepInput))

@@ -94,7 +94,7 @@ def test_the_offset_is_taken_between_two_looks_at_our_clock(monkeypatch: pytest.
     ours = iter([1000, 1020])
     monkeypatch.setattr(clock, "monotonic_ns", lambda: next(ours))
     monkeypatch.setattr(time, "time_ns", lambda: 5_000_000)
-    assert clock.zero_utc_ns() == 5_000_000 - 1010
+    assert clock.read_zero_utc_ns() == 5_000_000 - 1010
 
 
 def test_stamps_within_views_are_those_of_the_file(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from logs.recording.tlog import read_tlog
 from logs.recording.ulog import read_ulog
 from uavctl.cli.app import run
 from uavctl.errors import RecordingError, UsageError
-from uavctl.mavlink.framing import plain_text
+from uavctl.mavlink.message_layout import strip_escapes
 
 BEGIN_US = 1_764_000_000_000_000
 OFFBOARD = 6 << 16
@@ -240,7 +240,7 @@ def test_damage_that_pyulog_reads_without_end_ends(tmp_path: Path) -> None:
     ],
 )
 def test_no_text_acts_on_the_terminal(tmp_path: Path, text: str, plain: str) -> None:
-    assert plain_text(text) == plain
+    assert strip_escapes(text) == plain
     log = UlogWriter(START_US)
     log.text(4, START_US, text)
     (tmp_path / "a.ulg").write_bytes(log.file)

@@ -16,7 +16,7 @@ from logs.recording.derived_topics import VIEWS
 from logs.recording.design_view import DesignView, design_view
 from logs.recording.views import PLAN_NS, STD_95, STILL_NS, Views, plan_scene, room_scene
 from uavctl.errors import RecordingError
-from uavctl.frames import Frame, rotate
+from uavctl.frames import Frame, rotate_vector
 from uavctl.records import (
     ControlMode,
     Decision,
@@ -106,7 +106,7 @@ def test_the_room_is_turned_as_frames_say(found: Found) -> None:
     ((transform,),) = [message.transforms for _, message in found["/view/frames"][:1]]
     turn = transform.rotation
     for ned_m in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (1.5, -2.0, -0.7)):
-        turned = rotate((turn.w, turn.x, turn.y, turn.z), ned_m)
+        turned = rotate_vector((turn.w, turn.x, turn.y, turn.z), ned_m)
         assert turned == pytest.approx(Frame("enu").from_ned(ned_m), abs=1e-12)
     assert (transform.parent_frame_id, transform.child_frame_id) == ("room", "ned")
 
@@ -170,7 +170,7 @@ def test_the_estimate_s_ellipsoid_holds_95_percent(design: DesignView) -> None:
     inside = 0
     for state in drawn:
         offset = np.array(design.position_of(state)) - place(sphere.pose.position)
-        own = rotate((turn.w, -turn.x, -turn.y, -turn.z), (offset[0], offset[1], offset[2]))
+        own = rotate_vector((turn.w, -turn.x, -turn.y, -turn.z), (offset[0], offset[1], offset[2]))
         assert own is not None
         inside += sum((2 * x / size) ** 2 for x, size in zip(own, place(sphere.size), strict=True)) <= 1.0
     # 95 % of 4000, give or take four standard deviations

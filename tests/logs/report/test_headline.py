@@ -152,7 +152,7 @@ def test_a_vehicle_that_was_not_heard_is_told_before_what_came_of_it(
 ) -> None:
     assert HeadlineCause.VEHICLE_SILENT not in head(flight, judged).causes
     kept = [one for one in flight.vehicles if not 3.0 < (one.at_ns - flight.origin_ns) * 1e-9 < 7.0]
-    events = () if code is None else make_link().refused({code: 1}, flight.origin_ns + 3_400_000_000)
+    events = () if code is None else make_link().add_refusals({code: 1}, flight.origin_ns + 3_400_000_000)
     deaf = dataclasses.replace(flight, vehicles=tuple(kept), events=(*flight.events, *events))
     found = head(deaf, judged)
     first = found.text

@@ -29,7 +29,7 @@ from logs.recording.reader import read
 from logs.recording.topics import RecorderNote
 from uavctl.clock import Ticker, monotonic_ns
 from uavctl.config import Config
-from uavctl.daemon.daemon import realtime
+from uavctl.daemon.realtime import enable_realtime
 from uavctl.errors import UavctlError
 from uavctl.io.transport import open_connection, wait
 from uavctl.records import Decision, Timing
@@ -325,8 +325,8 @@ def _empty_loop(tick_ns: int, seconds: float, real: bool) -> Iterator[Pipe]:
 def empty_loop(pipe: Pipe, tick_ns: int, seconds: float, real: bool) -> None:
     """Wait for ticks as the daemon does, and do nothing; send how late they were [ns] and what was permitted."""
     if real:
-        with realtime() as outcomes:
-            pipe.send((_lateness(tick_ns, seconds), all(outcome.ok for outcome in outcomes)))
+        with enable_realtime() as outcomes:
+            pipe.send((_lateness(tick_ns, seconds), all(outcome.is_applied for outcome in outcomes)))
     else:
         pipe.send((_lateness(tick_ns, seconds), True))
 

@@ -19,8 +19,8 @@ from uavctl.config import Config
 from uavctl.errors import RecordingError
 from uavctl.loop import MOCAP, make_links
 from uavctl.mavlink.clocksync import ClockSource
-from uavctl.mavlink.framing import scan
-from uavctl.mavlink.profile import PROFILES, autopilot_name
+from uavctl.mavlink.framing import scan_frames
+from uavctl.mavlink.profile import PROFILES, find_autopilot_name
 from uavctl.records import Datagram, PositionSample, Record, Setpoint, StepInput
 
 # The TIMESYNC exchange of a recorded client: what tells a vehicle's clock though nobody asks any more.
@@ -50,7 +50,7 @@ class Exchange:
 
     def take(self, data: bytes, at_ns: int, *, outgoing: bool) -> Iterator[RoundTrip]:
         """Take a packet; return the round trip that it completes, if any."""
-        for frame in scan(data, final=True).frames:
+        for frame in scan_frames(data, final=True).frames:
             if frame.message_id != mavlink.MAVLINK_MSG_ID_TIMESYNC:
                 continue
             message = self._parser.decode(bytearray(frame.data))
@@ -229,9 +229,9 @@ class VehicleWords:
 
     def take(self, data: bytes) -> None:
         """Read the messages of a datagram or packet."""
-        for frame in scan(data, final=True).frames:
+        for frame in scan_frames(data, final=True).frames:
             if frame.message_id == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
-                name = autopilot_name(self._parser.decode(bytearray(frame.data)).autopilot)
+                name = find_autopilot_name(self._parser.decode(bytearray(frame.data)).autopilot)
                 self.autopilot = name if name in PROFILES else self.autopilot
             elif frame.message_id == mavlink.MAVLINK_MSG_ID_PARAM_VALUE:
                 message = self._parser.decode(bytearray(frame.data))
@@ -379,7 +379,7 @@ def _samples(packets: Sequence[TlogPacket], config: Config) -> tuple[list[Positi
     for one in packets:
         for trip in exchange.take(one.data, one.at_ns, outgoing=one.outgoing):
             for address in senders:
-                link.answered(address, trip.sent_ns, trip.remote_ns, one.at_ns)
+                link.add_timesync_answer(address, trip.sent_ns, trip.remote_ns, one.at_ns)
         if one.outgoing:
             continue
         understood = link.receive(one.data, one.at_ns)
@@ -424,7 +424,7 @@ def _history(
 def _accelerations(data: bytes, system: int) -> Iterable[tuple[tuple[float, float, float], bool]]:
     """Return the setpoints for a system in a client's packet, with whether each asks for an acceleration only."""
     parser = mavlink.MAVLink(None)
-    for frame in scan(data, final=True).frames:
+    for frame in scan_frames(data, final=True).frames:
         if frame.message_id == mavlink.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED:
             message = parser.decode(bytearray(frame.data))
             if system and message.target_system not in (0, system):

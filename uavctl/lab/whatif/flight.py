@@ -28,7 +28,7 @@ from uavctl.lab.trial import vec3
 from uavctl.lab.whatif.rewrite import InertialFrames, PositionFrame, SourceFrames
 from uavctl.loop import MOCAP, VEHICLE, ControlLoop
 from uavctl.mavlink.connection import STREAM_SCHEMES
-from uavctl.mavlink.framing import RawFrame, scan
+from uavctl.mavlink.framing import RawFrame, scan_frames
 from uavctl.mavlink.messages import Position
 from uavctl.records import Datagram, PositionSample, Record, Refused, Setpoint, Sink, StepInput, Truth, Vec3, to_nobody
 
@@ -231,8 +231,8 @@ class _Stream:
     def whole(self, chunk: bytes) -> bytes:
         """Return the whole frames so far; an incomplete one waits for the rest."""
         data = self._rest + chunk
-        found = scan(data, final=False, in_step=self._in_step)
-        self._rest, self._in_step = data[found.consumed :], found.in_step
+        found = scan_frames(data, final=False, is_aligned=self._in_step)
+        self._rest, self._in_step = data[found.consumed :], found.is_aligned
         return data[: found.consumed]
 
 
@@ -403,7 +403,7 @@ class _Flight:
             return data
         parts: list[bytes] = []
         done = 0
-        for frame in scan(data, final=True).frames:
+        for frame in scan_frames(data, final=True).frames:
             now = self._shown(frame, at_ns, begun=begun)
             if of_vehicle:  # it follows the recorded vehicle, so it hears of positions too
                 other = self._inertial.heard(frame, at_ns, departure.acceleration_mps2(at_ns) if begun else None)

@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.config.connections import DaemonConfig, FrameConfig
-from uavctl.frames import Frame, Quaternion, rotate
+from uavctl.frames import Frame, Quaternion, rotate_vector
 from uavctl.mavlink.codec import decode
-from uavctl.mavlink.framing import RawFrame, scan
+from uavctl.mavlink.framing import RawFrame, scan_frames
 from uavctl.mavlink.messages import Position
-from uavctl.mavlink.vehicle import GRAVITY_MPS2, VehicleWatch
+from uavctl.mavlink.vehicle import GRAVITY_MPS2, VehicleMonitor
 from uavctl.records import InertialSample, Vec3
 
 # Position messages moved to where the vehicle would have been: all other bytes of a datagram stay as they came.
@@ -43,7 +43,7 @@ class SourceFrames:
 
     def seen(self, data: bytes) -> Iterator[PositionFrame]:
         """Return the positions in some bytes, in order."""
-        for frame in scan(data, final=True).frames:
+        for frame in scan_frames(data, final=True).frames:
             seen = self.position(frame)
             if seen is not None:
                 yield seen
@@ -72,7 +72,7 @@ class SourceFrames:
             vx, vy, vz = self._from_ned(seen.position, by_mps)
             if seen.frame.message_id == mavlink.MAVLINK_MSG_ID_ODOMETRY and message.child_frame_id in _BODY_AXES:
                 turn: Quaternion = (message.q[0], -message.q[1], -message.q[2], -message.q[3])
-                vx, vy, vz = rotate(turn, (vx, vy, vz)) or NOWHERE  # a velocity is only read with a rotation
+                vx, vy, vz = rotate_vector(turn, (vx, vy, vz)) or NOWHERE  # a velocity is only read with a rotation
             message.vx, message.vy, message.vz = message.vx + vx, message.vy + vy, message.vz + vz
         if stamp_us is not None:
             _stamp(message, stamp_us)
@@ -130,7 +130,7 @@ class InertialFrames:
 
     def __init__(self, daemon: DaemonConfig) -> None:
         own = daemon.system_id, daemon.component_id
-        self._watch = VehicleWatch(
+        self._watch = VehicleMonitor(
             lambda _: None, own, daemon.vehicle_system_id, daemon.vehicle_component_id, inertial=True
         )
         self.moved = self.left_out = 0
@@ -145,7 +145,7 @@ class InertialFrames:
         samples = [
             item
             for message in decode(frame.data).messages
-            for item in self._watch.take(message, at_ns)
+            for item in self._watch.handle_message(message, at_ns)
             if isinstance(item, InertialSample)
         ]
         address = self._watch.address
@@ -169,7 +169,7 @@ def shifted(frame: RawFrame, attitude: Quaternion, by_mps2: Vec3) -> bytes:
         attitude: Body axes forward, right, down to local NED (w, x, y, z).
     """
     w, x, y, z = attitude
-    by = rotate((w, -x, -y, -z), by_mps2)
+    by = rotate_vector((w, -x, -y, -z), by_mps2)
     if by is None or by_mps2 == (0.0, 0.0, 0.0):
         return frame.data
     message: Any = mavlink.MAVLink(None).decode(bytearray(frame.data))

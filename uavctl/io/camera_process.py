@@ -1,0 +1,148 @@
+"""Connection to the process that listens to a camera system."""
+
+from __future__ import annotations
+
+import json
+import socket
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Callable
+from contextlib import ExitStack
+from importlib.util import find_spec
+
+from uavctl.config.connections import camera_system
+from uavctl.errors import ConnectionSpecError, ExtraMissingError
+from uavctl.io.admission import AdmissionRules, AllowList, RateLimiter
+from uavctl.io.base import BaseConnection, Connection
+from uavctl.io.camera import ANSWER_S, COUNTS, LARGEST, READY, REFUSED
+from uavctl.io.camera_url import parse_camera_url
+
+_MAVLINK = (0xFD, 0xFE)
+_START_S = 60.0  # for the interpreter of the process, on a busy computer
+_END_S = 2.0
+
+
+class CameraProcessConnection(BaseConnection):
+    """A process that gives MAVLink; see `uavctl.io.sources`. Implements `uavctl.io.base.Connection`.
+
+    When the process ends, the connection shows as `closed`; while only its server is gone it asks on, and nothing
+    comes.
+
+    Args:
+        arguments: of `uavctl.io.camera_host`, without the pipe.
+        advice: what may be amiss where the server does not answer.
+        now: clock for the times of arrival [ns].
+        rules: how many messages a second are taken.
+    """
+
+    def __init__(
+        self, url: str, arguments: list[str], advice: str, now: Callable[[], int], rules: AdmissionRules
+    ) -> None:
+        super().__init__(url, now)
+        self._advice = advice
+        self._refused_here: Counter[str] = Counter()
+        self._rate_limiter, self._sender = RateLimiter(rules, self._refused_here), (url, 0)
+        self._rate_limiter.trust_sender(self._sender, now())
+        self._refused_there: Counter[str] = Counter()  # what the process counted
+        self._socket, peer_socket = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with peer_socket:
+            command = [sys.executable, "-P", "-m", "uavctl.io.camera_host", str(peer_socket.fileno()), *arguments]
+            try:
+                self._process = subprocess.Popen(
+                    command,
+                    pass_fds=(peer_socket.fileno(),),
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.DEVNULL,
+                    start_new_session=True,  # an interrupt is for the daemon; this process ends with the pipe
+                )
+            except OSError as error:  # no memory, or too many processes
+                self._socket.close()
+                raise ConnectionSpecError(f"connection {url!r}: its process cannot be started ({error})") from error
+
+    def wait_until_ready(self) -> None:
+        """Wait, for a bounded time, until the cameras have answered and know the body.
+
+        Raises:
+            ConnectionSpecError: they did not; its cause is an OSError where the server cannot be reached.
+        """
+        self._socket.settimeout(_START_S + ANSWER_S)
+        try:
+            while (first := self._socket.recv(LARGEST))[:1] == COUNTS:
+                pass
+        except OSError as error:
+            raise ConnectionSpecError(f"connection {self.url!r}: its process does not start ({error})") from error
+        self._socket.setblocking(False)
+        kind, text = first[:1], first[1:].decode()
+        if kind == REFUSED:
+            raise ConnectionSpecError(f"connection {self.url!r}: {text}")
+        if kind != READY:
+            raise ConnectionSpecError(
+                f"connection {self.url!r}: {text or 'its process has ended'}; {self._advice}"
+            ) from TimeoutError(text)
+
+    def fileno(self) -> int:
+        """See `Connection`."""
+        return self._socket.fileno()
+
+    def receive(self, *, read_all: bool = False) -> list[tuple[bytes, int]]:
+        """See `Connection`; more than the rules allow is dropped, the oldest first."""
+        arrived = super().receive(read_all=read_all)
+        taken = self._rate_limiter.admit([self._sender] * len(arrived), [data for data, _ in arrived], self._now())
+        self.refused = self._refused_there + self._refused_here
+        return [item for item, fits in zip(arrived, taken, strict=True) if fits]
+
+    def send(self, data: bytes) -> None:
+        """See `Connection`; only time requests reach the cameras."""
+        try:
+            self._socket.send(data)
+        except OSError:
+            self.send_errors += 1
+
+    def close(self) -> None:
+        """See `Connection`; the process ends."""
+        self.closed = True
+        self._socket.close()
+        try:
+            self._process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    def _read(self) -> bytes | None:
+        data = self._socket.recv(LARGEST)
+        if not data:
+            self.closed = True
+        elif data[0] in _MAVLINK:
+            return data
+        elif data[:1] == COUNTS:
+            self._refused_there = Counter(json.loads(data[1:]))
+        return None
+
+
+def _open_camera(url: str, now: Callable[[], int], rules: AdmissionRules) -> Connection:
+    """Open a body of a camera system; see `open_source`.
+
+    Raises:
+        ConnectionSpecError: the URL, the server or the body is not as it has to be.
+        ExtraMissingError: the camera system's package is not installed.
+    """
+    camera_url = parse_camera_url(url)
+    system = camera_system(camera_url.system)
+    if system.package and find_spec(system.package) is None:  # not imported: the camera has a process of its own
+        raise ExtraMissingError(system.package, system.extra)
+    try:
+        address = socket.gethostbyname(camera_url.host)
+    except OSError as error:
+        raise ConnectionSpecError(
+            f"connection {url!r}: host {camera_url.host!r} is unknown ({error}); check the name"
+        ) from error
+    if not AllowList(rules.allow).allows(address):
+        raise ConnectionSpecError(f"connection {url!r}: {address} is not in security.allow; add it there")
+    arguments = [system.camera, address, str(camera_url.port), camera_url.body, camera_url.up, camera_url.interface]
+    connection = CameraProcessConnection(url, arguments, system.advice, now, rules)
+    with ExitStack() as stack:
+        stack.callback(connection.close)
+        connection.wait_until_ready()
+        stack.pop_all()
+    return connection
