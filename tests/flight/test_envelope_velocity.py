@@ -237,7 +237,7 @@ def test_the_place_of_the_way_is_the_mean_of_the_offsets() -> None:
 
 
 def test_over_a_gap_the_way_is_not_compared() -> None:
-    places = ((START_NS - S, np.array([9.0, 0.0, 0.0])),)
+    places = ((START_NS - S, (9.0, 0.0, 0.0)),)
     for spans_ns, kept in (((100 * MS,), True), ((1200 * MS,), False)):
         watching, breach = look(ZERO, own=AT_REST, places=places, **offsets(0.0, spans_ns=spans_ns))
         assert breach is None
@@ -247,11 +247,11 @@ def test_over_a_gap_the_way_is_not_compared() -> None:
     assert silent.velocity.places == missed.velocity.places == ()
     state = monitors(vehicle_path=((START_NS, np.zeros(3)),), places=places)  # the way is not known so early
     early, _ = update(state, seen(AT_NS, sample(START_NS, AT_NS), own=AT_REST), PARAMETERS)
-    assert early.velocity.offsets == early.velocity.places == ()
+    assert not early.velocity.offsets and not early.velocity.places
 
 
 def test_velocities_that_contradict_each_other_are_told_before_ways_that_do() -> None:
-    places = ((START_NS - S, np.array([9.0, 0.0, 0.0])),)
+    places = ((START_NS - S, (9.0, 0.0, 0.0)),)
     _, breach = look(ZERO, own=AT_REST, places=places, **offsets(9.0))
     assert breach is not None and breach.text.startswith("positions move otherwise")
 

@@ -28,9 +28,11 @@ from uavctl.flight.estimator import (
     TOO_OLD,
     FilterHistory,
     absorb_samples,
+    advance_window,
     begin_history,
     drop_samples,
     estimate_at,
+    insert_sample,
     note_input,
     predict_belief,
 )
@@ -202,8 +204,8 @@ def test_the_belief_of_the_capture_time_may_be_given_with_a_sample() -> None:
             one = sample(START_NS + since_ms * MS, at_ns, position_m=(float(rng.normal()), 0.0, 0.0), source=source)
             belief = predict_belief(kalman, given, one.captured_ns)
             history, _, _ = absorb_samples(kalman, history, at_ns, (one,))
-            given, taken, _ = absorb_samples(kalman, given, at_ns, (one,), belief)
-            assert taken == (one,)
+            given, refused = insert_sample(kalman, advance_window(kalman, given, at_ns), one, belief)
+            assert refused is None
         u = rng.normal(size=1)
         history, given = (note_input(kalman, known, at_ns, u) for known in (history, given))
         later_ns = at_ns + TICK_NS // 2

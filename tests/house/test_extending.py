@@ -18,7 +18,7 @@ import pytest
 from places import ROOT, without_pages
 
 from logs.recording.reader import records
-from uavctl.records import Truth
+from uavctl.records import Event, Truth
 
 PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
 EXAMPLE = ROOT / "docs" / "examples" / "own-parts"
@@ -144,6 +144,17 @@ def test_a_fault_happens(tmp_path: Path) -> None:
     amiss = {truth.at_ns: truth.faults for truth in records(recipe.work / told["recording"], Truth)}
     assert amiss[min(amiss)] == ()
     assert amiss[max(amiss)] == ("calm",)
+
+
+@pytest.mark.slow
+def test_a_monitor_releases_the_vehicle(tmp_path: Path) -> None:
+    recipe, (flight,), touched = walk("A monitor", tmp_path)
+    assert touched == 4
+    told = json.loads(recipe.run(f"{flight} --json || test $? = 1"))
+    events = list(records(recipe.work / told["recording"], Event))
+    (released,) = [event for event in events if event.code == "envelope-speed"]
+    landed = next(event for event in events if event.code == "fallback-land")
+    assert landed.at_ns - released.at_ns < 1_000_000_000
 
 
 class Server(threading.Thread):

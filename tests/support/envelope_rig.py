@@ -23,6 +23,7 @@ from uavctl.flight.monitors.vehicle_velocity import (
     find_trusted_velocity,
     is_inertial_consistent,
     judge_prediction,
+    judge_vehicle_velocity,
 )
 from uavctl.flight.monitors.verdict import Action, Cause, Verdict
 from uavctl.flight.supervise import RELEASES
@@ -97,7 +98,11 @@ def update(
 def trusted_velocity(
     state: MonitorState, tick: Observation, age_s: float, parameters: EnvelopeParameters
 ) -> Vec3 | None:
-    return find_trusted_velocity(VelocityObservation(state, tick, age_s, parameters))
+    observation = VelocityObservation(state, tick, age_s, parameters)
+    velocity, verdict = find_trusted_velocity(observation), judge_vehicle_velocity(observation)
+    assert verdict.is_none == (velocity is not None)
+    assert verdict.is_none or verdict.action is Action.DISTRUST_VEHICLE_VELOCITY
+    return velocity
 
 
 def is_prediction_inconsistent(

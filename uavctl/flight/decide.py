@@ -25,7 +25,8 @@ from uavctl.flight.fallback import Fallback, FallbackEnd, advance_fallback, begi
 from uavctl.flight.kalman import Belief
 from uavctl.flight.limits import AXES, ZERO
 from uavctl.flight.mission import MissionState, advance_mission, is_over, lead_with_one_axis, make_question
-from uavctl.flight.monitors.vehicle_velocity import find_confirmed_velocity, find_trusted_velocity
+from uavctl.flight.monitors.observation import read_vehicle_velocity
+from uavctl.flight.monitors.vehicle_velocity import find_confirmed_velocity, judge_vehicle_velocity
 from uavctl.flight.orders import Ordered, describe_order, follow_order
 from uavctl.flight.solve import ask_solver
 from uavctl.flight.state import ControlState, find_mode
@@ -203,7 +204,7 @@ def _decide_plan(begun: Decided, phase: _Phase) -> Decided:
 def _plan_from(begun: Decided, belief: Belief, phase: _Phase) -> Decided:
     """Plan from the belief at which an input begins to act, unless the mission is over or the controller has failed."""
     controller, context, supervised = phase.controller, phase.context, phase.supervised
-    base = make_estimate(controller.kalman, belief)
+    base = make_estimate(controller.kalman, belief, with_cov=False)
     mission = advance_mission(controller.mission, begun.mission, base.mean, context.boundary_ns)
     begun = replace(begun, mission=mission)
     if controller.mission.land and begun.order is None and is_over(controller.mission, mission, context.boundary_ns):
@@ -373,7 +374,8 @@ def find_braking_velocity(state: ControlState, context: TickContext, supervised:
     observation = None
     if context.inputs.motion is not None:
         observation = observe_velocity(state, supervised.monitors.engaged, estimate, context)
-    own = None if observation is None else find_trusted_velocity(observation)
+    is_believed = observation is not None and judge_vehicle_velocity(observation).is_none
+    own = read_vehicle_velocity(context.inputs.motion, context.at_ns) if is_believed else None
     if own is None:
         return predicted, False
     north, east, down = (v if axis in plant.axes else 0.0 for axis, v in zip(AXES, own, strict=True))

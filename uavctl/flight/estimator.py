@@ -95,23 +95,42 @@ def begin_history(kalman: Kalman, origin_ns: int, at_ns: int) -> FilterHistory:
 
 def advance_window(kalman: Kalman, history: FilterHistory, at_ns: int) -> FilterHistory:
     """Move the window up to `at_ns`, and keep a belief at a boundary that has come."""
+    is_due = is_mark_due(kalman, history, at_ns)
+    history = insert_mark(kalman, history, at_ns) if is_due else history
+    return move_horizon(kalman, history, at_ns)
+
+
+def move_horizon(kalman: Kalman, history: FilterHistory, at_ns: int) -> FilterHistory:
+    """Move the window up to `at_ns`."""
+    return _trim(history, max(history.horizon_ns, _compute_horizon_ns(kalman, at_ns)))
+
+
+def is_mark_due(kalman: Kalman, history: FilterHistory, at_ns: int) -> bool:
+    """Whether a boundary has come at which no belief is kept yet."""
     horizon_ns = max(history.horizon_ns, _compute_horizon_ns(kalman, at_ns))
+    mark = _find_mark(kalman, history, at_ns)
+    return mark[0] > horizon_ns and (not history.entries or history.entries[-1].key < mark)
+
+
+def insert_mark(kalman: Kalman, history: FilterHistory, at_ns: int) -> FilterHistory:
+    """Keep a belief at the last boundary."""
+    mark = _find_mark(kalman, history, at_ns)
+    return _insert(kalman, history, FilterEvent(key=mark, sample=None, input=None, after=history.newest), None)
+
+
+def _find_mark(kalman: Kalman, history: FilterHistory, at_ns: int) -> Key:
     boundary_ns = at_ns - (at_ns - history.origin_ns) % kalman.propagation.dt_ns
-    mark = (boundary_ns, _MARK, "", boundary_ns)
-    if boundary_ns > horizon_ns and (not history.entries or history.entries[-1].key < mark):
-        history = _insert(kalman, history, FilterEvent(key=mark, sample=None, input=None, after=history.newest), None)
-    return _trim(history, horizon_ns)
+    return (boundary_ns, _MARK, "", boundary_ns)
 
 
 def absorb_samples(
-    kalman: Kalman, history: FilterHistory, at_ns: int, samples: Sequence[PositionSample], belief: Belief | None = None
+    kalman: Kalman, history: FilterHistory, at_ns: int, samples: Sequence[PositionSample]
 ) -> tuple[FilterHistory, tuple[PositionSample, ...], tuple[str, ...]]:
     """Move the window up to `at_ns` and take samples of any age and order.
 
     Args:
         at_ns: Time now [ns]; no sample may be captured or received later.
         samples: Valid samples (see `uavctl.flight.measure`).
-        belief: What `predict_belief` gives at the first one's capture time, if that has been asked.
 
     Returns:
         The new state, the samples that were taken, and the reason for each one that was refused.
@@ -120,17 +139,29 @@ def absorb_samples(
     taken: list[PositionSample] = []
     refused: list[str] = []
     for sample in samples:
-        key = (read_capture_ns(sample), _SAMPLE, sample.source, sample.captured_ns)
-        if key[0] <= history.horizon_ns:
-            refused.append(TOO_OLD)
-        elif _is_duplicate(history.entries, key):
-            refused.append(DUPLICATE)
-        else:
+        history, reason = insert_sample(kalman, history, sample)
+        if reason is None:
             taken.append(sample)
-            new = FilterEvent(key=key, sample=sample, input=None, after=history.anchor)
-            history = _insert(kalman, history, new, belief)
-        belief = None  # the next one's is another
+        else:
+            refused.append(reason)
     return history, tuple(taken), tuple(refused)
+
+
+def insert_sample(
+    kalman: Kalman, history: FilterHistory, sample: PositionSample, belief: Belief | None = None
+) -> tuple[FilterHistory, str | None]:
+    """Sort a sample in; return too the reason if it is refused.
+
+    Args:
+        belief: What `predict_belief` gives at its capture time, if that is known.
+    """
+    key = (read_capture_ns(sample), _SAMPLE, sample.source, sample.captured_ns)
+    if key[0] <= history.horizon_ns:
+        return history, TOO_OLD
+    if _is_duplicate(history.entries, key):
+        return history, DUPLICATE
+    new = FilterEvent(key=key, sample=sample, input=None, after=history.anchor)
+    return _insert(kalman, history, new, belief), None
 
 
 def update_inertial(kalman: Kalman, history: FilterHistory, samples: Sequence[InertialSample]) -> FilterHistory:
@@ -255,14 +286,14 @@ def estimate_at(kalman: Kalman, history: FilterHistory, at_ns: int) -> Estimate 
     return None if belief is None else make_estimate(kalman, belief)
 
 
-def make_estimate(kalman: Kalman, belief: Belief) -> Estimate:
+def make_estimate(kalman: Kalman, belief: Belief, *, with_cov: bool = True) -> Estimate:
     """Make the estimate that leaves the filter from a belief, biases within their bounds."""
-    bias, largest = kalman.bias, np.array(kalman.bias_bounds)
+    bias, largest = kalman.bias, kalman.bias_limits
     return Estimate(
         at_ns=belief.at_ns,
         captured_ns=belief.captured_ns,
         mean=tuple(belief.mean[: bias.start].tolist()),
-        cov=tuple(map(tuple, belief.cov[: bias.start, : bias.start].tolist())),
+        cov=tuple(map(tuple, belief.cov[: bias.start, : bias.start].tolist())) if with_cov else (),
         bias=tuple(belief.mean[bias].clip(-largest, largest).tolist()),
     )
 

@@ -12,7 +12,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import msgspec
 import numpy as np
@@ -77,16 +77,16 @@ class Kalman:
     inertial_noise: Array  # covariance of their noise (n_inertial, n_inertial)
     push_cov: Array  # covariance that a push of bias_max in each input's bias gives z at once (n_x + n_w, n_x + n_w)
     identity: Array  # of the size of z
+    # Largest bias that is flown against, of each input that has one [input units]; made from the others
+    bias_bounds: tuple[float, ...] = field(init=False)
+    bias_limits: Array = field(init=False, repr=False)  # the same
+    bias: slice = field(init=False)  # slice of the biases among the states; made from the others
 
-    @property
-    def bias_bounds(self) -> tuple[float, ...]:
-        """Largest bias that is flown against, of each input that has one [input units]."""
-        return (self.parameters.bias_bounds or (self.parameters.bias_max,) * self.n_bias)[: self.n_bias]
-
-    @property
-    def bias(self) -> slice:
-        """Slice of the biases among the states."""
-        return slice(self.n_x - self.n_inertial - self.n_bias, self.n_x - self.n_inertial)
+    def __post_init__(self) -> None:
+        bounds = (self.parameters.bias_bounds or (self.parameters.bias_max,) * self.n_bias)[: self.n_bias]
+        object.__setattr__(self, "bias_bounds", bounds)
+        object.__setattr__(self, "bias_limits", np.array(bounds))
+        object.__setattr__(self, "bias", slice(self.n_x - self.n_inertial - self.n_bias, self.n_x - self.n_inertial))
 
 
 class Belief(msgspec.Struct, frozen=True, eq=False):

@@ -22,12 +22,14 @@ from uavctl.flight.estimator import (
     LATEST_STAMP_NS,
     FilterHistory,
     PendingInputs,
-    absorb_samples,
-    advance_window,
     apply_due_inputs,
     begin_history,
     drop_samples,
     find_newest_capture_ns,
+    insert_mark,
+    insert_sample,
+    is_mark_due,
+    move_horizon,
     predict_belief,
     update_inertial,
 )
@@ -77,6 +79,7 @@ def measure(state: ControlState, context: TickContext) -> Measured:
     origin_ns = inputs.at_ns - inputs.tick * controller.tick_ns
     history = estimator.history or begin_history(kalman, origin_ns, inputs.at_ns)
     history, pending_inputs = apply_due_inputs(kalman, history, estimator.pending_inputs, inputs.at_ns)
+    is_due = is_mark_due(kalman, history, inputs.at_ns)
     samples = gate_samples(
         kalman, controller.reach, history, estimator.sources, inputs, controller.horizon, estimator.consecutive_samples
     )
@@ -86,6 +89,8 @@ def measure(state: ControlState, context: TickContext) -> Measured:
     history = samples.history
     if inputs.inertial:
         history = update_inertial(kalman, history, inputs.inertial)
+    if is_due and not restarted:  # last, as samples before the boundary would change it
+        history = insert_mark(kalman, history, inputs.at_ns)
     return Measured(history, pending_inputs, samples, _read_inertial(estimator.inertial, inputs), restarted)
 
 
@@ -111,7 +116,7 @@ def gate_samples(
         consecutive_samples: Fresh samples in a row, before.
     """
     newest_ns = history.captured_ns
-    history = advance_window(kalman, history, inputs.at_ns)
+    history = move_horizon(kalman, history, inputs.at_ns)
     moved_ns = _find_moved_ns(sources.moved_ns, inputs, reach.parameters.at_rest_mps)
     sources = replace(sources, moved_ns=moved_ns)
     samples = GatedSamples(history, sources)
@@ -185,9 +190,11 @@ def _gate_in_order(
                     accepted = [one for one in accepted if not is_stale(one)]
                 refused.append((sample, code))
                 continue
-        history, taken, why = absorb_samples(kalman, history, inputs.at_ns, (sample,), belief)
-        accepted.extend(taken)
-        refused.extend((sample, reason) for reason in why)
+        history, reason = insert_sample(kalman, history, sample, belief)
+        if reason is None:
+            accepted.append(sample)
+        else:
+            refused.append((sample, reason))
     sources = replace(sources, absurd=_track_absurd(sources.absurd, kalman, bool(accepted), refused))
     return GatedSamples(history, sources, tuple(accepted), tuple(refused), clean_ns)
 

@@ -169,7 +169,7 @@ def _judge_inertial(state: ControlState, view: FilterView, context: TickContext)
     then = predict_belief(controller.kalman, view.history, min(motion.velocity_ns, context.at_ns))
     if then is None:
         return NO_VERDICT
-    estimate = make_estimate(controller.kalman, then)
+    estimate = make_estimate(controller.kalman, then, with_cov=False)
     observation = observe_velocity(state, state.monitors.engaged, estimate, context)
     consistent = observation is None or vehicle_velocity.is_inertial_consistent(observation)
     comparison = InertialObservation(Source.VEHICLE_VELOCITY, consistent, context.at_ns, belief.captured_ns)
@@ -298,7 +298,7 @@ def _judge_wall(state: ControlState, plan_base: Belief | None, context: TickCont
     controller = context.controller
     if not controller.outside or state.plan.flown is None or plan_base is None or controller.envelope is None:
         return NO_VERDICT
-    estimate = make_estimate(controller.kalman, plan_base)
+    estimate = make_estimate(controller.kalman, plan_base, with_cov=False)
     missing = float("nan")
     observation = WallObservation(
         name=controller.outside,

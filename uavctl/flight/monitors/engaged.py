@@ -81,14 +81,12 @@ def _update_with_position(
         position = replace(position, is_hinted=True)
     velocity_state, contradiction = velocity.update(state.velocity, position)
     is_clean = acceleration_state.is_quiet and velocity_state.agrees(parameters)
-    state = MonitorState(
+    state = replace(
+        state,
         motion=motion,
         acceleration=acceleration_state,
         velocity=velocity_state,
-        outside=state.outside,
-        braking=state.braking,
         clean_ns=position.at_ns if position.begins or is_clean else state.clean_ns,
-        agreed=state.agreed,
     )
     if response.cause is Cause.SCATTER:  # both others say more of what is wrong
         return state, _select_first(contradiction, response)

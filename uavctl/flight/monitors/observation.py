@@ -79,6 +79,6 @@ def read_vehicle_velocity(motion: VehicleMotion | None, at_ns: int) -> Vec3 | No
     return motion.velocity_mps if is_recent and all(map(math.isfinite, motion.velocity_mps)) else None
 
 
-def describe_vector(values: Array) -> str:
+def describe_vector(values: Array | Sequence[float]) -> str:
     """Return a vector in words."""
     return "(" + ", ".join(f"{value:.1f}" for value in values) + ")"

@@ -25,6 +25,7 @@ from uavctl.arrays import Array
 from uavctl.flight.monitors.motion import PositionObservation, TickObservation, find_distance
 from uavctl.flight.monitors.observation import EnvelopeParameters, describe_vector
 from uavctl.flight.monitors.verdict import NO_VERDICT, Cause, Verdict, release
+from uavctl.records import Vector
 
 PERSISTS_NS = 100_000_000  # time for which a difference has to last, over two positions at least
 PLAIN = 1.5  # this many times the bound is beyond it at once
@@ -42,12 +43,14 @@ _TIME = itemgetter(0)  # of pairs that begin with their time, oldest first
 
 Offsets = tuple[tuple[int, Array], ...]  # (capture time [ns], position minus the vehicle's own distance (3,)), in order
 
+Places = tuple[tuple[int, Vector], ...]  # the same, means over the window
+
 
 class VelocityState(msgspec.Struct, frozen=True, eq=False):
     """State of the monitor."""
 
     offsets: Offsets = ()  # of the window
-    places: Offsets = ()  # means of the offsets, one for each second or so
+    places: Places = ()  # means of the offsets, one for each second or so
     apart_mps: float | None = None  # difference of both velocities when last compared; None where it is not known
     is_contradicted: bool = False  # whether it was beyond its bound when last compared
     # Capture time from which it has been beyond its bound, as far as it counts [ns]; None while it is not
@@ -112,20 +115,21 @@ def _add_offset(offsets: Offsets, observation: PositionObservation) -> Offsets:
 
 
 def _find_drift(
-    places: Offsets, offsets: Offsets, parameters: EnvelopeParameters
-) -> tuple[tuple[float, Array] | None, Offsets]:
+    places: Places, offsets: Offsets, parameters: EnvelopeParameters
+) -> tuple[tuple[float, list[float]] | None, Places]:
     """Find the time [s] in which offsets changed too much, and the change (3,) [m]; return too the places after it."""
     at_ns = sum(one[0] - offsets[0][0] for one in offsets) // len(offsets) + offsets[0][0]
     # ō = Σ o_i / n
-    place: Array = np.add.reduce([one for _, one in offsets], axis=0) / len(offsets)
+    mean: Array = np.add.reduce([one for _, one in offsets], axis=0) / len(offsets)
+    place: list[float] = mean.tolist()
     places = places[bisect_right(places, at_ns - PLACES_NS, key=_TIME) :]
     for since_ns, before in places:
-        s, off = (at_ns - since_ns) * 1e-9, place - before
+        s, off = (at_ns - since_ns) * 1e-9, [now - then for now, then in zip(place, before, strict=True)]
         # |ō - ō_0| > (2 s + 0.16 s) v_max
-        if math.hypot(*off.tolist()) > (DRIFT_S + DRIFT_PART * s) * parameters.disagreement_mps:
+        if math.hypot(*off) > (DRIFT_S + DRIFT_PART * s) * parameters.disagreement_mps:
             return (s, off), places
     if not places or at_ns - places[-1][0] >= PLACE_NS:
-        places = (*places, (at_ns, place))
+        places = (*places, (at_ns, tuple(place)))
     return None, places
 
 
