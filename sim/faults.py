@@ -47,7 +47,7 @@ def check_faults(loaded: LoadedConfig) -> None:
     """
     wrong = tuple(problems(loaded.config.sim.autopilot, loaded.config.sim.fault, "sim.fault"))
     if wrong:
-        raise ConfigError(tuple(loaded.source.tell(problem) for problem in wrong))
+        raise ConfigError(tuple(loaded.source.describe(problem) for problem in wrong))
 
 
 def problems(

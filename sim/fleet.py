@@ -9,8 +9,8 @@ import msgspec
 
 from sim.natnet import PORT, SCHEME
 from sim.server import Seat
-from uavctl.config.checks import outside
-from uavctl.config.sim import ids
+from uavctl.config.checks import find_outside
+from uavctl.config.sim import check_system_ids
 from uavctl.config.types import Config
 from uavctl.errors import ConfigError, ConnectionSpecError
 from uavctl.records import Truth, Vec3
@@ -38,7 +38,7 @@ def fleet(config: Config, vehicle: str, mocap: str, count: int, on_truth: Callab
         )
     places = _places(config, count)
     configs = [_another(config, i, place) for i, place in enumerate(places)]
-    wrong = [problem for one in configs for problem in ids(one.sim, one.daemon)]
+    wrong = [problem for one in configs for problem in check_system_ids(one.sim, one.daemon)]
     if wrong:
         raise ConfigError(tuple(f"{one.key}: {one.reason}; {one.todo}" for one in wrong))
     seats = tuple(Seat(configs[i], _shifted(vehicle, i), _shifted(mocap, i), on_truth) for i in range(count))
@@ -56,7 +56,7 @@ def _places(config: Config, count: int) -> list[Vec3]:
     """Return the start positions [m]."""
 
     def fits(place: Vec3) -> bool:
-        return not any(outside(config.plant, config.sets, place, "", ""))
+        return not any(find_outside(config.plant, config.sets, place, "", ""))
 
     north, east, down = config.sim.start_position_m
     places = [(north, east, down)]

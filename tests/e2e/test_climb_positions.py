@@ -11,7 +11,7 @@ from take_off_rig import GOAL, RELAYED, Flight
 from logs.recording.reader import records
 from uavctl.cli.app import run
 from uavctl.config import load_config
-from uavctl.config.checks import position_index
+from uavctl.config.checks import get_position_index
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.records import Truth
 
@@ -108,7 +108,7 @@ def flown(folder: Path, seed: int, seconds: float, *settings: str) -> tuple[int,
     code = run(["loopback", "--config", "room-ardupilot", "--arm", "--takeoff", "1.2", "--seed", str(seed),
                 "--duration", str(seconds), "--out", str(folder), "--json", *words])  # fmt: skip
     config = load_config("room-ardupilot")
-    sides = [(config.sets.state_lower[i], config.sets.state_upper[i]) for i in position_index(config.plant)]
+    sides = [(config.sets.state_lower[i], config.sets.state_upper[i]) for i in get_position_index(config.plant)]
     beyond = [
         max(low - place, place - high)
         for one in records(folder / "flight.mcap", Truth)

@@ -14,7 +14,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import Client
 
 from sim.autopilot.autopilot import UPTIME_NS
-from uavctl.config.checks import position_limits_m
+from uavctl.config.checks import get_position_limits_m
 from uavctl.mavlink.relay import RELAY_RESUMED, RELAY_SILENT
 from uavctl.records import Event, RelayStats, StepInput
 
@@ -122,7 +122,7 @@ def test_a_flying_vehicle_keeps_its_position_and_its_room_whatever_the_round_tri
     rig = ready(name, delay, f"sim.clock_drift_ppm={drift_ppm}")
     rig.pilot_flies(EXTERNAL[name])
     estimator, vehicle = rig.peers.autopilot.estimator, rig.peers.vehicle
-    limits = position_limits_m(rig.config)
+    limits = get_position_limits_m(rig.config)
     while rig.peers.now_ns < TO_S * SECOND:
         rig.run(0.1)
         assert estimator.position_ok and not rig.loop.finished, rig.peers.now_ns / SECOND

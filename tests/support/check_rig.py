@@ -27,7 +27,7 @@ class Checked:
 
     def __init__(self, flight: Preflight, at_ns: int) -> None:
         self.flight = flight
-        self.items = {one.name: one for one in flight.items(at_ns)}
+        self.items = {one.name: one for one in flight.make_items(at_ns)}
 
     def __getitem__(self, name: str) -> Item:
         return self.items[name]

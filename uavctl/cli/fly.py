@@ -42,7 +42,7 @@ from uavctl.cli.flying import (
 from uavctl.cli.prepare import prepare
 from uavctl.clock import Ticker, monotonic_ns, zero_utc_ns
 from uavctl.config import Config, LoadedConfig
-from uavctl.config.connections import warnings
+from uavctl.config.connections import find_security_warnings
 from uavctl.daemon.control_socket import ControlServer, control_folder, daemon_name, listening
 from uavctl.daemon.daemon import AfterTick, collected_between_ticks, realtime
 from uavctl.daemon.daemon import fly as run_daemon
@@ -256,7 +256,7 @@ def fly_daemon(
                 put_header(recorder, prepared, monotonic_ns(), zero_utc_ns())
                 record_items(recorder, checked, monotonic_ns())
                 record_parameters(recorder, told, monotonic_ns())
-                for warning in warnings(config.security, config.daemon):
+                for warning in find_security_warnings(config.security, config.daemon):
                     messages().print(labelled("warning", warning), soft_wrap=True)
                 if tenure.left_ns is not None:
                     stand_by(loop, tenure.left_ns)

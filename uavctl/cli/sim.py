@@ -26,9 +26,9 @@ from uavctl.cli.common import DEFAULTS, Column, Common, WideTable, located, mess
 from uavctl.cli.flying import stop_on_signals
 from uavctl.clock import monotonic_ns
 from uavctl.config import Config
-from uavctl.config.checks import position_limits_m
+from uavctl.config.checks import get_position_limits_m
 from uavctl.config.connections import MOCAP_LINK, SecurityConfig
-from uavctl.config.load import with_faults
+from uavctl.config.load import add_faults
 from uavctl.io.signed_connection import read_key
 from uavctl.mavlink.connection import MOCAP
 from uavctl.mavlink.framing import scan
@@ -200,7 +200,7 @@ def scene_of(looks: Looks, config: Config) -> LiveScene:
     """Return what a live page shows of simulated vehicles, and the limits of the room they fly in."""
     from logs.live import LiveScene, SceneBody, SceneBox, SceneEvent, SceneFigure
 
-    limits = position_limits_m(config)
+    limits = get_position_limits_m(config)
     walls = [[side if math.isfinite(side) else None for side in limits.get(axis, (math.inf,) * 2)] for axis in AXES]
     lower_m, upper_m = zip(*walls, strict=True)
     figures, events = [], []
@@ -314,7 +314,7 @@ def sim(
     with located(loaded):
         check_axes(config)
     if faults is not None:
-        config = with_faults(config, faults, problems)
+        config = add_faults(config, faults, problems)
 
     def forget(truth: Truth) -> None:
         del truth

@@ -21,7 +21,7 @@ from typing import Literal, Protocol
 import msgspec
 
 from uavctl.config import Config
-from uavctl.config.checks import outside
+from uavctl.config.checks import find_outside
 from uavctl.daemon.health import Health
 from uavctl.daemon.lock import runtime_folders
 from uavctl.errors import UsageError, VehicleTakenError
@@ -220,7 +220,7 @@ class ControlServer:
         if request.position_m is None:
             return None
         config = self._config
-        found = outside(config.plant, config.sets, request.position_m, "position_m", "place")
+        found = find_outside(config.plant, config.sets, request.position_m, "position_m", "place")
         return "; ".join(problem.reason for problem in found) or None
 
     def _reply(self, client: _Client, reply: Reply) -> None:

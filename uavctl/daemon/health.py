@@ -12,7 +12,7 @@ from typing import Protocol
 import msgspec
 
 from uavctl.config import Config
-from uavctl.config.checks import position_index
+from uavctl.config.checks import get_position_index
 from uavctl.errors import UsageError
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.outcome import FlightCourse
@@ -129,7 +129,7 @@ class HealthWatch:
         tell: Callable[[str], None],
     ) -> None:
         self._flight, self._identity, self._recorder, self._tell = flight, identity, recorder, tell
-        self._axes = tuple(zip(config.plant.axes, position_index(config.plant), strict=True))
+        self._axes = tuple(zip(config.plant.axes, get_position_index(config.plant), strict=True))
         speeds = config.plant.velocity_index if config.plant.model == "matrices" else [i + 1 for _, i in self._axes]
         self._speed_axes = tuple(zip(config.plant.axes, speeds, strict=True))
         self._ticked: Ticked | None = None  # the last tick

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from importlib.util import find_spec
 
-from uavctl.config.connections import camera_scheme, camera_system
+from uavctl.config.connections import get_camera_system, parse_camera_scheme
 from uavctl.errors import ConnectionSpecError, ExtraMissingError
 from uavctl.io.admission import AllowList, Budgets, Rules
 from uavctl.io.base import Base, Connection
@@ -130,7 +130,7 @@ def _open_camera(url: str, now: Callable[[], int], rules: Rules) -> Connection:
         ExtraMissingError: the camera system's package is not installed.
     """
     place = parse(url)
-    system = camera_system(place.system)
+    system = get_camera_system(place.system)
     if system.package and find_spec(system.package) is None:  # not imported: the camera has a process of its own
         raise ExtraMissingError(system.package, system.extra)
     try:
@@ -177,5 +177,5 @@ def open_source(url: str, now: Callable[[], int] = time.monotonic_ns, rules: Rul
     Raises:
         ConnectionSpecError: the URL cannot be understood or opened, or the cameras cannot be used; says what to do.
     """
-    opener = _open_camera if camera_scheme(url) else open_connection
+    opener = _open_camera if parse_camera_scheme(url) else open_connection
     return opener(url, now, rules)
