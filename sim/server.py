@@ -17,7 +17,7 @@ from typing import Protocol
 from urllib.parse import urlsplit
 
 from sim.autopilot.profile import SIMULATED
-from sim.natnet import SCHEME, NatNetPort, as_motive
+from sim.natnet import SCHEME, NatNetPort, make_motive_config
 from sim.simulation import MOCAP, VEHICLE, Peers, VehicleSnapshot
 from uavctl.config.types import Config
 from uavctl.errors import ConnectionSpecError
@@ -26,14 +26,14 @@ from uavctl.records import Truth
 # The simulator's own sockets: datagrams in and out over UDP or TCP; nothing blocks.
 
 
-LARGEST_DATAGRAM = 65535
-LARGEST_BACKLOG = 1 << 16  # a TCP client that leaves more unread is dropped [bytes]
-MOST_CLIENTS = 8  # of a TCP port
+MAX_DATAGRAM_BYTES = 65535
+MAX_BACKLOG_BYTES = 1 << 16  # a TCP client that leaves more unread is dropped [bytes]
+MAX_CLIENTS = 8  # of a TCP port
 V1, V2 = 0xFE, 0xFD
 SIGNED = 0x01
 Greeting = tuple[bytes, ...]
 # What a peer that is not there, or not there any more, does to a socket.
-GONE = (ConnectionRefusedError, ConnectionResetError, BrokenPipeError)
+DISCONNECT_ERRORS = (ConnectionRefusedError, ConnectionResetError, BrokenPipeError)
 
 
 class Port(Protocol):
@@ -89,15 +89,15 @@ class UdpPort:
 
     def read(self) -> list[bytes]:
         """Return everything that has come."""
-        taken = []
+        datagrams = []
         with suppress(BlockingIOError):
             while True:
-                with suppress(*GONE):
-                    data, sender = self._socket.recvfrom(LARGEST_DATAGRAM)
+                with suppress(*DISCONNECT_ERRORS):
+                    data, sender = self._socket.recvfrom(MAX_DATAGRAM_BYTES)
                     if self._scheme == "udpin":
                         self._peer = sender
-                    taken.append(data)
-        return taken
+                    datagrams.append(data)
+        return datagrams
 
     def write(self, data: bytes) -> None:
         """Send one datagram."""
@@ -116,17 +116,17 @@ class _TcpClient:
 
     socket: socket.socket
     greeting: list[bytes]  # what of it is still to come
-    stream: bytearray = field(default_factory=bytearray)  # come, not yet a whole frame
+    received: bytearray = field(default_factory=bytearray)  # come, not yet a whole frame
     backlog: bytearray = field(default_factory=bytearray)  # to go
 
     def read(self) -> bool:
         """Take everything that has come; return False when the client is gone."""
         try:
-            while data := self.socket.recv(LARGEST_DATAGRAM):
-                self.stream += data
+            while data := self.socket.recv(MAX_DATAGRAM_BYTES):
+                self.received += data
         except BlockingIOError:
             return True
-        except GONE:
+        except DISCONNECT_ERRORS:
             pass
         return False
 
@@ -138,8 +138,8 @@ class _TcpClient:
         try:
             del self.backlog[: self.socket.send(self.backlog)]
         except BlockingIOError:
-            return len(self.backlog) <= LARGEST_BACKLOG
-        except GONE:
+            return len(self.backlog) <= MAX_BACKLOG_BYTES
+        except DISCONNECT_ERRORS:
             return False
         return True
 
@@ -153,7 +153,7 @@ class TcpPort:
 
     def __init__(self, address: tuple[str, int], greeting: Greeting = ()) -> None:
         self._greeting = greeting
-        self._listener = socket.create_server(address, backlog=MOST_CLIENTS)
+        self._listener = socket.create_server(address, backlog=MAX_CLIENTS)
         self._listener.setblocking(False)
         self._clients: list[_TcpClient] = []
 
@@ -174,20 +174,20 @@ class TcpPort:
                 self._accept()
         frames = []
         for client in self._clients.copy():
-            stays = client.read()
-            frames += cut_frames(client.stream)
-            if not stays:
+            is_connected = client.read()
+            frames += split_frames(client.received)
+            if not is_connected:
                 self._drop(client)
         return frames
 
     def _accept(self) -> None:
-        one, _ = self._listener.accept()
-        if len(self._clients) >= MOST_CLIENTS:
-            one.close()
+        connection, _ = self._listener.accept()
+        if len(self._clients) >= MAX_CLIENTS:
+            connection.close()
             return
-        one.setblocking(False)
-        one.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._clients.append(_TcpClient(one, list(self._greeting)))
+        connection.setblocking(False)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._clients.append(_TcpClient(connection, list(self._greeting)))
 
     def write(self, data: bytes) -> None:
         """Send to every client."""
@@ -219,7 +219,7 @@ class Ports:
 
     def sockets(self) -> tuple[socket.socket, ...]:
         """Return the sockets to wait for."""
-        return tuple(one for port in self._ports for one in port.sockets())
+        return tuple(sock for port in self._ports for sock in port.sockets())
 
     def read(self) -> list[bytes]:
         """Return everything that has come, at any port."""
@@ -236,7 +236,7 @@ class Ports:
             port.close()
 
 
-def cut_frames(stream: bytearray) -> list[bytes]:
+def split_frames(stream: bytearray) -> list[bytes]:
     """Take the whole MAVLink frames off a stream's front; bytes before a start mark are skipped."""
     frames = []
     while stream:
@@ -261,27 +261,27 @@ def open_port(url: str, greeting: Greeting = ()) -> Port:
     Raises:
         ConnectionSpecError: not a URL of a kind that the simulator has, or it cannot be opened.
     """
-    urls = [one.strip() for one in url.split(",")]
-    if len(urls) > 1 and any(one.startswith(f"{SCHEME}:") for one in urls):
+    urls = [single_url.strip() for single_url in url.split(",")]
+    if len(urls) > 1 and any(single_url.startswith(f"{SCHEME}:") for single_url in urls):
         raise ConnectionSpecError(f"{url}: NatNet is no MAVLink, so it stands alone; give one of them")
     opened: list[Port] = []
     try:
-        for one in urls:
-            opened.append(_open(one, greeting))
+        for single_url in urls:
+            opened.append(_open_single(single_url, greeting))
     except ConnectionSpecError:
         Ports(opened).close()
         raise
     return opened[0] if len(opened) == 1 else Ports(opened)
 
 
-def _open(url: str, greeting: Greeting) -> Port:
+def _open_single(url: str, greeting: Greeting) -> Port:
     kinds: dict[str, Callable[[tuple[str, int]], Port]] = {
         "udpout": lambda address: UdpPort("udpout", address),
         "udpin": lambda address: UdpPort("udpin", address),
         "tcpin": lambda address: TcpPort(address, greeting),
     }
     if url.startswith(f"{SCHEME}:"):
-        return _attempt(url, lambda: NatNetPort(url))
+        return _try_open(url, lambda: NatNetPort(url))
     try:
         parts = urlsplit(url)
         host, port = parts.hostname, parts.port
@@ -292,12 +292,12 @@ def _open(url: str, greeting: Greeting) -> Port:
     if parts.scheme not in kinds or host is None or port is None:
         raise ConnectionSpecError(f'"{url}": the simulator speaks {", ".join(kinds)}; write udpout://127.0.0.1:14540')
     address = host, port
-    return _attempt(url, lambda: kinds[parts.scheme](address))
+    return _try_open(url, lambda: kinds[parts.scheme](address))
 
 
-def _attempt(url: str, make: Callable[[], Port]) -> Port:
+def _try_open(url: str, open_it: Callable[[], Port]) -> Port:
     try:
-        return make()
+        return open_it()
     except socket.gaierror as error:
         raise ConnectionSpecError(f"{url}: no such host ({error.strerror}); check its name") from error
     except OSError as error:
@@ -309,13 +309,13 @@ def _attempt(url: str, make: Callable[[], Port]) -> Port:
 # The simulated peers on real sockets, in real time or a multiple of it.
 
 
-Door = Callable[[str, Port], Port]
+PortWrapper = Callable[[str, Port], Port]
 """Puts something around the port of a connection, which is named `vehicle` or `mocap`."""
 # Longest sleep, so that `stop` is asked often enough.
-NAP_S = 0.05
-LOOK_S = 0.25  # real time between two looks
+MAX_SLEEP_S = 0.05
+SNAPSHOT_PERIOD_S = 0.25  # real time between two looks
 # What is late is made up in strides of simulated time, so that a speed beyond this computer's cannot pile up work.
-STRIDE_NS = 100_000_000
+MAX_STEP_NS = 100_000_000
 
 
 @dataclass(frozen=True)
@@ -327,13 +327,13 @@ class Ready:
     start_ns: int
 
 
-def grid_start(now_ns: int, dt_ns: int) -> int:
+def compute_grid_start_ns(now_ns: int, dt_ns: int) -> int:
     """Return the next multiple of Δt on CLOCK_MONOTONIC [ns]: a grid that two processes share without a word."""
     return -(-now_ns // dt_ns) * dt_ns
 
 
 @dataclass(frozen=True)
-class Seat:
+class VehicleSetup:
     """One simulated vehicle: configuration, URLs (equal ones are one connection), and the receiver of its truth."""
 
     config: Config
@@ -352,23 +352,23 @@ def serve(
     on_ready: Callable[[Ready], None],
     on_truth: Callable[[Truth], None],
     stop: Callable[[], bool],
-    door: Door | None = None,
+    wrap_port: PortWrapper | None = None,
 ) -> None:
     """Run the peers of one vehicle in real time; see `serve_all`."""
-    seat = Seat(config, vehicle_url, mocap_url, on_truth)
-    serve_all((seat,), duration_s=duration_s, airborne=airborne, on_ready=on_ready, stop=stop, door=door)
+    setup = VehicleSetup(config, vehicle_url, mocap_url, on_truth)
+    serve_all((setup,), duration_s=duration_s, airborne=airborne, on_ready=on_ready, stop=stop, wrap_port=wrap_port)
 
 
 def serve_all(
-    seats: Sequence[Seat],
+    setups: Sequence[VehicleSetup],
     *,
     duration_s: float | None,
     airborne: bool,
     on_ready: Callable[[Ready], None],
     stop: Callable[[], bool],
     speed: float = 1.0,
-    on_look: Callable[[tuple[VehicleSnapshot, ...]], None] | None = None,
-    door: Door | None = None,
+    on_snapshot: Callable[[tuple[VehicleSnapshot, ...]], None] | None = None,
+    wrap_port: PortWrapper | None = None,
 ) -> None:
     """Run the peers of each seat until `stop()` or the end of the duration.
 
@@ -388,29 +388,29 @@ def serve_all(
     Raises:
         ConnectionSpecError: a URL is not understood or cannot be opened.
     """
-    opened: list[dict[str, Port]] = []
+    opened_ports: list[dict[str, Port]] = []
     try:
-        for seat in seats:
-            if seat.vehicle.startswith(f"{SCHEME}:"):
-                raise ConnectionSpecError(f"{seat.vehicle}: a vehicle speaks no NatNet; give it to the cameras")
+        for setup in setups:
+            if setup.vehicle.startswith(f"{SCHEME}:"):
+                raise ConnectionSpecError(f"{setup.vehicle}: a vehicle speaks no NatNet; give it to the cameras")
             ports: dict[str, Port] = {}
-            opened.append(ports)
-            ports[VEHICLE] = open_port(seat.vehicle, SIMULATED[seat.config.sim.autopilot].greeting)
-            if seat.mocap != seat.vehicle:
-                ports[MOCAP] = open_port(seat.mocap)
-            if door is not None:  # NatNet has no signatures
-                plain = {name: port for name, port in ports.items() if not isinstance(port, NatNetPort)}
-                ports.update({name: door(name, port) for name, port in plain.items()})
+            opened_ports.append(ports)
+            ports[VEHICLE] = open_port(setup.vehicle, SIMULATED[setup.config.sim.autopilot].greeting)
+            if setup.mocap != setup.vehicle:
+                ports[MOCAP] = open_port(setup.mocap)
+            if wrap_port is not None:  # NatNet has no signatures
+                mavlink_ports = {name: port for name, port in ports.items() if not isinstance(port, NatNetPort)}
+                ports.update({name: wrap_port(name, port) for name, port in mavlink_ports.items()})
         # One grid for all: a multiple of every step.
-        dt_ns = math.lcm(*(round(seat.config.plant.dt_s * 1e9) for seat in seats))
-        clock = _Clock(grid_start(time.monotonic_ns(), dt_ns), speed)
+        dt_ns = math.lcm(*(round(setup.config.plant.dt_s * 1e9) for setup in setups))
+        clock = _Clock(compute_grid_start_ns(time.monotonic_ns(), dt_ns), speed)
         end_ns = None if duration_s is None else clock.start_ns + round(duration_s * 1e9)
-        worlds = [_world(seat, ports, clock, airborne) for seat, ports in zip(seats, opened, strict=True)]
-        for ports in opened:
+        worlds = [_make_world(setup, ports, clock, airborne) for setup, ports in zip(setups, opened_ports, strict=True)]
+        for ports in opened_ports:
             on_ready(Ready(ports[VEHICLE].url, ports.get(MOCAP, ports[VEHICLE]).url, clock.start_ns))
-        _run(worlds, clock, end_ns, stop, on_look)
+        _run_worlds(worlds, clock, end_ns, stop, on_snapshot)
     finally:
-        for ports in opened:
+        for ports in opened_ports:
             for port in ports.values():
                 port.close()
 
@@ -425,7 +425,7 @@ class _Clock:
     def now_ns(self) -> int:
         return self.start_ns + round((time.monotonic_ns() - self.start_ns) * self.speed)
 
-    def left_s(self, until_ns: int) -> float:
+    def compute_remaining_s(self, until_ns: int) -> float:
         """Return the real time until a simulated time [s]."""
         return max(0, until_ns - self.now_ns()) * 1e-9 / self.speed
 
@@ -433,38 +433,38 @@ class _Clock:
 _World = tuple[Peers, dict[str, Port]]
 
 
-def _world(seat: Seat, ports: dict[str, Port], clock: _Clock, airborne: bool) -> _World:
-    shared = seat.mocap == seat.vehicle
-    config, cameras = seat.config, ports.get(MOCAP)
+def _make_world(setup: VehicleSetup, ports: dict[str, Port], clock: _Clock, airborne: bool) -> _World:
+    shared = setup.mocap == setup.vehicle
+    config, cameras = setup.config, ports.get(MOCAP)
     if isinstance(cameras, NatNetPort):
-        config = as_motive(config)
-    peers = Peers(config, clock.start_ns, airborne=airborne, shared_link=shared, on_truth=seat.on_truth)
+        config = make_motive_config(config)
+    peers = Peers(config, clock.start_ns, airborne=airborne, shared_link=shared, on_truth=setup.on_truth)
     if isinstance(cameras, NatNetPort):
         cameras.clock_us = lambda: peers.cameras.clock_us(clock.now_ns())
     return peers, ports
 
 
-def _run(
+def _run_worlds(
     worlds: Sequence[_World],
     clock: _Clock,
     end_ns: int | None,
     stop: Callable[[], bool],
-    on_look: Callable[[tuple[VehicleSnapshot, ...]], None] | None,
+    on_snapshot: Callable[[tuple[VehicleSnapshot, ...]], None] | None,
 ) -> None:
     sockets = [port for _, ports in worlds for port in ports.values()]
     last_ns = None if end_ns is None else end_ns - 1  # what happens at the end itself is not told any more
-    look_s = time.monotonic()  # time of the next look
+    snapshot_s = time.monotonic()  # time of the next look
 
-    def goal_ns(peers: Peers) -> int:
+    def compute_goal_ns(peers: Peers) -> int:
         now_ns = clock.now_ns() if last_ns is None else min(clock.now_ns(), last_ns)
-        return min(now_ns, peers.now_ns + STRIDE_NS)
+        return min(now_ns, peers.now_ns + MAX_STEP_NS)
 
     while not stop():
-        if on_look is not None and time.monotonic() >= look_s:
-            on_look(tuple(peers.look() for peers, _ in worlds))
-            look_s = time.monotonic() + LOOK_S
+        if on_snapshot is not None and time.monotonic() >= snapshot_s:
+            on_snapshot(tuple(peers.take_snapshot() for peers, _ in worlds))
+            snapshot_s = time.monotonic() + SNAPSHOT_PERIOD_S
         for peers, ports in worlds:
-            to_ns = goal_ns(peers)
+            to_ns = compute_goal_ns(peers)
             if to_ns >= peers.now_ns:  # else the start of the grid is still to come
                 for _, link, data in peers.advance(to_ns):
                     ports[link].write(data)
@@ -473,26 +473,26 @@ def _run(
         until_ns = min(peers.next_ns for peers, _ in worlds)
         if last_ns is not None:
             until_ns = min(until_ns, last_ns)
-        _wait(sockets, min(clock.left_s(until_ns), NAP_S))
+        _wait(sockets, min(clock.compute_remaining_s(until_ns), MAX_SLEEP_S))
         for peers, ports in worlds:
             for link, port in ports.items():
                 for data in port.read():
-                    at_ns = goal_ns(peers)
+                    at_ns = compute_goal_ns(peers)
                     if at_ns >= peers.now_ns:
                         peers.receive(link, data, at_ns)
     for peers, _ in worlds:
         peers.flush()
-    if on_look is not None:
-        on_look(tuple(peers.look() for peers, _ in worlds))
+    if on_snapshot is not None:
+        on_snapshot(tuple(peers.take_snapshot() for peers, _ in worlds))
 
 
-def _wait(ports: Sequence[Port], longest_s: float) -> None:
+def _wait(ports: Sequence[Port], max_s: float) -> None:
     """Sleep for a time or until bytes come; by select(2), as epoll's sleep is in whole milliseconds."""
-    sockets: list[socket.socket] = [one for port in ports for one in port.sockets()]
+    sockets: list[socket.socket] = [sock for port in ports for sock in port.sockets()]
     with SelectSelector() as selector:
-        for one in sockets:
-            selector.register(one, EVENT_READ)
-        selector.select(longest_s)
+        for sock in sockets:
+            selector.register(sock, EVENT_READ)
+        selector.select(max_s)
 
 
 def serve_in_child(
@@ -503,7 +503,7 @@ def serve_in_child(
     mocap_url: str,
     duration_s: float | None,
     airborne: bool,
-    door: Door | None = None,
+    wrap_port: PortWrapper | None = None,
 ) -> None:
     """Run `serve` in a child process: `Ready` and every `Truth` go into the pipe.
 
@@ -521,7 +521,7 @@ def serve_in_child(
             on_ready=pipe.send,
             on_truth=pipe.send,
             stop=lambda: stop.is_set() or (parent is not None and not parent.is_alive()),
-            door=door,
+            wrap_port=wrap_port,
         )
     except BrokenPipeError:
         return  # nobody listens any more

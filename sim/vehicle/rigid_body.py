@@ -96,13 +96,13 @@ class BatteryModel:
 
     def __init__(self, airframe: Airframe, *, charge: float = 1.0) -> None:
         self._airframe = airframe
-        self.charge(charge)
+        self.set_charge(charge)
         self.current_a = 0.0
         self.voltage_v = self.open_circuit_v
 
-    def charge(self, share: float) -> None:
+    def set_charge(self, charge: float) -> None:
         """Set the charge, 0 to 1."""
-        self.used_c = (1.0 - share) * self._airframe.capacity_c
+        self.used_c = (1.0 - charge) * self._airframe.capacity_c
 
     @property
     def remaining(self) -> float:
@@ -110,7 +110,7 @@ class BatteryModel:
         return max(1.0 - self.used_c / self._airframe.capacity_c, 0.0)
 
     @property
-    def empty(self) -> bool:
+    def is_empty(self) -> bool:
         """Whether no charge is left: the battery's protection has switched off."""
         return self.used_c >= self._airframe.capacity_c
 
@@ -118,12 +118,12 @@ class BatteryModel:
     def open_circuit_v(self) -> float:
         """Voltage without load [V], linear between the tenths of the table."""
         table = self._airframe.open_circuit_v
-        place = self.remaining * (len(table) - 1)
-        low = min(int(place), len(table) - 2)
-        return table[low] + (place - low) * (table[low + 1] - table[low])
+        table_position = self.remaining * (len(table) - 1)
+        low = min(int(table_position), len(table) - 2)
+        return table[low] + (table_position - low) * (table[low + 1] - table[low])
 
     @property
-    def largest_rps(self) -> float:
+    def max_rps(self) -> float:
         """Largest rotor speed at the present voltage [rad/s]."""
         return self._airframe.speed_at_0v_rps + self._airframe.speed_per_v_rps * self.voltage_v
 
@@ -133,13 +133,13 @@ class BatteryModel:
         U² - E U + R P = 0 has the voltage U under the power P; beyond E²/4R the battery gives no more, and nothing
         once it is empty.
         """
-        if self.empty:
+        if self.is_empty:
             self.voltage_v = self.current_a = 0.0
             return
         power_w = self._airframe.electronics_w + self._airframe.power_per_thrust_wpn * thrust_n
         source_v = self.open_circuit_v
-        left = source_v * source_v - 4.0 * self._airframe.resistance_ohm * power_w
-        self.voltage_v = 0.5 * (source_v + math.sqrt(max(left, 0.0)))
+        discriminant = source_v * source_v - 4.0 * self._airframe.resistance_ohm * power_w
+        self.voltage_v = 0.5 * (source_v + math.sqrt(max(discriminant, 0.0)))
         self.current_a = (source_v - self.voltage_v) / self._airframe.resistance_ohm
         self.used_c += self.current_a * duration_s
 
@@ -176,13 +176,13 @@ class Body:
     body_drag_kgpm: Vec3  # ½ ρ C_d A
 
     @classmethod
-    def of(cls, airframe: Airframe) -> Body:
+    def from_airframe(cls, airframe: Airframe) -> Body:
         """Return the body of an airframe."""
         front, right, down = (0.5 * AIR_DENSITY_KGPM3 * area for area in airframe.drag_area_m2)
         return cls(airframe.mass_kg, airframe.inertia_kgm2, airframe.rotor_drag_kg, (front, right, down))
 
 
-def turned(attitude: Quaternion, angle: Vec3) -> Quaternion:
+def rotate_attitude(attitude: Quaternion, angle: Vec3) -> Quaternion:
     """Return the attitude turned further by a rotation vector [rad] in body axes; of unit norm."""
     w, x, y, z = attitude
     p, q, r = angle
@@ -201,19 +201,19 @@ def turned(attitude: Quaternion, angle: Vec3) -> Quaternion:
     return w * scale, x * scale, y * scale, z * scale
 
 
-def uprighted(attitude: Quaternion, keep: float) -> Quaternion:
+def reduce_tilt(attitude: Quaternion, factor: float) -> Quaternion:
     """Return the attitude with the tangent of half its tilt shrunk to the share `keep`; the heading stays."""
     w, x, y, z = attitude
     heading = math.sqrt(w * w + z * z)
     c, s = (w / heading, z / heading) if heading > 0.0 else (1.0, 0.0)
     # attitude = (heading, tx, ty, 0) ⊗ (c, 0, 0, s)
-    tx, ty = keep * (x * c - y * s), keep * (y * c + x * s)
+    tx, ty = factor * (x * c - y * s), factor * (y * c + x * s)
     norm = math.sqrt(heading * heading + tx * tx + ty * ty)
     heading, tx, ty = heading / norm, tx / norm, ty / norm
     return heading * c, tx * c + ty * s, ty * c - tx * s, heading * s
 
 
-def acceleration(body: Body, attitude: Quaternion, velocity: Vec3, wrench: Wrench, wind: Vec3) -> Vec3:
+def compute_acceleration(body: Body, attitude: Quaternion, velocity: Vec3, wrench: Wrench, wind: Vec3) -> Vec3:
     """Return the acceleration of the centre of mass in NED [m/s²], with gravity.
 
     Drag in body axes, of the velocity v relative to the air: -(d ΣΩ + ½ ρ C_d A |v|) v, each axis with its own
@@ -240,7 +240,7 @@ def acceleration(body: Body, attitude: Quaternion, velocity: Vec3, wrench: Wrenc
     )
 
 
-def _spin(body: Body, rates: Vec3, torque: Vec3) -> Vec3:
+def _compute_angular_accel(body: Body, rates: Vec3, torque: Vec3) -> Vec3:
     """Return angular accelerations by Euler's equations: J ω' = τ - ω x J ω."""
     jx, jy, jz = body.inertia_kgm2
     p, q, r = rates
@@ -251,7 +251,7 @@ def _spin(body: Body, rates: Vec3, torque: Vec3) -> Vec3:
     )
 
 
-def _turning(angle: Vec3, rates: Vec3) -> Vec3:
+def _compute_rotation_vector_rate(angle: Vec3, rates: Vec3) -> Vec3:
     """Return the rate of the rotation vector: θ' = ω + ½ θ x ω + 1/12 θ x (θ x ω), enough for fourth order."""
     a, b, c = angle
     p, q, r = rates
@@ -263,11 +263,11 @@ def _turning(angle: Vec3, rates: Vec3) -> Vec3:
     )
 
 
-def _along(start: Vec3, slope: Vec3, h: float) -> Vec3:
+def _add_scaled(start: Vec3, slope: Vec3, h: float) -> Vec3:
     return start[0] + h * slope[0], start[1] + h * slope[1], start[2] + h * slope[2]
 
 
-def _mean(a: Vec3, b: Vec3, c: Vec3, d: Vec3) -> Vec3:
+def _average_slopes(a: Vec3, b: Vec3, c: Vec3, d: Vec3) -> Vec3:
     """Return the mean slope by the weights of the classical Runge-Kutta method (Simpson's rule)."""
     return (
         (a[0] + 2.0 * (b[0] + c[0]) + d[0]) / 6.0,
@@ -276,7 +276,9 @@ def _mean(a: Vec3, b: Vec3, c: Vec3, d: Vec3) -> Vec3:
     )
 
 
-def step(body: Body, start: BodyState, wrenches: tuple[Wrench, Wrench, Wrench], wind: Vec3, h: float) -> BodyState:
+def integrate_step(
+    body: Body, start: BodyState, wrenches: tuple[Wrench, Wrench, Wrench], wind: Vec3, h: float
+) -> BodyState:
     """Return the state after one step of Runge and Kutta's fourth-order method, after Munthe-Kaas on the rotations.
 
     The attitude moves by the exponential of a rotation vector that is integrated like any other variable, so it
@@ -292,26 +294,26 @@ def step(body: Body, start: BodyState, wrenches: tuple[Wrench, Wrench, Wrench], 
     position, v1, attitude, w1 = start
     half = 0.5 * h
 
-    a1 = acceleration(body, attitude, v1, first, wind)
-    s1 = _spin(body, w1, first.torque_nm)
+    a1 = compute_acceleration(body, attitude, v1, first, wind)
+    s1 = _compute_angular_accel(body, w1, first.torque_nm)
 
-    angle = _along((0.0, 0.0, 0.0), w1, half)
-    w2 = _along(w1, s1, half)
-    t2 = _turning(angle, w2)
-    a2 = acceleration(body, turned(attitude, angle), _along(v1, a1, half), middle, wind)
-    s2 = _spin(body, w2, middle.torque_nm)
+    angle = _add_scaled((0.0, 0.0, 0.0), w1, half)
+    w2 = _add_scaled(w1, s1, half)
+    t2 = _compute_rotation_vector_rate(angle, w2)
+    a2 = compute_acceleration(body, rotate_attitude(attitude, angle), _add_scaled(v1, a1, half), middle, wind)
+    s2 = _compute_angular_accel(body, w2, middle.torque_nm)
 
-    angle = _along((0.0, 0.0, 0.0), t2, half)
-    w3 = _along(w1, s2, half)
-    t3 = _turning(angle, w3)
-    a3 = acceleration(body, turned(attitude, angle), _along(v1, a2, half), middle, wind)
-    s3 = _spin(body, w3, middle.torque_nm)
+    angle = _add_scaled((0.0, 0.0, 0.0), t2, half)
+    w3 = _add_scaled(w1, s2, half)
+    t3 = _compute_rotation_vector_rate(angle, w3)
+    a3 = compute_acceleration(body, rotate_attitude(attitude, angle), _add_scaled(v1, a2, half), middle, wind)
+    s3 = _compute_angular_accel(body, w3, middle.torque_nm)
 
-    angle = _along((0.0, 0.0, 0.0), t3, h)
-    w4 = _along(w1, s3, h)
-    t4 = _turning(angle, w4)
-    a4 = acceleration(body, turned(attitude, angle), _along(v1, a3, h), last, wind)
-    s4 = _spin(body, w4, last.torque_nm)
+    angle = _add_scaled((0.0, 0.0, 0.0), t3, h)
+    w4 = _add_scaled(w1, s3, h)
+    t4 = _compute_rotation_vector_rate(angle, w4)
+    a4 = compute_acceleration(body, rotate_attitude(attitude, angle), _add_scaled(v1, a3, h), last, wind)
+    s4 = _compute_angular_accel(body, w4, last.torque_nm)
 
     sixth = h * h / 6.0
     return BodyState(
@@ -320,9 +322,9 @@ def step(body: Body, start: BodyState, wrenches: tuple[Wrench, Wrench, Wrench], 
             position[1] + h * v1[1] + sixth * (a1[1] + a2[1] + a3[1]),
             position[2] + h * v1[2] + sixth * (a1[2] + a2[2] + a3[2]),
         ),
-        _along(v1, _mean(a1, a2, a3, a4), h),
-        turned(attitude, _along((0.0, 0.0, 0.0), _mean(w1, t2, t3, t4), h)),
-        _along(w1, _mean(s1, s2, s3, s4), h),
+        _add_scaled(v1, _average_slopes(a1, a2, a3, a4), h),
+        rotate_attitude(attitude, _add_scaled((0.0, 0.0, 0.0), _average_slopes(w1, t2, t3, t4), h)),
+        _add_scaled(w1, _average_slopes(s1, s2, s3, s4), h),
     )
 
 
@@ -332,9 +334,9 @@ def step(body: Body, start: BodyState, wrenches: tuple[Wrench, Wrench, Wrench], 
 # that their reaction torque is to the right (positive about down).
 
 
-Four = tuple[float, float, float, float]
+RotorValues = tuple[float, float, float, float]
 
-STOPPED: Four = (0.0, 0.0, 0.0, 0.0)
+STOPPED: RotorValues = (0.0, 0.0, 0.0, 0.0)
 
 
 class Rotors:
@@ -354,11 +356,11 @@ class Rotors:
         self._idle_n = airframe.thrust_n_s2 * airframe.idle_rps**2
         self._half_decay = math.exp(-0.5 * step_s / airframe.motor_lag_s)
         self._decay = math.exp(-step_s / airframe.motor_lag_s)
-        self.speeds_rps: Four = STOPPED
-        self.commands_rps: Four = STOPPED
-        self.thrust_limited = self.torque_limited = False
+        self.speeds_rps: RotorValues = STOPPED
+        self.commands_rps: RotorValues = STOPPED
+        self.is_thrust_limited = self.is_torque_limited = False
 
-    def wrench(self, speeds_rps: Four) -> Wrench:
+    def compute_wrench(self, speeds_rps: RotorValues) -> Wrench:
         """Return force and torque of rotors at these speeds."""
         k = self._thrust_n_s2
         a, b, c, d = speeds_rps
@@ -376,11 +378,11 @@ class Rotors:
     def step(self) -> tuple[Wrench, Wrench, Wrench]:
         """Move on by one step, exactly; return the wrenches at its start, middle and end."""
         start = self.speeds_rps
-        middle = self._lagged(self._half_decay)
-        self.speeds_rps = self._lagged(self._decay)
-        return self.wrench(start), self.wrench(middle), self.wrench(self.speeds_rps)
+        middle = self._compute_lagged_speeds(self._half_decay)
+        self.speeds_rps = self._compute_lagged_speeds(self._decay)
+        return self.compute_wrench(start), self.compute_wrench(middle), self.compute_wrench(self.speeds_rps)
 
-    def _lagged(self, decay: float) -> Four:
+    def _compute_lagged_speeds(self, decay: float) -> RotorValues:
         (a, b, c, d), (p, q, r, s) = self.speeds_rps, self.commands_rps
         return p + (a - p) * decay, q + (b - q) * decay, r + (c - r) * decay, s + (d - s) * decay
 
@@ -388,7 +390,7 @@ class Rotors:
         """Switch off."""
         self.commands_rps = STOPPED
 
-    def command(self, thrust_n: float, torque_nm: Vec3, largest_rps: float) -> None:
+    def command(self, thrust_n: float, torque_nm: Vec3, max_rps: float) -> None:
         """Command the speeds that give this thrust and torque, as far as the rotors can.
 
         Where they cannot, roll and pitch come first, then the thrust, then yaw: a vehicle that keeps its
@@ -397,24 +399,24 @@ class Rotors:
         Args:
             largest_rps: speed that the battery's voltage allows.
         """
-        lowest = self._idle_n
-        highest = max(self._thrust_n_s2 * largest_rps * largest_rps, lowest)
+        min_n = self._idle_n
+        max_n = max(self._thrust_n_s2 * max_rps * max_rps, min_n)
         roll, pitch = 0.25 * torque_nm[0] / self._lever_m, 0.25 * torque_nm[1] / self._lever_m
         yaw = 0.25 * torque_nm[2] / self._torque_m
-        reach = abs(roll) + abs(pitch)
-        half = 0.5 * (highest - lowest)
-        clipped = reach > half
-        if clipped:
-            roll, pitch, reach = roll * half / reach, pitch * half / reach, half
-        each = min(max(0.25 * thrust_n, lowest + reach), highest - reach)
-        room = min(highest - reach - each, each - reach - lowest)
-        turn = min(max(yaw, -room), room)
-        self.thrust_limited = each != 0.25 * thrust_n
-        self.torque_limited = clipped or turn != yaw
+        tilt_n = abs(roll) + abs(pitch)
+        half = 0.5 * (max_n - min_n)
+        is_clipped = tilt_n > half
+        if is_clipped:
+            roll, pitch, tilt_n = roll * half / tilt_n, pitch * half / tilt_n, half
+        mean_n = min(max(0.25 * thrust_n, min_n + tilt_n), max_n - tilt_n)
+        yaw_margin_n = min(max_n - tilt_n - mean_n, mean_n - tilt_n - min_n)
+        yaw_n = min(max(yaw, -yaw_margin_n), yaw_margin_n)
+        self.is_thrust_limited = mean_n != 0.25 * thrust_n
+        self.is_torque_limited = is_clipped or yaw_n != yaw
         k = self._thrust_n_s2
         self.commands_rps = (
-            math.sqrt(max(each - roll + pitch + turn, 0.0) / k),
-            math.sqrt(max(each - roll - pitch - turn, 0.0) / k),
-            math.sqrt(max(each + roll - pitch + turn, 0.0) / k),
-            math.sqrt(max(each + roll + pitch - turn, 0.0) / k),
+            math.sqrt(max(mean_n - roll + pitch + yaw_n, 0.0) / k),
+            math.sqrt(max(mean_n - roll - pitch - yaw_n, 0.0) / k),
+            math.sqrt(max(mean_n + roll - pitch + yaw_n, 0.0) / k),
+            math.sqrt(max(mean_n + roll + pitch - yaw_n, 0.0) / k),
         )

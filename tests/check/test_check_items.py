@@ -280,7 +280,7 @@ def test_a_check_sends_nothing_that_arms_or_moves(autopilot: str) -> None:
     }
     assert kinds <= quiet | {"SET_GPS_GLOBAL_ORIGIN"}
     assert commands <= {511, 512}  # MAV_CMD_SET_MESSAGE_INTERVAL, MAV_CMD_REQUEST_MESSAGE
-    assert not peers.autopilot.pilot.armed
+    assert not peers.autopilot.pilot.is_armed
 
 
 # --- a camera system without a bridge --------------------------------------------------------------------------------

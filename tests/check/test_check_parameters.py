@@ -296,7 +296,7 @@ def test_a_simulated_vehicle_passes_the_check_of_each_preset_and_of_the_manual_s
     for tick in range(ticks):
         for arrival_ns, link, data in peers.advance(tick * tick_ns):
             flight.receive(link, data, arrival_ns)
-        flight.tick(tick, tick * tick_ns, peers.receiver(tick * tick_ns))
+        flight.tick(tick, tick * tick_ns, peers.make_sender(tick * tick_ns))
     found = flight.make_items(ticks * tick_ns)
     assert [describe_item(one) for one in find_refusals(found, config.check)] == []
     assert {one.name: one.state for one in found}[TIMEOUTS[3 if autopilot == "ardupilot" else 12]] is ItemState.GOOD

@@ -38,10 +38,10 @@ def furthest(flight: Flight) -> tuple[float, float]:
             break
         # An engaged flight is landed, to end it.
         flight.run(0.05, stop=flight.is_in(HandoverState.ENGAGED) and flight.now_ns > 40 * 10**9)
-        north, east, down = flight.peers.autopilot.craft.position_m
+        north, east, down = flight.peers.autopilot.vehicle.position_m
         side_m = max(side_m, abs(north - START_M[0]), abs(east - START_M[1]))
         height_m = max(height_m, -down)
-    assert flight.loop.finished and flight.peers.autopilot.craft.landed, (flight.state, flight.texts[-3:])
+    assert flight.loop.finished and flight.peers.autopilot.vehicle.landed, (flight.state, flight.texts[-3:])
     return side_m, height_m
 
 

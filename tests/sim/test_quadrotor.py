@@ -56,7 +56,7 @@ def test_rotors_at_their_limit_wind_nothing_up() -> None:
     one.battery = allowing(1900.0)
     one.accelerate((0.0, 0.0, -8.0))
     run(one, 1.0)
-    one.face(1.5)
+    one.set_heading(1.5)
     run(one, 3.0)
     assert abs(one.attitude[3]) < 0.05
     one.battery = BatteryModel(CRAZYFLIE_2)

@@ -61,5 +61,5 @@ def test_px4_flies_what_is_set_beside_numbers_that_are_none() -> None:
     assert flying(one) == (0.5, 0.0, 0.0)
     # A velocity with the force bit, which is about accelerations.
     one.send(one.client.pack(message(0, 1, 1, 1, 0xDC7 | 0x200, *nothing, 1.0, 0.0, 0.0, *nothing, 0.0, 0.0)))
-    assert one.peers.autopilot.pilot.helm.obeyed == ParsedSetpoint(SetpointKind.VELOCITY, (1.0, 0.0, 0.0))
+    assert one.peers.autopilot.pilot.dispatch.active_setpoint == ParsedSetpoint(SetpointKind.VELOCITY, (1.0, 0.0, 0.0))
     assert one.texts == []

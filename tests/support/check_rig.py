@@ -68,7 +68,7 @@ def look(
         at_ns = tick * TICK_NS
         for arrival_ns, link, data in peers.advance(at_ns):
             flight.receive(link, data if link == VEHICLE else twist(data), arrival_ns)
-        flight.tick(tick, at_ns, peers.receiver(at_ns))
+        flight.tick(tick, at_ns, peers.make_sender(at_ns))
         accel = setpoints(at_ns * 1e-9)
         if accel is not None:
             peers.receive(VEHICLE, client.setpoint(*accel), at_ns)

@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sim.faults import check_faults
+from sim.faults import check_fault_support
 from uavctl.build.controller import build_plant, build_problem, build_solver, design_of, ready_library
 from uavctl.build.link import build_ages
 from uavctl.config import Config, dump_config, parse
@@ -58,7 +58,7 @@ def load(source: Source = "room", overrides: Mapping[str, object] | None = None,
         loaded = parse(dump_config(source), source.name, given)
     else:
         loaded = load_file(str(source), given)
-    check_faults(loaded)
+    check_fault_support(loaded)
     return loaded.config
 
 

@@ -67,10 +67,10 @@ class Common:
         Raises:
             ConfigError: With all problems found.
         """
-        from sim.faults import check_faults  # a replay, which has a configuration of its own, needs no simulator
+        from sim.faults import check_fault_support  # a replay, which has a configuration of its own, needs no simulator
 
         loaded = load(self.config, self.overrides)
-        check_faults(loaded)
+        check_fault_support(loaded)
         return loaded
 
     def with_overrides(self, more: Sequence[str]) -> Common:

@@ -17,9 +17,9 @@ from cyclopts import Parameter, validators
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
 
-from sim.faults import problems
-from sim.fleet import fleet
-from sim.server import Door, Port, Ready, Seat, serve_all
+from sim.faults import find_fault_problems
+from sim.fleet import make_fleet
+from sim.server import Port, PortWrapper, Ready, VehicleSetup, serve_all
 from sim.simulation import VehicleSnapshot
 from uavctl.build.rest import check_axes
 from uavctl.cli.common import DEFAULTS, Column, Common, WideTable, located, messages, write_document
@@ -79,7 +79,7 @@ class SignedPort:
         self._inner.close()
 
 
-def make_door(security: SecurityConfig) -> Door | None:
+def make_door(security: SecurityConfig) -> PortWrapper | None:
     """Return a function that signs ports as `[security]` asks of the daemon; None if it asks for nothing.
 
     Raises:
@@ -155,9 +155,9 @@ def _vector(vector: Vec3) -> str:
 
 
 def _setpoint(one: VehicleSnapshot) -> str:
-    if one.steered_by is None or one.setpoint_age_s is None:
+    if one.setpoint_source is None or one.setpoint_age_s is None:
         return "-"
-    system, component = one.steered_by
+    system, component = one.setpoint_source
     return f"{system}/{component}, {one.setpoint_age_s:.2f} s ago"
 
 
@@ -314,12 +314,12 @@ def sim(
     with located(loaded):
         check_axes(config)
     if faults is not None:
-        config = add_faults(config, faults, problems)
+        config = add_faults(config, faults, find_fault_problems)
 
     def forget(truth: Truth) -> None:
         del truth
 
-    seats = fleet(config, VEHICLES[config.sim.autopilot] if vehicle is None else vehicle, mocap, vehicles, forget)
+    seats = make_fleet(config, VEHICLES[config.sim.autopilot] if vehicle is None else vehicle, mocap, vehicles, forget)
     opened: list[Ready] = []
 
     def ready(ports: Ready) -> None:
@@ -336,13 +336,13 @@ def sim(
             on_ready=ready,
             stop=stopped,
             speed=speed,
-            on_look=on_look,
-            door=make_door(config.security),
+            on_snapshot=on_look,
+            wrap_port=make_door(config.security),
         )
     return 0
 
 
-def _announce(seats: Sequence[Seat], opened: Sequence[Ready], *, as_json: bool) -> None:
+def _announce(seats: Sequence[VehicleSetup], opened: Sequence[Ready], *, as_json: bool) -> None:
     listed = [
         {"system_id": seat.config.sim.system_id, "vehicle": ports.vehicle, "mocap": ports.mocap}
         for seat, ports in zip(seats, opened, strict=True)
