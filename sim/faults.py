@@ -8,7 +8,8 @@ from typing import Literal
 import msgspec
 
 from sim.autopilot.autopilot import Autopilot
-from sim.autopilot.profile import SIMULATED, Parameters
+from sim.autopilot.parameters import Parameters
+from sim.autopilot.profile import SIMULATED
 from sim.cameras import AXES, Cameras
 from sim.channel import is_within
 from sim.vehicle.linear import LinearVehicle

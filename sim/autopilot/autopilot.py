@@ -1,315 +1,37 @@
 """Simulated autopilot: MAVLink bytes in, MAVLink bytes out.
 
-Its bytes are made and read with pymavlink's dialect directly, not with the controller's codec. It shows what was
-observed of the real autopilots: the table of `profile.py`, the rules for setpoints in `setpoints.py`, the state
-machine of `pilot.py`, the estimate of `estimator.py`, and the commands, parameters, files and streams in the modules of
-these names. What is not known is not answered, as the real ones do.
+It makes and reads its bytes with pymavlink's dialect, not with the controller's codec. It shows the observed behaviour
+of the real autopilots: the table of `profile.py`, the rules for setpoints in `setpoints.py`, the state machine of
+`pilot.py`, the estimate of `estimator.py`, and the commands, parameters, files and streams in the modules of these
+names. It does not answer unknown messages, as the real ones do not.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from sim.autopilot.checks import PreflightChecks
 from sim.autopilot.commands import CommandRequest, Commands
 from sim.autopilot.estimator import Estimator
+from sim.autopilot.failsafes import Failsafes
 from sim.autopilot.files import Files
+from sim.autopilot.geodesy import GeodeticOrigin
 from sim.autopilot.inertial import ERRORS, InertialSensors
-from sim.autopilot.pilot import CRASHED, CRITICAL, NOTICE, WARNING, Phase, Pilot
-from sim.autopilot.profile import (
-    SIMULATED,
-    Mode,
-    Parameters,
-    ParameterType,
-    Role,
-    SetpointKind,
-    SimulatedProfile,
-    parse_setpoint,
-)
-from sim.autopilot.telemetry import HOME_POSITION, BoardClock, GeodeticOrigin, Message, Telemetry, TelemetrySources
-from sim.channel import find_earliest_ns, is_within
-from sim.vehicle.interface import Battery, ControlledPlant, Vehicle
+from sim.autopilot.parameters import Parameters, ParameterType
+from sim.autopilot.peer_clock import PeerClock
+from sim.autopilot.pilot import CRASHED, WARNING, Pilot
+from sim.autopilot.profile import SIMULATED
+from sim.autopilot.setpoints import SetpointKind, parse_setpoint
+from sim.autopilot.telemetry import HOME_POSITION, BoardClock, Message, Telemetry, TelemetrySources
+from sim.channel import find_earliest_ns
+from sim.vehicle.interface import ControlledPlant, Vehicle
 from sim.vehicle.linear import LinearVehicle
-from uavctl.config.sim import ChecksConfig
+from uavctl.arrays import SECOND_NS
 from uavctl.config.types import Config
-
-# What the simulated autopilot doubts of itself on request: pre-flight checks that flicker, a position not valid.
-
-
-CHECK_PERIOD_NS = 100_000_000
-
-
-class PreflightChecks:
-    """Pre-flight checks that change at random times, and spans in which the position is not valid.
-
-    Args:
-        seed: seed of the times at which checks change.
-
-    Attributes:
-        passing: whether what flickers passes, which counts while disarmed.
-        valid: whether the position may count as valid, which matters while armed.
-    """
-
-    def __init__(self, config: ChecksConfig, seed: np.random.SeedSequence, start_ns: int) -> None:
-        self._config = config
-        self._rng = np.random.default_rng(np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 0)))
-        self._next_check_ns = start_ns
-        self._change_ns = self._draw_change_ns(start_ns)
-        self._armed_ns: int | None = None
-        self.are_passing = self.is_position_valid = True
-
-    @property
-    def next_ns(self) -> int | None:
-        """Time of the next look [ns]; None if no check ever changes."""
-        return self._next_check_ns if self._config.flicker_s or self._config.invalid else None
-
-    def run(self, at_ns: int, *, is_armed: bool) -> None:
-        """Change the checks, if it is time."""
-        if self.next_ns is None or at_ns < self._next_check_ns:
-            return
-        self._next_check_ns = at_ns + CHECK_PERIOD_NS
-        self._armed_ns = (self._armed_ns or at_ns) if is_armed else None
-        self.is_position_valid = self._armed_ns is None or not is_within(self._config.invalid, at_ns - self._armed_ns)
-        if self._config.flicker_s and at_ns >= self._change_ns:
-            self.are_passing = not self.are_passing
-            self._change_ns = self._draw_change_ns(at_ns)
-
-    def _draw_change_ns(self, at_ns: int) -> int:
-        return at_ns + round(1e9 * self._config.flicker_s * self._rng.exponential())
-
-
-# The vehicle's own failsafes, beside that on setpoints: position lost, fence, battery low, ground station gone.
-
-
-SECOND_NS = 1_000_000_000
-FAILSAFE_PERIOD_NS = SECOND_NS // 10
-# ArduPilot: ten bad looks at 10 Hz before its estimator's failsafe acts, as recorded.
-EKF_CHECK_NS = SECOND_NS
-# Modes by GF_ACTION and FENCE_ACTION; the values that are not here only warn.
-PX4_FENCE_MODES = {2.0: "AUTO.LOITER", 3.0: "AUTO.RTL", 5.0: "AUTO.LAND"}
-ARDUPILOT_FENCE_MODES = {1.0: "RTL", 2.0: "LAND"}
-
-
-class Failsafes:
-    """Failsafes of the autopilot, looked at ten times a second while armed."""
-
-    def __init__(
-        self,
-        profile: SimulatedProfile,
-        pilot: Pilot,
-        parameters: Parameters,
-        estimator: Estimator,
-        battery: Battery,
-        *,
-        can_clear: bool = False,
-    ) -> None:
-        self._is_px4 = profile.name == "px4"
-        self._get_mode_by_role, self._get_mode = profile.get_mode_by_role, profile.get_mode
-        self._pilot = pilot
-        self._parameters = parameters
-        self._estimator = estimator
-        self._battery = battery
-        self._next_check_ns = 0
-        self._lost_ns: int | None = None  # since when the position is lost
-        self._low_ns: int | None = None  # since when the battery is low
-        self._has_warned = False
-        self._can_clear = can_clear
-        self._previous_mode: Mode | None = None  # what it flew before its position was lost
-        self.gcs_heartbeat_ns: int | None = None  # last heartbeat of the ground station
-
-    @property
-    def next_ns(self) -> int | None:
-        """Time of the next look [ns]; None while disarmed."""
-        return self._next_check_ns if self._pilot.is_armed else None
-
-    def run(self, at_ns: int) -> None:
-        """Look for the cause of a failsafe, if it is time."""
-        if not self._pilot.is_armed:
-            self._lost_ns = self._low_ns = self._previous_mode = None
-            self._has_warned = self._pilot.is_fence_breached = False
-            return
-        if self._next_check_ns > at_ns:
-            return
-        self._next_check_ns = at_ns + FAILSAFE_PERIOD_NS
-        if self._previous_mode is not None:
-            self._check_recovery(at_ns)
-        if self._pilot.phase is not Phase.GROUND:
-            self._check_position(at_ns)
-            self._check_fence(at_ns)
-            self._check_battery(at_ns)
-            self._check_gcs(at_ns)
-
-    def _land(self, at_ns: int, *texts: str) -> None:
-        self._pilot.status_texts.extend((CRITICAL, text) for text in texts)
-        if self._pilot.mode.role is not Role.LAND:
-            self._pilot.enter_failsafe(self._get_mode_by_role(Role.LAND), at_ns)
-
-    def _check_recovery(self, at_ns: int) -> None:
-        """End a failsafe for want of a position with its cause, as recorded, if nobody has changed the mode since."""
-        if not self._pilot.is_failsafe:
-            self._previous_mode = None
-        elif self._estimator.is_position_valid and self._previous_mode is not None:
-            self._pilot.end_failsafe(self._previous_mode, at_ns)
-            self._previous_mode = None
-
-    def _check_position(self, at_ns: int) -> None:
-        if self._estimator.is_position_valid:
-            self._lost_ns = None
-            return
-        is_first = self._lost_ns is None
-        self._lost_ns = at_ns if self._lost_ns is None else self._lost_ns
-        mode = self._pilot.mode
-        # As recorded: PX4's landing is content with a position that is not trusted. Without any it descends.
-        must_descend = self._is_px4 and not self._estimator.has_position
-        if not (mode.needs_position or (must_descend and mode is self._get_mode_by_role(Role.LAND))):
-            return
-        if self._is_px4:
-            self._previous_mode = mode if self._can_clear else None
-            self._pilot.status_texts.append((CRITICAL, "Failsafe activated"))
-            self._pilot.enter_failsafe(
-                self._get_mode("AUTO.DESCEND") if must_descend else self._get_mode_by_role(Role.LAND), at_ns
-            )
-        elif at_ns - self._lost_ns >= EKF_CHECK_NS and self._parameters["FS_EKF_ACTION"] == 1:
-            self._land(at_ns, "EKF variance", "EKF Failsafe: changed to LAND Mode")
-        elif is_first and self._parameters["FS_EKF_ACTION"] == 0:
-            self._pilot.status_texts.append((CRITICAL, "EKF variance"))
-
-    def _check_fence(self, at_ns: int) -> None:
-        """Act as the vehicle first comes beyond the height of its fence; an ArduPilot's heartbeats show no failsafe."""
-        p, pilot = self._parameters, self._pilot
-        ceiling_m = p["GF_MAX_VER_DIST"] if self._is_px4 else p["FENCE_ALT_MAX"] * p["FENCE_ENABLE"]
-        action = p["GF_ACTION"] if self._is_px4 else p["FENCE_ACTION"]
-        was_breached = pilot.is_fence_breached
-        pilot.is_fence_breached = 0.0 < ceiling_m < pilot.home_m[2] - self._estimator.position_m[2]
-        if not self._is_px4 and was_breached and not pilot.is_fence_breached:
-            pilot.status_texts.append((NOTICE, "Fence breach cleared"))
-        if was_breached or not pilot.is_fence_breached or (self._is_px4 and action == 0):
-            return
-        if self._is_px4:
-            pilot.status_texts.append((CRITICAL, "Geofence: exceeding maximum altitude above Home"))
-        else:
-            pilot.status_texts.append((NOTICE, "Max Alt fence breached"))
-        modes = PX4_FENCE_MODES if self._is_px4 else ARDUPILOT_FENCE_MODES
-        mode = self._get_mode(modes[action]) if action in modes else None
-        if mode is None or pilot.mode.role is Role.LAND:
-            return
-        if self._is_px4:
-            pilot.status_texts.append((CRITICAL, "Failsafe activated"))
-        pilot.enter_failsafe(
-            mode if self._estimator.is_position_valid else self._get_mode_by_role(Role.LAND),
-            at_ns,
-            is_shown=self._is_px4,
-        )
-
-    def _check_battery(self, at_ns: int) -> None:
-        p = self._parameters
-        if self._is_px4:
-            self._check_charge(at_ns)
-        elif not 0.0 < self._battery.voltage_v < p["BATT_LOW_VOLT"]:
-            self._low_ns = None
-        else:
-            self._low_ns = at_ns if self._low_ns is None else self._low_ns
-            if at_ns - self._low_ns >= p["BATT_LOW_TIMER"] * SECOND_NS and not self._has_warned:
-                self._has_warned = True
-                self._pilot.status_texts.append((WARNING, f"Battery 1 is low {self._battery.voltage_v:.2f}V"))
-                if p["BATT_FS_LOW_ACT"] == 1:
-                    self._land(at_ns, "Battery Failsafe")
-
-    def _check_charge(self, at_ns: int) -> None:
-        p, charge = self._parameters, self._battery.remaining
-        if charge < p["BAT_LOW_THR"] and not self._has_warned:
-            self._has_warned = True
-            self._pilot.status_texts.append((WARNING, "Low battery level"))
-        must_land = charge < p["BAT_CRIT_THR"] and p["COM_LOW_BAT_ACT"] == 2
-        if must_land and self._pilot.mode.role is not Role.LAND:
-            self._land(at_ns, "Failsafe activated: critical battery, landing")
-
-    def _check_gcs(self, at_ns: int) -> None:
-        p = self._parameters
-        action, timeout = ("NAV_DLL_ACT", "COM_DL_LOSS_T") if self._is_px4 else ("FS_GCS_ENABLE", "FS_GCS_TIMEOUT")
-        if p[action] == 0 or self.gcs_heartbeat_ns is None or at_ns - self.gcs_heartbeat_ns < p[timeout] * SECOND_NS:
-            return
-        if self._is_px4 and p[action] == 1:
-            if self._pilot.mode.role not in (Role.HOLD, Role.LAND):
-                self._pilot.status_texts.append((CRITICAL, "Failsafe activated: no ground station"))
-                self._pilot.enter_failsafe(self._get_mode_by_role(Role.HOLD), at_ns)
-        elif self._pilot.mode.role is not Role.LAND:
-            self._land(at_ns, "Failsafe activated: no ground station" if self._is_px4 else "GCS Failsafe")
-
-
-# PX4's idea of another computer's clock, from that one's answers to its TIMESYNC requests.
-#
-# Rules and figures are those of PX4's src/lib/timesync/Timesync.{hpp,cpp}: an answer counts if it came back in less
-# than 10 ms; after 500 of them, so after 50 s at 10 Hz, stamps of what it receives are moved by the offset found.
-# Until then they are not looked at: what arrives is taken as of now. Offset and skew are smoothed with gains that fall
-# from 0.05 to 0.003 over those 500.
-
-
-CONVERGENCE_COUNT = 500
-MAX_ROUND_TRIP_NS = 10_000_000
-MAX_DEVIATION_NS = 100_000_000
-MAX_OUTLIERS = 5  # in a row; one more, and it begins anew
-FIRST_GAIN, LAST_GAIN = 0.05, 0.003
-
-
-class PeerClock:
-    """Clock of one peer, estimated by TIMESYNC."""
-
-    def __init__(self) -> None:
-        self._restart()
-
-    def _restart(self) -> None:
-        self._count = self._outlier_count = 0
-        self._offset_ns = self._skew_ns = 0.0
-
-    @property
-    def is_converged(self) -> bool:
-        """Whether the offset is known, so that the peer's stamps are converted."""
-        return self._count >= CONVERGENCE_COUNT
-
-    def add_answer(self, request_ns: int, peer_ns: int, now_ns: int) -> None:
-        """Take an answer to TIMESYNC.
-
-        Args:
-            asked_ns: own time of the request, as the answer gives it back.
-            theirs_ns: the peer's time in it; only one after 0 is an answer.
-        """
-        if peer_ns <= 0 or not 0 <= now_ns - request_ns < MAX_ROUND_TRIP_NS:
-            return
-        offset_ns = (request_ns + now_ns) / 2 - peer_ns
-        if self.is_converged and abs(self._offset_ns - offset_ns) > MAX_DEVIATION_NS:
-            self._outlier_count += 1
-            if self._outlier_count > MAX_OUTLIERS:
-                self._restart()
-            return
-        self._filter_offset(offset_ns)
-        self._count += 1
-        self._outlier_count = 0
-
-    def _filter_offset(self, offset_ns: float) -> None:
-        if self._count == 0:
-            self._offset_ns = offset_ns
-            return
-        previous_ns, gain = self._offset_ns, self._gain
-        self._offset_ns = gain * offset_ns + (1.0 - gain) * (previous_ns + self._skew_ns)
-        self._skew_ns = gain * (self._offset_ns - previous_ns) + (1.0 - gain) * self._skew_ns
-
-    @property
-    def _gain(self) -> float:
-        """Present filter gain, the same for offset and skew."""
-        if self.is_converged:
-            return LAST_GAIN
-        last_share = 1.0 - math.exp(0.5 * (1.0 - 1.0 / (1.0 - self._count / CONVERGENCE_COUNT)))
-        return last_share * LAST_GAIN + (1.0 - last_share) * FIRST_GAIN
-
-    def convert_ns(self, stamp_ns: int, now_ns: int) -> int:
-        """Convert a stamp of the peer to own time [ns]; it counts as now until the peer's clock is known."""
-        return stamp_ns + round(self._offset_ns) if self.is_converged else now_ns
-
 
 COMPONENT_ID = 1
 # Age of the autopilot at the start of the simulation, so that its clock is neither zero nor ours.

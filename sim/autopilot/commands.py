@@ -9,7 +9,8 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sim.autopilot.pilot import CRITICAL, FORCE_ARM_CODE, INFO, check_preflight
+from sim.autopilot.arming import check_preflight
+from sim.autopilot.pilot import CRITICAL, FORCE_ARM_CODE, INFO
 from sim.autopilot.profile import ACCEPTED, DENIED, FAILED, UNSUPPORTED, Mode, Role, make_px4_custom_mode
 from sim.autopilot.telemetry import (
     AUTOPILOT_VERSION,

@@ -11,11 +11,12 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from sim.autopilot.profile import Parameters, SimulatedProfile
+from sim.autopilot.parameters import Parameters
+from sim.autopilot.profile import SimulatedProfile
 from sim.vehicle.interface import ZERO, Vehicle, rotate_to_ned, subtract
+from uavctl.arrays import SECOND_NS
 from uavctl.records import Vec3
 
-SECOND_NS = 1_000_000_000
 STEP_NS = 20_000_000
 ACCEL_BIAS_MPS2: Vec3 = (-0.0187, 0.0155, 0.0)  # fitted to the recorded drift: 0.54 m north, -0.43 m east in 7.6 s
 LOST_NS = 7_200_000_000  # ArduPilot: from the last sample to flags 0x25

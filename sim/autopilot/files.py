@@ -16,7 +16,7 @@ from urllib.parse import parse_qsl
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sim.autopilot.profile import Parameters, ParameterType
+from sim.autopilot.parameters import Parameters, ParameterType
 from sim.autopilot.telemetry import Message
 
 PARAMETER_FILE = "@PARAM/param.pck"

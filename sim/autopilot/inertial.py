@@ -15,8 +15,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sim.vehicle.airframe import GRAVITY_MPS2
 from sim.vehicle.interface import Quaternion, Vehicle, rotate_to_body
-from sim.vehicle.rigid_body import GRAVITY_MPS2, rotate_attitude
+from sim.vehicle.rigid_body import rotate_attitude
 from uavctl.records import Vec3
 
 DRIFT_S, WANDER_S, HEADING_S = 60.0, 4.0, 30.0  # time constants

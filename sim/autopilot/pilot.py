@@ -1,152 +1,24 @@
-"""Pilot of the simulated autopilot: modes, arming, phases of flight, and whose setpoint is flown.
+"""State machine of the simulated autopilot: modes, arming, phases of flight, and setpoint source.
 
-No bytes here: `autopilot.py` translates. There is no free fall, so disarming in the air is refused,
-forced or not.
+It handles no bytes: `autopilot.py` translates. There is no free fall, so it refuses to disarm in the air, forced or
+not.
 """
 
 from __future__ import annotations
 
-import math
 from enum import Enum
 
+from sim.autopilot.arming import find_arming_refusals
+from sim.autopilot.dispatch import SetpointDispatch
 from sim.autopilot.estimator import Estimator
-from sim.autopilot.profile import (
-    ACCEPTED,
-    FAILED,
-    STOP,
-    TEMPORARILY_REJECTED,
-    Mode,
-    Parameters,
-    ParsedSetpoint,
-    Role,
-    SetpointKind,
-    SimulatedProfile,
-)
+from sim.autopilot.parameters import Parameters
+from sim.autopilot.profile import ACCEPTED, FAILED, TEMPORARILY_REJECTED, Mode, Role, SimulatedProfile
+from sim.autopilot.setpoints import STOP, ParsedSetpoint, SetpointKind
 from sim.channel import find_earliest_ns
-from sim.vehicle.interface import Battery, ControlledPlant, Vehicle
+from sim.vehicle.interface import ControlledPlant, Vehicle
+from uavctl.arrays import SECOND_NS
 from uavctl.records import Vec3
 
-# Arming checks: why a vehicle will not arm, in the words of each autopilot.
-
-
-# ArduCopter with external positions only: seen to be ready so long after boot, the estimator long before.
-READY_NS = 24_000_000_000
-
-
-def find_arming_refusals(
-    profile: SimulatedProfile,
-    mode: Mode,
-    parameters: Parameters,
-    estimator: Estimator,
-    battery: Battery,
-    boot_age_ns: int,
-) -> tuple[str, ...]:
-    """Return the reasons against arming as texts of STATUSTEXT; none if it may arm."""
-    refusals = list(check_preflight(profile, parameters, estimator, battery, boot_age_ns))
-    if mode.role is Role.LAND:
-        refusals.append(
-            "Arming denied: switch out of the landing mode" if profile.name == "px4" else "Arm: Land mode not armable"
-        )
-    return tuple(refusals)
-
-
-def check_preflight(
-    profile: SimulatedProfile, parameters: Parameters, estimator: Estimator, battery: Battery, boot_age_ns: int
-) -> tuple[str, ...]:
-    """Return the reasons against arming in any mode; without any, SYS_STATUS has its pre-arm bit set."""
-    return (
-        _check_px4(parameters, estimator, battery)
-        if profile.name == "px4"
-        else _check_ardupilot(parameters, estimator, battery, boot_age_ns)
-    )
-
-
-def _check_px4(parameters: Parameters, estimator: Estimator, battery: Battery) -> tuple[str, ...]:
-    checks = (
-        (estimator.passes_checks, "Arming denied: Resolve system health failures first"),
-        (estimator.is_position_valid, "Preflight Fail: no valid local position estimate"),
-        (estimator.has_height, "Preflight Fail: height estimate not stable"),
-        (estimator.has_heading, "Preflight Fail: heading estimate not stable"),
-        (battery.remaining > parameters["BAT_LOW_THR"], "Preflight Fail: low battery"),
-    )
-    return tuple(text for passes, text in checks if not passes)
-
-
-def _check_ardupilot(
-    parameters: Parameters, estimator: Estimator, battery: Battery, boot_age_ns: int
-) -> tuple[str, ...]:
-    uses_external = estimator.uses_external
-    checks = (
-        (estimator.passes_checks, "PreArm: Internal errors"),
-        (
-            estimator.is_position_valid,
-            "PreArm: VisOdom: not healthy" if uses_external else "PreArm: Need Position Estimate",
-        ),
-        (estimator.has_height, "PreArm: EKF3 waiting for height source"),
-        (estimator.has_heading, "PreArm: EKF3 yaw source not available"),
-        (not uses_external or boot_age_ns >= READY_NS, "PreArm: EKF3 still initialising"),
-        (battery.voltage_v > parameters["BATT_LOW_VOLT"], "PreArm: Battery 1 low voltage failsafe"),
-    )
-    return tuple(text for passes, text in checks if not passes)
-
-
-# From a setpoint to what is asked of the craft, and where its nose points.
-
-
-MIN_HEADING_SPEED_MPS = 0.5  # ArduPilot: the nose follows travel from this speed on
-
-
-class SetpointDispatch:
-    """Passes setpoints on to the craft.
-
-    Attributes:
-        obeyed: the setpoint that is flown, None if the vehicle flies by itself.
-    """
-
-    def __init__(
-        self,
-        profile: SimulatedProfile,
-        vehicle: Vehicle,
-        parameters: Parameters,
-        estimator: Estimator,
-        active_setpoint: ParsedSetpoint | None,
-    ) -> None:
-        self._is_ardupilot = profile.name == "ardupilot"
-        self._vehicle = vehicle
-        self._parameters = parameters
-        self._estimator = estimator
-        self.active_setpoint = active_setpoint
-
-    def apply(self, setpoint: ParsedSetpoint) -> None:
-        """Fly a setpoint; one that asks for nothing flyable stops the vehicle."""
-        self.active_setpoint = None if setpoint.kind is SetpointKind.STOP else setpoint
-        match setpoint.kind:
-            case SetpointKind.ACCELERATION:
-                self._vehicle.accelerate(setpoint.vector)
-            case SetpointKind.VELOCITY:
-                self._vehicle.fly(setpoint.vector)
-            case SetpointKind.POSITION if setpoint.velocity_mps is not None:
-                self._vehicle.follow(setpoint.vector, setpoint.velocity_mps, setpoint.accel_mps2)
-            case SetpointKind.POSITION:
-                self._vehicle.go_to(setpoint.vector)
-            case _:
-                self._vehicle.brake()
-        self._update_heading(setpoint)
-
-    def _update_heading(self, setpoint: ParsedSetpoint) -> None:
-        """Turn to the heading asked for; without one ArduPilot looks along its way, and PX4 stays as it is."""
-        north, east, _ = self._estimator.velocity_mps
-        if setpoint.yaw_rad is not None:
-            self._vehicle.set_heading(setpoint.yaw_rad)
-        elif (
-            self._is_ardupilot
-            and self._parameters["WP_YAW_BEHAVIOR"] != 0
-            and math.hypot(north, east) > MIN_HEADING_SPEED_MPS
-        ):
-            self._vehicle.set_heading(math.atan2(east, north))
-
-
-SECOND_NS = 1_000_000_000
 CHECK_PERIOD_NS = 20_000_000  # how often height and floor are looked at
 # PX4 takes OFFBOARD while the newest setpoint is younger than COM_OF_LOSS_T; its documentation asks for 2 Hz, so here
 # never longer than that.

@@ -1,4 +1,4 @@
-"""Telemetry of the simulated autopilot: messages, rates, geodesy."""
+"""Telemetry of the simulated autopilot: messages, their contents and their rates."""
 
 from __future__ import annotations
 
@@ -9,129 +9,18 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from sim.autopilot.arming import check_preflight
 from sim.autopilot.estimator import Estimator
+from sim.autopilot.geodesy import GeodeticOrigin
 from sim.autopilot.inertial import InertialSensors
-from sim.autopilot.pilot import Phase, Pilot, check_preflight
-from sim.autopilot.profile import (
-    IGNORE_ACCEL,
-    IGNORE_POSITION,
-    IGNORE_VELOCITY,
-    IGNORE_YAW,
-    Parameters,
-    Role,
-    SetpointKind,
-    SimulatedProfile,
-)
-from sim.vehicle.interface import ZERO, Quaternion, Vehicle, compute_heading_rad
-from sim.vehicle.rigid_body import GRAVITY_MPS2
+from sim.autopilot.parameters import Parameters
+from sim.autopilot.pilot import Phase, Pilot
+from sim.autopilot.position_target import make_position_target
+from sim.autopilot.profile import SimulatedProfile
+from sim.vehicle.airframe import GRAVITY_MPS2
+from sim.vehicle.interface import Vehicle, compute_heading_rad
 from uavctl.records import Vec3
 
-# Local NED to latitude and longitude, flat around the origin.
-
-
-EARTH_M = 6378137.0
-MAX_E7 = 2**31 - 1
-
-
-@dataclass(frozen=True)
-class GeodeticOrigin:
-    """Geographic position of local NED's zero."""
-
-    latitude_deg: float
-    longitude_deg: float
-    altitude_m: float
-
-    def compute_degrees_e7(self, position_m: Vec3) -> tuple[int, int]:
-        """Return latitude and longitude of a place, in MAVLink's unit [1e-7 degrees]."""
-        lat = self.latitude_deg + math.degrees(position_m[0] / EARTH_M)
-        lon = self.longitude_deg + math.degrees(position_m[1] / (EARTH_M * self._longitude_scale))
-        return _clip_e7(1e7 * lat), _clip_e7(1e7 * lon)
-
-    def compute_altitude_mm(self, position_m: Vec3) -> int:
-        """Return the height of a place above the sea [mm]."""
-        return _clip_e7(1000.0 * (self.altitude_m - position_m[2]))
-
-    def compute_local_m(self, latitude_deg: float, longitude_deg: float, altitude_m: float) -> Vec3:
-        """Return a place on the globe in local NED [m]."""
-        return (
-            math.radians(latitude_deg - self.latitude_deg) * EARTH_M,
-            math.radians(longitude_deg - self.longitude_deg) * EARTH_M * self._longitude_scale,
-            self.altitude_m - altitude_m,
-        )
-
-    @property
-    def _longitude_scale(self) -> float:
-        return max(math.cos(math.radians(self.latitude_deg)), 1e-3)
-
-
-def _clip_e7(value: float) -> int:
-    return min(max(round(value), -MAX_E7 - 1), MAX_E7)
-
-
-# POSITION_TARGET_LOCAL_NED: what is flown, as each autopilot tells it (masks and unset numbers as recorded).
-
-
-IGNORE_YAW_RATE = 0x800
-UNSET: Vec3 = (math.nan, math.nan, math.nan)
-DOWN: Vec3 = (0.0, 0.0, 100.0)  # acceleration with which PX4 presses itself to the floor
-TargetFields = tuple[int, Vec3, Vec3, Vec3]  # type mask, position, velocity, acceleration
-
-
-def make_position_target(
-    profile: SimulatedProfile, pilot: Pilot, estimator: Estimator, attitude: Quaternion, boot_ms: int
-) -> Any:
-    """Return POSITION_TARGET_LOCAL_NED (pymavlink's classes have no types); None where there is nothing to tell.
-
-    Args:
-        estimator: where the vehicle believes to be.
-    """
-    is_px4 = profile.name == "px4"
-    fields = _make_px4_target(pilot, estimator) if is_px4 else _make_ardupilot_target(pilot)
-    if fields is None:
-        return None
-    mask, *vectors = fields
-    numbers = [number for vector in vectors for number in vector]
-    setpoint = pilot.dispatch.active_setpoint
-    yaw_rad = None if setpoint is None else setpoint.yaw_rad
-    yaw = compute_heading_rad(attitude) if yaw_rad is None and is_px4 else yaw_rad or 0.0
-    return mavlink.MAVLink_position_target_local_ned_message(boot_ms, 1, mask, *numbers, yaw, 0.0)
-
-
-def _make_px4_target(pilot: Pilot, estimator: Estimator) -> TargetFields:
-    """Return PX4's target, sent always: in modes of its own it plans position, velocity and acceleration."""
-    setpoint = pilot.dispatch.active_setpoint
-    if setpoint is not None and setpoint.kind is SetpointKind.ACCELERATION:
-        return IGNORE_POSITION | IGNORE_VELOCITY, UNSET, UNSET, setpoint.vector
-    if setpoint is not None and setpoint.kind is SetpointKind.VELOCITY:
-        return IGNORE_POSITION, UNSET, setpoint.vector, ZERO
-    if setpoint is not None:
-        return 0, setpoint.vector, setpoint.velocity_mps or ZERO, setpoint.accel_mps2
-    if pilot.phase is Phase.GROUND:
-        return IGNORE_POSITION | IGNORE_VELOCITY, UNSET, UNSET, DOWN
-    return 0, estimator.position_m, estimator.velocity_mps, ZERO
-
-
-def _make_ardupilot_target(pilot: Pilot) -> TargetFields | None:
-    """Return ArduPilot's target, sent in GUIDED only: rest and braking by a velocity, a climb to a position."""
-    if pilot.mode.role is not Role.EXTERNAL:
-        return None
-    no_yaw = IGNORE_YAW | IGNORE_YAW_RATE
-    setpoint = pilot.dispatch.active_setpoint
-    if setpoint is not None and setpoint.kind is SetpointKind.ACCELERATION:
-        return IGNORE_POSITION | IGNORE_VELOCITY | no_yaw, ZERO, ZERO, setpoint.vector
-    if setpoint is not None and setpoint.kind is SetpointKind.POSITION and setpoint.velocity_mps is not None:
-        return no_yaw, setpoint.vector, setpoint.velocity_mps, setpoint.accel_mps2
-    if setpoint is not None and setpoint.kind is SetpointKind.POSITION:
-        return IGNORE_VELOCITY | IGNORE_ACCEL | no_yaw, setpoint.vector, ZERO, ZERO
-    if setpoint is None and pilot.is_armed and pilot.phase is not Phase.AIR:
-        return IGNORE_VELOCITY | IGNORE_ACCEL | no_yaw, ZERO, ZERO, ZERO
-    return IGNORE_POSITION | no_yaw, ZERO, ZERO if setpoint is None else setpoint.vector, ZERO
-
-
-# What the simulated vehicle tells: its messages, their contents, and how often each goes out.
-
-
-SECOND_NS = 1_000_000_000
 SHORTEST_INTERVAL_NS = 1_000_000
 ARMED_FLAG = 128  # MAV_MODE_FLAG
 CAPACITY_MAH = 240.0

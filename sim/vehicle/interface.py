@@ -8,7 +8,7 @@ from enum import Enum, auto
 from typing import Protocol
 
 from sim.vehicle.linear import LinearVehicle
-from sim.vehicle.loops import (
+from sim.vehicle.motion_laws import (
     BRAKE_MPS2,
     compute_approach_velocity,
     compute_brake_accel,
@@ -152,7 +152,7 @@ class _Goal(Enum):
 
 
 class ControlledPlant:
-    """Linear plant with simple laws (`steering.py`) in place of loops; always level, its nose north.
+    """Linear plant with simple laws (`motion_laws.py`) in place of loops; always level, its nose north.
 
     Its laws are evaluated at `next_ns`, every 20 ms, and when something new is asked.
     """

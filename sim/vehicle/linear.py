@@ -10,14 +10,12 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag, expm, logm
 
+from uavctl.arrays import Array
 from uavctl.config.types import Config, PlantConfig
 from uavctl.errors import DesignError
 from uavctl.records import Vec3
-
-Array = NDArray[np.float64]
 
 NED_AXES = ("north", "east", "down")
 # A setpoint beyond ten g is no acceleration that a multicopter can try; it is limited there, and

@@ -6,26 +6,25 @@ import math
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sim.vehicle.airframe import CRAZYFLIE_2, GRAVITY_MPS2, Airframe
+from sim.vehicle.attitude_loop import AttitudeLoop
+from sim.vehicle.battery import BatteryModel
 from sim.vehicle.linear import MAX_ACCEL_MPS2, LinearModel
-from sim.vehicle.loops import AttitudeLoop, Cascade
+from sim.vehicle.loops import Cascade
 from sim.vehicle.rigid_body import (
-    CRAZYFLIE_2,
-    GRAVITY_MPS2,
     LEVEL,
-    Airframe,
-    BatteryModel,
     Body,
     BodyState,
     Quaternion,
-    Rotors,
     compute_acceleration,
     integrate_step,
     reduce_tilt,
     rotate_attitude,
 )
+from sim.vehicle.rotors import Rotors
 from sim.wind import Wind
+from uavctl.arrays import Array
 from uavctl.records import Vec3
 
 STEP_NS = 2_500_000
@@ -149,7 +148,7 @@ class Quadrotor:
         return self._grounded or (self._touched_ns is not None and self.now_ns - self._touched_ns >= LANDED_NS)
 
     @property
-    def state(self) -> NDArray[np.float64]:
+    def state(self) -> Array:
         """State x (n_x,) of the controller's plant: positions, velocities, and what thrust and gravity accelerate."""
         x = np.zeros(self.model.a.shape[0])
         position, velocity, thrust_accel = self.position_m, self.velocity_mps, self._compute_thrust_accel()
@@ -160,7 +159,7 @@ class Quadrotor:
         return x
 
     @property
-    def input(self) -> NDArray[np.float64]:
+    def input(self) -> Array:
         """Input u (n_u,) of the controller's plant: the acceleration setpoint, in the plant's units; else zero."""
         return np.array([self._accel[axis] for axis in self.model.axes]) / self.model.accel_per_input
 

@@ -10,8 +10,10 @@ import pytest
 from check_rig import Checked, Hand, S, look, twisted
 from mavlink_rig import packets, read
 
-from uavctl.check.findings import CheckData, ItemState, Sample
-from uavctl.check.preflight import Preflight, check_axes, has_vehicle_position
+from uavctl.check.axes import check_axes, has_vehicle_position
+from uavctl.check.check_data import CheckData, Sample
+from uavctl.check.findings import ItemState
+from uavctl.check.preflight import Preflight
 from uavctl.config import load_config
 from uavctl.loop import make_links
 from uavctl.mavlink.messages import Heartbeat

@@ -13,8 +13,8 @@ from sim_rig import decode
 
 from sim.simulation import Peers
 from uavctl.check.findings import ItemState, find_refusals, make_item
+from uavctl.check.parameters import list_parameters
 from uavctl.check.preflight import Preflight
-from uavctl.check.vehicle import list_parameters
 from uavctl.config import load_config
 from uavctl.config.connections import CheckConfig
 from uavctl.lab.own_loop import EXTERNAL_ONLY

@@ -18,8 +18,8 @@ from places import ROOT
 
 from sim.simulation import Peers
 from uavctl.check.findings import ItemState, describe_item, find_refusals
+from uavctl.check.parameters import RULES, ParameterVerdict
 from uavctl.check.preflight import Preflight
-from uavctl.check.vehicle import RULES, ParameterVerdict
 from uavctl.cli.init import read_sizes, room_text
 from uavctl.config import Config, load_config, parse
 from uavctl.config.checks import get_position_limits_m

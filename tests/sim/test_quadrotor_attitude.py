@@ -7,18 +7,11 @@ import pytest
 from quadrotor_rig import HOVER_SUM_RPS, Array, quadrotor, run
 from scipy.linalg import expm
 
-from sim.vehicle.loops import YAW_INTEGRAL_1PS2, YAW_RATE_GAIN_1PS, AttitudeLoop, compute_attitude_setpoint
+from sim.vehicle.airframe import CRAZYFLIE_2, GRAVITY_MPS2
+from sim.vehicle.attitude_loop import YAW_INTEGRAL_1PS2, YAW_RATE_GAIN_1PS, AttitudeLoop, compute_attitude_setpoint
 from sim.vehicle.quadrotor import STEP_S
-from sim.vehicle.rigid_body import (
-    CRAZYFLIE_2,
-    GRAVITY_MPS2,
-    LEVEL,
-    Body,
-    BodyState,
-    Rotors,
-    integrate_step,
-    rotate_attitude,
-)
+from sim.vehicle.rigid_body import LEVEL, Body, BodyState, integrate_step, rotate_attitude
+from sim.vehicle.rotors import Rotors
 from uavctl.records import Vec3
 
 DRAG_1PS = CRAZYFLIE_2.rotor_drag_kg[0] * HOVER_SUM_RPS / CRAZYFLIE_2.mass_kg  # at hover

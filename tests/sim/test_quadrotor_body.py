@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
+from sim.vehicle.airframe import AIR_DENSITY_KGPM3, CRAZYFLIE_2, GRAVITY_MPS2
 from sim.vehicle.rigid_body import (
-    AIR_DENSITY_KGPM3,
-    CRAZYFLIE_2,
-    GRAVITY_MPS2,
     LEVEL,
     Body,
     BodyState,

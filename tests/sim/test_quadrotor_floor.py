@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 from quadrotor_rig import BOTH, Autopilot, allowing, quadrotor, run, steady
 
+from sim.vehicle.airframe import CRAZYFLIE_2, GRAVITY_MPS2
+from sim.vehicle.battery import BatteryModel
 from sim.vehicle.interface import Vehicle
 from sim.vehicle.loops import TUNINGS
 from sim.vehicle.quadrotor import STEP_NS, Quadrotor
-from sim.vehicle.rigid_body import CRAZYFLIE_2, GRAVITY_MPS2, LEVEL, BatteryModel
+from sim.vehicle.rigid_body import LEVEL
 
 
 @pytest.mark.parametrize("autopilot", BOTH)

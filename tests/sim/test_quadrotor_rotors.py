@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sim.vehicle.rigid_body import CRAZYFLIE_2, GRAVITY_MPS2, STOPPED, BatteryModel, Rotors
+from sim.vehicle.airframe import CRAZYFLIE_2, GRAVITY_MPS2
+from sim.vehicle.battery import BatteryModel
+from sim.vehicle.rotors import STOPPED, Rotors
 from uavctl.records import Vec3
 
 Array = NDArray[np.float64]

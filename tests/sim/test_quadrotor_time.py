@@ -7,9 +7,9 @@ import pytest
 from quadrotor_rig import MODEL, gusty, quadrotor, run, tilt
 from scipy.spatial.transform import Rotation
 
+from sim.vehicle.airframe import CRAZYFLIE_2, GRAVITY_MPS2
 from sim.vehicle.linear import LinearVehicle, make_linear_model
 from sim.vehicle.quadrotor import STEP_NS, Quadrotor
-from sim.vehicle.rigid_body import CRAZYFLIE_2, GRAVITY_MPS2
 from uavctl.config import load_config
 from uavctl.records import Vec3
 

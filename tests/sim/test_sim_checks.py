@@ -6,7 +6,7 @@ import pytest
 from sim_rig import decode
 from take_off_rig import Flight
 
-from sim.autopilot.autopilot import PreflightChecks
+from sim.autopilot.checks import PreflightChecks
 from uavctl.config import load_config
 from uavctl.config.sim import ChecksConfig
 from uavctl.errors import ConfigError

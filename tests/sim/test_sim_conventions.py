@@ -8,7 +8,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from recorded_rig import packets
 from sim_rig import ARM, LAND, SET_MODE, TAKE_OFF, Bench, S, bench, decode, heartbeat
 
-from sim.autopilot.profile import TABLES
+from sim.autopilot.parameters import TABLES
 
 GUIDED, OFFBOARD, HOLD, BRAKE = (1, 4, 0), (1, 6, 0), (1, 4, 3), (1, 17, 0)
 RADIO, FENCE = 1 << 16, 1 << 20  # MAV_SYS_STATUS_SENSOR_RC_RECEIVER, MAV_SYS_STATUS_GEOFENCE

@@ -11,7 +11,8 @@ from autopilot_rig import Flight, Name
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from quadrotor_rig import S, quadrotor, run
 
-from sim.autopilot.profile import IGNORE_ACCEL, IGNORE_VELOCITY, SIMULATED, ParsedSetpoint, SetpointKind, parse_setpoint
+from sim.autopilot.profile import SIMULATED
+from sim.autopilot.setpoints import IGNORE_ACCEL, IGNORE_VELOCITY, ParsedSetpoint, SetpointKind, parse_setpoint
 from sim.vehicle.interface import LEVEL
 from sim.vehicle.quadrotor import Quadrotor
 from uavctl.lab.own_loop import EXTERNAL_ONLY

@@ -20,7 +20,8 @@ from scipy.spatial.transform import Rotation
 from sim.cameras import UPTIME_S
 from sim.fleet import make_fleet
 from sim.natnet import NatNetPort
-from sim.server import VehicleSetup, open_port, serve_all
+from sim.ports import open_port
+from sim.server import VehicleSetup, serve_all
 from uavctl.config import load_config
 from uavctl.errors import ConnectionSpecError
 from uavctl.frames import Frame, Up

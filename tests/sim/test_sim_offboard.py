@@ -6,7 +6,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import SET_MODE, bench, flying
 
-from sim.autopilot.profile import ParsedSetpoint, SetpointKind
+from sim.autopilot.setpoints import ParsedSetpoint, SetpointKind
 
 OFFBOARD = (1, 6, 0)
 

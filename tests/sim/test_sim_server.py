@@ -12,17 +12,8 @@ import pytest
 from patience import LIMIT_S, until
 from sim_rig import Client, decode
 
-from sim.server import (
-    MAX_STEP_NS,
-    Ready,
-    VehicleSetup,
-    compute_grid_start_ns,
-    open_port,
-    serve,
-    serve_all,
-    serve_in_child,
-    split_frames,
-)
+from sim.ports import open_port, split_frames
+from sim.server import MAX_STEP_NS, Ready, VehicleSetup, compute_grid_start_ns, serve, serve_all, serve_in_child
 from sim.simulation import Peers
 from uavctl.config import Config, load_config
 from uavctl.errors import ConnectionSpecError

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sim.autopilot.autopilot import CONVERGENCE_COUNT, PeerClock
+from sim.autopilot.peer_clock import CONVERGENCE_COUNT, PeerClock
 
 MS = 1_000_000
 OFFSET_NS = -7_123_456_789

@@ -16,7 +16,7 @@ from typing import Any, Literal
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import Bench, bench, decode
 
-from sim.autopilot.profile import TABLES
+from sim.autopilot.parameters import TABLES
 
 HANDLED = (
     "ATT_POS_MOCAP",

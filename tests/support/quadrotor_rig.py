@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from places import DATA
 from scipy.signal import lfilter
 
+from sim.vehicle.airframe import CRAZYFLIE_2, Airframe
+from sim.vehicle.battery import BatteryModel
 from sim.vehicle.linear import make_linear_model
 from sim.vehicle.quadrotor import STEP_NS, STEP_S, Quadrotor
-from sim.vehicle.rigid_body import CRAZYFLIE_2, Airframe, BatteryModel
 from sim.wind import Wind
 from uavctl.config import load_config
 from uavctl.records import Vec3

@@ -6,9 +6,10 @@ import math
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
-from uavctl.check.findings import CheckData, Item, ItemState, Sample, judge_item, make_item
+from uavctl.arrays import Array
+from uavctl.check.check_data import CheckData, Sample
+from uavctl.check.findings import Item, ItemState, judge_item, make_item
 from uavctl.config.checks import get_position_limits_m
 from uavctl.config.connections import parse_camera_scheme
 from uavctl.config.types import Config
@@ -30,7 +31,6 @@ _UNITS = ((1000.0, "millimetres"), (100.0, "centimetres"))
 CAMERA_AXES = (
     "does Motive stream Z up? Then the URL of daemon.mocap needs ?up=z, else not; see [frame] (origin_m, yaw_deg)"
 )
-Array = NDArray[np.float64]
 
 
 def check_positions(data: CheckData, config: Config, at_ns: int) -> list[Item]:

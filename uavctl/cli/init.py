@@ -13,7 +13,7 @@ from cyclopts import Parameter
 
 from uavctl.build.controller import LEAST_OUTSIDE_M, design_of, resting
 from uavctl.build.mission import resting_places
-from uavctl.check.vehicle import compute_max_accel_mps2
+from uavctl.check.parameters import compute_max_accel_mps2
 from uavctl.cli.common import messages
 from uavctl.config import parse
 from uavctl.errors import UsageError

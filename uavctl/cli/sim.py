@@ -19,7 +19,8 @@ from rich.live import Live
 
 from sim.faults import find_fault_problems
 from sim.fleet import make_fleet
-from sim.server import Port, PortWrapper, Ready, VehicleSetup, serve_all
+from sim.ports import Port
+from sim.server import PortWrapper, Ready, VehicleSetup, serve_all
 from sim.simulation import VehicleSnapshot
 from uavctl.build.rest import check_axes
 from uavctl.cli.common import DEFAULTS, Column, Common, WideTable, located, messages, write_document
