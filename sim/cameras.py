@@ -28,7 +28,7 @@ ZERO_VELOCITY: Vec3 = (0.0, 0.0, 0.0)
 UNKNOWN = [math.nan, *([0.0] * 20)]  # a covariance whose first element is NaN is unknown (message definitions)
 
 
-# Axes that the cameras may take for local NED; a row for each component that they say.
+# Axes that the cameras may use as local NED; a row for each reported component.
 AXES: dict[str, tuple[Vec3, Vec3, Vec3]] = {
     "right": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
     "turned-90": ((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
@@ -60,7 +60,7 @@ class Cameras:
     of the body in the frame, with body axes FRD in a NED frame, FLU in an ENU one.
 
     Each effect draws from its own generator, the same number of values for every sample whether the effect is on or
-    off, seen or not. So two runs with one seed differ only by the effects that differ.
+    off, visible or not. So two runs with one seed differ only by the effects that differ.
 
     Attributes:
         next_ns: time of the next sample [ns].
@@ -129,7 +129,7 @@ class Cameras:
             attitude: true attitude (w, x, y, z), body axes FRD to NED.
 
         Returns:
-            When the cameras send it [ns], and its datagram; None if they do not see the vehicle.
+            When the cameras send it [ns], and its datagram; None if the vehicle is hidden.
         """
         camera, at_ns = self._camera, self.next_ns
         since_ns = at_ns - self._start_ns

@@ -17,8 +17,6 @@ import numpy as np
 from uavctl.config.document import Spans
 from uavctl.config.link import LinkConfig
 
-# Spans of time of a configuration, and which of several times is the next.
-
 
 def is_within(spans: Spans, since_ns: int) -> bool:
     """Return whether a time since the start [ns] lies in one of the spans [s], their ends included."""
@@ -102,7 +100,7 @@ class Channel:
         self._packet_number = 0  # of the next packet
 
     def push(self, at_ns: int, data: bytes, *, is_certain: bool = False) -> None:
-        """Send a packet at `at_ns`; a `certain` one is not lost."""
+        """Send a packet at `at_ns`; the link never loses one that `is_certain`."""
         counters, outcome = self.counters, self._draw(at_ns, data)
         counters.sent += 1
         if outcome.lost and not is_certain:
@@ -113,7 +111,7 @@ class Channel:
         counters.oversized += outcome.oversized
         counters.duplicated += len(outcome.delays_s) - 1
         for delay_s in outcome.delays_s:
-            # A packet that a trace loses has no delay of its own, but may be a certain one.
+            # A packet that a trace loses has no delay of its own, but it may be certain.
             arrival_ns = at_ns + (round(delay_s * 1e9) if math.isfinite(delay_s) else 0)
             self._order += 1
             heapq.heappush(self._pending, (self._compute_release_ns(arrival_ns), arrival_ns, self._order, outcome.data))

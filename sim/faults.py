@@ -24,7 +24,7 @@ LINK_FAULTS = ("blackout", "held", "uplink_blackout")
 CAMERA_FAULTS = ("occluded", "swapped", "frozen")
 LASTING_FAULTS = ("wind", "battery", "frame", "noise", "drift", "parameter")
 MAX_NOISE_M = 100.0
-MODE_REPORT_S = 1.0  # how long a change of mode is told; afterwards the mode itself tells
+MODE_REPORT_S = 1.0  # a change of mode counts as a fault for this time
 
 
 def merge_fault_spans(config: Config) -> Config:
@@ -83,7 +83,7 @@ def _check_name(key: str, what: str, name: str, names: Sequence[str]) -> Iterato
 
 
 def find_active_faults(config: Config, since_ns: int) -> tuple[str, ...]:
-    """Return the faults at a time since the start [ns]: spans that it lies in, and changes made by then."""
+    """Return the faults at a time since the start [ns]: spans around it, and changes made before."""
     sections = ((config.link, LINK_FAULTS), (config.sim.camera, CAMERA_FAULTS))
     spans = [name for section, names in sections for name in names if is_within(getattr(section, name), since_ns)]
     past_faults = [fault for fault in config.sim.fault if fault.at_s * 1e9 <= since_ns]
@@ -99,7 +99,7 @@ class Faults:
     """Faults that are no spans, each done once at its time.
 
     Raises:
-        ConfigError: a parameter, a value or a mode that the autopilot has not.
+        ConfigError: a parameter, a value or a mode that the autopilot lacks.
     """
 
     def __init__(

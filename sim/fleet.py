@@ -1,4 +1,4 @@
-"""Several simulated vehicles from one configuration, each with ports of its own."""
+"""Several simulated vehicles from one configuration, each with its own ports."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ TCP_PORT_STEP = 10  # from one vehicle to the next, as ArduPilot's simulator cou
 def make_fleet(
     config: Config, vehicle: str, mocap: str, count: int, on_truth: Callable[[Truth], None]
 ) -> tuple[VehicleSetup, ...]:
-    """Return the seats of `count` vehicles, the first as configured.
+    """Return the setups of `count` vehicles, the first as configured.
 
     Each of the others has the system id and the seed of the one before plus one, and its ports lie one (UDP) or ten
     (TCP) higher; port 0, any free one, stays 0. They start 1 m apart within the limits of the position: eastwards in
@@ -102,7 +102,7 @@ def _shift_port(url: str, number: int) -> str:
 
 
 def _list_fixed_urls(setup: VehicleSetup) -> Iterator[str]:
-    """Return the URLs of a seat, without those that stand for any free port."""
+    """Yield the URLs of a setup, without those of any free port."""
     for url in {*setup.vehicle.split(","), *setup.mocap.split(",")}:
         if not urlsplit(url).netloc.endswith(":0"):
             yield url

@@ -1,7 +1,7 @@
-"""The simulated cameras as an OptiTrack server: what they see in NatNet 4.1, unicast, as Motive 3 streams it.
+"""The simulated cameras as an OptiTrack server: poses in NatNet 4.1, unicast, as Motive 3 streams them.
 
-It takes the cameras' MAVLink, as any port of the simulator does, and answers the conversation of a client: who asked
-to connect gets frames. While the cameras see nothing, the frames say that the body is not tracked, as Motive's do.
+It takes the cameras' MAVLink, as any port of the simulator does, and answers NatNet clients: a
+client that connects gets frames. While the body is hidden, the frames mark it as not tracked, as Motive's do.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ TICKS_PER_US = 10
 BODY_ID = 1
 TRACKED = 1
 MAX_CLIENTS = 8
-CLIENT_TIMEOUT_S = 10.0  # a client that says nothing for so long gets no more frames
-TRACKING_TIMEOUT_S = 0.1  # after so long without a sight the body counts as not tracked
+CLIENT_TIMEOUT_S = 10.0  # a silent client gets no more frames after this time
+TRACKING_TIMEOUT_S = 0.1  # the body counts as not tracked after this time without a pose
 MAX_DATAGRAM_BYTES = 65535
 CONNECT, SERVER_INFO, DESCRIBE, DESCRIPTIONS, FRAME, ECHO_REQUEST, ECHO = 0, 1, 4, 5, 7, 12, 13
 LEVEL = 0.0, 0.0, 0.0, 1.0  # x, y, z, w
@@ -64,7 +64,7 @@ class NatNetPort:
         except OSError:
             self._socket.close()
             raise
-        self._clients: dict[tuple[str, int], float] = {}  # when each was heard last [s]
+        self._clients: dict[tuple[str, int], float] = {}  # time of each client's last message [s]
         self._sent_s = 0.0
         self._frame_count = 0
         self.clock_us: Callable[[], int] = lambda: 0
@@ -134,7 +134,7 @@ class NatNetPort:
                 self._send(FRAME, frame, client)
 
     def _send(self, kind: int, payload: bytes, to: tuple[str, int]) -> None:
-        with suppress(OSError):  # nobody there, or no room: lost, as on a network
+        with suppress(OSError):  # no receiver, or no room: lost, as on a network
             self._socket.sendto(struct.pack("<HH", kind, len(payload)) + payload, to)
 
 
@@ -151,7 +151,7 @@ def _parse_url(url: str) -> tuple[str, str, tuple[str, int]]:
     return body, up, (host, PORT if port is None else port)
 
 
-# Messages of NatNet 4.1 (NatNetTypes.h of the public SDK): every set of things is their number, their size, themselves.
+# Messages of NatNet 4.1 (NatNetTypes.h of the public SDK): a set is the number, the size and the bytes of its items.
 
 
 def _pack_set(*items: bytes) -> bytes:

@@ -18,7 +18,7 @@ MAX_CLIENTS = 8  # of a TCP port
 V1, V2 = 0xFE, 0xFD
 SIGNED = 0x01
 Greeting = tuple[bytes, ...]
-# What a peer that is not there, or not there any more, does to a socket.
+# Errors of a socket whose peer is absent or gone.
 DISCONNECT_ERRORS = (ConnectionRefusedError, ConnectionResetError, BrokenPipeError)
 
 
@@ -39,7 +39,7 @@ class Port(Protocol):
         ...
 
     def write(self, data: bytes) -> None:
-        """Send one datagram; lost if nobody is there."""
+        """Send one datagram; it is lost without a receiver."""
         ...
 
     def close(self) -> None:
@@ -48,12 +48,12 @@ class Port(Protocol):
 
 
 class UdpPort:
-    """UDP: `udpout` sends to an address, `udpin` to whoever spoke last."""
+    """UDP: `udpout` sends to an address, `udpin` to the last sender."""
 
     def __init__(self, scheme: str, address: tuple[str, int]) -> None:
         self._peer: tuple[str, int] | None = None
         self._scheme = scheme
-        if scheme == "udpout":  # a host that is not known is told now
+        if scheme == "udpout":  # an unknown host raises here
             self._peer = socket.gethostbyname(address[0]), address[1]
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)

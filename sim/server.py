@@ -22,11 +22,11 @@ from uavctl.errors import ConnectionSpecError
 from uavctl.records import Truth
 
 PortWrapper = Callable[[str, Port], Port]
-"""Puts something around the port of a connection, which is named `vehicle` or `mocap`."""
+"""Wraps the port of a connection, which is named `vehicle` or `mocap`."""
 # Longest sleep, so that `stop` is asked often enough.
 MAX_SLEEP_S = 0.05
-SNAPSHOT_PERIOD_S = 0.25  # real time between two looks
-# What is late is made up in strides of simulated time, so that a speed beyond this computer's cannot pile up work.
+SNAPSHOT_PERIOD_S = 0.25  # real time between two snapshots
+# Overdue time is simulated in steps of at most this length, so work cannot pile up at a speed beyond this computer's.
 MAX_STEP_NS = 100_000_000
 
 
@@ -40,7 +40,7 @@ class Ready:
 
 
 def compute_grid_start_ns(now_ns: int, dt_ns: int) -> int:
-    """Return the next multiple of Δt on CLOCK_MONOTONIC [ns]: a grid that two processes share without a word."""
+    """Return the next multiple of Δt on CLOCK_MONOTONIC [ns]: two processes share this grid without communication."""
     return -(-now_ns // dt_ns) * dt_ns
 
 
@@ -82,20 +82,19 @@ def serve_all(
     on_snapshot: Callable[[tuple[VehicleSnapshot, ...]], None] | None = None,
     wrap_port: PortWrapper | None = None,
 ) -> None:
-    """Run the peers of each seat until `stop()` or the end of the duration.
+    """Run the peers of each setup until `stop()` or the end of the duration.
 
-    What was missed is caught up in virtual time; at a speed that this computer does not reach, time goes as fast as it
-    can.
+    Virtual time catches up after a delay. At a speed beyond this computer's, it runs as fast as possible.
 
     Args:
-        seats: the vehicles; their URLs are udpout (PX4 sends *to* the client's port), udpin, or tcpin; those of the
+        setups: the vehicles; their URLs are udpout (PX4 sends *to* the client's port), udpin, or tcpin; those of the
             cameras may be natnet.
         duration_s: length of the run, in simulated time [s], None for ever.
         airborne: start flying in the external mode, else on the floor and disarmed.
         on_ready: called once for each vehicle, all ports being open.
         stop: asked at least every 50 ms.
-        on_look: gets a look at all the vehicles four times a second of real time, and one at the end; it must not wait.
-        door: put around every port, None leaves them as they are.
+        on_snapshot: gets snapshots of all vehicles four times a second of real time, and at the end; it must not block.
+        wrap_port: wraps every port, None leaves them as they are.
 
     Raises:
         ConnectionSpecError: a URL is not understood or cannot be opened.
@@ -164,8 +163,8 @@ def _run_worlds(
     on_snapshot: Callable[[tuple[VehicleSnapshot, ...]], None] | None,
 ) -> None:
     sockets = [port for _, ports in worlds for port in ports.values()]
-    last_ns = None if end_ns is None else end_ns - 1  # what happens at the end itself is not told any more
-    snapshot_s = time.monotonic()  # time of the next look
+    last_ns = None if end_ns is None else end_ns - 1  # events at the end itself are not sent
+    snapshot_s = time.monotonic()  # time of the next snapshot
 
     def compute_goal_ns(peers: Peers) -> int:
         now_ns = clock.now_ns() if last_ns is None else min(clock.now_ns(), last_ns)
@@ -236,6 +235,6 @@ def serve_in_child(
             wrap_port=wrap_port,
         )
     except BrokenPipeError:
-        return  # nobody listens any more
+        return  # the parent is gone
     finally:
         pipe.close()

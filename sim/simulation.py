@@ -18,8 +18,6 @@ from sim.wind import Wind
 from uavctl.config.types import Config
 from uavctl.records import Flyer, Received, Send, Truth, Vec3
 
-# A simulated vehicle at one instant, for whoever watches.
-
 
 @dataclass(frozen=True)
 class VehicleSnapshot:
@@ -33,16 +31,13 @@ class VehicleSnapshot:
     position_m: Vec3  # position
     velocity_mps: Vec3  # velocity
     battery: float  # charge left, 0 to 1
-    # (system, component) id of whom the last setpoint came from, None before the first
+    # (system, component) id of the sender of the last setpoint, None before the first
     setpoint_source: tuple[int, int] | None
     setpoint_age_s: float | None  # time since that setpoint, None before the first
     sent: int  # positions that the cameras sent
     lost: int  # those of them that the link lost
-    faults: tuple[str, ...]  # what is amiss, as kinds of faults
+    faults: tuple[str, ...]  # kinds of the active faults
     text: str  # the last STATUSTEXT
-
-
-# Everything on the other side of the wire, under one clock that the caller moves.
 
 
 VEHICLE, MOCAP = "vehicle", "mocap"
@@ -119,10 +114,9 @@ class Peers:
         return due
 
     def exchange(self, to_ns: int, handle: Callable[[str, bytes, int], Received]) -> None:
-        """Move time on and pass on every datagram in order of time; answers are taken at the time reached.
+        """Advance time and pass on every datagram in order of time; the peers receive answers at the reached time.
 
-        Time stops where the peers do something of themselves, and nowhere else: more stops would round their motion
-        in another way.
+        Time stops only at events of the peers: more stops would change the rounding of their motion.
         """
         while True:
             at_ns = max(min(to_ns, self._next_action_ns), self.now_ns)
@@ -238,16 +232,13 @@ def make_quadrotor(config: Config, seed: np.random.SeedSequence, start_ns: int) 
     )
 
 
-# The simulated peers and a controller in lockstep, in virtual time: no socket, no clock.
-
-
 class World:
     """Flight of `flyer` against the simulated peers; bit-identical for a seed.
 
     In each tick of the grid start_ns + n tick_s the flyer first gets every datagram that has arrived by
     then, then decides, and what it sends reaches the peers at the same instant. So a sample taken at a boundary
-    and not delayed is known to that boundary's decision. What it answers a datagram with reaches the vehicle when
-    that one was sent, or with the peers' next doing.
+    and not delayed is known to that boundary's decision. Its answer to a datagram reaches the vehicle at the
+    time of that datagram, or with the peers' next event.
 
     Args:
         config: the whole configuration; `sim`, `link`, `plant`, `frame` and the tick are used.

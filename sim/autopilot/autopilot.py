@@ -53,18 +53,18 @@ class Autopilot:
     """Simulated vehicle with the profile named by `config.sim.autopilot`; see `Pilot` for `airborne`.
 
     Args:
-        vehicle: linear plant, or a vehicle with loops of its own.
+        plant: linear plant, or a vehicle with its own loops.
         seed: seed of the errors of inertial data.
 
     Attributes:
-        craft: the vehicle that flies.
+        vehicle: the vehicle that flies.
         parameters: parameters of the autopilot.
         estimator: estimator of position and velocity.
         inertial: inertial sensors.
         pilot: state machine of modes and phases.
         telemetry: telemetry streams.
-        text: the last STATUSTEXT that it sent, empty before the first.
-        steered_by: (system, component) id of whom the last setpoint that counts came from, None before the first.
+        last_text: the last STATUSTEXT that it sent, empty before the first.
+        setpoint_source: (system, component) id of the sender of the last accepted setpoint, None before the first.
     """
 
     def __init__(
@@ -139,7 +139,7 @@ class Autopilot:
 
     @property
     def mode_name(self) -> str:
-        """Name of its mode, in the autopilot's own words, or CRASHED."""
+        """Autopilot's name of its mode, or CRASHED."""
         return CRASHED if self.pilot.crash_reason else self.pilot.mode.name
 
     @property
@@ -177,14 +177,12 @@ class Autopilot:
                 handler(msg, at_ns)
         return self._flush(at_ns)
 
-    # What it sends
-
     def _send(self, msg: Message) -> None:
         self._out.append(bytes(msg.pack(self._mav)))
         self._mav.seq = (self._mav.seq + 1) % 256  # pack() does not advance it
 
     def _flush(self, at_ns: int) -> tuple[bytes, ...]:
-        if self.pilot.is_armed and not self._was_armed:  # home is where it was armed: both tell it
+        if self.pilot.is_armed and not self._was_armed:  # both autopilots report home, the place of arming
             home = self.telemetry.make_message(HOME_POSITION, at_ns)
             if home is not None:
                 self._send(home)
@@ -196,8 +194,6 @@ class Autopilot:
         self.pilot.status_texts.clear()
         self._out.clear()
         return out
-
-    # What it receives
 
     def _is_addressed(self, msg: Any) -> bool:
         is_our_system = msg.target_system in (0, self._mav.srcSystem)
@@ -257,14 +253,14 @@ class Autopilot:
             self._send(mavlink.MAVLink_mission_count_message(*sender, 0, msg.mission_type))
 
     def _on_mission(self, msg: Any, _at_ns: int) -> None:
-        """Refuse a mission, fence or rally points, and items that nobody has; what is empty can be cleared."""
+        """Refuse missions, fences, rally points and unknown items; clearing an empty list succeeds."""
         if self._is_addressed(msg):
             sender = msg.get_srcSystem(), msg.get_srcComponent()
             result = MISSION_RESULTS[msg.get_type()]
             self._send(mavlink.MAVLink_mission_ack_message(*sender, result, msg.mission_type))
 
     def _on_log_list(self, msg: Any, _at_ns: int) -> None:
-        """Tell that there are no logs. Data of one that is not there are not answered, as by the real ones."""
+        """Report that there are no logs. Requests for data of a log get no answer, as from the real autopilots."""
         if not self._is_addressed(msg):
             return
         if self._profile.name == "ardupilot" and self.pilot.is_armed:
@@ -286,8 +282,6 @@ class Autopilot:
         interval_us = 1e6 / msg.req_message_rate if is_started else -1.0
         for stream_id in (message_id for group in groups for message_id in group):
             self.telemetry.set_interval(stream_id, interval_us, at_ns)
-
-    # Parameters
 
     def _on_parameter_list(self, msg: Any, _at_ns: int) -> None:
         if self._is_addressed(msg):

@@ -17,8 +17,8 @@ class PreflightChecks:
         seed: seed of the times at which checks change.
 
     Attributes:
-        passing: whether what flickers passes, which counts while disarmed.
-        valid: whether the position may count as valid, which matters while armed.
+        are_passing: whether the flickering checks pass; they count while disarmed.
+        is_position_valid: whether the position may count as valid; it counts while armed.
     """
 
     def __init__(self, config: ChecksConfig, seed: np.random.SeedSequence, start_ns: int) -> None:
@@ -31,7 +31,7 @@ class PreflightChecks:
 
     @property
     def next_ns(self) -> int | None:
-        """Time of the next look [ns]; None if no check ever changes."""
+        """Time of the next evaluation [ns]; None if no check ever changes."""
         return self._next_check_ns if self._config.flicker_s or self._config.invalid else None
 
     def run(self, at_ns: int, *, is_armed: bool) -> None:

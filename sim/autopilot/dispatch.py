@@ -14,10 +14,10 @@ MIN_HEADING_SPEED_MPS = 0.5  # ArduPilot: the nose follows travel from this spee
 
 
 class SetpointDispatch:
-    """Passes setpoints on to the craft.
+    """Passes setpoints on to the vehicle.
 
     Attributes:
-        obeyed: the setpoint that is flown, None if the vehicle flies by itself.
+        active_setpoint: the setpoint that is flown, None if the vehicle flies by itself.
     """
 
     def __init__(
@@ -35,7 +35,7 @@ class SetpointDispatch:
         self.active_setpoint = active_setpoint
 
     def apply(self, setpoint: ParsedSetpoint) -> None:
-        """Fly a setpoint; one that asks for nothing flyable stops the vehicle."""
+        """Fly a setpoint; one without a flyable part stops the vehicle."""
         self.active_setpoint = None if setpoint.kind is SetpointKind.STOP else setpoint
         match setpoint.kind:
             case SetpointKind.ACCELERATION:
@@ -51,7 +51,7 @@ class SetpointDispatch:
         self._update_heading(setpoint)
 
     def _update_heading(self, setpoint: ParsedSetpoint) -> None:
-        """Turn to the heading asked for; without one ArduPilot looks along its way, and PX4 stays as it is."""
+        """Turn to the setpoint's heading; without one ArduPilot turns along its velocity, and PX4 keeps its heading."""
         north, east, _ = self._estimator.velocity_mps
         if setpoint.yaw_rad is not None:
             self._vehicle.set_heading(setpoint.yaw_rad)

@@ -2,7 +2,7 @@
 
 With GPS the estimate is the truth. With external positions it carries an error: accelerometers with a constant bias
 drift, samples pull the estimate back, and when they stop the error grows unseen. Bias, silence and flags are those of
-the recorded loss of the cameras (ArduCopter: nothing is said for 7.2 s while the vehicle drifts half a metre).
+the recorded loss of the cameras (ArduCopter reports nothing for 7.2 s while the vehicle drifts half a metre).
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ STEP_NS = 20_000_000
 ACCEL_BIAS_MPS2: Vec3 = (-0.0187, 0.0155, 0.0)  # fitted to the recorded drift: 0.54 m north, -0.43 m east in 7.6 s
 LOST_NS = 7_200_000_000  # ArduPilot: from the last sample to flags 0x25
 FUSE_S = 0.2  # time constant with which samples pull the estimate
-GATE_M = 1.0  # a sample further off is not believed
+GATE_M = 1.0  # the estimator rejects a sample further off
 PX4_GAP_NS = 200_000_000  # PX4 begins to fuse at more than 5 Hz only
-# PX4 looks back by EKF2_DELAY_MAX (200 ms), and has no use for what is 100 ms older, or of a time to come.
+# PX4 fuses samples up to EKF2_DELAY_MAX (200 ms) back. It drops those 100 ms older, and those from the future.
 PX4_AGES_S = (-0.1, 0.3)
 START_NS = SECOND_NS  # of good samples before the estimate counts
 LOCAL_FRD, LOCAL_NED, BODY_FRD = 20, 1, 12  # MAV_FRAME
@@ -41,13 +41,13 @@ class Estimator:
 
     Args:
         kind: PX4 or ArduCopter.
-        age_ns: function of (stamp, time) [ns]: by how much the own clock is ahead of a stamp, to PX4 one moved by what
-            TIMESYNC found [ns].
+        age_ns: function of (stamp, time) [ns]: time of the own clock less the stamp [ns]; PX4 first corrects the stamp
+            by its TIMESYNC offset.
 
     Attributes:
-        valid: whether its position may count as valid, whatever is known of it.
-        steady: whether pre-flight checks that flicker pass.
-        origin: whether the geographic origin is known; ArduPilot without GPS waits for SET_GPS_GLOBAL_ORIGIN.
+        may_be_valid: whether its position may count as valid.
+        passes_checks: whether pre-flight checks that flicker pass.
+        has_origin: whether the geographic origin is known; ArduPilot without GPS waits for SET_GPS_GLOBAL_ORIGIN.
     """
 
     def __init__(
@@ -66,8 +66,6 @@ class Estimator:
         self._last_ns: int | None = None  # arrival of the last sample fused
         self._offset_ns: int | None = None  # least (arrival - stamp)
         self._step_ns = vehicle.now_ns
-
-    # What it uses
 
     @property
     def uses_gps(self) -> bool:
@@ -111,8 +109,6 @@ class Estimator:
         self.has_origin = True
         self._last_ns = self._updated_ns = self._vehicle.now_ns
         self._first_ns = self._last_ns - START_NS
-
-    # What it believes
 
     @property
     def _is_fusing(self) -> bool:
@@ -167,8 +163,6 @@ class Estimator:
         """Estimated velocity, local NED [m/s]."""
         return _add(self._vehicle.velocity_mps, self._velocity_error)
 
-    # Its motion in time
-
     @property
     def next_ns(self) -> int | None:
         """Time at which the error next moves on [ns]; None while there is none."""
@@ -198,8 +192,6 @@ class Estimator:
         self._position_error, self._velocity_error = position_error, velocity_error
         self._vehicle.set_estimate_error(position_error, velocity_error)
 
-    # External positions
-
     def fuse_message(self, msg: Any, at_ns: int) -> None:
         """Take an external position, if this autopilot takes and fuses messages of its kind."""
         if msg.get_type() not in FUSED_MESSAGES[self._profile.name] or not self.uses_external or self.uses_gps:
@@ -228,9 +220,9 @@ class Estimator:
         return rotate_to_ned(self._vehicle.attitude, body) if is_fused and is_plausible else None
 
     def _compute_age_s(self, stamp_us: int, at_ns: int) -> float | None:
-        """Return the age of a sample with the configured delay [s]; None if it cannot be used.
+        """Return the age of a sample with the configured delay [s]; None if it is unusable.
 
-        To PX4 its stamp is moved by what TIMESYNC found; to ArduPilot it is what it took more than the quickest one.
+        PX4 corrects the stamp by its TIMESYNC offset. ArduPilot counts the delay beyond the quickest sample.
         """
         px4 = self._profile.name == "px4"
         delay_s = min(max(self._parameters["EKF2_EV_DELAY" if px4 else "VISO_DELAY_MS"], 0.0), 1000.0) * 1e-3
@@ -239,7 +231,7 @@ class Estimator:
             return age_s if PX4_AGES_S[0] <= age_s <= PX4_AGES_S[1] else None
         offset_ns = self._age_ns(1000 * stamp_us, at_ns)
         if self._offset_ns is None or not self._offset_ns <= offset_ns <= self._offset_ns + SECOND_NS:
-            self._offset_ns = offset_ns  # quicker than any before, or another clock
+            self._offset_ns = offset_ns  # quicker than all samples before, or another clock
         return (offset_ns - self._offset_ns) * 1e-9 + delay_s
 
     def _fuse(self, position_m: Vec3, velocity_mps: Vec3 | None, age_s: float, at_ns: int) -> None:

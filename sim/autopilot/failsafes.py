@@ -10,7 +10,7 @@ from sim.vehicle.interface import Battery
 from uavctl.arrays import SECOND_NS
 
 FAILSAFE_PERIOD_NS = SECOND_NS // 10
-# ArduPilot: ten bad looks at 10 Hz before its estimator's failsafe acts, as recorded.
+# ArduPilot: ten bad checks at 10 Hz before its estimator's failsafe acts, as recorded.
 EKF_CHECK_NS = SECOND_NS
 # Modes by GF_ACTION and FENCE_ACTION; the values that are not here only warn.
 PX4_FENCE_MODES = {2.0: "AUTO.LOITER", 3.0: "AUTO.RTL", 5.0: "AUTO.LAND"}
@@ -18,7 +18,7 @@ ARDUPILOT_FENCE_MODES = {1.0: "RTL", 2.0: "LAND"}
 
 
 class Failsafes:
-    """Failsafes of the autopilot, looked at ten times a second while armed."""
+    """Failsafes of the autopilot, checked ten times a second while armed."""
 
     def __init__(
         self,
@@ -41,16 +41,16 @@ class Failsafes:
         self._low_ns: int | None = None  # since when the battery is low
         self._has_warned = False
         self._can_clear = can_clear
-        self._previous_mode: Mode | None = None  # what it flew before its position was lost
+        self._previous_mode: Mode | None = None  # mode before its position was lost
         self.gcs_heartbeat_ns: int | None = None  # last heartbeat of the ground station
 
     @property
     def next_ns(self) -> int | None:
-        """Time of the next look [ns]; None while disarmed."""
+        """Time of the next check [ns]; None while disarmed."""
         return self._next_check_ns if self._pilot.is_armed else None
 
     def run(self, at_ns: int) -> None:
-        """Look for the cause of a failsafe, if it is time."""
+        """Check for the cause of a failsafe, if it is time."""
         if not self._pilot.is_armed:
             self._lost_ns = self._low_ns = self._previous_mode = None
             self._has_warned = self._pilot.is_fence_breached = False
@@ -72,7 +72,7 @@ class Failsafes:
             self._pilot.enter_failsafe(self._get_mode_by_role(Role.LAND), at_ns)
 
     def _check_recovery(self, at_ns: int) -> None:
-        """End a failsafe for want of a position with its cause, as recorded, if nobody has changed the mode since."""
+        """End a position failsafe when the position returns, as recorded, unless the mode has changed since."""
         if not self._pilot.is_failsafe:
             self._previous_mode = None
         elif self._estimator.is_position_valid and self._previous_mode is not None:

@@ -20,11 +20,11 @@ from sim.autopilot.parameters import Parameters, ParameterType
 from sim.autopilot.telemetry import Message
 
 PARAMETER_FILE = "@PARAM/param.pck"
-HEADER = struct.Struct("<HBBBBBxI")  # sequence, session, opcode, size, opcode asked for, burst complete, offset
+HEADER = struct.Struct("<HBBBBBxI")  # sequence, session, opcode, size, requested opcode, burst complete, offset
 MAX_DATA_BYTES = 239
 MAX_SESSIONS = 4
-SESSION_TIMEOUT_NS = 3_000_000_000  # a session that was not used for so long gives way to a new one
-# What ArduPilot takes a packed parameter to need, so the size it tells when the file is opened [bytes]
+SESSION_TIMEOUT_NS = 3_000_000_000  # a session without requests for this time may be replaced
+# ArduPilot's estimate of a packed parameter; the size that it reports on opening follows from it [bytes]
 BYTES_PER_PARAMETER = 12
 
 
@@ -119,7 +119,7 @@ class OpenFile:
 
 @dataclass(frozen=True)
 class FileRequest:
-    """A request, and whom it comes from."""
+    """A request and its sender."""
 
     sender: tuple[int, int]  # system and component id
     sequence: int
@@ -151,7 +151,7 @@ class Files:
         self._last: tuple[FileRequest | None, tuple[Message, ...]] = None, ()
 
     def answer(self, msg: Any, at_ns: int) -> tuple[Message, ...]:
-        """Take a FILE_TRANSFER_PROTOCOL message; return the answers. One that is repeated is answered as before."""
+        """Take a FILE_TRANSFER_PROTOCOL message; return the answers. A repeated request gets the same answers."""
         payload = bytes(msg.payload)
         sequence, session, opcode, size, _, _, offset = HEADER.unpack_from(payload)
         if opcode in (FileOperation.ACK, FileOperation.NAK):
@@ -249,10 +249,6 @@ def _make_message(
     return mavlink.MAVLink_file_transfer_protocol_message(0, *request.sender, list((header + data).ljust(251, b"\0")))
 
 
-# ArduPilot's packed parameters: a head of three numbers, then for each parameter its type, how many letters of its
-# name are those of the one before, how many follow, these letters, its value, and its default where that is another.
-
-
 PLAIN, WITH_DEFAULTS = 0x671B, 0x671C
 PACKED_TYPES = {
     ParameterType.INT8: (1, "b"),
@@ -263,7 +259,11 @@ PACKED_TYPES = {
 
 
 def pack_parameters(parameters: Parameters, read_size: int, *, start: int, count: int, defaults: bool) -> bytes:
-    """Pack parameters as ArduPilot does; zeros keep a value from lying across two reads of `read_size` bytes."""
+    """Pack parameters as ArduPilot does; zeros keep a value from lying across two reads of `read_size` bytes.
+
+    Header: magic, count, total count. Each parameter: type, number of letters in common with the name before, number of
+    the other letters, these letters, value, and the default where it differs.
+    """
     names = parameters.names[start:]
     names = names[:count] if count else names
     packed = bytearray(struct.pack("<HHH", WITH_DEFAULTS if defaults else PLAIN, len(names), len(parameters.names)))

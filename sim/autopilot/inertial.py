@@ -1,9 +1,9 @@
 """Inertial sensors, and the attitude that an autopilot estimates from them, with the errors of both.
 
-A bias of the accelerometer across gravity cannot be told from a tilt, so the estimate tilts by it: at hover the
-specific force that is told, turned by the attitude that is told, is nearly right although both err. Dead reckoning goes
-wrong by what remains: a small tilt that wanders within seconds, biases that the estimate knows and the message keeps,
-and noise. All figures and their sources are in docs/vehicle.md.
+A horizontal accelerometer bias looks like a tilt, so the estimate tilts by it. At hover the reported specific force,
+turned by the reported attitude, is nearly right although both have errors. The remaining errors drive dead reckoning
+off: a small tilt that wanders within seconds, biases that the messages keep, and noise. All figures and their sources
+are in docs/vehicle.md.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from sim.vehicle.rigid_body import rotate_attitude
 from uavctl.records import Vec3
 
 DRIFT_S, WANDER_S, HEADING_S = 60.0, 4.0, 30.0  # time constants
-STEP_NS = 20_000_000  # between two changes of the attitude that the vehicle's own loops believe
+STEP_NS = 20_000_000  # between two updates of the attitude error of the vehicle's loops
 BATCH_SIZE = 1000  # normal numbers drawn at once
 
 
@@ -31,7 +31,7 @@ class InertialErrors:
 
     tilt_bias_mps2: float  # constant bias of the accelerometer along front and right, by which the estimate tilts
     drift_mps2: float  # drift of that bias, by which it tilts too
-    bias_mps2: float  # constant bias along front and right that the estimate knows and the message keeps
+    bias_mps2: float  # constant bias along front and right that the estimate removes and the message keeps
     bias_down_mps2: float  # constant bias along down; no tilt hides it
     tilt_rad: float  # constant tilt of the attitude beside that of the bias
     wander_rad: float  # wandering tilt, in flight
@@ -47,7 +47,7 @@ class InertialErrors:
         return InertialErrors(*(factor * size for size in astuple(self)))
 
 
-# PX4 takes the biases that its estimate knows out of HIGHRES_IMU; ArduPilot leaves them in its messages.
+# PX4 removes its estimated biases from HIGHRES_IMU; ArduPilot leaves them in its messages.
 ERRORS = {
     "px4": InertialErrors(
         tilt_bias_mps2=0.03,
@@ -160,15 +160,14 @@ class InertialMeasurement(NamedTuple):
 class InertialSensors:
     """Two inertial units of a vehicle, and the attitude estimated from the first.
 
-    Until the first measurement the attitude is the true one, so who uses no inertial data is not disturbed by their
-    errors. With `flown` the errors are there from the start, and the vehicle's own loops take the wrong attitude for
-    true.
+    Until the first measurement the attitude is the true one, so a run without inertial data has no such errors. With
+    `flown` the errors exist from the start, and the vehicle's loops use the wrong attitude.
 
     Args:
-        flown: whether the vehicle flies by the attitude that it believes.
+        flown: whether the vehicle's loops use the estimated attitude.
 
     Attributes:
-        next_ns: when what the loops believe changes next, None if they know the truth.
+        next_ns: time of the next attitude error of the loops, None if they use the true attitude.
     """
 
     def __init__(self, errors: InertialErrors, vehicle: Vehicle, seed: np.random.SeedSequence, *, flown: bool) -> None:

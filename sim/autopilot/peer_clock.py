@@ -12,7 +12,7 @@ import math
 CONVERGENCE_COUNT = 500
 MAX_ROUND_TRIP_NS = 10_000_000
 MAX_DEVIATION_NS = 100_000_000
-MAX_OUTLIERS = 5  # in a row; one more, and it begins anew
+MAX_OUTLIERS = 5  # in a row; one more restarts the estimate
 FIRST_GAIN, LAST_GAIN = 0.05, 0.003
 
 

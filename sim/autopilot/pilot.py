@@ -19,8 +19,8 @@ from sim.vehicle.interface import ControlledPlant, Vehicle
 from uavctl.arrays import SECOND_NS
 from uavctl.records import Vec3
 
-CHECK_PERIOD_NS = 20_000_000  # how often height and floor are looked at
-# PX4 takes OFFBOARD while the newest setpoint is younger than COM_OF_LOSS_T; its documentation asks for 2 Hz, so here
+CHECK_PERIOD_NS = 20_000_000  # of height and floor
+# PX4 takes OFFBOARD while the newest setpoint is younger than COM_OF_LOSS_T; its documentation requires 2 Hz, so here
 # never longer than that.
 MAX_SETPOINT_AGE_NS = SECOND_NS // 2
 TIMED_PHASE_NS = 5 * SECOND_NS  # length of a take-off or landing of a plant that has no vertical axis
@@ -49,13 +49,13 @@ class Pilot:
     from the first setpoint. Else it stands on the floor, disarmed.
 
     Attributes:
-        texts: (severity, text) of what is to be said, in order; the caller empties it.
-        crashed: why the autopilot's program died, None while it lives.
-        failsafe: whether a failsafe chose the mode.
-        breaches: whether it is beyond its fence.
-        radio: whether it hears a remote control.
-        switch_us: where that one's switch of modes stands [µs].
-        helm: knows which setpoint is flown.
+        status_texts: (severity, text) of the STATUSTEXTs to send, in order; the caller empties it.
+        crash_reason: why the autopilot's program stopped, None while it runs.
+        is_failsafe: whether a failsafe chose the mode.
+        is_fence_breached: whether it is beyond its fence.
+        has_radio: whether it receives a remote control.
+        switch_us: position of the remote control's mode switch [µs].
+        dispatch: passes setpoints on to the vehicle.
         setpoint_ns: when the last setpoint that counts came [ns], None before the first.
         home_m: where it was armed last, local NED.
     """
@@ -82,7 +82,7 @@ class Pilot:
         self._check_ns = vehicle.now_ns
         self._phase_end_ns: int | None = None  # end of a timed climb or descent, or of the wait for disarming
         self._disarm_text = profile.preflight_text
-        self._takeoff_m: float | None = None  # height that was asked for; without, PX4 has its own
+        self._takeoff_m: float | None = None  # requested height; PX4 has a default without one
         self._armed_ns = vehicle.now_ns
         self._liftoff_ns: int | None = None  # when it leaves the floor, while rotors spin up
         self._touchdown_ns: int | None = None  # since when it stands on the floor without knowing it
@@ -96,9 +96,7 @@ class Pilot:
         self.mode: Mode = (
             profile.get_mode_by_role(Role.EXTERNAL) if airborne else profile.get_mode(profile.initial_mode)
         )
-        self._chosen_mode: Mode = (
-            self.mode
-        )  # the last one that somebody chose which is neither a take-off nor a landing
+        self._chosen_mode: Mode = self.mode  # last mode chosen by pilot or command, without take-off and landing
         setpoint = ParsedSetpoint(SetpointKind.ACCELERATION) if airborne else None
         self.dispatch = SetpointDispatch(profile, vehicle, parameters, estimator, setpoint)
         self.home_m: Vec3 = (0.0, 0.0, 0.0)
@@ -117,9 +115,7 @@ class Pilot:
         if last_ns is None or not self.is_external:
             return None
         if self._profile.name == "px4":
-            if (
-                self._parameters["COM_OBL_RC_ACT"] < LAND_ACTION and not self.has_radio
-            ):  # seen to go on as if nothing were
+            if self._parameters["COM_OBL_RC_ACT"] < LAND_ACTION and not self.has_radio:  # observed: it flies on
                 return None
         elif (
             self.dispatch.active_setpoint is None or self.dispatch.active_setpoint.kind is SetpointKind.POSITION
@@ -169,14 +165,12 @@ class Pilot:
             self.dispatch.apply(setpoint)
 
     def crash(self, reasons: str) -> None:
-        """Stop the autopilot's program: nothing is decided, said or answered from now on."""
+        """Stop the autopilot's program: it decides, sends and answers nothing from now on."""
         self.crash_reason = reasons
         self._vehicle.accelerate((0.0, 0.0, 0.0))
 
-    # Commands, each giving a MAV_RESULT
-
     def arm(self, at_ns: int, *, is_forced: bool = False) -> int:
-        """Arm on the floor, or (without effect) when armed already; `forced` skips the checks."""
+        """Arm on the floor, or (without effect) when armed already; `is_forced` skips the checks."""
         if self.is_armed:
             return ACCEPTED
         reasons = find_arming_refusals(
@@ -234,7 +228,7 @@ class Pilot:
         """Change the mode; PX4's OFFBOARD needs a stream of setpoints before, and most modes a position.
 
         Args:
-            ordered: by a command; else the pilot's switch moves.
+            by_command: by a command; else the pilot's switch moves.
         """
         if not by_command:
             self.has_radio, self.switch_us = True, SWITCH_US + SWITCH_STEP_US * (1 + self._profile.modes.index(mode))
@@ -254,14 +248,14 @@ class Pilot:
     def enter_failsafe(
         self, mode: Mode, at_ns: int, *, ends_with_setpoints: bool = False, is_shown: bool = True
     ) -> None:
-        """Change the mode by a failsafe; with `returns`, setpoints that come again end it.
+        """Change the mode by a failsafe; with `ends_with_setpoints`, new setpoints end it.
 
         Args:
-            shown: heartbeats show it.
+                is_shown: heartbeats show it.
         """
         chosen_mode = self._chosen_mode
         self._enter_mode(mode, at_ns)
-        self._chosen_mode = chosen_mode  # nobody chose this one
+        self._chosen_mode = chosen_mode  # the failsafe's mode is not a choice
         self.is_failsafe, self._ends_with_setpoints = is_shown, ends_with_setpoints
 
     def end_failsafe(self, mode: Mode, at_ns: int) -> None:
@@ -271,14 +265,12 @@ class Pilot:
             self._start_climb(at_ns)
 
     def lacks_stream(self, at_ns: int) -> bool:
-        """Return whether arming is refused because the mode is PX4's OFFBOARD and nobody sends setpoints."""
+        """Return whether arming is refused: the mode is PX4's OFFBOARD, and no setpoints arrive."""
         return self.mode.role is Role.EXTERNAL and self._profile.needs_stream and not self._has_stream(at_ns)
 
     def _has_stream(self, at_ns: int) -> bool:
         limit_ns = min(MAX_SETPOINT_AGE_NS, round(self._parameters[self._profile.timeout_parameter] * 1e9))
         return self.setpoint_ns is not None and at_ns - self.setpoint_ns < limit_ns
-
-    # Modes and phases
 
     def _enter_mode(self, mode: Mode, at_ns: int) -> None:
         keeps_taking_off = self._liftoff_ns is not None and (mode is self.mode or mode.role is Role.TAKEOFF)
@@ -346,10 +338,10 @@ class Pilot:
             self._touchdown_ns = None
 
     def _complete_climb(self) -> None:
-        """Go on to the mode that holds after a take-off by a mode of its own.
+        """Change to the holding mode after a take-off in a take-off mode.
 
-        As recorded: a PX4 that knows latitude and longitude does so; one that has only a local position hovers in
-        AUTO.TAKEOFF, and tells that it takes off, until somebody chooses another mode.
+        As recorded: a PX4 with a global position does so. With only a local position it hovers in AUTO.TAKEOFF and
+        reports a take-off until another mode is chosen.
         """
         if self.mode.role is Role.TAKEOFF and not self._estimator.has_global_position:
             return
@@ -372,7 +364,7 @@ class Pilot:
         self._touchdown_ns = None
         if self._linear_plant is not None:  # its plant would fall through the floor
             self._vehicle.stand_on_floor()
-        else:  # whatever it was told to fly
+        else:  # whatever the last setpoint was
             self._vehicle.land()
         self.phase = Phase.GROUND
         self.dispatch.active_setpoint = None
@@ -394,7 +386,7 @@ class Pilot:
             self._fly_phase(at_ns)
 
     def _fly_phase(self, at_ns: int) -> None:
-        """Fly as the phase asks for."""
+        """Fly the motion of the present phase."""
         self.dispatch.active_setpoint = None
         if self.phase is Phase.CLIMB:
             self._vehicle.take_off(self._height_m)

@@ -23,10 +23,10 @@ TargetFields = tuple[int, Vec3, Vec3, Vec3]  # type mask, position, velocity, ac
 def make_position_target(
     profile: SimulatedProfile, pilot: Pilot, estimator: Estimator, attitude: Quaternion, boot_ms: int
 ) -> Any:
-    """Return POSITION_TARGET_LOCAL_NED (pymavlink's classes have no types); None where there is nothing to tell.
+    """Return POSITION_TARGET_LOCAL_NED (pymavlink's classes have no types); None if there is no target to report.
 
     Args:
-        estimator: where the vehicle believes to be.
+        estimator: estimated position of the vehicle.
     """
     is_px4 = profile.name == "px4"
     fields = _make_px4_target(pilot, estimator) if is_px4 else _make_ardupilot_target(pilot)
@@ -41,7 +41,7 @@ def make_position_target(
 
 
 def _make_px4_target(pilot: Pilot, estimator: Estimator) -> TargetFields:
-    """Return PX4's target, sent always: in modes of its own it plans position, velocity and acceleration."""
+    """Return PX4's target, always sent: in its own modes it plans position, velocity and acceleration."""
     setpoint = pilot.dispatch.active_setpoint
     if setpoint is not None and setpoint.kind is SetpointKind.ACCELERATION:
         return IGNORE_POSITION | IGNORE_VELOCITY, UNSET, UNSET, setpoint.vector

@@ -48,14 +48,14 @@ class SimulatedProfile:
     )
     refused_arming: int  # MAV_RESULT
     refused_disarming: int  # MAV_RESULT
-    unknown_mode: int  # MAV_RESULT for a mode that it has not
+    unknown_mode: int  # MAV_RESULT for an unknown mode
     set_mode_ack: int  # command number that answers SET_MODE
     armed_text: str
     disarmed_text: str
     preflight_text: str  # when it disarms itself before take-off
-    landed_text: str  # empty: it says nothing
-    takeoff_text: str  # when it notices that it takes off; empty: it says nothing
-    touch_text: str  # its simulator's, on the floor's first touch; empty: it says nothing
+    landed_text: str  # empty: none
+    takeoff_text: str  # at the detected take-off; empty: none
+    touch_text: str  # its simulator's, at touchdown; empty: none
     liftoff_s: float  # from arming to the thrust that lifts: rotors spin up, thrust ramps
     thrust_ramp_s: float  # the same from the order, armed for long
     landing_detection_s: float  # from standing on the floor to knowing it
@@ -65,7 +65,7 @@ class SimulatedProfile:
     vtol_state: int  # of EXTENDED_SYS_STATE
     version: int  # flight_sw_version of AUTOPILOT_VERSION
     origin_deg_m: tuple[float, float, float]  # latitude, longitude, altitude of its simulated field
-    has_radio: bool  # whether its simulator has a stick by itself, as SYS_STATUS of the recorded flights tells
+    has_radio: bool  # whether its simulator has a remote control, as in SYS_STATUS of the recorded flights
     greeting: tuple[bytes, ...]  # text on a TCP link, before its first packet and between that and the second
 
     def get_mode(self, name: str) -> Mode:

@@ -29,18 +29,20 @@ class SetpointKind(Enum):
     POSITION = auto()
     STOP = auto()  # nothing flyable: the vehicle stops
     REFUSED = auto()  # nothing: it does not count for the stream
-    FATAL = auto()  # the program dies of it
+    FATAL = auto()  # stops the program
 
 
 @dataclass(frozen=True)
 class ParsedSetpoint:
     """Motion that a setpoint asks for."""
 
-    kind: SetpointKind  # what about
+    kind: SetpointKind  # quantity
     vector: Vec3 = ZERO  # acceleration, velocity or position in local NED
-    yaw_rad: float | None = None  # heading to take; None is not asked
+    yaw_rad: float | None = None  # requested heading; None keeps the present one
     text: str = ""  # why it was refused
-    velocity_mps: Vec3 | None = None  # with a position, the velocity that it moves with; None is a place to go to
+    velocity_mps: Vec3 | None = (
+        None  # with a position, the velocity that it moves with; None flies to the position and holds it
+    )
     accel_mps2: Vec3 = ZERO  # with that velocity, its acceleration
 
 
@@ -52,7 +54,7 @@ def parse_setpoint(profile: SimulatedProfile, msg: Any, position_m: Vec3, attitu
     """Read a setpoint.
 
     Args:
-        place_m: where the vehicle believes to be; offsets count from there.
+        position_m: estimated position of the vehicle; offsets count from there.
         attitude: attitude of the vehicle, by which setpoints in body axes are turned.
     """
     return (

@@ -36,11 +36,11 @@ RADIO, FENCE, AHRS, BATTERY, PREARM = 1 << 16, 1 << 20, 1 << 21, 1 << 25, 1 << 2
 # MAV_PROTOCOL_CAPABILITY
 FLOAT, COMMAND_INT, BYTEWISE, FILES, LOCAL_TARGETS, MAVLINK2, CAST = 2, 8, 16, 32, 128, 8192, 131072
 
-# Roll, pitch, throttle and yaw of a stick that nobody moves [µs]; telemetry has room for 18 channels.
+# Roll, pitch, throttle and yaw of a stick at rest [µs]; telemetry has room for 18 channels.
 STICK_CENTRE_US = (1500, 1500, 1500, 1500)
 NO_CHANNEL, FULL_SIGNAL = 65535, 254
 
-# Usual intervals [ms]; 0: only when asked for. A message that is not here is not sent at all.
+# Usual intervals [ms]; 0: only on request. A message that is not here is never sent.
 COMMON_MS = {
     0: 1000,  # HEARTBEAT
     1: 1000,  # SYS_STATUS
@@ -62,7 +62,7 @@ USUAL_MS = {
     "px4": {**COMMON_MS, 31: 250, 105: 0, 111: 100, 141: 1000, 230: 1000, 242: 2000},
     "ardupilot": {**COMMON_MS, 27: 0, 116: 0, 193: 1000},
 }
-# What a PX4 was recorded to send unasked on an onboard link; an ArduPilot sends there what it is asked for.
+# Streams of a recorded PX4 on an onboard link; an ArduPilot sends there only requested streams.
 ONBOARD_MS = {
     "px4": {
         1: 200,
@@ -88,9 +88,9 @@ class BoardClock:
     """Clock of the autopilot's board: time since its boot, faster or slower than ours.
 
     Attributes:
-        start_ns: our time when the simulation began.
-        uptime_ns: what the clock showed then.
-        drift_ppm: what it gains [millionths].
+        start_ns: start of the simulation.
+        uptime_ns: reading of this clock at the start.
+        drift_ppm: gain [millionths].
     """
 
     start_ns: int
@@ -98,7 +98,7 @@ class BoardClock:
     drift_ppm: float
 
     def read_ns(self, at_ns: int) -> int:
-        """Return what the clock shows at a time of ours [ns]."""
+        """Return the reading of this clock at a simulated time [ns]."""
         since_ns = at_ns - self.start_ns
         return self.uptime_ns + since_ns + round(since_ns * self.drift_ppm * 1e-6)
 
@@ -122,7 +122,7 @@ class Telemetry:
     """Telemetry streams of one vehicle.
 
     Attributes:
-        streams: message id to what makes it; None from it is nothing to tell yet.
+        streams: message id to its maker, which returns None without data.
         next_ns: time of the next message, None if none is due ever.
     """
 
@@ -177,7 +177,7 @@ class Telemetry:
         return [msg for msg in messages if msg is not None]
 
     def make_message(self, message_id: int, at_ns: int) -> Message | None:
-        """Make one message now; None if there is nothing to tell, or no such message."""
+        """Make one message now; None without data, or without such a message."""
         return self.streams[message_id](at_ns) if message_id in self.streams else None
 
     def get_interval_us(self, message_id: int) -> int:
@@ -198,8 +198,6 @@ class Telemetry:
         self._due_ns[message_key] = at_ns + 1
         self.next_ns = self._find_next_ns()
         return True
-
-    # What it tells
 
     def _read_boot_ms(self, at_ns: int) -> int:
         return self._sources.clock.read_ns(at_ns) // 1_000_000 % 2**32
@@ -240,7 +238,7 @@ class Telemetry:
             healthy |= present & (AHRS | VISION)
         if self._can_arm(at_ns):
             healthy |= PREARM
-        # As recorded: an ArduPilot has a fence that is healthy unless it is enabled and breached, a PX4 tells of none.
+        # As recorded: an ArduPilot has a fence that is healthy unless it is enabled and breached, a PX4 reports none.
         fence = FENCE if sources.profile.name == "ardupilot" else 0
         enabled = fence if fence and sources.parameters["FENCE_ENABLE"] else 0
         power = round(1000.0 * battery.voltage_v), round(100.0 * battery.current_a), round(100.0 * battery.remaining)
@@ -427,7 +425,7 @@ class Telemetry:
         return mavlink.MAVLink_ekf_status_report_message(flags, variance, variance, 0.05, 0.05, 0.0)
 
     def _make_estimator(self, at_ns: int) -> Message:
-        """Return PX4's ESTIMATOR_STATUS; of a vehicle at rest it says that it assumes a constant position."""
+        """Return PX4's ESTIMATOR_STATUS; at rest its flags have a constant position."""
         estimator = self._sources.estimator
         flags = estimator.flags | (CONSTANT if self._sources.pilot.phase is Phase.GROUND else 0)
         ratio, accuracy = (0.1, 0.05) if estimator.is_position_valid else (2.0, 10.0)

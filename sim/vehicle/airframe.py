@@ -7,7 +7,7 @@ Sources, named at each figure:
   (documentation of the Crazyflie firmware, page "PWM to thrust"). The constants are least squares over its 16 rows;
   `docs/vehicle.md` gives them, and a test repeats the fits.
 * Firmware: the table of open-circuit voltages in the Crazyflie firmware's power management.
-* Estimate: nobody has published it; the reasoning is in `docs/vehicle.md`.
+* Estimate: no published value; the reasoning is in `docs/vehicle.md`.
 """
 
 from __future__ import annotations

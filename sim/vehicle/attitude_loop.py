@@ -17,7 +17,7 @@ YAW_INTEGRAL_1PS2 = 6.0
 DERIVATIVE_LAG_S = 0.004
 MAX_RATE_RPS = math.radians(220.0)
 MAX_YAW_RATE_RPS = math.radians(90.0)
-MIN_UP_MPS2 = 1.0  # thrust asked for is never less than this much upward: the lean stays defined
+MIN_UP_MPS2 = 1.0  # smallest upward thrust of a setpoint: keeps its attitude defined
 
 
 @dataclass(frozen=True)
@@ -26,12 +26,12 @@ class AttitudeSetpoint:
 
     force_mps2: Vec3  # specific force wanted of the rotors, NED
     attitude: Quaternion  # that points the rotors along it with the wanted heading
-    is_tilt_limited: bool  # whether the largest tilt kept the horizontal part below the wanted one
-    is_dive_limited: bool  # whether a dive was wanted in which no thrust would be left to lean
+    is_tilt_limited: bool  # whether the tilt limit reduced the horizontal part
+    is_dive_limited: bool  # whether the requested dive would leave no thrust to tilt
 
 
 def compute_attitude_setpoint(accel_mps2: Vec3, yaw_rad: float, tilt_limit_rad: float) -> AttitudeSetpoint:
-    """Return the lean that gives an acceleration in still air; where the tilt is limited, height has priority."""
+    """Return the setpoint that gives an acceleration in still air; where the tilt is limited, height has priority."""
     north, east = accel_mps2[0], accel_mps2[1]
     wanted_up = GRAVITY_MPS2 - accel_mps2[2]
     up = max(wanted_up, MIN_UP_MPS2)

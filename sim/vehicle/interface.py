@@ -25,7 +25,7 @@ LEVEL: Quaternion = (1.0, 0.0, 0.0, 0.0)
 
 
 class Battery(Protocol):
-    """Battery as telemetry sees it."""
+    """Battery as telemetry reports it."""
 
     @property
     def voltage_v(self) -> float:
@@ -102,7 +102,7 @@ class Vehicle(Protocol):
         """Hold this acceleration setpoint from now on [m/s²]."""
 
     def brake(self) -> None:
-        """Stop, and stay where that ends."""
+        """Stop and hold position."""
 
     def fly(self, velocity_mps: Vec3) -> None:
         """Fly this velocity [m/s]."""
@@ -114,7 +114,7 @@ class Vehicle(Protocol):
         """Hold a position [m] that moves with this velocity [m/s] and acceleration [m/s²]."""
 
     def take_off(self, height_m: float) -> None:
-        """Climb to this height above the floor [m], over the present place."""
+        """Climb to this height above the floor [m], over the present position."""
 
     def land(self) -> None:
         """Sink at the landing speed."""
@@ -126,10 +126,10 @@ class Vehicle(Protocol):
         """Stand on the floor, rotors off, until `grounded` is cleared."""
 
     def set_estimate_error(self, position_error_m: Vec3, velocity_error_mps: Vec3) -> None:
-        """Add an error to position and velocity as the vehicle's own loops see them, from now on."""
+        """Set the error of position and velocity in the vehicle's loops."""
 
     def set_attitude_error(self, error_rad: Vec3) -> None:
-        """Turn the attitude that the vehicle's own loops see by so much about body axes [rad], from now on."""
+        """Set the attitude error of the vehicle's loops about body axes [rad]."""
 
 
 @dataclass(frozen=True)
@@ -257,11 +257,11 @@ class ControlledPlant:
         self._plant.stand_on_floor()
 
     def set_estimate_error(self, position_error_m: Vec3, velocity_error_mps: Vec3) -> None:
-        """Add an error to position and velocity as its laws see them, from now on."""
+        """Set the error of position and velocity in its laws."""
         self._errors = (position_error_m, velocity_error_mps)
 
     def set_attitude_error(self, error_rad: Vec3) -> None:
-        """Do nothing: its laws know no attitude."""
+        """Do nothing: its laws use no attitude."""
 
     def update_control(self) -> None:
         """Evaluate the law of the present goal, and hold its acceleration."""

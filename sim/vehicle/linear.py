@@ -23,7 +23,7 @@ NED_AXES = ("north", "east", "down")
 MAX_ACCEL_MPS2 = 100.0
 # Closeness of expm(logm(M)) to M that proves the continuous-time model, relative to |M|.
 LOGARITHM_TOLERANCE = 1e-9
-# Sub-steps kept at hand; a lockstep run needs fewer than ten, a run on sockets any number.
+# Cached sub-steps; a lockstep run needs fewer than ten, a run on sockets any number.
 CACHED_TRANSITIONS = 256
 
 
@@ -137,7 +137,7 @@ def _velocity_reference_flow(plant: PlantConfig) -> Array:
         to_states[4, [4, 1]] = [1.0, -1.0]
         to_states[5, [5, 6]] = 1.0
         to_states[[6, 7, 8], [7, 8, 9]] = 1.0
-        from_states = np.zeros((10, 9))  # one of the loops' states that are seen so: that without a force
+        from_states = np.zeros((10, 9))  # a loop state of each x: the one without a force
         from_states[[0, 1, 2, 5], [0, 1, 2, 5]] = 1.0
         from_states[3, [0, 3]] = from_states[4, [1, 4]] = 1.0
         from_states[[7, 8, 9], [6, 7, 8]] = 1.0
@@ -168,8 +168,8 @@ def _generator(a: Array, b: Array, e: Array, dt_s: float) -> Array:
 class LinearVehicle:
     """State of the plant at one moment, moved forward by `advance`.
 
-    w is drawn anew at each boundary start_ns + k Δt and held for the step; u is held until it is
-    changed. Axes that the plant has not stay at their start position.
+    A new w is drawn at each boundary start_ns + k Δt and held for the step; u is held until it changes.
+    Axes that the plant lacks stay at their start position.
 
     Attributes:
         attitude: Attitude (w, x, y, z), body axes FRD to NED: always level, the nose north.
@@ -189,7 +189,7 @@ class LinearVehicle:
             x[v] = config.sim.start_velocity_mps[axis]
         self._anchor_x: Array = x  # state at the last change of u or w
         self._anchor_ns = start_ns
-        self._x: Array | None = x  # state now, once asked for
+        self._x: Array | None = x  # present state, computed on request
         self._u: Array = np.zeros(self.model.b.shape[1])
         self._w: Array = self._draw()
         self._next_boundary_ns = start_ns + self.model.dt_ns

@@ -27,7 +27,7 @@ REFERENCE_ACCEL_MPS2 = BRAKE_MPS2  # WPNAV_ACCEL of the recorded ArduCopter: wha
 REFERENCE_GAIN_1PS = 2.0
 REFERENCE_POSITION_1PS = 0.5  # a quarter of the former: no overshoot
 CRAWL_HEIGHT_M = 1.0  # PX4's MPC_LAND_ALT3
-EXTRAPOLATION_S = 3.0  # ArduPilot moves a position on with its velocity for so long (GUID_TIMEOUT), then it stays
+EXTRAPOLATION_S = 3.0  # ArduPilot moves a position on with its velocity for this time (GUID_TIMEOUT), then it holds it
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ TUNINGS = {
 
 
 class LoopDemand(Enum):
-    """Motion that the loops are asked for."""
+    """Kind of the demanded motion."""
 
     ACCELERATION = auto()
     VELOCITY = auto()
@@ -124,7 +124,7 @@ class _PendingSetpoint(NamedTuple):
 
 
 class Cascade:
-    """Outer loops from a setpoint to a lean, once per step.
+    """Outer loops from a setpoint to an attitude setpoint, once per step.
 
     Attributes:
         yaw_rad: heading to hold.
@@ -147,7 +147,7 @@ class Cascade:
         self._thrust_integral_mps2 = 0.0  # integral of the loop on the vertical acceleration
 
     def reset(self, motion: BodyState) -> None:
-        """Start anew from this motion, with zero acceleration."""
+        """Restart from this motion, with zero acceleration."""
         self._pending.clear()
         self._demand, self._setpoint = LoopDemand.ACCELERATION, ZERO
         self._accel = self._integral = ZERO
@@ -212,12 +212,12 @@ class Cascade:
         self._set_reference(motion)
 
     def step(self, motion: BodyState, *, thrust_limited: bool, down_accel_mps2: float = 0.0) -> AttitudeSetpoint:
-        """Take a step in the air; return the lean to take now.
+        """Take a step in the air; return the attitude setpoint.
 
         Args:
-            motion: motion of the vehicle, as its loops see it.
+            motion: motion of the vehicle, as its loops estimate it.
             thrust_limited: whether the rotors could not give the thrust of the last step.
-            fall_mps2: downward acceleration in the last step, as accelerometers feel it.
+            down_accel_mps2: downward acceleration in the last step, as measured.
         """
         if self._demand is LoopDemand.ACCELERATION:
             self._follow_acceleration()
@@ -242,8 +242,6 @@ class Cascade:
 
     def _compute_attitude(self, accel: Vec3) -> AttitudeSetpoint:
         return compute_attitude_setpoint(accel, self.yaw_rad, self.tuning.tilt_limit_rad)
-
-    # The reference
 
     def _set_reference(self, motion: BodyState) -> None:
         self._position, self._velocity = motion.position_m, motion.velocity_mps
@@ -298,10 +296,8 @@ class Cascade:
         self._position = (pn + h * (vn + 0.5 * h * an), pe + h * (ve + 0.5 * h * ae), pd + h * (vd + 0.5 * h * ad))
         self._velocity = (vn + h * an, ve + h * ae, vd + h * ad)
 
-    # The loops on it
-
     def _track_reference(self, motion: BodyState, thrust_limited: bool, down_accel_mps2: float) -> AttitudeSetpoint:
-        """Hold the vehicle on the reference, which must not run away from a vehicle that cannot follow."""
+        """Hold the vehicle on the reference; stop the reference where the vehicle cannot follow."""
         t = self.tuning
         (pn, pe, pd), (vn, ve, vd) = motion.position_m, motion.velocity_mps
         en = self._velocity[0] - vn + t.position_1ps * (self._position[0] - pn)

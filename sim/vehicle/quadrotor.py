@@ -31,19 +31,19 @@ STEP_NS = 2_500_000
 STEP_S = STEP_NS * 1e-9
 # A vehicle that touches the floor leaning is put upright by its legs: its tilt shrinks with this time constant.
 RIGHTING_S = 0.05
-LANDED_NS = 500_000_000  # on the floor without a break for so long is landed
+LANDED_NS = 500_000_000  # contact without a break for this time counts as landed
 ZERO: Vec3 = (0.0, 0.0, 0.0)
 
 
 class Quadrotor:
     """Quadrotor in the air or on the floor z = 0; takes the place of `LinearVehicle`.
 
-    The physics moves on the grid start_ns + k 2.5 ms; what is asked takes effect at the next point of it, and
-    positions between two points are read from the last one and its velocity and acceleration. So stops on the
-    way change no bit.
+    The physics moves on the grid start_ns + k 2.5 ms; a request takes effect at the next grid point.
+    Positions between two points follow from the last point, its velocity and its acceleration. So further stops
+    change no bit.
 
     Args:
-        model: the controller's plant as the simulator sees it; says what `state` and `input` hold.
+        model: the simulator's model of the controller's plant; defines `state` and `input`.
         wind: the air, stepped with the physics.
     """
 
@@ -75,12 +75,10 @@ class Quadrotor:
         self._accel: Vec3 = ZERO
         self._estimate_errors: tuple[Vec3, Vec3] | None = None
         self._down_accel_mps2 = 0.0  # downward acceleration in the last step
-        self._attitude_error_rad: Vec3 | None = None  # of the attitude that the loops believe
+        self._attitude_error_rad: Vec3 | None = None  # of the loops' attitude, about body axes
         hover_rps = airframe.hover_rps
         self._rotors.speeds_rps = self._rotors.commands_rps = (hover_rps, hover_rps, hover_rps, hover_rps)
         self.cascade.reset(self._motion)
-
-    # What it is doing
 
     @property
     def has_down(self) -> bool:
@@ -175,8 +173,6 @@ class Quadrotor:
             GRAVITY_MPS2 - (1.0 - 2.0 * (x * x + y * y)) * thrust_mps2,
         )
 
-    # What it is asked
-
     def accelerate(self, accel_mps2: Vec3) -> None:
         """Hold this acceleration setpoint (NED) [m/s²] from now on."""
         north, east, down = (min(max(a, -MAX_ACCEL_MPS2), MAX_ACCEL_MPS2) for a in accel_mps2)
@@ -184,7 +180,7 @@ class Quadrotor:
         self.cascade.accelerate(self._accel)
 
     def brake(self) -> None:
-        """Stop, and stay where that ends."""
+        """Stop and hold position."""
         self.fly(ZERO)
 
     def fly(self, velocity_mps: Vec3) -> None:
@@ -208,7 +204,7 @@ class Quadrotor:
         self.cascade.take_off(height_m)
 
     def land(self) -> None:
-        """Sink at the landing speed until told otherwise; `landed` says when the floor is reached."""
+        """Sink at the landing speed until the next order; `landed` turns true on the floor."""
         self._accel = ZERO
         self.cascade.land()
 
@@ -217,12 +213,12 @@ class Quadrotor:
         self.cascade.yaw_rad = yaw_rad
 
     def set_estimate_error(self, position_error_m: Vec3, velocity_error_mps: Vec3) -> None:
-        """Add an error to position and velocity as its own loops see them, from now on."""
+        """Set the error of position and velocity in its loops."""
         is_zero = position_error_m == velocity_error_mps == ZERO
         self._estimate_errors = None if is_zero else (position_error_m, velocity_error_mps)
 
     def set_attitude_error(self, error_rad: Vec3) -> None:
-        """Turn the attitude that its own loops see by so much about body axes [rad], from now on."""
+        """Set the attitude error of its loops about body axes [rad]."""
         self._attitude_error_rad = None if error_rad == ZERO else error_rad
 
     def stand_on_floor(self) -> None:
@@ -235,7 +231,7 @@ class Quadrotor:
 
     @property
     def grounded(self) -> bool:
-        """Whether it stands on the floor with its rotors off; cleared, they idle, and the loops begin anew."""
+        """Whether it stands on the floor with its rotors off; cleared, they idle, and the loops restart."""
         return self._grounded
 
     @grounded.setter
@@ -247,8 +243,6 @@ class Quadrotor:
             self._touched_ns = self.now_ns
             self.cascade.reset(self._motion)
             self._attitude_loop.reset(ZERO)
-
-    # Its motion
 
     def advance(self, to_ns: int) -> None:
         """Move on to `to_ns`, through every point of the grid up to and including it."""

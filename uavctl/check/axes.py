@@ -29,7 +29,7 @@ _VEHICLE_MESSAGES = ("LOCAL_POSITION_NED",)
 _TILT_DEG = 25.0  # between the two attitudes
 _MOVE_TOLERANCE_M, _MOVE_TOLERANCE_SHARE = 0.05, 0.15
 _PROMPT_TOLERANCE_SHARE = 0.6  # of the way that a person was asked to move the body
-_CONSTANT_POSITION = 128  # it assumes that it stands; PX4 says so of every vehicle that rests, whatever it knows
+_CONSTANT_POSITION = 128  # it assumes a constant position; PX4 sets this flag for every vehicle at rest
 _PX4 = 12  # MAV_AUTOPILOT
 _WANT = "the same axes, unit and handedness as the vehicle's own"
 _MOVE = "move the body by half a metre up, north and east while it looks, or `uavctl check --move`"
@@ -39,7 +39,7 @@ def check_axes(data: CheckData, config: Config, prompted_moves: list[tuple[Vec3,
     """Items of own position, axes and heading.
 
     Args:
-        asked: (movement that was asked for, movement that the cameras saw), local NED [m].
+        prompted_moves: (requested movement, movement measured by the cameras), local NED [m].
     """
     if config.source.messages == _VEHICLE_MESSAGES:
         return [make_item("axes", ItemState.GOOD, "the positions are the vehicle's own", _WANT)]
@@ -55,7 +55,7 @@ def check_axes(data: CheckData, config: Config, prompted_moves: list[tuple[Vec3,
 
 
 def has_vehicle_position(data: CheckData) -> bool:
-    """Whether there are positions of the vehicle's own to compare the cameras' with."""
+    """Whether there are enough positions of the vehicle to compare with the cameras'."""
     return _has_position(data) and len(data.pair_positions()) >= MIN_PAIRS
 
 

@@ -54,14 +54,14 @@ MISTAKES = (
 class Evidence:
     """Pairs that belong together."""
 
-    vehicle_m: Array  # v (k, 3), vectors as the vehicle knows them [m]
-    cameras_m: Array  # e (k, 3), the same as the cameras see them [m]
+    vehicle_m: Array  # v (k, 3), vectors in the vehicle's axes [m]
+    cameras_m: Array  # e (k, 3), the same vectors in the cameras' axes [m]
     tolerance_m: float  # root of the mean square of e - v that a right set-up keeps
 
     def compute_misfit(self, matrix: Array) -> float:
         """Return the error of e = M v, in tolerances; up to 1 the relation may hold."""
         error_m = self.cameras_m - self.vehicle_m @ matrix.T
-        # What the vehicle does not know of v counts as often as the set-up multiplies it.
+        # An error of v counts as often as the set-up multiplies it.
         scale = max(1.0, float(np.cbrt(abs(np.linalg.det(matrix)))))
         return math.sqrt(float(np.mean(np.sum(error_m * error_m, axis=1)))) / (self.tolerance_m * scale)
 

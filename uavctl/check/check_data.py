@@ -30,13 +30,13 @@ _MAX_GAP_NS = 500_000_000  # own positions further apart are not interpolated
 _LEVEL = (1.0, 0.0, 0.0, 0.0)
 _PX4, _EV_YAW, _EXTERNAL = 12, 8, 6  # MAV_AUTOPILOT; bit of EKF2_EV_CTRL; value of EK3_SRC1_YAW
 HORIZONTAL = 8 | 16  # ESTIMATOR_STATUS_FLAGS: position relative, or absolute
-AIDED = 256  # PX4: something tells it where it is
+AIDED = 256  # PX4: an external source gives its position
 BYTEWISE = 16  # MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
 
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """A position of the cameras, and how its body was turned in NED, if that was told."""
+    """A position of the cameras, and the body's attitude in NED, if the source gives one."""
 
     captured_ns: int
     received_ns: int
@@ -47,24 +47,23 @@ class Sample:
 
 @dataclass
 class CheckData:
-    """Record of all that was heard while the check listened."""
+    """Data received while the check listens."""
 
     start_ns: int  # when listening began
     samples: list[Sample] = field(default_factory=list)  # positions of the cameras, as they arrived
-    # whether the source gives attitudes; one that is always exactly level and to the north is what bridges send that
-    # know none
+    # whether the source gives attitudes; bridges without attitude data always send an exactly level one to the north
     has_attitude: bool = False
-    # (time in our clock [ns], position [m]) as the vehicle believes it
+    # (time in our clock [ns], position [m]) of the vehicle's estimate
     vehicle_positions: list[tuple[int, Vec3]] = field(default_factory=list)
-    # (time of arrival [ns], roll, pitch and yaw) as the vehicle tells its attitude
+    # (time of arrival [ns], roll, pitch and yaw) of the vehicle's attitude
     angles_rad: list[tuple[int, Vec3]] = field(default_factory=list)
     heartbeat: Heartbeat | None = None
     heartbeat_ns: int = 0  # when the last one came
     landed: bool | None = None
     battery_v: float | None = None
     estimator: int | None = None  # newest flags of the vehicle's estimator
-    # whether it has told, while a check listened, that it has a position and something that tells it where it is: over
-    # a lossy link PX4 takes the latter back for a second again and again
+    # whether it has reported, while a check listened, a position and an external source of it: over a lossy link PX4
+    # withdraws the latter for a second again and again
     is_aided: bool = False
     version: AutopilotVersion | None = None
     parameters: dict[str, ParamValue] = field(default_factory=dict)  # values of the vehicle's parameters
@@ -129,7 +128,7 @@ class CheckData:
         return None if self.heartbeat is None else self.heartbeat.autopilot
 
     def get_parameter(self, name: str, *, px4: bool) -> float | None:
-        """A parameter's value as this autopilot means its bytes; None if it has not told it."""
+        """Return a parameter's value by this autopilot's encoding; None without an answer."""
         message = self.parameters.get(name)
         if message is None:
             return None

@@ -15,7 +15,7 @@ class ItemState(StrEnum):
 
     GOOD = "good"
     NOTE = "note"  # flyable, and worth knowing
-    UNDETERMINED = "undetermined"  # nothing speaks against it, nothing shows it
+    UNDETERMINED = "undetermined"  # neither confirmed nor contradicted
     BAD = "bad"
 
 
@@ -23,10 +23,10 @@ class Item(msgspec.Struct, frozen=True, kw_only=True):
     """One line of a check."""
 
     name: str  # name of the item, as `check.accept` takes it
-    ok: bool  # nothing speaks against flying; false only for a `bad` state
-    value: str  # value that was found
+    ok: bool  # whether a flight may begin; false only for a `bad` state
+    value: str  # observed value
     want: str  # value that is wanted
-    hint: str  # what to do; empty if nothing is to be done
+    hint: str  # remedy; empty if none is needed
     state: ItemState  # the whole answer: `good`, `note`, `undetermined` or `bad`
 
 
@@ -53,7 +53,7 @@ def find_refusals(items: Iterable[Item], config: CheckConfig) -> tuple[Item, ...
 
 
 def describe_item(item: Item) -> str:
-    """Describe an item in sentences: what was seen, what is wanted, what to do."""
+    """Describe an item in sentences: value, wanted value, remedy."""
     return " ".join(
         (f"{item.name}: {item.value}.", f"Wanted: {item.want}.", *([_format_sentence(item.hint)] if item.hint else ()))
     )

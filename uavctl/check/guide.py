@@ -19,10 +19,10 @@ PROMPTS = (
 
 
 class Guide:
-    """Asks for one movement after another, and takes down what the cameras see of each.
+    """Prompts for one movement after another, and records the cameras' measurement of each.
 
     Args:
-        limit_ns: time for each prompt; one that is not followed is passed over.
+        limit_ns: time for each prompt; the guide skips a prompt that is not followed in it.
     """
 
     def __init__(self, limit_ns: int) -> None:
@@ -31,7 +31,7 @@ class Guide:
         self._start_ns: int | None = None
         self._recent_positions: deque[tuple[int, Vec3]] = deque()
         self._start_m: Vec3 | None = None
-        self.moves: list[tuple[Vec3, Vec3]] = []  # (asked for, seen), local NED [m]
+        self.moves: list[tuple[Vec3, Vec3]] = []  # (requested, measured), local NED [m]
         self.missed_prompts: list[str] = []  # names of prompts that were not followed
 
     @property
@@ -49,7 +49,7 @@ class Guide:
 
         Args:
             position_m: local NED [m].
-            heading_rad: the vehicle's own heading; without one only `up` can be asked for.
+            heading_rad: the vehicle's own heading; without one it can only prompt for `up`.
         """
         if self.is_done:
             return
@@ -93,7 +93,7 @@ class Guide:
 
 
 def _get_expected_move(name: str, heading_rad: float | None) -> Vec3 | None:
-    """The movement that a prompt asks for, local NED [m]."""
+    """Return the movement of a prompt, local NED [m]."""
     if name == "up":
         return (0.0, 0.0, -MOVE_M)
     if heading_rad is None:

@@ -52,7 +52,7 @@ def _require(want: str, *, good: bool, failed_state: ItemState = ItemState.NOTE)
 
 
 def _require_if(applies: bool, want: str, reason: str, *, good: bool) -> ParameterVerdict:
-    """Judge a want that holds only under a condition; without it any value will do, and the verdict says so."""
+    """Judge a want that holds only under a condition; without the condition any value is good."""
     return _require(want, good=good) if applies else ParameterVerdict(ItemState.GOOD, f"{_ANY}: {reason}")
 
 
@@ -139,12 +139,12 @@ def _round_down(max_s: float, min_s: float) -> float | None:
 
 
 def _describe_distances(tightest: list[Runaway], timeout_s: float) -> str:
-    """Say how far a timeout carries the vehicle where the room is tightest; empty in a room without limits."""
+    """Describe how far a timeout carries the vehicle where the room is tightest; empty in a room without limits."""
     directions = {"north": "north or south", "east": "east or west", "down": "up or down"}
     texts = []
     for runaway in tightest:
         distance_m = runaway.distance_m(timeout_s)
-        # As many digits as tell the two apart.
+        # As many digits as distinguish the two.
         digits = next((n for n in range(3, 9) if f"{distance_m:.{n}g}" != f"{runaway.free_m:.{n}g}"), 9)
         texts.append(
             f"{timeout_s:.7g} s would carry it {distance_m:.{digits}g} m {directions[runaway.axis]}; your room allows "
@@ -290,7 +290,7 @@ def check_parameters(data: CheckData, config: Config, take_off_m: float | None =
 
 
 def _make_climb_rule(config: Config, take_off_m: float | None) -> Rule:
-    """PX4 climbs to a height of its own, and is asked for OFFBOARD on the way, where `--takeoff` is reached."""
+    """Make the rule for PX4's take-off height: OFFBOARD is requested during its climb, at the height of `--takeoff`."""
     ceiling_m = -get_position_limits_m(config).get("down", (-math.inf, 0.0))[0]
     min_m = 0.0 if take_off_m is None else take_off_m
     bounds = [f"at most {ceiling_m:g} m, the room (sets)"] if math.isfinite(ceiling_m) else []

@@ -1,4 +1,4 @@
-"""Items of the positions themselves: do they come as the design counts on, and do they make sense."""
+"""Items of the positions: rate, gaps, age, loss, noise, room and repeats against the design."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from uavctl.flight.link_estimate import loss_std
 from uavctl.records import Vec3
 from uavctl.smpc.plant import AXES
 
-_MIN_SAMPLES = 8  # samples without which nothing is said
+_MIN_SAMPLES = 8  # fewest samples for a statement
 _AGE_TOLERANCE_S = 0.005
 _MIN_RATE_SHARE = 0.95  # of the rate that is wanted
 _MAX_STEP_DEVIATION, _MIN_REGULAR_SHARE = (
@@ -34,7 +34,7 @@ CAMERA_AXES = (
 
 
 def check_positions(data: CheckData, config: Config, at_ns: int) -> list[Item]:
-    """Items of rate, gaps, age, loss, noise and place of the positions heard up to `at_ns`."""
+    """Return items of rate, gaps, age, loss, noise and place of the positions received up to `at_ns`."""
     if not data.samples:
         return [_report_no_positions(data, config)]
     captured_s = sorted(sample.captured_ns * 1e-9 for sample in data.samples)
@@ -67,7 +67,7 @@ def _report_no_positions(data: CheckData, config: Config) -> Item:
 
 
 def uses_camera_system(config: Config) -> bool:
-    """Whether a camera system is listened to directly."""
+    """Return whether the positions come from a camera system without a bridge."""
     return bool(parse_camera_scheme(config.daemon.mocap))
 
 
@@ -128,7 +128,7 @@ def _check_age(data: CheckData, config: Config) -> Item:
     has_timesync = any(stats.clock_source == "timesync" for stats in data.stats.values())
     note = "" if has_timesync else "; counted from the quickest one, as the source answers no TIMESYNC"
     value = f"median {ages_s[len(ages_s) // 2] * 1e3:.1f} ms, 95 % within {p95_s * 1e3:.1f} ms{note}"
-    # Ages count in steps: one within Δt is 0, whatever the link was said to take.
+    # Ages count in steps: one within Δt is 0, whatever delay the link has.
     planned_steps = config.smpc.horizon if config.is_age_conditioned else config.schedule.late + 1
     step_s = planned_steps * config.plant.dt_s
     max_age_s = max(limit_s, step_s)
@@ -180,7 +180,7 @@ def estimate_noise_m(samples: list[Sample]) -> Vec3:
 
 
 def is_at_rest(data: CheckData, move_m: float) -> bool:
-    """Whether the vehicle stood still, as far as its own position, or else the cameras', show."""
+    """Return whether the vehicle stood still, by its own position, or else by the cameras'."""
     positions = (
         [position for _, position in data.vehicle_positions]
         if len(data.vehicle_positions) >= _MIN_SAMPLES
@@ -190,7 +190,7 @@ def is_at_rest(data: CheckData, move_m: float) -> bool:
 
 
 def measure_extent_m(positions: Array) -> float:
-    """How far places (n, 3) lie apart, the farthest of them left out [m]."""
+    """Return the extent of positions (n, 3) without the outermost [m]."""
     low, high = np.percentile(positions, [5, 95], axis=0)
     return float(np.linalg.norm(high - low))
 

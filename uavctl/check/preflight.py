@@ -25,12 +25,12 @@ VEHICLE = "vehicle"
 REQUEST_INTERVAL_NS = 1_000_000_000  # between two rounds of requests
 MAX_REQUEST_ROUNDS = 5
 PROMPT_TIMEOUT_NS = 30_000_000_000
-# Beside what a link asks for anyway: AUTOPILOT_VERSION once (0), EKF_STATUS_REPORT or ESTIMATOR_STATUS by autopilot
+# Beside a link's own requests: AUTOPILOT_VERSION once (0), EKF_STATUS_REPORT or ESTIMATOR_STATUS by autopilot
 _STREAMS_HZ = {3: {148: 0.0, 193: 1.0}, 12: {148: 0.0, 230: 1.0}}
 
 
-MessageHandler = Callable[[Message, int], None]  # hears a message that arrived at a time [ns]
-# Makes the protocol states of the connections by name, with somebody who hears every message.
+MessageHandler = Callable[[Message, int], None]  # receives a message and its time of arrival [ns]
+# Makes the protocol states of the connections by name; a handler receives every message.
 LinkFactory = Callable[[Config, MessageHandler], Mapping[str, MavlinkConnection]]
 
 
@@ -57,10 +57,10 @@ class Preflight:
         self._relay = Relay(config.relay)
         self._requested_ns: int | None = None
         self._rounds = 0
-        self.guide = Guide(PROMPT_TIMEOUT_NS) if move else None  # the prompts, if they were asked for
+        self.guide = Guide(PROMPT_TIMEOUT_NS) if move else None  # prompts, if requested
 
     def receive(self, link: str, data: bytes, at_ns: int) -> Received:
-        """Take one datagram that arrived at `at_ns`; gives what it was, and what is to be sent at once."""
+        """Take one datagram that arrived at `at_ns`; return its source and the datagrams to send at once."""
         from_vehicle = from_source = False
         decoded = self._links[link].receive(data, at_ns)
         for record in decoded.items:
@@ -96,7 +96,7 @@ class Preflight:
                 send(Outgoing(link=VEHICLE, data=data))
 
     def _requests(self, vehicle: MavlinkConnection) -> Iterator[bytes]:
-        """Yield requests for what the vehicle has not told yet."""
+        """Yield requests for data that the vehicle has not sent yet."""
         kind = self._data.autopilot
         if self._rounds <= 2:  # a lost request is repeated once; a vehicle that ignores it is not pestered
             for message_id, rate_hz in _STREAMS_HZ.get(kind or 0, {}).items():
@@ -145,14 +145,14 @@ class Preflight:
 
     @property
     def needs_vehicle_position(self) -> bool:
-        """Whether a vehicle is heard whose own position would show more, and is not there yet."""
+        """Whether a vehicle answers, but its own position, which would show more, is missing."""
         uses_vehicle_position = self._config.source.messages == ("LOCAL_POSITION_NED",)
         has_both = self._data.heartbeat is not None and bool(self._data.samples)
         return has_both and not uses_vehicle_position and not has_vehicle_position(self._data)
 
     @property
     def prompt(self) -> str:
-        """Prompt that tells a person what to do now; empty for nothing."""
+        """Prompt for the person now; empty if there is none."""
         return self.guide.prompt if self.guide is not None and self._is_safe else ""
 
     @property

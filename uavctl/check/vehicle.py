@@ -18,7 +18,7 @@ _NAMES = {3: "ArduPilot", 12: "PX4"}
 
 
 def check_vehicle(data: CheckData, config: Config, at_ns: int, take_off_m: float | None = None) -> list[Item]:
-    """Return the items of what the vehicle told of itself up to `at_ns`; `take_off_m` is the climb that is planned."""
+    """Return the items of the vehicle's own reports up to `at_ns`; `take_off_m` is the planned climb."""
     heartbeat = data.heartbeat
     want = "heartbeats of PX4 or ArduPilot, about one a second"
     if heartbeat is None:
@@ -64,7 +64,7 @@ def _check_other_vehicles(data: CheckData) -> Item:
 
 
 def is_armed(data: CheckData) -> bool:
-    """Whether the vehicle says that it is armed."""
+    """Return whether the vehicle reports that it is armed."""
     return data.heartbeat is not None and bool(data.heartbeat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
 
 

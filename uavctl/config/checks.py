@@ -33,9 +33,6 @@ from uavctl.config.types import (
 )
 from uavctl.frames import up_hint
 
-# Checks of a mission and its fences: lengths, times, and whether the places are inside the limits.
-
-
 MAX_STEPS = 50_000  # of a motion, each of which is made before the flight
 _AXES = ("north", "east", "down")
 
@@ -59,7 +56,7 @@ def find_outside(
     """Coordinates of a place that are outside the limits of the position."""
     for axis, i in zip(plant.axes, get_position_index(plant), strict=False):
         if not 0 <= i < min(len(sets.state_lower), len(sets.state_upper)):
-            continue  # a problem of its own
+            continue  # reported separately
         low, high = sets.state_lower[i], sets.state_upper[i]
         value = position_m[_AXES.index(axis)]
         if not low <= value <= high:
@@ -263,7 +260,7 @@ def _check_plant(plant: PlantConfig) -> Iterator[ConfigProblem]:
         required_keys = tuple(key for key in required_keys if key not in _AXIS_KEYS)
     foreign = dict.fromkeys(key for keys in _KEYS.values() for key in keys if key not in required_keys)
     missing = [key for key in required_keys if not getattr(plant, key)]
-    if plant.model == "matrices" and {*missing} >= {*_AXIS_KEYS}:  # one thing is missing: what the states are
+    if plant.model == "matrices" and {*missing} >= {*_AXIS_KEYS}:  # only the meaning of the states is missing
         yield ConfigProblem(
             "plant.axes",
             f"is given without {', '.join(_AXIS_KEYS)}, which say how the plant moves along them",

@@ -1,4 +1,4 @@
-"""[mocap] [vehicle] [security] [hand_over] [check] [relay]: whom the loop talks to."""
+"""Sections of the connections: hand-over, frame, source, clock, daemon, security, check and relay."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from uavctl.config.document import MAX_PATH_LENGTH, MAX_URL_LENGTH, ConfigProblem, Position, Section
-
-# Requests to the vehicle for modes, arming and take-off, and how long to wait for its answers.
 
 
 class HandOverConfig(Section, frozen=True, kw_only=True):
@@ -65,9 +63,6 @@ class HandOverConfig(Section, frozen=True, kw_only=True):
     ] = (47.397742, 8.545594, 488.0)
 
 
-# Partners of the control loop: frame and clock of the positions' source, and the connections.
-
-
 @dataclass(frozen=True)
 class CameraSystem:
     """A camera system that is listened to without a bridge to MAVLink."""
@@ -77,7 +72,7 @@ class CameraSystem:
     extra: str  # our optional dependency group that installs the package
     port: int  # of its server, if a URL names none; 0: a URL has to
     advice: str  # what to check if no answer comes
-    up: Literal["y", "z"] = "y"  # the axis that is up where a URL says nothing
+    up: Literal["y", "z"] = "y"  # the vertical axis without a statement in the URL
 
 
 # By the scheme of their URLs, SCHEME://SERVER[:PORT]/BODY.
@@ -115,7 +110,7 @@ def parse_camera_scheme(url: str) -> str:
 
 
 def get_camera_system(scheme: str) -> CameraSystem:
-    """Return what is known of a camera system, by the scheme of its URLs."""
+    """Return a camera system by the scheme of its URLs."""
     if scheme in CAMERA_SYSTEMS:
         return CAMERA_SYSTEMS[scheme]
     camera = next((entry_point.value for entry_point in entry_points(group=SOURCE_GROUP, name=scheme)), scheme)
@@ -221,9 +216,6 @@ class DaemonConfig(Section, frozen=True, kw_only=True):
     ] = True
 
 
-# Trust: signing, and the addresses that are listened to.
-
-
 MOCAP_LINK = 1  # its link id is that of the vehicle's connection plus this
 
 
@@ -321,9 +313,6 @@ def find_security_warnings(security: SecurityConfig, daemon: DaemonConfig) -> tu
     return tuple(f"{', '.join(names)}: {text}" for text, names in names_by_text.items())
 
 
-# Checks of a camera system that is listened to without a bridge to MAVLink.
-
-
 def check_roles(daemon: DaemonConfig) -> Iterator[ConfigProblem]:
     """Check that a camera system is not given as the vehicle."""
     if parse_camera_scheme(daemon.vehicle):
@@ -354,9 +343,6 @@ def check_signing(daemon: DaemonConfig, security: SecurityConfig) -> Iterator[Co
             f'"mocap" cannot be: {daemon.mocap} has no signatures',
             'write require = ["vehicle"], and keep the cameras\' network to itself',
         )
-
-
-# The sections `[check]` and `[relay]`: what is looked at before a flight, and positions passed on to the vehicle.
 
 
 class CheckConfig(Section, frozen=True, kw_only=True):

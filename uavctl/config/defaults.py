@@ -1,7 +1,6 @@
-"""Keys that a document may leave out because others say what they are: an own plant needs no room, and no vehicle.
+"""Defaults that follow from other keys of a document: a plant of matrices needs no room and no vehicle.
 
-They are filled in as plain values before anything is decoded, so that a configuration is complete wherever it is
-kept. What is written stays as it is written.
+They are filled in as plain values before decoding, so a stored configuration is complete. Given values stay unchanged.
 """
 
 from __future__ import annotations
@@ -12,17 +11,17 @@ from pathlib import PurePath
 from typing import Any
 
 AXES = ("north", "east", "down")
-# Of scheme `age-conditioned`: that of the presets, which looks 2.4 s ahead there.
+# Of scheme `age-conditioned`: that of the presets, 2.4 s there.
 _HORIZON = 48
 # A vehicle's setpoint as the presets limit it; no acceleration of an own plant is known.
 _ACCEL_MPS2, _SLEW_MPS3 = 2.0, 15.0
 _MAX_TICK_S = 0.1
-_DT_S = 0.05  # of the presets, where plant.dt_s is wrong and told anyway
+_DT_S = 0.05  # of the presets, used where plant.dt_s is wrong; the decoder reports it
 _ROUNDING = 1e-9
 
 
 def fill_defaults(table: dict[str, Any], file: str) -> None:
-    """Fill in what a document leaves out; what has a wrong type is left for the decoder to tell."""
+    """Fill in the keys that a document leaves out; the decoder reports values of a wrong type."""
     table.setdefault("name", PurePath(file).stem[:100] or "own")
     plant, sets, sim = (_get_table(table, key) for key in ("plant", "sets", "sim"))
     if "a" in plant:

@@ -1,7 +1,8 @@
-"""A configuration document: its sections' types in words, its problems, and the line of each key.
+"""A configuration document: bounds of its size, text files, lines of its keys, base of its sections, types as text.
 
-Parsers give values without places, or places without paths; a message that names the line of a
-wrong key needs both. The document must be valid TOML (the parser has seen it first).
+Parsers give values without lines, or lines without key paths; a message that names the line of a wrong key needs both.
+The scanner of key lines requires valid TOML, so the parser runs first. A document that nests too deep, or whose numbers
+and texts no key takes, is refused with its line before further processing.
 """
 
 from __future__ import annotations
@@ -20,8 +21,6 @@ import msgspec
 from msgspec import Meta
 from msgspec.structs import FieldInfo
 
-# One thing that is wrong with a configuration.
-
 
 class ConfigProblem(NamedTuple):
     """Key path, what is wrong with it, and what to do."""
@@ -31,18 +30,13 @@ class ConfigProblem(NamedTuple):
     todo: str
 
 
-# Bounds that no TOML document of ours exceeds, whatever its keys: checked before and right after it is read.
-#
-# A document that nests deeper than the parsers' own calls can, or whose numbers and texts no key takes, is refused
-# with the place, before anything is made of it.
-
-
+# Bounds of every document, checked before and right after it is read.
 MAX_DEPTH = 10
 MAX_BYTES = 4_000_000
 MAX_VALUES = 150_000
 MAX_KEY_LENGTH, MAX_TEXT_LENGTH, MAX_LIST_LENGTH = 100, 1000, 20_000
 MAX_INTEGER = 2**63 - 1
-_MAX_REPORTED = 5  # places that are told one by one
+_MAX_REPORTED = 5  # places reported one by one
 
 # Strings and comments, in which brackets mean nothing, or a bracket.
 _BRACKET = re.compile(
@@ -108,9 +102,6 @@ def _find_problem(path: str, value: object, depth: int) -> ConfigProblem | None:
     return None
 
 
-# Text files of a configuration and beside it: read whole and bounded, or refused with file and line.
-
-
 class DataFileError(Exception):
     """Errors in a file: one reason per line, each with file and line."""
 
@@ -127,7 +118,7 @@ def read_text(path: Path) -> str:
             no text.
     """
     try:
-        # A pipe that nobody writes to opens at once this way.
+        # A pipe without a writer opens at once this way.
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
         with os.fdopen(descriptor, "rb") as file:
             if stat.S_ISDIR(os.fstat(descriptor).st_mode):
@@ -306,12 +297,8 @@ class _Scanner:
         self._index += 1
 
 
-# Base of all sections of the configuration, and the largest sizes in them.
-#
-# Every number has a range and every list and text a longest length: anything beyond is a slip, and would only show
-# as an overflow, or as work without end.
-
-
+# Every number has a range and every list and text a maximum length: a value beyond is a slip, and would only show as
+# an overflow, or as work without end.
 MAX_NUMBER = 1e7  # of numbers that have no range of their own
 MAX_DURATION_S = 1e6
 MAX_PATH_LENGTH, MAX_URL_LENGTH = 1000, 300
@@ -335,9 +322,6 @@ class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     """Base of all sections."""
 
 
-# Places of the keys of a configuration, for its problems.
-
-
 @dataclass(frozen=True)
 class Source:
     """Origin of a configuration: enough to say where each key stands."""
@@ -345,10 +329,10 @@ class Source:
     file: str  # the file, as a person finds it
     lines: Mapping[str, int]  # key path -> line in the file
     overrides: tuple[tuple[str, str], ...] = ()  # (key path, text as typed) of each override, in order
-    file_places: Mapping[str, str] = field(default_factory=dict)  # key path -> place, for what another file holds
+    file_places: Mapping[str, str] = field(default_factory=dict)  # key path -> place, for keys of another file
     base_places: Mapping[str, str] = field(
         default_factory=dict
-    )  # key path -> place in the base, for what the file has not
+    )  # key path -> place in the base, for keys that the file lacks
 
     def locate(self, key: str) -> str:
         """The place in another file, the override that set `key`, or `file:line` of it or the nearest table around."""
@@ -379,14 +363,11 @@ def _iterate_enclosing(key: str) -> Iterator[str]:
         key = key[: max(key.rfind("."), key.rfind("["), 0)]
 
 
-# Types of the keys in words.
-
-
 _SCALARS = {float: "number", int: "whole number", str: "string", bool: "true or false"}
 
 
 def is_section(annotation: object) -> bool:
-    """Whether a field's type is a table of its own."""
+    """Return whether a field's type is a table."""
     return isinstance(annotation, type) and issubclass(annotation, Section)
 
 
@@ -402,7 +383,7 @@ def get_element_type(annotation: Any) -> type[Section] | None:
 
 
 def describe_type(annotation: Any) -> str:
-    """A field's type with its limits, in words."""
+    """Describe a field's type with its limits."""
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         metas = [meta for meta in arguments[1:] if isinstance(meta, Meta)]

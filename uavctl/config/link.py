@@ -24,9 +24,6 @@ from uavctl.config.document import (
     refuse_file,
 )
 
-# The section `[link]`.
-
-
 Probability = Annotated[float, Meta(ge=0, le=1)]
 # Each run length is a state of the design's chain.
 MAX_LOSS_RUN = 100
@@ -142,20 +139,17 @@ class LinkConfig(Section, frozen=True, kw_only=True):
     ] = ()
 
 
-# A measured trace of losses and delays from a CSV file.
-
-
 _COLUMN = "delay_s"
 _UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _HEADING = re.compile(r"^delay(?:[_ ]?[\[(]?(?P<unit>s|ms|us|ns)[\])]?)?$")
 
 
 def read_trace_file(link: LinkConfig, folder: Path, problems: list[ConfigProblem]) -> tuple[LinkConfig, dict[str, str]]:
-    """The delays of `link.trace_file` in its place, so that the configuration is complete in itself.
+    """Replace `link.trace_file` by its delays, so that the configuration is complete in itself.
 
     Args:
         folder: Where a relative name starts from.
-        found: What is wrong with the file is added here.
+        problems: Problems of the file are added here.
 
     Returns:
         The link, and where the keys that come from the file stand: `file:line`, or the file for the whole list.

@@ -1,4 +1,7 @@
-"""TOML and overrides in, Config out; dump; fault files."""
+"""Loading of configurations: TOML and overrides in, a checked `Config` out, with all problems and their places.
+
+Also the way back to TOML text, and fault files: lists of faults with the tables of `[[sim.fault]]`, headed `[[fault]]`.
+"""
 
 from __future__ import annotations
 
@@ -45,14 +48,11 @@ from uavctl.config.sim import MAX_FAULTS, FaultConfig, check_faults
 from uavctl.config.types import HAHN_STURSBERG_KEYS, Config
 from uavctl.errors import ConfigError, DesignError
 
-# A configuration as TOML text, in a time that grows with its length only.
-
-
 _DELETE = "\x7f"  # the one character that JSON leaves as it is and TOML wants escaped
 
 
 def dump_config(config: Config) -> str:
-    """TOML text with every key that has a value (TOML knows no null); `parse` gives an equal configuration back."""
+    """Return TOML text with every key that has a value (TOML has no null); `parse` gives an equal configuration."""
     return "\n".join(_format_table(msgspec.to_builtins(config), "")) + "\n"
 
 
@@ -129,9 +129,6 @@ def flatten_keys(value: object, path: str = "") -> Iterator[tuple[str, object]]:
         yield path, value
 
 
-# TOML and overrides in, a checked `Config` out; every problem at once, with its place.
-
-
 _SYNTAX_PLACE = re.compile(r" \(at (?:line (?P<line>\d+), column \d+|end of document)\)$")
 _EARLY_KEYS = re.compile(r"\s*(base|room)\s*[.=]")
 _REPEATED_KEY_ERRORS = ("Cannot overwrite", "Cannot declare", "Cannot mutate", "Cannot redefine", "Duplicate")
@@ -148,7 +145,7 @@ _MAY_BE_INFINITE = ("sets.", "link.trace_s")  # an open side, a lost packet; eve
 _MAX_VALUE_LENGTH = 40
 _UNKNOWN = "unknown key"
 _MAX_NAMED = 3  # keys that a wrong one may have meant
-_MAX_UNKNOWN = 10  # keys of a table that are told one by one
+_MAX_UNKNOWN = 10  # unknown keys reported one by one
 _MAX_PROBLEMS = 50
 MAX_OVERRIDES = 1000
 
@@ -228,11 +225,11 @@ def parse(text: str, file: str, overrides: Sequence[str] = ()) -> LoadedConfig:
 def _expand_base_and_room(
     document: dict[str, Any], lines: dict[str, int], problems: list[ConfigProblem]
 ) -> tuple[dict[str, Any], dict[str, str]]:
-    """Write what `base` and `[room]` say into the keys that they stand for.
+    """Write the values of `base` and `[room]` into the keys that they stand for.
 
     Args:
         lines: Lines of the file; those of keys that [room] writes are added.
-        found: What is wrong with them is added here.
+        problems: Problems of them are added here.
 
     Returns:
         The document, and where the keys stand that come from the base.
@@ -290,7 +287,7 @@ def parse_recorded(text: str, file: str, overrides: Sequence[str] = ()) -> Loade
 
 
 def describe_design_error(source: Source, error: DesignError) -> str:
-    """A refused design as the loader's own problems are told: place, key, reason, what to do."""
+    """Describe a refused design like a problem of the loader: place, key, reason, remedy."""
     return source.describe(ConfigProblem(error.key, error.reason, error.hint))
 
 
@@ -528,7 +525,7 @@ def _find_value_problems(key: str, value: object, field: FieldInfo) -> Iterator[
 def _describe_reason(message: str, wrong_value: object, field: FieldInfo) -> str:
     if message.startswith("Invalid enum value"):
         return f"{_shorten(wrong_value)} is not a choice{find_nearest(str(wrong_value), _list_choices(field.type))}"
-    message = message.replace(" | null", "")  # which TOML knows not
+    message = message.replace(" | null", "")  # TOML has no null
     for type_name, text in _TYPE_NAMES.items():
         message = message.replace(type_name, text)
     expected = message.partition(", got ")[0]
@@ -573,9 +570,6 @@ def read_document(section: type[D], path: Path) -> tuple[D | None, Source, list[
     return cast(D | None, document), Source(str(path), find_key_lines(text)), problems
 
 
-# A list of faults from a TOML file of its own: the same tables as `[[sim.fault]]`, headed `[[fault]]`.
-
-
 FaultCheck = Callable[[Literal["px4", "ardupilot"], Sequence[FaultConfig], str], Iterable[ConfigProblem]]
 _Faults = Annotated[
     tuple[FaultConfig, ...], Meta(max_length=MAX_FAULTS, description="what happens in the course of a flight")
@@ -592,7 +586,7 @@ def add_faults(config: Config, path: Path, find_problems: FaultCheck) -> Config:
     """The configuration with the faults of a file after its own.
 
     Args:
-        check: what the simulator cannot do of a list of faults, given the kind of autopilot, the list and its key.
+        find_problems: finds the unsupported faults, given the kind of autopilot, the list and its key.
 
     Raises:
         ConfigError: With all problems found in the file, each with its line.

@@ -1,4 +1,4 @@
-"""[mission] and sampled trajectories."""
+"""Mission of a flight: waypoints or a trajectory, from keys or a CSV file, and fences that close in."""
 
 from __future__ import annotations
 
@@ -26,8 +26,6 @@ from uavctl.config.document import (
     read_lines,
     refuse_file,
 )
-
-# Mission of a flight: waypoints or a trajectory, and limits that close in.
 
 
 class TrajectoryConfig(Section, frozen=True, kw_only=True):
@@ -108,9 +106,6 @@ class FenceConfig(Section, frozen=True, kw_only=True):
     ]
 
 
-# A trajectory's samples from a CSV file.
-
-
 _FORMAT_HINT = "give lines of t, x, y, z in s and m, or of t, x, y, z, vx, vy, vz"
 _POSITION_COLUMNS, _VELOCITY_COLUMNS = 4, 7  # columns
 _MAX_SHOWN = 40  # characters of a cell that is none
@@ -124,7 +119,7 @@ def read_trajectory_file(
 
     Args:
         folder: Where a relative name starts from.
-        found: What is wrong with the file is added here.
+        problems: Problems of the file are added here.
 
     Returns:
         The mission, and where the keys that come from the file stand: `file:line`, or the file for a whole list.

@@ -1,6 +1,6 @@
 """`base` and `[room]`: a preset as the rest of a configuration, and its limits by name in place of lists.
 
-Both are read before anything is decoded, and what they say is written into the keys that they stand for.
+Both are read before decoding, and written into the keys that they stand for.
 """
 
 from __future__ import annotations
@@ -54,11 +54,11 @@ def merge_tables(base: Mapping[str, Any], document: Mapping[str, Any]) -> dict[s
 def apply_room(
     table: dict[str, Any], room: RoomConfig, document: Mapping[str, Any], written: dict[str, str]
 ) -> Iterator[ConfigProblem]:
-    """Write what [room] says into the lists of a document; yield what cannot be.
+    """Write the values of [room] into the lists of a document; yield the problems.
 
     Args:
-        table: The document, with what its base says.
-        own: The document without it.
+        table: The document with its base.
+        document: The document without its base.
         written: The key of [room] that each key is written for is added here.
     """
     for name in ("north_m", "east_m", "height_m"):

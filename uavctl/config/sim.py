@@ -11,9 +11,6 @@ from msgspec import Meta
 from uavctl.config.connections import DaemonConfig
 from uavctl.config.document import MAX_DURATION_S, MAX_SEED, MAX_SPANS, ConfigProblem, Position, Section, Spans, Wind
 
-# The simulated side of the wire: vehicle, autopilot and motion capture.
-
-
 MAX_FAULTS = 1000
 
 
@@ -241,9 +238,6 @@ class SimConfig(Section, frozen=True, kw_only=True):
             "0.7 s, as a room needs it (as shipped PX4 has 1 s and ArduPilot 3 s)"
         ),
     ] = None
-
-
-# Checks of the simulated side's configuration.
 
 
 # Keys that a kind of fault heeds; the kinds that are not here are spans.

@@ -36,8 +36,6 @@ from uavctl.config.link import LinkConfig
 from uavctl.config.mission import FenceConfig, MissionConfig
 from uavctl.config.sim import SimConfig
 
-# `[log]`: the recording and the room that it needs.
-
 
 class LogConfig(Section, frozen=True, kw_only=True):
     """Recording."""
