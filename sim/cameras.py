@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sim.channel import within
-from sim.vehicle.interface import LEVEL, Quaternion, heading_rad, in_body
+from sim.channel import is_within
+from sim.vehicle.interface import LEVEL, Quaternion, compute_heading_rad, rotate_to_body
 from uavctl.config.connections import FrameConfig
 from uavctl.config.sim import CameraConfig
 from uavctl.errors import ConfigError
@@ -24,11 +24,11 @@ SYSTEM_ID, COMPONENT_ID = 17, 197  # 197: MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
 # The cameras' clock at the start, so that a stamp is never 0 ("unknown") and never our time.
 UPTIME_S = 4000.0
 HALF_ROLL: Quaternion = (0.0, 1.0, 0.0, 0.0)  # FLU to FRD
-STILL: Vec3 = (0.0, 0.0, 0.0)
+ZERO_VELOCITY: Vec3 = (0.0, 0.0, 0.0)
 UNKNOWN = [math.nan, *([0.0] * 20)]  # a covariance whose first element is NaN is unknown (message definitions)
 
 
-# Axes that the cameras may take for local NED; a row for each component that they say.
+# Axes that the cameras may use as local NED; a row for each reported component.
 AXES: dict[str, tuple[Vec3, Vec3, Vec3]] = {
     "right": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
     "turned-90": ((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
@@ -60,7 +60,7 @@ class Cameras:
     of the body in the frame, with body axes FRD in a NED frame, FLU in an ENU one.
 
     Each effect draws from its own generator, the same number of values for every sample whether the effect is on or
-    off, seen or not. So two runs with one seed differ only by the effects that differ.
+    off, visible or not. So two runs with one seed differ only by the effects that differ.
 
     Attributes:
         next_ns: time of the next sample [ns].
@@ -77,48 +77,48 @@ class Cameras:
         self._camera = camera
         self._odometry_frame = mavlink.MAV_FRAME_LOCAL_FRD if frame.convention == "ned" else mavlink.MAV_FRAME_LOCAL_ENU
         self._convention = frame.convention
-        self._turn = turn(frame)
+        self._frame_rotation = compute_frame_rotation(frame)
         self._frame = Frame(frame.convention, frame.origin_m, frame.yaw_deg)
-        self._noise = np.random.default_rng(seed)
-        self._lateness, self._occlusion = (np.random.default_rng(child) for child in seed.spawn(2))
+        self._noise_rng = np.random.default_rng(seed)
+        self._latency_rng, self._occlusion_rng = (np.random.default_rng(child) for child in seed.spawn(2))
         self._start_ns = start_ns
         self._clock_us = round((UPTIME_S + camera.clock_offset_s) * 1e6)
         # Probabilities that a random occlusion begins, and that it goes on, from one sample to the next.
-        self._hide = -math.expm1(-camera.occlusions_per_s / camera.rate_hz)
-        self._keep = math.exp(-1.0 / (camera.occlusion_s * camera.rate_hz))
-        self._hidden = False
-        self._seen: _Pose | None = None
+        self._occlusion_begin_probability = -math.expm1(-camera.occlusions_per_s / camera.rate_hz)
+        self._occlusion_stay_probability = math.exp(-1.0 / (camera.occlusion_s * camera.rate_hz))
+        self._is_occluded = False
+        self._last_pose: _Pose | None = None
         self._axes, self._noise_std_m = AXES["right"], camera.noise_std_m
-        self._creeps, self._crept_ns, self._crept_m = STILL, start_ns, STILL
+        self._drift_mps, self._drift_start_ns, self._drift_start_m = ZERO_VELOCITY, start_ns, ZERO_VELOCITY
         self._mav = mavlink.MAVLink(None, SYSTEM_ID, COMPONENT_ID)
-        self._taken = 0
-        self.next_ns = self._sample_ns()
+        self._sample_count = 0
+        self.next_ns = self._compute_sample_ns()
 
-    def _sample_ns(self) -> int:
-        return self._start_ns + round((self._camera.phase_s + self._taken / self._camera.rate_hz) * 1e9)
+    def _compute_sample_ns(self) -> int:
+        return self._start_ns + round((self._camera.phase_s + self._sample_count / self._camera.rate_hz) * 1e9)
 
     @property
-    def hidden(self) -> bool:
+    def is_occluded(self) -> bool:
         """Whether a random occlusion lasted at the last sample."""
-        return self._hidden
+        return self._is_occluded
 
     def clock_us(self, at_ns: int) -> int:
         """Return the cameras' own clock at a time of the simulation [µs]."""
         since_ns = at_ns - self._start_ns
         return self._clock_us + since_ns // 1000 + round(since_ns * self._camera.clock_drift_ppm * 1e-9)
 
-    def mistake(self, axes: str) -> None:
+    def set_axes(self, axes: str) -> None:
         """Permute the axes of positions from now on, by a name in `AXES`, as of a wrong setup."""
         self._axes = AXES[axes]
 
-    def shake(self, noise_std_m: float) -> None:
+    def set_noise(self, noise_std_m: float) -> None:
         """Set the noise of positions from now on [m]."""
         self._noise_std_m = noise_std_m
 
-    def creep(self, velocity_mps: Vec3) -> None:
+    def set_drift(self, velocity_mps: Vec3) -> None:
         """Let the cameras' origin drift from the next sample on [m/s], as of cameras that were knocked."""
-        self._crept_m = self._creep_m(self.next_ns)
-        self._creeps, self._crept_ns = velocity_mps, self.next_ns
+        self._drift_start_m = self._compute_drift_m(self.next_ns)
+        self._drift_mps, self._drift_start_ns = velocity_mps, self.next_ns
 
     def capture(self, position_m: Vec3, velocity_mps: Vec3, attitude: Quaternion) -> tuple[int, bytes] | None:
         """Take the sample that is due at `next_ns`.
@@ -129,69 +129,80 @@ class Cameras:
             attitude: true attitude (w, x, y, z), body axes FRD to NED.
 
         Returns:
-            When the cameras send it [ns], and its datagram; None if they do not see the vehicle.
+            When the cameras send it [ns], and its datagram; None if the vehicle is hidden.
         """
         camera, at_ns = self._camera, self.next_ns
         since_ns = at_ns - self._start_ns
-        self._taken += 1
-        self.next_ns = self._sample_ns()
-        noise = self._noise_std_m * self._noise.standard_normal(3)
-        latency_s = camera.latency_s + camera.jitter_s * float(self._lateness.random())
-        if self._hides(since_ns):
+        self._sample_count += 1
+        self.next_ns = self._compute_sample_ns()
+        noise = self._noise_std_m * self._noise_rng.standard_normal(3)
+        latency_s = camera.latency_s + camera.jitter_s * float(self._latency_rng.random())
+        if self._draw_occlusion(since_ns):
             return None
         truth = _Pose(position_m, velocity_mps, attitude)
-        body = _Pose(camera.other_body_m, STILL, LEVEL) if within(camera.swapped, since_ns) else truth
-        if self._seen is None or not within(camera.frozen, since_ns):
+        body = _Pose(camera.other_body_m, ZERO_VELOCITY, LEVEL) if is_within(camera.swapped, since_ns) else truth
+        if self._last_pose is None or not is_within(camera.frozen, since_ns):
             north, east, down = (float(p + n) for p, n in zip(body.position_m, noise, strict=True))
-            place, speed = _in_axes(self._axes, (north, east, down)), _in_axes(self._axes, body.velocity_mps)
-            if self._creeps is not STILL:
-                north, east, down = (p + off for p, off in zip(place, self._creep_m(at_ns), strict=True))
-                place = (north, east, down)
-            self._seen = body._replace(position_m=place, velocity_mps=speed)
-        msg = self._message(self.clock_us(at_ns), self._seen)
+            position_ned, velocity_ned = (
+                _transform_axes(self._axes, (north, east, down)),
+                _transform_axes(self._axes, body.velocity_mps),
+            )
+            if self._drift_mps is not ZERO_VELOCITY:
+                north, east, down = (
+                    p + drift for p, drift in zip(position_ned, self._compute_drift_m(at_ns), strict=True)
+                )
+                position_ned = (north, east, down)
+            self._last_pose = body._replace(position_m=position_ned, velocity_mps=velocity_ned)
+        msg = self._make_message(self.clock_us(at_ns), self._last_pose)
         data = bytes(msg.pack(self._mav))
         self._mav.seq = (self._mav.seq + 1) % 256  # pack() does not advance it
         return at_ns + round(latency_s * 1e9), data
 
-    def _creep_m(self, at_ns: int) -> Vec3:
-        s = (at_ns - self._crept_ns) * 1e-9
-        north, east, down = (off + s * v for off, v in zip(self._crept_m, self._creeps, strict=True))
+    def _compute_drift_m(self, at_ns: int) -> Vec3:
+        s = (at_ns - self._drift_start_ns) * 1e-9
+        north, east, down = (start + s * v for start, v in zip(self._drift_start_m, self._drift_mps, strict=True))
         return north, east, down
 
-    def _hides(self, since_ns: int) -> bool:
-        self._hidden = bool(self._occlusion.random() < (self._keep if self._hidden else self._hide))
-        return self._hidden or within(self._camera.occluded, since_ns)
+    def _draw_occlusion(self, since_ns: int) -> bool:
+        self._is_occluded = bool(
+            self._occlusion_rng.random()
+            < (self._occlusion_stay_probability if self._is_occluded else self._occlusion_begin_probability)
+        )
+        return self._is_occluded or is_within(self._camera.occluded, since_ns)
 
-    def _message(self, usec: int, pose: _Pose) -> mavlink.MAVLink_message:
+    def _make_message(self, usec: int, pose: _Pose) -> mavlink.MAVLink_message:
         msg: mavlink.MAVLink_message
-        where, turned = self._frame.from_ned(pose.position_m), multiply_quaternions(self._turn, pose.attitude)
+        position_m, attitude = (
+            self._frame.from_ned(pose.position_m),
+            multiply_quaternions(self._frame_rotation, pose.attitude),
+        )
         match self._camera.message:
             case "vision":
-                angles = self._angles(turned)
-                msg = mavlink.MAVLink_vision_position_estimate_message(usec, *where, *angles, UNKNOWN)
+                angles = self._compute_euler(attitude)
+                msg = mavlink.MAVLink_vision_position_estimate_message(usec, *position_m, *angles, UNKNOWN)
             case "vicon":
-                angles = self._angles(turned)
-                msg = mavlink.MAVLink_vicon_position_estimate_message(usec, *where, *angles, UNKNOWN)
+                angles = self._compute_euler(attitude)
+                msg = mavlink.MAVLink_vicon_position_estimate_message(usec, *position_m, *angles, UNKNOWN)
             case "mocap":
-                msg = mavlink.MAVLink_att_pos_mocap_message(usec, turned, *where, UNKNOWN)
+                msg = mavlink.MAVLink_att_pos_mocap_message(usec, attitude, *position_m, UNKNOWN)
             case "odometry":  # LOCAL_FRD and BODY_FRD are what both PX4 and ArduPilot take
                 frames = self._odometry_frame, mavlink.MAV_FRAME_BODY_FRD
-                motion = *in_body(pose.attitude, pose.velocity_mps), 0.0, 0.0, 0.0, UNKNOWN, UNKNOWN
-                msg = mavlink.MAVLink_odometry_message(usec, *frames, *where, turned, *motion)
+                motion = *rotate_to_body(pose.attitude, pose.velocity_mps), 0.0, 0.0, 0.0, UNKNOWN, UNKNOWN
+                msg = mavlink.MAVLink_odometry_message(usec, *frames, *position_m, attitude, *motion)
         return msg
 
-    def _angles(self, turned: Quaternion) -> Vec3:
-        return euler(turned if self._convention == "ned" else multiply_quaternions(turned, HALF_ROLL))
+    def _compute_euler(self, attitude: Quaternion) -> Vec3:
+        return compute_euler(attitude if self._convention == "ned" else multiply_quaternions(attitude, HALF_ROLL))
 
 
-def _in_axes(axes: tuple[Vec3, Vec3, Vec3], ned: Vec3) -> Vec3:
+def _transform_axes(axes: tuple[Vec3, Vec3, Vec3], ned: Vec3) -> Vec3:
     if axes is AXES["right"]:
         return ned
     north, east, down = (sum(row * value for row, value in zip(rows, ned, strict=True)) for rows in axes)
     return north, east, down
 
 
-def turn(frame: FrameConfig) -> Quaternion:
+def compute_frame_rotation(frame: FrameConfig) -> Quaternion:
     """Return the rotation from NED to the camera frame (w, x, y, z)."""
     cos, sin = math.cos(math.radians(frame.yaw_deg) / 2), math.sin(math.radians(frame.yaw_deg) / 2)
     if frame.convention == "ned":
@@ -200,9 +211,9 @@ def turn(frame: FrameConfig) -> Quaternion:
     return 0.0, half * (cos - sin), half * (cos + sin), 0.0
 
 
-def euler(attitude: Quaternion) -> Vec3:
+def compute_euler(attitude: Quaternion) -> Vec3:
     """Return roll, pitch and yaw of an attitude [rad], turned about z, y, x in this order."""
     w, x, y, z = attitude
     pitch = math.asin(min(max(2.0 * (w * y - x * z), -1.0), 1.0))
     roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
-    return roll, pitch, heading_rad(attitude)
+    return roll, pitch, compute_heading_rad(attitude)

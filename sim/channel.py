@@ -17,15 +17,13 @@ import numpy as np
 from uavctl.config.document import Spans
 from uavctl.config.link import LinkConfig
 
-# Spans of time of a configuration, and which of several times is the next.
 
-
-def within(spans: Spans, since_ns: int) -> bool:
+def is_within(spans: Spans, since_ns: int) -> bool:
     """Return whether a time since the start [ns] lies in one of the spans [s], their ends included."""
     return any(begin * 1e9 <= since_ns <= end * 1e9 for begin, end in spans)
 
 
-def earliest(times_ns: Iterable[int | None]) -> int | None:
+def find_earliest_ns(times_ns: Iterable[int | None]) -> int | None:
     """Return the first of some times [ns]; None for none."""
     first_ns = None
     for at_ns in times_ns:
@@ -35,7 +33,7 @@ def earliest(times_ns: Iterable[int | None]) -> int | None:
 
 
 OVERSIZE_BYTES = 5000
-_TO_DRAW = -1  # no run of losses is under way: the next packet begins one (of 0 or more)
+_NO_RUN = -1  # no run of losses is under way: the next packet begins one (of 0 or more)
 
 
 @dataclass
@@ -50,7 +48,7 @@ class Counters:
     oversized: int = 0
 
 
-class _Fate(NamedTuple):
+class _Outcome(NamedTuple):
     """Fate of a packet: lost, delayed, doubled, damaged."""
 
     lost: bool
@@ -96,29 +94,29 @@ class Channel:
         self._step_ns = step_ns or 0
         children = [np.random.default_rng(child) for child in seed.spawn(6)]
         self._loss, self._delay, self._duplicate, self._corrupt, self._truncate, self._oversize = children
-        self._bad = False
-        self._runs = np.cumsum(link.gaps)
-        self._to_lose = _TO_DRAW
-        self._number = 0  # of the next packet
+        self._is_bad = False
+        self._run_probabilities = np.cumsum(link.gaps)
+        self._remaining_losses = _NO_RUN
+        self._packet_number = 0  # of the next packet
 
-    def push(self, at_ns: int, data: bytes, *, certain: bool = False) -> None:
-        """Send a packet at `at_ns`; a `certain` one is not lost."""
-        counters, fate = self.counters, self._draw(at_ns, data)
+    def push(self, at_ns: int, data: bytes, *, is_certain: bool = False) -> None:
+        """Send a packet at `at_ns`; the link never loses one that `is_certain`."""
+        counters, outcome = self.counters, self._draw(at_ns, data)
         counters.sent += 1
-        if fate.lost and not certain:
+        if outcome.lost and not is_certain:
             counters.lost += 1
             return
-        counters.corrupted += fate.corrupted
-        counters.truncated += fate.truncated
-        counters.oversized += fate.oversized
-        counters.duplicated += len(fate.delays_s) - 1
-        for delay_s in fate.delays_s:
-            # A packet that a trace loses has no delay of its own, but may be a certain one.
+        counters.corrupted += outcome.corrupted
+        counters.truncated += outcome.truncated
+        counters.oversized += outcome.oversized
+        counters.duplicated += len(outcome.delays_s) - 1
+        for delay_s in outcome.delays_s:
+            # A packet that a trace loses has no delay of its own, but it may be certain.
             arrival_ns = at_ns + (round(delay_s * 1e9) if math.isfinite(delay_s) else 0)
             self._order += 1
-            heapq.heappush(self._pending, (self._released(arrival_ns), arrival_ns, self._order, fate.data))
+            heapq.heappush(self._pending, (self._compute_release_ns(arrival_ns), arrival_ns, self._order, outcome.data))
 
-    def pass_over(self, at_ns: int) -> None:
+    def skip_packet(self, at_ns: int) -> None:
         """Skip a packet that was due at `at_ns`; later ones fare as if it had been sent."""
         self._draw(at_ns, b"")
 
@@ -135,45 +133,47 @@ class Channel:
         """Time of the next arrival [ns]; None if nothing is under way."""
         return self._pending[0][0] if self._pending else None
 
-    def _draw(self, at_ns: int, data: bytes) -> _Fate:
+    def _draw(self, at_ns: int, data: bytes) -> _Outcome:
         link = self._link
-        lost = self._loses(at_ns)
+        lost = self._draw_loss(at_ns)
         delays = [link.delay_s + link.jitter_s * float(draw) for draw in self._delay.random(2)]
         if link.model == "trace":
-            delays = [link.trace_s[self._number % len(link.trace_s)]] * 2
+            delays = [link.trace_s[self._packet_number % len(link.trace_s)]] * 2
             lost |= math.isinf(delays[0])
-        self._number += 1
-        doubled = self._duplicate.random() < link.duplicate
-        data, corrupted = self._flip(data)
-        data, truncated = self._cut(data)
+        self._packet_number += 1
+        is_duplicated = self._duplicate.random() < link.duplicate
+        data, corrupted = self._flip_bit(data)
+        data, truncated = self._truncate_data(data)
         oversized = bool(self._oversize.random() < link.oversize)
         data = data.ljust(OVERSIZE_BYTES, b"\0") if oversized else data
-        return _Fate(lost, tuple(delays[: 1 + doubled]), data, corrupted, truncated, oversized)
+        return _Outcome(lost, tuple(delays[: 1 + is_duplicated]), data, corrupted, truncated, oversized)
 
-    def _released(self, arrival_ns: int) -> int:
+    def _compute_release_ns(self, arrival_ns: int) -> int:
         """Return when a packet that comes at `arrival_ns` is let through [ns]."""
         for begin, end in sorted(self._link.held):
             if begin * 1e9 <= arrival_ns - self._start_ns < end * 1e9:
                 arrival_ns = self._start_ns + round(end * 1e9)
         return arrival_ns
 
-    def _loses(self, at_ns: int) -> bool:
+    def _draw_loss(self, at_ns: int) -> bool:
         link = self._link
         step, draw = self._loss.random(2)
         since_ns = at_ns - self._start_ns
-        return bool(draw < self._probability(since_ns, step)) or within(link.blackout, since_ns)
+        return bool(draw < self._compute_loss_probability(since_ns, step)) or is_within(link.blackout, since_ns)
 
-    def _probability(self, since_ns: int, step: float) -> float:
+    def _compute_loss_probability(self, since_ns: int, step: float) -> float:
         """Return the probability that the next packet is lost; the channel's own state moves on by the draw `step`."""
         link = self._link
         if link.model == "gilbert-elliott":
-            self._bad = bool(step >= link.burst_leave if self._bad else step < link.burst_enter)
-            return link.burst_loss if self._bad else link.loss
+            self._is_bad = bool(step >= link.burst_leave if self._is_bad else step < link.burst_enter)
+            return link.burst_loss if self._is_bad else link.loss
         if link.model == "empirical":
-            if self._to_lose == _TO_DRAW:
-                self._to_lose = int(np.searchsorted(self._runs, step * self._runs[-1], side="right"))
-            self._to_lose -= 1
-            return 0.0 if self._to_lose == _TO_DRAW else 1.0
+            if self._remaining_losses == _NO_RUN:
+                self._remaining_losses = int(
+                    np.searchsorted(self._run_probabilities, step * self._run_probabilities[-1], side="right")
+                )
+            self._remaining_losses -= 1
+            return 0.0 if self._remaining_losses == _NO_RUN else 1.0
         if link.model == "trace":
             return 0.0
         if link.probability:
@@ -181,17 +181,17 @@ class Channel:
             return 1.0 - link.probability[min(max(number, 0), len(link.probability) - 1)]
         return link.loss
 
-    def _flip(self, data: bytes) -> tuple[bytes, bool]:
-        whether, where = self._corrupt.random(2)
-        if whether >= self._link.corrupt or not data:
+    def _flip_bit(self, data: bytes) -> tuple[bytes, bool]:
+        draw, position = self._corrupt.random(2)
+        if draw >= self._link.corrupt or not data:
             return data, False
-        bit = int(where * 8 * len(data))
+        bit = int(position * 8 * len(data))
         flipped = bytearray(data)
         flipped[bit // 8] ^= 1 << bit % 8
         return bytes(flipped), True
 
-    def _cut(self, data: bytes) -> tuple[bytes, bool]:
-        whether, where = self._truncate.random(2)
-        if whether >= self._link.truncate or not data:
+    def _truncate_data(self, data: bytes) -> tuple[bytes, bool]:
+        draw, position = self._truncate.random(2)
+        if draw >= self._link.truncate or not data:
             return data, False
-        return data[: int(where * len(data))], True
+        return data[: int(position * len(data))], True

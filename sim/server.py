@@ -1,4 +1,4 @@
-"""Simulation server: simulated vehicles on real sockets."""
+"""Simulation server: simulated vehicles on real sockets, in real time or a multiple of it."""
 
 from __future__ import annotations
 
@@ -7,315 +7,27 @@ import signal
 import socket
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from multiprocessing import parent_process
 from multiprocessing.connection import Connection
 from multiprocessing.synchronize import Event
 from selectors import EVENT_READ, SelectSelector
-from typing import Protocol
-from urllib.parse import urlsplit
 
 from sim.autopilot.profile import SIMULATED
-from sim.natnet import SCHEME, NatNetPort, as_motive
+from sim.natnet import SCHEME, NatNetPort, make_motive_config
+from sim.ports import Port, open_port
 from sim.simulation import MOCAP, VEHICLE, Peers, VehicleSnapshot
 from uavctl.config.types import Config
 from uavctl.errors import ConnectionSpecError
 from uavctl.records import Truth
 
-# The simulator's own sockets: datagrams in and out over UDP or TCP; nothing blocks.
-
-
-LARGEST_DATAGRAM = 65535
-LARGEST_BACKLOG = 1 << 16  # a TCP client that leaves more unread is dropped [bytes]
-MOST_CLIENTS = 8  # of a TCP port
-V1, V2 = 0xFE, 0xFD
-SIGNED = 0x01
-Greeting = tuple[bytes, ...]
-# What a peer that is not there, or not there any more, does to a socket.
-GONE = (ConnectionRefusedError, ConnectionResetError, BrokenPipeError)
-
-
-class Port(Protocol):
-    """Interface of one end of a connection."""
-
-    @property
-    def url(self) -> str:
-        """The URL with the port number that is really used."""
-        ...
-
-    def sockets(self) -> tuple[socket.socket, ...]:
-        """Return the sockets to wait for."""
-        ...
-
-    def read(self) -> list[bytes]:
-        """Return everything that has come, one MAVLink datagram or frame each."""
-        ...
-
-    def write(self, data: bytes) -> None:
-        """Send one datagram; lost if nobody is there."""
-        ...
-
-    def close(self) -> None:
-        """Close every socket."""
-        ...
-
-
-class UdpPort:
-    """UDP: `udpout` sends to an address, `udpin` to whoever spoke last."""
-
-    def __init__(self, scheme: str, address: tuple[str, int]) -> None:
-        self._peer: tuple[str, int] | None = None
-        self._scheme = scheme
-        if scheme == "udpout":  # a host that is not known is told now
-            self._peer = socket.gethostbyname(address[0]), address[1]
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.setblocking(False)
-        try:
-            self._socket.bind(("", 0) if scheme == "udpout" else address)
-        except OSError:
-            self._socket.close()
-            raise
-        self._address = address if scheme == "udpout" else self._socket.getsockname()
-
-    @property
-    def url(self) -> str:
-        """The URL with the port number that is really used."""
-        return f"{self._scheme}://{self._address[0]}:{self._address[1]}"
-
-    def sockets(self) -> tuple[socket.socket, ...]:
-        """Return the sockets to wait for."""
-        return (self._socket,)
-
-    def read(self) -> list[bytes]:
-        """Return everything that has come."""
-        taken = []
-        with suppress(BlockingIOError):
-            while True:
-                with suppress(*GONE):
-                    data, sender = self._socket.recvfrom(LARGEST_DATAGRAM)
-                    if self._scheme == "udpin":
-                        self._peer = sender
-                    taken.append(data)
-        return taken
-
-    def write(self, data: bytes) -> None:
-        """Send one datagram."""
-        if self._peer is not None:
-            with suppress(OSError):  # no way there, or no room: lost, as on a radio
-                self._socket.sendto(data, self._peer)
-
-    def close(self) -> None:
-        """Close the socket."""
-        self._socket.close()
-
-
-@dataclass
-class _TcpClient:
-    """One client of a `TcpPort`."""
-
-    socket: socket.socket
-    greeting: list[bytes]  # what of it is still to come
-    stream: bytearray = field(default_factory=bytearray)  # come, not yet a whole frame
-    backlog: bytearray = field(default_factory=bytearray)  # to go
-
-    def read(self) -> bool:
-        """Take everything that has come; return False when the client is gone."""
-        try:
-            while data := self.socket.recv(LARGEST_DATAGRAM):
-                self.stream += data
-        except BlockingIOError:
-            return True
-        except GONE:
-            pass
-        return False
-
-    def write(self, data: bytes) -> bool:
-        """Send in order what the socket takes now; return False if the client is gone or leaves too much unread."""
-        if self.greeting:
-            self.backlog += self.greeting.pop(0)
-        self.backlog += data
-        try:
-            del self.backlog[: self.socket.send(self.backlog)]
-        except BlockingIOError:
-            return len(self.backlog) <= LARGEST_BACKLOG
-        except GONE:
-            return False
-        return True
-
-
-class TcpPort:
-    """A listening TCP socket, as ArduPilot's simulator has on port 5760; every client gets everything.
-
-    Args:
-        greeting: text for each client, whose parts go before its first, second, ... packet.
-    """
-
-    def __init__(self, address: tuple[str, int], greeting: Greeting = ()) -> None:
-        self._greeting = greeting
-        self._listener = socket.create_server(address, backlog=MOST_CLIENTS)
-        self._listener.setblocking(False)
-        self._clients: list[_TcpClient] = []
-
-    @property
-    def url(self) -> str:
-        """The URL with the port number that is really used."""
-        host, port = self._listener.getsockname()
-        return f"tcpin://{host}:{port}"
-
-    def sockets(self) -> tuple[socket.socket, ...]:
-        """Return the sockets to wait for."""
-        return self._listener, *(client.socket for client in self._clients)
-
-    def read(self) -> list[bytes]:
-        """Accept new clients, then return every whole frame that has come."""
-        with suppress(BlockingIOError):
-            while True:
-                self._accept()
-        frames = []
-        for client in self._clients.copy():
-            stays = client.read()
-            frames += cut_frames(client.stream)
-            if not stays:
-                self._drop(client)
-        return frames
-
-    def _accept(self) -> None:
-        one, _ = self._listener.accept()
-        if len(self._clients) >= MOST_CLIENTS:
-            one.close()
-            return
-        one.setblocking(False)
-        one.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._clients.append(_TcpClient(one, list(self._greeting)))
-
-    def write(self, data: bytes) -> None:
-        """Send to every client."""
-        for client in self._clients.copy():
-            if not client.write(data):
-                self._drop(client)
-
-    def _drop(self, client: _TcpClient) -> None:
-        client.socket.close()
-        self._clients.remove(client)
-
-    def close(self) -> None:
-        """Close the clients and the listening socket."""
-        for client in self._clients.copy():
-            self._drop(client)
-        self._listener.close()
-
-
-class Ports:
-    """Several ports as one: every datagram is sent at all of them."""
-
-    def __init__(self, ports: list[Port]) -> None:
-        self._ports = ports
-
-    @property
-    def url(self) -> str:
-        """URLs of the ports, separated by commas."""
-        return ",".join(port.url for port in self._ports)
-
-    def sockets(self) -> tuple[socket.socket, ...]:
-        """Return the sockets to wait for."""
-        return tuple(one for port in self._ports for one in port.sockets())
-
-    def read(self) -> list[bytes]:
-        """Return everything that has come, at any port."""
-        return [data for port in self._ports for data in port.read()]
-
-    def write(self, data: bytes) -> None:
-        """Send one datagram at every port."""
-        for port in self._ports:
-            port.write(data)
-
-    def close(self) -> None:
-        """Close every port."""
-        for port in self._ports:
-            port.close()
-
-
-def cut_frames(stream: bytearray) -> list[bytes]:
-    """Take the whole MAVLink frames off a stream's front; bytes before a start mark are skipped."""
-    frames = []
-    while stream:
-        if stream[0] not in (V1, V2):
-            del stream[0]
-            continue
-        if len(stream) < 3:
-            break
-        length = stream[1] + (8 if stream[0] == V1 else 12)
-        if stream[0] == V2 and stream[2] & SIGNED:
-            length += 13
-        if len(stream) < length:
-            break
-        frames.append(bytes(stream[:length]))
-        del stream[:length]
-    return frames
-
-
-def open_port(url: str, greeting: Greeting = ()) -> Port:
-    """Open a port from its URL, or several from URLs separated by commas; a TCP port greets each client.
-
-    Raises:
-        ConnectionSpecError: not a URL of a kind that the simulator has, or it cannot be opened.
-    """
-    urls = [one.strip() for one in url.split(",")]
-    if len(urls) > 1 and any(one.startswith(f"{SCHEME}:") for one in urls):
-        raise ConnectionSpecError(f"{url}: NatNet is no MAVLink, so it stands alone; give one of them")
-    opened: list[Port] = []
-    try:
-        for one in urls:
-            opened.append(_open(one, greeting))
-    except ConnectionSpecError:
-        Ports(opened).close()
-        raise
-    return opened[0] if len(opened) == 1 else Ports(opened)
-
-
-def _open(url: str, greeting: Greeting) -> Port:
-    kinds: dict[str, Callable[[tuple[str, int]], Port]] = {
-        "udpout": lambda address: UdpPort("udpout", address),
-        "udpin": lambda address: UdpPort("udpin", address),
-        "tcpin": lambda address: TcpPort(address, greeting),
-    }
-    if url.startswith(f"{SCHEME}:"):
-        return _attempt(url, lambda: NatNetPort(url))
-    try:
-        parts = urlsplit(url)
-        host, port = parts.hostname, parts.port
-    except ValueError as error:
-        raise ConnectionSpecError(f"{url}: {error}; write udpout://127.0.0.1:14540") from error
-    if port == 0 and parts.scheme == "udpout":
-        raise ConnectionSpecError(f"{url}: port 0 is no address to send to; write udpout://127.0.0.1:14540")
-    if parts.scheme not in kinds or host is None or port is None:
-        raise ConnectionSpecError(f'"{url}": the simulator speaks {", ".join(kinds)}; write udpout://127.0.0.1:14540')
-    address = host, port
-    return _attempt(url, lambda: kinds[parts.scheme](address))
-
-
-def _attempt(url: str, make: Callable[[], Port]) -> Port:
-    try:
-        return make()
-    except socket.gaierror as error:
-        raise ConnectionSpecError(f"{url}: no such host ({error.strerror}); check its name") from error
-    except OSError as error:
-        raise ConnectionSpecError(
-            f"{url}: cannot be opened ({error.strerror or error}); choose another port"
-        ) from error
-
-
-# The simulated peers on real sockets, in real time or a multiple of it.
-
-
-Door = Callable[[str, Port], Port]
-"""Puts something around the port of a connection, which is named `vehicle` or `mocap`."""
+PortWrapper = Callable[[str, Port], Port]
+"""Wraps the port of a connection, which is named `vehicle` or `mocap`."""
 # Longest sleep, so that `stop` is asked often enough.
-NAP_S = 0.05
-LOOK_S = 0.25  # real time between two looks
-# What is late is made up in strides of simulated time, so that a speed beyond this computer's cannot pile up work.
-STRIDE_NS = 100_000_000
+MAX_SLEEP_S = 0.05
+SNAPSHOT_PERIOD_S = 0.25  # real time between two snapshots
+# Overdue time is simulated in steps of at most this length, so work cannot pile up at a speed beyond this computer's.
+MAX_STEP_NS = 100_000_000
 
 
 @dataclass(frozen=True)
@@ -327,13 +39,13 @@ class Ready:
     start_ns: int
 
 
-def grid_start(now_ns: int, dt_ns: int) -> int:
-    """Return the next multiple of Δt on CLOCK_MONOTONIC [ns]: a grid that two processes share without a word."""
+def compute_grid_start_ns(now_ns: int, dt_ns: int) -> int:
+    """Return the next multiple of Δt on CLOCK_MONOTONIC [ns]: two processes share this grid without communication."""
     return -(-now_ns // dt_ns) * dt_ns
 
 
 @dataclass(frozen=True)
-class Seat:
+class VehicleSetup:
     """One simulated vehicle: configuration, URLs (equal ones are one connection), and the receiver of its truth."""
 
     config: Config
@@ -352,65 +64,64 @@ def serve(
     on_ready: Callable[[Ready], None],
     on_truth: Callable[[Truth], None],
     stop: Callable[[], bool],
-    door: Door | None = None,
+    wrap_port: PortWrapper | None = None,
 ) -> None:
     """Run the peers of one vehicle in real time; see `serve_all`."""
-    seat = Seat(config, vehicle_url, mocap_url, on_truth)
-    serve_all((seat,), duration_s=duration_s, airborne=airborne, on_ready=on_ready, stop=stop, door=door)
+    setup = VehicleSetup(config, vehicle_url, mocap_url, on_truth)
+    serve_all((setup,), duration_s=duration_s, airborne=airborne, on_ready=on_ready, stop=stop, wrap_port=wrap_port)
 
 
 def serve_all(
-    seats: Sequence[Seat],
+    setups: Sequence[VehicleSetup],
     *,
     duration_s: float | None,
     airborne: bool,
     on_ready: Callable[[Ready], None],
     stop: Callable[[], bool],
     speed: float = 1.0,
-    on_look: Callable[[tuple[VehicleSnapshot, ...]], None] | None = None,
-    door: Door | None = None,
+    on_snapshot: Callable[[tuple[VehicleSnapshot, ...]], None] | None = None,
+    wrap_port: PortWrapper | None = None,
 ) -> None:
-    """Run the peers of each seat until `stop()` or the end of the duration.
+    """Run the peers of each setup until `stop()` or the end of the duration.
 
-    What was missed is caught up in virtual time; at a speed that this computer does not reach, time goes as fast as it
-    can.
+    Virtual time catches up after a delay. At a speed beyond this computer's, it runs as fast as possible.
 
     Args:
-        seats: the vehicles; their URLs are udpout (PX4 sends *to* the client's port), udpin, or tcpin; those of the
+        setups: the vehicles; their URLs are udpout (PX4 sends *to* the client's port), udpin, or tcpin; those of the
             cameras may be natnet.
         duration_s: length of the run, in simulated time [s], None for ever.
         airborne: start flying in the external mode, else on the floor and disarmed.
         on_ready: called once for each vehicle, all ports being open.
         stop: asked at least every 50 ms.
-        on_look: gets a look at all the vehicles four times a second of real time, and one at the end; it must not wait.
-        door: put around every port, None leaves them as they are.
+        on_snapshot: gets snapshots of all vehicles four times a second of real time, and at the end; it must not block.
+        wrap_port: wraps every port, None leaves them as they are.
 
     Raises:
         ConnectionSpecError: a URL is not understood or cannot be opened.
     """
-    opened: list[dict[str, Port]] = []
+    opened_ports: list[dict[str, Port]] = []
     try:
-        for seat in seats:
-            if seat.vehicle.startswith(f"{SCHEME}:"):
-                raise ConnectionSpecError(f"{seat.vehicle}: a vehicle speaks no NatNet; give it to the cameras")
+        for setup in setups:
+            if setup.vehicle.startswith(f"{SCHEME}:"):
+                raise ConnectionSpecError(f"{setup.vehicle}: a vehicle speaks no NatNet; give it to the cameras")
             ports: dict[str, Port] = {}
-            opened.append(ports)
-            ports[VEHICLE] = open_port(seat.vehicle, SIMULATED[seat.config.sim.autopilot].greeting)
-            if seat.mocap != seat.vehicle:
-                ports[MOCAP] = open_port(seat.mocap)
-            if door is not None:  # NatNet has no signatures
-                plain = {name: port for name, port in ports.items() if not isinstance(port, NatNetPort)}
-                ports.update({name: door(name, port) for name, port in plain.items()})
+            opened_ports.append(ports)
+            ports[VEHICLE] = open_port(setup.vehicle, SIMULATED[setup.config.sim.autopilot].greeting)
+            if setup.mocap != setup.vehicle:
+                ports[MOCAP] = open_port(setup.mocap)
+            if wrap_port is not None:  # NatNet has no signatures
+                mavlink_ports = {name: port for name, port in ports.items() if not isinstance(port, NatNetPort)}
+                ports.update({name: wrap_port(name, port) for name, port in mavlink_ports.items()})
         # One grid for all: a multiple of every step.
-        dt_ns = math.lcm(*(round(seat.config.plant.dt_s * 1e9) for seat in seats))
-        clock = _Clock(grid_start(time.monotonic_ns(), dt_ns), speed)
+        dt_ns = math.lcm(*(round(setup.config.plant.dt_s * 1e9) for setup in setups))
+        clock = _Clock(compute_grid_start_ns(time.monotonic_ns(), dt_ns), speed)
         end_ns = None if duration_s is None else clock.start_ns + round(duration_s * 1e9)
-        worlds = [_world(seat, ports, clock, airborne) for seat, ports in zip(seats, opened, strict=True)]
-        for ports in opened:
+        worlds = [_make_world(setup, ports, clock, airborne) for setup, ports in zip(setups, opened_ports, strict=True)]
+        for ports in opened_ports:
             on_ready(Ready(ports[VEHICLE].url, ports.get(MOCAP, ports[VEHICLE]).url, clock.start_ns))
-        _run(worlds, clock, end_ns, stop, on_look)
+        _run_worlds(worlds, clock, end_ns, stop, on_snapshot)
     finally:
-        for ports in opened:
+        for ports in opened_ports:
             for port in ports.values():
                 port.close()
 
@@ -425,7 +136,7 @@ class _Clock:
     def now_ns(self) -> int:
         return self.start_ns + round((time.monotonic_ns() - self.start_ns) * self.speed)
 
-    def left_s(self, until_ns: int) -> float:
+    def compute_remaining_s(self, until_ns: int) -> float:
         """Return the real time until a simulated time [s]."""
         return max(0, until_ns - self.now_ns()) * 1e-9 / self.speed
 
@@ -433,38 +144,38 @@ class _Clock:
 _World = tuple[Peers, dict[str, Port]]
 
 
-def _world(seat: Seat, ports: dict[str, Port], clock: _Clock, airborne: bool) -> _World:
-    shared = seat.mocap == seat.vehicle
-    config, cameras = seat.config, ports.get(MOCAP)
+def _make_world(setup: VehicleSetup, ports: dict[str, Port], clock: _Clock, airborne: bool) -> _World:
+    shared = setup.mocap == setup.vehicle
+    config, cameras = setup.config, ports.get(MOCAP)
     if isinstance(cameras, NatNetPort):
-        config = as_motive(config)
-    peers = Peers(config, clock.start_ns, airborne=airborne, shared_link=shared, on_truth=seat.on_truth)
+        config = make_motive_config(config)
+    peers = Peers(config, clock.start_ns, airborne=airborne, shared_link=shared, on_truth=setup.on_truth)
     if isinstance(cameras, NatNetPort):
         cameras.clock_us = lambda: peers.cameras.clock_us(clock.now_ns())
     return peers, ports
 
 
-def _run(
+def _run_worlds(
     worlds: Sequence[_World],
     clock: _Clock,
     end_ns: int | None,
     stop: Callable[[], bool],
-    on_look: Callable[[tuple[VehicleSnapshot, ...]], None] | None,
+    on_snapshot: Callable[[tuple[VehicleSnapshot, ...]], None] | None,
 ) -> None:
     sockets = [port for _, ports in worlds for port in ports.values()]
-    last_ns = None if end_ns is None else end_ns - 1  # what happens at the end itself is not told any more
-    look_s = time.monotonic()  # time of the next look
+    last_ns = None if end_ns is None else end_ns - 1  # events at the end itself are not sent
+    snapshot_s = time.monotonic()  # time of the next snapshot
 
-    def goal_ns(peers: Peers) -> int:
+    def compute_goal_ns(peers: Peers) -> int:
         now_ns = clock.now_ns() if last_ns is None else min(clock.now_ns(), last_ns)
-        return min(now_ns, peers.now_ns + STRIDE_NS)
+        return min(now_ns, peers.now_ns + MAX_STEP_NS)
 
     while not stop():
-        if on_look is not None and time.monotonic() >= look_s:
-            on_look(tuple(peers.look() for peers, _ in worlds))
-            look_s = time.monotonic() + LOOK_S
+        if on_snapshot is not None and time.monotonic() >= snapshot_s:
+            on_snapshot(tuple(peers.take_snapshot() for peers, _ in worlds))
+            snapshot_s = time.monotonic() + SNAPSHOT_PERIOD_S
         for peers, ports in worlds:
-            to_ns = goal_ns(peers)
+            to_ns = compute_goal_ns(peers)
             if to_ns >= peers.now_ns:  # else the start of the grid is still to come
                 for _, link, data in peers.advance(to_ns):
                     ports[link].write(data)
@@ -473,26 +184,26 @@ def _run(
         until_ns = min(peers.next_ns for peers, _ in worlds)
         if last_ns is not None:
             until_ns = min(until_ns, last_ns)
-        _wait(sockets, min(clock.left_s(until_ns), NAP_S))
+        _wait(sockets, min(clock.compute_remaining_s(until_ns), MAX_SLEEP_S))
         for peers, ports in worlds:
             for link, port in ports.items():
                 for data in port.read():
-                    at_ns = goal_ns(peers)
+                    at_ns = compute_goal_ns(peers)
                     if at_ns >= peers.now_ns:
                         peers.receive(link, data, at_ns)
     for peers, _ in worlds:
         peers.flush()
-    if on_look is not None:
-        on_look(tuple(peers.look() for peers, _ in worlds))
+    if on_snapshot is not None:
+        on_snapshot(tuple(peers.take_snapshot() for peers, _ in worlds))
 
 
-def _wait(ports: Sequence[Port], longest_s: float) -> None:
+def _wait(ports: Sequence[Port], max_s: float) -> None:
     """Sleep for a time or until bytes come; by select(2), as epoll's sleep is in whole milliseconds."""
-    sockets: list[socket.socket] = [one for port in ports for one in port.sockets()]
+    sockets: list[socket.socket] = [sock for port in ports for sock in port.sockets()]
     with SelectSelector() as selector:
-        for one in sockets:
-            selector.register(one, EVENT_READ)
-        selector.select(longest_s)
+        for sock in sockets:
+            selector.register(sock, EVENT_READ)
+        selector.select(max_s)
 
 
 def serve_in_child(
@@ -503,7 +214,7 @@ def serve_in_child(
     mocap_url: str,
     duration_s: float | None,
     airborne: bool,
-    door: Door | None = None,
+    wrap_port: PortWrapper | None = None,
 ) -> None:
     """Run `serve` in a child process: `Ready` and every `Truth` go into the pipe.
 
@@ -521,9 +232,9 @@ def serve_in_child(
             on_ready=pipe.send,
             on_truth=pipe.send,
             stop=lambda: stop.is_set() or (parent is not None and not parent.is_alive()),
-            door=door,
+            wrap_port=wrap_port,
         )
     except BrokenPipeError:
-        return  # nobody listens any more
+        return  # the parent is gone
     finally:
         pipe.close()

@@ -10,15 +10,13 @@ import numpy as np
 
 from sim.autopilot.autopilot import Autopilot
 from sim.cameras import Cameras
-from sim.channel import Channel, earliest, within
-from sim.faults import Faults, active, with_spans
-from sim.vehicle.linear import LinearVehicle, linear_model
+from sim.channel import Channel, find_earliest_ns, is_within
+from sim.faults import Faults, find_active_faults, merge_fault_spans
+from sim.vehicle.linear import LinearVehicle, make_linear_model
 from sim.vehicle.quadrotor import STEP_S, Quadrotor
 from sim.wind import Wind
 from uavctl.config.types import Config
 from uavctl.records import Flyer, Received, Send, Truth, Vec3
-
-# A simulated vehicle at one instant, for whoever watches.
 
 
 @dataclass(frozen=True)
@@ -33,16 +31,13 @@ class VehicleSnapshot:
     position_m: Vec3  # position
     velocity_mps: Vec3  # velocity
     battery: float  # charge left, 0 to 1
-    # (system, component) id of whom the last setpoint came from, None before the first
-    steered_by: tuple[int, int] | None
+    # (system, component) id of the sender of the last setpoint, None before the first
+    setpoint_source: tuple[int, int] | None
     setpoint_age_s: float | None  # time since that setpoint, None before the first
     sent: int  # positions that the cameras sent
     lost: int  # those of them that the link lost
-    faults: tuple[str, ...]  # what is amiss, as kinds of faults
+    faults: tuple[str, ...]  # kinds of the active faults
     text: str  # the last STATUSTEXT
-
-
-# Everything on the other side of the wire, under one clock that the caller moves.
 
 
 VEHICLE, MOCAP = "vehicle", "mocap"
@@ -70,23 +65,23 @@ class Peers:
         shared_link: bool = False,
         on_truth: Callable[[Truth], None] | None = None,
     ) -> None:
-        config = self._config = with_spans(config)
-        for_vehicle, for_cameras, for_channel, for_inertial = np.random.SeedSequence(config.sim.seed).spawn(4)
+        config = self._config = merge_fault_spans(config)
+        vehicle_seed, camera_seed, channel_seed, inertial_seed = np.random.SeedSequence(config.sim.seed).spawn(4)
         self.vehicle: LinearVehicle | Quadrotor
         if config.sim.plant == "quadrotor":
-            self.vehicle = quadrotor(config, for_vehicle, start_ns)
+            self.vehicle = make_quadrotor(config, vehicle_seed, start_ns)
         else:
-            self.vehicle = LinearVehicle(config, for_vehicle, start_ns)
-        self.autopilot = Autopilot(config, self.vehicle, start_ns, for_inertial, airborne=airborne)
-        self.channel = Channel(config.link, for_channel, start_ns, round(config.plant.dt_s * 1e9))
-        self.cameras = Cameras(config.sim.camera, config.frame, for_cameras, start_ns)
+            self.vehicle = LinearVehicle(config, vehicle_seed, start_ns)
+        self.autopilot = Autopilot(config, self.vehicle, start_ns, inertial_seed, airborne=airborne)
+        self.channel = Channel(config.link, channel_seed, start_ns, round(config.plant.dt_s * 1e9))
+        self.cameras = Cameras(config.sim.camera, config.frame, camera_seed, start_ns)
         self._faults = Faults(config, self.vehicle, self.autopilot, self.cameras, start_ns)
         self._airborne = airborne
         self._start_ns = start_ns
         self._mocap_link = VEHICLE if shared_link else MOCAP
         self._on_truth = on_truth
         self._truth_ns = start_ns  # boundary of the next truth
-        self._wire: deque[Due] = deque()  # in order of time
+        self._outbox: deque[Due] = deque()  # in order of time
 
     @property
     def now_ns(self) -> int:
@@ -96,53 +91,52 @@ class Peers:
     @property
     def next_ns(self) -> int:
         """Time of the next event [ns]: a datagram to send, a sample, or an act of the vehicle."""
-        times = [self._own_ns, self._truth_ns + 1, self.channel.next_ns]
-        if self._wire:
-            times.append(self._wire[0][0])
+        times = [self._next_action_ns, self._truth_ns + 1, self.channel.next_ns]
+        if self._outbox:
+            times.append(self._outbox[0][0])
         return min(at_ns for at_ns in times if at_ns is not None)
 
     @property
-    def _own_ns(self) -> int:
+    def _next_action_ns(self) -> int:
         """Time at which cameras, autopilot or a fault act next [ns]."""
-        return self._earliest_ns(self.autopilot.next_ns, self._faults.next_ns)
+        return self._find_next_action_ns(self.autopilot.next_ns, self._faults.next_ns)
 
-    def _earliest_ns(self, autopilot_ns: int | None, fault_ns: int | None) -> int:
-        found_ns = earliest((autopilot_ns, fault_ns))
-        return self.cameras.next_ns if found_ns is None else min(self.cameras.next_ns, found_ns)
+    def _find_next_action_ns(self, autopilot_ns: int | None, fault_ns: int | None) -> int:
+        event_ns = find_earliest_ns((autopilot_ns, fault_ns))
+        return self.cameras.next_ns if event_ns is None else min(self.cameras.next_ns, event_ns)
 
     def advance(self, to_ns: int) -> list[Due]:
         """Move time on; return the datagrams due up to and including `to_ns`, in order of time."""
-        self._run(to_ns)
-        due = [*self._wire, *((at_ns, self._mocap_link, data) for at_ns, data in self.channel.pop_due(to_ns))]
-        self._wire.clear()
-        due.sort(key=lambda one: one[0])  # stable: the vehicle first
+        self._run_events(to_ns)
+        due = [*self._outbox, *((at_ns, self._mocap_link, data) for at_ns, data in self.channel.pop_due(to_ns))]
+        self._outbox.clear()
+        due.sort(key=lambda datagram: datagram[0])  # stable: the vehicle first
         return due
 
-    def converse(self, to_ns: int, hear: Callable[[str, bytes, int], Received]) -> None:
-        """Move time on and pass on every datagram in order of time; answers are taken at the time reached.
+    def exchange(self, to_ns: int, handle: Callable[[str, bytes, int], Received]) -> None:
+        """Advance time and pass on every datagram in order of time; the peers receive answers at the reached time.
 
-        Time stops where the peers do something of themselves, and nowhere else: more stops would round their motion
-        in another way.
+        Time stops only at events of the peers: more stops would change the rounding of their motion.
         """
         while True:
-            at_ns = max(min(to_ns, self._own_ns), self.now_ns)
+            at_ns = max(min(to_ns, self._next_action_ns), self.now_ns)
             for arrival_ns, link, data in self.advance(at_ns):
-                for answer in hear(link, data, arrival_ns).answers:
+                for answer in handle(link, data, arrival_ns).answers:
                     self.receive(answer.link, answer.data, at_ns)
             if at_ns >= to_ns:
                 return
 
     def receive(self, link: str, data: bytes, at_ns: int) -> None:
         """Take one datagram of the controller at `at_ns`; the cameras take none."""
-        self._run(at_ns)
-        if link == VEHICLE and not within(self._config.link.uplink_blackout, at_ns - self._start_ns):
-            self._wire.extend((at_ns, VEHICLE, answer) for answer in self.autopilot.receive(data, at_ns))
+        self._run_events(at_ns)
+        if link == VEHICLE and not is_within(self._config.link.uplink_blackout, at_ns - self._start_ns):
+            self._outbox.extend((at_ns, VEHICLE, answer) for answer in self.autopilot.receive(data, at_ns))
 
-    def receiver(self, at_ns: int) -> Send:
+    def make_sender(self, at_ns: int) -> Send:
         """Return a function that takes the datagrams which the controller sends at `at_ns`."""
         return lambda outgoing: self.receive(outgoing.link, outgoing.data, at_ns)
 
-    def truth(self) -> Truth:
+    def read_truth(self) -> Truth:
         """Return the true state now, and the input that acts from now on."""
         return Truth(
             at_ns=self.now_ns,
@@ -153,16 +147,16 @@ class Peers:
             sent=self.channel.counters.sent,
             lost=self.channel.counters.lost,
             mode=self.autopilot.mode_name,
-            faults=self._amiss,
+            faults=self._active_faults,
         )
 
     @property
-    def _amiss(self) -> tuple[str, ...]:
+    def _active_faults(self) -> tuple[str, ...]:
         """Kinds of the faults that act now; a random occlusion is one too."""
-        found = active(self._config, self.now_ns - self._start_ns)
-        return (*found, "occluded") if self.cameras.hidden and "occluded" not in found else found
+        faults = find_active_faults(self._config, self.now_ns - self._start_ns)
+        return (*faults, "occluded") if self.cameras.is_occluded and "occluded" not in faults else faults
 
-    def look(self) -> VehicleSnapshot:
+    def take_snapshot(self) -> VehicleSnapshot:
         """Return a snapshot of the vehicle."""
         pilot, counters = self.autopilot.pilot, self.channel.counters
         setpoint_ns = pilot.setpoint_ns
@@ -170,65 +164,65 @@ class Peers:
             system_id=self._config.sim.system_id,
             time_s=(self.now_ns - self._start_ns) * 1e-9,
             mode=self.autopilot.mode_name,
-            armed=pilot.armed,
+            armed=pilot.is_armed,
             phase=pilot.phase.name.lower(),
             position_m=self.vehicle.position_m,
             velocity_mps=self.vehicle.velocity_mps,
-            battery=self.autopilot.craft.battery.remaining,
-            steered_by=self.autopilot.steered_by,
+            battery=self.autopilot.vehicle.battery.remaining,
+            setpoint_source=self.autopilot.setpoint_source,
             setpoint_age_s=None if setpoint_ns is None else (self.now_ns - setpoint_ns) * 1e-9,
             sent=counters.sent,
             lost=counters.lost,
-            faults=self._amiss,
-            text=self.autopilot.text,
+            faults=self._active_faults,
+            text=self.autopilot.last_text,
         )
 
     def flush(self) -> None:
         """Report the truth of a boundary that time has reached but not passed; for the end of a run."""
         if self._truth_ns == self.now_ns:
-            self._tell()
+            self._report_truth()
 
-    def _run(self, to_ns: int) -> None:
+    def _run_events(self, to_ns: int) -> None:
         while True:
             autopilot_ns, fault_ns = self.autopilot.next_ns, self._faults.next_ns
-            at_ns = max(min(self._earliest_ns(autopilot_ns, fault_ns), to_ns), self.now_ns)
-            self._move(at_ns)
-            busy = False
+            at_ns = max(min(self._find_next_action_ns(autopilot_ns, fault_ns), to_ns), self.now_ns)
+            self._advance_vehicle(at_ns)
+            has_acted = False
             if fault_ns is not None and fault_ns <= at_ns:
                 self._faults.run(at_ns)
-                busy = True
+                has_acted = True
             if autopilot_ns is not None and autopilot_ns <= at_ns:
-                self._wire.extend((at_ns, VEHICLE, data) for data in self.autopilot.run(at_ns))
-                busy = True
+                self._outbox.extend((at_ns, VEHICLE, data) for data in self.autopilot.run(at_ns))
+                has_acted = True
             if self.cameras.next_ns <= at_ns:
-                craft = self.vehicle
-                sample = self.cameras.capture(craft.position_m, craft.velocity_mps, craft.attitude)
+                vehicle = self.vehicle
+                sample = self.cameras.capture(vehicle.position_m, vehicle.velocity_mps, vehicle.attitude)
                 if sample is None:
-                    self.channel.pass_over(at_ns)
+                    self.channel.skip_packet(at_ns)
                 else:  # A flight that begins in the air begins with a known position: a(0) = 0, as in the paper.
-                    self.channel.push(*sample, certain=self._airborne and not self.channel.counters.sent)
-                busy = True
-            if not busy:
+                    self.channel.push(*sample, is_certain=self._airborne and not self.channel.counters.sent)
+                has_acted = True
+            if not has_acted:
                 break
-        self._move(to_ns)
+        self._advance_vehicle(to_ns)
 
-    def _move(self, to_ns: int) -> None:
+    def _advance_vehicle(self, to_ns: int) -> None:
         while self._truth_ns < to_ns:
             self.vehicle.advance(self._truth_ns)
-            self._tell()
+            self._report_truth()
         self.vehicle.advance(to_ns)
 
-    def _tell(self) -> None:
+    def _report_truth(self) -> None:
         self._truth_ns += self.vehicle.model.dt_ns
         if self._on_truth is not None:
-            self._on_truth(self.truth())
+            self._on_truth(self.read_truth())
 
 
-def quadrotor(config: Config, seed: np.random.SeedSequence, start_ns: int) -> Quadrotor:
+def make_quadrotor(config: Config, seed: np.random.SeedSequence, start_ns: int) -> Quadrotor:
     """Make the quadrotor of a configuration with its wind; the seed is that of the gusts."""
     sim = config.sim
     return Quadrotor(
-        linear_model(config.plant),
+        make_linear_model(config.plant),
         sim.autopilot,
         Wind(sim.wind.velocity_mps, sim.wind.gust_wind_mps, sim.wind.height_m, STEP_S, seed),
         start_ns,
@@ -238,16 +232,13 @@ def quadrotor(config: Config, seed: np.random.SeedSequence, start_ns: int) -> Qu
     )
 
 
-# The simulated peers and a controller in lockstep, in virtual time: no socket, no clock.
-
-
 class World:
     """Flight of `flyer` against the simulated peers; bit-identical for a seed.
 
     In each tick of the grid start_ns + n tick_s the flyer first gets every datagram that has arrived by
     then, then decides, and what it sends reaches the peers at the same instant. So a sample taken at a boundary
-    and not delayed is known to that boundary's decision. What it answers a datagram with reaches the vehicle when
-    that one was sent, or with the peers' next doing.
+    and not delayed is known to that boundary's decision. Its answer to a datagram reaches the vehicle at the
+    time of that datagram, or with the peers' next event.
 
     Args:
         config: the whole configuration; `sim`, `link`, `plant`, `frame` and the tick are used.
@@ -272,22 +263,22 @@ class World:
         self._start_ns = start_ns
         self._tick_ns = round(config.daemon.tick_s * 1e9)
         self._ticks_per_step = round(config.plant.dt_s / config.daemon.tick_s)
-        shared = config.daemon.vehicle == config.daemon.mocap
+        is_shared = config.daemon.vehicle == config.daemon.mocap
         self._ticks = 0
-        self.peers = Peers(config, start_ns, airborne=airborne, shared_link=shared, on_truth=on_truth)
+        self.peers = Peers(config, start_ns, airborne=airborne, shared_link=is_shared, on_truth=on_truth)
 
-    def run(self, duration_s: float, over: Callable[[], bool] = lambda: False) -> None:
+    def run(self, duration_s: float, is_done: Callable[[], bool] = lambda: False) -> None:
         """Fly all the ticks that begin within `duration_s` from the start, or until the flyer is done."""
         for tick in range(self._ticks, round(duration_s * 1e9) // self._tick_ns):
-            if over():
+            if is_done():
                 break
-            self._tick(tick)
+            self._run_tick(tick)
             self._ticks = tick + 1
             if self._on_progress is not None and (tick + 1) % self._ticks_per_step == 0:
                 self._on_progress((tick + 1) * self._tick_ns * 1e-9)
         self.peers.flush()
 
-    def _tick(self, tick: int) -> None:
+    def _run_tick(self, tick: int) -> None:
         at_ns = self._start_ns + tick * self._tick_ns
-        self.peers.converse(at_ns, self._flyer.receive)
-        self._flyer.tick(tick, at_ns, self.peers.receiver(at_ns))
+        self.peers.exchange(at_ns, self._flyer.receive)
+        self._flyer.tick(tick, at_ns, self.peers.make_sender(at_ns))

@@ -14,9 +14,9 @@ from msgspec.structs import FieldInfo
 from logs.recording.derived_topics import VIEWS, DerivedTopic
 from logs.recording.topics import TOPICS, definition
 from uavctl.cli.app import app
-from uavctl.config.document import Section, description, element, is_section, type_text
+from uavctl.config.document import Section, describe_type, get_description, get_element_type, is_section
 from uavctl.config.room import RoomConfig
-from uavctl.config.types import OF_HAHN_STURSBERG, Config
+from uavctl.config.types import HAHN_STURSBERG_KEYS, Config
 from uavctl.lab.campaign.spec import CampaignSpec
 from uavctl.lab.campaign.trials import TrialSpec
 from uavctl.mavlink.handover_states import TRANSITIONS, HandoverEvent, HandoverState
@@ -87,14 +87,14 @@ def tables(section: type[Section], path: str) -> Iterator[str]:
     yield "| key | type | meaning | default |\n|---|---|---|---|"
     for field in fields:
         if not is_section(field.type):
-            needed = f"{path}.{field.encode_name}" in OF_HAHN_STURSBERG
+            needed = f"{path}.{field.encode_name}" in HAHN_STURSBERG_KEYS
             default = "required with scheme `hahn-stursberg`" if needed else _default(field, section, path)
-            cells = (f"`{field.encode_name}`", type_text(field.type), description(field), default)
+            cells = (f"`{field.encode_name}`", describe_type(field.type), get_description(field), default)
             yield "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
     yield ""
     for field in fields:
         name = f"{path}.{field.encode_name}" if path else field.encode_name
-        one = element(field.type)
+        one = get_element_type(field.type)
         if one is not None:
             yield from tables(one, f"[{name}]")
         elif is_section(field.type):

@@ -208,7 +208,7 @@ def simulated(autopilot: str, *overrides: str, ends_s: float = LONGEST_S) -> Wat
             loop.receive(link, data, arrival_ns)
         if tick == ready:
             loop.order(Command(order=Order.TAKE_OFF, height_m=HEIGHT_M))
-        loop.tick(tick, at_ns, peers.receiver(at_ns), stop=tick >= land)
+        loop.tick(tick, at_ns, peers.make_sender(at_ns), stop=tick >= land)
         truth.append((at_ns * S, -peers.vehicle.position_m[2]))
         if loop.handover_state is HandoverState.DONE:
             break

@@ -14,7 +14,7 @@ import msgspec
 from mcap.records import Attachment, Metadata
 
 from logs.recording.parameters import ParameterReader, listed, parameter_file
-from uavctl.config.load import dotted
+from uavctl.config.load import flatten_keys
 from uavctl.records import Header
 
 CONFIG, LAYOUT, PARAMETERS = "config.toml", "foxglove-layout.json", "vehicle.params"
@@ -74,7 +74,7 @@ def _file(name: str, media_type: str, text: str, utc_ns: int) -> Attachment:
 def _flat(text: str) -> dict[str, str]:
     """Return a configuration by dotted names, its values as JSON; nothing if it is damaged."""
     try:
-        return {key: _word(value) for key, value in dotted(tomllib.loads(text))}
+        return {key: _word(value) for key, value in flatten_keys(tomllib.loads(text))}
     except tomllib.TOMLDecodeError:
         return {}
 

@@ -30,7 +30,7 @@ from logs.report import page
 from logs.report.page import Mark, PageSection
 from logs.report.plots import DASHED, DOTTED, SEEN, along, course, position_limits, thin
 from logs.report.svg import Canvas, Drawing, canvas, colour
-from uavctl.config.load import dotted
+from uavctl.config.load import flatten_keys
 from uavctl.errors import RecordingError, UsageError
 from uavctl.mavlink.framing import scan_frames
 from uavctl.records import Header
@@ -307,7 +307,10 @@ def _parameters(one: LoadedFlight) -> dict[str, object]:
         raise RecordingError(f"{one.side.recording}: the configuration in its header is damaged ({error})") from error
     return {
         # JSON has no infinity, which limits may be.
-        **{key: str(one) if isinstance(one, float) and not math.isfinite(one) else one for key, one in dotted(config)},
+        **{
+            key: str(one) if isinstance(one, float) and not math.isfinite(one) else one
+            for key, one in flatten_keys(config)
+        },
         "design_id": header.design_id,
         "library_id": header.library_id,
         "cpu": header.cpu,

@@ -275,7 +275,7 @@ def _promises(config: Config | None) -> tuple[float | None, tuple[float, ...]]:
     if config is None:
         return None, ()
     try:
-        if config.conditioned:
+        if config.is_age_conditioned:
             older = np.array([build_ages(config).outage(age) for age in range(_LONG + 1)])
             ages, least = older - np.append(older[1:], 0.0), 1.0 - float(older[1])
         else:

@@ -16,16 +16,16 @@ from urllib.parse import parse_qsl
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sim.autopilot.profile import Parameters, ParameterType
+from sim.autopilot.parameters import Parameters, ParameterType
 from sim.autopilot.telemetry import Message
 
 PARAMETER_FILE = "@PARAM/param.pck"
-HEADER = struct.Struct("<HBBBBBxI")  # sequence, session, opcode, size, opcode asked for, burst complete, offset
-DATA_MAX = 239
-SESSIONS = 4
-IDLE_NS = 3_000_000_000  # a session that was not used for so long gives way to a new one
-# What ArduPilot takes a packed parameter to need, so the size it tells when the file is opened [bytes]
-ESTIMATE = 12
+HEADER = struct.Struct("<HBBBBBxI")  # sequence, session, opcode, size, requested opcode, burst complete, offset
+MAX_DATA_BYTES = 239
+MAX_SESSIONS = 4
+SESSION_TIMEOUT_NS = 3_000_000_000  # a session without requests for this time may be replaced
+# ArduPilot's estimate of a packed parameter; the size that it reports on opening follows from it [bytes]
+BYTES_PER_PARAMETER = 12
 
 
 class FileOperation(IntEnum):
@@ -107,7 +107,9 @@ class OpenFile:
         """
         if not self.size:
             self.size = size
-            self.content = packed(self.parameters, size, start=self.start, count=self.count, defaults=self.defaults)
+            self.content = pack_parameters(
+                self.parameters, size, start=self.start, count=self.count, defaults=self.defaults
+            )
         if size != self.size:
             raise RefusedError(FileRefusal.ERRNO, errno.EINVAL)
         if offset >= len(self.content):
@@ -117,7 +119,7 @@ class OpenFile:
 
 @dataclass(frozen=True)
 class FileRequest:
-    """A request, and whom it comes from."""
+    """A request and its sender."""
 
     sender: tuple[int, int]  # system and component id
     sequence: int
@@ -143,13 +145,13 @@ class FileRequest:
 class Files:
     """The files of one vehicle."""
 
-    def __init__(self, parameters: Parameters, *, packs: bool) -> None:
-        self._parameters, self._packs = parameters, packs
+    def __init__(self, parameters: Parameters, *, has_parameter_file: bool) -> None:
+        self._parameters, self._has_parameter_file = parameters, has_parameter_file
         self._open: dict[tuple[int, int, int], OpenFile] = {}
         self._last: tuple[FileRequest | None, tuple[Message, ...]] = None, ()
 
     def answer(self, msg: Any, at_ns: int) -> tuple[Message, ...]:
-        """Take a FILE_TRANSFER_PROTOCOL message; return the answers. One that is repeated is answered as before."""
+        """Take a FILE_TRANSFER_PROTOCOL message; return the answers. A repeated request gets the same answers."""
         payload = bytes(msg.payload)
         sequence, session, opcode, size, _, _, offset = HEADER.unpack_from(payload)
         if opcode in (FileOperation.ACK, FileOperation.NAK):
@@ -160,47 +162,47 @@ class Files:
         if request == self._last[0]:
             return self._last[1]
         answers = tuple(
-            _message(request, (sequence + 1 + number) % 2**16, *answer)
-            for number, answer in enumerate(self._answers(request, at_ns))
+            _make_message(request, (sequence + 1 + number) % 2**16, *answer)
+            for number, answer in enumerate(self._generate_answers(request, at_ns))
         )
         self._last = request, answers
         return answers
 
-    def _answers(self, request: FileRequest, at_ns: int) -> Iterator[tuple[FileOperation, int, bytes, bool]]:
+    def _generate_answers(self, request: FileRequest, at_ns: int) -> Iterator[tuple[FileOperation, int, bytes, bool]]:
         """Yield opcode, offset, data, and whether it ends a burst, of each answer."""
         key = *request.sender, request.session
         offset = request.offset
         try:
-            if request.size > DATA_MAX:
+            if request.size > MAX_DATA_BYTES:
                 raise RefusedError(FileRefusal.BAD_SIZE)
             if request.opcode != FileOperation.BURST:
-                yield FileOperation.ACK, offset, self._do(request, key, at_ns), False
+                yield FileOperation.ACK, offset, self._execute(request, key, at_ns), False
                 return
-            one, size = self._file(key, at_ns), request.size or DATA_MAX
+            file, size = self._get_file(key, at_ns), request.size or MAX_DATA_BYTES
             while True:
-                data = one.read(offset, size)
+                data = file.read(offset, size)
                 yield FileOperation.ACK, offset, data, False
                 offset += len(data)
         except RefusedError as refused:
             yield FileOperation.NAK, offset, refused.data, request.opcode == FileOperation.BURST
 
-    def _do(self, request: FileRequest, key: tuple[int, int, int], at_ns: int) -> bytes:
+    def _execute(self, request: FileRequest, key: tuple[int, int, int], at_ns: int) -> bytes:
         match request.opcode:
             case FileOperation.NONE:
                 return b""
             case FileOperation.RESET:
-                self._open = {one: file for one, file in self._open.items() if one[:2] != request.sender}
+                self._open = {open_key: file for open_key, file in self._open.items() if open_key[:2] != request.sender}
                 return b""
             case FileOperation.TERMINATE:
-                if self._open.pop(key, None) is None and not self._packs:
+                if self._open.pop(key, None) is None and not self._has_parameter_file:
                     raise RefusedError(FileRefusal.NO_SESSION)  # ArduPilot closes what is not open, too
                 return b""
             case FileOperation.LIST:
                 raise RefusedError(FileRefusal.END if request.path == "/" else FileRefusal.NOT_FOUND)
             case FileOperation.OPEN:
-                return self._begin(request, key, at_ns)
+                return self._open_parameter_file(request, key, at_ns)
             case FileOperation.READ:
-                return self._file(key, at_ns).read(request.offset, request.size)
+                return self._get_file(key, at_ns).read(request.offset, request.size)
             case FileOperation.CHECKSUM:
                 raise RefusedError(FileRefusal.NOT_FOUND)
             case opcode if opcode in WRITES:
@@ -208,49 +210,47 @@ class Files:
             case _:
                 raise RefusedError(FileRefusal.UNKNOWN)
 
-    def _file(self, key: tuple[int, int, int], at_ns: int) -> OpenFile:
-        one = self._open.get(key)
-        if one is None:
-            raise RefusedError(FileRefusal.NOT_FOUND if self._packs else FileRefusal.NO_SESSION)
-        one.used_ns = at_ns
-        return one
+    def _get_file(self, key: tuple[int, int, int], at_ns: int) -> OpenFile:
+        file = self._open.get(key)
+        if file is None:
+            raise RefusedError(FileRefusal.NOT_FOUND if self._has_parameter_file else FileRefusal.NO_SESSION)
+        file.used_ns = at_ns
+        return file
 
-    def _begin(self, request: FileRequest, key: tuple[int, int, int], at_ns: int) -> bytes:
+    def _open_parameter_file(self, request: FileRequest, key: tuple[int, int, int], at_ns: int) -> bytes:
         name, _, query = request.path.partition("?")
-        if not self._packs or name != PARAMETER_FILE:
+        if not self._has_parameter_file or name != PARAMETER_FILE:
             raise RefusedError(FileRefusal.NOT_FOUND)
-        wanted = dict(parse_qsl(query))
-        start, count, defaults = (_number(wanted.get(one, "0")) for one in ("start", "count", "withdefaults"))
+        query_values = dict(parse_qsl(query))
+        start, count, defaults = (
+            _parse_number(query_values.get(one, "0")) for one in ("start", "count", "withdefaults")
+        )
         if start >= len(self._parameters.names) or defaults > 1:
             raise RefusedError(FileRefusal.ERRNO, errno.EINVAL)
-        self._open = {one: file for one, file in self._open.items() if at_ns - file.used_ns < IDLE_NS}
+        self._open = {one: file for one, file in self._open.items() if at_ns - file.used_ns < SESSION_TIMEOUT_NS}
         if key in self._open:
             raise RefusedError(FileRefusal.FAILED)
-        if len(self._open) == SESSIONS:
+        if len(self._open) == MAX_SESSIONS:
             raise RefusedError(FileRefusal.NONE_FREE)
         self._open[key] = OpenFile(self._parameters, start, count, bool(defaults), at_ns)
-        return struct.pack("<I", ESTIMATE * len(self._parameters.names))
+        return struct.pack("<I", BYTES_PER_PARAMETER * len(self._parameters.names))
 
 
-def _number(word: str) -> int:
-    if not (word.isascii() and word.isdigit() and int(word) < 2**16):
+def _parse_number(text: str) -> int:
+    if not (text.isascii() and text.isdigit() and int(text) < 2**16):
         raise RefusedError(FileRefusal.ERRNO, errno.EINVAL)
-    return int(word)
+    return int(text)
 
 
-def _message(
+def _make_message(
     request: FileRequest, sequence: int, opcode: FileOperation, offset: int, data: bytes, complete: bool
 ) -> Message:
-    head = HEADER.pack(sequence, request.session, opcode, len(data), request.opcode, complete, offset)
-    return mavlink.MAVLink_file_transfer_protocol_message(0, *request.sender, list((head + data).ljust(251, b"\0")))
-
-
-# ArduPilot's packed parameters: a head of three numbers, then for each parameter its type, how many letters of its
-# name are those of the one before, how many follow, these letters, its value, and its default where that is another.
+    header = HEADER.pack(sequence, request.session, opcode, len(data), request.opcode, complete, offset)
+    return mavlink.MAVLink_file_transfer_protocol_message(0, *request.sender, list((header + data).ljust(251, b"\0")))
 
 
 PLAIN, WITH_DEFAULTS = 0x671B, 0x671C
-PACKED_AS = {
+PACKED_TYPES = {
     ParameterType.INT8: (1, "b"),
     ParameterType.INT16: (2, "h"),
     ParameterType.INT32: (3, "i"),
@@ -258,23 +258,27 @@ PACKED_AS = {
 }
 
 
-def packed(parameters: Parameters, read_size: int, *, start: int, count: int, defaults: bool) -> bytes:
-    """Pack parameters as ArduPilot does; zeros keep a value from lying across two reads of `read_size` bytes."""
+def pack_parameters(parameters: Parameters, read_size: int, *, start: int, count: int, defaults: bool) -> bytes:
+    """Pack parameters as ArduPilot does; zeros keep a value from lying across two reads of `read_size` bytes.
+
+    Header: magic, count, total count. Each parameter: type, number of letters in common with the name before, number of
+    the other letters, these letters, value, and the default where it differs.
+    """
     names = parameters.names[start:]
     names = names[:count] if count else names
     packed = bytearray(struct.pack("<HHH", WITH_DEFAULTS if defaults else PLAIN, len(names), len(parameters.names)))
-    before = ""
+    previous_name = ""
     for name in names:
-        kind, form = PACKED_AS[parameters.kind(name)]
+        kind, form = PACKED_TYPES[parameters.get_type(name)]
         values = [parameters[name]]
-        if defaults and parameters.default(name) != parameters[name]:
-            values.append(parameters.default(name))
+        if defaults and parameters.get_default(name) != parameters[name]:
+            values.append(parameters.get_default(name))
         data = b"".join(struct.pack(f"<{form}", value if form == "f" else int(value)) for value in values)
-        common = next(i for i, letter in enumerate(name) if before[i : i + 1] != letter)
-        letters, size = name[common:].encode(), len(data) // len(values)
-        over = (len(packed) + 2 + len(letters) + len(data)) % read_size
-        if 0 < over < size:
-            packed += bytes(size - over)
-        packed += bytes((kind | (len(values) - 1) << 4, common | (len(letters) - 1) << 4)) + letters + data
-        before = name
+        common_letters = next(i for i, letter in enumerate(name) if previous_name[i : i + 1] != letter)
+        letters, size = name[common_letters:].encode(), len(data) // len(values)
+        overlap = (len(packed) + 2 + len(letters) + len(data)) % read_size
+        if 0 < overlap < size:
+            packed += bytes(size - overlap)
+        packed += bytes((kind | (len(values) - 1) << 4, common_letters | (len(letters) - 1) << 4)) + letters + data
+        previous_name = name
     return bytes(packed)

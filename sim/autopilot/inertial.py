@@ -1,9 +1,9 @@
 """Inertial sensors, and the attitude that an autopilot estimates from them, with the errors of both.
 
-A bias of the accelerometer across gravity cannot be told from a tilt, so the estimate tilts by it: at hover the
-specific force that is told, turned by the attitude that is told, is nearly right although both err. Dead reckoning goes
-wrong by what remains: a small tilt that wanders within seconds, biases that the estimate knows and the message keeps,
-and noise. All figures and their sources are in docs/vehicle.md.
+A horizontal accelerometer bias looks like a tilt, so the estimate tilts by it. At hover the reported specific force,
+turned by the reported attitude, is nearly right although both have errors. The remaining errors drive dead reckoning
+off: a small tilt that wanders within seconds, biases that the messages keep, and noise. All figures and their sources
+are in docs/vehicle.md.
 """
 
 from __future__ import annotations
@@ -15,22 +15,23 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sim.vehicle.interface import Quaternion, Vehicle, in_body
-from sim.vehicle.rigid_body import GRAVITY_MPS2, turned
+from sim.vehicle.airframe import GRAVITY_MPS2
+from sim.vehicle.interface import Quaternion, Vehicle, rotate_to_body
+from sim.vehicle.rigid_body import rotate_attitude
 from uavctl.records import Vec3
 
 DRIFT_S, WANDER_S, HEADING_S = 60.0, 4.0, 30.0  # time constants
-STEP_NS = 20_000_000  # between two changes of the attitude that the vehicle's own loops believe
-DRAWS = 1000  # normal numbers drawn at once
+STEP_NS = 20_000_000  # between two updates of the attitude error of the vehicle's loops
+BATCH_SIZE = 1000  # normal numbers drawn at once
 
 
 @dataclass(frozen=True)
 class InertialErrors:
     """Standard deviations of the errors of inertial and attitude data, for each axis."""
 
-    tilting_mps2: float  # constant bias of the accelerometer along front and right, by which the estimate tilts
+    tilt_bias_mps2: float  # constant bias of the accelerometer along front and right, by which the estimate tilts
     drift_mps2: float  # drift of that bias, by which it tilts too
-    bias_mps2: float  # constant bias along front and right that the estimate knows and the message keeps
+    bias_mps2: float  # constant bias along front and right that the estimate removes and the message keeps
     bias_down_mps2: float  # constant bias along down; no tilt hides it
     tilt_rad: float  # constant tilt of the attitude beside that of the bias
     wander_rad: float  # wandering tilt, in flight
@@ -41,15 +42,15 @@ class InertialErrors:
     gyro_noise_rps: float  # white noise of a body rate
     gyro_vibration_rps: float  # white noise that flying adds to it
 
-    def scaled(self, factor: float) -> InertialErrors:
+    def scale(self, factor: float) -> InertialErrors:
         """Return the errors times a factor."""
         return InertialErrors(*(factor * size for size in astuple(self)))
 
 
-# PX4 takes the biases that its estimate knows out of HIGHRES_IMU; ArduPilot leaves them in its messages.
+# PX4 removes its estimated biases from HIGHRES_IMU; ArduPilot leaves them in its messages.
 ERRORS = {
     "px4": InertialErrors(
-        tilting_mps2=0.03,
+        tilt_bias_mps2=0.03,
         drift_mps2=0.03,
         bias_mps2=0.0,
         bias_down_mps2=0.004,
@@ -63,7 +64,7 @@ ERRORS = {
         gyro_vibration_rps=0.01,
     ),
     "ardupilot": InertialErrors(
-        tilting_mps2=0.03,
+        tilt_bias_mps2=0.03,
         drift_mps2=0.03,
         bias_mps2=0.02,
         bias_down_mps2=0.03,
@@ -79,11 +80,11 @@ ERRORS = {
 }
 
 
-def normals(seed: np.random.SeedSequence) -> Iterator[float]:
+def draw_normals(seed: np.random.SeedSequence) -> Iterator[float]:
     """Draw standard normal numbers without end."""
     rng = np.random.default_rng(seed)
     while True:
-        yield from rng.standard_normal(DRAWS).tolist()
+        yield from rng.standard_normal(BATCH_SIZE).tolist()
 
 
 class GaussMarkov:
@@ -97,51 +98,55 @@ class GaussMarkov:
         self._time_s = time_s
         self.value = 0.0
 
-    def move(self, elapsed_s: float, std: float, normal: float) -> None:
+    def advance(self, elapsed_s: float, std: float, normal: float) -> None:
         """Move on towards this standard deviation; after infinite time the value is drawn from it."""
-        keep = math.exp(-elapsed_s / self._time_s)
-        self.value = keep * self.value + std * math.sqrt(1.0 - keep * keep) * normal
+        decay = math.exp(-elapsed_s / self._time_s)
+        self.value = decay * self.value + std * math.sqrt(1.0 - decay * decay) * normal
 
 
 class Imu:
     """One inertial measurement unit: biases and noise of its measurements."""
 
     def __init__(self, errors: InertialErrors, seed: np.random.SeedSequence) -> None:
-        e, draw = errors, normals(seed)
-        self._errors, self._draw = errors, draw
-        self._tilting = (e.tilting_mps2 * next(draw), e.tilting_mps2 * next(draw))
-        self._bias = (e.bias_mps2 * next(draw), e.bias_mps2 * next(draw), e.bias_down_mps2 * next(draw))
-        self._gyro_bias = (e.gyro_bias_rps * next(draw), e.gyro_bias_rps * next(draw), e.gyro_bias_rps * next(draw))
+        e, normals = errors, draw_normals(seed)
+        self._errors, self._normals = errors, normals
+        self._tilt_bias = (e.tilt_bias_mps2 * next(normals), e.tilt_bias_mps2 * next(normals))
+        self._bias = (e.bias_mps2 * next(normals), e.bias_mps2 * next(normals), e.bias_down_mps2 * next(normals))
+        self._gyro_bias = (
+            e.gyro_bias_rps * next(normals),
+            e.gyro_bias_rps * next(normals),
+            e.gyro_bias_rps * next(normals),
+        )
         self._drift = GaussMarkov(DRIFT_S), GaussMarkov(DRIFT_S)
 
     @property
-    def tilting_mps2(self) -> tuple[float, float]:
+    def tilt_bias_mps2(self) -> tuple[float, float]:
         """Bias along front and right by which an estimate tilts [m/s²]."""
-        (front, right), (one, other) = self._tilting, self._drift
-        return front + one.value, right + other.value
+        (front, right), (front_drift, right_drift) = self._tilt_bias, self._drift
+        return front + front_drift.value, right + right_drift.value
 
-    def move(self, elapsed_s: float) -> None:
+    def advance(self, elapsed_s: float) -> None:
         """Let the biases drift on."""
         for drift in self._drift:
-            drift.move(elapsed_s, self._errors.drift_mps2, next(self._draw))
+            drift.advance(elapsed_s, self._errors.drift_mps2, next(self._normals))
 
-    def force(self, true_mps2: Vec3, *, flies: bool) -> Vec3:
+    def measure_force(self, true_mps2: Vec3, *, is_flying: bool) -> Vec3:
         """Measure a specific force [m/s²]."""
-        e, draw, (tf, tr), (bf, br, bd) = self._errors, self._draw, self.tilting_mps2, self._bias
-        noise = math.hypot(e.noise_mps2, e.vibration_mps2) if flies else e.noise_mps2
+        e, normals, (tf, tr), (bf, br, bd) = self._errors, self._normals, self.tilt_bias_mps2, self._bias
+        noise = math.hypot(e.noise_mps2, e.vibration_mps2) if is_flying else e.noise_mps2
         front, right, down = true_mps2
         return (
-            front + tf + bf + noise * next(draw),
-            right + tr + br + noise * next(draw),
-            down + bd + noise * next(draw),
+            front + tf + bf + noise * next(normals),
+            right + tr + br + noise * next(normals),
+            down + bd + noise * next(normals),
         )
 
-    def rates(self, true_rps: Vec3, *, flies: bool) -> Vec3:
+    def measure_rates(self, true_rps: Vec3, *, is_flying: bool) -> Vec3:
         """Measure body rates [rad/s]."""
-        e, draw, (bp, bq, br) = self._errors, self._draw, self._gyro_bias
-        noise = math.hypot(e.gyro_noise_rps, e.gyro_vibration_rps) if flies else e.gyro_noise_rps
+        e, normals, (bp, bq, br) = self._errors, self._normals, self._gyro_bias
+        noise = math.hypot(e.gyro_noise_rps, e.gyro_vibration_rps) if is_flying else e.gyro_noise_rps
         p, q, r = true_rps
-        return p + bp + noise * next(draw), q + bq + noise * next(draw), r + br + noise * next(draw)
+        return p + bp + noise * next(normals), q + bq + noise * next(normals), r + br + noise * next(normals)
 
 
 class InertialMeasurement(NamedTuple):
@@ -155,78 +160,87 @@ class InertialMeasurement(NamedTuple):
 class InertialSensors:
     """Two inertial units of a vehicle, and the attitude estimated from the first.
 
-    Until the first measurement the attitude is the true one, so who uses no inertial data is not disturbed by their
-    errors. With `flown` the errors are there from the start, and the vehicle's own loops take the wrong attitude for
-    true.
+    Until the first measurement the attitude is the true one, so a run without inertial data has no such errors. With
+    `flown` the errors exist from the start, and the vehicle's loops use the wrong attitude.
 
     Args:
-        flown: whether the vehicle flies by the attitude that it believes.
+        flown: whether the vehicle's loops use the estimated attitude.
 
     Attributes:
-        next_ns: when what the loops believe changes next, None if they know the truth.
+        next_ns: time of the next attitude error of the loops, None if they use the true attitude.
     """
 
-    def __init__(self, errors: InertialErrors, craft: Vehicle, seed: np.random.SeedSequence, *, flown: bool) -> None:
-        first, second, own = seed.spawn(3)
-        self._errors, self._craft = errors, craft
-        self._units = Imu(errors, first), Imu(errors, second)
-        self._draw = normals(own)
-        self._tilt = (errors.tilt_rad * next(self._draw), errors.tilt_rad * next(self._draw))
+    def __init__(self, errors: InertialErrors, vehicle: Vehicle, seed: np.random.SeedSequence, *, flown: bool) -> None:
+        first_seed, second_seed, attitude_seed = seed.spawn(3)
+        self._errors, self._vehicle = errors, vehicle
+        self._units = Imu(errors, first_seed), Imu(errors, second_seed)
+        self._normals = draw_normals(attitude_seed)
+        self._tilt = (errors.tilt_rad * next(self._normals), errors.tilt_rad * next(self._normals))
         self._wander = GaussMarkov(WANDER_S), GaussMarkov(WANDER_S)
         self._heading = GaussMarkov(HEADING_S)
         self._moved_ns: int | None = None
-        self._errs = flown
-        self.next_ns = craft.now_ns if flown else None
+        self._has_errors = flown
+        self.next_ns = vehicle.now_ns if flown else None
 
     def measure(self, unit: int) -> InertialMeasurement:
         """Measure with the first (0) or the second unit (1)."""
-        self._errs = True
-        self._move()
-        craft, imu = self._craft, self._units[unit]
-        north, east, down = craft.acceleration_mps2
-        force = in_body(craft.attitude, (north, east, down - GRAVITY_MPS2))
-        flies = not craft.landed
+        self._has_errors = True
+        self._advance_errors()
+        vehicle, imu = self._vehicle, self._units[unit]
+        north, east, down = vehicle.acceleration_mps2
+        force = rotate_to_body(vehicle.attitude, (north, east, down - GRAVITY_MPS2))
+        is_flying = not vehicle.landed
         return InertialMeasurement(
-            craft.measured_ns, imu.force(force, flies=flies), imu.rates(craft.rates_rps, flies=flies)
+            vehicle.measured_ns,
+            imu.measure_force(force, is_flying=is_flying),
+            imu.measure_rates(vehicle.rates_rps, is_flying=is_flying),
         )
 
-    def attitude(self) -> Quaternion:
+    def estimate_attitude(self) -> Quaternion:
         """Estimate the attitude: the rotation from body axes FRD to NED."""
-        return turned(self._craft.attitude, self._error_rad()) if self._errs else self._craft.attitude
+        return (
+            rotate_attitude(self._vehicle.attitude, self._compute_error_rad())
+            if self._has_errors
+            else self._vehicle.attitude
+        )
 
-    def rates(self) -> Vec3:
+    def measure_rates(self) -> Vec3:
         """Measure the body rates that go with the attitude [rad/s]."""
-        craft = self._craft
-        return self._units[0].rates(craft.rates_rps, flies=not craft.landed) if self._errs else craft.rates_rps
+        vehicle = self._vehicle
+        return (
+            self._units[0].measure_rates(vehicle.rates_rps, is_flying=not vehicle.landed)
+            if self._has_errors
+            else vehicle.rates_rps
+        )
 
     def run(self, at_ns: int) -> None:
         """Pass the attitude error to the loops that fly, when that is due."""
         if self.next_ns is not None and self.next_ns <= at_ns:
             self.next_ns = at_ns + STEP_NS
-            self._craft.mislead_attitude(self._error_rad())
+            self._vehicle.set_attitude_error(self._compute_error_rad())
 
-    def _error_rad(self) -> Vec3:
+    def _compute_error_rad(self) -> Vec3:
         """Return the rotation from the true to the estimated attitude, about body axes [rad]."""
-        self._move()
-        front, right = self._units[0].tilting_mps2
-        (roll, pitch), (one, other) = self._tilt, self._wander
+        self._advance_errors()
+        front, right = self._units[0].tilt_bias_mps2
+        (roll, pitch), (roll_wander, pitch_wander) = self._tilt, self._wander
         # With this tilt a unit at rest that measures (front, right, -g) would measure nothing but gravity.
         return (
-            roll + one.value - right / GRAVITY_MPS2,
-            pitch + other.value + front / GRAVITY_MPS2,
+            roll + roll_wander.value - right / GRAVITY_MPS2,
+            pitch + pitch_wander.value + front / GRAVITY_MPS2,
             self._heading.value,
         )
 
-    def _move(self) -> None:
+    def _advance_errors(self) -> None:
         """Move all slow errors on to the present."""
-        now_ns = self._craft.now_ns
+        now_ns = self._vehicle.now_ns
         if now_ns == self._moved_ns:
             return
         elapsed_s = math.inf if self._moved_ns is None else (now_ns - self._moved_ns) * 1e-9
         self._moved_ns = now_ns
         for unit in self._units:
-            unit.move(elapsed_s)
-        e, flies = self._errors, not self._craft.landed
+            unit.advance(elapsed_s)
+        e, is_flying = self._errors, not self._vehicle.landed
         for wander in self._wander:
-            wander.move(elapsed_s, e.wander_rad if flies else 0.0, next(self._draw))
-        self._heading.move(elapsed_s, e.heading_rad if flies else 0.0, next(self._draw))
+            wander.advance(elapsed_s, e.wander_rad if is_flying else 0.0, next(self._normals))
+        self._heading.advance(elapsed_s, e.heading_rad if is_flying else 0.0, next(self._normals))

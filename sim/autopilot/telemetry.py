@@ -1,4 +1,4 @@
-"""Telemetry of the simulated autopilot: messages, rates, geodesy."""
+"""Telemetry of the simulated autopilot: messages, their contents and their rates."""
 
 from __future__ import annotations
 
@@ -9,127 +9,18 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from sim.autopilot.arming import check_preflight
 from sim.autopilot.estimator import Estimator
+from sim.autopilot.geodesy import GeodeticOrigin
 from sim.autopilot.inertial import InertialSensors
-from sim.autopilot.pilot import Phase, Pilot, preflight
-from sim.autopilot.profile import (
-    IGNORE_ACCEL,
-    IGNORE_POSITION,
-    IGNORE_VELOCITY,
-    IGNORE_YAW,
-    Parameters,
-    Role,
-    SetpointKind,
-    SimulatedProfile,
-)
-from sim.vehicle.interface import ZERO, Quaternion, Vehicle, heading_rad
-from sim.vehicle.rigid_body import GRAVITY_MPS2
+from sim.autopilot.parameters import Parameters
+from sim.autopilot.pilot import Phase, Pilot
+from sim.autopilot.position_target import make_position_target
+from sim.autopilot.profile import SimulatedProfile
+from sim.vehicle.airframe import GRAVITY_MPS2
+from sim.vehicle.interface import Vehicle, compute_heading_rad
 from uavctl.records import Vec3
 
-# Local NED to latitude and longitude, flat around the origin.
-
-
-EARTH_M = 6378137.0
-LARGEST_E7 = 2**31 - 1
-
-
-@dataclass(frozen=True)
-class GeodeticOrigin:
-    """Geographic position of local NED's zero."""
-
-    latitude_deg: float
-    longitude_deg: float
-    altitude_m: float
-
-    def degrees_e7(self, place_m: Vec3) -> tuple[int, int]:
-        """Return latitude and longitude of a place, in MAVLink's unit [1e-7 degrees]."""
-        lat = self.latitude_deg + math.degrees(place_m[0] / EARTH_M)
-        lon = self.longitude_deg + math.degrees(place_m[1] / (EARTH_M * self._shrink))
-        return _clipped(1e7 * lat), _clipped(1e7 * lon)
-
-    def altitude_mm(self, place_m: Vec3) -> int:
-        """Return the height of a place above the sea [mm]."""
-        return _clipped(1000.0 * (self.altitude_m - place_m[2]))
-
-    def local_m(self, latitude_deg: float, longitude_deg: float, altitude_m: float) -> Vec3:
-        """Return a place on the globe in local NED [m]."""
-        return (
-            math.radians(latitude_deg - self.latitude_deg) * EARTH_M,
-            math.radians(longitude_deg - self.longitude_deg) * EARTH_M * self._shrink,
-            self.altitude_m - altitude_m,
-        )
-
-    @property
-    def _shrink(self) -> float:
-        return max(math.cos(math.radians(self.latitude_deg)), 1e-3)
-
-
-def _clipped(value: float) -> int:
-    return min(max(round(value), -LARGEST_E7 - 1), LARGEST_E7)
-
-
-# POSITION_TARGET_LOCAL_NED: what is flown, as each autopilot tells it (masks and unset numbers as recorded).
-
-
-IGNORE_YAW_RATE = 0x800
-UNSET: Vec3 = (math.nan, math.nan, math.nan)
-DOWN: Vec3 = (0.0, 0.0, 100.0)  # acceleration with which PX4 presses itself to the floor
-Told = tuple[int, Vec3, Vec3, Vec3]  # type mask, position, velocity, acceleration
-
-
-def target(kind: SimulatedProfile, pilot: Pilot, estimator: Estimator, attitude: Quaternion, boot_ms: int) -> Any:
-    """Return POSITION_TARGET_LOCAL_NED (pymavlink's classes have no types); None where there is nothing to tell.
-
-    Args:
-        estimator: where the vehicle believes to be.
-    """
-    px4 = kind.name == "px4"
-    told = _px4(pilot, estimator) if px4 else _ardupilot(pilot)
-    if told is None:
-        return None
-    mask, *vectors = told
-    nine = [number for vector in vectors for number in vector]
-    obeyed = pilot.helm.obeyed
-    wanted = None if obeyed is None else obeyed.yaw_rad
-    yaw = heading_rad(attitude) if wanted is None and px4 else wanted or 0.0
-    return mavlink.MAVLink_position_target_local_ned_message(boot_ms, 1, mask, *nine, yaw, 0.0)
-
-
-def _px4(pilot: Pilot, estimator: Estimator) -> Told:
-    """Return PX4's target, sent always: in modes of its own it plans position, velocity and acceleration."""
-    obeyed = pilot.helm.obeyed
-    if obeyed is not None and obeyed.ask is SetpointKind.ACCELERATION:
-        return IGNORE_POSITION | IGNORE_VELOCITY, UNSET, UNSET, obeyed.vector
-    if obeyed is not None and obeyed.ask is SetpointKind.VELOCITY:
-        return IGNORE_POSITION, UNSET, obeyed.vector, ZERO
-    if obeyed is not None:
-        return 0, obeyed.vector, obeyed.velocity_mps or ZERO, obeyed.accel_mps2
-    if pilot.phase is Phase.GROUND:
-        return IGNORE_POSITION | IGNORE_VELOCITY, UNSET, UNSET, DOWN
-    return 0, estimator.position_m, estimator.velocity_mps, ZERO
-
-
-def _ardupilot(pilot: Pilot) -> Told | None:
-    """Return ArduPilot's target, sent in GUIDED only: rest and braking by a velocity, a climb to a position."""
-    if pilot.mode.role is not Role.EXTERNAL:
-        return None
-    no_yaw = IGNORE_YAW | IGNORE_YAW_RATE
-    obeyed = pilot.helm.obeyed
-    if obeyed is not None and obeyed.ask is SetpointKind.ACCELERATION:
-        return IGNORE_POSITION | IGNORE_VELOCITY | no_yaw, ZERO, ZERO, obeyed.vector
-    if obeyed is not None and obeyed.ask is SetpointKind.POSITION and obeyed.velocity_mps is not None:
-        return no_yaw, obeyed.vector, obeyed.velocity_mps, obeyed.accel_mps2
-    if obeyed is not None and obeyed.ask is SetpointKind.POSITION:
-        return IGNORE_VELOCITY | IGNORE_ACCEL | no_yaw, obeyed.vector, ZERO, ZERO
-    if obeyed is None and pilot.armed and pilot.phase is not Phase.AIR:
-        return IGNORE_VELOCITY | IGNORE_ACCEL | no_yaw, ZERO, ZERO, ZERO
-    return IGNORE_POSITION | no_yaw, ZERO, ZERO if obeyed is None else obeyed.vector, ZERO
-
-
-# What the simulated vehicle tells: its messages, their contents, and how often each goes out.
-
-
-SECOND_NS = 1_000_000_000
 SHORTEST_INTERVAL_NS = 1_000_000
 ARMED_FLAG = 128  # MAV_MODE_FLAG
 CAPACITY_MAH = 240.0
@@ -145,11 +36,11 @@ RADIO, FENCE, AHRS, BATTERY, PREARM = 1 << 16, 1 << 20, 1 << 21, 1 << 25, 1 << 2
 # MAV_PROTOCOL_CAPABILITY
 FLOAT, COMMAND_INT, BYTEWISE, FILES, LOCAL_TARGETS, MAVLINK2, CAST = 2, 8, 16, 32, 128, 8192, 131072
 
-# Roll, pitch, throttle and yaw of a stick that nobody moves [µs]; telemetry has room for 18 channels.
-STICK_US = (1500, 1500, 1500, 1500)
+# Roll, pitch, throttle and yaw of a stick at rest [µs]; telemetry has room for 18 channels.
+STICK_CENTRE_US = (1500, 1500, 1500, 1500)
 NO_CHANNEL, FULL_SIGNAL = 65535, 254
 
-# Usual intervals [ms]; 0: only when asked for. A message that is not here is not sent at all.
+# Usual intervals [ms]; 0: only on request. A message that is not here is never sent.
 COMMON_MS = {
     0: 1000,  # HEARTBEAT
     1: 1000,  # SYS_STATUS
@@ -171,7 +62,7 @@ USUAL_MS = {
     "px4": {**COMMON_MS, 31: 250, 105: 0, 111: 100, 141: 1000, 230: 1000, 242: 2000},
     "ardupilot": {**COMMON_MS, 27: 0, 116: 0, 193: 1000},
 }
-# What a PX4 was recorded to send unasked on an onboard link; an ArduPilot sends there what it is asked for.
+# Streams of a recorded PX4 on an onboard link; an ArduPilot sends there only requested streams.
 ONBOARD_MS = {
     "px4": {
         1: 200,
@@ -197,17 +88,17 @@ class BoardClock:
     """Clock of the autopilot's board: time since its boot, faster or slower than ours.
 
     Attributes:
-        start_ns: our time when the simulation began.
-        uptime_ns: what the clock showed then.
-        drift_ppm: what it gains [millionths].
+        start_ns: start of the simulation.
+        uptime_ns: reading of this clock at the start.
+        drift_ppm: gain [millionths].
     """
 
     start_ns: int
     uptime_ns: int
     drift_ppm: float
 
-    def shown_ns(self, at_ns: int) -> int:
-        """Return what the clock shows at a time of ours [ns]."""
+    def read_ns(self, at_ns: int) -> int:
+        """Return the reading of this clock at a simulated time [ns]."""
         since_ns = at_ns - self.start_ns
         return self.uptime_ns + since_ns + round(since_ns * self.drift_ppm * 1e-6)
 
@@ -216,8 +107,8 @@ class BoardClock:
 class TelemetrySources:
     """Objects whose state telemetry reports."""
 
-    kind: SimulatedProfile
-    craft: Vehicle
+    profile: SimulatedProfile
+    vehicle: Vehicle
     pilot: Pilot
     estimator: Estimator
     inertial: InertialSensors
@@ -231,293 +122,336 @@ class Telemetry:
     """Telemetry streams of one vehicle.
 
     Attributes:
-        streams: message id to what makes it; None from it is nothing to tell yet.
+        streams: message id to its maker, which returns None without data.
         next_ns: time of the next message, None if none is due ever.
     """
 
-    def __init__(self, vehicle: TelemetrySources, start_ns: int) -> None:
-        self._v = vehicle
-        name = vehicle.kind.name
-        usual_ms = USUAL_MS[name] | (ONBOARD_MS[name] if vehicle.streams == "onboard" else {})
-        self._usual_ns = {kind: ms * 1_000_000 for kind, ms in usual_ms.items()}
-        self._period_ns = dict(self._usual_ns)
-        self._due_ns = dict.fromkeys(self._usual_ns, start_ns)
-        self.next_ns = self._soonest_ns()
+    def __init__(self, sources: TelemetrySources, start_ns: int) -> None:
+        self._sources = sources
+        name = sources.profile.name
+        default_ms = USUAL_MS[name] | (ONBOARD_MS[name] if sources.streams == "onboard" else {})
+        self._default_period_ns = {message_id: ms * 1_000_000 for message_id, ms in default_ms.items()}
+        self._period_ns = dict(self._default_period_ns)
+        self._due_ns = dict.fromkeys(self._default_period_ns, start_ns)
+        self.next_ns = self._find_next_ns()
         makers: dict[int, Callable[[int], Message | None]] = {
-            0: self._heartbeat,
-            1: self._status,
-            24: self._gps,
-            27: self._raw_imu,
-            30: self._attitude,
-            31: self._quaternion,
-            32: self._local,
-            33: self._global,
-            49: self._origin,
-            65: self._radio,
-            74: self._hud,
-            85: self._target,
-            105: self._highres_imu,
-            111: self._timesync,
-            116: self._second_imu,
-            141: self._altitude,
-            147: self._battery,
-            148: self._version,
-            193: self._ekf,
-            230: self._estimator,
-            242: self._home,
-            245: self._landed,
-            331: self._odometry,
+            0: self._make_heartbeat,
+            1: self._make_status,
+            24: self._make_gps,
+            27: self._make_raw_imu,
+            30: self._make_attitude,
+            31: self._make_quaternion,
+            32: self._make_local_position,
+            33: self._make_global_position,
+            49: self._make_origin,
+            65: self._make_rc_channels,
+            74: self._make_hud,
+            85: self._make_target,
+            105: self._make_highres_imu,
+            111: self._make_timesync,
+            116: self._make_second_imu,
+            141: self._make_altitude,
+            147: self._make_battery,
+            148: self._make_version,
+            193: self._make_ekf,
+            230: self._make_estimator,
+            242: self._make_home,
+            245: self._make_landed,
+            331: self._make_odometry,
         }
-        self.streams = {kind: makers[kind] for kind in self._usual_ns}
+        self.streams = {message_id: makers[message_id] for message_id in self._default_period_ns}
 
-    def _soonest_ns(self) -> int | None:
-        return min((due for kind, due in self._due_ns.items() if self._period_ns[kind] > 0), default=None)
+    def _find_next_ns(self) -> int | None:
+        return min((due for message_id, due in self._due_ns.items() if self._period_ns[message_id] > 0), default=None)
 
-    def due(self, at_ns: int) -> list[Message]:
+    def make_due_messages(self, at_ns: int) -> list[Message]:
         """Return the messages that are due."""
         if self.next_ns is None or self.next_ns > at_ns:
             return []
-        made = []
-        for kind, make in self.streams.items():
-            if self._period_ns[kind] > 0 and self._due_ns[kind] <= at_ns:
-                self._due_ns[kind] += self._period_ns[kind]
-                made.append(make(at_ns))
-        self.next_ns = self._soonest_ns()
-        return [msg for msg in made if msg is not None]
+        messages = []
+        for message_id, make in self.streams.items():
+            if self._period_ns[message_id] > 0 and self._due_ns[message_id] <= at_ns:
+                self._due_ns[message_id] += self._period_ns[message_id]
+                messages.append(make(at_ns))
+        self.next_ns = self._find_next_ns()
+        return [msg for msg in messages if msg is not None]
 
-    def make(self, kind: int, at_ns: int) -> Message | None:
-        """Make one message now; None if there is nothing to tell, or no such message."""
-        return self.streams[kind](at_ns) if kind in self.streams else None
+    def make_message(self, message_id: int, at_ns: int) -> Message | None:
+        """Make one message now; None without data, or without such a message."""
+        return self.streams[message_id](at_ns) if message_id in self.streams else None
 
-    def interval_us(self, kind: int) -> int:
+    def get_interval_us(self, message_id: int) -> int:
         """Return the interval of a message as MESSAGE_INTERVAL has it [µs]: -1 not sent, 0 not known."""
-        if kind not in self.streams:
+        if message_id not in self.streams:
             return 0
-        return self._period_ns[kind] // 1000 or -1
+        return self._period_ns[message_id] // 1000 or -1
 
-    def set_interval(self, kind: float, interval_us: float, at_ns: int) -> bool:
+    def set_interval(self, message_id: float, interval_us: float, at_ns: int) -> bool:
         """Set an interval [µs]: 0 is the default one, -1 none; return False if that is not possible."""
-        if kind not in self.streams or not (interval_us == -1.0 or 0.0 <= interval_us <= 1e9):
+        if message_id not in self.streams or not (interval_us == -1.0 or 0.0 <= interval_us <= 1e9):
             return False
-        number = int(kind)
+        message_key = int(message_id)
         if interval_us > 0.0:
-            self._period_ns[number] = max(int(interval_us) * 1000, SHORTEST_INTERVAL_NS)
+            self._period_ns[message_key] = max(int(interval_us) * 1000, SHORTEST_INTERVAL_NS)
         else:
-            self._period_ns[number] = self._usual_ns[number] if interval_us == 0.0 else 0
-        self._due_ns[number] = at_ns + 1
-        self.next_ns = self._soonest_ns()
+            self._period_ns[message_key] = self._default_period_ns[message_key] if interval_us == 0.0 else 0
+        self._due_ns[message_key] = at_ns + 1
+        self.next_ns = self._find_next_ns()
         return True
 
-    # What it tells
+    def _read_boot_ms(self, at_ns: int) -> int:
+        return self._sources.clock.read_ns(at_ns) // 1_000_000 % 2**32
 
-    def _boot_ms(self, at_ns: int) -> int:
-        return self._v.clock.shown_ns(at_ns) // 1_000_000 % 2**32
+    def _read_boot_us(self, at_ns: int) -> int:
+        return self._sources.clock.read_ns(at_ns) // 1000
 
-    def _boot_us(self, at_ns: int) -> int:
-        return self._v.clock.shown_ns(at_ns) // 1000
-
-    def _heartbeat(self, at_ns: int) -> Message:
-        pilot = self._v.pilot
+    def _make_heartbeat(self, at_ns: int) -> Message:
+        pilot = self._sources.pilot
         status = mavlink.MAV_STATE_STANDBY
-        if not self._stands or (pilot.armed and self._v.kind.name == "px4"):
-            status = mavlink.MAV_STATE_CRITICAL if pilot.failsafe else mavlink.MAV_STATE_ACTIVE
-        elif self._v.kind.name == "px4" and not self._may_arm(at_ns):
+        if not self._is_on_floor or (pilot.is_armed and self._sources.profile.name == "px4"):
+            status = mavlink.MAV_STATE_CRITICAL if pilot.is_failsafe else mavlink.MAV_STATE_ACTIVE
+        elif self._sources.profile.name == "px4" and not self._can_arm(at_ns):
             status = mavlink.MAV_STATE_UNINIT  # as recorded: it stands by only while it might be armed
-        base = pilot.mode.base | (ARMED_FLAG if pilot.armed else 0)
-        kind = mavlink.MAV_TYPE_QUADROTOR, self._v.kind.autopilot
-        return mavlink.MAVLink_heartbeat_message(*kind, base, pilot.mode.custom, status, 3)
+        base = pilot.mode.base | (ARMED_FLAG if pilot.is_armed else 0)
+        vehicle_type = mavlink.MAV_TYPE_QUADROTOR, self._sources.profile.autopilot
+        return mavlink.MAVLink_heartbeat_message(*vehicle_type, base, pilot.mode.custom, status, 3)
 
-    def _may_arm(self, at_ns: int) -> bool:
-        v = self._v
-        why = preflight(v.kind, v.parameters, v.estimator, v.craft.battery, v.clock.shown_ns(at_ns))
-        return not (why or v.pilot.lacks_stream(at_ns))
+    def _can_arm(self, at_ns: int) -> bool:
+        sources = self._sources
+        refusals = check_preflight(
+            sources.profile,
+            sources.parameters,
+            sources.estimator,
+            sources.vehicle.battery,
+            sources.clock.read_ns(at_ns),
+        )
+        return not (refusals or sources.pilot.lacks_stream(at_ns))
 
-    def _status(self, at_ns: int) -> Message:
-        v, battery = self._v, self._v.craft.battery
-        estimator = v.estimator
+    def _make_status(self, at_ns: int) -> Message:
+        sources, battery = self._sources, self._sources.vehicle.battery
+        estimator = sources.estimator
         present = GYRO | ACCEL | MAG | BARO | CONTROL | AHRS | BATTERY | PREARM
         present |= (GPS if estimator.uses_gps else 0) | (VISION if estimator.uses_external else 0)
-        present |= RADIO if v.pilot.radio else 0
+        present |= RADIO if sources.pilot.has_radio else 0
         healthy = present & ~(AHRS | VISION | PREARM)
-        if estimator.position_ok:
+        if estimator.is_position_valid:
             healthy |= present & (AHRS | VISION)
-        if self._may_arm(at_ns):
+        if self._can_arm(at_ns):
             healthy |= PREARM
-        # As recorded: an ArduPilot has a fence that is healthy unless it is enabled and breached, a PX4 tells of none.
-        fence = FENCE if v.kind.name == "ardupilot" else 0
-        enabled = fence if fence and v.parameters["FENCE_ENABLE"] else 0
+        # As recorded: an ArduPilot has a fence that is healthy unless it is enabled and breached, a PX4 reports none.
+        fence = FENCE if sources.profile.name == "ardupilot" else 0
+        enabled = fence if fence and sources.parameters["FENCE_ENABLE"] else 0
         power = round(1000.0 * battery.voltage_v), round(100.0 * battery.current_a), round(100.0 * battery.remaining)
-        told = present | fence, present | enabled, healthy | (0 if v.pilot.breaches else fence)
-        return mavlink.MAVLink_sys_status_message(*told, 250, *power, 0, 0, 0, 0, 0, 0)
+        sensors = present | fence, present | enabled, healthy | (0 if sources.pilot.is_fence_breached else fence)
+        return mavlink.MAVLink_sys_status_message(*sensors, 250, *power, 0, 0, 0, 0, 0, 0)
 
-    def _gps(self, at_ns: int) -> Message:
-        v = self._v
-        if not v.estimator.uses_gps:
-            return mavlink.MAVLink_gps_raw_int_message(self._boot_us(at_ns), 0, 0, 0, 0, 65535, 65535, 65535, 65535, 0)
-        north, east, _ = v.craft.velocity_mps
+    def _make_gps(self, at_ns: int) -> Message:
+        sources = self._sources
+        if not sources.estimator.uses_gps:
+            return mavlink.MAVLink_gps_raw_int_message(
+                self._read_boot_us(at_ns), 0, 0, 0, 0, 65535, 65535, 65535, 65535, 0
+            )
+        north, east, _ = sources.vehicle.velocity_mps
         course = round(math.degrees(math.atan2(east, north)) * 100.0) % 36000
-        where = v.origin.degrees_e7(v.craft.position_m)
+        position = sources.origin.compute_degrees_e7(sources.vehicle.position_m)
         speed = min(round(100.0 * math.hypot(north, east)), 65534)
         return mavlink.MAVLink_gps_raw_int_message(
-            self._boot_us(at_ns), 3, *where, v.origin.altitude_mm(v.craft.position_m), 121, 200, speed, course, 10
+            self._read_boot_us(at_ns),
+            3,
+            *position,
+            sources.origin.compute_altitude_mm(sources.vehicle.position_m),
+            121,
+            200,
+            speed,
+            course,
+            10,
         )
 
-    def _euler(self) -> Vec3:
-        w, x, y, z = attitude = self._v.inertial.attitude()
+    def _compute_euler(self) -> Vec3:
+        w, x, y, z = attitude = self._sources.inertial.estimate_attitude()
         roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
         pitch = math.asin(min(max(2.0 * (w * y - z * x), -1.0), 1.0))
-        return roll, pitch, heading_rad(attitude)
+        return roll, pitch, compute_heading_rad(attitude)
 
-    def _attitude(self, at_ns: int) -> Message:
-        return mavlink.MAVLink_attitude_message(self._boot_ms(at_ns), *self._euler(), *self._v.inertial.rates())
+    def _make_attitude(self, at_ns: int) -> Message:
+        return mavlink.MAVLink_attitude_message(
+            self._read_boot_ms(at_ns), *self._compute_euler(), *self._sources.inertial.measure_rates()
+        )
 
-    def _quaternion(self, at_ns: int) -> Message:
-        inertial = self._v.inertial
-        turn = inertial.attitude()
-        return mavlink.MAVLink_attitude_quaternion_message(self._boot_ms(at_ns), *turn, *inertial.rates())
+    def _make_quaternion(self, at_ns: int) -> Message:
+        inertial = self._sources.inertial
+        attitude = inertial.estimate_attitude()
+        return mavlink.MAVLink_attitude_quaternion_message(
+            self._read_boot_ms(at_ns), *attitude, *inertial.measure_rates()
+        )
 
-    def _highres_imu(self, _at_ns: int) -> Message:
+    def _make_highres_imu(self, _at_ns: int) -> Message:
         """Return PX4's HIGHRES_IMU in SI units, with the fields of accelerometer and gyroscope only."""
-        measured_ns, force, rates = self._v.inertial.measure(0)
-        nothing = [0.0] * 7  # magnetometer, barometer and their temperature
-        boot_us = self._boot_us(measured_ns)
-        return mavlink.MAVLink_highres_imu_message(boot_us, *force, *rates, *nothing, FORCE_AND_RATES)
+        measured_ns, force, rates = self._sources.inertial.measure(0)
+        unset = [0.0] * 7  # magnetometer, barometer and their temperature
+        boot_us = self._read_boot_us(measured_ns)
+        return mavlink.MAVLink_highres_imu_message(boot_us, *force, *rates, *unset, FORCE_AND_RATES)
 
-    def _raw_imu(self, _at_ns: int) -> Message:
+    def _make_raw_imu(self, _at_ns: int) -> Message:
         """Return ArduPilot's RAW_IMU, scaled like SCALED_IMU despite its name."""
-        measured_ns, force, rates = self._v.inertial.measure(0)
-        return mavlink.MAVLink_raw_imu_message(self._boot_us(measured_ns), *in_thousandths(force, rates), 0, 0, 0)
+        measured_ns, force, rates = self._sources.inertial.measure(0)
+        return mavlink.MAVLink_raw_imu_message(
+            self._read_boot_us(measured_ns), *convert_to_milli(force, rates), 0, 0, 0
+        )
 
-    def _second_imu(self, _at_ns: int) -> Message:
-        measured_ns, force, rates = self._v.inertial.measure(1)
-        return mavlink.MAVLink_scaled_imu2_message(self._boot_ms(measured_ns), *in_thousandths(force, rates), 0, 0, 0)
+    def _make_second_imu(self, _at_ns: int) -> Message:
+        measured_ns, force, rates = self._sources.inertial.measure(1)
+        return mavlink.MAVLink_scaled_imu2_message(
+            self._read_boot_ms(measured_ns), *convert_to_milli(force, rates), 0, 0, 0
+        )
 
-    def _local(self, at_ns: int) -> Message | None:
-        estimator = self._v.estimator
-        if not estimator.begun:
+    def _make_local_position(self, at_ns: int) -> Message | None:
+        estimator = self._sources.estimator
+        if not estimator.has_estimate:
             return None
-        boot_ms = self._boot_ms(at_ns)
+        boot_ms = self._read_boot_ms(at_ns)
         return mavlink.MAVLink_local_position_ned_message(boot_ms, *estimator.position_m, *estimator.velocity_mps)
 
-    def _odometry(self, at_ns: int) -> Message | None:
+    def _make_odometry(self, at_ns: int) -> Message | None:
         """Return ODOMETRY of the vehicle's own estimate; as recorded, all of it in local NED."""
-        estimator, inertial = self._v.estimator, self._v.inertial
-        if not estimator.begun:
+        estimator, inertial = self._sources.estimator, self._sources.inertial
+        if not estimator.has_estimate:
             return None
         ned, unknown = mavlink.MAV_FRAME_LOCAL_NED, [math.nan] * 21
-        motion = *estimator.position_m, list(inertial.attitude()), *estimator.velocity_mps, *inertial.rates()
-        of_whom = mavlink.MAV_ESTIMATOR_TYPE_AUTOPILOT
-        return mavlink.MAVLink_odometry_message(self._boot_us(at_ns), ned, ned, *motion, unknown, unknown, 0, of_whom)
+        pose = (
+            *estimator.position_m,
+            list(inertial.estimate_attitude()),
+            *estimator.velocity_mps,
+            *inertial.measure_rates(),
+        )
+        estimator_type = mavlink.MAV_ESTIMATOR_TYPE_AUTOPILOT
+        return mavlink.MAVLink_odometry_message(
+            self._read_boot_us(at_ns), ned, ned, *pose, unknown, unknown, 0, estimator_type
+        )
 
-    def _heading_cdeg(self) -> int:
-        return round(math.degrees(heading_rad(self._v.craft.attitude)) * 100.0) % 36000
+    def _compute_heading_cdeg(self) -> int:
+        return round(math.degrees(compute_heading_rad(self._sources.vehicle.attitude)) * 100.0) % 36000
 
-    def _height_m(self) -> float:
-        return self._v.pilot.home_m[2] - self._v.estimator.position_m[2]
+    def _compute_height_m(self) -> float:
+        return self._sources.pilot.home_m[2] - self._sources.estimator.position_m[2]
 
-    def _global(self, at_ns: int) -> Message | None:
-        v = self._v
-        if not v.estimator.geographic:
+    def _make_global_position(self, at_ns: int) -> Message | None:
+        sources = self._sources
+        if not sources.estimator.has_global_position:
             return None
-        where = v.estimator.position_m
-        speed = (min(max(round(100.0 * each), -32768), 32767) for each in v.estimator.velocity_mps)
-        place = *v.origin.degrees_e7(where), v.origin.altitude_mm(where), clipped_mm(self._height_m())
-        return mavlink.MAVLink_global_position_int_message(self._boot_ms(at_ns), *place, *speed, self._heading_cdeg())
+        position = sources.estimator.position_m
+        speed = (min(max(round(100.0 * value), -32768), 32767) for value in sources.estimator.velocity_mps)
+        geodetic = (
+            *sources.origin.compute_degrees_e7(position),
+            sources.origin.compute_altitude_mm(position),
+            clip_mm(self._compute_height_m()),
+        )
+        return mavlink.MAVLink_global_position_int_message(
+            self._read_boot_ms(at_ns), *geodetic, *speed, self._compute_heading_cdeg()
+        )
 
-    def _origin(self, at_ns: int) -> Message | None:
-        v = self._v
-        if not v.estimator.geographic:
+    def _make_origin(self, at_ns: int) -> Message | None:
+        sources = self._sources
+        if not sources.estimator.has_global_position:
             return None
         zero = (0.0, 0.0, 0.0)
-        place = *v.origin.degrees_e7(zero), v.origin.altitude_mm(zero)
-        return mavlink.MAVLink_gps_global_origin_message(*place, self._boot_us(at_ns))
+        geodetic = *sources.origin.compute_degrees_e7(zero), sources.origin.compute_altitude_mm(zero)
+        return mavlink.MAVLink_gps_global_origin_message(*geodetic, self._read_boot_us(at_ns))
 
-    def _home(self, at_ns: int) -> Message | None:
-        v, home = self._v, self._v.pilot.home_m
-        if not v.estimator.geographic:
+    def _make_home(self, at_ns: int) -> Message | None:
+        sources, home = self._sources, self._sources.pilot.home_m
+        if not sources.estimator.has_global_position:
             return None
-        place = *v.origin.degrees_e7(home), v.origin.altitude_mm(home)
-        level = [1.0, 0.0, 0.0, 0.0] if v.kind.name == "px4" else [math.nan] * 4  # as recorded
-        return mavlink.MAVLink_home_position_message(*place, *home, level, 0.0, 0.0, 0.0, self._boot_us(at_ns))
+        geodetic = *sources.origin.compute_degrees_e7(home), sources.origin.compute_altitude_mm(home)
+        attitude = [1.0, 0.0, 0.0, 0.0] if sources.profile.name == "px4" else [math.nan] * 4  # as recorded
+        return mavlink.MAVLink_home_position_message(
+            *geodetic, *home, attitude, 0.0, 0.0, 0.0, self._read_boot_us(at_ns)
+        )
 
-    def _radio(self, at_ns: int) -> Message | None:
+    def _make_rc_channels(self, at_ns: int) -> Message | None:
         """Return RC_CHANNELS with the stick at rest, and the switch of modes; nothing without a remote control."""
-        if not self._v.pilot.radio:
+        if not self._sources.pilot.has_radio:
             return None
-        used = *STICK_US, self._v.pilot.switch_us
-        channels = *used, *([NO_CHANNEL] * (18 - len(used)))
-        return mavlink.MAVLink_rc_channels_message(self._boot_ms(at_ns), len(used), *channels, FULL_SIGNAL)
+        stick_us = *STICK_CENTRE_US, self._sources.pilot.switch_us
+        channels = *stick_us, *([NO_CHANNEL] * (18 - len(stick_us)))
+        return mavlink.MAVLink_rc_channels_message(self._read_boot_ms(at_ns), len(stick_us), *channels, FULL_SIGNAL)
 
-    def _hud(self, _at_ns: int) -> Message:
-        v = self._v
-        north, east, down = v.estimator.velocity_mps
+    def _make_hud(self, _at_ns: int) -> Message:
+        sources = self._sources
+        north, east, down = sources.estimator.velocity_mps
         speed = math.hypot(north, east)
-        height = v.origin.altitude_m - v.estimator.position_m[2]
-        throttle = 50 if v.pilot.phase is not Phase.GROUND else 0
-        return mavlink.MAVLink_vfr_hud_message(speed, speed, self._heading_cdeg() // 100, throttle, height, -down)
+        height = sources.origin.altitude_m - sources.estimator.position_m[2]
+        throttle = 50 if sources.pilot.phase is not Phase.GROUND else 0
+        return mavlink.MAVLink_vfr_hud_message(
+            speed, speed, self._compute_heading_cdeg() // 100, throttle, height, -down
+        )
 
-    def _altitude(self, at_ns: int) -> Message:
-        v = self._v
-        local = -v.estimator.position_m[2]
-        amsl = v.origin.altitude_m + local
-        heights = amsl, amsl, local, self._height_m(), math.nan, math.nan
-        return mavlink.MAVLink_altitude_message(self._boot_us(at_ns), *heights)
+    def _make_altitude(self, at_ns: int) -> Message:
+        sources = self._sources
+        local = -sources.estimator.position_m[2]
+        amsl = sources.origin.altitude_m + local
+        heights = amsl, amsl, local, self._compute_height_m(), math.nan, math.nan
+        return mavlink.MAVLink_altitude_message(self._read_boot_us(at_ns), *heights)
 
-    def _target(self, at_ns: int) -> Message | None:
-        v = self._v
-        return target(v.kind, v.pilot, v.estimator, v.craft.attitude, self._boot_ms(at_ns))
+    def _make_target(self, at_ns: int) -> Message | None:
+        sources = self._sources
+        return make_position_target(
+            sources.profile, sources.pilot, sources.estimator, sources.vehicle.attitude, self._read_boot_ms(at_ns)
+        )
 
-    def _timesync(self, at_ns: int) -> Message:
+    def _make_timesync(self, at_ns: int) -> Message:
         """Return a TIMESYNC request of the autopilot's own."""
-        return mavlink.MAVLink_timesync_message(0, self._v.clock.shown_ns(at_ns))
+        return mavlink.MAVLink_timesync_message(0, self._sources.clock.read_ns(at_ns))
 
-    def _battery(self, _at_ns: int) -> Message:
-        battery = self._v.craft.battery
+    def _make_battery(self, _at_ns: int) -> Message:
+        battery = self._sources.vehicle.battery
         volts = [round(1000.0 * battery.voltage_v), *([65535] * 9)]
-        used = round((1.0 - battery.remaining) * CAPACITY_MAH)
+        used_mah = round((1.0 - battery.remaining) * CAPACITY_MAH)
         return mavlink.MAVLink_battery_status_message(
-            0, 0, 1, 32767, volts, round(100.0 * battery.current_a), used, -1, round(100.0 * battery.remaining)
+            0, 0, 1, 32767, volts, round(100.0 * battery.current_a), used_mah, -1, round(100.0 * battery.remaining)
         )
 
-    def _version(self, _at_ns: int) -> Message:
-        px4 = self._v.kind.name == "px4"
-        can = FLOAT | COMMAND_INT | FILES | LOCAL_TARGETS | MAVLINK2 | (BYTEWISE if px4 else CAST)
-        version = self._v.kind.version
+    def _make_version(self, _at_ns: int) -> Message:
+        is_px4 = self._sources.profile.name == "px4"
+        capabilities = FLOAT | COMMAND_INT | FILES | LOCAL_TARGETS | MAVLINK2 | (BYTEWISE if is_px4 else CAST)
+        version = self._sources.profile.version
         return mavlink.MAVLink_autopilot_version_message(
-            can, version, 0, 0, 0, [0] * 8, [0] * 8, [0] * 8, 0, 0, 0x5541564354, [0] * 18
+            capabilities, version, 0, 0, 0, [0] * 8, [0] * 8, [0] * 8, 0, 0, 0x5541564354, [0] * 18
         )
 
-    def _ekf(self, _at_ns: int) -> Message:
-        estimator = self._v.estimator
-        flags, variance = estimator.flags, 0.05 if estimator.position_ok else 1.0
+    def _make_ekf(self, _at_ns: int) -> Message:
+        estimator = self._sources.estimator
+        flags, variance = estimator.flags, 0.05 if estimator.is_position_valid else 1.0
         return mavlink.MAVLink_ekf_status_report_message(flags, variance, variance, 0.05, 0.05, 0.0)
 
-    def _estimator(self, at_ns: int) -> Message:
-        """Return PX4's ESTIMATOR_STATUS; of a vehicle at rest it says that it assumes a constant position."""
-        estimator = self._v.estimator
-        flags = estimator.flags | (CONSTANT if self._v.pilot.phase is Phase.GROUND else 0)
-        ratio, accuracy = (0.1, 0.05) if estimator.position_ok else (2.0, 10.0)
+    def _make_estimator(self, at_ns: int) -> Message:
+        """Return PX4's ESTIMATOR_STATUS; at rest its flags have a constant position."""
+        estimator = self._sources.estimator
+        flags = estimator.flags | (CONSTANT if self._sources.pilot.phase is Phase.GROUND else 0)
+        ratio, accuracy = (0.1, 0.05) if estimator.is_position_valid else (2.0, 10.0)
         return mavlink.MAVLink_estimator_status_message(
-            self._boot_us(at_ns), flags, ratio, ratio, 0.1, 0.1, 0.0, 0.0, accuracy, 0.1
+            self._read_boot_us(at_ns), flags, ratio, ratio, 0.1, 0.1, 0.0, 0.0, accuracy, 0.1
         )
 
     @property
-    def _stands(self) -> bool:
+    def _is_on_floor(self) -> bool:
         """Whether the vehicle is on the floor, its rotors perhaps spinning up."""
-        return self._v.pilot.phase is Phase.GROUND or (self._v.pilot.phase is Phase.CLIMB and self._v.craft.grounded)
+        return self._sources.pilot.phase is Phase.GROUND or (
+            self._sources.pilot.phase is Phase.CLIMB and self._sources.vehicle.grounded
+        )
 
-    def _landed(self, _at_ns: int) -> Message:
+    def _make_landed(self, _at_ns: int) -> Message:
         return mavlink.MAVLink_extended_sys_state_message(
-            self._v.kind.vtol_state, (Phase.GROUND if self._stands else self._v.pilot.phase).value
+            self._sources.profile.vtol_state, (Phase.GROUND if self._is_on_floor else self._sources.pilot.phase).value
         )
 
 
-def clipped_mm(metres: float) -> int:
+def clip_mm(metres: float) -> int:
     """Return a length in millimetres that fits 32 bits [mm]."""
     return min(max(round(1000.0 * metres), -(2**31)), 2**31 - 1)
 
 
-def in_thousandths(force_mps2: Vec3, rates_rps: Vec3) -> tuple[int, ...]:
+def convert_to_milli(force_mps2: Vec3, rates_rps: Vec3) -> tuple[int, ...]:
     """Convert specific force to mg and body rates to mrad/s, 16 bits, truncated towards zero as ArduPilot does."""
-    values = *(each / GRAVITY_MPS2 for each in force_mps2), *rates_rps
-    return tuple(int(min(max(1000.0 * each, -32768.0), 32767.0)) for each in values)
+    values = *(value / GRAVITY_MPS2 for value in force_mps2), *rates_rps
+    return tuple(int(min(max(1000.0 * value, -32768.0), 32767.0)) for value in values)

@@ -8,18 +8,24 @@ from enum import Enum, auto
 from typing import Protocol
 
 from sim.vehicle.linear import LinearVehicle
-from sim.vehicle.loops import BRAKE_MPS2, approach, brake, climb, descend
+from sim.vehicle.motion_laws import (
+    BRAKE_MPS2,
+    compute_approach_velocity,
+    compute_brake_accel,
+    compute_climb_accel,
+    compute_descent_accel,
+)
 from uavctl.records import Vec3
 
 Quaternion = tuple[float, float, float, float]  # w, x, y, z: turns body axes into NED
 
-STEER_NS = 20_000_000  # period of the linear plant's own braking, climbing and landing
+CONTROL_PERIOD_NS = 20_000_000  # period of the linear plant's own braking, climbing and landing
 ZERO: Vec3 = (0.0, 0.0, 0.0)
 LEVEL: Quaternion = (1.0, 0.0, 0.0, 0.0)
 
 
-class Supply(Protocol):
-    """Battery as telemetry sees it."""
+class Battery(Protocol):
+    """Battery as telemetry reports it."""
 
     @property
     def voltage_v(self) -> float:
@@ -88,7 +94,7 @@ class Vehicle(Protocol):
         ...
 
     @property
-    def battery(self) -> Supply:
+    def battery(self) -> Battery:
         """Its battery."""
         ...
 
@@ -96,7 +102,7 @@ class Vehicle(Protocol):
         """Hold this acceleration setpoint from now on [m/s²]."""
 
     def brake(self) -> None:
-        """Stop, and stay where that ends."""
+        """Stop and hold position."""
 
     def fly(self, velocity_mps: Vec3) -> None:
         """Fly this velocity [m/s]."""
@@ -108,22 +114,22 @@ class Vehicle(Protocol):
         """Hold a position [m] that moves with this velocity [m/s] and acceleration [m/s²]."""
 
     def take_off(self, height_m: float) -> None:
-        """Climb to this height above the floor [m], over the present place."""
+        """Climb to this height above the floor [m], over the present position."""
 
     def land(self) -> None:
         """Sink at the landing speed."""
 
-    def face(self, yaw_rad: float) -> None:
+    def set_heading(self, yaw_rad: float) -> None:
         """Turn the nose to this heading, clockwise from north [rad]."""
 
-    def rest(self) -> None:
+    def stand_on_floor(self) -> None:
         """Stand on the floor, rotors off, until `grounded` is cleared."""
 
-    def mislead(self, position_error_m: Vec3, velocity_error_mps: Vec3) -> None:
-        """Add an error to position and velocity as the vehicle's own loops see them, from now on."""
+    def set_estimate_error(self, position_error_m: Vec3, velocity_error_mps: Vec3) -> None:
+        """Set the error of position and velocity in the vehicle's loops."""
 
-    def mislead_attitude(self, error_rad: Vec3) -> None:
-        """Turn the attitude that the vehicle's own loops see by so much about body axes [rad], from now on."""
+    def set_attitude_error(self, error_rad: Vec3) -> None:
+        """Set the attitude error of the vehicle's loops about body axes [rad]."""
 
 
 @dataclass(frozen=True)
@@ -145,28 +151,28 @@ class _Goal(Enum):
     LAND = auto()
 
 
-class SteeredPlant:
-    """Linear plant with simple laws (`steering.py`) in place of loops; always level, its nose north.
+class ControlledPlant:
+    """Linear plant with simple laws (`motion_laws.py`) in place of loops; always level, its nose north.
 
     Its laws are evaluated at `next_ns`, every 20 ms, and when something new is asked.
     """
 
     attitude: Quaternion = LEVEL
     rates_rps: Vec3 = ZERO
-    battery: Supply = FullBattery()
+    battery: Battery = FullBattery()
 
     def __init__(self, plant: LinearVehicle) -> None:
         self._plant = plant
         self._goal = _Goal.NOTHING
-        self._wanted: Vec3 = ZERO
-        self._ahead: Vec3 = ZERO  # velocity of a position that moves
+        self._setpoint: Vec3 = ZERO
+        self._feedforward_mps: Vec3 = ZERO  # velocity of a position that moves
         self._errors: tuple[Vec3, Vec3] = (ZERO, ZERO)
-        self._steer_ns = plant.now_ns
+        self._control_ns = plant.now_ns
 
     @property
     def next_ns(self) -> int | None:
         """Time of the next evaluation of its laws [ns]; None under an acceleration setpoint, or on the floor."""
-        return None if self._goal is _Goal.NOTHING or self.grounded else self._steer_ns
+        return None if self._goal is _Goal.NOTHING or self.grounded else self._control_ns
 
     @property
     def now_ns(self) -> int:
@@ -219,85 +225,89 @@ class SteeredPlant:
 
     def brake(self) -> None:
         """Stop."""
-        self._ask(_Goal.VELOCITY, ZERO)
+        self._set_goal(_Goal.VELOCITY, ZERO)
 
     def fly(self, velocity_mps: Vec3) -> None:
         """Fly this velocity [m/s]."""
-        self._ask(_Goal.VELOCITY, velocity_mps)
+        self._set_goal(_Goal.VELOCITY, velocity_mps)
 
     def go_to(self, position_m: Vec3) -> None:
         """Fly to this position [m]."""
-        self._ask(_Goal.POSITION, position_m)
+        self._set_goal(_Goal.POSITION, position_m)
 
     def follow(self, position_m: Vec3, velocity_mps: Vec3, accel_mps2: Vec3) -> None:
         """Hold a position [m] that moves with this velocity [m/s]; the acceleration is not used."""
         del accel_mps2
-        self._ask(_Goal.POSITION, position_m, velocity_mps)
+        self._set_goal(_Goal.POSITION, position_m, velocity_mps)
 
     def take_off(self, height_m: float) -> None:
         """Climb to this height above the floor [m]."""
-        self._ask(_Goal.CLIMB, (0.0, 0.0, -height_m))
+        self._set_goal(_Goal.CLIMB, (0.0, 0.0, -height_m))
 
     def land(self) -> None:
         """Sink at the landing speed."""
-        self._ask(_Goal.LAND, ZERO)
+        self._set_goal(_Goal.LAND, ZERO)
 
-    def face(self, yaw_rad: float) -> None:
+    def set_heading(self, yaw_rad: float) -> None:
         """Do nothing: the nose stays north."""
 
-    def rest(self) -> None:
+    def stand_on_floor(self) -> None:
         """Stand on the floor until `grounded` is cleared."""
         self._goal = _Goal.NOTHING
-        self._plant.rest()
+        self._plant.stand_on_floor()
 
-    def mislead(self, position_error_m: Vec3, velocity_error_mps: Vec3) -> None:
-        """Add an error to position and velocity as its laws see them, from now on."""
+    def set_estimate_error(self, position_error_m: Vec3, velocity_error_mps: Vec3) -> None:
+        """Set the error of position and velocity in its laws."""
         self._errors = (position_error_m, velocity_error_mps)
 
-    def mislead_attitude(self, error_rad: Vec3) -> None:
-        """Do nothing: its laws know no attitude."""
+    def set_attitude_error(self, error_rad: Vec3) -> None:
+        """Do nothing: its laws use no attitude."""
 
-    def steer(self) -> None:
+    def update_control(self) -> None:
         """Evaluate the law of the present goal, and hold its acceleration."""
-        self._steer_ns = self.now_ns + STEER_NS
-        where, speed = self._plant.position_m, self._plant.velocity_mps
-        off_m, off_mps = self._errors
-        place = (where[0] + off_m[0], where[1] + off_m[1], where[2] + off_m[2])
-        motion = (speed[0] + off_mps[0], speed[1] + off_mps[1], speed[2] + off_mps[2])
-        self._plant.accelerate(self._law(place, motion))
+        self._control_ns = self.now_ns + CONTROL_PERIOD_NS
+        true_m, true_mps = self._plant.position_m, self._plant.velocity_mps
+        error_m, error_mps = self._errors
+        position_m = (true_m[0] + error_m[0], true_m[1] + error_m[1], true_m[2] + error_m[2])
+        velocity_mps = (true_mps[0] + error_mps[0], true_mps[1] + error_mps[1], true_mps[2] + error_mps[2])
+        self._plant.accelerate(self._compute_accel(position_m, velocity_mps))
 
-    def _ask(self, goal: _Goal, wanted: Vec3, ahead: Vec3 = ZERO) -> None:
-        self._goal, self._wanted, self._ahead = goal, wanted, ahead
+    def _set_goal(self, goal: _Goal, setpoint: Vec3, feedforward_mps: Vec3 = ZERO) -> None:
+        self._goal, self._setpoint, self._feedforward_mps = goal, setpoint, feedforward_mps
         if not self.grounded:
-            self.steer()
+            self.update_control()
 
-    def _law(self, place: Vec3, motion: Vec3) -> Vec3:
-        wanted = self._wanted
+    def _compute_accel(self, position_m: Vec3, velocity_mps: Vec3) -> Vec3:
+        target_mps = self._setpoint
         if self._goal is _Goal.POSITION:
-            near, ahead = approach(place, self._wanted), self._ahead
-            wanted = (near[0] + ahead[0], near[1] + ahead[1], near[2] + ahead[2])
+            approach_mps, feedforward_mps = compute_approach_velocity(position_m, self._setpoint), self._feedforward_mps
+            target_mps = (
+                approach_mps[0] + feedforward_mps[0],
+                approach_mps[1] + feedforward_mps[1],
+                approach_mps[2] + feedforward_mps[2],
+            )
         elif self._goal in (_Goal.CLIMB, _Goal.LAND):
-            wanted = ZERO
-        north, east, down = brake(tuple_minus(motion, wanted), BRAKE_MPS2)
+            target_mps = ZERO
+        north, east, down = compute_brake_accel(subtract(velocity_mps, target_mps), BRAKE_MPS2)
         if self._goal is _Goal.CLIMB and self.has_down:
-            down = climb(place[2], motion[2], self._wanted[2])
+            down = compute_climb_accel(position_m[2], velocity_mps[2], self._setpoint[2])
         elif self._goal is _Goal.LAND and self.has_down:
-            down = descend(motion[2])
+            down = compute_descent_accel(velocity_mps[2])
         return north, east, down
 
 
-def tuple_minus(a: Vec3, b: Vec3) -> Vec3:
+def subtract(a: Vec3, b: Vec3) -> Vec3:
     """Return the difference of two vectors."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
-def heading_rad(attitude: Quaternion) -> float:
+def compute_heading_rad(attitude: Quaternion) -> float:
     """Return the heading of an attitude, clockwise from north [rad]."""
     w, x, y, z = attitude
     return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
-def rotated(attitude: Quaternion, body: Vec3) -> Vec3:
+def rotate_to_ned(attitude: Quaternion, body: Vec3) -> Vec3:
     """Return a vector in body axes, turned into NED."""
     w, x, y, z = attitude
     bx, by, bz = body
@@ -308,7 +318,7 @@ def rotated(attitude: Quaternion, body: Vec3) -> Vec3:
     )
 
 
-def in_body(attitude: Quaternion, ned: Vec3) -> Vec3:
+def rotate_to_body(attitude: Quaternion, ned: Vec3) -> Vec3:
     """Return a vector in NED, turned into body axes."""
     w, x, y, z = attitude
-    return rotated((w, -x, -y, -z), ned)
+    return rotate_to_ned((w, -x, -y, -z), ned)

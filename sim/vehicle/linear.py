@@ -10,14 +10,12 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag, expm, logm
 
+from uavctl.arrays import Array
 from uavctl.config.types import Config, PlantConfig
 from uavctl.errors import DesignError
 from uavctl.records import Vec3
-
-Array = NDArray[np.float64]
 
 NED_AXES = ("north", "east", "down")
 # A setpoint beyond ten g is no acceleration that a multicopter can try; it is limited there, and
@@ -25,7 +23,7 @@ NED_AXES = ("north", "east", "down")
 MAX_ACCEL_MPS2 = 100.0
 # Closeness of expm(logm(M)) to M that proves the continuous-time model, relative to |M|.
 LOGARITHM_TOLERANCE = 1e-9
-# Sub-steps kept at hand; a lockstep run needs fewer than ten, a run on sockets any number.
+# Cached sub-steps; a lockstep run needs fewer than ten, a run on sockets any number.
 CACHED_TRANSITIONS = 256
 
 
@@ -55,7 +53,7 @@ def _split(m: Array, n_x: int, n_u: int) -> tuple[Array, Array, Array]:
     return m[:n_x, :n_x], m[:n_x, n_x : n_x + n_u], m[:n_x, n_x + n_u :]
 
 
-def linear_model(plant: PlantConfig) -> LinearModel:
+def make_linear_model(plant: PlantConfig) -> LinearModel:
     """Build the linear model of a configuration, of either kind.
 
     Raises:
@@ -68,16 +66,20 @@ def linear_model(plant: PlantConfig) -> LinearModel:
         position, velocity, gain = plant.position_index, plant.velocity_index, plant.accel_per_input
     else:
         n = len(plant.axes)
-        each = plant.states_per_axis
+        axis_states = plant.states_per_axis
         if plant.model == "drag-lag":
             flow, deviations = _drag_lag_flow(plant), np.array(plant.wind_std_mps2)
         else:
             flow = _velocity_reference_flow(plant)
             drift = np.array(plant.force_drift_mps2_rts) / np.sqrt(plant.dt_s)
             deviations = np.column_stack([plant.wind_std_mps2, plant.input_std_mps2, drift]).ravel()
-        a, b, e = _split(expm(flow * plant.dt_s), each * n, n)
+        a, b, e = _split(expm(flow * plant.dt_s), axis_states * n, n)
         w = np.diag(np.square(deviations))
-        position, velocity, gain = tuple(range(0, each * n, each)), tuple(range(1, each * n, each)), (1.0,) * n
+        position, velocity, gain = (
+            tuple(range(0, axis_states * n, axis_states)),
+            tuple(range(1, axis_states * n, axis_states)),
+            (1.0,) * n,
+        )
     eigenvalues, vectors = np.linalg.eigh(w)
     return LinearModel(
         a=a,
@@ -120,30 +122,30 @@ def _velocity_reference_flow(plant: PlantConfig) -> Array:
     for axis in range(n):
         kp, kv, ki = plant.position_1ps[axis], plant.velocity_1ps[axis], plant.integral_1ps2[axis]
         c, lag = plant.drag_1ps[axis], plant.lag_s[axis]
-        loops = np.zeros((10, 10))  # p, v, b, P, V, j, f, u, w, n
-        loops[0, 1] = 1.0
-        loops[1, [1, 2, 6, 8]] = [-c, 1.0, 1.0, 1.0]
-        loops[2, [0, 1, 2, 3, 4, 5, 7]] = np.array([-kv * kp, -kv, -1.0, kv * kp, kv, 1.0, 1.0]) / lag
-        loops[3, 4] = 1.0
-        loops[4, 7] = 1.0
-        loops[5, [0, 1, 3, 4]] = [-ki * kp, -ki, ki * kp, ki]
-        loops[6, 9] = 1.0
-        seen = np.zeros((9, 10))  # p, v, b + f, P - p, V - v, j + f, u, w, n
-        seen[[0, 1], [0, 1]] = 1.0
-        seen[2, [2, 6]] = 1.0
-        seen[3, [3, 0]] = [1.0, -1.0]
-        seen[4, [4, 1]] = [1.0, -1.0]
-        seen[5, [5, 6]] = 1.0
-        seen[[6, 7, 8], [7, 8, 9]] = 1.0
-        meant = np.zeros((10, 9))  # one of the loops' states that are seen so: that without a force
-        meant[[0, 1, 2, 5], [0, 1, 2, 5]] = 1.0
-        meant[3, [0, 3]] = meant[4, [1, 4]] = 1.0
-        meant[[7, 8, 9], [6, 7, 8]] = 1.0
-        one = seen @ loops @ meant
-        disturbed = 7 * n + 3 * axis
-        places = [*range(6 * axis, 6 * axis + 6), states + axis, disturbed, disturbed + 2]
-        flow[np.ix_(places, places)] = one
-        flow[:, disturbed + 1] = flow[:, states + axis]
+        loop_flow = np.zeros((10, 10))  # p, v, b, P, V, j, f, u, w, n
+        loop_flow[0, 1] = 1.0
+        loop_flow[1, [1, 2, 6, 8]] = [-c, 1.0, 1.0, 1.0]
+        loop_flow[2, [0, 1, 2, 3, 4, 5, 7]] = np.array([-kv * kp, -kv, -1.0, kv * kp, kv, 1.0, 1.0]) / lag
+        loop_flow[3, 4] = 1.0
+        loop_flow[4, 7] = 1.0
+        loop_flow[5, [0, 1, 3, 4]] = [-ki * kp, -ki, ki * kp, ki]
+        loop_flow[6, 9] = 1.0
+        to_states = np.zeros((9, 10))  # p, v, b + f, P - p, V - v, j + f, u, w, n
+        to_states[[0, 1], [0, 1]] = 1.0
+        to_states[2, [2, 6]] = 1.0
+        to_states[3, [3, 0]] = [1.0, -1.0]
+        to_states[4, [4, 1]] = [1.0, -1.0]
+        to_states[5, [5, 6]] = 1.0
+        to_states[[6, 7, 8], [7, 8, 9]] = 1.0
+        from_states = np.zeros((10, 9))  # a loop state of each x: the one without a force
+        from_states[[0, 1, 2, 5], [0, 1, 2, 5]] = 1.0
+        from_states[3, [0, 3]] = from_states[4, [1, 4]] = 1.0
+        from_states[[7, 8, 9], [6, 7, 8]] = 1.0
+        axis_flow = to_states @ loop_flow @ from_states
+        w_index = 7 * n + 3 * axis
+        indices = [*range(6 * axis, 6 * axis + 6), states + axis, w_index, w_index + 2]
+        flow[np.ix_(indices, indices)] = axis_flow
+        flow[:, w_index + 1] = flow[:, states + axis]
     return flow
 
 
@@ -166,8 +168,8 @@ def _generator(a: Array, b: Array, e: Array, dt_s: float) -> Array:
 class LinearVehicle:
     """State of the plant at one moment, moved forward by `advance`.
 
-    w is drawn anew at each boundary start_ns + k Δt and held for the step; u is held until it is
-    changed. Axes that the plant has not stay at their start position.
+    A new w is drawn at each boundary start_ns + k Δt and held for the step; u is held until it changes.
+    Axes that the plant lacks stay at their start position.
 
     Attributes:
         attitude: Attitude (w, x, y, z), body axes FRD to NED: always level, the nose north.
@@ -176,8 +178,8 @@ class LinearVehicle:
     attitude = (1.0, 0.0, 0.0, 0.0)
 
     def __init__(self, config: Config, seed: np.random.SeedSequence, start_ns: int) -> None:
-        self.model = linear_model(config.plant)
-        self._speeding = self.model.flow[list(self.model.velocity_index)]  # rows of v'
+        self.model = make_linear_model(config.plant)
+        self._accel_rows = self.model.flow[list(self.model.velocity_index)]  # rows of v'
         self._rng = np.random.default_rng(seed)
         self._transition = lru_cache(maxsize=CACHED_TRANSITIONS)(self.model.transition)
         self._offset_m = config.sim.start_position_m
@@ -187,7 +189,7 @@ class LinearVehicle:
             x[v] = config.sim.start_velocity_mps[axis]
         self._anchor_x: Array = x  # state at the last change of u or w
         self._anchor_ns = start_ns
-        self._x: Array | None = x  # state now, once asked for
+        self._x: Array | None = x  # present state, computed on request
         self._u: Array = np.zeros(self.model.b.shape[1])
         self._w: Array = self._draw()
         self._next_boundary_ns = start_ns + self.model.dt_ns
@@ -230,8 +232,8 @@ class LinearVehicle:
         """Acceleration in local NED [m/s²]; zero on the floor, and along axes that the plant does not have."""
         values = [0.0, 0.0, 0.0]
         if not self.grounded:
-            changes = self._speeding @ np.concatenate((self.state, self._u, self._w))
-            for axis, value in zip(self.model.axes, changes.tolist(), strict=True):
+            accel = self._accel_rows @ np.concatenate((self.state, self._u, self._w))
+            for axis, value in zip(self.model.axes, accel.tolist(), strict=True):
                 values[axis] = value
         return values[0], values[1], values[2]
 
@@ -248,7 +250,7 @@ class LinearVehicle:
             raise ValueError(f"time cannot go back from {self.now_ns} to {to_ns} ns")
         while self._next_boundary_ns <= to_ns:
             self._move(self._next_boundary_ns)
-            self._re_anchor()
+            self._set_anchor()
             self._w = self._draw()
             self._next_boundary_ns += self.model.dt_ns
         self._move(to_ns)
@@ -262,19 +264,19 @@ class LinearVehicle:
         else:
             self._x = None
 
-    def _re_anchor(self) -> None:
+    def _set_anchor(self) -> None:
         self._anchor_x = self.state
         self._anchor_ns = self.now_ns
 
     def accelerate(self, accel_mps2: Vec3) -> None:
         """Hold this acceleration setpoint [m/s²] from now on, in the axes that the plant has."""
-        wanted = [min(max(accel_mps2[axis], -MAX_ACCEL_MPS2), MAX_ACCEL_MPS2) for axis in self.model.axes]
-        u = np.array(wanted) / self.model.accel_per_input
+        limited = [min(max(accel_mps2[axis], -MAX_ACCEL_MPS2), MAX_ACCEL_MPS2) for axis in self.model.axes]
+        u = np.array(limited) / self.model.accel_per_input
         if not np.array_equal(u, self._u):
-            self._re_anchor()
+            self._set_anchor()
             self._u = u
 
-    def rest(self) -> None:
+    def stand_on_floor(self) -> None:
         """Stand on the floor (z = 0): at rest, with no input, until `grounded` is cleared."""
         x = np.zeros_like(self.state)
         for axis, p in zip(self.model.axes, self.model.position_index, strict=True):

@@ -1,9 +1,10 @@
-"""Outer loops of the cascade: setpoint, reference that follows it, and the acceleration that holds the vehicle on it.
+"""Outer loops of the cascade: setpoint, reference, and the acceleration that holds the vehicle on the reference.
 
-A reference (position, velocity, acceleration) moves within limits towards what is asked; a proportional position loop
-and a proportional-integral velocity loop hold the vehicle on it. What distinguishes the autopilots is what an
-acceleration setpoint does: ArduPilot moves the reference with it, so zero keeps the velocity and rejects wind; PX4
-flies it open loop, so wind, drag and the error of its hover thrust show.
+1. The reference (position, velocity, acceleration) moves within limits towards the setpoint.
+2. A proportional position loop and a proportional-integral velocity loop hold the vehicle on the reference.
+
+The autopilots differ in their answer to an acceleration setpoint. ArduPilot moves the reference with it, so zero keeps
+the velocity and rejects wind. PX4 flies it open loop, so wind, drag and the error of its hover thrust show.
 """
 
 from __future__ import annotations
@@ -14,166 +15,26 @@ from dataclasses import dataclass
 from enum import Enum, auto
 from typing import Literal, NamedTuple
 
-from sim.vehicle.rigid_body import GRAVITY_MPS2, Airframe, BodyState, Quaternion
+from sim.vehicle.airframe import GRAVITY_MPS2
+from sim.vehicle.attitude_loop import AttitudeSetpoint, compute_attitude_setpoint
+from sim.vehicle.motion_laws import BRAKE_MPS2, CLIMB_MPS, CRUISE_MPS, LAND_MPS
+from sim.vehicle.rigid_body import BodyState
 from uavctl.records import Vec3
-
-# Inner loops of the cascade: from a wanted acceleration to thrust and attitude, to body rates, to torque.
-
-
-# Gains of the rate loop for a Crazyflie. With the derivative gain D the motors' lag of 65 ms acts like 65/(1 + D) ms.
-RATE_GAIN_1PS = 110.0
-RATE_DERIVATIVE = 3.0
-RATE_INTEGRAL_1PS2 = 200.0
-YAW_RATE_GAIN_1PS = 6.0
-YAW_INTEGRAL_1PS2 = 6.0
-DERIVATIVE_LAG_S = 0.004
-MAX_RATE_RPS = math.radians(220.0)
-MAX_YAW_RATE_RPS = math.radians(90.0)
-LEAST_UP_MPS2 = 1.0  # thrust asked for is never less than this much upward: the lean stays defined
-
-
-@dataclass(frozen=True)
-class Lean:
-    """Thrust per mass, and the attitude that points it."""
-
-    force_mps2: Vec3  # specific force wanted of the rotors, NED
-    attitude: Quaternion  # that points the rotors along it with the wanted heading
-    limited: bool  # whether the largest tilt kept the horizontal part below the wanted one
-    dive_limited: bool  # whether a dive was wanted in which no thrust would be left to lean
-
-
-def lean(accel_mps2: Vec3, yaw_rad: float, tilt_limit_rad: float) -> Lean:
-    """Return the lean that gives an acceleration in still air; where the tilt is limited, height has priority."""
-    north, east = accel_mps2[0], accel_mps2[1]
-    wanted_up = GRAVITY_MPS2 - accel_mps2[2]
-    up = max(wanted_up, LEAST_UP_MPS2)
-    level = math.sqrt(north * north + east * east)
-    most = up * math.tan(tilt_limit_rad)
-    limited = level > most
-    if limited:
-        north, east = north * most / level, east * most / level
-    norm = math.sqrt(north * north + east * east + up * up)
-    # Body-down is against the force; half-angle formula of the shortest turn from down to there, then the heading.
-    bx, by, bz = -north / norm, -east / norm, up / norm
-    w = math.sqrt(0.5 * (1.0 + bz))
-    x, y = -0.5 * by / w, 0.5 * bx / w
-    c, s = math.cos(0.5 * yaw_rad), math.sin(0.5 * yaw_rad)
-    attitude = (w * c, x * c + y * s, y * c - x * s, w * s)
-    return Lean((north, east, -up), attitude, limited, up != wanted_up)
-
-
-class AttitudeLoop:
-    """Attitude controller: proportional from attitude error to rates, PID from rates to torque.
-
-    Args:
-        airframe: its inertia turns angular accelerations into torques.
-        attitude_gain_1ps: rate per angle of roll and pitch; yaw has a quarter of it.
-    """
-
-    def __init__(self, airframe: Airframe, attitude_gain_1ps: float, step_s: float) -> None:
-        self._inertia = airframe.inertia_kgm2
-        self._gain = attitude_gain_1ps
-        self._step_s = step_s
-        self._smooth = 1.0 - math.exp(-step_s / DERIVATIVE_LAG_S)
-        self.reset((0.0, 0.0, 0.0))
-
-    def reset(self, rates_rps: Vec3) -> None:
-        """Forget the past; the body turns at these rates [rad/s]."""
-        self._last = rates_rps
-        self._slope: Vec3 = (0.0, 0.0, 0.0)
-        self._integral: Vec3 = (0.0, 0.0, 0.0)
-
-    def torque(self, motion: BodyState, attitude: Quaternion, *, integrate: bool) -> Vec3:
-        """Return the torque that turns the body towards an attitude [N m]; do not `integrate` at the rotors' limits."""
-        w, x, y, z = motion.attitude
-        a, b, c, d = attitude
-        ew, ex = w * a + x * b + y * c + z * d, w * b - x * a - y * d + z * c
-        ey, ez = w * c + x * d - y * a - z * b, w * d - x * c + y * b - z * a
-        # As the autopilots do it: the shortest turn that points the thrust first, whatever the heading still lacks.
-        upright = math.sqrt(ew * ew + ez * ez)
-        if upright > 0.0:
-            ex, ey = (ew * ex - ey * ez) / upright, (ew * ey + ex * ez) / upright
-        p, q = 2.0 * self._gain * ex, 2.0 * self._gain * ey
-        r = math.copysign(0.5, ew) * self._gain * ez
-        size = math.sqrt(p * p + q * q)
-        if size > MAX_RATE_RPS:
-            p, q = p * MAX_RATE_RPS / size, q * MAX_RATE_RPS / size
-        r = min(max(r, -MAX_YAW_RATE_RPS), MAX_YAW_RATE_RPS)
-        return self._rate_loop(motion.rates_rps, (p, q, r), integrate)
-
-    def _rate_loop(self, rates: Vec3, wanted: Vec3, integrate: bool) -> Vec3:
-        (lp, lq, lr), (sp, sq, sr), (ip, iq, ir) = self._last, self._slope, self._integral
-        p, q, r = rates
-        smooth = self._smooth
-        per_step = 1.0 / self._step_s
-        sp += smooth * ((p - lp) * per_step - sp)
-        sq += smooth * ((q - lq) * per_step - sq)
-        sr += smooth * ((r - lr) * per_step - sr)
-        ep, eq, er = wanted[0] - p, wanted[1] - q, wanted[2] - r
-        if integrate:
-            tilting, turning = RATE_INTEGRAL_1PS2 * self._step_s, YAW_INTEGRAL_1PS2 * self._step_s
-            ip, iq, ir = ip + tilting * ep, iq + tilting * eq, ir + turning * er
-        self._last, self._slope, self._integral = rates, (sp, sq, sr), (ip, iq, ir)
-        jx, jy, jz = self._inertia
-        return (
-            jx * (RATE_GAIN_1PS * ep + ip - RATE_DERIVATIVE * sp),
-            jy * (RATE_GAIN_1PS * eq + iq - RATE_DERIVATIVE * sq),
-            jz * (YAW_RATE_GAIN_1PS * er + ir),
-        )
-
-
-# Simple laws by which the simulated vehicle moves itself, on its true state; gains in 1/s.
-
-
-BRAKE_MPS2 = 2.5  # as recorded of ArduCopter after its setpoint timeout
-BRAKE_GAIN = 2.0
-LAND_MPS = 0.5  # LAND_SPEED of the recorded ArduCopter
-CLIMB_MPS = 1.0
-CLIMB_GAIN = 0.8
-CRUISE_MPS = 5.0
-
-
-def brake(velocity_mps: Vec3, limit_mps2: float) -> Vec3:
-    """Return the acceleration against the velocity [m/s²]: proportional to it, its norm at most the limit."""
-    speed = math.hypot(*velocity_mps)
-    gain = min(BRAKE_GAIN, limit_mps2 / speed) if speed > 0.0 else 0.0
-    north, east, down = velocity_mps
-    return -gain * north, -gain * east, -gain * down
-
-
-def descend(down_mps: float) -> float:
-    """Return the downward acceleration that settles at the landing speed [m/s²]."""
-    return BRAKE_GAIN * (LAND_MPS - down_mps)
-
-
-def climb(down_m: float, down_mps: float, to_m: float) -> float:
-    """Return the downward acceleration towards the height `to_m` (NED down) [m/s²], at most at the climbing speed."""
-    wanted = min(max(CLIMB_GAIN * (to_m - down_m), -CLIMB_MPS), CLIMB_MPS)
-    return BRAKE_GAIN * (wanted - down_mps)
-
-
-def approach(place_m: Vec3, to_m: Vec3) -> Vec3:
-    """Return the velocity towards a position [m/s]: proportional to the distance, at most cruise and climb speed."""
-    north, east, down = (CLIMB_GAIN * (to - at) for at, to in zip(place_m, to_m, strict=True))
-    level = math.hypot(north, east)
-    slow = CRUISE_MPS / level if level > CRUISE_MPS else 1.0
-    return slow * north, slow * east, min(max(down, -CLIMB_MPS), CLIMB_MPS)
-
 
 ZERO: Vec3 = (0.0, 0.0, 0.0)
 # Reference: within these limits a velocity is reached with a gain such that the jerk limit is met by itself.
 REFERENCE_ACCEL_MPS2 = BRAKE_MPS2  # WPNAV_ACCEL of the recorded ArduCopter: what it brakes with
 REFERENCE_GAIN_1PS = 2.0
 REFERENCE_POSITION_1PS = 0.5  # a quarter of the former: no overshoot
-CRAWL_BELOW_M = 1.0  # PX4's MPC_LAND_ALT3
-CARRIED_S = 3.0  # ArduPilot moves a position on with its velocity for so long (GUID_TIMEOUT), then it stays
+CRAWL_HEIGHT_M = 1.0  # PX4's MPC_LAND_ALT3
+EXTRAPOLATION_S = 3.0  # ArduPilot moves a position on with its velocity for this time (GUID_TIMEOUT), then it holds it
 
 
 @dataclass(frozen=True)
 class Tuning:
     """Gains and limits by which an autopilot flies."""
 
-    open_loop: bool  # whether an acceleration setpoint is flown as it comes
+    is_open_loop: bool  # whether an acceleration setpoint is flown as it comes
     dead_time_s: float  # from taking an acceleration setpoint, or one of a position that moves, to acting on it
     tilt_limit_rad: float  # largest lean
     jerk_mps3: float  # limit of the change of an acceleration setpoint; infinite is none
@@ -203,7 +64,7 @@ THROTTLE_MPS2 = GRAVITY_MPS2 / 0.39
 # dead time, attitude gain and hover error are fitted to the recorded flights, see docs/vehicle.md.
 TUNINGS = {
     "ardupilot": Tuning(
-        open_loop=False,
+        is_open_loop=False,
         dead_time_s=0.0,
         tilt_limit_rad=math.radians(30.0),
         jerk_mps3=5.0,
@@ -221,7 +82,7 @@ TUNINGS = {
         climb_1ps=1.0,
     ),
     "px4": Tuning(
-        open_loop=True,
+        is_open_loop=True,
         dead_time_s=0.08,
         tilt_limit_rad=math.radians(45.0),
         jerk_mps3=math.inf,
@@ -242,7 +103,7 @@ TUNINGS = {
 
 
 class LoopDemand(Enum):
-    """Motion that the loops are asked for."""
+    """Kind of the demanded motion."""
 
     ACCELERATION = auto()
     VELOCITY = auto()
@@ -252,18 +113,18 @@ class LoopDemand(Enum):
     LANDING = auto()
 
 
-class _Asked(NamedTuple):
+class _PendingSetpoint(NamedTuple):
     """A setpoint that waits for the dead time to pass; a motion has position, velocity and acceleration."""
 
-    due: int  # step in which it acts
+    due_step: int  # step in which it acts
     demand: LoopDemand
-    wanted: Vec3
+    setpoint: Vec3
     velocity: Vec3 = ZERO
     accel: Vec3 = ZERO
 
 
 class Cascade:
-    """Outer loops from a setpoint to a lean, once per step.
+    """Outer loops from a setpoint to an attitude setpoint, once per step.
 
     Attributes:
         yaw_rad: heading to hold.
@@ -275,157 +136,159 @@ class Cascade:
         self._step_s = step_s
         self._dead_steps = round(self.tuning.dead_time_s / step_s)
         self._steps = 0
-        self._coming: deque[_Asked] = deque()  # taken, and not acting yet
-        self._carried_steps = 0  # for which a position has moved on by itself
+        self._pending: deque[_PendingSetpoint] = deque()  # taken, and not acting yet
+        self._extrapolated_steps = 0  # for which a position has moved on by itself
         self._demand = LoopDemand.ACCELERATION
-        self._wanted: Vec3 = ZERO
+        self._setpoint: Vec3 = ZERO
         self._position: Vec3 = ZERO
         self._velocity: Vec3 = ZERO
         self._accel: Vec3 = ZERO
         self._integral: Vec3 = ZERO
-        self._thrust_mps2 = 0.0  # integral of the loop on the vertical acceleration
+        self._thrust_integral_mps2 = 0.0  # integral of the loop on the vertical acceleration
 
-    def begin(self, motion: BodyState) -> None:
-        """Start anew from this motion, with zero acceleration."""
-        self._coming.clear()
-        self._demand, self._wanted = LoopDemand.ACCELERATION, ZERO
+    def reset(self, motion: BodyState) -> None:
+        """Restart from this motion, with zero acceleration."""
+        self._pending.clear()
+        self._demand, self._setpoint = LoopDemand.ACCELERATION, ZERO
         self._accel = self._integral = ZERO
-        self._thrust_mps2 = 0.0
-        self._carry(motion)
+        self._thrust_integral_mps2 = 0.0
+        self._set_reference(motion)
 
     def accelerate(self, accel_mps2: Vec3) -> None:
         """Fly this acceleration (NED) [m/s²], after the autopilot's dead time."""
-        self._take(_Asked(self._steps + self._dead_steps, LoopDemand.ACCELERATION, accel_mps2))
+        self._queue_setpoint(_PendingSetpoint(self._steps + self._dead_steps, LoopDemand.ACCELERATION, accel_mps2))
 
     def follow(self, position_m: Vec3, velocity_mps: Vec3, accel_mps2: Vec3) -> None:
         """Hold a position (NED) [m] that moves with this velocity and acceleration, after the dead time.
 
         PX4 takes each for what it is, until the next comes; ArduPilot moves it on in between.
         """
-        due = self._steps + self._dead_steps
-        self._take(_Asked(due, LoopDemand.MOTION, position_m, velocity_mps, accel_mps2))
+        due_step = self._steps + self._dead_steps
+        self._queue_setpoint(_PendingSetpoint(due_step, LoopDemand.MOTION, position_m, velocity_mps, accel_mps2))
 
-    def _take(self, asked: _Asked) -> None:
-        if self._coming and self._coming[-1].due == asked.due:
-            self._coming.pop()
-        self._coming.append(asked)
+    def _queue_setpoint(self, setpoint: _PendingSetpoint) -> None:
+        if self._pending and self._pending[-1].due_step == setpoint.due_step:
+            self._pending.pop()
+        self._pending.append(setpoint)
 
     def fly(self, velocity_mps: Vec3) -> None:
         """Fly this velocity (NED) [m/s]; zero stops, and stays where that ends."""
-        self._coming.clear()
-        self._demand, self._wanted = LoopDemand.VELOCITY, velocity_mps
+        self._pending.clear()
+        self._demand, self._setpoint = LoopDemand.VELOCITY, velocity_mps
 
     def go_to(self, position_m: Vec3) -> None:
         """Fly to this position (NED) [m] and stay."""
-        self._coming.clear()
-        self._demand, self._wanted = LoopDemand.POSITION, position_m
+        self._pending.clear()
+        self._demand, self._setpoint = LoopDemand.POSITION, position_m
 
     def take_off(self, height_m: float) -> None:
         """Climb to this height above the origin [m], over the present place."""
-        self._coming.clear()
-        self._demand, self._wanted = LoopDemand.CLIMB, (self._position[0], self._position[1], -height_m)
+        self._pending.clear()
+        self._demand, self._setpoint = LoopDemand.CLIMB, (self._position[0], self._position[1], -height_m)
 
     def land(self) -> None:
         """Sink at the landing speed, over the present place."""
-        self._coming.clear()
-        self._demand, self._wanted = LoopDemand.LANDING, (0.0, 0.0, self.tuning.land_mps)
+        self._pending.clear()
+        self._demand, self._setpoint = LoopDemand.LANDING, (0.0, 0.0, self.tuning.land_mps)
 
-    def listen(self) -> None:
+    def apply_due_setpoint(self) -> None:
         """Begin a step: a setpoint whose dead time has passed acts from now on."""
-        if self._coming and self._coming[0].due <= self._steps:
-            _, self._demand, self._wanted, velocity, accel = self._coming.popleft()
+        if self._pending and self._pending[0].due_step <= self._steps:
+            _, self._demand, self._setpoint, velocity, accel = self._pending.popleft()
             if self._demand is LoopDemand.MOTION:
-                self._position, self._velocity, self._accel = self._wanted, velocity, accel
-                self._carried_steps = 0
+                self._position, self._velocity, self._accel = self._setpoint, velocity, accel
+                self._extrapolated_steps = 0
         self._steps += 1
 
     @property
-    def climbs(self) -> bool:
+    def is_leaving_floor(self) -> bool:
         """Whether the setpoint leads up from the floor."""
-        return self._wanted[2] < 0.0
+        return self._setpoint[2] < 0.0
 
-    def stand(self, motion: BodyState) -> None:
+    def step_on_floor(self, motion: BodyState) -> None:
         """Take a step on the floor: the reference stays with the vehicle, and the flight before is forgotten."""
         self._accel = self._integral = ZERO
-        self._thrust_mps2 = 0.0
-        self._carry(motion)
+        self._thrust_integral_mps2 = 0.0
+        self._set_reference(motion)
 
-    def step(self, motion: BodyState, *, thrust_limited: bool, fall_mps2: float = 0.0) -> Lean:
-        """Take a step in the air; return the lean to take now.
+    def step(self, motion: BodyState, *, thrust_limited: bool, down_accel_mps2: float = 0.0) -> AttitudeSetpoint:
+        """Take a step in the air; return the attitude setpoint.
 
         Args:
-            motion: motion of the vehicle, as its loops see it.
+            motion: motion of the vehicle, as its loops estimate it.
             thrust_limited: whether the rotors could not give the thrust of the last step.
-            fall_mps2: downward acceleration in the last step, as accelerometers feel it.
+            down_accel_mps2: downward acceleration in the last step, as measured.
         """
         if self._demand is LoopDemand.ACCELERATION:
             self._follow_acceleration()
-            if self.tuning.open_loop:
-                self._carry(motion)
+            if self.tuning.is_open_loop:
+                self._set_reference(motion)
                 north, east, down = self._accel
-                return self._lean((north, east, down - self.tuning.hover_error * GRAVITY_MPS2))
+                return self._compute_attitude((north, east, down - self.tuning.hover_error * GRAVITY_MPS2))
         elif self._demand is LoopDemand.VELOCITY:
-            self._follow_velocity(self._wanted)
+            self._follow_velocity(self._setpoint)
         elif self._demand is LoopDemand.LANDING:
-            near = -motion.position_m[2] < CRAWL_BELOW_M
-            self._follow_velocity((0.0, 0.0, self.tuning.crawl_mps if near else self.tuning.land_mps))
+            is_near_floor = -motion.position_m[2] < CRAWL_HEIGHT_M
+            self._follow_velocity((0.0, 0.0, self.tuning.crawl_mps if is_near_floor else self.tuning.land_mps))
         elif self._demand is LoopDemand.POSITION:
             self._follow_position(REFERENCE_POSITION_1PS, CLIMB_MPS)
         elif self._demand is LoopDemand.CLIMB:
             self._follow_position(self.tuning.climb_1ps, self.tuning.climb_mps)
         else:
-            self._carry_on()
-            return self._track(motion, thrust_limited, fall_mps2)
+            self._extrapolate_position()
+            return self._track_reference(motion, thrust_limited, down_accel_mps2)
         self._move_reference()
-        return self._track(motion, thrust_limited, fall_mps2)
+        return self._track_reference(motion, thrust_limited, down_accel_mps2)
 
-    def _lean(self, accel: Vec3) -> Lean:
-        return lean(accel, self.yaw_rad, self.tuning.tilt_limit_rad)
+    def _compute_attitude(self, accel: Vec3) -> AttitudeSetpoint:
+        return compute_attitude_setpoint(accel, self.yaw_rad, self.tuning.tilt_limit_rad)
 
-    # The reference
-
-    def _carry(self, motion: BodyState) -> None:
+    def _set_reference(self, motion: BodyState) -> None:
         self._position, self._velocity = motion.position_m, motion.velocity_mps
 
     def _follow_acceleration(self) -> None:
         """Change the reference acceleration within the jerk limit, and within what the tilt limit can give."""
-        north, east, down = self._wanted
-        most = GRAVITY_MPS2 * math.tan(self.tuning.tilt_limit_rad)
-        level = math.sqrt(north * north + east * east)
-        if level > most:
-            north, east = north * most / level, east * most / level
-        change = self.tuning.jerk_mps3 * self._step_s
+        north, east, down = self._setpoint
+        max_horizontal = GRAVITY_MPS2 * math.tan(self.tuning.tilt_limit_rad)
+        horizontal = math.sqrt(north * north + east * east)
+        if horizontal > max_horizontal:
+            north, east = north * max_horizontal / horizontal, east * max_horizontal / horizontal
+        max_change = self.tuning.jerk_mps3 * self._step_s
         dn, de, dd = north - self._accel[0], east - self._accel[1], down - self._accel[2]
-        level = math.sqrt(dn * dn + de * de)
-        if level > change:
-            north, east = self._accel[0] + dn * change / level, self._accel[1] + de * change / level
-        self._accel = (north, east, self._accel[2] + min(max(dd, -change), change))
+        horizontal = math.sqrt(dn * dn + de * de)
+        if horizontal > max_change:
+            north, east = self._accel[0] + dn * max_change / horizontal, self._accel[1] + de * max_change / horizontal
+        self._accel = (north, east, self._accel[2] + min(max(dd, -max_change), max_change))
 
-    def _follow_velocity(self, wanted: Vec3) -> None:
+    def _follow_velocity(self, velocity_mps: Vec3) -> None:
         vn, ve, vd = self._velocity
-        north, east = REFERENCE_GAIN_1PS * (wanted[0] - vn), REFERENCE_GAIN_1PS * (wanted[1] - ve)
-        down = REFERENCE_GAIN_1PS * (wanted[2] - vd)
-        level = math.sqrt(north * north + east * east)
-        if level > REFERENCE_ACCEL_MPS2:
-            north, east = north * REFERENCE_ACCEL_MPS2 / level, east * REFERENCE_ACCEL_MPS2 / level
+        north, east = REFERENCE_GAIN_1PS * (velocity_mps[0] - vn), REFERENCE_GAIN_1PS * (velocity_mps[1] - ve)
+        down = REFERENCE_GAIN_1PS * (velocity_mps[2] - vd)
+        horizontal = math.sqrt(north * north + east * east)
+        if horizontal > REFERENCE_ACCEL_MPS2:
+            north, east = north * REFERENCE_ACCEL_MPS2 / horizontal, east * REFERENCE_ACCEL_MPS2 / horizontal
         self._accel = (north, east, min(max(down, -REFERENCE_ACCEL_MPS2), REFERENCE_ACCEL_MPS2))
 
     def _follow_position(self, down_1ps: float, climb_mps: float) -> None:
-        dn, de = self._wanted[0] - self._position[0], self._wanted[1] - self._position[1]
-        dd = self._wanted[2] - self._position[2]
-        far = math.sqrt(dn * dn + de * de)
-        speed = _approach(far, CRUISE_MPS, REFERENCE_POSITION_1PS) / far if far > 0.0 else 0.0
-        down = math.copysign(_approach(abs(dd), climb_mps, down_1ps), dd)
+        dn, de = self._setpoint[0] - self._position[0], self._setpoint[1] - self._position[1]
+        dd = self._setpoint[2] - self._position[2]
+        distance_m = math.sqrt(dn * dn + de * de)
+        speed = (
+            _compute_approach_speed(distance_m, CRUISE_MPS, REFERENCE_POSITION_1PS) / distance_m
+            if distance_m > 0.0
+            else 0.0
+        )
+        down = math.copysign(_compute_approach_speed(abs(dd), climb_mps, down_1ps), dd)
         self._follow_velocity((speed * dn, speed * de, down))
 
-    def _carry_on(self) -> None:
+    def _extrapolate_position(self) -> None:
         """Move a position setpoint on with its velocity, where the autopilot does so."""
-        if self.tuning.open_loop:
+        if self.tuning.is_open_loop:
             return
-        if self._carried_steps * self._step_s >= CARRIED_S:
+        if self._extrapolated_steps * self._step_s >= EXTRAPOLATION_S:
             self._velocity = self._accel = ZERO
         self._move_reference()
-        self._carried_steps += 1
+        self._extrapolated_steps += 1
 
     def _move_reference(self) -> None:
         h = self._step_s
@@ -433,10 +296,8 @@ class Cascade:
         self._position = (pn + h * (vn + 0.5 * h * an), pe + h * (ve + 0.5 * h * ae), pd + h * (vd + 0.5 * h * ad))
         self._velocity = (vn + h * an, ve + h * ae, vd + h * ad)
 
-    # The loops on it
-
-    def _track(self, motion: BodyState, thrust_limited: bool, fall_mps2: float) -> Lean:
-        """Hold the vehicle on the reference, which must not run away from a vehicle that cannot follow."""
+    def _track_reference(self, motion: BodyState, thrust_limited: bool, down_accel_mps2: float) -> AttitudeSetpoint:
+        """Hold the vehicle on the reference; stop the reference where the vehicle cannot follow."""
         t = self.tuning
         (pn, pe, pd), (vn, ve, vd) = motion.position_m, motion.velocity_mps
         en = self._velocity[0] - vn + t.position_1ps * (self._position[0] - pn)
@@ -444,28 +305,28 @@ class Cascade:
         ed = self._velocity[2] - vd + t.position_down_1ps * (self._position[2] - pd)
         (an, ae, ad), (jn, je, jd) = self._accel, self._integral
         down = ad + t.velocity_down_1ps * ed + jd - t.hover_error * GRAVITY_MPS2
-        lack = down - fall_mps2
+        accel_error = down - down_accel_mps2
         if t.thrust_gain > 0.0:  # a loop on the acceleration gives the thrust for it
-            down = t.thrust_gain * lack + self._thrust_mps2
-        result = self._lean((an + t.velocity_1ps * en + jn, ae + t.velocity_1ps * ee + je, down))
-        if result.limited:
+            down = t.thrust_gain * accel_error + self._thrust_integral_mps2
+        result = self._compute_attitude((an + t.velocity_1ps * en + jn, ae + t.velocity_1ps * ee + je, down))
+        if result.is_tilt_limited:
             self._position, self._velocity = (pn, pe, self._position[2]), (vn, ve, self._velocity[2])
         else:
             gain = t.integral_1ps2 * self._step_s
             jn, je = jn + gain * en, je + gain * ee
-        if thrust_limited or result.dive_limited:
+        if thrust_limited or result.is_dive_limited:
             self._position, self._velocity = (*self._position[:2], pd), (*self._velocity[:2], vd)
         else:
             jd += t.integral_down_1ps2 * self._step_s * ed
-            self._thrust_mps2 += t.thrust_integral_1ps * self._step_s * lack
+            self._thrust_integral_mps2 += t.thrust_integral_1ps * self._step_s * accel_error
         self._integral = (jn, je, jd)
         return result
 
 
-def _approach(distance_m: float, limit_mps: float, gain_1ps: float) -> float:
+def _compute_approach_speed(distance_m: float, limit_mps: float, gain_1ps: float) -> float:
     """Return the approach speed [m/s]: proportional when near, else such that a stop takes half of the limit."""
-    near = REFERENCE_ACCEL_MPS2 / (2.0 * gain_1ps**2)
-    if distance_m <= near:
+    linear_m = REFERENCE_ACCEL_MPS2 / (2.0 * gain_1ps**2)
+    if distance_m <= linear_m:
         return min(gain_1ps * distance_m, limit_mps)
-    braking = math.sqrt(REFERENCE_ACCEL_MPS2 * (distance_m - 0.5 * near))
+    braking = math.sqrt(REFERENCE_ACCEL_MPS2 * (distance_m - 0.5 * linear_m))
     return min(braking, limit_mps)

@@ -6,45 +6,44 @@ import math
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sim.vehicle.airframe import CRAZYFLIE_2, GRAVITY_MPS2, Airframe
+from sim.vehicle.attitude_loop import AttitudeLoop
+from sim.vehicle.battery import BatteryModel
 from sim.vehicle.linear import MAX_ACCEL_MPS2, LinearModel
-from sim.vehicle.loops import AttitudeLoop, Cascade
+from sim.vehicle.loops import Cascade
 from sim.vehicle.rigid_body import (
-    CRAZYFLIE_2,
-    GRAVITY_MPS2,
     LEVEL,
-    Airframe,
-    BatteryModel,
     Body,
     BodyState,
     Quaternion,
-    Rotors,
-    acceleration,
-    step,
-    turned,
-    uprighted,
+    compute_acceleration,
+    integrate_step,
+    reduce_tilt,
+    rotate_attitude,
 )
+from sim.vehicle.rotors import Rotors
 from sim.wind import Wind
+from uavctl.arrays import Array
 from uavctl.records import Vec3
 
 STEP_NS = 2_500_000
 STEP_S = STEP_NS * 1e-9
 # A vehicle that touches the floor leaning is put upright by its legs: its tilt shrinks with this time constant.
 RIGHTING_S = 0.05
-LANDED_NS = 500_000_000  # on the floor without a break for so long is landed
+LANDED_NS = 500_000_000  # contact without a break for this time counts as landed
 ZERO: Vec3 = (0.0, 0.0, 0.0)
 
 
 class Quadrotor:
     """Quadrotor in the air or on the floor z = 0; takes the place of `LinearVehicle`.
 
-    The physics moves on the grid start_ns + k 2.5 ms; what is asked takes effect at the next point of it, and
-    positions between two points are read from the last one and its velocity and acceleration. So stops on the
-    way change no bit.
+    The physics moves on the grid start_ns + k 2.5 ms; a request takes effect at the next grid point.
+    Positions between two points follow from the last point, its velocity and its acceleration. So further stops
+    change no bit.
 
     Args:
-        model: the controller's plant as the simulator sees it; says what `state` and `input` hold.
+        model: the simulator's model of the controller's plant; defines `state` and `input`.
         wind: the air, stepped with the physics.
     """
 
@@ -65,23 +64,21 @@ class Quadrotor:
         self.cascade = Cascade(autopilot, STEP_S)
         self.now_ns = start_ns
         self._airframe = airframe
-        self._body = Body.of(airframe)
+        self._body = Body.from_airframe(airframe)
         self._rotors = Rotors(airframe, STEP_S)
-        self._loop = AttitudeLoop(airframe, self.cascade.tuning.attitude_gain_1ps, STEP_S)
+        self._attitude_loop = AttitudeLoop(airframe, self.cascade.tuning.attitude_gain_1ps, STEP_S)
         self.wind = wind
         self._motion = BodyState(position_m, velocity_mps, LEVEL, ZERO)
         self._grid_ns = start_ns
         self._touched_ns: int | None = None
         self._grounded = False
         self._accel: Vec3 = ZERO
-        self._errors: tuple[Vec3, Vec3] | None = None
-        self._fall_mps2 = 0.0  # downward acceleration in the last step
-        self._turn: Vec3 | None = None  # of the attitude that the loops believe
-        hover = airframe.hover_rps
-        self._rotors.speeds_rps = self._rotors.commands_rps = (hover, hover, hover, hover)
-        self.cascade.begin(self._motion)
-
-    # What it is doing
+        self._estimate_errors: tuple[Vec3, Vec3] | None = None
+        self._down_accel_mps2 = 0.0  # downward acceleration in the last step
+        self._attitude_error_rad: Vec3 | None = None  # of the loops' attitude, about body axes
+        hover_rps = airframe.hover_rps
+        self._rotors.speeds_rps = self._rotors.commands_rps = (hover_rps, hover_rps, hover_rps, hover_rps)
+        self.cascade.reset(self._motion)
 
     @property
     def has_down(self) -> bool:
@@ -139,9 +136,9 @@ class Quadrotor:
         """Acceleration in NED at the last point of the grid [m/s²]; zero on the floor."""
         if self._touched_ns is not None or self._grounded:
             return ZERO
-        wrench = self._rotors.wrench(self._rotors.speeds_rps)
+        wrench = self._rotors.compute_wrench(self._rotors.speeds_rps)
         motion = self._motion
-        return acceleration(self._body, motion.attitude, motion.velocity_mps, wrench, self.wind.velocity_mps)
+        return compute_acceleration(self._body, motion.attitude, motion.velocity_mps, wrench, self.wind.velocity_mps)
 
     @property
     def landed(self) -> bool:
@@ -149,34 +146,32 @@ class Quadrotor:
         return self._grounded or (self._touched_ns is not None and self.now_ns - self._touched_ns >= LANDED_NS)
 
     @property
-    def state(self) -> NDArray[np.float64]:
+    def state(self) -> Array:
         """State x (n_x,) of the controller's plant: positions, velocities, and what thrust and gravity accelerate."""
         x = np.zeros(self.model.a.shape[0])
-        place, speed, pull = self.position_m, self.velocity_mps, self._pull()
+        position, velocity, thrust_accel = self.position_m, self.velocity_mps, self._compute_thrust_accel()
         for axis, p, v in zip(self.model.axes, self.model.position_index, self.model.velocity_index, strict=True):
-            x[p], x[v] = place[axis], speed[axis]
+            x[p], x[v] = position[axis], velocity[axis]
             if x.size == 3 * len(self.model.axes):  # drag and lag: an acceleration follows each velocity
-                x[v + 1] = pull[axis]
+                x[v + 1] = thrust_accel[axis]
         return x
 
     @property
-    def input(self) -> NDArray[np.float64]:
+    def input(self) -> Array:
         """Input u (n_u,) of the controller's plant: the acceleration setpoint, in the plant's units; else zero."""
         return np.array([self._accel[axis] for axis in self.model.axes]) / self.model.accel_per_input
 
-    def _pull(self) -> Vec3:
+    def _compute_thrust_accel(self) -> Vec3:
         """Return the acceleration by thrust and gravity alone [m/s²]: what the input does in the plant."""
         if self._touched_ns is not None or self._grounded:
             return ZERO
         w, x, y, z = self._motion.attitude
-        each = self._rotors.wrench(self._rotors.speeds_rps).thrust_n / self._airframe.mass_kg
+        thrust_mps2 = self._rotors.compute_wrench(self._rotors.speeds_rps).thrust_n / self._airframe.mass_kg
         return (
-            -2.0 * (x * z + w * y) * each,
-            -2.0 * (y * z - w * x) * each,
-            GRAVITY_MPS2 - (1.0 - 2.0 * (x * x + y * y)) * each,
+            -2.0 * (x * z + w * y) * thrust_mps2,
+            -2.0 * (y * z - w * x) * thrust_mps2,
+            GRAVITY_MPS2 - (1.0 - 2.0 * (x * x + y * y)) * thrust_mps2,
         )
-
-    # What it is asked
 
     def accelerate(self, accel_mps2: Vec3) -> None:
         """Hold this acceleration setpoint (NED) [m/s²] from now on."""
@@ -185,7 +180,7 @@ class Quadrotor:
         self.cascade.accelerate(self._accel)
 
     def brake(self) -> None:
-        """Stop, and stay where that ends."""
+        """Stop and hold position."""
         self.fly(ZERO)
 
     def fly(self, velocity_mps: Vec3) -> None:
@@ -209,47 +204,45 @@ class Quadrotor:
         self.cascade.take_off(height_m)
 
     def land(self) -> None:
-        """Sink at the landing speed until told otherwise; `landed` says when the floor is reached."""
+        """Sink at the landing speed until the next order; `landed` turns true on the floor."""
         self._accel = ZERO
         self.cascade.land()
 
-    def face(self, yaw_rad: float) -> None:
+    def set_heading(self, yaw_rad: float) -> None:
         """Turn the nose to this heading, clockwise from north [rad]."""
         self.cascade.yaw_rad = yaw_rad
 
-    def mislead(self, position_error_m: Vec3, velocity_error_mps: Vec3) -> None:
-        """Add an error to position and velocity as its own loops see them, from now on."""
-        right = position_error_m == velocity_error_mps == ZERO
-        self._errors = None if right else (position_error_m, velocity_error_mps)
+    def set_estimate_error(self, position_error_m: Vec3, velocity_error_mps: Vec3) -> None:
+        """Set the error of position and velocity in its loops."""
+        is_zero = position_error_m == velocity_error_mps == ZERO
+        self._estimate_errors = None if is_zero else (position_error_m, velocity_error_mps)
 
-    def mislead_attitude(self, error_rad: Vec3) -> None:
-        """Turn the attitude that its own loops see by so much about body axes [rad], from now on."""
-        self._turn = None if error_rad == ZERO else error_rad
+    def set_attitude_error(self, error_rad: Vec3) -> None:
+        """Set the attitude error of its loops about body axes [rad]."""
+        self._attitude_error_rad = None if error_rad == ZERO else error_rad
 
-    def rest(self) -> None:
+    def stand_on_floor(self) -> None:
         """Stand on the floor, rotors off, until `grounded` is cleared."""
         north, east, _ = self.position_m
-        self._motion = BodyState((north, east, 0.0), ZERO, uprighted(self._motion.attitude, 0.0), ZERO)
+        self._motion = BodyState((north, east, 0.0), ZERO, reduce_tilt(self._motion.attitude, 0.0), ZERO)
         self._accel = ZERO
         self._rotors.stop()
         self._grounded = True
 
     @property
     def grounded(self) -> bool:
-        """Whether it stands on the floor with its rotors off; cleared, they idle, and the loops begin anew."""
+        """Whether it stands on the floor with its rotors off; cleared, they idle, and the loops restart."""
         return self._grounded
 
     @grounded.setter
     def grounded(self, grounded: bool) -> None:
         if grounded:
-            self.rest()
+            self.stand_on_floor()
         elif self._grounded:
             self._grounded = False
             self._touched_ns = self.now_ns
-            self.cascade.begin(self._motion)
-            self._loop.reset(ZERO)
-
-    # Its motion
+            self.cascade.reset(self._motion)
+            self._attitude_loop.reset(ZERO)
 
     def advance(self, to_ns: int) -> None:
         """Move on to `to_ns`, through every point of the grid up to and including it."""
@@ -267,54 +260,60 @@ class Quadrotor:
 
     def _step(self) -> None:
         motion = self._motion
-        believed = motion if self._errors is None else _mistaken(motion, *self._errors)
-        if self._turn is not None:
-            believed = believed._replace(attitude=turned(motion.attitude, self._turn))
-        self._control(believed)
+        estimate = motion if self._estimate_errors is None else _add_errors(motion, *self._estimate_errors)
+        if self._attitude_error_rad is not None:
+            estimate = estimate._replace(attitude=rotate_attitude(motion.attitude, self._attitude_error_rad))
+        self._control(estimate)
         wrenches = self._rotors.step()
-        self._motion = step(self._body, motion, wrenches, self.wind.velocity_mps, STEP_S)
+        self._motion = integrate_step(self._body, motion, wrenches, self.wind.velocity_mps, STEP_S)
         self.battery.drain(wrenches[0].thrust_n, STEP_S)
-        self._fall_mps2 = (self._motion.velocity_mps[2] - motion.velocity_mps[2]) / STEP_S
-        self._meet_the_floor(motion)
+        self._down_accel_mps2 = (self._motion.velocity_mps[2] - motion.velocity_mps[2]) / STEP_S
+        self._handle_floor_contact(motion)
 
     def _control(self, motion: BodyState) -> None:
         """Command the rotors; on the floor they idle until a setpoint leads off it."""
-        self.cascade.listen()
-        idles = self._touched_ns is not None and not self.cascade.climbs
-        if idles or self.battery.empty:
-            self.cascade.stand(motion)
-            self._fall_mps2 = 0.0
-            self._loop.reset(motion.rates_rps)
-            self._rotors.command(0.0, ZERO, self.battery.largest_rps)
-            if self.battery.empty:
+        self.cascade.apply_due_setpoint()
+        is_idle = self._touched_ns is not None and not self.cascade.is_leaving_floor
+        if is_idle or self.battery.is_empty:
+            self.cascade.step_on_floor(motion)
+            self._down_accel_mps2 = 0.0
+            self._attitude_loop.reset(motion.rates_rps)
+            self._rotors.command(0.0, ZERO, self.battery.max_rps)
+            if self.battery.is_empty:
                 self._rotors.stop()
             return
-        wanted = self.cascade.step(motion, thrust_limited=self._rotors.thrust_limited, fall_mps2=self._fall_mps2)
+        setpoint = self.cascade.step(
+            motion, thrust_limited=self._rotors.is_thrust_limited, down_accel_mps2=self._down_accel_mps2
+        )
         w, x, y, z = motion.attitude
-        fn, fe, fd = wanted.force_mps2
-        along = fn * (x * z + w * y) * 2.0 + fe * (y * z - w * x) * 2.0 + fd * (1.0 - 2.0 * (x * x + y * y))
-        thrust = self._airframe.mass_kg * max(-along, 0.0)
-        torque = self._loop.torque(motion, wanted.attitude, integrate=not self._rotors.torque_limited)
-        self._rotors.command(thrust, torque, self.battery.largest_rps)
+        fn, fe, fd = setpoint.force_mps2
+        force = fn * (x * z + w * y) * 2.0 + fe * (y * z - w * x) * 2.0 + fd * (1.0 - 2.0 * (x * x + y * y))
+        thrust = self._airframe.mass_kg * max(-force, 0.0)
+        torque = self._attitude_loop.compute_torque(
+            motion, setpoint.attitude, integrate=not self._rotors.is_torque_limited
+        )
+        self._rotors.command(thrust, torque, self.battery.max_rps)
 
-    def _meet_the_floor(self, before: BodyState) -> None:
+    def _handle_floor_contact(self, before: BodyState) -> None:
         """Stop at the floor: impact without bounce, Coulomb friction from its impulse, legs that right the body."""
         (north, east, down), (vn, ve, vd), attitude, _ = self._motion
         if down < 0.0:
             self._touched_ns = None
             return
-        into = max(vd, 0.0)
-        slip = math.sqrt(vn * vn + ve * ve)
-        keep = max(1.0 - self._airframe.friction * into / slip, 0.0) if slip > 0.0 else 0.0
+        impact_mps = max(vd, 0.0)
+        slip_mps = math.sqrt(vn * vn + ve * ve)
+        friction_factor = max(1.0 - self._airframe.friction * impact_mps / slip_mps, 0.0) if slip_mps > 0.0 else 0.0
         if self._touched_ns is None:
             self._touched_ns = self._grid_ns
-        elif keep == 0.0:  # sticks where it stood
+        elif friction_factor == 0.0:  # sticks where it stood
             north, east, _ = before.position_m
-        upright = uprighted(attitude, math.exp(-STEP_S / RIGHTING_S))
-        self._motion = BodyState((north, east, 0.0), (keep * vn, keep * ve, min(vd, 0.0)), upright, ZERO)
+        attitude_after = reduce_tilt(attitude, math.exp(-STEP_S / RIGHTING_S))
+        self._motion = BodyState(
+            (north, east, 0.0), (friction_factor * vn, friction_factor * ve, min(vd, 0.0)), attitude_after, ZERO
+        )
 
 
-def _mistaken(motion: BodyState, position_error_m: Vec3, velocity_error_mps: Vec3) -> BodyState:
+def _add_errors(motion: BodyState, position_error_m: Vec3, velocity_error_mps: Vec3) -> BodyState:
     (pn, pe, pd), (vn, ve, vd), attitude, rates = motion
     (en, ee, ed), (fn, fe, fd) = position_error_m, velocity_error_mps
     return BodyState((pn + en, pe + ee, pd + ed), (vn + fn, ve + fe, vd + fd), attitude, rates)

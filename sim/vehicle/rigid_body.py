@@ -9,140 +9,8 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from sim.vehicle.airframe import AIR_DENSITY_KGPM3, GRAVITY_MPS2, Airframe
 from uavctl.records import Vec3
-
-# Parameters of the simulated quadrotor: a Crazyflie 2.0, as identified and measured by others.
-#
-# Sources, named at each figure:
-#
-# * Förster: J. Förster, System Identification of the Crazyflie 2.0 Nano Quadrocopter, ETH Zurich, 2015.
-# * Bitcraze: the measured table of current, thrust, voltage, duty and speed of a Crazyflie 2.0 on a thrust stand
-#   (documentation of the Crazyflie firmware, page "PWM to thrust"). The constants are least squares over its 16 rows;
-#   `docs/vehicle.md` gives them, and a test repeats the fits.
-# * Firmware: the table of open-circuit voltages in the Crazyflie firmware's power management.
-# * Estimate: nobody has published it; the reasoning is in `docs/vehicle.md`.
-
-
-GRAVITY_MPS2 = 9.80665
-AIR_DENSITY_KGPM3 = 1.225
-
-
-@dataclass(frozen=True)
-class Airframe:
-    """A quadrotor with rotors at 45 degrees to its axes; body axes FRD (front, right, down)."""
-
-    mass_kg: float  # mass
-    inertia_kgm2: tuple[float, float, float]  # principal moments of inertia about front, right, down
-    arm_m: float  # distance of each rotor from the centre of mass
-    thrust_n_s2: float  # k_T of thrust = k_T Ω², one rotor [N s²]
-    torque_m: float  # reaction torque per thrust, k_Q / k_T [m]
-    motor_lag_s: float  # time constant of the rotors' speed
-    idle_rps: float  # slowest speed of an armed rotor [rad/s]
-    speed_at_0v_rps: float  # intercept of the largest speed as a line over the battery's voltage [rad/s]
-    speed_per_v_rps: float  # slope of that line [rad/s per V]
-    # drag of the rotors along front, right, down per air speed and per sum of rotor speeds [kg]
-    rotor_drag_kg: tuple[float, float, float]
-    drag_area_m2: tuple[float, float, float]  # C_d A of the body along front, right, down
-    electronics_w: float  # power without thrust
-    power_per_thrust_wpn: float  # power per newton of thrust
-    capacity_c: float  # charge of the full battery [C]
-    resistance_ohm: float  # battery, protection and wires
-    open_circuit_v: tuple[float, ...]  # voltage without load at charges 0, 0.1, ..., 1.0
-    friction: float  # of the floor
-
-    @property
-    def weight_n(self) -> float:
-        """Weight [N]."""
-        return self.mass_kg * GRAVITY_MPS2
-
-    @property
-    def hover_rps(self) -> float:
-        """Rotor speed at which four rotors carry the weight [rad/s]."""
-        return math.sqrt(self.weight_n / (4.0 * self.thrust_n_s2))
-
-
-CRAZYFLIE_2 = Airframe(
-    mass_kg=0.028,  # Förster
-    inertia_kgm2=(16.571710e-6, 16.655602e-6, 29.261652e-6),  # Förster; products of inertia, up to 1.8e-6, left out
-    arm_m=0.046,  # Bitcraze: 92 mm from motor to motor
-    thrust_n_s2=2.2176e-8,  # Bitcraze, fitted to speed and thrust
-    torque_m=0.005964552,  # Förster
-    motor_lag_s=0.0647,  # Förster: pole of the motors' transfer function at -15.4666 1/s
-    idle_rps=469.7,  # Bitcraze: 4485 1/min at the lowest duty of the table
-    speed_at_0v_rps=531.5,  # Bitcraze, fitted to duty times voltage and speed from 25 % duty
-    speed_per_v_rps=616.0,  # the same
-    rotor_drag_kg=(9.1785e-7, 9.1785e-7, 10.311e-7),  # Förster
-    drag_area_m2=(1.0e-3, 1.0e-3, 2.5e-3),  # Estimate
-    electronics_w=1.071,  # Bitcraze, fitted to power and thrust
-    power_per_thrust_wpn=23.97,  # the same
-    capacity_c=864.0,  # Bitcraze: 240 mAh
-    resistance_ohm=0.15,  # Estimate
-    open_circuit_v=(3.00, 3.78, 3.83, 3.87, 3.89, 3.92, 3.96, 4.00, 4.04, 4.10, 4.20),  # Firmware; full: charger
-    friction=0.5,  # Estimate
-)
-
-
-# The battery: charge, voltage under load, and the rotor speed that the voltage allows.
-
-
-class BatteryModel:
-    """Battery: a voltage that sinks with the charge used, behind a resistance, feeding a load of given power.
-
-    Attributes:
-        voltage_v: at the terminals, under the last load.
-        current_a: current of the last load [A].
-        used_c: charge used.
-    """
-
-    def __init__(self, airframe: Airframe, *, charge: float = 1.0) -> None:
-        self._airframe = airframe
-        self.charge(charge)
-        self.current_a = 0.0
-        self.voltage_v = self.open_circuit_v
-
-    def charge(self, share: float) -> None:
-        """Set the charge, 0 to 1."""
-        self.used_c = (1.0 - share) * self._airframe.capacity_c
-
-    @property
-    def remaining(self) -> float:
-        """Charge left, 0 to 1."""
-        return max(1.0 - self.used_c / self._airframe.capacity_c, 0.0)
-
-    @property
-    def empty(self) -> bool:
-        """Whether no charge is left: the battery's protection has switched off."""
-        return self.used_c >= self._airframe.capacity_c
-
-    @property
-    def open_circuit_v(self) -> float:
-        """Voltage without load [V], linear between the tenths of the table."""
-        table = self._airframe.open_circuit_v
-        place = self.remaining * (len(table) - 1)
-        low = min(int(place), len(table) - 2)
-        return table[low] + (place - low) * (table[low + 1] - table[low])
-
-    @property
-    def largest_rps(self) -> float:
-        """Largest rotor speed at the present voltage [rad/s]."""
-        return self._airframe.speed_at_0v_rps + self._airframe.speed_per_v_rps * self.voltage_v
-
-    def drain(self, thrust_n: float, duration_s: float) -> None:
-        """Feed the electronics and the rotors' thrust for a time.
-
-        U² - E U + R P = 0 has the voltage U under the power P; beyond E²/4R the battery gives no more, and nothing
-        once it is empty.
-        """
-        if self.empty:
-            self.voltage_v = self.current_a = 0.0
-            return
-        power_w = self._airframe.electronics_w + self._airframe.power_per_thrust_wpn * thrust_n
-        source_v = self.open_circuit_v
-        left = source_v * source_v - 4.0 * self._airframe.resistance_ohm * power_w
-        self.voltage_v = 0.5 * (source_v + math.sqrt(max(left, 0.0)))
-        self.current_a = (source_v - self.voltage_v) / self._airframe.resistance_ohm
-        self.used_c += self.current_a * duration_s
-
 
 Quaternion = tuple[float, float, float, float]  # w, x, y, z: turns body axes into NED
 
@@ -176,13 +44,13 @@ class Body:
     body_drag_kgpm: Vec3  # ½ ρ C_d A
 
     @classmethod
-    def of(cls, airframe: Airframe) -> Body:
+    def from_airframe(cls, airframe: Airframe) -> Body:
         """Return the body of an airframe."""
         front, right, down = (0.5 * AIR_DENSITY_KGPM3 * area for area in airframe.drag_area_m2)
         return cls(airframe.mass_kg, airframe.inertia_kgm2, airframe.rotor_drag_kg, (front, right, down))
 
 
-def turned(attitude: Quaternion, angle: Vec3) -> Quaternion:
+def rotate_attitude(attitude: Quaternion, angle: Vec3) -> Quaternion:
     """Return the attitude turned further by a rotation vector [rad] in body axes; of unit norm."""
     w, x, y, z = attitude
     p, q, r = angle
@@ -201,19 +69,19 @@ def turned(attitude: Quaternion, angle: Vec3) -> Quaternion:
     return w * scale, x * scale, y * scale, z * scale
 
 
-def uprighted(attitude: Quaternion, keep: float) -> Quaternion:
+def reduce_tilt(attitude: Quaternion, factor: float) -> Quaternion:
     """Return the attitude with the tangent of half its tilt shrunk to the share `keep`; the heading stays."""
     w, x, y, z = attitude
     heading = math.sqrt(w * w + z * z)
     c, s = (w / heading, z / heading) if heading > 0.0 else (1.0, 0.0)
     # attitude = (heading, tx, ty, 0) ⊗ (c, 0, 0, s)
-    tx, ty = keep * (x * c - y * s), keep * (y * c + x * s)
+    tx, ty = factor * (x * c - y * s), factor * (y * c + x * s)
     norm = math.sqrt(heading * heading + tx * tx + ty * ty)
     heading, tx, ty = heading / norm, tx / norm, ty / norm
     return heading * c, tx * c + ty * s, ty * c - tx * s, heading * s
 
 
-def acceleration(body: Body, attitude: Quaternion, velocity: Vec3, wrench: Wrench, wind: Vec3) -> Vec3:
+def compute_acceleration(body: Body, attitude: Quaternion, velocity: Vec3, wrench: Wrench, wind: Vec3) -> Vec3:
     """Return the acceleration of the centre of mass in NED [m/s²], with gravity.
 
     Drag in body axes, of the velocity v relative to the air: -(d ΣΩ + ½ ρ C_d A |v|) v, each axis with its own
@@ -240,7 +108,7 @@ def acceleration(body: Body, attitude: Quaternion, velocity: Vec3, wrench: Wrenc
     )
 
 
-def _spin(body: Body, rates: Vec3, torque: Vec3) -> Vec3:
+def _compute_angular_accel(body: Body, rates: Vec3, torque: Vec3) -> Vec3:
     """Return angular accelerations by Euler's equations: J ω' = τ - ω x J ω."""
     jx, jy, jz = body.inertia_kgm2
     p, q, r = rates
@@ -251,7 +119,7 @@ def _spin(body: Body, rates: Vec3, torque: Vec3) -> Vec3:
     )
 
 
-def _turning(angle: Vec3, rates: Vec3) -> Vec3:
+def _compute_rotation_vector_rate(angle: Vec3, rates: Vec3) -> Vec3:
     """Return the rate of the rotation vector: θ' = ω + ½ θ x ω + 1/12 θ x (θ x ω), enough for fourth order."""
     a, b, c = angle
     p, q, r = rates
@@ -263,11 +131,11 @@ def _turning(angle: Vec3, rates: Vec3) -> Vec3:
     )
 
 
-def _along(start: Vec3, slope: Vec3, h: float) -> Vec3:
+def _add_scaled(start: Vec3, slope: Vec3, h: float) -> Vec3:
     return start[0] + h * slope[0], start[1] + h * slope[1], start[2] + h * slope[2]
 
 
-def _mean(a: Vec3, b: Vec3, c: Vec3, d: Vec3) -> Vec3:
+def _average_slopes(a: Vec3, b: Vec3, c: Vec3, d: Vec3) -> Vec3:
     """Return the mean slope by the weights of the classical Runge-Kutta method (Simpson's rule)."""
     return (
         (a[0] + 2.0 * (b[0] + c[0]) + d[0]) / 6.0,
@@ -276,7 +144,9 @@ def _mean(a: Vec3, b: Vec3, c: Vec3, d: Vec3) -> Vec3:
     )
 
 
-def step(body: Body, start: BodyState, wrenches: tuple[Wrench, Wrench, Wrench], wind: Vec3, h: float) -> BodyState:
+def integrate_step(
+    body: Body, start: BodyState, wrenches: tuple[Wrench, Wrench, Wrench], wind: Vec3, h: float
+) -> BodyState:
     """Return the state after one step of Runge and Kutta's fourth-order method, after Munthe-Kaas on the rotations.
 
     The attitude moves by the exponential of a rotation vector that is integrated like any other variable, so it
@@ -292,26 +162,26 @@ def step(body: Body, start: BodyState, wrenches: tuple[Wrench, Wrench, Wrench], 
     position, v1, attitude, w1 = start
     half = 0.5 * h
 
-    a1 = acceleration(body, attitude, v1, first, wind)
-    s1 = _spin(body, w1, first.torque_nm)
+    a1 = compute_acceleration(body, attitude, v1, first, wind)
+    s1 = _compute_angular_accel(body, w1, first.torque_nm)
 
-    angle = _along((0.0, 0.0, 0.0), w1, half)
-    w2 = _along(w1, s1, half)
-    t2 = _turning(angle, w2)
-    a2 = acceleration(body, turned(attitude, angle), _along(v1, a1, half), middle, wind)
-    s2 = _spin(body, w2, middle.torque_nm)
+    angle = _add_scaled((0.0, 0.0, 0.0), w1, half)
+    w2 = _add_scaled(w1, s1, half)
+    t2 = _compute_rotation_vector_rate(angle, w2)
+    a2 = compute_acceleration(body, rotate_attitude(attitude, angle), _add_scaled(v1, a1, half), middle, wind)
+    s2 = _compute_angular_accel(body, w2, middle.torque_nm)
 
-    angle = _along((0.0, 0.0, 0.0), t2, half)
-    w3 = _along(w1, s2, half)
-    t3 = _turning(angle, w3)
-    a3 = acceleration(body, turned(attitude, angle), _along(v1, a2, half), middle, wind)
-    s3 = _spin(body, w3, middle.torque_nm)
+    angle = _add_scaled((0.0, 0.0, 0.0), t2, half)
+    w3 = _add_scaled(w1, s2, half)
+    t3 = _compute_rotation_vector_rate(angle, w3)
+    a3 = compute_acceleration(body, rotate_attitude(attitude, angle), _add_scaled(v1, a2, half), middle, wind)
+    s3 = _compute_angular_accel(body, w3, middle.torque_nm)
 
-    angle = _along((0.0, 0.0, 0.0), t3, h)
-    w4 = _along(w1, s3, h)
-    t4 = _turning(angle, w4)
-    a4 = acceleration(body, turned(attitude, angle), _along(v1, a3, h), last, wind)
-    s4 = _spin(body, w4, last.torque_nm)
+    angle = _add_scaled((0.0, 0.0, 0.0), t3, h)
+    w4 = _add_scaled(w1, s3, h)
+    t4 = _compute_rotation_vector_rate(angle, w4)
+    a4 = compute_acceleration(body, rotate_attitude(attitude, angle), _add_scaled(v1, a3, h), last, wind)
+    s4 = _compute_angular_accel(body, w4, last.torque_nm)
 
     sixth = h * h / 6.0
     return BodyState(
@@ -320,101 +190,7 @@ def step(body: Body, start: BodyState, wrenches: tuple[Wrench, Wrench, Wrench], 
             position[1] + h * v1[1] + sixth * (a1[1] + a2[1] + a3[1]),
             position[2] + h * v1[2] + sixth * (a1[2] + a2[2] + a3[2]),
         ),
-        _along(v1, _mean(a1, a2, a3, a4), h),
-        turned(attitude, _along((0.0, 0.0, 0.0), _mean(w1, t2, t3, t4), h)),
-        _along(w1, _mean(s1, s2, s3, s4), h),
+        _add_scaled(v1, _average_slopes(a1, a2, a3, a4), h),
+        rotate_attitude(attitude, _add_scaled((0.0, 0.0, 0.0), _average_slopes(w1, t2, t3, t4), h)),
+        _add_scaled(w1, _average_slopes(s1, s2, s3, s4), h),
     )
-
-
-# The four rotors: their speeds, what they do to the body, and how a wanted thrust and torque is shared among them.
-#
-# Order: front right, rear right, rear left, front left. The first and third turn against the clock seen from above, so
-# that their reaction torque is to the right (positive about down).
-
-
-Four = tuple[float, float, float, float]
-
-STOPPED: Four = (0.0, 0.0, 0.0, 0.0)
-
-
-class Rotors:
-    """Rotors with a first-order lag of the speed, thrust k_T Ω² and reaction torque k_Q Ω².
-
-    Attributes:
-        speeds_rps: present speeds.
-        commands_rps: speeds that they tend to.
-        thrust_limited: whether the last command gave more or less thrust than was wanted.
-        torque_limited: whether the last command gave more or less torque than was wanted.
-    """
-
-    def __init__(self, airframe: Airframe, step_s: float) -> None:
-        self._thrust_n_s2 = airframe.thrust_n_s2
-        self._lever_m = airframe.arm_m * math.sqrt(0.5)
-        self._torque_m = airframe.torque_m
-        self._idle_n = airframe.thrust_n_s2 * airframe.idle_rps**2
-        self._half_decay = math.exp(-0.5 * step_s / airframe.motor_lag_s)
-        self._decay = math.exp(-step_s / airframe.motor_lag_s)
-        self.speeds_rps: Four = STOPPED
-        self.commands_rps: Four = STOPPED
-        self.thrust_limited = self.torque_limited = False
-
-    def wrench(self, speeds_rps: Four) -> Wrench:
-        """Return force and torque of rotors at these speeds."""
-        k = self._thrust_n_s2
-        a, b, c, d = speeds_rps
-        f1, f2, f3, f4 = k * a * a, k * b * b, k * c * c, k * d * d
-        return Wrench(
-            f1 + f2 + f3 + f4,
-            (
-                self._lever_m * (f3 + f4 - f1 - f2),
-                self._lever_m * (f1 + f4 - f2 - f3),
-                self._torque_m * (f1 + f3 - f2 - f4),
-            ),
-            a + b + c + d,
-        )
-
-    def step(self) -> tuple[Wrench, Wrench, Wrench]:
-        """Move on by one step, exactly; return the wrenches at its start, middle and end."""
-        start = self.speeds_rps
-        middle = self._lagged(self._half_decay)
-        self.speeds_rps = self._lagged(self._decay)
-        return self.wrench(start), self.wrench(middle), self.wrench(self.speeds_rps)
-
-    def _lagged(self, decay: float) -> Four:
-        (a, b, c, d), (p, q, r, s) = self.speeds_rps, self.commands_rps
-        return p + (a - p) * decay, q + (b - q) * decay, r + (c - r) * decay, s + (d - s) * decay
-
-    def stop(self) -> None:
-        """Switch off."""
-        self.commands_rps = STOPPED
-
-    def command(self, thrust_n: float, torque_nm: Vec3, largest_rps: float) -> None:
-        """Command the speeds that give this thrust and torque, as far as the rotors can.
-
-        Where they cannot, roll and pitch come first, then the thrust, then yaw: a vehicle that keeps its
-        lean keeps its way.
-
-        Args:
-            largest_rps: speed that the battery's voltage allows.
-        """
-        lowest = self._idle_n
-        highest = max(self._thrust_n_s2 * largest_rps * largest_rps, lowest)
-        roll, pitch = 0.25 * torque_nm[0] / self._lever_m, 0.25 * torque_nm[1] / self._lever_m
-        yaw = 0.25 * torque_nm[2] / self._torque_m
-        reach = abs(roll) + abs(pitch)
-        half = 0.5 * (highest - lowest)
-        clipped = reach > half
-        if clipped:
-            roll, pitch, reach = roll * half / reach, pitch * half / reach, half
-        each = min(max(0.25 * thrust_n, lowest + reach), highest - reach)
-        room = min(highest - reach - each, each - reach - lowest)
-        turn = min(max(yaw, -room), room)
-        self.thrust_limited = each != 0.25 * thrust_n
-        self.torque_limited = clipped or turn != yaw
-        k = self._thrust_n_s2
-        self.commands_rps = (
-            math.sqrt(max(each - roll + pitch + turn, 0.0) / k),
-            math.sqrt(max(each - roll - pitch - turn, 0.0) / k),
-            math.sqrt(max(each + roll - pitch + turn, 0.0) / k),
-            math.sqrt(max(each + roll + pitch - turn, 0.0) / k),
-        )

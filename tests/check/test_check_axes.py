@@ -10,8 +10,10 @@ import pytest
 from check_rig import Checked, Hand, S, look, twisted
 from mavlink_rig import packets, read
 
-from uavctl.check.findings import Heard, ItemState, Sample
-from uavctl.check.preflight import Preflight, axis_items, compared
+from uavctl.check.axes import check_axes, has_vehicle_position
+from uavctl.check.check_data import CheckData, Sample
+from uavctl.check.findings import ItemState
+from uavctl.check.preflight import Preflight
 from uavctl.config import load_config
 from uavctl.loop import make_links
 from uavctl.mavlink.messages import Heartbeat
@@ -288,15 +290,15 @@ def test_the_recorded_flight_in_a_wrong_frame_is_caught(wrong: str) -> None:
     assert recorded(wrong)["axes"].state is ItemState.BAD
 
 
-def seen_with(autopilot: int, flags: int) -> Heard:
+def seen_with(autopilot: int, flags: int) -> CheckData:
     """A vehicle at rest whose estimator tells these flags, with positions of its own beside the cameras'."""
     beat = Heartbeat(
         system=1, component=1, vehicle_type=2, autopilot=autopilot, base_mode=0, custom_mode=0, system_status=3
     )
-    seen = Heard(0, heartbeat=beat, estimator=flags)
+    seen = CheckData(0, heartbeat=beat, estimator=flags)
     for k in range(20):
         at_ns = k * S // 10
-        seen.own.append((at_ns, (1.0, 2.0, -0.1)))
+        seen.vehicle_positions.append((at_ns, (1.0, 2.0, -0.1)))
         seen.samples.append(Sample(at_ns + 1, at_ns + 2, (1.0, 2.0, -0.1), None, "VISION_POSITION_ESTIMATE"))
     return seen
 
@@ -314,8 +316,8 @@ def seen_with(autopilot: int, flags: int) -> Heard:
 )
 def test_a_resting_px4_has_a_position_of_its_own(autopilot: int, flags: int, there: bool) -> None:
     seen = seen_with(autopilot, flags)
-    assert compared(seen) is there
-    own = axis_items(seen, load_config("room-hahn-stursberg"), [])[0]
+    assert has_vehicle_position(seen) is there
+    own = check_axes(seen, load_config("room-hahn-stursberg"), [])[0]
     assert own.name == "own position" and (own.state is ItemState.GOOD) is there
 
 
@@ -341,6 +343,6 @@ def test_a_recorded_px4_at_rest_over_a_lossy_link_has_a_position_and_its_origin_
 
 def test_another_origin_is_found_beside_a_resting_px4() -> None:
     seen = seen_with(12, 0x1EF)
-    seen.own = [(at_ns, (1.0, 0.0, -0.1)) for at_ns, _ in seen.own]
-    axes = axis_items(seen, load_config("room-hahn-stursberg"), [])[1]
+    seen.vehicle_positions = [(at_ns, (1.0, 0.0, -0.1)) for at_ns, _ in seen.vehicle_positions]
+    axes = check_axes(seen, load_config("room-hahn-stursberg"), [])[1]
     assert axes.name == "axes" and axes.state is ItemState.BAD

@@ -20,7 +20,7 @@ from logs.recording.info import info
 from logs.recording.parameters import ParameterReader
 from logs.recording.recorder import SyncRecorder
 from sim.simulation import Peers
-from uavctl.check.findings import ItemState, item
+from uavctl.check.findings import ItemState, make_item
 from uavctl.cli.app import run
 from uavctl.cli.check import disk_items, record_items, record_parameters, run_preflight
 from uavctl.config import load_config
@@ -256,7 +256,7 @@ def test_prompts_are_told_once_each_and_the_guided_check_ends_too() -> None:
 
 def test_what_was_found_goes_into_the_recording() -> None:
     memory = Memory()
-    items = [item(each, each, "value", "want", "hint") for each in ItemState]
+    items = [make_item(each, each, "value", "want", "hint") for each in ItemState]
     record_items(memory, items, 7)
     assert [(one.at_ns, one.name, one.state) for one in memory.of(Checked)] == [(7, each, each) for each in ItemState]
     assert not memory.of(Event)  # a replay compares events, and knows nothing of a check

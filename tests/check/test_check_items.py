@@ -12,9 +12,9 @@ from mavlink_rig import MS, Peer
 from sim_rig import decode
 
 from sim.simulation import Peers
-from uavctl.check.findings import ItemState, item, refusals
+from uavctl.check.findings import ItemState, find_refusals, make_item
+from uavctl.check.parameters import list_parameters
 from uavctl.check.preflight import Preflight
-from uavctl.check.vehicle import wanted
 from uavctl.config import load_config
 from uavctl.config.connections import CheckConfig
 from uavctl.lab.own_loop import EXTERNAL_ONLY
@@ -52,7 +52,7 @@ def test_on_a_shared_link_the_vehicle_s_own_estimate_is_offered(shared: bool) ->
     flight, vehicle = Preflight(config, make_links, 0), Peer(1, 1)
     for at_ns in (MS, 2 * MS):
         flight.receive("vehicle", vehicle.heartbeat() + vehicle.local_position(at_ns // MS), at_ns)
-    one = next(one for one in flight.items(3 * MS) if one.name == "positions")
+    one = next(one for one in flight.make_items(3 * MS) if one.name == "positions")
     assert one.state is ItemState.BAD and ("LOCAL_POSITION_NED" in one.hint) == shared
 
 
@@ -238,7 +238,7 @@ def test_the_rate_of_the_vehicles_own_velocity_is_told(
     for period_ms in periods_ms:
         at_ms += period_ms
         flight.receive("vehicle", vehicle.local_position(at_ms), at_ms * MS)
-    one = next(one for one in flight.items((at_ms + 1) * MS) if one.name == "own velocity")
+    one = next(one for one in flight.make_items((at_ms + 1) * MS) if one.name == "own velocity")
     assert (one.value, one.state) == (told, wanted_state)
 
 
@@ -247,7 +247,7 @@ def test_what_is_to_take_off_is_not_armed_already(armed: bool) -> None:
     config = load_config("room-hahn-stursberg")
     flight = Preflight(config, make_links, 0, take_off_m=1.0)
     flight.receive("vehicle", Peer(1, 1).heartbeat(base_mode=129 if armed else 1), 1)
-    one = next(one for one in flight.items(1) if one.name == "armed")
+    one = next(one for one in flight.make_items(1) if one.name == "armed")
     assert one.state is (ItemState.BAD if armed else ItemState.GOOD)
     assert ("without --arm" in one.hint) == armed
 
@@ -280,7 +280,7 @@ def test_a_check_sends_nothing_that_arms_or_moves(autopilot: str) -> None:
     }
     assert kinds <= quiet | {"SET_GPS_GLOBAL_ORIGIN"}
     assert commands <= {511, 512}  # MAV_CMD_SET_MESSAGE_INTERVAL, MAV_CMD_REQUEST_MESSAGE
-    assert not peers.autopilot.pilot.armed
+    assert not peers.autopilot.pilot.is_armed
 
 
 # --- a camera system without a bridge --------------------------------------------------------------------------------
@@ -289,8 +289,8 @@ MOTIVE = "daemon.mocap=natnet://10.0.0.5/drone"
 
 
 def test_without_a_position_the_hint_is_of_who_should_have_sent_it() -> None:
-    bridge = Preflight(load_config("room-hahn-stursberg"), make_links, 0).items(3 * S)
-    motive = Preflight(load_config("room-hahn-stursberg", [MOTIVE]), make_links, 0).items(3 * S)
+    bridge = Preflight(load_config("room-hahn-stursberg"), make_links, 0).make_items(3 * S)
+    motive = Preflight(load_config("room-hahn-stursberg", [MOTIVE]), make_links, 0).make_items(3 * S)
     hints = [next(one.hint for one in items if one.name == "positions") for items in (bridge, motive)]
     assert "VISION_POSITION_ESTIMATE" in hints[0] and "Motive" not in hints[0]
     assert "Motive track the body" in hints[1] and "VISION_POSITION_ESTIMATE" not in hints[1]
@@ -318,9 +318,9 @@ def told_by_motive(*place: float) -> Preflight:
 
 
 def test_a_body_of_motive_s_out_of_the_room_is_a_matter_of_its_up_axis_not_of_units() -> None:
-    place = {one.name: one for one in told_by_motive(0.1, 0.2, 1.2).items(3 * S)}["position in the room"]
+    place = {one.name: one for one in told_by_motive(0.1, 0.2, 1.2).make_items(3 * S)}["position in the room"]
     assert place.state is ItemState.BAD and "?up=z" in place.hint and "frame.convention" not in place.hint
-    place = {one.name: one for one in told_by_motive(50.0, 20.0, -90.0).items(3 * S)}["position in the room"]
+    place = {one.name: one for one in told_by_motive(50.0, 20.0, -90.0).make_items(3 * S)}["position in the room"]
     assert place.state is ItemState.BAD and "metres" not in place.hint
 
 
@@ -328,9 +328,9 @@ def test_a_body_of_motive_s_out_of_the_room_is_a_matter_of_its_up_axis_not_of_un
 
 
 def test_only_bad_items_forbid_arming_and_accepted_ones_do_not() -> None:
-    items = [item(f"one {each}", each, "x", "y", "z") for each in ItemState]
-    assert [one.name for one in refusals(items, CheckConfig())] == ["one bad"]
-    assert refusals(items, CheckConfig(accept=("one bad",))) == ()
+    items = [make_item(f"one {each}", each, "x", "y", "z") for each in ItemState]
+    assert [one.name for one in find_refusals(items, CheckConfig())] == ["one bad"]
+    assert find_refusals(items, CheckConfig(accept=("one bad",))) == ()
 
 
 def test_the_heading_of_a_turned_body_is_a_mean_of_directions() -> None:
@@ -363,7 +363,7 @@ def test_absurd_values_of_a_vehicle_never_raise(autopilot: int, value: float) ->
     hand = Hand(own=True)
     hand.rest(2.0)
     hand.tell(hand.vehicle.heartbeat(autopilot=autopilot, custom_mode=4))
-    for name in wanted(autopilot):
+    for name in list_parameters(autopilot):
         for kind in (2, 6, 9):
             hand.tell(hand.vehicle.send("param_value", name.encode(), value, kind, 9, 3))
     for n in range(20):
@@ -385,4 +385,4 @@ def test_random_bytes_never_raise(chunks: list[bytes]) -> None:
     for n, data in enumerate(chunks):
         flight.receive("vehicle" if n % 2 else "mocap", data, n * MS)
         flight.tick(n, n * MS, to_nobody)
-    assert flight.items(S)
+    assert flight.make_items(S)

@@ -17,12 +17,12 @@ from mavlink_rig import packets, read
 from places import ROOT
 
 from sim.simulation import Peers
-from uavctl.check.findings import ItemState, describe, refusals
+from uavctl.check.findings import ItemState, describe_item, find_refusals
+from uavctl.check.parameters import RULES, ParameterVerdict
 from uavctl.check.preflight import Preflight
-from uavctl.check.vehicle import RULES, ParameterVerdict
 from uavctl.cli.init import read_sizes, room_text
 from uavctl.config import Config, load_config, parse
-from uavctl.config.checks import position_limits_m
+from uavctl.config.checks import get_position_limits_m
 from uavctl.lab.own_loop import EXTERNAL_ONLY
 from uavctl.loop import make_links
 
@@ -286,7 +286,7 @@ def test_a_simulated_vehicle_passes_the_check_of_each_preset_and_of_the_manual_s
 ) -> None:
     config = loaded(name, autopilot, overrides)
     simulated = loaded(name, autopilot, [*overrides, f"sim.autopilot={autopilot}"])
-    place = [(a + b) / 2.0 for a, b in position_limits_m(config).values()]
+    place = [(a + b) / 2.0 for a, b in get_position_limits_m(config).values()]
     simulated = msgspec.structs.replace(
         simulated, sim=msgspec.structs.replace(simulated.sim, start_position_m=(*place[:2], -0.1), seed=1)
     )
@@ -296,7 +296,7 @@ def test_a_simulated_vehicle_passes_the_check_of_each_preset_and_of_the_manual_s
     for tick in range(ticks):
         for arrival_ns, link, data in peers.advance(tick * tick_ns):
             flight.receive(link, data, arrival_ns)
-        flight.tick(tick, tick * tick_ns, peers.receiver(tick * tick_ns))
-    found = flight.items(ticks * tick_ns)
-    assert [describe(one) for one in refusals(found, config.check)] == []
+        flight.tick(tick, tick * tick_ns, peers.make_sender(tick * tick_ns))
+    found = flight.make_items(ticks * tick_ns)
+    assert [describe_item(one) for one in find_refusals(found, config.check)] == []
     assert {one.name: one.state for one in found}[TIMEOUTS[3 if autopilot == "ardupilot" else 12]] is ItemState.GOOD

@@ -23,7 +23,7 @@ from operation_rig import PATIENT_DAEMON, PATIENT_VEHICLE, ended, port
 from patience import until
 from places import ROOT, without_pages
 
-from sim.server import Seat, serve_all
+from sim.server import VehicleSetup, serve_all
 from uavctl.cli.app import run
 from uavctl.cli.ctl import ask
 from uavctl.cli.fleet import FleetFlight, Member, horizontally_apart_m, read_fleet
@@ -163,7 +163,7 @@ def flying() -> Iterator[tuple[Path, dict[str, list[Truth]], subprocess.Popen[st
         vehicle, mocap = (f"127.0.0.1:{one}" for one in ports)
         start = f"sim.start_position_m=[0,{sum(limits) / 2},-1]"
         config = load_config("room-px4", [PATIENT_VEHICLE, start, f"sim.system_id={number + 1}"])
-        seats.append(Seat(config, f"udpout://{vehicle}", f"udpout://{mocap}", truths[name].append))
+        seats.append(VehicleSetup(config, f"udpout://{vehicle}", f"udpout://{mocap}", truths[name].append))
         tables.append(entry(name, limits, f"udpin://{vehicle}", f"udpin://{mocap}", *PATIENT_DAEMON))
     peers = threading.Thread(
         target=serve_all,

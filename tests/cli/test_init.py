@@ -13,7 +13,7 @@ from uavctl.cli.app import run
 from uavctl.cli.init import WALL_M, read_sizes, room_text
 from uavctl.cli.sim import VEHICLES
 from uavctl.config import dump_config, load, parse
-from uavctl.config.checks import position_limits_m
+from uavctl.config.checks import get_position_limits_m
 from uavctl.errors import ConfigError, UsageError
 
 
@@ -28,7 +28,7 @@ def test_the_file_has_a_dozen_keys_and_is_the_room(autopilot: str, tmp_path: Pat
     table = tomllib.loads(path.read_text())
     assert sum(len(one) if isinstance(one, dict) else 1 for one in table.values()) <= 16
     config = load(str(path)).config
-    assert position_limits_m(config) == {
+    assert get_position_limits_m(config) == {
         "north": (-4.0 + WALL_M, 4.0 - WALL_M),
         "east": (-2.0 + WALL_M, 2.0 - WALL_M),
         "down": (-3.0 + WALL_M, 0.0),
@@ -36,7 +36,7 @@ def test_the_file_has_a_dozen_keys_and_is_the_room(autopilot: str, tmp_path: Pat
     assert config.name == "mine"
     assert config.sim.autopilot == autopilot
     assert design_of(config).plant.axes == ("north", "east", "down")
-    for axis, (low, high) in position_limits_m(config).items():
+    for axis, (low, high) in get_position_limits_m(config).items():
         place = ("north", "east", "down").index(axis)
         assert low < config.target.position_m[place] < high
         assert low < config.sim.start_position_m[place] < high

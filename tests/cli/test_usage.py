@@ -19,7 +19,7 @@ from rich.console import Console
 from uavctl.cli.app import app, run
 from uavctl.cli.common import columns, labelled, messages, pictures, two_columns
 from uavctl.cli.usage import EXAMPLES, commands_of, example
-from uavctl.config.load import keys_named
+from uavctl.config.load import find_keys
 from uavctl.frames import suggest_height_sign
 
 COMMANDS = {" ".join(chain): one for chain, one in commands_of(app)}
@@ -75,7 +75,7 @@ def told(capsys: pytest.CaptureFixture[str], words: Sequence[str]) -> str:
         ("loopback loss=0.3", ["--set link.loss=0.3"]),
         ("loopback --seeds 3", ["--seed"]),
         ("loopback --duratoin 3", ["--duration"]),
-        ("loopback --rate 20", [f"--set {key}=20" for key in keys_named("rate")]),
+        ("loopback --rate 20", [f"--set {key}=20" for key in find_keys("rate")]),
         ("loopback --set loss=0.3", ["link.loss"]),
         ("loopback --set smpc.loss=0.3", ["link.loss"]),
         ("-v", ["--version"]),

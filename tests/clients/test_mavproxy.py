@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from client_rig import LIMIT_S, free_port, interpreter, simulator
 
-from sim.autopilot.profile import ARDUPILOT_PARAMETERS
+from sim.autopilot.parameters import ARDUPILOT_PARAMETERS
 
 
 class Console:

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from places import ROOT
 
 from uavctl.build.controller import build_spec
-from uavctl.config import Config, dump_config, explain, load, load_config, parse, presets
-from uavctl.config.document import key_lines
+from uavctl.config import Config, describe_design_error, dump_config, load, load_config, parse, presets
+from uavctl.config.document import find_key_lines
 from uavctl.config.load import parse_recorded
 from uavctl.config.mission import FenceConfig
 from uavctl.config.types import SmpcConfig
@@ -226,13 +226,15 @@ def test_a_design_error_is_told_with_file_and_line() -> None:
     error = DesignError("smpc.k_tau", "spectral radius 1.2 is not below 1", "give a smaller gain")
     loaded = parse(PAPER, "my.toml")
     line = line_of(PAPER, "k_tau =")
-    assert explain(loaded.source, error) == (
+    assert describe_design_error(loaded.source, error) == (
         f"my.toml:{line}: smpc.k_tau: spectral radius 1.2 is not below 1; give a smaller gain"
     )
     overridden = parse(PAPER, "my.toml", ["smpc.delta_x=0.999"]).source
-    assert explain(overridden, DesignError("smpc.delta_x", "a", "b")).startswith("--set smpc.delta_x=0.999: ")
+    assert describe_design_error(overridden, DesignError("smpc.delta_x", "a", "b")).startswith(
+        "--set smpc.delta_x=0.999: "
+    )
     # A key with a default, which the file does not have, is told at its table.
-    assert explain(loaded.source, DesignError("schedule.gamma_max", "a", "b")).startswith(
+    assert describe_design_error(loaded.source, DesignError("schedule.gamma_max", "a", "b")).startswith(
         f"my.toml:{line_of(PAPER, '[schedule]')}: "
     )
 
@@ -256,7 +258,7 @@ four = 4
 four = \'\'\'it's\'\'\'
 five = 'x'
 '''
-    lines = key_lines(text)
+    lines = find_key_lines(text)
     assert lines == {
         "title": 2,
         "many": 3, "many[0]": 4, "many[0][0]": 4, "many[0][1]": 4, "many[1]": 5, "many[1][0]": 5, "many[1][1]": 6,
@@ -282,7 +284,7 @@ def test_index_agrees_with_a_document_written_line_by_line(document: dict[str, d
         for key, value in pairs.items():
             written.append(f"{key} = {toml(value)}")
             wanted[f"{table}.{key}"] = len(written)
-    lines = key_lines("\n".join(written))
+    lines = find_key_lines("\n".join(written))
     assert {key: line for key, line in lines.items() if "[" not in key} == wanted
 
 

@@ -15,16 +15,16 @@ from config_mutants import CONFIG, Case, Mutants, bases, ranges
 from uavctl.cli.app import run
 from uavctl.config import Config, dump_config, load, load_config, parse
 from uavctl.config.document import (
-    DEEPEST,
-    LONGEST_LIST,
-    LONGEST_MOTION,
-    MOST_BYTES,
-    MOST_VALUES,
+    MAX_BYTES,
+    MAX_DEPTH,
+    MAX_LIST_LENGTH,
+    MAX_TRAJECTORY_SAMPLES,
+    MAX_VALUES,
     DataFileError,
-    excess,
+    find_excess,
     read_text,
 )
-from uavctl.config.link import LONGEST_TRACE
+from uavctl.config.link import MAX_TRACE_PACKETS
 from uavctl.config.mission import TrajectoryConfig
 from uavctl.errors import ConfigError
 from uavctl.lab.campaign.spec import read_campaign
@@ -41,14 +41,14 @@ def told(text: str, *overrides: str) -> tuple[str, ...]:
 
 
 @pytest.mark.parametrize("brackets", ["[]", "{}"])
-@pytest.mark.parametrize("depth", [DEEPEST + 1, 500, 200_000])
+@pytest.mark.parametrize("depth", [MAX_DEPTH + 1, 500, 200_000])
 @pytest.mark.fault(33)
 def test_deep_nesting_is_refused_with_its_line(brackets: str, depth: int) -> None:
     opened = brackets[0] if brackets == "[]" else "{a="
     text = PAPER + f"\n[extra]\ndeep = {opened * depth}1{brackets[1] * depth}\n"
     (problem,) = told(text)
     line = text.splitlines().index("[extra]") + 2
-    assert problem.startswith(f"my.toml:{line}: ") and f"more than {DEEPEST} deep" in problem
+    assert problem.startswith(f"my.toml:{line}: ") and f"more than {MAX_DEPTH} deep" in problem
 
 
 @pytest.mark.parametrize("value", ["[" * 5000 + "]" * 5000, "{a=" * 5000 + "1" + "}" * 5000])
@@ -57,7 +57,7 @@ def test_deep_nesting_of_an_override_is_refused(value: str) -> None:
     assert problem.startswith("--set link.loss=") and "deep" in problem
 
 
-@pytest.mark.parametrize("parts", [DEEPEST + 1, 3000])
+@pytest.mark.parametrize("parts", [MAX_DEPTH + 1, 3000])
 def test_dotted_keys_are_as_deep_as_brackets(parts: int) -> None:
     path = ".".join("a" * parts)
     assert "deep" in told(f"{path} = 1\n" + PAPER)[0]
@@ -65,18 +65,18 @@ def test_dotted_keys_are_as_deep_as_brackets(parts: int) -> None:
 
 
 def test_brackets_in_strings_and_comments_are_none() -> None:
-    assert excess(f'a = "{"[" * 50}"\nb = \'{"{" * 50}\'\n# {"[" * 50}\nc = """\n{"[" * 50}"""\n') is None
-    assert excess("a = [\n" * (DEEPEST + 1)) == (
-        DEEPEST + 1,
-        f"brackets are nested more than {DEEPEST} deep, or not closed",
+    assert find_excess(f'a = "{"[" * 50}"\nb = \'{"{" * 50}\'\n# {"[" * 50}\nc = """\n{"[" * 50}"""\n') is None
+    assert find_excess("a = [\n" * (MAX_DEPTH + 1)) == (
+        MAX_DEPTH + 1,
+        f"brackets are nested more than {MAX_DEPTH} deep, or not closed",
     )
 
 
 def test_long_texts_are_refused_before_they_are_read_as_toml() -> None:
-    (problem,) = told(f'name = "{"a" * MOST_BYTES}"\n')
+    (problem,) = told(f'name = "{"a" * MAX_BYTES}"\n')
     assert problem.startswith("my.toml:1: ") and "characters" in problem
-    (problem,) = told("a = 1\n" * (MOST_VALUES + 1))  # a key that is there twice, were it read
-    assert f"more than {MOST_VALUES}" in problem
+    (problem,) = told("a = 1\n" * (MAX_VALUES + 1))  # a key that is there twice, were it read
+    assert f"more than {MAX_VALUES}" in problem
 
 
 @pytest.mark.parametrize(
@@ -87,7 +87,7 @@ def test_long_texts_are_refused_before_they_are_read_as_toml() -> None:
         (f'name="{"a" * 2000}"', "name"),
         ('name="a\\u001b[2J"', "name"),
         (f"mission.waypoints=[{'[0,0,-1],' * 1001}]", "mission.waypoints"),
-        (f"mission.waypoints=[{'[0,0,-1],' * (LONGEST_LIST + 1)}]", "mission.waypoints"),
+        (f"mission.waypoints=[{'[0,0,-1],' * (MAX_LIST_LENGTH + 1)}]", "mission.waypoints"),
         ("daemon.tick_s=1e-9", "daemon.tick_s"),
         ("plant.dt_s=1e6", "plant.dt_s"),
         (f"sim.seed={2**70}", "sim.seed"),
@@ -129,17 +129,17 @@ def test_many_unknown_keys_are_told_in_short() -> None:
 
 def test_a_longest_trace_and_motion_still_make_a_configuration_that_can_be_read_back() -> None:
     config = load_config("paper")
-    places = tuple((i / 3.0e-3 % 20.0, -i / 7.0e-3 % 20.0, 0.1 / 3.0) for i in range(LONGEST_MOTION))
+    places = tuple((i / 3.0e-3 % 20.0, -i / 7.0e-3 % 20.0, 0.1 / 3.0) for i in range(MAX_TRAJECTORY_SAMPLES))
     motion = TrajectoryConfig(
-        times_s=tuple(i / 3.0 for i in range(LONGEST_MOTION)), positions_m=places, velocities_mps=places
+        times_s=tuple(i / 3.0 for i in range(MAX_TRAJECTORY_SAMPLES)), positions_m=places, velocities_mps=places
     )
-    trace = tuple(0.1 / 3.0 + i * 1e-9 / 3.0 for i in range(LONGEST_TRACE))
+    trace = tuple(0.1 / 3.0 + i * 1e-9 / 3.0 for i in range(MAX_TRACE_PACKETS))
     config = msgspec.structs.replace(
         config,
         mission=msgspec.structs.replace(config.mission, trajectory=motion),
         link=msgspec.structs.replace(config.link, model="trace", trace_s=trace),
     )
-    assert excess(dump_config(config)) is None
+    assert find_excess(dump_config(config)) is None
 
 
 def test_every_number_has_a_range() -> None:
@@ -149,11 +149,11 @@ def test_every_number_has_a_range() -> None:
     assert unbounded == []
 
 
-@pytest.mark.parametrize("depth", [DEEPEST + 1, 5000])
+@pytest.mark.parametrize("depth", [MAX_DEPTH + 1, 5000])
 def test_a_campaign_that_nests_deep_is_refused(depth: int, tmp_path: Path) -> None:
     path = tmp_path / "c.toml"
     path.write_text(f'name = "deep"\ndeep = {"[" * depth}{"]" * depth}\n', encoding="utf-8")
-    with pytest.raises(ConfigError, match=f"c.toml:2: brackets are nested more than {DEEPEST} deep"):
+    with pytest.raises(ConfigError, match=f"c.toml:2: brackets are nested more than {MAX_DEPTH} deep"):
         read_campaign(path)
 
 
@@ -187,15 +187,18 @@ def test_a_pipe_is_not_waited_for(pipe: Path) -> None:
 
 def test_a_long_file_is_read_up_to_a_bound(tmp_path: Path) -> None:
     path = tmp_path / "long.csv"
-    path.write_bytes(b"0" * (MOST_BYTES + 1))
-    with pytest.raises(DataFileError, match=f"longer than {MOST_BYTES}"):
+    path.write_bytes(b"0" * (MAX_BYTES + 1))
+    with pytest.raises(DataFileError, match=f"longer than {MAX_BYTES}"):
         read_text(path)
 
 
 @pytest.mark.parametrize(
     ("rows", "told"),
     [
-        (["0,1,1,-1"] * (LONGEST_MOTION + 1), f"has {LONGEST_MOTION + 1} rows, more than {LONGEST_MOTION}"),
+        (
+            ["0,1,1,-1"] * (MAX_TRAJECTORY_SAMPLES + 1),
+            f"has {MAX_TRAJECTORY_SAMPLES + 1} rows, more than {MAX_TRAJECTORY_SAMPLES}",
+        ),
         (["0,1,1,-1", "1,1e300,1,-1"], "motion.csv:2: 1e+300 is beyond 1e+07"),
         (["0,1,1,-1", "1e6,1,1,-1"], "times_s: the last one is 1e+06 steps"),
         (["0,1,1,-1", f"1,{'9' * 100_000},1,-1"], "is not a finite number"),

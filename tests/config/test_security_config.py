@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from uavctl.config import load_config
-from uavctl.config.connections import SecurityConfig, warnings
+from uavctl.config.connections import SecurityConfig, find_security_warnings
 from uavctl.config.load import dump_config
 from uavctl.errors import ConfigError
 
@@ -60,7 +60,7 @@ def test_a_dumped_configuration_comes_back() -> None:
 )
 def test_what_is_open_to_strangers_is_warned_of(overrides: tuple[str, ...], wanted: list[str]) -> None:
     config = load_config("room-hahn-stursberg", overrides)
-    found = warnings(config.security, config.daemon)
+    found = find_security_warnings(config.security, config.daemon)
     assert len(found) == len(wanted)
     for text, words in zip(found, wanted, strict=True):
         names, kind = words.split()

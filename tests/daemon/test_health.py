@@ -42,7 +42,7 @@ class Flight:
             at_ns = self.tick * TICK_NS
             for arrival_ns, link, data in self.peers.advance(at_ns):
                 self.loop.receive(link, data, arrival_ns)
-            self.ticked = self.loop.tick(self.tick, at_ns, self.peers.receiver(at_ns), missed)
+            self.ticked = self.loop.tick(self.tick, at_ns, self.peers.make_sender(at_ns), missed)
             self.watch.after_tick(self.ticked, lateness_ns)
             self.tick += 1
         return self.watch.make_health()

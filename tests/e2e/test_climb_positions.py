@@ -11,7 +11,7 @@ from take_off_rig import GOAL, RELAYED, Flight
 from logs.recording.reader import records
 from uavctl.cli.app import run
 from uavctl.config import load_config
-from uavctl.config.checks import position_index
+from uavctl.config.checks import get_position_index
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.records import Truth
 
@@ -38,10 +38,10 @@ def furthest(flight: Flight) -> tuple[float, float]:
             break
         # An engaged flight is landed, to end it.
         flight.run(0.05, stop=flight.is_in(HandoverState.ENGAGED) and flight.now_ns > 40 * 10**9)
-        north, east, down = flight.peers.autopilot.craft.position_m
+        north, east, down = flight.peers.autopilot.vehicle.position_m
         side_m = max(side_m, abs(north - START_M[0]), abs(east - START_M[1]))
         height_m = max(height_m, -down)
-    assert flight.loop.finished and flight.peers.autopilot.craft.landed, (flight.state, flight.texts[-3:])
+    assert flight.loop.finished and flight.peers.autopilot.vehicle.landed, (flight.state, flight.texts[-3:])
     return side_m, height_m
 
 
@@ -108,7 +108,7 @@ def flown(folder: Path, seed: int, seconds: float, *settings: str) -> tuple[int,
     code = run(["loopback", "--config", "room-ardupilot", "--arm", "--takeoff", "1.2", "--seed", str(seed),
                 "--duration", str(seconds), "--out", str(folder), "--json", *words])  # fmt: skip
     config = load_config("room-ardupilot")
-    sides = [(config.sets.state_lower[i], config.sets.state_upper[i]) for i in position_index(config.plant)]
+    sides = [(config.sets.state_lower[i], config.sets.state_upper[i]) for i in get_position_index(config.plant)]
     beyond = [
         max(low - place, place - high)
         for one in records(folder / "flight.mcap", Truth)

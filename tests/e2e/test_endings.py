@@ -61,7 +61,9 @@ def stick(mode: str) -> Callable[[Endings], None]:
 
 def fail(mode: Role) -> Callable[[Endings], None]:
     """A failsafe of the vehicle's own."""
-    return lambda rig: rig.peers.autopilot.pilot.fail(SIMULATED[rig.config.sim.autopilot].by_role(mode), rig.now_ns)
+    return lambda rig: rig.peers.autopilot.pilot.enter_failsafe(
+        SIMULATED[rig.config.sim.autopilot].get_mode_by_role(mode), rig.now_ns
+    )
 
 
 def deafen(kind: str) -> Callable[[Endings], None]:
@@ -295,13 +297,17 @@ def test_positions_that_jump_in_the_climb_break_it_off(tmp_path: Path, typed: Ty
 
 @pytest.mark.slow
 def test_it_disarms_before_it_has_left_the_ground(tmp_path: Path, typed: Type) -> None:
-    rig = Endings(tmp_path).at(HandoverState.CLIMBING, lambda one: one.peers.autopilot.pilot._disarm(), after_s=0.0)
+    rig = Endings(tmp_path).at(
+        HandoverState.CLIMBING, lambda one: one.peers.autopilot.pilot._apply_disarming(), after_s=0.0
+    )
     typed(rig, Cause.NOT_RISEN, *TAKE_OFF)
 
 
 @pytest.mark.slow
 def test_it_disarms_in_flight(tmp_path: Path, typed: Type) -> None:
-    rig = Endings(tmp_path).at(HandoverState.ENGAGED, lambda one: one.peers.autopilot.pilot._disarm(), after_s=2.0)
+    rig = Endings(tmp_path).at(
+        HandoverState.ENGAGED, lambda one: one.peers.autopilot.pilot._apply_disarming(), after_s=2.0
+    )
     typed(rig, Cause.DISARMED, *TAKE_OFF)
 
 

@@ -195,7 +195,7 @@ def test_a_long_blackout_ends_in_a_landing_that_the_vehicle_obeys() -> None:
     rig = Rig("link.blackout=[[3.0, 100.0]]")
     sent = rig.run(400)
     assert sent.count(LAND) == 1
-    assert not rig.peers.autopilot.pilot.armed and rig.peers.vehicle.position_m[2] == 0.0
+    assert not rig.peers.autopilot.pilot.is_armed and rig.peers.vehicle.position_m[2] == 0.0
     assert rig.loop.finished
     assert SETPOINT not in sent[sent.index(LAND) :]
 
@@ -240,7 +240,7 @@ def test_the_operator_s_stop_brakes_sends_zero_and_asks_for_landing() -> None:
     assert len(braking) > 5
     assert setpoints[-1].source is SetpointSource.HOLD and setpoints[-1].accel_mps2 == (0.0, 0.0, 0.0)
     assert sent.count(LAND) == 1 and rig.loop.finished
-    assert not rig.peers.autopilot.pilot.armed and rig.peers.vehicle.position_m[2] == 0.0
+    assert not rig.peers.autopilot.pilot.is_armed and rig.peers.vehicle.position_m[2] == 0.0
 
 
 def test_without_landing_the_stop_ends_with_zero_and_asks_for_nothing() -> None:

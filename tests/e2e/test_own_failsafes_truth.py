@@ -33,7 +33,7 @@ def until_it_is_down(flight: Flight, seconds: float) -> None:
     flight.run(seconds, until=HandoverState.DONE)
     assert flight.loop.finished
     assert flight.peers.vehicle.position_m[2] == pytest.approx(0.0, abs=0.15)
-    assert not flight.peers.autopilot.pilot.armed
+    assert not flight.peers.autopilot.pilot.is_armed
 
 
 @pytest.mark.slow
@@ -68,7 +68,7 @@ def test_px4_s_blind_descent_is_a_failsafe_and_positions_go_on_as_soon_as_they_a
         if flight.peers.autopilot.mode_name == "AUTO.DESCEND":
             descent.append(flight.now_ns)
         seen_ns = seen_ns or (flight.now_ns if flight.is_in(HandoverState.FAILSAFE, HandoverState.LANDING) else 0)
-    assert descent and flight.loop.finished and not flight.peers.autopilot.pilot.armed
+    assert descent and flight.loop.finished and not flight.peers.autopilot.pilot.is_armed
     assert flight.loop.ending.exit_code == 1, flight.loop.ending
     assert seen_ns - descent[0] < SECOND and not flight.setpoints_between(seen_ns, flight.now_ns)
     back_ns = round((from_s + dark_s) * SECOND)

@@ -11,7 +11,7 @@ from take_off_rig import Flight
 
 from logs.recording.parameters import ParameterReader, listed
 from logs.recording.replay import replay
-from sim.autopilot.profile import TABLES
+from sim.autopilot.parameters import TABLES
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.mavlink.messages import ParamValue
 from uavctl.mavlink.stream_requests import MAX_READ_ROUNDS, MAX_TRIES, READS_PER_BATCH, ParameterDownload

@@ -35,7 +35,7 @@ def test_the_whole_way(autopilot: str, plant: str) -> None:
     assert math.dist(flight.peers.vehicle.position_m, GOAL) < 0.3
     flight.run(20.0, stop=True, until=HandoverState.DONE)
     assert flight.loop.finished and not flight.loop.failure
-    assert not flight.peers.autopilot.pilot.armed and flight.peers.autopilot.craft.landed
+    assert not flight.peers.autopilot.pilot.is_armed and flight.peers.autopilot.vehicle.landed
     went = ["ready", "asking for the mode", "arming", "climbing", "engaging", "engaged", "landing", "settling", "done"]
     assert flight.states == went
     wanted = [SET_MODE, ARM, SET_MODE, LAND] if autopilot == "px4" else [SET_MODE, ARM, TAKE_OFF, LAND]
@@ -78,7 +78,7 @@ def test_a_refusal_to_arm_ends_it_with_the_vehicle_s_own_words() -> None:
     flight.run(12.0, until=HandoverState.FAILED)
     assert "low battery" in flight.loop.failure and "TEMPORARILY_REJECTED" in flight.loop.failure
     assert 2 <= flight.commands().count(ARM) <= 6
-    assert flight.loop.finished and not flight.peers.autopilot.pilot.armed
+    assert flight.loop.finished and not flight.peers.autopilot.pilot.is_armed
 
 
 @pytest.mark.fault(26)
@@ -135,11 +135,11 @@ def test_the_pilot_s_stick_ends_streaming_and_is_never_argued_with(autopilot: st
 def test_the_vehicle_s_own_failsafe_has_precedence(autopilot: str) -> None:
     flight = Flight(autopilot, "sim.plant=quadrotor").take_off().run(7.0)
     pilot = flight.peers.autopilot.pilot
-    pilot.fail(SIMULATED[autopilot].by_role(Role.LAND), flight.now_ns)
+    pilot.enter_failsafe(SIMULATED[autopilot].get_mode_by_role(Role.LAND), flight.now_ns)
     before = flight.commands()
     flight.run(2.0, until=HandoverState.FAILSAFE)
     flight.run(20.0, until=HandoverState.DONE)
-    assert flight.commands() == before and not pilot.armed
+    assert flight.commands() == before and not pilot.is_armed
     assert "failsafe" in flight.loop.failure
 
 
@@ -150,7 +150,7 @@ def test_a_stop_on_the_way_up_lands(autopilot: str, state: HandoverState) -> Non
     flight = Flight(autopilot).take_off().run(10.0, until=state)
     flight.run(25.0, stop=True, until=HandoverState.DONE)
     assert LAND in flight.commands()
-    assert not flight.peers.autopilot.pilot.armed and flight.peers.autopilot.craft.landed
+    assert not flight.peers.autopilot.pilot.is_armed and flight.peers.autopilot.vehicle.landed
 
 
 @pytest.mark.fault(34)
@@ -166,7 +166,7 @@ def test_a_climb_that_never_ends_is_ended_by_landing() -> None:
     flight = Flight("ardupilot", "hand_over.climb_s=1.0").take_off()
     flight.run(8.0, until=HandoverState.LANDING)
     flight.run(20.0, until=HandoverState.DONE)
-    assert "take-off" in flight.loop.failure and not flight.peers.autopilot.pilot.armed
+    assert "take-off" in flight.loop.failure and not flight.peers.autopilot.pilot.is_armed
 
 
 @pytest.mark.fault(20)
@@ -191,7 +191,7 @@ def test_an_ardupilot_without_gps_is_told_a_place_on_the_globe_and_one_with_gps_
         flight.peers.autopilot.parameters.set(name, value)
     flight.take_off().run(20.0, until=HandoverState.ENGAGED)  # by the positions that we relay to it
     told = flight.sent("SET_GPS_GLOBAL_ORIGIN")
-    assert len(told) == 1 and flight.peers.autopilot.estimator.origin
+    assert len(told) == 1 and flight.peers.autopilot.estimator.has_origin
     assert (told[0][1].latitude, told[0][1].altitude) == (473977420, 488000)
 
 

@@ -74,7 +74,7 @@ class _Flyer(WatchedFlyer):
 
         if self.craft is not None and at_ns >= BEGINS_S * 1e9:
             north, east, down = (value / DRAG_1PS for value in self.push_mps2)
-            self.craft.wind.blow((north, east, down))
+            self.craft.wind.set_mean((north, east, down))
             self.craft = None
         super().tick(tick, at_ns, noting)
 
@@ -103,7 +103,7 @@ def blown(autopilot: str, push_mps2: Vec3, *overrides: str, seed: int = 3, over_
     craft._body = replace(craft._body, rotor_drag_kg=(front, right, down))
     for name, value in EXTERNAL_ONLY[autopilot].items():
         assert world.peers.autopilot.parameters.set(name, value)
-    world.peers.autopilot.estimator.begin_in_flight()
+    world.peers.autopilot.estimator.start_in_flight()
     flyer.craft, flyer.where = craft, lambda: craft.position_m
     world.run(over_s)
     times, where = np.array(flyer.times_s), np.array(flyer.positions_m)

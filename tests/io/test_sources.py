@@ -21,7 +21,7 @@ from natnet_server import UPTIME_S, Body, Server
 from patience import LIMIT_S, until
 
 from uavctl.config import Config, load_config
-from uavctl.config.connections import warnings
+from uavctl.config.connections import find_security_warnings
 from uavctl.errors import ConfigError, ConnectionSpecError, ExtraMissingError
 from uavctl.io.admission import AdmissionRules
 from uavctl.io.base import Connection
@@ -316,7 +316,10 @@ def test_configurations_that_cannot_be(overrides: tuple[str, ...], words: str) -
 
 def test_it_is_told_that_nothing_is_signed() -> None:
     config = load_config("room-hahn-stursberg", ("daemon.mocap=natnet://10.0.0.5/drone",))
-    assert any("natnet://10.0.0.5/drone has no signatures" in text for text in warnings(config.security, config.daemon))
+    assert any(
+        "natnet://10.0.0.5/drone has no signatures" in text
+        for text in find_security_warnings(config.security, config.daemon)
+    )
 
 
 def test_the_daemon_opens_it_by_its_configuration() -> None:

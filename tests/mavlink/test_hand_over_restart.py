@@ -163,7 +163,7 @@ class Air:
                 if loop is not None:
                     loop.receive(link, data, arrival_ns)
             if loop is not None:
-                loop.tick(self._tick, at_ns, self.peers.receiver(at_ns))
+                loop.tick(self._tick, at_ns, self.peers.make_sender(at_ns))
             self._tick += 1
 
 

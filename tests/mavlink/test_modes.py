@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sim.autopilot.profile import SIMULATED, px4_custom
+from sim.autopilot.profile import SIMULATED, make_px4_custom_mode
 from uavctl.mavlink.profile import PROFILES, describe_mode, find_autopilot_name
 
 
@@ -51,8 +51,8 @@ def test_the_modes_that_are_asked_for_are_those_that_are_shown(autopilot: str) -
     profile = PROFILES[autopilot]
     assert {profile.external_mode, profile.take_off_mode} == set(profile.mode_parameters)
     for name, (first, second) in profile.mode_parameters.items():
-        custom = px4_custom(first, second) if autopilot == "px4" else first
+        custom = make_px4_custom_mode(first, second) if autopilot == "px4" else first
         assert describe_mode(autopilot, 2, custom) == (name, name == profile.external_mode)
-        shown = SIMULATED[autopilot].by_number(custom)
+        shown = SIMULATED[autopilot].get_mode_by_number(custom)
         assert shown is not None and shown.name == name
     assert not profile.climb_modes & profile.landing_modes

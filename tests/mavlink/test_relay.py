@@ -147,7 +147,7 @@ def test_a_vehicle_without_gps_gets_its_position_through_us_and_may_be_armed(nam
     rig.peers.receive("vehicle", Client().pack(mavlink.MAVLink_set_gps_global_origin_message(1, 0, 0, 0)), 0)
     rig.run(6.0)
     estimator = rig.peers.autopilot.estimator
-    assert estimator.position_ok and estimator.has_heading
+    assert estimator.is_position_valid and estimator.has_heading
     assert estimator.position_m == pytest.approx(rig.peers.vehicle.position_m, abs=0.03)
     assert len(list(rig.relayed())) > 90  # and every one is in the recording
 
@@ -188,9 +188,9 @@ def test_px4_moves_stamps_once_its_timesync_has_converged() -> None:
 
     estimator._age_ns = noted
     rig.run(49.0)  # 500 answers at 10 Hz are not there yet
-    assert estimator.position_ok and set(ages_ms) == {0.0}
+    assert estimator.is_position_valid and set(ages_ms) == {0.0}
     rig.run(3.0)
-    assert estimator.position_ok
+    assert estimator.is_position_valid
     assert min(ages_ms[-20:]) > 45 and max(ages_ms[-20:]) < 200  # the cameras' time, and the wait for the tick
 
 
@@ -203,7 +203,7 @@ def test_a_vehicle_that_the_pilot_took_off_lands_by_our_positions_to_the_end(nam
     rig.pilot_flies(external)
     rig.run(40.0, stop=True)
     assert rig.loop.finished and rig.loop.handover_state is HandoverState.DONE
-    assert not rig.peers.autopilot.pilot.armed and rig.peers.autopilot.estimator.position_ok
+    assert not rig.peers.autopilot.pilot.is_armed and rig.peers.autopilot.estimator.is_position_valid
     assert not any("Failsafe" in event.text for event in rig.memory.of(Event))
     end_ns = rig.peers.now_ns
     assert len([at_ns for at_ns, _ in rig.relayed() if end_ns - SECOND < at_ns <= end_ns]) > 15
@@ -217,7 +217,8 @@ def test_without_the_relay_a_vehicle_that_the_pilot_took_off_is_left_as_soon_as_
     rig.run(3.0)
     rig.pilot_flies("OFFBOARD")
     rig.run(40.0, stop=True)
-    assert rig.loop.finished and rig.loop.handover_state is HandoverState.SETTLING and rig.peers.autopilot.pilot.armed
+    assert rig.loop.finished and rig.loop.handover_state is HandoverState.SETTLING
+    assert rig.peers.autopilot.pilot.is_armed
 
 
 def test_frozen_cameras_are_not_passed_on() -> None:

@@ -14,7 +14,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import Client
 
 from sim.autopilot.autopilot import UPTIME_NS
-from uavctl.config.checks import position_limits_m
+from uavctl.config.checks import get_position_limits_m
 from uavctl.mavlink.relay import RELAY_RESUMED, RELAY_SILENT
 from uavctl.records import Event, RelayStats, StepInput
 
@@ -96,7 +96,7 @@ def test_an_ardupilot_gets_its_positions_with_stamps_of_its_clock(link: str) -> 
     rig = ready("ardupilot", delay)
     while rig.peers.now_ns < TO_S * SECOND:
         rig.run(1.0)
-        assert rig.peers.autopilot.estimator.position_ok
+        assert rig.peers.autopilot.estimator.is_position_valid
     assert_they_flow(rig, 4.0, off_s)
 
 
@@ -122,10 +122,10 @@ def test_a_flying_vehicle_keeps_its_position_and_its_room_whatever_the_round_tri
     rig = ready(name, delay, f"sim.clock_drift_ppm={drift_ppm}")
     rig.pilot_flies(EXTERNAL[name])
     estimator, vehicle = rig.peers.autopilot.estimator, rig.peers.vehicle
-    limits = position_limits_m(rig.config)
+    limits = get_position_limits_m(rig.config)
     while rig.peers.now_ns < TO_S * SECOND:
         rig.run(0.1)
-        assert estimator.position_ok and not rig.loop.finished, rig.peers.now_ns / SECOND
+        assert estimator.is_position_valid and not rig.loop.finished, rig.peers.now_ns / SECOND
         assert max(abs(a - b) for a, b in zip(estimator.position_m, vehicle.position_m, strict=True)) < 0.25
         assert all(low < x < high for x, (low, high) in zip(vehicle.position_m, limits.values(), strict=False))
     assert_they_flow(rig, 8.0, off_s)

@@ -52,7 +52,7 @@ def poses_after(flight: Flight, at_ns: int) -> list[int]:
 
 
 def is_down(flight: Flight) -> bool:
-    return flight.peers.autopilot.craft.landed and not flight.peers.autopilot.pilot.armed
+    return flight.peers.autopilot.vehicle.landed and not flight.peers.autopilot.pilot.is_armed
 
 
 @pytest.mark.slow

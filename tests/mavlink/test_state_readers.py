@@ -12,7 +12,7 @@ from mavlink_rig import NO_COVARIANCE, Peer
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from scipy.spatial.transform import Rotation
 
-from sim.cameras import HALF_ROLL, euler, turn
+from sim.cameras import HALF_ROLL, compute_euler, compute_frame_rotation
 from uavctl.config.connections import FrameConfig
 from uavctl.frames import (
     Convention,
@@ -111,8 +111,8 @@ def test_attitudes_come_back_from_the_simulated_cameras_axes(
     truth = quaternion_from_euler(angles)
     assert truth is not None
     frame = Frame(convention, (0.0, 0.0, 0.0), yaw_deg)
-    turned = product(turn(FrameConfig(convention=convention, yaw_deg=yaw_deg)), truth)  # type: ignore[arg-type]
-    told = quaternion_from_euler(euler(turned if convention == "ned" else product(turned, HALF_ROLL)))
+    turned = product(compute_frame_rotation(FrameConfig(convention=convention, yaw_deg=yaw_deg)), truth)  # type: ignore[arg-type]
+    told = quaternion_from_euler(compute_euler(turned if convention == "ned" else product(turned, HALF_ROLL)))
     assert told is not None
     for got in (frame.attitude_to_ned(turned, euler=False), frame.attitude_to_ned(told, euler=True)):
         assert abs(sum(a * b for a, b in zip(got, truth, strict=True))) == pytest.approx(1.0, abs=1e-6)

@@ -12,8 +12,8 @@ from inertial_rig import FIRST, NAMES, QUADROTOR, QUATERNION, SECOND, Array, G, 
 from quadrotor_rig import quadrotor, run
 from sim_rig import Bench, bench
 
-from sim.autopilot.inertial import DRIFT_S, ERRORS, GaussMarkov, Imu, InertialErrors, InertialSensors, normals
-from sim.vehicle.interface import rotated
+from sim.autopilot.inertial import DRIFT_S, ERRORS, GaussMarkov, Imu, InertialErrors, InertialSensors, draw_normals
+from sim.vehicle.interface import rotate_to_ned
 from sim.vehicle.quadrotor import Quadrotor
 from uavctl.config import load_config
 from uavctl.errors import ConfigError
@@ -29,11 +29,11 @@ def seeded(seed: int) -> np.random.SeedSequence:
 
 
 def test_a_gauss_markov_process_has_its_variance_and_its_time() -> None:
-    draw, one = normals(seeded(1)), GaussMarkov(2.0)
-    one.move(math.inf, 3.0, next(draw))
+    draw, one = draw_normals(seeded(1)), GaussMarkov(2.0)
+    one.advance(math.inf, 3.0, next(draw))
     values = []
     for _ in range(40_000):
-        one.move(0.5, 3.0, next(draw))
+        one.advance(0.5, 3.0, next(draw))
         values.append(one.value)
     x = np.array(values)
     assert x.std() == pytest.approx(3.0, rel=0.05)
@@ -49,7 +49,7 @@ def test_steps_of_any_length_lead_to_the_same_distribution() -> None:
             one = GaussMarkov(2.0)
             one.value = 5.0
             for elapsed_s, sign in zip(steps, signs, strict=True):
-                one.move(elapsed_s, 3.0, sign)
+                one.advance(elapsed_s, 3.0, sign)
             ends.append(one.value)
         return float(np.mean(ends)), float(np.var(ends))
 
@@ -64,8 +64,8 @@ def test_noise_has_the_size_of_standing_and_of_flying(name: str) -> None:
         (False, e.noise_mps2, e.gyro_noise_rps),
         (True, math.hypot(e.noise_mps2, e.vibration_mps2), math.hypot(e.gyro_noise_rps, e.gyro_vibration_rps)),
     ):
-        force = np.array([one.force(LEVEL_MPS2, flies=flies) for _ in range(4000)])
-        rates = np.array([one.rates((0.1, 0.2, 0.3), flies=flies) for _ in range(4000)])
+        force = np.array([one.measure_force(LEVEL_MPS2, is_flying=flies) for _ in range(4000)])
+        rates = np.array([one.measure_rates((0.1, 0.2, 0.3), is_flying=flies) for _ in range(4000)])
         assert force.std(axis=0) == pytest.approx([noise] * 3, rel=0.05)
         assert rates.std(axis=0) == pytest.approx([gyro] * 3, rel=0.05)
         successive = np.mean((force[1:] - force.mean(axis=0)) * (force[:-1] - force.mean(axis=0)), axis=0)
@@ -78,17 +78,17 @@ def test_biases_are_drawn_for_each_flight_and_stay_but_for_their_drift(name: str
     starts, gyros, drifts = [], [], []
     for seed in range(1500):
         one = Imu(e, seeded(seed))
-        start = np.array(one.force(LEVEL_MPS2, flies=True)) - LEVEL_MPS2
-        assert np.array_equal(one.force(LEVEL_MPS2, flies=False), start + LEVEL_MPS2)
-        one.move(math.inf)
-        first = np.array(one.force(LEVEL_MPS2, flies=True)) - LEVEL_MPS2 - start
-        one.move(DRIFT_S)
-        second = np.array(one.force(LEVEL_MPS2, flies=True)) - LEVEL_MPS2 - start
+        start = np.array(one.measure_force(LEVEL_MPS2, is_flying=True)) - LEVEL_MPS2
+        assert np.array_equal(one.measure_force(LEVEL_MPS2, is_flying=False), start + LEVEL_MPS2)
+        one.advance(math.inf)
+        first = np.array(one.measure_force(LEVEL_MPS2, is_flying=True)) - LEVEL_MPS2 - start
+        one.advance(DRIFT_S)
+        second = np.array(one.measure_force(LEVEL_MPS2, is_flying=True)) - LEVEL_MPS2 - start
         starts.append(start)
-        gyros.append(one.rates((0.0, 0.0, 0.0), flies=True))
+        gyros.append(one.measure_rates((0.0, 0.0, 0.0), is_flying=True))
         drifts.append((first[:2], second[:2]))
         assert first[2] == second[2] == 0.0
-    across = math.hypot(e.tilting_mps2, e.bias_mps2)
+    across = math.hypot(e.tilt_bias_mps2, e.bias_mps2)
     assert np.std(starts, axis=0) == pytest.approx([across, across, e.bias_down_mps2], rel=0.07)
     assert np.std(gyros, axis=0) == pytest.approx([e.gyro_bias_rps] * 3, rel=0.07)
     drift = np.array(drifts)
@@ -100,14 +100,14 @@ def test_biases_are_drawn_for_each_flight_and_stay_but_for_their_drift(name: str
 @pytest.mark.parametrize("heading_deg", [0.0, 130.0])
 def test_the_estimate_tilts_by_the_bias_so_that_both_cancel_at_hover(heading_deg: float) -> None:
     vehicle = quadrotor("px4")
-    vehicle.face(math.radians(heading_deg))
+    vehicle.set_heading(math.radians(heading_deg))
     vehicle.brake()
     run(vehicle, 4.0)
-    one = InertialSensors(replace(NONE, tilting_mps2=0.1, drift_mps2=0.1), vehicle, seeded(5), flown=False)
-    told, attitude = one.measure(0), one.attitude()
+    one = InertialSensors(replace(NONE, tilt_bias_mps2=0.1, drift_mps2=0.1), vehicle, seeded(5), flown=False)
+    told, attitude = one.measure(0), one.estimate_attitude()
     gravity = np.array([0.0, 0.0, G])
-    biased = np.array(rotated(vehicle.attitude, told.force_mps2)) + gravity
-    turned = np.array(rotated(attitude, told.force_mps2)) + gravity
+    biased = np.array(rotate_to_ned(vehicle.attitude, told.force_mps2)) + gravity
+    turned = np.array(rotate_to_ned(attitude, told.force_mps2)) + gravity
     wrong, left = (math.dist(each, vehicle.acceleration_mps2) for each in (biased, turned))
     assert wrong > 0.03
     assert left < 0.01 * wrong  # of second order
@@ -116,8 +116,8 @@ def test_the_estimate_tilts_by_the_bias_so_that_both_cancel_at_hover(heading_deg
 @BOTH
 def test_all_errors_grow_by_the_configured_factor(name: str) -> None:
     e = ERRORS[name]
-    assert e.scaled(0.0) == NONE
-    assert e.scaled(3.0).wander_rad == pytest.approx(3.0 * e.wander_rad)
+    assert e.scale(0.0) == NONE
+    assert e.scale(3.0).wander_rad == pytest.approx(3.0 * e.wander_rad)
     tilts = []
     for errors in (1, 3):
         one = bench(name, QUADROTOR, "sim.seed=4", f"sim.inertial.errors={errors}")
@@ -185,20 +185,20 @@ def test_the_wandering_tilt_is_for_flying() -> None:
     """On the floor the attitude errs by the bias alone, which drifts slowly; in flight it wanders beside that."""
     errors = replace(NONE, wander_rad=0.01)
     vehicle = quadrotor("px4", at=(0.0, 0.0, -1.0))
-    vehicle.rest()
+    vehicle.stand_on_floor()
     one = InertialSensors(errors, vehicle, seeded(2), flown=False)
     one.measure(0)
     run(vehicle, 1.0)
-    assert one.attitude() == pytest.approx(vehicle.attitude, abs=1e-12)
+    assert one.estimate_attitude() == pytest.approx(vehicle.attitude, abs=1e-12)
     vehicle.grounded = False
     vehicle.take_off(1.0)
     run(vehicle, 4.0)
-    assert one.attitude() != pytest.approx(vehicle.attitude, abs=1e-4)
+    assert one.estimate_attitude() != pytest.approx(vehicle.attitude, abs=1e-4)
 
 
 @BOTH
 def test_the_second_unit_has_errors_of_its_own(name: str) -> None:
-    one = InertialSensors(ERRORS[name].scaled(1.0), quadrotor("px4"), seeded(6), flown=False)
+    one = InertialSensors(ERRORS[name].scale(1.0), quadrotor("px4"), seeded(6), flown=False)
     first, second = one.measure(0), one.measure(1)
     assert first.force_mps2 != second.force_mps2
 

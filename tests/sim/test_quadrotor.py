@@ -8,9 +8,10 @@ import pytest
 from quadrotor_rig import BOTH, Array, Autopilot, allowing, gusty, quadrotor, run, steady, tilt
 from scipy.optimize import fsolve
 
+from sim.vehicle.airframe import AIR_DENSITY_KGPM3, CRAZYFLIE_2, GRAVITY_MPS2
+from sim.vehicle.battery import BatteryModel
 from sim.vehicle.loops import REFERENCE_ACCEL_MPS2, TUNINGS
 from sim.vehicle.quadrotor import STEP_NS, STEP_S
-from sim.vehicle.rigid_body import AIR_DENSITY_KGPM3, CRAZYFLIE_2, GRAVITY_MPS2, BatteryModel
 
 
 @pytest.mark.parametrize("autopilot", BOTH)
@@ -56,7 +57,7 @@ def test_rotors_at_their_limit_wind_nothing_up() -> None:
     one.battery = allowing(1900.0)
     one.accelerate((0.0, 0.0, -8.0))
     run(one, 1.0)
-    one.face(1.5)
+    one.set_heading(1.5)
     run(one, 3.0)
     assert abs(one.attitude[3]) < 0.05
     one.battery = BatteryModel(CRAZYFLIE_2)

@@ -10,18 +10,16 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
+from sim.vehicle.airframe import AIR_DENSITY_KGPM3, CRAZYFLIE_2, GRAVITY_MPS2
 from sim.vehicle.rigid_body import (
-    AIR_DENSITY_KGPM3,
-    CRAZYFLIE_2,
-    GRAVITY_MPS2,
     LEVEL,
     Body,
     BodyState,
     Wrench,
-    acceleration,
-    step,
-    turned,
-    uprighted,
+    compute_acceleration,
+    integrate_step,
+    reduce_tilt,
+    rotate_attitude,
 )
 from uavctl.records import Vec3
 
@@ -30,15 +28,15 @@ Array = NDArray[np.float64]
 H = 0.0025
 ZERO: Vec3 = (0.0, 0.0, 0.0)
 NOTHING = Wrench(0.0, ZERO, 0.0)
-FLYING = Body.of(CRAZYFLIE_2)
+FLYING = Body.from_airframe(CRAZYFLIE_2)
 IN_VACUUM = replace(FLYING, rotor_drag_kg=ZERO, body_drag_kgpm=ZERO)
-TUMBLING = BodyState((1.0, 2.0, -50.0), (1.5, -0.5, -2.0), turned(LEVEL, (0.4, -0.9, 0.3)), (9.0, -6.0, 4.0))
+TUMBLING = BodyState((1.0, 2.0, -50.0), (1.5, -0.5, -2.0), rotate_attitude(LEVEL, (0.4, -0.9, 0.3)), (9.0, -6.0, 4.0))
 
 
 def fly(body: Body, start: BodyState, wrench: Wrench, seconds: float, h: float = H, wind: Vec3 = ZERO) -> BodyState:
     motion = start
     for _ in range(round(seconds / h)):
-        motion = step(body, motion, (wrench, wrench, wrench), wind, h)
+        motion = integrate_step(body, motion, (wrench, wrench, wrench), wind, h)
     return motion
 
 
@@ -61,7 +59,7 @@ def test_free_fall_is_a_parabola_and_keeps_its_energy() -> None:
 def test_without_thrust_or_air_a_tumbling_body_keeps_its_horizontal_momentum() -> None:
     motion = TUMBLING
     for _ in range(400):
-        motion = step(IN_VACUUM, motion, (NOTHING, NOTHING, NOTHING), (3.0, 4.0, 5.0), H)
+        motion = integrate_step(IN_VACUUM, motion, (NOTHING, NOTHING, NOTHING), (3.0, 4.0, 5.0), H)
         assert motion.velocity_mps[:2] == TUMBLING.velocity_mps[:2]
 
 
@@ -73,7 +71,7 @@ def test_without_torque_angular_momentum_and_energy_of_rotation_stay() -> None:
     energy = np.array(motion.rates_rps) @ inertia @ motion.rates_rps
     flipped = False
     for _ in range(4000):
-        motion = step(body, motion, (NOTHING, NOTHING, NOTHING), ZERO, H)
+        motion = integrate_step(body, motion, (NOTHING, NOTHING, NOTHING), ZERO, H)
         flipped |= motion.rates_rps[1] < -8.0
         assert abs(sum(number * number for number in motion.attitude) - 1.0) <= 1e-15
     assert flipped
@@ -157,8 +155,8 @@ def test_air_takes_a_hovering_body_along_with_the_rotors_drag() -> None:
 
 
 def test_drag_acts_along_the_body_axes() -> None:
-    leaning = turned(LEVEL, (0.0, 0.5, 0.0))
-    a = acceleration(FLYING, leaning, (1.0, 0.0, 0.0), Wrench(0.0, ZERO, 7000.0), ZERO)
+    leaning = rotate_attitude(LEVEL, (0.0, 0.5, 0.0))
+    a = compute_acceleration(FLYING, leaning, (1.0, 0.0, 0.0), Wrench(0.0, ZERO, 7000.0), ZERO)
     front, down = math.cos(0.5), math.sin(0.5)
     k, c = FLYING.rotor_drag_kg, FLYING.body_drag_kgpm
     f_front, f_down = -(7000.0 * k[0] + c[0]) * front, -(7000.0 * k[2] + c[2]) * down
@@ -169,9 +167,9 @@ def test_drag_acts_along_the_body_axes() -> None:
 
 @pytest.mark.parametrize("heading", [0.0, 1.0, -2.5])
 def test_putting_a_body_upright_keeps_its_heading_and_the_side_it_leans_to(heading: float) -> None:
-    tilted = turned(turned(LEVEL, (0.3, -0.4, 0.0)), (0.0, 0.0, heading))
-    np.testing.assert_allclose(uprighted(tilted, 1.0), tilted, atol=1e-15)
-    np.testing.assert_allclose(uprighted(tilted, 0.0), turned(LEVEL, (0.0, 0.0, heading)), atol=1e-15)
+    tilted = rotate_attitude(rotate_attitude(LEVEL, (0.3, -0.4, 0.0)), (0.0, 0.0, heading))
+    np.testing.assert_allclose(reduce_tilt(tilted, 1.0), tilted, atol=1e-15)
+    np.testing.assert_allclose(reduce_tilt(tilted, 0.0), rotate_attitude(LEVEL, (0.0, 0.0, heading)), atol=1e-15)
     angle = 2.0 * math.atan(0.5 * math.tan(0.25))  # half of the tangent of half the 0.5 rad
-    halved = turned(turned(LEVEL, (0.6 * angle, -0.8 * angle, 0.0)), (0.0, 0.0, heading))
-    np.testing.assert_allclose(uprighted(tilted, 0.5), halved, atol=1e-15)
+    halved = rotate_attitude(rotate_attitude(LEVEL, (0.6 * angle, -0.8 * angle, 0.0)), (0.0, 0.0, heading))
+    np.testing.assert_allclose(reduce_tilt(tilted, 0.5), halved, atol=1e-15)

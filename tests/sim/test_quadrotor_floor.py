@@ -7,16 +7,18 @@ import numpy as np
 import pytest
 from quadrotor_rig import BOTH, Autopilot, allowing, quadrotor, run, steady
 
+from sim.vehicle.airframe import CRAZYFLIE_2, GRAVITY_MPS2
+from sim.vehicle.battery import BatteryModel
 from sim.vehicle.interface import Vehicle
 from sim.vehicle.loops import TUNINGS
 from sim.vehicle.quadrotor import STEP_NS, Quadrotor
-from sim.vehicle.rigid_body import CRAZYFLIE_2, GRAVITY_MPS2, LEVEL, BatteryModel
+from sim.vehicle.rigid_body import LEVEL
 
 
 @pytest.mark.parametrize("autopilot", BOTH)
 def test_it_takes_off_from_the_floor_and_lands_on_it(autopilot: Autopilot) -> None:
     one = quadrotor(autopilot, at=(1.0, 2.0, 0.0))
-    one.rest()
+    one.stand_on_floor()
     run(one, 1.0)
     assert one.grounded
     assert one.landed
@@ -48,13 +50,13 @@ def test_it_takes_off_from_the_floor_and_lands_on_it(autopilot: Autopilot) -> No
     assert one.position_m[2] == 0.0
     assert one.velocity_mps == (0.0, 0.0, 0.0)
     assert not one.grounded  # the rotors still turn: disarming is the autopilot's
-    one.rest()
+    one.stand_on_floor()
     assert one.grounded
 
 
 def test_a_hard_landing_neither_bounces_nor_sinks_in() -> None:
     one = quadrotor(at=(0.0, 0.0, -60.0))
-    one.face(1.0)
+    one.set_heading(1.0)
     one.brake()
     run(one, 4.0)
     one.accelerate((3.0, 3.0, 9.0))
@@ -108,14 +110,14 @@ def test_a_weak_battery_limits_the_thrust_and_a_weaker_one_cannot_lift_it() -> N
     run(one, 1.0)
     assert one.battery.current_a == pytest.approx(2.0, abs=0.2)
     one.battery = BatteryModel(CRAZYFLIE_2, charge=0.5)
-    assert one.battery.largest_rps == CRAZYFLIE_2.speed_at_0v_rps + CRAZYFLIE_2.speed_per_v_rps * 3.92
+    assert one.battery.max_rps == CRAZYFLIE_2.speed_at_0v_rps + CRAZYFLIE_2.speed_per_v_rps * 3.92
     one.accelerate((0.0, 0.0, -50.0))
     run(one, 2.5)
     power_w = CRAZYFLIE_2.electronics_w + CRAZYFLIE_2.power_per_thrust_wpn * (
         CRAZYFLIE_2.thrust_n_s2 * sum(speed**2 for speed in one.rotor_speeds_rps)
     )
     assert one.battery.voltage_v * one.battery.current_a == pytest.approx(power_w, rel=0.01)
-    np.testing.assert_allclose(one.rotor_speeds_rps, one.battery.largest_rps, rtol=0.01)
+    np.testing.assert_allclose(one.rotor_speeds_rps, one.battery.max_rps, rtol=0.01)
     one.battery = allowing(0.9 * CRAZYFLIE_2.hover_rps)
     one.brake()
     run(one, 20.0)
@@ -126,7 +128,7 @@ def test_with_an_empty_battery_the_rotors_run_down_and_it_falls() -> None:
     in_vacuum = replace(CRAZYFLIE_2, drag_area_m2=(0.0, 0.0, 0.0), rotor_drag_kg=(0.0, 0.0, 0.0))
     one = quadrotor(at=(0.0, 0.0, -5.0), airframe=in_vacuum)
     run(one, 1.0)
-    one.battery.charge(0.0)
+    one.battery.set_charge(0.0)
     start_m, start_mps = one.position_m[2], one.velocity_mps[2]
     run(one, 0.5)
     # The thrust falls as the square of the speed: v' = g (1 - exp(-2 t / T)).
@@ -165,7 +167,7 @@ def test_a_far_position_is_reached_at_cruising_speed_and_braked_for_in_time() ->
 @pytest.mark.parametrize("yaw", [1.5, -3.0])
 def test_it_turns_its_nose_and_flies_the_same_way(yaw: float) -> None:
     one = quadrotor()
-    one.face(yaw)
+    one.set_heading(yaw)
     one.accelerate((1.0, 0.0, 0.0))
     run(one, 6.0)
     w, _, _, z = one.attitude
@@ -179,14 +181,14 @@ def test_nothing_of_the_attitude_loop_of_the_flight_before_is_left_at_take_off(h
     """It was turning, its yaw integral wound up, when it was put or came down; the next take-off does not turn."""
     one = quadrotor(at=(0.0, 0.0, -height_m))
     one.land()
-    one.face(2.5)
+    one.set_heading(2.5)
     run(one, 0.8)
     assert rests == (one.position_m[2] < 0.0)
     if rests:
-        one.rest()
+        one.stand_on_floor()
         run(one, 1.0)  # the rotors run down, each from another speed
         one.grounded = False
-    one.face(2.0 * math.atan2(one.attitude[3], one.attitude[0]))
+    one.set_heading(2.0 * math.atan2(one.attitude[3], one.attitude[0]))
     one.take_off(2.0)
     turning: list[float] = []
     run(one, 3.0, lambda it: turning.append(math.hypot(*it.rates_rps)))
@@ -219,18 +221,18 @@ def test_on_the_floor_nothing_moves_but_the_battery() -> None:
 def test_misled_loops_hold_the_wrong_place() -> None:
     one: Vehicle = quadrotor(at=(0.0, 0.0, -5.0))
     one.go_to((1.0, 0.0, -5.0))
-    one.mislead((0.4, -0.3, 0.2), (0.0, 0.0, 0.0))
+    one.set_estimate_error((0.4, -0.3, 0.2), (0.0, 0.0, 0.0))
     assert isinstance(one, Quadrotor)
     run(one, 20.0)
     np.testing.assert_allclose(one.position_m, (0.6, 0.3, -5.2), atol=0.01)
     # A velocity that is none is cancelled by the position loop at the distance where that asks for it.
     one.go_to((1.0, 0.0, -5.0))
-    one.mislead((0.0, 0.0, 0.0), (0.2, 0.0, -0.1))
+    one.set_estimate_error((0.0, 0.0, 0.0), (0.2, 0.0, -0.1))
     run(one, 20.0)
     gains = TUNINGS["ardupilot"]
     wanted = (1.0 - 0.2 / gains.position_1ps, 0.0, -5.0 + 0.1 / gains.position_down_1ps)
     np.testing.assert_allclose(one.position_m, wanted, atol=0.01)
-    one.mislead((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    one.set_estimate_error((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     run(one, 20.0)
     np.testing.assert_allclose(one.position_m, (1.0, 0.0, -5.0), atol=0.01)
 
@@ -239,7 +241,7 @@ def test_what_the_loops_learn_on_the_floor_does_not_make_it_run_at_take_off() ->
     one = quadrotor(at=(0.0, 0.0, -1.0))
     one.land()
     run(one, 5.0)
-    one.mislead((1.0, -2.0, 0.0), (0.0, 0.0, 0.0))  # the estimator finds that it was elsewhere all the time
+    one.set_estimate_error((1.0, -2.0, 0.0), (0.0, 0.0, 0.0))  # the estimator finds that it was elsewhere all the time
     run(one, 0.1)
     one.take_off(2.0)
     run(one, 10.0, lambda it: None if math.hypot(*it.position_m[:2]) < 0.05 else pytest.fail("ran away"))
@@ -254,7 +256,7 @@ def test_what_the_loops_learnt_in_the_flight_before_does_not_lean_it_at_take_off
     one.land()
     run(one, 4.0)
     assert one.landed
-    one.wind.blow((0.0, 0.0, 0.0))
+    one.wind.set_mean((0.0, 0.0, 0.0))
     one.take_off(2.0)
     run(one, 0.5)
     assert abs(one.velocity_mps[0]) < 0.02

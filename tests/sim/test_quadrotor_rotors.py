@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sim.vehicle.rigid_body import CRAZYFLIE_2, GRAVITY_MPS2, STOPPED, BatteryModel, Rotors
+from sim.vehicle.airframe import CRAZYFLIE_2, GRAVITY_MPS2
+from sim.vehicle.battery import BatteryModel
+from sim.vehicle.rotors import STOPPED, Rotors
 from uavctl.records import Vec3
 
 Array = NDArray[np.float64]
@@ -80,14 +82,14 @@ def test_a_speed_follows_its_command_as_a_first_order_lag() -> None:
         start, middle, end = one.step()
         risen = -math.expm1(-k * H / CRAZYFLIE_2.motor_lag_s)
         np.testing.assert_allclose(one.speeds_rps, np.array(one.commands_rps) * risen, rtol=1e-12)
-        assert end == one.wrench(one.speeds_rps)
+        assert end == one.compute_wrench(one.speeds_rps)
         between = -math.expm1(-(k - 0.5) * H / CRAZYFLIE_2.motor_lag_s)
         assert middle.speeds_rps == pytest.approx(3500.0 * between, rel=1e-12)
         assert start.speeds_rps < middle.speeds_rps < end.speeds_rps
 
 
 def test_four_rotors_at_the_hover_speed_carry_the_weight_and_turn_nothing() -> None:
-    wrench = rotors().wrench((CRAZYFLIE_2.hover_rps,) * 4)
+    wrench = rotors().compute_wrench((CRAZYFLIE_2.hover_rps,) * 4)
     assert wrench.thrust_n == pytest.approx(CRAZYFLIE_2.mass_kg * GRAVITY_MPS2, rel=1e-12)
     assert wrench.torque_nm == (0.0, 0.0, 0.0)
     assert CRAZYFLIE_2.hover_rps * 60.0 / (2.0 * math.pi) == pytest.approx(16800.0, rel=0.01)
@@ -96,7 +98,7 @@ def test_four_rotors_at_the_hover_speed_carry_the_weight_and_turn_nothing() -> N
 @pytest.mark.parametrize("speeds", [(1500.0, 1600.0, 1700.0, 1900.0), (2000.0, 900.0, 1000.0, 800.0)])
 def test_the_wrench_is_that_of_forces_on_levers(speeds: tuple[float, float, float, float]) -> None:
     thrust, torque = by_hand(speeds)
-    wrench = rotors().wrench(speeds)
+    wrench = rotors().compute_wrench(speeds)
     assert wrench.thrust_n == pytest.approx(thrust, rel=1e-12)
     np.testing.assert_allclose(wrench.torque_nm, torque, rtol=1e-9, atol=1e-12)
     assert wrench.speeds_rps == sum(speeds)
@@ -106,7 +108,7 @@ def test_what_the_rotors_can_do_is_commanded_exactly() -> None:
     one = rotors()
     for roll, pitch, yaw in itertools.product((-1e-3, 0.0, 2e-3), (-2e-3, 0.0, 1e-3), (-1e-4, 0.0, 1e-4)):
         one.command(0.3, (roll, pitch, yaw), FAST)
-        assert not (one.thrust_limited or one.torque_limited)
+        assert not (one.is_thrust_limited or one.is_torque_limited)
         thrust, torque = by_hand(one.commands_rps)
         assert thrust == pytest.approx(0.3, rel=1e-12)
         np.testing.assert_allclose(torque, (roll, pitch, yaw), rtol=1e-9, atol=1e-15)
@@ -134,8 +136,8 @@ def test_commands_stay_between_idling_and_what_the_voltage_allows() -> None:
         assert min(one.commands_rps) >= CRAZYFLIE_2.idle_rps * (1.0 - 1e-9)
         assert max(one.commands_rps) <= FAST * (1.0 + 1e-9)
         given, turning = by_hand(one.commands_rps)
-        assert one.thrust_limited == (abs(given - thrust) > 1e-9)
-        assert one.torque_limited == (np.abs(np.array(turning) - torque).max() > 1e-12)
+        assert one.is_thrust_limited == (abs(given - thrust) > 1e-9)
+        assert one.is_torque_limited == (np.abs(np.array(turning) - torque).max() > 1e-12)
     one.stop()
     assert one.commands_rps == STOPPED
 
@@ -158,12 +160,12 @@ def test_a_shorted_battery_gives_what_it_can() -> None:
 
 def test_an_empty_battery_gives_nothing_until_it_has_charge_again() -> None:
     battery = BatteryModel(CRAZYFLIE_2, charge=1e-6)
-    while not battery.empty:
+    while not battery.is_empty:
         battery.drain(CRAZYFLIE_2.weight_n, H)
     used_c = battery.used_c
     battery.drain(CRAZYFLIE_2.weight_n, 1.0)
     assert (battery.voltage_v, battery.current_a, battery.remaining, battery.used_c) == (0.0, 0.0, 0.0, used_c)
-    battery.charge(0.5)
+    battery.set_charge(0.5)
     battery.drain(CRAZYFLIE_2.weight_n, H)
     assert battery.voltage_v > 3.0
 
@@ -187,6 +189,6 @@ def test_the_voltage_falls_with_the_charge_and_takes_rotor_speed_along() -> None
     for charge in np.arange(0.99, -0.01, -0.01):
         battery = BatteryModel(CRAZYFLIE_2, charge=float(charge))
         assert battery.open_circuit_v < last.open_circuit_v
-        assert battery.largest_rps < last.largest_rps
+        assert battery.max_rps < last.max_rps
         last = battery
     assert BatteryModel(CRAZYFLIE_2, charge=-1.0).open_circuit_v == 3.0

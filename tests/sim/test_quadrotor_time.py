@@ -7,9 +7,9 @@ import pytest
 from quadrotor_rig import MODEL, gusty, quadrotor, run, tilt
 from scipy.spatial.transform import Rotation
 
-from sim.vehicle.linear import LinearVehicle, linear_model
+from sim.vehicle.airframe import CRAZYFLIE_2, GRAVITY_MPS2
+from sim.vehicle.linear import LinearVehicle, make_linear_model
 from sim.vehicle.quadrotor import STEP_NS, Quadrotor
-from sim.vehicle.rigid_body import CRAZYFLIE_2, GRAVITY_MPS2
 from uavctl.config import load_config
 from uavctl.records import Vec3
 
@@ -79,7 +79,7 @@ def test_state_and_input_are_those_of_the_controllers_plant() -> None:
     np.testing.assert_allclose(state[[2, 5]], (1.0, -0.5), atol=0.03)
     assert one.input.tolist() == [1.0, -0.5, 0.25]
 
-    flat = linear_model(load_config("paper").plant)
+    flat = make_linear_model(load_config("paper").plant)
     one = Quadrotor(flat, "px4", gusty(1), 0, position_m=(1.0, 2.0, -3.0), velocity_mps=(0.1, 0.2, 0.0))
     one.accelerate((0.4, -0.4, 0.0))
     assert one.state[list(flat.position_index)].tolist() == [1.0, 2.0]
@@ -109,7 +109,7 @@ def test_it_can_take_the_place_of_the_linear_vehicle() -> None:
     one = quadrotor()
     for name in ("model", "now_ns", "grounded", "has_down", "state", "input", "position_m", "velocity_mps"):
         assert type(getattr(one, name)) is type(getattr(linear, name)), name
-    for name in ("advance", "accelerate", "rest"):
+    for name in ("advance", "accelerate", "stand_on_floor"):
         assert callable(getattr(one, name))
     assert one.state.shape == linear.state.shape
     assert one.input.shape == linear.input.shape

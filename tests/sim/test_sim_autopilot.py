@@ -127,7 +127,7 @@ def test_a_setpoint_that_is_no_number_kills_ardupilot_and_stops_px4(value: float
     one = bench("ardupilot")
     one.send(one.client.setpoint(1.0, value, 0.0))
     assert one.peers.autopilot.mode_name == "CRASHED"
-    assert one.peers.autopilot.pilot.crashed == "a setpoint was not a number"
+    assert one.peers.autopilot.pilot.crash_reason == "a setpoint was not a number"
     before = len(one.seen)
     one.wait(5.0)
     assert one.send(one.client.timesync(1)) == []
@@ -248,7 +248,7 @@ def test_disarming_in_the_air_is_refused_even_if_forced() -> None:
         one = bench(autopilot)
         assert one.ask(ARM, 0) == result
         assert one.ask(ARM, 0, 21196) == result
-        assert one.peers.autopilot.pilot.armed
+        assert one.peers.autopilot.pilot.is_armed
         assert one.texts == ["Disarming denied: not landed"] * 2
 
 
@@ -283,10 +283,10 @@ def test_landing_descends_touches_and_disarms(command: str) -> None:
         one.wait(2.5)
         assert one.texts == landed
         assert one.peers.vehicle.position_m[2] == 0.0
-        assert one.peers.autopilot.pilot.armed
+        assert one.peers.autopilot.pilot.is_armed
         one.wait(2.0)
         assert one.texts == [*landed, disarmed]
-        assert not one.peers.autopilot.pilot.armed
+        assert not one.peers.autopilot.pilot.is_armed
         assert heartbeat(one).base_mode & 128 == 0
         assert one.of("EXTENDED_SYS_STATE")[-1].landed_state == 1
 

@@ -71,7 +71,7 @@ def test_damaged_datagrams_neither_raise_nor_change_anything(autopilot: str) -> 
             one.send(one.client.setpoint(0.0, 0.0, 0.0))
             one.wait(0.05)
     assert one.peers.autopilot.mode_name == mode
-    assert one.peers.autopilot.pilot.armed
+    assert one.peers.autopilot.pilot.is_armed
     assert flying(one) == (0.0, 0.0, 0.0)
     assert one.of("COMMAND_ACK") == []
 

@@ -144,9 +144,9 @@ def test_an_effect_switched_on_shifts_no_other_draw(effect: str) -> None:
 def test_cameras_that_creep_say_more_and_more_beside_the_vehicle() -> None:
     one = cameras(PLAIN)
     place = [msg.x for _, msg in shots(one, 5).values()]
-    one.creep((0.5, 0.0, 0.0))
+    one.set_drift((0.5, 0.0, 0.0))
     place += [msg.x for _, msg in shots(one, 5).values()]
-    one.creep((-1.0, 0.0, 0.0))
+    one.set_drift((-1.0, 0.0, 0.0))
     place += [msg.x for _, msg in shots(one, 3).values()]
     off = [0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.15, 0.05]  # at 10 Hz
     vehicle = [0, 1, 2, 3, 4, 0, 1, 2, 3, 4, 0, 1, 2]

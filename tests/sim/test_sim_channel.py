@@ -184,7 +184,7 @@ def test_what_is_not_sent_shifts_no_draw() -> None:
         for i in range(400):
             whole.push(i * 10 * MS, packet(i))
             if 100 <= i < 200:
-                holes.pass_over(i * 10 * MS)
+                holes.skip_packet(i * 10 * MS)
             else:
                 holes.push(i * 10 * MS, packet(i))
         assert holes.counters.sent == 300

@@ -6,7 +6,7 @@ import pytest
 from sim_rig import decode
 from take_off_rig import Flight
 
-from sim.autopilot.autopilot import Checks
+from sim.autopilot.checks import PreflightChecks
 from uavctl.config import load_config
 from uavctl.config.sim import ChecksConfig
 from uavctl.errors import ConfigError
@@ -59,7 +59,7 @@ def test_px4_is_back_in_its_take_off_when_its_position_is_valid_again_where_that
 
 def test_nothing_is_drawn_or_looked_at_unless_asked_for() -> None:
     autopilot = Flight("px4").peers.autopilot
-    assert isinstance(autopilot._checks, Checks) and autopilot._checks.next_ns is None
+    assert isinstance(autopilot._checks, PreflightChecks) and autopilot._checks.next_ns is None
     assert ChecksConfig() == load_config("room").sim.checks
 
 

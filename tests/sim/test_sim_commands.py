@@ -50,7 +50,7 @@ def test_what_clients_read_is_streamed_without_being_asked(name: Name) -> None:
 @BOTH
 def test_telemetry_tells_the_truth(name: Name) -> None:
     one = Flight(name)
-    one.vehicle.face(math.pi / 2)
+    one.vehicle.set_heading(math.pi / 2)
     one.stream(4.0, 0.5, 0.0, 0.0)
     for number in (30, 31, 32, 33, 24, 1, 147, 74):
         assert one.ask(REQUEST, number) == 0

@@ -8,7 +8,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from recorded_rig import packets
 from sim_rig import ARM, LAND, SET_MODE, TAKE_OFF, Bench, S, bench, decode, heartbeat
 
-from sim.autopilot.profile import TABLES
+from sim.autopilot.parameters import TABLES
 
 GUIDED, OFFBOARD, HOLD, BRAKE = (1, 4, 0), (1, 6, 0), (1, 4, 3), (1, 17, 0)
 RADIO, FENCE = 1 << 16, 1 << 20  # MAV_SYS_STATUS_SENSOR_RC_RECEIVER, MAV_SYS_STATUS_GEOFENCE
@@ -144,7 +144,7 @@ def test_only_px4_says_that_it_has_landed() -> None:
         assert one.ask(LAND) == 0
         one.wait(8.0)
         assert ("Landing detected" in one.texts) is says
-        assert not one.peers.autopilot.pilot.armed
+        assert not one.peers.autopilot.pilot.is_armed
 
 
 @BOTH
@@ -152,10 +152,10 @@ def test_a_quadrotor_flown_onto_the_floor_has_landed_and_disarms(autopilot: str)
     one = bench(autopilot, "sim.plant=quadrotor", "sim.start_position_m=[0.0,0.0,-1.0]")
     one.stream(6.0, 0.0, 0.0, 0.5)
     assert one.of("EXTENDED_SYS_STATE")[-1].landed_state == 1
-    assert one.peers.truth().position_m[2] == pytest.approx(0.0, abs=0.02)
+    assert one.peers.read_truth().position_m[2] == pytest.approx(0.0, abs=0.02)
     one.stream(3.0, 0.0, 0.0, -1.0)  # landed: it does not rise again
-    assert not one.peers.autopilot.pilot.armed
-    assert one.peers.truth().position_m[2] == 0.0
+    assert not one.peers.autopilot.pilot.is_armed
+    assert one.peers.read_truth().position_m[2] == 0.0
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import pytest
 from sim_rig import CALM, bench
 
 from sim.simulation import Peers
-from sim.vehicle.interface import SteeredPlant, heading_rad, rotated
+from sim.vehicle.interface import ControlledPlant, compute_heading_rad, rotate_to_ned
 from sim.vehicle.linear import LinearVehicle
 from uavctl.config import load_config
 
@@ -19,17 +19,17 @@ DRAG = (
 SHORT = 2.0 / 2.3
 
 
-def craft(*overrides: str) -> SteeredPlant:
+def craft(*overrides: str) -> ControlledPlant:
     vehicle = Peers(load_config("room-hahn-stursberg", [*CALM, AT, *overrides]), 0).vehicle
     assert isinstance(vehicle, LinearVehicle)
-    return SteeredPlant(vehicle)
+    return ControlledPlant(vehicle)
 
 
-def fly(one: SteeredPlant, seconds: float) -> None:
+def fly(one: ControlledPlant, seconds: float) -> None:
     end_ns = one.now_ns + round(seconds * 1e9)
     while one.next_ns is not None and one.next_ns <= end_ns:
         one._plant.advance(one.next_ns)
-        one.steer()
+        one.update_control()
     one._plant.advance(end_ns)
 
 
@@ -51,7 +51,7 @@ def test_far_away_positions_are_approached_at_the_cruising_and_climbing_speeds()
 
 def test_an_error_of_what_it_believes_moves_where_it_stays() -> None:
     one = craft()
-    one.mislead((0.5, 0.0, 0.0), (0.0, 0.0, 0.0))
+    one.set_estimate_error((0.5, 0.0, 0.0), (0.0, 0.0, 0.0))
     one.go_to((0.0, 0.0, -1.5))
     fly(one, 12.0)
     assert one.position_m == pytest.approx((-0.5, 0.0, -1.5), abs=0.02)
@@ -71,9 +71,9 @@ def test_setpoints_of_position_and_velocity_fly_the_linear_plant() -> None:
 def test_quaternions_turn_as_their_rotation_does() -> None:
     half = math.sqrt(0.5)
     east = (half, 0.0, 0.0, half)  # nose to the east
-    assert heading_rad(east) == pytest.approx(math.pi / 2)
-    assert rotated(east, (1.0, 0.0, 0.0)) == pytest.approx((0.0, 1.0, 0.0), abs=1e-12)
-    assert rotated(east, (0.0, 1.0, 0.0)) == pytest.approx((-1.0, 0.0, 0.0), abs=1e-12)
+    assert compute_heading_rad(east) == pytest.approx(math.pi / 2)
+    assert rotate_to_ned(east, (1.0, 0.0, 0.0)) == pytest.approx((0.0, 1.0, 0.0), abs=1e-12)
+    assert rotate_to_ned(east, (0.0, 1.0, 0.0)) == pytest.approx((-1.0, 0.0, 0.0), abs=1e-12)
     down = (half, 0.0, -half, 0.0)  # nose down
-    assert rotated(down, (1.0, 0.0, 0.0)) == pytest.approx((0.0, 0.0, 1.0), abs=1e-12)
-    assert rotated(down, (0.0, 0.0, 1.0)) == pytest.approx((-1.0, 0.0, 0.0), abs=1e-12)
+    assert rotate_to_ned(down, (1.0, 0.0, 0.0)) == pytest.approx((0.0, 0.0, 1.0), abs=1e-12)
+    assert rotate_to_ned(down, (0.0, 0.0, 1.0)) == pytest.approx((-1.0, 0.0, 0.0), abs=1e-12)

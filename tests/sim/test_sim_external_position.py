@@ -51,7 +51,7 @@ def test_other_kinds_are_not_fused_and_arming_is_denied(name: Name, kind: str) -
     one = indoors(name, kind)
     assert one.ask(ARM, 1) == (1 if name == "px4" else 4)
     assert any("position" in text or "VisOdom" in text for text in one.texts)
-    assert not one.autopilot.pilot.armed
+    assert not one.autopilot.pilot.is_armed
     assert one.of("LOCAL_POSITION_NED")[-1:] == one.of("LOCAL_POSITION_NED")[:1]  # at most the one with GPS
 
 
@@ -124,7 +124,7 @@ def test_ardupilot_notices_the_loss_of_the_cameras_after_seven_seconds_and_lands
     assert one.mode == "LAND" and one.of("HEARTBEAT")[-1].system_status == 5
     assert one.ask(SET_MODE, *GUIDED) == 4
     one.wait(10.0)
-    assert not one.autopilot.pilot.armed
+    assert not one.autopilot.pilot.is_armed
 
 
 def test_with_its_estimators_failsafe_off_ardupilot_only_says_that_it_is_lost() -> None:
@@ -206,7 +206,7 @@ def test_a_jump_is_not_believed_and_a_short_pause_is_survived() -> None:
     one.wait(3.0)
     one.external = "VISION_POSITION_ESTIMATE"
     one.wait(3.0)
-    assert one.mode == "GUIDED" and one.autopilot.estimator.position_ok
+    assert one.mode == "GUIDED" and one.autopilot.estimator.is_position_valid
     assert one.autopilot.estimator.position_m == pytest.approx(one.vehicle.position_m, abs=0.02)
 
 

@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 from sim_rig import Bench, decode
 
-from sim.faults import problems
+from sim.faults import find_fault_problems
 from sim.simulation import MOCAP, VEHICLE, Peers
 from sim.vehicle.quadrotor import Quadrotor
 from uavctl.cli.app import run
 from uavctl.config import Config, load_config
-from uavctl.config.load import with_faults
+from uavctl.config.load import add_faults
 from uavctl.errors import ConfigError
 from uavctl.records import Truth
 
@@ -132,7 +132,7 @@ def test_a_file_of_faults_comes_after_those_of_the_configuration(tmp_path: Path)
         '[[fault]]\nat_s = 4.0\nkind = "mode"\nname = "POSCTL"\n',
         encoding="utf-8",
     )
-    given = with_faults(config('at_s=0.5, for_s=0.25, kind="frozen"'), file, problems)
+    given = add_faults(config('at_s=0.5, for_s=0.25, kind="frozen"'), file, find_fault_problems)
     assert [(one.at_s, one.kind, one.for_s, one.name) for one in given.sim.fault] == [
         (0.5, "frozen", 0.25, ""),
         (1.0, "occluded", 2.5, ""),
@@ -179,7 +179,7 @@ def test_what_is_wrong_in_a_file_is_told_with_its_line(tmp_path: Path, text: str
     file = tmp_path / "faults.toml"
     file.write_text(text, encoding="utf-8")
     with pytest.raises(ConfigError) as caught:
-        with_faults(config(), file, problems)
+        add_faults(config(), file, find_fault_problems)
     assert told in "\n".join(caught.value.problems)
 
 
@@ -207,7 +207,7 @@ def test_the_command_serves_a_file_of_faults_at_a_multiple_of_real_time(
 
 def test_a_file_that_is_not_there_is_told(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="cannot be read"):
-        with_faults(config(), tmp_path / "nowhere.toml", problems)
+        add_faults(config(), tmp_path / "nowhere.toml", find_fault_problems)
 
 
 @pytest.mark.parametrize(
@@ -262,7 +262,7 @@ def test_random_occlusions_are_told_while_they_last() -> None:
     told = []
     for tenth in range(300):
         peers.advance(tenth * S // 10)
-        told.append((peers.channel.counters.sent, peers.look().faults))
+        told.append((peers.channel.counters.sent, peers.take_snapshot().faults))
     seen = [after[0] > before[0] for before, after in pairwise(told)]
     assert [faults == () for _, faults in told[1:]] == seen
     assert {faults for _, faults in told} == {(), ("occluded",)}

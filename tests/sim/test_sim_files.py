@@ -12,7 +12,7 @@ from autopilot_rig import Flight, Name
 from pymavlink import mavftp
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sim.autopilot.profile import TABLES, ParameterType
+from sim.autopilot.parameters import TABLES, ParameterType
 
 BOTH = pytest.mark.parametrize("name", ["px4", "ardupilot"])
 # Of ArduPilot's packed parameters

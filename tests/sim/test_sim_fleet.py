@@ -11,8 +11,8 @@ from patience import LIMIT_S, until
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import LAND, Bench, Client, bench, decode
 
-from sim.fleet import fleet
-from sim.server import Ready, Seat, serve_all
+from sim.fleet import make_fleet
+from sim.server import Ready, VehicleSetup, serve_all
 from uavctl.cli.app import run
 from uavctl.config import load_config
 from uavctl.errors import ConfigError, ConnectionSpecError
@@ -25,8 +25,10 @@ def ignore(truth: Truth) -> None:
     del truth
 
 
-def seats(count: int, vehicle: str, mocap: str = "udpout://127.0.0.1:14560", *overrides: str) -> tuple[Seat, ...]:
-    return fleet(load_config("room-hahn-stursberg", overrides), vehicle, mocap, count, ignore)
+def seats(
+    count: int, vehicle: str, mocap: str = "udpout://127.0.0.1:14560", *overrides: str
+) -> tuple[VehicleSetup, ...]:
+    return make_fleet(load_config("room-hahn-stursberg", overrides), vehicle, mocap, count, ignore)
 
 
 def test_each_has_the_id_seed_place_and_ports_after_the_one_before() -> None:
@@ -111,8 +113,8 @@ def test_two_vehicles_are_seen_with_their_ids_and_a_command_to_the_second_moves_
     told: tuple[list[Truth], list[Truth]] = ([], [])
     config = load_config("room-hahn-stursberg", [f"sim.autopilot={autopilot}", "plant.wind_std_mps2=[1e-9,1e-9,1e-9]"])
     pair = [
-        Seat(one.config, one.vehicle, one.mocap, told[i].append)
-        for i, one in enumerate(fleet(config, ANY, ANY, 2, ignore))
+        VehicleSetup(one.config, one.vehicle, one.mocap, told[i].append)
+        for i, one in enumerate(make_fleet(config, ANY, ANY, 2, ignore))
     ]
     readies: list[Ready] = []
     opened, stop = threading.Event(), threading.Event()
@@ -169,7 +171,7 @@ def test_the_parameter_of_the_id_tells_it(autopilot: str, name: str) -> None:
     assert one.send(one.client.pack(read(1, 1, name.encode(), -1))) == []
     (answer,) = one.send(one.client.pack(read(2, 1, name.encode(), -1)))
     assert answer.get_srcSystem() == 2
-    assert one.peers.autopilot.parameters.decoded(name, answer.param_value) == 2.0
+    assert one.peers.autopilot.parameters.decode(name, answer.param_value) == 2.0
 
 
 def test_an_origin_for_another_vehicle_is_not_taken() -> None:
@@ -179,7 +181,7 @@ def test_an_origin_for_another_vehicle_is_not_taken() -> None:
     assert parameters.set("EK3_SRC1_POSXY", 6)
     for system in (1, 2):
         one.send(one.client.pack(mavlink.MAVLink_set_gps_global_origin_message(system, 473_977_000, 85_456_000, 0)))
-        assert one.peers.autopilot.estimator.origin is (system == 2)
+        assert one.peers.autopilot.estimator.has_origin is (system == 2)
 
 
 @pytest.mark.parametrize("url", ["udpout://:14540", "udpout://127.0.0.1", "udpout://127.0.0.1:65535", "14540"])

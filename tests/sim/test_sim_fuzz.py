@@ -7,7 +7,7 @@ from typing import Literal
 import pytest
 from fuzz_rig import MAY_CHANGE, Judge
 
-from sim.autopilot.profile import Parameters
+from sim.autopilot.parameters import Parameters
 
 
 @pytest.mark.slow

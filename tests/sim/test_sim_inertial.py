@@ -25,7 +25,7 @@ from inertial_rig import (
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import INTERVAL, Bench, S, bench
 
-from sim.autopilot.telemetry import in_thousandths
+from sim.autopilot.telemetry import convert_to_milli
 from sim.vehicle.quadrotor import Quadrotor
 
 REQUEST, GET_INTERVAL, DENIED = 512, 510, 2
@@ -146,7 +146,7 @@ def test_the_acceleration_told_is_that_of_the_linear_plant(name: str) -> None:
     for accel in ((1.0, -0.5, 0.2), (-0.5, 0.8, -0.3)):
         one.stream(0.35, *accel, period_s=0.05)
         assert one.ask(REQUEST, FIRST[name]) == 0
-        state = np.array(one.peers.truth().state).reshape(3, 3)
+        state = np.array(one.peers.read_truth().state).reshape(3, 3)
         wanted = state[:, 2] - drag * state[:, 1] - [0.0, 0.0, G]
         assert np.abs(wanted[:2]).max() > 0.3
         told = np.array(si(one.of(NAMES[FIRST[name]])[-1]))
@@ -184,5 +184,5 @@ def test_rates_are_those_of_the_body(name: str) -> None:
 
 def test_ardupilot_cuts_towards_zero_and_to_16_bits() -> None:
     g = 9.80665
-    assert in_thousandths((0.0019 * g, -0.0019 * g, -9.80664), (0.0019, -0.0019, 0.0)) == (1, -1, -999, 1, -1, 0)
-    assert in_thousandths((1e9, -1e9, math.inf), (0.0, 0.0, -math.inf)) == (32767, -32768, 32767, 0, 0, -32768)
+    assert convert_to_milli((0.0019 * g, -0.0019 * g, -9.80664), (0.0019, -0.0019, 0.0)) == (1, -1, -999, 1, -1, 0)
+    assert convert_to_milli((1e9, -1e9, math.inf), (0.0, 0.0, -math.inf)) == (32767, -32768, 32767, 0, 0, -32768)

@@ -11,7 +11,8 @@ from autopilot_rig import Flight, Name
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from quadrotor_rig import S, quadrotor, run
 
-from sim.autopilot.profile import IGNORE_ACCEL, IGNORE_VELOCITY, SIMULATED, ParsedSetpoint, SetpointKind, interpret
+from sim.autopilot.profile import SIMULATED
+from sim.autopilot.setpoints import IGNORE_ACCEL, IGNORE_VELOCITY, ParsedSetpoint, SetpointKind, parse_setpoint
 from sim.vehicle.interface import LEVEL
 from sim.vehicle.quadrotor import Quadrotor
 from uavctl.lab.own_loop import EXTERNAL_ONLY
@@ -27,15 +28,15 @@ def told(name: str, mask: int, velocity: Vec3 = AHEAD, accel: Vec3 = CHANGE) -> 
     message = mavlink.MAVLink_set_position_target_local_ned_message(
         0, 1, 1, 1, mask, *HERE, *velocity, *accel, 0.0, 0.0
     )
-    return interpret(SIMULATED[name], message, (0.0, 0.0, 0.0), LEVEL)
+    return parse_setpoint(SIMULATED[name], message, (0.0, 0.0, 0.0), LEVEL)
 
 
 @BOTH
 def test_a_position_alone_is_a_place_and_with_a_velocity_it_moves(name: str) -> None:
     place = told(name, IGNORE_VELOCITY | IGNORE_ACCEL)
-    assert (place.ask, place.vector, place.velocity_mps) == (SetpointKind.POSITION, HERE, None)
+    assert (place.kind, place.vector, place.velocity_mps) == (SetpointKind.POSITION, HERE, None)
     moving = told(name, IGNORE_ACCEL)
-    assert (moving.ask, moving.vector) == (SetpointKind.POSITION, HERE)
+    assert (moving.kind, moving.vector) == (SetpointKind.POSITION, HERE)
     assert (moving.velocity_mps, moving.accel_mps2) == (AHEAD, (0.0, 0.0, 0.0))
     assert told(name, 0).accel_mps2 == CHANGE
 
@@ -43,7 +44,7 @@ def test_a_position_alone_is_a_place_and_with_a_velocity_it_moves(name: str) -> 
 def test_a_velocity_that_is_no_number_is_left_out_by_px4_and_kills_ardupilot() -> None:
     broken = (math.nan, 0.0, 0.0)
     assert told("px4", IGNORE_ACCEL, velocity=broken).velocity_mps is None
-    assert told("ardupilot", IGNORE_ACCEL, velocity=broken).ask is SetpointKind.FATAL
+    assert told("ardupilot", IGNORE_ACCEL, velocity=broken).kind is SetpointKind.FATAL
 
 
 def orbit(time_s: float) -> tuple[Vec3, Vec3, Vec3]:
@@ -94,14 +95,14 @@ def test_ardupilot_carries_a_motion_on_for_three_seconds_and_px4_does_not() -> N
 def test_who_begins_in_the_air_may_count_as_aligned_and_flies_on_external_positions_at_once(name: Name) -> None:
     one = Flight(name)
     one.set(**EXTERNAL_ONLY[name])
-    assert not one.autopilot.estimator.position_ok
-    one.autopilot.estimator.begin_in_flight()
+    assert not one.autopilot.estimator.is_position_valid
+    one.autopilot.estimator.start_in_flight()
     one.external, one.external_hz = "VISION_POSITION_ESTIMATE", 4.0  # PX4 would not begin on so few
     before = one.mode
     one.wait(5.0)
-    assert one.mode == before and one.autopilot.estimator.position_ok
+    assert one.mode == before and one.autopilot.estimator.is_position_valid
     off = np.subtract(one.autopilot.estimator.position_m, one.vehicle.position_m)
     assert 0.0 < np.linalg.norm(off) < 0.02
     one.external = None
     one.wait(8.0)
-    assert not one.autopilot.estimator.position_ok and one.now_ns > 13 * S - 1
+    assert not one.autopilot.estimator.is_position_valid and one.now_ns > 13 * S - 1

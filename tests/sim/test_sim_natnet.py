@@ -18,9 +18,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from scipy.spatial.transform import Rotation
 
 from sim.cameras import UPTIME_S
-from sim.fleet import fleet
+from sim.fleet import make_fleet
 from sim.natnet import NatNetPort
-from sim.server import Seat, open_port, serve_all
+from sim.ports import open_port
+from sim.server import VehicleSetup, serve_all
 from uavctl.config import load_config
 from uavctl.errors import ConnectionSpecError
 from uavctl.frames import Frame, Up
@@ -144,7 +145,7 @@ def test_urls_that_are_wrong(url: str) -> None:
         open_port(url)
 
 
-def served(seats: tuple[Seat, ...], over: threading.Event, urls: list[str]) -> threading.Thread:
+def served(seats: tuple[VehicleSetup, ...], over: threading.Event, urls: list[str]) -> threading.Thread:
     thread = threading.Thread(
         target=lambda: serve_all(
             seats, duration_s=None, airborne=True, on_ready=lambda ready: urls.append(ready.mocap), stop=over.is_set
@@ -175,7 +176,7 @@ def heard(url: str, enough: Callable[[list[Any]], bool]) -> tuple[list[Any], lis
 def test_the_client_of_another_package_sees_where_each_simulated_vehicle_is() -> None:
     truths: list[Truth] = []
     config = load_config("room-hahn-stursberg", ["link.loss=0.0", "sim.start_position_m=[0.5,-1.0,-1.5]"])
-    seats = fleet(config, "udpin://127.0.0.1:0", "natnet://127.0.0.1:0/drone", 2, truths.append)
+    seats = make_fleet(config, "udpin://127.0.0.1:0", "natnet://127.0.0.1:0/drone", 2, truths.append)
     over, urls = threading.Event(), list[str]()
     thread = served(seats, over, urls)
     try:
@@ -198,7 +199,7 @@ def test_the_client_of_another_package_sees_where_each_simulated_vehicle_is() ->
 def test_the_daemon_s_own_source_has_them_where_the_vehicle_was(up: str) -> None:
     truths: list[Truth] = []
     config = load_config("room-hahn-stursberg", ["link.loss=0.0", "frame.yaw_deg=30.0", "frame.origin_m=[1.0,2.0,0.5]"])
-    seats = (Seat(config, "udpin://127.0.0.1:0", f"natnet://127.0.0.1:0/drone%201{up}", truths.append),)
+    seats = (VehicleSetup(config, "udpin://127.0.0.1:0", f"natnet://127.0.0.1:0/drone%201{up}", truths.append),)
     over, urls = threading.Event(), list[str]()
     thread = served(seats, over, urls)
     seen: list[Any] = []
@@ -226,13 +227,15 @@ def test_the_daemon_s_own_source_has_them_where_the_vehicle_was(up: str) -> None
 
 def test_a_vehicle_speaks_no_natnet() -> None:
     config = load_config("room-hahn-stursberg")
-    seats = (Seat(config, "natnet://127.0.0.1:0/drone", "udpin://127.0.0.1:0", lambda _: None),)
+    seats = (VehicleSetup(config, "natnet://127.0.0.1:0/drone", "udpin://127.0.0.1:0", lambda _: None),)
     with pytest.raises(ConnectionSpecError, match="a vehicle speaks no NatNet"):
         serve_all(seats, duration_s=None, airborne=True, on_ready=lambda _: None, stop=lambda: True)
 
 
 def test_ports_of_a_fleet_of_servers_follow_each_other() -> None:
-    seats = fleet(load_config("room"), "udpin://127.0.0.1:5000", "natnet://127.0.0.1/drone%201?up=z", 2, lambda _: None)
+    seats = make_fleet(
+        load_config("room"), "udpin://127.0.0.1:5000", "natnet://127.0.0.1/drone%201?up=z", 2, lambda _: None
+    )
     assert [seat.mocap for seat in seats] == [
         "natnet://127.0.0.1:1510/drone%201?up=z",
         "natnet://127.0.0.1:1511/drone%201?up=z",

@@ -141,7 +141,7 @@ def test_px4_holds_its_heading() -> None:
 def turned(name: Name, yaw_rad: float) -> Flight:
     """Hovering, with its nose turned."""
     one = Flight(name)
-    one.vehicle.face(yaw_rad)
+    one.vehicle.set_heading(yaw_rad)
     one.stream(4.0, 0.0, 0.0, 0.0)
     return one
 
@@ -216,9 +216,9 @@ def test_armed_and_not_taken_off_it_disarms_by_itself_after_10_s(name: Name, tex
     one = Flight(name, airborne=False)
     assert one.ask(ARM, 1) == 0
     one.wait(9.9)
-    assert one.autopilot.pilot.armed
+    assert one.autopilot.pilot.is_armed
     one.wait(0.2)
-    assert not one.autopilot.pilot.armed
+    assert not one.autopilot.pilot.is_armed
     assert one.texts[-1].startswith(text)
 
 
@@ -232,7 +232,7 @@ def test_take_off_and_landing_on_the_quadrotor(name: Name) -> None:
     one.wait(12.0)
     assert one.vehicle.position_m == pytest.approx((0.0, 0.0, 0.0), abs=0.15)
     assert one.vehicle.rotor_speeds_rps[0] < 1.0  # disarmed: they stand
-    assert not one.autopilot.pilot.armed
+    assert not one.autopilot.pilot.is_armed
     assert one.of("BATTERY_STATUS")[-1].battery_remaining < 100
 
 
@@ -267,7 +267,7 @@ def test_a_position_does_not_time_out_and_a_velocity_does() -> None:
     one.send(one.client.setpoint(0.0, 0.0, 0.0, mask=0xDF8))  # position (0, 0, 0): down to the floor's height
     one.wait(3.5)
     assert one.vehicle.velocity_mps[2] > 0.5
-    assert one.autopilot.pilot.helm.obeyed is not None
+    assert one.autopilot.pilot.dispatch.active_setpoint is not None
 
 
 def test_px4_goes_on_with_the_last_acceleration_where_the_loss_of_the_stream_needs_a_radio() -> None:
@@ -390,7 +390,7 @@ def test_rotors_spin_up_before_it_lifts_and_it_disarms_some_time_after_it_stands
     while one.vehicle.position_m[2] < 0.0:
         one.wait(0.05)
     stood_ns = one.now_ns
-    while one.autopilot.pilot.armed:
+    while one.autopilot.pilot.is_armed:
         one.wait(0.05)
     assert (one.now_ns - stood_ns) * 1e-9 == pytest.approx(disarm_s, abs=0.4)
 
@@ -442,7 +442,7 @@ def test_px4_that_has_landed_is_in_the_mode_of_before_and_stands_by_only_while_i
     one = Flight("px4")
     one.stream(1.0, 0.0, 0.0, 0.5)
     assert one.ask(LAND) == 0 and one.texts[-1] == "Landing at current position"
-    while one.autopilot.pilot.armed:
+    while one.autopilot.pilot.is_armed:
         one.wait(0.5)
         assert one.now_ns < 40e9
     one.wait(1.1)

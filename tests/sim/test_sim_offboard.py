@@ -6,7 +6,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import SET_MODE, bench, flying
 
-from sim.autopilot.profile import ParsedSetpoint, SetpointKind
+from sim.autopilot.setpoints import ParsedSetpoint, SetpointKind
 
 OFFBOARD = (1, 6, 0)
 
@@ -61,5 +61,5 @@ def test_px4_flies_what_is_set_beside_numbers_that_are_none() -> None:
     assert flying(one) == (0.5, 0.0, 0.0)
     # A velocity with the force bit, which is about accelerations.
     one.send(one.client.pack(message(0, 1, 1, 1, 0xDC7 | 0x200, *nothing, 1.0, 0.0, 0.0, *nothing, 0.0, 0.0)))
-    assert one.peers.autopilot.pilot.helm.obeyed == ParsedSetpoint(SetpointKind.VELOCITY, (1.0, 0.0, 0.0))
+    assert one.peers.autopilot.pilot.dispatch.active_setpoint == ParsedSetpoint(SetpointKind.VELOCITY, (1.0, 0.0, 0.0))
     assert one.texts == []

@@ -11,7 +11,7 @@ import pytest
 from autopilot_rig import Flight, Name
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sim.autopilot.profile import TABLES, ParameterType
+from sim.autopilot.parameters import TABLES, ParameterType
 
 BOTH = pytest.mark.parametrize("name", ["px4", "ardupilot"])
 # Of vehicles that were flown: what a ground check reads before take-off.

@@ -72,7 +72,7 @@ def test_the_seed_is_that_of_the_gusts_and_calm_air_needs_none() -> None:
     def ends(*overrides: str) -> tuple[float, ...]:
         peers = Peers(load_config("room-hahn-stursberg", [QUADROTOR, *overrides]), 0)
         peers.advance(2_000_000_000)
-        return peers.truth().position_m
+        return peers.read_truth().position_m
 
     assert ends(*GUSTS, "sim.seed=1") == ends(*GUSTS, "sim.seed=1") != ends(*GUSTS, "sim.seed=2")
     assert ends("sim.seed=1") == ends("sim.seed=2")
@@ -83,7 +83,7 @@ def test_the_seed_is_that_of_the_gusts_and_calm_air_needs_none() -> None:
 def test_its_state_is_in_the_order_of_the_plant_and_begins_where_it_is_told() -> None:
     config = load_config("room-hahn-stursberg", [QUADROTOR, "sim.start_velocity_mps=[0.5, -0.25, 0.1]"])
     peers = Peers(config, 0)
-    truth = peers.truth()
+    truth = peers.read_truth()
     assert isinstance(peers.vehicle, Quadrotor)
     assert truth.position_m == (-2.4, -1.9, -0.7)
     assert truth.state[0::3] == truth.position_m
@@ -102,7 +102,7 @@ def test_its_battery_begins_with_the_charge_asked_for() -> None:
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 def test_it_takes_off_and_lands(autopilot: Literal["px4", "ardupilot"]) -> None:
     one = Bench(load_config("room-hahn-stursberg", [QUADROTOR, f"sim.autopilot={autopilot}"]), airborne=False)
-    assert one.peers.truth().position_m == (-2.4, -1.9, 0.0)
+    assert one.peers.read_truth().position_m == (-2.4, -1.9, 0.0)
     one.wait(30.0)
     if autopilot == "px4":
         assert one.ask(TAKE_OFF, *[0.0] * 4, math.nan, math.nan, math.nan) == 0
@@ -112,11 +112,11 @@ def test_it_takes_off_and_lands(autopilot: Literal["px4", "ardupilot"]) -> None:
         assert one.ask(ARM, 1.0) == 0
         assert one.ask(TAKE_OFF, *[0.0] * 6, 2.5) == 0
     one.wait(8.0)
-    assert one.peers.truth().position_m[2] == pytest.approx(-2.5, abs=0.25)
+    assert one.peers.read_truth().position_m[2] == pytest.approx(-2.5, abs=0.25)
     assert one.ask(21) == 0
     one.wait(15.0)
-    assert one.peers.truth().position_m[2] == 0.0
-    assert not one.peers.autopilot.pilot.armed
+    assert one.peers.read_truth().position_m[2] == 0.0
+    assert not one.peers.autopilot.pilot.is_armed
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,8 @@ import pytest
 from patience import LIMIT_S, until
 from sim_rig import Client, decode
 
-from sim.server import STRIDE_NS, Ready, Seat, cut_frames, grid_start, open_port, serve, serve_all, serve_in_child
+from sim.ports import open_port, split_frames
+from sim.server import MAX_STEP_NS, Ready, VehicleSetup, compute_grid_start_ns, serve, serve_all, serve_in_child
 from sim.simulation import Peers
 from uavctl.config import Config, load_config
 from uavctl.errors import ConnectionSpecError
@@ -93,8 +94,8 @@ def is_a(kind: str) -> Any:
 
 
 def test_the_grid_is_shared_without_a_word() -> None:
-    assert grid_start(17, 5) == 20
-    assert grid_start(20, 5) == 20
+    assert compute_grid_start_ns(17, 5) == 20
+    assert compute_grid_start_ns(20, 5) == 20
 
 
 def test_udp_vehicle_and_cameras_send_to_the_client_and_obey_it() -> None:
@@ -250,7 +251,7 @@ def tcp_until(sock: socket.socket, kind: str) -> Any:
     stream = bytearray()
     for _ in range(500):
         stream += sock.recv(4096)
-        for frame in cut_frames(stream):
+        for frame in split_frames(stream):
             (msg,) = decode(frame)
             if msg.get_type() == kind:
                 return msg
@@ -263,12 +264,12 @@ def test_frames_are_cut_off_a_stream_whatever_the_pieces() -> None:
     stream, got = bytearray(), []
     for byte in b"\x00\x11" + wanted[0] + b"\x22" + wanted[1] + wanted[2]:
         stream.append(byte)
-        got += cut_frames(stream)
+        got += split_frames(stream)
     assert got == wanted
     assert not stream
     signed = bytearray(wanted[0])
     signed[2] = 1
-    assert cut_frames(bytearray(bytes(signed) + bytes(13) + wanted[1])) == [bytes(signed) + bytes(13), wanted[1]]
+    assert split_frames(bytearray(bytes(signed) + bytes(13) + wanted[1])) == [bytes(signed) + bytes(13), wanted[1]]
 
 
 @pytest.mark.parametrize(
@@ -319,10 +320,10 @@ def test_a_speed_beyond_this_computer_s_piles_up_no_work_and_tells_all(monkeypat
 
     monkeypatch.setattr(Peers, "advance", spied)
     told: list[Truth] = []
-    seat = Seat(config("sim.plant=quadrotor"), "udpin://127.0.0.1:0", "udpin://127.0.0.1:0", told.append)
+    seat = VehicleSetup(config("sim.plant=quadrotor"), "udpin://127.0.0.1:0", "udpin://127.0.0.1:0", told.append)
     readies: list[Ready] = []
     serve_all((seat,), duration_s=10.0, airborne=True, on_ready=readies.append, stop=lambda: False, speed=1000.0)
-    assert max(strides) <= STRIDE_NS
+    assert max(strides) <= MAX_STEP_NS
     assert [one.at_ns - readies[0].start_ns for one in told] == [k * S // 5 for k in range(50)]
 
 
@@ -330,7 +331,7 @@ def test_simulated_time_runs_at_a_multiple_of_real_time_for_several_vehicles_at_
     clients = [udp() for _ in range(4)]
     told: tuple[list[Truth], list[Truth]] = ([], [])
     seats = [
-        Seat(config(f"sim.autopilot={name}"), clients[2 * i][1], clients[2 * i + 1][1], told[i].append)
+        VehicleSetup(config(f"sim.autopilot={name}"), clients[2 * i][1], clients[2 * i + 1][1], told[i].append)
         for i, name in enumerate(("px4", "ardupilot"))
     ]
     readies: list[Ready] = []

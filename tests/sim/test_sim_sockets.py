@@ -9,7 +9,7 @@ from patience import LIMIT_S
 from sim_rig import Client, bench
 
 from sim.autopilot.profile import ARDUPILOT
-from sim.server import UdpPort, open_port
+from sim.ports import UdpPort, open_port
 from uavctl.cli.app import run
 from uavctl.mavlink.codec import StreamDecoder
 from uavctl.mavlink.messages import Heartbeat

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from sim.vehicle.linear import MAX_ACCEL_MPS2, LinearVehicle, linear_model
+from sim.vehicle.linear import MAX_ACCEL_MPS2, LinearVehicle, make_linear_model
 from uavctl.config import Config, load_config
 from uavctl.errors import DesignError
 from uavctl.records import Vec3
@@ -78,7 +78,7 @@ def test_its_acceleration_is_the_slope_of_its_velocity_wind_and_all(name: str) -
                 told = flown.acceleration_mps2
         assert told == pytest.approx((speeds[2] - speeds[0]) / (2e-9 * step_ns), abs=1e-5)
         flown.advance((k + 1) * flown.model.dt_ns)
-    flown.rest()
+    flown.stand_on_floor()
     assert flown.acceleration_mps2 == (0.0, 0.0, 0.0)
 
 
@@ -118,7 +118,7 @@ def test_drag_lag_matches_an_integrator_with_the_input_changed_within_a_step() -
 
 def test_disturbance_has_the_covariance_asked_for() -> None:
     config = load_config("paper", ["plant.w=[[0.6,0.2],[0.2,0.5]]"])
-    root = linear_model(config.plant).w_root
+    root = make_linear_model(config.plant).w_root
     np.testing.assert_allclose(root @ root.T, [[0.6, 0.2], [0.2, 0.5]], atol=1e-12)
     flown = vehicle(config)
     a = np.array(config.plant.a)
@@ -152,7 +152,7 @@ def test_the_input_is_in_plant_units_and_limited_only_beyond_ten_g() -> None:
 def test_on_the_floor_nothing_moves_but_the_draws_go_on() -> None:
     config = load_config("room-hahn-stursberg")
     resting, flying = vehicle(config), vehicle(config)
-    resting.rest()
+    resting.stand_on_floor()
     for one in (resting, flying):
         one.advance(3 * S + 1)
     assert resting.position_m == (-2.4, -1.9, 0.0)
@@ -161,7 +161,7 @@ def test_on_the_floor_nothing_moves_but_the_draws_go_on() -> None:
     before = resting.state.copy(), flying.state.copy()
     for one in (resting, flying):
         one.advance(3 * S + S // 10)
-    a = linear_model(config.plant).transition(S // 10 - 1)[0]
+    a = make_linear_model(config.plant).transition(S // 10 - 1)[0]
     # the same w in both: what differs is the homogeneous motion only
     np.testing.assert_allclose(resting.state - a @ before[0], flying.state - a @ before[1], rtol=0, atol=1e-12)
 
@@ -195,4 +195,4 @@ def test_a_plant_without_a_real_logarithm_is_refused(a: tuple[tuple[float, ...],
         accel_per_input=(1.0,),
     )
     with pytest.raises(DesignError, match=r"plant\.a"):
-        linear_model(plant)
+        make_linear_model(plant)

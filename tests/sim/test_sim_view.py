@@ -9,7 +9,7 @@ from patience import LIMIT_S
 from rich.console import Console
 from sim_rig import bench
 
-from sim.server import Seat, serve_all
+from sim.server import VehicleSetup, serve_all
 from sim.simulation import VehicleSnapshot
 from uavctl.cli.app import run
 from uavctl.cli.sim import HEADINGS, LANDED, line, scene_of, view, watching
@@ -26,7 +26,7 @@ ONE = VehicleSnapshot(
     position_m=(1.0, -2.5, -1.5),
     velocity_mps=(0.25, 0.0, -0.125),
     battery=0.87,
-    steered_by=(245, 25),
+    setpoint_source=(245, 25),
     setpoint_age_s=0.05,
     sent=600,
     lost=17,
@@ -44,7 +44,7 @@ def drawn(*looks: VehicleSnapshot, width: int = 250) -> str:
 
 
 def test_the_table_has_a_row_for_each_vehicle_and_takes_no_text_for_markup() -> None:
-    other = replace(ONE, system_id=4, mode="CRASHED", steered_by=None, setpoint_age_s=None, faults=(), text="")
+    other = replace(ONE, system_id=4, mode="CRASHED", setpoint_source=None, setpoint_age_s=None, faults=(), text="")
     text = drawn(ONE, other)
     rows = [row for row in text.splitlines() if row.startswith("│")]
     assert len(rows) == 2
@@ -95,23 +95,23 @@ def test_a_look_tells_what_the_vehicle_does() -> None:
         '{at_s=1.0,kind="blackout",for_s=1.0},{at_s=1.5,kind="parameter",name="COM_OF_LOSS_T",value=2.0},'
         '{at_s=5.0,kind="occluded",for_s=1.0}]',
     )
-    before = one.peers.look()
-    assert (before.steered_by, before.setpoint_age_s, before.faults, before.text) == (None, None, (), "")
+    before = one.peers.take_snapshot()
+    assert (before.setpoint_source, before.setpoint_age_s, before.faults, before.text) == (None, None, (), "")
     assert (before.armed, LANDED[before.phase], before.battery, before.system_id) == (True, "in the air", 1.0, 1)
     one.stream(1.6, 1.0, 0.0, 0.0)
-    now = one.peers.look()
+    now = one.peers.take_snapshot()
     assert now.time_s == pytest.approx(1.6)
-    assert now.steered_by == (245, 25)
+    assert now.setpoint_source == (245, 25)
     assert now.setpoint_age_s == pytest.approx(0.1)
     assert now.velocity_mps == one.peers.vehicle.velocity_mps and now.velocity_mps[0] > 0.5
     assert now.faults == ("blackout", "parameter COM_OF_LOSS_T")
     assert (now.sent, now.lost) == (9, 4)  # each 0.2 s from 0 to 1.6 s; the blackout begins with that at 1 s
     one.wait(3.0)
-    later = one.peers.look()
+    later = one.peers.take_snapshot()
     assert (later.mode, later.text) == ("AUTO.LOITER", "Failsafe activated")
     assert later.faults == ("parameter COM_OF_LOSS_T",)
     one.wait(0.5)
-    assert "occluded" in one.peers.look().faults
+    assert "occluded" in one.peers.take_snapshot().faults
 
 
 def test_without_a_terminal_it_is_said_and_told_line_by_line(capsys: pytest.CaptureFixture[str]) -> None:
@@ -148,12 +148,18 @@ class Stuck(io.StringIO):
 def test_a_terminal_that_has_stopped_does_not_hold_up_the_simulation() -> None:
     stuck = Stuck()
     told: list[int] = []
-    seat = Seat(load_config("room-hahn-stursberg"), ANY, ANY, lambda truth: told.append(truth.at_ns))
+    seat = VehicleSetup(load_config("room-hahn-stursberg"), ANY, ANY, lambda truth: told.append(truth.at_ns))
     with watching(Console(file=stuck, force_terminal=True), ROOM) as tell:
         tell((ONE,))
         assert stuck.tried.wait(LIMIT_S)
         serve_all(
-            (seat,), duration_s=2.0, airborne=True, on_ready=lambda _: None, stop=lambda: False, speed=4.0, on_look=tell
+            (seat,),
+            duration_s=2.0,
+            airborne=True,
+            on_ready=lambda _: None,
+            stop=lambda: False,
+            speed=4.0,
+            on_snapshot=tell,
         )
         assert not stuck.let.is_set()
     assert len(told) == 10  # each Δt boundary of the 2 s
@@ -162,8 +168,10 @@ def test_a_terminal_that_has_stopped_does_not_hold_up_the_simulation() -> None:
 
 def test_looks_come_with_the_run_and_at_its_end() -> None:
     looks: list[tuple[VehicleSnapshot, ...]] = []
-    seat = Seat(load_config("room-hahn-stursberg"), ANY, ANY, lambda _: None)
-    serve_all((seat,), duration_s=1.0, airborne=True, on_ready=lambda _: None, stop=lambda: False, on_look=looks.append)
+    seat = VehicleSetup(load_config("room-hahn-stursberg"), ANY, ANY, lambda _: None)
+    serve_all(
+        (seat,), duration_s=1.0, airborne=True, on_ready=lambda _: None, stop=lambda: False, on_snapshot=looks.append
+    )
     times = [one.time_s for (one,) in looks]
     assert times == sorted(times)
     assert 3 <= len(times) <= 6 + 2  # at most four a second (the wait for the grid too), one at the end

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm, solve_continuous_lyapunov
 from scipy.signal import welch
 
-from sim.wind import CALM, FOOT_M, Wind, _Across, dryden
+from sim.wind import CALM, FOOT_M, Wind, _LateralGust, compute_dryden
 from uavctl.records import Vec3
 
 Array = NDArray[np.float64]
@@ -17,7 +17,7 @@ NORTH_WIND: Vec3 = (20.0, 0.0, 0.0)
 STEP_S = 0.1
 HEIGHT_M = 20.0
 SEGMENT = 4096
-FIGURES = dryden(15.4, HEIGHT_M, 20.0)
+FIGURES = compute_dryden(15.4, HEIGHT_M, 20.0)
 
 
 def blow(steps: int, seed: int = 1, mean: Vec3 = NORTH_WIND, step_s: float = STEP_S, gusts: float = 15.4) -> Array:
@@ -37,21 +37,21 @@ def long() -> Array:
 
 def test_the_figures_are_those_of_the_specification() -> None:
     # At 20 ft: L_u = 20 / (0.177 + 0.01646)^1.2 ft, σ_w = 0.1 W20, σ_u = σ_w / (0.177 + 0.01646)^0.4.
-    figures = dryden(10.0, 20.0 * FOOT_M, 4.0)
+    figures = compute_dryden(10.0, 20.0 * FOOT_M, 4.0)
     assert figures.sigma_down_mps == pytest.approx(1.0)
     assert figures.sigma_mps == pytest.approx(0.19346**-0.4)
     assert figures.time_s == pytest.approx(20.0 * 0.3048 / 0.19346**1.2 / 4.0)
     assert figures.time_down_s == pytest.approx(6.096 / 4.0)
     # At 1000 ft the turbulence is isotropic: both forms meet.
-    high = dryden(10.0, 1000.0 * FOOT_M, 4.0)
+    high = compute_dryden(10.0, 1000.0 * FOOT_M, 4.0)
     assert high.sigma_mps == pytest.approx(high.sigma_down_mps)
     assert high.time_s == pytest.approx(high.time_down_s)
 
 
 def test_outside_its_heights_the_model_is_held_at_its_ends() -> None:
-    assert dryden(10.0, 0.5, 4.0) == dryden(10.0, 10.0 * FOOT_M, 4.0)
-    assert dryden(10.0, 5000.0, 4.0) == dryden(10.0, 1000.0 * FOOT_M, 4.0)
-    assert dryden(10.0, 5.0, 0.0) == dryden(10.0, 5.0, 1.0)
+    assert compute_dryden(10.0, 0.5, 4.0) == compute_dryden(10.0, 10.0 * FOOT_M, 4.0)
+    assert compute_dryden(10.0, 5000.0, 4.0) == compute_dryden(10.0, 1000.0 * FOOT_M, 4.0)
+    assert compute_dryden(10.0, 5.0, 0.0) == compute_dryden(10.0, 5.0, 1.0)
 
 
 def test_mean_and_variances(long: Array) -> None:
@@ -112,7 +112,7 @@ def test_a_step_is_exact_whatever_its_length() -> None:
         # The filter's answer to unit states and unit draws, read from its output before and after another step.
         rows = []
         for start, draws in (((1, 0), (0, 0)), ((0, 1), (0, 0)), ((0, 0), (1, 0)), ((0, 0), (0, 1))):
-            one = _Across(sigma, time_s, step_s, start)
+            one = _LateralGust(sigma, time_s, step_s, start)
             one.step(*draws)
             first = one.value
             one.step(0.0, 0.0)

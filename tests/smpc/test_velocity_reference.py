@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from quadrotor_rig import S, quadrotor, steady
 from scipy.integrate import solve_ivp
 
-from sim.vehicle.linear import linear_model
+from sim.vehicle.linear import make_linear_model
 from sim.wind import Wind
 from uavctl.build.controller import build_plant
 from uavctl.cli.app import run as main
@@ -192,7 +192,7 @@ def test_its_states_have_names() -> None:
 
 def test_the_simulators_own_reading_is_the_same() -> None:
     config = load_config("room-hahn-stursberg", list(OVERRIDES))
-    plant, model = build_plant(config), linear_model(config.plant)
+    plant, model = build_plant(config), make_linear_model(config.plant)
     for ours, theirs in ((plant.a, model.a), (plant.b, model.b), (plant.e, model.e)):
         np.testing.assert_allclose(ours, theirs, rtol=0.0, atol=1e-12)
     np.testing.assert_allclose(model.w_root @ model.w_root.T, plant.w, rtol=1e-12, atol=0.0)

@@ -12,7 +12,7 @@ from quadrotor_rig import WITH_SIH_DRAG, quadrotor, steady
 from sim_rig import ARM, TAKE_OFF, Client, S, decode
 
 from sim.autopilot.autopilot import Autopilot
-from sim.vehicle.interface import heading_rad
+from sim.vehicle.interface import compute_heading_rad
 from sim.vehicle.quadrotor import Quadrotor
 from uavctl.config import load_config
 from uavctl.records import Vec3
@@ -91,10 +91,10 @@ class Flight:
     def set(self, **parameters: float) -> None:
         """Set parameters over the wire; each must hold afterwards."""
         for name, value in parameters.items():
-            kind = self.autopilot.parameters.kind(name)
+            kind = self.autopilot.parameters.get_type(name)
             before = self.autopilot.parameters[name]
             self.autopilot.parameters.set(name, value)
-            wire = self.autopilot.parameters.encoded(name)
+            wire = self.autopilot.parameters.encode(name)
             self.autopilot.parameters.set(name, before)
             (answer,) = self.send(self.client.pack(mavlink.MAVLink_param_set_message(1, 1, name.encode(), wire, kind)))
             assert answer.param_id == name
@@ -140,7 +140,7 @@ class Flight:
 
     @property
     def heading_deg(self) -> float:
-        return math.degrees(heading_rad(self.vehicle.attitude))
+        return math.degrees(compute_heading_rad(self.vehicle.attitude))
 
 
 def external(kind: str, usec: int, vehicle: Quadrotor) -> Any:

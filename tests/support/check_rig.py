@@ -27,7 +27,7 @@ class Checked:
 
     def __init__(self, flight: Preflight, at_ns: int) -> None:
         self.flight = flight
-        self.items = {one.name: one for one in flight.items(at_ns)}
+        self.items = {one.name: one for one in flight.make_items(at_ns)}
 
     def __getitem__(self, name: str) -> Item:
         return self.items[name]
@@ -68,7 +68,7 @@ def look(
         at_ns = tick * TICK_NS
         for arrival_ns, link, data in peers.advance(at_ns):
             flight.receive(link, data if link == VEHICLE else twist(data), arrival_ns)
-        flight.tick(tick, at_ns, peers.receiver(at_ns))
+        flight.tick(tick, at_ns, peers.make_sender(at_ns))
         accel = setpoints(at_ns * 1e-9)
         if accel is not None:
             peers.receive(VEHICLE, client.setpoint(*accel), at_ns)

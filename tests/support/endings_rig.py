@@ -133,7 +133,7 @@ class Endings:
         self.config = load_config(preset, settings)
         self.folder, self.now_ns = folder, BEGUN_NS
         self.peers = Peers(self.config, BEGUN_NS, airborne=airborne)
-        self.peers.autopilot.pilot.radio = True  # the pilot is there, with his stick
+        self.peers.autopilot.pilot.has_radio = True  # the pilot is there, with his stick
         self.lines = {"vehicle": Line(self, "vehicle"), "mocap": Line(self, "mocap")}
         self.hears: Callable[[bytes], bool] = lambda data: True
         self.told: Callable[[bytes], bool] = lambda data: True
@@ -158,7 +158,7 @@ class Endings:
 
     def stick(self, mode: str) -> None:
         kind = SIMULATED[self.config.sim.autopilot]
-        self.peers.autopilot.pilot.change(kind.mode(mode), self.now_ns)
+        self.peers.autopilot.pilot.change_mode(kind.get_mode(mode), self.now_ns)
 
     def at(self, state: HandoverState, do: Callable[[Endings], None], *, after_s: float = 0.0) -> Endings:
         """A step once the hand-over has been in a state for a while."""

@@ -16,7 +16,7 @@ from typing import Any, Literal
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import Bench, bench, decode
 
-from sim.autopilot.profile import TABLES
+from sim.autopilot.parameters import TABLES
 
 HANDLED = (
     "ATT_POS_MOCAP",
@@ -146,12 +146,12 @@ def snapshot(one: Bench) -> dict[str, Any]:
     pilot = autopilot.pilot
     return {
         "mode": pilot.mode.name,
-        "flags": (pilot.armed, pilot.phase, pilot.failsafe, vehicle.grounded),
-        "crashed": pilot.crashed,
+        "flags": (pilot.is_armed, pilot.phase, pilot.is_failsafe, vehicle.grounded),
+        "crashed": pilot.crash_reason,
         "parameters": tuple(autopilot.parameters[name] for name in autopilot.parameters.names),
-        "intervals": tuple(autopilot.telemetry.interval_us(kind) for kind in autopilot.telemetry.streams),
+        "intervals": tuple(autopilot.telemetry.get_interval_us(kind) for kind in autopilot.telemetry.streams),
         "home": pilot.home_m,
-        "origin": autopilot.estimator.origin,
+        "origin": autopilot.estimator.has_origin,
         "input": tuple(vehicle.input.tolist()),
     }
 

@@ -73,7 +73,7 @@ class Indoors:
         """Move time on, and deliver what is due, in order of arrival."""
         while True:
             due_ns = min(self._way[0][0], to_ns) if self._way else to_ns
-            self.peers.converse(max(due_ns, self.peers.now_ns), self._hear)
+            self.peers.exchange(max(due_ns, self.peers.now_ns), self._hear)
             if not self._way or self._way[0][0] > to_ns:
                 return
             due_ns, _, up, link, data = heapq.heappop(self._way)
@@ -104,10 +104,10 @@ class Indoors:
         """The pilot takes off by hand, and switches at 1.2 m."""
         pilot, kind = self.peers.autopilot.pilot, SIMULATED[self.config.sim.autopilot]
         if kind.name == "ardupilot":
-            pilot.change(kind.mode(external), self.peers.now_ns)
+            pilot.change_mode(kind.get_mode(external), self.peers.now_ns)
         assert pilot.arm(self.peers.now_ns) == 0 and pilot.take_off(1.2, self.peers.now_ns) == 0
         self.run(5.0)
-        assert pilot.change(kind.mode(external), self.peers.now_ns) == 0
+        assert pilot.change_mode(kind.get_mode(external), self.peers.now_ns) == 0
         self.run(3.0)
         assert self.loop.handover_state is HandoverState.ENGAGED and not self.loop.finished
 

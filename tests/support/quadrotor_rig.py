@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from places import DATA
 from scipy.signal import lfilter
 
-from sim.vehicle.linear import linear_model
+from sim.vehicle.airframe import CRAZYFLIE_2, Airframe
+from sim.vehicle.battery import BatteryModel
+from sim.vehicle.linear import make_linear_model
 from sim.vehicle.quadrotor import STEP_NS, STEP_S, Quadrotor
-from sim.vehicle.rigid_body import CRAZYFLIE_2, Airframe, BatteryModel
 from sim.wind import Wind
 from uavctl.config import load_config
 from uavctl.records import Vec3
@@ -23,7 +24,7 @@ Array = NDArray[np.float64]
 Autopilot = Literal["px4", "ardupilot"]
 
 S = 1_000_000_000
-MODEL = linear_model(load_config("room-hahn-stursberg").plant)
+MODEL = make_linear_model(load_config("room-hahn-stursberg").plant)
 # The recorded PX4 flew a vehicle with drag of 1 N s/m and 1 kg (SIH_KDV, SIH_MASS), the same along all axes.
 HOVER_SUM_RPS = 4.0 * CRAZYFLIE_2.hover_rps
 WITH_SIH_DRAG = replace(

@@ -84,7 +84,7 @@ def checked(name: str, since_s: float, seconds: float, *overrides: str) -> dict[
             flight.tick(tick, begin_ns + tick * TICK_NS, to_nobody)
             tick += 1
         flight.receive(VEHICLE, one.data, one.at_ns)
-    return {one.name: one.state.value for one in flight.items(begin_ns + tick * TICK_NS)}
+    return {one.name: one.state.value for one in flight.make_items(begin_ns + tick * TICK_NS)}
 
 
 @dataclass(frozen=True)

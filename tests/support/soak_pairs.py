@@ -87,7 +87,7 @@ def fly_true(
         decision = None if watch.ticked is None else watch.ticked.decision
         outside_m = max(outside_m, beyond_m(config, place))
         pilot = world.peers.autopilot
-        if pilot.pilot.armed:  # disarmed, a PX4 takes up the mode of before
+        if pilot.pilot.is_armed:  # disarmed, a PX4 takes up the mode of before
             ended = pilot.mode_name
         speed_mps = max(speed_mps, math.hypot(*world.peers.vehicle.velocity_mps))
         if at_ns * 1e-9 >= begins_s:

@@ -163,7 +163,7 @@ def fly(
 
     def is_over() -> bool:
         autopilot = world.peers.autopilot
-        return watch.loop.finished and not (lands and (autopilot.pilot.armed or not autopilot.craft.landed))
+        return watch.loop.finished and not (lands and (autopilot.pilot.is_armed or not autopilot.vehicle.landed))
 
     try:
         world.run(config.duration_s, is_over)

@@ -85,9 +85,9 @@ def troubled(autopilot: str, seed: int) -> Flight:
 def outcome(flight: Flight) -> str:
     """What has become of the true vehicle; `hovers` is what must not be."""
     up_m, pilot = -flight.peers.vehicle.position_m[2], flight.peers.autopilot.pilot
-    if not pilot.armed and flight.peers.autopilot.craft.landed:
+    if not pilot.is_armed and flight.peers.autopilot.vehicle.landed:
         return "landed" if "climbing" in flight.states else "refused"
-    obeys = pilot.external and pilot.helm.obeyed is not None  # whatever the hand-over takes it for
+    obeys = pilot.is_external and pilot.dispatch.active_setpoint is not None  # whatever the hand-over takes it for
     return "engaged" if flight.is_in(HandoverState.ENGAGED) and obeys and up_m > LOW_M else "hovers"
 
 
@@ -100,7 +100,7 @@ def flown(flight: Flight) -> str:
         if flight.loop.finished or (engaged_s > SETTLED_S and armed_s > to_come_s + SETTLED_S):
             break
         flight.run(1.0)
-        armed_s += flight.peers.autopilot.pilot.armed
+        armed_s += flight.peers.autopilot.pilot.is_armed
         engaged_s = engaged_s + 1.0 if flight.is_in(HandoverState.ENGAGED) else 0.0
     return outcome(flight)
 
@@ -120,7 +120,7 @@ def fly_take_off(autopilot: str, seed: int) -> TakeOff:
         wrong.append(f"nobody has it in the air ({flight.state})")
     if what != "engaged" and not (told and flight.loop.course.told):
         wrong.append("nobody was told why")
-    if flight.state not in ATTENDED and flight.peers.autopilot.pilot.armed:
+    if flight.state not in ATTENDED and flight.peers.autopilot.pilot.is_armed:
         wrong.append(f"it was left armed ({flight.state})")
     reached = flight.loop.course.engaged
     return TakeOff(autopilot, seed, what, reached, round(seconds, 1), told, flight.loop.ending.sentence, tuple(wrong))

@@ -44,7 +44,7 @@ class Flight:
         self.memory.put("/uavctl/header", 0, header(self.config, design))
         self.loop = ControlLoop(self.config, controller, self.memory, lambda: 0)
         self.peers = Peers(self.config, 0, airborne=False)
-        self.peers.autopilot.pilot.radio = True  # the pilot is there, with his stick
+        self.peers.autopilot.pilot.has_radio = True  # the pilot is there, with his stick
         self.tick = 0
         self.ticked: Ticked | None = None  # the last one
         self.notices: list[Event] = []  # of the whole flight
@@ -92,7 +92,7 @@ class Flight:
     def stick(self, mode: str) -> None:
         """The pilot changes the mode."""
         kind = SIMULATED[self.config.sim.autopilot]
-        self.peers.autopilot.pilot.change(kind.mode(mode), self.now_ns)
+        self.peers.autopilot.pilot.change_mode(kind.get_mode(mode), self.now_ns)
 
     @property
     def states(self) -> list[str]:

@@ -13,12 +13,12 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sim.faults import check_faults
+from sim.faults import check_fault_support
 from uavctl.build.controller import build_plant, build_problem, build_solver, design_of
 from uavctl.build.link import build_ages
 from uavctl.config import Config, dump_config, parse
 from uavctl.config import load as load_file
-from uavctl.config.load import override_texts
+from uavctl.config.load import format_overrides
 from uavctl.config.mission import MissionConfig
 from uavctl.errors import ConfigError, UavctlError, UsageError, need
 from uavctl.records import names_of
@@ -53,12 +53,12 @@ def load(source: Source = "room", overrides: Mapping[str, object] | None = None,
     """
     if not isinstance(overrides, Mapping | None):
         raise UsageError(f'{overrides!r} does not say which key is to differ; give {{"link.loss": 0.3}}')
-    given = tuple(override_texts({**(overrides or {}), **keys}))
+    given = tuple(format_overrides({**(overrides or {}), **keys}))
     if isinstance(source, Config):
         loaded = parse(dump_config(source), source.name, given)
     else:
         loaded = load_file(str(source), given)
-    check_faults(loaded)
+    check_fault_support(loaded)
     return loaded.config
 
 

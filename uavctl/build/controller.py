@@ -18,7 +18,7 @@ from uavctl.build.link import build_ages, build_delayed_link, late_steps, promis
 from uavctl.build.mission import build_mission, build_names, build_rests
 from uavctl.build.outside import controller_id, decider_id, flown_outside
 from uavctl.build.rest import check_axes, resting_target
-from uavctl.config.checks import position_limits_m
+from uavctl.config.checks import get_position_limits_m
 from uavctl.config.types import Config
 from uavctl.errors import DesignError
 from uavctl.flight.controller import Controller
@@ -239,7 +239,7 @@ def design_of(config: Config) -> AnyDesign:
     Raises:
         DesignError: There is none, naming key, reason and what to do.
     """
-    return build_conditioned(config) if config.conditioned else build_design(config)
+    return build_conditioned(config) if config.is_age_conditioned else build_design(config)
 
 
 def build_design(config: Config) -> Design:
@@ -305,7 +305,7 @@ def record_of(design: AnyDesign) -> dict[str, object]:
 
 def _promised(config: Config) -> float:
     """The least probability of news in a step that plans count on."""
-    return 1.0 - build_ages(config).outage(1) if config.conditioned else promised(build_delayed_link(config))
+    return 1.0 - build_ages(config).outage(1) if config.is_age_conditioned else promised(build_delayed_link(config))
 
 
 def build_estimator(config: Config) -> EstimatorParameters:
@@ -336,7 +336,7 @@ def _bias_bounds(config: Config) -> tuple[float, ...]:
 
 def build_envelope(config: Config, plant: Plant) -> EnvelopeParameters:
     """Return the bounds of what is possible in flight, by the limits, the plant and the last gate."""
-    envelope, limits, walls = config.envelope, config.limits, position_limits_m(config)
+    envelope, limits, walls = config.envelope, config.limits, get_position_limits_m(config)
     lower, upper = map(list, zip(*(walls.get(axis, (-math.inf, math.inf)) for axis in AXES), strict=True))
     room = [high - low for low, high in zip(lower, upper, strict=True)]
     outside = [envelope.outside_m or max(0.1 * size if math.isfinite(size) else 0.0, LEAST_OUTSIDE_M) for size in room]

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from uavctl.config.link import LONGEST_RUN, LinkConfig
+from uavctl.config.link import MAX_LOSS_RUN, LinkConfig
 from uavctl.config.types import Config
 from uavctl.errors import DesignError
 from uavctl.smpc.link import (
@@ -93,7 +93,7 @@ def _trace_gaps(link: LinkConfig) -> NDArray[np.float64]:
             f"set link.delay_s and link.jitter_s to how long the design is to wait (quickest: {delays.min():g} s)",
         )
     runs = np.diff(arrived, append=arrived[0] + len(delays)) - 1
-    counts = np.bincount(np.minimum(runs, LONGEST_RUN))
+    counts = np.bincount(np.minimum(runs, MAX_LOSS_RUN))
     return np.asarray(counts / counts.sum(), dtype=np.float64)
 
 
@@ -153,7 +153,7 @@ def build_delayed_link(config: Config) -> LinkModel:
     """
     link, dt_s = config.link, config.plant.dt_s
     independent = link.model == "bernoulli" and not link.probability
-    if config.conditioned and independent and config.source.rate_hz * dt_s >= 1.0 - _ROUNDING:
+    if config.is_age_conditioned and independent and config.source.rate_hz * dt_s >= 1.0 - _ROUNDING:
         return _of_many(config)
     if _longest_s(config) < dt_s:
         return build_link(config)

@@ -1,414 +1,60 @@
-"""Items of the vehicle's parameters: what it does when setpoints or positions stop, and where it takes positions from.
-
-The wants are those of docs/autopilots.md, as seen with ArduCopter 4.6 and PX4 (main, 2026).
-"""
+"""Items of the vehicle: identity, other vehicles, arming, landed state, velocity stream, battery."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
-from dataclasses import dataclass
 from itertools import pairwise
 from statistics import median
-from typing import NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from uavctl.check.findings import Heard, Item, ItemState, item, judged
-from uavctl.config.checks import position_limits_m
+from uavctl.check.check_data import CheckData
+from uavctl.check.findings import Item, ItemState, judge_item, make_item
 from uavctl.config.types import Config
 from uavctl.flight.monitors.observation import MOTION_NS
-from uavctl.mavlink.clocksync import ROUND_TRIP_MARGIN_NS, TimesyncClock
 from uavctl.mavlink.vehicle import SECOND_VEHICLE
-from uavctl.smpc.plant import AXES
 
-# Items of the clocks: who answers TIMESYNC, how far it can be believed, how the clocks drift apart.
-
-
-_DRIFT_PPM = 500.0  # crystals keep 100; what is above is a simulator, or a broken clock
-_REJECTED = 0.5  # part of the answers
-_WANT = f"TIMESYNC answered within {ROUND_TRIP_MARGIN_NS * 1e-6:.0f} ms"
-
-
-def clock_items(seen: Heard, config: Config) -> list[Item]:
-    """Items of the vehicle's clock and of the source's."""
-    items = [_clock("vehicle clock", seen.trips.get("vehicle"), _of_vehicle(config))]
-    if config.source.messages != ("LOCAL_POSITION_NED",):
-        hint = "set clock.latency_s to the source's smallest delay: without answers ages count from the quickest one"
-        items.append(_clock("source clock", seen.trips.get("source"), (ItemState.NOTE, hint)))
-        items[-1] = _with_stamps(items[-1], seen)
-    return items
-
-
-def _of_vehicle(config: Config) -> tuple[ItemState, str]:
-    """Return how bad it is that the vehicle does not answer, and what to do."""
-    if config.relay.enabled:
-        return (ItemState.BAD, "does the link carry our messages to the vehicle? Positions of [relay] go the same way")
-    return ItemState.NOTE, "does the link carry our messages to the vehicle? Setpoints go the same way"
-
-
-def _clock(name: str, trips: TimesyncClock | None, unanswered: tuple[ItemState, str]) -> Item:
-    if trips is None or not trips.round_trips_ns:
-        return item(name, unanswered[0], "TIMESYNC is not answered", _WANT, unanswered[1])
-    ordered = sorted(trips.round_trips_ns)
-    middle_ms, p95_ms = (ordered[int(part * (len(ordered) - 1))] * 1e-6 for part in (0.5, 0.95))
-    drift = trips.drift_ppm
-    value = f"round trip median {middle_ms:.2g} ms, 95 % within {p95_ms:.2g} ms, {trips.rejected} rejected"
-    value += "" if drift is None else f", drift {drift:+.0f} ppm"
-    if trips.rejected > _REJECTED * len(ordered) or middle_ms > ROUND_TRIP_MARGIN_NS * 1e-6:
-        hint = "a slow or busy link: offsets and ages are uncertain by half of the round trip"
-        return item(name, ItemState.NOTE, value, f"{_WANT}, and few answers rejected", hint)
-    if drift is not None and abs(drift) > _DRIFT_PPM:
-        hint = "the drift is followed; a real clock keeps 100 ppm, so this is a simulator, or a computer short of time"
-        return item(name, ItemState.NOTE, value, f"{_WANT}, and a drift of at most {_DRIFT_PPM:g} ppm", hint)
-    return item(name, ItemState.GOOD, value, _WANT)
-
-
-def _with_stamps(clock: Item, seen: Heard) -> Item:
-    """The source's clock is trouble if its stamps are refused, whether it answers or not."""
-    names = ("future-stamp", "stamp-leap", "duplicate")
-    refused = {name: sum(stats.bad.get(name, 0) for stats in seen.stats.values()) for name in names}
-    if sum(refused.values()) <= len(seen.samples) // 20:
-        return clock
-    told = ", ".join(f"{count} {name}" for name, count in refused.items() if count)
-    hint = "do two programs send the same positions, or does the source's clock jump?"
-    return item(clock.name, ItemState.BAD, f"stamps refused: {told}", "stamps of one clock that goes forward", hint)
-
-
-Get = Callable[[str], float | None]
-_SLOW_S = 1.0
-_BRAKING_MPS2 = 2.5  # of an ArduPilot whose setpoints have stopped
-_SINGLE = 1e-6  # relative: vehicles keep parameters in single precision
-_DIGITS = 7  # decimals, which single precision does not exceed for times up to a second
-_NO_RADIO = 4  # COM_RC_IN_MODE
-_EXTERNAL = 6  # EK3_SRC1_*
-_HORIZONTAL, _VERTICAL, _YAW = 1, 2, 8  # EKF2_EV_CTRL
-_ANY = "any value"
-
-
-class ParameterVerdict(NamedTuple):
-    """Verdict on a parameter's value, and what is wanted in its place with the other parameters as they are."""
-
-    state: ItemState
-    want: str
-    hint: str = ""  # what to do with this value here; empty is the hint of the rule
-
-
-Judge = Callable[[float, Get, Config], ParameterVerdict]
-
-
-@dataclass(frozen=True)
-class Rule:
-    """One parameter: how its value is judged, and what to do about another one."""
-
-    name: str
-    hint: str
-    judge: Judge
-
-
-def _wanted(want: str, *, good: bool, otherwise: ItemState = ItemState.NOTE) -> ParameterVerdict:
-    return ParameterVerdict(ItemState.GOOD if good else otherwise, want)
-
-
-def _only(applies: bool, want: str, unless: str, *, good: bool) -> ParameterVerdict:
-    """Judge a want that holds only under a condition; without it any value will do, and the verdict says so."""
-    return _wanted(want, good=good) if applies else ParameterVerdict(ItemState.GOOD, f"{_ANY}: {unless}")
-
-
-class Runaway(NamedTuple):
-    """Flight on one axis after setpoints have stopped: from rest in the room's middle, with the largest acceleration.
-
-    It accelerates until the vehicle's own timeout, then it brakes: d(t) = a t²/2 + (a t)²/(2 b).
-    """
-
-    axis: str
-    accel_mps2: float
-    free_m: float  # from the middle to a limit
-
-    def distance_m(self, timeout_s: float) -> float:
-        """Return how far the vehicle goes until it stands [m]."""
-        speed_mps = self.accel_mps2 * timeout_s
-        return speed_mps * timeout_s / 2.0 + speed_mps**2 / (2.0 * _BRAKING_MPS2)
-
-    @property
-    def longest_s(self) -> float:
-        """Timeout after which the vehicle stands at the limit [s]."""
-        return math.sqrt(self.free_m / self.distance_m(1.0))  # d grows with t²
-
-
-def largest_accel_mps2(free_m: float, timeout_s: float) -> float:
-    """Return the acceleration [m/s²] with which a `Runaway` with this timeout [s] stands at a limit so far away [m].
-
-    a² + a b - 2 b d / t² = 0
-    """
-    return (math.sqrt(_BRAKING_MPS2**2 + 8.0 * _BRAKING_MPS2 * free_m / timeout_s**2) - _BRAKING_MPS2) / 2.0
-
-
-def _runaways(config: Config) -> list[Runaway]:
-    """Return the axes that have limits, the one with the least room for its acceleration first."""
-    limits = position_limits_m(config).items()
-    found = [Runaway(axis, config.limits.accel_mps2[AXES.index(axis)], (b - a) / 2.0) for axis, (a, b) in limits]
-    found = [one for one in found if math.isfinite(one.free_m)]
-    return sorted(found, key=lambda one: one.longest_s)
-
-
-def _timeout(shortest_s: float) -> Judge:
-    """Judge the silence for which the last acceleration goes on: from rest in its middle, the room has to hold that.
-
-    Args:
-        shortest_s: timeout that the autopilot does not go below [s].
-    """
-
-    def judge(value: float, _get: Get, config: Config) -> ParameterVerdict:
-        least_s, tightest = max(3.0 * config.daemon.tick_s, shortest_s), _runaways(config)[:1]
-        longest_s = min((one.longest_s for one in tightest), default=math.inf)
-        most_s = _rounded_down(min(_SLOW_S, longest_s), least_s)
-        if most_s is None:
-            hint = (
-                f"No value fits. {_carried(tightest, least_s)} Give [sets] more room, or lower limits.accel_mps2 "
-                f"({tightest[0].axis})."
-            )
-            return ParameterVerdict(ItemState.BAD, f"at least {least_s:.7g} s, in a larger room", hint)
-        want = f"{least_s:.7g} to {most_s:.7g} s"
-        if value < least_s * (1.0 - _SINGLE):
-            hint = (
-                f"Set it to {most_s:.7g} s. It has to outlast three setpoints ({3.0 * config.daemon.tick_s:.7g} s), "
-                "or a short pause of the link ends the flight."
-            )
-            return ParameterVerdict(ItemState.BAD, want, hint)
-        hint = (
-            f"Set it to {most_s:.7g} s or less. If setpoints stop, the vehicle keeps accelerating that long. "
-            f"{_carried(tightest, value)}"
-        )
-        if value > longest_s * (1.0 + _SINGLE):
-            return ParameterVerdict(ItemState.BAD, want, hint)
-        good = value <= most_s * (1.0 + _SINGLE)
-        return ParameterVerdict(ItemState.GOOD if good else ItemState.NOTE, want, hint)
-
-    return judge
-
-
-def _rounded_down(most_s: float, least_s: float) -> float | None:
-    """Return `most_s` with as few decimals as leave it at `least_s` or above; None if it is below."""
-    least_s *= 1.0 - _SINGLE
-    rounded = (math.floor(most_s * 10**digits + _SINGLE) / 10**digits for digits in range(1, _DIGITS))
-    return None if most_s < least_s else next((one for one in rounded if one >= least_s), most_s)
-
-
-def _carried(tightest: list[Runaway], timeout_s: float) -> str:
-    """Say how far a timeout carries the vehicle where the room is tightest; empty in a room without limits."""
-    ways = {"north": "north or south", "east": "east or west", "down": "up or down"}
-    texts = []
-    for one in tightest:
-        gone_m = one.distance_m(timeout_s)
-        # As many digits as tell the two apart.
-        digits = next((n for n in range(3, 9) if f"{gone_m:.{n}g}" != f"{one.free_m:.{n}g}"), 9)
-        texts.append(
-            f"{timeout_s:.7g} s would carry it {gone_m:.{digits}g} m {ways[one.axis]}; your room allows "
-            f"{one.free_m:.{digits}g} m from its middle."
-        )
-    return "".join(texts)
-
-
-def _offboard_loss(value: float, get: Get, _config: Config) -> ParameterVerdict:
-    flies_on = value in (0, 1, 2) and get("COM_RC_IN_MODE") == _NO_RADIO
-    return _wanted("4: land, or 5: hold", good=value in (4, 5), otherwise=ItemState.BAD if flies_on else ItemState.NOTE)
-
-
-def _guided_options(value: float, _get: Get, _config: Config) -> ParameterVerdict:
-    return _wanted("bits 4 and 5 off", good=not int(value) & 0x30)
-
-
-def _copter_source(value: float, get: Get, config: Config) -> ParameterVerdict:
-    if value == _EXTERNAL and get("VISO_TYPE") == 0:
-        return ParameterVerdict(ItemState.BAD, "6: the cameras, with a VISO_TYPE other than 0")
-    otherwise = ItemState.BAD if config.relay.enabled else ItemState.NOTE
-    return _wanted("6: the cameras", good=value == _EXTERNAL, otherwise=otherwise)
-
-
-def _copter_also(value: float, get: Get, _config: Config) -> ParameterVerdict:
-    applies = get("EK3_SRC1_POSXY") == _EXTERNAL
-    return _only(applies, "6: the cameras", "EK3_SRC1_POSXY is not 6", good=value == _EXTERNAL)
-
-
-def _viso(value: float, get: Get, config: Config) -> ParameterVerdict:
-    if get("EK3_SRC1_POSXY") != _EXTERNAL and not config.relay.enabled:
-        return ParameterVerdict(ItemState.GOOD, f"{_ANY}: no external positions are asked for")
-    return _wanted("1, or another that is not 0", good=value != 0, otherwise=ItemState.BAD)
-
-
-def _compass(value: float, get: Get, _config: Config) -> ParameterVerdict:
-    return _only(get("EK3_SRC1_YAW") == _EXTERNAL, "0: off", "EK3_SRC1_YAW is not 6", good=value == 0)
-
-
-def _copter_failsafe(value: float, _get: Get, config: Config) -> ParameterVerdict:
-    return _wanted("1 or 3: land", good=value in (1, 3), otherwise=_without_positions(config))
-
-
-def _copter_threshold(value: float, _get: Get, config: Config) -> ParameterVerdict:
-    off = _without_positions(config) if value <= 0.0 else ItemState.NOTE
-    return _wanted("0.6 to 1", good=0.6 <= value <= 1.0, otherwise=off)
-
-
-def _without_positions(config: Config) -> ItemState:
-    """Return how bad it is that nothing ends a flight without positions: where they are ours, they stop when we do."""
-    return ItemState.BAD if config.relay.enabled else ItemState.NOTE
-
-
-def _px4_external(value: float, _get: Get, config: Config) -> ParameterVerdict:
-    bits = _HORIZONTAL | _VERTICAL | _YAW
-    deaf = config.relay.enabled and not int(value) & _HORIZONTAL
-    want = f"{bits}: position, height, yaw (bits 0, 1 and 3)"
-    return _wanted(want, good=int(value) & bits == bits, otherwise=ItemState.BAD if deaf else ItemState.NOTE)
-
-
-def _takes(get: Get, bit: int) -> bool:
-    """Whether PX4 takes this from external positions."""
-    return bool(int(get("EKF2_EV_CTRL") or 0) & bit)
-
-
-def _px4_height(value: float, get: Get, _config: Config) -> ParameterVerdict:
-    return _only(_takes(get, _VERTICAL), "3: the cameras", "EKF2_EV_CTRL takes no height", good=value == 3)
-
-
-def _px4_gps(value: float, get: Get, _config: Config) -> ParameterVerdict:
-    return _only(_takes(get, _HORIZONTAL), "0: off", "EKF2_EV_CTRL takes no position", good=value == 0)
-
-
-def _px4_mag(value: float, get: Get, _config: Config) -> ParameterVerdict:
-    return _only(_takes(get, _YAW), "5: none", "EKF2_EV_CTRL takes no yaw", good=value == 5)
-
-
-_INDOORS = "the cameras. GPS and compass are wrong indoors"
-_DOORS = "Set it to {0}. Air pressure indoors changes with doors."
-_IRON = "Set it to {0}. A compass indoors is off by tens of degrees."
-ARDUPILOT = (
-    Rule("GUID_TIMEOUT", "", _timeout(0.1)),  # ArduCopter takes a shorter one for 0.1 s
-    Rule("GUID_OPTIONS", "Clear these bits. With them an acceleration is not held against the wind.", _guided_options),
-    Rule("EK3_SRC1_POSXY", f"Set it to 6, and VISO_TYPE to 1, to fly on {_INDOORS}.", _copter_source),
-    Rule("EK3_SRC1_POSZ", _DOORS.format(6), _copter_also),
-    Rule("EK3_SRC1_YAW", _IRON.format(6), _copter_also),
-    Rule("VISO_TYPE", "Set it to 1 and restart. Without it the vehicle does not read external positions.", _viso),
-    Rule("COMPASS_USE", "Set it to 0. Arming checks a compass that is not used.", _compass),
-    Rule(
-        "FS_EKF_ACTION",
-        "Set it to 1. Otherwise a vehicle without positions stays in GUIDED and drifts, whatever GUID_TIMEOUT is.",
-        _copter_failsafe,
-    ),
-    Rule(
-        "FS_EKF_THRESH",
-        "Set it to 0.8, as shipped. 0 turns FS_EKF_ACTION off. It was seen to act 8 s after the last position.",
-        _copter_threshold,
-    ),
-)
-PX4 = (
-    Rule("COM_OF_LOSS_T", "", _timeout(0.0)),
-    Rule(
-        "COM_OBL_RC_ACT",
-        "Set it to 4 (land) or 5 (hold; PX4 goes back to OFFBOARD by itself when setpoints come again). With 0 to 2 "
-        "and no radio it was seen to fly on the last acceleration for 12 s.",
-        _offboard_loss,
-    ),
-    Rule("EKF2_EV_CTRL", f"Set it to 11 to fly on {_INDOORS}.", _px4_external),
-    Rule("EKF2_HGT_REF", _DOORS.format(3), _px4_height),
-    Rule("EKF2_GPS_CTRL", f"Set it to 0 to fly on {_INDOORS}.", _px4_gps),
-    Rule("EKF2_MAG_TYPE", _IRON.format(5), _px4_mag),
-)
-RULES = {3: ARDUPILOT, 12: PX4}  # MAV_AUTOPILOT
-_TAKE_OFF = "MIS_TAKEOFF_ALT"
-_ALSO = {3: (), 12: ("COM_RC_IN_MODE", _TAKE_OFF)}
-
-
-def wanted(autopilot: int | None) -> tuple[str, ...]:
-    """Names of the parameters to ask this kind of autopilot for."""
-    if autopilot not in RULES:
-        return ()
-    return (*_ALSO[autopilot], *(rule.name for rule in RULES[autopilot]))
-
-
-def parameter_items(seen: Heard, config: Config, take_off_m: float | None = None) -> list[Item]:
-    """An item for each parameter that matters to this kind of autopilot; `take_off_m` is the climb that is planned."""
-    rules = RULES.get(seen.autopilot or 0, ())
-    if rules is PX4:
-        rules = (*rules, _climb(config, take_off_m))
-
-    def get(name: str) -> float | None:
-        return seen.parameter(name, px4=seen.autopilot == 12)
-
-    return [_one(rule, get, config) for rule in rules]
-
-
-def _climb(config: Config, take_off_m: float | None) -> Rule:
-    """PX4 climbs to a height of its own, and is asked for OFFBOARD on the way, where `--takeoff` is reached."""
-    ceiling_m = -position_limits_m(config).get("down", (-math.inf, 0.0))[0]
-    least_m = 0.0 if take_off_m is None else take_off_m
-    bounds = [f"at most {ceiling_m:g} m, the room (sets)"] if math.isfinite(ceiling_m) else []
-    bounds += [f"at least {least_m:g} m, --takeoff"] if least_m else []
-    hint = (
-        "Set it to the height of --takeoff. PX4 climbs to it by itself. Lower, the flight begins below --takeoff (not "
-        "at all under a third of it). Higher than the room, the ceiling ends the climb if OFFBOARD is not granted."
-    )
-
-    def judge(value: float, _get: Get, _config: Config) -> ParameterVerdict:
-        return _wanted("; ".join(bounds) or _ANY, good=least_m <= value <= ceiling_m)
-
-    return Rule(_TAKE_OFF, hint, judge)
-
-
-def _one(rule: Rule, get: Get, config: Config) -> Item:
-    value = get(rule.name)
-    if value is None:
-        hint = "it was asked for several times; does this version have it, and does the link carry our messages?"
-        return item(rule.name, ItemState.UNDETERMINED, "not told", "its value, to judge it", hint)
-    verdict = rule.judge(value, get, config)
-    return item(rule.name, verdict.state, f"{value:g}", verdict.want, verdict.hint or rule.hint)
-
-
-# Items of the vehicle: who it is, whether others are heard, armed, landed, battery.
-
-
-_SILENCE_S = 3.0
+_MAX_SILENCE_S = 3.0
 _NAMES = {3: "ArduPilot", 12: "PX4"}
 
 
-def vehicle_items(seen: Heard, config: Config, at_ns: int, take_off_m: float | None = None) -> list[Item]:
-    """Return the items of what the vehicle told of itself up to `at_ns`; `take_off_m` is the climb that is planned."""
-    heartbeat = seen.heartbeat
+def check_vehicle(data: CheckData, config: Config, at_ns: int, take_off_m: float | None = None) -> list[Item]:
+    """Return the items of the vehicle's own reports up to `at_ns`; `take_off_m` is the planned climb."""
+    heartbeat = data.heartbeat
     want = "heartbeats of PX4 or ArduPilot, about one a second"
     if heartbeat is None:
         hint = (
             f"is the vehicle on, and does it speak at {config.daemon.vehicle}? See --vehicle, and its telemetry ports"
         )
-        return [item("vehicle", ItemState.BAD, "no heartbeat", want, hint)]
+        return [make_item("vehicle", ItemState.BAD, "no heartbeat", want, hint)]
     return [
-        _who(seen, at_ns, want),
-        _others(seen),
-        _armed(seen, takes_off=take_off_m is not None),
-        _landed(seen),
-        _own_velocity(seen),
-        _battery(seen, config),
+        _check_identity(data, at_ns, want),
+        _check_other_vehicles(data),
+        _check_armed(data, takes_off=take_off_m is not None),
+        _check_landed(data),
+        _check_velocity_rate(data),
+        _check_battery(data, config),
     ]
 
 
-def _who(seen: Heard, at_ns: int, want: str) -> Item:
-    assert seen.heartbeat is not None
-    kind = seen.heartbeat.autopilot
-    silent_s = (at_ns - seen.heartbeat_ns) * 1e-9
-    version = "" if seen.version is None else " " + ".".join(map(str, seen.version.version))
+def _check_identity(data: CheckData, at_ns: int, want: str) -> Item:
+    assert data.heartbeat is not None
+    kind = data.heartbeat.autopilot
+    silent_s = (at_ns - data.heartbeat_ns) * 1e-9
+    version = "" if data.version is None else " " + ".".join(map(str, data.version.version))
     name = _NAMES.get(kind, f"MAV_AUTOPILOT {kind}")
-    value = f"{name}{version}, system {seen.heartbeat.system}"
+    value = f"{name}{version}, system {data.heartbeat.system}"
     if kind not in _NAMES:
-        return item(
+        return make_item(
             "vehicle", ItemState.BAD, value, want, "its modes are not known, so its setpoint mode cannot be told"
         )
-    if silent_s > _SILENCE_S:
-        return item("vehicle", ItemState.BAD, f"{value}, silent for {silent_s:.1f} s", want, "see to the link")
-    return item("vehicle", ItemState.GOOD, value, want)
+    if silent_s > _MAX_SILENCE_S:
+        return make_item("vehicle", ItemState.BAD, f"{value}, silent for {silent_s:.1f} s", want, "see to the link")
+    return make_item("vehicle", ItemState.GOOD, value, want)
 
 
-def _others(seen: Heard) -> Item:
-    count = sum(stats.bad.get(SECOND_VEHICLE, 0) for stats in seen.stats.values())
-    return judged(
+def _check_other_vehicles(data: CheckData) -> Item:
+    count = sum(stats.bad.get(SECOND_VEHICLE, 0) for stats in data.stats.values())
+    return judge_item(
         "other vehicles",
         good=count == 0,
         value=f"{count} heartbeats of others" if count else "none",
@@ -417,50 +63,50 @@ def _others(seen: Heard) -> Item:
     )
 
 
-def is_armed(seen: Heard) -> bool:
-    """Whether the vehicle says that it is armed."""
-    return seen.heartbeat is not None and bool(seen.heartbeat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+def is_armed(data: CheckData) -> bool:
+    """Return whether the vehicle reports that it is armed."""
+    return data.heartbeat is not None and bool(data.heartbeat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
 
 
-def _armed(seen: Heard, *, takes_off: bool) -> Item:
+def _check_armed(data: CheckData, *, takes_off: bool) -> Item:
     want = "disarmed before a flight"
-    if not is_armed(seen):
-        return item("armed", ItemState.GOOD, "no", want)
+    if not is_armed(data):
+        return make_item("armed", ItemState.GOOD, "no", want)
     if takes_off:
         hint = "land and disarm it, or start without --arm --takeoff to fly it from where it is"
-        return item("armed", ItemState.BAD, "yes, already", want, hint)
-    return item("armed", ItemState.NOTE, "yes", want, "keep away from the propellers")
+        return make_item("armed", ItemState.BAD, "yes, already", want, hint)
+    return make_item("armed", ItemState.NOTE, "yes", want, "keep away from the propellers")
 
 
-def _landed(seen: Heard) -> Item:
-    told = {None: "not told", True: "on the ground", False: "in the air"}[seen.landed]
-    state = ItemState.GOOD if seen.landed else ItemState.NOTE
+def _check_landed(data: CheckData) -> Item:
+    value = {None: "not told", True: "on the ground", False: "in the air"}[data.landed]
+    state = ItemState.GOOD if data.landed else ItemState.NOTE
     hint = (
         "a flight with --arm --takeoff begins on the ground"
-        if seen.landed is False
+        if data.landed is False
         else "what it does not tell cannot be waited for"
     )
-    return item("landed", state, told, "on the ground", hint)
+    return make_item("landed", state, value, "on the ground", hint)
 
 
-def _own_velocity(seen: Heard) -> Item:
+def _check_velocity_rate(data: CheckData) -> Item:
     """Whether positions can be held against the vehicle's own velocity in flight."""
     want = f"LOCAL_POSITION_NED at {1e9 / MOTION_NS:.2g} Hz or more, for positions to be held against it in flight"
     hint = (
         "without it a turned or mirrored frame is found later in flight, and one that creeps is not; "
         "see to the vehicle's streams, and to its estimator"
     )
-    if len(seen.own) < 2:
-        return item("own velocity", ItemState.NOTE, "not told", want, hint)
-    period_ns = median(b - a for (a, _), (b, _) in pairwise(seen.own))
+    if len(data.vehicle_positions) < 2:
+        return make_item("own velocity", ItemState.NOTE, "not told", want, hint)
+    period_ns = median(b - a for (a, _), (b, _) in pairwise(data.vehicle_positions))
     state = ItemState.GOOD if period_ns <= MOTION_NS else ItemState.NOTE
-    return item("own velocity", state, f"{1e9 / period_ns:.3g} Hz", want, hint)
+    return make_item("own velocity", state, f"{1e9 / period_ns:.3g} Hz", want, hint)
 
 
-def _battery(seen: Heard, config: Config) -> Item:
-    least_v = config.check.battery_v
-    want = f"at least {least_v:g} V (check.battery_v)" if least_v else "check.battery_v is not set"
-    if seen.battery_v is None:
-        return item("battery", ItemState.UNDETERMINED, "not told", want, "see to the vehicle's battery monitor")
-    value = f"{seen.battery_v:.2f} V"
-    return judged("battery", good=seen.battery_v >= least_v, value=value, want=want, hint="charge it, or change it")
+def _check_battery(data: CheckData, config: Config) -> Item:
+    min_v = config.check.battery_v
+    want = f"at least {min_v:g} V (check.battery_v)" if min_v else "check.battery_v is not set"
+    if data.battery_v is None:
+        return make_item("battery", ItemState.UNDETERMINED, "not told", want, "see to the vehicle's battery monitor")
+    value = f"{data.battery_v:.2f} V"
+    return judge_item("battery", good=data.battery_v >= min_v, value=value, want=want, hint="charge it, or change it")

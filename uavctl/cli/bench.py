@@ -104,7 +104,7 @@ def bench(
     if loop:
         return bench_loop(common, seconds, runs)
     loaded = common.load()
-    if loaded.config.conditioned:
+    if loaded.config.is_age_conditioned:
         with located(loaded):
             solver = build_conditioned(loaded.config).solver
         with _progress() as advance:

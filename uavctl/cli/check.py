@@ -20,13 +20,13 @@ from logs.recording.topics import PARAMETER
 from uavctl.build.controller import Prepared, build_controller, design_of
 from uavctl.build.rehearsal import rehearse
 from uavctl.build.rest import check_axes
-from uavctl.check.findings import Item, ItemState, describe, item, judged, refusals
+from uavctl.check.findings import Item, ItemState, describe_item, find_refusals, judge_item, make_item
 from uavctl.check.preflight import Preflight
 from uavctl.cli.common import DEFAULTS, SPAN_S, Common, Mocap, given_keys, labelled, located, messages
 from uavctl.cli.flying import stop_on_signals
 from uavctl.clock import Ticker, monotonic_ns
 from uavctl.config import Config
-from uavctl.config.connections import CheckConfig, warnings
+from uavctl.config.connections import CheckConfig, find_security_warnings
 from uavctl.errors import ConnectionSpecError, KeyFileError, NotReadyError
 from uavctl.io.base import Connection
 from uavctl.io.signed_connection import open_links
@@ -80,12 +80,16 @@ def run_preflight(
         if prompt is not None and flight.prompt != asked:
             asked = flight.prompt
             prompt(asked)
-        moving = flight.guide is not None and not flight.guide.over
+        moving = flight.guide is not None and not flight.guide.is_done
         closed = all(connection.closed for connection in connections.values())
         heard_s = (due.at_ns - begun_ns) * 1e-9
         limit_s = seconds + (MOVE_LIMIT_S if moving else 0.0)
-        if closed or stop() or (heard_s >= limit_s and (heard_s >= limit_s + config.check.wait_s or not flight.waits)):
-            return flight.items(due.at_ns)
+        if (
+            closed
+            or stop()
+            or (heard_s >= limit_s and (heard_s >= limit_s + config.check.wait_s or not flight.needs_vehicle_position))
+        ):
+            return flight.make_items(due.at_ns)
         due = ticker.next()
 
 
@@ -128,12 +132,12 @@ def checked_before_arming(
     messages().print(f"checking for {config.check.seconds:g} s before arming", soft_wrap=True)
     heard = run_preflight(config, connections, config.check.seconds, take_off_m=take_off_m, stop=stop, told=told)
     items = (*planned, *heard)
-    against = refusals(items, config.check)
+    against = find_refusals(items, config.check)
     if against:
-        raise NotReadyError("\n".join(("not armed, as the check before it failed:", *map(describe, against))))
+        raise NotReadyError("\n".join(("not armed, as the check before it failed:", *map(describe_item, against))))
     for one in items:
         if one.state is not ItemState.GOOD:
-            messages().print(labelled("check", describe(one)), soft_wrap=True)
+            messages().print(labelled("check", describe_item(one)), soft_wrap=True)
     return items
 
 
@@ -196,7 +200,7 @@ def check(
     with located(loaded):
         check_axes(config)
         items = [*mission_items(config), *disk_items(out, config.log.free_bytes)]
-    items.append(_strangers(warnings(config.security, config.daemon)))
+    items.append(_strangers(find_security_warnings(config.security, config.daemon)))
 
     def prompt(text: str) -> None:
         messages().print(text or "good; let it rest for a moment", style="bold")
@@ -208,8 +212,10 @@ def check(
     except (ConnectionSpecError, KeyFileError) as error:
         if isinstance(error, ConnectionSpecError) and not isinstance(error.__cause__, OSError):
             raise  # a URL that is none: usage
-        items.append(item("connections", ItemState.BAD, str(error), "connections and key can be used", _PERMISSIONS))
-    report = Report(ok=not refusals(items, config.check), items=tuple(items))
+        items.append(
+            make_item("connections", ItemState.BAD, str(error), "connections and key can be used", _PERMISSIONS)
+        )
+    report = Report(ok=not find_refusals(items, config.check), items=tuple(items))
     common.show("check", report, lambda: Findings(report, config.check))
     return 0 if report.ok else 1
 
@@ -223,7 +229,7 @@ def mission_items(config: Config, prepared: Prepared | None = None) -> tuple[Ite
     Raises:
         DesignError: There is no controller of this configuration.
     """
-    if not config.conditioned or config.smpc.controller:
+    if not config.is_age_conditioned or config.smpc.controller:
         return ()
     design = design_of(config) if prepared is None else prepared.design
     controller = build_controller(config, design) if prepared is None else prepared.controller
@@ -233,7 +239,7 @@ def mission_items(config: Config, prepared: Prepared | None = None) -> tuple[Ite
     state = ItemState.BAD if bad else ItemState.NOTE if noted else ItemState.GOOD
     value = ". ".join(found.sentences) or f"{found.seconds:g} s rehearsed, {found.relaxed:.0%} of the plans relax"
     want = "plans keep their constraints, and the trajectory to mission.accept_m"
-    return (item("mission", state, value, want, found.hint),)
+    return (make_item("mission", state, value, want, found.hint),)
 
 
 def disk_items(folder: Path, free_bytes: int) -> list[Item]:
@@ -242,14 +248,14 @@ def disk_items(folder: Path, free_bytes: int) -> list[Item]:
     writable = there.is_dir() and os.access(there, os.W_OK | os.X_OK)
     free = shutil.disk_usage(there).free
     return [
-        judged(
+        judge_item(
             "recordings folder",
             good=writable,
             value=f"{folder}: {'writable' if writable else f'{there} is not writable'}",
             want="a folder to write to",
             hint="choose another folder (--out), or change its owner",
         ),
-        judged(
+        judge_item(
             "disk room",
             good=free >= free_bytes,
             value=f"{free / 1e9:.2f} GB free",
@@ -262,7 +268,7 @@ def disk_items(folder: Path, free_bytes: int) -> list[Item]:
 def _strangers(texts: tuple[str, ...]) -> Item:
     state = ItemState.NOTE if texts else ItemState.GOOD
     value, hint = ". ".join(texts) or "none can speak", "see docs/security.md"
-    return item("strangers", state, value, "known peers, and signed frames", hint)
+    return make_item("strangers", state, value, "known peers, and signed frames", hint)
 
 
 @dataclass(frozen=True)
@@ -275,7 +281,7 @@ class Findings:
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Text]:
         del console
         width, items = min(options.max_width, _WIDTH) - _LABEL, self.report.items
-        problems = refusals(items, self.config)
+        problems = find_refusals(items, self.config)
         accepted = tuple(one for one in items if not one.ok and one not in problems)
         noted = tuple(one for one in items if one.ok and one.state is not ItemState.GOOD)
         counts = (
@@ -290,7 +296,7 @@ class Findings:
             yield Text()
             label = "accepted" if one in accepted else str(one.state)
             # A word that is longer than a line, as the name of a folder, stays whole.
-            lines = textwrap.wrap(describe(one), width, break_long_words=False, break_on_hyphens=False)
+            lines = textwrap.wrap(describe_item(one), width, break_long_words=False, break_on_hyphens=False)
             yield _line(label, one.state, lines[0])
             yield from (_line("", one.state, line) for line in lines[1:])
         yield Text()

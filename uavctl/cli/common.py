@@ -21,8 +21,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColum
 from rich.table import Table
 from rich.text import Text
 
-from uavctl.config import LoadedConfig, explain, load
-from uavctl.config.document import LARGEST_SEED, LONGEST_S
+from uavctl.config import LoadedConfig, describe_design_error, load
+from uavctl.config.document import MAX_DURATION_S, MAX_SEED
 from uavctl.errors import ConfigError, DesignError
 
 if TYPE_CHECKING:
@@ -67,10 +67,10 @@ class Common:
         Raises:
             ConfigError: With all problems found.
         """
-        from sim.faults import check_faults  # a replay, which has a configuration of its own, needs no simulator
+        from sim.faults import check_fault_support  # a replay, which has a configuration of its own, needs no simulator
 
         loaded = load(self.config, self.overrides)
-        check_faults(loaded)
+        check_fault_support(loaded)
         return loaded
 
     def with_overrides(self, more: Sequence[str]) -> Common:
@@ -145,9 +145,9 @@ System = Annotated[
         help="with several vehicles' MAVLink: the vehicle's system id", validator=validators.Number(gte=1, lte=255)
     ),
 ]
-SPAN_S = validators.Number(gt=0, lte=LONGEST_S)
+SPAN_S = validators.Number(gt=0, lte=MAX_DURATION_S)
 HEIGHT_M = validators.Number(gt=0, lte=1000)
-SEED = validators.Number(gte=0, lte=LARGEST_SEED)
+SEED = validators.Number(gte=0, lte=MAX_SEED)
 WORKERS = validators.Number(gte=1, lte=1024)
 PORT = validators.Number(gte=1, lte=65535)
 FREE_PORT = validators.Number(gte=0, lte=65535)
@@ -298,7 +298,7 @@ def located(loaded: LoadedConfig) -> Iterator[None]:
     try:
         yield
     except DesignError as error:
-        raise ConfigError((explain(loaded.source, error),)) from error
+        raise ConfigError((describe_design_error(loaded.source, error),)) from error
 
 
 # A table with more columns than a terminal has room for: several below each other.

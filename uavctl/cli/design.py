@@ -106,7 +106,7 @@ def design(
         return gains_report(common)
     loaded = common.load()
     start = time.perf_counter()
-    if loaded.config.conditioned:
+    if loaded.config.is_age_conditioned:
         with located(loaded):
             conditioned = build_conditioned(loaded.config)
             found = rehearsed(loaded.config, conditioned)

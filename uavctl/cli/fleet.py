@@ -32,7 +32,7 @@ from uavctl.cli.common import SPAN_S, Common, QuietJson, TakeOff, columns, given
 from uavctl.cli.ctl import ask
 from uavctl.cli.usage import example
 from uavctl.config import Config, load
-from uavctl.config.checks import position_limits_m
+from uavctl.config.checks import get_position_limits_m
 from uavctl.config.document import ConfigProblem, Section
 from uavctl.config.load import read_document
 from uavctl.daemon.control_socket import ControlRequest, find_control_folder, make_daemon_name
@@ -85,7 +85,7 @@ class Member:
 
     def limits_m(self, axis: str) -> tuple[float, float]:
         """Limits of its position along an axis; infinite where there are none."""
-        return position_limits_m(self.config).get(axis, (-math.inf, math.inf))
+        return get_position_limits_m(self.config).get(axis, (-math.inf, math.inf))
 
 
 Looks = dict[str, Health | None]  # by name; None where no daemon answers
@@ -109,7 +109,7 @@ def read_fleet(path: Path) -> Fleet:
     if document is not None and not document.vehicle:
         found.append(ConfigProblem("vehicle", "there is none", "write a [[vehicle]] table for each"))
     if document is None or found:
-        raise ConfigError(tuple(source.tell(problem) for problem in found))
+        raise ConfigError(tuple(source.describe(problem) for problem in found))
     told: list[str] = []
     members: list[Member] = []
     for number, one in enumerate(document.vehicle):
@@ -119,13 +119,13 @@ def read_fleet(path: Path) -> Fleet:
         try:
             loaded = load(config, overrides).config
         except ConfigError as error:
-            told += [f"{source.where(f'vehicle[{number}]')}: {one.name}: {problem}" for problem in error.problems]
+            told += [f"{source.locate(f'vehicle[{number}]')}: {one.name}: {problem}" for problem in error.problems]
             continue
         options = ("--config", config, *(part for override in overrides for part in ("--set", override)))
         members.append(Member(one.name, options, loaded))
     problems = list(_problems(members, document.spacing_m))
     if told or problems:
-        raise ConfigError((*told, *(source.tell(problem) for problem in problems)))
+        raise ConfigError((*told, *(source.describe(problem) for problem in problems)))
     pairs = [horizontally_apart_m(one, other) for one, other in combinations(members, 2)]
     return Fleet(tuple(members), min(pairs, default=math.inf))
 

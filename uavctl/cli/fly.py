@@ -41,7 +41,7 @@ from uavctl.cli.flying import (
 )
 from uavctl.clock import Ticker, monotonic_ns, read_zero_utc_ns
 from uavctl.config import Config, LoadedConfig
-from uavctl.config.connections import warnings
+from uavctl.config.connections import find_security_warnings
 from uavctl.daemon.control_socket import ControlServer, find_control_folder, make_daemon_name, open_listener
 from uavctl.daemon.daemon import AfterTick
 from uavctl.daemon.daemon import fly as run_daemon
@@ -259,7 +259,7 @@ def fly_daemon(
                 put_header(recorder, prepared, monotonic_ns(), read_zero_utc_ns())
                 record_items(recorder, checked, monotonic_ns())
                 record_parameters(recorder, told, monotonic_ns())
-                for warning in warnings(config.security, config.daemon):
+                for warning in find_security_warnings(config.security, config.daemon):
                     messages().print(labelled("warning", warning), soft_wrap=True)
                 if tenure.left_flight_ns is not None:
                     stand_by(loop, tenure.left_flight_ns)

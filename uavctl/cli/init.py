@@ -13,7 +13,7 @@ from cyclopts import Parameter
 
 from uavctl.build.controller import LEAST_OUTSIDE_M, design_of, resting
 from uavctl.build.mission import resting_places
-from uavctl.check.vehicle import largest_accel_mps2
+from uavctl.check.parameters import compute_max_accel_mps2
 from uavctl.cli.common import messages
 from uavctl.config import parse
 from uavctl.errors import UsageError
@@ -130,7 +130,7 @@ def room_text(sizes: tuple[float, float, float], autopilot: str, file: str) -> s
     length, width, height = sizes
     top = round(height - WALL_M, 3)
     north, east = (round(0.5 * size - WALL_M, 3) for size in (length, width))
-    allowed_mps2 = math.floor(largest_accel_mps2(max(min(north, east), 0.0), TIMEOUT_S) * 10.0) / 10.0
+    allowed_mps2 = math.floor(compute_max_accel_mps2(max(min(north, east), 0.0), TIMEOUT_S) * 10.0) / 10.0
     return _TEXT.format(
         length=length,
         width=width,

@@ -129,7 +129,7 @@ def replay_flight(flight: Path, tolerance: float = 0.0, overrides: Sequence[str]
         controller, changed = recorded_flyer(flight, config).controller, ()
     holes = note.text if note is not None and note.text.startswith(RECOVERED) and HOLES in note.text else ""
     # Before it had a name of its own, scheme `age-conditioned` flew under that of a design that decided nothing.
-    ignored = MAKERS if overrides or (config.conditioned and "scheme" not in recorded.design) else frozenset()
+    ignored = MAKERS if overrides or (config.is_age_conditioned and "scheme" not in recorded.design) else frozenset()
     if tolerance:
         ignored |= LAST_BITS
     result = replay_recording(

@@ -17,18 +17,19 @@ from cyclopts import Parameter, validators
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
 
-from sim.faults import problems
-from sim.fleet import fleet
-from sim.server import Door, Port, Ready, Seat, serve_all
+from sim.faults import find_fault_problems
+from sim.fleet import make_fleet
+from sim.ports import Port
+from sim.server import PortWrapper, Ready, VehicleSetup, serve_all
 from sim.simulation import VehicleSnapshot
 from uavctl.build.rest import check_axes
 from uavctl.cli.common import DEFAULTS, Column, Common, WideTable, located, messages, write_document
 from uavctl.cli.flying import stop_on_signals
 from uavctl.clock import monotonic_ns
 from uavctl.config import Config
-from uavctl.config.checks import position_limits_m
+from uavctl.config.checks import get_position_limits_m
 from uavctl.config.connections import MOCAP_LINK, SecurityConfig
-from uavctl.config.load import with_faults
+from uavctl.config.load import add_faults
 from uavctl.io.key_file import read_key
 from uavctl.mavlink.connection import MOCAP
 from uavctl.mavlink.framing import scan_frames
@@ -79,7 +80,7 @@ class SignedPort:
         self._inner.close()
 
 
-def make_door(security: SecurityConfig) -> Door | None:
+def make_door(security: SecurityConfig) -> PortWrapper | None:
     """Return a function that signs ports as `[security]` asks of the daemon; None if it asks for nothing.
 
     Raises:
@@ -155,9 +156,9 @@ def _vector(vector: Vec3) -> str:
 
 
 def _setpoint(one: VehicleSnapshot) -> str:
-    if one.steered_by is None or one.setpoint_age_s is None:
+    if one.setpoint_source is None or one.setpoint_age_s is None:
         return "-"
-    system, component = one.steered_by
+    system, component = one.setpoint_source
     return f"{system}/{component}, {one.setpoint_age_s:.2f} s ago"
 
 
@@ -200,7 +201,7 @@ def scene_of(looks: Looks, config: Config) -> LiveScene:
     """Return what a live page shows of simulated vehicles, and the limits of the room they fly in."""
     from logs.live import LiveScene, SceneBody, SceneBox, SceneEvent, SceneFigure
 
-    limits = position_limits_m(config)
+    limits = get_position_limits_m(config)
     walls = [[side if math.isfinite(side) else None for side in limits.get(axis, (math.inf,) * 2)] for axis in AXES]
     lower_m, upper_m = zip(*walls, strict=True)
     figures, events = [], []
@@ -314,12 +315,12 @@ def sim(
     with located(loaded):
         check_axes(config)
     if faults is not None:
-        config = with_faults(config, faults, problems)
+        config = add_faults(config, faults, find_fault_problems)
 
     def forget(truth: Truth) -> None:
         del truth
 
-    seats = fleet(config, VEHICLES[config.sim.autopilot] if vehicle is None else vehicle, mocap, vehicles, forget)
+    seats = make_fleet(config, VEHICLES[config.sim.autopilot] if vehicle is None else vehicle, mocap, vehicles, forget)
     opened: list[Ready] = []
 
     def ready(ports: Ready) -> None:
@@ -336,13 +337,13 @@ def sim(
             on_ready=ready,
             stop=stopped,
             speed=speed,
-            on_look=on_look,
-            door=make_door(config.security),
+            on_snapshot=on_look,
+            wrap_port=make_door(config.security),
         )
     return 0
 
 
-def _announce(seats: Sequence[Seat], opened: Sequence[Ready], *, as_json: bool) -> None:
+def _announce(seats: Sequence[VehicleSetup], opened: Sequence[Ready], *, as_json: bool) -> None:
     listed = [
         {"system_id": seat.config.sim.system_id, "vehicle": ports.vehicle, "mocap": ports.mocap}
         for seat, ports in zip(seats, opened, strict=True)

@@ -15,7 +15,7 @@ from cyclopts import (
     UnusedCliTokensError,
 )
 
-from uavctl.config.load import keys_named
+from uavctl.config.load import find_keys
 
 MOST_SUGGESTED = 3
 SET = "--set"
@@ -153,7 +153,7 @@ def _as_settings(name: str, value: str, error: CycloptsError) -> list[str]:
     if SET not in _options(error):
         return []
     given = value or "VALUE"
-    return [f"{SET} {shlex.quote(f'{key}={given}')}" for key in keys_named(name)]
+    return [f"{SET} {shlex.quote(f'{key}={given}')}" for key in find_keys(name)]
 
 
 def _options(error: CycloptsError) -> list[str]:

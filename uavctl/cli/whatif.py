@@ -31,7 +31,7 @@ from uavctl.cli.common import SEED, Common, Flight, Json, bars, columns, located
 from uavctl.cli.flying import conclude
 from uavctl.cli.replay import changed_flyer, check_first, compute_as, other_versions, recorded_flyer
 from uavctl.config import Config, LoadedConfig, load
-from uavctl.config.checks import dimensions
+from uavctl.config.checks import get_dimensions
 from uavctl.config.load import parse_recorded
 from uavctl.config.types import PlantConfig, TargetConfig
 from uavctl.errors import UsageError
@@ -107,7 +107,7 @@ def check_plant(plant: PlantConfig, recorded: PlantConfig, what: str) -> None:
     Raises:
         UsageError: It is another one.
     """
-    shapes = [(*dimensions(one), one.axes, one.dt_s) for one in (plant, recorded)]
+    shapes = [(*get_dimensions(one), one.axes, one.dt_s) for one in (plant, recorded)]
     if shapes[0] != shapes[1]:
         told = [
             f"{n_x} states, {n_u} inputs, axes {', '.join(axes)} and steps of {dt_s:g} s"

@@ -1,7 +1,17 @@
 """Configuration: TOML in, typed and checked values out."""
 
 from uavctl.config.document import Source
-from uavctl.config.load import LoadedConfig, dump_config, explain, load, load_config, parse, presets
+from uavctl.config.load import LoadedConfig, describe_design_error, dump_config, load, load_config, parse, presets
 from uavctl.config.types import Config
 
-__all__ = ["Config", "LoadedConfig", "Source", "dump_config", "explain", "load", "load_config", "parse", "presets"]
+__all__ = [
+    "Config",
+    "LoadedConfig",
+    "Source",
+    "describe_design_error",
+    "dump_config",
+    "load",
+    "load_config",
+    "parse",
+    "presets",
+]

@@ -21,7 +21,7 @@ _SPEEDS = {
     **{unit + form: size for unit, size in _METRES.items() for form in ("ps", "/s")},
     **dict.fromkeys(("kmh", "km/h", "kmph"), 1.0 / 3.6),
 }
-TRAJECTORY: Mapping[str, Mapping[str, float]] = {
+TRAJECTORY_UNITS: Mapping[str, Mapping[str, float]] = {
     "t": _SECONDS,
     **dict.fromkeys("xyz", _METRES),
     **dict.fromkeys(("vx", "vy", "vz"), _SPEEDS),
@@ -32,19 +32,19 @@ _NAME = re.compile(r"^(?P<name>[^\[(]*?)\s*(?:[\[(]\s*(?P<unit>[^\])]*?)\s*[\])]
 class StatedColumn(NamedTuple):
     """Place of a quantity in the rows, and what a number there is multiplied by."""
 
-    place: int
+    column: int
     factor: float
 
 
-def quantity(cell: str) -> tuple[str, float, str] | None:
+def parse_heading(cell: str) -> tuple[str, float, str] | None:
     """What a heading names: `t`, `x`, `vx` …, its sign, and its unit (empty where it states none); None if nothing."""
     match = _NAME.match(cell.strip().strip("\"'").lower())
     if match is None:
         return None
     words = [word for word in re.split(r"[_\s.\-]+", match["name"]) if word]
     unit = match["unit"] or ""
-    known = (*_SECONDS, *_METRES, *_SPEEDS)
-    if not unit and len(words) > 1 and words[-1] in known:
+    known_units = (*_SECONDS, *_METRES, *_SPEEDS)
+    if not unit and len(words) > 1 and words[-1] in known_units:
         unit = words.pop()
     if len(words) == 1 and words[0] in _TIME:
         return "t", 1.0, unit
@@ -61,7 +61,7 @@ def quantity(cell: str) -> tuple[str, float, str] | None:
 
 
 def read_header(
-    cells: Sequence[str], units: Sequence[str] | None, wanted: Mapping[str, Mapping[str, float]]
+    cells: Sequence[str], unit_cells: Sequence[str] | None, known_units: Mapping[str, Mapping[str, float]]
 ) -> tuple[dict[str, StatedColumn], list[str]]:
     """The columns of a header by quantity, and what is wrong with it.
 
@@ -70,21 +70,21 @@ def read_header(
         units: A row of units below them; None if there is none.
         wanted: Factor of each unit of each quantity that may be there; the first one is that of no statement.
     """
-    found: dict[str, StatedColumn] = {}
-    wrong: list[str] = []
-    for place, cell in enumerate(cells):
-        what, shown = quantity(cell), f'column {place + 1}, "{cell.strip()[:40]}"'
-        name, sign, unit = what or ("", 1.0, "")
-        if name not in wanted:
-            wrong.append(f"{shown}, is not a quantity that is known here; rename or remove the column")
+    columns: dict[str, StatedColumn] = {}
+    problems: list[str] = []
+    for index, cell in enumerate(cells):
+        parsed, label = parse_heading(cell), f'column {index + 1}, "{cell.strip()[:40]}"'
+        name, sign, unit = parsed or ("", 1.0, "")
+        if name not in known_units:
+            problems.append(f"{label}, is not a quantity that is known here; rename or remove the column")
             continue
-        if units is not None and not unit:
-            unit = units[place].strip().strip("[]()").lower() if place < len(units) else ""
-        if unit and unit not in wanted[name]:
-            wrong.append(f'{shown}: "{unit}" is not a unit of it; give one of {", ".join(wanted[name])}')
+        if unit_cells is not None and not unit:
+            unit = unit_cells[index].strip().strip("[]()").lower() if index < len(unit_cells) else ""
+        if unit and unit not in known_units[name]:
+            problems.append(f'{label}: "{unit}" is not a unit of it; give one of {", ".join(known_units[name])}')
             continue
-        if name in found:
-            wrong.append(f"{shown}, means the same as column {found[name].place + 1}; keep one of them")
+        if name in columns:
+            problems.append(f"{label}, means the same as column {columns[name].column + 1}; keep one of them")
             continue
-        found[name] = StatedColumn(place, sign * (wanted[name][unit] if unit else 1.0))
-    return found, wrong
+        columns[name] = StatedColumn(index, sign * (known_units[name][unit] if unit else 1.0))
+    return columns, problems

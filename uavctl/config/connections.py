@@ -1,4 +1,4 @@
-"""[mocap] [vehicle] [security] [hand_over] [check] [relay]: whom the loop talks to."""
+"""Sections of the connections: hand-over, frame, source, clock, daemon, security, check and relay."""
 
 from __future__ import annotations
 
@@ -11,9 +11,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from uavctl.config.document import LONGEST_PATH, LONGEST_URL, ConfigProblem, Position, Section
-
-# Requests to the vehicle for modes, arming and take-off, and how long to wait for its answers.
+from uavctl.config.document import MAX_PATH_LENGTH, MAX_URL_LENGTH, ConfigProblem, Position, Section
 
 
 class HandOverConfig(Section, frozen=True, kw_only=True):
@@ -65,9 +63,6 @@ class HandOverConfig(Section, frozen=True, kw_only=True):
     ] = (47.397742, 8.545594, 488.0)
 
 
-# Partners of the control loop: frame and clock of the positions' source, and the connections.
-
-
 @dataclass(frozen=True)
 class CameraSystem:
     """A camera system that is listened to without a bridge to MAVLink."""
@@ -77,7 +72,7 @@ class CameraSystem:
     extra: str  # our optional dependency group that installs the package
     port: int  # of its server, if a URL names none; 0: a URL has to
     advice: str  # what to check if no answer comes
-    up: Literal["y", "z"] = "y"  # the axis that is up where a URL says nothing
+    up: Literal["y", "z"] = "y"  # the vertical axis without a statement in the URL
 
 
 # By the scheme of their URLs, SCHEME://SERVER[:PORT]/BODY.
@@ -98,12 +93,12 @@ CAMERA_SYSTEMS = {
         up="z",
     ),
 }
-SOURCES = "uavctl.sources"  # entry points of those of other packages
+SOURCE_GROUP = "uavctl.sources"  # entry points of those of other packages
 _TRANSPORTS = ("udpin", "udpout", "tcp", "serial")  # MAVLink as it is
 CAMERA_SYSTEM_ID, CAMERA_MESSAGE = 246, "ODOMETRY"  # as what their positions come to the controller
 
 
-def camera_scheme(url: str) -> str:
+def parse_camera_scheme(url: str) -> str:
     """Return the scheme of a camera system's URL; empty if it is no camera system's.
 
     That of another package is the name of its entry point `uavctl.sources`, or its `module:Class`.
@@ -111,14 +106,14 @@ def camera_scheme(url: str) -> str:
     scheme, separator, _ = url.partition("://")
     if not separator or scheme in _TRANSPORTS:
         return ""
-    return scheme if scheme in CAMERA_SYSTEMS or ":" in scheme or entry_points(group=SOURCES, name=scheme) else ""
+    return scheme if scheme in CAMERA_SYSTEMS or ":" in scheme or entry_points(group=SOURCE_GROUP, name=scheme) else ""
 
 
-def camera_system(scheme: str) -> CameraSystem:
-    """Return what is known of a camera system, by the scheme of its URLs."""
+def get_camera_system(scheme: str) -> CameraSystem:
+    """Return a camera system by the scheme of its URLs."""
     if scheme in CAMERA_SYSTEMS:
         return CAMERA_SYSTEMS[scheme]
-    camera = next((point.value for point in entry_points(group=SOURCES, name=scheme)), scheme)
+    camera = next((entry_point.value for entry_point in entry_points(group=SOURCE_GROUP, name=scheme)), scheme)
     return CameraSystem(camera=camera, package="", extra="", port=0, advice="does the server run there?")
 
 
@@ -187,11 +182,11 @@ class DaemonConfig(Section, frozen=True, kw_only=True):
     """The control loop and its connections."""
 
     tick_s: Annotated[float, Meta(le=0.1, ge=0.001, description="time between setpoints; divides Δt [s]")]
-    vehicle: Annotated[str, Meta(max_length=LONGEST_URL, description="URL of the vehicle")] = "udpin://0.0.0.0:14540"
+    vehicle: Annotated[str, Meta(max_length=MAX_URL_LENGTH, description="URL of the vehicle")] = "udpin://0.0.0.0:14540"
     mocap: Annotated[
         str,
         Meta(
-            max_length=LONGEST_URL,
+            max_length=MAX_URL_LENGTH,
             description="URL of the source of positions; the same URL as the vehicle's is one connection. "
             "`natnet://SERVER/BODY` is a rigid body of an OptiTrack system, `qualisys://SERVER/BODY` one of Qualisys "
             "(docs/sources.md), `NAME://SERVER:PORT/BODY` one of another package, by its entry point `uavctl.sources` "
@@ -221,9 +216,6 @@ class DaemonConfig(Section, frozen=True, kw_only=True):
     ] = True
 
 
-# Trust: signing, and the addresses that are listened to.
-
-
 MOCAP_LINK = 1  # its link id is that of the vehicle's connection plus this
 
 
@@ -233,7 +225,7 @@ class SecurityConfig(Section, frozen=True, kw_only=True):
     key_file: Annotated[
         str,
         Meta(
-            max_length=LONGEST_PATH,
+            max_length=MAX_PATH_LENGTH,
             description="file of the signing key, from `/` or `~` on, readable by its owner only (`uavctl key new` "
             "makes one); empty neither signs nor verifies",
         ),
@@ -284,7 +276,7 @@ class SecurityConfig(Section, frozen=True, kw_only=True):
     )
 
 
-def check(security: SecurityConfig) -> Iterator[ConfigProblem]:
+def check_security(security: SecurityConfig) -> Iterator[ConfigProblem]:
     """All problems of `[security]`."""
     path = security.key_file
     if path and not (PurePath(path).is_absolute() or path.startswith("~")):
@@ -302,37 +294,34 @@ def check(security: SecurityConfig) -> Iterator[ConfigProblem]:
             )
 
 
-def warnings(security: SecurityConfig, daemon: DaemonConfig) -> tuple[str, ...]:
+def find_security_warnings(security: SecurityConfig, daemon: DaemonConfig) -> tuple[str, ...]:
     """Return warnings of what a valid configuration leaves open to strangers; for people, before a flight."""
     urls = {"vehicle": daemon.vehicle, "mocap": daemon.mocap}
     if daemon.vehicle == daemon.mocap:
         del urls["mocap"]
-    found: dict[str, list[str]] = {}
+    names_by_text: dict[str, list[str]] = {}
     for name, url in urls.items():
-        signed = bool(security.key_file) and name in security.require
+        is_signed = bool(security.key_file) and name in security.require
         if url.startswith("udpin:") and not security.allow:
-            found.setdefault("any address may send; list the peers in security.allow", []).append(name)
-        if url.startswith("udp") and not signed:
-            found.setdefault("not signed, so an address can be forged; see security.key_file", []).append(name)
-        if camera_scheme(url):
-            found.setdefault(f"{url} has no signatures, so an address can be forged; see docs/sources.md", []).append(
-                name
-            )
-    return tuple(f"{', '.join(names)}: {text}" for text, names in found.items())
+            names_by_text.setdefault("any address may send; list the peers in security.allow", []).append(name)
+        if url.startswith("udp") and not is_signed:
+            names_by_text.setdefault("not signed, so an address can be forged; see security.key_file", []).append(name)
+        if parse_camera_scheme(url):
+            names_by_text.setdefault(
+                f"{url} has no signatures, so an address can be forged; see docs/sources.md", []
+            ).append(name)
+    return tuple(f"{', '.join(names)}: {text}" for text, names in names_by_text.items())
 
 
-# Checks of a camera system that is listened to without a bridge to MAVLink.
-
-
-def roles(daemon: DaemonConfig) -> Iterator[ConfigProblem]:
+def check_roles(daemon: DaemonConfig) -> Iterator[ConfigProblem]:
     """Check that a camera system is not given as the vehicle."""
-    if camera_scheme(daemon.vehicle):
+    if parse_camera_scheme(daemon.vehicle):
         yield ConfigProblem("daemon.vehicle", f'"{daemon.vehicle}" is a camera system', "give it as daemon.mocap")
 
 
-def source(daemon: DaemonConfig, source: SourceConfig) -> Iterator[ConfigProblem]:
+def check_source(daemon: DaemonConfig, source: SourceConfig) -> Iterator[ConfigProblem]:
     """Check that a camera system's positions are among those that count."""
-    if not camera_scheme(daemon.mocap):
+    if not parse_camera_scheme(daemon.mocap):
         return
     if CAMERA_MESSAGE not in source.messages:
         yield ConfigProblem(
@@ -346,17 +335,14 @@ def source(daemon: DaemonConfig, source: SourceConfig) -> Iterator[ConfigProblem
         )
 
 
-def signing(daemon: DaemonConfig, security: SecurityConfig) -> Iterator[ConfigProblem]:
+def check_signing(daemon: DaemonConfig, security: SecurityConfig) -> Iterator[ConfigProblem]:
     """Check that no signatures are asked of a camera system, which cannot sign."""
-    if camera_scheme(daemon.mocap) and security.key_file and "mocap" in security.require:
+    if parse_camera_scheme(daemon.mocap) and security.key_file and "mocap" in security.require:
         yield ConfigProblem(
             "security.require",
             f'"mocap" cannot be: {daemon.mocap} has no signatures',
             'write require = ["vehicle"], and keep the cameras\' network to itself',
         )
-
-
-# The sections `[check]` and `[relay]`: what is looked at before a flight, and positions passed on to the vehicle.
 
 
 class CheckConfig(Section, frozen=True, kw_only=True):

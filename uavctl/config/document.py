@@ -1,7 +1,8 @@
-"""A configuration document: its sections' types in words, its problems, and the line of each key.
+"""A configuration document: bounds of its size, text files, lines of its keys, base of its sections, types as text.
 
-Parsers give values without places, or places without paths; a message that names the line of a
-wrong key needs both. The document must be valid TOML (the parser has seen it first).
+Parsers give values without lines, or lines without key paths; a message that names the line of a wrong key needs both.
+The scanner of key lines requires valid TOML, so the parser runs first. A document that nests too deep, or whose numbers
+and texts no key takes, is refused with its line before further processing.
 """
 
 from __future__ import annotations
@@ -20,8 +21,6 @@ import msgspec
 from msgspec import Meta
 from msgspec.structs import FieldInfo
 
-# One thing that is wrong with a configuration.
-
 
 class ConfigProblem(NamedTuple):
     """Key path, what is wrong with it, and what to do."""
@@ -31,18 +30,13 @@ class ConfigProblem(NamedTuple):
     todo: str
 
 
-# Bounds that no TOML document of ours exceeds, whatever its keys: checked before and right after it is read.
-#
-# A document that nests deeper than the parsers' own calls can, or whose numbers and texts no key takes, is refused
-# with the place, before anything is made of it.
-
-
-DEEPEST = 10
-MOST_BYTES = 4_000_000
-MOST_VALUES = 150_000
-LONGEST_KEY, LONGEST_TEXT, LONGEST_LIST = 100, 1000, 20_000
-LARGEST_WHOLE = 2**63 - 1
-_TOLD = 5  # places that are told one by one
+# Bounds of every document, checked before and right after it is read.
+MAX_DEPTH = 10
+MAX_BYTES = 4_000_000
+MAX_VALUES = 150_000
+MAX_KEY_LENGTH, MAX_TEXT_LENGTH, MAX_LIST_LENGTH = 100, 1000, 20_000
+MAX_INTEGER = 2**63 - 1
+_MAX_REPORTED = 5  # places reported one by one
 
 # Strings and comments, in which brackets mean nothing, or a bracket.
 _BRACKET = re.compile(
@@ -51,62 +45,61 @@ _BRACKET = re.compile(
 )
 
 
-def excess(text: str) -> tuple[int, str] | None:
+def find_excess(text: str) -> tuple[int, str] | None:
     """Line and reason, if a TOML text is too long, has too many values, or nests too deep to be read."""
-    if len(text) > MOST_BYTES:
-        return 1, f"is longer than {MOST_BYTES} characters"
-    if text.count(",") + text.count("\n") > MOST_VALUES:
-        return 1, f"has more than {MOST_VALUES} lines and commas"
+    if len(text) > MAX_BYTES:
+        return 1, f"is longer than {MAX_BYTES} characters"
+    if text.count(",") + text.count("\n") > MAX_VALUES:
+        return 1, f"has more than {MAX_VALUES} lines and commas"
     depth = 0
     for match in _BRACKET.finditer(text):
         depth += (match.lastgroup == "open") - (match.lastgroup == "close")
-        if depth > DEEPEST:
+        if depth > MAX_DEPTH:
             line = text.count("\n", 0, match.start()) + 1
-            return line, f"brackets are nested more than {DEEPEST} deep, or not closed"
+            return line, f"brackets are nested more than {MAX_DEPTH} deep, or not closed"
     return None
 
 
-def oversized(table: dict[str, Any]) -> Iterator[ConfigProblem]:
+def find_oversized(table: dict[str, Any]) -> Iterator[ConfigProblem]:
     """Yield the first values in a document that no key takes, by depth, length or whole number; without recursion."""
-    todo: list[tuple[str, object, int]] = [("", table, 0)]
-    found = 0
-    while todo and found < _TOLD:
-        path, value, depth = todo.pop()
-        problem = _problem(path, value, depth)
+    pending: list[tuple[str, object, int]] = [("", table, 0)]
+    count = 0
+    while pending and count < _MAX_REPORTED:
+        path, value, depth = pending.pop()
+        problem = _find_problem(path, value, depth)
         if problem is not None:
-            found += 1
+            count += 1
             yield problem
         elif isinstance(value, dict):
-            todo.extend((f"{path}.{key}" if path else key, one, depth + 1) for key, one in value.items())
+            pending.extend((f"{path}.{key}" if path else key, item, depth + 1) for key, item in value.items())
         elif isinstance(value, list):
-            todo.extend((f"{path}[{i}]", one, depth + 1) for i, one in enumerate(value))
+            pending.extend((f"{path}[{i}]", item, depth + 1) for i, item in enumerate(value))
 
 
-def _problem(path: str, value: object, depth: int) -> ConfigProblem | None:
-    if depth > DEEPEST:
-        return ConfigProblem(path, f"is nested more than {DEEPEST} deep", "no key is; remove it")
+def _find_problem(path: str, value: object, depth: int) -> ConfigProblem | None:
+    if depth > MAX_DEPTH:
+        return ConfigProblem(path, f"is nested more than {MAX_DEPTH} deep", "no key is; remove it")
     if isinstance(value, dict):
-        key = next((key for key in value if len(key) > LONGEST_KEY), None)
+        key = next((key for key in value if len(key) > MAX_KEY_LENGTH), None)
         if key is not None:
             return ConfigProblem(
-                path, f"has a key of {len(key)} characters", f"no key has more than {LONGEST_KEY}; remove it"
+                path, f"has a key of {len(key)} characters", f"no key has more than {MAX_KEY_LENGTH}; remove it"
             )
     elif isinstance(value, list):
-        if len(value) > LONGEST_LIST:
-            return ConfigProblem(path, f"has {len(value)} entries", f"no list has more than {LONGEST_LIST}; shorten it")
-    elif isinstance(value, str):
-        if len(value) > LONGEST_TEXT:
+        if len(value) > MAX_LIST_LENGTH:
             return ConfigProblem(
-                path, f"has {len(value)} characters", f"no text has more than {LONGEST_TEXT}; shorten it"
+                path, f"has {len(value)} entries", f"no list has more than {MAX_LIST_LENGTH}; shorten it"
+            )
+    elif isinstance(value, str):
+        if len(value) > MAX_TEXT_LENGTH:
+            return ConfigProblem(
+                path, f"has {len(value)} characters", f"no text has more than {MAX_TEXT_LENGTH}; shorten it"
             )
         if not value.isprintable():
             return ConfigProblem(path, f"{value[:20]!r} has a character that cannot be shown", "write it without")
-    elif isinstance(value, int) and not -LARGEST_WHOLE - 1 <= value <= LARGEST_WHOLE:
+    elif isinstance(value, int) and not -MAX_INTEGER - 1 <= value <= MAX_INTEGER:
         return ConfigProblem(path, "is a whole number of more than 64 bits", "give a smaller one")
     return None
-
-
-# Text files of a configuration and beside it: read whole and bounded, or refused with file and line.
 
 
 class DataFileError(Exception):
@@ -125,20 +118,20 @@ def read_text(path: Path) -> str:
             no text.
     """
     try:
-        # A pipe that nobody writes to opens at once this way.
+        # A pipe without a writer opens at once this way.
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
         with os.fdopen(descriptor, "rb") as file:
             if stat.S_ISDIR(os.fstat(descriptor).st_mode):
                 raise DataFileError((f"{path}: cannot be read (Is a directory)",))
             if not stat.S_ISREG(os.fstat(descriptor).st_mode):
                 raise DataFileError((f"{path}: cannot be read (it is a pipe or a device, not a file)",))
-            data = file.read(MOST_BYTES + 1)
+            data = file.read(MAX_BYTES + 1)
     except OSError as error:
         raise DataFileError((f"{path}: cannot be read ({error.strerror})",)) from error
     except ValueError as error:
         raise DataFileError((f"{path}: cannot be read ({error})",)) from error
-    if len(data) > MOST_BYTES:
-        raise DataFileError((f"{path}: is longer than {MOST_BYTES} bytes",))
+    if len(data) > MAX_BYTES:
+        raise DataFileError((f"{path}: is longer than {MAX_BYTES} bytes",))
     try:
         return data.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
     except UnicodeDecodeError as error:
@@ -154,15 +147,15 @@ def read_lines(path: Path) -> list[str]:
     return read_text(path).splitlines()
 
 
-def refuse(path: Path, wrong: Sequence[str]) -> None:
+def refuse_file(path: Path, reasons: Sequence[str]) -> None:
     """Refuse a file in which something is wrong.
 
     Raises:
         DataFileError: With the first few reasons, and how many more there are.
     """
-    if wrong:
-        more = (f"{path}: {len(wrong) - _TOLD} more",) if len(wrong) > _TOLD else ()
-        raise DataFileError((*wrong[:_TOLD], *more))
+    if reasons:
+        more = (f"{path}: {len(reasons) - _MAX_REPORTED} more",) if len(reasons) > _MAX_REPORTED else ()
+        raise DataFileError((*reasons[:_MAX_REPORTED], *more))
 
 
 _TOKEN = re.compile(
@@ -177,22 +170,22 @@ _TOKEN = re.compile(
 )
 
 
-def key_lines(text: str) -> dict[str, int]:
+def find_key_lines(text: str) -> dict[str, int]:
     """Line (from 1) of every table, key and list element, named as `plant.a`, `plant.a[0][1]`, `fence[0].side`."""
     scanner = _Scanner(text)
-    scanner.document()
+    scanner.scan()
     return scanner.lines
 
 
-def given_before(text: str) -> tuple[str, int, int] | None:
+def find_repeated_key(text: str) -> tuple[str, int, int] | None:
     """Key that the last statement of a text gives again, its first line, and this one's; None if it gives none again.
 
     The text may break off after it.
     """
     scanner = _Scanner(text)
     with suppress(IndexError):  # it breaks off
-        scanner.document()
-    return scanner.again[0] if scanner.again else None
+        scanner.scan()
+    return scanner.repeated[0] if scanner.repeated else None
 
 
 class _Scanner:
@@ -200,126 +193,124 @@ class _Scanner:
 
     def __init__(self, text: str) -> None:
         self.lines: dict[str, int] = {}
-        self.again: list[tuple[str, int, int]] = []  # keys of the last statement that were there: key, first line, line
+        self.repeated: list[
+            tuple[str, int, int]
+        ] = []  # keys of the last statement that were there: key, first line, line
         self._values: set[str] = set()  # keys that have a value
         self._known: set[str] = set()
         self._count: dict[str, int] = {}  # elements so far of each array of tables, less one
         self._tokens: list[tuple[str, int]] = []  # token, line; a newline is "\n"
-        self._at = 0
+        self._index = 0
         line = 1
         for match in _TOKEN.finditer(text):
             if match.lastgroup != "skip":
                 self._tokens.append((match.group(), line))
             line += match.group().count("\n")
 
-    def document(self) -> None:
+    def scan(self) -> None:
         """Read tables and pairs up to the end."""
         table = ""
-        while self._at < len(self._tokens):
+        while self._index < len(self._tokens):
             if self._peek() == "\n":
-                self._at += 1
+                self._index += 1
                 continue
-            self.again = []
+            self.repeated = []
             if self._peek() == "[":
-                table = self._header()
+                table = self._read_header()
             else:
-                self._pair(table)
+                self._read_pair(table)
 
     def _peek(self) -> str:
-        return self._tokens[self._at][0] if self._at < len(self._tokens) else ""
+        return self._tokens[self._index][0] if self._index < len(self._tokens) else ""
 
     def _skip(self, mark: str) -> None:
         while self._peek() == mark:
-            self._at += 1
+            self._index += 1
 
-    def _header(self) -> str:
+    def _read_header(self) -> str:
         """Read `[table]`, or `[[table]]`, which is one more element of a list."""
-        before = self._at
+        start = self._index
         self._skip("[")
-        many = self._at - before > 1
-        line = self._tokens[self._at][1]
-        path = self._key("")
+        is_list = self._index - start > 1
+        line = self._tokens[self._index][1]
+        path = self._read_key("")
         self._skip("]")
-        if many:
+        if is_list:
             self._count[path] = self._count.get(path, -1) + 1
             path = f"{path}[{self._count[path]}]"
             self.lines[path] = line
         return path
 
-    def _key(self, prefix: str) -> str:
+    def _read_key(self, prefix: str) -> str:
         """Read a dotted key; each of its parts is recorded where it first stands."""
         path = prefix
         while True:
-            token, line = self._tokens[self._at]
+            token, line = self._tokens[self._index]
             part = token[1:-1] if token[0] in "\"'" else token
             path = f"{path}.{part}" if path else part
-            first = self.lines.setdefault(path, line)
-            known = path in self._known
+            first_line = self.lines.setdefault(path, line)
+            is_known = path in self._known
             self._known.add(path)
-            self._at += 1
-            last = self._peek() != "."
-            if known and (last or path in self._values):
-                self.again.append((path, first, line))
-            if last:
+            self._index += 1
+            is_last = self._peek() != "."
+            if is_known and (is_last or path in self._values):
+                self.repeated.append((path, first_line, line))
+            if is_last:
                 return path
-            self._at += 1
+            self._index += 1
 
-    def _pair(self, prefix: str) -> None:
-        path = self._key(prefix)
+    def _read_pair(self, prefix: str) -> None:
+        path = self._read_key(prefix)
         self._skip("=")
-        self._value(path)
+        self._read_value(path)
         self._values.add(path)
 
-    def _value(self, path: str) -> None:
+    def _read_value(self, path: str) -> None:
         if self._peek() == "[":
-            self._array(path)
+            self._read_array(path)
         elif self._peek() == "{":
-            self._inline_table(path)
+            self._read_inline_table(path)
         else:
             while self._peek() not in ("", "\n", ",", "]", "}"):
-                self._at += 1
+                self._index += 1
 
-    def _array(self, path: str) -> None:
-        self._at += 1
+    def _read_array(self, path: str) -> None:
+        self._index += 1
         element = 0
         while self._peek() not in ("", "]"):
             if self._peek() in ("\n", ","):
-                self._at += 1
+                self._index += 1
                 continue
             name = f"{path}[{element}]"
-            self.lines[name] = self._tokens[self._at][1]
-            self._value(name)
+            self.lines[name] = self._tokens[self._index][1]
+            self._read_value(name)
             element += 1
-        self._at += 1
+        self._index += 1
 
-    def _inline_table(self, path: str) -> None:
-        self._at += 1
+    def _read_inline_table(self, path: str) -> None:
+        self._index += 1
         while self._peek() not in ("", "}"):
             if self._peek() in ("\n", ","):
-                self._at += 1
+                self._index += 1
             else:
-                self._pair(path)
-        self._at += 1
+                self._read_pair(path)
+        self._index += 1
 
 
-# Base of all sections of the configuration, and the largest sizes in them.
-#
-# Every number has a range and every list and text a longest length: anything beyond is a slip, and would only show
-# as an overflow, or as work without end.
+# Every number has a range and every list and text a maximum length: a value beyond is a slip, and would only show as
+# an overflow, or as work without end.
+MAX_NUMBER = 1e7  # of numbers that have no range of their own
+MAX_DURATION_S = 1e6
+MAX_PATH_LENGTH, MAX_URL_LENGTH = 1000, 300
+MAX_STATES = 24  # states
+MAX_SEED = 2**53  # what JSON holds exactly
+MAX_SPANS = 1000
+MAX_TRAJECTORY_SAMPLES = 10_000  # samples of a trajectory; a recording holds them
 
-
-LARGEST = 1e7  # of numbers that have no range of their own
-LONGEST_S = 1e6
-LONGEST_PATH, LONGEST_URL = 1000, 300
-LARGEST_PLANT = 24  # states
-LARGEST_SEED = 2**53  # what JSON holds exactly
-MOST_SPANS = 1000
-LONGEST_MOTION = 10_000  # samples of a trajectory; a recording holds them
-
-Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
+Number = Annotated[float, Meta(ge=-MAX_NUMBER, le=MAX_NUMBER)]
 Rows = tuple[tuple[Number, ...], ...]
 Floats = tuple[Number, ...]
-Open = tuple[float, ...]  # may be infinite: each use has its own check
+UnboundedFloats = tuple[float, ...]  # may be infinite: each use has its own check
 Weights = tuple[Annotated[float, Meta(ge=0, le=1e12)], ...]
 Position = tuple[Number, Number, Number]
 Speed = Annotated[float, Meta(ge=-100, le=100)]
@@ -331,9 +322,6 @@ class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     """Base of all sections."""
 
 
-# Places of the keys of a configuration, for its problems.
-
-
 @dataclass(frozen=True)
 class Source:
     """Origin of a configuration: enough to say where each key stands."""
@@ -341,51 +329,52 @@ class Source:
     file: str  # the file, as a person finds it
     lines: Mapping[str, int]  # key path -> line in the file
     overrides: tuple[tuple[str, str], ...] = ()  # (key path, text as typed) of each override, in order
-    elsewhere: Mapping[str, str] = field(default_factory=dict)  # key path -> place, for what another file holds
-    below: Mapping[str, str] = field(default_factory=dict)  # key path -> place in the base, for what the file has not
+    file_places: Mapping[str, str] = field(default_factory=dict)  # key path -> place, for keys of another file
+    base_places: Mapping[str, str] = field(
+        default_factory=dict
+    )  # key path -> place in the base, for keys that the file lacks
 
-    def where(self, key: str) -> str:
+    def locate(self, key: str) -> str:
         """The place in another file, the override that set `key`, or `file:line` of it or the nearest table around."""
-        outer = next((around for around in _outwards(key) if around in self.elsewhere), "")
-        if outer:
-            return self.elsewhere[outer]
+        enclosing = next(
+            (enclosing_key for enclosing_key in _iterate_enclosing(key) if enclosing_key in self.file_places), ""
+        )
+        if enclosing:
+            return self.file_places[enclosing]
         for path, text in reversed(self.overrides):
             if key == path or key.startswith((f"{path}.", f"{path}[")) or path.startswith(f"{key}."):
                 return f"--set {text}"
-        for around in _outwards(key):
-            if around in self.lines:
-                return f"{self.file}:{self.lines[around]}"
-            if around in self.below:
-                return self.below[around]
+        for enclosing_key in _iterate_enclosing(key):
+            if enclosing_key in self.lines:
+                return f"{self.file}:{self.lines[enclosing_key]}"
+            if enclosing_key in self.base_places:
+                return self.base_places[enclosing_key]
         return f"{self.file}:1"
 
-    def tell(self, problem: ConfigProblem) -> str:
+    def describe(self, problem: ConfigProblem) -> str:
         """One line: place, key, what is wrong, what to do."""
-        return f"{self.where(problem.key)}: {problem.key}: {problem.reason}; {problem.todo}"
+        return f"{self.locate(problem.key)}: {problem.key}: {problem.reason}; {problem.todo}"
 
 
-def _outwards(key: str) -> Iterator[str]:
+def _iterate_enclosing(key: str) -> Iterator[str]:
     """A key path, and those of what is around it."""
     while key:
         yield key
         key = key[: max(key.rfind("."), key.rfind("["), 0)]
 
 
-# Types of the keys in words.
-
-
 _SCALARS = {float: "number", int: "whole number", str: "string", bool: "true or false"}
 
 
 def is_section(annotation: object) -> bool:
-    """Whether a field's type is a table of its own."""
+    """Return whether a field's type is a table."""
     return isinstance(annotation, type) and issubclass(annotation, Section)
 
 
-def element(annotation: Any) -> type[Section] | None:
+def get_element_type(annotation: Any) -> type[Section] | None:
     """The tables that a field is a list of, if it is one: `[[name]]`."""
     if get_origin(annotation) is Annotated:
-        return element(get_args(annotation)[0])
+        return get_element_type(get_args(annotation)[0])
     arguments = get_args(annotation)
     if get_origin(annotation) is tuple and arguments[1:] == (Ellipsis,) and is_section(arguments[0]):
         section: type[Section] = arguments[0]
@@ -393,43 +382,43 @@ def element(annotation: Any) -> type[Section] | None:
     return None
 
 
-def type_text(annotation: Any) -> str:
-    """A field's type with its limits, in words."""
+def describe_type(annotation: Any) -> str:
+    """Describe a field's type with its limits."""
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         metas = [meta for meta in arguments[1:] if isinstance(meta, Meta)]
-        return type_text(arguments[0]) + "".join(_limits(meta, _unit(arguments[0])) for meta in metas)
+        return describe_type(arguments[0]) + "".join(_describe_limits(meta, _get_unit(arguments[0])) for meta in metas)
     if origin is Literal:
         return " or ".join(f'"{choice}"' for choice in arguments)
     if origin in (Union, types.UnionType):
-        return ", or ".join(type_text(argument) for argument in arguments if argument is not types.NoneType)
-    if element(annotation) is not None:
+        return ", or ".join(describe_type(argument) for argument in arguments if argument is not types.NoneType)
+    if get_element_type(annotation) is not None:
         return "list of tables"
     if origin is tuple:
         count = "" if arguments[1:] == (Ellipsis,) else f"{len(arguments)} "
-        return f"list of {count}{_plural(type_text(arguments[0]))}"
+        return f"list of {count}{_make_plural(describe_type(arguments[0]))}"
     return _SCALARS[annotation]
 
 
-def _plural(text: str) -> str:
+def _make_plural(text: str) -> str:
     return text.replace("list", "lists", 1) if text.startswith("list") else text.replace("number", "numbers", 1)
 
 
-def description(field: FieldInfo) -> str:
+def get_description(field: FieldInfo) -> str:
     """Unit and meaning of a field; empty for a table."""
     metas = (meta for meta in get_args(field.type)[1:] if isinstance(meta, Meta))
     return next((meta.description for meta in metas if meta.description), "")
 
 
-def _unit(annotation: Any) -> str:
+def _get_unit(annotation: Any) -> str:
     """Return the unit that the length of a value counts."""
     return "characters" if annotation is str else "entries"
 
 
-def _limits(meta: Meta, unit: str) -> str:
+def _describe_limits(meta: Meta, unit: str) -> str:
     bounds = ((">", meta.gt), (">=", meta.ge), ("<", meta.lt), ("<=", meta.le))
-    told = [f"{sign} {value:g}".replace("e+0", "e").replace("e+", "e") for sign, value in bounds if value is not None]
-    most = f"{unit}: at most" if meta.min_length is None else "at most"
-    lengths = ((f"{unit}: at least", meta.min_length), (most, meta.max_length))
-    told += [f"{word} {value}" for word, value in lengths if value is not None]
-    return f" ({', '.join(told)})" if told else ""
+    texts = [f"{sign} {value:g}".replace("e+0", "e").replace("e+", "e") for sign, value in bounds if value is not None]
+    max_label = f"{unit}: at most" if meta.min_length is None else "at most"
+    lengths = ((f"{unit}: at least", meta.min_length), (max_label, meta.max_length))
+    texts += [f"{label} {value}" for label, value in lengths if value is not None]
+    return f" ({', '.join(texts)})" if texts else ""

@@ -12,27 +12,24 @@ import msgspec
 from msgspec import Meta
 
 from uavctl.config.document import (
-    LONGEST_PATH,
-    MOST_SPANS,
+    MAX_PATH_LENGTH,
+    MAX_SPANS,
     ConfigProblem,
     DataFileError,
     Floats,
-    Open,
     Section,
     Spans,
+    UnboundedFloats,
     read_lines,
-    refuse,
+    refuse_file,
 )
-
-# The section `[link]`.
-
 
 Probability = Annotated[float, Meta(ge=0, le=1)]
 # Each run length is a state of the design's chain.
-LONGEST_RUN = 100
+MAX_LOSS_RUN = 100
 # A recording holds its configuration.
-LONGEST_TRACE = 20_000
-LONGEST_DELAY_S = 60.0
+MAX_TRACE_PACKETS = 20_000
+MAX_DELAY_S = 60.0
 
 
 class LinkConfig(Section, frozen=True, kw_only=True):
@@ -68,7 +65,7 @@ class LinkConfig(Section, frozen=True, kw_only=True):
     gaps: Annotated[
         tuple[Probability, ...],
         Meta(
-            max_length=LONGEST_RUN + 1,
+            max_length=MAX_LOSS_RUN + 1,
             description="with `empirical`: probability that exactly i packets in a row are lost after one that "
             "arrived, i = 0, 1, …; they add up to 1",
         ),
@@ -76,16 +73,16 @@ class LinkConfig(Section, frozen=True, kw_only=True):
     trace_file: Annotated[
         str,
         Meta(
-            max_length=LONGEST_PATH,
+            max_length=MAX_PATH_LENGTH,
             description="with `trace`: CSV file beside this one (given on the command line: in the folder there) with "
             "one line for each packet in the order of sending: its delay in s, nothing or `inf` for a lost one; of "
             "several columns, the one headed `delay_s` (or `delay_ms`, `delay_us`, `delay_ns`)",
         ),
     ] = ""
     trace_s: Annotated[
-        Open,
+        UnboundedFloats,
         Meta(
-            max_length=LONGEST_TRACE,
+            max_length=MAX_TRACE_PACKETS,
             description="with `trace`: the same delays as a list [s]; after the last packet the first one's follows. "
             "The design takes a position that is on its way for longer than delay_s + jitter_s for lost, and the runs "
             "of losses as they come in the trace; a campaign begins each run at another packet",
@@ -103,13 +100,13 @@ class LinkConfig(Section, frozen=True, kw_only=True):
         Meta(ge=0, le=1, description="with `gilbert-elliott`: loss in the bad state (`loss` applies in the good one)"),
     ] = 1.0
     delay_s: Annotated[
-        float, Meta(ge=0, le=LONGEST_DELAY_S, description="constant delay of a packet, but with `trace` [s]")
+        float, Meta(ge=0, le=MAX_DELAY_S, description="constant delay of a packet, but with `trace` [s]")
     ] = 0.0
     jitter_s: Annotated[
         float,
         Meta(
             ge=0,
-            le=LONGEST_DELAY_S,
+            le=MAX_DELAY_S,
             description="uniform extra delay from 0 to this, likewise [s]; packets may overtake others",
         ),
     ] = 0.0
@@ -122,13 +119,13 @@ class LinkConfig(Section, frozen=True, kw_only=True):
     blackout: Annotated[
         Spans,
         Meta(
-            max_length=MOST_SPANS, description="spans [from_s, to_s] since the start in which every packet is lost [s]"
+            max_length=MAX_SPANS, description="spans [from_s, to_s] since the start in which every packet is lost [s]"
         ),
     ] = ()
     held: Annotated[
         Spans,
         Meta(
-            max_length=MOST_SPANS,
+            max_length=MAX_SPANS,
             description="spans [from_s, to_s] since the start in which nothing arrives; what was to arrive comes at "
             "the end, all at once and in the order of arrival [s]",
         ),
@@ -136,13 +133,10 @@ class LinkConfig(Section, frozen=True, kw_only=True):
     uplink_blackout: Annotated[
         Spans,
         Meta(
-            max_length=MOST_SPANS,
+            max_length=MAX_SPANS,
             description="spans [from_s, to_s] since the start in which nothing that we send reaches the vehicle [s]",
         ),
     ] = ()
-
-
-# A measured trace of losses and delays from a CSV file.
 
 
 _COLUMN = "delay_s"
@@ -150,12 +144,12 @@ _UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _HEADING = re.compile(r"^delay(?:[_ ]?[\[(]?(?P<unit>s|ms|us|ns)[\])]?)?$")
 
 
-def read_trace(link: LinkConfig, folder: Path, found: list[ConfigProblem]) -> tuple[LinkConfig, dict[str, str]]:
-    """The delays of `link.trace_file` in its place, so that the configuration is complete in itself.
+def read_trace_file(link: LinkConfig, folder: Path, problems: list[ConfigProblem]) -> tuple[LinkConfig, dict[str, str]]:
+    """Replace `link.trace_file` by its delays, so that the configuration is complete in itself.
 
     Args:
         folder: Where a relative name starts from.
-        found: What is wrong with the file is added here.
+        problems: Problems of the file are added here.
 
     Returns:
         The link, and where the keys that come from the file stand: `file:line`, or the file for the whole list.
@@ -164,18 +158,18 @@ def read_trace(link: LinkConfig, folder: Path, found: list[ConfigProblem]) -> tu
     if not link.trace_file:
         return link, {}
     if link.trace_s:
-        found.append(ConfigProblem(key, "there are delays in link.trace_s as well", "keep the file or the list"))
+        problems.append(ConfigProblem(key, "there are delays in link.trace_s as well", "keep the file or the list"))
         return link, {}
     path = folder / link.trace_file
     try:
-        delays = _delays(path)
+        delays = _read_delays(path)
     except DataFileError as error:
-        found.extend(ConfigProblem(key, reason, "mend the file") for reason in error.reasons)
+        problems.extend(ConfigProblem(key, reason, "mend the file") for reason in error.reasons)
         return link, {}
     return msgspec.structs.replace(link, trace_file="", trace_s=delays), {"link.trace_s": str(path)}
 
 
-def _delays(path: Path) -> Floats:
+def _read_delays(path: Path) -> Floats:
     """Delay of each packet [s], infinite for a lost one."""
     rows = [(number, line.split(",")) for number, line in enumerate(read_lines(path), 1)]
     rows = [(number, cells) for number, cells in rows if not cells[0].lstrip().startswith("#")]
@@ -183,20 +177,23 @@ def _delays(path: Path) -> Floats:
     if rows and any(cell.strip() for cell in rows[0][1]) and not any(_is_number(cell) for cell in rows[0][1]):
         number, cells = rows[0]
         names = [cell.strip().strip("\"'").lower() for cell in cells]
-        found = [i for i, name in enumerate(names) if _HEADING.match(name)]
-        if len(found) != 1:
-            told = "none of its columns" if not found else f"{len(found)} of its columns"
-            raise DataFileError((f"{path}:{number}: {told} is a delay; head one of them {_COLUMN}, or delay_ms",))
-        column, width = found[0], len(names)
+        delay_columns = [i for i, name in enumerate(names) if _HEADING.match(name)]
+        if len(delay_columns) != 1:
+            count_text = "none of its columns" if not delay_columns else f"{len(delay_columns)} of its columns"
+            raise DataFileError((f"{path}:{number}: {count_text} is a delay; head one of them {_COLUMN}, or delay_ms",))
+        column, width = delay_columns[0], len(names)
         heading = _HEADING.match(names[column])
         factor = _UNITS[(heading and heading["unit"]) or "s"]
         rows = rows[1:]
     if not rows:
         raise DataFileError((f"{path}: has no packets",))
-    if len(rows) > LONGEST_TRACE:
-        raise DataFileError((f"{path}: has {len(rows)} packets, more than {LONGEST_TRACE}",))
-    refuse(path, [f"{path}:{number}: {reason}" for number, cells in rows for reason in _wrong(cells, column, width)])
-    return tuple(_delay(cells[column]) * factor for _, cells in rows)
+    if len(rows) > MAX_TRACE_PACKETS:
+        raise DataFileError((f"{path}: has {len(rows)} packets, more than {MAX_TRACE_PACKETS}",))
+    refuse_file(
+        path,
+        [f"{path}:{number}: {reason}" for number, cells in rows for reason in _find_row_problems(cells, column, width)],
+    )
+    return tuple(_parse_delay(cells[column]) * factor for _, cells in rows)
 
 
 def _is_number(cell: str) -> bool:
@@ -207,13 +204,13 @@ def _is_number(cell: str) -> bool:
     return True
 
 
-def _wrong(cells: list[str], column: int, width: int) -> Iterator[str]:
+def _find_row_problems(cells: list[str], column: int, width: int) -> Iterator[str]:
     """Yield the errors in a line."""
     if len(cells) != width:
         yield f"has {len(cells)} columns; give {'as many as the header' if width > 1 else 'one, or a header'}"
         return
     try:
-        delay = _delay(cells[column])
+        delay = _parse_delay(cells[column])
     except ValueError:
         yield f'"{cells[column].strip()[:40]}" is not a number'
         return
@@ -221,5 +218,5 @@ def _wrong(cells: list[str], column: int, width: int) -> Iterator[str]:
         yield f"{delay:g} is not a delay in s"
 
 
-def _delay(cell: str) -> float:
+def _parse_delay(cell: str) -> float:
     return float(cell) if cell.strip() else math.inf

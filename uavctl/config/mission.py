@@ -1,4 +1,4 @@
-"""[mission] and sampled trajectories."""
+"""Mission of a flight: waypoints or a trajectory, from keys or a CSV file, and fences that close in."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from uavctl.config.columns import TRAJECTORY, StatedColumn, quantity, read_header
+from uavctl.config.columns import TRAJECTORY_UNITS, StatedColumn, parse_heading, read_header
 from uavctl.config.document import (
-    LARGEST,
-    LARGEST_PLANT,
-    LONGEST_MOTION,
-    LONGEST_PATH,
+    MAX_NUMBER,
+    MAX_PATH_LENGTH,
+    MAX_STATES,
+    MAX_TRAJECTORY_SAMPLES,
     ConfigProblem,
     DataFileError,
     Floats,
@@ -24,32 +24,32 @@ from uavctl.config.document import (
     Position,
     Section,
     read_lines,
-    refuse,
+    refuse_file,
 )
-
-# Mission of a flight: waypoints or a trajectory, and limits that close in.
 
 
 class TrajectoryConfig(Section, frozen=True, kw_only=True):
     """A trajectory as samples; time counts from the first decision with a vehicle that takes setpoints."""
 
     times_s: Annotated[
-        Floats, Meta(max_length=LONGEST_MOTION, description="times of the samples, increasing from 0 or later [s]")
+        Floats,
+        Meta(max_length=MAX_TRAJECTORY_SAMPLES, description="times of the samples, increasing from 0 or later [s]"),
     ] = ()
     positions_m: Annotated[
-        tuple[Position, ...], Meta(max_length=LONGEST_MOTION, description="positions at these times, local NED [m]")
+        tuple[Position, ...],
+        Meta(max_length=MAX_TRAJECTORY_SAMPLES, description="positions at these times, local NED [m]"),
     ] = ()
     velocities_mps: Annotated[
         tuple[Position, ...],
         Meta(
-            max_length=LONGEST_MOTION,
+            max_length=MAX_TRAJECTORY_SAMPLES,
             description="velocities at these times, local NED [m/s]; without them they follow from the positions",
         ),
     ] = ()
     file: Annotated[
         str,
         Meta(
-            max_length=LONGEST_PATH,
+            max_length=MAX_PATH_LENGTH,
             description="CSV file with the samples instead, beside this file: columns t, x, y, z in s and m, and "
             "vx, vy, vz in m/s or none of them, in local NED; with a header line in the order that it states, by names "
             "and units as in `time_ms`, `east_m`, `height [cm]`, `v_north_mps`",
@@ -88,7 +88,7 @@ class FenceConfig(Section, frozen=True, kw_only=True):
     """A limit of a state that changes in time, inside the constant one of `[sets]`."""
 
     state: Annotated[
-        Annotated[str, Meta(max_length=100)] | Annotated[int, Meta(ge=0, lt=LARGEST_PLANT)],
+        Annotated[str, Meta(max_length=100)] | Annotated[int, Meta(ge=0, lt=MAX_STATES)],
         Meta(description="axis whose position is limited (`north`, `east`, `down`), or index of a state"),
     ]
     side: Annotated[Literal["lower", "upper"], Meta(description="which limit")]
@@ -106,123 +106,127 @@ class FenceConfig(Section, frozen=True, kw_only=True):
     ]
 
 
-# A trajectory's samples from a CSV file.
-
-
-_WANTED = "give lines of t, x, y, z in s and m, or of t, x, y, z, vx, vy, vz"
-_WITHOUT, _WITH = 4, 7  # columns
-_SHOWN = 40  # characters of a cell that is none
+_FORMAT_HINT = "give lines of t, x, y, z in s and m, or of t, x, y, z, vx, vy, vz"
+_POSITION_COLUMNS, _VELOCITY_COLUMNS = 4, 7  # columns
+_MAX_SHOWN = 40  # characters of a cell that is none
 _LISTS = ("times_s", "positions_m", "velocities_mps")
 
 
-def read_samples(
-    mission: MissionConfig, folder: Path, found: list[ConfigProblem]
+def read_trajectory_file(
+    mission: MissionConfig, folder: Path, problems: list[ConfigProblem]
 ) -> tuple[MissionConfig, dict[str, str]]:
     """The samples of `mission.trajectory.file` in its place, so that the configuration is complete in itself.
 
     Args:
         folder: Where a relative name starts from.
-        found: What is wrong with the file is added here.
+        problems: Problems of the file are added here.
 
     Returns:
         The mission, and where the keys that come from the file stand: `file:line`, or the file for a whole list.
     """
-    given, key = mission.trajectory, "mission.trajectory.file"
-    if not given.file:
+    trajectory, key = mission.trajectory, "mission.trajectory.file"
+    if not trajectory.file:
         return mission, {}
-    if given.times_s or given.positions_m or given.velocities_mps:
-        found.append(ConfigProblem(key, "there are samples in the table as well", "keep the file or the samples"))
+    if trajectory.times_s or trajectory.positions_m or trajectory.velocities_mps:
+        problems.append(ConfigProblem(key, "there are samples in the table as well", "keep the file or the samples"))
         return mission, {}
-    path = folder / given.file
+    path = folder / trajectory.file
     try:
-        rows = _rows(path)
+        rows = _read_rows(path)
     except DataFileError as error:
-        found.extend(ConfigProblem(key, reason, "mend the file") for reason in error.reasons)
+        problems.extend(ConfigProblem(key, reason, "mend the file") for reason in error.reasons)
         return mission, {}
-    motion = msgspec.structs.replace(
-        given,
+    samples = msgspec.structs.replace(
+        trajectory,
         file="",
         times_s=tuple(row[0] for _, row in rows),
-        positions_m=tuple(_three(row[1:4]) for _, row in rows),
-        velocities_mps=tuple(_three(row[4:7]) for _, row in rows if len(row) == _WITH),
+        positions_m=tuple(_make_vector(row[1:4]) for _, row in rows),
+        velocities_mps=tuple(_make_vector(row[4:7]) for _, row in rows if len(row) == _VELOCITY_COLUMNS),
     )
     places = {}
     for name in _LISTS:
         places[f"mission.trajectory.{name}"] = str(path)
         places |= {f"mission.trajectory.{name}[{i}]": f"{path}:{line}" for i, (line, _) in enumerate(rows)}
-    return msgspec.structs.replace(mission, trajectory=motion), places
+    return msgspec.structs.replace(mission, trajectory=samples), places
 
 
-def _rows(path: Path) -> list[tuple[int, Floats]]:
+def _read_rows(path: Path) -> list[tuple[int, Floats]]:
     """Line number and values of each row, as t, x, y, z and vx, vy, vz in s, m and m/s, all of the same width."""
     rows: list[tuple[int, list[str]]] = []
     for number, line in enumerate(read_lines(path), 1):
         text = line.strip()
         if text.startswith("#"):  # a comment, or a header in one
             cells = re.split(r"[,\s]+(?![^\[(]*[\])])", text.lstrip("# ").strip())
-            if rows or len(cells) < _WITHOUT or not all(quantity(cell) for cell in cells):
+            if rows or len(cells) < _POSITION_COLUMNS or not all(parse_heading(cell) for cell in cells):
                 continue
             text = ",".join(cells)
         if text:
             rows.append((number, text.split(",")))
-    columns, rows = _columns(path, rows)
+    columns, rows = _read_columns(path, rows)
     if not rows:
         raise DataFileError((f"{path}: has no rows",))
-    if len(rows) > LONGEST_MOTION:
-        raise DataFileError((f"{path}: has {len(rows)} rows, more than {LONGEST_MOTION}",))
+    if len(rows) > MAX_TRAJECTORY_SAMPLES:
+        raise DataFileError((f"{path}: has {len(rows)} rows, more than {MAX_TRAJECTORY_SAMPLES}",))
     width = len(rows[0][1])
-    refuse(path, [f"{path}:{number}: {reason}" for number, cells in rows for reason in _wrong(cells, width)])
+    refuse_file(
+        path, [f"{path}:{number}: {reason}" for number, cells in rows for reason in _find_row_problems(cells, width)]
+    )
     return [
-        (number, tuple(float(cells[column.place]) * column.factor for column in columns or _in_order(width)))
+        (
+            number,
+            tuple(float(cells[column.column]) * column.factor for column in columns or _make_default_columns(width)),
+        )
         for number, cells in rows
     ]
 
 
-def _in_order(width: int) -> list[StatedColumn]:
-    return [StatedColumn(place, 1.0) for place in range(width)]
+def _make_default_columns(width: int) -> list[StatedColumn]:
+    return [StatedColumn(index, 1.0) for index in range(width)]
 
 
-def _columns(path: Path, rows: list[tuple[int, list[str]]]) -> tuple[list[StatedColumn], list[tuple[int, list[str]]]]:
+def _read_columns(
+    path: Path, rows: list[tuple[int, list[str]]]
+) -> tuple[list[StatedColumn], list[tuple[int, list[str]]]]:
     """The columns by a header, none without one, and the rows below it.
 
     Raises:
         DataFileError: The header states what is not known, or not all that is needed.
     """
-    if not rows or any(_number(cell) is not None for cell in rows[0][1]):
+    if not rows or any(_parse_number(cell) is not None for cell in rows[0][1]):
         return [], rows
     (line, cells), rows = rows[0], rows[1:]
     units = None
-    if rows and not any(_number(cell) is not None for cell in rows[0][1]):
+    if rows and not any(_parse_number(cell) is not None for cell in rows[0][1]):
         units, rows = rows[0][1], rows[1:]
-    found, wrong = read_header(cells, units, TRAJECTORY)
-    names = list(TRAJECTORY)
-    needed = names if any(name in found for name in names[_WITHOUT:]) else names[:_WITHOUT]
-    if not wrong and (missing := [name for name in needed if name not in found]):
-        wrong.append(f"the header has no column for {', '.join(missing)}; {_WANTED}")
-    refuse(path, [f"{path}:{line}: {reason}" for reason in wrong])
-    return [found[name] for name in needed], rows
+    columns, problems = read_header(cells, units, TRAJECTORY_UNITS)
+    names = list(TRAJECTORY_UNITS)
+    required = names if any(name in columns for name in names[_POSITION_COLUMNS:]) else names[:_POSITION_COLUMNS]
+    if not problems and (missing := [name for name in required if name not in columns]):
+        problems.append(f"the header has no column for {', '.join(missing)}; {_FORMAT_HINT}")
+    refuse_file(path, [f"{path}:{line}: {reason}" for reason in problems])
+    return [columns[name] for name in required], rows
 
 
-def _three(values: Floats) -> tuple[float, float, float]:
+def _make_vector(values: Floats) -> tuple[float, float, float]:
     x, y, z = values
     return x, y, z
 
 
-def _wrong(cells: list[str], width: int) -> Iterator[str]:
+def _find_row_problems(cells: list[str], width: int) -> Iterator[str]:
     """Yield the errors in a row."""
-    if len(cells) not in (_WITHOUT, _WITH):
-        yield f"has {len(cells)} columns; {_WANTED}"
+    if len(cells) not in (_POSITION_COLUMNS, _VELOCITY_COLUMNS):
+        yield f"has {len(cells)} columns; {_FORMAT_HINT}"
     elif len(cells) != width:
         yield f"has {len(cells)} columns, the first row has {width}"
     for cell in cells:
-        value = _number(cell)
+        value = _parse_number(cell)
         if value is None:
-            yield f'"{cell.strip()[:_SHOWN]}" is not a finite number'
-        elif abs(value) > LARGEST:
-            yield f"{value:g} is beyond {LARGEST:g}"
+            yield f'"{cell.strip()[:_MAX_SHOWN]}" is not a finite number'
+        elif abs(value) > MAX_NUMBER:
+            yield f"{value:g} is beyond {MAX_NUMBER:g}"
 
 
-def _number(cell: str) -> float | None:
+def _parse_number(cell: str) -> float | None:
     try:
         value = float(cell)
     except ValueError:

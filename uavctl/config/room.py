@@ -1,6 +1,6 @@
 """`base` and `[room]`: a preset as the rest of a configuration, and its limits by name in place of lists.
 
-Both are read before anything is decoded, and what they say is written into the keys that they stand for.
+Both are read before decoding, and written into the keys that they stand for.
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ from typing import Annotated, Any
 
 from msgspec import Meta
 
-from uavctl.config.defaults import AXES, places
+from uavctl.config.defaults import AXES, find_position_states
 from uavctl.config.document import ConfigProblem, Number, Section
 
 Span = tuple[Number, Number] | None
 Size = Annotated[float, Meta(gt=0, le=1000)] | None
 # Keys of lists that [room] writes: they are given by name or as lists, not both.
-WRITTEN = ("sets", "target.position_m", "limits.accel_mps2")
+ROOM_KEYS = ("sets", "target.position_m", "limits.accel_mps2")
 
 
 class RoomConfig(Section, frozen=True, kw_only=True):
@@ -34,31 +34,31 @@ class RoomConfig(Section, frozen=True, kw_only=True):
     target_height_m: Annotated[Number | None, Meta(description="target [m]; without it where the base has it")] = None
 
 
-_OF_AXIS = {
+_AXIS_KEYS = {
     "north": ("north_m", "speed_mps", "target_north_m"),
     "east": ("east_m", "speed_mps", "target_east_m"),
     "down": ("height_m", "climb_mps", "target_height_m"),
 }
 
 
-def merge(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+def merge_tables(base: Mapping[str, Any], document: Mapping[str, Any]) -> dict[str, Any]:
     """A document with the keys of a base that it does not have, table by table."""
     merged = dict(base)
-    for key, value in own.items():
-        below = merged.get(key)
-        both = isinstance(value, dict) and isinstance(below, dict)
-        merged[key] = merge(below, value) if both else value  # type: ignore[arg-type]
+    for key, value in document.items():
+        base_value = merged.get(key)
+        are_tables = isinstance(value, dict) and isinstance(base_value, dict)
+        merged[key] = merge_tables(base_value, value) if are_tables else value  # type: ignore[arg-type]
     return merged
 
 
-def furnish(
-    table: dict[str, Any], room: RoomConfig, own: Mapping[str, Any], written: dict[str, str]
+def apply_room(
+    table: dict[str, Any], room: RoomConfig, document: Mapping[str, Any], written: dict[str, str]
 ) -> Iterator[ConfigProblem]:
-    """Write what [room] says into the lists of a document; yield what cannot be.
+    """Write the values of [room] into the lists of a document; yield the problems.
 
     Args:
-        table: The document, with what its base says.
-        own: The document without it.
+        table: The document with its base.
+        document: The document without its base.
         written: The key of [room] that each key is written for is added here.
     """
     for name in ("north_m", "east_m", "height_m"):
@@ -67,57 +67,61 @@ def furnish(
             yield ConfigProblem(f"room.{name}", f"{span[0]:g} is not below {span[1]:g}", "give the smaller one first")
             return
     plant = table.get("plant", {})
-    index = places(plant) if isinstance(plant, dict) else {}
+    index = find_position_states(plant) if isinstance(plant, dict) else {}
     if not index:
         yield ConfigProblem("room", "there is no plant with axes that it could limit", "add base, or [plant] with axes")
         return
     speeds = [i + 1 for i in index.values()] if plant.get("model") != "matrices" else plant.get("velocity_index", [])
     sets = table.setdefault("sets", {})
     lower, upper = (
-        _list(sets, "state_lower", -math.inf, plant, index),
-        _list(sets, "state_upper", math.inf, plant, index),
+        _get_limits(sets, "state_lower", -math.inf, plant, index),
+        _get_limits(sets, "state_upper", math.inf, plant, index),
     )
-    before = {axis: (lower[i], upper[i]) for axis, i in index.items()}
-    for place, (axis, i) in enumerate(index.items()):
-        of_span, of_speed, _ = _OF_AXIS[axis]
-        span, speed = getattr(room, of_span), getattr(room, of_speed)
+    old_limits = {axis: (lower[i], upper[i]) for axis, i in index.items()}
+    for axis_number, (axis, i) in enumerate(index.items()):
+        span_key, speed_key, _ = _AXIS_KEYS[axis]
+        span, speed = getattr(room, span_key), getattr(room, speed_key)
         if span is not None:
             lower[i], upper[i] = span if axis != "down" else (0.0 - span[1], 0.0 - span[0])
-            _note(written, f"room.{of_span}", f"sets.state_lower[{i}]", f"sets.state_upper[{i}]")
-        if speed is not None and place < len(speeds):
-            lower[speeds[place]], upper[speeds[place]] = -speed, speed
-            _note(written, f"room.{of_speed}", *(f"sets.state_{side}[{speeds[place]}]" for side in ("lower", "upper")))
+            _add_written(written, f"room.{span_key}", f"sets.state_lower[{i}]", f"sets.state_upper[{i}]")
+        if speed is not None and axis_number < len(speeds):
+            lower[speeds[axis_number]], upper[speeds[axis_number]] = -speed, speed
+            _add_written(
+                written,
+                f"room.{speed_key}",
+                *(f"sets.state_{side}[{speeds[axis_number]}]" for side in ("lower", "upper")),
+            )
     sets["state_lower"], sets["state_upper"] = lower, upper
     if room.accel_mps2 is not None:
         _limit_inputs(table, plant, index, room.accel_mps2, written)
-    after = {axis: (lower[i], upper[i]) for axis, i in index.items()}
-    _move(table.setdefault("target", {}), "position_m", before, after)
+    new_limits = {axis: (lower[i], upper[i]) for axis, i in index.items()}
+    _rescale_position(table.setdefault("target", {}), "position_m", old_limits, new_limits)
     target = table["target"].get("position_m")
     for axis in index:
-        name = _OF_AXIS[axis][2]
+        name = _AXIS_KEYS[axis][2]
         value = getattr(room, name)
         if value is not None:
             target = target or [0.0, 0.0, 0.0]
             target[AXES.index(axis)] = 0.0 - value if axis == "down" else value
-            _note(written, f"room.{name}", f"target.position_m[{AXES.index(axis)}]")
+            _add_written(written, f"room.{name}", f"target.position_m[{AXES.index(axis)}]")
     if target:
         table["target"]["position_m"] = target
     else:
         del table["target"]
-    if "start_position_m" not in own.get("sim", {}):
-        _move(table.setdefault("sim", {}), "start_position_m", before, after)
+    if "start_position_m" not in document.get("sim", {}):
+        _rescale_position(table.setdefault("sim", {}), "start_position_m", old_limits, new_limits)
 
 
-def _note(written: dict[str, str], by: str, *keys: str) -> None:
-    written.update(dict.fromkeys(keys, by))
+def _add_written(written: dict[str, str], room_key: str, *keys: str) -> None:
+    written.update(dict.fromkeys(keys, room_key))
 
 
-def _list(
-    sets: Mapping[str, Any], key: str, otherwise: float, plant: Mapping[str, Any], index: Mapping[str, int]
+def _get_limits(
+    sets: Mapping[str, Any], key: str, default: float, plant: Mapping[str, Any], index: Mapping[str, int]
 ) -> list[float]:
     """The limits of a base, or as many open ones as there are states."""
-    each = {"drag-lag": 3, "velocity-reference": 6}.get(str(plant.get("model")), 0)
-    return list(sets.get(key, [otherwise] * (each * len(index) or len(plant.get("a", ())))))
+    axis_states = {"drag-lag": 3, "velocity-reference": 6}.get(str(plant.get("model")), 0)
+    return list(sets.get(key, [default] * (axis_states * len(index) or len(plant.get("a", ())))))
 
 
 def _limit_inputs(
@@ -128,28 +132,35 @@ def _limit_inputs(
     written: dict[str, str],
 ) -> None:
     """Limit the inputs of the level axes, and the last gate's setpoints along them."""
-    sets, gate = table["sets"], table.setdefault("limits", {}).setdefault("accel_mps2", [accel_mps2] * 3)
+    sets, accel_limits = table["sets"], table.setdefault("limits", {}).setdefault("accel_mps2", [accel_mps2] * 3)
     scales = plant.get("accel_per_input") or [1.0] * len(index)
     for side, sign in (("lower", -1.0), ("upper", 1.0)):
         limits = list(sets.get(f"input_{side}", [sign * accel_mps2 / abs(scale) for scale in scales]))
-        for place, axis in enumerate(index):
+        for axis_number, axis in enumerate(index):
             if axis != "down":
-                limits[place] = sign * accel_mps2 / abs(scales[place])
-                _note(written, "room.accel_mps2", f"sets.input_{side}[{place}]")
+                limits[axis_number] = sign * accel_mps2 / abs(scales[axis_number])
+                _add_written(written, "room.accel_mps2", f"sets.input_{side}[{axis_number}]")
         sets[f"input_{side}"] = limits
-    table["limits"]["accel_mps2"] = [gate[place] if axis == "down" else accel_mps2 for place, axis in enumerate(AXES)]
+    table["limits"]["accel_mps2"] = [
+        accel_limits[axis_number] if axis == "down" else accel_mps2 for axis_number, axis in enumerate(AXES)
+    ]
 
 
-def _move(
-    table: dict[str, Any], key: str, before: Mapping[str, tuple[float, float]], after: Mapping[str, tuple[float, float]]
+def _rescale_position(
+    table: dict[str, Any],
+    key: str,
+    old_limits: Mapping[str, tuple[float, float]],
+    new_limits: Mapping[str, tuple[float, float]],
 ) -> None:
     """Keep a place of the base where it was as a share of the room."""
-    place = table.get(key)
-    if not place:
+    position_m = table.get(key)
+    if not position_m:
         return
-    moved = list(place)
-    for axis, (low, high) in before.items():
-        new, i = after[axis], AXES.index(axis)
-        if new != (low, high) and all(map(math.isfinite, (low, high, *new))) and low < high:
-            moved[i] = round(new[0] + (place[i] - low) / (high - low) * (new[1] - new[0]), 3)
-    table[key] = moved
+    new_position_m = list(position_m)
+    for axis, (low, high) in old_limits.items():
+        new_span, i = new_limits[axis], AXES.index(axis)
+        if new_span != (low, high) and all(map(math.isfinite, (low, high, *new_span))) and low < high:
+            new_position_m[i] = round(
+                new_span[0] + (position_m[i] - low) / (high - low) * (new_span[1] - new_span[0]), 3
+            )
+    table[key] = new_position_m

@@ -9,12 +9,9 @@ import msgspec
 from msgspec import Meta
 
 from uavctl.config.connections import DaemonConfig
-from uavctl.config.document import LARGEST_SEED, LONGEST_S, MOST_SPANS, ConfigProblem, Position, Section, Spans, Wind
+from uavctl.config.document import MAX_DURATION_S, MAX_SEED, MAX_SPANS, ConfigProblem, Position, Section, Spans, Wind
 
-# The simulated side of the wire: vehicle, autopilot and motion capture.
-
-
-MOST_FAULTS = 1000
+MAX_FAULTS = 1000
 
 
 class CameraConfig(Section, frozen=True, kw_only=True):
@@ -22,7 +19,7 @@ class CameraConfig(Section, frozen=True, kw_only=True):
 
     rate_hz: Annotated[float, Meta(ge=0.01, le=1000, description="samples a second [1/s]")]
     phase_s: Annotated[
-        float, Meta(ge=0, le=LONGEST_S, description="time of the first sample; then every 1/rate_hz [s]")
+        float, Meta(ge=0, le=MAX_DURATION_S, description="time of the first sample; then every 1/rate_hz [s]")
     ] = 0.0
     noise_std_m: Annotated[float, Meta(ge=0, le=1000, description="noise of a position, each axis [m]")] = 0.0
     latency_s: Annotated[
@@ -41,7 +38,7 @@ class CameraConfig(Section, frozen=True, kw_only=True):
     occluded: Annotated[
         Spans,
         Meta(
-            max_length=MOST_SPANS,
+            max_length=MAX_SPANS,
             description="spans [from_s, to_s] since the start in which the vehicle is not seen: no samples [s]",
         ),
     ] = ()
@@ -52,12 +49,12 @@ class CameraConfig(Section, frozen=True, kw_only=True):
         ),
     ] = 0.0
     occlusion_s: Annotated[
-        float, Meta(ge=0.001, le=LONGEST_S, description="their mean length; lengths are exponential [s]")
+        float, Meta(ge=0.001, le=MAX_DURATION_S, description="their mean length; lengths are exponential [s]")
     ] = 0.5
     swapped: Annotated[
         Spans,
         Meta(
-            max_length=MOST_SPANS,
+            max_length=MAX_SPANS,
             description="spans [from_s, to_s] since the start in which another body is taken for the vehicle: it "
             "stands still at other_body_m, level, its nose north [s]",
         ),
@@ -66,7 +63,7 @@ class CameraConfig(Section, frozen=True, kw_only=True):
     frozen: Annotated[
         Spans,
         Meta(
-            max_length=MOST_SPANS,
+            max_length=MAX_SPANS,
             description="spans [from_s, to_s] since the start in which the last sample's pose is repeated, to the last "
             "bit, with new stamps [s]",
         ),
@@ -129,7 +126,7 @@ class ChecksConfig(Section, frozen=True, kw_only=True):
         float,
         Meta(
             ge=0,
-            le=LONGEST_S,
+            le=MAX_DURATION_S,
             description="mean time after which its pre-flight checks change between passing and failing, drawn each "
             "time; 0: they stay as they are [s]",
         ),
@@ -137,7 +134,7 @@ class ChecksConfig(Section, frozen=True, kw_only=True):
     invalid: Annotated[
         Spans,
         Meta(
-            max_length=MOST_SPANS,
+            max_length=MAX_SPANS,
             description="spans [from_s, to_s] since arming in which its position does not count as valid: its failsafe "
             "acts [s]",
         ),
@@ -154,7 +151,7 @@ class ChecksConfig(Section, frozen=True, kw_only=True):
 class FaultConfig(Section, frozen=True, kw_only=True):
     """Something that happens at a time of the simulated flight; `uavctl sim --faults FILE` reads a list of them."""
 
-    at_s: Annotated[float, Meta(ge=0, le=LONGEST_S, description="when, since the start [s]")]
+    at_s: Annotated[float, Meta(ge=0, le=MAX_DURATION_S, description="when, since the start [s]")]
     kind: Annotated[
         Literal[
             "blackout",
@@ -179,7 +176,7 @@ class FaultConfig(Section, frozen=True, kw_only=True):
             "autopilot's has another value; `mode`: the pilot changes the autopilot's mode with the stick"
         ),
     ]
-    for_s: Annotated[float, Meta(ge=0, le=LONGEST_S, description="length of a span [s]")] = 0.0
+    for_s: Annotated[float, Meta(ge=0, le=MAX_DURATION_S, description="length of a span [s]")] = 0.0
     velocity_mps: Annotated[
         Wind,
         Meta(description="of the air, with `wind`, or of positions beside the vehicle, with `drift`, local NED [m/s]"),
@@ -225,10 +222,10 @@ class SimConfig(Section, frozen=True, kw_only=True):
         ),
     ] = "few"
     fault: Annotated[
-        tuple[FaultConfig, ...], Meta(max_length=MOST_FAULTS, description="what happens in the course of a flight")
+        tuple[FaultConfig, ...], Meta(max_length=MAX_FAULTS, description="what happens in the course of a flight")
     ] = ()
     system_id: Annotated[int, Meta(ge=1, le=250, description="MAVLink system id of the simulated vehicle")] = 1
-    seed: Annotated[int, Meta(ge=0, le=LARGEST_SEED, description="seed of every random draw")] = 0
+    seed: Annotated[int, Meta(ge=0, le=MAX_SEED, description="seed of every random draw")] = 0
     start_position_m: Annotated[Position, Meta(description="position at the start, local NED [m]")] = (0.0, 0.0, 0.0)
     start_velocity_mps: Annotated[Wind, Meta(description="velocity at the start, local NED [m/s]")] = (0.0, 0.0, 0.0)
     clock_drift_ppm: Annotated[
@@ -243,11 +240,8 @@ class SimConfig(Section, frozen=True, kw_only=True):
     ] = None
 
 
-# Checks of the simulated side's configuration.
-
-
 # Keys that a kind of fault heeds; the kinds that are not here are spans.
-_OF_KIND = {
+_KEYS_OF_KIND = {
     "wind": ("velocity_mps",),
     "battery": ("charge",),
     "frame": ("name",),
@@ -258,9 +252,9 @@ _OF_KIND = {
 }
 
 
-def spans(key: str, given: Spans) -> Iterator[ConfigProblem]:
+def check_spans(key: str, spans: Spans) -> Iterator[ConfigProblem]:
     """Yield the spans of time since the start that are not valid: a negative start, or an end that is not after it."""
-    for i, (start, end) in enumerate(given):
+    for i, (start, end) in enumerate(spans):
         if not 0 <= start < end:
             yield ConfigProblem(
                 f"{key}[{i}]",
@@ -269,21 +263,24 @@ def spans(key: str, given: Spans) -> Iterator[ConfigProblem]:
             )
 
 
-def sim(config: SimConfig) -> Iterator[ConfigProblem]:
+def check_sim(config: SimConfig) -> Iterator[ConfigProblem]:
     """All problems of `[sim]`."""
     for name in ("occluded", "swapped", "frozen"):
-        yield from spans(f"sim.camera.{name}", getattr(config.camera, name))
-    yield from spans("sim.checks.invalid", config.checks.invalid)
+        yield from check_spans(f"sim.camera.{name}", getattr(config.camera, name))
+    yield from check_spans("sim.checks.invalid", config.checks.invalid)
     if config.checks.clears and config.autopilot != "px4":
         yield ConfigProblem(
             "sim.checks.clears",
             f'has no effect with autopilot "{config.autopilot}", which stays in the mode of its failsafe',
             'remove it, or set sim.autopilot = "px4"',
         )
-    yield from faults("sim.fault", config.fault, config.plant)
+    yield from check_faults("sim.fault", config.fault, config.plant)
     if config.plant == "linear":
-        for key, same in (("wind", config.wind == WindConfig()), ("quadrotor", config.quadrotor == QuadrotorConfig())):
-            if not same:
+        for key, is_default in (
+            ("wind", config.wind == WindConfig()),
+            ("quadrotor", config.quadrotor == QuadrotorConfig()),
+        ):
+            if not is_default:
                 yield ConfigProblem(
                     f"sim.{key}",
                     'has no effect with plant "linear", whose disturbance is that of [plant]',
@@ -303,7 +300,7 @@ def sim(config: SimConfig) -> Iterator[ConfigProblem]:
         )
 
 
-def ids(sim: SimConfig, daemon: DaemonConfig) -> Iterator[ConfigProblem]:
+def check_system_ids(sim: SimConfig, daemon: DaemonConfig) -> Iterator[ConfigProblem]:
     """Check that the simulated vehicle and the daemon have different system ids, to be told apart on one link."""
     if sim.system_id == daemon.system_id:
         yield ConfigProblem(
@@ -311,16 +308,16 @@ def ids(sim: SimConfig, daemon: DaemonConfig) -> Iterator[ConfigProblem]:
         )
 
 
-def faults(key: str, given: tuple[FaultConfig, ...], plant: str) -> Iterator[ConfigProblem]:
+def check_faults(key: str, faults: tuple[FaultConfig, ...], plant: str) -> Iterator[ConfigProblem]:
     """All problems of a list of faults that happen to a plant of this kind."""
-    for i, fault in enumerate(given):
-        yield from _fault(f"{key}[{i}]", fault, plant)
+    for i, fault in enumerate(faults):
+        yield from _check_fault(f"{key}[{i}]", fault, plant)
 
 
-def _fault(key: str, fault: FaultConfig, plant: str) -> Iterator[ConfigProblem]:
-    meant = ("at_s", "kind", *_OF_KIND.get(fault.kind, ("for_s",)))
+def _check_fault(key: str, fault: FaultConfig, plant: str) -> Iterator[ConfigProblem]:
+    used_keys = ("at_s", "kind", *_KEYS_OF_KIND.get(fault.kind, ("for_s",)))
     for field in msgspec.structs.fields(fault):
-        if field.name not in meant and getattr(fault, field.name) != field.default:
+        if field.name not in used_keys and getattr(fault, field.name) != field.default:
             yield ConfigProblem(f"{key}.{field.name}", f'has no effect with kind "{fault.kind}"', "remove it")
     if fault.kind in ("wind", "battery"):
         if plant == "linear":
@@ -328,5 +325,5 @@ def _fault(key: str, fault: FaultConfig, plant: str) -> Iterator[ConfigProblem]:
     elif fault.kind in ("parameter", "mode", "frame"):
         if not fault.name:
             yield ConfigProblem(f"{key}.name", f"is missing: which {fault.kind}", "add it")
-    elif fault.kind not in _OF_KIND and fault.for_s == 0.0:
+    elif fault.kind not in _KEYS_OF_KIND and fault.for_s == 0.0:
         yield ConfigProblem(f"{key}.for_s", f'is missing: how long the span of kind "{fault.kind}" is', "add it")

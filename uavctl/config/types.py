@@ -22,21 +22,19 @@ from uavctl.config.connections import (
     SourceConfig,
 )
 from uavctl.config.document import (
-    LARGEST_PLANT,
-    LONGEST_S,
+    MAX_DURATION_S,
+    MAX_STATES,
     ConfigProblem,
     Floats,
-    Open,
     Position,
     Rows,
     Section,
+    UnboundedFloats,
     Weights,
 )
 from uavctl.config.link import LinkConfig
 from uavctl.config.mission import FenceConfig, MissionConfig
 from uavctl.config.sim import SimConfig
-
-# `[log]`: the recording and the room that it needs.
 
 
 class LogConfig(Section, frozen=True, kw_only=True):
@@ -68,7 +66,7 @@ class LogConfig(Section, frozen=True, kw_only=True):
     ] = 10_000_000
 
 
-def check(log: LogConfig) -> Iterator[ConfigProblem]:
+def check_log(log: LogConfig) -> Iterator[ConfigProblem]:
     """Yield the keys that do not fit together."""
     if log.stop_bytes > log.low_bytes:
         yield ConfigProblem(
@@ -78,9 +76,9 @@ def check(log: LogConfig) -> Iterator[ConfigProblem]:
         )
 
 
-PLANNED_HORIZON = 40  # solving the program with planned feedback takes seconds beyond
+MAX_PLANNED_HORIZON = 40  # solving the program with planned feedback takes seconds beyond
 # Keys with a default that scheme `hahn-stursberg` cannot do without.
-OF_HAHN_STURSBERG = frozenset(
+HAHN_STURSBERG_KEYS = frozenset(
     {"smpc.tau", "smpc.delta_u", "smpc.delta_tau", "smpc.k_tau", "smpc.offset_weight", "schedule"}
 )
 Delay = Annotated[int, Meta(le=60)]
@@ -106,13 +104,13 @@ class PlantConfig(Section, frozen=True, kw_only=True):
             "it may have none: then it is planned for and simulated, and flies nowhere",
         ),
     ] = ()
-    a: Annotated[Rows, Meta(max_length=LARGEST_PLANT, description="A (n_x, n_x), with model `matrices`")] = ()
-    b: Annotated[Rows, Meta(max_length=LARGEST_PLANT, description="B (n_x, n_u), with model `matrices`")] = ()
-    e: Annotated[Rows, Meta(max_length=LARGEST_PLANT, description="E (n_x, n_w), with model `matrices`")] = ()
+    a: Annotated[Rows, Meta(max_length=MAX_STATES, description="A (n_x, n_x), with model `matrices`")] = ()
+    b: Annotated[Rows, Meta(max_length=MAX_STATES, description="B (n_x, n_u), with model `matrices`")] = ()
+    e: Annotated[Rows, Meta(max_length=MAX_STATES, description="E (n_x, n_w), with model `matrices`")] = ()
     w: Annotated[
         Rows,
         Meta(
-            max_length=LARGEST_PLANT,
+            max_length=MAX_STATES,
             description="covariance W (n_w, n_w) of the disturbance, with model `matrices`; without it the identity",
         ),
     ] = ()
@@ -198,19 +196,23 @@ class SetsConfig(Section, frozen=True, kw_only=True):
     """Admissible boxes X and U; `inf` leaves a side open, any other number is 1e7 at most."""
 
     state_lower: Annotated[
-        Open, Meta(max_length=LARGEST_PLANT, description="lower limits of the states (n_x) [m, m/s, m/s²]")
+        UnboundedFloats, Meta(max_length=MAX_STATES, description="lower limits of the states (n_x) [m, m/s, m/s²]")
     ]
     state_upper: Annotated[
-        Open, Meta(max_length=LARGEST_PLANT, description="upper limits of the states (n_x) [m, m/s, m/s²]")
+        UnboundedFloats, Meta(max_length=MAX_STATES, description="upper limits of the states (n_x) [m, m/s, m/s²]")
     ]
-    input_lower: Annotated[Open, Meta(max_length=3, description="lower limits of the inputs (n_u) [input units]")]
-    input_upper: Annotated[Open, Meta(max_length=3, description="upper limits of the inputs (n_u) [input units]")]
+    input_lower: Annotated[
+        UnboundedFloats, Meta(max_length=3, description="lower limits of the inputs (n_u) [input units]")
+    ]
+    input_upper: Annotated[
+        UnboundedFloats, Meta(max_length=3, description="upper limits of the inputs (n_u) [input units]")
+    ]
 
 
 class CostConfig(Section, frozen=True, kw_only=True):
     """Stage cost (3), diagonal weights."""
 
-    state: Annotated[Weights, Meta(max_length=LARGEST_PLANT, description="diagonal of Q_x (n_x)")]
+    state: Annotated[Weights, Meta(max_length=MAX_STATES, description="diagonal of Q_x (n_x)")]
     input: Annotated[Weights, Meta(max_length=3, description="diagonal of Q_u (n_u)")]
 
 
@@ -242,7 +244,7 @@ class SmpcConfig(Section, frozen=True, kw_only=True):
         Meta(
             ge=2,
             le=100,
-            description=f"prediction horizon H; with scheme `hahn-stursberg` at most {PLANNED_HORIZON} [steps]",
+            description=f"prediction horizon H; with scheme `hahn-stursberg` at most {MAX_PLANNED_HORIZON} [steps]",
         ),
     ]
     tau: Annotated[
@@ -272,7 +274,7 @@ class SmpcConfig(Section, frozen=True, kw_only=True):
     ] = 1e5
 
     @property
-    def conditioned(self) -> bool:
+    def is_age_conditioned(self) -> bool:
         """Whether plans are made by the scheme with risk conditioned on the age."""
         return self.scheme == "age-conditioned"
 
@@ -443,7 +445,7 @@ class EstimatorConfig(Section, frozen=True, kw_only=True):
         ),
     ] = 0.1
     inertial_bias_s: Annotated[
-        float, Meta(ge=0.1, le=LONGEST_S, description="time in which that comes and goes [s]")
+        float, Meta(ge=0.1, le=MAX_DURATION_S, description="time in which that comes and goes [s]")
     ] = 20.0
 
 
@@ -453,15 +455,17 @@ class FallbackConfig(Section, frozen=True, kw_only=True):
     brake_gain_1ps: Annotated[
         float, Meta(ge=1e-6, le=1000, description="deceleration per predicted speed while braking [1/s]")
     ] = 1.5
-    brake_s: Annotated[float, Meta(ge=0, le=LONGEST_S, description="longest time of braking on the prediction [s]")] = (
-        2.0
+    brake_s: Annotated[
+        float, Meta(ge=0, le=MAX_DURATION_S, description="longest time of braking on the prediction [s]")
+    ] = 2.0
+    hold_s: Annotated[float, Meta(ge=0, le=MAX_DURATION_S, description="then zero acceleration for this long [s]")] = (
+        3.0
     )
-    hold_s: Annotated[float, Meta(ge=0, le=LONGEST_S, description="then zero acceleration for this long [s]")] = 3.0
     blind_hold_s: Annotated[
         float,
         Meta(
             ge=0,
-            le=LONGEST_S,
+            le=MAX_DURATION_S,
             description="for no longer than this where nothing tells whether it drifts: no position of late, and the "
             "vehicle's own velocity does not come, or nothing speaks for it [s]",
         ),
@@ -535,7 +539,7 @@ class Config(Section, frozen=True, kw_only=True):
     """A complete configuration."""
 
     name: Annotated[str, Meta(max_length=100, description="name of the configuration")]
-    duration_s: Annotated[float, Meta(gt=0, le=LONGEST_S, description="length of a loopback flight [s]")] = 40.0
+    duration_s: Annotated[float, Meta(gt=0, le=MAX_DURATION_S, description="length of a loopback flight [s]")] = 40.0
     plant: PlantConfig
     sets: SetsConfig
     cost: CostConfig
@@ -572,6 +576,6 @@ class Config(Section, frozen=True, kw_only=True):
         )
 
     @property
-    def conditioned(self) -> bool:
+    def is_age_conditioned(self) -> bool:
         """Whether plans are made by the scheme with risk conditioned on the age."""
-        return self.smpc.conditioned
+        return self.smpc.is_age_conditioned

@@ -22,7 +22,7 @@ from typing import Literal, Protocol
 import msgspec
 
 from uavctl.config import Config
-from uavctl.config.checks import outside
+from uavctl.config.checks import find_outside
 from uavctl.daemon.health import Health
 from uavctl.daemon.runtime_folder import find_runtime_folders
 from uavctl.errors import UsageError, VehicleTakenError
@@ -228,8 +228,8 @@ class ControlServer:
         if request.position_m is None:
             return None
         config = self._config
-        answer = outside(config.plant, config.sets, request.position_m, "position_m", "place")
-        return "; ".join(problem.reason for problem in answer) or None
+        problems = find_outside(config.plant, config.sets, request.position_m, "position_m", "place")
+        return "; ".join(problem.reason for problem in problems) or None
 
     def _reply(self, client: _Client, reply: Reply) -> None:
         data = msgspec.json.encode(reply) + b"\n"

@@ -9,7 +9,7 @@ from typing import Protocol
 import msgspec
 
 from uavctl.config import Config
-from uavctl.config.checks import position_index
+from uavctl.config.checks import get_position_index
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.outcome import FlightCourse
 from uavctl.records import ControlMode, RelayStats, Ticked, Vector, VehicleStatus
@@ -122,7 +122,7 @@ class HealthMonitor:
         write_line: Callable[[str], None],
     ) -> None:
         self._flight, self._identity, self._recorder, self._write_line = flight, identity, recorder, write_line
-        self._axes = tuple(zip(config.plant.axes, position_index(config.plant), strict=True))
+        self._axes = tuple(zip(config.plant.axes, get_position_index(config.plant), strict=True))
         speed_indices = (
             config.plant.velocity_index if config.plant.model == "matrices" else [i + 1 for _, i in self._axes]
         )

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from importlib.util import find_spec
 
-from uavctl.config.connections import camera_system
+from uavctl.config.connections import get_camera_system
 from uavctl.errors import ConnectionSpecError, ExtraMissingError
 from uavctl.io.admission import AdmissionRules, AllowList, RateLimiter
 from uavctl.io.base import BaseConnection, Connection
@@ -128,7 +128,7 @@ def _open_camera(url: str, now: Callable[[], int], rules: AdmissionRules) -> Con
         ExtraMissingError: the camera system's package is not installed.
     """
     camera_url = parse_camera_url(url)
-    system = camera_system(camera_url.system)
+    system = get_camera_system(camera_url.system)
     if system.package and find_spec(system.package) is None:  # not imported: the camera has a process of its own
         raise ExtraMissingError(system.package, system.extra)
     try:

@@ -7,7 +7,7 @@ from ipaddress import IPv4Address
 from typing import get_args
 from urllib.parse import parse_qsl, unquote, urlsplit
 
-from uavctl.config.connections import camera_scheme, camera_system
+from uavctl.config.connections import get_camera_system, parse_camera_scheme
 from uavctl.errors import ConnectionSpecError
 from uavctl.frames import Up
 
@@ -43,14 +43,14 @@ def parse_camera_url(url: str) -> CameraUrl:
     except ValueError as error:
         raise ConnectionSpecError(f"connection {url!r}: {error}; {form}") from error
     body = unquote(parts.path.removeprefix("/"))
-    if not camera_scheme(url) or not host or not body or parts.fragment or port == 0:
+    if not parse_camera_scheme(url) or not host or not body or parts.fragment or port == 0:
         raise ConnectionSpecError(f"connection {url!r} needs a server and the name of a rigid body; {form}")
-    up, interface = options.pop("up", camera_system(scheme).up), options.pop("interface", "0.0.0.0")
+    up, interface = options.pop("up", get_camera_system(scheme).up), options.pop("interface", "0.0.0.0")
     if options:
         raise ConnectionSpecError(f"connection {url!r}: option {min(options)!r} is not known; {form}")
     for axis in get_args(Up):
         if up == axis:
-            port = camera_system(scheme).port if port is None else port
+            port = get_camera_system(scheme).port if port is None else port
             if not port:
                 raise ConnectionSpecError(f"connection {url!r} needs the server's port too; {form}")
             return CameraUrl(scheme, host, port, body, axis, _parse_address(url, interface))

@@ -19,7 +19,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from uavctl.config.connections import camera_scheme
+from uavctl.config.connections import parse_camera_scheme
 from uavctl.io.admission import AdmissionRules
 from uavctl.io.base import Connection
 from uavctl.io.camera_process import _open_camera
@@ -38,5 +38,5 @@ def open_source(
     Raises:
         ConnectionSpecError: the URL cannot be understood or opened, or the cameras cannot be used; names the remedy.
     """
-    opener = _open_camera if camera_scheme(url) else open_connection
+    opener = _open_camera if parse_camera_scheme(url) else open_connection
     return opener(url, now, rules)

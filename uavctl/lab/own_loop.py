@@ -122,9 +122,9 @@ class OwnLoop:
             if not autopilot.parameters.set(name, value):
                 raise ValueError(f"{kind} does not take {name} = {value:g}")
         # PX4 begins to fuse at more than 5 Hz only, and both land without an estimate: on the ground that came first.
-        autopilot.estimator.begin_in_flight()
-        if isinstance(autopilot.craft, Quadrotor):
-            cascade = autopilot.craft.cascade
+        autopilot.estimator.start_in_flight()
+        if isinstance(autopilot.vehicle, Quadrotor):
+            cascade = autopilot.vehicle.cascade
             cascade.tuning = replace(cascade.tuning, **dict(self.tuning.gains))  # type: ignore[arg-type]
 
     def receive(self, link: str, data: bytes, at_ns: int) -> Received:

@@ -19,7 +19,7 @@ from sim.simulation import World
 from uavctl.build.controller import build_conditioned, build_controller, build_plant, resting
 from uavctl.build.mission import build_rests, resting_places
 from uavctl.config import Config, load_config, parse
-from uavctl.config.checks import position_limits_m
+from uavctl.config.checks import get_position_limits_m
 from uavctl.config.mission import TrajectoryConfig
 from uavctl.flight.controller import Controller
 from uavctl.lab.own_loop import Moment, OwnLoop, OwnTuning, Path
@@ -325,7 +325,7 @@ def beyond_m(positions: Array, lower: Array, upper: Array) -> Array:
 
 def room_of(config: Config) -> tuple[Array, Array]:
     """Return the least and the largest position in the room (3,) [m]; infinite where there is no wall."""
-    limits = position_limits_m(config)
+    limits = get_position_limits_m(config)
     lower, upper = np.array([limits.get(axis, (-np.inf, np.inf)) for axis in AXES]).T
     return lower, upper
 

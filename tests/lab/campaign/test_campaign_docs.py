@@ -57,7 +57,7 @@ def test_what_is_refused_is_what_the_file_says(file: Path) -> None:
     spec, refused = campaign.spec, set()
     assert spec.name == file.stem
     for (i, link), config in campaign.believed.items():
-        if spec.controller[i].kind == "smpc" and not config.conditioned:  # which takes no promise of a design's
+        if spec.controller[i].kind == "smpc" and not config.is_age_conditioned:  # which takes no promise of a design's
             try:
                 build_design(config)
             except DesignError:

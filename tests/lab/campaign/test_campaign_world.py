@@ -74,7 +74,7 @@ def test_losses_are_the_channel_s_for_the_same_draws(name: str) -> None:
         channel._loss = _Fed(chances[run, :, :2])  # type: ignore[assignment]
         known = 0
         for k in range(30):
-            channel.push(k * 1_000_000_000, b"x", certain=k == 0)
+            channel.push(k * 1_000_000_000, b"x", is_certain=k == 0)
             known = k if channel.pop_due(k * 1_000_000_000) else known
             assert found[run, k] == known, (run, k)
 

@@ -85,7 +85,7 @@ class GivenDelays(Channel):
         super().__init__(link, seed, start_ns, step_ns)
         self._given = delays_ns(run.newest)
 
-    def push(self, at_ns: int, data: bytes, *, certain: bool = False) -> None:
+    def push(self, at_ns: int, data: bytes, *, is_certain: bool = False) -> None:
         delay_ns = next(self._given, None)
         self.counters.sent += 1
         if delay_ns is None:

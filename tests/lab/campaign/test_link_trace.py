@@ -126,8 +126,8 @@ def test_the_channel_loses_and_delays_each_packet_as_the_trace_did_over_and_over
 
 def test_a_certain_packet_that_the_trace_lost_comes_at_once_and_one_not_sent_takes_its_place_in_it() -> None:
     channel = Channel(load_config("paper", [*PAPER, listed((INF, 0.25, 0.5))]).link, np.random.SeedSequence(1), 0)
-    channel.push(0, b"a", certain=True)
-    channel.pass_over(S)
+    channel.push(0, b"a", is_certain=True)
+    channel.skip_packet(S)
     channel.push(2 * S, b"b")
     assert channel.pop_due(10**18) == [(0, b"a"), (2 * S + S // 2, b"b")]
 

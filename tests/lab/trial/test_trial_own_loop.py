@@ -128,7 +128,7 @@ def test_it_is_sent_places_alone_and_knows_of_no_other_position(autopilot: Autop
     places = np.unique([(msg.x, msg.y, msg.z) for msg in setpoints], axis=0)
     assert places == pytest.approx(np.array([config.target.position_m]), rel=1e-6)
     estimator = peers.autopilot.estimator
-    assert estimator.uses_external and not estimator.uses_gps and estimator.position_ok
+    assert estimator.uses_external and not estimator.uses_gps and estimator.is_position_valid
     assert peers.autopilot.parameters[DELAY[autopilot]] == 50.0
     assert np.linalg.norm(np.subtract(estimator.position_m, peers.vehicle.position_m)) > 1e-4  # cameras' noise, delays
     assert peers.autopilot.mode_name in ("OFFBOARD", "GUIDED")

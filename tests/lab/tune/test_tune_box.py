@@ -13,7 +13,7 @@ import pytest
 import sim.vehicle.quadrotor as quadrotor
 from sim import simulation
 from sim.simulation import World
-from sim.vehicle.rigid_body import CRAZYFLIE_2
+from sim.vehicle.airframe import CRAZYFLIE_2
 from uavctl.build.controller import build_controller, design_of
 from uavctl.config import Config, load_config
 from uavctl.lab.trial import FlightTally, beyond_m

@@ -88,7 +88,7 @@ def test_it_goes_on_with_a_new_flight_and_the_stick_stops_that_too(under_way: tu
     assert Cause.PILOT_LANDED in result.document["stopped"].lower() and result.document["before"] == ""
     assert result.flies_after(0) and not result.flies_after(since_ns)
     assert (folder / f"{BEFORE}-2" / "flight.mcap").exists()
-    assert not result.rig.peers.autopilot.pilot.armed
+    assert not result.rig.peers.autopilot.pilot.is_armed
 
 
 @pytest.mark.slow
@@ -98,7 +98,7 @@ def test_a_no_at_enter_stops_before_the_second_flight(not_agreed: Tuned, folder:
     assert not_agreed.document["config"] == str(folder / TUNED) and not_agreed.document["stopped"]
     assert str(folder) in not_agreed.told
     assert (folder / TUNED).exists() and (folder / FIT_PAGE).exists() and not (folder / AFTER).exists()
-    assert not not_agreed.rig.peers.autopilot.pilot.armed
+    assert not not_agreed.rig.peers.autopilot.pilot.is_armed
 
 
 @pytest.mark.slow
@@ -126,7 +126,7 @@ def test_it_comes_to_its_end(done: Tuned, folder: Path) -> None:
     comparison = done.document["comparison"]
     assert comparison["new_errors"]["rms_m"][0][3] < comparison["old_errors"]["rms_m"][0][3]
     assert comparison["after"]["hold_s"] > 2.0 and comparison["after"]["judged_by"] == "estimate"
-    assert not done.rig.peers.autopilot.pilot.armed
+    assert not done.rig.peers.autopilot.pilot.is_armed
     before, after = (parse(recorded(folder, f"{name}"), name).config for name in (f"{BEFORE}-3", f"{AFTER}-2"))
     assert before.mission == after.mission and before.mission.then == "land" and before.plant != after.plant
 

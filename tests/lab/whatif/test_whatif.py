@@ -9,7 +9,7 @@ from loopback_rig import Memory, flight, header
 from whatif_rig import EXACT, PAPER, QUADROTOR, ROOM, WIRE, Case, again, config_of, far, flown, history, stripped
 
 from logs.recording.topics import encode
-from sim.vehicle.linear import LinearVehicle, linear_model
+from sim.vehicle.linear import LinearVehicle, make_linear_model
 from uavctl.build.controller import build_controller, build_design
 from uavctl.errors import RecordingError
 from uavctl.lab.whatif.comparison import departure_m, model_fit, reproduction, until
@@ -143,7 +143,7 @@ def test_departure_is_the_difference_of_two_vehicles_in_the_same_wind() -> None:
 
 
 def test_what_is_sent_acts_after_the_dead_time() -> None:
-    model = linear_model(config_of(ROOM).plant)
+    model = make_linear_model(config_of(ROOM).plant)
     at_once, late = Departure(Response(model)), Departure(Response(model, 120_000_000))
     for at_ns, accel in ((0, (1.0, -0.5, 0.2)), (50_000_000, (0.3, 0.0, -0.1)), (900_000_000, (0.0, 0.0, 0.0))):
         at_once.steer(at_ns, accel)

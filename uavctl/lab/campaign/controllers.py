@@ -208,7 +208,7 @@ def recipe_for(given: ControllerSpec, config: Config, spec: CampaignSpec) -> Rec
     if spec.measured == "position":
         sight = sight_of(config)
         made = replace(made, cov=innovations(sight.plant, sight.position_std_m, 0.0, 0).estimate_cov)
-    if kind == "smpc" and not config.conditioned:
+    if kind == "smpc" and not config.is_age_conditioned:
         made = replace(made, design=build_design(config))
     elif kind == "pid":
         made = replace(made, gains=_tuned(config, spec))
@@ -271,7 +271,7 @@ def built(recipe: Recipe) -> BatchController:
 def _smpc(recipe: Recipe) -> BatchSmpc:
     config, design, plant = recipe.config, recipe.design, build_plant(recipe.config)
     brake_gain_1ps = config.fallback.brake_gain_1ps
-    if config.conditioned:
+    if config.is_age_conditioned:
         conditioned, steps = build_conditioned(config, flown=False, cov=recipe.cov).solver, config.smpc.horizon
         return BatchSmpc(
             ConditionedDecider(conditioned, conditioned.problem.target), plant, steps, steps, brake_gain_1ps

@@ -14,17 +14,17 @@ from msgspec import Meta
 
 from uavctl.build.outside import ACTS, controller_class, make
 from uavctl.config import Config, Source, dump_config, load, parse, presets
-from uavctl.config.checks import dimensions
+from uavctl.config.checks import get_dimensions
 from uavctl.config.document import (
-    LARGEST_PLANT,
-    LARGEST_SEED,
+    MAX_SEED,
+    MAX_STATES,
     ConfigProblem,
     DataFileError,
     Floats,
     Rows,
     Section,
-    key_lines,
-    oversized,
+    find_key_lines,
+    find_oversized,
     read_text,
 )
 from uavctl.config.load import decode, find_nearest, parse_toml
@@ -166,7 +166,7 @@ class CampaignSpec(Section, frozen=True, kw_only=True):
     steps: Annotated[int, Meta(ge=2, le=100_000, description="steps of a run")] = 50
     runs: Annotated[int, Meta(ge=1, le=MOST_RUNS, description="runs of each cell")] = 1000
     master: Annotated[
-        int, Meta(ge=0, le=LARGEST_SEED, description="seed: run i's draws come from (master, i), in every cell")
+        int, Meta(ge=0, le=MAX_SEED, description="seed: run i's draws come from (master, i), in every cell")
     ] = 0
     measured: Annotated[
         Measured,
@@ -177,7 +177,7 @@ class CampaignSpec(Section, frozen=True, kw_only=True):
         ),
     ] = "state"
     start: Annotated[
-        Floats, Meta(max_length=LARGEST_PLANT, description="state (n_x) in which every run starts; else sim.start_*")
+        Floats, Meta(max_length=MAX_STATES, description="state (n_x) in which every run starts; else sim.start_*")
     ] = ()
     start_box: Annotated[
         Rows,
@@ -245,7 +245,7 @@ class SpecProblems:
 
     def tell(self, problems: Iterable[ConfigProblem]) -> None:
         """Add problems."""
-        self._problems.update((self._source.tell(problem), None) for problem in problems)
+        self._problems.update((self._source.describe(problem), None) for problem in problems)
 
     def load(self, configure: Callable[[Sequence[str]], Config], placed: Placed) -> Config | None:
         """Load the configuration with these overrides; add its problems and return None if it has any."""
@@ -263,11 +263,11 @@ class SpecProblems:
     def _located(self, problem: str, placed: Placed) -> str:
         for key, text in reversed(placed):
             if problem.startswith(f"--set {text}: "):
-                return f"{self._source.where(key)}: {key}: {problem.removeprefix('--set ')}"
+                return f"{self._source.locate(key)}: {key}: {problem.removeprefix('--set ')}"
         own = _OWN_PLACE.match(problem)
         if own and placed:  # a check of several keys, which the overrides made fail
             key = placed[-1][0].rpartition("[")[0]
-            return f"{self._source.where(key)}: {key}: {problem[own.end() :]}"
+            return f"{self._source.locate(key)}: {key}: {problem[own.end() :]}"
         return problem
 
 
@@ -321,7 +321,7 @@ def compose(spec: CampaignSpec, configuration: str, told: SpecProblems | None = 
 
 def _one_a_step(believed: Config) -> Config:
     """Return the belief with one position a step, which campaigns carry; a scheme that counts on more has to know."""
-    if not believed.conditioned:
+    if not believed.is_age_conditioned:
         return believed
     return msgspec.structs.replace(believed, source=msgspec.structs.replace(believed.source, rate_hz=0.0))
 
@@ -368,12 +368,12 @@ def flown(one: Config, given: Placed, key: str) -> Iterator[ConfigProblem]:
 
 
 def _differs(base: Config, one: Config) -> bool:
-    return dimensions(base.plant) != dimensions(one.plant) or base.plant.dt_s != one.plant.dt_s
+    return get_dimensions(base.plant) != get_dimensions(one.plant) or base.plant.dt_s != one.plant.dt_s
 
 
 def _fits(key: str, base: Config, one: Config) -> ConfigProblem:
     """Return the problem that a plant has other sizes or another step than the base configuration's."""
-    sizes = (f"n_x, n_u = {dimensions(plant)}, Δt = {plant.dt_s:g} s" for plant in (one.plant, base.plant))
+    sizes = (f"n_x, n_u = {get_dimensions(plant)}, Δt = {plant.dt_s:g} s" for plant in (one.plant, base.plant))
     return ConfigProblem(
         key, f"the plant has {' where the configuration has '.join(sizes)}", "keep its sizes and its step"
     )
@@ -416,8 +416,8 @@ def read_spec(path: Path, kind: type[Spec]) -> tuple[Spec, SpecProblems, str]:
     text = text_of(path)
     table = parse_toml(text, str(path))  # refuses what is too deep to be gone through
     found: list[ConfigProblem] = []
-    told = SpecProblems(Source(str(path), key_lines(text)))
-    told.tell(oversized(table))
+    told = SpecProblems(Source(str(path), find_key_lines(text)))
+    told.tell(find_oversized(table))
     if told.problems:
         raise ConfigError(told.problems)
     spec = cast("Spec | None", decode(kind, table, "", found, {}))
@@ -518,7 +518,7 @@ def _known(key: str, name: str, names: Sequence[str], what: str) -> Iterator[Con
 
 
 def _starts(spec: CampaignSpec, base: Config) -> Iterator[ConfigProblem]:
-    n_x, _ = dimensions(base.plant)
+    n_x, _ = get_dimensions(base.plant)
     if spec.start and spec.start_box:
         yield ConfigProblem("start_box", "there is a start too", "give one of them")
     if spec.start and len(spec.start) != n_x:

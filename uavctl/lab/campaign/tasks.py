@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from uavctl import __version__
 from uavctl.config import Config
-from uavctl.config.checks import position_index
+from uavctl.config.checks import get_position_index
 from uavctl.config.link import LinkConfig
 from uavctl.errors import RAISED, DesignError, in_words
 from uavctl.lab.campaign.controllers import Recipe, Setting, built, met, recipe_for, sight_of
@@ -158,7 +158,7 @@ def ways(config: Config, states: Array) -> dict[str, Array]:
         config: The configuration by which runs are judged: room, target, Δt.
         states: (N, T+1, n_x).
     """
-    plant, index = config.plant, list(position_index(config.plant))
+    plant, index = config.plant, list(get_position_index(config.plant))
     if not index:
         return {}
     axes = [AXES.index(axis) for axis in plant.axes]

@@ -19,7 +19,7 @@ from logs.report.statistics import finite
 from uavctl import __version__
 from uavctl.build.controller import build_controller, design_of
 from uavctl.config import Config, dump_config, load, load_config, parse
-from uavctl.config.document import LARGEST_SEED, ConfigProblem, Section
+from uavctl.config.document import MAX_SEED, ConfigProblem, Section
 from uavctl.config.load import parse_toml
 from uavctl.errors import RAISED, ConfigError, DesignError, in_words
 from uavctl.lab.campaign.pool import Columns, Work
@@ -92,7 +92,7 @@ class TrialSpec(Section, frozen=True, kw_only=True):
     set: Annotated[Overrides, Meta(description="overrides of the configuration, for all")] = ()
     runs: Annotated[int, Meta(ge=1, le=MOST_TRIALS, description="flights of each cell")] = 20
     master: Annotated[
-        int, Meta(ge=0, le=LARGEST_SEED, description="seed: flight i's draws come from (master, i), in every cell")
+        int, Meta(ge=0, le=MAX_SEED, description="seed: flight i's draws come from (master, i), in every cell")
     ] = 0
     seconds: Annotated[
         float, Meta(ge=1, le=3600, description="length of a flight; a figure of eight has its own [s]")

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from logs.report.statistics import finite
 from uavctl.config import Config
-from uavctl.config.link import LONGEST_RUN
+from uavctl.config.link import MAX_LOSS_RUN
 from uavctl.errors import RecordingError
 from uavctl.flight.link_estimate import compute_loss_std
 from uavctl.lab.identify.fit import (
@@ -73,7 +73,7 @@ def fit_link(seen: PositionHistory, missing: NDArray[np.int64]) -> LinkFit:
     loss = int(usual.sum()) / (int(usual.sum()) + came)
     statistic = _burst_statistic(usual)
     quantiles = tuple(round(float(q), _ROUND) for q in np.quantile(seen.delays_s, _QUANTILES))
-    counts = np.bincount(np.minimum(usual, LONGEST_RUN), minlength=1)
+    counts = np.bincount(np.minimum(usual, MAX_LOSS_RUN), minlength=1)
     return LinkFit(
         rate_hz=rate_hz,
         received=came,

@@ -25,7 +25,7 @@ from logs.report.page import Mark, PageSection, grid, page, table
 from logs.report.plots import DASHED, DOTTED
 from logs.report.svg import Drawing, canvas, colour
 from uavctl.config import Config
-from uavctl.config.load import dotted, dump_config, parse
+from uavctl.config.load import dump_config, flatten_keys, parse
 from uavctl.errors import UsageError
 from uavctl.lab.trial import beyond_m, rms_m
 from uavctl.lab.tune.change import Change, PredictionErrors, TunedResult
@@ -284,8 +284,8 @@ def read_tuned(path: Path) -> Config:
     """
     text = path.read_text(encoding="utf-8")
     config = parse(text, str(path)).config
-    there = dict(dotted(tomllib.loads(text)))
-    lacking = [key for key, _ in dotted(tomllib.loads(dump_config(config))) if key not in there]
+    there = dict(flatten_keys(tomllib.loads(text)))
+    lacking = [key for key, _ in flatten_keys(tomllib.loads(dump_config(config))) if key not in there]
     if lacking:
         more = f" and {len(lacking) - 1} more keys" if len(lacking) > 1 else ""
         raise UsageError(
@@ -305,10 +305,10 @@ def _read(path: Path) -> TuneProgress:
 def _differences(settings: Path, text: str) -> Iterator[str]:
     """Return the first keys in which two configurations differ, with both values."""
     try:
-        old = dict(dotted(tomllib.loads(settings.read_text(encoding="utf-8"))))
+        old = dict(flatten_keys(tomllib.loads(settings.read_text(encoding="utf-8"))))
     except (OSError, tomllib.TOMLDecodeError):
         return
-    new = dict(dotted(tomllib.loads(text)))
+    new = dict(flatten_keys(tomllib.loads(text)))
     keys = [key for key in dict.fromkeys([*old, *new]) if old.get(key) != new.get(key)]
     for key in keys[:_MOST_TOLD]:
         yield f"{key} = {old.get(key)} there, {new.get(key)} here"

@@ -17,7 +17,7 @@ from scipy.interpolate import CubicHermiteSpline, CubicSpline
 from logs.recording.flight import FlightData
 from sim.cameras import COMPONENT_ID, SYSTEM_ID, UPTIME_S
 from sim.channel import Channel
-from sim.vehicle.linear import CACHED_TRANSITIONS, LinearModel, linear_model
+from sim.vehicle.linear import CACHED_TRANSITIONS, LinearModel, make_linear_model
 from uavctl.config import Config
 from uavctl.config.connections import DaemonConfig
 from uavctl.config.link import LinkConfig
@@ -207,7 +207,7 @@ def response_of(history: RecordedFlight, plant: PlantConfig) -> Response:
         DesignError: There is no motion between its steps.
     """
     at_once = bool(history.flight.truths) and history.config.sim.plant == "linear"
-    return Response(linear_model(plant), 0 if at_once else round(plant.dead_time_s * 1e9))
+    return Response(make_linear_model(plant), 0 if at_once else round(plant.dead_time_s * 1e9))
 
 
 def _whole_frames(entries: Iterable[Entry], daemon: DaemonConfig) -> Iterator[Entry]:
@@ -488,7 +488,7 @@ class Relinked:
             by_mps = _plus(one.by_mps, departure.velocity_mps(one.at_ns))
             data = self._axes.moved(one.seen, by_m, by_mps, stamp_us=one.stamp_us)
             # A recorded flight begins with a known position.
-            self._channel.push(one.at_ns, data, certain=not self._channel.counters.sent)
+            self._channel.push(one.at_ns, data, is_certain=not self._channel.counters.sent)
         return self._channel.pop_due(to_ns)
 
 
