@@ -20,7 +20,8 @@ from typing import Literal, TypeVar
 import msgspec
 
 from logs.recording.derived_topics import tightened
-from logs.recording.design_view import AXIS_NUMBER, DesignView, Floats, config_name, design_view
+from logs.recording.design_view import AXIS_NUMBER, DesignView, config_name, design_view
+from uavctl.arrays import Array
 from uavctl.errors import RecordingError, UsageError
 from uavctl.records import (
     ControlMode,
@@ -207,7 +208,7 @@ def _places(design: DesignView, plan: Plan) -> tuple[Vec3, ...]:
     return tuple((north, east, down) for north, east, down in rows)
 
 
-def _box(design: DesignView, lower: Floats, upper: Floats) -> SceneBox:
+def _box(design: DesignView, lower: Array, upper: Array) -> SceneBox:
     """Return the limits of the positions among those of the states."""
     sides: list[tuple[float | None, ...]] = []
     for limits in (lower, upper):

@@ -21,7 +21,8 @@ from google.protobuf.message import Message
 from google.protobuf.message_factory import GetMessageClass
 from mcap_protobuf.schema import build_file_descriptor_set
 
-from logs.recording.design_view import Box, DesignView, Floats
+from logs.recording.design_view import Box, DesignView
+from uavctl.arrays import Array
 from uavctl.records import Decision, Estimate, LinkStats, Matrix, Plan, Record, Setpoint, Timing, Truth
 
 PlotRecord = typing.TypeVar("PlotRecord", bound=Record)
@@ -148,12 +149,12 @@ class VehiclePlot(Record, frozen=True, kw_only=True):
     battery_v: float
 
 
-def axes_of(design: DesignView, values: Sequence[float] | Floats) -> Axes:
+def axes_of(design: DesignView, values: Sequence[float] | Array) -> Axes:
     """Name numbers that are in the order of the plant's axes."""
     return Axes(**dict(zip(design.axes, map(float, values), strict=True)))
 
 
-def pick(values: Sequence[float] | Floats, index: Sequence[int]) -> list[float]:
+def pick(values: Sequence[float] | Array, index: Sequence[int]) -> list[float]:
     """Return the values at some indices."""
     return [float(values[i]) for i in index]
 
@@ -217,7 +218,7 @@ def _sides(box: Box, axes: tuple[str, ...], index: tuple[int, ...]) -> tuple[Axe
     return lower, upper
 
 
-def tightened(design: DesignView, backoff: Matrix, stage: int) -> tuple[Floats, Floats]:
+def tightened(design: DesignView, backoff: Matrix, stage: int) -> tuple[Array, Array]:
     """Return the state limits less the back-offs of a stage: lower and upper (n_x,)."""
     lower, upper, kept = design.state_box.lower.copy(), design.state_box.upper.copy(), backoff[stage]
     for side, closed in zip((lower, upper), design.closed_sides, strict=True):

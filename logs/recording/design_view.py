@@ -13,10 +13,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.errors import RecordingError
 from uavctl.records import Header, Matrix, Names, Vec3, Vector, names_of
 
-Floats = NDArray[np.float64]
 AXIS_NUMBER = {"north": 0, "east": 1, "down": 2}
 
 
@@ -82,7 +82,7 @@ class DesignView(msgspec.Struct, frozen=True, kw_only=True, dict=True):
             position[AXIS_NUMBER[axis]] = float(state[index])
         return (position[0], position[1], position[2])
 
-    def positions_of(self, states: Matrix | Floats) -> Floats:
+    def positions_of(self, states: Matrix | Array) -> Array:
         """Return the positions in many states (n, n_x), local NED (n, 3) [m]."""
         positions = np.zeros((len(states), 3))
         if isinstance(states, np.ndarray):
@@ -142,8 +142,8 @@ class DesignView(msgspec.Struct, frozen=True, kw_only=True, dict=True):
 class Box:
     """Axis-parallel limits of a polytope; open sides are infinite and have row -1."""
 
-    lower: Floats  # (n,)
-    upper: Floats  # (n,)
+    lower: Array  # (n,)
+    upper: Array  # (n,)
     row_lower: NDArray[np.int64]  # (n,) row of the polytope that the side comes from
     row_upper: NDArray[np.int64]
 

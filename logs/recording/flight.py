@@ -13,8 +13,9 @@ from typing import Any, NamedTuple, Self, get_args, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
-from logs.recording.design_view import DesignView, Floats, design_view
+from logs.recording.design_view import DesignView, design_view
 from logs.recording.topics import END, GOES_ON, RecorderNote
+from uavctl.arrays import Array
 from uavctl.errors import RecordingError
 from uavctl.flight.decision import MISSION_OVER
 from uavctl.flight.envelope import BREACHES
@@ -196,7 +197,7 @@ class FlightData:
         return {p.seq: p for p in self.plans if p.seq in seqs and p.status is SolveStatus.OPTIMAL}
 
     @cached_property
-    def targets(self) -> tuple[Floats, Floats]:
+    def targets(self) -> tuple[Array, Array]:
         """Return times (n,) [s] and targets (n, n_x) of the mission, one for each boundary.
 
         A recording without any says what its design was made for.
@@ -239,7 +240,7 @@ class FlightData:
         """Return the flown Δt boundaries."""
         return Steps.of(self)
 
-    def seconds(self, at_ns: Sequence[int]) -> Floats:
+    def seconds(self, at_ns: Sequence[int]) -> Array:
         """Return times on the report's axis (n,) [s], 0 at the first tick."""
         return np.array([(at - self.origin_ns) * 1e-9 for at in at_ns], dtype=np.float64)
 
@@ -258,7 +259,7 @@ class FlightData:
             spans.append((self._second(begun), end_s))
         return spans
 
-    def lost_at_s(self) -> Floats:
+    def lost_at_s(self) -> Array:
         """Return when the simulated channel lost positions (n,) [s], one entry each; empty for a real flight."""
         times = [b.at_ns for a, b in pairwise(self.truths) for _ in range(b.lost - a.lost)]
         return self.seconds(times)
@@ -272,11 +273,11 @@ class Steps:
     """One row for each Δt boundary at which the controller flew (TRACK, BRAKE or HOLD)."""
 
     decisions: tuple[Decision, ...]
-    t_s: Floats  # (n,)
-    state: Floats  # (n, n_x), the true one if known, else the estimate
-    decided: Floats  # (n, n_u), inputs before the wire; NaN where there was none
-    input: Floats  # (n, n_u), applied during the step; NaN if unknown
-    target: Floats  # (n, n_x), where the mission wanted the vehicle to be
+    t_s: Array  # (n,)
+    state: Array  # (n, n_x), the true one if known, else the estimate
+    decided: Array  # (n, n_u), inputs before the wire; NaN where there was none
+    input: Array  # (n, n_u), applied during the step; NaN if unknown
+    target: Array  # (n, n_x), where the mission wanted the vehicle to be
     from_truth: bool
 
     def __len__(self) -> int:
@@ -307,7 +308,7 @@ def _nearest(known: NDArray[np.int64], wanted: NDArray[np.int64]) -> NDArray[np.
     return np.where(np.abs(known[left] - wanted) < np.abs(known[right] - wanted), left, right)
 
 
-def _applied(flight: FlightData, at_ns: NDArray[np.int64]) -> Floats:
+def _applied(flight: FlightData, at_ns: NDArray[np.int64]) -> Array:
     """Return the input of the plant in each step (n, n_u).
 
     The setpoint reaches the vehicle shortly after the boundary, so the last truth within the step

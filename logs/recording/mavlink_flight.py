@@ -19,11 +19,11 @@ import msgspec
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from logs.recording.design_view import Floats
 from logs.recording.parameters import ParameterReader, VehicleParameter
 from logs.recording.senders import ChosenVehicle, LogSender, SenderCounts, choose_vehicle, message_of, system_of
 from logs.recording.summary import count
 from logs.recording.tlog import Tlog, TlogPacket, read_tlog
+from uavctl.arrays import Array
 from uavctl.errors import RecordingError
 from uavctl.mavlink.clocksync import ClockSync, StampUnit, StampUnitWatch
 from uavctl.mavlink.codec import OWN_ESTIMATE, decoded
@@ -104,18 +104,18 @@ class MavlinkFlightInfo(msgspec.Struct, frozen=True, kw_only=True):
 class HeardTrack(NamedTuple):
     """Places over time."""
 
-    t_s: Floats  # (n,)
-    position_m: Floats  # (n, 3), local NED
-    velocity_mps: Floats  # (n, 3), NaN where none is told
+    t_s: Array  # (n,)
+    position_m: Array  # (n, 3), local NED
+    velocity_mps: Array  # (n, 3), NaN where none is told
 
 
 class Ages(NamedTuple):
     """Ages of one source's positions."""
 
-    t_s: Floats  # (n,) of arrival
-    delay_s: Floats  # (n,) from capture, beyond the quickest; NaN without a usable stamp
-    age_t_s: Floats  # (m,)
-    age_s: Floats  # (m,) of the newest position, just before and just after each arrival
+    t_s: Array  # (n,) of arrival
+    delay_s: Array  # (n,) from capture, beyond the quickest; NaN without a usable stamp
+    age_t_s: Array  # (m,)
+    age_s: Array  # (m,) of the newest position, just before and just after each arrival
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,17 +126,17 @@ class MavlinkFlight:
     own: HeardTrack
     sent: dict[str, HeardTrack]  # by source, the one with most positions first
     ages: dict[str, Ages]
-    setpoint_t_s: Floats  # (n,)
-    setpoint_m: Floats  # (n, 3), NaN where it is to be ignored
-    setpoint_mps: Floats  # (n, 3)
-    setpoint_mps2: Floats  # (n, 3)
-    attitude_t_s: Floats = field(default_factory=lambda: np.empty(0))
-    attitude_deg: Floats = field(default_factory=lambda: np.empty((0, 3)))  # roll, pitch, yaw
-    height_t_s: Floats = field(default_factory=lambda: np.empty(0))
-    height_m: Floats = field(default_factory=lambda: np.empty(0))  # where it tells no whole position
-    battery_t_s: Floats = field(default_factory=lambda: np.empty(0))
-    battery_v: Floats = field(default_factory=lambda: np.empty(0))
-    beat_t_s: Floats = field(default_factory=lambda: np.empty(0))  # of the vehicle's heartbeats; none in a ULog
+    setpoint_t_s: Array  # (n,)
+    setpoint_m: Array  # (n, 3), NaN where it is to be ignored
+    setpoint_mps: Array  # (n, 3)
+    setpoint_mps2: Array  # (n, 3)
+    attitude_t_s: Array = field(default_factory=lambda: np.empty(0))
+    attitude_deg: Array = field(default_factory=lambda: np.empty((0, 3)))  # roll, pitch, yaw
+    height_t_s: Array = field(default_factory=lambda: np.empty(0))
+    height_m: Array = field(default_factory=lambda: np.empty(0))  # where it tells no whole position
+    battery_t_s: Array = field(default_factory=lambda: np.empty(0))
+    battery_v: Array = field(default_factory=lambda: np.empty(0))
+    beat_t_s: Array = field(default_factory=lambda: np.empty(0))  # of the vehicle's heartbeats; none in a ULog
 
     @property
     def duration_s(self) -> float:
@@ -427,7 +427,7 @@ def from_home(lat_deg: float, lon_deg: float, home_deg: tuple[float, float]) -> 
     return north_m, math.radians(lon_deg - home_deg[1]) * _EARTH_M * math.cos(math.radians(home_deg[0]))
 
 
-def seconds(at_ns: Iterable[int], origin_ns: int) -> Floats:
+def seconds(at_ns: Iterable[int], origin_ns: int) -> Array:
     """Return times from the origin on [s]."""
     return np.array([(at - origin_ns) * 1e-9 for at in at_ns], dtype=np.float64)
 

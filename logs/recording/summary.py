@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from rich.table import Table
 from rich.text import Text
 
-from logs.recording.design_view import Box, Floats
+from logs.recording.design_view import Box
 from logs.recording.flight import FLOWN, FlightData
+from uavctl.arrays import Array
 from uavctl.config.mission import FenceConfig
 from uavctl.outcome import Cause, lacking, make_ending
 from uavctl.records import ControlMode, Ending, Matrix, SolveStatus, Vector, duration, number, percent_above
@@ -85,7 +86,7 @@ def _seconds(flight: FlightData, at_ns: int) -> str:
 # The limits of the state over a flight: constant ones, and fences that closed in.
 
 
-def limits_at(flight: FlightData, t_s: Floats) -> Floats:
+def limits_at(flight: FlightData, t_s: Array) -> Array:
     """Return the right sides of the state set's rows (n, m_x) at report times (n,) [s]."""
     design, begun_s = flight.design, flight.targets[0][0]
     limits = np.tile(np.array(design.b_x), (len(t_s), 1))
@@ -99,7 +100,7 @@ def limits_at(flight: FlightData, t_s: Floats) -> Floats:
     return limits
 
 
-def box_at(flight: FlightData, t_s: Floats) -> tuple[Floats, Floats]:
+def box_at(flight: FlightData, t_s: Array) -> tuple[Array, Array]:
     """Return the axis-parallel limits of the states, lower and upper (n, n_x); infinite where a side is open."""
     design, limits = flight.design, limits_at(flight, t_s)
     sides = []
@@ -295,7 +296,7 @@ def _methods(s: FlightSummary) -> str:
     return ", ".join(f"{n} {method}" for method, n in s.methods.items()) + certified
 
 
-def position_error_m(flight: FlightData) -> Floats:
+def position_error_m(flight: FlightData) -> Array:
     """Return the distance from the target of the moment at each flown boundary (n,) [m]."""
     index = list(flight.design.position_index)
     return np.asarray(np.linalg.norm((flight.steps.state - flight.steps.target)[:, index], axis=1))
@@ -322,7 +323,7 @@ def course_error(flight: FlightData) -> CourseError | None:
     return errors_from_arrival(flight.steps.t_s, position_error_m(flight), moved)
 
 
-def errors_from_arrival(t_s: Floats, error_m: Floats, moved: NDArray[np.bool_]) -> CourseError | None:
+def errors_from_arrival(t_s: Array, error_m: Array, moved: NDArray[np.bool_]) -> CourseError | None:
     """Return what distances come to that count from each arrival on; None without one.
 
     Args:
@@ -363,14 +364,14 @@ def input_outside(flight: FlightData) -> np.ndarray[tuple[int], np.dtype[np.bool
     return outside
 
 
-def decision_times_us(flight: FlightData) -> Floats:
+def decision_times_us(flight: FlightData) -> Array:
     """Return the computing time (n,) [µs] of the ticks that solved; of all ticks if none did."""
     solved = {d.tick for d in flight.decisions if d.solve is not None}
     times = [timing.step_ns for timing in flight.timings if timing.tick in solved]
     return np.array(times or [timing.step_ns for timing in flight.timings]) * 1e-3
 
 
-def spread(values_us: Floats) -> Percentiles:
+def spread(values_us: Array) -> Percentiles:
     """Return median, 99th percentile and maximum."""
     if not len(values_us):
         return Percentiles()
@@ -477,7 +478,7 @@ def _fallback_entries(flight: FlightData) -> int:
 
 
 def _outside(
-    values: Floats, c: Matrix, b: Vector | Floats, tolerance: float
+    values: Array, c: Matrix, b: Vector | Array, tolerance: float
 ) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
     """Return which rows of `values` (n, m) violate {v | c v <= b} by more than a relative tolerance."""
     normals = np.array(c).reshape(-1, values.shape[1])

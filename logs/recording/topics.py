@@ -19,9 +19,9 @@ from typing import cast
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from logs.recording.derived_topics import VIEWS
+from uavctl.arrays import Array
 from uavctl.errors import RecordingError
 from uavctl.records import (
     Checked,
@@ -193,13 +193,12 @@ def _anything(kind: type) -> dict[str, object]:
 
 # Records as exact JSON.
 #
-# Floats keep every bit: shortest digits that round-trip, the sign of zero included. JSON has no NaN
+# Array keep every bit: shortest digits that round-trip, the sign of zero included. JSON has no NaN
 # and no infinity (msgspec would write null, which reads back as "missing"), so these are the strings
 # "NaN", "Infinity" and "-Infinity", read back as floats wherever the record's type has a float. Where
 # it has any value at all (`Header.design`) they stay strings.
 
 
-Array = NDArray[np.float64]
 _MAX_TIME_NS = 2**64 - 1
 MATRICES = ("inputs", "states", "backoff_x", "backoff_u")  # of a plan, rounded in recordings
 DIGITS = 4  # of them: of 3 m, a millimetre

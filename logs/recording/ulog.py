@@ -18,12 +18,12 @@ from typing import Any
 import numpy as np
 
 from logs.recording import mavlink_flight as neutral
-from logs.recording.design_view import Floats
 from logs.recording.disk import ULOG_MAGIC, FileKind, hint_of, kind_of
 from logs.recording.mavlink_flight import MavlinkFlight, ModeBegin, SentSource, SpokenText
 from logs.recording.parameters import VehicleParameter
 from logs.recording.summary import count
 from logs.recording.tlog import LONGEST_SILENCE_NS
+from uavctl.arrays import Array
 from uavctl.errors import RecordingError, need
 from uavctl.mavlink.framing import plain_text
 
@@ -225,7 +225,7 @@ class _Reader:
     def _second(self, at_us: int) -> float:
         return max(0, int(at_us) - self._origin_us) * 1e-6
 
-    def _seconds(self, fields: dict[str, Any]) -> Floats:
+    def _seconds(self, fields: dict[str, Any]) -> Array:
         return np.asarray((fields["timestamp"].astype(np.int64) - self._origin_us) * 1e-6, dtype=np.float64)
 
     def _own(self) -> tuple[str, list[tuple[int, Any, Any]]]:
@@ -273,7 +273,7 @@ class _Reader:
                     array[fields[flag] == 0, axes] = math.nan
         return self._known(_OWN, fields["timestamp"], position_m, velocity_mps)
 
-    def _known(self, name: str, at_us: Any, position_m: Floats, more: Any) -> list[tuple[int, Any, Any]]:
+    def _known(self, name: str, at_us: Any, position_m: Array, more: Any) -> list[tuple[int, Any, Any]]:
         """Return those with a position, and count the others."""
         known = np.isfinite(position_m).all(axis=1)
         if not known.all():
@@ -281,14 +281,14 @@ class _Reader:
         at_ns = [int(one) * 1000 for one in at_us[known]]
         return list(zip(at_ns, map(tuple, position_m[known].tolist()), more[known].tolist(), strict=True))
 
-    def _height(self) -> tuple[Floats, Floats]:
+    def _height(self) -> tuple[Array, Array]:
         """Return the height of its own local position, which may be known without a place."""
         fields = self._first(_OWN)
         height_m = -_columns(fields, "z")[:, 0]
         known = np.isfinite(height_m) & (fields.get("z_valid", np.ones(len(height_m))) != 0)
         return self._seconds(fields)[known], height_m[known]
 
-    def _battery(self) -> tuple[Floats, Floats]:
+    def _battery(self) -> tuple[Array, Array]:
         fields = self._first("battery_status")
         voltage_v = _columns(fields, "voltage_v")[:, 0]
         known = voltage_v > 0
@@ -308,12 +308,12 @@ class _Reader:
             if source.track:
                 yield name, source
 
-    def _setpoints(self) -> tuple[Floats, Floats]:
+    def _setpoints(self) -> tuple[Array, Array]:
         fields = self._first(_SETPOINT)
         place, speed = _vector(fields, "position", ("x", "y", "z")), _vector(fields, "velocity", ("vx", "vy", "vz"))
         return self._seconds(fields), _columns(fields, *place, *speed, *(f"acceleration[{axis}]" for axis in range(3)))
 
-    def _attitude(self) -> tuple[Floats, Floats]:
+    def _attitude(self) -> tuple[Array, Array]:
         """Return roll, pitch and yaw, of quaternions that turn the body's axes into north, east, down."""
         fields = self._first("vehicle_attitude")
         w, x, y, z = _columns(fields, "q[0]", "q[1]", "q[2]", "q[3]").T
@@ -377,7 +377,7 @@ def _vector(fields: dict[str, Any], name: str, older: Sequence[str]) -> Sequence
     return older if older[0] in fields else [f"{name}[{axis}]" for axis in range(3)]
 
 
-def _columns(fields: dict[str, Any], *names: str) -> Floats:
+def _columns(fields: dict[str, Any], *names: str) -> Array:
     """Return fields as columns, NaN where there is no such field."""
     missing = np.full(len(fields["timestamp"]), math.nan)
     return np.column_stack([fields.get(name, missing) for name in names]).astype(np.float64)

@@ -22,12 +22,12 @@ from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.message import Message
-from numpy.typing import NDArray
 
 from logs.recording import derived_topics as topics
 from logs.recording.derived_topics import pack, tightened
 from logs.recording.design_view import AXIS_NUMBER, DesignView, design_view
 from logs.recording.topics import RecorderNote
+from uavctl.arrays import Array
 from uavctl.frames import axes_turn, from_axes
 from uavctl.records import (
     ControlMode,
@@ -54,9 +54,6 @@ from uavctl.records import (
 # Many parts of a message that differ by their numbers alone: made by filling in the bytes of one of them.
 
 
-Floats = NDArray[np.float64]
-
-
 class Many:
     """Bytes of a repeated field, to be merged into the message that has it.
 
@@ -71,7 +68,7 @@ class Many:
         starts = [data.index(np.array(mark, dtype="<f8").tobytes()) for mark in marks]
         self._at = np.add.outer(starts, np.arange(8)).ravel()
 
-    def of(self, numbers: Floats) -> bytes:
+    def of(self, numbers: Array) -> bytes:
         """Return the field with one part for each row of the numbers (n, k)."""
         rows = np.empty((len(numbers), self._one.size), dtype=np.uint8)
         rows[:] = self._one
@@ -137,7 +134,7 @@ def pose_in_frame(at_ns: int, at_m: Vec3) -> PoseInFrame:
     return _made(PoseInFrame, timestamp=stamp(at_ns), frame_id=NED, pose=pose(at_m))
 
 
-def poses_in_frame(at_ns: int, places_m: Floats) -> PosesInFrame:
+def poses_in_frame(at_ns: int, places_m: Array) -> PosesInFrame:
     """Return places in local NED [m] (n, 3) as poses with their frame, in order."""
     message = _made(PosesInFrame, timestamp=stamp(at_ns), frame_id=NED)
     message.MergeFromString(_POSES.of(places_m))
@@ -183,7 +180,7 @@ def room_scene(at_ns: int, design: DesignView) -> SceneUpdate:
 
 
 def plan_scene(
-    at_ns: int, design: DesignView, plan: Plan, estimate: Estimate | None, places: Floats | None = None
+    at_ns: int, design: DesignView, plan: Plan, estimate: Estimate | None, places: Array | None = None
 ) -> SceneUpdate:
     """Draw a plan's predicted path, its confidence ellipsoids, and the tightened limits at its end.
 
@@ -271,7 +268,7 @@ def _box(lower: Vec3, upper: Vec3, colour: Fields) -> Fields:
     return {**line, "type": LinePrimitive.LINE_LIST, "indices": _EDGES}
 
 
-def _sides(design: DesignView, lower: Floats, upper: Floats) -> tuple[Vec3, Vec3]:
+def _sides(design: DesignView, lower: Array, upper: Array) -> tuple[Vec3, Vec3]:
     """Return the sides of the room in local NED [m]; open ones lie near the target, axes without motion are flat."""
     centre = np.array(design.target)
     return (
@@ -280,7 +277,7 @@ def _sides(design: DesignView, lower: Floats, upper: Floats) -> tuple[Vec3, Vec3
     )
 
 
-def _reach(design: DesignView, backoff: Matrix) -> Floats:
+def _reach(design: DesignView, backoff: Matrix) -> Array:
     """Return the semi-axes of the stages' ellipsoids (n, 3) [m]; 0 in an axis without limits."""
     reach = np.zeros((len(backoff), len(design.target)))
     for state, row, size in design.position_rows:

@@ -242,11 +242,11 @@ def info(flight: Flight, /, *, system: System = None, json: Json = False) -> int
     if kind_of(flight) is not FileKind.MCAP or system is not None:
         foreign = foreign_flight(flight, system)
         assert foreign is not None  # only one of ours is none, of which there is no system
-        told, main = foreign.info, tlog_headline.headline_of(foreign)
+        told, main = foreign.info, tlog_headline.derive_tlog_headline(foreign)
         name = FileKind.ULOG if is_ulog(flight) else FileKind.TLOG
         Common(json=json).show(f"log/info-{name}", _with(main, told), lambda: Group(first_line(main), _tlog_info(told)))
         return 0
-    found, ours = recording_info(flight), headline.headline_in(flight)
+    found, ours = recording_info(flight), headline.derive_headline_of_file(flight)
     line = () if ours is None else (first_line(ours),)
     Common(json=json).show("log/info", _with(ours, found), lambda: Group(*line, info_table(found)))
     return 0

@@ -17,12 +17,13 @@ from synthetic_scene import room
 
 from logs.recording.flight import FlightData
 from logs.recording.summary import summarise
-from logs.report.causes import BAD, GOOD, MIND, Headline, HeadlineCause
-from logs.report.excursion import excursions
-from logs.report.headline import headline
-from logs.report.plots import fences, input_beyond, path, path_3d, state_beyond
-from logs.report.timeline import script
-from logs.report.verdicts import Judged, judge
+from logs.report.causes import BAD, CAUTION, GOOD, Headline, HeadlineCause
+from logs.report.cursor import render_cursor_script
+from logs.report.excursion import find_excursions
+from logs.report.headline import derive_headline
+from logs.report.path_3d import draw_path_3d
+from logs.report.plots import draw_path_views, find_input_violations, find_moving_limits, find_state_violations
+from logs.report.verdicts import Judgement, judge_flight
 from uavctl.records import Setpoint, SetpointSource, Truth
 
 WALLS = {  # axis, sign, limit of preset and scene
@@ -36,8 +37,8 @@ BLOWN = RELAYED[2]
 WENT = re.compile(r"went ([\d.]+) (m|mm) (?:through the (.*?)|below the (floor)) at ([\d.]+) s")
 
 
-def head(flight: FlightData, judged: Judged | None = None) -> Headline:
-    return headline(flight, summarise(flight, wall_s=None), judge(flight) if judged is None else judged)
+def head(flight: FlightData, judged: Judgement | None = None) -> Headline:
+    return derive_headline(flight, summarise(flight, wall_s=None), judge_flight(flight) if judged is None else judged)
 
 
 def went(text: str) -> tuple[float, str, float]:
@@ -69,8 +70,8 @@ def flight() -> FlightData:
 
 
 @pytest.fixture(scope="module")
-def judged(flight: FlightData) -> Judged:
-    return judge(flight)
+def judged(flight: FlightData) -> Judgement:
+    return judge_flight(flight)
 
 
 def bumped(flight: FlightData, wall: str, beyond_m: float, at_s: float, width_s: float = 0.6) -> FlightData:
@@ -95,23 +96,23 @@ def dataclass_of(truth: Truth, place: list[float], state: list[float]) -> Truth:
 
 
 @pytest.mark.parametrize("wall", WALLS)
-def test_it_names_wall_metres_and_time(flight: FlightData, judged: Judged, wall: str) -> None:
+def test_it_names_wall_metres_and_time(flight: FlightData, judged: Judgement, wall: str) -> None:
     found = head(bumped(flight, wall, 1.6, 8.0), judged)
     assert found.tone == BAD
     check(found, (1.6, wall, 8.0))
     assert found.at_s == pytest.approx(8.0, abs=0.06)
 
 
-def test_a_touch_is_no_grave_matter(flight: FlightData, judged: Judged) -> None:
+def test_a_touch_is_no_grave_matter(flight: FlightData, judged: Judgement) -> None:
     found = head(bumped(flight, "east wall", 0.02, 8.0), judged)
     assert HeadlineCause.TOUCHED_LIMIT in found.causes and HeadlineCause.LEFT_LIMITS not in found.causes
-    (told,) = [one for one in found.why if WENT.search(one)]
+    (told,) = [one for one in found.reasons if WENT.search(one)]
     assert went(told)[:2] == (0.02, "east wall")
 
 
-def test_a_flight_that_stayed_inside_says_so(flight: FlightData, judged: Judged) -> None:
+def test_a_flight_that_stayed_inside_says_so(flight: FlightData, judged: Judgement) -> None:
     found = head(flight, judged)
-    assert furthest(flight)[0] < 0.0 and excursions(flight) == ()
+    assert furthest(flight)[0] < 0.0 and find_excursions(flight) == ()
     assert found.tone == GOOD and "inside its walls throughout" in found.text
     near = re.search(r"([\d.]+) m from the (.*?) at the nearest, (?:at ([\d.]+) s|where it began)", found.text)
     assert near is not None
@@ -120,18 +121,18 @@ def test_a_flight_that_stayed_inside_says_so(flight: FlightData, judged: Judged)
     assert float(near[3] or 0.5) == pytest.approx(at_s, abs=0.06 if near[3] else 0.5)
 
 
-def test_without_truth_it_says_by_what(flight: FlightData, judged: Judged) -> None:
+def test_without_truth_it_says_by_what(flight: FlightData, judged: Judgement) -> None:
     assert "by the estimate" in head(dataclasses.replace(flight, truths=()), judged).text
     assert "by the estimate" not in head(flight, judged).text
 
 
-def test_it_says_when_it_left_and_came_back(flight: FlightData, judged: Judged) -> None:
+def test_it_says_when_it_left_and_came_back(flight: FlightData, judged: Judgement) -> None:
     moved = bumped(flight, "north wall", 1.0, 8.0)
-    (one,) = excursions(moved)
+    (one,) = find_excursions(moved)
     beyond = [(t.at_ns - flight.origin_ns) * 1e-9 for t in moved.truths if t.position_m[0] > 3.0]
-    assert one.left_s == pytest.approx(beyond[0]) and one.back_s == pytest.approx(beyond[-1] + 0.05, abs=0.051)
-    (told,) = [why for why in head(moved, judged).why if "beyond the north wall" in why]
-    assert [float(n) for n in re.findall(r"([\d.]+) s\b", told)] == pytest.approx([one.left_s, one.back_s], abs=0.051)
+    assert one.exit_s == pytest.approx(beyond[0]) and one.return_s == pytest.approx(beyond[-1] + 0.05, abs=0.051)
+    (told,) = [why for why in head(moved, judged).reasons if "beyond the north wall" in why]
+    assert [float(n) for n in re.findall(r"([\d.]+) s\b", told)] == pytest.approx([one.exit_s, one.return_s], abs=0.051)
 
 
 def test_blind_is_the_time_without_a_position() -> None:
@@ -148,7 +149,7 @@ def test_blind_is_the_time_without_a_position() -> None:
 
 @pytest.mark.parametrize("code", [None, "hung-up", "went-silent"])
 def test_a_vehicle_that_was_not_heard_is_told_before_what_came_of_it(
-    flight: FlightData, judged: Judged, code: str | None
+    flight: FlightData, judged: Judgement, code: str | None
 ) -> None:
     assert HeadlineCause.VEHICLE_SILENT not in head(flight, judged).causes
     kept = [one for one in flight.vehicles if not 3.0 < (one.at_ns - flight.origin_ns) * 1e-9 < 7.0]
@@ -164,13 +165,13 @@ def test_a_vehicle_that_was_not_heard_is_told_before_what_came_of_it(
 
 
 @pytest.mark.parametrize("every", [3, 50])
-def test_setpoints_that_the_gate_changed_are_counted(flight: FlightData, judged: Judged, every: int) -> None:
+def test_setpoints_that_the_gate_changed_are_counted(flight: FlightData, judged: Judgement, every: int) -> None:
     def sent(number: int, at_ns: int) -> Setpoint:
         limited = () if number % every else ("slew-north",)
         return Setpoint(at_ns=at_ns, accel_mps2=(0.0, 0.0, 0.0), source=SetpointSource.PLAN, limited=limited)
 
     setpoints = tuple(sent(number, one.at_ns) for number, one in enumerate(flight.decisions))
-    told = " ".join(head(dataclasses.replace(flight, setpoints=setpoints), judged).why)
+    told = " ".join(head(dataclasses.replace(flight, setpoints=setpoints), judged).reasons)
     share = 100.0 * sum(bool(one.limited) for one in setpoints) / len(setpoints)
     assert (f"limited {share:.0f} % of the setpoints" in told) is (every == 3)
     assert ("slew north" in told) is (every == 3)
@@ -178,7 +179,7 @@ def test_setpoints_that_the_gate_changed_are_counted(flight: FlightData, judged:
 
 def test_crosses_are_on_the_axis_that_is_outside_only(flight: FlightData) -> None:
     moved = bumped(flight, "north wall", 1.0, 8.0)
-    counts = [int(state_beyond(moved, index).sum()) for index in range(9)]
+    counts = [int(find_state_violations(moved, index).sum()) for index in range(9)]
     assert counts[0] > 0 and sum(counts) == counts[0]
     steps = flight.steps
     decided = steps.decided.copy()
@@ -186,26 +187,26 @@ def test_crosses_are_on_the_axis_that_is_outside_only(flight: FlightData) -> Non
     over = dataclasses.replace(steps, decided=decided)
     pushed = dataclasses.replace(flight)
     pushed.__dict__["steps"] = over
-    assert [int(input_beyond(pushed, number).sum()) for number in range(3)] == [0, 1, 0]
+    assert [int(find_input_violations(pushed, number).sum()) for number in range(3)] == [0, 1, 0]
 
 
 def test_the_place_is_marked_in_each_view_of_the_path(flight: FlightData) -> None:
     def marked(one: FlightData) -> list[list[str]]:
         with drawn() as figures:
-            list(path(one))
-            path_3d(one)
+            list(draw_path_views(one))
+            draw_path_3d(one)
         texts = [[text.get_text() for text in figure.axes[0].texts] for figure in figures.values()]
         return [[text for text in each if text.startswith("left at") or " m out at " in text] for each in texts]
 
     moved = bumped(flight, "north wall", 1.0, 8.0)
-    (one,) = excursions(moved)
-    wanted = [f"left at {one.left_s:.1f} s", f"1 m out at {one.worst_s:.1f} s"]
+    (one,) = find_excursions(moved)
+    wanted = [f"left at {one.exit_s:.1f} s", f"1 m out at {one.worst_s:.1f} s"]
     assert marked(moved) == [wanted] * 3
     assert marked(flight) == [[]] * 3
 
 
 def test_the_cursor_has_the_true_path_and_begins_where_it_matters(flight: FlightData) -> None:
-    text = script(flight, 8.0)
+    text = render_cursor_script(flight, 8.0)
     found = re.search(r"const flight = (\{.*?\});\n", text)
     assert found is not None
     given = json.loads(found[1])
@@ -235,11 +236,11 @@ def test_wind_beyond_the_vehicles_strength_carries_it_out(blown: FlightData) -> 
     check(found, (beyond_m, wall, at_s))
     assert "wind" in found.text
     bound = [event for event in blown.events if event.code == "bias-at-bound"]
-    told = [why for why in found.why if "bias was at its bound" in why]
+    told = [why for why in found.reasons if "bias was at its bound" in why]
     assert bool(told) == bool(bound)
     assert blown.breach is not None
     assert HeadlineCause.LET_GO in found.causes
-    (let_go,) = [why for why in found.why if blown.breach.text in why]
+    (let_go,) = [why for why in found.reasons if blown.breach.text in why]
     (breach_s,) = blown.seconds([blown.breach.at_ns])
     assert f"at {breach_s:.1f} s" in let_go
 
@@ -254,7 +255,7 @@ def test_a_drifting_frame_is_told_as_wrong_positions_and_not_as_wind() -> None:
     if beyond_m > 0.05:
         check(found, (beyond_m, wall, at_s))
     assert HeadlineCause.POSITIONS_DRIFTED in found.causes and HeadlineCause.WIND not in found.causes
-    (told,) = [one for one in (found.text, *found.why) if "from the true place" in one]
+    (told,) = [one for one in (found.text, *found.reasons) if "from the true place" in one]
     first_s = 6.0 + 0.3 / 0.1
     assert float(re.search(r"first at ([\d.]+) s", told)[1]) == pytest.approx(first_s, abs=0.5)  # type: ignore[index]
 
@@ -264,13 +265,13 @@ def test_a_fence_that_closes_in_is_drawn_and_named() -> None:
     fence = 'fence=[{state="north", side="upper", times_s=[4.0, 8.0], values=[3.0, 0.5]}]'
     memory = lockstep("room", 11.0, "sim.seed=3", fence)
     closed = FlightData.from_records(memory.entries)
-    (one,) = fences(closed)
+    (one,) = find_moving_limits(closed)
     assert (one.axis, one.upper) == ("north", True)
     assert one.tightest_m == pytest.approx(0.5)
     assert one.at_s == pytest.approx(8.1, abs=0.2)
     found = head(closed)
     assert furthest(closed)[0] < 0.0
-    assert "fence" in found.text and found.tone == MIND
+    assert "fence" in found.text and found.tone == CAUTION
     late = [t.position_m[0] for t in closed.truths if (t.at_ns - closed.origin_ns) * 1e-9 > 8.2]
     assert max(late) < 0.55  # and so the target, at 1.5 m, was not to be reached
     assert re.search(r"target at the last step, which lay 1\.0 m beyond the limit north", found.text)

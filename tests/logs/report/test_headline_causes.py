@@ -21,10 +21,11 @@ from logs.recording.flight import FlightData
 from logs.recording.mavlink_flight import read_flight
 from logs.recording.summary import course_error, position_error_m, summarise
 from logs.recording.topics import RECOVERED, RecorderNote
-from logs.report.causes import GOOD, Headline, HeadlineCause, cause_of_text, ranked
-from logs.report.headline import headline
-from logs.report.tlog_headline import headline_of
-from logs.report.verdicts import judge
+from logs.report.causes import GOOD, Headline, HeadlineCause, sort_findings
+from logs.report.headline import derive_headline
+from logs.report.tlog_headline import derive_tlog_headline
+from logs.report.vehicle_texts import classify_text
+from logs.report.verdicts import judge_flight
 from uavctl.flight.envelope import OUTSIDE
 from uavctl.mavlink.codec import BAD_FIELD
 from uavctl.outcome import Cause, make_ending
@@ -37,7 +38,7 @@ PILOTS = {"px4": "POSCTL", "ardupilot": "LOITER"}
 
 
 def head(flight: FlightData) -> Headline:
-    return headline(flight, summarise(flight, wall_s=None), judge(flight))
+    return derive_headline(flight, summarise(flight, wall_s=None), judge_flight(flight))
 
 
 def flown(autopilot: str, duration_s: float, *overrides: str) -> FlightData:
@@ -326,8 +327,8 @@ def test_the_gravest_comes_first_and_within_a_rank_the_earliest(good: FlightData
     found = head(told(told(statuses(good, [4.2] * 6 + [0.0] * 6), 2.0, "vehicle-text", "Radio Failsafe", Severity.INFO),
                       1.0, "vehicle-text", "Max Alt fence breached", Severity.INFO))  # fmt: skip
     assert found.causes[:3] == (C.BATTERY_EMPTY, C.VEHICLE_FENCE, C.VEHICLE_FAILSAFE)
-    assert ranked([]) == []
-    assert cause_of_text("PreArm: Battery Failsafe", grave=True, warns=True) is None
+    assert sort_findings([]) == []
+    assert classify_text("PreArm: Battery Failsafe", is_error=True, is_warning=True) is None
 
 
 @pytest.mark.parametrize(("lets_go", "reason"), [(False, "held back"), (True, "held back"), (True, "nothing comes")])
@@ -409,7 +410,7 @@ def written(tmp_path: Path, packets: list[tuple[float, int, Any]]) -> Headline:
         data += struct.pack(">Q", 1_764_000_000_000_000 + round(at_s * 1e6)) + message.pack(mav)
     path = tmp_path / "a.tlog"
     path.write_bytes(data)
-    return headline_of(read_flight(path))
+    return derive_tlog_headline(read_flight(path))
 
 
 def beat(mode: int = 4, *, armed: bool = True) -> Any:

@@ -20,7 +20,8 @@ from rich.console import Console
 from logs.recording.flight import FlightData
 from logs.recording.recorder import SyncRecorder
 from logs.recording.summary import summarise
-from logs.report.compare import Figure, FlightComparison, compare, comparison_html, load_all
+from logs.report.compare import Figure, FlightComparison, compare_flights, load_flights
+from logs.report.compare_page import render_comparison
 from uavctl.cli.app import run
 from uavctl.cli.log_report import comparison_picture
 from uavctl.records import Datagram, Decision, Header, Record, Timing
@@ -60,7 +61,9 @@ def test_the_same_flight_says_so(base: Memory, tmp_path: Path) -> None:
             one = msgspec.structs.replace(one, started_utc="2026-02-02T00:00:00", command="uavctl loopback --out b")
         again.append((topic, at_ns, one))
     again.append(("/uavctl/timing", 1, Timing(tick=0, at_ns=1, lateness_ns=0, step_ns=7, send_ns=7)))
-    found = compare(load_all([record(tmp_path / "a.mcap", base.entries), record(tmp_path / "b.mcap", again)]))
+    found = compare_flights(
+        load_flights([record(tmp_path / "a.mcap", base.entries), record(tmp_path / "b.mcap", again)])
+    )
     (likeness,) = found.likenesses
     assert likeness.identical and likeness.parting is None
     assert likeness.records == len(base.entries) - 1  # all but the header
@@ -70,7 +73,7 @@ def test_the_same_flight_says_so(base: Memory, tmp_path: Path) -> None:
 
 def test_parameters_that_differ_have_dotted_names(base: Memory, other: Memory, tmp_path: Path) -> None:
     a, b = record(tmp_path / "a.mcap", base.entries), record(tmp_path / "b.mcap", other.entries)
-    found = compare(load_all([a, b]))
+    found = compare_flights(load_flights([a, b]))
     differing = {one.key: one.values for one in found.parameters}
     assert differing["sim.seed"] == (0, 3)
     assert differing["link.loss"] == (0.3, 0.25)
@@ -86,7 +89,9 @@ def test_header_and_versions_count_as_parameters(base: Memory, tmp_path: Path) -
         )
         for topic, at_ns, one in base.entries
     ]
-    found = compare(load_all([record(tmp_path / "a.mcap", base.entries), record(tmp_path / "b.mcap", changed)]))
+    found = compare_flights(
+        load_flights([record(tmp_path / "a.mcap", base.entries), record(tmp_path / "b.mcap", changed)])
+    )
     assert {one.key: one.values for one in found.parameters} == {"cpu": ("", "another"), "versions.numpy": (None, "3")}
     assert found.likenesses[0].identical
     assert any("different processors" in note for note in found.notes)
@@ -106,7 +111,7 @@ def test_parameters_of_the_vehicle_are_compared(base: Memory, tmp_path: Path) ->
 
     flights = {"a": {"P": 0.1, "Q": 1.0}, "b": {"P": 0.25, "Q": 1.0, "R": 3.0}, "c": {}}
     paths = [record(tmp_path / f"{name}.mcap", with_parameters(**told)) for name, told in flights.items()]
-    found = compare(load_all(paths))
+    found = compare_flights(load_flights(paths))
     assert [(one.key, one.values) for one in found.parameters] == [("vehicle.P", (0.1, 0.25, None))]
     assert sum("A 2, B 3, C 0" in note for note in found.notes) == 1
 
@@ -120,13 +125,13 @@ def test_tables_of_a_list_are_compared_one_by_one(base: Memory, tmp_path: Path) 
         ]
 
     paths = [record(tmp_path / f"{count}.mcap", with_waypoints(count)) for count in (1, 2)]
-    found = compare(load_all(paths))
+    found = compare_flights(load_flights(paths))
     assert [(one.key, one.values) for one in found.parameters] == [("mission.waypoint[1].at", (None, [1.0]))]
 
 
 def test_figures_are_the_summaries(base: Memory, other: Memory, tmp_path: Path) -> None:
     a, b = record(tmp_path / "a.mcap", base.entries), record(tmp_path / "b.mcap", other.entries)
-    found = figures(compare(load_all([a, b])))
+    found = figures(compare_flights(load_flights([a, b])))
     first, second = (summarise(FlightData.from_records(one.entries), wall_s=None) for one in (base, other))
     for key in ("steps", "received", "lost", "max_age", "fallbacks", "cost", "settled_error_m", "solves", "rejected"):
         values = (getattr(first, key), getattr(second, key))
@@ -145,7 +150,7 @@ def test_where_they_part(base: Memory, tmp_path: Path) -> None:
     changed = [*base.entries]
     changed[at] = (topic, at_ns, msgspec.structs.replace(one, input=(one.input[0] + 2.0**-50, *one.input[1:])))
     a, b = record(tmp_path / "a.mcap", base.entries), record(tmp_path / "b.mcap", changed)
-    (likeness,) = compare(load_all([a, b])).likenesses
+    (likeness,) = compare_flights(load_flights([a, b])).likenesses
     assert not likeness.identical and likeness.records == at - 1
     parting = likeness.parting
     assert parting is not None and (parting.topic, parting.field) == (topic, "input[0]")
@@ -157,7 +162,7 @@ def test_a_torn_one_is_compared_up_to_its_end(base: Memory, tmp_path: Path) -> N
     a = record(tmp_path / "a.mcap", base.entries)
     torn = tmp_path / "b.mcap"
     torn.write_bytes(a.read_bytes()[: a.stat().st_size // 2])
-    found = compare(load_all([a, torn]))
+    found = compare_flights(load_flights([a, torn]))
     (likeness,) = found.likenesses
     assert likeness.parting is not None and likeness.parting.other == "its end"
     assert any(note.startswith("B is torn") for note in found.notes)
@@ -174,7 +179,7 @@ def shown(found: FlightComparison, width: int) -> str:
 @pytest.mark.parametrize("width", [80, 120])
 def test_people_are_shown_every_figure(width: int, base: Memory, other: Memory, tmp_path: Path) -> None:
     paths = [record(tmp_path / "a.mcap", base.entries), record(tmp_path / "b.mcap", other.entries)]
-    found = compare(load_all([*paths, *paths]))
+    found = compare_flights(load_flights([*paths, *paths]))
     text = shown(found, width)
     assert max(map(len, text.splitlines())) <= width
     assert "…" not in text
@@ -206,10 +211,10 @@ def test_command(base: Memory, other: Memory, tmp_path: Path, capsys: pytest.Cap
 
 def test_a_page_of_many_flights_has_tables_that_paper_can_hold(base: Memory, other: Memory, tmp_path: Path) -> None:
     paths = [record(tmp_path / "a.mcap", base.entries), record(tmp_path / "b.mcap", other.entries)]
-    loaded = load_all([*paths, *paths, paths[0]])
-    found = compare(loaded)
+    loaded = load_flights([*paths, *paths, paths[0]])
+    found = compare_flights(loaded)
     with unwritten():
-        page = comparison_html(found, loaded)
+        page = render_comparison(found, loaded)
     heads = [re.findall(r"<th>|<th class=\"number\">", head) for head in re.findall(r"<thead>.*?</thead>", page)]
     assert max(map(len, heads)) <= 8
     for name in "BCDE":

@@ -13,7 +13,7 @@ from synthetic_scene import room
 
 from logs.recording.flight import FlightData
 from logs.recording.summary import Percentiles, predicted_only, rows, summarise
-from logs.report.summary_text import story
+from logs.report.summary_text import describe_flight
 from uavctl.config import load_config
 from uavctl.config.load import dump_config
 from uavctl.flight.decision import MISSION_OVER
@@ -126,7 +126,7 @@ def test_what_went_amiss_is_in_the_table_alone() -> None:
     good = summarise(flight, wall_s=1.0)
     times = Percentiles(p50=100.0, p99=900.0, max=73_400.0)
     bad = msgspec.structs.replace(good, missed_ticks=3, tick_lateness_us=times, recorder_dropped=1)
-    assert story(flight, bad) == story(flight, good)
+    assert describe_flight(flight, bad) == describe_flight(flight, good)
     cells = " ".join(text for _, text in rows(bad))
     assert "73.4 ms" in cells and "3 ticks" in cells and "1 record " in cells
 
@@ -213,7 +213,7 @@ def test_a_place_that_was_ordered_is_no_trajectory() -> None:
     summary = summarise(flight, wall_s=1.0)
     assert not summary.trajectory
     assert [target[0] for _, target in flight.ordered_places] == [-0.7]
-    text = " ".join(story(flight, summary))
+    text = " ".join(describe_flight(flight, summary))
     assert "trajectory" not in text and "(-0.7, " in text
     assert not any("trajectory" in name for name, _ in rows(summary))
 
@@ -229,4 +229,4 @@ def test_waypoints_alone_are_no_orders_and_a_target_that_moves_is_a_trajectory()
 
     flight = FlightData.from_records([(t, at, moving(r)) for t, at, r in fly(room(), 4.0)])
     assert flight.moving_target and flight.ordered_places == ()
-    assert "trajectory" in " ".join(story(flight, summarise(flight, wall_s=1.0)))
+    assert "trajectory" in " ".join(describe_flight(flight, summarise(flight, wall_s=1.0)))

@@ -18,7 +18,7 @@ from report_rig import walk
 
 from logs.recording.mavlink_flight import MavlinkFlight, read_flight
 from logs.recording.tlog import export_tlog
-from logs.report.tlog_page import tlog_html
+from logs.report.tlog_page import render_tlog_page
 from uavctl.cli.app import run
 from uavctl.errors import RecordingError
 from uavctl.records import StepInput, Truth
@@ -152,7 +152,7 @@ def test_the_page_shows_what_the_vehicle_says(tmp_path: Path, capsys: pytest.Cap
 
 
 def test_the_page_draws_what_there_is(flight: MavlinkFlight) -> None:
-    ids = set(walk(tlog_html(flight)).ids)
+    ids = set(walk(render_tlog_page(flight)).ids)
     axes = {f"{what}-{axis}" for what in ("position", "velocity") for axis in ("north", "east", "down")}
     assert {"path-above", "path-side", "age-0", *axes} <= ids
 

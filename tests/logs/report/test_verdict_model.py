@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from verdict_rig import as_modelled, room
 
 from logs.recording.flight import FlightData
-from logs.report.verdict_model import FEWEST, LAGS, InnovationSamples, Track, innovations, judge_innovations
-from logs.report.verdicts import judge
+from logs.report.innovations import FilterReplay, InnovationSamples, compute_innovations
+from logs.report.verdict_model import LAGS, MIN_ERRORS, judge_innovations
+from logs.report.verdicts import judge_flight
 from uavctl.build.controller import build_estimator, build_plant
 from uavctl.config import load_config
 from uavctl.flight.kalman import make_kalman
@@ -79,7 +80,7 @@ def test_figures_below_zero_have_a_minus_as_elsewhere() -> None:
 
 
 def test_a_few_positions_are_too_few() -> None:
-    verdict = judge_innovations(errors(np.ones((FEWEST - 1, 3))), AXES, 0.2)
+    verdict = judge_innovations(errors(np.ones((MIN_ERRORS - 1, 3))), AXES, 0.2)
     assert verdict.axes == ()
     assert not verdict.refuted
     assert "too few" in verdict.text
@@ -101,7 +102,7 @@ def test_ellipsoids_are_counted_by_the_time_ahead() -> None:
 def test_a_flight_of_the_model_itself_passes(seed: int) -> None:
     config = room()
     flight = as_modelled(config, 1200, seed=seed)
-    verdict = judge(flight).verdicts.model
+    verdict = judge_flight(flight).verdicts.model
     assert verdict is not None and not verdict.refuted
     assert [one.count for one in verdict.axes] == [len(flight.samples) - 6] * 3
     assert [one.lead_steps for one in verdict.leads] == list(range(1, 13))
@@ -109,7 +110,7 @@ def test_a_flight_of_the_model_itself_passes(seed: int) -> None:
 
 
 def test_gusts_of_twice_the_size_are_found() -> None:
-    verdict = judge(as_modelled(room(), 600, seed=2, noise=lambda _, w: 2.0 * w)).verdicts.model
+    verdict = judge_flight(as_modelled(room(), 600, seed=2, noise=lambda _, w: 2.0 * w)).verdicts.model
     assert verdict is not None
     assert all(one.variance_refuted and one.variance > 2.0 for one in verdict.axes)
     assert any(one.refuted and one.inside.rate < 0.9 for one in verdict.leads)
@@ -123,7 +124,7 @@ def test_gusts_that_last_are_found() -> None:
         last = np.asarray(0.9 * last + np.sqrt(1.0 - 0.81) * w)
         return last
 
-    verdict = judge(as_modelled(room(), 1200, seed=3, noise=lasting)).verdicts.model
+    verdict = judge_flight(as_modelled(room(), 1200, seed=3, noise=lasting)).verdicts.model
     assert verdict is not None
     assert all(one.whiteness_refuted for one in verdict.axes)
 
@@ -132,8 +133,8 @@ def test_the_filter_is_the_flights_own() -> None:
     config = load_config("room-hahn-stursberg", ("solver.method=exact",))
     memory = lockstep("room-hahn-stursberg", 8.0, "solver.method=exact")
     flight = FlightData.from_records(memory.entries)
-    track = Track(flight, make_kalman(build_plant(config), build_estimator(config), flight.design.dt_ns))
-    known = {belief.captured_ns: belief for belief, _, _ in track.one_ahead()}
+    track = FilterReplay(flight, make_kalman(build_plant(config), build_estimator(config), flight.design.dt_ns))
+    known = {belief.captured_ns: belief for belief, _, _ in track.iterate_one_step_errors()}
     compared = 0
     for estimate in flight.estimates:
         belief = known.get(estimate.captured_ns)
@@ -146,10 +147,10 @@ def test_the_filter_is_the_flights_own() -> None:
 
 def test_what_is_sent_acts_after_the_dead_time() -> None:
     config = load_config("room-hahn-stursberg", ("solver.method=exact", "plant.dead_time_s=0.2"))
-    right = judge(as_modelled(config, 800, seed=1, dead_steps=1)).verdicts.model
-    wrong = judge(as_modelled(config, 800, seed=1)).verdicts.model
+    right = judge_flight(as_modelled(config, 800, seed=1, dead_steps=1)).verdicts.model
+    wrong = judge_flight(as_modelled(config, 800, seed=1)).verdicts.model
     assert right is not None and not right.refuted
-    assert wrong is not None and all(one.larger for one in wrong.axes)
+    assert wrong is not None and all(one.has_larger_errors for one in wrong.axes)
 
 
 def test_positions_while_others_fly_do_not_count() -> None:
@@ -160,6 +161,6 @@ def test_positions_while_others_fly_do_not_count() -> None:
         msgspec.structs.replace(one, mode=ControlMode.STOPPED) if one.at_ns >= half_ns else one
         for one in whole.decisions
     )
-    found = innovations(dataclasses.replace(whole, decisions=handed), config)
+    found = compute_innovations(dataclasses.replace(whole, decisions=handed), config)
     assert len(found.t_s) > 50
     assert float(found.t_s.max()) <= 1e-9 * half_ns

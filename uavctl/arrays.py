@@ -1,0 +1,9 @@
+"""Array type and time unit of all numerical code."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+SECOND_NS = 1_000_000_000
