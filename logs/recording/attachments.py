@@ -62,8 +62,8 @@ def of_parameters(told: ParameterReader, utc_ns: int) -> tuple[Attachment | Meta
     return (
         _file(PARAMETERS, "text/tab-separated-values", parameter_file(parameters, count), utc_ns),
         Metadata(_LIST, {"told": str(found), "of": str(count or "unknown"), "complete": whole}),
-        Metadata(_VALUES, {name: str(one.value) for name, one in parameters.items()}),
-        Metadata(_TYPES, {name: one.type for name, one in parameters.items()}),
+        Metadata(_VALUES, {name: str(parameter.value) for name, parameter in parameters.items()}),
+        Metadata(_TYPES, {name: parameter.type for name, parameter in parameters.items()}),
     )
 
 

@@ -150,7 +150,7 @@ def segment_path(path: Path, segment: int) -> Path:
 def later_segments(path: Path) -> tuple[Path, ...]:
     """Return the existing later segments of the recording `path`, in order."""
     pattern = re.compile(rf"{re.escape(path.stem)}-([2-9]|[1-9]\d+){re.escape(path.suffix)}")
-    found = {int(match[1]): one for one in path.parent.glob("*") if (match := pattern.fullmatch(one.name))}
+    found = {int(match[1]): file for file in path.parent.glob("*") if (match := pattern.fullmatch(file.name))}
     return tuple(found[number] for number in sorted(found))
 
 
@@ -213,7 +213,7 @@ def check_room(path: Path, free_bytes: int) -> int:
         RecordingError: there is such a recording, less than `free_bytes`, or the folder cannot be made or written.
     """
     try:
-        taken = [one for one in (path, *later_segments(path)) if one.exists()]
+        taken = [file for file in (path, *later_segments(path)) if file.exists()]
         path.parent.mkdir(parents=True, exist_ok=True)
         free = shutil.disk_usage(path.parent).free
     except OSError as error:
@@ -242,7 +242,7 @@ def no_empty_folders(files: Iterable[Path]) -> Iterator[None]:
     try:
         yield
     finally:
-        for folder in sorted(missing, key=lambda one: len(one.parts), reverse=True):
+        for folder in sorted(missing, key=lambda path: len(path.parts), reverse=True):
             with suppress(OSError):  # it has something in it, or was never made
                 folder.rmdir()
 

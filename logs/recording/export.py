@@ -150,7 +150,7 @@ def _form(kind: Any) -> _Form:
 def _present(kind: Any) -> Any:
     """Return a type without None."""
     if isinstance(kind, types.UnionType) or typing.get_origin(kind) is typing.Union:
-        (rest,) = (one for one in typing.get_args(kind) if one is not types.NoneType)
+        (rest,) = (member for member in typing.get_args(kind) if member is not types.NoneType)
         return rest
     return kind
 
@@ -214,8 +214,8 @@ class Tables:
         table = self._table(topic, times, type(record))
         table.learn(record)
         for field, kind in table.lists:
-            for one in getattr(record, field):
-                self._table(f"{topic}.{field}", (*times, "row", "place"), kind).learn(one)
+            for item in getattr(record, field):
+                self._table(f"{topic}.{field}", (*times, "row", "place"), kind).learn(item)
 
     def columns(self) -> dict[str, tuple[TableColumn, ...]]:
         """Return the columns of each table, by its name."""
@@ -229,8 +229,8 @@ class Tables:
         yield topic, table.row(times, record)
         for field, _ in table.lists:
             name = f"{topic}.{field}"
-            for place, one in enumerate(getattr(record, field)):
-                yield name, self._tables[name].row((*times, number, place), one)
+            for place, item in enumerate(getattr(record, field)):
+                yield name, self._tables[name].row((*times, number, place), item)
 
     def _table(self, name: str, lead: tuple[str, ...], kind: type[msgspec.Struct]) -> _Table:
         if name not in self._tables:
@@ -473,7 +473,9 @@ def table_names(flight: Path) -> tuple[str, ...]:
     """
     topics = {message.definition.topic for message in good_messages(flight)}
     known = sorted(filter(is_known, topics))
-    return tuple(name for one in known for name in (one, *(f"{one}.{field}" for field, _ in _lists(record_type(one)))))
+    return tuple(
+        name for table in known for name in (table, *(f"{table}.{field}" for field, _ in _lists(record_type(table))))
+    )
 
 
 def read_table(flight: Path, name: str) -> pa.Table:

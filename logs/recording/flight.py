@@ -117,7 +117,7 @@ class FlightData:
         A decision counts what it refused without naming it, so ticks that refused any are left out.
         """
         refusing = {decision.tick for decision in self.decisions if decision.rejected}
-        return tuple(sample for one in self.step_inputs if one.tick not in refusing for sample in one.samples)
+        return tuple(sample for inputs in self.step_inputs if inputs.tick not in refusing for sample in inputs.samples)
 
     @cached_property
     def flown(self) -> tuple[Decision, ...]:
@@ -128,32 +128,32 @@ class FlightData:
     @cached_property
     def stopped_ns(self) -> int | None:
         """Return the time at which the operator asked for the hand-over [ns]; None if nobody did."""
-        return min((one.at_ns for one in self.step_inputs if one.stop), default=None)
+        return min((inputs.at_ns for inputs in self.step_inputs if inputs.stop), default=None)
 
     @cached_property
     def breach(self) -> Event | None:
         """Return the envelope's event on an impossible observation, for which the vehicle was let go; else None."""
-        return next((one for one in self.events if one.code in BREACHES), None)
+        return next((event for event in self.events if event.code in BREACHES), None)
 
     @cached_property
     def landing(self) -> Landing | None:
         """Return the wanted landing that began before the operator's stop with no plan flown after it; else None."""
         after_ns = max((d.at_ns for d in self.flown if d.mode is ControlMode.TRACK), default=-1)
         ordered = [
-            Landing(one.at_ns, ordered=True)
-            for one in self.events
-            if one.code == ORDER_ACCEPTED and one.text == Order.LAND.value
+            Landing(event.at_ns, ordered=True)
+            for event in self.events
+            if event.code == ORDER_ACCEPTED and event.text == Order.LAND.value
         ]
-        due = [Landing(one.at_ns, ordered=False) for one in self.flown if one.reason == MISSION_OVER]
+        due = [Landing(decision.at_ns, ordered=False) for decision in self.flown if decision.reason == MISSION_OVER]
         until_ns = self.decisions[-1].at_ns + 1 if self.stopped_ns is None else self.stopped_ns
-        return min((one for one in ordered + due if after_ns < one.at_ns < until_ns), default=None)
+        return min((landing for landing in ordered + due if after_ns < landing.at_ns < until_ns), default=None)
 
     @cached_property
     def fallen(self) -> tuple[Decision, ...]:
         """Return the flown ticks of the fallback, without braking and holding before a wanted landing."""
         wanted = self.landing
-        before = (one for one in self.flown if wanted is None or one.at_ns < wanted.at_ns)
-        return tuple(one for one in before if one.mode in FALLBACK)
+        before = (decision for decision in self.flown if wanted is None or decision.at_ns < wanted.at_ns)
+        return tuple(decision for decision in before if decision.mode in FALLBACK)
 
     @property
     def fallback_spans(self) -> list[tuple[float, float]]:
@@ -233,7 +233,7 @@ class FlightData:
     def last_flown(self) -> Estimate | None:
         """Return the estimate at the last flown boundary."""
         at_ns = self.steps.decisions[-1].at_ns if len(self.steps) else None
-        return next((one for one in reversed(self.estimates) if one.at_ns == at_ns), None)
+        return next((estimate for estimate in reversed(self.estimates) if estimate.at_ns == at_ns), None)
 
     @cached_property
     def steps(self) -> Steps:
@@ -290,10 +290,12 @@ class Steps:
         at_ns = np.array([d.at_ns for d in decisions], dtype=np.int64)
         n_x, n_u = len(flight.design.target), len(flight.design.q_u)
         known: Sequence[Truth] | Sequence[Estimate] = flight.truths or flight.estimates
-        states = np.array([one.state if isinstance(one, Truth) else one.mean for one in known]).reshape(-1, n_x)
+        states = np.array([record.state if isinstance(record, Truth) else record.mean for record in known]).reshape(
+            -1, n_x
+        )
         decided = np.array([d.input or (np.nan,) * n_u for d in decisions]).reshape(-1, n_u)
         applied = _applied(flight, at_ns) if flight.truths else decided
-        near = _nearest(np.array([one.at_ns for one in known], dtype=np.int64), at_ns)
+        near = _nearest(np.array([record.at_ns for record in known], dtype=np.int64), at_ns)
         state = states[near] if len(states) else np.full((len(decisions), n_x), np.nan)
         target = np.array([d.target or flight.design.target for d in decisions]).reshape(-1, n_x)
         return cls(decisions, flight.seconds(at_ns.tolist()), state, decided, applied, target, bool(flight.truths))

@@ -272,20 +272,25 @@ def info(path: Path) -> RecordingInfo:
         account.add(decode(topic, item.data, item.at_ns))
     if not courses and not damage:
         raise RecordingError(f"{path}: holds nothing; it is empty, or was ended before its first chunk was written")
-    flown = [one for topic, one in courses.items() if topic not in _OWN] or list(courses.values())
-    start_ns = min((one.first_ns for one in flown), default=0)
-    end_ns = max((one.last_ns for one in flown), default=0)
+    flown = [course for topic, course in courses.items() if topic not in _OWN] or list(courses.values())
+    start_ns = min((decision.first_ns for decision in flown), default=0)
+    end_ns = max((decision.last_ns for decision in flown), default=0)
     note = account.note
     files = tuple(
-        SegmentInfo(file=str(one.path), bytes=one.path.stat().st_size, messages=one.messages, finished=one.finished)
-        for one in segments
+        SegmentInfo(
+            file=str(segment.path),
+            bytes=segment.path.stat().st_size,
+            messages=segment.messages,
+            finished=segment.finished,
+        )
+        for segment in segments
     )
     return RecordingInfo(
-        files=tuple(one.file for one in files),
-        bytes=sum(one.bytes for one in files),
-        finished=all(one.finished for one in files),
+        files=tuple(segment.file for segment in files),
+        bytes=sum(segment.bytes for segment in files),
+        finished=all(segment.finished for segment in files),
         damage=tuple(damage),
-        messages=sum(one.messages for one in courses.values()),
+        messages=sum(course.messages for course in courses.values()),
         missing=missing,
         start_ns=start_ns,
         end_ns=end_ns,

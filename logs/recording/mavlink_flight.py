@@ -295,7 +295,7 @@ class _Reader:
 
     def _is_another(self, system: int) -> bool:
         """Return whether a system is another vehicle."""
-        return any(system == one.system for one in self._vehicle.others)
+        return any(system == sender.system for sender in self._vehicle.others)
 
     def _take_mode(self, beat: Heartbeat, at_ns: int) -> None:
         mode, _ = describe_mode(autopilot_name(beat.autopilot), beat.vehicle_type, beat.custom_mode)
@@ -352,9 +352,9 @@ class _Reader:
     def flight(self, name: str, log: Tlog) -> MavlinkFlight:
         """Return the flight in what was taken."""
         beat, attitudes = self._beat, self._attitudes.get(False, self._attitudes.get(True, []))
-        own_source = next((one for one in _OWN if one in self._own), "")
-        sources = dict(sorted(self._sources.items(), key=lambda one: -len(one[1].track)))
-        ages = {source: ages_of(one, self._origin_ns) for source, one in sources.items()}
+        own_source = next((own_name for own_name in _OWN if own_name in self._own), "")
+        sources = dict(sorted(self._sources.items(), key=lambda item: -len(item[1].track)))
+        ages = {source: ages_of(sent, self._origin_ns) for source, sent in sources.items()}
         told = np.array([numbers for _, numbers in self._setpoints], dtype=np.float64).reshape(-1, 9)
         begin = datetime.fromtimestamp(self._origin_ns // 1_000_000 / 1000, UTC)
         info = MavlinkFlightInfo(
@@ -365,7 +365,7 @@ class _Reader:
             vehicle_system=None if beat is None else beat.system,
             own_positions=len(self._own.get(own_source, ())),
             own_source=own_source,
-            sent=tuple(figures_of(source, one, ages[source]) for source, one in sources.items()),
+            sent=tuple(figures_of(source, sent, ages[source]) for source, sent in sources.items()),
             setpoints=len(told),
             modes=tuple(self._modes),
             texts=tuple(self._texts),
@@ -383,7 +383,7 @@ class _Reader:
         flight = MavlinkFlight(
             info=info,
             own=track_of(self._own.get(own_source, ()), self._origin_ns),
-            sent={source: track_of(one.track, self._origin_ns) for source, one in sources.items()},
+            sent={source: track_of(sent.track, self._origin_ns) for source, sent in sources.items()},
             ages=ages,
             setpoint_t_s=seconds((at_ns for at_ns, _ in self._setpoints), self._origin_ns),
             setpoint_m=told[:, :3],
@@ -444,7 +444,7 @@ def track_of(points: Sequence[tuple[int, Vec3, Vec3 | None]], origin_ns: int) ->
 
 def ages_of(source: SentSource, origin_ns: int) -> Ages:
     """Return the ages of a source's positions."""
-    at_ns = [one for one, _, _ in source.track]
+    at_ns = [captured for captured, _, _ in source.track]
     delay_s, age_at_ns, age_s = [], [], []
     newest_ns: int | None = None
     for at, captured in zip(at_ns, source.captured_ns, strict=True):
@@ -506,13 +506,16 @@ def facts_of(info: MavlinkFlightInfo) -> Iterator[tuple[str, str]]:
     for sent in info.sent:
         yield f"positions, {sent.source}", f"{sent.positions}, {sent.rate_hz:.1f}/s; {longest_gap(sent)}{_delays(sent)}"
     yield "setpoints in local NED", str(info.setpoints)
-    yield "modes", ", ".join(dict.fromkeys(one.mode for one in info.modes)) or "none"
+    yield "modes", ", ".join(dict.fromkeys(mode.mode for mode in info.modes)) or "none"
     yield "texts", str(len(info.texts))
     if info.battery_v is not None:
         yield "battery", "{:.2f} V at the begin, {:.2f} V at the end".format(*info.battery_v)
-    for one in info.senders:
-        kind, lost = f" ({one.kind})" if one.kind else "", f"; {one.missing} more did not come" if one.missing else ""
-        yield f"from {one.system}, component {one.component}{kind}", f"{count(one.messages, 'message')}{lost}"
+    for sender in info.senders:
+        kind, lost = (
+            f" ({sender.kind})" if sender.kind else "",
+            f"; {sender.missing} more did not come" if sender.missing else "",
+        )
+        yield f"from {sender.system}, component {sender.component}{kind}", f"{count(sender.messages, 'message')}{lost}"
     yield "parameters told", str(len(info.parameters))
     if info.bad:
         yield "passed over", ", ".join(f"{number} {reason}" for reason, number in info.bad.items())

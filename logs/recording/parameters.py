@@ -134,7 +134,7 @@ class ParameterReader:
 
 def listed(parameters: Mapping[str, VehicleParameter]) -> int:
     """Return how many of the autopilot's list were told."""
-    return sum(one.component == mavlink.MAV_COMP_ID_AUTOPILOT1 for one in parameters.values())
+    return sum(parameter.component == mavlink.MAV_COMP_ID_AUTOPILOT1 for parameter in parameters.values())
 
 
 def told_records(
@@ -145,9 +145,11 @@ def told_records(
     Args:
         count: how many the vehicle says it has.
     """
-    for name, one in parameters.items():
-        where = {"system": one.system, "component": one.component}
-        yield ToldParameter(at_ns=at_ns, name=name, value=float(one.value), type=one.type, count=count or 0, **where)
+    for name, parameter in parameters.items():
+        where = {"system": parameter.system, "component": parameter.component}
+        yield ToldParameter(
+            at_ns=at_ns, name=name, value=float(parameter.value), type=parameter.type, count=count or 0, **where
+        )
 
 
 def parameter_file(parameters: Mapping[str, VehicleParameter], count: int | None = None) -> str:
@@ -161,8 +163,8 @@ def parameter_file(parameters: Mapping[str, VehicleParameter], count: int | None
     of = "" if count is None else f"# {found} of the {count} that the vehicle says it has{lacks}\n"
     head = f"# Vehicle parameters, as PARAM_VALUE told them\n{of}# system\tcomponent\tname\tvalue\tMAV_PARAM_TYPE\n"
     return head + "".join(
-        f"{one.system}\t{one.component}\t{name}\t{one.value}\t{_NUMBERS.get(one.type, one.type)}\n"
-        for name, one in parameters.items()
+        f"{parameter.system}\t{parameter.component}\t{name}\t{parameter.value}\t{_NUMBERS.get(parameter.type, parameter.type)}\n"
+        for name, parameter in parameters.items()
     )
 
 

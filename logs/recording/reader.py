@@ -439,7 +439,7 @@ def segment_files(path: Path) -> tuple[Path, ...]:
         inside = sorted(held.difference(*map(later_segments, held)))[:3]
         hint = f"; give the recording in it: {', '.join(map(str, inside))}" if inside else " and holds no recording"
         raise RecordingError(f"{path}: is a folder{hint}")
-    files = tuple(one for one in later_segments(path) if _continues(one))
+    files = tuple(file for file in later_segments(path) if _continues(file))
     if path.exists():
         files = (path, *files)
     if not files:

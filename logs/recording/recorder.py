@@ -153,7 +153,7 @@ class WriteQueue:
         clock: Callable[[], float],
         onlookers: DerivedTopics,
     ) -> None:
-        taken = [one for one in (path, *later_segments(path)) if one.exists()]
+        taken = [file for file in (path, *later_segments(path)) if file.exists()]
         if taken:
             raise RecordingError(f"{taken[0]} exists and a recording never overwrites; choose another name")
         try:

@@ -145,7 +145,7 @@ def _copy(src: Path, file: DiskFile) -> RecoverResult:
                         segment.attach((*attachments.of_header(record, utc_ns), *attachments.layout(utc_ns)))
     segment = segment or Segment(file, CHUNK_BYTES)
     tally.end()
-    damage = [str(one) for one in tally.damage]
+    damage = [str(item) for item in tally.damage]
     if not tally.ended:
         damage.append(f"{src}: the end is missing: messages after the last restored one cannot be counted")
     result = RecoverResult(

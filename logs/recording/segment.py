@@ -115,7 +115,7 @@ class Segment:
     def records(self) -> int:
         """Messages on the disk, without those for viewers."""
         counts = self._counts.copy()
-        return sum(counts[one.number] for topic, one in [*self._channels.items()] if not is_view(topic))
+        return sum(counts[channel.number] for topic, channel in [*self._channels.items()] if not is_view(topic))
 
     def add(self, entry: QueuedMessage) -> None:
         """Take a message; writes the open chunk first if it would grow too large.
@@ -168,9 +168,9 @@ class Segment:
             return
         prefix, at = self._prefix(), self.bytes
         block, indexes = prefix, []
-        for one in records:
-            data = _bytes(one)
-            indexes.append(_index(one, at + len(block), len(data)))
+        for record in records:
+            data = _bytes(record)
+            indexes.append(_index(record, at + len(block), len(data)))
             block += data
         self._file.write(block)
         self._crc = zlib.crc32(block, self._crc)
@@ -252,7 +252,7 @@ class Segment:
 
     def _commit(self, entries: list[QueuedMessage]) -> None:
         content = b"".join(self._parts)
-        times_ns = [one.at_ns + self._zero_utc_ns for one in entries]
+        times_ns = [entry.at_ns + self._zero_utc_ns for entry in entries]
         first, last = min(times_ns), max(times_ns)
         size, stored = len(content), self._compress(content)
         fields = CHUNK_FIELDS + len(COMPRESSION) + len(stored)
@@ -312,7 +312,7 @@ class Segment:
         return data_end + summary + offsets + footer + MAGIC
 
     def _of(self, kind: type[AttachmentIndex | MetadataIndex]) -> list[AttachmentIndex | MetadataIndex]:
-        return [one for one in self._attached if isinstance(one, kind)]
+        return [attachment for attachment in self._attached if isinstance(attachment, kind)]
 
     def _statistics(self) -> Statistics:
         first, last = self._times_ns or (0, 0)
@@ -456,7 +456,7 @@ class Rotation:
         segment, done = self._segment, [*self._done]
         if segment is not None and segment.bytes:
             done.append(self._part(segment))
-        return [(one.path, one.messages, one.bytes) for one in done]
+        return [(file.path, file.messages, file.bytes) for file in done]
 
     def look(self) -> None:
         """Check that the files written so far are still where they were made.
@@ -574,7 +574,7 @@ class Rotation:
             return  # it could not even be opened
         self.written -= len(segment.open_entries)  # they are numbered anew
         kept = segment.open_entries[max(0, self._preface - segment.messages) :]
-        self.unwritten.extendleft((one.definition.topic, one.at_ns, one.data) for one in reversed(kept))
+        self.unwritten.extendleft((record.definition.topic, record.at_ns, record.data) for record in reversed(kept))
         # what abandon cannot do is no second alarm: whole chunks are readable without it
         there = self._is_there(segment)
         with contextlib.suppress(OSError):

@@ -56,7 +56,7 @@ class ChosenVehicle:
         if self.system is not None and self.heartbeat is None:
             found.append(f"system {self.system} sends no heartbeat of an autopilot: its mode and arming are not known")
         if self.others:
-            names = ", ".join(f"system {one.system} ({autopilot_name(one.autopilot)})" for one in self.others)
+            names = ", ".join(f"system {sender.system} ({autopilot_name(sender.autopilot)})" for sender in self.others)
             found.append(
                 f"another vehicle is in it: {names}; system {self.system} is shown, `--system` chooses another"
                 if len(self.others) == 1
@@ -66,7 +66,7 @@ class ChosenVehicle:
 
     def of_others(self, packet: TlogPacket) -> bool:
         """Return whether a packet comes from another vehicle's system."""
-        return any(system_of(packet.data) == one.system for one in self.others)
+        return any(system_of(packet.data) == sender.system for sender in self.others)
 
 
 def system_of(frame: bytes) -> int:
@@ -93,12 +93,12 @@ def choose_vehicle(packets: Sequence[TlogPacket], name: str, system: int | None 
     first: dict[tuple[int, int], Heartbeat] = {}
     for packet in packets:
         if message_of(packet.data) == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
-            for one in decode(packet.data).messages:
-                if isinstance(one, Heartbeat) and is_vehicle(one):
-                    first.setdefault((one.system, one.component), one)
+            for message in decode(packet.data).messages:
+                if isinstance(message, Heartbeat) and is_vehicle(message):
+                    first.setdefault((message.system, message.component), message)
     vehicles: dict[int, Heartbeat] = {}
-    for one in sorted(first.values(), key=lambda one: one.component != _AUTOPILOT):  # in order else
-        vehicles.setdefault(one.system, one)
+    for sender in sorted(first.values(), key=lambda sender: sender.component != _AUTOPILOT):  # in order else
+        vehicles.setdefault(sender.system, sender)
     if system is None:
         system = next(iter(vehicles), None)
     elif system not in vehicles and all(system_of(packet.data) != system for packet in packets):
@@ -106,9 +106,9 @@ def choose_vehicle(packets: Sequence[TlogPacket], name: str, system: int | None 
         listed = ", ".join(map(str, there))
         raise UsageError(f"--system {system}: {name} has nothing of it; systems in it: {listed}")
     if system is None:
-        told = (system_of(one.data) for one in packets if message_of(one.data) in _STATES)
-        system = next((one for one in told if one not in GROUND_SYSTEMS), None)
-    others = tuple(one for number, one in sorted(vehicles.items()) if number != system)
+        told = (system_of(heard.data) for heard in packets if message_of(heard.data) in _STATES)
+        system = next((recording for recording in told if recording not in GROUND_SYSTEMS), None)
+    others = tuple(vehicle for number, vehicle in sorted(vehicles.items()) if number != system)
     return ChosenVehicle(system, None if system is None else vehicles.get(system), others)
 
 

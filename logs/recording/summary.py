@@ -332,7 +332,7 @@ def errors_from_arrival(t_s: Array, error_m: Array, moved: NDArray[np.bool_]) ->
         moved: At which of them another target has begun (n,).
     """
     near, place = error_m <= ARRIVED_M, np.cumsum(moved)
-    there = [np.logical_or.accumulate(near[place == one]) for one in np.unique(place)]
+    there = [np.logical_or.accumulate(near[place == index]) for index in np.unique(place)]
     counts = np.concatenate(there) if there else np.zeros(0, dtype=np.bool_)
     if not counts.any():
         return None
@@ -349,7 +349,7 @@ def state_outside(flight: FlightData) -> np.ndarray[tuple[int], np.dtype[np.bool
     steps = flight.steps
     outside = _outside(steps.state, flight.design.c_x, limits_at(flight, steps.t_s), RELATIVE_TOLERANCE)
     if not steps.from_truth:
-        ages = np.array([0 if one.age_steps is None else one.age_steps for one in steps.decisions])
+        ages = np.array([0 if decision.age_steps is None else decision.age_steps for decision in steps.decisions])
         outside &= ages <= flight.design.horizon
     return outside
 

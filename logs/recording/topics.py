@@ -273,9 +273,9 @@ def _round(values: Array) -> Array:
     return np.where(counts, np.rint(values / down * up) / up * down, values)
 
 
-def alike(one: Record, other: Record) -> bool:
+def alike(record: Record, other: Record) -> bool:
     """Return whether two records of a type are surely the same in every bit; cheaper than to look for a difference."""
-    binary = _exact(one)
+    binary = _exact(record)
     return binary is not None and binary == _exact(other)
 
 
@@ -377,9 +377,9 @@ def _spell(value: object) -> object:
     if isinstance(value, float) and not math.isfinite(value):
         return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
     if isinstance(value, dict):
-        return {key: _spell(one) for key, one in value.items()}
+        return {key: _spell(element) for key, element in value.items()}
     if isinstance(value, tuple | list):
-        return [_spell(one) for one in value]
+        return [_spell(entry) for entry in value]
     return value
 
 
@@ -396,9 +396,9 @@ def _restore(value: object, kind: object) -> object:
     if isinstance(value, str):
         return _NON_FINITE.get(value, value) if float in _alternatives(kind) else value
     if isinstance(value, list):
-        return [_restore(one, item) for one, item in zip(value, _item_types(kind, len(value)), strict=True)]
+        return [_restore(entry, item) for entry, item in zip(value, _item_types(kind, len(value)), strict=True)]
     if isinstance(value, dict):
-        return {key: _restore(one, _field_type(kind, key)) for key, one in value.items()}
+        return {key: _restore(element, _field_type(kind, key)) for key, element in value.items()}
     return value
 
 
@@ -411,9 +411,9 @@ def _alternatives(kind: object) -> tuple[object, ...]:
 
 
 def _item_types(kind: object, count: int) -> tuple[object, ...]:
-    for one in _alternatives(kind):
-        if typing.get_origin(one) is tuple:
-            args = typing.get_args(one)
+    for alternative in _alternatives(kind):
+        if typing.get_origin(alternative) is tuple:
+            args = typing.get_args(alternative)
             items = args[:1] * count if args[-1] is Ellipsis else args
             # a wrong length is told by the conversion that follows
             return items if len(items) == count else (object,) * count
@@ -421,11 +421,11 @@ def _item_types(kind: object, count: int) -> tuple[object, ...]:
 
 
 def _field_type(kind: object, key: str) -> object:
-    for one in _alternatives(kind):
-        if typing.get_origin(one) is dict:
-            return typing.get_args(one)[1]
-        if isinstance(one, type) and issubclass(one, msgspec.Struct):
-            return _fields(one).get(key, object)
+    for alternative in _alternatives(kind):
+        if typing.get_origin(alternative) is dict:
+            return typing.get_args(alternative)[1]
+        if isinstance(alternative, type) and issubclass(alternative, msgspec.Struct):
+            return _fields(alternative).get(key, object)
     return object
 
 

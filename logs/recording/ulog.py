@@ -141,10 +141,10 @@ class _Reader:
     def flight(self) -> MavlinkFlight:
         """Return the flight."""
         log, origin_ns = self._log, self._origin_us * 1000
-        sources = dict(sorted(self._sources(), key=lambda one: -len(one[1].track)))
+        sources = dict(sorted(self._sources(), key=lambda item: -len(item[1].track)))
         own_source, own = self._own()
-        stamps = {_name(one): one.data["timestamp"].astype(np.float64) for one in self._topics()}
-        ages = {name: neutral.ages_of(one, origin_ns) for name, one in sources.items()}
+        stamps = {_name(topic): topic.data["timestamp"].astype(np.float64) for topic in self._topics()}
+        ages = {name: neutral.ages_of(source, origin_ns) for name, source in sources.items()}
         setpoints, attitude, height, battery = self._setpoints(), self._attitude(), self._height(), self._battery()
         system = int(log.initial_parameters.get("MAV_SYS_ID", 1))  # as PX4 comes
         info = neutral.MavlinkFlightInfo(
@@ -155,7 +155,7 @@ class _Reader:
             vehicle_system=system,
             own_positions=len(own),
             own_source=own_source if own else "",
-            sent=tuple(neutral.figures_of(name, one, ages[name]) for name, one in sources.items()),
+            sent=tuple(neutral.figures_of(name, source, ages[name]) for name, source in sources.items()),
             setpoints=len(setpoints[0]),
             modes=tuple(self._modes()),
             texts=tuple(self._texts()),
@@ -176,7 +176,7 @@ class _Reader:
         flight = MavlinkFlight(
             info=info,
             own=neutral.track_of(own, origin_ns),
-            sent={name: neutral.track_of(one.track, origin_ns) for name, one in sources.items()},
+            sent={name: neutral.track_of(source.track, origin_ns) for name, source in sources.items()},
             ages=ages,
             setpoint_t_s=setpoints[0],
             setpoint_m=setpoints[1][:, :3],
@@ -197,7 +197,7 @@ class _Reader:
         A damaged stamp is anything: what counts is the longest part that no hour of silence parts.
         """
         begin_us = int(self._log.start_timestamp)
-        every = [one.data["timestamp"].astype(np.uint64) for one in self._topics()]
+        every = [topic.data["timestamp"].astype(np.uint64) for topic in self._topics()]
         if not every:
             return begin_us, max(begin_us, int(self._log.last_timestamp))
         at_us = np.sort(np.concatenate(every))
@@ -206,21 +206,21 @@ class _Reader:
         first_us, last_us = int(longest[0]), int(longest[-1])
         if strays := len(at_us) - len(longest):
             self._bad["stamp of another time"] += strays
-            for one in self._topics():
-                stamps = one.data["timestamp"]
+            for topic in self._topics():
+                stamps = topic.data["timestamp"]
                 known = (stamps >= longest[0]) & (stamps <= longest[-1])
-                one.data = {name: values[known] for name, values in one.data.items()}
+                topic.data = {name: values[known] for name, values in topic.data.items()}
         # What held before the log began is logged with its own, earlier stamp.
         near = abs(begin_us - first_us) * 1000 <= LONGEST_SILENCE_NS and begin_us <= last_us
         return begin_us if near else first_us, last_us
 
     def _topics(self, *names: str) -> Iterator[Any]:
         """Yield the topics of some names, or all, that have times."""
-        named = (one for one in self._log.data_list if not names or one.name in names)
-        return (one for one in named if len(one.data.get("timestamp", ())))
+        named = (topic for topic in self._log.data_list if not names or topic.name in names)
+        return (topic for topic in named if len(topic.data.get("timestamp", ())))
 
     def _first(self, name: str) -> dict[str, Any]:
-        return next((one.data for one in self._topics(name)), {"timestamp": np.empty(0)})
+        return next((topic.data for topic in self._topics(name)), {"timestamp": np.empty(0)})
 
     def _second(self, at_us: int) -> float:
         return max(0, int(at_us) - self._origin_us) * 1e-6
@@ -230,13 +230,13 @@ class _Reader:
 
     def _own(self) -> tuple[str, list[tuple[int, Any, Any]]]:
         """Return the name and the points of its own position: in local NED, else on the globe."""
-        for one in self._topics(_OWN):
-            if known := self._local(one.data):
+        for topic in self._topics(_OWN):
+            if known := self._local(topic.data):
                 return _OWN, known
         for name, (columns, (unit_deg, unit_m)) in _PLACES.items():
-            for one in self._topics(name):
-                newer = _PLACES["sensor_gps"] if "latitude_deg" in one.data else (columns, (unit_deg, unit_m))
-                if known := self._global(one.data, *newer):
+            for topic in self._topics(name):
+                newer = _PLACES["sensor_gps"] if "latitude_deg" in topic.data else (columns, (unit_deg, unit_m))
+                if known := self._global(topic.data, *newer):
                     return name, known
         return "", []
 
@@ -255,14 +255,11 @@ class _Reader:
         home_deg, unknown = (float(lat_deg[at[0]]), float(lon_deg[at[0]])), (math.nan,) * 3
         return [
             (
-                int(fields["timestamp"][one]) * 1000,
-                (
-                    *neutral.from_home(float(lat_deg[one]), float(lon_deg[one]), home_deg),
-                    height_m[at[0]] - height_m[one],
-                ),
+                int(fields["timestamp"][t]) * 1000,
+                (*neutral.from_home(float(lat_deg[t]), float(lon_deg[t]), home_deg), height_m[at[0]] - height_m[t]),
                 unknown,
             )
-            for one in at
+            for t in at
         ]
 
     def _local(self, fields: dict[str, Any]) -> list[tuple[int, Any, Any]]:
@@ -278,7 +275,7 @@ class _Reader:
         known = np.isfinite(position_m).all(axis=1)
         if not known.all():
             self._bad[f"{name} without a valid position"] += int((~known).sum())
-        at_ns = [int(one) * 1000 for one in at_us[known]]
+        at_ns = [int(t_us) * 1000 for t_us in at_us[known]]
         return list(zip(at_ns, map(tuple, position_m[known].tolist()), more[known].tolist(), strict=True))
 
     def _height(self) -> tuple[Array, Array]:
@@ -295,8 +292,8 @@ class _Reader:
         return self._seconds(fields)[known], voltage_v[known]
 
     def _sources(self) -> Iterator[tuple[str, SentSource]]:
-        for one in self._topics(*_SENT):
-            fields, name, source = one.data, _name(one), SentSource()
+        for topic in self._topics(*_SENT):
+            fields, name, source = topic.data, _name(topic), SentSource()
             position_m = _columns(fields, *_vector(fields, "position", ("x", "y", "z")))
             stamps = fields.get("timestamp_sample", np.zeros(len(position_m), dtype=np.int64))
             for at_ns, place, stamp_us in self._known(name, fields["timestamp"], position_m, stamps):
@@ -332,15 +329,15 @@ class _Reader:
             before = mode, armed
 
     def _texts(self) -> Iterator[SpokenText]:
-        tagged = [one for some in self._log.logged_messages_tagged.values() for one in some]
-        for one in sorted([*self._log.logged_messages, *tagged], key=lambda one: int(one.timestamp)):
-            severity = _SEVERITIES[min(max(one.log_level - ord("0"), 0), 7)]
-            yield SpokenText(at_s=self._second(one.timestamp), severity=severity, text=plain_text(one.message))
+        tagged = [topic for some in self._log.logged_messages_tagged.values() for topic in some]
+        for message in sorted([*self._log.logged_messages, *tagged], key=lambda message: int(message.timestamp)):
+            severity = _SEVERITIES[min(max(message.log_level - ord("0"), 0), 7)]
+            yield SpokenText(at_s=self._second(message.timestamp), severity=severity, text=plain_text(message.message))
 
     def _begin_utc(self) -> str:
         """Return when the log began, by the first GPS time; `time_ref_utc` is but the offset of a time zone."""
-        for one in self._topics(*_GPS):
-            for at_us, utc_us in zip(one.data["timestamp"], one.data.get("time_utc_usec", ()), strict=False):
+        for topic in self._topics(*_GPS):
+            for at_us, utc_us in zip(topic.data["timestamp"], topic.data.get("time_utc_usec", ()), strict=False):
                 if 0 < utc_us < 2**52:  # beyond, no calendar of Python's reaches
                     begin_s = (int(utc_us) - int(at_us) + self._origin_us) // 1000 / 1000
                     return datetime.fromtimestamp(begin_s, UTC).isoformat(timespec="milliseconds")
@@ -348,7 +345,7 @@ class _Reader:
 
     def _odd(self) -> Iterator[str]:
         """Return sentences on what was left out or changed."""
-        if dropouts := [one.duration for one in self._log.dropouts]:
+        if dropouts := [dropout.duration for dropout in self._log.dropouts]:
             total_s, longest_s = sum(dropouts) * 1e-3, max(dropouts) * 1e-3
             yield f"{count(len(dropouts), 'dropout')} of the log, {total_s:.2f} s in all, the longest {longest_s:.2f} s"
         for at_us, name, value in self._log.changed_parameters:

@@ -296,7 +296,7 @@ def _estimate_sphere(design: DesignView, estimate: Estimate) -> Fields:
     semi_axes_m = STD_95 * np.sqrt(np.maximum(variances, 0.0))
     turn = quaternion(from_axes(directions.T.tolist()))
     at = pose(design.position_of(estimate.mean), turn)
-    return {"pose": at, "size": vector([2 * one for one in semi_axes_m.tolist()]), "color": _SPREAD}
+    return {"pose": at, "size": vector([2 * semi_axis for semi_axis in semi_axes_m.tolist()]), "color": _SPREAD}
 
 
 _POSES = Many(lambda at_m: _made(PosesInFrame, poses=[pose(at_m)]), 3)

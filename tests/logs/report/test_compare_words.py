@@ -19,11 +19,11 @@ def figure(key: str) -> Figure:
 
 
 def test_a_certified_gap_is_read_in_percent() -> None:
-    one = convert_to_display_unit(figure("largest_gap"))
-    assert format_label(one) == "largest certified gap, %"
-    assert [format_value(value) for value in one.values] == ["0.002274", "0.002002", "–"]
-    assert [format_difference(value) for value in one.differences] == ["-0.000272", "–"]
-    assert one.ratios == figure("largest_gap").ratios
+    converted = convert_to_display_unit(figure("largest_gap"))
+    assert format_label(converted) == "largest certified gap, %"
+    assert [format_value(value) for value in converted.values] == ["0.002274", "0.002002", "–"]
+    assert [format_difference(value) for value in converted.differences] == ["-0.000272", "–"]
+    assert converted.ratios == figure("largest_gap").ratios
 
 
 def test_other_figures_stay() -> None:

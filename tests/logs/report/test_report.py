@@ -153,7 +153,7 @@ def test_a_flight_of_unknown_configuration_is_judged_as_far_as_it_goes(room_html
 def test_slack_is_drawn(room_flight: FlightData) -> None:
     some = list(room_flight.flown_plans.values())[:2]
     gave = [msgspec.structs.replace(plan, slack=slack) for plan, slack in zip(some, (0.2, 0.1), strict=True)]
-    plans = (*gave, *(plan for plan in room_flight.plans if plan.seq not in {one.seq for one in gave}))
+    plans = (*gave, *(plan for plan in room_flight.plans if plan.seq not in {plan.seq for plan in gave}))
     seen = words_of(dataclasses.replace(room_flight, plans=plans))
     assert "plan-slack" in seen.plots
     assert "2 flown with slack" in " ".join(seen.text)

@@ -70,8 +70,8 @@ def test_what_is_too_small_to_count_is_no_slack(flight: FlightData) -> None:
 
 @pytest.mark.parametrize("slack", [0.003, 20.0])
 def test_small_slack_fills_its_drawing(flight: FlightData, slack: float) -> None:
-    two = {one.seq for one in list(flight.flown_plans.values())[:2]}
-    plans = tuple(msgspec.structs.replace(one, slack=slack) if one.seq in two else one for one in flight.plans)
+    two = {plan.seq for plan in list(flight.flown_plans.values())[:2]}
+    plans = tuple(msgspec.structs.replace(plan, slack=slack) if plan.seq in two else plan for plan in flight.plans)
     with drawn() as figures:
         list(plan_figures.draw_certificates(dataclasses.replace(flight, plans=plans)))
     low, high = figures["What gave way in plans flown"].axes[0].get_ylim()
@@ -93,9 +93,9 @@ def test_gaps_that_are_alike_still_have_a_scale(flight: FlightData) -> None:
 def test_arrivals_without_delay_are_not_drawn(flight: FlightData) -> None:
     inputs = tuple(
         msgspec.structs.replace(
-            one, samples=tuple(msgspec.structs.replace(s, received_ns=s.captured_ns) for s in one.samples)
+            step, samples=tuple(msgspec.structs.replace(s, received_ns=s.captured_ns) for s in step.samples)
         )
-        for one in flight.step_inputs
+        for step in flight.step_inputs
     )
     quick = dataclasses.replace(flight, step_inputs=inputs)
     with drawn() as figures:
@@ -115,7 +115,7 @@ def test_a_short_flight_is_not_said_to_prove_anything(short: FlightData) -> None
 
 def test_promised_risks_are_what_was_configured(short: FlightData) -> None:
     verdicts = judge_flight(short).verdicts
-    promised = {one.name: one.promised for one in verdicts.risk.limits}
+    promised = {limit.name: limit.promised for limit in verdicts.risk.limits}
     assert (promised["all states"], promised["all inputs"]) == (0.05, 0.1)
     assert verdicts.link.promised_ages[:3] == (0.7, 0.21, 0.063)
 
@@ -134,8 +134,8 @@ def part_of(flight: FlightData, from_tick: int) -> FlightData:
     return dataclasses.replace(
         flight,
         decisions=flight.decisions[from_tick:],
-        truths=tuple(one for one in flight.truths if one.at_ns >= begun_ns),
-        estimates=tuple(one for one in flight.estimates if one.at_ns >= begun_ns),
+        truths=tuple(truth for truth in flight.truths if truth.at_ns >= begun_ns),
+        estimates=tuple(estimate for estimate in flight.estimates if estimate.at_ns >= begun_ns),
     )
 
 
@@ -143,9 +143,9 @@ def test_a_part_of_a_flight_says_so(flight: FlightData) -> None:
     seen = words_of(part_of(flight, 80)).text
     text = " ".join(seen)
     assert "Flight “room”, a part" in text and "a part of a flight" in text
-    begins = [one for one in seen if "tick 80" in one]
+    begins = [line for line in seen if "tick 80" in line]
     assert len(begins) == 1 and "tick 80, 4 s into" in begins[0]
-    assert any(one.startswith("40 steps;") for one in seen) and "controller took over" not in text
+    assert any(line.startswith("40 steps;") for line in seen) and "controller took over" not in text
 
 
 def note(text: str, segment: int = 1) -> RecorderNote:
@@ -200,11 +200,11 @@ def test_a_whole_flight_is_no_part(flight: FlightData) -> None:
 
 
 def test_without_truth_nothing_is_drawn_in_its_colour(flight: FlightData) -> None:
-    def key(one: FlightData) -> tuple[set[str], list[str]]:
+    def key(flight: FlightData) -> tuple[set[str], list[str]]:
         """Colours of the lines of the path in three dimensions, and what the small picture explains."""
         with drawn() as figures:
-            draw_path_3d(one)
-            draw_overview(one)
+            draw_path_3d(flight)
+            draw_overview(flight)
         deep = {str(line.get_color()) for line in figures[""].axes[0].lines if line.get_marker() == "None"}
         return deep, [text.get_text() for text in figures["The path, from above"].legends[0].get_texts()]
 

@@ -188,9 +188,11 @@ def test_a_place_that_is_predicted_only_is_not_told_as_one_that_was_seen(
 
 def test_the_uncertainty_at_the_end_is_the_estimate_s_own() -> None:
     flight = flown_blind(2.0)
-    steps = {one.at_ns for one in flight.steps.decisions}
+    steps = {decision.at_ns for decision in flight.steps.decisions}
     index = list(flight.design.position_index)
-    cov = np.array(next(one for one in reversed(flight.estimates) if one.at_ns in steps).cov)[np.ix_(index, index)]
+    cov = np.array(next(estimate for estimate in reversed(flight.estimates) if estimate.at_ns in steps).cov)[
+        np.ix_(index, index)
+    ]
     told = summarise(flight, wall_s=1.0).final_std_m
     assert told == pytest.approx(float(np.sqrt(np.linalg.eigvalsh(cov).max())))
 

@@ -21,8 +21,8 @@ def flight() -> FlightData:
 
 
 def lane(found: FlightData, name: str) -> list[tuple[float, float, str]]:
-    (one,) = (one for one in make_lanes(found) if one.name == name)
-    return [(span.begun_s, span.ended_s, span.text) for span in one.spans]
+    (chosen,) = (lane for lane in make_lanes(found) if lane.name == name)
+    return [(span.begun_s, span.ended_s, span.text) for span in chosen.spans]
 
 
 def test_modes_follow_each_other_without_gaps(flight: FlightData) -> None:
@@ -61,7 +61,7 @@ def test_what_the_vehicle_said(flight: FlightData) -> None:
 def test_marks_are_where_things_happened(flight: FlightData) -> None:
     orders = (StepInput(tick=20, at_ns=flight.origin_ns + 1_000_000_000, commands=(Command(order=Order.HOLD),)),)
     found = dataclasses.replace(flight, step_inputs=(*flight.step_inputs, *orders))
-    by_name = {one.name: one for one in make_lanes(found)}
+    by_name = {lane.name: lane for lane in make_lanes(found)}
     _, times = by_name["orders"].marks
     assert times.tolist() == [1.0]
     silent = sum(bool(d.age_steps) for d in flight.decisions if d.boundary)

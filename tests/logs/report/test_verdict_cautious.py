@@ -82,10 +82,12 @@ def test_the_outcome_is_that_of_the_errors_that_were_made(
 
 def test_correlation_that_comes_of_expecting_too_much_noise_is_told_and_is_caution() -> None:
     verdict = judged(too_noisy(4, 1500))
-    assert all(one.whiteness_refuted and one.correlation[0] > 0.15 for one in verdict.axes)
+    assert all(axis_verdict.whiteness_refuted and axis_verdict.correlation[0] > 0.15 for axis_verdict in verdict.axes)
     assert verdict.outcome is ModelOutcome.CAUTIOUS and not verdict.refuted
     assert "tells a little" in verdict.text and "the model is cautious" in verdict.text
-    assert all(f"{one.correlation[0]:.2g} {one.axis}" in verdict.text for one in verdict.axes)
+    assert all(
+        f"{axis_verdict.correlation[0]:.2g} {axis_verdict.axis}" in verdict.text for axis_verdict in verdict.axes
+    )
 
 
 def test_expecting_too_much_noise_refutes_in_hardly_any_flight() -> None:

@@ -48,20 +48,22 @@ def test_white_errors_pass_in_almost_all_flights() -> None:
 
 def test_errors_that_tell_of_the_next_are_found() -> None:
     verdict = judge_innovations(errors(ar1(np.random.default_rng(1), 1000, 0.4)), AXES, 0.2)
-    assert all(one.whiteness_refuted for one in verdict.axes)
-    assert [one.correlation[0] for one in verdict.axes] == pytest.approx([0.4] * 3, abs=0.1)
+    assert all(axis_verdict.whiteness_refuted for axis_verdict in verdict.axes)
+    assert [axis_verdict.correlation[0] for axis_verdict in verdict.axes] == pytest.approx([0.4] * 3, abs=0.1)
     assert len(verdict.axes[0].correlation) == LAGS
     assert verdict.refuted
     assert "error tells of the next" in verdict.text
-    assert all(f"{one.correlation[0]:.2g} {one.axis}" in verdict.text for one in verdict.axes)
+    assert all(
+        f"{axis_verdict.correlation[0]:.2g} {axis_verdict.axis}" in verdict.text for axis_verdict in verdict.axes
+    )
 
 
 @pytest.mark.parametrize(("scale", "outcome", "told"), [(1.3, "refuted", "too small"), (0.7, "cautious", "cautious")])
 def test_errors_of_another_size_are_found(scale: float, outcome: str, told: str) -> None:
     values = scale * np.random.default_rng(2).standard_normal((800, 3))
     verdict = judge_innovations(errors(values), AXES, 0.2)
-    assert all(one.variance_refuted for one in verdict.axes)
-    assert [one.variance for one in verdict.axes] == pytest.approx([scale**2] * 3, rel=0.2)
+    assert all(axis_verdict.variance_refuted for axis_verdict in verdict.axes)
+    assert [axis_verdict.variance for axis_verdict in verdict.axes] == pytest.approx([scale**2] * 3, rel=0.2)
     assert (verdict.outcome, verdict.refuted) == (outcome, outcome == "refuted")
     assert told in verdict.text
 
@@ -70,7 +72,7 @@ def test_errors_that_are_off_are_found() -> None:
     values = np.random.default_rng(3).standard_normal((800, 3))
     values[:, 1] += 0.3
     verdict = judge_innovations(errors(values), AXES, 0.2)
-    assert [one.mean_refuted for one in verdict.axes] == [False, True, False]
+    assert [axis_verdict.mean_refuted for axis_verdict in verdict.axes] == [False, True, False]
     assert "east deviations off on average" in verdict.text
 
 
@@ -104,16 +106,16 @@ def test_a_flight_of_the_model_itself_passes(seed: int) -> None:
     flight = as_modelled(config, 1200, seed=seed)
     verdict = judge_flight(flight).verdicts.model
     assert verdict is not None and not verdict.refuted
-    assert [one.count for one in verdict.axes] == [len(flight.samples) - 6] * 3
-    assert [one.lead_steps for one in verdict.leads] == list(range(1, 13))
-    assert all(one.inside.trials > 40 for one in verdict.leads)
+    assert [axis_verdict.count for axis_verdict in verdict.axes] == [len(flight.samples) - 6] * 3
+    assert [lead.lead_steps for lead in verdict.leads] == list(range(1, 13))
+    assert all(lead.inside.trials > 40 for lead in verdict.leads)
 
 
 def test_gusts_of_twice_the_size_are_found() -> None:
     verdict = judge_flight(as_modelled(room(), 600, seed=2, noise=lambda _, w: 2.0 * w)).verdicts.model
     assert verdict is not None
-    assert all(one.variance_refuted and one.variance > 2.0 for one in verdict.axes)
-    assert any(one.refuted and one.inside.rate < 0.9 for one in verdict.leads)
+    assert all(axis_verdict.variance_refuted and axis_verdict.variance > 2.0 for axis_verdict in verdict.axes)
+    assert any(lead.refuted and lead.inside.rate < 0.9 for lead in verdict.leads)
 
 
 def test_gusts_that_last_are_found() -> None:
@@ -126,7 +128,7 @@ def test_gusts_that_last_are_found() -> None:
 
     verdict = judge_flight(as_modelled(room(), 1200, seed=3, noise=lasting)).verdicts.model
     assert verdict is not None
-    assert all(one.whiteness_refuted for one in verdict.axes)
+    assert all(axis_verdict.whiteness_refuted for axis_verdict in verdict.axes)
 
 
 def test_the_filter_is_the_flights_own() -> None:
@@ -150,7 +152,7 @@ def test_what_is_sent_acts_after_the_dead_time() -> None:
     right = judge_flight(as_modelled(config, 800, seed=1, dead_steps=1)).verdicts.model
     wrong = judge_flight(as_modelled(config, 800, seed=1)).verdicts.model
     assert right is not None and not right.refuted
-    assert wrong is not None and all(one.has_larger_errors for one in wrong.axes)
+    assert wrong is not None and all(axis.has_larger_errors for axis in wrong.axes)
 
 
 def test_positions_while_others_fly_do_not_count() -> None:
@@ -158,8 +160,8 @@ def test_positions_while_others_fly_do_not_count() -> None:
     whole = as_modelled(config, 200, seed=5)
     half_ns = 100 * whole.design.dt_ns
     handed = tuple(
-        msgspec.structs.replace(one, mode=ControlMode.STOPPED) if one.at_ns >= half_ns else one
-        for one in whole.decisions
+        msgspec.structs.replace(decision, mode=ControlMode.STOPPED) if decision.at_ns >= half_ns else decision
+        for decision in whole.decisions
     )
     found = compute_innovations(dataclasses.replace(whole, decisions=handed), config)
     assert len(found.t_s) > 50

@@ -233,7 +233,8 @@ def test_without_truth_or_motion_stamps_are_not_judged() -> None:
     found = circling(0)
     assert judge_stamps(dataclasses.replace(found, truths=())) is None
     still = tuple(
-        msgspec.structs.replace(one, velocity_mps=(0.0, 0.0, 0.0), position_m=(1.0, 0.0, 0.0)) for one in found.truths
+        msgspec.structs.replace(truth, velocity_mps=(0.0, 0.0, 0.0), position_m=(1.0, 0.0, 0.0))
+        for truth in found.truths
     )
     assert judge_stamps(dataclasses.replace(found, truths=still)) is None
 
@@ -257,5 +258,5 @@ def test_plans_and_decisions_are_what_the_trials_are_made_from() -> None:
 
     items = [item for item in fly(room(), 8.0) if without(item[2])]
     found = FlightData.from_records(items)
-    assert any(isinstance(one, Decision) for one in found.decisions)
+    assert any(isinstance(decision, Decision) for decision in found.decisions)
     assert judge_risk(found, room_config()).limits[0].measured.trials == 0
