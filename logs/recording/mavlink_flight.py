@@ -20,7 +20,14 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from logs.recording.parameters import ParameterReader, VehicleParameter
-from logs.recording.senders import ChosenVehicle, LogSender, SenderCounts, choose_vehicle, message_of, system_of
+from logs.recording.senders import (
+    ChosenVehicle,
+    LogSender,
+    SenderCounter,
+    choose_vehicle,
+    get_message_id,
+    get_system_id,
+)
 from logs.recording.summary import count
 from logs.recording.tlog import Tlog, TlogPacket, read_tlog
 from uavctl.arrays import Array
@@ -101,7 +108,7 @@ class MavlinkFlightInfo(msgspec.Struct, frozen=True, kw_only=True):
     missing: tuple[str, ...] = ()  # parts of the page that the file has nothing for
 
 
-class HeardTrack(NamedTuple):
+class PositionTrack(NamedTuple):
     """Places over time."""
 
     t_s: Array  # (n,)
@@ -123,8 +130,8 @@ class MavlinkFlight:
     """A flight as its MAVLink tells it, with arrays to draw; times count from the first packet."""
 
     info: MavlinkFlightInfo
-    own: HeardTrack
-    sent: dict[str, HeardTrack]  # by source, the one with most positions first
+    own: PositionTrack
+    sent: dict[str, PositionTrack]  # by source, the one with most positions first
     ages: dict[str, Ages]
     setpoint_t_s: Array  # (n,)
     setpoint_m: Array  # (n, 3), NaN where it is to be ignored
@@ -207,7 +214,7 @@ class _Reader:
     def __init__(self, origin_ns: int, vehicle: ChosenVehicle) -> None:
         self._origin_ns = self._last_ns = origin_ns
         self._vehicle, self._beat = vehicle, vehicle.heartbeat
-        self._senders = SenderCounts()
+        self._senders = SenderCounter()
         self._attitudes: dict[bool, list[tuple[int, Vec3]]] = {}  # of quaternions, and of angles
         self._battery: list[tuple[int, float]] = []
         self._height: list[tuple[int, float]] = []
@@ -229,7 +236,7 @@ class _Reader:
         self._last_ns = packet.at_ns
         found = scan_one(packet.data)
         for frame in found.frames:
-            system = system_of(frame.data)
+            system = get_system_id(frame.data)
             name = f"{mavlink.mavlink_map[frame.message_id].msgname} of system {system}"
             self.counted[name] += 1
             self._spans_ns[name] = self._spans_ns.get(name, (packet.at_ns, 0))[0], packet.at_ns
@@ -238,7 +245,7 @@ class _Reader:
                 self._take_setpoint(frame.data, packet.at_ns)
             elif self._is_vehicle(system):
                 self._take_own(frame.message_id, frame.data, packet.at_ns)
-        if message_of(packet.data) in _LOOKED_INTO and self._is_vehicle(system_of(packet.data)):
+        if get_message_id(packet.data) in _LOOKED_INTO and self._is_vehicle(get_system_id(packet.data)):
             self._take_parameter(packet)
         understood = decoded(found)
         self._bad.update(understood.bad)
@@ -256,7 +263,7 @@ class _Reader:
     def _take_parameter(self, packet: TlogPacket) -> None:
         """Take a parameter, or the heartbeat that says how they are written: that of the autopilot alone."""
         component = packet.data[6 if packet.data[0] == mavlink.PROTOCOL_MARKER_V2 else 4]
-        beats = message_of(packet.data) == mavlink.MAVLINK_MSG_ID_HEARTBEAT
+        beats = get_message_id(packet.data) == mavlink.MAVLINK_MSG_ID_HEARTBEAT
         if not beats or (self._beat is not None and component == self._beat.component):
             self._parameters.take(Datagram(at_ns=packet.at_ns, link="", outgoing=False, data=packet.data))
 
@@ -355,7 +362,7 @@ class _Reader:
         own_source = next((own_name for own_name in _OWN if own_name in self._own), "")
         sources = dict(sorted(self._sources.items(), key=lambda item: -len(item[1].track)))
         ages = {source: ages_of(sent, self._origin_ns) for source, sent in sources.items()}
-        told = np.array([numbers for _, numbers in self._setpoints], dtype=np.float64).reshape(-1, 9)
+        setpoints = np.array([numbers for _, numbers in self._setpoints], dtype=np.float64).reshape(-1, 9)
         begin = datetime.fromtimestamp(self._origin_ns // 1_000_000 / 1000, UTC)
         info = MavlinkFlightInfo(
             recording=name,
@@ -366,7 +373,7 @@ class _Reader:
             own_positions=len(self._own.get(own_source, ())),
             own_source=own_source,
             sent=tuple(figures_of(source, sent, ages[source]) for source, sent in sources.items()),
-            setpoints=len(told),
+            setpoints=len(setpoints),
             modes=tuple(self._modes),
             texts=tuple(self._texts),
             messages=dict(sorted(self.counted.items())),
@@ -386,9 +393,9 @@ class _Reader:
             sent={source: track_of(sent.track, self._origin_ns) for source, sent in sources.items()},
             ages=ages,
             setpoint_t_s=seconds((at_ns for at_ns, _ in self._setpoints), self._origin_ns),
-            setpoint_m=told[:, :3],
-            setpoint_mps=told[:, 3:6],
-            setpoint_mps2=told[:, 6:],
+            setpoint_m=setpoints[:, :3],
+            setpoint_mps=setpoints[:, 3:6],
+            setpoint_mps2=setpoints[:, 6:],
             attitude_t_s=seconds((at_ns for at_ns, _ in attitudes), self._origin_ns),
             attitude_deg=np.degrees(np.array([angles for _, angles in attitudes], dtype=np.float64).reshape(-1, 3)),
             height_t_s=seconds((at_ns for at_ns, _ in self._height), self._origin_ns),
@@ -432,10 +439,10 @@ def seconds(at_ns: Iterable[int], origin_ns: int) -> Array:
     return np.array([(at - origin_ns) * 1e-9 for at in at_ns], dtype=np.float64)
 
 
-def track_of(points: Sequence[tuple[int, Vec3, Vec3 | None]], origin_ns: int) -> HeardTrack:
+def track_of(points: Sequence[tuple[int, Vec3, Vec3 | None]], origin_ns: int) -> PositionTrack:
     """Return places and speeds as arrays."""
     unknown = (math.nan, math.nan, math.nan)
-    return HeardTrack(
+    return PositionTrack(
         seconds((at_ns for at_ns, _, _ in points), origin_ns),
         np.array([position_m for _, position_m, _ in points], dtype=np.float64).reshape(-1, 3),
         np.array([velocity or unknown for _, _, velocity in points], dtype=np.float64).reshape(-1, 3),

@@ -17,7 +17,16 @@ from functools import cache
 
 import msgspec
 
-from logs.recording.topics import DIGITS, RecorderNote, alike, condense, decode, raw_link, record_type, says
+from logs.recording.topics import (
+    DIGITS,
+    RecorderNote,
+    are_identical,
+    decode,
+    get_record_type,
+    is_encoding_of,
+    parse_raw_topic,
+    round_plan,
+)
 from uavctl.loop import ControlLoop
 from uavctl.records import (
     Command,
@@ -166,7 +175,7 @@ def _unit(name: str) -> str:
 
 def stage(topic: str) -> str:
     """Return which stage of a tick is in question if this topic is the first to differ."""
-    return _SAID_BY.get(topic, _SENT if raw_link(topic) is not None else "")
+    return _SAID_BY.get(topic, _SENT if parse_raw_topic(topic) is not None else "")
 
 
 def leaves(recorded: Record, replayed: Record) -> list[Leaf]:
@@ -357,8 +366,8 @@ class _Findings:
         """Compare a recorded record with the replayed one; either may be missing."""
         parts: list[Leaf] = []
         if isinstance(recorded, Plan) and isinstance(replayed, Plan) and recorded.exact_crc32 is not None:
-            replayed = condense(replayed)
-        if recorded is not None and replayed is not None and not alike(recorded, replayed):
+            replayed = round_plan(replayed)
+        if recorded is not None and replayed is not None and not are_identical(recorded, replayed):
             parts = [
                 leaf
                 for leaf in leaves(recorded, replayed)
@@ -481,7 +490,12 @@ def replay(
             found.dropped = record.dropped
         if _is_compared(topic):
             replayed = produced.take(topic, at_ns)
-            if found.first is None and isinstance(message, bytes) and replayed is not None and says(replayed, message):
+            if (
+                found.first is None
+                and isinstance(message, bytes)
+                and replayed is not None
+                and is_encoding_of(replayed, message)
+            ):
                 found.same(topic)
             else:
                 found.compare(topic, at_ns, record or _decoded(topic, at_ns, message), replayed)
@@ -507,8 +521,8 @@ def _is_compared(topic: str) -> bool:
 @cache
 def _is_input(topic: str) -> bool:
     """Return whether a topic is not compared: its records drive the loop, or the result reports them."""
-    link = raw_link(topic)
+    link = parse_raw_topic(topic)
     try:
-        return record_type(topic) in (StepInput, Refused, RecorderNote) if link is None else not link[1]
+        return get_record_type(topic) in (StepInput, Refused, RecorderNote) if link is None else not link[1]
     except KeyError:
         return True  # decoding says that nobody knows it

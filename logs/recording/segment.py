@@ -42,8 +42,8 @@ from mcap.records import (
 from mcap.records import SummaryOffset as Group
 from zstandard import ZstdCompressor
 
-from logs.recording.disk import MAGIC, OutputFile, is_there, segment_path
-from logs.recording.topics import HEADER, Definition, definition, is_view
+from logs.recording.disk import MAGIC, OutputFile, is_present, make_segment_path
+from logs.recording.topics import HEADER, Definition, get_definition, is_view
 from uavctl.config.types import LogConfig
 
 MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
@@ -424,7 +424,7 @@ class Rotation:
     @property
     def name(self) -> str:
         """Name of the file that is open, or comes next."""
-        return segment_path(self._path, self.number).name
+        return make_segment_path(self._path, self.number).name
 
     @property
     def has_chunk(self) -> bool:
@@ -465,7 +465,7 @@ class Rotation:
             OSError: the open file is not; closed ones are remembered as gone.
         """
         for part in [*self._done]:
-            if not is_there(part.path, part.bytes):
+            if not is_present(part.path, part.bytes):
                 self._done.remove(part)
                 self._lose(part)
         if self._segment is not None and not self._is_there(self._segment):
@@ -481,7 +481,7 @@ class Rotation:
         Raises:
             OSError: it cannot be opened or written.
         """
-        path = segment_path(self._path, self.number)
+        path = make_segment_path(self._path, self.number)
         path.parent.mkdir(parents=True, exist_ok=True)  # somebody may have removed it with the file before
         self._segment = Segment(self._open_file(path), self._log.chunk_bytes, self.zero_utc_ns)
         self._opened = path.stat()
@@ -500,7 +500,7 @@ class Rotation:
             OSError: a chunk could not be written; `fail` keeps what it held, this message included.
         """
         self.written += 1
-        self._open_segment().add(QueuedMessage(definition(topic), self.written, at_ns, data))
+        self._open_segment().add(QueuedMessage(get_definition(topic), self.written, at_ns, data))
 
     def write_record(self, topic: str, at_ns: int, data: bytes) -> None:
         """Add a record's message; the header is kept for later files.
@@ -586,14 +586,16 @@ class Rotation:
         return self._segment
 
     def _part(self, segment: Segment) -> _SegmentPart:
-        return _SegmentPart(segment_path(self._path, self.number), segment.messages, segment.bytes, segment.records)
+        return _SegmentPart(
+            make_segment_path(self._path, self.number), segment.messages, segment.bytes, segment.records
+        )
 
     def _lose(self, part: _SegmentPart) -> None:
         self.gone.append(part.path.name)
         self.gone_records += part.records
 
     def _is_there(self, segment: Segment) -> bool:
-        return is_there(segment_path(self._path, self.number), segment.bytes, self._opened)
+        return is_present(make_segment_path(self._path, self.number), segment.bytes, self._opened)
 
     def _retire(self, segment: Segment, *, there: bool) -> None:
         part = self._part(segment)

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from logs.recording import mavlink_flight as neutral
-from logs.recording.disk import ULOG_MAGIC, FileKind, hint_of, kind_of
+from logs.recording.disk import ULOG_MAGIC, FileKind, describe_kind_error, detect_kind
 from logs.recording.mavlink_flight import MavlinkFlight, ModeBegin, SentSource, SpokenText
 from logs.recording.parameters import VehicleParameter
 from logs.recording.summary import count
@@ -55,7 +55,7 @@ _MODES = {
 
 def is_ulog(path: Path) -> bool:
     """Return whether a file is a ULog, by its first bytes or else its name."""
-    return kind_of(path) is FileKind.ULOG
+    return detect_kind(path) is FileKind.ULOG
 
 
 def read_ulog(path: Path) -> MavlinkFlight:
@@ -70,17 +70,17 @@ def read_ulog(path: Path) -> MavlinkFlight:
     except OSError as error:
         raise RecordingError(f"{path}: {error.strerror}") from error
     if not data.startswith(ULOG_MAGIC):
-        raise RecordingError(f"{path}: does not begin as a ULog does; is it a .ulg of PX4?{hint_of(path)}")
+        raise RecordingError(f"{path}: does not begin as a ULog does; is it a .ulg of PX4?{describe_kind_error(path)}")
     if len(data) < _HEAD_BYTES:
         raise RecordingError(f"{path}: torn within its head, {len(data)} of {_HEAD_BYTES} bytes; fetch it again")
-    short, torn_bytes = _without_short(data)
-    log = _parsed(path, data)
+    short, torn_bytes = _remove_short_messages(data)
+    log = _parse(path, data)
     if not log.data_list and not log.logged_messages and not log.logged_messages_tagged:
         raise RecordingError(f"{path}: no message in it; was logging stopped at once, or the file torn?")
     return _Reader(path, log, short, torn_bytes).flight()
 
 
-def _parsed(path: Path, data: bytearray) -> Any:
+def _parse(path: Path, data: bytearray) -> Any:
     need("pyulog", "ulog")
     from pyulog.core import ULog, ULogException  # type: ignore[import-untyped]
 
@@ -107,7 +107,7 @@ class _BoundedFile(io.BytesIO):
         return found
 
 
-def _without_short(data: bytearray) -> tuple[int, int]:
+def _remove_short_messages(data: bytearray) -> tuple[int, int]:
     """Take out the messages that are too short for their type, at which pyulog would end without a word.
 
     Returns:
@@ -143,7 +143,7 @@ class _Reader:
         log, origin_ns = self._log, self._origin_us * 1000
         sources = dict(sorted(self._sources(), key=lambda item: -len(item[1].track)))
         own_source, own = self._own()
-        stamps = {_name(topic): topic.data["timestamp"].astype(np.float64) for topic in self._topics()}
+        stamps = {_make_topic_name(topic): topic.data["timestamp"].astype(np.float64) for topic in self._topics()}
         ages = {name: neutral.ages_of(source, origin_ns) for name, source in sources.items()}
         setpoints, attitude, height, battery = self._setpoints(), self._attitude(), self._height(), self._battery()
         system = int(log.initial_parameters.get("MAV_SYS_ID", 1))  # as PX4 comes
@@ -162,7 +162,7 @@ class _Reader:
             messages={name: len(at_us) for name, at_us in stamps.items()},
             bad=dict(self._bad),
             parameters={
-                plain_text(name): _parameter(value, system)
+                plain_text(name): _make_parameter(value, system)
                 for name, value in log.initial_parameters.items()
                 if isinstance(value, int | float)
             },
@@ -245,7 +245,7 @@ class _Reader:
     ) -> list[tuple[int, Any, Any]]:
         """Return places on the globe as north, east and down of the first one."""
         unit_deg, unit_m = units
-        lat_deg, lon_deg, height_m = (_columns(fields, *names) * (unit_deg, unit_deg, unit_m)).T
+        lat_deg, lon_deg, height_m = (_make_columns(fields, *names) * (unit_deg, unit_deg, unit_m)).T
         known = np.isfinite(lat_deg + lon_deg + height_m) & (np.abs(lat_deg) <= 90) & ((lat_deg != 0) | (lon_deg != 0))
         if "fix_type" in fields:
             known &= fields["fix_type"] >= _LEAST_FIX
@@ -263,7 +263,7 @@ class _Reader:
         ]
 
     def _local(self, fields: dict[str, Any]) -> list[tuple[int, Any, Any]]:
-        position_m, velocity_mps = _columns(fields, "x", "y", "z"), _columns(fields, "vx", "vy", "vz")
+        position_m, velocity_mps = _make_columns(fields, "x", "y", "z"), _make_columns(fields, "vx", "vy", "vz")
         for prefix, array in (("", position_m), ("v_", velocity_mps)):
             for flag, axes in ((f"{prefix}xy_valid", slice(2)), (f"{prefix}z_valid", slice(2, 3))):
                 if flag in fields:
@@ -281,20 +281,20 @@ class _Reader:
     def _height(self) -> tuple[Array, Array]:
         """Return the height of its own local position, which may be known without a place."""
         fields = self._first(_OWN)
-        height_m = -_columns(fields, "z")[:, 0]
+        height_m = -_make_columns(fields, "z")[:, 0]
         known = np.isfinite(height_m) & (fields.get("z_valid", np.ones(len(height_m))) != 0)
         return self._seconds(fields)[known], height_m[known]
 
     def _battery(self) -> tuple[Array, Array]:
         fields = self._first("battery_status")
-        voltage_v = _columns(fields, "voltage_v")[:, 0]
+        voltage_v = _make_columns(fields, "voltage_v")[:, 0]
         known = voltage_v > 0
         return self._seconds(fields)[known], voltage_v[known]
 
     def _sources(self) -> Iterator[tuple[str, SentSource]]:
         for topic in self._topics(*_SENT):
-            fields, name, source = topic.data, _name(topic), SentSource()
-            position_m = _columns(fields, *_vector(fields, "position", ("x", "y", "z")))
+            fields, name, source = topic.data, _make_topic_name(topic), SentSource()
+            position_m = _make_columns(fields, *_list_vector_fields(fields, "position", ("x", "y", "z")))
             stamps = fields.get("timestamp_sample", np.zeros(len(position_m), dtype=np.int64))
             for at_ns, place, stamp_us in self._known(name, fields["timestamp"], position_m, stamps):
                 source.take(place, None, stamp_us or None, at_ns)
@@ -307,13 +307,18 @@ class _Reader:
 
     def _setpoints(self) -> tuple[Array, Array]:
         fields = self._first(_SETPOINT)
-        place, speed = _vector(fields, "position", ("x", "y", "z")), _vector(fields, "velocity", ("vx", "vy", "vz"))
-        return self._seconds(fields), _columns(fields, *place, *speed, *(f"acceleration[{axis}]" for axis in range(3)))
+        place, speed = (
+            _list_vector_fields(fields, "position", ("x", "y", "z")),
+            _list_vector_fields(fields, "velocity", ("vx", "vy", "vz")),
+        )
+        return self._seconds(fields), _make_columns(
+            fields, *place, *speed, *(f"acceleration[{axis}]" for axis in range(3))
+        )
 
     def _attitude(self) -> tuple[Array, Array]:
         """Return roll, pitch and yaw, of quaternions that turn the body's axes into north, east, down."""
         fields = self._first("vehicle_attitude")
-        w, x, y, z = _columns(fields, "q[0]", "q[1]", "q[2]", "q[3]").T
+        w, x, y, z = _make_columns(fields, "q[0]", "q[1]", "q[2]", "q[3]").T
         roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
         pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
         yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
@@ -359,22 +364,22 @@ class _Reader:
             yield f"the recording is torn within a message: its last {count(self._torn_bytes, 'byte')} left out"
 
 
-def _parameter(value: Any, system: int) -> VehicleParameter:
+def _make_parameter(value: Any, system: int) -> VehicleParameter:
     kind = "INT32" if isinstance(value, int) else "REAL32"
     return VehicleParameter(value=value, type=kind, system=system, component=1)
 
 
-def _name(topic: Any) -> str:
+def _make_topic_name(topic: Any) -> str:
     name = plain_text(topic.name)
     return f"{name} {topic.multi_id}" if topic.multi_id else name
 
 
-def _vector(fields: dict[str, Any], name: str, older: Sequence[str]) -> Sequence[str]:
+def _list_vector_fields(fields: dict[str, Any], name: str, older: Sequence[str]) -> Sequence[str]:
     """Return the names of a vector's fields: an array, in older versions three numbers."""
     return older if older[0] in fields else [f"{name}[{axis}]" for axis in range(3)]
 
 
-def _columns(fields: dict[str, Any], *names: str) -> Array:
+def _make_columns(fields: dict[str, Any], *names: str) -> Array:
     """Return fields as columns, NaN where there is no such field."""
     missing = np.full(len(fields["timestamp"]), math.nan)
     return np.column_stack([fields.get(name, missing) for name in names]).astype(np.float64)

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from logs.recording.flight import FlightData
-from logs.recording.info import info
+from logs.recording.info import read_info
 from logs.recording.parameters import VehicleParameter
 from logs.recording.reader import RecordedMessage, good_messages, read
 from logs.recording.replay import leaves
-from logs.recording.summary import FlightSummary, Percentiles, position_error_m, summarise
-from logs.recording.topics import HEADER, LIBRARY, RECORDER, decode, raw_link
+from logs.recording.summary import FlightSummary, Percentiles, compute_position_errors_m, summarise
+from logs.recording.topics import HEADER, LIBRARY, RECORDER, decode, parse_raw_topic
 from uavctl.config.load import dotted
 from uavctl.errors import RecordingError
 from uavctl.mavlink.framing import scan
@@ -67,7 +67,7 @@ def load_flights(paths: Sequence[Path], on_loaded: Callable[[], None] = lambda: 
 
 
 def _load_flight(path: Path, name: str) -> LoadedFlight:
-    file_info = info(path)
+    file_info = read_info(path)
     flight = FlightData.from_records(read(path), path)
     summary = summarise(flight, wall_s=None)
     identity = ComparedFlight(
@@ -127,7 +127,7 @@ def _collect_rows(recording: LoadedFlight) -> tuple[_Row, ...]:
     """Return the figures of one flight; those of the summary keep its keys."""
     s, flight = recording.summary, recording.flight
     ages = [d.age_steps for d in flight.steps.decisions if d.age_steps is not None]
-    error_m = position_error_m(flight)
+    error_m = compute_position_errors_m(flight)
     inputs = np.linalg.norm(flight.steps.input, axis=1)
     methods = {**dict.fromkeys(("frozen", "mixture", "exact"), 0), **s.methods}
     in_fallback_s = sum((b - a for a, b in flight.fallback_spans), 0.0)
@@ -274,7 +274,7 @@ def _find_divergence(
             f"{message.definition.topic} at {(message.at_ns - origin_ns) * 1e-9:.3f} s"
             for message in (first_message, other_message)
         )
-    elif raw_link(topic) is not None:
+    elif parse_raw_topic(topic) is not None:
         contents = (_describe_frame(first_message.data), _describe_frame(other_message.data))
     else:
         field, first_value, other_value = leaves(

@@ -10,7 +10,7 @@ from markupsafe import Markup
 from matplotlib.axes import Axes
 
 from logs.recording.design_view import AXIS_NUMBER
-from logs.recording.disk import spare_recording, write_whole
+from logs.recording.disk import refuse_recording_path, write_atomically
 from logs.recording.flight import FlightData
 from logs.report import page
 from logs.report.compare import FlightComparison, LoadedFlight
@@ -45,12 +45,12 @@ def write_comparison_page(comparison: FlightComparison, recordings: Sequence[Loa
         RecordingError: The file cannot be written.
         UsageError: More flights than can be told apart in one drawing, or `path` is that of a recording.
     """
-    spare_recording(path)
+    refuse_recording_path(path)
     if len(recordings) > len(_ROLES):
         raise UsageError(
             f"--out draws {len(_ROLES)} flights at most, these are {len(recordings)}; compare fewer at a time"
         )
-    write_whole(path, render_comparison(comparison, recordings))
+    write_atomically(path, render_comparison(comparison, recordings))
 
 
 def render_comparison(comparison: FlightComparison, recordings: Sequence[LoadedFlight]) -> str:

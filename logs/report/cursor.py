@@ -9,7 +9,7 @@ from itertools import groupby
 import numpy as np
 
 from logs.recording.flight import FlightData
-from logs.recording.summary import box_at
+from logs.recording.summary import compute_box
 from logs.report.excursion import select_trusted_estimates
 from logs.report.plots import DISPLAY_AXES, VIEWS
 from uavctl.arrays import Array
@@ -53,7 +53,7 @@ def _list_moving_limits(flight: FlightData) -> list[dict[str, object]]:
     design, limits = flight.design, []
     for view, (axes, _) in VIEWS.items():
         for axis in set(axes) & set(design.axes):
-            for side in box_at(flight, t_s):
+            for side in compute_box(flight, t_s):
                 values = DISPLAY_AXES[axis][1] * side[:, design.position_index[design.axes.index(axis)]]
                 if np.isfinite(values).all() and np.ptp(values):
                     positions = np.zeros((len(t_s), 3))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from logs.recording.design_view import AXIS_NUMBER
 from logs.recording.flight import FLOWN, FlightData
-from logs.recording.summary import BLIND_S, RELATIVE_TOLERANCE, box_at
+from logs.recording.summary import BLIND_S, RELATIVE_TOLERANCE, compute_box
 from uavctl.arrays import Array
 from uavctl.records import Estimate
 
@@ -64,7 +64,7 @@ class Clearance:
         """Measure a flight; without rows where nothing was flown."""
         design = flight.design
         t_s, position_m, flown = _collect_airborne_positions(flight)
-        lower, upper = box_at(flight, t_s)
+        lower, upper = compute_box(flight, t_s)
         box, walls, free = design.state_box, [], []
 
         def measure(name: str, axis: str, side: int, bound: Array) -> None:

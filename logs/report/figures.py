@@ -12,7 +12,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocato
 from numpy.typing import NDArray
 
 from logs.recording.flight import FlightData
-from logs.recording.summary import decision_times_us
+from logs.recording.summary import get_decision_times_us
 from logs.report.plots import (
     DASHED,
     draw_path,
@@ -152,10 +152,14 @@ def draw_timing(flight: FlightData) -> Iterator[Drawing]:
         return
     solved = {d.tick for d in flight.decisions if d.solve is not None}
     timings = [t for t in flight.timings if t.tick in solved] or list(flight.timings)
-    if not has_variation(decision_times_us(flight)):
+    if not has_variation(get_decision_times_us(flight)):
         return
     yield _draw_times(
-        flight, "time-decision", "Decision time", flight.seconds([t.at_ns for t in timings]), decision_times_us(flight)
+        flight,
+        "time-decision",
+        "Decision time",
+        flight.seconds([t.at_ns for t in timings]),
+        get_decision_times_us(flight),
     )
     if flight.virtual_time:
         return

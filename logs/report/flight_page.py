@@ -8,11 +8,11 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from logs.recording.design_view import config_name
-from logs.recording.disk import write_whole
+from logs.recording.design_view import get_config_name
+from logs.recording.disk import write_atomically
 from logs.recording.flight import FlightData
 from logs.recording.reader import read
-from logs.recording.summary import FlightSummary, input_outside, rows, state_outside
+from logs.recording.summary import FlightSummary, find_input_violations, find_state_violations, list_summary_rows
 from logs.report import figures, link_figures, page, plan_figures, plots
 from logs.report.cursor import render_cursor_script
 from logs.report.excursion import find_excursions
@@ -49,14 +49,14 @@ def write_report(flight: FlightData, summary: FlightSummary, path: Path, judged:
     Raises:
         RecordingError: the file cannot be written.
     """
-    write_whole(path, render_report(flight, summary, judged))
+    write_atomically(path, render_report(flight, summary, judged))
 
 
 def render_report(flight: FlightData, summary: FlightSummary, judged: Judgement | None = None) -> str:
     """Return the page of a flight as HTML."""
     judged = judge_flight(flight) if judged is None else judged
     header = flight.header
-    name = config_name(header)
+    name = get_config_name(header)
     title = f"Flight “{name}”" if name else "Flight"
     title += ", a part" if describe_part_begin(flight) else ""
     subtitle = f"{header.started_utc} · {header.command} · seed {header.seed}"
@@ -94,7 +94,7 @@ def _make_sections(flight: FlightData, summary: FlightSummary, judged: Judgement
 
 
 def _make_summary_section(flight: FlightData, summary: FlightSummary, judged: Judgement) -> PageSection:
-    facts = page.render_facts([*rows(summary), *make_verdict_rows(judged.verdicts)])
+    facts = page.render_facts([*list_summary_rows(summary), *make_verdict_rows(judged.verdicts)])
     return PageSection("Summary", "", page.render_list(describe_flight(flight, summary)) + facts)
 
 
@@ -129,7 +129,7 @@ def _make_axes_section(flight: FlightData) -> PageSection:
             _TARGET,
             _LIMIT,
             Mark("band", "limit", "reserve kept"),
-            *((_OUTSIDE,) if state_outside(flight).any() else ()),
+            *((_OUTSIDE,) if find_state_violations(flight).any() else ()),
             *_make_fallback_mark(flight),
         ),
     )
@@ -204,7 +204,7 @@ def _make_inputs_section(flight: FlightData) -> PageSection:
         "The colour tells how far into its plan the controller was when it gave the input: from blue, the first step "
         "of a plan, to orange, its last.",
         page.render_grid(list(figures.draw_inputs(flight))),
-        (_LIMIT, *((_OUTSIDE,) if input_outside(flight).any() else ()), *_make_fallback_mark(flight)),
+        (_LIMIT, *((_OUTSIDE,) if find_input_violations(flight).any() else ()), *_make_fallback_mark(flight)),
     )
 
 

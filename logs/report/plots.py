@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 
 from logs.recording.design_view import AXIS_NUMBER, DesignView
 from logs.recording.flight import FlightData
-from logs.recording.summary import RELATIVE_TOLERANCE, WIRE_TOLERANCE, box_at, limits_at, position_error_m
+from logs.recording.summary import (
+    RELATIVE_TOLERANCE,
+    WIRE_TOLERANCE,
+    compute_box,
+    compute_limits,
+    compute_position_errors_m,
+)
 from logs.report.excursion import Excursion, find_excursions, select_trusted_estimates
 from logs.report.svg import Drawing, colour, draw_dots, open_canvas
 from uavctl.arrays import Array
@@ -61,7 +67,7 @@ def find_moving_limits(flight: FlightData) -> list[MovingLimit]:
     """Return the limits of position that move over the flight."""
     t_s, design = np.linspace(0.0, flight.duration_s, LIMIT_SAMPLES), flight.design
     moving_limits = []
-    for upper, sides in enumerate(box_at(flight, t_s)):
+    for upper, sides in enumerate(compute_box(flight, t_s)):
         for axis, state in zip(design.axes, design.position_index, strict=True):
             side = sides[:, state]
             if np.isfinite(side).all() and np.ptp(side) > 0.0:
@@ -268,7 +274,7 @@ def _draw_state(flight: FlightData, axis: str, index: int, y_label: str, title: 
 
 def find_state_violations(flight: FlightData, index: int) -> NDArray[np.bool_]:
     """Return at which flown boundaries a limit that a state has a part in is violated (n,)."""
-    states, limits = flight.steps.state, limits_at(flight, flight.steps.t_s)
+    states, limits = flight.steps.state, compute_limits(flight, flight.steps.t_s)
     rows = np.flatnonzero([normal[index] != 0.0 for normal in flight.design.c_x])
     return _find_violations(states, np.array(flight.design.c_x)[rows], limits[:, rows], RELATIVE_TOLERANCE)
 
@@ -301,7 +307,7 @@ def draw_limits(ax: Axes, flight: FlightData, index: int, sign: float) -> None:
     plans = list(flight.flown_plans.values())
     t_s = flight.seconds([plan.base_ns for plan in plans])
     all_s = np.linspace(0.0, flight.duration_s, LIMIT_SAMPLES)
-    at_plans, at_all = box_at(flight, t_s), box_at(flight, all_s)
+    at_plans, at_all = compute_box(flight, t_s), compute_box(flight, all_s)
     for side_index, row, inward_sign in ((0, box.row_lower[index], 1.0), (1, box.row_upper[index], -1.0)):
         if row < 0:
             continue
@@ -407,7 +413,7 @@ def _compute_plan_times(flight: FlightData, plan: Plan) -> Array:
 def choose_plans(flight: FlightData) -> list[Plan]:
     """Choose at most six plans on the way to the target: of each sixth of it the one flown longest."""
     steps, plans = flight.steps, flight.flown_plans
-    error_m = position_error_m(flight)
+    error_m = compute_position_errors_m(flight)
     if not plans or not len(steps):
         return []
     arrival_indices = np.flatnonzero(error_m <= ARRIVAL_SHARE * error_m[0])

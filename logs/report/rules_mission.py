@@ -7,7 +7,15 @@ from collections.abc import Iterator
 import numpy as np
 
 from logs.recording.flight import FLOWN
-from logs.recording.summary import ARRIVED_M, box_at, count, input_outside, limits_at, position_error_m, state_outside
+from logs.recording.summary import (
+    ARRIVED_M,
+    compute_box,
+    compute_limits,
+    compute_position_errors_m,
+    count,
+    find_input_violations,
+    find_state_violations,
+)
 from logs.report.causes import BAD, CAUTION, Finding, HeadlineCause, metres, seconds
 from logs.report.evidence import HEARTBEAT_S, FlightEvidence
 from logs.report.rules_loss import NEGLIGIBLE_SHARE, find_battery_fault
@@ -121,10 +129,10 @@ def find_limit_violations(e: FlightEvidence) -> Iterator[Finding]:
     the risk judges the promise.
     """
     flight, design, steps = e.flight, e.flight.design, e.flight.steps
-    normals, limits = np.array(design.c_x).reshape(-1, len(design.q_x)), limits_at(flight, steps.t_s)
+    normals, limits = np.array(design.c_x).reshape(-1, len(design.q_x)), compute_limits(flight, steps.t_s)
     other_rows = np.flatnonzero((np.delete(normals, design.position_index, axis=1) != 0.0).any(axis=1))
     excess = (steps.state @ normals.T - limits)[:, other_rows]
-    outside = state_outside(flight) & ~(excess <= 0.0).all(axis=1)
+    outside = find_state_violations(flight) & ~(excess <= 0.0).all(axis=1)
     if _is_significant(excess, limits[:, other_rows], outside):
         at_s, text = float(steps.t_s[outside][0]), f"{outside.sum()} of {count(len(steps), 'step')} outside"
         row, worst = np.unravel_index(int(np.nan_to_num(excess, nan=-np.inf).argmax()), excess.shape)
@@ -137,7 +145,7 @@ def find_limit_violations(e: FlightEvidence) -> Iterator[Finding]:
             unit = " m/s" if index in design.velocity_index else ""
             text = f"{max_excess:.2g}{unit} beyond the limit of {design.state_name(index)} at {seconds(at_s)} ({text})"
         yield Finding(HeadlineCause.BEYOND_LIMIT, at_s, text)
-    outside = input_outside(flight)
+    outside = find_input_violations(flight)
     input_extremes = np.fmax(steps.decided, steps.input), np.fmin(steps.decided, steps.input)
     normals, bounds = np.array(design.c_u).reshape(-1, len(design.q_u)), np.array(design.b_u)
     excess = np.maximum(*(values @ normals.T - bounds for values in input_extremes))
@@ -181,7 +189,7 @@ def find_mission_miss(e: FlightEvidence) -> Iterator[Finding]:
     last_s = float(flight.steps.t_s[-1])
     if s.trajectory:
         yield from _find_short_trajectory(e, last_s)
-    elif s.final_error_m > max(accept_m, _ARRIVAL_SHARE * float(position_error_m(flight)[0])):
+    elif s.final_error_m > max(accept_m, _ARRIVAL_SHARE * float(compute_position_errors_m(flight)[0])):
         yield Finding(
             HeadlineCause.NOT_REACHED,
             last_s,
@@ -198,7 +206,7 @@ def find_mission_miss(e: FlightEvidence) -> Iterator[Finding]:
                 f"{max(reached_waypoints)} of {count(len(waypoints), 'waypoint')} were reached",
             )
     if s.course_rms_m is None or s.course_worst_m is None or s.course_worst_s is None:
-        near_m, at_s = float(position_error_m(flight).min()), last_s
+        near_m, at_s = float(compute_position_errors_m(flight).min()), last_s
         cause = HeadlineCause.OFF_TRACK if s.trajectory else HeadlineCause.NOT_REACHED
         yield Finding(cause, at_s, f"it never came nearer to its target than {metres(near_m)}")
     elif s.course_worst_m > accept_m or s.course_rms_m > _MAX_RMS_SHARE * accept_m:
@@ -226,7 +234,7 @@ def _describe_unreachable_target(e: FlightEvidence) -> str:
     flight, design = e.flight, e.flight.design
     index = list(design.position_index)
     target = flight.steps.target[-1, index]
-    lower, upper = (side[0, index] for side in box_at(flight, flight.steps.t_s[-1:]))
+    lower, upper = (side[0, index] for side in compute_box(flight, flight.steps.t_s[-1:]))
     excess_m = np.maximum(lower - target, target - upper)
     worst_axis = int(excess_m.argmax())
     if excess_m[worst_axis] <= 0.0:

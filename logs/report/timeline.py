@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from logs.recording.flight import FlightData
-from logs.recording.summary import SLACK_TOLERANCE, input_outside, state_outside
+from logs.recording.summary import SLACK_TOLERANCE, find_input_violations, find_state_violations
 from logs.report.page import Mark
 from logs.report.plots import set_time_axis
 from logs.report.svg import WIDTH_IN, Drawing, colour, draw_strokes, open_canvas
@@ -143,8 +143,8 @@ def make_lanes(flight: FlightData) -> Iterator[Lane]:
             "a plan that was not found",
             (d for d in decisions if d.solve not in (None, SolveStatus.OPTIMAL)),
         ),
-        Lane("outside", "the state beyond a limit", marks=("limit", flight.steps.t_s[state_outside(flight)])),
-        Lane("input over", "an input beyond a limit", marks=("limit", flight.steps.t_s[input_outside(flight)])),
+        Lane("outside", "the state beyond a limit", marks=("limit", flight.steps.t_s[find_state_violations(flight)])),
+        Lane("input over", "an input beyond a limit", marks=("limit", flight.steps.t_s[find_input_violations(flight)])),
         *(
             _make_mark_lane(
                 flight, name, role, f"{text} among the events", (e for e in flight.events if e.severity is severity)

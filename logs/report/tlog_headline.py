@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from logs.recording.mavlink_flight import HeardTrack, MavlinkFlight, MavlinkFlightInfo
-from logs.recording.summary import ARRIVED_M, BLIND_S, count, errors_from_arrival
+from logs.recording.mavlink_flight import MavlinkFlight, MavlinkFlightInfo, PositionTrack
+from logs.recording.summary import ARRIVED_M, BLIND_S, compute_errors_from_arrival, count
 from logs.report.battery import find_battery_faults
 from logs.report.causes import BAD, Finding, Headline, HeadlineCause, make_headline, metres, seconds, sort_findings
 from logs.report.vehicle_texts import FAILSAFE_MODES, classify_text
@@ -215,7 +215,7 @@ def _find_longest_gap(t_s: Array, spans: Sequence[tuple[float, float]]) -> tuple
     return longest
 
 
-def _measure_motion(track: HeardTrack, since_s: float, duration_s: float) -> float:
+def _measure_motion(track: PositionTrack, since_s: float, duration_s: float) -> float:
     """Return how far a track went in a time [m]."""
     positions_m = track.position_m[(track.t_s >= since_s) & (track.t_s <= since_s + duration_s)]
     return float(np.linalg.norm(positions_m - positions_m[0], axis=1).max()) if len(positions_m) else 0.0
@@ -288,7 +288,7 @@ def _measure_disagreement(armed: ArmedFlight) -> tuple[float, float, str]:
     return worst
 
 
-def _interpolate_track(track: HeardTrack, at_s: Array) -> Array:
+def _interpolate_track(track: PositionTrack, at_s: Array) -> Array:
     """Return the places of a track at some times (n, 3) [m]."""
     return np.column_stack([np.interp(at_s, track.t_s, track.position_m[:, axis]) for axis in range(3)])
 
@@ -311,7 +311,7 @@ def _find_track_error(armed: ArmedFlight) -> Iterator[Finding]:
     if np.count_nonzero(has_moved) > 0.5 * len(has_moved):
         has_moved[:] = False
     error_m = np.linalg.norm(_interpolate_track(flight.own, at_s) - setpoint_m, axis=1)
-    errors = errors_from_arrival(at_s, error_m, has_moved)
+    errors = compute_errors_from_arrival(at_s, error_m, has_moved)
     if errors is not None and (errors.worst_m > ARRIVED_M or errors.rms_m > _MAX_RMS_SHARE * ARRIVED_M):
         max_text = f"at most {metres(errors.worst_m)} at {seconds(errors.worst_s)}"
         text = f"{metres(errors.rms_m)} from its setpoints (rms), {max_text}"

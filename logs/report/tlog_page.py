@@ -9,7 +9,7 @@ import numpy as np
 from markupsafe import Markup
 
 from logs.recording.design_view import AXIS_NUMBER
-from logs.recording.disk import write_whole
+from logs.recording.disk import write_atomically
 from logs.recording.mavlink_flight import Ages, MavlinkFlight, MavlinkFlightInfo, facts_of, rate_of
 from logs.report import page
 from logs.report.figures import thin_keeping_largest
@@ -32,7 +32,7 @@ def write_tlog_page(flight: MavlinkFlight, path: Path) -> None:
     Raises:
         RecordingError: The file cannot be written.
     """
-    write_whole(path, render_tlog_page(flight))
+    write_atomically(path, render_tlog_page(flight))
 
 
 def render_tlog_page(flight: MavlinkFlight) -> str:

@@ -15,7 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from logs.recording.flight import FlightData
-from logs.recording.summary import RELATIVE_TOLERANCE, SLACK_TOLERANCE, count, input_outside, limits_at, state_outside
+from logs.recording.summary import (
+    RELATIVE_TOLERANCE,
+    SLACK_TOLERANCE,
+    compute_limits,
+    count,
+    find_input_violations,
+    find_state_violations,
+)
 from logs.report.statistics import LEVEL, Share, binomial_p_value, estimate_share
 from uavctl.config import Config
 from uavctl.records import ControlMode
@@ -53,8 +60,8 @@ def judge_risk(flight: FlightData, config: Config | None) -> RiskVerdict:
     risk_x, risk_u = (None, None) if config is None else map(_to_risk, (config.smpc.delta_x, config.smpc.delta_u))
     tests = 2 + violated_rows.shape[1]
     limits = [
-        _judge_limit("all states", risk_x, state_outside(flight), is_trial, tests),
-        _judge_limit("all inputs", risk_u, input_outside(flight), is_trial, tests),
+        _judge_limit("all states", risk_x, find_state_violations(flight), is_trial, tests),
+        _judge_limit("all inputs", risk_u, find_input_violations(flight), is_trial, tests),
         *(
             _judge_limit(name, risk_x, violated_rows[:, row], is_trial, tests)
             for row, (name, _, _) in enumerate(flight.design.names.rows)
@@ -108,7 +115,7 @@ def _find_trials(flight: FlightData) -> tuple[Flags, Flags]:
 
 def _find_violated_rows(flight: FlightData) -> Flags:
     """Return which rows of the state set are violated at each flown boundary (n, rows)."""
-    limits = limits_at(flight, flight.steps.t_s)
+    limits = compute_limits(flight, flight.steps.t_s)
     row_values = flight.steps.state @ np.array(flight.design.c_x).reshape(-1, flight.steps.state.shape[1]).T
     return np.asarray(~(row_values <= limits + RELATIVE_TOLERANCE * np.maximum(1.0, np.abs(limits))))
 

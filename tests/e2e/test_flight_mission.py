@@ -15,7 +15,7 @@ from report_rig import unwritten
 from told_numbers import numbers_in
 
 from logs.recording.replay import replay
-from logs.recording.summary import box_at, position_error_m, rows, summarise
+from logs.recording.summary import compute_box, compute_position_errors_m, list_summary_rows, summarise
 from logs.report.causes import HeadlineCause
 from logs.report.flight_page import render_report
 from logs.report.headline import derive_headline
@@ -187,10 +187,10 @@ def test_the_report_shows_the_target_of_the_moment_and_the_moving_limit() -> Non
     (sentence,) = [text for text in describe_flight(data, summarise(data, wall_s=1.0)) if "set out" in text]
     assert numbers_in(sentence)[::2] == [2.0, 3.0]  # waypoints, each with its time
     assert sentence.replace("&", "&amp;") in html
-    assert position_error_m(data)[-1] < 0.3
+    assert compute_position_errors_m(data)[-1] < 0.3
     fenced = flight(flown(22.0, *FENCE))
     begun_s = fenced.targets[0][0]
-    lower, upper = box_at(fenced, begun_s + np.array([0.0, 10.0, 100.0]))
+    lower, upper = compute_box(fenced, begun_s + np.array([0.0, 10.0, 100.0]))
     assert upper[:, 0].tolist() == pytest.approx([3.0, 1.95, 0.9])
     assert lower[:, 0].tolist() == [-3.0] * 3
     assert render_report(fenced, summarise(fenced, wall_s=1.0)).startswith("<!DOCTYPE html>")
@@ -198,14 +198,14 @@ def test_the_report_shows_the_target_of_the_moment_and_the_moving_limit() -> Non
     assert moving.moving_target and not data.moving_target
     summary = summarise(moving, wall_s=1.0)
     assert render_report(moving, summary).startswith("<!DOCTYPE html>")
-    assert summary.trajectory and "Distance from trajectory" in dict(rows(summary))
-    assert "Distance from target" in dict(rows(summarise(data, wall_s=1.0)))
+    assert summary.trajectory and "Distance from trajectory" in dict(list_summary_rows(summary))
+    assert "Distance from target" in dict(list_summary_rows(summarise(data, wall_s=1.0)))
     told = describe_flight(moving, summary)
     (sentence,) = [text for text in told if "follow a trajectory" in text]
     assert not any("from the target" in text or "waypoint" in text for text in told)
     # 40 chords of the circle, one a sample, of which each is cut into pieces of a step.
     length_m, begun_s, ended_s = numbers_in(sentence)
-    error_m = position_error_m(moving)
+    error_m = compute_position_errors_m(moving)
     assert length_m == pytest.approx(2 * 2 * np.pi * 0.9, rel=0.01)
     assert ended_s - begun_s == pytest.approx(20.0, abs=0.5)
     assert summary.course_rms_m is not None and summary.course_worst_m is not None

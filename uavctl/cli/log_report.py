@@ -11,12 +11,12 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from logs.recording.disk import FileKind, spare_recording, write_whole
+from logs.recording.disk import FileKind, refuse_recording_path, write_atomically
 from logs.recording.flight import FlightData
-from logs.recording.foreign import foreign_flight
+from logs.recording.foreign import read_foreign_flight
 from logs.recording.mavlink_flight import MavlinkFlight, facts_of
 from logs.recording.reader import lacks_end, read
-from logs.recording.summary import names_and_values, render, summarise
+from logs.recording.summary import make_summary_table, make_value_table, summarise
 from logs.recording.ulog import is_ulog
 from logs.report.causes import Headline
 from logs.report.compare import ComparedFlight, FlightComparison, compare_flights, load_flights
@@ -91,7 +91,7 @@ def _sides(sides: tuple[ComparedFlight, ...]) -> RenderableType:
         state = "" if one.finished else ", torn"
         return f"{one.recording}\nconfig {one.config}, seed {one.seed}, {one.started_utc}; {one.ended}{state}"
 
-    return names_and_values((one.name, told(one)) for one in sides)
+    return make_value_table((one.name, told(one)) for one in sides)
 
 
 def _parameters(found: FlightComparison) -> Table:
@@ -131,8 +131,8 @@ def report(
     """Write the page of a recording, of a .tlog, or of a ULog of PX4: one HTML file that needs nothing else."""
     page = out if out is not None else flight.with_suffix(".html")
     for target in (page, *(() if svg is None else (svg,))):
-        spare_recording(target)
-    foreign = foreign_flight(flight, system)
+        refuse_recording_path(target)
+    foreign = read_foreign_flight(flight, system)
     if foreign is not None:
         return _report_foreign(flight, foreign, page, svg, Common(json=json))
     data = FlightData.from_records(read(flight), flight)
@@ -140,14 +140,14 @@ def report(
     summary = summarise(data, wall_s=None, recording=str(flight), report=str(page), recorder_dropped=dropped)
     judged = judge_flight(data)
     if svg is not None:
-        write_whole(svg, draw_overview(data))
+        write_atomically(svg, draw_overview(data))
     write_report(data, summary, page, judged)
     if cut := lacks_end(flight):
         warn(f"{cut}: shown up to there")
     main = derive_headline(data, summary, judged)
     document = {**msgspec.structs.asdict(summary), "verdicts": judged.verdicts, "headline": main.document()}
     Common(json=json).show(
-        "log/report", document, lambda: _told(main, render(summary, make_verdict_rows(judged.verdicts)))
+        "log/report", document, lambda: _told(main, make_summary_table(summary, make_verdict_rows(judged.verdicts)))
     )
     return 0
 

@@ -19,7 +19,7 @@ from synthetic_scene import room
 
 from logs.recording.flight import FlightData
 from logs.recording.mavlink_flight import read_flight
-from logs.recording.summary import course_error, position_error_m, summarise
+from logs.recording.summary import compute_course_error, compute_position_errors_m, summarise
 from logs.recording.topics import RECOVERED, RecorderNote
 from logs.report.causes import GOOD, Headline, HeadlineCause, sort_findings
 from logs.report.headline import derive_headline
@@ -292,9 +292,9 @@ def test_the_whole_course_counts_and_not_its_end(good: FlightData, off_m: float)
     state[:, good.design.position_index[0]] += off_m * ((steps.t_s > 5.0) & (steps.t_s < 9.0))
     moved = dataclasses.replace(good)
     moved.__dict__["steps"] = dataclasses.replace(steps, state=state)
-    headline, error = head(moved), course_error(moved)
+    headline, error = head(moved), compute_course_error(moved)
     assert error is not None and (C.OFF_TRACK in headline.causes) == bool(off_m)
-    assert error.worst_m == pytest.approx(position_error_m(moved)[steps.t_s >= 5.0].max()) or not off_m
+    assert error.worst_m == pytest.approx(compute_position_errors_m(moved)[steps.t_s >= 5.0].max()) or not off_m
     assert not off_m or 5.0 < error.worst_s < 9.0
 
 

@@ -18,9 +18,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from logs.recording.disk import write_whole
+from logs.recording.disk import write_atomically
 from logs.recording.flight import FlightData
-from logs.recording.summary import position_error_m
+from logs.recording.summary import compute_position_errors_m
 from logs.report.page import Mark, PageSection, render_grid, render_page, render_table
 from logs.report.plots import DASHED, DOTTED
 from logs.report.svg import Drawing, colour, open_canvas
@@ -75,7 +75,7 @@ def figures_of(flight: FlightData, recording: str, fallbacks: int, box: SafeBox 
     """
     steps = flight.steps
     held = holding(flight)
-    distances = position_error_m(flight)[held]
+    distances = compute_position_errors_m(flight)[held]
     hold_s = float(np.count_nonzero(held)) * flight.design.dt_s
     enough = hold_s >= LEAST_HOLD_S
     planned = plan_errors_m(flight)
@@ -196,7 +196,7 @@ class TuneFolder:
             path.mkdir(parents=True, exist_ok=True)
             folder = cls(path, TuneProgress(asked=asked, digest=digest))
             folder.note()
-            write_whole(path / SETTINGS, text)
+            write_atomically(path / SETTINGS, text)
             return folder
         progress = _read(path / STATE)
         if progress.digest != digest:
@@ -212,7 +212,7 @@ class TuneFolder:
             )
         folder = cls(path, progress)
         if not (path / SETTINGS).exists():
-            write_whole(path / SETTINGS, text)
+            write_atomically(path / SETTINGS, text)
         if progress.comparison is None:
             folder.note()  # a folder that takes no more is told before anything is flown
         return folder
@@ -224,7 +224,7 @@ class TuneFolder:
             RecordingError: It cannot be written.
         """
         self.progress = msgspec.structs.replace(self.progress, **done)
-        write_whole(self.path / STATE, msgspec.json.format(msgspec.json.encode(self.progress)).decode() + "\n")
+        write_atomically(self.path / STATE, msgspec.json.format(msgspec.json.encode(self.progress)).decode() + "\n")
 
     def free(self, name: str) -> Path:
         """Return a folder for one more flight: the first of NAME, NAME-2, NAME-3, … that does not exist yet."""
@@ -470,7 +470,7 @@ def _held(before: FlightData, after: FlightData) -> Drawing:
             held, steps = holding(flight), flight.steps
             if not held.any():
                 continue
-            off = position_error_m(flight)[held]
+            off = compute_position_errors_m(flight)[held]
             ax.plot(steps.t_s[held] - steps.t_s[held][0], 100.0 * off, color=colour(role))
         ax.set_ylim(bottom=0.0)
     return Drawing("held", drawn.svg, "distance from the last place over the time of holding, of both flights")

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from logs.recording.flight import FlightData
-from logs.recording.summary import FlightSummary, rows
+from logs.recording.summary import FlightSummary, list_summary_rows
 from logs.recording.topics import RecorderNote, encode
 from logs.report.page import Mark, PageSection, render_grid, render_page, render_table
 from logs.report.plots import DASHED, DOTTED, draw_limits
@@ -237,7 +237,7 @@ def story(found: WhatIf) -> list[str]:
 def side_by_side(found: WhatIf) -> Iterator[tuple[str, ...]]:
     """Return rows of the figures: name, recorded, reproduced, what-if."""
     bare = [replace(one, recording=None, report=None) for one in (found.recorded, found.reproduced, found.what_if)]
-    columns = [dict(rows(one)) for one in bare]
+    columns = [dict(list_summary_rows(one)) for one in bare]
     for name in dict.fromkeys(name for column in columns for name in column):
         if name not in _NOT_FLOWN:
             yield (name, *(column.get(name, "-") for column in columns))
