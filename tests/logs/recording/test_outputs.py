@@ -39,7 +39,8 @@ def test_a_text_that_does_not_fit_leaves_the_one_before(tmp_path: Path) -> None:
 
 def test_a_text_goes_through_what_is_no_file(tmp_path: Path) -> None:
     script = (
-        "from pathlib import Path; from logs.recording.disk import write_atomically; write_atomically(Path('/dev/stdout'), 'a')"
+        "from pathlib import Path; from logs.recording.disk import write_atomically; "
+        "write_atomically(Path('/dev/stdout'), 'a')"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout == "a"
