@@ -19,8 +19,9 @@ from typing import Literal, TypeVar
 
 import msgspec
 
-from logs.recording.derived_topics import tightened
-from logs.recording.design_view import AXIS_NUMBER, DesignView, Floats, config_name, design_view
+from logs.recording.derived_topics import tighten_limits
+from logs.recording.design_view import AXIS_NUMBER, DesignView, get_config_name, read_design
+from uavctl.arrays import Array
 from uavctl.errors import RecordingError, UsageError
 from uavctl.records import (
     ControlMode,
@@ -117,9 +118,9 @@ class FlightScene:
         if isinstance(record, Event):
             self._events.append(record)
         elif isinstance(record, Header):
-            self._name = config_name(record)
+            self._name = get_config_name(record)
             try:
-                self._design = design_view(record)
+                self._design = read_design(record)
             except RecordingError:
                 self._design = None  # the page then draws no limits
 
@@ -139,19 +140,19 @@ class FlightScene:
         if truth is not None:
             bodies.append(SceneBody("truth", truth.position_m, "plain"))
         current = plan if plan is not None and plan.seq == decision.plan_seq else None
-        level = _level_of(decision, age_s, limit_s)
+        level = _get_level(decision, age_s, limit_s)
         return LiveScene(
             title=f"uavctl: {self._name}" if self._name else "uavctl",
             time_s=(decision.at_ns - header.started_ns) * 1e-9,
-            headline=_headline(decision, age_s),
+            headline=_make_headline(decision, age_s),
             level=level,
             bodies=tuple(bodies),
-            plan=() if current is None or design is None else _places(design, current),
+            plan=() if current is None or design is None else _list_positions(design, current),
             target_m=None if decision.target is None or design is None else design.position_of(decision.target),
-            box=None if design is None else _box(design, design.state_box.lower, design.state_box.upper),
+            box=None if design is None else _make_box(design, design.state_box.lower, design.state_box.upper),
             margins=None
             if current is None or design is None
-            else _box(design, *tightened(design, current.backoff_x, -1)),
+            else _make_box(design, *tighten_limits(design, current.backoff_x, -1)),
             age_s=age_s,
             age_limit_s=limit_s,
             figures=tuple(self._figures(decision, current)),
@@ -190,24 +191,24 @@ class FlightScene:
         return found if isinstance(found, kind) else None
 
 
-def _headline(decision: Decision, age_s: float | None) -> str:
+def _make_headline(decision: Decision, age_s: float | None) -> str:
     age = "no position yet" if age_s is None else f"newest position {age_s:.2f} s old"
     why = "" if decision.mode in _IN_CONTROL else decision.reason
     return f"{decision.mode.value}: {why or age}"
 
 
-def _level_of(decision: Decision, age_s: float | None, limit_s: float | None) -> Level:
+def _get_level(decision: Decision, age_s: float | None, limit_s: float | None) -> Level:
     if decision.mode not in _IN_CONTROL:
         return "bad"
     return "warn" if age_s is None or (limit_s is not None and age_s > 0.5 * limit_s) else "good"
 
 
-def _places(design: DesignView, plan: Plan) -> tuple[Vec3, ...]:
+def _list_positions(design: DesignView, plan: Plan) -> tuple[Vec3, ...]:
     rows = design.positions_of(plan.states).tolist()
     return tuple((north, east, down) for north, east, down in rows)
 
 
-def _box(design: DesignView, lower: Floats, upper: Floats) -> SceneBox:
+def _make_box(design: DesignView, lower: Array, upper: Array) -> SceneBox:
     """Return the limits of the positions among those of the states."""
     sides: list[tuple[float | None, ...]] = []
     for limits in (lower, upper):
@@ -223,7 +224,7 @@ Look = Callable[[], LiveScene | None]
 
 
 @contextmanager
-def live_page(look: Look, port: int) -> Iterator[str]:
+def serve_live_page(look: Look, port: int) -> Iterator[str]:
     """Serve the page on this machine alone; yields its address.
 
     Args:

@@ -12,7 +12,7 @@ from msgspec import NODEFAULT
 from msgspec.structs import FieldInfo
 
 from logs.recording.derived_topics import VIEWS, DerivedTopic
-from logs.recording.topics import TOPICS, definition
+from logs.recording.topics import TOPICS, get_definition
 from uavctl.cli.app import app
 from uavctl.config.document import Section, describe_type, get_description, get_element_type, is_section
 from uavctl.config.room import RoomConfig
@@ -133,7 +133,7 @@ def topics_page() -> str:
     ]
     for topic in TOPICS:
         lines += [f"## `{topic.name}`", "", (topic.record.__doc__ or "").strip(), "", "| field | type |", "|---|---|"]
-        properties = msgspec.json.decode(definition(topic.name).schema)["properties"]
+        properties = msgspec.json.decode(get_definition(topic.name).schema)["properties"]
         lines += [f"| `{name}` | {_json_type(schema)} |" for name, schema in properties.items()]
         lines.append("")
     return "\n".join([*lines, *_views_section()])

@@ -16,14 +16,11 @@ from rich.text import Text
 
 from logs.recording.flight import FlightData
 from logs.recording.reader import read
-from logs.report import figures as plots_control
-from logs.report import figures as plots_link
-from logs.report import figures as plots_verdicts
-from logs.report import plots
-from logs.report.plots import path_3d
-from logs.report.svg import Drawing, standalone
-from logs.report.timeline import timeline
-from logs.report.verdicts import judge
+from logs.report import figures, link_figures, plots, verdict_figures
+from logs.report.path_3d import draw_path_3d
+from logs.report.svg import Drawing, make_standalone
+from logs.report.timeline import draw_timeline
+from logs.report.verdicts import judge_flight
 
 OUT = Path(__file__).parents[1] / "docs" / "img"
 WIDTH = 92
@@ -37,7 +34,7 @@ def main() -> None:
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
         flight = FlightData.from_records(read(Path(folder) / "flight.mcap"))
     for name, drawing in pictures(flight):
-        (OUT / f"report-{name}.svg").write_text(standalone(drawing.svg, drawing.label), encoding="utf-8")
+        (OUT / f"report-{name}.svg").write_text(make_standalone(drawing.svg, drawing.label), encoding="utf-8")
     (OUT / "quick-fly.svg").write_text(terminal("loopback", "--udp", "--config", "room"), encoding="utf-8")
 
 
@@ -61,18 +58,18 @@ def terminal(*command: str) -> str:
 
 def pictures(flight: FlightData) -> Iterator[tuple[str, Drawing]]:
     """Name and drawing of each picture."""
-    judged = judge(flight)
-    yield "timeline", timeline(flight)[0]
-    deep = path_3d(flight)
+    judged = judge_flight(flight)
+    yield "timeline", draw_timeline(flight)[0]
+    deep = draw_path_3d(flight)
     if deep is not None:
         yield "path", deep
-    yield "axis", next(plots.axes_over_time(flight))
-    yield "age", plots_control.age(flight)
-    yield "link", next(plots_link.link_ages(flight, judged.verdicts.link))
+    yield "axis", next(plots.draw_axes_over_time(flight))
+    yield "age", figures.draw_age_figure(flight)
+    yield "link", next(link_figures.draw_link_ages(flight, judged.verdicts.link))
     model = judged.verdicts.model
     if model is not None:
-        yield "white", plots_verdicts.whiteness(model.axes[0])
-        yield "ellipsoids", plots_verdicts.coverage(model.leads)
+        yield "white", verdict_figures.draw_whiteness(model.axes[0])
+        yield "ellipsoids", verdict_figures.draw_coverage(model.leads)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from logs.report.statistics import RUNS_LEVEL, Array, Pair, paired_difference
+from logs.report.run_statistics import RUNS_LEVEL, Interval, paired_difference
+from uavctl.arrays import Array
 from uavctl.errors import UsageError
 from uavctl.lab.campaign.results import CellSummary, Results, cell_summary, grouped, read_results
 
@@ -38,7 +39,7 @@ def main(arguments: list[str]) -> int:
     return 0
 
 
-def paired_ratio(a: Array, b: Array, level: float = RUNS_LEVEL) -> tuple[float, Pair]:
+def paired_ratio(a: Array, b: Array, level: float = RUNS_LEVEL) -> tuple[float, Interval]:
     """Mean of a (N,) over the mean of b (N,), run against run on the same draws, with its interval.
 
     The interval is that of the mean of a - r b, with r the ratio, over the mean of b: what moves both costs of a run

@@ -13,7 +13,7 @@ from importlib import resources
 import msgspec
 from mcap.records import Attachment, Metadata
 
-from logs.recording.parameters import ParameterReader, listed, parameter_file
+from logs.recording.parameters import ParameterReader, count_parameters, make_parameter_file
 from uavctl.config.load import flatten_keys
 from uavctl.records import Header
 
@@ -23,12 +23,12 @@ _VALUES, _TYPES, _LIST = "vehicle parameters", "vehicle parameter types", "vehic
 
 
 @cache
-def layout_text() -> str:
+def make_layout_text() -> str:
     """Return the layout for Foxglove."""
     return resources.files("logs").joinpath("foxglove-layout.json").read_text(encoding="utf-8")
 
 
-def of_header(header: Header, utc_ns: int) -> tuple[Attachment | Metadata, ...]:
+def make_header_attachments(header: Header, utc_ns: int) -> tuple[Attachment | Metadata, ...]:
     """Return what a header has for other programs: configuration, versions, origin.
 
     Args:
@@ -40,44 +40,44 @@ def of_header(header: Header, utc_ns: int) -> tuple[Attachment | Metadata, ...]:
         if key not in ("config_toml", "design", "versions") and getattr(header, key) is not None
     }
     return (
-        _file(CONFIG, "application/toml", header.config_toml, utc_ns),
+        _make_file(CONFIG, "application/toml", header.config_toml, utc_ns),
         Metadata(_ORIGIN, origin),
         Metadata(_VERSIONS, header.versions),
-        Metadata(_CONFIG, _flat(header.config_toml)),
+        Metadata(_CONFIG, _flatten(header.config_toml)),
     )
 
 
-def layout(utc_ns: int) -> tuple[Attachment, ...]:
+def make_layout_attachment(utc_ns: int) -> tuple[Attachment, ...]:
     """Return the layout for Foxglove as an attachment."""
-    return (_file(LAYOUT, "application/json", layout_text(), utc_ns),)
+    return (_make_file(LAYOUT, "application/json", make_layout_text(), utc_ns),)
 
 
-def of_parameters(told: ParameterReader, utc_ns: int) -> tuple[Attachment | Metadata, ...]:
+def make_parameter_attachments(reader: ParameterReader, utc_ns: int) -> tuple[Attachment | Metadata, ...]:
     """Return the vehicle's parameters for other programs; nothing if it told none."""
-    parameters, count = told.parameters(), told.count
+    parameters, count = reader.parameters(), reader.count
     if not parameters:
         return ()
-    found = listed(parameters)
-    whole = "unknown" if count is None else str(found >= count).lower()
+    received_count = count_parameters(parameters)
+    is_complete = "unknown" if count is None else str(received_count >= count).lower()
     return (
-        _file(PARAMETERS, "text/tab-separated-values", parameter_file(parameters, count), utc_ns),
-        Metadata(_LIST, {"told": str(found), "of": str(count or "unknown"), "complete": whole}),
-        Metadata(_VALUES, {name: str(one.value) for name, one in parameters.items()}),
-        Metadata(_TYPES, {name: one.type for name, one in parameters.items()}),
+        _make_file(PARAMETERS, "text/tab-separated-values", make_parameter_file(parameters, count), utc_ns),
+        Metadata(_LIST, {"told": str(received_count), "of": str(count or "unknown"), "complete": is_complete}),
+        Metadata(_VALUES, {name: str(parameter.value) for name, parameter in parameters.items()}),
+        Metadata(_TYPES, {name: parameter.type for name, parameter in parameters.items()}),
     )
 
 
-def _file(name: str, media_type: str, text: str, utc_ns: int) -> Attachment:
+def _make_file(name: str, media_type: str, text: str, utc_ns: int) -> Attachment:
     return Attachment(create_time=utc_ns, log_time=utc_ns, name=name, media_type=media_type, data=text.encode())
 
 
-def _flat(text: str) -> dict[str, str]:
+def _flatten(text: str) -> dict[str, str]:
     """Return a configuration by dotted names, its values as JSON; nothing if it is damaged."""
     try:
-        return {key: _word(value) for key, value in flatten_keys(tomllib.loads(text))}
+        return {key: _format_value(value) for key, value in flatten_keys(tomllib.loads(text))}
     except tomllib.TOMLDecodeError:
         return {}
 
 
-def _word(value: object) -> str:
+def _format_value(value: object) -> str:
     return str(value) if isinstance(value, str | float) else msgspec.json.encode(value).decode()

@@ -21,7 +21,8 @@ from google.protobuf.message import Message
 from google.protobuf.message_factory import GetMessageClass
 from mcap_protobuf.schema import build_file_descriptor_set
 
-from logs.recording.design_view import Box, DesignView, Floats
+from logs.recording.design_view import Box, DesignView
+from uavctl.arrays import Array
 from uavctl.records import Decision, Estimate, LinkStats, Matrix, Plan, Record, Setpoint, Timing, Truth
 
 PlotRecord = typing.TypeVar("PlotRecord", bound=Record)
@@ -148,76 +149,76 @@ class VehiclePlot(Record, frozen=True, kw_only=True):
     battery_v: float
 
 
-def axes_of(design: DesignView, values: Sequence[float] | Floats) -> Axes:
+def make_axes(design: DesignView, values: Sequence[float] | Array) -> Axes:
     """Name numbers that are in the order of the plant's axes."""
     return Axes(**dict(zip(design.axes, map(float, values), strict=True)))
 
 
-def pick(values: Sequence[float] | Floats, index: Sequence[int]) -> list[float]:
+def select_values(values: Sequence[float] | Array, index: Sequence[int]) -> list[float]:
     """Return the values at some indices."""
     return [float(values[i]) for i in index]
 
 
-def age_plot(design: DesignView, decision: Decision, captured_ns: int | None) -> AgePlot:
+def make_age_plot(design: DesignView, decision: Decision, captured_ns: int | None) -> AgePlot:
     """Return the age at a tick; `captured_ns` is the capture time of the newest position so far."""
-    return same(
+    return copy_fields(
         AgePlot,
         decision,
         age_s=math.nan if captured_ns is None else (decision.at_ns - captured_ns) * 1e-9,
-        age_steps=number(decision.age_steps),
+        age_steps=replace_missing(decision.age_steps),
         limit_steps=float(design.horizon),
-        plan_index=number(decision.plan_index),
+        plan_index=replace_missing(decision.plan_index),
         mode=decision.mode.value,
     )
 
 
-def input_plot(design: DesignView, decision: Decision) -> InputPlot:
+def make_input_plot(design: DesignView, decision: Decision) -> InputPlot:
     """Return the input that a tick chose."""
-    lower, upper = _sides(design.input_box, design.axes, tuple(range(len(design.axes))))
-    chosen = Axes() if decision.input is None else axes_of(design, decision.input)
+    lower, upper = _get_limits(design.input_box, design.axes, tuple(range(len(design.axes))))
+    chosen = Axes() if decision.input is None else make_axes(design, decision.input)
     return InputPlot(chosen=chosen, lower=lower, upper=upper)
 
 
-def setpoint_plot(setpoint: Setpoint) -> SetpointPlot:
+def make_setpoint_plot(setpoint: Setpoint) -> SetpointPlot:
     """Return the setpoint that was sent."""
     north, east, down = setpoint.accel_mps2
     accel = Axes(north=north, east=east, down=down)
     return SetpointPlot(accel_mps2=accel, limited=bool(setpoint.limited), source=setpoint.source.value)
 
 
-def state_plot(design: DesignView, estimate: Estimate) -> StatePlot:
+def make_state_plot(design: DesignView, estimate: Estimate) -> StatePlot:
     """Return an estimate by axis."""
     std = [math.sqrt(max(0.0, estimate.cov[i][i])) for i in design.position_index]
     return StatePlot(
-        position_m=axes_of(design, pick(estimate.mean, design.position_index)),
-        velocity_mps=axes_of(design, pick(estimate.mean, design.velocity_index)),
-        position_std_m=axes_of(design, std),
+        position_m=make_axes(design, select_values(estimate.mean, design.position_index)),
+        velocity_mps=make_axes(design, select_values(estimate.mean, design.velocity_index)),
+        position_std_m=make_axes(design, std),
     )
 
 
-def limits_plot(design: DesignView, plan: Plan) -> LimitsPlot:
+def make_limits_plot(design: DesignView, plan: Plan) -> LimitsPlot:
     """Return the limits, and the tightened ones of a plan."""
-    position_lower_m, position_upper_m = _sides(design.state_box, design.axes, design.position_index)
-    velocity_lower_mps, velocity_upper_mps = _sides(design.state_box, design.axes, design.velocity_index)
-    lower, upper = tightened(design, plan.backoff_x, -1)
+    position_lower_m, position_upper_m = _get_limits(design.state_box, design.axes, design.position_index)
+    velocity_lower_mps, velocity_upper_mps = _get_limits(design.state_box, design.axes, design.velocity_index)
+    lower, upper = tighten_limits(design, plan.backoff_x, -1)
     return LimitsPlot(
         position_lower_m=position_lower_m,
         position_upper_m=position_upper_m,
-        tightened_lower_m=axes_of(design, pick(lower, design.position_index)),
-        tightened_upper_m=axes_of(design, pick(upper, design.position_index)),
+        tightened_lower_m=make_axes(design, select_values(lower, design.position_index)),
+        tightened_upper_m=make_axes(design, select_values(upper, design.position_index)),
         velocity_lower_mps=velocity_lower_mps,
         velocity_upper_mps=velocity_upper_mps,
     )
 
 
 @lru_cache(maxsize=16)
-def _sides(box: Box, axes: tuple[str, ...], index: tuple[int, ...]) -> tuple[Axes, Axes]:
+def _get_limits(box: Box, axes: tuple[str, ...], index: tuple[int, ...]) -> tuple[Axes, Axes]:
     """Return a box's lower and upper sides at some indices, one for each axis; asked anew in every tick."""
-    lower, upper = (Axes(**dict(zip(axes, pick(side, index), strict=True))) for side in (box.lower, box.upper))
+    lower, upper = (Axes(**dict(zip(axes, select_values(side, index), strict=True))) for side in (box.lower, box.upper))
     return lower, upper
 
 
-def tightened(design: DesignView, backoff: Matrix, stage: int) -> tuple[Floats, Floats]:
+def tighten_limits(design: DesignView, backoff: Matrix, stage: int) -> tuple[Array, Array]:
     """Return the state limits less the back-offs of a stage: lower and upper (n_x,)."""
     lower, upper, kept = design.state_box.lower.copy(), design.state_box.upper.copy(), backoff[stage]
     for side, closed in zip((lower, upper), design.closed_sides, strict=True):
@@ -226,40 +227,40 @@ def tightened(design: DesignView, backoff: Matrix, stage: int) -> tuple[Floats, 
     return lower, upper
 
 
-def timing_plot(timing: Timing) -> TimingPlot:
+def make_timing_plot(timing: Timing) -> TimingPlot:
     """Return the computing times of a tick."""
     return TimingPlot(
         lateness_us=timing.lateness_ns * 1e-3,
         step_us=timing.step_ns * 1e-3,
         send_us=timing.send_ns * 1e-3,
-        capture_to_send_ms=number(timing.capture_to_send_ns) * 1e-6,
+        capture_to_send_ms=replace_missing(timing.capture_to_send_ns) * 1e-6,
     )
 
 
-def counter_plot(stats: LinkStats) -> CounterPlot:
+def make_counter_plot(stats: LinkStats) -> CounterPlot:
     """Return the counters of a connection."""
-    return same(
+    return copy_fields(
         CounterPlot,
         stats,
         bad=sum(stats.bad.values()),
-        clock_offset_ms=number(stats.clock_offset_ns) * 1e-6,
-        clock_rtt_ms=number(stats.clock_rtt_ns) * 1e-6,
-        clock_drift_ppm=number(stats.clock_drift_ppm),
+        clock_offset_ms=replace_missing(stats.clock_offset_ns) * 1e-6,
+        clock_rtt_ms=replace_missing(stats.clock_rtt_ns) * 1e-6,
+        clock_drift_ppm=replace_missing(stats.clock_drift_ppm),
     )
 
 
-def truth_plot(truth: Truth) -> TruthPlot:
+def make_truth_plot(truth: Truth) -> TruthPlot:
     """Return the true state of the simulated vehicle."""
     position, velocity = (Axes(north=v[0], east=v[1], down=v[2]) for v in (truth.position_m, truth.velocity_mps))
-    return same(TruthPlot, truth, position_m=position, velocity_mps=velocity)
+    return copy_fields(TruthPlot, truth, position_m=position, velocity_mps=velocity)
 
 
-def same(kind: type[PlotRecord], record: Record, **others: object) -> PlotRecord:
+def copy_fields(kind: type[PlotRecord], record: Record, **others: object) -> PlotRecord:
     """Return a record of `kind`: fields of the same name are copied from `record`, the others given."""
     return kind(**{name: getattr(record, name) for name in kind.__struct_fields__ if name not in others}, **others)
 
 
-def number(value: float | None) -> float:
+def replace_missing(value: float | None) -> float:
     """A number that may be missing; NaN if it is."""
     return math.nan if value is None else float(value)
 
@@ -280,7 +281,7 @@ _SCALARS: Mapping[object, FieldDescriptorProto.Type.ValueType] = {
 
 
 @cache
-def message_class(kind: type[Record]) -> type[Message]:
+def make_message_class(kind: type[Record]) -> type[Message]:
     """Make the message class `uavctl.<name of the record>` of a record type.
 
     Args:
@@ -296,17 +297,17 @@ def message_class(kind: type[Record]) -> type[Message]:
     return GetMessageClass(pool.FindMessageTypeByName(f"{_PACKAGE}.{kind.__name__}"))
 
 
-def pack(record: Record) -> bytes:
+def pack_message(record: Record) -> bytes:
     """Pack a record as the message of its type.
 
     Raises:
         ValueError: an integer that does not fit 64 bits, or a text that is none.
         TypeError: a value that is not of its field's type.
     """
-    return message_class(type(record))(**msgspec.to_builtins(record)).SerializeToString()
+    return make_message_class(type(record))(**msgspec.to_builtins(record)).SerializeToString()
 
 
-def schema_of(kind: type[Message]) -> bytes:
+def describe_schema(kind: type[Message]) -> bytes:
     """Return the descriptors of a message type and of all types in it, as MCAP wants them."""
     return build_file_descriptor_set(kind).SerializeToString()
 
@@ -353,7 +354,7 @@ class DerivedTopic:
     @cached_property
     def message(self) -> type[Message]:
         """Return the class of the topic's messages."""
-        return self.kind if issubclass(self.kind, Message) else message_class(self.kind)
+        return self.kind if issubclass(self.kind, Message) else make_message_class(self.kind)
 
     @property
     def schema_name(self) -> str:
@@ -363,7 +364,7 @@ class DerivedTopic:
     @cached_property
     def schema(self) -> bytes:
         """Return the descriptors of the message type, as MCAP wants them."""
-        return schema_of(self.message)
+        return describe_schema(self.message)
 
 
 VIEWS: tuple[DerivedTopic, ...] = (

@@ -13,10 +13,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.errors import RecordingError
 from uavctl.records import Header, Matrix, Names, Vec3, Vector, names_of
 
-Floats = NDArray[np.float64]
 AXIS_NUMBER = {"north": 0, "east": 1, "down": 2}
 
 
@@ -82,7 +82,7 @@ class DesignView(msgspec.Struct, frozen=True, kw_only=True, dict=True):
             position[AXIS_NUMBER[axis]] = float(state[index])
         return (position[0], position[1], position[2])
 
-    def positions_of(self, states: Matrix | Floats) -> Floats:
+    def positions_of(self, states: Matrix | Array) -> Array:
         """Return the positions in many states (n, n_x), local NED (n, 3) [m]."""
         positions = np.zeros((len(states), 3))
         if isinstance(states, np.ndarray):
@@ -142,8 +142,8 @@ class DesignView(msgspec.Struct, frozen=True, kw_only=True, dict=True):
 class Box:
     """Axis-parallel limits of a polytope; open sides are infinite and have row -1."""
 
-    lower: Floats  # (n,)
-    upper: Floats  # (n,)
+    lower: Array  # (n,)
+    upper: Array  # (n,)
     row_lower: NDArray[np.int64]  # (n,) row of the polytope that the side comes from
     row_upper: NDArray[np.int64]
 
@@ -165,7 +165,7 @@ class Box:
         return cls(lower, upper, row_lower, row_upper)
 
 
-def design_view(header: Header) -> DesignView:
+def read_design(header: Header) -> DesignView:
     """Read the design of a header.
 
     Raises:
@@ -175,12 +175,12 @@ def design_view(header: Header) -> DesignView:
         view = msgspec.convert(header.design, DesignView)
     except msgspec.ValidationError as error:
         raise RecordingError(f"the header's design cannot be used: {error}") from error
-    free = _free_input(header)
+    free = _get_free_input(header)
     sides = tuple(b + free * sum(map(abs, row)) for row, b in zip(view.c_u, view.b_u, strict=True))
     return msgspec.structs.replace(view, b_u=sides)
 
 
-def _free_input(header: Header) -> float:
+def _get_free_input(header: Header) -> float:
     """Return how much of each input plans leave free to act against a bias [input units]."""
     try:
         estimator = tomllib.loads(header.config_toml).get("estimator", {})
@@ -189,7 +189,7 @@ def _free_input(header: Header) -> float:
     return float(estimator.get("bias_max", 0.0))
 
 
-def config_name(header: Header) -> str | None:
+def get_config_name(header: Header) -> str | None:
     """Return the name in a recording's configuration; None if there is none, or the TOML is damaged."""
     try:
         name = tomllib.loads(header.config_toml).get("name")

@@ -55,9 +55,9 @@ _OTHERS = {
 }
 
 
-def kind_of(path: Path) -> FileKind:
+def detect_kind(path: Path) -> FileKind:
     """Return the kind of a recording; one that cannot be read, or tells nothing, counts as MCAP."""
-    begin = _begin(path)
+    begin = _read_head(path)
     if begin.startswith(MAGIC):
         return FileKind.MCAP
     if begin.startswith(ULOG_MAGIC):
@@ -69,17 +69,17 @@ def kind_of(path: Path) -> FileKind:
     return FileKind.TLOG if stamped else FileKind.MCAP
 
 
-def hint_of(path: Path) -> str:
+def describe_kind_error(path: Path) -> str:
     """Return what to do with a file that is not of the kind that is asked for, after a semicolon; empty if unknown."""
-    begin = _begin(path)
-    other = next((words for magic, words in _OTHERS.items() if begin.startswith(magic)), "")
-    if not other and path.suffix.lower() == ".bin":
-        other = "it is called like an autopilot's own log: give the MAVLink of that flight, as a .tlog"
-    words = other or _READ_BY.get(kind_of(path), "")
-    return f"; {words}" if words else ""
+    begin = _read_head(path)
+    other_program_text = next((text for magic, text in _OTHERS.items() if begin.startswith(magic)), "")
+    if not other_program_text and path.suffix.lower() == ".bin":
+        other_program_text = "it is called like an autopilot's own log: give the MAVLink of that flight, as a .tlog"
+    text = other_program_text or _READ_BY.get(detect_kind(path), "")
+    return f"; {text}" if text else ""
 
 
-def _begin(path: Path) -> bytes:
+def _read_head(path: Path) -> bytes:
     try:
         with path.open("rb") as file:
             return file.read(_HEAD_BYTES)
@@ -142,34 +142,34 @@ class DiskFile:
         os.close(fd)
 
 
-def segment_path(path: Path, segment: int) -> Path:
+def make_segment_path(path: Path, segment: int) -> Path:
     """Return the path of segment `number`; the first is the recording's own path."""
     return path if segment == 1 else path.with_name(f"{path.stem}-{segment}{path.suffix}")
 
 
-def later_segments(path: Path) -> tuple[Path, ...]:
+def find_later_segments(path: Path) -> tuple[Path, ...]:
     """Return the existing later segments of the recording `path`, in order."""
     pattern = re.compile(rf"{re.escape(path.stem)}-([2-9]|[1-9]\d+){re.escape(path.suffix)}")
-    found = {int(match[1]): one for one in path.parent.glob("*") if (match := pattern.fullmatch(one.name))}
-    return tuple(found[number] for number in sorted(found))
+    files_by_number = {int(match[1]): file for file in path.parent.glob("*") if (match := pattern.fullmatch(file.name))}
+    return tuple(files_by_number[number] for number in sorted(files_by_number))
 
 
-def is_there(path: Path, size: int, opened: os.stat_result | None = None) -> bool:
+def is_present(path: Path, size: int, opened: os.stat_result | None = None) -> bool:
     """Return whether a file is still where it was made, and no shorter than what was written to it.
 
     Args:
         opened: status of the file while it is open; of a closed file some file systems (FAT) change the number.
     """
     try:
-        found = path.stat()
+        status = path.stat()
     except (FileNotFoundError, NotADirectoryError):
         return False
     except OSError:
         return True  # nobody knows, and the next write will tell
-    return found.st_size >= size and (opened is None or os.path.samestat(found, opened))
+    return status.st_size >= size and (opened is None or os.path.samestat(status, opened))
 
 
-def free_bytes(folder: Path) -> int | None:
+def get_free_bytes(folder: Path) -> int | None:
     """Return the free space of a folder's file system [bytes]; None if it cannot be told."""
     try:
         return shutil.disk_usage(folder).free
@@ -177,7 +177,7 @@ def free_bytes(folder: Path) -> int | None:
         return None
 
 
-class RoomWatch:
+class FreeSpaceMonitor:
     """Watch of the free space: tells when it gets low, when recording must pause, and when it may go on.
 
     Attributes:
@@ -206,14 +206,14 @@ class RoomWatch:
         )
 
 
-def check_room(path: Path, free_bytes: int) -> int:
+def check_free_space(path: Path, free_bytes: int) -> int:
     """Make the folder of the new recording `path`; return the free space there [bytes].
 
     Raises:
         RecordingError: there is such a recording, less than `free_bytes`, or the folder cannot be made or written.
     """
     try:
-        taken = [one for one in (path, *later_segments(path)) if one.exists()]
+        taken = [file for file in (path, *find_later_segments(path)) if file.exists()]
         path.parent.mkdir(parents=True, exist_ok=True)
         free = shutil.disk_usage(path.parent).free
     except OSError as error:
@@ -236,22 +236,22 @@ def check_room(path: Path, free_bytes: int) -> int:
 
 
 @contextmanager
-def no_empty_folders(files: Iterable[Path]) -> Iterator[None]:
+def remove_empty_folders(files: Iterable[Path]) -> Iterator[None]:
     """Remove in the end the folders that were made within this block and are empty."""
-    missing = {folder for file in files for folder in file.parents if not _is_there(folder)}
+    missing = {folder for file in files for folder in file.parents if not _exists(folder)}
     try:
         yield
     finally:
-        for folder in sorted(missing, key=lambda one: len(one.parts), reverse=True):
+        for folder in sorted(missing, key=lambda path: len(path.parts), reverse=True):
             with suppress(OSError):  # it has something in it, or was never made
                 folder.rmdir()
 
 
 @contextmanager
-def all_or_none(files: Sequence[Path]) -> Iterator[None]:
+def remove_on_error(files: Sequence[Path]) -> Iterator[None]:
     """After an error or an interruption, remove files and folders that were not there before."""
-    new = [file for file in files if not _is_there(file)]
-    with no_empty_folders(files):
+    new = [file for file in files if not _exists(file)]
+    with remove_empty_folders(files):
         try:
             yield
         except BaseException:
@@ -261,7 +261,7 @@ def all_or_none(files: Sequence[Path]) -> Iterator[None]:
             raise
 
 
-def _is_there(path: Path) -> bool:
+def _exists(path: Path) -> bool:
     """Return whether a path exists; one that cannot be looked at counts as existing, so it is not removed."""
     try:
         return path.exists()
@@ -275,7 +275,7 @@ def _is_there(path: Path) -> bool:
 _UNFINISHED = ".part"
 
 
-def spare_recording(target: Path) -> None:
+def refuse_recording_path(target: Path) -> None:
     """Refuse to overwrite a recording with another output: a slip on the command line would cost the flight.
 
     Raises:
@@ -289,14 +289,14 @@ def spare_recording(target: Path) -> None:
         raise UsageError(f"{target}: is a recording, or called like one, and would be lost; choose another name")
 
 
-def check_free(targets: Sequence[Path], *, force: bool) -> None:
+def refuse_existing_files(targets: Sequence[Path], *, force: bool) -> None:
     """Refuse to overwrite files, unless `force` is given.
 
     Raises:
         UsageError: One of the files exists, and `force` is not given, or it is a recording, or no file.
     """
     for target in targets:
-        spare_recording(target)
+        refuse_recording_path(target)
         if target.exists() and not target.is_file():
             raise UsageError(f"{target}: is no file (a folder or a device); choose another name")
     there = [target for target in targets if target.exists()]
@@ -305,7 +305,7 @@ def check_free(targets: Sequence[Path], *, force: bool) -> None:
         raise UsageError(f"{there[0]} exists{more}; --force writes anew, --out chooses another place")
 
 
-def write_whole(path: Path, text: str) -> None:
+def write_atomically(path: Path, text: str) -> None:
     """Write a text file; if it cannot be written whole, the file of before stays as it was.
 
     Raises:
@@ -328,7 +328,7 @@ def write_whole(path: Path, text: str) -> None:
 
 
 @contextmanager
-def unfinished(targets: Sequence[Path]) -> Iterator[Mapping[Path, Path]]:
+def write_temporary_files(targets: Sequence[Path]) -> Iterator[Mapping[Path, Path]]:
     """Return a temporary path for each file; in the end they get their names, after an error they are removed.
 
     Raises:

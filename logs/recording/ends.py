@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 
-from logs.recording.disk import check_room, no_empty_folders
+from logs.recording.disk import check_free_space, remove_empty_folders
 from logs.recording.recorder import RecorderStatus
 from logs.recording.topics import HEADER
 from uavctl.build.controller import Prepared, cpu, record_of, versions
@@ -20,7 +20,7 @@ from uavctl.outcome import lacking
 from uavctl.records import Ending, Header, Sink
 
 
-def recording_path(out: Path | None, name: str) -> Path:
+def make_recording_path(out: Path | None, name: str) -> Path:
     """Return the path of a new recording: in `out`, or in a folder of its own below `flights/`."""
     stamp = datetime.now(UTC).strftime("%Y%m%d-%H%M%S-%f")[:-3]
     folder = out if out is not None else Path("flights") / f"{stamp}-{name}"
@@ -28,15 +28,15 @@ def recording_path(out: Path | None, name: str) -> Path:
 
 
 @contextmanager
-def new_recording(out: Path | None, name: str, free_bytes: int) -> Iterator[Path]:
+def create_recording(out: Path | None, name: str, free_bytes: int) -> Iterator[Path]:
     """Yield the path of a new recording, with room checked; folders made for it are removed if they stay empty.
 
     Raises:
         RecordingError: as `check_room` does.
     """
-    path = recording_path(out, name)
-    with no_empty_folders([path]):
-        check_room(path, free_bytes)
+    path = make_recording_path(out, name)
+    with remove_empty_folders([path]):
+        check_free_space(path, free_bytes)
         yield path
 
 
@@ -71,12 +71,12 @@ def put_header(
     recorder.put(HEADER, started_ns, header)
 
 
-def final(ending: Ending, status: RecorderStatus) -> Ending:
+def describe_ending(ending: Ending, status: RecorderStatus) -> Ending:
     """Return how a flight ended, with the state of its recording."""
     why = status.reason or status.refusal or "the disk was too slow"
-    return ending if status.ok else lacking(ending, max(lacks(status), 1), why)
+    return ending if status.ok else lacking(ending, max(count_missing_records(status), 1), why)
 
 
-def lacks(status: RecorderStatus) -> int:
+def count_missing_records(status: RecorderStatus) -> int:
     """Return the number of records that are not in the recording."""
     return status.dropped + status.refused + status.gone + status.waiting

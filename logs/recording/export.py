@@ -30,9 +30,9 @@ import msgspec
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
-from logs.recording.disk import all_or_none, check_free, unfinished
+from logs.recording.disk import refuse_existing_files, remove_on_error, write_temporary_files
 from logs.recording.reader import RecordedMessage, good_messages, lacks_end, segment_files
-from logs.recording.topics import HEADER, LIBRARY, decode, is_known, is_view, record_type
+from logs.recording.topics import HEADER, LIBRARY, decode, get_record_type, is_known, is_view
 from uavctl.config.load import find_nearest
 from uavctl.errors import RecordingError, need
 from uavctl.records import Record, Vec3
@@ -92,7 +92,7 @@ class _Parts:
         """Look at a value to find the columns that it needs."""
         for key, part in ({} if value is None else self._parts(value)).items():
             if key not in self._forms:
-                self._forms = dict(sorted([*self._forms.items(), (key, _form(self._item))]))
+                self._forms = dict(sorted([*self._forms.items(), (key, _choose_form(self._item))]))
             self._forms[key].learn(part)
 
     def columns(self, name: str) -> Iterator[TableColumn]:
@@ -111,21 +111,21 @@ class _Parts:
 _Form = _Leaf | _Parts
 
 
-def _fields(kind: type[msgspec.Struct]) -> _Parts:
-    forms = {field.name: _form(field.type) for field in msgspec.structs.fields(kind)}
+def _list_columns(kind: type[msgspec.Struct]) -> _Parts:
+    forms = {field.name: _choose_form(field.type) for field in msgspec.structs.fields(kind)}
     return _Parts(".", lambda value: {name: getattr(value, name) for name in forms}, forms)
 
 
 _LEAVES = (int, float, bool, str, bytes)
 
 
-def _form(kind: Any) -> _Form:
+def _choose_form(kind: Any) -> _Form:
     """Return the form of a field's type; None makes an empty cell of any type.
 
     Raises:
         TypeError: no table has a place for such values.
     """
-    kind = _present(kind)
+    kind = _remove_none(kind)
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if kind in _LEAVES:
         return _Leaf(kind)
@@ -143,14 +143,14 @@ def _form(kind: Any) -> _Form:
     if isinstance(kind, type) and issubclass(kind, StrEnum):
         return _Leaf(str, lambda value: value.value)
     if _is_record(kind):
-        return _fields(kind)
+        return _list_columns(kind)
     raise TypeError(f"no column can hold {kind}")
 
 
-def _present(kind: Any) -> Any:
+def _remove_none(kind: Any) -> Any:
     """Return a type without None."""
     if isinstance(kind, types.UnionType) or typing.get_origin(kind) is typing.Union:
-        (rest,) = (one for one in typing.get_args(kind) if one is not types.NoneType)
+        (rest,) = (member for member in typing.get_args(kind) if member is not types.NoneType)
         return rest
     return kind
 
@@ -164,8 +164,8 @@ class _Table:
 
     def __init__(self, lead: tuple[str, ...], kind: type[msgspec.Struct]) -> None:
         self._lead = lead
-        self._form = _fields(kind)
-        self.lists = tuple(_lists(kind))
+        self._form = _list_columns(kind)
+        self.lists = tuple(_find_record_lists(kind))
         self.rows = 0
 
     def learn(self, record: msgspec.Struct) -> None:
@@ -182,10 +182,10 @@ class _Table:
         return row
 
 
-def _lists(kind: type[msgspec.Struct]) -> Iterator[tuple[str, type[msgspec.Struct]]]:
+def _find_record_lists(kind: type[msgspec.Struct]) -> Iterator[tuple[str, type[msgspec.Struct]]]:
     """Return the fields that are lists of records, with the type of those records."""
     for field in msgspec.structs.fields(kind):
-        arguments = typing.get_args(_present(field.type))
+        arguments = typing.get_args(_remove_none(field.type))
         if arguments and arguments[-1] is Ellipsis and _is_record(arguments[0]):
             yield field.name, arguments[0]
 
@@ -205,7 +205,7 @@ class Tables:
     def declare(self, topic: str) -> None:
         """Make the tables of a topic, whether there are rows for them or not."""
         times = ("log_time_ns", _UTC) if self.zero_utc_ns else ("log_time_ns",)
-        for field, kind in self._table(topic, times, record_type(topic)).lists:
+        for field, kind in self._table(topic, times, get_record_type(topic)).lists:
             self._table(f"{topic}.{field}", (*times, "row", "place"), kind)
 
     def learn(self, topic: str, record: Record) -> None:
@@ -214,8 +214,8 @@ class Tables:
         table = self._table(topic, times, type(record))
         table.learn(record)
         for field, kind in table.lists:
-            for one in getattr(record, field):
-                self._table(f"{topic}.{field}", (*times, "row", "place"), kind).learn(one)
+            for item in getattr(record, field):
+                self._table(f"{topic}.{field}", (*times, "row", "place"), kind).learn(item)
 
     def columns(self) -> dict[str, tuple[TableColumn, ...]]:
         """Return the columns of each table, by its name."""
@@ -229,8 +229,8 @@ class Tables:
         yield topic, table.row(times, record)
         for field, _ in table.lists:
             name = f"{topic}.{field}"
-            for place, one in enumerate(getattr(record, field)):
-                yield name, self._tables[name].row((*times, number, place), one)
+            for place, item in enumerate(getattr(record, field)):
+                yield name, self._tables[name].row((*times, number, place), item)
 
     def _table(self, name: str, lead: tuple[str, ...], kind: type[msgspec.Struct]) -> _Table:
         if name not in self._tables:
@@ -274,12 +274,12 @@ Watch = Callable[[Iterable[RecordedMessage], int | None, str], Iterable[Recorded
 """Looks at messages as they go by, for a progress bar: given them, their number if it is known, and what is done."""
 
 
-def unwatched(messages: Iterable[RecordedMessage], _total: int | None, _what: str) -> Iterable[RecordedMessage]:
+def ignore_progress(messages: Iterable[RecordedMessage], _total: int | None, _what: str) -> Iterable[RecordedMessage]:
     """Ignore progress."""
     return messages
 
 
-def known_number(flight: Path) -> int | None:
+def count_messages(flight: Path) -> int | None:
     """Return how many messages `good_messages` will yield, by the recording's statistics; None if it is torn.
 
     Raises:
@@ -305,7 +305,7 @@ def known_number(flight: Path) -> int | None:
 
 
 def export_tables(
-    flight: Path, folder: Path, kind: TableFormat, *, force: bool = False, watch: Watch = unwatched
+    flight: Path, folder: Path, kind: TableFormat, *, force: bool = False, watch: Watch = ignore_progress
 ) -> Exported:
     """Write the tables of a recording into a folder.
 
@@ -317,18 +317,18 @@ def export_tables(
         ExtraMissingError: `pyarrow` is not there.
         UsageError: A file exists and is not to be overwritten, or the folder cannot be made.
     """
-    begin = _writer(kind)
-    tables, unknown, total = _survey(flight, watch)
+    begin = _choose_writer(kind)
+    tables, unknown, total = _find_columns(flight, watch)
     columns = tables.columns()
     if not columns:
         raise RecordingError(f"{flight}: no record of this version in it, so there is nothing to export")
-    files = {name: folder / f"{file_stem(name)}.{kind.value}" for name in columns}
+    files = {name: folder / f"{make_file_stem(name)}.{kind.value}" for name in columns}
     targets = list(files.values())
-    check_free(targets, force=force)
+    refuse_existing_files(targets, force=force)
     rows: Counter[str] = Counter()
-    with all_or_none(targets), unfinished(targets) as parts, ExitStack() as stack:
+    with remove_on_error(targets), write_temporary_files(targets) as parts, ExitStack() as stack:
         writers = {name: stack.enter_context(begin(parts[files[name]], columns[name])) for name in columns}
-        for topic, at_ns, record in _decoded(watch(good_messages(flight), total, "writing")):
+        for topic, at_ns, record in _decode_messages(watch(good_messages(flight), total, "writing")):
             for name, row in tables.rows(topic, at_ns, record):
                 writers[name](row)
                 rows[name] += 1
@@ -341,12 +341,12 @@ def export_tables(
     )
 
 
-def file_stem(table: str) -> str:
+def make_file_stem(table: str) -> str:
     """Return the file name of a table without its suffix; no two tables share one."""
     return ".".join(quote(part, safe="") for part in table.strip("/").split("/"))
 
 
-def _survey(flight: Path, watch: Watch) -> tuple[Tables, Counter[str], int]:
+def _find_columns(flight: Path, watch: Watch) -> tuple[Tables, Counter[str], int]:
     """Return the columns of all tables, the number of records of unknown topics, and the number of messages."""
     tables, unknown = Tables(), Counter[str]()
     total = 0
@@ -360,12 +360,12 @@ def _survey(flight: Path, watch: Watch) -> tuple[Tables, Counter[str], int]:
                 unknown[message.definition.topic] += 1
             yield message
 
-    for topic, _, record in _decoded(watch(counted(), known_number(flight), "reading")):
+    for topic, _, record in _decode_messages(watch(counted(), count_messages(flight), "reading")):
         tables.learn(topic, record)
     return tables, unknown, total
 
 
-def _decoded(messages: Iterable[RecordedMessage]) -> Iterator[tuple[str, int, Record]]:
+def _decode_messages(messages: Iterable[RecordedMessage]) -> Iterator[tuple[str, int, Record]]:
     for message in messages:
         topic = message.definition.topic
         if is_known(topic):
@@ -376,26 +376,26 @@ _Write = Callable[[list[Cell]], None]  # appends a row to a table
 _Writer = Callable[[Path, tuple[TableColumn, ...]], AbstractContextManager[_Write]]
 
 
-def _writer(kind: TableFormat) -> _Writer:
+def _choose_writer(kind: TableFormat) -> _Writer:
     """Return the writer of a table format.
 
     Raises:
         ExtraMissingError: `pyarrow` is not there.
     """
     if kind is TableFormat.CSV:
-        return _csv_file
+        return _write_csv
     need("pyarrow", "parquet")  # before anything is read or written
-    return _parquet_file
+    return _write_parquet
 
 
-def _date(utc_ns: Cell) -> str:
+def _format_date(utc_ns: Cell) -> str:
     """Return a time in UTC [ns since 1970] as ISO 8601 has it, with all its digits."""
     seconds, ns = divmod(int(utc_ns or 0), 1_000_000_000)
     return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{ns:09d}Z"
 
 
 @contextmanager
-def _csv_file(path: Path, columns: tuple[TableColumn, ...]) -> Iterator[_Write]:
+def _write_csv(path: Path, columns: tuple[TableColumn, ...]) -> Iterator[_Write]:
     """CSV (RFC 4180) with a line of names; floats are written so that they read back exactly, bytes in hexadecimal."""
     in_bytes = tuple(place for place, column in enumerate(columns) if column.kind is bytes)
     instants = tuple(place for place, column in enumerate(columns) if column.kind is Instant)
@@ -408,13 +408,13 @@ def _csv_file(path: Path, columns: tuple[TableColumn, ...]) -> Iterator[_Write]:
                 held = row[place]
                 row[place] = held.hex() if isinstance(held, bytes) else None
             for place in instants:
-                row[place] = _date(row[place])
+                row[place] = _format_date(row[place])
             rows.writerow(row)
 
         yield write
 
 
-def arrow_table(columns: Sequence[TableColumn], rows: Sequence[Sequence[Cell]]) -> pa.Table:
+def make_arrow_table(columns: Sequence[TableColumn], rows: Sequence[Sequence[Cell]]) -> pa.Table:
     """Return rows as an Arrow table: NaN stays NaN, a missing value is null, bytes are bytes.
 
     Raises:
@@ -422,7 +422,7 @@ def arrow_table(columns: Sequence[TableColumn], rows: Sequence[Sequence[Cell]]) 
     """
     import pyarrow as pa
 
-    fields, arrays = _arrow_fields(columns), []
+    fields, arrays = _make_arrow_fields(columns), []
     for place, (name, kind) in enumerate(fields):
         try:
             arrays.append(pa.array([row[place] for row in rows], type=kind))
@@ -431,7 +431,7 @@ def arrow_table(columns: Sequence[TableColumn], rows: Sequence[Sequence[Cell]]) 
     return pa.Table.from_arrays(arrays, schema=pa.schema(fields))
 
 
-def _arrow_fields(columns: Sequence[TableColumn]) -> list[tuple[str, pa.DataType]]:
+def _make_arrow_fields(columns: Sequence[TableColumn]) -> list[tuple[str, pa.DataType]]:
     import pyarrow as pa
 
     types = {int: pa.int64(), float: pa.float64(), bool: pa.bool_(), str: pa.string(), bytes: pa.binary()}
@@ -440,16 +440,16 @@ def _arrow_fields(columns: Sequence[TableColumn]) -> list[tuple[str, pa.DataType
 
 
 @contextmanager
-def _parquet_file(path: Path, columns: tuple[TableColumn, ...]) -> Iterator[_Write]:
+def _write_parquet(path: Path, columns: tuple[TableColumn, ...]) -> Iterator[_Write]:
     """Parquet with one row group for each batch; NaN stays NaN, a missing value is null, bytes are bytes."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    schema = pa.schema(_arrow_fields(columns))
+    schema = pa.schema(_make_arrow_fields(columns))
     rows: list[list[Cell]] = []
 
     def flush() -> None:
-        writer.write_table(arrow_table(columns, rows))
+        writer.write_table(make_arrow_table(columns, rows))
         rows.clear()
 
     def write(row: list[Cell]) -> None:
@@ -465,15 +465,19 @@ def _parquet_file(path: Path, columns: tuple[TableColumn, ...]) -> Iterator[_Wri
 # One table of a recording, in memory.
 
 
-def table_names(flight: Path) -> tuple[str, ...]:
+def list_tables(flight: Path) -> tuple[str, ...]:
     """Return the tables that a recording can be had as: its topics of records, and the lists of records within.
 
     Raises:
         RecordingError: It cannot be read.
     """
     topics = {message.definition.topic for message in good_messages(flight)}
-    known = sorted(filter(is_known, topics))
-    return tuple(name for one in known for name in (one, *(f"{one}.{field}" for field, _ in _lists(record_type(one)))))
+    known_topics = sorted(filter(is_known, topics))
+    return tuple(
+        name
+        for table in known_topics
+        for name in (table, *(f"{table}.{field}" for field, _ in _find_record_lists(get_record_type(table))))
+    )
 
 
 def read_table(flight: Path, name: str) -> pa.Table:
@@ -486,24 +490,24 @@ def read_table(flight: Path, name: str) -> pa.Table:
 
     topic = name if is_known(name) else name.rpartition(".")[0]
     tables = Tables()
-    found: list[tuple[int, Record]] = []
+    records: list[tuple[int, Record]] = []
     first_ns = None
     for message in good_messages(flight):
         first_ns = message.at_ns if first_ns is None else first_ns
         tables.zero_utc_ns = message.zero_utc_ns
         if message.definition.topic == topic and is_known(topic):
-            found.append((message.at_ns, decode(topic, message.data, message.at_ns)))
-    if found:
+            records.append((message.at_ns, decode(topic, message.data, message.at_ns)))
+    if records:
         tables.declare(topic)
     if name not in tables.columns():
-        names, why = table_names(flight), "was made for viewers" if is_view(name) else "is not in it"
+        names, why = list_tables(flight), "was made for viewers" if is_view(name) else "is not in it"
         raise RecordingError(f"{flight}: topic {name} {why}{find_nearest(name, names)}; there are {', '.join(names)}")
-    for _, record in found:
+    for _, record in records:
         tables.learn(topic, record)
     columns = tables.columns()[name]
-    every = (row for at_ns, record in found for row in tables.rows(topic, at_ns, record))
-    rows = [row for table, row in every if table == name]
-    told = arrow_table(columns, rows)
+    table_rows = (row for at_ns, record in records for row in tables.rows(topic, at_ns, record))
+    rows = [row for table, row in table_rows if table == name]
+    table = make_arrow_table(columns, rows)
     times_ns = [int(row[0] or 0) for row in rows]
     seconds = pa.array([(at_ns - (first_ns or 0)) / 1e9 for at_ns in times_ns], type=pa.float64())
-    return told.add_column(1, "time_s", seconds)
+    return table.add_column(1, "time_s", seconds)

@@ -13,8 +13,9 @@ from typing import Any, NamedTuple, Self, get_args, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
-from logs.recording.design_view import DesignView, Floats, design_view
+from logs.recording.design_view import DesignView, read_design
 from logs.recording.topics import END, GOES_ON, RecorderNote
+from uavctl.arrays import Array
 from uavctl.errors import RecordingError
 from uavctl.flight.decide import MISSION_OVER
 from uavctl.flight.supervise import RELEASES
@@ -43,7 +44,7 @@ from uavctl.records import (
 )
 
 FLOWN = frozenset({ControlMode.TRACK, ControlMode.BRAKE, ControlMode.HOLD})
-MOVES = 3  # successive boundaries with another target each: it moves, and was not only changed
+MIN_TARGET_CHANGES = 3  # successive boundaries with another target each: it moves, and was not only changed
 FALLBACK = frozenset({ControlMode.BRAKE, ControlMode.HOLD, ControlMode.LAND})
 
 
@@ -86,22 +87,26 @@ class FlightData:
         Raises:
             RecordingError: no header, no decision, or a design without the keys of `DesignView`.
         """
-        found: defaultdict[type[Record], list[Any]] = defaultdict(list)
+        records_by_type: defaultdict[type[Record], list[Any]] = defaultdict(list)
         for _, _, record in records:
-            found[type(record)].append(record)
+            records_by_type[type(record)].append(record)
 
-        headers = found[Header]
-        where = "" if path is None else f"{path}: "
+        headers = records_by_type[Header]
+        prefix = "" if path is None else f"{path}: "
         if not headers:
-            raise RecordingError(f"{where}the recording has no header; it is empty, or not one of uavctl")
-        if not found[Decision]:
+            raise RecordingError(f"{prefix}the recording has no header; it is empty, or not one of uavctl")
+        if not records_by_type[Decision]:
             raise RecordingError(
-                f"{where}the recording has no decision: nothing was flown, so there is nothing to report"
+                f"{prefix}the recording has no decision: nothing was flown, so there is nothing to report"
             )
         return cls(
             header=headers[0],
-            design=design_view(headers[0]),
-            **{name: tuple(found[get_args(kind)[0]]) for name, kind in get_type_hints(cls).items() if get_args(kind)},
+            design=read_design(headers[0]),
+            **{
+                name: tuple(records_by_type[get_args(annotation)[0]])
+                for name, annotation in get_type_hints(cls).items()
+                if get_args(annotation)
+            },
         )
 
     @property
@@ -116,7 +121,7 @@ class FlightData:
         A decision counts what it refused without naming it, so ticks that refused any are left out.
         """
         refusing = {decision.tick for decision in self.decisions if decision.rejected}
-        return tuple(sample for one in self.step_inputs if one.tick not in refusing for sample in one.samples)
+        return tuple(sample for inputs in self.step_inputs if inputs.tick not in refusing for sample in inputs.samples)
 
     @cached_property
     def flown(self) -> tuple[Decision, ...]:
@@ -127,32 +132,32 @@ class FlightData:
     @cached_property
     def stopped_ns(self) -> int | None:
         """Return the time at which the operator asked for the hand-over [ns]; None if nobody did."""
-        return min((one.at_ns for one in self.step_inputs if one.stop), default=None)
+        return min((inputs.at_ns for inputs in self.step_inputs if inputs.stop), default=None)
 
     @cached_property
     def breach(self) -> Event | None:
         """Return the envelope's event on an impossible observation, for which the vehicle was let go; else None."""
-        return next((one for one in self.events if one.code in RELEASES), None)
+        return next((event for event in self.events if event.code in RELEASES), None)
 
     @cached_property
     def landing(self) -> Landing | None:
         """Return the wanted landing that began before the operator's stop with no plan flown after it; else None."""
         after_ns = max((d.at_ns for d in self.flown if d.mode is ControlMode.TRACK), default=-1)
         ordered = [
-            Landing(one.at_ns, ordered=True)
-            for one in self.events
-            if one.code == ORDER_ACCEPTED and one.text == Order.LAND.value
+            Landing(event.at_ns, ordered=True)
+            for event in self.events
+            if event.code == ORDER_ACCEPTED and event.text == Order.LAND.value
         ]
-        due = [Landing(one.at_ns, ordered=False) for one in self.flown if one.reason == MISSION_OVER]
+        due = [Landing(decision.at_ns, ordered=False) for decision in self.flown if decision.reason == MISSION_OVER]
         until_ns = self.decisions[-1].at_ns + 1 if self.stopped_ns is None else self.stopped_ns
-        return min((one for one in ordered + due if after_ns < one.at_ns < until_ns), default=None)
+        return min((landing for landing in ordered + due if after_ns < landing.at_ns < until_ns), default=None)
 
     @cached_property
     def fallen(self) -> tuple[Decision, ...]:
         """Return the flown ticks of the fallback, without braking and holding before a wanted landing."""
-        wanted = self.landing
-        before = (one for one in self.flown if wanted is None or one.at_ns < wanted.at_ns)
-        return tuple(one for one in before if one.mode in FALLBACK)
+        landing = self.landing
+        decisions = (decision for decision in self.flown if landing is None or decision.at_ns < landing.at_ns)
+        return tuple(decision for decision in decisions if decision.mode in FALLBACK)
 
     @property
     def fallback_spans(self) -> list[tuple[float, float]]:
@@ -196,14 +201,14 @@ class FlightData:
         return {p.seq: p for p in self.plans if p.seq in seqs and p.status is SolveStatus.OPTIMAL}
 
     @cached_property
-    def targets(self) -> tuple[Floats, Floats]:
+    def targets(self) -> tuple[Array, Array]:
         """Return times (n,) [s] and targets (n, n_x) of the mission, one for each boundary.
 
         A recording without any says what its design was made for.
         """
-        told = [(d.at_ns, d.target) for d in self.flown if d.boundary and d.target is not None]
-        told = told or [(self.origin_ns, self.design.target)]
-        return self.seconds([at_ns for at_ns, _ in told]), np.array([target for _, target in told])
+        targets = [(d.at_ns, d.target) for d in self.flown if d.boundary and d.target is not None]
+        targets = targets or [(self.origin_ns, self.design.target)]
+        return self.seconds([at_ns for at_ns, _ in targets]), np.array([target for _, target in targets])
 
     @cached_property
     def moving_target(self) -> bool:
@@ -212,19 +217,19 @@ class FlightData:
         A place that was ordered is no waypoint either, and stays where it is.
         """
         targets = [None if d.waypoint is not None else d.target for d in self.flown if d.boundary]
-        runs = zip(*(targets[n:] for n in range(MOVES)), strict=False)
-        return any(None not in run and len(set(run)) == MOVES for run in runs)
+        runs = zip(*(targets[n:] for n in range(MIN_TARGET_CHANGES)), strict=False)
+        return any(None not in run and len(set(run)) == MIN_TARGET_CHANGES for run in runs)
 
     @cached_property
     def ordered_places(self) -> tuple[tuple[int, tuple[float, ...]], ...]:
         """Return the places that the vehicle was ordered to: (time [ns], target (n_x,))."""
         if self.moving_target:
             return ()
-        told = [(d.at_ns, d.target, d.waypoint) for d in self.flown if d.boundary and d.target is not None]
-        before = [(None, 0), *((target, waypoint) for _, target, waypoint in told)]
+        targets = [(d.at_ns, d.target, d.waypoint) for d in self.flown if d.boundary and d.target is not None]
+        previous = [(None, 0), *((target, waypoint) for _, target, waypoint in targets)]
         return tuple(
             (at_ns, target)
-            for (at_ns, target, waypoint), (last, last_waypoint) in zip(told, before, strict=False)
+            for (at_ns, target, waypoint), (last, last_waypoint) in zip(targets, previous, strict=False)
             if waypoint is None and (target != last or last_waypoint is not None)
         )
 
@@ -232,14 +237,14 @@ class FlightData:
     def last_flown(self) -> Estimate | None:
         """Return the estimate at the last flown boundary."""
         at_ns = self.steps.decisions[-1].at_ns if len(self.steps) else None
-        return next((one for one in reversed(self.estimates) if one.at_ns == at_ns), None)
+        return next((estimate for estimate in reversed(self.estimates) if estimate.at_ns == at_ns), None)
 
     @cached_property
     def steps(self) -> Steps:
         """Return the flown Δt boundaries."""
         return Steps.of(self)
 
-    def seconds(self, at_ns: Sequence[int]) -> Floats:
+    def seconds(self, at_ns: Sequence[int]) -> Array:
         """Return times on the report's axis (n,) [s], 0 at the first tick."""
         return np.array([(at - self.origin_ns) * 1e-9 for at in at_ns], dtype=np.float64)
 
@@ -258,7 +263,7 @@ class FlightData:
             spans.append((self._second(begun), end_s))
         return spans
 
-    def lost_at_s(self) -> Floats:
+    def lost_at_s(self) -> Array:
         """Return when the simulated channel lost positions (n,) [s], one entry each; empty for a real flight."""
         times = [b.at_ns for a, b in pairwise(self.truths) for _ in range(b.lost - a.lost)]
         return self.seconds(times)
@@ -272,11 +277,11 @@ class Steps:
     """One row for each Δt boundary at which the controller flew (TRACK, BRAKE or HOLD)."""
 
     decisions: tuple[Decision, ...]
-    t_s: Floats  # (n,)
-    state: Floats  # (n, n_x), the true one if known, else the estimate
-    decided: Floats  # (n, n_u), inputs before the wire; NaN where there was none
-    input: Floats  # (n, n_u), applied during the step; NaN if unknown
-    target: Floats  # (n, n_x), where the mission wanted the vehicle to be
+    t_s: Array  # (n,)
+    state: Array  # (n, n_x), the true one if known, else the estimate
+    decided: Array  # (n, n_u), inputs before the wire; NaN where there was none
+    input: Array  # (n, n_u), applied during the step; NaN if unknown
+    target: Array  # (n, n_x), where the mission wanted the vehicle to be
     from_truth: bool
 
     def __len__(self) -> int:
@@ -288,32 +293,34 @@ class Steps:
         decisions = tuple(d for d in flight.flown if d.boundary and d.mode in FLOWN)
         at_ns = np.array([d.at_ns for d in decisions], dtype=np.int64)
         n_x, n_u = len(flight.design.target), len(flight.design.q_u)
-        known: Sequence[Truth] | Sequence[Estimate] = flight.truths or flight.estimates
-        states = np.array([one.state if isinstance(one, Truth) else one.mean for one in known]).reshape(-1, n_x)
+        records: Sequence[Truth] | Sequence[Estimate] = flight.truths or flight.estimates
+        states = np.array([record.state if isinstance(record, Truth) else record.mean for record in records]).reshape(
+            -1, n_x
+        )
         decided = np.array([d.input or (np.nan,) * n_u for d in decisions]).reshape(-1, n_u)
-        applied = _applied(flight, at_ns) if flight.truths else decided
-        near = _nearest(np.array([one.at_ns for one in known], dtype=np.int64), at_ns)
-        state = states[near] if len(states) else np.full((len(decisions), n_x), np.nan)
+        applied = _find_applied_inputs(flight, at_ns) if flight.truths else decided
+        nearest = _find_nearest(np.array([record.at_ns for record in records], dtype=np.int64), at_ns)
+        state = states[nearest] if len(states) else np.full((len(decisions), n_x), np.nan)
         target = np.array([d.target or flight.design.target for d in decisions]).reshape(-1, n_x)
         return cls(decisions, flight.seconds(at_ns.tolist()), state, decided, applied, target, bool(flight.truths))
 
 
-def _nearest(known: NDArray[np.int64], wanted: NDArray[np.int64]) -> NDArray[np.int64]:
+def _find_nearest(known_ns: NDArray[np.int64], wanted_ns: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the index of the known time nearest to each wanted one; 0 if none is known."""
-    right = np.clip(np.searchsorted(known, wanted), 0, max(0, len(known) - 1))
+    right = np.clip(np.searchsorted(known_ns, wanted_ns), 0, max(0, len(known_ns) - 1))
     left = np.maximum(right - 1, 0)
-    if not len(known):
+    if not len(known_ns):
         return right
-    return np.where(np.abs(known[left] - wanted) < np.abs(known[right] - wanted), left, right)
+    return np.where(np.abs(known_ns[left] - wanted_ns) < np.abs(known_ns[right] - wanted_ns), left, right)
 
 
-def _applied(flight: FlightData, at_ns: NDArray[np.int64]) -> Floats:
+def _find_applied_inputs(flight: FlightData, at_ns: NDArray[np.int64]) -> Array:
     """Return the input of the plant in each step (n, n_u).
 
     The setpoint reaches the vehicle shortly after the boundary, so the last truth within the step
     tells what was applied; the one at the boundary may still show the step before.
     """
-    known = np.array([truth.at_ns for truth in flight.truths], dtype=np.int64)
-    inside = np.searchsorted(known, at_ns + flight.design.dt_ns) - 1
-    index = np.where(known[inside] > at_ns, inside, _nearest(known, at_ns))
+    truth_ns = np.array([truth.at_ns for truth in flight.truths], dtype=np.int64)
+    last_in_step = np.searchsorted(truth_ns, at_ns + flight.design.dt_ns) - 1
+    index = np.where(truth_ns[last_in_step] > at_ns, last_in_step, _find_nearest(truth_ns, at_ns))
     return np.array([truth.input for truth in flight.truths])[index].reshape(len(at_ns), len(flight.design.q_u))

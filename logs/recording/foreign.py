@@ -20,19 +20,19 @@ from mcap.exceptions import EndOfFile, McapError
 from mcap.records import Channel, Message, Schema
 from mcap.stream_reader import StreamReader
 
-from logs.recording.disk import MAGIC, FileKind, kind_of
+from logs.recording.disk import MAGIC, FileKind, detect_kind
 from logs.recording.mavlink_flight import MavlinkFlight, flight_in
 from logs.recording.summary import count
 from logs.recording.tlog import (
     MARKERS,
-    SteadyClock,
+    MonotonicClock,
     Tlog,
     TlogPacket,
-    frame_length,
-    in_order,
-    next_marker,
-    packet_of,
+    find_next_marker,
+    get_frame_length,
+    make_packet,
     read_tlog,
+    sort_packets,
 )
 from logs.recording.ulog import is_ulog, read_ulog
 from uavctl.errors import RecordingError, UsageError
@@ -93,7 +93,9 @@ class UnreadableError(Exception):
     """A message or its definition is not as it should be; says why."""
 
 
-def unwrapper(encoding: str, schema_encoding: str, name: str, definition: bytes) -> Callable[[bytes], bytes] | None:
+def make_unwrapper(
+    encoding: str, schema_encoding: str, name: str, definition: bytes
+) -> Callable[[bytes], bytes] | None:
     """Return a function that makes a frame of each message of a channel, if they are MAVLink wrapped by ROS.
 
     Such messages are known by their fields, those of mavros_msgs/Mavlink, wherever they stand in the definition.
@@ -103,26 +105,26 @@ def unwrapper(encoding: str, schema_encoding: str, name: str, definition: bytes)
     """
     if _DEFINITIONS.get(encoding) != schema_encoding:
         return None
-    top = _plain(name)
+    top = _normalise_type_name(name)
     try:
-        types = _parse(top, definition.decode("utf-8", errors="replace"))
+        types = _parse_definition(top, definition.decode("utf-8", errors="replace"))
     except UnreadableError:
         return None
     if not _NEEDED.issubset(field.name for field in types[top]):
         return None
 
     def unwrap(data: bytes) -> bytes:
-        return _frame(_RosReader(data, types, encoding).record(top))
+        return _make_frame(_RosReader(data, types, encoding).record(top))
 
     return unwrap
 
 
-def _plain(name: str) -> str:
+def _normalise_type_name(name: str) -> str:
     """Return a type's name as ROS 1 has it: without `msg` between package and type."""
     return name.replace("/msg/", "/")
 
 
-def _parse(top: str, text: str) -> Definitions:
+def _parse_definition(top: str, text: str) -> Definitions:
     """Return the fields of all types in a ROS message definition, without constants and comments."""
     types: Definitions = {}
     for number, part in enumerate(_BORDER.split(text)):
@@ -132,19 +134,19 @@ def _parse(top: str, text: str) -> Definitions:
         if number:
             if not lines or not lines[0].startswith("MSG:"):
                 raise UnreadableError("a definition without its name")
-            owner = _plain(lines.pop(0).removeprefix("MSG:").strip())
-        types[owner] = [field for line in lines if (field := _field(line, owner)) is not None]
+            owner = _normalise_type_name(lines.pop(0).removeprefix("MSG:").strip())
+        types[owner] = [field for line in lines if (field := _parse_field(line, owner)) is not None]
     return types
 
 
-def _field(line: str, owner: str) -> _RosField | None:
+def _parse_field(line: str, owner: str) -> _RosField | None:
     """Return a field of a definition; None for a constant."""
     found = _FIELD.match(line)
     if found is None:
         raise UnreadableError(f"cannot make sense of {line!r}")
     if found["rest"].lstrip().startswith("="):
         return None
-    kind = _plain(found["type"])
+    kind = _normalise_type_name(found["type"])
     if kind == "Header":
         kind = "std_msgs/Header"
     elif "/" not in kind and kind not in _NUMBERS and kind not in _STAMPS and kind not in ("string", "wstring"):
@@ -210,24 +212,24 @@ class _RosReader:
         return data
 
 
-def _frame(fields: Mapping[str, Value]) -> bytes:
+def _make_frame(fields: Mapping[str, Value]) -> bytes:
     """Return the MAVLink frame that was wrapped: https://mavlink.io/en/guide/serialization.html."""
-    magic, length, message_id = _whole(fields, "magic"), _whole(fields, "len"), _whole(fields, "msgid")
-    sender = (_whole(fields, "seq"), _whole(fields, "sysid"), _whole(fields, "compid"))
+    magic, length, message_id = _to_integer(fields, "magic"), _to_integer(fields, "len"), _to_integer(fields, "msgid")
+    sender = (_to_integer(fields, "seq"), _to_integer(fields, "sysid"), _to_integer(fields, "compid"))
     signature = b""
     try:
         # The words are the payload's bytes as a little-endian computer sees them, filled up with zeros.
-        payload = struct.pack(f"<{len(_list(fields, 'payload64'))}Q", *_list(fields, "payload64"))[:length]
+        payload = struct.pack(f"<{len(_to_list(fields, 'payload64'))}Q", *_to_list(fields, "payload64"))[:length]
         if magic == _V2:
-            flags = (_whole(fields, "incompat_flags"), _whole(fields, "compat_flags"))
+            flags = (_to_integer(fields, "incompat_flags"), _to_integer(fields, "compat_flags"))
             head = struct.pack("<7B", magic, length, *flags, *sender) + struct.pack("<I", message_id)[:3]
             if flags[0] & _SIGNED:
-                signature = struct.pack(f"{_SIGNATURE_BYTES}B", *_list(fields, "signature"))
+                signature = struct.pack(f"{_SIGNATURE_BYTES}B", *_to_list(fields, "signature"))
         elif magic == _V1:
             head = struct.pack("<6B", magic, length, *sender, message_id)
         else:
             raise UnreadableError(f"it begins with {magic}, which no frame does")
-        checksum = struct.pack("<H", _whole(fields, "checksum"))
+        checksum = struct.pack("<H", _to_integer(fields, "checksum"))
     except struct.error as error:
         raise UnreadableError(f"a field has no place in a frame ({error})") from error
     if len(payload) < length:
@@ -235,14 +237,14 @@ def _frame(fields: Mapping[str, Value]) -> bytes:
     return head + payload + checksum + signature
 
 
-def _whole(fields: Mapping[str, Value], name: str) -> int:
+def _to_integer(fields: Mapping[str, Value], name: str) -> int:
     value = fields.get(name)
     if not isinstance(value, int):
         raise UnreadableError(f"it has no number {name}")
     return value
 
 
-def _list(fields: Mapping[str, Value], name: str) -> list[Value]:
+def _to_list(fields: Mapping[str, Value], name: str) -> list[Value]:
     value = fields.get(name)
     if not isinstance(value, list):
         raise UnreadableError(f"it has no list {name}")
@@ -253,7 +255,7 @@ def _list(fields: Mapping[str, Value], name: str) -> list[Value]:
 
 
 @dataclass(frozen=True)
-class Cut:
+class FrameStream:
     """Frames of a stream of bytes, and what was left out of it."""
 
     # Its frames in the order of the stream, each at the time of the piece that its last byte came in
@@ -262,7 +264,7 @@ class Cut:
     left_out_bytes: int  # bytes that are no frame: garbage, and frames that were cut
 
 
-def cut(pieces: list[tuple[int, bytes]]) -> Cut:
+def cut_stream(pieces: list[tuple[int, bytes]]) -> FrameStream:
     """Cut a stream into frames.
 
     Frames with a wrong checksum or of an unknown id are kept where they stand between others: the parser counts them.
@@ -279,18 +281,18 @@ def cut(pieces: list[tuple[int, bytes]]) -> Cut:
     at = right = left_out = 0
     in_step = True  # what is before `at` was a frame
     while at < len(data):
-        end = at + frame_length(data, at)
+        end = at + get_frame_length(data, at)
         whole = at < end <= len(data)
         checked = whole and is_frame(data[at:end])
         in_step = checked or (whole and in_step and (end == len(data) or data[end] in MARKERS))
         if not in_step:
-            end = next_marker(data, at + 1)
+            end = find_next_marker(data, at + 1)
             left_out += end - at
         else:
             right += checked
-            packets.append(packet_of(pieces[bisect_right(ends, end - 1)][0], data[at:end]))
+            packets.append(make_packet(pieces[bisect_right(ends, end - 1)][0], data[at:end]))
         at = end
-    return Cut(tuple(packets), right, left_out)
+    return FrameStream(tuple(packets), right, left_out)
 
 
 _OURS = "/uavctl/"
@@ -324,7 +326,7 @@ class _ChannelStream:
         self.messages = 0
         self._unwrap: Callable[[bytes], bytes] | None = None
         if schema is not None:
-            self._unwrap = unwrapper(self.encoding, schema.encoding, schema.name, schema.data)
+            self._unwrap = make_unwrapper(self.encoding, schema.encoding, schema.name, schema.data)
         self._wanted = wanted
         self._pieces: list[tuple[int, bytes]] = []
         self._probe: bytearray | None = None if wanted or self._unwrap else bytearray()
@@ -352,10 +354,10 @@ class _ChannelStream:
         Raises:
             RecordingError: Its log times are all zero.
         """
-        clock = SteadyClock()
+        clock = MonotonicClock()
         pieces = [(clock.steady(at_ns), data) for at_ns, data in self._pieces]
         # A recorder of several threads writes not in order; a clock that was set back has been put right.
-        found = cut(sorted(pieces, key=lambda piece: piece[0]))
+        found = cut_stream(sorted(pieces, key=lambda piece: piece[0]))
         notes = []
         if self._unreadable:
             notes.append(f"{self.topic}: {count(self._unreadable, 'message')} left out: {self._why}")
@@ -380,7 +382,7 @@ class _ChannelStream:
         self._probe += data[: _PROBED_BYTES - len(self._probe)]
         if len(self._probe) < _PROBED_BYTES:
             return
-        self._given_up = not cut([(0, bytes(self._probe))]).right
+        self._given_up = not cut_stream([(0, bytes(self._probe))]).right
         self._probe = None
         if self._given_up:
             self._pieces.clear()
@@ -400,7 +402,7 @@ def is_foreign(path: Path) -> bool:
             if file.read(len(MAGIC)) != MAGIC:
                 return False
             file.seek(0)
-            for record in _records(file, path.stat().st_size):
+            for record in _iterate_records(file, path.stat().st_size):
                 if isinstance(record, Channel):
                     found = True
                     if record.topic.startswith(_OURS):
@@ -428,7 +430,7 @@ def read_mcap(path: Path, topics: Sequence[str] = ()) -> ForeignMcap:
     streams: dict[int, _ChannelStream] = {}
     try:
         with path.open("rb") as file:
-            torn = _collect(file, path.stat().st_size, topics, streams)
+            torn = _collect_messages(file, path.stat().st_size, topics, streams)
     except OSError as error:
         raise RecordingError(f"{path}: {error.strerror}") from error
     except _DAMAGE as error:
@@ -445,16 +447,16 @@ def read_mcap(path: Path, topics: Sequence[str] = ()) -> ForeignMcap:
         taken += [stream.topic] if found else []
         notes += told
     if not taken:
-        listed = _names(sorted(stream.listed() for stream in streams.values()))
+        listed = _format_names(sorted(stream.listed() for stream in streams.values()))
         raise RecordingError("; ".join([f"{path}: no raw MAVLink in it", listed, *notes]))
-    return ForeignMcap(in_order(packets), tuple(dict.fromkeys(taken)), torn, tuple(notes))
+    return ForeignMcap(sort_packets(packets), tuple(dict.fromkeys(taken)), torn, tuple(notes))
 
 
-def _collect(file: BinaryIO, size: int, topics: Sequence[str], streams: dict[int, _ChannelStream]) -> bool:
+def _collect_messages(file: BinaryIO, size: int, topics: Sequence[str], streams: dict[int, _ChannelStream]) -> bool:
     """Take the messages of some topics, or of all if none is given; return whether the file is torn."""
     schemas: dict[int, Schema] = {}
     try:
-        for record in _records(file, size):
+        for record in _iterate_records(file, size):
             if isinstance(record, Schema):
                 schemas[record.id] = record
             elif isinstance(record, Channel) and record.id not in streams:
@@ -472,7 +474,7 @@ def _collect(file: BinaryIO, size: int, topics: Sequence[str], streams: dict[int
     return False
 
 
-def _records(file: BinaryIO, size: int) -> Iterator[object]:
+def _iterate_records(file: BinaryIO, size: int) -> Iterator[object]:
     """Yield channels and messages in file order; each chunk is checked by its checksum if it has one."""
     # A damaged length must not ask for more memory than the file has bytes.
     yield from StreamReader(file, validate_crcs=True, record_size_limit=size).records
@@ -482,10 +484,10 @@ def _check_names(path: Path, topics: Sequence[str], streams: dict[int, _ChannelS
     there = {stream.topic for stream in streams.values()}
     for topic in topics:
         if topic not in there:
-            raise UsageError(f"--topic {topic}: {path} has none of this name; {_names(sorted(there))}")
+            raise UsageError(f"--topic {topic}: {path} has none of this name; {_format_names(sorted(there))}")
 
 
-def _names(names: list[str]) -> str:
+def _format_names(names: list[str]) -> str:
     if not names:
         return "it has no topic at all"
     more = f", and {len(names) - _TOLD} more" if len(names) > _TOLD else ""
@@ -495,7 +497,7 @@ def _names(names: list[str]) -> str:
 # Any recording of another program, by its kind.
 
 
-def foreign_log(path: Path, topics: Sequence[str] = ()) -> Tlog | None:
+def read_foreign_packets(path: Path, topics: Sequence[str] = ()) -> Tlog | None:
     """Return the MAVLink packets of another program's recording, and what was odd; None if it is of no such kind.
 
     Args:
@@ -506,18 +508,18 @@ def foreign_log(path: Path, topics: Sequence[str] = ()) -> Tlog | None:
         RecordingError: It cannot be read, or holds no MAVLink.
         UsageError: It has no such topic.
     """
-    if kind_of(path) is FileKind.TLOG and path.exists():
+    if detect_kind(path) is FileKind.TLOG and path.exists():
         if topics:
             raise UsageError("--topic is for an MCAP: a .tlog has no topics")
         return read_tlog(path)
-    if kind_of(path) is not FileKind.MCAP or not is_foreign(path):
+    if detect_kind(path) is not FileKind.MCAP or not is_foreign(path):
         return None
     found = read_mcap(path, topics)
     torn = ("the recording is torn: read up to its end",) if found.torn else ()
     return Tlog(found.packets, clock_notes=(f"MAVLink in {', '.join(found.topics)}", *found.notes, *torn))
 
 
-def foreign_flight(path: Path, system: int | None = None) -> MavlinkFlight | None:
+def read_foreign_flight(path: Path, system: int | None = None) -> MavlinkFlight | None:
     """Return the flight in another program's recording; None if it is one of ours.
 
     Args:
@@ -532,7 +534,7 @@ def foreign_flight(path: Path, system: int | None = None) -> MavlinkFlight | Non
         if system is not None:
             raise UsageError("--system is for MAVLink: a ULog is of one vehicle")
         return read_ulog(path)
-    log = read_tlog(path) if kind_of(path) is FileKind.TLOG else foreign_log(path)
+    log = read_tlog(path) if detect_kind(path) is FileKind.TLOG else read_foreign_packets(path)
     if log is not None:
         return flight_in(log, str(path), system)
     if system is not None:

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import msgspec
 
-from logs.recording.design_view import config_name
+from logs.recording.design_view import get_config_name
 from logs.recording.parameters import ParameterReader, VehicleParameter
 from logs.recording.reader import AttachedFile, Damage, EndOfFile, RecordedMessage, segment_files, walk
-from logs.recording.topics import END, HEADER, LIBRARY, PARAMETER, RECORDER, RecorderNote, decode, raw_link
+from logs.recording.topics import END, HEADER, LIBRARY, PARAMETER, RECORDER, RecorderNote, decode, parse_raw_topic
 from uavctl.errors import RecordingError
 from uavctl.records import Header, LinkEstimate, LinkStats, PolicyLibrary, Record, Refused, Truth
 
@@ -130,7 +130,7 @@ class RecordingInfo(msgspec.Struct, frozen=True, kw_only=True):
     parameter_count: int | None = None  # parameters that it says it has
 
 
-class _Course:
+class _TopicTimes:
     """Times of one topic's messages, taken one by one."""
 
     def __init__(self, message: RecordedMessage) -> None:
@@ -189,7 +189,7 @@ class _Account:
                 if record.text not in _PLAIN_NOTES:
                     self.notes.append((record.at_ns, record.text))
             case Header():
-                self.origin = _origin(record)
+                self.origin = _get_origin(record)
             case PolicyLibrary():
                 self.library = LibraryInfo(library_id=record.library_id, bytes=len(record.data))
             case LinkStats():
@@ -226,13 +226,13 @@ class _Account:
         )
 
 
-def info(path: Path) -> RecordingInfo:
+def read_info(path: Path) -> RecordingInfo:
     """Summarise a recording, be it finished, torn or damaged.
 
     Raises:
         RecordingError: there is no such recording, it holds nothing, or a file of it is none.
     """
-    courses: dict[str, _Course] = {}
+    courses: dict[str, _TopicTimes] = {}
     damage: list[str] = []
     missing = 0
     following: int | None = None
@@ -260,32 +260,37 @@ def info(path: Path) -> RecordingInfo:
         topic = item.definition.topic
         if item.repeated:
             continue
-        courses.setdefault(topic, _Course(item)).add(item)
+        courses.setdefault(topic, _TopicTimes(item)).add(item)
         if topic in _LOOKED_INTO:
             account.add(decode(topic, item.data, item.at_ns))
         elif topic in _NEWEST_TELLS:
             newest[topic] = item
-        elif topic == PARAMETER or raw_link(topic) is not None:
+        elif topic == PARAMETER or parse_raw_topic(topic) is not None:
             parameters.take(decode(topic, item.data, item.at_ns))
         zero_utc_ns = item.zero_utc_ns
     for topic, item in newest.items():
         account.add(decode(topic, item.data, item.at_ns))
     if not courses and not damage:
         raise RecordingError(f"{path}: holds nothing; it is empty, or was ended before its first chunk was written")
-    flown = [one for topic, one in courses.items() if topic not in _OWN] or list(courses.values())
-    start_ns = min((one.first_ns for one in flown), default=0)
-    end_ns = max((one.last_ns for one in flown), default=0)
+    flown = [course for topic, course in courses.items() if topic not in _OWN] or list(courses.values())
+    start_ns = min((decision.first_ns for decision in flown), default=0)
+    end_ns = max((decision.last_ns for decision in flown), default=0)
     note = account.note
     files = tuple(
-        SegmentInfo(file=str(one.path), bytes=one.path.stat().st_size, messages=one.messages, finished=one.finished)
-        for one in segments
+        SegmentInfo(
+            file=str(segment.path),
+            bytes=segment.path.stat().st_size,
+            messages=segment.messages,
+            finished=segment.finished,
+        )
+        for segment in segments
     )
     return RecordingInfo(
-        files=tuple(one.file for one in files),
-        bytes=sum(one.bytes for one in files),
-        finished=all(one.finished for one in files),
+        files=tuple(segment.file for segment in files),
+        bytes=sum(segment.bytes for segment in files),
+        finished=all(segment.finished for segment in files),
         damage=tuple(damage),
-        messages=sum(one.messages for one in courses.values()),
+        messages=sum(course.messages for course in courses.values()),
         missing=missing,
         start_ns=start_ns,
         end_ns=end_ns,
@@ -300,17 +305,17 @@ def info(path: Path) -> RecordingInfo:
         topics=tuple(courses[topic].info(topic, start_ns, end_ns) for topic in sorted(courses)),
         origin=account.origin,
         library=account.library,
-        begin_utc=_utc(start_ns + zero_utc_ns) if zero_utc_ns else None,
+        begin_utc=_format_utc(start_ns + zero_utc_ns) if zero_utc_ns else None,
         attachments=tuple(attachments.values()),
         parameters=parameters.parameters(),
         parameter_count=parameters.count,
     )
 
 
-def _utc(utc_ns: int) -> str:
+def _format_utc(utc_ns: int) -> str:
     return datetime.fromtimestamp(utc_ns // 1_000_000 / 1000, UTC).isoformat(timespec="milliseconds")
 
 
-def _origin(header: Header) -> RecordingOrigin:
+def _get_origin(header: Header) -> RecordingOrigin:
     copied = {key: getattr(header, key) for key in RecordingOrigin.__struct_fields__ if key != "config"}
-    return RecordingOrigin(config=config_name(header) or "", **copied)
+    return RecordingOrigin(config=get_config_name(header) or "", **copied)

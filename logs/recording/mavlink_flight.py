@@ -19,11 +19,18 @@ import msgspec
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from logs.recording.design_view import Floats
 from logs.recording.parameters import ParameterReader, VehicleParameter
-from logs.recording.senders import ChosenVehicle, LogSender, SenderCounts, choose_vehicle, message_of, system_of
+from logs.recording.senders import (
+    ChosenVehicle,
+    LogSender,
+    SenderCounter,
+    choose_vehicle,
+    get_message_id,
+    get_system_id,
+)
 from logs.recording.summary import count
 from logs.recording.tlog import Tlog, TlogPacket, read_tlog
+from uavctl.arrays import Array
 from uavctl.errors import RecordingError
 from uavctl.mavlink.clocksync import ClockSync, StampUnit, StampUnitDetector
 from uavctl.mavlink.codec import AUTOPILOT_ESTIMATE, decode_scan
@@ -102,21 +109,21 @@ class MavlinkFlightInfo(msgspec.Struct, frozen=True, kw_only=True):
     missing: tuple[str, ...] = ()  # parts of the page that the file has nothing for
 
 
-class HeardTrack(NamedTuple):
+class PositionTrack(NamedTuple):
     """Places over time."""
 
-    t_s: Floats  # (n,)
-    position_m: Floats  # (n, 3), local NED
-    velocity_mps: Floats  # (n, 3), NaN where none is told
+    t_s: Array  # (n,)
+    position_m: Array  # (n, 3), local NED
+    velocity_mps: Array  # (n, 3), NaN where none is told
 
 
 class Ages(NamedTuple):
     """Ages of one source's positions."""
 
-    t_s: Floats  # (n,) of arrival
-    delay_s: Floats  # (n,) from capture, beyond the quickest; NaN without a usable stamp
-    age_t_s: Floats  # (m,)
-    age_s: Floats  # (m,) of the newest position, just before and just after each arrival
+    t_s: Array  # (n,) of arrival
+    delay_s: Array  # (n,) from capture, beyond the quickest; NaN without a usable stamp
+    age_t_s: Array  # (m,)
+    age_s: Array  # (m,) of the newest position, just before and just after each arrival
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,20 +131,20 @@ class MavlinkFlight:
     """A flight as its MAVLink tells it, with arrays to draw; times count from the first packet."""
 
     info: MavlinkFlightInfo
-    own: HeardTrack
-    sent: dict[str, HeardTrack]  # by source, the one with most positions first
+    own: PositionTrack
+    sent: dict[str, PositionTrack]  # by source, the one with most positions first
     ages: dict[str, Ages]
-    setpoint_t_s: Floats  # (n,)
-    setpoint_m: Floats  # (n, 3), NaN where it is to be ignored
-    setpoint_mps: Floats  # (n, 3)
-    setpoint_mps2: Floats  # (n, 3)
-    attitude_t_s: Floats = field(default_factory=lambda: np.empty(0))
-    attitude_deg: Floats = field(default_factory=lambda: np.empty((0, 3)))  # roll, pitch, yaw
-    height_t_s: Floats = field(default_factory=lambda: np.empty(0))
-    height_m: Floats = field(default_factory=lambda: np.empty(0))  # where it tells no whole position
-    battery_t_s: Floats = field(default_factory=lambda: np.empty(0))
-    battery_v: Floats = field(default_factory=lambda: np.empty(0))
-    beat_t_s: Floats = field(default_factory=lambda: np.empty(0))  # of the vehicle's heartbeats; none in a ULog
+    setpoint_t_s: Array  # (n,)
+    setpoint_m: Array  # (n, 3), NaN where it is to be ignored
+    setpoint_mps: Array  # (n, 3)
+    setpoint_mps2: Array  # (n, 3)
+    attitude_t_s: Array = field(default_factory=lambda: np.empty(0))
+    attitude_deg: Array = field(default_factory=lambda: np.empty((0, 3)))  # roll, pitch, yaw
+    height_t_s: Array = field(default_factory=lambda: np.empty(0))
+    height_m: Array = field(default_factory=lambda: np.empty(0))  # where it tells no whole position
+    battery_t_s: Array = field(default_factory=lambda: np.empty(0))
+    battery_v: Array = field(default_factory=lambda: np.empty(0))
+    beat_t_s: Array = field(default_factory=lambda: np.empty(0))  # of the vehicle's heartbeats; none in a ULog
 
     @property
     def duration_s(self) -> float:
@@ -208,7 +215,7 @@ class _Reader:
     def __init__(self, origin_ns: int, vehicle: ChosenVehicle) -> None:
         self._origin_ns = self._last_ns = origin_ns
         self._vehicle, self._beat = vehicle, vehicle.heartbeat
-        self._senders = SenderCounts()
+        self._senders = SenderCounter()
         self._attitudes: dict[bool, list[tuple[int, Vec3]]] = {}  # of quaternions, and of angles
         self._battery: list[tuple[int, float]] = []
         self._height: list[tuple[int, float]] = []
@@ -230,7 +237,7 @@ class _Reader:
         self._last_ns = packet.at_ns
         found = scan_single_frame(packet.data)
         for frame in found.frames:
-            system = system_of(frame.data)
+            system = get_system_id(frame.data)
             name = f"{mavlink.mavlink_map[frame.message_id].msgname} of system {system}"
             self.counted[name] += 1
             self._spans_ns[name] = self._spans_ns.get(name, (packet.at_ns, 0))[0], packet.at_ns
@@ -239,7 +246,7 @@ class _Reader:
                 self._take_setpoint(frame.data, packet.at_ns)
             elif self._is_vehicle(system):
                 self._take_own(frame.message_id, frame.data, packet.at_ns)
-        if message_of(packet.data) in _LOOKED_INTO and self._is_vehicle(system_of(packet.data)):
+        if get_message_id(packet.data) in _LOOKED_INTO and self._is_vehicle(get_system_id(packet.data)):
             self._take_parameter(packet)
         understood = decode_scan(found)
         self._bad.update(understood.bad)
@@ -257,7 +264,7 @@ class _Reader:
     def _take_parameter(self, packet: TlogPacket) -> None:
         """Take a parameter, or the heartbeat that says how they are written: that of the autopilot alone."""
         component = packet.data[6 if packet.data[0] == mavlink.PROTOCOL_MARKER_V2 else 4]
-        beats = message_of(packet.data) == mavlink.MAVLINK_MSG_ID_HEARTBEAT
+        beats = get_message_id(packet.data) == mavlink.MAVLINK_MSG_ID_HEARTBEAT
         if not beats or (self._beat is not None and component == self._beat.component):
             self._parameters.take(Datagram(at_ns=packet.at_ns, link="", outgoing=False, data=packet.data))
 
@@ -296,7 +303,7 @@ class _Reader:
 
     def _is_another(self, system: int) -> bool:
         """Return whether a system is another vehicle."""
-        return any(system == one.system for one in self._vehicle.others)
+        return any(system == sender.system for sender in self._vehicle.others)
 
     def _take_mode(self, beat: Heartbeat, at_ns: int) -> None:
         mode, _ = describe_mode(find_autopilot_name(beat.autopilot), beat.vehicle_type, beat.custom_mode)
@@ -353,10 +360,10 @@ class _Reader:
     def flight(self, name: str, log: Tlog) -> MavlinkFlight:
         """Return the flight in what was taken."""
         beat, attitudes = self._beat, self._attitudes.get(False, self._attitudes.get(True, []))
-        own_source = next((one for one in _OWN if one in self._own), "")
-        sources = dict(sorted(self._sources.items(), key=lambda one: -len(one[1].track)))
-        ages = {source: ages_of(one, self._origin_ns) for source, one in sources.items()}
-        told = np.array([numbers for _, numbers in self._setpoints], dtype=np.float64).reshape(-1, 9)
+        own_source = next((own_name for own_name in _OWN if own_name in self._own), "")
+        sources = dict(sorted(self._sources.items(), key=lambda item: -len(item[1].track)))
+        ages = {source: ages_of(sent, self._origin_ns) for source, sent in sources.items()}
+        setpoints = np.array([numbers for _, numbers in self._setpoints], dtype=np.float64).reshape(-1, 9)
         begin = datetime.fromtimestamp(self._origin_ns // 1_000_000 / 1000, UTC)
         info = MavlinkFlightInfo(
             recording=name,
@@ -366,8 +373,8 @@ class _Reader:
             vehicle_system=None if beat is None else beat.system,
             own_positions=len(self._own.get(own_source, ())),
             own_source=own_source,
-            sent=tuple(figures_of(source, one, ages[source]) for source, one in sources.items()),
-            setpoints=len(told),
+            sent=tuple(figures_of(source, sent, ages[source]) for source, sent in sources.items()),
+            setpoints=len(setpoints),
             modes=tuple(self._modes),
             texts=tuple(self._texts),
             messages=dict(sorted(self.counted.items())),
@@ -384,12 +391,12 @@ class _Reader:
         flight = MavlinkFlight(
             info=info,
             own=track_of(self._own.get(own_source, ()), self._origin_ns),
-            sent={source: track_of(one.track, self._origin_ns) for source, one in sources.items()},
+            sent={source: track_of(sent.track, self._origin_ns) for source, sent in sources.items()},
             ages=ages,
             setpoint_t_s=seconds((at_ns for at_ns, _ in self._setpoints), self._origin_ns),
-            setpoint_m=told[:, :3],
-            setpoint_mps=told[:, 3:6],
-            setpoint_mps2=told[:, 6:],
+            setpoint_m=setpoints[:, :3],
+            setpoint_mps=setpoints[:, 3:6],
+            setpoint_mps2=setpoints[:, 6:],
             attitude_t_s=seconds((at_ns for at_ns, _ in attitudes), self._origin_ns),
             attitude_deg=np.degrees(np.array([angles for _, angles in attitudes], dtype=np.float64).reshape(-1, 3)),
             height_t_s=seconds((at_ns for at_ns, _ in self._height), self._origin_ns),
@@ -428,15 +435,15 @@ def from_home(lat_deg: float, lon_deg: float, home_deg: tuple[float, float]) -> 
     return north_m, math.radians(lon_deg - home_deg[1]) * _EARTH_M * math.cos(math.radians(home_deg[0]))
 
 
-def seconds(at_ns: Iterable[int], origin_ns: int) -> Floats:
+def seconds(at_ns: Iterable[int], origin_ns: int) -> Array:
     """Return times from the origin on [s]."""
     return np.array([(at - origin_ns) * 1e-9 for at in at_ns], dtype=np.float64)
 
 
-def track_of(points: Sequence[tuple[int, Vec3, Vec3 | None]], origin_ns: int) -> HeardTrack:
+def track_of(points: Sequence[tuple[int, Vec3, Vec3 | None]], origin_ns: int) -> PositionTrack:
     """Return places and speeds as arrays."""
     unknown = (math.nan, math.nan, math.nan)
-    return HeardTrack(
+    return PositionTrack(
         seconds((at_ns for at_ns, _, _ in points), origin_ns),
         np.array([position_m for _, position_m, _ in points], dtype=np.float64).reshape(-1, 3),
         np.array([velocity or unknown for _, _, velocity in points], dtype=np.float64).reshape(-1, 3),
@@ -445,7 +452,7 @@ def track_of(points: Sequence[tuple[int, Vec3, Vec3 | None]], origin_ns: int) ->
 
 def ages_of(source: SentSource, origin_ns: int) -> Ages:
     """Return the ages of a source's positions."""
-    at_ns = [one for one, _, _ in source.track]
+    at_ns = [captured for captured, _, _ in source.track]
     delay_s, age_at_ns, age_s = [], [], []
     newest_ns: int | None = None
     for at, captured in zip(at_ns, source.captured_ns, strict=True):
@@ -507,13 +514,16 @@ def facts_of(info: MavlinkFlightInfo) -> Iterator[tuple[str, str]]:
     for sent in info.sent:
         yield f"positions, {sent.source}", f"{sent.positions}, {sent.rate_hz:.1f}/s; {longest_gap(sent)}{_delays(sent)}"
     yield "setpoints in local NED", str(info.setpoints)
-    yield "modes", ", ".join(dict.fromkeys(one.mode for one in info.modes)) or "none"
+    yield "modes", ", ".join(dict.fromkeys(mode.mode for mode in info.modes)) or "none"
     yield "texts", str(len(info.texts))
     if info.battery_v is not None:
         yield "battery", "{:.2f} V at the begin, {:.2f} V at the end".format(*info.battery_v)
-    for one in info.senders:
-        kind, lost = f" ({one.kind})" if one.kind else "", f"; {one.missing} more did not come" if one.missing else ""
-        yield f"from {one.system}, component {one.component}{kind}", f"{count(one.messages, 'message')}{lost}"
+    for sender in info.senders:
+        kind, lost = (
+            f" ({sender.kind})" if sender.kind else "",
+            f"; {sender.missing} more did not come" if sender.missing else "",
+        )
+        yield f"from {sender.system}, component {sender.component}{kind}", f"{count(sender.messages, 'message')}{lost}"
     yield "parameters told", str(len(info.parameters))
     if info.bad:
         yield "passed over", ", ".join(f"{number} {reason}" for reason, number in info.bad.items())

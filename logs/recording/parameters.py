@@ -63,8 +63,10 @@ class ParameterReader:
         """Take raw bytes, or what was told before; any other record, and what is sent, says nothing."""
         if isinstance(record, ToldParameter):
             value = int(record.value) if record.type in _INTEGERS and math.isfinite(record.value) else record.value
-            told = VehicleParameter(value=value, type=record.type, system=record.system, component=record.component)
-            self._before[record.name] = told
+            parameter = VehicleParameter(
+                value=value, type=record.type, system=record.system, component=record.component
+            )
+            self._before[record.name] = parameter
             self._count_before = record.count or self._count_before
         elif isinstance(record, Datagram) and not record.outgoing:
             self._take_bytes(record)
@@ -119,7 +121,7 @@ class ParameterReader:
     def parameters(self) -> dict[str, VehicleParameter]:
         """Return the parameters by name, in order: of the first vehicle that was heard, or else told any."""
         systems = [*self._autopilots, *(system for system, _, _ in self._told)]
-        found = {
+        received = {
             name: VehicleParameter(
                 value=_value(value, kind, bytewise=self._autopilots.get(system) == mavlink.MAV_AUTOPILOT_PX4),
                 type=_TYPES.get(kind, str(kind)),
@@ -127,18 +129,18 @@ class ParameterReader:
                 component=component,
             )
             # The autopilot comes last: what else has parameters aboard (a gimbal, a radio) does not hide its own.
-            for (system, component, name), (value, kind) in sorted(self._told.items(), key=_autopilot_last)
+            for (system, component, name), (value, kind) in sorted(self._told.items(), key=_is_autopilot)
             if system == systems[0]
         }
-        return dict(sorted({**self._before, **found}.items()))
+        return dict(sorted({**self._before, **received}.items()))
 
 
-def listed(parameters: Mapping[str, VehicleParameter]) -> int:
+def count_parameters(parameters: Mapping[str, VehicleParameter]) -> int:
     """Return how many of the autopilot's list were told."""
-    return sum(one.component == mavlink.MAV_COMP_ID_AUTOPILOT1 for one in parameters.values())
+    return sum(parameter.component == mavlink.MAV_COMP_ID_AUTOPILOT1 for parameter in parameters.values())
 
 
-def told_records(
+def make_parameter_records(
     parameters: Mapping[str, VehicleParameter], at_ns: int, count: int | None = None
 ) -> Iterator[ToldParameter]:
     """Return records of parameters, for a recording that begins after they were told.
@@ -146,29 +148,37 @@ def told_records(
     Args:
         count: how many the vehicle says it has.
     """
-    for name, one in parameters.items():
-        where = {"system": one.system, "component": one.component}
-        yield ToldParameter(at_ns=at_ns, name=name, value=float(one.value), type=one.type, count=count or 0, **where)
+    for name, parameter in parameters.items():
+        where = {"system": parameter.system, "component": parameter.component}
+        yield ToldParameter(
+            at_ns=at_ns, name=name, value=float(parameter.value), type=parameter.type, count=count or 0, **where
+        )
 
 
-def parameter_file(parameters: Mapping[str, VehicleParameter], count: int | None = None) -> str:
+def make_parameter_file(parameters: Mapping[str, VehicleParameter], count: int | None = None) -> str:
     """Return parameters as a file of QGroundControl: system, component, name, value and type, parted by tabs.
 
     Args:
         count: how many the vehicle says it has.
     """
-    found = listed(parameters)
-    lacks = "" if count is None or found >= count else ": INCOMPLETE"
-    of = "" if count is None else f"# {found} of the {count} that the vehicle says it has{lacks}\n"
-    head = f"# Vehicle parameters, as PARAM_VALUE told them\n{of}# system\tcomponent\tname\tvalue\tMAV_PARAM_TYPE\n"
+    received_count = count_parameters(parameters)
+    incomplete_text = "" if count is None or received_count >= count else ": INCOMPLETE"
+    count_text = (
+        "" if count is None else f"# {received_count} of the {count} that the vehicle says it has{incomplete_text}\n"
+    )
+    head = (
+        f"# Vehicle parameters, as PARAM_VALUE told them\n{count_text}# "
+        f"system\tcomponent\tname\tvalue\tMAV_PARAM_TYPE\n"
+    )
     return head + "".join(
-        f"{one.system}\t{one.component}\t{name}\t{one.value}\t{_NUMBERS.get(one.type, one.type)}\n"
-        for name, one in parameters.items()
+        f"{parameter.system}\t{parameter.component}\t{name}\t{parameter.value}\t"
+        f"{_NUMBERS.get(parameter.type, parameter.type)}\n"
+        for name, parameter in parameters.items()
     )
 
 
-def _autopilot_last(told: tuple[tuple[int, int, str], object]) -> bool:
-    return bool(told[0][1] == mavlink.MAV_COMP_ID_AUTOPILOT1)
+def _is_autopilot(item: tuple[tuple[int, int, str], object]) -> bool:
+    return bool(item[0][1] == mavlink.MAV_COMP_ID_AUTOPILOT1)
 
 
 def _value(value: float, kind: int, *, bytewise: bool) -> int | float:

@@ -21,7 +21,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Schema
 from zstandard import ZstdDecompressor, ZstdError, get_frame_parameters
 
-from logs.recording.disk import MAGIC, hint_of, later_segments
+from logs.recording.disk import MAGIC, describe_kind_error, find_later_segments
 from logs.recording.segment import CHUNK, CHUNK_FIELDS, COMPRESSION, INDEX, MESSAGE, STORED_SIZE, ZERO_UTC
 from logs.recording.topics import (
     END,
@@ -34,9 +34,9 @@ from logs.recording.topics import (
     Definition,
     RecorderNote,
     decode,
-    definition,
+    get_definition,
+    get_record_type,
     is_known,
-    record_type,
 )
 from uavctl.errors import RecordingError
 from uavctl.records import Header, Record
@@ -142,7 +142,7 @@ def _definition(channel: Channel, schema: Schema | None) -> Definition:
     if schema is not None:
         return Definition(channel.topic, channel.message_encoding, schema.name, schema.encoding, schema.data)
     try:
-        return definition(channel.topic)  # the chunk with its schema is damaged
+        return get_definition(channel.topic)  # the chunk with its schema is damaged
     except KeyError:
         return Definition(channel.topic, channel.message_encoding)
 
@@ -265,7 +265,7 @@ def _scan(path: Path, data: Buffer, order: ReadingOrder | None) -> Iterator[Scan
             return
         first = _next_chunk(data, 0)
         if first is None:
-            raise RecordingError(f"{path}: not a recording (no MCAP magic, no whole chunk){hint_of(path)}")
+            raise RecordingError(f"{path}: not a recording (no MCAP magic, no whole chunk){describe_kind_error(path)}")
         yield Damage(path, 0, first, "damaged before the first whole chunk")
         at, damaged = first, True
     contents = Contents()
@@ -436,10 +436,10 @@ def segment_files(path: Path) -> tuple[Path, ...]:
     """
     if path.is_dir():
         held = set(path.glob("*.mcap"))
-        inside = sorted(held.difference(*map(later_segments, held)))[:3]
+        inside = sorted(held.difference(*map(find_later_segments, held)))[:3]
         hint = f"; give the recording in it: {', '.join(map(str, inside))}" if inside else " and holds no recording"
         raise RecordingError(f"{path}: is a folder{hint}")
-    files = tuple(one for one in later_segments(path) if _continues(one))
+    files = tuple(file for file in find_later_segments(path) if _continues(file))
     if path.exists():
         files = (path, *files)
     if not files:
@@ -537,7 +537,7 @@ def records(path: Path, kind: type[R]) -> Iterator[R]:
     """
     for message in good_messages(path):
         topic = message.definition.topic
-        if is_known(topic) and issubclass(record_type(topic), kind):
+        if is_known(topic) and issubclass(get_record_type(topic), kind):
             record = decode(topic, message.data, message.at_ns)
             assert isinstance(record, kind)  # the topic's type
             yield record

@@ -19,7 +19,7 @@ from typing import Protocol
 import msgspec
 
 from logs.recording import attachments
-from logs.recording.disk import DiskFile, OutputFile, RoomWatch, free_bytes, later_segments
+from logs.recording.disk import DiskFile, FreeSpaceMonitor, OutputFile, find_later_segments, get_free_bytes
 from logs.recording.parameters import ParameterReader
 from logs.recording.segment import Rotation
 from logs.recording.topics import (
@@ -29,9 +29,9 @@ from logs.recording.topics import (
     RECORDER,
     Definition,
     RecorderNote,
-    definition,
     encode,
     encode_message,
+    get_definition,
 )
 from uavctl.config.types import LogConfig
 from uavctl.errors import RecordingError, UsageError, need
@@ -44,7 +44,7 @@ Watcher = Callable[[Definition, int, bytes], None]
 
 
 class ViewMaker(Protocol):
-    """Interface of what makes messages for viewers, as `logs.recording.views.Views`."""
+    """Interface of what makes messages for viewers, as `logs.recording.views.ViewBuilder`."""
 
     def made(self, at_ns: int, record: Record) -> list[tuple[str, bytes]]:
         """Return topic and message of all that is derived from a record."""
@@ -84,7 +84,7 @@ class DerivedTopics:
         made = [(name, at_ns, view) for name, view in self._made(at_ns, record)]
         if self._watch is not None:
             for name, time_ns, message in ((topic, at_ns, data), *made):
-                self._watch(definition(name), time_ns + self._zero_utc_ns, message)
+                self._watch(get_definition(name), time_ns + self._zero_utc_ns, message)
         return made
 
     def _made(self, at_ns: int, record: Record) -> list[tuple[str, bytes]]:
@@ -153,14 +153,14 @@ class WriteQueue:
         clock: Callable[[], float],
         onlookers: DerivedTopics,
     ) -> None:
-        taken = [one for one in (path, *later_segments(path)) if one.exists()]
+        taken = [file for file in (path, *find_later_segments(path)) if file.exists()]
         if taken:
             raise RecordingError(f"{taken[0]} exists and a recording never overwrites; choose another name")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise RecordingError(f"{path.parent}: {error.strerror}; choose another folder") from error
-        self._room = RoomWatch(path.parent, free, log.low_bytes, log.stop_bytes)
+        self._room = FreeSpaceMonitor(path.parent, free, log.low_bytes, log.stop_bytes)
         self._room.look()
         self._files = Rotation(path, log, open_file, clock)
         self._parameters = ParameterReader()
@@ -306,7 +306,9 @@ class WriteQueue:
             self._files.commit()
         if isinstance(record, Header):
             utc_ns = at_ns + self._files.zero_utc_ns
-            self._files.attach(attachments.of_header(record, utc_ns), attachments.layout(utc_ns))
+            self._files.attach(
+                attachments.make_header_attachments(record, utc_ns), attachments.make_layout_attachment(utc_ns)
+            )
         else:
             self._parameters.take(record)
 
@@ -348,7 +350,7 @@ class WriteQueue:
         try:
             self._write_note(f"{text}; {blind.unseen} without views: {blind.reason}" if blind.unseen else text)
             utc_ns = self._files.at_ns + self._files.zero_utc_ns
-            self._files.finish(attachments.of_parameters(self._parameters, utc_ns))
+            self._files.finish(attachments.make_parameter_attachments(self._parameters, utc_ns))
         except OSError as error:
             self._files.fail(error)
 
@@ -441,7 +443,7 @@ class _Base:
         log: LogConfig | None = None,
         *,
         open_file: Callable[[Path], OutputFile] = DiskFile,
-        free: Callable[[Path], int | None] = free_bytes,
+        free: Callable[[Path], int | None] = get_free_bytes,
         clock: Callable[[], float] = time.monotonic,
         onlookers: DerivedTopics | None = None,
     ) -> None:

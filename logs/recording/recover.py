@@ -21,9 +21,9 @@ from logs.recording.topics import (
     RECOVERED,
     RecorderNote,
     decode,
-    definition,
     encode,
-    raw_link,
+    get_definition,
+    parse_raw_topic,
 )
 from uavctl.errors import RecordingError
 from uavctl.records import Header
@@ -137,15 +137,20 @@ def _copy(src: Path, file: DiskFile) -> RecoverResult:
             if not item.repeated:
                 segment.add(QueuedMessage(item.definition, tally.messages, item.at_ns, item.data))
                 topic = item.definition.topic
-                if topic in (HEADER, PARAMETER) or raw_link(topic) is not None:
+                if topic in (HEADER, PARAMETER) or parse_raw_topic(topic) is not None:
                     record = decode(topic, item.data, item.at_ns)
                     parameters.take(record)
                     if isinstance(record, Header):
                         utc_ns = at_ns + zero_utc_ns
-                        segment.attach((*attachments.of_header(record, utc_ns), *attachments.layout(utc_ns)))
+                        segment.attach(
+                            (
+                                *attachments.make_header_attachments(record, utc_ns),
+                                *attachments.make_layout_attachment(utc_ns),
+                            )
+                        )
     segment = segment or Segment(file, CHUNK_BYTES)
     tally.end()
-    damage = [str(one) for one in tally.damage]
+    damage = [str(item) for item in tally.damage]
     if not tally.ended:
         damage.append(f"{src}: the end is missing: messages after the last restored one cannot be counted")
     result = RecoverResult(
@@ -162,8 +167,8 @@ def _copy(src: Path, file: DiskFile) -> RecoverResult:
         note = RecorderNote(
             at_ns=at_ns, segment=1, written=result.messages, dropped=0, refused=0, failures=0, text=text
         )
-        segment.add(QueuedMessage(definition(RECORDER), tally.messages + 1, at_ns, encode(note)))
-    segment.attach(attachments.of_parameters(parameters, at_ns + zero_utc_ns))
+        segment.add(QueuedMessage(get_definition(RECORDER), tally.messages + 1, at_ns, encode(note)))
+    segment.attach(attachments.make_parameter_attachments(parameters, at_ns + zero_utc_ns))
     segment.finish()
     return result
 

@@ -17,7 +17,16 @@ from functools import cache
 
 import msgspec
 
-from logs.recording.topics import DIGITS, RecorderNote, alike, condense, decode, raw_link, record_type, says
+from logs.recording.topics import (
+    DIGITS,
+    RecorderNote,
+    are_identical,
+    decode,
+    get_record_type,
+    is_encoding_of,
+    parse_raw_topic,
+    round_plan,
+)
 from uavctl.loop import ControlLoop
 from uavctl.records import (
     Command,
@@ -136,13 +145,13 @@ class FieldNames:
     def __init__(self, plant: Plant) -> None:
         self._states = names_of((), plant.n_x, plant.axes, plant.position_index, plant.velocity_index).states
         self._inputs = tuple(
-            (f"{axis} input", "m/s²" if one == 1.0 else "")
-            for axis, one in zip(plant.axes, plant.accel_per_input, strict=True)
+            (f"{axis} input", "m/s²" if accel == 1.0 else "")
+            for axis, accel in zip(plant.axes, plant.accel_per_input, strict=True)
         )
 
     def meaning(self, topic: str, path: str) -> tuple[str, str]:
         """Return the meaning of a leaf, and its unit; either may be empty."""
-        numbers = [int(one) for one in _NUMBER.findall(path)]
+        numbers = [int(text) for text in _NUMBER.findall(path)]
         name = plain(path)
         if not numbers:
             return "", _unit(name)
@@ -166,7 +175,7 @@ def _unit(name: str) -> str:
 
 def stage(topic: str) -> str:
     """Return which stage of a tick is in question if this topic is the first to differ."""
-    return _SAID_BY.get(topic, _SENT if raw_link(topic) is not None else "")
+    return _SAID_BY.get(topic, _SENT if parse_raw_topic(topic) is not None else "")
 
 
 def leaves(recorded: Record, replayed: Record) -> list[Leaf]:
@@ -180,8 +189,8 @@ def unequal(left: object, right: object, path: str = "") -> Iterator[Leaf]:
         for key in dict.fromkeys([*left, *right]):
             yield from unequal(left.get(key), right.get(key), f"{path}.{key}" if path else str(key))
     elif isinstance(left, list | tuple) and isinstance(right, list | tuple) and len(left) == len(right):
-        for index, (one, other) in enumerate(zip(left, right, strict=True)):
-            yield from unequal(one, other, f"{path}[{index}]")
+        for index, (value, other) in enumerate(zip(left, right, strict=True)):
+            yield from unequal(value, other, f"{path}[{index}]")
     elif not _same_bits(left, right):
         yield path, left, right
 
@@ -201,7 +210,7 @@ def close(left: object, right: object, tolerance: float) -> bool:
 
 def change(recorded: object, replayed: object) -> float | None:
     """Return the difference of two numbers; None of anything else."""
-    numbers = all(isinstance(one, int | float) and not isinstance(one, bool) for one in (recorded, replayed))
+    numbers = all(isinstance(value, int | float) and not isinstance(value, bool) for value in (recorded, replayed))
     return float(replayed - recorded) if numbers else None  # type: ignore[operator]  # both are numbers
 
 
@@ -236,7 +245,7 @@ def context(
     inp: StepInput, decisions_before: int, records_before: int, recorded: Record | None, replayed: Record | None
 ) -> Context:
     """Return the inputs of the tick `inp`, and the decisions that it led to."""
-    newest: PositionSample | None = max(inp.samples, key=lambda one: one.captured_ns, default=None)
+    newest: PositionSample | None = max(inp.samples, key=lambda sample: sample.captured_ns, default=None)
     return Context(
         decisions_before=decisions_before,
         records_before=records_before,
@@ -357,12 +366,13 @@ class _Findings:
         """Compare a recorded record with the replayed one; either may be missing."""
         parts: list[Leaf] = []
         if isinstance(recorded, Plan) and isinstance(replayed, Plan) and recorded.exact_crc32 is not None:
-            replayed = condense(replayed)
-        if recorded is not None and replayed is not None and not alike(recorded, replayed):
+            replayed = round_plan(replayed)
+        if recorded is not None and replayed is not None and not are_identical(recorded, replayed):
             parts = [
-                one
-                for one in leaves(recorded, replayed)
-                if (topic, plain(one[0])) not in self.ignored and not close(one[1], one[2], self._tolerance_of(topic))
+                leaf
+                for leaf in leaves(recorded, replayed)
+                if (topic, plain(leaf[0])) not in self.ignored
+                and not close(leaf[1], leaf[2], self._tolerance_of(topic))
             ]
         differs = bool(parts) or recorded is None or replayed is None
         if differs:
@@ -407,8 +417,8 @@ class _Findings:
         if topic == DECISION:
             self.first_decision = self.first_decision or found
         fields: dict[str, list[Leaf]] = defaultdict(list)
-        for one in parts or [("", None, None)]:
-            fields[plain(one[0])].append(one)
+        for part in parts or [("", None, None)]:
+            fields[plain(part[0])].append(part)
         for name, those in fields.items():
             known = self._fields.setdefault((topic, name), _Field(at_s, self._records[topic]))
             known.add(those, at_s)
@@ -427,15 +437,15 @@ class _Findings:
                 FieldDivergence(
                     topic=topic,
                     field=name,
-                    entry=self.places.meaning(topic, one.path)[0],
-                    unit=self.places.meaning(topic, one.path or name)[1],
-                    differing=one.differing,
-                    records=self._records[topic] - one.before,
-                    first_s=one.first_s,
-                    largest=one.largest,
-                    largest_s=one.largest_s,
+                    entry=self.places.meaning(topic, field.path)[0],
+                    unit=self.places.meaning(topic, field.path or name)[1],
+                    differing=field.differing,
+                    records=self._records[topic] - field.before,
+                    first_s=field.first_s,
+                    largest=field.largest,
+                    largest_s=field.largest_s,
                 )
-                for (topic, name), one in self._fields.items()
+                for (topic, name), field in self._fields.items()
             ),
             dropped=self.dropped,
         )
@@ -480,7 +490,12 @@ def replay(
             found.dropped = record.dropped
         if _is_compared(topic):
             replayed = produced.take(topic, at_ns)
-            if found.first is None and isinstance(message, bytes) and replayed is not None and says(replayed, message):
+            if (
+                found.first is None
+                and isinstance(message, bytes)
+                and replayed is not None
+                and is_encoding_of(replayed, message)
+            ):
                 found.same(topic)
             else:
                 found.compare(topic, at_ns, record or _decoded(topic, at_ns, message), replayed)
@@ -506,8 +521,8 @@ def _is_compared(topic: str) -> bool:
 @cache
 def _is_input(topic: str) -> bool:
     """Return whether a topic is not compared: its records drive the loop, or the result reports them."""
-    link = raw_link(topic)
+    link = parse_raw_topic(topic)
     try:
-        return record_type(topic) in (StepInput, Refused, RecorderNote) if link is None else not link[1]
+        return get_record_type(topic) in (StepInput, Refused, RecorderNote) if link is None else not link[1]
     except KeyError:
         return True  # decoding says that nobody knows it

@@ -42,8 +42,8 @@ from mcap.records import (
 from mcap.records import SummaryOffset as Group
 from zstandard import ZstdCompressor
 
-from logs.recording.disk import MAGIC, OutputFile, is_there, segment_path
-from logs.recording.topics import HEADER, Definition, definition, is_view
+from logs.recording.disk import MAGIC, OutputFile, is_present, make_segment_path
+from logs.recording.topics import HEADER, Definition, get_definition, is_view
 from uavctl.config.types import LogConfig
 
 MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
@@ -115,7 +115,7 @@ class Segment:
     def records(self) -> int:
         """Messages on the disk, without those for viewers."""
         counts = self._counts.copy()
-        return sum(counts[one.number] for topic, one in [*self._channels.items()] if not is_view(topic))
+        return sum(counts[channel.number] for topic, channel in [*self._channels.items()] if not is_view(topic))
 
     def add(self, entry: QueuedMessage) -> None:
         """Take a message; writes the open chunk first if it would grow too large.
@@ -168,9 +168,9 @@ class Segment:
             return
         prefix, at = self._prefix(), self.bytes
         block, indexes = prefix, []
-        for one in records:
-            data = _bytes(one)
-            indexes.append(_index(one, at + len(block), len(data)))
+        for record in records:
+            data = _bytes(record)
+            indexes.append(_index(record, at + len(block), len(data)))
             block += data
         self._file.write(block)
         self._crc = zlib.crc32(block, self._crc)
@@ -252,7 +252,7 @@ class Segment:
 
     def _commit(self, entries: list[QueuedMessage]) -> None:
         content = b"".join(self._parts)
-        times_ns = [one.at_ns + self._zero_utc_ns for one in entries]
+        times_ns = [entry.at_ns + self._zero_utc_ns for entry in entries]
         first, last = min(times_ns), max(times_ns)
         size, stored = len(content), self._compress(content)
         fields = CHUNK_FIELDS + len(COMPRESSION) + len(stored)
@@ -312,7 +312,7 @@ class Segment:
         return data_end + summary + offsets + footer + MAGIC
 
     def _of(self, kind: type[AttachmentIndex | MetadataIndex]) -> list[AttachmentIndex | MetadataIndex]:
-        return [one for one in self._attached if isinstance(one, kind)]
+        return [attachment for attachment in self._attached if isinstance(attachment, kind)]
 
     def _statistics(self) -> Statistics:
         first, last = self._times_ns or (0, 0)
@@ -424,7 +424,7 @@ class Rotation:
     @property
     def name(self) -> str:
         """Name of the file that is open, or comes next."""
-        return segment_path(self._path, self.number).name
+        return make_segment_path(self._path, self.number).name
 
     @property
     def has_chunk(self) -> bool:
@@ -456,7 +456,7 @@ class Rotation:
         segment, done = self._segment, [*self._done]
         if segment is not None and segment.bytes:
             done.append(self._part(segment))
-        return [(one.path, one.messages, one.bytes) for one in done]
+        return [(file.path, file.messages, file.bytes) for file in done]
 
     def look(self) -> None:
         """Check that the files written so far are still where they were made.
@@ -465,7 +465,7 @@ class Rotation:
             OSError: the open file is not; closed ones are remembered as gone.
         """
         for part in [*self._done]:
-            if not is_there(part.path, part.bytes):
+            if not is_present(part.path, part.bytes):
                 self._done.remove(part)
                 self._lose(part)
         if self._segment is not None and not self._is_there(self._segment):
@@ -481,7 +481,7 @@ class Rotation:
         Raises:
             OSError: it cannot be opened or written.
         """
-        path = segment_path(self._path, self.number)
+        path = make_segment_path(self._path, self.number)
         path.parent.mkdir(parents=True, exist_ok=True)  # somebody may have removed it with the file before
         self._segment = Segment(self._open_file(path), self._log.chunk_bytes, self.zero_utc_ns)
         self._opened = path.stat()
@@ -500,7 +500,7 @@ class Rotation:
             OSError: a chunk could not be written; `fail` keeps what it held, this message included.
         """
         self.written += 1
-        self._open_segment().add(QueuedMessage(definition(topic), self.written, at_ns, data))
+        self._open_segment().add(QueuedMessage(get_definition(topic), self.written, at_ns, data))
 
     def write_record(self, topic: str, at_ns: int, data: bytes) -> None:
         """Add a record's message; the header is kept for later files.
@@ -574,7 +574,7 @@ class Rotation:
             return  # it could not even be opened
         self.written -= len(segment.open_entries)  # they are numbered anew
         kept = segment.open_entries[max(0, self._preface - segment.messages) :]
-        self.unwritten.extendleft((one.definition.topic, one.at_ns, one.data) for one in reversed(kept))
+        self.unwritten.extendleft((record.definition.topic, record.at_ns, record.data) for record in reversed(kept))
         # what abandon cannot do is no second alarm: whole chunks are readable without it
         there = self._is_there(segment)
         with contextlib.suppress(OSError):
@@ -586,14 +586,16 @@ class Rotation:
         return self._segment
 
     def _part(self, segment: Segment) -> _SegmentPart:
-        return _SegmentPart(segment_path(self._path, self.number), segment.messages, segment.bytes, segment.records)
+        return _SegmentPart(
+            make_segment_path(self._path, self.number), segment.messages, segment.bytes, segment.records
+        )
 
     def _lose(self, part: _SegmentPart) -> None:
         self.gone.append(part.path.name)
         self.gone_records += part.records
 
     def _is_there(self, segment: Segment) -> bool:
-        return is_there(segment_path(self._path, self.number), segment.bytes, self._opened)
+        return is_present(make_segment_path(self._path, self.number), segment.bytes, self._opened)
 
     def _retire(self, segment: Segment, *, there: bool) -> None:
         part = self._part(segment)

@@ -56,7 +56,9 @@ class ChosenVehicle:
         if self.system is not None and self.heartbeat is None:
             found.append(f"system {self.system} sends no heartbeat of an autopilot: its mode and arming are not known")
         if self.others:
-            names = ", ".join(f"system {one.system} ({find_autopilot_name(one.autopilot)})" for one in self.others)
+            names = ", ".join(
+                f"system {sender.system} ({find_autopilot_name(sender.autopilot)})" for sender in self.others
+            )
             found.append(
                 f"another vehicle is in it: {names}; system {self.system} is shown, `--system` chooses another"
                 if len(self.others) == 1
@@ -66,15 +68,15 @@ class ChosenVehicle:
 
     def of_others(self, packet: TlogPacket) -> bool:
         """Return whether a packet comes from another vehicle's system."""
-        return any(system_of(packet.data) == one.system for one in self.others)
+        return any(get_system_id(packet.data) == sender.system for sender in self.others)
 
 
-def system_of(frame: bytes) -> int:
+def get_system_id(frame: bytes) -> int:
     """Return the system id of a whole frame."""
     return frame[5 if frame[0] == mavlink.PROTOCOL_MARKER_V2 else 3]
 
 
-def message_of(frame: bytes) -> int:
+def get_message_id(frame: bytes) -> int:
     """Return the message id of a whole frame."""
     return int.from_bytes(frame[7:10], "little") if frame[0] == mavlink.PROTOCOL_MARKER_V2 else frame[5]
 
@@ -92,27 +94,27 @@ def choose_vehicle(packets: Sequence[TlogPacket], name: str, system: int | None 
     """
     first: dict[tuple[int, int], Heartbeat] = {}
     for packet in packets:
-        if message_of(packet.data) == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
-            for one in decode(packet.data).messages:
-                if isinstance(one, Heartbeat) and is_vehicle(one):
-                    first.setdefault((one.system, one.component), one)
+        if get_message_id(packet.data) == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
+            for message in decode(packet.data).messages:
+                if isinstance(message, Heartbeat) and is_vehicle(message):
+                    first.setdefault((message.system, message.component), message)
     vehicles: dict[int, Heartbeat] = {}
-    for one in sorted(first.values(), key=lambda one: one.component != _AUTOPILOT):  # in order else
-        vehicles.setdefault(one.system, one)
+    for sender in sorted(first.values(), key=lambda sender: sender.component != _AUTOPILOT):  # in order else
+        vehicles.setdefault(sender.system, sender)
     if system is None:
         system = next(iter(vehicles), None)
-    elif system not in vehicles and all(system_of(packet.data) != system for packet in packets):
-        there = sorted({system_of(packet.data) for packet in packets})
+    elif system not in vehicles and all(get_system_id(packet.data) != system for packet in packets):
+        there = sorted({get_system_id(packet.data) for packet in packets})
         listed = ", ".join(map(str, there))
         raise UsageError(f"--system {system}: {name} has nothing of it; systems in it: {listed}")
     if system is None:
-        told = (system_of(one.data) for one in packets if message_of(one.data) in _STATES)
-        system = next((one for one in told if one not in GROUND_SYSTEMS), None)
-    others = tuple(one for number, one in sorted(vehicles.items()) if number != system)
+        systems = (get_system_id(heard.data) for heard in packets if get_message_id(heard.data) in _STATES)
+        system = next((system for system in systems if system not in GROUND_SYSTEMS), None)
+    others = tuple(vehicle for number, vehicle in sorted(vehicles.items()) if number != system)
     return ChosenVehicle(system, None if system is None else vehicles.get(system), others)
 
 
-class SenderCounts:
+class SenderCounter:
     """Counts what each component sent, by the frames that were right."""
 
     def __init__(self) -> None:
@@ -139,11 +141,11 @@ class SenderCounts:
         for (system, component), messages in sorted(self._messages.items()):
             kind = self._kinds.get((system, component))
             yield LogSender(
-                system=system, component=component, kind="" if kind is None else _kind_name(kind),
+                system=system, component=component, kind="" if kind is None else _get_type_name(kind),
                 messages=messages, missing=self._missing[system, component],
             )  # fmt: skip
 
 
-def _kind_name(kind: int) -> str:
+def _get_type_name(kind: int) -> str:
     known = mavlink.enums["MAV_TYPE"].get(kind)
     return f"type {kind}" if known is None else known.name.removeprefix("MAV_TYPE_").lower().replace("_", " ")

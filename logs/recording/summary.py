@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from rich.table import Table
 from rich.text import Text
 
-from logs.recording.design_view import Box, Floats
+from logs.recording.design_view import Box
 from logs.recording.flight import FLOWN, FlightData
+from uavctl.arrays import Array
 from uavctl.config.mission import FenceConfig
 from uavctl.outcome import Cause, lacking, make_ending
 from uavctl.records import ControlMode, Ending, Matrix, SolveStatus, Vector, duration, number, percent_above
@@ -31,15 +32,15 @@ _IN_FLIGHT = {
 }
 
 
-def ending_of(flight: FlightData) -> Ending:
+def find_ending(flight: FlightData) -> Ending:
     """Return how a flight ended: as recorded, else by its records, as in older, torn and partial recordings."""
     if flight.endings:
         return flight.endings[-1]
-    cause = _cause(flight)
-    return make_ending(cause, _sentence(flight, cause))
+    cause = _find_cause(flight)
+    return make_ending(cause, _describe_cause(flight, cause))
 
 
-def _cause(flight: FlightData) -> Cause:
+def _find_cause(flight: FlightData) -> Cause:
     modes = [decision.mode for decision in flight.flown]
     if flight.breach is not None:
         return Cause.LET_GO
@@ -52,23 +53,23 @@ def _cause(flight: FlightData) -> Cause:
     return Cause.IN_FLIGHT if flight.stopped_ns is None else Cause.OPERATOR
 
 
-def _sentence(flight: FlightData, cause: Cause) -> str:
+def _describe_cause(flight: FlightData, cause: Cause) -> str:
     last = (flight.flown or flight.decisions)[-1]
     if flight.breach is not None:
-        return f"{cause.value} after {_seconds(flight, flight.breach.at_ns)}: {flight.breach.text}"
+        return f"{cause.value} after {_format_seconds(flight, flight.breach.at_ns)}: {flight.breach.text}"
     if cause in _LANDED:
         landed_ns = next(d.at_ns for d in flight.flown if d.mode is ControlMode.LAND)
-        return f"{cause.value} after {_seconds(flight, landed_ns)}"
+        return f"{cause.value} after {_format_seconds(flight, landed_ns)}"
     if cause is Cause.WAITING:
         return f"at the end the controller was waiting: {last.reason}"
     if flight.stopped_ns is not None:
-        return f"{cause.value} after {_seconds(flight, flight.stopped_ns)}; {_hand_over(flight)}"
+        return f"{cause.value} after {_format_seconds(flight, flight.stopped_ns)}; {_describe_hand_over(flight)}"
     if flight.landing is not None and last.mode in _IN_FLIGHT:
         return "the recording ends while the vehicle was brought to rest, to land"
     return _IN_FLIGHT.get(last.mode, "at the end a plan was being flown")
 
 
-def _hand_over(flight: FlightData) -> str:
+def _describe_hand_over(flight: FlightData) -> str:
     """Return in words what the controller did after the operator's stop."""
     modes = {d.mode for d in flight.decisions[len(flight.flown) :]}
     if ControlMode.LAND in modes:
@@ -78,18 +79,18 @@ def _hand_over(flight: FlightData) -> str:
     return "the recording ends before the vehicle was handed over"
 
 
-def _seconds(flight: FlightData, at_ns: int) -> str:
+def _format_seconds(flight: FlightData, at_ns: int) -> str:
     return f"{number(float(flight.seconds([at_ns])[0]))} s"
 
 
 # The limits of the state over a flight: constant ones, and fences that closed in.
 
 
-def limits_at(flight: FlightData, t_s: Floats) -> Floats:
+def compute_limits(flight: FlightData, t_s: Array) -> Array:
     """Return the right sides of the state set's rows (n, m_x) at report times (n,) [s]."""
     design, begun_s = flight.design, flight.targets[0][0]
     limits = np.tile(np.array(design.b_x), (len(t_s), 1))
-    for fence in _fences(flight):
+    for fence in _read_fences(flight):
         state, box = fence.state, design.state_box
         if isinstance(state, str):
             state = design.position_index[design.axes.index(state)]
@@ -99,9 +100,9 @@ def limits_at(flight: FlightData, t_s: Floats) -> Floats:
     return limits
 
 
-def box_at(flight: FlightData, t_s: Floats) -> tuple[Floats, Floats]:
+def compute_box(flight: FlightData, t_s: Array) -> tuple[Array, Array]:
     """Return the axis-parallel limits of the states, lower and upper (n, n_x); infinite where a side is open."""
-    design, limits = flight.design, limits_at(flight, t_s)
+    design, limits = flight.design, compute_limits(flight, t_s)
     sides = []
     box: Box = design.state_box
     for rows, constant in ((box.row_lower, box.lower), (box.row_upper, box.upper)):
@@ -113,7 +114,7 @@ def box_at(flight: FlightData, t_s: Floats) -> tuple[Floats, Floats]:
     return sides[0], sides[1]
 
 
-def _fences(flight: FlightData) -> Iterator[FenceConfig]:
+def _read_fences(flight: FlightData) -> Iterator[FenceConfig]:
     """Return the fences of the flight's configuration; none if it cannot be read any more."""
     try:
         found = tomllib.loads(flight.header.config_toml).get("fence", [])
@@ -205,34 +206,34 @@ def summarise(
     is `ending`, which the recording tells then.
     """
     if ending is None:
-        ending = lacking(ending_of(flight), recorder_dropped, "")
+        ending = lacking(find_ending(flight), recorder_dropped, "")
     steps = flight.steps
     flown = [d for d in flight.flown if d.mode in FLOWN]
     flown_ns = {d.at_ns for d in flown}
     accepted = sum(d.accepted for d in flight.decisions)
-    received, lost = _channel(flight)
+    received, lost = _count_channel_positions(flight)
     solves = [d.solve for d in flight.decisions if d.solve is not None]
-    error_m = position_error_m(flight)
+    error_m = compute_position_errors_m(flight)
     settled = error_m[-max(1, round(SETTLED_SHARE * len(error_m))) :]
-    course = course_error(flight)
+    course = compute_course_error(flight)
     return FlightSummary(
         steps=len(steps),
         duration_s=round(flight.duration_s, 9),
         received=max(received, accepted),  # the last truth may be older than the last position
         lost=lost,
         max_age=max((d.age_steps for d in steps.decisions if d.age_steps is not None), default=0),
-        fallbacks=_fallback_entries(flight),
-        state_violations=int(np.count_nonzero(state_outside(flight))),
-        input_violations=int(np.count_nonzero(input_outside(flight))),
+        fallbacks=_count_fallbacks(flight),
+        state_violations=int(np.count_nonzero(find_state_violations(flight))),
+        input_violations=int(np.count_nonzero(find_input_violations(flight))),
         slack_used=sum(
             plan.slack > SLACK_TOLERANCE or plan.terminal_miss > SLACK_TOLERANCE for plan in flight.flown_plans.values()
         ),
-        cost=_cost(flight),
+        cost=_compute_cost(flight),
         recording=recording,
         report=report,
         wall_s=wall_s,
-        decision_us=spread(decision_times_us(flight)),
-        tick_lateness_us=spread(np.array([timing.lateness_ns for timing in flight.timings]) * 1e-3),
+        decision_us=compute_percentiles(get_decision_times_us(flight)),
+        tick_lateness_us=compute_percentiles(np.array([timing.lateness_ns for timing in flight.timings]) * 1e-3),
         state_source="truth" if steps.from_truth else "estimate",
         real_time_factor=flight.duration_s / wall_s if wall_s else None,
         accepted=accepted,
@@ -269,16 +270,16 @@ def _position_std_m(flight: FlightData) -> float | None:
     return float(np.sqrt(max(np.linalg.eigvalsh(cov)[-1], 0.0)))
 
 
-def predicted_only(summary: FlightSummary) -> str:
+def describe_prediction(summary: FlightSummary) -> str:
     """Return in words that the last distance is a prediction, and how uncertain; empty after a recent position."""
     s = summary
     if s.state_source == "truth" or s.final_age_s is None or s.final_age_s <= max(BLIND_S, BLIND_STEPS * s.dt_s):
         return ""
-    trusted = "" if s.final_std_m is None else f", standard deviation {number(s.final_std_m)} m by its own account"
-    return f"predicted only: the newest position was {number(s.final_age_s)} s old{trusted}"
+    std_text = "" if s.final_std_m is None else f", standard deviation {number(s.final_std_m)} m by its own account"
+    return f"predicted only: the newest position was {number(s.final_age_s)} s old{std_text}"
 
 
-def _channel(flight: FlightData) -> tuple[int, int | None]:
+def _count_channel_positions(flight: FlightData) -> tuple[int, int | None]:
     """Return the positions that the simulated channel delivered and lost in this recording; 0 and None without one."""
     if not flight.truths:
         return 0, None
@@ -287,7 +288,7 @@ def _channel(flight: FlightData) -> tuple[int, int | None]:
     return sent - lost, lost
 
 
-def _methods(s: FlightSummary) -> str:
+def _describe_methods(s: FlightSummary) -> str:
     """Return the number of plans by method, and the largest certified gap to the optimum."""
     if not s.methods:
         return "none"
@@ -295,7 +296,7 @@ def _methods(s: FlightSummary) -> str:
     return ", ".join(f"{n} {method}" for method, n in s.methods.items()) + certified
 
 
-def position_error_m(flight: FlightData) -> Floats:
+def compute_position_errors_m(flight: FlightData) -> Array:
     """Return the distance from the target of the moment at each flown boundary (n,) [m]."""
     index = list(flight.design.position_index)
     return np.asarray(np.linalg.norm((flight.steps.state - flight.steps.target)[:, index], axis=1))
@@ -309,7 +310,7 @@ class CourseError(NamedTuple):
     worst_s: float
 
 
-def course_error(flight: FlightData) -> CourseError | None:
+def compute_course_error(flight: FlightData) -> CourseError | None:
     """Return how far the vehicle was off its target once it had come there; None where it never came there.
 
     On a trajectory all counts from the first arrival on. On the way to a waypoint, or to another place, the distance
@@ -319,10 +320,10 @@ def course_error(flight: FlightData) -> CourseError | None:
     moved = np.zeros(len(target), dtype=np.bool_)  # to another place, with this step
     if not flight.moving_target:
         moved[1:] = np.any(target[1:] != target[:-1], axis=1)
-    return errors_from_arrival(flight.steps.t_s, position_error_m(flight), moved)
+    return compute_errors_from_arrival(flight.steps.t_s, compute_position_errors_m(flight), moved)
 
 
-def errors_from_arrival(t_s: Floats, error_m: Floats, moved: NDArray[np.bool_]) -> CourseError | None:
+def compute_errors_from_arrival(t_s: Array, error_m: Array, has_moved: NDArray[np.bool_]) -> CourseError | None:
     """Return what distances come to that count from each arrival on; None without one.
 
     Args:
@@ -330,47 +331,47 @@ def errors_from_arrival(t_s: Floats, error_m: Floats, moved: NDArray[np.bool_]) 
         error_m: Distances from the target of the moment (n,) [m].
         moved: At which of them another target has begun (n,).
     """
-    near, place = error_m <= ARRIVED_M, np.cumsum(moved)
-    there = [np.logical_or.accumulate(near[place == one]) for one in np.unique(place)]
-    counts = np.concatenate(there) if there else np.zeros(0, dtype=np.bool_)
-    if not counts.any():
+    has_arrived, segment = error_m <= ARRIVED_M, np.cumsum(has_moved)
+    arrived_by_segment = [np.logical_or.accumulate(has_arrived[segment == index]) for index in np.unique(segment)]
+    is_counted = np.concatenate(arrived_by_segment) if arrived_by_segment else np.zeros(0, dtype=np.bool_)
+    if not is_counted.any():
         return None
-    kept, at_s = error_m[counts], t_s[counts]
-    return CourseError(float(np.sqrt(np.mean(kept**2))), float(kept.max()), float(at_s[kept.argmax()]))
+    counted_m, at_s = error_m[is_counted], t_s[is_counted]
+    return CourseError(float(np.sqrt(np.mean(counted_m**2))), float(counted_m.max()), float(at_s[counted_m.argmax()]))
 
 
-def state_outside(flight: FlightData) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+def find_state_violations(flight: FlightData) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
     """Return at which flown boundaries the state violates its set or a fence (n,); NaN counts as outside.
 
     Where the truth is unknown, a state without a position that plans still reach from is a mere prediction, and no step
     counts as outside by it.
     """
     steps = flight.steps
-    outside = _outside(steps.state, flight.design.c_x, limits_at(flight, steps.t_s), RELATIVE_TOLERANCE)
+    is_outside = _find_violations(steps.state, flight.design.c_x, compute_limits(flight, steps.t_s), RELATIVE_TOLERANCE)
     if not steps.from_truth:
-        ages = np.array([0 if one.age_steps is None else one.age_steps for one in steps.decisions])
-        outside &= ages <= flight.design.horizon
-    return outside
+        ages = np.array([0 if decision.age_steps is None else decision.age_steps for decision in steps.decisions])
+        is_outside &= ages <= flight.design.horizon
+    return is_outside
 
 
-def input_outside(flight: FlightData) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+def find_input_violations(flight: FlightData) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
     """Return at which flown boundaries the input, as decided or as applied, violates its set (n,)."""
     design, steps = flight.design, flight.steps
-    given = ~np.isnan(steps.decided).any(axis=1)
-    outside = given & _outside(steps.decided, design.c_u, design.b_u, RELATIVE_TOLERANCE)
+    has_input = ~np.isnan(steps.decided).any(axis=1)
+    is_outside = has_input & _find_violations(steps.decided, design.c_u, design.b_u, RELATIVE_TOLERANCE)
     if steps.from_truth:
-        outside |= _outside(steps.input, design.c_u, design.b_u, WIRE_TOLERANCE)
-    return outside
+        is_outside |= _find_violations(steps.input, design.c_u, design.b_u, WIRE_TOLERANCE)
+    return is_outside
 
 
-def decision_times_us(flight: FlightData) -> Floats:
+def get_decision_times_us(flight: FlightData) -> Array:
     """Return the computing time (n,) [µs] of the ticks that solved; of all ticks if none did."""
     solved = {d.tick for d in flight.decisions if d.solve is not None}
     times = [timing.step_ns for timing in flight.timings if timing.tick in solved]
     return np.array(times or [timing.step_ns for timing in flight.timings]) * 1e-3
 
 
-def spread(values_us: Floats) -> Percentiles:
+def compute_percentiles(values_us: Array) -> Percentiles:
     """Return median, 99th percentile and maximum."""
     if not len(values_us):
         return Percentiles()
@@ -379,12 +380,12 @@ def spread(values_us: Floats) -> Percentiles:
     return Percentiles(p50=round(float(p50), 3), p99=round(float(p99), 3), max=round(float(values_us.max()), 3))
 
 
-def render(summary: FlightSummary, more: Iterable[tuple[str, str]] = ()) -> Table:
+def make_summary_table(summary: FlightSummary, extra_rows: Iterable[tuple[str, str]] = ()) -> Table:
     """Return the summary as a table for a terminal, followed by further (name, value)."""
-    return names_and_values((*rows(summary), *more))
+    return make_value_table((*list_summary_rows(summary), *extra_rows))
 
 
-def names_and_values(pairs: Iterable[tuple[str, str]]) -> Table:
+def make_value_table(pairs: Iterable[tuple[str, str]]) -> Table:
     """A table of (name, value) without lines, for a terminal."""
     table = Table(show_header=False, box=None, pad_edge=False)
     table.add_column(style="bold")
@@ -394,72 +395,78 @@ def names_and_values(pairs: Iterable[tuple[str, str]]) -> Table:
     return table
 
 
-def rows(summary: FlightSummary) -> list[tuple[str, str]]:
+def list_summary_rows(summary: FlightSummary) -> list[tuple[str, str]]:
     """Return the summary as (name, value)."""
     s = summary
-    lost = "" if s.lost is None else f", {s.lost} lost{_share(s.lost, s.received + s.lost)}"
-    seen = "" if s.state_source == "truth" else " (by the estimate; the true state is unknown)"
-    found = [
-        ("Flown", f"{count(s.steps, 'step')}; {number(s.duration_s)} s{_pace(s)}"),
+    lost_text = "" if s.lost is None else f", {s.lost} lost{_format_share(s.lost, s.received + s.lost)}"
+    source_text = "" if s.state_source == "truth" else " (by the estimate; the true state is unknown)"
+    summary_rows = [
+        ("Flown", f"{count(s.steps, 'step')}; {number(s.duration_s)} s{_describe_pace(s)}"),
         ("Ended", f"{s.ending.sentence} The recording breaks off." if s.breaks_off else s.ending.sentence),
         *((("Relay", s.ending.relay),) if s.ending.relay else ()),
         *(() if s.let_go is None else (("Let go", s.let_go),)),
-        ("Positions", f"{s.received} received{lost}; {s.accepted} used, {s.rejected} refused"),
+        ("Positions", f"{s.received} received{lost_text}; {s.accepted} used, {s.rejected} refused"),
         ("Largest age", f"{count(s.max_age, 'step')} ({number(s.max_age_s)} s)"),
         ("Fallbacks", str(s.fallbacks)),
-        ("State outside limits", f"{count(s.state_violations, 'step')}{_share(s.state_violations, s.steps)}{seen}"),
-        ("Input outside limits", f"{count(s.input_violations, 'step')}{_share(s.input_violations, s.steps)}"),
+        (
+            "State outside limits",
+            f"{count(s.state_violations, 'step')}{_format_share(s.state_violations, s.steps)}{source_text}",
+        ),
+        ("Input outside limits", f"{count(s.input_violations, 'step')}{_format_share(s.input_violations, s.steps)}"),
         ("Solves", f"{s.solves}, {s.failed_solves} without an optimum; {s.slack_used} flown with slack"),
-        ("Plans found", _methods(s)),
-        ("Cost", f"{s.cost:.6g}{seen}" if math.isfinite(s.cost) else "unknown: not every step's state is a number"),
-        (f"Distance from {'trajectory' if s.trajectory else 'target'}", _distance(s)),
-        ("Decision time", _times(s.decision_us)),
-        _punctuality(s),
+        ("Plans found", _describe_methods(s)),
+        (
+            "Cost",
+            f"{s.cost:.6g}{source_text}" if math.isfinite(s.cost) else "unknown: not every step's state is a number",
+        ),
+        (f"Distance from {'trajectory' if s.trajectory else 'target'}", _describe_distance(s)),
+        ("Decision time", _format_percentiles(s.decision_us)),
+        _describe_lateness(s),
     ]
     if s.recorder_dropped:
-        found.append(("Recording", _lack(s.recorder_dropped)))
-    found += [(name, path) for name, path in (("Recorded in", s.recording), ("Report", s.report)) if path]
-    return found
+        summary_rows.append(("Recording", _describe_dropped(s.recorder_dropped)))
+    summary_rows += [(name, path) for name, path in (("Recorded in", s.recording), ("Report", s.report)) if path]
+    return summary_rows
 
 
-def _pace(s: FlightSummary) -> str:
-    if s.wall_s is None or not _in_virtual_time(s):
+def _describe_pace(s: FlightSummary) -> str:
+    if s.wall_s is None or not _is_virtual_time(s):
         return ""
-    speed = "" if s.real_time_factor is None else f" ({number(s.real_time_factor, 1)} × real time)"
-    return f" in {number(s.wall_s)} s{speed}"
+    factor_text = "" if s.real_time_factor is None else f" ({number(s.real_time_factor, 1)} × real time)"
+    return f" in {number(s.wall_s)} s{factor_text}"
 
 
-def _punctuality(s: FlightSummary) -> tuple[str, str]:
-    if _in_virtual_time(s):
+def _describe_lateness(s: FlightSummary) -> tuple[str, str]:
+    if _is_virtual_time(s):
         return "Clock", "virtual time"
-    return "Tick lateness", f"{_times(s.tick_lateness_us)}; {count(s.missed_ticks, 'tick')} missed"
+    return "Tick lateness", f"{_format_percentiles(s.tick_lateness_us)}; {count(s.missed_ticks, 'tick')} missed"
 
 
-def _in_virtual_time(s: FlightSummary) -> bool:
+def _is_virtual_time(s: FlightSummary) -> bool:
     return s.tick_lateness_us.max == 0 and not s.missed_ticks
 
 
-def _lack(records: int) -> str:
+def _describe_dropped(records: int) -> str:
     return f"{count(records, 'record')} dropped, and missing from all figures: the disk was too slow"
 
 
-def _distance(s: FlightSummary) -> str:
+def _describe_distance(s: FlightSummary) -> str:
     if s.final_error_m is None:
         return "not flown"
-    blind = predicted_only(s)
-    final = f"{number(s.final_error_m)} m at the last flown step{f' ({blind})' if blind else ''}"
+    prediction = describe_prediction(s)
+    final_text = f"{number(s.final_error_m)} m at the last flown step{f' ({prediction})' if prediction else ''}"
     if s.course_rms_m is None or s.course_worst_m is None or s.course_worst_s is None:
-        return f"{final}; it never came within {ARRIVED_M:g} m"
-    where = "on the whole way" if s.trajectory else "from each arrival on"
-    worst = f"at most {number(s.course_worst_m)} m, at {number(s.course_worst_s)} s"
-    return f"{number(s.course_rms_m)} m {where} (rms), {worst}; {final}"
+        return f"{final_text}; it never came within {ARRIVED_M:g} m"
+    period = "on the whole way" if s.trajectory else "from each arrival on"
+    max_text = f"at most {number(s.course_worst_m)} m, at {number(s.course_worst_s)} s"
+    return f"{number(s.course_rms_m)} m {period} (rms), {max_text}; {final_text}"
 
 
-def _share(part: int, whole: int) -> str:
+def _format_share(part: int, whole: int) -> str:
     return f" ({100 * part / whole:.3g} %)" if part and whole else ""
 
 
-def _times(times: Percentiles) -> str:
+def _format_percentiles(times: Percentiles) -> str:
     if times.p50 is None or times.p99 is None or times.max is None:
         return "not measured"
     return f"median {duration(times.p50)}, 99 % {duration(times.p99)}, largest {duration(times.max)}"
@@ -470,14 +477,14 @@ def count(amount: int, noun: str) -> str:
     return f"{amount} {noun}{'' if amount == 1 else 's'}"
 
 
-def _fallback_entries(flight: FlightData) -> int:
-    fallen = {d.tick for d in flight.fallen}
-    inside = [d.tick in fallen for d in flight.flown]
-    return sum(b and not a for a, b in pairwise([False, *inside]))
+def _count_fallbacks(flight: FlightData) -> int:
+    fallback_ticks = {d.tick for d in flight.fallen}
+    is_fallback = [d.tick in fallback_ticks for d in flight.flown]
+    return sum(b and not a for a, b in pairwise([False, *is_fallback]))
 
 
-def _outside(
-    values: Floats, c: Matrix, b: Vector | Floats, tolerance: float
+def _find_violations(
+    values: Array, c: Matrix, b: Vector | Array, tolerance: float
 ) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
     """Return which rows of `values` (n, m) violate {v | c v <= b} by more than a relative tolerance."""
     normals = np.array(c).reshape(-1, values.shape[1])
@@ -485,7 +492,7 @@ def _outside(
     return np.asarray(~(values @ normals.T <= limit + tolerance * np.maximum(1.0, np.abs(limit))).all(axis=1))
 
 
-def _cost(flight: FlightData) -> float:
+def _compute_cost(flight: FlightData) -> float:
     """Return the closed-loop cost (3), summed over the flown boundaries; NaN where their states are not all known."""
     design, steps = flight.design, flight.steps
     x = steps.state - steps.target

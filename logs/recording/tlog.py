@@ -15,11 +15,11 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from logs.recording.disk import all_or_none, check_free, hint_of, unfinished
-from logs.recording.export import Watch, known_number, unwatched
+from logs.recording.disk import describe_kind_error, refuse_existing_files, remove_on_error, write_temporary_files
+from logs.recording.export import Watch, count_messages, ignore_progress
 from logs.recording.reader import RecordedMessage, good_messages, header
 from logs.recording.summary import count
-from logs.recording.topics import raw_link
+from logs.recording.topics import parse_raw_topic
 from uavctl.errors import RecordingError, UsageError
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.connection import STREAM_SCHEMES
@@ -36,7 +36,7 @@ _TOLD_SILENCE_NS = 10_000_000_000  # a vehicle's heartbeats come once a second
 _MOST_AT_ONCE = 200  # packets of one stamp: what a fast link brings within the 16 ms of a coarse clock is less
 
 
-class SteadyClock:
+class MonotonicClock:
     """Clock that goes on steadily where the stamps of a recording leap.
 
     After a leap time goes on from the last one before it. When the stamps come back to what they were (a single one
@@ -188,10 +188,12 @@ def read_tlog(path: Path) -> Tlog:
             ".tlog.raw), so nobody knows what came when; give the .tlog of that flight"
         )
     if not found.packets:
-        raise RecordingError(f"{path}: no MAVLink packet with a time stamp in it; is it a .tlog?{hint_of(path)}")
+        raise RecordingError(
+            f"{path}: no MAVLink packet with a time stamp in it; is it a .tlog?{describe_kind_error(path)}"
+        )
     found.clock.check(str(path))
     return Tlog(
-        in_order(found.packets),
+        sort_packets(found.packets),
         torn_bytes=found.torn_bytes,
         skipped_bytes=found.skipped_bytes,
         clock_notes=(*note, *found.clock.notes(path.name)),
@@ -210,7 +212,7 @@ class _Cutter:
         self._data, self._stamp = data, stamp
         self._first = 0  # where the first packet begins
         self.packets: list[TlogPacket] = []
-        self.clock = SteadyClock()
+        self.clock = MonotonicClock()
         self.skipped_bytes = self.torn_bytes = 0
         self._cut()
 
@@ -219,7 +221,7 @@ class _Cutter:
         least = self._stamp.size + 3  # of a packet: enough to know its length
         while at + least <= len(data):
             begin = at + self._stamp.size
-            length = frame_length(data, begin)
+            length = get_frame_length(data, begin)
             end = begin + length
             stamp_us = self._stamp_us(at)
             expected = bool(length) and self.clock.expects(stamp_us * 1000)
@@ -227,7 +229,7 @@ class _Cutter:
                 break
             if expected or (length and self._is_believed(stamp_us, begin, end)):
                 self._first = self._first if self.packets else begin
-                self.packets.append(packet_of(self.clock.steady(stamp_us * 1000), data[begin:end]))
+                self.packets.append(make_packet(self.clock.steady(stamp_us * 1000), data[begin:end]))
                 at = end
             else:
                 likely = _LIKELY[self._stamp].search(data, at + 1)
@@ -241,8 +243,8 @@ class _Cutter:
         at, last = self._first, min(self._first + _PROBED_BYTES, len(self._data))
         frames = stamped = 0
         before = -1  # the end of the frame before
-        while (at := next_marker(self._data, at)) < last:
-            end = at + frame_length(self._data, at)
+        while (at := find_next_marker(self._data, at)) < last:
+            end = at + get_frame_length(self._data, at)
             if end <= at or end > len(self._data) or not is_frame(self._data[at:end]):
                 at += 1
                 continue
@@ -259,19 +261,19 @@ class _Cutter:
         data = self._data
         if end > len(data) or stamp_us >= _LAST_STAMP_US:
             return False
-        follows = frame_length(data, end + self._stamp.size) > 0
+        follows = get_frame_length(data, end + self._stamp.size) > 0
         if follows and abs(self._stamp_us(end) - stamp_us) * 1000 <= LONGEST_SILENCE_NS:
             return True
         return is_frame(data[begin:end])
 
 
-def next_marker(data: bytes, start: int) -> int:
+def find_next_marker(data: bytes, start: int) -> int:
     """Return the index of the next byte that could begin a frame, or the end."""
     found = _ANY_MARKER.search(data, start)
     return len(data) if found is None else found.start()
 
 
-def frame_length(data: bytes, at: int) -> int:
+def get_frame_length(data: bytes, at: int) -> int:
     """Return the length of the frame that begins at `at` by its head [bytes]; 0 if none does."""
     if at + 3 > len(data):
         return 0
@@ -282,13 +284,13 @@ def frame_length(data: bytes, at: int) -> int:
     return 0
 
 
-def packet_of(at_ns: int, data: bytes) -> TlogPacket:
+def make_packet(at_ns: int, data: bytes) -> TlogPacket:
     """Return a packet with its direction guessed; one too short to name a system counts as incoming."""
     place = 5 if data[0] == _STX_V2 else 3
     return TlogPacket(at_ns=at_ns, data=data, outgoing=len(data) > place and data[place] in GROUND_SYSTEMS)
 
 
-def in_order(packets: list[TlogPacket]) -> tuple[TlogPacket, ...]:
+def sort_packets(packets: list[TlogPacket]) -> tuple[TlogPacket, ...]:
     """Return packets in order of time; those of the same time keep their order."""
     return tuple(sorted(packets, key=lambda packet: packet.at_ns))
 
@@ -310,7 +312,7 @@ class ExportedTlog(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def export_tlog(
-    flight: Path, file: Path, *, link: str | None = None, force: bool = False, watch: Watch = unwatched
+    flight: Path, file: Path, *, link: str | None = None, force: bool = False, watch: Watch = ignore_progress
 ) -> ExportedTlog:
     """Write the packets of all connections, or of one, in both directions.
 
@@ -322,13 +324,13 @@ def export_tlog(
         UsageError: There is no such connection, or the file exists and is not to be overwritten.
     """
     first = header(flight)
-    zero_utc_ns = utc_of_zero(flight, first)
-    check_free([file], force=force)
+    zero_utc_ns = find_utc_of_zero(flight, first)
+    refuse_existing_files([file], force=force)
     packets: Counter[str] = Counter()
-    raw = _Raw(_streams(first))
-    with all_or_none([file]), unfinished([file]) as parts, parts[file].open("wb") as out:
-        messages = watch(good_messages(flight), known_number(flight), "writing")
-        for at_ns, topic, packet in _in_order(raw.packets(messages, link)):
+    raw = _Raw(_find_streams(first))
+    with remove_on_error([file]), write_temporary_files([file]) as parts, parts[file].open("wb") as out:
+        messages = watch(good_messages(flight), count_messages(flight), "writing")
+        for at_ns, topic, packet in _merge_packets(raw.packets(messages, link)):
             out.write(_STAMP.pack((zero_utc_ns + at_ns) // 1000) + packet)
             packets[topic] += 1
         if link is not None and link not in raw.links:
@@ -361,7 +363,7 @@ class _Raw:
         """Yield time [ns], topic and bytes of each packet of the wanted connection, or of all."""
         for message in messages:
             topic = message.definition.topic
-            raw = raw_link(topic)
+            raw = parse_raw_topic(topic)
             if raw is None:
                 continue
             link, _ = raw
@@ -373,7 +375,7 @@ class _Raw:
     def _cut(self, topic: str, data: bytes, goes_on: bool) -> Iterator[bytes]:
         at = 0
         while at < len(data):
-            end = _packet_end(data, at)
+            end = _find_packet_end(data, at)
             if end is None and goes_on:
                 self._rest[topic] = data[at:]
                 return
@@ -385,7 +387,7 @@ class _Raw:
                 at += 1
 
 
-def _packet_end(data: bytes, at: int) -> int | None:
+def _find_packet_end(data: bytes, at: int) -> int | None:
     """Return where the packet that begins at `at` ends; `at` if none does, None if it goes on beyond the data.
 
     It is believed to be one if another follows, or nothing; else only by its checksum.
@@ -394,14 +396,14 @@ def _packet_end(data: bytes, at: int) -> int | None:
         return at
     if at + _HEAD_BYTES > len(data):
         return None
-    end = at + frame_length(data, at)
+    end = at + get_frame_length(data, at)
     if end > len(data):
         return None
     good = end == len(data) or data[end] in MARKERS or is_frame(data[at:end])
     return end if good else at
 
 
-def _in_order(packets: Iterable[tuple[int, str, bytes]]) -> Iterator[tuple[int, str, bytes]]:
+def _merge_packets(packets: Iterable[tuple[int, str, bytes]]) -> Iterator[tuple[int, str, bytes]]:
     """Yield the packets in order of time: incoming and outgoing bytes are recorded separately."""
     waiting: list[tuple[int, int, str, bytes]] = []
     for number, (at_ns, topic, packet) in enumerate(packets):
@@ -412,7 +414,7 @@ def _in_order(packets: Iterable[tuple[int, str, bytes]]) -> Iterator[tuple[int, 
     yield from ((first[0], first[2], first[3]) for first in sorted(waiting))
 
 
-def utc_of_zero(flight: Path, first: Header) -> int:
+def find_utc_of_zero(flight: Path, first: Header) -> int:
     """Return UTC of time 0 of a recording's clock [ns since the epoch]; of an older one by when it began.
 
     Raises:
@@ -428,7 +430,7 @@ def utc_of_zero(flight: Path, first: Header) -> int:
     return began_us * 1000 - first.started_ns
 
 
-def _streams(first: Header) -> frozenset[str]:
+def _find_streams(first: Header) -> frozenset[str]:
     """Return the connections that carry a stream of bytes, by the configuration that was flown."""
     try:
         urls = tomllib.loads(first.config_toml).get("daemon", {})
@@ -510,7 +512,7 @@ def replay_tlog(
         loop.receive(link, data, at_ns)
         datagrams += 1
     if start_ns is None:
-        return _figures(collector, link, datagrams, tick)
+        return _summarise_delays(collector, link, datagrams, tick)
     end_ns = start_ns + tick * tick_ns
     loop.tick(tick, end_ns, to_nobody)  # sees the last packets
     tick += 1
@@ -518,10 +520,10 @@ def replay_tlog(
     while collector.stats[link].at_ns < end_ns:  # they are told once a second
         loop.tick(later, start_ns + later * tick_ns, to_nobody)
         later += 1
-    return _figures(collector, link, datagrams, tick)
+    return _summarise_delays(collector, link, datagrams, tick)
 
 
-def _figures(collector: _Collector, link: str, datagrams: int, ticks: int) -> ForeignReplay:
+def _summarise_delays(collector: _Collector, link: str, datagrams: int, ticks: int) -> ForeignReplay:
     captured = np.array([s.captured_ns for s in collector.samples], dtype=np.int64)
     age_ms = np.array([(s.received_ns - s.captured_ns) * 1e-6 for s in collector.samples])
     boundaries = [d for d in collector.decisions if d.boundary]
@@ -537,12 +539,12 @@ def _figures(collector: _Collector, link: str, datagrams: int, ticks: int) -> Fo
         solves=dict(Counter(d.solve.value for d in collector.decisions if d.solve is not None)),
         modes=dict(Counter(d.mode.value for d in collector.decisions)),
         left_out=dict(sorted(collector.stats[link].bad.items())) if link in collector.stats else {},
-        age_ms=_quantiles(age_ms),
+        age_ms=_compute_quantiles(age_ms),
         age_steps={str(age): count for age, count in sorted(ages.items())},
     )
 
 
-def _quantiles(values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> DelayQuantiles | None:
+def _compute_quantiles(values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> DelayQuantiles | None:
     if not len(values):
         return None
     low, p05, p50, p95, high = (float(q) for q in np.quantile(values, [0.0, 0.05, 0.5, 0.95, 1.0]))

@@ -19,9 +19,9 @@ from typing import cast
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from logs.recording.derived_topics import VIEWS
+from uavctl.arrays import Array
 from uavctl.errors import RecordingError
 from uavctl.records import (
     Checked,
@@ -137,7 +137,7 @@ _RAW = re.compile(r"/raw/([^/]+)/(in|out)")
 
 
 @lru_cache(maxsize=256)
-def raw_link(topic: str) -> tuple[str, bool] | None:
+def parse_raw_topic(topic: str) -> tuple[str, bool] | None:
     """Return connection name and whether outgoing, of a raw topic; None for any other topic."""
     match = _RAW.fullmatch(topic)
     return None if match is None else (match[1], match[2] == "out")
@@ -150,26 +150,26 @@ def is_view(topic: str) -> bool:
 
 def is_known(topic: str) -> bool:
     """Whether this version has records of a topic."""
-    return topic in _BY_NAME or raw_link(topic) is not None
+    return topic in _BY_NAME or parse_raw_topic(topic) is not None
 
 
-def record_type(topic: str) -> type[Record]:
+def get_record_type(topic: str) -> type[Record]:
     """Return the record type of a topic.
 
     Raises:
         KeyError: there is no such topic.
     """
-    return Datagram if raw_link(topic) is not None else _BY_NAME[topic].record
+    return Datagram if parse_raw_topic(topic) is not None else _BY_NAME[topic].record
 
 
 @lru_cache(maxsize=256)
-def definition(topic: str) -> Definition:
+def get_definition(topic: str) -> Definition:
     """Return encoding and schema of a topic.
 
     Raises:
         KeyError: there is no such topic.
     """
-    if raw_link(topic) is not None:
+    if parse_raw_topic(topic) is not None:
         return Definition(topic=topic, encoding="mavlink")
     if topic in _VIEW_BY_NAME:
         view = _VIEW_BY_NAME[topic]
@@ -178,13 +178,15 @@ def definition(topic: str) -> Definition:
 
 
 def _schema(record: type[Record]) -> dict[str, object]:
-    (reference,), parts = msgspec.json.schema_components([record], schema_hook=_anything, ref_template="#/$defs/{name}")
+    (reference,), parts = msgspec.json.schema_components(
+        [record], schema_hook=_make_any_schema, ref_template="#/$defs/{name}"
+    )
     name = cast("str", reference["$ref"]).rpartition("/")[2]
     top: dict[str, object] = parts.pop(name)
     return {**top, "$defs": parts} if parts else top
 
 
-def _anything(kind: type) -> dict[str, object]:
+def _make_any_schema(kind: type) -> dict[str, object]:
     """Return the schema of a value of any type, which msgspec cannot make itself."""
     if kind is object:
         return {"description": "any JSON value"}
@@ -193,13 +195,12 @@ def _anything(kind: type) -> dict[str, object]:
 
 # Records as exact JSON.
 #
-# Floats keep every bit: shortest digits that round-trip, the sign of zero included. JSON has no NaN
+# Array keep every bit: shortest digits that round-trip, the sign of zero included. JSON has no NaN
 # and no infinity (msgspec would write null, which reads back as "missing"), so these are the strings
 # "NaN", "Infinity" and "-Infinity", read back as floats wherever the record's type has a float. Where
 # it has any value at all (`Header.design`) they stay strings.
 
 
-Array = NDArray[np.float64]
 _MAX_TIME_NS = 2**64 - 1
 MATRICES = ("inputs", "states", "backoff_x", "backoff_u")  # of a plan, rounded in recordings
 DIGITS = 4  # of them: of 3 m, a millimetre
@@ -211,17 +212,17 @@ class EncodingError(RecordingError):
     """A value cannot be written so that it reads back the same."""
 
 
-def _plain(value: object) -> object:
+def _convert_numpy(value: object) -> object:
     """Turn numpy values of a record into plain numbers."""
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
     raise NotImplementedError
 
 
-_ENCODER = msgspec.json.Encoder(enc_hook=_plain)
+_ENCODER = msgspec.json.Encoder(enc_hook=_convert_numpy)
 # MessagePack keeps the eight bytes of each float behind 0xcb: where the exponent has all bits set, it is not finite.
 # Other values may have such bytes too, which costs time only.
-_BINARY = msgspec.msgpack.Encoder(enc_hook=_plain)
+_BINARY = msgspec.msgpack.Encoder(enc_hook=_convert_numpy)
 _NON_FINITE_BYTES = re.compile(rb"\xcb[\x7f\xff][\xf0-\xff]", re.DOTALL)
 
 
@@ -235,18 +236,18 @@ def encode(record: Record) -> bytes:
         return record.data
     try:
         if isinstance(record, Plan):
-            record = condense(record)
-        if not _is_seen_to_be_non_finite(record):
+            record = round_plan(record)
+        if not _is_non_finite(record):
             data = _ENCODER.encode(record)
             # msgspec writes every non-finite float as null: without one, all is said.
             if b"null" not in data or not _may_be_non_finite(record):
                 return data
-        return _ENCODER.encode({field: _spelled(getattr(record, field)) for field in record.__struct_fields__})
+        return _ENCODER.encode({field: _spell_field(getattr(record, field)) for field in record.__struct_fields__})
     except (TypeError, ValueError, NotImplementedError, OverflowError, RecursionError) as error:
         raise EncodingError(f"{type(record).__name__}: {error}") from error
 
 
-def condense(plan: Plan) -> Plan:
+def round_plan(plan: Plan) -> Plan:
     """Round a plan's matrices as they are recorded, and note the checksum of all their bits; a condensed one stays.
 
     An exact plan is two thirds of a recording: 1,461 numbers in each step. What flies of it is in the decisions, bit
@@ -274,13 +275,13 @@ def _round(values: Array) -> Array:
     return np.where(counts, np.rint(values / down * up) / up * down, values)
 
 
-def alike(one: Record, other: Record) -> bool:
+def are_identical(record: Record, other: Record) -> bool:
     """Return whether two records of a type are surely the same in every bit; cheaper than to look for a difference."""
-    binary = _exact(one)
-    return binary is not None and binary == _exact(other)
+    binary = _get_exact_bytes(record)
+    return binary is not None and binary == _get_exact_bytes(other)
 
 
-def says(record: Record, message: bytes) -> bool:
+def is_encoding_of(record: Record, message: bytes) -> bool:
     """Return whether a message is surely this record in every bit: its bytes are those that it would be recorded as."""
     try:
         return encode(record) == message
@@ -298,7 +299,7 @@ def encode_message(topic: str, at_ns: int, record: Record, zero_utc_ns: int = 0)
         RecordingError: it would not, and why.
     """
     try:
-        expected = record_type(topic)
+        expected = get_record_type(topic)
     except KeyError:
         raise RecordingError(f"there is no topic {topic}") from None
     if type(record) is not expected:
@@ -319,18 +320,18 @@ def decode(topic: str, data: bytes, at_ns: int) -> Record:
     Raises:
         RecordingError: no such topic, or the bytes are no record of its type.
     """
-    raw = raw_link(topic)
+    raw = parse_raw_topic(topic)
     if raw is not None:
         return Datagram(at_ns=at_ns, link=raw[0], outgoing=raw[1], data=data)
     try:
-        kind = record_type(topic)
+        kind = get_record_type(topic)
         if b'NaN"' not in data and b'Infinity"' not in data:
             return _decoder(kind).decode(data)
         fields = msgspec.json.decode(data)
         # the gap of most plans is the only one: their thousands of numbers need not be looked through
-        if isinstance(fields, dict) and _restore_plain(fields, kind) == data.count(b'NaN"') + data.count(b'Infinity"'):
+        if isinstance(fields, dict) and _restore_fields(fields, kind) == data.count(b'NaN"') + data.count(b'Infinity"'):
             return msgspec.convert(fields, kind)
-        return msgspec.convert(_restore(fields, kind), kind)
+        return msgspec.convert(_restore_tree(fields, kind), kind)
     except KeyError as error:
         raise RecordingError(f"topic {topic} is not known to this version") from error
     except msgspec.MsgspecError as error:
@@ -342,7 +343,7 @@ def _decoder(kind: type[Record]) -> msgspec.json.Decoder[Record]:
     return msgspec.json.Decoder(kind)
 
 
-def _exact(value: object) -> bytes | None:
+def _get_exact_bytes(value: object) -> bytes | None:
     """Return a value's bytes and those of its floats; None if an integer is too large for that."""
     try:
         return _BINARY.encode(value)
@@ -350,7 +351,7 @@ def _exact(value: object) -> bytes | None:
         return None
 
 
-def _is_seen_to_be_non_finite(record: Record) -> bool:
+def _is_non_finite(record: Record) -> bool:
     """Return whether a field of type float is not finite, as the gap of most plans is."""
     values = [getattr(record, name) for name in _float_fields(type(record))]
     return any(type(value) is float and not math.isfinite(value) for value in values)
@@ -362,29 +363,29 @@ def _float_fields(kind: type[Record]) -> tuple[str, ...]:
 
 
 def _may_be_non_finite(value: object) -> bool:
-    binary = _exact(value)
+    binary = _get_exact_bytes(value)
     return binary is None or _NON_FINITE_BYTES.search(binary) is not None
 
 
-def _spelled(value: object) -> object:
+def _spell_field(value: object) -> object:
     """Return a record's field with non-finite floats as text; the numbers of a plan without any are not searched."""
     if isinstance(value, tuple) and not _may_be_non_finite(value):
         return value
-    return _spell(msgspec.to_builtins(value, enc_hook=_plain))
+    return _spell_tree(msgspec.to_builtins(value, enc_hook=_convert_numpy))
 
 
-def _spell(value: object) -> object:
+def _spell_tree(value: object) -> object:
     """Return a tree with non-finite floats as text."""
     if isinstance(value, float) and not math.isfinite(value):
         return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
     if isinstance(value, dict):
-        return {key: _spell(one) for key, one in value.items()}
+        return {key: _spell_tree(element) for key, element in value.items()}
     if isinstance(value, tuple | list):
-        return [_spell(one) for one in value]
+        return [_spell_tree(entry) for entry in value]
     return value
 
 
-def _restore_plain(fields: dict[str, object], kind: type[Record]) -> int:
+def _restore_fields(fields: dict[str, object], kind: type[Record]) -> int:
     """Turn spelled floats back where a field itself is a float; return how many."""
     said = {name: value for name in _float_fields(kind) if isinstance(value := fields.get(name), str)}
     restored = {name: _NON_FINITE[text] for name, text in said.items() if text in _NON_FINITE}
@@ -392,14 +393,14 @@ def _restore_plain(fields: dict[str, object], kind: type[Record]) -> int:
     return len(restored)
 
 
-def _restore(value: object, kind: object) -> object:
+def _restore_tree(value: object, kind: object) -> object:
     """Return a tree with spelled floats turned back, where the type has a float; text stays text."""
     if isinstance(value, str):
         return _NON_FINITE.get(value, value) if float in _alternatives(kind) else value
     if isinstance(value, list):
-        return [_restore(one, item) for one, item in zip(value, _item_types(kind, len(value)), strict=True)]
+        return [_restore_tree(entry, item) for entry, item in zip(value, _item_types(kind, len(value)), strict=True)]
     if isinstance(value, dict):
-        return {key: _restore(one, _field_type(kind, key)) for key, one in value.items()}
+        return {key: _restore_tree(element, _field_type(kind, key)) for key, element in value.items()}
     return value
 
 
@@ -412,9 +413,9 @@ def _alternatives(kind: object) -> tuple[object, ...]:
 
 
 def _item_types(kind: object, count: int) -> tuple[object, ...]:
-    for one in _alternatives(kind):
-        if typing.get_origin(one) is tuple:
-            args = typing.get_args(one)
+    for alternative in _alternatives(kind):
+        if typing.get_origin(alternative) is tuple:
+            args = typing.get_args(alternative)
             items = args[:1] * count if args[-1] is Ellipsis else args
             # a wrong length is told by the conversion that follows
             return items if len(items) == count else (object,) * count
@@ -422,11 +423,11 @@ def _item_types(kind: object, count: int) -> tuple[object, ...]:
 
 
 def _field_type(kind: object, key: str) -> object:
-    for one in _alternatives(kind):
-        if typing.get_origin(one) is dict:
-            return typing.get_args(one)[1]
-        if isinstance(one, type) and issubclass(one, msgspec.Struct):
-            return _fields(one).get(key, object)
+    for alternative in _alternatives(kind):
+        if typing.get_origin(alternative) is dict:
+            return typing.get_args(alternative)[1]
+        if isinstance(alternative, type) and issubclass(alternative, msgspec.Struct):
+            return _fields(alternative).get(key, object)
     return object
 
 

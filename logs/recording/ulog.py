@@ -18,12 +18,12 @@ from typing import Any
 import numpy as np
 
 from logs.recording import mavlink_flight as neutral
-from logs.recording.design_view import Floats
-from logs.recording.disk import ULOG_MAGIC, FileKind, hint_of, kind_of
+from logs.recording.disk import ULOG_MAGIC, FileKind, describe_kind_error, detect_kind
 from logs.recording.mavlink_flight import MavlinkFlight, ModeBegin, SentSource, SpokenText
 from logs.recording.parameters import VehicleParameter
 from logs.recording.summary import count
 from logs.recording.tlog import LONGEST_SILENCE_NS
+from uavctl.arrays import Array
 from uavctl.errors import RecordingError, need
 from uavctl.mavlink.message_layout import strip_escapes
 
@@ -55,7 +55,7 @@ _MODES = {
 
 def is_ulog(path: Path) -> bool:
     """Return whether a file is a ULog, by its first bytes or else its name."""
-    return kind_of(path) is FileKind.ULOG
+    return detect_kind(path) is FileKind.ULOG
 
 
 def read_ulog(path: Path) -> MavlinkFlight:
@@ -70,17 +70,17 @@ def read_ulog(path: Path) -> MavlinkFlight:
     except OSError as error:
         raise RecordingError(f"{path}: {error.strerror}") from error
     if not data.startswith(ULOG_MAGIC):
-        raise RecordingError(f"{path}: does not begin as a ULog does; is it a .ulg of PX4?{hint_of(path)}")
+        raise RecordingError(f"{path}: does not begin as a ULog does; is it a .ulg of PX4?{describe_kind_error(path)}")
     if len(data) < _HEAD_BYTES:
         raise RecordingError(f"{path}: torn within its head, {len(data)} of {_HEAD_BYTES} bytes; fetch it again")
-    short, torn_bytes = _without_short(data)
-    log = _parsed(path, data)
+    short, torn_bytes = _remove_short_messages(data)
+    log = _parse(path, data)
     if not log.data_list and not log.logged_messages and not log.logged_messages_tagged:
         raise RecordingError(f"{path}: no message in it; was logging stopped at once, or the file torn?")
     return _Reader(path, log, short, torn_bytes).flight()
 
 
-def _parsed(path: Path, data: bytearray) -> Any:
+def _parse(path: Path, data: bytearray) -> Any:
     need("pyulog", "ulog")
     from pyulog.core import ULog, ULogException  # type: ignore[import-untyped]
 
@@ -107,7 +107,7 @@ class _BoundedFile(io.BytesIO):
         return found
 
 
-def _without_short(data: bytearray) -> tuple[int, int]:
+def _remove_short_messages(data: bytearray) -> tuple[int, int]:
     """Take out the messages that are too short for their type, at which pyulog would end without a word.
 
     Returns:
@@ -141,10 +141,10 @@ class _Reader:
     def flight(self) -> MavlinkFlight:
         """Return the flight."""
         log, origin_ns = self._log, self._origin_us * 1000
-        sources = dict(sorted(self._sources(), key=lambda one: -len(one[1].track)))
+        sources = dict(sorted(self._sources(), key=lambda item: -len(item[1].track)))
         own_source, own = self._own()
-        stamps = {_name(one): one.data["timestamp"].astype(np.float64) for one in self._topics()}
-        ages = {name: neutral.ages_of(one, origin_ns) for name, one in sources.items()}
+        stamps = {_make_topic_name(topic): topic.data["timestamp"].astype(np.float64) for topic in self._topics()}
+        ages = {name: neutral.ages_of(source, origin_ns) for name, source in sources.items()}
         setpoints, attitude, height, battery = self._setpoints(), self._attitude(), self._height(), self._battery()
         system = int(log.initial_parameters.get("MAV_SYS_ID", 1))  # as PX4 comes
         info = neutral.MavlinkFlightInfo(
@@ -155,14 +155,14 @@ class _Reader:
             vehicle_system=system,
             own_positions=len(own),
             own_source=own_source if own else "",
-            sent=tuple(neutral.figures_of(name, one, ages[name]) for name, one in sources.items()),
+            sent=tuple(neutral.figures_of(name, source, ages[name]) for name, source in sources.items()),
             setpoints=len(setpoints[0]),
             modes=tuple(self._modes()),
             texts=tuple(self._texts()),
             messages={name: len(at_us) for name, at_us in stamps.items()},
             bad=dict(self._bad),
             parameters={
-                strip_escapes(name): _parameter(value, system)
+                strip_escapes(name): _make_parameter(value, system)
                 for name, value in log.initial_parameters.items()
                 if isinstance(value, int | float)
             },
@@ -176,7 +176,7 @@ class _Reader:
         flight = MavlinkFlight(
             info=info,
             own=neutral.track_of(own, origin_ns),
-            sent={name: neutral.track_of(one.track, origin_ns) for name, one in sources.items()},
+            sent={name: neutral.track_of(source.track, origin_ns) for name, source in sources.items()},
             ages=ages,
             setpoint_t_s=setpoints[0],
             setpoint_m=setpoints[1][:, :3],
@@ -197,7 +197,7 @@ class _Reader:
         A damaged stamp is anything: what counts is the longest part that no hour of silence parts.
         """
         begin_us = int(self._log.start_timestamp)
-        every = [one.data["timestamp"].astype(np.uint64) for one in self._topics()]
+        every = [topic.data["timestamp"].astype(np.uint64) for topic in self._topics()]
         if not every:
             return begin_us, max(begin_us, int(self._log.last_timestamp))
         at_us = np.sort(np.concatenate(every))
@@ -206,37 +206,37 @@ class _Reader:
         first_us, last_us = int(longest[0]), int(longest[-1])
         if strays := len(at_us) - len(longest):
             self._bad["stamp of another time"] += strays
-            for one in self._topics():
-                stamps = one.data["timestamp"]
+            for topic in self._topics():
+                stamps = topic.data["timestamp"]
                 known = (stamps >= longest[0]) & (stamps <= longest[-1])
-                one.data = {name: values[known] for name, values in one.data.items()}
+                topic.data = {name: values[known] for name, values in topic.data.items()}
         # What held before the log began is logged with its own, earlier stamp.
         near = abs(begin_us - first_us) * 1000 <= LONGEST_SILENCE_NS and begin_us <= last_us
         return begin_us if near else first_us, last_us
 
     def _topics(self, *names: str) -> Iterator[Any]:
         """Yield the topics of some names, or all, that have times."""
-        named = (one for one in self._log.data_list if not names or one.name in names)
-        return (one for one in named if len(one.data.get("timestamp", ())))
+        named = (topic for topic in self._log.data_list if not names or topic.name in names)
+        return (topic for topic in named if len(topic.data.get("timestamp", ())))
 
     def _first(self, name: str) -> dict[str, Any]:
-        return next((one.data for one in self._topics(name)), {"timestamp": np.empty(0)})
+        return next((topic.data for topic in self._topics(name)), {"timestamp": np.empty(0)})
 
     def _second(self, at_us: int) -> float:
         return max(0, int(at_us) - self._origin_us) * 1e-6
 
-    def _seconds(self, fields: dict[str, Any]) -> Floats:
+    def _seconds(self, fields: dict[str, Any]) -> Array:
         return np.asarray((fields["timestamp"].astype(np.int64) - self._origin_us) * 1e-6, dtype=np.float64)
 
     def _own(self) -> tuple[str, list[tuple[int, Any, Any]]]:
         """Return the name and the points of its own position: in local NED, else on the globe."""
-        for one in self._topics(_OWN):
-            if known := self._local(one.data):
+        for topic in self._topics(_OWN):
+            if known := self._local(topic.data):
                 return _OWN, known
         for name, (columns, (unit_deg, unit_m)) in _PLACES.items():
-            for one in self._topics(name):
-                newer = _PLACES["sensor_gps"] if "latitude_deg" in one.data else (columns, (unit_deg, unit_m))
-                if known := self._global(one.data, *newer):
+            for topic in self._topics(name):
+                newer = _PLACES["sensor_gps"] if "latitude_deg" in topic.data else (columns, (unit_deg, unit_m))
+                if known := self._global(topic.data, *newer):
                     return name, known
         return "", []
 
@@ -245,7 +245,7 @@ class _Reader:
     ) -> list[tuple[int, Any, Any]]:
         """Return places on the globe as north, east and down of the first one."""
         unit_deg, unit_m = units
-        lat_deg, lon_deg, height_m = (_columns(fields, *names) * (unit_deg, unit_deg, unit_m)).T
+        lat_deg, lon_deg, height_m = (_make_columns(fields, *names) * (unit_deg, unit_deg, unit_m)).T
         known = np.isfinite(lat_deg + lon_deg + height_m) & (np.abs(lat_deg) <= 90) & ((lat_deg != 0) | (lon_deg != 0))
         if "fix_type" in fields:
             known &= fields["fix_type"] >= _LEAST_FIX
@@ -255,49 +255,46 @@ class _Reader:
         home_deg, unknown = (float(lat_deg[at[0]]), float(lon_deg[at[0]])), (math.nan,) * 3
         return [
             (
-                int(fields["timestamp"][one]) * 1000,
-                (
-                    *neutral.from_home(float(lat_deg[one]), float(lon_deg[one]), home_deg),
-                    height_m[at[0]] - height_m[one],
-                ),
+                int(fields["timestamp"][t]) * 1000,
+                (*neutral.from_home(float(lat_deg[t]), float(lon_deg[t]), home_deg), height_m[at[0]] - height_m[t]),
                 unknown,
             )
-            for one in at
+            for t in at
         ]
 
     def _local(self, fields: dict[str, Any]) -> list[tuple[int, Any, Any]]:
-        position_m, velocity_mps = _columns(fields, "x", "y", "z"), _columns(fields, "vx", "vy", "vz")
+        position_m, velocity_mps = _make_columns(fields, "x", "y", "z"), _make_columns(fields, "vx", "vy", "vz")
         for prefix, array in (("", position_m), ("v_", velocity_mps)):
             for flag, axes in ((f"{prefix}xy_valid", slice(2)), (f"{prefix}z_valid", slice(2, 3))):
                 if flag in fields:
                     array[fields[flag] == 0, axes] = math.nan
         return self._known(_OWN, fields["timestamp"], position_m, velocity_mps)
 
-    def _known(self, name: str, at_us: Any, position_m: Floats, more: Any) -> list[tuple[int, Any, Any]]:
+    def _known(self, name: str, at_us: Any, position_m: Array, more: Any) -> list[tuple[int, Any, Any]]:
         """Return those with a position, and count the others."""
         known = np.isfinite(position_m).all(axis=1)
         if not known.all():
             self._bad[f"{name} without a valid position"] += int((~known).sum())
-        at_ns = [int(one) * 1000 for one in at_us[known]]
+        at_ns = [int(t_us) * 1000 for t_us in at_us[known]]
         return list(zip(at_ns, map(tuple, position_m[known].tolist()), more[known].tolist(), strict=True))
 
-    def _height(self) -> tuple[Floats, Floats]:
+    def _height(self) -> tuple[Array, Array]:
         """Return the height of its own local position, which may be known without a place."""
         fields = self._first(_OWN)
-        height_m = -_columns(fields, "z")[:, 0]
+        height_m = -_make_columns(fields, "z")[:, 0]
         known = np.isfinite(height_m) & (fields.get("z_valid", np.ones(len(height_m))) != 0)
         return self._seconds(fields)[known], height_m[known]
 
-    def _battery(self) -> tuple[Floats, Floats]:
+    def _battery(self) -> tuple[Array, Array]:
         fields = self._first("battery_status")
-        voltage_v = _columns(fields, "voltage_v")[:, 0]
+        voltage_v = _make_columns(fields, "voltage_v")[:, 0]
         known = voltage_v > 0
         return self._seconds(fields)[known], voltage_v[known]
 
     def _sources(self) -> Iterator[tuple[str, SentSource]]:
-        for one in self._topics(*_SENT):
-            fields, name, source = one.data, _name(one), SentSource()
-            position_m = _columns(fields, *_vector(fields, "position", ("x", "y", "z")))
+        for topic in self._topics(*_SENT):
+            fields, name, source = topic.data, _make_topic_name(topic), SentSource()
+            position_m = _make_columns(fields, *_list_vector_fields(fields, "position", ("x", "y", "z")))
             stamps = fields.get("timestamp_sample", np.zeros(len(position_m), dtype=np.int64))
             for at_ns, place, stamp_us in self._known(name, fields["timestamp"], position_m, stamps):
                 source.take(place, None, stamp_us or None, at_ns)
@@ -308,15 +305,20 @@ class _Reader:
             if source.track:
                 yield name, source
 
-    def _setpoints(self) -> tuple[Floats, Floats]:
+    def _setpoints(self) -> tuple[Array, Array]:
         fields = self._first(_SETPOINT)
-        place, speed = _vector(fields, "position", ("x", "y", "z")), _vector(fields, "velocity", ("vx", "vy", "vz"))
-        return self._seconds(fields), _columns(fields, *place, *speed, *(f"acceleration[{axis}]" for axis in range(3)))
+        place, speed = (
+            _list_vector_fields(fields, "position", ("x", "y", "z")),
+            _list_vector_fields(fields, "velocity", ("vx", "vy", "vz")),
+        )
+        return self._seconds(fields), _make_columns(
+            fields, *place, *speed, *(f"acceleration[{axis}]" for axis in range(3))
+        )
 
-    def _attitude(self) -> tuple[Floats, Floats]:
+    def _attitude(self) -> tuple[Array, Array]:
         """Return roll, pitch and yaw, of quaternions that turn the body's axes into north, east, down."""
         fields = self._first("vehicle_attitude")
-        w, x, y, z = _columns(fields, "q[0]", "q[1]", "q[2]", "q[3]").T
+        w, x, y, z = _make_columns(fields, "q[0]", "q[1]", "q[2]", "q[3]").T
         roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
         pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
         yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
@@ -332,15 +334,17 @@ class _Reader:
             before = mode, armed
 
     def _texts(self) -> Iterator[SpokenText]:
-        tagged = [one for some in self._log.logged_messages_tagged.values() for one in some]
-        for one in sorted([*self._log.logged_messages, *tagged], key=lambda one: int(one.timestamp)):
-            severity = _SEVERITIES[min(max(one.log_level - ord("0"), 0), 7)]
-            yield SpokenText(at_s=self._second(one.timestamp), severity=severity, text=strip_escapes(one.message))
+        tagged = [topic for some in self._log.logged_messages_tagged.values() for topic in some]
+        for message in sorted([*self._log.logged_messages, *tagged], key=lambda message: int(message.timestamp)):
+            severity = _SEVERITIES[min(max(message.log_level - ord("0"), 0), 7)]
+            yield SpokenText(
+                at_s=self._second(message.timestamp), severity=severity, text=strip_escapes(message.message)
+            )
 
     def _begin_utc(self) -> str:
         """Return when the log began, by the first GPS time; `time_ref_utc` is but the offset of a time zone."""
-        for one in self._topics(*_GPS):
-            for at_us, utc_us in zip(one.data["timestamp"], one.data.get("time_utc_usec", ()), strict=False):
+        for topic in self._topics(*_GPS):
+            for at_us, utc_us in zip(topic.data["timestamp"], topic.data.get("time_utc_usec", ()), strict=False):
                 if 0 < utc_us < 2**52:  # beyond, no calendar of Python's reaches
                     begin_s = (int(utc_us) - int(at_us) + self._origin_us) // 1000 / 1000
                     return datetime.fromtimestamp(begin_s, UTC).isoformat(timespec="milliseconds")
@@ -348,7 +352,7 @@ class _Reader:
 
     def _odd(self) -> Iterator[str]:
         """Return sentences on what was left out or changed."""
-        if dropouts := [one.duration for one in self._log.dropouts]:
+        if dropouts := [dropout.duration for dropout in self._log.dropouts]:
             total_s, longest_s = sum(dropouts) * 1e-3, max(dropouts) * 1e-3
             yield f"{count(len(dropouts), 'dropout')} of the log, {total_s:.2f} s in all, the longest {longest_s:.2f} s"
         for at_us, name, value in self._log.changed_parameters:
@@ -362,22 +366,22 @@ class _Reader:
             yield f"the recording is torn within a message: its last {count(self._torn_bytes, 'byte')} left out"
 
 
-def _parameter(value: Any, system: int) -> VehicleParameter:
+def _make_parameter(value: Any, system: int) -> VehicleParameter:
     kind = "INT32" if isinstance(value, int) else "REAL32"
     return VehicleParameter(value=value, type=kind, system=system, component=1)
 
 
-def _name(topic: Any) -> str:
+def _make_topic_name(topic: Any) -> str:
     name = strip_escapes(topic.name)
     return f"{name} {topic.multi_id}" if topic.multi_id else name
 
 
-def _vector(fields: dict[str, Any], name: str, older: Sequence[str]) -> Sequence[str]:
+def _list_vector_fields(fields: dict[str, Any], name: str, older: Sequence[str]) -> Sequence[str]:
     """Return the names of a vector's fields: an array, in older versions three numbers."""
     return older if older[0] in fields else [f"{name}[{axis}]" for axis in range(3)]
 
 
-def _columns(fields: dict[str, Any], *names: str) -> Floats:
+def _make_columns(fields: dict[str, Any], *names: str) -> Array:
     """Return fields as columns, NaN where there is no such field."""
     missing = np.full(len(fields["timestamp"]), math.nan)
     return np.column_stack([fields.get(name, missing) for name in names]).astype(np.float64)

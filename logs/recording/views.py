@@ -22,12 +22,12 @@ from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.message import Message
-from numpy.typing import NDArray
 
 from logs.recording import derived_topics as topics
-from logs.recording.derived_topics import pack, tightened
-from logs.recording.design_view import AXIS_NUMBER, DesignView, design_view
+from logs.recording.derived_topics import pack_message, tighten_limits
+from logs.recording.design_view import AXIS_NUMBER, DesignView, read_design
 from logs.recording.topics import RecorderNote
+from uavctl.arrays import Array
 from uavctl.frames import quaternion_from_axes, rotation_to_ned
 from uavctl.records import (
     ControlMode,
@@ -54,10 +54,7 @@ from uavctl.records import (
 # Many parts of a message that differ by their numbers alone: made by filling in the bytes of one of them.
 
 
-Floats = NDArray[np.float64]
-
-
-class Many:
+class RepeatedField:
     """Bytes of a repeated field, to be merged into the message that has it.
 
     Args:
@@ -71,7 +68,7 @@ class Many:
         starts = [data.index(np.array(mark, dtype="<f8").tobytes()) for mark in marks]
         self._at = np.add.outer(starts, np.arange(8)).ravel()
 
-    def of(self, numbers: Floats) -> bytes:
+    def of(self, numbers: Array) -> bytes:
         """Return the field with one part for each row of the numbers (n, k)."""
         rows = np.empty((len(numbers), self._one.size), dtype=np.uint8)
         rows[:] = self._one
@@ -88,14 +85,14 @@ OPEN_M = 5.0  # an open side of the room is drawn so far from the target
 STD_95 = 2.7955
 
 
-def _colour(red: float, green: float, blue: float, alpha: float) -> Fields:
+def _choose_colour(red: float, green: float, blue: float, alpha: float) -> Fields:
     return {"r": red, "g": green, "b": blue, "a": alpha}
 
 
-_LIMITS, _TIGHT = _colour(0.9, 0.9, 0.9, 0.9), _colour(1.0, 0.65, 0.1, 0.8)
-_PLANNED, _SPREAD = _colour(0.25, 0.6, 1.0, 1.0), _colour(0.25, 0.6, 1.0, 0.15)
-_FLOWN, _MEASURED = _colour(0.2, 0.85, 0.4, 1.0), _colour(0.85, 0.3, 0.85, 0.8)
-_NEWS, _SILENCE, _FALLBACK = _colour(0.2, 0.85, 0.4, 0.9), _TIGHT, _colour(0.95, 0.2, 0.2, 0.9)
+_LIMITS, _TIGHT = _choose_colour(0.9, 0.9, 0.9, 0.9), _choose_colour(1.0, 0.65, 0.1, 0.8)
+_PLANNED, _SPREAD = _choose_colour(0.25, 0.6, 1.0, 1.0), _choose_colour(0.25, 0.6, 1.0, 0.15)
+_FLOWN, _MEASURED = _choose_colour(0.2, 0.85, 0.4, 1.0), _choose_colour(0.85, 0.3, 0.85, 0.8)
+_NEWS, _SILENCE, _FALLBACK = _choose_colour(0.2, 0.85, 0.4, 0.9), _TIGHT, _choose_colour(0.95, 0.2, 0.2, 0.9)
 _LEVEL: Fields = {"w": 1.0}
 _LABEL_M = (0.0, 0.0, -0.35)  # above the vehicle: down is positive
 _IN_CONTROL = frozenset({ControlMode.WAIT, ControlMode.TRACK})
@@ -106,84 +103,84 @@ _EDGES = [  # corners whose numbers differ in one bit
 ]  # fmt: skip
 
 
-def _made(kind: Callable[..., M], **fields: Any) -> M:
+def _make_message(kind: Callable[..., M], **fields: Any) -> M:
     """Make a message of its fields; the constructors are typed for nested messages, not for their fields."""
     return kind(**fields)
 
 
-def stamp(at_ns: int) -> Fields:
+def make_timestamp(at_ns: int) -> Fields:
     """Return a log time as a Protobuf timestamp."""
     return {"seconds": at_ns // 1_000_000_000, "nanos": at_ns % 1_000_000_000}
 
 
-def vector(at_m: Sequence[float]) -> Fields:
+def make_vector(at_m: Sequence[float]) -> Fields:
     """Return three numbers as a vector or a point."""
     return {"x": at_m[0], "y": at_m[1], "z": at_m[2]}
 
 
-def pose(at_m: Sequence[float], turn: Fields = _LEVEL) -> Fields:
+def make_pose(at_m: Sequence[float], turn: Fields = _LEVEL) -> Fields:
     """Return a place [m] and a rotation as a pose."""
-    return {"position": vector(at_m), "orientation": turn}
+    return {"position": make_vector(at_m), "orientation": turn}
 
 
-def quaternion(turn: Sequence[float]) -> Fields:
+def make_quaternion(turn: Sequence[float]) -> Fields:
     """Return a rotation (w, x, y, z) as a quaternion."""
     w, x, y, z = turn
     return {"x": x, "y": y, "z": z, "w": w}
 
 
-def pose_in_frame(at_ns: int, at_m: Vec3) -> PoseInFrame:
+def make_pose_in_frame(at_ns: int, at_m: Vec3) -> PoseInFrame:
     """Return a place in local NED [m] as a pose with its frame."""
-    return _made(PoseInFrame, timestamp=stamp(at_ns), frame_id=NED, pose=pose(at_m))
+    return _make_message(PoseInFrame, timestamp=make_timestamp(at_ns), frame_id=NED, pose=make_pose(at_m))
 
 
-def poses_in_frame(at_ns: int, places_m: Floats) -> PosesInFrame:
+def make_poses_in_frame(at_ns: int, places_m: Array) -> PosesInFrame:
     """Return places in local NED [m] (n, 3) as poses with their frame, in order."""
-    message = _made(PosesInFrame, timestamp=stamp(at_ns), frame_id=NED)
+    message = _make_message(PosesInFrame, timestamp=make_timestamp(at_ns), frame_id=NED)
     message.MergeFromString(_POSES.of(places_m))
     return message
 
 
-def frames(at_ns: int) -> FrameTransforms:
+def make_frames(at_ns: int) -> FrameTransforms:
     """Return the transform from local NED to the room's frame, whose z axis points up as viewers want it."""
     turned: Fields = {
-        "timestamp": stamp(at_ns),
+        "timestamp": make_timestamp(at_ns),
         "parent_frame_id": ROOM,
         "child_frame_id": NED,
         "translation": {},
-        "rotation": quaternion(rotation_to_ned("enu")),
+        "rotation": make_quaternion(rotation_to_ned("enu")),
     }
-    return _made(FrameTransforms, transforms=[turned])
+    return _make_message(FrameTransforms, transforms=[turned])
 
 
-def vehicle_frame(at_ns: int, at_m: Vec3) -> FrameTransform:
+def make_vehicle_frame(at_ns: int, at_m: Vec3) -> FrameTransform:
     """Return the transform to the estimated position; the attitude is not known, so axes stay those of local NED."""
-    return _made(
+    return _make_message(
         FrameTransform,
-        timestamp=stamp(at_ns),
+        timestamp=make_timestamp(at_ns),
         parent_frame_id=NED,
         child_frame_id=VEHICLE,
-        translation=vector(at_m),
+        translation=make_vector(at_m),
         rotation=_LEVEL,
     )
 
 
-def log_line(event: Event, at_ns: int) -> Log:
+def make_log_message(event: Event, at_ns: int) -> Log:
     """Return an event as a log message."""
     times = "" if event.count == 1 else f" ({event.count} times)"
-    return _made(
-        Log, timestamp=stamp(at_ns), level=_LEVELS[event.severity], message=event.text + times, name=event.code
+    return _make_message(
+        Log, timestamp=make_timestamp(at_ns), level=_LEVELS[event.severity], message=event.text + times, name=event.code
     )
 
 
-def room_scene(at_ns: int, design: DesignView) -> SceneUpdate:
+def draw_room(at_ns: int, design: DesignView) -> SceneUpdate:
     """Draw the position limits as a box."""
-    lower, upper = _sides(design, design.state_box.lower, design.state_box.upper)
-    return _update(_entity(at_ns, "limits", lines=[_box(lower, upper, _LIMITS)]))
+    lower, upper = _get_room_sides(design, design.state_box.lower, design.state_box.upper)
+    return _make_update(_make_entity(at_ns, "limits", lines=[_make_box(lower, upper, _LIMITS)]))
 
 
-def plan_scene(
-    at_ns: int, design: DesignView, plan: Plan, estimate: Estimate | None, places: Floats | None = None
+def draw_plan(
+    at_ns: int, design: DesignView, plan: Plan, estimate: Estimate | None, places: Array | None = None
 ) -> SceneUpdate:
     """Draw a plan's predicted path, its confidence ellipsoids, and the tightened limits at its end.
 
@@ -192,50 +189,50 @@ def plan_scene(
     `places` are the positions of the plan's states, where they are at hand.
     """
     places = design.positions_of(plan.states) if places is None else places
-    spread = np.concatenate([places, 2.0 * _reach(design, plan.backoff_x)], axis=1)
-    lower, upper = _sides(design, *tightened(design, plan.backoff_x, -1))
+    spread = np.concatenate([places, 2.0 * _compute_semi_axes(design, plan.backoff_x)], axis=1)
+    lower, upper = _get_room_sides(design, *tighten_limits(design, plan.backoff_x, -1))
     entities = [
-        _entity(at_ns, "predicted path", lines=[_line((), _PLANNED, 3.0)]),
-        _entity(at_ns, "predicted spread"),
-        _entity(at_ns, "limits less back-offs", lines=[_box(lower, upper, _TIGHT)]),
+        _make_entity(at_ns, "predicted path", lines=[_make_line((), _PLANNED, 3.0)]),
+        _make_entity(at_ns, "predicted spread"),
+        _make_entity(at_ns, "limits less back-offs", lines=[_make_box(lower, upper, _TIGHT)]),
     ]
     if estimate is not None:
-        entities.append(_entity(at_ns, "estimate, 95 %", spheres=[_estimate_sphere(design, estimate)]))
-    scene = _update(*entities)
+        entities.append(_make_entity(at_ns, "estimate, 95 %", spheres=[_draw_estimate_ellipsoid(design, estimate)]))
+    scene = _make_update(*entities)
     scene.entities[0].lines[0].MergeFromString(_POINTS.of(places))
     scene.entities[1].MergeFromString(_SPHERES.of(spread))
     return scene
 
 
-def path_scene(at_ns: int, flown_m: Sequence[Vec3], measured_m: Sequence[Vec3]) -> SceneUpdate:
+def draw_path(at_ns: int, flown_m: Sequence[Vec3], measured_m: Sequence[Vec3]) -> SceneUpdate:
     """Draw the recently flown path and the recent positions."""
-    return _update(
-        _entity(at_ns, "flown path", lines=[_line(flown_m, _FLOWN, 3.0)]),
-        _entity(at_ns, "measured path", lines=[_line(measured_m, _MEASURED, 1.5)]),
+    return _make_update(
+        _make_entity(at_ns, "flown path", lines=[_make_line(flown_m, _FLOWN, 3.0)]),
+        _make_entity(at_ns, "measured path", lines=[_make_line(measured_m, _MEASURED, 1.5)]),
     )
 
 
-def link_scene(at_ns: int, design: DesignView, decision: Decision) -> SceneUpdate:
+def draw_link(at_ns: int, design: DesignView, decision: Decision) -> SceneUpdate:
     """Draw the link's state at the vehicle, with words: green with news, amber in silence, red in the fallback."""
     colour = _FALLBACK if decision.mode not in _IN_CONTROL else _NEWS if decision.news else _SILENCE
     age = "no position yet" if decision.age_steps is None else f"age {decision.age_steps} of {design.horizon} steps"
     label: Fields = {
-        "pose": pose(_LABEL_M),
+        "pose": make_pose(_LABEL_M),
         "billboard": True,
         "font_size": 14.0,
         "scale_invariant": True,
         "color": colour,
         "text": f"{decision.mode.value}, {age}",
     }
-    ball: Fields = {"pose": pose((0.0, 0.0, 0.0)), "size": vector((0.2, 0.2, 0.2)), "color": colour}
-    return _update(_entity(at_ns, "link", VEHICLE, spheres=[ball], texts=[label]))
+    ball: Fields = {"pose": make_pose((0.0, 0.0, 0.0)), "size": make_vector((0.2, 0.2, 0.2)), "color": colour}
+    return _make_update(_make_entity(at_ns, "link", VEHICLE, spheres=[ball], texts=[label]))
 
 
-def _update(*entities: Fields) -> SceneUpdate:
-    return _made(SceneUpdate, entities=entities)
+def _make_update(*entities: Fields) -> SceneUpdate:
+    return _make_message(SceneUpdate, entities=entities)
 
 
-def _entity(
+def _make_entity(
     at_ns: int,
     name: str,
     frame: str = NED,
@@ -245,7 +242,7 @@ def _entity(
     texts: Sequence[Fields] = (),
 ) -> Fields:
     return {
-        "timestamp": stamp(at_ns),
+        "timestamp": make_timestamp(at_ns),
         "frame_id": frame,
         "id": name,
         "frame_locked": True,
@@ -255,23 +252,23 @@ def _entity(
     }
 
 
-def _line(places_m: Iterable[Sequence[float]], colour: Fields, pixels: float) -> Fields:
+def _make_line(places_m: Iterable[Sequence[float]], colour: Fields, pixels: float) -> Fields:
     return {
         "type": LinePrimitive.LINE_STRIP,
-        "pose": pose((0.0, 0.0, 0.0)),
+        "pose": make_pose((0.0, 0.0, 0.0)),
         "thickness": pixels,
         "scale_invariant": True,
-        "points": [vector(at_m) for at_m in places_m],
+        "points": [make_vector(at_m) for at_m in places_m],
         "color": colour,
     }
 
 
-def _box(lower: Vec3, upper: Vec3, colour: Fields) -> Fields:
-    line = _line(product(*zip(lower, upper, strict=True)), colour, 1.5)
+def _make_box(lower: Vec3, upper: Vec3, colour: Fields) -> Fields:
+    line = _make_line(product(*zip(lower, upper, strict=True)), colour, 1.5)
     return {**line, "type": LinePrimitive.LINE_LIST, "indices": _EDGES}
 
 
-def _sides(design: DesignView, lower: Floats, upper: Floats) -> tuple[Vec3, Vec3]:
+def _get_room_sides(design: DesignView, lower: Array, upper: Array) -> tuple[Vec3, Vec3]:
     """Return the sides of the room in local NED [m]; open ones lie near the target, axes without motion are flat."""
     centre = np.array(design.target)
     return (
@@ -280,7 +277,7 @@ def _sides(design: DesignView, lower: Floats, upper: Floats) -> tuple[Vec3, Vec3
     )
 
 
-def _reach(design: DesignView, backoff: Matrix) -> Floats:
+def _compute_semi_axes(design: DesignView, backoff: Matrix) -> Array:
     """Return the semi-axes of the stages' ellipsoids (n, 3) [m]; 0 in an axis without limits."""
     reach = np.zeros((len(backoff), len(design.target)))
     for state, row, size in design.position_rows:
@@ -288,7 +285,7 @@ def _reach(design: DesignView, backoff: Matrix) -> Floats:
     return design.positions_of(reach)
 
 
-def _estimate_sphere(design: DesignView, estimate: Estimate) -> Fields:
+def _draw_estimate_ellipsoid(design: DesignView, estimate: Estimate) -> Fields:
     """Draw the ellipsoid that holds the position with 95 %, by the covariance."""
     cov = [[0.0] * 3 for _ in range(3)]
     places = [(AXIS_NUMBER[axis], index) for axis, index in zip(design.axes, design.position_index, strict=True)]
@@ -297,15 +294,18 @@ def _estimate_sphere(design: DesignView, estimate: Estimate) -> Fields:
             cov[row][column] = estimate.cov[i][j]
     variances, directions = np.linalg.eigh(cov)
     semi_axes_m = STD_95 * np.sqrt(np.maximum(variances, 0.0))
-    turn = quaternion(quaternion_from_axes(directions.T.tolist()))
-    at = pose(design.position_of(estimate.mean), turn)
-    return {"pose": at, "size": vector([2 * one for one in semi_axes_m.tolist()]), "color": _SPREAD}
+    turn = make_quaternion(quaternion_from_axes(directions.T.tolist()))
+    at = make_pose(design.position_of(estimate.mean), turn)
+    return {"pose": at, "size": make_vector([2 * semi_axis for semi_axis in semi_axes_m.tolist()]), "color": _SPREAD}
 
 
-_POSES = Many(lambda at_m: _made(PosesInFrame, poses=[pose(at_m)]), 3)
-_POINTS = Many(lambda at_m: _made(LinePrimitive, points=[vector(at_m)]), 3)
-_SPHERES = Many(
-    lambda of: _made(SceneEntity, spheres=[{"pose": pose(of[:3]), "size": vector(of[3:]), "color": _SPREAD}]), 6
+_POSES = RepeatedField(lambda at_m: _make_message(PosesInFrame, poses=[make_pose(at_m)]), 3)
+_POINTS = RepeatedField(lambda at_m: _make_message(LinePrimitive, points=[make_vector(at_m)]), 3)
+_SPHERES = RepeatedField(
+    lambda of: _make_message(
+        SceneEntity, spheres=[{"pose": make_pose(of[:3]), "size": make_vector(of[3:]), "color": _SPREAD}]
+    ),
+    6,
 )
 
 
@@ -322,7 +322,7 @@ _TRAIL_POINTS = 100  # at most, however fast positions come
 _Item = tuple[str, Message]
 
 
-class Views:
+class ViewBuilder:
     """Maker of messages for viewers, one for each recording: it remembers paths and the newest estimate."""
 
     def __init__(self) -> None:
@@ -346,39 +346,39 @@ class Views:
             LookupError: its arrays do not fit the design.
         """
         if isinstance(record, Header):
-            self._design, self._still_ns = design_view(record), at_ns
+            self._design, self._still_ns = read_design(record), at_ns
             self._zero_utc_ns = record.zero_utc_ns or 0
         if self._design is None or isinstance(record, Datagram):  # half of all records
             return []
         views = [*self._views(self._design, at_ns, record)]
         made = [(topic, view.SerializeToString()) for topic, view in views]
-        made += [(topics.PLOTS[type(plot)], pack(plot)) for plot in self._plots(self._design, record)]
+        made += [(topics.PLOTS[type(plot)], pack_message(plot)) for plot in self._plots(self._design, record)]
         return made
 
     def _plots(self, design: DesignView, record: Record) -> Iterator[Record]:
         match record:
             case Decision():
                 captured_ns = None if self._estimate is None else self._estimate.captured_ns
-                yield topics.age_plot(design, record, captured_ns)
-                yield topics.input_plot(design, record)
+                yield topics.make_age_plot(design, record, captured_ns)
+                yield topics.make_input_plot(design, record)
             case Estimate():
-                yield topics.state_plot(design, record)
+                yield topics.make_state_plot(design, record)
             case Setpoint():
-                yield topics.setpoint_plot(record)
+                yield topics.make_setpoint_plot(record)
             case Timing():
-                yield topics.timing_plot(record)
+                yield topics.make_timing_plot(record)
             case Plan():
-                yield topics.same(topics.SolvePlot, record, status=record.status.value)
+                yield topics.copy_fields(topics.SolvePlot, record, status=record.status.value)
                 if record.status is SolveStatus.OPTIMAL:
-                    yield topics.limits_plot(design, record)
+                    yield topics.make_limits_plot(design, record)
             case LinkEstimate():
-                yield topics.same(topics.LinkPlot, record)
+                yield topics.copy_fields(topics.LinkPlot, record)
             case LinkStats():
-                yield topics.counter_plot(record)
+                yield topics.make_counter_plot(record)
             case Truth():
-                yield topics.truth_plot(record)
+                yield topics.make_truth_plot(record)
             case VehicleStatus():
-                yield topics.same(topics.VehiclePlot, record, battery_v=topics.number(record.battery_v))
+                yield topics.copy_fields(topics.VehiclePlot, record, battery_v=topics.replace_missing(record.battery_v))
 
     def _views(self, design: DesignView, at_ns: int, record: Record) -> Iterator[_Item]:
         match record:
@@ -392,47 +392,47 @@ class Views:
                 if not self._true_path:
                     self._flown.add(record.at_ns, at_m)
                 utc_ns = record.at_ns + self._zero_utc_ns
-                yield topics.ESTIMATE, pose_in_frame(utc_ns, at_m)
-                yield topics.VEHICLE_FRAME, vehicle_frame(utc_ns, at_m)
+                yield topics.ESTIMATE, make_pose_in_frame(utc_ns, at_m)
+                yield topics.VEHICLE_FRAME, make_vehicle_frame(utc_ns, at_m)
             case Truth():
                 self._true_path = True
                 self._flown.add(record.at_ns, record.position_m)
-                yield topics.TRUTH, pose_in_frame(record.at_ns + self._zero_utc_ns, record.position_m)
+                yield topics.TRUTH, make_pose_in_frame(record.at_ns + self._zero_utc_ns, record.position_m)
             case StepInput():
                 for sample in record.samples:
                     self._measured.add(record.at_ns, sample.position_m)
                     captured_utc_ns = sample.captured_ns + self._zero_utc_ns
-                    yield topics.MEASURED, pose_in_frame(captured_utc_ns, sample.position_m)
+                    yield topics.MEASURED, make_pose_in_frame(captured_utc_ns, sample.position_m)
             case Plan() if record.status is SolveStatus.OPTIMAL and at_ns >= self._plan_ns:
                 self._plan_ns = at_ns + PLAN_NS
                 places = design.positions_of(record.states)
                 utc_ns = at_ns + self._zero_utc_ns
-                yield topics.PLAN, poses_in_frame(utc_ns, places)
-                yield topics.PLAN_SCENE, plan_scene(utc_ns, design, record, self._estimate, places)
+                yield topics.PLAN, make_poses_in_frame(utc_ns, places)
+                yield topics.PLAN_SCENE, draw_plan(utc_ns, design, record, self._estimate, places)
             case Event():
-                yield topics.LOG, log_line(record, record.at_ns + self._zero_utc_ns)
+                yield topics.LOG, make_log_message(record, record.at_ns + self._zero_utc_ns)
             case RecorderNote():
                 told = Event(at_ns=at_ns, severity=Severity.WARNING, code="recording", text=record.text)
-                yield topics.LOG, log_line(told, at_ns + self._zero_utc_ns)
+                yield topics.LOG, make_log_message(told, at_ns + self._zero_utc_ns)
 
     def _still(self, design: DesignView, at_ns: int) -> Iterator[_Item]:
         """Yield the scenes that do not move, when they are due."""
         if at_ns >= self._still_ns:
             self._still_ns = at_ns + STILL_NS
-            yield topics.FRAMES, frames(at_ns + self._zero_utc_ns)
-            yield topics.ROOM_SCENE, room_scene(at_ns + self._zero_utc_ns, design)
+            yield topics.FRAMES, make_frames(at_ns + self._zero_utc_ns)
+            yield topics.ROOM_SCENE, draw_room(at_ns + self._zero_utc_ns, design)
 
     def _decision(self, design: DesignView, decision: Decision) -> Iterator[_Item]:
         utc_ns = decision.at_ns + self._zero_utc_ns
         if decision.boundary:
-            yield topics.LINK_SCENE, link_scene(utc_ns, design, decision)
+            yield topics.LINK_SCENE, draw_link(utc_ns, design, decision)
             if decision.target is not None:
                 target_m = design.position_of(decision.target)
-                yield topics.TARGET, pose_in_frame(utc_ns, target_m)
+                yield topics.TARGET, make_pose_in_frame(utc_ns, target_m)
         if decision.at_ns >= self._trail_ns:
             self._trail_ns = decision.at_ns + TRAIL_NS
             since_ns = decision.at_ns - round(TRAIL_S * 1e9)
-            yield (topics.PATH_SCENE, path_scene(utc_ns, self._flown.since(since_ns), self._measured.since(since_ns)))
+            yield (topics.PATH_SCENE, draw_path(utc_ns, self._flown.since(since_ns), self._measured.since(since_ns)))
 
 
 class _Trail:

@@ -13,10 +13,10 @@ from typing import Literal, cast
 import jinja2
 from markupsafe import Markup, escape
 
-from logs.report.svg import FONT, Drawing, css_variables
+from logs.report.svg import FONT, Drawing, make_css_variables
 
 NOTHING = Markup("")
-_MANY = 9  # sections from which on a page has a list of them
+_MIN_CONTENTS_SECTIONS = 9  # sections from which on a page has a list of them
 
 
 MarkKind = Literal[
@@ -52,7 +52,7 @@ class PageSection:
 
 
 @cache
-def _macros() -> jinja2.Environment:
+def _load_macros() -> jinja2.Environment:
     """Return the environment of the page's macros: whatever is not marked as HTML is escaped."""
     return jinja2.Environment(
         loader=jinja2.PackageLoader("logs.report", "."),
@@ -63,14 +63,14 @@ def _macros() -> jinja2.Environment:
     )
 
 
-def _made(macro: str, *arguments: object) -> Markup:
-    return cast(Markup, getattr(_macros().get_template("page.html").module, macro)(*arguments))
+def _render_macro(macro: str, *arguments: object) -> Markup:
+    return cast(Markup, getattr(_load_macros().get_template("page.html").module, macro)(*arguments))
 
 
-def page(
+def render_page(
     title: str,
     subtitle: str,
-    story: Iterable[str],
+    sentences: Iterable[str],
     sections: Iterable[PageSection],
     heading: str = "What happened",
     top: Markup = NOTHING,
@@ -84,55 +84,59 @@ def page(
         script: JavaScript of the page's end, before that of zoom and pan; the page is whole without it.
     """
     css = Template(resources.files("logs.report").joinpath("page.css").read_text(encoding="utf-8"))
-    style = Markup(css.substitute(light=css_variables(False), dark=css_variables(True), font=FONT))
-    sentences = list(story)
-    shown = [*([PageSection(heading, "", listed(sentences))] if sentences else ()), *sections]
+    style = Markup(css.substitute(light=make_css_variables(False), dark=make_css_variables(True), font=FONT))
+    sentence_list = list(sentences)
+    all_sections = [*([PageSection(heading, "", render_list(sentence_list))] if sentence_list else ()), *sections]
     code = Markup(script + resources.files("logs.report").joinpath("zoom.js").read_text(encoding="utf-8"))
-    return str(_made("document", title, subtitle, top, shown, len(shown) >= _MANY, style, code)).lstrip()
+    return str(
+        _render_macro(
+            "document", title, subtitle, top, all_sections, len(all_sections) >= _MIN_CONTENTS_SECTIONS, style, code
+        )
+    ).lstrip()
 
 
-def banner(tone: str, word: str, text: str, why: Iterable[str]) -> Markup:
+def render_banner(tone: str, title: str, text: str, sentences: Iterable[str]) -> Markup:
     """Return the line on what matters most as HTML, with the sentences below it.
 
     Args:
         tone: "good", "mind" or "bad", for its colour.
         word: What it comes to, so that it is said without colour, too.
     """
-    return _made("banner", tone, word, text, list(why))
+    return _render_macro("banner", tone, title, text, list(sentences))
 
 
-def joined(parts: Iterable[Markup]) -> Markup:
+def join(parts: Iterable[Markup]) -> Markup:
     """Return pieces of HTML one after another."""
     return NOTHING.join(parts)
 
 
-def listed(sentences: Iterable[str]) -> Markup:
+def render_list(sentences: Iterable[str]) -> Markup:
     """Return sentences as a list in HTML."""
-    return _made("items", sentences, "story")
+    return _render_macro("items", sentences, "story")
 
 
-def grid(drawings: Sequence[Drawing]) -> Markup:
+def render_grid(drawings: Sequence[Drawing]) -> Markup:
     """Return figures as HTML, two beside each other where there is room."""
-    return _made("figures", [(one.key, "", _labelled(one)) for one in drawings])
+    return _render_macro("figures", [(drawing.key, "", _add_label(drawing)) for drawing in drawings])
 
 
-def wide_or_narrow(wide: Drawing, narrow: Drawing) -> Markup:
+def render_wide_or_narrow(wide: Drawing, narrow: Drawing) -> Markup:
     """Return one figure as HTML in two drawings: for wide pages and for phones."""
-    both = ((wide, " wide broad"), (narrow, " wide narrow"))
-    return _made("figures", [(one.key, kind, _labelled(one)) for one, kind in both])
+    drawings = ((wide, " wide broad"), (narrow, " wide narrow"))
+    return _render_macro("figures", [(drawing.key, kind, _add_label(drawing)) for drawing, kind in drawings])
 
 
-def _labelled(drawing: Drawing) -> Markup:
+def _add_label(drawing: Drawing) -> Markup:
     """Return a drawing with its description for those who do not see it."""
     return Markup(drawing.svg.replace("<svg ", f'<svg role="img" aria-label="{escape(drawing.label)}" ', 1))
 
 
-def facts(pairs: Iterable[tuple[str, str]]) -> Markup:
+def render_facts(pairs: Iterable[tuple[str, str]]) -> Markup:
     """Return a table of names and values as HTML."""
-    return _made("facts", pairs)
+    return _render_macro("facts", pairs)
 
 
-def table(
+def render_table(
     columns: Sequence[str],
     rows: Iterable[Sequence[str]],
     numbers: frozenset[int],
@@ -151,29 +155,29 @@ def table(
     rows = [tuple(row) for row in rows]
     if any(len(row) != len(columns) for row in rows):
         raise ValueError(f"a row of another length than its head {columns}")
-    return _made("table", columns, rows, numbers, f"many {kind}".rstrip(), remarks)
+    return _render_macro("table", columns, rows, numbers, f"many {kind}".rstrip(), remarks)
 
 
-def paragraph(text: str) -> Markup:
+def render_paragraph(text: str) -> Markup:
     """Return plain text as an HTML paragraph."""
-    return _made("paragraph", text)
+    return _render_macro("paragraph", text)
 
 
-def strong(text: str) -> Markup:
+def render_strong(text: str) -> Markup:
     """Return plain text as an HTML paragraph that stands out."""
-    return _made("strong", text)
+    return _render_macro("strong", text)
 
 
-def note(text: str) -> Markup:
+def render_note(text: str) -> Markup:
     """Return plain text as a remark below a table or a figure."""
-    return _made("note", text)
+    return _render_macro("note", text)
 
 
-def folded(title: str, body: str) -> Markup:
+def render_folded(title: str, body: str) -> Markup:
     """Return HTML, or long plain text, behind a line that opens it."""
-    return _made("folded", title, body if isinstance(body, Markup) else _made("plain", body))
+    return _render_macro("folded", title, body if isinstance(body, Markup) else _render_macro("plain", body))
 
 
-def legend(marks: Iterable[Mark]) -> Markup:
+def render_legend(marks: Iterable[Mark]) -> Markup:
     """Return what marks mean as HTML."""
-    return _made("legend", marks)
+    return _render_macro("legend", marks)

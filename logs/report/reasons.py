@@ -9,114 +9,122 @@ import numpy as np
 from logs.recording.summary import count
 from logs.report.causes import metres, seconds
 from logs.report.evidence import FlightEvidence
-from logs.report.excursion import GRAVE_M, Excursion, trusted
+from logs.report.excursion import GRAVE_M, Excursion, select_trusted_estimates
 from uavctl.records import number
 
-_FAR_M = 0.3  # between the estimate and the true place: worth telling
+_MIN_ESTIMATE_ERROR_M = 0.3  # between the estimate and the true place: worth telling
 _GATE_SHARE = 0.15  # of the setpoints: setting out takes some
-_AT_BOUND = 0.999  # of the largest bias
-_NEAR_BOUND = 0.7  # of the acceleration that the envelope allows to be unexplained
-_COMPASS = {"north": ("north", "south"), "east": ("east", "west"), "down": ("down", "up")}
+_BOUND_SHARE = 0.999  # of the largest bias
+_NEAR_BOUND_SHARE = 0.7  # of the acceleration that the envelope allows to be unexplained
+_DIRECTIONS = {"north": ("north", "south"), "east": ("east", "west"), "down": ("down", "up")}
 
 
-def reasons(e: FlightEvidence, worst: Excursion | None) -> Iterator[str]:
+def describe_reasons(e: FlightEvidence, worst: Excursion | None) -> Iterator[str]:
     """Return the sentences; `worst` is the excursion that the headline tells of, None if it tells of another cause."""
     if worst is not None:
-        yield from _outside(e, worst)
-    yield from _gate(e)
-    yield from _bias(e)
-    yield from _model(e)
-    yield from _solver(e)
+        yield from _describe_excursion(e, worst)
+    yield from _describe_gate(e)
+    yield from _describe_bias(e)
+    yield from _describe_model(e)
+    yield from _describe_failed_solves(e)
 
 
-def _outside(e: FlightEvidence, worst: Excursion) -> Iterator[str]:
-    until = "to the end of the recording" if worst.back_s is None else f"until {seconds(worst.back_s)}"
-    whole = f"It was beyond the {worst.wall} from {seconds(worst.left_s)} on, {until}"
-    others = [
-        f"{metres(one.beyond_m)} {one.passage} at {seconds(one.worst_s)}"
-        for one in e.excursions[1:3]
-        if one.beyond_m >= min(GRAVE_M, worst.beyond_m)
+def _describe_excursion(e: FlightEvidence, worst: Excursion) -> Iterator[str]:
+    end_text = "to the end of the recording" if worst.return_s is None else f"until {seconds(worst.return_s)}"
+    text = f"It was beyond the {worst.wall} from {seconds(worst.exit_s)} on, {end_text}"
+    other_excursions = [
+        f"{metres(excursion.beyond_m)} {excursion.passage} at {seconds(excursion.worst_s)}"
+        for excursion in e.excursions[1:3]
+        if excursion.beyond_m >= min(GRAVE_M, worst.beyond_m)
     ]
-    yield f"{whole}{'; also ' + ', '.join(others) if others else ''}."
-    push = e.push(worst)
+    yield f"{text}{'; also ' + ', '.join(other_excursions) if other_excursions else ''}."
+    push = e.estimate_push(worst)
     if push is not None:
         yield (
             f"From {seconds(push.begun_s)} to {seconds(push.ended_s)} it was pushed outwards by "
             f"{push.accel_mps2:.1f} m/s² beside its setpoints."
         )
-    believed = _believed(e, worst)
-    if believed is not None:
-        yield believed
+    estimate_text = _describe_estimate_error(e, worst)
+    if estimate_text is not None:
+        yield estimate_text
 
 
-def _believed(e: FlightEvidence, worst: Excursion) -> str | None:
+def _describe_estimate_error(e: FlightEvidence, worst: Excursion) -> str | None:
     """Return a sentence on where the estimate put it at the worst moment; None if about right, or not known."""
     flight, at_ns = e.flight, e.flight.origin_ns + round(worst.worst_s * 1e9)
-    near = min(trusted(flight), key=lambda one: abs(one.at_ns - at_ns), default=None)
-    if not flight.truths or near is None or abs(near.at_ns - at_ns) > flight.tick_ns:
+    nearest = min(select_trusted_estimates(flight), key=lambda estimate: abs(estimate.at_ns - at_ns), default=None)
+    if not flight.truths or nearest is None or abs(nearest.at_ns - at_ns) > flight.tick_ns:
         return None
-    off_m = float(np.linalg.norm(np.subtract(flight.design.position_of(near.mean), worst.worst_m)))
-    if not np.isfinite(off_m) or off_m < _FAR_M:
+    error_m = float(np.linalg.norm(np.subtract(flight.design.position_of(nearest.mean), worst.worst_m)))
+    if not np.isfinite(error_m) or error_m < _MIN_ESTIMATE_ERROR_M:
         return None
-    return f"At {seconds(worst.worst_s)} the estimate put it {metres(off_m)} away from where it was."
+    return f"At {seconds(worst.worst_s)} the estimate put it {metres(error_m)} away from where it was."
 
 
-def _gate(e: FlightEvidence) -> Iterator[str]:
+def _describe_gate(e: FlightEvidence) -> Iterator[str]:
     """Return a sentence on setpoints that the last gate changed, if these were more than a few."""
-    share, first_s, kinds = e.limited()
+    share, first_s, kinds = e.count_limited()
     if share > _GATE_SHARE:
         names = ", ".join(f"{name} {100 * part:.0f} %" for name, part in kinds)
         yield f"The last gate limited {100 * share:.0f} % of the setpoints ({names}), first at {seconds(first_s)}."
 
 
-def _bias(e: FlightEvidence) -> Iterator[str]:
+def _describe_bias(e: FlightEvidence) -> Iterator[str]:
     """Return a sentence for each axis whose estimated bias was at its bound."""
-    t_s, biases, bounds = e.biases()
+    t_s, biases, bounds = e.collect_biases()
     if len(bounds) != biases.shape[1]:
         return
     for column, axis in enumerate(e.flight.design.axes):
         bound = float(bounds[column])
-        at = np.abs(biases[:, column]) >= _AT_BOUND * bound
-        if bound and at.any():
-            side = _COMPASS[axis][int(biases[at, column].mean() < 0)]
-            lasted_s = int(at.sum()) * e.flight.tick_ns * 1e-9
+        is_at_bound = np.abs(biases[:, column]) >= _BOUND_SHARE * bound
+        if bound and is_at_bound.any():
+            direction = _DIRECTIONS[axis][int(biases[is_at_bound, column].mean() < 0)]
+            lasted_s = int(is_at_bound.sum()) * e.flight.tick_ns * 1e-9
             unit = e.flight.design.input_unit
             yield (
-                f"The estimated bias was at its bound of {number(bound, 2)} {unit} towards {side} for "
-                f"{seconds(lasted_s)}, first at {seconds(float(t_s[at][0]))}."
+                f"The estimated bias was at its bound of {number(bound, 2)} {unit} towards {direction} for "
+                f"{seconds(lasted_s)}, first at {seconds(float(t_s[is_at_bound][0]))}."
             )
 
 
-def _model(e: FlightEvidence) -> Iterator[str]:
+def _describe_model(e: FlightEvidence) -> Iterator[str]:
     """Return sentences on what positions showed that nothing sent explains, and on errors of the forecast."""
-    shown = [(d.unexplained_mps2, d.at_ns) for d in e.flight.decisions if d.unexplained_mps2 is not None]
+    unexplained = [(d.unexplained_mps2, d.at_ns) for d in e.flight.decisions if d.unexplained_mps2 is not None]
     bound = None if e.config is None else e.config.envelope.unexplained_mps2
-    if shown and bound:
-        most, at_ns = max(shown)
-        if most > _NEAR_BOUND * bound:
+    if unexplained and bound:
+        max_mps2, at_ns = max(unexplained)
+        if max_mps2 > _NEAR_BOUND_SHARE * bound:
             yield (
-                f"Positions showed {most:.1f} m/s² that no setpoint had asked for, at {seconds(e.second(at_ns))}; "
+                f"Positions showed {max_mps2:.1f} m/s² that no setpoint had asked for, at "
+                f"{seconds(e.to_seconds(at_ns))}; "
                 f"{number(bound)} m/s² is what wind and the model's error may make."
             )
     model = e.judged.verdicts.model
     axes = () if model is None else model.axes
-    larger, telling = [one for one in axes if one.larger], [one for one in axes if one.telling]
-    if larger:
-        sizes = ", ".join(f"{one.variance**0.5:.1f} times {one.axis}" for one in larger)
+    large_axes, correlated_axes = (
+        [verdict for verdict in axes if verdict.has_larger_errors],
+        [verdict for verdict in axes if verdict.has_correlated_errors],
+    )
+    if large_axes:
+        sizes = ", ".join(f"{verdict.variance**0.5:.1f} times {verdict.axis}" for verdict in large_axes)
         yield (
-            f"Errors of the forecast were larger than the model expects ({sizes}, over {larger[0].count} positions): "
+            f"Errors of the forecast were larger than the model expects ({sizes}, over {large_axes[0].count} "
+            f"positions): "
             "more wind, or noisier positions, than it was made for."
         )
-    elif telling:
-        found = ", ".join(f"{one.correlation[0]:.1f} {one.axis}".replace("-", "−") for one in telling)
+    elif correlated_axes:
+        correlations = ", ".join(
+            f"{verdict.correlation[0]:.1f} {verdict.axis}".replace("-", "−") for verdict in correlated_axes
+        )
         yield (
-            f"An error of the forecast says something of the next one (correlation {found}, over {telling[0].count} "
+            f"An error of the forecast says something of the next one (correlation {correlations}, over "
+            f"{correlated_axes[0].count} "
             "positions): wind that stays for a while, or a vehicle that answers otherwise."
         )
 
 
-def _solver(e: FlightEvidence) -> Iterator[str]:
+def _describe_failed_solves(e: FlightEvidence) -> Iterator[str]:
     failed = [d for d in e.flight.decisions if d.solve is not None and d.solve.value != "optimal"]
     if failed:
-        at_s = e.second(failed[0].at_ns)
+        at_s = e.to_seconds(failed[0].at_ns)
         yield f"{count(len(failed), 'plan')} of {e.summary.solves} came to no optimum, first at {seconds(at_s)}."

@@ -12,18 +12,25 @@ from logs.recording.topics import GOES_ON, RECOVERED
 from uavctl.records import number, severity, tell, worst
 
 # A target that moves by less than this share of its longest step only settles.
-_STILL = 0.05
+_SETTLING_SHARE = 0.05
 
 
-def story(flight: FlightData, summary: FlightSummary) -> list[str]:
+def describe_flight(flight: FlightData, summary: FlightSummary) -> list[str]:
     """Return sentences on a flight that neither headline nor summary has, each made from its data."""
     if summary.final_error_m is None:
-        return [*_part(flight), *_cut(flight)]
-    course = _trajectory(flight) if summary.trajectory else _waypoints(flight)
-    return [*_part(flight), *_begun(flight), *course, *_fallback(flight, summary), *_gave_way(flight), *_cut(flight)]
+        return [*_describe_part(flight), *_describe_cut(flight)]
+    course = _describe_trajectory(flight) if summary.trajectory else _describe_waypoints(flight)
+    return [
+        *_describe_part(flight),
+        *_describe_engagement(flight),
+        *course,
+        *_describe_fallback(flight, summary),
+        *_describe_relaxed_plan(flight),
+        *_describe_cut(flight),
+    ]
 
 
-def part_begins(flight: FlightData) -> str:
+def describe_part_begin(flight: FlightData) -> str:
     """Return where in its flight a recording begins that lacks the first ticks, in words; empty if it has them."""
     first = flight.decisions[0]
     if not flight.part:
@@ -32,19 +39,19 @@ def part_begins(flight: FlightData) -> str:
     return f"tick {first.tick}" + (f", {number(into_s)} s into the flight" if into_s else "")
 
 
-def _part(flight: FlightData) -> list[str]:
-    begins = part_begins(flight)
-    which = f"file {flight.notes[0].segment}" if flight.notes and flight.notes[0].segment > 1 else "a part"
-    return [f"This is {which} of a flight: it begins at {begins}. All times count from there."] if begins else []
+def _describe_part(flight: FlightData) -> list[str]:
+    begins = describe_part_begin(flight)
+    part_name = f"file {flight.notes[0].segment}" if flight.notes and flight.notes[0].segment > 1 else "a part"
+    return [f"This is {part_name} of a flight: it begins at {begins}. All times count from there."] if begins else []
 
 
-def _begun(flight: FlightData) -> list[str]:
+def _describe_engagement(flight: FlightData) -> list[str]:
     """Return a sentence on when the controller took over; none if it flew from the first tick on."""
     begun_s = flight.spans(FLOWN)[0][0]
     return [f"The controller took over {number(begun_s)} s after the first tick."] if begun_s else []
 
 
-def _cut(flight: FlightData) -> list[str]:
+def _describe_cut(flight: FlightData) -> list[str]:
     """Return a sentence on why the recording ends before the flight does; empty if it does not."""
     if not flight.notes:
         return []
@@ -61,7 +68,7 @@ def _cut(flight: FlightData) -> list[str]:
     return []
 
 
-def _fallback(flight: FlightData, s: FlightSummary) -> list[str]:
+def _describe_fallback(flight: FlightData, s: FlightSummary) -> list[str]:
     """Return a sentence on when and why the fallback took over; none if it never did."""
     if not s.fallbacks:
         return []
@@ -77,7 +84,7 @@ def _fallback(flight: FlightData, s: FlightSummary) -> list[str]:
     ]
 
 
-def _gave_way(flight: FlightData) -> list[str]:
+def _describe_relaxed_plan(flight: FlightData) -> list[str]:
     """Return a sentence on the constraint that gave way most in any plan flown; none where none did."""
     names = flight.design.names
     plans = [plan for plan in flight.flown_plans.values() if plan.gave_way]
@@ -88,37 +95,38 @@ def _gave_way(flight: FlightData) -> list[str]:
     return [f"At worst, in the plan of {number(at_s)} s, the {tell(names, worst(names, plan.gave_way))}."]
 
 
-def _waypoints(flight: FlightData) -> list[str]:
+def _describe_waypoints(flight: FlightData) -> list[str]:
     """Return sentences on when later waypoints were set out for, and where the vehicle was ordered to."""
-    told = [(d.at_ns, d.waypoint) for d in flight.flown if d.waypoint is not None]
-    left = [(at_ns, then) for (_, now), (at_ns, then) in pairwise(told) if then != now]
+    waypoints = [(d.at_ns, d.waypoint) for d in flight.flown if d.waypoint is not None]
+    changes = [(at_ns, waypoint) for (_, previous), (at_ns, waypoint) in pairwise(waypoints) if waypoint != previous]
     ordered = ", ".join(
-        f"to {_place(flight, target)} at {_seconds(flight, at_ns)}" for at_ns, target in flight.ordered_places
+        f"to {_format_position(flight, target)} at {_format_seconds(flight, at_ns)}"
+        for at_ns, target in flight.ordered_places
     )
-    sent = [f"It was ordered {ordered}."] if ordered else []
-    if not left:
-        return sent
-    times = ", ".join(f"waypoint {then + 1} at {_seconds(flight, at_ns)}" for at_ns, then in left)
-    return [f"It set out for {times}.", *sent]
+    order_texts = [f"It was ordered {ordered}."] if ordered else []
+    if not changes:
+        return order_texts
+    times = ", ".join(f"waypoint {waypoint + 1} at {_format_seconds(flight, at_ns)}" for at_ns, waypoint in changes)
+    return [f"It set out for {times}.", *order_texts]
 
 
-def _place(flight: FlightData, target: tuple[float, ...]) -> str:
+def _format_position(flight: FlightData, target: tuple[float, ...]) -> str:
     """Return the position of a target in words, local NED [m]."""
     values = (f"{target[index]:.4g}" for index in flight.design.position_index)
     return f"({', '.join(values)}) m ({', '.join(flight.design.axes)})"
 
 
-def _trajectory(flight: FlightData) -> list[str]:
+def _describe_trajectory(flight: FlightData) -> list[str]:
     """Return a sentence on how far and how long the target moved."""
     times_s, states = flight.targets
-    moves = np.linalg.norm(np.diff(states[:, list(flight.design.position_index)], axis=0), axis=1)
-    (moved,) = np.nonzero(moves > _STILL * moves.max(initial=0.0))
-    if not len(moved):
+    step_lengths_m = np.linalg.norm(np.diff(states[:, list(flight.design.position_index)], axis=0), axis=1)
+    (moving_indices,) = np.nonzero(step_lengths_m > _SETTLING_SHARE * step_lengths_m.max(initial=0.0))
+    if not len(moving_indices):
         return ["The trajectory did not move."]
-    begun_s, ended_s = float(times_s[moved[0]]), float(times_s[moved[-1] + 1])
-    length_m = number(float(moves.sum()))
+    begun_s, ended_s = float(times_s[moving_indices[0]]), float(times_s[moving_indices[-1] + 1])
+    length_m = number(float(step_lengths_m.sum()))
     return [f"It was to follow a trajectory, {length_m} m from {number(begun_s)} s to {number(ended_s)} s."]
 
 
-def _seconds(flight: FlightData, at_ns: int) -> str:
+def _format_seconds(flight: FlightData, at_ns: int) -> str:
     return f"{number(float(flight.seconds([at_ns])[0]))} s"

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path
 
-from logs.recording.design_view import Floats
+from uavctl.arrays import Array
 
 # role -> (light, dark). Okabe and Ito's colours, which colour-blind people can tell apart; lifted for dark pages.
 PALETTE = {
@@ -43,7 +43,7 @@ FONT = "system-ui, -apple-system, 'Segoe UI', 'Helvetica Neue', Arial, 'DejaVu S
 _CURVES = re.compile(r"[CcQqSsTtAaHhVvlm]|e")
 _COMMANDS = re.compile(r"([MLz])(?: (\S+) (\S+))?")
 
-_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 _STYLE: dict[str, object] = {
     "svg.fonttype": "none",
@@ -84,16 +84,16 @@ def colour(role: str) -> str:
     return PALETTE[role][0]
 
 
-def ramp(index: int, count: int) -> str:
+def choose_ramp_colour(index: int, count: int) -> str:
     """Return the colour of plan index `index` of `count`."""
-    place = (len(RAMP) - 1) * index / max(1, count - 1)
-    left = min(int(place), len(RAMP) - 2)
-    part = place - left
-    mixed = (round(a + part * (b - a)) for a, b in zip(RAMP[left], RAMP[left + 1], strict=True))
-    return "#" + "".join(f"{value:02x}" for value in mixed)
+    position = (len(RAMP) - 1) * index / max(1, count - 1)
+    index = min(int(position), len(RAMP) - 2)
+    fraction = position - index
+    channels = (round(a + fraction * (b - a)) for a, b in zip(RAMP[index], RAMP[index + 1], strict=True))
+    return "#" + "".join(f"{value:02x}" for value in channels)
 
 
-def css_variables(dark: bool) -> str:
+def make_css_variables(dark: bool) -> str:
     """Return the palette as CSS declarations."""
     return "".join(f"--{role}:{pair[dark]};" for role, pair in PALETTE.items())
 
@@ -113,7 +113,9 @@ class Canvas:
 
     figure: Figure
     svg: str = field(default="", init=False)
-    seen: str = field(default="", init=False)  # what its first axes show, for the page's cursor: "time", or a view
+    cursor_axes: str = field(
+        default="", init=False
+    )  # what its first axes show, for the page's cursor: "time", or a view
 
     def axes(self, title: str, x_label: str, y_label: str, left_in: float = _LEFT_IN) -> Axes:
         """Add one set of axes, titled and labelled, that fills the figure.
@@ -131,46 +133,46 @@ class Canvas:
         axes.set_xlabel(x_label)
         axes.set_ylabel(y_label)
         if x_label == _TIME:
-            self.seen = "time"
+            self.cursor_axes = "time"
         return axes
 
     def cursor(self) -> str:
         """Return an attribute that says where on the drawing the first axes are, and from where to where they go."""
-        if not self.seen:
+        if not self.cursor_axes:
             return ""
         ax = self.figure.axes[0]
         size = 72.0 * self.figure.get_size_inches()
         box = ax.get_position()
         x, y = (size[0] * box.x0, size[0] * box.x1), (size[1] * (1.0 - box.y0), size[1] * (1.0 - box.y1))
         numbers = " ".join(f"{value:.5g}" for value in (*x, *ax.get_xlim(), *y, *ax.get_ylim()))
-        return f'data-{self.seen}="{numbers}" '
+        return f'data-{self.cursor_axes}="{numbers}" '
 
 
 @contextmanager
-def canvas(key: str, height_in: float, width_in: float = WIDTH_IN) -> Iterator[Canvas]:
+def open_canvas(key: str, height_in: float, width_in: float = WIDTH_IN) -> Iterator[Canvas]:
     """Return a styled figure; `key` keeps its ids apart from those of the page's other figures."""
     with style.context([_STYLE, {name: colour(role) for name, role in _ROLES.items()}, {"svg.hashsalt": key}]):
         figure = Figure(figsize=(width_in, height_in), layout="constrained")
-        one = Canvas(figure)
-        yield one
+        canvas = Canvas(figure)
+        yield canvas
         out = io.StringIO()
         figure.savefig(out, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
-        one.svg = _inline(out.getvalue(), key).replace("<svg ", f"<svg {one.cursor()}", 1)
+        canvas.svg = _convert_to_inline(out.getvalue(), key).replace("<svg ", f"<svg {canvas.cursor()}", 1)
 
 
-def power_of_ten(value: float, _place: object = None) -> str:
+def format_power_of_ten(value: float, _place: object = None) -> str:
     """Return a tick of a logarithmic axis as text, as in "10⁻⁹": figures have no markup."""
-    return "10" + str(round(np.log10(value))).translate(_RAISED)
+    return "10" + str(round(np.log10(value))).translate(_SUPERSCRIPTS)
 
 
-def dots(ax: Axes, x: Floats, y: Floats, role: str, size_pt: float, zorder: float = 2) -> None:
+def draw_dots(ax: Axes, x: Array, y: Array, role: str, size_pt: float, zorder: float = 2) -> None:
     """Draw round dots, as strokes without length."""
     points = (x, y)
-    strokes(ax, points, points, colour(role), size_pt, zorder)
+    draw_strokes(ax, points, points, colour(role), size_pt, zorder)
 
 
-def strokes(
-    ax: Axes, begin: tuple[Floats, Floats], end: tuple[Floats, Floats], paint: str, width_pt: float, zorder: float = 2
+def draw_strokes(
+    ax: Axes, begin: tuple[Array, Array], end: tuple[Array, Array], paint: str, width_pt: float, zorder: float = 2
 ) -> None:
     """Draw separate strokes between points (x, y) as one path, a tenth of the bytes of as many lines."""
     if not len(begin[0]):
@@ -181,20 +183,20 @@ def strokes(
     ax.add_patch(PathPatch(path, fill=False, ec=paint, lw=width_pt, capstyle="round", zorder=zorder))
 
 
-def standalone(svg: str, label: str) -> str:
+def make_standalone(svg: str, label: str) -> str:
     """Return an inline SVG as a file of its own, with colours, background and fonts."""
-    look = (
-        f"<style>:root{{{css_variables(False)}}}"
-        f"@media (prefers-color-scheme:dark){{:root{{{css_variables(True)}}}}}"
+    style_text = (
+        f"<style>:root{{{make_css_variables(False)}}}"
+        f"@media (prefers-color-scheme:dark){{:root{{{make_css_variables(True)}}}}}"
         f"text{{font-family:{FONT}!important}}</style>"
         f'<title>{label}</title><rect width="100%" height="100%" rx="6" style="fill:var(--card)"/>'
     )
-    opened = svg.replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" role="img" ', 1)
-    head, _, tail = opened.partition(">")
-    return f"{head}>{look}{tail}"
+    root = svg.replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" role="img" ', 1)
+    head, _, tail = root.partition(">")
+    return f"{head}>{style_text}{tail}"
 
 
-def _inline(text: str, key: str) -> str:
+def _convert_to_inline(text: str, key: str) -> str:
     """Return an SVG for HTML: without what HTML does not need, ids apart, numbers short, colours from the page."""
     text = text[text.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>|<!--.*?-->", "", text, flags=re.DOTALL)
@@ -203,47 +205,47 @@ def _inline(text: str, key: str) -> str:
     text = re.sub(r'(<svg [^>]*?) height="[^"]*"', r"\1", text, count=1)
     text = re.sub(r'\b(id=")', rf"\1{key}-", text)
     text = re.sub(r'(href="#|url\(#)', rf"\1{key}-", text)
-    text = re.sub(r' d="([^"]*)"', lambda found: f' d="{compact(found.group(1))}"', text)
+    text = re.sub(r' d="([^"]*)"', lambda match: f' d="{compact_path(match.group(1))}"', text)
     text = re.sub(r"font-family: [^;\"]*; ", "", text)  # the page says which
-    text = re.sub(r' (?:x|y|transform)="[^"]*"', lambda found: _shorten(found.group()), text)
+    text = re.sub(r' (?:x|y|transform)="[^"]*"', lambda match: _shorten_numbers(match.group()), text)
     text = re.sub(r"\s*\n\s*", "\n", text)
     roles = {light: f"var(--{role},{light})" for role, (light, _) in PALETTE.items()}
-    return re.sub("|".join(roles), lambda found: roles[found.group()], text)
+    return re.sub("|".join(roles), lambda match: roles[match.group()], text)
 
 
-def compact(path: str) -> str:
+def compact_path(path: str) -> str:
     """Return a path's straight lines in relative tenths of a point, a third of the bytes; curves stay as they are.
 
     Args:
         path: Path as Matplotlib writes it: commands M, L and z with absolute coordinates.
     """
     if _CURVES.search(path):
-        return _shorten(path)
+        return _shorten_numbers(path)
     parts: list[str] = []
-    at = begun = (0, 0)
+    current = subpath_start = (0, 0)
     for command, x, y in _COMMANDS.findall(path):
         if command == "z":
             parts.append("z")
-            at = begun
+            current = subpath_start
             continue
-        to = (round(10.0 * float(x)), round(10.0 * float(y)))
+        target = (round(10.0 * float(x)), round(10.0 * float(y)))
         if command == "M":
             parts.append("m")  # the first one counts from zero; lines that follow need no letter
-            begun = to
-        parts += [_tenths(to[0] - at[0]), _tenths(to[1] - at[1])]
-        at = to
+            subpath_start = target
+        parts += [_format_tenths(target[0] - current[0]), _format_tenths(target[1] - current[1])]
+        current = target
     text = " ".join(parts)
-    for needless in (" m ", "m ", " z", "z ", " -"):
-        text = text.replace(needless, needless.strip())
+    for separator in (" m ", "m ", " z", "z ", " -"):
+        text = text.replace(separator, separator.strip())
     return text
 
 
 @cache
-def _tenths(value: int) -> str:
+def _format_tenths(value: int) -> str:
     """Return a tenth of a whole number as text, as short as SVG allows."""
     return f"{value / 10:.1f}".removesuffix(".0").replace("0.", ".", 1) if abs(value) < 10 else f"{value / 10:g}"
 
 
-def _shorten(attribute: str) -> str:
+def _shorten_numbers(attribute: str) -> str:
     """Return a number with two decimals: a hundredth of a point is finer than any screen."""
     return re.sub(r"-?\d+\.\d{3,}", lambda number: f"{float(number.group()):.2f}", attribute)

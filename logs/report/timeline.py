@@ -2,31 +2,28 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from importlib import resources
 from itertools import groupby, pairwise
 from typing import Protocol
 
 import numpy as np
 from matplotlib.axes import Axes
 
-from logs.recording.design_view import Floats
 from logs.recording.flight import FlightData
-from logs.recording.summary import SLACK_TOLERANCE, box_at, input_outside, state_outside
-from logs.report.excursion import trusted
+from logs.recording.summary import SLACK_TOLERANCE, find_input_violations, find_state_violations
 from logs.report.page import Mark
-from logs.report.plots import SEEN, VIEWS, span
-from logs.report.svg import WIDTH_IN, Drawing, canvas, colour, strokes
+from logs.report.plots import set_time_axis
+from logs.report.svg import WIDTH_IN, Drawing, colour, draw_strokes, open_canvas
+from uavctl.arrays import Array
 from uavctl.records import ControlMode, Decision, Severity, SolveStatus
 
 WIDE_IN = 11.0
-MARKS = 400  # of one lane: more would touch each other
+MAX_MARKS = 400  # of one lane: more would touch each other
 _LANE_IN = 0.3
 _LEFT_IN = 0.95  # for the lanes' names
 _INK_PER_CHARACTER_IN = 0.072
-_MODES = {
+_MODE_ROLES = {
     ControlMode.WAIT: "grid",
     ControlMode.TRACK: "estimate",
     ControlMode.BRAKE: "fallback",
@@ -34,13 +31,13 @@ _MODES = {
     ControlMode.LAND: "limit",
     ControlMode.STOPPED: "grid",
 }
-_NONE = np.zeros(0)
-_EVENTS = (
+_NO_TIMES = np.zeros(0)
+_EVENT_LANES = (
     (Severity.ERROR, "errors", "limit", "an error"),
     (Severity.WARNING, "warnings", "sample", "a warning"),
     (Severity.INFO, "notes", "muted", "what else came"),
 )
-_HANDS = {"engaged": "estimate", "failed": "limit", "landing": "limit", "settling": "limit"}
+_HAND_OVER_ROLES = {"engaged": "estimate", "failed": "limit", "landing": "limit", "settling": "limit"}
 
 
 @dataclass(frozen=True)
@@ -60,69 +57,71 @@ class Lane:
     name: str
     meaning: str
     spans: tuple[Span, ...] = ()
-    marks: tuple[str, Floats] = ("muted", _NONE)  # role of their colour, times [s]
+    marks: tuple[str, Array] = ("muted", _NO_TIMES)  # role of their colour, times [s]
 
 
-class _Timed(Protocol):
+class _TimedRecord(Protocol):
     @property
     def at_ns(self) -> int: ...
 
 
-def timeline(flight: FlightData) -> tuple[Drawing, Drawing, tuple[Mark, ...], str]:
+def draw_timeline(flight: FlightData) -> tuple[Drawing, Drawing, tuple[Mark, ...], str]:
     """Draw the lanes for a wide page and a narrow one; return both, a legend of bars, and what the lanes mean."""
-    rows = list(lanes(flight))
+    rows = list(make_lanes(flight))
     label = "Timeline of the flight: " + ", ".join(lane.name for lane in rows)
     drawings = []
     for key, width_in in (("timeline-wide", WIDE_IN), ("timeline-narrow", WIDTH_IN)):
-        with canvas(key, 0.55 + _LANE_IN * len(rows), width_in) as one:
-            ax = one.axes("", "time [s]", "", _LEFT_IN)
-            span(ax, flight)
+        with open_canvas(key, 0.55 + _LANE_IN * len(rows), width_in) as canvas:
+            ax = canvas.axes("", "time [s]", "", _LEFT_IN)
+            set_time_axis(ax, flight)
             for row, lane in enumerate(rows):
-                _draw_lane(ax, lane, row, _character_s(float(np.ptp(ax.get_xlim())), width_in))
+                _draw_lane(ax, lane, row, _compute_character_s(float(np.ptp(ax.get_xlim())), width_in))
             ax.set_ylim(len(rows) - 0.5, -0.5)
             ax.set_yticks(range(len(rows)), [lane.name for lane in rows])
             ax.tick_params(axis="y", length=0)
             ax.grid(visible=False, axis="y")
             ax.spines["left"].set_visible(False)  # it would cover marks of the first tick
-        drawings.append(Drawing(key, one.svg, label))
+        drawings.append(Drawing(key, canvas.svg, label))
     meanings = "; ".join(f"“{lane.name}”: {lane.meaning}" for lane in rows)
-    return drawings[0], drawings[1], tuple(_untold(rows, flight)), f"What a lane shows: {meanings}."
+    return drawings[0], drawings[1], tuple(_list_hidden_texts(rows, flight)), f"What a lane shows: {meanings}."
 
 
-def _silent(flight: FlightData) -> Iterator[Decision]:
+def _find_silent_steps(flight: FlightData) -> Iterator[Decision]:
     """Return the flown boundaries before which no position was taken since the one before."""
-    flown, came = {one.tick for one in flight.flown}, 0
+    flown_ticks, arrivals = {decision.tick for decision in flight.flown}, 0
     for decision in flight.decisions:
-        came += decision.accepted
+        arrivals += decision.accepted
         if decision.boundary:
-            if not came and decision.tick in flown:
+            if not arrivals and decision.tick in flown_ticks:
                 yield decision
-            came = 0
+            arrivals = 0
 
 
-def _untold(rows: list[Lane], flight: FlightData) -> Iterator[Mark]:
+def _list_hidden_texts(rows: list[Lane], flight: FlightData) -> Iterator[Mark]:
     """Return legend entries for bars that are too short for their text on the narrow page."""
     shown_s = max(flight.duration_s, flight.design.dt_s)
-    character_s = _character_s(shown_s, WIDTH_IN)
-    texts: dict[str, dict[str, None]] = {}
-    for one in (one for lane in rows for one in lane.spans):
-        if not _fits(one, character_s):
-            texts.setdefault(one.role, {})[one.text] = None
-    for role, told in texts.items():
-        yield Mark("band", role, " · ".join(told))
+    character_s = _compute_character_s(shown_s, WIDTH_IN)
+    texts_by_role: dict[str, dict[str, None]] = {}
+    for bar in (bar for lane in rows for bar in lane.spans):
+        if not _fits(bar, character_s):
+            texts_by_role.setdefault(bar.role, {})[bar.text] = None
+    for role, texts in texts_by_role.items():
+        yield Mark("band", role, " · ".join(texts))
 
 
-def lanes(flight: FlightData) -> Iterator[Lane]:
+def make_lanes(flight: FlightData) -> Iterator[Lane]:
     """Return the lanes that this flight has something for; each means one thing."""
     decisions = flight.decisions
     plans = flight.flown_plans.values()
-    yield Lane("controller", "what flew", tuple(_modes(flight)))
-    found = (
-        Lane("hand-over", "who is in charge", tuple(_hand_over(flight))),
-        Lane("vehicle", "its own mode", tuple(_vehicle(flight))),
-        _marks(flight, "no news", "lost", "a step without a new position", _silent(flight)),
-        _marks(flight, "refused", "fallback", "a position that was not believed", (d for d in decisions if d.rejected)),
-        _marks(
+    yield Lane("controller", "what flew", tuple(_list_mode_spans(flight)))
+    lanes = (
+        Lane("hand-over", "who is in charge", tuple(_list_hand_over_spans(flight))),
+        Lane("vehicle", "its own mode", tuple(_list_vehicle_spans(flight))),
+        _make_mark_lane(flight, "no news", "lost", "a step without a new position", _find_silent_steps(flight)),
+        _make_mark_lane(
+            flight, "refused", "fallback", "a position that was not believed", (d for d in decisions if d.rejected)
+        ),
+        _make_mark_lane(
             flight,
             "limited",
             "plan",
@@ -137,139 +136,96 @@ def lanes(flight: FlightData) -> Iterator[Lane]:
                 flight.seconds([p.base_ns for p in plans if max(p.slack, p.terminal_miss) > SLACK_TOLERANCE]),
             ),
         ),
-        _marks(
+        _make_mark_lane(
             flight,
             "no optimum",
             "limit",
             "a plan that was not found",
             (d for d in decisions if d.solve not in (None, SolveStatus.OPTIMAL)),
         ),
-        Lane("outside", "the state beyond a limit", marks=("limit", flight.steps.t_s[state_outside(flight)])),
-        Lane("input over", "an input beyond a limit", marks=("limit", flight.steps.t_s[input_outside(flight)])),
+        Lane("outside", "the state beyond a limit", marks=("limit", flight.steps.t_s[find_state_violations(flight)])),
+        Lane("input over", "an input beyond a limit", marks=("limit", flight.steps.t_s[find_input_violations(flight)])),
         *(
-            _marks(flight, name, role, f"{text} among the events", (e for e in flight.events if e.severity is severity))
-            for severity, name, role, text in _EVENTS
+            _make_mark_lane(
+                flight, name, role, f"{text} among the events", (e for e in flight.events if e.severity is severity)
+            )
+            for severity, name, role, text in _EVENT_LANES
         ),
-        Lane("orders", "an order of the operator", marks=("target", _orders(flight))),
+        Lane("orders", "an order of the operator", marks=("target", _list_order_times(flight))),
     )
-    for lane in found:
+    for lane in lanes:
         if lane.spans or len(lane.marks[1]):
             yield lane
 
 
-def _marks(flight: FlightData, name: str, role: str, meaning: str, records: Iterable[_Timed]) -> Lane:
-    return Lane(name, meaning, marks=(role, flight.seconds([one.at_ns for one in records])))
+def _make_mark_lane(flight: FlightData, name: str, role: str, meaning: str, records: Iterable[_TimedRecord]) -> Lane:
+    return Lane(name, meaning, marks=(role, flight.seconds([record.at_ns for record in records])))
 
 
-def _modes(flight: FlightData) -> Iterator[Span]:
+def _list_mode_spans(flight: FlightData) -> Iterator[Span]:
     changes = [next(group) for _, group in groupby(flight.decisions, key=lambda decision: decision.mode)]
     begins = flight.seconds([decision.at_ns for decision in changes]).tolist()
     for decision, (begun_s, ended_s) in zip(changes, pairwise([*begins, flight.duration_s]), strict=True):
-        yield Span(begun_s, ended_s, _MODES[decision.mode], decision.mode.value)
+        yield Span(begun_s, ended_s, _MODE_ROLES[decision.mode], decision.mode.value)
 
 
-def _hand_over(flight: FlightData) -> Iterator[Span]:
+def _list_hand_over_spans(flight: FlightData) -> Iterator[Span]:
     """Return the states of the hand-over, read from its events: "before -> after (mode, armed)"."""
-    told = [event for event in flight.events if event.code == "hand-over" and " -> " in event.text]
-    states = [event.text.split(" -> ", 1)[1].split(" (", 1)[0] for event in told]
-    begins = flight.seconds([event.at_ns for event in told]).tolist()
-    if told and begins[0] > 0.0:
-        states.insert(0, told[0].text.split(" -> ", 1)[0])
+    events = [event for event in flight.events if event.code == "hand-over" and " -> " in event.text]
+    states = [event.text.split(" -> ", 1)[1].split(" (", 1)[0] for event in events]
+    begins = flight.seconds([event.at_ns for event in events]).tolist()
+    if events and begins[0] > 0.0:
+        states.insert(0, events[0].text.split(" -> ", 1)[0])
         begins.insert(0, 0.0)
     for state, (begun_s, ended_s) in zip(states, pairwise([*begins, flight.duration_s]), strict=True):
-        yield Span(begun_s, ended_s, _HANDS.get(state, "grid"), state)
+        yield Span(begun_s, ended_s, _HAND_OVER_ROLES.get(state, "grid"), state)
 
 
-def _vehicle(flight: FlightData) -> Iterator[Span]:
+def _list_vehicle_spans(flight: FlightData) -> Iterator[Span]:
     """Return mode and arming of the vehicle, as its heartbeats said."""
-    told = [(one.at_ns, f"{one.mode}{'' if one.armed else ', disarmed'}", one) for one in flight.vehicles]
-    changes = [next(group) for _, group in groupby(told, key=lambda one: one[1])]
+    states = [
+        (heartbeat.at_ns, f"{heartbeat.mode}{'' if heartbeat.armed else ', disarmed'}", heartbeat)
+        for heartbeat in flight.vehicles
+    ]
+    changes = [next(group) for _, group in groupby(states, key=lambda row: row[1])]
     begins = flight.seconds([at_ns for at_ns, _, _ in changes]).tolist()
     for (_, text, status), (begun_s, ended_s) in zip(changes, pairwise([*begins, flight.duration_s]), strict=True):
         role = "grid" if not status.armed else "estimate" if status.external else "sample"
         yield Span(max(0.0, begun_s), ended_s, role, text)
 
 
-def _orders(flight: FlightData) -> Floats:
-    given = [one.at_ns for one in flight.step_inputs if one.commands]
-    return flight.seconds(given if flight.stopped_ns is None else [*given, flight.stopped_ns])
+def _list_order_times(flight: FlightData) -> Array:
+    order_times = [step.at_ns for step in flight.step_inputs if step.commands]
+    return flight.seconds(order_times if flight.stopped_ns is None else [*order_times, flight.stopped_ns])
 
 
-def _character_s(shown_s: float, width_in: float) -> float:
+def _compute_character_s(shown_s: float, width_in: float) -> float:
     """Return the width of a character of a bar's text, as time [s]."""
     return _INK_PER_CHARACTER_IN * shown_s / (width_in - 1.1)
 
 
-def _fits(one: Span, character_s: float) -> bool:
-    return (len(one.text) + 1) * character_s < one.ended_s - one.begun_s
+def _fits(bar: Span, character_s: float) -> bool:
+    return (len(bar.text) + 1) * character_s < bar.ended_s - bar.begun_s
 
 
 def _draw_lane(ax: Axes, lane: Lane, row: int, character_s: float) -> None:
-    for one in lane.spans:
+    for bar in lane.spans:
         ax.broken_barh(
-            [(one.begun_s, one.ended_s - one.begun_s)],
+            [(bar.begun_s, bar.ended_s - bar.begun_s)],
             (row - 0.32, 0.64),
-            color=colour(one.role),
-            alpha=0.9 if one.role == "grid" else 0.3,
+            color=colour(bar.role),
+            alpha=0.9 if bar.role == "grid" else 0.3,
             lw=0,
         )
-        if _fits(one, character_s):
-            ax.text(0.5 * (one.begun_s + one.ended_s), row, one.text, ha="center", va="center", fontsize=8.5)
+        if _fits(bar, character_s):
+            ax.text(0.5 * (bar.begun_s + bar.ended_s), row, bar.text, ha="center", va="center", fontsize=8.5)
     role, times_s = lane.marks
-    shown = _apart(times_s[times_s >= 0.0], float(np.ptp(ax.get_xlim())))
-    low, high = np.full(len(shown), row - 0.28), np.full(len(shown), row + 0.28)
-    strokes(ax, (shown, low), (shown, high), colour(role), 1.2)
+    mark_times = _thin_marks(times_s[times_s >= 0.0], float(np.ptp(ax.get_xlim())))
+    lower, upper = np.full(len(mark_times), row - 0.28), np.full(len(mark_times), row + 0.28)
+    draw_strokes(ax, (mark_times, lower), (mark_times, upper), colour(role), 1.2)
 
 
-def _apart(times_s: Floats, shown_s: float) -> Floats:
+def _thin_marks(times_s: Array, shown_s: float) -> Array:
     """Return times (n,) [s], of several too near to be told apart only the first."""
-    _, first = np.unique(np.floor(times_s / shown_s * MARKS), return_index=True)
+    _, first = np.unique(np.floor(times_s / shown_s * MAX_MARKS), return_index=True)
     return times_s[first]
-
-
-POINTS = 500  # of a path, evenly in time
-
-
-def script(flight: FlightData, at_s: float) -> str:
-    """Return the script of a flight's page, which shows the moment `at_s` [s] first."""
-    design = flight.design
-    estimates = trusted(flight)
-    believed_m = np.array([design.position_of(one.mean) for one in estimates]).reshape(-1, 3)
-    course_m = np.array([one.position_m for one in flight.truths]).reshape(-1, 3)
-    modes = [next(group) for _, group in groupby(flight.decisions, key=lambda one: one.mode)]
-    data = {
-        "end_s": round(flight.duration_s, 3),
-        "step_s": round(flight.tick_ns * 1e-9, 3) or 0.01,
-        "at_s": round(at_s, 3),
-        "views": {name: matrix.tolist() for name, (_, matrix) in VIEWS.items()},
-        "course": _rows(flight.seconds([one.at_ns for one in flight.truths]), course_m),
-        "believed": _rows(flight.seconds([one.at_ns for one in estimates]), believed_m),
-        "modes": [(round((one.at_ns - flight.origin_ns) * 1e-9, 3), one.mode) for one in modes],
-        "fences": _fences(flight),
-    }
-    text = json.dumps(data, separators=(",", ":")).replace("</", "<\\/")
-    return resources.files("logs.report").joinpath("cursor.js").read_text(encoding="utf-8").replace("DATA", text, 1)
-
-
-def _rows(t_s: Floats, position_m: Floats) -> list[list[float]]:
-    """Return rows of time [s] and place [m], thinned; those that are not finite are left out."""
-    kept = np.flatnonzero(np.isfinite(position_m).all(axis=1))
-    if len(kept) > POINTS:
-        kept = kept[np.unique(np.linspace(0, len(kept) - 1, POINTS).astype(int))]
-    table = np.column_stack([t_s[kept], position_m[kept]]).round(2)
-    return [[value + 0.0 for value in row] for row in table.tolist()]
-
-
-def _fences(flight: FlightData) -> list[dict[str, object]]:
-    """Return the limits of position that move, for each view in which they are a line."""
-    t_s = np.linspace(0.0, flight.duration_s, POINTS // 4)
-    design, found = flight.design, []
-    for view, (axes, _) in VIEWS.items():
-        for axis in set(axes) & set(design.axes):
-            for side in box_at(flight, t_s):
-                values = SEEN[axis][1] * side[:, design.position_index[design.axes.index(axis)]]
-                if np.isfinite(values).all() and np.ptp(values):
-                    places = np.zeros((len(t_s), 3))
-                    places[:, 0] = values
-                    found.append({"view": view, "along": axis == axes[1], "rows": _rows(t_s, places)})
-    return found

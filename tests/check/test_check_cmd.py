@@ -16,7 +16,7 @@ import pytest
 from loopback_rig import Memory
 from patience import LIMIT_S
 
-from logs.recording.info import info
+from logs.recording.info import read_info
 from logs.recording.parameters import ParameterReader
 from logs.recording.recorder import SyncRecorder
 from sim.simulation import Peers
@@ -270,7 +270,7 @@ def test_parameters_that_were_told_go_into_the_recording(autopilot: str, tmp_pat
     record_parameters(recorder, told, 7)
     recorder.close()
     held = bench.peers.autopilot.parameters
-    found = info(tmp_path / "flight.mcap").parameters
+    found = read_info(tmp_path / "flight.mcap").parameters
     assert len(found) > 5
     assert {name: one.value for name, one in found.items()} == pytest.approx({name: held[name] for name in found})
     assert found == told.parameters()

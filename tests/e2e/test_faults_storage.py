@@ -16,7 +16,7 @@ from places import ROOT
 from recording_fakes import Clock, Disk, Item, flight, own, record_flight, stored_byte
 
 from logs.recording.disk import DiskFile, OutputFile
-from logs.recording.info import info
+from logs.recording.info import read_info
 from logs.recording.reader import Damage, RecordedMessage, read, records, scan, segment_files
 from logs.recording.recorder import Recorder, SyncRecorder
 from logs.recording.recover import recover
@@ -121,7 +121,7 @@ def test_29_queue_is_bounded_while_the_disk_is_full(tmp_path: Path) -> None:
     got = own(list(read(path)))
     assert len(got) + final.dropped == len(items)
     assert got == [item for item in items if item in got]
-    assert list(records(path, RecorderNote))[-1].dropped == final.dropped == info(path).dropped
+    assert list(records(path, RecorderNote))[-1].dropped == final.dropped == read_info(path).dropped
 
 
 @pytest.mark.fault(29)
@@ -183,7 +183,7 @@ def test_30_slow_disk_never_holds_up_the_caller(tmp_path: Path) -> None:
     final = recorder.close(timeout_s=30.0)
     assert (final.waiting, final.dropped) == (0, 300)
     assert own(list(read(path))) == items[:101]
-    assert info(path).dropped == 300
+    assert read_info(path).dropped == 300
 
 
 @pytest.mark.slow

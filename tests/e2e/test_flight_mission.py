@@ -15,12 +15,12 @@ from report_rig import unwritten
 from told_numbers import numbers_in
 
 from logs.recording.replay import replay
-from logs.recording.summary import box_at, position_error_m, rows, summarise
+from logs.recording.summary import compute_box, compute_position_errors_m, list_summary_rows, summarise
 from logs.report.causes import HeadlineCause
-from logs.report.flight_page import report_html
-from logs.report.headline import headline
-from logs.report.summary_text import story
-from logs.report.verdicts import judge
+from logs.report.flight_page import render_report
+from logs.report.headline import derive_headline
+from logs.report.summary_text import describe_flight
+from logs.report.verdicts import judge_flight
 from uavctl.build.controller import build_design
 from uavctl.config import load_config
 from uavctl.config.load import dump_config
@@ -172,7 +172,7 @@ def test_a_fence_that_shuts_the_vehicle_out_gives_way_is_told_and_left() -> None
     assert memory.of(Plan)[-1].gave_way == ()
     assert memory.of(Truth)[-1].state[0] < -0.5
     data = flight(memory)
-    (sentence,) = [text for text in story(data, summarise(data, wall_s=1.0)) if "gave way" in text]
+    (sentence,) = [text for text in describe_flight(data, summarise(data, wall_s=1.0)) if "gave way" in text]
     assert "upper limit of north position" in sentence
 
 
@@ -183,29 +183,29 @@ def test_the_report_shows_the_target_of_the_moment_and_the_moving_limit() -> Non
     times_s, targets = data.targets
     assert len(times_s) == len(targets) == len({*times_s.tolist()})
     assert {tuple(target[[0, 3, 6]].tolist()) for target in targets} == set(PLACES_M)
-    html = report_html(data, summarise(data, wall_s=1.0))
-    (sentence,) = [text for text in story(data, summarise(data, wall_s=1.0)) if "set out" in text]
+    html = render_report(data, summarise(data, wall_s=1.0))
+    (sentence,) = [text for text in describe_flight(data, summarise(data, wall_s=1.0)) if "set out" in text]
     assert numbers_in(sentence)[::2] == [2.0, 3.0]  # waypoints, each with its time
     assert sentence.replace("&", "&amp;") in html
-    assert position_error_m(data)[-1] < 0.3
+    assert compute_position_errors_m(data)[-1] < 0.3
     fenced = flight(flown(22.0, *FENCE))
     begun_s = fenced.targets[0][0]
-    lower, upper = box_at(fenced, begun_s + np.array([0.0, 10.0, 100.0]))
+    lower, upper = compute_box(fenced, begun_s + np.array([0.0, 10.0, 100.0]))
     assert upper[:, 0].tolist() == pytest.approx([3.0, 1.95, 0.9])
     assert lower[:, 0].tolist() == [-3.0] * 3
-    assert report_html(fenced, summarise(fenced, wall_s=1.0)).startswith("<!DOCTYPE html>")
+    assert render_report(fenced, summarise(fenced, wall_s=1.0)).startswith("<!DOCTYPE html>")
     moving = flight(flown(22.0, *as_trajectory(20.0)))
     assert moving.moving_target and not data.moving_target
     summary = summarise(moving, wall_s=1.0)
-    assert report_html(moving, summary).startswith("<!DOCTYPE html>")
-    assert summary.trajectory and "Distance from trajectory" in dict(rows(summary))
-    assert "Distance from target" in dict(rows(summarise(data, wall_s=1.0)))
-    told = story(moving, summary)
+    assert render_report(moving, summary).startswith("<!DOCTYPE html>")
+    assert summary.trajectory and "Distance from trajectory" in dict(list_summary_rows(summary))
+    assert "Distance from target" in dict(list_summary_rows(summarise(data, wall_s=1.0)))
+    told = describe_flight(moving, summary)
     (sentence,) = [text for text in told if "follow a trajectory" in text]
     assert not any("from the target" in text or "waypoint" in text for text in told)
     # 40 chords of the circle, one a sample, of which each is cut into pieces of a step.
     length_m, begun_s, ended_s = numbers_in(sentence)
-    error_m = position_error_m(moving)
+    error_m = compute_position_errors_m(moving)
     assert length_m == pytest.approx(2 * 2 * np.pi * 0.9, rel=0.01)
     assert ended_s - begun_s == pytest.approx(20.0, abs=0.5)
     assert summary.course_rms_m is not None and summary.course_worst_m is not None
@@ -221,7 +221,10 @@ def test_a_step_beyond_a_fence_counts_as_outside_the_limits() -> None:
     beyond = fenced.steps.state[:, 0] - 1.0
     summary = summarise(fenced, wall_s=1.0)
     assert summary.state_violations == np.count_nonzero(beyond > 0) > 5
-    assert headline(fenced, summary, judge(fenced)).cause in (HeadlineCause.BEYOND_LIMIT, HeadlineCause.LEFT_LIMITS)
+    assert derive_headline(fenced, summary, judge_flight(fenced)).cause in (
+        HeadlineCause.BEYOND_LIMIT,
+        HeadlineCause.LEFT_LIMITS,
+    )
 
 
 def test_time_counts_from_the_first_decision_with_a_vehicle_that_takes_setpoints() -> None:

@@ -9,7 +9,7 @@ from loopback_rig import make_loop
 from sim_rig import decode
 from take_off_rig import Flight
 
-from logs.recording.parameters import ParameterReader, listed
+from logs.recording.parameters import ParameterReader, count_parameters
 from logs.recording.replay import replay
 from sim.autopilot.parameters import TABLES
 from uavctl.mavlink.handover_states import HandoverState
@@ -44,7 +44,7 @@ def test_a_lossy_link_loses_none(autopilot: str) -> None:
     flight.run(15.0)
     found = read(flight)
     assert TABLES[autopilot].keys() <= found.parameters().keys()
-    assert found.count == listed(found.parameters()) == len(TABLES[autopilot])
+    assert found.count == count_parameters(found.parameters()) == len(TABLES[autopilot])
     assert flight.sent("PARAM_REQUEST_READ")  # some were lost
     before = len(flight.sent("PARAM_REQUEST_LIST")), len(flight.sent("PARAM_REQUEST_READ"))
     flight.run(5.0)

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from view_rig import flown
 
-from logs.live import HOST, MOST_PAGES, FlightScene, LiveScene, live_page
-from logs.recording.design_view import design_view
+from logs.live import HOST, MOST_PAGES, FlightScene, LiveScene, serve_live_page
+from logs.recording.design_view import read_design
 from uavctl.config import parse
 from uavctl.errors import UsageError
 from uavctl.records import Decision, Estimate, Event, Header, Plan, Record, Truth
@@ -61,7 +61,7 @@ def test_it_shows_what_the_records_say() -> None:
         found = seen.scene()
         assert found is not None
         header, estimate, truth = newest[Header], newest.get(Estimate), newest.get(Truth)
-        design = design_view(header)
+        design = read_design(header)
         assert found.title == f"uavctl: {parse(header.config_toml, 'flight').config.name}"
         places = {body.name: body.at_m for body in found.bodies}
         assert found.time_s == pytest.approx((record.at_ns - header.started_ns) * 1e-9)
@@ -105,7 +105,7 @@ def test_newest_messages_come_first_and_old_ones_go() -> None:
 
 def test_a_browser_gets_the_page_its_script_and_one_state_after_another() -> None:
     count = iter(range(10**6))
-    with live_page(lambda: scene(next(count)), 0) as address:
+    with serve_live_page(lambda: scene(next(count)), 0) as address:
         port = port_of(address)
         with asked(port, "/") as page:
             text = page.read().decode()
@@ -121,7 +121,7 @@ def test_a_browser_gets_the_page_its_script_and_one_state_after_another() -> Non
 
 def test_a_foreign_site_s_page_gets_nothing() -> None:
     """By a name of its own that leads to this machine."""
-    with live_page(lambda: scene(0), 0) as address:
+    with serve_live_page(lambda: scene(0), 0) as address:
         for path in ("/", "/live.js", "/scenes"):
             with asked(port_of(address), path, Host=f"flights.example:{port_of(address)}") as answer:
                 assert answer.status == 403
@@ -131,7 +131,7 @@ def test_a_foreign_site_s_page_gets_nothing() -> None:
 
 
 def test_more_pages_than_there_are_seats_are_refused_and_a_seat_that_is_left_is_free() -> None:
-    with live_page(lambda: scene(0), 0) as address:
+    with serve_live_page(lambda: scene(0), 0) as address:
         port = port_of(address)
         held = [asked(port, "/scenes") for _ in range(MOST_PAGES)]
         for one in held:
@@ -155,7 +155,7 @@ def test_without_a_page_nothing_is_made_and_the_end_does_not_wait_for_a_page_tha
         made.append(threading.current_thread().name)
         return scene(0)
 
-    with live_page(look, 0) as address:
+    with serve_live_page(look, 0) as address:
         with asked(port_of(address), "/") as page:
             page.read()
         assert not made
@@ -175,7 +175,7 @@ def test_a_port_that_cannot_be_had_is_told() -> None:
         taken.bind((HOST, 0))
         taken.listen()
         port = taken.getsockname()[1]
-        with pytest.raises(UsageError, match=f"port {port} cannot be had"), live_page(lambda: None, port):
+        with pytest.raises(UsageError, match=f"port {port} cannot be had"), serve_live_page(lambda: None, port):
             pass
-    with pytest.raises(UsageError, match="ports are 1 to 65535"), live_page(lambda: None, 65_536):
+    with pytest.raises(UsageError, match="ports are 1 to 65535"), serve_live_page(lambda: None, 65_536):
         pass

@@ -305,7 +305,7 @@ def in_virtual_time(rig: Endings) -> Iterator[None]:
         patch.setattr("uavctl.cli.check.checked_before_arming", lambda *_: ())
         patch.setattr("uavctl.cli.fly.HealthMonitor", Watched)
         patch.setattr(Notifier, "send_status", lambda _, text: rig.notified.append(text))
-        patch.setattr(report, "_sections", lambda *given: [report._summary_section(*given)])  # no drawings
+        patch.setattr(report, "_make_sections", lambda *given: [report._make_summary_section(*given)])  # no drawings
         patch.setattr(Sync, "full", False)
         yield
 

@@ -12,11 +12,11 @@ from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from recording_fakes import HEADER, Clock, Item, flight, own
 
-from logs.recording.info import RecordingInfo, info
+from logs.recording.info import RecordingInfo, read_info
 from logs.recording.reader import RecordedMessage, header, read, scan
 from logs.recording.recorder import SyncRecorder
 from logs.recording.recover import recover
-from logs.recording.topics import definition
+from logs.recording.topics import get_definition
 from uavctl.config.types import LogConfig
 from uavctl.errors import RecordingError
 
@@ -39,7 +39,7 @@ class Flips:
         self._finished = finished
         self._items: list[Item] = [item for item in flight(15) if item[0] != "/uavctl/setpoint"]
         # A layout of many bytes that all are of one attachment would make most of the file.
-        with mock.patch("logs.recording.attachments.layout_text", lambda: '{"layout": 0}'):
+        with mock.patch("logs.recording.attachments.make_layout_text", lambda: '{"layout": 0}'):
             recorder = SyncRecorder(self._path, LogConfig(chunk_bytes=1024), clock=Clock())
             for item in self._items:
                 recorder.put(*item)
@@ -50,7 +50,7 @@ class Flips:
             self._path.write_bytes(self.data)
         offsets = [item.offset for item in scan(self._path) if isinstance(item, RecordedMessage)]
         self._most = max(Counter(offsets).values())  # messages in one chunk
-        self._info = info(self._path)
+        self._info = read_info(self._path)
         assert own(list(read(self._path))) == self._items and len(set(offsets)) > 3
 
     def flip(self, position: int, mask: int) -> None:
@@ -81,7 +81,7 @@ class Flips:
         """Header and info: the truth, or nothing, and damage is told."""
         with contextlib.suppress(RecordingError):
             assert header(self._path) == HEADER
-        found = info(self._path)
+        found = read_info(self._path)
         assert found.origin in (self._info.origin, None)
         assert found.start_ns >= self._info.start_ns and found.end_ns <= self._info.end_ns
         if self._finished:
@@ -129,6 +129,6 @@ def _check_parts(path: Path, entries: list[Item]) -> None:
     assert {summary.channels[key].topic: n for key, n in statistics.channel_message_counts.items()} == topics
     assert [(channel.topic, one.log_time) for _, channel, one in indexed] == [entry[:2] for entry in entries]
     for schema, channel, _ in indexed:
-        wanted = definition(channel.topic)
+        wanted = get_definition(channel.topic)
         assert channel.message_encoding == wanted.encoding
         assert (b"" if schema is None else schema.data) == wanted.schema

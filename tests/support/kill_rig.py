@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from recording_fakes import Item, flight, own
 
-from logs.recording.disk import segment_path
+from logs.recording.disk import make_segment_path
 from logs.recording.reader import read, segment_files
 from logs.recording.recorder import RECORDS as AT_ONCE
 from logs.recording.recorder import Recorder, SyncRecorder, WriteQueue
@@ -120,7 +120,7 @@ def _look(folder: Path, kind: str, put: int, taken: int, items: list[Item]) -> K
         elif _independent(out) != len(list(read(out))):
             wrong = "the format's own reader finds something else"
         for number in range(1, files):
-            with segment_path(path, number).open("rb") as file:
+            with make_segment_path(path, number).open("rb") as file:
                 if make_reader(file, validate_crcs=True).get_summary() is None:
                     wrong = f"file {number} is not closed"
     lost = [len(encode(record)) + MESSAGE_HEAD for _, _, record in items[kept:taken]]

@@ -15,7 +15,7 @@ from zstandard import ZstdDecompressor
 
 from logs.recording.disk import DiskFile, OutputFile
 from logs.recording.recorder import SyncRecorder
-from logs.recording.topics import condense
+from logs.recording.topics import round_plan
 from uavctl.config.types import LogConfig
 from uavctl.records import Datagram, Event, Header, Plan, Record, Setpoint, SetpointSource, Severity, raw_topic
 
@@ -35,7 +35,7 @@ Item = tuple[str, int, Record]
 
 def as_recorded(items: Sequence[Item]) -> list[Item]:
     """Return records as a recording gives them back: of a plan's matrices it has four digits."""
-    return [(topic, at_ns, condense(one) if isinstance(one, Plan) else one) for topic, at_ns, one in items]
+    return [(topic, at_ns, round_plan(one) if isinstance(one, Plan) else one) for topic, at_ns, one in items]
 
 
 def stored_byte(path: Path, needle: bytes) -> int:

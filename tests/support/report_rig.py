@@ -14,7 +14,7 @@ from synthetic_scene import Scene
 
 from logs.recording.flight import FlightData
 from logs.recording.summary import summarise
-from logs.report.flight_page import report_html
+from logs.report.flight_page import render_report
 from uavctl.records import Record
 
 VOID = {"meta", "br", "hr", "img", "link", "input"}
@@ -73,7 +73,7 @@ def data(scene: Scene, duration_s: float, keep: Callable[[Record], bool] = lambd
 
 
 def html_of(flight: FlightData) -> str:
-    return report_html(flight, summarise(flight, wall_s=1.0))
+    return render_report(flight, summarise(flight, wall_s=1.0))
 
 
 @contextmanager

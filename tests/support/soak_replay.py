@@ -17,10 +17,10 @@ from msgspec.structs import replace
 from signing_rig import KEY, OFFSET_NS
 
 from logs.recording.ends import put_header
-from logs.recording.info import info
+from logs.recording.info import read_info
 from logs.recording.recorder import DerivedTopics, SyncRecorder
 from logs.recording.replay import ReplayResult
-from logs.recording.views import Views
+from logs.recording.views import ViewBuilder
 from sim.simulation import Peers, World
 from uavctl.build.controller import Prepared
 from uavctl.cli.replay import replay_flight
@@ -196,7 +196,7 @@ def record(seed: int, path: Path) -> tuple[Drawn, Counter[str]]:
     """Fly a seed's flight into the new recording `path`."""
     plan = drawn(seed)
     config, prepared = plan.config, prepared_of(plan.config)
-    recorder = SyncRecorder(path, config.log, onlookers=DerivedTopics(Views()) if plan.viewers else None)
+    recorder = SyncRecorder(path, config.log, onlookers=DerivedTopics(ViewBuilder()) if plan.viewers else None)
     sink = _Seen(recorder)
     try:
         put_header(recorder, prepared, started_ns=plan.start_ns)
@@ -222,7 +222,7 @@ def replayed(seed: int, folder: Path) -> Replayed:
     """Fly a seed's flight into a recording, and replay it from the recording alone."""
     path = folder / f"{seed}" / "flight.mcap"
     plan, seen = record(seed, path)
-    found = info(path)
+    found = read_info(path)
     return Replayed(seed, path, plan.words, replay_flight(path).result, seen, len(found.files), found.duration_s)
 
 

@@ -12,7 +12,7 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from logs.recording.recorder import DerivedTopics, SyncRecorder
-from logs.recording.views import Views
+from logs.recording.views import ViewBuilder
 from uavctl.records import Decision, Timing
 
 SECONDS = 6.0
@@ -31,7 +31,7 @@ def flown() -> Memory:
 
 def record(path: Path) -> Path:
     """The flight's file."""
-    recorder = SyncRecorder(path, onlookers=DerivedTopics(Views()))
+    recorder = SyncRecorder(path, onlookers=DerivedTopics(ViewBuilder()))
     for entry in flown().entries:
         recorder.put(*entry)
     status = recorder.close()

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import msgspec
 import numpy as np
 
-from logs.recording.disk import spare_recording
-from logs.recording.ends import final, new_recording
-from logs.recording.export import read_table, table_names
+from logs.recording.disk import refuse_recording_path
+from logs.recording.ends import create_recording, describe_ending
+from logs.recording.export import list_tables, read_table
 from logs.recording.flight import FlightData
 from logs.recording.reader import header, lacks_end, records
 from logs.recording.reader import read as read_records
@@ -120,7 +120,7 @@ class Recording:
         from logs.report.flight_page import write_report
 
         page = self.path.with_suffix(".html") if out is None else Path(out)
-        spare_recording(page)
+        refuse_recording_path(page)
         write_report(self.data, msgspec.structs.replace(self.summary, report=str(page)), page)
         return page
 
@@ -141,7 +141,7 @@ def read(path: str | Path, *, torn: bool = False) -> Recording:
         raise RecordingError(
             f"{path}: {cut}; read(path, torn=True) reads it as far as it goes, `uavctl log recover` restores it"
         )
-    return Recording(path, table_names(path))
+    return Recording(path, list_tables(path))
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,7 +199,7 @@ def fly(
     engagement = Engagement(found, take_off_m=take_off_m, goto=goto is not None)
     check_places(found, design, take_off_m, engagement.goal)
     prepared = prepare(found, design)
-    with new_recording(None if out is None else Path(out), found.name, found.log.free_bytes) as path:
+    with create_recording(None if out is None else Path(out), found.name, found.log.free_bytes) as path:
         flight = LockstepFlight(prepared, path, command="uavctl.fly")
         engagement.begin(flight.loop)
         landing_s = None if take_off_m is None else compute_stop_limit_s(found, takes_off=True)
@@ -213,7 +213,7 @@ def fly(
     truth = tuple(records(path, Truth))
     return Flight(
         config=found,
-        ending=final(flight.loop.ending, status),
+        ending=describe_ending(flight.loop.ending, status),
         recording=read(path, torn=True),
         time_s=np.array([one.at_ns for one in truth]) * 1e-9,
         position_m=np.array([one.position_m for one in truth]).reshape(-1, 3),

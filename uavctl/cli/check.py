@@ -15,7 +15,7 @@ from cyclopts import Parameter
 from rich.console import Console, ConsoleOptions
 from rich.text import Text
 
-from logs.recording.parameters import ParameterReader, told_records
+from logs.recording.parameters import ParameterReader, make_parameter_records
 from logs.recording.topics import PARAMETER
 from uavctl.build.controller import Prepared, build_controller, design_of
 from uavctl.build.rehearsal import rehearse
@@ -150,7 +150,7 @@ def record_items(sink: Sink, items: Iterable[Item], at_ns: int) -> None:
 
 def record_parameters(sink: Sink, told: ParameterReader, at_ns: int) -> None:
     """Record the vehicle's parameters that a check has heard."""
-    for one in told_records(told.parameters(), at_ns, told.count):
+    for one in make_parameter_records(told.parameters(), at_ns, told.count):
         sink.put(PARAMETER, at_ns, one)
 
 

@@ -16,10 +16,10 @@ from typing import Annotated
 from cyclopts import Parameter
 from rich.text import Text
 
-from logs.recording.ends import final, new_recording, put_header
+from logs.recording.ends import create_recording, describe_ending, put_header
 from logs.recording.parameters import ParameterReader
 from logs.recording.recorder import Recorder, RecorderStatus
-from logs.recording.summary import FlightSummary, render
+from logs.recording.summary import FlightSummary, make_summary_table
 from logs.recording.topics import ENDED
 from uavctl.build.controller import design_of, prepare
 from uavctl.check.findings import Item
@@ -191,7 +191,7 @@ def fly(
         as_realtime_process=realtime,
         view_port=view_port,
     )
-    common.show("fly", summary, lambda: render(summary))
+    common.show("fly", summary, lambda: make_summary_table(summary))
     return summary.ending.exit_code
 
 
@@ -231,7 +231,7 @@ def fly_daemon(
         lock_vehicle(config.daemon.vehicle) as tenure,
         open_listener(find_control_folder(control), make_daemon_name(config)) as listener,
         onlookers(view_port) as looking,
-        new_recording(out, config.name, config.log.free_bytes) as path,
+        create_recording(out, config.name, config.log.free_bytes) as path,
     ):
         with located(loaded):
             design = design_of(config)
@@ -292,5 +292,5 @@ def fly_daemon(
                 ending = loop.ending
                 recorder.put(ENDED, monotonic_ns(), ending)
                 status = recorder.close()
-                tell_ending(final(ending, status))
+                tell_ending(describe_ending(ending, status))
     return conclude(path, time.perf_counter() - begun, status, ending)

@@ -21,12 +21,12 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TimeElapsedColumn
 from rich.text import Text
 
-from logs.recording.ends import final, lacks
+from logs.recording.ends import count_missing_records, describe_ending
 from logs.recording.flight import FlightData
 from logs.recording.reader import read
 from logs.recording.recorder import DerivedTopics, RecorderStatus, live_view
 from logs.recording.summary import FlightSummary, summarise
-from logs.recording.views import Views
+from logs.recording.views import ViewBuilder
 from uavctl.cli.common import FREE_PORT, labelled, messages
 from uavctl.daemon.engagement import make_goto_keys
 from uavctl.errors import ConnectionClosedError, EndedBySignal, RecordingError, UavctlError, UsageError, in_words
@@ -202,22 +202,22 @@ def onlookers(live_port: int | None = None) -> Iterator[DerivedTopics]:
         UsageError: there can be no live page, or no live view.
     """
     if live_port is None:
-        yield DerivedTopics(Views())
+        yield DerivedTopics(ViewBuilder())
         return
-    from logs.live import FlightScene, live_page  # nobody looks: nothing of it is loaded
+    from logs.live import FlightScene, serve_live_page  # nobody looks: nothing of it is loaded
 
     def tell(port: int) -> None:
         messages().print(f'for Foxglove: ws://localhost:{port} ("Open connection")', soft_wrap=True)
 
     flight, has_sdk = FlightScene(), find_spec("foxglove") is not None
     with (
-        live_page(flight.scene, live_port and live_port + 1) as address,
+        serve_live_page(flight.scene, live_port and live_port + 1) as address,
         live_view(live_port if has_sdk else None, on_open=tell) as watch,
     ):
         messages().print(f"live page: {address}", soft_wrap=True)
         if not has_sdk:
             messages().print("nothing for Foxglove: that takes pip install 'uavctl[live]'", soft_wrap=True)
-        yield DerivedTopics(Views(), watch, flight.see)
+        yield DerivedTopics(ViewBuilder(), watch, flight.see)
 
 
 def conclude(path: Path, wall_s: float, status: RecorderStatus, ending: Ending | None = None) -> FlightSummary:
@@ -241,8 +241,8 @@ def conclude(path: Path, wall_s: float, status: RecorderStatus, ending: Ending |
         wall_s=wall_s,
         recording=str(path),
         report=str(page),
-        recorder_dropped=0 if status.ok else lacks(status),
-        ending=None if ending is None else final(ending, status),
+        recorder_dropped=0 if status.ok else count_missing_records(status),
+        ending=None if ending is None else describe_ending(ending, status),
     )
     try:
         draw_page(path, summary, page)
@@ -432,7 +432,7 @@ def tell_losses(status: RecorderStatus) -> None:
         messages().print(
             labelled(
                 "warning",
-                f"the recording lacks {lacks(status)} records "
+                f"the recording lacks {count_missing_records(status)} records "
                 f"({status.reason or status.refusal or 'the disk was too slow'}); what is in it is whole. "
                 f"Files: {', '.join(status.segments) or 'none'}",
                 "bold red",

@@ -14,9 +14,9 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from logs.recording.disk import FileKind, kind_of, spare_recording, write_whole
+from logs.recording.disk import FileKind, detect_kind, refuse_recording_path, write_atomically
 from logs.recording.reader import header, lacks_end, read
-from logs.recording.senders import choose_vehicle, system_of
+from logs.recording.senders import choose_vehicle, get_system_id
 from logs.recording.tlog import read_tlog
 from uavctl.build.controller import design_of
 from uavctl.cli.common import DEFAULTS, Common, System, bars, can_be_read, warn
@@ -45,15 +45,15 @@ def identify_command(
     target = out if out is not None else flight.with_name("identified.toml")
     if target == flight:
         raise UsageError(f"{target}: is the recording itself, which would be lost; choose another place with --out")
-    spare_recording(target)
+    refuse_recording_path(target)
     with fitting(fits_of(history, config)) as advance:
         found = identify(history, config, advance)
     doubts = (*found.result.warnings, *design_doubts(found.config))
     result = msgspec.structs.replace(found.result, warnings=doubts)
     found = dataclasses.replace(found, result=result)
     page = target.with_suffix(".html")
-    write_whole(target, dump_config(found.config))
-    write_whole(page, write_page(found, history.seen, str(flight)))
+    write_atomically(target, dump_config(found.config))
+    write_atomically(page, write_page(found, history.seen, str(flight)))
     document = {**msgspec.to_builtins(result), "config": str(target), "report": str(page)}
     common.show("identify", document, lambda: _picture(found, target, page))
     return 0
@@ -61,7 +61,7 @@ def identify_command(
 
 def _history(flight: Path, common: Common, system: int | None) -> tuple[FlightHistory, Config]:
     """Return the flight, and the configuration that its result goes into."""
-    if kind_of(flight) is FileKind.TLOG:
+    if detect_kind(flight) is FileKind.TLOG:
         config = common.load().config
         recorded = read_tlog(flight)
         for note in recorded.notes:
@@ -75,7 +75,7 @@ def _history(flight: Path, common: Common, system: int | None) -> tuple[FlightHi
             config.daemon, vehicle="tlog", mocap="tlog", vehicle_system_id=chosen.system or 0
         )
         read_as = msgspec.structs.replace(config, daemon=one_link)
-        return from_tlog([one for one in recorded.packets if system_of(one.data) not in others], read_as), config
+        return from_tlog([one for one in recorded.packets if get_system_id(one.data) not in others], read_as), config
     if system is not None:
         raise UsageError("--system is for a .tlog: a recording of ours is of one vehicle")
     if common.overrides or common.config != DEFAULTS.config:

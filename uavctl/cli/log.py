@@ -14,14 +14,14 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from logs.recording.attachments import layout_text
-from logs.recording.disk import FileKind, kind_of
+from logs.recording.attachments import make_layout_text
+from logs.recording.disk import FileKind, detect_kind
 from logs.recording.export import Exported, TableFormat, Watch, export_tables
-from logs.recording.foreign import foreign_flight
+from logs.recording.foreign import read_foreign_flight
 from logs.recording.info import PositionLoss, RecordingInfo
-from logs.recording.info import info as recording_info
+from logs.recording.info import read_info as recording_info
 from logs.recording.mavlink_flight import MavlinkFlightInfo, facts_of, rate_of
-from logs.recording.parameters import VehicleParameter, listed
+from logs.recording.parameters import VehicleParameter, count_parameters
 from logs.recording.reader import RecordedMessage, lacks_end
 from logs.recording.recover import RecoverResult
 from logs.recording.recover import recover as restore
@@ -168,7 +168,7 @@ def _lines(found: RecordingInfo) -> Iterator[str]:
 def _parameters(told: Mapping[str, VehicleParameter], count: int | None) -> Iterator[str]:
     some = ", ".join(f"{name} {one.value}" for name, one in [*told.items()][:_SOME_PARAMETERS])
     more = "" if len(told) <= _SOME_PARAMETERS else " ...; --json has all"
-    found = listed(told)
+    found = count_parameters(told)
     lacks = "" if count is None or found >= count else f"; INCOMPLETE: {found} of the {count} that it says it has"
     yield f"vehicle parameters: {len(told)} ({some}{more}){lacks}"
 
@@ -239,14 +239,14 @@ def info(flight: Flight, /, *, system: System = None, json: Json = False) -> int
     """Say what a recording, a .tlog or a ULog holds: the page's first line, topics, rates, gaps, losses, its making."""
     from logs.report import headline, tlog_headline  # not for the other commands: it takes SciPy
 
-    if kind_of(flight) is not FileKind.MCAP or system is not None:
-        foreign = foreign_flight(flight, system)
+    if detect_kind(flight) is not FileKind.MCAP or system is not None:
+        foreign = read_foreign_flight(flight, system)
         assert foreign is not None  # only one of ours is none, of which there is no system
-        told, main = foreign.info, tlog_headline.headline_of(foreign)
+        told, main = foreign.info, tlog_headline.derive_tlog_headline(foreign)
         name = FileKind.ULOG if is_ulog(flight) else FileKind.TLOG
         Common(json=json).show(f"log/info-{name}", _with(main, told), lambda: Group(first_line(main), _tlog_info(told)))
         return 0
-    found, ours = recording_info(flight), headline.headline_in(flight)
+    found, ours = recording_info(flight), headline.derive_headline_of_file(flight)
     line = () if ours is None else (first_line(ours),)
     Common(json=json).show("log/info", _with(ours, found), lambda: Group(*line, info_table(found)))
     return 0
@@ -268,7 +268,7 @@ def recover(flight: Flight, out: Annotated[Path, Parameter(help="file to write")
 @log_app.command(help_epilogue=example("log layout"))
 def layout() -> int:
     """Print the layout for Foxglove: `uavctl log layout > uavctl.json`, there "Import from file"."""
-    sys.stdout.write(layout_text())
+    sys.stdout.write(make_layout_text())
     return 0
 
 

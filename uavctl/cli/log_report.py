@@ -11,32 +11,31 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from logs.recording.disk import FileKind, spare_recording, write_whole
+from logs.recording.disk import FileKind, refuse_recording_path, write_atomically
 from logs.recording.flight import FlightData
-from logs.recording.foreign import foreign_flight
+from logs.recording.foreign import read_foreign_flight
 from logs.recording.mavlink_flight import MavlinkFlight, facts_of
 from logs.recording.reader import lacks_end, read
-from logs.recording.summary import names_and_values, render, summarise
+from logs.recording.summary import make_summary_table, make_value_table, summarise
 from logs.recording.ulog import is_ulog
 from logs.report.causes import Headline
-from logs.report.compare import (
-    ComparedFlight,
-    FlightComparison,
-    compare,
-    difference,
-    for_people,
-    label,
-    likeness,
-    load_all,
-    measured,
-    parameter,
-    write_page,
+from logs.report.compare import ComparedFlight, FlightComparison, compare_flights, load_flights
+from logs.report.compare_page import write_comparison_page
+from logs.report.compare_text import (
+    convert_to_display_unit,
+    describe_match,
+    format_difference,
+    format_label,
+    format_parameter,
+    format_value,
 )
-from logs.report.figures import picture
-from logs.report.flight_page import verdict_rows, write_report
-from logs.report.headline import headline
-from logs.report.tlog_page import headline_of, write_tlog_page
-from logs.report.verdicts import judge
+from logs.report.figures import draw_overview
+from logs.report.flight_page import write_report
+from logs.report.headline import derive_headline
+from logs.report.tlog_headline import derive_tlog_headline
+from logs.report.tlog_page import write_tlog_page
+from logs.report.verdict_sections import make_verdict_rows
+from logs.report.verdicts import judge_flight
 from uavctl.cli.common import (
     Column,
     Common,
@@ -68,11 +67,11 @@ def compare_command(
     with bars() as progress:
         paths = (first, second, *more)
         task = progress.add_task("reading", total=len(paths))
-        loaded = load_all(paths, lambda: progress.advance(task))
+        loaded = load_flights(paths, lambda: progress.advance(task))
         progress.update(task, description="comparing")
-        found = compare(loaded)
+        found = compare_flights(loaded)
     if out is not None:
-        write_page(found, loaded, out)
+        write_comparison_page(found, loaded, out)
     Common(json=json).show("log/compare", found, lambda: comparison_picture(found))
     return 0
 
@@ -80,7 +79,7 @@ def compare_command(
 def comparison_picture(found: FlightComparison) -> RenderableType:
     """Return the comparison for a terminal: flights, how far they agree, parameters, figures, notes."""
     parts: list[RenderableType] = [_sides(found.recordings)]
-    parts += [Text(text) for text in map(likeness, found.likenesses)]
+    parts += [Text(text) for text in map(describe_match, found.likenesses)]
     parts.append(_parameters(found) if found.parameters else Text("No parameter differs."))
     parts.append(_figures(found))
     parts += [Text(f"Mind: {text}.", style="yellow") for text in found.notes]
@@ -92,29 +91,29 @@ def _sides(sides: tuple[ComparedFlight, ...]) -> RenderableType:
         state = "" if one.finished else ", torn"
         return f"{one.recording}\nconfig {one.config}, seed {one.seed}, {one.started_utc}; {one.ended}{state}"
 
-    return names_and_values((one.name, told(one)) for one in sides)
+    return make_value_table((one.name, told(one)) for one in sides)
 
 
 def _parameters(found: FlightComparison) -> Table:
     headings = ("", *(one.name for one in found.recordings))
-    rows = ((Text(one.key), *(Text(parameter(value)) for value in one.values)) for one in found.parameters)
+    rows = ((Text(one.key), *(Text(format_parameter(value)) for value in one.values)) for one in found.parameters)
     return columns("Parameters that differ", headings, rows, headings, fold=True)
 
 
 def _figures(found: FlightComparison) -> WideTable:
-    rows = list(map(for_people, found.figures))
+    rows = list(map(convert_to_display_unit, found.figures))
     first, *others = (one.name for one in found.recordings)
-    groups = [[Column(first, [measured(row.values[0]) for row in rows])]]
+    groups = [[Column(first, [format_value(row.values[0]) for row in rows])]]
     for place, name in enumerate(others):
         groups.append(
             [
-                Column(name, [measured(row.values[place + 1]) for row in rows]),
-                Column(f"{name} − {first}", [difference(row.differences[place]) for row in rows]),
-                Column(f"{name} / {first}", [measured(row.ratios[place]) for row in rows]),
+                Column(name, [format_value(row.values[place + 1]) for row in rows]),
+                Column(f"{name} − {first}", [format_difference(row.differences[place]) for row in rows]),
+                Column(f"{name} / {first}", [format_value(row.ratios[place]) for row in rows]),
             ]
         )
     ends = frozenset(place for place in range(len(rows) - 1) if rows[place].group != rows[place + 1].group)
-    return WideTable(Column("figure", list(map(label, rows)), "left"), groups, ends)
+    return WideTable(Column("figure", list(map(format_label, rows)), "left"), groups, ends)
 
 
 # `uavctl log report`: the page of a recording, ours, a `.tlog` of any ground station, or a ULog of PX4.
@@ -132,28 +131,30 @@ def report(
     """Write the page of a recording, of a .tlog, or of a ULog of PX4: one HTML file that needs nothing else."""
     page = out if out is not None else flight.with_suffix(".html")
     for target in (page, *(() if svg is None else (svg,))):
-        spare_recording(target)
-    foreign = foreign_flight(flight, system)
+        refuse_recording_path(target)
+    foreign = read_foreign_flight(flight, system)
     if foreign is not None:
         return _report_foreign(flight, foreign, page, svg, Common(json=json))
     data = FlightData.from_records(read(flight), flight)
     dropped = max((note.dropped for note in data.notes), default=0)
     summary = summarise(data, wall_s=None, recording=str(flight), report=str(page), recorder_dropped=dropped)
-    judged = judge(data)
+    judged = judge_flight(data)
     if svg is not None:
-        write_whole(svg, picture(data))
+        write_atomically(svg, draw_overview(data))
     write_report(data, summary, page, judged)
     if cut := lacks_end(flight):
         warn(f"{cut}: shown up to there")
-    main = headline(data, summary, judged)
+    main = derive_headline(data, summary, judged)
     document = {**msgspec.structs.asdict(summary), "verdicts": judged.verdicts, "headline": main.document()}
-    Common(json=json).show("log/report", document, lambda: _told(main, render(summary, verdict_rows(judged.verdicts))))
+    Common(json=json).show(
+        "log/report", document, lambda: _told(main, make_summary_table(summary, make_verdict_rows(judged.verdicts)))
+    )
     return 0
 
 
 def _told(main: Headline, summary: RenderableType) -> Group:
     """Return what a terminal shows: the page's first line and why, then the figures."""
-    return Group(first_line(main), *(Text(f"  {sentence}") for sentence in main.why), summary)
+    return Group(first_line(main), *(Text(f"  {sentence}") for sentence in main.reasons), summary)
 
 
 def _report_foreign(flight: Path, found: MavlinkFlight, out: Path, svg: Path | None, common: Common) -> int:
@@ -162,7 +163,7 @@ def _report_foreign(flight: Path, found: MavlinkFlight, out: Path, svg: Path | N
     write_tlog_page(found, out)
     for note in found.info.notes:
         warn(note)
-    main = headline_of(found)
+    main = derive_tlog_headline(found)
     document = {**msgspec.to_builtins(found.info), "report": str(out), "headline": main.document()}
     kind = FileKind.ULOG if is_ulog(flight) else FileKind.TLOG
     facts: list[tuple[str, object]] = [*facts_of(found.info), ("page", str(out))]

@@ -16,9 +16,9 @@ import msgspec
 from cyclopts import Parameter
 from rich.progress import TaskProgressColumn, TimeRemainingColumn
 
-from logs.recording.ends import final, new_recording, put_header
+from logs.recording.ends import create_recording, describe_ending, put_header
 from logs.recording.recorder import DerivedTopics, Recorder
-from logs.recording.summary import FlightSummary, render
+from logs.recording.summary import FlightSummary, make_summary_table
 from logs.recording.topics import ENDED
 from sim.server import Ready, serve_in_child
 from uavctl.build.controller import Prepared, design_of, prepare
@@ -86,7 +86,7 @@ def loopback(
         out=out,
         view_port=view_port,
     )
-    common.show("loopback", summary, lambda: render(summary))
+    common.show("loopback", summary, lambda: make_summary_table(summary))
     return summary.ending.exit_code
 
 
@@ -119,7 +119,7 @@ def fly_simulated(
     with located(loaded):
         design = design_of(config)
     engagement = Engagement(config, take_off_m=take_off_m, goto=goto, follower=follower)
-    with onlookers(view_port) as looking, new_recording(out, config.name, config.log.free_bytes) as path:
+    with onlookers(view_port) as looking, create_recording(out, config.name, config.log.free_bytes) as path:
         with located(loaded):
             check_places(config, design, take_off_m, engagement.goal)
             prepared = prepare(config, design)
@@ -147,7 +147,7 @@ def lockstep(prepared: Prepared, path: Path, engagement: Engagement) -> FlightSu
             flight.fly(show, follower=engagement, landing_s=landing_s)
     finally:
         status = flight.close()
-        tell_ending(final(flight.loop.ending, status))
+        tell_ending(describe_ending(flight.loop.ending, status))
     return conclude(path, flight.wall_s, status, flight.loop.ending)
 
 
@@ -190,7 +190,7 @@ def _real_time(prepared: Prepared, path: Path, engagement: Engagement, looking: 
         finally:
             recorder.put(ENDED, monotonic_ns(), loop.ending)
             status = recorder.close()
-            tell_ending(final(loop.ending, status))
+            tell_ending(describe_ending(loop.ending, status))
     return conclude(path, wall_s, status, loop.ending)
 
 

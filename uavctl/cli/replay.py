@@ -13,7 +13,7 @@ from cyclopts import Parameter
 from rich.console import Group, RenderableType
 from rich.table import Table
 
-from logs.recording.foreign import foreign_log
+from logs.recording.foreign import read_foreign_packets
 from logs.recording.reader import good_messages, header, lacks_end, last_note, records
 from logs.recording.replay import LAST_BITS, MAKERS, Chosen, Context, FieldDivergence, ReplayDifference, ReplayResult
 from logs.recording.replay import replay as replay_recording
@@ -153,7 +153,7 @@ def foreign_packets(flight: Path, topics: Sequence[str], system: int | None = No
         RecordingError: It cannot be read, or holds no MAVLink.
         UsageError: It has no such topic, or nothing of that system.
     """
-    log = foreign_log(flight, topics)
+    log = read_foreign_packets(flight, topics)
     if log is None:
         return None
     vehicle = choose_vehicle(log.packets, str(flight), system)

@@ -176,7 +176,7 @@ def watching(console: Console, config: Config) -> Iterator[Callable[[tuple[Vehic
     The same is on a page for browsers on this machine. A thread of its own draws, so whoever tells never waits, not
     even for a terminal that has stopped.
     """
-    from logs.live import live_page  # nobody looks: nothing of it is loaded
+    from logs.live import serve_live_page  # nobody looks: nothing of it is loaded
 
     latest: list[tuple[VehicleSnapshot, ...]] = []
     done = threading.Event()
@@ -187,7 +187,7 @@ def watching(console: Console, config: Config) -> Iterator[Callable[[tuple[Vehic
     draw = _draw if console.is_terminal else _write
     if not console.is_terminal:
         console.print("--view: no terminal to draw in, so a line a second", soft_wrap=True)
-    with live_page(lambda: scene_of(latest[0], config) if latest else None, 0) as address:
+    with serve_live_page(lambda: scene_of(latest[0], config) if latest else None, 0) as address:
         thread = threading.Thread(target=draw, args=(console, address, latest, done), name="view", daemon=True)
         thread.start()
         try:

@@ -17,7 +17,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from logs.recording.disk import write_whole
+from logs.recording.disk import write_atomically
 from logs.recording.flight import FlightData
 from logs.recording.reader import header, lacks_end, read
 from logs.recording.summary import FlightSummary, summarise
@@ -456,13 +456,13 @@ class _TuneRun:
             found = identify(history, self._config, advance)
         result = tuned(self._config, found)
         doubts = design_doubts(result.config)
-        write_whole(self.folder.path / FIT_PAGE, write_fit_page(found, history.seen, str(recording)))
+        write_atomically(self.folder.path / FIT_PAGE, write_fit_page(found, history.seen, str(recording)))
         told = msgspec.structs.replace(result.result, warnings=(*result.result.warnings, *doubts))
         messages().print(changes_picture(told))
         if doubts:
             raise RecordingError(f"{doubts[0]}. Nothing is written")
         lines = [f"# {one}" for one in _written(told)]
-        write_whole(self.folder.path / TUNED, "\n".join([*lines, dump_config(result.config)]))
+        write_atomically(self.folder.path / TUNED, "\n".join([*lines, dump_config(result.config)]))
         self.folder.note(tuned=told)
         messages().print(f"written: {self.folder.path / TUNED}", soft_wrap=True)
         return 0, ""
@@ -499,7 +499,7 @@ class _TuneRun:
         found = TuneComparison(before=before, after=after, old_errors=old, new_errors=new)
         self.folder.note(comparison=found)
         progress = self.folder.progress
-        write_whole(self.folder.path / PAGE, write_page(progress, flights[0], flights[1], self._made.box))
+        write_atomically(self.folder.path / PAGE, write_page(progress, flights[0], flights[1], self._made.box))
         return 0, ""
 
     def _errors(self, recording: Path) -> tuple[PredictionErrors, PredictionErrors]:

@@ -16,16 +16,16 @@ from rich.console import Group, RenderableType
 from rich.progress import Progress, TaskProgressColumn, TimeElapsedColumn
 from rich.text import Text
 
-from logs.recording.disk import FileKind, kind_of, write_whole
-from logs.recording.ends import new_recording, put_header
-from logs.recording.export import known_number
+from logs.recording.disk import FileKind, detect_kind, write_atomically
+from logs.recording.ends import create_recording, put_header
+from logs.recording.export import count_messages
 from logs.recording.flight import FlightData
 from logs.recording.foreign import is_foreign
 from logs.recording.reader import header, lacks_end, read
 from logs.recording.recorder import DerivedTopics, RecorderStatus, SyncRecorder
 from logs.recording.summary import count, summarise
 from logs.recording.topics import HEADER, RecorderNote
-from logs.recording.views import Views
+from logs.recording.views import ViewBuilder
 from uavctl.build.controller import Prepared, build_problem, design_of, prepare
 from uavctl.cli.common import SEED, Common, Flight, Json, bars, columns, located, warn
 from uavctl.cli.flying import conclude
@@ -208,7 +208,7 @@ def whatif(
     json: Json = False,
 ) -> int:
     """Fly a recorded flight again with something changed, in the same disturbance, and compare."""
-    if (kind_of(flight) is FileKind.TLOG and flight.exists()) or is_foreign(flight):
+    if (detect_kind(flight) is FileKind.TLOG and flight.exists()) or is_foreign(flight):
         raise UsageError(
             f"{flight} is another program's recording: it does not tell what was decided; `uavctl log replay` and "
             "`uavctl identify` read it"
@@ -225,7 +225,7 @@ def whatif(
     on = changed(before, recorded.config_toml, flight, config, (*overrides, *keys)).config.link
     plant, source = plant_of(model, before)
     with _progress() as progress:
-        entries = progress.track(read(flight), total=known_number(flight), description="reading")
+        entries = progress.track(read(flight), total=count_messages(flight), description="reading")
         history = history_of(entries, before, str(flight))
     response = response_of(history, plant)
     _warn(flight, recorded, history)
@@ -244,7 +244,7 @@ def whatif(
         noise_m = before.sim.camera.noise_std_m if history.flight.truths else before.estimator.position_std_m
         other = Relinked(history, on, before.sim.seed if seed is None else seed, noise_m)
     begun = time.perf_counter()
-    with new_recording(out, loaded.config.name, before.log.free_bytes) as path, _progress() as progress:
+    with create_recording(out, loaded.config.name, before.log.free_bytes) as path, _progress() as progress:
         again = _reproduced(history, was, response, _watch(progress, "reproducing the flight"))
         course, status = _recorded(
             history, now, response, other, path, recorded, _watch(progress, "flying it otherwise")
@@ -279,7 +279,7 @@ def whatif(
             report=str(path.with_suffix(".html")),
             page=str(path.with_name("what-if.html")),
         )
-        write_whole(Path(result.page), write_page(result, sides[0], sides[2]))
+        write_atomically(Path(result.page), write_page(result, sides[0], sides[2]))
     Common(json=json).show("log/whatif", result, lambda: _picture(result))
     return 0 if result.what_if.steps else 1
 
@@ -354,7 +354,7 @@ def _recorded(
     watch: Watch,
 ) -> tuple[FlownCourse, RecorderStatus]:
     """Fly what was changed, and record it; remove an incomplete recording, which would look like a shorter flight."""
-    recorder = SyncRecorder(path, now.config.log, onlookers=DerivedTopics(Views()))
+    recorder = SyncRecorder(path, now.config.log, onlookers=DerivedTopics(ViewBuilder()))
     try:
         put_header(recorder, now, recorded.started_ns, recorded.zero_utc_ns)
         course = fly(history, now.config, now.controller, response, recorder, time.perf_counter_ns, other, watch)

@@ -10,7 +10,7 @@ from typing import Protocol
 from logs.recording.ends import put_header
 from logs.recording.recorder import DerivedTopics, RecorderStatus, SyncRecorder
 from logs.recording.topics import ENDED
-from logs.recording.views import Views
+from logs.recording.views import ViewBuilder
 from sim.simulation import World
 from uavctl.build.controller import Prepared
 from uavctl.config.types import Config
@@ -79,7 +79,7 @@ class LockstepFlight:
 
     def __init__(self, prepared: Prepared, path: Path, command: str | None = None) -> None:
         self._prepared, self._command = prepared, command
-        self._recorder = SyncRecorder(path, prepared.config.log, onlookers=DerivedTopics(Views()))
+        self._recorder = SyncRecorder(path, prepared.config.log, onlookers=DerivedTopics(ViewBuilder()))
         self.loop = ControlLoop(prepared.config, prepared.controller, self._recorder, time.perf_counter_ns)
         self._at_ns = 0
         self.wall_s = 0.0

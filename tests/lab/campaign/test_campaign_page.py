@@ -14,8 +14,8 @@ from campaign_results import cell, runs, write
 from report_rig import unwritten
 from told_numbers import numbers_in
 
-from logs.report.page import legend
-from logs.report.statistics import PairedDifference
+from logs.report.page import render_legend
+from logs.report.run_statistics import PairedDifference
 from uavctl.errors import UavctlError
 from uavctl.lab.campaign.page import CampaignView, story, write_report
 from uavctl.lab.campaign.plots import Looks
@@ -271,6 +271,6 @@ def test_a_legend_has_the_markers_of_its_figure() -> None:
     looks = Looks(tuple(f"controller {place}" for place in range(12)))
     entries = list(looks.entries(looks.controllers))
     assert len({(one.role, one.path, one.full) for one in entries}) == 12
-    drawn = re.findall(r"<li>.*?</li>", legend(entries))
+    drawn = re.findall(r"<li>.*?</li>", render_legend(entries))
     assert len({re.sub(r"controller \d+", "", one) for one in drawn}) == 12
     assert all(f"var(--{one.role})" in text and one.path in text for one, text in zip(entries, drawn, strict=True))

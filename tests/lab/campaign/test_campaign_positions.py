@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import binom
 
-from logs.report.statistics import worst_step
+from logs.report.run_statistics import max_step_rate
 from uavctl.build.controller import build_estimator, build_plant, build_problem
 from uavctl.config import Config, load_config
 from uavctl.flight.estimator import absorb_samples, begin_history, estimate_at, note_input
@@ -178,7 +178,7 @@ def test_the_promise_is_kept_on_positions_alone_and_only_with_the_filter_s_covar
     found = rows(cell(tmp_path, 'measured = "position"\n'))
     assert not any(found["error"])
     hits = np.asarray(found["outside"], dtype=np.int64).sum(axis=0)
-    worst, (low, _) = worst_step(hits, 400, 40)
+    worst, (low, _) = max_step_rate(hits, 400, 40)
     assert low <= 0.05 and worst > 0.01
     assert found["slack_used"].sum() <= 0.05 * found["decisions"].sum()
     # The same scheme told that what it knows is exact: steps of the second half, 8000 of them.

@@ -12,13 +12,13 @@ from ratios import paired_ratio
 from scipy.optimize import brentq
 from scipy.stats import binom
 
-from logs.report.statistics import (
-    BOOTSTRAP_UP_TO,
+from logs.report.run_statistics import (
+    MAX_BOOTSTRAP_VALUES,
     bootstrap_mean,
     clopper_pearson,
+    max_step_rate,
     paired_difference,
     step_rate,
-    worst_step,
 )
 from uavctl.errors import UavctlError, UsageError
 from uavctl.lab.campaign.results import difference, read_results, summarise
@@ -65,7 +65,7 @@ def test_the_bootstrap_covers_the_mean_of_skewed_costs_about_as_often_as_it_says
 
 def test_the_bootstrap_is_the_normal_interval_where_there_are_many_values() -> None:
     # Drawn by hand on both sides of the border: the same figure by either way, to a twentieth of its width.
-    values = np.random.default_rng(5).exponential(2.0, BOOTSTRAP_UP_TO)
+    values = np.random.default_rng(5).exponential(2.0, MAX_BOOTSTRAP_VALUES)
     resampled = bootstrap_mean(values)
     reach = 1.959963984540054 * values.std(ddof=1) / len(values) ** 0.5
     assert resampled == pytest.approx((values.mean() - reach, values.mean() + reach), abs=0.1 * reach)
@@ -133,7 +133,7 @@ def test_the_worst_step_s_interval_goes_for_all_steps_at_once() -> None:
     rng, missed, alone = np.random.default_rng(4), 0, 0
     for _ in range(400):
         hits = rng.binomial(300, 0.05, 40)
-        rate, (low, high) = worst_step(hits, 300, 40)
+        rate, (low, high) = max_step_rate(hits, 300, 40)
         assert rate == hits.max() / 300 and low <= rate <= high
         missed += low > 0.05
         alone += clopper_pearson(int(hits.max()), 300)[0] > 0.05

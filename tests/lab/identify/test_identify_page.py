@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from places import DATA
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from logs.recording.senders import message_of
+from logs.recording.senders import get_message_id
 from logs.recording.tlog import read_tlog
 from uavctl.cli import identify as identify_cmd
 from uavctl.cli.common import Common
@@ -135,7 +135,7 @@ def test_a_second_vehicle_in_a_log_changes_nothing(tmp_path: Path, system: int |
     rows = []
     for packet in packets:
         rows.append((packet.at_ns, packet.data))
-        message: Any = parser.decode(bytearray(packet.data)) if message_of(packet.data) in (0, 84) else None
+        message: Any = parser.decode(bytearray(packet.data)) if get_message_id(packet.data) in (0, 84) else None
         if message is not None and message.get_type() == "HEARTBEAT" and message.get_srcSystem() == 1:
             rows.append((packet.at_ns, bytes(message.pack(other))))
         elif message is not None and message.get_type() != "HEARTBEAT":

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from record_values import values
 
-from logs.recording.topics import MATRICES, TOPICS, EncodingError, Topic, alike, condense, decode, encode
+from logs.recording.topics import MATRICES, TOPICS, EncodingError, Topic, are_identical, decode, encode, round_plan
 from uavctl.errors import RecordingError
 from uavctl.records import (
     Datagram,
@@ -39,7 +39,7 @@ def test_every_record_reads_back_bit_for_bit(topic: Topic) -> None:
         data = encode(record)
         json.loads(data, parse_constant=pytest.fail)  # plain JSON, no bare NaN
         # repr tells every float apart, the sign of zero and NaN included
-        assert repr(decode(topic.name, data, 0)) == repr(condense(record) if isinstance(record, Plan) else record)
+        assert repr(decode(topic.name, data, 0)) == repr(round_plan(record) if isinstance(record, Plan) else record)
 
     check()
 
@@ -47,8 +47,8 @@ def test_every_record_reads_back_bit_for_bit(topic: Topic) -> None:
 @given(values(Truth), values(Truth))
 def test_records_that_are_alike_are_so_in_every_bit(one: Truth, other: Truth) -> None:
     same = msgspec.structs.replace(one)
-    assert alike(one, same) and repr(one) == repr(same)
-    assert alike(one, other) == (repr(one) == repr(other))  # the sign of a zero too
+    assert are_identical(one, same) and repr(one) == repr(same)
+    assert are_identical(one, other) == (repr(one) == repr(other))  # the sign of a zero too
 
 
 def plan_of(rows: Matrix) -> Plan:
@@ -83,14 +83,14 @@ def test_a_recorded_plan_has_four_digits_of_each_number_and_the_checksum_of_all_
     matrix: tuple[tuple[float, float], ...], plan: Plan
 ) -> None:
     exact = msgspec.structs.replace(plan, exact_crc32=None, **dict.fromkeys(MATRICES, matrix))
-    found = condense(exact)
+    found = round_plan(exact)
     numbers = [number for row in matrix for number in row]
     assert found.exact_crc32 == zlib.crc32(4 * struct.pack(f"={len(numbers)}d", *numbers))
     assert all(getattr(found, name) == found.states for name in MATRICES)
     rounded = [number for row in found.states for number in row]
     assert rounded == [float(f"{number:.3e}") for number in rounded]
     assert rounded == pytest.approx(numbers, rel=5.0001e-4, abs=0.0)
-    assert condense(found) is found
+    assert round_plan(found) is found
 
 
 @pytest.mark.parametrize("name", MATRICES)
@@ -98,18 +98,18 @@ def test_the_last_bit_of_a_plan_changes_what_is_recorded(name: str) -> None:
     plan = plan_of(((0.1, 1.0), (2.0, 3.0)))
     nudged = msgspec.structs.replace(plan, **{name: ((0.1, 1.0), (2.0, math.nextafter(3.0, 4.0)))})
     assert encode(nudged) != encode(plan)
-    assert condense(nudged).states == condense(plan).states
+    assert round_plan(nudged).states == round_plan(plan).states
 
 
 def test_alike_looks_at_every_bit_and_never_raises() -> None:
     def setpoint(north: float, at_ns: int = 1) -> Setpoint:
         return Setpoint(at_ns=at_ns, accel_mps2=(north, 0.0, 0.0), source=SetpointSource.HOLD)
 
-    assert alike(setpoint(math.nan), setpoint(math.nan))
-    assert not alike(setpoint(0.0), setpoint(-0.0))
-    assert not alike(setpoint(1.0), setpoint(math.nextafter(1.0, 2.0)))
-    assert not alike(setpoint(1.0), setpoint(1))
-    assert not alike(setpoint(1.0, 2**70), setpoint(1.0, 2**70))  # not sure: to be looked at
+    assert are_identical(setpoint(math.nan), setpoint(math.nan))
+    assert not are_identical(setpoint(0.0), setpoint(-0.0))
+    assert not are_identical(setpoint(1.0), setpoint(math.nextafter(1.0, 2.0)))
+    assert not are_identical(setpoint(1.0), setpoint(1))
+    assert not are_identical(setpoint(1.0, 2**70), setpoint(1.0, 2**70))  # not sure: to be looked at
 
 
 def test_numbers_that_look_like_non_finite_ones_in_between_change_nothing() -> None:
@@ -135,12 +135,12 @@ def test_fields_beside_a_non_finite_float_are_written_as_without_it(field: str, 
     changed = msgspec.structs.replace(plan, **{field: odd})
     written = encode(changed)
     spelled = "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
-    fields = json.loads(encode(plan)) | {"exact_crc32": condense(changed).exact_crc32}
+    fields = json.loads(encode(plan)) | {"exact_crc32": round_plan(changed).exact_crc32}
     fields[field] = [[spelled, -0.0, 5e-324], [1e300, 0.3333, 7.0]] if field == "backoff_x" else spelled
     assert written == msgspec.json.encode(fields)
     for method in ("NaN", "qp"):  # a text that looks like a number stays one
         whole = msgspec.structs.replace(plan, method=method, **{field: odd})
-        assert repr(decode("/uavctl/plan", encode(whole), 0)) == repr(condense(whole))
+        assert repr(decode("/uavctl/plan", encode(whole), 0)) == repr(round_plan(whole))
 
 
 def test_text_is_left_alone() -> None:

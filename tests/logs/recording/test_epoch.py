@@ -19,12 +19,12 @@ from report_rig import unpaged
 from view_rig import flown, protobuf
 
 from logs.recording.export import TableFormat, export_tables
-from logs.recording.info import info
+from logs.recording.info import read_info
 from logs.recording.reader import read, walk
 from logs.recording.recorder import DerivedTopics, SyncRecorder
 from logs.recording.recover import recover
 from logs.recording.tlog import export_tlog
-from logs.recording.views import Views
+from logs.recording.views import ViewBuilder
 from uavctl import clock
 from uavctl.cli.app import run
 from uavctl.config.types import LogConfig
@@ -78,7 +78,7 @@ def test_a_step_of_the_wall_clock_changes_nothing(tmp_path: Path, monkeypatch: p
 
 def test_later_files_and_recovered_ones_have_the_same_times(tmp_path: Path) -> None:
     path = record(tmp_path / "flight.mcap", LogConfig(chunk_bytes=1024, segment_bytes=6000))
-    files = info(path).files
+    files = read_info(path).files
     assert len(files) > 2
     later = [one for file in files for one in others_see(Path(file))]
     assert all(log_time >= ZERO_NS for _, log_time, _, _ in later)
@@ -100,7 +100,7 @@ def test_the_offset_is_taken_between_two_looks_at_our_clock(monkeypatch: pytest.
 def test_stamps_within_views_are_those_of_the_file(tmp_path: Path) -> None:
     path = tmp_path / "flight.mcap"
     watched: list[int] = []
-    recorder = SyncRecorder(path, onlookers=DerivedTopics(Views(), lambda _, at_ns, __: watched.append(at_ns)))
+    recorder = SyncRecorder(path, onlookers=DerivedTopics(ViewBuilder(), lambda _, at_ns, __: watched.append(at_ns)))
     for topic, at_ns, one in flown().entries:
         recorder.put(
             topic, at_ns, msgspec.structs.replace(one, zero_utc_ns=ZERO_NS) if isinstance(one, Header) else one
@@ -151,7 +151,7 @@ def test_a_recording_of_before_keeps_its_times(tmp_path: Path) -> None:
     for item in flight(20):
         recorder.put(*item)
     recorder.close()
-    assert HEADER.zero_utc_ns is None and info(path).begin_utc is None
+    assert HEADER.zero_utc_ns is None and read_info(path).begin_utc is None
     assert [at_ns for topic, at_ns, _, _ in others_see(path) if topic != "/uavctl/recorder"] == [
         at_ns for _, at_ns, _ in flight(20)
     ]

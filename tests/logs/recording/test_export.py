@@ -21,13 +21,13 @@ from flat_rig import tabulate
 from recording_fakes import record_flight, stored_byte
 
 from logs.recording.disk import DiskFile
-from logs.recording.export import TableFormat, export_tables, file_stem
+from logs.recording.export import TableFormat, export_tables, make_file_stem
 from logs.recording.reader import RecordedMessage, good_messages, read, segment_files
 from logs.recording.recorder import DerivedTopics, SyncRecorder
 from logs.recording.segment import QueuedMessage, Segment
 from logs.recording.tlog import export_tlog
 from logs.recording.topics import Definition
-from logs.recording.views import Views
+from logs.recording.views import ViewBuilder
 from uavctl.cli.app import run
 from uavctl.config.types import LogConfig
 from uavctl.errors import RecordingError, UsageError
@@ -285,7 +285,7 @@ def test_without_pyarrow_the_extra_is_named(flown: Path) -> None:
 
 def test_two_tables_never_share_a_file() -> None:
     names = ["/raw/a/in", "/raw/a.b/in", "/raw/a b/in", "/raw/a%20b/in", "/raw/../in", "/uavctl/plan.gave_way"]
-    stems = [file_stem(name) for name in names]
+    stems = [make_file_stem(name) for name in names]
     assert len(set(stems)) == len(names) and not any("/" in stem for stem in stems)
 
 
@@ -304,7 +304,7 @@ def test_progress_sees_every_message_and_knows_their_number(tmp_path: Path, file
     segment_bytes = 10**9 if files == 1 else view_rig.record(path).stat().st_size * 2 // 5
     path.unlink(missing_ok=True)
     recorder = SyncRecorder(
-        path, LogConfig(segment_bytes=segment_bytes, chunk_bytes=16384), onlookers=DerivedTopics(Views())
+        path, LogConfig(segment_bytes=segment_bytes, chunk_bytes=16384), onlookers=DerivedTopics(ViewBuilder())
     )
     for entry in view_rig.flown().entries:
         recorder.put(*entry)

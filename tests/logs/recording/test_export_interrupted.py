@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from recording_fakes import record_flight
 
-from logs.recording.disk import all_or_none
+from logs.recording.disk import remove_on_error
 from logs.recording.export import TableFormat, Watch, export_tables
 from logs.recording.reader import RecordedMessage, good_messages
 from logs.recording.tlog import export_tlog
@@ -100,7 +100,7 @@ def test_after_it_the_same_export_goes_through(flight: Path, tmp_path: Path) -> 
 def test_an_old_file_outlives_a_new_one(tmp_path: Path) -> None:
     old, new = tmp_path / "old", tmp_path / "below" / "new"
     old.write_text("old")
-    with pytest.raises(KeyboardInterrupt), all_or_none([old, new]):
+    with pytest.raises(KeyboardInterrupt), remove_on_error([old, new]):
         new.parent.mkdir()
         new.write_text("new")
         raise KeyboardInterrupt

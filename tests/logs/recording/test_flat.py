@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from record_values import values
 
 from logs.recording.export import Cell
-from logs.recording.topics import TOPICS, Topic, record_type
+from logs.recording.topics import TOPICS, Topic, get_record_type
 from uavctl.records import (
     Command,
     Estimate,
@@ -130,7 +130,7 @@ def test_a_longer_list_later_gives_its_column_to_all() -> None:
 
 def test_what_has_any_value_is_json() -> None:
     design = {"gamma": [1.0, 0.5], "name": None}
-    header = record_type("/uavctl/header")(
+    header = get_record_type("/uavctl/header")(
         started_ns=0, started_utc="", seed=0, command="", config_toml="", design_id="", design=design,
         versions={"a": "1"}, cpu="",
     )  # fmt: skip

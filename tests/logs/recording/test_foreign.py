@@ -14,7 +14,7 @@ from places import DATA
 
 from logs.recording.foreign import ForeignMcap, is_foreign, read_mcap
 from logs.recording.recorder import SyncRecorder
-from logs.recording.tlog import ForeignReplay, TlogPacket, frame_length, read_tlog, replay_tlog
+from logs.recording.tlog import ForeignReplay, TlogPacket, get_frame_length, read_tlog, replay_tlog
 from uavctl.cli.app import run
 from uavctl.config import load_config
 from uavctl.config.types import LogConfig
@@ -175,8 +175,8 @@ def test_recordings_of_ours_and_files_of_nobody_are_not_foreign(tmp_path: Path) 
 
 
 def test_frame_length_needs_a_head() -> None:
-    assert [frame_length(b"\xfd\x05\x00"[:n], 0) for n in range(4)] == [0, 0, 0, 17]
-    assert frame_length(b"\xfe\x09\x00", 0) == 17 and frame_length(b"abc", 0) == 0
+    assert [get_frame_length(b"\xfd\x05\x00"[:n], 0) for n in range(4)] == [0, 0, 0, 17]
+    assert get_frame_length(b"\xfe\x09\x00", 0) == 17 and get_frame_length(b"abc", 0) == 0
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ from mcap_ros2.writer import Writer as Ros2Writer
 from places import DATA
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from logs.recording.foreign import ROS1, ROS2, UnreadableError, read_mcap, unwrapper
+from logs.recording.foreign import ROS1, ROS2, UnreadableError, make_unwrapper, read_mcap
 from logs.recording.tlog import TlogPacket, read_tlog
 from uavctl.errors import RecordingError
 
@@ -154,7 +154,7 @@ def cdr(order: str, kind: int, packet: bytes, most: int) -> bytes:
 
 @pytest.mark.parametrize(("order", "kind", "most"), [("<", 1, 8), (">", 0, 8), ("<", 7, 4), (">", 6, 4)])
 def test_every_byte_order_of_cdr(order: str, kind: int, most: int) -> None:
-    unwrap = unwrapper(ROS2, "ros2msg", NAME2, DEFINITION2.encode())
+    unwrap = make_unwrapper(ROS2, "ros2msg", NAME2, DEFINITION2.encode())
     assert unwrap is not None
     for packet in read_tlog(DATA / TLOGS[1]).packets[:50]:
         assert unwrap(cdr(order, kind, packet.data, most)) == packet.data
@@ -165,7 +165,7 @@ def test_a_definition_in_another_order_with_more_fields_is_read_as_it_says() -> 
     lines = [line for line in lines if not line.startswith("#")]
     text = "\n".join(["string<=9 note", "float64[3] place 0.0", "Link[] links", *reversed(lines)])
     text += f"\n{BORDER}\nMSG: my_msgs/Link\nint16 quality\nduration age\nwstring<=4[] never\n"
-    unwrap = unwrapper(ROS1, "ros1msg", "my_msgs/Wrapped", text.encode())
+    unwrap = make_unwrapper(ROS1, "ros1msg", "my_msgs/Wrapped", text.encode())
     assert unwrap is not None
     packet = read_tlog(DATA / TLOGS[0]).packets[3].data
     fields = wrapped(packet)
@@ -181,17 +181,17 @@ def test_a_definition_in_another_order_with_more_fields_is_read_as_it_says() -> 
 
 def test_what_has_not_the_fields_is_not_taken_for_it() -> None:
     without = DEFINITION1.replace("uint16 checksum\n", "")
-    assert unwrapper(ROS1, "ros1msg", NAME1, without.encode()) is None
-    assert unwrapper(ROS1, "ros2msg", NAME1, DEFINITION1.encode()) is None
-    assert unwrapper(ROS2, "ros2idl", NAME2, b"module mavros_msgs { };") is None
-    assert unwrapper(ROS2, "ros2msg", NAME2, b"struct { nonsense }") is None
-    assert unwrapper(ROS1, "ros1msg", NAME1, f"{FIELDS}\n{BORDER}\nuint8 nameless\n".encode()) is None
-    assert unwrapper("json", "jsonschema", "x", b"{}") is None
+    assert make_unwrapper(ROS1, "ros1msg", NAME1, without.encode()) is None
+    assert make_unwrapper(ROS1, "ros2msg", NAME1, DEFINITION1.encode()) is None
+    assert make_unwrapper(ROS2, "ros2idl", NAME2, b"module mavros_msgs { };") is None
+    assert make_unwrapper(ROS2, "ros2msg", NAME2, b"struct { nonsense }") is None
+    assert make_unwrapper(ROS1, "ros1msg", NAME1, f"{FIELDS}\n{BORDER}\nuint8 nameless\n".encode()) is None
+    assert make_unwrapper("json", "jsonschema", "x", b"{}") is None
 
 
 def test_a_damaged_message_is_told_never_raised() -> None:
     packet = read_tlog(DATA / TLOGS[0]).packets[3].data
-    unwrap = unwrapper(ROS2, "ros2msg", NAME2, DEFINITION2.encode())
+    unwrap = make_unwrapper(ROS2, "ros2msg", NAME2, DEFINITION2.encode())
     assert unwrap is not None
     whole = cdr("<", 1, packet, 8)
     for cut_at in range(len(whole)):
@@ -205,7 +205,7 @@ def test_a_damaged_message_is_told_never_raised() -> None:
             except UnreadableError:
                 refused += 1
     assert refused > 10
-    no_header = unwrapper(ROS1, "ros1msg", NAME1, FIELDS.encode())
+    no_header = make_unwrapper(ROS1, "ros1msg", NAME1, FIELDS.encode())
     assert no_header is not None
     with pytest.raises(UnreadableError, match="its definition says nothing of std_msgs/Header"):
         no_header(bytes(100))

@@ -11,7 +11,7 @@ from foreign_rig import TLOGS, Row, by_tlog, flown, rows_of, write
 from places import DATA
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from logs.recording.foreign import cut, read_mcap
+from logs.recording.foreign import cut_stream, read_mcap
 from logs.recording.tlog import TlogPacket, read_tlog
 from uavctl.cli.replay import foreign_packets
 from uavctl.errors import RecordingError, UsageError
@@ -101,7 +101,7 @@ def test_a_wrong_checksum_and_an_unknown_id_are_left_to_the_parser() -> None:
     good = bytes(beat.pack(mavlink.MAVLink(None, 1, 1)))
     wrong = good[:-1] + bytes((good[-1] ^ 1,))
     unknown = good[:7] + b"\xff\xff\x7f" + good[10:]
-    found = cut([(5, good + wrong + unknown + good)])
+    found = cut_stream([(5, good + wrong + unknown + good)])
     assert [one.data for one in found.packets] == [good, wrong, unknown, good]
     assert (found.right, found.left_out_bytes) == (2, 0)
 

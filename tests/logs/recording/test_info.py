@@ -9,8 +9,8 @@ from recording_fakes import HEADER, Clock, record_flight, stored_byte, write_two
 from rich.console import Console
 from view_rig import record
 
-from logs.recording.disk import MAGIC, check_room
-from logs.recording.info import RecordingInfo, info
+from logs.recording.disk import MAGIC, check_free_space
+from logs.recording.info import RecordingInfo, read_info
 from logs.recording.reader import header, read
 from logs.recording.recorder import SyncRecorder
 from logs.recording.recover import recover
@@ -30,7 +30,7 @@ def shown(found: RecordingInfo) -> str:
 def test_figures_of_a_flight(tmp_path: Path) -> None:
     path = tmp_path / "flight.mcap"
     record_flight(path, 61)
-    found = info(path)
+    found = read_info(path)
     assert (found.finished, found.damage, found.missing, found.messages) == (True, (), 0, 64)
     # 61 records 10 ms apart
     assert found.start_ns == 1_000_000_000
@@ -62,7 +62,7 @@ def test_a_topic_that_begins_late_or_falls_silent_has_a_gap_there(tmp_path: Path
                 one = Datagram(at_ns=at_ds * 100_000_000, link=link, outgoing=False, data=b"x")
                 recorder.put(f"/raw/{link}/in", one.at_ns, one)
     recorder.close()
-    found = info(path)
+    found = read_info(path)
     gaps = {one.topic: (one.longest_gap_s, one.longest_gap_at_s) for one in found.topics}
     assert gaps["/raw/dies/in"] == pytest.approx((6.0, 4.0))
     assert gaps["/raw/late/in"] == pytest.approx((7.5, 0.0))
@@ -74,7 +74,7 @@ def test_a_topic_that_begins_late_or_falls_silent_has_a_gap_there(tmp_path: Path
 def test_failed_write_is_told(tmp_path: Path) -> None:
     path = tmp_path / "flight.mcap"
     write_two_segments(path)
-    found = info(path)
+    found = read_info(path)
     assert len(found.files) == 2
     assert (found.failures, found.dropped, found.missing) == (1, 0, 0)
     assert found.messages == 101 + 3  # notes: begin, after a failed write, end
@@ -86,7 +86,7 @@ def test_damage_is_told_not_raised(tmp_path: Path) -> None:
     data = bytearray(path.read_bytes())
     data[stored_byte(path, b"number 29")] ^= 1
     path.write_bytes(data)
-    found = info(path)
+    found = read_info(path)
     assert found.finished
     assert len(found.damage) == 1
     assert found.missing == 63 - found.messages
@@ -101,10 +101,10 @@ def test_torn_file(tmp_path: Path) -> None:
     path = tmp_path / "flight.mcap"
     record_flight(path, 30)
     path.write_bytes(path.read_bytes()[:-200])
-    assert not info(path).finished
-    assert "not closed: `uavctl log recover`" in shown(info(path))
+    assert not read_info(path).finished
+    assert "not closed: `uavctl log recover`" in shown(read_info(path))
     path.write_bytes(path.read_bytes()[:5])
-    found = info(path)
+    found = read_info(path)
     assert (found.finished, found.messages, found.duration_s, found.origin, found.topics) == (False, 0, 0.0, None, ())
     assert "torn in the first bytes" in found.damage[0]
 
@@ -114,7 +114,7 @@ def test_nothing_in_it(tmp_path: Path, held: bytes) -> None:
     path = tmp_path / "flight.mcap"
     path.write_bytes(held)
     with pytest.raises(RecordingError, match=r"flight\.mcap: holds nothing"):
-        info(path)
+        read_info(path)
 
 
 def test_lost_header_is_not_taken_for_an_early_end(tmp_path: Path) -> None:
@@ -134,10 +134,10 @@ def test_room_is_refused_where_a_recording_is_or_no_folder_can_be(tmp_path: Path
     for taken in (later, path):
         taken.touch()
         with pytest.raises(RecordingError) as told:
-            check_room(path, 0)
+            check_free_space(path, 0)
         assert str(told.value).startswith(f"{taken} exists") and "choose another folder" in str(told.value)
     with pytest.raises(RecordingError) as told:
-        check_room(path / "flight.mcap", 0)
+        check_free_space(path / "flight.mcap", 0)
     assert str(told.value).startswith(f"{path}: ") and "(File exists); choose another folder" in str(told.value)
 
 
@@ -166,7 +166,7 @@ def test_links_losses_and_what_the_recorder_said(tmp_path: Path) -> None:
     recorder.put("/uavctl/link_estimate", 2 * second, estimate)
     recorder.put("/sim/truth", 2 * second, truth)
     recorder.close()
-    found = info(path)
+    found = read_info(path)
     mocap, vehicle = found.connections
     assert (mocap.link, mocap.datagrams, mocap.refused) == ("mocap", 0, {"address": 4, "rate": 3})
     assert (vehicle.datagrams, vehicle.messages, vehicle.samples, vehicle.bad) == (20, 18, 2, {"checksum": 2})
@@ -192,14 +192,14 @@ def test_a_damaged_index_is_told_and_a_torn_one_is_not_called_damaged(tmp_path: 
     data = bytearray(whole)
     data[data.rindex(b"/uavctl/event")] ^= 1  # a channel's name, in the summary
     path.write_bytes(data)
-    assert "the index is damaged" in info(path).damage[0]
+    assert "the index is damaged" in read_info(path).damage[0]
     with pytest.raises(RecordingError, match="log recover"):
         list(read(path))
     result = recover(path, out)
     assert result.lossless and len(result.damage) == 1
     path.write_bytes(whole[:-100])  # killed while it was closed
     assert list(read(path)) == list(read(out))
-    assert not info(path).finished
+    assert not read_info(path).finished
 
 
 @pytest.mark.parametrize(

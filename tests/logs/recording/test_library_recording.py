@@ -11,7 +11,7 @@ import pytest
 from places import DATA
 from recording_fakes import flight
 
-from logs.recording.info import info
+from logs.recording.info import read_info
 from logs.recording.reader import read, records
 from logs.recording.recorder import SyncRecorder
 from uavctl.cli.app import run
@@ -63,5 +63,5 @@ def test_a_flight_of_today_carries_none(tmp_path: Path) -> None:
     for item in flight(5):
         recorder.put(*item)
     assert recorder.close().ok
-    assert info(tmp_path / "flight.mcap").library is None
+    assert read_info(tmp_path / "flight.mcap").library is None
     assert not any(isinstance(record, PolicyLibrary) for _, _, record in read(tmp_path / "flight.mcap"))

@@ -20,8 +20,8 @@ from view_rig import flown
 from logs.recording.derived_topics import VIEWS
 from logs.recording.reader import read, records
 from logs.recording.recorder import BACKLOG, DerivedTopics, Recorder, Watcher, live_view
-from logs.recording.topics import definition
-from logs.recording.views import Views
+from logs.recording.topics import get_definition
+from logs.recording.views import ViewBuilder
 from uavctl.cli.app import run
 from uavctl.errors import UsageError
 from uavctl.records import Decision
@@ -58,7 +58,7 @@ def refused(port: int) -> bool:
 
 
 def tell(watch: Watcher, at_ns: int, data: bytes = b"{}") -> None:
-    watch(definition(EVENT), at_ns, data)
+    watch(get_definition(EVENT), at_ns, data)
 
 
 @pytest.mark.slow
@@ -66,7 +66,7 @@ def test_a_viewer_gets_every_topic_with_its_schema(tmp_path: Path) -> None:
     ports: list[int] = []
     told = {topic for topic, _, _ in flown().entries if not topic.startswith("/raw/")} | {view.name for view in VIEWS}
     with live_view(0, on_open=ports.append) as watch:
-        recorder = Recorder(tmp_path / "a.mcap", onlookers=DerivedTopics(Views(), watch))
+        recorder = Recorder(tmp_path / "a.mcap", onlookers=DerivedTopics(ViewBuilder(), watch))
         for entry in flown().entries:
             recorder.put(*entry)
         assert recorder.close().ok
@@ -74,7 +74,7 @@ def test_a_viewer_gets_every_topic_with_its_schema(tmp_path: Path) -> None:
             channels = viewer.channels(told)
             assert channels.keys() == told
             for topic, channel in channels.items():
-                want = definition(topic)
+                want = get_definition(topic)
                 assert (channel["encoding"], channel["schemaName"]) == (want.encoding, want.schema_name)
             viewer.subscribe({EVENT: channels[EVENT]})
             assert watch is not None
@@ -95,7 +95,7 @@ def test_a_stalled_viewer_holds_nothing_up_and_the_oldest_messages_go(tmp_path: 
             with telling(watch, 1, b"{}"):
                 next(messages)
             # From here on the viewer does not read.
-            recorder = Recorder(tmp_path / "a.mcap", onlookers=DerivedTopics(Views(), watch))
+            recorder = Recorder(tmp_path / "a.mcap", onlookers=DerivedTopics(ViewBuilder(), watch))
 
             def fly() -> None:
                 for entry in flown().entries:

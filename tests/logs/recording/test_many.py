@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 
-from logs.recording.views import Many
+from logs.recording.views import RepeatedField
 
 
 def poses(places: list[list[float]]) -> PosesInFrame:
@@ -24,7 +24,7 @@ def test_they_are_those_made_one_by_one(count: int) -> None:
     places[::3, 1] = 0.0
     places[1::7, 2] = [np.inf] * len(places[1::7])
     filled = PosesInFrame(frame_id="ned")
-    filled.MergeFromString(Many(lambda at_m: poses([[*at_m]]), 3).of(places))
+    filled.MergeFromString(RepeatedField(lambda at_m: poses([[*at_m]]), 3).of(places))
     made = poses(places.tolist())
     made.frame_id = "ned"
     assert filled.SerializeToString() == made.SerializeToString()
@@ -32,4 +32,4 @@ def test_they_are_those_made_one_by_one(count: int) -> None:
 
 def test_a_number_that_the_part_has_not_is_an_error() -> None:
     with pytest.raises(ValueError, match="not found"):
-        Many(lambda at_m: poses([[*at_m][:3]]), 4)
+        RepeatedField(lambda at_m: poses([[*at_m][:3]]), 4)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from logs.recording.ends import new_recording
+from logs.recording.ends import create_recording
 from uavctl.cli.app import run
 from uavctl.errors import RecordingError
 
@@ -62,7 +62,7 @@ def test_a_height_that_is_outside_the_limits_leaves_no_folder(tmp_path: Path) ->
 
 
 def test_a_full_disk_leaves_no_folder(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match=r"log\.free_bytes"), new_recording(tmp_path / "a" / "b", "room", 2**62):
+    with pytest.raises(RecordingError, match=r"log\.free_bytes"), create_recording(tmp_path / "a" / "b", "room", 2**62):
         pass
     assert list(tmp_path.iterdir()) == []
 
@@ -75,14 +75,14 @@ def test_a_folder_that_was_there_stays(taken_port: int, tmp_path: Path) -> None:
 
 
 def test_a_recording_that_was_begun_stays(tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt), new_recording(tmp_path / "a" / "b", "room", 0) as path:
+    with pytest.raises(KeyboardInterrupt), create_recording(tmp_path / "a" / "b", "room", 0) as path:
         path.write_bytes(b"the first records")
         raise KeyboardInterrupt
     assert path.read_bytes() == b"the first records"
 
 
 def test_of_nested_folders_only_those_made_and_empty_go(tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt), new_recording(tmp_path / "a" / "b", "room", 0):
+    with pytest.raises(KeyboardInterrupt), create_recording(tmp_path / "a" / "b", "room", 0):
         (tmp_path / "a" / "another").mkdir()
         raise KeyboardInterrupt
     assert [one.name for one in (tmp_path / "a").iterdir()] == ["another"]

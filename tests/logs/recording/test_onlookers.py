@@ -9,12 +9,12 @@ from recording_fakes import Clock, Disk, as_recorded, flight, own
 from view_rig import flown, record
 
 from logs.recording.derived_topics import VIEWS
-from logs.recording.info import info
+from logs.recording.info import read_info
 from logs.recording.reader import RecordedMessage, read, records, scan, segment_files
 from logs.recording.recorder import DerivedTopics, Recorder, SyncRecorder
 from logs.recording.recover import recover
 from logs.recording.topics import Definition, RecorderNote, is_view
-from logs.recording.views import Views
+from logs.recording.views import ViewBuilder
 from uavctl.config.types import LogConfig
 from uavctl.records import Estimate, Record
 
@@ -22,7 +22,7 @@ from uavctl.records import Estimate, Record
 def test_the_records_read_back_as_if_there_were_no_views(tmp_path: Path) -> None:
     path = record(tmp_path / "flight.mcap")
     assert own(list(read(path))) == as_recorded(flown().entries)
-    found = info(path)
+    found = read_info(path)
     assert found.finished and not found.missing and not found.refused
     assert sum(is_view(one.topic) for one in found.topics) == len(VIEWS)
 
@@ -30,7 +30,7 @@ def test_the_records_read_back_as_if_there_were_no_views(tmp_path: Path) -> None
 def test_a_disk_full_at_every_operation_loses_neither_records_nor_views(tmp_path: Path) -> None:
     items = flown().entries[:120]
     whole = tmp_path / "whole.mcap"
-    recorder = SyncRecorder(whole, onlookers=DerivedTopics(Views()))
+    recorder = SyncRecorder(whole, onlookers=DerivedTopics(ViewBuilder()))
     for item in items:
         recorder.put(*item)
     recorder.close()
@@ -40,7 +40,7 @@ def test_a_disk_full_at_every_operation_loses_neither_records_nor_views(tmp_path
         path = tmp_path / f"at{number}" / "flight.mcap"
         clock, disk = Clock(), Disk({number}.__contains__)
         recorder = SyncRecorder(
-            path, LogConfig(chunk_bytes=4096), open_file=disk.open, clock=clock, onlookers=DerivedTopics(Views())
+            path, LogConfig(chunk_bytes=4096), open_file=disk.open, clock=clock, onlookers=DerivedTopics(ViewBuilder())
         )
         for item in items:
             clock.now_s += 0.1
@@ -60,7 +60,7 @@ def test_a_torn_file_is_recovered_with_its_views(tmp_path: Path) -> None:
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     recover(cut, tmp_path / "again.mcap")
-    views = {one.topic for one in info(tmp_path / "again.mcap").topics if is_view(one.topic)}
+    views = {one.topic for one in read_info(tmp_path / "again.mcap").topics if is_view(one.topic)}
     assert len(views) > len(VIEWS) - 3
     kept = own(list(read(tmp_path / "again.mcap")))
     assert kept == as_recorded(flown().entries[: len(kept)]) and len(kept) > 100
@@ -68,7 +68,7 @@ def test_a_torn_file_is_recovered_with_its_views(tmp_path: Path) -> None:
 
 def test_what_has_no_view_is_recorded_and_counted(tmp_path: Path) -> None:
     # This header's design lacks what a view needs.
-    recorder = SyncRecorder(tmp_path / "flight.mcap", onlookers=DerivedTopics(Views()))
+    recorder = SyncRecorder(tmp_path / "flight.mcap", onlookers=DerivedTopics(ViewBuilder()))
     for item in flight(30):
         recorder.put(*item)
     status = recorder.close()
@@ -80,7 +80,7 @@ def test_what_has_no_view_is_recorded_and_counted(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("error", [ValueError, TypeError, IndexError, ZeroDivisionError])
 def test_a_view_that_fails_once_is_there_again_with_the_next_record(tmp_path: Path, error: type[Exception]) -> None:
-    class Failing(Views):
+    class Failing(ViewBuilder):
         def made(self, at_ns: int, record: Record) -> list[tuple[str, bytes]]:
             if isinstance(record, Estimate) and record.at_ns == flown().of(Estimate)[5].at_ns:
                 raise error("no")
@@ -91,7 +91,7 @@ def test_a_view_that_fails_once_is_there_again_with_the_next_record(tmp_path: Pa
         recorder.put(*item)
     status = recorder.close()
     assert (status.ok, status.unseen) == (True, 1)
-    counts = {one.topic: one.messages for one in info(tmp_path / "flight.mcap").topics}
+    counts = {one.topic: one.messages for one in read_info(tmp_path / "flight.mcap").topics}
     assert counts["/view/estimate"] == counts["/uavctl/estimate"] - 1
 
 
@@ -102,7 +102,7 @@ def test_who_watches_sees_each_message_once_in_order(tmp_path: Path) -> None:
         seen.append((definition.topic, at_ns, data))
 
     path = tmp_path / "flight.mcap"
-    recorder = SyncRecorder(path, onlookers=DerivedTopics(Views(), watch))
+    recorder = SyncRecorder(path, onlookers=DerivedTopics(ViewBuilder(), watch))
     for item in flown().entries:
         recorder.put(*item)
     recorder.close()

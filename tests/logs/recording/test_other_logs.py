@@ -13,7 +13,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from ulog_writer import UlogWriter, message
 
-from logs.recording.disk import FileKind, kind_of
+from logs.recording.disk import FileKind, detect_kind
 from logs.recording.mavlink_flight import read_flight
 from logs.recording.tlog import read_tlog
 from logs.recording.ulog import read_ulog
@@ -132,7 +132,7 @@ def test_little_endian_stamps_are_read_and_noted(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["FLIGHT.TLOG", "flight.Tlog", "flight.log", "flight"])
 def test_a_tlog_is_known_by_its_name_in_any_case_and_by_its_bytes(tmp_path: Path, name: str) -> None:
     path = two_vehicles().save(tmp_path / name)
-    assert kind_of(path) is FileKind.TLOG
+    assert detect_kind(path) is FileKind.TLOG
     assert run(["log", "info", str(path)]) == 0
     assert run(["log", "compare", str(path), str(path)]) == 1
     assert run(["log", "whatif", str(path)]) == 2
@@ -143,7 +143,7 @@ def test_a_ulog_is_known_by_its_bytes_whatever_it_is_called(tmp_path: Path) -> N
     log.text(4, START_US, "hello")
     for name in ("A.ULG", "a.tlog", "a"):
         (tmp_path / name).write_bytes(log.file)
-        assert kind_of(tmp_path / name) is FileKind.ULOG
+        assert detect_kind(tmp_path / name) is FileKind.ULOG
         assert [one.text for one in read_ulog(tmp_path / name).info.texts] == ["hello"]
         assert run(["log", "info", str(tmp_path / name)]) == 0
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from recording_fakes import record_flight
 
-from logs.recording.disk import check_free, write_whole
+from logs.recording.disk import refuse_existing_files, write_atomically
 from logs.recording.recover import recover
 from logs.recording.segment import Segment
 from uavctl.cli.flying import LIVE_PORT, live_view_port
@@ -21,16 +21,16 @@ from uavctl.errors import RecordingError, UsageError
 LIMITED = """
 import resource, signal, sys
 from pathlib import Path
-from logs.recording.disk import write_whole
+from logs.recording.disk import write_atomically
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
-write_whole(Path(sys.argv[1]), "new" * 1000)
+write_atomically(Path(sys.argv[1]), "new" * 1000)
 """
 
 
 def test_a_text_that_does_not_fit_leaves_the_one_before(tmp_path: Path) -> None:
     page = tmp_path / "page.html"
-    write_whole(page, "the page of before")
+    write_atomically(page, "the page of before")
     done = subprocess.run([sys.executable, "-c", LIMITED, str(page)], capture_output=True, text=True, check=False)
     assert f"RecordingError: {page}: cannot be written (File too large); choose another place" in done.stderr
     assert page.read_text(encoding="utf-8") == "the page of before"
@@ -39,14 +39,15 @@ def test_a_text_that_does_not_fit_leaves_the_one_before(tmp_path: Path) -> None:
 
 def test_a_text_goes_through_what_is_no_file(tmp_path: Path) -> None:
     script = (
-        "from pathlib import Path; from logs.recording.disk import write_whole; write_whole(Path('/dev/stdout'), 'a')"
+        "from pathlib import Path; from logs.recording.disk import write_atomically; "
+        "write_atomically(Path('/dev/stdout'), 'a')"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout == "a"
     with pytest.raises(RecordingError, match="cannot be written"):
-        write_whole(tmp_path, "a folder")
+        write_atomically(tmp_path, "a folder")
     with pytest.raises(RecordingError, match="cannot be written"):
-        write_whole(tmp_path / "missing" / "page.html", "no folder")
+        write_atomically(tmp_path / "missing" / "page.html", "no folder")
 
 
 def test_what_is_no_file_is_never_replaced(tmp_path: Path) -> None:
@@ -54,7 +55,7 @@ def test_what_is_no_file_is_never_replaced(tmp_path: Path) -> None:
     os.mkfifo(pipe)
     for target in (pipe, tmp_path):
         with pytest.raises(UsageError, match="is no file"):
-            check_free([target], force=True)
+            refuse_existing_files([target], force=True)
     assert stat.S_ISFIFO(pipe.stat().st_mode)
 
 

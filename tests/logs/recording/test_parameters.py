@@ -13,9 +13,9 @@ from mcap.reader import make_reader
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from recording_fakes import HEADER
 
-from logs.recording.attachments import layout_text
-from logs.recording.info import info
-from logs.recording.parameters import ParameterReader, VehicleParameter, parameter_file
+from logs.recording.attachments import make_layout_text
+from logs.recording.info import read_info
+from logs.recording.parameters import ParameterReader, VehicleParameter, make_parameter_file
 from logs.recording.recorder import SyncRecorder
 from logs.recording.recover import recover
 from uavctl.cli.app import run
@@ -100,7 +100,7 @@ def test_frames_that_are_skipped_tell_what_reading_them_would(monkeypatch: pytes
 
 def test_the_file_is_one_of_qgroundcontrol() -> None:
     found = read([heartbeat(3), told("ANGLE_MAX", 3000.0, INT32), told("WPNAV_SPEED", 0.1, REAL32)])
-    lines = parameter_file(found).splitlines()
+    lines = make_parameter_file(found).splitlines()
     rows = [line.split("\t") for line in lines if not line.startswith("#")]
     assert rows == [["1", "1", "ANGLE_MAX", "3000", "6"], ["1", "1", "WPNAV_SPEED", "0.1", "9"]]
 
@@ -133,13 +133,13 @@ def test_a_recording_carries_them_for_other_programs(tmp_path: Path) -> None:
     path = flight(tmp_path / "flight.mcap", 4.0, 5.0)
     attachments, metadata = beside(path)
     assert attachments["config.toml"].decode() == HEADER.config_toml
-    assert attachments["foxglove-layout.json"].decode() == layout_text()
+    assert attachments["foxglove-layout.json"].decode() == make_layout_text()
     assert b"1\t1\tA\t5\t6\n" in attachments["vehicle.params"]
     assert metadata["vehicle parameters"] == {"A": "5"} and metadata["vehicle parameter types"] == {"A": "INT32"}
     assert metadata["configuration"] == {"name": "room-hahn-stursberg", "duration_s": "40.0"}
     assert metadata["versions"] == {"uavctl": "0.1"}
     assert (metadata["uavctl"]["platform"], metadata["uavctl"]["seed"]) == ("Linux", "7")
-    found = info(path)
+    found = read_info(path)
     assert {one.name: one.bytes for one in found.attachments} == {name: len(data) for name, data in attachments.items()}
     assert found.parameters["A"].value == 5
 
@@ -176,4 +176,4 @@ def test_the_attachment_says_whether_the_list_is_whole(
     with path.open("rb") as file:
         found = {one.name: one.metadata for one in make_reader(file).iter_metadata()}["vehicle parameter list"]
     assert found == {"told": str(len(names)), "of": "2", "complete": complete}
-    assert info(path).parameter_count == 2
+    assert read_info(path).parameter_count == 2

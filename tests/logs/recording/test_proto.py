@@ -8,7 +8,7 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 
-from logs.recording.derived_topics import message_class, pack, schema_of
+from logs.recording.derived_topics import describe_schema, make_message_class, pack_message
 from uavctl.records import Record
 
 
@@ -34,12 +34,12 @@ SHEET = Sheet(name="é", count=-(2**63), good=True, one=Pair(left=1e-300), other
 
 
 def test_a_stranger_reads_every_field_with_the_schema_alone() -> None:
-    files = FileDescriptorSet.FromString(schema_of(message_class(Sheet)))
+    files = FileDescriptorSet.FromString(describe_schema(make_message_class(Sheet)))
     pool = DescriptorPool()
     for file in files.file:
         pool.Add(file)
     read = GetMessageClass(pool.FindMessageTypeByName("uavctl.Sheet")).FromString(
-        pack(Sheet(name="é", count=-5, good=True, one=SHEET.one, other=SHEET.other, values=(1.5, math.nan)))
+        pack_message(Sheet(name="é", count=-5, good=True, one=SHEET.one, other=SHEET.other, values=(1.5, math.nan)))
     )
     found = {field.name: getattr(read, field.name) for field in read.DESCRIPTOR.fields}
     assert (found["name"], found["count"], found["good"]) == ("é", -5, True)
@@ -49,16 +49,16 @@ def test_a_stranger_reads_every_field_with_the_schema_alone() -> None:
 
 
 def test_integers_of_64_bits_fit_and_larger_ones_are_refused() -> None:
-    assert getattr(message_class(Sheet).FromString(pack(SHEET)), "count") == SHEET.count  # noqa: B009
+    assert getattr(make_message_class(Sheet).FromString(pack_message(SHEET)), "count") == SHEET.count  # noqa: B009
     with pytest.raises(ValueError, match="range"):
-        pack(Sheet(name="", count=2**63, good=False, one=SHEET.one, other=SHEET.one))
+        pack_message(Sheet(name="", count=2**63, good=False, one=SHEET.one, other=SHEET.one))
 
 
 def test_a_value_of_another_type_is_refused() -> None:
     with pytest.raises(TypeError):
-        pack(Sheet(name="", count=cast("int", "x"), good=False, one=SHEET.one, other=SHEET.one))
+        pack_message(Sheet(name="", count=cast("int", "x"), good=False, one=SHEET.one, other=SHEET.one))
 
 
 def test_a_type_without_a_field_of_its_own_is_named() -> None:
     with pytest.raises(TypeError, match=r"Wrong\.value"):
-        message_class(Wrong)
+        make_message_class(Wrong)

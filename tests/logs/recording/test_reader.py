@@ -9,7 +9,7 @@ from logs.recording.disk import DiskFile
 from logs.recording.reader import header, read, records, segment_files
 from logs.recording.recorder import SyncRecorder
 from logs.recording.segment import QueuedMessage, Segment
-from logs.recording.topics import definition, encode
+from logs.recording.topics import encode, get_definition
 from uavctl.config.types import LogConfig
 from uavctl.errors import RecordingError
 from uavctl.records import Datagram, Event, Record, Setpoint, Severity
@@ -88,7 +88,7 @@ def test_a_missing_message_is_noticed_also_one_for_viewers(lacks: str, tmp_path:
     path = tmp_path / "flight.mcap"
     event = encode(Event(at_ns=7, severity=Severity.INFO, code="code", text="text"))
     messages = [
-        QueuedMessage(definition(topic), 1 + n, n, event)
+        QueuedMessage(get_definition(topic), 1 + n, n, event)
         for n, topic in enumerate(["/uavctl/event", "/view/estimate"] * 9)
     ]
     at = next(n for n, one in enumerate(messages) if n > 5 and one.definition.topic == lacks)

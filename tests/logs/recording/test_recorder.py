@@ -15,7 +15,7 @@ from logs.recording.disk import DiskFile, OutputFile
 from logs.recording.reader import RecordedMessage, read, records, scan, segment_files
 from logs.recording.recorder import RECORDS, VIEWS, DerivedTopics, Recorder, SyncRecorder, WriteQueue, portion
 from logs.recording.topics import RecorderNote, is_view
-from logs.recording.views import Views
+from logs.recording.views import ViewBuilder
 from uavctl.config.types import LogConfig
 from uavctl.errors import RecordingError
 from uavctl.records import Datagram, Event, Record, Severity
@@ -215,7 +215,11 @@ def test_29_disk_full_at_every_operation_of_the_writing_thread_loses_neither_rec
         path = tmp_path / f"at{number}" / "flight.mcap"
         disk = Disk({number - 1}.__contains__)  # none first, to know the views
         recorder = Recorder(
-            path, LogConfig(chunk_bytes=4096), open_file=disk.open, clock=Clock(0.01), onlookers=DerivedTopics(Views())
+            path,
+            LogConfig(chunk_bytes=4096),
+            open_file=disk.open,
+            clock=Clock(0.01),
+            onlookers=DerivedTopics(ViewBuilder()),
         )
         for item in items:
             recorder.put(*item)

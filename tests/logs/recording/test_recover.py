@@ -7,7 +7,7 @@ from mcap.reader import make_reader
 from recording_fakes import flight, own, record_flight, stored_byte, write_two_segments
 
 from logs.recording.disk import DiskFile
-from logs.recording.info import info
+from logs.recording.info import read_info
 from logs.recording.reader import read, records
 from logs.recording.recover import recover
 from logs.recording.topics import RecorderNote
@@ -56,7 +56,7 @@ def test_one_bad_chunk_costs_only_its_messages(tmp_path: Path, number: int) -> N
     assert result.chunks_bad == 1
     assert not result.lossless
     assert "lost" in list(records(out, RecorderNote))[-1].text
-    assert info(out).damage == ()
+    assert read_info(out).damage == ()
 
 
 def test_damaged_index_loses_nothing(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from places import DATA
 
 from logs.recording.replay import replay
 from logs.recording.tlog import read_tlog, replay_tlog
-from logs.recording.topics import encode, raw_link
+from logs.recording.topics import encode, parse_raw_topic
 from uavctl.config import load_config
 from uavctl.errors import RecordingError
 from uavctl.loop import VEHICLE
@@ -54,7 +54,7 @@ def test_a_recording_is_compared_by_its_bytes_and_by_what_they_say_where_these_a
     whole = replayed(flown.entries)
     assert whole.identical and replayed(written) == whole
     otherwise = [
-        (topic, at_ns, data if raw_link(topic) else json.dumps(json.loads(data)).encode())
+        (topic, at_ns, data if parse_raw_topic(topic) else json.dumps(json.loads(data)).encode())
         for topic, at_ns, data in written
     ]
     assert otherwise != written and replayed(otherwise) == whole

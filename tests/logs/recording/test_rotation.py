@@ -16,14 +16,14 @@ from mcap.reader import make_reader
 from recording_fakes import HEADER, Clock, Disk, Item, flight, own
 
 from logs.recording.derived_topics import LOG
-from logs.recording.disk import DiskFile, RoomWatch
-from logs.recording.info import info
+from logs.recording.disk import DiskFile, FreeSpaceMonitor
+from logs.recording.info import read_info
 from logs.recording.reader import header, read, records, segment_files
 from logs.recording.recorder import DerivedTopics, SyncRecorder
 from logs.recording.recover import recover
 from logs.recording.segment import QueuedMessage, Segment
-from logs.recording.topics import RecorderNote, definition
-from logs.recording.views import Views
+from logs.recording.topics import RecorderNote, get_definition
+from logs.recording.views import ViewBuilder
 from uavctl.build.controller import build_design
 from uavctl.config import load_config
 from uavctl.config.types import LogConfig
@@ -78,7 +78,7 @@ def test_a_file_of_its_size_is_closed_and_the_next_one_goes_on(tmp_path: Path) -
     ]
     assert recover(path, out).lossless
     assert own(list(read(out))) == items
-    found = info(path)
+    found = read_info(path)
     assert [one.file for one in found.segments] == list(found.files)
     assert sum(one.messages for one in found.segments) == status.written
     assert all(one.finished for one in found.segments)
@@ -169,7 +169,7 @@ def test_memory_does_not_grow_with_the_length_of_a_flight(tmp_path: Path) -> Non
 
 def test_an_index_takes_few_bytes_of_memory(tmp_path: Path) -> None:
     segment = Segment(DiskFile(tmp_path / "a.mcap"), 1024)
-    kinds = [definition(f"/raw/{name}/in") for name in ("a", "b", "c", "d")]
+    kinds = [get_definition(f"/raw/{name}/in") for name in ("a", "b", "c", "d")]
     tracemalloc.start()
     try:
         for number in range(4000):
@@ -196,7 +196,7 @@ class Room:
 
 def test_the_watch_warns_rests_and_goes_on_with_a_margin() -> None:
     room = Room()
-    watch = RoomWatch(Path("flights"), room, LOW, STOP)
+    watch = FreeSpaceMonitor(Path("flights"), room, LOW, STOP)
     seen = []
     for room.free in (3000, 2999, 1000, 999, 1500, 2999, None, 3000, 1500):
         watch.look()
@@ -236,11 +236,11 @@ def test_29_recording_rests_before_the_disk_is_full_and_goes_on_when_there_is_ro
     got = own(list(read(path)))
     assert got == [item for item in items if item in got]
     assert got[-90:] == items[-90:]
-    assert len(items) - len(got) == final.dropped == info(path).dropped > 0
-    said = " | ".join(one.text for one in info(path).notes)
+    assert len(items) - len(got) == final.dropped == read_info(path).dropped > 0
+    said = " | ".join(one.text for one in read_info(path).notes)
     for text in ("disk gets low: 2000 bytes", "900 bytes free", "after a rest", "disk has room again"):
         assert text in said
-    assert [one.finished for one in info(path).segments] == [True, True]
+    assert [one.finished for one in read_info(path).segments] == [True, True]
 
 
 @pytest.mark.fault(29)
@@ -263,7 +263,7 @@ def test_29_what_waited_in_a_rest_is_written_at_the_end(tmp_path: Path) -> None:
 def test_29_viewers_are_told_that_the_disk_gets_low(tmp_path: Path) -> None:
     seen: list[tuple[str, bytes]] = []
     room, clock = Room(), Clock()
-    looking = DerivedTopics(Views(), lambda definition, _, data: seen.append((definition.topic, data)))
+    looking = DerivedTopics(ViewBuilder(), lambda definition, _, data: seen.append((definition.topic, data)))
     log = LogConfig(low_bytes=LOW, stop_bytes=STOP)
     recorder = SyncRecorder(tmp_path / "flight.mcap", log, free=room, clock=clock, onlookers=looking)
     loaded = load_config("room-hahn-stursberg")

@@ -10,9 +10,9 @@ from mcap.records import Chunk, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
 from recording_fakes import record_flight, stored_chunks
 
-from logs.recording.disk import DiskFile, check_room, later_segments, segment_path
+from logs.recording.disk import DiskFile, check_free_space, find_later_segments, make_segment_path
 from logs.recording.segment import QueuedMessage, Segment
-from logs.recording.topics import definition
+from logs.recording.topics import get_definition
 from uavctl.errors import RecordingError
 
 
@@ -97,7 +97,7 @@ def test_message_larger_than_a_chunk_has_its_own(tmp_path: Path) -> None:
     path = tmp_path / "big.mcap"
     segment = Segment(DiskFile(path), 1024)
     for number, size in enumerate((10, 5000, 10, 10), 1):
-        segment.add(QueuedMessage(definition("/raw/vehicle/in"), number, number, bytes(size)))
+        segment.add(QueuedMessage(get_definition("/raw/vehicle/in"), number, number, bytes(size)))
     segment.finish()
     counts = [sum(isinstance(record, Message) for record in breakup_chunk(chunk)) for chunk in chunks(path)]
     assert counts == [1, 1, 2]
@@ -121,18 +121,18 @@ def test_never_overwrites(tmp_path: Path) -> None:
 def test_segment_names_in_numeric_order(tmp_path: Path) -> None:
     path = tmp_path / "a.b[1].mcap"
     for number in (1, 2, 3, 10, 11):
-        segment_path(path, number).touch()
+        make_segment_path(path, number).touch()
     for other in ("a.b[1]-1.mcap", "a.b[1]-02.mcap", "a.b[1]-x.mcap", "xa.b[1]-2.mcap", "a.b[1]-2.mcap.bak"):
         (tmp_path / other).touch()
-    assert [one.name for one in later_segments(path)] == [f"a.b[1]-{number}.mcap" for number in (2, 3, 10, 11)]
+    assert [one.name for one in find_later_segments(path)] == [f"a.b[1]-{number}.mcap" for number in (2, 3, 10, 11)]
 
 
 @pytest.mark.fault(29)
 def test_room_is_checked_before_a_flight(tmp_path: Path) -> None:
     path = tmp_path / "new" / "flight.mcap"
-    assert check_room(path, 0) > 0
+    assert check_free_space(path, 0) > 0
     with pytest.raises(RecordingError, match=r"bytes free, log\.free_bytes asks for"):
-        check_room(path, 2**62)
+        check_free_space(path, 2**62)
     (tmp_path / "file").touch()
     with pytest.raises(RecordingError, match="choose another folder"):
-        check_room(tmp_path / "file" / "flight.mcap", 0)
+        check_free_space(tmp_path / "file" / "flight.mcap", 0)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from loopback_rig import lockstep
 
-from logs.recording.disk import MAGIC, spare_recording
+from logs.recording.disk import MAGIC, refuse_recording_path
 from logs.recording.reader import lacks_end
 from logs.recording.recorder import SyncRecorder
 from uavctl.cli.app import run
@@ -46,12 +46,12 @@ def test_a_slip_does_not_cost_the_flight(
 
 def test_a_recording_of_any_name_is_known_by_its_first_bytes(tmp_path: Path) -> None:
     page = tmp_path / "page.html"
-    spare_recording(page)
+    refuse_recording_path(page)
     page.write_text("<p>an old page", encoding="utf-8")
-    spare_recording(page)
+    refuse_recording_path(page)
     page.write_bytes(MAGIC + b"rest")
     with pytest.raises(UsageError, match="would be lost"):
-        spare_recording(page)
+        refuse_recording_path(page)
 
 
 def test_a_file_is_finished_with_its_whole_index_only(recorded: Path, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from synthetic_flight import Item, fly, header
 from synthetic_scene import paper, room
 
 from logs.recording.flight import FALLBACK, FlightData
-from logs.recording.summary import FlightSummary, Percentiles, render, spread, summarise
+from logs.recording.summary import FlightSummary, Percentiles, compute_percentiles, make_summary_table, summarise
 from uavctl.errors import RecordingError
 from uavctl.flight.decide import MISSION_OVER
 from uavctl.records import (
@@ -243,7 +243,7 @@ def test_decision_times_are_those_of_ticks_that_solved() -> None:
 
 
 def test_spread_of_nothing_is_nothing() -> None:
-    assert spread(np.array([])) == Percentiles(p50=None, p99=None, max=None)
+    assert compute_percentiles(np.array([])) == Percentiles(p50=None, p99=None, max=None)
 
 
 def test_one_tick_is_a_flight() -> None:
@@ -288,8 +288,8 @@ def test_a_whole_flight_agrees_with_its_records() -> None:
 def test_table_tells_estimates_from_truth() -> None:
     console = Console(width=120, file=None, record=True, quiet=False, force_terminal=False)
     with console.capture() as shown:
-        console.print(render(figures(decision(0), truth(0, (0.0,) * 4))))
-        console.print(render(figures(decision(0))))
+        console.print(make_summary_table(figures(decision(0), truth(0, (0.0,) * 4))))
+        console.print(make_summary_table(figures(decision(0))))
     assert shown.get().count("true state is unknown") == 1  # without it there is no cost either
     assert "1 step;" in shown.get()
 
@@ -297,7 +297,7 @@ def test_table_tells_estimates_from_truth() -> None:
 def shown(s: FlightSummary) -> str:
     console = Console(width=120, force_terminal=False)
     with console.capture() as text:
-        console.print(render(s))
+        console.print(make_summary_table(s))
     return text.get()
 
 

@@ -6,7 +6,7 @@ import msgspec
 import pytest
 
 from logs.recording.derived_topics import VIEWS
-from logs.recording.topics import TOPICS, definition, is_view, raw_link, record_type
+from logs.recording.topics import TOPICS, get_definition, get_record_type, is_view, parse_raw_topic
 from uavctl import records as data
 from uavctl.records import Datagram, Decision, Record, raw_topic
 
@@ -44,26 +44,26 @@ def test_schema_is_an_object_with_the_record_s_fields(topic: object) -> None:
 
 def test_raw_topics_name_link_and_direction() -> None:
     assert raw_topic("vehicle", outgoing=False) == "/raw/vehicle/in"
-    assert raw_link("/raw/mocap/out") == ("mocap", True)
-    assert raw_link("/raw/a/b/in") is None
-    assert record_type("/raw/vehicle/in") is Datagram
-    assert definition("/raw/vehicle/in").encoding == "mavlink"
-    assert definition("/raw/vehicle/in").schema == b""
+    assert parse_raw_topic("/raw/mocap/out") == ("mocap", True)
+    assert parse_raw_topic("/raw/a/b/in") is None
+    assert get_record_type("/raw/vehicle/in") is Datagram
+    assert get_definition("/raw/vehicle/in").encoding == "mavlink"
+    assert get_definition("/raw/vehicle/in").schema == b""
 
 
 def test_unknown_topic() -> None:
-    assert record_type("/uavctl/decision") is Decision
+    assert get_record_type("/uavctl/decision") is Decision
     with pytest.raises(KeyError):
-        record_type("/uavctl/unknown")
+        get_record_type("/uavctl/unknown")
     with pytest.raises(KeyError):
-        definition("/raw/vehicle/sideways")
+        get_definition("/raw/vehicle/sideways")
 
 
 def test_topics_for_viewers_are_no_records() -> None:
     names = {view.name for view in VIEWS}
     assert len(names) == len(VIEWS) and not names & {topic.name for topic in TOPICS}
     for name in names:
-        assert is_view(name) and definition(name).encoding == definition(name).schema_encoding == "protobuf"
+        assert is_view(name) and get_definition(name).encoding == get_definition(name).schema_encoding == "protobuf"
         with pytest.raises(KeyError):
-            record_type(name)
+            get_record_type(name)
     assert not any(is_view(topic.name) for topic in TOPICS) and not is_view("/raw/vehicle/in")

@@ -17,9 +17,9 @@ from rerun.chunk import McapReader
 from view_rig import protobuf
 
 from logs.recording.derived_topics import VIEWS
-from logs.recording.info import info
+from logs.recording.info import read_info
 from logs.recording.reader import read
-from logs.recording.topics import TOPICS, definition
+from logs.recording.topics import TOPICS, get_definition
 from uavctl.cli.app import run
 from uavctl.records import Decision, Estimate, Plan
 
@@ -66,7 +66,7 @@ def test_mcap_decodes_every_message_of_every_topic(
     schemas = {schema for messages in decoded.values() for schema, _, _ in messages}
     assert {name.removeprefix("foxglove.") for name in schemas if name.startswith("foxglove.")} == WELL_KNOWN
     assert {name.split(".")[0] for name in schemas} == {"foxglove", "uavctl"}
-    counted = {one.topic: one.messages for one in info(recording).topics}
+    counted = {one.topic: one.messages for one in read_info(recording).topics}
     assert {topic: len(messages) for topic, messages in decoded.items()} == {
         view.name: counted[view.name] for view in VIEWS
     }
@@ -96,7 +96,7 @@ def test_views_are_as_many_as_the_records_that_they_are_made_from(
 
 
 def test_views_at_most_double_the_file(recording: Path) -> None:
-    sizes = {one.topic: one.bytes for one in info(recording).topics}
+    sizes = {one.topic: one.bytes for one in read_info(recording).topics}
     made = sum(sizes[view.name] for view in VIEWS)
     assert made < sum(sizes.values()) - made
 
@@ -108,7 +108,7 @@ def test_rerun_loads_every_topic(recording: Path, decoded: dict[str, list[tuple[
         names = set(chunk.to_record_batch().schema.names)
         rows[chunk.entity_path] += chunk.num_rows if "message_log_time" in names else 0
         components[chunk.entity_path] |= names
-    assert {one.topic for one in info(recording).topics} <= rows.keys()
+    assert {one.topic for one in read_info(recording).topics} <= rows.keys()
     for view in VIEWS:
         assert rows[view.name] == len(decoded[view.name]), view.name
         assert DRAWN.get(view.schema_name, f"{view.schema_name}:message") in components[view.name]
@@ -189,5 +189,5 @@ def test_definitions_are_what_the_file_says(recording: Path) -> None:
     assert summary is not None
     for channel in summary.channels.values():
         if channel.message_encoding == "protobuf":
-            schema, want = summary.schemas[channel.schema_id], definition(channel.topic)
+            schema, want = summary.schemas[channel.schema_id], get_definition(channel.topic)
             assert (schema.name, schema.encoding, schema.data) == (want.schema_name, "protobuf", want.schema)

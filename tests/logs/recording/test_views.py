@@ -13,8 +13,8 @@ from loopback_rig import lockstep
 from view_rig import flown
 
 from logs.recording.derived_topics import VIEWS
-from logs.recording.design_view import DesignView, design_view
-from logs.recording.views import PLAN_NS, STD_95, STILL_NS, Views, plan_scene, room_scene
+from logs.recording.design_view import DesignView, read_design
+from logs.recording.views import PLAN_NS, STD_95, STILL_NS, ViewBuilder, draw_plan, draw_room
 from uavctl.errors import RecordingError
 from uavctl.frames import Frame, rotate_vector
 from uavctl.records import (
@@ -36,9 +36,9 @@ KINDS = {view.name: view.message for view in VIEWS}
 Found = dict[str, list[tuple[int, Any]]]
 
 
-def views(*records: Record, maker: Views | None = None) -> Found:
+def views(*records: Record, maker: ViewBuilder | None = None) -> Found:
     """Messages by topic, of these records or of the whole flight."""
-    maker = maker or Views()
+    maker = maker or ViewBuilder()
     found: Found = {name: [] for name in KINDS}
     entries = [(getattr(one, "at_ns", 0), one) for one in records] or [(at, one) for _, at, one in flown().entries]
     for at_ns, record in entries:
@@ -54,7 +54,7 @@ def found() -> Found:
 
 @pytest.fixture(scope="module")
 def design() -> DesignView:
-    return design_view(flown().of(Header)[0])
+    return read_design(flown().of(Header)[0])
 
 
 def place(vector: Any) -> Vec3:
@@ -83,7 +83,7 @@ def test_each_topic_has_as_many_messages_as_its_records(found: Found) -> None:
 
 def test_plans_that_come_quickly_are_not_all_drawn() -> None:
     header, plan = flown().of(Header)[0], next(p for p in flown().of(Plan) if p.status is SolveStatus.OPTIMAL)
-    maker = Views()
+    maker = ViewBuilder()
     maker.made(0, header)
     times_ns = [n * 50_000_000 for n in range(40)]
     drawn_ns = [at for at in times_ns if any(topic == "/view/scene/plan" for topic, _ in maker.made(at, plan))]
@@ -126,7 +126,7 @@ def test_what_does_not_move_is_told_every_five_seconds(found: Found) -> None:
 
 
 def test_the_room_is_the_box_of_the_limits(design: DesignView) -> None:
-    (entity,) = room_scene(0, design).entities
+    (entity,) = draw_room(0, design).entities
     (line,) = entity.lines
     corners = np.array([place(point) for point in line.points])
     assert corners.min(axis=0).tolist() == [-3.0, -2.5, -2.5]
@@ -140,13 +140,13 @@ def test_an_open_side_is_drawn_near_the_target(design: DesignView) -> None:
     number = design.position_index[0]
     row = int(design.state_box.row_upper[number])
     open_side = msgspec.structs.replace(design, b_x=(*design.b_x[:row], math.inf, *design.b_x[row + 1 :]))
-    (entity,) = room_scene(0, open_side).entities
+    (entity,) = draw_room(0, open_side).entities
     assert max(point.x for point in entity.lines[0].points) == design.target_m[0] + 5.0
 
 
 def test_a_plan_s_ellipsoids_are_its_back_offs(design: DesignView) -> None:
     plan = next(p for p in flown().of(Plan) if p.status is SolveStatus.OPTIMAL)
-    scene = {entity.id: entity for entity in plan_scene(0, design, plan, None).entities}
+    scene = {entity.id: entity for entity in draw_plan(0, design, plan, None).entities}
     box = design.state_box
     for sphere, state, backoff in zip(scene["predicted spread"].spheres, plan.states, plan.backoff_x, strict=True):
         assert place(sphere.pose.position) == design.position_of(state)
@@ -163,7 +163,7 @@ def test_the_estimate_s_ellipsoid_holds_95_percent(design: DesignView) -> None:
     root = rng.normal(size=(9, 9))
     cov = root @ root.T
     estimate = msgspec.structs.replace(flown().of(Estimate)[0], cov=tuple(map(tuple, cov.tolist())))
-    scene = {entity.id: entity for entity in plan_scene(0, design, plan, estimate).entities}
+    scene = {entity.id: entity for entity in draw_plan(0, design, plan, estimate).entities}
     (sphere,) = scene["estimate, 95 %"].spheres
     turn = sphere.pose.orientation
     drawn = rng.multivariate_normal(np.array(estimate.mean), cov, size=4000)
@@ -225,7 +225,7 @@ def test_events_keep_their_severity_and_count() -> None:
 
 
 def test_paths_are_those_of_the_last_twenty_seconds() -> None:
-    maker = Views()
+    maker = ViewBuilder()
     header, truth, decision = flown().of(Header)[0], flown().of(Truth)[0], flown().of(Decision)[0]
     maker.made(0, header)
     for tenth in range(500):
@@ -251,14 +251,14 @@ def test_nothing_is_made_before_a_header() -> None:
 
 def test_a_design_that_cannot_be_used_is_told() -> None:
     header = msgspec.structs.replace(flown().of(Header)[0], design={"gamma_x": [1.0]})
-    maker = Views()
+    maker = ViewBuilder()
     with pytest.raises(RecordingError, match="design cannot be used"):
         maker.made(0, header)
     assert maker.made(1, flown().of(Estimate)[0]) == []
 
 
 def test_a_plant_in_the_plane_has_no_number_for_the_third_axis() -> None:
-    maker, made = Views(), set()
+    maker, made = ViewBuilder(), set()
     for _, at_ns, record in lockstep("paper", 4.0).entries:
         for topic, data in maker.made(at_ns, record):
             made.add(topic)

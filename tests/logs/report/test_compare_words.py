@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from logs.report.compare import Figure, difference, for_people, label, measured
+from logs.report.compare import Figure
+from logs.report.compare_text import convert_to_display_unit, format_difference, format_label, format_value
 
 
 def figure(key: str) -> Figure:
@@ -18,12 +19,12 @@ def figure(key: str) -> Figure:
 
 
 def test_a_certified_gap_is_read_in_percent() -> None:
-    one = for_people(figure("largest_gap"))
-    assert label(one) == "largest certified gap, %"
-    assert [measured(value) for value in one.values] == ["0.002274", "0.002002", "–"]
-    assert [difference(value) for value in one.differences] == ["-0.000272", "–"]
-    assert one.ratios == figure("largest_gap").ratios
+    converted = convert_to_display_unit(figure("largest_gap"))
+    assert format_label(converted) == "largest certified gap, %"
+    assert [format_value(value) for value in converted.values] == ["0.002274", "0.002002", "–"]
+    assert [format_difference(value) for value in converted.differences] == ["-0.000272", "–"]
+    assert converted.ratios == figure("largest_gap").ratios
 
 
 def test_other_figures_stay() -> None:
-    assert for_people(figure("cost")) == figure("cost")
+    assert convert_to_display_unit(figure("cost")) == figure("cost")

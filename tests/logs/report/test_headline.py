@@ -17,12 +17,13 @@ from synthetic_scene import room
 
 from logs.recording.flight import FlightData
 from logs.recording.summary import summarise
-from logs.report.causes import BAD, GOOD, MIND, Headline, HeadlineCause
-from logs.report.excursion import excursions
-from logs.report.headline import headline
-from logs.report.plots import fences, input_beyond, path, path_3d, state_beyond
-from logs.report.timeline import script
-from logs.report.verdicts import Judged, judge
+from logs.report.causes import BAD, CAUTION, GOOD, Headline, HeadlineCause
+from logs.report.cursor import render_cursor_script
+from logs.report.excursion import find_excursions
+from logs.report.headline import derive_headline
+from logs.report.path_3d import draw_path_3d
+from logs.report.plots import draw_path_views, find_input_violations, find_moving_limits, find_state_violations
+from logs.report.verdicts import Judgement, judge_flight
 from uavctl.records import Setpoint, SetpointSource, Truth
 
 WALLS = {  # axis, sign, limit of preset and scene
@@ -36,8 +37,8 @@ BLOWN = RELAYED[2]
 WENT = re.compile(r"went ([\d.]+) (m|mm) (?:through the (.*?)|below the (floor)) at ([\d.]+) s")
 
 
-def head(flight: FlightData, judged: Judged | None = None) -> Headline:
-    return headline(flight, summarise(flight, wall_s=None), judge(flight) if judged is None else judged)
+def head(flight: FlightData, judged: Judgement | None = None) -> Headline:
+    return derive_headline(flight, summarise(flight, wall_s=None), judge_flight(flight) if judged is None else judged)
 
 
 def went(text: str) -> tuple[float, str, float]:
@@ -47,8 +48,8 @@ def went(text: str) -> tuple[float, str, float]:
     return float(found[1]) * (1e-3 if found[2] == "mm" else 1.0), found[3] or found[4], float(found[5])
 
 
-def check(found: Headline, wanted: tuple[float, str, float]) -> None:
-    beyond_m, wall, at_s = went(found.text)
+def check(headline: Headline, wanted: tuple[float, str, float]) -> None:
+    beyond_m, wall, at_s = went(headline.text)
     assert wall == wanted[1]
     assert (beyond_m, at_s) == pytest.approx((wanted[0], wanted[2]), abs=0.06)
 
@@ -69,8 +70,8 @@ def flight() -> FlightData:
 
 
 @pytest.fixture(scope="module")
-def judged(flight: FlightData) -> Judged:
-    return judge(flight)
+def judged(flight: FlightData) -> Judgement:
+    return judge_flight(flight)
 
 
 def bumped(flight: FlightData, wall: str, beyond_m: float, at_s: float, width_s: float = 0.6) -> FlightData:
@@ -95,52 +96,56 @@ def dataclass_of(truth: Truth, place: list[float], state: list[float]) -> Truth:
 
 
 @pytest.mark.parametrize("wall", WALLS)
-def test_it_names_wall_metres_and_time(flight: FlightData, judged: Judged, wall: str) -> None:
-    found = head(bumped(flight, wall, 1.6, 8.0), judged)
-    assert found.tone == BAD
-    check(found, (1.6, wall, 8.0))
-    assert found.at_s == pytest.approx(8.0, abs=0.06)
+def test_it_names_wall_metres_and_time(flight: FlightData, judged: Judgement, wall: str) -> None:
+    headline = head(bumped(flight, wall, 1.6, 8.0), judged)
+    assert headline.tone == BAD
+    check(headline, (1.6, wall, 8.0))
+    assert headline.at_s == pytest.approx(8.0, abs=0.06)
 
 
-def test_a_touch_is_no_grave_matter(flight: FlightData, judged: Judged) -> None:
-    found = head(bumped(flight, "east wall", 0.02, 8.0), judged)
-    assert HeadlineCause.TOUCHED_LIMIT in found.causes and HeadlineCause.LEFT_LIMITS not in found.causes
-    (told,) = [one for one in found.why if WENT.search(one)]
-    assert went(told)[:2] == (0.02, "east wall")
+def test_a_touch_is_no_grave_matter(flight: FlightData, judged: Judgement) -> None:
+    headline = head(bumped(flight, "east wall", 0.02, 8.0), judged)
+    assert HeadlineCause.TOUCHED_LIMIT in headline.causes and HeadlineCause.LEFT_LIMITS not in headline.causes
+    (sentence,) = [reason for reason in headline.reasons if WENT.search(reason)]
+    assert went(sentence)[:2] == (0.02, "east wall")
 
 
-def test_a_flight_that_stayed_inside_says_so(flight: FlightData, judged: Judged) -> None:
-    found = head(flight, judged)
-    assert furthest(flight)[0] < 0.0 and excursions(flight) == ()
-    assert found.tone == GOOD and "inside its walls throughout" in found.text
-    near = re.search(r"([\d.]+) m from the (.*?) at the nearest, (?:at ([\d.]+) s|where it began)", found.text)
+def test_a_flight_that_stayed_inside_says_so(flight: FlightData, judged: Judgement) -> None:
+    headline = head(flight, judged)
+    assert furthest(flight)[0] < 0.0 and find_excursions(flight) == ()
+    assert headline.tone == GOOD and "inside its walls throughout" in headline.text
+    near = re.search(r"([\d.]+) m from the (.*?) at the nearest, (?:at ([\d.]+) s|where it began)", headline.text)
     assert near is not None
     beyond_m, wall, at_s = furthest(flight)
     assert near[2] == wall and float(near[1]) == pytest.approx(-beyond_m, abs=0.05)
     assert float(near[3] or 0.5) == pytest.approx(at_s, abs=0.06 if near[3] else 0.5)
 
 
-def test_without_truth_it_says_by_what(flight: FlightData, judged: Judged) -> None:
+def test_without_truth_it_says_by_what(flight: FlightData, judged: Judgement) -> None:
     assert "by the estimate" in head(dataclasses.replace(flight, truths=()), judged).text
     assert "by the estimate" not in head(flight, judged).text
 
 
-def test_it_says_when_it_left_and_came_back(flight: FlightData, judged: Judged) -> None:
+def test_it_says_when_it_left_and_came_back(flight: FlightData, judged: Judgement) -> None:
     moved = bumped(flight, "north wall", 1.0, 8.0)
-    (one,) = excursions(moved)
+    (excursion,) = find_excursions(moved)
     beyond = [(t.at_ns - flight.origin_ns) * 1e-9 for t in moved.truths if t.position_m[0] > 3.0]
-    assert one.left_s == pytest.approx(beyond[0]) and one.back_s == pytest.approx(beyond[-1] + 0.05, abs=0.051)
-    (told,) = [why for why in head(moved, judged).why if "beyond the north wall" in why]
-    assert [float(n) for n in re.findall(r"([\d.]+) s\b", told)] == pytest.approx([one.left_s, one.back_s], abs=0.051)
+    assert excursion.exit_s == pytest.approx(beyond[0]) and excursion.return_s == pytest.approx(
+        beyond[-1] + 0.05, abs=0.051
+    )
+    (sentence,) = [why for why in head(moved, judged).reasons if "beyond the north wall" in why]
+    assert [float(n) for n in re.findall(r"([\d.]+) s\b", sentence)] == pytest.approx(
+        [excursion.exit_s, excursion.return_s], abs=0.051
+    )
 
 
 def test_blind_is_the_time_without_a_position() -> None:
     silent = FlightData.from_records(fly(room(), 12.0, blackout=(4.0, 8.0)))
-    captured = sorted(one.captured_ns for one in silent.samples)
+    captured = sorted(sample.captured_ns for sample in silent.samples)
     gap_s = float(np.diff(captured).max()) * 1e-9
-    found = head(silent)
-    assert found.cause in (HeadlineCause.FLOWN_BLIND, HeadlineCause.SILENCE)
-    lasted, begun, ended = (float(n) for n in re.findall(r"([\d.]+) s", found.text)[:3])
+    headline = head(silent)
+    assert headline.cause in (HeadlineCause.FLOWN_BLIND, HeadlineCause.SILENCE)
+    lasted, begun, ended = (float(n) for n in re.findall(r"([\d.]+) s", headline.text)[:3])
     assert lasted == pytest.approx(gap_s, abs=0.26)  # known at ticks, and until the next position has come
     assert ended - begun == pytest.approx(lasted, abs=0.11)
     assert begun <= 4.05 and 7.9 <= ended <= 8.6
@@ -148,15 +153,15 @@ def test_blind_is_the_time_without_a_position() -> None:
 
 @pytest.mark.parametrize("code", [None, "hung-up", "went-silent"])
 def test_a_vehicle_that_was_not_heard_is_told_before_what_came_of_it(
-    flight: FlightData, judged: Judged, code: str | None
+    flight: FlightData, judged: Judgement, code: str | None
 ) -> None:
     assert HeadlineCause.VEHICLE_SILENT not in head(flight, judged).causes
-    kept = [one for one in flight.vehicles if not 3.0 < (one.at_ns - flight.origin_ns) * 1e-9 < 7.0]
+    kept = [status for status in flight.vehicles if not 3.0 < (status.at_ns - flight.origin_ns) * 1e-9 < 7.0]
     events = () if code is None else make_link().add_refusals({code: 1}, flight.origin_ns + 3_400_000_000)
     deaf = dataclasses.replace(flight, vehicles=tuple(kept), events=(*flight.events, *events))
-    found = head(deaf, judged)
-    first = found.text
-    assert found.cause is HeadlineCause.VEHICLE_SILENT
+    headline = head(deaf, judged)
+    first = headline.text
+    assert headline.cause is HeadlineCause.VEHICLE_SILENT
     assert "for 4.0 s, from 3.0 s on" in first
     assert ("at 3.4 s" in first and "connection" in first) == (code is not None)
     ends = dataclasses.replace(flight, vehicles=flight.vehicles[:8])
@@ -164,21 +169,21 @@ def test_a_vehicle_that_was_not_heard_is_told_before_what_came_of_it(
 
 
 @pytest.mark.parametrize("every", [3, 50])
-def test_setpoints_that_the_gate_changed_are_counted(flight: FlightData, judged: Judged, every: int) -> None:
+def test_setpoints_that_the_gate_changed_are_counted(flight: FlightData, judged: Judgement, every: int) -> None:
     def sent(number: int, at_ns: int) -> Setpoint:
         limited = () if number % every else ("slew-north",)
         return Setpoint(at_ns=at_ns, accel_mps2=(0.0, 0.0, 0.0), source=SetpointSource.PLAN, limited=limited)
 
-    setpoints = tuple(sent(number, one.at_ns) for number, one in enumerate(flight.decisions))
-    told = " ".join(head(dataclasses.replace(flight, setpoints=setpoints), judged).why)
-    share = 100.0 * sum(bool(one.limited) for one in setpoints) / len(setpoints)
-    assert (f"limited {share:.0f} % of the setpoints" in told) is (every == 3)
-    assert ("slew north" in told) is (every == 3)
+    setpoints = tuple(sent(number, decision.at_ns) for number, decision in enumerate(flight.decisions))
+    sentence = " ".join(head(dataclasses.replace(flight, setpoints=setpoints), judged).reasons)
+    share = 100.0 * sum(bool(setpoint.limited) for setpoint in setpoints) / len(setpoints)
+    assert (f"limited {share:.0f} % of the setpoints" in sentence) is (every == 3)
+    assert ("slew north" in sentence) is (every == 3)
 
 
 def test_crosses_are_on_the_axis_that_is_outside_only(flight: FlightData) -> None:
     moved = bumped(flight, "north wall", 1.0, 8.0)
-    counts = [int(state_beyond(moved, index).sum()) for index in range(9)]
+    counts = [int(find_state_violations(moved, index).sum()) for index in range(9)]
     assert counts[0] > 0 and sum(counts) == counts[0]
     steps = flight.steps
     decided = steps.decided.copy()
@@ -186,26 +191,26 @@ def test_crosses_are_on_the_axis_that_is_outside_only(flight: FlightData) -> Non
     over = dataclasses.replace(steps, decided=decided)
     pushed = dataclasses.replace(flight)
     pushed.__dict__["steps"] = over
-    assert [int(input_beyond(pushed, number).sum()) for number in range(3)] == [0, 1, 0]
+    assert [int(find_input_violations(pushed, number).sum()) for number in range(3)] == [0, 1, 0]
 
 
 def test_the_place_is_marked_in_each_view_of_the_path(flight: FlightData) -> None:
-    def marked(one: FlightData) -> list[list[str]]:
+    def marked(flight: FlightData) -> list[list[str]]:
         with drawn() as figures:
-            list(path(one))
-            path_3d(one)
+            list(draw_path_views(flight))
+            draw_path_3d(flight)
         texts = [[text.get_text() for text in figure.axes[0].texts] for figure in figures.values()]
         return [[text for text in each if text.startswith("left at") or " m out at " in text] for each in texts]
 
     moved = bumped(flight, "north wall", 1.0, 8.0)
-    (one,) = excursions(moved)
-    wanted = [f"left at {one.left_s:.1f} s", f"1 m out at {one.worst_s:.1f} s"]
+    (excursion,) = find_excursions(moved)
+    wanted = [f"left at {excursion.exit_s:.1f} s", f"1 m out at {excursion.worst_s:.1f} s"]
     assert marked(moved) == [wanted] * 3
     assert marked(flight) == [[]] * 3
 
 
 def test_the_cursor_has_the_true_path_and_begins_where_it_matters(flight: FlightData) -> None:
-    text = script(flight, 8.0)
+    text = render_cursor_script(flight, 8.0)
     found = re.search(r"const flight = (\{.*?\});\n", text)
     assert found is not None
     given = json.loads(found[1])
@@ -229,17 +234,17 @@ def blown() -> FlightData:
 
 @pytest.mark.slow
 def test_wind_beyond_the_vehicles_strength_carries_it_out(blown: FlightData) -> None:
-    found = head(blown)
+    headline = head(blown)
     beyond_m, wall, at_s = furthest(blown)
-    assert beyond_m > 0.3 and wall == "north wall" and found.tone == BAD
-    check(found, (beyond_m, wall, at_s))
-    assert "wind" in found.text
+    assert beyond_m > 0.3 and wall == "north wall" and headline.tone == BAD
+    check(headline, (beyond_m, wall, at_s))
+    assert "wind" in headline.text
     bound = [event for event in blown.events if event.code == "bias-at-bound"]
-    told = [why for why in found.why if "bias was at its bound" in why]
-    assert bool(told) == bool(bound)
+    sentence = [why for why in headline.reasons if "bias was at its bound" in why]
+    assert bool(sentence) == bool(bound)
     assert blown.breach is not None
-    assert HeadlineCause.LET_GO in found.causes
-    (let_go,) = [why for why in found.why if blown.breach.text in why]
+    assert HeadlineCause.LET_GO in headline.causes
+    (let_go,) = [why for why in headline.reasons if blown.breach.text in why]
     (breach_s,) = blown.seconds([blown.breach.at_ns])
     assert f"at {breach_s:.1f} s" in let_go
 
@@ -249,14 +254,14 @@ def test_a_drifting_frame_is_told_as_wrong_positions_and_not_as_wind() -> None:
     fault = 'sim.fault=[{at_s=6.0, kind="drift", velocity_mps=[-0.1, 0.0, 0.0]}]'
     memory = lockstep("room", 22.0, "sim.plant=linear", "sim.seed=3", "target.position_m=[2.2, 1.0, -1.2]", fault)
     drifted = FlightData.from_records(memory.entries)
-    found, (beyond_m, wall, at_s) = head(drifted), furthest(drifted)
-    assert "wind carried" not in found.text and "carried by wind" not in found.text
+    headline, (beyond_m, wall, at_s) = head(drifted), furthest(drifted)
+    assert "wind carried" not in headline.text and "carried by wind" not in headline.text
     if beyond_m > 0.05:
-        check(found, (beyond_m, wall, at_s))
-    assert HeadlineCause.POSITIONS_DRIFTED in found.causes and HeadlineCause.WIND not in found.causes
-    (told,) = [one for one in (found.text, *found.why) if "from the true place" in one]
+        check(headline, (beyond_m, wall, at_s))
+    assert HeadlineCause.POSITIONS_DRIFTED in headline.causes and HeadlineCause.WIND not in headline.causes
+    (sentence,) = [text for text in (headline.text, *headline.reasons) if "from the true place" in text]
     first_s = 6.0 + 0.3 / 0.1
-    assert float(re.search(r"first at ([\d.]+) s", told)[1]) == pytest.approx(first_s, abs=0.5)  # type: ignore[index]
+    assert float(re.search(r"first at ([\d.]+) s", sentence)[1]) == pytest.approx(first_s, abs=0.5)  # type: ignore[index]
 
 
 @pytest.mark.slow
@@ -264,27 +269,27 @@ def test_a_fence_that_closes_in_is_drawn_and_named() -> None:
     fence = 'fence=[{state="north", side="upper", times_s=[4.0, 8.0], values=[3.0, 0.5]}]'
     memory = lockstep("room", 11.0, "sim.seed=3", fence)
     closed = FlightData.from_records(memory.entries)
-    (one,) = fences(closed)
-    assert (one.axis, one.upper) == ("north", True)
-    assert one.tightest_m == pytest.approx(0.5)
-    assert one.at_s == pytest.approx(8.1, abs=0.2)
-    found = head(closed)
+    (limit,) = find_moving_limits(closed)
+    assert (limit.axis, limit.upper) == ("north", True)
+    assert limit.tightest_m == pytest.approx(0.5)
+    assert limit.at_s == pytest.approx(8.1, abs=0.2)
+    headline = head(closed)
     assert furthest(closed)[0] < 0.0
-    assert "fence" in found.text and found.tone == MIND
+    assert "fence" in headline.text and headline.tone == CAUTION
     late = [t.position_m[0] for t in closed.truths if (t.at_ns - closed.origin_ns) * 1e-9 > 8.2]
     assert max(late) < 0.55  # and so the target, at 1.5 m, was not to be reached
-    assert re.search(r"target at the last step, which lay 1\.0 m beyond the limit north", found.text)
+    assert re.search(r"target at the last step, which lay 1\.0 m beyond the limit north", headline.text)
 
 
 @pytest.mark.slow
 def test_a_recorded_flight_that_was_blown_away_is_told_by_its_positions() -> None:
     """PX4's own simulator, in a wind that its pilot had not ordered for; its truth was recorded beside it."""
     since_s, lasted_s = 50.0, 12.0
-    found = head(page_of(listened(BLOWN, since_s, lasted_s).memory))
-    beyond_m, wall, at_s = went(found.text)
+    headline = head(page_of(listened(BLOWN, since_s, lasted_s).memory))
+    beyond_m, wall, at_s = went(headline.text)
     rows = truth(BLOWN)
     true_m = [float(np.interp(since_s + at_s, rows[:, 0], rows[:, 1 + axis])) for axis in range(3)]
     truly = {name: sign * true_m[axis] - limit for name, (axis, sign, limit) in WALLS.items()}
     assert wall == max(truly, key=truly.__getitem__) and truly[wall] > 0.5
     assert beyond_m == pytest.approx(truly[wall], abs=0.1)  # by positions, which are a little old
-    assert "no longer believed" in found.text and found.tone == BAD
+    assert "no longer believed" in headline.text and headline.tone == BAD

@@ -19,12 +19,13 @@ from synthetic_scene import room
 
 from logs.recording.flight import FlightData
 from logs.recording.mavlink_flight import read_flight
-from logs.recording.summary import course_error, position_error_m, summarise
+from logs.recording.summary import compute_course_error, compute_position_errors_m, summarise
 from logs.recording.topics import RECOVERED, RecorderNote
-from logs.report.causes import GOOD, Headline, HeadlineCause, cause_of_text, ranked
-from logs.report.headline import headline
-from logs.report.tlog_headline import headline_of
-from logs.report.verdicts import judge
+from logs.report.causes import GOOD, Headline, HeadlineCause, sort_findings
+from logs.report.headline import derive_headline
+from logs.report.tlog_headline import derive_tlog_headline
+from logs.report.vehicle_texts import classify_text
+from logs.report.verdicts import judge_flight
 from uavctl.flight.monitors import verdict as monitor
 from uavctl.mavlink.codec import BAD_FIELD
 from uavctl.outcome import Cause, make_ending
@@ -37,7 +38,7 @@ PILOTS = {"px4": "POSCTL", "ardupilot": "LOITER"}
 
 
 def head(flight: FlightData) -> Headline:
-    return headline(flight, summarise(flight, wall_s=None), judge(flight))
+    return derive_headline(flight, summarise(flight, wall_s=None), judge_flight(flight))
 
 
 def flown(autopilot: str, duration_s: float, *overrides: str) -> FlightData:
@@ -59,9 +60,9 @@ def flown(autopilot: str, duration_s: float, *overrides: str) -> FlightData:
 )
 def test_a_fault_is_named_and_never_called_wind(autopilot: str, fault: str, wanted: set[HeadlineCause]) -> None:
     flight = flown(autopilot, 12.0, f"sim.fault=[{fault}]")
-    found = head(flight)
-    assert found.cause in wanted
-    assert C.WIND not in found.causes and C.ALL_WELL not in found.causes
+    headline = head(flight)
+    assert headline.cause in wanted
+    assert C.WIND not in headline.causes and C.ALL_WELL not in headline.causes
 
 
 @pytest.mark.slow
@@ -69,12 +70,12 @@ def test_a_fault_is_named_and_never_called_wind(autopilot: str, fault: str, want
 def test_the_pilots_stick_is_named(autopilot: str) -> None:
     fault = f'{{at_s=5.0, kind="mode", name="{PILOTS[autopilot]}"}}'
     flight = flown(autopilot, 8.0, f"sim.fault=[{fault}]")
-    left = next(one for one in flight.vehicles if not one.external)
+    left = next(status for status in flight.vehicles if not status.external)
     # Who switched is the ending's to say; a recording without one tells the mode alone.
     assert head(flight).cause in (C.PILOT, C.MODE_LEFT)
     ended = dataclasses.replace(flight, endings=(make_ending(Cause.PILOT, Cause.PILOT.value),))
-    found = head(ended)
-    assert found.cause is C.PILOT and found.at_s == pytest.approx((left.at_ns - flight.origin_ns) * 1e-9)
+    headline = head(ended)
+    assert headline.cause is C.PILOT and headline.at_s == pytest.approx((left.at_ns - flight.origin_ns) * 1e-9)
 
 
 # --- made from the records of one good flight ---
@@ -86,7 +87,7 @@ def good() -> FlightData:
     return dataclasses.replace(flight, endings=(make_ending(Cause.OPERATOR, Cause.OPERATOR.value),))
 
 
-def told(flight: FlightData, at_s: float, code: str, text: str, severity: Severity, count: int = 1) -> FlightData:
+def add_event(flight: FlightData, at_s: float, code: str, text: str, severity: Severity, count: int = 1) -> FlightData:
     event = Event(at_ns=flight.origin_ns + round(at_s * SECOND), severity=severity, code=code, text=text, count=count)
     return dataclasses.replace(flight, events=(*flight.events, event))
 
@@ -119,9 +120,9 @@ def statuses(flight: FlightData, volts: Sequence[float | None], **more: Any) -> 
     ],
 )
 def test_a_battery_that_falls(good: FlightData, volts: list[float | None], cause: HeadlineCause | None) -> None:
-    found = head(statuses(good, volts))
-    assert {C.BATTERY_EMPTY, C.BATTERY_LOW} & set(found.causes) == ({cause} if cause else set())
-    assert cause is None or found.cause is cause
+    headline = head(statuses(good, volts))
+    assert {C.BATTERY_EMPTY, C.BATTERY_LOW} & set(headline.causes) == ({cause} if cause else set())
+    assert cause is None or headline.cause is cause
 
 
 @pytest.mark.parametrize(
@@ -139,12 +140,12 @@ def test_a_battery_that_falls(good: FlightData, volts: list[float | None], cause
 )
 def test_what_the_vehicle_says(good: FlightData, text: str, severity: Severity, cause: HeadlineCause | None) -> None:
     plain = statuses(good, [4.1] * 12)
-    found = head(told(plain, 6.0, "vehicle-text", text, severity))
-    assert found.causes == (head(plain).causes if cause is None else (cause, *set(found.causes) - {cause}))
+    headline = head(add_event(plain, 6.0, "vehicle-text", text, severity))
+    assert headline.causes == (head(plain).causes if cause is None else (cause, *set(headline.causes) - {cause}))
     disarmed = dataclasses.replace(
-        plain, vehicles=tuple(msgspec.structs.replace(one, armed=False) for one in plain.vehicles)
+        plain, vehicles=tuple(msgspec.structs.replace(status, armed=False) for status in plain.vehicles)
     )
-    assert cause is None or cause not in head(told(disarmed, 6.0, "vehicle-text", text, severity)).causes
+    assert cause is None or cause not in head(add_event(disarmed, 6.0, "vehicle-text", text, severity)).causes
 
 
 @pytest.mark.parametrize(
@@ -180,11 +181,11 @@ def test_a_killed_process_is_told_with_what_is_left(good: FlightData) -> None:
 
 
 def test_a_process_that_is_killed_in_the_vehicles_own_climb_has_cut_the_recording(good: FlightData) -> None:
-    waited = tuple(msgspec.structs.replace(one, mode=ControlMode.WAIT) for one in good.decisions)
+    waited = tuple(msgspec.structs.replace(decision, mode=ControlMode.WAIT) for decision in good.decisions)
     begun = RecorderNote(at_ns=good.origin_ns, text="begin", segment=1, written=0, dropped=0, refused=0, failures=0)
     cut = dataclasses.replace(statuses(good, [4.1] * 12), decisions=waited, endings=(), notes=(begun,))
     assert cut.breaks_off and head(cut).cause is C.RECORDING_CUT
-    down = tuple(msgspec.structs.replace(one, armed=False) for one in cut.vehicles)
+    down = tuple(msgspec.structs.replace(status, armed=False) for status in cut.vehicles)
     assert C.RECORDING_CUT not in head(dataclasses.replace(cut, vehicles=down)).causes
 
 
@@ -194,15 +195,17 @@ def test_a_prediction_alone_says_of_no_wall_that_it_was_passed(good: FlightData,
     last_ns = good.origin_ns + 6 * SECOND
     far = tuple(
         msgspec.structs.replace(
-            one, mean=(20.0, *one.mean[1:]), captured_ns=last_ns - 90 * SECOND if predicted else one.captured_ns
+            estimate,
+            mean=(20.0, *estimate.mean[1:]),
+            captured_ns=last_ns - 90 * SECOND if predicted else estimate.captured_ns,
         )
-        if one.at_ns > last_ns
-        else one
-        for one in good.estimates
+        if estimate.at_ns > last_ns
+        else estimate
+        for estimate in good.estimates
     )
     aged = tuple(
-        msgspec.structs.replace(one, age_steps=1000) if predicted and one.at_ns > last_ns else one
-        for one in good.decisions
+        msgspec.structs.replace(decision, age_steps=1000) if predicted and decision.at_ns > last_ns else decision
+        for decision in good.decisions
     )
     flight = dataclasses.replace(good, truths=(), estimates=far, decisions=aged)
     assert (C.LEFT_LIMITS in head(flight).causes) != predicted
@@ -214,11 +217,11 @@ def test_a_vehicle_is_not_silent_while_we_did_not_run(good: FlightData, ran: boo
     """Four seconds without a heartbeat, in which the process ran, or stood still."""
     begun_ns, ended_ns = (good.origin_ns + n * SECOND for n in (4, 8))
     plain = statuses(good, [4.1] * 12)
-    heard = tuple(one for one in plain.vehicles if not begun_ns < one.at_ns < ended_ns)
-    ticks = tuple(one for one in good.decisions if ran or not begun_ns < one.at_ns < ended_ns)
-    found = head(dataclasses.replace(plain, vehicles=heard, decisions=ticks))
-    assert (C.VEHICLE_SILENT in found.causes) == ran and (C.STOOD_STILL in found.causes) != ran
-    off = tuple(msgspec.structs.replace(one, armed=False) for one in heard)
+    heard = tuple(status for status in plain.vehicles if not begun_ns < status.at_ns < ended_ns)
+    ticks = tuple(decision for decision in good.decisions if ran or not begun_ns < decision.at_ns < ended_ns)
+    headline = head(dataclasses.replace(plain, vehicles=heard, decisions=ticks))
+    assert (C.VEHICLE_SILENT in headline.causes) == ran and (C.STOOD_STILL in headline.causes) != ran
+    off = tuple(msgspec.structs.replace(status, armed=False) for status in heard)
     assert C.VEHICLE_SILENT not in head(dataclasses.replace(plain, vehicles=off)).causes
 
 
@@ -234,8 +237,8 @@ def test_a_vehicle_is_not_silent_while_we_did_not_run(good: FlightData, ran: boo
     ],
 )
 def test_what_was_refused(good: FlightData, code: str, cause: HeadlineCause) -> None:
-    found = head(told(good, 5.0, code, "", Severity.WARNING, count=75))
-    assert cause in found.causes and C.ALL_WELL not in found.causes
+    headline = head(add_event(good, 5.0, code, "", Severity.WARNING, count=75))
+    assert cause in headline.causes and C.ALL_WELL not in headline.causes
 
 
 def with_bad(flight: FlightData, reason: str, count: int) -> FlightData:
@@ -257,7 +260,7 @@ def test_a_relay_that_stops_is_told_by_its_counters(good: FlightData) -> None:
     )  # fmt: skip
     plain = statuses(good, [4.1] * 12)
     assert C.RELAY_SILENT in head(dataclasses.replace(plain, relays=rows)).causes
-    whole = tuple(msgspec.structs.replace(one, sent=20 * n) for n, one in enumerate(rows))
+    whole = tuple(msgspec.structs.replace(row, sent=20 * n) for n, row in enumerate(rows))
     assert C.RELAY_SILENT not in head(dataclasses.replace(plain, relays=whole)).causes
 
 
@@ -268,17 +271,17 @@ def test_a_relay_that_stops_is_told_by_its_counters(good: FlightData) -> None:
 def test_a_position_that_was_never_valid(good: FlightData, came: bool, unread: int, cause: HeadlineCause) -> None:
     """Nothing was ever estimated, as no position came, none was a number, or none could be used."""
     waited = tuple(
-        msgspec.structs.replace(one, mode=ControlMode.WAIT, accepted=0, plan_seq=None, input=None)
-        for one in good.decisions
+        msgspec.structs.replace(decision, mode=ControlMode.WAIT, accepted=0, plan_seq=None, input=None)
+        for decision in good.decisions
     )
-    inputs = tuple(one if came else msgspec.structs.replace(one, samples=()) for one in good.step_inputs)
+    inputs = tuple(step if came else msgspec.structs.replace(step, samples=()) for step in good.step_inputs)
     never = dataclasses.replace(good, decisions=waited, estimates=(), plans=(), step_inputs=inputs)
     assert head(with_bad(never, BAD_FIELD, unread)).cause is cause
 
 
 def test_all_well_is_said_of_a_flight_in_which_nothing_is_amiss(good: FlightData) -> None:
-    found = head(good)
-    assert found.tone == GOOD and found.cause is C.ALL_WELL
+    headline = head(good)
+    assert headline.tone == GOOD and headline.cause is C.ALL_WELL
 
 
 @pytest.mark.parametrize("off_m", [0.0, 0.36])
@@ -289,9 +292,9 @@ def test_the_whole_course_counts_and_not_its_end(good: FlightData, off_m: float)
     state[:, good.design.position_index[0]] += off_m * ((steps.t_s > 5.0) & (steps.t_s < 9.0))
     moved = dataclasses.replace(good)
     moved.__dict__["steps"] = dataclasses.replace(steps, state=state)
-    found, error = head(moved), course_error(moved)
-    assert error is not None and (C.OFF_TRACK in found.causes) == bool(off_m)
-    assert error.worst_m == pytest.approx(position_error_m(moved)[steps.t_s >= 5.0].max()) or not off_m
+    headline, error = head(moved), compute_course_error(moved)
+    assert error is not None and (C.OFF_TRACK in headline.causes) == bool(off_m)
+    assert error.worst_m == pytest.approx(compute_position_errors_m(moved)[steps.t_s >= 5.0].max()) or not off_m
     assert not off_m or 5.0 < error.worst_s < 9.0
 
 
@@ -323,24 +326,24 @@ def test_a_wall_that_is_passed_by_less_than_a_position_is_off_is_no_headline(
 
 
 def test_the_gravest_comes_first_and_within_a_rank_the_earliest(good: FlightData) -> None:
-    found = head(told(told(statuses(good, [4.2] * 6 + [0.0] * 6), 2.0, "vehicle-text", "Radio Failsafe", Severity.INFO),
-                      1.0, "vehicle-text", "Max Alt fence breached", Severity.INFO))  # fmt: skip
-    assert found.causes[:3] == (C.BATTERY_EMPTY, C.VEHICLE_FENCE, C.VEHICLE_FAILSAFE)
-    assert ranked([]) == []
-    assert cause_of_text("PreArm: Battery Failsafe", grave=True, warns=True) is None
+    failed = add_event(statuses(good, [4.2] * 6 + [0.0] * 6), 2.0, "vehicle-text", "Radio Failsafe", Severity.INFO)
+    headline = head(add_event(failed, 1.0, "vehicle-text", "Max Alt fence breached", Severity.INFO))
+    assert headline.causes[:3] == (C.BATTERY_EMPTY, C.VEHICLE_FENCE, C.VEHICLE_FAILSAFE)
+    assert sort_findings([]) == []
+    assert classify_text("PreArm: Battery Failsafe", is_error=True, is_warning=True) is None
 
 
 @pytest.mark.parametrize(("lets_go", "reason"), [(False, "held back"), (True, "held back"), (True, "nothing comes")])
 def test_a_relay_that_is_held_back_as_the_vehicle_was_let_go_is_no_cause(
     good: FlightData, lets_go: bool, reason: str
 ) -> None:
-    flight = told(good, 5.5, "relay-silent", "", Severity.WARNING)
+    flight = add_event(good, 5.5, "relay-silent", "", Severity.WARNING)
     row = RelayStats(at_ns=good.origin_ns + 6 * SECOND, sent=100, kept={}, last_ns=good.origin_ns + 5 * SECOND,
                      alone=False, silent_for=reason)  # fmt: skip
     if lets_go:
-        flight = told(flight, 5.0, monitor.Cause.OUTSIDE, "the estimate leaves a limit", Severity.ERROR)
-    found = head(dataclasses.replace(flight, relays=(row,)))
-    assert (C.RELAY_SILENT in found.causes) != (lets_go and reason == "held back")
+        flight = add_event(flight, 5.0, monitor.Cause.OUTSIDE, "the estimate leaves a limit", Severity.ERROR)
+    headline = head(dataclasses.replace(flight, relays=(row,)))
+    assert (C.RELAY_SILENT in headline.causes) != (lets_go and reason == "held back")
 
 
 @pytest.mark.parametrize(("left_s", "windy"), [(None, True), (6, False), (11, True)])
@@ -350,12 +353,12 @@ def test_what_pushes_once_the_vehicle_follows_setpoints_no_more_is_no_wind(
     """The vehicle lands by itself from a time on; a push is told at 5.6 s."""
     plain = statuses(good, [4.1] * 12)
     modes = tuple(
-        one
+        status
         if left_s is None or number < left_s
-        else msgspec.structs.replace(one, mode="AUTO.LAND", external=False, failsafe=True)
-        for number, one in enumerate(plain.vehicles)
+        else msgspec.structs.replace(status, mode="AUTO.LAND", external=False, failsafe=True)
+        for number, status in enumerate(plain.vehicles)
     )
-    flight = told(dataclasses.replace(plain, vehicles=modes), 5.6, "bias-at-bound", "", Severity.WARNING)
+    flight = add_event(dataclasses.replace(plain, vehicles=modes), 5.6, "bias-at-bound", "", Severity.WARNING)
     assert (C.WIND in head(flight).causes) == windy
 
 
@@ -371,16 +374,16 @@ def test_a_vehicle_that_was_armed_and_stood_still_never_rose(
     vehicles = (msgspec.structs.replace(first, armed=False, landed=landed), *later)
     inputs = tuple(
         msgspec.structs.replace(
-            one,
+            step,
             samples=tuple(
                 msgspec.structs.replace(sample, position_m=(moves_m * (number // 20 % 2), 0.0, 0.0))
-                for sample in one.samples
+                for sample in step.samples
             ),
         )
-        for number, one in enumerate(plain.step_inputs)
+        for number, step in enumerate(plain.step_inputs)
     )
-    found = head(dataclasses.replace(plain, vehicles=vehicles, step_inputs=inputs))
-    assert (C.NOT_RISEN in found.causes) != risen
+    headline = head(dataclasses.replace(plain, vehicles=vehicles, step_inputs=inputs))
+    assert (C.NOT_RISEN in headline.causes) != risen
 
 
 @pytest.mark.parametrize("order", ["COMPONENT_ARM_DISARM", "DO_SET_MODE"])
@@ -388,13 +391,15 @@ def test_a_vehicle_that_was_armed_and_stood_still_never_rose(
 def test_a_vehicle_that_never_armed_refused_it(good: FlightData, order: str, armed: bool) -> None:
     grounded = statuses(good, [4.1] * 12)
     vehicles = tuple(
-        msgspec.structs.replace(one, armed=armed, external=False, landed=True) for one in grounded.vehicles
+        msgspec.structs.replace(status, armed=armed, external=False, landed=True) for status in grounded.vehicles
     )
-    waited = tuple(msgspec.structs.replace(one, mode=ControlMode.WAIT, boundary=False) for one in good.decisions)
+    waited = tuple(
+        msgspec.structs.replace(decision, mode=ControlMode.WAIT, boundary=False) for decision in good.decisions
+    )
     flight = dataclasses.replace(grounded, vehicles=vehicles, decisions=waited, setpoints=())
-    refused = told(flight, 3.0, "command-ack", f"{order}: DENIED", Severity.WARNING)
+    refused = add_event(flight, 3.0, "command-ack", f"{order}: DENIED", Severity.WARNING)
     assert (head(refused).cause is C.BEGIN_REFUSED) != armed
-    granted = told(refused, 5.0, "command-ack", f"{order}: ACCEPTED", Severity.INFO)
+    granted = add_event(refused, 5.0, "command-ack", f"{order}: ACCEPTED", Severity.INFO)
     assert C.BEGIN_REFUSED not in head(granted).causes
 
 
@@ -404,12 +409,12 @@ def test_a_vehicle_that_never_armed_refused_it(good: FlightData, order: str, arm
 def written(tmp_path: Path, packets: list[tuple[float, int, Any]]) -> Headline:
     senders: dict[int, Any] = {}
     data = bytearray()
-    for at_s, system, message in sorted(packets, key=lambda one: one[0]):
+    for at_s, system, message in sorted(packets, key=lambda packet: packet[0]):
         mav = senders.setdefault(system, mavlink.MAVLink(None, srcSystem=system, srcComponent=1))
         data += struct.pack(">Q", 1_764_000_000_000_000 + round(at_s * 1e6)) + message.pack(mav)
     path = tmp_path / "a.tlog"
     path.write_bytes(data)
-    return headline_of(read_flight(path))
+    return derive_tlog_headline(read_flight(path))
 
 
 def beat(mode: int = 4, *, armed: bool = True) -> Any:
@@ -449,7 +454,7 @@ def frozen() -> list[tuple[float, int, Any]]:
 
 
 def killed() -> list[tuple[float, int, Any]]:
-    return [one for one in course() if one[1] == 20 or one[0] < 6.0]
+    return [message for message in course() if message[1] == 20 or message[0] < 6.0]
 
 
 def unstamped() -> list[tuple[float, int, Any]]:
@@ -467,9 +472,9 @@ def unstamped() -> list[tuple[float, int, Any]]:
         (frozen(), C.POSITIONS_FROZEN),
         (killed(), C.VEHICLE_SILENT),
         (unstamped(), C.STAMPS_UNUSABLE),
-        ([one for one in course() if one[1] == 20 or isinstance(one[2], mavlink.MAVLink_heartbeat_message)],
+        ([m for m in course() if m[1] == 20 or isinstance(m[2], mavlink.MAVLink_heartbeat_message)],
          C.POSITIONS_ABSENT),
-        ([one for one in course() if one[1] == 1 or not 3.0 < one[0] < 9.0], C.SILENCE),
+        ([message for message in course() if message[1] == 1 or not 3.0 < message[0] < 9.0], C.SILENCE),
         ([*course(), *((t, s, m) for t, s, m in course(system=2) if s == 2)], C.SECOND_VEHICLE),
     ],
 )  # fmt: skip
@@ -487,5 +492,5 @@ def test_setpoints_that_were_not_followed(tmp_path: Path, off_m: float) -> None:
             0, 1, 1, 1, 0xDF8, north_m, 0, -1, *np.zeros(8).tolist()
         )
 
-    found = written(tmp_path, [*course(), *((0.1 * n, 245, wanted(n)) for n in range(120))])
-    assert (found.cause is C.OFF_TRACK) == bool(off_m)
+    headline = written(tmp_path, [*course(), *((0.1 * n, 245, wanted(n)) for n in range(120))])
+    assert (headline.cause is C.OFF_TRACK) == bool(off_m)

@@ -20,7 +20,8 @@ from rich.console import Console
 from logs.recording.flight import FlightData
 from logs.recording.recorder import SyncRecorder
 from logs.recording.summary import summarise
-from logs.report.compare import Figure, FlightComparison, compare, comparison_html, load_all
+from logs.report.compare import Figure, FlightComparison, compare_flights, load_flights
+from logs.report.compare_page import render_comparison
 from uavctl.cli.app import run
 from uavctl.cli.log_report import comparison_picture
 from uavctl.records import Datagram, Decision, Header, Record, Timing
@@ -48,30 +49,32 @@ def record(path: Path, entries: Sequence[tuple[str, int, Record]]) -> Path:
     return path
 
 
-def figures(found: FlightComparison) -> dict[str, Figure]:
-    return {one.key: one for one in found.figures}
+def figures(comparison: FlightComparison) -> dict[str, Figure]:
+    return {figure.key: figure for figure in comparison.figures}
 
 
 def test_the_same_flight_says_so(base: Memory, tmp_path: Path) -> None:
     # another day: another start, other computing times
     again = []
-    for topic, at_ns, one in base.entries:
-        if isinstance(one, Header):
-            one = msgspec.structs.replace(one, started_utc="2026-02-02T00:00:00", command="uavctl loopback --out b")
-        again.append((topic, at_ns, one))
+    for topic, at_ns, entry in base.entries:
+        if isinstance(entry, Header):
+            entry = msgspec.structs.replace(entry, started_utc="2026-02-02T00:00:00", command="uavctl loopback --out b")
+        again.append((topic, at_ns, entry))
     again.append(("/uavctl/timing", 1, Timing(tick=0, at_ns=1, lateness_ns=0, step_ns=7, send_ns=7)))
-    found = compare(load_all([record(tmp_path / "a.mcap", base.entries), record(tmp_path / "b.mcap", again)]))
-    (likeness,) = found.likenesses
+    comparison = compare_flights(
+        load_flights([record(tmp_path / "a.mcap", base.entries), record(tmp_path / "b.mcap", again)])
+    )
+    (likeness,) = comparison.likenesses
     assert likeness.identical and likeness.parting is None
     assert likeness.records == len(base.entries) - 1  # all but the header
-    assert found.parameters == () and found.notes[1:] == ()
-    assert all(one.differences == (0,) for one in found.figures if one.group not in ("time", "recording"))
+    assert comparison.parameters == () and comparison.notes[1:] == ()
+    assert all(figure.differences == (0,) for figure in comparison.figures if figure.group not in ("time", "recording"))
 
 
 def test_parameters_that_differ_have_dotted_names(base: Memory, other: Memory, tmp_path: Path) -> None:
     a, b = record(tmp_path / "a.mcap", base.entries), record(tmp_path / "b.mcap", other.entries)
-    found = compare(load_all([a, b]))
-    differing = {one.key: one.values for one in found.parameters}
+    comparison = compare_flights(load_flights([a, b]))
+    differing = {entry.key: entry.values for entry in comparison.parameters}
     assert differing["sim.seed"] == (0, 3)
     assert differing["link.loss"] == (0.3, 0.25)
     assert differing.keys() == {"sim.seed", "link.loss", "design_id"}
@@ -82,14 +85,21 @@ def test_header_and_versions_count_as_parameters(base: Memory, tmp_path: Path) -
         (
             topic,
             at_ns,
-            msgspec.structs.replace(one, cpu="another", versions={"numpy": "3"}) if isinstance(one, Header) else one,
+            msgspec.structs.replace(entry, cpu="another", versions={"numpy": "3"})
+            if isinstance(entry, Header)
+            else entry,
         )
-        for topic, at_ns, one in base.entries
+        for topic, at_ns, entry in base.entries
     ]
-    found = compare(load_all([record(tmp_path / "a.mcap", base.entries), record(tmp_path / "b.mcap", changed)]))
-    assert {one.key: one.values for one in found.parameters} == {"cpu": ("", "another"), "versions.numpy": (None, "3")}
-    assert found.likenesses[0].identical
-    assert any("different processors" in note for note in found.notes)
+    comparison = compare_flights(
+        load_flights([record(tmp_path / "a.mcap", base.entries), record(tmp_path / "b.mcap", changed)])
+    )
+    assert {entry.key: entry.values for entry in comparison.parameters} == {
+        "cpu": ("", "another"),
+        "versions.numpy": (None, "3"),
+    }
+    assert comparison.likenesses[0].identical
+    assert any("different processors" in note for note in comparison.notes)
 
 
 def test_parameters_of_the_vehicle_are_compared(base: Memory, tmp_path: Path) -> None:
@@ -106,81 +116,81 @@ def test_parameters_of_the_vehicle_are_compared(base: Memory, tmp_path: Path) ->
 
     flights = {"a": {"P": 0.1, "Q": 1.0}, "b": {"P": 0.25, "Q": 1.0, "R": 3.0}, "c": {}}
     paths = [record(tmp_path / f"{name}.mcap", with_parameters(**told)) for name, told in flights.items()]
-    found = compare(load_all(paths))
-    assert [(one.key, one.values) for one in found.parameters] == [("vehicle.P", (0.1, 0.25, None))]
-    assert sum("A 2, B 3, C 0" in note for note in found.notes) == 1
+    comparison = compare_flights(load_flights(paths))
+    assert [(entry.key, entry.values) for entry in comparison.parameters] == [("vehicle.P", (0.1, 0.25, None))]
+    assert sum("A 2, B 3, C 0" in note for note in comparison.notes) == 1
 
 
 def test_tables_of_a_list_are_compared_one_by_one(base: Memory, tmp_path: Path) -> None:
     def with_waypoints(count: int) -> list[tuple[str, int, Record]]:
         text = "".join(f"\n[[mission.waypoint]]\nat = [{number}.0]\n" for number in range(count)) + "\n[a]\nb = inf\n"
         return [
-            (topic, at_ns, msgspec.structs.replace(one, config_toml=text) if isinstance(one, Header) else one)
-            for topic, at_ns, one in base.entries
+            (topic, at_ns, msgspec.structs.replace(entry, config_toml=text) if isinstance(entry, Header) else entry)
+            for topic, at_ns, entry in base.entries
         ]
 
     paths = [record(tmp_path / f"{count}.mcap", with_waypoints(count)) for count in (1, 2)]
-    found = compare(load_all(paths))
-    assert [(one.key, one.values) for one in found.parameters] == [("mission.waypoint[1].at", (None, [1.0]))]
+    comparison = compare_flights(load_flights(paths))
+    assert [(entry.key, entry.values) for entry in comparison.parameters] == [("mission.waypoint[1].at", (None, [1.0]))]
 
 
 def test_figures_are_the_summaries(base: Memory, other: Memory, tmp_path: Path) -> None:
     a, b = record(tmp_path / "a.mcap", base.entries), record(tmp_path / "b.mcap", other.entries)
-    found = figures(compare(load_all([a, b])))
-    first, second = (summarise(FlightData.from_records(one.entries), wall_s=None) for one in (base, other))
+    comparison = figures(compare_flights(load_flights([a, b])))
+    first, second = (summarise(FlightData.from_records(memory.entries), wall_s=None) for memory in (base, other))
     for key in ("steps", "received", "lost", "max_age", "fallbacks", "cost", "settled_error_m", "solves", "rejected"):
         values = (getattr(first, key), getattr(second, key))
-        assert found[key].values == values
-        assert found[key].differences == (values[1] - values[0],)
-        assert found[key].ratios == ((values[1] / values[0],) if values[0] else (None,))
+        assert comparison[key].values == values
+        assert comparison[key].differences == (values[1] - values[0],)
+        assert comparison[key].ratios == ((values[1] / values[0],) if values[0] else (None,))
     ages = [d.age_steps for d in base.of(Decision) if d.boundary and d.age_steps is not None and d.mode != "wait"]
-    assert found["mean_age"].values[0] == pytest.approx(np.mean(ages))
-    assert found["loss"].values[0] == pytest.approx(first.lost / (first.received + first.lost))  # type: ignore[operator]
+    assert comparison["mean_age"].values[0] == pytest.approx(np.mean(ages))
+    assert comparison["loss"].values[0] == pytest.approx(first.lost / (first.received + first.lost))  # type: ignore[operator]
 
 
 def test_where_they_part(base: Memory, tmp_path: Path) -> None:
     at = next(i for i, (_, _, r) in enumerate(base.entries) if isinstance(r, Decision) and r.tick == 57)
-    topic, at_ns, one = base.entries[at]
-    assert isinstance(one, Decision) and one.input is not None
+    topic, at_ns, entry = base.entries[at]
+    assert isinstance(entry, Decision) and entry.input is not None
     changed = [*base.entries]
-    changed[at] = (topic, at_ns, msgspec.structs.replace(one, input=(one.input[0] + 2.0**-50, *one.input[1:])))
+    changed[at] = (topic, at_ns, msgspec.structs.replace(entry, input=(entry.input[0] + 2.0**-50, *entry.input[1:])))
     a, b = record(tmp_path / "a.mcap", base.entries), record(tmp_path / "b.mcap", changed)
-    (likeness,) = compare(load_all([a, b])).likenesses
+    (likeness,) = compare_flights(load_flights([a, b])).likenesses
     assert not likeness.identical and likeness.records == at - 1
     parting = likeness.parting
     assert parting is not None and (parting.topic, parting.field) == (topic, "input[0]")
     assert parting.flight_s == pytest.approx(57 * 0.05)
-    assert parting.first == repr(one.input[0]) and parting.other != parting.first
+    assert parting.first == repr(entry.input[0]) and parting.other != parting.first
 
 
 def test_a_torn_one_is_compared_up_to_its_end(base: Memory, tmp_path: Path) -> None:
     a = record(tmp_path / "a.mcap", base.entries)
     torn = tmp_path / "b.mcap"
     torn.write_bytes(a.read_bytes()[: a.stat().st_size // 2])
-    found = compare(load_all([a, torn]))
-    (likeness,) = found.likenesses
+    comparison = compare_flights(load_flights([a, torn]))
+    (likeness,) = comparison.likenesses
     assert likeness.parting is not None and likeness.parting.other == "its end"
-    assert any(note.startswith("B is torn") for note in found.notes)
-    assert any("different length" in note for note in found.notes)
-    assert [one.finished for one in found.recordings] == [True, False]
+    assert any(note.startswith("B is torn") for note in comparison.notes)
+    assert any("different length" in note for note in comparison.notes)
+    assert [recording.finished for recording in comparison.recordings] == [True, False]
 
 
-def shown(found: FlightComparison, width: int) -> str:
+def shown(comparison: FlightComparison, width: int) -> str:
     out = io.StringIO()
-    Console(file=out, width=width).print(comparison_picture(found))
+    Console(file=out, width=width).print(comparison_picture(comparison))
     return out.getvalue()
 
 
 @pytest.mark.parametrize("width", [80, 120])
 def test_people_are_shown_every_figure(width: int, base: Memory, other: Memory, tmp_path: Path) -> None:
     paths = [record(tmp_path / "a.mcap", base.entries), record(tmp_path / "b.mcap", other.entries)]
-    found = compare(load_all([*paths, *paths]))
-    text = shown(found, width)
+    comparison = compare_flights(load_flights([*paths, *paths]))
+    text = shown(comparison, width)
     assert max(map(len, text.splitlines())) <= width
     assert "…" not in text
     assert "C is the same flight" in text and "B is the same as A" in text
-    for one in found.figures:
-        assert text.count(f"│ {one.text}") >= 1
+    for figure in comparison.figures:
+        assert text.count(f"│ {figure.text}") >= 1
     for heading in ("B − A", "B / A", "C − A", "D / A"):
         assert heading in text
 
@@ -190,7 +200,7 @@ def test_command(base: Memory, other: Memory, tmp_path: Path, capsys: pytest.Cap
     page = tmp_path / "c.html"
     assert run(["log", "compare", str(a), str(b), "--out", str(page), "--json"]) == 0
     document: dict[str, Any] = json.loads(capsys.readouterr().out)
-    assert [one["name"] for one in document["recordings"]] == ["A", "B"]
+    assert [recording["name"] for recording in document["recordings"]] == ["A", "B"]
     assert msgspec.convert(document, FlightComparison).figures
     text = page.read_text(encoding="utf-8")
     for part in ('id="path-above"', 'id="position-north"', 'id="age"', "sim.seed", "distance from target"):
@@ -206,10 +216,10 @@ def test_command(base: Memory, other: Memory, tmp_path: Path, capsys: pytest.Cap
 
 def test_a_page_of_many_flights_has_tables_that_paper_can_hold(base: Memory, other: Memory, tmp_path: Path) -> None:
     paths = [record(tmp_path / "a.mcap", base.entries), record(tmp_path / "b.mcap", other.entries)]
-    loaded = load_all([*paths, *paths, paths[0]])
-    found = compare(loaded)
+    loaded = load_flights([*paths, *paths, paths[0]])
+    comparison = compare_flights(loaded)
     with unwritten():
-        page = comparison_html(found, loaded)
+        page = render_comparison(comparison, loaded)
     heads = [re.findall(r"<th>|<th class=\"number\">", head) for head in re.findall(r"<thead>.*?</thead>", page)]
     assert max(map(len, heads)) <= 8
     for name in "BCDE":

@@ -16,9 +16,9 @@ from synthetic_scene import Scene, paper, room
 
 from logs.recording.flight import FlightData
 from logs.recording.summary import summarise
-from logs.report.figures import picture
+from logs.report.figures import draw_overview
 from logs.report.flight_page import write_report
-from logs.report.svg import PALETTE, compact
+from logs.report.svg import PALETTE, compact_path
 from uavctl.errors import RecordingError
 from uavctl.records import Checked, ControlMode, Decision, Estimate, Plan, Record, StepInput, Timing, Truth
 
@@ -153,7 +153,7 @@ def test_a_flight_of_unknown_configuration_is_judged_as_far_as_it_goes(room_html
 def test_slack_is_drawn(room_flight: FlightData) -> None:
     some = list(room_flight.flown_plans.values())[:2]
     gave = [msgspec.structs.replace(plan, slack=slack) for plan, slack in zip(some, (0.2, 0.1), strict=True)]
-    plans = (*gave, *(plan for plan in room_flight.plans if plan.seq not in {one.seq for one in gave}))
+    plans = (*gave, *(plan for plan in room_flight.plans if plan.seq not in {plan.seq for plan in gave}))
     seen = words_of(dataclasses.replace(room_flight, plans=plans))
     assert "plan-slack" in seen.plots
     assert "2 flown with slack" in " ".join(seen.text)
@@ -174,7 +174,7 @@ def test_checks_before_arming_are_listed(room_flight: FlightData) -> None:
     ],
 )
 def test_paths_are_written_short(drawn: str, short: str) -> None:
-    assert compact(drawn) == short
+    assert compact_path(drawn) == short
 
 
 @pytest.mark.slow
@@ -289,7 +289,7 @@ def test_a_page_that_cannot_be_written_is_told(tmp_path: Path, room_flight: Flig
 
 
 def test_picture_is_a_file_of_its_own(room_flight: FlightData) -> None:
-    svg = picture(room_flight)
+    svg = draw_overview(room_flight)
     root = ET.fromstring(svg)
     assert root.tag == "{http://www.w3.org/2000/svg}svg"
     assert root.get("viewBox")

@@ -14,13 +14,14 @@ from synthetic_scene import room
 from logs.recording.flight import FlightData
 from logs.recording.summary import summarise
 from logs.recording.topics import RecorderNote
-from logs.report import figures as plots_link
-from logs.report import figures as plots_solver
-from logs.report import plots
-from logs.report.figures import picture
-from logs.report.plots import POINTS, along, path_3d
+from logs.report import link_figures, plan_figures, plots
+from logs.report.figures import draw_overview
+from logs.report.path_3d import draw_path_3d
+from logs.report.plots import MAX_POINTS, thin_path
 from logs.report.svg import colour
-from logs.report.verdicts import judge, judge_link, plain
+from logs.report.verdict_clocks import format_plain
+from logs.report.verdict_link import judge_link
+from logs.report.verdicts import judge_flight
 from uavctl.records import ControlMode, Decision
 
 
@@ -38,13 +39,13 @@ def test_a_long_stay_takes_no_point_from_the_journey() -> None:
     journey = np.linspace([0.0, 0.0, -1.0], [6.0, 3.0, -1.0], 200)
     stay = journey[-1] + 0.01 * np.random.default_rng(0).standard_normal((20_000, 3))
     whole = np.vstack([journey, stay])
-    kept = along(whole)
+    kept = thin_path(whole)
     gone_m = np.linalg.norm(np.diff(whole, axis=0), axis=1).sum()
-    assert len(kept) <= POINTS
+    assert len(kept) <= MAX_POINTS
     assert kept[0].tolist() == whole[0].tolist() and kept[-1].tolist() == whole[-1].tolist()
     step_m = np.linalg.norm(np.diff(kept, axis=0), axis=1)
-    assert step_m.max() <= gone_m / POINTS + np.linalg.norm(np.diff(whole, axis=0), axis=1).max()
-    assert len(along(np.full((10, 3), np.nan))) == 0
+    assert step_m.max() <= gone_m / MAX_POINTS + np.linalg.norm(np.diff(whole, axis=0), axis=1).max()
+    assert len(thin_path(np.full((10, 3), np.nan))) == 0
 
 
 def test_the_reserve_is_drawn_as_long_as_a_plan_is_flown(flight: FlightData) -> None:
@@ -54,7 +55,7 @@ def test_the_reserve_is_drawn_as_long_as_a_plan_is_flown(flight: FlightData) -> 
         msgspec.structs.replace(d, plan_seq=last.seq) if d.at_ns >= silent else d for d in flight.decisions
     )
     with drawn() as figures:
-        list(plots.axes_over_time(dataclasses.replace(flight, decisions=decisions)))
+        list(plots.draw_axes_over_time(dataclasses.replace(flight, decisions=decisions)))
     for figure in figures.values():
         bands = figure.axes[0].collections
         assert bands and all(band.get_paths()[0].get_extents().x1 == pytest.approx(flight.duration_s) for band in bands)
@@ -69,10 +70,10 @@ def test_what_is_too_small_to_count_is_no_slack(flight: FlightData) -> None:
 
 @pytest.mark.parametrize("slack", [0.003, 20.0])
 def test_small_slack_fills_its_drawing(flight: FlightData, slack: float) -> None:
-    two = {one.seq for one in list(flight.flown_plans.values())[:2]}
-    plans = tuple(msgspec.structs.replace(one, slack=slack) if one.seq in two else one for one in flight.plans)
+    two = {plan.seq for plan in list(flight.flown_plans.values())[:2]}
+    plans = tuple(msgspec.structs.replace(plan, slack=slack) if plan.seq in two else plan for plan in flight.plans)
     with drawn() as figures:
-        list(plots_solver.certificates(dataclasses.replace(flight, plans=plans)))
+        list(plan_figures.draw_certificates(dataclasses.replace(flight, plans=plans)))
     low, high = figures["What gave way in plans flown"].axes[0].get_ylim()
     assert low <= 0.0 and slack < high < 2 * slack
 
@@ -81,7 +82,7 @@ def test_gaps_that_are_alike_still_have_a_scale(flight: FlightData) -> None:
     gaps = np.geomspace(1.5e-9, 4e-9, len(flight.plans))
     plans = tuple(msgspec.structs.replace(plan, gap=gap) for plan, gap in zip(flight.plans, gaps, strict=True))
     with drawn() as figures:
-        list(plots_solver.certificates(dataclasses.replace(flight, plans=plans)))
+        list(plan_figures.draw_certificates(dataclasses.replace(flight, plans=plans)))
     ax = figures["Certified gap"].axes[0]
     low, high = ax.get_ylim()
     assert low <= 100.0 * gaps[0] and 100.0 * gaps[-1] <= high and high < 1000.0 * gaps[-1]
@@ -92,13 +93,13 @@ def test_gaps_that_are_alike_still_have_a_scale(flight: FlightData) -> None:
 def test_arrivals_without_delay_are_not_drawn(flight: FlightData) -> None:
     inputs = tuple(
         msgspec.structs.replace(
-            one, samples=tuple(msgspec.structs.replace(s, received_ns=s.captured_ns) for s in one.samples)
+            step, samples=tuple(msgspec.structs.replace(s, received_ns=s.captured_ns) for s in step.samples)
         )
-        for one in flight.step_inputs
+        for step in flight.step_inputs
     )
     quick = dataclasses.replace(flight, step_inputs=inputs)
     with drawn() as figures:
-        list(plots_link.link_in_flight(quick, judge_link(quick, None)))
+        list(link_figures.draw_link_in_flight(quick, judge_link(quick, None)))
     assert "Capture to arrival, by the stamps" not in figures  # one value is no plot
 
 
@@ -113,8 +114,8 @@ def test_a_short_flight_is_not_said_to_prove_anything(short: FlightData) -> None
 
 
 def test_promised_risks_are_what_was_configured(short: FlightData) -> None:
-    verdicts = judge(short).verdicts
-    promised = {one.name: one.promised for one in verdicts.risk.limits}
+    verdicts = judge_flight(short).verdicts
+    promised = {limit.name: limit.promised for limit in verdicts.risk.limits}
     assert (promised["all states"], promised["all inputs"]) == (0.05, 0.1)
     assert verdicts.link.promised_ages[:3] == (0.7, 0.21, 0.063)
 
@@ -124,7 +125,7 @@ def test_promised_risks_are_what_was_configured(short: FlightData) -> None:
     [(-1291.4, "−1291"), (-63.5321, "−63.5"), (0.2994, "0.299"), (0.0, "0"), (-3e-15, "0"), (1e6, "1000000")],
 )
 def test_figures_of_clocks_have_no_exponent(value: float, told: str) -> None:
-    assert plain(value) == told
+    assert format_plain(value) == told
 
 
 def part_of(flight: FlightData, from_tick: int) -> FlightData:
@@ -133,8 +134,8 @@ def part_of(flight: FlightData, from_tick: int) -> FlightData:
     return dataclasses.replace(
         flight,
         decisions=flight.decisions[from_tick:],
-        truths=tuple(one for one in flight.truths if one.at_ns >= begun_ns),
-        estimates=tuple(one for one in flight.estimates if one.at_ns >= begun_ns),
+        truths=tuple(truth for truth in flight.truths if truth.at_ns >= begun_ns),
+        estimates=tuple(estimate for estimate in flight.estimates if estimate.at_ns >= begun_ns),
     )
 
 
@@ -142,9 +143,9 @@ def test_a_part_of_a_flight_says_so(flight: FlightData) -> None:
     seen = words_of(part_of(flight, 80)).text
     text = " ".join(seen)
     assert "Flight “room”, a part" in text and "a part of a flight" in text
-    begins = [one for one in seen if "tick 80" in one]
+    begins = [line for line in seen if "tick 80" in line]
     assert len(begins) == 1 and "tick 80, 4 s into" in begins[0]
-    assert any(one.startswith("40 steps;") for one in seen) and "controller took over" not in text
+    assert any(line.startswith("40 steps;") for line in seen) and "controller took over" not in text
 
 
 def note(text: str, segment: int = 1) -> RecorderNote:
@@ -199,11 +200,11 @@ def test_a_whole_flight_is_no_part(flight: FlightData) -> None:
 
 
 def test_without_truth_nothing_is_drawn_in_its_colour(flight: FlightData) -> None:
-    def key(one: FlightData) -> tuple[set[str], list[str]]:
+    def key(flight: FlightData) -> tuple[set[str], list[str]]:
         """Colours of the lines of the path in three dimensions, and what the small picture explains."""
         with drawn() as figures:
-            path_3d(one)
-            picture(one)
+            draw_path_3d(flight)
+            draw_overview(flight)
         deep = {str(line.get_color()) for line in figures[""].axes[0].lines if line.get_marker() == "None"}
         return deep, [text.get_text() for text in figures["The path, from above"].legends[0].get_texts()]
 

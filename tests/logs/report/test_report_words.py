@@ -12,8 +12,8 @@ from synthetic_flight import fly
 from synthetic_scene import room
 
 from logs.recording.flight import FlightData
-from logs.recording.summary import Percentiles, predicted_only, rows, summarise
-from logs.report.summary_text import story
+from logs.recording.summary import Percentiles, describe_prediction, list_summary_rows, summarise
+from logs.report.summary_text import describe_flight
 from uavctl.config import load_config
 from uavctl.config.load import dump_config
 from uavctl.flight.decide import MISSION_OVER
@@ -126,8 +126,8 @@ def test_what_went_amiss_is_in_the_table_alone() -> None:
     good = summarise(flight, wall_s=1.0)
     times = Percentiles(p50=100.0, p99=900.0, max=73_400.0)
     bad = msgspec.structs.replace(good, missed_ticks=3, tick_lateness_us=times, recorder_dropped=1)
-    assert story(flight, bad) == story(flight, good)
-    cells = " ".join(text for _, text in rows(bad))
+    assert describe_flight(flight, bad) == describe_flight(flight, good)
+    cells = " ".join(text for _, text in list_summary_rows(bad))
     assert "73.4 ms" in cells and "3 ticks" in cells and "1 record " in cells
 
 
@@ -178,9 +178,9 @@ def test_a_place_that_is_predicted_only_is_not_told_as_one_that_was_seen(
     summary = summarise(flight, wall_s=1.0)
     last = flight.estimates[-1]
     assert summary.final_age_s == pytest.approx(last.age_s, abs=room().dt_s)
-    text = predicted_only(summary)
+    text = describe_prediction(summary)
     assert bool(text) == blind
-    assert any("predicted only" in value for _, value in rows(summary)) == blind
+    assert any("predicted only" in value for _, value in list_summary_rows(summary)) == blind
     if blind:
         assert summary.final_age_s is not None and summary.final_std_m is not None
         assert number(summary.final_age_s) in text and number(summary.final_std_m) in text
@@ -188,9 +188,11 @@ def test_a_place_that_is_predicted_only_is_not_told_as_one_that_was_seen(
 
 def test_the_uncertainty_at_the_end_is_the_estimate_s_own() -> None:
     flight = flown_blind(2.0)
-    steps = {one.at_ns for one in flight.steps.decisions}
+    steps = {decision.at_ns for decision in flight.steps.decisions}
     index = list(flight.design.position_index)
-    cov = np.array(next(one for one in reversed(flight.estimates) if one.at_ns in steps).cov)[np.ix_(index, index)]
+    cov = np.array(next(estimate for estimate in reversed(flight.estimates) if estimate.at_ns in steps).cov)[
+        np.ix_(index, index)
+    ]
     told = summarise(flight, wall_s=1.0).final_std_m
     assert told == pytest.approx(float(np.sqrt(np.linalg.eigvalsh(cov).max())))
 
@@ -213,9 +215,9 @@ def test_a_place_that_was_ordered_is_no_trajectory() -> None:
     summary = summarise(flight, wall_s=1.0)
     assert not summary.trajectory
     assert [target[0] for _, target in flight.ordered_places] == [-0.7]
-    text = " ".join(story(flight, summary))
+    text = " ".join(describe_flight(flight, summary))
     assert "trajectory" not in text and "(-0.7, " in text
-    assert not any("trajectory" in name for name, _ in rows(summary))
+    assert not any("trajectory" in name for name, _ in list_summary_rows(summary))
 
 
 def test_waypoints_alone_are_no_orders_and_a_target_that_moves_is_a_trajectory() -> None:
@@ -229,4 +231,4 @@ def test_waypoints_alone_are_no_orders_and_a_target_that_moves_is_a_trajectory()
 
     flight = FlightData.from_records([(t, at, moving(r)) for t, at, r in fly(room(), 4.0)])
     assert flight.moving_target and flight.ordered_places == ()
-    assert "trajectory" in " ".join(story(flight, summarise(flight, wall_s=1.0)))
+    assert "trajectory" in " ".join(describe_flight(flight, summarise(flight, wall_s=1.0)))

@@ -8,13 +8,13 @@ from scipy import stats
 
 from logs.report.statistics import (
     LEVEL,
-    at_least,
     autocorrelation,
+    binomial_p_value,
     chi2_quantile,
+    estimate_share,
     ljung_box,
-    normal_reach,
-    share,
-    two_sided_normal,
+    two_sided_p_value,
+    two_sided_quantile,
     variance_bounds,
     variance_p,
 )
@@ -22,19 +22,19 @@ from logs.report.statistics import (
 
 @pytest.mark.parametrize(("hits", "trials", "tests"), [(0, 30, 1), (1, 30, 1), (17, 40, 12), (40, 40, 3), (5, 2000, 1)])
 def test_share_is_clopper_and_pearsons(hits: int, trials: int, tests: int) -> None:
-    found = share(hits, trials, tests)
+    found = estimate_share(hits, trials, tests)
     exact = stats.binomtest(hits, trials).proportion_ci(confidence_level=1.0 - (1.0 - LEVEL) / tests, method="exact")
     assert (found.low, found.high) == pytest.approx((exact.low, exact.high), rel=1e-9)
     assert found.rate == hits / trials
 
 
 def test_share_of_nothing_says_nothing() -> None:
-    assert (share(0, 0).low, share(0, 0).high, share(0, 0).rate) == (0.0, 1.0, 0.0)
+    assert (estimate_share(0, 0).low, estimate_share(0, 0).high, estimate_share(0, 0).rate) == (0.0, 1.0, 0.0)
 
 
 def test_dependent_trials_are_worth_less() -> None:
-    whole, half = share(20, 100), share(20, 100, worth=0.5)
-    same = share(10, 50)
+    whole, half = estimate_share(20, 100), estimate_share(20, 100, trial_weight=0.5)
+    same = estimate_share(10, 50)
     assert (half.low, half.high) == (same.low, same.high)
     assert half.high - half.low > whole.high - whole.low
 
@@ -42,26 +42,28 @@ def test_dependent_trials_are_worth_less() -> None:
 @pytest.mark.parametrize("hits", [-1, 4])
 def test_a_share_of_more_than_all_is_refused(hits: int) -> None:
     with pytest.raises(ValueError, match=f"{hits} of 3"):
-        share(hits, 3)
+        estimate_share(hits, 3)
 
 
 def test_interval_covers_at_least_as_often_as_it_says() -> None:
     n = 25
     for p in (0.02, 0.3, 0.95):
         covered = sum(
-            stats.binom.pmf(hits, n, p) for hits in range(n + 1) if share(hits, n).low <= p <= share(hits, n).high
+            stats.binom.pmf(hits, n, p)
+            for hits in range(n + 1)
+            if estimate_share(hits, n).low <= p <= estimate_share(hits, n).high
         )
         assert covered >= LEVEL
 
 
 @pytest.mark.parametrize(("hits", "trials", "p"), [(0, 10, 0.1), (1, 10, 0.1), (7, 40, 0.05), (40, 40, 0.9)])
 def test_so_many_or_more(hits: int, trials: int, p: float) -> None:
-    assert at_least(hits, trials, p) == pytest.approx(float(stats.binom.sf(hits - 1, trials, p)), rel=1e-9)
+    assert binomial_p_value(hits, trials, p) == pytest.approx(float(stats.binom.sf(hits - 1, trials, p)), rel=1e-9)
 
 
 def test_normal_and_chi_squared() -> None:
-    assert two_sided_normal(-1.7) == pytest.approx(2.0 * stats.norm.sf(1.7))
-    assert 2.0 * stats.norm.sf(normal_reach(7)) == pytest.approx((1.0 - LEVEL) / 7)
+    assert two_sided_p_value(-1.7) == pytest.approx(2.0 * stats.norm.sf(1.7))
+    assert 2.0 * stats.norm.sf(two_sided_quantile(7)) == pytest.approx((1.0 - LEVEL) / 7)
     assert chi2_quantile(0.95, 3) == pytest.approx(float(stats.chi2.ppf(0.95, 3)))
     low, high = variance_bounds(40, 5)
     tail = 0.5 * (1.0 - LEVEL) / 5

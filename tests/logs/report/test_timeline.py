@@ -10,8 +10,8 @@ from synthetic_flight import fly
 from synthetic_scene import paper, room
 
 from logs.recording.flight import FlightData
-from logs.report.plots import grid_m, outline, path_3d, shown
-from logs.report.timeline import lanes, timeline
+from logs.report.path_3d import compute_grid_m, draw_path_3d, outline_ellipsoid, project_3d
+from logs.report.timeline import draw_timeline, make_lanes
 from uavctl.records import Command, Event, Order, Severity, StepInput, VehicleStatus
 
 
@@ -21,8 +21,8 @@ def flight() -> FlightData:
 
 
 def lane(found: FlightData, name: str) -> list[tuple[float, float, str]]:
-    (one,) = (one for one in lanes(found) if one.name == name)
-    return [(span.begun_s, span.ended_s, span.text) for span in one.spans]
+    (chosen,) = (lane for lane in make_lanes(found) if lane.name == name)
+    return [(span.begun_s, span.ended_s, span.text) for span in chosen.spans]
 
 
 def test_modes_follow_each_other_without_gaps(flight: FlightData) -> None:
@@ -61,7 +61,7 @@ def test_what_the_vehicle_said(flight: FlightData) -> None:
 def test_marks_are_where_things_happened(flight: FlightData) -> None:
     orders = (StepInput(tick=20, at_ns=flight.origin_ns + 1_000_000_000, commands=(Command(order=Order.HOLD),)),)
     found = dataclasses.replace(flight, step_inputs=(*flight.step_inputs, *orders))
-    by_name = {one.name: one for one in lanes(found)}
+    by_name = {lane.name: lane for lane in make_lanes(found)}
     _, times = by_name["orders"].marks
     assert times.tolist() == [1.0]
     silent = sum(bool(d.age_steps) for d in flight.decisions if d.boundary)
@@ -71,27 +71,27 @@ def test_marks_are_where_things_happened(flight: FlightData) -> None:
 
 def test_bars_too_short_for_their_text_are_explained(flight: FlightData) -> None:
     told = (hand_over(3.0, "engaging -> engaged", flight.origin_ns), hand_over(3.1, "engaged -> released", 0))
-    *_, meanings = timeline(dataclasses.replace(flight, events=told[:1]))
+    *_, meanings = draw_timeline(dataclasses.replace(flight, events=told[:1]))
     assert "a step without a new position" in meanings and "an error" not in meanings
-    short = timeline(FlightData.from_records(fly(room(), 60.0, blackout=(4.0, 8.0))))[2]
+    short = draw_timeline(FlightData.from_records(fly(room(), 60.0, blackout=(4.0, 8.0))))[2]
     assert any(mark.kind == "band" and mark.text == "brake" for mark in short)
 
 
 def test_the_outline_holds_the_ellipsoid_and_touches_it() -> None:
     semi = np.array([0.3, 0.8, 0.5])
-    width, height, tilt = outline(semi)
+    width, height, tilt = outline_ellipsoid(semi)
     rng = np.random.default_rng(0)
     ball = rng.standard_normal((20000, 3))
     ball /= np.linalg.norm(ball, axis=1, keepdims=True)
     c, s = np.cos(np.radians(tilt)), np.sin(np.radians(tilt))
-    turned = shown(ball * semi) @ np.array([[c, -s], [s, c]])
+    turned = project_3d(ball * semi) @ np.array([[c, -s], [s, c]])
     reach = (2.0 * turned[:, 0] / width) ** 2 + (2.0 * turned[:, 1] / height) ** 2
     assert reach.max() <= 1.0 + 1e-9
     assert reach.max() > 0.999
 
 
 def test_up_is_up_on_the_page() -> None:
-    low, high, east = shown(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]))
+    low, high, east = project_3d(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]))
     assert high[1] > low[1] and high[0] == low[0]
     assert east[0] > low[0]
 
@@ -106,13 +106,13 @@ def test_up_is_up_on_the_page() -> None:
     ],
 )
 def test_the_floor_has_a_line_each_metre_or_so(lower: float, upper: float, lines: list[float]) -> None:
-    assert grid_m(lower, upper).tolist() == lines
+    assert compute_grid_m(lower, upper).tolist() == lines
 
 
 @pytest.mark.parametrize("side", [10.5, 1e3, 1e7])
 def test_a_floor_of_any_size_has_few_lines(side: float) -> None:
-    assert 2 <= len(grid_m(-side, 0.3 * side)) <= 21
+    assert 2 <= len(compute_grid_m(-side, 0.3 * side)) <= 21
 
 
 def test_a_plant_of_two_axes_has_no_depth() -> None:
-    assert path_3d(FlightData.from_records(fly(paper(), 5.0))) is None
+    assert draw_path_3d(FlightData.from_records(fly(paper(), 5.0))) is None

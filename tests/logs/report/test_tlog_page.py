@@ -18,7 +18,7 @@ from report_rig import walk
 
 from logs.recording.mavlink_flight import MavlinkFlight, read_flight
 from logs.recording.tlog import export_tlog
-from logs.report.tlog_page import tlog_html
+from logs.report.tlog_page import render_tlog_page
 from uavctl.cli.app import run
 from uavctl.errors import RecordingError
 from uavctl.records import StepInput, Truth
@@ -57,14 +57,16 @@ def copter(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_path_is_that_of_the_flight(flight: MavlinkFlight) -> None:
     memory = view_rig.flown()
-    samples = [sample for one in memory.of(StepInput) for sample in one.samples]
+    samples = [sample for step in memory.of(StepInput) for sample in step.samples]
     (sent,) = flight.sent.values()
     # single floats on the wire, and what came after the last tick is in no record
-    assert sent.position_m[: len(samples)] == pytest.approx(np.array([one.position_m for one in samples]), abs=1e-6)
+    assert sent.position_m[: len(samples)] == pytest.approx(
+        np.array([position_sample.position_m for position_sample in samples]), abs=1e-6
+    )
     truths = memory.of(Truth)
-    began_s = min(one.at_ns for one in memory.of(StepInput)) * 1e-9
-    true_s = np.array([one.at_ns * 1e-9 - began_s for one in truths])
-    true_m = np.array([one.position_m for one in truths])
+    began_s = min(step.at_ns for step in memory.of(StepInput)) * 1e-9
+    true_s = np.array([truth.at_ns * 1e-9 - began_s for truth in truths])
+    true_m = np.array([truth.position_m for truth in truths])
     first_s = min(flight.own.t_s[0], sent.t_s[0])
     for axis in range(3):
         wanted = np.interp(flight.own.t_s - first_s, true_s - true_s[0], true_m[:, axis])
@@ -74,13 +76,13 @@ def test_the_path_is_that_of_the_flight(flight: MavlinkFlight) -> None:
 def test_numbers_are_those_of_pymavlink(exported: Path, flight: MavlinkFlight) -> None:
     own = others_read(exported, "LOCAL_POSITION_NED")
     assert len(own) == flight.info.own_positions > 50
-    assert flight.own.position_m.tolist() == [[one.x, one.y, one.z] for one in own]
-    assert flight.own.velocity_mps.tolist() == [[one.vx, one.vy, one.vz] for one in own]
-    stamps_s = np.array([one._timestamp for one in others_read(exported)])
-    own_s = np.array([one._timestamp for one in own])
+    assert flight.own.position_m.tolist() == [[position.x, position.y, position.z] for position in own]
+    assert flight.own.velocity_mps.tolist() == [[position.vx, position.vy, position.vz] for position in own]
+    stamps_s = np.array([message._timestamp for message in others_read(exported)])
+    own_s = np.array([position._timestamp for position in own])
     assert flight.own.t_s == pytest.approx(own_s - stamps_s.min(), abs=1e-5)
     setpoints = others_read(exported, "SET_POSITION_TARGET_LOCAL_NED")
-    assert flight.setpoint_mps2.tolist() == [[one.afx, one.afy, one.afz] for one in setpoints]
+    assert flight.setpoint_mps2.tolist() == [[setpoint.afx, setpoint.afy, setpoint.afz] for setpoint in setpoints]
     assert np.isnan(flight.setpoint_m).all()
     counted = sum(flight.info.messages.values())
     assert counted == len(others_read(exported))
@@ -88,13 +90,13 @@ def test_numbers_are_those_of_pymavlink(exported: Path, flight: MavlinkFlight) -
 
 def test_what_a_real_autopilot_says(copter: Path) -> None:
     info = read_flight(copter).info
-    beats = [one for one in others_read(copter, "HEARTBEAT", system=1) if one.autopilot == 3]
-    modes = [(mavutil.mode_string_v10(one), bool(one.base_mode & 128)) for one in beats]
-    changes = [one for one, before in zip(modes, [None, *modes], strict=False) if one != before]
-    assert [(one.mode, one.armed) for one in info.modes] == changes and len(changes) > 3
-    assert [one.text for one in info.texts] == [one.text for one in others_read(copter, "STATUSTEXT", system=1)]
-    told = {one.param_id: one.param_value for one in others_read(copter, "PARAM_VALUE", system=1)}
-    assert {name: one.value for name, one in info.parameters.items()} == pytest.approx(told)
+    beats = [beat for beat in others_read(copter, "HEARTBEAT", system=1) if beat.autopilot == 3]
+    modes = [(mavutil.mode_string_v10(beat), bool(beat.base_mode & 128)) for beat in beats]
+    changes = [mode for mode, before in zip(modes, [None, *modes], strict=False) if mode != before]
+    assert [(mode.mode, mode.armed) for mode in info.modes] == changes and len(changes) > 3
+    assert [text.text for text in info.texts] == [text.text for text in others_read(copter, "STATUSTEXT", system=1)]
+    told = {value.param_id: value.param_value for value in others_read(copter, "PARAM_VALUE", system=1)}
+    assert {name: parameter.value for name, parameter in info.parameters.items()} == pytest.approx(told)
     assert (info.autopilot, info.vehicle_system, info.notes) == ("ardupilot", 1, ())
 
 
@@ -102,11 +104,11 @@ def test_positions_that_are_sent_have_ages() -> None:
     found = read_flight(DATA / "px4-relay.tlog")
     (sent,) = found.info.sent
     positions = others_read(DATA / "px4-relay.tlog", "VISION_POSITION_ESTIMATE")
-    delays_s = np.array([one._timestamp - one.usec * 1e-6 for one in positions])
+    delays_s = np.array([position._timestamp - position.usec * 1e-6 for position in positions])
     # the rig adds 10 to 40 ms, and the recorder's clock stamped them: so what is beyond the quickest is within 30 ms
     assert sent.delay_ms is not None and 0 < sent.delay_ms[0] < 1e3 * (delays_s.max() - delays_s.min()) + 1
     assert sent.delay_ms[2] < 35
-    gaps_s = np.diff([one._timestamp for one in positions])
+    gaps_s = np.diff([position._timestamp for position in positions])
     assert sent.longest_gap_s == pytest.approx(gaps_s.max(), abs=1e-5)
     assert sent.largest_age_s is not None and gaps_s.max() <= sent.largest_age_s < gaps_s.max() + 0.04
     assert found.info.own_source == "ODOMETRY"
@@ -144,7 +146,7 @@ def test_the_page_shows_what_the_vehicle_says(tmp_path: Path, capsys: pytest.Cap
     assert run(["log", "report", str(path), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["schema"] == "uavctl/log/report-tlog/1" and found["report"] == str(tmp_path / "a.html")
-    assert [(one["severity"], one["text"]) for one in found["texts"]] == [("error", "<b>crash & burn</b>")]
+    assert [(text["severity"], text["text"]) for text in found["texts"]] == [("error", "<b>crash & burn</b>")]
     seen = walk((tmp_path / "a.html").read_text(encoding="utf-8"))
     assert "<b>crash & burn</b>" in seen.text and "GUIDED" in seen.text
     assert run(["log", "info", str(path)]) == 0
@@ -152,7 +154,7 @@ def test_the_page_shows_what_the_vehicle_says(tmp_path: Path, capsys: pytest.Cap
 
 
 def test_the_page_draws_what_there_is(flight: MavlinkFlight) -> None:
-    ids = set(walk(tlog_html(flight)).ids)
+    ids = set(walk(render_tlog_page(flight)).ids)
     axes = {f"{what}-{axis}" for what in ("position", "velocity") for axis in ("north", "east", "down")}
     assert {"path-above", "path-side", "age-0", *axes} <= ids
 

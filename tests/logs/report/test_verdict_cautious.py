@@ -9,17 +9,17 @@ from loopback_rig import lockstep
 from numpy.typing import NDArray
 
 from logs.recording.flight import FlightData
-from logs.report.flight_page import verdict_rows
+from logs.report.innovations import InnovationSamples
 from logs.report.verdict_model import (
     BANDS,
-    InnovationSamples,
     ModelOutcome,
     ModelVerdict,
-    band_powers,
+    compute_band_powers,
+    compute_power_bounds,
     judge_innovations,
-    power_bounds,
 )
-from logs.report.verdicts import judge
+from logs.report.verdict_sections import make_verdict_rows
+from logs.report.verdicts import judge_flight
 
 Array = NDArray[np.float64]
 AXES = ("north", "east", "down")
@@ -82,10 +82,12 @@ def test_the_outcome_is_that_of_the_errors_that_were_made(
 
 def test_correlation_that_comes_of_expecting_too_much_noise_is_told_and_is_caution() -> None:
     verdict = judged(too_noisy(4, 1500))
-    assert all(one.whiteness_refuted and one.correlation[0] > 0.15 for one in verdict.axes)
+    assert all(axis_verdict.whiteness_refuted and axis_verdict.correlation[0] > 0.15 for axis_verdict in verdict.axes)
     assert verdict.outcome is ModelOutcome.CAUTIOUS and not verdict.refuted
     assert "tells a little" in verdict.text and "the model is cautious" in verdict.text
-    assert all(f"{one.correlation[0]:.2g} {one.axis}" in verdict.text for one in verdict.axes)
+    assert all(
+        f"{axis_verdict.correlation[0]:.2g} {axis_verdict.axis}" in verdict.text for axis_verdict in verdict.axes
+    )
 
 
 def test_expecting_too_much_noise_refutes_in_hardly_any_flight() -> None:
@@ -113,28 +115,28 @@ def test_ellipsoids_that_hold_more_than_promised_are_caution_and_fewer_are_not()
 @pytest.mark.parametrize("n", [30, 31, 134])
 def test_powers_are_of_an_orthonormal_basis(n: int) -> None:
     values = np.random.default_rng(n).standard_normal(n)
-    powers, counts = band_powers(values)
+    powers, counts = compute_band_powers(values)
     assert (len(powers), int(counts.sum())) == (BANDS, n)
     assert float(powers @ counts) == pytest.approx(float(values @ values))
     wave = np.sqrt(2.0) * np.cos(2.0 * np.pi * np.arange(n) / n)
-    slow, *others = band_powers(wave)[0]
+    slow, *others = compute_band_powers(wave)[0]
     assert slow == pytest.approx(n / counts[0]) and others == pytest.approx([0.0] * (BANDS - 1), abs=1e-9)
 
 
 def test_bounds_of_powers_hold_in_all_but_one_flight_of_a_hundred() -> None:
     rng = np.random.default_rng(7)
-    counts = band_powers(rng.standard_normal(100))[1]
-    bounds = power_bounds(counts, BANDS)
-    broken = sum(bool((band_powers(rng.standard_normal(100))[0] > bounds).any()) for _ in range(2000))
+    counts = compute_band_powers(rng.standard_normal(100))[1]
+    bounds = compute_power_bounds(counts, BANDS)
+    broken = sum(bool((compute_band_powers(rng.standard_normal(100))[0] > bounds).any()) for _ in range(2000))
     assert 5 <= broken <= 38  # 20 are expected
 
 
 def test_the_summary_says_in_words_which_it_is() -> None:
     flight = FlightData.from_records(lockstep("paper", 4.0, "solver.method=exact").entries)
-    others = judge(flight).verdicts
+    others = judge_flight(flight).verdicts
 
     def row(model: ModelVerdict) -> str:
-        return dict(verdict_rows(msgspec.structs.replace(others, model=model)))["Model of the vehicle"]
+        return dict(make_verdict_rows(msgspec.structs.replace(others, model=model)))["Model of the vehicle"]
 
     said: tuple[tuple[str, set[str], float, float], ...] = (
         ("cautious", {"smaller"}, 0.8, 0.0),

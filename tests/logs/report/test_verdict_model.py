@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from verdict_rig import as_modelled, room
 
 from logs.recording.flight import FlightData
-from logs.report.verdict_model import FEWEST, LAGS, InnovationSamples, Track, innovations, judge_innovations
-from logs.report.verdicts import judge
+from logs.report.innovations import FilterReplay, InnovationSamples, compute_innovations
+from logs.report.verdict_model import LAGS, MIN_ERRORS, judge_innovations
+from logs.report.verdicts import judge_flight
 from uavctl.build.controller import build_estimator, build_plant
 from uavctl.config import load_config
 from uavctl.flight.kalman import make_kalman
@@ -47,20 +48,22 @@ def test_white_errors_pass_in_almost_all_flights() -> None:
 
 def test_errors_that_tell_of_the_next_are_found() -> None:
     verdict = judge_innovations(errors(ar1(np.random.default_rng(1), 1000, 0.4)), AXES, 0.2)
-    assert all(one.whiteness_refuted for one in verdict.axes)
-    assert [one.correlation[0] for one in verdict.axes] == pytest.approx([0.4] * 3, abs=0.1)
+    assert all(axis_verdict.whiteness_refuted for axis_verdict in verdict.axes)
+    assert [axis_verdict.correlation[0] for axis_verdict in verdict.axes] == pytest.approx([0.4] * 3, abs=0.1)
     assert len(verdict.axes[0].correlation) == LAGS
     assert verdict.refuted
     assert "error tells of the next" in verdict.text
-    assert all(f"{one.correlation[0]:.2g} {one.axis}" in verdict.text for one in verdict.axes)
+    assert all(
+        f"{axis_verdict.correlation[0]:.2g} {axis_verdict.axis}" in verdict.text for axis_verdict in verdict.axes
+    )
 
 
 @pytest.mark.parametrize(("scale", "outcome", "told"), [(1.3, "refuted", "too small"), (0.7, "cautious", "cautious")])
 def test_errors_of_another_size_are_found(scale: float, outcome: str, told: str) -> None:
     values = scale * np.random.default_rng(2).standard_normal((800, 3))
     verdict = judge_innovations(errors(values), AXES, 0.2)
-    assert all(one.variance_refuted for one in verdict.axes)
-    assert [one.variance for one in verdict.axes] == pytest.approx([scale**2] * 3, rel=0.2)
+    assert all(axis_verdict.variance_refuted for axis_verdict in verdict.axes)
+    assert [axis_verdict.variance for axis_verdict in verdict.axes] == pytest.approx([scale**2] * 3, rel=0.2)
     assert (verdict.outcome, verdict.refuted) == (outcome, outcome == "refuted")
     assert told in verdict.text
 
@@ -69,7 +72,7 @@ def test_errors_that_are_off_are_found() -> None:
     values = np.random.default_rng(3).standard_normal((800, 3))
     values[:, 1] += 0.3
     verdict = judge_innovations(errors(values), AXES, 0.2)
-    assert [one.mean_refuted for one in verdict.axes] == [False, True, False]
+    assert [axis_verdict.mean_refuted for axis_verdict in verdict.axes] == [False, True, False]
     assert "east deviations off on average" in verdict.text
 
 
@@ -79,7 +82,7 @@ def test_figures_below_zero_have_a_minus_as_elsewhere() -> None:
 
 
 def test_a_few_positions_are_too_few() -> None:
-    verdict = judge_innovations(errors(np.ones((FEWEST - 1, 3))), AXES, 0.2)
+    verdict = judge_innovations(errors(np.ones((MIN_ERRORS - 1, 3))), AXES, 0.2)
     assert verdict.axes == ()
     assert not verdict.refuted
     assert "too few" in verdict.text
@@ -101,18 +104,18 @@ def test_ellipsoids_are_counted_by_the_time_ahead() -> None:
 def test_a_flight_of_the_model_itself_passes(seed: int) -> None:
     config = room()
     flight = as_modelled(config, 1200, seed=seed)
-    verdict = judge(flight).verdicts.model
+    verdict = judge_flight(flight).verdicts.model
     assert verdict is not None and not verdict.refuted
-    assert [one.count for one in verdict.axes] == [len(flight.samples) - 6] * 3
-    assert [one.lead_steps for one in verdict.leads] == list(range(1, 13))
-    assert all(one.inside.trials > 40 for one in verdict.leads)
+    assert [axis_verdict.count for axis_verdict in verdict.axes] == [len(flight.samples) - 6] * 3
+    assert [lead.lead_steps for lead in verdict.leads] == list(range(1, 13))
+    assert all(lead.inside.trials > 40 for lead in verdict.leads)
 
 
 def test_gusts_of_twice_the_size_are_found() -> None:
-    verdict = judge(as_modelled(room(), 600, seed=2, noise=lambda _, w: 2.0 * w)).verdicts.model
+    verdict = judge_flight(as_modelled(room(), 600, seed=2, noise=lambda _, w: 2.0 * w)).verdicts.model
     assert verdict is not None
-    assert all(one.variance_refuted and one.variance > 2.0 for one in verdict.axes)
-    assert any(one.refuted and one.inside.rate < 0.9 for one in verdict.leads)
+    assert all(axis_verdict.variance_refuted and axis_verdict.variance > 2.0 for axis_verdict in verdict.axes)
+    assert any(lead.refuted and lead.inside.rate < 0.9 for lead in verdict.leads)
 
 
 def test_gusts_that_last_are_found() -> None:
@@ -123,17 +126,17 @@ def test_gusts_that_last_are_found() -> None:
         last = np.asarray(0.9 * last + np.sqrt(1.0 - 0.81) * w)
         return last
 
-    verdict = judge(as_modelled(room(), 1200, seed=3, noise=lasting)).verdicts.model
+    verdict = judge_flight(as_modelled(room(), 1200, seed=3, noise=lasting)).verdicts.model
     assert verdict is not None
-    assert all(one.whiteness_refuted for one in verdict.axes)
+    assert all(axis_verdict.whiteness_refuted for axis_verdict in verdict.axes)
 
 
 def test_the_filter_is_the_flights_own() -> None:
     config = load_config("room-hahn-stursberg", ("solver.method=exact",))
     memory = lockstep("room-hahn-stursberg", 8.0, "solver.method=exact")
     flight = FlightData.from_records(memory.entries)
-    track = Track(flight, make_kalman(build_plant(config), build_estimator(config), flight.design.dt_ns))
-    known = {belief.captured_ns: belief for belief, _, _ in track.one_ahead()}
+    track = FilterReplay(flight, make_kalman(build_plant(config), build_estimator(config), flight.design.dt_ns))
+    known = {belief.captured_ns: belief for belief, _, _ in track.iterate_one_step_errors()}
     compared = 0
     for estimate in flight.estimates:
         belief = known.get(estimate.captured_ns)
@@ -146,10 +149,10 @@ def test_the_filter_is_the_flights_own() -> None:
 
 def test_what_is_sent_acts_after_the_dead_time() -> None:
     config = load_config("room-hahn-stursberg", ("solver.method=exact", "plant.dead_time_s=0.2"))
-    right = judge(as_modelled(config, 800, seed=1, dead_steps=1)).verdicts.model
-    wrong = judge(as_modelled(config, 800, seed=1)).verdicts.model
+    right = judge_flight(as_modelled(config, 800, seed=1, dead_steps=1)).verdicts.model
+    wrong = judge_flight(as_modelled(config, 800, seed=1)).verdicts.model
     assert right is not None and not right.refuted
-    assert wrong is not None and all(one.larger for one in wrong.axes)
+    assert wrong is not None and all(axis.has_larger_errors for axis in wrong.axes)
 
 
 def test_positions_while_others_fly_do_not_count() -> None:
@@ -157,9 +160,9 @@ def test_positions_while_others_fly_do_not_count() -> None:
     whole = as_modelled(config, 200, seed=5)
     half_ns = 100 * whole.design.dt_ns
     handed = tuple(
-        msgspec.structs.replace(one, mode=ControlMode.STOPPED) if one.at_ns >= half_ns else one
-        for one in whole.decisions
+        msgspec.structs.replace(decision, mode=ControlMode.STOPPED) if decision.at_ns >= half_ns else decision
+        for decision in whole.decisions
     )
-    found = innovations(dataclasses.replace(whole, decisions=handed), config)
+    found = compute_innovations(dataclasses.replace(whole, decisions=handed), config)
     assert len(found.t_s) > 50
     assert float(found.t_s.max()) <= 1e-9 * half_ns

@@ -13,17 +13,11 @@ from verdict_rig import as_modelled
 from verdict_rig import room as room_config
 
 from logs.recording.flight import FlightData
-from logs.report.statistics import share
-from logs.report.verdicts import (
-    Verdicts,
-    flown_config,
-    judge,
-    judge_clocks,
-    judge_link,
-    judge_risk,
-    judge_stamps,
-    offsets,
-)
+from logs.report.statistics import estimate_share
+from logs.report.verdict_clocks import compute_offset_residuals, judge_clocks, judge_stamps
+from logs.report.verdict_link import judge_link
+from logs.report.verdict_risk import judge_risk
+from logs.report.verdicts import Verdicts, judge_flight, read_flown_config
 from uavctl.config import Config
 from uavctl.records import Decision, Event, LinkStats, Plan, PositionSample, Record, Severity, StepInput, Truth
 
@@ -110,7 +104,7 @@ def test_news_and_ages_by_hand() -> None:
     ages = [d.age_steps or 0 for d in found.steps.decisions]
     verdict = judge_link(found, room_config())
     assert (verdict.news.hits, verdict.news.trials) == (ages.count(0), 400)
-    assert verdict.news == share(ages.count(0), 400)
+    assert verdict.news == estimate_share(ages.count(0), 400)
     assert verdict.ages == pytest.approx([ages.count(age) / 400 for age in range(max(ages) + 1)])
     assert verdict.promised_news == pytest.approx(0.7)
     # independent losses: P(age j) = 0.7 · 0.3^j
@@ -132,7 +126,7 @@ def test_bursts_are_found_where_losses_are_taken_for_independent() -> None:
     verdict = judge_link(dataclasses.replace(found, decisions=held), room_config())
     assert verdict.bursts and verdict.refuted
     assert "in bursts" in verdict.text
-    independent = share(verdict.news.hits, verdict.news.trials)
+    independent = estimate_share(verdict.news.hits, verdict.news.trials)
     assert verdict.news.high - verdict.news.low > 2.0 * (independent.high - independent.low)
 
 
@@ -183,7 +177,7 @@ def test_drift_and_residual_of_a_clock_by_hand() -> None:
     assert verdict.residual_us == pytest.approx(5.0, rel=0.02)
     assert (verdict.rtt_ms, verdict.rejected, verdict.counted, verdict.source) == (2.0, 3, 40, "timesync")
     assert "TIMESYNC" in verdict.text and "5 µs" in verdict.text
-    assert len(offsets(found, "mocap")[1]) == 40
+    assert len(compute_offset_residuals(found, "mocap")[1]) == 40
 
 
 def test_an_offset_told_twice_is_not_judged() -> None:
@@ -239,21 +233,22 @@ def test_without_truth_or_motion_stamps_are_not_judged() -> None:
     found = circling(0)
     assert judge_stamps(dataclasses.replace(found, truths=())) is None
     still = tuple(
-        msgspec.structs.replace(one, velocity_mps=(0.0, 0.0, 0.0), position_m=(1.0, 0.0, 0.0)) for one in found.truths
+        msgspec.structs.replace(truth, velocity_mps=(0.0, 0.0, 0.0), position_m=(1.0, 0.0, 0.0))
+        for truth in found.truths
     )
     assert judge_stamps(dataclasses.replace(found, truths=still)) is None
 
 
 def test_a_configuration_that_cannot_be_read_leaves_the_rest() -> None:
     found = flight(8.0)
-    assert flown_config(found) is None
-    verdicts = judge(found).verdicts
+    assert read_flown_config(found) is None
+    verdicts = judge_flight(found).verdicts
     assert verdicts.model is None
     assert verdicts.risk.limits[0].steps == 40
 
 
 def test_verdicts_survive_json() -> None:
-    verdicts = judge(as_modelled(room_config(), 100, seed=6)).verdicts
+    verdicts = judge_flight(as_modelled(room_config(), 100, seed=6)).verdicts
     assert msgspec.json.decode(msgspec.json.encode(verdicts), type=Verdicts) == verdicts
 
 
@@ -263,5 +258,5 @@ def test_plans_and_decisions_are_what_the_trials_are_made_from() -> None:
 
     items = [item for item in fly(room(), 8.0) if without(item[2])]
     found = FlightData.from_records(items)
-    assert any(isinstance(one, Decision) for one in found.decisions)
+    assert any(isinstance(decision, Decision) for decision in found.decisions)
     assert judge_risk(found, room_config()).limits[0].measured.trials == 0

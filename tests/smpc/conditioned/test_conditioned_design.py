@@ -11,7 +11,7 @@ import pytest
 from loopback_rig import lockstep
 from msgspec.structs import replace
 
-from logs.recording.design_view import design_view
+from logs.recording.design_view import read_design
 from logs.recording.reader import header, read
 from logs.recording.recorder import SyncRecorder
 from uavctl.build.controller import build_conditioned, design_of, record_of, resting
@@ -63,7 +63,7 @@ def test_a_flight_is_flown_replayed_reported_and_told_otherwise(
     told = header(Path(flight))
     assert told.design_id == figures["design_id"] == told.design["design_id"]
     assert {key: value for key, value in figures.items() if key not in ("schema", "wall_s", "rehearsal")} == told.design
-    assert design_view(told).horizon == 48
+    assert read_design(told).horizon == 48
     assert main(["log", "replay", flight, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["identical"]
     assert main(["log", "report", flight, "--json"]) == 0

@@ -14,7 +14,7 @@ from logs.recording.summary import count
 from logs.report import page
 from logs.report.excursion import GRAVE_M
 from logs.report.page import Mark, PageSection
-from logs.report.statistics import Pair
+from logs.report.run_statistics import Interval
 from uavctl.errors import UavctlError
 from uavctl.lab.campaign import plots
 from uavctl.lab.campaign.plots import Looks
@@ -130,8 +130,10 @@ def _main(view: CampaignView) -> Markup:
     promise = _promise(view)
     if failed:
         why = () if promise is None else (f"{promise[1]}: {promise[2]}",)
-        return page.banner("bad", "Runs failed", f"{failed} of {count(flown, 'run')}; they are in no figure.", why)
-    return page.NOTHING if promise is None else page.banner(*promise, ())
+        return page.render_banner(
+            "bad", "Runs failed", f"{failed} of {count(flown, 'run')}; they are in no figure.", why
+        )
+    return page.NOTHING if promise is None else page.render_banner(*promise, ())
 
 
 def _promise(view: CampaignView) -> tuple[str, str, str] | None:
@@ -217,7 +219,7 @@ def _write(folder: Path, text: str) -> Path:
 def _specification(folder: Path) -> Markup:
     """Return the campaign's file as folded HTML; empty where it is missing."""
     try:
-        return page.folded("Specification", (folder / SPECIFICATION).read_text(encoding="utf-8"))
+        return page.render_folded("Specification", (folder / SPECIFICATION).read_text(encoding="utf-8"))
     except OSError:
         return page.NOTHING
 
@@ -226,7 +228,7 @@ def report_html(results: Results) -> str:
     """Return the page of a campaign as HTML."""
     view = CampaignView.of(results)
     subtitle = f"{count(len(view.cells), 'cell')} · seed {results.master} · uavctl {results.version}"
-    return page.page(f"Campaign “{results.name}”", subtitle, story(view), _sections(view), top=_main(view))
+    return page.render_page(f"Campaign “{results.name}”", subtitle, story(view), _sections(view), top=_main(view))
 
 
 def _sections(view: CampaignView) -> Iterator[PageSection]:
@@ -255,12 +257,12 @@ def _compared_section(view: CampaignView) -> PageSection:
         ("Runs of a cell", f"{results.planned} of {count(results.steps, 'step')}"),
         ("Seed", f"{results.master}; run i of every cell has the draws of (seed, i)"),
     ]
-    return PageSection("What was compared", "", page.facts(rows) + _specification(results.folder))
+    return PageSection("What was compared", "", page.render_facts(rows) + _specification(results.folder))
 
 
 def _verdict_section(view: CampaignView) -> PageSection:
     if not view.verdicts:
-        return PageSection(_QUESTION, "", page.paragraph("No SMPC was flown."))
+        return PageSection(_QUESTION, "", page.render_paragraph("No SMPC was flown."))
     baselines = dict.fromkeys(one.baseline.controller for v in view.verdicts for one in v.comparisons)
     rows, words = [], []
     for verdict in view.verdicts:
@@ -268,12 +270,12 @@ def _verdict_section(view: CampaignView) -> PageSection:
         said = {one.baseline.controller: brief(one) for one in verdict.comparisons}
         if verdict.comparisons:
             rows.append((name, word_of(verdict), *(said.get(baseline, "–") for baseline in baselines)))
-        words += [page.strong(name), page.listed(in_words(verdict))]
-    folded = page.folded("In words, with figures and reasons", page.joined(words))
+        words += [page.render_strong(name), page.render_list(in_words(verdict))]
+    folded = page.render_folded("In words, with figures and reasons", page.join(words))
     if not rows:
         return PageSection(_QUESTION, _VERDICT, folded)
     columns = ("", "best at its rate", *baselines)
-    return PageSection(_QUESTION, _VERDICT, page.table(columns, rows, frozenset(), kind="dense") + folded)
+    return PageSection(_QUESTION, _VERDICT, page.render_table(columns, rows, frozenset(), kind="dense") + folded)
 
 
 def _name(view: CampaignView, verdict: CampaignVerdict) -> str:
@@ -292,7 +294,9 @@ def _scene_section(
     if drawings:
         note = "" if key != "s0" else _HOW_SURE + " An arrow stands at the upper end of the interval of a rate of zero."
         flown = {cell.controller for cell in cells if cell.cost is not None}
-        body = page.legend([*view.looks.entries(flown), Mark("dashed", "limit", _PROMISED)]) + page.grid(drawings)
+        body = page.render_legend([*view.looks.entries(flown), Mark("dashed", "limit", _PROMISED)]) + page.render_grid(
+            drawings
+        )
         yield PageSection(f"Costs and limits{_suffix(view, scene)}", note, body)
 
 
@@ -307,12 +311,12 @@ def _difference_section(view: CampaignView) -> PageSection:
                 drawings.append(drawing)
     compared = [one for verdict in view.verdicts for one in verdict.comparisons]
     if not drawings:
-        return PageSection(_DIFFERENCE, "", page.paragraph("There is nothing to compare."))
+        return PageSection(_DIFFERENCE, "", page.render_paragraph("There is nothing to compare."))
     who = {one.baseline.controller for one in compared}
     marks = [*view.looks.entries(who)]
     if not all(one.as_safe for one in compared):
         marks.append(Mark("cross", "ink", "the SMPC breaks limits more often"))
-    body = page.legend(marks) + page.grid(drawings)
+    body = page.render_legend(marks) + page.render_grid(drawings)
     return PageSection(_DIFFERENCE, _DIFFERENCES, body)
 
 
@@ -325,9 +329,9 @@ def _suffix(view: CampaignView, scene: tuple[str, str]) -> str:
 def _age_section(view: CampaignView) -> PageSection:
     note = "Every controller meets the same losses, so the ages are those of the link."
     if not any(cell.ages for cell in view.cells):
-        return PageSection("Age of information", "", page.paragraph("No run ended in order."))
-    figures = page.grid([plots.ages(view.cells, view.results)])
-    return PageSection("Age of information", note, page.legend(plots.age_entries(view.cells)) + figures)
+        return PageSection("Age of information", "", page.render_paragraph("No run ended in order."))
+    figures = page.render_grid([plots.ages(view.cells, view.results)])
+    return PageSection("Age of information", note, page.render_legend(plots.age_entries(view.cells)) + figures)
 
 
 def _ways_section(view: CampaignView) -> Iterator[PageSection]:
@@ -359,7 +363,7 @@ def _ways_section(view: CampaignView) -> Iterator[PageSection]:
         "second half of a run, median. Beyond a wall: furthest of all runs; negative is the room that was left. Usable "
         "room: share of it in which a plan may rest."
     )
-    yield PageSection("Through the room", note, page.table(columns, rows, frozenset(range(2, 7)), kind="dense"))
+    yield PageSection("Through the room", note, page.render_table(columns, rows, frozenset(range(2, 7)), kind="dense"))
 
 
 _COLUMNS = (
@@ -373,15 +377,15 @@ def _cells_section(view: CampaignView) -> PageSection:
     for group, cells in view.groups.items():
         rows = [_row(cell) for cell in cells if not cell.refused]
         refused = [f"{cell.index} {cell.controller}: no design; {cell.refused}" for cell in cells if cell.refused]
-        body = page.table(_COLUMNS, rows, frozenset(range(len(_COLUMNS))) - {1}, refused, kind="dense")
-        tables.append(page.folded(view.place(group), body))
+        body = page.render_table(_COLUMNS, rows, frozenset(range(len(_COLUMNS))) - {1}, refused, kind="dense")
+        tables.append(page.render_folded(view.place(group), body))
     note = (
         "States and inputs outside: share of steps. Worst step: share of runs with a state outside in the step with "
         "the most, its exact interval for all steps at once (Bonferroni). Runs with any: share of runs with a state "
         "outside. No plan left: steps in which the SMPC braked. No plan found, limits eased: decisions. Oldest: "
         "largest age in steps."
     )
-    return PageSection("All figures", note, page.joined(tables))
+    return PageSection("All figures", note, page.join(tables))
 
 
 def _row(cell: CellSummary) -> tuple[str, ...]:
@@ -402,17 +406,17 @@ def _row(cell: CellSummary) -> tuple[str, ...]:
     )
 
 
-def _mean(value: float | None, interval: Pair | None) -> str:
+def _mean(value: float | None, interval: Interval | None) -> str:
     return "–" if value is None or interval is None else f"{value:.5g} {_whole(interval, 5)}"
 
 
-def _rate(value: float | None, interval: Pair | None) -> str:
+def _rate(value: float | None, interval: Interval | None) -> str:
     if value is None or interval is None:
         return "–"
     return f"{percent(value)} {_whole((100 * interval[0], 100 * interval[1]), 3)}"
 
 
-def _whole(interval: Pair, digits: int) -> str:
+def _whole(interval: Interval, digits: int) -> str:
     """Return an interval as text that no line break splits."""
     return f"({interval[0]:.{digits}g} to {interval[1]:.{digits}g})".replace(" ", "\N{NO-BREAK SPACE}")
 
@@ -425,7 +429,11 @@ def _failures_section(view: CampaignView) -> PageSection:
     ]
     shown = failed[:_SHOWN_FAILURES]
     columns = ("cell", "controller", "where", "run", "what ended it")
-    body = page.table(columns, shown, frozenset({0, 3}), kind="dense") if shown else page.paragraph("There were none.")
+    body = (
+        page.render_table(columns, shown, frozenset({0, 3}), kind="dense")
+        if shown
+        else page.render_paragraph("There were none.")
+    )
     note = "" if len(shown) == len(failed) else f"The first {len(shown)} of {len(failed)}; runs.parquet has all."
     return PageSection("Runs that failed", note, body)
 
@@ -462,7 +470,7 @@ def trial_html(told: ToldTrial, cells: Sequence[TrialSummary], specification: Ma
     """Return the page of a campaign of trials as HTML."""
     subtitle = f"{count(len(cells), 'cell')} · seed {told.master} · uavctl {told.uavctl_version}"
     title, sections = f"Campaign “{told.name}”", _trial_sections(told, cells, specification)
-    return page.page(title, subtitle, _story(cells), sections, top=_trial_main(cells))
+    return page.render_page(title, subtitle, _story(cells), sections, top=_trial_main(cells))
 
 
 def _trial_main(cells: Sequence[TrialSummary]) -> Markup:
@@ -470,7 +478,9 @@ def _trial_main(cells: Sequence[TrialSummary]) -> Markup:
     failed = sum(cell.failed for cell in cells)
     runs = sum(cell.runs for cell in cells)
     if failed:
-        return page.banner("bad", "Flights failed", f"{failed} of {count(runs, 'flight')}; they are in no figure.", ())
+        return page.render_banner(
+            "bad", "Flights failed", f"{failed} of {count(runs, 'flight')}; they are in no figure.", ()
+        )
     beyond = [
         (value, cell)
         for cell in cells
@@ -484,9 +494,9 @@ def _trial_main(cells: Sequence[TrialSummary]) -> Markup:
     left = sum(value > 0.0 for value, _ in beyond)
     if not left:
         text = f"{count(len(beyond), 'flight')}, of which the nearest to a wall had {-worst_m:.2f} m left ({where})."
-        return page.banner("good", "All inside", text, ())
+        return page.render_banner("good", "All inside", text, ())
     text = f"{left} of {count(len(beyond), 'flight')}, the furthest by {worst_m:.2f} m ({where})."
-    return page.banner("bad" if worst_m >= GRAVE_M else "mind", "Left their limits", text, ())
+    return page.render_banner("bad" if worst_m >= GRAVE_M else "mind", "Left their limits", text, ())
 
 
 def _story(cells: Sequence[TrialSummary]) -> Iterator[str]:
@@ -529,7 +539,7 @@ def _trial_sections(told: ToldTrial, cells: Sequence[TrialSummary], specificatio
     rows += [
         (f"Usable room, {name}", f"{100 * share:.0f} % of it is where a plan may rest") for name, share in rooms.items()
     ]
-    yield PageSection("What was compared", _OWN, page.facts(rows) + specification)
+    yield PageSection("What was compared", _OWN, page.render_facts(rows) + specification)
     for number, (scenario, shown) in enumerate(SHOWN.items()):
         mine = [cell for cell in cells if cell.place.scenario == scenario and not cell.place.refused]
         if not mine:
@@ -543,7 +553,7 @@ def _trial_sections(told: ToldTrial, cells: Sequence[TrialSummary], specificatio
             )
             for cell in mine
         ]
-        body = page.table(columns, table, frozenset(range(5, 5 + len(shown))), kind="dense")
+        body = page.render_table(columns, table, frozenset(range(5, 5 + len(shown))), kind="dense")
         yield PageSection(_TITLES[scenario], MEANING if number == 0 else "", body)
     yield _amiss(cells)
 
@@ -554,5 +564,9 @@ def _amiss(cells: Sequence[TrialSummary]) -> PageSection:
         for cell in cells
         for why in ([cell.place.refused] if cell.place.refused else cell.errors)
     ]
-    body = page.table(("cell", "controller", "where", "why"), rows, frozenset({0})) if rows else page.paragraph("None.")
+    body = (
+        page.render_table(("cell", "controller", "where", "why"), rows, frozenset({0}))
+        if rows
+        else page.render_paragraph("None.")
+    )
     return PageSection("Not flown, or failed", "", body)

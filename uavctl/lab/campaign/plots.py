@@ -13,8 +13,8 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 
 from logs.report.page import Mark
 from logs.report.plots import DASHED, DOTTED
-from logs.report.statistics import Pair
-from logs.report.svg import Drawing, canvas, colour
+from logs.report.run_statistics import Interval
+from logs.report.svg import Drawing, colour, open_canvas
 from uavctl.lab.campaign.results import BaselineComparison, CampaignVerdict, CellSummary, Results
 
 # Legends of a campaign's figures, with the markers that the figures have.
@@ -157,7 +157,7 @@ class Quantity:
     title: str  # of the figure
     label: str  # label of its axis
     # The figure of a cell and its interval; None where it has none
-    value: Callable[[CellSummary], tuple[float | None, Pair | None]]
+    value: Callable[[CellSummary], tuple[float | None, Interval | None]]
     # The share that a cell's design allows; None where that is no matter
     promised: Callable[[CellSummary], float | None]
     scale: float = 1.0  # to the unit of the axis
@@ -209,8 +209,8 @@ def _over_loss(
     quantity: Quantity, cells: Sequence[CellSummary], losses: dict[str, float], looks: Looks, key: str
 ) -> Drawing:
     name = f"{quantity.key}-loss-{key}"
-    with canvas(name, 2.8) as one:
-        ax = one.axes(quantity.title, "positions lost [%]", quantity.label)
+    with open_canvas(name, 2.8) as canvas:
+        ax = canvas.axes(quantity.title, "positions lost [%]", quantity.label)
         floor = _scale(ax, quantity, cells, ax.set_yscale)
         for controller in dict.fromkeys(cell.controller for cell in cells):
             look = looks.of(controller)
@@ -225,7 +225,7 @@ def _over_loss(
             ax.plot(x[none], high[none], ls="", marker=CARETDOWNBASE, ms=5, color=paint, mfc=face)
         for share in {quantity.promised(cell) for cell in cells} - {None}:
             ax.axhline(quantity.scale * (share or 0.0), color=colour("limit"), lw=1.3, ls=DASHED)
-    return Drawing(name, one.svg, f"{quantity.title} of each controller over the loss of the link")
+    return Drawing(name, canvas.svg, f"{quantity.title} of each controller over the loss of the link")
 
 
 def _by_link(quantity: Quantity, cells: Sequence[CellSummary], looks: Looks, key: str) -> Drawing:
@@ -234,8 +234,8 @@ def _by_link(quantity: Quantity, cells: Sequence[CellSummary], looks: Looks, key
     links = list(dict.fromkeys(cell.link for cell in cells))
     who = list(dict.fromkeys(cell.controller for cell in cells))
     labels = [fill(link, _LABEL_WIDTH) for link in links]
-    with canvas(name, 0.9 + rows_in(labels, len(who))) as one:
-        ax = one.axes(quantity.title, quantity.label, "", left_in(labels))
+    with open_canvas(name, 0.9 + rows_in(labels, len(who))) as canvas:
+        ax = canvas.axes(quantity.title, quantity.label, "", left_in(labels))
         floor = _scale(ax, quantity, cells, ax.set_xscale)
         for place, controller in enumerate(who):
             look = looks.of(controller)
@@ -249,7 +249,7 @@ def _by_link(quantity: Quantity, cells: Sequence[CellSummary], looks: Looks, key
             ax.plot(high[~there], rows[~there], ls="", marker=CARETLEFTBASE, ms=5, color=paint, mfc=face)
         _promise(ax, quantity, cells, links)
         draw_rows(ax, labels)
-    return Drawing(name, one.svg, f"{quantity.title} of each controller by link")
+    return Drawing(name, canvas.svg, f"{quantity.title} of each controller by link")
 
 
 def differences(verdicts: Sequence[CampaignVerdict], looks: Looks, title: str, key: str) -> Drawing | None:
@@ -262,8 +262,8 @@ def differences(verdicts: Sequence[CampaignVerdict], looks: Looks, title: str, k
     name = f"difference-{key}"
     heading = fill(title, _TITLE_WIDTH)
     more_in = _TITLE_LINE_IN * heading.count("\n")
-    with canvas(name, 0.9 + rows_in(labels, len(who)) + more_in) as one:
-        ax = one.axes(heading, "what the baseline costs more [%]", "", left_in(labels))
+    with open_canvas(name, 0.9 + rows_in(labels, len(who)) + more_in) as canvas:
+        ax = canvas.axes(heading, "what the baseline costs more [%]", "", left_in(labels))
         lower(ax, more_in)
         ax.set_xscale("symlog", linthresh=LINEAR_PERCENT, linscale=0.8)
         ax.axvline(0.0, color=colour("ink"), lw=0.9)
@@ -275,7 +275,7 @@ def differences(verdicts: Sequence[CampaignVerdict], looks: Looks, title: str, k
         ax.xaxis.set_major_formatter(FuncFormatter(plain))
         ax.xaxis.set_minor_formatter(NullFormatter())
         draw_rows(ax, labels)
-    return Drawing(name, one.svg, f"{title}: what each baseline costs more, by link, with its interval")
+    return Drawing(name, canvas.svg, f"{title}: what each baseline costs more, by link, with its interval")
 
 
 def _difference(ax: Axes, one: BaselineComparison, place: float, looks: Looks) -> None:
@@ -298,9 +298,9 @@ def ages(cells: Sequence[CellSummary], results: Results) -> Drawing:
             by_link[cell.link] = cell.ages
     steps = results.planned * results.steps
     label = f"Share of {steps} steps in which the age of information is at least j, by link"
-    with canvas("ages", 2.8) as one:
-        _tails(one.axes("", "age j [steps]", "steps with an age of j or more [%]"), list(by_link.values()))
-    return Drawing("ages", one.svg, label)
+    with open_canvas("ages", 2.8) as canvas:
+        _tails(canvas.axes("", "age j [steps]", "steps with an age of j or more [%]"), list(by_link.values()))
+    return Drawing("ages", canvas.svg, label)
 
 
 def _tails(ax: Axes, histograms: list[list[int]]) -> None:

@@ -13,16 +13,16 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from logs.report.statistics import (
-    Pair,
+from logs.report.run_statistics import (
+    Interval,
     PairedDifference,
     bootstrap_mean,
     clopper_pearson,
-    finite,
+    max_step_rate,
     paired_difference,
     step_rate,
-    worst_step,
 )
+from logs.report.statistics import replace_infinite
 from uavctl.errors import UavctlError
 
 # A finished campaign's folder, read: what was compared, and what each run came to.
@@ -189,7 +189,7 @@ def _histogram(lists: pa.ChunkedArray, good: NDArray[np.bool_]) -> NDArray[np.in
 
 
 Array = NDArray[np.float64]
-Figure = tuple[float, Pair] | tuple[None, None]
+Figure = tuple[float, Interval] | tuple[None, None]
 
 
 class CellSummary(msgspec.Struct, frozen=True, kw_only=True):
@@ -202,11 +202,11 @@ class CellSummary(msgspec.Struct, frozen=True, kw_only=True):
     runs: int
     failed: int
     violation_rate: float | None  # share of steps with a state outside
-    violation_ci: Pair | None
+    violation_ci: Interval | None
     run_violation_rate: float | None  # share of runs with any such step
-    run_violation_ci: Pair | None
+    run_violation_ci: Interval | None
     cost: float | None  # of a run
-    cost_ci: Pair | None
+    cost_ci: Interval | None
     fallbacks: int  # steps
     max_age: int  # steps
     refused: str
@@ -215,9 +215,9 @@ class CellSummary(msgspec.Struct, frozen=True, kw_only=True):
     kind: str
     promised_u: float | None
     input_violation_rate: float | None
-    input_violation_ci: Pair | None
+    input_violation_ci: Interval | None
     settled_cost: float | None  # of a step, second half of a run
-    settled_cost_ci: Pair | None
+    settled_cost_ci: Interval | None
     mean_square_input: float | None
     saturated: int  # steps
     decisions: int
@@ -232,7 +232,7 @@ class CellSummary(msgspec.Struct, frozen=True, kw_only=True):
     beyond_m: float | None = None  # furthest beyond a wall of all runs; negative is the room that was left
     usable_room: float | None = None  # share of it in which a plan may rest
     worst_step_rate: float | None = None  # share of runs with a state outside, in the step with the most
-    worst_step_ci: Pair | None = None  # for all steps at once, see `intervals.worst_step`
+    worst_step_ci: Interval | None = None  # for all steps at once, see `intervals.worst_step`
 
 
 def summarise(folder: Path) -> list[CellSummary]:
@@ -254,7 +254,7 @@ def cell_summary(results: Results, cell: CellFigures) -> CellSummary:
     cost, settled = _mean(runs["cost"]), _mean(runs["settled_cost"])
     gaps = runs["largest_gap"][np.isfinite(runs["largest_gap"])]
     counted = n > 0 and (runs.outside.sum() > 0 or not runs["state_violations"].any())
-    worst = worst_step(runs.outside, n, results.steps) if counted else (None, None)
+    worst = max_step_rate(runs.outside, n, results.steps) if counted else (None, None)
     (ages,) = np.nonzero(runs.ages)
     told = CellSummary.__struct_fields__
     same: dict[str, Any] = {name: getattr(cell, name) for name in cell.__struct_fields__ if name in told}
@@ -287,7 +287,7 @@ def cell_summary(results: Results, cell: CellFigures) -> CellSummary:
 
 def _finite(figure: Callable[[Array], np.float64], values: Array) -> float | None:
     """Return a figure of values; None of no values, and where the figure is not finite."""
-    return finite(float(figure(values))) if values.size else None
+    return replace_infinite(float(figure(values))) if values.size else None
 
 
 def difference(a: CampaignRuns, b: CampaignRuns, column: str, per: float = 1.0) -> PairedDifference | None:

@@ -15,7 +15,7 @@ import numpy as np
 import pyarrow as pa
 from msgspec import Meta
 
-from logs.report.statistics import finite
+from logs.report.statistics import replace_infinite
 from uavctl import __version__
 from uavctl.build.controller import build_controller, design_of
 from uavctl.config import Config, dump_config, load, load_config, parse
@@ -400,8 +400,8 @@ def _summary(rows: pa.Table, place: ToldPlace) -> TrialSummary:
         place=place,
         runs=len(errors),
         failed=len(errors) - len(good),
-        median={name: finite(median(found)) if found else None for name, found in values.items()},
-        worst={name: finite(max(found)) if found else None for name, found in values.items()},
+        median={name: replace_infinite(median(found)) if found else None for name, found in values.items()},
+        worst={name: replace_infinite(max(found)) if found else None for name, found in values.items()},
         modes=dict(modes),
         errors=[error for error in dict.fromkeys(errors) if error],
         values=values,

@@ -8,8 +8,8 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 
-from logs.report.page import PageSection, folded, grid, page, table
-from logs.report.svg import Drawing, canvas, colour, dots
+from logs.report.page import PageSection, render_folded, render_grid, render_page, render_table
+from logs.report.svg import Drawing, colour, draw_dots, open_canvas
 from uavctl.config.load import dump_config
 from uavctl.lab.identify.fit import LAGS, SHOWN_S, Prediction
 from uavctl.lab.identify.history import PositionHistory
@@ -39,7 +39,7 @@ def write_page(found: Identification, seen: PositionHistory, source: str) -> str
         *_ramps(result),
         *(f"{warning}." for warning in result.warnings),
     ]
-    return page("Identified plant and link", source, story, _sections(found, seen))
+    return render_page("Identified plant and link", source, story, _sections(found, seen))
 
 
 def _ramps(result: Identified) -> Iterator[str]:
@@ -52,17 +52,17 @@ def _ramps(result: Identified) -> Iterator[str]:
 
 def _sections(found: Identification, seen: PositionHistory) -> Iterator[PageSection]:
     names = [one.axis for one in found.result.response]
-    yield PageSection("Response", _RESPONSE, table(_COLUMNS, _rows(found), frozenset(range(1, len(_COLUMNS)))))
-    yield PageSection("Dead time and plant", _DEAD, _candidates(found) + grid([_curves(found)]))
+    yield PageSection("Response", _RESPONSE, render_table(_COLUMNS, _rows(found), frozenset(range(1, len(_COLUMNS)))))
+    yield PageSection("Dead time and plant", _DEAD, _candidates(found) + render_grid([_curves(found)]))
     drawings = [_moved(name, one) for name, one in zip(names, found.predictions, strict=True)]
-    yield PageSection(f"Motion of the next {SHOWN_S:g} s", _MOVED, grid(drawings))
+    yield PageSection(f"Motion of the next {SHOWN_S:g} s", _MOVED, render_grid(drawings))
     rest = [_innovations(name, one) for name, one in zip(names, found.predictions, strict=True)]
     white = [_whiteness(name, one) for name, one in zip(names, found.predictions, strict=True)]
     yield PageSection(
-        "What is left unexplained", _REST, grid([one for pair in zip(rest, white, strict=True) for one in pair])
+        "What is left unexplained", _REST, render_grid([one for pair in zip(rest, white, strict=True) for one in pair])
     )
-    yield PageSection("Link", _LINK, grid([_delays(seen), _runs(found)]))
-    yield PageSection("Configuration", "", folded("TOML with what was identified", dump_config(found.config)))
+    yield PageSection("Link", _LINK, render_grid([_delays(seen), _runs(found)]))
+    yield PageSection("Configuration", "", render_folded("TOML with what was identified", dump_config(found.config)))
 
 
 _COLUMNS = ("axis", "lag [s]", "drag [1/s]", "gain", "wind [m/s²]", "noise [mm]", "R²")
@@ -112,11 +112,11 @@ def _candidates(found: Identification) -> Markup:
     ]
     columns = ("plant", "dead time [s]", "axis", "lag [s]", *ahead)
     # Names of axes are no paths: they stay whole, and the columns are as wide as they need.
-    return table(columns, rows, frozenset(range(3, len(columns))), kind="words")
+    return render_table(columns, rows, frozenset(range(3, len(columns))), kind="words")
 
 
 def _curves(found: Identification) -> Drawing:
-    with canvas("dead-time", _HEIGHT_IN) as drawn:
+    with open_canvas("dead-time", _HEIGHT_IN) as drawn:
         ax = drawn.axes("Deviance over the dead time", "dead time [s]", "rise of the deviance", _LEFT_IN)
         for one, name in zip(found.result.candidates, ("estimate", "lost"), strict=False):
             curve = np.array(one.curve)
@@ -130,24 +130,24 @@ def _with_error(value: float, error: float | None) -> str:
 
 
 def _moved(name: str, one: Prediction) -> Drawing:
-    with canvas(f"moved-{name}", _HEIGHT_IN) as drawn:
+    with open_canvas(f"moved-{name}", _HEIGHT_IN) as drawn:
         ax = drawn.axes(name, "predicted [m]", "flown [m]")
         ends = [
             float(min(one.predicted_m.min(), one.moved_m.min())),
             float(max(one.predicted_m.max(), one.moved_m.max())),
         ]
         ax.plot(ends, ends, color=colour("limit"), linewidth=1.0)
-        dots(ax, one.predicted_m, one.moved_m, "estimate", 2.5)
+        draw_dots(ax, one.predicted_m, one.moved_m, "estimate", 2.5)
         ax.autoscale_view()
     return Drawing(f"moved-{name}", drawn.svg, f"{name}: motion flown against motion predicted, R² {one.r2:.3f}")
 
 
 def _innovations(name: str, one: Prediction) -> Drawing:
-    with canvas(f"innovations-{name}", _HEIGHT_IN) as drawn:
+    with open_canvas(f"innovations-{name}", _HEIGHT_IN) as drawn:
         ax = drawn.axes(f"{name}: position minus prediction", "time [s]", "difference [m]", _LEFT_IN)
         for sign in (-2.0, 2.0):
             ax.plot(one.times_s, sign * one.stds_m, color=colour("limit"), linewidth=0.8)
-        dots(ax, one.times_s, one.innovations_m, "estimate", 2.5)
+        draw_dots(ax, one.times_s, one.innovations_m, "estimate", 2.5)
     inside = float(np.mean(np.abs(one.innovations_m) <= 2.0 * one.stds_m))
     label = f"{name}: innovations with two standard deviations; {100 * inside:.0f} % are inside, 95 % should be"
     return Drawing(f"innovations-{name}", drawn.svg, label)
@@ -156,7 +156,7 @@ def _innovations(name: str, one: Prediction) -> Drawing:
 def _whiteness(name: str, one: Prediction) -> Drawing:
     lags = np.arange(1, len(one.correlation) + 1)
     band = 1.96 / np.sqrt(max(len(one.innovations_m), 1))
-    with canvas(f"white-{name}", _HEIGHT_IN) as drawn:
+    with open_canvas(f"white-{name}", _HEIGHT_IN) as drawn:
         ax = drawn.axes(f"{name}: correlation of innovations", "positions apart", "correlation")
         ax.bar(lags, one.correlation, color=colour("estimate"), width=0.6)
         for sign in (-band, band):
@@ -169,10 +169,10 @@ def _whiteness(name: str, one: Prediction) -> Drawing:
 
 
 def _delays(seen: PositionHistory) -> Drawing:
-    with canvas("delays", _HEIGHT_IN) as drawn:
+    with open_canvas("delays", _HEIGHT_IN) as drawn:
         ax = drawn.axes("Delay from capture to arrival", "time [s]", "delay [ms]")
         every = slice(None, None, max(1, len(seen.times_s) // _MOST_DELAYS))
-        dots(ax, seen.times_s[every], 1e3 * seen.delays_s[every], "sample", 2.0)
+        draw_dots(ax, seen.times_s[every], 1e3 * seen.delays_s[every], "sample", 2.0)
         ax.set_xlim(float(seen.times_s[0]), float(seen.times_s[-1]))
         ax.set_ylim(0.0, max(1.0, 1.05e3 * float(seen.delays_s.max())))
     return Drawing("delays", drawn.svg, "delay of each position over the flight")
@@ -182,7 +182,7 @@ def _runs(found: Identification) -> Drawing:
     link = found.link
     count = np.arange(len(link.runs))
     alone = (1.0 - link.loss) * link.loss**count
-    with canvas("runs", _HEIGHT_IN) as drawn:
+    with open_canvas("runs", _HEIGHT_IN) as drawn:
         ax = drawn.axes("Losses in a row after a position", "lost in a row", "share")
         ax.bar(count, link.runs, color=colour("lost"), width=0.6)
         ax.plot(count, alone, color=colour("estimate"), marker="o", markersize=3)

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from logs.report.statistics import finite
+from logs.report.statistics import replace_infinite
 from uavctl.config import Config
 from uavctl.config.link import MAX_LOSS_RUN
 from uavctl.errors import RecordingError
@@ -347,9 +347,9 @@ def _response(name: str, flown: Sequence[Stretch], fit: AxisFit, prediction: Pre
         input_std_mps2=fit.value("input_mps2_rts") / math.sqrt(dt_s) if reference else None,
         force_drift_mps2_rts=fit.value("drift_mps2_rts") if reference else None,
         position_std_m=fit.value("noise_m"),
-        lag_std_s=finite(errors["lag_s"]),
-        drag_std_1ps=finite(errors["drag_1ps"]),
-        gain_std=finite(errors.get("gain", math.inf)),
+        lag_std_s=replace_infinite(errors["lag_s"]),
+        drag_std_1ps=replace_infinite(errors["drag_1ps"]),
+        gain_std=replace_infinite(errors.get("gain", math.inf)),
         residual_std_m=prediction.residual_std_m,
         r2=prediction.r2,
     )

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from logs.report.statistics import clopper_pearson
+from logs.report.run_statistics import clopper_pearson
 from uavctl.build.controller import build_problem, build_spec, needed
 from uavctl.lab.paper.runs import DRAWN, LIKELIHOOD, Flights, Setup, Totals, fly_runs, planes
 from uavctl.smpc.baselines import Lqg, WorstCaseDelay

@@ -13,7 +13,7 @@ from matplotlib.patches import Patch, Polygon, Rectangle
 from matplotlib.ticker import FuncFormatter, NullLocator
 from numpy.typing import NDArray
 
-from logs.report.svg import canvas, colour, ramp, standalone
+from logs.report.svg import choose_ramp_colour, colour, make_standalone, open_canvas
 from uavctl.lab.paper.runs import LIKELIHOOD, ellipsoid_scale, planes
 from uavctl.smpc.hahn_stursberg.design import Design
 
@@ -59,15 +59,17 @@ def trajectories_svg(states: Array, design: Design) -> str:
         Line2D([], [], color=colour("limit"), lw=2, label=f"{LIKELIHOOD:.0%} ellipsoid of Σ_ξ (τ = {tau}), projected"),
         Line2D([], [], color=colour("estimate"), ls="", marker="s", label="initial state"),
     ]
-    with canvas(f"runs-tau{tau}", _HEIGHT_IN, _WIDTH_IN) as one:
-        one.figure.set_layout_engine(None)
-        all_axes = one.figure.subplots(1, len(shown), squeeze=False, gridspec_kw={**_SIDES, "wspace": 0.2})[0]
+    with open_canvas(f"runs-tau{tau}", _HEIGHT_IN, _WIDTH_IN) as canvas:
+        canvas.figure.set_layout_engine(None)
+        all_axes = canvas.figure.subplots(1, len(shown), squeeze=False, gridspec_kw={**_SIDES, "wspace": 0.2})[0]
         for ax, (pair, x, y) in zip(all_axes, shown, strict=True):
             ax.set(title=f"({x}, {y})", xlabel=x, ylabel=y)
             _draw_plane(ax, states[:, :, list(pair)], pair, design)
-        one.figure.legend(handles=keys, loc="lower left", ncols=len(keys))
+        canvas.figure.legend(handles=keys, loc="lower left", ncols=len(keys))
     where = ", ".join(f"({x}, {y})" for _, x, y in shown)
-    return standalone(one.svg, f"{len(states)} runs of the paper's example with τ = {tau} in the planes {where}")
+    return make_standalone(
+        canvas.svg, f"{len(states)} runs of the paper's example with τ = {tau} in the planes {where}"
+    )
 
 
 def _draw_plane(ax: Axes, points: Array, pair: tuple[int, int], design: Design) -> None:
@@ -107,16 +109,18 @@ def ages_svg(ages: Counts, link: AgeReference) -> str:
         link: Link and design that the ages are compared with.
     """
     runs = int(ages[0].sum())
-    with canvas("ages", _HEIGHT_IN, _WIDTH_IN) as one:
-        one.figure.set_layout_engine(None)
-        over_time, tail = one.figure.subplots(
+    with open_canvas("ages", _HEIGHT_IN, _WIDTH_IN) as canvas:
+        canvas.figure.set_layout_engine(None)
+        over_time, tail = canvas.figure.subplots(
             1, 2, width_ratios=(2.0, 1.0), gridspec_kw={**_SIDES, "bottom": 0.12, "wspace": 0.5}
         )
         over_time.set(title=f"Age of information in each step, {runs:,} runs", xlabel="step k", ylabel="share of runs")
         _draw_over_time(over_time, ages / runs)
         tail.set(title="How rarely an age is reached", xlabel="age j", ylabel="steps with a ≥ j")
         _draw_tail(tail, ages, link)
-    return standalone(one.svg, f"Distribution of the age of information in each of {len(ages)} steps of {runs} runs")
+    return make_standalone(
+        canvas.svg, f"Distribution of the age of information in each of {len(ages)} steps of {runs} runs"
+    )
 
 
 def _draw_over_time(ax: Axes, shares: Array) -> None:
@@ -126,7 +130,15 @@ def _draw_over_time(ax: Axes, shares: Array) -> None:
     edges, below = np.arange(steps + 1) - 0.5, np.zeros(steps)
     for age, top in enumerate(tops.T):
         name = f"{age}" if age < oldest else f"{age} or more"
-        ax.stairs(top, edges, baseline=below, fill=True, color=ramp(age, oldest + 1), label=name, gid=f"age-{age}")
+        ax.stairs(
+            top,
+            edges,
+            baseline=below,
+            fill=True,
+            color=choose_ramp_colour(age, oldest + 1),
+            label=name,
+            gid=f"age-{age}",
+        )
         below = top
     ax.set(xlim=(-0.5, steps - 0.5), ylim=(0.0, 1.0))
     ax.yaxis.set_major_formatter(FuncFormatter(lambda share, _: f"{share:.0%}"))

@@ -18,12 +18,12 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from logs.recording.disk import write_whole
+from logs.recording.disk import write_atomically
 from logs.recording.flight import FlightData
-from logs.recording.summary import position_error_m
-from logs.report.page import Mark, PageSection, grid, page, table
+from logs.recording.summary import compute_position_errors_m
+from logs.report.page import Mark, PageSection, render_grid, render_page, render_table
 from logs.report.plots import DASHED, DOTTED
-from logs.report.svg import Drawing, canvas, colour
+from logs.report.svg import Drawing, colour, open_canvas
 from uavctl.config import Config
 from uavctl.config.load import dump_config, flatten_keys, parse
 from uavctl.errors import UsageError
@@ -75,7 +75,7 @@ def figures_of(flight: FlightData, recording: str, fallbacks: int, box: SafeBox 
     """
     steps = flight.steps
     held = holding(flight)
-    distances = position_error_m(flight)[held]
+    distances = compute_position_errors_m(flight)[held]
     hold_s = float(np.count_nonzero(held)) * flight.design.dt_s
     enough = hold_s >= LEAST_HOLD_S
     planned = plan_errors_m(flight)
@@ -196,7 +196,7 @@ class TuneFolder:
             path.mkdir(parents=True, exist_ok=True)
             folder = cls(path, TuneProgress(asked=asked, digest=digest))
             folder.note()
-            write_whole(path / SETTINGS, text)
+            write_atomically(path / SETTINGS, text)
             return folder
         progress = _read(path / STATE)
         if progress.digest != digest:
@@ -212,7 +212,7 @@ class TuneFolder:
             )
         folder = cls(path, progress)
         if not (path / SETTINGS).exists():
-            write_whole(path / SETTINGS, text)
+            write_atomically(path / SETTINGS, text)
         if progress.comparison is None:
             folder.note()  # a folder that takes no more is told before anything is flown
         return folder
@@ -224,7 +224,7 @@ class TuneFolder:
             RecordingError: It cannot be written.
         """
         self.progress = msgspec.structs.replace(self.progress, **done)
-        write_whole(self.path / STATE, msgspec.json.format(msgspec.json.encode(self.progress)).decode() + "\n")
+        write_atomically(self.path / STATE, msgspec.json.format(msgspec.json.encode(self.progress)).decode() + "\n")
 
     def free(self, name: str) -> Path:
         """Return a folder for one more flight: the first of NAME, NAME-2, NAME-3, … that does not exist yet."""
@@ -438,7 +438,9 @@ def write_page(progress: TuneProgress, before: FlightData, after: FlightData, bo
     assert progress.tuned is not None and progress.comparison is not None
     told, found = progress.tuned, progress.comparison
     sections = _sections(progress, found, before, after, box)
-    return page("Tuned by flying", f"{found.before.recording}, {found.after.recording}", story(told, found), sections)
+    return render_page(
+        "Tuned by flying", f"{found.before.recording}, {found.after.recording}", story(told, found), sections
+    )
 
 
 def _sections(
@@ -446,29 +448,29 @@ def _sections(
 ) -> Iterator[PageSection]:
     assert progress.tuned is not None
     told = progress.tuned
-    yield PageSection("Both flights", _FIGURES, table(FIGURE_COLUMNS, figure_rows(found), frozenset({1, 2, 3})))
-    yield PageSection("How the place was held", _HOLD, grid([_held(before, after)]), _MARKS)
-    yield PageSection("What changes", _CHANGES, table(CHANGE_COLUMNS, change_rows(told), frozenset({1, 2, 3})))
+    yield PageSection("Both flights", _FIGURES, render_table(FIGURE_COLUMNS, figure_rows(found), frozenset({1, 2, 3})))
+    yield PageSection("How the place was held", _HOLD, render_grid([_held(before, after)]), _MARKS)
+    yield PageSection("What changes", _CHANGES, render_table(CHANGE_COLUMNS, change_rows(told), frozenset({1, 2, 3})))
     yield _prediction("first", "Prediction on the first flight", _ON_FIRST, told.old_errors, told.new_errors)
     yield _prediction("second", "Prediction on the second flight", _ON_SECOND, found.old_errors, found.new_errors)
     drawings = [_axis(before, after, name, place, box) for place, name in enumerate(before.design.axes)]
-    yield PageSection("Motion", _MOTION, grid(drawings), (*_MARKS, _TARGET, *([] if box is None else [_BOX])))
+    yield PageSection("Motion", _MOTION, render_grid(drawings), (*_MARKS, _TARGET, *([] if box is None else [_BOX])))
 
 
 def _prediction(key: str, title: str, note: str, old: PredictionErrors, new: PredictionErrors) -> PageSection:
     columns = error_columns(old)
-    body = table(columns, error_rows(old, new), frozenset(range(2, len(columns))))
-    return PageSection(title, note, body + grid([_growing(key, old, new)]), _MODELS)
+    body = render_table(columns, error_rows(old, new), frozenset(range(2, len(columns))))
+    return PageSection(title, note, body + render_grid([_growing(key, old, new)]), _MODELS)
 
 
 def _held(before: FlightData, after: FlightData) -> Drawing:
-    with canvas("held", _HEIGHT_IN) as drawn:
+    with open_canvas("held", _HEIGHT_IN) as drawn:
         ax = drawn.axes("Distance from the last place", "time of holding [s]", "distance [cm]")
         for flight, role in ((before, _BEFORE), (after, _AFTER)):
             held, steps = holding(flight), flight.steps
             if not held.any():
                 continue
-            off = position_error_m(flight)[held]
+            off = compute_position_errors_m(flight)[held]
             ax.plot(steps.t_s[held] - steps.t_s[held][0], 100.0 * off, color=colour(role))
         ax.set_ylim(bottom=0.0)
     return Drawing("held", drawn.svg, "distance from the last place over the time of holding, of both flights")
@@ -477,7 +479,7 @@ def _held(before: FlightData, after: FlightData) -> Drawing:
 def _growing(key: str, old: PredictionErrors, new: PredictionErrors) -> Drawing:
     """Draw how errors grow with the time ahead, a line for each axis."""
     title = "Error over the time ahead, each axis"
-    with canvas(f"growing-{key}", _HEIGHT_IN) as drawn:
+    with open_canvas(f"growing-{key}", _HEIGHT_IN) as drawn:
         ax = drawn.axes(title, "time ahead [s]", "error [mm]")
         for errors, role in ((old, _BEFORE), (new, _AFTER)):
             for row in errors.rms_m:
@@ -487,7 +489,7 @@ def _growing(key: str, old: PredictionErrors, new: PredictionErrors) -> Drawing:
 
 
 def _axis(before: FlightData, after: FlightData, name: str, place: int, box: SafeBox | None) -> Drawing:
-    with canvas(f"motion-{name}", _HEIGHT_IN) as drawn:
+    with open_canvas(f"motion-{name}", _HEIGHT_IN) as drawn:
         ax = drawn.axes(name, "time [s]", "position [m]")
         for flight, role in ((before, _BEFORE), (after, _AFTER)):
             index = flight.design.position_index[place]

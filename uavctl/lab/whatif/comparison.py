@@ -12,11 +12,11 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from logs.recording.flight import FlightData
-from logs.recording.summary import FlightSummary, rows
+from logs.recording.summary import FlightSummary, list_summary_rows
 from logs.recording.topics import RecorderNote, encode
-from logs.report.page import Mark, PageSection, grid, page, table
+from logs.report.page import Mark, PageSection, render_grid, render_page, render_table
 from logs.report.plots import DASHED, DOTTED, draw_limits
-from logs.report.svg import Drawing, canvas, colour
+from logs.report.svg import Drawing, colour, open_canvas
 from sim.vehicle.linear import CACHED_TRANSITIONS
 from uavctl.lab.whatif.flight import Entry, RecordedFlight, Response
 from uavctl.records import Decision, Estimate, Plan, Record, Setpoint, Truth
@@ -205,7 +205,7 @@ def write_page(found: WhatIf, recorded: FlightData, other: FlightData) -> str:
     Args:
         recorded: The recorded flight, as far as it is compared.
     """
-    return page("What if", found.flight, story(found), _sections(found, recorded, other))
+    return render_page("What if", found.flight, story(found), _sections(found, recorded, other))
 
 
 def story(found: WhatIf) -> list[str]:
@@ -237,7 +237,7 @@ def story(found: WhatIf) -> list[str]:
 def side_by_side(found: WhatIf) -> Iterator[tuple[str, ...]]:
     """Return rows of the figures: name, recorded, reproduced, what-if."""
     bare = [replace(one, recording=None, report=None) for one in (found.recorded, found.reproduced, found.what_if)]
-    columns = [dict(rows(one)) for one in bare]
+    columns = [dict(list_summary_rows(one)) for one in bare]
     for name in dict.fromkeys(name for column in columns for name in column):
         if name not in _NOT_FLOWN:
             yield (name, *(column.get(name, "-") for column in columns))
@@ -246,14 +246,14 @@ def side_by_side(found: WhatIf) -> Iterator[tuple[str, ...]]:
 def _sections(found: WhatIf, recorded: FlightData, other: FlightData) -> Iterator[PageSection]:
     index = recorded.design.position_index
     axes = [_axis(recorded, other, place, name) for place, name in zip(index, recorded.design.axes, strict=True)]
-    yield PageSection("Motion", _MOTION, grid(axes), _MARKS)
+    yield PageSection("Motion", _MOTION, render_grid(axes), _MARKS)
     horizon = Mark("dashed", "limit", f"horizon H = {other.design.horizon}")
-    yield PageSection("Link", _AGE, grid([_ages(recorded, other)]), (*_MARKS[:2], horizon))
-    yield PageSection("Side by side", _WORTH, table(HEADINGS, side_by_side(found), frozenset()))
+    yield PageSection("Link", _AGE, render_grid([_ages(recorded, other)]), (*_MARKS[:2], horizon))
+    yield PageSection("Side by side", _WORTH, render_table(HEADINGS, side_by_side(found), frozenset()))
 
 
 def _axis(recorded: FlightData, other: FlightData, place: int, name: str) -> Drawing:
-    with canvas(f"motion-{name}", _HEIGHT_IN) as drawn:
+    with open_canvas(f"motion-{name}", _HEIGHT_IN) as drawn:
         ax = drawn.axes(name, "time [s]", "position [m]")
         draw_limits(ax, other, place, 1.0)
         for flight, role in ((recorded, RECORDED), (other, MIGHT)):
@@ -265,7 +265,7 @@ def _axis(recorded: FlightData, other: FlightData, place: int, name: str) -> Dra
 
 
 def _ages(recorded: FlightData, other: FlightData) -> Drawing:
-    with canvas("ages", _HEIGHT_IN) as drawn:
+    with open_canvas("ages", _HEIGHT_IN) as drawn:
         ax = drawn.axes("Age of the newest position", "time [s]", "steps")
         for flight, role in ((recorded, RECORDED), (other, MIGHT)):
             steps = flight.steps

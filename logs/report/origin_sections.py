@@ -1,0 +1,82 @@
+"""Sections of a flight's page on its origin: design, checks before arming, configuration, versions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+from logs.recording.flight import FlightData
+from logs.report import page
+from logs.report.page import PageSection
+
+# Numbers that say no more than that it hardly ever happens are told as one.
+_NEGLIGIBLE = 1e-6
+_DESIGN = {
+    "horizon": "Horizon H [steps]",
+    "dt_s": "Step Δt [s]",
+    "scheme": "Scheme",
+    "weights": "Shares of the ages of information",
+    "budgets": "Risk of each age",
+    "beyond": "Share of information older than the horizon",
+    "tau": "Delay τ of the terminal law [steps]",
+    "delays": "Information delays d",
+    "gamma_x": "Likelihoods γ of the states",
+    "gamma_u": "Likelihoods γ of the inputs",
+    "spectral_radius": "Spectral radius of the terminal law",
+    "stationary_cost": "Stationary cost",
+}
+
+
+def make_origin_sections(flight: FlightData) -> Iterator[PageSection]:
+    """Return the sections on parameters and on how the flight was made."""
+    design = list(_list_design_facts(flight.header.design))
+    parts = [page.render_facts(design)] if design else []
+    assumptions = list(_list_assumptions(flight.header.design))
+    if assumptions:
+        columns = ("assumption", "value", "limit", "holds")
+        parts.append(
+            page.render_folded("Assumptions of the design", page.render_table(columns, assumptions, frozenset({1, 2})))
+        )
+    if flight.checks:
+        columns = ("check before arming", "state", "found", "wanted")
+        check_rows = [(check.name, check.state, check.value, check.want) for check in flight.checks]
+        parts.append(page.render_folded("Checked before arming", page.render_table(columns, check_rows, frozenset())))
+    header = flight.header
+    parts.append(page.render_folded("Configuration", header.config_toml))
+    yield PageSection("Configuration and parameters", "", page.join(parts))
+    versions = [("Design", header.design_id), ("Processor", header.cpu), *sorted(header.versions.items())]
+    yield PageSection("Made with", "", page.render_facts(versions))
+
+
+def _list_design_facts(design: Mapping[str, object]) -> Iterator[tuple[str, str]]:
+    for key, name in _DESIGN.items():
+        if key in design:
+            yield name, _format_value(design[key])
+
+
+def _format_value(value: object) -> str:
+    """Return a number, or a list of them, as text; a run of equal numbers is written once."""
+    if isinstance(value, (int, float)):
+        return f"{value:.4g}"
+    if not isinstance(value, (list, tuple)):
+        return str(value)
+    runs: list[tuple[str, int]] = []
+    for entry in value:
+        text = f"< {_NEGLIGIBLE:g}" if isinstance(entry, float) and 0 < entry < _NEGLIGIBLE else _format_value(entry)
+        if runs and runs[-1][0] == text:
+            runs[-1] = (text, runs[-1][1] + 1)
+        else:
+            runs.append((text, 1))
+    return ", ".join(text if times == 1 else f"{times} × {text}" for text, times in runs)
+
+
+def _list_assumptions(design: Mapping[str, object]) -> Iterator[tuple[str, ...]]:
+    assumptions = design.get("assumptions")
+    for assumption in assumptions if isinstance(assumptions, (list, tuple)) else ():
+        if isinstance(assumption, Mapping):
+            name = f"{assumption.get('item')}: {assumption.get('text')}"
+            yield (
+                name,
+                _format_value(assumption.get("value")),
+                _format_value(assumption.get("limit")),
+                "yes" if assumption.get("ok") else "no",
+            )

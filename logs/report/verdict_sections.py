@@ -1,0 +1,199 @@
+"""Sections of a flight's page with the verdicts on risk, model and clocks."""
+
+from __future__ import annotations
+
+from logs.recording.flight import FlightData
+from logs.report import page, verdict_figures
+from logs.report.page import Mark, PageSection
+from logs.report.statistics import LEVEL
+from logs.report.verdict_clocks import ClockVerdict, format_plain
+from logs.report.verdict_model import AxisVerdict, ModelOutcome, ModelVerdict
+from logs.report.verdict_risk import LimitRisk
+from logs.report.verdicts import Judgement, Verdicts
+
+_PREDICTED = Mark("line", "estimate", "measured")
+_BAND = Mark("band", "target", f"where a right model stays with {100 * LEVEL:.0f} %")
+_UNREADABLE = "The flight's configuration cannot be read by this version, so its model cannot be run again."
+
+
+def make_verdict_rows(verdicts: Verdicts) -> list[tuple[str, str]]:
+    """Return one row (name, outcome) for each verdict."""
+    risk = verdicts.risk
+    is_judged = bool(risk.limits[0].measured.trials) and risk.limits[0].promised is not None
+    link = verdicts.link
+    return [
+        ("Promised risk", _describe_verdict(risk.refuted, is_judged)),
+        ("Promised link", _describe_verdict(link.refuted, bool(link.news.trials) and link.promised_news is not None)),
+        ("Model of the vehicle", _describe_model_verdict(verdicts.model)),
+    ]
+
+
+def _describe_verdict(is_refuted: bool, is_judged: bool) -> str:
+    if not is_judged:
+        return "too little to judge"
+    return "refuted by this flight" if is_refuted else "nothing in this flight speaks against it"
+
+
+def _describe_model_verdict(model: ModelVerdict | None) -> str:
+    if model is None:
+        return "not known"
+    if model.outcome is ModelOutcome.CAUTIOUS:
+        return "cautious: errors were smaller than foretold"
+    return _describe_verdict(model.refuted, model.outcome is not ModelOutcome.UNKNOWN) + _describe_departure(model)
+
+
+def _describe_departure(model: ModelVerdict) -> str:
+    """Return what refutes a model, each test in a few words."""
+    tests = [
+        *(["larger than foretold"] if any(axis_verdict.has_larger_errors for axis_verdict in model.axes) else ()),
+        *(["off on average"] if any(axis_verdict.mean_refuted for axis_verdict in model.axes) else ()),
+        *(["telling of the next"] if any(axis_verdict.has_correlated_errors for axis_verdict in model.axes) else ()),
+    ]
+    if any(lead.has_too_few_inside for lead in model.leads):
+        return ": too few positions were where they were foretold"
+    return f": errors were {', '.join(tests)}" if tests else ""
+
+
+def make_risk_section(verdicts: Verdicts) -> PageSection:
+    """Make the section on the promised and the measured risk."""
+    risk = verdicts.risk
+    limits = [limit for index, limit in enumerate(risk.limits) if index < 2 or limit.outside]
+    hidden_count = len(risk.limits) - len(limits)
+    columns = ("limit", "outside", "with news", "risk up to", "promised")
+    body = [
+        page.render_paragraph(risk.text),
+        page.render_table(columns, [_make_risk_row(limit) for limit in limits], frozenset({1, 2, 3, 4})),
+    ]
+    if hidden_count:
+        body.append(page.render_note(f"The other {hidden_count} limits of single states were never broken."))
+    if risk.unpromised:
+        body.append(
+            page.render_note(
+                f"{risk.unpromised} of {risk.limits[0].steps} flown steps had no promise: it takes a plan that was "
+                "flown in the step before, and in which no constraint gave way."
+            )
+        )
+    note = (
+        "“outside” counts all flown steps; “with news” those at which a position had just come, which are independent "
+        f"as far as the promise goes. “risk up to” is the upper end of the exact {100 * LEVEL:.0f} % interval "
+        "(Clopper and Pearson), all limits together. A promise holds for all limits of the states, or of the inputs, "
+        "at once."
+    )
+    return PageSection("Verdict: promised risk against measured", note, page.join(body))
+
+
+def _make_risk_row(risk: LimitRisk) -> tuple[str, ...]:
+    return (
+        risk.name,
+        f"{risk.outside} of {risk.steps}",
+        f"{risk.measured.hits} of {risk.measured.trials}",
+        _format_percent(risk.measured.high),
+        "unknown" if risk.promised is None else f"{_format_percent(risk.promised)}{', broken' if risk.refuted else ''}",
+    )
+
+
+def make_model_section(flight: FlightData, judged: Judgement) -> PageSection:
+    """Make the section on the model: errors of its forecasts, and their tests."""
+    title = "Verdict: the model against what was flown"
+    verdict, samples = judged.verdicts.model, judged.innovations
+    if verdict is None or samples is None:
+        return PageSection(title, "", page.render_paragraph(_UNREADABLE))
+    drawings = [
+        *(
+            drawing
+            for column, axis in enumerate(verdict.axes)
+            for drawing in (
+                verdict_figures.draw_errors(flight, axis.axis, samples.t_s, samples.normalised[:, column]),
+                verdict_figures.draw_whiteness(axis),
+            )
+        ),
+        *([verdict_figures.draw_coverage(verdict.leads)] if verdict.leads else ()),
+    ]
+    columns = ("axis", "error [mm]", "× foretold", "bounds", "mean", "white")
+    table = page.render_table(
+        columns, [_make_axis_row(axis_verdict) for axis_verdict in verdict.axes], frozenset({1, 2, 3, 4, 5})
+    )
+    body = [page.render_paragraph(verdict.text)]
+    if verdict.axes:
+        body.append(table)
+    if drawings:
+        body.append(page.render_grid(drawings))
+    if verdict.leads:
+        columns_ahead = ("time ahead", "in the ellipsoid", "share", "interval")
+        rows = [
+            (
+                f"{lead.lead_s:.3g} s",
+                f"{lead.inside.hits} of {lead.inside.trials}",
+                f"{_format_percent(lead.inside.rate)}{_mark(lead.has_too_few_inside, lead.refuted)}",
+                f"{100 * lead.inside.low:.3g} … {100 * lead.inside.high:.3g} %",
+            )
+            for lead in verdict.leads
+        ]
+        body.append(
+            page.render_folded("Ellipsoids in figures", page.render_table(columns_ahead, rows, frozenset({0, 1, 2, 3})))
+        )
+    note = (
+        "The flight's filter is run again over all positions it used, in the order of capture. An error is a position "
+        "minus what those before it foretell; if the model is right, errors are as large as foretold (1 ×), zero on "
+        "average and say nothing of each other (white: the p-value of Ljung and Box). An ellipsoid is foretold for "
+        "the inputs that were then flown. ✗ refutes the model; ○ departs from it on the cautious side."
+    )
+    legend = (_PREDICTED, _BAND, Mark("dashed", "limit", "promised")) if drawings else ()
+    return PageSection(title, note, page.join(body), legend)
+
+
+def _make_axis_row(verdict: AxisVerdict) -> tuple[str, ...]:
+    return (
+        verdict.axis,
+        f"{1e3 * verdict.rms_m:.3g}",
+        f"{verdict.variance**0.5:.2f}{_mark(verdict.has_larger_errors, verdict.has_smaller_errors)}",
+        f"{verdict.variance_low**0.5:.2f} … {verdict.variance_high**0.5:.2f}",
+        f"{round(verdict.mean, 2) + 0.0:+.2f}{_mark(verdict.mean_refuted)}".replace("-", "−"),
+        f"{_format_p_value(verdict.whiteness_p)}{_mark(verdict.has_correlated_errors, verdict.whiteness_refuted)}",
+    )
+
+
+def _mark(is_refuted: bool, is_cautious: bool = False) -> str:
+    return " ✗" if is_refuted else " ○" if is_cautious else ""
+
+
+def make_clocks_section(flight: FlightData, verdicts: Verdicts) -> PageSection:
+    """Make the section on the clocks of all connections."""
+    note = "The age of information is only as true as the times of capture, which come from the clocks of others."
+    sentences = [clock.text for clock in verdicts.clocks]
+    if verdicts.stamps is not None:
+        sentences.append(verdicts.stamps.text)
+    if not sentences:
+        return PageSection("Verdict: clocks", note, page.render_paragraph("No connection told anything of its clock."))
+    drawings = list(verdict_figures.draw_clocks(flight, verdicts.clocks))
+    body = [page.render_paragraph(sentence) for sentence in sentences]
+    columns = ("connection", "source", "drift [ppm]", "residual [µs]", "round trip [ms]", "refused")
+    if verdicts.clocks:
+        body.append(
+            page.render_table(columns, [_make_clock_row(clock) for clock in verdicts.clocks], frozenset({2, 3, 4, 5}))
+        )
+    if drawings:
+        body.append(page.render_grid(drawings))
+    return PageSection("Verdict: clocks", note, page.join(body))
+
+
+def _make_clock_row(verdict: ClockVerdict) -> tuple[str, ...]:
+    def figure(value: float | None) -> str:
+        return "–" if value is None else format_plain(value)
+
+    return (
+        verdict.link,
+        verdict.source,
+        figure(verdict.drift_ppm),
+        "–" if verdict.residual_us is None else f"{verdict.residual_us:.0f}",
+        figure(verdict.rtt_ms),
+        str(verdict.rejected),
+    )
+
+
+def _format_percent(share: float) -> str:
+    return f"{100 * share:.3g} %"
+
+
+def _format_p_value(value: float) -> str:
+    return f"{value:.2g}" if value >= 1e-4 else "< 0.0001"
