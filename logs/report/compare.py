@@ -204,7 +204,7 @@ class Match(msgspec.Struct, frozen=True, kw_only=True):
 class ParameterDifference(msgspec.Struct, frozen=True, kw_only=True):
     """Parameter in which the recordings differ; null where a recording does not have it."""
 
-    # Key in the configuration, as `smpc.horizon`, or design_id, library_id, cpu, platform, versions.<package>, vehicle.<PARAMETER>
+    # Key in the configuration, or design_id, library_id, cpu, platform, versions.<package>, vehicle.<PARAMETER>
     key: str
     values: tuple[object, ...]  # one each recording
 
