@@ -93,7 +93,7 @@ FORM = (
 class CameraUrl:
     """A body that a server of cameras tells of."""
 
-    system: str  # its scheme, see `uavctl.config.connections.camera_scheme`
+    system: str  # its scheme, see `uavctl.config.connections.parse_camera_scheme`
     host: str  # name or address of the server
     port: int  # where it takes questions
     body: str  # name of the body, as the cameras have it
