@@ -117,7 +117,7 @@ def test_a_hand_over_that_fails_leaves_the_positions_until_the_vehicle_is_down(m
         if flight.loop.finished:
             break
         flight.run(1.0)
-    assert flight.loop.finished and flight.peers.autopilot.craft.landed
+    assert flight.loop.finished and flight.peers.autopilot.vehicle.landed
     assert [event.code for event in flight.memory.of(Event)].count("control") == 1
 
 
