@@ -74,11 +74,11 @@ def find_fault_problems(
             )
 
 
-def _check_name(key: str, what: str, name: str, names: Sequence[str]) -> Iterator[ConfigProblem]:
+def _check_name(key: str, complaint: str, name: str, names: Sequence[str]) -> Iterator[ConfigProblem]:
     if name and name not in names:
         nearest = find_nearest(name, names)
         yield ConfigProblem(
-            key, f'{what} "{name}"{nearest}', "rename it" if nearest else f"give one of {', '.join(names)}"
+            key, f'{complaint} "{name}"{nearest}', "rename it" if nearest else f"give one of {', '.join(names)}"
         )
 
 

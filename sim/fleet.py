@@ -40,9 +40,11 @@ def make_fleet(
         )
     positions_m = _find_start_positions(config, count)
     configs = [_make_config(config, i, position_m) for i, position_m in enumerate(positions_m)]
-    problems = [problem for one in configs for problem in check_system_ids(one.sim, one.daemon)]
+    problems = [
+        problem for vehicle_config in configs for problem in check_system_ids(vehicle_config.sim, vehicle_config.daemon)
+    ]
     if problems:
-        raise ConfigError(tuple(f"{one.key}: {one.reason}; {one.todo}" for one in problems))
+        raise ConfigError(tuple(f"{problem.key}: {problem.reason}; {problem.todo}" for problem in problems))
     setups = tuple(
         VehicleSetup(configs[i], _shift_urls(vehicle, i), _shift_urls(mocap, i), on_truth) for i in range(count)
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from sim.autopilot.estimator import Estimator
 from sim.autopilot.parameters import Parameters
 from sim.autopilot.profile import Mode, Role, SimulatedProfile
-from sim.vehicle.interface import Battery
+from sim.vehicle.interface import BatteryState
 
 READY_NS = 24_000_000_000
 
@@ -15,7 +15,7 @@ def find_arming_refusals(
     mode: Mode,
     parameters: Parameters,
     estimator: Estimator,
-    battery: Battery,
+    battery: BatteryState,
     boot_age_ns: int,
 ) -> tuple[str, ...]:
     """Return the reasons against arming as texts of STATUSTEXT; none if it may arm."""
@@ -28,7 +28,7 @@ def find_arming_refusals(
 
 
 def check_preflight(
-    profile: SimulatedProfile, parameters: Parameters, estimator: Estimator, battery: Battery, boot_age_ns: int
+    profile: SimulatedProfile, parameters: Parameters, estimator: Estimator, battery: BatteryState, boot_age_ns: int
 ) -> tuple[str, ...]:
     """Return the reasons against arming in any mode; without any, SYS_STATUS has its pre-arm bit set."""
     return (
@@ -38,7 +38,7 @@ def check_preflight(
     )
 
 
-def _check_px4(parameters: Parameters, estimator: Estimator, battery: Battery) -> tuple[str, ...]:
+def _check_px4(parameters: Parameters, estimator: Estimator, battery: BatteryState) -> tuple[str, ...]:
     checks = (
         (estimator.passes_checks, "Arming denied: Resolve system health failures first"),
         (estimator.is_position_valid, "Preflight Fail: no valid local position estimate"),
@@ -50,7 +50,7 @@ def _check_px4(parameters: Parameters, estimator: Estimator, battery: Battery) -
 
 
 def _check_ardupilot(
-    parameters: Parameters, estimator: Estimator, battery: Battery, boot_age_ns: int
+    parameters: Parameters, estimator: Estimator, battery: BatteryState, boot_age_ns: int
 ) -> tuple[str, ...]:
     uses_external = estimator.uses_external
     checks = (

@@ -6,7 +6,7 @@ from sim.autopilot.estimator import Estimator
 from sim.autopilot.parameters import Parameters
 from sim.autopilot.pilot import CRITICAL, NOTICE, WARNING, Phase, Pilot
 from sim.autopilot.profile import Mode, Role, SimulatedProfile
-from sim.vehicle.interface import Battery
+from sim.vehicle.interface import BatteryState
 from uavctl.arrays import SECOND_NS
 
 FAILSAFE_PERIOD_NS = SECOND_NS // 10
@@ -26,7 +26,7 @@ class Failsafes:
         pilot: Pilot,
         parameters: Parameters,
         estimator: Estimator,
-        battery: Battery,
+        battery: BatteryState,
         *,
         can_clear: bool = False,
     ) -> None:

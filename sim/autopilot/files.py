@@ -223,11 +223,11 @@ class Files:
             raise RefusedError(FileRefusal.NOT_FOUND)
         query_values = dict(parse_qsl(query))
         start, count, defaults = (
-            _parse_number(query_values.get(one, "0")) for one in ("start", "count", "withdefaults")
+            _parse_number(query_values.get(field, "0")) for field in ("start", "count", "withdefaults")
         )
         if start >= len(self._parameters.names) or defaults > 1:
             raise RefusedError(FileRefusal.ERRNO, errno.EINVAL)
-        self._open = {one: file for one, file in self._open.items() if at_ns - file.used_ns < SESSION_TIMEOUT_NS}
+        self._open = {name: file for name, file in self._open.items() if at_ns - file.used_ns < SESSION_TIMEOUT_NS}
         if key in self._open:
             raise RefusedError(FileRefusal.FAILED)
         if len(self._open) == MAX_SESSIONS:

@@ -89,7 +89,7 @@ class AttitudeLoop:
         r = min(max(r, -MAX_YAW_RATE_RPS), MAX_YAW_RATE_RPS)
         return self._compute_rate_torque(motion.rates_rps, (p, q, r), integrate)
 
-    def _compute_rate_torque(self, rates: Vec3, wanted: Vec3, integrate: bool) -> Vec3:
+    def _compute_rate_torque(self, rates: Vec3, target_rps: Vec3, integrate: bool) -> Vec3:
         (lp, lq, lr), (sp, sq, sr), (ip, iq, ir) = self._last_rates_rps, self._rate_derivative, self._integral
         p, q, r = rates
         filter_gain = self._filter_gain
@@ -97,7 +97,7 @@ class AttitudeLoop:
         sp += filter_gain * ((p - lp) * per_step - sp)
         sq += filter_gain * ((q - lq) * per_step - sq)
         sr += filter_gain * ((r - lr) * per_step - sr)
-        ep, eq, er = wanted[0] - p, wanted[1] - q, wanted[2] - r
+        ep, eq, er = target_rps[0] - p, target_rps[1] - q, target_rps[2] - r
         if integrate:
             tilt_gain, yaw_gain = RATE_INTEGRAL_1PS2 * self._step_s, YAW_INTEGRAL_1PS2 * self._step_s
             ip, iq, ir = ip + tilt_gain * ep, iq + tilt_gain * eq, ir + yaw_gain * er

@@ -24,7 +24,7 @@ ZERO: Vec3 = (0.0, 0.0, 0.0)
 LEVEL: Quaternion = (1.0, 0.0, 0.0, 0.0)
 
 
-class Battery(Protocol):
+class BatteryState(Protocol):
     """Battery as telemetry reports it."""
 
     @property
@@ -94,7 +94,7 @@ class Vehicle(Protocol):
         ...
 
     @property
-    def battery(self) -> Battery:
+    def battery(self) -> BatteryState:
         """Its battery."""
         ...
 
@@ -159,7 +159,7 @@ class ControlledPlant:
 
     attitude: Quaternion = LEVEL
     rates_rps: Vec3 = ZERO
-    battery: Battery = FullBattery()
+    battery: BatteryState = FullBattery()
 
     def __init__(self, plant: LinearVehicle) -> None:
         self._plant = plant

@@ -42,9 +42,9 @@ def make_item(name: str, state: ItemState, value: str, want: str, hint: str = ""
     )
 
 
-def judge_item(name: str, *, good: bool, value: str, want: str, hint: str) -> Item:
+def judge_item(name: str, *, is_good: bool, value: str, want: str, hint: str) -> Item:
     """An item that is good or bad."""
-    return make_item(name, ItemState.GOOD if good else ItemState.BAD, value, want, hint)
+    return make_item(name, ItemState.GOOD if is_good else ItemState.BAD, value, want, hint)
 
 
 def find_refusals(items: Iterable[Item], config: CheckConfig) -> tuple[Item, ...]:

@@ -47,13 +47,13 @@ class Rule:
     judge: ParameterJudge
 
 
-def _require(want: str, *, good: bool, failed_state: ItemState = ItemState.NOTE) -> ParameterVerdict:
-    return ParameterVerdict(ItemState.GOOD if good else failed_state, want)
+def _require(want: str, *, is_good: bool, failed_state: ItemState = ItemState.NOTE) -> ParameterVerdict:
+    return ParameterVerdict(ItemState.GOOD if is_good else failed_state, want)
 
 
-def _require_if(applies: bool, want: str, reason: str, *, good: bool) -> ParameterVerdict:
+def _require_if(applies: bool, want: str, reason: str, *, is_good: bool) -> ParameterVerdict:
     """Judge a want that holds only under a condition; without the condition any value is good."""
-    return _require(want, good=good) if applies else ParameterVerdict(ItemState.GOOD, f"{_ANY}: {reason}")
+    return _require(want, is_good=is_good) if applies else ParameterVerdict(ItemState.GOOD, f"{_ANY}: {reason}")
 
 
 class Runaway(NamedTuple):
@@ -125,8 +125,8 @@ def _make_timeout_judge(lowest_s: float) -> ParameterJudge:
         )
         if value > fitting_s * (1.0 + _FLOAT32_TOLERANCE):
             return ParameterVerdict(ItemState.BAD, want, hint)
-        good = value <= max_s * (1.0 + _FLOAT32_TOLERANCE)
-        return ParameterVerdict(ItemState.GOOD if good else ItemState.NOTE, want, hint)
+        is_good = value <= max_s * (1.0 + _FLOAT32_TOLERANCE)
+        return ParameterVerdict(ItemState.GOOD if is_good else ItemState.NOTE, want, hint)
 
     return judge
 
@@ -156,43 +156,43 @@ def _describe_distances(tightest: list[Runaway], timeout_s: float) -> str:
 def _judge_offboard_loss(value: float, get: ParameterGetter, _config: Config) -> ParameterVerdict:
     keeps_flying = value in (0, 1, 2) and get("COM_RC_IN_MODE") == _NO_RADIO
     return _require(
-        "4: land, or 5: hold", good=value in (4, 5), failed_state=ItemState.BAD if keeps_flying else ItemState.NOTE
+        "4: land, or 5: hold", is_good=value in (4, 5), failed_state=ItemState.BAD if keeps_flying else ItemState.NOTE
     )
 
 
 def _judge_guided_options(value: float, _get: ParameterGetter, _config: Config) -> ParameterVerdict:
-    return _require("bits 4 and 5 off", good=not int(value) & 0x30)
+    return _require("bits 4 and 5 off", is_good=not int(value) & 0x30)
 
 
 def _judge_copter_source(value: float, get: ParameterGetter, config: Config) -> ParameterVerdict:
     if value == _EXTERNAL and get("VISO_TYPE") == 0:
         return ParameterVerdict(ItemState.BAD, "6: the cameras, with a VISO_TYPE other than 0")
     failed_state = ItemState.BAD if config.relay.enabled else ItemState.NOTE
-    return _require("6: the cameras", good=value == _EXTERNAL, failed_state=failed_state)
+    return _require("6: the cameras", is_good=value == _EXTERNAL, failed_state=failed_state)
 
 
 def _judge_copter_other_source(value: float, get: ParameterGetter, _config: Config) -> ParameterVerdict:
     applies = get("EK3_SRC1_POSXY") == _EXTERNAL
-    return _require_if(applies, "6: the cameras", "EK3_SRC1_POSXY is not 6", good=value == _EXTERNAL)
+    return _require_if(applies, "6: the cameras", "EK3_SRC1_POSXY is not 6", is_good=value == _EXTERNAL)
 
 
 def _judge_viso(value: float, get: ParameterGetter, config: Config) -> ParameterVerdict:
     if get("EK3_SRC1_POSXY") != _EXTERNAL and not config.relay.enabled:
         return ParameterVerdict(ItemState.GOOD, f"{_ANY}: no external positions are asked for")
-    return _require("1, or another that is not 0", good=value != 0, failed_state=ItemState.BAD)
+    return _require("1, or another that is not 0", is_good=value != 0, failed_state=ItemState.BAD)
 
 
 def _judge_compass(value: float, get: ParameterGetter, _config: Config) -> ParameterVerdict:
-    return _require_if(get("EK3_SRC1_YAW") == _EXTERNAL, "0: off", "EK3_SRC1_YAW is not 6", good=value == 0)
+    return _require_if(get("EK3_SRC1_YAW") == _EXTERNAL, "0: off", "EK3_SRC1_YAW is not 6", is_good=value == 0)
 
 
 def _judge_copter_failsafe(value: float, _get: ParameterGetter, config: Config) -> ParameterVerdict:
-    return _require("1 or 3: land", good=value in (1, 3), failed_state=_grade_missing_failsafe(config))
+    return _require("1 or 3: land", is_good=value in (1, 3), failed_state=_grade_missing_failsafe(config))
 
 
 def _judge_copter_threshold(value: float, _get: ParameterGetter, config: Config) -> ParameterVerdict:
     failed_state = _grade_missing_failsafe(config) if value <= 0.0 else ItemState.NOTE
-    return _require("0.6 to 1", good=0.6 <= value <= 1.0, failed_state=failed_state)
+    return _require("0.6 to 1", is_good=0.6 <= value <= 1.0, failed_state=failed_state)
 
 
 def _grade_missing_failsafe(config: Config) -> ItemState:
@@ -204,7 +204,9 @@ def _judge_px4_external(value: float, _get: ParameterGetter, config: Config) -> 
     bits = _HORIZONTAL | _VERTICAL | _YAW
     is_ignored = config.relay.enabled and not int(value) & _HORIZONTAL
     want = f"{bits}: position, height, yaw (bits 0, 1 and 3)"
-    return _require(want, good=int(value) & bits == bits, failed_state=ItemState.BAD if is_ignored else ItemState.NOTE)
+    return _require(
+        want, is_good=int(value) & bits == bits, failed_state=ItemState.BAD if is_ignored else ItemState.NOTE
+    )
 
 
 def _fuses_external(get: ParameterGetter, bit: int) -> bool:
@@ -214,16 +216,18 @@ def _fuses_external(get: ParameterGetter, bit: int) -> bool:
 
 def _judge_px4_height(value: float, get: ParameterGetter, _config: Config) -> ParameterVerdict:
     return _require_if(
-        _fuses_external(get, _VERTICAL), "3: the cameras", "EKF2_EV_CTRL takes no height", good=value == 3
+        _fuses_external(get, _VERTICAL), "3: the cameras", "EKF2_EV_CTRL takes no height", is_good=value == 3
     )
 
 
 def _judge_px4_gps(value: float, get: ParameterGetter, _config: Config) -> ParameterVerdict:
-    return _require_if(_fuses_external(get, _HORIZONTAL), "0: off", "EKF2_EV_CTRL takes no position", good=value == 0)
+    return _require_if(
+        _fuses_external(get, _HORIZONTAL), "0: off", "EKF2_EV_CTRL takes no position", is_good=value == 0
+    )
 
 
 def _judge_px4_mag(value: float, get: ParameterGetter, _config: Config) -> ParameterVerdict:
-    return _require_if(_fuses_external(get, _YAW), "5: none", "EKF2_EV_CTRL takes no yaw", good=value == 5)
+    return _require_if(_fuses_external(get, _YAW), "5: none", "EKF2_EV_CTRL takes no yaw", is_good=value == 5)
 
 
 _CAMERA_HINT = "the cameras. GPS and compass are wrong indoors"
@@ -301,7 +305,7 @@ def _make_climb_rule(config: Config, take_off_m: float | None) -> Rule:
     )
 
     def judge(value: float, _get: ParameterGetter, _config: Config) -> ParameterVerdict:
-        return _require("; ".join(bounds) or _ANY, good=min_m <= value <= ceiling_m)
+        return _require("; ".join(bounds) or _ANY, is_good=min_m <= value <= ceiling_m)
 
     return Rule(_TAKE_OFF, hint, judge)
 

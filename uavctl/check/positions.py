@@ -102,7 +102,7 @@ def _check_rate(samples: list[Sample], period_s: float | None, config: Config) -
         is_good, value = 1.0 / period_s >= min_hz, f"{1.0 / period_s:.3g} Hz captured"
     return judge_item(
         "position rate",
-        good=is_good,
+        is_good=is_good,
         value=f"{value}, {arrival_hz:.3g} Hz arrive",
         want=want,
         hint="raise the rate of the cameras, or lower source.rate_hz, and design again",
@@ -115,7 +115,7 @@ def _check_gaps(data: CheckData, config: Config, at_ns: int) -> Item:
     horizon_s = config.smpc.horizon * config.plant.dt_s
     return judge_item(
         "longest gap",
-        good=max_gap_s < horizon_s,
+        is_good=max_gap_s < horizon_s,
         value=f"{max_gap_s:.3g} s",
         want=f"under {horizon_s:.3g} s, the horizon: then plans end and the vehicle brakes",
         hint="look for occlusions and for the radio link; a flight would fall back at once",
@@ -169,7 +169,7 @@ def _check_loss(captured_s: list[float], config: Config) -> Item:
     hint = "design for the loss that is there (link.loss, link.model), or better the link"
     if lower_bound <= expected < loss:
         value += ", which is within the chance of so few"
-    return judge_item(name, good=lower_bound <= expected, value=value, want=want, hint=hint)
+    return judge_item(name, is_good=lower_bound <= expected, value=value, want=want, hint=hint)
 
 
 def estimate_noise_m(samples: list[Sample]) -> Vec3:
@@ -213,7 +213,9 @@ def _check_noise(samples: list[Sample], config: Config) -> Item:
         ):
             hint = f"does the source send {unit}? It has to send metres; else {hint}"
             break
-    return judge_item("position noise", good=noise_m <= _NOISE_FACTOR * configured_m, value=value, want=want, hint=hint)
+    return judge_item(
+        "position noise", is_good=noise_m <= _NOISE_FACTOR * configured_m, value=value, want=want, hint=hint
+    )
 
 
 def _check_room(samples: list[Sample], config: Config) -> Item:
@@ -233,7 +235,9 @@ def _check_room(samples: list[Sample], config: Config) -> Item:
         if _is_inside(flipped, limits, config.check.margin_m):
             hint = f'is up negative? With cameras that point up, frame.convention = "enu"; else {hint}'
     want = ", ".join(f"{axis} {low:g} to {high:g}" for axis, (low, high) in limits.items())
-    return judge_item("position in the room", good=is_inside, value=f"({text}) m", want=f"{want} m (sets)", hint=hint)
+    return judge_item(
+        "position in the room", is_good=is_inside, value=f"({text}) m", want=f"{want} m (sets)", hint=hint
+    )
 
 
 def _is_inside(position: list[float], limits: dict[str, tuple[float, float]], margin_m: float) -> bool:

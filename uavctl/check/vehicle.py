@@ -56,7 +56,7 @@ def _check_other_vehicles(data: CheckData) -> Item:
     count = sum(stats.bad.get(SECOND_VEHICLE, 0) for stats in data.stats.values())
     return judge_item(
         "other vehicles",
-        good=count == 0,
+        is_good=count == 0,
         value=f"{count} heartbeats of others" if count else "none",
         want="one vehicle on a link",
         hint="give each vehicle a port of its own, and ids that differ (SYSID_THISMAV, MAV_SYS_ID)",
@@ -109,4 +109,6 @@ def _check_battery(data: CheckData, config: Config) -> Item:
     if data.battery_v is None:
         return make_item("battery", ItemState.UNDETERMINED, "not told", want, "see to the vehicle's battery monitor")
     value = f"{data.battery_v:.2f} V"
-    return judge_item("battery", good=data.battery_v >= min_v, value=value, want=want, hint="charge it, or change it")
+    return judge_item(
+        "battery", is_good=data.battery_v >= min_v, value=value, want=want, hint="charge it, or change it"
+    )

@@ -250,14 +250,14 @@ def disk_items(folder: Path, free_bytes: int) -> list[Item]:
     return [
         judge_item(
             "recordings folder",
-            good=writable,
+            is_good=writable,
             value=f"{folder}: {'writable' if writable else f'{there} is not writable'}",
             want="a folder to write to",
             hint="choose another folder (--out), or change its owner",
         ),
         judge_item(
             "disk room",
-            good=free >= free_bytes,
+            is_good=free >= free_bytes,
             value=f"{free / 1e9:.2f} GB free",
             want=f"at least {free_bytes / 1e9:.2f} GB (log.free_bytes)",
             hint="make room, choose another folder (--out), or lower log.free_bytes",

@@ -20,7 +20,7 @@ FORM = (
 class CameraUrl:
     """Body of a camera server."""
 
-    system: str  # its scheme, see `uavctl.config.connections.camera_scheme`
+    system: str  # its scheme, see `uavctl.config.connections.parse_camera_scheme`
     host: str  # name or address of the server
     port: int  # its port for commands
     body: str  # name of the body in the camera system
