@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -50,6 +51,7 @@ FLIES = """uavctl ctl status --json | grep -q '"mode":"track"'"""
 # The machine may stand still for a while: what a check then finds, and a setpoint timeout, are not the manual's. That
 # the vehicle's own timeout passes is seen in step 6, and in tests/check in virtual time.
 OF_TIME = ["vehicle", "position rate", "position age", "longest gap", "position loss", "vehicle clock", "source clock"]
+READER_S = 3.0  # a reader watches the vehicle after an order; `identify` needs 5 s of flight
 TIMEOUTS = ["COM_OF_LOSS_T", "GUID_TIMEOUT"]
 PATIENT = "--set sim.setpoint_timeout_s=600.0"
 ROOM_START = '--set sim.camera.rate_hz=25 --set "sim.start_position_m=[0,0,-0.1]"'
@@ -175,6 +177,7 @@ def test_the_first_flight_as_the_page_says(autopilot: str, at_desk: Desk) -> Non
     at_desk.until_good(FLIES)
     for order in orders:
         at_desk.run(order)
+        time.sleep(READER_S)
     at_desk.ends(flight, fly)
     for command in on_page("10. "):
         if command.startswith("uavctl fly"):
