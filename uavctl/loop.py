@@ -12,24 +12,24 @@ from traceback import extract_tb
 
 from msgspec.structs import replace
 
+from uavctl.account import FlightAccount
+from uavctl.cause import Cause
 from uavctl.config import Config
 from uavctl.errors import in_words
+from uavctl.event_codes import EventCode
 from uavctl.flight.controller import Controller
 from uavctl.flight.events import BIAS_AT_BOUND, BIAS_FREE, STRONG_PUSH
 from uavctl.flight.monitors.external import CONTROLLER_FAULT
 from uavctl.flight.supervise import distrusts_positions
 from uavctl.flight.tick import TickOutput, make_initial_state
 from uavctl.flight.tick import tick as run_tick
-from uavctl.mavlink.connection import CONNECTION_SILENT, HUNG_UP, NO_HEARTBEAT, OVERRUN, STAMP_UNIT, MavlinkConnection
+from uavctl.mavlink.connection import OVERRUN, MavlinkConnection
 from uavctl.mavlink.handover import HAND_OVER_ORDERS, HandoverOutput, HandoverStateMachine
 from uavctl.mavlink.handover_guards import HandoverInput, explain_move_refusal
 from uavctl.mavlink.handover_states import NOT_LEFT_IN_FLIGHT, HandoverState, SetpointMode
 from uavctl.mavlink.messages import CommandAck, Message, StatusText
 from uavctl.mavlink.relay import Relay
-from uavctl.outcome import Cause, FlightCourse
 from uavctl.records import (
-    ORDER_ACCEPTED,
-    ORDER_REFUSED,
     Command,
     ControlMode,
     Datagram,
@@ -66,15 +66,15 @@ FAILED = "the controller has failed:"  # and what failed in it
 MAX_ORDERS = 16  # that wait for one tick
 FOR_A_PERSON = frozenset(
     {
-        "vehicle-text",
+        EventCode.VEHICLE_TEXT,
         BIAS_AT_BOUND,
         BIAS_FREE,
         STRONG_PUSH,
         CONTROLLER_FAULT,
-        HUNG_UP,
-        CONNECTION_SILENT,
-        NO_HEARTBEAT,
-        STAMP_UNIT,
+        EventCode.HUNG_UP,
+        EventCode.CONNECTION_SILENT,
+        EventCode.NO_HEARTBEAT,
+        EventCode.STAMP_UNIT,
     }
 )  # codes of the events that the console tells
 MISLED_NS = 3_000_000_000  # positions are held back for so long after they could not be the vehicle's own
@@ -139,12 +139,12 @@ class ControlLoop:
         self._adrift = False  # not even the hand-over works any more: positions are all that is sent
         self._controlled_ns: int | None = None  # the last setpoint that flew the vehicle
         self._lands = config.fallback.land or config.relay.enabled
-        self.course = FlightCourse()  # course of the flight, as far as it bears upon the end
+        self.account = FlightAccount()  # course of the flight, as far as it bears upon the end
 
     @property
     def ending(self) -> Ending:
         """End of the flight, or the one that it would have now."""
-        return replace(self.course.ending(over=self.finished), relay=self._relayed())
+        return replace(self.account.compute_ending(is_over=self.finished), relay=self._relayed())
 
     def _relayed(self) -> str:
         """Return a text for a person on the positions passed on to the vehicle."""
@@ -177,7 +177,7 @@ class ControlLoop:
             return None
         kept = {reason: count for reason, count in self._relay.kept.items() if count}
         at_ns = 0 if self._decision is None else self._decision.at_ns
-        alone = bool(self.course.died) or (self._controlled_ns is not None and self._controlled_ns < at_ns)
+        alone = bool(self.account.control_error) or (self._controlled_ns is not None and self._controlled_ns < at_ns)
         relay = self._relay
         return RelayStats(
             at_ns=at_ns, sent=relay.sent, kept=kept, last_ns=relay.last_ns, alone=alone, silent_for=relay.silent_for
@@ -241,7 +241,7 @@ class ControlLoop:
         sent until it is heard again.
         """
         self._put("/uavctl/refused", at_ns, Refused(at_ns=at_ns, link=link, counts=counts))
-        if link == VEHICLE and counts.keys() & {HUNG_UP, OVERRUN}:
+        if link == VEHICLE and counts.keys() & {EventCode.HUNG_UP, OVERRUN}:
             self._unsure_since_ns = at_ns
         events = self._links[link].add_refusals(counts, at_ns)
         for event in events:
@@ -257,7 +257,7 @@ class ControlLoop:
         """
         inp = self._gather(tick, at_ns, missed_ticks, stop)
         if stop:
-            self.course.stop(Cause.OPERATOR)  # unless who asks has said why
+            self.account.note_requested_end(Cause.ENDED_BY_OPERATOR)  # unless who asks has said why
         for name, link in self._links.items():
             for data in link.due(at_ns):
                 send(self._outgoing(name, data, at_ns))
@@ -267,9 +267,9 @@ class ControlLoop:
         step_ns = self._stopwatch() - begun
         self._decision = out.decision
         self._record(out, at_ns)
-        self.course.let_go = self.let_go
-        self.course.see(at_ns, self._vehicle)
-        self.course.decide(out.decision, out.events, estimated=out.estimate is not None)
+        self.account.release_reason = self.let_go
+        self.account.update_vehicle(at_ns, self._vehicle)
+        self.account.add_decision(out.decision, out.events, has_estimate=out.estimate is not None)
         # A vehicle that climbs or lands must not do so by positions that have just been found to be wrong.
         if out.position_inconsistent and self._hand_over.has_begun:
             self._misled_ns = at_ns
@@ -300,7 +300,7 @@ class ControlLoop:
                 notices.append(self._die(error, at_ns))
             for one in outgoing:
                 send(one)
-        self.course.over = self.finished
+        self.account.is_over = self.finished
         self._record_stats(at_ns)
         return Ticked(
             decision=out.decision,
@@ -315,7 +315,7 @@ class ControlLoop:
 
     def _decide(self, inp: StepInput, notices: list[Event]) -> TickOutput:
         """Run the core for a tick; a core that has failed is not run again, and the vehicle it flew has to land."""
-        if not self.course.died:
+        if not self.account.control_error:
             try:
                 self._state, out = run_tick(self._state, inp, self._controller, carried=self._hand_over.has_begun)
             except Exception as error:  # noqa: BLE001 the vehicle may be in the air by the positions that it gets
@@ -342,7 +342,7 @@ class ControlLoop:
             missed_ticks=inp.missed_ticks,
             accepted=0,
             rejected=0,
-            reason=f"{FAILED} {self.course.died}",
+            reason=f"{FAILED} {self.account.control_error}",
         )
         return TickOutput(estimate=None, plan=None, decision=decision, setpoint=None, events=(), land=land)
 
@@ -354,8 +354,13 @@ class ControlLoop:
         """
         last = next(reversed(extract_tb(error.__traceback__)), None)
         where = "" if last is None else f" ({last.filename.rpartition('/')[2]}, line {last.lineno})"
-        self.course.died = self.course.died or f"{in_words(error)}{where}"
-        event = Event(at_ns=at_ns, severity=Severity.ERROR, code="control", text=f"{FAILED} {self.course.died}")
+        self.account.control_error = self.account.control_error or f"{in_words(error)}{where}"
+        event = Event(
+            at_ns=at_ns,
+            severity=Severity.ERROR,
+            code=EventCode.CONTROL_FAILED,
+            text=f"{FAILED} {self.account.control_error}",
+        )
         self._put("/uavctl/event", at_ns, event)
         return event
 
@@ -364,7 +369,7 @@ class ControlLoop:
         if len(self._orders) >= MAX_ORDERS:
             return False
         self._orders.append(command)
-        self.course.takes_off = self.course.takes_off or command.order is Order.TAKE_OFF
+        self.account.takes_off = self.account.takes_off or command.order is Order.TAKE_OFF
         return True
 
     @property
@@ -469,10 +474,10 @@ class ControlLoop:
     def _noted(self, told: HandoverOutput, at_ns: int) -> Iterator[Event]:
         """Note what the hand-over did; yields what a person has to be told of it: whoever ordered gets the answer."""
         if told.transition is not None:
-            self.course.turn(told.transition, self._vehicle)
+            self.account.add_transition(told.transition, self._vehicle)
         for event in told.events:
             self._put("/uavctl/event", at_ns, event)
-            if event.severity is not Severity.INFO and event.code != ORDER_REFUSED:
+            if event.severity is not Severity.INFO and event.code != EventCode.ORDER_REFUSED:
                 yield event
 
     def _command(self, told: HandoverOutput, out: TickOutput, at_ns: int, send: Send) -> None:
@@ -501,11 +506,14 @@ class ControlLoop:
         for command, event in _answered(commands, core, hand_over):
             landing = (
                 command.order is Order.LAND
-                and event.code == ORDER_REFUSED
+                and event.code == EventCode.ORDER_REFUSED
                 and self.handover_state is HandoverState.LANDING
             )
             text = "land: the vehicle is asked for it"
-            yield command, replace(event, severity=Severity.INFO, code=ORDER_ACCEPTED, text=text) if landing else event
+            yield (
+                command,
+                replace(event, severity=Severity.INFO, code=EventCode.ORDER_ACCEPTED, text=text) if landing else event,
+            )
 
     def _view(self, inp: StepInput, out: TickOutput) -> HandoverInput:
         """Return the inputs of the hand-over in this tick."""
@@ -571,7 +579,7 @@ def _answered(
 ) -> Iterator[tuple[Command, Event]]:
     """Each order with the event that answers it; the core and the hand-over answer their own, in order."""
     mine, theirs = (
-        iter([event for event in events if event.code in (ORDER_ACCEPTED, ORDER_REFUSED)])
+        iter([event for event in events if event.code in (EventCode.ORDER_ACCEPTED, EventCode.ORDER_REFUSED)])
         for events in (hand_over, core)
     )
     for command in commands:

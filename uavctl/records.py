@@ -211,13 +211,14 @@ class Severity(StrEnum):
 
 
 class Event(Record, frozen=True, kw_only=True):
-    """Something worth telling a person; `count` events of one kind are told once a second."""
+    """Event of a flight, for people and programs; `count` events of one kind are reported once a second."""
 
     at_ns: int
     severity: Severity
-    code: str
+    code: str  # an `uavctl.event_codes.EventCode`; a recording of another version may have others
     text: str
     count: int = 1
+    subject: str = ""  # what the event is about, as its code says: a state, order, command or connection
 
 
 class Order(StrEnum):
@@ -230,10 +231,6 @@ class Order(StrEnum):
     ENGAGE = "engage"  # ask for the external mode again, after the pilot or the vehicle has left it
     TAKE_OFF = "take-off"  # ask for the mode, arm, climb and fly; from the ground only
     STAND_BY = "stand by"  # leave a vehicle that is found armed alone until ENGAGE: a daemon before this one left it
-
-
-ORDER_ACCEPTED = "order-accepted"  # codes of the events that answer orders, one each, in their order
-ORDER_REFUSED = "order-refused"
 
 
 class Command(Record, frozen=True, kw_only=True):
@@ -322,7 +319,8 @@ class ToldParameter(Record, frozen=True, kw_only=True):
 class Ending(Record, frozen=True, kw_only=True):
     """End of the flight: the last word of the daemon, before its recording is closed."""
 
-    cause: str  # one of a few phrases (`uavctl.outcome.Cause`)
+    cause: str  # phrase of the cause, for a table
+    code: str = ""  # the cause, a `uavctl.cause.Cause`; a recording of another version may have others
     as_ordered: bool  # by the operator, the mission or the pilot
     sentence: str  # for a person, with where the vehicle was then
     exit_code: int  # of the program

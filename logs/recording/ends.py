@@ -13,10 +13,10 @@ from pathlib import Path
 from logs.recording.disk import check_free_space, remove_empty_folders
 from logs.recording.recorder import RecorderStatus
 from logs.recording.topics import HEADER
+from uavctl.account import report_lost_records
 from uavctl.build.controller import Prepared, cpu, record_of, versions
 from uavctl.clock import VIRTUAL_ZERO_UTC_NS
 from uavctl.config.load import dump_config
-from uavctl.outcome import lacking
 from uavctl.records import Ending, Header, Sink
 
 
@@ -74,7 +74,7 @@ def put_header(
 def describe_ending(ending: Ending, status: RecorderStatus) -> Ending:
     """Return how a flight ended, with the state of its recording."""
     why = status.reason or status.refusal or "the disk was too slow"
-    return ending if status.ok else lacking(ending, max(count_missing_records(status), 1), why)
+    return ending if status.ok else report_lost_records(ending, max(count_missing_records(status), 1), why)
 
 
 def count_missing_records(status: RecorderStatus) -> int:

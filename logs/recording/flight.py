@@ -14,13 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from logs.recording.design_view import DesignView, read_design
-from logs.recording.topics import END, GOES_ON, RecorderNote
+from logs.recording.notes import NoteKind, RecorderNote
 from uavctl.arrays import Array
 from uavctl.errors import RecordingError
-from uavctl.flight.decide import MISSION_OVER
+from uavctl.event_codes import MISSION, EventCode
 from uavctl.flight.supervise import RELEASES
 from uavctl.records import (
-    ORDER_ACCEPTED,
     Checked,
     ControlMode,
     Decision,
@@ -146,9 +145,9 @@ class FlightData:
         ordered = [
             Landing(event.at_ns, ordered=True)
             for event in self.events
-            if event.code == ORDER_ACCEPTED and event.text == Order.LAND.value
+            if event.code == EventCode.ORDER_ACCEPTED and event.subject == Order.LAND
         ]
-        due = [Landing(decision.at_ns, ordered=False) for decision in self.flown if decision.reason == MISSION_OVER]
+        due = [Landing(event.at_ns, ordered=False) for event in self.events if event.subject == MISSION]
         until_ns = self.decisions[-1].at_ns + 1 if self.stopped_ns is None else self.stopped_ns
         return min((landing for landing in ordered + due if after_ns < landing.at_ns < until_ns), default=None)
 
@@ -176,7 +175,7 @@ class FlightData:
     @property
     def breaks_off(self) -> bool:
         """Whether the recorder could not close the recording: killed, without power, or the file was cut."""
-        return bool(self.notes) and not self.notes[-1].text.startswith((END, GOES_ON))
+        return bool(self.notes) and self.notes[-1].kind not in (NoteKind.END, NoteKind.CONTINUED)
 
     @cached_property
     def virtual_time(self) -> bool:

@@ -11,16 +11,17 @@ from pathlib import Path
 import msgspec
 
 from logs.recording.design_view import get_config_name
+from logs.recording.notes import NoteKind, RecorderNote
 from logs.recording.parameters import ParameterReader, VehicleParameter
 from logs.recording.reader import AttachedFile, Damage, EndOfFile, RecordedMessage, segment_files, walk
-from logs.recording.topics import END, HEADER, LIBRARY, PARAMETER, RECORDER, RecorderNote, decode, parse_raw_topic
+from logs.recording.topics import HEADER, LIBRARY, PARAMETER, RECORDER, decode, parse_raw_topic
 from uavctl.errors import RecordingError
 from uavctl.records import Header, LinkEstimate, LinkStats, PolicyLibrary, Record, Refused, Truth
 
 _OWN = (HEADER, LIBRARY, RECORDER)  # of the recording itself, not of the flight
 _LOOKED_INTO = (*_OWN, "/uavctl/link", "/uavctl/refused")
 _NEWEST_TELLS = ("/uavctl/link_estimate", "/sim/truth")
-_PLAIN_NOTES = ("begin", END)
+_PLAIN_NOTES = (NoteKind.BEGIN, NoteKind.END)
 
 
 class TopicInfo(msgspec.Struct, frozen=True, kw_only=True):
@@ -186,7 +187,7 @@ class _Account:
         match record:
             case RecorderNote():
                 self.note = record
-                if record.text not in _PLAIN_NOTES:
+                if record.kind not in _PLAIN_NOTES:
                     self.notes.append((record.at_ns, record.text))
             case Header():
                 self.origin = _get_origin(record)

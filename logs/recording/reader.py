@@ -22,17 +22,13 @@ from mcap.records import Attachment, Channel, Schema
 from zstandard import ZstdDecompressor, ZstdError, get_frame_parameters
 
 from logs.recording.disk import MAGIC, describe_kind_error, find_later_segments
+from logs.recording.notes import NoteKind, RecorderNote
 from logs.recording.segment import CHUNK, CHUNK_FIELDS, COMPRESSION, INDEX, MESSAGE, STORED_SIZE, ZERO_UTC
 from logs.recording.topics import (
-    END,
-    GOES_ON,
     HEADER,
     LIBRARY,
-    NO_END,
     RECORDER,
-    RECOVERED,
     Definition,
-    RecorderNote,
     decode,
     get_definition,
     get_record_type,
@@ -491,19 +487,13 @@ def lacks_end(path: Path) -> str:
     if None in ends:
         return "the recording is torn"
     note = _note(ends[-1])
-    if note is not None and is_end(note):
+    if note is not None and note.is_end:
         return ""
-    text = "" if note is None else note.text
-    if text.startswith(GOES_ON):
+    if note is not None and note.kind is NoteKind.CONTINUED:
         return f"the recording goes on after {files[-1].name}, in a file that is missing"
-    if text.startswith(RECOVERED):
-        return f"the recording was {text}"
+    if note is not None and note.kind is NoteKind.RECOVERED:
+        return f"the recording was {note.text}"
     return f"the recording has no end: nothing could be written after {files[-1].name}"
-
-
-def is_end(note: RecorderNote) -> bool:
-    """Return whether a note is the last one of a whole recording."""
-    return note.text.startswith(END) or (note.text.startswith(RECOVERED) and NO_END not in note.text)
 
 
 def last_note(path: Path) -> RecorderNote | None:

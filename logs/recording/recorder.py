@@ -20,19 +20,10 @@ import msgspec
 
 from logs.recording import attachments
 from logs.recording.disk import DiskFile, FreeSpaceMonitor, OutputFile, find_later_segments, get_free_bytes
+from logs.recording.notes import NoteKind, RecorderNote
 from logs.recording.parameters import ParameterReader
 from logs.recording.segment import Rotation
-from logs.recording.topics import (
-    END,
-    GOES_ON,
-    HEADER,
-    RECORDER,
-    Definition,
-    RecorderNote,
-    encode,
-    encode_message,
-    get_definition,
-)
+from logs.recording.topics import HEADER, RECORDER, Definition, encode, encode_message, get_definition
 from uavctl.config.types import LogConfig
 from uavctl.errors import RecordingError, UsageError, need
 from uavctl.records import Datagram, Header, Record
@@ -225,7 +216,7 @@ class WriteQueue:
             self._files.try_again()
             self.drain(len(self.queue), len(self.views_due) + len(self.queue))
             if self._files.is_open:
-                self._finish_file(END)
+                self._finish_file(NoteKind.END, "end")
         with suppress(OSError):  # None is open
             self._files.look()
         self.finished = True
@@ -270,7 +261,7 @@ class WriteQueue:
         waits = bool(self.queue or self.views_due or files.unwritten)
         if waits and files.is_open:
             files.because = f"goes on after {files.name}"
-            self._finish_file(GOES_ON)
+            self._finish_file(NoteKind.CONTINUED, "goes on in the next file")
         if files.is_open:
             return True
         if not waits or not files.may_begin or (self._room.resting and not self.closed):
@@ -288,7 +279,7 @@ class WriteQueue:
         self._files.reason = self._room.text
         if self._files.is_open:
             self._files.because = f"after a rest: {self._room.text}"
-            self._finish_file(self._room.text)
+            self._finish_file(NoteKind.STATE, self._room.text)
 
     def _take(self, topic: str, at_ns: int, record: Record) -> None:
         if isinstance(record, Datagram):
@@ -302,7 +293,7 @@ class WriteQueue:
         self.views_due.append((topic, at_ns, record, data))
         self._files.write_record(topic, at_ns, data)
         if topic == HEADER:
-            self._write_note("begin")
+            self._write_note("begin", NoteKind.BEGIN)
             self._files.commit()
         if isinstance(record, Header):
             utc_ns = at_ns + self._files.zero_utc_ns
@@ -331,7 +322,7 @@ class WriteQueue:
         note = self._write_note(text)
         self._show(RECORDER, note.at_ns, note, encode(note))
 
-    def _write_note(self, text: str) -> RecorderNote:
+    def _write_note(self, text: str, kind: NoteKind = NoteKind.STATE) -> RecorderNote:
         self._noted = (self._dropped, self._refused)
         note = RecorderNote(
             at_ns=self._files.at_ns,
@@ -341,14 +332,15 @@ class WriteQueue:
             refused=self._refused,
             failures=self._files.failures,
             text=text,
+            kind=kind,
         )
         self._files.write(RECORDER, note.at_ns, encode(note))
         return note
 
-    def _finish_file(self, text: str) -> None:
+    def _finish_file(self, kind: NoteKind, text: str) -> None:
         blind = self._onlookers
         try:
-            self._write_note(f"{text}; {blind.unseen} without views: {blind.reason}" if blind.unseen else text)
+            self._write_note(f"{text}; {blind.unseen} without views: {blind.reason}" if blind.unseen else text, kind)
             utc_ns = self._files.at_ns + self._files.zero_utc_ns
             self._files.finish(attachments.make_parameter_attachments(self._parameters, utc_ns))
         except OSError as error:

@@ -9,22 +9,11 @@ import msgspec
 
 from logs.recording import attachments
 from logs.recording.disk import DiskFile
+from logs.recording.notes import END_MISSING, MESSAGES_LOST, NoteKind, RecorderNote
 from logs.recording.parameters import ParameterReader
-from logs.recording.reader import AttachedFile, Damage, EndOfFile, RecordedMessage, is_end, note_of, walk
+from logs.recording.reader import AttachedFile, Damage, EndOfFile, RecordedMessage, note_of, walk
 from logs.recording.segment import QueuedMessage, Segment
-from logs.recording.topics import (
-    HEADER,
-    HOLES,
-    NO_END,
-    PARAMETER,
-    RECORDER,
-    RECOVERED,
-    RecorderNote,
-    decode,
-    encode,
-    get_definition,
-    parse_raw_topic,
-)
+from logs.recording.topics import HEADER, PARAMETER, RECORDER, decode, encode, get_definition, parse_raw_topic
 from uavctl.errors import RecordingError
 from uavctl.records import Header
 
@@ -71,7 +60,7 @@ class _Tally:
         self._next = item.sequence + 1
         self.messages += not item.repeated
         note = note_of(item)
-        self.ended = note is not None and is_end(note)
+        self.ended = note is not None and note.is_end
 
     def damaged(self, item: Damage) -> None:
         self.damage.append(item)
@@ -163,9 +152,17 @@ def _copy(src: Path, file: DiskFile) -> RecoverResult:
         damage=tuple(damage),
     )
     if not (result.lossless and result.ended):
-        text = f"{RECOVERED}{src.name}: {_losses(result)}"
         note = RecorderNote(
-            at_ns=at_ns, segment=1, written=result.messages, dropped=0, refused=0, failures=0, text=text
+            at_ns=at_ns,
+            segment=1,
+            written=result.messages,
+            dropped=0,
+            refused=0,
+            failures=0,
+            text=f"recovered from {src.name}: {_losses(result)}",
+            kind=NoteKind.RECOVERED,
+            lacks_records=result.messages_lost > 0,
+            lacks_end=not result.ended,
         )
         segment.add(QueuedMessage(get_definition(RECORDER), tally.messages + 1, at_ns, encode(note)))
     segment.attach(attachments.make_parameter_attachments(parameters, at_ns + zero_utc_ns))
@@ -175,8 +172,8 @@ def _copy(src: Path, file: DiskFile) -> RecoverResult:
 
 def _losses(result: RecoverResult) -> str:
     parts = (
-        (result.messages_lost > 0, f"{result.messages_lost} {HOLES}"),
+        (result.messages_lost > 0, f"{result.messages_lost} {MESSAGES_LOST}"),
         (result.lost_bytes > 0, f"{result.lost_bytes} bytes lost"),
-        (not result.ended, NO_END),
+        (not result.ended, END_MISSING),
     )
     return ", ".join(text for given, text in parts if given)

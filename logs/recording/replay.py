@@ -17,9 +17,9 @@ from functools import cache
 
 import msgspec
 
+from logs.recording.notes import RecorderNote
 from logs.recording.topics import (
     DIGITS,
-    RecorderNote,
     are_identical,
     decode,
     get_record_type,

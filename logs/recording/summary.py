@@ -17,15 +17,16 @@ from rich.text import Text
 
 from logs.recording.design_view import Box
 from logs.recording.flight import FLOWN, FlightData
+from uavctl.account import make_ending, report_lost_records
 from uavctl.arrays import Array
+from uavctl.cause import CAUSES, Cause
 from uavctl.config.mission import FenceConfig
-from uavctl.outcome import Cause, lacking, make_ending
 from uavctl.records import ControlMode, Ending, Matrix, SolveStatus, Vector, duration, number, percent_above
 
 # How a recorded flight ended: the daemon's own last word, or what its records tell where there is none.
 
 
-_LANDED = frozenset({Cause.FALLBACK, Cause.ORDERED, Cause.MISSION})
+_LANDED = frozenset({Cause.FALLBACK_LANDED, Cause.LANDED_AS_ORDERED, Cause.LANDED_AFTER_MISSION})
 _IN_FLIGHT = {
     ControlMode.BRAKE: "the recording ends while the fallback was braking",
     ControlMode.HOLD: "the recording ends while the fallback held zero acceleration",
@@ -46,24 +47,26 @@ def _find_cause(flight: FlightData) -> Cause:
         return Cause.LET_GO
     if ControlMode.LAND in modes:  # for one tick; nobody flies after it
         if flight.landing is None:
-            return Cause.FALLBACK
-        return Cause.ORDERED if flight.landing.ordered else Cause.MISSION
+            return Cause.FALLBACK_LANDED
+        return Cause.LANDED_AS_ORDERED if flight.landing.ordered else Cause.LANDED_AFTER_MISSION
     if not modes or modes[-1] is ControlMode.WAIT:
         return Cause.WAITING
-    return Cause.IN_FLIGHT if flight.stopped_ns is None else Cause.OPERATOR
+    return Cause.IN_FLIGHT if flight.stopped_ns is None else Cause.ENDED_BY_OPERATOR
 
 
 def _describe_cause(flight: FlightData, cause: Cause) -> str:
     last = (flight.flown or flight.decisions)[-1]
     if flight.breach is not None:
-        return f"{cause.value} after {_format_seconds(flight, flight.breach.at_ns)}: {flight.breach.text}"
+        return f"{CAUSES[cause].phrase} after {_format_seconds(flight, flight.breach.at_ns)}: {flight.breach.text}"
     if cause in _LANDED:
         landed_ns = next(d.at_ns for d in flight.flown if d.mode is ControlMode.LAND)
-        return f"{cause.value} after {_format_seconds(flight, landed_ns)}"
+        return f"{CAUSES[cause].phrase} after {_format_seconds(flight, landed_ns)}"
     if cause is Cause.WAITING:
         return f"at the end the controller was waiting: {last.reason}"
     if flight.stopped_ns is not None:
-        return f"{cause.value} after {_format_seconds(flight, flight.stopped_ns)}; {_describe_hand_over(flight)}"
+        return (
+            f"{CAUSES[cause].phrase} after {_format_seconds(flight, flight.stopped_ns)}; {_describe_hand_over(flight)}"
+        )
     if flight.landing is not None and last.mode in _IN_FLIGHT:
         return "the recording ends while the vehicle was brought to rest, to land"
     return _IN_FLIGHT.get(last.mode, "at the end a plan was being flown")
@@ -206,7 +209,7 @@ def summarise(
     is `ending`, which the recording tells then.
     """
     if ending is None:
-        ending = lacking(find_ending(flight), recorder_dropped, "")
+        ending = report_lost_records(find_ending(flight), recorder_dropped, "")
     steps = flight.steps
     flown = [d for d in flight.flown if d.mode in FLOWN]
     flown_ns = {d.at_ns for d in flown}

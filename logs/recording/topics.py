@@ -21,6 +21,8 @@ import msgspec
 import numpy as np
 
 from logs.recording.derived_topics import VIEWS
+from logs.recording.earlier import complete_record
+from logs.recording.notes import RecorderNote
 from uavctl.arrays import Array
 from uavctl.errors import RecordingError
 from uavctl.records import (
@@ -53,25 +55,6 @@ LIBRARY = "/uavctl/library"
 PARAMETER = "/uavctl/parameter"
 ENDED = "/uavctl/end"
 RECORDER = "/uavctl/recorder"
-# How what the recorder notes last in a file begins. Where none of it stands last, the recording has no end: the
-# process was killed, the power failed, the disk took no more, or the file was cut.
-END = "end"  # all is in it that was not told as dropped or refused
-GOES_ON = "goes on in the next file"  # the file was full
-RECOVERED = "recovered from "  # by a recovery, of a recording with holes or without an end
-HOLES = "messages lost"  # in that: some are missing before the last one
-NO_END = "its end is missing"  # in that: some may be missing after the last one
-
-
-class RecorderNote(Record, frozen=True, kw_only=True):
-    """What the recorder says of itself: at the start of a segment, after drops, and at the end."""
-
-    at_ns: int
-    segment: int  # 1 is the first file
-    written: int  # records in the segments so far
-    dropped: int  # records so far that found the queue full
-    refused: int  # records so far that could not be encoded
-    failures: int  # failed writes so far
-    text: str
 
 
 @dataclass(frozen=True)
@@ -324,18 +307,21 @@ def decode(topic: str, data: bytes, at_ns: int) -> Record:
     if raw is not None:
         return Datagram(at_ns=at_ns, link=raw[0], outgoing=raw[1], data=data)
     try:
-        kind = get_record_type(topic)
-        if b'NaN"' not in data and b'Infinity"' not in data:
-            return _decoder(kind).decode(data)
-        fields = msgspec.json.decode(data)
-        # the gap of most plans is the only one: their thousands of numbers need not be looked through
-        if isinstance(fields, dict) and _restore_fields(fields, kind) == data.count(b'NaN"') + data.count(b'Infinity"'):
-            return msgspec.convert(fields, kind)
-        return msgspec.convert(_restore_tree(fields, kind), kind)
+        return complete_record(_decode_fields(data, get_record_type(topic)))
     except KeyError as error:
         raise RecordingError(f"topic {topic} is not known to this version") from error
     except msgspec.MsgspecError as error:
         raise RecordingError(f"topic {topic}, log time {at_ns} ns: {error}") from error
+
+
+def _decode_fields(data: bytes, kind: type[Record]) -> Record:
+    if b'NaN"' not in data and b'Infinity"' not in data:
+        return _decoder(kind).decode(data)
+    fields = msgspec.json.decode(data)
+    # the gap of most plans is the only one: their thousands of numbers need not be looked through
+    if isinstance(fields, dict) and _restore_fields(fields, kind) == data.count(b'NaN"') + data.count(b'Infinity"'):
+        return msgspec.convert(fields, kind)
+    return msgspec.convert(_restore_tree(fields, kind), kind)
 
 
 @cache

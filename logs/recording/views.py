@@ -26,8 +26,9 @@ from google.protobuf.message import Message
 from logs.recording import derived_topics as topics
 from logs.recording.derived_topics import pack_message, tighten_limits
 from logs.recording.design_view import AXIS_NUMBER, DesignView, read_design
-from logs.recording.topics import RecorderNote
+from logs.recording.notes import RecorderNote
 from uavctl.arrays import Array
+from uavctl.event_codes import EventCode
 from uavctl.frames import quaternion_from_axes, rotation_to_ned
 from uavctl.records import (
     ControlMode,
@@ -412,7 +413,7 @@ class ViewBuilder:
             case Event():
                 yield topics.LOG, make_log_message(record, record.at_ns + self._zero_utc_ns)
             case RecorderNote():
-                told = Event(at_ns=at_ns, severity=Severity.WARNING, code="recording", text=record.text)
+                told = Event(at_ns=at_ns, severity=Severity.WARNING, code=EventCode.RECORDING, text=record.text)
                 yield topics.LOG, make_log_message(told, at_ns + self._zero_utc_ns)
 
     def _still(self, design: DesignView, at_ns: int) -> Iterator[_Item]:

@@ -6,8 +6,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from logs.report.causes import Finding, HeadlineCause, seconds
+from logs.report.findings import Finding, seconds
 from uavctl.arrays import Array
+from uavctl.cause import Cause
 
 _EMPTY_SHARE = 0.5  # of the voltage at the beginning: no battery under load shows that before it is cut off
 _CELL_V, _FULL_V = 3.3, 4.35  # of a lithium cell: under load below this it is low; none is charged higher
@@ -26,10 +27,7 @@ def find_battery_faults(at_s: Array, volts: Array) -> Iterator[Finding]:
     at_s, volts = at_s[valid_indices[0] :], volts[valid_indices[0] :]
     initial_v = float(volts[0])
     cells = int(np.ceil(initial_v / _FULL_V))
-    for cause, limit_v in (
-        (HeadlineCause.BATTERY_EMPTY, _EMPTY_SHARE * initial_v),
-        (HeadlineCause.BATTERY_LOW, _CELL_V * cells),
-    ):
+    for cause, limit_v in ((Cause.BATTERY_EMPTY, _EMPTY_SHARE * initial_v), (Cause.BATTERY_LOW, _CELL_V * cells)):
         is_low = volts < limit_v
         lasting_indices = np.flatnonzero(
             is_low & np.append(is_low[1:], True)

@@ -26,6 +26,7 @@ from logs.report.verdict_link import DelayVerdict, LinkVerdict
 from logs.report.verdict_sections import make_clocks_section, make_model_section, make_risk_section, make_verdict_rows
 from logs.report.verdicts import Judgement, judge_flight
 from uavctl.errors import UavctlError
+from uavctl.event_codes import EventCode
 from uavctl.records import Event, number
 
 _LIMIT = Mark("dashed", "limit", "limit")
@@ -40,7 +41,7 @@ _LATENESS = "lateness is from a tick's deadline to its start"
 _NO_TIMING = "No times were measured in this flight."
 
 # Of these every other text is another matter: what the vehicle says, who flies.
-_VERBATIM_EVENTS = frozenset({"vehicle-text", "command-ack", "hand-over"})
+_VERBATIM_EVENTS = frozenset({EventCode.VEHICLE_TEXT, EventCode.COMMAND_ACK, EventCode.HAND_OVER})
 
 
 def write_report(flight: FlightData, summary: FlightSummary, path: Path, judged: Judgement | None = None) -> None:

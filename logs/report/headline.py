@@ -11,8 +11,8 @@ from pathlib import Path
 from logs.recording.flight import FLOWN, FlightData
 from logs.recording.reader import read
 from logs.recording.summary import FlightSummary, summarise
-from logs.report.causes import Finding, Headline, HeadlineCause, make_headline, metres, seconds, sort_findings
 from logs.report.evidence import MIN_STALL_S, FlightEvidence
+from logs.report.findings import Finding, Headline, make_headline, metres, seconds, sort_findings
 from logs.report.reasons import describe_reasons
 from logs.report.rules_loss import (
     describe_depth,
@@ -43,6 +43,7 @@ from logs.report.rules_positions import (
 )
 from logs.report.rules_takeover import find_failsafe, find_takeover, find_vehicle_texts
 from logs.report.verdicts import Judgement, judge_flight
+from uavctl.cause import Cause
 from uavctl.errors import RecordingError
 from uavctl.records import ControlMode
 
@@ -55,7 +56,7 @@ def derive_headline(flight: FlightData, summary: FlightSummary, judged: Judgemen
     findings = sort_findings(finding for rule in RULES for finding in rule(evidence))
     if not findings:
         return make_headline([_make_clear_finding(evidence)], reasons=describe_reasons(evidence, None))
-    left_limits = findings[0].cause is HeadlineCause.LEFT_LIMITS
+    left_limits = findings[0].cause is Cause.LEFT_LIMITS
     worst = evidence.excursions[0] if evidence.excursions else None
     return make_headline(
         findings, _describe_outcome(evidence, findings[0]), describe_reasons(evidence, worst if left_limits else None)
@@ -73,27 +74,21 @@ def derive_headline_of_file(path: Path) -> Headline | None:
 
 _END_CAUSES = frozenset(
     {
-        HeadlineCause.LET_GO,
-        HeadlineCause.NOT_AS_ORDERED,
-        HeadlineCause.NOT_FLOWN,
-        HeadlineCause.VEHICLE_SILENT,
-        HeadlineCause.VEHICLE_RESTARTED,
-        HeadlineCause.VEHICLE_DISARMED,
-        HeadlineCause.CONTROL_FAILED,
-        HeadlineCause.PILOT,
-        HeadlineCause.GROUND_STATION,
-        HeadlineCause.MODE_LEFT,
+        Cause.LET_GO,
+        Cause.NOT_AS_ORDERED,
+        Cause.NOT_FLOWN,
+        Cause.VEHICLE_SILENT,
+        Cause.VEHICLE_RESTARTED,
+        Cause.VEHICLE_DISARMED,
+        Cause.CONTROL_FAILED,
+        Cause.PILOT,
+        Cause.GROUND_STATION,
+        Cause.MODE_LEFT,
     }
 )
 _FINAL_MODES = (ControlMode.LAND, ControlMode.STOPPED)  # told by `_how`
 _PLACE_CAUSES = frozenset(
-    {
-        HeadlineCause.LEFT_LIMITS,
-        HeadlineCause.TOUCHED_LIMIT,
-        HeadlineCause.NOT_FLOWN,
-        HeadlineCause.POSITIONS_ABSENT,
-        HeadlineCause.POSITIONS_INVALID,
-    }
+    {Cause.LEFT_LIMITS, Cause.TOUCHED_LIMIT, Cause.NOT_FLOWN, Cause.POSITIONS_ABSENT, Cause.POSITIONS_INVALID}
 )
 
 
@@ -101,8 +96,7 @@ def _describe_outcome(e: FlightEvidence, main_finding: Finding) -> str:
     """Return how the flight ended, if not as ordered, and where it stayed."""
     ending = e.summary.ending
     is_named = main_finding.cause in _END_CAUSES or (
-        main_finding.cause is HeadlineCause.LEFT_LIMITS
-        and e.find_decision(main_finding.view_s or 0.0).mode in _FINAL_MODES
+        main_finding.cause is Cause.LEFT_LIMITS and e.find_decision(main_finding.view_s or 0.0).mode in _FINAL_MODES
     )
     ended = "" if ending.as_ordered or is_named or not e.summary.steps else str(ending.cause)
     clearance = "" if main_finding.cause in _PLACE_CAUSES or not e.summary.steps else _describe_clearance(e)
@@ -125,9 +119,7 @@ def _make_clear_finding(e: FlightEvidence) -> Finding:
     ]
     if unknowns:
         texts.append(f"not known: {' and '.join(unknowns)}")
-    cause = (
-        HeadlineCause.ALL_WELL if e.flight.endings or e.flight.stopped_ns is not None else HeadlineCause.NOTHING_FOUND
-    )
+    cause = Cause.ALL_WELL if e.flight.endings or e.flight.stopped_ns is not None else Cause.NOTHING_FOUND
     return Finding(cause, 0.0, "; ".join(texts))
 
 

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from logs.recording.summary import count
-from logs.report.causes import metres, seconds
 from logs.report.evidence import FlightEvidence
 from logs.report.excursion import GRAVE_M, Excursion, select_trusted_estimates
+from logs.report.findings import metres, seconds
 from uavctl.records import number
 
 _MIN_ESTIMATE_ERROR_M = 0.3  # between the estimate and the true place: worth telling

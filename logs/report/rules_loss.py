@@ -8,17 +8,17 @@ from itertools import pairwise
 import numpy as np
 
 from logs.recording.flight import FLOWN
-from logs.recording.topics import GOES_ON
+from logs.recording.notes import NoteKind
 from logs.report.battery import find_battery_faults
-from logs.report.causes import Finding, HeadlineCause, metres, seconds
 from logs.report.evidence import MIN_STALL_S, FlightEvidence
 from logs.report.excursion import GRAVE_M, Excursion
+from logs.report.findings import Finding, metres, seconds
+from uavctl.cause import Cause
+from uavctl.event_codes import EventCode
 from uavctl.flight.supervise import OF_POSITIONS
-from uavctl.mavlink.connection import CONNECTION_SILENT, HUNG_UP
-from uavctl.outcome import Cause
+from uavctl.mavlink.connection import DISCONNECT_TEXTS, VEHICLE
 from uavctl.records import ControlMode, number
 
-_LINK_OF_VEHICLE = "link vehicle: "  # begins what is told of the vehicle's connection
 HEARTBEAT_TIMEOUT_S = 2.5  # a heartbeat comes each second
 WRONG_POSITION_M = 0.3  # between a position that was used and the true place: no noise of a camera
 NEGLIGIBLE_SHARE = 0.05  # of positions, plans, or steps
@@ -56,7 +56,7 @@ def find_excursion(e: FlightEvidence) -> Iterator[Finding]:
     for worst in e.excursions[:1]:
         if worst.beyond_m <= _SLIGHT_M:
             return
-        cause = HeadlineCause.LEFT_LIMITS if worst.beyond_m >= GRAVE_M else HeadlineCause.TOUCHED_LIMIT
+        cause = Cause.LEFT_LIMITS if worst.beyond_m >= GRAVE_M else Cause.TOUCHED_LIMIT
         text = f"went {describe_depth(e, worst)} at {seconds(worst.worst_s)}{_describe_circumstances(e, worst)}"
         yield Finding(cause, worst.exit_s, f"{text}{describe_source(e, worst.worst_s)}", worst.worst_s)
 
@@ -77,7 +77,7 @@ def _describe_circumstances(e: FlightEvidence, excursion: Excursion) -> str:
 
 def find_vehicle_loss(e: FlightEvidence) -> Iterator[Finding]:
     """Find a vehicle that was not heard, has started anew, or disarmed in flight; and a controller that failed."""
-    flight, cause = e.flight, e.summary.ending.cause
+    flight, cause = e.flight, e.summary.ending.code
     heartbeat_s = flight.seconds([*(status.at_ns for status in flight.vehicles), flight.decisions[-1].at_ns])
     # A vehicle that is disarmed may be switched off.
     gaps_s = np.diff(heartbeat_s - e.compute_stalled_s(heartbeat_s)) * [status.armed for status in flight.vehicles]
@@ -86,29 +86,25 @@ def find_vehicle_loss(e: FlightEvidence) -> Iterator[Finding]:
         begun_s, ended_s = (float(t) for t in heartbeat_s[gaps_s.argmax() :][:2])
         text = f"no heartbeat of it came for {seconds(ended_s - begun_s)}, from {seconds(begun_s)} on"
         connection_losses = [
-            o for o in flight.events if o.code in (HUNG_UP, CONNECTION_SILENT) and o.text.startswith(_LINK_OF_VEHICLE)
+            event for event in flight.events if event.code in DISCONNECT_TEXTS and event.subject == VEHICLE
         ]
         if connection_losses:
-            reason = connection_losses[0].text.removeprefix(_LINK_OF_VEHICLE).partition(";")[0]
-            text += f"; at {seconds(e.to_seconds(connection_losses[0].at_ns))} {reason}"
-        yield Finding(HeadlineCause.VEHICLE_SILENT, begun_s, text)
-    elif cause in (Cause.SILENT, Cause.CONNECTION):
-        yield Finding(HeadlineCause.VEHICLE_SILENT, end_s, str(cause))
-    restarted_s = e.find_first_s("vehicle-reboot")
-    if restarted_s is not None or cause == Cause.RESTARTED:
+            loss = connection_losses[0]
+            text += f"; at {seconds(e.to_seconds(loss.at_ns))} {DISCONNECT_TEXTS[EventCode(loss.code)][0]}"
+        yield Finding(Cause.VEHICLE_SILENT, begun_s, text)
+    elif cause in (Cause.VEHICLE_SILENT, Cause.CONNECTION_CLOSED):
+        yield Finding(Cause.VEHICLE_SILENT, end_s, e.summary.ending.cause)
+    restarted_s = e.find_first_s(EventCode.VEHICLE_REBOOT)
+    if restarted_s is not None or cause == Cause.VEHICLE_RESTARTED:
         at_s = end_s if restarted_s is None else restarted_s
-        yield Finding(HeadlineCause.VEHICLE_RESTARTED, at_s, f"its autopilot started anew at {seconds(at_s)}")
-    if cause == Cause.DISARMED:
+        yield Finding(Cause.VEHICLE_RESTARTED, at_s, f"its autopilot started anew at {seconds(at_s)}")
+    if cause == Cause.VEHICLE_DISARMED:
         disarmed_ns = [after.at_ns for before, after in pairwise(flight.vehicles) if before.armed and not after.armed]
         at_s = e.to_seconds(disarmed_ns[0]) if disarmed_ns else end_s
-        yield Finding(
-            HeadlineCause.VEHICLE_DISARMED, at_s, f"the vehicle disarmed at {seconds(at_s)}, while it was flown"
-        )
-    if cause == Cause.CONTROL:
-        at_s = e.find_first_s("control") or end_s
-        yield Finding(
-            HeadlineCause.CONTROL_FAILED, at_s, f"{e.summary.ending.sentence.rstrip('.')}, at {seconds(at_s)}"
-        )
+        yield Finding(Cause.VEHICLE_DISARMED, at_s, f"the vehicle disarmed at {seconds(at_s)}, while it was flown")
+    if cause == Cause.CONTROL_FAILED:
+        at_s = e.find_first_s(EventCode.CONTROL_FAILED) or end_s
+        yield Finding(Cause.CONTROL_FAILED, at_s, f"{e.summary.ending.sentence.rstrip('.')}, at {seconds(at_s)}")
 
 
 def find_process_pause(e: FlightEvidence) -> Iterator[Finding]:
@@ -122,13 +118,13 @@ def find_process_pause(e: FlightEvidence) -> Iterator[Finding]:
     if longest_ns > MIN_STALL_S * 1e9:
         at_s = e.to_seconds(begun_ns)
         text = f"it did not run for {seconds(longest_ns * 1e-9)}, from {seconds(at_s)} on, and sent no setpoints"
-        yield Finding(HeadlineCause.STOOD_STILL, at_s, text)
+        yield Finding(Cause.STOOD_STILL, at_s, text)
 
 
 def find_recording_cut(e: FlightEvidence) -> Iterator[Finding]:
     """Find a recording that breaks off while the vehicle was flown, as one of a killed process does."""
     flight, last = e.flight, e.flight.decisions[-1]
-    if not flight.breaks_off or flight.endings or flight.notes[-1].text.startswith(GOES_ON):
+    if not flight.breaks_off or flight.endings or flight.notes[-1].kind is NoteKind.CONTINUED:
         return
     status = flight.vehicles[-1] if flight.vehicles else None
     is_landed = status is not None and (not status.armed or (status.landed is True and e.summary.steps > 0))
@@ -137,9 +133,7 @@ def find_recording_cut(e: FlightEvidence) -> Iterator[Finding]:
         mode = f" ({status.mode})" if status is not None else ""
         phase = "while it was flown" if last.mode in FLOWN else f"while the vehicle was armed{mode}"
         yield Finding(
-            HeadlineCause.RECORDING_CUT,
-            at_s,
-            f"at {seconds(at_s)}, {phase}: the process was killed, or the power failed",
+            Cause.RECORDING_CUT, at_s, f"at {seconds(at_s)}, {phase}: the process was killed, or the power failed"
         )
 
 
@@ -162,4 +156,4 @@ def find_blind_flight(e: FlightEvidence) -> Iterator[Finding]:
     drift_m = e.compute_max_drift_m(begun_s, ended_s)
     if drift_m is not None and drift_m >= GRAVE_M:
         text += f"; it drifted {metres(drift_m)} away from its prediction"
-    yield Finding(HeadlineCause.FLOWN_BLIND if has_given_up else HeadlineCause.SILENCE, begun_s, text, ended_s)
+    yield Finding(Cause.FLOWN_BLIND if has_given_up else Cause.SILENCE, begun_s, text, ended_s)

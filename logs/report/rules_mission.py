@@ -16,15 +16,15 @@ from logs.recording.summary import (
     find_input_violations,
     find_state_violations,
 )
-from logs.report.causes import BAD, CAUTION, Finding, HeadlineCause, metres, seconds
 from logs.report.evidence import HEARTBEAT_S, FlightEvidence
+from logs.report.findings import Finding, metres, seconds
 from logs.report.rules_loss import NEGLIGIBLE_SHARE, find_battery_fault
 from logs.report.rules_takeover import find_external_exit
 from logs.report.verdict_risk import Flags
 from uavctl.arrays import Array
+from uavctl.cause import BAD, CAUTION, Cause
+from uavctl.event_codes import EventCode
 from uavctl.flight.monitors.stale import FROZEN
-from uavctl.mavlink.vehicle import SECOND_VEHICLE
-from uavctl.outcome import Cause
 from uavctl.records import ControlMode, Severity
 
 _MAX_RMS_SHARE = 0.5  # of the radius of arrival: root mean square distance that a mission of places may have on average
@@ -48,28 +48,23 @@ def find_bad_ending(e: FlightEvidence) -> Iterator[Finding]:
         text = s.ending.sentence.rstrip(".")
         text = f"{text[:1].lower()}{text[1:]}" if flight.endings else last_decision.reason
         has_risen = any(status.armed and status.landed is False for status in flight.vehicles)
-        if has_risen and s.ending.cause == Cause.NOT_FLOWN:
+        if has_risen and s.ending.code == Cause.NOT_FLOWN:
             text = f"the controller was never in charge ({last_decision.reason})"
         yield Finding(
-            HeadlineCause.NOT_AS_ORDERED if has_risen else HeadlineCause.NOT_FLOWN,
-            e.to_seconds(last_decision.at_ns),
-            text,
-            tone=tone,
+            Cause.NOT_AS_ORDERED if has_risen else Cause.NOT_FLOWN, e.to_seconds(last_decision.at_ns), text, tone=tone
         )
     elif flight.breach is not None or not s.ending.as_ordered:
         at_s = _find_release_s(e)
         time_text = "" if at_s is None else f" at {seconds(at_s)}"
         if flight.breach is not None:
-            yield Finding(HeadlineCause.LET_GO, at_s or 0.0, f"by the envelope{time_text}: {flight.breach.text}")
+            yield Finding(Cause.LET_GO, at_s or 0.0, f"by the envelope{time_text}: {flight.breach.text}")
         else:
             cause_text = (
                 s.ending.cause
-                if s.ending.cause != Cause.WAITING
+                if s.ending.code != Cause.WAITING
                 else f"at the end it was waiting ({last_decision.reason})"
             )
-            yield Finding(
-                HeadlineCause.NOT_AS_ORDERED, at_s or e.to_seconds(last_decision.at_ns), f"{cause_text}{time_text}"
-            )
+            yield Finding(Cause.NOT_AS_ORDERED, at_s or e.to_seconds(last_decision.at_ns), f"{cause_text}{time_text}")
 
 
 def find_failed_takeoff(e: FlightEvidence) -> Iterator[Finding]:
@@ -85,7 +80,7 @@ def find_failed_takeoff(e: FlightEvidence) -> Iterator[Finding]:
     moved_m = float(np.linalg.norm(places_m - places_m[0], axis=1).max())
     if moved_m < _MIN_RISE_M:
         text = f"the vehicle was armed for {seconds(lasted_s)} and its position moved by {metres(moved_m)} at most"
-        yield Finding(HeadlineCause.NOT_RISEN, begun_s, text)
+        yield Finding(Cause.NOT_RISEN, begun_s, text)
 
 
 def find_refused_start(e: FlightEvidence) -> Iterator[Finding]:
@@ -94,7 +89,7 @@ def find_refused_start(e: FlightEvidence) -> Iterator[Finding]:
         (e.to_seconds(event.at_ns), order, event.severity)
         for event in e.flight.events
         for order in _START_ORDERS
-        if event.code == "command-ack" and event.text.startswith(order)
+        if event.code == EventCode.COMMAND_ACK and event.subject == order
     ]
     if not answers or answers[-1][2] is Severity.INFO or e.armed_spans:
         return
@@ -103,7 +98,7 @@ def find_refused_start(e: FlightEvidence) -> Iterator[Finding]:
     quoted_texts = [
         f'"{event.text.strip()}"'
         for event in e.flight.events
-        if event.code == "vehicle-text"
+        if event.code == EventCode.VEHICLE_TEXT
         and event.severity is not Severity.INFO
         and refused_s[0] - HEARTBEAT_S <= e.to_seconds(event.at_ns) <= refused_s[-1] + HEARTBEAT_S
     ]
@@ -112,7 +107,7 @@ def find_refused_start(e: FlightEvidence) -> Iterator[Finding]:
         f"it refused {count(len(refused_s), 'time')} to "
         f"{_START_ORDERS[order]}{f' and said {text_list}' if text_list else ''}"
     )
-    yield Finding(HeadlineCause.BEGIN_REFUSED, refused_s[0], text)
+    yield Finding(Cause.BEGIN_REFUSED, refused_s[0], text)
 
 
 def _find_release_s(e: FlightEvidence) -> float | None:
@@ -144,7 +139,7 @@ def find_limit_violations(e: FlightEvidence) -> Iterator[Finding]:
             )
             unit = " m/s" if index in design.velocity_index else ""
             text = f"{max_excess:.2g}{unit} beyond the limit of {design.state_name(index)} at {seconds(at_s)} ({text})"
-        yield Finding(HeadlineCause.BEYOND_LIMIT, at_s, text)
+        yield Finding(Cause.BEYOND_LIMIT, at_s, text)
     outside = find_input_violations(flight)
     input_extremes = np.fmax(steps.decided, steps.input), np.fmin(steps.decided, steps.input)
     normals, bounds = np.array(design.c_u).reshape(-1, len(design.q_u)), np.array(design.b_u)
@@ -152,7 +147,7 @@ def find_limit_violations(e: FlightEvidence) -> Iterator[Finding]:
     if _is_significant(excess, bounds, outside):
         at_s = float(steps.t_s[outside][0])
         text = f"an input was beyond its limits at {count(int(outside.sum()), 'step')}, first at {seconds(at_s)}"
-        yield Finding(HeadlineCause.BEYOND_LIMIT, at_s, text)
+        yield Finding(Cause.BEYOND_LIMIT, at_s, text)
 
 
 def _is_significant(excess: Array, limits: Array, outside: Flags) -> bool:
@@ -173,7 +168,7 @@ def find_fallback(e: FlightEvidence) -> Iterator[Finding]:
         spans, first = e.flight.fallback_spans, e.flight.fallen[0]
         total_s = sum(end - begin for begin, end in spans)
         period = f"for {seconds(total_s)} in all, from {seconds(spans[0][0])} on"
-        yield Finding(HeadlineCause.FELL_BACK, spans[0][0], f"the fallback flew {period}: {first.reason}")
+        yield Finding(Cause.FELL_BACK, spans[0][0], f"the fallback flew {period}: {first.reason}")
 
 
 def find_mission_miss(e: FlightEvidence) -> Iterator[Finding]:
@@ -191,7 +186,7 @@ def find_mission_miss(e: FlightEvidence) -> Iterator[Finding]:
         yield from _find_short_trajectory(e, last_s)
     elif s.final_error_m > max(accept_m, _ARRIVAL_SHARE * float(compute_position_errors_m(flight)[0])):
         yield Finding(
-            HeadlineCause.NOT_REACHED,
+            Cause.NOT_REACHED,
             last_s,
             f"{metres(s.final_error_m)} from its target at the last step{_describe_unreachable_target(e)}",
         )
@@ -201,13 +196,13 @@ def find_mission_miss(e: FlightEvidence) -> Iterator[Finding]:
         reached_waypoints = [decision.waypoint for decision in flight.flown if decision.waypoint is not None]
         if len(waypoints) and reached_waypoints and max(reached_waypoints) < len(waypoints) - 1:
             yield Finding(
-                HeadlineCause.NOT_REACHED,
+                Cause.NOT_REACHED,
                 last_s,
                 f"{max(reached_waypoints)} of {count(len(waypoints), 'waypoint')} were reached",
             )
     if s.course_rms_m is None or s.course_worst_m is None or s.course_worst_s is None:
         near_m, at_s = float(compute_position_errors_m(flight).min()), last_s
-        cause = HeadlineCause.OFF_TRACK if s.trajectory else HeadlineCause.NOT_REACHED
+        cause = Cause.OFF_TRACK if s.trajectory else Cause.NOT_REACHED
         yield Finding(cause, at_s, f"it never came nearer to its target than {metres(near_m)}")
     elif s.course_worst_m > accept_m or s.course_rms_m > _MAX_RMS_SHARE * accept_m:
         course_text = "its trajectory on the whole way" if s.trajectory else "its target from its arrival on"
@@ -215,18 +210,18 @@ def find_mission_miss(e: FlightEvidence) -> Iterator[Finding]:
             f"{metres(s.course_rms_m)} from {course_text} (rms), at most {metres(s.course_worst_m)} at "
             f"{seconds(s.course_worst_s)}"
         )
-        yield Finding(HeadlineCause.OFF_TRACK, s.course_worst_s, text)
+        yield Finding(Cause.OFF_TRACK, s.course_worst_s, text)
 
 
 def _find_short_trajectory(e: FlightEvidence, last_s: float) -> Iterator[Finding]:
     """Find a trajectory of which the end was not flown though no operator ended it."""
     times_s = () if e.config is None else e.config.mission.trajectory.times_s
-    if not times_s or e.flight.part or e.summary.ending.cause == Cause.OPERATOR:
+    if not times_s or e.flight.part or e.summary.ending.code == Cause.ENDED_BY_OPERATOR:
         return
     begun_s = e.flight.spans(FLOWN)[0][0]
     if last_s - begun_s < times_s[-1] - e.flight.design.dt_s * 2.0:
         text = f"{seconds(last_s - begun_s)} of its trajectory's {seconds(times_s[-1])} were flown"
-        yield Finding(HeadlineCause.NOT_REACHED, last_s, text)
+        yield Finding(Cause.NOT_REACHED, last_s, text)
 
 
 def _describe_unreachable_target(e: FlightEvidence) -> str:
@@ -251,13 +246,15 @@ def find_wind_push(e: FlightEvidence) -> Iterator[Finding]:
     if at_s is None or at_s >= flight_end_s or any(find_battery_fault(e)):
         return
     until_s = next(
-        (e.to_seconds(o.at_ns) for o in e.flight.events if o.code == "bias-free" and e.to_seconds(o.at_ns) > at_s),
+        (
+            e.to_seconds(o.at_ns)
+            for o in e.flight.events
+            if o.code == EventCode.BIAS_FREE and e.to_seconds(o.at_ns) > at_s
+        ),
         e.to_seconds(e.flight.decisions[-1].at_ns),
     )
     if until_s - at_s > _MIN_PUSH_S:
-        yield Finding(
-            HeadlineCause.WIND, at_s, f"what pushed was as strong as may be flown against, from {seconds(at_s)} on"
-        )
+        yield Finding(Cause.WIND, at_s, f"what pushed was as strong as may be flown against, from {seconds(at_s)} on")
 
 
 def find_relaxed_plans(e: FlightEvidence) -> Iterator[Finding]:
@@ -265,7 +262,7 @@ def find_relaxed_plans(e: FlightEvidence) -> Iterator[Finding]:
     plans = e.flight.flown_plans
     if e.summary.slack_used > NEGLIGIBLE_SHARE * max(1, len(plans)):
         text = f"in {e.summary.slack_used} of {count(len(plans), 'plan')} that were flown a constraint gave way"
-        yield Finding(HeadlineCause.PLANS_RELAXED, e.find_first_s("gave-way") or 0.0, text)
+        yield Finding(Cause.PLANS_RELAXED, e.find_first_s(EventCode.RELAXED) or 0.0, text)
 
 
 def find_link_trouble(e: FlightEvidence) -> Iterator[Finding]:
@@ -276,9 +273,7 @@ def find_link_trouble(e: FlightEvidence) -> Iterator[Finding]:
             f"{100 * link.news.rate:.0f} % of the steps had a position captured within them, and the design counts on "
             f"{100 * link.promised_news:.0f} %"
         )
-        yield Finding(HeadlineCause.LINK_WORSE, 0.0, text)
-    second_s = e.find_first_s(SECOND_VEHICLE)
+        yield Finding(Cause.LINK_WORSE, 0.0, text)
+    second_s = e.find_first_s(EventCode.SECOND_VEHICLE)
     if second_s is not None:
-        yield Finding(
-            HeadlineCause.SECOND_VEHICLE, second_s, f"it was heard on the vehicle's link at {seconds(second_s)}"
-        )
+        yield Finding(Cause.SECOND_VEHICLE, second_s, f"it was heard on the vehicle's link at {seconds(second_s)}")

@@ -8,29 +8,27 @@ from itertools import pairwise
 import numpy as np
 
 from logs.recording.summary import count
-from logs.report.causes import BAD, CAUTION, Finding, HeadlineCause, metres, seconds
 from logs.report.evidence import FlightEvidence
+from logs.report.findings import Finding, metres, seconds
 from logs.report.rules_loss import NEGLIGIBLE_COUNT, NEGLIGIBLE_SHARE, WRONG_POSITION_M
+from uavctl.cause import BAD, CAUTION, Cause
+from uavctl.event_codes import EventCode
 from uavctl.flight.estimator import DUPLICATE, TOO_OLD
 from uavctl.flight.measure import FUTURE, INVALID
 from uavctl.flight.monitors.outliers import JUMP
 from uavctl.flight.monitors.stale import FROZEN
 from uavctl.mavlink.clocksync import StampRefusal
 from uavctl.mavlink.codec import BAD_FIELD
-from uavctl.mavlink.relay import HELD_BACK, REASONS, RELAY_RESUMED, RELAY_SILENT
+from uavctl.mavlink.relay import HELD_BACK, REASONS
 
 _MAX_DRIFT_STEP_M = 0.1  # what a drifting source adds from one position to the next; a jump adds more
 _UNUSABLE_SHARE = 0.2  # of positions: more than come out of order, or twice, on any link
 _RELAY_TIMEOUT_S = 2.0  # without a position passed on: vehicles' estimators give up after 5 to 7 s
 _SAMPLE_CAUSES = (
-    (HeadlineCause.POSITIONS_FROZEN, (FROZEN,), "the camera sent the same position again and again"),
-    (HeadlineCause.POSITIONS_JUMPED, (JUMP,), "positions were where the vehicle cannot have been"),
-    (
-        HeadlineCause.STAMPS_UNUSABLE,
-        (FUTURE, TOO_OLD, DUPLICATE),
-        "stamps lay in the future, were too old or came twice",
-    ),
-    (HeadlineCause.POSITIONS_INVALID, (INVALID,), "positions were no finite numbers, or absurd"),
+    (Cause.POSITIONS_FROZEN, (FROZEN,), "the camera sent the same position again and again"),
+    (Cause.POSITIONS_JUMPED, (JUMP,), "positions were where the vehicle cannot have been"),
+    (Cause.STAMPS_UNUSABLE, (FUTURE, TOO_OLD, DUPLICATE), "stamps lay in the future, were too old or came twice"),
+    (Cause.POSITIONS_INVALID, (INVALID,), "positions were no finite numbers, or absurd"),
 )
 
 
@@ -39,8 +37,8 @@ def find_refused_samples(e: FlightEvidence) -> Iterator[Finding]:
     arrived = max(1, len(e.captured_s))
     for cause, codes, text in _SAMPLE_CAUSES:
         refused, first_s = e.count_refused(*codes)
-        limit = NEGLIGIBLE_COUNT if cause is HeadlineCause.POSITIONS_FROZEN else NEGLIGIBLE_SHARE * arrived
-        if cause is HeadlineCause.STAMPS_UNUSABLE:
+        limit = NEGLIGIBLE_COUNT if cause is Cause.POSITIONS_FROZEN else NEGLIGIBLE_SHARE * arrived
+        if cause is Cause.STAMPS_UNUSABLE:
             limit = _UNUSABLE_SHARE * arrived
         if refused > limit:
             tone = BAD if not e.summary.ending.as_ordered or e.summary.fallbacks else CAUTION
@@ -56,7 +54,7 @@ def _find_unusable_stamps(e: FlightEvidence) -> Iterator[Finding]:
         if refused > _UNUSABLE_SHARE * (refused + link_stats.samples):
             main_reason = max(refused_by_reason, key=lambda reason: refused_by_reason[reason])
             share = f"{refused} of {count(refused + link_stats.samples, 'position')} on “{link_stats.link}”"
-            yield Finding(HeadlineCause.STAMPS_UNUSABLE, 0.0, f"{share} had none that counts ({main_reason})")
+            yield Finding(Cause.STAMPS_UNUSABLE, 0.0, f"{share} had none that counts ({main_reason})")
 
 
 def find_wrong_positions(e: FlightEvidence) -> Iterator[Finding]:
@@ -74,9 +72,7 @@ def find_wrong_positions(e: FlightEvidence) -> Iterator[Finding]:
         f"{seconds(float(e.position_error_t_s[worst]))}"
     )
     yield Finding(
-        HeadlineCause.POSITIONS_DRIFTED if is_drift else HeadlineCause.POSITIONS_JUMPED,
-        float(e.position_error_t_s[first]),
-        text,
+        Cause.POSITIONS_DRIFTED if is_drift else Cause.POSITIONS_JUMPED, float(e.position_error_t_s[first]), text
     )
 
 
@@ -88,22 +84,18 @@ def find_absent_positions(e: FlightEvidence) -> Iterator[Finding]:
     if arrivals:
         kinds = sorted({event.code for event in e.flight.events if event.code.startswith("sample-")})
         reason_text = f" ({', '.join(kinds)})" if kinds else ""
-        yield Finding(
-            HeadlineCause.POSITIONS_INVALID, 0.0, f"none of {count(arrivals, 'position')} could be used{reason_text}"
-        )
+        yield Finding(Cause.POSITIONS_INVALID, 0.0, f"none of {count(arrivals, 'position')} could be used{reason_text}")
     elif unreadable := sum(link.bad.get(BAD_FIELD, 0) for link in e.last_link_stats):
         yield Finding(
-            HeadlineCause.POSITIONS_INVALID,
-            0.0,
-            f"{count(unreadable, 'message')} had values that are no finite numbers",
+            Cause.POSITIONS_INVALID, 0.0, f"{count(unreadable, 'message')} had values that are no finite numbers"
         )
     elif not any(_find_unusable_stamps(e)):
-        yield Finding(HeadlineCause.POSITIONS_ABSENT, 0.0, f"none came in {seconds(e.flight.duration_s)}")
+        yield Finding(Cause.POSITIONS_ABSENT, 0.0, f"none came in {seconds(e.flight.duration_s)}")
 
 
 def find_relay_silence(e: FlightEvidence) -> Iterator[Finding]:
     """Find that the vehicle, which lives on the positions that are passed on to it, got none."""
-    silent_s = e.find_first_s(RELAY_SILENT)
+    silent_s = e.find_first_s(EventCode.RELAY_SILENT)
     if silent_s is None:
         silent_s = _find_relay_gap_s(e)
     if silent_s is None:
@@ -115,12 +107,12 @@ def find_relay_silence(e: FlightEvidence) -> Iterator[Finding]:
     if reason == HELD_BACK and silent_s >= e.breach_s:
         return  # it was let go, and so they were held back
     begun_s = silent_s if report is None or report.last_ns is None else min(silent_s, e.to_seconds(report.last_ns))
-    resumption_times = (e.to_seconds(o.at_ns) for o in e.flight.events if o.code == RELAY_RESUMED)
+    resumption_times = (e.to_seconds(o.at_ns) for o in e.flight.events if o.code == EventCode.RELAY_RESUMED)
     resumed_s = next((at_s for at_s in resumption_times if at_s > silent_s), None)
     end_text = "on" if resumed_s is None else f"to {seconds(resumed_s)}"
     reason_text = f" ({REASONS[reason]})" if reason in REASONS else ""
     yield Finding(
-        HeadlineCause.RELAY_SILENT,
+        Cause.RELAY_SILENT,
         begun_s,
         f"the vehicle got no position from us from {seconds(begun_s)} {end_text}{reason_text}",
     )

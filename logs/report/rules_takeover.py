@@ -8,30 +8,29 @@ from itertools import pairwise
 import numpy as np
 
 from logs.recording.flight import FLOWN
-from logs.report.causes import Finding, HeadlineCause, seconds
 from logs.report.evidence import FlightEvidence
+from logs.report.findings import Finding, seconds
 from logs.report.rules_loss import HEARTBEAT_TIMEOUT_S
 from logs.report.vehicle_texts import FAILSAFE_MODES, classify_text
-from uavctl.outcome import Cause
+from uavctl.cause import Cause
+from uavctl.event_codes import EventCode
+from uavctl.mavlink.handover_states import HandoverState
 from uavctl.records import Severity, VehicleStatus
 
 _FAILSAFE_CAUSES = frozenset(
-    {
-        HeadlineCause.VEHICLE_FENCE,
-        HeadlineCause.BATTERY_LOW,
-        HeadlineCause.VEHICLE_POSITION_LOST,
-        HeadlineCause.VEHICLE_FAILSAFE,
-    }
+    {Cause.VEHICLE_FENCE, Cause.BATTERY_LOW, Cause.VEHICLE_POSITION_LOST, Cause.VEHICLE_FAILSAFE}
 )
+_FAILSAFE_ENDS = frozenset({Cause.VEHICLE_FAILSAFE, Cause.FAILSAFE_LANDED})
+_FENCE_ENDS = frozenset({Cause.VEHICLE_FENCE, Cause.FENCE_LANDED})
 
 
 def find_vehicle_texts(e: FlightEvidence) -> Iterator[Finding]:
     """Find what the vehicle said that a pilot must know, each cause once."""
-    reported_causes: set[HeadlineCause] = set()
+    reported_causes: set[Cause] = set()
     last_change = ""  # the change of mode that was told last: one text after another tells of the same
     for event in e.flight.events:
         at_s = e.to_seconds(event.at_ns)
-        if event.code != "vehicle-text" or not e.is_armed(at_s):
+        if event.code != EventCode.VEHICLE_TEXT or not e.is_armed(at_s):
             continue
         is_error = event.severity is Severity.ERROR
         cause = classify_text(event.text, is_error=is_error, is_warning=is_error or event.severity is Severity.WARNING)
@@ -59,10 +58,10 @@ def _describe_mode_change(e: FlightEvidence, at_s: float) -> str:
 
 def find_failsafe(e: FlightEvidence) -> Iterator[Finding]:
     """Find a failsafe of the vehicle's own that its heartbeats or the end of the flight tell of."""
-    name = _get_cause_name(e)
+    code = e.summary.ending.code
     failsafe_status = next((o for o in e.flight.vehicles if o.armed and (o.failsafe or o.mode in FAILSAFE_MODES)), None)
     texts = {finding.cause for finding in find_vehicle_texts(e)} & _FAILSAFE_CAUSES
-    if texts or (failsafe_status is None and "FAILSAFE" not in name and "FENCE" not in name):
+    if texts or (failsafe_status is None and code not in _FAILSAFE_ENDS | _FENCE_ENDS):
         return
     external_exit = find_external_exit(e)
     at_s = (
@@ -73,37 +72,29 @@ def find_failsafe(e: FlightEvidence) -> Iterator[Finding]:
         else e.to_seconds(e.flight.decisions[-1].at_ns)
     )
     mode = failsafe_status.mode if failsafe_status is not None else external_exit[1] if external_exit else ""
-    cause = HeadlineCause.VEHICLE_FENCE if "FENCE" in name else HeadlineCause.VEHICLE_FAILSAFE
+    cause = Cause.VEHICLE_FENCE if code in _FENCE_ENDS else Cause.VEHICLE_FAILSAFE
     yield Finding(cause, at_s, f"it acted at {seconds(at_s)}{f' ({mode})' if mode else ''}")
 
 
 def find_takeover(e: FlightEvidence) -> Iterator[Finding]:
     """Find who took the vehicle out of the mode that takes setpoints, if not we and no failsafe."""
-    name = _get_cause_name(e)
+    code = e.summary.ending.code
     external_exit = find_external_exit(e)
-    if "PILOT" in name:
+    if code in (Cause.PILOT, Cause.PILOT_LANDED):
         at_s, mode = external_exit or (e.to_seconds(e.flight.decisions[-1].at_ns), "")
-        landed = ", and landed it" if name == Cause.PILOT_LANDED.name else ""
-        yield Finding(HeadlineCause.PILOT, at_s, f"at {seconds(at_s)}{f', to {mode}' if mode else ''}{landed}")
-    elif name == "GROUND_STATION":
+        landed = ", and landed it" if code == Cause.PILOT_LANDED else ""
+        yield Finding(Cause.PILOT, at_s, f"at {seconds(at_s)}{f', to {mode}' if mode else ''}{landed}")
+    elif code == Cause.GROUND_STATION:
         at_s, mode = external_exit or (e.to_seconds(e.flight.decisions[-1].at_ns), "")
-        yield Finding(HeadlineCause.GROUND_STATION, at_s, f"at {seconds(at_s)}{f', to {mode}' if mode else ''}")
+        yield Finding(Cause.GROUND_STATION, at_s, f"at {seconds(at_s)}{f', to {mode}' if mode else ''}")
     elif external_exit is not None and not any(
         (*find_failsafe(e), *(finding for finding in find_vehicle_texts(e) if finding.cause in _FAILSAFE_CAUSES))
     ):
         yield Finding(
-            HeadlineCause.MODE_LEFT,
+            Cause.MODE_LEFT,
             external_exit[0],
             f"the vehicle went to {external_exit[1]} at {seconds(external_exit[0])}; who asked is unknown",
         )
-
-
-def _get_cause_name(e: FlightEvidence) -> str:
-    """Return the name of the ending's cause; empty if this version has none such."""
-    try:
-        return Cause(e.summary.ending.cause).name
-    except ValueError:
-        return ""
 
 
 def find_external_exit(e: FlightEvidence) -> tuple[float, str] | None:
@@ -122,6 +113,8 @@ def _is_landing_requested(e: FlightEvidence, before: VehicleStatus, after: Vehic
     """Return whether the vehicle was asked to land between two of its heartbeats, or shortly before."""
     begun_s, ended_s = e.to_seconds(before.at_ns) - HEARTBEAT_TIMEOUT_S, e.to_seconds(after.at_ns)
     return any(
-        event.code == "hand-over" and begun_s <= e.to_seconds(event.at_ns) <= ended_s and "-> landing" in event.text
+        event.code == EventCode.HAND_OVER
+        and event.subject == HandoverState.LANDING
+        and begun_s <= e.to_seconds(event.at_ns) <= ended_s
         for event in e.flight.events
     )

@@ -7,8 +7,8 @@ from itertools import groupby, pairwise
 import numpy as np
 
 from logs.recording.flight import FLOWN, FlightData
+from logs.recording.notes import NoteKind
 from logs.recording.summary import FlightSummary
-from logs.recording.topics import GOES_ON, RECOVERED
 from uavctl.records import number, severity, tell, worst
 
 # A target that moves by less than this share of its longest step only settles.
@@ -55,10 +55,10 @@ def _describe_cut(flight: FlightData) -> list[str]:
     """Return a sentence on why the recording ends before the flight does; empty if it does not."""
     if not flight.notes:
         return []
-    text = flight.notes[-1].text
-    if text.startswith(RECOVERED):
-        return [f"The recording was {text}."]
-    if text.startswith(GOES_ON):
+    note = flight.notes[-1]
+    if note.kind is NoteKind.RECOVERED:
+        return [f"The recording was {note.text}."]
+    if note.kind is NoteKind.CONTINUED:
         return ["The flight goes on in the next file."]
     if flight.breaks_off:
         return [

@@ -16,6 +16,8 @@ from logs.report.page import Mark
 from logs.report.plots import set_time_axis
 from logs.report.svg import WIDTH_IN, Drawing, colour, draw_strokes, open_canvas
 from uavctl.arrays import Array
+from uavctl.event_codes import EventCode
+from uavctl.mavlink.handover_states import HandoverState
 from uavctl.records import ControlMode, Decision, Severity, SolveStatus
 
 WIDE_IN = 11.0
@@ -170,12 +172,12 @@ def _list_mode_spans(flight: FlightData) -> Iterator[Span]:
 
 
 def _list_hand_over_spans(flight: FlightData) -> Iterator[Span]:
-    """Return the states of the hand-over, read from its events: "before -> after (mode, armed)"."""
-    events = [event for event in flight.events if event.code == "hand-over" and " -> " in event.text]
-    states = [event.text.split(" -> ", 1)[1].split(" (", 1)[0] for event in events]
+    """Return the states of the hand-over, from its events; a flight begins in the first one."""
+    events = [event for event in flight.events if event.code == EventCode.HAND_OVER]
+    states = [event.subject for event in events]
     begins = flight.seconds([event.at_ns for event in events]).tolist()
-    if events and begins[0] > 0.0:
-        states.insert(0, events[0].text.split(" -> ", 1)[0])
+    if events and begins[0] > 0.0 and not flight.part:
+        states.insert(0, HandoverState.WAITING)
         begins.insert(0, 0.0)
     for state, (begun_s, ended_s) in zip(states, pairwise([*begins, flight.duration_s]), strict=True):
         yield Span(begun_s, ended_s, _HAND_OVER_ROLES.get(state, "grid"), state)

@@ -14,9 +14,10 @@ import numpy as np
 from logs.recording.mavlink_flight import MavlinkFlight, MavlinkFlightInfo, PositionTrack
 from logs.recording.summary import ARRIVED_M, BLIND_S, compute_errors_from_arrival, count
 from logs.report.battery import find_battery_faults
-from logs.report.causes import BAD, Finding, Headline, HeadlineCause, make_headline, metres, seconds, sort_findings
+from logs.report.findings import Finding, Headline, make_headline, metres, seconds, sort_findings
 from logs.report.vehicle_texts import FAILSAFE_MODES, classify_text
 from uavctl.arrays import Array
+from uavctl.cause import BAD, Cause
 from uavctl.mavlink.profile import PROFILES
 from uavctl.records import number
 
@@ -63,24 +64,20 @@ def derive_tlog_headline(flight: MavlinkFlight) -> Headline:
     """Return what matters most in a flight of a foreign recording, while the vehicle was armed."""
     info = flight.info
     if info.vehicle_system is None:
-        return make_headline([Finding(HeadlineCause.NO_VEHICLE, 0.0, "no autopilot's heartbeat is in it")])
+        return make_headline([Finding(Cause.NO_VEHICLE, 0.0, "no autopilot's heartbeat is in it")])
     armed = ArmedFlight(flight, find_armed_spans(info))
     others = list(_find_second_vehicle(armed))
     if not armed.spans:
         unarmed_flight = ArmedFlight(flight, [(0.0, np.inf)])
         sentences = [finding.sentence for finding in _find_texts(unarmed_flight)]
         arming = (
-            Finding(HeadlineCause.NOT_ARMED, 0.0, "the vehicle was never armed in it")
+            Finding(Cause.NOT_ARMED, 0.0, "the vehicle was never armed in it")
             if info.modes
-            else Finding(HeadlineCause.ARMING_UNKNOWN, 0.0, "nothing in it tells modes or arming")
+            else Finding(Cause.ARMING_UNKNOWN, 0.0, "nothing in it tells modes or arming")
         )
         return make_headline([arming, *others], reasons=sentences)
     findings = sort_findings(finding for rule in RULES for finding in rule(armed))
-    reported_s = {
-        finding.at_s
-        for finding in findings
-        if finding.cause in (HeadlineCause.MODE_LEFT, HeadlineCause.VEHICLE_FAILSAFE)
-    }
+    reported_s = {finding.at_s for finding in findings if finding.cause in (Cause.MODE_LEFT, Cause.VEHICLE_FAILSAFE)}
     return make_headline(findings or [_make_clear_finding(armed)], reasons=_describe_mode_exits(info, reported_s))
 
 
@@ -112,12 +109,12 @@ def _make_clear_finding(armed: ArmedFlight) -> Finding:
         texts.append("where it was to be is not in it")
     if not len(flight.battery_v):
         texts.append("its battery is not known")
-    return Finding(HeadlineCause.NOTHING_FOUND, 0.0, "; ".join(texts))
+    return Finding(Cause.NOTHING_FOUND, 0.0, "; ".join(texts))
 
 
 def _find_texts(armed: ArmedFlight) -> Iterator[Finding]:
     """Find what it said that a pilot must know, each cause once."""
-    reported_causes: set[HeadlineCause] = set()
+    reported_causes: set[Cause] = set()
     at_s = np.array([text.at_s for text in armed.info.texts])
     is_armed = armed.inside(at_s, _HEARTBEAT_S)
     for text in (text for text, is_inside in zip(armed.info.texts, is_armed, strict=True) if is_inside):
@@ -142,7 +139,7 @@ def _find_failsafe_mode(armed: ArmedFlight) -> Iterator[Finding]:
     """Find a mode that a failsafe alone chooses."""
     for mode in armed.info.modes:
         if mode.armed and mode.mode in FAILSAFE_MODES:
-            yield Finding(HeadlineCause.VEHICLE_FAILSAFE, mode.at_s, f"it went to {mode.mode} at {seconds(mode.at_s)}")
+            yield Finding(Cause.VEHICLE_FAILSAFE, mode.at_s, f"it went to {mode.mode} at {seconds(mode.at_s)}")
             return
 
 
@@ -151,7 +148,7 @@ def _find_vehicle_silence(armed: ArmedFlight) -> Iterator[Finding]:
     begun_s, ended_s = _find_first_gap(armed, armed.flight.beat_t_s, _HEARTBEAT_TIMEOUT_S)
     if ended_s > begun_s:
         text = f"no heartbeat of it came for {seconds(ended_s - begun_s)}, from {seconds(begun_s)} on"
-        yield Finding(HeadlineCause.VEHICLE_SILENT, begun_s, text)
+        yield Finding(Cause.VEHICLE_SILENT, begun_s, text)
 
 
 def _find_position_loss(armed: ArmedFlight) -> Iterator[Finding]:
@@ -160,14 +157,14 @@ def _find_position_loss(armed: ArmedFlight) -> Iterator[Finding]:
     if not len(own_s):
         invalid = [name for name in armed.info.bad if "position" in name.lower()]
         invalid_text = f" ({', '.join(invalid)})" if invalid else ""
-        cause = HeadlineCause.POSITIONS_INVALID if invalid else HeadlineCause.POSITIONS_ABSENT
+        cause = Cause.POSITIONS_INVALID if invalid else Cause.POSITIONS_ABSENT
         yield Finding(cause, armed.spans[0][0], f"the vehicle told no valid position of its own{invalid_text}")
         return
     usual_s = float(np.median(np.diff(own_s))) if len(own_s) > 1 else np.inf
     begun_s, ended_s = _find_first_gap(armed, own_s, max(_HEARTBEAT_TIMEOUT_S, _MAX_PERIODS * usual_s))
     if ended_s > begun_s and not any(_find_vehicle_silence(armed)):
         text = f"it told none for {seconds(ended_s - begun_s)}, from {seconds(begun_s)} on"
-        yield Finding(HeadlineCause.VEHICLE_POSITION_LOST, begun_s, text)
+        yield Finding(Cause.VEHICLE_POSITION_LOST, begun_s, text)
 
 
 def _find_first_gap(armed: ArmedFlight, t_s: Array, limit_s: float) -> tuple[float, float]:
@@ -189,14 +186,14 @@ def _find_silence(armed: ArmedFlight) -> Iterator[Finding]:
         motion_text = f", while its own position moved by {metres(moved_m)}" if moved_m >= _MAX_DISAGREEMENT_M else ""
         period = f"for {seconds(silent_s)}, from {seconds(since_s)} on ({armed.mode_at(since_s)})"
         tone = BAD if silent_s >= _ESTIMATOR_TIMEOUT_S else ""
-        yield Finding(HeadlineCause.SILENCE, since_s, f"none came {period}{motion_text}", tone=tone)
+        yield Finding(Cause.SILENCE, since_s, f"none came {period}{motion_text}", tone=tone)
     for source, track in flight.sent.items():
         if len(flight.sent) < 2 or len(track.t_s) < _MIN_POSITIONS:
             continue
         longest_s, begun_s = _find_longest_gap(track.t_s, armed.spans)
         if begun_s >= track.t_s[0] and longest_s >= max(_SOURCE_TIMEOUT_S, silent_s + _HEARTBEAT_S):
             text = f"{source} stopped for {seconds(longest_s)}, from {seconds(begun_s)} on, while others went on"
-            yield Finding(HeadlineCause.RELAY_SILENT, begun_s, text)
+            yield Finding(Cause.RELAY_SILENT, begun_s, text)
 
 
 def _measure_silence(armed: ArmedFlight) -> tuple[float, float]:
@@ -234,7 +231,7 @@ def _find_frozen_source(armed: ArmedFlight) -> Iterator[Finding]:
                     f"{source} sent the same position {end - begin + 1} × from {seconds(begun_s)} on, while its own "
                     f"moved by {metres(moved_m)}"
                 )
-                yield Finding(HeadlineCause.POSITIONS_FROZEN, begun_s, text)
+                yield Finding(Cause.POSITIONS_FROZEN, begun_s, text)
                 break
 
 
@@ -243,13 +240,13 @@ def _find_unusable_stamps(armed: ArmedFlight) -> Iterator[Finding]:
     for source in armed.info.sent:
         if source.positions >= _MIN_POSITIONS and source.refused_stamps > _UNUSABLE_SHARE * source.positions:
             text = f"{source.refused_stamps} of {count(source.positions, 'stamp')} of {source.source} cannot be used"
-            yield Finding(HeadlineCause.STAMPS_UNUSABLE, 0.0, text)
+            yield Finding(Cause.STAMPS_UNUSABLE, 0.0, text)
         elif source.positions >= _MIN_POSITIONS and source.delay_ms is not None and source.delay_ms[1] > _MAX_DELAY_MS:
             text = (
                 f"by those of {source.source} positions were up to {seconds(1e-3 * source.delay_ms[2])} late: late, or "
                 "stamped in another unit"
             )
-            yield Finding(HeadlineCause.STAMPS_UNUSABLE, 0.0, text)
+            yield Finding(Cause.STAMPS_UNUSABLE, 0.0, text)
 
 
 def _find_position_disagreement(armed: ArmedFlight) -> Iterator[Finding]:
@@ -257,7 +254,7 @@ def _find_position_disagreement(armed: ArmedFlight) -> Iterator[Finding]:
     if apart_m > _MAX_DISAGREEMENT_M:
         description = f"{metres(apart_m)} off that of {source} at {seconds(apart_s)} ({armed.mode_at(apart_s)})"
         tone = BAD if apart_m > 2 * _MAX_DISAGREEMENT_M else ""
-        yield Finding(HeadlineCause.POSITIONS_APART, apart_s, f"its own position was {description}", tone=tone)
+        yield Finding(Cause.POSITIONS_APART, apart_s, f"its own position was {description}", tone=tone)
 
 
 def _measure_disagreement(armed: ArmedFlight) -> tuple[float, float, str]:
@@ -315,12 +312,10 @@ def _find_track_error(armed: ArmedFlight) -> Iterator[Finding]:
     if errors is not None and (errors.worst_m > ARRIVED_M or errors.rms_m > _MAX_RMS_SHARE * ARRIVED_M):
         max_text = f"at most {metres(errors.worst_m)} at {seconds(errors.worst_s)}"
         text = f"{metres(errors.rms_m)} from its setpoints (rms), {max_text}"
-        yield Finding(HeadlineCause.OFF_TRACK, errors.worst_s, text)
+        yield Finding(Cause.OFF_TRACK, errors.worst_s, text)
     elif errors is None:
         yield Finding(
-            HeadlineCause.OFF_TRACK,
-            float(at_s[0]),
-            f"it never came nearer to its setpoints than {metres(error_m.min())}",
+            Cause.OFF_TRACK, float(at_s[0]), f"it never came nearer to its setpoints than {metres(error_m.min())}"
         )
 
 
@@ -328,18 +323,13 @@ def _find_mode_exit(armed: ArmedFlight) -> Iterator[Finding]:
     """Find where it left the mode that takes setpoints for one that is no landing; who asked is not in it."""
     external = {profile.external_mode for profile in PROFILES.values()}
     landing = {mode for profile in PROFILES.values() for mode in profile.landing_modes}
-    failsafe = {
-        HeadlineCause.VEHICLE_FENCE,
-        HeadlineCause.BATTERY_LOW,
-        HeadlineCause.VEHICLE_POSITION_LOST,
-        HeadlineCause.VEHICLE_FAILSAFE,
-    }
+    failsafe = {Cause.VEHICLE_FENCE, Cause.BATTERY_LOW, Cause.VEHICLE_POSITION_LOST, Cause.VEHICLE_FAILSAFE}
     if any(finding.cause in failsafe for finding in (*_find_texts(armed), *_find_failsafe_mode(armed))):
         return
     for before, after in pairwise(armed.info.modes):
         if before.armed and after.armed and before.mode in external and after.mode not in landing | external:
             text = f"from {before.mode} to {after.mode} at {seconds(after.at_s)}; who asked is not in it"
-            yield Finding(HeadlineCause.MODE_LEFT, after.at_s, text)
+            yield Finding(Cause.MODE_LEFT, after.at_s, text)
             return
 
 
@@ -353,9 +343,7 @@ def _find_second_vehicle(armed: ArmedFlight) -> Iterator[Finding]:
     if other_systems:
         subject = f"system{'s' if len(other_systems) > 1 else ''} {', '.join(sorted(other_systems, key=int))}"
         text = f"{subject} speaks in it, too; this is of system {armed.info.vehicle_system}"
-        yield Finding(
-            HeadlineCause.SECOND_VEHICLE, 0.0, text.replace("speaks", "speak") if len(other_systems) > 1 else text
-        )
+        yield Finding(Cause.SECOND_VEHICLE, 0.0, text.replace("speaks", "speak") if len(other_systems) > 1 else text)
 
 
 def _describe_mode_exits(info: MavlinkFlightInfo, reported_s: Container[float]) -> Iterator[str]:

@@ -15,6 +15,7 @@ from uavctl.arrays import Array
 from uavctl.build.link import build_ages, build_delayed_link, promised
 from uavctl.config import Config
 from uavctl.errors import DesignError
+from uavctl.event_codes import EventCode
 from uavctl.flight.link_estimate import NO_COUNTS, LinkEstimateParameters, compute_burst_statistic, count_step
 
 # Steps after which the age has forgotten where it began, for any link that a design is made for.
@@ -28,7 +29,7 @@ _NEGLIGIBLE_SHARE = 1e-9
 _DELAY_TOLERANCE_S = 0.002
 
 # Events by which the controller warns of the link in flight.
-_WARNINGS = frozenset({"link-bursts", "link-below-promise"})
+_WARNINGS = frozenset({EventCode.LINK_BURSTS, EventCode.LINK_BELOW_DESIGN})
 _WARNED_TEXT = (
     " The events' warnings of the link were made in flight, on few steps; this verdict is on all steps flown."
 )

@@ -28,7 +28,8 @@ from uavctl.daemon.control_socket import (
 )
 from uavctl.daemon.health import Health, RecorderHealth
 from uavctl.errors import UsageError, VehicleTakenError
-from uavctl.records import ORDER_ACCEPTED, ORDER_REFUSED, Command, Event, Order, Severity
+from uavctl.event_codes import EventCode
+from uavctl.records import Command, Event, Order, Severity
 
 SECOND = 1_000_000_000
 CONFIG = load_config("room")
@@ -74,7 +75,9 @@ class Flight:
 
     def _decide(self, command: Command, at_ns: int) -> Event:
         good = command.position_m is None or command.position_m[0] <= 1.0
-        code, severity = (ORDER_ACCEPTED, Severity.INFO) if good else (ORDER_REFUSED, Severity.WARNING)
+        code, severity = (
+            (EventCode.ORDER_ACCEPTED, Severity.INFO) if good else (EventCode.ORDER_REFUSED, Severity.WARNING)
+        )
         return Event(at_ns=at_ns, severity=severity, code=code, text=f"{command.order} {'yes' if good else 'no'}")
 
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from chaos import runs, soak_core
 
-from uavctl.records import ORDER_ACCEPTED, ORDER_REFUSED, ControlMode, Vec3
+from uavctl.event_codes import EventCode
+from uavctl.records import ControlMode, Vec3
 
 
 @pytest.mark.slow
@@ -37,7 +38,7 @@ def test_the_random_flights_see_every_mode_refusal_and_answer() -> None:
         codes |= {event.code for event in output.events}
     assert modes == set(ControlMode)
     wanted = {"sample-jump", "sample-invalid", "sample-future", "sample-duplicate", "missed-ticks", "solve-late"}
-    assert codes >= wanted | {"solve-infeasible", "solve-failed", ORDER_ACCEPTED, ORDER_REFUSED}
+    assert codes >= wanted | {"solve-infeasible", "solve-failed", EventCode.ORDER_ACCEPTED, EventCode.ORDER_REFUSED}
 
 
 @pytest.mark.parametrize("planted", [(2.1, 0.0, 0.0), (math.nan, 0.0, 0.0), (0.0, 0.0, -1.6)])

@@ -21,12 +21,13 @@ from logs.recording.summary import summarise
 from logs.report import flight_page as report
 from sim.autopilot.profile import FAILED, SIMULATED, Role
 from uavctl import loop as control
+from uavctl.account import FlightAccount, make_ending
+from uavctl.cause import CAUSES, Cause
 from uavctl.cli.app import run
 from uavctl.daemon import engagement
 from uavctl.daemon.lock import lock_vehicle
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.handover_states import HandoverState
-from uavctl.outcome import Cause, FlightCourse, make_ending
 from uavctl.records import Command, Order
 
 Type = Callable[..., Told]
@@ -40,7 +41,7 @@ def typed(capsys: pytest.CaptureFixture[str]) -> Type:
     def fly(rig: Endings, cause: Cause, *words: str, good: bool = False) -> Told:
         told = flown(rig, capsys, *words)
         assert told.summary, told.console
-        assert told.ending["cause"] == cause, told.ending
+        assert told.ending["code"] == cause, told.ending
         told.agrees()
         assert told.code == (0 if good else 1), told.ending
         return told
@@ -87,33 +88,33 @@ def hear(rig: Endings) -> None:
 @pytest.mark.slow
 def test_the_mission_is_over(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path, "mission.waypoints=[[0.3,0.0,-1.2]]", "mission.hold_s=0.5", "mission.then='land'")
-    told = typed(rig, Cause.MISSION, *TAKE_OFF, good=True)
+    told = typed(rig, Cause.LANDED_AFTER_MISSION, *TAKE_OFF, good=True)
     assert "landed and disarmed" in told.ending["sentence"]
 
 
 @pytest.mark.slow
 def test_the_operator_orders_the_landing(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path).at(HandoverState.ENGAGED, order(Order.LAND), after_s=2.0)
-    typed(rig, Cause.ORDERED, *TAKE_OFF, good=True)
+    typed(rig, Cause.LANDED_AS_ORDERED, *TAKE_OFF, good=True)
 
 
 @pytest.mark.slow
 def test_the_operator_ends_it(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path).at(HandoverState.ENGAGED, interrupt, after_s=2.0)
-    told = typed(rig, Cause.OPERATOR, *TAKE_OFF, good=True)
+    told = typed(rig, Cause.ENDED_BY_OPERATOR, *TAKE_OFF, good=True)
     assert "landed and disarmed" in told.ending["sentence"]
 
 
 @pytest.mark.slow
 def test_the_operator_hands_over_a_flight_that_the_pilot_began(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path, "fallback.land=false", airborne=True).at(HandoverState.ENGAGED, interrupt, after_s=3.0)
-    told = typed(rig, Cause.OPERATOR, good=True)
+    told = typed(rig, Cause.ENDED_BY_OPERATOR, good=True)
     assert "in mode OFFBOARD" in told.ending["sentence"]
 
 
 @pytest.mark.slow
 def test_its_time_is_over(tmp_path: Path, typed: Type) -> None:
-    typed(Endings(tmp_path), Cause.TIME, *TAKE_OFF, "--duration", "9", good=True)
+    typed(Endings(tmp_path), Cause.TIME_OVER, *TAKE_OFF, "--duration", "9", good=True)
 
 
 @pytest.mark.slow
@@ -136,7 +137,7 @@ def test_the_pilot_takes_over_and_lands(tmp_path: Path, typed: Type) -> None:
 def test_a_failsafe_that_ended_in_the_climb_is_told_with_what_came_after(tmp_path: Path, typed: Type) -> None:
     # The vehicle's own climb is longer than ours, so that its failsafe acts before the controller is in charge.
     rig = Endings(tmp_path, "sim.checks.invalid=[[0.2, 1.4]]", "sim.checks.clears=true")
-    told = typed(rig, Cause.TIME, *TAKE_OFF, "--duration", "15", good=True)
+    told = typed(rig, Cause.TIME_OVER, *TAKE_OFF, "--duration", "15", good=True)
     assert "had acted and ended" in told.ending["sentence"]
 
 
@@ -164,7 +165,7 @@ def test_the_operator_orders_the_landing_in_the_climb(tmp_path: Path, typed: Typ
 @pytest.mark.slow
 def test_arming_is_refused_in_the_vehicle_s_words(tmp_path: Path, typed: Type) -> None:
     poor = ("hand_over.ground_s=4.0", "sim.plant=quadrotor", "sim.quadrotor.charge=0.1")
-    told = typed(Endings(tmp_path, *poor), Cause.NOT_ARMED, *TAKE_OFF)
+    told = typed(Endings(tmp_path, *poor), Cause.ARMING_REFUSED, *TAKE_OFF)
     assert "low battery" in told.ending["sentence"] and "was not armed" in told.ending["sentence"]
 
 
@@ -172,7 +173,7 @@ def test_arming_is_refused_in_the_vehicle_s_words(tmp_path: Path, typed: Type) -
 def test_the_mode_to_take_off_in_is_refused(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path, "hand_over.ground_s=4.0")
     rig.hears = lambda data: not NO_COMMANDS(data)
-    told = typed(rig, Cause.NO_MODE, *TAKE_OFF)
+    told = typed(rig, Cause.MODE_REFUSED, *TAKE_OFF)
     assert "did not answer" in told.ending["sentence"]
 
 
@@ -180,13 +181,13 @@ def test_the_mode_to_take_off_in_is_refused(tmp_path: Path, typed: Type) -> None
 def test_the_take_off_is_refused(tmp_path: Path, typed: Type, monkeypatch: pytest.MonkeyPatch) -> None:
     rig = Endings(tmp_path, "sim.autopilot=ardupilot", "hand_over.climb_s=4.0")
     monkeypatch.setattr(rig.peers.autopilot.pilot, "take_off", lambda height_m, at_ns: FAILED)
-    told = typed(rig, Cause.NO_TAKE_OFF, *TAKE_OFF)
+    told = typed(rig, Cause.TAKE_OFF_REFUSED, *TAKE_OFF)
     assert "FAILED" in told.ending["sentence"]
 
 
 @pytest.mark.slow
 def test_the_climb_takes_too_long(tmp_path: Path, typed: Type) -> None:
-    told = typed(Endings(tmp_path, "hand_over.climb_s=1.0"), Cause.NO_CLIMB, *TAKE_OFF)
+    told = typed(Endings(tmp_path, "hand_over.climb_s=1.0"), Cause.CLIMB_TOO_LONG, *TAKE_OFF)
     assert "landed and disarmed" in told.ending["sentence"]
 
 
@@ -194,13 +195,13 @@ def test_the_climb_takes_too_long(tmp_path: Path, typed: Type) -> None:
 def test_the_mode_that_takes_setpoints_is_refused(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path, "hand_over.engage_s=3.0")
     rig.at(HandoverState.CLIMBING, deafen("SET_POSITION_TARGET_LOCAL_NED"))
-    told = typed(rig, Cause.NOT_GRANTED, *TAKE_OFF)
+    told = typed(rig, Cause.SETPOINTS_REFUSED, *TAKE_OFF)
     assert "landed and disarmed" in told.ending["sentence"]
 
 
 def test_no_positions_come(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path, "hand_over.ground_s=4.0", "link.blackout=[[0.0, 1000.0]]")
-    typed(rig, Cause.NO_POSITIONS, *TAKE_OFF)
+    typed(rig, Cause.POSITIONS_ABSENT, *TAKE_OFF)
 
 
 @pytest.mark.slow
@@ -216,13 +217,13 @@ def test_another_vehicle_is_heard(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path)
     for at_s in (0.3, 0.6, 1.2):
         rig.after(at_s, lambda one: one.lines["vehicle"].arrived.append((beat, one.now_ns)))
-    typed(rig, Cause.NOT_ALONE, *TAKE_OFF)
+    typed(rig, Cause.SECOND_VEHICLE, *TAKE_OFF)
 
 
 def test_the_vehicle_is_in_the_air_already(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path, airborne=True)
     rig.stick("POSCTL")
-    told = typed(rig, Cause.NOT_BEGUN, *TAKE_OFF)
+    told = typed(rig, Cause.TAKE_OFF_NOT_BEGUN, *TAKE_OFF)
     assert "armed already" in told.ending["sentence"]
 
 
@@ -242,7 +243,7 @@ def test_a_daemon_before_has_left_it_in_flight(tmp_path: Path, typed: Type, monk
 
     monkeypatch.setattr(rig, "fly", left)
     rig.after(12.0, interrupt)
-    told = typed(rig, Cause.LEFT)
+    told = typed(rig, Cause.LEFT_IN_FLIGHT)
     assert "in the air" in told.ending["sentence"]
 
 
@@ -258,7 +259,7 @@ def test_the_place_is_not_reached(tmp_path: Path, typed: Type) -> None:
 
 @pytest.mark.slow
 def test_the_fallback_lands_it(tmp_path: Path, typed: Type) -> None:
-    told = typed(Endings(tmp_path, "link.blackout=[[8.0, 100.0]]"), Cause.FALLBACK, *TAKE_OFF)
+    told = typed(Endings(tmp_path, "link.blackout=[[8.0, 100.0]]"), Cause.FALLBACK_LANDED, *TAKE_OFF)
     assert "age of information" in told.ending["sentence"] and "landed and disarmed" in told.ending["sentence"]
 
 
@@ -284,14 +285,14 @@ def test_landing_fails(tmp_path: Path, typed: Type) -> None:
 def test_a_landing_that_is_long_not_heard_of_is_asked_for_until_it_is(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path, "hand_over.land_s=8.0").at(HandoverState.ENGAGED, deafen("COMMAND_LONG"), after_s=2.0)
     rig.at(HandoverState.LANDING, hear, after_s=12.0)
-    told = typed(rig, Cause.TIME, *TAKE_OFF, "--duration", "9", good=True)
+    told = typed(rig, Cause.TIME_OVER, *TAKE_OFF, "--duration", "9", good=True)
     assert "landed and disarmed" in told.ending["sentence"] and "asked on" in told.console
 
 
 @pytest.mark.slow
 def test_positions_that_jump_in_the_climb_break_it_off(tmp_path: Path, typed: Type) -> None:
     swapped = ("sim.camera.swapped=[[1.6, 60.0]]", "sim.camera.other_body_m=[2.0, 1.5, -0.5]")
-    told = typed(Endings(tmp_path, *swapped), Cause.BROKEN_OFF, *TAKE_OFF)
+    told = typed(Endings(tmp_path, *swapped), Cause.CLIMB_ABORTED, *TAKE_OFF)
     assert "jumped" in told.ending["sentence"] and "landed and disarmed" in told.ending["sentence"]
 
 
@@ -308,7 +309,7 @@ def test_it_disarms_in_flight(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path).at(
         HandoverState.ENGAGED, lambda one: one.peers.autopilot.pilot._apply_disarming(), after_s=2.0
     )
-    typed(rig, Cause.DISARMED, *TAKE_OFF)
+    typed(rig, Cause.VEHICLE_DISARMED, *TAKE_OFF)
 
 
 @pytest.mark.slow
@@ -328,7 +329,7 @@ def test_a_failsafe_of_the_vehicle_s_own_lands_it(tmp_path: Path, typed: Type) -
 def test_a_failsafe_of_the_vehicle_s_own_hovers_and_does_not_end(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path, "hand_over.climb_s=8.0")
     rig.at(HandoverState.ENGAGED, deafen("SET_POSITION_TARGET_LOCAL_NED"), after_s=2.0)
-    told = typed(rig, Cause.FAILSAFE, *TAKE_OFF)
+    told = typed(rig, Cause.VEHICLE_FAILSAFE, *TAKE_OFF)
     assert "not ended in 8 s" in told.ending["sentence"] and "landed and disarmed" in told.ending["sentence"]
 
 
@@ -336,7 +337,7 @@ def test_a_failsafe_of_the_vehicle_s_own_hovers_and_does_not_end(tmp_path: Path,
 def test_a_failsafe_ends_a_flight_that_the_pilot_began(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path, airborne=True).at(HandoverState.ENGAGED, fail(Role.HOLD), after_s=2.0)
     rig.at(HandoverState.RELEASED, interrupt, after_s=2.0)
-    told = typed(rig, Cause.FAILSAFE)
+    told = typed(rig, Cause.VEHICLE_FAILSAFE)
     assert "in the air" in told.ending["sentence"]
 
 
@@ -353,7 +354,7 @@ def test_the_vehicle_starts_anew(tmp_path: Path, typed: Type) -> None:
         .at(HandoverState.ENGAGED, young, after_s=2.0)
         .at(HandoverState.RELEASED, interrupt, after_s=2.0)
     )
-    typed(rig, Cause.RESTARTED, *TAKE_OFF)
+    typed(rig, Cause.VEHICLE_RESTARTED, *TAKE_OFF)
 
 
 @pytest.mark.slow
@@ -368,7 +369,7 @@ def test_the_vehicle_falls_silent(tmp_path: Path, typed: Type, words: tuple[str,
     rig = Endings(tmp_path, "hand_over.land_s=6.0", "hand_over.climb_s=2.0", airborne=not words)
     rig.at(state, silence, after_s=0.0 if state is HandoverState.CLIMBING else 2.0)
     rig.at(HandoverState.ENGAGED, interrupt, after_s=12.0)
-    typed(rig, Cause.SILENT, *words)
+    typed(rig, Cause.VEHICLE_SILENT, *words)
 
 
 @pytest.mark.slow
@@ -376,7 +377,7 @@ def test_the_connection_is_closed(tmp_path: Path, typed: Type) -> None:
     def close(rig: Endings) -> None:
         rig.lines["vehicle"].closed = True
 
-    typed(Endings(tmp_path).at(HandoverState.ENGAGED, close, after_s=2.0), Cause.CONNECTION, *TAKE_OFF)
+    typed(Endings(tmp_path).at(HandoverState.ENGAGED, close, after_s=2.0), Cause.CONNECTION_CLOSED, *TAKE_OFF)
 
 
 @pytest.mark.fault(64)
@@ -389,7 +390,7 @@ def test_the_controller_fails_and_the_relay_goes_on(
 
     rig = Endings(tmp_path, "relay.enabled=true", "sim.plant=quadrotor")
     rig.at(HandoverState.ENGAGED, lambda _: monkeypatch.setattr(control, "run_tick", broken), after_s=2.0)
-    told = typed(rig, Cause.CONTROL, *TAKE_OFF)
+    told = typed(rig, Cause.CONTROL_FAILED, *TAKE_OFF)
     assert "the core is broken" in told.ending["sentence"] and "landed and disarmed" in told.ending["sentence"]
     assert "after the last setpoint" in told.ending["relay"] and told.ending["relay"] in told.console
     assert told.ending["relay"] in told.page
@@ -412,7 +413,8 @@ def test_the_operator_is_answered_while_the_relay_goes_on_alone(tmp_path: Path, 
     assert flying["relay"]["sent"] < alone["relay"]["sent"] < landing["relay"]["sent"]
     for one, mode in ((alone, "POSCTL"), (landing, "AUTO.LAND")):
         assert one["relay"]["alone"] and one["relay"]["sent_hz"] > 0.0 and one["relay"]["last_s"] < 3.0
-        assert one["ending"].lower().startswith(Cause.PILOT) and f"in the air, in mode {mode}" in one["ending"]
+        assert one["ending"].lower().startswith(CAUSES[Cause.PILOT].phrase)
+        assert f"in the air, in mode {mode}" in one["ending"]
         assert one["who_flies"] == HandoverState.RELEASED
     assert told.relay is not None and told.relay.alone
 
@@ -424,9 +426,10 @@ def test_the_operator_is_answered_with_the_end_that_is_under_way(tmp_path: Path,
         .at(HandoverState.ENGAGED, interrupt, after_s=2.0)
         .at(HandoverState.LANDING, Endings.ask_status, after_s=0.5)
     )
-    typed(rig, Cause.OPERATOR, *TAKE_OFF, good=True)
+    typed(rig, Cause.ENDED_BY_OPERATOR, *TAKE_OFF, good=True)
     (status,) = rig.statuses
-    assert status["ending"].lower().startswith(Cause.OPERATOR) and "in the air" in status["ending"]
+    assert status["ending"].lower().startswith(CAUSES[Cause.ENDED_BY_OPERATOR].phrase)
+    assert "in the air" in status["ending"]
     assert status["who_flies"] in (HandoverState.LANDING, HandoverState.SETTLING) and status["relay"] is None
 
 
@@ -441,7 +444,7 @@ def test_a_second_signal_ends_it_at_once(tmp_path: Path, capsys: pytest.CaptureF
     )
     told = flown(rig, capsys, *TAKE_OFF)
     (recorded,) = told.recorded
-    assert (recorded.cause, recorded.exit_code) == (Cause.SIGNALLED, 130)
+    assert (recorded.code, recorded.exit_code) == (Cause.SIGNALLED, 130)
     assert told.code == 130 and f"ended: {recorded.sentence}" in told.console and told.status == recorded.sentence
     assert "in the air" in recorded.sentence
     page = told.path.with_name("again.html")
@@ -461,7 +464,7 @@ def test_a_disk_that_takes_no_more_is_told_with_how_it_ended(
     rig = Endings(tmp_path).at(HandoverState.ENGAGED, fill, after_s=2.0)
     told = flown(rig, capsys, *TAKE_OFF, "--duration", "12")
     ending = told.ending
-    assert ending["cause"] == Cause.TIME and not ending["as_ordered"] and told.code == ending["exit_code"] == 1
+    assert ending["code"] == Cause.TIME_OVER and not ending["as_ordered"] and told.code == ending["exit_code"] == 1
     assert "the recording lacks" in ending["sentence"] and "No space left on device" in ending["sentence"]
     assert f"ended: {ending['sentence']}" in told.console and ending["sentence"] in told.page
     assert ending["sentence"].startswith(told.status.removesuffix("."))
@@ -477,8 +480,8 @@ def test_an_end_that_is_cut_off_is_told_everywhere(
     # The time of a hand-over is longer than that of any request to land, so it takes a shorter one to be cut off.
     monkeypatch.setattr(engagement, "LANDING_S", 1.0)
     rig = Endings(tmp_path, airborne=True).at(HandoverState.ENGAGED, deafen("COMMAND_LONG"))
-    told = typed(rig.at(HandoverState.ENGAGED, interrupt, after_s=3.0), Cause.CUT_OFF)
-    assert Cause.OPERATOR in told.ending["sentence"] and "in the air" in told.ending["sentence"]
+    told = typed(rig.at(HandoverState.ENGAGED, interrupt, after_s=3.0), Cause.ENDED_IN_AIR)
+    assert CAUSES[Cause.ENDED_BY_OPERATOR].phrase in told.ending["sentence"] and "in the air" in told.ending["sentence"]
 
 
 @pytest.mark.slow
@@ -489,7 +492,7 @@ def test_a_simulated_flight_that_is_still_flying_is_told_everywhere(
     code = run(arguments)
     out, err = capsys.readouterr()
     ending, path = json.loads(out)["ending"], tmp_path / "flight.mcap"
-    assert (code, ending["cause"], ending["exit_code"]) == (0, Cause.IN_FLIGHT, 0)
+    assert (code, ending["code"], ending["exit_code"]) == (0, Cause.IN_FLIGHT, 0)
     assert f"ended: {ending['sentence']}" in " ".join(err.split())
     assert ending["sentence"] in words_of(path.with_suffix(".html"))
     flight = FlightData.from_records(read(path))
@@ -506,29 +509,36 @@ def test_a_recording_that_does_not_say_for_what_it_waited_is_told_alike(
     flight = replace(FlightData.from_records(read(path), path), endings=())
     summary = summarise(flight, wall_s=None)
     report.write_report(flight, summary, tmp_path / "again.html")
-    assert (summary.ending.cause, summary.ending.as_ordered, summary.ending.exit_code) == (Cause.WAITING, False, 1)
-    assert summary.ended == Cause.WAITING
+    assert (summary.ending.code, summary.ending.as_ordered, summary.ending.exit_code) == (Cause.WAITING, False, 1)
+    assert summary.ended == CAUSES[Cause.WAITING].phrase
     assert summary.ending.sentence in words_of(tmp_path / "again.html")
 
 
 def test_an_end_that_was_cut_off_says_so() -> None:
-    course = FlightCourse(engaged=True, flown=True)
-    course.stop(Cause.OPERATOR)
-    assert course.ending(over=False).cause == Cause.CUT_OFF and course.ending(over=False).exit_code == 1
-    assert course.ending(over=True).cause == Cause.OPERATOR and course.ending(over=True).exit_code == 0
+    account = FlightAccount(was_engaged=True, was_controlled=True)
+    account.note_requested_end(Cause.ENDED_BY_OPERATOR)
+    for is_over, code, exit_code in ((False, Cause.ENDED_IN_AIR, 1), (True, Cause.ENDED_BY_OPERATOR, 0)):
+        ending = account.compute_ending(is_over=is_over)
+        assert (ending.code, ending.exit_code) == (code, exit_code)
 
 
 def test_the_table_of_the_documentation_has_every_cause_with_its_exit_code() -> None:
     page = (ROOT / "docs" / "operation.md").read_text(encoding="utf-8")
     table = page.partition("| the sentence begins with |")[2].partition("\n\n")[0]
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines() if "---" not in line]
-    for cause in set(Cause) - {Cause.WAITING, Cause.SIGNALLED}:
-        (code,) = [row[1] for row in rows if row[0].partition(" (")[0] == cause.value]
-        assert code == str(make_ending(cause, "").exit_code), cause
+    ends = {cause: text.phrase for cause, text in CAUSES.items() if text.phrase}
+    for cause in ends.keys() - {Cause.WAITING, Cause.SIGNALLED}:
+        (row,) = [row for row in rows if row[0].partition(" (")[0] == ends[cause]]
+        assert row[1:] == [f"`{cause}`", str(make_ending(cause, "").exit_code)], cause
 
 
 @pytest.mark.slow
 def test_the_lock_is_free_again(tmp_path: Path, typed: Type) -> None:
-    typed(Endings(tmp_path).at(HandoverState.ENGAGED, interrupt, after_s=1.0), Cause.OPERATOR, *TAKE_OFF, good=True)
+    typed(
+        Endings(tmp_path).at(HandoverState.ENGAGED, interrupt, after_s=1.0),
+        Cause.ENDED_BY_OPERATOR,
+        *TAKE_OFF,
+        good=True,
+    )
     with lock_vehicle("udpin://127.0.0.1:1") as tenure:
         assert not tenure.is_left_in_flight

@@ -17,10 +17,10 @@ from recording_fakes import Clock, Disk, Item, flight, own, record_flight, store
 
 from logs.recording.disk import DiskFile, OutputFile
 from logs.recording.info import read_info
+from logs.recording.notes import RecorderNote
 from logs.recording.reader import Damage, RecordedMessage, read, records, scan, segment_files
 from logs.recording.recorder import Recorder, SyncRecorder
 from logs.recording.recover import recover
-from logs.recording.topics import RecorderNote
 from sim.simulation import World
 from uavctl.build.controller import build_design
 from uavctl.config import load_config

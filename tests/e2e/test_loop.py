@@ -13,23 +13,13 @@ from sim_rig import decode
 from logs.recording.replay import replay
 from sim.simulation import Peers
 from uavctl.config import load_config
+from uavctl.event_codes import EventCode
 from uavctl.loop import MAX_SAMPLES
 from uavctl.mavlink.connection import MavlinkConnection
 from uavctl.mavlink.encoder import UnsendableError
 from uavctl.mavlink.handover import HandoverOutput, HandoverStateMachine
 from uavctl.mavlink.handover_guards import HandoverInput
-from uavctl.records import (
-    ORDER_ACCEPTED,
-    Command,
-    ControlMode,
-    Datagram,
-    Event,
-    Order,
-    Outgoing,
-    Setpoint,
-    SetpointSource,
-    StepInput,
-)
+from uavctl.records import Command, ControlMode, Datagram, Event, Order, Outgoing, Setpoint, SetpointSource, StepInput
 
 TICK_NS = 50_000_000
 OFFBOARD, HOLD_MODE, LAND_MODE = 6 << 16, (4 << 16) | (3 << 24), (4 << 16) | (6 << 24)
@@ -275,7 +265,7 @@ def test_an_order_that_no_hand_over_took_is_not_answered_with_what_the_tick_befo
     rig.run(40)
     assert rig.loop.order(hold)
     rig.run(1)
-    assert [(command, event.code) for command, event in rig.answers] == [(hold, ORDER_ACCEPTED)]
+    assert [(command, event.code) for command, event in rig.answers] == [(hold, EventCode.ORDER_ACCEPTED)]
 
     def faulty(hand_over: HandoverStateMachine, view: HandoverInput) -> HandoverOutput:
         raise LookupError("no such state")
@@ -298,7 +288,7 @@ def test_what_the_hand_over_answered_stands_if_its_request_cannot_be_sent(monkey
     monkeypatch.setattr(MavlinkConnection, "encode_setpoint", faulty)
     assert rig.loop.order(land)
     assert SETPOINT not in rig.run(1)
-    assert [(command, event.code) for command, event in rig.answers] == [(land, ORDER_ACCEPTED)]
+    assert [(command, event.code) for command, event in rig.answers] == [(land, EventCode.ORDER_ACCEPTED)]
     assert rig.notices == ["control"]
 
 
@@ -313,4 +303,4 @@ def test_what_fails_in_sending_is_no_failure_of_the_controller() -> None:
 
     with pytest.raises(OSError, match="no such device"):
         rig.loop.tick(rig.tick, rig.tick * TICK_NS, send)
-    assert not rig.loop.course.died
+    assert not rig.loop.account.control_error

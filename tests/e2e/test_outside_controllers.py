@@ -15,9 +15,9 @@ from soak_rig import Watch, fly
 
 from sim.simulation import World
 from uavctl.build.controller import Prepared, design_of, prepare
+from uavctl.cause import Cause
 from uavctl.cli.app import run
 from uavctl.config import Config, load_config
-from uavctl.outcome import Cause
 from uavctl.records import ControlMode, Ending
 
 MODULE = "outside_controllers"
@@ -77,7 +77,7 @@ def assert_let_go(seen: Seen, words: str) -> None:
     """It never left the room, was never fast, and the end says why."""
     assert seen.wrong == () and seen.outside_m <= 0.0 and seen.speed_mps <= SPEED_MPS
     assert seen.ending is not None and seen.ending.exit_code == 1 and not seen.ending.as_ordered
-    assert seen.ending.cause == Cause.FALLBACK and words in seen.ending.sentence
+    assert seen.ending.code == Cause.FALLBACK_LANDED and words in seen.ending.sentence
     assert ControlMode.BRAKE in seen.modes
 
 
@@ -152,6 +152,8 @@ def test_one_that_flies_at_a_wall_is_braked_while_it_can_be(
     assert seen.wrong == () and seen.outside_m <= 0.3 and seen.speed_mps <= SPEED_MPS
     # The envelope may have its say while it brakes.
     assert (
-        seen.ending is not None and seen.ending.cause in (Cause.FALLBACK, Cause.LET_GO) and seen.ending.exit_code == 1
+        seen.ending is not None
+        and seen.ending.code in (Cause.FALLBACK_LANDED, Cause.LET_GO)
+        and seen.ending.exit_code == 1
     )
     assert ControlMode.BRAKE in seen.modes and ControlMode.HOLD in seen.modes

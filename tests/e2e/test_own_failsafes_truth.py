@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from take_off_rig import RELAYED, SECOND, Flight
 
+from uavctl.cause import Cause
 from uavctl.mavlink.handover_states import HandoverState
-from uavctl.outcome import Cause
 from uavctl.records import Command, Order
 
 GOAL = "mission.waypoints=[[0.5,0.0,-2.4]]"
@@ -49,7 +49,7 @@ def test_the_vehicle_s_own_fence_ends_the_flight_on_the_ground(autopilot: str, m
     until_it_is_down(flight, 60.0)
     assert not flight.setpoints_between(taken_ns, flight.now_ns)
     ending = flight.loop.ending
-    assert ending.cause in (Cause.FENCE, Cause.FENCE_LANDED) and ending.exit_code == 1, ending
+    assert ending.code in (Cause.VEHICLE_FENCE, Cause.FENCE_LANDED) and ending.exit_code == 1, ending
     orders = flight.commands()[len([0 for at_ns, _ in flight.sent("COMMAND_LONG") if at_ns < taken_ns]) :]
     assert set(orders) <= {LAND}
 
@@ -74,7 +74,7 @@ def test_px4_s_blind_descent_is_a_failsafe_and_positions_go_on_as_soon_as_they_a
     back_ns = round((from_s + dark_s) * SECOND)
     poses = [at_ns for at_ns, _ in flight.sent("VISION_POSITION_ESTIMATE") if at_ns > back_ns]
     if descent[-1] > back_ns + SECOND:  # it is still in its failsafe then
-        assert flight.loop.ending.cause == Cause.FAILSAFE_LANDED
+        assert flight.loop.ending.code == Cause.FAILSAFE_LANDED
         assert poses[0] - back_ns < SECOND and len([one for one in poses if one < descent[-1]]) > 20
     else:
         assert dark_s > 10.0

@@ -15,11 +15,11 @@ from patience import LIMIT_S, until
 from transport_rig import FRAME, LIMIT_NS, Clock, port_of
 
 from uavctl.errors import ConnectionSpecError
+from uavctl.event_codes import EventCode
 from uavctl.io.base import Connection
 from uavctl.io.byte_stream import RETRY_NS
 from uavctl.io.transport import open_connection, wait
 from uavctl.io.udp import PEER_SILENCE_NS
-from uavctl.mavlink.connection import CONNECTION_SILENT, HUNG_UP
 
 
 @contextmanager
@@ -167,7 +167,7 @@ def test_tcp_carries_bytes_both_ways_and_counts_the_end() -> None:
             assert b"".join(arrived(connection, 12)) == FRAME * 4
             assert not connection.closed
         assert arrived(connection) == []
-        assert connection.refused == {HUNG_UP: 1} and not connection.closed
+        assert connection.refused == {EventCode.HUNG_UP: 1} and not connection.closed
         connection.send(FRAME)  # no error into the loop
         assert connection.send_errors == 1
         assert wait({"it": connection}, time.monotonic_ns()) == []
@@ -205,7 +205,7 @@ def test_tcp_calls_a_peer_again_that_has_hung_up_and_never_waits_for_it() -> Non
                 assert b"".join(arrived(connection, len(FRAME))) == FRAME
                 connection.send(FRAME)
                 assert peer.recv(4096) == FRAME  # nothing of what waited for the one before
-        assert connection.refused == {HUNG_UP: 1}
+        assert connection.refused == {EventCode.HUNG_UP: 1}
 
 
 def test_tcp_makes_a_connection_again_that_has_fallen_silent() -> None:
@@ -223,7 +223,7 @@ def test_tcp_makes_a_connection_again_that_has_fallen_silent() -> None:
                 clock[0] += PEER_SILENCE_NS
                 assert connection.receive() == [] and not connection.refused
                 clock[0] += 1
-                assert connection.receive() == [] and connection.refused == {CONNECTION_SILENT: 1}
+                assert connection.receive() == [] and connection.refused == {EventCode.CONNECTION_SILENT: 1}
                 peer.settimeout(LIMIT_S)
                 with pytest.raises(ConnectionResetError):  # an end that is still there knows at once
                     while peer.recv(100):
@@ -234,9 +234,9 @@ def test_tcp_makes_a_connection_again_that_has_fallen_silent() -> None:
                 peer, _ = server.accept()
                 with peer:
                     clock[0] += PEER_SILENCE_NS
-                    assert connection.receive() == [] and connection.refused == {CONNECTION_SILENT: again - 1}
+                    assert connection.receive() == [] and connection.refused == {EventCode.CONNECTION_SILENT: again - 1}
                     clock[0] += 1
-                    assert connection.receive() == [] and connection.refused == {CONNECTION_SILENT: again}
+                    assert connection.receive() == [] and connection.refused == {EventCode.CONNECTION_SILENT: again}
 
 
 def test_tcp_never_cuts_a_frame_when_the_peer_does_not_read() -> None:

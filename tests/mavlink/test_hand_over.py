@@ -7,10 +7,11 @@ from hand_over_rig import ACCEPTED, DENIED, ENGAGE, FLY, NEUTRAL, NOTHING, NOW, 
 from msgspec.structs import replace
 
 from uavctl.config.connections import HandOverConfig
+from uavctl.event_codes import EventCode
 from uavctl.mavlink.handover_guards import HEARTBEAT_TIMEOUT_NS
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.mavlink.requests import RequestKind
-from uavctl.records import ORDER_ACCEPTED, ORDER_REFUSED, Command, Order, Severity
+from uavctl.records import Command, Order, Severity
 
 
 @pytest.mark.parametrize("state", [s for s in HandoverState if s not in (HandoverState.DONE, HandoverState.FAILED)])
@@ -198,7 +199,7 @@ def test_px4_that_stops_below_the_height_is_flown_from_there_and_one_that_never_
 def test_take_off_is_ordered_once_and_on_the_ground(state: HandoverState) -> None:
     rig = Rig().to(state)
     told = rig.tick(commands=(TAKE_OFF,))
-    assert [event.code for event in told.events if event.code.startswith("order")] == [ORDER_REFUSED]
+    assert [event.code for event in told.events if event.code.startswith("order")] == [EventCode.ORDER_REFUSED]
     assert rig.is_in(state)
 
 
@@ -206,7 +207,7 @@ def test_an_order_before_the_vehicle_is_heard_waits_for_it() -> None:
     rig = Rig()
     vehicle, rig.vehicle = rig.vehicle, None
     told = rig.tick(commands=(TAKE_OFF,))
-    assert [event.code for event in told.events] == [ORDER_ACCEPTED]
+    assert [event.code for event in told.events] == [EventCode.ORDER_ACCEPTED]
     rig.run(5.0)
     assert rig.is_in(HandoverState.WAITING)
     rig.vehicle = vehicle
@@ -281,7 +282,7 @@ def test_engaging_again_takes_an_order_and_a_vehicle_in_the_air() -> None:
         RequestKind.EXTERNAL_MODE,
         NEUTRAL,
     )
-    assert [event.code for event in told.events if event.code.startswith("order")] == [ORDER_ACCEPTED]
+    assert [event.code for event in told.events if event.code.startswith("order")] == [EventCode.ORDER_ACCEPTED]
     rig.be(mode="OFFBOARD")
     assert rig.tick().setpoint_mode is FLY
 
@@ -309,7 +310,7 @@ def test_engaging_is_refused_with_the_reason(
     rig = Rig().to(state)
     rig.be(**fields)
     told = rig.tick(commands=(ENGAGE,), **view)
-    (refused,) = [event for event in told.events if event.code == ORDER_REFUSED]
+    (refused,) = [event for event in told.events if event.code == EventCode.ORDER_REFUSED]
     assert why in refused.text and refused.severity is Severity.WARNING
     assert rig.is_in(state)
 

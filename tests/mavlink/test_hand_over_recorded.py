@@ -11,6 +11,8 @@ from itertools import pairwise
 import pytest
 from mavlink_rig import packets, read
 
+from uavctl.account import FlightAccount
+from uavctl.cause import Cause
 from uavctl.config.connections import ClockConfig, DaemonConfig, FrameConfig, HandOverConfig, SourceConfig
 from uavctl.config.types import EstimatorConfig
 from uavctl.mavlink.connection import MavlinkConnection
@@ -20,7 +22,6 @@ from uavctl.mavlink.handover_states import HandoverState, SetpointMode
 from uavctl.mavlink.messages import CommandAck, StatusText
 from uavctl.mavlink.mode_reason import ModeReason
 from uavctl.mavlink.requests import RequestKind
-from uavctl.outcome import Cause, FlightCourse
 from uavctl.records import Command, Ending, Event, Order, PositionSample, VehicleStatus
 
 CLIENT, TICK_NS = 255, 50_000_000
@@ -58,7 +59,8 @@ def fly(
         source=SourceConfig(messages=("LOCAL_POSITION_NED",)),
         estimator=EstimatorConfig(position_std_m=0.005),
     )
-    hand_over, flown, course = HandoverStateMachine(config), Flown(), FlightCourse(takes_off=True, flown=True)
+    hand_over, flown = HandoverStateMachine(config), Flown()
+    account = FlightAccount(takes_off=True, was_controlled=True)
     vehicle: VehicleStatus | None = None
     where: PositionSample | None = None
     heard: list[CommandAck | StatusText] = []
@@ -89,9 +91,9 @@ def fly(
             )
             heard.clear()
             wanted.clear()
-            course.see(tick_ns, vehicle)
+            account.update_vehicle(tick_ns, vehicle)
             if told.transition is not None:
-                course.turn(told.transition, vehicle)
+                account.add_transition(told.transition, vehicle)
                 flown.who += [] if told.transition.mode_reason is None else [told.transition.mode_reason]
             if hand_over.state is not state:
                 state = hand_over.state
@@ -119,7 +121,7 @@ def fly(
                     heard.append(item)
                 case Event():
                     pass
-    flown.ending = course.ending(over=True)
+    flown.ending = account.compute_ending(is_over=True)
     return flown
 
 
@@ -250,7 +252,7 @@ def test_arducopter_s_own_fence_is_not_the_pilot() -> None:
     flown = fly("arducopter-fence.tlog", 1.2, {(4.0, 0.0, 0.0): "take off"}, HandOverConfig(), client=245)
     assert [state for state, _ in flown.states] == [R, M, A, C, G, E, HandoverState.FAILSAFE]
     assert flown.who[-1] is ModeReason.FENCE
-    assert flown.ending is not None and (flown.ending.cause, flown.ending.exit_code) == (Cause.FENCE, 1)
+    assert flown.ending is not None and (flown.ending.code, flown.ending.exit_code) == (Cause.VEHICLE_FENCE, 1)
     assert "Max Alt fence breached" in flown.ending.sentence
     assert RequestKind.LAND not in [ask for ask, _ in flown.asked]
 
@@ -266,7 +268,7 @@ def test_px4_s_descend_is_its_failsafe(asks: bool) -> None:
     assert flown.who == ([] if asks else [ModeReason.FAILSAFE])
     landings = [ask for ask, _ in flown.asked if ask is RequestKind.LAND]
     assert len(landings) > 1 if asks else not landings  # asked on; its failsafe has precedence
-    assert flown.ending is not None and (asks or flown.ending.cause == Cause.FAILSAFE)
+    assert flown.ending is not None and (asks or flown.ending.code == Cause.VEHICLE_FAILSAFE)
     assert asks or flown.ending.exit_code == 1
 
 
@@ -275,4 +277,4 @@ def test_arducopter_s_pilot_who_takes_loiter_is_the_pilot() -> None:
     flown = fly("arducopter-pilot.tlog", 1.2, {(4.0, 0.0, 0.0): "take off"}, HandOverConfig(), client=245)
     assert [state for state, _ in flown.states][:7] == [R, M, A, C, G, E, HandoverState.RELEASED]
     assert set(flown.who) == {ModeReason.PILOT} and RequestKind.LAND not in [ask for ask, _ in flown.asked]
-    assert flown.ending is not None and (flown.ending.cause, flown.ending.exit_code) == (Cause.PILOT, 0)
+    assert flown.ending is not None and (flown.ending.code, flown.ending.exit_code) == (Cause.PILOT, 0)

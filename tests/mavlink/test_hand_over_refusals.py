@@ -21,11 +21,12 @@ from hand_over_rig import (
 )
 
 from uavctl.config.connections import HandOverConfig
+from uavctl.event_codes import EventCode
 from uavctl.mavlink.handover_guards import GRACE_NS
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.mavlink.messages import StatusText
 from uavctl.mavlink.requests import RequestKind
-from uavctl.records import ORDER_REFUSED, Command, Order
+from uavctl.records import Command, Order
 
 # Refusals
 
@@ -273,5 +274,5 @@ def test_silence_on_the_way_changes_nothing_until_time_is_up(state: HandoverStat
 def test_a_climb_to_nowhere_is_refused(height_m: float | None) -> None:
     rig = Rig().to(HandoverState.READY)
     told = rig.tick(commands=(Command(order=Order.TAKE_OFF, height_m=height_m),))
-    assert [event.code for event in told.events] == [ORDER_REFUSED] and rig.hand_over.height_m == 0.0
+    assert [event.code for event in told.events] == [EventCode.ORDER_REFUSED] and rig.hand_over.height_m == 0.0
     assert rig.is_in(HandoverState.READY) and not rig.hand_over.is_ordered_flight

@@ -11,11 +11,12 @@ from msgspec.structs import replace
 from logs.recording.replay import replay
 from sim.simulation import Peers
 from uavctl.config import load_config
+from uavctl.event_codes import EventCode
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.handover_guards import BOOT_TIME_WAIT_NS
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.mavlink.requests import RequestKind
-from uavctl.records import ORDER_ACCEPTED, ORDER_REFUSED, Command, ControlMode, Decision, Order, Setpoint
+from uavctl.records import Command, ControlMode, Decision, Order, Setpoint
 
 TICK_NS = 50_000_000
 
@@ -25,7 +26,7 @@ def restarted(autopilot: str = "px4", **fields: object) -> Rig:
     rig = Rig(autopilot)
     vehicle, rig.vehicle = rig.vehicle, None
     told = rig.tick(commands=(STAND_BY,))
-    assert [event.code for event in told.events] == [ORDER_ACCEPTED] and rig.is_in(HandoverState.WAITING)
+    assert [event.code for event in told.events] == [EventCode.ORDER_ACCEPTED] and rig.is_in(HandoverState.WAITING)
     rig.vehicle = vehicle
     rig.be(**fields)
     return rig
@@ -72,7 +73,7 @@ def test_an_ordered_take_off_does_not_follow_a_flight_that_was_left() -> None:
 def test_once_the_vehicle_is_heard_it_is_too_late_to_stand_by() -> None:
     rig = Rig().to(HandoverState.READY)
     told = rig.tick(commands=(STAND_BY,))
-    assert [event.code for event in told.events] == [ORDER_REFUSED]
+    assert [event.code for event in told.events] == [EventCode.ORDER_REFUSED]
     rig.be(armed=True, landed=False, mode="OFFBOARD")
     assert rig.tick().setpoint_mode is FLY
 

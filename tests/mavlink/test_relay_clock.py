@@ -15,7 +15,7 @@ from sim_rig import Client
 
 from sim.autopilot.autopilot import UPTIME_NS
 from uavctl.config.checks import get_position_limits_m
-from uavctl.mavlink.relay import RELAY_RESUMED, RELAY_SILENT
+from uavctl.event_codes import EventCode
 from uavctl.records import Event, RelayStats, StepInput
 
 TIMESYNC = mavlink.MAVLINK_MSG_ID_TIMESYNC
@@ -78,7 +78,7 @@ def assert_they_flow(rig: Indoors, from_s: float, off_s: float) -> None:
     times = [at_ns for at_ns, _ in sent]
     assert len(sent) > 15 * (rig.peers.now_ns / SECOND - from_s)
     assert max(b - a for a, b in pairwise(times)) < 500 * MS
-    assert RELAY_SILENT not in {event.code for event in rig.memory.of(Event)}
+    assert EventCode.RELAY_SILENT not in {event.code for event in rig.memory.of(Event)}
     captured = {one.position_m: one.captured_ns for inp in rig.memory.of(StepInput) for one in inp.samples}
     places = sorted(captured)
     rate = 1.0 + rig.config.sim.clock_drift_ppm * 1e-6
@@ -136,8 +136,8 @@ def test_a_relay_that_is_silent_is_reported_once_with_its_reason_and_its_end(nam
     rig = ready(name, both_ways(0.0, 0.0), "link.blackout=[[18.0, 20.5], [22.0, 22.4]]")
     rig.pilot_flies(EXTERNAL[name])
     rig.run(8.0)
-    told = [event for event in rig.memory.of(Event) if event.code in (RELAY_SILENT, RELAY_RESUMED)]
-    assert [event.code for event in told] == [RELAY_SILENT, RELAY_RESUMED]
+    told = [event for event in rig.memory.of(Event) if event.code in (EventCode.RELAY_SILENT, EventCode.RELAY_RESUMED)]
+    assert [event.code for event in told] == [EventCode.RELAY_SILENT, EventCode.RELAY_RESUMED]
     assert [event.at_ns / SECOND for event in told] == pytest.approx([18.55, 20.55], abs=0.15)
     silent = {stats.silent_for for stats in rig.memory.of(RelayStats)}
     assert silent == {"", "nothing comes"}

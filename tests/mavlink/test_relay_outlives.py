@@ -8,6 +8,7 @@ import pytest
 from take_off_rig import RELAYED, Flight
 
 from uavctl import loop as control
+from uavctl.cause import Cause
 from uavctl.flight.controller import Controller
 from uavctl.flight.state import ControlState
 from uavctl.flight.tick import TickOutput
@@ -15,7 +16,6 @@ from uavctl.flight.tick import tick as run_tick
 from uavctl.mavlink.handover import HandoverOutput, HandoverStateMachine
 from uavctl.mavlink.handover_guards import LAND_PERIODS, HandoverInput
 from uavctl.mavlink.handover_states import HandoverState
-from uavctl.outcome import Cause
 from uavctl.records import Event, RelayStats, StepInput
 
 BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
@@ -79,7 +79,7 @@ def test_a_core_that_fails_lands_the_vehicle_and_leaves_it_its_positions_until_t
     told = [event.text for event in flight.notices if event.code == "control"]
     assert len(told) == 1 and "the core is broken" in told[0]
     ending = flight.loop.ending
-    assert ending.cause == Cause.CONTROL and ending.exit_code == 1 and "the core is broken" in ending.sentence
+    assert ending.code == Cause.CONTROL_FAILED and ending.exit_code == 1 and "the core is broken" in ending.sentence
     assert "landed and disarmed" in ending.sentence
     stats = flight.memory.of(RelayStats)[-1]
     assert stats.alone and stats.sent > 50
@@ -146,7 +146,7 @@ def test_positions_go_on_for_a_vehicle_that_does_not_land() -> None:
     flight.run(LAND_PERIODS * LAND_S + 15.0, stop=True)
     assert flight.is_in(HandoverState.FAILED) and flight.loop.is_relay_needed and not flight.loop.finished
     assert poses_after(flight, flight.now_ns - SECOND)
-    assert flight.loop.ending.cause == Cause.LANDING_FAILED
+    assert flight.loop.ending.code == Cause.LANDING_FAILED
 
 
 @pytest.mark.slow

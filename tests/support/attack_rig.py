@@ -27,8 +27,8 @@ from places import without_pages
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from signing_rig import EPOCH_S, KEY, SECOND, SignedPeer
 
+from logs.recording.notes import RecorderNote
 from logs.recording.reader import read
-from logs.recording.topics import RecorderNote
 from uavctl.records import ControlMode, Decision, Refused
 
 POSITION_CONTROL = 3 << 16

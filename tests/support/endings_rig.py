@@ -29,6 +29,7 @@ from logs.recording.summary import summarise
 from logs.report import flight_page as report
 from sim.autopilot.profile import SIMULATED
 from sim.simulation import Peers
+from uavctl.cause import Cause
 from uavctl.cli import fly as fly_cmd
 from uavctl.cli import tune as tune_flight
 from uavctl.cli.app import run
@@ -42,7 +43,6 @@ from uavctl.daemon.notifier import Notifier
 from uavctl.io.base import Connection
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.handover_states import HandoverState
-from uavctl.outcome import Cause
 from uavctl.records import Ending, RelayStats
 
 SECOND = 1_000_000_000
@@ -249,7 +249,7 @@ class Told:
         """All places have the one sentence, and the exit code goes with it."""
         sentence = self.ending["sentence"]
         assert f"ended: {sentence}" in self.console
-        if self.ending["cause"] != Cause.CUT_OFF:  # then nobody can ask any more when it is known
+        if self.ending["code"] != Cause.ENDED_IN_AIR:  # then nobody can ask any more when it is known
             assert self.status == sentence, (self.status, sentence)
         assert self.notified[-1] == f"ended: {sentence}"
         self._agrees_on_the_relay()

@@ -101,9 +101,9 @@ class Watch:
         decision = self.ticked.decision
         self.modes[decision.mode.value] = self.modes.get(decision.mode.value, 0) + 1
         self._judge(decision)
-        if self.loop.course.died and not self._failed:
-            self.wrong.append(f"at {at_ns * 1e-9:.2f} s: the controller has failed: {self.loop.course.died}")
-        self._failed = bool(self.loop.course.died)
+        if self.loop.account.control_error and not self._failed:
+            self.wrong.append(f"at {at_ns * 1e-9:.2f} s: the controller has failed: {self.loop.account.control_error}")
+        self._failed = bool(self.loop.account.control_error)
         self.after_tick(at_ns)
 
     def _judge(self, decision: Decision) -> None:

@@ -118,11 +118,11 @@ def fly_take_off(autopilot: str, seed: int) -> TakeOff:
         wrong.append(f"it was in the air and not flown at {seconds:.0f} s; then: {what}")
     if what == "hovers":
         wrong.append(f"nobody has it in the air ({flight.state})")
-    if what != "engaged" and not (told and flight.loop.course.told):
+    if what != "engaged" and not (told and flight.loop.account.end_sentence):
         wrong.append("nobody was told why")
     if flight.state not in ATTENDED and flight.peers.autopilot.pilot.is_armed:
         wrong.append(f"it was left armed ({flight.state})")
-    reached = flight.loop.course.engaged
+    reached = flight.loop.account.was_engaged
     return TakeOff(autopilot, seed, what, reached, round(seconds, 1), told, flight.loop.ending.sentence, tuple(wrong))
 
 

@@ -206,7 +206,7 @@ def fly(
         try:
             flight.fly(lambda _: True, follower=engagement, landing_s=landing_s)
         except Exception as error:
-            flight.loop.course.died = in_words(error)
+            flight.loop.account.control_error = in_words(error)
             raise
         finally:
             status = flight.close()

@@ -10,8 +10,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from uavctl.check.check_data import CheckData
 from uavctl.check.findings import Item, ItemState, judge_item, make_item
 from uavctl.config.types import Config
+from uavctl.event_codes import EventCode
 from uavctl.flight.monitors.observation import MOTION_NS
-from uavctl.mavlink.vehicle import SECOND_VEHICLE
 
 _MAX_SILENCE_S = 3.0
 _NAMES = {3: "ArduPilot", 12: "PX4"}
@@ -53,7 +53,7 @@ def _check_identity(data: CheckData, at_ns: int, want: str) -> Item:
 
 
 def _check_other_vehicles(data: CheckData) -> Item:
-    count = sum(stats.bad.get(SECOND_VEHICLE, 0) for stats in data.stats.values())
+    count = sum(stats.bad.get(EventCode.SECOND_VEHICLE, 0) for stats in data.stats.values())
     return judge_item(
         "other vehicles",
         is_good=count == 0,

@@ -26,7 +26,7 @@ from uavctl.config.document import MAX_DURATION_S, MAX_SEED
 from uavctl.errors import ConfigError, DesignError
 
 if TYPE_CHECKING:
-    from logs.report.causes import Headline
+    from logs.report.findings import Headline
 
 # What all commands share: --config, --set and --json, where output goes, and how a bad design is told.
 # A string is never markup: paths, units and what vehicles say have brackets. Styles are those of `rich.text.Text`.

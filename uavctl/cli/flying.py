@@ -30,6 +30,7 @@ from logs.recording.views import ViewBuilder
 from uavctl.cli.common import FREE_PORT, labelled, messages
 from uavctl.daemon.engagement import make_goto_keys
 from uavctl.errors import ConnectionClosedError, EndedBySignal, RecordingError, UavctlError, UsageError, in_words
+from uavctl.event_codes import EventCode
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.records import Command, ControlMode, Ending, Event, Order, Record, Severity, Ticked
@@ -98,7 +99,6 @@ def tell_ending(ending: Ending) -> None:
 
 AGAIN_NS = 30_000_000_000  # until the same is said again, if it goes on
 MOST = 256  # different texts that are remembered
-VEHICLE_TEXT = "vehicle-text"
 
 _WAITS_FOR = {
     HandoverState.WAITING: "the vehicle's heartbeat",
@@ -125,7 +125,7 @@ class Said:
 
     def line(self, event: Event, state: HandoverState) -> str | None:
         """Return the line to print for an event now; None for nothing."""
-        if event.code == VEHICLE_TEXT and event.severity is Severity.INFO:
+        if event.code == EventCode.VEHICLE_TEXT and event.severity is Severity.INFO:
             return None
         said_ns = self._said_ns.get(event.text)
         if said_ns is not None and event.at_ns - said_ns < AGAIN_NS:
@@ -134,7 +134,7 @@ class Said:
             del self._said_ns[min(self._said_ns, key=lambda text: self._said_ns[text])]
         self._said_ns[event.text] = event.at_ns
         waiting = waits_for(state)
-        text = f'the vehicle says: "{event.text}"' if event.code == VEHICLE_TEXT else event.text
+        text = f'the vehicle says: "{event.text}"' if event.code == EventCode.VEHICLE_TEXT else event.text
         return f"{text} (waiting for {waiting})" if waiting else text
 
 
@@ -280,10 +280,10 @@ def ending_noted(loop: ControlLoop) -> Iterator[None]:
     except ConnectionClosedError:
         pass
     except SystemExit as ended:
-        loop.course.kill(int(ended.code or 0) - SIGNALLED)
+        loop.account.note_signal(int(ended.code or 0) - SIGNALLED)
         raise
     except Exception as error:
-        loop.course.died = in_words(error)
+        loop.account.control_error = in_words(error)
         raise
 
 

@@ -28,7 +28,7 @@ from logs.recording.recover import recover as restore
 from logs.recording.summary import count
 from logs.recording.tlog import ExportedTlog, export_tlog
 from logs.recording.ulog import is_ulog
-from logs.report.causes import Headline
+from logs.report.findings import Headline
 from uavctl.cli.common import Common, Flight, Json, System, bars, columns, counted, first_line, two_columns, warn
 from uavctl.cli.usage import example
 from uavctl.errors import UsageError

@@ -18,7 +18,6 @@ from logs.recording.mavlink_flight import MavlinkFlight, facts_of
 from logs.recording.reader import lacks_end, read
 from logs.recording.summary import make_summary_table, make_value_table, summarise
 from logs.recording.ulog import is_ulog
-from logs.report.causes import Headline
 from logs.report.compare import ComparedFlight, FlightComparison, compare_flights, load_flights
 from logs.report.compare_page import write_comparison_page
 from logs.report.compare_text import (
@@ -30,6 +29,7 @@ from logs.report.compare_text import (
     format_value,
 )
 from logs.report.figures import draw_overview
+from logs.report.findings import Headline
 from logs.report.flight_page import write_report
 from logs.report.headline import derive_headline
 from logs.report.tlog_headline import derive_tlog_headline

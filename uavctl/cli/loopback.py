@@ -160,7 +160,7 @@ def _real_time(prepared: Prepared, path: Path, engagement: Engagement, looking: 
         recorder = Recorder(path, config.log, onlookers=looking)
         loop = ControlLoop(config, prepared.controller, recorder, time.perf_counter_ns)
         engagement.begin(loop)
-        loop.course.in_flight = not takes_off
+        loop.account.ends_in_flight = not takes_off
         wall_s = 0.0
         try:
             put_header(recorder, prepared, monotonic_ns(), read_zero_utc_ns())

@@ -14,13 +14,13 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 
 from logs.recording.foreign import read_foreign_packets
+from logs.recording.notes import RecorderNote
 from logs.recording.reader import good_messages, header, lacks_end, last_note, records
 from logs.recording.replay import LAST_BITS, MAKERS, Chosen, Context, FieldDivergence, ReplayDifference, ReplayResult
 from logs.recording.replay import replay as replay_recording
 from logs.recording.senders import choose_vehicle
 from logs.recording.summary import count
 from logs.recording.tlog import ForeignReplay, TlogPacket, replay_tlog
-from logs.recording.topics import HOLES, RECOVERED, RecorderNote
 from uavctl.arithmetic import ARITHMETIC, OWN, without_choice
 from uavctl.build.controller import ARITHMETIC_NAME, CONTROLLER, Prepared, cpu, design_of, prepare, versions
 from uavctl.build.outside import KEY
@@ -127,7 +127,7 @@ def replay_flight(flight: Path, tolerance: float = 0.0, overrides: Sequence[str]
         )
     else:
         controller, changed = recorded_flyer(flight, config).controller, ()
-    holes = note.text if note is not None and note.text.startswith(RECOVERED) and HOLES in note.text else ""
+    holes = note.text if note is not None and note.lacks_records else ""
     # Before it had a name of its own, scheme `age-conditioned` flew under that of a design that decided nothing.
     ignored = MAKERS if overrides or (config.is_age_conditioned and "scheme" not in recorded.design) else frozenset()
     if tolerance:

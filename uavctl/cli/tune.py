@@ -22,6 +22,7 @@ from logs.recording.flight import FlightData
 from logs.recording.reader import header, lacks_end, read
 from logs.recording.summary import FlightSummary, summarise
 from uavctl.build.controller import design_of
+from uavctl.cause import Cause
 from uavctl.cli.common import (
     SEED,
     Common,
@@ -87,7 +88,6 @@ from uavctl.lab.tune.run_folder import (
 )
 from uavctl.loop import make_links
 from uavctl.mavlink.connection import MavlinkConnection
-from uavctl.outcome import Cause
 from uavctl.records import PositionSample, Vec3, VehicleStatus
 from uavctl.smpc.plant import AXES
 
@@ -164,14 +164,14 @@ def left_whole(config: Config, out: Path) -> Path | None:
 
 
 def _end(config: Config, summary: FlightSummary, recording: Path) -> TuneEnd:
-    cause = summary.ending.cause
+    cause = summary.ending.code
     if cause in (Cause.PILOT, Cause.PILOT_LANDED):
         return TuneEnd.PILOT
     if summary.ending.as_ordered and _whole(config, FlightData.from_records(read(recording), recording)):
         return TuneEnd.WHOLE
     # A simulated flight ends in the air as ordered, also where Ctrl-C ended it before its time.
     cut = cause == Cause.IN_FLIGHT and summary.duration_s < config.duration_s - _ROUNDING_S
-    return TuneEnd.OPERATOR if cut or cause == Cause.OPERATOR else TuneEnd.FAILED
+    return TuneEnd.OPERATOR if cut or cause == Cause.ENDED_BY_OPERATOR else TuneEnd.FAILED
 
 
 def _whole(config: Config, flight: FlightData) -> bool:
@@ -574,8 +574,9 @@ def _stopped(flown: TuneFlown) -> tuple[int, str]:
     code = codes[flown.end]
     if flown.ended and flown.end is TuneEnd.FAILED:
         return code, f"{flown.ended} ({flown.recording})"
-    told = flown.end is not TuneEnd.OPERATOR or "operator" in sentence
-    who = "" if told else "Ended by the operator. "
+    # A simulated flight that Ctrl-C ended is "still flying".
+    is_cut = flown.end is TuneEnd.OPERATOR and flown.summary.ending.code == Cause.IN_FLIGHT
+    who = "Ended by the operator. " if is_cut else ""
     return code, "" if not code else f"{who}{sentence}. The flight did not come to its end ({flown.recording})"
 
 

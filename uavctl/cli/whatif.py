@@ -21,10 +21,11 @@ from logs.recording.ends import create_recording, put_header
 from logs.recording.export import count_messages
 from logs.recording.flight import FlightData
 from logs.recording.foreign import is_foreign
+from logs.recording.notes import RecorderNote
 from logs.recording.reader import header, lacks_end, read
 from logs.recording.recorder import DerivedTopics, RecorderStatus, SyncRecorder
 from logs.recording.summary import count, summarise
-from logs.recording.topics import HEADER, RecorderNote
+from logs.recording.topics import HEADER
 from logs.recording.views import ViewBuilder
 from uavctl.build.controller import Prepared, build_problem, design_of, prepare
 from uavctl.cli.common import SEED, Common, Flight, Json, bars, columns, located, warn

@@ -26,7 +26,8 @@ from uavctl.config.checks import find_outside
 from uavctl.daemon.health import Health
 from uavctl.daemon.runtime_folder import find_runtime_folders
 from uavctl.errors import UsageError, VehicleTakenError
-from uavctl.records import ORDER_ACCEPTED, Command, Event, Order, Ticked, Vec3
+from uavctl.event_codes import EventCode
+from uavctl.records import Command, Event, Order, Ticked, Vec3
 
 FOLDER_VARIABLE = "UAVCTL_CONTROL"
 SUFFIX = ".sock"
@@ -161,7 +162,7 @@ class ControlServer:
                 self._reply(client, Reply(ok=False, text="the flight gave no answer to this"))
             else:
                 answers.remove(answer)
-                self._reply(client, Reply(ok=answer[1].code == ORDER_ACCEPTED, text=answer[1].text))
+                self._reply(client, Reply(ok=answer[1].code == EventCode.ORDER_ACCEPTED, text=answer[1].text))
 
     def _accept(self, now_ns: int) -> None:
         while len(self._clients) < MAX_CLIENTS:

@@ -9,13 +9,14 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from uavctl.arrays import SECOND_NS
+from uavctl.cause import Cause
 from uavctl.clock import Ticker, monotonic_ns
 from uavctl.errors import ConnectionClosedError
+from uavctl.event_codes import EventCode
 from uavctl.io.base import Connection
 from uavctl.io.transport import wait
 from uavctl.loop import VEHICLE, ControlLoop
-from uavctl.mavlink.connection import HUNG_UP, OVERRUN
-from uavctl.outcome import Cause
+from uavctl.mavlink.connection import OVERRUN
 from uavctl.records import Event, Outgoing, Ticked
 
 READ_PAUSE_NS = 2_000_000  # after a read without data for the flight
@@ -83,7 +84,9 @@ def fly(
                 if not has_received:  # a flood: read several datagrams at once
                     wait_for({}, min(due.at_ns, now() + READ_PAUSE_NS))
             if connections[VEHICLE].closed:
-                loop.course.close(f"{connections[VEHICLE].url}; nothing can be sent, and its own failsafe has it")
+                loop.account.note_closed_connection(
+                    f"{connections[VEHICLE].url}; nothing can be sent, and its own failsafe has it"
+                )
                 raise ConnectionClosedError(
                     f"{connections[VEHICLE].url}: closed by the other side, so nothing can be sent; "
                     "the vehicle's own failsafe has it. See to the link and start again"
@@ -95,7 +98,7 @@ def fly(
             is_time_over = duration_s is not None and due.at_ns - first_ns >= duration_s * 1e9
             if stop_ns is None and (is_time_over or stop_requested()):
                 stop_ns = due.at_ns
-                loop.course.stop(Cause.TIME if is_time_over else Cause.OPERATOR)
+                loop.account.note_requested_end(Cause.TIME_OVER if is_time_over else Cause.ENDED_BY_OPERATOR)
             is_overdue = stop_ns is not None and due.at_ns - stop_ns >= stop_limit_s * 1e9
             if is_overdue and not (stop_limit_s and loop.is_relay_needed):
                 break
@@ -193,7 +196,7 @@ class _RefusalReporter:
     def report(self, at_ns: int, *, is_last: bool = False) -> None:
         """Report new counts if a second has passed, a peer has hung up, or this is the last call."""
         hung_up = any(
-            connection.refused[HUNG_UP] > self._reported[name][HUNG_UP]
+            connection.refused[EventCode.HUNG_UP] > self._reported[name][EventCode.HUNG_UP]
             for name, connection in self._connections.items()
         )
         if at_ns < self._next_ns and not hung_up and not is_last:

@@ -70,14 +70,14 @@ class Engagement:
 
     def begin(self, loop: ControlLoop) -> None:
         """Note the order in the course of the flight, before the first tick."""
-        loop.course.takes_off = self.takes_off
-        loop.course.goal = "" if self.goal is None else f"--goto {','.join(f'{x:g}' for x in self.goal)}"
+        loop.account.takes_off = self.takes_off
+        loop.account.goal = "" if self.goal is None else f"--goto {','.join(f'{x:g}' for x in self.goal)}"
 
     def follow(self, loop: ControlLoop, ticked: Ticked) -> None:
         """Update after a tick; after the first one, order the take-off."""
         self.has_engaged = self.has_engaged or loop.handover_state is HandoverState.ENGAGED
         self._check_arrival(loop, ticked)
-        loop.course.arrived = self.has_arrived
+        loop.account.has_arrived = self.has_arrived
         if self._take_off_m is not None and not self._is_take_off_ordered:
             self._is_take_off_ordered = loop.order(Command(order=Order.TAKE_OFF, height_m=self._take_off_m))
         if self._follower is not None:

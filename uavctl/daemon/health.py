@@ -8,10 +8,10 @@ from typing import Protocol
 
 import msgspec
 
+from uavctl.account import FlightAccount
 from uavctl.config import Config
 from uavctl.config.checks import get_position_index
 from uavctl.mavlink.handover_states import HandoverState
-from uavctl.outcome import FlightCourse
 from uavctl.records import ControlMode, RelayStats, Ticked, Vector, VehicleStatus
 
 PERIOD_NS = 1_000_000_000
@@ -82,7 +82,7 @@ class Health(msgspec.Struct, frozen=True, kw_only=True):
 class MonitoredFlight(Protocol):
     """Control loop for the health monitor."""
 
-    course: FlightCourse
+    account: FlightAccount
 
     @property
     def handover_state(self) -> HandoverState:
@@ -215,7 +215,7 @@ class HealthMonitor:
             vehicle=None if vehicle is None else _make_vehicle_health(vehicle, self._now_ns),
             recorder=recorder,
             who_flies=flight.handover_state.value,
-            ending=flight.course.told,
+            ending=flight.account.end_sentence,
             relay=self._make_relay_health(),
             let_go=flight.let_go,
             inertial=self._inertial_share,

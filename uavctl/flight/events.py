@@ -13,9 +13,10 @@ from collections.abc import Iterable, Sequence
 import msgspec
 import numpy as np
 
+from uavctl.event_codes import MISSION
 from uavctl.flight.context import TickContext
 from uavctl.flight.decide import Decided
-from uavctl.flight.fallback import FallbackEnd
+from uavctl.flight.fallback import Fallback, FallbackEnd
 from uavctl.flight.link_estimate import LinkBelief, count_step, estimate_link
 from uavctl.flight.measure import Measured
 from uavctl.flight.monitors.acceleration import describe_push
@@ -86,7 +87,7 @@ def report_events(
         *ordered.answers,
         *_report_faults(state, context, measured, supervised, decided),
         *_report_samples(context, measured),
-        *_report_decision(context, decided),
+        *_report_decision(context, ordered, decided),
         *_report_link(link_alarms, before.link_alarms, link),
         *_report_inertial(before.inertial, inertial, at_ns),
     )
@@ -97,8 +98,8 @@ def report_events(
     return Reported(events, AlarmGroup(belief, link_alarms, inertial, inputs_at_bound), link)
 
 
-def _make_event(at_ns: int, severity: Severity, code: str, text: str, count: int = 1) -> Event:
-    return Event(at_ns=at_ns, severity=severity, code=code, text=text, count=count)
+def _make_event(at_ns: int, severity: Severity, code: str, text: str, count: int = 1, subject: str = "") -> Event:
+    return Event(at_ns=at_ns, severity=severity, code=code, text=text, count=count, subject=subject)
 
 
 def _report_faults(
@@ -126,19 +127,25 @@ def _report_samples(context: TickContext, measured: Measured) -> Iterable[Event]
         yield _make_event(at_ns, Severity.WARNING, "missed-ticks", text, context.inputs.missed_ticks)
 
 
-def _report_decision(context: TickContext, decided: Decided) -> Iterable[Event]:
-    """Report trouble of the solver, limits that gave way, and a change of mode."""
+def _report_decision(context: TickContext, ordered: Ordered, decided: Decided) -> Iterable[Event]:
+    """Report trouble of the solver, limits that gave way, a change of mode, and the end of the mission."""
     at_ns, plan, mode = context.at_ns, decided.new_plan, decided.mode
     if decided.solve is not None and decided.trouble:
         yield _make_event(at_ns, Severity.WARNING, f"solve-{decided.solve.value}", decided.trouble)
     if plan is not None and plan.gave_way:
         text = tell_all(context.controller.names, plan.gave_way)
         yield _make_event(at_ns, Severity.WARNING, "gave-way", text)
-    if mode is not context.mode:
+    is_mission_over = _lands(decided.fallback) and not _lands(ordered.fallback)
+    if mode is not context.mode or is_mission_over:
         severity, code = _ENTERED[mode]
         if decided.fallback is not None and decided.fallback.end >= FallbackEnd.STOP:
             severity = Severity.INFO  # somebody wanted it
-        yield _make_event(at_ns, severity, code, decided.reason)
+        subject = MISSION if is_mission_over else ""
+        yield _make_event(at_ns, severity, code, decided.reason, subject=subject)
+
+
+def _lands(fallback: Fallback | None) -> bool:
+    return fallback is not None and fallback.end is FallbackEnd.LAND
 
 
 def _count_link(

@@ -12,11 +12,12 @@ import math
 import msgspec
 from msgspec.structs import replace
 
+from uavctl.event_codes import EventCode
 from uavctl.flight.context import TickContext
 from uavctl.flight.fallback import Fallback, FallbackEnd, request_end
 from uavctl.flight.mission import Mission, MissionState, Room, resume, stay_at
 from uavctl.flight.state import ControlState
-from uavctl.records import ORDER_ACCEPTED, ORDER_REFUSED, Command, Event, Order, Severity, Vec3, Vector
+from uavctl.records import Command, Event, Order, Severity, Vec3, Vector
 
 _OF_CORE = frozenset({Order.GOTO, Order.HOLD, Order.RESUME, Order.LAND})
 
@@ -38,9 +39,12 @@ def take_orders(state: ControlState, context: TickContext) -> Ordered:
         if command.order not in _OF_CORE:
             continue
         reason = _find_refusal(ordered, command, context)
-        severity, code = (Severity.WARNING, ORDER_REFUSED) if reason else (Severity.INFO, ORDER_ACCEPTED)
+        severity, code = (
+            (Severity.WARNING, EventCode.ORDER_REFUSED) if reason else (Severity.INFO, EventCode.ORDER_ACCEPTED)
+        )
         text = f"{describe_order(command)}: {reason}" if reason else describe_order(command)
-        answers.append(Event(at_ns=context.at_ns, severity=severity, code=code, text=text))
+        subject = "" if reason else command.order.value
+        answers.append(Event(at_ns=context.at_ns, severity=severity, code=code, text=text, subject=subject))
         if reason:
             continue
         if command.order is Order.LAND:

@@ -12,10 +12,10 @@ from contextlib import suppress
 import serial
 
 from uavctl.errors import ConnectionSpecError
+from uavctl.event_codes import EventCode
 from uavctl.io.admission import Address
 from uavctl.io.base import BaseConnection, SocketConnection
 from uavctl.io.udp import PEER_SILENCE_NS
-from uavctl.mavlink.connection import CONNECTION_SILENT, HUNG_UP
 
 CONNECT_TIMEOUT_S = 5.0
 RETRY_NS = 1_000_000_000  # from the end of a connection, or of an attempt, to the next attempt
@@ -72,13 +72,13 @@ class TcpConnection(SocketConnection):
         except BlockingIOError:
             # After a network failure neither end may notice that the connection is lost.
             if self._heard_ns is not None and self._now() - self._heard_ns > PEER_SILENCE_NS:
-                self._disconnect(CONNECTION_SILENT)
+                self._disconnect(EventCode.CONNECTION_SILENT)
             raise
         except OSError:
-            self._disconnect(HUNG_UP)
+            self._disconnect(EventCode.HUNG_UP)
             raise
         if not data:
-            self._disconnect(HUNG_UP)
+            self._disconnect(EventCode.HUNG_UP)
             return None
         self._heard_ns = self._now()
         return data

@@ -13,10 +13,10 @@ from logs.recording.topics import ENDED
 from logs.recording.views import ViewBuilder
 from sim.simulation import World
 from uavctl.build.controller import Prepared
+from uavctl.cause import Cause
 from uavctl.config.types import Config
 from uavctl.errors import UsageError
 from uavctl.loop import ControlLoop
-from uavctl.outcome import Cause
 from uavctl.records import Received, Send, Ticked, Truth
 
 TRUTH = "/sim/truth"
@@ -97,12 +97,12 @@ class LockstepFlight:
         """
         config, lands = self._prepared.config, landing_s is not None
         put_header(self._recorder, self._prepared, started_ns=0, command=self._command)
-        self.loop.course.in_flight = not lands
+        self.loop.account.ends_in_flight = not lands
         timed = _Timed(self.loop, follower)
 
         def tell(flown_s: float) -> None:
             if not go_on(flown_s):
-                self.loop.course.stop(Cause.OPERATOR)
+                self.loop.account.note_requested_end(Cause.ENDED_BY_OPERATOR)
                 raise _InterruptedError
 
         def record(truth: Truth) -> None:
@@ -114,7 +114,7 @@ class LockstepFlight:
             world.run(config.duration_s, lambda: lands and self.loop.finished)
             if landing_s is not None:
                 timed.stop = True
-                self.loop.course.stop(Cause.TIME)
+                self.loop.account.note_requested_end(Cause.TIME_OVER)
                 world.run(config.duration_s + landing_s, lambda: self.loop.finished)
         except _InterruptedError:
             pass  # an end that was asked for is no failure

@@ -19,6 +19,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from uavctl.arrays import SECOND_NS
 from uavctl.config.connections import ClockConfig, DaemonConfig, FrameConfig, SourceConfig
 from uavctl.config.types import EstimatorConfig
+from uavctl.event_codes import EventCode
 from uavctl.frames import Quaternion
 from uavctl.mavlink.clocksync import (
     MAX_CLOCK_STEP_NS,
@@ -32,7 +33,7 @@ from uavctl.mavlink.codec import AUTOPILOT_ESTIMATE, StreamDecoder, decode
 from uavctl.mavlink.encoder import Encoder, UnsendableError
 from uavctl.mavlink.framing import SkipReason
 from uavctl.mavlink.messages import Attitude, CommandAck, Message, Position, StatusText, TimeSync
-from uavctl.mavlink.positions import SLOW_ANSWER, PositionDecoder
+from uavctl.mavlink.positions import PositionDecoder
 from uavctl.mavlink.profile import PROFILES
 from uavctl.mavlink.relay import Relay
 from uavctl.mavlink.requests import COMMANDS, RequestKind
@@ -44,7 +45,7 @@ from uavctl.mavlink.stream_requests import (
     ParameterDownload,
     StreamRequests,
 )
-from uavctl.mavlink.vehicle import MIN_INERTIAL, MIN_INERTIAL_SHARE, SECOND_VEHICLE, STALE_INERTIAL, VehicleMonitor
+from uavctl.mavlink.vehicle import MIN_INERTIAL, MIN_INERTIAL_SHARE, VehicleMonitor
 from uavctl.records import (
     Event,
     InertialSample,
@@ -70,18 +71,15 @@ MAX_ANSWERS, ANSWER_WINDOW_NS = 8, 50_000_000
 STREAM_SCHEMES = ("tcp:", "serial:")
 SLOW_EVENT_NS = 10_000_000_000  # between two events about slow answers
 MISSING_HEARTBEAT_NS = 3 * SECOND_NS  # three missing heartbeats
-NO_HEARTBEAT = "no-heartbeat"
-STAMP_UNIT = "stamp-unit"
 TIMESYNC_FLOOD = "timesync-flood"
 OVERRUN = "overrun"  # dropped by the system before it was read; perhaps the newest state of the vehicle
-HUNG_UP = "hung-up"  # times that the other side has closed a TCP connection
-CONNECTION_SILENT = "went-silent"  # reconnections of a silent TCP connection
-_DISCONNECT_TEXTS = {
-    HUNG_UP: "the other side closed the connection; it is called again each second",
-    CONNECTION_SILENT: "nothing came over the connection any more; it is made again",
+# Code of a lost connection: what happened, and what follows.
+DISCONNECT_TEXTS = {
+    EventCode.HUNG_UP: ("the other side closed the connection", "it is called again each second"),
+    EventCode.CONNECTION_SILENT: ("nothing came over the connection any more", "it is made again"),
 }
 # Counted but not reported: every flight has them, or another event reports them.
-_NOT_REPORTED = frozenset({SkipReason.UNKNOWN, AUTOPILOT_ESTIMATE, *_DISCONNECT_TEXTS})
+_NOT_REPORTED = frozenset({SkipReason.UNKNOWN, AUTOPILOT_ESTIMATE, *DISCONNECT_TEXTS})
 
 Item = PositionSample | VehicleStatus | VehicleMotion | InertialSample | Event | CommandAck | StatusText
 
@@ -219,9 +217,9 @@ class MavlinkConnection:
         for reason, count in counts.items():
             self._count_bad(reason, count)
         events = tuple(
-            Event(at_ns=at_ns, severity=Severity.ERROR, code=reason, text=f"link {self._name}: {text}")
-            for reason, text in _DISCONNECT_TEXTS.items()
-            if reason in counts
+            self._make_event(at_ns, Severity.ERROR, code, "; ".join(texts))
+            for code, texts in DISCONNECT_TEXTS.items()
+            if code in counts
         )
         return events + self._make_events(at_ns)
 
@@ -420,8 +418,8 @@ class MavlinkConnection:
                 ParameterDownload(),
                 ArrivalClock(),
             )
-            text = f"link {self._name}: the vehicle has started anew"
-            return (*items, Event(at_ns=at_ns, severity=Severity.ERROR, code="vehicle-reboot", text=text))
+            text = "the vehicle has started anew"
+            return (*items, self._make_event(at_ns, Severity.ERROR, EventCode.VEHICLE_REBOOT, text))
         if self._vehicle.not_ready_count != not_ready_count:
             self._streams.restart()  # streams that continue are received again before the next request
         if (message.system, message.component) == self.vehicle:
@@ -462,28 +460,39 @@ class MavlinkConnection:
 
     def _count_bad(self, reason: str, count: int = 1) -> None:
         self._bad[reason] += count
-        if reason == SLOW_ANSWER:
+        if reason == EventCode.SLOW_ANSWER:
             self._slow_count += count
-        elif reason == STALE_INERTIAL:  # reported once; then the used share is reported
+        elif reason == EventCode.INERTIAL_STALE:  # reported once; then the used share is reported
             if self._bad[reason] == count:
                 self._unreported[reason] += count
         elif reason not in _NOT_REPORTED:
             self._unreported[reason] += count
+
+    def _make_event(self, at_ns: int, severity: Severity, code: EventCode, text: str, count: int = 1) -> Event:
+        """Make an event of this connection."""
+        return Event(
+            at_ns=at_ns,
+            severity=severity,
+            code=code,
+            text=f"link {self._name}: {text}",
+            count=count,
+            subject=self._name,
+        )
 
     def _make_events(self, at_ns: int) -> tuple[Event, ...]:
         """Return events: dropped data once a second; new clocks, units and other findings once each."""
         events = []
         if self._positions.resyncs > self._reported_resyncs:
             self._reported_resyncs = self._positions.resyncs
-            text = f"link {self._name}: a source's clock has jumped; synchronised anew"
-            events.append(Event(at_ns=at_ns, severity=Severity.WARNING, code="clock-resync", text=text))
+            text = "a source's clock has jumped; synchronised anew"
+            events.append(self._make_event(at_ns, Severity.WARNING, EventCode.CLOCK_RESYNC, text))
         for (system, component), unit in self._positions.units.items():
             if (system, component, unit) not in self._reported_units:
                 self._reported_units.add((system, component, unit))
                 fault = "do not go on" if unit is StampUnit.CONSTANT else f"are in {unit}, not in us"
-                text = f"link {self._name}: stamps of the positions of {system}/{component} {fault}: "
+                text = f"stamps of the positions of {system}/{component} {fault}: "
                 text += "they count by their arrival, and their ages are not known"
-                events.append(Event(at_ns=at_ns, severity=Severity.WARNING, code=STAMP_UNIT, text=text))
+                events.append(self._make_event(at_ns, Severity.WARNING, EventCode.STAMP_UNIT, text))
         since_ns = self._no_heartbeat_since_ns
         if (
             since_ns is not None
@@ -493,17 +502,15 @@ class MavlinkConnection:
         ):
             self._is_no_heartbeat_reported = True
             sender = self._no_heartbeat_address and self._no_heartbeat_address[0]
-            text = f"link {self._name}: system {sender} sends its position or attitude, "
+            text = f"system {sender} sends its position or attitude, "
             text += "but no heartbeat of an autopilot: its mode is not known, so it is not flown"
-            events.append(Event(at_ns=at_ns, severity=Severity.WARNING, code=NO_HEARTBEAT, text=text))
+            events.append(self._make_event(at_ns, Severity.WARNING, EventCode.NO_HEARTBEAT, text))
         used_count, total = self._vehicle.inertial_used, self._vehicle.inertial_total
         if not self._is_low_share_reported and total >= MIN_INERTIAL and used_count < MIN_INERTIAL_SHARE * total:
             self._is_low_share_reported = True
-            text = f"link {self._name}: {1 - used_count / total:.0%} of the inertial data are not used: late, frozen, "
+            text = f"{1 - used_count / total:.0%} of the inertial data are not used: late, frozen, "
             text += "or without an attitude of now"
-            events.append(
-                Event(at_ns=at_ns, severity=Severity.WARNING, code=STALE_INERTIAL, text=text, count=total - used_count)
-            )
+            events.append(self._make_event(at_ns, Severity.WARNING, EventCode.INERTIAL_STALE, text, total - used_count))
         if self._slow_count and (self._slow_reported_ns is None or at_ns - self._slow_reported_ns >= SLOW_EVENT_NS):
             self._slow_reported_ns = at_ns
             events.append(self._make_slow_answer_event(at_ns))
@@ -517,21 +524,21 @@ class MavlinkConnection:
     def _make_slow_answer_event(self, at_ns: int) -> Event:
         """Return the event about answers to TIMESYNC that were too slow; harmless while other answers are used."""
         known = self._positions.are_clocks_known(at_ns)
-        text = f"link {self._name}: answers to TIMESYNC came too slow to be used; the clock " + (
+        text = "answers to TIMESYNC came too slow to be used; the clock " + (
             "stays known by the others" if known else "is not known by them any more"
         )
         severity = Severity.INFO if known else Severity.WARNING
-        return Event(at_ns=at_ns, severity=severity, code=SLOW_ANSWER, text=text, count=self._slow_count)
+        return self._make_event(at_ns, severity, EventCode.SLOW_ANSWER, text, self._slow_count)
 
     def _make_drop_events(self, at_ns: int) -> list[Event]:
         events = []
-        vehicles = self._unreported.pop(SECOND_VEHICLE, 0)
+        vehicles = self._unreported.pop(EventCode.SECOND_VEHICLE, 0)
         if vehicles and self._vehicle.address is not None:
-            text = f"link {self._name}: another vehicle than system {self._vehicle.address[0]} is heard, and ignored"
-            events.append(Event(at_ns=at_ns, severity=Severity.ERROR, code=SECOND_VEHICLE, text=text, count=vehicles))
+            text = f"another vehicle than system {self._vehicle.address[0]} is heard, and ignored"
+            events.append(self._make_event(at_ns, Severity.ERROR, EventCode.SECOND_VEHICLE, text, vehicles))
         if self._unreported:
             reasons = ", ".join(f"{count} {reason}" for reason, count in sorted(self._unreported.items()))
-            text = f"link {self._name}: dropped {reasons}"
+            text = f"dropped {reasons}"
             count = self._unreported.total()
-            events.append(Event(at_ns=at_ns, severity=Severity.WARNING, code="dropped", text=text, count=count))
+            events.append(self._make_event(at_ns, Severity.WARNING, EventCode.DROPPED, text, count))
         return events

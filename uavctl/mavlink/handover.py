@@ -12,6 +12,7 @@ from __future__ import annotations
 import msgspec
 
 from uavctl.config.connections import HandOverConfig
+from uavctl.event_codes import EventCode
 from uavctl.mavlink.handover_guards import (
     LAND_PERIODS,
     REQUESTING,
@@ -29,7 +30,7 @@ from uavctl.mavlink.handover_states import TRANSITIONS, HandoverEvent, HandoverS
 from uavctl.mavlink.mode_reason import ModeReason
 from uavctl.mavlink.profile import find_profile
 from uavctl.mavlink.requests import PendingRequest, RequestKind, RequestLimits
-from uavctl.records import ORDER_ACCEPTED, ORDER_REFUSED, Command, Event, Order, Severity, VehicleStatus
+from uavctl.records import Command, Event, Order, Severity, VehicleStatus
 
 LAND_TRIES = 5
 NEW_HEARTBEAT_NS = 100_000_000  # a heartbeat counts as new for two ticks
@@ -75,7 +76,7 @@ class StateTransition(msgspec.Struct, frozen=True):
     before: HandoverState  # the state that was left
     event: HandoverEvent
     after: HandoverState  # the state that was entered
-    reason: str = ""  # reason of a failure
+    reason: str = ""  # reason of a failure, without what was asked for
     request: RequestKind | None = None  # request to the vehicle at that time
     is_granted: bool = False  # the vehicle had accepted the request
     mode_reason: ModeReason | None = None  # reason of a mode that is not ours
@@ -204,7 +205,7 @@ class HandoverStateMachine:
                 before,
                 result.event,
                 progress.state,
-                result.reason,
+                "" if result.failure is None else result.failure.reason,
                 previous_request.kind,
                 previous_request.granted_ns is not None,
                 result.mode_reason,
@@ -248,9 +249,18 @@ class HandoverStateMachine:
                 self._progress.take_off_ordered_ns, self._progress.height_m = inputs.at_ns, command.height_m or 0.0
             elif not refusal and command.order is Order.STAND_BY:
                 self._progress.is_standing_by, self._progress.previous_flight_ns = True, command.flown_ns
-            code, severity = (ORDER_REFUSED, Severity.WARNING) if refusal else (ORDER_ACCEPTED, Severity.INFO)
-            text = refusal or _ORDER_TEXTS[command.order]
-            events.append(Event(at_ns=inputs.at_ns, severity=severity, code=code, text=text))
+            code, severity = (
+                (EventCode.ORDER_REFUSED, Severity.WARNING) if refusal else (EventCode.ORDER_ACCEPTED, Severity.INFO)
+            )
+            events.append(
+                Event(
+                    at_ns=inputs.at_ns,
+                    severity=severity,
+                    code=code,
+                    text=refusal or _ORDER_TEXTS[command.order],
+                    subject="" if refusal else command.order.value,
+                )
+            )
         return events
 
     def _explain_refusal(self, command: Command, inputs: HandoverInput) -> str:
@@ -309,7 +319,7 @@ class HandoverStateMachine:
         elif progress.state not in (HandoverState.CLIMBING, HandoverState.ENGAGING):
             progress.granted_ns = None
         if before is not HandoverState.RETURNING:
-            self.failure = self.failure or result.reason
+            self.failure = self.failure or ("" if result.failure is None else result.failure.text)
 
     def _choose_request(self, inputs: HandoverInput) -> RequestKind | None:
         climbs_on_arming = inputs.vehicle is not None and find_profile(inputs.vehicle).climbs_on_arming
@@ -374,14 +384,13 @@ class HandoverStateMachine:
             self._is_heartbeat_lost = is_heartbeat_lost
             suffix = ", though its other messages come" if inputs.has_motion else ", and nothing else comes"
             text = f"heartbeat lost{suffix}: braking and holding" if is_heartbeat_lost else "heartbeat is back"
-            events.append(Event(at_ns=inputs.at_ns, severity=Severity.ERROR, code="heartbeat", text=text))
-        overdue_reason = (
-            self._progress.request.describe_failure(inputs.at_ns) if self.state is HandoverState.LANDING else ""
-        )
-        if overdue_reason and not self._is_landing_overdue:
-            text = f"{overdue_reason}; it is asked on, as it is heard in the air"
-            events.append(Event(at_ns=inputs.at_ns, severity=Severity.ERROR, code="refused", text=text))
-        self._is_landing_overdue = bool(overdue_reason)
+            events.append(Event(at_ns=inputs.at_ns, severity=Severity.ERROR, code=EventCode.HEARTBEAT, text=text))
+        is_landing = self.state is HandoverState.LANDING
+        overdue = self._progress.request.find_failure(inputs.at_ns) if is_landing else None
+        if overdue is not None and not self._is_landing_overdue:
+            text = f"{overdue.text}; it is asked on, as it is heard in the air"
+            events.append(Event(at_ns=inputs.at_ns, severity=Severity.ERROR, code=EventCode.REQUEST_FAILED, text=text))
+        self._is_landing_overdue = overdue is not None
         if has_changed:
             vehicle = inputs.vehicle
             mode = "" if vehicle is None else f" ({vehicle.mode}, {'armed' if vehicle.armed else 'disarmed'})"
@@ -391,9 +400,16 @@ class HandoverStateMachine:
             if result.mode_reason is not None:
                 failsafe_text = "" if vehicle is None or not vehicle.said else f', "{vehicle.said}"'
                 text += f": {result.mode_reason}{failsafe_text}"
-            events.append(Event(at_ns=inputs.at_ns, severity=severity, code="hand-over", text=text))
-            if result.reason:
-                events.append(Event(at_ns=inputs.at_ns, severity=Severity.ERROR, code="refused", text=result.reason))
+            events.append(
+                Event(
+                    at_ns=inputs.at_ns, severity=severity, code=EventCode.HAND_OVER, text=text, subject=self.state.value
+                )
+            )
+            if result.failure is not None:
+                text = result.failure.text
+                events.append(
+                    Event(at_ns=inputs.at_ns, severity=Severity.ERROR, code=EventCode.REQUEST_FAILED, text=text)
+                )
         return events
 
 

@@ -21,7 +21,7 @@ from uavctl.mavlink.handover_states import HandoverEvent, HandoverState
 from uavctl.mavlink.messages import CommandAck, StatusText
 from uavctl.mavlink.mode_reason import VEHICLE_REASONS, ModeReason, determine_mode_reason, is_autonomous_mode
 from uavctl.mavlink.profile import PROFILES, find_profile
-from uavctl.mavlink.requests import PendingRequest
+from uavctl.mavlink.requests import Failure, PendingRequest, RequestKind, make_failure
 from uavctl.records import Command, Order, VehicleStatus
 
 HEARTBEAT_TIMEOUT_NS = 3_000_000_000
@@ -43,16 +43,18 @@ REQUESTING = _IN_PROGRESS | {HandoverState.LANDING}
 BOOT_TIME_WAIT_NS = 5_000_000_000  # wait for the uptime of a vehicle that is armed at the start
 # The clock of a simulated vehicle may be slow, so its uptime may be too short.
 MIN_CLOCK_RATE, BOOT_TIME_MARGIN_S = 0.8, 1.0
-_SECOND_VEHICLE = "another vehicle is heard on this link: nothing is armed; give each its own link"
+_SECOND_VEHICLE = make_failure("nothing is armed; give each its own link", "another vehicle is heard on this link: ")
+_TAKE_OFF = f"{RequestKind.TAKE_OFF}: "
 _ALREADY_ARMED = (
     "the vehicle is armed already; it begins on the ground, disarmed. Land and disarm it, or start without --arm "
     "--takeoff to fly it from where it is"
 )
 _ENGAGE_HINT = ", and ask for that with `uavctl ctl engage`"
-CLIMB_ABORTED = "the climb is broken off: "
 _SLOW_OR_PILOT = "it is slow, or the pilot has taken it back"
-_DISARMED = "the vehicle has disarmed itself"
-_LEFT_IN_FLIGHT = "a daemon before this one has left the vehicle in flight: nothing is sent until `uavctl ctl engage`"
+_DISARMED = make_failure("the vehicle has disarmed itself")
+_LEFT_IN_FLIGHT = make_failure(
+    "a daemon before this one has left the vehicle in flight: nothing is sent until `uavctl ctl engage`"
+)
 
 
 class HandoverInput(msgspec.Struct, frozen=True, kw_only=True):
@@ -106,7 +108,7 @@ class GuardResult(msgspec.Struct, frozen=True):
     """Event of a tick, with its reason."""
 
     event: HandoverEvent  # column of the transition table
-    reason: str = ""  # why something failed
+    failure: Failure | None = None
     granted_ns: int | None = None  # when it was granted, if a heartbeat does not show it yet [ns]
     mode_reason: ModeReason | None = None  # reason of a mode that is not ours
 
@@ -172,7 +174,7 @@ def evaluate(progress: HandoverProgress, inputs: HandoverInput) -> GuardResult:
     """Return the event of a tick; of several, the first in the order of `HandoverEvent`."""
     vehicle, state = inputs.vehicle, progress.state
     if vehicle is not None and vehicle.boots > progress.boots and state is not HandoverState.WAITING:
-        return GuardResult(HandoverEvent.REBOOT, "the vehicle has started anew")
+        return GuardResult(HandoverEvent.REBOOT, make_failure("the vehicle has started anew"))
     result = GuardResult(HandoverEvent.SILENCE)
     if vehicle is not None and not is_silent(inputs.at_ns, vehicle):
         result = _GUARDS.get(state, _guard_standby)(progress, inputs, vehicle)
@@ -195,16 +197,16 @@ def evaluate(progress: HandoverProgress, inputs: HandoverInput) -> GuardResult:
         # The controller has ended without a landing, and no pilot has the vehicle that we took off.
         return GuardResult(HandoverEvent.LAND)
     if state in _CLIMB_STATES and inputs.climb_hazard:
-        return GuardResult(HandoverEvent.UNSAFE, f"{CLIMB_ABORTED}{inputs.climb_hazard}")
+        return GuardResult(HandoverEvent.UNSAFE, make_failure(inputs.climb_hazard, "the climb is broken off: "))
     if result.event in (HandoverEvent.GRANTED, HandoverEvent.REFUSED):
         return result
     if result.event is HandoverEvent.DISARMED and state is HandoverState.LANDING:
         return result  # it has landed, whatever it answered
-    reason = _find_failure(progress, inputs)
-    return GuardResult(HandoverEvent.REFUSED, reason) if reason else result
+    failure = _find_failure(progress, inputs)
+    return result if failure is None else GuardResult(HandoverEvent.REFUSED, failure)
 
 
-def _find_failure(progress: HandoverProgress, inputs: HandoverInput) -> str:
+def _find_failure(progress: HandoverProgress, inputs: HandoverInput) -> Failure | None:
     state, vehicle = progress.state, inputs.vehicle
     if state in (HandoverState.WAITING, HandoverState.READY):
         return _find_take_off_failure(progress, inputs)
@@ -213,7 +215,7 @@ def _find_failure(progress: HandoverProgress, inputs: HandoverInput) -> str:
     if state in (HandoverState.FAILSAFE, HandoverState.UNCLEAR):
         return _find_wait_timeout(progress, inputs)
     is_waiting = (state in REQUESTING or state is HandoverState.SETTLING) and not _must_keep_landing(progress, inputs)
-    return progress.request.describe_failure(inputs.at_ns) if is_waiting else ""
+    return progress.request.find_failure(inputs.at_ns) if is_waiting else None
 
 
 def _must_keep_landing(progress: HandoverProgress, inputs: HandoverInput) -> bool:
@@ -238,24 +240,26 @@ def _is_landing_ordered(progress: HandoverProgress, inputs: HandoverInput) -> bo
     return is_unclear and is_without_pilot(progress, inputs.vehicle)
 
 
-def _find_wait_timeout(progress: HandoverProgress, inputs: HandoverInput) -> str:
-    """Return the reason to end the wait for a failsafe or an unknown pilot; empty while it lasts."""
+def _find_wait_timeout(progress: HandoverProgress, inputs: HandoverInput) -> Failure | None:
+    """Return the failure that ends the wait for a failsafe or an unknown pilot; None while it lasts."""
     vehicle, config = inputs.vehicle, progress.config
     is_unclear = progress.state is HandoverState.UNCLEAR
     if is_unclear and not is_without_pilot(progress, vehicle):
-        return ""
+        return None
     is_landing = vehicle is not None and vehicle.mode in find_profile(vehicle).landing_modes
     start_ns, limit_s = progress.state_start_ns, config.land_s if is_landing else config.climb_s
     if progress.is_climb_interrupted and not is_landing and progress.climb_start_ns is not None:
         start_ns = progress.climb_start_ns
     if inputs.at_ns - start_ns < round(limit_s * 1e9):
-        return ""
+        return None
     if is_unclear:
         mode = "" if vehicle is None else vehicle.mode
-        return f"nobody has shown in {limit_s:g} s that he has the vehicle, which flies by itself ({mode})"
+        text = f"nobody has shown in {limit_s:g} s that he has the vehicle, which flies by itself ({mode})"
+        return make_failure(text)
     is_failsafe_active = vehicle is None or is_in_failsafe(vehicle)
     outcome = "has not ended" if is_failsafe_active else "has ended, and nobody has taken the flight up again,"
-    return f"{_describe_failsafe(progress)} {outcome} in {limit_s:g} s{progress.failsafe_texts}"
+    outcome += f" in {limit_s:g} s{progress.failsafe_texts}"
+    return Failure(f"{_describe_failsafe(progress)} {outcome}", f"{progress.previous_mode} {outcome}")
 
 
 def _describe_failsafe(progress: HandoverProgress) -> str:
@@ -263,22 +267,23 @@ def _describe_failsafe(progress: HandoverProgress) -> str:
     return f"{progress.mode_reason or ModeReason.FAILSAFE} ({progress.previous_mode})"
 
 
-def _find_take_off_failure(progress: HandoverProgress, inputs: HandoverInput) -> str:
-    """Return why an ordered take-off cannot begin; empty if it can, or without an order."""
+def _find_take_off_failure(progress: HandoverProgress, inputs: HandoverInput) -> Failure | None:
+    """Return the failure by which an ordered take-off cannot begin; None if it can, or without an order."""
     vehicle, limit_s = inputs.vehicle, progress.config.ground_s
     if progress.take_off_ordered_ns is None:
-        return ""
+        return None
     if vehicle is not None and vehicle.autopilot not in PROFILES:
-        return f"take-off: how autopilot {vehicle.autopilot!r} takes off is not known; PX4 and ArduCopter are"
+        text = f"how autopilot {vehicle.autopilot!r} takes off is not known; PX4 and ArduCopter are"
+        return make_failure(text, _TAKE_OFF)
     if vehicle is not None and not vehicle.alone:
         return _SECOND_VEHICLE
     if vehicle is not None and vehicle.armed:
-        return f"take-off: {_ALREADY_ARMED}{_ENGAGE_HINT if progress.is_standing_by else ''}"
+        return make_failure(f"{_ALREADY_ARMED}{_ENGAGE_HINT if progress.is_standing_by else ''}", _TAKE_OFF)
     if inputs.at_ns - progress.take_off_ordered_ns < round(limit_s * 1e9):
-        return ""
+        return None
     silence = "the vehicle's heartbeats are missing" if inputs.has_motion else "the vehicle is silent"
     reason = "no vehicle is heard" if vehicle is None else inputs.arming_refusal or silence
-    return f"take-off: {reason} (waited {limit_s:g} s)"
+    return make_failure(f"{reason} (waited {limit_s:g} s)", _TAKE_OFF)
 
 
 def _guard_standby(progress: HandoverProgress, inputs: HandoverInput, vehicle: VehicleStatus) -> GuardResult:
@@ -340,9 +345,9 @@ def _guard_mode(progress: HandoverProgress, inputs: HandoverInput, vehicle: Vehi
     if vehicle.alone and vehicle.mode not in (profile.take_off_mode, progress.previous_mode):
         return _classify_takeover(progress, vehicle)
     if _is_after_grant(progress, vehicle, MODE_SHOWN_NS):
-        return GuardResult(
-            HandoverEvent.REFUSED, f"{progress.request.describe_failure(inputs.at_ns, is_final=True)}; {_SLOW_OR_PILOT}"
-        )
+        failure = progress.request.describe_failure(inputs.at_ns)
+        texts = (f"{text}; {_SLOW_OR_PILOT}" for text in (failure.text, failure.reason))
+        return GuardResult(HandoverEvent.REFUSED, Failure(*texts))
     return GuardResult(HandoverEvent.PENDING)
 
 
@@ -406,9 +411,8 @@ def _guard_external(progress: HandoverProgress, _inputs: HandoverInput, vehicle:
 def _guard_failsafe(progress: HandoverProgress, inputs: HandoverInput, vehicle: VehicleStatus) -> GuardResult:
     """Return the event in a failsafe of an ordered flight; the pilot can take over at any time."""
     if not vehicle.armed:
-        return GuardResult(
-            HandoverEvent.DISARMED, f"{_describe_failsafe(progress)} has landed it{progress.failsafe_texts}"
-        )
+        text = f"{_describe_failsafe(progress)} has landed it{progress.failsafe_texts}"
+        return GuardResult(HandoverEvent.DISARMED, make_failure(text))
     if is_ordered(inputs, Order.ENGAGE) and not explain_engage_refusal(progress.state, inputs):
         return GuardResult(HandoverEvent.ENGAGE)
     profile = find_profile(vehicle)

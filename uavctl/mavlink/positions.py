@@ -15,6 +15,7 @@ from typing import Generic, TypeVar, get_args
 
 from uavctl.config.connections import ClockConfig, FrameConfig, SourceConfig
 from uavctl.config.types import EstimatorConfig
+from uavctl.event_codes import EventCode
 from uavctl.frames import Convention, Frame, Quaternion
 from uavctl.mavlink.clocksync import ClockSource, ClockSync, StampRefusal, StampUnit, StampUnitDetector, TimesyncClock
 from uavctl.mavlink.encoder import BOOT_MS_WRAP
@@ -34,7 +35,6 @@ WRONG_SYSTEM = "system-id"
 NEW_SOURCE = "new-source"  # more samples of new sources than the limit
 TOO_MANY_SOURCES = "sources"  # more than `MAX_SOURCES`: the state of one is lost
 IMPLAUSIBLE = "absurd"
-SLOW_ANSWER = "timesync"
 
 Address = tuple[int, int]
 
@@ -155,7 +155,7 @@ class PositionDecoder:
             address, received_ns, lambda: TimesyncClock(_ns(self._clock.window_s))
         )
         if not timesync.add_answer(sent_ns, remote_ns, received_ns):
-            self._count_bad(SLOW_ANSWER)
+            self._count_bad(EventCode.SLOW_ANSWER)
 
     def make_sample(self, message: Position, received_ns: int) -> PositionSample | None:
         """Make a sample of a message, or count the reason why not; None also for messages that are not configured."""

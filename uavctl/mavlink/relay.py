@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from uavctl.config.connections import RelayConfig
+from uavctl.event_codes import EventCode
 from uavctl.frames import Quaternion, rotate_vector
 from uavctl.records import Event, PositionSample, Severity, Vec3
 
@@ -24,7 +25,6 @@ STUCK_AFTER = 25  # identical poses in a row
 _MAX_QUEUE = 64  # poses of one tick
 SILENT_NS = 500_000_000  # without positions for longer, an estimator drifts by more than 0.1 m
 START_NS = 3_000_000_000  # start time of cameras and vehicle
-RELAY_SILENT, RELAY_RESUMED = "relay-silent", "relay-resumed"
 NO_POSITION, HELD_BACK = "nothing comes", "held back"
 REASONS = {
     NO_POSITION: "no position comes",
@@ -136,7 +136,7 @@ class Relay:
         if not is_silent and self._reported:
             self._reported = ""
             text = "the vehicle gets positions again"
-            return Event(at_ns=at_ns, severity=Severity.INFO, code=RELAY_RESUMED, text=text)
+            return Event(at_ns=at_ns, severity=Severity.INFO, code=EventCode.RELAY_RESUMED, text=text)
         if (
             not is_silent
             or self._reported == "armed"
@@ -147,7 +147,7 @@ class Relay:
         self._is_reported_on_ground = self._is_reported_on_ground or not armed
         since_ns = self._start_ns if self.last_ns is None else since_ns
         text = f"the vehicle gets no position since {(at_ns - since_ns) * 1e-9:.1f} s: {REASONS[self.silent_for]}"
-        return Event(at_ns=at_ns, severity=Severity.WARNING, code=RELAY_SILENT, text=text)
+        return Event(at_ns=at_ns, severity=Severity.WARNING, code=EventCode.RELAY_SILENT, text=text)
 
     def _find_silence_reason(self) -> str:
         counts = (Counter(self.kept) - self._kept_before).most_common(1)

@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
+import msgspec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.arrays import SECOND_NS
@@ -41,6 +42,18 @@ COMMANDS = {
     RequestKind.LAND: int(mavlink.MAV_CMD_NAV_LAND),
     RequestKind.DISARM: int(mavlink.MAV_CMD_COMPONENT_ARM_DISARM),
 }
+
+
+class Failure(msgspec.Struct, frozen=True):
+    """Failure in words."""
+
+    text: str  # whole, for an event
+    reason: str  # without what was asked for, for a sentence that names it
+
+
+def make_failure(reason: str, subject: str = "") -> Failure:
+    """Make a failure whose text is the subject, then the reason."""
+    return Failure(f"{subject}{reason}", reason)
 
 
 @dataclass(frozen=True)
@@ -106,22 +119,24 @@ class PendingRequest:
         self._next_ns = at_ns + self._limits.answer_ns
         return self.kind
 
-    def describe_failure(self, at_ns: int, *, is_final: bool = False) -> str:
-        """Return why the request has failed; empty while it may still succeed (`is_final`: it may not)."""
-        is_over_time = is_final or at_ns - self._start_ns >= self._limits.limit_ns
+    def find_failure(self, at_ns: int) -> Failure | None:
+        """Return the failure of the request; None while it may still succeed."""
+        is_over_time = at_ns - self._start_ns >= self._limits.limit_ns
         out_of_tries = self.kind is not None and self._tries >= self._limits.tries and at_ns >= self._next_ns
         if not (is_over_time or out_of_tries or (self._result is not None and self._result in _FINAL)):
-            return ""
-        return (
-            f"{self._describe_request()}{self._describe_reason()}{self.quoted_texts} ({self._describe_effort(at_ns)})"
-        )
+            return None
+        return self.describe_failure(at_ns)
 
-    def _describe_request(self) -> str:
-        return "" if self.kind is None else f"{self.kind.value}: "
-
-    def _describe_reason(self) -> str:
+    def describe_failure(self, at_ns: int) -> Failure:
+        """Return the failure of a request that will not succeed."""
+        effort = self._describe_effort(at_ns)
         if self.kind is None:
-            return "it took too long"
+            return Failure(
+                f"it took too long{self.quoted_texts} ({effort})", f"not done in {effort}{self.quoted_texts}"
+            )
+        return make_failure(f"{self._describe_answer()}{self.quoted_texts} ({effort})", f"{self.kind.value}: ")
+
+    def _describe_answer(self) -> str:
         if self._blocked_reason and self._result is None:
             return f"not asked for, because {self._blocked_reason}"
         if self._result is None:

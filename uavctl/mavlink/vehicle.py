@@ -13,6 +13,7 @@ from collections.abc import Callable
 import msgspec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from uavctl.event_codes import EventCode
 from uavctl.frames import Quaternion, quaternion_from_euler, rotate_vector
 from uavctl.mavlink.boot_clock import BootClock
 from uavctl.mavlink.clocksync import ArrivalClock
@@ -35,8 +36,6 @@ from uavctl.mavlink.mode_reason import ModeReasonEvidence
 from uavctl.mavlink.profile import PROFILES, describe_mode, find_autopilot_name
 from uavctl.records import Event, InertialSample, Severity, Vec3, VehicleMotion, VehicleStatus
 
-SECOND_VEHICLE = "second-vehicle"
-STALE_INERTIAL = "inertial-not-of-now"  # late, repeated, or frozen
 # Identical readings for longer come from a frozen sensor. Whole thousandths of g repeat for 0.7 s at most in recorded
 # flights of ArduCopter. Fractions have noise and never repeated.
 FROZEN_RAW_US, FROZEN_US = 1_000_000, 100_000
@@ -293,7 +292,7 @@ class VehicleMonitor:
         ):
             self._attitude = message.angles_rad, at_ns
         else:
-            self._count_bad(STALE_INERTIAL)
+            self._count_bad(EventCode.INERTIAL_STALE)
 
     def _make_inertial_sample(self, message: Inertial, at_ns: int) -> tuple[InertialSample, ...]:
         """Make a sample from a specific force and the newest attitude; nothing if either is old or unknown."""
@@ -304,7 +303,7 @@ class VehicleMonitor:
         is_new = stream.is_current(message.stamp_us, message.specific_force_mps2, at_ns, frozen_us=frozen_us)
         self.inertial_total += is_new is not None
         if not is_new:
-            self._count_bad(STALE_INERTIAL)
+            self._count_bad(EventCode.INERTIAL_STALE)
             return ()
         attitude = self.attitude(at_ns)
         force_ned = None if attitude is None else rotate_vector(attitude, message.specific_force_mps2)
@@ -353,7 +352,7 @@ class VehicleMonitor:
             self._follow_vehicle(address, at_ns)
         if address != self.address:
             if self.address is None or message.system != self.address[0]:
-                self._count_bad(SECOND_VEHICLE)
+                self._count_bad(EventCode.SECOND_VEHICLE)
                 self._other_vehicle_ns = at_ns
             return ()
         is_booting = message.system_status == mavlink.MAV_STATE_BOOT and self._status is not None
@@ -385,7 +384,7 @@ class VehicleMonitor:
 
 
 def _make_text_event(text: StatusText, at_ns: int) -> Event:
-    return Event(at_ns=at_ns, severity=_convert_severity(text.severity), code="vehicle-text", text=text.text)
+    return Event(at_ns=at_ns, severity=_convert_severity(text.severity), code=EventCode.VEHICLE_TEXT, text=text.text)
 
 
 def _convert_severity(mav_severity: int) -> Severity:
@@ -399,7 +398,8 @@ def _make_ack_event(ack: CommandAck, at_ns: int) -> Event:
     return Event(
         at_ns=at_ns,
         severity=Severity.INFO if is_accepted else Severity.WARNING,
-        code="command-ack",
+        code=EventCode.COMMAND_ACK,
+        subject=_find_enum_name("MAV_CMD", ack.command),
         text=f"{_find_enum_name('MAV_CMD', ack.command)}: {_find_enum_name('MAV_RESULT', ack.result)}",
     )
 

@@ -10,6 +10,7 @@ from endings_rig import Endings, interrupt
 from tune_rig import Tuned, fly_real, real_rig
 
 from logs.recording.reader import header
+from uavctl.cause import CAUSES, Cause
 from uavctl.cli import tune as tune_cmd
 from uavctl.cli import tune as tune_flight
 from uavctl.config import load_config
@@ -18,7 +19,6 @@ from uavctl.daemon.lock import lock_vehicle
 from uavctl.errors import NotReachedError, VehicleTakenError
 from uavctl.lab.tune.run_folder import AFTER, BEFORE, FIT_PAGE, PAGE, STATE, TUNED
 from uavctl.mavlink.handover_states import HandoverState
-from uavctl.outcome import Cause
 
 STICK = "POSCTL"
 
@@ -76,7 +76,7 @@ def recorded(folder: Path, noted: str) -> str:
 def test_the_pilots_stick_in_the_climb_stops_the_run(in_the_climb: tuple[Tuned, int], folder: Path) -> None:
     result, since_ns = in_the_climb
     assert result.code == result.document["exit_code"] == tune_cmd.PILOT
-    assert Cause.PILOT in result.document["stopped"].lower() and result.document["before"] == ""
+    assert CAUSES[Cause.PILOT].phrase in result.document["stopped"].lower() and result.document["before"] == ""
     assert not result.flies_after(since_ns)
     assert (folder / BEFORE / "flight.mcap").exists()
 
@@ -85,7 +85,7 @@ def test_the_pilots_stick_in_the_climb_stops_the_run(in_the_climb: tuple[Tuned, 
 def test_it_goes_on_with_a_new_flight_and_the_stick_stops_that_too(under_way: tuple[Tuned, int], folder: Path) -> None:
     result, since_ns = under_way
     assert result.code == result.document["exit_code"] == tune_cmd.PILOT
-    assert Cause.PILOT_LANDED in result.document["stopped"].lower() and result.document["before"] == ""
+    assert CAUSES[Cause.PILOT_LANDED].phrase in result.document["stopped"].lower() and result.document["before"] == ""
     assert result.flies_after(0) and not result.flies_after(since_ns)
     assert (folder / f"{BEFORE}-2" / "flight.mcap").exists()
     assert not result.rig.peers.autopilot.pilot.is_armed

@@ -117,8 +117,8 @@ def test_parquet_reads_back_bit_for_bit(flown: Path) -> None:
 
 def test_csv_is_as_rfc_4180_wants_it(flown: Path) -> None:
     data = export(flown, TableFormat.CSV)["/uavctl/event"].read_bytes()
-    assert data.startswith(b"log_time_ns,at_ns,severity,code,text,count\r\n")
-    assert f'{2**62 + 3},{2**62 + 3},error,,"said ""a, b"";\r\nthen é\n",1\r\n'.encode() in data
+    assert data.startswith(b"log_time_ns,at_ns,severity,code,text,count,subject\r\n")
+    assert f'{2**62 + 3},{2**62 + 3},error,,"said ""a, b"";\r\nthen é\n",1,\r\n'.encode() in data
     text = export(flown, TableFormat.CSV)["/uavctl/setpoint"].read_text(encoding="utf-8")
     assert f"{2**62 + 1},{2**62 + 1},nan,-0.0,-inf,,hold," in text
 
@@ -294,7 +294,7 @@ def test_people_are_shown_what_was_written(tmp_path: Path, capsys: pytest.Captur
     record_flight(path, 30)
     assert run(["log", "export", str(path), "--to", "csv"]) == 0
     shown = capsys.readouterr().out
-    assert re.search(r"│ uavctl\.event\.csv +│   10 │ +6 │", shown)
+    assert re.search(r"│ uavctl\.event\.csv +│   10 │ +7 │", shown)
     assert f"in {tmp_path / 'flight-csv'}" in shown.replace("\n", "")
 
 

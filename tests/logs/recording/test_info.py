@@ -11,10 +11,10 @@ from view_rig import record
 
 from logs.recording.disk import MAGIC, check_free_space
 from logs.recording.info import RecordingInfo, read_info
+from logs.recording.notes import RecorderNote
 from logs.recording.reader import header, read
 from logs.recording.recorder import SyncRecorder
 from logs.recording.recover import recover
-from logs.recording.topics import RecorderNote
 from uavctl.cli.app import run
 from uavctl.cli.log import info_table
 from uavctl.errors import RecordingError

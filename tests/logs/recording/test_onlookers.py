@@ -10,10 +10,11 @@ from view_rig import flown, record
 
 from logs.recording.derived_topics import VIEWS
 from logs.recording.info import read_info
+from logs.recording.notes import RecorderNote
 from logs.recording.reader import RecordedMessage, read, records, scan, segment_files
 from logs.recording.recorder import DerivedTopics, Recorder, SyncRecorder
 from logs.recording.recover import recover
-from logs.recording.topics import Definition, RecorderNote, is_view
+from logs.recording.topics import Definition, is_view
 from logs.recording.views import ViewBuilder
 from uavctl.config.types import LogConfig
 from uavctl.records import Estimate, Record

@@ -12,9 +12,10 @@ from view_rig import flown
 import logs.recording.recorder as recorder_module
 from logs.recording.derived_topics import LOG
 from logs.recording.disk import DiskFile, OutputFile
+from logs.recording.notes import RecorderNote
 from logs.recording.reader import RecordedMessage, read, records, scan, segment_files
 from logs.recording.recorder import RECORDS, VIEWS, DerivedTopics, Recorder, SyncRecorder, WriteQueue, portion
-from logs.recording.topics import RecorderNote, is_view
+from logs.recording.topics import is_view
 from logs.recording.views import ViewBuilder
 from uavctl.config.types import LogConfig
 from uavctl.errors import RecordingError

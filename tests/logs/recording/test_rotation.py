@@ -18,11 +18,12 @@ from recording_fakes import HEADER, Clock, Disk, Item, flight, own
 from logs.recording.derived_topics import LOG
 from logs.recording.disk import DiskFile, FreeSpaceMonitor
 from logs.recording.info import read_info
+from logs.recording.notes import RecorderNote
 from logs.recording.reader import header, read, records, segment_files
 from logs.recording.recorder import DerivedTopics, SyncRecorder
 from logs.recording.recover import recover
 from logs.recording.segment import QueuedMessage, Segment
-from logs.recording.topics import RecorderNote, get_definition
+from logs.recording.topics import get_definition
 from logs.recording.views import ViewBuilder
 from uavctl.build.controller import build_design
 from uavctl.config import load_config

@@ -15,9 +15,8 @@ from synthetic_scene import paper, room
 from logs.recording.flight import FALLBACK, FlightData
 from logs.recording.summary import FlightSummary, Percentiles, compute_percentiles, make_summary_table, summarise
 from uavctl.errors import RecordingError
-from uavctl.flight.decide import MISSION_OVER
+from uavctl.event_codes import MISSION, EventCode
 from uavctl.records import (
-    ORDER_ACCEPTED,
     ControlMode,
     Decision,
     Estimate,
@@ -337,13 +336,18 @@ def test_unmeasured_ticks_are_not_called_virtual() -> None:
 def landing(*names: str, order_at: int | None = None, due_at: int | None = None) -> FlightData:
     """One decision a second in these modes; the operator orders the landing, or the mission is over, at a tick."""
     events = [] if order_at is None else [order_of(order_at, Order.LAND)]
+    if due_at is not None:
+        events.append(event_of(due_at, EventCode.BRAKE, MISSION))
     ticks = [decision(k, ControlMode(name)) for k, name in enumerate(names)]
-    told = [msgspec.structs.replace(one, reason=MISSION_OVER) if one.tick == due_at else one for one in ticks]
-    return flight(*events, *told, truth(0, (0.0,) * 4))
+    return flight(*events, *ticks, truth(0, (0.0,) * 4))
 
 
 def order_of(k: int, order: Order) -> Event:
-    return Event(at_ns=k * DT_NS, severity=Severity.INFO, code=ORDER_ACCEPTED, text=order.value)
+    return event_of(k, EventCode.ORDER_ACCEPTED, order)
+
+
+def event_of(k: int, code: EventCode, subject: str) -> Event:
+    return Event(at_ns=k * DT_NS, severity=Severity.INFO, code=code, text="", subject=subject)
 
 
 @pytest.mark.parametrize(

@@ -17,13 +17,14 @@ from synthetic_scene import room
 
 from logs.recording.flight import FlightData
 from logs.recording.summary import summarise
-from logs.report.causes import BAD, CAUTION, GOOD, Headline, HeadlineCause
 from logs.report.cursor import render_cursor_script
 from logs.report.excursion import find_excursions
+from logs.report.findings import Headline
 from logs.report.headline import derive_headline
 from logs.report.path_3d import draw_path_3d
 from logs.report.plots import draw_path_views, find_input_violations, find_moving_limits, find_state_violations
 from logs.report.verdicts import Judgement, judge_flight
+from uavctl.cause import BAD, CAUTION, GOOD, Cause
 from uavctl.records import Setpoint, SetpointSource, Truth
 
 WALLS = {  # axis, sign, limit of preset and scene
@@ -105,7 +106,7 @@ def test_it_names_wall_metres_and_time(flight: FlightData, judged: Judgement, wa
 
 def test_a_touch_is_no_grave_matter(flight: FlightData, judged: Judgement) -> None:
     headline = head(bumped(flight, "east wall", 0.02, 8.0), judged)
-    assert HeadlineCause.TOUCHED_LIMIT in headline.causes and HeadlineCause.LEFT_LIMITS not in headline.causes
+    assert Cause.TOUCHED_LIMIT in headline.causes and Cause.LEFT_LIMITS not in headline.causes
     (sentence,) = [reason for reason in headline.reasons if WENT.search(reason)]
     assert went(sentence)[:2] == (0.02, "east wall")
 
@@ -144,7 +145,7 @@ def test_blind_is_the_time_without_a_position() -> None:
     captured = sorted(sample.captured_ns for sample in silent.samples)
     gap_s = float(np.diff(captured).max()) * 1e-9
     headline = head(silent)
-    assert headline.cause in (HeadlineCause.FLOWN_BLIND, HeadlineCause.SILENCE)
+    assert headline.cause in (Cause.FLOWN_BLIND, Cause.SILENCE)
     lasted, begun, ended = (float(n) for n in re.findall(r"([\d.]+) s", headline.text)[:3])
     assert lasted == pytest.approx(gap_s, abs=0.26)  # known at ticks, and until the next position has come
     assert ended - begun == pytest.approx(lasted, abs=0.11)
@@ -155,13 +156,13 @@ def test_blind_is_the_time_without_a_position() -> None:
 def test_a_vehicle_that_was_not_heard_is_told_before_what_came_of_it(
     flight: FlightData, judged: Judgement, code: str | None
 ) -> None:
-    assert HeadlineCause.VEHICLE_SILENT not in head(flight, judged).causes
+    assert Cause.VEHICLE_SILENT not in head(flight, judged).causes
     kept = [status for status in flight.vehicles if not 3.0 < (status.at_ns - flight.origin_ns) * 1e-9 < 7.0]
     events = () if code is None else make_link().add_refusals({code: 1}, flight.origin_ns + 3_400_000_000)
     deaf = dataclasses.replace(flight, vehicles=tuple(kept), events=(*flight.events, *events))
     headline = head(deaf, judged)
     first = headline.text
-    assert headline.cause is HeadlineCause.VEHICLE_SILENT
+    assert headline.cause is Cause.VEHICLE_SILENT
     assert "for 4.0 s, from 3.0 s on" in first
     assert ("at 3.4 s" in first and "connection" in first) == (code is not None)
     ends = dataclasses.replace(flight, vehicles=flight.vehicles[:8])
@@ -243,7 +244,7 @@ def test_wind_beyond_the_vehicles_strength_carries_it_out(blown: FlightData) -> 
     sentence = [why for why in headline.reasons if "bias was at its bound" in why]
     assert bool(sentence) == bool(bound)
     assert blown.breach is not None
-    assert HeadlineCause.LET_GO in headline.causes
+    assert Cause.LET_GO in headline.causes
     (let_go,) = [why for why in headline.reasons if blown.breach.text in why]
     (breach_s,) = blown.seconds([blown.breach.at_ns])
     assert f"at {breach_s:.1f} s" in let_go
@@ -258,7 +259,7 @@ def test_a_drifting_frame_is_told_as_wrong_positions_and_not_as_wind() -> None:
     assert "wind carried" not in headline.text and "carried by wind" not in headline.text
     if beyond_m > 0.05:
         check(headline, (beyond_m, wall, at_s))
-    assert HeadlineCause.POSITIONS_DRIFTED in headline.causes and HeadlineCause.WIND not in headline.causes
+    assert Cause.POSITIONS_DRIFTED in headline.causes and Cause.WIND not in headline.causes
     (sentence,) = [text for text in (headline.text, *headline.reasons) if "from the true place" in text]
     first_s = 6.0 + 0.3 / 0.1
     assert float(re.search(r"first at ([\d.]+) s", sentence)[1]) == pytest.approx(first_s, abs=0.5)  # type: ignore[index]

@@ -12,8 +12,8 @@ from report_rig import data, drawn, words_of
 from synthetic_scene import room
 
 from logs.recording.flight import FlightData
+from logs.recording.notes import RecorderNote
 from logs.recording.summary import summarise
-from logs.recording.topics import RecorderNote
 from logs.report import link_figures, plan_figures, plots
 from logs.report.figures import draw_overview
 from logs.report.path_3d import draw_path_3d

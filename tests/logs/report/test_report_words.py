@@ -16,20 +16,8 @@ from logs.recording.summary import Percentiles, describe_prediction, list_summar
 from logs.report.summary_text import describe_flight
 from uavctl.config import load_config
 from uavctl.config.load import dump_config
-from uavctl.flight.decide import MISSION_OVER
-from uavctl.records import (
-    ORDER_ACCEPTED,
-    ControlMode,
-    Decision,
-    Event,
-    LinkStats,
-    Order,
-    Record,
-    Severity,
-    StepInput,
-    Truth,
-    number,
-)
+from uavctl.event_codes import MISSION, EventCode
+from uavctl.records import ControlMode, Decision, Event, LinkStats, Order, Record, Severity, StepInput, Truth, number
 
 TICK_S = room().tick_s
 
@@ -50,16 +38,18 @@ def ended_in(
             return msgspec.structs.replace(record, stop=record.tick >= stop_tick)
         if isinstance(record, Decision) and record.tick >= min(modes):
             mode = modes[max(tick for tick in modes if tick <= record.tick)]
-            return msgspec.structs.replace(
-                record, mode=mode, reason=MISSION_OVER if record.tick == due_tick else "why not"
-            )
+            return msgspec.structs.replace(record, mode=mode, reason="why not")
         return record
 
     items = [(t, at, change(r)) for t, at, r in fly(room(), 4.0)]
-    if order_tick is not None:
-        at_ns = next(r.at_ns for _, _, r in items if isinstance(r, Decision) and r.tick == order_tick)
-        order = Event(at_ns=at_ns, severity=Severity.INFO, code=ORDER_ACCEPTED, text=Order.LAND.value)
-        items.append(("/uavctl/event", at_ns, order))
+    for tick, code, subject in (
+        (order_tick, EventCode.ORDER_ACCEPTED, Order.LAND),
+        (due_tick, EventCode.BRAKE, MISSION),
+    ):
+        at_ns = next((r.at_ns for _, _, r in items if isinstance(r, Decision) and r.tick == tick), None)
+        if at_ns is not None:
+            event = Event(at_ns=at_ns, severity=Severity.INFO, code=code, text="", subject=subject)
+            items.append(("/uavctl/event", at_ns, event))
     return " ".join(words_of(FlightData.from_records(items)).text)
 
 

@@ -12,6 +12,8 @@ from synthetic_scene import paper, room
 from logs.recording.flight import FlightData
 from logs.report.path_3d import compute_grid_m, draw_path_3d, outline_ellipsoid, project_3d
 from logs.report.timeline import draw_timeline, make_lanes
+from uavctl.event_codes import EventCode
+from uavctl.mavlink.handover_states import HandoverState
 from uavctl.records import Command, Event, Order, Severity, StepInput, VehicleStatus
 
 
@@ -35,17 +37,18 @@ def test_modes_follow_each_other_without_gaps(flight: FlightData) -> None:
     assert spans[1][:2] == pytest.approx((begun, ended))
 
 
-def hand_over(at_s: float, text: str, origin_ns: int) -> Event:
-    return Event(at_ns=origin_ns + round(at_s * 1e9), severity=Severity.INFO, code="hand-over", text=text)
+def enter_state(at_s: float, state: HandoverState, origin_ns: int) -> Event:
+    at_ns = origin_ns + round(at_s * 1e9)
+    return Event(at_ns=at_ns, severity=Severity.INFO, code=EventCode.HAND_OVER, text="", subject=state)
 
 
 def test_hand_over_states_come_from_its_events(flight: FlightData) -> None:
     told = (
-        hand_over(1.0, "ready -> arming (STANDBY, disarmed)", flight.origin_ns),
-        hand_over(3.0, "arming -> engaged (OFFBOARD, armed)", flight.origin_ns),
+        enter_state(1.0, HandoverState.ARMING, flight.origin_ns),
+        enter_state(3.0, HandoverState.ENGAGED, flight.origin_ns),
     )
     spans = lane(dataclasses.replace(flight, events=told), "hand-over")
-    assert spans == [(0.0, 1.0, "ready"), (1.0, 3.0, "arming"), (3.0, pytest.approx(flight.duration_s), "engaged")]
+    assert spans == [(0.0, 1.0, "waiting"), (1.0, 3.0, "arming"), (3.0, pytest.approx(flight.duration_s), "engaged")]
 
 
 def test_what_the_vehicle_said(flight: FlightData) -> None:
@@ -70,8 +73,8 @@ def test_marks_are_where_things_happened(flight: FlightData) -> None:
 
 
 def test_bars_too_short_for_their_text_are_explained(flight: FlightData) -> None:
-    told = (hand_over(3.0, "engaging -> engaged", flight.origin_ns), hand_over(3.1, "engaged -> released", 0))
-    *_, meanings = draw_timeline(dataclasses.replace(flight, events=told[:1]))
+    told = (enter_state(3.0, HandoverState.ENGAGED, flight.origin_ns),)
+    *_, meanings = draw_timeline(dataclasses.replace(flight, events=told))
     assert "a step without a new position" in meanings and "an error" not in meanings
     short = draw_timeline(FlightData.from_records(fly(room(), 60.0, blackout=(4.0, 8.0))))[2]
     assert any(mark.kind == "band" and mark.text == "brake" for mark in short)

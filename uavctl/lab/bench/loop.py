@@ -25,8 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pymavlink.dialects.v20 import common as mavlink
 
+from logs.recording.notes import RecorderNote
 from logs.recording.reader import read
-from logs.recording.topics import RecorderNote
 from uavctl.clock import Ticker, monotonic_ns
 from uavctl.config import Config
 from uavctl.daemon.realtime import enable_realtime

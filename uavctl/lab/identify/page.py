@@ -34,7 +34,7 @@ def write_page(found: Identification, seen: PositionHistory, source: str) -> str
         *(
             f"{one.axis}: {100 * one.r2:.1f} % of the motion of the next {SHOWN_S:g} s is predicted."
             for one in result.response
-            if not any(warning.startswith(f"{one.axis}: only ") for warning in result.warnings)  # which says it already
+            if one.is_well_predicted  # else a warning says it
         ),
         *_ramps(result),
         *(f"{warning}." for warning in result.warnings),

@@ -155,6 +155,11 @@ class AxisResponse(msgspec.Struct, frozen=True, kw_only=True):
     residual_std_m: float
     r2: float
 
+    @property
+    def is_well_predicted(self) -> bool:
+        """Whether at least half of the motion of the next second is predicted."""
+        return self.r2 >= 0.5
+
 
 class Candidate(msgspec.Struct, frozen=True, kw_only=True):
     """One kind of plant with its prediction errors on the halves that it was not fitted to."""
@@ -358,7 +363,7 @@ def _response(name: str, flown: Sequence[Stretch], fit: AxisFit, prediction: Pre
 def _doubts(responses: Sequence[AxisResponse]) -> list[str]:
     found = []
     for one in responses:
-        if one.r2 < 0.5:
+        if not one.is_well_predicted:
             found.append(f"{one.axis}: only {100 * one.r2:.0f} % of the motion of the next second is predicted")
         if one.lag_std_s is None or one.lag_std_s > 0.5 * one.lag_s:
             found.append(f"{one.axis}: the lag of {one.lag_s:.2f} s is uncertain; fly more changes of direction")

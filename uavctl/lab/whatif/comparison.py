@@ -12,8 +12,9 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from logs.recording.flight import FlightData
+from logs.recording.notes import RecorderNote
 from logs.recording.summary import FlightSummary, list_summary_rows
-from logs.recording.topics import RecorderNote, encode
+from logs.recording.topics import encode
 from logs.report.page import Mark, PageSection, render_grid, render_page, render_table
 from logs.report.plots import DASHED, DOTTED, draw_limits
 from logs.report.svg import Drawing, colour, open_canvas
