@@ -67,7 +67,7 @@ def _failures_are_seen(request: pytest.FixtureRequest, monkeypatch: pytest.Monke
 
     # By its name: the process that hands the tests out, and runs none, would load all that flies.
     if "control_may_fail" not in request.fixturenames:
-        monkeypatch.setattr("uavctl.loop.ControlLoop._die", fail)
+        monkeypatch.setattr("uavctl.loop.ControlLoop._report_control_failure", fail)
 
 
 @pytest.fixture

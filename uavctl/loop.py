@@ -1,7 +1,11 @@
 """The control loop without its clock and sockets: bytes in, decisions, bytes out.
 
-The daemon runs it in real time, the simulator in lockstep, and replay from a recording. Whatever
-it learns and chooses goes to the sink, in the order in which it happened.
+The daemon runs it in real time, the simulator in lockstep, and replay from a recording. All
+measurements and decisions go to the sink, in their order.
+
+One tick: 1. gather and record the inputs; 2. send what is due on the connections; 3. run the core (`flight.tick`);
+4. relay positions to the vehicle; 5. update the hand-over; 6. send a setpoint or a request, and answer orders.
+A core that fails is not run again: no setpoint is sent from then on, and the vehicle is asked to land.
 """
 
 from __future__ import annotations
@@ -57,14 +61,14 @@ from uavctl.records import (
 )
 from uavctl.smpc.plant import Plant
 
-Heard = PositionSample | VehicleStatus | VehicleMotion | InertialSample | CommandAck | StatusText
+ReceivedItem = PositionSample | VehicleStatus | VehicleMotion | InertialSample | CommandAck | StatusText
 
 VEHICLE = "vehicle"
 MOCAP = "mocap"
 SECOND_NS = 1_000_000_000
-FAILED = "the controller has failed:"  # and what failed in it
-MAX_ORDERS = 16  # that wait for one tick
-FOR_A_PERSON = frozenset(
+CONTROL_FAILED_TEXT = "the controller has failed:"  # then the error
+MAX_ORDERS = 16  # that wait for a tick
+CONSOLE_CODES = frozenset(
     {
         EventCode.VEHICLE_TEXT,
         BIAS_AT_BOUND,
@@ -76,8 +80,8 @@ FOR_A_PERSON = frozenset(
         EventCode.NO_HEARTBEAT,
         EventCode.STAMP_UNIT,
     }
-)  # codes of the events that the console tells
-MISLED_NS = 3_000_000_000  # positions are held back for so long after they could not be the vehicle's own
+)  # codes of events that the console shows
+INCONSISTENT_HOLD_NS = 3_000_000_000  # time in which positions are held back after such a contradiction
 MAX_INERTIAL = 20  # newest of one tick: their mean is what counts
 MAX_SAMPLES = 20  # of one tick, the newest of each source in turn: each costs the estimator its time
 
@@ -85,10 +89,10 @@ MAX_SAMPLES = 20  # of one tick, the newest of each source in turn: each costs t
 def make_links(
     config: Config, on_message: Callable[[Message, int], None] | None = None
 ) -> dict[str, MavlinkConnection]:
-    """The connections' protocol states: one for both roles when the two URLs are the same.
+    """Make the connections' protocol states: one for both roles when the two URLs are the same.
 
     Args:
-        listen: hears every message of others that is understood.
+        on_message: Called with each decoded message of others, and its time [ns].
     """
     shared = config.daemon.vehicle == config.daemon.mocap
     names = {VEHICLE: (VEHICLE, MOCAP)} if shared else {VEHICLE: (VEHICLE,), MOCAP: (MOCAP,)}
@@ -109,9 +113,10 @@ def make_links(
 
 
 class ControlLoop:
-    """One vehicle's controller with its MAVLink links; implements `uavctl.records.Flyer`.
+    """Controller of one vehicle, with its MAVLink connections; implements `uavctl.records.Flyer`.
 
-    `stopwatch` gives nanoseconds for the timing records only; no decision depends on it.
+    Args:
+        stopwatch: Returns nanoseconds, for timing records only; no decision depends on it.
     """
 
     def __init__(self, config: Config, controller: Controller, sink: Sink, stopwatch: Callable[[], int]) -> None:
@@ -119,51 +124,52 @@ class ControlLoop:
         self._put: Callable[[str, int, Record], None] = sink.put
         self._stopwatch = stopwatch
         self._links = make_links(config)
-        self._relay, self._relays = Relay(config.relay), config.relay.enabled
+        self._relay, self._is_relay_enabled = Relay(config.relay), config.relay.enabled
         self._hand_over = HandoverStateMachine(config.hand_over, waits_for_landing=config.relay.enabled)
-        self._config = config.hand_over
-        self._heard: tuple[CommandAck | StatusText, ...] = ()
+        self._handover_config = config.hand_over
+        self._vehicle_messages: tuple[CommandAck | StatusText, ...] = ()
         self._state = make_initial_state()
-        self._inbox: deque[tuple[int, Heard]] = deque()
-        self._feels = config.estimator.inertial_std_mps2 > 0.0
+        self._inbox: deque[tuple[int, ReceivedItem]] = deque()
+        self._uses_inertial = config.estimator.inertial_std_mps2 > 0.0
         self._inertial: tuple[InertialSample, ...] = ()
         self._next_stats_ns: int | None = None
-        self._unsure_since_ns: int | None = None  # time since which the vehicle's messages may have been lost unread
+        self._messages_lost_ns: int | None = None  # time since which the vehicle's messages may have been lost unread
         self._vehicle: VehicleStatus | None = None
         self._motion: VehicleMotion | None = None
         self._decision: Decision | None = None
         self._orders: deque[Command] = deque()
-        self._answered_ns = 0  # time that a controller of another package took in the last tick
-        # The last time at which positions could not be those of the vehicle on its way up or down; None before.
-        self._misled_ns: int | None = None
-        self._adrift = False  # not even the hand-over works any more: positions are all that is sent
-        self._controlled_ns: int | None = None  # the last setpoint that flew the vehicle
-        self._lands = config.fallback.land or config.relay.enabled
-        self.account = FlightAccount()  # course of the flight, as far as it bears upon the end
+        self._external_solve_ns = 0  # time that a controller of another package took in the last tick
+        # Last time at which positions contradicted the vehicle's climb or landing; None before.
+        self._position_inconsistent_ns: int | None = None
+        self._is_handover_failed = False  # not even the hand-over works any more: positions are all that is sent
+        self._last_setpoint_ns: int | None = None  # the last setpoint that flew the vehicle
+        self._lands_on_failure = config.fallback.land or config.relay.enabled
+        self.account = FlightAccount()
 
     @property
     def ending(self) -> Ending:
-        """End of the flight, or the one that it would have now."""
-        return replace(self.account.compute_ending(is_over=self.finished), relay=self._relayed())
+        """Ending of the flight, or the one that it would have now."""
+        return replace(self.account.compute_ending(is_over=self.finished), relay=self._describe_relay())
 
-    def _relayed(self) -> str:
-        """Return a text for a person on the positions passed on to the vehicle."""
+    def _describe_relay(self) -> str:
+        """Describe the positions passed on to the vehicle; empty where none are relayed."""
         stats = self.relay
         if stats is None or stats.last_ns is None:
             return "" if stats is None else "no position was passed on to the vehicle"
-        before_s = (stats.at_ns - stats.last_ns) * 1e-9
-        kept = sum(stats.kept.values())
-        text = f"passed on {stats.sent} positions and kept {kept} back, the last one {before_s:.1f} s before the end"
-        longer_s = 0.0 if self._controlled_ns is None else (stats.last_ns - self._controlled_ns) * 1e-9
-        return f"{text}, {longer_s:.1f} s after the last setpoint" if longer_s > 0.0 else text
+        since_last_s = (stats.at_ns - stats.last_ns) * 1e-9
+        kept_count = sum(stats.kept.values())
+        text = f"passed on {stats.sent} positions and kept {kept_count} back"
+        text += f", the last one {since_last_s:.1f} s before the end"
+        after_setpoints_s = 0.0 if self._last_setpoint_ns is None else (stats.last_ns - self._last_setpoint_ns) * 1e-9
+        return f"{text}, {after_setpoints_s:.1f} s after the last setpoint" if after_setpoints_s > 0.0 else text
 
     @property
     def finished(self) -> bool:
         """Whether the vehicle has been handed over and nothing more will be sent."""
-        if self._adrift:
+        if self._is_handover_failed:
             return not self._hand_over.is_relay_needed
-        over = self._decision is not None and self._decision.mode in (ControlMode.LAND, ControlMode.STOPPED)
-        return self._hand_over.is_finished or (over and not self._hand_over.is_busy)
+        is_core_over = self._decision is not None and self._decision.mode in (ControlMode.LAND, ControlMode.STOPPED)
+        return self._hand_over.is_finished or (is_core_over and not self._hand_over.is_busy)
 
     @property
     def is_relay_needed(self) -> bool:
@@ -173,20 +179,25 @@ class ControlLoop:
     @property
     def relay(self) -> RelayStats | None:
         """Counts of the positions passed on to the vehicle; None where none are passed on."""
-        if not self._relays:
+        if not self._is_relay_enabled:
             return None
-        kept = {reason: count for reason, count in self._relay.kept.items() if count}
+        kept_counts = {reason: count for reason, count in self._relay.kept.items() if count}
         at_ns = 0 if self._decision is None else self._decision.at_ns
-        alone = bool(self.account.control_error) or (self._controlled_ns is not None and self._controlled_ns < at_ns)
+        has_control_ended = self._last_setpoint_ns is not None and self._last_setpoint_ns < at_ns
         relay = self._relay
         return RelayStats(
-            at_ns=at_ns, sent=relay.sent, kept=kept, last_ns=relay.last_ns, alone=alone, silent_for=relay.silent_for
+            at_ns=at_ns,
+            sent=relay.sent,
+            kept=kept_counts,
+            last_ns=relay.last_ns,
+            alone=bool(self.account.control_error) or has_control_ended,
+            silent_for=relay.silent_for,
         )
 
     @property
     def inertial(self) -> tuple[int, int] | None:
         """Inertial data of the vehicle that are used, and all that came; None where none are used."""
-        return self._links[VEHICLE].inertial_counts if self._feels else None
+        return self._links[VEHICLE].inertial_counts if self._uses_inertial else None
 
     @property
     def plant(self) -> Plant:
@@ -200,7 +211,7 @@ class ControlLoop:
 
     @property
     def let_go(self) -> str:
-        """Reason why the envelope let the vehicle go: what was seen and cannot be; empty as long as nothing was."""
+        """Reason why a monitor has released the vehicle; empty while none has."""
         return "" if self._state.monitors.release is None else self._state.monitors.release.text
 
     @property
@@ -214,121 +225,136 @@ class ControlLoop:
         return None if self.handover_state is HandoverState.WAITING else self.handover_state not in NOT_LEFT_IN_FLIGHT
 
     def receive(self, link: str, data: bytes, at_ns: int) -> Received:
-        """Take one datagram that arrived at `at_ns`; of positions, ticks before that time see nothing."""
+        """Receive one datagram that arrived at `at_ns`; ticks before that time use none of its positions."""
         self._put(raw_topic(link, outgoing=False), at_ns, Datagram(at_ns=at_ns, link=link, outgoing=False, data=data))
         from_vehicle = from_source = False
-        news: tuple[Event, ...] = ()
-        understood = self._links[link].receive(data, at_ns)
-        for item in understood.items:
+        console_events: tuple[Event, ...] = ()
+        received = self._links[link].receive(data, at_ns)
+        for item in received.items:
             from_vehicle = from_vehicle or isinstance(item, VehicleStatus)
             if isinstance(item, Event):
                 self._put("/uavctl/event", at_ns, item)
-                news = (*news, item) if item.code in FOR_A_PERSON else news
-            elif self._feels or not isinstance(item, InertialSample):
+                console_events = (*console_events, item) if item.code in CONSOLE_CODES else console_events
+            elif self._uses_inertial or not isinstance(item, InertialSample):
                 self._inbox.append((at_ns, item))
             if isinstance(item, PositionSample):
-                from_source = understood.is_source_settled
-                if self._relays:
-                    self._relay.add_sample(item, understood.attitude)
-        asked = understood.replies
-        answers = tuple([self._outgoing(link, answer, at_ns) for answer in asked]) if asked else ()
-        return Received(answers, from_vehicle, from_source, news)
+                from_source = received.is_source_settled
+                if self._is_relay_enabled:
+                    self._relay.add_sample(item, received.attitude)
+        replies = received.replies
+        answers = tuple([self._record_outgoing(link, answer, at_ns) for answer in replies]) if replies else ()
+        return Received(answers, from_vehicle, from_source, console_events)
 
     def refused(self, link: str, counts: dict[str, int], at_ns: int) -> tuple[Event, ...]:
-        """Take note that a connection has dropped datagrams unread, and return what a person is to be told of it.
+        """Note that a connection has dropped datagrams unread; return its events for the console.
 
-        Where that was the vehicle's, it may have been that the pilot has taken over: nothing that moves the vehicle is
-        sent until it is heard again.
+        A dropped message of the vehicle may have reported that the pilot took over. So nothing that moves the vehicle
+        is sent until its next heartbeat.
         """
         self._put("/uavctl/refused", at_ns, Refused(at_ns=at_ns, link=link, counts=counts))
         if link == VEHICLE and counts.keys() & {EventCode.HUNG_UP, OVERRUN}:
-            self._unsure_since_ns = at_ns
+            self._messages_lost_ns = at_ns
         events = self._links[link].add_refusals(counts, at_ns)
         for event in events:
             self._put("/uavctl/event", at_ns, event)
-        return tuple([event for event in events if event.code in FOR_A_PERSON])
+        return tuple([event for event in events if event.code in CONSOLE_CODES])
 
     def tick(self, tick: int, at_ns: int, send: Send, missed_ticks: int = 0, stop: bool = False) -> Ticked:
         """Run the control tick of grid time `at_ns`.
 
         Args:
-            send: is given the bytes to send, each as soon as it is known: heartbeats and TIMESYNC before the decision,
-                so that a solve does not delay a round trip.
+            send: Called with the bytes to send, each as soon as it is known: heartbeats and TIMESYNC before the
+                decision, so that a solve does not delay a round trip.
         """
-        inp = self._gather(tick, at_ns, missed_ticks, stop)
+        inputs = self._gather_inputs(tick, at_ns, missed_ticks, stop)
         if stop:
             self.account.note_requested_end(Cause.ENDED_BY_OPERATOR)  # unless who asks has said why
         for name, link in self._links.items():
             for data in link.due(at_ns):
-                send(self._outgoing(name, data, at_ns))
+                send(self._record_outgoing(name, data, at_ns))
         notices: list[Event] = []
-        begun = self._stopwatch()
-        out = self._decide(inp, notices)
-        step_ns = self._stopwatch() - begun
-        self._decision = out.decision
-        self._record(out, at_ns)
+        begin_ns = self._stopwatch()
+        output = self._run_core(inputs, notices)
+        step_ns = self._stopwatch() - begin_ns
+        self._decision = output.decision
+        self._record_output(output, at_ns)
         self.account.release_reason = self.let_go
         self.account.update_vehicle(at_ns, self._vehicle)
-        self.account.add_decision(out.decision, out.events, has_estimate=out.estimate is not None)
-        # A vehicle that climbs or lands must not do so by positions that have just been found to be wrong.
-        if out.position_inconsistent and self._hand_over.has_begun:
-            self._misled_ns = at_ns
-        misled = self._misled_ns is not None and at_ns - self._misled_ns < MISLED_NS
-        held_back = misled or distrusts_positions(self._state)
-        if self._relays and not held_back:
-            for data in self._links[VEHICLE].encode_relayed_poses(
-                self._relay, at_ns, refused=inp.samples if out.newest_inconsistent else out.refused
-            ):
-                send(self._outgoing(VEHICLE, data, at_ns))
-        if self._relays and self._vehicle is not None:
-            silence = self._relay.make_event(at_ns, held_back=held_back, armed=self._vehicle.armed)
-            if silence is not None:
-                self._put("/uavctl/event", at_ns, silence)
-                notices.append(silence)
-        answers: tuple[tuple[Command, Event], ...] = ()
-        if self._adrift:
-            self._hand_over.update_airborne(at_ns, self._vehicle)
-        else:
-            outgoing: list[Outgoing] = []  # what fails in `send` is no failure of the controller
-            try:
-                told = self._hand_over.update(self._view(inp, out))
-                answers = tuple(self._answers(inp.commands, out.events, told.events)) if inp.commands else ()
-                notices += self._noted(told, at_ns)
-                self._command(told, out, at_ns, outgoing.append)
-            except Exception as error:  # noqa: BLE001 the vehicle may be in the air by the positions that it gets
-                self._adrift = True
-                notices.append(self._die(error, at_ns))
-            for one in outgoing:
-                send(one)
+        self.account.add_decision(output.decision, output.events, has_estimate=output.estimate is not None)
+        self._relay_positions(inputs, output, send, notices)
+        answers = self._update_handover(inputs, output, send, notices)
         self.account.is_over = self.finished
         self._record_stats(at_ns)
         return Ticked(
-            decision=out.decision,
-            estimate=out.estimate,
-            link=out.link,
+            decision=output.decision,
+            estimate=output.estimate,
+            link=output.link,
             vehicle=self._vehicle,
             answers=answers,
-            news=tuple([event for event in out.events if event.code in FOR_A_PERSON]),
+            news=tuple([event for event in output.events if event.code in CONSOLE_CODES]),
             notices=tuple(notices),
             step_ns=step_ns,
         )
 
-    def _decide(self, inp: StepInput, notices: list[Event]) -> TickOutput:
-        """Run the core for a tick; a core that has failed is not run again, and the vehicle it flew has to land."""
+    def _relay_positions(self, inputs: StepInput, output: TickOutput, send: Send, notices: list[Event]) -> None:
+        """Pass positions on to the vehicle, but those that contradict its climb or landing."""
+        at_ns = inputs.at_ns
+        if output.position_inconsistent and self._hand_over.has_begun:
+            self._position_inconsistent_ns = at_ns
+        if not self._is_relay_enabled:
+            return
+        since_ns = self._position_inconsistent_ns
+        is_inconsistent = since_ns is not None and at_ns - since_ns < INCONSISTENT_HOLD_NS
+        is_held_back = is_inconsistent or distrusts_positions(self._state)
+        if not is_held_back:
+            refused = inputs.samples if output.newest_inconsistent else output.refused
+            for data in self._links[VEHICLE].encode_relayed_poses(self._relay, at_ns, refused=refused):
+                send(self._record_outgoing(VEHICLE, data, at_ns))
+        if self._vehicle is not None:
+            relay_event = self._relay.make_event(at_ns, held_back=is_held_back, armed=self._vehicle.armed)
+            if relay_event is not None:
+                self._put("/uavctl/event", at_ns, relay_event)
+                notices.append(relay_event)
+
+    def _update_handover(
+        self, inputs: StepInput, output: TickOutput, send: Send, notices: list[Event]
+    ) -> tuple[tuple[Command, Event], ...]:
+        """Update the hand-over and send what it allows; return each order with its answer."""
+        if self._is_handover_failed:
+            self._hand_over.update_airborne(inputs.at_ns, self._vehicle)
+            return ()
+        answers: tuple[tuple[Command, Event], ...] = ()
+        outgoing: list[Outgoing] = []  # what fails in `send` is no failure of the controller
+        try:
+            handover_output = self._hand_over.update(self._make_handover_input(inputs, output))
+            answers = tuple(self._match_answers(inputs.commands, output.events, handover_output.events))
+            notices += self._record_handover(handover_output, inputs.at_ns)
+            self._send_commands(handover_output, output, inputs.at_ns, outgoing.append)
+        except Exception as error:  # noqa: BLE001 the vehicle may be in the air by the positions that it gets
+            self._is_handover_failed = True
+            notices.append(self._report_control_failure(error, inputs.at_ns))
+        for datagram in outgoing:
+            send(datagram)
+        return answers
+
+    def _run_core(self, inputs: StepInput, notices: list[Event]) -> TickOutput:
+        """Run the core for a tick. A core that has failed is not run again; the vehicle that it flew is to land."""
         if not self.account.control_error:
             try:
-                self._state, out = run_tick(self._state, inp, self._controller, carried=self._hand_over.has_begun)
+                self._state, output = run_tick(self._state, inputs, self._controller, carried=self._hand_over.has_begun)
             except Exception as error:  # noqa: BLE001 the vehicle may be in the air by the positions that it gets
-                notices.append(self._die(error, inp.at_ns))
-                return self._without_core(inp, land=self._lands or self._hand_over.is_ordered_flight)
-            return out
-        return self._without_core(inp, land=False)
+                notices.append(self._report_control_failure(error, inputs.at_ns))
+                return self._make_failed_output(
+                    inputs, land=self._lands_on_failure or self._hand_over.is_ordered_flight
+                )
+            return output
+        return self._make_failed_output(inputs, land=False)
 
-    def _without_core(self, inp: StepInput, *, land: bool) -> TickOutput:
-        """A tick of a controller that has failed: nothing is decided; once, the vehicle's own landing is asked for."""
+    def _make_failed_output(self, inputs: StepInput, *, land: bool) -> TickOutput:
+        """Make the output of a tick after the core has failed: no setpoint; `land` asks the vehicle to land."""
         decision = Decision(
-            tick=inp.tick,
-            at_ns=inp.at_ns,
+            tick=inputs.tick,
+            at_ns=inputs.at_ns,
             step=0 if self._decision is None else self._decision.step,
             boundary=False,
             mode=ControlMode.STOPPED,
@@ -339,19 +365,15 @@ class ControlLoop:
             solve=None,
             input=None,
             fresh=0,
-            missed_ticks=inp.missed_ticks,
+            missed_ticks=inputs.missed_ticks,
             accepted=0,
             rejected=0,
-            reason=f"{FAILED} {self.account.control_error}",
+            reason=f"{CONTROL_FAILED_TEXT} {self.account.control_error}",
         )
         return TickOutput(estimate=None, plan=None, decision=decision, setpoint=None, events=(), land=land)
 
-    def _die(self, error: Exception, at_ns: int) -> Event:
-        """Note that the controller has failed: no setpoint is sent any more; positions still go to the vehicle.
-
-        Returns:
-            The event that tells it, for a person.
-        """
+    def _report_control_failure(self, error: Exception, at_ns: int) -> Event:
+        """Note that the controller has failed, and return its event: no setpoint is sent; the relay goes on."""
         last = next(reversed(extract_tb(error.__traceback__)), None)
         where = "" if last is None else f" ({last.filename.rpartition('/')[2]}, line {last.lineno})"
         self.account.control_error = self.account.control_error or f"{in_words(error)}{where}"
@@ -359,7 +381,7 @@ class ControlLoop:
             at_ns=at_ns,
             severity=Severity.ERROR,
             code=EventCode.CONTROL_FAILED,
-            text=f"{FAILED} {self.account.control_error}",
+            text=f"{CONTROL_FAILED_TEXT} {self.account.control_error}",
         )
         self._put("/uavctl/event", at_ns, event)
         return event
@@ -378,16 +400,16 @@ class ControlLoop:
         return self._controller.outside
 
     def answered(self, took_ns: int) -> None:
-        """Take note of how long that one took for the plan of the last tick; the next one judges it."""
-        self._answered_ns = took_ns
+        """Note the time that a controller of another package took for its last plan; the next tick judges it."""
+        self._external_solve_ns = took_ns
 
     def explain_refusal(self, order: Order) -> str:
         """Return why an order of where to fly would have no effect now; empty if it may be taken, or is another one."""
-        moves = order in (Order.GOTO, Order.HOLD, Order.RESUME)
-        return explain_move_refusal(self.handover_state, self._vehicle) if moves else ""
+        is_move = order in (Order.GOTO, Order.HOLD, Order.RESUME)
+        return explain_move_refusal(self.handover_state, self._vehicle) if is_move else ""
 
     def timing(self, ticked: Ticked, lateness_ns: int, send_ns: int) -> None:
-        """Record what the shell measured around a tick."""
+        """Record the times that the shell measured around a tick."""
         estimate, at_ns = ticked.estimate, ticked.decision.at_ns
         self._put(
             "/uavctl/timing",
@@ -402,10 +424,10 @@ class ControlLoop:
             ),
         )
 
-    def _gather(self, tick: int, at_ns: int, missed_ticks: int, stop: bool) -> StepInput:
-        """Gather the inputs of the tick; they are recorded first, so that a replay knows when the tick ran."""
-        samples, heard, self._heard = self._take_due(at_ns)
-        inp = StepInput(
+    def _gather_inputs(self, tick: int, at_ns: int, missed_ticks: int, stop: bool) -> StepInput:
+        """Gather the inputs of the tick. They are recorded first, so that a replay knows when the tick ran."""
+        samples, statuses, self._vehicle_messages = self._take_due_messages(at_ns)
+        inputs = StepInput(
             tick=tick,
             at_ns=at_ns,
             samples=samples,
@@ -415,96 +437,97 @@ class ControlLoop:
             missed_ticks=missed_ticks,
             stop=stop,
             commands=tuple(self._orders),
-            answered_ns=self._answered_ns,
+            answered_ns=self._external_solve_ns,
         )
         self._orders.clear()
-        self._answered_ns = 0
-        self._put("/uavctl/step_input", at_ns, inp)
-        for status in heard:
+        self._external_solve_ns = 0
+        self._put("/uavctl/step_input", at_ns, inputs)
+        for status in statuses:
             self._put("/uavctl/vehicle", status.at_ns, status)
-        return inp
+        return inputs
 
-    def _take_due(
+    def _take_due_messages(
         self, at_ns: int
     ) -> tuple[tuple[PositionSample, ...], tuple[VehicleStatus, ...], tuple[CommandAck | StatusText, ...]]:
-        """Samples that arrived up to `at_ns`, and all that the vehicle has said: its newest state is taken over.
+        """Take the samples that arrived up to `at_ns`, and all other messages of the vehicle.
 
-        What it says counts in a late tick too, when it came after the time of the tick: it may be that the pilot flies.
-        That he does is not overtaken by a later word in the same backlog.
+        Its messages count even if they came after the time of a late tick: they may report that the pilot flies. A
+        later status of the same batch does not hide that.
         """
         samples: list[PositionSample] = []
-        heard: list[VehicleStatus] = []
-        words: list[CommandAck | StatusText] = []
-        felt: list[InertialSample] = []
-        waiting: deque[tuple[int, Heard]] = deque()
+        statuses: list[VehicleStatus] = []
+        messages: list[CommandAck | StatusText] = []
+        inertial: list[InertialSample] = []
+        later_items: deque[tuple[int, ReceivedItem]] = deque()
         for received_ns, item in self._inbox:
             if isinstance(item, VehicleStatus):
-                heard.append(item)
+                statuses.append(item)
             elif isinstance(item, VehicleMotion):
                 self._motion = item
             elif not isinstance(item, PositionSample | InertialSample):
-                words.append(item)
+                messages.append(item)
             elif received_ns <= at_ns and isinstance(item, InertialSample):
-                felt.append(item)
+                inertial.append(item)
             elif received_ns <= at_ns and isinstance(item, PositionSample):
                 samples.append(item)
             else:
-                waiting.append((received_ns, item))
-        self._inbox, self._inertial = waiting, tuple(felt[-MAX_INERTIAL:])
+                later_items.append((received_ns, item))
+        self._inbox, self._inertial = later_items, tuple(inertial[-MAX_INERTIAL:])
         flown = self._hand_over.state is HandoverState.ENGAGED
-        left = [status for status in heard if flown and self._hand_over.has_left_external_mode(status)]
-        # Of the mode that it left for the newest word counts: it may say who has chosen it.
-        left = [status for status in left if status.mode == left[0].mode]
-        self._vehicle = next(iter((left or heard)[::-1]), self._vehicle)
-        if heard and self._unsure_since_ns is not None and heard[-1].at_ns > self._unsure_since_ns:
-            self._unsure_since_ns = None
-        return _newest_of_each(samples), tuple(heard), tuple(words)
+        left_statuses = [status for status in statuses if flown and self._hand_over.has_left_external_mode(status)]
+        # The newest status with the mode that it left for counts: it may have the reason of the change.
+        left_statuses = [status for status in left_statuses if status.mode == left_statuses[0].mode]
+        self._vehicle = next(iter((left_statuses or statuses)[::-1]), self._vehicle)
+        if statuses and self._messages_lost_ns is not None and statuses[-1].at_ns > self._messages_lost_ns:
+            self._messages_lost_ns = None
+        return _select_newest(samples), tuple(statuses), tuple(messages)
 
-    def _record(self, out: TickOutput, at_ns: int) -> None:
-        if out.estimate is not None:
-            self._put("/uavctl/estimate", at_ns, out.estimate)
-        if out.link is not None:
-            self._put("/uavctl/link_estimate", at_ns, out.link)
-        if out.plan is not None:
-            self._put("/uavctl/plan", at_ns, out.plan)
-        self._put("/uavctl/decision", at_ns, out.decision)
-        for event in out.events:
+    def _record_output(self, output: TickOutput, at_ns: int) -> None:
+        if output.estimate is not None:
+            self._put("/uavctl/estimate", at_ns, output.estimate)
+        if output.link is not None:
+            self._put("/uavctl/link_estimate", at_ns, output.link)
+        if output.plan is not None:
+            self._put("/uavctl/plan", at_ns, output.plan)
+        self._put("/uavctl/decision", at_ns, output.decision)
+        for event in output.events:
             self._put("/uavctl/event", at_ns, event)
 
-    def _noted(self, told: HandoverOutput, at_ns: int) -> Iterator[Event]:
-        """Note what the hand-over did; yields what a person has to be told of it: whoever ordered gets the answer."""
-        if told.transition is not None:
-            self.account.add_transition(told.transition, self._vehicle)
-        for event in told.events:
+    def _record_handover(self, handover_output: HandoverOutput, at_ns: int) -> Iterator[Event]:
+        """Record the hand-over's events; yield those for the console. Refused orders are answered to their sender."""
+        if handover_output.transition is not None:
+            self.account.add_transition(handover_output.transition, self._vehicle)
+        for event in handover_output.events:
             self._put("/uavctl/event", at_ns, event)
             if event.severity is not Severity.INFO and event.code != EventCode.ORDER_REFUSED:
                 yield event
 
-    def _command(self, told: HandoverOutput, out: TickOutput, at_ns: int, send: Send) -> None:
-        """Send the vehicle what the hand-over wants: a setpoint, a request, or nothing."""
+    def _send_commands(self, handover_output: HandoverOutput, output: TickOutput, at_ns: int, send: Send) -> None:
+        """Send the vehicle what the hand-over allows: a setpoint, a request, or nothing."""
         link = self._links[VEHICLE]
-        sure = self._unsure_since_ns is None
-        if sure and told.setpoint_mode is not SetpointMode.NOTHING and out.setpoint is not None:
-            self._put("/uavctl/setpoint", at_ns, out.setpoint)
-            if told.setpoint_mode is SetpointMode.SETPOINTS:
-                self._controlled_ns = at_ns
-            send(self._outgoing(VEHICLE, link.encode_setpoint(out.setpoint), at_ns))
-        if sure and told.request is not None:
-            send(self._outgoing(VEHICLE, link.encode_request(told.request, self._hand_over.height_m), at_ns))
+        is_state_known = self._messages_lost_ns is None
+        if is_state_known and handover_output.setpoint_mode is not SetpointMode.NOTHING and output.setpoint is not None:
+            self._put("/uavctl/setpoint", at_ns, output.setpoint)
+            if handover_output.setpoint_mode is SetpointMode.SETPOINTS:
+                self._last_setpoint_ns = at_ns
+            send(self._record_outgoing(VEHICLE, link.encode_setpoint(output.setpoint), at_ns))
+        if is_state_known and handover_output.request is not None:
+            data = link.encode_request(handover_output.request, self._hand_over.height_m)
+            send(self._record_outgoing(VEHICLE, data, at_ns))
         if self._hand_over.is_ordered_flight and self._hand_over.state in (
             HandoverState.READY,
             HandoverState.MODE,
             HandoverState.ARMING,
         ):
-            for data in link.setup_global_origin(at_ns, self._config.origin_deg_m):
-                send(self._outgoing(VEHICLE, data, at_ns))
+            for data in link.setup_global_origin(at_ns, self._handover_config.origin_deg_m):
+                send(self._record_outgoing(VEHICLE, data, at_ns))
 
-    def _answers(
+    def _match_answers(
         self, commands: tuple[Command, ...], core: tuple[Event, ...], hand_over: tuple[Event, ...]
     ) -> Iterator[tuple[Command, Event]]:
-        """Each order with its answer; a landing that the core does not fly, and the hand-over asks for, is accepted."""
-        for command, event in _answered(commands, core, hand_over):
-            landing = (
+        """Yield each order with its answer; a landing that the hand-over asks for is accepted, too."""
+        for command, event in _pair_answers(commands, core, hand_over):
+            is_landing_accepted = (
                 command.order is Order.LAND
                 and event.code == EventCode.ORDER_REFUSED
                 and self.handover_state is HandoverState.LANDING
@@ -512,40 +535,42 @@ class ControlLoop:
             text = "land: the vehicle is asked for it"
             yield (
                 command,
-                replace(event, severity=Severity.INFO, code=EventCode.ORDER_ACCEPTED, text=text) if landing else event,
+                replace(event, severity=Severity.INFO, code=EventCode.ORDER_ACCEPTED, text=text)
+                if is_landing_accepted
+                else event,
             )
 
-    def _view(self, inp: StepInput, out: TickOutput) -> HandoverInput:
+    def _make_handover_input(self, inputs: StepInput, output: TickOutput) -> HandoverInput:
         """Return the inputs of the hand-over in this tick."""
-        plant, estimate = self._controller.plant, out.estimate
+        plant, estimate = self._controller.plant, output.estimate
         up_m, up_mps = None, 0.0
         if estimate is not None and "down" in plant.axes:
             down = plant.axes.index("down")
             up_m, up_mps = -estimate.mean[plant.position_index[down]], -estimate.mean[plant.velocity_index[down]]
-        unfit = ""
-        if out.setpoint is None or estimate is None:
-            unfit = "the controller has no estimate of the position"
-        elif estimate.age_s > self._config.fresh_s:
-            unfit = f"the newest position is {estimate.age_s:.1f} s old"
+        arming_refusal = ""
+        if output.setpoint is None or estimate is None:
+            arming_refusal = "the controller has no estimate of the position"
+        elif estimate.age_s > self._handover_config.fresh_s:
+            arming_refusal = f"the newest position is {estimate.age_s:.1f} s old"
         return HandoverInput(
-            at_ns=inp.at_ns,
+            at_ns=inputs.at_ns,
             vehicle=self._vehicle,
-            uptime_s=self._links[VEHICLE].vehicle_uptime_s(inp.at_ns),
-            has_setpoint=out.setpoint is not None,
-            is_landing_requested=out.land,
-            is_stop_requested=inp.stop,
-            may_have_lost_messages=self._unsure_since_ns is not None,
-            arming_refusal=unfit,
-            climb_hazard=out.unsafe_to_climb,
+            uptime_s=self._links[VEHICLE].vehicle_uptime_s(inputs.at_ns),
+            has_setpoint=output.setpoint is not None,
+            is_landing_requested=output.land,
+            is_stop_requested=inputs.stop,
+            may_have_lost_messages=self._messages_lost_ns is not None,
+            arming_refusal=arming_refusal,
+            climb_hazard=output.unsafe_to_climb,
             estimated_height_m=up_m,
             climb_rate_mps=up_mps,
-            has_motion=moves_now(self._motion, inp.at_ns),
-            messages=self._heard,
-            commands=inp.commands,
+            has_motion=moves_now(self._motion, inputs.at_ns),
+            messages=self._vehicle_messages,
+            commands=inputs.commands,
         )
 
-    def _outgoing(self, link: str, data: bytes, at_ns: int) -> Outgoing:
-        """Bytes that are about to be sent, recorded as such."""
+    def _record_outgoing(self, link: str, data: bytes, at_ns: int) -> Outgoing:
+        """Record bytes that are about to be sent, and return them with their connection."""
         self._put(raw_topic(link, outgoing=True), at_ns, Datagram(at_ns=at_ns, link=link, outgoing=True, data=data))
         return Outgoing(link=link, data=data)
 
@@ -561,28 +586,28 @@ class ControlLoop:
                 self._put("/uavctl/relay", at_ns, relay)
 
 
-def _newest_of_each(samples: list[PositionSample]) -> tuple[PositionSample, ...]:
-    """Return as many samples as a tick may look at, in order; a source that sends many takes no room of another's."""
+def _select_newest(samples: list[PositionSample]) -> tuple[PositionSample, ...]:
+    """Return at most `MAX_SAMPLES` samples, in order; a source that sends many displaces none of another source."""
     if len(samples) <= MAX_SAMPLES:
         return tuple(samples)
-    behind: Counter[str] = Counter()  # newer samples of the same source
+    newer_counts: Counter[str] = Counter()  # newer samples of the same source
     ranks = [0] * len(samples)
-    for place in range(len(samples) - 1, -1, -1):
-        ranks[place] = behind[samples[place].source]
-        behind[samples[place].source] += 1
-    chosen = sorted(range(len(samples)), key=lambda place: (ranks[place], -place))[:MAX_SAMPLES]
-    return tuple(samples[place] for place in sorted(chosen))
+    for index in range(len(samples) - 1, -1, -1):
+        ranks[index] = newer_counts[samples[index].source]
+        newer_counts[samples[index].source] += 1
+    newest_indices = sorted(range(len(samples)), key=lambda index: (ranks[index], -index))[:MAX_SAMPLES]
+    return tuple(samples[index] for index in sorted(newest_indices))
 
 
-def _answered(
+def _pair_answers(
     commands: tuple[Command, ...], core: Iterable[Event], hand_over: Iterable[Event]
 ) -> Iterator[tuple[Command, Event]]:
-    """Each order with the event that answers it; the core and the hand-over answer their own, in order."""
-    mine, theirs = (
+    """Yield each order with the event that answers it; core and hand-over answer their own orders, in sequence."""
+    handover_answers, core_answers = (
         iter([event for event in events if event.code in (EventCode.ORDER_ACCEPTED, EventCode.ORDER_REFUSED)])
         for events in (hand_over, core)
     )
     for command in commands:
-        answer = next(mine if command.order in HAND_OVER_ORDERS else theirs, None)
+        answer = next(handover_answers if command.order in HAND_OVER_ORDERS else core_answers, None)
         if answer is not None:
             yield command, answer
