@@ -112,7 +112,7 @@ class FlightScene:
         self._design: DesignView | None = None
         self._name: str | None = None  # of the configuration
 
-    def see(self, record: Record) -> None:
+    def add_record(self, record: Record) -> None:
         """Take a record."""
         self._newest[type(record)] = record
         if isinstance(record, Event):
@@ -135,8 +135,8 @@ class FlightScene:
         bodies = []
         if estimate is not None and design is not None:
             level: Level = "good" if decision.news else "warn"
-            place = design.position_of(estimate.mean)
-            bodies.append(SceneBody("estimate", place, level if decision.mode in _IN_CONTROL else "bad"))
+            position = design.position_of(estimate.mean)
+            bodies.append(SceneBody("estimate", position, level if decision.mode in _IN_CONTROL else "bad"))
         if truth is not None:
             bodies.append(SceneBody("truth", truth.position_m, "plain"))
         current = plan if plan is not None and plan.seq == decision.plan_seq else None
@@ -155,14 +155,14 @@ class FlightScene:
             else _make_box(design, *tighten_limits(design, current.backoff_x, -1)),
             age_s=age_s,
             age_limit_s=limit_s,
-            figures=tuple(self._figures(decision, current)),
+            figures=tuple(self._list_figures(decision, current)),
             events=tuple(
                 SceneEvent((event.at_ns - header.started_ns) * 1e-9, _LEVELS[event.severity], event.text)
                 for event in reversed(self._events.copy())
             ),
         )
 
-    def _figures(self, decision: Decision, plan: Plan | None) -> Iterator[SceneFigure]:
+    def _list_figures(self, decision: Decision, plan: Plan | None) -> Iterator[SceneFigure]:
         vehicle, setpoint = self._get(VehicleStatus), self._get(Setpoint)
         link, timing = self._get(LinkEstimate), self._get(Timing)
         if vehicle is None:
@@ -175,26 +175,28 @@ class FlightScene:
         if link is not None and link.below_promise:
             yield SceneFigure("positions", "fewer in time than counted on", "warn")
         if setpoint is not None:
-            told = ", ".join(f"{value:+.2f}" for value in setpoint.accel_mps2)
+            accel_text = ", ".join(f"{value:+.2f}" for value in setpoint.accel_mps2)
             limited = f" (limited: {', '.join(setpoint.limited)})" if setpoint.limited else ""
-            yield SceneFigure("setpoint N, E, D [m/s²]", told + limited, "warn" if limited else "plain")
+            yield SceneFigure("setpoint N, E, D [m/s²]", accel_text + limited, "warn" if limited else "plain")
         if plan is not None:
-            gave = f", gave way by {plan.slack:.2g}" if plan.gave_way else ""
-            yield SceneFigure("plan", f"{plan.status.value}, {plan.method}{gave}", "warn" if gave else "plain")
+            relaxed_text = f", gave way by {plan.slack:.2g}" if plan.gave_way else ""
+            yield SceneFigure(
+                "plan", f"{plan.status.value}, {plan.method}{relaxed_text}", "warn" if relaxed_text else "plain"
+            )
         if decision.unexplained_mps2 is not None:
             yield SceneFigure("unexplained acceleration", f"{decision.unexplained_mps2:.2f} m/s²")
         if timing is not None:
             yield SceneFigure("tick late by", f"{timing.lateness_ns * 1e-6:.1f} ms")
 
     def _get(self, kind: type[R]) -> R | None:
-        found = self._newest.get(kind)
-        return found if isinstance(found, kind) else None
+        record = self._newest.get(kind)
+        return record if isinstance(record, kind) else None
 
 
 def _make_headline(decision: Decision, age_s: float | None) -> str:
     age = "no position yet" if age_s is None else f"newest position {age_s:.2f} s old"
-    why = "" if decision.mode in _IN_CONTROL else decision.reason
-    return f"{decision.mode.value}: {why or age}"
+    reason = "" if decision.mode in _IN_CONTROL else decision.reason
+    return f"{decision.mode.value}: {reason or age}"
 
 
 def _get_level(decision: Decision, age_s: float | None, limit_s: float | None) -> Level:
@@ -212,11 +214,11 @@ def _make_box(design: DesignView, lower: Array, upper: Array) -> SceneBox:
     """Return the limits of the positions among those of the states."""
     sides: list[tuple[float | None, ...]] = []
     for limits in (lower, upper):
-        found: list[float | None] = [None, None, None]
+        bounds: list[float | None] = [None, None, None]
         for axis, index in zip(design.axes, design.position_index, strict=True):
             if math.isfinite(limits[index]):
-                found[AXIS_NUMBER[axis]] = float(limits[index])
-        sides.append(tuple(found))
+                bounds[AXIS_NUMBER[axis]] = float(limits[index])
+        sides.append(tuple(bounds))
     return SceneBox(*sides)
 
 
@@ -224,7 +226,7 @@ Look = Callable[[], LiveScene | None]
 
 
 @contextmanager
-def serve_live_page(look: Look, port: int) -> Iterator[str]:
+def serve_live_page(get_scene: Look, port: int) -> Iterator[str]:
     """Serve the page on this machine alone; yields its address.
 
     Args:
@@ -237,7 +239,7 @@ def serve_live_page(look: Look, port: int) -> Iterator[str]:
     if not 0 <= port <= 65535:
         raise UsageError(f"live page: port {port}; ports are 1 to 65535, and 0 takes one that is free")
     try:
-        server = _Server(look, port)
+        server = _Server(get_scene, port)
     except OSError as error:
         raise UsageError(
             f"live page: port {port} cannot be had ({error.strerror}); choose another, or 0 for one that is free"

@@ -123,9 +123,9 @@ class DiskFile:
 
     def write(self, data: bytes) -> None:
         """Hand all of `data` to the operating system."""
-        rest = memoryview(data)
-        while rest:
-            rest = rest[os.write(self._fd, rest) :]
+        remaining = memoryview(data)
+        while remaining:
+            remaining = remaining[os.write(self._fd, remaining) :]
 
     def truncate(self, size: int) -> None:
         """Cut the file to `size` bytes and go on writing there."""
@@ -191,18 +191,18 @@ class FreeSpaceMonitor:
 
     def __init__(self, folder: Path, free: Callable[[Path], int | None], low_bytes: int, stop_bytes: int) -> None:
         self._folder, self._free, self._low_bytes, self._stop_bytes = folder, free, low_bytes, stop_bytes
-        self.low = self.resting = False
+        self.low = self.is_paused = False
         self.text = ""
 
-    def look(self) -> None:
+    def check(self) -> None:
         """Look at the free space."""
         free = self._free(self._folder)
         if free is None:
             return
         self.low = free < self._low_bytes
-        self.resting = free < self._stop_bytes or (self.resting and self.low)
+        self.is_paused = free < self._stop_bytes or (self.is_paused and self.low)
         self.text = f"{free} bytes free in {self._folder}" + (
-            f"; recording rests until there are {self._low_bytes}" if self.resting else ""
+            f"; recording rests until there are {self._low_bytes}" if self.is_paused else ""
         )
 
 
@@ -213,15 +213,15 @@ def check_free_space(path: Path, free_bytes: int) -> int:
         RecordingError: there is such a recording, less than `free_bytes`, or the folder cannot be made or written.
     """
     try:
-        taken = [file for file in (path, *find_later_segments(path)) if file.exists()]
+        existing_files = [file for file in (path, *find_later_segments(path)) if file.exists()]
         path.parent.mkdir(parents=True, exist_ok=True)
         free = shutil.disk_usage(path.parent).free
     except OSError as error:
         raise RecordingError(
             f"{path.parent}: the folder cannot be made ({error.strerror}); choose another folder for the recording"
         ) from error
-    if taken:
-        raise RecordingError(f"{taken[0]} exists and a recording never overwrites; choose another folder")
+    if existing_files:
+        raise RecordingError(f"{existing_files[0]} exists and a recording never overwrites; choose another folder")
     if not os.access(path.parent, os.W_OK):
         raise RecordingError(f"{path.parent}: not writable; choose another folder for the recording")
     if free < free_bytes:
@@ -250,12 +250,12 @@ def remove_empty_folders(files: Iterable[Path]) -> Iterator[None]:
 @contextmanager
 def remove_on_error(files: Sequence[Path]) -> Iterator[None]:
     """After an error or an interruption, remove files and folders that were not there before."""
-    new = [file for file in files if not _exists(file)]
+    new_files = [file for file in files if not _exists(file)]
     with remove_empty_folders(files):
         try:
             yield
         except BaseException:
-            for file in new:
+            for file in new_files:
                 with suppress(OSError):
                     file.unlink()
             raise
@@ -346,9 +346,9 @@ def write_temporary_files(targets: Sequence[Path]) -> Iterator[Mapping[Path, Pat
         for target, part in parts.items():
             part.replace(target)
     except OSError as error:
-        where = error.filename or targets[0].parent
+        path = error.filename or targets[0].parent
         reason = os.strerror(error.errno) if error.errno else error
-        raise RecordingError(f"{where}: cannot be written ({reason}); make room or choose another place") from error
+        raise RecordingError(f"{path}: cannot be written ({reason}); make room or choose another place") from error
     finally:
         for part in parts.values():
             with contextlib.suppress(OSError):

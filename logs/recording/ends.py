@@ -73,8 +73,8 @@ def put_header(
 
 def describe_ending(ending: Ending, status: RecorderStatus) -> Ending:
     """Return how a flight ended, with the state of its recording."""
-    why = status.reason or status.refusal or "the disk was too slow"
-    return ending if status.ok else report_lost_records(ending, max(count_missing_records(status), 1), why)
+    reason = status.reason or status.refusal or "the disk was too slow"
+    return ending if status.ok else report_lost_records(ending, max(count_missing_records(status), 1), reason)
 
 
 def count_missing_records(status: RecorderStatus) -> int:

@@ -102,9 +102,9 @@ class _Parts:
 
     def put(self, value: Any, row: list[Cell]) -> None:
         """Append the cells of a value, one for each column."""
-        held = {} if value is None else self._parts(value)
+        parts = {} if value is None else self._parts(value)
         for key, form in self._forms.items():
-            form.put(held.get(key), row)
+            form.put(parts.get(key), row)
 
 
 # How values of one type stand in columns; told all values first, then asked for the cells of each.
@@ -150,8 +150,8 @@ def _choose_form(kind: Any) -> _Form:
 def _remove_none(kind: Any) -> Any:
     """Return a type without None."""
     if isinstance(kind, types.UnionType) or typing.get_origin(kind) is typing.Union:
-        (rest,) = (member for member in typing.get_args(kind) if member is not types.NoneType)
-        return rest
+        (member_type,) = (member for member in typing.get_args(kind) if member is not types.NoneType)
+        return member_type
     return kind
 
 
@@ -229,8 +229,8 @@ class Tables:
         yield topic, table.row(times, record)
         for field, _ in table.lists:
             name = f"{topic}.{field}"
-            for place, item in enumerate(getattr(record, field)):
-                yield name, self._tables[name].row((*times, number, place), item)
+            for index, item in enumerate(getattr(record, field)):
+                yield name, self._tables[name].row((*times, number, index), item)
 
     def _table(self, name: str, lead: tuple[str, ...], kind: type[msgspec.Struct]) -> _Table:
         if name not in self._tables:
@@ -288,8 +288,8 @@ def count_messages(flight: Path) -> int | None:
     if lacks_end(flight):
         return None
     number = 0
-    for place, path in enumerate(segment_files(flight)):
-        left_out = {HEADER, LIBRARY} if place else set()  # which later files repeat
+    for index, path in enumerate(segment_files(flight)):
+        left_out = {HEADER, LIBRARY} if index else set()  # which later files repeat
         try:
             with path.open("rb") as file:
                 summary = make_reader(file).get_summary()
@@ -397,18 +397,18 @@ def _format_date(utc_ns: Cell) -> str:
 @contextmanager
 def _write_csv(path: Path, columns: tuple[TableColumn, ...]) -> Iterator[_Write]:
     """CSV (RFC 4180) with a line of names; floats are written so that they read back exactly, bytes in hexadecimal."""
-    in_bytes = tuple(place for place, column in enumerate(columns) if column.kind is bytes)
-    instants = tuple(place for place, column in enumerate(columns) if column.kind is Instant)
+    in_bytes = tuple(index for index, column in enumerate(columns) if column.kind is bytes)
+    instants = tuple(index for index, column in enumerate(columns) if column.kind is Instant)
     with path.open("w", newline="", encoding=CSV_ENCODING) as file:
         rows = csv.writer(file)
         rows.writerow([column.name for column in columns])
 
         def write(row: list[Cell]) -> None:
-            for place in in_bytes:
-                held = row[place]
-                row[place] = held.hex() if isinstance(held, bytes) else None
-            for place in instants:
-                row[place] = _format_date(row[place])
+            for index in in_bytes:
+                value = row[index]
+                row[index] = value.hex() if isinstance(value, bytes) else None
+            for index in instants:
+                row[index] = _format_date(row[index])
             rows.writerow(row)
 
         yield write

@@ -306,11 +306,11 @@ class Steps:
 
 def _find_nearest(known_ns: NDArray[np.int64], wanted_ns: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the index of the known time nearest to each wanted one; 0 if none is known."""
-    right = np.clip(np.searchsorted(known_ns, wanted_ns), 0, max(0, len(known_ns) - 1))
-    left = np.maximum(right - 1, 0)
+    right_index = np.clip(np.searchsorted(known_ns, wanted_ns), 0, max(0, len(known_ns) - 1))
+    left = np.maximum(right_index - 1, 0)
     if not len(known_ns):
-        return right
-    return np.where(np.abs(known_ns[left] - wanted_ns) < np.abs(known_ns[right] - wanted_ns), left, right)
+        return right_index
+    return np.where(np.abs(known_ns[left] - wanted_ns) < np.abs(known_ns[right_index] - wanted_ns), left, right_index)
 
 
 def _find_applied_inputs(flight: FlightData, at_ns: NDArray[np.int64]) -> Array:

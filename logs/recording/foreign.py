@@ -141,18 +141,18 @@ def _parse_definition(top: str, text: str) -> Definitions:
 
 def _parse_field(line: str, owner: str) -> _RosField | None:
     """Return a field of a definition; None for a constant."""
-    found = _FIELD.match(line)
-    if found is None:
+    match = _FIELD.match(line)
+    if match is None:
         raise UnreadableError(f"cannot make sense of {line!r}")
-    if found["rest"].lstrip().startswith("="):
+    if match["rest"].lstrip().startswith("="):
         return None
-    kind = _normalise_type_name(found["type"])
+    kind = _normalise_type_name(match["type"])
     if kind == "Header":
         kind = "std_msgs/Header"
     elif "/" not in kind and kind not in _NUMBERS and kind not in _STAMPS and kind not in ("string", "wstring"):
         kind = f"{owner.rpartition('/')[0]}/{kind}"
-    size = int(found["size"]) if found["array"] and found["size"] and "<=" not in found["array"] else 0
-    return _RosField(kind, found["name"], size if found["array"] else None)
+    size = int(match["size"]) if match["array"] and match["size"] and "<=" not in match["array"] else 0
+    return _RosField(kind, match["name"], size if match["array"] else None)
 
 
 class _RosReader:
@@ -176,16 +176,16 @@ class _RosReader:
 
     def _field(self, field: _RosField) -> Value:
         if field.size is None:
-            return self._one(field.type)
+            return self._read_value(field.type)
         length = field.size or self._number("I")
         letter = _NUMBERS.get(field.type)
         if letter is None:
             if length > len(self._data):
                 raise UnreadableError("it is too short")
-            return [self._one(field.type) for _ in range(length)]
+            return [self._read_value(field.type) for _ in range(length)]
         return list(self._numbers(letter, length))
 
-    def _one(self, kind: str) -> Value:
+    def _read_value(self, kind: str) -> Value:
         if kind in _NUMBERS:
             return self._number(_NUMBERS[kind])
         if kind in _STAMPS:
@@ -260,7 +260,7 @@ class FrameStream:
 
     # Its frames in the order of the stream, each at the time of the piece that its last byte came in
     packets: tuple[TlogPacket, ...]
-    right: int  # those of a known id with the right checksum
+    valid_count: int  # those of a known id with the right checksum
     left_out_bytes: int  # bytes that are no frame: garbage, and frames that were cut
 
 
@@ -278,7 +278,7 @@ def cut_stream(pieces: list[tuple[int, bytes]]) -> FrameStream:
         at += len(piece)
         ends.append(at)
     packets: list[TlogPacket] = []
-    at = right = left_out = 0
+    at = valid_count = left_out = 0
     in_step = True  # what is before `at` was a frame
     while at < len(data):
         end = at + get_frame_length(data, at)
@@ -289,14 +289,14 @@ def cut_stream(pieces: list[tuple[int, bytes]]) -> FrameStream:
             end = find_next_marker(data, at + 1)
             left_out += end - at
         else:
-            right += checked
+            valid_count += checked
             packets.append(make_packet(pieces[bisect_right(ends, end - 1)][0], data[at:end]))
         at = end
-    return FrameStream(tuple(packets), right, left_out)
+    return FrameStream(tuple(packets), valid_count, left_out)
 
 
 _OURS = "/uavctl/"
-_TOLD = 12  # channels that an error names
+_MAX_NAMED_CHANNELS = 12  # channels that an error names
 _PROBED_BYTES = 65_536  # without a frame in so many a channel holds something else
 # What the library raises on bytes that are no MCAP: its own, and those of the formats within.
 _DAMAGE = (McapError, ValueError, OverflowError, RuntimeError, struct.error, zstandard.ZstdError)
@@ -320,33 +320,33 @@ class _ChannelStream:
         wanted: It was asked for, so it is read however little MAVLink is in it.
     """
 
-    def __init__(self, channel: Channel, schema: Schema | None, *, wanted: bool) -> None:
+    def __init__(self, channel: Channel, schema: Schema | None, *, is_requested: bool) -> None:
         self.topic, self.encoding = channel.topic, channel.message_encoding
         self.kind = "" if schema is None else schema.name
         self.messages = 0
         self._unwrap: Callable[[bytes], bytes] | None = None
         if schema is not None:
             self._unwrap = make_unwrapper(self.encoding, schema.encoding, schema.name, schema.data)
-        self._wanted = wanted
+        self._is_requested = is_requested
         self._pieces: list[tuple[int, bytes]] = []
-        self._probe: bytearray | None = None if wanted or self._unwrap else bytearray()
-        self._given_up = False
-        self._unreadable, self._why = 0, ""
+        self._probe: bytearray | None = None if is_requested or self._unwrap else bytearray()
+        self._is_unreadable = False
+        self._unreadable, self._reason = 0, ""
 
     def take(self, at_ns: int, data: bytes) -> None:
         """Take a message of log time `at_ns`."""
         self.messages += 1
-        if self._given_up:
+        if self._is_unreadable:
             return
         if self._unwrap is not None:
             try:
                 data = self._unwrap(data)
             except UnreadableError as error:
-                self._unreadable, self._why = self._unreadable + 1, str(error)
+                self._unreadable, self._reason = self._unreadable + 1, str(error)
                 return
         self._pieces.append((at_ns, data))
         if self._probe is not None:
-            self._look(data)
+            self._inspect(data)
 
     def packets(self) -> tuple[tuple[TlogPacket, ...], tuple[str, ...]]:
         """Return the channel's packets, none if it holds no MAVLink, and remarks on it.
@@ -357,34 +357,34 @@ class _ChannelStream:
         clock = MonotonicClock()
         pieces = [(clock.steady(at_ns), data) for at_ns, data in self._pieces]
         # A recorder of several threads writes not in order; a clock that was set back has been put right.
-        found = cut_stream(sorted(pieces, key=lambda piece: piece[0]))
+        stream = cut_stream(sorted(pieces, key=lambda piece: piece[0]))
         notes = []
         if self._unreadable:
-            notes.append(f"{self.topic}: {count(self._unreadable, 'message')} left out: {self._why}")
-        mostly = 2 * found.left_out_bytes < sum(len(data) for _, data in pieces)
-        if found.right and not (mostly or self._wanted):
+            notes.append(f"{self.topic}: {count(self._unreadable, 'message')} left out: {self._reason}")
+        mostly = 2 * stream.left_out_bytes < sum(len(data) for _, data in pieces)
+        if stream.valid_count and not (mostly or self._is_requested):
             notes.append(f"{self.topic}: not taken, most of it is no MAVLink; `--topic {self.topic}` takes it")
-        if not found.right or not (mostly or self._wanted):
+        if not stream.valid_count or not (mostly or self._is_requested):
             return (), tuple(notes)
         clock.check(self.topic)
-        if found.left_out_bytes:
-            notes.append(f"{self.topic}: {count(found.left_out_bytes, 'byte')} left out that are no whole frame")
-        return found.packets, (*notes, *clock.notes(self.topic))
+        if stream.left_out_bytes:
+            notes.append(f"{self.topic}: {count(stream.left_out_bytes, 'byte')} left out that are no whole frame")
+        return stream.packets, (*notes, *clock.notes(self.topic))
 
     def listed(self) -> str:
         """Return what the channel holds in words, for an error."""
         kind = f", {self.kind}" if self.kind else ""
         return f"{self.topic} ({self.encoding or 'no encoding'}{kind}, {self.messages})"
 
-    def _look(self, data: bytes) -> None:
+    def _inspect(self, data: bytes) -> None:
         """Look for a first frame; a channel without one for long is not kept."""
         assert self._probe is not None
         self._probe += data[: _PROBED_BYTES - len(self._probe)]
         if len(self._probe) < _PROBED_BYTES:
             return
-        self._given_up = not cut_stream([(0, bytes(self._probe))]).right
+        self._is_unreadable = not cut_stream([(0, bytes(self._probe))]).valid_count
         self._probe = None
-        if self._given_up:
+        if self._is_unreadable:
             self._pieces.clear()
 
 
@@ -396,7 +396,7 @@ def is_foreign(path: Path) -> bool:
     Raises:
         RecordingError: It cannot be read.
     """
-    found = False
+    has_messages = False
     try:
         with path.open("rb") as file:
             if file.read(len(MAGIC)) != MAGIC:
@@ -404,7 +404,7 @@ def is_foreign(path: Path) -> bool:
             file.seek(0)
             for record in _iterate_records(file, path.stat().st_size):
                 if isinstance(record, Channel):
-                    found = True
+                    has_messages = True
                     if record.topic.startswith(_OURS):
                         return False
     except (FileNotFoundError, IsADirectoryError):
@@ -412,8 +412,8 @@ def is_foreign(path: Path) -> bool:
     except OSError as error:
         raise RecordingError(f"{path}: {error.strerror}") from error
     except _DAMAGE:
-        return found
-    return found
+        return has_messages
+    return has_messages
 
 
 def read_mcap(path: Path, topics: Sequence[str] = ()) -> ForeignMcap:
@@ -437,19 +437,19 @@ def read_mcap(path: Path, topics: Sequence[str] = ()) -> ForeignMcap:
         raise RecordingError(f"{path}: damaged, or no MCAP ({error}); mcap's own tool may recover it") from error
     _check_names(path, topics, streams)
     packets: list[TlogPacket] = []
-    taken: list[str] = []
+    used_topics: list[str] = []
     notes: list[str] = []
     for stream in streams.values():
         if topics and stream.topic not in topics:
             continue
-        found, told = stream.packets()
-        packets += found
-        taken += [stream.topic] if found else []
-        notes += told
-    if not taken:
+        stream_packets, stream_notes = stream.packets()
+        packets += stream_packets
+        used_topics += [stream.topic] if stream_packets else []
+        notes += stream_notes
+    if not used_topics:
         listed = _format_names(sorted(stream.listed() for stream in streams.values()))
         raise RecordingError("; ".join([f"{path}: no raw MAVLink in it", listed, *notes]))
-    return ForeignMcap(sort_packets(packets), tuple(dict.fromkeys(taken)), torn, tuple(notes))
+    return ForeignMcap(sort_packets(packets), tuple(dict.fromkeys(used_topics)), torn, tuple(notes))
 
 
 def _collect_messages(file: BinaryIO, size: int, topics: Sequence[str], streams: dict[int, _ChannelStream]) -> bool:
@@ -461,7 +461,7 @@ def _collect_messages(file: BinaryIO, size: int, topics: Sequence[str], streams:
                 schemas[record.id] = record
             elif isinstance(record, Channel) and record.id not in streams:
                 streams[record.id] = _ChannelStream(
-                    record, schemas.get(record.schema_id), wanted=record.topic in topics
+                    record, schemas.get(record.schema_id), is_requested=record.topic in topics
                 )
             elif isinstance(record, Message) and record.channel_id in streams:
                 stream = streams[record.channel_id]
@@ -490,8 +490,8 @@ def _check_names(path: Path, topics: Sequence[str], streams: dict[int, _ChannelS
 def _format_names(names: list[str]) -> str:
     if not names:
         return "it has no topic at all"
-    more = f", and {len(names) - _TOLD} more" if len(names) > _TOLD else ""
-    return f"it has: {', '.join(names[:_TOLD])}{more}"
+    more = f", and {len(names) - _MAX_NAMED_CHANNELS} more" if len(names) > _MAX_NAMED_CHANNELS else ""
+    return f"it has: {', '.join(names[:_MAX_NAMED_CHANNELS])}{more}"
 
 
 # Any recording of another program, by its kind.
@@ -514,9 +514,9 @@ def read_foreign_packets(path: Path, topics: Sequence[str] = ()) -> Tlog | None:
         return read_tlog(path)
     if detect_kind(path) is not FileKind.MCAP or not is_foreign(path):
         return None
-    found = read_mcap(path, topics)
-    torn = ("the recording is torn: read up to its end",) if found.torn else ()
-    return Tlog(found.packets, clock_notes=(f"MAVLink in {', '.join(found.topics)}", *found.notes, *torn))
+    recording = read_mcap(path, topics)
+    torn = ("the recording is torn: read up to its end",) if recording.torn else ()
+    return Tlog(recording.packets, clock_notes=(f"MAVLink in {', '.join(recording.topics)}", *recording.notes, *torn))
 
 
 def read_foreign_flight(path: Path, system: int | None = None) -> MavlinkFlight | None:

@@ -20,7 +20,7 @@ from uavctl.records import Header, LinkEstimate, LinkStats, PolicyLibrary, Recor
 
 _OWN = (HEADER, LIBRARY, RECORDER)  # of the recording itself, not of the flight
 _LOOKED_INTO = (*_OWN, "/uavctl/link", "/uavctl/refused")
-_NEWEST_TELLS = ("/uavctl/link_estimate", "/sim/truth")
+_LATEST_ONLY = ("/uavctl/link_estimate", "/sim/truth")
 _PLAIN_NOTES = (NoteKind.BEGIN, NoteKind.END)
 
 
@@ -264,7 +264,7 @@ def read_info(path: Path) -> RecordingInfo:
         courses.setdefault(topic, _TopicTimes(item)).add(item)
         if topic in _LOOKED_INTO:
             account.add(decode(topic, item.data, item.at_ns))
-        elif topic in _NEWEST_TELLS:
+        elif topic in _LATEST_ONLY:
             newest[topic] = item
         elif topic == PARAMETER or parse_raw_topic(topic) is not None:
             parameters.take(decode(topic, item.data, item.at_ns))
@@ -273,7 +273,7 @@ def read_info(path: Path) -> RecordingInfo:
         account.add(decode(topic, item.data, item.at_ns))
     if not courses and not damage:
         raise RecordingError(f"{path}: holds nothing; it is empty, or was ended before its first chunk was written")
-    flown = [course for topic, course in courses.items() if topic not in _OWN] or list(courses.values())
+    flown = [topic_counts for topic, topic_counts in courses.items() if topic not in _OWN] or list(courses.values())
     start_ns = min((decision.first_ns for decision in flown), default=0)
     end_ns = max((decision.last_ns for decision in flown), default=0)
     note = account.note

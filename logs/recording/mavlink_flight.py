@@ -202,9 +202,9 @@ class SentSource:
         if stamp_us is not None and self.units.update(stamp_us, position_m, at_ns) is not StampUnit.MICROSECONDS:
             self.refused += 1
         elif stamp_us is not None:
-            found = self.clock.estimate_capture_ns(stamp_us * 1000, at_ns)
-            self.refused += isinstance(found, str)
-            captured = None if isinstance(found, str) else found
+            capture_ns = self.clock.estimate_capture_ns(stamp_us * 1000, at_ns)
+            self.refused += isinstance(capture_ns, str)
+            captured = None if isinstance(capture_ns, str) else capture_ns
         self.track.append((at_ns, position_m, velocity_mps))
         self.captured_ns.append(captured)
 
@@ -220,7 +220,9 @@ class _Reader:
         self._battery: list[tuple[int, float]] = []
         self._height: list[tuple[int, float]] = []
         self._spans_ns: dict[str, tuple[int, int]] = {}  # first and last of each message
-        self._own: dict[str, list[tuple[int, Vec3, Vec3 | None]]] = {}  # of each system's messages, by name
+        self._vehicle_positions: dict[
+            str, list[tuple[int, Vec3, Vec3 | None]]
+        ] = {}  # of each system's messages, by name
         self._sources: dict[str, SentSource] = {}
         self._setpoints: list[tuple[int, list[float]]] = []
         self._modes: list[ModeBegin] = []
@@ -235,8 +237,8 @@ class _Reader:
     def take(self, packet: TlogPacket) -> None:
         """Take one packet."""
         self._last_ns = packet.at_ns
-        found = scan_single_frame(packet.data)
-        for frame in found.frames:
+        scan = scan_single_frame(packet.data)
+        for frame in scan.frames:
             system = get_system_id(frame.data)
             name = f"{mavlink.mavlink_map[frame.message_id].msgname} of system {system}"
             self.counted[name] += 1
@@ -248,7 +250,7 @@ class _Reader:
                 self._take_own(frame.message_id, frame.data, packet.at_ns)
         if get_message_id(packet.data) in _LOOKED_INTO and self._is_vehicle(get_system_id(packet.data)):
             self._take_parameter(packet)
-        understood = decode_scan(found)
+        understood = decode_scan(scan)
         self._bad.update(understood.bad)
         for message in understood.messages:
             self._take_message(message, packet.at_ns)
@@ -269,26 +271,28 @@ class _Reader:
             self._parameters.take(Datagram(at_ns=packet.at_ns, link="", outgoing=False, data=packet.data))
 
     def _take_message(self, message: Message, at_ns: int) -> None:
-        own = self._is_vehicle(message.system)
+        is_vehicle = self._is_vehicle(message.system)
         match message:
             case Heartbeat():
                 self._senders.take_heartbeat(message)
                 if self._beat is not None and (message.system, message.component) == self._address:
                     self._beats_ns.append(at_ns)
                     self._take_mode(message, at_ns)
-            case Position(local_ned=True) if own:
-                track = self._own.setdefault(message.name, [])
+            case Position(local_ned=True) if is_vehicle:
+                track = self._vehicle_positions.setdefault(message.name, [])
                 track.append((at_ns, message.position_m, message.velocity_mps))
             case Position(local_ned=False) if not self._is_another(message.system):
                 name = f"{message.name} of system {message.system}"
-                place = _ned(message, message.position_m)
-                self._sources.setdefault(name, SentSource()).take(place, _velocity(message), message.stamp_us, at_ns)
-            case StatusText() if own:
+                position_m = _ned(message, message.position_m)
+                self._sources.setdefault(name, SentSource()).take(
+                    position_m, _velocity(message), message.stamp_us, at_ns
+                )
+            case StatusText() if is_vehicle:
                 self._take_text(message, at_ns)
-            case Attitude() if own:
+            case Attitude() if is_vehicle:
                 self._attitudes.setdefault(message.quaternion, []).append((at_ns, message.angles_rad))
             # An autopilot without a battery's sensor sends 0 V from the start; a battery may fall to it.
-            case Battery(voltage_v=float(voltage_v)) if own and (voltage_v > 0 or self._battery):
+            case Battery(voltage_v=float(voltage_v)) if is_vehicle and (voltage_v > 0 or self._battery):
                 if voltage_v < _LARGEST_V:
                     self._battery.append((at_ns, voltage_v))
 
@@ -347,20 +351,22 @@ class _Reader:
         lat_deg, lon_deg = lat * 1e-7, lon * 1e-7
         self._home_deg = self._home_deg or (lat_deg, lon_deg)
         north_m, east_m = from_home(lat_deg, lon_deg, self._home_deg)
-        self._own.setdefault(name, []).append((at_ns, (north_m, east_m, down_m), velocity))
+        self._vehicle_positions.setdefault(name, []).append((at_ns, (north_m, east_m, down_m), velocity))
 
     def _take_odometry(self, frame: bytes, at_ns: int) -> None:
         """Take the vehicle's own estimate, as PX4 sends it where it sends no LOCAL_POSITION_NED."""
         raw = _ODOMETRY_LAYOUT.unpack(frame)
         position_m = (raw.x, raw.y, raw.z)
-        own = raw.estimator_type == mavlink.MAV_ESTIMATOR_TYPE_AUTOPILOT and raw.frame_id == mavlink.MAV_FRAME_LOCAL_NED
-        if own and all(map(math.isfinite, position_m)):
-            self._own.setdefault(raw.msgname, []).append((at_ns, position_m, None))
+        is_autopilot = (
+            raw.estimator_type == mavlink.MAV_ESTIMATOR_TYPE_AUTOPILOT and raw.frame_id == mavlink.MAV_FRAME_LOCAL_NED
+        )
+        if is_autopilot and all(map(math.isfinite, position_m)):
+            self._vehicle_positions.setdefault(raw.msgname, []).append((at_ns, position_m, None))
 
     def flight(self, name: str, log: Tlog) -> MavlinkFlight:
         """Return the flight in what was taken."""
         beat, attitudes = self._beat, self._attitudes.get(False, self._attitudes.get(True, []))
-        own_source = next((own_name for own_name in _OWN if own_name in self._own), "")
+        own_source = next((own_name for own_name in _OWN if own_name in self._vehicle_positions), "")
         sources = dict(sorted(self._sources.items(), key=lambda item: -len(item[1].track)))
         ages = {source: ages_of(sent, self._origin_ns) for source, sent in sources.items()}
         setpoints = np.array([numbers for _, numbers in self._setpoints], dtype=np.float64).reshape(-1, 9)
@@ -371,7 +377,7 @@ class _Reader:
             duration_s=self._second(self._last_ns),
             autopilot="" if beat is None else find_autopilot_name(beat.autopilot),
             vehicle_system=None if beat is None else beat.system,
-            own_positions=len(self._own.get(own_source, ())),
+            own_positions=len(self._vehicle_positions.get(own_source, ())),
             own_source=own_source,
             sent=tuple(figures_of(source, sent, ages[source]) for source, sent in sources.items()),
             setpoints=len(setpoints),
@@ -390,7 +396,7 @@ class _Reader:
         )
         flight = MavlinkFlight(
             info=info,
-            own=track_of(self._own.get(own_source, ()), self._origin_ns),
+            own=track_of(self._vehicle_positions.get(own_source, ()), self._origin_ns),
             sent={source: track_of(sent.track, self._origin_ns) for source, sent in sources.items()},
             ages=ages,
             setpoint_t_s=seconds((at_ns for at_ns, _ in self._setpoints), self._origin_ns),
@@ -509,8 +515,8 @@ def facts_of(info: MavlinkFlightInfo) -> Iterator[tuple[str, str]]:
     yield "begins at", info.begin_utc or "unknown"
     yield "duration", f"{info.duration_s:.1f} s"
     yield "autopilot", f"{info.autopilot}, system {info.vehicle_system}" if info.vehicle_system is not None else "none"
-    own = f"{info.own_positions} ({info.own_source})" if info.own_positions else "none"
-    yield "positions of its own", own
+    positions_text = f"{info.own_positions} ({info.own_source})" if info.own_positions else "none"
+    yield "positions of its own", positions_text
     for sent in info.sent:
         yield f"positions, {sent.source}", f"{sent.positions}, {sent.rate_hz:.1f}/s; {longest_gap(sent)}{_delays(sent)}"
     yield "setpoints in local NED", str(info.setpoints)
@@ -548,6 +554,6 @@ def _delays(sent: SentPositions) -> str:
         return f"; stamps in {sent.stamp_unit}, not in us"
     if sent.delay_ms is None:
         return "; without stamps"
-    median, p95, most = sent.delay_ms
+    median, p95, max_ms = sent.delay_ms
     refused = f"; {count(sent.refused_stamps, 'stamp')} out of its clock" if sent.refused_stamps else ""
-    return f"; delay beyond the quickest {median:.0f} ms (median), {p95:.0f} (95 %), {most:.0f} (largest){refused}"
+    return f"; delay beyond the quickest {median:.0f} ms (median), {p95:.0f} (95 %), {max_ms:.0f} (largest){refused}"

@@ -51,10 +51,10 @@ class ParameterReader:
     """Reader of the parameters in what comes from the vehicle, datagram by datagram."""
 
     def __init__(self) -> None:
-        self._rest: dict[str, bytes] = {}  # of a link: the frame that its last bytes ended in
+        self._partial_frames: dict[str, bytes] = {}  # of a link: the frame that its last bytes ended in
         self._lost: set[str] = set()  # links on which nobody knows where the next frame begins
-        self._before: dict[str, VehicleParameter] = {}  # told before the recording began
-        self._told: dict[tuple[int, int, str], tuple[float, int]] = {}
+        self._earlier_values: dict[str, VehicleParameter] = {}  # told before the recording began
+        self._values: dict[tuple[int, int, str], tuple[float, int]] = {}
         self._counts: dict[tuple[int, int], int] = {}  # parameters that each says it has
         self._count_before: int | None = None
         self._autopilots: dict[int, int] = {}  # MAV_AUTOPILOT by system, in the order in which they were heard
@@ -66,15 +66,15 @@ class ParameterReader:
             parameter = VehicleParameter(
                 value=value, type=record.type, system=record.system, component=record.component
             )
-            self._before[record.name] = parameter
+            self._earlier_values[record.name] = parameter
             self._count_before = record.count or self._count_before
         elif isinstance(record, Datagram) and not record.outgoing:
             self._take_bytes(record)
 
     def _take_bytes(self, datagram: Datagram) -> None:
         data, at = datagram.data, 0
-        if datagram.link in self._rest:
-            data = self._rest.pop(datagram.link) + data
+        if datagram.link in self._partial_frames:
+            data = self._partial_frames.pop(datagram.link) + data
         elif datagram.link not in self._lost:
             at = _unread(data)
         while at < len(data):
@@ -83,7 +83,7 @@ class ParameterReader:
                 self._lost.add(datagram.link)
             length = _length(data, begin)
             if length is None or begin + length > len(data):
-                self._rest[datagram.link] = data[begin:]
+                self._partial_frames[datagram.link] = data[begin:]
                 return
             end = begin + length
             message = data[begin + 5] if data[begin] == _V1 else int.from_bytes(data[begin + 7 : begin + 10], "little")
@@ -107,20 +107,20 @@ class ParameterReader:
                 self._autopilots.setdefault(fields.src_system, fields.autopilot)
             return
         key = fields.src_system, fields.src_component, decode_text(fields.param_id)
-        if key[2] != _HASH and (len(self._told) < _MOST or key in self._told):
-            self._told[key] = fields.param_value, fields.param_type
+        if key[2] != _HASH and (len(self._values) < _MOST or key in self._values):
+            self._values[key] = fields.param_value, fields.param_type
             self._counts[key[:2]] = fields.param_count
 
     @property
     def count(self) -> int | None:
         """Number of parameters that the autopilot says it has; None if it told none."""
         systems = [*self._autopilots, *(system for system, _ in self._counts)]
-        told = self._counts.get((systems[0], mavlink.MAV_COMP_ID_AUTOPILOT1)) if systems else None
-        return told or self._count_before
+        count = self._counts.get((systems[0], mavlink.MAV_COMP_ID_AUTOPILOT1)) if systems else None
+        return count or self._count_before
 
     def parameters(self) -> dict[str, VehicleParameter]:
         """Return the parameters by name, in order: of the first vehicle that was heard, or else told any."""
-        systems = [*self._autopilots, *(system for system, _, _ in self._told)]
+        systems = [*self._autopilots, *(system for system, _, _ in self._values)]
         received = {
             name: VehicleParameter(
                 value=_value(value, kind, bytewise=self._autopilots.get(system) == mavlink.MAV_AUTOPILOT_PX4),
@@ -129,10 +129,10 @@ class ParameterReader:
                 component=component,
             )
             # The autopilot comes last: what else has parameters aboard (a gimbal, a radio) does not hide its own.
-            for (system, component, name), (value, kind) in sorted(self._told.items(), key=_is_autopilot)
+            for (system, component, name), (value, kind) in sorted(self._values.items(), key=_is_autopilot)
             if system == systems[0]
         }
-        return dict(sorted({**self._before, **received}.items()))
+        return dict(sorted({**self._earlier_values, **received}.items()))
 
 
 def count_parameters(parameters: Mapping[str, VehicleParameter]) -> int:
@@ -149,9 +149,9 @@ def make_parameter_records(
         count: how many the vehicle says it has.
     """
     for name, parameter in parameters.items():
-        where = {"system": parameter.system, "component": parameter.component}
+        address = {"system": parameter.system, "component": parameter.component}
         yield ToldParameter(
-            at_ns=at_ns, name=name, value=float(parameter.value), type=parameter.type, count=count or 0, **where
+            at_ns=at_ns, name=name, value=float(parameter.value), type=parameter.type, count=count or 0, **address
         )
 
 
@@ -204,8 +204,8 @@ def _unread(data: bytes) -> int:
 
 def _next_frame(data: bytes, at: int) -> int:
     """Return where the next frame may begin, from `at` on; the end if nowhere."""
-    found = [place for marker in (_V1, _V2) if (place := data.find(marker, at)) >= 0]
-    return min(found, default=len(data))
+    starts = [start for marker in (_V1, _V2) if (start := data.find(marker, at)) >= 0]
+    return min(starts, default=len(data))
 
 
 def _length(data: bytes, at: int) -> int | None:

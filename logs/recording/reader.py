@@ -76,7 +76,7 @@ class Contents:
 
     def __init__(self) -> None:
         self._schemas: dict[int, Schema] = {}
-        self._known: dict[bytes, tuple[int, Definition, int]] = {}
+        self._definitions: dict[bytes, tuple[int, Definition, int]] = {}
 
     def messages(self, content: bytes, offset: int, order: ReadingOrder | None = None) -> Iterator[RecordedMessage]:
         """Read the messages of one chunk whose checksum is right.
@@ -119,19 +119,19 @@ class Contents:
         return int(at + length)
 
     def _channel(self, record: bytes) -> tuple[int, Definition, int]:
-        if record not in self._known:
+        if record not in self._definitions:
             channel = Channel.read(ReadDataStream(BytesIO(record)))
             schema = self._schemas.get(channel.schema_id)
-            self._known[record] = channel.id, _definition(channel, schema), _zero_utc_ns(channel)
-        return self._known[record]
+            self._definitions[record] = channel.id, _definition(channel, schema), _zero_utc_ns(channel)
+        return self._definitions[record]
 
 
 def _zero_utc_ns(channel: Channel) -> int:
     """Return how much later log times are than those of our clock [ns]; 0 in recordings of before."""
-    told = channel.metadata.get(ZERO_UTC, "0")
-    if not (told.isascii() and told.isdigit()):
-        raise RecordingError(f"topic {channel.topic}: {ZERO_UTC} of its channel is {told!r}, which is no time")
-    return int(told)
+    zero_text = channel.metadata.get(ZERO_UTC, "0")
+    if not (zero_text.isascii() and zero_text.isdigit()):
+        raise RecordingError(f"topic {channel.topic}: {ZERO_UTC} of its channel is {zero_text!r}, which is no time")
+    return int(zero_text)
 
 
 def _definition(channel: Channel, schema: Schema | None) -> Definition:
@@ -307,20 +307,20 @@ def _whole(data: Buffer, at: int) -> int:
         raise _TornRecordError("is torn")
     inner = at + _RECORD.size
     if opcode == _IS_INDEX:  # of each topic in each chunk, so most of all
-        good = length >= 6 and INDEX.unpack_from(data, at)[3] == length - 6
+        is_complete = length >= 6 and INDEX.unpack_from(data, at)[3] == length - 6
     elif opcode == Opcode.CHUNK:
-        good = length >= CHUNK_FIELDS
+        is_complete = length >= CHUNK_FIELDS
     elif opcode == Opcode.DATA_END:
-        good = length == _DATA_END.size - _RECORD.size
+        is_complete = length == _DATA_END.size - _RECORD.size
     elif opcode == Opcode.ATTACHMENT:
-        good = length >= _ATTACHMENT_FIELDS
+        is_complete = length >= _ATTACHMENT_FIELDS
     elif opcode == Opcode.METADATA:
-        good = _pair_length(data, inner, length) == length
+        is_complete = _pair_length(data, inner, length) == length
     elif opcode == Opcode.HEADER:
-        good = at == len(MAGIC) and _pair_length(data, inner, length) == length
+        is_complete = at == len(MAGIC) and _pair_length(data, inner, length) == length
     else:
-        good = False
-    if not good:
+        is_complete = False
+    if not is_complete:
         raise _BadRecordError("is damaged")
     return int(_RECORD.size + length)
 
@@ -331,10 +331,10 @@ def _attached(data: Buffer, at: int, length: int) -> AttachedFile:
     if zlib.crc32(content[:-4]) != struct.unpack("<I", content[-4:])[0]:
         raise _BadRecordError("has a wrong checksum")
     try:
-        found = Attachment.read(ReadDataStream(BytesIO(content)))
+        attachment = Attachment.read(ReadDataStream(BytesIO(content)))
     except (McapError, struct.error, ValueError) as error:  # it was written so
         raise _BadRecordError("is no attachment") from error
-    return AttachedFile(found.name, found.media_type, len(found.data))
+    return AttachedFile(attachment.name, attachment.media_type, len(attachment.data))
 
 
 def _pair_length(data: Buffer, inner: int, length: int) -> int:
@@ -431,8 +431,8 @@ def segment_files(path: Path) -> tuple[Path, ...]:
         RecordingError: there is none, or the path is that of a folder.
     """
     if path.is_dir():
-        held = set(path.glob("*.mcap"))
-        inside = sorted(held.difference(*map(find_later_segments, held)))[:3]
+        existing_files = set(path.glob("*.mcap"))
+        inside = sorted(existing_files.difference(*map(find_later_segments, existing_files)))[:3]
         hint = f"; give the recording in it: {', '.join(map(str, inside))}" if inside else " and holds no recording"
         raise RecordingError(f"{path}: is a folder{hint}")
     files = tuple(file for file in find_later_segments(path) if _continues(file))

@@ -37,7 +37,7 @@ Watcher = Callable[[Definition, int, bytes], None]
 class ViewMaker(Protocol):
     """Interface of what makes messages for viewers, as `logs.recording.views.ViewBuilder`."""
 
-    def made(self, at_ns: int, record: Record) -> list[tuple[str, bytes]]:
+    def derive(self, at_ns: int, record: Record) -> list[tuple[str, bytes]]:
         """Return topic and message of all that is derived from a record."""
         ...
 
@@ -67,22 +67,22 @@ class DerivedTopics:
         self.unseen = 0
         self.reason = ""
 
-    def beside(self, topic: str, at_ns: int, record: Record, data: bytes) -> list[tuple[str, int, bytes]]:
+    def derive_messages(self, topic: str, at_ns: int, record: Record, data: bytes) -> list[tuple[str, int, bytes]]:
         """Return topic, log time [ns] and message of all that is derived from a record, whose message is `data`."""
         self._look(record)
         if isinstance(record, Header):
             self._zero_utc_ns = record.zero_utc_ns or 0
-        made = [(name, at_ns, view) for name, view in self._made(at_ns, record)]
+        messages = [(name, at_ns, view) for name, view in self._derive_views(at_ns, record)]
         if self._watch is not None:
-            for name, time_ns, message in ((topic, at_ns, data), *made):
+            for name, time_ns, message in ((topic, at_ns, data), *messages):
                 self._watch(get_definition(name), time_ns + self._zero_utc_ns, message)
-        return made
+        return messages
 
-    def _made(self, at_ns: int, record: Record) -> list[tuple[str, bytes]]:
+    def _derive_views(self, at_ns: int, record: Record) -> list[tuple[str, bytes]]:
         if self._views is None:
             return []
         try:
-            return self._views.made(at_ns, record)
+            return self._views.derive(at_ns, record)
         except (RecordingError, ValueError, TypeError, LookupError, ArithmeticError) as error:
             self.unseen += 1
             self.reason = f"{type(record).__name__}: {error}"
@@ -142,25 +142,25 @@ class WriteQueue:
         open_file: Callable[[Path], OutputFile],
         free: Callable[[Path], int | None],
         clock: Callable[[], float],
-        onlookers: DerivedTopics,
+        derived_topics: DerivedTopics,
     ) -> None:
-        taken = [file for file in (path, *find_later_segments(path)) if file.exists()]
-        if taken:
-            raise RecordingError(f"{taken[0]} exists and a recording never overwrites; choose another name")
+        existing_files = [file for file in (path, *find_later_segments(path)) if file.exists()]
+        if existing_files:
+            raise RecordingError(f"{existing_files[0]} exists and a recording never overwrites; choose another name")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise RecordingError(f"{path.parent}: {error.strerror}; choose another folder") from error
-        self._room = FreeSpaceMonitor(path.parent, free, log.low_bytes, log.stop_bytes)
-        self._room.look()
+        self._free_space = FreeSpaceMonitor(path.parent, free, log.low_bytes, log.stop_bytes)
+        self._free_space.check()
         self._files = Rotation(path, log, open_file, clock)
         self._parameters = ParameterReader()
         self._clock = clock
-        self._onlookers = onlookers
+        self._derived_topics = derived_topics
         self._written_s = clock()  # nothing that waited for the disk then does so now
         self._next_look_s = self._written_s + LOOK_S
         self._noted = (0, 0)  # dropped and refused, as last written down
-        self._told_low = False
+        self._is_low_noted = False
         self._drop_lock = threading.Lock()
         self._dropped = 0
         self._refused = 0
@@ -183,26 +183,26 @@ class WriteQueue:
         due = self._clock() >= self._next_look_s
         if due:
             self._next_look_s = self._clock() + LOOK_S
-            self._room.look()
-            self._rest()
+            self._free_space.check()
+            self._pause()
         try:
             if due:
-                self._files.look()
-            if self._files.unwritten and self._ready():
+                self._files.check_files()
+            if self._files.unwritten and self._open_next_file():
                 self._files.write_unwritten()
             if self._files.is_open and self._dropped and not self._noted[0]:
-                self._note_news()  # before all that was put after it: a recording without an end tells of it, too
+                self._note_changes()  # before all that was put after it: a recording without an end tells of it, too
             files = self._files
             for _ in range(min(records, len(self.queue))):
-                if not (files.has_room or self._ready()):
+                if not (files.has_room or self._open_next_file()):
                     return
-                self._take(*self.queue.popleft())
+                self._write_message(*self.queue.popleft())
             for _ in range(min(views, len(self.views_due))):
-                if not (files.has_room or self._ready()):
+                if not (files.has_room or self._open_next_file()):
                     return
-                self._show(*self.views_due.popleft())
+                self._write_derived(*self.views_due.popleft())
             if due and self._files.is_open:
-                self._note_news()
+                self._note_changes()
                 self._files.sync()
             if due:
                 self._written_s = self._clock()
@@ -213,12 +213,12 @@ class WriteQueue:
         """Write all that waits and close the file; after a failed write, in a new file."""
         self.closed = True
         for _ in range(LAST_TRIES):
-            self._files.try_again()
+            self._files.allow_retry()
             self.drain(len(self.queue), len(self.views_due) + len(self.queue))
             if self._files.is_open:
                 self._finish_file(NoteKind.END, "end")
         with suppress(OSError):  # None is open
-            self._files.look()
+            self._files.check_files()
         self.finished = True
 
     def status(self) -> RecorderStatus:
@@ -230,14 +230,14 @@ class WriteQueue:
         stuck = bool(files.reason) and not self.closed and not files.has_chunk
         hangs = self.closed and not self.finished
         unwritten_s = max(0.0, self._clock() - self._written_s) if waiting or hangs else 0.0
-        late = hangs or unwritten_s > LATE_S
+        is_late = hangs or unwritten_s > LATE_S
         reasons = (
             (bool(files.gone), f"{', '.join(files.gone)} deleted, moved or replaced"),
-            (late, f"the recording was last written {unwritten_s:.1f} s ago"),
+            (is_late, f"the recording was last written {unwritten_s:.1f} s ago"),
             (bool(files.reason) and not (files.gone and not stuck), files.reason),
         )
         return RecorderStatus(
-            ok=not lost and not stuck and not late,
+            ok=not lost and not stuck and not is_late,
             written=sum(messages for _, messages, _ in parts),
             waiting=waiting,
             dropped=self._dropped,
@@ -248,12 +248,12 @@ class WriteQueue:
             refusal=self._refusal,
             bytes=sum(size for _, _, size in parts),
             segments=tuple(str(path) for path, _, _ in parts),
-            warning=self._room.text if self._room.low else "",
+            warning=self._free_space.text if self._free_space.low else "",
             unwritten_s=unwritten_s,
-            unseen=self._onlookers.unseen,
+            unseen=self._derived_topics.unseen,
         )
 
-    def _ready(self) -> bool:
+    def _open_next_file(self) -> bool:
         """Return whether there is a file to write to; one is begun if something waits for it."""
         files = self._files
         if files.has_room:
@@ -264,7 +264,7 @@ class WriteQueue:
             self._finish_file(NoteKind.CONTINUED, "goes on in the next file")
         if files.is_open:
             return True
-        if not waits or not files.may_begin or (self._room.resting and not self.closed):
+        if not waits or not files.may_begin or (self._free_space.is_paused and not self.closed):
             return False
         head = self.queue[0][2] if self.queue else None
         if isinstance(head, Header):  # it comes first, and tells the time of all that follows
@@ -272,16 +272,16 @@ class WriteQueue:
         files.begin(self._write_note)
         return True
 
-    def _rest(self) -> None:
+    def _pause(self) -> None:
         """Close the file in order while the disk still has room for that."""
-        if not self._room.resting or self.closed:
+        if not self._free_space.is_paused or self.closed:
             return
-        self._files.reason = self._room.text
+        self._files.reason = self._free_space.text
         if self._files.is_open:
-            self._files.because = f"after a rest: {self._room.text}"
-            self._finish_file(NoteKind.STATE, self._room.text)
+            self._files.because = f"after a rest: {self._free_space.text}"
+            self._finish_file(NoteKind.STATE, self._free_space.text)
 
-    def _take(self, topic: str, at_ns: int, record: Record) -> None:
+    def _write_message(self, topic: str, at_ns: int, record: Record) -> None:
         if isinstance(record, Datagram):
             at_ns = record.at_ns  # the log time is the only place that keeps it
         try:
@@ -303,24 +303,26 @@ class WriteQueue:
         else:
             self._parameters.take(record)
 
-    def _show(self, topic: str, at_ns: int, record: Record, data: bytes) -> None:
+    def _write_derived(self, topic: str, at_ns: int, record: Record, data: bytes) -> None:
         """Write the messages for viewers that are derived from a record."""
-        made = self._onlookers.beside(topic, at_ns, record, data)
-        if made:
-            self._files.unwritten.extend(made)
+        messages = self._derived_topics.derive_messages(topic, at_ns, record, data)
+        if messages:
+            self._files.unwritten.extend(messages)
             self._files.write_unwritten()
 
-    def _note_news(self) -> None:
+    def _note_changes(self) -> None:
         if (self._dropped, self._refused) != self._noted:
-            self._tell_note("records lost" + (f"; newest refusal: {self._refusal}" if self._refusal else ""))
-        if self._room.low != self._told_low:
-            self._told_low = self._room.low
-            self._tell_note(f"disk {'gets low' if self._told_low else 'has room again'}: {self._room.text}")
+            self._publish_note("records lost" + (f"; newest refusal: {self._refusal}" if self._refusal else ""))
+        if self._free_space.low != self._is_low_noted:
+            self._is_low_noted = self._free_space.low
+            self._publish_note(
+                f"disk {'gets low' if self._is_low_noted else 'has room again'}: {self._free_space.text}"
+            )
 
-    def _tell_note(self, text: str) -> None:
+    def _publish_note(self, text: str) -> None:
         """Write a note, which watchers see too."""
         note = self._write_note(text)
-        self._show(RECORDER, note.at_ns, note, encode(note))
+        self._write_derived(RECORDER, note.at_ns, note, encode(note))
 
     def _write_note(self, text: str, kind: NoteKind = NoteKind.STATE) -> RecorderNote:
         self._noted = (self._dropped, self._refused)
@@ -338,9 +340,11 @@ class WriteQueue:
         return note
 
     def _finish_file(self, kind: NoteKind, text: str) -> None:
-        blind = self._onlookers
+        derived = self._derived_topics
         try:
-            self._write_note(f"{text}; {blind.unseen} without views: {blind.reason}" if blind.unseen else text, kind)
+            self._write_note(
+                f"{text}; {derived.unseen} without views: {derived.reason}" if derived.unseen else text, kind
+            )
             utc_ns = self._files.at_ns + self._files.zero_utc_ns
             self._files.finish(attachments.make_parameter_attachments(self._parameters, utc_ns))
         except OSError as error:
@@ -385,7 +389,7 @@ def live_view(port: int | None, *, on_open: Callable[[int], None] = lambda _: No
         raise UsageError(f"--live: port {port} cannot be had ({error}); choose another with --live-port") from error
     try:
         on_open(server.port)
-        yield _watcher(foxglove, context)
+        yield _make_watcher(foxglove, context)
     finally:
         # It waits for every viewer to take its leave; one that has stalled never does.
         stopping = threading.Thread(target=server.stop, name="live view's end", daemon=True)
@@ -393,7 +397,7 @@ def live_view(port: int | None, *, on_open: Callable[[int], None] = lambda _: No
         stopping.join(STOP_S)
 
 
-def _watcher(foxglove: ModuleType, context: object) -> Watcher:
+def _make_watcher(foxglove: ModuleType, context: object) -> Watcher:
     logs: dict[str, Callable[..., None]] = {}  # a channel's entrance, by topic
 
     def watch(definition: Definition, at_ns: int, data: bytes) -> None:
@@ -437,12 +441,12 @@ class _Base:
         open_file: Callable[[Path], OutputFile] = DiskFile,
         free: Callable[[Path], int | None] = get_free_bytes,
         clock: Callable[[], float] = time.monotonic,
-        onlookers: DerivedTopics | None = None,
+        derived_topics: DerivedTopics | None = None,
     ) -> None:
         self._log = log or LogConfig()
-        self._journal = WriteQueue(path, self._log, open_file, free, clock, onlookers or DerivedTopics())
+        self._journal = WriteQueue(path, self._log, open_file, free, clock, derived_topics or DerivedTopics())
         self._queue = self._journal.queue
-        self._most = self._log.queue  # records in the queue; 0 from the end on
+        self._max_waiting = self._log.queue  # records in the queue; 0 from the end on
         self._begin()
 
     def put(self, topic: str, at_ns: int, record: Record) -> None:
@@ -450,7 +454,7 @@ class _Base:
         # Each tick comes here after a rest, when nothing of this is in the processor's caches: so it is one function,
         # that looks at little, takes no lock and wakes no thread.
         queue = self._queue
-        if len(queue) < self._most:
+        if len(queue) < self._max_waiting:
             queue.append((topic, at_ns, record))
         else:
             self._journal.drop()
@@ -470,7 +474,7 @@ class SyncRecorder(_Base):
 
     def close(self) -> RecorderStatus:
         """Write the rest, the index and the footer; later records are dropped."""
-        self._most = 0
+        self._max_waiting = 0
         if not self._journal.closed:
             self._journal.finish()
         return self.status()
@@ -498,7 +502,7 @@ class Recorder(_Base):
 
     def close(self, timeout_s: float = 5.0) -> RecorderStatus:
         """Stop taking records and write those that wait; gives up after `timeout_s` on a disk that hangs."""
-        self._most = 0
+        self._max_waiting = 0
         self._journal.closed = True
         self._stop.set()
         self._due.set()
@@ -515,10 +519,12 @@ class Recorder(_Base):
         while not self._stop.is_set():
             self._due.wait(POLL_S)
             self._due.clear()
-            journal.drain(portion(len(journal.queue), RECORDS), portion(len(journal.views_due), VIEWS))
+            journal.drain(
+                compute_batch_size(len(journal.queue), RECORDS), compute_batch_size(len(journal.views_due), VIEWS)
+            )
         journal.finish()
 
 
-def portion(waiting: int, at_once: int) -> int:
+def compute_batch_size(waiting: int, at_once: int) -> int:
     """Return how many of `waiting` records are taken in a round: `at_once`, or a share of a large backlog."""
     return max(at_once, waiting // BACKLOG_SHARE)

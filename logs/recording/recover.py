@@ -176,4 +176,4 @@ def _losses(result: RecoverResult) -> str:
         (result.lost_bytes > 0, f"{result.lost_bytes} bytes lost"),
         (not result.ended, END_MISSING),
     )
-    return ", ".join(text for given, text in parts if given)
+    return ", ".join(text for is_lost, text in parts if is_lost)

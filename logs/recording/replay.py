@@ -53,7 +53,7 @@ NOTHING = "nothing"
 Leaf = tuple[str, object, object]  # path, recorded, replayed
 
 # What the records of a tick say one after the other: those before the first one that differs are the same.
-_SAID_BY = {
+_STAGES = {
     "/uavctl/step_input": "of the same bytes the tick was given something else: parser, clock or frame",
     "/uavctl/vehicle": "the vehicle's messages are understood otherwise",
     "/uavctl/estimate": "the tick was given the same: estimator, or how far positions are believed",
@@ -175,7 +175,7 @@ def _unit(name: str) -> str:
 
 def stage(topic: str) -> str:
     """Return which stage of a tick is in question if this topic is the first to differ."""
-    return _SAID_BY.get(topic, _SENT if parse_raw_topic(topic) is not None else "")
+    return _STAGES.get(topic, _SENT if parse_raw_topic(topic) is not None else "")
 
 
 def leaves(recorded: Record, replayed: Record) -> list[Leaf]:
@@ -183,16 +183,16 @@ def leaves(recorded: Record, replayed: Record) -> list[Leaf]:
     return list(unequal(msgspec.to_builtins(recorded), msgspec.to_builtins(replayed)))
 
 
-def unequal(left: object, right: object, path: str = "") -> Iterator[Leaf]:
+def unequal(recorded: object, replayed: object, path: str = "") -> Iterator[Leaf]:
     """Leaves where two trees of plain values differ in any bit."""
-    if isinstance(left, dict) and isinstance(right, dict):
-        for key in dict.fromkeys([*left, *right]):
-            yield from unequal(left.get(key), right.get(key), f"{path}.{key}" if path else str(key))
-    elif isinstance(left, list | tuple) and isinstance(right, list | tuple) and len(left) == len(right):
-        for index, (value, other) in enumerate(zip(left, right, strict=True)):
+    if isinstance(recorded, dict) and isinstance(replayed, dict):
+        for key in dict.fromkeys([*recorded, *replayed]):
+            yield from unequal(recorded.get(key), replayed.get(key), f"{path}.{key}" if path else str(key))
+    elif isinstance(recorded, list | tuple) and isinstance(replayed, list | tuple) and len(recorded) == len(replayed):
+        for index, (value, other) in enumerate(zip(recorded, replayed, strict=True)):
             yield from unequal(value, other, f"{path}[{index}]")
-    elif not _same_bits(left, right):
-        yield path, left, right
+    elif not _same_bits(recorded, replayed):
+        yield path, recorded, replayed
 
 
 def _same_bits(left: object, right: object) -> bool:
@@ -262,11 +262,11 @@ def context(
 
 
 def _order(command: Command) -> str:
-    given = command.position_m if command.height_m is None else command.height_m
-    return command.order.value if given is None else f"{command.order.value} {given}"
+    argument = command.position_m if command.height_m is None else command.height_m
+    return command.order.value if argument is None else f"{command.order.value} {argument}"
 
 
-COMPARED = frozenset(_SAID_BY)
+COMPARED = frozenset(_STAGES)
 Labels = frozenset[tuple[str, str]]
 # What a plan says of who made it, which a changed controller need not repeat to decide alike.
 MAKERS: Labels = frozenset({("/uavctl/plan", "design_id"), ("/uavctl/plan", "method")})
@@ -300,17 +300,17 @@ class _Produced:
 
     def take(self, topic: str, at_ns: int) -> Record | None:
         """Return the next replayed record of this topic and time."""
-        for place, (its_topic, its_ns, record) in enumerate(self.waiting):  # nearly always the first
+        for index, (its_topic, its_ns, record) in enumerate(self.waiting):  # nearly always the first
             if its_ns == at_ns and its_topic == topic:
-                del self.waiting[place]
+                del self.waiting[index]
                 return record
         return None
 
-    def unsaid(self) -> list[tuple[str, int, Record]]:
+    def list_missing(self) -> list[tuple[str, int, Record]]:
         """Return and forget the replayed records that the recording does not have."""
-        found = [*self.waiting]
+        records = [*self.waiting]
         self.waiting.clear()
-        return found
+        return records
 
 
 @dataclass
@@ -336,7 +336,7 @@ class _Field:
 class _Findings:
     """Comparison so far, and where the two part."""
 
-    places: FieldNames
+    field_names: FieldNames
     tolerance: float
     ignored: Labels
     compared: int = 0
@@ -397,8 +397,8 @@ class _Findings:
     ) -> None:
         at_s = 0.0 if self._begun_ns is None else (at_ns - self._begun_ns) * 1e-9
         path, left, right = parts[0] if parts else ("", None, None)
-        meaning, unit = self.places.meaning(topic, path)
-        found = ReplayDifference(
+        meaning, unit = self.field_names.meaning(topic, path)
+        difference = ReplayDifference(
             topic=topic,
             at_ns=at_ns,
             flight_s=at_s,
@@ -413,15 +413,15 @@ class _Findings:
             stage=stage(topic),
         )
         if self.first is None:
-            self.first, self._before = found, (self.decisions, self.compared)
+            self.first, self._before = difference, (self.decisions, self.compared)
         if topic == DECISION:
-            self.first_decision = self.first_decision or found
+            self.first_decision = self.first_decision or difference
         fields: dict[str, list[Leaf]] = defaultdict(list)
         for part in parts or [("", None, None)]:
             fields[plain(part[0])].append(part)
         for name, those in fields.items():
-            known = self._fields.setdefault((topic, name), _Field(at_s, self._records[topic]))
-            known.add(those, at_s)
+            field = self._fields.setdefault((topic, name), _Field(at_s, self._records[topic]))
+            field.add(those, at_s)
 
     def result(self, *, finished: bool) -> ReplayResult:
         """Return the result; a recording that claims an end must hold more than nothing."""
@@ -437,8 +437,8 @@ class _Findings:
                 FieldDivergence(
                     topic=topic,
                     field=name,
-                    entry=self.places.meaning(topic, field.path)[0],
-                    unit=self.places.meaning(topic, field.path or name)[1],
+                    entry=self.field_names.meaning(topic, field.path)[0],
+                    unit=self.field_names.meaning(topic, field.path or name)[1],
                     differing=field.differing,
                     records=self._records[topic] - field.before,
                     first_s=field.first_s,
@@ -471,13 +471,13 @@ def replay(
     """
     produced = _Produced()
     loop = make_loop(produced)
-    found = _Findings(FieldNames(loop.plant), tolerance, ignored)
+    findings = _Findings(FieldNames(loop.plant), tolerance, ignored)
     for topic, at_ns, message in messages:
         record = _decoded(topic, at_ns, message) if _is_input(topic) or not isinstance(message, bytes) else None
         if isinstance(record, StepInput):
             # What the last tick said must have been read by now. Only a torn file's last tick may lack some.
-            _unsaid(found, produced)
-            found.begin(record)
+            _add_missing(findings, produced)
+            findings.begin(record)
             for command in record.commands:
                 loop.order(command)
             loop.answered(record.answered_ns)
@@ -487,30 +487,30 @@ def replay(
         elif isinstance(record, Refused):
             loop.refused(record.link, record.counts, record.at_ns)
         elif isinstance(record, RecorderNote):
-            found.dropped = record.dropped
+            findings.dropped = record.dropped
         if _is_compared(topic):
             replayed = produced.take(topic, at_ns)
             if (
-                found.first is None
+                findings.first is None
                 and isinstance(message, bytes)
                 and replayed is not None
                 and is_encoding_of(replayed, message)
             ):
-                found.same(topic)
+                findings.same(topic)
             else:
-                found.compare(topic, at_ns, record or _decoded(topic, at_ns, message), replayed)
+                findings.compare(topic, at_ns, record or _decoded(topic, at_ns, message), replayed)
     if finished:
-        _unsaid(found, produced)
-    return found.result(finished=finished)
+        _add_missing(findings, produced)
+    return findings.result(finished=finished)
 
 
 def _decoded(topic: str, at_ns: int, message: Record | bytes) -> Record:
     return decode(topic, message, at_ns) if isinstance(message, bytes) else message
 
 
-def _unsaid(found: _Findings, produced: _Produced) -> None:
-    for topic, at_ns, record in produced.unsaid():
-        found.compare(topic, at_ns, None, record)
+def _add_missing(findings: _Findings, produced: _Produced) -> None:
+    for topic, at_ns, record in produced.list_missing():
+        findings.compare(topic, at_ns, None, record)
 
 
 @cache

@@ -138,14 +138,14 @@ class Segment:
             self._commit(entries[:-1])
             self.open_entries = [entry]
             head, index = head or channel.record, None
-        utc_ns, place = at_ns + self._zero_utc_ns, self._size + len(head)
+        utc_ns, offset = at_ns + self._zero_utc_ns, self._size + len(head)
         if index is None:
-            self._indexes[channel.number] = [utc_ns, place]
+            self._indexes[channel.number] = [utc_ns, offset]
         else:
-            index += (utc_ns, place)
+            index += (utc_ns, offset)
         fields = MESSAGE.pack(_OPCODE, _MESSAGE_FIELDS + len(data), channel.number, sequence, utc_ns, utc_ns)
         self._parts += (head, fields, data)
-        self._size = place + size
+        self._size = offset + size
 
     def commit(self) -> None:
         """Write the open chunk, if there is anything in it.
@@ -210,7 +210,7 @@ class Segment:
         finally:
             self._file.close()
 
-    def leave(self) -> None:
+    def close_missing(self) -> None:
         """Close a file that nobody can find any more.
 
         Raises:
@@ -274,16 +274,18 @@ class Segment:
         self._file.write(block)
         self._crc = zlib.crc32(block, self._crc)
         self.bytes += len(block)
-        places = b"".join(offsets)
-        fields = _CHUNK_INDEX_FIELDS + len(places)
-        self._chunk_indexes += _CHUNK_INDEX.pack(Opcode.CHUNK_INDEX, fields, first, last, start, length, len(places))
-        self._chunk_indexes += places
+        offset_bytes = b"".join(offsets)
+        fields = _CHUNK_INDEX_FIELDS + len(offset_bytes)
+        self._chunk_indexes += _CHUNK_INDEX.pack(
+            Opcode.CHUNK_INDEX, fields, first, last, start, length, len(offset_bytes)
+        )
+        self._chunk_indexes += offset_bytes
         self._chunk_indexes += _CHUNK_INDEX_END.pack(
             at - start - length, len(COMPRESSION), COMPRESSION, len(stored), size
         )
         self._chunks += 1
-        before = self._times_ns or (first, last)
-        self._times_ns = min(before[0], first), max(before[1], last)
+        earlier_times_ns = self._times_ns or (first, last)
+        self._times_ns = min(earlier_times_ns[0], first), max(earlier_times_ns[1], last)
         self.messages += len(entries)
         self._counts.update({channel_id: len(flat) // 2 for channel_id, flat in self._indexes.items()})
         self._begin_chunk()
@@ -298,8 +300,8 @@ class Segment:
             (Opcode.CHANNEL, b"".join(channel.record for channel in self._channels.values())),
             (Opcode.STATISTICS, _bytes(self._statistics())),
             (Opcode.CHUNK_INDEX, bytes(self._chunk_indexes)),
-            (Opcode.ATTACHMENT_INDEX, _bytes(*self._of(AttachmentIndex))),
-            (Opcode.METADATA_INDEX, _bytes(*self._of(MetadataIndex))),
+            (Opcode.ATTACHMENT_INDEX, _bytes(*self._list_indexes(AttachmentIndex))),
+            (Opcode.METADATA_INDEX, _bytes(*self._list_indexes(MetadataIndex))),
         )
         summary, offsets = b"", b""
         for opcode, data in groups:
@@ -311,20 +313,20 @@ class Segment:
         footer = _bytes(Footer(summary_start=start, summary_offset_start=offset_start, summary_crc=crc))
         return data_end + summary + offsets + footer + MAGIC
 
-    def _of(self, kind: type[AttachmentIndex | MetadataIndex]) -> list[AttachmentIndex | MetadataIndex]:
+    def _list_indexes(self, kind: type[AttachmentIndex | MetadataIndex]) -> list[AttachmentIndex | MetadataIndex]:
         return [attachment for attachment in self._attached if isinstance(attachment, kind)]
 
     def _statistics(self) -> Statistics:
         first, last = self._times_ns or (0, 0)
         return Statistics(
-            attachment_count=len(self._of(AttachmentIndex)),
+            attachment_count=len(self._list_indexes(AttachmentIndex)),
             channel_count=len(self._channels),
             channel_message_counts=dict(self._counts),
             chunk_count=self._chunks,
             message_count=self.messages,
             message_start_time=first,
             message_end_time=last,
-            metadata_count=len(self._of(MetadataIndex)),
+            metadata_count=len(self._list_indexes(MetadataIndex)),
             schema_count=len(self._schemas),
         )
 
@@ -458,7 +460,7 @@ class Rotation:
             done.append(self._part(segment))
         return [(file.path, file.messages, file.bytes) for file in done]
 
-    def look(self) -> None:
+    def check_files(self) -> None:
         """Check that the files written so far are still where they were made.
 
         Raises:
@@ -467,15 +469,15 @@ class Rotation:
         for part in [*self._done]:
             if not is_present(part.path, part.bytes):
                 self._done.remove(part)
-                self._lose(part)
-        if self._segment is not None and not self._is_there(self._segment):
+                self._count_lost(part)
+        if self._segment is not None and not self._is_present(self._segment):
             raise FileNotFoundError(errno.ENOENT, "the file was deleted, moved or replaced", self.name)
 
-    def try_again(self) -> None:
+    def allow_retry(self) -> None:
         """Allow that a file is begun at once."""
         self._retry_s = self._clock()
 
-    def begin(self, tell: Callable[[str], object]) -> None:
+    def begin(self, write_note: Callable[[str], object]) -> None:
         """Open the next file; a later one than the first repeats the header.
 
         Raises:
@@ -490,7 +492,7 @@ class Rotation:
             self._preface = 1 + bool(self._header)
             if self._header:
                 self.write(HEADER, self.at_ns, self._header)
-            tell(self.because)
+            write_note(self.because)
             self._segment.attach(self._attachments)
 
     def write(self, topic: str, at_ns: int, data: bytes) -> None:
@@ -531,7 +533,9 @@ class Rotation:
         """
         self._open_segment().commit()
 
-    def attach(self, each: Sequence[Attachment | Metadata], once: Sequence[Attachment | Metadata]) -> None:
+    def attach(
+        self, file_records: Sequence[Attachment | Metadata], recording_records: Sequence[Attachment | Metadata]
+    ) -> None:
         """Write attachments and metadata into this file, after its chunk.
 
         Args:
@@ -541,8 +545,8 @@ class Rotation:
         Raises:
             OSError: they could not be written.
         """
-        self._attachments = tuple(each)
-        self._open_segment().attach((*each, *once))
+        self._attachments = tuple(file_records)
+        self._open_segment().attach((*file_records, *recording_records))
 
     def sync(self) -> None:
         """Write the open chunk and wait until the disk has it.
@@ -561,7 +565,7 @@ class Rotation:
         segment = self._open_segment()
         segment.attach(records)
         segment.finish()
-        self._retire(segment, there=self._is_there(segment))
+        self._retire(segment, there=self._is_present(segment))
 
     def fail(self, error: OSError) -> None:
         """Handle a failed write: keep the messages of the open chunk, and close the file as well as possible."""
@@ -573,12 +577,14 @@ class Rotation:
         if segment is None:
             return  # it could not even be opened
         self.written -= len(segment.open_entries)  # they are numbered anew
-        kept = segment.open_entries[max(0, self._preface - segment.messages) :]
-        self.unwritten.extendleft((record.definition.topic, record.at_ns, record.data) for record in reversed(kept))
+        kept_entries = segment.open_entries[max(0, self._preface - segment.messages) :]
+        self.unwritten.extendleft(
+            (record.definition.topic, record.at_ns, record.data) for record in reversed(kept_entries)
+        )
         # what abandon cannot do is no second alarm: whole chunks are readable without it
-        there = self._is_there(segment)
+        there = self._is_present(segment)
         with contextlib.suppress(OSError):
-            segment.abandon() if there else segment.leave()
+            segment.abandon() if there else segment.close_missing()
         self._retire(segment, there=there)
 
     def _open_segment(self) -> Segment:
@@ -590,11 +596,11 @@ class Rotation:
             make_segment_path(self._path, self.number), segment.messages, segment.bytes, segment.records
         )
 
-    def _lose(self, part: _SegmentPart) -> None:
+    def _count_lost(self, part: _SegmentPart) -> None:
         self.gone.append(part.path.name)
         self.gone_records += part.records
 
-    def _is_there(self, segment: Segment) -> bool:
+    def _is_present(self, segment: Segment) -> bool:
         return is_present(make_segment_path(self._path, self.number), segment.bytes, self._opened)
 
     def _retire(self, segment: Segment, *, there: bool) -> None:
@@ -603,7 +609,7 @@ class Rotation:
             if there:
                 self._done.append(part)
             else:
-                self._lose(part)
+                self._count_lost(part)
             self.number += 1
         else:
             try:

@@ -52,19 +52,19 @@ class ChosenVehicle:
     @property
     def notes(self) -> tuple[str, ...]:
         """Sentences on who else is in the recording, and on what is not known of the vehicle."""
-        found = []
+        notes = []
         if self.system is not None and self.heartbeat is None:
-            found.append(f"system {self.system} sends no heartbeat of an autopilot: its mode and arming are not known")
+            notes.append(f"system {self.system} sends no heartbeat of an autopilot: its mode and arming are not known")
         if self.others:
             names = ", ".join(
                 f"system {sender.system} ({find_autopilot_name(sender.autopilot)})" for sender in self.others
             )
-            found.append(
+            notes.append(
                 f"another vehicle is in it: {names}; system {self.system} is shown, `--system` chooses another"
                 if len(self.others) == 1
                 else f"other vehicles are in it: {names}; system {self.system} is shown, `--system` chooses another"
             )
-        return tuple(found)
+        return tuple(notes)
 
     def of_others(self, packet: TlogPacket) -> bool:
         """Return whether a packet comes from another vehicle's system."""
@@ -108,7 +108,7 @@ def choose_vehicle(packets: Sequence[TlogPacket], name: str, system: int | None 
         listed = ", ".join(map(str, there))
         raise UsageError(f"--system {system}: {name} has nothing of it; systems in it: {listed}")
     if system is None:
-        systems = (get_system_id(heard.data) for heard in packets if get_message_id(heard.data) in _STATES)
+        systems = (get_system_id(packet.data) for packet in packets if get_message_id(packet.data) in _STATES)
         system = next((system for system in systems if system not in GROUND_SYSTEMS), None)
     others = tuple(vehicle for number, vehicle in sorted(vehicles.items()) if number != system)
     return ChosenVehicle(system, None if system is None else vehicles.get(system), others)
@@ -147,5 +147,5 @@ class SenderCounter:
 
 
 def _get_type_name(kind: int) -> str:
-    known = mavlink.enums["MAV_TYPE"].get(kind)
-    return f"type {kind}" if known is None else known.name.removeprefix("MAV_TYPE_").lower().replace("_", " ")
+    entry = mavlink.enums["MAV_TYPE"].get(kind)
+    return f"type {kind}" if entry is None else entry.name.removeprefix("MAV_TYPE_").lower().replace("_", " ")

@@ -120,8 +120,8 @@ def compute_box(flight: FlightData, t_s: Array) -> tuple[Array, Array]:
 def _read_fences(flight: FlightData) -> Iterator[FenceConfig]:
     """Return the fences of the flight's configuration; none if it cannot be read any more."""
     try:
-        found = tomllib.loads(flight.header.config_toml).get("fence", [])
-        yield from msgspec.convert(found, tuple[FenceConfig, ...])
+        fences = tomllib.loads(flight.header.config_toml).get("fence", [])
+        yield from msgspec.convert(fences, tuple[FenceConfig, ...])
     except (tomllib.TOMLDecodeError, msgspec.ValidationError):
         return
 
@@ -218,7 +218,7 @@ def summarise(
     solves = [d.solve for d in flight.decisions if d.solve is not None]
     error_m = compute_position_errors_m(flight)
     settled = error_m[-max(1, round(SETTLED_SHARE * len(error_m))) :]
-    course = compute_course_error(flight)
+    course_error = compute_course_error(flight)
     return FlightSummary(
         steps=len(steps),
         duration_s=round(flight.duration_s, 9),
@@ -251,9 +251,9 @@ def summarise(
         trajectory=flight.moving_target,
         settled_error_m=float(np.sqrt(np.mean(settled**2))) if len(settled) else None,
         final_error_m=float(error_m[-1]) if len(error_m) else None,
-        course_rms_m=None if course is None else course.rms_m,
-        course_worst_m=None if course is None else course.worst_m,
-        course_worst_s=None if course is None else course.worst_s,
+        course_rms_m=None if course_error is None else course_error.rms_m,
+        course_worst_m=None if course_error is None else course_error.worst_m,
+        course_worst_s=None if course_error is None else course_error.worst_s,
         final_age_s=None if flight.last_flown is None else flight.last_flown.age_s,
         final_std_m=_position_std_m(flight),
         recorder_dropped=recorder_dropped,

@@ -32,7 +32,7 @@ from uavctl.records import Decision, Header, LinkStats, PositionSample, Record, 
 # Clocks are set by hand, by a GPS or by a server; what is no more than this is order, or a silence.
 FARTHEST_BACK_NS = 1_000_000_000
 LONGEST_SILENCE_NS = 3600 * 1_000_000_000
-_TOLD_SILENCE_NS = 10_000_000_000  # a vehicle's heartbeats come once a second
+_MIN_REPORTED_SILENCE_NS = 10_000_000_000  # a vehicle's heartbeats come once a second
 _MOST_AT_ONCE = 200  # packets of one stamp: what a fast link brings within the 16 ms of a coarse clock is less
 
 
@@ -46,7 +46,7 @@ class MonotonicClock:
     def __init__(self) -> None:
         self._offset_ns = self._former_ns = 0
         self._last_ns: int | None = None  # the latest time given
-        self._stamps = self._zeros = self._missing = self._backward = self._leaps = 0
+        self._stamps = self._zeros = self._missing = self._backward = self._jumps = 0
         self._first_ns: int | None = None  # the first stamp
         self._same = True  # all stamps so far are that one
         self._farthest_ns = self._silence_ns = 0
@@ -70,7 +70,7 @@ class MonotonicClock:
         if offset_ns is None:
             offset_ns = self._last_ns - stamp_ns
         if offset_ns != self._offset_ns:
-            self._leaps += 1
+            self._jumps += 1
             self._farthest_ns = max(self._farthest_ns, abs(offset_ns - self._offset_ns))
             self._former_ns, self._offset_ns = self._offset_ns, offset_ns
         at_ns = stamp_ns + offset_ns
@@ -92,19 +92,19 @@ class MonotonicClock:
 
     def notes(self, name: str) -> tuple[str, ...]:
         """Return sentences on what was odd about the stamps."""
-        found = []
-        if self._leaps:
-            found.append(
-                f"{name}: its clock leaps ({count(self._leaps, 'time')}, by up to {self._farthest_ns * 1e-9:.0f} s); "
+        notes = []
+        if self._jumps:
+            notes.append(
+                f"{name}: its clock leaps ({count(self._jumps, 'time')}, by up to {self._farthest_ns * 1e-9:.0f} s); "
                 "taken as if it had gone on"
             )
         if self._missing:
-            found.append(f"{name}: {count(self._missing, 'time stamp')} of zero; taken for the time before")
+            notes.append(f"{name}: {count(self._missing, 'time stamp')} of zero; taken for the time before")
         if self._backward:
-            found.append(f"{name}: {count(self._backward, 'time stamp')} not in order; put in order")
-        if self._silence_ns > _TOLD_SILENCE_NS:
-            found.append(f"{name}: nothing in it for {self._silence_ns * 1e-9:.0f} s")
-        return tuple(found)
+            notes.append(f"{name}: {count(self._backward, 'time stamp')} not in order; put in order")
+        if self._silence_ns > _MIN_REPORTED_SILENCE_NS:
+            notes.append(f"{name}: nothing in it for {self._silence_ns * 1e-9:.0f} s")
+        return tuple(notes)
 
     def _fitting(self, stamp_ns: int) -> int | None:
         """Return which of the last two offsets a stamp fits [ns]; None if neither."""
@@ -155,12 +155,12 @@ class Tlog:
     @property
     def notes(self) -> tuple[str, ...]:
         """Sentences on what was left out, and what was odd about the clock."""
-        found = list(self.clock_notes)
+        notes = list(self.clock_notes)
         if self.skipped_bytes:
-            found.append(f"{count(self.skipped_bytes, 'byte')} between its packets left out: no packet with a stamp")
+            notes.append(f"{count(self.skipped_bytes, 'byte')} between its packets left out: no packet with a stamp")
         if self.torn_bytes:
-            found.append(f"the recording is torn within a packet: its last {count(self.torn_bytes, 'byte')} left out")
-        return tuple(found)
+            notes.append(f"the recording is torn within a packet: its last {count(self.torn_bytes, 'byte')} left out")
+        return tuple(notes)
 
 
 def read_tlog(path: Path) -> Tlog:
@@ -175,28 +175,28 @@ def read_tlog(path: Path) -> Tlog:
         data = path.read_bytes()
     except OSError as error:
         raise RecordingError(f"{path}: {error.strerror}") from error
-    found = _Cutter(data, _STAMP)
+    cutter = _Cutter(data, _STAMP)
     note: tuple[str, ...] = ()
-    if 2 * found.skipped_bytes > len(data) or not found.packets:
-        other = _Cutter(data, _OLD_STAMP)
-        if 2 * other.skipped_bytes < found.skipped_bytes or len(other.packets) > 2 * len(found.packets):
-            found = other
+    if 2 * cutter.skipped_bytes > len(data) or not cutter.packets:
+        other_cutter = _Cutter(data, _OLD_STAMP)
+        if 2 * other_cutter.skipped_bytes < cutter.skipped_bytes or len(other_cutter.packets) > 2 * len(cutter.packets):
+            cutter = other_cutter
             note = (f"{path.name}: its time stamps are little-endian, as QGroundControl wrote them before 2014",)
-    if found.lacks_stamps():
+    if cutter.lacks_stamps():
         raise RecordingError(
             f"{path}: its MAVLink packets have no time stamps (the bytes of a link as they came, like MAVProxy's "
             ".tlog.raw), so nobody knows what came when; give the .tlog of that flight"
         )
-    if not found.packets:
+    if not cutter.packets:
         raise RecordingError(
             f"{path}: no MAVLink packet with a time stamp in it; is it a .tlog?{describe_kind_error(path)}"
         )
-    found.clock.check(str(path))
+    cutter.clock.check(str(path))
     return Tlog(
-        sort_packets(found.packets),
-        torn_bytes=found.torn_bytes,
-        skipped_bytes=found.skipped_bytes,
-        clock_notes=(*note, *found.clock.notes(path.name)),
+        sort_packets(cutter.packets),
+        torn_bytes=cutter.torn_bytes,
+        skipped_bytes=cutter.skipped_bytes,
+        clock_notes=(*note, *cutter.clock.notes(path.name)),
     )
 
 
@@ -218,8 +218,8 @@ class _Cutter:
 
     def _cut(self) -> None:
         data, at = self._data, 0
-        least = self._stamp.size + 3  # of a packet: enough to know its length
-        while at + least <= len(data):
+        min_bytes = self._stamp.size + 3  # of a packet: enough to know its length
+        while at + min_bytes <= len(data):
             begin = at + self._stamp.size
             length = get_frame_length(data, begin)
             end = begin + length
@@ -233,7 +233,7 @@ class _Cutter:
                 at = end
             else:
                 likely = _LIKELY[self._stamp].search(data, at + 1)
-                later = min(len(data) if likely is None else likely.start(), len(data) - least + 1)
+                later = min(len(data) if likely is None else likely.start(), len(data) - min_bytes + 1)
                 self.skipped_bytes += later - at
                 at = later
         self.torn_bytes = len(data) - at
@@ -242,15 +242,15 @@ class _Cutter:
         """Return whether most frames follow each other without a stamp, by those near the first packet."""
         at, last = self._first, min(self._first + _PROBED_BYTES, len(self._data))
         frames = stamped = 0
-        before = -1  # the end of the frame before
+        frame_end = -1  # the end of the frame before
         while (at := find_next_marker(self._data, at)) < last:
             end = at + get_frame_length(self._data, at)
             if end <= at or end > len(self._data) or not is_frame(self._data[at:end]):
                 at += 1
                 continue
             frames += 1
-            stamped += at != before
-            at = before = end
+            stamped += at != frame_end
+            at = frame_end = end
         return frames > 2 * stamped
 
     def _stamp_us(self, at: int) -> int:
@@ -269,8 +269,8 @@ class _Cutter:
 
 def find_next_marker(data: bytes, start: int) -> int:
     """Return the index of the next byte that could begin a frame, or the end."""
-    found = _ANY_MARKER.search(data, start)
-    return len(data) if found is None else found.start()
+    match = _ANY_MARKER.search(data, start)
+    return len(data) if match is None else match.start()
 
 
 def get_frame_length(data: bytes, at: int) -> int:
@@ -286,8 +286,8 @@ def get_frame_length(data: bytes, at: int) -> int:
 
 def make_packet(at_ns: int, data: bytes) -> TlogPacket:
     """Return a packet with its direction guessed; one too short to name a system counts as incoming."""
-    place = 5 if data[0] == _STX_V2 else 3
-    return TlogPacket(at_ns=at_ns, data=data, outgoing=len(data) > place and data[place] in GROUND_SYSTEMS)
+    offset = 5 if data[0] == _STX_V2 else 3
+    return TlogPacket(at_ns=at_ns, data=data, outgoing=len(data) > offset and data[offset] in GROUND_SYSTEMS)
 
 
 def sort_packets(packets: list[TlogPacket]) -> tuple[TlogPacket, ...]:
@@ -350,16 +350,18 @@ class _Raw:
 
     def __init__(self, streams: frozenset[str]) -> None:
         self._streams = streams
-        self._rest: dict[str, bytes] = {}  # of a stream: the packet that its last chunk ended in
+        self._partial_packets: dict[str, bytes] = {}  # of a stream: the packet that its last chunk ended in
         self._skipped_bytes = 0
         self.links: set[str] = set()
 
     @property
     def left_out_bytes(self) -> int:
         """Return the number of bytes so far that were no packet."""
-        return self._skipped_bytes + sum(map(len, self._rest.values()))
+        return self._skipped_bytes + sum(map(len, self._partial_packets.values()))
 
-    def packets(self, messages: Iterable[RecordedMessage], wanted: str | None) -> Iterator[tuple[int, str, bytes]]:
+    def packets(
+        self, messages: Iterable[RecordedMessage], vehicle_link: str | None
+    ) -> Iterator[tuple[int, str, bytes]]:
         """Yield time [ns], topic and bytes of each packet of the wanted connection, or of all."""
         for message in messages:
             topic = message.definition.topic
@@ -368,8 +370,8 @@ class _Raw:
                 continue
             link, _ = raw
             self.links.add(link)
-            if wanted in (None, link):
-                data = self._rest.pop(topic, b"") + message.data
+            if vehicle_link in (None, link):
+                data = self._partial_packets.pop(topic, b"") + message.data
                 yield from ((message.at_ns, topic, packet) for packet in self._cut(topic, data, link in self._streams))
 
     def _cut(self, topic: str, data: bytes, goes_on: bool) -> Iterator[bytes]:
@@ -377,7 +379,7 @@ class _Raw:
         while at < len(data):
             end = _find_packet_end(data, at)
             if end is None and goes_on:
-                self._rest[topic] = data[at:]
+                self._partial_packets[topic] = data[at:]
                 return
             if end is not None and end > at:
                 yield data[at:end]
@@ -399,8 +401,8 @@ def _find_packet_end(data: bytes, at: int) -> int | None:
     end = at + get_frame_length(data, at)
     if end > len(data):
         return None
-    good = end == len(data) or data[end] in MARKERS or is_frame(data[at:end])
-    return end if good else at
+    is_packet = end == len(data) or data[end] in MARKERS or is_frame(data[at:end])
+    return end if is_packet else at
 
 
 def _merge_packets(packets: Iterable[tuple[int, str, bytes]]) -> Iterator[tuple[int, str, bytes]]:

@@ -373,8 +373,8 @@ def _spell_tree(value: object) -> object:
 
 def _restore_fields(fields: dict[str, object], kind: type[Record]) -> int:
     """Turn spelled floats back where a field itself is a float; return how many."""
-    said = {name: value for name in _float_fields(kind) if isinstance(value := fields.get(name), str)}
-    restored = {name: _NON_FINITE[text] for name, text in said.items() if text in _NON_FINITE}
+    number_texts = {name: value for name in _float_fields(kind) if isinstance(value := fields.get(name), str)}
+    restored = {name: _NON_FINITE[text] for name, text in number_texts.items() if text in _NON_FINITE}
     fields.update(restored)
     return len(restored)
 

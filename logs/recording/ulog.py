@@ -102,9 +102,9 @@ class _BoundedFile(io.BytesIO):
         """Read bytes; none once each byte was read too often."""
         if self._reads_left <= 0 or self._bytes_left <= 0:
             return b""
-        found = super().read(size)
-        self._reads_left, self._bytes_left = self._reads_left - 1, self._bytes_left - len(found)
-        return found
+        data = super().read(size)
+        self._reads_left, self._bytes_left = self._reads_left - 1, self._bytes_left - len(data)
+        return data
 
 
 def _remove_short_messages(data: bytearray) -> tuple[int, int]:
@@ -142,7 +142,7 @@ class _Reader:
         """Return the flight."""
         log, origin_ns = self._log, self._origin_us * 1000
         sources = dict(sorted(self._sources(), key=lambda item: -len(item[1].track)))
-        own_source, own = self._own()
+        own_source, own_positions = self._read_own_positions()
         stamps = {_make_topic_name(topic): topic.data["timestamp"].astype(np.float64) for topic in self._topics()}
         ages = {name: neutral.ages_of(source, origin_ns) for name, source in sources.items()}
         setpoints, attitude, height, battery = self._setpoints(), self._attitude(), self._height(), self._battery()
@@ -153,8 +153,8 @@ class _Reader:
             duration_s=self._second(self._last_us),
             autopilot=strip_escapes(str(log.msg_info_dict.get("sys_name", "PX4"))).lower(),
             vehicle_system=system,
-            own_positions=len(own),
-            own_source=own_source if own else "",
+            own_positions=len(own_positions),
+            own_source=own_source if own_positions else "",
             sent=tuple(neutral.figures_of(name, source, ages[name]) for name, source in sources.items()),
             setpoints=len(setpoints[0]),
             modes=tuple(self._modes()),
@@ -175,7 +175,7 @@ class _Reader:
         )
         flight = MavlinkFlight(
             info=info,
-            own=neutral.track_of(own, origin_ns),
+            own=neutral.track_of(own_positions, origin_ns),
             sent={name: neutral.track_of(source.track, origin_ns) for name, source in sources.items()},
             ages=ages,
             setpoint_t_s=setpoints[0],
@@ -197,10 +197,10 @@ class _Reader:
         A damaged stamp is anything: what counts is the longest part that no hour of silence parts.
         """
         begin_us = int(self._log.start_timestamp)
-        every = [topic.data["timestamp"].astype(np.uint64) for topic in self._topics()]
-        if not every:
+        stamp_arrays = [topic.data["timestamp"].astype(np.uint64) for topic in self._topics()]
+        if not stamp_arrays:
             return begin_us, max(begin_us, int(self._log.last_timestamp))
-        at_us = np.sort(np.concatenate(every))
+        at_us = np.sort(np.concatenate(stamp_arrays))
         cuts = np.flatnonzero(np.diff(at_us) > LONGEST_SILENCE_NS // 1000) + 1
         longest = max(np.split(at_us, cuts), key=len)
         first_us, last_us = int(longest[0]), int(longest[-1])
@@ -208,8 +208,8 @@ class _Reader:
             self._bad["stamp of another time"] += strays
             for topic in self._topics():
                 stamps = topic.data["timestamp"]
-                known = (stamps >= longest[0]) & (stamps <= longest[-1])
-                topic.data = {name: values[known] for name, values in topic.data.items()}
+                is_within = (stamps >= longest[0]) & (stamps <= longest[-1])
+                topic.data = {name: values[is_within] for name, values in topic.data.items()}
         # What held before the log began is logged with its own, earlier stamp.
         near = abs(begin_us - first_us) * 1000 <= LONGEST_SILENCE_NS and begin_us <= last_us
         return begin_us if near else first_us, last_us
@@ -228,16 +228,16 @@ class _Reader:
     def _seconds(self, fields: dict[str, Any]) -> Array:
         return np.asarray((fields["timestamp"].astype(np.int64) - self._origin_us) * 1e-6, dtype=np.float64)
 
-    def _own(self) -> tuple[str, list[tuple[int, Any, Any]]]:
+    def _read_own_positions(self) -> tuple[str, list[tuple[int, Any, Any]]]:
         """Return the name and the points of its own position: in local NED, else on the globe."""
         for topic in self._topics(_OWN):
-            if known := self._local(topic.data):
-                return _OWN, known
+            if positions := self._local(topic.data):
+                return _OWN, positions
         for name, (columns, (unit_deg, unit_m)) in _PLACES.items():
             for topic in self._topics(name):
                 newer = _PLACES["sensor_gps"] if "latitude_deg" in topic.data else (columns, (unit_deg, unit_m))
-                if known := self._global(topic.data, *newer):
-                    return name, known
+                if positions := self._global(topic.data, *newer):
+                    return name, positions
         return "", []
 
     def _global(
@@ -246,10 +246,12 @@ class _Reader:
         """Return places on the globe as north, east and down of the first one."""
         unit_deg, unit_m = units
         lat_deg, lon_deg, height_m = (_make_columns(fields, *names) * (unit_deg, unit_deg, unit_m)).T
-        known = np.isfinite(lat_deg + lon_deg + height_m) & (np.abs(lat_deg) <= 90) & ((lat_deg != 0) | (lon_deg != 0))
+        is_valid = (
+            np.isfinite(lat_deg + lon_deg + height_m) & (np.abs(lat_deg) <= 90) & ((lat_deg != 0) | (lon_deg != 0))
+        )
         if "fix_type" in fields:
-            known &= fields["fix_type"] >= _LEAST_FIX
-        at = np.flatnonzero(known)
+            is_valid &= fields["fix_type"] >= _LEAST_FIX
+        at = np.flatnonzero(is_valid)
         if not len(at):
             return []
         home_deg, unknown = (float(lat_deg[at[0]]), float(lon_deg[at[0]])), (math.nan,) * 3
@@ -268,36 +270,36 @@ class _Reader:
             for flag, axes in ((f"{prefix}xy_valid", slice(2)), (f"{prefix}z_valid", slice(2, 3))):
                 if flag in fields:
                     array[fields[flag] == 0, axes] = math.nan
-        return self._known(_OWN, fields["timestamp"], position_m, velocity_mps)
+        return self._list_valid(_OWN, fields["timestamp"], position_m, velocity_mps)
 
-    def _known(self, name: str, at_us: Any, position_m: Array, more: Any) -> list[tuple[int, Any, Any]]:
+    def _list_valid(self, name: str, at_us: Any, position_m: Array, more: Any) -> list[tuple[int, Any, Any]]:
         """Return those with a position, and count the others."""
-        known = np.isfinite(position_m).all(axis=1)
-        if not known.all():
-            self._bad[f"{name} without a valid position"] += int((~known).sum())
-        at_ns = [int(t_us) * 1000 for t_us in at_us[known]]
-        return list(zip(at_ns, map(tuple, position_m[known].tolist()), more[known].tolist(), strict=True))
+        is_valid = np.isfinite(position_m).all(axis=1)
+        if not is_valid.all():
+            self._bad[f"{name} without a valid position"] += int((~is_valid).sum())
+        at_ns = [int(t_us) * 1000 for t_us in at_us[is_valid]]
+        return list(zip(at_ns, map(tuple, position_m[is_valid].tolist()), more[is_valid].tolist(), strict=True))
 
     def _height(self) -> tuple[Array, Array]:
         """Return the height of its own local position, which may be known without a place."""
         fields = self._first(_OWN)
         height_m = -_make_columns(fields, "z")[:, 0]
-        known = np.isfinite(height_m) & (fields.get("z_valid", np.ones(len(height_m))) != 0)
-        return self._seconds(fields)[known], height_m[known]
+        is_valid = np.isfinite(height_m) & (fields.get("z_valid", np.ones(len(height_m))) != 0)
+        return self._seconds(fields)[is_valid], height_m[is_valid]
 
     def _battery(self) -> tuple[Array, Array]:
         fields = self._first("battery_status")
         voltage_v = _make_columns(fields, "voltage_v")[:, 0]
-        known = voltage_v > 0
-        return self._seconds(fields)[known], voltage_v[known]
+        is_valid = voltage_v > 0
+        return self._seconds(fields)[is_valid], voltage_v[is_valid]
 
     def _sources(self) -> Iterator[tuple[str, SentSource]]:
         for topic in self._topics(*_SENT):
             fields, name, source = topic.data, _make_topic_name(topic), SentSource()
             position_m = _make_columns(fields, *_list_vector_fields(fields, "position", ("x", "y", "z")))
             stamps = fields.get("timestamp_sample", np.zeros(len(position_m), dtype=np.int64))
-            for at_ns, place, stamp_us in self._known(name, fields["timestamp"], position_m, stamps):
-                source.take(place, None, stamp_us or None, at_ns)
+            for at_ns, sample_m, stamp_us in self._list_valid(name, fields["timestamp"], position_m, stamps):
+                source.take(sample_m, None, stamp_us or None, at_ns)
             # North-east-down is 1 of pose_frame; of local_frame, which older versions have, it is 0.
             frame, ned = (fields["pose_frame"], 1) if "pose_frame" in fields else (fields.get("local_frame"), 0)
             if frame is not None and (frame != ned).any():
@@ -307,12 +309,12 @@ class _Reader:
 
     def _setpoints(self) -> tuple[Array, Array]:
         fields = self._first(_SETPOINT)
-        place, speed = (
+        position_m, speed = (
             _list_vector_fields(fields, "position", ("x", "y", "z")),
             _list_vector_fields(fields, "velocity", ("vx", "vy", "vz")),
         )
         return self._seconds(fields), _make_columns(
-            fields, *place, *speed, *(f"acceleration[{axis}]" for axis in range(3))
+            fields, *position_m, *speed, *(f"acceleration[{axis}]" for axis in range(3))
         )
 
     def _attitude(self) -> tuple[Array, Array]:
@@ -325,16 +327,16 @@ class _Reader:
         return self._seconds(fields), np.degrees(np.column_stack((roll, pitch, yaw)))
 
     def _modes(self) -> Iterator[ModeBegin]:
-        fields, before = self._first("vehicle_status"), None
+        fields, previous_mode = self._first("vehicle_status"), None
         states = (fields["timestamp"], fields.get("nav_state", ()), fields.get("arming_state", ()))
         for at_us, state, arming in zip(*states, strict=False):
             mode, armed = _MODES.get(int(state), f"MODE_{state}"), bool(arming == _ARMED)
-            if (mode, armed) != before:
+            if (mode, armed) != previous_mode:
                 yield ModeBegin(at_s=self._second(at_us), mode=mode, armed=armed)
-            before = mode, armed
+            previous_mode = mode, armed
 
     def _texts(self) -> Iterator[SpokenText]:
-        tagged = [topic for some in self._log.logged_messages_tagged.values() for topic in some]
+        tagged = [topic for topics in self._log.logged_messages_tagged.values() for topic in topics]
         for message in sorted([*self._log.logged_messages, *tagged], key=lambda message: int(message.timestamp)):
             severity = _SEVERITIES[min(max(message.log_level - ord("0"), 0), 7)]
             yield SpokenText(

@@ -62,17 +62,17 @@ class RepeatedField:
         made: A message with the field once, and nothing else; the argument is the part's numbers (k,), doubles all.
     """
 
-    def __init__(self, made: Callable[[Sequence[float]], Message], count: int) -> None:
+    def __init__(self, make_message: Callable[[Sequence[float]], Message], count: int) -> None:
         marks = [math.pi * (1 + i) for i in range(count)]
-        data = made(marks).SerializeToString()
-        self._one = np.frombuffer(data, dtype=np.uint8)
+        data = make_message(marks).SerializeToString()
+        self._template = np.frombuffer(data, dtype=np.uint8)
         starts = [data.index(np.array(mark, dtype="<f8").tobytes()) for mark in marks]
         self._at = np.add.outer(starts, np.arange(8)).ravel()
 
-    def of(self, numbers: Array) -> bytes:
+    def encode(self, numbers: Array) -> bytes:
         """Return the field with one part for each row of the numbers (n, k)."""
-        rows = np.empty((len(numbers), self._one.size), dtype=np.uint8)
-        rows[:] = self._one
+        rows = np.empty((len(numbers), self._template.size), dtype=np.uint8)
+        rows[:] = self._template
         rows[:, self._at] = np.ascontiguousarray(numbers, dtype="<f8").view(np.uint8)
         return rows.tobytes()
 
@@ -93,7 +93,7 @@ def _choose_colour(red: float, green: float, blue: float, alpha: float) -> Field
 _LIMITS, _TIGHT = _choose_colour(0.9, 0.9, 0.9, 0.9), _choose_colour(1.0, 0.65, 0.1, 0.8)
 _PLANNED, _SPREAD = _choose_colour(0.25, 0.6, 1.0, 1.0), _choose_colour(0.25, 0.6, 1.0, 0.15)
 _FLOWN, _MEASURED = _choose_colour(0.2, 0.85, 0.4, 1.0), _choose_colour(0.85, 0.3, 0.85, 0.8)
-_NEWS, _SILENCE, _FALLBACK = _choose_colour(0.2, 0.85, 0.4, 0.9), _TIGHT, _choose_colour(0.95, 0.2, 0.2, 0.9)
+_NEW_MEASUREMENT, _SILENCE, _FALLBACK = _choose_colour(0.2, 0.85, 0.4, 0.9), _TIGHT, _choose_colour(0.95, 0.2, 0.2, 0.9)
 _LEVEL: Fields = {"w": 1.0}
 _LABEL_M = (0.0, 0.0, -0.35)  # above the vehicle: down is positive
 _IN_CONTROL = frozenset({ControlMode.WAIT, ControlMode.TRACK})
@@ -138,7 +138,7 @@ def make_pose_in_frame(at_ns: int, at_m: Vec3) -> PoseInFrame:
 def make_poses_in_frame(at_ns: int, places_m: Array) -> PosesInFrame:
     """Return places in local NED [m] (n, 3) as poses with their frame, in order."""
     message = _make_message(PosesInFrame, timestamp=make_timestamp(at_ns), frame_id=NED)
-    message.MergeFromString(_POSES.of(places_m))
+    message.MergeFromString(_POSES.encode(places_m))
     return message
 
 
@@ -181,7 +181,7 @@ def draw_room(at_ns: int, design: DesignView) -> SceneUpdate:
 
 
 def draw_plan(
-    at_ns: int, design: DesignView, plan: Plan, estimate: Estimate | None, places: Array | None = None
+    at_ns: int, design: DesignView, plan: Plan, estimate: Estimate | None, positions: Array | None = None
 ) -> SceneUpdate:
     """Draw a plan's predicted path, its confidence ellipsoids, and the tightened limits at its end.
 
@@ -189,7 +189,7 @@ def draw_plan(
     from them so that they hold with the promised probability. The estimate's is from its covariance.
     `places` are the positions of the plan's states, where they are at hand.
     """
-    places = design.positions_of(plan.states) if places is None else places
+    places = design.positions_of(plan.states) if positions is None else positions
     spread = np.concatenate([places, 2.0 * _compute_semi_axes(design, plan.backoff_x)], axis=1)
     lower, upper = _get_room_sides(design, *tighten_limits(design, plan.backoff_x, -1))
     entities = [
@@ -200,8 +200,8 @@ def draw_plan(
     if estimate is not None:
         entities.append(_make_entity(at_ns, "estimate, 95 %", spheres=[_draw_estimate_ellipsoid(design, estimate)]))
     scene = _make_update(*entities)
-    scene.entities[0].lines[0].MergeFromString(_POINTS.of(places))
-    scene.entities[1].MergeFromString(_SPHERES.of(spread))
+    scene.entities[0].lines[0].MergeFromString(_POINTS.encode(places))
+    scene.entities[1].MergeFromString(_SPHERES.encode(spread))
     return scene
 
 
@@ -215,7 +215,7 @@ def draw_path(at_ns: int, flown_m: Sequence[Vec3], measured_m: Sequence[Vec3]) -
 
 def draw_link(at_ns: int, design: DesignView, decision: Decision) -> SceneUpdate:
     """Draw the link's state at the vehicle, with words: green with news, amber in silence, red in the fallback."""
-    colour = _FALLBACK if decision.mode not in _IN_CONTROL else _NEWS if decision.news else _SILENCE
+    colour = _FALLBACK if decision.mode not in _IN_CONTROL else _NEW_MEASUREMENT if decision.news else _SILENCE
     age = "no position yet" if decision.age_steps is None else f"age {decision.age_steps} of {design.horizon} steps"
     label: Fields = {
         "pose": make_pose(_LABEL_M),
@@ -289,9 +289,9 @@ def _compute_semi_axes(design: DesignView, backoff: Matrix) -> Array:
 def _draw_estimate_ellipsoid(design: DesignView, estimate: Estimate) -> Fields:
     """Draw the ellipsoid that holds the position with 95 %, by the covariance."""
     cov = [[0.0] * 3 for _ in range(3)]
-    places = [(AXIS_NUMBER[axis], index) for axis, index in zip(design.axes, design.position_index, strict=True)]
-    for row, i in places:
-        for column, j in places:
+    axis_states = [(AXIS_NUMBER[axis], index) for axis, index in zip(design.axes, design.position_index, strict=True)]
+    for row, i in axis_states:
+        for column, j in axis_states:
             cov[row][column] = estimate.cov[i][j]
     variances, directions = np.linalg.eigh(cov)
     semi_axes_m = STD_95 * np.sqrt(np.maximum(variances, 0.0))
@@ -335,7 +335,7 @@ class ViewBuilder:
         self._still_ns = self._trail_ns = self._plan_ns = 0
         self._zero_utc_ns = 0  # stamps, like log times, are so much later than the records' times
 
-    def made(self, at_ns: int, record: Record) -> list[tuple[str, bytes]]:
+    def derive(self, at_ns: int, record: Record) -> list[tuple[str, bytes]]:
         """Yield topic and message of all that is derived from a record, in order; nothing before a header.
 
         Args:
@@ -352,9 +352,9 @@ class ViewBuilder:
         if self._design is None or isinstance(record, Datagram):  # half of all records
             return []
         views = [*self._views(self._design, at_ns, record)]
-        made = [(topic, view.SerializeToString()) for topic, view in views]
-        made += [(topics.PLOTS[type(plot)], pack_message(plot)) for plot in self._plots(self._design, record)]
-        return made
+        messages = [(topic, view.SerializeToString()) for topic, view in views]
+        messages += [(topics.PLOTS[type(plot)], pack_message(plot)) for plot in self._plots(self._design, record)]
+        return messages
 
     def _plots(self, design: DesignView, record: Record) -> Iterator[Record]:
         match record:
@@ -406,15 +406,15 @@ class ViewBuilder:
                     yield topics.MEASURED, make_pose_in_frame(captured_utc_ns, sample.position_m)
             case Plan() if record.status is SolveStatus.OPTIMAL and at_ns >= self._plan_ns:
                 self._plan_ns = at_ns + PLAN_NS
-                places = design.positions_of(record.states)
+                positions = design.positions_of(record.states)
                 utc_ns = at_ns + self._zero_utc_ns
-                yield topics.PLAN, make_poses_in_frame(utc_ns, places)
-                yield topics.PLAN_SCENE, draw_plan(utc_ns, design, record, self._estimate, places)
+                yield topics.PLAN, make_poses_in_frame(utc_ns, positions)
+                yield topics.PLAN_SCENE, draw_plan(utc_ns, design, record, self._estimate, positions)
             case Event():
                 yield topics.LOG, make_log_message(record, record.at_ns + self._zero_utc_ns)
             case RecorderNote():
-                told = Event(at_ns=at_ns, severity=Severity.WARNING, code=EventCode.RECORDING, text=record.text)
-                yield topics.LOG, make_log_message(told, at_ns + self._zero_utc_ns)
+                event = Event(at_ns=at_ns, severity=Severity.WARNING, code=EventCode.RECORDING, text=record.text)
+                yield topics.LOG, make_log_message(event, at_ns + self._zero_utc_ns)
 
     def _still(self, design: DesignView, at_ns: int) -> Iterator[_Item]:
         """Yield the scenes that do not move, when they are due."""
@@ -433,20 +433,23 @@ class ViewBuilder:
         if decision.at_ns >= self._trail_ns:
             self._trail_ns = decision.at_ns + TRAIL_NS
             since_ns = decision.at_ns - round(TRAIL_S * 1e9)
-            yield (topics.PATH_SCENE, draw_path(utc_ns, self._flown.since(since_ns), self._measured.since(since_ns)))
+            yield (
+                topics.PATH_SCENE,
+                draw_path(utc_ns, self._flown.list_points(since_ns), self._measured.list_points(since_ns)),
+            )
 
 
 class _Trail:
     """Recent places."""
 
     def __init__(self) -> None:
-        self._places: deque[tuple[int, Vec3]] = deque(maxlen=_TRAIL_POINTS)
+        self._points: deque[tuple[int, Vec3]] = deque(maxlen=_TRAIL_POINTS)
 
     def add(self, at_ns: int, at_m: Vec3) -> None:
         """Add a place, unless the last one was added only just before."""
-        if not self._places or at_ns - self._places[-1][0] >= TRAIL_S * 1e9 / _TRAIL_POINTS:
-            self._places.append((at_ns, at_m))
+        if not self._points or at_ns - self._points[-1][0] >= TRAIL_S * 1e9 / _TRAIL_POINTS:
+            self._points.append((at_ns, at_m))
 
-    def since(self, at_ns: int) -> list[Vec3]:
+    def list_points(self, at_ns: int) -> list[Vec3]:
         """Return the places since a time."""
-        return [at_m for told_ns, at_m in self._places if told_ns >= at_ns]
+        return [at_m for point_ns, at_m in self._points if point_ns >= at_ns]

@@ -54,7 +54,7 @@ def test_it_shows_what_the_records_say() -> None:
     """At each decision of a recorded flight, beside the records themselves."""
     seen, newest, shown = FlightScene(), dict[type[Record], Any](), 0
     for _, _, record in flown().entries:
-        seen.see(record)
+        seen.add_record(record)
         newest[type(record)] = record
         if not isinstance(record, Decision):
             continue
@@ -86,7 +86,7 @@ def test_there_is_nothing_to_see_before_the_first_decision() -> None:
     for _, _, record in flown().entries:
         if isinstance(record, Decision):
             break
-        seen.see(record)
+        seen.add_record(record)
     assert seen.scene() is None
 
 
@@ -94,9 +94,9 @@ def test_newest_messages_come_first_and_old_ones_go() -> None:
     seen = FlightScene()
     rows = [record for _, _, record in flown().entries if isinstance(record, Header | Decision)]
     for record in rows[:2]:
-        seen.see(record)
+        seen.add_record(record)
     for number in range(100):
-        seen.see(Event(at_ns=number, severity="info", code="a", text=str(number)))  # type: ignore[arg-type]
+        seen.add_record(Event(at_ns=number, severity="info", code="a", text=str(number)))  # type: ignore[arg-type]
     found = seen.scene()
     assert found is not None
     assert [one.text for one in found.events] == [str(number) for number in range(99, 99 - len(found.events), -1)]

@@ -48,7 +48,7 @@ def cost(folder: Path, ticks: list[list[Item]], seconds: float) -> dict[str, flo
         Wall times [us] of a record and of a tick's records, median and 99th percentile; with `empty_`, those of the
         sink that does nothing. The clock's own time is in all of them. `dropped`, `records` and `ticks` were recorded.
     """
-    recorder, nothing = Recorder(folder / "flight.mcap", onlookers=DerivedTopics(ViewBuilder())), Nothing()
+    recorder, nothing = Recorder(folder / "flight.mcap", derived_topics=DerivedTopics(ViewBuilder())), Nothing()
     with _as_in_flight():
         found = _measured({"": recorder, "empty_": nothing}, ticks, round(seconds / TICK_S))
     status = recorder.close()

@@ -196,7 +196,7 @@ def record(seed: int, path: Path) -> tuple[Drawn, Counter[str]]:
     """Fly a seed's flight into the new recording `path`."""
     plan = drawn(seed)
     config, prepared = plan.config, prepared_of(plan.config)
-    recorder = SyncRecorder(path, config.log, onlookers=DerivedTopics(ViewBuilder()) if plan.viewers else None)
+    recorder = SyncRecorder(path, config.log, derived_topics=DerivedTopics(ViewBuilder()) if plan.viewers else None)
     sink = _Seen(recorder)
     try:
         put_header(recorder, prepared, started_ns=plan.start_ns)

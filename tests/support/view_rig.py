@@ -31,7 +31,7 @@ def flown() -> Memory:
 
 def record(path: Path) -> Path:
     """The flight's file."""
-    recorder = SyncRecorder(path, onlookers=DerivedTopics(ViewBuilder()))
+    recorder = SyncRecorder(path, derived_topics=DerivedTopics(ViewBuilder()))
     for entry in flown().entries:
         recorder.put(*entry)
     status = recorder.close()

@@ -251,7 +251,7 @@ def fly_daemon(
             told = ParameterReader()
             if take_off_m is not None:
                 checked = checked_before_arming(config, connections, stopped, take_off_m, told, planned)
-            recorder = Recorder(path, config.log, onlookers=looking)
+            recorder = Recorder(path, config.log, derived_topics=looking)
             loop = ControlLoop(config, prepared.controller, recorder, time.perf_counter_ns)
             engagement.begin(loop)
             asked_for = False

@@ -217,7 +217,7 @@ def onlookers(live_port: int | None = None) -> Iterator[DerivedTopics]:
         messages().print(f"live page: {address}", soft_wrap=True)
         if not has_sdk:
             messages().print("nothing for Foxglove: that takes pip install 'uavctl[live]'", soft_wrap=True)
-        yield DerivedTopics(ViewBuilder(), watch, flight.see)
+        yield DerivedTopics(ViewBuilder(), watch, flight.add_record)
 
 
 def conclude(path: Path, wall_s: float, status: RecorderStatus, ending: Ending | None = None) -> FlightSummary:

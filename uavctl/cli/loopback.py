@@ -157,7 +157,7 @@ def _real_time(prepared: Prepared, path: Path, engagement: Engagement, looking: 
     with ExitStack() as stack:
         stopped = stack.enter_context(stop_on_signals())
         connections = stack.enter_context(open_links(config))
-        recorder = Recorder(path, config.log, onlookers=looking)
+        recorder = Recorder(path, config.log, derived_topics=looking)
         loop = ControlLoop(config, prepared.controller, recorder, time.perf_counter_ns)
         engagement.begin(loop)
         loop.account.ends_in_flight = not takes_off

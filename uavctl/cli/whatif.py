@@ -355,7 +355,7 @@ def _recorded(
     watch: Watch,
 ) -> tuple[FlownCourse, RecorderStatus]:
     """Fly what was changed, and record it; remove an incomplete recording, which would look like a shorter flight."""
-    recorder = SyncRecorder(path, now.config.log, onlookers=DerivedTopics(ViewBuilder()))
+    recorder = SyncRecorder(path, now.config.log, derived_topics=DerivedTopics(ViewBuilder()))
     try:
         put_header(recorder, now, recorded.started_ns, recorded.zero_utc_ns)
         course = fly(history, now.config, now.controller, response, recorder, time.perf_counter_ns, other, watch)

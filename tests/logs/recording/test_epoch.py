@@ -100,7 +100,9 @@ def test_the_offset_is_taken_between_two_looks_at_our_clock(monkeypatch: pytest.
 def test_stamps_within_views_are_those_of_the_file(tmp_path: Path) -> None:
     path = tmp_path / "flight.mcap"
     watched: list[int] = []
-    recorder = SyncRecorder(path, onlookers=DerivedTopics(ViewBuilder(), lambda _, at_ns, __: watched.append(at_ns)))
+    recorder = SyncRecorder(
+        path, derived_topics=DerivedTopics(ViewBuilder(), lambda _, at_ns, __: watched.append(at_ns))
+    )
     for topic, at_ns, one in flown().entries:
         recorder.put(
             topic, at_ns, msgspec.structs.replace(one, zero_utc_ns=ZERO_NS) if isinstance(one, Header) else one

@@ -304,7 +304,7 @@ def test_progress_sees_every_message_and_knows_their_number(tmp_path: Path, file
     segment_bytes = 10**9 if files == 1 else view_rig.record(path).stat().st_size * 2 // 5
     path.unlink(missing_ok=True)
     recorder = SyncRecorder(
-        path, LogConfig(segment_bytes=segment_bytes, chunk_bytes=16384), onlookers=DerivedTopics(ViewBuilder())
+        path, LogConfig(segment_bytes=segment_bytes, chunk_bytes=16384), derived_topics=DerivedTopics(ViewBuilder())
     )
     for entry in view_rig.flown().entries:
         recorder.put(*entry)

@@ -103,7 +103,7 @@ def test_a_wrong_checksum_and_an_unknown_id_are_left_to_the_parser() -> None:
     unknown = good[:7] + b"\xff\xff\x7f" + good[10:]
     found = cut_stream([(5, good + wrong + unknown + good)])
     assert [one.data for one in found.packets] == [good, wrong, unknown, good]
-    assert (found.right, found.left_out_bytes) == (2, 0)
+    assert (found.valid_count, found.left_out_bytes) == (2, 0)
 
 
 def test_a_channel_that_is_mostly_something_else_is_named_and_taken_when_asked_for(tmp_path: Path) -> None:

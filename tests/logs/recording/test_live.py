@@ -66,7 +66,7 @@ def test_a_viewer_gets_every_topic_with_its_schema(tmp_path: Path) -> None:
     ports: list[int] = []
     told = {topic for topic, _, _ in flown().entries if not topic.startswith("/raw/")} | {view.name for view in VIEWS}
     with live_view(0, on_open=ports.append) as watch:
-        recorder = Recorder(tmp_path / "a.mcap", onlookers=DerivedTopics(ViewBuilder(), watch))
+        recorder = Recorder(tmp_path / "a.mcap", derived_topics=DerivedTopics(ViewBuilder(), watch))
         for entry in flown().entries:
             recorder.put(*entry)
         assert recorder.close().ok
@@ -95,7 +95,7 @@ def test_a_stalled_viewer_holds_nothing_up_and_the_oldest_messages_go(tmp_path: 
             with telling(watch, 1, b"{}"):
                 next(messages)
             # From here on the viewer does not read.
-            recorder = Recorder(tmp_path / "a.mcap", onlookers=DerivedTopics(ViewBuilder(), watch))
+            recorder = Recorder(tmp_path / "a.mcap", derived_topics=DerivedTopics(ViewBuilder(), watch))
 
             def fly() -> None:
                 for entry in flown().entries:

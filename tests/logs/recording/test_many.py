@@ -24,7 +24,7 @@ def test_they_are_those_made_one_by_one(count: int) -> None:
     places[::3, 1] = 0.0
     places[1::7, 2] = [np.inf] * len(places[1::7])
     filled = PosesInFrame(frame_id="ned")
-    filled.MergeFromString(RepeatedField(lambda at_m: poses([[*at_m]]), 3).of(places))
+    filled.MergeFromString(RepeatedField(lambda at_m: poses([[*at_m]]), 3).encode(places))
     made = poses(places.tolist())
     made.frame_id = "ned"
     assert filled.SerializeToString() == made.SerializeToString()

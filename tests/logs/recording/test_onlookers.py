@@ -31,7 +31,7 @@ def test_the_records_read_back_as_if_there_were_no_views(tmp_path: Path) -> None
 def test_a_disk_full_at_every_operation_loses_neither_records_nor_views(tmp_path: Path) -> None:
     items = flown().entries[:120]
     whole = tmp_path / "whole.mcap"
-    recorder = SyncRecorder(whole, onlookers=DerivedTopics(ViewBuilder()))
+    recorder = SyncRecorder(whole, derived_topics=DerivedTopics(ViewBuilder()))
     for item in items:
         recorder.put(*item)
     recorder.close()
@@ -41,7 +41,11 @@ def test_a_disk_full_at_every_operation_loses_neither_records_nor_views(tmp_path
         path = tmp_path / f"at{number}" / "flight.mcap"
         clock, disk = Clock(), Disk({number}.__contains__)
         recorder = SyncRecorder(
-            path, LogConfig(chunk_bytes=4096), open_file=disk.open, clock=clock, onlookers=DerivedTopics(ViewBuilder())
+            path,
+            LogConfig(chunk_bytes=4096),
+            open_file=disk.open,
+            clock=clock,
+            derived_topics=DerivedTopics(ViewBuilder()),
         )
         for item in items:
             clock.now_s += 0.1
@@ -69,7 +73,7 @@ def test_a_torn_file_is_recovered_with_its_views(tmp_path: Path) -> None:
 
 def test_what_has_no_view_is_recorded_and_counted(tmp_path: Path) -> None:
     # This header's design lacks what a view needs.
-    recorder = SyncRecorder(tmp_path / "flight.mcap", onlookers=DerivedTopics(ViewBuilder()))
+    recorder = SyncRecorder(tmp_path / "flight.mcap", derived_topics=DerivedTopics(ViewBuilder()))
     for item in flight(30):
         recorder.put(*item)
     status = recorder.close()
@@ -82,12 +86,12 @@ def test_what_has_no_view_is_recorded_and_counted(tmp_path: Path) -> None:
 @pytest.mark.parametrize("error", [ValueError, TypeError, IndexError, ZeroDivisionError])
 def test_a_view_that_fails_once_is_there_again_with_the_next_record(tmp_path: Path, error: type[Exception]) -> None:
     class Failing(ViewBuilder):
-        def made(self, at_ns: int, record: Record) -> list[tuple[str, bytes]]:
+        def derive(self, at_ns: int, record: Record) -> list[tuple[str, bytes]]:
             if isinstance(record, Estimate) and record.at_ns == flown().of(Estimate)[5].at_ns:
                 raise error("no")
-            return super().made(at_ns, record)
+            return super().derive(at_ns, record)
 
-    recorder = Recorder(tmp_path / "flight.mcap", onlookers=DerivedTopics(Failing()))
+    recorder = Recorder(tmp_path / "flight.mcap", derived_topics=DerivedTopics(Failing()))
     for item in flown().entries:
         recorder.put(*item)
     status = recorder.close()
@@ -103,7 +107,7 @@ def test_who_watches_sees_each_message_once_in_order(tmp_path: Path) -> None:
         seen.append((definition.topic, at_ns, data))
 
     path = tmp_path / "flight.mcap"
-    recorder = SyncRecorder(path, onlookers=DerivedTopics(ViewBuilder(), watch))
+    recorder = SyncRecorder(path, derived_topics=DerivedTopics(ViewBuilder(), watch))
     for item in flown().entries:
         recorder.put(*item)
     recorder.close()

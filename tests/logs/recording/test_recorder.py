@@ -14,7 +14,15 @@ from logs.recording.derived_topics import LOG
 from logs.recording.disk import DiskFile, OutputFile
 from logs.recording.notes import RecorderNote
 from logs.recording.reader import RecordedMessage, read, records, scan, segment_files
-from logs.recording.recorder import RECORDS, VIEWS, DerivedTopics, Recorder, SyncRecorder, WriteQueue, portion
+from logs.recording.recorder import (
+    RECORDS,
+    VIEWS,
+    DerivedTopics,
+    Recorder,
+    SyncRecorder,
+    WriteQueue,
+    compute_batch_size,
+)
 from logs.recording.topics import is_view
 from logs.recording.views import ViewBuilder
 from uavctl.config.types import LogConfig
@@ -169,12 +177,12 @@ def test_all_that_waits_is_written_before_anything_is_made_for_viewers(tmp_path:
         return DiskFile(path)
 
     class Looking:
-        def made(self, at_ns: int, record: Record) -> list[tuple[str, bytes]]:
+        def derive(self, at_ns: int, record: Record) -> list[tuple[str, bytes]]:
             on_disk.append(len(own(list(read(path)))))
             return []
 
     items = flight(RECORDS)
-    recorder = Recorder(path, LogConfig(chunk_bytes=1024), open_file=open_file, onlookers=DerivedTopics(Looking()))
+    recorder = Recorder(path, LogConfig(chunk_bytes=1024), open_file=open_file, derived_topics=DerivedTopics(Looking()))
     recorder.put(*items[0])
     assert reached.wait(30.0)  # the first round took one record
     for item in items[1:]:
@@ -189,7 +197,7 @@ def test_all_that_waits_is_written_before_anything_is_made_for_viewers(tmp_path:
 
 def test_views_that_a_rest_overtakes_are_written_after_it(tmp_path: Path) -> None:
     class Same:
-        def made(self, at_ns: int, record: Record) -> list[tuple[str, bytes]]:
+        def derive(self, at_ns: int, record: Record) -> list[tuple[str, bytes]]:
             return [(LOG, record.code.encode())] if isinstance(record, Event) else []
 
     path = tmp_path / "flight.mcap"
@@ -220,7 +228,7 @@ def test_29_disk_full_at_every_operation_of_the_writing_thread_loses_neither_rec
             LogConfig(chunk_bytes=4096),
             open_file=disk.open,
             clock=Clock(0.01),
-            onlookers=DerivedTopics(ViewBuilder()),
+            derived_topics=DerivedTopics(ViewBuilder()),
         )
         for item in items:
             recorder.put(*item)
@@ -238,10 +246,10 @@ def test_29_disk_full_at_every_operation_of_the_writing_thread_loses_neither_rec
 
 
 def test_a_large_backlog_is_written_in_shares() -> None:
-    assert portion(0, RECORDS) == portion(RECORDS, RECORDS) == RECORDS
-    assert portion(8000, RECORDS) == 1000
+    assert compute_batch_size(0, RECORDS) == compute_batch_size(RECORDS, RECORDS) == RECORDS
+    assert compute_batch_size(8000, RECORDS) == 1000
     waiting, rounds = 8192, 0
     while waiting > VIEWS:
-        waiting += 24 - portion(waiting, VIEWS)  # 24 more come in the time of a round, 1200 a second
+        waiting += 24 - compute_batch_size(waiting, VIEWS)  # 24 more come in the time of a round, 1200 a second
         rounds += 1
     assert rounds < 100  # two seconds

@@ -200,8 +200,8 @@ def test_the_watch_warns_rests_and_goes_on_with_a_margin() -> None:
     watch = FreeSpaceMonitor(Path("flights"), room, LOW, STOP)
     seen = []
     for room.free in (3000, 2999, 1000, 999, 1500, 2999, None, 3000, 1500):
-        watch.look()
-        seen.append((watch.low, watch.resting))
+        watch.check()
+        seen.append((watch.low, watch.is_paused))
     low, rest, well = (True, False), (True, True), (False, False)
     assert seen == [well, low, low, rest, rest, rest, rest, well, low]
 
@@ -266,7 +266,7 @@ def test_29_viewers_are_told_that_the_disk_gets_low(tmp_path: Path) -> None:
     room, clock = Room(), Clock()
     looking = DerivedTopics(ViewBuilder(), lambda definition, _, data: seen.append((definition.topic, data)))
     log = LogConfig(low_bytes=LOW, stop_bytes=STOP)
-    recorder = SyncRecorder(tmp_path / "flight.mcap", log, free=room, clock=clock, onlookers=looking)
+    recorder = SyncRecorder(tmp_path / "flight.mcap", log, free=room, clock=clock, derived_topics=looking)
     loaded = load_config("room-hahn-stursberg")
     recorder.put("/uavctl/header", 0, made_header(loaded, build_design(loaded)))
     fly(recorder, clock, flight(20)[1:])

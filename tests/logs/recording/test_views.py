@@ -42,7 +42,7 @@ def views(*records: Record, maker: ViewBuilder | None = None) -> Found:
     found: Found = {name: [] for name in KINDS}
     entries = [(getattr(one, "at_ns", 0), one) for one in records] or [(at, one) for _, at, one in flown().entries]
     for at_ns, record in entries:
-        for topic, data in maker.made(at_ns, record):
+        for topic, data in maker.derive(at_ns, record):
             found[topic].append((at_ns, KINDS[topic].FromString(data)))
     return found
 
@@ -84,9 +84,9 @@ def test_each_topic_has_as_many_messages_as_its_records(found: Found) -> None:
 def test_plans_that_come_quickly_are_not_all_drawn() -> None:
     header, plan = flown().of(Header)[0], next(p for p in flown().of(Plan) if p.status is SolveStatus.OPTIMAL)
     maker = ViewBuilder()
-    maker.made(0, header)
+    maker.derive(0, header)
     times_ns = [n * 50_000_000 for n in range(40)]
-    drawn_ns = [at for at in times_ns if any(topic == "/view/scene/plan" for topic, _ in maker.made(at, plan))]
+    drawn_ns = [at for at in times_ns if any(topic == "/view/scene/plan" for topic, _ in maker.derive(at, plan))]
     assert min(later - one for one, later in pairwise(drawn_ns)) == PLAN_NS
     assert len(drawn_ns) == 10
 
@@ -227,10 +227,10 @@ def test_events_keep_their_severity_and_count() -> None:
 def test_paths_are_those_of_the_last_twenty_seconds() -> None:
     maker = ViewBuilder()
     header, truth, decision = flown().of(Header)[0], flown().of(Truth)[0], flown().of(Decision)[0]
-    maker.made(0, header)
+    maker.derive(0, header)
     for tenth in range(500):
         at_ns = tenth * 100_000_000
-        maker.made(at_ns, msgspec.structs.replace(truth, at_ns=at_ns, position_m=(float(tenth), 0.0, 0.0)))
+        maker.derive(at_ns, msgspec.structs.replace(truth, at_ns=at_ns, position_m=(float(tenth), 0.0, 0.0)))
     late = msgspec.structs.replace(decision, at_ns=50_000_000_000)
     ((_, scene),) = views(late, maker=maker)["/view/scene/path"]
     (line,) = {entity.id: entity for entity in scene.entities}["flown path"].lines
@@ -253,14 +253,14 @@ def test_a_design_that_cannot_be_used_is_told() -> None:
     header = msgspec.structs.replace(flown().of(Header)[0], design={"gamma_x": [1.0]})
     maker = ViewBuilder()
     with pytest.raises(RecordingError, match="design cannot be used"):
-        maker.made(0, header)
-    assert maker.made(1, flown().of(Estimate)[0]) == []
+        maker.derive(0, header)
+    assert maker.derive(1, flown().of(Estimate)[0]) == []
 
 
 def test_a_plant_in_the_plane_has_no_number_for_the_third_axis() -> None:
     maker, made = ViewBuilder(), set()
     for _, at_ns, record in lockstep("paper", 4.0).entries:
-        for topic, data in maker.made(at_ns, record):
+        for topic, data in maker.derive(at_ns, record):
             made.add(topic)
             if topic == "/plot/state":
                 state: Any = KINDS[topic].FromString(data)
