@@ -17,7 +17,7 @@ from places import ROOT
 from rich.console import Console
 
 from uavctl.cli.app import app, run
-from uavctl.cli.common import columns, labelled, messages, pictures, two_columns
+from uavctl.cli.common import label_text, make_message_console, make_output_console, make_pair_table, make_table
 from uavctl.cli.usage import EXAMPLES, commands_of, example
 from uavctl.config.load import find_keys
 from uavctl.frames import suggest_height_sign
@@ -180,13 +180,13 @@ MARKED = "pip install 'uavctl[live]' [/] [bold]x[/bold] :bug: \\[y]"
 
 
 def test_a_string_is_never_markup(capsys: pytest.CaptureFixture[str]) -> None:
-    messages().print(labelled("error", MARKED), soft_wrap=True)
-    messages().print(MARKED, soft_wrap=True)
+    make_message_console().print(label_text("error", MARKED), soft_wrap=True)
+    make_message_console().print(MARKED, soft_wrap=True)
     assert capsys.readouterr().err.count(MARKED) == 2
-    console = pictures()
+    console = make_output_console()
     console.width = 400
-    console.print(two_columns(MARKED, [(MARKED, MARKED)]))
-    console.print(columns(MARKED, (MARKED,), [(MARKED,)]))
+    console.print(make_pair_table(MARKED, [(MARKED, MARKED)]))
+    console.print(make_table(MARKED, (MARKED,), [(MARKED,)]))
     assert capsys.readouterr().out.count(MARKED) == 6
 
 

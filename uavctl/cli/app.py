@@ -11,7 +11,14 @@ from typing import Annotated
 from cyclopts import App, CycloptsError, Parameter
 
 from uavctl import __version__
-from uavctl.cli.common import documents_alone, labelled, messages, pictures, two_columns, write_document
+from uavctl.cli.common import (
+    label_text,
+    make_output_console,
+    make_pair_table,
+    print_message,
+    reserve_stdout,
+    write_document,
+)
 from uavctl.cli.usage import example, explain, unknown_command, unknown_option
 from uavctl.config.load import find_nearest
 from uavctl.errors import ConfigError, UavctlError, UsageError
@@ -77,14 +84,14 @@ def docs(page: Annotated[str, Parameter(help="name of a page; else all of them a
         near = find_nearest(name, tuple(pages))
         raise UsageError(f'There is no page "{page}"{near}; `uavctl docs` lists all of them')
     if name and sys.stdout.isatty():
-        pictures().print(Markdown(pages[name]))
+        make_output_console().print(Markdown(pages[name]))
     elif name:
         sys.stdout.write(pages[name])
     else:
         titles: list[tuple[str, object]] = [
             (one, text.partition("\n")[0].removeprefix("# ")) for one, text in pages.items()
         ]
-        pictures().print(two_columns(f"Pages, as files in {folder.resolve()}", titles))
+        make_output_console().print(make_pair_table(f"Pages, as files in {folder.resolve()}", titles))
     return 0
 
 
@@ -99,7 +106,7 @@ def run(arguments: Sequence[str], imported: Callable[[], None] = lambda: None) -
         _know(arguments)
         command, bound, _ = app.parse_args(list(arguments), exit_on_error=False, print_error=False)
         imported()
-        with documents_alone() if "--json" in arguments else nullcontext():
+        with reserve_stdout() if "--json" in arguments else nullcontext():
             result = command(*bound.args, **bound.kwargs)
     except CycloptsError as error:
         text = explain(error, arguments, app)
@@ -135,7 +142,7 @@ def _refuse(error: UavctlError, problems: Sequence[str], arguments: Sequence[str
     shown = [_shown(problem) for problem in problems[:_MOST_SHOWN]]
     if len(problems) > _MOST_SHOWN:
         shown.append(f"{len(problems) - _MOST_SHOWN} more")
-    messages().print(labelled("error", "\n".join(shown), "bold red"), soft_wrap=True)
+    print_message(label_text("error", "\n".join(shown), "bold red"))
     if "--json" in arguments:  # what could not be parsed, too, is told to a program
         told = {"type": type(error).__name__, "message": "\n".join(problems), "exit_code": error.exit_code}
         write_document("error", told)

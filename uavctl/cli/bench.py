@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from uavctl.build.controller import build_conditioned, build_design, build_spec
-from uavctl.cli.common import DEFAULTS, SEED, SPAN_S, Common, bars, columns, located
+from uavctl.cli.common import DEFAULTS, SEED, SPAN_S, Common, locate_design_errors, make_progress, make_table
 from uavctl.config.types import Config
 from uavctl.errors import DesignError
 from uavctl.lab.bench.loop import LoopBench, LoopRun, run_loop_bench
@@ -31,7 +31,7 @@ def bench_loop(common: Common, seconds: float, runs: int) -> int:
     options = ["--config", common.config]
     for override in common.overrides:
         options += ["--set", override]
-    with bars(auto_refresh=False) as progress:
+    with make_progress(auto_refresh=False) as progress:
         task = progress.add_task("")
 
         def told(what: str, done: int, total: int) -> None:
@@ -44,7 +44,7 @@ def bench_loop(common: Common, seconds: float, runs: int) -> int:
 
 def loop_picture(result: LoopBench) -> RenderableType:
     """Return the figures of the control loop as a table."""
-    table = columns("Control loop on real UDP, recording", ("", "median", "p99", "p99.9", "largest"), ())
+    table = make_table("Control loop on real UDP, recording", ("", "median", "p99", "p99.9", "largest"), ())
     for name, run in (("without --realtime", result.plain), ("with --realtime", result.realtime)):
         table.add_row(Text(name, style="bold"))
         for label, spread in (
@@ -105,7 +105,7 @@ def bench(
         return bench_loop(common, seconds, runs)
     loaded = common.load()
     if loaded.config.is_age_conditioned:
-        with located(loaded):
+        with locate_design_errors(loaded):
             solver = build_conditioned(loaded.config).solver
         with _progress() as advance:
             advance("a flight's own decisions", 0, None)
@@ -114,7 +114,7 @@ def bench(
         decided = msgspec.structs.replace(decided, flight=flight)
         common.show("bench/decisions", decided, lambda: _decisions(decided, loaded.config.name))
         return 0
-    with located(loaded):
+    with locate_design_errors(loaded):
         design = build_design(loaded.config)
         loss = build_spec(loaded.config).link.outage(1)
         with _progress() as advance:
@@ -156,7 +156,7 @@ def _decisions(found: DecisionBench, name: str) -> str:
 @contextmanager
 def _progress() -> Iterator[Advance]:
     # A thread that draws the bar would disturb what is measured.
-    with bars(auto_refresh=False) as progress:
+    with make_progress(auto_refresh=False) as progress:
         task = progress.add_task("design", total=None)
         drawn = 0.0
 
@@ -200,7 +200,7 @@ def _methods(result: BenchResult) -> Table:
     )
     told = [(label, str(states), _ms(took), ratio, ending) for label, states, took, ratio, ending in rows]
     headings = ("", "states", "median", "to the exact program", "what came of it")
-    return columns("One decision for all axes", headings, told, (headings[0], headings[-1]))
+    return make_table("One decision for all axes", headings, told, (headings[0], headings[-1]))
 
 
 def _conditioned(ours: ConditionedTimes | None) -> str:
@@ -223,7 +223,7 @@ def _certificates(result: BenchResult) -> Table:
         ("frozen policies alone", f"{shares.frozen:.1%}", _us(result.frozen_us)),
         ("exact program", f"{shares.exact:.1%}", _us(result.program_us)),
     )
-    return columns("Answers as flown", ("method", "share", "median"), rows)
+    return make_table("Answers as flown", ("method", "share", "median"), rows)
 
 
 def _gaps(result: BenchResult) -> str:

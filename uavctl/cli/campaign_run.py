@@ -18,7 +18,7 @@ from rich.console import Group, RenderableType
 from rich.progress import MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from uavctl.cli import INTERRUPTED
-from uavctl.cli.common import Common, bars, columns, messages
+from uavctl.cli.common import Common, make_progress, make_table, print_message
 from uavctl.cli.flying import stop_on_signals
 from uavctl.errors import UsageError
 from uavctl.lab.campaign.page import write_report, write_trial_report
@@ -77,7 +77,7 @@ def trial_picture(result: CampaignResult[TrialSummary]) -> RenderableType:
             continue
         named = [name.replace("rate_hz", "Hz") for name in (*lists, "controller")]
         headings = (*named, *(one.heading for one in shown))
-        table = columns(f"Campaign {result.name}: {scenario}", headings, (), named)
+        table = make_table(f"Campaign {result.name}: {scenario}", headings, (), named)
         for cell in cells:
             names = [_text(getattr(cell.place, name)) for name in (*lists, "controller")]
             told = ["refused"] if cell.place.refused else [one.told(cell.values[one.key]) for one in shown]
@@ -190,8 +190,8 @@ def _fly(store: Store, tasks: Sequence[Work], crew: AbstractContextManager[Worke
         return True
     with stop_on_signals() as stopped, crew as flying, _progress(tasks, kept) as advance:
 
-        def keep(task: Work, columns: Columns) -> None:
-            store.keep(task, columns)
+        def keep(task: Work, results: Columns) -> None:
+            store.keep(task, results)
             advance(task)
 
         fly_tasks(left, flying, keep, stopped)
@@ -200,7 +200,9 @@ def _fly(store: Store, tasks: Sequence[Work], crew: AbstractContextManager[Worke
 
 @contextmanager
 def _progress(tasks: Sequence[Work], kept: set[str]) -> Iterator[Callable[[Work], None]]:
-    with bars(MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn()) as progress:
+    with make_progress(
+        MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn()
+    ) as progress:
         there = sum(task.runs for task in tasks if task.name in kept)
         bar = progress.add_task("runs", total=sum(task.runs for task in tasks), completed=there)
         yield lambda task: progress.update(bar, advance=task.runs)
@@ -216,14 +218,14 @@ def _interrupted(store: Store, spec: Path, runs: int | None) -> str:
 
 
 def _tell(text: str) -> None:
-    messages().print(text, soft_wrap=True)
+    print_message(text)
 
 
 def _picture(result: CampaignResult[CellSummary]) -> RenderableType:
     # What is the same in all cells needs no column.
     lists = [name for name in _NAMES if name == "controller" or len({getattr(cell, name) for cell in result.cells}) > 1]
     figured = ("runs", "failed", "steps out %", "runs out %", "cost", "fallbacks", "oldest")
-    table = columns(f"Campaign {result.name}", (*lists, *figured), (), lists)
+    table = make_table(f"Campaign {result.name}", (*lists, *figured), (), lists)
     for cell in result.cells:
         names = [getattr(cell, name) for name in lists]
         if cell.refused:

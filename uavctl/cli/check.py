@@ -22,7 +22,16 @@ from uavctl.build.rehearsal import rehearse
 from uavctl.build.rest import check_axes
 from uavctl.check.findings import Item, ItemState, describe_item, find_refusals, judge_item, make_item
 from uavctl.check.preflight import Preflight
-from uavctl.cli.common import DEFAULTS, SPAN_S, Common, Mocap, given_keys, labelled, located, messages
+from uavctl.cli.common import (
+    DEFAULTS,
+    SPAN_S,
+    Common,
+    Mocap,
+    label_text,
+    locate_design_errors,
+    make_key_overrides,
+    print_message,
+)
 from uavctl.cli.flying import stop_on_signals
 from uavctl.clock import Ticker, monotonic_ns
 from uavctl.config import Config
@@ -129,7 +138,7 @@ def checked_before_arming(
     Raises:
         NotReadyError: an item forbids arming.
     """
-    messages().print(f"checking for {config.check.seconds:g} s before arming", soft_wrap=True)
+    print_message(f"checking for {config.check.seconds:g} s before arming")
     heard = run_preflight(config, connections, config.check.seconds, take_off_m=take_off_m, stop=stop, told=told)
     items = (*planned, *heard)
     against = find_refusals(items, config.check)
@@ -137,7 +146,7 @@ def checked_before_arming(
         raise NotReadyError("\n".join(("not armed, as the check before it failed:", *map(describe_item, against))))
     for one in items:
         if one.state is not ItemState.GOOD:
-            messages().print(labelled("check", describe_item(one)), soft_wrap=True)
+            print_message(label_text("check", describe_item(one)))
     return items
 
 
@@ -194,16 +203,16 @@ def check(
 
     Exit code 0: nothing speaks against flying. What could not be determined is told, and does not fail the check.
     """
-    overrides = given_keys(daemon__vehicle=vehicle, daemon__mocap=mocap, check__seconds=seconds)
+    overrides = make_key_overrides(daemon__vehicle=vehicle, daemon__mocap=mocap, check__seconds=seconds)
     loaded = common.with_overrides(overrides).load()
     config = loaded.config
-    with located(loaded):
+    with locate_design_errors(loaded):
         check_axes(config)
         items = [*mission_items(config), *disk_items(out, config.log.free_bytes)]
     items.append(_strangers(find_security_warnings(config.security, config.daemon)))
 
     def prompt(text: str) -> None:
-        messages().print(text or "good; let it rest for a moment", style="bold")
+        print_message(text or "good; let it rest for a moment", style="bold")
 
     try:
         with open_links(config) as connections, stop_on_signals() as stopped:

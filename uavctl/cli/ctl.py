@@ -12,7 +12,7 @@ import msgspec
 from cyclopts import App, Parameter
 from rich.table import Table
 
-from uavctl.cli.common import Common, QuietJson, messages, two_columns
+from uavctl.cli.common import Common, QuietJson, make_pair_table, print_message
 from uavctl.cli.usage import example
 from uavctl.daemon.control_socket import SUFFIX, ControlRequest, Reply, find_control_folder
 from uavctl.daemon.health import Health, RecorderHealth, RelayHealth
@@ -107,7 +107,7 @@ def _order(request: ControlRequest, which: Which) -> int:
         Common(json=True).show("ctl/order", {"ok": reply.ok, "text": reply.text}, str)
     else:
         verdict = "accepted" if reply.ok else "refused"
-        messages().print(f"{request.ask} {verdict}: {reply.text}", soft_wrap=True, highlight=False)
+        print_message(f"{request.ask} {verdict}: {reply.text}", highlight=False)
     return 0 if reply.ok else 1
 
 
@@ -199,7 +199,7 @@ def _table(health: Health) -> Table:
         "lateness": f"{health.lateness_us / 1e3:.2f} ms, {health.missed_ticks} ticks missed",
         "recording": recorder.path if recorder.ok and not recorder.reason else f"{recorder.path}, {_trouble(recorder)}",
     }
-    return two_columns(f"{health.name} (process {health.pid}), {health.url}", list(rows.items()))
+    return make_pair_table(f"{health.name} (process {health.pid}), {health.url}", list(rows.items()))
 
 
 def _relay(relay: RelayHealth) -> str:

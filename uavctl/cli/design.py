@@ -25,7 +25,15 @@ from uavctl.build.controller import (
 )
 from uavctl.build.mission import build_names
 from uavctl.build.rehearsal import RehearsalResult, rehearse
-from uavctl.cli.common import DEFAULTS, Column, Common, WideTable, columns, located, messages
+from uavctl.cli.common import (
+    DEFAULTS,
+    Column,
+    Common,
+    WideTable,
+    locate_design_errors,
+    make_message_console,
+    make_table,
+)
 from uavctl.config import Config
 from uavctl.errors import UsageError
 from uavctl.lab.terminal_gain import GainComparison, GainReport, compare_gains
@@ -42,7 +50,7 @@ def gains_report(common: Common) -> int:
     """Synthesise the terminal gain and compare; return 1 if no complete design can be made with it."""
     loaded = common.load()
     begin = time.perf_counter()
-    with located(loaded), messages().status("synthesis and designs"):
+    with locate_design_errors(loaded), make_message_console().status("synthesis and designs"):
         spec = build_spec(loaded.config)
         found = compare_gains(spec, start_state(loaded.config, spec.plant))
     document = {**msgspec.to_builtins(found), "k_tau": found.after.k_tau, "wall_s": time.perf_counter() - begin}
@@ -52,7 +60,7 @@ def gains_report(common: Common) -> int:
 
 def _gains_picture(found: GainComparison, name: str) -> RenderableType:
     rows = ((label, figure(found.before), figure(found.after)) for label, figure in _GAIN_ROWS)
-    table = columns(f"Terminal gain of {name}", ("", "configured", "synthesised"), rows)
+    table = make_table(f"Terminal gain of {name}", ("", "configured", "synthesised"), rows)
     refusals = [
         Text(f"No complete design with the {which} gain: {report.refused}")
         for which, report in (("configured", found.before), ("synthesised", found.after))
@@ -107,7 +115,7 @@ def design(
     loaded = common.load()
     start = time.perf_counter()
     if loaded.config.is_age_conditioned:
-        with located(loaded):
+        with locate_design_errors(loaded):
             conditioned = build_conditioned(loaded.config)
             found = rehearsed(loaded.config, conditioned)
         figures = {
@@ -117,7 +125,7 @@ def design(
         }
         common.show("design/conditioned", figures, lambda: conditioned_picture(conditioned, loaded.config.name, found))
         return 1 if found is not None and (found.relaxes or found.strays) else 0
-    with located(loaded):
+    with locate_design_errors(loaded):
         made = build_design(loaded.config)
     document = design_document(made, time.perf_counter() - start)
     common.show("design", document, lambda: design_picture(made, loaded.config.name))
@@ -138,7 +146,7 @@ def rehearsed(config: Config, made: ConditionedDesign) -> RehearsalResult | None
 def conditioned_picture(made: ConditionedDesign, name: str, found: RehearsalResult | None = None) -> RenderableType:
     """Return tables of ages with their risk, and of where a plan may rest; and what is wrong with the mission."""
     title = f"Risk by the age of information, design {made.design_id} of {name}"
-    ages = columns(title, ("age [steps]", "probability", "may be outside", "far from limits"), (), ())
+    ages = make_table(title, ("age [steps]", "probability", "may be outside", "far from limits"), (), ())
     risk, transit, problem = made.solver.risk, made.solver.risk_in_transit, made.solver.problem
     left = 1.0 - np.cumsum(risk.weights)
     told = min(problem.horizon, 1 + int(np.count_nonzero(left > _RARE)))
@@ -160,7 +168,7 @@ def conditioned_picture(made: ConditionedDesign, name: str, found: RehearsalResu
     headings = ("limit", "at", "rests up to", "unit")
     wrong = [] if found is None or not found.sentences else [*found.sentences, found.hint]
     doubts = [Text(f"{one[:1].upper()}{one[1:]}.", style="bold yellow") for one in wrong]
-    return Group(ages, columns("Where a plan may rest", headings, rows, ("limit", "unit")), *doubts)
+    return Group(ages, make_table("Where a plan may rest", headings, rows, ("limit", "unit")), *doubts)
 
 
 def design_document(made: Design, wall_s: float) -> dict[str, object]:
@@ -181,8 +189,8 @@ def design_picture(made: Design, name: str) -> RenderableType:
         )
         for check in made.assumptions
     )
-    checks = columns(f"Assumption 4, design {made.design_id} of {name}", headings, checked, headings)
-    schedule = columns("", ("t", "d_t", "α_t", "γ^x_t+1", "γ^u_t"), (), ())
+    checks = make_table(f"Assumption 4, design {made.design_id} of {name}", headings, checked, headings)
+    schedule = make_table("", ("t", "d_t", "α_t", "γ^x_t+1", "γ^u_t"), (), ())
     stages = zip(
         made.schedule.delays, made.schedule.alpha, made.schedule.gamma_x[1:], made.schedule.gamma_u, strict=True
     )
@@ -210,7 +218,7 @@ def solve(
 ) -> int:
     """Solve one decision problem, towards the configured target."""
     loaded = common.with_overrides([] if method is None else [f"solver.method={method}"]).load()
-    with located(loaded):
+    with locate_design_errors(loaded):
         design = design_of(loaded.config)
         x = parse_state(state, design.plant.n_x)
         solver = build_solver(design, loaded.config)

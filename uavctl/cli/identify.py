@@ -19,7 +19,7 @@ from logs.recording.reader import header, lacks_end, read
 from logs.recording.senders import choose_vehicle, get_system_id
 from logs.recording.tlog import read_tlog
 from uavctl.build.controller import design_of
-from uavctl.cli.common import DEFAULTS, Common, System, bars, can_be_read, warn
+from uavctl.cli.common import DEFAULTS, Common, System, check_readable, make_progress, warn
 from uavctl.config import Config
 from uavctl.config.load import dump_config, parse
 from uavctl.errors import DesignError, UsageError
@@ -29,7 +29,9 @@ from uavctl.lab.identify.result import Identification, fits_of, identify, loss_w
 
 
 def identify_command(
-    flight: Annotated[Path, Parameter(help="the recording: .mcap of ours, or anybody's .tlog", validator=can_be_read)],
+    flight: Annotated[
+        Path, Parameter(help="the recording: .mcap of ours, or anybody's .tlog", validator=check_readable)
+    ],
     /,
     *,
     common: Common = DEFAULTS,
@@ -98,7 +100,7 @@ def design_doubts(config: Config) -> tuple[str, ...]:
 @contextmanager
 def fitting(steps: int) -> Iterator[Callable[[], None]]:
     """Show a bar while plants are fitted."""
-    with bars() as progress:
+    with make_progress() as progress:
         task = progress.add_task("fitting", total=steps)
         yield lambda: progress.advance(task)
 

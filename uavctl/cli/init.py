@@ -14,7 +14,7 @@ from cyclopts import Parameter
 from uavctl.build.controller import LEAST_OUTSIDE_M, design_of, resting
 from uavctl.build.mission import resting_places
 from uavctl.check.parameters import compute_max_accel_mps2
-from uavctl.cli.common import messages
+from uavctl.cli.common import print_message
 from uavctl.config import parse
 from uavctl.errors import UsageError
 
@@ -98,11 +98,7 @@ def init(
         raise UsageError(f"{out}: is there already; give another file with --out, or remove it") from error
     except OSError as error:
         raise UsageError(f"{out}: cannot be written ({error.strerror}); give another file with --out") from error
-    messages().print(
-        f"wrote {out}: limits {WALL_M:g} m from walls and ceiling; next: uavctl design --config {out}",
-        markup=False,
-        soft_wrap=True,
-    )
+    print_message(f"wrote {out}: limits {WALL_M:g} m from walls and ceiling; next: uavctl design --config {out}")
     return 0
 
 

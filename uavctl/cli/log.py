@@ -29,7 +29,18 @@ from logs.recording.summary import count
 from logs.recording.tlog import ExportedTlog, export_tlog
 from logs.recording.ulog import is_ulog
 from logs.report.causes import Headline
-from uavctl.cli.common import Common, Flight, Json, System, bars, columns, counted, first_line, two_columns, warn
+from uavctl.cli.common import (
+    Common,
+    Flight,
+    Json,
+    System,
+    format_counts,
+    make_headline_text,
+    make_pair_table,
+    make_progress,
+    make_table,
+    warn,
+)
 from uavctl.cli.usage import example
 from uavctl.errors import UsageError
 
@@ -84,7 +95,7 @@ def _tlog_file(flight: Path, out: Path | None) -> Path:
 
 @contextmanager
 def _progress() -> Iterator[Watch]:
-    with bars() as progress:
+    with make_progress() as progress:
 
         def watch(records: Iterable[RecordedMessage], total: int | None, what: str) -> Iterable[RecordedMessage]:
             return progress.track(records, total=total, description=what)
@@ -94,12 +105,12 @@ def _progress() -> Iterator[Watch]:
 
 def _tables_picture(exported: Exported, folder: Path) -> RenderableType:
     rows = ((Text(Path(one.file).name), str(one.rows), str(one.columns)) for one in exported.tables)
-    return Group(columns("", ("file", "rows", "columns"), rows, fold=True), Text(f"in {folder}"))
+    return Group(make_table("", ("file", "rows", "columns"), rows, fold=True), Text(f"in {folder}"))
 
 
 def _tlog_picture(exported: ExportedTlog) -> RenderableType:
     rows = ((Text(topic), str(packets)) for topic, packets in exported.packets.items())
-    return Group(columns("", ("topic", "packets"), rows), Text(f"in {exported.file}"))
+    return Group(make_table("", ("topic", "packets"), rows), Text(f"in {exported.file}"))
 
 
 # `uavctl log info` as a table.
@@ -111,7 +122,7 @@ _SOME_PARAMETERS = 4
 def _tlog_info(told: MavlinkFlightInfo) -> RenderableType:
     rows = ((Text(name), str(number), rate_of(told, name)) for name, number in told.messages.items())
     lines = [f"{name}: {value}" for name, value in facts_of(told)]
-    return Group(columns("", ("message", "number", "rate"), rows, fold=True), *map(Text, (*lines, *told.notes)))
+    return Group(make_table("", ("message", "number", "rate"), rows, fold=True), *map(Text, (*lines, *told.notes)))
 
 
 def info_table(found: RecordingInfo) -> RenderableType:
@@ -119,7 +130,7 @@ def info_table(found: RecordingInfo) -> RenderableType:
     title = f"{found.files[0]}: {found.duration_s:.1f} s, {found.bytes:,} bytes"
     if len(found.files) > 1:
         title += f" in {len(found.files)} files"
-    table = columns("", ("topic", "messages", "rate", "longest gap", "at"), ())
+    table = make_table("", ("topic", "messages", "rate", "longest gap", "at"), ())
     for topic in found.topics:
         rate = f"{topic.rate_hz:.1f}/s" if topic.messages > 1 else ""
         gap = (f"{topic.longest_gap_s:.3f} s", f"{topic.longest_gap_at_s:.1f} s") if topic.longest_gap_s else ("", "")
@@ -147,7 +158,7 @@ def _lines(found: RecordingInfo) -> Iterator[str]:
         yield f"{note.at_s:.1f} s: {note.text}"
     for link in found.connections:
         left_out = {what: counts for what, counts in (("bad", link.bad), ("refused", link.refused)) if counts}
-        lost = "".join(f"; {what}: {counted(dict(sorted(counts.items())))}" for what, counts in left_out.items())
+        lost = "".join(f"; {what}: {format_counts(dict(sorted(counts.items())))}" for what, counts in left_out.items())
         yield (
             f"connection {link.link}: {link.datagrams} datagrams, {link.messages} messages, "
             f"{link.samples} positions{lost}"
@@ -244,10 +255,12 @@ def info(flight: Flight, /, *, system: System = None, json: Json = False) -> int
         assert foreign is not None  # only one of ours is none, of which there is no system
         told, main = foreign.info, tlog_headline.derive_tlog_headline(foreign)
         name = FileKind.ULOG if is_ulog(flight) else FileKind.TLOG
-        Common(json=json).show(f"log/info-{name}", _with(main, told), lambda: Group(first_line(main), _tlog_info(told)))
+        Common(json=json).show(
+            f"log/info-{name}", _with(main, told), lambda: Group(make_headline_text(main), _tlog_info(told))
+        )
         return 0
     found, ours = recording_info(flight), headline.derive_headline_of_file(flight)
-    line = () if ours is None else (first_line(ours),)
+    line = () if ours is None else (make_headline_text(ours),)
     Common(json=json).show("log/info", _with(ours, found), lambda: Group(*line, info_table(found)))
     return 0
 
@@ -276,7 +289,7 @@ def _recover_table(result: RecoverResult, out: Path) -> Table:
     lost = str(result.messages_lost)
     if not result.ended:
         lost += " known; those after the last restored one cannot be counted"
-    return two_columns(
+    return make_pair_table(
         "Recovered",
         [
             ("written to", out),

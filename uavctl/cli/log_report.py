@@ -43,11 +43,11 @@ from uavctl.cli.common import (
     Json,
     System,
     WideTable,
-    bars,
-    can_be_read,
-    columns,
-    first_line,
-    two_columns,
+    check_readable,
+    make_headline_text,
+    make_pair_table,
+    make_progress,
+    make_table,
     warn,
 )
 from uavctl.errors import UsageError
@@ -56,15 +56,15 @@ from uavctl.errors import UsageError
 
 
 def compare_command(
-    first: Annotated[Path, Parameter(help="the recording that the others are compared with", validator=can_be_read)],
-    second: Annotated[Path, Parameter(help="another one", validator=can_be_read)],
+    first: Annotated[Path, Parameter(help="the recording that the others are compared with", validator=check_readable)],
+    second: Annotated[Path, Parameter(help="another one", validator=check_readable)],
     /,
-    *more: Annotated[Path, Parameter(help="and more", validator=can_be_read)],
+    *more: Annotated[Path, Parameter(help="and more", validator=check_readable)],
     out: Annotated[Path | None, Parameter(help="also write a page (HTML) with the flights in one drawing")] = None,
     json: Json = False,
 ) -> int:
     """Put flights beside each other: parameters that differ, figures, and where they part."""
-    with bars() as progress:
+    with make_progress() as progress:
         paths = (first, second, *more)
         task = progress.add_task("reading", total=len(paths))
         loaded = load_flights(paths, lambda: progress.advance(task))
@@ -97,7 +97,7 @@ def _sides(sides: tuple[ComparedFlight, ...]) -> RenderableType:
 def _parameters(found: FlightComparison) -> Table:
     headings = ("", *(one.name for one in found.recordings))
     rows = ((Text(one.key), *(Text(format_parameter(value)) for value in one.values)) for one in found.parameters)
-    return columns("Parameters that differ", headings, rows, headings, fold=True)
+    return make_table("Parameters that differ", headings, rows, headings, fold=True)
 
 
 def _figures(found: FlightComparison) -> WideTable:
@@ -154,7 +154,7 @@ def report(
 
 def _told(main: Headline, summary: RenderableType) -> Group:
     """Return what a terminal shows: the page's first line and why, then the figures."""
-    return Group(first_line(main), *(Text(f"  {sentence}") for sentence in main.reasons), summary)
+    return Group(make_headline_text(main), *(Text(f"  {sentence}") for sentence in main.reasons), summary)
 
 
 def _report_foreign(flight: Path, found: MavlinkFlight, out: Path, svg: Path | None, common: Common) -> int:
@@ -167,5 +167,5 @@ def _report_foreign(flight: Path, found: MavlinkFlight, out: Path, svg: Path | N
     document = {**msgspec.to_builtins(found.info), "report": str(out), "headline": main.document()}
     kind = FileKind.ULOG if is_ulog(flight) else FileKind.TLOG
     facts: list[tuple[str, object]] = [*facts_of(found.info), ("page", str(out))]
-    common.show(f"log/report-{kind}", document, lambda: _told(main, two_columns("", facts)))
+    common.show(f"log/report-{kind}", document, lambda: _told(main, make_pair_table("", facts)))
     return 0

@@ -22,20 +22,29 @@ from logs.recording.summary import FlightSummary, make_summary_table
 from logs.recording.topics import ENDED
 from sim.server import Ready, serve_in_child
 from uavctl.build.controller import Prepared, design_of, prepare
-from uavctl.cli.common import DEFAULTS, SEED, SPAN_S, Common, TakeOff, bars, given_keys, located
+from uavctl.cli.common import (
+    DEFAULTS,
+    SEED,
+    SPAN_S,
+    Common,
+    TakeOff,
+    locate_design_errors,
+    make_key_overrides,
+    make_progress,
+)
 from uavctl.cli.flying import (
     Live,
     LivePort,
-    checked_take_off,
-    conclude,
-    ending_noted,
-    goto_overrides,
-    live_line,
-    live_view_port,
-    onlookers,
+    check_take_off,
+    choose_live_port,
+    conclude_flight,
+    make_goto_overrides,
+    open_viewers,
+    print_ending,
+    record_failure,
     stop_on_signals,
-    tell_ending,
 )
+from uavctl.cli.live_line import show_live_line
 from uavctl.cli.sim import make_door
 from uavctl.clock import Ticker, monotonic_ns, read_zero_utc_ns
 from uavctl.config import Config, LoadedConfig
@@ -73,11 +82,11 @@ def loopback(
     In virtual time the same seed gives the same flight, bit for bit. It begins in the air; with --arm --takeoff HEIGHT
     on the ground, and after its duration it ends there too.
     """
-    take_off_m = checked_take_off(arm, takeoff)
-    view_port = live_view_port(live=live, port=live_port)
+    take_off_m = check_take_off(arm, takeoff)
+    view_port = choose_live_port(live=live, port=live_port)
     if live and not udp:
         raise UsageError("--live needs --udp: in virtual time a flight is over before a viewer has seen it")
-    overrides = [*given_keys(duration_s=duration, sim__seed=seed), *goto_overrides(goto)]
+    overrides = [*make_key_overrides(duration_s=duration, sim__seed=seed), *make_goto_overrides(goto)]
     summary = fly_simulated(
         common.with_overrides(overrides).load(),
         udp=udp,
@@ -116,14 +125,14 @@ def fly_simulated(
     """
     config = _on_loopback(loaded.config) if udp else loaded.config
     check_length(config)
-    with located(loaded):
+    with locate_design_errors(loaded):
         design = design_of(config)
     engagement = Engagement(config, take_off_m=take_off_m, goto=goto, follower=follower)
-    with onlookers(view_port) as looking, create_recording(out, config.name, config.log.free_bytes) as path:
-        with located(loaded):
+    with open_viewers(view_port) as viewers, create_recording(out, config.name, config.log.free_bytes) as path:
+        with locate_design_errors(loaded):
             check_places(config, design, take_off_m, engagement.goal)
             prepared = prepare(config, design)
-        return _real_time(prepared, path, engagement, looking) if udp else lockstep(prepared, path, engagement)
+        return _real_time(prepared, path, engagement, viewers) if udp else lockstep(prepared, path, engagement)
 
 
 def lockstep(prepared: Prepared, path: Path, engagement: Engagement) -> FlightSummary:
@@ -133,9 +142,9 @@ def lockstep(prepared: Prepared, path: Path, engagement: Engagement) -> FlightSu
     engagement.begin(flight.loop)
     try:
         with (
-            ending_noted(flight.loop),
+            record_failure(flight.loop),
             stop_on_signals() as stopped,
-            bars(TaskProgressColumn(), TimeRemainingColumn()) as progress,
+            make_progress(TaskProgressColumn(), TimeRemainingColumn()) as progress,
         ):
             task = progress.add_task("flying in virtual time", total=config.duration_s)
 
@@ -147,17 +156,17 @@ def lockstep(prepared: Prepared, path: Path, engagement: Engagement) -> FlightSu
             flight.fly(show, follower=engagement, landing_s=landing_s)
     finally:
         status = flight.close()
-        tell_ending(describe_ending(flight.loop.ending, status))
-    return conclude(path, flight.wall_s, status, flight.loop.ending)
+        print_ending(describe_ending(flight.loop.ending, status))
+    return conclude_flight(path, flight.wall_s, status, flight.loop.ending)
 
 
-def _real_time(prepared: Prepared, path: Path, engagement: Engagement, looking: DerivedTopics) -> FlightSummary:
+def _real_time(prepared: Prepared, path: Path, engagement: Engagement, viewers: DerivedTopics) -> FlightSummary:
     config, takes_off = prepared.config, engagement.takes_off
     tick_ns, dt_ns = round(config.daemon.tick_s * 1e9), round(config.plant.dt_s * 1e9)
     with ExitStack() as stack:
         stopped = stack.enter_context(stop_on_signals())
         connections = stack.enter_context(open_links(config))
-        recorder = Recorder(path, config.log, onlookers=looking)
+        recorder = Recorder(path, config.log, onlookers=viewers)
         loop = ControlLoop(config, prepared.controller, recorder, time.perf_counter_ns)
         engagement.begin(loop)
         loop.course.in_flight = not takes_off
@@ -166,10 +175,12 @@ def _real_time(prepared: Prepared, path: Path, engagement: Engagement, looking: 
             put_header(recorder, prepared, monotonic_ns(), read_zero_utc_ns())
             simulator = stack.enter_context(ExitStack())
             simulator.enter_context(_simulator(config, recorder, airborne=not takes_off))
-            shown = simulator.enter_context(live_line(loop, recorder, config.duration_s, config.daemon.tick_s))
+            feed = simulator.enter_context(
+                show_live_line(loop, recorder.status, config.duration_s, config.daemon.tick_s)
+            )
             collector = simulator.enter_context(control_garbage_collection())
-            begun = time.perf_counter()
-            with ending_noted(loop):
+            begin_s = time.perf_counter()
+            with record_failure(loop):
                 fly(
                     loop,
                     connections,
@@ -178,20 +189,20 @@ def _real_time(prepared: Prepared, path: Path, engagement: Engagement, looking: 
                     duration_s=config.duration_s,
                     stop_limit_s=compute_stop_limit_s(config, takes_off=True) if takes_off else 0.0,
                     after_tick=(
-                        shown.after_tick,
+                        feed.after_tick,
                         lambda *_: recorder.catch_up(),
                         lambda ticked, _: engagement.follow(loop, ticked),
                         collector.after_tick,
                     ),
-                    on_events=shown.news.extend,
+                    on_events=feed.events.extend,
                 )
-            wall_s = time.perf_counter() - begun
+            wall_s = time.perf_counter() - begin_s
             simulator.close()  # its last words go into the recording
         finally:
             recorder.put(ENDED, monotonic_ns(), loop.ending)
             status = recorder.close()
-            tell_ending(describe_ending(loop.ending, status))
-    return conclude(path, wall_s, status, loop.ending)
+            print_ending(describe_ending(loop.ending, status))
+    return conclude_flight(path, wall_s, status, loop.ending)
 
 
 def _on_loopback(config: Config) -> Config:

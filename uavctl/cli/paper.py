@@ -17,7 +17,16 @@ from rich.table import Table
 from rich.text import Text
 
 from uavctl.build.controller import build_design, build_spec
-from uavctl.cli.common import SEED, WORKERS, Common, QuietJson, bars, columns, located, messages
+from uavctl.cli.common import (
+    SEED,
+    WORKERS,
+    Common,
+    QuietJson,
+    locate_design_errors,
+    make_message_console,
+    make_progress,
+    make_table,
+)
 from uavctl.errors import UsageError
 from uavctl.lab.paper.claims import (
     PRESET,
@@ -107,7 +116,7 @@ def _make(out: Path) -> None:
 def _setup(variant: Variant) -> Setup:
     """Return the design of a variant."""
     loaded = Common(config=PRESET, overrides=variant.overrides).load()
-    with located(loaded):
+    with locate_design_errors(loaded):
         return Setup(loaded.config, build_design(loaded.config))
 
 
@@ -116,7 +125,7 @@ def _progress(total: int, *, shown: bool) -> Iterator[Advance]:
     if not shown:
         yield lambda _: None
         return
-    with bars(MofNCompleteColumn(), TimeRemainingColumn()) as progress:
+    with make_progress(MofNCompleteColumn(), TimeRemainingColumn()) as progress:
         task = progress.add_task("runs", total=total)
         yield lambda done: progress.update(task, advance=done)
 
@@ -124,7 +133,7 @@ def _progress(total: int, *, shown: bool) -> Iterator[Advance]:
 def _measure_depth(seed: int) -> Depth:
     from uavctl.lab.paper.depth import measure_depth  # the printed problem's CVXPY takes time to import
 
-    with messages().status("measuring") as status:
+    with make_message_console().status("measuring") as status:
         return measure_depth(seed, status.update)
 
 
@@ -152,7 +161,7 @@ def paper_picture(
     title = f"Section 5 of the paper: {first.runs:,} runs of {first.steps} steps, seed {first.seed}"
     headings = ("claim", "paper", *(f"τ = {result.tau}" for result in results))
     others = [{one.key: one for one in result.claims} for result in results[1:]]
-    table = columns(title, headings, (), headings, lines=True)
+    table = make_table(title, headings, (), headings, lines=True)
     for one in claims:
         table.add_row(one.claim, one.paper, _cell(one), *(_cell(other.get(one.key)) for other in others))
     more = [] if depth is None else [_designs(depth.designs), _complexity(depth.complexity)]
@@ -188,12 +197,12 @@ def _designs(tried: list[DesignTried]) -> Table:
         )
         for one in tried
     )
-    return columns("Schedules, and what comes of them", headings, rows, headings)
+    return make_table("Schedules, and what comes of them", headings, rows, headings)
 
 
 def _complexity(sizes: list[Complexity]) -> Table:
     headings = ("τ", "H", "terminal states", "gains", "as printed", "exact", "refused")
-    table = columns("One decision of one axis over τ, medians", headings, (), ("refused",))
+    table = make_table("One decision of one axis over τ, medians", headings, (), ("refused",))
     for one in sizes:
         times = (
             "" if one.printed_ms is None else f"{one.printed_ms:.0f} ms",

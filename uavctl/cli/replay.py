@@ -25,7 +25,17 @@ from uavctl.arithmetic import ARITHMETIC, OWN, without_choice
 from uavctl.build.controller import ARITHMETIC_NAME, CONTROLLER, Prepared, cpu, design_of, prepare, versions
 from uavctl.build.outside import KEY
 from uavctl.cli import start_anew
-from uavctl.cli.common import DEFAULTS, Common, Flight, System, columns, counted, located, two_columns, warn
+from uavctl.cli.common import (
+    DEFAULTS,
+    Common,
+    Flight,
+    System,
+    format_counts,
+    locate_design_errors,
+    make_pair_table,
+    make_table,
+    warn,
+)
 from uavctl.config import Config, LoadedConfig
 from uavctl.config.load import parse_recorded
 from uavctl.errors import DesignError, RecordingError, UsageError
@@ -61,7 +71,7 @@ def changed_flyer(loaded: LoadedConfig) -> Prepared:
     Raises:
         ConfigError: The configuration leaves no design.
     """
-    with located(loaded):
+    with locate_design_errors(loaded):
         return prepare(loaded.config, design_of(loaded.config))
 
 
@@ -231,7 +241,7 @@ def replay_table(replayed: Replayed) -> RenderableType:
     ]
     first = result.first_difference
     if first is None:
-        return two_columns("Replay", rows)
+        return make_pair_table("Replay", rows)
     rows += _difference("first difference", first)
     if first.stage:
         rows.append(("in question", first.stage))
@@ -246,7 +256,7 @@ def replay_table(replayed: Replayed) -> RenderableType:
         rows.append(("decisions that differ", f"{result.decisions_differing} of {since} from then on"))
         if decision != first:
             rows += _difference("the first of them", decision)
-    return Group(two_columns("Replay", rows), _course(result.course))
+    return Group(make_pair_table("Replay", rows), _course(result.course))
 
 
 def _difference(title: str, one: ReplayDifference) -> Iterator[tuple[str, object]]:
@@ -295,7 +305,7 @@ def _course(course: tuple[FieldDivergence, ...]) -> Table:
     title = "What becomes of it, on the recorded inputs"
     if len(course) > MOST_FIELDS:
         title += f" ({MOST_FIELDS} of {len(course)} fields, all with --json)"
-    table = columns(title, ("field", "from [s]", "records that differ", "largest", "at [s]"), ())
+    table = make_table(title, ("field", "from [s]", "records that differ", "largest", "at [s]"), ())
     for one in course[:MOST_FIELDS]:
         unit = f" {one.unit}" if one.unit else ""
         entry = f" ({one.entry})" if one.entry else ""
@@ -365,7 +375,7 @@ def replay(
 def _replay_foreign(flight: Path, recorded: tuple[TlogPacket, ...], common: Common) -> int:
     loaded = common.with_overrides(("daemon.mocap=tlog", "daemon.vehicle=tlog")).load()
     config = loaded.config
-    with located(loaded):
+    with locate_design_errors(loaded):
         prepared = prepare(config, design_of(config))
     # Somebody else's setpoints flew it, so what it did is none of ours and would be found to be impossible.
     controller = replace(prepared.controller, envelope=None)
@@ -398,12 +408,12 @@ def _foreign_table(result: ForeignReplay, horizon: int) -> Table:
         ("out of order", result.out_of_order),
         ("accepted / refused", f"{result.accepted} / {result.rejected}"),
         ("ticks / decisions", f"{result.ticks} / {result.decisions}"),
-        ("solves", counted(result.solves)),
-        ("ticks by mode", counted(result.modes)),
-        *([("not taken by the connection", counted(result.left_out))] if result.left_out else []),
+        ("solves", format_counts(result.solves)),
+        ("ticks by mode", format_counts(result.modes)),
+        *([("not taken by the connection", format_counts(result.left_out))] if result.left_out else []),
         ("decisions by age in steps", _ages(result.age_steps, horizon)),
     ]
     if ages is not None:
         spread = f"{ages.min:.0f}, {ages.p05:.0f}, {ages.p50:.0f}, {ages.p95:.0f}, {ages.max:.0f}"
         rows.append(("capture to arrival, ms: min, 5 %, median, 95 %, max", spread))
-    return two_columns("Foreign recording through our controller", rows)
+    return make_pair_table("Foreign recording through our controller", rows)

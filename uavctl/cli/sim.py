@@ -23,7 +23,15 @@ from sim.ports import Port
 from sim.server import PortWrapper, Ready, VehicleSetup, serve_all
 from sim.simulation import VehicleSnapshot
 from uavctl.build.rest import check_axes
-from uavctl.cli.common import DEFAULTS, Column, Common, WideTable, located, messages, write_document
+from uavctl.cli.common import (
+    DEFAULTS,
+    Column,
+    Common,
+    WideTable,
+    locate_design_errors,
+    make_message_console,
+    write_document,
+)
 from uavctl.cli.flying import stop_on_signals
 from uavctl.clock import monotonic_ns
 from uavctl.config import Config
@@ -312,7 +320,7 @@ def sim(
     overrides = () if autopilot is None else (f'sim.autopilot="{autopilot}"',)
     loaded = common.with_overrides(overrides).load()
     config = loaded.config
-    with located(loaded):
+    with locate_design_errors(loaded):
         check_axes(config)
     if faults is not None:
         config = add_faults(config, faults, find_fault_problems)
@@ -328,7 +336,7 @@ def sim(
         if len(opened) == len(seats):
             _announce(seats, opened, as_json=common.json)
 
-    watch = watching(messages(), config) if view else nullcontext()
+    watch = watching(make_message_console(), config) if view else nullcontext()
     with stop_on_signals() as stopped, watch as on_look:
         serve_all(
             seats,

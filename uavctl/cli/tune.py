@@ -28,16 +28,17 @@ from uavctl.cli.common import (
     Json,
     Overrides,
     TakeOff,
-    can_be_read,
-    columns,
-    given_keys,
-    labelled,
-    located,
-    messages,
+    check_readable,
+    label_text,
+    locate_design_errors,
+    make_key_overrides,
+    make_message_console,
+    make_table,
+    print_message,
     warn,
 )
 from uavctl.cli.fly import fly_daemon
-from uavctl.cli.flying import checked_take_off
+from uavctl.cli.flying import check_take_off
 from uavctl.cli.identify import design_doubts, fitting
 from uavctl.cli.loopback import fly_simulated
 from uavctl.clock import Ticker, monotonic_ns
@@ -274,7 +275,7 @@ def comparison_picture(progress: TuneProgress, folder: Path) -> RenderableType:
 
 
 def _table(title: str, headings: Sequence[str], rows: Iterable[Sequence[str]], left: Sequence[str]) -> Table:
-    return columns(title, headings, rows, left, fold=True)
+    return make_table(title, headings, rows, left, fold=True)
 
 
 # `uavctl tune`: fly to learn how the vehicle answers, write that down, fly again, compare. Goes on where it ended.
@@ -298,7 +299,9 @@ def tune(
     ] = None,
     flight: Annotated[
         Path | None,
-        Parameter(help="begin with this recording of ours instead; its mission is flown again", validator=can_be_read),
+        Parameter(
+            help="begin with this recording of ours instead; its mission is flown again", validator=check_readable
+        ),
     ] = None,
     loopback: Annotated[
         bool, Parameter(negative=(), help="fly the simulator in this process, in virtual time")
@@ -320,20 +323,20 @@ def tune(
     Exit codes: 0 done; 1 a flight went otherwise, or shows too little; 2 what was asked for cannot be; 4 the pilot has
     taken over; 130 interrupted.
     """
-    take_off_m = checked_take_off(arm, takeoff)
+    take_off_m = check_take_off(arm, takeoff)
     if (box is None) == (flight is None):
         raise UsageError("give --box, to excite the vehicle inside, or --flight, to begin with a recording")
     if not loopback and seed is not None:
         raise UsageError("--seed is of the simulator; add --loopback")
     if loopback and not (vehicle is None and mocap is None):
         raise UsageError("--vehicle and --mocap are of a real vehicle; leave them out with --loopback")
-    more = given_keys(daemon__vehicle=vehicle, daemon__mocap=mocap, sim__seed=seed)
+    more = make_key_overrides(daemon__vehicle=vehicle, daemon__mocap=mocap, sim__seed=seed)
     common = Common(config, overrides, json)
     if loopback and not _says_plant(common):
         more.insert(0, "sim.plant=quadrotor")
     loaded = common.with_overrides(more).load()
     check_tunable(loaded.config)
-    with located(loaded):
+    with locate_design_errors(loaded):
         made = _Flights.of(loaded.config, box, flight, simulated=loopback, take_off_m=take_off_m)
     asked = TuneAsked(
         box="" if made.box is None else ",".join(f"{one:g}" for one in (*made.box.lower, *made.box.upper)),
@@ -348,8 +351,8 @@ def tune(
         except KeyboardInterrupt:  # beside a flight, which has its own end
             code, why = INTERRUPTED, "interrupted by the operator"
     if why:
-        messages().print(labelled("stopped", why, "bold yellow"), soft_wrap=True)
-        messages().print(f"Go on with the same command; what is done stays in {folder}.", soft_wrap=True)
+        print_message(label_text("stopped", why, "bold yellow"))
+        print_message(f"Go on with the same command; what is done stays in {folder}.")
     progress = run.folder.progress
     document = {
         **msgspec.to_builtins(progress),
@@ -458,13 +461,13 @@ class _TuneRun:
         doubts = design_doubts(result.config)
         write_atomically(self.folder.path / FIT_PAGE, write_fit_page(found, history.seen, str(recording)))
         told = msgspec.structs.replace(result.result, warnings=(*result.result.warnings, *doubts))
-        messages().print(changes_picture(told))
+        make_message_console().print(changes_picture(told))
         if doubts:
             raise RecordingError(f"{doubts[0]}. Nothing is written")
         lines = [f"# {one}" for one in _written(told)]
         write_atomically(self.folder.path / TUNED, "\n".join([*lines, dump_config(result.config)]))
         self.folder.note(tuned=told)
-        messages().print(f"written: {self.folder.path / TUNED}", soft_wrap=True)
+        print_message(f"written: {self.folder.path / TUNED}")
         return 0, ""
 
     def _refly(self) -> tuple[int, str]:
@@ -550,21 +553,20 @@ class _TuneRun:
 
     def _say_what_comes(self, what: str) -> None:
         mission, box = self._made.mission.mission, self._made.box
-        messages().print(f"{what}.", style="bold", soft_wrap=True)
+        print_message(f"{what}.", style="bold")
         if box is not None:
             sides = ", ".join(
                 f"{axis} {low:g} to {high:g}" for axis, low, high in zip(AXES, box.lower, box.upper, strict=True)
             )
-            messages().print(f"{len(mission.waypoints)} waypoints in the box {sides} m.", soft_wrap=True)
+            print_message(f"{len(mission.waypoints)} waypoints in the box {sides} m.")
         if not self._made.simulated:
-            messages().print(
+            print_message(
                 "The pilot's stick ends it at any time, and the pilot keeps the vehicle. Ctrl-C brakes and lands; so "
-                "does the end of the mission.",
-                soft_wrap=True,
+                "does the end of the mission."
             )
 
     def _told(self, what: str) -> tuple[int, str]:
-        messages().print(what, style="dim", soft_wrap=True)
+        print_message(what, style="dim")
         return 0, ""
 
 
@@ -581,7 +583,7 @@ def _stopped(flown: TuneFlown) -> tuple[int, str]:
 
 def agreed() -> bool:
     """Ask the operator to press Enter; without anybody there the answer is no."""
-    messages().print("Press Enter to fly, Ctrl-C to stop here.", soft_wrap=True)
+    print_message("Press Enter to fly, Ctrl-C to stop here.")
     return bool(sys.stdin.readline())
 
 

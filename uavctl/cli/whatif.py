@@ -27,8 +27,8 @@ from logs.recording.summary import count, summarise
 from logs.recording.topics import HEADER, RecorderNote
 from logs.recording.views import ViewBuilder
 from uavctl.build.controller import Prepared, build_problem, design_of, prepare
-from uavctl.cli.common import SEED, Common, Flight, Json, bars, columns, located, warn
-from uavctl.cli.flying import conclude
+from uavctl.cli.common import SEED, Common, Flight, Json, locate_design_errors, make_progress, make_table, warn
+from uavctl.cli.flying import conclude_flight
 from uavctl.cli.replay import changed_flyer, check_first, compute_as, other_versions, recorded_flyer
 from uavctl.config import Config, LoadedConfig, load
 from uavctl.config.checks import get_dimensions
@@ -146,7 +146,7 @@ def baseline_flyer(loaded: LoadedConfig, kind: str, start: Array) -> Prepared:
     config = replace(loaded.config, solver=replace(loaded.config.solver, method="exact"))
     spec = ControllerSpec(name=kind, kind=kind)
     campaign = CampaignSpec(name="what-if", config=config.name, controller=(spec,), start=tuple(start.tolist()))
-    with located(loaded):
+    with locate_design_errors(loaded):
         prepared = prepare(config, design_of(config))
         recipe = recipe_for(spec, config, campaign)
 
@@ -250,7 +250,7 @@ def whatif(
             history, now, response, other, path, recorded, _watch(progress, "flying it otherwise")
         )
         progress.add_task("writing the pages", total=None)
-        conclude(path, time.perf_counter() - begun, status)
+        conclude_flight(path, time.perf_counter() - begun, status)
         given = (
             *((f"--config {config}",) if config else ()),
             *overrides,
@@ -297,7 +297,7 @@ def _warn(flight: Path, recorded: Header, history: RecordedFlight) -> None:
 
 
 def _progress() -> Progress:
-    return bars(TaskProgressColumn(), TimeElapsedColumn())
+    return make_progress(TaskProgressColumn(), TimeElapsedColumn())
 
 
 def _watch(progress: Progress, what: str) -> Watch:
@@ -366,6 +366,6 @@ def _recorded(
 
 
 def _picture(result: WhatIf) -> RenderableType:
-    table = columns("", HEADINGS, (map(Text, row) for row in side_by_side(result)), HEADINGS, fold=True)
+    table = make_table("", HEADINGS, (map(Text, row) for row in side_by_side(result)), HEADINGS, fold=True)
     places = [f"recording: {result.recording}", f"report: {result.report}", f"page: {result.page}"]
     return Group(*map(Text, story(result)), table, *map(Text, places))
