@@ -25,7 +25,7 @@ from places import ROOT, without_pages
 
 from sim.server import VehicleSetup, serve_all
 from uavctl.cli.app import run
-from uavctl.cli.ctl import ask
+from uavctl.cli.ctl import send_request
 from uavctl.cli.fleet import FleetFlight, Member, compute_gap_m, read_fleet
 from uavctl.config import load_config
 from uavctl.daemon.control_socket import FOLDER_VARIABLE, ControlRequest
@@ -195,7 +195,7 @@ def status(path: Path) -> list[dict[str, Any]]:
     found = []
     for one in read_fleet(path).members:
         try:
-            health = ask(ControlRequest(ask="status"), path.parent / "c", one.daemon).status
+            health = send_request(ControlRequest(ask="status"), path.parent / "c", one.daemon).status
         except NotReachedError:
             health = None
         found.append({"mode": None, "pid": 0} if health is None else {"mode": health.mode, "pid": health.pid})

@@ -10,7 +10,7 @@ import pytest
 
 from uavctl.build.controller import design_of
 from uavctl.cli.app import run
-from uavctl.cli.init import WALL_M, read_sizes, room_text
+from uavctl.cli.init import WALL_M, format_room, parse_sizes
 from uavctl.cli.sim import VEHICLES
 from uavctl.config import dump_config, load, parse
 from uavctl.config.checks import get_position_limits_m
@@ -18,7 +18,7 @@ from uavctl.errors import ConfigError, UsageError
 
 
 def written(autopilot: str, room: str = "6x5x2.5") -> str:
-    return room_text(read_sizes(room), autopilot, "mine.toml")
+    return format_room(parse_sizes(room), autopilot, "mine.toml")
 
 
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
@@ -128,7 +128,7 @@ def test_overrides_reach_names_and_lists() -> None:
 
 def test_a_room_whose_sizes_are_not_lengths() -> None:
     with pytest.raises(UsageError):
-        read_sizes("6 by 5 by 2")
+        parse_sizes("6 by 5 by 2")
 
 
 def test_a_base_that_is_no_preset_is_refused() -> None:

@@ -18,11 +18,11 @@ from rich.console import Console
 
 from uavctl.cli.app import app, run
 from uavctl.cli.common import label_text, make_message_console, make_output_console, make_pair_table, make_table
-from uavctl.cli.usage import EXAMPLES, commands_of, example
+from uavctl.cli.usage import EXAMPLES, format_example, list_commands
 from uavctl.config.load import find_keys
 from uavctl.frames import suggest_height_sign
 
-COMMANDS = {" ".join(chain): one for chain, one in commands_of(app)}
+COMMANDS = {" ".join(chain): one for chain, one in list_commands(app)}
 EXIT_CODES = "130 interrupted"  # told once, by `uavctl --help`
 
 
@@ -39,7 +39,7 @@ def test_help_ends_with_an_example_of_the_command_and_names_all_its_arguments(co
     assert text.rstrip().endswith(EXAMPLES[command])
     assert "[ARGS" not in text
     assert (EXIT_CODES in text) == (command == "")
-    assert example(command)
+    assert format_example(command)
 
 
 @pytest.mark.parametrize("command", COMMANDS)

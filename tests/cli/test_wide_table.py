@@ -11,7 +11,7 @@ from rich.console import Console, Group, RenderableType
 
 from uavctl.build.controller import build_design
 from uavctl.cli.common import DEFAULTS, Column, WideTable, make_pair_table, make_table
-from uavctl.cli.design import _column, plan_table
+from uavctl.cli.design import _make_column, make_plan_table
 from uavctl.config import load_config
 from uavctl.smpc.answer import Answer
 from uavctl.smpc.hahn_stursberg.design import Design
@@ -40,7 +40,7 @@ def room() -> tuple[Answer, Design]:
 @pytest.mark.parametrize(("width", "tables"), [(200, 1), (80, 2), (60, 4), (30, 8)])
 def test_a_plan_fits_its_terminal_stage_by_stage(width: int, tables: int) -> None:
     answer, design = room()
-    lines = printed(plan_table(answer, design), width)
+    lines = printed(make_plan_table(answer, design), width)
     assert max(map(len, lines)) <= width
     rows = cells(lines)
     count = design.horizon + 2  # with the heading
@@ -97,4 +97,4 @@ def test_a_table_with_room_keeps_the_usual_width_in_a_file(capsys: pytest.Captur
 
 
 def test_a_figure_as_good_as_zero_has_no_minus() -> None:
-    assert list(_column("x", [-1e-9, -0.0004, -0.0006], 4).cells) == ["0.000", "0.000", "-0.001", ""]
+    assert list(_make_column("x", [-1e-9, -0.0004, -0.0006], 4).cells) == ["0.000", "0.000", "-0.001", ""]

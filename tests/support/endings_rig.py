@@ -302,7 +302,7 @@ def in_virtual_time(rig: Endings) -> Iterator[None]:
         patch.setattr(fly_cmd, "run_daemon", rig.fly)
         patch.setattr(fly_cmd, "Ticker", lambda tick_ns, dt_ns: Ticker(tick_ns, dt_ns, lambda: rig.now_ns))
         patch.setattr(fly_cmd, "Recorder", Sync)
-        patch.setattr("uavctl.cli.check.checked_before_arming", lambda *_: ())
+        patch.setattr("uavctl.cli.check.check_before_arming", lambda *_: ())
         patch.setattr("uavctl.cli.services.HealthMonitor", Watched)
         patch.setattr(Notifier, "send_status", lambda _, text: rig.notified.append(text))
         patch.setattr(report, "_make_sections", lambda *given: [report._make_summary_section(*given)])  # no drawings

@@ -37,9 +37,9 @@ from uavctl.cli.common import (
     make_table,
     print_message,
 )
-from uavctl.cli.ctl import ask
+from uavctl.cli.ctl import send_request
 from uavctl.cli.health_lines import hide_health_lines
-from uavctl.cli.usage import example
+from uavctl.cli.usage import format_example
 from uavctl.config import Config, load
 from uavctl.config.checks import get_position_limits_m
 from uavctl.config.document import ConfigProblem, Section
@@ -56,7 +56,9 @@ MAX_VEHICLES = 20
 MAX_NAME_LENGTH = 30
 
 fleet_app = App(
-    name="fleet", help="Fly several vehicles from one file: check, fly, status, land.", help_epilogue=example("fleet")
+    name="fleet",
+    help="Fly several vehicles from one file: check, fly, status, land.",
+    help_epilogue=format_example("fleet"),
 )
 File = Annotated[Path, Parameter(help="TOML file: spacing_m, and a [[vehicle]] table for each vehicle")]
 
@@ -174,7 +176,7 @@ def _find_problems(members: Sequence[Member], spacing_m: float) -> Iterator[Conf
             )
 
 
-@fleet_app.command(help_epilogue=example("fleet check"))
+@fleet_app.command(help_epilogue=format_example("fleet check"))
 def check(file: File, /, *, json: QuietJson = False) -> int:
     """Say whether a fleet can be flown: its configurations, links, and how far apart its boxes are; sends nothing."""
     fleet = read_fleet(file)
@@ -189,7 +191,7 @@ def check(file: File, /, *, json: QuietJson = False) -> int:
     return 0
 
 
-@fleet_app.command(help_epilogue=example("fleet fly"))
+@fleet_app.command(help_epilogue=format_example("fleet fly"))
 def fly(
     file: File,
     /,
@@ -237,7 +239,7 @@ def fly(
     return max((flight.exit_code or 0 for flight in flights), default=0)
 
 
-@fleet_app.command(help_epilogue=example("fleet status"))
+@fleet_app.command(help_epilogue=format_example("fleet status"))
 def status(
     file: File, /, *, control: Annotated[Path | None, Parameter(show=False)] = None, json: QuietJson = False
 ) -> int:
@@ -248,13 +250,13 @@ def status(
     return 0 if all(health.values()) else 1
 
 
-@fleet_app.command(help_epilogue=example("fleet land"))
+@fleet_app.command(help_epilogue=format_example("fleet land"))
 def land(file: File, /, *, control: Annotated[Path | None, Parameter(show=False)] = None) -> int:
     """Land all vehicles of a file. Exit code 1: not all of them take the order."""
     fleet, folder, all_accepted = read_fleet(file), find_control_folder(control), True
     for member in fleet.members:
         try:
-            reply = ask(ControlRequest(ask="land"), folder, member.daemon)
+            reply = send_request(ControlRequest(ask="land"), folder, member.daemon)
             verdict, text = ("accepted" if reply.ok else "refused"), reply.text
         except NotReachedError as error:
             verdict, text = "not reached", str(error)
@@ -397,7 +399,7 @@ def _show_status(flights: Sequence[FleetFlight]) -> Iterator[HealthByName]:
 def _read_health(member: Member, folder: Path) -> Health | None:
     """Return the health of a vehicle; None where its daemon does not answer."""
     try:
-        return ask(ControlRequest(ask="status"), folder, member.daemon).status
+        return send_request(ControlRequest(ask="status"), folder, member.daemon).status
     except NotReachedError:
         return None
 

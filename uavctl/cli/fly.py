@@ -143,9 +143,9 @@ def fly_daemon(
             check_places(config, design, take_off_m, engagement.goal)
             prepared = prepare(config, design)
         # Loaded late: it takes an eighth of the loading time of `fly`.
-        from uavctl.cli.check import checked_before_arming, mission_items, record_items, record_parameters
+        from uavctl.cli.check import check_before_arming, make_mission_items, record_items, record_parameters
 
-        mission_results = () if take_off_m is None else mission_items(config, prepared)
+        mission_items = () if take_off_m is None else make_mission_items(config, prepared)
         begin_s = time.perf_counter()
         with (
             enable_realtime_process(realtime) as garbage_functions,
@@ -155,7 +155,7 @@ def fly_daemon(
             checked: tuple[Item, ...] = ()
             parameters = ParameterReader()
             if take_off_m is not None:
-                checked = checked_before_arming(config, connections, stopped, take_off_m, parameters, mission_results)
+                checked = check_before_arming(config, connections, stopped, take_off_m, parameters, mission_items)
             recorder = Recorder(path, config.log, onlookers=viewers)
             loop = ControlLoop(config, prepared.controller, recorder, time.perf_counter_ns)
             engagement.begin(loop)

@@ -109,21 +109,21 @@ def fly_simulated(
     view_port: int | None = None,
     follower: TickFollower | None = None,
 ) -> FlightSummary:
-    """Fly the simulated vehicle for the configured time, record it, and say on the console how it ended.
+    """Fly the simulated vehicle for the configured time, record it, and print how it ended.
 
     Args:
-        loaded: the configuration, with where it is from.
-        udp: over real sockets and in real time, else in lockstep and virtual time.
-        take_off_m: height of the climb above the ground [m]; None begins and ends in the air.
-        goto: whether the mission is the place of `--goto`.
-        out: folder of the recording; None makes a new one below `flights/`.
-        view_port: TCP port of a live view; None is none.
-        follower: looks at every tick, and may give orders.
+        loaded: The configuration and its source.
+        udp: Over real sockets and in real time, else in lockstep and virtual time.
+        take_off_m: Height of the climb above the ground [m]; None begins and ends in the air.
+        goto: Whether the mission is the place of `--goto`.
+        out: Folder of the recording; None makes a new one below `flights/`.
+        view_port: TCP port of a live view; None: no view.
+        follower: Called at every tick; may give orders.
 
     Raises:
-        UavctlError: nothing was flown, and why.
+        UavctlError: Nothing was flown; the message is the reason.
     """
-    config = _on_loopback(loaded.config) if udp else loaded.config
+    config = _use_loopback_ports(loaded.config) if udp else loaded.config
     check_length(config)
     with locate_design_errors(loaded):
         design = design_of(config)
@@ -132,10 +132,10 @@ def fly_simulated(
         with locate_design_errors(loaded):
             check_places(config, design, take_off_m, engagement.goal)
             prepared = prepare(config, design)
-        return _real_time(prepared, path, engagement, viewers) if udp else lockstep(prepared, path, engagement)
+        return _fly_real_time(prepared, path, engagement, viewers) if udp else fly_lockstep(prepared, path, engagement)
 
 
-def lockstep(prepared: Prepared, path: Path, engagement: Engagement) -> FlightSummary:
+def fly_lockstep(prepared: Prepared, path: Path, engagement: Engagement) -> FlightSummary:
     """Fly in virtual time, with a progress bar."""
     config = prepared.config
     flight = LockstepFlight(prepared, path)
@@ -160,7 +160,7 @@ def lockstep(prepared: Prepared, path: Path, engagement: Engagement) -> FlightSu
     return conclude_flight(path, flight.wall_s, status, flight.loop.ending)
 
 
-def _real_time(prepared: Prepared, path: Path, engagement: Engagement, viewers: DerivedTopics) -> FlightSummary:
+def _fly_real_time(prepared: Prepared, path: Path, engagement: Engagement, viewers: DerivedTopics) -> FlightSummary:
     config, takes_off = prepared.config, engagement.takes_off
     tick_ns, dt_ns = round(config.daemon.tick_s * 1e9), round(config.plant.dt_s * 1e9)
     with ExitStack() as stack:
@@ -174,7 +174,7 @@ def _real_time(prepared: Prepared, path: Path, engagement: Engagement, viewers: 
         try:
             put_header(recorder, prepared, monotonic_ns(), read_zero_utc_ns())
             simulator = stack.enter_context(ExitStack())
-            simulator.enter_context(_simulator(config, recorder, airborne=not takes_off))
+            simulator.enter_context(_run_simulator(config, recorder, airborne=not takes_off))
             feed = simulator.enter_context(
                 show_live_line(loop, recorder.status, config.duration_s, config.daemon.tick_s)
             )
@@ -197,7 +197,7 @@ def _real_time(prepared: Prepared, path: Path, engagement: Engagement, viewers: 
                     on_events=feed.events.extend,
                 )
             wall_s = time.perf_counter() - begin_s
-            simulator.close()  # its last words go into the recording
+            simulator.close()  # its last records go into the recording
         finally:
             recorder.put(ENDED, monotonic_ns(), loop.ending)
             status = recorder.close()
@@ -205,33 +205,33 @@ def _real_time(prepared: Prepared, path: Path, engagement: Engagement, viewers: 
     return conclude_flight(path, wall_s, status, loop.ending)
 
 
-def _on_loopback(config: Config) -> Config:
+def _use_loopback_ports(config: Config) -> Config:
     """Return the configuration with connections on free ports of this machine."""
-    with socket.socket(type=socket.SOCK_DGRAM) as one, socket.socket(type=socket.SOCK_DGRAM) as other:
-        one.bind(("127.0.0.1", 0))
-        other.bind(("127.0.0.1", 0))
-        vehicle, mocap = (f"udpin://127.0.0.1:{s.getsockname()[1]}" for s in (one, other))
+    with socket.socket(type=socket.SOCK_DGRAM) as first, socket.socket(type=socket.SOCK_DGRAM) as second:
+        first.bind(("127.0.0.1", 0))
+        second.bind(("127.0.0.1", 0))
+        vehicle, mocap = (f"udpin://127.0.0.1:{s.getsockname()[1]}" for s in (first, second))
     return msgspec.structs.replace(config, daemon=msgspec.structs.replace(config.daemon, vehicle=vehicle, mocap=mocap))
 
 
 @contextmanager
-def _simulator(config: Config, sink: Sink, *, airborne: bool) -> Iterator[None]:
-    """Run the simulated peers in a process of their own, sending to the daemon's ports; their truth goes to the sink.
+def _run_simulator(config: Config, sink: Sink, *, airborne: bool) -> Iterator[None]:
+    """Run the simulated peers in a process of their own, which sends to the daemon's ports; record their truth.
 
     Raises:
-        UavctlError: they do not start.
+        UavctlError: The simulator does not start.
     """
     context = multiprocessing.get_context("spawn")
-    ours, theirs = context.Pipe(duplex=False)
+    receiver, sender = context.Pipe(duplex=False)
     stop = context.Event()
     urls = [url.replace("udpin", "udpout") for url in (config.daemon.vehicle, config.daemon.mocap)]
-    arguments = (theirs, stop, config, *urls, None, airborne, make_door(config.security))
+    arguments = (sender, stop, config, *urls, None, airborne, make_door(config.security))
     child = context.Process(target=serve_in_child, args=arguments, name="simulator")
     child.start()
-    theirs.close()
-    listener = threading.Thread(target=_listen, args=(ours, sink), name="truth", daemon=True)
+    sender.close()
+    listener = threading.Thread(target=_record_truth, args=(receiver, sink), name="truth", daemon=True)
     try:
-        if not _ready(ours):
+        if not _wait_for_ready(receiver):
             raise UavctlError(f"the simulator did not start within {START_LIMIT_S:g} s; see the messages above")
         listener.start()
         yield
@@ -242,10 +242,10 @@ def _simulator(config: Config, sink: Sink, *, airborne: bool) -> Iterator[None]:
             child.kill()
         if listener.ident is not None:
             listener.join(START_LIMIT_S)
-        ours.close()
+        receiver.close()
 
 
-def _ready(pipe: Pipe) -> bool:
+def _wait_for_ready(pipe: Pipe) -> bool:
     """Wait for the simulator's ports; return False if it ended or took too long."""
     try:
         return pipe.poll(START_LIMIT_S) and isinstance(pipe.recv(), Ready)
@@ -253,12 +253,12 @@ def _ready(pipe: Pipe) -> bool:
         return False
 
 
-def _listen(pipe: Pipe, sink: Sink) -> None:
-    """Pass the simulator's truth on until it hangs up."""
+def _record_truth(pipe: Pipe, sink: Sink) -> None:
+    """Record the truth of the simulator until its connection closes."""
     try:
         while True:
-            told = pipe.recv()
-            if isinstance(told, Truth):
-                sink.put(TRUTH, told.at_ns, told)
+            message = pipe.recv()
+            if isinstance(message, Truth):
+                sink.put(TRUTH, message.at_ns, message)
     except EOFError:
         return

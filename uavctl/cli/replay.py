@@ -24,7 +24,7 @@ from logs.recording.topics import HOLES, RECOVERED, RecorderNote
 from uavctl.arithmetic import ARITHMETIC, OWN, without_choice
 from uavctl.build.controller import ARITHMETIC_NAME, CONTROLLER, Prepared, cpu, design_of, prepare, versions
 from uavctl.build.outside import KEY
-from uavctl.cli import start_anew
+from uavctl.cli import restart_process
 from uavctl.cli.common import (
     DEFAULTS,
     Common,
@@ -201,7 +201,7 @@ def compute_as(recorded: Header) -> None:
     So it was where numpy was loaded before `uavctl`, or where somebody chose it.
     """
     if recorded.versions.get(ARITHMETIC_NAME) == OWN and ARITHMETIC != OWN and recorded.cpu == cpu():
-        start_anew(without_choice(os.environ))
+        restart_process(without_choice(os.environ))
 
 
 def other_versions(recorded: Header, controller: str) -> Iterator[str]:

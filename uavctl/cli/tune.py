@@ -39,7 +39,7 @@ from uavctl.cli.common import (
 )
 from uavctl.cli.fly import fly_daemon
 from uavctl.cli.flying import check_take_off
-from uavctl.cli.identify import design_doubts, fitting
+from uavctl.cli.identify import find_design_warnings, show_fit_progress
 from uavctl.cli.loopback import fly_simulated
 from uavctl.clock import Ticker, monotonic_ns
 from uavctl.config import Config, LoadedConfig
@@ -455,10 +455,10 @@ class _TuneRun:
             return self._told("identified, and the configuration is written")
         recording = self.folder.recording(self.folder.progress.before)
         history = from_records(read(recording))
-        with fitting(fits_of(history, self._config)) as advance:
+        with show_fit_progress(fits_of(history, self._config)) as advance:
             found = identify(history, self._config, advance)
         result = tuned(self._config, found)
-        doubts = design_doubts(result.config)
+        doubts = find_design_warnings(result.config)
         write_atomically(self.folder.path / FIT_PAGE, write_fit_page(found, history.seen, str(recording)))
         told = msgspec.structs.replace(result.result, warnings=(*result.result.warnings, *doubts))
         make_message_console().print(changes_picture(told))

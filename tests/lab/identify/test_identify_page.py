@@ -145,10 +145,10 @@ def test_a_second_vehicle_in_a_log_changes_nothing(tmp_path: Path, system: int |
     both = tmp_path / "both.tlog"
     both.write_bytes(b"".join(struct.pack(">Q", at_ns // 1000) + data for at_ns, data in rows))
     common = Common(config="room-px4")
-    alone, _ = identify_cmd._history(DATA / "px4-relay.tlog", common, None)
-    found, _ = identify_cmd._history(both, common, system)
+    alone, _ = identify_cmd._read_history(DATA / "px4-relay.tlog", common, None)
+    found, _ = identify_cmd._read_history(both, common, system)
     assert len(rows) > len(packets) + 10 and len(alone.asked.times_s)
     assert np.array_equal(found.asked.accel_mps2, alone.asked.accel_mps2)
     assert np.array_equal(found.seen.times_s, alone.seen.times_s)
     with pytest.raises(UsageError):
-        identify_cmd._history(both, common, 9)
+        identify_cmd._read_history(both, common, 9)
