@@ -11,7 +11,7 @@ import pytest
 from uavctl.build.controller import design_of
 from uavctl.cli.app import run
 from uavctl.cli.init import WALL_M, format_room, parse_sizes
-from uavctl.cli.sim import VEHICLES
+from uavctl.cli.sim import DEFAULT_VEHICLE_URLS
 from uavctl.config import dump_config, load, parse
 from uavctl.config.checks import get_position_limits_m
 from uavctl.errors import ConfigError, UsageError
@@ -46,7 +46,7 @@ def test_the_file_has_a_dozen_keys_and_is_the_room(autopilot: str, tmp_path: Pat
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 def test_the_vehicle_of_the_file_is_the_simulated_one(autopilot: str) -> None:
     own = urlsplit(parse(written(autopilot), "mine.toml").config.daemon.vehicle)
-    simulated = urlsplit(VEHICLES[autopilot].split(",")[0])
+    simulated = urlsplit(DEFAULT_VEHICLE_URLS[autopilot].split(",")[0])
     assert (own.scheme, simulated.scheme) in {("udpin", "udpout"), ("tcp", "tcpin")} and own.port == simulated.port
 
 

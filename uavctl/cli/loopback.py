@@ -45,7 +45,7 @@ from uavctl.cli.flying import (
     stop_on_signals,
 )
 from uavctl.cli.live_line import show_live_line
-from uavctl.cli.sim import make_door
+from uavctl.cli.signed_port import make_port_wrapper
 from uavctl.clock import Ticker, monotonic_ns, read_zero_utc_ns
 from uavctl.config import Config, LoadedConfig
 from uavctl.daemon.daemon import fly
@@ -225,7 +225,7 @@ def _run_simulator(config: Config, sink: Sink, *, airborne: bool) -> Iterator[No
     receiver, sender = context.Pipe(duplex=False)
     stop = context.Event()
     urls = [url.replace("udpin", "udpout") for url in (config.daemon.vehicle, config.daemon.mocap)]
-    arguments = (sender, stop, config, *urls, None, airborne, make_door(config.security))
+    arguments = (sender, stop, config, *urls, None, airborne, make_port_wrapper(config.security))
     child = context.Process(target=serve_in_child, args=arguments, name="simulator")
     child.start()
     sender.close()

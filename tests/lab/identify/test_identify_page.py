@@ -117,7 +117,7 @@ def test_what_speaks_against_a_design_is_on_the_page_too(
 
     asked = SetpointHistory(np.zeros(1), np.zeros((1, 3)), np.ones(1, dtype=bool))
     history = FlightHistory(asked, seen(), np.zeros(0, dtype=np.int64))
-    monkeypatch.setattr(identify_cmd, "_history", lambda *_: (history, load_config("room-hahn-stursberg")))
+    monkeypatch.setattr(identify_cmd, "_read_history", lambda *_: (history, load_config("room-hahn-stursberg")))
     monkeypatch.setattr(identify_cmd, "identify", lambda *_: found(HARDLY))
     monkeypatch.setattr(identify_cmd, "design_of", refused)
     assert identify_cmd.identify_command(tmp_path / "flight.mcap") == 0
