@@ -22,7 +22,7 @@ from logs.recording.recorder import SyncRecorder
 from sim.simulation import Peers
 from uavctl.check.findings import ItemState, make_item
 from uavctl.cli.app import run
-from uavctl.cli.check import disk_items, record_items, record_parameters, run_preflight
+from uavctl.cli.check import make_disk_items, record_items, record_parameters, run_preflight
 from uavctl.config import load_config
 from uavctl.io.base import Connection
 from uavctl.records import Checked, Event
@@ -147,14 +147,14 @@ def test_a_time_that_is_none_is_refused(seconds: str) -> None:
 
 @pytest.mark.fault(29)
 def test_no_room_and_no_folder_are_items(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    good = disk_items(tmp_path / "a" / "b", 1)
+    good = make_disk_items(tmp_path / "a" / "b", 1)
     assert [one.state for one in good] == [ItemState.GOOD, ItemState.GOOD]
     assert not (tmp_path / "a").exists()  # nothing is made
-    assert disk_items(tmp_path, 2**62)[1].state is ItemState.BAD
+    assert make_disk_items(tmp_path, 2**62)[1].state is ItemState.BAD
     (tmp_path / "file").write_text("")
-    assert disk_items(tmp_path / "file" / "flights", 1)[0].state is ItemState.BAD
+    assert make_disk_items(tmp_path / "file" / "flights", 1)[0].state is ItemState.BAD
     monkeypatch.setattr(os, "access", lambda *_: False)  # root may write anywhere
-    assert disk_items(tmp_path, 1)[0].state is ItemState.BAD
+    assert make_disk_items(tmp_path, 1)[0].state is ItemState.BAD
 
 
 # --- the runner, in virtual time ----------------------------------------------------------------

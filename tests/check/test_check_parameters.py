@@ -20,7 +20,7 @@ from sim.simulation import Peers
 from uavctl.check.findings import ItemState, describe_item, find_refusals
 from uavctl.check.parameters import RULES, ParameterVerdict
 from uavctl.check.preflight import Preflight
-from uavctl.cli.init import read_sizes, room_text
+from uavctl.cli.init import format_room, parse_sizes
 from uavctl.config import Config, load_config, parse
 from uavctl.config.checks import get_position_limits_m
 from uavctl.lab.own_loop import EXTERNAL_ONLY
@@ -276,7 +276,7 @@ ROOMS: list[tuple[str, str, list[str]]] = [
 
 def loaded(name: str, autopilot: str, overrides: list[str]) -> Config:
     if name[0].isdigit():
-        return parse(room_text(read_sizes(name), autopilot, "mine.toml"), "mine.toml", overrides).config
+        return parse(format_room(parse_sizes(name), autopilot, "mine.toml"), "mine.toml", overrides).config
     return load_config(name, overrides)
 
 

@@ -17,7 +17,7 @@ from places import ROOT
 
 from uavctl import __version__
 from uavctl.cli.app import app, run
-from uavctl.cli.common import bars
+from uavctl.cli.common import make_progress
 
 PRESET = ROOT / "uavctl" / "presets" / "paper.toml"
 STATE = "35,-2,-20,-4"
@@ -256,7 +256,7 @@ def test_a_place_that_is_none_is_told(words: list[str], told: str, capsys: pytes
 
 def test_progress_is_told_in_lines_where_no_bar_can_be_drawn(capsys: pytest.CaptureFixture[str]) -> None:
     now_s = 0.0
-    with bars() as progress:
+    with make_progress() as progress:
         progress.get_time = lambda: now_s
         task = progress.add_task("flights", total=40_000)
         for _ in range(20):

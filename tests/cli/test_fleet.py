@@ -25,8 +25,8 @@ from places import ROOT, without_pages
 
 from sim.server import VehicleSetup, serve_all
 from uavctl.cli.app import run
-from uavctl.cli.ctl import ask
-from uavctl.cli.fleet import FleetFlight, Member, horizontally_apart_m, read_fleet
+from uavctl.cli.ctl import send_request
+from uavctl.cli.fleet import FleetFlight, Member, compute_gap_m, read_fleet
 from uavctl.config import load_config
 from uavctl.daemon.control_socket import FOLDER_VARIABLE, ControlRequest
 from uavctl.errors import ConfigError, NotReachedError
@@ -142,7 +142,7 @@ def test_places_in_two_boxes_are_as_far_apart_as_is_said(
     other_east: tuple[float, float],
 ) -> None:
     """By the corners, and where boxes overlap along an axis by a place that both have there."""
-    apart_m = horizontally_apart_m(member(north, east), member(other_north, other_east))
+    apart_m = compute_gap_m(member(north, east), member(other_north, other_east))
     nearest = [
         min((abs(a - b) for a, b in product(one, other)), default=0.0)
         if one[1] < other[0] or other[1] < one[0]
@@ -195,7 +195,7 @@ def status(path: Path) -> list[dict[str, Any]]:
     found = []
     for one in read_fleet(path).members:
         try:
-            health = ask(ControlRequest(ask="status"), path.parent / "c", one.daemon).status
+            health = send_request(ControlRequest(ask="status"), path.parent / "c", one.daemon).status
         except NotReachedError:
             health = None
         found.append({"mode": None, "pid": 0} if health is None else {"mode": health.mode, "pid": health.pid})
@@ -236,8 +236,8 @@ def test_a_daemon_that_refuses_to_arm_ends_with_its_own_exit_code(
     path.write_text(HEAD + entry("west", WEST, "udpin://127.0.0.1:0", "udpin://127.0.0.1:0", "check.seconds=0.2"))
     (one,) = read_fleet(path).members
     flight = FleetFlight(one, ["--arm", "--takeoff", "1.2", "--out", str(tmp_path / "out")])
-    flight.begin()
-    until(lambda: not flight.lasts(), "the end of the daemon")
-    flight.last_words()
-    flight.end()
+    flight.start()
+    until(lambda: not flight.is_running(), "the end of the daemon")
+    flight.join_output()
+    flight.request_end()
     assert flight.exit_code == 1

@@ -10,15 +10,15 @@ import pytest
 
 from uavctl.build.controller import design_of
 from uavctl.cli.app import run
-from uavctl.cli.init import WALL_M, read_sizes, room_text
-from uavctl.cli.sim import VEHICLES
+from uavctl.cli.init import WALL_M, format_room, parse_sizes
+from uavctl.cli.sim import DEFAULT_VEHICLE_URLS
 from uavctl.config import dump_config, load, parse
 from uavctl.config.checks import get_position_limits_m
 from uavctl.errors import ConfigError, UsageError
 
 
 def written(autopilot: str, room: str = "6x5x2.5") -> str:
-    return room_text(read_sizes(room), autopilot, "mine.toml")
+    return format_room(parse_sizes(room), autopilot, "mine.toml")
 
 
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
@@ -46,7 +46,7 @@ def test_the_file_has_a_dozen_keys_and_is_the_room(autopilot: str, tmp_path: Pat
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 def test_the_vehicle_of_the_file_is_the_simulated_one(autopilot: str) -> None:
     own = urlsplit(parse(written(autopilot), "mine.toml").config.daemon.vehicle)
-    simulated = urlsplit(VEHICLES[autopilot].split(",")[0])
+    simulated = urlsplit(DEFAULT_VEHICLE_URLS[autopilot].split(",")[0])
     assert (own.scheme, simulated.scheme) in {("udpin", "udpout"), ("tcp", "tcpin")} and own.port == simulated.port
 
 
@@ -128,7 +128,7 @@ def test_overrides_reach_names_and_lists() -> None:
 
 def test_a_room_whose_sizes_are_not_lengths() -> None:
     with pytest.raises(UsageError):
-        read_sizes("6 by 5 by 2")
+        parse_sizes("6 by 5 by 2")
 
 
 def test_a_base_that_is_no_preset_is_refused() -> None:

@@ -32,4 +32,4 @@ def end_code(end: str) -> tuple[int, str]:
 
 def test_a_thread_that_waits_for_input_changes_no_exit_code() -> None:
     assert end_code("sys.exit(3)")[0] < 0  # the interpreter's own end is an abort
-    assert end_code("cli._end(3)") == (3, '{"ok": true}')
+    assert end_code("cli._end_process(3)") == (3, '{"ok": true}')

@@ -17,12 +17,12 @@ from places import ROOT
 from rich.console import Console
 
 from uavctl.cli.app import app, run
-from uavctl.cli.common import columns, labelled, messages, pictures, two_columns
-from uavctl.cli.usage import EXAMPLES, commands_of, example
+from uavctl.cli.common import label_text, make_message_console, make_output_console, make_pair_table, make_table
+from uavctl.cli.usage import EXAMPLES, format_example, list_commands
 from uavctl.config.load import find_keys
 from uavctl.frames import suggest_height_sign
 
-COMMANDS = {" ".join(chain): one for chain, one in commands_of(app)}
+COMMANDS = {" ".join(chain): one for chain, one in list_commands(app)}
 EXIT_CODES = "130 interrupted"  # told once, by `uavctl --help`
 
 
@@ -39,7 +39,7 @@ def test_help_ends_with_an_example_of_the_command_and_names_all_its_arguments(co
     assert text.rstrip().endswith(EXAMPLES[command])
     assert "[ARGS" not in text
     assert (EXIT_CODES in text) == (command == "")
-    assert example(command)
+    assert format_example(command)
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -180,13 +180,13 @@ MARKED = "pip install 'uavctl[live]' [/] [bold]x[/bold] :bug: \\[y]"
 
 
 def test_a_string_is_never_markup(capsys: pytest.CaptureFixture[str]) -> None:
-    messages().print(labelled("error", MARKED), soft_wrap=True)
-    messages().print(MARKED, soft_wrap=True)
+    make_message_console().print(label_text("error", MARKED), soft_wrap=True)
+    make_message_console().print(MARKED, soft_wrap=True)
     assert capsys.readouterr().err.count(MARKED) == 2
-    console = pictures()
+    console = make_output_console()
     console.width = 400
-    console.print(two_columns(MARKED, [(MARKED, MARKED)]))
-    console.print(columns(MARKED, (MARKED,), [(MARKED,)]))
+    console.print(make_pair_table(MARKED, [(MARKED, MARKED)]))
+    console.print(make_table(MARKED, (MARKED,), [(MARKED,)]))
     assert capsys.readouterr().out.count(MARKED) == 6
 
 

@@ -10,8 +10,8 @@ import pytest
 from rich.console import Console, Group, RenderableType
 
 from uavctl.build.controller import build_design
-from uavctl.cli.common import DEFAULTS, Column, WideTable, columns, two_columns
-from uavctl.cli.design import _column, plan_table
+from uavctl.cli.common import DEFAULTS, Column, WideTable, make_pair_table, make_table
+from uavctl.cli.design import _make_column, make_plan_table
 from uavctl.config import load_config
 from uavctl.smpc.answer import Answer
 from uavctl.smpc.hahn_stursberg.design import Design
@@ -40,23 +40,23 @@ def room() -> tuple[Answer, Design]:
 @pytest.mark.parametrize(("width", "tables"), [(200, 1), (80, 2), (60, 4), (30, 8)])
 def test_a_plan_fits_its_terminal_stage_by_stage(width: int, tables: int) -> None:
     answer, design = room()
-    lines = printed(plan_table(answer, design), width)
+    lines = printed(make_plan_table(answer, design), width)
     assert max(map(len, lines)) <= width
     rows = cells(lines)
     count = design.horizon + 2  # with the heading
     assert len(rows) == tables * count
     parts = [rows[i * count : (i + 1) * count] for i in range(tables)]
     assert all([row[0] for row in part] == ["t", *map(str, range(design.horizon + 1))] for part in parts)
-    columns = {column[0]: column[1:] for part in parts for column in zip(*(row[1:] for row in part), strict=True)}
-    assert list(columns) == [
+    make_table = {column[0]: column[1:] for part in parts for column in zip(*(row[1:] for row in part), strict=True)}
+    assert list(make_table) == [
         *("p_n", "v_n", "a_n", "u_n", "p_e", "v_e", "a_e", "u_e", "p_d", "v_d", "a_d", "u_d"),
         *("back-off x", "back-off u"),
     ]
     for i, name in enumerate(("p_n", "v_n", "a_n", "p_e", "v_e", "a_e", "p_d", "v_d", "a_d")):
-        assert list(columns[name]) == [f"{value:z.3f}" for value in answer.states[:, i]]
+        assert list(make_table[name]) == [f"{value:z.3f}" for value in answer.states[:, i]]
     for i, name in enumerate(("u_n", "u_e", "u_d")):
-        assert list(columns[name]) == [*(f"{value:z.3f}" for value in answer.inputs[:, i]), ""]
-    assert list(columns["back-off x"]) == [f"{row.max():z.3f}" for row in answer.backoff_x]
+        assert list(make_table[name]) == [*(f"{value:z.3f}" for value in answer.inputs[:, i]), ""]
+    assert list(make_table["back-off x"]) == [f"{row.max():z.3f}" for row in answer.backoff_x]
 
 
 def test_groups_stay_together_where_they_fit() -> None:
@@ -80,9 +80,9 @@ LONG = "x" * 170  # as a path may be
 @pytest.mark.parametrize(
     "table",
     [
-        two_columns("title", [("file", LONG), ("more", "two words")]),
-        columns("title", ["a", "b"], [["1", LONG], ["2", "two words"]]),
-        Group("before", columns("title", ["a", "b"], [[LONG, LONG]]), "two words"),
+        make_pair_table("title", [("file", LONG), ("more", "two words")]),
+        make_table("title", ["a", "b"], [["1", LONG], ["2", "two words"]]),
+        Group("before", make_table("title", ["a", "b"], [[LONG, LONG]]), "two words"),
     ],
 )
 def test_a_table_that_goes_to_a_file_is_whole(table: RenderableType, capsys: pytest.CaptureFixture[str]) -> None:
@@ -92,9 +92,9 @@ def test_a_table_that_goes_to_a_file_is_whole(table: RenderableType, capsys: pyt
 
 
 def test_a_table_with_room_keeps_the_usual_width_in_a_file(capsys: pytest.CaptureFixture[str]) -> None:
-    DEFAULTS.show("table", {}, lambda: columns("", ["a", "b"], [["1", "word " * 100]]))
+    DEFAULTS.show("table", {}, lambda: make_table("", ["a", "b"], [["1", "word " * 100]]))
     assert {len(line) for line in capsys.readouterr().out.splitlines()} == {120}
 
 
 def test_a_figure_as_good_as_zero_has_no_minus() -> None:
-    assert list(_column("x", [-1e-9, -0.0004, -0.0006], 4).cells) == ["0.000", "0.000", "-0.001", ""]
+    assert list(_make_column("x", [-1e-9, -0.0004, -0.0006], 4).cells) == ["0.000", "0.000", "-0.001", ""]

@@ -9,7 +9,7 @@ import pytest
 from loopback_rig import Memory, shared_loop
 
 from sim.simulation import Peers
-from uavctl.cli.ctl import _relay
+from uavctl.cli.ctl import describe_relay
 from uavctl.config import load_config
 from uavctl.daemon.health import Health, HealthMonitor, RecorderHealth, RelayHealth, format_health
 from uavctl.records import ControlMode, Ticked
@@ -143,6 +143,6 @@ def test_a_relay_that_goes_on_alone_is_told_apart() -> None:
 
 def test_the_operator_is_told_a_relay_that_goes_on_alone() -> None:
     relay = RelayHealth(sent=90, sent_hz=30.0, kept={}, last_s=0.1, alone=False)
-    both = _relay(relay)
-    alone = _relay(msgspec.structs.replace(relay, alone=True))
+    both = describe_relay(relay)
+    alone = describe_relay(msgspec.structs.replace(relay, alone=True))
     assert alone != both and alone.startswith(both)

@@ -13,7 +13,7 @@ import pytest
 from manual_rig import PAGES, Desk, blocks, commands, desk, edited, keys
 from places import DATA, ROOT
 
-from uavctl.cli.init import read_sizes, room_text
+from uavctl.cli.init import format_room, parse_sizes
 from uavctl.config import load_config, parse
 
 # Placeholders that are no names of files: what a reader has in their place.
@@ -131,7 +131,7 @@ def test_a_page_s_configurations_load(page: str) -> None:
         if any((table, key) == ("plant", "a") for table, key, _ in found):
             parse(block, page)
         elif any(table == "room" for table, _, _ in found):
-            parse(room_text(read_sizes("5x5x2.7"), "px4", page), page, overrides)
+            parse(format_room(parse_sizes("5x5x2.7"), "px4", page), page, overrides)
         else:
             load_config("room-px4", overrides)
 

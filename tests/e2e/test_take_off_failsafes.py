@@ -13,7 +13,7 @@ from soak_take_off import flown, outcome, troubled
 from take_off_rig import RELAYED, Flight
 
 from logs.recording.replay import replay
-from uavctl.cli.flying import tell_notices
+from uavctl.cli.live_line import print_notices
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.records import ControlMode, Order, Severity
 
@@ -57,7 +57,7 @@ def test_a_person_is_told_on_the_console_what_the_hand_over_has_to_tell() -> Non
     flight.run(3.0, until=HandoverState.RELEASED)
     said = io.StringIO()
     notices = deque(flight.notices)
-    tell_notices(notices, Console(file=said, width=200))
+    print_notices(notices, Console(file=said, width=200))
     lines = said.getvalue().splitlines()
     assert [line.split(" (")[0] for line in lines if line.startswith("hand-over")] == [
         "hand-over: climbing -> failsafe",

@@ -6,7 +6,7 @@ import pytest
 from loopback_rig import Memory, make_loop
 from mavlink_rig import Peer, events, make_link, packets
 
-from uavctl.cli.flying import AGAIN_NS, Said, waits_for
+from uavctl.cli.live_line import REPEAT_NS, MessageFilter, describe_wait
 from uavctl.config import load_config
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.mavlink.statustext import CHUNK_WAIT_NS, MAX_PARTIAL_TEXTS, MISSING_CHUNK
@@ -23,41 +23,41 @@ def words(at_ns: int, text: str = NOT_NEUTRAL, severity: Severity = Severity.ERR
 @pytest.mark.fault(26)
 def test_a_refusal_that_goes_on_is_said_at_once_and_again_after_a_while() -> None:
     """As observed: ArduPilot refused 26 times in 54 s."""
-    said = Said()
+    message_filter = MessageFilter()
     times = [round(n * 54 / 25 * SECOND) for n in range(26)]
-    told = [at_ns for at_ns in times if said.line(words(at_ns), HandoverState.ARMING)]
-    again = next(at_ns for at_ns in times if at_ns >= AGAIN_NS)
-    assert told == [0, again]
+    shown_ns = [at_ns for at_ns in times if message_filter.format_line(words(at_ns), HandoverState.ARMING)]
+    again = next(at_ns for at_ns in times if at_ns >= REPEAT_NS)
+    assert shown_ns == [0, again]
 
 
 def test_it_is_said_in_the_vehicle_s_words_with_what_is_waited_for() -> None:
-    line = Said().line(words(0), HandoverState.ARMING)
-    assert line is not None and NOT_NEUTRAL in line and waits_for(HandoverState.ARMING) in line
-    flying = Said().line(words(0), HandoverState.ENGAGED)
+    line = MessageFilter().format_line(words(0), HandoverState.ARMING)
+    assert line is not None and NOT_NEUTRAL in line and describe_wait(HandoverState.ARMING) in line
+    flying = MessageFilter().format_line(words(0), HandoverState.ENGAGED)
     assert flying is not None and "waiting" not in flying
 
 
 def test_different_words_are_each_said_and_what_is_no_refusal_is_not() -> None:
-    said = Said()
-    assert said.line(words(0), HandoverState.ARMING) and said.line(
+    message_filter = MessageFilter()
+    assert message_filter.format_line(words(0), HandoverState.ARMING) and message_filter.format_line(
         words(0, "Arm: VisOdom: not healthy"), HandoverState.ARMING
     )
-    assert said.line(words(0, "Arming motors", Severity.INFO), HandoverState.ARMING) is None
+    assert message_filter.format_line(words(0, "Arming motors", Severity.INFO), HandoverState.ARMING) is None
     for n in range(10_000):
-        said.line(words(n, f"text {n}"), HandoverState.ARMING)
-    assert len(said._said_ns) < 1000
+        message_filter.format_line(words(n, f"text {n}"), HandoverState.ARMING)
+    assert len(message_filter._shown_ns) < 1000
 
 
 @pytest.mark.fault(26)
 def test_a_recorded_refusal_reaches_the_console_as_it_is_heard() -> None:
     loop = make_loop(load_config("room-hahn-stursberg"), Memory())
-    said = Said()
+    message_filter = MessageFilter()
     lines: dict[str, float] = {}
     begun_ns = 0
     for at_ns, data in packets("arducopter-refusal.tlog"):
         begun_ns = begun_ns or at_ns
         for event in loop.receive("vehicle", data, at_ns).news:
-            line = said.line(event, HandoverState.ARMING)
+            line = message_filter.format_line(event, HandoverState.ARMING)
             if line is not None:
                 lines[line] = (at_ns - begun_ns) * 1e-9
     assert len(lines) == 1
@@ -72,10 +72,10 @@ DENIED = b"Arming denied: Resolve system health failures firs", b"t\t"
 def test_the_pieces_of_a_long_text_are_one_event() -> None:
     link, vehicle = make_link(), Peer(1, 1)
     link.receive(vehicle.heartbeat(), 0)
-    told = []
+    texts = []
     for chunk, piece in enumerate(DENIED):
-        told += events(link.receive(vehicle.send("statustext", 2, piece, 7, chunk), SECOND).items)
-    assert [event.text for event in told] == ["Arming denied: Resolve system health failures first"]
+        texts += events(link.receive(vehicle.send("statustext", 2, piece, 7, chunk), SECOND).items)
+    assert [event.text for event in texts] == ["Arming denied: Resolve system health failures first"]
 
 
 def test_what_has_come_of_a_text_is_told_when_the_rest_stays_out() -> None:

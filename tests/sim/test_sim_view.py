@@ -12,7 +12,7 @@ from sim_rig import bench
 from sim.server import VehicleSetup, serve_all
 from sim.simulation import VehicleSnapshot
 from uavctl.cli.app import run
-from uavctl.cli.sim import HEADINGS, LANDED, line, scene_of, view, watching
+from uavctl.cli.sim_view import HEADINGS, PHASE_TEXTS, format_line, make_scene, render_view, show_view
 from uavctl.config import load_config
 
 ROOM = load_config("room", ("sets.state_upper=[3, 1.5, inf, 2.5, 1.5, inf, inf, 1, inf]",))
@@ -38,7 +38,7 @@ TOLD = ("3", "OFFBOARD", "in the air", "+1.00 -2.50 -1.50", "87%", "245/25, 0.05
 
 def drawn(*looks: VehicleSnapshot, width: int = 250) -> str:
     console = Console(file=io.StringIO(), width=width)
-    console.print(view(looks))
+    console.print(render_view(looks))
     assert isinstance(console.file, io.StringIO)
     return console.file.getvalue()
 
@@ -61,7 +61,7 @@ def test_the_table_has_a_row_for_each_vehicle_and_takes_no_text_for_markup() -> 
 
 
 def test_the_live_page_tells_the_same() -> None:
-    found = scene_of((ONE, replace(ONE, system_id=2, faults=())), ROOM)
+    found = make_scene((ONE, replace(ONE, system_id=2, faults=())), ROOM)
     assert [body.at_m for body in found.bodies] == [ONE.position_m] * 2
     assert found.box is not None  # what is open is drawn open
     assert (found.box.lower_m, found.box.upper_m) == ((-3.0, -2.5, -2.5), (3.0, 2.5, None))
@@ -70,17 +70,17 @@ def test_the_live_page_tells_the_same() -> None:
         assert f"{ONE.system_id}: {name}" in told and f"2: {name}" in told
     assert {one.level for one in found.figures} == {"plain", "warn"} and bool(ONE.faults)
     assert [event.text for event in found.events] == [f"{ONE.system_id}: {ONE.text}", f"2: {ONE.text}"]
-    alone = scene_of((ONE,), ROOM).headline
-    assert ONE.mode in alone and LANDED[ONE.phase] in alone
+    alone = make_scene((ONE,), ROOM).headline
+    assert ONE.mode in alone and PHASE_TEXTS[ONE.phase] in alone
 
 
 def test_what_is_as_good_as_zero_has_no_minus() -> None:
     rests = replace(ONE, position_m=(-1e-9, -0.004, -0.0), velocity_mps=(-1e-4, 0.0, -0.004))
-    assert "-0.00" not in line(rests) and line(rests).count("+0.00 +0.00 +0.00") == 2
+    assert "-0.00" not in format_line(rests) and format_line(rests).count("+0.00 +0.00 +0.00") == 2
 
 
 def test_the_line_tells_the_same() -> None:
-    text = line(ONE)
+    text = format_line(ONE)
     assert "\n" not in text
     for told in (*TOLD, "12.3 s", "[red]Failsafe activated[/]"):
         assert told in text
@@ -97,7 +97,7 @@ def test_a_look_tells_what_the_vehicle_does() -> None:
     )
     before = one.peers.take_snapshot()
     assert (before.setpoint_source, before.setpoint_age_s, before.faults, before.text) == (None, None, (), "")
-    assert (before.armed, LANDED[before.phase], before.battery, before.system_id) == (True, "in the air", 1.0, 1)
+    assert (before.armed, PHASE_TEXTS[before.phase], before.battery, before.system_id) == (True, "in the air", 1.0, 1)
     one.stream(1.6, 1.0, 0.0, 0.0)
     now = one.peers.take_snapshot()
     assert now.time_s == pytest.approx(1.6)
@@ -125,7 +125,7 @@ def test_without_a_terminal_it_is_said_and_told_line_by_line(capsys: pytest.Capt
 
 def test_in_a_terminal_the_table_is_drawn_to_the_end() -> None:
     console = Console(file=io.StringIO(), width=250, force_terminal=True)
-    with watching(console, ROOM) as tell:
+    with show_view(console, ROOM) as tell:
         tell((ONE,))
         tell((replace(ONE, mode="AUTO.LAND"),))
     assert isinstance(console.file, io.StringIO)
@@ -149,7 +149,7 @@ def test_a_terminal_that_has_stopped_does_not_hold_up_the_simulation() -> None:
     stuck = Stuck()
     told: list[int] = []
     seat = VehicleSetup(load_config("room-hahn-stursberg"), ANY, ANY, lambda truth: told.append(truth.at_ns))
-    with watching(Console(file=stuck, force_terminal=True), ROOM) as tell:
+    with show_view(Console(file=stuck, force_terminal=True), ROOM) as tell:
         tell((ONE,))
         assert stuck.tried.wait(LIMIT_S)
         serve_all(

@@ -16,7 +16,7 @@ from recording_fakes import Item
 
 from logs.recording.recorder import DerivedTopics, Recorder
 from logs.recording.views import ViewBuilder
-from uavctl.cli.flying import SWITCH_INTERVAL_S
+from uavctl.cli.live_line import SWITCH_INTERVAL_S
 from uavctl.records import Record, Sink
 
 FLIGHT_S = 20.0  # it is put again and again

@@ -31,7 +31,7 @@ from sim.autopilot.profile import SIMULATED
 from sim.simulation import Peers
 from uavctl.cause import Cause
 from uavctl.cli import fly as fly_cmd
-from uavctl.cli import tune as tune_flight
+from uavctl.cli import tune_flights
 from uavctl.cli.app import run
 from uavctl.clock import Ticker
 from uavctl.config import load_config
@@ -294,16 +294,16 @@ def in_virtual_time(rig: Endings) -> Iterator[None]:
             yield rig.listener
 
     with pytest.MonkeyPatch.context() as patch:
-        for module in (fly_cmd, tune_flight):
+        for module in (fly_cmd, tune_flights):
             patch.setattr(module, "open_links", open_links)
             patch.setattr(module, "monotonic_ns", lambda: rig.now_ns)
-        patch.setattr(tune_flight, "wait", rig.wait)
+        patch.setattr(tune_flights, "wait", rig.wait)
         patch.setattr(fly_cmd, "open_listener", open_listener)
         patch.setattr(fly_cmd, "run_daemon", rig.fly)
         patch.setattr(fly_cmd, "Ticker", lambda tick_ns, dt_ns: Ticker(tick_ns, dt_ns, lambda: rig.now_ns))
         patch.setattr(fly_cmd, "Recorder", Sync)
-        patch.setattr("uavctl.cli.check.checked_before_arming", lambda *_: ())
-        patch.setattr("uavctl.cli.fly.HealthMonitor", Watched)
+        patch.setattr("uavctl.cli.check.check_before_arming", lambda *_: ())
+        patch.setattr("uavctl.cli.services.HealthMonitor", Watched)
         patch.setattr(Notifier, "send_status", lambda _, text: rig.notified.append(text))
         patch.setattr(report, "_make_sections", lambda *given: [report._make_summary_section(*given)])  # no drawings
         patch.setattr(Sync, "full", False)

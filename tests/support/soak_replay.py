@@ -23,7 +23,7 @@ from logs.recording.replay import ReplayResult
 from logs.recording.views import ViewBuilder
 from sim.simulation import Peers, World
 from uavctl.build.controller import Prepared
-from uavctl.cli.replay import replay_flight
+from uavctl.cli.replays import replay_flight
 from uavctl.config import Config
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.framing import scan_frames

@@ -1,4 +1,4 @@
-"""Command line: joins configuration, controller, simulator and recorder; a module for each command or pair of them."""
+"""Command line: it joins configuration, controller, simulator and recorder; a module for each command or pair."""
 
 from __future__ import annotations
 
@@ -10,33 +10,33 @@ from collections.abc import Mapping
 from typing import NoReturn
 
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-INTERRUPTED = 130  # as a shell says of what SIGINT ended
-_words: list[str] | None = None  # of the command line that this process runs; None if it is somebody else's
+INTERRUPTED = 130  # exit code of a shell for a command that SIGINT ended
+_arguments: list[str] | None = None  # of the command line of this process; None in a process that is not `uavctl`
 
 
 def main() -> None:
     """Run `uavctl`; end the process with the command's exit code."""
-    # The matrices are small: BLAS threads only disturb the control loop. Read once, when numpy is imported.
+    # The matrices are small: BLAS threads only disturb the control loop. numpy reads this once, at its import.
     for variable in _THREAD_VARIABLES:
         os.environ.setdefault(variable, "1")
-    # What is imported stays: to look through it again and again for garbage takes a fifth of the start.
+    # Imported modules stay: the search for garbage among them would take a fifth of the start.
     gc.disable()
     try:
         from uavctl.cli.app import run
 
-        global _words
-        _words = sys.argv[1:]
-        code = run(_words, _imported)
+        global _arguments
+        _arguments = sys.argv[1:]
+        code = run(_arguments, _freeze_imports)
     except KeyboardInterrupt:
         sys.stderr.write("interrupted\n")
         code = INTERRUPTED
-    _end(code)
+    _end_process(code)
 
 
-def _end(code: int) -> NoReturn:
+def _end_process(code: int) -> NoReturn:
     """End the process, at once where a daemon thread is left.
 
-    A thread that waits for standard input holds the stream's lock, and the interpreter's own end aborts on it.
+    A thread that waits for standard input holds the lock of the stream; the end of the interpreter would abort on it.
     """
     if any(thread.daemon for thread in threading.enumerate()):
         sys.stdout.flush()
@@ -44,13 +44,13 @@ def _end(code: int) -> NoReturn:
     sys.exit(code)
 
 
-def start_anew(environ: Mapping[str, str]) -> None:
-    """Run this process's command line again with this environment; do nothing in a process that is not `uavctl`."""
-    if _words is not None:
+def restart_process(environ: Mapping[str, str]) -> None:
+    """Restart this process with its command line and this environment; do nothing if the process is not `uavctl`."""
+    if _arguments is not None:
         sys.stdout.flush()
-        os.execve(sys.executable, [sys.executable, "-m", "uavctl", *_words], dict(environ))
+        os.execve(sys.executable, [sys.executable, "-m", "uavctl", *_arguments], dict(environ))
 
 
-def _imported() -> None:
+def _freeze_imports() -> None:
     gc.freeze()
     gc.enable()

@@ -11,8 +11,15 @@ from typing import Annotated
 from cyclopts import App, CycloptsError, Parameter
 
 from uavctl import __version__
-from uavctl.cli.common import documents_alone, labelled, messages, pictures, two_columns, write_document
-from uavctl.cli.usage import example, explain, unknown_command, unknown_option
+from uavctl.cli.common import (
+    label_text,
+    make_output_console,
+    make_pair_table,
+    print_message,
+    reserve_stdout,
+    write_document,
+)
+from uavctl.cli.usage import describe_unknown_command, describe_unknown_option, explain_error, format_example
 from uavctl.config.load import find_nearest
 from uavctl.errors import ConfigError, UavctlError, UsageError
 
@@ -25,16 +32,16 @@ else, also of an error. `uavctl docs` has the manual."""
 app = App(
     name="uavctl",
     help=_HELP,
-    help_epilogue=example(""),
+    help_epilogue=format_example(""),
     help_format="markdown",
     version=__version__,
     suppress_keyboard_interrupt=False,
 )
 
-_MOST_SHOWN = 30  # problems of a configuration
-_LONGEST_HALF = 500  # characters of a problem at either end
+_MAX_PROBLEMS = 30  # problems of a configuration
+_MAX_HALF_LENGTH = 500  # characters of a problem at either end
 
-# A command's module is imported when the command runs, so that help, completion and usage errors stay quick.
+# The module of a command is imported when the command runs, so help, completion and usage errors stay quick.
 _COMMANDS = {
     "init": ("init:init", "Write a short configuration for a room: the keys that matter, by name."),
     "loopback": ("loopback:loopback", "Fly the simulated vehicle over a lossy link, record it, and report."),
@@ -59,9 +66,9 @@ _COMMANDS = {
 }
 _USAGES = {"docs": {"usage": "Usage: uavctl docs [PAGE]"}}
 for _name, (_path, _help) in _COMMANDS.items():
-    # A command with commands of its own is an application, and says these things itself.
-    _more = {} if _path.endswith("_app") else {"help_epilogue": example(_name), **_USAGES.get(_name, {})}
-    app.command(f"uavctl.cli.{_path}", name=_name, help=_help, **_more)
+    # A command with subcommands is an application and has its own help.
+    _options = {} if _path.endswith("_app") else {"help_epilogue": format_example(_name), **_USAGES.get(_name, {})}
+    app.command(f"uavctl.cli.{_path}", name=_name, help=_help, **_options)
 
 app.register_install_completion_command(add_to_startup=False)
 
@@ -74,76 +81,76 @@ def docs(page: Annotated[str, Parameter(help="name of a page; else all of them a
     pages = {path.stem: path.read_text(encoding="utf-8") for path in sorted(folder.glob("*.md"))}
     name = page.rpartition("/")[2].removesuffix(".md")
     if name and name not in pages:
-        near = find_nearest(name, tuple(pages))
-        raise UsageError(f'There is no page "{page}"{near}; `uavctl docs` lists all of them')
+        suggestion = find_nearest(name, tuple(pages))
+        raise UsageError(f'There is no page "{page}"{suggestion}; `uavctl docs` lists all of them')
     if name and sys.stdout.isatty():
-        pictures().print(Markdown(pages[name]))
+        make_output_console().print(Markdown(pages[name]))
     elif name:
         sys.stdout.write(pages[name])
     else:
         titles: list[tuple[str, object]] = [
-            (one, text.partition("\n")[0].removeprefix("# ")) for one, text in pages.items()
+            (page_name, text.partition("\n")[0].removeprefix("# ")) for page_name, text in pages.items()
         ]
-        pictures().print(two_columns(f"Pages, as files in {folder.resolve()}", titles))
+        make_output_console().print(make_pair_table(f"Pages, as files in {folder.resolve()}", titles))
     return 0
 
 
-def run(arguments: Sequence[str], imported: Callable[[], None] = lambda: None) -> int:
-    """Run one command line; return its exit code. Errors meant for a person come without a traceback.
+def run(arguments: Sequence[str], on_imported: Callable[[], None] = lambda: None) -> int:
+    """Run one command line; return its exit code. Errors for users are printed without a traceback.
 
     Args:
-        arguments: The words after the program's name.
-        imported: Called before the command runs, when its modules are there.
+        arguments: The arguments after the name of the program.
+        on_imported: Called before the command runs, after its modules are imported.
     """
     try:
-        _know(arguments)
+        _check_command(arguments)
         command, bound, _ = app.parse_args(list(arguments), exit_on_error=False, print_error=False)
-        imported()
-        with documents_alone() if "--json" in arguments else nullcontext():
+        on_imported()
+        with reserve_stdout() if "--json" in arguments else nullcontext():
             result = command(*bound.args, **bound.kwargs)
     except CycloptsError as error:
-        text = explain(error, arguments, app)
-        return _refuse(UsageError(text), [text], arguments)
+        text = explain_error(error, arguments, app)
+        return _report_error(UsageError(text), [text], arguments)
     except ConfigError as error:
-        return _refuse(error, error.problems, arguments)
+        return _report_error(error, error.problems, arguments)
     except UavctlError as error:
-        return _refuse(error, str(error).split("\n"), arguments)
+        return _report_error(error, str(error).split("\n"), arguments)
     except BrokenPipeError:
         raise
-    except OSError as error:  # a file that no command foresaw: a full disk, a name that is too long
+    except OSError as error:  # an error that no command handles: a full disk, a name that is too long
         text = f"{error.filename or 'system'}: {error.strerror or error}"
-        return _refuse(UavctlError(text), [text], arguments)
+        return _report_error(UavctlError(text), [text], arguments)
     return result if isinstance(result, int) else 0
 
 
-def _know(arguments: Sequence[str]) -> None:
-    """Refuse a command or a leading option that there is none of, before all commands are imported to find one like it.
+def _check_command(arguments: Sequence[str]) -> None:
+    """Refuse an unknown command or leading option early: cyclopts would import all commands to find a similar one.
 
     Raises:
-        UsageError: There is none.
+        UsageError: It is unknown.
     """
     name = arguments[0] if arguments else "--help"
     if name.partition("=")[0] in app:
         return
     if name.startswith("-"):
-        raise UsageError(f"{unknown_option(name, app)} A command comes first: uavctl COMMAND [OPTIONS]")
-    raise UsageError(unknown_command(name, app, ("uavctl",)))
+        raise UsageError(f"{describe_unknown_option(name, app)} A command comes first: uavctl COMMAND [OPTIONS]")
+    raise UsageError(describe_unknown_command(name, app, ("uavctl",)))
 
 
-def _refuse(error: UavctlError, problems: Sequence[str], arguments: Sequence[str]) -> int:
-    """Tell an error, with --json as a document too; return its exit code."""
-    shown = [_shown(problem) for problem in problems[:_MOST_SHOWN]]
-    if len(problems) > _MOST_SHOWN:
-        shown.append(f"{len(problems) - _MOST_SHOWN} more")
-    messages().print(labelled("error", "\n".join(shown), "bold red"), soft_wrap=True)
-    if "--json" in arguments:  # what could not be parsed, too, is told to a program
-        told = {"type": type(error).__name__, "message": "\n".join(problems), "exit_code": error.exit_code}
-        write_document("error", told)
+def _report_error(error: UavctlError, problems: Sequence[str], arguments: Sequence[str]) -> int:
+    """Print an error, with --json also as a document; return its exit code."""
+    lines = [_format_problem(problem) for problem in problems[:_MAX_PROBLEMS]]
+    if len(problems) > _MAX_PROBLEMS:
+        lines.append(f"{len(problems) - _MAX_PROBLEMS} more")
+    print_message(label_text("error", "\n".join(lines), "bold red"))
+    if "--json" in arguments:  # also for an unknown argument: a program reads it
+        document = {"type": type(error).__name__, "message": "\n".join(problems), "exit_code": error.exit_code}
+        write_document("error", document)
     return error.exit_code
 
 
-def _shown(text: str) -> str:
-    """Return a line cut to a readable length, with control characters escaped, so a terminal takes none as an order."""
-    if len(text) > 2 * _LONGEST_HALF:
-        text = f"{text[:_LONGEST_HALF]} … {text[-_LONGEST_HALF:]}"
+def _format_problem(text: str) -> str:
+    """Return a line cut to a readable length, with control characters escaped: a terminal would execute them."""
+    if len(text) > 2 * _MAX_HALF_LENGTH:
+        text = f"{text[:_MAX_HALF_LENGTH]} … {text[-_MAX_HALF_LENGTH:]}"
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)

@@ -1,4 +1,4 @@
-"""Command `uavctl bench`."""
+"""Command `uavctl bench`: the duration of a decision beside the problem as printed, or with --loop the control loop."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from uavctl.build.controller import build_conditioned, build_design, build_spec
-from uavctl.cli.common import DEFAULTS, SEED, SPAN_S, Common, bars, columns, located
+from uavctl.cli.common import DEFAULTS, SEED, SPAN_S, Common, locate_design_errors, make_progress, make_table
 from uavctl.config.types import Config
 from uavctl.errors import DesignError
 from uavctl.lab.bench.loop import LoopBench, LoopRun, run_loop_bench
@@ -23,28 +23,26 @@ from uavctl.lab.bench.run import DEFAULT_SIZES, Advance, DecisionBench, run_benc
 from uavctl.lab.bench.timing import BenchResult, ConditionedTimes
 from uavctl.smpc.conditioned.planner import ConditionedSolver
 
-# `uavctl bench --loop`: the control loop on real UDP beside an empty one.
 
-
-def bench_loop(common: Common, seconds: float, runs: int) -> int:
+def report_loop(common: Common, seconds: float, runs: int) -> int:
     """Measure the control loop and show the result."""
     options = ["--config", common.config]
     for override in common.overrides:
         options += ["--set", override]
-    with bars(auto_refresh=False) as progress:
+    with make_progress(auto_refresh=False) as progress:
         task = progress.add_task("")
 
-        def told(what: str, done: int, total: int) -> None:
+        def report(what: str, done: int, total: int) -> None:
             progress.update(task, description=what, completed=done, total=total, refresh=True)
 
-        result = run_loop_bench(common.load().config, options, seconds, runs, told)
-    common.show("bench/loop", result, lambda: loop_picture(result))
+        result = run_loop_bench(common.load().config, options, seconds, runs, report)
+    common.show("bench/loop", result, lambda: render_loop(result))
     return 0
 
 
-def loop_picture(result: LoopBench) -> RenderableType:
+def render_loop(result: LoopBench) -> RenderableType:
     """Return the figures of the control loop as a table."""
-    table = columns("Control loop on real UDP, recording", ("", "median", "p99", "p99.9", "largest"), ())
+    table = make_table("Control loop on real UDP, recording", ("", "median", "p99", "p99.9", "largest"), ())
     for name, run in (("without --realtime", result.plain), ("with --realtime", result.realtime)):
         table.add_row(Text(name, style="bold"))
         for label, spread in (
@@ -59,11 +57,16 @@ def loop_picture(result: LoopBench) -> RenderableType:
     )
     denied = () if result.permitted else ("Not all of --realtime was permitted; `uavctl fly --realtime` says what.",)
     return Group(
-        head, "", table, _rest("without --realtime", result.plain), _rest("with --realtime", result.realtime), *denied
+        head,
+        "",
+        table,
+        _describe_run("without --realtime", result.plain),
+        _describe_run("with --realtime", result.realtime),
+        *denied,
     )
 
 
-def _rest(name: str, run: LoopRun) -> str:
+def _describe_run(name: str, run: LoopRun) -> str:
     return (
         f"{name}: {run.positions:.0f} positions, {run.unanswered:.0f} without a setpoint in their tick, "
         f"{run.missed_ticks:.0f} ticks missed; {run.recorded:.0f} records, {run.dropped:.0f} dropped; "
@@ -71,10 +74,7 @@ def _rest(name: str, run: LoopRun) -> str:
     )
 
 
-# `uavctl bench`: how long a decision takes, beside the problem as printed.
-
-
-_REFRESH_S = 0.2
+_REFRESH_PERIOD_S = 0.2
 
 
 def bench(
@@ -102,29 +102,29 @@ def bench(
 ) -> int:
     """Measure the speed of a decision on this machine; of hahn-stursberg beside the problem as printed, in one run."""
     if loop:
-        return bench_loop(common, seconds, runs)
+        return report_loop(common, seconds, runs)
     loaded = common.load()
     if loaded.config.is_age_conditioned:
-        with located(loaded):
+        with locate_design_errors(loaded):
             solver = build_conditioned(loaded.config).solver
-        with _progress() as advance:
+        with _show_progress() as advance:
             advance("a flight's own decisions", 0, None)
             flight = time_flight(loaded.config, lambda done, total: advance("a flight's own decisions", done, total))
-            decided = time_decisions(solver, states, seed, lambda done: advance("decisions", done, states))
-        decided = msgspec.structs.replace(decided, flight=flight)
-        common.show("bench/decisions", decided, lambda: _decisions(decided, loaded.config.name))
+            decisions = time_decisions(solver, states, seed, lambda done: advance("decisions", done, states))
+        decisions = msgspec.structs.replace(decisions, flight=flight)
+        common.show("bench/decisions", decisions, lambda: _describe_decisions(decisions, loaded.config.name))
         return 0
-    with located(loaded):
+    with locate_design_errors(loaded):
         design = build_design(loaded.config)
         loss = build_spec(loaded.config).link.outage(1)
-        with _progress() as advance:
+        with _show_progress() as advance:
             sizes = replace(DEFAULT_SIZES, states=states)
-            result = run_bench(design, loss, seed, advance, sizes, _conditioned_solver(loaded.config))
-    common.show("bench", result, lambda: bench_picture(result, loaded.config.name))
+            result = run_bench(design, loss, seed, advance, sizes, _build_conditioned_solver(loaded.config))
+    common.show("bench", result, lambda: render_bench(result, loaded.config.name))
     return 0
 
 
-def _conditioned_solver(config: Config) -> ConditionedSolver | None:
+def _build_conditioned_solver(config: Config) -> ConditionedSolver | None:
     """Make the solver of scheme `age-conditioned`; None where silence outlasts the horizon too often for it."""
     try:
         return build_conditioned(config).solver
@@ -132,59 +132,63 @@ def _conditioned_solver(config: Config) -> ConditionedSolver | None:
         return None
 
 
-def _decisions(found: DecisionBench, name: str) -> str:
-    """Return the figures of scheme `age-conditioned` in words."""
-    us, iterations, flight = found.us, found.iterations, found.flight
-    flown = (
+def _describe_decisions(result: DecisionBench, name: str) -> str:
+    """Return the figures of scheme `age-conditioned` as text."""
+    us, iterations, flight = result.us, result.iterations, result.flight
+    flight_text = (
         ""
         if flight is None
         else (
-            f"\n{flight.questions} of its own flight: median {_us(flight.us.p50)}, p99 {_us(flight.us.p99)}, at most "
-            f"{_us(flight.us.max)}, the first one {_us(flight.first_us)}; iterations {flight.iterations.p50:.0f}, p99 "
+            f"\n{flight.questions} of its own flight: median {_format_us(flight.us.p50)}, p99 "
+            f"{_format_us(flight.us.p99)}, at most "
+            f"{_format_us(flight.us.max)}, the first one {_format_us(flight.first_us)}; iterations "
+            f"{flight.iterations.p50:.0f}, p99 "
             f"{flight.iterations.p99:.0f}, at most {flight.iterations.max:.0f}. {flight.left_alone:.1%} need no "
             f"program, {flight.gave_way:.1%} give way."
         )
     )
     return (
-        f"{name}, risk conditioned on the age: one decision for all axes, {found.states} states and targets anywhere "
-        f"within the limits.\nMedian {_us(us.p50)}, p99 {_us(us.p99)}, at most {_us(us.max)}; iterations "
+        f"{name}, risk conditioned on the age: one decision for all axes, {result.states} states and targets anywhere "
+        f"within the limits.\nMedian {_format_us(us.p50)}, p99 {_format_us(us.p99)}, at most {_format_us(us.max)}; "
+        f"iterations "
         f"{iterations.p50:.0f}, p99 {iterations.p99:.0f}, at most {iterations.max:.0f}.\n"
-        f"{found.left_alone:.1%} need no program, {found.gave_way:.1%} give way, {found.without} got no plan.{flown}"
+        f"{result.left_alone:.1%} need no program, {result.gave_way:.1%} give way, {result.without} got no "
+        f"plan.{flight_text}"
     )
 
 
 @contextmanager
-def _progress() -> Iterator[Advance]:
-    # A thread that draws the bar would disturb what is measured.
-    with bars(auto_refresh=False) as progress:
+def _show_progress() -> Iterator[Advance]:
+    # A thread that draws the bar would disturb the measurement.
+    with make_progress(auto_refresh=False) as progress:
         task = progress.add_task("design", total=None)
-        drawn = 0.0
+        drawn_s = 0.0
 
-        def advance(what: str, done: int, total: int | None) -> None:
-            nonlocal drawn
-            now = time.monotonic()
-            if done and done != total and now - drawn < _REFRESH_S:
+        def advance(stage: str, done: int, total: int | None) -> None:
+            nonlocal drawn_s
+            now_s = time.monotonic()
+            if done and done != total and now_s - drawn_s < _REFRESH_PERIOD_S:
                 return
-            drawn = now
-            progress.update(task, description=what, completed=done, total=total, refresh=True)
+            drawn_s = now_s
+            progress.update(task, description=stage, completed=done, total=total, refresh=True)
 
         yield advance
 
 
-def bench_picture(result: BenchResult, name: str) -> RenderableType:
+def render_bench(result: BenchResult, name: str) -> RenderableType:
     """Return the figures as tables."""
     axes = "1 independent axis" if result.components == 1 else f"{result.components} independent axes"
     head = (
         f"{name}: {axes}; {result.states} states, half uniform over the feasible {result.feasible_share:.0%} of the "
         "box, half along closed loops"
     )
-    methods = (_methods(result), _conditioned(result.conditioned), _axis(result))
-    return Group(head, "", *methods, _certificates(result), _gaps(result))
+    methods = (_make_method_table(result), _describe_conditioned(result.conditioned), _describe_axis(result))
+    return Group(head, "", *methods, _make_certificate_table(result), _describe_gaps(result))
 
 
-def _methods(result: BenchResult) -> Table:
-    joint = f"{result.printed_status} ({result.printed_optimal} of {result.printed_states} optimal)"
-    same = "" if result.cost_difference is None else f"cost of the exact one to {result.cost_difference:.1e}"
+def _make_method_table(result: BenchResult) -> Table:
+    printed_outcome = f"{result.printed_status} ({result.printed_optimal} of {result.printed_states} optimal)"
+    cost_agreement = "" if result.cost_difference is None else f"cost of the exact one to {result.cost_difference:.1e}"
     flown = result.flown_us
     rows = (
         (
@@ -192,41 +196,58 @@ def _methods(result: BenchResult) -> Table:
             result.printed_states,
             result.printed_ms,
             f"{result.ratio_printed:.0f} ×",
-            joint,
+            printed_outcome,
         ),
-        ("as printed, axis by axis, CVXPY", result.cvxpy_states, result.cvxpy_ms, f"{result.ratio_cvxpy:.0f} ×", same),
+        (
+            "as printed, axis by axis, CVXPY",
+            result.cvxpy_states,
+            result.cvxpy_ms,
+            f"{result.ratio_cvxpy:.0f} ×",
+            cost_agreement,
+        ),
         ("exact program alone", result.exact_states, result.exact_ms, "", ""),
-        ("as flown", result.states, flown.p50 / 1e3, "", f"p99 {_us(flown.p99)}, at most {_us(flown.max)}"),
+        (
+            "as flown",
+            result.states,
+            flown.p50 / 1e3,
+            "",
+            f"p99 {_format_us(flown.p99)}, at most {_format_us(flown.max)}",
+        ),
     )
-    told = [(label, str(states), _ms(took), ratio, ending) for label, states, took, ratio, ending in rows]
+    cells = [
+        (label, str(states), _format_ms(duration_ms), ratio, outcome)
+        for label, states, duration_ms, ratio, outcome in rows
+    ]
     headings = ("", "states", "median", "to the exact program", "what came of it")
-    return columns("One decision for all axes", headings, told, (headings[0], headings[-1]))
+    return make_table("One decision for all axes", headings, cells, (headings[0], headings[-1]))
 
 
-def _conditioned(ours: ConditionedTimes | None) -> str:
-    if ours is None:
+def _describe_conditioned(times: ConditionedTimes | None) -> str:
+    if times is None:
         return ""
     return (
-        f"Risk conditioned on the age, a scheme of its own: {_us(ours.us.p50)}, p99 {_us(ours.us.p99)}, at most "
-        f"{_us(ours.us.max)} and {ours.iterations.max:.0f} iterations; {ours.left_alone:.0%} of the states need no "
-        f"program. The printed problem, axis by axis, takes {ours.ratio_cvxpy:.0f} × as long.\n"
+        f"Risk conditioned on the age, a scheme of its own: {_format_us(times.us.p50)}, p99 "
+        f"{_format_us(times.us.p99)}, at most "
+        f"{_format_us(times.us.max)} and {times.iterations.max:.0f} iterations; {times.left_alone:.0%} of the states "
+        f"need no "
+        f"program. The printed problem, axis by axis, takes {times.ratio_cvxpy:.0f} × as long.\n"
     )
 
 
-def _axis(result: BenchResult) -> str:
-    return f"One axis: exact {_ms(result.exact_axis_ms)}, as printed {_ms(result.cvxpy_axis_ms)}.\n"
+def _describe_axis(result: BenchResult) -> str:
+    return f"One axis: exact {_format_ms(result.exact_axis_ms)}, as printed {_format_ms(result.cvxpy_axis_ms)}.\n"
 
 
-def _certificates(result: BenchResult) -> Table:
+def _make_certificate_table(result: BenchResult) -> Table:
     shares = result.shares
     rows = (
-        ("frozen policies alone", f"{shares.frozen:.1%}", _us(result.frozen_us)),
-        ("exact program", f"{shares.exact:.1%}", _us(result.program_us)),
+        ("frozen policies alone", f"{shares.frozen:.1%}", _format_us(result.frozen_us)),
+        ("exact program", f"{shares.exact:.1%}", _format_us(result.program_us)),
     )
-    return columns("Answers as flown", ("method", "share", "median"), rows)
+    return make_table("Answers as flown", ("method", "share", "median"), rows)
 
 
-def _gaps(result: BenchResult) -> str:
+def _describe_gaps(result: BenchResult) -> str:
     gap = result.gap
     return (
         f"Certified gap: median {gap.p50:.1e}, p99 {gap.p99:.1e}, at most {gap.max:.1e}; "
@@ -235,9 +256,9 @@ def _gaps(result: BenchResult) -> str:
     )
 
 
-def _ms(milliseconds: float) -> str:
+def _format_ms(milliseconds: float) -> str:
     return f"{milliseconds:.3g} ms" if milliseconds < 999.5 else f"{milliseconds / 1e3:.3g} s"
 
 
-def _us(microseconds: float | None) -> str:
+def _format_us(microseconds: float | None) -> str:
     return "-" if microseconds is None else f"{microseconds:.0f} µs"

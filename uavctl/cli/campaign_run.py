@@ -1,4 +1,4 @@
-"""What `uavctl campaign` does; it needs the extra `campaign`."""
+"""Run of `uavctl campaign`: flights of many controllers on the same noise and losses; needs the extra `campaign`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rich.console import Group, RenderableType
 from rich.progress import MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from uavctl.cli import INTERRUPTED
-from uavctl.cli.common import Common, bars, columns, messages
+from uavctl.cli.common import Common, make_progress, make_table, print_message
 from uavctl.cli.flying import stop_on_signals
 from uavctl.errors import UsageError
 from uavctl.lab.campaign.page import write_report, write_trial_report
@@ -27,7 +27,7 @@ from uavctl.lab.campaign.results import CellSummary, summarise
 from uavctl.lab.campaign.spec import read_campaign
 from uavctl.lab.campaign.store import SCHEMA, Store
 from uavctl.lab.campaign.tasks import cells_of, document, tasks_of
-from uavctl.lab.campaign.trials import SCHEMA as TRIALS
+from uavctl.lab.campaign.trials import SCHEMA as TRIAL_SCHEMA
 from uavctl.lab.campaign.trials import (
     TrialSummary,
     is_trial,
@@ -38,9 +38,6 @@ from uavctl.lab.campaign.trials import (
     trial_tasks,
 )
 from uavctl.lab.trial import COUNTS, MEANING, SHOWN
-
-# A campaign of flights of the quadrotor, as tables for the terminal.
-
 
 S = TypeVar("S", CellSummary, TrialSummary)
 
@@ -55,7 +52,7 @@ class CampaignResult(msgspec.Struct, Generic[S], frozen=True, kw_only=True):
     cells: list[S]
 
 
-def _closing(result: CampaignResult[Any], refused: Iterable[str], remarks: Sequence[str]) -> Iterator[str]:
+def _format_closing(result: CampaignResult[Any], refused: Iterable[str], remarks: Sequence[str]) -> Iterator[str]:
     """Return the lines below the tables: refused cells, remarks, and paths of the files."""
     yield from (f"Refused: {text}" for text in dict.fromkeys(refused))
     yield from remarks
@@ -65,36 +62,35 @@ def _closing(result: CampaignResult[Any], refused: Iterable[str], remarks: Seque
 _TRIAL_NAMES = ("autopilot", "rate_hz", "link", "air")
 
 
-def trial_picture(result: CampaignResult[TrialSummary]) -> RenderableType:
+def render_trials(result: CampaignResult[TrialSummary]) -> RenderableType:
     """Return a table for each scenario."""
-    # What is the same in all cells needs no column, and of what only tells of ours the page has more.
-    lists = [name for name in _TRIAL_NAMES if len({getattr(cell.place, name) for cell in result.cells}) > 1]
+    # A value that is equal in all cells has no column; figures of our controller alone are on the page.
+    varied_names = [name for name in _TRIAL_NAMES if len({getattr(cell.place, name) for cell in result.cells}) > 1]
     tables: list[RenderableType] = []
-    for scenario, every in SHOWN.items():
-        shown = [one for one in every if one not in COUNTS]
+    for scenario, quantities in SHOWN.items():
+        listed = [quantity for quantity in quantities if quantity not in COUNTS]
         cells = [cell for cell in result.cells if cell.place.scenario == scenario]
         if not cells:
             continue
-        named = [name.replace("rate_hz", "Hz") for name in (*lists, "controller")]
-        headings = (*named, *(one.heading for one in shown))
-        table = columns(f"Campaign {result.name}: {scenario}", headings, (), named)
+        name_headings = [name.replace("rate_hz", "Hz") for name in (*varied_names, "controller")]
+        headings = (*name_headings, *(quantity.heading for quantity in listed))
+        table = make_table(f"Campaign {result.name}: {scenario}", headings, (), name_headings)
         for cell in cells:
-            names = [_text(getattr(cell.place, name)) for name in (*lists, "controller")]
-            told = ["refused"] if cell.place.refused else [one.told(cell.values[one.key]) for one in shown]
-            table.add_row(*names, *told)
+            names = [_format_value(getattr(cell.place, name)) for name in (*varied_names, "controller")]
+            values = (
+                ["refused"] if cell.place.refused else [quantity.told(cell.values[quantity.key]) for quantity in listed]
+            )
+            table.add_row(*names, *values)
         tables.append(table)
     places = [cell.place for cell in result.cells]
     refused = [f"{place.controller}, {place.link}: {place.refused}" for place in places if place.refused]
     failed = sum(cell.failed for cell in result.cells)
     remarks = [f"{failed} flights failed; runs.parquet says why"] if failed else []
-    return Group(*tables, *_closing(result, refused, [*remarks, MEANING]))
+    return Group(*tables, *_format_closing(result, refused, [*remarks, MEANING]))
 
 
-def _text(value: object) -> str:
+def _format_value(value: object) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
-
-
-# `uavctl campaign`: many flights of many controllers on the same noise and the same losses.
 
 
 _NAMES = ("controller", "link", "disturbance", "plant")
@@ -108,37 +104,37 @@ def fly_campaign(
         raise UsageError("--workers are this machine's, --dask has its own; give one of them")
     if resume and out is None:
         raise UsageError("--resume: give the campaign's folder with --out")
-    given = _of_trials(spec, runs) if is_trial(spec) else _of_runs(spec, runs)
-    begun = time.perf_counter()
-    store = Store(out or _new_folder(given.name), given.schema)
+    campaign = _prepare_trials(spec, runs) if is_trial(spec) else _prepare_runs(spec, runs)
+    begin_s = time.perf_counter()
+    store = Store(out or _make_folder_path(campaign.name), campaign.schema)
     store.check(resume)  # the designs may take minutes
     try:
-        described, tasks = given.prepare()
-        with store.opened(described, given.text, resume):
-            crew = processes(workers or len(os.sched_getaffinity(0))) if dask is None else cluster(dask)
-            if not store.complete() and not _fly(store, tasks, crew):
+        description, tasks = campaign.prepare()
+        with store.opened(description, campaign.text, resume):
+            workers_context = processes(workers or len(os.sched_getaffinity(0))) if dask is None else cluster(dask)
+            if not store.complete() and not _fly_tasks(store, tasks, workers_context):
                 raise KeyboardInterrupt
             runs_file = store.finish(tasks)
-            _tell("writing the page")
-            report = given.write(store.folder)
+            print_message("writing the page")
+            report = campaign.write(store.folder)
     except KeyboardInterrupt:
-        _tell(_interrupted(store, spec, runs))
+        print_message(_describe_interruption(store, spec, runs))
         return INTERRUPTED
-    return given.conclude(store, runs_file, report, time.perf_counter() - begun, json)
+    return campaign.conclude(store, runs_file, report, time.perf_counter() - begin_s, json)
 
 
 @dataclass(frozen=True)
-class _Given(Generic[S]):
-    """A campaign of either world, ready to fly."""
+class _PreparedCampaign(Generic[S]):
+    """Campaign of the linear or the quadrotor world, ready to fly."""
 
     name: str  # its name
     text: str  # text of the campaign's file
     schema: pyarrow.Schema  # schema of the table of runs
-    # Makes what `campaign.json` holds, and all tasks
+    # Makes the document of `campaign.json` and all tasks
     prepare: Callable[[], tuple[Mapping[str, object], Sequence[Work]]]
     write: Callable[[Path], Path]  # writes the page into a folder
-    summarise: Callable[[Path], list[S]]  # the figures of a folder's cells
-    picture: Callable[[CampaignResult[S]], RenderableType]
+    summarise: Callable[[Path], list[S]]  # computes the figures of the cells in a folder
+    render: Callable[[CampaignResult[S]], RenderableType]
 
     def conclude(self, store: Store, runs_file: Path, report: Path, wall_s: float, json: bool) -> int:
         """Show the result; return the exit code."""
@@ -149,105 +145,111 @@ class _Given(Generic[S]):
             wall_s=wall_s,
             cells=self.summarise(store.folder),
         )
-        Common(json=json).show("campaign", result, lambda: self.picture(result))
+        Common(json=json).show("campaign", result, lambda: self.render(result))
         return 0 if any(cell.runs > cell.failed for cell in result.cells) else 1
 
 
-def _of_runs(spec: Path, runs: int | None) -> _Given[CellSummary]:
-    """Make a campaign in the linear world."""
-    read, text = read_campaign(spec, runs)
+def _prepare_runs(spec: Path, runs: int | None) -> _PreparedCampaign[CellSummary]:
+    """Prepare a campaign in the linear world."""
+    campaign, text = read_campaign(spec, runs)
 
     def prepare() -> tuple[Mapping[str, object], Sequence[Work]]:
-        cells = cells_of(read)
-        return document(read, cells), list(tasks_of(cells))
+        cells = cells_of(campaign)
+        return document(campaign, cells), list(tasks_of(cells))
 
-    return _Given(read.spec.name, text, SCHEMA, prepare, write_report, summarise, _picture)
+    return _PreparedCampaign(campaign.spec.name, text, SCHEMA, prepare, write_report, summarise, _render_runs)
 
 
-def _of_trials(path: Path, runs: int | None) -> _Given[TrialSummary]:
-    """Make a campaign in the world of the quadrotor."""
+def _prepare_trials(path: Path, runs: int | None) -> _PreparedCampaign[TrialSummary]:
+    """Prepare a campaign in the world of the quadrotor."""
     spec, text = read_trial(path, runs)
 
     def prepare() -> tuple[Mapping[str, object], Sequence[Work]]:
         places = places_of(spec)
         return trial_document(spec, places), list(trial_tasks(spec, places))
 
-    return _Given(
-        spec.name, text, TRIALS, prepare, write_trial_report, lambda folder: summarise_trial(folder)[1], trial_picture
+    return _PreparedCampaign(
+        spec.name,
+        text,
+        TRIAL_SCHEMA,
+        prepare,
+        write_trial_report,
+        lambda folder: summarise_trial(folder)[1],
+        render_trials,
     )
 
 
-def _new_folder(name: str) -> Path:
+def _make_folder_path(name: str) -> Path:
     stamp = datetime.now(UTC).strftime("%Y%m%d-%H%M%S-%f")[:-3]
     return Path("flights") / f"{stamp}-{name.replace(' ', '-')}"
 
 
-def _fly(store: Store, tasks: Sequence[Work], crew: AbstractContextManager[Workers]) -> bool:
-    """Fly the tasks that are not done yet; return False if it was interrupted."""
-    kept = store.kept(tasks)
-    left = [task for task in tasks if task.name not in kept]
-    if not left:
+def _fly_tasks(store: Store, tasks: Sequence[Work], workers_context: AbstractContextManager[Workers]) -> bool:
+    """Fly the remaining tasks; return False after an interruption."""
+    finished = store.kept(tasks)
+    remaining = [task for task in tasks if task.name not in finished]
+    if not remaining:
         return True
-    with stop_on_signals() as stopped, crew as flying, _progress(tasks, kept) as advance:
+    with stop_on_signals() as stopped, workers_context as fly_workers, _show_progress(tasks, finished) as advance:
 
-        def keep(task: Work, columns: Columns) -> None:
-            store.keep(task, columns)
+        def keep(task: Work, results: Columns) -> None:
+            store.keep(task, results)
             advance(task)
 
-        fly_tasks(left, flying, keep, stopped)
+        fly_tasks(remaining, fly_workers, keep, stopped)
     return len(store.kept(tasks)) == len(tasks)
 
 
 @contextmanager
-def _progress(tasks: Sequence[Work], kept: set[str]) -> Iterator[Callable[[Work], None]]:
-    with bars(MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn()) as progress:
-        there = sum(task.runs for task in tasks if task.name in kept)
-        bar = progress.add_task("runs", total=sum(task.runs for task in tasks), completed=there)
+def _show_progress(tasks: Sequence[Work], finished: set[str]) -> Iterator[Callable[[Work], None]]:
+    with make_progress(
+        MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn()
+    ) as progress:
+        finished_runs = sum(task.runs for task in tasks if task.name in finished)
+        bar = progress.add_task("runs", total=sum(task.runs for task in tasks), completed=finished_runs)
         yield lambda task: progress.update(bar, advance=task.runs)
 
 
-def _interrupted(store: Store, spec: Path, runs: int | None) -> str:
-    """Say after an interruption what is done, and how to go on."""
+def _describe_interruption(store: Store, spec: Path, runs: int | None) -> str:
+    """Return the message of an interruption: finished runs, and the command to go on."""
     if not store.begun():
         return "interrupted before the first run"
-    number = () if runs is None else ("--runs", str(runs))
-    again = shlex.join(["uavctl", "campaign", str(spec), *number, "--out", str(store.folder), "--resume"])
-    return f"interrupted; the runs that were finished are kept. To go on:\n{again}"
+    run_options = () if runs is None else ("--runs", str(runs))
+    command = shlex.join(["uavctl", "campaign", str(spec), *run_options, "--out", str(store.folder), "--resume"])
+    return f"interrupted; the runs that were finished are kept. To go on:\n{command}"
 
 
-def _tell(text: str) -> None:
-    messages().print(text, soft_wrap=True)
-
-
-def _picture(result: CampaignResult[CellSummary]) -> RenderableType:
-    # What is the same in all cells needs no column.
-    lists = [name for name in _NAMES if name == "controller" or len({getattr(cell, name) for cell in result.cells}) > 1]
-    figured = ("runs", "failed", "steps out %", "runs out %", "cost", "fallbacks", "oldest")
-    table = columns(f"Campaign {result.name}", (*lists, *figured), (), lists)
+def _render_runs(result: CampaignResult[CellSummary]) -> RenderableType:
+    # A value that is equal in all cells has no column.
+    varied_names = [
+        name for name in _NAMES if name == "controller" or len({getattr(cell, name) for cell in result.cells}) > 1
+    ]
+    figure_headings = ("runs", "failed", "steps out %", "runs out %", "cost", "fallbacks", "oldest")
+    table = make_table(f"Campaign {result.name}", (*varied_names, *figure_headings), (), varied_names)
     for cell in result.cells:
-        names = [getattr(cell, name) for name in lists]
+        names = [getattr(cell, name) for name in varied_names]
         if cell.refused:
             table.add_row(*names, "refused")
             continue
         figures = (
-            _percent(cell.violation_rate, cell.violation_ci),
-            _percent(cell.run_violation_rate, cell.run_violation_ci),
-            _cost(cell.cost, cell.cost_ci),
+            _format_percent(cell.violation_rate, cell.violation_ci),
+            _format_percent(cell.run_violation_rate, cell.run_violation_ci),
+            _format_cost(cell.cost, cell.cost_ci),
         )
         table.add_row(*names, str(cell.runs), str(cell.failed), *figures, str(cell.fallbacks), str(cell.max_age))
     refused = [f"{cell.controller}, {cell.link}: {cell.refused}" for cell in result.cells if cell.refused]
     note = (
         "Out: beyond a limit of the state, with its interval at 95 %. Failed runs are in no figure but in runs.parquet."
     )
-    return Group(table, *_closing(result, refused, [note]))
+    return Group(table, *_format_closing(result, refused, [note]))
 
 
-def _percent(rate: float | None, interval: tuple[float, float] | None) -> str:
+def _format_percent(rate: float | None, interval: tuple[float, float] | None) -> str:
     if rate is None or interval is None:
         return "-"
     low, high = (f"{100 * side:.3g}" for side in interval)
     return f"{100 * rate:.3g} ({low}–{high})"
 
 
-def _cost(mean: float | None, interval: tuple[float, float] | None) -> str:
+def _format_cost(mean: float | None, interval: tuple[float, float] | None) -> str:
     return "-" if mean is None or interval is None else f"{mean:.6g} ± {(interval[1] - interval[0]) / 2:.2g}"

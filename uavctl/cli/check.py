@@ -1,4 +1,7 @@
-"""Command `uavctl check`, and the check before arming."""
+"""Command `uavctl check`, and the check of `uavctl fly --arm` before it arms.
+
+Both run on real connections for a limited time. Neither arms, and neither changes a mode or a parameter.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,16 @@ from uavctl.build.rehearsal import rehearse
 from uavctl.build.rest import check_axes
 from uavctl.check.findings import Item, ItemState, describe_item, find_refusals, judge_item, make_item
 from uavctl.check.preflight import Preflight
-from uavctl.cli.common import DEFAULTS, SPAN_S, Common, Mocap, given_keys, labelled, located, messages
+from uavctl.cli.common import (
+    DEFAULTS,
+    SPAN_S,
+    Common,
+    Mocap,
+    label_text,
+    locate_design_errors,
+    make_key_overrides,
+    print_message,
+)
 from uavctl.cli.flying import stop_on_signals
 from uavctl.clock import Ticker, monotonic_ns
 from uavctl.config import Config
@@ -34,9 +46,6 @@ from uavctl.io.transport import wait
 from uavctl.loop import make_links
 from uavctl.records import Checked, Datagram, Sink
 from uavctl.smpc.conditioned.planner import ConditionedDesign
-
-# A check on real connections, bounded in time: what `uavctl check` runs, and `uavctl fly --arm` before it arms.
-
 
 MOVE_LIMIT_S = 120.0  # for the guided movements, beside the listening
 
@@ -52,109 +61,110 @@ def run_preflight(
     stop: Callable[[], bool] = lambda: False,
     wait_for: Callable[[Mapping[str, Connection], int], list[str]] = wait,
     now: Callable[[], int] = monotonic_ns,
-    told: ParameterReader | None = None,
+    parameters: ParameterReader | None = None,
 ) -> tuple[Item, ...]:
-    """Listen, ask, and report what was found. Arms nothing, changes no mode and no parameter.
+    """Listen to the vehicle and the cameras, send requests, and return the items of the check.
 
     Args:
-        seconds: how long to listen [s].
-        move: go on until a person has moved the body as asked, for `MOVE_LIMIT_S` at most.
-        take_off_m: height of the climb that is planned [m]; None if none is.
-        prompt: called with every new thing that is asked of that person; empty means to wait.
-        stop: asked once a tick; ends the listening.
-        wait_for: sleeps until a deadline or the first arrival; gives the names of connections to read.
-        now: the clock [ns].
-        told: takes the vehicle's parameters, too.
+        seconds: Duration of the listening [s].
+        move: Go on until a person has moved the body as prompted, for `MOVE_LIMIT_S` at most.
+        take_off_m: Height of the planned climb [m]; None without a climb.
+        prompt: Called with each new prompt for that person; an empty one means to wait.
+        stop: Called once a tick; True ends the listening.
+        wait_for: Sleeps until a deadline or the first arrival; returns the names of connections to read.
+        now: The clock [ns].
+        parameters: Receives the vehicle's parameters, too.
     """
     ticker = Ticker(round(config.daemon.tick_s * 1e9), round(config.plant.dt_s * 1e9), now)
     due = ticker.next()
-    begun_ns, asked = due.at_ns, ""
-    flight = Preflight(config, make_links, begun_ns, move=move, take_off_m=take_off_m)
+    begin_ns, last_prompt = due.at_ns, ""
+    flight = Preflight(config, make_links, begin_ns, move=move, take_off_m=take_off_m)
     while True:
         while True:
             for name in wait_for(connections, due.at_ns):
-                _receive(flight, name, connections[name], told)
+                _receive(flight, name, connections[name], parameters)
             if now() >= due.at_ns:
                 break
         flight.tick(due.tick, due.at_ns, lambda message: connections[message.link].send(message.data))
-        if prompt is not None and flight.prompt != asked:
-            asked = flight.prompt
-            prompt(asked)
+        if prompt is not None and flight.prompt != last_prompt:
+            last_prompt = flight.prompt
+            prompt(last_prompt)
         moving = flight.guide is not None and not flight.guide.is_done
         closed = all(connection.closed for connection in connections.values())
-        heard_s = (due.at_ns - begun_ns) * 1e-9
+        elapsed_s = (due.at_ns - begin_ns) * 1e-9
         limit_s = seconds + (MOVE_LIMIT_S if moving else 0.0)
         if (
             closed
             or stop()
-            or (heard_s >= limit_s and (heard_s >= limit_s + config.check.wait_s or not flight.needs_vehicle_position))
+            or (
+                elapsed_s >= limit_s
+                and (elapsed_s >= limit_s + config.check.wait_s or not flight.needs_vehicle_position)
+            )
         ):
             return flight.make_items(due.at_ns)
         due = ticker.next()
 
 
-def _receive(flight: Preflight, name: str, connection: Connection, told: ParameterReader | None) -> None:
+def _receive(flight: Preflight, name: str, connection: Connection, parameters: ParameterReader | None) -> None:
     for index, (data, received_ns) in enumerate(connection.receive()):
-        if told is not None:
-            told.take(Datagram(at_ns=received_ns, link=name, outgoing=False, data=data))
+        if parameters is not None:
+            parameters.take(Datagram(at_ns=received_ns, link=name, outgoing=False, data=data))
         received = flight.receive(name, data, received_ns)
         if received.from_vehicle:  # cameras or a ground station may share the port
             connection.select_peer(index)
         elif received.from_source:
             connection.trust_sender(index)
-        for answer in received.answers:
-            connection.send(answer.data)
+        for reply in received.answers:
+            connection.send(reply.data)
 
 
-# What `uavctl fly --arm` looks at before the vehicle is asked for anything.
-
-
-def checked_before_arming(
+def check_before_arming(
     config: Config,
     connections: Mapping[str, Connection],
     stop: Callable[[], bool],
     take_off_m: float,
-    told: ParameterReader,
-    planned: tuple[Item, ...] = (),
+    parameters: ParameterReader,
+    mission_items: tuple[Item, ...] = (),
 ) -> tuple[Item, ...]:
-    """Check vehicle and cameras for `check.seconds`, before a climb of `take_off_m` [m]; report what is not good.
+    """Check vehicle and cameras for `check.seconds`, before a climb of `take_off_m` [m]; print items that are not good.
 
     Args:
-        told: takes the vehicle's parameters, for the recording that begins afterwards.
-        planned: items on the configuration, see `mission_items`.
+        parameters: Receives the vehicle's parameters, for the recording that begins afterwards.
+        mission_items: Items on the configuration, see `make_mission_items`.
 
     Returns:
         All items; none of them forbids arming.
 
     Raises:
-        NotReadyError: an item forbids arming.
+        NotReadyError: An item forbids arming.
     """
-    messages().print(f"checking for {config.check.seconds:g} s before arming", soft_wrap=True)
-    heard = run_preflight(config, connections, config.check.seconds, take_off_m=take_off_m, stop=stop, told=told)
-    items = (*planned, *heard)
-    against = find_refusals(items, config.check)
-    if against:
-        raise NotReadyError("\n".join(("not armed, as the check before it failed:", *map(describe_item, against))))
-    for one in items:
-        if one.state is not ItemState.GOOD:
-            messages().print(labelled("check", describe_item(one)), soft_wrap=True)
+    print_message(f"checking for {config.check.seconds:g} s before arming")
+    preflight_items = run_preflight(
+        config, connections, config.check.seconds, take_off_m=take_off_m, stop=stop, parameters=parameters
+    )
+    items = (*mission_items, *preflight_items)
+    refusals = find_refusals(items, config.check)
+    if refusals:
+        raise NotReadyError("\n".join(("not armed, as the check before it failed:", *map(describe_item, refusals))))
+    for item in items:
+        if item.state is not ItemState.GOOD:
+            print_message(label_text("check", describe_item(item)))
     return items
 
 
 def record_items(sink: Sink, items: Iterable[Item], at_ns: int) -> None:
     """Record the items of a check."""
-    for one in items:
-        found = Checked(at_ns=at_ns, name=one.name, state=str(one.state), value=one.value, want=one.want, hint=one.hint)
-        sink.put("/uavctl/check", at_ns, found)
+    for item in items:
+        record = Checked(
+            at_ns=at_ns, name=item.name, state=str(item.state), value=item.value, want=item.want, hint=item.hint
+        )
+        sink.put("/uavctl/check", at_ns, record)
 
 
-def record_parameters(sink: Sink, told: ParameterReader, at_ns: int) -> None:
-    """Record the vehicle's parameters that a check has heard."""
-    for one in make_parameter_records(told.parameters(), at_ns, told.count):
-        sink.put(PARAMETER, at_ns, one)
-
-
-# `uavctl check`: what can be known before take-off. It never arms, and changes neither mode nor parameter.
+def record_parameters(sink: Sink, parameters: ParameterReader, at_ns: int) -> None:
+    """Record the vehicle's parameters that a check has received."""
+    for record in make_parameter_records(parameters.parameters(), at_ns, parameters.count):
+        sink.put(PARAMETER, at_ns, record)
 
 
 _STYLES = {
@@ -165,16 +175,16 @@ _STYLES = {
 }
 
 
-_WIDTH = 80  # columns
-_LABEL = 14  # of them for the longest state and a blank
+_MAX_WIDTH = 80  # columns
+_LABEL_WIDTH = 14  # columns for the longest state and a blank
 _PERMISSIONS = "see to cable, port, permissions (serial ports: group dialout), or another program that has it"
 
 
-class Report(msgspec.Struct, frozen=True, kw_only=True):
+class CheckReport(msgspec.Struct, frozen=True, kw_only=True):
     """Result of a check; the fields are the keys of `--json`."""
 
-    ok: bool  # nothing speaks against arming
-    items: tuple[Item, ...]  # one for each thing that was looked at
+    ok: bool  # no item forbids arming
+    items: tuple[Item, ...]  # one for each checked property
 
 
 def check(
@@ -194,16 +204,16 @@ def check(
 
     Exit code 0: nothing speaks against flying. What could not be determined is told, and does not fail the check.
     """
-    overrides = given_keys(daemon__vehicle=vehicle, daemon__mocap=mocap, check__seconds=seconds)
+    overrides = make_key_overrides(daemon__vehicle=vehicle, daemon__mocap=mocap, check__seconds=seconds)
     loaded = common.with_overrides(overrides).load()
     config = loaded.config
-    with located(loaded):
+    with locate_design_errors(loaded):
         check_axes(config)
-        items = [*mission_items(config), *disk_items(out, config.log.free_bytes)]
-    items.append(_strangers(find_security_warnings(config.security, config.daemon)))
+        items = [*make_mission_items(config), *make_disk_items(out, config.log.free_bytes)]
+    items.append(_make_stranger_item(find_security_warnings(config.security, config.daemon)))
 
     def prompt(text: str) -> None:
-        messages().print(text or "good; let it rest for a moment", style="bold")
+        print_message(text or "good; let it rest for a moment", style="bold")
 
     try:
         with open_links(config) as connections, stop_on_signals() as stopped:
@@ -211,47 +221,47 @@ def check(
             items += run_preflight(config, connections, seconds_s, move=move, prompt=prompt, stop=stopped)
     except (ConnectionSpecError, KeyFileError) as error:
         if isinstance(error, ConnectionSpecError) and not isinstance(error.__cause__, OSError):
-            raise  # a URL that is none: usage
+            raise  # a wrong URL: usage
         items.append(
             make_item("connections", ItemState.BAD, str(error), "connections and key can be used", _PERMISSIONS)
         )
-    report = Report(ok=not find_refusals(items, config.check), items=tuple(items))
-    common.show("check", report, lambda: Findings(report, config.check))
+    report = CheckReport(ok=not find_refusals(items, config.check), items=tuple(items))
+    common.show("check", report, lambda: CheckView(report, config.check))
     return 0 if report.ok else 1
 
 
-def mission_items(config: Config, prepared: Prepared | None = None) -> tuple[Item, ...]:
-    """Rehearse the mission on the model; none with the paper's scheme, nor with a controller of another package.
+def make_mission_items(config: Config, prepared: Prepared | None = None) -> tuple[Item, ...]:
+    """Rehearse the mission on the model; no items for the paper's scheme and for a controller of another package.
 
     Args:
-        prepared: The controller, if it is there already.
+        prepared: The controller, if it is made already.
 
     Raises:
-        DesignError: There is no controller of this configuration.
+        DesignError: The configuration has no controller.
     """
     if not config.is_age_conditioned or config.smpc.controller:
         return ()
     design = design_of(config) if prepared is None else prepared.design
     controller = build_controller(config, design) if prepared is None else prepared.controller
     assert isinstance(design, ConditionedDesign)
-    found = rehearse(config, design, controller)
-    bad, noted = found.relaxes or found.strays, found.saturates or found.depends_on_drag
-    state = ItemState.BAD if bad else ItemState.NOTE if noted else ItemState.GOOD
-    value = ". ".join(found.sentences) or f"{found.seconds:g} s rehearsed, {found.relaxed:.0%} of the plans relax"
+    result = rehearse(config, design, controller)
+    is_bad, is_noted = result.relaxes or result.strays, result.saturates or result.depends_on_drag
+    state = ItemState.BAD if is_bad else ItemState.NOTE if is_noted else ItemState.GOOD
+    value = ". ".join(result.sentences) or f"{result.seconds:g} s rehearsed, {result.relaxed:.0%} of the plans relax"
     want = "plans keep their constraints, and the trajectory to mission.accept_m"
-    return (make_item("mission", state, value, want, found.hint),)
+    return (make_item("mission", state, value, want, result.hint),)
 
 
-def disk_items(folder: Path, free_bytes: int) -> list[Item]:
-    """Check the folder that recordings go to; create nothing."""
-    there = next((one for one in (folder, *folder.absolute().parents) if one.exists()), Path("/"))
-    writable = there.is_dir() and os.access(there, os.W_OK | os.X_OK)
-    free = shutil.disk_usage(there).free
+def make_disk_items(folder: Path, free_bytes: int) -> list[Item]:
+    """Check the folder of recordings; create nothing."""
+    existing = next((ancestor for ancestor in (folder, *folder.absolute().parents) if ancestor.exists()), Path("/"))
+    is_writable = existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)
+    free = shutil.disk_usage(existing).free
     return [
         judge_item(
             "recordings folder",
-            is_good=writable,
-            value=f"{folder}: {'writable' if writable else f'{there} is not writable'}",
+            is_good=is_writable,
+            value=f"{folder}: {'writable' if is_writable else f'{existing} is not writable'}",
             want="a folder to write to",
             hint="choose another folder (--out), or change its owner",
         ),
@@ -265,46 +275,46 @@ def disk_items(folder: Path, free_bytes: int) -> list[Item]:
     ]
 
 
-def _strangers(texts: tuple[str, ...]) -> Item:
+def _make_stranger_item(texts: tuple[str, ...]) -> Item:
     state = ItemState.NOTE if texts else ItemState.GOOD
     value, hint = ". ".join(texts) or "none can speak", "see docs/security.md"
     return make_item("strangers", state, value, "known peers, and signed frames", hint)
 
 
 @dataclass(frozen=True)
-class Findings:
-    """A check on the screen: problems in paragraphs, then notes, then a line for each thing that is good."""
+class CheckView:
+    """View of a check: problems in paragraphs, then notes, then a line for each good item."""
 
-    report: Report
+    report: CheckReport
     config: CheckConfig  # names the items that may fail
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Text]:
         del console
-        width, items = min(options.max_width, _WIDTH) - _LABEL, self.report.items
+        width, items = min(options.max_width, _MAX_WIDTH) - _LABEL_WIDTH, self.report.items
         problems = find_refusals(items, self.config)
-        accepted = tuple(one for one in items if not one.ok and one not in problems)
-        noted = tuple(one for one in items if one.ok and one.state is not ItemState.GOOD)
+        accepted = tuple(item for item in items if not item.ok and item not in problems)
+        noted = tuple(item for item in items if item.ok and item.state is not ItemState.GOOD)
         counts = (
             (problems, "problem" if len(problems) == 1 else "problems"),
             (accepted, "accepted"),
             (noted, "to know"),
         )
-        summary = ", ".join(f"{len(some)} {kind}" for some, kind in counts if some)
+        summary = ", ".join(f"{len(group)} {label}" for group, label in counts if group)
         verdict = "ready" if self.report.ok else "not ready"
         yield Text(f"check: {verdict} ({summary})" if summary else f"check: {verdict}", "bold")
-        for one in (*problems, *accepted, *noted):
+        for item in (*problems, *accepted, *noted):
             yield Text()
-            label = "accepted" if one in accepted else str(one.state)
-            # A word that is longer than a line, as the name of a folder, stays whole.
-            lines = textwrap.wrap(describe_item(one), width, break_long_words=False, break_on_hyphens=False)
-            yield _line(label, one.state, lines[0])
-            yield from (_line("", one.state, line) for line in lines[1:])
+            label = "accepted" if item in accepted else str(item.state)
+            # A word that is longer than a line stays whole, as the name of a folder.
+            lines = textwrap.wrap(describe_item(item), width, break_long_words=False, break_on_hyphens=False)
+            yield _format_line(label, item.state, lines[0])
+            yield from (_format_line("", item.state, line) for line in lines[1:])
         yield Text()
-        for one in items:
-            if one.state is ItemState.GOOD:
-                text = textwrap.shorten(f"{one.name}: {one.value}", width, placeholder=" …", break_on_hyphens=False)
-                yield _line(str(one.state), one.state, text)
+        for item in items:
+            if item.state is ItemState.GOOD:
+                text = textwrap.shorten(f"{item.name}: {item.value}", width, placeholder=" …", break_on_hyphens=False)
+                yield _format_line(str(item.state), item.state, text)
 
 
-def _line(label: str, state: ItemState, text: str) -> Text:
-    return Text.assemble((label.ljust(_LABEL), _STYLES[state]), text, no_wrap=True, overflow="ignore")
+def _format_line(label: str, state: ItemState, text: str) -> Text:
+    return Text.assemble((label.ljust(_LABEL_WIDTH), _STYLES[state]), text, no_wrap=True, overflow="ignore")

@@ -1,4 +1,8 @@
-"""Common parts of commands: options, output, wide tables."""
+"""Common parts of commands: options, output and wide tables.
+
+All commands share --config, --set and --json, the place of their output, and the message of a refused design. A string
+is never markup: paths, units and texts of vehicles have brackets. Styles are those of `rich.text.Text`.
+"""
 
 from __future__ import annotations
 
@@ -28,11 +32,7 @@ from uavctl.errors import ConfigError, DesignError
 if TYPE_CHECKING:
     from logs.report.findings import Headline
 
-# What all commands share: --config, --set and --json, where output goes, and how a bad design is told.
-# A string is never markup: paths, units and what vehicles say have brackets. Styles are those of `rich.text.Text`.
-
-
-_FILE_WIDTH, _WIDEST = 120, 10_000
+_FILE_WIDTH, _MAX_WIDTH = 120, 10_000
 
 Overrides = Annotated[
     tuple[str, ...],
@@ -73,64 +73,64 @@ class Common:
         check_fault_support(loaded)
         return loaded
 
-    def with_overrides(self, more: Sequence[str]) -> Common:
-        """Return the options with further overrides of a command's own, which win."""
-        return replace(self, overrides=(*self.overrides, *more))
+    def with_overrides(self, extra: Sequence[str]) -> Common:
+        """Return the options with further overrides, which win."""
+        return replace(self, overrides=(*self.overrides, *extra))
 
     def show(
-        self, name: str, document: Mapping[str, object] | msgspec.Struct, picture: Callable[[], RenderableType]
+        self, name: str, document: Mapping[str, object] | msgspec.Struct, render: Callable[[], RenderableType]
     ) -> None:
         """Write the result to standard output, as the JSON document `name` or as a picture for people."""
         if self.json:
             write_document(name, document)
         else:
-            shown, console = picture(), pictures()
+            renderable, console = render(), make_output_console()
             if not sys.stdout.isatty():
-                # Files and pipes have no width of their own; the usual 80 columns would fold tables and cut words.
-                anything = console.options.update_width(_WIDEST)
-                console.width = max(_FILE_WIDTH, Measurement.get(console, anything, shown).minimum)
-            console.print(shown)
+                # Files and pipes have no width; the default of 80 columns would fold tables and cut words.
+                unlimited = console.options.update_width(_MAX_WIDTH)
+                console.width = max(_FILE_WIDTH, Measurement.get(console, unlimited, renderable).minimum)
+            console.print(renderable)
 
 
-_DOCUMENTS: ContextVar[TextIO | None] = ContextVar("documents", default=None)
+_DOCUMENT_STREAM: ContextVar[TextIO | None] = ContextVar("documents", default=None)
 
 
 @contextmanager
-def documents_alone() -> Iterator[None]:
-    """Keep standard output for documents: what a controller of another package prints goes to standard error."""
-    kept = _DOCUMENTS.set(sys.stdout)
+def reserve_stdout() -> Iterator[None]:
+    """Reserve standard output for documents; a print of another package's controller goes to standard error."""
+    token = _DOCUMENT_STREAM.set(sys.stdout)
     try:
         with redirect_stdout(sys.stderr):
             yield
     finally:
-        _DOCUMENTS.reset(kept)
+        _DOCUMENT_STREAM.reset(token)
 
 
-# Documents of which a key has gone, or means something else, since the first version; the others have version 1.
+# Version of each document with a removed or changed key; every other document has version 1.
 _VERSIONS: dict[str, int] = {}
 
 
 def write_document(name: str, document: Mapping[str, object] | msgspec.Struct) -> None:
-    """Write a JSON document, on one line, to standard output; its first key says which one it is, of which version."""
+    """Write a JSON document, on one line, to standard output; its first key names the document and its version."""
     fields = msgspec.to_builtins(document)
     text = msgspec.json.encode({"schema": f"uavctl/{name}/{_VERSIONS.get(name, 1)}", **fields}).decode()
-    out = _DOCUMENTS.get() or sys.stdout
+    out = _DOCUMENT_STREAM.get() or sys.stdout
     out.write(text + "\n")
     out.flush()
 
 
-def can_be_read(type_: object, path: object) -> None:
+def check_readable(type_: object, path: object) -> None:
     """Refuse a path that cannot be read as a recording: reading a pipe would wait, a device has no end.
 
     Raises:
-        ValueError: It is one, or a name that the system does not take.
+        ValueError: The path is a pipe or a device, or a name that the system refuses.
     """
     del type_
-    for one in path if isinstance(path, tuple) else (path,):
+    for name in path if isinstance(path, tuple) else (path,):
         try:
-            mode = Path(str(one)).stat().st_mode
+            mode = Path(str(name)).stat().st_mode
         except FileNotFoundError:
-            continue  # told by who reads it
+            continue  # the reader of the file reports it
         except OSError as error:
             raise ValueError(f"{error.strerror}; give a recording") from error
         if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
@@ -138,7 +138,7 @@ def can_be_read(type_: object, path: object) -> None:
 
 
 DEFAULTS = Common()
-Flight = Annotated[Path, Parameter(help="the recording", validator=can_be_read)]
+Flight = Annotated[Path, Parameter(help="the recording", validator=check_readable)]
 System = Annotated[
     int | None,
     Parameter(
@@ -159,13 +159,13 @@ TakeOff = Annotated[
 ]
 
 
-def given_keys(**given: str | float | None) -> list[str]:
-    """Overrides of those keys that a command's own options give; `__` stands for the dot in a key."""
+def make_key_overrides(**given: str | float | None) -> list[str]:
+    """Return overrides of the keys that have a value; `__` stands for the dot in a key."""
     values = {key.replace("__", "."): value for key, value in given.items() if value is not None}
     return [f'{key}="{value}"' if isinstance(value, str) else f"{key}={value}" for key, value in values.items()]
 
 
-def two_columns(title: str, rows: list[tuple[str, object]]) -> Table:
+def make_pair_table(title: str, rows: list[tuple[str, object]]) -> Table:
     """Return a table of names and values."""
     table = Table(title=title, show_header=False, title_justify="left")
     for name, value in rows:
@@ -173,7 +173,7 @@ def two_columns(title: str, rows: list[tuple[str, object]]) -> Table:
     return table
 
 
-def columns(
+def make_table(
     title: str,
     headings: Sequence[str],
     rows: Iterable[Iterable[RenderableType]],
@@ -182,13 +182,13 @@ def columns(
     fold: bool = False,
     lines: bool = False,
 ) -> Table:
-    """A table with headings.
+    """Return a table with headings.
 
     Args:
         rows: Cells; a `Text` has a style.
         left: Headings of the columns that are set flush left, the others right; the first alone if None.
-        fold: Go on in the next line where a column is too narrow, else cut.
-        lines: Draw one between the rows.
+        fold: Whether a cell that is too wide continues in the next line; else it is cut.
+        lines: Whether a line is drawn between the rows.
     """
     table = Table(title=title or None, title_justify="left", show_lines=lines)
     for heading in headings:
@@ -199,98 +199,106 @@ def columns(
     return table
 
 
-def counted(counts: Mapping[str, int]) -> str:
-    """Counts in words, as in "126 track, 20 hold"."""
+def format_counts(counts: Mapping[str, int]) -> str:
+    """Return counts as text, as in "126 track, 20 hold"."""
     return ", ".join(f"{number} {name}" for name, number in counts.items()) or "none"
 
 
-LINE_S = 5.0  # between two lines of progress where no bar can be drawn
+LINE_PERIOD_S = 5.0  # between two lines of progress where no bar can be drawn
 
 
-class _Bars(Progress):
-    """Bars in a terminal; in a file or a pipe a line now and then, so that one who reads it sees that it goes on."""
+class _ProgressLines(Progress):
+    """Bars in a terminal; in a file or a pipe a line every few seconds."""
 
-    _told_s: float | None = None
+    _printed_s: float | None = None
 
     def advance(self, task_id: TaskID, advance: float = 1) -> None:
-        """Go on by so many."""
+        """Advance a task by so many steps."""
         super().advance(task_id, advance)
-        self._tell(task_id)
+        self._print_line(task_id)
 
     def update(self, task_id: TaskID, **changes: Any) -> None:
-        """Change what rich's own takes, by name."""
+        """Change fields of a task, as in rich."""
         super().update(task_id, **changes)
-        self._tell(task_id)
+        self._print_line(task_id)
 
-    def _tell(self, task_id: TaskID) -> None:
+    def _print_line(self, task_id: TaskID) -> None:
         if self.console.is_terminal:
             return
         now_s = self.get_time()
-        if self._told_s is None:
-            self._told_s = now_s
-        if now_s - self._told_s < LINE_S:
+        if self._printed_s is None:
+            self._printed_s = now_s
+        if now_s - self._printed_s < LINE_PERIOD_S:
             return
-        self._told_s = now_s
+        self._printed_s = now_s
         task = self._tasks[task_id]
         done = "" if task.total is None else f": {round(task.completed, 1):.10g} of {round(task.total, 1):.10g}"
         # Not by the bar's own console, which would draw it.
-        messages().print(f"{task.description or 'at work'}{done} ({task.elapsed or 0.0:.0f} s)", soft_wrap=True)
+        print_message(f"{task.description or 'at work'}{done} ({task.elapsed or 0.0:.0f} s)")
 
 
-def bars(*more: ProgressColumn, auto_refresh: bool = True) -> Progress:
-    """Progress among the messages, gone in the end: what is done, a bar, and `more`; else how many of all, and time.
+def make_progress(*columns_after: ProgressColumn, auto_refresh: bool = True) -> Progress:
+    """Return a progress bar on standard error, which is removed at the end.
 
-    Where there is no terminal it is a line every five seconds.
+    Without a terminal it is a line every five seconds.
+
+    Args:
+        columns_after: Columns after the bar; without any the count and the elapsed time.
+        auto_refresh: A thread of its own draws.
     """
-    counted = more or (MofNCompleteColumn(), TimeElapsedColumn())
+    trailing = columns_after or (MofNCompleteColumn(), TimeElapsedColumn())
     head = (TextColumn("{task.description}", markup=False), BarColumn())
-    return _Bars(*head, *counted, console=messages(), transient=True, auto_refresh=auto_refresh)
+    return _ProgressLines(*head, *trailing, console=make_message_console(), transient=True, auto_refresh=auto_refresh)
 
 
-class _Messages(Console):
-    """Standard error, which may be gone: a flight does not end because nobody reads its messages any more."""
+class _MessageConsole(Console):
+    """Standard error that may be closed: a flight goes on without a reader of its messages."""
 
     def on_broken_pipe(self) -> None:
-        """Send what comes to nobody, where rich would end the program."""
-        with open(os.devnull, "w") as nobody:  # noqa: PTH123 (a name of the system's, not a path)
-            os.dup2(nobody.fileno(), sys.stderr.fileno())
+        """Discard further output; rich itself would end the program."""
+        with open(os.devnull, "w") as null_file:  # noqa: PTH123 (a name of the system's, not a path)
+            os.dup2(null_file.fileno(), sys.stderr.fileno())
 
 
-def messages() -> Console:
+def make_message_console() -> Console:
     """Return the console for messages and progress: standard error.
 
-    Called interactive also where it is a file or a pipe: there rich shows no progress, but else would leave an empty
-    line where the bar would have been.
+    It counts as interactive also for a file or a pipe. So rich shows no progress there, and no empty line for a bar.
     """
-    return _Messages(stderr=True, force_interactive=True, markup=False, emoji=False)
+    return _MessageConsole(stderr=True, force_interactive=True, markup=False, emoji=False)
 
 
-def pictures() -> Console:
+def make_output_console() -> Console:
     """Return the console for results that people read: standard output."""
     return Console(markup=False, emoji=False)
 
 
-def labelled(label: str, text: str, style: str = "yellow") -> Text:
+def print_message(content: RenderableType, *, style: str | None = None, highlight: bool | None = None) -> None:
+    """Print a message on standard error; the terminal wraps its lines."""
+    make_message_console().print(content, style=style, highlight=highlight, soft_wrap=True)
+
+
+def label_text(label: str, text: str, style: str = "yellow") -> Text:
     """Return a message that begins with a label in a style, as in "warning: ..."."""
     return Text.assemble((f"{label}:", style), f" {text}")
 
 
 def warn(text: str) -> None:
     """Write a warning on a line of its own."""
-    messages().print(text, style="yellow", soft_wrap=True)
+    print_message(text, style="yellow")
 
 
 _STYLES = {"good": "bold green", "mind": "bold yellow", "bad": "bold red"}
 
 
-def first_line(main: Headline) -> Text:
+def make_headline_text(headline: Headline) -> Text:
     """Return the first line of a recording's page, in its colour."""
-    return Text.assemble((f"{main.word}: ", _STYLES[main.tone]), main.text)
+    return Text.assemble((f"{headline.word}: ", _STYLES[headline.tone]), headline.text)
 
 
 @contextmanager
-def located(loaded: LoadedConfig) -> Iterator[None]:
-    """Turn the error of a refused design into one with the file and line of the key to blame.
+def locate_design_errors(loaded: LoadedConfig) -> Iterator[None]:
+    """Turn the error of a refused design into one with the file and line of its key.
 
     Raises:
         ConfigError: In place of the DesignError.
@@ -301,10 +309,7 @@ def located(loaded: LoadedConfig) -> Iterator[None]:
         raise ConfigError((describe_design_error(loaded.source, error),)) from error
 
 
-# A table with more columns than a terminal has room for: several below each other.
-
-
-_BETWEEN = 3  # a border and a blank on either side
+_BORDER_WIDTH = 3  # a border and a blank on either side
 
 
 @dataclass(frozen=True)
@@ -318,7 +323,7 @@ class Column:
     @property
     def width(self) -> int:
         """Width of the column with its border [characters]."""
-        return max(map(cell_len, (self.heading, *self.cells))) + _BETWEEN
+        return max(map(cell_len, (self.heading, *self.cells))) + _BORDER_WIDTH
 
 
 @dataclass(frozen=True)
@@ -331,7 +336,7 @@ class WideTable:
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Table]:
         del console
-        for columns in self._cut(options.max_width - 1 - self.first.width):
+        for columns in self._split_columns(options.max_width - 1 - self.first.width):
             table = Table()
             for column in (self.first, *columns):
                 table.add_column(Text(column.heading), justify=column.justify, no_wrap=True)
@@ -340,17 +345,17 @@ class WideTable:
                 table.add_row(*map(Text, row), end_section=number in self.sections)
             yield table
 
-    def _cut(self, room: int) -> list[list[Column]]:
-        """Return the columns of each table, of `room` characters beside the first column."""
+    def _split_columns(self, width: int) -> list[list[Column]]:
+        """Return the columns of each table, of `width` characters beside the first column."""
         tables: list[list[Column]] = [[]]
         for group in self.groups:
-            together = _width(group) <= room
-            for piece in (list(group),) if together else ([column] for column in group):
-                if tables[-1] and _width(tables[-1]) + _width(piece) > room:
+            fits = _sum_widths(group) <= width
+            for piece in (list(group),) if fits else ([column] for column in group):
+                if tables[-1] and _sum_widths(tables[-1]) + _sum_widths(piece) > width:
                     tables.append([])
                 tables[-1] += piece
         return tables
 
 
-def _width(columns: Sequence[Column]) -> int:
+def _sum_widths(columns: Sequence[Column]) -> int:
     return sum(column.width for column in columns)

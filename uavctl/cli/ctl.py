@@ -1,4 +1,4 @@
-"""Command `uavctl ctl`: orders and questions to a daemon that is flying."""
+"""Command `uavctl ctl`: orders and requests for the status to a daemon in flight."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ import msgspec
 from cyclopts import App, Parameter
 from rich.table import Table
 
-from uavctl.cli.common import Common, QuietJson, messages, two_columns
-from uavctl.cli.usage import example
+from uavctl.cli.common import Common, QuietJson, make_pair_table, print_message
+from uavctl.cli.usage import format_example
 from uavctl.daemon.control_socket import SUFFIX, ControlRequest, Reply, find_control_folder
 from uavctl.daemon.health import Health, RecorderHealth, RelayHealth
 from uavctl.errors import NotReachedError, UsageError
 from uavctl.records import Vec3
 
 ANSWER_LIMIT_S = 5.0  # a tick takes a tenth of a second at most
-_BLOCK = 65_536
+_BLOCK_BYTES = 65_536
 
 ctl_app = App(
     name="ctl",
     help="Orders to a flight that goes on: goto, hold, resume, land, engage; and its status.",
-    help_epilogue=example("ctl"),
+    help_epilogue=format_example("ctl"),
 )
 
 
 @Parameter(name="*")
 @dataclass(frozen=True)
-class Which:
-    """Options of every order."""
+class DaemonChoice:
+    """Options of every order: which daemon gets it."""
 
     vehicle: Annotated[
         str | None, Parameter(help="which daemon, if several run: its name, or a part of it that no other one has")
@@ -43,51 +43,51 @@ class Which:
     json: QuietJson = False
 
 
-ANY = Which()
+ANY_DAEMON = DaemonChoice()
 
 
-@ctl_app.command(usage="Usage: uavctl ctl goto [OPTIONS] NORTH EAST DOWN", help_epilogue=example("ctl goto"))
-def goto(*place: Annotated[str, Parameter(allow_leading_hyphen=True)], which: Which = ANY) -> int:
+@ctl_app.command(usage="Usage: uavctl ctl goto [OPTIONS] NORTH EAST DOWN", help_epilogue=format_example("ctl goto"))
+def goto(*place: Annotated[str, Parameter(allow_leading_hyphen=True)], choice: DaemonChoice = ANY_DAEMON) -> int:
     """Fly to a place and stay there: north, east, down in local NED [m], as in `ctl goto 2,1,-2` or `goto 2 1 -2`.
 
     Args:
         place: north,east,down, or each for itself.
     """
-    return _order(ControlRequest(ask="goto", position_m=_place(",".join(place))), which)
+    return _send_order(ControlRequest(ask="goto", position_m=_parse_place(",".join(place))), choice)
 
 
-Ask = Literal["hold", "resume", "land", "engage"]
+OrderName = Literal["hold", "resume", "land", "engage"]
 
 
-def _plain_order(ask: Ask) -> Callable[..., int]:
-    def order(*, which: Which = ANY) -> int:
-        return _order(ControlRequest(ask=ask), which)
+def _make_order_command(order_name: OrderName) -> Callable[..., int]:
+    def give_order(*, choice: DaemonChoice = ANY_DAEMON) -> int:
+        return _send_order(ControlRequest(ask=order_name), choice)
 
-    return order
+    return give_order
 
 
-_ORDERS: dict[Ask, str] = {
+_ORDERS: dict[OrderName, str] = {
     "hold": "Stay where the vehicle comes to rest.",
     "resume": "Go on with the configured mission where it was left.",
     "land": "Brake and hand over to the vehicle's own landing.",
     "engage": "Ask for the external mode again, after the pilot or the vehicle has left it.",
 }
 for _name, _help in _ORDERS.items():
-    ctl_app.command(_plain_order(_name), name=_name, help=_help, help_epilogue=example(f"ctl {_name}"))
+    ctl_app.command(_make_order_command(_name), name=_name, help=_help, help_epilogue=format_example(f"ctl {_name}"))
 
 
-@ctl_app.command(help_epilogue=example("ctl status"))
-def status(*, which: Which = ANY) -> int:
+@ctl_app.command(help_epilogue=format_example("ctl status"))
+def status(*, choice: DaemonChoice = ANY_DAEMON) -> int:
     """Say how the flight is doing. Exit code 1: no daemon answers."""
-    reply = ask(ControlRequest(ask="status"), find_control_folder(which.control), which.vehicle)
+    reply = send_request(ControlRequest(ask="status"), find_control_folder(choice.control), choice.vehicle)
     if reply.status is None:
         raise NotReachedError(f"the daemon gave no status: {reply.text}; is it of this version?")
-    found = reply.status
-    Common(json=which.json).show("ctl/status", found, lambda: _table(found))
+    health = reply.status
+    Common(json=choice.json).show("ctl/status", health, lambda: _make_status_table(health))
     return 0
 
 
-def _place(text: str) -> Vec3:
+def _parse_place(text: str) -> Vec3:
     try:
         north, east, down = map(float, text.split(","))
     except ValueError:
@@ -101,28 +101,28 @@ def _place(text: str) -> Vec3:
     return north, east, down
 
 
-def _order(request: ControlRequest, which: Which) -> int:
-    reply = ask(request, find_control_folder(which.control), which.vehicle)
-    if which.json:
+def _send_order(request: ControlRequest, choice: DaemonChoice) -> int:
+    reply = send_request(request, find_control_folder(choice.control), choice.vehicle)
+    if choice.json:
         Common(json=True).show("ctl/order", {"ok": reply.ok, "text": reply.text}, str)
     else:
         verdict = "accepted" if reply.ok else "refused"
-        messages().print(f"{request.ask} {verdict}: {reply.text}", soft_wrap=True, highlight=False)
+        print_message(f"{request.ask} {verdict}: {reply.text}", highlight=False)
     return 0 if reply.ok else 1
 
 
-def ask(request: ControlRequest, folder: Path, vehicle: str | None) -> Reply:
+def send_request(request: ControlRequest, folder: Path, vehicle: str | None) -> Reply:
     """Return the daemon's answer to a request.
 
     Raises:
-        NotReachedError: none, or more than one, or no answer.
+        NotReachedError: No daemon, several daemons, or no answer.
     """
-    with _reach(folder, vehicle) as connection:
+    with _connect_daemon(folder, vehicle) as connection:
         try:
             connection.sendall(msgspec.json.encode(request) + b"\n")
             line = b""
             while not line.endswith(b"\n"):
-                data = connection.recv(_BLOCK)
+                data = connection.recv(_BLOCK_BYTES)
                 if not data:
                     raise NotReachedError("the daemon hung up: it is ending, or runs as another user")
                 line += data
@@ -136,31 +136,31 @@ def ask(request: ControlRequest, folder: Path, vehicle: str | None) -> Reply:
             raise NotReachedError(f"the answer is not understood ({error}); is the daemon of this version?") from error
 
 
-def _reach(folder: Path, wanted: str | None) -> socket.socket:
-    """Return a connection to the daemon that is meant."""
-    found = {path.name.removesuffix(SUFFIX): path for path in _sockets(folder)}
-    names = [name for name in found if wanted is None or wanted in name]
-    if wanted in found:
-        names = [wanted]
-    alive: dict[str, socket.socket] = {}
+def _connect_daemon(folder: Path, vehicle: str | None) -> socket.socket:
+    """Return a connection to the chosen daemon."""
+    paths = {path.name.removesuffix(SUFFIX): path for path in _list_sockets(folder)}
+    names = [name for name in paths if vehicle is None or vehicle in name]
+    if vehicle in paths:
+        names = [vehicle]
+    connections: dict[str, socket.socket] = {}
     for name in names:
-        connection = _connect(found[name])
+        connection = _connect_socket(paths[name])
         if connection is not None:
-            alive[name] = connection
-    if len(alive) == 1:
-        return alive.popitem()[1]
-    for connection in alive.values():
+            connections[name] = connection
+    if len(connections) == 1:
+        return connections.popitem()[1]
+    for connection in connections.values():
         connection.close()
-    if alive:
-        raise NotReachedError(f"several daemons run: {', '.join(sorted(alive))}; choose one with --vehicle NAME")
-    whose = "no daemon" if wanted is None else f"no daemon named like {wanted!r}"
+    if connections:
+        raise NotReachedError(f"several daemons run: {', '.join(sorted(connections))}; choose one with --vehicle NAME")
+    missing = "no daemon" if vehicle is None else f"no daemon named like {vehicle!r}"
     raise NotReachedError(
-        f"{whose} answers in {folder}; start one with `uavctl fly`, or name its folder with --control "
+        f"{missing} answers in {folder}; start one with `uavctl fly`, or name its folder with --control "
         "(a service's is in its unit)"
     )
 
 
-def _sockets(folder: Path) -> list[Path]:
+def _list_sockets(folder: Path) -> list[Path]:
     try:
         return sorted(path for path in folder.iterdir() if path.suffix == SUFFIX)
     except FileNotFoundError:
@@ -171,8 +171,8 @@ def _sockets(folder: Path) -> list[Path]:
         ) from error
 
 
-def _connect(path: Path) -> socket.socket | None:
-    """Return a connection to a daemon's socket; None if nobody listens there any more."""
+def _connect_socket(path: Path) -> socket.socket | None:
+    """Return a connection to a daemon's socket; None if the daemon has ended."""
     connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     connection.settimeout(ANSWER_LIMIT_S)
     try:
@@ -183,37 +183,39 @@ def _connect(path: Path) -> socket.socket | None:
     return connection
 
 
-def _table(health: Health) -> Table:
+def _make_status_table(health: Health) -> Table:
     vehicle, recorder = health.vehicle, health.recorder
     rows = {
         "mode": "waiting" if health.mode is None else f"{health.mode.value}: {health.reason}",
         "who flies": health.who_flies or "-",
         **({"ending": health.ending} if health.ending else {}),
-        **({} if health.relay is None else {"relay": _relay(health.relay)}),
+        **({} if health.relay is None else {"relay": describe_relay(health.relay)}),
         "age": "-" if health.age_s is None else f"{health.age_s:.2f} s ({health.age_steps} steps)",
-        "position": _point(health.position_m),
-        "target": _point(health.target_m),
+        "position": _format_point(health.position_m),
+        "target": _format_point(health.target_m),
         "vehicle": "not heard" if vehicle is None else f"{vehicle.mode}, {'armed' if vehicle.armed else 'disarmed'}",
         "battery": "-" if vehicle is None or vehicle.battery_v is None else f"{vehicle.battery_v:.1f} V",
         "loss": "-" if health.loss is None else f"{health.loss:.0%}",
         "lateness": f"{health.lateness_us / 1e3:.2f} ms, {health.missed_ticks} ticks missed",
-        "recording": recorder.path if recorder.ok and not recorder.reason else f"{recorder.path}, {_trouble(recorder)}",
+        "recording": recorder.path
+        if recorder.ok and not recorder.reason
+        else f"{recorder.path}, {_describe_recorder(recorder)}",
     }
-    return two_columns(f"{health.name} (process {health.pid}), {health.url}", list(rows.items()))
+    return make_pair_table(f"{health.name} (process {health.pid}), {health.url}", list(rows.items()))
 
 
-def _relay(relay: RelayHealth) -> str:
-    """Return in words how the vehicle gets its positions; control may have ended before."""
+def describe_relay(relay: RelayHealth) -> str:
+    """Describe how the vehicle gets its positions, also after the end of control."""
     if relay.last_s is None:
         return "no position has been passed on yet"
-    alone = "; control has ended, positions go on" if relay.alone else ""
-    return f"{relay.sent_hz:.0f} positions a second, {relay.sent} in all, the last {relay.last_s:.1f} s ago{alone}"
+    suffix = "; control has ended, positions go on" if relay.alone else ""
+    return f"{relay.sent_hz:.0f} positions a second, {relay.sent} in all, the last {relay.last_s:.1f} s ago{suffix}"
 
 
-def _trouble(recorder: RecorderHealth) -> str:
-    """Return in words what is wrong with the recording."""
+def _describe_recorder(recorder: RecorderHealth) -> str:
+    """Describe the trouble of the recording."""
     return f"{'' if recorder.ok else 'in trouble, '}{recorder.dropped} dropped: {recorder.reason or 'the disk is slow'}"
 
 
-def _point(point: dict[str, float] | None) -> str:
+def _format_point(point: dict[str, float] | None) -> str:
     return "-" if point is None else ", ".join(f"{axis} {value:z.2f} m" for axis, value in point.items())

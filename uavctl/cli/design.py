@@ -1,4 +1,4 @@
-"""Commands `uavctl design` and `uavctl solve`: a design, and one decision."""
+"""Commands `uavctl design`, with --synthesize for the best terminal gain, and `uavctl solve` for one decision."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import Annotated, Literal
 import msgspec
 import numpy as np
 from cyclopts import Parameter
-from numpy.typing import NDArray
 from rich.console import Group, RenderableType
 from rich.text import Text
 
+from uavctl.arrays import Array
 from uavctl.build.controller import (
     build_conditioned,
     build_controller,
@@ -25,7 +25,15 @@ from uavctl.build.controller import (
 )
 from uavctl.build.mission import build_names
 from uavctl.build.rehearsal import RehearsalResult, rehearse
-from uavctl.cli.common import DEFAULTS, Column, Common, WideTable, columns, located, messages
+from uavctl.cli.common import (
+    DEFAULTS,
+    Column,
+    Common,
+    WideTable,
+    locate_design_errors,
+    make_message_console,
+    make_table,
+)
 from uavctl.config import Config
 from uavctl.errors import UsageError
 from uavctl.lab.terminal_gain import GainComparison, GainReport, compare_gains
@@ -35,62 +43,61 @@ from uavctl.smpc.conditioned.planner import AnyDesign, ConditionedDesign, condit
 from uavctl.smpc.hahn_stursberg.design import Design, design_record
 from uavctl.smpc.hahn_stursberg.terminal import stationary_cost
 
-# `uavctl design --synthesize`: the configured terminal gain beside the best one.
 
-
-def gains_report(common: Common) -> int:
+def report_gains(common: Common) -> int:
     """Synthesise the terminal gain and compare; return 1 if no complete design can be made with it."""
     loaded = common.load()
-    begin = time.perf_counter()
-    with located(loaded), messages().status("synthesis and designs"):
+    begin_s = time.perf_counter()
+    with locate_design_errors(loaded), make_message_console().status("synthesis and designs"):
         spec = build_spec(loaded.config)
-        found = compare_gains(spec, start_state(loaded.config, spec.plant))
-    document = {**msgspec.to_builtins(found), "k_tau": found.after.k_tau, "wall_s": time.perf_counter() - begin}
-    common.show("design/gains", document, lambda: _gains_picture(found, loaded.config.name))
-    return 0 if found.after.refused is None else 1
+        comparison = compare_gains(spec, start_state(loaded.config, spec.plant))
+    document = {
+        **msgspec.to_builtins(comparison),
+        "k_tau": comparison.after.k_tau,
+        "wall_s": time.perf_counter() - begin_s,
+    }
+    common.show("design/gains", document, lambda: _render_gains(comparison, loaded.config.name))
+    return 0 if comparison.after.refused is None else 1
 
 
-def _gains_picture(found: GainComparison, name: str) -> RenderableType:
-    rows = ((label, figure(found.before), figure(found.after)) for label, figure in _GAIN_ROWS)
-    table = columns(f"Terminal gain of {name}", ("", "configured", "synthesised"), rows)
+def _render_gains(comparison: GainComparison, name: str) -> RenderableType:
+    rows = ((label, figure(comparison.before), figure(comparison.after)) for label, figure in _GAIN_ROWS)
+    table = make_table(f"Terminal gain of {name}", ("", "configured", "synthesised"), rows)
     refusals = [
-        Text(f"No complete design with the {which} gain: {report.refused}")
-        for which, report in (("configured", found.before), ("synthesised", found.after))
+        Text(f"No complete design with the {label} gain: {report.refused}")
+        for label, report in (("configured", comparison.before), ("synthesised", comparison.after))
         if report.refused is not None
     ]
-    return Group(table, *refusals, _BASIS, "To take the synthesised gain over:", "", Text(found.toml))
+    return Group(table, *refusals, _INFEASIBLE_NOTE, "To take the synthesised gain over:", "", Text(comparison.toml))
 
 
-_BASIS = (
+_INFEASIBLE_NOTE = (
     "Infeasible: the target is not reached within the horizon with all constraints kept; a flight goes there by "
     "way of nearer equilibria, or gives way where the limits are soft."
 )
 
 
-def _figure(value: float | None) -> str:
+def _format_figure(value: float | None) -> str:
     return "-" if value is None else f"{value:.4g}"
 
 
-def _start_cost(report: GainReport) -> str:
+def _format_start_cost(report: GainReport) -> str:
     if report.refused is not None:
         return "-"
     return "infeasible" if report.start_cost is None else f"{report.start_cost:.2f}"
 
 
 _GAIN_ROWS: tuple[tuple[str, Callable[[GainReport], str]], ...] = (
-    ("stationary cost of a step", lambda report: _figure(report.stationary_cost)),
-    ("spectral radius (4.2: below 1)", lambda report: _figure(report.spectral_radius)),
-    ("state room taken (4.3: at most 1)", lambda report: _figure(report.filled_x)),
-    ("input room taken (4.4: at most 1)", lambda report: _figure(report.filled_u)),
-    ("margin s* of the terminal condition", lambda report: _figure(report.margin)),
-    ("optimal cost from the simulator's start", _start_cost),
+    ("stationary cost of a step", lambda report: _format_figure(report.stationary_cost)),
+    ("spectral radius (4.2: below 1)", lambda report: _format_figure(report.spectral_radius)),
+    ("state room taken (4.3: at most 1)", lambda report: _format_figure(report.filled_x)),
+    ("input room taken (4.4: at most 1)", lambda report: _format_figure(report.filled_u)),
+    ("margin s* of the terminal condition", lambda report: _format_figure(report.margin)),
+    ("optimal cost from the simulator's start", _format_start_cost),
 )
 
 
-# `uavctl design`: make a design, and show what it rests on.
-
-
-_RARE = 1e-9  # ages that are all older than this share of the time are told together
+_RARE_SHARE = 1e-9  # ages with a smaller probability of being exceeded share one row
 
 
 def design(
@@ -103,75 +110,81 @@ def design(
 ) -> int:
     """Make a design: schedule, terminal ingredients, Assumption 4 with figures."""
     if synthesize:
-        return gains_report(common)
+        return report_gains(common)
     loaded = common.load()
-    start = time.perf_counter()
+    begin_s = time.perf_counter()
     if loaded.config.is_age_conditioned:
-        with located(loaded):
+        with locate_design_errors(loaded):
             conditioned = build_conditioned(loaded.config)
-            found = rehearsed(loaded.config, conditioned)
+            rehearsal = rehearse_mission(loaded.config, conditioned)
         figures = {
             **conditioned_record(conditioned),
-            "rehearsal": msgspec.to_builtins(found),
-            "wall_s": time.perf_counter() - start,
+            "rehearsal": msgspec.to_builtins(rehearsal),
+            "wall_s": time.perf_counter() - begin_s,
         }
-        common.show("design/conditioned", figures, lambda: conditioned_picture(conditioned, loaded.config.name, found))
-        return 1 if found is not None and (found.relaxes or found.strays) else 0
-    with located(loaded):
-        made = build_design(loaded.config)
-    document = design_document(made, time.perf_counter() - start)
-    common.show("design", document, lambda: design_picture(made, loaded.config.name))
+        common.show(
+            "design/conditioned", figures, lambda: render_conditioned(conditioned, loaded.config.name, rehearsal)
+        )
+        return 1 if rehearsal is not None and (rehearsal.relaxes or rehearsal.strays) else 0
+    with locate_design_errors(loaded):
+        paper_design = build_design(loaded.config)
+    document = make_design_document(paper_design, time.perf_counter() - begin_s)
+    common.show("design", document, lambda: render_design(paper_design, loaded.config.name))
     return 0
 
 
-def rehearsed(config: Config, made: ConditionedDesign) -> RehearsalResult | None:
-    """Rehearse the mission; None for a plant without axes, or where a controller of another package flies.
+def rehearse_mission(config: Config, design: ConditionedDesign) -> RehearsalResult | None:
+    """Rehearse the mission; None for a plant without axes and for a controller of another package.
 
     Raises:
         DesignError: The mission cannot be flown.
     """
     if not config.plant.axes or config.smpc.controller:
         return None
-    return rehearse(config, made, build_controller(config, made))
+    return rehearse(config, design, build_controller(config, design))
 
 
-def conditioned_picture(made: ConditionedDesign, name: str, found: RehearsalResult | None = None) -> RenderableType:
-    """Return tables of ages with their risk, and of where a plan may rest; and what is wrong with the mission."""
-    title = f"Risk by the age of information, design {made.design_id} of {name}"
-    ages = columns(title, ("age [steps]", "probability", "may be outside", "far from limits"), (), ())
-    risk, transit, problem = made.solver.risk, made.solver.risk_in_transit, made.solver.problem
-    left = 1.0 - np.cumsum(risk.weights)
-    told = min(problem.horizon, 1 + int(np.count_nonzero(left > _RARE)))
-    for age in range(told):
-        both = (f"{spread.budgets[age]:.2%}" for spread in (risk, transit))
-        ages.add_row(str(age + 1), f"{risk.weights[age]:.3g}", *both)
-    if told < problem.horizon:
-        rest = f"{risk.weights[told:].sum():.3g}"
-        both = (f"up to {spread.budgets[-1]:.2%}" for spread in (risk, transit))
-        ages.add_row(f"{told + 1} to {problem.horizon}", rest, *both)
+def render_conditioned(
+    design: ConditionedDesign, name: str, rehearsal: RehearsalResult | None = None
+) -> RenderableType:
+    """Return tables of the risk of each age and of the limits at rest, and warnings on the mission."""
+    title = f"Risk by the age of information, design {design.design_id} of {name}"
+    ages = make_table(title, ("age [steps]", "probability", "may be outside", "far from limits"), (), ())
+    risk, transit, problem = design.solver.risk, design.solver.risk_in_transit, design.solver.problem
+    remaining = 1.0 - np.cumsum(risk.weights)
+    listed_ages = min(problem.horizon, 1 + int(np.count_nonzero(remaining > _RARE_SHARE)))
+    for age in range(listed_ages):
+        budgets = (f"{spread.budgets[age]:.2%}" for spread in (risk, transit))
+        ages.add_row(str(age + 1), f"{risk.weights[age]:.3g}", *budgets)
+    if listed_ages < problem.horizon:
+        probability = f"{risk.weights[listed_ages:].sum():.3g}"
+        budgets = (f"up to {spread.budgets[-1]:.2%}" for spread in (risk, transit))
+        ages.add_row(f"{listed_ages + 1} to {problem.horizon}", probability, *budgets)
     ages.add_row(f"> {problem.horizon}", f"{risk.beyond:.3g}", "counts in full", "counts in full")
-    names = build_names(made)
+    names = build_names(design)
     # A row of one entry limits -x from below where the entry is negative.
     sizes = problem.state_set.c.sum(axis=1)
     rows = (
-        (row, f"{side / size:.3g}", f"{rest / size:.3g}", unit)
-        for (row, unit, _), size, side, rest in zip(names.rows, sizes, problem.state_set.b, made.rests, strict=True)
+        (row, f"{side / size:.3g}", f"{probability / size:.3g}", unit)
+        for (row, unit, _), size, side, probability in zip(
+            names.rows, sizes, problem.state_set.b, design.rests, strict=True
+        )
     )
     headings = ("limit", "at", "rests up to", "unit")
-    wrong = [] if found is None or not found.sentences else [*found.sentences, found.hint]
-    doubts = [Text(f"{one[:1].upper()}{one[1:]}.", style="bold yellow") for one in wrong]
-    return Group(ages, columns("Where a plan may rest", headings, rows, ("limit", "unit")), *doubts)
+    sentences = [] if rehearsal is None or not rehearsal.sentences else [*rehearsal.sentences, rehearsal.hint]
+    warnings = [Text(f"{sentence[:1].upper()}{sentence[1:]}.", style="bold yellow") for sentence in sentences]
+    return Group(ages, make_table("Where a plan may rest", headings, rows, ("limit", "unit")), *warnings)
 
 
-def design_document(made: Design, wall_s: float) -> dict[str, object]:
+def make_design_document(design: Design, wall_s: float) -> dict[str, object]:
     """Return the figures of a design, for --json."""
-    return {**design_record(made), "wall_s": wall_s}
+    return {**design_record(design), "wall_s": wall_s}
 
 
-def design_picture(made: Design, name: str) -> RenderableType:
+def render_design(design: Design, name: str) -> RenderableType:
     """Return Assumption 4 and the schedule as tables."""
     headings = ("item", "holds", "value", "limit", "of what")
-    checked = (
+    rows = (
         (
             check.item,
             Text("yes", style="green") if check.ok else Text("no", style="red"),
@@ -179,18 +192,18 @@ def design_picture(made: Design, name: str) -> RenderableType:
             f"{check.limit:.4g}",
             check.text,
         )
-        for check in made.assumptions
+        for check in design.assumptions
     )
-    checks = columns(f"Assumption 4, design {made.design_id} of {name}", headings, checked, headings)
-    schedule = columns("", ("t", "d_t", "α_t", "γ^x_t+1", "γ^u_t"), (), ())
+    checks = make_table(f"Assumption 4, design {design.design_id} of {name}", headings, rows, headings)
+    schedule = make_table("", ("t", "d_t", "α_t", "γ^x_t+1", "γ^u_t"), (), ())
     stages = zip(
-        made.schedule.delays, made.schedule.alpha, made.schedule.gamma_x[1:], made.schedule.gamma_u, strict=True
+        design.schedule.delays, design.schedule.alpha, design.schedule.gamma_x[1:], design.schedule.gamma_u, strict=True
     )
     for t, (delay, *shares) in enumerate(stages):
         schedule.add_row(str(t), str(delay), *(f"{share:.5f}" for share in shares))
     terminal = (
-        f"τ = {made.terminal.tau}, spectral radius of the terminal loop {made.terminal.spectral_radius:.4f}, "
-        f"its stationary cost {stationary_cost(made.terminal):.4f} a step.\n"
+        f"τ = {design.terminal.tau}, spectral radius of the terminal loop {design.terminal.spectral_radius:.4f}, "
+        f"its stationary cost {stationary_cost(design.terminal):.4f} a step.\n"
     )
     return Group(checks, terminal, "Schedule: stage t counts on information that is d_t steps old.", schedule)
 
@@ -210,21 +223,21 @@ def solve(
 ) -> int:
     """Solve one decision problem, towards the configured target."""
     loaded = common.with_overrides([] if method is None else [f"solver.method={method}"]).load()
-    with located(loaded):
+    with locate_design_errors(loaded):
         design = design_of(loaded.config)
         x = parse_state(state, design.plant.n_x)
         solver = build_solver(design, loaded.config)
-    start = time.perf_counter()
+    begin_s = time.perf_counter()
     answer = solver.solve(0, x, design.target)
-    solve_us = (time.perf_counter() - start) * 1e6
+    solve_us = (time.perf_counter() - begin_s) * 1e6
     common.show(
-        "solve", solve_document(answer, solve_us), lambda: solve_picture(answer, design, loaded.config, solve_us)
+        "solve", make_solve_document(answer, solve_us), lambda: render_solution(answer, design, loaded.config, solve_us)
     )
     return 0 if answer.status is SolveStatus.OPTIMAL else 1
 
 
-def parse_state(text: str, n_x: int) -> NDArray[np.float64]:
-    """Parse a state (n_x,) that a person typed.
+def parse_state(text: str, n_x: int) -> Array:
+    """Parse a state (n_x,) of the command line.
 
     Raises:
         UsageError: It is not n_x finite numbers.
@@ -238,15 +251,15 @@ def parse_state(text: str, n_x: int) -> NDArray[np.float64]:
     return np.array(numbers)
 
 
-def solve_document(answer: Answer, solve_us: float) -> dict[str, object]:
+def make_solve_document(answer: Answer, solve_us: float) -> dict[str, object]:
     """Return the answer for --json; infinite values (no plan, no lower bound) are null."""
     document: dict[str, object] = msgspec.to_builtins(answer, enc_hook=lambda array: array.tolist())
     del document["seq"]
     return {**document, "solve_us": solve_us}
 
 
-def solve_picture(answer: Answer, design: AnyDesign, config: Config, solve_us: float) -> RenderableType:
-    """Return the plan as a table, stage by stage, with its largest back-offs."""
+def render_solution(answer: Answer, design: AnyDesign, config: Config, solve_us: float) -> RenderableType:
+    """Return the plan as a table with its largest back-offs, a row for each stage."""
     head = f"{config.name}, method {answer.method}: {answer.status.value} in {solve_us / 1000:.1f} ms"
     if not answer.inputs.size:
         hint = "is the state far beyond what numbers can hold? Give one nearer to the limits"
@@ -257,41 +270,41 @@ def solve_picture(answer: Answer, design: AnyDesign, config: Config, solve_us: f
     if math.isfinite(answer.gap):
         bound = f"at least {answer.cost_lower:.2f}, gap {answer.gap:.1e}"
     facts = f"cost {answer.cost:.2f} ({bound}), slack {answer.slack:.3g}, offset {answer.offset:.3g}"
-    gave_way = [tell_all(build_names(design), answer.gave_way)] if answer.gave_way else []
+    relaxed_lines = [tell_all(build_names(design), answer.gave_way)] if answer.gave_way else []
     return Group(
         head,
         facts,
-        *gave_way,
+        *relaxed_lines,
         "Predicted means, inputs, and the largest back-off from a limit, stage by stage:",
-        plan_table(answer, design),
+        make_plan_table(answer, design),
     )
 
 
-def plan_table(answer: Answer, design: AnyDesign) -> WideTable:
-    """Return the plan as a table, stage by stage; the columns of an axis stay together, and so do back-offs."""
+def make_plan_table(answer: Answer, design: AnyDesign) -> WideTable:
+    """Return the plan as a table, a row for each stage; the columns of an axis and the back-offs are groups."""
     axes, count = design.plant.axes, len(answer.states)
     inputs = [f"u_{axis[0]}" for axis in axes] if axes else [f"u{i}" for i in range(design.plant.n_u)]
-    names = [*state_names(design.plant.n_x, axes), *inputs]
+    names = [*make_state_names(design.plant.n_x, axes), *inputs]
     values = [*answer.states.T, *answer.inputs.T]
     groups: dict[str, list[Column]] = {}
-    for name, of_stages in zip(names, values, strict=True):
-        groups.setdefault(name.partition("_")[2] or name, []).append(_column(name, of_stages, count))
+    for name, stage_values in zip(names, values, strict=True):
+        groups.setdefault(name.partition("_")[2] or name, []).append(_make_column(name, stage_values, count))
     backoffs = [
-        _column(f"back-off {of}", [max(rows, default=0.0) for rows in table], count)
-        for of, table in (("x", answer.backoff_x), ("u", answer.backoff_u))
+        _make_column(f"back-off {symbol}", [max(rows, default=0.0) for rows in table], count)
+        for symbol, table in (("x", answer.backoff_x), ("u", answer.backoff_u))
     ]
     return WideTable(Column("t", [str(t) for t in range(count)]), [*groups.values(), backoffs])
 
 
-def state_names(n_x: int, axes: Sequence[str]) -> list[str]:
+def make_state_names(n_x: int, axes: Sequence[str]) -> list[str]:
     """Return the names of the states, axis by axis: position, velocity, acceleration; numbers for other plants."""
-    each, rest = divmod(n_x, len(axes)) if axes else (n_x, 0)
-    if not axes or rest or each > len("pva"):
+    states_per_axis, remainder = divmod(n_x, len(axes)) if axes else (n_x, 0)
+    if not axes or remainder or states_per_axis > len("pva"):
         return [f"x{i}" for i in range(n_x)]
-    return [f"{letter}_{axis[0]}" for axis in axes for letter in "pva"[:each]]
+    return [f"{letter}_{axis[0]}" for axis in axes for letter in "pva"[:states_per_axis]]
 
 
-def _column(heading: str, values: Iterable[float], rows: int) -> Column:
+def _make_column(heading: str, values: Iterable[float], rows: int) -> Column:
     """Return a column of figures, blank where there are fewer of them than `rows`."""
     cells = [f"{value:z.3f}" for value in values]
     return Column(heading, [*cells, *([""] * (rows - len(cells)))])

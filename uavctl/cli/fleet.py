@@ -1,15 +1,14 @@
 """Command `uavctl fleet`: several vehicles from one file, each in a box of its own, landed together.
 
-Each vehicle has a daemon, a process of its own: what goes wrong in one stops in it. Plans stay within the limits of
-their configuration, so vehicles whose limits are apart are apart; a file whose boxes are too near is refused before
-anything is sent. A vehicle that ends otherwise than it was asked to may be anywhere, so all others land then.
+Each vehicle has a daemon, a process of its own, so an error in one does not reach the others. Plans stay within the
+limits of their configuration, so vehicles with separate limits stay separate. A file whose boxes are too near is
+refused before anything is sent. If one vehicle ends otherwise than requested, its position is unknown: all others land.
 """
 
 from __future__ import annotations
 
 import math
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -28,9 +27,19 @@ from rich.live import Live
 from rich.table import Table
 
 from uavctl.cli import main
-from uavctl.cli.common import SPAN_S, Common, QuietJson, TakeOff, columns, given_keys, messages
-from uavctl.cli.ctl import ask
-from uavctl.cli.usage import example
+from uavctl.cli.common import (
+    SPAN_S,
+    Common,
+    QuietJson,
+    TakeOff,
+    make_key_overrides,
+    make_message_console,
+    make_table,
+    print_message,
+)
+from uavctl.cli.ctl import send_request
+from uavctl.cli.health_lines import hide_health_lines
+from uavctl.cli.usage import format_example
 from uavctl.config import Config, load
 from uavctl.config.checks import get_position_limits_m
 from uavctl.config.document import ConfigProblem, Section
@@ -40,15 +49,16 @@ from uavctl.daemon.health import Health
 from uavctl.errors import ConfigError, NotReachedError
 from uavctl.flight.limits import AXES
 
-LOOK_S = 0.5  # between two looks at all vehicles
-POLL_S = 0.1  # between two looks at their processes
-LINE_S = 5.0  # between two tables where there is no terminal
-MOST_VEHICLES = 20
-LONGEST_NAME = 30
-_HEALTH = re.compile(r"\w+ +age .* dropped \d+$")  # a daemon's line of each second
+STATUS_PERIOD_S = 0.5  # between two requests for the status of all vehicles
+POLL_S = 0.1  # between two checks of their processes
+TABLE_PERIOD_S = 5.0  # between two tables where there is no terminal
+MAX_VEHICLES = 20
+MAX_NAME_LENGTH = 30
 
 fleet_app = App(
-    name="fleet", help="Fly several vehicles from one file: check, fly, status, land.", help_epilogue=example("fleet")
+    name="fleet",
+    help="Fly several vehicles from one file: check, fly, status, land.",
+    help_epilogue=format_example("fleet"),
 )
 File = Annotated[Path, Parameter(help="TOML file: spacing_m, and a [[vehicle]] table for each vehicle")]
 
@@ -56,7 +66,7 @@ File = Annotated[Path, Parameter(help="TOML file: spacing_m, and a [[vehicle]] t
 class FleetVehicle(Section, frozen=True, kw_only=True):
     """A vehicle of a fleet: its configuration, and what differs from it."""
 
-    name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]+$", max_length=LONGEST_NAME)]
+    name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]+$", max_length=MAX_NAME_LENGTH)]
     config: str = "room"  # a preset, or a TOML file beside this one
     set: tuple[str, ...] = ()  # as --set
     vehicle: str | None = None  # URL; else daemon.vehicle
@@ -64,10 +74,10 @@ class FleetVehicle(Section, frozen=True, kw_only=True):
 
 
 class FleetFile(Section, frozen=True, kw_only=True):
-    """A fleet as its file tells."""
+    """A fleet as its file describes it."""
 
-    spacing_m: Annotated[float, Meta(gt=0.0, le=1000.0)]  # least horizontal distance of two vehicles' limits
-    vehicle: Annotated[tuple[FleetVehicle, ...], Meta(max_length=MOST_VEHICLES)]
+    spacing_m: Annotated[float, Meta(gt=0.0, le=1000.0)]  # smallest horizontal distance of two vehicles' limits
+    vehicle: Annotated[tuple[FleetVehicle, ...], Meta(max_length=MAX_VEHICLES)]
 
 
 @dataclass(frozen=True)
@@ -75,25 +85,25 @@ class Member:
     """A vehicle of a fleet with its configuration loaded."""
 
     name: str
-    options: tuple[str, ...]  # of `uavctl fly`, that say which configuration
+    options: tuple[str, ...]  # options of `uavctl fly` for the configuration
     config: Config
 
     @property
     def daemon(self) -> str:
-        """Name of its daemon."""
+        """Name of the daemon of this vehicle."""
         return make_daemon_name(self.config)
 
-    def limits_m(self, axis: str) -> tuple[float, float]:
-        """Limits of its position along an axis; infinite where there are none."""
+    def get_limits_m(self, axis: str) -> tuple[float, float]:
+        """Return the limits of the position along an axis [m]; infinite where there are none."""
         return get_position_limits_m(self.config).get(axis, (-math.inf, math.inf))
 
 
-Looks = dict[str, Health | None]  # by name; None where no daemon answers
+HealthByName = dict[str, Health | None]  # None where no daemon answers
 
 
 @dataclass(frozen=True)
 class Fleet:
-    """The vehicles of a file, whose limits are apart."""
+    """The vehicles of a file, with separate limits."""
 
     members: tuple[Member, ...]
     nearest_m: float  # smallest horizontal distance of two vehicles' limits; infinite for a single one
@@ -103,81 +113,85 @@ def read_fleet(path: Path) -> Fleet:
     """Read a fleet's file and its configurations.
 
     Raises:
-        ConfigError: With all problems found: of the file, of a configuration, boxes too near, a link of two vehicles.
+        ConfigError: With all problems: in the file, in a configuration, boxes too near, one link of two vehicles.
     """
-    document, source, found = read_document(FleetFile, path)
+    document, source, file_problems = read_document(FleetFile, path)
     if document is not None and not document.vehicle:
-        found.append(ConfigProblem("vehicle", "there is none", "write a [[vehicle]] table for each"))
-    if document is None or found:
-        raise ConfigError(tuple(source.describe(problem) for problem in found))
-    told: list[str] = []
+        file_problems.append(ConfigProblem("vehicle", "there is none", "write a [[vehicle]] table for each"))
+    if document is None or file_problems:
+        raise ConfigError(tuple(source.describe(problem) for problem in file_problems))
+    config_problems: list[str] = []
     members: list[Member] = []
-    for number, one in enumerate(document.vehicle):
-        beside = path.parent / one.config
-        config = str(beside) if one.config.endswith(".toml") else one.config
-        overrides = [*one.set, *given_keys(daemon__vehicle=one.vehicle, daemon__mocap=one.mocap)]
+    for number, vehicle in enumerate(document.vehicle):
+        path_beside = path.parent / vehicle.config
+        config = str(path_beside) if vehicle.config.endswith(".toml") else vehicle.config
+        overrides = [*vehicle.set, *make_key_overrides(daemon__vehicle=vehicle.vehicle, daemon__mocap=vehicle.mocap)]
         try:
             loaded = load(config, overrides).config
         except ConfigError as error:
-            told += [f"{source.locate(f'vehicle[{number}]')}: {one.name}: {problem}" for problem in error.problems]
+            config_problems += [
+                f"{source.locate(f'vehicle[{number}]')}: {vehicle.name}: {problem}" for problem in error.problems
+            ]
             continue
         options = ("--config", config, *(part for override in overrides for part in ("--set", override)))
-        members.append(Member(one.name, options, loaded))
-    problems = list(_problems(members, document.spacing_m))
-    if told or problems:
-        raise ConfigError((*told, *(source.describe(problem) for problem in problems)))
-    pairs = [horizontally_apart_m(one, other) for one, other in combinations(members, 2)]
+        members.append(Member(vehicle.name, options, loaded))
+    fleet_problems = list(_find_problems(members, document.spacing_m))
+    if config_problems or fleet_problems:
+        raise ConfigError((*config_problems, *(source.describe(problem) for problem in fleet_problems)))
+    pairs = [compute_gap_m(vehicle, second) for vehicle, second in combinations(members, 2)]
     return Fleet(tuple(members), min(pairs, default=math.inf))
 
 
-def horizontally_apart_m(one: Member, other: Member) -> float:
-    """Return how far apart two vehicles' limits are, north or east; negative where they overlap.
+def compute_gap_m(first: Member, second: Member) -> float:
+    """Return the horizontal distance of two vehicles' limits [m], north or east; negative where they overlap.
 
-    Height is no distance: whoever flies below another one flies in its downwash.
+    A distance in height does not count: the lower vehicle would fly in the downwash of the upper one.
     """
     gaps = []
     for axis in AXES[:2]:
-        (low, high), (other_low, other_high) = one.limits_m(axis), other.limits_m(axis)
-        gaps.append(max(other_low - high, low - other_high))
+        (low, high), (second_low, second_high) = first.get_limits_m(axis), second.get_limits_m(axis)
+        gaps.append(max(second_low - high, low - second_high))
     return max(gaps)
 
 
-def _problems(members: Sequence[Member], spacing_m: float) -> Iterator[ConfigProblem]:
-    for (number, one), (_, other) in combinations(enumerate(members), 2):
+def _find_problems(members: Sequence[Member], spacing_m: float) -> Iterator[ConfigProblem]:
+    for (number, first), (_, second) in combinations(enumerate(members), 2):
         key = f"vehicle[{number}]"
-        if one.name == other.name:
-            yield ConfigProblem(key, f"two vehicles are named {one.name}", "give each a name of its own")
-        if one.config.daemon.vehicle == other.config.daemon.vehicle:
-            reason = f"{one.name} and {other.name} have one link, {one.config.daemon.vehicle}"
+        if first.name == second.name:
+            yield ConfigProblem(key, f"two vehicles are named {first.name}", "give each a name of its own")
+        if first.config.daemon.vehicle == second.config.daemon.vehicle:
+            reason = f"{first.name} and {second.name} have one link, {first.config.daemon.vehicle}"
             yield ConfigProblem(key, reason, "give each a `vehicle` of its own")
-        elif one.daemon == other.daemon:
-            reason = f"the daemons of {one.name} and {other.name} would both be named {one.daemon}"
+        elif first.daemon == second.daemon:
+            reason = f"the daemons of {first.name} and {second.name} would both be named {first.daemon}"
             yield ConfigProblem(key, reason, "give their configurations names that differ early")
-        apart_m = horizontally_apart_m(one, other)
-        if apart_m < spacing_m:
-            how = f"{apart_m:.2f} m apart" if apart_m >= 0 else f"overlap by {-apart_m:.2f} m"
+        gap_m = compute_gap_m(first, second)
+        if gap_m < spacing_m:
+            relation = f"{gap_m:.2f} m apart" if gap_m >= 0 else f"overlap by {-gap_m:.2f} m"
             yield ConfigProblem(
                 "spacing_m",
-                f"the limits of {one.name} and {other.name} are {how} north and east, {spacing_m:g} m is asked for",
+                f"the limits of {first.name} and {second.name} are {relation} north and east, "
+                f"{spacing_m:g} m is asked for",
                 "move sets.state_lower and sets.state_upper of one of them",
             )
 
 
-@fleet_app.command(help_epilogue=example("fleet check"))
+@fleet_app.command(help_epilogue=format_example("fleet check"))
 def check(file: File, /, *, json: QuietJson = False) -> int:
     """Say whether a fleet can be flown: its configurations, links, and how far apart its boxes are; sends nothing."""
     fleet = read_fleet(file)
     document = {
         "vehicles": [
-            {"name": one.name, "daemon": one.daemon, "url": one.config.daemon.vehicle} for one in fleet.members
+            {"name": member.name, "daemon": member.daemon, "url": member.config.daemon.vehicle}
+            for member in fleet.members
         ],
         "nearest_m": fleet.nearest_m if math.isfinite(fleet.nearest_m) else None,
     }
-    Common(json=json).show("fleet/check", document, lambda: _boxes(fleet))
+    Common(json=json).show("fleet/check", document, lambda: _make_box_table(fleet))
     return 0
 
 
-@fleet_app.command(help_epilogue=example("fleet fly"))
+@fleet_app.command(help_epilogue=format_example("fleet fly"))
 def fly(
     file: File,
     /,
@@ -194,60 +208,61 @@ def fly(
 
     When one ends otherwise than it was asked to, the others are landed, too. Exit code: the largest of theirs.
     """
-    from uavctl.cli.flying import checked_take_off
+    from uavctl.cli.flying import check_take_off
 
-    checked_take_off(arm, takeoff)
+    check_take_off(arm, takeoff)
     fleet = read_fleet(file)
-    more = [*(("--duration", str(duration)) if duration is not None else ())]
-    more += ["--arm", "--takeoff", str(takeoff)] if takeoff is not None else []
-    flights = [FleetFlight(one, [*more, "--out", str(out / one.name)]) for one in fleet.members]
-    with _first_signal() as asked, _shown(flights) as looks:
+    options = [*(("--duration", str(duration)) if duration is not None else ())]
+    options += ["--arm", "--takeoff", str(takeoff)] if takeoff is not None else []
+    flights = [FleetFlight(member, [*options, "--out", str(out / member.name)]) for member in fleet.members]
+    with _catch_first_signal() as stop_requested, _show_status(flights) as health:
         for flight in flights:
-            flight.begin()
-        landing = False
-        while any(flight.lasts() for flight in flights):
-            why = "asked to" if asked.is_set() else _astray(flights, looks)
-            if why and not landing:
-                landing = True
-                messages().print(f"{why}: all vehicles end their flights", soft_wrap=True)
+            flight.start()
+        is_landing = False
+        while any(flight.is_running() for flight in flights):
+            reason = "asked to" if stop_requested.is_set() else _find_failure(flights, health)
+            if reason and not is_landing:
+                is_landing = True
+                print_message(f"{reason}: all vehicles end their flights")
                 for flight in flights:
-                    flight.end()
-            asked.wait(POLL_S) if not landing else time.sleep(POLL_S)
+                    flight.request_end()
+            stop_requested.wait(POLL_S) if not is_landing else time.sleep(POLL_S)
         for flight in flights:
-            flight.last_words()
+            flight.join_output()
     document = {
         "vehicles": [
-            {"name": one.member.name, "exit_code": one.exit_code, "out": str(out / one.member.name)} for one in flights
+            {"name": flight.member.name, "exit_code": flight.exit_code, "out": str(out / flight.member.name)}
+            for flight in flights
         ]
     }
-    Common(json=json).show("fleet/fly", document, lambda: _ended(flights))
-    return max((one.exit_code or 0 for one in flights), default=0)
+    Common(json=json).show("fleet/fly", document, lambda: _make_exit_table(flights))
+    return max((flight.exit_code or 0 for flight in flights), default=0)
 
 
-@fleet_app.command(help_epilogue=example("fleet status"))
+@fleet_app.command(help_epilogue=format_example("fleet status"))
 def status(
     file: File, /, *, control: Annotated[Path | None, Parameter(show=False)] = None, json: QuietJson = False
 ) -> int:
     """Say how all vehicles of a file are doing, in one table. Exit code 1: not all daemons answer."""
     fleet, folder = read_fleet(file), find_control_folder(control)
-    found = {one.name: _health(one, folder) for one in fleet.members}
-    Common(json=json).show("fleet/status", {"vehicles": found}, lambda: _table(found))
-    return 0 if all(found.values()) else 1
+    health = {member.name: _read_health(member, folder) for member in fleet.members}
+    Common(json=json).show("fleet/status", {"vehicles": health}, lambda: _make_status_table(health))
+    return 0 if all(health.values()) else 1
 
 
-@fleet_app.command(help_epilogue=example("fleet land"))
+@fleet_app.command(help_epilogue=format_example("fleet land"))
 def land(file: File, /, *, control: Annotated[Path | None, Parameter(show=False)] = None) -> int:
     """Land all vehicles of a file. Exit code 1: not all of them take the order."""
-    fleet, folder, good = read_fleet(file), find_control_folder(control), True
-    for one in fleet.members:
+    fleet, folder, all_accepted = read_fleet(file), find_control_folder(control), True
+    for member in fleet.members:
         try:
-            reply = ask(ControlRequest(ask="land"), folder, one.daemon)
+            reply = send_request(ControlRequest(ask="land"), folder, member.daemon)
             verdict, text = ("accepted" if reply.ok else "refused"), reply.text
         except NotReachedError as error:
             verdict, text = "not reached", str(error)
-        good = good and verdict == "accepted"
-        messages().print(f"{one.name}: land {verdict}: {text}", soft_wrap=True, highlight=False)
-    return 0 if good else 1
+        all_accepted = all_accepted and verdict == "accepted"
+        print_message(f"{member.name}: land {verdict}: {text}", highlight=False)
+    return 0 if all_accepted else 1
 
 
 class FleetFlight:
@@ -255,10 +270,10 @@ class FleetFlight:
 
     def __init__(self, member: Member, options: Sequence[str]) -> None:
         self.member = member
-        begin = "from uavctl.cli.fleet import begin_daemon; begin_daemon()"
-        self._command = [sys.executable, "-P", "-c", begin, "fly", *member.options, *options]
+        daemon_code = "from uavctl.cli.fleet import run_fleet_daemon; run_fleet_daemon()"
+        self._command = [sys.executable, "-P", "-c", daemon_code, "fly", *member.options, *options]
         self._process: subprocess.Popen[str] | None = None
-        self._speaker = threading.Thread(target=self._say, name=member.name, daemon=True)
+        self._output_thread = threading.Thread(target=self._print_output, name=member.name, daemon=True)
 
     @property
     def exit_code(self) -> int | None:
@@ -266,9 +281,9 @@ class FleetFlight:
         code = None if self._process is None else self._process.poll()
         return code if code is None or code >= 0 else 128 - code
 
-    def begin(self) -> None:
-        """Start the daemon; what it says comes with the vehicle's name before each line."""
-        # A terminal's Ctrl-C goes to all processes of its session: a second one would end a daemon at once.
+    def start(self) -> None:
+        """Start the daemon; its output is printed with the vehicle's name before each line."""
+        # Ctrl-C of a terminal goes to all processes of its session: a second signal would end a daemon at once.
         self._process = subprocess.Popen(
             self._command,
             stdin=subprocess.PIPE,
@@ -278,62 +293,65 @@ class FleetFlight:
             errors="replace",
             start_new_session=True,
         )
-        self._speaker.start()
+        self._output_thread.start()
 
-    def lasts(self) -> bool:
-        """Whether the daemon runs."""
+    def is_running(self) -> bool:
+        """Return whether the daemon runs."""
         return self._process is not None and self._process.poll() is None
 
-    def end(self) -> None:
-        """Ask for the end, as Ctrl-C does: it brakes, holds, and lands or hands over; once more changes nothing."""
+    def request_end(self) -> None:
+        """Request the end, as Ctrl-C does: the vehicle brakes, holds, and lands or is handed over."""
         if self._process is not None and self._process.stdin is not None:
             self._process.stdin.close()
 
-    def last_words(self) -> None:
-        """Wait until all that the daemon said is shown; not for a process of its own that outlives it."""
-        self._speaker.join(LINE_S)
+    def join_output(self) -> None:
+        """Wait until the output of the daemon is printed, not for a child process that keeps it open."""
+        self._output_thread.join(TABLE_PERIOD_S)
 
-    def _say(self) -> None:
+    def _print_output(self) -> None:
         assert self._process is not None and self._process.stderr is not None
         with self._process.stderr as lines:
             for line in lines:
                 text = line.rstrip()
-                if text and not _HEALTH.match(text):  # of which the table has the newest
-                    messages().print(f"{self.member.name}: {text}", soft_wrap=True, highlight=False)
+                if text:
+                    print_message(f"{self.member.name}: {text}", highlight=False)
 
 
-def begin_daemon() -> None:
-    """Run the command line as a daemon of a fleet, with a Ctrl-C for it once standard input is closed.
+def run_fleet_daemon() -> None:
+    """Run the command line as a daemon of a fleet; raise Ctrl-C once standard input is closed.
 
-    It is closed by the fleet, or by the system when the fleet's process is killed: nobody would watch over the spacing.
+    The fleet closes it, or the system if the fleet's process is killed: then nothing supervises the spacing.
     """
 
-    def watch() -> None:
-        # Not by `sys.stdin`: the interpreter wants its lock when it ends, and aborts where this thread holds it.
+    def wait_for_close() -> None:
+        # Without `sys.stdin`: this thread would hold its lock, and the interpreter would abort at its end.
         while os.read(0, 1):
             pass
         signal.raise_signal(signal.SIGINT)
 
-    threading.Thread(target=watch, name="fleet", daemon=True).start()
+    threading.Thread(target=wait_for_close, name="fleet", daemon=True).start()
+    hide_health_lines()  # the fleet's table has the health of each vehicle
     main()
 
 
 @contextmanager
-def _first_signal() -> Iterator[threading.Event]:
-    """Note the first Ctrl-C or SIGTERM; later ones change nothing, since the vehicles are on their way down."""
-    asked = threading.Event()
-    before = {number: signal.signal(number, lambda *_: asked.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+def _catch_first_signal() -> Iterator[threading.Event]:
+    """Catch Ctrl-C and SIGTERM; only the first one counts, since all vehicles land then."""
+    stop_requested = threading.Event()
+    previous = {
+        number: signal.signal(number, lambda *_: stop_requested.set()) for number in (signal.SIGINT, signal.SIGTERM)
+    }
     try:
-        yield asked
+        yield stop_requested
     finally:
-        for number, handler in before.items():
+        for number, handler in previous.items():
             signal.signal(number, handler)
 
 
-def _astray(flights: Sequence[FleetFlight], looks: Looks) -> str:
-    """Return which vehicle may be anywhere: it was let go, or its daemon ended otherwise than it was asked to."""
+def _find_failure(flights: Sequence[FleetFlight], health_by_name: HealthByName) -> str:
+    """Return the failure of a vehicle: the envelope let it go, or its daemon failed; empty if there is none."""
     for flight in flights:
-        name, health = flight.member.name, looks.get(flight.member.name)
+        name, health = flight.member.name, health_by_name.get(flight.member.name)
         if flight.exit_code:
             return f"the daemon of {name} has ended with exit code {flight.exit_code}"
         if health is not None and health.let_go:
@@ -342,53 +360,58 @@ def _astray(flights: Sequence[FleetFlight], looks: Looks) -> str:
 
 
 @contextmanager
-def _shown(flights: Sequence[FleetFlight]) -> Iterator[Looks]:
-    """Look at all vehicles while they fly, and show them, from a thread of its own; yields the newest look."""
-    done, console, folder, looks = threading.Event(), messages(), find_control_folder(None), Looks()
+def _show_status(flights: Sequence[FleetFlight]) -> Iterator[HealthByName]:
+    """Show the status of all vehicles from a thread of its own; yield the newest health of each."""
+    done, console, folder, health_by_name = (
+        threading.Event(),
+        make_message_console(),
+        find_control_folder(None),
+        HealthByName(),
+    )
 
-    def look() -> Table:
-        for one in flights:
-            looks[one.member.name] = _health(one.member, folder) if one.lasts() else None
-        return _table(looks)
+    def refresh() -> Table:
+        for flight in flights:
+            health_by_name[flight.member.name] = _read_health(flight.member, folder) if flight.is_running() else None
+        return _make_status_table(health_by_name)
 
     def draw() -> None:
         if console.is_terminal:
             with Live(console=console, auto_refresh=False, transient=True) as live:
-                while not done.wait(LOOK_S):
-                    live.update(look(), refresh=True)
+                while not done.wait(STATUS_PERIOD_S):
+                    live.update(refresh(), refresh=True)
             return
-        told_s = -LINE_S
-        while not done.wait(LOOK_S):
-            table = look()
-            if time.monotonic() - told_s >= LINE_S:
-                told_s = time.monotonic()
+        printed_s = -TABLE_PERIOD_S
+        while not done.wait(STATUS_PERIOD_S):
+            table = refresh()
+            if time.monotonic() - printed_s >= TABLE_PERIOD_S:
+                printed_s = time.monotonic()
                 console.print(table)
 
     thread = threading.Thread(target=draw, name="fleet", daemon=True)
     thread.start()
     try:
-        yield looks
+        yield health_by_name
     finally:
         done.set()
-        thread.join(LINE_S)
+        thread.join(TABLE_PERIOD_S)
 
 
-def _health(member: Member, folder: Path) -> Health | None:
-    """Return how a vehicle is doing; None where its daemon does not answer."""
+def _read_health(member: Member, folder: Path) -> Health | None:
+    """Return the health of a vehicle; None where its daemon does not answer."""
     try:
-        return ask(ControlRequest(ask="status"), folder, member.daemon).status
+        return send_request(ControlRequest(ask="status"), folder, member.daemon).status
     except NotReachedError:
         return None
 
 
-def _table(found: Looks) -> Table:
+def _make_status_table(health_by_name: HealthByName) -> Table:
     rows = []
-    for name, health in found.items():
+    for name, health in health_by_name.items():
         if health is None:
             rows.append([name, "-", "no daemon answers", "-", "-", "-"])
             continue
         vehicle = health.vehicle
-        place = health.position_m
+        position = health.position_m
         rows.append(
             [
                 name,
@@ -396,22 +419,24 @@ def _table(found: Looks) -> Table:
                 health.ending or health.who_flies or "-",
                 "not heard" if vehicle is None else f"{vehicle.mode}, {'armed' if vehicle.armed else 'disarmed'}",
                 "-" if health.age_s is None else f"{health.age_s:.2f} s",
-                "-" if place is None else ", ".join(f"{value:+.2f}" for value in place.values()),
+                "-" if position is None else ", ".join(f"{value:+.2f}" for value in position.values()),
             ]
         )
     headings = ("vehicle", "mode", "who flies", "autopilot", "age", "position NED [m]")
-    return columns("", headings, rows, headings[:4], fold=True)
+    return make_table("", headings, rows, headings[:4], fold=True)
 
 
-def _boxes(fleet: Fleet) -> Table:
+def _make_box_table(fleet: Fleet) -> Table:
     rows = []
-    for one in fleet.members:
-        sides = [f"{low:g} to {high:g}" for low, high in map(one.limits_m, AXES)]
-        rows.append([one.name, one.config.daemon.vehicle, *sides])
-    near = "one vehicle" if not math.isfinite(fleet.nearest_m) else f"nearest boxes {fleet.nearest_m:.2f} m apart"
-    return columns(near, ("vehicle", "link", *(f"{axis} [m]" for axis in AXES)), rows, ("vehicle", "link"), fold=True)
+    for member in fleet.members:
+        sides = [f"{low:g} to {high:g}" for low, high in map(member.get_limits_m, AXES)]
+        rows.append([member.name, member.config.daemon.vehicle, *sides])
+    title = "one vehicle" if not math.isfinite(fleet.nearest_m) else f"nearest boxes {fleet.nearest_m:.2f} m apart"
+    return make_table(
+        title, ("vehicle", "link", *(f"{axis} [m]" for axis in AXES)), rows, ("vehicle", "link"), fold=True
+    )
 
 
-def _ended(flights: Sequence[FleetFlight]) -> Table:
-    rows = [[one.member.name, str(one.exit_code)] for one in flights]
-    return columns("how the daemons ended", ("vehicle", "exit code"), rows)
+def _make_exit_table(flights: Sequence[FleetFlight]) -> Table:
+    rows = [[flight.member.name, str(flight.exit_code)] for flight in flights]
+    return make_table("how the daemons ended", ("vehicle", "exit code"), rows)

@@ -1,151 +1,56 @@
-"""Command `uavctl fly`."""
+"""Command `uavctl fly`: the flight daemon on a real link. Without `--arm` it asks for no mode but landing."""
 
 from __future__ import annotations
 
-import os
-import socket
-import sys
-import threading
 import time
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
-from rich.text import Text
 
 from logs.recording.ends import create_recording, describe_ending, put_header
 from logs.recording.parameters import ParameterReader
-from logs.recording.recorder import Recorder, RecorderStatus
+from logs.recording.recorder import Recorder
 from logs.recording.summary import FlightSummary, make_summary_table
 from logs.recording.topics import ENDED
 from uavctl.build.controller import design_of, prepare
 from uavctl.check.findings import Item
-from uavctl.cli.common import DEFAULTS, SPAN_S, Common, Mocap, TakeOff, given_keys, labelled, located, messages
+from uavctl.cli.common import (
+    DEFAULTS,
+    SPAN_S,
+    Common,
+    Mocap,
+    TakeOff,
+    label_text,
+    locate_design_errors,
+    make_key_overrides,
+    print_message,
+)
 from uavctl.cli.flying import (
     Live,
     LivePort,
-    checked_take_off,
-    conclude,
-    ending_noted,
-    goto_overrides,
-    live_line,
-    live_view_port,
-    onlookers,
-    stand_by,
+    check_take_off,
+    choose_live_port,
+    conclude_flight,
+    make_goto_overrides,
+    open_viewers,
+    order_stand_by,
+    print_ending,
+    record_failure,
     stop_on_signals,
-    tell_ending,
     wait_for_server,
 )
+from uavctl.cli.live_line import show_live_line
+from uavctl.cli.services import enable_realtime_process, run_services
 from uavctl.clock import Ticker, monotonic_ns, read_zero_utc_ns
-from uavctl.config import Config, LoadedConfig
+from uavctl.config import LoadedConfig
 from uavctl.config.connections import find_security_warnings
-from uavctl.daemon.control_socket import ControlServer, find_control_folder, make_daemon_name, open_listener
-from uavctl.daemon.daemon import AfterTick
+from uavctl.daemon.control_socket import find_control_folder, make_daemon_name, open_listener
 from uavctl.daemon.daemon import fly as run_daemon
 from uavctl.daemon.engagement import Engagement, TickFollower, check_places, compute_stop_limit_s
-from uavctl.daemon.health import HealthMonitor, RecorderHealth
 from uavctl.daemon.lock import lock_vehicle
-from uavctl.daemon.notifier import Notifier
-from uavctl.daemon.realtime import control_garbage_collection, enable_realtime
 from uavctl.io.signed_connection import open_links
 from uavctl.loop import ControlLoop
-
-# What stands beside the control loop of `uavctl fly`: orders, health lines, the service manager, real time.
-
-
-_UNREAD_LINES = 10  # health lines that wait for a slow terminal or log
-
-
-@contextmanager
-def operation(
-    loop: ControlLoop, config: Config, path: Path, status: Callable[[], RecorderStatus], listener: socket.socket
-) -> Iterator[Sequence[AfterTick]]:
-    """Yield the function that the daemon calls after each tick; close its parts at the end.
-
-    Raises:
-        UsageError: the service manager's variables cannot be understood.
-    """
-    notifier = Notifier()
-    with _health_lines() as show:
-
-        def tell(line: str) -> None:
-            notifier.send_status(line)
-            show(line)
-
-        def recorder() -> RecorderHealth:
-            return recorder_health(status(), path)
-
-        identity = (make_daemon_name(config), config.daemon.vehicle, os.getpid())
-        watch = HealthMonitor(loop, config, identity, recorder, tell)
-        server = ControlServer(listener, config, loop, watch.make_health)
-        try:
-            # The sign of life comes last: it stands for all that a tick has to do.
-            yield watch.after_tick, server.after_tick, notifier.after_tick
-        finally:
-            notifier.send_status(f"ended: {loop.ending.sentence}")
-            server.close()
-            notifier.close()
-
-
-@contextmanager
-def as_realtime(wanted: bool) -> Iterator[Sequence[AfterTick]]:
-    """Set real-time scheduling and memory if wanted; return the function to call after each tick."""
-    with ExitStack() as stack:
-        for outcome in stack.enter_context(enable_realtime()) if wanted else ():
-            told = Text(f"--realtime: {outcome.name}: {outcome.text}")
-            messages().print(
-                told if outcome.is_applied else labelled("warning", told.plain, "bold yellow"), soft_wrap=True
-            )
-        yield (stack.enter_context(control_garbage_collection()).after_tick,)
-
-
-@contextmanager
-def _health_lines() -> Iterator[Callable[[str], None]]:
-    """Write lines to standard error from a thread of its own, unless a terminal shows the live line instead."""
-    lines: deque[str] = deque(maxlen=_UNREAD_LINES)
-    if sys.stderr.isatty():
-        yield lines.append
-        return
-    news, done = threading.Event(), threading.Event()
-
-    def write() -> None:
-        while not done.is_set():
-            news.wait()
-            news.clear()
-            while lines:
-                sys.stderr.write(lines.popleft() + "\n")
-                sys.stderr.flush()
-
-    def show(line: str) -> None:
-        lines.append(line)
-        news.set()
-
-    thread = threading.Thread(target=write, name="health", daemon=True)
-    thread.start()
-    try:
-        yield show
-    finally:
-        done.set()
-        news.set()
-        thread.join(1.0)  # a reader that hangs does not keep the daemon
-
-
-def recorder_health(status: RecorderStatus, path: Path) -> RecorderHealth:
-    """Return the state of a recording, for the flight's status."""
-    reason = status.warning if status.ok else status.reason or status.refusal
-    return RecorderHealth(
-        ok=status.ok,
-        dropped=status.dropped + status.refused + status.gone,
-        reason=reason,
-        path=str(path),
-        unwritten_s=status.unwritten_s,
-    )
-
-
-# `uavctl fly`: the flight daemon on a real link. Without `--arm` it never asks for a mode but landing.
 
 
 def fly(
@@ -178,9 +83,9 @@ def fly(
     Setpoints are streamed as soon as the vehicle is heard and there is an estimate, neutral ones until the pilot
     switches. When the pilot leaves the mode, streaming stops at once and does not come back.
     """
-    take_off_m = checked_take_off(arm, takeoff)
-    view_port = live_view_port(live=live, port=live_port)
-    overrides = [*given_keys(daemon__vehicle=vehicle, daemon__mocap=mocap), *goto_overrides(goto)]
+    take_off_m = check_take_off(arm, takeoff)
+    view_port = choose_live_port(live=live, port=live_port)
+    overrides = [*make_key_overrides(daemon__vehicle=vehicle, daemon__mocap=mocap), *make_goto_overrides(goto)]
     summary = fly_daemon(
         common.with_overrides(overrides).load(),
         take_off_m=take_off_m,
@@ -188,7 +93,7 @@ def fly(
         duration_s=duration,
         out=out,
         control=control,
-        as_realtime_process=realtime,
+        realtime=realtime,
         view_port=view_port,
     )
     common.show("fly", summary, lambda: make_summary_table(summary))
@@ -203,73 +108,73 @@ def fly_daemon(
     duration_s: float | None = None,
     out: Path | None = None,
     control: Path | None = None,
-    as_realtime_process: bool = False,
+    realtime: bool = False,
     view_port: int | None = None,
     follower: TickFollower | None = None,
 ) -> FlightSummary:
-    """Fly a vehicle until the end, record it, and say on the console how it ended.
+    """Fly a vehicle until the end, record it, and print how it ended.
 
     Args:
-        loaded: the configuration, with where it is from.
-        take_off_m: height of the climb above the ground [m]; None leaves arming and modes to the pilot.
-        goto: whether the mission is the place of `--goto`.
-        duration_s: hand over after this time [s]; None flies on.
-        out: folder of the recording; None makes a new one below `flights/`.
-        control: folder of the socket for orders; None is the user's own.
-        as_realtime_process: SCHED_FIFO and locked memory, as far as permitted.
-        view_port: TCP port of a live view; None is none.
-        follower: looks at every tick, and may give orders.
+        loaded: The configuration and its source.
+        take_off_m: Height of the climb above the ground [m]; None leaves arming and modes to the pilot.
+        goto: Whether the mission is the place of `--goto`.
+        duration_s: Hand over after this time [s]; None flies on.
+        out: Folder of the recording; None makes a new one below `flights/`.
+        control: Folder of the socket for orders; None: the user's folder.
+        realtime: SCHED_FIFO and locked memory, as far as permitted.
+        view_port: TCP port of a live view; None: no view.
+        follower: Called at every tick; may give orders.
 
     Raises:
-        UavctlError: nothing was flown, and why.
+        UavctlError: Nothing was flown; the message is the reason.
     """
     config = loaded.config
     engagement = Engagement(config, take_off_m=take_off_m, goto=goto, follower=follower)
     tick_ns, dt_ns = round(config.daemon.tick_s * 1e9), round(config.plant.dt_s * 1e9)
-    # First of all, so that a second daemon is refused at once.
+    # The lock comes first: it refuses a second daemon at once.
     with (
-        lock_vehicle(config.daemon.vehicle) as tenure,
+        lock_vehicle(config.daemon.vehicle) as vehicle_lock,
         open_listener(find_control_folder(control), make_daemon_name(config)) as listener,
-        onlookers(view_port) as looking,
+        open_viewers(view_port) as viewers,
         create_recording(out, config.name, config.log.free_bytes) as path,
     ):
-        with located(loaded):
+        with locate_design_errors(loaded):
             design = design_of(config)
             check_places(config, design, take_off_m, engagement.goal)
             prepared = prepare(config, design)
-        # an eighth of what loading `fly` would take
-        from uavctl.cli.check import checked_before_arming, mission_items, record_items, record_parameters
+        # Loaded late: it takes an eighth of the loading time of `fly`.
+        from uavctl.cli.check import check_before_arming, make_mission_items, record_items, record_parameters
 
-        planned = () if take_off_m is None else mission_items(config, prepared)
-        begun = time.perf_counter()
+        mission_items = () if take_off_m is None else make_mission_items(config, prepared)
+        begin_s = time.perf_counter()
         with (
-            as_realtime(as_realtime_process) as collect,
+            enable_realtime_process(realtime) as garbage_functions,
             stop_on_signals() as stopped,
             open_links(config, wait_for_server(stopped)) as connections,
         ):
             checked: tuple[Item, ...] = ()
-            told = ParameterReader()
+            parameters = ParameterReader()
             if take_off_m is not None:
-                checked = checked_before_arming(config, connections, stopped, take_off_m, told, planned)
-            recorder = Recorder(path, config.log, derived_topics=looking)
+                checked = check_before_arming(config, connections, stopped, take_off_m, parameters, mission_items)
+            recorder = Recorder(path, config.log, derived_topics=viewers)
             loop = ControlLoop(config, prepared.controller, recorder, time.perf_counter_ns)
             engagement.begin(loop)
-            asked_for = False
+            is_stop_requested = False
             try:
                 put_header(recorder, prepared, monotonic_ns(), read_zero_utc_ns())
                 record_items(recorder, checked, monotonic_ns())
-                record_parameters(recorder, told, monotonic_ns())
+                record_parameters(recorder, parameters, monotonic_ns())
                 for warning in find_security_warnings(config.security, config.daemon):
-                    messages().print(labelled("warning", warning), soft_wrap=True)
-                if tenure.left_flight_ns is not None:
-                    stand_by(loop, tenure.left_flight_ns)
-                messages().print(f"recording to {path}; Ctrl-C hands over", soft_wrap=True)
+                    print_message(label_text("warning", warning))
+                if vehicle_lock.left_flight_ns is not None:
+                    order_stand_by(loop, vehicle_lock.left_flight_ns)
+                print_message(f"recording to {path}; Ctrl-C hands over")
                 with (
-                    live_line(loop, recorder, duration_s, config.daemon.tick_s) as shown,
-                    operation(loop, config, path, recorder.status, listener) as beside,
-                    ending_noted(loop),
+                    show_live_line(loop, recorder.status, duration_s, config.daemon.tick_s) as feed,
+                    run_services(loop, config, path, recorder.status, listener) as service_functions,
+                    record_failure(loop),
                 ):
-                    asked_for = run_daemon(
+                    is_stop_requested = run_daemon(
                         loop,
                         connections,
                         Ticker(tick_ns, dt_ns),
@@ -277,20 +182,20 @@ def fly_daemon(
                         duration_s=duration_s,
                         stop_limit_s=compute_stop_limit_s(config, takes_off=engagement.takes_off),
                         after_tick=(
-                            shown.after_tick,
-                            lambda *_: tenure.update(loop.leaves_vehicle),
+                            feed.after_tick,
+                            lambda *_: vehicle_lock.update(loop.leaves_vehicle),
                             lambda *_: recorder.catch_up(),
                             lambda ticked, _: engagement.follow(loop, ticked),
-                            *beside,
-                            *collect,
+                            *service_functions,
+                            *garbage_functions,
                         ),
-                        on_events=shown.news.extend,
+                        on_events=feed.events.extend,
                     )
-                if asked_for:
-                    tenure.update(False)
+                if is_stop_requested:
+                    vehicle_lock.update(False)
             finally:
                 ending = loop.ending
                 recorder.put(ENDED, monotonic_ns(), ending)
                 status = recorder.close()
-                tell_ending(describe_ending(ending, status))
-    return conclude(path, time.perf_counter() - begun, status, ending)
+                print_ending(describe_ending(ending, status))
+    return conclude_flight(path, time.perf_counter() - begin_s, status, ending)

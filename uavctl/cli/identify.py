@@ -1,4 +1,4 @@
-"""`uavctl identify`: plant, lag, disturbance and link model from a recording."""
+"""Command `uavctl identify`: plant, lag, disturbance and link model from a recording."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from logs.recording.reader import header, lacks_end, read
 from logs.recording.senders import choose_vehicle, get_system_id
 from logs.recording.tlog import read_tlog
 from uavctl.build.controller import design_of
-from uavctl.cli.common import DEFAULTS, Common, System, bars, can_be_read, warn
+from uavctl.cli.common import DEFAULTS, Common, System, check_readable, make_progress, warn
 from uavctl.config import Config
 from uavctl.config.load import dump_config, parse
 from uavctl.errors import DesignError, UsageError
@@ -29,7 +29,9 @@ from uavctl.lab.identify.result import Identification, fits_of, identify, loss_w
 
 
 def identify_command(
-    flight: Annotated[Path, Parameter(help="the recording: .mcap of ours, or anybody's .tlog", validator=can_be_read)],
+    flight: Annotated[
+        Path, Parameter(help="the recording: .mcap of ours, or anybody's .tlog", validator=check_readable)
+    ],
     /,
     *,
     common: Common = DEFAULTS,
@@ -41,41 +43,43 @@ def identify_command(
     A recording of ours brings its configuration along; for a `.tlog`, --config and --set say which messages are
     positions and in what frame. Plant, link, rate and noise of that configuration are replaced, all else is kept.
     """
-    history, config = _history(flight, common, system)
+    history, config = _read_history(flight, common, system)
     target = out if out is not None else flight.with_name("identified.toml")
     if target == flight:
         raise UsageError(f"{target}: is the recording itself, which would be lost; choose another place with --out")
     refuse_recording_path(target)
-    with fitting(fits_of(history, config)) as advance:
-        found = identify(history, config, advance)
-    doubts = (*found.result.warnings, *design_doubts(found.config))
-    result = msgspec.structs.replace(found.result, warnings=doubts)
-    found = dataclasses.replace(found, result=result)
+    with show_fit_progress(fits_of(history, config)) as advance:
+        identification = identify(history, config, advance)
+    warnings = (*identification.result.warnings, *find_design_warnings(identification.config))
+    result = msgspec.structs.replace(identification.result, warnings=warnings)
+    identification = dataclasses.replace(identification, result=result)
     page = target.with_suffix(".html")
-    write_atomically(target, dump_config(found.config))
-    write_atomically(page, write_page(found, history.seen, str(flight)))
+    write_atomically(target, dump_config(identification.config))
+    write_atomically(page, write_page(identification, history.seen, str(flight)))
     document = {**msgspec.to_builtins(result), "config": str(target), "report": str(page)}
-    common.show("identify", document, lambda: _picture(found, target, page))
+    common.show("identify", document, lambda: _render(identification, target, page))
     return 0
 
 
-def _history(flight: Path, common: Common, system: int | None) -> tuple[FlightHistory, Config]:
-    """Return the flight, and the configuration that its result goes into."""
+def _read_history(flight: Path, common: Common, system: int | None) -> tuple[FlightHistory, Config]:
+    """Read the flight, and the configuration that the result is written into."""
     if detect_kind(flight) is FileKind.TLOG:
         config = common.load().config
         recorded = read_tlog(flight)
         for note in recorded.notes:
             warn(note)
-        chosen = choose_vehicle(recorded.packets, str(flight), system or config.daemon.vehicle_system_id or None)
-        others = {one.system for one in chosen.others}
-        if others:
-            listed = ", ".join(map(str, sorted(others)))
-            warn(f"system {chosen.system} is identified; vehicles left out: {listed}; --system chooses another")
-        one_link = msgspec.structs.replace(
-            config.daemon, vehicle="tlog", mocap="tlog", vehicle_system_id=chosen.system or 0
+        choice = choose_vehicle(recorded.packets, str(flight), system or config.daemon.vehicle_system_id or None)
+        other_systems = {vehicle.system for vehicle in choice.others}
+        if other_systems:
+            system_list = ", ".join(map(str, sorted(other_systems)))
+            warn(f"system {choice.system} is identified; vehicles left out: {system_list}; --system chooses another")
+        tlog_daemon = msgspec.structs.replace(
+            config.daemon, vehicle="tlog", mocap="tlog", vehicle_system_id=choice.system or 0
         )
-        read_as = msgspec.structs.replace(config, daemon=one_link)
-        return from_tlog([one for one in recorded.packets if get_system_id(one.data) not in others], read_as), config
+        tlog_config = msgspec.structs.replace(config, daemon=tlog_daemon)
+        return from_tlog(
+            [vehicle for vehicle in recorded.packets if get_system_id(vehicle.data) not in other_systems], tlog_config
+        ), config
     if system is not None:
         raise UsageError("--system is for a .tlog: a recording of ours is of one vehicle")
     if common.overrides or common.config != DEFAULTS.config:
@@ -86,8 +90,8 @@ def _history(flight: Path, common: Common, system: int | None) -> tuple[FlightHi
     return from_records(read(flight)), config
 
 
-def design_doubts(config: Config) -> tuple[str, ...]:
-    """Return why the identified configuration makes no design as it stands; empty if it does."""
+def find_design_warnings(config: Config) -> tuple[str, ...]:
+    """Return a warning if the identified configuration has no design; else nothing."""
     try:
         design_of(config)
     except DesignError as error:
@@ -96,44 +100,47 @@ def design_doubts(config: Config) -> tuple[str, ...]:
 
 
 @contextmanager
-def fitting(steps: int) -> Iterator[Callable[[], None]]:
+def show_fit_progress(steps: int) -> Iterator[Callable[[], None]]:
     """Show a bar while plants are fitted."""
-    with bars() as progress:
+    with make_progress() as progress:
         task = progress.add_task("fitting", total=steps)
         yield lambda: progress.advance(task)
 
 
-def _picture(found: Identification, target: Path, page: Path) -> RenderableType:
-    result = found.result
+def _render(identification: Identification, target: Path, page: Path) -> RenderableType:
+    result = identification.result
     plant = Table(title=f"{result.flown_s:.0f} s flown under setpoints, {result.positions} positions")
     for column in ("axis", "lag [s]", "drag [1/s]", "gain", "wind [m/s²]", "residual [mm]", "R²"):
         plant.add_column(column, justify="left" if column == "axis" else "right")
-    for one in result.response:
+    for axis in result.response:
         plant.add_row(
-            one.axis,
-            f"{one.lag_s:.3f}",
-            f"{one.drag_1ps:.3f}",
-            "–" if one.gain is None else f"{one.gain:.3f}",
-            f"{one.wind_std_mps2:.3f}",
-            f"{1e3 * one.residual_std_m:.1f}",
-            f"{one.r2:.3f}",
+            axis.axis,
+            f"{axis.lag_s:.3f}",
+            f"{axis.drag_1ps:.3f}",
+            "–" if axis.gain is None else f"{axis.gain:.3f}",
+            f"{axis.wind_std_mps2:.3f}",
+            f"{1e3 * axis.residual_std_m:.1f}",
+            f"{axis.r2:.3f}",
         )
     kinds = Table(title="dead time, and error on the halves not fitted to")
     for column in ("plant", "dead time [s]", "range [s]", "error [mm]"):
         kinds.add_column(column, justify="left" if column == "plant" else "right")
     for kind in result.candidates:
         low_s, high_s = kind.dead_time_range_s
-        within = f"{low_s:.2f} to {high_s:.2f}"
-        kinds.add_row(kind.model, f"{kind.dead_time_s:.2f}", within, f"{1e3 * kind.error_m:.1f}")
-    dead_ms, ramp_ms = 1e3 * found.config.plant.dead_time_s, 1e3 * result.ramp_s
+        range_text = f"{low_s:.2f} to {high_s:.2f}"
+        kinds.add_row(kind.model, f"{kind.dead_time_s:.2f}", range_text, f"{1e3 * kind.error_m:.1f}")
+    dead_ms, ramp_ms = 1e3 * identification.config.plant.dead_time_s, 1e3 * result.ramp_s
     ramp = f"configured dead time: {dead_ms:.1f} ms, of which {ramp_ms:.1f} ms are half of a setpoint's own ramp"
     link = Table(title="link", show_header=False)
     for name, value in (
-        ("rate", f"{found.link.rate_hz:.4g} Hz"),
-        ("lost", loss_words(found.link)),
-        ("delay", f"{1e3 * found.link.delay_s:.0f} ms, 99 % within {1e3 * found.link.jitter_s:.0f} ms more"),
+        ("rate", f"{identification.link.rate_hz:.4g} Hz"),
+        ("lost", loss_words(identification.link)),
+        (
+            "delay",
+            f"{1e3 * identification.link.delay_s:.0f} ms, 99 % within {1e3 * identification.link.jitter_s:.0f} ms more",
+        ),
     ):
         link.add_row(name, value)
-    told = [Text(text, style="yellow") for text in result.warnings]
+    warning_lines = [Text(text, style="yellow") for text in result.warnings]
     ramps = [ramp] if result.ramp_s > 0.0 else []
-    return Group(plant, kinds, *ramps, link, *told, f"configuration: {target}", f"page: {page}")
+    return Group(plant, kinds, *ramps, link, *warning_lines, f"configuration: {target}", f"page: {page}")

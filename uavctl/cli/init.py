@@ -14,19 +14,19 @@ from cyclopts import Parameter
 from uavctl.build.controller import LEAST_OUTSIDE_M, design_of, resting
 from uavctl.build.mission import resting_places
 from uavctl.check.parameters import compute_max_accel_mps2
-from uavctl.cli.common import messages
+from uavctl.cli.common import print_message
 from uavctl.config import parse
 from uavctl.errors import UsageError
 
-WALL_M = LEAST_OUTSIDE_M  # between a wall and the limit of the vehicle's centre: so far the envelope lets it go
-TIMEOUT_S = 0.7  # COM_OF_LOSS_T and GUID_TIMEOUT of docs/first-flight.md: so long the last acceleration may go on
-MOST_MPS2 = {"px4": 4.0, "ardupilot": 2.0}  # of the presets
+WALL_M = LEAST_OUTSIDE_M  # from a limit of the vehicle's centre to the wall; the envelope allows as much
+TIMEOUT_S = 0.7  # COM_OF_LOSS_T and GUID_TIMEOUT of docs/first-flight.md: longest time of the last acceleration
+MAX_ACCEL_MPS2 = {"px4": 4.0, "ardupilot": 2.0}  # of the presets
 SIMULATED_VEHICLES = {"px4": "udpin://0.0.0.0:14540", "ardupilot": "tcp://127.0.0.1:5760"}  # as of `uavctl sim`
-LEAST_MPS2 = 1.0  # holds the wind that the presets count on (0.6 m/s²), and leaves something to fly with
-LEAST_M = 0.2  # between the places to rest in, so that there is somewhere to fly to
-LARGEST_M = 1000.0
-_WIDE_M = 3.0
-_STEP_M = 0.1  # that a smallest size is rounded up to
+MIN_ACCEL_MPS2 = 1.0  # the wind of the presets is 0.6 m/s²; the rest is for flight
+MIN_FLIGHT_M = 0.2  # least distance between the first and the last place at rest
+MAX_SIZE_M = 1000.0
+_WIDE_SIDE_M = 3.0
+_ROUND_UP_M = 0.1  # the smallest size in a message is rounded up to a multiple
 _AXES = ("length", "width", "height")
 
 _TEXT = """\
@@ -84,9 +84,9 @@ def init(
     ] = ("my-room.toml"),
 ) -> int:
     """Write a short configuration for a room: the keys that matter, by name; everything else has its default."""
-    sizes = read_sizes(room)
+    sizes = parse_sizes(room)
     name = "my-room.toml" if out == "-" else out
-    text = room_text(sizes, autopilot, name)
+    text = format_room(sizes, autopilot, name)
     _check_fits(sizes, autopilot)
     if out == "-":
         sys.stdout.write(text)
@@ -98,16 +98,12 @@ def init(
         raise UsageError(f"{out}: is there already; give another file with --out, or remove it") from error
     except OSError as error:
         raise UsageError(f"{out}: cannot be written ({error.strerror}); give another file with --out") from error
-    messages().print(
-        f"wrote {out}: limits {WALL_M:g} m from walls and ceiling; next: uavctl design --config {out}",
-        markup=False,
-        soft_wrap=True,
-    )
+    print_message(f"wrote {out}: limits {WALL_M:g} m from walls and ceiling; next: uavctl design --config {out}")
     return 0
 
 
-def read_sizes(room: str) -> tuple[float, float, float]:
-    """Length, width and height [m] of a room as it is typed.
+def parse_sizes(room: str) -> tuple[float, float, float]:
+    """Parse length, width and height [m] of a room.
 
     Raises:
         UsageError: They are not three lengths.
@@ -116,17 +112,17 @@ def read_sizes(room: str) -> tuple[float, float, float]:
         sizes = [float(part) for part in re.split("[x×X*]", room)]
     except ValueError:
         sizes = []
-    if len(sizes) != len(_AXES) or not all(0.0 < size <= LARGEST_M for size in sizes):
+    if len(sizes) != len(_AXES) or not all(0.0 < size <= MAX_SIZE_M for size in sizes):
         raise UsageError(
             f"--room {room}: is no room; give length x width x height in metres, each above 0 and at most "
-            f"{LARGEST_M:g}, as in 6x5x2.5"
+            f"{MAX_SIZE_M:g}, as in 6x5x2.5"
         )
     length, width, height = sizes
     return length, width, height
 
 
-def room_text(sizes: tuple[float, float, float], autopilot: str, file: str) -> str:
-    """The configuration of a room of these sizes [m]."""
+def format_room(sizes: tuple[float, float, float], autopilot: str, file: str) -> str:
+    """Return the configuration of a room of these sizes [m]."""
     length, width, height = sizes
     top = round(height - WALL_M, 3)
     north, east = (round(0.5 * size - WALL_M, 3) for size in (length, width))
@@ -140,7 +136,7 @@ def room_text(sizes: tuple[float, float, float], autopilot: str, file: str) -> s
         base=f"room-{autopilot}",
         wall=WALL_M,
         timeout=TIMEOUT_S,
-        accel=max(min(allowed_mps2, MOST_MPS2[autopilot]), LEAST_MPS2),
+        accel=max(min(allowed_mps2, MAX_ACCEL_MPS2[autopilot]), MIN_ACCEL_MPS2),
         north=(-north, north),
         east=(-east, east),
         top=top,
@@ -149,24 +145,25 @@ def room_text(sizes: tuple[float, float, float], autopilot: str, file: str) -> s
     )
 
 
-def _check_fits(sizes: tuple[float, float, float], autopilot: str) -> None:
-    """See that plans may rest in a room, and somewhere to fly to is left.
+def _check_fits(sizes_m: tuple[float, float, float], autopilot: str) -> None:
+    """Check that plans may rest in a room, and that places at rest are far enough apart.
 
     Raises:
-        UsageError: A side is too short; the shortest possible one is told.
+        UsageError: A side is too short; the message has the shortest possible one.
     """
-    length, width, height = (max(size, _WIDE_M) for size in sizes)  # where there is a design in any case
-    config = parse(room_text((length, width, height), autopilot, "room"), "room").config
+    length, width, height = (max(size_m, _WIDE_SIDE_M) for size_m in sizes_m)  # a room of this size always has a design
+    config = parse(format_room((length, width, height), autopilot, "room"), "room").config
     design = design_of(config)
-    least, most = resting_places(design.plant, design.state_set, resting(design))
-    needed = np.array((length, width, height)) - (most - least) + LEAST_M
-    short = [
-        f"a {name} of {size:g} m (at least {math.ceil(need / _STEP_M) * _STEP_M:.1f} m)"
-        for name, size, need in zip(_AXES, sizes, needed.tolist(), strict=True)
-        if size < need
+    lower_m, upper_m = resting_places(design.plant, design.state_set, resting(design))
+    needed_m = np.array((length, width, height)) - (upper_m - lower_m) + MIN_FLIGHT_M
+    short_sides = [
+        f"a {name} of {size_m:g} m (at least {math.ceil(need_m / _ROUND_UP_M) * _ROUND_UP_M:.1f} m)"
+        for name, size_m, need_m in zip(_AXES, sizes_m, needed_m.tolist(), strict=True)
+        if size_m < need_m
     ]
-    if short:
+    if short_sides:
         raise UsageError(
-            f"--room: {', '.join(short)} leaves no place to fly to, {WALL_M:g} m from walls and ceiling and with room "
+            f"--room: {', '.join(short_sides)} leaves no place to fly to, {WALL_M:g} m from walls and ceiling and "
+            f"with room "
             "to stop"
         )

@@ -9,13 +9,13 @@ from cyclopts import App, Parameter
 from rich.table import Table
 
 from uavctl.cli.common import Common, Json
-from uavctl.cli.usage import example
+from uavctl.cli.usage import format_example
 from uavctl.io.key_file import new_key, read_key
 
-key_app = App(name="key", help="Make and look at keys of MAVLink 2 signing.", help_epilogue=example("key"))
+key_app = App(name="key", help="Make and look at keys of MAVLink 2 signing.", help_epilogue=format_example("key"))
 
 
-@key_app.command(help_epilogue=example("key new"))
+@key_app.command(help_epilogue=format_example("key new"))
 def new(
     file: Annotated[Path, Parameter(help="file to make; one that is there is not written over")], *, json: Json = False
 ) -> int:
@@ -23,16 +23,16 @@ def new(
 
     The file holds a passphrase, so that ground stations that ask for one can be given the same key.
     """
-    return _show(file, new_key(file).name, json=json)
+    return _show_key(file, new_key(file).name, json=json)
 
 
-@key_app.command(help_epilogue=example("key show"))
+@key_app.command(help_epilogue=format_example("key show"))
 def show(file: Annotated[Path, Parameter(help="file to read")], *, json: Json = False) -> int:
     """Say which key a file holds: equal names are equal keys. Nothing of the key itself is shown."""
-    return _show(file, read_key(file).name, json=json)
+    return _show_key(file, read_key(file).name, json=json)
 
 
-def _show(file: Path, name: str, *, json: bool) -> int:
+def _show_key(file: Path, name: str, *, json: bool) -> int:
     table = Table.grid(padding=(0, 2))
     table.add_row("file", str(file))
     table.add_row("name of the key", name)

@@ -1,4 +1,4 @@
-"""Commands `uavctl log`: info, recover, export, layout."""
+"""Commands `uavctl log`: export, info, recover and layout, and the names of the other ones."""
 
 from __future__ import annotations
 
@@ -19,22 +19,30 @@ from logs.recording.disk import FileKind, detect_kind
 from logs.recording.export import Exported, TableFormat, Watch, export_tables
 from logs.recording.foreign import read_foreign_flight
 from logs.recording.info import PositionLoss, RecordingInfo
-from logs.recording.info import read_info as recording_info
+from logs.recording.info import read_info as read_info
 from logs.recording.mavlink_flight import MavlinkFlightInfo, facts_of, rate_of
 from logs.recording.parameters import VehicleParameter, count_parameters
 from logs.recording.reader import RecordedMessage, lacks_end
 from logs.recording.recover import RecoverResult
-from logs.recording.recover import recover as restore
+from logs.recording.recover import recover as recover_recording
 from logs.recording.summary import count
 from logs.recording.tlog import ExportedTlog, export_tlog
 from logs.recording.ulog import is_ulog
 from logs.report.findings import Headline
-from uavctl.cli.common import Common, Flight, Json, System, bars, columns, counted, first_line, two_columns, warn
-from uavctl.cli.usage import example
+from uavctl.cli.common import (
+    Common,
+    Flight,
+    Json,
+    System,
+    format_counts,
+    make_headline_text,
+    make_pair_table,
+    make_progress,
+    make_table,
+    warn,
+)
+from uavctl.cli.usage import format_example
 from uavctl.errors import UsageError
-
-# `uavctl log export`: a recording for other programs.
-
 
 TLOG = "tlog"
 
@@ -53,14 +61,14 @@ def export(
 ) -> int:
     """Write a recording as tables (CSV, or Parquet with uavctl[parquet]), or its raw MAVLink as a .tlog."""
     if to == TLOG:
-        _export_tlog(flight, _tlog_file(flight, out), link, force=force, common=Common(json=json))
+        _export_tlog(flight, _choose_tlog_path(flight, out), link, force=force, common=Common(json=json))
     elif link is not None:
         raise UsageError("--link is for --to tlog: tables hold all topics, the raw bytes of each connection in its own")
     else:
         folder = out if out is not None else flight.with_name(f"{flight.stem}-{to}")
-        with _progress() as watch:
+        with _show_progress() as watch:
             exported = export_tables(flight, folder, TableFormat(to), force=force, watch=watch)
-        Common(json=json).show("log/export", exported, lambda: _tables_picture(exported, folder))
+        Common(json=json).show("log/export", exported, lambda: _render_tables(exported, folder))
         for topic, number in exported.unknown.items():
             warn(f"left out: {count(number, 'record')} of {topic}, which this version does not know")
     if cut := lacks_end(flight):
@@ -69,22 +77,22 @@ def export(
 
 
 def _export_tlog(flight: Path, file: Path, link: str | None, *, force: bool, common: Common) -> None:
-    with _progress() as watch:
+    with _show_progress() as watch:
         exported = export_tlog(flight, file, link=link, force=force, watch=watch)
-    common.show("log/export-tlog", exported, lambda: _tlog_picture(exported))
+    common.show("log/export-tlog", exported, lambda: _render_tlog(exported))
     if exported.left_out_bytes:
         warn(f"left out: {count(exported.left_out_bytes, 'byte')} that are no whole MAVLink packet")
 
 
-def _tlog_file(flight: Path, out: Path | None) -> Path:
+def _choose_tlog_path(flight: Path, out: Path | None) -> Path:
     if out is None:
         return flight.with_suffix(".tlog")
     return out / f"{flight.stem}.tlog" if out.is_dir() else out
 
 
 @contextmanager
-def _progress() -> Iterator[Watch]:
-    with bars() as progress:
+def _show_progress() -> Iterator[Watch]:
+    with make_progress() as progress:
 
         def watch(records: Iterable[RecordedMessage], total: int | None, what: str) -> Iterable[RecordedMessage]:
             return progress.track(records, total=total, description=what)
@@ -92,107 +100,103 @@ def _progress() -> Iterator[Watch]:
         yield watch
 
 
-def _tables_picture(exported: Exported, folder: Path) -> RenderableType:
-    rows = ((Text(Path(one.file).name), str(one.rows), str(one.columns)) for one in exported.tables)
-    return Group(columns("", ("file", "rows", "columns"), rows, fold=True), Text(f"in {folder}"))
+def _render_tables(exported: Exported, folder: Path) -> RenderableType:
+    rows = ((Text(Path(table.file).name), str(table.rows), str(table.columns)) for table in exported.tables)
+    return Group(make_table("", ("file", "rows", "columns"), rows, fold=True), Text(f"in {folder}"))
 
 
-def _tlog_picture(exported: ExportedTlog) -> RenderableType:
+def _render_tlog(exported: ExportedTlog) -> RenderableType:
     rows = ((Text(topic), str(packets)) for topic, packets in exported.packets.items())
-    return Group(columns("", ("topic", "packets"), rows), Text(f"in {exported.file}"))
+    return Group(make_table("", ("topic", "packets"), rows), Text(f"in {exported.file}"))
 
 
-# `uavctl log info` as a table.
+_SHOWN_PARAMETERS = 4
 
 
-_SOME_PARAMETERS = 4
+def _render_tlog_info(flight_info: MavlinkFlightInfo) -> RenderableType:
+    rows = ((Text(name), str(number), rate_of(flight_info, name)) for name, number in flight_info.messages.items())
+    lines = [f"{name}: {value}" for name, value in facts_of(flight_info)]
+    return Group(
+        make_table("", ("message", "number", "rate"), rows, fold=True), *map(Text, (*lines, *flight_info.notes))
+    )
 
 
-def _tlog_info(told: MavlinkFlightInfo) -> RenderableType:
-    rows = ((Text(name), str(number), rate_of(told, name)) for name, number in told.messages.items())
-    lines = [f"{name}: {value}" for name, value in facts_of(told)]
-    return Group(columns("", ("message", "number", "rate"), rows, fold=True), *map(Text, (*lines, *told.notes)))
-
-
-def info_table(found: RecordingInfo) -> RenderableType:
+def render_info(info: RecordingInfo) -> RenderableType:
     """Return a table of topics with rates and gaps, and below it further facts."""
-    title = f"{found.files[0]}: {found.duration_s:.1f} s, {found.bytes:,} bytes"
-    if len(found.files) > 1:
-        title += f" in {len(found.files)} files"
-    table = columns("", ("topic", "messages", "rate", "longest gap", "at"), ())
-    for topic in found.topics:
+    title = f"{info.files[0]}: {info.duration_s:.1f} s, {info.bytes:,} bytes"
+    if len(info.files) > 1:
+        title += f" in {len(info.files)} files"
+    table = make_table("", ("topic", "messages", "rate", "longest gap", "at"), ())
+    for topic in info.topics:
         rate = f"{topic.rate_hz:.1f}/s" if topic.messages > 1 else ""
         gap = (f"{topic.longest_gap_s:.3f} s", f"{topic.longest_gap_at_s:.1f} s") if topic.longest_gap_s else ("", "")
         table.add_row(Text(topic.topic), str(topic.messages), rate, *gap)
-    return Group(Text(title), table, *map(Text, _lines(found)))
+    return Group(Text(title), table, *map(Text, _list_facts(info)))
 
 
-def _lines(found: RecordingInfo) -> Iterator[str]:
-    if not found.finished:
+def _list_facts(info: RecordingInfo) -> Iterator[str]:
+    if not info.finished:
         yield "not closed: `uavctl log recover` makes a clean file"
-    elif found.damage:
+    elif info.damage:
         yield "damaged: `uavctl log recover` restores the rest"
     else:
         yield "closed in order"
     yield (
-        f"records lost: {found.dropped} dropped, {found.refused} refused, {found.missing} missing; "
-        f"{found.failures} failed writes"
+        f"records lost: {info.dropped} dropped, {info.refused} refused, {info.missing} missing; "
+        f"{info.failures} failed writes"
     )
-    if len(found.segments) > 1:
-        for one in found.segments:
-            state = "" if one.finished else ", not closed"
-            yield f"{one.file}: {one.messages} messages, {one.bytes:,} bytes{state}"
-    yield from found.damage
-    for note in found.notes:
+    if len(info.segments) > 1:
+        for segment in info.segments:
+            state = "" if segment.finished else ", not closed"
+            yield f"{segment.file}: {segment.messages} messages, {segment.bytes:,} bytes{state}"
+    yield from info.damage
+    for note in info.notes:
         yield f"{note.at_s:.1f} s: {note.text}"
-    for link in found.connections:
+    for link in info.connections:
         left_out = {what: counts for what, counts in (("bad", link.bad), ("refused", link.refused)) if counts}
-        lost = "".join(f"; {what}: {counted(dict(sorted(counts.items())))}" for what, counts in left_out.items())
+        lost = "".join(f"; {what}: {format_counts(dict(sorted(counts.items())))}" for what, counts in left_out.items())
         yield (
             f"connection {link.link}: {link.datagrams} datagrams, {link.messages} messages, "
             f"{link.samples} positions{lost}"
         )
-    yield from _loss(found.position_loss)
-    if found.origin is not None:
-        yield f"{found.origin.command} ({found.origin.started_utc}, seed {found.origin.seed})"
-    if found.library is not None:
-        yield f"policy library {found.library.library_id}, {found.library.bytes:,} bytes"
-    if found.begin_utc is not None:
-        yield f"begins at {found.begin_utc}"
-    for file in found.attachments:
+    yield from _describe_loss(info.position_loss)
+    if info.origin is not None:
+        yield f"{info.origin.command} ({info.origin.started_utc}, seed {info.origin.seed})"
+    if info.library is not None:
+        yield f"policy library {info.library.library_id}, {info.library.bytes:,} bytes"
+    if info.begin_utc is not None:
+        yield f"begins at {info.begin_utc}"
+    for file in info.attachments:
         yield f"attached: {file.name}, {file.bytes:,} bytes"
-    if found.parameters:
-        yield from _parameters(found.parameters, found.parameter_count)
+    if info.parameters:
+        yield from _describe_parameters(info.parameters, info.parameter_count)
 
 
-def _parameters(told: Mapping[str, VehicleParameter], count: int | None) -> Iterator[str]:
-    some = ", ".join(f"{name} {one.value}" for name, one in [*told.items()][:_SOME_PARAMETERS])
-    more = "" if len(told) <= _SOME_PARAMETERS else " ...; --json has all"
-    found = count_parameters(told)
-    lacks = "" if count is None or found >= count else f"; INCOMPLETE: {found} of the {count} that it says it has"
-    yield f"vehicle parameters: {len(told)} ({some}{more}){lacks}"
+def _describe_parameters(parameters: Mapping[str, VehicleParameter], count: int | None) -> Iterator[str]:
+    shown = ", ".join(f"{name} {parameter.value}" for name, parameter in [*parameters.items()][:_SHOWN_PARAMETERS])
+    ellipsis = "" if len(parameters) <= _SHOWN_PARAMETERS else " ...; --json has all"
+    number = count_parameters(parameters)
+    missing = "" if count is None or number >= count else f"; INCOMPLETE: {number} of the {count} that it says it has"
+    yield f"vehicle parameters: {len(parameters)} ({shown}{ellipsis}){missing}"
 
 
-def _loss(loss: PositionLoss) -> Iterator[str]:
+def _describe_loss(loss: PositionLoss) -> Iterator[str]:
     if loss.believed is not None:
         bursts = ", lost in bursts" if loss.bursts else ""
-        promise = ", fewer than promised" if loss.below_promise else ""
-        own = f"{100 * (1.0 - loss.believed):.0f} % of the steps"
-        yield f"positions: {own} had one captured within them, as last estimated{promise}{bursts}"
+        promise_text = ", fewer than promised" if loss.below_promise else ""
+        share = f"{100 * (1.0 - loss.believed):.0f} % of the steps"
+        yield f"positions: {share} had one captured within them, as last estimated{promise_text}{bursts}"
     if loss.simulated_sent:
         yield f"simulated channel: {loss.simulated_lost} of {loss.simulated_sent} positions lost"
-
-
-# `uavctl log`: its commands by name; what a recording holds, its repair, and a viewer's layout.
 
 
 RECOVERED_WITH_LOSS = 3
 log_app = App(
     name="log",
     help="Recordings: info, recover, replay, report, compare, whatif, export; a layout.",
-    help_epilogue=example("log"),
+    help_epilogue=format_example("log"),
 )
-# Imported when they run: a replay does not wait for what draws pages.
+# A module is imported when its command runs: a replay does not load what draws pages.
 _COMMANDS = {
     "replay": (
         "replay:replay",
@@ -231,52 +235,65 @@ _COMMANDS = {
 }
 for _name, (_path, _help) in _COMMANDS.items():
     _more = {"usage": "Usage: uavctl log compare [OPTIONS] FIRST SECOND [MORE]..."} if _name == "compare" else {}
-    log_app.command(f"uavctl.cli.{_path}", name=_name, help=_help, help_epilogue=example(f"log {_name}"), **_more)
+    log_app.command(
+        f"uavctl.cli.{_path}", name=_name, help=_help, help_epilogue=format_example(f"log {_name}"), **_more
+    )
 
 
-@log_app.command(help_epilogue=example("log info"))
+@log_app.command(help_epilogue=format_example("log info"))
 def info(flight: Flight, /, *, system: System = None, json: Json = False) -> int:
     """Say what a recording, a .tlog or a ULog holds: the page's first line, topics, rates, gaps, losses, its making."""
-    from logs.report import headline, tlog_headline  # not for the other commands: it takes SciPy
+    from logs.report import headline, tlog_headline  # loads SciPy, so only for this command
 
     if detect_kind(flight) is not FileKind.MCAP or system is not None:
         foreign = read_foreign_flight(flight, system)
-        assert foreign is not None  # only one of ours is none, of which there is no system
-        told, main = foreign.info, tlog_headline.derive_tlog_headline(foreign)
+        assert foreign is not None  # None only for our own recording, which has no system id
+        foreign_info, foreign_headline = foreign.info, tlog_headline.derive_tlog_headline(foreign)
         name = FileKind.ULOG if is_ulog(flight) else FileKind.TLOG
-        Common(json=json).show(f"log/info-{name}", _with(main, told), lambda: Group(first_line(main), _tlog_info(told)))
+        Common(json=json).show(
+            f"log/info-{name}",
+            _add_headline(foreign_headline, foreign_info),
+            lambda: Group(make_headline_text(foreign_headline), _render_tlog_info(foreign_info)),
+        )
         return 0
-    found, ours = recording_info(flight), headline.derive_headline_of_file(flight)
-    line = () if ours is None else (first_line(ours),)
-    Common(json=json).show("log/info", _with(ours, found), lambda: Group(*line, info_table(found)))
+    recording_info, recording_headline = read_info(flight), headline.derive_headline_of_file(flight)
+    headline_text = () if recording_headline is None else (make_headline_text(recording_headline),)
+    Common(json=json).show(
+        "log/info",
+        _add_headline(recording_headline, recording_info),
+        lambda: Group(*headline_text, render_info(recording_info)),
+    )
     return 0
 
 
-def _with(main: Headline | None, found: msgspec.Struct) -> dict[str, object]:
-    """Return the document of a recording, the page's first line before all else."""
-    return {"headline": None if main is None else main.document(), **msgspec.structs.asdict(found)}
+def _add_headline(recording_headline: Headline | None, info: msgspec.Struct) -> dict[str, object]:
+    """Return the document of a recording; its first key is the first line of the page."""
+    return {
+        "headline": None if recording_headline is None else recording_headline.document(),
+        **msgspec.structs.asdict(info),
+    }
 
 
-@log_app.command(help_epilogue=example("log recover"))
+@log_app.command(help_epilogue=format_example("log recover"))
 def recover(flight: Flight, out: Annotated[Path, Parameter(help="file to write")], /, *, json: Json = False) -> int:
     """Restore what a torn or damaged recording still holds. Exit code 3: with loss."""
-    result = restore(flight, out)
-    Common(json=json).show("log/recover", result, lambda: _recover_table(result, out))
+    result = recover_recording(flight, out)
+    Common(json=json).show("log/recover", result, lambda: _make_recover_table(result, out))
     return 0 if result.lossless else RECOVERED_WITH_LOSS
 
 
-@log_app.command(help_epilogue=example("log layout"))
+@log_app.command(help_epilogue=format_example("log layout"))
 def layout() -> int:
     """Print the layout for Foxglove: `uavctl log layout > uavctl.json`, there "Import from file"."""
     sys.stdout.write(make_layout_text())
     return 0
 
 
-def _recover_table(result: RecoverResult, out: Path) -> Table:
+def _make_recover_table(result: RecoverResult, out: Path) -> Table:
     lost = str(result.messages_lost)
     if not result.ended:
         lost += " known; those after the last restored one cannot be counted"
-    return two_columns(
+    return make_pair_table(
         "Recovered",
         [
             ("written to", out),

@@ -1,4 +1,7 @@
-"""Commands `uavctl log report` and `uavctl log compare`, which draw pages."""
+"""Commands `uavctl log report` and `uavctl log compare`, which draw pages.
+
+A report is of our recording, a `.tlog` of any ground station, or a ULog of PX4.
+"""
 
 from __future__ import annotations
 
@@ -43,80 +46,79 @@ from uavctl.cli.common import (
     Json,
     System,
     WideTable,
-    bars,
-    can_be_read,
-    columns,
-    first_line,
-    two_columns,
+    check_readable,
+    make_headline_text,
+    make_pair_table,
+    make_progress,
+    make_table,
     warn,
 )
 from uavctl.errors import UsageError
 
-# `uavctl log compare`: recordings beside each other.
-
 
 def compare_command(
-    first: Annotated[Path, Parameter(help="the recording that the others are compared with", validator=can_be_read)],
-    second: Annotated[Path, Parameter(help="another one", validator=can_be_read)],
+    first: Annotated[Path, Parameter(help="the recording that the others are compared with", validator=check_readable)],
+    second: Annotated[Path, Parameter(help="another one", validator=check_readable)],
     /,
-    *more: Annotated[Path, Parameter(help="and more", validator=can_be_read)],
+    *more: Annotated[Path, Parameter(help="and more", validator=check_readable)],
     out: Annotated[Path | None, Parameter(help="also write a page (HTML) with the flights in one drawing")] = None,
     json: Json = False,
 ) -> int:
     """Put flights beside each other: parameters that differ, figures, and where they part."""
-    with bars() as progress:
+    with make_progress() as progress:
         paths = (first, second, *more)
         task = progress.add_task("reading", total=len(paths))
         loaded = load_flights(paths, lambda: progress.advance(task))
         progress.update(task, description="comparing")
-        found = compare_flights(loaded)
+        comparison = compare_flights(loaded)
     if out is not None:
-        write_comparison_page(found, loaded, out)
-    Common(json=json).show("log/compare", found, lambda: comparison_picture(found))
+        write_comparison_page(comparison, loaded, out)
+    Common(json=json).show("log/compare", comparison, lambda: render_terminal_comparison(comparison))
     return 0
 
 
-def comparison_picture(found: FlightComparison) -> RenderableType:
-    """Return the comparison for a terminal: flights, how far they agree, parameters, figures, notes."""
-    parts: list[RenderableType] = [_sides(found.recordings)]
-    parts += [Text(text) for text in map(describe_match, found.likenesses)]
-    parts.append(_parameters(found) if found.parameters else Text("No parameter differs."))
-    parts.append(_figures(found))
-    parts += [Text(f"Mind: {text}.", style="yellow") for text in found.notes]
+def render_terminal_comparison(comparison: FlightComparison) -> RenderableType:
+    """Return the comparison for a terminal: flights, their agreement, parameters, figures, notes."""
+    parts: list[RenderableType] = [_render_sides(comparison.recordings)]
+    parts += [Text(text) for text in map(describe_match, comparison.likenesses)]
+    parts.append(_make_parameter_table(comparison) if comparison.parameters else Text("No parameter differs."))
+    parts.append(_make_figure_table(comparison))
+    parts += [Text(f"Mind: {text}.", style="yellow") for text in comparison.notes]
     return Group(*parts)
 
 
-def _sides(sides: tuple[ComparedFlight, ...]) -> RenderableType:
-    def told(one: ComparedFlight) -> str:
-        state = "" if one.finished else ", torn"
-        return f"{one.recording}\nconfig {one.config}, seed {one.seed}, {one.started_utc}; {one.ended}{state}"
+def _render_sides(sides: tuple[ComparedFlight, ...]) -> RenderableType:
+    def describe(flight: ComparedFlight) -> str:
+        state = "" if flight.finished else ", torn"
+        facts = f"config {flight.config}, seed {flight.seed}, {flight.started_utc}; {flight.ended}{state}"
+        return f"{flight.recording}\n{facts}"
 
-    return make_value_table((one.name, told(one)) for one in sides)
-
-
-def _parameters(found: FlightComparison) -> Table:
-    headings = ("", *(one.name for one in found.recordings))
-    rows = ((Text(one.key), *(Text(format_parameter(value)) for value in one.values)) for one in found.parameters)
-    return columns("Parameters that differ", headings, rows, headings, fold=True)
+    return make_value_table((flight.name, describe(flight)) for flight in sides)
 
 
-def _figures(found: FlightComparison) -> WideTable:
-    rows = list(map(convert_to_display_unit, found.figures))
-    first, *others = (one.name for one in found.recordings)
+def _make_parameter_table(comparison: FlightComparison) -> Table:
+    headings = ("", *(parameter.name for parameter in comparison.recordings))
+    rows = (
+        (Text(parameter.key), *(Text(format_parameter(value)) for value in parameter.values))
+        for parameter in comparison.parameters
+    )
+    return make_table("Parameters that differ", headings, rows, headings, fold=True)
+
+
+def _make_figure_table(comparison: FlightComparison) -> WideTable:
+    rows = list(map(convert_to_display_unit, comparison.figures))
+    first, *other_names = (flight.name for flight in comparison.recordings)
     groups = [[Column(first, [format_value(row.values[0]) for row in rows])]]
-    for place, name in enumerate(others):
+    for index, name in enumerate(other_names):
         groups.append(
             [
-                Column(name, [format_value(row.values[place + 1]) for row in rows]),
-                Column(f"{name} − {first}", [format_difference(row.differences[place]) for row in rows]),
-                Column(f"{name} / {first}", [format_value(row.ratios[place]) for row in rows]),
+                Column(name, [format_value(row.values[index + 1]) for row in rows]),
+                Column(f"{name} − {first}", [format_difference(row.differences[index]) for row in rows]),
+                Column(f"{name} / {first}", [format_value(row.ratios[index]) for row in rows]),
             ]
         )
-    ends = frozenset(place for place in range(len(rows) - 1) if rows[place].group != rows[place + 1].group)
-    return WideTable(Column("figure", list(map(format_label, rows)), "left"), groups, ends)
-
-
-# `uavctl log report`: the page of a recording, ours, a `.tlog` of any ground station, or a ULog of PX4.
+    section_ends = frozenset(index for index in range(len(rows) - 1) if rows[index].group != rows[index + 1].group)
+    return WideTable(Column("figure", list(map(format_label, rows)), "left"), groups, section_ends)
 
 
 def report(
@@ -138,34 +140,36 @@ def report(
     data = FlightData.from_records(read(flight), flight)
     dropped = max((note.dropped for note in data.notes), default=0)
     summary = summarise(data, wall_s=None, recording=str(flight), report=str(page), recorder_dropped=dropped)
-    judged = judge_flight(data)
+    verdicts = judge_flight(data)
     if svg is not None:
         write_atomically(svg, draw_overview(data))
-    write_report(data, summary, page, judged)
+    write_report(data, summary, page, verdicts)
     if cut := lacks_end(flight):
         warn(f"{cut}: shown up to there")
-    main = derive_headline(data, summary, judged)
-    document = {**msgspec.structs.asdict(summary), "verdicts": judged.verdicts, "headline": main.document()}
+    headline = derive_headline(data, summary, verdicts)
+    document = {**msgspec.structs.asdict(summary), "verdicts": verdicts.verdicts, "headline": headline.document()}
     Common(json=json).show(
-        "log/report", document, lambda: _told(main, make_summary_table(summary, make_verdict_rows(judged.verdicts)))
+        "log/report",
+        document,
+        lambda: _render_report(headline, make_summary_table(summary, make_verdict_rows(verdicts.verdicts))),
     )
     return 0
 
 
-def _told(main: Headline, summary: RenderableType) -> Group:
-    """Return what a terminal shows: the page's first line and why, then the figures."""
-    return Group(first_line(main), *(Text(f"  {sentence}") for sentence in main.reasons), summary)
+def _render_report(headline: Headline, summary: RenderableType) -> Group:
+    """Return the report for a terminal: the first line of the page with its reasons, then the figures."""
+    return Group(make_headline_text(headline), *(Text(f"  {sentence}") for sentence in headline.reasons), summary)
 
 
-def _report_foreign(flight: Path, found: MavlinkFlight, out: Path, svg: Path | None, common: Common) -> int:
+def _report_foreign(flight: Path, foreign: MavlinkFlight, out: Path, svg: Path | None, common: Common) -> int:
     if svg is not None:
         raise UsageError(f"--svg draws a recording of ours; {flight} is none, and of it there is the page")
-    write_tlog_page(found, out)
-    for note in found.info.notes:
+    write_tlog_page(foreign, out)
+    for note in foreign.info.notes:
         warn(note)
-    main = derive_tlog_headline(found)
-    document = {**msgspec.to_builtins(found.info), "report": str(out), "headline": main.document()}
+    headline = derive_tlog_headline(foreign)
+    document = {**msgspec.to_builtins(foreign.info), "report": str(out), "headline": headline.document()}
     kind = FileKind.ULOG if is_ulog(flight) else FileKind.TLOG
-    facts: list[tuple[str, object]] = [*facts_of(found.info), ("page", str(out))]
-    common.show(f"log/report-{kind}", document, lambda: _told(main, two_columns("", facts)))
+    facts: list[tuple[str, object]] = [*facts_of(foreign.info), ("page", str(out))]
+    common.show(f"log/report-{kind}", document, lambda: _render_report(headline, make_pair_table("", facts)))
     return 0

@@ -22,21 +22,30 @@ from logs.recording.summary import FlightSummary, make_summary_table
 from logs.recording.topics import ENDED
 from sim.server import Ready, serve_in_child
 from uavctl.build.controller import Prepared, design_of, prepare
-from uavctl.cli.common import DEFAULTS, SEED, SPAN_S, Common, TakeOff, bars, given_keys, located
+from uavctl.cli.common import (
+    DEFAULTS,
+    SEED,
+    SPAN_S,
+    Common,
+    TakeOff,
+    locate_design_errors,
+    make_key_overrides,
+    make_progress,
+)
 from uavctl.cli.flying import (
     Live,
     LivePort,
-    checked_take_off,
-    conclude,
-    ending_noted,
-    goto_overrides,
-    live_line,
-    live_view_port,
-    onlookers,
+    check_take_off,
+    choose_live_port,
+    conclude_flight,
+    make_goto_overrides,
+    open_viewers,
+    print_ending,
+    record_failure,
     stop_on_signals,
-    tell_ending,
 )
-from uavctl.cli.sim import make_door
+from uavctl.cli.live_line import show_live_line
+from uavctl.cli.signed_port import make_port_wrapper
 from uavctl.clock import Ticker, monotonic_ns, read_zero_utc_ns
 from uavctl.config import Config, LoadedConfig
 from uavctl.daemon.daemon import fly
@@ -73,11 +82,11 @@ def loopback(
     In virtual time the same seed gives the same flight, bit for bit. It begins in the air; with --arm --takeoff HEIGHT
     on the ground, and after its duration it ends there too.
     """
-    take_off_m = checked_take_off(arm, takeoff)
-    view_port = live_view_port(live=live, port=live_port)
+    take_off_m = check_take_off(arm, takeoff)
+    view_port = choose_live_port(live=live, port=live_port)
     if live and not udp:
         raise UsageError("--live needs --udp: in virtual time a flight is over before a viewer has seen it")
-    overrides = [*given_keys(duration_s=duration, sim__seed=seed), *goto_overrides(goto)]
+    overrides = [*make_key_overrides(duration_s=duration, sim__seed=seed), *make_goto_overrides(goto)]
     summary = fly_simulated(
         common.with_overrides(overrides).load(),
         udp=udp,
@@ -100,42 +109,42 @@ def fly_simulated(
     view_port: int | None = None,
     follower: TickFollower | None = None,
 ) -> FlightSummary:
-    """Fly the simulated vehicle for the configured time, record it, and say on the console how it ended.
+    """Fly the simulated vehicle for the configured time, record it, and print how it ended.
 
     Args:
-        loaded: the configuration, with where it is from.
-        udp: over real sockets and in real time, else in lockstep and virtual time.
-        take_off_m: height of the climb above the ground [m]; None begins and ends in the air.
-        goto: whether the mission is the place of `--goto`.
-        out: folder of the recording; None makes a new one below `flights/`.
-        view_port: TCP port of a live view; None is none.
-        follower: looks at every tick, and may give orders.
+        loaded: The configuration and its source.
+        udp: Over real sockets and in real time, else in lockstep and virtual time.
+        take_off_m: Height of the climb above the ground [m]; None begins and ends in the air.
+        goto: Whether the mission is the place of `--goto`.
+        out: Folder of the recording; None makes a new one below `flights/`.
+        view_port: TCP port of a live view; None: no view.
+        follower: Called at every tick; may give orders.
 
     Raises:
-        UavctlError: nothing was flown, and why.
+        UavctlError: Nothing was flown; the message is the reason.
     """
-    config = _on_loopback(loaded.config) if udp else loaded.config
+    config = _use_loopback_ports(loaded.config) if udp else loaded.config
     check_length(config)
-    with located(loaded):
+    with locate_design_errors(loaded):
         design = design_of(config)
     engagement = Engagement(config, take_off_m=take_off_m, goto=goto, follower=follower)
-    with onlookers(view_port) as looking, create_recording(out, config.name, config.log.free_bytes) as path:
-        with located(loaded):
+    with open_viewers(view_port) as viewers, create_recording(out, config.name, config.log.free_bytes) as path:
+        with locate_design_errors(loaded):
             check_places(config, design, take_off_m, engagement.goal)
             prepared = prepare(config, design)
-        return _real_time(prepared, path, engagement, looking) if udp else lockstep(prepared, path, engagement)
+        return _fly_real_time(prepared, path, engagement, viewers) if udp else fly_lockstep(prepared, path, engagement)
 
 
-def lockstep(prepared: Prepared, path: Path, engagement: Engagement) -> FlightSummary:
+def fly_lockstep(prepared: Prepared, path: Path, engagement: Engagement) -> FlightSummary:
     """Fly in virtual time, with a progress bar."""
     config = prepared.config
     flight = LockstepFlight(prepared, path)
     engagement.begin(flight.loop)
     try:
         with (
-            ending_noted(flight.loop),
+            record_failure(flight.loop),
             stop_on_signals() as stopped,
-            bars(TaskProgressColumn(), TimeRemainingColumn()) as progress,
+            make_progress(TaskProgressColumn(), TimeRemainingColumn()) as progress,
         ):
             task = progress.add_task("flying in virtual time", total=config.duration_s)
 
@@ -147,17 +156,17 @@ def lockstep(prepared: Prepared, path: Path, engagement: Engagement) -> FlightSu
             flight.fly(show, follower=engagement, landing_s=landing_s)
     finally:
         status = flight.close()
-        tell_ending(describe_ending(flight.loop.ending, status))
-    return conclude(path, flight.wall_s, status, flight.loop.ending)
+        print_ending(describe_ending(flight.loop.ending, status))
+    return conclude_flight(path, flight.wall_s, status, flight.loop.ending)
 
 
-def _real_time(prepared: Prepared, path: Path, engagement: Engagement, looking: DerivedTopics) -> FlightSummary:
+def _fly_real_time(prepared: Prepared, path: Path, engagement: Engagement, viewers: DerivedTopics) -> FlightSummary:
     config, takes_off = prepared.config, engagement.takes_off
     tick_ns, dt_ns = round(config.daemon.tick_s * 1e9), round(config.plant.dt_s * 1e9)
     with ExitStack() as stack:
         stopped = stack.enter_context(stop_on_signals())
         connections = stack.enter_context(open_links(config))
-        recorder = Recorder(path, config.log, derived_topics=looking)
+        recorder = Recorder(path, config.log, derived_topics=viewers)
         loop = ControlLoop(config, prepared.controller, recorder, time.perf_counter_ns)
         engagement.begin(loop)
         loop.account.ends_in_flight = not takes_off
@@ -165,11 +174,13 @@ def _real_time(prepared: Prepared, path: Path, engagement: Engagement, looking: 
         try:
             put_header(recorder, prepared, monotonic_ns(), read_zero_utc_ns())
             simulator = stack.enter_context(ExitStack())
-            simulator.enter_context(_simulator(config, recorder, airborne=not takes_off))
-            shown = simulator.enter_context(live_line(loop, recorder, config.duration_s, config.daemon.tick_s))
+            simulator.enter_context(_run_simulator(config, recorder, airborne=not takes_off))
+            feed = simulator.enter_context(
+                show_live_line(loop, recorder.status, config.duration_s, config.daemon.tick_s)
+            )
             collector = simulator.enter_context(control_garbage_collection())
-            begun = time.perf_counter()
-            with ending_noted(loop):
+            begin_s = time.perf_counter()
+            with record_failure(loop):
                 fly(
                     loop,
                     connections,
@@ -178,49 +189,49 @@ def _real_time(prepared: Prepared, path: Path, engagement: Engagement, looking: 
                     duration_s=config.duration_s,
                     stop_limit_s=compute_stop_limit_s(config, takes_off=True) if takes_off else 0.0,
                     after_tick=(
-                        shown.after_tick,
+                        feed.after_tick,
                         lambda *_: recorder.catch_up(),
                         lambda ticked, _: engagement.follow(loop, ticked),
                         collector.after_tick,
                     ),
-                    on_events=shown.news.extend,
+                    on_events=feed.events.extend,
                 )
-            wall_s = time.perf_counter() - begun
-            simulator.close()  # its last words go into the recording
+            wall_s = time.perf_counter() - begin_s
+            simulator.close()  # its last records go into the recording
         finally:
             recorder.put(ENDED, monotonic_ns(), loop.ending)
             status = recorder.close()
-            tell_ending(describe_ending(loop.ending, status))
-    return conclude(path, wall_s, status, loop.ending)
+            print_ending(describe_ending(loop.ending, status))
+    return conclude_flight(path, wall_s, status, loop.ending)
 
 
-def _on_loopback(config: Config) -> Config:
+def _use_loopback_ports(config: Config) -> Config:
     """Return the configuration with connections on free ports of this machine."""
-    with socket.socket(type=socket.SOCK_DGRAM) as one, socket.socket(type=socket.SOCK_DGRAM) as other:
-        one.bind(("127.0.0.1", 0))
-        other.bind(("127.0.0.1", 0))
-        vehicle, mocap = (f"udpin://127.0.0.1:{s.getsockname()[1]}" for s in (one, other))
+    with socket.socket(type=socket.SOCK_DGRAM) as first, socket.socket(type=socket.SOCK_DGRAM) as second:
+        first.bind(("127.0.0.1", 0))
+        second.bind(("127.0.0.1", 0))
+        vehicle, mocap = (f"udpin://127.0.0.1:{s.getsockname()[1]}" for s in (first, second))
     return msgspec.structs.replace(config, daemon=msgspec.structs.replace(config.daemon, vehicle=vehicle, mocap=mocap))
 
 
 @contextmanager
-def _simulator(config: Config, sink: Sink, *, airborne: bool) -> Iterator[None]:
-    """Run the simulated peers in a process of their own, sending to the daemon's ports; their truth goes to the sink.
+def _run_simulator(config: Config, sink: Sink, *, airborne: bool) -> Iterator[None]:
+    """Run the simulated peers in a process of their own, which sends to the daemon's ports; record their truth.
 
     Raises:
-        UavctlError: they do not start.
+        UavctlError: The simulator does not start.
     """
     context = multiprocessing.get_context("spawn")
-    ours, theirs = context.Pipe(duplex=False)
+    receiver, sender = context.Pipe(duplex=False)
     stop = context.Event()
     urls = [url.replace("udpin", "udpout") for url in (config.daemon.vehicle, config.daemon.mocap)]
-    arguments = (theirs, stop, config, *urls, None, airborne, make_door(config.security))
+    arguments = (sender, stop, config, *urls, None, airborne, make_port_wrapper(config.security))
     child = context.Process(target=serve_in_child, args=arguments, name="simulator")
     child.start()
-    theirs.close()
-    listener = threading.Thread(target=_listen, args=(ours, sink), name="truth", daemon=True)
+    sender.close()
+    listener = threading.Thread(target=_record_truth, args=(receiver, sink), name="truth", daemon=True)
     try:
-        if not _ready(ours):
+        if not _wait_for_ready(receiver):
             raise UavctlError(f"the simulator did not start within {START_LIMIT_S:g} s; see the messages above")
         listener.start()
         yield
@@ -231,10 +242,10 @@ def _simulator(config: Config, sink: Sink, *, airborne: bool) -> Iterator[None]:
             child.kill()
         if listener.ident is not None:
             listener.join(START_LIMIT_S)
-        ours.close()
+        receiver.close()
 
 
-def _ready(pipe: Pipe) -> bool:
+def _wait_for_ready(pipe: Pipe) -> bool:
     """Wait for the simulator's ports; return False if it ended or took too long."""
     try:
         return pipe.poll(START_LIMIT_S) and isinstance(pipe.recv(), Ready)
@@ -242,12 +253,12 @@ def _ready(pipe: Pipe) -> bool:
         return False
 
 
-def _listen(pipe: Pipe, sink: Sink) -> None:
-    """Pass the simulator's truth on until it hangs up."""
+def _record_truth(pipe: Pipe, sink: Sink) -> None:
+    """Record the truth of the simulator until its connection closes."""
     try:
         while True:
-            told = pipe.recv()
-            if isinstance(told, Truth):
-                sink.put(TRUTH, told.at_ns, told)
+            message = pipe.recv()
+            if isinstance(message, Truth):
+                sink.put(TRUTH, message.at_ns, message)
     except EOFError:
         return

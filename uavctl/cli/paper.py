@@ -1,4 +1,4 @@
-"""Command `uavctl paper`: Section 5 of the paper, reproduced, with each claim beside what was measured."""
+"""Command `uavctl paper`: Section 5 of the paper reproduced, with each claim beside its measurement."""
 
 from __future__ import annotations
 
@@ -17,7 +17,16 @@ from rich.table import Table
 from rich.text import Text
 
 from uavctl.build.controller import build_design, build_spec
-from uavctl.cli.common import SEED, WORKERS, Common, QuietJson, bars, columns, located, messages
+from uavctl.cli.common import (
+    SEED,
+    WORKERS,
+    Common,
+    QuietJson,
+    locate_design_errors,
+    make_message_console,
+    make_progress,
+    make_table,
+)
 from uavctl.errors import UsageError
 from uavctl.lab.paper.claims import (
     PRESET,
@@ -35,20 +44,20 @@ from uavctl.lab.paper.claims import (
 from uavctl.lab.paper.runs import HERE_UP_TO, Advance, Flights, Setup, fly_all
 from uavctl.records import percent_above
 
-_RUNS = validators.Number(gte=1, lte=1_000_000)
-# Beyond, a second design would take minutes more to say the same of the claims.
-BOTH_UP_TO = 20_000
+_RUN_LIMITS = validators.Number(gte=1, lte=1_000_000)
+# Above this number a second design would take minutes more for the same answer.
+MAX_RUNS_OF_BOTH = 20_000
 
 
 def paper(
     *,
-    runs: Annotated[int, Parameter(help="number of runs", validator=_RUNS)] = 200,
+    runs: Annotated[int, Parameter(help="number of runs", validator=_RUN_LIMITS)] = 200,
     steps: Annotated[int, Parameter(help="steps of a run", validator=validators.Number(gte=4, lte=10_000))] = 50,
     seed: Annotated[int, Parameter(help="seed of every random draw", validator=SEED)] = 0,
     tau: Annotated[
         Literal[4, 3] | None,
         Parameter(
-            help=f"one design only: 4 as printed, or 3; else both, and the printed one above {BOTH_UP_TO} runs",
+            help=f"one design only: 4 as printed, or 3; else both, and the printed one above {MAX_RUNS_OF_BOTH} runs",
             show_default=False,
         ),
     ] = None,
@@ -72,18 +81,18 @@ def paper(
     json: QuietJson = False,
 ) -> int:
     """Fly Section 5 of the paper, draw its figures, and hold every claim against what was measured."""
-    begun = time.perf_counter()
-    _make(out)
-    wanted = PRINTED.tau if tau is None and runs > BOTH_UP_TO else tau
-    chosen = [variant for variant in VARIANTS if wanted in (None, variant.tau)]
-    setups = [_setup(variant) for variant in chosen]
-    with _progress(runs * len(chosen), shown=runs > HERE_UP_TO) as advance:
+    begin_s = time.perf_counter()
+    _make_folder(out)
+    chosen_tau = PRINTED.tau if tau is None and runs > MAX_RUNS_OF_BOTH else tau
+    chosen = [variant for variant in VARIANTS if chosen_tau in (None, variant.tau)]
+    setups = [_make_setup(variant) for variant in chosen]
+    with _show_progress(runs * len(chosen), shown=runs > HERE_UP_TO) as advance:
         flights = fly_all(setups, runs, steps, seed, workers or os.cpu_count() or 1, advance)
     results = [
         assess(setup, variant.note, flown, seed) for setup, variant, flown in zip(setups, chosen, flights, strict=True)
     ]
     depth = _measure_depth(seed) if full else None
-    figures = _draw(out, setups, flights)
+    figures = _draw_figures(out, setups, flights)
     claims = [*results[0].claims, *(claims_of_depth(depth, results[0].settled_cost) if depth else [])]
     document = {
         **msgspec.to_builtins(results[0]),
@@ -91,32 +100,32 @@ def paper(
         "variants": msgspec.to_builtins(results),
         "depth": None if depth is None else msgspec.to_builtins(depth),
         "figures": [str(path) for path in figures],
-        "wall_s": time.perf_counter() - begun,
+        "wall_s": time.perf_counter() - begin_s,
     }
-    Common(json=json).show("paper", document, lambda: paper_picture(results, claims, depth, figures))
+    Common(json=json).show("paper", document, lambda: render_paper(results, claims, depth, figures))
     return 0 if all(result.decisions and not result.infeasible and not result.failed for result in results) else 1
 
 
-def _make(out: Path) -> None:
+def _make_folder(out: Path) -> None:
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"--out: {out} cannot be made ({error.strerror}); name another folder") from error
 
 
-def _setup(variant: Variant) -> Setup:
+def _make_setup(variant: Variant) -> Setup:
     """Return the design of a variant."""
     loaded = Common(config=PRESET, overrides=variant.overrides).load()
-    with located(loaded):
+    with locate_design_errors(loaded):
         return Setup(loaded.config, build_design(loaded.config))
 
 
 @contextmanager
-def _progress(total: int, *, shown: bool) -> Iterator[Advance]:
+def _show_progress(total: int, *, shown: bool) -> Iterator[Advance]:
     if not shown:
         yield lambda _: None
         return
-    with bars(MofNCompleteColumn(), TimeRemainingColumn()) as progress:
+    with make_progress(MofNCompleteColumn(), TimeRemainingColumn()) as progress:
         task = progress.add_task("runs", total=total)
         yield lambda done: progress.update(task, advance=done)
 
@@ -124,13 +133,13 @@ def _progress(total: int, *, shown: bool) -> Iterator[Advance]:
 def _measure_depth(seed: int) -> Depth:
     from uavctl.lab.paper.depth import measure_depth  # the printed problem's CVXPY takes time to import
 
-    with messages().status("measuring") as status:
+    with make_message_console().status("measuring") as status:
         return measure_depth(seed, status.update)
 
 
-def _draw(out: Path, setups: list[Setup], flights: list[Flights]) -> list[Path]:
+def _draw_figures(out: Path, setups: list[Setup], flights: list[Flights]) -> list[Path]:
     """Draw Fig. 3 of every design, and Fig. 4 once: all designs have the same link."""
-    # matplotlib, when all is flown
+    # Loads matplotlib, so only after the flights.
     from uavctl.lab.paper.figures import AgeReference, ages_svg, trajectories_svg
 
     figures = {}
@@ -144,30 +153,44 @@ def _draw(out: Path, setups: list[Setup], flights: list[Flights]) -> list[Path]:
     return [out / name for name in figures]
 
 
-def paper_picture(
+def render_paper(
     results: list[VariantResult], claims: list[Claim], depth: Depth | None, figures: list[Path]
 ) -> RenderableType:
-    """Return the claims beside each design's result; `claims` are those of the first, and what was measured beyond."""
+    """Return the claims beside each design's result.
+
+    Args:
+        results: Result of each design.
+        claims: Claims of the first design, and those of the measured depth.
+        depth: Measured depth; None without --full.
+        figures: Paths of the figures.
+    """
     first = results[0]
     title = f"Section 5 of the paper: {first.runs:,} runs of {first.steps} steps, seed {first.seed}"
     headings = ("claim", "paper", *(f"τ = {result.tau}" for result in results))
-    others = [{one.key: one for one in result.claims} for result in results[1:]]
-    table = columns(title, headings, (), headings, lines=True)
-    for one in claims:
-        table.add_row(one.claim, one.paper, _cell(one), *(_cell(other.get(one.key)) for other in others))
-    more = [] if depth is None else [_designs(depth.designs), _complexity(depth.complexity)]
-    lines = [Text(f"{_costs(result)}\n{result.note}.") for result in results]
-    return Group(table, *lines, *more, Text(f"Figures: {', '.join(map(str, figures))}"))
+    other_claims = [{claim.key: claim for claim in result.claims} for result in results[1:]]
+    table = make_table(title, headings, (), headings, lines=True)
+    for claim in claims:
+        table.add_row(
+            claim.claim,
+            claim.paper,
+            _format_cell(claim),
+            *(_format_cell(column_claims.get(claim.key)) for column_claims in other_claims),
+        )
+    depth_tables = (
+        [] if depth is None else [_make_design_table(depth.designs), _make_complexity_table(depth.complexity)]
+    )
+    lines = [Text(f"{_describe_costs(result)}\n{result.note}.") for result in results]
+    return Group(table, *lines, *depth_tables, Text(f"Figures: {', '.join(map(str, figures))}"))
 
 
-def _cell(claim: Claim | None) -> Text:
+def _format_cell(claim: Claim | None) -> Text:
     if claim is None:
         return Text("")
     word, style = {True: ("yes: ", "green"), False: ("no: ", "red"), None: ("", "")}[claim.holds]
     return Text.assemble((word, style), claim.measured)
 
 
-def _costs(result: VariantResult) -> str:
+def _describe_costs(result: VariantResult) -> str:
     spread = ", ".join(f"{std:.2f}" for std in result.settled_std)
     return (
         f"τ = {result.tau}: summed cost {result.mean_cost:.0f} ± {result.cost_stderr:.0f} (standard error), settled "
@@ -175,29 +198,29 @@ def _costs(result: VariantResult) -> str:
     )
 
 
-def _designs(tried: list[DesignTried]) -> Table:
+def _make_design_table(tried: list[DesignTried]) -> Table:
     headings = ("τ", "schedule", "delays", "γ^x_H", "cost at start", "refused")
     rows = (
         (
-            str(one.tau),
-            one.schedule,
-            "" if one.delays is None else " ".join(map(str, one.delays)),
-            "" if one.gamma_h is None else f"{one.gamma_h:.4f}",
-            "" if one.refused else "not reached" if one.cost is None else f"{one.cost:.0f}",
-            Text(one.refused),
+            str(design.tau),
+            design.schedule,
+            "" if design.delays is None else " ".join(map(str, design.delays)),
+            "" if design.gamma_h is None else f"{design.gamma_h:.4f}",
+            "" if design.refused else "not reached" if design.cost is None else f"{design.cost:.0f}",
+            Text(design.refused),
         )
-        for one in tried
+        for design in tried
     )
-    return columns("Schedules, and what comes of them", headings, rows, headings)
+    return make_table("Schedules, and what comes of them", headings, rows, headings)
 
 
-def _complexity(sizes: list[Complexity]) -> Table:
+def _make_complexity_table(sizes: list[Complexity]) -> Table:
     headings = ("τ", "H", "terminal states", "gains", "as printed", "exact", "refused")
-    table = columns("One decision of one axis over τ, medians", headings, (), ("refused",))
-    for one in sizes:
+    table = make_table("One decision of one axis over τ, medians", headings, (), ("refused",))
+    for size in sizes:
         times = (
-            "" if one.printed_ms is None else f"{one.printed_ms:.0f} ms",
-            "" if one.exact_ms is None else f"{one.exact_ms:.1f} ms",
+            "" if size.printed_ms is None else f"{size.printed_ms:.0f} ms",
+            "" if size.exact_ms is None else f"{size.exact_ms:.1f} ms",
         )
-        table.add_row(str(one.tau), str(one.horizon), str(one.lifted), str(one.gains), *times, Text(one.refused))
+        table.add_row(str(size.tau), str(size.horizon), str(size.lifted), str(size.gains), *times, Text(size.refused))
     return table

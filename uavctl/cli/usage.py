@@ -1,4 +1,4 @@
-"""Help with the command line: an example for each command, and what a wrong command line should have been."""
+"""Help with the command line: an example for each command, and a correction of a wrong command line."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from cyclopts import (
 
 from uavctl.config.load import find_keys
 
-MOST_SUGGESTED = 3
+MAX_SUGGESTED = 3
 SET = "--set"
 
-# One for each command, by its words; each can be typed as it is, but for the names of files.
+# Example of each command, by its name; it can be typed as it is, except for the names of files.
 EXAMPLES = {
     "": "uavctl loopback --config room",
     "loopback": "uavctl loopback --config room --set link.loss=0.3",
@@ -63,113 +63,113 @@ EXAMPLES = {
 }
 
 
-def example(command: str) -> str:
+def format_example(command: str) -> str:
     """Return the last line of a command's help."""
     return f"Example: `{EXAMPLES[command]}`"
 
 
-def explain(error: CycloptsError, words: Sequence[str], app: App) -> str:
-    """Return what is wrong with a command line, and what it may have been meant to be."""
+def explain_error(error: CycloptsError, arguments: Sequence[str], app: App) -> str:
+    """Return the error of a command line, with a suggestion."""
     chain = tuple(error.command_chain or ())
     if isinstance(error, UnknownOptionError):
-        return _unknown_option(error, words)
+        return _explain_unknown_option(error, arguments)
     if isinstance(error, UnknownCommandError) and error.unused_tokens:
-        return unknown_command(error.unused_tokens[0], _command(app, chain), ("uavctl", *chain))
+        return describe_unknown_command(error.unused_tokens[0], _find_command(app, chain), ("uavctl", *chain))
     if isinstance(error, UnusedCliTokensError) and error.unused_tokens:
         unused = list(error.unused_tokens)
-        meant = [text for word in unused for text in _as_settings(*_split(word), error)][:MOST_SUGGESTED]
-        hint = f"write {' or '.join(meant)}" if meant else usage_of(app, chain)
-        return f"{' '.join(['uavctl', *chain])} does not understand {_quoted(unused)}; {hint}"
+        settings = [text for word in unused for text in _find_settings(*_split_option(word), error)][:MAX_SUGGESTED]
+        hint = f"write {' or '.join(settings)}" if settings else format_usage_line(app, chain)
+        return f"{' '.join(['uavctl', *chain])} does not understand {_quote(unused)}; {hint}"
     if isinstance(error, MissingArgumentError) and error.argument is not None:
-        return f"{_missing(error)}; {usage_of(app, chain)}"
+        return f"{_describe_missing(error)}; {format_usage_line(app, chain)}"
     return str(error)
 
 
-def unknown_command(word: str, app: App, chain: Iterable[str]) -> str:
-    """Return that there is no such command, with one that is like it, or all of them."""
+def describe_unknown_command(word: str, app: App, chain: Iterable[str]) -> str:
+    """Return a message on an unknown command, with a similar one, or all of them."""
     names = [name for name in app if not name.startswith("-")]
-    near = get_close_matches(word, names, 1)
-    did = f' Did you mean "{near[0]}"?' if near else f" Commands are {', '.join(names)}."
-    place = " ".join(chain)
-    return f'Unknown command "{word}".{did}' if place == "uavctl" else f'Unknown command "{word}" of {place}.{did}'
+    matches = get_close_matches(word, names, 1)
+    hint = f' Did you mean "{matches[0]}"?' if matches else f" Commands are {', '.join(names)}."
+    prefix = " ".join(chain)
+    return f'Unknown command "{word}".{hint}' if prefix == "uavctl" else f'Unknown command "{word}" of {prefix}.{hint}'
 
 
-def unknown_option(word: str, names: Iterable[str]) -> str:
-    """Return that there is no such option, with those that begin like it, or are like it."""
+def describe_unknown_option(word: str, names: Iterable[str]) -> str:
+    """Return a message on an unknown option, with similar ones."""
     bare = word.lstrip("-").lower()
     known = {name.lstrip("-").lower(): name for name in names if name.startswith("--")}
-    near = [name for text, name in known.items() if bare and text.startswith(bare)]
-    near = near or [known[text] for text in get_close_matches(bare, known, 1)]
-    did = f" Did you mean {' or '.join(near[:MOST_SUGGESTED])}?" if near else ""
-    return f"Unknown option: {word}.{did}"
+    matches = [name for text, name in known.items() if bare and text.startswith(bare)]
+    matches = matches or [known[text] for text in get_close_matches(bare, known, 1)]
+    hint = f" Did you mean {' or '.join(matches[:MAX_SUGGESTED])}?" if matches else ""
+    return f"Unknown option: {word}.{hint}"
 
 
-def _missing(error: MissingArgumentError) -> str:
+def _describe_missing(error: MissingArgumentError) -> str:
     assert error.argument is not None
     unknown = [word for word in error.unused_tokens or () if word.startswith("--")]
     if error.keyword or error.argument.tokens:
         return f"{error.keyword or error.argument.name} needs a value"
     name = error.argument.name
     name = name.lstrip("-").upper() if error.argument.field_info.is_positional else name
-    return f"{name} is missing" + (f", and {_quoted(unknown)} is no option" if unknown else "")
+    return f"{name} is missing" + (f", and {_quote(unknown)} is no option" if unknown else "")
 
 
-def usage_of(app: App, chain: Sequence[str]) -> str:
+def format_usage_line(app: App, chain: Sequence[str]) -> str:
     """Return the usage of a command in one line."""
-    one = _command(app, chain)
-    from cyclopts.help import format_usage  # draws: not for every command line
+    command = _find_command(app, chain)
+    from cyclopts.help import format_usage  # loads what draws: only for this error
 
-    text = one.usage or str(format_usage(app, chain))
+    text = command.usage or str(format_usage(app, chain))
     return f"usage: {text.strip().removeprefix('Usage: ')}"
 
 
-def _command(app: App, chain: Sequence[str]) -> App:
+def _find_command(app: App, chain: Sequence[str]) -> App:
     for word in chain:
         app = app[word]
     return app
 
 
-def _unknown_option(error: UnknownOptionError, words: Sequence[str]) -> str:
-    name, _ = _split(error.token.keyword or error.token.value)
-    place = next(i for i, one in enumerate(words) if _split(one)[0] == name)
-    _, value = _split(words[place])
-    if not value and place + 1 < len(words) and not words[place + 1].startswith("--"):
-        value = words[place + 1]
-    settings = _as_settings(name, value, error)
+def _explain_unknown_option(error: UnknownOptionError, arguments: Sequence[str]) -> str:
+    name, _ = _split_option(error.token.keyword or error.token.value)
+    index = next(i for i, argument in enumerate(arguments) if _split_option(argument)[0] == name)
+    _, value = _split_option(arguments[index])
+    if not value and index + 1 < len(arguments) and not arguments[index + 1].startswith("--"):
+        value = arguments[index + 1]
+    settings = _find_settings(name, value, error)
     if settings:
-        more = " …" if len(settings) > MOST_SUGGESTED else ""
-        return f"Unknown option: {name}; write {' or '.join(settings[:MOST_SUGGESTED])}{more}"
-    text = unknown_option(name, _options(error))
+        ellipsis = " …" if len(settings) > MAX_SUGGESTED else ""
+        return f"Unknown option: {name}; write {' or '.join(settings[:MAX_SUGGESTED])}{ellipsis}"
+    text = describe_unknown_option(name, _list_options(error))
     return text if text.endswith("?") else f"{text} See {' '.join(['uavctl', *(error.command_chain or ())])} --help"
 
 
-def _split(word: str) -> tuple[str, str]:
+def _split_option(word: str) -> tuple[str, str]:
     name, _, value = word.partition("=")
     return name, value
 
 
-def _as_settings(name: str, value: str, error: CycloptsError) -> list[str]:
+def _find_settings(name: str, value: str, error: CycloptsError) -> list[str]:
     """Return `--set KEY=VALUE` for each configuration key with this name, if the command takes them."""
-    if SET not in _options(error):
+    if SET not in _list_options(error):
         return []
     given = value or "VALUE"
     return [f"{SET} {shlex.quote(f'{key}={given}')}" for key in find_keys(name)]
 
 
-def _options(error: CycloptsError) -> list[str]:
+def _list_options(error: CycloptsError) -> list[str]:
     collection: Iterable[object] = getattr(error, "argument_collection", None) or ()
     if not collection and error.target is not None and error.app is not None:
         collection = error.app.assemble_argument_collection()
-    return [name for one in collection for name in getattr(one, "names", ())]
+    return [name for argument in collection for name in getattr(argument, "names", ())]
 
 
-def _quoted(words: Iterable[str]) -> str:
-    return ", ".join(f'"{word}"' for word in words)
+def _quote(arguments: Iterable[str]) -> str:
+    return ", ".join(f'"{argument}"' for argument in arguments)
 
 
-def commands_of(app: App, chain: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], App]]:
-    """Yield every command with its words, the application first."""
+def list_commands(app: App, chain: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], App]]:
+    """Yield every command with its name, the application first."""
     yield chain, app
     for name in app:
         if not name.startswith("-"):
-            yield from commands_of(app[name], (*chain, name))
+            yield from list_commands(app[name], (*chain, name))

@@ -117,7 +117,7 @@ def test_what_speaks_against_a_design_is_on_the_page_too(
 
     asked = SetpointHistory(np.zeros(1), np.zeros((1, 3)), np.ones(1, dtype=bool))
     history = FlightHistory(asked, seen(), np.zeros(0, dtype=np.int64))
-    monkeypatch.setattr(identify_cmd, "_history", lambda *_: (history, load_config("room-hahn-stursberg")))
+    monkeypatch.setattr(identify_cmd, "_read_history", lambda *_: (history, load_config("room-hahn-stursberg")))
     monkeypatch.setattr(identify_cmd, "identify", lambda *_: found(HARDLY))
     monkeypatch.setattr(identify_cmd, "design_of", refused)
     assert identify_cmd.identify_command(tmp_path / "flight.mcap") == 0
@@ -145,10 +145,10 @@ def test_a_second_vehicle_in_a_log_changes_nothing(tmp_path: Path, system: int |
     both = tmp_path / "both.tlog"
     both.write_bytes(b"".join(struct.pack(">Q", at_ns // 1000) + data for at_ns, data in rows))
     common = Common(config="room-px4")
-    alone, _ = identify_cmd._history(DATA / "px4-relay.tlog", common, None)
-    found, _ = identify_cmd._history(both, common, system)
+    alone, _ = identify_cmd._read_history(DATA / "px4-relay.tlog", common, None)
+    found, _ = identify_cmd._read_history(both, common, system)
     assert len(rows) > len(packets) + 10 and len(alone.asked.times_s)
     assert np.array_equal(found.asked.accel_mps2, alone.asked.accel_mps2)
     assert np.array_equal(found.seen.times_s, alone.seen.times_s)
     with pytest.raises(UsageError):
-        identify_cmd._history(both, common, 9)
+        identify_cmd._read_history(both, common, 9)

@@ -16,7 +16,7 @@ from logs.recording.reader import header, segment_files
 from uavctl.cli import loopback as loopback_cmd
 from uavctl.cli import tune as tune_cmd
 from uavctl.cli.app import run
-from uavctl.cli.tune import left_whole
+from uavctl.cli.tune_flights import find_complete_flight
 from uavctl.config import Config, load_config
 from uavctl.config.load import parse
 from uavctl.lab.tune.excitation import parse_box
@@ -233,7 +233,7 @@ def test_what_cannot_be_is_refused_before_anything_is_made(
 def test_nobody_to_agree_is_a_no(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = iter(["", "\n"])
     monkeypatch.setattr("sys.stdin.readline", lambda: next(asked), raising=False)
-    assert [tune_cmd.agreed(), tune_cmd.agreed()] == [False, True]
+    assert [tune_cmd.ask_agreement(), tune_cmd.ask_agreement()] == [False, True]
 
 
 # What a careless user does
@@ -281,10 +281,10 @@ def test_flights_that_came_to_their_end_count_though_nobody_was_left_to_note_the
 @pytest.mark.slow
 def test_a_flight_of_another_configuration_or_without_its_end_does_not_count(done: Path, tmp_path: Path) -> None:
     config = parse(header(done / BEFORE / "flight.mcap").config_toml, "before").config
-    assert left_whole(config, done / BEFORE) == done / BEFORE / "flight.mcap"
-    assert left_whole(config, done / AFTER) is None and left_whole(config, tmp_path) is None
+    assert find_complete_flight(config, done / BEFORE) == done / BEFORE / "flight.mcap"
+    assert find_complete_flight(config, done / AFTER) is None and find_complete_flight(config, tmp_path) is None
     (tmp_path / "flight.mcap").write_bytes((done / BEFORE / "flight.mcap").read_bytes())  # its first file alone
-    assert left_whole(config, tmp_path) is None
+    assert find_complete_flight(config, tmp_path) is None
 
 
 def test_a_tuned_configuration_that_was_cut_is_not_flown(begun: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -12,7 +12,7 @@ from tune_rig import Tuned, fly_real, real_rig
 from logs.recording.reader import header
 from uavctl.cause import CAUSES, Cause
 from uavctl.cli import tune as tune_cmd
-from uavctl.cli import tune as tune_flight
+from uavctl.cli import tune_flights
 from uavctl.config import load_config
 from uavctl.config.load import parse
 from uavctl.daemon.lock import lock_vehicle
@@ -141,14 +141,14 @@ def test_without_positions_nothing_is_flown(tmp_path: Path) -> None:
     rig = real_rig("link.blackout=[[0.0, 1000.0]]")
     result = fly_real(rig, tmp_path / "run")
     assert result.code == NotReachedError.exit_code and "uavctl check" in result.told
-    assert not result.flies_after(0) and rig.now_ns >= tune_flight.LISTENS_S * 1e9
+    assert not result.flies_after(0) and rig.now_ns >= tune_flights.LISTEN_S * 1e9
     assert not (tmp_path / "run" / BEFORE).exists()
 
 
 def test_a_vehicle_that_another_daemon_flies_is_not_spoken_to() -> None:
     config = load_config("room", ["daemon.vehicle='udpin://127.0.0.1:1'"])
     with lock_vehicle(config.daemon.vehicle), pytest.raises(VehicleTakenError):
-        tune_flight.where_it_stands(config)
+        tune_flights.measure_position(config)
 
 
 @pytest.mark.slow

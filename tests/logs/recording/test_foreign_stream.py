@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from logs.recording.foreign import cut_stream, read_mcap
 from logs.recording.tlog import TlogPacket, read_tlog
-from uavctl.cli.replay import foreign_packets
+from uavctl.cli.replays import read_foreign_vehicle
 from uavctl.errors import RecordingError, UsageError
 
 S = 1_000_000_000
@@ -266,16 +266,16 @@ def test_a_tlog_that_begins_with_garbage_or_is_torn_says_so(tmp_path: Path) -> N
 def test_the_command_line_tells_what_was_left_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     tlog, mcap = tmp_path / "a.tlog", tmp_path / "a.mcap"
     tlog.write_bytes(stamped(tlog_rows(TLOGS[0]))[:-7])
-    packets = foreign_packets(tlog, ())
+    packets = read_foreign_vehicle(tlog, ())
     assert packets is not None and len(packets) == 1033
     assert "torn within a packet" in capsys.readouterr().err
     write(mcap, [("/serial", "", at_ns, GARBAGE + data) for _, _, at_ns, data in rows_of(TLOGS[0])], use_chunking=False)
     mcap.write_bytes(mcap.read_bytes()[:20_000])
-    found = foreign_packets(mcap, ())
+    found = read_foreign_vehicle(mcap, ())
     assert found is not None and 100 < len(found) < 1034
     told = capsys.readouterr().err.splitlines()
     assert told[0] == "MAVLink in /serial"
     assert told[1].startswith("/serial: ") and told[1].endswith("bytes left out that are no whole frame")
     assert told[2] == "the recording is torn: read up to its end"
     with pytest.raises(UsageError, match=r"a \.tlog has no topics"):
-        foreign_packets(tlog, ("/serial",))
+        read_foreign_vehicle(tlog, ("/serial",))

@@ -16,14 +16,14 @@ from logs.recording.reader import header, read
 from logs.recording.recorder import SyncRecorder
 from logs.recording.recover import recover
 from uavctl.cli.app import run
-from uavctl.cli.log import info_table
+from uavctl.cli.log import render_info
 from uavctl.errors import RecordingError
 from uavctl.records import Datagram, LinkEstimate, LinkStats, Refused, Truth
 
 
 def shown(found: RecordingInfo) -> str:
     console = Console(width=160, record=True, file=io.StringIO())
-    console.print(info_table(found))
+    console.print(render_info(found))
     return console.export_text()
 
 

@@ -14,7 +14,7 @@ from recording_fakes import record_flight
 from logs.recording.disk import refuse_existing_files, write_atomically
 from logs.recording.recover import recover
 from logs.recording.segment import Segment
-from uavctl.cli.flying import LIVE_PORT, live_view_port
+from uavctl.cli.flying import LIVE_PORT, choose_live_port
 from uavctl.errors import RecordingError, UsageError
 
 # Of one file: a write beyond it fails as on a full disk, at a byte that is known.
@@ -72,7 +72,7 @@ def test_recovery_that_is_interrupted_leaves_nothing(tmp_path: Path, monkeypatch
 
 
 def test_a_port_without_a_view_is_refused() -> None:
-    assert (live_view_port(live=False, port=None), live_view_port(live=True, port=None)) == (None, LIVE_PORT)
-    assert live_view_port(live=True, port=1234) == 1234
+    assert (choose_live_port(live=False, port=None), choose_live_port(live=True, port=None)) == (None, LIVE_PORT)
+    assert choose_live_port(live=True, port=1234) == 1234
     with pytest.raises(UsageError, match="--live-port 1234"):
-        live_view_port(live=False, port=1234)
+        choose_live_port(live=False, port=1234)

@@ -15,7 +15,7 @@ from recording_fakes import Clock, flight, own
 from logs.recording.disk import DiskFile, OutputFile
 from logs.recording.reader import read
 from logs.recording.recorder import LATE_S, Recorder, RecorderStatus, SyncRecorder
-from uavctl.cli.fly import recorder_health
+from uavctl.cli.services import make_recorder_health
 from uavctl.config.types import LogConfig
 
 ITEMS = flight(400)
@@ -89,7 +89,7 @@ def test_a_disk_that_hangs_is_told_by_the_age_of_the_last_completed_write(tmp_pa
     status = recorder.status()
     assert (status.ok, status.dropped, status.unwritten_s) == (False, 0, 12.3)
     assert "last written 12.3 s ago" in status.reason
-    told = recorder_health(status, tmp_path)
+    told = make_recorder_health(status, tmp_path)
     assert (told.ok, told.reason, told.unwritten_s) == (False, status.reason, 12.3)
     disk.released.set()
 
@@ -156,7 +156,7 @@ def test_a_file_that_is_taken_away_is_told_and_another_one_begun(tmp_path: Path,
     assert kept == ITEMS[-len(kept) :] and len(kept) > 180
     lost = len(ITEMS) - len(kept)
     assert lost < final.gone <= lost + 2  # and the recorder's own notes
-    assert recorder_health(final, path).dropped == final.gone
+    assert make_recorder_health(final, path).dropped == final.gone
 
 
 @pytest.mark.fault(55)

@@ -23,7 +23,7 @@ from logs.recording.summary import summarise
 from logs.report.compare import Figure, FlightComparison, compare_flights, load_flights
 from logs.report.compare_page import render_comparison
 from uavctl.cli.app import run
-from uavctl.cli.log_report import comparison_picture
+from uavctl.cli.log_report import render_terminal_comparison
 from uavctl.records import Datagram, Decision, Header, Record, Timing
 
 SECONDS = 6.0
@@ -177,7 +177,7 @@ def test_a_torn_one_is_compared_up_to_its_end(base: Memory, tmp_path: Path) -> N
 
 def shown(comparison: FlightComparison, width: int) -> str:
     out = io.StringIO()
-    Console(file=out, width=width).print(comparison_picture(comparison))
+    Console(file=out, width=width).print(render_terminal_comparison(comparison))
     return out.getvalue()
 
 

@@ -13,7 +13,7 @@ from report_rig import unpaged
 
 from uavctl.build.controller import Prepared
 from uavctl.cli.app import run
-from uavctl.cli.replay import recorded_flyer
+from uavctl.cli.replays import make_recorded_controller
 from uavctl.config import Config
 
 SMALL = ("--config", "paper", "--set", "solver.method=exact", "--set", "log={segment_bytes=100000, chunk_bytes=4096}")
@@ -33,10 +33,10 @@ def _designed_once(cuts: Cuts) -> Iterator[None]:
 
     @lru_cache
     def flyer(config: Config) -> Prepared:
-        return recorded_flyer(cuts.files[0], config)
+        return make_recorded_controller(cuts.files[0], config)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("uavctl.cli.replay.recorded_flyer", lambda _, config: flyer(config))
+        patch.setattr("uavctl.cli.replays.make_recorded_controller", lambda _, config: flyer(config))
         yield
 
 

@@ -12,7 +12,7 @@ import pytest
 from optimisation_cases import ORIGIN, PAPER_COST, PAPER_COST_X, PAPER_COST_Y, START, paper, room
 from rich.console import Console
 
-from uavctl.cli.design import solve_document, solve_picture
+from uavctl.cli.design import make_solve_document, render_solution
 from uavctl.config import load_config
 from uavctl.records import SolveStatus
 from uavctl.smpc.hahn_stursberg.design import Design
@@ -51,11 +51,11 @@ def test_plan_of_both_axes(solver: PrintedSolver) -> None:
 def test_nothing_is_certified_and_a_person_is_told_so(design: Design, solver: PrintedSolver) -> None:
     answer = solver.solve(0, START, ORIGIN)
     assert (answer.status, answer.cost_lower, answer.gap) == (SolveStatus.OPTIMAL, -np.inf, np.inf)
-    shown = json.loads(msgspec.json.encode(solve_document(answer, 1.0)))
+    shown = json.loads(msgspec.json.encode(make_solve_document(answer, 1.0)))
     assert shown["cost"] == pytest.approx(PAPER_COST, rel=1e-6)
     assert (shown["cost_lower"], shown["gap"]) == (None, None)
     console = Console(file=StringIO(), width=200)
-    console.print(solve_picture(answer, design, load_config("paper"), 1.0))
+    console.print(render_solution(answer, design, load_config("paper"), 1.0))
     assert isinstance(console.file, StringIO)
     assert "(no lower bound known), slack 0" in console.file.getvalue()
 
