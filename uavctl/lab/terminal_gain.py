@@ -6,15 +6,14 @@ from dataclasses import replace
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.errors import DesignError
 from uavctl.smpc.hahn_stursberg.design import DesignSpec, make_design
 from uavctl.smpc.hahn_stursberg.exact import check_schedule, optimal_cost
 from uavctl.smpc.hahn_stursberg.synthesis import synthesize, terminal_factors
 from uavctl.smpc.hahn_stursberg.terminal import stationary_cost
 
-Array = NDArray[np.float64]
 _DIGITS = 6  # of a gain as it is printed: the figures are those of the printed one
 
 

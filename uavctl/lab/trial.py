@@ -1,4 +1,11 @@
-"""Trials with the simulated quadrotor: case, flight, figures."""
+"""Trials with the simulated quadrotor: case, flight in lockstep, figures from its true positions.
+
+The figure of eight has the speeds and rounds of J. A. Preiss, W. Hönig, G. S. Sukhatme and N. Ayanian, "Crazyswarm: A
+large nano-quadcopter swarm", ICRA 2017: three times around, 0.76 m/s in the mean, 1.5 m/s at most. The curve is our
+own, (a sin θ, b sin θ cos θ), and θ runs faster through the crossing than around the tips.
+
+The figures of a flight are pure functions, in metres and seconds; a larger figure is always worse.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +18,11 @@ from typing import Literal
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 from scipy.optimize import brentq
 
 from sim.simulation import World
+from uavctl.arrays import Array
 from uavctl.build.controller import build_conditioned, build_controller, build_plant, resting
 from uavctl.build.mission import build_rests, resting_places
 from uavctl.config import Config, load_config, parse
@@ -34,9 +41,6 @@ from uavctl.smpc.plant import AXES
 # Speeds and rounds are those of J. A. Preiss, W. Hönig, G. S. Sukhatme and N. Ayanian, "Crazyswarm: A large
 # nano-quadcopter swarm", ICRA 2017: three times around, 0.76 m/s in the mean, 1.5 m/s at most. The curve is our own:
 # (a sin θ, b sin θ cos θ), and θ runs faster through the crossing than around the tips.
-
-
-Array = NDArray[np.float64]
 
 MEAN_MPS, LARGEST_MPS, ROUNDS = 0.76, 1.5, 3
 CENTRE_M: Vec3 = (0.0, 0.0, -1.2)
@@ -108,9 +112,6 @@ def _length() -> float:
     angle = np.linspace(0.0, 2.0 * math.pi, _FINE + 1)
     points = np.column_stack([HALF_M * np.sin(angle), 0.5 * WIDTH_M * np.sin(2.0 * angle)])
     return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
-
-
-# What is flown in a trial: who flies, what, with whom, in which air and over which link. Plain and picklable.
 
 
 Scenario = Literal["hold", "eight", "blackout"]
@@ -218,9 +219,6 @@ def _with_mission(config: Config, scenario: Scenario) -> Config:
     )
 
 
-# The figures of a flight that tables show, by scenario; in all of them the larger, the worse.
-
-
 @dataclass(frozen=True)
 class Shown:
     """Display of a figure in a table."""
@@ -273,9 +271,6 @@ MEANING = (
 )
 
 
-# What a flight came to, from where the vehicle truly was. Pure; lengths in metres, times in seconds.
-
-
 def distances_m(positions: Array, wanted: Array) -> Array:
     """Return the distance (n,) [m] of positions (n, 3) from where they were wanted, (3,) or (n, 3)."""
     return np.asarray(np.linalg.norm(positions - wanted, axis=1))
@@ -320,9 +315,6 @@ def beyond_m(positions: Array, lower: Array, upper: Array) -> Array:
     return np.asarray(np.maximum(lower - positions, positions - upper).max(axis=1))
 
 
-# The room of a configuration, and what of it a controller can use.
-
-
 def room_of(config: Config) -> tuple[Array, Array]:
     """Return the least and the largest position in the room (3,) [m]; infinite where there is no wall."""
     limits = get_position_limits_m(config)
@@ -357,9 +349,6 @@ def _volume_share(config: Config, least: Array, most: Array) -> float:
     lower, upper = room_of(config)
     whole = (upper - lower)[axes]
     return float(np.prod(np.clip(most - least, 0.0, None) / whole)) if np.isfinite(whole).all() else math.nan
-
-
-# One flight of the true vehicle in lockstep, and what it came to.
 
 
 NEAR_M, NEARER_M = 0.3, 0.1  # of the target

@@ -9,10 +9,10 @@ import msgspec
 import numpy as np
 import pytest
 from baseline_rig import problem
-from numpy.typing import NDArray
 from optimisation_cases import PAPER_LOWER, PAPER_UPPER, START, paper
 
 from sim.simulation import World
+from uavctl.arrays import Array
 from uavctl.build.controller import build_conditioned, build_controller
 from uavctl.cli import bench as bench_cmd
 from uavctl.cli.app import run as command
@@ -40,8 +40,6 @@ from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver
 from uavctl.smpc.hahn_stursberg.frozen import FROZEN
 from uavctl.smpc.link import bernoulli
-
-Array = NDArray[np.float64]
 
 WANTED = {
     "printed_ms", "printed_status", "cvxpy_axis_ms", "exact_axis_ms", "flown_us", "ratio_printed", "ratio_cvxpy",
@@ -190,9 +188,6 @@ def test_progress_reaches_the_end_of_every_phase(result: BenchResult, told: list
     assert last["all methods in turns"] == (decisions, decisions)
 
 
-# --- states ----------------------------------------------------------------------------------------------------------
-
-
 def test_states_are_seeded_feasible_and_in_turns(design: Design) -> None:
     exact = ConicSolver(design)
     one, again = (draw_states(design, exact, 7, 0.3, 4, lambda _: None) for _ in range(2))
@@ -262,9 +257,6 @@ def test_a_loop_without_plans_is_given_up(design: Design) -> None:
     assert 0 < len(stub.asked) < LOOP_STEPS
 
 
-# --- times -----------------------------------------------------------------------------------------------------------
-
-
 def test_cases_are_run_in_turns_without_garbage_collection() -> None:
     stub, done = Stub(), list[int]()
     cases = [Case(stub, [np.array([float(i)]) for i in points], np.zeros(1)) for points in ((1, 2), (), (3,))]
@@ -293,9 +285,6 @@ def test_garbage_is_collected_again_after_an_error() -> None:
     with pytest.raises(ArithmeticError):
         timed([Case(Breaks(), [np.zeros(1)], np.zeros(1))], 1)
     assert gc.isenabled()
-
-
-# --- what people see -------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture

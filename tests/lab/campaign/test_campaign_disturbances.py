@@ -4,21 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.stats import norm, t
 
+from uavctl.arrays import Array
 from uavctl.lab.campaign.controllers import disturbances
 from uavctl.lab.campaign.spec import DisturbanceSpec, Shape
 
 RUNS, STEPS = 4000, 50
-NORMAL: NDArray[np.float64] = np.random.default_rng(3).standard_normal((RUNS, STEPS, 2))
+NORMAL: Array = np.random.default_rng(3).standard_normal((RUNS, STEPS, 2))
 W = np.array([[0.6, 0.2], [0.2, 0.3]])
 SHAPES: tuple[Shape, ...] = ("gaussian", "uniform", "heavy", "gusts")
 
 
-def made(
-    kind: Shape, scale: float = 1.0, bias: float = 0.0, memory: float = 0.0, w: NDArray[np.float64] = W
-) -> NDArray[np.float64]:
+def made(kind: Shape, scale: float = 1.0, bias: float = 0.0, memory: float = 0.0, w: Array = W) -> Array:
     return disturbances(DisturbanceSpec(name="d", kind=kind, scale=scale, bias=bias, memory=memory), w, NORMAL)
 
 

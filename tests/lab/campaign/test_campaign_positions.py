@@ -9,10 +9,10 @@ import campaign_rig as rig
 import msgspec
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.stats import binom
 
 from logs.report.run_statistics import max_step_rate
+from uavctl.arrays import Array
 from uavctl.build.controller import build_estimator, build_plant, build_problem
 from uavctl.config import Config, load_config
 from uavctl.flight.estimator import absorb_samples, begin_history, estimate_at, note_input
@@ -27,7 +27,6 @@ from uavctl.smpc.batch import Counts, News, predict, predicted_cov
 from uavctl.smpc.estimate import innovations
 from uavctl.smpc.nominal import unseen
 
-Array = NDArray[np.float64]
 S = 1_000_000_000
 RUNS, STEPS = 4, 25
 LINKS = {

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from campaign_results import cell, runs, write
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.build.controller import build_conditioned, build_design
 from uavctl.build.mission import build_rests
 from uavctl.config import load_config
@@ -22,7 +22,7 @@ CONFIG = load_config("room-hahn-stursberg")  # target (1.5, 1, -1.2), walls at +
 DT_S = CONFIG.plant.dt_s
 
 
-def approaching(far_m: float, tau_s: float, steps: int) -> NDArray[np.float64]:
+def approaching(far_m: float, tau_s: float, steps: int) -> Array:
     """States of a run (1, T+1, 9) that comes from the north as an exponential."""
     states = np.zeros((1, steps + 1, 9))
     states[0, :, [0, 3, 6]] = np.array(CONFIG.target.position_m)[:, None]
@@ -56,7 +56,7 @@ def test_the_room_that_can_be_used_is_that_between_the_places_to_rest() -> None:
     assert usable_seen(CONFIG, design) < usable_seen(config, None) < 1.0
 
 
-def share(rests: NDArray[np.float64]) -> float:
+def share(rests: Array) -> float:
     """By the box between rows of the state set that are a position alone."""
     rows = build_design(CONFIG).state_set.c
     sides: dict[tuple[int, bool], float] = {}

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from sim.channel import Channel
+from uavctl.arrays import Array
 from uavctl.build.controller import build_design, build_plant
 from uavctl.build.link import build_delayed_link
 from uavctl.config import Config, load_config
@@ -15,7 +15,6 @@ from uavctl.smpc.batch import BatchSmpc, Decisions, News, predict
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope
 
-Array = NDArray[np.float64]
 RUNS, STEPS = 20_000, 12
 
 LINKS = {

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from loopback_rig import Memory, make_loop
 from msgspec.structs import replace
-from numpy.typing import NDArray
 
 from sim import simulation
 from sim.channel import Channel
 from sim.simulation import World
 from sim.vehicle.linear import LinearVehicle
+from uavctl.arrays import Array
 from uavctl.build.controller import build_design, build_plant
 from uavctl.config import Config, load_config
 from uavctl.config.connections import ClockConfig
@@ -24,8 +24,6 @@ from uavctl.lab.campaign.world import Flown, Scene, draw, fly, newest
 from uavctl.records import Decision, Truth
 from uavctl.smpc.batch import BatchSmpc, Counts
 from uavctl.smpc.hahn_stursberg.frozen import ShortcutDecider, ShortcutSolver
-
-Array = NDArray[np.float64]
 
 STEPS, DT_NS = 50, 1_000_000_000
 NEVER = 1e6  # [s], [m], [m/s]

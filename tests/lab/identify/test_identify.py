@@ -12,6 +12,7 @@ from places import DATA
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from logs.recording.tlog import read_tlog
+from uavctl.arrays import Array
 from uavctl.cli.app import run
 from uavctl.config import load_config
 from uavctl.errors import RecordingError
@@ -129,7 +130,7 @@ def flown_by_reference(seed: int) -> Stretch:
     return Stretch(TICK_S * np.arange(len(asked), dtype=np.float64), inputs, np.array(times), np.array(rows))
 
 
-def missed(flown: Stretch, fit: AxisFit) -> NDArray[np.float64]:
+def missed(flown: Stretch, fit: AxisFit) -> Array:
     """Rms errors of the motion of the next times [m]."""
     return np.array([np.sqrt(np.mean(one.errors_m**2)) for one in predict_ahead((flown,), 0, fit)])
 

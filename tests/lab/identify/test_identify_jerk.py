@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from quadrotor_rig import quadrotor
 
 from sim.vehicle.quadrotor import STEP_NS, STEP_S
+from uavctl.arrays import Array
 from uavctl.config import load_config
 from uavctl.lab.identify.fit import fit_axes
 from uavctl.lab.identify.history import FlightHistory, PositionHistory, SetpointHistory, Stretch
@@ -20,7 +20,7 @@ TICK_S = 0.05
 LIMIT_MPS3 = 5.0  # the simulated ArduPilot's
 
 
-def steps(seed: int, seconds: float, slew_mps3: float) -> NDArray[np.float64]:
+def steps(seed: int, seconds: float, slew_mps3: float) -> Array:
     """Setpoints each tick (n, 3): towards one random acceleration after the other, each axis within its slew limit."""
     rng = np.random.default_rng(seed)
     accel, rows = np.zeros(3), []
@@ -34,13 +34,13 @@ def steps(seed: int, seconds: float, slew_mps3: float) -> NDArray[np.float64]:
     return np.array(rows)
 
 
-def stretch(setpoints: NDArray[np.float64]) -> Stretch:
+def stretch(setpoints: Array) -> Stretch:
     times_s = TICK_S * np.arange(len(setpoints), dtype=np.float64)
     return Stretch(times_s, setpoints, times_s, np.zeros((len(times_s), 3)))
 
 
-def at(ramps: Stretch, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
-    held: NDArray[np.float64] = ramps.inputs_mps2[np.searchsorted(ramps.input_times_s, times_s, side="right") - 1]
+def at(ramps: Stretch, times_s: Array) -> Array:
+    held: Array = ramps.inputs_mps2[np.searchsorted(ramps.input_times_s, times_s, side="right") - 1]
     return held
 
 
@@ -76,7 +76,7 @@ def test_a_setpoint_that_stays_is_reached_and_no_limit_changes_nothing() -> None
     assert ramped(asked, np.inf, np.inf) is asked
 
 
-def flown(setpoints: NDArray[np.float64], seed: int) -> PositionHistory:
+def flown(setpoints: Array, seed: int) -> PositionHistory:
     """Positions of the simulated quadrotor under ArduPilot's loops, 20 a second, 3 mm of noise."""
     vehicle = quadrotor("ardupilot", at=(0.0, 0.0, -10.0))
     rng = np.random.default_rng(seed)

@@ -8,15 +8,14 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from uavctl.arrays import Array
 from uavctl.build.controller import build_design
 from uavctl.config import load_config
 from uavctl.lab.paper.figures import AgeReference, ages_svg, trajectories_svg
 from uavctl.smpc.hahn_stursberg.design import Design
 
-Array = NDArray[np.float64]
 SVG = "{http://www.w3.org/2000/svg}"
 LINK = AgeReference(tau=4, horizon=12, loss=0.3)
 PLANES = ("(0, 1)", "(2, 3)", "(0, 2)")  # both axes, and the positions

@@ -7,6 +7,7 @@ import pytest
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.build.controller import build_design, build_plant, start_state
 from uavctl.config import load_config
 from uavctl.lab.campaign.world import Flown, Scene, draw, fly, newest
@@ -24,8 +25,6 @@ from uavctl.lab.paper.claims import (
 from uavctl.lab.paper.runs import Chunk, ChunkRunner, Moments, Setup, Watched, fly_all, in_ellipsoid, together, total
 from uavctl.smpc.batch import BatchSmpc, Decisions
 from uavctl.smpc.hahn_stursberg.frozen import ShortcutDecider, ShortcutSolver
-
-Array = NDArray[np.float64]
 
 RUNS, STEPS, SEED = 20, 50, 3
 

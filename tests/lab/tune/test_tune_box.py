@@ -95,9 +95,6 @@ def test_a_flight_whose_smallest_motion_does_not_fit_is_ended(monkeypatch: pytes
     assert "north" in monitor.why
 
 
-# The monitor alone
-
-
 @dataclass
 class Orders:
     """A loop that takes orders, and the ticks of a flight on it."""

@@ -236,9 +236,6 @@ def test_nobody_to_agree_is_a_no(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert [tune_cmd.agreed(), tune_cmd.agreed()] == [False, True]
 
 
-# What a careless user does
-
-
 @pytest.fixture
 def copy(done: Path, tmp_path: Path) -> Callable[..., Path]:
     """The run as it was before some of its steps were noted."""

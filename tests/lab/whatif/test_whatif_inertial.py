@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from inertial_rig import ATTITUDE, HIGHRES, QUATERNION
 from loopback_rig import Memory
-from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from whatif_rig import Case, again, config_of, flown, history
 
 from logs.recording.topics import encode
+from uavctl.arrays import Array
 from uavctl.build.controller import build_controller
 from uavctl.frames import Quaternion, quaternion_from_euler, rotate_vector
 from uavctl.lab.whatif.comparison import model_fit
@@ -253,12 +253,12 @@ def inertial_events(memory: Memory) -> Counter[str]:
     return Counter(one.code for one in memory.of(Event) if one.code.startswith("inertial-"))
 
 
-def felt(memory: Memory) -> NDArray[np.float64]:
+def felt(memory: Memory) -> Array:
     """Accelerations (n, 3) that the controller read of inertial data."""
     return np.array([sample.accel_mps2 for one in memory.of(StepInput) for sample in one.inertial])
 
 
-def velocities(memory: Memory) -> NDArray[np.float64]:
+def velocities(memory: Memory) -> Array:
     """The vehicle's own velocities (n, 3), as ticks knew them."""
     return np.array([one.motion.velocity_mps for one in memory.of(StepInput) if one.motion and one.motion.velocity_mps])
 

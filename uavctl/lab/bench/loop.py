@@ -1,6 +1,9 @@
 """Benchmark of the control loop: `uavctl fly` as a process with a vehicle on real UDP, an empty loop beside it.
 
-Both loops run at the same time, half a tick apart, so that what else the machine does meets both alike.
+1. The vehicle is a point mass with cameras. It sends each position just in time for a tick.
+2. The empty loop does the same sleeps without a controller. Both loops run at the same time, half a tick apart, so
+   other work of the machine delays both alike.
+3. `LoopBench` holds the figures; its fields are the keys of the JSON document of `uavctl bench --loop`.
 """
 
 from __future__ import annotations
@@ -27,15 +30,13 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from logs.recording.reader import read
 from logs.recording.topics import RecorderNote
+from uavctl.arrays import SECOND_NS
 from uavctl.clock import Ticker, monotonic_ns
 from uavctl.config import Config
 from uavctl.daemon.realtime import enable_realtime
 from uavctl.errors import UavctlError
 from uavctl.io.transport import open_connection, wait
 from uavctl.records import Decision, Timing
-
-# A vehicle with cameras for measuring a control loop: a point mass whose position comes just in time for each tick.
-
 
 LEAD_NS = 2_000_000  # a position is sent this long before the deadline of a tick
 _HEARTBEAT_TICKS = 10
@@ -98,7 +99,7 @@ class Peer:
             stamp = next(value for level, kind, value in ancillary if kind == _SO_TIMESTAMPNS)
             seconds, nanoseconds = _TIMESPEC.unpack(stamp)
             # The kernel stamps in wall time; both clocks are read now, a moment later.
-            arrived_ns = seconds * 1_000_000_000 + nanoseconds - time.time_ns() + time.monotonic_ns()
+            arrived_ns = seconds * SECOND_NS + nanoseconds - time.time_ns() + time.monotonic_ns()
             parser = mavlink.MAVLink(None)
             for message in parser.parse_buffer(data) or []:
                 if message.get_type() == "SET_POSITION_TARGET_LOCAL_NED":
@@ -128,9 +129,6 @@ class Peer:
             self._socket.send(data)
         except ConnectionRefusedError:
             return  # the daemon is not there yet, or any more
-
-
-# What `uavctl bench --loop` measures; the fields are the keys of its JSON document.
 
 
 class TimeQuantiles(msgspec.Struct, frozen=True, kw_only=True):
@@ -198,7 +196,7 @@ class LoopBench(msgspec.Struct, frozen=True, kw_only=True):
 START_LIMIT_S = 600.0  # a design may have to be made first
 _END_LIMIT_S = 60.0
 _WARM_SHARE = 0.2
-_SAMPLE_NS = 1_000_000_000
+_SAMPLE_NS = SECOND_NS
 
 
 def run_loop_bench(

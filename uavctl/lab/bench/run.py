@@ -1,4 +1,9 @@
-"""A benchmark run: its states or those of a flight, and the times of all solvers on them."""
+"""A benchmark run: its states or those of a flight, and the times of all solvers on them.
+
+The states of scheme `hahn-stursberg` are half uniform over the feasible box and half from closed loops, in turns. The
+decisions of scheme `age-conditioned` are those of a flight of the configuration in lockstep, and others from anywhere
+within the limits, which are harder than those of a flight.
+"""
 
 from __future__ import annotations
 
@@ -9,9 +14,9 @@ from itertools import chain, cycle, islice, zip_longest
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from sim.simulation import World
+from uavctl.arrays import Array
 from uavctl.build.controller import build_controller
 from uavctl.config import Config
 from uavctl.errors import UavctlError
@@ -40,9 +45,6 @@ from uavctl.smpc.sets import Polytope
 
 # The decision of scheme `age-conditioned` as a flight asks for it.
 
-
-Array = NDArray[np.float64]
-
 _COVARIANCES = 7  # in turns: a filter's is hardly ever the last one's
 
 
@@ -63,9 +65,6 @@ class InFlight:
         """See `Solver`; the outlook is its own."""
         self._asked = (self._asked + 1) % _COVARIANCES
         return self._solver.solve(seq, x, target, self._outlooks[self._asked])
-
-
-# The states of a benchmark: half uniform over the feasible box, half along closed loops, in turns.
 
 
 LOOP_STEPS = 50
@@ -177,9 +176,6 @@ def closed_loops(
                 return asked
             x = plant.a @ x + plant.b @ inputs[age] + effect @ rng.standard_normal(plant.n_w)
     return asked
-
-
-# One benchmark, from a design to its figures.
 
 
 # Told what is being done, how much of it is done, and of how much; None where nobody knows.
@@ -304,9 +300,6 @@ def _cost_difference(printed: Sequence[Answer], exact: Sequence[Answer]) -> floa
     return max((abs(one / other - 1.0) for one, other in pairs), default=None)
 
 
-# Decisions that a flight asks for: those of the configuration's own, flown in lockstep by the simulated vehicle.
-
-
 ROUNDS = 5
 
 
@@ -388,9 +381,6 @@ def time_flight(config: Config, told: Callable[[int, int], None] = lambda *_: No
         gave_way=float(np.mean([answer.slack > 0.0 for answer in answers] & planned)),
         first_us=asked.first_us,
     )
-
-
-# Decisions of scheme `age-conditioned` from anywhere within the limits: harder than what a flight asks.
 
 
 _WARM = 20

@@ -1,4 +1,7 @@
-"""Timing of decisions, and the result document of a benchmark."""
+"""Times of decisions, and the result document of a benchmark.
+
+Solvers are warmed up, run without garbage collection, and solve the same states several times.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +13,9 @@ from dataclasses import dataclass
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.smpc.answer import Answer, Solver
-
-# What a benchmark found; one document, all of one run.
 
 
 class Quantiles(msgspec.Struct, frozen=True, kw_only=True):
@@ -25,7 +26,7 @@ class Quantiles(msgspec.Struct, frozen=True, kw_only=True):
     max: float
 
     @staticmethod
-    def of(values: NDArray[np.float64]) -> Quantiles:
+    def of(values: Array) -> Quantiles:
         """Return the quantiles of values (n,)."""
         p50, p99, most = np.quantile(values, [0.5, 0.99, 1.0]).tolist()
         return Quantiles(p50=p50, p99=p99, max=most)
@@ -79,9 +80,6 @@ class BenchResult(msgspec.Struct, frozen=True, kw_only=True):
 
 
 # Times of decisions: warmed up, without garbage collection, several runs of the same states.
-
-
-Array = NDArray[np.float64]
 
 _EMPTY = 1000
 _WARM = 5

@@ -1,4 +1,10 @@
-"""Controllers of a campaign's cells, the settings they fly in, and baselines within the flight core."""
+"""Controllers of a campaign's cells, their settings, and baselines within the flight core.
+
+1. A disturbance is a transform of standard normal draws, which are the same for every cell.
+2. A `Setting` holds what is the same for every controller: plant, limits, costs, start, link and disturbance.
+3. A `Recipe` is made once for each belief; each worker builds its own controller from it.
+4. A `BaselineSolver` replaces the SMPC within the flight core; filter, fallback and last gate stay.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +16,9 @@ from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr, stdtrit
 
+from uavctl.arrays import Array
 from uavctl.build.controller import (
     build_conditioned,
     build_design,
@@ -52,9 +58,6 @@ from uavctl.smpc.outside import Rehearsal, make_answer
 
 # Disturbances of many runs: each kind a transform of the same standard normal draws.
 
-
-Array = NDArray[np.float64]
-
 _DEGREES = 4.0  # of Student's t; its variance is degrees / (degrees - 2)
 
 
@@ -86,9 +89,6 @@ def _shaped(spec: DisturbanceSpec, normal: Array) -> Array:
             gusts[:, k] = spec.memory * gusts[:, k - 1] + np.sqrt(1.0 - spec.memory**2) * normal[:, k]
         return gusts
     return normal
-
-
-# What a cell's runs meet, whoever flies them: plant, limits, costs, start, link, disturbance.
 
 
 _START = 2  # child of a run's seed that draws its start; 0 and 1 are those of `chance.draw`
@@ -168,9 +168,6 @@ def _starts(setting: Setting, first: int, runs: int) -> Array:
     return np.asarray(lower + (upper - lower) * draws, dtype=np.float64)
 
 
-# From what a controller is to believe to the controller: first a recipe, once, then as many controllers as workers.
-
-
 # Runs that a PID is tuned on: beyond the last index that a campaign can fly.
 TUNING_FIRST, TUNING_RUNS = 10_000_000, 64
 TUNING_STEPS = 200  # longer runs show nothing new, and every candidate flies them all
@@ -189,7 +186,7 @@ class Recipe:
     gains: PidGains | None = None  # the gains of a PID
     margin: float = 0.0  # of an MPC without back-offs, see `ControllerSpec`
     # Covariance (n_x, n_x) that the simple margins begin with; None: the state is measured
-    cov: NDArray[np.float64] | None = None
+    cov: Array | None = None
 
 
 def recipe_for(given: ControllerSpec, config: Config, spec: CampaignSpec) -> Recipe:
@@ -293,9 +290,6 @@ def _tuned(config: Config, spec: CampaignSpec) -> PidGains:
     meets = met(believed, TUNING_FIRST, TUNING_RUNS)
     start = start_of(spec, config)
     return tune(build_problem(config), np.asarray(start), meets.newest, meets.disturbances)
-
-
-# Controllers of ours in place of the SMPC, within the flight core: its filter, fallback and last gate stay.
 
 
 class BaselineSolver:

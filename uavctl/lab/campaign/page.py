@@ -1,4 +1,4 @@
-"""Pages of campaigns, in the linear world and of quadrotor trials."""
+"""Pages of campaigns, in the linear world and of quadrotor trials; each is one complete HTML file."""
 
 from __future__ import annotations
 
@@ -39,9 +39,6 @@ from uavctl.lab.campaign.store import SPECIFICATION
 from uavctl.lab.campaign.trials import ToldTrial, TrialSummary, summarise_trial
 from uavctl.lab.trial import BEYOND, MEANING, SHOWN
 
-# A campaign with all that its page shows worked out.
-
-
 _WHAT = ("link", "disturbance", "plant")
 
 
@@ -79,9 +76,6 @@ class CampaignView:
         for cell in self.cells:
             scenes.setdefault((cell.disturbance, cell.plant), []).append(cell)
         return scenes
-
-
-# What a campaign came to, in sentences made from its figures.
 
 
 def story(view: CampaignView) -> Iterator[str]:
@@ -167,9 +161,6 @@ def _step_by_step(view: CampaignView) -> Iterator[str]:
             f"step, beyond chance; the worst step of all had {percent(highest.worst_step_rate)} "
             f"({highest.controller}, {view.place(group_of(highest))})."
         )
-
-
-# The page of a campaign: one HTML file, complete in itself.
 
 
 PAGE = "report.html"
@@ -436,9 +427,6 @@ def _failures_section(view: CampaignView) -> PageSection:
     )
     note = "" if len(shown) == len(failed) else f"The first {len(shown)} of {len(failed)}; runs.parquet has all."
     return PageSection("Runs that failed", note, body)
-
-
-# The page of a campaign in the world of the quadrotor: one HTML file, complete in itself.
 
 
 _TITLES = {

@@ -1,4 +1,8 @@
-"""Figures of a campaign's page."""
+"""Figures of a campaign's page: cost, violation rates, inputs, ages and differences, by controller and link.
+
+A figure by link has one row for each link, with the link's name beside the axis. Legends show the markers of the
+figures. Numbers below a logarithmic axis are short and do not touch.
+"""
 
 from __future__ import annotations
 
@@ -16,9 +20,6 @@ from logs.report.plots import DASHED, DOTTED
 from logs.report.run_statistics import Interval
 from logs.report.svg import Drawing, colour, open_canvas
 from uavctl.lab.campaign.results import BaselineComparison, CampaignVerdict, CellSummary, Results
-
-# Legends of a campaign's figures, with the markers that the figures have.
-
 
 # By matplotlib's name of the marker, around (13, 7).
 _SHAPES = {
@@ -42,9 +43,6 @@ class MarkerStyle:
     def meaning(self, text: str) -> Mark:
         """Return the legend's entry of what has this style."""
         return Mark("marker", self.role, text, _SHAPES[self.marker], self.full)
-
-
-# Rows of a figure, one a link, with the names of the links beside the axis.
 
 
 _LETTER_IN = 0.08  # of the page's font, the widest that browsers take for it
@@ -82,9 +80,6 @@ def draw_rows(ax: Axes, labels: Sequence[str]) -> None:
         ax.axhline(row - 0.5, color=colour("grid"), lw=0.6, ls=DOTTED)
 
 
-# Numbers below a logarithmic axis: short, and apart from each other.
-
-
 LINEAR_PERCENT = 3.0  # of the axis of differences; logarithmic beyond
 _TICK_LETTER_IN, _TICK_GAP_IN = 0.075, 0.08  # of the axis of differences
 
@@ -110,9 +105,6 @@ def plain(value: float, _place: int) -> str:
         if abs(value) >= least:
             return f"{value / (1e6 if suffix == 'M' else 1e3):.6g}{suffix}"
     return f"{value:.4g}"
-
-
-# Figures of a campaign's page: cost, violation rates, inputs, ages and differences, by controller and link.
 
 
 # Beyond this ratio of the largest to the smallest, a logarithmic axis.

@@ -221,9 +221,6 @@ def _end_after(sentinel: int) -> None:
     os._exit(1)
 
 
-# Flying a campaign: every task that is not there yet, whatever becomes of the workers.
-
-
 Keep = Callable[[Work, Columns], None]
 _LOOK_S = 0.2
 _AHEAD = 2  # tasks for each worker: the one that it flies, and the next

@@ -1,4 +1,8 @@
-"""Results of a campaign: figures of its cells, and verdicts on the SMPC."""
+"""Results of a campaign: its folder as read, figures of its cells, and verdicts on the SMPC.
+
+Each figure has a confidence interval; see `logs.report.run_statistics`. A verdict states whether a baseline is as cheap
+as the SMPC at equal or lower violation rates.
+"""
 
 from __future__ import annotations
 
@@ -23,14 +27,12 @@ from logs.report.run_statistics import (
     step_rate,
 )
 from logs.report.statistics import replace_infinite
+from uavctl.arrays import Array
 from uavctl.errors import UavctlError
-
-# A finished campaign's folder, read: what was compared, and what each run came to.
-
 
 DOCUMENT, RUNS = "campaign.json", "runs.parquet"
 
-Values = NDArray[np.float64]
+Values = Array
 
 _COUNTED = ("saturated", "decisions", "infeasible", "slack_used", "fallbacks")
 _REAL = ("cost", "settled_cost", "mean_square_input", "largest_gap")
@@ -186,9 +188,6 @@ def _histogram(lists: pa.ChunkedArray, good: NDArray[np.bool_]) -> NDArray[np.in
 
 
 # The figures of a campaign's cells, each with a confidence interval; see `intervals` for how.
-
-
-Array = NDArray[np.float64]
 Figure = tuple[float, Interval] | tuple[None, None]
 
 
@@ -306,9 +305,6 @@ def _step_and_run_rate(hits: Array, steps: int) -> tuple[Figure, Figure]:
         return (None, None), (None, None)
     some = int(np.count_nonzero(hits))
     return step_rate(hits, steps), (some / hits.size, clopper_pearson(some, hits.size))
-
-
-# Whether a baseline is as cheap as the SMPC at equal or lower violation rates, and what each one pays for what.
 
 
 SMPC = "smpc"

@@ -1,4 +1,9 @@
-"""Specification of a campaign: its file, its types and kinds of controllers, and the configurations that come of it."""
+"""Specification of a campaign: its file, its types, and the configurations that it describes.
+
+1. The sections are the TOML tables of the file. Every key has its unit and meaning in `Meta(description=...)`.
+2. `compose` makes every configuration: those of the flown links and plants, and the belief of each controller.
+3. `read_campaign` reads a file and reports all problems at once.
+"""
 
 from __future__ import annotations
 
@@ -53,11 +58,6 @@ def make_controller(kind: str, problem: ControlProblem) -> BatchController:
         DesignError: There is none, or its class does not take the problem.
     """
     return cast(BatchController, make(controller_class(kind, KEY, (ACTS,), KINDS), kind, KEY, problem))
-
-
-# What a campaign is asked to fly, as its TOML file says it.
-#
-# Every key has its unit and meaning in `Meta(description=...)`, as in the flight configuration.
 
 
 TRUE = "true"  # a controller that believes in the link it flies on
@@ -199,9 +199,6 @@ class CampaignSpec(Section, frozen=True, kw_only=True):
     tuning: Annotated[
         tuple[TuningSpec, ...], Meta(max_length=MOST_OF_A_KIND, description="settings of controllers on some links")
     ] = ()
-
-
-# Every configuration that a campaign's specification asks for: what flies, and what each controller believes.
 
 
 CONFIGURATION = "the configuration"
@@ -377,9 +374,6 @@ def _fits(key: str, base: Config, one: Config) -> ConfigProblem:
     return ConfigProblem(
         key, f"the plant has {' where the configuration has '.join(sizes)}", "keep its sizes and its step"
     )
-
-
-# A campaign's file in, its specification out, with every configuration that it asks for; all problems at once.
 
 
 def read_campaign(path: Path, runs: int | None = None) -> tuple[Campaign, str]:

@@ -1,4 +1,8 @@
-"""Cells and tasks of a campaign in the linear world."""
+"""Cells and tasks of a campaign in the linear world.
+
+The cells are the product of controllers, links, disturbances and plants, in the order of the specification. A task
+flies some runs of one cell and returns a row of figures for each, the same on every worker.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uavctl import __version__
+from uavctl.arrays import Array
 from uavctl.config import Config
 from uavctl.config.checks import get_position_index
 from uavctl.config.link import LinkConfig
@@ -24,9 +29,6 @@ from uavctl.lab.campaign.world import Flown, MeasuredPositions, PositionFilter, 
 from uavctl.lab.trial import NEAR_M, NEARER_M, room_of, usable_seen
 from uavctl.smpc.batch import Tally
 from uavctl.smpc.plant import AXES
-
-# The cells of a campaign: the product of its controllers, links, disturbances and plants, in the order given.
-
 
 VERSION = 1
 
@@ -140,12 +142,6 @@ def _refused(setting: Setting) -> str:
     return ""
 
 
-# How runs of the linear world went through the room: to the target, at it, and how near to the walls.
-
-
-Array = NDArray[np.float64]
-
-
 def ways(config: Config, states: Array) -> dict[str, Array]:
     """Return figures (N,) of runs by column of the results: way to the target, hold, and distance to walls.
 
@@ -177,9 +173,6 @@ def ways(config: Config, states: Array) -> dict[str, Array]:
 def _first_s(near: NDArray[np.bool_], dt_s: float) -> Array:
     """Return the time of the first step (N,) that is true [s]; infinite where there is none."""
     return np.where(near.any(axis=1), near.argmax(axis=1) * dt_s, np.inf)
-
-
-# A task of a campaign: some runs of one cell, in; a row of figures for each, out. The same wherever it is done.
 
 
 _MET = ("decisions", "infeasible", "slack_used", "fallbacks")

@@ -1,4 +1,4 @@
-"""Campaigns of quadrotor trials: specification, cells, tasks, figures."""
+"""Campaigns of quadrotor trials: specification, reading of their file, cells, tasks and figures."""
 
 from __future__ import annotations
 
@@ -51,9 +51,6 @@ from uavctl.lab.trial import (
     fly,
     usable_room,
 )
-
-# What a campaign in the world of the quadrotor is asked to fly, as its TOML file says it.
-
 
 QUADROTOR = "quadrotor"
 MOST_TRIALS = 100_000
@@ -128,9 +125,6 @@ class TrialSpec(Section, frozen=True, kw_only=True):
     link: Annotated[tuple[LinkSpec, ...], Meta(min_length=1, max_length=MOST_OF_A_KIND, description="links")] = (
         LinkSpec(name="as configured"),
     )
-
-
-# The cells of a campaign in the world of the quadrotor, and the tasks that fly them.
 
 
 VERSION = 1
@@ -282,9 +276,6 @@ def _told(place: TrialPlace) -> dict[str, object]:
     }
 
 
-# The file of a campaign in the world of the quadrotor in, its specification out; all problems at once.
-
-
 def is_trial(path: Path) -> bool:
     """Return whether a campaign's file is one of quadrotor flights.
 
@@ -342,9 +333,6 @@ def _wrong(spec: TrialSpec) -> Iterator[ConfigProblem]:
         yield ConfigProblem(
             "controller", f"there are {cells} cells", f"at most {MOST_CELLS} are flown; take fewer of them"
         )
-
-
-# What the flights of a campaign in the world of the quadrotor came to.
 
 
 class ToldPlace(ToldCell, frozen=True, kw_only=True):

@@ -1,4 +1,10 @@
-"""Linear world of campaigns: many runs in step, their link, filter and random numbers."""
+"""Linear world of campaigns: many runs in step, in memory, with their draws, link and filter.
+
+1. All random numbers of a run come from (master, index) alone, so all cells share them.
+2. The link determines when each position is known, and which known one is the newest.
+3. Where positions alone are measured, the flight's filter estimates the state, for all runs in step.
+4. `fly` steps all runs with one controller.
+"""
 
 from __future__ import annotations
 
@@ -8,15 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.config.link import LinkConfig
 from uavctl.smpc.batch import BatchController, Counts, News
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope
 
 # All that is random in a run, from (master, index) alone: common random numbers for every cell of a campaign.
-
-
-Array = NDArray[np.float64]
 
 _NOISE = 3  # child of a run's seed: 0 and 1 are those of `draw`, 2 draws its start
 
@@ -49,12 +53,9 @@ def draw_noise(master: int, first: int, runs: int, steps: int, axes: int) -> Arr
     return noise
 
 
-# What the link of a configuration does to the positions of many runs: when each is known, and which is the newest.
-
-
 Flags = NDArray[np.bool_]
 
-_ROUNDING = 1e-9
+_ROUNDING = 1e-9  # share of a limit, or of a step; less is rounding
 
 
 def known(link: LinkConfig, dt_s: float, chances: Array) -> Counts:
@@ -155,9 +156,6 @@ def _gaps(link: LinkConfig, chances: Array) -> Flags:
     return lost
 
 
-# What controllers know where positions alone are measured: the flight's filter, for many runs in step.
-
-
 @dataclass(frozen=True, eq=False)
 class FilterBelief:
     """Plant and noise that a controller assumes of positions."""
@@ -242,12 +240,6 @@ class PositionFilter:
         # Joseph's form: symmetric and positive semidefinite whatever rounding does.
         cov[who] = keep @ held @ keep.transpose(0, 2, 1) + gain @ self._shown @ gain.transpose(0, 2, 1)
         return mean, cov
-
-
-# The linear world of a campaign: N runs in step, one controller, in memory.
-
-
-# Beyond a limit by less than this share of it is rounding.
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,11 +1,14 @@
-"""Fit of a plant to a flight: its parameters, its dead time, and how well it predicts the half it was not fitted to.
+"""Fit of a plant to a flight: its parameters, its dead time, and its prediction errors on held-out halves.
 
-The dead time is where the deviance of the whole flight, summed over the axes, is least. Prediction tells plants apart
-and not dead times: a lag stands in for one with hardly a difference at 0.25 s and more. It is judged by halves, blocks
-in turn so that each has something of every manoeuvre, on the motion of the next 0.25 to 2 s; the figure is the
-geometric mean of the rms errors over these times and the axes, in which each counts alike. For the fit as for the
-judgement the filter goes through the whole flight, and only the innovations in a half, or the motions, count: where it
-began anew in each block, they would tell how it finds the state and little of the plant.
+1. The parameters of an axis maximise the likelihood of the filter's innovations. The search is Fisher scoring with
+   Levenberg-Marquardt damping: the slopes of innovations and variances give gradient and expected curvature at once.
+2. The dead time minimises the deviance of the whole flight, summed over the axes. Prediction errors tell plants apart
+   but not dead times: a lag replaces a dead time with hardly a difference at 0.25 s and more.
+3. Plants are compared on halves of the flight. The halves are alternating blocks, so each has a part of every
+   manoeuvre. The measure is the motion of the next 0.25 to 2 s: the geometric mean of the rms errors over these times
+   and the axes.
+4. The filter always runs over the whole flight; only innovations or motions within a half count. A restart in each
+   block would measure how the filter converges, and little of the plant.
 """
 
 from __future__ import annotations
@@ -20,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from logs.report.statistics import autocorrelation
+from uavctl.arrays import Array
 from uavctl.errors import RecordingError
 from uavctl.lab.identify.history import LEAST_SAMPLES, Stretch
 from uavctl.lab.identify.response import (
@@ -41,9 +45,6 @@ from uavctl.lab.identify.response import (
 #
 # The search is Fisher's scoring with Levenberg and Marquardt's damping: what the innovations and their variances
 # change by with each parameter gives the gradient and the expected curvature at once.
-
-
-Array = NDArray[np.float64]
 
 _HESSIAN_STEP = 1e-2
 _STEP = 1e-5  # of the difference quotients: its error and that of rounding move no result by a millionth
@@ -195,9 +196,6 @@ def _slope(found: Likelihood) -> _Slope:
     # The difference goes up by the gradient and by half a step of the curvature.
     gradient = (found.deviances[1:] - found.deviances[0]) / _STEP - 0.5 * _STEP * np.diag(curvature)
     return _Slope(float(found.deviances[0]), gradient, curvature)
-
-
-# How well a fitted response predicts: what one step leaves unexplained, and the motion of the next seconds.
 
 
 AHEAD_S = (0.25, 0.5, 1.0, 2.0)

@@ -1,4 +1,8 @@
-"""Flight history for identification, from recordings: setpoints, positions, messages and their senders."""
+"""Flight history for identification, from recordings: setpoints, positions, messages and their senders.
+
+A history is read from our recordings or from any `.tlog`. The TIMESYNC exchange of a recorded client gives the
+vehicle's clock although no client asks any more.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +19,7 @@ from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from logs.recording.tlog import TlogPacket
+from uavctl.arrays import Array
 from uavctl.config import Config
 from uavctl.errors import RecordingError
 from uavctl.loop import MOCAP, make_links
@@ -22,9 +27,6 @@ from uavctl.mavlink.clocksync import ClockSource
 from uavctl.mavlink.framing import scan_frames
 from uavctl.mavlink.profile import PROFILES, find_autopilot_name
 from uavctl.records import Datagram, PositionSample, Record, Setpoint, StepInput
-
-# The TIMESYNC exchange of a recorded client: what tells a vehicle's clock though nobody asks any more.
-
 
 _OPEN = 64  # requests whose answers are still taken
 Address = tuple[int, int]
@@ -64,9 +66,6 @@ class Exchange:
 
 
 # What was asked for and what was seen, axis by axis: all that identification needs of a flight.
-
-
-Array = NDArray[np.float64]
 
 LONGEST_PAUSE_S = 0.5  # without a setpoint for longer than this, the vehicle does as it likes
 SHORTEST_S = 5.0  # a stretch says nothing of drag below this
@@ -181,9 +180,6 @@ def _all(asked: SetpointHistory, seen: PositionHistory) -> Iterator[Stretch]:
         changed = np.concatenate([[True], np.any(np.diff(accel, axis=0) != 0.0, axis=1)])
         held = (seen.times_s > begin) & (seen.times_s <= end)
         yield Stretch(times_s[changed], accel[changed], seen.times_s[held], seen.positions_m[held])
-
-
-# The history of a flight out of its recording: our own, or a `.tlog` of anybody's.
 
 
 _NO_POSITION_NO_VELOCITY = 0x03F  # bits of type_mask: ignored

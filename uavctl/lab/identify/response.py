@@ -1,9 +1,20 @@
 """Likelihood of a recorded axis under one of the plants, by the innovations of a Kalman filter.
 
-The motion is linear, so the filter steps from position to position, however many inputs lie between: what they do is
-summed beforehand. So are its gains, which come of the times alone. All times are counted in instants of half a
-millisecond, so few different lengths occur, and each is a product of powers of one instant's motion. Several parameter
-vectors, of several axes, go through at once: the gradients of three axes cost one pass.
+The two plants are continuous motions under white noise, with the parameters that a flight can show:
+
+    drag-lag              p' = v,  v' = a − c v + b + w,  T a' = g u(t − d) − a,  b' = n
+    velocity-reference    `uavctl.smpc.plant`, with input u(t − d) + e
+
+w, e and n are white. The dead time d shifts the inputs and is no part of the motion.
+
+The motion is linear, so the filter steps from position to position; the effect of all inputs in between is summed
+beforehand. So are its gains, which depend on the times alone. All times are counted in units of half a millisecond, so
+few different lengths occur, and each transition is a product of powers of one unit's. Several parameter vectors, of
+several axes, are filtered at once: the gradients of three axes cost one pass.
+
+ArduPilot limits the jerk of its reference, so its acceleration moves towards each setpoint no faster. North and east
+share one limit (PSC_JERK_XY), so setpoints within it on each axis may exceed it together; the reference never reaches
+those. Down has its own limit (PSC_JERK_Z).
 """
 
 from __future__ import annotations
@@ -18,6 +29,7 @@ from typing import ClassVar, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.lab.identify.history import Stretch
 
 # The two plants of an axis as continuous motion under white noise, with the parameters that a flight may tell.
@@ -26,9 +38,6 @@ from uavctl.lab.identify.history import Stretch
 #     velocity-reference    `uavctl.smpc.plant`, with input u(t − d) + e
 #
 # w, e and n are white. The dead time d shifts the inputs and is no part of the motion.
-
-
-Array = NDArray[np.float64]
 
 DRAG_LAG, VELOCITY_REFERENCE = "drag-lag", "velocity-reference"
 
@@ -176,12 +185,6 @@ def places(model: AxisModel, values: dict[str, float]) -> Array:
 def values(model: AxisModel, parameters: Sequence[float]) -> dict[str, float]:
     """Return the values of a parameter vector by name."""
     return {one.name: one.outside(place) for one, place in zip(model.free, parameters, strict=True)}
-
-
-# Setpoints as ArduPilot takes them: its reference's acceleration moves towards each no faster than a jerk limit.
-#
-# North and east share one limit (PSC_JERK_XY), so setpoints within it on each axis may exceed it together, and are
-# then never reached. Down has its own (PSC_JERK_Z).
 
 
 _PART_S = 0.01  # a ramp at 5 m/s³ is 0.05 m/s² high in it

@@ -1,4 +1,4 @@
-"""Result of an identification: the plant, the link, and the configuration with both."""
+"""Result of an identification: the plant, the link (rate, losses, delays), and the configuration with both."""
 
 from __future__ import annotations
 
@@ -29,9 +29,6 @@ from uavctl.lab.identify.fit import (
 from uavctl.lab.identify.history import FlightHistory, PositionHistory, Stretch, stretches, thinned
 from uavctl.lab.identify.response import DRAG_LAG, VELOCITY_REFERENCE, AxisModel, DragLagAxis, ReferenceAxis, ramped
 from uavctl.smpc.plant import AXES
-
-# What the link did: rate, losses and their runs, delays.
-
 
 _QUANTILES = (0.0, 0.05, 0.5, 0.95, 0.99)
 _BURSTS = 3.0  # standard deviations of the number of runs, below which losses come in bursts
@@ -123,9 +120,6 @@ def _burst_statistic(missing: NDArray[np.int64]) -> float:
     mean = 2.0 * lost * came / total + 1.0
     variance = (mean - 1.0) * (mean - 2.0) / (total - 1.0)
     return float((mean - runs) / np.sqrt(variance))
-
-
-# What was identified, and the configuration that it makes.
 
 
 _LEAST_INPUT_STD = 0.02  # m/s²; an axis that was hardly steered shows nothing of how it answers

@@ -16,10 +16,10 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates, spline_filter
 from scipy.special import roots_hermitenorm
 
+from uavctl.arrays import Array
 from uavctl.build.controller import build_design, build_spec, start_state
 from uavctl.config import load
 from uavctl.errors import ConfigError, DesignError, UavctlError
@@ -33,8 +33,6 @@ from uavctl.smpc.hahn_stursberg.terminal import make_terminal
 from uavctl.smpc.nominal import lqr
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope
-
-Array = NDArray[np.float64]
 
 _OLDEST = 7  # older information counts as this old: 0.3^8 of the time
 _NODES = 7  # of the Gaussian quadrature, each direction
@@ -142,9 +140,6 @@ def _least(values: Array) -> Array:
 def _square(points: Array, weight: Array) -> Array:
     """Return x'W x of points (…, 2)."""
     return np.asarray(np.einsum("...i,ij,...j->...", points, weight, points), dtype=np.float64)
-
-
-# What takes a minute or two: which schedules make a design, complexity over τ, and the least settled cost.
 
 
 Told = Callable[[str], None]

@@ -14,10 +14,10 @@ from matplotlib.ticker import FuncFormatter, NullLocator
 from numpy.typing import NDArray
 
 from logs.report.svg import choose_ramp_colour, colour, make_standalone, open_canvas
+from uavctl.arrays import Array
 from uavctl.lab.paper.runs import LIKELIHOOD, ellipsoid_scale, planes
 from uavctl.smpc.hahn_stursberg.design import Design
 
-Array = NDArray[np.float64]
 Counts = NDArray[np.intp]
 
 _WIDTH_IN, _HEIGHT_IN = 10.0, 3.9

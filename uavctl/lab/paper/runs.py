@@ -1,4 +1,8 @@
-"""Runs of the paper's example in chunks, and their totals."""
+"""Runs of the paper's example in chunks, and their totals.
+
+A chunk flies in memory and keeps sums, counts and extremes, never the runs. Few runs fly in this process; more are
+spread in chunks over worker processes.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from logs.report.statistics import chi2_quantile
+from uavctl.arrays import Array
 from uavctl.build.controller import build_plant, build_problem, start_state
 from uavctl.config import Config
 from uavctl.errors import UavctlError
@@ -28,9 +33,6 @@ from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope
 
 # Runs of the paper's example in memory: who flies, what is flown, and the runs of one chunk.
-
-
-Array = NDArray[np.float64]
 
 # The QPs' rounding; far below anything that a plan would miss its end by.
 _MISS = 1e-6
@@ -131,9 +133,6 @@ def fly_runs(
 def planes(plant: Plant) -> Sequence[tuple[int, int]]:
     """Return the state indices (position, velocity) of each axis."""
     return list(zip(plant.position_index, plant.velocity_index, strict=True))
-
-
-# What many runs come to, chunk by chunk: sums, counts and extremes, never the runs themselves.
 
 
 Counts = NDArray[np.intp]
@@ -255,9 +254,6 @@ def in_ellipsoid(states: Array, design: Design) -> NDArray[np.bool_]:
     whitened = np.linalg.solve(root, (states - design.target).reshape(-1, design.plant.n_x).T)
     distance: Array = (whitened**2).sum(axis=0).reshape(states.shape[:-1])
     return distance <= ellipsoid_scale(design)
-
-
-# The runs of Section 5: in this process where they are few, else in chunks over worker processes.
 
 
 Advance = Callable[[int], None]

@@ -1,8 +1,12 @@
 """Changes of a configuration by a flight: values that the flight shows well, and nothing else.
 
-Dead time, lag, drag and gain are taken over where the flight tells them. Noise, loss and delay are raised where the
-flight was worse than believed, and never lowered: a calm minute says nothing of the next day's air or radio. Inputs may
-be quicker, down to the weight of the presets that know their autopilot, where the model predicts well.
+Each plant is judged on the halves of the flight that it was not fitted to. Dead time, lag, drag and gain of a
+configuration are pinned; noises are fitted for each, so that no filter gets noises that suit the other.
+
+Dead time, lag, drag and gain are adopted where the flight determines them. Noise, loss and delay are raised where the
+flight was worse than the configuration assumes, and never lowered: a calm minute does not predict the next day's air or
+radio. Inputs may be quicker, down to the weight of the presets that know their autopilot, where the model predicts
+well.
 """
 
 from __future__ import annotations
@@ -13,8 +17,8 @@ from dataclasses import dataclass
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.config import Config
 from uavctl.config.link import LinkConfig
 from uavctl.errors import UsageError
@@ -23,15 +27,6 @@ from uavctl.lab.identify.history import Stretch
 from uavctl.lab.identify.response import DRAG_LAG, VELOCITY_REFERENCE, AxisModel, Free, LinearMotion
 from uavctl.lab.identify.result import AxisResponse, Identification, LinkFit
 from uavctl.smpc.plant import AXES
-
-# How a vehicle answers by one configuration and by another, and which of the two tells a flight better.
-#
-# Each plant is judged on the halves of the flight that it was not fitted to. What a configuration believes of dead
-# time, lag, drag and gain is pinned; noises are fitted for each, so that the filter of neither is fed what suits the
-# other.
-
-
-Array = NDArray[np.float64]
 
 
 class PredictionErrors(msgspec.Struct, frozen=True, kw_only=True):

@@ -1,6 +1,7 @@
-"""Folder of a tuning run: what was asked for, how far it has come, where its files are, and its page.
+"""Folder of a tuning run: its settings, its progress, its files, and its page.
 
-Every step writes its files first and its note last, so a run that was cut off goes on after the last one that is whole.
+Every step writes its files first and its note last, so an interrupted run continues after the last complete step. The
+page compares two flights of the same mission: how well each held a place, and how well its plans predicted the motion.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from logs.recording.summary import compute_position_errors_m
 from logs.report.page import Mark, PageSection, render_grid, render_page, render_table
 from logs.report.plots import DASHED, DOTTED
 from logs.report.svg import Drawing, colour, open_canvas
+from uavctl.arrays import Array
 from uavctl.config import Config
 from uavctl.config.load import dump_config, flatten_keys, parse
 from uavctl.errors import UsageError
@@ -34,9 +36,6 @@ from uavctl.records import ControlMode
 from uavctl.smpc.plant import AXES
 
 # Two flights of the same mission, before and after: how well the place was held, and how well plans came true.
-
-
-Array = NDArray[np.float64]
 
 PLANNED_AHEAD_S = 0.5  # so much later a plan is compared with what became of it
 LEAST_HOLD_S = 2.0
@@ -327,9 +326,6 @@ def _asked_otherwise(there: TuneAsked, here: TuneAsked) -> Iterator[str]:
         yield "no --arm" if there.take_off_m is None else f"--arm --takeoff {there.take_off_m:g}"
 
 
-# A tuning run in words and rows, as terminal and page show them.
-
-
 CHANGE_COLUMNS = ("value", "old", "the flight says", "new", "why")
 FIGURE_COLUMNS = ("figure", "before", "after", "after / before")
 _NONE = "–"
@@ -403,9 +399,6 @@ def _said(row: Change) -> str:
 def _row(name: str, before: float | None, after: float | None, scale: float) -> tuple[str, ...]:
     ratio = _NONE if before is None or after is None or not before else f"{after / before:.2f}"
     return (name, *(_NONE if one is None else f"{scale * one:.1f}" for one in (before, after)), ratio)
-
-
-# The page of a tuning run: what changed and why, and both flights in the same pictures.
 
 
 _HEIGHT_IN = 2.6

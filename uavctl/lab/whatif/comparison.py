@@ -1,4 +1,7 @@
-"""Comparison of a what-if with the recorded flight, and its page."""
+"""Comparison of a what-if with the recorded flight, its validity, and its page.
+
+The recorded flight is flown again unchanged too; that reproduction shows what a what-if of this recording is worth.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,6 @@ from typing import TypeVar
 import msgspec
 import numpy as np
 from msgspec.structs import replace
-from numpy.typing import NDArray
 
 from logs.recording.flight import FlightData
 from logs.recording.summary import FlightSummary, list_summary_rows
@@ -18,13 +20,11 @@ from logs.report.page import Mark, PageSection, render_grid, render_page, render
 from logs.report.plots import DASHED, DOTTED, draw_limits
 from logs.report.svg import Drawing, colour, open_canvas
 from sim.vehicle.linear import CACHED_TRANSITIONS
+from uavctl.arrays import Array
 from uavctl.lab.whatif.flight import Entry, RecordedFlight, Response
 from uavctl.records import Decision, Estimate, Plan, Record, Setpoint, Truth
 
 # What a what-if is worth, and its figures: the recorded flight, the same reproduced, the one that might have been.
-
-
-Array = NDArray[np.float64]
 AHEAD_S = 1.0
 _COMPARED = (Decision, Plan, Setpoint)
 R = TypeVar("R", bound=Record)
@@ -170,9 +170,6 @@ def _largest(sides: Iterable[dict[int, tuple[float, ...]]]) -> float:
     some, others = sides
     gaps = (np.abs(np.array(some[at]) - np.array(others[at])).max(initial=0.0) for at in some.keys() & others.keys())
     return max(map(float, gaps), default=0.0)
-
-
-# The page of a what-if: both flights in the same plots, beside their figures.
 
 
 _HEIGHT_IN = 2.6

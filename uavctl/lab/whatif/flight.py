@@ -1,4 +1,11 @@
-"""Flight of a recording through another control loop, or over another link."""
+"""Flight of a recording through another control loop, or over another link.
+
+1. Recorded and other flight obey x(k+1) = A x + B u + w with the same w, so their difference obeys
+   δ(k+1) = A δ + B (u' − u): the disturbance cancels and need not be known. Between boundaries the same holds in
+   continuous time with constant u. Where the vehicle has a dead time, inputs act by that much later.
+2. The recorded inputs pass through the control loop, with positions moved by δ.
+3. Another link passes on positions that came, and positions that the recorded link lost.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +18,13 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 from msgspec.structs import replace
-from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from logs.recording.flight import FlightData
 from sim.cameras import COMPONENT_ID, SYSTEM_ID, UPTIME_S
 from sim.channel import Channel
 from sim.vehicle.linear import CACHED_TRANSITIONS, LinearModel, make_linear_model
+from uavctl.arrays import Array
 from uavctl.config import Config
 from uavctl.config.connections import DaemonConfig
 from uavctl.config.link import LinkConfig
@@ -31,15 +38,6 @@ from uavctl.mavlink.connection import STREAM_SCHEMES
 from uavctl.mavlink.framing import RawFrame, scan_frames
 from uavctl.mavlink.messages import Position
 from uavctl.records import Datagram, PositionSample, Record, Refused, Setpoint, Sink, StepInput, Truth, Vec3, to_nobody
-
-# How far the flight that might have been departs from the recorded one.
-#
-# Both obey x(k+1) = A x + B u + w with the same w, so their difference obeys δ(k+1) = A δ + B (u' − u): what disturbed
-# the recorded flight cancels, and need not be known. Between boundaries the same holds in continuous time, u held.
-# Where the vehicle has a dead time, what was sent acts by that much later.
-
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -119,9 +117,6 @@ class Departure:
         for axis, value in zip(self._model.axes, by_axis.tolist(), strict=True):
             values[axis] = value
         return values[0], values[1], values[2]
-
-
-# What a recording tells of its flight: inputs of the loop, setpoints flown, and when each position was captured.
 
 
 Entry = tuple[str, int, Record]
@@ -234,9 +229,6 @@ class _Stream:
         found = scan_frames(data, final=False, is_aligned=self._in_step)
         self._rest, self._in_step = data[found.consumed :], found.is_aligned
         return data[: found.consumed]
-
-
-# A recording's inputs through a control loop, its positions moved to where that would have brought the vehicle.
 
 
 TRUTH = "/sim/truth"
@@ -436,9 +428,6 @@ class _Flight:
 
 def _plus(a: Vec3, b: Vec3) -> Vec3:
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
-
-
-# Another link for the positions of a recording: those that came, and those that were lost on the recorded one.
 
 
 _USUAL_SHARE = 0.2  # of the spacings: those of positions with none lost between them

@@ -1,8 +1,10 @@
-"""Rewriting of position and inertial messages, as they would have been in another course of the flight.
+"""Rewriting of position and inertial messages, as they would be in another course of the flight.
 
-The controller turns a specific force by the attitude that the vehicle told last, R f + g. In the other course the
-vehicle accelerates by δa more, so it is told f + Rᵀ δa: the recorded attitude turns that into just δa more. The vehicle
-would have leaned otherwise too, and f and R would both be others; that shows in neither sum, so the attitude stays.
+All other bytes of a datagram stay unchanged.
+
+The controller turns a specific force f by the latest attitude R of the vehicle, R f + g. In the other course the
+vehicle accelerates by δa more, so the message has f + Rᵀ δa, and the recorded attitude turns that into δa more. The
+vehicle's attitude would differ too, and f and R with it; the sum is the same, so the attitude stays.
 """
 
 from __future__ import annotations
@@ -19,9 +21,6 @@ from uavctl.mavlink.framing import RawFrame, scan_frames
 from uavctl.mavlink.messages import Position
 from uavctl.mavlink.vehicle import GRAVITY_MPS2, VehicleMonitor
 from uavctl.records import InertialSample, Vec3
-
-# Position messages moved to where the vehicle would have been: all other bytes of a datagram stay as they came.
-
 
 NOWHERE: Vec3 = (0.0, 0.0, 0.0)
 _BODY_AXES = (mavlink.MAV_FRAME_BODY_FRD, mavlink.MAV_FRAME_BODY_NED)
