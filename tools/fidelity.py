@@ -29,7 +29,7 @@ from uavctl.config import Config, load_config
 from uavctl.errors import UavctlError
 from uavctl.lab.identify.history import FlightHistory, from_records, from_tlog
 from uavctl.lab.identify.result import Identified, identify
-from uavctl.lab.own_loop import EXTERNAL_ONLY
+from uavctl.lab.position_loop import EXTERNAL_ONLY
 from uavctl.loop import VEHICLE, ControlLoop
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.records import Command, Datagram, Order, Record

@@ -37,7 +37,7 @@ from uavctl.config import load_config
 from uavctl.lab.identify.fit import choose_dead_time
 from uavctl.lab.identify.history import Exchange, FlightHistory, from_tlog
 from uavctl.lab.identify.result import LinkFit, fit_link, flown_stretches, identify, kinds_of
-from uavctl.lab.trial import room_of
+from uavctl.lab.trial import get_room_limits
 from uavctl.mavlink.clocksync import TimesyncClock
 from uavctl.records import Command, ControlMode, Decision, Event, Order
 
@@ -388,7 +388,7 @@ def test_parameters_that_another_client_read_are_judged_as_that_flight_was_set_u
 @pytest.mark.parametrize(("name", "since_s"), [(GPS, 60.0), (OFFBOARD, 28.0)])
 def test_a_vehicle_that_flies_above_the_room_is_found_out_of_it(name: str, since_s: float) -> None:
     """Both took off to 5 m."""
-    lower, _ = room_of(config_of(name))
+    lower, _ = get_room_limits(config_of(name))
     assert lower[2] > -5.0
     items = checked(name, since_s, 10.0)
     assert [one for one, state in items.items() if state == BAD] == ["position in the room"]

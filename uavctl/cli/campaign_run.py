@@ -22,22 +22,22 @@ from uavctl.cli.common import Common, bars, columns, messages
 from uavctl.cli.flying import stop_on_signals
 from uavctl.errors import UsageError
 from uavctl.lab.campaign.page import write_report, write_trial_report
-from uavctl.lab.campaign.pool import Columns, Work, Workers, cluster, fly_tasks, processes
+from uavctl.lab.campaign.pool import Columns, Work, Workers, fly_tasks, open_cluster, open_processes
 from uavctl.lab.campaign.results import CellSummary, summarise
 from uavctl.lab.campaign.spec import read_campaign
 from uavctl.lab.campaign.store import SCHEMA, Store
-from uavctl.lab.campaign.tasks import cells_of, document, tasks_of
+from uavctl.lab.campaign.tasks import make_cells, make_document, make_tasks
 from uavctl.lab.campaign.trials import SCHEMA as TRIALS
 from uavctl.lab.campaign.trials import (
     TrialSummary,
-    is_trial,
-    places_of,
+    is_trial_file,
+    make_trial_cells,
+    make_trial_document,
+    make_trial_tasks,
     read_trial,
     summarise_trial,
-    trial_document,
-    trial_tasks,
 )
-from uavctl.lab.trial import COUNTS, MEANING, SHOWN
+from uavctl.lab.trial import COUNT_FIGURES, FIGURE_NOTE, SCENARIO_FIGURES
 
 # A campaign of flights of the quadrotor, as tables for the terminal.
 
@@ -70,8 +70,8 @@ def trial_picture(result: CampaignResult[TrialSummary]) -> RenderableType:
     # What is the same in all cells needs no column, and of what only tells of ours the page has more.
     lists = [name for name in _TRIAL_NAMES if len({getattr(cell.place, name) for cell in result.cells}) > 1]
     tables: list[RenderableType] = []
-    for scenario, every in SHOWN.items():
-        shown = [one for one in every if one not in COUNTS]
+    for scenario, every in SCENARIO_FIGURES.items():
+        shown = [one for one in every if one not in COUNT_FIGURES]
         cells = [cell for cell in result.cells if cell.place.scenario == scenario]
         if not cells:
             continue
@@ -80,14 +80,14 @@ def trial_picture(result: CampaignResult[TrialSummary]) -> RenderableType:
         table = columns(f"Campaign {result.name}: {scenario}", headings, (), named)
         for cell in cells:
             names = [_text(getattr(cell.place, name)) for name in (*lists, "controller")]
-            told = ["refused"] if cell.place.refused else [one.told(cell.values[one.key]) for one in shown]
+            told = ["refused"] if cell.place.refused else [one.format_values(cell.values[one.key]) for one in shown]
             table.add_row(*names, *told)
         tables.append(table)
     places = [cell.place for cell in result.cells]
     refused = [f"{place.controller}, {place.link}: {place.refused}" for place in places if place.refused]
     failed = sum(cell.failed for cell in result.cells)
     remarks = [f"{failed} flights failed; runs.parquet says why"] if failed else []
-    return Group(*tables, *_closing(result, refused, [*remarks, MEANING]))
+    return Group(*tables, *_closing(result, refused, [*remarks, FIGURE_NOTE]))
 
 
 def _text(value: object) -> str:
@@ -108,15 +108,15 @@ def fly_campaign(
         raise UsageError("--workers are this machine's, --dask has its own; give one of them")
     if resume and out is None:
         raise UsageError("--resume: give the campaign's folder with --out")
-    given = _of_trials(spec, runs) if is_trial(spec) else _of_runs(spec, runs)
+    given = _of_trials(spec, runs) if is_trial_file(spec) else _of_runs(spec, runs)
     begun = time.perf_counter()
     store = Store(out or _new_folder(given.name), given.schema)
     store.check(resume)  # the designs may take minutes
     try:
         described, tasks = given.prepare()
-        with store.opened(described, given.text, resume):
-            crew = processes(workers or len(os.sched_getaffinity(0))) if dask is None else cluster(dask)
-            if not store.complete() and not _fly(store, tasks, crew):
+        with store.open(described, given.text, resume):
+            crew = open_processes(workers or len(os.sched_getaffinity(0))) if dask is None else open_cluster(dask)
+            if not store.is_complete() and not _fly(store, tasks, crew):
                 raise KeyboardInterrupt
             runs_file = store.finish(tasks)
             _tell("writing the page")
@@ -158,8 +158,8 @@ def _of_runs(spec: Path, runs: int | None) -> _Given[CellSummary]:
     read, text = read_campaign(spec, runs)
 
     def prepare() -> tuple[Mapping[str, object], Sequence[Work]]:
-        cells = cells_of(read)
-        return document(read, cells), list(tasks_of(cells))
+        cells = make_cells(read)
+        return make_document(read, cells), list(make_tasks(cells))
 
     return _Given(read.spec.name, text, SCHEMA, prepare, write_report, summarise, _picture)
 
@@ -169,8 +169,8 @@ def _of_trials(path: Path, runs: int | None) -> _Given[TrialSummary]:
     spec, text = read_trial(path, runs)
 
     def prepare() -> tuple[Mapping[str, object], Sequence[Work]]:
-        places = places_of(spec)
-        return trial_document(spec, places), list(trial_tasks(spec, places))
+        places = make_trial_cells(spec)
+        return make_trial_document(spec, places), list(make_trial_tasks(spec, places))
 
     return _Given(
         spec.name, text, TRIALS, prepare, write_trial_report, lambda folder: summarise_trial(folder)[1], trial_picture
@@ -184,7 +184,7 @@ def _new_folder(name: str) -> Path:
 
 def _fly(store: Store, tasks: Sequence[Work], crew: AbstractContextManager[Workers]) -> bool:
     """Fly the tasks that are not done yet; return False if it was interrupted."""
-    kept = store.kept(tasks)
+    kept = store.find_finished(tasks)
     left = [task for task in tasks if task.name not in kept]
     if not left:
         return True
@@ -195,7 +195,7 @@ def _fly(store: Store, tasks: Sequence[Work], crew: AbstractContextManager[Worke
             advance(task)
 
         fly_tasks(left, flying, keep, stopped)
-    return len(store.kept(tasks)) == len(tasks)
+    return len(store.find_finished(tasks)) == len(tasks)
 
 
 @contextmanager
@@ -208,7 +208,7 @@ def _progress(tasks: Sequence[Work], kept: set[str]) -> Iterator[Callable[[Work]
 
 def _interrupted(store: Store, spec: Path, runs: int | None) -> str:
     """Say after an interruption what is done, and how to go on."""
-    if not store.begun():
+    if not store.has_begun():
         return "interrupted before the first run"
     number = () if runs is None else ("--runs", str(runs))
     again = shlex.join(["uavctl", "campaign", str(spec), *number, "--out", str(store.folder), "--resume"])

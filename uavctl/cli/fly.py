@@ -280,7 +280,7 @@ def fly_daemon(
                             shown.after_tick,
                             lambda *_: tenure.update(loop.leaves_vehicle),
                             lambda *_: recorder.catch_up(),
-                            lambda ticked, _: engagement.follow(loop, ticked),
+                            lambda ticked, _: engagement.handle_tick(loop, ticked),
                             *beside,
                             *collect,
                         ),

@@ -144,7 +144,7 @@ def lockstep(prepared: Prepared, path: Path, engagement: Engagement) -> FlightSu
                 return not stopped()
 
             landing_s = compute_stop_limit_s(config, takes_off=True) if engagement.takes_off else None
-            flight.fly(show, follower=engagement, landing_s=landing_s)
+            flight.fly(show, observer=engagement, landing_s=landing_s)
     finally:
         status = flight.close()
         tell_ending(describe_ending(flight.loop.ending, status))
@@ -180,7 +180,7 @@ def _real_time(prepared: Prepared, path: Path, engagement: Engagement, looking: 
                     after_tick=(
                         shown.after_tick,
                         lambda *_: recorder.catch_up(),
-                        lambda ticked, _: engagement.follow(loop, ticked),
+                        lambda ticked, _: engagement.handle_tick(loop, ticked),
                         collector.after_tick,
                     ),
                     on_events=shown.news.extend,

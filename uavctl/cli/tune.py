@@ -51,39 +51,39 @@ from uavctl.io.transport import wait
 from uavctl.lab.identify.history import from_records
 from uavctl.lab.identify.page import write_page as write_fit_page
 from uavctl.lab.identify.result import fits_of, flown_stretches, identify, kinds_of, ramp_of
-from uavctl.lab.tune.box_monitor import KNOWN, WEAKEST, BoxMonitor
+from uavctl.lab.tune.box_monitor import MIN_BRAKE_SHARE, TUNED_BRAKE_SHARE, BoxMonitor
 from uavctl.lab.tune.change import (
-    PinnedAxis,
+    PinnedAxisModel,
     PredictionErrors,
     TunedResult,
-    believed,
     check_tunable,
-    held_out_errors,
-    tuned,
+    compute_held_out_errors,
+    get_assumed_response,
+    tune_config,
 )
-from uavctl.lab.tune.excitation import DOWN, SafeBox, check_start, excited, parse_box
+from uavctl.lab.tune.excitation import DOWN, SafeBox, add_excitation, check_start, parse_box
 from uavctl.lab.tune.run_folder import (
-    AFTER,
-    BEFORE,
+    AFTER_FOLDER,
+    BEFORE_FOLDER,
     CHANGE_COLUMNS,
     FIGURE_COLUMNS,
-    FIT_PAGE,
-    PAGE,
-    TUNED,
-    TuneAsked,
+    FIT_PAGE_FILE,
+    PAGE_FILE,
+    TUNED_FILE,
     TuneComparison,
     TuneFolder,
     TuneProgress,
-    change_rows,
-    error_columns,
-    error_rows,
-    figure_rows,
-    figures_of,
-    last_place,
+    TuneSettings,
+    compute_flight_figures,
+    describe_tuning,
+    find_last_waypoint_steps,
+    lock_run,
+    make_change_rows,
+    make_error_columns,
+    make_error_rows,
+    make_figure_rows,
     read_tuned,
-    sole_run,
-    story,
-    write_page,
+    render_tune_page,
 )
 from uavctl.loop import make_links
 from uavctl.mavlink.connection import MavlinkConnection
@@ -133,7 +133,7 @@ def fly_once(
     Raises:
         UavctlError: Nothing was flown, and why.
     """
-    follower = None if monitor is None else monitor.follow
+    follower = None if monitor is None else monitor.handle_tick
     loaded: LoadedConfig = parse(dump_config(config), f"{out} (configuration)")
     if simulated:
         summary = fly_simulated(loaded, take_off_m=take_off_m, out=out, follower=follower)
@@ -143,8 +143,8 @@ def fly_once(
     end = _end(config, summary, recording)
     if monitor is None:
         return TuneFlown(summary, recording, end)
-    end = TuneEnd.FAILED if monitor.why and end is not TuneEnd.PILOT else end
-    return TuneFlown(summary, recording, end, monitor.why, monitor.repeated)
+    end = TuneEnd.FAILED if monitor.reason and end is not TuneEnd.PILOT else end
+    return TuneFlown(summary, recording, end, monitor.reason, monitor.repeated)
 
 
 def left_whole(config: Config, out: Path) -> Path | None:
@@ -179,7 +179,7 @@ def _whole(config: Config, flight: FlightData) -> bool:
     mission = config.mission
     if not mission.waypoints:
         return True  # it had no end to come to
-    chosen, since_s = last_place(flight)
+    chosen, since_s = find_last_waypoint_steps(flight)
     if not chosen.any():
         return False
     index = list(flight.design.position_index)
@@ -251,9 +251,9 @@ def _enough(samples: list[PositionSample]) -> bool:
 
 def changes_picture(told: TunedResult) -> RenderableType:
     """Return tables of old and new values, and of both models' prediction errors on data they were not fitted to."""
-    predicted, rows = error_columns(told.old_errors), error_rows(told.old_errors, told.new_errors)
+    predicted, rows = make_error_columns(told.old_errors), make_error_rows(told.old_errors, told.new_errors)
     return Group(
-        _table("Configuration", CHANGE_COLUMNS, change_rows(told), ("value", "why")),
+        _table("Configuration", CHANGE_COLUMNS, make_change_rows(told), ("value", "why")),
         _table("Prediction on halves of the flight not fitted to, rms", predicted, rows, predicted[:2]),
         *(Text(f"{one}.", style="yellow") for one in told.warnings),
     )
@@ -263,13 +263,13 @@ def comparison_picture(progress: TuneProgress, folder: Path) -> RenderableType:
     """Return tables of what the run has found so far."""
     parts: list[RenderableType] = []
     if progress.tuned is not None:
-        parts += [Text(one) for one in story(progress.tuned, progress.comparison)]
+        parts += [Text(one) for one in describe_tuning(progress.tuned, progress.comparison)]
     if progress.comparison is not None:
-        parts.append(_table("Both flights", FIGURE_COLUMNS, figure_rows(progress.comparison), FIGURE_COLUMNS[:1]))
+        parts.append(_table("Both flights", FIGURE_COLUMNS, make_figure_rows(progress.comparison), FIGURE_COLUMNS[:1]))
     if progress.tuned is not None:
-        parts.append(Text(f"configuration: {folder / TUNED}"))
+        parts.append(Text(f"configuration: {folder / TUNED_FILE}"))
     if progress.comparison is not None:
-        parts.append(Text(f"page: {folder / PAGE}"))
+        parts.append(Text(f"page: {folder / PAGE_FILE}"))
     return Group(*parts)
 
 
@@ -335,14 +335,14 @@ def tune(
     check_tunable(loaded.config)
     with located(loaded):
         made = _Flights.of(loaded.config, box, flight, simulated=loopback, take_off_m=take_off_m)
-    asked = TuneAsked(
+    asked = TuneSettings(
         box="" if made.box is None else ",".join(f"{one:g}" for one in (*made.box.lower, *made.box.upper)),
         flight="" if flight is None else str(flight.absolute()),
         simulated=loopback,
         take_off_m=take_off_m,
     )
-    with sole_run(folder):
-        run = _TuneRun(TuneFolder.opened(folder, loaded.config, asked), loaded.config, made, yes=yes or loopback)
+    with lock_run(folder):
+        run = _TuneRun(TuneFolder.open(folder, loaded.config, asked), loaded.config, made, yes=yes or loopback)
         try:
             code, why = run.go()
         except KeyboardInterrupt:  # beside a flight, which has its own end
@@ -355,8 +355,8 @@ def tune(
         **msgspec.to_builtins(progress),
         "exit_code": code,
         "stopped": why,
-        "config": str(folder / TUNED) if progress.tuned is not None else None,
-        "report": str(folder / PAGE) if progress.comparison is not None else None,
+        "config": str(folder / TUNED_FILE) if progress.tuned is not None else None,
+        "report": str(folder / PAGE_FILE) if progress.comparison is not None else None,
     }
     common.show("tune", document, lambda: comparison_picture(progress, folder))
     return code
@@ -406,7 +406,7 @@ class _Flights:
         assert box is not None
         inside = parse_box(box)
         design = design_of(config)
-        mission_of = excited(config, design, inside, lands=lands)
+        mission_of = add_excitation(config, design, inside, lands=lands)
         if take_off_m is not None:
             check_start(inside, (0.0, 0.0, -take_off_m), "--takeoff", (DOWN,))
         if simulated:
@@ -440,31 +440,31 @@ class _TuneRun:
         if self._made.flight is not None:
             if cut := lacks_end(self._made.flight):
                 warn(f"{cut}: identified from what comes before")
-            self.folder.note(before=str(self._made.flight.absolute()))
+            self.folder.save_progress(before=str(self._made.flight.absolute()))
             return 0, ""
-        if (done := self._flown_before(self._made.mission, BEFORE)) is not None:
+        if (done := self._flown_before(self._made.mission, BEFORE_FOLDER)) is not None:
             return done
         self._say_what_comes("The first flight, with the configuration as it is")
-        return self._fly(self._made.mission, BEFORE)
+        return self._fly(self._made.mission, BEFORE_FOLDER)
 
     def _identify(self) -> tuple[int, str]:
-        if self.folder.progress.tuned is not None and (self.folder.path / TUNED).exists():
+        if self.folder.progress.tuned is not None and (self.folder.path / TUNED_FILE).exists():
             return self._told("identified, and the configuration is written")
-        recording = self.folder.recording(self.folder.progress.before)
+        recording = self.folder.get_recording_path(self.folder.progress.before)
         history = from_records(read(recording))
         with fitting(fits_of(history, self._config)) as advance:
             found = identify(history, self._config, advance)
-        result = tuned(self._config, found)
+        result = tune_config(self._config, found)
         doubts = design_doubts(result.config)
-        write_atomically(self.folder.path / FIT_PAGE, write_fit_page(found, history.seen, str(recording)))
+        write_atomically(self.folder.path / FIT_PAGE_FILE, write_fit_page(found, history.seen, str(recording)))
         told = msgspec.structs.replace(result.result, warnings=(*result.result.warnings, *doubts))
         messages().print(changes_picture(told))
         if doubts:
             raise RecordingError(f"{doubts[0]}. Nothing is written")
         lines = [f"# {one}" for one in _written(told)]
-        write_atomically(self.folder.path / TUNED, "\n".join([*lines, dump_config(result.config)]))
-        self.folder.note(tuned=told)
-        messages().print(f"written: {self.folder.path / TUNED}", soft_wrap=True)
+        write_atomically(self.folder.path / TUNED_FILE, "\n".join([*lines, dump_config(result.config)]))
+        self.folder.save_progress(tuned=told)
+        messages().print(f"written: {self.folder.path / TUNED_FILE}", soft_wrap=True)
         return 0, ""
 
     def _refly(self) -> tuple[int, str]:
@@ -478,28 +478,30 @@ class _TuneRun:
             target=mission.target,
             duration_s=mission.duration_s,
         )
-        if (done := self._flown_before(again, AFTER)) is not None:
+        if (done := self._flown_before(again, AFTER_FOLDER)) is not None:
             return done
         self._say_what_comes("The second flight: the same mission with the tuned configuration")
         if not self._yes and not agreed():
             return INTERRUPTED, "the second flight was not agreed to"
-        return self._fly(again, AFTER)
+        return self._fly(again, AFTER_FOLDER)
 
     def _compare(self) -> tuple[int, str]:
         progress = self.folder.progress
-        if progress.comparison is not None and (self.folder.path / PAGE).exists():
+        if progress.comparison is not None and (self.folder.path / PAGE_FILE).exists():
             return 0, ""
-        paths = [self.folder.recording(one) for one in (progress.before, progress.after)]
+        paths = [self.folder.get_recording_path(one) for one in (progress.before, progress.after)]
         flights = [FlightData.from_records(read(path), path) for path in paths]
         before, after = (
-            figures_of(one, noted, summarise(one, wall_s=None).fallbacks, self._made.box)
+            compute_flight_figures(one, noted, summarise(one, wall_s=None).fallbacks, self._made.box)
             for one, noted in zip(flights, (progress.before, progress.after), strict=True)
         )
         old, new = self._errors(paths[1])
         found = TuneComparison(before=before, after=after, old_errors=old, new_errors=new)
-        self.folder.note(comparison=found)
+        self.folder.save_progress(comparison=found)
         progress = self.folder.progress
-        write_atomically(self.folder.path / PAGE, write_page(progress, flights[0], flights[1], self._made.box))
+        write_atomically(
+            self.folder.path / PAGE_FILE, render_tune_page(progress, flights[0], flights[1], self._made.box)
+        )
         return 0, ""
 
     def _errors(self, recording: Path) -> tuple[PredictionErrors, PredictionErrors]:
@@ -513,30 +515,30 @@ class _TuneRun:
         models = kinds_of(history, new)[0]
         found = []
         for one in (self._config, new):
-            response = believed(one, ramp_s)
-            pinned = [PinnedAxis(model, own) for model, own in zip(models, response.axes, strict=True)]
-            found.append(held_out_errors(flown, names, where, pinned, response.dead_time_s, new.plant.dt_s))
+            response = get_assumed_response(one, ramp_s)
+            pinned = [PinnedAxisModel(model, own) for model, own in zip(models, response.axes, strict=True)]
+            found.append(compute_held_out_errors(flown, names, where, pinned, response.dead_time_s, new.plant.dt_s))
         return found[0], found[1]
 
     def _tuned(self) -> Config:
-        return read_tuned(self.folder.path / TUNED)
+        return read_tuned(self.folder.path / TUNED_FILE)
 
     def _flown_before(self, config: Config, name: str) -> tuple[int, str] | None:
         """Take up a flight that ended while nobody was left to note it; None if there is none."""
-        newest = self.folder.newest(name)
+        newest = self.folder.find_newest(name)
         recording = None if newest is None else left_whole(config, newest)
         if recording is None:
             return None
-        self.folder.note(**{name: self.folder.relative(recording)})
+        self.folder.save_progress(**{name: self.folder.make_relative(recording)})
         return self._told(f"the flight in {newest} came to its end, and counts")
 
     def _fly(self, config: Config, name: str) -> tuple[int, str]:
         if not self._made.simulated and self._made.box is not None:
             check_start(self._made.box, where_it_stands(self._config), "where the vehicle stands", _LEVEL)
-        box, weakest = self._made.box, WEAKEST if name == BEFORE else KNOWN
+        box, weakest = self._made.box, MIN_BRAKE_SHARE if name == BEFORE_FOLDER else TUNED_BRAKE_SHARE
         flown = fly_once(
             config,
-            self.folder.free(name),
+            self.folder.find_free_folder(name),
             simulated=self._made.simulated,
             take_off_m=self._made.take_off_m,
             monitor=None if box is None else BoxMonitor(config, box, weakest),
@@ -545,7 +547,7 @@ class _TuneRun:
             self._told(f"motions that came too near to a side of the box and were repeated smaller: {flown.repeated}")
         code, why = _stopped(flown)
         if not code:
-            self.folder.note(**{name: self.folder.relative(flown.recording)})
+            self.folder.save_progress(**{name: self.folder.make_relative(flown.recording)})
         return code, why
 
     def _say_what_comes(self, what: str) -> None:
@@ -588,5 +590,5 @@ def agreed() -> bool:
 def _written(told: TunedResult) -> Iterator[str]:
     yield "Written by `uavctl tune`. Changed:"
     for row in told.changes:
-        if row.changed:
+        if row.is_changed:
             yield f"  {row.key}{f', {row.axis}' if row.axis else ''}: {row.old:g} -> {row.new:g}"

@@ -35,7 +35,7 @@ from uavctl.config.checks import get_dimensions
 from uavctl.config.load import parse_recorded
 from uavctl.config.types import PlantConfig, TargetConfig
 from uavctl.errors import UsageError
-from uavctl.lab.campaign.controllers import BaselineSolver, build, recipe_for
+from uavctl.lab.campaign.controllers import BaselineSolver, build_from_recipe, make_recipe
 from uavctl.lab.campaign.spec import KINDS, CampaignSpec, ControllerSpec
 from uavctl.lab.whatif.comparison import (
     HEADINGS,
@@ -148,11 +148,11 @@ def baseline_flyer(loaded: LoadedConfig, kind: str, start: Array) -> Prepared:
     campaign = CampaignSpec(name="what-if", config=config.name, controller=(spec,), start=tuple(start.tolist()))
     with located(loaded):
         prepared = prepare(config, design_of(config))
-        recipe = recipe_for(spec, config, campaign)
+        recipe = make_recipe(spec, config, campaign)
 
     def make(target: Array) -> tuple[ControlProblem, BatchController]:
         there = replace(config, target=TargetConfig(position_m=_place(config.plant.axes, prepared, target)))
-        return build_problem(there), build(dataclasses.replace(recipe, config=there))
+        return build_problem(there), build_from_recipe(dataclasses.replace(recipe, config=there))
 
     controller = dataclasses.replace(prepared.controller, solver=BaselineSolver(kind, make))
     return dataclasses.replace(prepared, controller=controller)

@@ -15,7 +15,7 @@ from uavctl.build.link import build_delayed_link, build_link, promised
 from uavctl.config import load, load_config
 from uavctl.config.load import dump_config, parse
 from uavctl.errors import ConfigError, DesignError
-from uavctl.lab.campaign.world import draw, newest
+from uavctl.lab.campaign.world import compute_newest_captures, draw
 from uavctl.records import Truth
 
 S = 1_000_000_000
@@ -181,7 +181,7 @@ def known(delays: Array, dt_s: float) -> list[int]:
 def test_runs_of_a_campaign_begin_at_drawn_packets_and_follow_the_trace(dt_s: float) -> None:
     link = load_config("paper", [*PAPER, listed(MEASURED)]).link
     chances = draw(3, 0, 200, 20, 1).link
-    found = newest(link, dt_s, chances)
+    found = compute_newest_captures(link, dt_s, chances)
     first = (chances[:, 0, 0] * 8).astype(int)
     assert set(first) == set(range(8))
     for run in range(200):

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from uavctl.arrays import Array
 from uavctl.build.controller import build_design, build_plant, start_state
 from uavctl.config import load_config
-from uavctl.lab.campaign.world import Flown, Scene, draw, fly, newest
+from uavctl.lab.campaign.world import LinearWorld, Trajectories, compute_newest_captures, draw, simulate
 from uavctl.lab.paper import runs as run
 from uavctl.lab.paper.claims import (
     PRINTED,
@@ -37,17 +37,17 @@ def setup() -> Setup:
 
 
 @pytest.fixture(scope="module")
-def directly(setup: Setup) -> tuple[Flown, BatchSmpc]:
+def directly(setup: Setup) -> tuple[Trajectories, BatchSmpc]:
     """The same runs with nothing of this command in between."""
     design, plant = setup.design, build_plant(setup.config)
     chances = draw(SEED, 0, RUNS, STEPS, plant.n_w)
-    scene = Scene(
+    scene = LinearWorld(
         plant, design.state_set, design.input_set, design.q_x, design.q_u, np.zeros(4), np.zeros(2),
         np.tile([35.0, -2.0, -20.0, -4.0], (RUNS, 1)),
     )  # fmt: skip
     smpc = BatchSmpc(ShortcutDecider(ShortcutSolver(design), np.zeros(4)), plant, 12, 0, 0.5)
     w = chances.normal * np.sqrt(0.6)
-    return fly(scene, smpc, newest(setup.config.link, 1.0, chances.link), w), smpc
+    return simulate(scene, smpc, compute_newest_captures(setup.config.link, 1.0, chances.link), w), smpc
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +56,7 @@ def result(setup: Setup) -> VariantResult:
     return assess(setup, PRINTED.note, flights, SEED)
 
 
-def test_figures_are_those_of_the_runs(result: VariantResult, directly: tuple[Flown, BatchSmpc]) -> None:
+def test_figures_are_those_of_the_runs(result: VariantResult, directly: tuple[Trajectories, BatchSmpc]) -> None:
     flown, smpc = directly
     cost, settled = flown.cost.sum(axis=1), flown.states[:, STEPS // 2 :].reshape(-1, 4)
     assert result.mean_cost == pytest.approx(cost.mean(), rel=1e-12)
@@ -137,7 +137,9 @@ def made(states: Array, ages: NDArray[np.intp]) -> Chunk:
     runs, steps = ages.shape
     flat, flags = np.zeros((runs, steps, 2)), np.zeros((runs, steps), dtype=bool)
     flags[0, 1:] = True
-    flown = Flown(states, flat, flat, ages, np.ones((runs, steps)), flags, flags.copy(), np.zeros(runs, dtype=bool))
+    flown = Trajectories(
+        states, flat, flat, ages, np.ones((runs, steps)), flags, flags.copy(), np.zeros(runs, dtype=bool)
+    )
     return Chunk(flown, decisions=3, infeasible=0, slack_used=1, missed=2, fallbacks=0, largest_gap=0.5)
 
 

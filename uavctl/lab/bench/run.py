@@ -43,8 +43,6 @@ from uavctl.smpc.hahn_stursberg.horizon import Component, decompose
 from uavctl.smpc.hahn_stursberg.printed import SOLVERS_OWN, PrintedSolver
 from uavctl.smpc.sets import Polytope
 
-# The decision of scheme `age-conditioned` as a flight asks for it.
-
 _COVARIANCES = 7  # in turns: a filter's is hardly ever the last one's
 
 

@@ -79,8 +79,6 @@ class BenchResult(msgspec.Struct, frozen=True, kw_only=True):
     wall_s: float
 
 
-# Times of decisions: warmed up, without garbage collection, several runs of the same states.
-
 _EMPTY = 1000
 _WARM = 5
 

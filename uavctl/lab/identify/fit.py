@@ -41,11 +41,6 @@ from uavctl.lab.identify.response import (
     values,
 )
 
-# The most likely parameters of an axis, by maximum likelihood of the filter's innovations.
-#
-# The search is Fisher's scoring with Levenberg and Marquardt's damping: what the innovations and their variances
-# change by with each parameter gives the gradient and the expected curvature at once.
-
 _HESSIAN_STEP = 1e-2
 _STEP = 1e-5  # of the difference quotients: its error and that of rounding move no result by a millionth
 # Gain of the deviance by one more step, below which the search ends; a standard error is a gain of 1.

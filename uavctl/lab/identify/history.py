@@ -65,8 +65,6 @@ class Exchange:
                 yield RoundTrip(address, self._sent[message.ts1], message.tc1)
 
 
-# What was asked for and what was seen, axis by axis: all that identification needs of a flight.
-
 LONGEST_PAUSE_S = 0.5  # without a setpoint for longer than this, the vehicle does as it likes
 SHORTEST_S = 5.0  # a stretch says nothing of drag below this
 LEAST_SAMPLES = 20

@@ -32,13 +32,6 @@ from numpy.typing import NDArray
 from uavctl.arrays import Array
 from uavctl.lab.identify.history import Stretch
 
-# The two plants of an axis as continuous motion under white noise, with the parameters that a flight may tell.
-#
-#     drag-lag              p' = v,  v' = a − c v + b + w,  T a' = g u(t − d) − a,  b' = n
-#     velocity-reference    `uavctl.smpc.plant`, with input u(t − d) + e
-#
-# w, e and n are white. The dead time d shifts the inputs and is no part of the motion.
-
 DRAG_LAG, VELOCITY_REFERENCE = "drag-lag", "velocity-reference"
 
 

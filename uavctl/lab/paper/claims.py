@@ -370,8 +370,8 @@ def lqg_asking(setup: Setup, seed: int, runs: int, steps: int) -> float:
     open_sides = Polytope(limits.c, np.full(limits.b.size, np.inf))
     problem = replace(build_problem(setup.config), input_set=open_sides)
     flown = fly_runs(setup, Lqg(problem), seed, range(runs), steps, open_sides)
-    beyond = flown.asked[:, steps // 2 :] @ limits.c.T > limits.b  # opposite rows are never broken together
-    return float(beyond.sum() / flown.asked[:, steps // 2 :].size)
+    beyond = flown.requested[:, steps // 2 :] @ limits.c.T > limits.b  # opposite rows are never broken together
+    return float(beyond.sum() / flown.requested[:, steps // 2 :].size)
 
 
 def area_ratios(covariance: Array, design: Design) -> list[float]:

@@ -24,15 +24,13 @@ from uavctl.arrays import Array
 from uavctl.build.controller import build_plant, build_problem, start_state
 from uavctl.config import Config
 from uavctl.errors import UavctlError
-from uavctl.lab.campaign.pool import processes
-from uavctl.lab.campaign.world import Flown, Scene, draw, fly, newest
+from uavctl.lab.campaign.pool import open_processes
+from uavctl.lab.campaign.world import LinearWorld, Trajectories, compute_newest_captures, draw, simulate
 from uavctl.smpc.batch import BatchController, BatchSmpc, Decider, Decisions
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.frozen import ShortcutDecider, ShortcutSolver
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope
-
-# Runs of the paper's example in memory: who flies, what is flown, and the runs of one chunk.
 
 # The QPs' rounding; far below anything that a plan would miss its end by.
 _MISS = 1e-6
@@ -72,7 +70,7 @@ _TALLIED = ("decisions", "infeasible", "slack_used", "fallbacks")  # of a `Tally
 class Chunk:
     """Runs that were flown together, with the tally of the SMPC."""
 
-    flown: Flown  # the runs
+    flown: Trajectories  # the runs
     decisions: int  # plans asked for
     infeasible: int  # those that were not found
     slack_used: int  # plans that leave a state row
@@ -107,7 +105,7 @@ class ChunkRunner:
 
 def fly_runs(
     setup: Setup, controller: BatchController, seed: int, runs: range, steps: int, input_set: Polytope | None = None
-) -> Flown:
+) -> Trajectories:
     """Fly runs of a seed with any controller.
 
     Args:
@@ -116,7 +114,7 @@ def fly_runs(
     config, problem = setup.config, build_problem(setup.config)
     plant = problem.plant
     chances = draw(seed, runs.start, len(runs), steps, plant.n_w)
-    scene = Scene(
+    scene = LinearWorld(
         plant=plant,
         state_set=problem.state_set,
         input_set=input_set or problem.input_set,
@@ -127,7 +125,9 @@ def fly_runs(
         start=np.tile(start_state(config, plant), (len(runs), 1)),
     )
     disturbances = chances.normal @ np.linalg.cholesky(plant.w).T
-    return fly(scene, controller, newest(config.link, config.plant.dt_s, chances.link), disturbances)
+    return simulate(
+        scene, controller, compute_newest_captures(config.link, config.plant.dt_s, chances.link), disturbances
+    )
 
 
 def planes(plant: Plant) -> Sequence[tuple[int, int]]:
@@ -321,12 +321,12 @@ def _flier(
     if runs <= HERE_UP_TO:
         yield lambda tasks: map(partial(_flown, [ChunkRunner(setup) for setup in setups]), tasks)
         return
-    with processes(workers) as pool, TemporaryDirectory() as folder:
+    with open_processes(workers) as pool, TemporaryDirectory() as folder:
         # Not with each task: designs are larger than what a pipe holds.
         path = Path(folder) / "setups"
         path.write_bytes(pickle.dumps(list(setups)))
         try:
-            yield lambda tasks: pool.each(partial(_fly, path), tasks)
+            yield lambda tasks: pool.map(partial(_fly, path), tasks)
         except BrokenProcessPool as error:
             raise UavctlError("a worker process ended before its runs; take fewer --workers, or free memory") from error
 

@@ -31,7 +31,7 @@ from uavctl.config.link import LinkConfig
 from uavctl.config.types import PlantConfig
 from uavctl.errors import RecordingError
 from uavctl.flight.controller import Controller
-from uavctl.lab.trial import vec3
+from uavctl.lab.trial import to_vec3
 from uavctl.lab.whatif.rewrite import InertialFrames, PositionFrame, SourceFrames
 from uavctl.loop import MOCAP, VEHICLE, ControlLoop
 from uavctl.mavlink.connection import STREAM_SCHEMES
@@ -537,7 +537,7 @@ def _lost(before: Capture, after: Capture, usual_us: float, path: _Path, noise: 
         where, how_fast = path.at(at_ns)
         by_m = where + noise() - before.seen.position_m
         by_mps = how_fast - path.at(before.at_ns)[1]
-        found.append(Capture(at_ns, before.seen, vec3(by_m), vec3(by_mps), stamp_us))
+        found.append(Capture(at_ns, before.seen, to_vec3(by_m), to_vec3(by_mps), stamp_us))
     return found
 
 
