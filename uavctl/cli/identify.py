@@ -23,9 +23,9 @@ from uavctl.cli.common import DEFAULTS, Common, System, bars, can_be_read, warn
 from uavctl.config import Config
 from uavctl.config.load import dump_config, parse
 from uavctl.errors import DesignError, UsageError
-from uavctl.lab.identify.history import FlightHistory, from_records, from_tlog
-from uavctl.lab.identify.page import write_page
-from uavctl.lab.identify.result import Identification, fits_of, identify, loss_words
+from uavctl.lab.identify.history import FlightHistory, read_recorded_history, read_tlog_history
+from uavctl.lab.identify.page import render_identify_page
+from uavctl.lab.identify.result import Identification, count_fits, describe_loss, identify
 
 
 def identify_command(
@@ -46,14 +46,14 @@ def identify_command(
     if target == flight:
         raise UsageError(f"{target}: is the recording itself, which would be lost; choose another place with --out")
     refuse_recording_path(target)
-    with fitting(fits_of(history, config)) as advance:
+    with fitting(count_fits(history, config)) as advance:
         found = identify(history, config, advance)
     doubts = (*found.result.warnings, *design_doubts(found.config))
     result = msgspec.structs.replace(found.result, warnings=doubts)
     found = dataclasses.replace(found, result=result)
     page = target.with_suffix(".html")
     write_atomically(target, dump_config(found.config))
-    write_atomically(page, write_page(found, history.seen, str(flight)))
+    write_atomically(page, render_identify_page(found, history.positions, str(flight)))
     document = {**msgspec.to_builtins(result), "config": str(target), "report": str(page)}
     common.show("identify", document, lambda: _picture(found, target, page))
     return 0
@@ -75,7 +75,9 @@ def _history(flight: Path, common: Common, system: int | None) -> tuple[FlightHi
             config.daemon, vehicle="tlog", mocap="tlog", vehicle_system_id=chosen.system or 0
         )
         read_as = msgspec.structs.replace(config, daemon=one_link)
-        return from_tlog([one for one in recorded.packets if get_system_id(one.data) not in others], read_as), config
+        return read_tlog_history(
+            [one for one in recorded.packets if get_system_id(one.data) not in others], read_as
+        ), config
     if system is not None:
         raise UsageError("--system is for a .tlog: a recording of ours is of one vehicle")
     if common.overrides or common.config != DEFAULTS.config:
@@ -83,7 +85,7 @@ def _history(flight: Path, common: Common, system: int | None) -> tuple[FlightHi
     config = parse(header(flight).config_toml, f"{flight} (configuration)").config
     if cut := lacks_end(flight):
         warn(f"{cut}: identified from what comes before")
-    return from_records(read(flight)), config
+    return read_recorded_history(read(flight)), config
 
 
 def design_doubts(config: Config) -> tuple[str, ...]:
@@ -130,7 +132,7 @@ def _picture(found: Identification, target: Path, page: Path) -> RenderableType:
     link = Table(title="link", show_header=False)
     for name, value in (
         ("rate", f"{found.link.rate_hz:.4g} Hz"),
-        ("lost", loss_words(found.link)),
+        ("lost", describe_loss(found.link)),
         ("delay", f"{1e3 * found.link.delay_s:.0f} ms, 99 % within {1e3 * found.link.jitter_s:.0f} ms more"),
     ):
         link.add_row(name, value)

@@ -48,9 +48,15 @@ from uavctl.errors import NotReachedError, RecordingError, UsageError
 from uavctl.io.base import Connection
 from uavctl.io.signed_connection import open_links
 from uavctl.io.transport import wait
-from uavctl.lab.identify.history import from_records
-from uavctl.lab.identify.page import write_page as write_fit_page
-from uavctl.lab.identify.result import fits_of, flown_stretches, identify, kinds_of, ramp_of
+from uavctl.lab.identify.history import read_recorded_history
+from uavctl.lab.identify.page import render_identify_page
+from uavctl.lab.identify.result import (
+    compute_ramp_delay_s,
+    count_fits,
+    get_candidate_models,
+    identify,
+    make_fitted_stretches,
+)
 from uavctl.lab.tune.box_monitor import MIN_BRAKE_SHARE, TUNED_BRAKE_SHARE, BoxMonitor
 from uavctl.lab.tune.change import (
     PinnedAxisModel,
@@ -451,12 +457,14 @@ class _TuneRun:
         if self.folder.progress.tuned is not None and (self.folder.path / TUNED_FILE).exists():
             return self._told("identified, and the configuration is written")
         recording = self.folder.get_recording_path(self.folder.progress.before)
-        history = from_records(read(recording))
-        with fitting(fits_of(history, self._config)) as advance:
+        history = read_recorded_history(read(recording))
+        with fitting(count_fits(history, self._config)) as advance:
             found = identify(history, self._config, advance)
         result = tune_config(self._config, found)
         doubts = design_doubts(result.config)
-        write_atomically(self.folder.path / FIT_PAGE_FILE, write_fit_page(found, history.seen, str(recording)))
+        write_atomically(
+            self.folder.path / FIT_PAGE_FILE, render_identify_page(found, history.positions, str(recording))
+        )
         told = msgspec.structs.replace(result.result, warnings=(*result.result.warnings, *doubts))
         messages().print(changes_picture(told))
         if doubts:
@@ -506,13 +514,13 @@ class _TuneRun:
 
     def _errors(self, recording: Path) -> tuple[PredictionErrors, PredictionErrors]:
         """Return the prediction errors of the old and the new plant on the second flight."""
-        history = from_records(read(recording))
+        history = read_recorded_history(read(recording))
         new = self._tuned()
-        flown = flown_stretches(history, new)
-        ramp_s = ramp_of(history, new)
+        flown = make_fitted_stretches(history, new)
+        ramp_s = compute_ramp_delay_s(history, new)
         names = new.plant.axes
         where = [AXES.index(name) for name in names]
-        models = kinds_of(history, new)[0]
+        models = get_candidate_models(history, new)[0]
         found = []
         for one in (self._config, new):
             response = get_assumed_response(one, ramp_s)

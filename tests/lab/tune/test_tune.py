@@ -15,8 +15,8 @@ from logs.recording.flight import FlightData
 from uavctl.build.controller import design_of
 from uavctl.config import Config, load_config
 from uavctl.errors import UsageError
-from uavctl.lab.identify.history import from_records
-from uavctl.lab.identify.response import DragLagAxis, places
+from uavctl.lab.identify.history import read_recorded_history
+from uavctl.lab.identify.response import DragLagAxis, make_parameters
 from uavctl.lab.identify.result import Identification, identify
 from uavctl.lab.tune.change import (
     MAX_DEAD_TIME_RANGE_S,
@@ -120,7 +120,7 @@ def test_a_pinned_axis_moves_as_its_model_with_these_values() -> None:
         "drift_mps2_rts": 0.02,
     }
     pinned = PinnedAxisModel(model, {"lag_s": 0.2, "gain": 0.9, "unknown": 1.0})
-    whole, fitted = places(model, values)[None], places(pinned, values)[None]
+    whole, fitted = make_parameters(model, values)[None], make_parameters(pinned, values)[None]
     assert fitted.shape[1] == whole.shape[1] - 2
     for one, other in zip(model.motion(whole), pinned.motion(fitted), strict=True):
         assert one == pytest.approx(other)
@@ -136,7 +136,7 @@ def flight() -> tuple[Config, FlightData, Identification]:
     )
     memory = lockstep("room", 30.0, *overrides)
     config = load_config("room", overrides)
-    found = identify(from_records(memory.entries), config, lambda: None)
+    found = identify(read_recorded_history(memory.entries), config, lambda: None)
     return config, FlightData.from_records(memory.entries), found
 
 

@@ -22,9 +22,17 @@ from uavctl.arrays import Array
 from uavctl.config import Config
 from uavctl.config.link import LinkConfig
 from uavctl.errors import UsageError
-from uavctl.lab.identify.fit import AHEAD_S, ROUGH, AxisFit, fit_axes, halves, held_out, standard_errors
+from uavctl.lab.identify.fit import (
+    AHEAD_S,
+    ROUGH_TOLERANCE,
+    AxisFit,
+    compute_held_out_error,
+    compute_standard_errors,
+    fit_axes,
+    split_halves,
+)
 from uavctl.lab.identify.history import Stretch
-from uavctl.lab.identify.response import DRAG_LAG, VELOCITY_REFERENCE, AxisModel, Free, LinearMotion
+from uavctl.lab.identify.response import DRAG_LAG, VELOCITY_REFERENCE, AxisModel, FreeParameter, LinearMotion
 from uavctl.lab.identify.result import AxisResponse, Identification, LinkFit
 from uavctl.smpc.plant import AXES
 
@@ -56,7 +64,7 @@ class PinnedAxisModel:
         return self.model.name
 
     @property
-    def free(self) -> tuple[Free, ...]:
+    def free(self) -> tuple[FreeParameter, ...]:
         """See `AxisModel`: the parameters that are not pinned."""
         return tuple(parameter for parameter in self.model.free if parameter.name not in self.pinned)
 
@@ -76,7 +84,9 @@ class PinnedAxisModel:
         fitted_columns = iter(parameters.T)
         for column, parameter in enumerate(self.model.free):
             completed[:, column] = (
-                parameter.inside(self.pinned[parameter.name]) if parameter.name in self.pinned else next(fitted_columns)
+                parameter.to_search_scale(self.pinned[parameter.name])
+                if parameter.name in self.pinned
+                else next(fitted_columns)
             )
         return self.model.motion(completed)
 
@@ -123,7 +133,9 @@ def compute_held_out_errors(
         dt_s: One step [s].
     """
     times = (dt_s, *AHEAD_S)
-    errors = held_out(flown, halves(flown), axis_indices, models, dead_time_s, [None] * len(models), times, ROUGH)
+    errors = compute_held_out_error(
+        flown, split_halves(flown), axis_indices, models, dead_time_s, [None] * len(models), times, ROUGH_TOLERANCE
+    )
     return PredictionErrors(axes=tuple(axes), ahead_s=times, rms_m=tuple(map(tuple, errors.rms_m.tolist())))
 
 
@@ -314,7 +326,7 @@ def _make_axis_changes(
     has_gain: bool,
 ) -> Iterator[Change]:
     """Yield the changes of lag, drag and gain of an axis, each with its reason."""
-    errors = standard_errors(identification.flown, axis_index, fit)
+    errors = compute_standard_errors(identification.flown, axis_index, fit)
     keys = [("lag_s", "s"), ("drag_1ps", "1/s"), *([("gain", "")] if has_gain else [])]
     for key, unit in keys:
         value = max(0.0, fit.value(key))

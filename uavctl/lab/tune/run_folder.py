@@ -397,8 +397,8 @@ def describe_tuning(result: TunedResult, comparison: TuneComparison | None) -> l
     ]
     if comparison is not None:
         sentences.append(
-            f"On the second flight, which neither was fitted to: {1e3 * comparison.new_errors.overall_m:.1f} mm instead "
-            f"of {1e3 * comparison.old_errors.overall_m:.1f} mm."
+            f"On the second flight, which neither was fitted to: {1e3 * comparison.new_errors.overall_m:.1f} mm "
+            f"instead of {1e3 * comparison.old_errors.overall_m:.1f} mm."
         )
         before_m, after_m = comparison.before.hold_rms_m, comparison.after.hold_rms_m
         if before_m is not None and after_m is not None:
