@@ -40,25 +40,25 @@ from uavctl.lab.campaign.spec import KINDS, CampaignSpec, ControllerSpec
 from uavctl.lab.whatif.comparison import (
     HEADINGS,
     WhatIf,
-    departure_m,
-    model_fit,
-    reproduction,
-    side_by_side,
-    story,
-    until,
-    write_page,
+    compare_reproduction,
+    compute_max_distance_m,
+    cut_entries,
+    describe_what_if,
+    fit_model,
+    make_comparison_rows,
+    render_what_if_page,
 )
 from uavctl.lab.whatif.flight import (
     Entry,
-    FlownCourse,
+    EntryObserver,
     OtherLink,
     RecordedFlight,
-    Relinked,
-    Response,
-    Watch,
-    fly,
-    history_of,
-    response_of,
+    ReflownFlight,
+    SimulatedLink,
+    VehicleResponse,
+    make_recorded_flight,
+    make_response,
+    refly,
 )
 from uavctl.records import Header, Record
 from uavctl.smpc.batch import BatchController
@@ -226,8 +226,8 @@ def whatif(
     plant, source = plant_of(model, before)
     with _progress() as progress:
         entries = progress.track(read(flight), total=count_messages(flight), description="reading")
-        history = history_of(entries, before, str(flight))
-    response = response_of(history, plant)
+        history = make_recorded_flight(entries, before, str(flight))
+    response = make_response(history, plant)
     _warn(flight, recorded, history)
     was = recorded_flyer(flight, before)
     outside = controller not in KINDS
@@ -242,7 +242,7 @@ def whatif(
     other = None
     if over != RECORDED:
         noise_m = before.sim.camera.noise_std_m if history.flight.truths else before.estimator.position_std_m
-        other = Relinked(history, on, before.sim.seed if seed is None else seed, noise_m)
+        other = SimulatedLink(history, on, before.sim.seed if seed is None else seed, noise_m)
     begun = time.perf_counter()
     with create_recording(out, loaded.config.name, before.log.free_bytes) as path, _progress() as progress:
         again = _reproduced(history, was, response, _watch(progress, "reproducing the flight"))
@@ -257,21 +257,21 @@ def whatif(
             *((f"--seed {seed}",) if seed is not None else ()),
         )
         sides = [
-            FlightData.from_records(until(entries, course.end_ns))
+            FlightData.from_records(cut_entries(entries, course.end_ns))
             for entries in (history.entries, again, tuple(read(path)))
         ]
         result = WhatIf(
             flight=str(flight),
-            reproduction=reproduction(sides[0], sides[1]),
-            model=model_fit(history, response, source),
+            reproduction=compare_reproduction(sides[0], sides[1]),
+            model=fit_model(history, response, source),
             controller=controller,
             link=over,
             changed=given,
             compared_s=(course.end_ns - sides[0].origin_ns + sides[0].tick_ns) * 1e-9,
             ended=course.ended,
-            largest_departure_m=departure_m(sides[0], sides[2]),
+            largest_departure_m=compute_max_distance_m(sides[0], sides[2]),
             inertial_moved=course.inertial_moved,
-            inertial_left_out=course.inertial_left_out,
+            inertial_left_out=course.inertial_dropped,
             recorded=summarise(sides[0], wall_s=None),
             reproduced=summarise(sides[1], wall_s=None),
             what_if=summarise(sides[2], wall_s=None),
@@ -279,7 +279,7 @@ def whatif(
             report=str(path.with_suffix(".html")),
             page=str(path.with_name("what-if.html")),
         )
-        write_atomically(Path(result.page), write_page(result, sides[0], sides[2]))
+        write_atomically(Path(result.page), render_what_if_page(result, sides[0], sides[2]))
     Common(json=json).show("log/whatif", result, lambda: _picture(result))
     return 0 if result.what_if.steps else 1
 
@@ -300,7 +300,7 @@ def _progress() -> Progress:
     return bars(TaskProgressColumn(), TimeElapsedColumn())
 
 
-def _watch(progress: Progress, what: str) -> Watch:
+def _watch(progress: Progress, what: str) -> EntryObserver:
     """Show a progress bar of a flight through a recording's entries."""
 
     def watch(entries: Iterable[Entry]) -> Iterable[Entry]:
@@ -336,28 +336,30 @@ class _Memory:
         self.entries.append((topic, at_ns, record))
 
 
-def _reproduced(history: RecordedFlight, was: Prepared, response: Response, watch: Watch) -> tuple[Entry, ...]:
+def _reproduced(
+    history: RecordedFlight, was: Prepared, response: VehicleResponse, watch: EntryObserver
+) -> tuple[Entry, ...]:
     """Fly the recorded flight again, with nothing changed."""
     memory = _Memory()
     memory.put(HEADER, history.flight.header.started_ns, history.flight.header)
-    fly(history, was.config, was.controller, response, memory, lambda: 0, watch=watch)
+    refly(history, was.config, was.controller, response, memory, lambda: 0, watch=watch)
     return tuple(memory.entries)
 
 
 def _recorded(
     history: RecordedFlight,
     now: Prepared,
-    response: Response,
+    response: VehicleResponse,
     other: OtherLink | None,
     path: Path,
     recorded: Header,
-    watch: Watch,
-) -> tuple[FlownCourse, RecorderStatus]:
+    watch: EntryObserver,
+) -> tuple[ReflownFlight, RecorderStatus]:
     """Fly what was changed, and record it; remove an incomplete recording, which would look like a shorter flight."""
     recorder = SyncRecorder(path, now.config.log, onlookers=DerivedTopics(ViewBuilder()))
     try:
         put_header(recorder, now, recorded.started_ns, recorded.zero_utc_ns)
-        course = fly(history, now.config, now.controller, response, recorder, time.perf_counter_ns, other, watch)
+        course = refly(history, now.config, now.controller, response, recorder, time.perf_counter_ns, other, watch)
     except BaseException:
         recorder.close()
         path.unlink(missing_ok=True)
@@ -366,6 +368,6 @@ def _recorded(
 
 
 def _picture(result: WhatIf) -> RenderableType:
-    table = columns("", HEADINGS, (map(Text, row) for row in side_by_side(result)), HEADINGS, fold=True)
+    table = columns("", HEADINGS, (map(Text, row) for row in make_comparison_rows(result)), HEADINGS, fold=True)
     places = [f"recording: {result.recording}", f"report: {result.report}", f"page: {result.page}"]
-    return Group(*map(Text, story(result)), table, *map(Text, places))
+    return Group(*map(Text, describe_what_if(result)), table, *map(Text, places))

@@ -33,7 +33,7 @@ HARDLY = "down: only 26 % of the motion of the next second is predicted"
 @pytest.fixture(autouse=True)
 def _no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Only the sentences at the page's head are read."""
-    monkeypatch.setattr("uavctl.lab.identify.page._sections", lambda *_: iter(()))
+    monkeypatch.setattr("uavctl.lab.identify.page._make_sections", lambda *_: iter(()))
 
 
 def seen() -> PositionHistory:

@@ -12,7 +12,7 @@ from whatif_rig import PAPER, config_of, far, flown, history
 from uavctl.build.controller import build_controller, build_problem
 from uavctl.lab.campaign.controllers import BaselineSolver, build_from_recipe, make_recipe
 from uavctl.lab.campaign.spec import CampaignSpec, ControllerSpec
-from uavctl.lab.whatif.flight import fly, response_of
+from uavctl.lab.whatif.flight import make_response, refly
 from uavctl.records import Plan, Truth
 from uavctl.smpc.batch import News
 
@@ -54,11 +54,11 @@ def test_a_baseline_flies_and_its_plans_say_so() -> None:
     controller = build_controller(config)
     solver = BaselineSolver("lqg", lambda target: (build_problem(config), build_from_recipe(recipe)))
     memory = Memory()
-    fly(
+    refly(
         history(PAPER),
         config,
         dataclasses.replace(controller, solver=solver),
-        response_of(history(PAPER), config.plant),
+        make_response(history(PAPER), config.plant),
         memory,
         lambda: 0,
     )

@@ -314,9 +314,9 @@ class BaselineSolver:
     def __init__(self, name: str, make: Callable[[Array], tuple[ControlProblem, BatchController]]) -> None:
         self._name, self._rehearsal = name, Rehearsal(make)
 
-    def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:
+    def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:
         """See `Solver`; the preview is not used."""
-        del preview
+        del outlook
         problem, inputs = self._rehearsal.inputs(seq, x, target)
         if not np.isfinite(inputs).all():
             return Answer.failed(seq, SolveStatus.FAILED, self._name)
