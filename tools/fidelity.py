@@ -27,9 +27,9 @@ from sim.simulation import Peers
 from uavctl.build.controller import build_controller, design_of
 from uavctl.config import Config, load_config
 from uavctl.errors import UavctlError
-from uavctl.lab.identify.history import FlightHistory, from_records, from_tlog
+from uavctl.lab.identify.history import FlightHistory, read_recorded_history, read_tlog_history
 from uavctl.lab.identify.result import Identified, identify
-from uavctl.lab.own_loop import EXTERNAL_ONLY
+from uavctl.lab.position_loop import EXTERNAL_ONLY
 from uavctl.loop import VEHICLE, ControlLoop
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.records import Command, Datagram, Order, Record
@@ -188,7 +188,7 @@ def recorded(folder: Path, name: str, beside: str) -> Watched:
     seen = [line.split(maxsplit=4) for line in events.read_text().splitlines()] if events.exists() else []
     # On some recorded links nothing was said: what an observer heard on another one counts.
     texts = _texts(heard) or [(float(one[0]), one[4]) for one in seen if one[1] == "TEXT" and len(one[-1].strip()) > 1]
-    return Watched(heard, truth, texts, _identified(lambda: from_tlog(packets, config), config))
+    return Watched(heard, truth, texts, _identified(lambda: read_tlog_history(packets, config), config))
 
 
 def simulated(autopilot: str, *overrides: str, ends_s: float = LONGEST_S) -> Watched:
@@ -216,7 +216,7 @@ def simulated(autopilot: str, *overrides: str, ends_s: float = LONGEST_S) -> Wat
         sink.put("", arrival_ns, Datagram(at_ns=arrival_ns, link=link, outgoing=False, data=data))
     records = sink.entries
     heard = _heard((at_ns * S, one.data) for _, at_ns, one in records if isinstance(one, Datagram) and _of_vehicle(one))
-    return Watched(heard, np.array(truth), _texts(heard), _identified(lambda: from_records(records), config))
+    return Watched(heard, np.array(truth), _texts(heard), _identified(lambda: read_recorded_history(records), config))
 
 
 def _texts(heard: Iterable[tuple[float, Any]]) -> list[tuple[float, str]]:

@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 
 from uavctl.lab.campaign.spec import CampaignSpec, ControllerSpec, compose, read_campaign
-from uavctl.lab.campaign.tasks import Cell, Task, cells_of, flown
+from uavctl.lab.campaign.tasks import Cell, Task, fly_task, make_cells
 
 SIMPLE = ("mean-qp", "governor")
 LEAST, MOST, HALVINGS = 0.5, 4.5, 6
@@ -91,14 +91,14 @@ class _Judge:
         ]
         own = one if margin is None else msgspec.structs.replace(one, margin=margin)
         alone = msgspec.structs.replace(spec, controller=(own,), link=(flown_link,), tuning=tuple(tuning))
-        (cell,) = cells_of(compose(alone, self.configuration))
+        (cell,) = make_cells(compose(alone, self.configuration))
         return self._figures(cell)
 
     def _figures(self, cell: Cell) -> tuple[float, float]:
         if cell.recipe is None:
             raise SystemExit(cell.refused)
         runs = cell.setting.spec.runs
-        found, _ = flown(Task(cell.index, 0, runs, cell.setting, cell.recipe), 0, runs)
+        found, _ = fly_task(Task(cell.index, 0, runs, cell.setting, cell.recipe), 0, runs)
         share = found.state_violated.mean(axis=0)
         rate = share[share.size // 2 :].mean() if self.settled else share.max()
         return float(rate), float(np.sum(found.cost, axis=1).mean())

@@ -16,7 +16,7 @@ import numpy as np
 from logs.report.run_statistics import RUNS_LEVEL, Interval, paired_difference
 from uavctl.arrays import Array
 from uavctl.errors import UsageError
-from uavctl.lab.campaign.results import CellSummary, Results, cell_summary, grouped, read_results
+from uavctl.lab.campaign.results import CellSummary, Results, group_cells, read_results, summarise_cell
 
 COLUMNS = ("cost", "settled_cost")
 
@@ -29,7 +29,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("others", nargs="*")
     given = parser.parse_args(arguments)
     results = read_results(given.folder)
-    groups = grouped([cell_summary(results, cell) for cell in results.cells])
+    groups = group_cells([summarise_cell(results, cell) for cell in results.cells])
     for group, cells in groups.items():
         named = {cell.controller: cell for cell in cells}
         ours = named[given.controller]

@@ -33,8 +33,18 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from uavctl.errors import UavctlError
-from uavctl.lab.own_loop import TUNED, OwnTuning
-from uavctl.lab.trial import AUTOPILOTS, SCENARIOS, SHOWN, Air, Scenario, TrialCell, TrialFlight, TrialPilot, fly
+from uavctl.lab.position_loop import TUNED_LOOPS, PositionLoopTuning
+from uavctl.lab.trial import (
+    AUTOPILOTS,
+    SCENARIO_FIGURES,
+    SCENARIOS,
+    Air,
+    Scenario,
+    TrialCell,
+    TrialFlight,
+    TrialPilot,
+    fly_trial,
+)
 
 SCHEMES = ("hahn-stursberg", "age-conditioned")
 PILOTS = ("configured", *SCHEMES, "own", "own-tuned")
@@ -122,13 +132,13 @@ def pilots(given: argparse.Namespace, autopilot: str) -> list[TrialPilot]:
     return out
 
 
-def _tuning(given: argparse.Namespace, name: str, autopilot: str) -> OwnTuning:
+def _tuning(given: argparse.Namespace, name: str, autopilot: str) -> PositionLoopTuning:
     if name == "own":
-        return OwnTuning()
-    tuned = TUNED[autopilot]
+        return PositionLoopTuning()
+    tuned = TUNED_LOOPS[autopilot]
     gains = dict(tuned.gains) | {key: float(value) for key, value in (one.split("=") for one in given.own_gain)}
-    return OwnTuning(
-        at_once=True,
+    return PositionLoopTuning(
+        relays_at_once=True,
         delay_s=tuned.delay_s if given.own_delay is None else given.own_delay,
         lead_s=tuned.lead_s if given.own_lead is None else given.own_lead,
         gains=tuple(gains.items()),
@@ -165,7 +175,7 @@ def _flown(
 def flights(cell: TrialCell, seeds: Sequence[int], seconds: float, from_s: float) -> list[TrialFlight] | str:
     """The flights of a cell, or why there are none."""
     try:
-        return [fly(cell, seed, seconds=seconds, from_s=from_s) for seed in seeds]
+        return [fly_trial(cell, seed, seconds=seconds, from_s=from_s) for seed in seeds]
     except UavctlError as error:
         return str(error)
 
@@ -177,7 +187,7 @@ def _table(
     table = Table(title=what, title_justify="left")
     for heading in ("autopilot", "Hz", "loss", "air", "pilot"):
         table.add_column(heading, no_wrap=True)
-    shown = SHOWN[scenario]
+    shown = SCENARIO_FIGURES[scenario]
     for one in shown:
         table.add_column(one.heading, justify="right")
     table.add_column("ended")
@@ -192,7 +202,7 @@ def _table(
         if not flown:
             table.add_row(*names, "refused")
             continue
-        told = [figure.told([getattr(one, figure.key) for one in flown]) for figure in shown]
+        told = [figure.format_values([getattr(one, figure.key) for one in flown]) for figure in shown]
         table.add_row(*names, *told, " ".join(sorted({one.mode for one in flown})))
     return table
 

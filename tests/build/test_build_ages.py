@@ -12,7 +12,7 @@ from uavctl.build.controller import build_conditioned
 from uavctl.build.link import build_ages, build_delayed_link
 from uavctl.config import Config, load_config
 from uavctl.errors import DesignError
-from uavctl.lab.campaign.world import draw, newest
+from uavctl.lab.campaign.world import compute_newest_captures, draw
 
 Array = NDArray[np.float64]
 RUNS, STEPS, OLDEST = 20_000, 80, 12
@@ -50,7 +50,7 @@ def chances() -> Array:
 @pytest.mark.parametrize("name", LINKS)
 def test_ages_are_those_of_the_campaign_s_link(name: str) -> None:
     given = config(*LINKS[name])
-    age = STEPS - 1 - newest(given.link, 1.0, chances())[:, -1]
+    age = STEPS - 1 - compute_newest_captures(given.link, 1.0, chances())[:, -1]
     model = build_ages(given)
     for steps in range(OLDEST):
         share, expected = float(np.mean(age >= steps)), model.outage(steps)
@@ -80,7 +80,7 @@ def test_several_positions_of_a_step_come_one_after_the_other() -> None:
 @pytest.mark.slow
 def test_losses_known_ahead_count_as_the_worst_of_them_in_every_step() -> None:
     given = config("link.probability=[0.4, 0.9, 0.6]")
-    known = newest(given.link, 1.0, chances())
+    known = compute_newest_captures(given.link, 1.0, chances())
     model = build_ages(given)
     for step in (1, 2, 5, 40):
         for steps in range(1, 6):

@@ -10,7 +10,7 @@ from sim.simulation import World
 from uavctl.build.controller import build_conditioned, build_controller
 from uavctl.build.rehearsal import LARGE_DRAG_1PS, RehearsalResult, rehearse
 from uavctl.config import Config, load_config
-from uavctl.lab.trial import FlightTally, WatchedFlyer, distances_m, eight, path_of
+from uavctl.lab.trial import FlightCounts, TrackedFlyer, compute_distances_m, make_figure_eight, make_path
 from uavctl.loop import ControlLoop
 
 BURSTS = ("link.model=gilbert-elliott", "link.loss=0.0", "link.burst_loss=1.0")
@@ -25,7 +25,7 @@ def rehearsed(config: Config) -> RehearsalResult:
 
 def flown(config: Config) -> float:
     """Share of the plans of a simulated flight that relaxed a constraint."""
-    tally = FlightTally()
+    tally = FlightCounts()
     World(config, ControlLoop(config, build_controller(config), tally, lambda: 0)).run(config.duration_s)
     return tally.gave_way / tally.plans
 
@@ -33,7 +33,7 @@ def flown(config: Config) -> float:
 def along_eight(preset: str, *overrides: str) -> Config:
     config = load_config(preset, overrides)
     replace = msgspec.structs.replace
-    return replace(config, mission=replace(config.mission, trajectory=eight()))
+    return replace(config, mission=replace(config.mission, trajectory=make_figure_eight()))
 
 
 def test_long_bursts_relax_most_plans_in_rehearsal_and_flight() -> None:
@@ -75,19 +75,19 @@ def eight_flown_m(config: Config, drag_1ps: float) -> float:
     """Mean distance from the figure of eight in the linear simulator, with a vehicle of that drag."""
     replace = msgspec.structs.replace
     assert config.mission.trajectory is not None
-    path, end_s = path_of(config.mission.trajectory), config.mission.trajectory.times_s[-1]
+    path, end_s = make_path(config.mission.trajectory), config.mission.trajectory.times_s[-1]
     start = replace(config.sim, start_position_m=config.mission.trajectory.positions_m[0])
     vehicle = replace(config, sim=start, plant=replace(config.plant, drag_1ps=(drag_1ps,) * 3))
-    tally = FlightTally()
-    watched = WatchedFlyer(ControlLoop(config, build_controller(config), tally, lambda: 0))
+    tally = FlightCounts()
+    watched = TrackedFlyer(ControlLoop(config, build_controller(config), tally, lambda: 0))
     world = World(vehicle, watched)
-    watched.where = lambda: world.peers.vehicle.position_m
+    watched.get_position = lambda: world.peers.vehicle.position_m
     world.run(end_s + 2.0)
-    assert tally.begun_ns is not None
-    times = np.array(watched.times_s) - tally.begun_ns * 1e-9
+    assert tally.first_target_ns is not None
+    times = np.array(watched.times_s) - tally.first_target_ns * 1e-9
     flies = (times >= 0.0) & (times <= end_s)
     wanted = np.array([path(t)[0] for t in times[flies]])
-    return float(distances_m(np.array(watched.positions_m)[flies], wanted).mean())
+    return float(compute_distances_m(np.array(watched.positions_m)[flies], wanted).mean())
 
 
 def test_the_cost_of_a_drag_that_nobody_identified_is_rehearsed_and_flown() -> None:

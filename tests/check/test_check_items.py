@@ -17,7 +17,7 @@ from uavctl.check.parameters import list_parameters
 from uavctl.check.preflight import Preflight
 from uavctl.config import load_config
 from uavctl.config.connections import CheckConfig
-from uavctl.lab.own_loop import EXTERNAL_ONLY
+from uavctl.lab.position_loop import EXTERNAL_ONLY
 from uavctl.loop import make_links
 from uavctl.records import Outgoing, to_nobody
 

@@ -13,10 +13,10 @@ from logs.recording.replay import replay
 from uavctl.build.controller import build_conditioned, build_design, resting
 from uavctl.cli.app import run as main
 from uavctl.config import load_config
-from uavctl.lab.campaign.controllers import build, met
+from uavctl.lab.campaign.controllers import build_from_recipe, draw_conditions
 from uavctl.lab.campaign.spec import read_campaign
-from uavctl.lab.campaign.tasks import cells_of, told
-from uavctl.lab.campaign.world import fly
+from uavctl.lab.campaign.tasks import describe_cell, make_cells
+from uavctl.lab.campaign.world import simulate
 from uavctl.records import ControlMode, Decision, Plan, Setpoint, SolveStatus, Truth
 from uavctl.smpc.conditioned.planner import METHOD
 
@@ -142,17 +142,17 @@ set = ["link.loss=0.6"]
 def test_a_campaign_flies_it_where_the_printed_design_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "two.toml"
     file.write_text(CAMPAIGN, encoding="utf-8")
-    printed, *others = cells_of(read_campaign(file)[0])
+    printed, *others = make_cells(read_campaign(file)[0])
     assert printed.refused.startswith("smpc.delta_x")
     costs = []
     for cell in others:
         assert cell.recipe is not None and cell.recipe.design is None
-        meets = met(cell.setting, 0, 40)
-        found = fly(meets.scene, build(cell.recipe), meets.newest, meets.disturbances)
+        meets = draw_conditions(cell.setting, 0, 40)
+        found = simulate(meets.world, build_from_recipe(cell.recipe), meets.newest_captures, meets.disturbances)
         assert not found.failed.any()
         costs.append(found.cost.sum(axis=1).mean())
-    assert told(others[0])["promised_x"] == pytest.approx(0.05)
-    assert told(others[1])["promised_x"] is None
+    assert describe_cell(others[0])["promised_x"] == pytest.approx(0.05)
+    assert describe_cell(others[1])["promised_x"] is None
     assert max(costs) < 1.03 * min(costs)
 
 
@@ -162,10 +162,10 @@ def test_a_campaign_s_links_carry_one_position_a_step(tmp_path: Path) -> None:
     text = CAMPAIGN.partition("[[controller]]")[0].replace("paper", "room")
     asked = f'{text}set = {given}\n[[controller]]\nname = "ours"\nkind = "smpc"\n'.replace("'", '"')
     file.write_text(asked, encoding="utf-8")
-    (cell,) = cells_of(read_campaign(file)[0])
+    (cell,) = make_cells(read_campaign(file)[0])
     assert cell.recipe is not None
     # Where positions take longer than a step, none comes in its own, and each is lost with 30 %.
-    ages = met(cell.setting, 0, 400).newest[:, 12:]
+    ages = draw_conditions(cell.setting, 0, 400).newest_captures[:, 12:]
     older = np.mean(np.arange(12, 12 + ages.shape[1]) - ages >= 2)
     risk = build_conditioned(cell.recipe.config).solver.risk
     assert older == pytest.approx(1.0 - risk.weights[:2].sum(), abs=0.03)

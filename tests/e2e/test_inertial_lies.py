@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from sim.autopilot.inertial import InertialMeasurement
 from sim.simulation import World
 from uavctl.config import load_config
-from uavctl.lab.trial import WatchedFlyer, beyond_m, controller_of, room_of
+from uavctl.lab.trial import TrackedFlyer, compute_excess_m, get_cached_controller, get_room_limits
 from uavctl.loop import ControlLoop
 from uavctl.records import Event, Record, Vec3
 
@@ -68,14 +68,14 @@ def furthest_m(
     )
     told = Told()
     believed = load_config(preset, design)
-    watched = WatchedFlyer(ControlLoop(believed, controller_of(believed), told, lambda: 0))
+    watched = TrackedFlyer(ControlLoop(believed, get_cached_controller(believed), told, lambda: 0))
     world = World(flown, watched)
     vehicle, sensors = world.peers.vehicle, world.peers.autopilot.inertial
     streams, own = world.peers.autopilot.telemetry.streams, mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED
     says = streams[own]
     streams[own] = lambda at_ns: says(at_ns) if at_ns < silent_s * 1e9 else None
 
-    watched.where = lambda: vehicle.position_m
+    watched.get_position = lambda: vehicle.position_m
     measure, kept = sensors.measure, []
 
     def lying(unit: int) -> InertialMeasurement:
@@ -96,7 +96,7 @@ def furthest_m(
     sensors.measure = lying  # type: ignore[method-assign]
     world.run(flown.duration_s)
     times, where = np.array(watched.times_s), np.array(watched.positions_m)
-    beyond = beyond_m(where, *room_of(flown))
+    beyond = compute_excess_m(where, *get_room_limits(flown))
     return float(beyond[(times >= blackout_s[0]) & (times <= blackout_s[1])].max()), frozenset(told.codes)
 
 

@@ -35,9 +35,9 @@ from report_rig import words_of
 
 from uavctl.config import load_config
 from uavctl.lab.identify.fit import choose_dead_time
-from uavctl.lab.identify.history import Exchange, FlightHistory, from_tlog
-from uavctl.lab.identify.result import LinkFit, fit_link, flown_stretches, identify, kinds_of
-from uavctl.lab.trial import room_of
+from uavctl.lab.identify.history import FlightHistory, TimesyncExchange, read_tlog_history
+from uavctl.lab.identify.result import LinkFit, fit_link, get_candidate_models, identify, make_fitted_stretches
+from uavctl.lab.trial import get_room_limits
 from uavctl.mavlink.clocksync import TimesyncClock
 from uavctl.records import Command, ControlMode, Decision, Event, Order
 
@@ -106,7 +106,7 @@ def test_a_recorded_failsafe_that_holds_is_told_from_a_pilot_who_holds() -> None
 @pytest.mark.parametrize("name", [*OF_OTHERS, *RELAYED])
 def test_the_client_s_exchange_foretells_the_vehicle_s_clock_until_the_next_answer(name: str) -> None:
     """To half of the longest round trip that counts; simulated clocks run up to 3.4 % slow, and unevenly."""
-    exchange, trips, off_ms = Exchange(), TimesyncClock(10_000_000_000), []
+    exchange, trips, off_ms = TimesyncExchange(), TimesyncClock(10_000_000_000), []
     for one in packets(name):
         for trip in exchange.take(one.data, one.at_ns, outgoing=one.outgoing):
             foretold = trips.offset_ns(one.at_ns)
@@ -118,7 +118,7 @@ def test_the_client_s_exchange_foretells_the_vehicle_s_clock_until_the_next_answ
 
 
 def history(name: str) -> FlightHistory:
-    return from_tlog(packets(name), config_of(name))
+    return read_tlog_history(packets(name), config_of(name))
 
 
 @pytest.mark.parametrize(("name", "most_ms"), [(GPS, 10.0), (OFFBOARD, 20.0)])
@@ -126,14 +126,14 @@ def test_the_vehicle_s_own_estimate_comes_within_milliseconds_though_its_clock_r
     name: str, most_ms: float
 ) -> None:
     """PX4's simulated clock lost 1.5 s in 113 s: with one offset for all of it, delays were 0.1 to 0.3 s."""
-    delays_ms = 1e3 * history(name).seen.delays_s
+    delays_ms = 1e3 * history(name).positions.delays_s
     assert np.median(delays_ms) < 5.0
     assert np.quantile(delays_ms, 0.95) < most_ms
 
 
 def test_the_cameras_delays_are_those_of_the_simulator() -> None:
     """25 to 142 ms, of which the shortest is configured (30 ms): the simulator's clock is not the answers'."""
-    delays_ms = 1e3 * history(VICON).seen.delays_s
+    delays_ms = 1e3 * history(VICON).positions.delays_s
     low, middle, high = np.quantile(delays_ms, [0.05, 0.5, 0.95])
     assert (low, middle, high) == pytest.approx((34.0, 80.0, 124.0), abs=10.0)
 
@@ -143,7 +143,7 @@ def test_the_cameras_delays_are_those_of_the_simulator() -> None:
 
 def link(name: str) -> LinkFit:
     found = history(name)
-    return fit_link(found.seen, found.gaps)
+    return fit_link(found.positions, found.losses)
 
 
 CAMERA_HZ = 40.0
@@ -226,8 +226,8 @@ def test_all_but_a_hundredth_of_the_positions_come_as_late_as_the_rig_was_told(n
     """Of one flight only those before its wind: 3 s later, and for 43 s, 7 % of the frames came 50 to 95 ms late."""
     until_s = seen_s(BLOWN, "ORDER set SIH_WIND")[0] if name == BLOWN else np.inf
     until_ns = packets(name)[0].at_ns + until_s * 1e9
-    found = from_tlog([one for one in packets(name) if one.at_ns < until_ns], config_of(name))
-    late_s = fit_link(found.seen, found.gaps).delay_quantiles_s[4]
+    found = read_tlog_history([one for one in packets(name) if one.at_ns < until_ns], config_of(name))
+    late_s = fit_link(found.positions, found.losses).delay_quantiles_s[4]
     assert late_s == pytest.approx(SLOWEST_S - 0.01 * (SLOWEST_S - QUICKEST_S), abs=0.010)
 
 
@@ -249,10 +249,10 @@ def test_positions_are_captured_where_the_vehicle_truly_was(name: str) -> None:
     """The truth is 0.1 s apart, the cameras' noise 2 mm."""
     found, rows = history(name), truth(name)
     first_s = _first_capture_s(name)
-    at_s = found.seen.times_s + first_s
+    at_s = found.positions.times_s + first_s
     inside = (at_s > rows[0, 0]) & (at_s < rows[-1, 0])
     off = [
-        np.interp(at_s[inside], rows[:, 0], rows[:, 1 + axis]) - found.seen.positions_m[inside, axis]
+        np.interp(at_s[inside], rows[:, 0], rows[:, 1 + axis]) - found.positions.positions_m[inside, axis]
         for axis in range(2)
     ]
     assert np.median(np.hypot(*off)) < 0.05
@@ -272,7 +272,7 @@ def _first_capture_s(name: str) -> float:
 def test_px4_s_response_is_that_of_its_own_log_though_its_clock_ran_slow() -> None:
     """By its log: dead time and lag together 0.24 and 0.32 s, drag 0.97 and 1.08 1/s, gain 0.98 and 1.10."""
     config = load_config("room-hahn-stursberg", ["daemon.mocap=tlog", "daemon.vehicle=tlog", OWN_ESTIMATE])
-    found = identify(from_tlog(packets(OFFBOARD), config), config, lambda: None).result
+    found = identify(read_tlog_history(packets(OFFBOARD), config), config, lambda: None).result
     together_s = [found.candidates[0].dead_time_s + one.lag_s for one in found.response[:2]]
     assert together_s == pytest.approx([0.24, 0.32], abs=0.09)
     assert [one.drag_1ps for one in found.response[:2]] == pytest.approx([0.974, 1.080], abs=0.1)
@@ -292,9 +292,9 @@ def test_arducopter_s_response_to_steps_is_that_of_its_own_log() -> None:
     """
     config = load_config("room-hahn-stursberg", ["daemon.mocap=tlog", "daemon.vehicle=tlog", OWN_ESTIMATE])
     boot_ns, estimates = _own_estimates(GPS)
-    steps = from_tlog([one for one in packets(GPS) if one.at_ns < boot_ns + 87.4e9], config)
-    flown = flown_stretches(steps, config)
-    found = choose_dead_time(flown, (0, 1), kinds_of(steps, config)[0][:2], lambda: None)
+    steps = read_tlog_history([one for one in packets(GPS) if one.at_ns < boot_ns + 87.4e9], config)
+    flown = make_fitted_stretches(steps, config)
+    found = choose_dead_time(flown, (0, 1), get_candidate_models(steps, config)[0][:2], lambda: None)
     assert found.name == "drag-lag" and sum(one.length_s for one in flown) > 30.0
     for axis, gain, drag_1ps in ((0, 1.027, 0.009), (1, 1.026, 0.011)):
         fit = found.fits[axis]
@@ -388,7 +388,7 @@ def test_parameters_that_another_client_read_are_judged_as_that_flight_was_set_u
 @pytest.mark.parametrize(("name", "since_s"), [(GPS, 60.0), (OFFBOARD, 28.0)])
 def test_a_vehicle_that_flies_above_the_room_is_found_out_of_it(name: str, since_s: float) -> None:
     """Both took off to 5 m."""
-    lower, _ = room_of(config_of(name))
+    lower, _ = get_room_limits(config_of(name))
     assert lower[2] > -5.0
     items = checked(name, since_s, 10.0)
     assert [one for one, state in items.items() if state == BAD] == ["position in the room"]

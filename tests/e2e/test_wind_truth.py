@@ -20,8 +20,8 @@ from uavctl.flight.monitors.engaged import INITIAL, MonitorState, update
 from uavctl.flight.monitors.observation import Observation
 from uavctl.flight.monitors.verdict import Cause
 from uavctl.flight.supervise import OF_POSITIONS, RELEASES
-from uavctl.lab.own_loop import EXTERNAL_ONLY
-from uavctl.lab.trial import WatchedFlyer, beyond_m, controller_of, room_of
+from uavctl.lab.position_loop import EXTERNAL_ONLY
+from uavctl.lab.trial import TrackedFlyer, compute_excess_m, get_cached_controller, get_room_limits
 from uavctl.loop import VEHICLE, ControlLoop, make_links
 from uavctl.mavlink.framing import scan_frames
 from uavctl.records import Event, InertialSample, Outgoing, PositionSample, Record, Send, Vec3, VehicleMotion
@@ -57,7 +57,7 @@ class _Told:
             self.events.append(record)
 
 
-class _Flyer(WatchedFlyer):
+class _Flyer(TrackedFlyer):
     """Notes when poses go to the vehicle, and lets the wind blow at its time."""
 
     def __init__(self, flyer: ControlLoop, push_mps2: Vec3) -> None:
@@ -94,7 +94,7 @@ def blown(autopilot: str, push_mps2: Vec3, *overrides: str, seed: int = 3, over_
         ],
     )
     told = _Told()
-    flyer = _Flyer(ControlLoop(config, controller_of(config), told, lambda: 0), push_mps2)
+    flyer = _Flyer(ControlLoop(config, get_cached_controller(config), told, lambda: 0), push_mps2)
     world = World(config, flyer)
     craft = world.peers.vehicle
     assert isinstance(craft, Quadrotor)
@@ -104,19 +104,19 @@ def blown(autopilot: str, push_mps2: Vec3, *overrides: str, seed: int = 3, over_
     for name, value in EXTERNAL_ONLY[autopilot].items():
         assert world.peers.autopilot.parameters.set(name, value)
     world.peers.autopilot.estimator.start_in_flight()
-    flyer.craft, flyer.where = craft, lambda: craft.position_m
+    flyer.craft, flyer.get_position = craft, lambda: craft.position_m
     world.run(over_s)
     times, where = np.array(flyer.times_s), np.array(flyer.positions_m)
     goals = (config.target.position_m, *config.mission.waypoints)
     off = np.linalg.norm(where - np.array(goals[-1]), axis=1)
-    lower, upper = room_of(config)
+    lower, upper = get_room_limits(config)
     let_go = [event.at_ns * 1e-9 for event in told.events if event.code in RELEASES]
     return Blown(
         codes=[event.code for event in told.events],
         from_target_m=float(off[times > over_s - 1.0].max()),
         worst_m=float(off[times > BEGINS_S].max()),
-        beyond_m=float(beyond_m(where[-1:, :2], lower[:2], upper[:2])[0]),
-        furthest_beyond_m=float(beyond_m(where[:, :2], lower[:2], upper[:2]).max()),
+        beyond_m=float(compute_excess_m(where[-1:, :2], lower[:2], upper[:2])[0]),
+        furthest_beyond_m=float(compute_excess_m(where[:, :2], lower[:2], upper[:2]).max()),
         relayed_s=flyer.relayed_s,
         let_go_s=min(let_go, default=None),
         mode=world.peers.autopilot.mode_name,

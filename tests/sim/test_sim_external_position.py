@@ -10,7 +10,7 @@ from autopilot_rig import GUIDED, Flight, Name
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import ARM, SET_MODE, S
 
-from uavctl.lab.own_loop import EXTERNAL_ONLY
+from uavctl.lab.position_loop import EXTERNAL_ONLY
 
 BOTH = pytest.mark.parametrize("name", ["px4", "ardupilot"])
 TAKEN = {

@@ -15,7 +15,7 @@ from sim.autopilot.profile import SIMULATED
 from sim.autopilot.setpoints import IGNORE_ACCEL, IGNORE_VELOCITY, ParsedSetpoint, SetpointKind, parse_setpoint
 from sim.vehicle.interface import LEVEL
 from sim.vehicle.quadrotor import Quadrotor
-from uavctl.lab.own_loop import EXTERNAL_ONLY
+from uavctl.lab.position_loop import EXTERNAL_ONLY
 from uavctl.records import Vec3
 
 BOTH = pytest.mark.parametrize("name", ["px4", "ardupilot"])

@@ -90,7 +90,7 @@ def test_lqg_without_limits_costs_the_bound_and_would_break_them_in_7_percent_of
     mean = result.cost[:, burn:].mean(axis=1)
     bound = stationary_bound(given.plant, given.q_x, given.q_u, bernoulli(np.array([0.7])))
     assert abs(mean.mean() - bound) < 3.0 * mean.std() / np.sqrt(runs)
-    beyond = np.abs(result.asked[:, burn:]) > 7.5  # of each axis by itself
+    beyond = np.abs(result.requested[:, burn:]) > 7.5  # of each axis by itself
     assert beyond.mean() == pytest.approx(0.075, abs=0.004)
 
 

@@ -11,7 +11,7 @@ from design_rig import spec
 from numpy.typing import NDArray
 from plant_cases import NAMED, spec_of
 
-from uavctl.lab.campaign.world import Flown, Scene, fly
+from uavctl.lab.campaign.world import LinearWorld, Trajectories, simulate
 from uavctl.smpc.baselines import CascadedPid, HoldLast, Lqg, PacketisedPredictive, PidGains, WorstCaseDelay, ZeroOnLoss
 from uavctl.smpc.batch import BatchController, News
 from uavctl.smpc.hahn_stursberg.design import DesignSpec
@@ -89,9 +89,9 @@ def noise(given: ControlProblem, runs: int, steps: int, seed: int) -> Array:
 
 def flown(
     given: ControlProblem, controller: BatchController, start: Array, newest: Counts, disturbances: Array
-) -> Flown:
+) -> Trajectories:
     """Fly the very plant that the problem is about; `start` (n_x,) or (N, n_x)."""
-    scene = Scene(
+    scene = LinearWorld(
         plant=given.plant,
         state_set=given.state_set,
         input_set=given.input_set,
@@ -101,7 +101,7 @@ def flown(
         u_target=given.u_target,
         start=np.broadcast_to(start, (len(newest), given.plant.n_x)),
     )
-    return fly(scene, controller, newest, disturbances)
+    return simulate(scene, controller, newest, disturbances)
 
 
 class Fed:

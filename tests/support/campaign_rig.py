@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from uavctl.lab.campaign.spec import Campaign, read_campaign
-from uavctl.lab.campaign.tasks import Cell, cells_of
+from uavctl.lab.campaign.tasks import Cell, make_cells
 
 HEAD = 'name = "small"\nconfig = "paper"\n'
 
@@ -25,4 +25,4 @@ def read(folder: Path, *parts: str) -> Campaign:
 
 
 def cells(folder: Path, *parts: str) -> tuple[Cell, ...]:
-    return cells_of(read(folder, *parts))
+    return make_cells(read(folder, *parts))

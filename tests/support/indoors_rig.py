@@ -13,7 +13,7 @@ from mavlink_rig import MS, read
 from sim.autopilot.profile import SIMULATED
 from sim.simulation import Peers
 from uavctl.config import load_config
-from uavctl.lab.own_loop import EXTERNAL_ONLY
+from uavctl.lab.position_loop import EXTERNAL_ONLY
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.records import Datagram, Outgoing, Received
 

@@ -11,7 +11,7 @@ from sim_rig import decode
 from sim.autopilot.profile import SIMULATED
 from sim.simulation import Peers
 from uavctl.config import load_config
-from uavctl.lab.own_loop import EXTERNAL_ONLY
+from uavctl.lab.position_loop import EXTERNAL_ONLY
 from uavctl.loop import ControlLoop
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.records import Command, Datagram, Event, Order, Outgoing, Setpoint, Ticked

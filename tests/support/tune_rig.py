@@ -42,7 +42,7 @@ def words(folder: Path, *more: str) -> list[str]:
 def short_flights() -> Iterator[None]:
     """One large step of each axis and a third of the hold: enough to identify, in a quarter of the time."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(excitation, "SIZES", excitation.SIZES[-1:])
+        patch.setattr(excitation, "STEP_SIZES", excitation.STEP_SIZES[-1:])
         patch.setattr(excitation, "HOLD_S", 7.5)
         yield
 

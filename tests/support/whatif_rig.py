@@ -8,7 +8,15 @@ import numpy as np
 from loopback_rig import Memory, header, lockstep, shared
 
 from uavctl.config import Config, load_config
-from uavctl.lab.whatif.flight import Entry, FlownCourse, OtherLink, RecordedFlight, fly, history_of, response_of
+from uavctl.lab.whatif.flight import (
+    Entry,
+    OtherLink,
+    RecordedFlight,
+    ReflownFlight,
+    make_recorded_flight,
+    make_response,
+    refly,
+)
 from uavctl.records import Record, Truth
 
 EXACT = ("solver.method=exact",)
@@ -34,15 +42,15 @@ def flown(case: Case, *changes: str) -> Memory:
 
 @cache
 def history(case: Case) -> RecordedFlight:
-    return history_of(flown(case).entries, config_of(case), "recording")
+    return make_recorded_flight(flown(case).entries, config_of(case), "recording")
 
 
-def again(case: Case, *changes: str, other: OtherLink | None = None) -> tuple[Memory, FlownCourse]:
+def again(case: Case, *changes: str, other: OtherLink | None = None) -> tuple[Memory, ReflownFlight]:
     config, memory = config_of(case, *changes), Memory()
     design, controller = shared(config)
     memory.put("/uavctl/header", 0, header(config, design))
-    response = response_of(history(case), config_of(case).plant)
-    course = fly(history(case), config, controller, response, memory, lambda: 0, other)
+    response = make_response(history(case), config_of(case).plant)
+    course = refly(history(case), config, controller, response, memory, lambda: 0, other)
     return memory, course
 
 

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     import pandas
     import polars
 
-    from uavctl.lab.campaign.controllers import Recipe, Setting
+    from uavctl.lab.campaign.controllers import CellSetting, Recipe
 
 Array = NDArray[np.float64]
 Source = Config | str | Path
@@ -246,14 +246,14 @@ def controller(config: Source, kind: str = "smpc") -> SteppedController:
         ConfigError: The configuration is wrong, or not one of campaigns.
         DesignError: There is no such controller.
     """
-    from uavctl.lab.campaign.controllers import build
+    from uavctl.lab.campaign.controllers import build_from_recipe
 
     found = loaded(config)
     recipe, _ = cell_of(found, kind)
-    return SteppedController(build(recipe), build_problem(found))
+    return SteppedController(build_from_recipe(recipe), build_problem(found))
 
 
-def cell_of(config: Config, kind: str, **spec: object) -> tuple[Recipe, Setting]:
+def cell_of(config: Config, kind: str, **spec: object) -> tuple[Recipe, CellSetting]:
     """Return the one cell of a campaign: the recipe of a controller, and what its runs meet.
 
     Args:
@@ -266,22 +266,26 @@ def cell_of(config: Config, kind: str, **spec: object) -> tuple[Recipe, Setting]
         UsageError: A key of the campaign is wrong.
         DesignError: There is no such controller.
     """
-    from uavctl.lab.campaign.controllers import Setting, recipe_for
-    from uavctl.lab.campaign.spec import CampaignSpec, compose, flown
+    from uavctl.lab.campaign.controllers import CellSetting, make_recipe
+    from uavctl.lab.campaign.spec import CampaignSpec, compose, find_plant_problems
 
     given = {"name": "python", "config": config.name, "controller": [{"name": kind, "kind": kind}], **spec}
     try:
         campaign = msgspec.convert(given, CampaignSpec)
     except msgspec.ValidationError as error:
         raise UsageError(f"{error}; docs/campaign-keys.md says what is possible") from error
-    wrong = tuple(f"{one.key}: {one.reason}; load it with {one.todo}" for one in flown(config, (), "config"))
+    wrong = tuple(
+        f"{one.key}: {one.reason}; load it with {one.todo}" for one in find_plant_problems(config, (), "config")
+    )
     if wrong:
         raise ConfigError(wrong)
     base = msgspec.structs.replace(config, mission=MissionConfig(), fence=())  # runs go to the target alone
     made = compose(campaign, dump_config(base))
-    believed = made.believed_link(0, 0)
-    recipe = recipe_for(made.tuned(0, believed), made.believed[0, believed], campaign)
-    setting = Setting(campaign, made.base, made.flown_plant[0].plant, made.flown_link[0].link, campaign.disturbance[0])
+    believed = made.get_believed_link(0, 0)
+    recipe = make_recipe(made.get_tuned_controller(0, believed), made.believed_configs[0, believed], campaign)
+    setting = CellSetting(
+        campaign, made.base, made.flown_plants[0].plant, made.flown_links[0].link, campaign.disturbance[0]
+    )
     return recipe, setting
 
 
@@ -402,13 +406,13 @@ def simulate(
     """
     need("pyarrow", "campaign")
     from uavctl.lab.campaign.spec import CHUNK
-    from uavctl.lab.campaign.tasks import Task, flown
+    from uavctl.lab.campaign.tasks import Task, fly_task
 
     found = loaded(config)
     begin = () if start is None else tuple(state_of(start, build_plant(found).n_x).tolist())
     recipe, setting = cell_of(found, controller, runs=runs, steps=steps, master=seed, start=begin, measured=measured)
     task = Task(0, 0, runs, setting, recipe)
-    parts = [flown(task, first, min(CHUNK, runs - first))[0] for first in range(0, runs, CHUNK)]
+    parts = [fly_task(task, first, min(CHUNK, runs - first))[0] for first in range(0, runs, CHUNK)]
 
     arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS}
     arrays["age_steps"] = arrays.pop("age")

@@ -204,7 +204,7 @@ def fly(
         engagement.begin(flight.loop)
         landing_s = None if take_off_m is None else compute_stop_limit_s(found, takes_off=True)
         try:
-            flight.fly(lambda _: True, follower=engagement, landing_s=landing_s)
+            flight.fly(lambda _: True, observer=engagement, landing_s=landing_s)
         except Exception as error:
             flight.loop.account.control_error = in_words(error)
             raise

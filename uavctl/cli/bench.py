@@ -19,7 +19,7 @@ from uavctl.cli.common import DEFAULTS, SEED, SPAN_S, Common, locate_design_erro
 from uavctl.config.types import Config
 from uavctl.errors import DesignError
 from uavctl.lab.bench.loop import LoopBench, LoopRun, run_loop_bench
-from uavctl.lab.bench.run import DEFAULT_SIZES, Advance, DecisionBench, run_bench, time_decisions, time_flight
+from uavctl.lab.bench.run import DEFAULT_SIZES, DecisionBench, ReportProgress, run_bench, time_decisions, time_flight
 from uavctl.lab.bench.timing import BenchResult, ConditionedTimes
 from uavctl.smpc.conditioned.planner import ConditionedSolver
 
@@ -158,7 +158,7 @@ def _describe_decisions(result: DecisionBench, name: str) -> str:
 
 
 @contextmanager
-def _show_progress() -> Iterator[Advance]:
+def _show_progress() -> Iterator[ReportProgress]:
     # A thread that draws the bar would disturb the measurement.
     with make_progress(auto_refresh=False) as progress:
         task = progress.add_task("design", total=None)

@@ -9,7 +9,7 @@ from cyclopts import Parameter, validators
 
 from uavctl.cli.common import WORKERS, QuietJson
 from uavctl.errors import need
-from uavctl.lab.campaign.spec import MOST_RUNS
+from uavctl.lab.campaign.spec import MAX_RUNS
 
 
 def campaign(
@@ -17,7 +17,7 @@ def campaign(
     *,
     runs: Annotated[
         int | None,
-        Parameter(help="runs of each cell; else the file's", validator=validators.Number(gte=1, lte=MOST_RUNS)),
+        Parameter(help="runs of each cell; else the file's", validator=validators.Number(gte=1, lte=MAX_RUNS)),
     ] = None,
     workers: Annotated[
         int | None, Parameter(help="processes that fly; else one for each processor", validator=WORKERS)

@@ -22,22 +22,22 @@ from uavctl.cli.common import Common, make_progress, make_table, print_message
 from uavctl.cli.flying import stop_on_signals
 from uavctl.errors import UsageError
 from uavctl.lab.campaign.page import write_report, write_trial_report
-from uavctl.lab.campaign.pool import Columns, Work, Workers, cluster, fly_tasks, processes
+from uavctl.lab.campaign.pool import Columns, Work, Workers, fly_tasks, open_cluster, open_processes
 from uavctl.lab.campaign.results import CellSummary, summarise
 from uavctl.lab.campaign.spec import read_campaign
 from uavctl.lab.campaign.store import SCHEMA, Store
-from uavctl.lab.campaign.tasks import cells_of, document, tasks_of
+from uavctl.lab.campaign.tasks import make_cells, make_document, make_tasks
 from uavctl.lab.campaign.trials import SCHEMA as TRIAL_SCHEMA
 from uavctl.lab.campaign.trials import (
     TrialSummary,
-    is_trial,
-    places_of,
+    is_trial_file,
+    make_trial_cells,
+    make_trial_document,
+    make_trial_tasks,
     read_trial,
     summarise_trial,
-    trial_document,
-    trial_tasks,
 )
-from uavctl.lab.trial import COUNTS, MEANING, SHOWN
+from uavctl.lab.trial import COUNT_FIGURES, FIGURE_NOTE, SCENARIO_FIGURES
 
 S = TypeVar("S", CellSummary, TrialSummary)
 
@@ -67,8 +67,8 @@ def render_trials(result: CampaignResult[TrialSummary]) -> RenderableType:
     # A value that is equal in all cells has no column; figures of our controller alone are on the page.
     varied_names = [name for name in _TRIAL_NAMES if len({getattr(cell.place, name) for cell in result.cells}) > 1]
     tables: list[RenderableType] = []
-    for scenario, quantities in SHOWN.items():
-        listed = [quantity for quantity in quantities if quantity not in COUNTS]
+    for scenario, quantities in SCENARIO_FIGURES.items():
+        listed = [quantity for quantity in quantities if quantity not in COUNT_FIGURES]
         cells = [cell for cell in result.cells if cell.place.scenario == scenario]
         if not cells:
             continue
@@ -78,7 +78,9 @@ def render_trials(result: CampaignResult[TrialSummary]) -> RenderableType:
         for cell in cells:
             names = [_format_value(getattr(cell.place, name)) for name in (*varied_names, "controller")]
             values = (
-                ["refused"] if cell.place.refused else [quantity.told(cell.values[quantity.key]) for quantity in listed]
+                ["refused"]
+                if cell.place.refused
+                else [quantity.format_values(cell.values[quantity.key]) for quantity in listed]
             )
             table.add_row(*names, *values)
         tables.append(table)
@@ -86,7 +88,7 @@ def render_trials(result: CampaignResult[TrialSummary]) -> RenderableType:
     refused = [f"{place.controller}, {place.link}: {place.refused}" for place in places if place.refused]
     failed = sum(cell.failed for cell in result.cells)
     remarks = [f"{failed} flights failed; runs.parquet says why"] if failed else []
-    return Group(*tables, *_format_closing(result, refused, [*remarks, MEANING]))
+    return Group(*tables, *_format_closing(result, refused, [*remarks, FIGURE_NOTE]))
 
 
 def _format_value(value: object) -> str:
@@ -104,15 +106,17 @@ def fly_campaign(
         raise UsageError("--workers are this machine's, --dask has its own; give one of them")
     if resume and out is None:
         raise UsageError("--resume: give the campaign's folder with --out")
-    campaign = _prepare_trials(spec, runs) if is_trial(spec) else _prepare_runs(spec, runs)
+    campaign = _prepare_trials(spec, runs) if is_trial_file(spec) else _prepare_runs(spec, runs)
     begin_s = time.perf_counter()
     store = Store(out or _make_folder_path(campaign.name), campaign.schema)
     store.check(resume)  # the designs may take minutes
     try:
         description, tasks = campaign.prepare()
-        with store.opened(description, campaign.text, resume):
-            workers_context = processes(workers or len(os.sched_getaffinity(0))) if dask is None else cluster(dask)
-            if not store.complete() and not _fly_tasks(store, tasks, workers_context):
+        with store.open(description, campaign.text, resume):
+            workers_context = (
+                open_processes(workers or len(os.sched_getaffinity(0))) if dask is None else open_cluster(dask)
+            )
+            if not store.is_complete() and not _fly_tasks(store, tasks, workers_context):
                 raise KeyboardInterrupt
             runs_file = store.finish(tasks)
             print_message("writing the page")
@@ -154,8 +158,8 @@ def _prepare_runs(spec: Path, runs: int | None) -> _PreparedCampaign[CellSummary
     campaign, text = read_campaign(spec, runs)
 
     def prepare() -> tuple[Mapping[str, object], Sequence[Work]]:
-        cells = cells_of(campaign)
-        return document(campaign, cells), list(tasks_of(cells))
+        cells = make_cells(campaign)
+        return make_document(campaign, cells), list(make_tasks(cells))
 
     return _PreparedCampaign(campaign.spec.name, text, SCHEMA, prepare, write_report, summarise, _render_runs)
 
@@ -165,8 +169,8 @@ def _prepare_trials(path: Path, runs: int | None) -> _PreparedCampaign[TrialSumm
     spec, text = read_trial(path, runs)
 
     def prepare() -> tuple[Mapping[str, object], Sequence[Work]]:
-        places = places_of(spec)
-        return trial_document(spec, places), list(trial_tasks(spec, places))
+        places = make_trial_cells(spec)
+        return make_trial_document(spec, places), list(make_trial_tasks(spec, places))
 
     return _PreparedCampaign(
         spec.name,
@@ -186,7 +190,7 @@ def _make_folder_path(name: str) -> Path:
 
 def _fly_tasks(store: Store, tasks: Sequence[Work], workers_context: AbstractContextManager[Workers]) -> bool:
     """Fly the remaining tasks; return False after an interruption."""
-    finished = store.kept(tasks)
+    finished = store.find_finished(tasks)
     remaining = [task for task in tasks if task.name not in finished]
     if not remaining:
         return True
@@ -197,7 +201,7 @@ def _fly_tasks(store: Store, tasks: Sequence[Work], workers_context: AbstractCon
             advance(task)
 
         fly_tasks(remaining, fly_workers, keep, stopped)
-    return len(store.kept(tasks)) == len(tasks)
+    return len(store.find_finished(tasks)) == len(tasks)
 
 
 @contextmanager
@@ -212,7 +216,7 @@ def _show_progress(tasks: Sequence[Work], finished: set[str]) -> Iterator[Callab
 
 def _describe_interruption(store: Store, spec: Path, runs: int | None) -> str:
     """Return the message of an interruption: finished runs, and the command to go on."""
-    if not store.begun():
+    if not store.has_begun():
         return "interrupted before the first run"
     run_options = () if runs is None else ("--runs", str(runs))
     command = shlex.join(["uavctl", "campaign", str(spec), *run_options, "--out", str(store.folder), "--resume"])

@@ -185,7 +185,7 @@ def fly_daemon(
                             feed.after_tick,
                             lambda *_: vehicle_lock.update(loop.leaves_vehicle),
                             lambda *_: recorder.catch_up(),
-                            lambda ticked, _: engagement.follow(loop, ticked),
+                            lambda ticked, _: engagement.handle_tick(loop, ticked),
                             *service_functions,
                             *garbage_functions,
                         ),

@@ -23,9 +23,9 @@ from uavctl.cli.common import DEFAULTS, Common, System, check_readable, make_pro
 from uavctl.config import Config
 from uavctl.config.load import dump_config, parse
 from uavctl.errors import DesignError, UsageError
-from uavctl.lab.identify.history import FlightHistory, from_records, from_tlog
-from uavctl.lab.identify.page import write_page
-from uavctl.lab.identify.result import Identification, fits_of, identify, loss_words
+from uavctl.lab.identify.history import FlightHistory, read_recorded_history, read_tlog_history
+from uavctl.lab.identify.page import render_identify_page
+from uavctl.lab.identify.result import Identification, count_fits, describe_loss, identify
 
 
 def identify_command(
@@ -48,14 +48,14 @@ def identify_command(
     if target == flight:
         raise UsageError(f"{target}: is the recording itself, which would be lost; choose another place with --out")
     refuse_recording_path(target)
-    with show_fit_progress(fits_of(history, config)) as advance:
+    with show_fit_progress(count_fits(history, config)) as advance:
         identification = identify(history, config, advance)
     warnings = (*identification.result.warnings, *find_design_warnings(identification.config))
     result = msgspec.structs.replace(identification.result, warnings=warnings)
     identification = dataclasses.replace(identification, result=result)
     page = target.with_suffix(".html")
     write_atomically(target, dump_config(identification.config))
-    write_atomically(page, write_page(identification, history.seen, str(flight)))
+    write_atomically(page, render_identify_page(identification, history.positions, str(flight)))
     document = {**msgspec.to_builtins(result), "config": str(target), "report": str(page)}
     common.show("identify", document, lambda: _render(identification, target, page))
     return 0
@@ -77,7 +77,7 @@ def _read_history(flight: Path, common: Common, system: int | None) -> tuple[Fli
             config.daemon, vehicle="tlog", mocap="tlog", vehicle_system_id=choice.system or 0
         )
         tlog_config = msgspec.structs.replace(config, daemon=tlog_daemon)
-        return from_tlog(
+        return read_tlog_history(
             [vehicle for vehicle in recorded.packets if get_system_id(vehicle.data) not in other_systems], tlog_config
         ), config
     if system is not None:
@@ -87,7 +87,7 @@ def _read_history(flight: Path, common: Common, system: int | None) -> tuple[Fli
     config = parse(header(flight).config_toml, f"{flight} (configuration)").config
     if cut := lacks_end(flight):
         warn(f"{cut}: identified from what comes before")
-    return from_records(read(flight)), config
+    return read_recorded_history(read(flight)), config
 
 
 def find_design_warnings(config: Config) -> tuple[str, ...]:
@@ -134,7 +134,7 @@ def _render(identification: Identification, target: Path, page: Path) -> Rendera
     link = Table(title="link", show_header=False)
     for name, value in (
         ("rate", f"{identification.link.rate_hz:.4g} Hz"),
-        ("lost", loss_words(identification.link)),
+        ("lost", describe_loss(identification.link)),
         (
             "delay",
             f"{1e3 * identification.link.delay_s:.0f} ms, 99 % within {1e3 * identification.link.jitter_s:.0f} ms more",

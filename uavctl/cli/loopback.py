@@ -153,7 +153,7 @@ def fly_lockstep(prepared: Prepared, path: Path, engagement: Engagement) -> Flig
                 return not stopped()
 
             landing_s = compute_stop_limit_s(config, takes_off=True) if engagement.takes_off else None
-            flight.fly(show, follower=engagement, landing_s=landing_s)
+            flight.fly(show, observer=engagement, landing_s=landing_s)
     finally:
         status = flight.close()
         print_ending(describe_ending(flight.loop.ending, status))
@@ -191,7 +191,7 @@ def _fly_real_time(prepared: Prepared, path: Path, engagement: Engagement, viewe
                     after_tick=(
                         feed.after_tick,
                         lambda *_: recorder.catch_up(),
-                        lambda ticked, _: engagement.follow(loop, ticked),
+                        lambda ticked, _: engagement.handle_tick(loop, ticked),
                         collector.after_tick,
                     ),
                     on_events=feed.events.extend,

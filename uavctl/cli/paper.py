@@ -35,13 +35,13 @@ from uavctl.lab.paper.claims import (
     Claim,
     Complexity,
     Depth,
-    DesignTried,
+    TriedDesign,
     Variant,
     VariantResult,
     assess,
-    claims_of_depth,
+    make_depth_claims,
 )
-from uavctl.lab.paper.runs import HERE_UP_TO, Advance, Flights, Setup, fly_all
+from uavctl.lab.paper.runs import MAX_LOCAL_RUNS, Flights, ReportProgress, Setup, fly_all
 from uavctl.records import percent_above
 
 _RUN_LIMITS = validators.Number(gte=1, lte=1_000_000)
@@ -65,7 +65,7 @@ def paper(
     workers: Annotated[
         int | None,
         Parameter(
-            help=f"processes for more than {HERE_UP_TO} runs; all cores by default. They change no figure",
+            help=f"processes for more than {MAX_LOCAL_RUNS} runs; all cores by default. They change no figure",
             validator=WORKERS,
             show_default=False,
         ),
@@ -86,14 +86,14 @@ def paper(
     chosen_tau = PRINTED.tau if tau is None and runs > MAX_RUNS_OF_BOTH else tau
     chosen = [variant for variant in VARIANTS if chosen_tau in (None, variant.tau)]
     setups = [_make_setup(variant) for variant in chosen]
-    with _show_progress(runs * len(chosen), shown=runs > HERE_UP_TO) as advance:
+    with _show_progress(runs * len(chosen), shown=runs > MAX_LOCAL_RUNS) as advance:
         flights = fly_all(setups, runs, steps, seed, workers or os.cpu_count() or 1, advance)
     results = [
         assess(setup, variant.note, flown, seed) for setup, variant, flown in zip(setups, chosen, flights, strict=True)
     ]
     depth = _measure_depth(seed) if full else None
     figures = _draw_figures(out, setups, flights)
-    claims = [*results[0].claims, *(claims_of_depth(depth, results[0].settled_cost) if depth else [])]
+    claims = [*results[0].claims, *(make_depth_claims(depth, results[0].settled_cost) if depth else [])]
     document = {
         **msgspec.to_builtins(results[0]),
         "claims": msgspec.to_builtins(claims),
@@ -121,7 +121,7 @@ def _make_setup(variant: Variant) -> Setup:
 
 
 @contextmanager
-def _show_progress(total: int, *, shown: bool) -> Iterator[Advance]:
+def _show_progress(total: int, *, shown: bool) -> Iterator[ReportProgress]:
     if not shown:
         yield lambda _: None
         return
@@ -140,14 +140,14 @@ def _measure_depth(seed: int) -> Depth:
 def _draw_figures(out: Path, setups: list[Setup], flights: list[Flights]) -> list[Path]:
     """Draw Fig. 3 of every design, and Fig. 4 once: all designs have the same link."""
     # Loads matplotlib, so only after the flights.
-    from uavctl.lab.paper.figures import AgeReference, ages_svg, trajectories_svg
+    from uavctl.lab.paper.figures import AgeReference, draw_ages_svg, draw_trajectories_svg
 
     figures = {}
     for setup, flown in zip(setups, flights, strict=True):
-        figures[f"paper-runs-tau{setup.design.terminal.tau}.svg"] = trajectories_svg(flown.drawn, setup.design)
+        figures[f"paper-runs-tau{setup.design.terminal.tau}.svg"] = draw_trajectories_svg(flown.drawn, setup.design)
     first = setups[0]
     link = AgeReference(first.design.terminal.tau, first.design.horizon, build_spec(first.config).link.outage(1))
-    figures["paper-ages.svg"] = ages_svg(flights[0].totals.ages, link)
+    figures["paper-ages.svg"] = draw_ages_svg(flights[0].totals.ages, link)
     for name, svg in figures.items():
         (out / name).write_text(svg, encoding="utf-8")
     return [out / name for name in figures]
@@ -198,7 +198,7 @@ def _describe_costs(result: VariantResult) -> str:
     )
 
 
-def _make_design_table(tried: list[DesignTried]) -> Table:
+def _make_design_table(tried: list[TriedDesign]) -> Table:
     headings = ("τ", "schedule", "delays", "γ^x_H", "cost at start", "refused")
     rows = (
         (

@@ -44,50 +44,56 @@ from uavctl.cli.tune_flights import TuneEnd, TuneFlight, find_complete_flight, f
 from uavctl.config import Config
 from uavctl.config.load import dump_config, parse_recorded, parse_toml
 from uavctl.errors import RecordingError, UsageError
-from uavctl.lab.identify.history import from_records
-from uavctl.lab.identify.page import write_page as write_fit_page
-from uavctl.lab.identify.result import fits_of, flown_stretches, identify, kinds_of, ramp_of
-from uavctl.lab.tune.box_monitor import KNOWN, WEAKEST, BoxMonitor
+from uavctl.lab.identify.history import read_recorded_history
+from uavctl.lab.identify.page import render_identify_page
+from uavctl.lab.identify.result import (
+    compute_ramp_delay_s,
+    count_fits,
+    get_candidate_models,
+    identify,
+    make_fitted_stretches,
+)
+from uavctl.lab.tune.box_monitor import MIN_BRAKE_SHARE, TUNED_BRAKE_SHARE, BoxMonitor
 from uavctl.lab.tune.change import (
-    PinnedAxis,
+    PinnedAxisModel,
     PredictionErrors,
     TunedResult,
-    believed,
     check_tunable,
-    held_out_errors,
-    tuned,
+    compute_held_out_errors,
+    get_assumed_response,
+    tune_config,
 )
-from uavctl.lab.tune.excitation import DOWN, SafeBox, check_start, excited, parse_box
+from uavctl.lab.tune.excitation import DOWN, SafeBox, add_excitation, check_start, parse_box
 from uavctl.lab.tune.run_folder import (
-    AFTER,
-    BEFORE,
+    AFTER_FOLDER,
+    BEFORE_FOLDER,
     CHANGE_COLUMNS,
     FIGURE_COLUMNS,
-    FIT_PAGE,
-    PAGE,
-    TUNED,
-    TuneAsked,
+    FIT_PAGE_FILE,
+    PAGE_FILE,
+    TUNED_FILE,
     TuneComparison,
     TuneFolder,
     TuneProgress,
-    change_rows,
-    error_columns,
-    error_rows,
-    figure_rows,
-    figures_of,
+    TuneSettings,
+    compute_flight_figures,
+    describe_tuning,
+    lock_run,
+    make_change_rows,
+    make_error_columns,
+    make_error_rows,
+    make_figure_rows,
     read_tuned,
-    sole_run,
-    story,
-    write_page,
+    render_tune_page,
 )
 from uavctl.smpc.plant import AXES
 
 
 def render_changes(result: TunedResult) -> RenderableType:
     """Return tables of old and new values, and of the prediction errors of both models on unfitted data."""
-    error_headings, rows = error_columns(result.old_errors), error_rows(result.old_errors, result.new_errors)
+    error_headings, rows = make_error_columns(result.old_errors), make_error_rows(result.old_errors, result.new_errors)
     return Group(
-        _make_text_table("Configuration", CHANGE_COLUMNS, change_rows(result), ("value", "why")),
+        _make_text_table("Configuration", CHANGE_COLUMNS, make_change_rows(result), ("value", "why")),
         _make_text_table(
             "Prediction on halves of the flight not fitted to, rms", error_headings, rows, error_headings[:2]
         ),
@@ -99,15 +105,15 @@ def render_progress(progress: TuneProgress, folder: Path) -> RenderableType:
     """Return tables of the results of the run so far."""
     parts: list[RenderableType] = []
     if progress.tuned is not None:
-        parts += [Text(line) for line in story(progress.tuned, progress.comparison)]
+        parts += [Text(line) for line in describe_tuning(progress.tuned, progress.comparison)]
     if progress.comparison is not None:
         parts.append(
-            _make_text_table("Both flights", FIGURE_COLUMNS, figure_rows(progress.comparison), FIGURE_COLUMNS[:1])
+            _make_text_table("Both flights", FIGURE_COLUMNS, make_figure_rows(progress.comparison), FIGURE_COLUMNS[:1])
         )
     if progress.tuned is not None:
-        parts.append(Text(f"configuration: {folder / TUNED}"))
+        parts.append(Text(f"configuration: {folder / TUNED_FILE}"))
     if progress.comparison is not None:
-        parts.append(Text(f"page: {folder / PAGE}"))
+        parts.append(Text(f"page: {folder / PAGE_FILE}"))
     return Group(*parts)
 
 
@@ -172,7 +178,7 @@ def tune(
     check_tunable(loaded.config)
     with locate_design_errors(loaded):
         settings = _FlightSettings.check(loaded.config, box, flight, simulated=loopback, take_off_m=take_off_m)
-    asked = TuneAsked(
+    asked = TuneSettings(
         box=""
         if settings.box is None
         else ",".join(f"{coordinate:g}" for coordinate in (*settings.box.lower, *settings.box.upper)),
@@ -180,8 +186,8 @@ def tune(
         simulated=loopback,
         take_off_m=take_off_m,
     )
-    with sole_run(folder):
-        run = _TuneRun(TuneFolder.opened(folder, loaded.config, asked), loaded.config, settings, yes=yes or loopback)
+    with lock_run(folder):
+        run = _TuneRun(TuneFolder.open(folder, loaded.config, asked), loaded.config, settings, yes=yes or loopback)
         try:
             code, stop_reason = run.run()
         except KeyboardInterrupt:  # outside of a flight, which handles it itself
@@ -194,8 +200,8 @@ def tune(
         **msgspec.to_builtins(progress),
         "exit_code": code,
         "stopped": stop_reason,
-        "config": str(folder / TUNED) if progress.tuned is not None else None,
-        "report": str(folder / PAGE) if progress.comparison is not None else None,
+        "config": str(folder / TUNED_FILE) if progress.tuned is not None else None,
+        "report": str(folder / PAGE_FILE) if progress.comparison is not None else None,
     }
     common.show("tune", document, lambda: render_progress(progress, folder))
     return code
@@ -249,7 +255,7 @@ class _FlightSettings:
         assert box is not None
         safe_box = parse_box(box)
         design = design_of(config)
-        mission_config = excited(config, design, safe_box, lands=lands)
+        mission_config = add_excitation(config, design, safe_box, lands=lands)
         if take_off_m is not None:
             check_start(safe_box, (0.0, 0.0, -take_off_m), "--takeoff", (DOWN,))
         if simulated:
@@ -283,31 +289,33 @@ class _TuneRun:
         if self._settings.flight is not None:
             if cut := lacks_end(self._settings.flight):
                 warn(f"{cut}: identified from what comes before")
-            self.folder.note(before=str(self._settings.flight.absolute()))
+            self.folder.save_progress(before=str(self._settings.flight.absolute()))
             return 0, ""
-        if (outcome := self._find_flown(self._settings.mission, BEFORE)) is not None:
+        if (outcome := self._find_flown(self._settings.mission, BEFORE_FOLDER)) is not None:
             return outcome
         self._announce_flight("The first flight, with the configuration as it is")
-        return self._fly(self._settings.mission, BEFORE)
+        return self._fly(self._settings.mission, BEFORE_FOLDER)
 
     def _identify(self) -> tuple[int, str]:
-        if self.folder.progress.tuned is not None and (self.folder.path / TUNED).exists():
+        if self.folder.progress.tuned is not None and (self.folder.path / TUNED_FILE).exists():
             return self._skip_step("identified, and the configuration is written")
-        recording = self.folder.recording(self.folder.progress.before)
-        history = from_records(read(recording))
-        with show_fit_progress(fits_of(history, self._config)) as advance:
+        recording = self.folder.get_recording_path(self.folder.progress.before)
+        history = read_recorded_history(read(recording))
+        with show_fit_progress(count_fits(history, self._config)) as advance:
             identification = identify(history, self._config, advance)
-        result = tuned(self._config, identification)
+        result = tune_config(self._config, identification)
         warnings = find_design_warnings(result.config)
-        write_atomically(self.folder.path / FIT_PAGE, write_fit_page(identification, history.seen, str(recording)))
+        write_atomically(
+            self.folder.path / FIT_PAGE_FILE, render_identify_page(identification, history.positions, str(recording))
+        )
         tuned_result = msgspec.structs.replace(result.result, warnings=(*result.result.warnings, *warnings))
         make_message_console().print(render_changes(tuned_result))
         if warnings:
             raise RecordingError(f"{warnings[0]}. Nothing is written")
         lines = [f"# {line}" for line in _list_changes(tuned_result)]
-        write_atomically(self.folder.path / TUNED, "\n".join([*lines, dump_config(result.config)]))
-        self.folder.note(tuned=tuned_result)
-        print_message(f"written: {self.folder.path / TUNED}")
+        write_atomically(self.folder.path / TUNED_FILE, "\n".join([*lines, dump_config(result.config)]))
+        self.folder.save_progress(tuned=tuned_result)
+        print_message(f"written: {self.folder.path / TUNED_FILE}")
         return 0, ""
 
     def _fly_again(self) -> tuple[int, str]:
@@ -321,66 +329,68 @@ class _TuneRun:
             target=mission.target,
             duration_s=mission.duration_s,
         )
-        if (outcome := self._find_flown(second_config, AFTER)) is not None:
+        if (outcome := self._find_flown(second_config, AFTER_FOLDER)) is not None:
             return outcome
         self._announce_flight("The second flight: the same mission with the tuned configuration")
         if not self._is_agreed and not ask_agreement():
             return INTERRUPTED, "the second flight was not agreed to"
-        return self._fly(second_config, AFTER)
+        return self._fly(second_config, AFTER_FOLDER)
 
     def _compare(self) -> tuple[int, str]:
         progress = self.folder.progress
-        if progress.comparison is not None and (self.folder.path / PAGE).exists():
+        if progress.comparison is not None and (self.folder.path / PAGE_FILE).exists():
             return 0, ""
-        paths = [self.folder.recording(name) for name in (progress.before, progress.after)]
+        paths = [self.folder.get_recording_path(name) for name in (progress.before, progress.after)]
         flights = [FlightData.from_records(read(path), path) for path in paths]
         before, after = (
-            figures_of(flight, name, summarise(flight, wall_s=None).fallbacks, self._settings.box)
+            compute_flight_figures(flight, name, summarise(flight, wall_s=None).fallbacks, self._settings.box)
             for flight, name in zip(flights, (progress.before, progress.after), strict=True)
         )
         old, new = self._compute_errors(paths[1])
         comparison = TuneComparison(before=before, after=after, old_errors=old, new_errors=new)
-        self.folder.note(comparison=comparison)
+        self.folder.save_progress(comparison=comparison)
         progress = self.folder.progress
-        write_atomically(self.folder.path / PAGE, write_page(progress, flights[0], flights[1], self._settings.box))
+        write_atomically(
+            self.folder.path / PAGE_FILE, render_tune_page(progress, flights[0], flights[1], self._settings.box)
+        )
         return 0, ""
 
     def _compute_errors(self, recording: Path) -> tuple[PredictionErrors, PredictionErrors]:
         """Return the prediction errors of the old and the new plant on the second flight."""
-        history = from_records(read(recording))
+        history = read_recorded_history(read(recording))
         new = self._read_tuned()
-        stretches = flown_stretches(history, new)
-        ramp_s = ramp_of(history, new)
+        stretches = make_fitted_stretches(history, new)
+        ramp_s = compute_ramp_delay_s(history, new)
         names = new.plant.axes
         axis_indices = [AXES.index(name) for name in names]
-        models = kinds_of(history, new)[0]
+        models = get_candidate_models(history, new)[0]
 
         def compute_errors(config: Config) -> PredictionErrors:
-            response = believed(config, ramp_s)
-            pinned = [PinnedAxis(model, axis) for model, axis in zip(models, response.axes, strict=True)]
-            return held_out_errors(stretches, names, axis_indices, pinned, response.dead_time_s, new.plant.dt_s)
+            response = get_assumed_response(config, ramp_s)
+            pinned = [PinnedAxisModel(model, axis) for model, axis in zip(models, response.axes, strict=True)]
+            return compute_held_out_errors(stretches, names, axis_indices, pinned, response.dead_time_s, new.plant.dt_s)
 
         return compute_errors(self._config), compute_errors(new)
 
     def _read_tuned(self) -> Config:
-        return read_tuned(self.folder.path / TUNED)
+        return read_tuned(self.folder.path / TUNED_FILE)
 
     def _find_flown(self, config: Config, name: str) -> tuple[int, str] | None:
         """Find a complete flight that an earlier run did not note, and note it; None if there is none."""
-        newest = self.folder.newest(name)
+        newest = self.folder.find_newest(name)
         recording = None if newest is None else find_complete_flight(config, newest)
         if recording is None:
             return None
-        self.folder.note(**{name: self.folder.relative(recording)})
+        self.folder.save_progress(**{name: self.folder.make_relative(recording)})
         return self._skip_step(f"the flight in {newest} came to its end, and counts")
 
     def _fly(self, config: Config, name: str) -> tuple[int, str]:
         if not self._settings.simulated and self._settings.box is not None:
             check_start(self._settings.box, measure_position(self._config), "where the vehicle stands", _HORIZONTAL)
-        box, weakest = self._settings.box, WEAKEST if name == BEFORE else KNOWN
+        box, weakest = self._settings.box, MIN_BRAKE_SHARE if name == BEFORE_FOLDER else TUNED_BRAKE_SHARE
         flight = fly_once(
             config,
-            self.folder.free(name),
+            self.folder.find_free_folder(name),
             simulated=self._settings.simulated,
             take_off_m=self._settings.take_off_m,
             monitor=None if box is None else BoxMonitor(config, box, weakest),
@@ -392,7 +402,7 @@ class _TuneRun:
             )
         code, stop_reason = _describe_stop(flight)
         if not code:
-            self.folder.note(**{name: self.folder.relative(flight.recording)})
+            self.folder.save_progress(**{name: self.folder.make_relative(flight.recording)})
         return code, stop_reason
 
     def _announce_flight(self, text: str) -> None:
@@ -436,5 +446,5 @@ def ask_agreement() -> bool:
 def _list_changes(result: TunedResult) -> Iterator[str]:
     yield "Written by `uavctl tune`. Changed:"
     for row in result.changes:
-        if row.changed:
+        if row.is_changed:
             yield f"  {row.key}{f', {row.axis}' if row.axis else ''}: {row.old:g} -> {row.new:g}"

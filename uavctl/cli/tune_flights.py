@@ -25,7 +25,7 @@ from uavctl.io.base import Connection
 from uavctl.io.signed_connection import open_links
 from uavctl.io.transport import wait
 from uavctl.lab.tune.box_monitor import BoxMonitor
-from uavctl.lab.tune.run_folder import last_place
+from uavctl.lab.tune.run_folder import find_last_waypoint_steps
 from uavctl.loop import make_links
 from uavctl.mavlink.connection import MavlinkConnection
 from uavctl.records import PositionSample, Vec3, VehicleStatus
@@ -74,7 +74,7 @@ def fly_once(
     Raises:
         UavctlError: Nothing was flown; the message is the reason.
     """
-    follower = None if monitor is None else monitor.follow
+    follower = None if monitor is None else monitor.handle_tick
     loaded: LoadedConfig = parse(dump_config(config), f"{out} (configuration)")
     if simulated:
         summary = fly_simulated(loaded, take_off_m=take_off_m, out=out, follower=follower)
@@ -84,8 +84,8 @@ def fly_once(
     end = _classify_end(config, summary, recording)
     if monitor is None:
         return TuneFlight(summary, recording, end)
-    end = TuneEnd.FAILED if monitor.why and end is not TuneEnd.PILOT else end
-    return TuneFlight(summary, recording, end, monitor.why, monitor.repeated)
+    end = TuneEnd.FAILED if monitor.reason and end is not TuneEnd.PILOT else end
+    return TuneFlight(summary, recording, end, monitor.reason, monitor.repeated)
 
 
 def find_complete_flight(config: Config, out: Path) -> Path | None:
@@ -120,7 +120,7 @@ def _is_complete(config: Config, flight: FlightData) -> bool:
     mission = config.mission
     if not mission.waypoints:
         return True  # a flight without waypoints has no last one
-    is_at_last, since_s = last_place(flight)
+    is_at_last, since_s = find_last_waypoint_steps(flight)
     if not is_at_last.any():
         return False
     index = list(flight.design.position_index)

@@ -44,25 +44,25 @@ from uavctl.lab.campaign.spec import KINDS
 from uavctl.lab.whatif.comparison import (
     HEADINGS,
     WhatIf,
-    departure_m,
-    model_fit,
-    reproduction,
-    side_by_side,
-    story,
-    until,
-    write_page,
+    compare_reproduction,
+    compute_max_distance_m,
+    cut_entries,
+    describe_what_if,
+    fit_model,
+    make_comparison_rows,
+    render_what_if_page,
 )
 from uavctl.lab.whatif.flight import (
     Entry,
-    FlownCourse,
+    EntryObserver,
     OtherLink,
     RecordedFlight,
-    Relinked,
-    Response,
-    Watch,
-    fly,
-    history_of,
-    response_of,
+    ReflownFlight,
+    SimulatedLink,
+    VehicleResponse,
+    make_recorded_flight,
+    make_response,
+    refly,
 )
 from uavctl.records import Header, Record
 
@@ -123,8 +123,8 @@ def whatif(
     plant, source = choose_plant(model, before)
     with _show_progress() as progress:
         entries = progress.track(read(flight), total=count_messages(flight), description="reading")
-        history = history_of(entries, before, str(flight))
-    response = response_of(history, plant)
+        history = make_recorded_flight(entries, before, str(flight))
+    response = make_response(history, plant)
     _print_warnings(flight, recorded, history)
     recorded_controller = make_recorded_controller(flight, before)
     is_outside = controller not in KINDS
@@ -139,7 +139,7 @@ def whatif(
     other_link = None
     if link_name != RECORDED:
         noise_m = before.sim.camera.noise_std_m if history.flight.truths else before.estimator.position_std_m
-        other_link = Relinked(history, other_link_config, before.sim.seed if seed is None else seed, noise_m)
+        other_link = SimulatedLink(history, other_link_config, before.sim.seed if seed is None else seed, noise_m)
     begin_s = time.perf_counter()
     with create_recording(out, loaded.config.name, before.log.free_bytes) as path, _show_progress() as progress:
         reproduced = _reproduce(history, recorded_controller, response, _make_watch(progress, "reproducing the flight"))
@@ -160,21 +160,21 @@ def whatif(
             *((f"--seed {seed}",) if seed is not None else ()),
         )
         flights = [
-            FlightData.from_records(until(entries, course.end_ns))
+            FlightData.from_records(cut_entries(entries, course.end_ns))
             for entries in (history.entries, reproduced, tuple(read(path)))
         ]
         result = WhatIf(
             flight=str(flight),
-            reproduction=reproduction(flights[0], flights[1]),
-            model=model_fit(history, response, source),
+            reproduction=compare_reproduction(flights[0], flights[1]),
+            model=fit_model(history, response, source),
             controller=controller,
             link=link_name,
             changed=options,
             compared_s=(course.end_ns - flights[0].origin_ns + flights[0].tick_ns) * 1e-9,
             ended=course.ended,
-            largest_departure_m=departure_m(flights[0], flights[2]),
+            largest_departure_m=compute_max_distance_m(flights[0], flights[2]),
             inertial_moved=course.inertial_moved,
-            inertial_left_out=course.inertial_left_out,
+            inertial_left_out=course.inertial_dropped,
             recorded=summarise(flights[0], wall_s=None),
             reproduced=summarise(flights[1], wall_s=None),
             what_if=summarise(flights[2], wall_s=None),
@@ -182,7 +182,7 @@ def whatif(
             report=str(path.with_suffix(".html")),
             page=str(path.with_name("what-if.html")),
         )
-        write_atomically(Path(result.page), write_page(result, flights[0], flights[2]))
+        write_atomically(Path(result.page), render_what_if_page(result, flights[0], flights[2]))
     Common(json=json).show("log/whatif", result, lambda: _render(result))
     return 0 if result.what_if.steps else 1
 
@@ -205,7 +205,7 @@ def _show_progress() -> Progress:
     return make_progress(TaskProgressColumn(), TimeElapsedColumn())
 
 
-def _make_watch(progress: Progress, what: str) -> Watch:
+def _make_watch(progress: Progress, what: str) -> EntryObserver:
     """Return a function that shows a progress bar of a flight through the entries of a recording."""
 
     def watch(entries: Iterable[Entry]) -> Iterable[Entry]:
@@ -242,29 +242,29 @@ class _RecordMemory:
 
 
 def _reproduce(
-    history: RecordedFlight, recorded_controller: Prepared, response: Response, watch: Watch
+    history: RecordedFlight, recorded_controller: Prepared, response: VehicleResponse, watch: EntryObserver
 ) -> tuple[Entry, ...]:
     """Fly the recorded flight again, with nothing changed."""
     memory = _RecordMemory()
     memory.put(HEADER, history.flight.header.started_ns, history.flight.header)
-    fly(history, recorded_controller.config, recorded_controller.controller, response, memory, lambda: 0, watch=watch)
+    refly(history, recorded_controller.config, recorded_controller.controller, response, memory, lambda: 0, watch=watch)
     return tuple(memory.entries)
 
 
 def _record_changed(
     history: RecordedFlight,
     changed_controller: Prepared,
-    response: Response,
+    response: VehicleResponse,
     other_link: OtherLink | None,
     path: Path,
     recorded: Header,
-    watch: Watch,
-) -> tuple[FlownCourse, RecorderStatus]:
+    watch: EntryObserver,
+) -> tuple[ReflownFlight, RecorderStatus]:
     """Fly the changed configuration and record it; remove an incomplete recording, a seeming shorter flight."""
     recorder = SyncRecorder(path, changed_controller.config.log, derived_topics=DerivedTopics(ViewBuilder()))
     try:
         put_header(recorder, changed_controller, recorded.started_ns, recorded.zero_utc_ns)
-        course = fly(
+        course = refly(
             history,
             changed_controller.config,
             changed_controller.controller,
@@ -282,6 +282,6 @@ def _record_changed(
 
 
 def _render(result: WhatIf) -> RenderableType:
-    table = make_table("", HEADINGS, (map(Text, row) for row in side_by_side(result)), HEADINGS, fold=True)
+    table = make_table("", HEADINGS, (map(Text, row) for row in make_comparison_rows(result)), HEADINGS, fold=True)
     file_lines = [f"recording: {result.recording}", f"report: {result.report}", f"page: {result.page}"]
-    return Group(*map(Text, story(result)), table, *map(Text, file_lines))
+    return Group(*map(Text, describe_what_if(result)), table, *map(Text, file_lines))

@@ -16,7 +16,7 @@ from uavctl.config.checks import get_dimensions
 from uavctl.config.load import parse_recorded
 from uavctl.config.types import PlantConfig, TargetConfig
 from uavctl.errors import UsageError
-from uavctl.lab.campaign.controllers import BaselineSolver, build, recipe_for
+from uavctl.lab.campaign.controllers import BaselineSolver, build_from_recipe, make_recipe
 from uavctl.lab.campaign.spec import CampaignSpec, ControllerSpec
 from uavctl.smpc.batch import BatchController
 from uavctl.smpc.nominal import ControlProblem
@@ -107,13 +107,13 @@ def make_baseline_controller(loaded: LoadedConfig, kind: str, start: Array) -> P
     campaign = CampaignSpec(name="what-if", config=config.name, controller=(spec,), start=tuple(start.tolist()))
     with locate_design_errors(loaded):
         prepared = prepare(config, design_of(config))
-        recipe = recipe_for(spec, config, campaign)
+        recipe = make_recipe(spec, config, campaign)
 
     def make(target: Array) -> tuple[ControlProblem, BatchController]:
         target_config = replace(
             config, target=TargetConfig(position_m=_get_position_m(config.plant.axes, prepared, target))
         )
-        return build_problem(target_config), build(dataclasses.replace(recipe, config=target_config))
+        return build_problem(target_config), build_from_recipe(dataclasses.replace(recipe, config=target_config))
 
     controller = dataclasses.replace(prepared.controller, solver=BaselineSolver(kind, make))
     return dataclasses.replace(prepared, controller=controller)

@@ -73,7 +73,7 @@ class Engagement:
         loop.account.takes_off = self.takes_off
         loop.account.goal = "" if self.goal is None else f"--goto {','.join(f'{x:g}' for x in self.goal)}"
 
-    def follow(self, loop: ControlLoop, ticked: Ticked) -> None:
+    def handle_tick(self, loop: ControlLoop, ticked: Ticked) -> None:
         """Update after a tick; after the first one, order the take-off."""
         self.has_engaged = self.has_engaged or loop.handover_state is HandoverState.ENGAGED
         self._check_arrival(loop, ticked)

@@ -32,20 +32,20 @@ def check_length(config: Config) -> None:
         raise UsageError(f"a flight of {config.duration_s:g} s is shorter than a tick of {config.daemon.tick_s:g} s")
 
 
-class Follower(Protocol):
-    """What looks at every tick, and may give orders."""
+class TickObserver(Protocol):
+    """Interface of an object that gets every tick, and may give orders."""
 
-    def follow(self, loop: ControlLoop, ticked: Ticked) -> None:
-        """Look at the tick that has just run."""
+    def handle_tick(self, loop: ControlLoop, ticked: Ticked) -> None:
+        """Handle the tick that has just run."""
         ...
 
 
-class _Timed:
+class _VirtualTimeLoop:
     """Loop in virtual time: no tick is ever late, and the computing time in the core is recorded."""
 
-    def __init__(self, loop: ControlLoop, follower: Follower | None) -> None:
+    def __init__(self, loop: ControlLoop, observer: TickObserver | None) -> None:
         self._loop = loop
-        self._follower = follower
+        self._observer = observer
         self.stop = False
         self.at_ns = 0  # of the last tick
 
@@ -56,16 +56,16 @@ class _Timed:
         self.at_ns = at_ns
         ticked = self._loop.tick(tick, at_ns, send, stop=self.stop)
         self._loop.timing(ticked, lateness_ns=0, send_ns=0)
-        if self._follower is not None:
-            self._follower.follow(self._loop, ticked)
+        if self._observer is not None:
+            self._observer.handle_tick(self._loop, ticked)
 
 
 class _InterruptedError(Exception):
-    """The operator has asked for the end of a flight in virtual time."""
+    """The operator ended a flight in virtual time."""
 
 
 class LockstepFlight:
-    """One flight with its recording, bit-identical for a seed; `close` it, however `fly` ended.
+    """One flight with its recording, bit-identical for a seed; `close` it even if `fly` raised.
 
     Attributes:
         loop: the control loop.
@@ -85,42 +85,46 @@ class LockstepFlight:
         self.wall_s = 0.0
 
     def fly(
-        self, go_on: Callable[[float], bool], *, follower: Follower | None = None, landing_s: float | None = None
+        self,
+        is_continued: Callable[[float], bool],
+        *,
+        observer: TickObserver | None = None,
+        landing_s: float | None = None,
     ) -> None:
         """Fly for the configured time.
 
         Args:
-            go_on: told the seconds flown after each Δt; False ends the flight there.
-            follower: looks at every tick.
-            landing_s: begin on the ground, and take so long for the landing after the configured time [s]; None
-                begins and ends in the air.
+            is_continued: called with the seconds flown after each Δt; false ends the flight there.
+            observer: gets every tick.
+            landing_s: time for the landing after the configured time [s], in a flight that begins on the ground; None:
+                the flight begins and ends in the air.
         """
         config, lands = self._prepared.config, landing_s is not None
         put_header(self._recorder, self._prepared, started_ns=0, command=self._command)
         self.loop.account.ends_in_flight = not lands
-        timed = _Timed(self.loop, follower)
+        virtual_loop = _VirtualTimeLoop(self.loop, observer)
 
-        def tell(flown_s: float) -> None:
-            if not go_on(flown_s):
+        def check_continued(flown_s: float) -> None:
+            if not is_continued(flown_s):
                 self.loop.account.note_requested_end(Cause.ENDED_BY_OPERATOR)
                 raise _InterruptedError
 
         def record(truth: Truth) -> None:
             self._recorder.put(TRUTH, truth.at_ns, truth)
 
-        world = World(config, timed, on_truth=record, on_progress=tell, airborne=not lands)
-        begun = time.perf_counter()
+        world = World(config, virtual_loop, on_truth=record, on_progress=check_continued, airborne=not lands)
+        began_s = time.perf_counter()
         try:
             world.run(config.duration_s, lambda: lands and self.loop.finished)
             if landing_s is not None:
-                timed.stop = True
+                virtual_loop.stop = True
                 self.loop.account.note_requested_end(Cause.TIME_OVER)
                 world.run(config.duration_s + landing_s, lambda: self.loop.finished)
         except _InterruptedError:
-            pass  # an end that was asked for is no failure
+            pass  # an ordered end is no failure
         finally:
-            self.wall_s = time.perf_counter() - begun
-            self._at_ns = timed.at_ns
+            self.wall_s = time.perf_counter() - began_s
+            self._at_ns = virtual_loop.at_ns
 
     def close(self) -> RecorderStatus:
         """End the recording with how the flight ended (`loop.ending`); return the recording's state."""

@@ -6,15 +6,14 @@ from dataclasses import replace
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.errors import DesignError
 from uavctl.smpc.hahn_stursberg.design import DesignSpec, make_design
 from uavctl.smpc.hahn_stursberg.exact import check_schedule, optimal_cost
 from uavctl.smpc.hahn_stursberg.synthesis import synthesize, terminal_factors
 from uavctl.smpc.hahn_stursberg.terminal import stationary_cost
 
-Array = NDArray[np.float64]
 _DIGITS = 6  # of a gain as it is printed: the figures are those of the printed one
 
 
@@ -52,7 +51,7 @@ def compare_gains(spec: DesignSpec, start: Array) -> GainComparison:
         DesignError: No gain was found (see `synthesize`), or the target or the likelihoods are out of reach.
     """
     kappa_x, kappa_u = terminal_factors(spec)
-    found = synthesize(
+    synthesis = synthesize(
         spec.plant,
         spec.tau,
         spec.q_x,
@@ -65,18 +64,18 @@ def compare_gains(spec: DesignSpec, start: Array) -> GainComparison:
         start=spec.k_tau,
         estimate_cov=spec.estimate_cov,
     )
-    rounded = np.array([[float(f"{entry:.{_DIGITS}g}") for entry in row] for row in found.k])
-    before, after = (_report(replace(spec, k_tau=gain), start) for gain in (spec.k_tau, rounded))
-    return GainComparison(toml=_gain_toml(rounded), before=before, after=after, starts=found.starts)
+    rounded_gain = np.array([[float(f"{entry:.{_DIGITS}g}") for entry in row] for row in synthesis.k])
+    before, after = (_make_report(replace(spec, k_tau=gain), start) for gain in (spec.k_tau, rounded_gain))
+    return GainComparison(toml=_format_gain(rounded_gain), before=before, after=after, starts=synthesis.starts)
 
 
-def _gain_toml(k: Array) -> str:
+def _format_gain(k: Array) -> str:
     """Return a gain as it stands in a configuration."""
     rows = "".join(f"  [{', '.join(repr(float(entry)) for entry in row)}],\n" for row in k)
     return f"[smpc]\nk_tau = [\n{rows}]\n"
 
 
-def _report(spec: DesignSpec, start: Array) -> GainReport:
+def _make_report(spec: DesignSpec, start: Array) -> GainReport:
     try:
         design = make_design(spec, optimal_cost)
         margin = check_schedule(design)

@@ -9,10 +9,10 @@ import msgspec
 import numpy as np
 import pytest
 from baseline_rig import problem
-from numpy.typing import NDArray
 from optimisation_cases import PAPER_LOWER, PAPER_UPPER, START, paper
 
 from sim.simulation import World
+from uavctl.arrays import Array
 from uavctl.build.controller import build_conditioned, build_controller
 from uavctl.cli import bench as bench_cmd
 from uavctl.cli.app import run as command
@@ -23,15 +23,15 @@ from uavctl.lab.bench.run import (
     LOOP_STEPS,
     ROUNDS,
     BenchSizes,
-    InFlight,
-    closed_loops,
+    VariedPreviewSolver,
+    collect_loop_states,
+    draw_questions,
     draw_states,
-    questions,
     run_bench,
     time_decisions,
     time_flight,
 )
-from uavctl.lab.bench.timing import BenchResult, Case, timed
+from uavctl.lab.bench.timing import BenchResult, TimedCase, time_cases
 from uavctl.loop import ControlLoop
 from uavctl.records import Plan, Record, SolveStatus
 from uavctl.smpc.answer import NOMINAL, Answer, Preview
@@ -40,8 +40,6 @@ from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver
 from uavctl.smpc.hahn_stursberg.frozen import FROZEN
 from uavctl.smpc.link import bernoulli
-
-Array = NDArray[np.float64]
 
 WANTED = {
     "printed_ms", "printed_status", "cvxpy_axis_ms", "exact_axis_ms", "flown_us", "ratio_printed", "ratio_cvxpy",
@@ -102,7 +100,7 @@ def test_no_question_in_flight_has_the_covariance_of_the_last_one() -> None:
             return super().solve(seq, x, target, outlook)
 
     given = problem("paper")
-    in_flight = InFlight(Recorder(given, bernoulli(np.array([0.7])), 0.05))
+    in_flight = VariedPreviewSolver(Recorder(given, bernoulli(np.array([0.7])), 0.05))
     for seq in range(9):
         assert in_flight.solve(seq, START, given.target).status is SolveStatus.OPTIMAL
     covs = [one.cov for one in asked if one.cov is not None]
@@ -113,7 +111,7 @@ def test_no_question_in_flight_has_the_covariance_of_the_last_one() -> None:
 
 def test_decisions_from_anywhere_within_the_limits_are_counted_as_they_are() -> None:
     solver = build_conditioned(load_config("room-hahn-stursberg", ["smpc.scheme=age-conditioned"])).solver
-    asked = [*questions(solver, 30, 4)]
+    asked = [*draw_questions(solver, 30, 4)]
     low, high = solver.problem.state_set.bounds
     assert all((low <= x).all() and (x <= high).all() for x, _, _ in asked)
     assert all((low <= target).all() and (target <= high).all() for _, target, _ in asked)
@@ -190,9 +188,6 @@ def test_progress_reaches_the_end_of_every_phase(result: BenchResult, told: list
     assert last["all methods in turns"] == (decisions, decisions)
 
 
-# --- states ----------------------------------------------------------------------------------------------------------
-
-
 def test_states_are_seeded_feasible_and_in_turns(design: Design) -> None:
     exact = ConicSolver(design)
     one, again = (draw_states(design, exact, 7, 0.3, 4, lambda _: None) for _ in range(2))
@@ -211,7 +206,7 @@ def test_states_are_seeded_feasible_and_in_turns(design: Design) -> None:
 
 
 def test_a_box_without_a_feasible_state_ends_with_exit_code_1(design: Design, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("uavctl.lab.bench.run._MOST_MISSES", 3)
+    monkeypatch.setattr("uavctl.lab.bench.run._MAX_MISSES", 3)
     beyond = replace(design, target=np.array([60.0, 0.0, 0.0, 0.0]))
     with pytest.raises(UavctlError, match=r"no state was found .* \[sets\]") as caught:
         draw_states(beyond, ConicSolver(beyond), 2, 0.3, 0, lambda _: None)
@@ -227,7 +222,7 @@ def test_a_loop_asks_on_news_and_plays_the_plan_out_without(design: Design, loss
     # Without disturbance the next question is where the plan says; without news, where the plan ends.
     solver = ConicSolver(design)
     rng = np.random.default_rng(0)
-    asked = closed_loops(undisturbed(design), solver, [START], 2, loss, rng, lambda _: None)
+    asked = collect_loop_states(undisturbed(design), solver, [START], 2, loss, rng, lambda _: None)
     first = solver.solve(0, START, design.target)
     assert asked[0] == pytest.approx(first.states[stage], abs=1e-9)
     second = solver.solve(0, asked[0], design.target)
@@ -258,31 +253,30 @@ class Breaks(Stub):
 
 def test_a_loop_without_plans_is_given_up(design: Design) -> None:
     stub = Stub()
-    assert closed_loops(design, stub, [START], 3, 0.3, np.random.default_rng(0), lambda _: None) == []
+    assert collect_loop_states(design, stub, [START], 3, 0.3, np.random.default_rng(0), lambda _: None) == []
     assert 0 < len(stub.asked) < LOOP_STEPS
-
-
-# --- times -----------------------------------------------------------------------------------------------------------
 
 
 def test_cases_are_run_in_turns_without_garbage_collection() -> None:
     stub, done = Stub(), list[int]()
-    cases = [Case(stub, [np.array([float(i)]) for i in points], np.zeros(1)) for points in ((1, 2), (), (3,))]
-    found = timed(cases, 2, done.append)
+    cases = [TimedCase(stub, [np.array([float(i)]) for i in points], np.zeros(1)) for points in ((1, 2), (), (3,))]
+    found = time_cases(cases, 2, done.append)
     assert stub.asked == [1, 2, 3, *[1, 2, 3] * 2]  # warmed up, then two runs
     assert stub.collected == [True] * 3 + [False] * 6
     assert done == [1, 2, 3, 4, 5, 6]
     assert gc.isenabled()
     assert [each.us.shape for each in found] == [(2,), (0,), (1,)]
     assert [len(each.answers) for each in found] == [2, 0, 1]
-    assert found[0].of(FROZEN).size == 0  # none has a plan
+    assert found[0].get_times_us(FROZEN).size == 0  # none has a plan
 
 
 @pytest.mark.slow
 def test_a_slow_case_is_spread_over_the_runs() -> None:
     often, once = Stub(), Stub()
     points = [np.array([float(i)]) for i in range(5)]
-    found = timed([Case(often, points[:1], np.zeros(1)), Case(once, points, np.zeros(1), once=True)], 2)
+    found = time_cases(
+        [TimedCase(often, points[:1], np.zeros(1)), TimedCase(once, points, np.zeros(1), is_asked_once=True)], 2
+    )
     assert often.asked == [0, 0, 0]
     assert once.asked == [0, 1, 2, 3, 4, 0, 2, 4, 1, 3]  # warmed up, then each state once
     assert np.isfinite(found[1].us).all() and found[1].us.shape == (5,)
@@ -291,11 +285,8 @@ def test_a_slow_case_is_spread_over_the_runs() -> None:
 
 def test_garbage_is_collected_again_after_an_error() -> None:
     with pytest.raises(ArithmeticError):
-        timed([Case(Breaks(), [np.zeros(1)], np.zeros(1))], 1)
+        time_cases([TimedCase(Breaks(), [np.zeros(1)], np.zeros(1))], 1)
     assert gc.isenabled()
-
-
-# --- what people see -------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -304,7 +295,12 @@ def measured(result: BenchResult, monkeypatch: pytest.MonkeyPatch) -> list[tuple
     given: list[tuple[float, int, int]] = []
 
     def fake(
-        _design: Design, loss: float, seed: int, advance: run.Advance, sizes: BenchSizes, conditioned: ConditionedSolver
+        _design: Design,
+        loss: float,
+        seed: int,
+        advance: run.ReportProgress,
+        sizes: BenchSizes,
+        conditioned: ConditionedSolver,
     ) -> BenchResult:
         assert conditioned.problem.horizon == 12
         for done in range(3):

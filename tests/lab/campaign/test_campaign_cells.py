@@ -10,10 +10,17 @@ from campaign_rig import cells, controller, read, table
 
 from uavctl.build.controller import build_problem
 from uavctl.config import load_config
-from uavctl.lab.campaign.controllers import TUNING_FIRST, Met, build, built, met, start_of
+from uavctl.lab.campaign.controllers import (
+    TUNING_FIRST,
+    RunConditions,
+    build_from_recipe,
+    draw_conditions,
+    get_controller,
+    get_start_state,
+)
 from uavctl.lab.campaign.spec import CHUNK
-from uavctl.lab.campaign.tasks import cells_of, document, tasks_of, told
-from uavctl.lab.campaign.world import draw, fly, newest
+from uavctl.lab.campaign.tasks import describe_cell, make_cells, make_document, make_tasks
+from uavctl.lab.campaign.world import compute_newest_captures, draw, simulate
 from uavctl.smpc.baselines import Lqg, PacketisedPredictive, WorstCaseDelay
 from uavctl.smpc.batch import BatchSmpc
 from uavctl.smpc.hahn_stursberg.design import kappa
@@ -55,19 +62,19 @@ def test_what_is_flown_and_what_is_believed_are_two_things(tmp_path: Path) -> No
     first, weak = cells(tmp_path, controller("lqg", 'link = "good"'), LINKS, table("plant", "b"), WEAK)[2:]
     assert first.recipe is weak.recipe and weak.recipe is not None
     assert weak.recipe.config.link.loss == 0.1 and weak.setting.link.loss == 0.6
-    assert met(first.setting, 0, 1).scene.plant.b[1, 0] == 0.39
-    assert met(weak.setting, 0, 1).scene.plant.b[1, 0] == 0.2
+    assert draw_conditions(first.setting, 0, 1).world.plant.b[1, 0] == 0.39
+    assert draw_conditions(weak.setting, 0, 1).world.plant.b[1, 0] == 0.2
     assert build_problem(weak.recipe.config).plant.b[1, 0] == 0.39
 
 
 def test_a_design_that_is_refused_costs_its_cells_only(tmp_path: Path) -> None:
     links = table("link", "as printed") + table("link", "bad", 'set = ["link.loss=0.6"]')
     campaign = read(tmp_path, controller("smpc"), controller("lqg"), links)
-    found = cells_of(campaign)
+    found = make_cells(campaign)
     assert [bool(cell.refused) for cell in found] == [False, True, False, False]
     assert found[1].refused.startswith("smpc.delta_x: 0.95 is out of reach") and found[1].recipe is None
-    assert {task.cell for task in tasks_of(found)} == {0, 2, 3}
-    kept = document(campaign, found)["cells"]
+    assert {task.cell for task in make_tasks(found)} == {0, 2, 3}
+    kept = make_document(campaign, found)["cells"]
     assert isinstance(kept, list)
     assert kept[1]["refused"] == found[1].refused and kept[1]["design_id"] is None
     assert kept[0]["promised_x"] == pytest.approx(0.05) and kept[0]["link_loss"] == 0.3
@@ -83,35 +90,37 @@ def test_a_plant_that_cannot_be_flown_is_refused_too(tmp_path: Path) -> None:
 def test_every_cell_meets_the_same_chance(tmp_path: Path) -> None:
     lines = 'steps = 9\nmaster = 5\nset = ["plant.w=[[0.5, 0.1], [0.1, 0.3]]"]\n'
     found = cells(tmp_path, lines, controller("lqg"), controller("hold-last"), LINKS)
-    one, other = (met(cell.setting, 3, 4) for cell in (found[0], found[2]))
+    one, other = (draw_conditions(cell.setting, 3, 4) for cell in (found[0], found[2]))
     np.testing.assert_array_equal(one.disturbances, other.disturbances)
-    np.testing.assert_array_equal(one.newest, other.newest)
+    np.testing.assert_array_equal(one.newest_captures, other.newest_captures)
     # A worse link loses what the better one loses, and more.
-    assert (met(found[1].setting, 3, 4).newest <= one.newest).all()
+    assert (draw_conditions(found[1].setting, 3, 4).newest_captures <= one.newest_captures).all()
     chances = draw(5, 3, 4, 9, 2)
-    np.testing.assert_array_equal(one.newest, newest(found[0].setting.link, 1.0, chances.link))
+    np.testing.assert_array_equal(
+        one.newest_captures, compute_newest_captures(found[0].setting.link, 1.0, chances.link)
+    )
     root = np.linalg.cholesky(np.array([[0.5, 0.1], [0.1, 0.3]]))
     whitened = one.disturbances @ np.linalg.inv(root).T
     turn = whitened.reshape(-1, 2).T @ np.linalg.pinv(chances.normal.reshape(-1, 2).T)
     np.testing.assert_allclose(turn @ turn.T, np.eye(2), atol=1e-9)  # any two roots differ by a rotation
-    np.testing.assert_array_equal(met(found[0].setting, 4, 1).disturbances[0], one.disturbances[1])
+    np.testing.assert_array_equal(draw_conditions(found[0].setting, 4, 1).disturbances[0], one.disturbances[1])
 
 
 def test_runs_start_where_they_are_told(tmp_path: Path) -> None:
-    def starts(line: str) -> Met:
+    def starts(line: str) -> RunConditions:
         (found,) = cells(tmp_path, line, controller("lqg"))
-        return met(found.setting, 2, 50)
+        return draw_conditions(found.setting, 2, 50)
 
-    np.testing.assert_array_equal(starts("").scene.start, np.tile([35.0, -2.0, -20.0, -4.0], (50, 1)))
-    np.testing.assert_array_equal(starts("start = [1, 2, 3, 4]\n").scene.start[7], [1, 2, 3, 4])
+    np.testing.assert_array_equal(starts("").world.start, np.tile([35.0, -2.0, -20.0, -4.0], (50, 1)))
+    np.testing.assert_array_equal(starts("start = [1, 2, 3, 4]\n").world.start[7], [1, 2, 3, 4])
     box = starts("start_box = [[-1, 0, 5, 0], [1, 2, 5, 8]]\n")
-    drawn = box.scene.start
+    drawn = box.world.start
     assert (drawn >= [-1, 0, 5, 0]).all() and (drawn <= [1, 2, 5, 8]).all()
     assert (drawn[:, 2] == 5).all() and len(np.unique(drawn[:, 0])) == 50
     assert drawn.mean(axis=0) == pytest.approx([0, 1, 5, 4], abs=1.2)
     (found,) = cells(tmp_path, "start_box = [[-1, 0, 5, 0], [1, 2, 5, 8]]\n", controller("lqg"))
-    np.testing.assert_array_equal(met(found.setting, 9, 1).scene.start[0], drawn[7])
-    np.testing.assert_array_equal(start_of(found.setting.spec, found.setting.base), [0, 1, 5, 4])
+    np.testing.assert_array_equal(draw_conditions(found.setting, 9, 1).world.start[0], drawn[7])
+    np.testing.assert_array_equal(get_start_state(found.setting.spec, found.setting.base), [0, 1, 5, 4])
     # The draws of where runs start leave the others as they are.
     np.testing.assert_array_equal(box.disturbances, starts("").disturbances)
 
@@ -122,24 +131,24 @@ def test_every_kind_of_controller_flies(tmp_path: Path) -> None:
     found = cells(tmp_path, "steps = 6\n", *(controller(kind) for kind in kinds))
     assert [cell.kind for cell in found] == list(kinds) and not any(cell.refused for cell in found)
     recipes = [cell.recipe for cell in found if cell.recipe is not None]
-    assert isinstance(build(recipes[0]), BatchSmpc) and isinstance(build(recipes[1]), Lqg)
+    assert isinstance(build_from_recipe(recipes[0]), BatchSmpc) and isinstance(build_from_recipe(recipes[1]), Lqg)
     assert recipes[6].gains is not None
-    assert told(found[6])["gains"] == {
+    assert describe_cell(found[6])["gains"] == {
         name: getattr(recipes[6].gains, name).tolist()
         for name in ("position_1ps", "velocity_1ps", "integral_1ps2", "derivative", "speed")
     }
-    assert built(recipes[1]) is built(recipes[1])
-    assert built(recipes[2]) is not built(recipes[1])
+    assert get_controller(recipes[1]) is get_controller(recipes[1])
+    assert get_controller(recipes[2]) is not get_controller(recipes[1])
 
 
 def test_the_worst_case_delay_is_tau_with_the_promised_likelihoods(tmp_path: Path) -> None:
     (found,) = cells(tmp_path, 'set = ["smpc.tau=3"]\n', controller("worst-case-delay"))
     config, recipe = load_config("paper", ["smpc.tau=3"]), found.recipe
     assert recipe is not None
-    own, problem = build(recipe), build_problem(config)
+    own, problem = build_from_recipe(recipe), build_problem(config)
     expected = WorstCaseDelay(problem, 3, kappa(0.95, 4, 8, "ellipsoid"), kappa(0.9, 2, 4, "ellipsoid"))
-    meets = met(found.setting, 0, 5)
-    one, other = (fly(meets.scene, each, meets.newest, meets.disturbances) for each in (own, expected))
+    meets = draw_conditions(found.setting, 0, 5)
+    one, other = (simulate(meets.world, each, meets.newest_captures, meets.disturbances) for each in (own, expected))
     np.testing.assert_array_equal(one.inputs, other.inputs)
 
 
@@ -147,18 +156,22 @@ def test_a_margin_goes_to_the_plans_that_it_is_for(tmp_path: Path) -> None:
     found = cells(
         tmp_path, controller("packetised"), controller("packetised", "margin = 3.0").replace('d"\n', 'd2"\n', 1)
     )
-    meets = met(found[0].setting, 0, 5)
+    meets = draw_conditions(found[0].setting, 0, 5)
     without, own = (
-        fly(meets.scene, build(cell.recipe), meets.newest, meets.disturbances) for cell in found if cell.recipe
+        simulate(meets.world, build_from_recipe(cell.recipe), meets.newest_captures, meets.disturbances)
+        for cell in found
+        if cell.recipe
     )
     expected = PacketisedPredictive(build_problem(load_config("paper")), 3.0)
-    np.testing.assert_array_equal(own.inputs, fly(meets.scene, expected, meets.newest, meets.disturbances).inputs)
+    np.testing.assert_array_equal(
+        own.inputs, simulate(meets.world, expected, meets.newest_captures, meets.disturbances).inputs
+    )
     assert np.abs(own.inputs - without.inputs).max() > 0.1
 
 
 def test_tasks_are_fixed_chunks_and_tuning_runs_are_nobody_s(tmp_path: Path) -> None:
     found = cells(tmp_path, f"runs = {2 * CHUNK + 7}\n", controller("lqg"), LINKS)
-    tasks = list(tasks_of(found))
+    tasks = list(make_tasks(found))
     assert [(task.cell, task.first, task.runs) for task in tasks] == [
         (cell, first, runs) for cell in (0, 1) for first, runs in ((0, CHUNK), (CHUNK, CHUNK), (2 * CHUNK, 7))
     ]

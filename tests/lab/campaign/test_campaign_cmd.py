@@ -161,7 +161,7 @@ def test_ctrl_c_before_the_first_run_leaves_nothing_to_go_on_with(
     def interrupted(*arguments: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(campaign_run, "cells_of", interrupted)
+    monkeypatch.setattr(campaign_run, "make_cells", interrupted)
     assert run(["campaign", str(spec), "--out", str(tmp_path / "none")]) == 130
     assert "interrupted before the first run" in capsys.readouterr().err and not (tmp_path / "none").exists()
 

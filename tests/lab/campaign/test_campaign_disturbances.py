@@ -4,26 +4,24 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.stats import norm, t
 
-from uavctl.lab.campaign.controllers import disturbances
-from uavctl.lab.campaign.spec import DisturbanceSpec, Shape
+from uavctl.arrays import Array
+from uavctl.lab.campaign.controllers import shape_disturbances
+from uavctl.lab.campaign.spec import DisturbanceKind, DisturbanceSpec
 
 RUNS, STEPS = 4000, 50
-NORMAL: NDArray[np.float64] = np.random.default_rng(3).standard_normal((RUNS, STEPS, 2))
+NORMAL: Array = np.random.default_rng(3).standard_normal((RUNS, STEPS, 2))
 W = np.array([[0.6, 0.2], [0.2, 0.3]])
-SHAPES: tuple[Shape, ...] = ("gaussian", "uniform", "heavy", "gusts")
+SHAPES: tuple[DisturbanceKind, ...] = ("gaussian", "uniform", "heavy", "gusts")
 
 
-def made(
-    kind: Shape, scale: float = 1.0, bias: float = 0.0, memory: float = 0.0, w: NDArray[np.float64] = W
-) -> NDArray[np.float64]:
-    return disturbances(DisturbanceSpec(name="d", kind=kind, scale=scale, bias=bias, memory=memory), w, NORMAL)
+def made(kind: DisturbanceKind, scale: float = 1.0, bias: float = 0.0, memory: float = 0.0, w: Array = W) -> Array:
+    return shape_disturbances(DisturbanceSpec(name="d", kind=kind, scale=scale, bias=bias, memory=memory), w, NORMAL)
 
 
 @pytest.mark.parametrize("kind", SHAPES)
-def test_every_kind_has_the_covariance_and_the_mean_asked_for(kind: Shape) -> None:
+def test_every_kind_has_the_covariance_and_the_mean_asked_for(kind: DisturbanceKind) -> None:
     flat = made(kind, scale=1.5, bias=0.4, memory=0.6 if kind == "gusts" else 0.0).reshape(-1, 2)
     # 200,000 draws; the fourth moment of Student's t with 4 degrees is infinite, so its covariance converges slowly.
     tolerance = 0.1 if kind == "heavy" else 0.02
@@ -50,7 +48,7 @@ def test_shapes_are_quantiles_of_the_same_draws() -> None:
 
 def test_heavy_tails_stay_finite_and_symmetric_far_out() -> None:
     far = np.array([[[-12.0, 12.0], [-9.0, 9.0]]])  # nine standard deviations: once in 1e19 draws
-    heavy = disturbances(DisturbanceSpec(name="d", kind="heavy"), np.eye(2), far)
+    heavy = shape_disturbances(DisturbanceSpec(name="d", kind="heavy"), np.eye(2), far)
     assert np.isfinite(heavy).all() and (np.diff(heavy, axis=2) > 0).all()
     np.testing.assert_array_equal(heavy[..., 0], -heavy[..., 1])
     # P(t_4 < x) = P(z < -9), by the survival function that is not rounded.

@@ -11,13 +11,13 @@ from places import ROOT
 
 from uavctl.build.controller import build_design
 from uavctl.errors import DesignError
-from uavctl.lab.campaign.controllers import Setting, met
+from uavctl.lab.campaign.controllers import CellSetting, draw_conditions
 from uavctl.lab.campaign.spec import read_campaign
-from uavctl.lab.campaign.trials import is_trial, read_trial
+from uavctl.lab.campaign.trials import is_trial_file, read_trial
 
 FOLDER = ROOT / "docs" / "campaigns"
 EVERY = sorted(FOLDER.glob("*.toml"))
-FILES = [file for file in EVERY if not is_trial(file)]
+FILES = [file for file in EVERY if not is_trial_file(file)]
 # (file, controller, link that it believes in): there is no such design, as the file's head says.
 REFUSED = {
     *(("loss", "smpc as printed", f"{loss} %") for loss in range(40, 100, 10)),
@@ -56,12 +56,12 @@ def test_what_is_refused_is_what_the_file_says(file: Path) -> None:
     campaign, _ = read_campaign(file)
     spec, refused = campaign.spec, set()
     assert spec.name == file.stem
-    for (i, link), config in campaign.believed.items():
+    for (i, link), config in campaign.believed_configs.items():
         if spec.controller[i].kind == "smpc" and not config.is_age_conditioned:  # which takes no promise of a design's
             try:
                 build_design(config)
             except DesignError:
                 refused.add((file.stem, spec.controller[i].name, link))
     assert refused == {one for one in REFUSED if one[0] == file.stem}
-    for flown, disturbance in product(campaign.flown_plant, spec.disturbance):
-        met(Setting(spec, campaign.base, flown.plant, campaign.flown_link[0].link, disturbance), 0, 1)
+    for flown, disturbance in product(campaign.flown_plants, spec.disturbance):
+        draw_conditions(CellSetting(spec, campaign.base, flown.plant, campaign.flown_links[0].link, disturbance), 0, 1)

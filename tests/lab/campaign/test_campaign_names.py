@@ -14,8 +14,8 @@ from matplotlib.textpath import TextPath
 
 from logs.report.svg import Drawing
 from uavctl.lab.campaign import plots
-from uavctl.lab.campaign.plots import Looks
-from uavctl.lab.campaign.results import grouped, read_results, summarise, verdicts
+from uavctl.lab.campaign.plots import ControllerStyles
+from uavctl.lab.campaign.results import group_cells, make_verdicts, read_results, summarise
 
 LINKS = (
     "30 %",
@@ -73,11 +73,11 @@ def drawings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Drawing]:
             cells.append(cell(2 * place + who, controller, "lqg" if who else "smpc", link=link))
             rows += runs(2 * place + who, [100.0 + who, 110.0, 105.0])
     folder = write(tmp_path_factory.mktemp("names"), cells, rows)
-    summaries, looks = summarise(folder), Looks(CONTROLLERS)
-    found = list(verdicts(read_results(folder), grouped(summaries)))
-    difference = plots.differences(found, looks, f"Beside {CONTROLLERS[0]}", "0")
+    summaries, looks = summarise(folder), ControllerStyles(CONTROLLERS)
+    found = list(make_verdicts(read_results(folder), group_cells(summaries)))
+    difference = plots.draw_differences(found, looks, f"Beside {CONTROLLERS[0]}", "0")
     assert difference is not None
-    return {"cost": next(plots.compared(summaries, {}, looks, "0")), "difference": difference}
+    return {"cost": next(plots.draw_quantities(summaries, {}, looks, "0")), "difference": difference}
 
 
 def names_of(svg: str) -> list[list[Box]]:

@@ -17,17 +17,17 @@ from told_numbers import numbers_in
 from logs.report.page import render_legend
 from logs.report.run_statistics import PairedDifference
 from uavctl.errors import UavctlError
-from uavctl.lab.campaign.page import CampaignView, story, write_report
-from uavctl.lab.campaign.plots import Looks
+from uavctl.lab.campaign.page import CampaignView, describe_outcome, write_report
+from uavctl.lab.campaign.plots import ControllerStyles
 from uavctl.lab.campaign.results import (
     CampaignVerdict,
-    brief,
-    grouped,
-    in_words,
+    describe_briefly,
+    describe_verdict,
+    get_verdict_word,
+    group_cells,
+    make_verdicts,
     read_results,
     summarise,
-    verdicts,
-    word_of,
 )
 
 N = 60
@@ -65,7 +65,7 @@ def text_of(path: Path) -> str:
 def judged(tmp_path: Path, baseline: list[dict[str, Any]], smpc: list[dict[str, Any]] | None = None) -> CampaignVerdict:
     rows = [*(smpc or runs(0, SMPC.tolist())), *baseline]
     results = read_results(write(tmp_path, [cell(0, "ours", "smpc"), cell(1, "theirs")], rows))
-    (found,) = verdicts(results, grouped(summarise(tmp_path)))
+    (found,) = make_verdicts(results, group_cells(summarise(tmp_path)))
     return found
 
 
@@ -75,32 +75,42 @@ def outside(steps: int) -> list[int]:
 
 def test_cheaper_and_as_safe_is_yes(tmp_path: Path) -> None:
     found = judged(tmp_path, runs(1, (SMPC * 1.1).tolist()))
-    assert (found.holds, found.outright, found.beaten, word_of(found)) == (True, True, False, "yes")
-    assert brief(found.comparisons[0]) == "costs 10 % more"
-    (sentence,) = in_words(found)
+    assert (found.is_unmatched, found.is_better_than_all, found.is_beaten, get_verdict_word(found)) == (
+        True,
+        True,
+        False,
+        "yes",
+    )
+    assert describe_briefly(found.comparisons[0]) == "costs 10 % more"
+    (sentence,) = describe_verdict(found)
     assert "theirs (10 % more" in sentence  # among those that are beaten
 
 
 def test_a_difference_that_pairs_tell_is_told(tmp_path: Path) -> None:
     # Both costs lie within 99.7 to 100.3; the difference of 0.02 is the same in every run.
     found = judged(tmp_path, runs(1, (SMPC + 0.02).tolist()))
-    assert found.holds
+    assert found.is_unmatched
 
 
 def test_a_baseline_that_saves_by_breaking_limits_is_named_with_what_it_breaks(tmp_path: Path) -> None:
     cheaper = runs(1, (SMPC * 0.97).tolist(), state_violations=outside(1), input_violations=outside(15))
     found = judged(tmp_path, cheaper)
-    assert (found.holds, found.outright, found.beaten, word_of(found)) == (True, False, False, "yes")
-    costs, limits = brief(found.comparisons[0]).split(", ")
+    assert (found.is_unmatched, found.is_better_than_all, found.is_beaten, get_verdict_word(found)) == (
+        True,
+        False,
+        False,
+        "yes",
+    )
+    costs, limits = describe_briefly(found.comparisons[0]).split(", ")
     assert numbers_in(costs) == [3.0] and "less" in costs and "more often" in limits
-    (sentence,) = in_words(found)
+    (sentence,) = describe_verdict(found)
     assert numbers_in(sentence)[-5:] == [2.0, 0.0, 30.0, 0.0, 10.0]  # states, SMPC's, inputs, SMPC's; allowed
     assert "inputs (10 %)" in sentence and "caution" not in sentence and "chance" not in sentence
 
 
 def test_caution_that_was_not_asked_for_is_told(tmp_path: Path) -> None:
     found = judged(tmp_path, runs(1, (SMPC * 0.97).tolist(), state_violations=outside(1)))
-    (sentence,) = in_words(found)
+    (sentence,) = describe_verdict(found)
     assert "(states 5 %, inputs 10 %)" in sentence and "caution" in sentence
 
 
@@ -112,7 +122,7 @@ def test_a_rate_above_the_allowance_is_never_told_as_within_it(tmp_path: Path) -
     rate, interval = one.baseline.input_violation_rate, one.baseline.input_violation_ci
     assert rate is not None and interval is not None and interval[0] <= 0.1 < rate
     safer = replace(one, inputs=PairedDifference(mean=-rate, low=-rate, high=-rate, runs=3))
-    (sentence,) = in_words(replace(found, comparisons=(safer,)))
+    (sentence,) = describe_verdict(replace(found, comparisons=(safer,)))
     assert numbers_in(sentence)[-3:] == [28.0, 0.0, 10.0]  # inputs, SMPC's; allowed
     assert "10 % allowed for inputs" in sentence and "chance" in sentence and "caution" not in sentence
 
@@ -121,8 +131,8 @@ def test_a_rate_at_the_allowance_is_within_it(tmp_path: Path) -> None:
     cells = [cell(0, "ours", "smpc", promised_u=1.0 - 0.9), cell(1, "theirs")]  # below 0.1 by rounding
     rows = [*runs(0, SMPC.tolist()), *runs(1, (SMPC * 0.9).tolist(), input_violations=[10, 0] * (N // 2))]
     results = read_results(write(tmp_path, cells, rows))
-    (found,) = verdicts(results, grouped(summarise(tmp_path)))
-    (sentence,) = in_words(found)
+    (found,) = make_verdicts(results, group_cells(summarise(tmp_path)))
+    (sentence,) = describe_verdict(found)
     assert "inputs in 10 %" in sentence and "caution" in sentence
 
 
@@ -144,23 +154,23 @@ def test_the_promise_is_told_by_what_was_measured(
 
 def test_a_baseline_that_is_better_outright_is_told(tmp_path: Path) -> None:
     found = judged(tmp_path, runs(1, (SMPC * 0.5).tolist()))
-    assert (found.holds, found.beaten, word_of(found)) == (False, True, "no")
-    assert "theirs costs 50 % less" in in_words(found)[0]
-    assert "breaks limits no more often" in in_words(found)[0]
+    assert (found.is_unmatched, found.is_beaten, get_verdict_word(found)) == (False, True, "no")
+    assert "theirs costs 50 % less" in describe_verdict(found)[0]
+    assert "breaks limits no more often" in describe_verdict(found)[0]
 
 
 def test_cheaper_at_a_higher_violation_rate_is_not_outright(tmp_path: Path) -> None:
     worse = runs(0, SMPC.tolist(), state_violations=outside(2))
     found = judged(tmp_path, runs(1, (SMPC * 1.1).tolist()), worse)
-    assert (found.holds, found.outright, found.beaten) == (True, False, False)
-    costs, limits = brief(found.comparisons[0]).split(", ")
+    assert (found.is_unmatched, found.is_better_than_all, found.is_beaten) == (True, False, False)
+    costs, limits = describe_briefly(found.comparisons[0]).split(", ")
     assert numbers_in(costs) == [10.0] and "more" in costs and "better" in limits
 
 
 def test_costs_that_cannot_be_told_apart_are_no(tmp_path: Path) -> None:
     found = judged(tmp_path, runs(1, (SMPC + np.tile([1.0, -1.0], N // 2)).tolist()))
-    assert (found.holds, found.beaten) == (False, False)
-    assert brief(found.comparisons[0]) == "costs the same"
+    assert (found.is_unmatched, found.is_beaten) == (False, False)
+    assert describe_briefly(found.comparisons[0]) == "costs the same"
 
 
 @pytest.fixture(scope="module")
@@ -196,7 +206,7 @@ def test_the_page_says_what_was_compared_and_what_came_of_it(grid: Path) -> None
     text = text_of(grid / "report.html")
     for label in ("Campaign “by hand”", "12 cells", "seed 7", "uavctl 9.9", f"Not flown: {REFUSED}"):
         assert label in text
-    told = list(story(CampaignView.of(read_results(grid))))
+    told = list(describe_outcome(CampaignView.make(read_results(grid))))
     assert all(sentence in text for sentence in told)
     assert numbers_in(told[0])[:2] == [480.0, 50.0]  # runs, steps
     assert numbers_in(told[1]) == [4.0] and "no design" in told[1]
@@ -268,8 +278,8 @@ def test_numbers_below_the_axis_of_differences_do_not_touch(tmp_path: Path) -> N
 
 
 def test_a_legend_has_the_markers_of_its_figure() -> None:
-    looks = Looks(tuple(f"controller {place}" for place in range(12)))
-    entries = list(looks.entries(looks.controllers))
+    looks = ControllerStyles(tuple(f"controller {place}" for place in range(12)))
+    entries = list(looks.make_marks(looks.controllers))
     assert len({(one.role, one.path, one.full) for one in entries}) == 12
     drawn = re.findall(r"<li>.*?</li>", render_legend(entries))
     assert len({re.sub(r"controller \d+", "", one) for one in drawn}) == 12

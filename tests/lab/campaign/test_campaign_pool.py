@@ -14,16 +14,16 @@ from patience import LIMIT_S, until
 
 from uavctl.errors import UsageError
 from uavctl.lab.campaign import pool
-from uavctl.lab.campaign.pool import ONE_THREAD, Columns, Work, fly_tasks, processes
+from uavctl.lab.campaign.pool import ONE_THREAD, Columns, Work, fly_tasks, open_processes
 from uavctl.lab.campaign.spec import CHUNK
-from uavctl.lab.campaign.tasks import tasks_of
+from uavctl.lab.campaign.tasks import make_tasks
 
 ORPHAN = """
 import os, sys
-from uavctl.lab.campaign.pool import processes
+from uavctl.lab.campaign.pool import open_processes
 if __name__ == "__main__":
-    with processes(1) as crew:
-        print(crew._pool.submit(os.getpid).result(), flush=True)
+    with open_processes(1) as crew:
+        print(crew._executor.submit(os.getpid).result(), flush=True)
         sys.stdin.read()
 """
 
@@ -34,14 +34,14 @@ def test_a_worker_that_is_killed_is_replaced_and_nothing_is_lost(
 ) -> None:
     monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "2")
-    tasks = list(tasks_of(cells(tmp_path, f"steps = 3\nruns = {5 * CHUNK}\n", controller("lqg"))))
+    tasks = list(make_tasks(cells(tmp_path, f"steps = 3\nruns = {5 * CHUNK}\n", controller("lqg"))))
     kept: dict[str, Columns] = {}
-    with processes(1) as crew:
-        assert crew._pool.submit(os.getenv, "OPENBLAS_NUM_THREADS").result() == "1"
+    with open_processes(1) as crew:
+        assert crew._executor.submit(os.getenv, "OPENBLAS_NUM_THREADS").result() == "1"
 
         def keep(task: Work, columns: Columns) -> None:
             if not kept:
-                os.kill(crew._pool.submit(os.getpid).result(), signal.SIGKILL)
+                os.kill(crew._executor.submit(os.getpid).result(), signal.SIGKILL)
             kept[task.name] = columns
 
         fly_tasks(tasks, crew, keep, lambda: False)
@@ -67,14 +67,14 @@ def test_workers_end_with_their_parent_however_it_ends(tmp_path: Path) -> None:
 def test_workers_that_would_give_other_numbers_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
-    here = pool._about()
+    here = pool._get_version_and_threads()
     assert here[1] == "1"
-    pool._check("tcp://a", {"w": here})
+    pool._check_workers("tcp://a", {"w": here})
     with pytest.raises(UsageError, match=r"worker w has uavctl 0\.0, this is"):
-        pool._check("tcp://a", {"v": here, "w": ("0.0", "1")})
+        pool._check_workers("tcp://a", {"v": here, "w": ("0.0", "1")})
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "4")  # it wins over the other
     with pytest.raises(UsageError, match=r"computes with 4 BLAS threads.*OPENBLAS_NUM_THREADS=1"):
-        pool._check("tcp://a", {"w": pool._about()})
+        pool._check_workers("tcp://a", {"w": pool._get_version_and_threads()})
     assert set(ONE_THREAD.values()) == {"1"}
 
 

@@ -9,25 +9,24 @@ import campaign_rig as rig
 import msgspec
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.stats import binom
 
 from logs.report.run_statistics import max_step_rate
+from uavctl.arrays import Array
 from uavctl.build.controller import build_estimator, build_plant, build_problem
 from uavctl.config import Config, load_config
 from uavctl.flight.estimator import absorb_samples, begin_history, estimate_at, note_input
 from uavctl.flight.kalman import make_kalman
-from uavctl.lab.campaign.controllers import met, sight_of
+from uavctl.lab.campaign.controllers import draw_conditions, make_filter_belief
 from uavctl.lab.campaign.pool import Columns
-from uavctl.lab.campaign.tasks import Cell, flown, tasks_of
-from uavctl.lab.campaign.world import PositionFilter, draw, draw_noise, known, newest_of
+from uavctl.lab.campaign.tasks import Cell, fly_task, make_tasks
+from uavctl.lab.campaign.world import PositionFilter, compute_known_steps, draw, draw_noise, select_newest_captures
 from uavctl.records import PositionSample
 from uavctl.smpc.baselines import Governor, MeanQp
 from uavctl.smpc.batch import Counts, News, predict, predicted_cov
 from uavctl.smpc.estimate import innovations
 from uavctl.smpc.nominal import unseen
 
-Array = NDArray[np.float64]
 S = 1_000_000_000
 RUNS, STEPS = 4, 25
 LINKS = {
@@ -45,14 +44,14 @@ FLIGHTS = {
 
 def arrived(config: Config, overrides: list[str], seed: int) -> Counts:
     link = load_config("paper", overrides).link  # whose delays are of whole seconds
-    return known(link, 1.0, draw(seed, 0, RUNS, STEPS, 1).link)
+    return compute_known_steps(link, 1.0, draw(seed, 0, RUNS, STEPS, 1).link)
 
 
 def told(config: Config, first_known: Counts, positions: Array, inputs: Array) -> tuple[list[Array], list[Array]]:
     """What the campaign's filter says at the begin of each step, of all runs."""
-    looked = PositionFilter(sight_of(config), first_known)
-    newest = newest_of(first_known)
-    pairs = [looked.told(k, positions[:, k], newest[:, k], inputs[:, :k]) for k in range(STEPS)]
+    looked = PositionFilter(make_filter_belief(config), first_known)
+    newest = select_newest_captures(first_known)
+    pairs = [looked.update(k, positions[:, k], newest[:, k], inputs[:, :k]) for k in range(STEPS)]
     return [mean for mean, _ in pairs], [cov for _, cov in pairs]
 
 
@@ -64,7 +63,7 @@ def test_what_is_told_is_what_the_flight_s_filter_says_of_the_same_positions(pre
     axes = len(plant.axes)
     positions, inputs = 3.0 * rng.normal(size=(RUNS, STEPS, axes)), rng.normal(size=(RUNS, STEPS, plant.n_u))
     means, covs = told(config, first_known, positions, inputs)
-    newest = newest_of(first_known)
+    newest = select_newest_captures(first_known)
     dt_ns = round(config.plant.dt_s * 1e9)
     overtaken = 0
     for run in range(RUNS):
@@ -101,8 +100,8 @@ def test_errors_are_as_large_as_the_covariance_says_and_the_covariance_of_a_pred
     config = load_config("paper", FLIGHTS["paper"])
     plant, runs, steps = build_plant(config), 3000, 12
     chances = draw(2, 0, runs, steps, plant.n_w)
-    first_known = known(load_config("paper", LINKS["losses"]).link, 1.0, chances.link)
-    newest, looked = newest_of(first_known), PositionFilter(sight_of(config), first_known)
+    first_known = compute_known_steps(load_config("paper", LINKS["losses"]).link, 1.0, chances.link)
+    newest, looked = select_newest_captures(first_known), PositionFilter(make_filter_belief(config), first_known)
     rng = np.random.default_rng(1)
     index = list(plant.position_index)
     state = np.zeros((runs, steps + 1, plant.n_x))
@@ -111,7 +110,7 @@ def test_errors_are_as_large_as_the_covariance_says_and_the_covariance_of_a_pred
     inputs = rng.normal(size=(runs, steps, plant.n_u))
     pushes = chances.normal @ np.linalg.cholesky(plant.w).T
     for k in range(steps):
-        mean, cov = looked.told(k, state[:, k, index] + noise[:, k], newest[:, k], inputs[:, :k])
+        mean, cov = looked.update(k, state[:, k, index] + noise[:, k], newest[:, k], inputs[:, :k])
         news = News(k, newest[:, k], mean, inputs[:, :k], cov)
         state[:, k + 1] = state[:, k] @ plant.a.T + inputs[:, k] @ plant.b.T + pushes[:, k] @ plant.e.T
         spread = predicted_cov(plant, news)
@@ -142,10 +141,10 @@ def test_simple_margins_begin_with_what_the_filter_leaves_open() -> None:
     cov = innovations(plant, 0.3, 0.0, 0).estimate_cov
     # What the filter leaves is what it ends at where every position comes.
     looked = PositionFilter(
-        sight_of(load_config("paper", ["estimator.position_std_m=0.3"])), np.arange(80, dtype=np.intp)[None]
+        make_filter_belief(load_config("paper", ["estimator.position_std_m=0.3"])), np.arange(80, dtype=np.intp)[None]
     )
     for k in range(80):
-        _, last = looked.told(k, np.zeros((1, 2)), np.array([k]), np.zeros((1, k, 2)))
+        _, last = looked.update(k, np.zeros((1, 2)), np.array([k]), np.zeros((1, k, 2)))
     assert last[0] == pytest.approx(cov, abs=1e-9)
     assert unseen(plant, 1, cov)[1] == pytest.approx(plant.a @ cov @ plant.a.T + unseen(plant, 1)[1])
     toward = News(0, np.zeros(1, dtype=np.intp), np.array([[0.0, 0.0, 18.9, 0.3]]), np.zeros((1, 0, 2)))
@@ -168,7 +167,7 @@ def cell(tmp_path: Path, *more: str, overrides: str = "", master: int = 0) -> Ce
 
 
 def rows(made: Cell) -> Columns:
-    (task,) = tasks_of([made])
+    (task,) = make_tasks([made])
     return task.fly()
 
 
@@ -192,7 +191,7 @@ def test_what_is_not_asked_for_changes_nothing(tmp_path: Path) -> None:
     as_ever, exact = cell(tmp_path), cell(tmp_path, 'measured = "state"\n')
     first, second = (rows(of_runs(made, 20)) for made in (as_ever, exact))
     assert all(np.array_equal(first[name], second[name], equal_nan=name not in ("error",)) for name in first)
-    assert met(as_ever.setting, 0, 3).noise is None
+    assert draw_conditions(as_ever.setting, 0, 3).noise is None
 
 
 def of_runs(made: Cell, runs: int) -> Cell:
@@ -208,8 +207,8 @@ def test_every_kind_flies_on_positions_and_runs_do_not_depend_on_each_other(tmp_
         *(rig.controller(kind) for kind in kinds),
         rig.table("link", "late", 'set = ["link.loss=0.2", "link.delay_s=1.0", "link.jitter_s=1.0"]'),
     )
-    for task in tasks_of(made):
-        together, _ = flown(task, 0, 6)
-        alone, _ = flown(task, 4, 1)
+    for task in make_tasks(made):
+        together, _ = fly_task(task, 0, 6)
+        alone, _ = fly_task(task, 4, 1)
         assert not together.failed.any()
         assert together.states[4] == pytest.approx(alone.states[0], abs=1e-9)

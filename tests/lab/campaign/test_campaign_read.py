@@ -37,7 +37,9 @@ def test_a_short_file_has_all_defaults(tmp_path: Path) -> None:
     spec = campaign.spec
     assert (spec.runs, spec.steps, spec.master) == (1000, 50, 0)
     assert [len(one) for one in (spec.link, spec.disturbance, spec.plant)] == [1, 1, 1]
-    assert same(campaign.base, load_config("paper")) and same(campaign.believed[0, "as configured"], campaign.base)
+    assert same(campaign.base, load_config("paper")) and same(
+        campaign.believed_configs[0, "as configured"], campaign.base
+    )
 
 
 def test_each_controller_believes_what_it_is_told(tmp_path: Path) -> None:
@@ -50,7 +52,7 @@ def test_each_controller_believes_what_it_is_told(tmp_path: Path) -> None:
         table("plant", "strong", 'set = ["plant.w=[[1.2, 0.0], [0.0, 1.2]]"]'),
         '[[tuning]]\ncontrollers = ["smpc"]\nlinks = ["bad"]\nset = ["smpc.tau=3", "risk.allocation=ellipsoid"]\n',
     )
-    believed = campaign.believed
+    believed = campaign.believed_configs
     assert set(believed) == {(0, "good"), (0, "bad"), (1, "bad")}
     assert {one.smpc.delta_u for one in believed.values()} == {0.8}
     good, bad, wrong = believed[0, "good"], believed[0, "bad"], believed[1, "bad"]
@@ -58,10 +60,10 @@ def test_each_controller_believes_what_it_is_told(tmp_path: Path) -> None:
     assert (bad.link.loss, bad.risk.allocation, bad.smpc.tau) == (0.6, "ellipsoid", 3)
     assert (wrong.link.loss, wrong.risk.allocation, wrong.smpc.tau) == (0.6, "ellipsoid", 4)
     # Only what is flown changes with the plant.
-    assert [one.plant.w[0][0] for one in campaign.flown_plant] == [1.2]
+    assert [one.plant.w[0][0] for one in campaign.flown_plants] == [1.2]
     assert {one.plant.w[0][0] for one in believed.values()} == {0.6}
-    assert [one.link.loss for one in campaign.flown_link] == [0.1, 0.6]
-    assert [campaign.believed_link(i, j) for i in (0, 1) for j in (0, 1)] == ["good", "bad", "bad", "bad"]
+    assert [one.link.loss for one in campaign.flown_links] == [0.1, 0.6]
+    assert [campaign.get_believed_link(i, j) for i in (0, 1) for j in (0, 1)] == ["good", "bad", "bad", "bad"]
 
 
 def test_a_configuration_file_is_found_beside_the_campaign(tmp_path: Path) -> None:

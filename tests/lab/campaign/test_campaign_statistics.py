@@ -21,7 +21,7 @@ from logs.report.run_statistics import (
     step_rate,
 )
 from uavctl.errors import UavctlError, UsageError
-from uavctl.lab.campaign.results import difference, read_results, summarise
+from uavctl.lab.campaign.results import compute_difference, read_results, summarise
 
 
 @pytest.mark.parametrize(("hits", "trials"), [(1, 10), (3, 7), (50, 200), (199, 200), (2, 200_000)])
@@ -183,12 +183,12 @@ def test_differences_are_over_the_runs_that_both_ended(tmp_path: Path) -> None:
     nan = float("nan")
     rows = [*runs(0, [10.0, nan, 30.0, 40.0]), *runs(1, [1.0, 2.0, nan, 4.0])]
     found = read_results(write(tmp_path, [cell(0, "a"), cell(1, "b"), cell(2, "c")], rows))
-    both = difference(found.runs[0], found.runs[1], "cost")
+    both = compute_difference(found.runs[0], found.runs[1], "cost")
     assert both is not None
     assert both.runs == 2
     assert both.mean == pytest.approx((9 + 36) / 2)
     assert found.runs[0].failed == ((1, "it broke"),)
-    assert difference(found.runs[0], found.runs[2], "cost") is None
+    assert compute_difference(found.runs[0], found.runs[2], "cost") is None
 
 
 def test_a_folder_without_a_campaign_is_refused(tmp_path: Path) -> None:

@@ -11,8 +11,8 @@ from campaign_rig import cells, controller, table
 
 from uavctl.errors import UavctlError, UsageError
 from uavctl.lab.campaign.spec import CHUNK
-from uavctl.lab.campaign.store import SCHEMA, Store, first_difference, table_of
-from uavctl.lab.campaign.tasks import Task, flown, tasks_of
+from uavctl.lab.campaign.store import SCHEMA, Store, find_first_difference, make_table
+from uavctl.lab.campaign.tasks import Task, fly_task, make_tasks
 
 TWO = table("link", "a") + table("link", "b", 'set = ["link.loss=0.5"]')
 CELLS = [{"index": 0, "controller": "lqg", "link": "a"}, {"index": 1, "controller": "lqg", "link": "b"}]
@@ -21,19 +21,19 @@ DOCUMENT = {"name": "one", "runs": 3, "cells": CELLS}
 
 @pytest.fixture
 def given(tmp_path: Path) -> list[Task]:
-    return list(tasks_of(cells(tmp_path, f"steps = 3\nruns = {CHUNK + 4}\n", controller("lqg"), TWO)))
+    return list(make_tasks(cells(tmp_path, f"steps = 3\nruns = {CHUNK + 4}\n", controller("lqg"), TWO)))
 
 
 def test_the_table_is_sorted_whatever_the_order_of_the_tasks(tmp_path: Path, given: list[Task]) -> None:
     files = []
     for name, order in (("one", given), ("other", given[::-1])):
         store = Store(tmp_path / name)
-        with store.opened(DOCUMENT, "text", resume=False):
+        with store.open(DOCUMENT, "text", resume=False):
             for task in order:
                 store.keep(task, task.fly())
-            assert store.kept(given) == {task.name for task in given} and not store.complete()
+            assert store.find_finished(given) == {task.name for task in given} and not store.is_complete()
             files.append(store.finish(given))
-        assert store.complete() and not (tmp_path / name / "parts").exists()
+        assert store.is_complete() and not (tmp_path / name / "parts").exists()
     assert files[0].read_bytes() == files[1].read_bytes()
     found = pq.read_table(files[0])
     assert found.schema.names == ["cell", "controller", "link", *SCHEMA.names[1:]]
@@ -50,14 +50,14 @@ def test_the_table_is_sorted_whatever_the_order_of_the_tasks(tmp_path: Path, giv
 
 
 def test_rows_without_figures_are_kept(given: list[Task]) -> None:
-    rows = table_of(given[1].lost("it died")).to_pylist()
+    rows = make_table(given[1].make_lost_rows("it died")).to_pylist()
     assert len(rows) == 4 and rows[0]["error"] == "it died" and rows[0]["ages"] == []
     assert np.isnan(rows[0]["cost"]) and rows[0]["steps"] == 0
 
 
 def test_a_part_that_is_damaged_is_named(tmp_path: Path, given: list[Task]) -> None:
     store = Store(tmp_path / "one")
-    with store.opened(DOCUMENT, "text", resume=False):
+    with store.open(DOCUMENT, "text", resume=False):
         for task in given:
             store.keep(task, task.fly())
         part = tmp_path / "one" / "parts" / f"{given[1].name}.parquet"
@@ -68,42 +68,42 @@ def test_a_part_that_is_damaged_is_named(tmp_path: Path, given: list[Task]) -> N
 
 def test_only_the_same_campaign_goes_on_and_only_if_it_is_asked_to(tmp_path: Path) -> None:
     store = Store(tmp_path / "one")
-    with pytest.raises(UsageError, match="leave out --resume"), store.opened(DOCUMENT, "text", resume=True):
+    with pytest.raises(UsageError, match="leave out --resume"), store.open(DOCUMENT, "text", resume=True):
         pass
-    with store.opened(DOCUMENT, "text", resume=False):
+    with store.open(DOCUMENT, "text", resume=False):
         assert (tmp_path / "one" / "campaign.toml").read_text() == "text"
-        with pytest.raises(UsageError, match="another process"), Store(store.folder).opened(DOCUMENT, "text", True):
+        with pytest.raises(UsageError, match="another process"), Store(store.folder).open(DOCUMENT, "text", True):
             pass
-    with pytest.raises(UsageError, match="go on with it by --resume"), store.opened(DOCUMENT, "text", resume=False):
+    with pytest.raises(UsageError, match="go on with it by --resume"), store.open(DOCUMENT, "text", resume=False):
         pass
-    with store.opened(DOCUMENT, "text", resume=True):
+    with store.open(DOCUMENT, "text", resume=True):
         pass
     other = {**DOCUMENT, "cells": [{"index": 1, "controller": "lqg", "link": "a"}, *CELLS[1:]]}
     with (
         pytest.raises(UsageError, match=r"cells\[0\]\.index is 0 there and 1 here"),
-        store.opened(other, "text", resume=True),
+        store.open(other, "text", resume=True),
     ):
         pass
 
 
 def test_the_first_difference_is_told() -> None:
     one = {"a": 1, "b": {"c": [1, {"d": "x"}]}, "e": None}
-    assert first_difference(one, {**one}) is None
-    assert first_difference(one, {**one, "b": {"c": [1, {"d": "y"}]}}) == 'b.c[1].d is "x" there and "y" here'
-    assert first_difference(one, {**one, "b": {"c": [1]}}) == 'b.c is [1,{"d":"x"}] there and [1] here'
-    assert first_difference({}, {"f": 2}) == "f is null there and 2 here"
+    assert find_first_difference(one, {**one}) is None
+    assert find_first_difference(one, {**one, "b": {"c": [1, {"d": "y"}]}}) == 'b.c[1].d is "x" there and "y" here'
+    assert find_first_difference(one, {**one, "b": {"c": [1]}}) == 'b.c is [1,{"d":"x"}] there and [1] here'
+    assert find_first_difference({}, {"f": 2}) == "f is null there and 2 here"
 
 
 def test_a_folder_that_cannot_be_is_told(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(UavctlError, match="file"), Store(tmp_path / "file").opened(DOCUMENT, "text", resume=False):
+    with pytest.raises(UavctlError, match="file"), Store(tmp_path / "file").open(DOCUMENT, "text", resume=False):
         pass
 
 
 def test_a_run_alone_is_that_of_its_chunk(tmp_path: Path) -> None:
     made = cells(tmp_path, f"steps = 6\nruns = {CHUNK + 4}\nmaster = 2\n", controller("lqg"), controller("smpc"), TWO)
-    task = list(tasks_of(made))[3]
+    task = list(make_tasks(made))[3]
     assert (task.cell, task.first, task.runs) == (1, CHUNK, 4)
-    found, _ = flown(task, CHUNK + 2, 1)
+    found, _ = fly_task(task, CHUNK + 2, 1)
     assert found.cost.shape == (1, 6)
     assert found.cost.sum() == pytest.approx(task.fly()["cost"][2], rel=1e-12)

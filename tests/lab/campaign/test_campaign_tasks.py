@@ -12,10 +12,10 @@ import pytest
 from campaign_rig import cells, controller, table
 
 from uavctl.lab.campaign import controllers, spec
-from uavctl.lab.campaign.controllers import build, met
+from uavctl.lab.campaign.controllers import build_from_recipe, draw_conditions
 from uavctl.lab.campaign.pool import Columns, Work, fly_tasks
-from uavctl.lab.campaign.tasks import Task, tasks_of
-from uavctl.lab.campaign.world import fly
+from uavctl.lab.campaign.tasks import Task, make_tasks
+from uavctl.lab.campaign.world import simulate
 from uavctl.smpc.batch import BatchSmpc, News
 
 FIGURES = ("cost", "settled_cost", "mean_square_input", "largest_gap")
@@ -24,14 +24,14 @@ WILD = 'set = ["plant.a=[[1e7, 0, 0, 0], [0, 1e7, 0, 0], [0, 0, 1e7, 0], [0, 0, 
 
 
 def task(folder: Path, *parts: str) -> Task:
-    return next(tasks_of(cells(folder, *parts)))
+    return next(make_tasks(cells(folder, *parts)))
 
 
 def test_figures_are_those_of_the_runs(tmp_path: Path) -> None:
     one = task(tmp_path, "steps = 11\nruns = 7\n", controller("smpc"))
     columns = one.fly()
-    smpc, meets = build(one.recipe), met(one.setting, 0, 7)
-    flown = fly(meets.scene, smpc, meets.newest, meets.disturbances)
+    smpc, meets = build_from_recipe(one.recipe), draw_conditions(one.setting, 0, 7)
+    flown = simulate(meets.world, smpc, meets.newest_captures, meets.disturbances)
     assert isinstance(smpc, BatchSmpc)
     assert set(columns["error"]) == {""}
     for i in range(7):
@@ -81,9 +81,9 @@ class Crashing:
 def test_a_run_that_raises_is_told_and_stops_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     box = "start_box = [[0, 0, 0, 0], [10, 0, 0, 0]]\nsteps = 2\nruns = 40\n"
     one = task(tmp_path, box, controller("lqg"))
-    starts = met(one.setting, 0, 40).scene.start[:, 0]
+    starts = draw_conditions(one.setting, 0, 40).world.start[:, 0]
     limit = float(np.sort(starts)[-3])
-    monkeypatch.setattr(controllers, "build", lambda recipe: Crashing(limit))
+    monkeypatch.setattr(controllers, "build_from_recipe", lambda recipe: Crashing(limit))
     columns = replace(one, recipe=replace(one.recipe, key="crashing")).fly()
     out = starts > limit
     assert out.sum() == 2
@@ -98,7 +98,7 @@ def test_a_controller_that_cannot_be_built_loses_its_runs_only(tmp_path: Path, m
         raise OSError("no such file")
 
     one = task(tmp_path, "steps = 2\nruns = 4\n", controller("lqg"))
-    monkeypatch.setattr(controllers, "build", none)
+    monkeypatch.setattr(controllers, "build_from_recipe", none)
     columns = replace(one, recipe=replace(one.recipe, key="none")).fly()
     assert list(columns["error"]) == ["OSError: no such file"] * 4
 
@@ -126,13 +126,13 @@ class FakeCrew:
         if self._broken:
             future.set_exception(DeadError())
         else:
-            future.set_result(task.lost(""))
+            future.set_result(task.make_lost_rows(""))
         return future
 
-    def broken(self, error: BaseException) -> bool:
+    def is_worker_death(self, error: BaseException) -> bool:
         return isinstance(error, DeadError)
 
-    def renew(self) -> None:
+    def restart(self) -> None:
         self.renewed += 1
         self._broken = False
 
@@ -142,7 +142,7 @@ def never() -> bool:
 
 
 def several(folder: Path) -> list[Task]:
-    return list(tasks_of(cells(folder, f"runs = {5 * spec.CHUNK}\n", controller("lqg"))))
+    return list(make_tasks(cells(folder, f"runs = {5 * spec.CHUNK}\n", controller("lqg"))))
 
 
 @pytest.mark.parametrize("deaths", [1, 2])
@@ -165,7 +165,7 @@ def test_what_is_asked_to_stop_keeps_what_is_under_way(tmp_path: Path) -> None:
 
 def test_an_error_that_is_no_worker_s_death_is_raised(tmp_path: Path) -> None:
     class Broken(FakeCrew):
-        def broken(self, error: BaseException) -> bool:
+        def is_worker_death(self, error: BaseException) -> bool:
             return False
 
     with pytest.raises(DeadError):

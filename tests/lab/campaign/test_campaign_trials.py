@@ -14,21 +14,21 @@ import pytest
 from uavctl.cli.app import run
 from uavctl.errors import ConfigError
 from uavctl.lab.campaign import trials as trial_cells
-from uavctl.lab.campaign.page import trial_html
-from uavctl.lab.campaign.store import Store, table_of
+from uavctl.lab.campaign.page import render_trial_report
+from uavctl.lab.campaign.store import Store, make_table
 from uavctl.lab.campaign.trials import (
     CHUNK,
     SCHEMA,
     TrialTask,
-    is_trial,
-    places_of,
+    get_flight_seed,
+    is_trial_file,
+    make_trial_cells,
+    make_trial_document,
+    make_trial_tasks,
     read_trial,
-    seed_of,
     summarise_trial,
-    trial_document,
-    trial_tasks,
 )
-from uavctl.lab.trial import TrialCell, TrialFlight, fly
+from uavctl.lab.trial import TrialCell, TrialFlight, fly_trial
 
 RUNS = CHUNK + 1  # two tasks a cell
 HEAD = f"""
@@ -78,7 +78,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
 )
 def test_what_is_wrong_with_a_file_is_told_with_its_place(tmp_path: Path, text: str, told: str) -> None:
     file = written(tmp_path, text)
-    assert is_trial(file)
+    assert is_trial_file(file)
     with pytest.raises(ConfigError) as caught:
         read_trial(file)
     assert told in str(caught.value) and str(file) in str(caught.value)
@@ -86,16 +86,16 @@ def test_what_is_wrong_with_a_file_is_told_with_its_place(tmp_path: Path, text: 
 
 def test_every_controller_meets_the_same_seeds_and_the_same_link(tmp_path: Path) -> None:
     spec, _ = read_trial(written(tmp_path, HEAD + OWN + OURS))
-    places = places_of(spec)
+    places = make_trial_cells(spec)
     assert [(one.cell.scenario, one.cell.pilot.name) for one in places] == [
         ("hold", "own loop"), ("hold", "ours"), ("blackout", "own loop"), ("blackout", "ours")
     ]  # fmt: skip
-    tasks = list(trial_tasks(spec, places))
+    tasks = list(make_trial_tasks(spec, places))
     assert [(one.cell, one.first, one.runs) for one in tasks] == [
         (c, f, r) for c in range(4) for f, r in ((0, 5), (5, 1))
     ]
-    assert len({seed_of(spec.master, i) for i in range(1000)}) == 1000
-    assert seed_of(0, 3) != seed_of(1, 3)
+    assert len({get_flight_seed(spec.master, i) for i in range(1000)}) == 1000
+    assert get_flight_seed(0, 3) != get_flight_seed(1, 3)
     ours, own = places[1], places[0]
     assert ours.usable_room is not None and 0.3 < ours.usable_room < 1.0
     assert (own.usable_room, own.design_id) == (None, None)
@@ -107,10 +107,10 @@ def test_the_table_has_each_flight_as_it_is_flown_alone(flown: Path) -> None:
     assert [(row["cell"], row["run"]) for row in rows] == [(c, i) for c in (0, 1, 3, 4) for i in range(RUNS)]
     assert not any(row["error"] for row in rows)
     spec, _ = read_trial(flown.parent / "small.toml")
-    cell = places_of(spec)[1].cell
-    alone = fly(cell, seed_of(spec.master, 5), seconds=2.0, from_s=1.0)
+    cell = make_trial_cells(spec)[1].cell
+    alone = fly_trial(cell, get_flight_seed(spec.master, 5), seconds=2.0, from_s=1.0)
     row = next(row for row in rows if (row["cell"], row["run"]) == (1, 5))
-    for name in (*trial_cells.REAL, "positions", "mode", "seed"):
+    for name in (*trial_cells.FLOAT_COLUMNS, "positions", "mode", "seed"):
         assert row[name] == getattr(alone, name) or np.isnan(row[name]), name
 
 
@@ -118,9 +118,9 @@ def test_the_table_has_each_flight_as_it_is_flown_alone(flown: Path) -> None:
 def test_one_that_was_interrupted_goes_on_to_the_same_bytes(flown: Path, tmp_path: Path) -> None:
     path = flown.parent / "small.toml"
     spec, text = read_trial(path)
-    places = places_of(spec)
-    tasks, store = list(trial_tasks(spec, places)), Store(tmp_path / "two", SCHEMA)
-    with store.opened(trial_document(spec, places), text, resume=False):
+    places = make_trial_cells(spec)
+    tasks, store = list(make_trial_tasks(spec, places)), Store(tmp_path / "two", SCHEMA)
+    with store.open(make_trial_document(spec, places), text, resume=False):
         for task in tasks[3::-2]:
             store.keep(task, task.fly())
     assert run(["campaign", str(path), "--workers", "2", "--out", str(store.folder), "--resume"]) == 0
@@ -130,17 +130,17 @@ def test_one_that_was_interrupted_goes_on_to_the_same_bytes(flown: Path, tmp_pat
 
 def test_a_flight_that_raises_is_told_and_stops_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(cell: TrialCell, seed: int, *, seconds: float, from_s: float) -> TrialFlight:
-        if seed == seed_of(0, 1):
+        if seed == get_flight_seed(0, 1):
             raise RuntimeError("no more")
         return TrialFlight(seed, hold_rms_m=0.5, mode="GUIDED")
 
     spec, _ = read_trial(written(tmp_path, HEAD + OWN))
-    task = next(trial_tasks(spec, places_of(spec)))
-    monkeypatch.setattr(trial_cells, "fly", fails)
-    rows = table_of(task.fly(), SCHEMA).to_pylist()
+    task = next(make_trial_tasks(spec, make_trial_cells(spec)))
+    monkeypatch.setattr(trial_cells, "fly_trial", fails)
+    rows = make_table(task.fly(), SCHEMA).to_pylist()
     assert [row["error"] for row in rows] == ["", "RuntimeError: no more", "", "", ""]
     assert [row["hold_rms_m"] for row in rows] == pytest.approx([0.5, np.nan, 0.5, 0.5, 0.5], nan_ok=True)
-    dead = table_of(replace(task, runs=2).lost("it died"), SCHEMA).to_pylist()
+    dead = make_table(replace(task, runs=2).make_lost_rows("it died"), SCHEMA).to_pylist()
     assert [(row["run"], row["error"]) for row in dead] == [(0, "it died"), (1, "it died")]
 
 
@@ -156,7 +156,7 @@ def test_the_summary_has_the_medians_and_the_worst_of_the_table(flown: Path) -> 
             holds = [row["hold_rms_m"] for row in mine]
             assert cell.median["hold_rms_m"] == median(holds) and cell.worst["hold_rms_m"] == max(holds)
             assert cell.modes == {"GUIDED": RUNS}
-    page = trial_html(told, cells)
+    page = render_trial_report(told, cells)
     assert "own loop" in page and "Not flown, or failed" in page and "too sure" in page
     beyond_m = max(row["beyond_m"] for row in rows if np.isfinite(row["beyond_m"]))
     assert (f"had {-beyond_m:.2f} m left" if beyond_m <= 0.0 else f"the furthest by {beyond_m:.2f} m") in page

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from sim.channel import Channel
+from uavctl.arrays import Array
 from uavctl.build.controller import build_design, build_plant
 from uavctl.build.link import build_delayed_link
 from uavctl.config import Config, load_config
-from uavctl.lab.campaign.world import Scene, draw, fly, newest
+from uavctl.lab.campaign.world import LinearWorld, compute_newest_captures, draw, simulate
 from uavctl.smpc.batch import BatchSmpc, Decisions, News, predict
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope
 
-Array = NDArray[np.float64]
 RUNS, STEPS = 20_000, 12
 
 LINKS = {
@@ -43,7 +42,7 @@ def config(*overrides: str) -> Config:
 def test_the_age_is_distributed_as_the_theory_says(name: str, base: int) -> None:
     """From a position that came by itself: after a while, where the channel remembers how it began."""
     given = config(*LINKS[name])
-    found = newest(given.link, 1.0, draw(3, 0, RUNS, base + STEPS, 1).link)
+    found = compute_newest_captures(given.link, 1.0, draw(3, 0, RUNS, base + STEPS, 1).link)
     found = found[found[:, base] == base][:, base:] - base
     age = np.arange(STEPS) - found
     wanted = build_delayed_link(given).age(STEPS - 1)
@@ -57,7 +56,7 @@ def test_the_age_is_distributed_as_the_theory_says(name: str, base: int) -> None
 @pytest.mark.slow
 def test_probabilities_of_each_step_lose_that_share() -> None:
     given = config(*LINKS["p(k)"])
-    found = newest(given.link, 1.0, draw(3, 0, RUNS, STEPS, 1).link)
+    found = compute_newest_captures(given.link, 1.0, draw(3, 0, RUNS, STEPS, 1).link)
     for k in range(1, STEPS):
         share = float((found[:, k] == k).mean())
         assert share == pytest.approx(given.link.probability[min(k, 4)], abs=5.0 * 0.5 / np.sqrt(RUNS))
@@ -68,7 +67,7 @@ def test_losses_are_the_channel_s_for_the_same_draws(name: str) -> None:
     """The simulator's own channel, fed the same uniform numbers, loses the same packets."""
     link = config(*LINKS[name]).link
     chances = draw(5, 0, 40, 30, 1).link
-    found = newest(link, 1.0, chances)
+    found = compute_newest_captures(link, 1.0, chances)
     for run in range(len(chances)):
         channel = Channel(link, np.random.SeedSequence(0), 0, 1_000_000_000)
         channel._loss = _Fed(chances[run, :, :2])  # type: ignore[assignment]
@@ -92,7 +91,9 @@ class _Fed:
 
 
 def test_a_blackout_loses_all() -> None:
-    found = newest(config("link.blackout=[[3, 6]]", "link.loss=0.0").link, 1.0, draw(0, 0, 2, 10, 1).link)
+    found = compute_newest_captures(
+        config("link.blackout=[[3, 6]]", "link.loss=0.0").link, 1.0, draw(0, 0, 2, 10, 1).link
+    )
     assert found.tolist() == [[0, 1, 2, 2, 2, 2, 2, 7, 8, 9]] * 2
 
 
@@ -122,9 +123,9 @@ class _Linear:
         return asked
 
 
-def scene(plant: Plant, runs: int) -> Scene:
+def scene(plant: Plant, runs: int) -> LinearWorld:
     n_x, n_u = plant.n_x, plant.n_u
-    return Scene(
+    return LinearWorld(
         plant=plant,
         state_set=Polytope.from_box([-3.0] * n_x, [3.0] * n_x),
         input_set=Polytope.from_box([-0.5] * n_u, [0.4] * n_u),
@@ -141,9 +142,9 @@ def test_a_flight_is_what_a_plain_loop_says() -> None:
     gain = np.array([[-0.2, -0.8, 0.0, 0.0], [0.0, 0.0, -0.3, -0.9]])
     runs, steps = 6, 15
     chances = draw(1, 0, runs, steps, plant.n_w)
-    known = newest(config("link.loss=0.6").link, 1.0, chances.link)
+    known = compute_newest_captures(config("link.loss=0.6").link, 1.0, chances.link)
     given = scene(plant, runs)
-    flown = fly(given, _Linear(plant, gain), known, chances.normal)
+    flown = simulate(given, _Linear(plant, gain), known, chances.normal)
     for i in range(runs):
         x, states = given.start[i], [given.start[i]]
         past: list[Array] = []
@@ -173,9 +174,9 @@ def test_a_run_that_asks_for_no_number_fails_alone() -> None:
     plant = build_plant(config())
     gain = np.zeros((2, 4))
     chances = draw(1, 0, 3, 8, plant.n_w)
-    known = newest(config().link, 1.0, chances.link)
-    good = fly(scene(plant, 3), _Linear(plant, gain), known, chances.normal)
-    bad = fly(scene(plant, 3), _Linear(plant, gain, bad=1), known, chances.normal)
+    known = compute_newest_captures(config().link, 1.0, chances.link)
+    good = simulate(scene(plant, 3), _Linear(plant, gain), known, chances.normal)
+    bad = simulate(scene(plant, 3), _Linear(plant, gain, bad=1), known, chances.normal)
     assert bad.failed.tolist() == [False, True, False]
     assert np.array_equal(bad.states[[0, 2]], good.states[[0, 2]])
     assert np.isfinite(bad.states).all()
@@ -185,13 +186,13 @@ class _Numbered:
     """Plans that say in which step they were made: first input 100 k + index; every third question has no plan."""
 
     def __init__(self, steps: int) -> None:
-        self._steps, self.asked = steps, 0
+        self._steps, self.requested = steps, 0
 
     def decide(self, x: Array, late: int, cov: Array | None = None) -> Decisions:
-        self.asked += 1
-        plan = 100.0 * self.asked + np.arange(self._steps)
+        self.requested += 1
+        plan = 100.0 * self.requested + np.arange(self._steps)
         inputs = np.broadcast_to(plan[None, :, None], (len(x), self._steps, 2)).copy()
-        solved = np.full(len(x), self.asked % 3 != 0)
+        solved = np.full(len(x), self.requested % 3 != 0)
         return Decisions(solved, inputs, np.where(solved, 0.5, np.inf), np.ones(len(x)), np.full(len(x), 1e-5))
 
 

@@ -10,22 +10,20 @@ import numpy as np
 import pytest
 from loopback_rig import Memory, make_loop
 from msgspec.structs import replace
-from numpy.typing import NDArray
 
 from sim import simulation
 from sim.channel import Channel
 from sim.simulation import World
 from sim.vehicle.linear import LinearVehicle
+from uavctl.arrays import Array
 from uavctl.build.controller import build_design, build_plant
 from uavctl.config import Config, load_config
 from uavctl.config.connections import ClockConfig
 from uavctl.config.link import LinkConfig
-from uavctl.lab.campaign.world import Flown, Scene, draw, fly, newest
+from uavctl.lab.campaign.world import LinearWorld, Trajectories, compute_newest_captures, draw, simulate
 from uavctl.records import Decision, Truth
 from uavctl.smpc.batch import BatchSmpc, Counts
 from uavctl.smpc.hahn_stursberg.frozen import ShortcutDecider, ShortcutSolver
-
-Array = NDArray[np.float64]
 
 STEPS, DT_NS = 50, 1_000_000_000
 NEVER = 1e6  # [s], [m], [m/s]
@@ -43,21 +41,21 @@ class Run:
     start: Array  # x(0) (n_x,)
     newest: Counts  # capture step of the newest position known in each step (T,)
     disturbances: Array  # w (T, n_w)
-    flown: Flown  # N = 1
+    flown: Trajectories  # N = 1
 
 
 def in_the_linear_world(link: LinkConfig, number: int) -> Run:
     plant = build_plant(BASE)
     chances = draw(5, number, 1, STEPS, plant.n_w)
-    known = newest(link, plant.dt_s, chances.link)
+    known = compute_newest_captures(link, plant.dt_s, chances.link)
     w = chances.normal @ np.linalg.cholesky(plant.w).T
     start = np.array([33.5, -2.25, -18.0, 1.5])
-    scene = Scene(
+    scene = LinearWorld(
         plant, DESIGN.state_set, DESIGN.input_set, DESIGN.q_x, DESIGN.q_u, DESIGN.target, np.zeros(2), start[None]
     )
     decider = ShortcutDecider(ShortcutSolver(DESIGN), DESIGN.target)
     controller = BatchSmpc(decider, plant, DESIGN.horizon, len(DESIGN.late), 0.5)
-    return Run(start, known[0], w[0], fly(scene, controller, known, w))
+    return Run(start, known[0], w[0], simulate(scene, controller, known, w))
 
 
 def delays_ns(known: Counts) -> Iterator[int | None]:

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from loopback_rig import lockstep
-from numpy.typing import NDArray
 
 from sim.channel import Channel
+from uavctl.arrays import Array
 from uavctl.build.link import build_delayed_link, build_link, promised
 from uavctl.config import load, load_config
 from uavctl.config.load import dump_config, parse
 from uavctl.errors import ConfigError, DesignError
-from uavctl.lab.campaign.world import draw, newest
+from uavctl.lab.campaign.world import compute_newest_captures, draw
 from uavctl.records import Truth
 
 S = 1_000_000_000
@@ -32,9 +32,6 @@ def problems(*overrides: str, preset: str = "paper") -> str:
     with pytest.raises(ConfigError) as caught:
         load_config(preset, list(overrides))
     return "\n".join(caught.value.problems)
-
-
-# --- the file
 
 
 @pytest.mark.parametrize(
@@ -110,9 +107,6 @@ def test_a_trace_that_cannot_be_is_refused(overrides: list[str], told: str) -> N
     assert told in problems(*overrides)
 
 
-# --- the channel
-
-
 def test_the_channel_loses_and_delays_each_packet_as_the_trace_did_over_and_over_again() -> None:
     link = load_config("paper", [*PAPER, listed(MEASURED), "link.jitter_s=0.4", "link.loss=0.9"]).link
     channel = Channel(link, np.random.SeedSequence(1), 5 * S)
@@ -136,9 +130,6 @@ def test_a_flight_over_a_trace_gets_what_the_trace_lets_through() -> None:
     memory = lockstep("paper", 24.0, *PAPER, listed((0.05, 0.01, INF, 0.02)))
     truths = memory.of(Truth)
     assert [one.lost for one in truths] == [(k + 2) // 4 for k in range(24)]  # packet 2 and every fourth after it
-
-
-# --- the design
 
 
 def test_the_design_counts_the_trace_s_own_runs_and_late_packets_as_lost() -> None:
@@ -173,10 +164,7 @@ def test_delays_of_a_step_and_more_are_for_independent_losses_only() -> None:
         build_delayed_link(load_config("paper", [*PAPER, listed(MEASURED), "link.delay_s=1.5"]))
 
 
-# --- campaigns
-
-
-def known(delays: NDArray[np.float64], dt_s: float) -> list[int]:
+def known(delays: Array, dt_s: float) -> list[int]:
     """Newest capture known at each step, by going through the packets: late ones by whole steps, rounded up."""
     whole = max(delay for delay in MEASURED if delay < INF) < dt_s
     found, best = [], 0
@@ -193,7 +181,7 @@ def known(delays: NDArray[np.float64], dt_s: float) -> list[int]:
 def test_runs_of_a_campaign_begin_at_drawn_packets_and_follow_the_trace(dt_s: float) -> None:
     link = load_config("paper", [*PAPER, listed(MEASURED)]).link
     chances = draw(3, 0, 200, 20, 1).link
-    found = newest(link, dt_s, chances)
+    found = compute_newest_captures(link, dt_s, chances)
     first = (chances[:, 0, 0] * 8).astype(int)
     assert set(first) == set(range(8))
     for run in range(200):

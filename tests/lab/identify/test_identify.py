@@ -12,19 +12,20 @@ from places import DATA
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from logs.recording.tlog import read_tlog
+from uavctl.arrays import Array
 from uavctl.cli.app import run
 from uavctl.config import load_config
 from uavctl.errors import RecordingError
 from uavctl.lab.identify.fit import (
     FINE_S,
-    TRIES,
+    MAX_TRIES,
     AxisFit,
     choose_dead_time,
+    compute_standard_errors,
     fit_axes,
     is_worse,
     predict,
     predict_ahead,
-    standard_errors,
 )
 from uavctl.lab.identify.history import (
     FlightHistory,
@@ -32,20 +33,20 @@ from uavctl.lab.identify.history import (
     Senders,
     SetpointHistory,
     Stretch,
-    from_tlog,
-    seen_from,
-    stretches,
-    thinned,
+    find_stretches,
+    make_position_history,
+    read_tlog_history,
+    thin_positions,
 )
 from uavctl.lab.identify.response import (
-    INSTANT_S,
+    TIME_UNIT_S,
     AxisModel,
     DragLagAxis,
     LinearMotion,
     ReferenceAxis,
-    advance,
-    places,
-    values,
+    compute_transition,
+    get_values,
+    make_parameters,
 )
 from uavctl.lab.identify.result import fit_link, identify
 from uavctl.smpc.plant import HeldAxis, Plant, drag_lag, velocity_reference
@@ -83,7 +84,7 @@ def test_the_plant_that_made_the_data_is_found_within_its_standard_errors() -> N
     for seed, (lag_s, drag_1ps, gain) in enumerate([(0.25, 0.3, 1.0), (0.4, 0.8, 1.1)]):
         flown = (fly(lag_s, drag_1ps, gain, seed=seed),)
         fit = fit_axis(flown, 0, DRAG_LAG, 0.0)
-        told = standard_errors(flown, 0, fit)
+        told = compute_standard_errors(flown, 0, fit)
         errors = tuple(told[name] for name in ("lag_s", "drag_1ps", "gain"))
         found = tuple(fit.value(name) for name in ("lag_s", "drag_1ps", "gain"))
         misses += [(a - b) / e for a, b, e in zip(found, (lag_s, drag_1ps, gain), errors, strict=True)]
@@ -108,7 +109,7 @@ def test_the_likeliest_dead_time_is_the_one_that_made_the_data(seed: int) -> Non
     for dead_time_s, rise in found.curve[::3]:
         alone = fit_axis(flown, 0, DRAG_LAG, dead_time_s)
         assert found.fits[0].deviance + rise == pytest.approx(alone.deviance, abs=0.1)
-    assert len(tries) == TRIES
+    assert len(tries) == MAX_TRIES
 
 
 def flown_by_reference(seed: int) -> Stretch:
@@ -129,7 +130,7 @@ def flown_by_reference(seed: int) -> Stretch:
     return Stretch(TICK_S * np.arange(len(asked), dtype=np.float64), inputs, np.array(times), np.array(rows))
 
 
-def missed(flown: Stretch, fit: AxisFit) -> NDArray[np.float64]:
+def missed(flown: Stretch, fit: AxisFit) -> Array:
     """Rms errors of the motion of the next times [m]."""
     return np.array([np.sqrt(np.mean(one.errors_m**2)) for one in predict_ahead((flown,), 0, fit)])
 
@@ -142,13 +143,13 @@ def test_the_plant_with_a_reference_is_found_and_predicts_another_flight(seed: i
     fit = right.fits[0]
     assert right.dead_time_s == pytest.approx(0.1, abs=FINE_S + 1e-9)
     assert right.dead_time_s + fit.value("lag_s") == pytest.approx(0.2, abs=0.01)
-    assert fit.value("drag_1ps") == pytest.approx(0.25, abs=3.0 * standard_errors(flown, 0, fit)["drag_1ps"])
+    assert fit.value("drag_1ps") == pytest.approx(0.25, abs=3.0 * compute_standard_errors(flown, 0, fit)["drag_1ps"])
     assert fit.value("input_mps2_rts") == pytest.approx(0.1 * np.sqrt(TICK_S), rel=0.4)
     assert fit.value("noise_m") == pytest.approx(NOISE_M, rel=0.1)
     assert fit.deviance < wrong.fits[0].deviance - 20.0  # 22 000 times as likely
     # On the halves not fitted to, and on a flight that neither has seen: there it is as good as the truth.
-    assert right.judged.error_m < 0.9 * wrong.judged.error_m
-    assert not is_worse(right.judged, wrong.judged)
+    assert right.held_out.error_m < 0.9 * wrong.held_out.error_m
+    assert not is_worse(right.held_out, wrong.held_out)
     true = {
         "lag_s": 0.1,
         "drag_1ps": 0.25,
@@ -157,7 +158,7 @@ def test_the_plant_with_a_reference_is_found_and_predicts_another_flight(seed: i
         "input_mps2_rts": 0.1 * np.sqrt(TICK_S),
         "drift_mps2_rts": 0.05,
     }
-    truth = AxisFit(HELD, 0.1, tuple(places(HELD, true).tolist()), 0.0)
+    truth = AxisFit(HELD, 0.1, tuple(make_parameters(HELD, true).tolist()), 0.0)
     assert np.all(missed(other, fit) < 1.1 * missed(other, truth))
     assert np.all(missed(other, fit) < missed(other, wrong.fits[0]))
     assert missed(other, fit)[-1] < 0.7 * missed(other, wrong.fits[0])[-1]  # 2 s ahead
@@ -179,12 +180,12 @@ def test_a_right_model_leaves_white_innovations_and_a_wrong_one_does_not() -> No
 
 def advanced(motion: LinearMotion, plant: Plant) -> None:
     """Compare the motion over many instants with the plant's own."""
-    count = round(plant.dt_s / INSTANT_S)
-    found = advance(motion, np.array([0, count]))
+    count = round(plant.dt_s / TIME_UNIT_S)
+    found = compute_transition(motion, np.array([0, count]))
     n_x = plant.n_x
-    np.testing.assert_allclose(found.move[1, 0, :n_x, :n_x], plant.a, atol=1e-11)
-    np.testing.assert_allclose(found.push[1, 0, :n_x], plant.b[:, 0], atol=1e-11)
-    np.testing.assert_array_equal(found.move[0, 0], np.eye(motion.a.shape[-1]))
+    np.testing.assert_allclose(found.transition[1, 0, :n_x, :n_x], plant.a, atol=1e-11)
+    np.testing.assert_allclose(found.input_effect[1, 0, :n_x], plant.b[:, 0], atol=1e-11)
+    np.testing.assert_array_equal(found.transition[0, 0], np.eye(motion.a.shape[-1]))
 
 
 @pytest.mark.parametrize(("lag_s", "drag_1ps"), [(0.25, 0.3), (0.02, 0.0), (0.5, 1.4)])
@@ -199,10 +200,11 @@ def test_the_motion_is_that_of_the_plant(lag_s: float, drag_1ps: float) -> None:
         "drift_mps2_rts": 0.3,
     }
     advanced(
-        DRAG_LAG.motion(places(DRAG_LAG, given)[None]), drag_lag([drag_1ps], [lag_s], [0.9], [1.0], 0.13, ("north",))
+        DRAG_LAG.motion(make_parameters(DRAG_LAG, given)[None]),
+        drag_lag([drag_1ps], [lag_s], [0.9], [1.0], 0.13, ("north",)),
     )
     held = HeldAxis(drag_1ps, lag_s, 1.0, 2.0, 1.0, 0.7, 0.2, 0.3)
-    motion = HELD.motion(places(HELD, given)[None])
+    motion = HELD.motion(make_parameters(HELD, given)[None])
     advanced(motion, velocity_reference([held], 0.13, ("north",)))
     # White noise as the limit of noise that is held over ever shorter parts.
     fine_s = 0.13 / 4000
@@ -211,9 +213,9 @@ def test_the_motion_is_that_of_the_plant(lag_s: float, drag_1ps: float) -> None:
     cov = np.zeros((6, 6))
     for _ in range(4000):
         cov = part.a @ cov @ part.a.T + part.e @ part.w @ part.e.T
-    spread = advance(motion, np.array([round(0.13 / INSTANT_S)])).spread[0, 0]
+    spread = compute_transition(motion, np.array([round(0.13 / TIME_UNIT_S)])).noise_cov[0, 0]
     np.testing.assert_allclose(spread, cov, rtol=2e-3, atol=1e-5)
-    assert values(HELD, places(HELD, given).tolist())["lag_s"] == pytest.approx(lag_s)
+    assert get_values(HELD, make_parameters(HELD, given).tolist())["lag_s"] == pytest.approx(lag_s)
 
 
 def test_an_outlier_does_not_spoil_the_fit() -> None:
@@ -221,7 +223,7 @@ def test_an_outlier_does_not_spoil_the_fit() -> None:
     bad = clean.positions_m.copy()
     bad[::25, 0] += 2.0
     rows = zip(clean.times_s, bad[:, 0], strict=True)
-    seen = seen_from([(float(t), float(t), (float(x), 0.0, 0.0)) for t, x in rows])
+    seen = make_position_history([(float(t), float(t), (float(x), 0.0, 0.0)) for t, x in rows])
     gone = ~np.isin(clean.times_s, seen.times_s)
     assert gone[::25][1:].all()
     assert np.count_nonzero(gone) <= len(bad[::25]) + 3
@@ -239,15 +241,15 @@ def asked_for(times_s: list[float], flown: list[bool]) -> SetpointHistory:
 def test_a_pause_and_a_pilot_end_a_stretch() -> None:
     ticks = [0.05 * i for i in range(600)]
     times = [t for t in ticks if not 10.0 < t < 11.0]
-    seen = seen_from([(0.1 * i, 0.1 * i + 0.02, (0.0, 0.0, -1.0)) for i in range(300)])
-    found = stretches(asked_for(times, [t < 20.0 for t in times]), seen)
+    seen = make_position_history([(0.1 * i, 0.1 * i + 0.02, (0.0, 0.0, -1.0)) for i in range(300)])
+    found = find_stretches(asked_for(times, [t < 20.0 for t in times]), seen)
     assert [(round(s.times_s[0], 3), round(s.times_s[-1], 3)) for s in found] == [(0.1, 10.0), (11.1, 19.9)]
 
 
 def test_too_little_is_refused_with_what_is_missing() -> None:
-    seen = seen_from([(0.1 * i, 0.1 * i, (0.0, 0.0, 0.0)) for i in range(30)])
+    seen = make_position_history([(0.1 * i, 0.1 * i, (0.0, 0.0, 0.0)) for i in range(30)])
     with pytest.raises(RecordingError, match=r"flown for 3\.0 s, and 30 positions .* at least 5 s"):
-        stretches(asked_for([0.05 * i for i in range(60)], [True] * 60), seen)
+        find_stretches(asked_for([0.05 * i for i in range(60)], [True] * 60), seen)
 
 
 def sent(lost: NDArray[np.bool_]) -> tuple[PositionHistory, NDArray[np.int64]]:
@@ -255,7 +257,7 @@ def sent(lost: NDArray[np.bool_]) -> tuple[PositionHistory, NDArray[np.int64]]:
     rng = np.random.default_rng(0)
     at_s = [float(t) for t in np.arange(len(lost))[~lost] / 25.0]
     came = [(t, t + 0.02 + 0.1 * rng.random(), (0.0, 0.0, 0.0)) for t in at_s]
-    return seen_from(came), np.diff(np.flatnonzero(~lost)) - 1
+    return make_position_history(came), np.diff(np.flatnonzero(~lost)) - 1
 
 
 def test_independent_losses_and_delays_are_measured() -> None:
@@ -296,7 +298,7 @@ def test_numbers_of_messages_wrap_and_overtake() -> None:
         senders.take(camera(number, stamps_us[number]), 0)
         if number == 100:  # an id that the dialect has not, of the same sender, has a number of its own
             senders.take(bytes((0xFD, 1, 0, 0, 205, 17, 18, 0x9A, 0x01, 0x00, 7, 0, 0)), 0)
-    gaps = senders.gaps((17, 18))
+    gaps = senders.count_losses((17, 18))
     assert gaps.sum() == 6
     assert sorted(gaps[gaps > 0]) == [2, 4]
 
@@ -308,8 +310,8 @@ def test_losses_before_numbering_are_told_by_the_stamps(share: float) -> None:
     for number, frame in enumerate(came.tolist()):
         stamp_us = 1_000_000_000 + 25_000 * frame + round(rng.normal(0.0, 1_200.0))
         senders.take(camera(number, stamp_us), 1000 * stamp_us + round(rng.uniform(10e6, 40e6)))
-    np.testing.assert_array_equal(senders.gaps((17, 18)), np.diff(came) - 1)
-    shortest_s = senders.shortest_delay_s((17, 18))
+    np.testing.assert_array_equal(senders.count_losses((17, 18)), np.diff(came) - 1)
+    shortest_s = senders.estimate_min_delay_s((17, 18))
     assert shortest_s is not None
     assert shortest_s == pytest.approx(0.010, abs=0.001)
 
@@ -319,7 +321,7 @@ def test_a_stamp_of_another_clock_tells_no_delay() -> None:
         senders = Senders()
         for number in range(100):
             senders.take(camera(number, 25_000 * number + 60_000_000), 1000 * (25_000 * number + 60_000_000 - ahead_us))
-        assert senders.shortest_delay_s((17, 18)) is None
+        assert senders.estimate_min_delay_s((17, 18)) is None
 
 
 def test_the_cameras_of_a_recorded_px4_are_not_mistaken_for_its_own_odometry() -> None:
@@ -328,9 +330,9 @@ def test_the_cameras_of_a_recorded_px4_are_not_mistaken_for_its_own_odometry() -
     It numbered part of what it then lost, and PX4 sends ODOMETRY of its own at 30 Hz without a loss.
     """
     for name in ("room-px4", "room"):
-        history = from_tlog(read_tlog(DATA / "px4-relay.tlog").packets, load_config(name))
-        link = fit_link(history.seen, history.gaps)
-        sent = 1.0 + 40.0 * (history.seen.times_s[-1] - history.seen.times_s[0])
+        history = read_tlog_history(read_tlog(DATA / "px4-relay.tlog").packets, load_config(name))
+        link = fit_link(history.positions, history.losses)
+        sent = 1.0 + 40.0 * (history.positions.times_s[-1] - history.positions.times_s[0])
         assert link.loss == pytest.approx(1.0 - link.received / sent, abs=0.01)
         assert link.loss == pytest.approx(0.3, abs=0.02)
         assert link.bursts
@@ -346,14 +348,14 @@ def test_the_recorded_arducopter_answers_as_its_own_log_says() -> None:
     Seen through positions the shortest delay of 25 ms comes on top, and the ramp of a limited jerk counts as lag.
     """
     config = load_config("room-hahn-stursberg", ["daemon.mocap=tlog", "daemon.vehicle=tlog"])
-    history = from_tlog(read_tlog(DATA / "arducopter-vicon-loop.tlog").packets, config)
-    flown = [thinned(one, 0.2) for one in stretches(history.asked, history.seen)]
+    history = read_tlog_history(read_tlog(DATA / "arducopter-vicon-loop.tlog").packets, config)
+    flown = [thin_positions(one, 0.2) for one in find_stretches(history.setpoints, history.positions)]
     fit = fit_axis(flown, 0, DRAG_LAG, 0.0)
     assert 0.9 < fit.value("gain") < 1.2
     assert 0.16 < fit.value("lag_s") < 0.32
     assert fit.value("drag_1ps") < 0.15
     assert predict(flown, 0, fit).r2 > 0.97
-    link = fit_link(history.seen, history.gaps)
+    link = fit_link(history.positions, history.losses)
     assert link.rate_hz == pytest.approx(24.7, rel=0.03)
     assert link.loss < 0.01
     # Arrivals alone tell what is above the shortest, for which `clock.latency_s` stands.

@@ -6,21 +6,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from quadrotor_rig import quadrotor
 
 from sim.vehicle.quadrotor import STEP_NS, STEP_S
+from uavctl.arrays import Array
 from uavctl.config import load_config
 from uavctl.lab.identify.fit import fit_axes
 from uavctl.lab.identify.history import FlightHistory, PositionHistory, SetpointHistory, Stretch
-from uavctl.lab.identify.response import ReferenceAxis, ramped
+from uavctl.lab.identify.response import ReferenceAxis, ramp_setpoints
 from uavctl.lab.identify.result import identify
 
 TICK_S = 0.05
 LIMIT_MPS3 = 5.0  # the simulated ArduPilot's
 
 
-def steps(seed: int, seconds: float, slew_mps3: float) -> NDArray[np.float64]:
+def steps(seed: int, seconds: float, slew_mps3: float) -> Array:
     """Setpoints each tick (n, 3): towards one random acceleration after the other, each axis within its slew limit."""
     rng = np.random.default_rng(seed)
     accel, rows = np.zeros(3), []
@@ -34,13 +34,13 @@ def steps(seed: int, seconds: float, slew_mps3: float) -> NDArray[np.float64]:
     return np.array(rows)
 
 
-def stretch(setpoints: NDArray[np.float64]) -> Stretch:
+def stretch(setpoints: Array) -> Stretch:
     times_s = TICK_S * np.arange(len(setpoints), dtype=np.float64)
     return Stretch(times_s, setpoints, times_s, np.zeros((len(times_s), 3)))
 
 
-def at(ramps: Stretch, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
-    held: NDArray[np.float64] = ramps.inputs_mps2[np.searchsorted(ramps.input_times_s, times_s, side="right") - 1]
+def at(ramps: Stretch, times_s: Array) -> Array:
+    held: Array = ramps.inputs_mps2[np.searchsorted(ramps.input_times_s, times_s, side="right") - 1]
     return held
 
 
@@ -48,7 +48,7 @@ def at(ramps: Stretch, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
 @pytest.mark.parametrize("slew_mps3", [3.5, 5.0, 40.0])
 def test_ramps_are_those_of_a_limited_jerk(slew_mps3: float) -> None:
     setpoints = steps(1, 4.0, slew_mps3)
-    ramps = ramped(stretch(setpoints), LIMIT_MPS3, 2.0)
+    ramps = ramp_setpoints(stretch(setpoints), LIMIT_MPS3, 2.0)
     fine_s = 1e-4
     times_s = fine_s * np.arange(round(4.0 / fine_s), dtype=np.float64)
     accel, path = setpoints[0].copy(), np.empty((len(times_s), 3))
@@ -68,15 +68,15 @@ def test_ramps_are_those_of_a_limited_jerk(slew_mps3: float) -> None:
 def test_a_setpoint_that_stays_is_reached_and_no_limit_changes_nothing() -> None:
     setpoints = np.array([[0.0, 0.0, 0.0], [0.3, -0.4, 0.5]])
     asked = Stretch(np.array([0.0, 1.0]), setpoints, np.array([0.0, 3.0]), np.zeros((2, 3)))
-    ramps = ramped(asked, LIMIT_MPS3, LIMIT_MPS3)
+    ramps = ramp_setpoints(asked, LIMIT_MPS3, LIMIT_MPS3)
     # The level part is 0.5 m/s² long, as the vertical one is: both take 0.1 s.
     np.testing.assert_allclose(
         at(ramps, np.array([0.5, 1.055, 1.101, 2.9])), [[0, 0, 0], [0.165, -0.22, 0.275], *2 * [setpoints[1]]]
     )
-    assert ramped(asked, np.inf, np.inf) is asked
+    assert ramp_setpoints(asked, np.inf, np.inf) is asked
 
 
-def flown(setpoints: NDArray[np.float64], seed: int) -> PositionHistory:
+def flown(setpoints: Array, seed: int) -> PositionHistory:
     """Positions of the simulated quadrotor under ArduPilot's loops, 20 a second, 3 mm of noise."""
     vehicle = quadrotor("ardupilot", at=(0.0, 0.0, -10.0))
     rng = np.random.default_rng(seed)
@@ -98,7 +98,7 @@ def test_the_simulated_ardupilot_is_found_whether_its_jerk_limit_is_exceeded_or_
     seen = flown(setpoints, 1)
     asked = replace(stretch(setpoints), positions_m=seen.positions_m)
     models = [ReferenceAxis(1.0, 2.0, 1.0)] * 2
-    with_ramps = fit_axes([ramped(asked, LIMIT_MPS3, LIMIT_MPS3)], (0, 1), models, 0.0, (None, None))
+    with_ramps = fit_axes([ramp_setpoints(asked, LIMIT_MPS3, LIMIT_MPS3)], (0, 1), models, 0.0, (None, None))
     as_sent = fit_axes([asked], (0, 1), models, 0.0, (None, None))
     for right, wrong in zip(with_ramps, as_sent, strict=True):
         assert right.value("lag_s") == pytest.approx(0.13, abs=0.01)

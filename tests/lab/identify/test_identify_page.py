@@ -23,7 +23,7 @@ from uavctl.config import load_config
 from uavctl.errors import DesignError, UsageError
 from uavctl.lab.identify.fit import Prediction
 from uavctl.lab.identify.history import FlightHistory, PositionHistory, SetpointHistory
-from uavctl.lab.identify.page import _innovations, write_page
+from uavctl.lab.identify.page import _draw_innovations, render_identify_page
 from uavctl.lab.identify.result import AxisResponse, Identification, Identified, fit_link
 
 AXES = ("north", "east", "down")
@@ -33,7 +33,7 @@ HARDLY = "down: only 26 % of the motion of the next second is predicted"
 @pytest.fixture(autouse=True)
 def _no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Only the sentences at the page's head are read."""
-    monkeypatch.setattr("uavctl.lab.identify.page._sections", lambda *_: iter(()))
+    monkeypatch.setattr("uavctl.lab.identify.page._make_sections", lambda *_: iter(()))
 
 
 def seen() -> PositionHistory:
@@ -82,14 +82,14 @@ def sentences(page: str) -> list[str]:
 
 
 def test_what_is_predicted_of_an_axis_is_said_once() -> None:
-    said = sentences(write_page(found(HARDLY), seen(), "flight"))
+    said = sentences(render_identify_page(found(HARDLY), seen(), "flight"))
     assert [sum(one.startswith(f"{axis}:") for one in said) for axis in AXES] == [1, 1, 1]
     assert f"{HARDLY}." in said
 
 
 def test_another_warning_takes_no_axis_its_line() -> None:
     uncertain = "down: the lag of 0.25 s is uncertain; fly more changes of direction"
-    said = sentences(write_page(found(uncertain), seen(), "flight"))
+    said = sentences(render_identify_page(found(uncertain), seen(), "flight"))
     assert [sum(one.startswith(f"{axis}:") and "predicted" in one for one in said) for axis in AXES] == [1, 1, 1]
     assert said.count(f"{uncertain}.") == 1
 
@@ -105,7 +105,7 @@ def test_differences_of_millimetres_leave_room_for_the_name_of_their_axis(monkey
     monkeypatch.setattr(Figure, "savefig", keep)
     differences_m = np.linspace(-0.08, 0.06, 30)
     rest = np.ones(30)
-    _innovations("north", Prediction(np.arange(30.0), differences_m, 0.02 * rest, rest, rest, np.zeros(20)))
+    _draw_innovations("north", Prediction(np.arange(30.0), differences_m, 0.02 * rest, rest, rest, np.zeros(20)))
     assert left_px and left_px[0] >= 0.0
 
 
@@ -147,8 +147,8 @@ def test_a_second_vehicle_in_a_log_changes_nothing(tmp_path: Path, system: int |
     common = Common(config="room-px4")
     alone, _ = identify_cmd._read_history(DATA / "px4-relay.tlog", common, None)
     found, _ = identify_cmd._read_history(both, common, system)
-    assert len(rows) > len(packets) + 10 and len(alone.asked.times_s)
-    assert np.array_equal(found.asked.accel_mps2, alone.asked.accel_mps2)
-    assert np.array_equal(found.seen.times_s, alone.seen.times_s)
+    assert len(rows) > len(packets) + 10 and len(alone.setpoints.times_s)
+    assert np.array_equal(found.setpoints.accel_mps2, alone.setpoints.accel_mps2)
+    assert np.array_equal(found.positions.times_s, alone.positions.times_s)
     with pytest.raises(UsageError):
         identify_cmd._read_history(both, common, 9)

@@ -16,7 +16,7 @@ from uavctl.cli import paper as paper_cmd
 from uavctl.cli.app import run as command
 from uavctl.lab.paper import depth as deep
 from uavctl.lab.paper import runs as run
-from uavctl.lab.paper.claims import Complexity, Depth, DesignTried
+from uavctl.lab.paper.claims import Complexity, Depth, TriedDesign
 
 WANTED = {
     "runs", "mean_cost", "cost_stderr", "infeasible", "slack_used", "state_violations", "input_violations", "max_age",
@@ -24,9 +24,9 @@ WANTED = {
 }  # fmt: skip
 DEPTH = Depth(
     designs=[
-        DesignTried(tau=3, schedule="d_t = 5", delays=None, gamma_h=None, cost=None, refused="too slow"),
-        DesignTried(tau=4, schedule="greedy", delays=[1, 2], gamma_h=0.97, cost=None, refused=""),
-        DesignTried(tau=4, schedule="d_t = 5", delays=[5, 5], gamma_h=0.97, cost=61670.0, refused=""),
+        TriedDesign(tau=3, schedule="d_t = 5", delays=None, gamma_h=None, cost=None, refused="too slow"),
+        TriedDesign(tau=4, schedule="greedy", delays=[1, 2], gamma_h=0.97, cost=None, refused=""),
+        TriedDesign(tau=4, schedule="d_t = 5", delays=[5, 5], gamma_h=0.97, cost=61670.0, refused=""),
     ],
     complexity=[
         Complexity(tau=tau, horizon=12, gains=36, lifted=8, exact_ms=10.0, printed_ms=printed, refused="")

@@ -12,43 +12,47 @@ from uavctl.config import load_config
 from uavctl.errors import UavctlError
 from uavctl.lab.paper import depth as deep
 from uavctl.lab.paper.claims import Depth
-from uavctl.lab.paper.depth import Fineness, alone, least_settled_cost
+from uavctl.lab.paper.depth import GridSize, compute_least_settled_cost, extract_component
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.horizon import decompose
 from uavctl.smpc.nominal import lqr, stationary_bound
 from uavctl.smpc.sets import Polytope
 
-COARSE = Fineness(states=35, inputs=31)
+COARSE = GridSize(states=35, inputs=31)
 
 
 @pytest.fixture(scope="module")
 def axis() -> Design:
     design = build_design(load_config("paper"))
-    return alone(design, decompose(design)[0])
+    return extract_component(design, decompose(design)[0])
 
 
 @pytest.fixture(scope="module")
 def depth() -> Depth:
     """All of it, with fewer designs, states and points."""
-    some = [one for one in deep._schedules() if "search" not in one[1]][:3]
+    some = [one for one in deep._list_schedules() if "search" not in one[1]][:3]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(deep, "_schedules", lambda: iter(some))
+        patch.setattr(deep, "_list_schedules", lambda: iter(some))
         for name, value in (("_TAUS", (2, 3, 4)), ("_STATES", 2), ("_RUNS", 1)):
             patch.setattr(deep, name, value)
-        patch.setattr(deep, "least_settled_cost", partial(least_settled_cost, fineness=Fineness(states=11, inputs=11)))
+        patch.setattr(
+            deep,
+            "compute_least_settled_cost",
+            partial(compute_least_settled_cost, grid_size=GridSize(states=11, inputs=11)),
+        )
         return deep.measure_depth(0, lambda _: None)
 
 
 def test_without_limits_the_least_cost_is_the_lqg_bound(axis: Design) -> None:
     link = build_spec(load_config("paper")).link
     open_sides = Polytope(axis.input_set.c, 20 * axis.input_set.b)
-    found = least_settled_cost(axis.plant, open_sides, axis.q_x, axis.q_u, 0.3, Fineness(states=25, inputs=61))
+    found = compute_least_settled_cost(axis.plant, open_sides, axis.q_x, axis.q_u, 0.3, GridSize(states=25, inputs=61))
     assert found == pytest.approx(stationary_bound(axis.plant, axis.q_x, axis.q_u, link), rel=2e-3)
 
 
 @pytest.mark.slow
 def test_limits_cost_and_clipped_lqg_is_not_below_the_least(axis: Design) -> None:
-    least = least_settled_cost(axis.plant, axis.input_set, axis.q_x, axis.q_u, 0.3, COARSE)
+    least = compute_least_settled_cost(axis.plant, axis.input_set, axis.q_x, axis.q_u, 0.3, COARSE)
     assert least == pytest.approx(11.95, abs=0.05)
     # LQG with its input clipped, simulated by itself: an upper bound of the least.
     rng, k = np.random.default_rng(0), lqr(axis.plant, axis.q_x, axis.q_u).k
@@ -71,7 +75,7 @@ def test_limits_cost_and_clipped_lqg_is_not_below_the_least(axis: Design) -> Non
 def test_a_plant_of_several_axes_has_to_be_taken_apart(axis: Design) -> None:
     design = build_design(load_config("paper"))
     with pytest.raises(UavctlError, match="one axis"):
-        least_settled_cost(design.plant, design.input_set, design.q_x, design.q_u, 0.3, COARSE)
+        compute_least_settled_cost(design.plant, design.input_set, design.q_x, design.q_u, 0.3, COARSE)
 
 
 @pytest.mark.slow

@@ -8,15 +8,14 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from uavctl.arrays import Array
 from uavctl.build.controller import build_design
 from uavctl.config import load_config
-from uavctl.lab.paper.figures import AgeReference, ages_svg, trajectories_svg
+from uavctl.lab.paper.figures import AgeReference, draw_ages_svg, draw_trajectories_svg
 from uavctl.smpc.hahn_stursberg.design import Design
 
-Array = NDArray[np.float64]
 SVG = "{http://www.w3.org/2000/svg}"
 LINK = AgeReference(tau=4, horizon=12, loss=0.3)
 PLANES = ("(0, 1)", "(2, 3)", "(0, 2)")  # both axes, and the positions
@@ -62,7 +61,7 @@ def words(root: ElementTree.Element) -> set[str]:
 @pytest.mark.slow
 @pytest.mark.parametrize("runs", [1, 7, 40])
 def test_trajectories_show_box_ellipsoid_start_and_every_run(design: Design, runs: int) -> None:
-    root = ElementTree.fromstring(trajectories_svg(states(runs), design))
+    root = ElementTree.fromstring(draw_trajectories_svg(states(runs), design))
     assert root.tag == f"{SVG}svg"
     assert f"{runs} runs" in (root.findtext(f"{SVG}title") or "")
     for plane in PLANES:
@@ -73,7 +72,7 @@ def test_trajectories_show_box_ellipsoid_start_and_every_run(design: Design, run
 
 
 def test_box_start_and_ellipse_are_to_scale(design: Design) -> None:
-    root = ElementTree.fromstring(trajectories_svg(states(3), design))
+    root = ElementTree.fromstring(draw_trajectories_svg(states(3), design))
     (box,) = courses(root, "box-(0, 1)")
     per_m, per_mps = size(root, "box-(0, 1)") / [80.0, 15.0]  # -30 … 50 m, -8 … 7 m/s
     corner = np.cumsum(box, axis=0)
@@ -89,9 +88,9 @@ def test_box_start_and_ellipse_are_to_scale(design: Design) -> None:
 
 def test_the_largest_picture_stays_small_and_is_always_the_same(design: Design) -> None:
     many = states(200)
-    svg = trajectories_svg(many, design)
+    svg = draw_trajectories_svg(many, design)
     assert len(svg.encode()) < 1_000_000
-    assert svg == trajectories_svg(many, design)
+    assert svg == draw_trajectories_svg(many, design)
 
 
 def test_ages_are_stacked_to_all_runs_in_each_step() -> None:
@@ -100,7 +99,7 @@ def test_ages_are_stacked_to_all_runs_in_each_step() -> None:
     ages[:, 1] = 30
     ages[0, :2] = [100, 0]
     ages[7, :8] = [60, 20, 10, 4, 3, 1, 1, 1]
-    root = ElementTree.fromstring(ages_svg(ages, LINK))
+    root = ElementTree.fromstring(draw_ages_svg(ages, LINK))
     outlines = [np.cumsum(courses(root, f"age-{age}")[0], axis=0) for age in range(6)]  # 0 … 4, 5 or more
     high = np.ptp(outlines[0][:, 1])  # all runs, in step 0
     middle = np.ptp(outlines[0][:, 0]) * 7.5 / 30 + outlines[0][:, 0].min()  # of step 7
@@ -118,5 +117,5 @@ def test_ages_are_stacked_to_all_runs_in_each_step() -> None:
 def test_ages_without_loss_and_of_few_steps_are_drawn() -> None:
     ages = np.zeros((4, 4), dtype=np.intp)
     ages[:, 0] = 5
-    root = ElementTree.fromstring(ages_svg(ages, AgeReference(tau=4, horizon=12, loss=0.0)))
+    root = ElementTree.fromstring(draw_ages_svg(ages, AgeReference(tau=4, horizon=12, loss=0.0)))
     assert sum("-age-" in (one.get("id") or "") for one in root.iter()) == 4

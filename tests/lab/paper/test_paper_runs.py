@@ -7,25 +7,34 @@ import pytest
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.build.controller import build_design, build_plant, start_state
 from uavctl.config import load_config
-from uavctl.lab.campaign.world import Flown, Scene, draw, fly, newest
+from uavctl.lab.campaign.world import LinearWorld, Trajectories, compute_newest_captures, draw, simulate
 from uavctl.lab.paper import runs as run
 from uavctl.lab.paper.claims import (
     PRINTED,
-    SMALLEST,
+    SMALLEST_TAU,
     VARIANTS,
     Claim,
     VariantResult,
-    age_distribution,
     assess,
-    claims_of,
+    compute_age_distribution,
+    make_claims,
 )
-from uavctl.lab.paper.runs import Chunk, ChunkRunner, Moments, Setup, Watched, fly_all, in_ellipsoid, together, total
+from uavctl.lab.paper.runs import (
+    Chunk,
+    ChunkRunner,
+    Moments,
+    Setup,
+    TerminalCheckDecider,
+    add_totals,
+    compute_totals,
+    fly_all,
+    is_in_ellipsoid,
+)
 from uavctl.smpc.batch import BatchSmpc, Decisions
 from uavctl.smpc.hahn_stursberg.frozen import ShortcutDecider, ShortcutSolver
-
-Array = NDArray[np.float64]
 
 RUNS, STEPS, SEED = 20, 50, 3
 
@@ -38,17 +47,17 @@ def setup() -> Setup:
 
 
 @pytest.fixture(scope="module")
-def directly(setup: Setup) -> tuple[Flown, BatchSmpc]:
+def directly(setup: Setup) -> tuple[Trajectories, BatchSmpc]:
     """The same runs with nothing of this command in between."""
     design, plant = setup.design, build_plant(setup.config)
     chances = draw(SEED, 0, RUNS, STEPS, plant.n_w)
-    scene = Scene(
+    scene = LinearWorld(
         plant, design.state_set, design.input_set, design.q_x, design.q_u, np.zeros(4), np.zeros(2),
         np.tile([35.0, -2.0, -20.0, -4.0], (RUNS, 1)),
     )  # fmt: skip
     smpc = BatchSmpc(ShortcutDecider(ShortcutSolver(design), np.zeros(4)), plant, 12, 0, 0.5)
     w = chances.normal * np.sqrt(0.6)
-    return fly(scene, smpc, newest(setup.config.link, 1.0, chances.link), w), smpc
+    return simulate(scene, smpc, compute_newest_captures(setup.config.link, 1.0, chances.link), w), smpc
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +66,7 @@ def result(setup: Setup) -> VariantResult:
     return assess(setup, PRINTED.note, flights, SEED)
 
 
-def test_figures_are_those_of_the_runs(result: VariantResult, directly: tuple[Flown, BatchSmpc]) -> None:
+def test_figures_are_those_of_the_runs(result: VariantResult, directly: tuple[Trajectories, BatchSmpc]) -> None:
     flown, smpc = directly
     cost, settled = flown.cost.sum(axis=1), flown.states[:, STEPS // 2 :].reshape(-1, 4)
     assert result.mean_cost == pytest.approx(cost.mean(), rel=1e-12)
@@ -96,7 +105,7 @@ def test_chunks_change_nothing(setup: Setup, result: VariantResult, monkeypatch:
 
 @pytest.mark.slow
 def test_workers_change_nothing(setup: Setup, result: VariantResult, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run, "HERE_UP_TO", 0)
+    monkeypatch.setattr(run, "MAX_LOCAL_RUNS", 0)
     monkeypatch.setattr(run, "CHUNK", 8)
     one, two = (fly_all([setup], RUNS, STEPS, SEED, workers, lambda _: None)[0] for workers in (1, 2))
     assert vars(one.totals).keys() == vars(two.totals).keys()
@@ -111,7 +120,7 @@ def test_workers_change_nothing(setup: Setup, result: VariantResult, monkeypatch
 def test_longer_campaigns_begin_with_the_same_runs(setup: Setup) -> None:
     pilot = ChunkRunner(setup)
     few, more = pilot.fly(SEED, 0, 3, STEPS), pilot.fly(SEED, 2, 4, STEPS)
-    assert few.flown.states[2] == pytest.approx(more.flown.states[0], abs=1e-9)
+    assert few.trajectories.states[2] == pytest.approx(more.trajectories.states[0], abs=1e-9)
 
 
 def test_the_start_is_the_printed_one(setup: Setup) -> None:
@@ -120,17 +129,17 @@ def test_the_start_is_the_printed_one(setup: Setup) -> None:
 
 def test_moments_of_parts_are_those_of_all() -> None:
     values = np.random.default_rng(0).normal(5e4, 3.0, 1000)
-    parts = [Moments.of(part) for part in np.split(values, [1, 10, 400])]
+    parts = [Moments.compute(part) for part in np.split(values, [1, 10, 400])]
     found = parts[0] + parts[1] + parts[2] + parts[3]
     assert found.count == 1000
     assert found.mean == pytest.approx(values.mean(), rel=1e-14)
     assert found.stderr == pytest.approx(values.std(ddof=1) / np.sqrt(1000), rel=1e-9)
-    assert Moments.of(values[:1]).stderr == np.inf
+    assert Moments.compute(values[:1]).stderr == np.inf
 
 
 def test_the_ellipsoid_holds_its_share_of_what_it_is_made_for(setup: Setup) -> None:
     draws = np.random.default_rng(1).multivariate_normal(np.zeros(4), setup.design.terminal.sigma_x, 40_000)
-    assert in_ellipsoid(draws, setup.design).mean() == pytest.approx(0.95, abs=0.004)  # 3.7 standard errors
+    assert is_in_ellipsoid(draws, setup.design).mean() == pytest.approx(0.95, abs=0.004)  # 3.7 standard errors
 
 
 def made(states: Array, ages: NDArray[np.intp]) -> Chunk:
@@ -138,20 +147,22 @@ def made(states: Array, ages: NDArray[np.intp]) -> Chunk:
     runs, steps = ages.shape
     flat, flags = np.zeros((runs, steps, 2)), np.zeros((runs, steps), dtype=bool)
     flags[0, 1:] = True
-    flown = Flown(states, flat, flat, ages, np.ones((runs, steps)), flags, flags.copy(), np.zeros(runs, dtype=bool))
+    flown = Trajectories(
+        states, flat, flat, ages, np.ones((runs, steps)), flags, flags.copy(), np.zeros(runs, dtype=bool)
+    )
     return Chunk(flown, decisions=3, infeasible=0, slack_used=1, missed=2, fallbacks=0, largest_gap=0.5)
 
 
 def test_totals_of_made_up_runs(setup: Setup) -> None:
     states = np.full((2, 5, 4), 100.0)
     states[0, 2:] = 0.0  # the first run arrives in step 2, the second never
-    found = together([total(made(states, np.array([[0, 1, 0, 1], [0, 1, 2, 3]])), setup.design)] * 2)
+    found = add_totals([compute_totals(made(states, np.array([[0, 1, 0, 1], [0, 1, 2, 3]])), setup.design)] * 2)
     assert found.arrived.tolist() == [0, 0, 2, 0, 0, 2]
     assert (found.ended_inside, found.settled_inside, found.settled) == (2, 6, 12)
     assert found.outside.tolist() == [0, 2, 2, 2]
     assert (found.runs_outside, found.runs_asking, found.decisions, found.slack_used, found.missed) == (2, 2, 6, 2, 4)
     assert found.ages[3].tolist() == [0, 2, 0, 2]
-    assert age_distribution(found) == [0.375, 0.375, 0.125, 0.125]
+    assert compute_age_distribution(found) == [0.375, 0.375, 0.125, 0.125]
     # Beyond the upper limits by 100 - limit; from the lower ones, the nearest was the origin.
     assert found.closest.tolist() == [50.0, -30.0, 93.0, -8.0, 80.0, -25.0, 92.0, -8.0]
     assert found.largest_gap == 0.5
@@ -173,9 +184,9 @@ def test_plans_that_end_elsewhere_are_counted(setup: Setup) -> None:
 
     x = np.array([[1.0, 0.0, 0.0, 0.0], [2.0, 0.0, 0.0, 0.0], [35.0, -2.0, -20.0, -4.0]])
     for decider, missed in ((inner, 0), (Astray(), 1)):
-        watched = Watched(decider, design)
+        watched = TerminalCheckDecider(decider, design)
         watched.decide(x, 0)
-        assert watched.missed == missed
+        assert watched.missed_target == missed
 
 
 def by_key(claims: list[Claim]) -> dict[str, Claim]:
@@ -184,7 +195,7 @@ def by_key(claims: list[Claim]) -> dict[str, Claim]:
 
 def test_claims_hold_or_not_by_what_was_measured(result: VariantResult) -> None:
     def holds(**changes: object) -> dict[str, bool | None]:
-        claims = claims_of(replace(result, **changes), 0.3, 12, 0.95, 0.9)
+        claims = make_claims(replace(result, **changes), 0.3, 12, 0.95, 0.9)
         return {key: one.holds for key, one in by_key(claims).items()}
 
     as_flown = holds()
@@ -225,7 +236,7 @@ def test_lqg_breaks_the_input_limits_as_often_as_its_inputs_spread(result: Varia
 
 
 def test_variants_are_designs_that_the_tool_accepts() -> None:
-    assert (PRINTED, SMALLEST) == VARIANTS
+    assert (PRINTED, SMALLEST_TAU) == VARIANTS
     for variant in VARIANTS:
         design = build_design(load_config("paper", variant.overrides))
         assert design.terminal.tau == variant.tau

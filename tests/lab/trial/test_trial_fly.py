@@ -15,24 +15,32 @@ sys.path.insert(0, str(ROOT / "tools"))
 
 import trials
 
-from uavctl.lab.own_loop import OwnTuning
+from uavctl.lab.position_loop import PositionLoopTuning
 from uavctl.lab.trial import (
     AUTOPILOTS,
     AutopilotName,
-    FlightTally,
+    FlightCounts,
     TrialCell,
     TrialPilot,
-    believed,
-    blackout_s,
-    eight,
-    flown,
-    fly,
-    length_s,
-    room_of,
+    draw_blackout_begin_s,
+    fly_trial,
+    get_flight_length_s,
+    get_room_limits,
+    make_design_config,
+    make_figure_eight,
+    make_flight_config,
 )
 from uavctl.records import ControlMode, Decision, Plan, Setpoint, SetpointSource, SolveStatus
 
-OWN = TrialCell(TrialPilot("own", own=OwnTuning()), "hold", "ardupilot", 20.0, "30 %", ("link.loss=0.3",), "gusts")
+OWN = TrialCell(
+    TrialPilot("own", position_loop=PositionLoopTuning()),
+    "hold",
+    "ardupilot",
+    20.0,
+    "30 %",
+    ("link.loss=0.3",),
+    "gusts",
+)
 LOSES = ("link.loss=0.6",)
 OURS = replace(OWN, pilot=TrialPilot("ours", overrides=("smpc.scheme=age-conditioned",), knows_link=True))
 
@@ -83,7 +91,7 @@ def plan(slack: float) -> Plan:
 
 
 def test_a_tally_counts_from_the_first_order_on() -> None:
-    tally = FlightTally()
+    tally = FlightCounts()
     tally.put("", 1, decision(1, ControlMode.WAIT, None))
     for at_ns, mode in enumerate((ControlMode.TRACK, ControlMode.TRACK, ControlMode.BRAKE), start=2):
         tally.put("", at_ns, decision(at_ns, mode, (1.0,)))
@@ -92,41 +100,41 @@ def test_a_tally_counts_from_the_first_order_on() -> None:
         tally.put("", 3, setpoint)
     for slack in (0.0, 1e-9, 0.5):
         tally.put("", 3, plan(slack))
-    assert (tally.begun_ns, tally.ticks, tally.fallen, tally.positions) == (2, 3, 1, 12)
+    assert (tally.first_target_ns, tally.ticks, tally.fallback_ticks, tally.positions) == (2, 3, 1, 12)
     assert (tally.setpoints, tally.limited, tally.plans, tally.gave_way) == (3, 2, 3, 1)
 
 
 def test_the_room_is_that_of_the_state_limits_in_any_order_of_axes() -> None:
-    lower, upper = room_of(flown(OWN, 0, 5.0))
+    lower, upper = get_room_limits(make_flight_config(OWN, 0, 5.0))
     assert lower.tolist() == [-3.0, -2.5, -2.5] and upper.tolist() == [3.0, 2.5, 0.0]
 
 
 def test_who_knows_the_link_is_made_for_it_and_others_for_that_of_their_configuration() -> None:
-    assert believed(replace(OURS, link=LOSES)).link.loss == 0.6
+    assert make_design_config(replace(OURS, link=LOSES)).link.loss == 0.6
     unknowing = replace(OURS, pilot=replace(OURS.pilot, knows_link=False), link=LOSES)
-    assert believed(unknowing).link.loss == 0.3
+    assert make_design_config(unknowing).link.loss == 0.3
 
 
 def test_all_who_fly_meet_the_same_air_cameras_and_link() -> None:
-    mine, theirs = (flown(replace(cell, scenario="blackout"), 5, 9.0) for cell in (OURS, OWN))
+    mine, theirs = (make_flight_config(replace(cell, scenario="blackout"), 5, 9.0) for cell in (OURS, OWN))
     assert (mine.sim, mine.link) == (theirs.sim, theirs.link)
     ((begin, end),) = mine.link.blackout
-    assert (begin, round(end - begin, 9)) == (blackout_s(5), 4.0)
-    moments = np.array([blackout_s(seed) for seed in range(200)])
+    assert (begin, round(end - begin, 9)) == (draw_blackout_begin_s(5), 4.0)
+    moments = np.array([draw_blackout_begin_s(seed) for seed in range(200)])
     assert moments.min() >= 1.0 and moments.max() <= 6.0 and np.unique(moments).size > 190
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("cell", [OURS, OWN])
 def test_a_flight_is_judged_by_the_truth(cell: TrialCell) -> None:
-    found = fly(cell, 2, seconds=14.0, from_s=10.0)
+    found = fly_trial(cell, 2, seconds=14.0, from_s=10.0)
     assert 0.0 < found.hold_rms_m <= found.hold_max_m < 0.5
     assert 1.0 < found.near_s <= found.nearer_s
     assert -2.5 < found.beyond_m < 0.0
     assert found.positions == pytest.approx(0.7 * 20.0 * 14.0, rel=0.15)
     assert found.mode == "GUIDED" and math.isnan(found.tracking_m)
     assert math.isnan(found.limited) is (cell is OWN)
-    assert fly(cell, 2, seconds=14.0, from_s=10.0) == found or cell is OWN  # NaN is not itself
+    assert fly_trial(cell, 2, seconds=14.0, from_s=10.0) == found or cell is OWN  # NaN is not itself
 
 
 @pytest.mark.slow
@@ -134,7 +142,7 @@ def test_a_flight_is_judged_by_the_truth(cell: TrialCell) -> None:
 def test_who_has_arrived_hangs_still_in_calm_air(autopilot: AutopilotName) -> None:
     """The recorded ArduCopter held 3 to 5 mm; the simulated one swung by 50 to 180 mm after the same way."""
     ours = TrialPilot("ours", config=f"room-{autopilot}")
-    found = fly(
+    found = fly_trial(
         TrialCell(ours, "hold", autopilot, 20.0, "30 %", ("link.loss=0.3",), "calm"), 0, seconds=20.0, from_s=12.0
     )
     assert found.nearer_s < 12.0
@@ -144,10 +152,10 @@ def test_who_has_arrived_hangs_still_in_calm_air(autopilot: AutopilotName) -> No
 
 @pytest.mark.slow
 def test_an_eight_is_tracked_along_its_own_time() -> None:
-    found = fly(replace(OWN, scenario="eight", air="calm"), 0, seconds=1.0, from_s=0.0)
+    found = fly_trial(replace(OWN, scenario="eight", air="calm"), 0, seconds=1.0, from_s=0.0)
     assert 0.0 < found.tracking_m < found.tracking_max_m < 0.6
     assert math.isnan(found.hold_rms_m)
-    assert length_s("eight", 1.0) > eight().times_s[-1]
+    assert get_flight_length_s("eight", 1.0) > make_figure_eight().times_s[-1]
 
 
 @pytest.mark.slow

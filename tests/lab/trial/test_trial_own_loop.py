@@ -12,17 +12,17 @@ from mavlink_rig import read
 
 from sim.simulation import VEHICLE, Peers, World
 from uavctl.config import Config
-from uavctl.lab.own_loop import DELAY, OwnLoop, OwnTuning
+from uavctl.lab.position_loop import DELAY_PARAMETER, PositionLoopFlyer, PositionLoopTuning
 from uavctl.lab.trial import (
     AutopilotName,
     Scenario,
     TrialCell,
     TrialPilot,
-    believed,
-    controller_of,
-    flown,
-    fly,
-    own_loop,
+    fly_trial,
+    get_cached_controller,
+    make_design_config,
+    make_flight_config,
+    make_position_loop,
 )
 from uavctl.loop import ControlLoop
 from uavctl.records import Outgoing, PositionSample, Received, Record, Send, StepInput
@@ -30,7 +30,7 @@ from uavctl.records import Outgoing, PositionSample, Received, Record, Send, Ste
 BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 SECONDS = 12.0
 OURS = TrialPilot("ours", overrides=("smpc.scheme=age-conditioned",))
-AS_DELIVERED, TUNED = OwnTuning(), OwnTuning(at_once=True, delay_s=0.05)
+AS_DELIVERED, TUNED = PositionLoopTuning(), PositionLoopTuning(relays_at_once=True, delay_s=0.05)
 
 
 def cell(pilot: TrialPilot, autopilot: AutopilotName, scenario: Scenario = "hold", loss: float = 0.6) -> TrialCell:
@@ -40,7 +40,7 @@ def cell(pilot: TrialPilot, autopilot: AutopilotName, scenario: Scenario = "hold
 class Overheard:
     """What goes to the vehicle, by kind of message."""
 
-    def __init__(self, own: OwnLoop) -> None:
+    def __init__(self, own: PositionLoopFlyer) -> None:
         self.own = own
         self.sent: list[Any] = []
 
@@ -74,12 +74,12 @@ class Samples:
             self.seen += record.samples
 
 
-def flight_of_own(autopilot: AutopilotName, tuning: OwnTuning) -> tuple[Overheard, Peers, Config]:
-    one = cell(TrialPilot("own", own=tuning), autopilot)
-    config = flown(one, 3, SECONDS)
-    overheard = Overheard(own_loop(one, config))
+def flight_of_own(autopilot: AutopilotName, tuning: PositionLoopTuning) -> tuple[Overheard, Peers, Config]:
+    one = cell(TrialPilot("own", position_loop=tuning), autopilot)
+    config = make_flight_config(one, 3, SECONDS)
+    overheard = Overheard(make_position_loop(one, config))
     world = World(config, overheard)
-    overheard.own.board(world.peers.autopilot)
+    overheard.own.configure_vehicle(world.peers.autopilot)
     world.run(SECONDS)
     return overheard, world.peers, config
 
@@ -93,8 +93,10 @@ def arrivals(samples: Iterable[PositionSample]) -> list[tuple[int, int]]:
 def test_it_gets_the_positions_that_ours_get_no_more_and_no_fewer(autopilot: AutopilotName) -> None:
     overheard, _, _ = flight_of_own(autopilot, AS_DELIVERED)
     one, sink = cell(OURS, autopilot), Samples()
-    knows = believed(one)
-    World(flown(one, 3, SECONDS), ControlLoop(knows, controller_of(knows), sink, lambda: 0)).run(SECONDS)
+    knows = make_design_config(one)
+    World(make_flight_config(one, 3, SECONDS), ControlLoop(knows, get_cached_controller(knows), sink, lambda: 0)).run(
+        SECONDS
+    )
     last_ns = max(received for _, received in arrivals(sink.seen))  # what comes after the last tick nobody uses
     own = [found for found in arrivals(overheard.own.samples) if found[1] <= last_ns]
     assert own == arrivals(sink.seen)
@@ -105,7 +107,7 @@ def test_it_gets_the_positions_that_ours_get_no_more_and_no_fewer(autopilot: Aut
 @BOTH
 @pytest.mark.parametrize("tuning", [AS_DELIVERED, TUNED])
 def test_all_of_them_go_on_to_the_vehicle_but_for_those_that_were_overtaken(
-    autopilot: AutopilotName, tuning: OwnTuning
+    autopilot: AutopilotName, tuning: PositionLoopTuning
 ) -> None:
     overheard, _, _ = flight_of_own(autopilot, tuning)
     own, passed = overheard.own, overheard.of("VISION_POSITION_ESTIMATE")
@@ -129,7 +131,7 @@ def test_it_is_sent_places_alone_and_knows_of_no_other_position(autopilot: Autop
     assert places == pytest.approx(np.array([config.target.position_m]), rel=1e-6)
     estimator = peers.autopilot.estimator
     assert estimator.uses_external and not estimator.uses_gps and estimator.is_position_valid
-    assert peers.autopilot.parameters[DELAY[autopilot]] == 50.0
+    assert peers.autopilot.parameters[DELAY_PARAMETER[autopilot]] == 50.0
     assert np.linalg.norm(np.subtract(estimator.position_m, peers.vehicle.position_m)) > 1e-4  # cameras' noise, delays
     assert peers.autopilot.mode_name in ("OFFBOARD", "GUIDED")
 
@@ -137,8 +139,10 @@ def test_it_is_sent_places_alone_and_knows_of_no_other_position(autopilot: Autop
 @pytest.mark.slow
 @BOTH
 def test_without_wind_and_losses_it_holds_its_place(autopilot: AutopilotName) -> None:
-    one = TrialCell(TrialPilot("own", own=AS_DELIVERED), "hold", autopilot, 50.0, "", ("link.loss=0.0",), "calm")
-    found = fly(one, 0, seconds=16.0, from_s=12.0)
+    one = TrialCell(
+        TrialPilot("own", position_loop=AS_DELIVERED), "hold", autopilot, 50.0, "", ("link.loss=0.0",), "calm"
+    )
+    found = fly_trial(one, 0, seconds=16.0, from_s=12.0)
     assert found.hold_rms_m < 0.03 and found.nearer_s < 12.0 and found.beyond_m < 0.0
 
 
@@ -146,7 +150,7 @@ def test_without_wind_and_losses_it_holds_its_place(autopilot: AutopilotName) ->
 @BOTH
 def test_told_of_the_motion_it_follows_closer_than_by_places(autopilot: AutopilotName) -> None:
     one = TrialCell(
-        TrialPilot("own", own=OwnTuning(at_once=True, delay_s=0.05)),
+        TrialPilot("own", position_loop=PositionLoopTuning(relays_at_once=True, delay_s=0.05)),
         "eight",
         autopilot,
         50.0,
@@ -154,18 +158,18 @@ def test_told_of_the_motion_it_follows_closer_than_by_places(autopilot: Autopilo
         ("link.loss=0.0",),
         "calm",
     )
-    config = flown(one, 0, 12.0)
+    config = make_flight_config(one, 0, 12.0)
     errors = []
     for whole in (True, False):
-        own = own_loop(one, config)
+        own = make_position_loop(one, config)
         path = own.path
         assert path is not None
         world = World(config, overheard := Overheard(own))
-        own.board(world.peers.autopilot)
+        own.configure_vehicle(world.peers.autopilot)
         off = []
         for tick in range(1, 240):
             if not whole:
-                own.path, own.place = None, path(tick * 0.05)[0]
+                own.path, own.target_m = None, path(tick * 0.05)[0]
             world.run(tick * 0.05)
             off.append(np.linalg.norm(np.subtract(world.peers.vehicle.position_m, path(tick * 0.05)[0])))
         assert {msg.type_mask for msg in overheard.of("SET_POSITION_TARGET_LOCAL_NED")} == (
@@ -176,8 +180,8 @@ def test_told_of_the_motion_it_follows_closer_than_by_places(autopilot: Autopilo
 
 
 def test_a_parameter_that_the_vehicle_does_not_take_is_told() -> None:
-    one = cell(TrialPilot("own", own=OwnTuning(delay_s=1e9)), "px4")
-    config = flown(one, 0, 1.0)
-    own = own_loop(one, config)
+    one = cell(TrialPilot("own", position_loop=PositionLoopTuning(delay_s=1e9)), "px4")
+    config = make_flight_config(one, 0, 1.0)
+    own = make_position_loop(one, config)
     with pytest.raises(ValueError, match="EKF2_EV_DELAY"):
-        own.board(World(config, own).peers.autopilot)
+        own.configure_vehicle(World(config, own).peers.autopilot)

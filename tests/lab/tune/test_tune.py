@@ -15,15 +15,28 @@ from logs.recording.flight import FlightData
 from uavctl.build.controller import design_of
 from uavctl.config import Config, load_config
 from uavctl.errors import UsageError
-from uavctl.lab.identify.history import from_records
-from uavctl.lab.identify.response import DragLagAxis, places
+from uavctl.lab.identify.history import read_recorded_history
+from uavctl.lab.identify.response import DragLagAxis, make_parameters
 from uavctl.lab.identify.result import Identification, identify
-from uavctl.lab.tune.change import MOST_DEAD_RANGE_S, Change, PinnedAxis, TunedResult, check_tunable, tuned
-from uavctl.lab.tune.excitation import LEAST_WAY_M, SafeBox, check_start, excited, parse_box
-from uavctl.lab.tune.run_folder import STATE, TuneAsked, TuneFolder, figures_of, plan_errors_m
+from uavctl.lab.tune.change import (
+    MAX_DEAD_TIME_RANGE_S,
+    Change,
+    PinnedAxisModel,
+    TunedResult,
+    check_tunable,
+    tune_config,
+)
+from uavctl.lab.tune.excitation import MIN_STEP_M, SafeBox, add_excitation, check_start, parse_box
+from uavctl.lab.tune.run_folder import (
+    STATE_FILE,
+    TuneFolder,
+    TuneSettings,
+    compute_flight_figures,
+    compute_plan_errors_m,
+)
 
 BOX = parse_box("-1.5,-1.4,-2,1.5,1.4,-0.4")
-ASKED = TuneAsked(box="b", flight="", simulated=True, take_off_m=None)
+ASKED = TuneSettings(box="b", flight="", simulated=True, take_off_m=None)
 
 
 def room(*overrides: str) -> Config:
@@ -43,11 +56,11 @@ def test_what_is_no_box_is_refused(text: str) -> None:
 @pytest.mark.parametrize("preset", ["room", "room-px4", "room-ardupilot"])
 def test_each_axis_is_stepped_by_itself_well_inside_the_box(preset: str) -> None:
     config = load_config(preset, ("sim.plant=quadrotor",))
-    made = excited(config, design_of(config), BOX, lands=False)
+    made = add_excitation(config, design_of(config), BOX, lands=False)
     points = np.array(made.mission.waypoints)
     assert np.all(points > np.array(BOX.lower) + 0.1) and np.all(points < np.array(BOX.upper) - 0.1)
     steps = np.abs(np.diff(points, axis=0))
-    for axis, least_m in enumerate(LEAST_WAY_M):
+    for axis, least_m in enumerate(MIN_STEP_M):
         alone = (steps[:, axis] >= least_m) & (np.delete(steps, axis, axis=1).max(axis=1) == 0.0)
         assert np.count_nonzero(alone) >= 3
     assert tuple(points[-1]) == BOX.centre
@@ -61,27 +74,27 @@ def test_each_axis_is_stepped_by_itself_well_inside_the_box(preset: str) -> None
 def test_a_box_outside_the_room_is_refused_by_its_axis() -> None:
     config = room()
     with pytest.raises(UsageError, match=r"east: .* -2\.5 to 2\.5 m") as refused:
-        excited(config, design_of(config), parse_box("-1,-3,-2,1,1,-0.4"), lands=False)
+        add_excitation(config, design_of(config), parse_box("-1,-3,-2,1,1,-0.4"), lands=False)
     assert "north" not in str(refused.value)
 
 
 def test_a_fence_of_the_configuration_counts_as_a_wall() -> None:
     config = room('fence=[{state="north",side="upper",times_s=[0.0,5.0],values=[2.0,1.0]}]')
     with pytest.raises(UsageError, match=r"north: .* to 1 m"):
-        excited(config, design_of(config), BOX, lands=False)
+        add_excitation(config, design_of(config), BOX, lands=False)
 
 
 def test_a_box_that_is_too_small_says_how_large_it_must_be() -> None:
     config = room()
     design = design_of(config)
     with pytest.raises(UsageError) as refused:
-        excited(config, design, parse_box("-0.2,-1,-2,0.2,1,-0.4"), lands=False)
+        add_excitation(config, design, parse_box("-0.2,-1,-2,0.2,1,-0.4"), lands=False)
     found = re.search(r"north: .* at least ([\d.]+) m", str(refused.value))
     assert found is not None
     half = float(found[1]) / 2.0
-    excited(config, design, parse_box(f"{-half},-1,-2,{half},1,-0.4"), lands=False)
+    add_excitation(config, design, parse_box(f"{-half},-1,-2,{half},1,-0.4"), lands=False)
     with pytest.raises(UsageError):
-        excited(config, design, parse_box(f"{-half + 0.02},-1,-2,{half - 0.02},1,-0.4"), lands=False)
+        add_excitation(config, design, parse_box(f"{-half + 0.02},-1,-2,{half - 0.02},1,-0.4"), lands=False)
 
 
 def test_a_start_outside_the_box_is_refused() -> None:
@@ -106,8 +119,8 @@ def test_a_pinned_axis_moves_as_its_model_with_these_values() -> None:
         "noise_m": 0.01,
         "drift_mps2_rts": 0.02,
     }
-    pinned = PinnedAxis(model, {"lag_s": 0.2, "gain": 0.9, "unknown": 1.0})
-    whole, fitted = places(model, values)[None], places(pinned, values)[None]
+    pinned = PinnedAxisModel(model, {"lag_s": 0.2, "gain": 0.9, "unknown": 1.0})
+    whole, fitted = make_parameters(model, values)[None], make_parameters(pinned, values)[None]
     assert fitted.shape[1] == whole.shape[1] - 2
     for one, other in zip(model.motion(whole), pinned.motion(fitted), strict=True):
         assert one == pytest.approx(other)
@@ -123,7 +136,7 @@ def flight() -> tuple[Config, FlightData, Identification]:
     )
     memory = lockstep("room", 30.0, *overrides)
     config = load_config("room", overrides)
-    found = identify(from_records(memory.entries), config, lambda: None)
+    found = identify(read_recorded_history(memory.entries), config, lambda: None)
     return config, FlightData.from_records(memory.entries), found
 
 
@@ -134,11 +147,11 @@ def rows(told: TunedResult, key: str) -> list[Change]:
 @pytest.mark.slow
 def test_a_flight_changes_what_it_tells_and_predicts_better(flight: tuple[Config, FlightData, Identification]) -> None:
     config, _, found = flight
-    made = tuned(config, found)
+    made = tune_config(config, found)
     told = made.result
     assert told.new_errors.overall_m < 0.6 * told.old_errors.overall_m
     for row in rows(told, "plant.lag_s")[:2] + rows(told, "plant.drag_1ps"):
-        assert row.changed and row.new == row.flight
+        assert row.is_changed and row.new == row.flight
     assert made.config.plant.drag_1ps == tuple(one.new for one in rows(told, "plant.drag_1ps"))
     assert made.config.plant.drag_1ps[0] == pytest.approx(0.25, abs=0.05)
     # A calm half minute lowers no noise, and a link that was as believed stays so.
@@ -157,19 +170,19 @@ def test_an_axis_that_is_not_predicted_is_kept_with_the_reason(
     north, *others = found.result.response
     doubtful = (msgspec.structs.replace(north, r2=0.3), *others)
     result = msgspec.structs.replace(found.result, response=doubtful)
-    made = tuned(config, dataclasses.replace(found, result=result))
+    made = tune_config(config, dataclasses.replace(found, result=result))
     for key in ("plant.lag_s", "plant.drag_1ps", "plant.gain"):
         row = rows(made.result, key)[0]
-        assert not row.changed and "30 %" in row.reason
+        assert not row.is_changed and "30 %" in row.reason
         assert rows(made.result, key)[1].reason != row.reason
 
 
 @pytest.mark.slow
 def test_a_dead_time_that_is_not_told_is_kept(flight: tuple[Config, FlightData, Identification]) -> None:
     config, _, found = flight
-    flat = msgspec.structs.replace(found.result.candidates[0], dead_time_range_s=(0.02, 0.021 + MOST_DEAD_RANGE_S))
+    flat = msgspec.structs.replace(found.result.candidates[0], dead_time_range_s=(0.02, 0.021 + MAX_DEAD_TIME_RANGE_S))
     result = msgspec.structs.replace(found.result, candidates=(flat,))
-    made = tuned(config, dataclasses.replace(found, result=result))
+    made = tune_config(config, dataclasses.replace(found, result=result))
     assert made.config.plant.dead_time_s == config.plant.dead_time_s
     assert made.config.plant.drag_1ps != config.plant.drag_1ps
 
@@ -184,7 +197,7 @@ def test_noise_and_losses_that_were_worse_are_raised(flight: tuple[Config, Fligh
         link=replace(config.link, loss=0.1, jitter_s=0.0),
         estimator=replace(config.estimator, position_std_m=1e-4),
     )
-    made = tuned(hopeful, found).config
+    made = tune_config(hopeful, found).config
     assert made.plant.wind_std_mps2 == found.config.plant.wind_std_mps2
     assert made.estimator.position_std_m == found.config.estimator.position_std_m
     assert made.link.loss == pytest.approx(0.3, abs=0.08)
@@ -196,16 +209,16 @@ def test_a_computer_that_stood_still_is_no_link(flight: tuple[Config, FlightData
     config, _, found = flight
     stalled = dataclasses.replace(found, link=dataclasses.replace(found.link, jitter_s=3.0))
     late = dataclasses.replace(found, link=dataclasses.replace(found.link, jitter_s=0.1))
-    assert tuned(config, stalled).config.link.jitter_s == config.link.jitter_s
-    assert "stood still" in rows(tuned(config, stalled).result, "link.jitter_s")[0].reason
-    assert tuned(config, late).config.link.jitter_s == pytest.approx(0.1, abs=0.005)
+    assert tune_config(config, stalled).config.link.jitter_s == config.link.jitter_s
+    assert "stood still" in rows(tune_config(config, stalled).result, "link.jitter_s")[0].reason
+    assert tune_config(config, late).config.link.jitter_s == pytest.approx(0.1, abs=0.005)
 
 
 @pytest.mark.slow
 def test_a_model_that_predicts_no_better_changes_nothing(flight: tuple[Config, FlightData, Identification]) -> None:
     config, _, found = flight
     fitted = msgspec.structs.replace(config, plant=found.config.plant)
-    told = tuned(fitted, found).result
+    told = tune_config(fitted, found).result
     assert told.new_errors.overall_m <= told.old_errors.overall_m
     assert told.new_errors.overall_m == pytest.approx(told.old_errors.overall_m, rel=0.05)
 
@@ -213,39 +226,39 @@ def test_a_model_that_predicts_no_better_changes_nothing(flight: tuple[Config, F
 @pytest.mark.slow
 def test_the_hold_is_judged_where_the_vehicle_truly_was(flight: tuple[Config, FlightData, Identification]) -> None:
     _, flown, _ = flight
-    figures = figures_of(flown, "flight", 0, BOX)
+    figures = compute_flight_figures(flown, "flight", 0, BOX)
     assert figures.judged_by == "truth"
     assert figures.hold_s > 2.0
     assert figures.hold_rms_m is not None and 0.0 < figures.hold_rms_m < 0.1
     truth = np.array([one.state for one in flown.truths])[:, list(flown.design.position_index)]
     inside = np.minimum(truth - np.array(BOX.lower), np.array(BOX.upper) - truth).min()
     assert figures.beyond_box_m == pytest.approx(-inside, abs=0.03)
-    wrong = plan_errors_m(flown)
+    wrong = compute_plan_errors_m(flown)
     assert len(wrong) > 300 and 0.001 < float(np.median(wrong)) < 0.1
 
 
 def test_a_folder_goes_on_and_refuses_other_runs(tmp_path: Path) -> None:
-    folder = TuneFolder.opened(tmp_path / "run", room(), ASKED)
-    folder.note(before="before/flight.mcap")
-    again = TuneFolder.opened(tmp_path / "run", room(), ASKED)
+    folder = TuneFolder.open(tmp_path / "run", room(), ASKED)
+    folder.save_progress(before="before/flight.mcap")
+    again = TuneFolder.open(tmp_path / "run", room(), ASKED)
     assert again.progress.before == "before/flight.mcap"
     with pytest.raises(UsageError, match=r"link\.loss = 0\.3 there, 0\.4 here"):
-        TuneFolder.opened(tmp_path / "run", room("link.loss=0.4"), ASKED)
+        TuneFolder.open(tmp_path / "run", room("link.loss=0.4"), ASKED)
     with pytest.raises(UsageError, match="--box=b"):
-        TuneFolder.opened(tmp_path / "run", room(), msgspec.structs.replace(ASKED, box="other"))
+        TuneFolder.open(tmp_path / "run", room(), msgspec.structs.replace(ASKED, box="other"))
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "notes.txt").write_text("mine")
     with pytest.raises(UsageError, match="no run"):
-        TuneFolder.opened(tmp_path / "other", room(), ASKED)
-    (tmp_path / "run" / STATE).write_text("{")
+        TuneFolder.open(tmp_path / "other", room(), ASKED)
+    (tmp_path / "run" / STATE_FILE).write_text("{")
     with pytest.raises(UsageError, match="cannot be read"):
-        TuneFolder.opened(tmp_path / "run", room(), ASKED)
+        TuneFolder.open(tmp_path / "run", room(), ASKED)
 
 
 def test_attempts_have_folders_of_their_own(tmp_path: Path) -> None:
-    folder = TuneFolder.opened(tmp_path, room(), ASKED)
-    folder.free("before").mkdir()
-    assert folder.free("before").name == "before-2"
-    assert folder.relative(tmp_path / "before" / "flight.mcap") == "before/flight.mcap"
-    assert folder.recording("before/flight.mcap") == tmp_path / "before" / "flight.mcap"
-    assert folder.recording("/else/flight.mcap") == Path("/else/flight.mcap")
+    folder = TuneFolder.open(tmp_path, room(), ASKED)
+    folder.find_free_folder("before").mkdir()
+    assert folder.find_free_folder("before").name == "before-2"
+    assert folder.make_relative(tmp_path / "before" / "flight.mcap") == "before/flight.mcap"
+    assert folder.get_recording_path("before/flight.mcap") == tmp_path / "before" / "flight.mcap"
+    assert folder.get_recording_path("/else/flight.mcap") == Path("/else/flight.mcap")

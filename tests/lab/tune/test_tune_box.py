@@ -16,9 +16,9 @@ from sim.simulation import World
 from sim.vehicle.airframe import CRAZYFLIE_2
 from uavctl.build.controller import build_controller, design_of
 from uavctl.config import Config, load_config
-from uavctl.lab.trial import FlightTally, beyond_m
-from uavctl.lab.tune.box_monitor import SMALLEST, BoxMonitor
-from uavctl.lab.tune.excitation import HOLD_S, LEAST_WAY_M, PAUSE_S, SafeBox, excited, parse_box
+from uavctl.lab.trial import FlightCounts, compute_excess_m
+from uavctl.lab.tune.box_monitor import MIN_REPEAT_SHARE, BoxMonitor
+from uavctl.lab.tune.excitation import HOLD_S, MIN_STEP_M, PAUSE_S, SafeBox, add_excitation, parse_box
 from uavctl.loop import ControlLoop
 from uavctl.records import Command, ControlMode, Decision, Estimate, Event, Order, Send, Severity, Ticked, Vec3
 
@@ -54,8 +54,8 @@ def fly(
     assert defaults is not None
     patch.setitem(defaults, "airframe", replace(CRAZYFLIE_2, rotor_drag_kg=(front, right, down)))
     patch.setattr(simulation, "Quadrotor", type("True", (TrueVehicle,), {"gain": gain, "lag_s": lag_s}))
-    made = excited(config, design_of(config), box, lands=False)
-    loop = ControlLoop(made, build_controller(made), FlightTally(), lambda: 0)
+    made = add_excitation(config, design_of(config), box, lands=False)
+    loop = ControlLoop(made, build_controller(made), FlightCounts(), lambda: 0)
     monitor, beyond = BoxMonitor(made, box), [-np.inf]
     sides = np.array(box.lower), np.array(box.upper)
 
@@ -63,9 +63,9 @@ def fly(
         receive = staticmethod(loop.receive)
 
         def tick(self, tick: int, at_ns: int, send: Send) -> None:
-            monitor.follow(loop, loop.tick(tick, at_ns, send))
-            if not monitor.why:
-                beyond.append(float(beyond_m(np.array([vehicle.position_m]), *sides)[0]))
+            monitor.handle_tick(loop, loop.tick(tick, at_ns, send))
+            if not monitor.reason:
+                beyond.append(float(compute_excess_m(np.array([vehicle.position_m]), *sides)[0]))
 
     world = World(made, Followed())
     vehicle = world.peers.vehicle
@@ -85,17 +85,14 @@ def test_an_unknown_drag_stays_well_inside_the_box(monkeypatch: pytest.MonkeyPat
 def test_a_motion_that_comes_too_near_is_repeated_smaller(monkeypatch: pytest.MonkeyPatch) -> None:
     # PX4 with 0.15 s more of lag: 0.25 m beyond the box in the first 8 s without the monitor.
     monitor = fly(monkeypatch, "room-px4", BOX, over_s=14.0, drag=0.24, gain=0.8, lag_s=0.15)
-    assert monitor.repeated > 0 and not monitor.why
+    assert monitor.repeated > 0 and not monitor.reason
 
 
 @pytest.mark.slow
 def test_a_flight_whose_smallest_motion_does_not_fit_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
     # ArduPilot with 0.3 s more of lag: unstable, and 0.6 m beyond the box within 11 s without the monitor.
     monitor = fly(monkeypatch, "room-ardupilot", SMALL, over_s=12.0, drag=0.24, gain=1.2, lag_s=0.3)
-    assert "north" in monitor.why
-
-
-# The monitor alone
+    assert "north" in monitor.reason
 
 
 @dataclass
@@ -134,7 +131,7 @@ class Orders:
         decision = cast(Decision, SimpleNamespace(at_ns=at_ns, mode=ControlMode.TRACK, waypoint=waypoint))
         estimate = Estimate(at_ns=at_ns, captured_ns=at_ns, mean=tuple(mean.tolist()), cov=())
         ticked = cast(Ticked, SimpleNamespace(decision=decision, estimate=estimate, answers=answered))
-        self.monitor.follow(cast(ControlLoop, self), ticked)
+        self.monitor.handle_tick(cast(ControlLoop, self), ticked)
 
     @property
     def place(self) -> Vec3:
@@ -146,7 +143,7 @@ class Orders:
 @pytest.fixture(params=["room-px4", "room-ardupilot"])
 def orders(request: pytest.FixtureRequest) -> Orders:
     config = load_config(request.param, ("sim.plant=quadrotor",))
-    return Orders(excited(config, design_of(config), BOX, lands=True), BOX)
+    return Orders(add_excitation(config, design_of(config), BOX, lands=True), BOX)
 
 
 def test_a_flight_that_stays_inside_gets_no_order(orders: Orders) -> None:
@@ -172,7 +169,7 @@ def test_what_cannot_stop_at_half_the_deceleration_is_turned_back_and_repeated_a
     assert len(orders.given) == 1
     orders.see(0.0, 0.0, dt_s=PAUSE_S)
     assert orders.place == pytest.approx((0.5 * first[0], *CENTRE[1:]), abs=1e-3)
-    assert orders.monitor.repeated == 1 and not orders.monitor.why
+    assert orders.monitor.repeated == 1 and not orders.monitor.reason
     orders.see(orders.place[0], 0.0)
     orders.see(orders.place[0], 0.0, dt_s=PAUSE_S)
     second = orders.config.mission.waypoints[1]
@@ -193,12 +190,12 @@ def test_a_motion_too_small_to_tell_anything_ends_the_flight(orders: Orders) -> 
     for _ in range(9):
         orders.see(1.4, 0.0, waypoint=0)
         orders.see(0.5, -0.5, waypoint=0)
-        if orders.monitor.why:
+        if orders.monitor.reason:
             break
         size *= 0.5
-        assert size >= SMALLEST * LEAST_WAY_M[0]
-    assert orders.given[-1].order is Order.LAND and "north" in orders.monitor.why
-    assert 0.5 * size < SMALLEST * LEAST_WAY_M[0]
+        assert size >= MIN_REPEAT_SHARE * MIN_STEP_M[0]
+    assert orders.given[-1].order is Order.LAND and "north" in orders.monitor.reason
+    assert 0.5 * size < MIN_REPEAT_SHARE * MIN_STEP_M[0]
     given = len(orders.given)
     orders.see(1.4, 1.0)
     assert len(orders.given) == given
@@ -206,7 +203,7 @@ def test_a_motion_too_small_to_tell_anything_ends_the_flight(orders: Orders) -> 
 
 def test_what_leaves_the_box_is_landed_at_once(orders: Orders) -> None:
     orders.see(1.49, 0.2, waypoint=5)
-    assert [one.order for one in orders.given] == [Order.LAND] and orders.monitor.why
+    assert [one.order for one in orders.given] == [Order.LAND] and orders.monitor.reason
 
 
 def test_the_rest_is_flown_by_orders_up_to_the_landing(orders: Orders) -> None:
@@ -221,7 +218,7 @@ def test_the_rest_is_flown_by_orders_up_to_the_landing(orders: Orders) -> None:
     orders.see(0.0, 0.0)
     orders.see(0.0, 0.0, dt_s=HOLD_S)
     assert orders.given[-1].order is Order.LAND
-    assert not orders.monitor.why
+    assert not orders.monitor.reason
 
 
 def test_motions_that_no_longer_fit_in_the_time_are_left_out(orders: Orders) -> None:
@@ -243,7 +240,7 @@ def test_an_order_of_a_person_ends_the_monitor(orders: Orders, order: Order) -> 
 @pytest.mark.parametrize("preset", ["room", "room-px4", "room-ardupilot"])
 def test_each_axis_begins_with_its_smaller_steps(preset: str) -> None:
     config = load_config(preset, ("sim.plant=quadrotor",))
-    points = np.array(excited(config, design_of(config), BOX, lands=False).mission.waypoints)
+    points = np.array(add_excitation(config, design_of(config), BOX, lands=False).mission.waypoints)
     steps = np.abs(np.diff(points, axis=0))
     for axis in range(3):
         alone = (steps[:, axis] > 0.0) & (np.delete(steps, axis, axis=1).max(axis=1) == 0.0)

@@ -21,16 +21,16 @@ from uavctl.config import Config, load_config
 from uavctl.config.load import parse
 from uavctl.lab.tune.excitation import parse_box
 from uavctl.lab.tune.run_folder import (
-    AFTER,
-    BEFORE,
-    FIT_PAGE,
-    PAGE,
-    SETTINGS,
-    STATE,
-    TUNED,
-    TuneAsked,
+    AFTER_FOLDER,
+    BEFORE_FOLDER,
+    FIT_PAGE_FILE,
+    PAGE_FILE,
+    SETTINGS_FILE,
+    STATE_FILE,
+    TUNED_FILE,
     TuneFolder,
-    sole_run,
+    TuneSettings,
+    lock_run,
 )
 
 PILOT = 'sim.fault=[{at_s=6.0,kind="mode",name="POSCTL"}]'
@@ -62,9 +62,9 @@ def begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.slow
 def test_a_run_leaves_flights_configuration_and_pages(done: Path) -> None:
-    for name in (TUNED, PAGE, FIT_PAGE, STATE):
+    for name in (TUNED_FILE, PAGE_FILE, FIT_PAGE_FILE, STATE_FILE):
         assert (done / name).is_file()
-    state = json.loads((done / STATE).read_text())
+    state = json.loads((done / STATE_FILE).read_text())
     before, after = state["comparison"]["before"], state["comparison"]["after"]
     assert before["hold_s"] > 2.0 and after["hold_s"] > 2.0
     assert after["beyond_box_m"] < 0.0 and before["beyond_box_m"] < 0.0
@@ -74,26 +74,28 @@ def test_a_run_leaves_flights_configuration_and_pages(done: Path) -> None:
 
 @pytest.mark.slow
 def test_all_files_of_a_recording_are_read(done: Path) -> None:
-    first = done / BEFORE / "flight.mcap"
+    first = done / BEFORE_FOLDER / "flight.mcap"
     assert len(segment_files(first)) > 1
-    state = json.loads((done / STATE).read_text())
+    state = json.loads((done / STATE_FILE).read_text())
     assert state["comparison"]["before"]["flown_s"] > 25.0
 
 
 @pytest.mark.slow
 def test_the_second_flight_is_the_same_mission_with_the_tuned_configuration(done: Path) -> None:
-    flown = [parse(header(done / name / "flight.mcap").config_toml, name).config for name in (BEFORE, AFTER)]
-    made = load_config(str(done / TUNED))
+    flown = [
+        parse(header(done / name / "flight.mcap").config_toml, name).config for name in (BEFORE_FOLDER, AFTER_FOLDER)
+    ]
+    made = load_config(str(done / TUNED_FILE))
     assert flown[0].mission == flown[1].mission and flown[0].fence == flown[1].fence
     assert flown[1].plant == made.plant and flown[1].cost == made.cost
     assert made.plant != flown[0].plant
     assert made.mission.waypoints == () and made.fence == ()
-    assert "plant.dead_time_s" in (done / TUNED).read_text().split("\n\n")[0]
+    assert "plant.dead_time_s" in (done / TUNED_FILE).read_text().split("\n\n")[0]
 
 
 @pytest.mark.slow
 def test_the_page_has_its_pictures_in_words(done: Path) -> None:
-    page = (done / PAGE).read_text()
+    page = (done / PAGE_FILE).read_text()
     figures = re.findall(r'<figure id="([\w-]+)"', page)
     assert {"held", "growing-first", "growing-second", "motion-north", "motion-east", "motion-down"} <= set(figures)
     assert page.count('aria-label="') >= len(figures)
@@ -101,36 +103,36 @@ def test_the_page_has_its_pictures_in_words(done: Path) -> None:
 
 @pytest.mark.slow
 def test_a_run_that_is_done_flies_no_more(done: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    stamp = (done / STATE).read_bytes()
+    stamp = (done / STATE_FILE).read_bytes()
     with short_flights():
         code, out, _ = typed(capsys, *words(done, "--set", "log.segment_bytes=1000000", "--json"))
     assert code == 0
     document = json.loads(out)
-    assert document["config"] == str(done / TUNED) and document["stopped"] == ""
-    assert (done / STATE).read_bytes() == stamp
-    assert not (done / f"{BEFORE}-2").exists() and not (done / f"{AFTER}-2").exists()
+    assert document["config"] == str(done / TUNED_FILE) and document["stopped"] == ""
+    assert (done / STATE_FILE).read_bytes() == stamp
+    assert not (done / f"{BEFORE_FOLDER}-2").exists() and not (done / f"{AFTER_FOLDER}-2").exists()
 
 
 @pytest.mark.slow
 def test_a_run_goes_on_after_the_last_step_that_is_done(
     done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    state = json.loads((done / STATE).read_text())
+    state = json.loads((done / STATE_FILE).read_text())
     folder = tmp_path / "run"
     folder.mkdir()
-    (folder / STATE).write_text(
+    (folder / STATE_FILE).write_text(
         json.dumps(
             {**state, "before": str(done / state["before"]), "after": str(done / state["after"]), "comparison": None}
         )
     )
-    (folder / TUNED).write_bytes((done / TUNED).read_bytes())
+    (folder / TUNED_FILE).write_bytes((done / TUNED_FILE).read_bytes())
     monkeypatch.setattr(tune_cmd, "fly_once", lambda *_, **__: pytest.fail("flown again"))
     with short_flights():
         code, _, _ = typed(capsys, *words(folder, "--set", "log.segment_bytes=1000000"))
     assert code == 0
-    again = json.loads((folder / STATE).read_text())["comparison"]
+    again = json.loads((folder / STATE_FILE).read_text())["comparison"]
     assert again["new_errors"] == state["comparison"]["new_errors"]
-    assert (folder / PAGE).is_file()
+    assert (folder / PAGE_FILE).is_file()
 
 
 def test_another_configuration_is_refused_by_its_key(begun: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -158,8 +160,8 @@ def test_the_pilots_stick_stops_the_run_and_the_next_try_is_a_new_flight(
         assert "pilot" in document["stopped"].lower() and str(folder) in err
         monkeypatch.setattr(tune_cmd, "fly_once", pressed)
         assert run(words(folder, "--set", PILOT)) == tune_cmd.INTERRUPTED
-    assert (folder / BEFORE / "flight.mcap").exists() and tries == [folder / f"{BEFORE}-2"]
-    assert not (folder / TUNED).exists()
+    assert (folder / BEFORE_FOLDER / "flight.mcap").exists() and tries == [folder / f"{BEFORE_FOLDER}-2"]
+    assert not (folder / TUNED_FILE).exists()
 
 
 @pytest.mark.slow
@@ -178,14 +180,14 @@ def test_ctrl_c_ends_the_flight_and_the_run(
     document = json.loads(out)
     assert code == document["exit_code"] == tune_cmd.INTERRUPTED
     assert document["before"] == "" and "operator" in document["stopped"]
-    assert (folder / BEFORE / "flight.mcap").exists()
+    assert (folder / BEFORE_FOLDER / "flight.mcap").exists()
 
 
 @pytest.mark.slow
 def test_a_recording_takes_the_place_of_the_first_flight(
     done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    flight, folder = done / BEFORE / "flight.mcap", tmp_path / "run"
+    flight, folder = done / BEFORE_FOLDER / "flight.mcap", tmp_path / "run"
     asked: list[Config] = []
 
     def pressed(config: Config, *_: object, **__: object) -> None:
@@ -197,8 +199,8 @@ def test_a_recording_takes_the_place_of_the_first_flight(
     code, out, _ = typed(capsys, *arguments, "--json")
     assert code == tune_cmd.INTERRUPTED
     document = json.loads(out)
-    assert Path(document["before"]) == flight.absolute() and document["config"] == str(folder / TUNED)
-    assert not (folder / BEFORE).exists()
+    assert Path(document["before"]) == flight.absolute() and document["config"] == str(folder / TUNED_FILE)
+    assert not (folder / BEFORE_FOLDER).exists()
     (second,) = asked
     assert second.mission.waypoints == parse(header(flight).config_toml, "flight").config.mission.waypoints
 
@@ -236,9 +238,6 @@ def test_nobody_to_agree_is_a_no(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert [tune_cmd.ask_agreement(), tune_cmd.ask_agreement()] == [False, True]
 
 
-# What a careless user does
-
-
 @pytest.fixture
 def copy(done: Path, tmp_path: Path) -> Callable[..., Path]:
     """The run as it was before some of its steps were noted."""
@@ -246,8 +245,8 @@ def copy(done: Path, tmp_path: Path) -> Callable[..., Path]:
     def make(**noted: object) -> Path:
         folder = tmp_path / "copy"
         shutil.copytree(done, folder)
-        state = json.loads((folder / STATE).read_text())
-        (folder / STATE).write_text(json.dumps({**state, "comparison": None, **noted}))
+        state = json.loads((folder / STATE_FILE).read_text())
+        (folder / STATE_FILE).write_text(json.dumps({**state, "comparison": None, **noted}))
         return folder
 
     return make
@@ -273,17 +272,17 @@ def test_flights_that_came_to_their_end_count_though_nobody_was_left_to_note_the
     code, out, _ = again(capsys, folder)
     document = json.loads(out)
     assert (code, document["stopped"]) == (0, "")
-    there = json.loads((done / STATE).read_text())
+    there = json.loads((done / STATE_FILE).read_text())
     assert (document["before"], document["after"]) == (there["before"], there["after"])
     assert document["comparison"]["new_errors"] == there["comparison"]["new_errors"]
 
 
 @pytest.mark.slow
 def test_a_flight_of_another_configuration_or_without_its_end_does_not_count(done: Path, tmp_path: Path) -> None:
-    config = parse(header(done / BEFORE / "flight.mcap").config_toml, "before").config
-    assert find_complete_flight(config, done / BEFORE) == done / BEFORE / "flight.mcap"
-    assert find_complete_flight(config, done / AFTER) is None and find_complete_flight(config, tmp_path) is None
-    (tmp_path / "flight.mcap").write_bytes((done / BEFORE / "flight.mcap").read_bytes())  # its first file alone
+    config = parse(header(done / BEFORE_FOLDER / "flight.mcap").config_toml, "before").config
+    assert find_complete_flight(config, done / BEFORE_FOLDER) == done / BEFORE_FOLDER / "flight.mcap"
+    assert find_complete_flight(config, done / AFTER_FOLDER) is None and find_complete_flight(config, tmp_path) is None
+    (tmp_path / "flight.mcap").write_bytes((done / BEFORE_FOLDER / "flight.mcap").read_bytes())  # its first file alone
     assert find_complete_flight(config, tmp_path) is None
 
 
@@ -292,14 +291,14 @@ def test_a_tuned_configuration_that_was_cut_is_not_flown(begun: Path, capsys: py
     ranges = {"dead_time_range_s": [0.0, 0.1], "old_errors": errors, "new_errors": errors}
     link = {"link_loss": 0.0, "link_bursts": False, "link_delay_s": 0.0, "link_jitter_s": 0.0}
     noted = {"before": "before/flight.mcap", "tuned": {"changes": [], "warnings": [], **ranges, **link}}
-    state = json.loads((begun / STATE).read_text())
-    (begun / STATE).write_text(json.dumps({**state, **noted}))
-    lines = (begun / SETTINGS).read_text().splitlines(keepends=True)
+    state = json.loads((begun / STATE_FILE).read_text())
+    (begun / STATE_FILE).write_text(json.dumps({**state, **noted}))
+    lines = (begun / SETTINGS_FILE).read_text().splitlines(keepends=True)
     cut = "".join(lines[: len(lines) // 2])
-    (begun / TUNED).write_text(cut)
+    (begun / TUNED_FILE).write_text(cut)
     code, out, err = again(capsys, begun)
-    assert (code, json.loads(out)["exit_code"]) == (2, 2) and str(begun / TUNED) in " ".join(err.split())
-    assert (begun / TUNED).read_text() == cut and not (begun / AFTER).exists()
+    assert (code, json.loads(out)["exit_code"]) == (2, 2) and str(begun / TUNED_FILE) in " ".join(err.split())
+    assert (begun / TUNED_FILE).read_text() == cut and not (begun / AFTER_FOLDER).exists()
 
 
 @pytest.mark.slow
@@ -319,30 +318,30 @@ def test_ctrl_c_beside_a_flight_keeps_what_is_done(
 
 
 def test_a_second_run_in_the_same_folder_is_refused(begun: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    stamp = (begun / STATE).read_bytes()
-    with sole_run(begun):
+    stamp = (begun / STATE_FILE).read_bytes()
+    with lock_run(begun):
         code, out, err = again(capsys, begun)
     assert (code, json.loads(out)["exit_code"]) == (2, 2) and "--folder" in err
-    assert (begun / STATE).read_bytes() == stamp
+    assert (begun / STATE_FILE).read_bytes() == stamp
 
 
 def test_a_folder_that_takes_no_more_is_told_before_a_flight(begun: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    stamp = (begun / STATE).read_bytes()
-    (begun / f"{STATE}.part").mkdir()  # root may write into any folder; nobody writes a file over this one
+    stamp = (begun / STATE_FILE).read_bytes()
+    (begun / f"{STATE_FILE}.part").mkdir()  # root may write into any folder; nobody writes a file over this one
     code, out, err = again(capsys, begun)
-    assert (code, json.loads(out)["exit_code"]) == (1, 1) and STATE in err
-    assert (begun / STATE).read_bytes() == stamp
+    assert (code, json.loads(out)["exit_code"]) == (1, 1) and STATE_FILE in err
+    assert (begun / STATE_FILE).read_bytes() == stamp
 
 
 def test_a_folder_that_was_cut_off_at_its_first_file_is_begun_anew(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     folder.mkdir()
-    (folder / f"{STATE}.part").write_text("{")
-    asked = TuneAsked(box="b", flight="", simulated=True, take_off_m=None)
-    TuneFolder.opened(folder, load_config("room"), asked)
-    (folder / SETTINGS).unlink()
-    TuneFolder.opened(folder, load_config("room"), asked)
-    assert (folder / STATE).is_file() and (folder / SETTINGS).is_file()
+    (folder / f"{STATE_FILE}.part").write_text("{")
+    asked = TuneSettings(box="b", flight="", simulated=True, take_off_m=None)
+    TuneFolder.open(folder, load_config("room"), asked)
+    (folder / SETTINGS_FILE).unlink()
+    TuneFolder.open(folder, load_config("room"), asked)
+    assert (folder / STATE_FILE).is_file() and (folder / SETTINGS_FILE).is_file()
 
 
 @pytest.mark.parametrize("content", [b"", b"no recording", b"\x89MCAP0\r\n"])

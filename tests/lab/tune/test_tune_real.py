@@ -17,7 +17,7 @@ from uavctl.config import load_config
 from uavctl.config.load import parse
 from uavctl.daemon.lock import lock_vehicle
 from uavctl.errors import NotReachedError, VehicleTakenError
-from uavctl.lab.tune.run_folder import AFTER, BEFORE, FIT_PAGE, PAGE, STATE, TUNED
+from uavctl.lab.tune.run_folder import AFTER_FOLDER, BEFORE_FOLDER, FIT_PAGE_FILE, PAGE_FILE, STATE_FILE, TUNED_FILE
 from uavctl.mavlink.handover_states import HandoverState
 
 STICK = "POSCTL"
@@ -78,7 +78,7 @@ def test_the_pilots_stick_in_the_climb_stops_the_run(in_the_climb: tuple[Tuned, 
     assert result.code == result.document["exit_code"] == tune_cmd.PILOT
     assert CAUSES[Cause.PILOT].phrase in result.document["stopped"].lower() and result.document["before"] == ""
     assert not result.flies_after(since_ns)
-    assert (folder / BEFORE / "flight.mcap").exists()
+    assert (folder / BEFORE_FOLDER / "flight.mcap").exists()
 
 
 @pytest.mark.slow
@@ -87,54 +87,56 @@ def test_it_goes_on_with_a_new_flight_and_the_stick_stops_that_too(under_way: tu
     assert result.code == result.document["exit_code"] == tune_cmd.PILOT
     assert CAUSES[Cause.PILOT_LANDED].phrase in result.document["stopped"].lower() and result.document["before"] == ""
     assert result.flies_after(0) and not result.flies_after(since_ns)
-    assert (folder / f"{BEFORE}-2" / "flight.mcap").exists()
+    assert (folder / f"{BEFORE_FOLDER}-2" / "flight.mcap").exists()
     assert not result.rig.peers.autopilot.pilot.is_armed
 
 
 @pytest.mark.slow
 def test_a_no_at_enter_stops_before_the_second_flight(not_agreed: Tuned, folder: Path) -> None:
     assert not_agreed.code == not_agreed.document["exit_code"] == tune_cmd.INTERRUPTED
-    assert not_agreed.document["before"] == f"{BEFORE}-3/flight.mcap" and not_agreed.document["after"] == ""
-    assert not_agreed.document["config"] == str(folder / TUNED) and not_agreed.document["stopped"]
+    assert not_agreed.document["before"] == f"{BEFORE_FOLDER}-3/flight.mcap" and not_agreed.document["after"] == ""
+    assert not_agreed.document["config"] == str(folder / TUNED_FILE) and not_agreed.document["stopped"]
     assert str(folder) in not_agreed.told
-    assert (folder / TUNED).exists() and (folder / FIT_PAGE).exists() and not (folder / AFTER).exists()
+    assert (folder / TUNED_FILE).exists() and (folder / FIT_PAGE_FILE).exists() and not (folder / AFTER_FOLDER).exists()
     assert not not_agreed.rig.peers.autopilot.pilot.is_armed
 
 
 @pytest.mark.slow
 def test_ctrl_c_at_enter_is_a_no_too(not_agreed: Tuned, folder: Path) -> None:
-    stamp = (folder / STATE).read_bytes()
+    stamp = (folder / STATE_FILE).read_bytes()
     again = fly_real(real_rig(), folder, enter=KeyboardInterrupt)
     assert again.code == again.document["exit_code"] == tune_cmd.INTERRUPTED
     assert again.document["stopped"] and str(folder) in again.told
-    assert not again.rig.sent and (folder / STATE).read_bytes() == stamp
+    assert not again.rig.sent and (folder / STATE_FILE).read_bytes() == stamp
 
 
 @pytest.mark.slow
 def test_the_stick_in_the_second_flight_keeps_what_is_done(in_the_second: tuple[Tuned, int], folder: Path) -> None:
     result, since_ns = in_the_second
     assert result.code == result.document["exit_code"] == tune_cmd.PILOT
-    assert result.document["before"] == f"{BEFORE}-3/flight.mcap" and result.document["after"] == ""
+    assert result.document["before"] == f"{BEFORE_FOLDER}-3/flight.mcap" and result.document["after"] == ""
     assert result.flies_after(0) and not result.flies_after(since_ns)
-    assert (folder / AFTER / "flight.mcap").exists() and (folder / TUNED).exists()
+    assert (folder / AFTER_FOLDER / "flight.mcap").exists() and (folder / TUNED_FILE).exists()
 
 
 @pytest.mark.slow
 def test_it_comes_to_its_end(done: Tuned, folder: Path) -> None:
     assert (done.code, done.document["stopped"]) == (0, "")
-    assert done.document["after"] == f"{AFTER}-2/flight.mcap" and (folder / PAGE).exists()
+    assert done.document["after"] == f"{AFTER_FOLDER}-2/flight.mcap" and (folder / PAGE_FILE).exists()
     comparison = done.document["comparison"]
     assert comparison["new_errors"]["rms_m"][0][3] < comparison["old_errors"]["rms_m"][0][3]
     assert comparison["after"]["hold_s"] > 2.0 and comparison["after"]["judged_by"] == "estimate"
     assert not done.rig.peers.autopilot.pilot.is_armed
-    before, after = (parse(recorded(folder, f"{name}"), name).config for name in (f"{BEFORE}-3", f"{AFTER}-2"))
+    before, after = (
+        parse(recorded(folder, f"{name}"), name).config for name in (f"{BEFORE_FOLDER}-3", f"{AFTER_FOLDER}-2")
+    )
     assert before.mission == after.mission and before.mission.then == "land" and before.plant != after.plant
 
 
 def test_a_vehicle_that_stands_outside_of_the_box_is_not_flown(tmp_path: Path) -> None:
     result = fly_real(real_rig("sim.start_position_m=[1.9,0.0,-0.7]"), tmp_path / "run")
     assert result.code == 2 and "north" in result.told and "1.9" in result.told
-    assert not result.flies_after(0) and not (tmp_path / "run" / BEFORE).exists()
+    assert not result.flies_after(0) and not (tmp_path / "run" / BEFORE_FOLDER).exists()
 
 
 def test_without_positions_nothing_is_flown(tmp_path: Path) -> None:
@@ -142,7 +144,7 @@ def test_without_positions_nothing_is_flown(tmp_path: Path) -> None:
     result = fly_real(rig, tmp_path / "run")
     assert result.code == NotReachedError.exit_code and "uavctl check" in result.told
     assert not result.flies_after(0) and rig.now_ns >= tune_flights.LISTEN_S * 1e9
-    assert not (tmp_path / "run" / BEFORE).exists()
+    assert not (tmp_path / "run" / BEFORE_FOLDER).exists()
 
 
 def test_a_vehicle_that_another_daemon_flies_is_not_spoken_to() -> None:
@@ -153,5 +155,5 @@ def test_a_vehicle_that_another_daemon_flies_is_not_spoken_to() -> None:
 
 @pytest.mark.slow
 def test_the_state_is_that_of_the_document(done: Tuned, folder: Path) -> None:
-    state = json.loads((folder / STATE).read_text())
+    state = json.loads((folder / STATE_FILE).read_text())
     assert all(done.document[key] == value for key, value in state.items())

@@ -10,9 +10,9 @@ from loopback_rig import Memory
 from whatif_rig import PAPER, config_of, far, flown, history
 
 from uavctl.build.controller import build_controller, build_problem
-from uavctl.lab.campaign.controllers import BaselineSolver, build, recipe_for
+from uavctl.lab.campaign.controllers import BaselineSolver, build_from_recipe, make_recipe
 from uavctl.lab.campaign.spec import CampaignSpec, ControllerSpec
-from uavctl.lab.whatif.flight import fly, response_of
+from uavctl.lab.whatif.flight import make_response, refly
 from uavctl.records import Plan, Truth
 from uavctl.smpc.batch import News
 
@@ -23,9 +23,9 @@ def test_a_baseline_s_plan_is_what_it_does_in_silence(kind: str) -> None:
     config = config_of(PAPER)
     spec = ControllerSpec(name=kind, kind=kind)
     campaign = CampaignSpec(name="x", config="paper", controller=(spec,))
-    recipe = recipe_for(spec, config, campaign)
-    solver = BaselineSolver(kind, lambda target: (build_problem(config), build(recipe)))
-    alone, problem = build(recipe), build_problem(config)
+    recipe = make_recipe(spec, config, campaign)
+    solver = BaselineSolver(kind, lambda target: (build_problem(config), build_from_recipe(recipe)))
+    alone, problem = build_from_recipe(recipe), build_problem(config)
     alone.begin(1)
     low, high = problem.input_set.bounds
     acted = np.zeros((1, 0, 2))
@@ -50,15 +50,15 @@ def test_a_baseline_s_plan_is_what_it_does_in_silence(kind: str) -> None:
 def test_a_baseline_flies_and_its_plans_say_so() -> None:
     config = config_of(PAPER)
     spec = ControllerSpec(name="lqg", kind="lqg")
-    recipe = recipe_for(spec, config, CampaignSpec(name="x", config="paper", controller=(spec,)))
+    recipe = make_recipe(spec, config, CampaignSpec(name="x", config="paper", controller=(spec,)))
     controller = build_controller(config)
-    solver = BaselineSolver("lqg", lambda target: (build_problem(config), build(recipe)))
+    solver = BaselineSolver("lqg", lambda target: (build_problem(config), build_from_recipe(recipe)))
     memory = Memory()
-    fly(
+    refly(
         history(PAPER),
         config,
         dataclasses.replace(controller, solver=solver),
-        response_of(history(PAPER), config.plant),
+        make_response(history(PAPER), config.plant),
         memory,
         lambda: 0,
     )

@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 from inertial_rig import ATTITUDE, HIGHRES, QUATERNION
 from loopback_rig import Memory
-from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from whatif_rig import Case, again, config_of, flown, history
 
 from logs.recording.topics import encode
+from uavctl.arrays import Array
 from uavctl.build.controller import build_controller
 from uavctl.frames import Quaternion, quaternion_from_euler, rotate_vector
-from uavctl.lab.whatif.comparison import model_fit
-from uavctl.lab.whatif.flight import Relinked, Response, fly, history_of, response_of
-from uavctl.lab.whatif.rewrite import InertialFrames, shifted
+from uavctl.lab.whatif.comparison import fit_model
+from uavctl.lab.whatif.flight import SimulatedLink, VehicleResponse, make_recorded_flight, make_response, refly
+from uavctl.lab.whatif.rewrite import InertialFrames, add_acceleration
 from uavctl.mavlink.codec import decode
 from uavctl.mavlink.framing import RawFrame, scan_frames
 from uavctl.mavlink.vehicle import VehicleMonitor
@@ -88,7 +88,7 @@ def force_of(frame: bytes) -> Vec3:
 def test_a_shifted_specific_force_is_the_acceleration_more(kind: str, resolution: float, first_version: bool) -> None:
     speaker, attitude = Speaker(number=200), turn(LEANING)
     frame = speaker.feels(kind, 5_000_000, (0.31, -0.42, -9.77), first_version=first_version)
-    moved = shifted(frame, attitude, BY)
+    moved = add_acceleration(frame, attitude, BY)
     was, now = (rotate_vector(attitude, force_of(one)) for one in (frame.data, moved))
     assert was is not None and now is not None
     # The rounding of three fields, turned.
@@ -97,12 +97,12 @@ def test_a_shifted_specific_force_is_the_acceleration_more(kind: str, resolution
     assert moved[0] == frame.data[0] and after.get_seq() == 200 and after.get_srcSystem() == 1
     for name in set(before.fieldnames) - {"xacc", "yacc", "zacc"}:
         assert getattr(before, name) == getattr(after, name)
-    assert shifted(frame, attitude, (0.0, 0.0, 0.0)) == frame.data
+    assert add_acceleration(frame, attitude, (0.0, 0.0, 0.0)) == frame.data
 
 
 def test_what_does_not_fit_into_a_message_stays_at_its_end() -> None:
     frame = Speaker().feels("raw_imu", 5_000_000, (310.0, 0.0, -310.0))
-    assert force_of(shifted(frame, (1.0, 0.0, 0.0, 0.0), (50.0, 0.0, -50.0))) == pytest.approx(
+    assert force_of(add_acceleration(frame, (1.0, 0.0, 0.0, 0.0), (50.0, 0.0, -50.0))) == pytest.approx(
         (32767 * MILLI_G_MPS2, 0.0, -32768 * MILLI_G_MPS2)
     )
 
@@ -128,11 +128,11 @@ def test_the_controller_reads_the_acceleration_more(
         said.append(speaker.feels(kind, 1_000_000 + 20_000 * i, (0.3 + 0.1 * i, -0.1 * i, -9.8)))
     for place, frame in enumerate(said):
         at_ns = 10_000_000 * place
-        data = frames.heard(frame, at_ns, BY)
+        data = frames.rewrite(frame, at_ns, BY)
         for bytes_of, watch, heard in ((frame.data, recorded, read[0]), (data, other, read[1])):
             for message in decode(bytes_of).messages:
                 heard += [one for one in watch.handle_message(message, at_ns) if isinstance(one, InertialSample)]
-    assert len(read[0]) == len(read[1]) == frames.moved == 20 and frames.left_out == 0
+    assert len(read[0]) == len(read[1]) == frames.moved == 20 and frames.dropped == 0
     more = [np.subtract(now.accel_mps2, was.accel_mps2) for was, now in zip(*read, strict=True)]
     np.testing.assert_allclose(more, [BY] * 20, atol=math.sqrt(3.0) * resolution)
 
@@ -141,7 +141,7 @@ def test_frames_that_cannot_be_mended_are_left_out_once_the_courses_part() -> No
     speaker, frames = Speaker(), InertialFrames(config_of(LINEAR).daemon)
 
     def heard(frame: RawFrame, at_ms: int, by: Vec3 | None = BY) -> bool:
-        return bool(frames.heard(frame, at_ms * 1_000_000, by))
+        return bool(frames.rewrite(frame, at_ms * 1_000_000, by))
 
     assert heard(speaker.beat(), 0) and heard(speaker.feels("raw_imu", 5000, (0.1, 0.0, -9.8)), 5, None)
     assert not heard(speaker.feels("raw_imu", 10_000, (0.2, 0.0, -9.8)), 10)  # no attitude yet
@@ -151,10 +151,10 @@ def test_frames_that_cannot_be_mended_are_left_out_once_the_courses_part() -> No
     assert not heard(speaker.feels("raw_imu", 45_000, (0.5, 0.0, -9.8)), 145)  # late
     assert not heard(speaker.feels("scaled_imu2", 200_000, (0.5, 0.0, -9.8)), 200)  # the attitude is old
     assert not heard(speaker.feels("highres_imu", 200_000, (0.5, 0.0, math.nan)), 200)
-    assert (frames.moved, frames.left_out) == (1, 5)
+    assert (frames.moved, frames.dropped) == (1, 5)
     other = mavlink.MAVLink_raw_imu_message(220_000, 9, 9, 9, 0, 0, 0, 0, 0, 0).pack(mavlink.MAVLink(None, 2, 1))
     (frame,) = scan_frames(bytes(other), final=True).frames  # nobody follows that vehicle
-    assert frames.heard(frame, 220_000_000, BY) == frame.data and (frames.moved, frames.left_out) == (1, 5)
+    assert frames.rewrite(frame, 220_000_000, BY) == frame.data and (frames.moved, frames.dropped) == (1, 5)
 
 
 @pytest.mark.slow
@@ -166,7 +166,7 @@ def test_nothing_changed_is_the_recorded_flight_bit_for_bit(case: Case) -> None:
         assert len(mine) == len(recorded) > 0
         assert [encode(one) for one in mine] == [encode(one) for one in recorded]
     assert sum(len(one.inertial) for one in memory.of(StepInput)) > 500
-    assert course.departure.begun_ns is None and course.inertial_moved == course.inertial_left_out == 0
+    assert course.deviation.first_acting_ns is None and course.inertial_moved == course.inertial_dropped == 0
 
 
 @pytest.mark.slow
@@ -176,7 +176,7 @@ def test_on_the_linear_plant_the_sensors_say_what_they_then_really_say(case: Cas
     memory, course = again(case, change)
     real = flown(case, change)
     feels, truly, recorded = (felt(side) for side in (memory, real, flown(case)))
-    assert feels.shape == truly.shape == recorded.shape and course.inertial_left_out <= 1  # one before any attitude
+    assert feels.shape == truly.shape == recorded.shape and course.inertial_dropped <= 1  # one before any attitude
     assert np.abs(recorded - truly).max() > 0.25  # the recorded ones would have been wrong
     # The attitude that is told errs by a few thousandths, and RAW_IMU is rounded twice, to 0.01 m/s². Plans are made of
     # that in each step from the first on, and where they all but tie they go another way for a few ticks.
@@ -203,7 +203,7 @@ def test_the_true_quadrotor_holds_as_it_then_really_does(case: Case, change: str
     other = None
     if change.startswith("link."):
         before = config_of(case).sim
-        other = Relinked(history(case), config_of(case, change).link, before.seed, before.camera.noise_std_m)
+        other = SimulatedLink(history(case), config_of(case, change).link, before.seed, before.camera.noise_std_m)
     memory, course = again(case, change, other=other)
     real = flown(case, change)
     place = target or config_of(case).target.position_m
@@ -211,7 +211,7 @@ def test_the_true_quadrotor_holds_as_it_then_really_does(case: Case, change: str
     assert 0.9 < hold_m(memory, place) / hold_m(real, place) < 1.1
     assert hold_m(memory, place) < 0.02
     assert largest_m(memory, real) < most < largest_m(real, flown(case)) + most
-    assert course.inertial_moved > 500 and course.inertial_left_out <= 1
+    assert course.inertial_moved > 500 and course.inertial_dropped <= 1
 
 
 @pytest.mark.slow
@@ -226,13 +226,13 @@ def test_without_an_attitude_inertial_data_are_left_out_and_positions_fly_on() -
         for topic, at_ns, one in flown(PX4).entries
     ]
     config, memory = config_of(PX4, ELSEWHERE), Memory()
-    recorded = history_of(entries, config_of(PX4), "x")
-    course = fly(recorded, config, build_controller(config), response_of(recorded, config.plant), memory, lambda: 0)
-    assert course.inertial_moved == 0 and course.inertial_left_out > 500
+    recorded = make_recorded_flight(entries, config_of(PX4), "x")
+    course = refly(recorded, config, build_controller(config), make_response(recorded, config.plant), memory, lambda: 0)
+    assert course.inertial_moved == 0 and course.inertial_dropped > 500
     came = [
         frame for one in memory.of(Datagram) if not one.outgoing for frame in scan_frames(one.data, final=True).frames
     ]
-    parted_ns = course.departure.begun_ns
+    parted_ns = course.deviation.first_acting_ns
     assert parted_ns is not None and sum(frame.message_id == HIGHRES for frame in came) < 20
     assert not any(one.inertial for one in memory.of(StepInput))
     assert "inertial-doubted" not in inertial_events(memory) and hold_m(memory, TARGET) < 0.2
@@ -241,24 +241,24 @@ def test_without_an_attitude_inertial_data_are_left_out_and_positions_fly_on() -
 @pytest.mark.slow
 @pytest.mark.parametrize("case", [PX4, ARDUPILOT], ids=["px4", "ardupilot"])
 def test_the_dead_time_belongs_to_the_model(case: Case) -> None:
-    response = response_of(history(case), config_of(case).plant)
-    assert response.dead_ns == round(config_of(case).plant.dead_time_s * 1e9) > 0
-    late, at_once = (model_fit(history(case), one, "own") for one in (response, Response(response.model)))
+    response = make_response(history(case), config_of(case).plant)
+    assert response.dead_time_ns == round(config_of(case).plant.dead_time_s * 1e9) > 0
+    late, at_once = (fit_model(history(case), one, "own") for one in (response, VehicleResponse(response.model)))
     assert late.rms_m is not None and at_once.rms_m is not None
     assert late.rms_m < at_once.rms_m and late.moves > 250
-    assert response_of(history(LINEAR), config_of(LINEAR).plant).dead_ns == 0
+    assert make_response(history(LINEAR), config_of(LINEAR).plant).dead_time_ns == 0
 
 
 def inertial_events(memory: Memory) -> Counter[str]:
     return Counter(one.code for one in memory.of(Event) if one.code.startswith("inertial-"))
 
 
-def felt(memory: Memory) -> NDArray[np.float64]:
+def felt(memory: Memory) -> Array:
     """Accelerations (n, 3) that the controller read of inertial data."""
     return np.array([sample.accel_mps2 for one in memory.of(StepInput) for sample in one.inertial])
 
 
-def velocities(memory: Memory) -> NDArray[np.float64]:
+def velocities(memory: Memory) -> Array:
     """The vehicle's own velocities (n, 3), as ticks knew them."""
     return np.array([one.motion.velocity_mps for one in memory.of(StepInput) if one.motion and one.motion.velocity_mps])
 

@@ -15,7 +15,7 @@ from synthetic_scene import room
 from logs.recording.flight import FlightData
 from logs.recording.summary import FlightSummary, summarise
 from logs.report.svg import colour
-from uavctl.lab.whatif.comparison import ModelFit, Reproduction, WhatIf, story, write_page
+from uavctl.lab.whatif.comparison import ModelFit, Reproduction, WhatIf, describe_what_if, render_what_if_page
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,7 @@ def figures(recorded: FlightData, other: FlightData) -> tuple[dict[str, Axes], s
     """The page's axes by their titles, and its text."""
     summary = summarise(recorded, wall_s=None)
     with drawn() as kept:
-        text = write_page(worse_link(summary), recorded, other)
+        text = render_what_if_page(worse_link(summary), recorded, other)
     return {title: figure.axes[0] for title, figure in kept.items()}, text
 
 
@@ -95,15 +95,15 @@ def test_the_reserve_is_the_largest_of_each_plan(recorded: FlightData, other: Fl
 
 def test_another_link_is_not_called_nothing(recorded: FlightData) -> None:
     summary = summarise(recorded, wall_s=None)
-    (said,) = (text for text in story(worse_link(summary)) if "link: loss=0.5" in text)
+    (said,) = (text for text in describe_what_if(worse_link(summary)) if "link: loss=0.5" in text)
     assert "nothing" not in said
 
 
 def test_inertial_messages_that_are_left_out_are_told(recorded: FlightData) -> None:
     found = worse_link(summarise(recorded, wall_s=None))
-    assert not any("inertial" in text for text in story(found))
+    assert not any("inertial" in text for text in describe_what_if(found))
     lacking = msgspec.structs.replace(found, inertial_moved=30, inertial_left_out=12)
-    (said,) = (text for text in story(lacking) if "inertial" in text)
+    (said,) = (text for text in describe_what_if(lacking) if "inertial" in text)
     assert said.startswith("12 of 42 inertial messages")
 
 

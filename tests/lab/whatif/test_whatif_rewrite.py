@@ -43,25 +43,25 @@ def camera_of(message: str) -> CameraConfig:
 @pytest.mark.parametrize("message", ["vision", "vicon", "mocap", "odometry"])
 def test_what_cameras_would_have_said(message: str, frame: FrameConfig) -> None:
     camera, axes = camera_of(message), SourceFrames(frame)
-    (seen,) = axes.seen(said(camera, frame, HERE))
+    (seen,) = axes.find_positions(said(camera, frame, HERE))
     np.testing.assert_allclose(seen.position_m, HERE[0], atol=1e-6)
-    moved = axes.moved(seen, *BY)
+    moved = axes.move(seen, *BY)
     expected = said(camera, frame, THERE)
     mav = mavlink.MAVLink(None)
     mine, theirs = (mav.decode(bytearray(one)) for one in (moved, expected))
     assert mine.get_type() == theirs.get_type() and moved[:10] == expected[:10]  # length, number, sender
     for name in mine.fieldnames:
         np.testing.assert_allclose(getattr(mine, name), getattr(theirs, name), atol=2e-6, err_msg=name)
-    (again,) = axes.seen(moved)
+    (again,) = axes.find_positions(moved)
     np.testing.assert_allclose(again.position_m, THERE[0], atol=2e-6)
 
 
 @pytest.mark.parametrize("message", ["vision", "odometry"])
 def test_a_stamp_is_replaced(message: str) -> None:
     axes = SourceFrames(FrameConfig())
-    (seen,) = axes.seen(said(camera_of(message), FrameConfig(), HERE))
-    moved = axes.moved(seen, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), stamp_us=123_456_789)
-    (again,) = axes.seen(moved)
+    (seen,) = axes.find_positions(said(camera_of(message), FrameConfig(), HERE))
+    moved = axes.move(seen, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), stamp_us=123_456_789)
+    (again,) = axes.find_positions(moved)
     assert again.position.stamp_us == 123_456_789 and again.position_m == seen.position_m
 
 
@@ -71,8 +71,8 @@ def test_the_vehicle_s_own_estimate_is_moved_as_it_stands_and_in_its_own_version
     frame = FRAMES[2]
     message = mavlink.MAVLink_local_position_ned_message(5000, 1.0, 2.0, -3.0, 0.5, 0.0, 0.0)
     axes = SourceFrames(frame)
-    (seen,) = axes.seen(bytes(message.pack(mav, force_mavlink1=True)))
-    moved = axes.moved(seen, (0.5, 0.0, 0.25), (0.0, 1.0, 0.0), stamp_us=7_000_000)
+    (seen,) = axes.find_positions(bytes(message.pack(mav, force_mavlink1=True)))
+    moved = axes.move(seen, (0.5, 0.0, 0.25), (0.0, 1.0, 0.0), stamp_us=7_000_000)
     assert moved[0] == 0xFE and moved[2] == 77
     found = mavlink.MAVLink(None).decode(bytearray(moved))
     assert (found.x, found.y, found.z, found.vx, found.vy, found.time_boot_ms) == (1.5, 2.0, -2.75, 0.5, 1.0, 7000)
@@ -80,4 +80,4 @@ def test_the_vehicle_s_own_estimate_is_moved_as_it_stands_and_in_its_own_version
 
 def test_what_is_no_position_is_not_seen() -> None:
     beat = mavlink.MAVLink_heartbeat_message(2, 3, 81, 0, 4, 3).pack(mavlink.MAVLink(None, 1, 1))
-    assert list(SourceFrames(FrameConfig()).seen(bytes(beat) + b"\xfd\x00garbage")) == []
+    assert list(SourceFrames(FrameConfig()).find_positions(bytes(beat) + b"\xfd\x00garbage")) == []

@@ -37,7 +37,7 @@ def test_mirrored_flights_are_flown_mirrored(name: str) -> None:
     start = starts(given, 3)
     there = flown(given, MAKERS[name](given), start, newest, disturbances)
     back = flown(given, MAKERS[name](given), -start, newest, -disturbances)
-    assert back.asked == pytest.approx(-there.asked, abs=1e-6)
+    assert back.requested == pytest.approx(-there.requested, abs=1e-6)
     assert np.abs(there.inputs).max() == 7.5  # the limits were met
 
 
@@ -51,7 +51,7 @@ def test_runs_do_not_influence_each_other(name: str, plant: str) -> None:
     order = np.random.default_rng(7).permutation(RUNS)[: RUNS - 3]
     # The same controller once more: `begin` forgets.
     some = flown(given, controller, start[order], newest[order], disturbances[order])
-    assert some.asked == pytest.approx(together.asked[order], abs=1e-7)
+    assert some.requested == pytest.approx(together.requested[order], abs=1e-7)
 
 
 # Gains that fly the paper's plant fly no other; and a target of zero input does not hold a spring.
@@ -92,5 +92,5 @@ def test_a_target_that_takes_an_input_to_hold_is_held(name: str) -> None:
     given = replace(given, target=target, u_target=u_target)
     newest, disturbances = arrivals(1, 30, 0.3, 1), np.zeros((1, 30, plant.n_w))
     result = flown(given, MAKERS[name](given), target, newest, disturbances)
-    assert result.asked == pytest.approx(np.full((1, 30, 1), 0.02), abs=1e-9)
+    assert result.requested == pytest.approx(np.full((1, 30, 1), 0.02), abs=1e-9)
     assert result.cost.max() < 1e-12

@@ -7,7 +7,7 @@ import pytest
 
 from uavctl.build.controller import build_controller
 from uavctl.config import load_config
-from uavctl.lab.bench.run import questions
+from uavctl.lab.bench.run import draw_questions
 from uavctl.smpc.answer import Answer
 from uavctl.smpc.conditioned.planner import ConditionedSolver
 from uavctl.smpc.qp import FirstRows
@@ -17,7 +17,7 @@ def asked(name: str) -> list[Answer]:
     """Answers to states from anywhere, of which most are on their way out faster than inputs can brake."""
     solver = build_controller(load_config(name)).solver
     assert isinstance(solver, ConditionedSolver)
-    return [solver.solve(seq, *question) for seq, question in enumerate(questions(solver, 60, 4))]
+    return [solver.solve(seq, *question) for seq, question in enumerate(draw_questions(solver, 60, 4))]
 
 
 @pytest.mark.parametrize("name", ["room-px4", "room-ardupilot"])

@@ -12,7 +12,7 @@ from baseline_rig import problem
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from uavctl.lab.campaign.tasks import Cell, tasks_of
+from uavctl.lab.campaign.tasks import Cell, make_tasks
 from uavctl.smpc.conditioned.backoffs import SLACK, age_risk, quantile, rest_backoffs
 from uavctl.smpc.conditioned.planner import ConditionedSolver
 from uavctl.smpc.conditioned.program import SlewRows
@@ -136,7 +136,7 @@ def corner(tmp_path: Path, loss: float, steps: int) -> Cell:
 @pytest.mark.parametrize(("loss", "steps"), [(0.1, 12), (0.8, 32), (0.9, 56)])
 def test_a_corner_uses_half_of_the_allowance_and_no_more_than_it(tmp_path: Path, loss: float, steps: int) -> None:
     """Settled steps outside, by their mean over runs and four of its standard errors; and plans with slack."""
-    (task,) = tasks_of([corner(tmp_path, loss, steps)])
+    (task,) = make_tasks([corner(tmp_path, loss, steps)])
     found = task.fly()
     assert not any(found["error"])
     rate = np.asarray(found["outside"])[:, 25:].mean(axis=1)

@@ -1,4 +1,9 @@
-"""A benchmark run: its states or those of a flight, and the times of all solvers on them."""
+"""A benchmark run: its states or those of a flight, and the times of all solvers on them.
+
+The states of scheme `hahn-stursberg` are half uniform over the feasible box and half from closed loops, in turns. The
+decisions of scheme `age-conditioned` are those of a flight of the configuration in lockstep, and others from anywhere
+within the limits, which are harder than those of a flight.
+"""
 
 from __future__ import annotations
 
@@ -9,23 +14,23 @@ from itertools import chain, cycle, islice, zip_longest
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from sim.simulation import World
+from uavctl.arrays import Array
 from uavctl.build.controller import build_controller
 from uavctl.config import Config
 from uavctl.errors import UavctlError
 from uavctl.lab.bench.timing import (
     BenchResult,
-    Case,
     ConditionedTimes,
     Quantiles,
     Shares,
-    Timed,
-    clock_us,
-    median,
-    quiet,
-    timed,
+    TimedAnswers,
+    TimedCase,
+    compute_median,
+    measure_clock_us,
+    suspend_garbage_collection,
+    time_cases,
 )
 from uavctl.loop import ControlLoop
 from uavctl.records import Record, SolveStatus
@@ -38,47 +43,39 @@ from uavctl.smpc.hahn_stursberg.horizon import Component, decompose
 from uavctl.smpc.hahn_stursberg.printed import SOLVERS_OWN, PrintedSolver
 from uavctl.smpc.sets import Polytope
 
-# The decision of scheme `age-conditioned` as a flight asks for it.
+_N_COVARIANCES = 7  # in turns: the covariance of a filter changes at each decision
 
 
-Array = NDArray[np.float64]
+class VariedPreviewSolver:
+    """Solver whose previews vary as in a flight: each decision has another covariance, and a last sent setpoint.
 
-_COVARIANCES = 7  # in turns: a filter's is hardly ever the last one's
-
-
-class InFlight:
-    """Solver for the benchmark: every question has another covariance than the last, and a setpoint sent before.
-
-    What was sent is the target's own input, so a state in transit has all of its way to slew.
+    The sent setpoint is the input of the target, so a state far from it has to slew all the way.
     """
 
     def __init__(self, solver: ConditionedSolver) -> None:
         self._solver, plant = solver, solver.problem.plant
         noise = plant.e @ plant.w @ plant.e.T
-        shares = np.linspace(0.1, 0.5, _COVARIANCES)
-        self._outlooks = [Preview(cov=share * noise, sent=solver.problem.u_target) for share in shares]
-        self._asked = 0
+        shares = np.linspace(0.1, 0.5, _N_COVARIANCES)
+        self._previews = [Preview(cov=share * noise, sent=solver.problem.u_target) for share in shares]
+        self._count = 0
 
     def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:  # noqa: ARG002
         """See `Solver`; the outlook is its own."""
-        self._asked = (self._asked + 1) % _COVARIANCES
-        return self._solver.solve(seq, x, target, self._outlooks[self._asked])
-
-
-# The states of a benchmark: half uniform over the feasible box, half along closed loops, in turns.
+        self._count = (self._count + 1) % _N_COVARIANCES
+        return self._solver.solve(seq, x, target, self._previews[self._count])
 
 
 LOOP_STEPS = 50
-# Where no state of a component is feasible, so many draws say so.
-_MOST_MISSES = 2000
+# After so many draws without a feasible state a component counts as infeasible.
+_MAX_MISSES = 2000
 # States without limits are drawn within so many standard deviations around the target.
-_SPREAD = 3.0
-# A loop ends at once where the solver has no plan; more than so many loops a state are not begun.
-_MOST_LOOPS = 5
+_SPREAD_STDS = 3.0
+# A loop ends where the solver has no plan; at most so many loops are begun for each state.
+_MAX_LOOPS_PER_STATE = 5
 
 
 @dataclass(frozen=True, eq=False)
-class States:
+class BenchStates:
     """States of one benchmark."""
 
     points: tuple[Array, ...]  # states (n_x,): box, loop, box, loop …
@@ -86,82 +83,84 @@ class States:
 
 
 def draw_states(
-    design: Design, solver: Solver, count: int, loss: float, seed: int, told: Callable[[int], None]
-) -> States:
-    """Draw seeded states; the same arguments give the same ones.
+    design: Design, solver: Solver, count: int, loss: float, seed: int, on_progress: Callable[[int], None]
+) -> BenchStates:
+    """Draw seeded states; the same arguments give the same states.
 
     Args:
-        loss: Probability that a step of a closed loop brings no news.
-        told: Called with how many states there are, now and then.
+        loss: Probability that a step of a closed loop has no new measurement.
+        on_progress: Called with the number of states from time to time.
 
     Raises:
         UavctlError: No state of the box is feasible.
     """
     rng = np.random.default_rng(seed)
-    inside, share = _box_states(design, count - count // 2, rng, told)
-    loops = closed_loops(design, solver, inside, count // 2, loss, rng, lambda done: told(len(inside) + done))
-    both = chain.from_iterable(zip_longest(inside, loops))
-    return States(tuple(x for x in both if x is not None), share)
+    box_states, share = _draw_box_states(design, count - count // 2, rng, on_progress)
+    loop_states = collect_loop_states(
+        design, solver, box_states, count // 2, loss, rng, lambda done: on_progress(len(box_states) + done)
+    )
+    alternating = chain.from_iterable(zip_longest(box_states, loop_states))
+    return BenchStates(tuple(x for x in alternating if x is not None), share)
 
 
-def _box_states(
-    design: Design, count: int, rng: np.random.Generator, told: Callable[[int], None]
+def _draw_box_states(
+    design: Design, count: int, rng: np.random.Generator, on_progress: Callable[[int], None]
 ) -> tuple[list[Array], float]:
     """Draw states uniformly from the feasible part of the box.
 
     Components are independent, so each is drawn until it is feasible. Feasible: the exact program keeps all limits and
     reaches the target (slack, offset and terminal miss below 1e-6).
     """
-    found = np.zeros((count, design.plant.n_x))
+    states = np.zeros((count, design.plant.n_x))
     share = 1.0
     for component in decompose(design):
-        solver, (lower, upper) = PartSolver(design, component), _box(component, design.target[component.states])
-        tried, done, misses = 0, 0, 0
-        while done < count:
+        solver, (lower, upper) = PartSolver(design, component), _get_box(component, design.target[component.states])
+        tries, count_done, misses = 0, 0, 0
+        while count_done < count:
             x = design.target.copy()
             x[component.states] = rng.uniform(lower, upper)
             answer = solver.solve(x, design.target)
-            tried += 1
+            tries += 1
             if answer.status is SolveStatus.OPTIMAL and answer.slack + answer.offset + answer.terminal_miss < KEPT:
-                found[done, component.states] = x[component.states]
-                done, misses = done + 1, 0
-                told(done)
+                states[count_done, component.states] = x[component.states]
+                count_done, misses = count_done + 1, 0
+                on_progress(count_done)
                 continue
             misses += 1
-            if misses == _MOST_MISSES:
+            if misses == _MAX_MISSES:
                 raise UavctlError(
                     "no state was found from which the target is reached with all limits kept; "
                     "widen the limits in [sets]"
                 )
-        share *= done / tried
-    return list(found), share
+        share *= count_done / tries
+    return list(states), share
 
 
-def _box(component: Component, home: Array) -> tuple[Array, Array]:
+def _get_box(component: Component, centre: Array) -> tuple[Array, Array]:
     """Return the box of a component's state set; _SPREAD standard deviations around `home` where it is open."""
-    around = _SPREAD * np.sqrt(np.diagonal(component.sigma_x + component.estimate_cov))
+    half_width = _SPREAD_STDS * np.sqrt(np.diagonal(component.sigma_x + component.estimate_cov))
     low, high = Polytope(component.c_x, component.b_x).bounds
-    return np.where(np.isfinite(low), low, home - around), np.where(np.isfinite(high), high, home + around)
+    return np.where(np.isfinite(low), low, centre - half_width), np.where(np.isfinite(high), high, centre + half_width)
 
 
-def closed_loops(
+def collect_loop_states(
     design: Design,
     solver: Solver,
     starts: list[Array],
     count: int,
     loss: float,
     rng: np.random.Generator,
-    told: Callable[[int], None],
+    on_progress: Callable[[int], None],
 ) -> list[Array]:
-    """Yield the states that a closed loop asks from: a step brings news, or the plan is played out.
+    """Return the states in which a closed loop decides: where a measurement arrives, or the plan has ended.
 
-    The starts themselves are left out. Fewer than `count` states come back only where loops find no plan.
+    Starts are excluded. There are fewer than `count` states only if loops find no plan.
     """
     plant = design.plant
     values, vectors = np.linalg.eigh(plant.w)
-    effect = plant.e @ (vectors * np.sqrt(np.maximum(values, 0.0)))
-    asked: list[Array] = []
-    for x in islice(cycle(starts), _MOST_LOOPS * count):
+    disturbance_root = plant.e @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+    asked_states: list[Array] = []
+    for x in islice(cycle(starts), _MAX_LOOPS_PER_STATE * count):
         inputs, age = np.zeros((0, plant.n_u)), 0
         for step in range(LOOP_STEPS):
             age += 1
@@ -171,30 +170,27 @@ def closed_loops(
                     break
                 inputs, age = answer.inputs, 0
                 if step:
-                    asked.append(x)
-                    told(len(asked))
-            if len(asked) == count:
-                return asked
-            x = plant.a @ x + plant.b @ inputs[age] + effect @ rng.standard_normal(plant.n_w)
-    return asked
+                    asked_states.append(x)
+                    on_progress(len(asked_states))
+            if len(asked_states) == count:
+                return asked_states
+            x = plant.a @ x + plant.b @ inputs[age] + disturbance_root @ rng.standard_normal(plant.n_w)
+    return asked_states
 
 
-# One benchmark, from a design to its figures.
-
-
-# Told what is being done, how much of it is done, and of how much; None where nobody knows.
-Advance = Callable[[str, int, int | None], None]
+# Called with the name of a phase, its progress, and its total; None where the total is not known.
+ReportProgress = Callable[[str, int, int | None], None]
 
 
 @dataclass(frozen=True)
 class BenchSizes:
     """Numbers of states and runs of a benchmark."""
 
-    states: int = 300  # asked as in flight; the slow methods are asked the first of them
-    printed: int = 3  # asked of the joint problem as printed; it ends badly, and a few say so
-    cvxpy: int = 20  # asked of the printed problem axis by axis
-    exact: int = 50  # asked of the exact program
-    runs: int = 5  # but of the printed problem, over their states; a state's time is the median
+    states: int = 300  # solved as in flight; slower methods solve only the first of them
+    printed: int = 3  # solved by the joint problem as printed; it fails, which a few show
+    cvxpy: int = 20  # solved by the printed problem, axis by axis
+    exact: int = 50  # solved by the exact program
+    runs: int = 5  # runs over the states; a state's time is their median
 
 
 DEFAULT_SIZES = BenchSizes()
@@ -204,14 +200,14 @@ def run_bench(
     design: Design,
     loss: float,
     seed: int,
-    advance: Advance,
+    advance: ReportProgress,
     sizes: BenchSizes = DEFAULT_SIZES,
     conditioned: ConditionedSolver | None = None,
 ) -> BenchResult:
     """Measure all solvers on the same states.
 
     Args:
-        loss: Probability that a step of a closed loop brings no news.
+        loss: Probability that a step of a closed loop has no new measurement.
         conditioned: Solver of scheme `age-conditioned` for the same plant; None: it is left out.
 
     Raises:
@@ -221,28 +217,30 @@ def run_bench(
     solver = ShortcutSolver(design)
     ready_s = time.perf_counter() - begin
 
-    def phase(what: str, total: int) -> Callable[[int], None]:
-        advance(what, 0, total)
-        return lambda done: advance(what, done, total)
+    def begin_phase(name: str, total: int) -> Callable[[int], None]:
+        advance(name, 0, total)
+        return lambda done: advance(name, done, total)
 
-    states = draw_states(design, solver, sizes.states, loss, seed, phase("states", sizes.states))
+    states = draw_states(design, solver, sizes.states, loss, seed, begin_phase("states", sizes.states))
     points, target = states.points, design.target
     count = len(points)
-    compared = [
-        Case(solver, points, target),
-        Case(ConicSolver(design), points[: sizes.exact], target),
-        Case(PrintedSolver(design), points[: sizes.cvxpy], target, once=True),
+    cases = [
+        TimedCase(solver, points, target),
+        TimedCase(ConicSolver(design), points[: sizes.exact], target),
+        TimedCase(PrintedSolver(design), points[: sizes.cvxpy], target, is_asked_once=True),
     ]
     if conditioned is not None:
-        compared.append(Case(InFlight(conditioned), points, target))
-    asked = sum(len(case.asked(run, sizes.runs)) for case in compared for run in range(sizes.runs))
-    flown, exact, axes, *ours = timed(compared, sizes.runs, phase("all methods in turns", asked))
-    few = points[: sizes.printed]
-    whole = Case(PrintedSolver(design, joint=True, regularization=SOLVERS_OWN), few, target)
-    (joint,) = timed([whole], 1, phase("printed, jointly", len(few)))
+        cases.append(TimedCase(VariedPreviewSolver(conditioned), points, target))
+    decisions = sum(len(case.get_indices(run, sizes.runs)) for case in cases for run in range(sizes.runs))
+    flown, exact, axes, *conditioned_times = time_cases(
+        cases, sizes.runs, begin_phase("all methods in turns", decisions)
+    )
+    printed_points = points[: sizes.printed]
+    joint_case = TimedCase(PrintedSolver(design, joint=True, regularization=SOLVERS_OWN), printed_points, target)
+    (joint,) = time_cases([joint_case], 1, begin_phase("printed, jointly", len(printed_points)))
 
     components = len(decompose(design))
-    exact_ms, axes_ms, joint_ms = (float(np.median(found.us)) / 1e3 for found in (exact, axes, joint))
+    exact_ms, axes_ms, joint_ms = (float(np.median(result.us)) / 1e3 for result in (exact, axes, joint))
     endings = [answer.status for answer in joint.answers]
     return BenchResult(
         states=count,
@@ -259,52 +257,53 @@ def run_bench(
         exact_ms=exact_ms,
         exact_states=len(exact.answers),
         flown_us=Quantiles.of(flown.us),
-        frozen_us=median(flown.of(FROZEN)),
-        program_us=median(flown.of(METHOD)),
+        frozen_us=compute_median(flown.get_times_us(FROZEN)),
+        program_us=compute_median(flown.get_times_us(METHOD)),
         ratio_printed=joint_ms / exact_ms,
         ratio_cvxpy=axes_ms / exact_ms,
-        conditioned=_conditioned(ours[0], axes_ms) if ours else None,
-        shares=_shares(flown),
+        conditioned=_make_conditioned_times(conditioned_times[0], axes_ms) if conditioned_times else None,
+        shares=_compute_shares(flown),
         gap=Quantiles.of(np.array([answer.gap for answer in flown.answers])),
-        certificate_excess=_excess(flown.answers, exact.answers),
-        cost_difference=None if design.estimate_cov.any() else _cost_difference(axes.answers, exact.answers),
+        certificate_excess=_compute_excess(flown.answers, exact.answers),
+        cost_difference=None if design.estimate_cov.any() else _compute_cost_difference(axes.answers, exact.answers),
         ready_s=ready_s,
-        clock_us=clock_us(),
+        clock_us=measure_clock_us(),
         wall_s=time.perf_counter() - begin,
     )
 
 
-def _conditioned(found: Timed, axes_ms: float) -> ConditionedTimes:
-    us = Quantiles.of(found.us)
+def _make_conditioned_times(result: TimedAnswers, axes_ms: float) -> ConditionedTimes:
+    us = Quantiles.of(result.us)
     return ConditionedTimes(
         us=us,
-        iterations=Quantiles.of(np.array([answer.iterations for answer in found.answers])),
-        left_alone=sum(answer.iterations == 0 for answer in found.answers) / len(found.answers),
+        iterations=Quantiles.of(np.array([answer.iterations for answer in result.answers])),
+        left_alone=sum(answer.iterations == 0 for answer in result.answers) / len(result.answers),
         ratio_cvxpy=axes_ms * 1e3 / us.p50,
     )
 
 
-def _shares(found: Timed) -> Shares:
-    methods = [answer.method for answer in found.answers]
+def _compute_shares(result: TimedAnswers) -> Shares:
+    methods = [answer.method for answer in result.answers]
     return Shares(frozen=methods.count(FROZEN) / len(methods), exact=methods.count(METHOD) / len(methods))
 
 
-def _excess(certified: Sequence[Answer], exact: Sequence[Answer]) -> float:
+def _compute_excess(certified: Sequence[Answer], exact: Sequence[Answer]) -> float:
     """Return how far exact optima lie outside the certified bounds, relative, beyond their own gap."""
-    most = 0.0
-    for ours, theirs in zip(certified, exact, strict=False):  # the exact program is asked fewer
-        beyond = max(ours.cost_lower - theirs.cost, theirs.cost_lower - ours.cost)
-        most = max(most, beyond / max(1.0, abs(theirs.cost)))
-    return most
+    max_excess = 0.0
+    for certified_answer, exact_answer in zip(certified, exact, strict=False):  # the exact program solves fewer
+        excess = max(certified_answer.cost_lower - exact_answer.cost, exact_answer.cost_lower - certified_answer.cost)
+        max_excess = max(max_excess, excess / max(1.0, abs(exact_answer.cost)))
+    return max_excess
 
 
-def _cost_difference(printed: Sequence[Answer], exact: Sequence[Answer]) -> float | None:
+def _compute_cost_difference(printed: Sequence[Answer], exact: Sequence[Answer]) -> float | None:
     """Return the largest relative cost difference of printed problem and exact program; None without any."""
-    pairs = [(one.cost, other.cost) for one, other in zip(printed, exact, strict=False) if np.isfinite(one.cost)]
-    return max((abs(one / other - 1.0) for one, other in pairs), default=None)
-
-
-# Decisions that a flight asks for: those of the configuration's own, flown in lockstep by the simulated vehicle.
+    pairs = [
+        (printed_answer.cost, exact_answer.cost)
+        for printed_answer, exact_answer in zip(printed, exact, strict=False)
+        if np.isfinite(printed_answer.cost)
+    ]
+    return max((abs(printed_answer / exact_answer - 1.0) for printed_answer, exact_answer in pairs), default=None)
 
 
 ROUNDS = 5
@@ -322,12 +321,12 @@ class FlightBench(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class QuestionRecorder:
-    """Solver that records the questions it is asked."""
+    """Solver that records its problems."""
 
     def __init__(self, solver: Solver) -> None:
         self._solver = solver
-        self.questions: list[tuple[Array, Array, Preview]] = []  # state (n_x,), target (n_x,) and outlook of each
-        self.first_us = np.nan  # how long the first one took [µs]
+        self.questions: list[tuple[Array, Array, Preview]] = []  # state (n_x,), target (n_x,) and preview of each
+        self.first_us = np.nan  # time of the first decision [µs]
 
     def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:
         """See `Solver`."""
@@ -339,67 +338,67 @@ class QuestionRecorder:
         return answer
 
 
-class _Nowhere:
+class _NullSink:
     """Sink that drops records."""
 
     def put(self, topic: str, at_ns: int, record: Record) -> None:
         """See `Sink`."""
 
 
-def fly_and_ask(config: Config) -> tuple[Solver, QuestionRecorder]:
-    """Fly a configuration in virtual time; return its solver, and the questions that the solver was asked.
+def record_questions(config: Config) -> tuple[Solver, QuestionRecorder]:
+    """Fly a configuration in virtual time; return its solver, and the recorded problems.
 
     Raises:
         DesignError: There is no design.
     """
     controller = build_controller(config)
-    asked = QuestionRecorder(controller.solver)
-    loop = ControlLoop(config, replace(controller, solver=asked), _Nowhere(), time.perf_counter_ns)
+    recorder = QuestionRecorder(controller.solver)
+    loop = ControlLoop(config, replace(controller, solver=recorder), _NullSink(), time.perf_counter_ns)
     World(config, loop).run(config.duration_s)
-    return controller.solver, asked
+    return controller.solver, recorder
 
 
-def time_flight(config: Config, told: Callable[[int, int], None] = lambda *_: None) -> FlightBench | None:
-    """Time the decisions of a flight; None if it asked for none.
+def time_flight(config: Config, on_progress: Callable[[int, int], None] = lambda *_: None) -> FlightBench | None:
+    """Time the decisions of a flight; None if it has none.
 
     Args:
-        told: Called with the number of rounds done, and of how many.
+        on_progress: Called with the number of finished rounds, and of all.
     """
-    solver, asked = fly_and_ask(config)
-    if not asked.questions:
+    solver, recorder = record_questions(config)
+    if not recorder.questions:
         return None
-    us = np.full((ROUNDS, len(asked.questions)), np.nan)
+    us = np.full((ROUNDS, len(recorder.questions)), np.nan)
     answers: list[Answer] = []
-    with quiet():
+    with suspend_garbage_collection():
         for times in us:
-            told(len(answers) // len(asked.questions), ROUNDS)
-            for i, question in enumerate(asked.questions):
+            on_progress(len(answers) // len(recorder.questions), ROUNDS)
+            for i, question in enumerate(recorder.questions):
                 start = time.perf_counter()
                 answers.append(solver.solve(i, *question))
                 times[i] = (time.perf_counter() - start) * 1e6
-    answers = answers[: len(asked.questions)]
+    answers = answers[: len(recorder.questions)]
     iterations = np.array([answer.iterations for answer in answers], dtype=np.float64)
-    planned = np.array([answer.inputs.size > 0 for answer in answers])
+    has_plan = np.array([answer.inputs.size > 0 for answer in answers])
     return FlightBench(
         questions=len(answers),
         us=Quantiles.of(us.min(axis=0)),
         iterations=Quantiles.of(iterations),
-        left_alone=float(np.mean(planned & (iterations == 0))),
-        gave_way=float(np.mean([answer.slack > 0.0 for answer in answers] & planned)),
-        first_us=asked.first_us,
+        left_alone=float(np.mean(has_plan & (iterations == 0))),
+        gave_way=float(np.mean([answer.slack > 0.0 for answer in answers] & has_plan)),
+        first_us=recorder.first_us,
     )
 
 
-# Decisions of scheme `age-conditioned` from anywhere within the limits: harder than what a flight asks.
-
-
-_WARM = 20
-_SHARES = (0.1, 0.5)  # of the disturbance's covariance in a step: the estimate's, from question to question another
-_OPEN_SPREAD = 0.5  # standard deviation of a state without limits, in its unit
+_WARM_UP = 20
+_COVARIANCE_SHARES = (
+    0.1,
+    0.5,
+)  # covariance of the estimate, as a share of a step's disturbance; drawn for each decision
+_OPEN_STD = 0.5  # standard deviation of a state without limits, in its unit
 
 
 class DecisionBench(msgspec.Struct, frozen=True, kw_only=True):
-    """Times of decisions for all axes, each state asked once."""
+    """Times of decisions for all axes, each state solved once."""
 
     states: int
     us: Quantiles
@@ -411,51 +410,51 @@ class DecisionBench(msgspec.Struct, frozen=True, kw_only=True):
     flight: FlightBench | None = None  # the same of the configuration's own flight
 
 
-def questions(solver: ConditionedSolver, count: int, seed: int) -> Iterator[tuple[Array, Array, Preview]]:
-    """Yield state (n_x,), target (n_x,) and outlook, drawn within the limits of position and input.
+def draw_questions(solver: ConditionedSolver, count: int, seed: int) -> Iterator[tuple[Array, Array, Preview]]:
+    """Yield state (n_x,), target (n_x,) and preview, drawn within the limits of position and input.
 
     Args:
-        solver: Solver to ask; all its axes have limits of position and input.
+        solver: Solver of the problems; all its axes have limits of position and input.
     """
     problem, rng = solver.problem, np.random.default_rng(seed)
     plant, noise = problem.plant, solver.seen.e @ solver.seen.w @ solver.seen.e.T
     low, high = problem.state_set.bounds
-    limited = np.isfinite(low) & np.isfinite(high)
+    is_limited = np.isfinite(low) & np.isfinite(high)
     sent_low, sent_high = problem.input_set.bounds
-    places = list(plant.position_index)
+    position_index = list(plant.position_index)
     for _ in range(count):
-        x = rng.normal(0.0, _OPEN_SPREAD, plant.n_x)
-        x[limited] = rng.uniform(low[limited], high[limited])
-        at = dict(zip(plant.axes, rng.uniform(low[places], high[places]).tolist(), strict=True))
-        target = plant.equilibrium((at.get("north", 0.0), at.get("east", 0.0), at.get("down", 0.0)))
-        yield x, target, Preview(cov=rng.uniform(*_SHARES) * noise, sent=rng.uniform(sent_low, sent_high))
+        x = rng.normal(0.0, _OPEN_STD, plant.n_x)
+        x[is_limited] = rng.uniform(low[is_limited], high[is_limited])
+        target_m = dict(zip(plant.axes, rng.uniform(low[position_index], high[position_index]).tolist(), strict=True))
+        target = plant.equilibrium((target_m.get("north", 0.0), target_m.get("east", 0.0), target_m.get("down", 0.0)))
+        yield x, target, Preview(cov=rng.uniform(*_COVARIANCE_SHARES) * noise, sent=rng.uniform(sent_low, sent_high))
 
 
 def time_decisions(
-    solver: ConditionedSolver, count: int, seed: int, told: Callable[[int], None] = lambda _: None
+    solver: ConditionedSolver, count: int, seed: int, on_progress: Callable[[int], None] = lambda _: None
 ) -> DecisionBench:
     """Time decisions from `count` states.
 
     Args:
-        told: Called with the number of decisions done.
+        on_progress: Called with the number of finished decisions.
     """
-    for x, target, outlook in questions(solver, _WARM, seed + 1):
+    for x, target, outlook in draw_questions(solver, _WARM_UP, seed + 1):
         solver.solve(0, x, target, outlook)
-    us, iterations, slack, planned = np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count, dtype=bool)
-    with quiet():
-        for i, (x, target, outlook) in enumerate(questions(solver, count, seed)):
+    us, iterations, slack, has_plan = np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count, dtype=bool)
+    with suspend_garbage_collection():
+        for i, (x, target, outlook) in enumerate(draw_questions(solver, count, seed)):
             start = time.perf_counter()
             answer = solver.solve(i, x, target, outlook)
             us[i] = (time.perf_counter() - start) * 1e6
             iterations[i], slack[i] = answer.iterations, answer.slack
-            planned[i] = answer.inputs.size > 0  # an inaccurate answer is a plan, too
-            told(i + 1)
+            has_plan[i] = answer.inputs.size > 0  # an inaccurate answer is also a plan
+            on_progress(i + 1)
     return DecisionBench(
         states=count,
         us=Quantiles.of(us),
         iterations=Quantiles.of(iterations),
-        left_alone=float(np.mean(planned & (iterations == 0))),
-        gave_way=float(np.mean(planned & (slack > 0.0))),
-        without=int(count - planned.sum()),
-        clock_us=clock_us(),
+        left_alone=float(np.mean(has_plan & (iterations == 0))),
+        gave_way=float(np.mean(has_plan & (slack > 0.0))),
+        without=int(count - has_plan.sum()),
+        clock_us=measure_clock_us(),
     )

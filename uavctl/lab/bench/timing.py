@@ -1,4 +1,7 @@
-"""Timing of decisions, and the result document of a benchmark."""
+"""Times of decisions, and the result document of a benchmark.
+
+Solvers are warmed up, run without garbage collection, and solve the same states several times.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +13,9 @@ from dataclasses import dataclass
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.smpc.answer import Answer, Solver
-
-# What a benchmark found; one document, all of one run.
 
 
 class Quantiles(msgspec.Struct, frozen=True, kw_only=True):
@@ -25,17 +26,17 @@ class Quantiles(msgspec.Struct, frozen=True, kw_only=True):
     max: float
 
     @staticmethod
-    def of(values: NDArray[np.float64]) -> Quantiles:
+    def of(values: Array) -> Quantiles:
         """Return the quantiles of values (n,)."""
         p50, p99, most = np.quantile(values, [0.5, 0.99, 1.0]).tolist()
         return Quantiles(p50=p50, p99=p99, max=most)
 
 
 class Shares(msgspec.Struct, frozen=True, kw_only=True):
-    """Shares of the states that were answered by each method; a plan is named by its slowest axis."""
+    """Shares of the states that each method solved; a plan counts for the method of its slowest axis."""
 
     frozen: float  # by the frozen policies alone
-    exact: float  # by the exact program for one axis or more
+    exact: float  # by the exact program, for one axis or more
 
 
 class ConditionedTimes(msgspec.Struct, frozen=True, kw_only=True):
@@ -43,7 +44,7 @@ class ConditionedTimes(msgspec.Struct, frozen=True, kw_only=True):
 
     us: Quantiles
     iterations: Quantiles  # of all its programs together
-    left_alone: float  # share of the states from which the regulator's own plan keeps everything
+    left_alone: float  # share of the states from which the regulator's plan keeps all limits
     ratio_cvxpy: float  # the problem as printed, axis by axis, in the same run
 
 
@@ -54,8 +55,8 @@ class BenchResult(msgspec.Struct, frozen=True, kw_only=True):
     components: int  # independent axes
     feasible_share: float  # of the box
     printed_ms: float  # the joint problem as printed, CVXPY
-    printed_status: str  # how that ended; several endings are joined by commas
-    printed_optimal: int  # how many of printed_states were solved
+    printed_status: str  # status of the solver; several ones are joined by commas
+    printed_optimal: int  # solved ones of printed_states
     printed_states: int
     cvxpy_axis_ms: float  # as printed, one axis, CVXPY with the problem compiled once
     cvxpy_ms: float
@@ -68,33 +69,28 @@ class BenchResult(msgspec.Struct, frozen=True, kw_only=True):
     program_us: float | None  # median where the exact program was needed
     ratio_printed: float  # as printed, jointly, to the exact program
     ratio_cvxpy: float  # as printed, axis by axis, to the exact program
-    conditioned: ConditionedTimes | None  # null: silence outlasts the horizon too often for it
+    conditioned: ConditionedTimes | None  # null: outages outlast the horizon too often
     shares: Shares
     gap: Quantiles  # certified
-    certificate_excess: float  # most by which an exact optimum is outside the certified bounds, relative; 0: never
+    certificate_excess: float  # largest relative distance of an exact optimum outside the certified bounds
     cost_difference: float | None  # largest relative difference of printed and exact optima; null: not the same problem
     ready_s: float  # from the design to a solver
     clock_us: float  # an empty measurement, which all times contain
     wall_s: float
 
 
-# Times of decisions: warmed up, without garbage collection, several runs of the same states.
-
-
-Array = NDArray[np.float64]
-
-_EMPTY = 1000
-_WARM = 5
+_CLOCK_SAMPLES = 1000
+_WARM_UP = 5
 
 
 @dataclass(frozen=True, eq=False)
-class Timed:
+class TimedAnswers:
     """Times and answers of one solver, one for each state."""
 
     us: Array  # median over the runs (n,) [µs]
     answers: tuple[Answer, ...]  # the last run's
 
-    def of(self, method: str) -> Array:
+    def get_times_us(self, method: str) -> Array:
         """Return the times (n,) [µs] of the states that a method answered with a plan."""
         with_plan = [answer.method == method and bool(np.isfinite(answer.cost)) for answer in self.answers]
         times: Array = self.us[np.array(with_plan, dtype=bool)]
@@ -102,8 +98,8 @@ class Timed:
 
 
 @contextmanager
-def quiet() -> Iterator[None]:
-    """Suspend garbage collection, whose pauses are not part of any decision."""
+def suspend_garbage_collection() -> Iterator[None]:
+    """Suspend garbage collection, as its pauses are not part of a decision."""
     enabled = gc.isenabled()
     gc.collect()
     gc.disable()
@@ -115,60 +111,62 @@ def quiet() -> Iterator[None]:
 
 
 @dataclass(frozen=True, eq=False)
-class Case:
-    """Solver and questions that are timed."""
+class TimedCase:
+    """Solver to time, with its problems."""
 
-    solver: Solver  # who decides
-    points: Sequence[Array]  # from which states (n_x,)
-    target: Array  # towards which equilibrium (n_x,)
-    once: bool = False  # whether each state is asked in one of the runs only; else in all of them
+    solver: Solver
+    points: Sequence[Array]  # initial states (n_x,)
+    target: Array  # target equilibrium (n_x,)
+    is_asked_once: bool = False  # whether each state is solved in one run only; else in all
 
-    def asked(self, run: int, runs: int) -> range:
-        """Return the indices of the states that a run asks."""
-        return range(run, len(self.points), runs) if self.once else range(len(self.points))
+    def get_indices(self, run: int, runs: int) -> range:
+        """Return the indices of the states that a run solves."""
+        return range(run, len(self.points), runs) if self.is_asked_once else range(len(self.points))
 
 
-def timed(cases: Sequence[Case], runs: int, told: Callable[[int], None] = lambda _: None) -> list[Timed]:
-    """Time several solvers, run by run in turns, so that the machine's other load affects all of them alike.
+def time_cases(
+    cases: Sequence[TimedCase], runs: int, on_progress: Callable[[int], None] = lambda _: None
+) -> list[TimedAnswers]:
+    """Time several solvers, run by run in turns, so that other load of the machine affects all alike.
 
     Args:
-        cases: Solvers with their questions; a few states of each are asked before.
+        cases: Solvers with their problems; a few states of each are solved before as warm-up.
         runs: Number of runs; a state's time is their median.
-        told: Called with the number of decisions done, after each.
+        on_progress: Called with the number of decisions after each.
     """
     for case in cases:
-        for x in case.points[:_WARM]:
+        for x in case.points[:_WARM_UP]:
             case.solver.solve(0, x, case.target)
     us = [np.full((runs, len(case.points)), np.nan) for case in cases]
     answers: list[dict[int, Answer]] = [{} for _ in cases]
     done = 0
-    with quiet():
+    with suspend_garbage_collection():
         for run in range(runs):
             gc.collect()
             for i, case in enumerate(cases):
-                for j in case.asked(run, runs):
+                for j in case.get_indices(run, runs):
                     x = case.points[j]
                     start = time.perf_counter()
                     answer = case.solver.solve(0, x, case.target)
                     us[i][run, j] = (time.perf_counter() - start) * 1e6
                     answers[i][j] = answer
                     done += 1
-                    told(done)
+                    on_progress(done)
     return [
-        Timed(np.nanmedian(times, axis=0), tuple(found[j] for j in range(len(found))))
-        for times, found in zip(us, answers, strict=True)
+        TimedAnswers(np.nanmedian(times, axis=0), tuple(by_state[j] for j in range(len(by_state))))
+        for times, by_state in zip(us, answers, strict=True)
     ]
 
 
-def clock_us() -> float:
+def measure_clock_us() -> float:
     """Return the median time of an empty measurement [µs]."""
-    us = np.zeros(_EMPTY)
-    for i in range(_EMPTY):
+    us = np.zeros(_CLOCK_SAMPLES)
+    for i in range(_CLOCK_SAMPLES):
         start = time.perf_counter()
         us[i] = (time.perf_counter() - start) * 1e6
     return float(np.median(us))
 
 
-def median(times: Array) -> float | None:
+def compute_median(times: Array) -> float | None:
     """Return the median; None of no values."""
     return float(np.median(times)) if times.size else None

@@ -1,4 +1,10 @@
-"""Controllers of a campaign's cells, the settings they fly in, and baselines within the flight core."""
+"""Controllers of a campaign's cells, their settings, and baselines within the flight core.
+
+1. A disturbance is a transform of standard normal draws, which are the same for every cell.
+2. A `CellSetting` holds what is the same for every controller: plant, limits, costs, start, link and disturbance.
+3. A `Recipe` is made once for each belief; each worker builds its own controller from it.
+4. A `BaselineSolver` replaces the SMPC within the flight core; filter, fallback and last gate stay.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +16,9 @@ from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr, stdtrit
 
+from uavctl.arrays import Array
 from uavctl.build.controller import (
     build_conditioned,
     build_design,
@@ -27,7 +33,14 @@ from uavctl.config import Config
 from uavctl.config.link import LinkConfig
 from uavctl.config.types import PlantConfig
 from uavctl.lab.campaign.spec import CampaignSpec, ControllerSpec, DisturbanceSpec, make_controller
-from uavctl.lab.campaign.world import FilterBelief, Scene, draw, draw_noise, known, newest_of
+from uavctl.lab.campaign.world import (
+    FilterBelief,
+    LinearWorld,
+    compute_known_steps,
+    draw,
+    draw_noise,
+    select_newest_captures,
+)
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import NOMINAL, Answer, Preview
 from uavctl.smpc.baselines import (
@@ -50,36 +63,33 @@ from uavctl.smpc.hahn_stursberg.frozen import ShortcutDecider, ShortcutSolver
 from uavctl.smpc.nominal import ControlProblem
 from uavctl.smpc.outside import Rehearsal, make_answer
 
-# Disturbances of many runs: each kind a transform of the same standard normal draws.
+_STUDENT_DEGREES = 4.0  # of Student's t; its variance is degrees / (degrees - 2)
 
 
-Array = NDArray[np.float64]
-
-_DEGREES = 4.0  # of Student's t; its variance is degrees / (degrees - 2)
-
-
-def disturbances(spec: DisturbanceSpec, w: Array, normal: Array) -> Array:
+def shape_disturbances(spec: DisturbanceSpec, w: Array, normal: Array) -> Array:
     """Return w(k) of every run (N, T, n_w).
 
     Args:
-        spec: The kind; all have mean `bias` and covariance scale² W, gusts as they are once they have long blown.
+        spec: The kind; all have mean `bias` and covariance scale² W, gusts in their stationary state.
         w: W (n_w, n_w).
-        normal: Standard normal draws (N, T, n_w), see `Chances.normal`.
+        normal: Standard normal draws (N, T, n_w), see `RandomDraws.normal`.
     """
     values, vectors = np.linalg.eigh(w)
     root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T  # the symmetric one, which is unique
-    shaped = spec.scale * _shaped(spec, normal) @ root
+    shaped = spec.scale * _shape_draws(spec, normal) @ root
     return np.asarray(shaped + spec.bias * np.sqrt(np.diag(w)), dtype=np.float64)
 
 
-def _shaped(spec: DisturbanceSpec, normal: Array) -> Array:
+def _shape_draws(spec: DisturbanceSpec, normal: Array) -> Array:
     """Return draws of mean 0 and covariance I."""
     if spec.kind == "uniform":
         return np.asarray(np.sqrt(3.0) * (2.0 * ndtr(normal) - 1.0), dtype=np.float64)
     if spec.kind == "heavy":
         # By the lower tail on either side: the upper one's probability would be rounded to 1.
-        tail = stdtrit(_DEGREES, ndtr(-np.abs(normal)))
-        return np.asarray(-np.sign(normal) * tail * np.sqrt((_DEGREES - 2.0) / _DEGREES), dtype=np.float64)
+        tail = stdtrit(_STUDENT_DEGREES, ndtr(-np.abs(normal)))
+        return np.asarray(
+            -np.sign(normal) * tail * np.sqrt((_STUDENT_DEGREES - 2.0) / _STUDENT_DEGREES), dtype=np.float64
+        )
     if spec.kind == "gusts":
         gusts = normal.copy()
         for k in range(1, normal.shape[1]):
@@ -88,14 +98,11 @@ def _shaped(spec: DisturbanceSpec, normal: Array) -> Array:
     return normal
 
 
-# What a cell's runs meet, whoever flies them: plant, limits, costs, start, link, disturbance.
-
-
-_START = 2  # child of a run's seed that draws its start; 0 and 1 are those of `chance.draw`
+_START_CHILD = 2  # child of a run's seed that draws its start; 0 and 1 are those of `world.draw`
 
 
 @dataclass(frozen=True, eq=False)
-class Setting:
+class CellSetting:
     """Setting of a cell: everything but its controller."""
 
     spec: CampaignSpec  # the campaign's specification: steps, seed, start
@@ -106,46 +113,50 @@ class Setting:
 
 
 @dataclass(frozen=True, eq=False)
-class Met:
-    """Disturbances, losses and noise that N runs of T steps meet."""
+class RunConditions:
+    """World, losses, disturbances and noise of N runs of T steps; the same for every controller."""
 
-    scene: Scene  # the scene
-    newest: Counts  # capture step of the newest position known in each step (N, T)
+    world: LinearWorld  # the scene
+    newest_captures: Counts  # capture step of the newest position known in each step (N, T)
     disturbances: Array  # w (N, T, n_w)
-    known: Counts  # step that knows the position of each step first (N, T)
+    known_steps: Counts  # step that knows the position of each step first (N, T)
     noise: Array | None  # noise of the positions (N, T, n_axes) [m]; None where the state is measured
 
 
-def met(setting: Setting, first: int, runs: int) -> Met:
-    """Return what the runs `first` … `first` + `runs` - 1 meet.
+def draw_conditions(setting: CellSetting, first: int, runs: int) -> RunConditions:
+    """Draw the conditions of the runs `first` … `first` + `runs` - 1.
 
     Raises:
-        DesignError: The plant that flies is none.
+        DesignError: The flown plant is not valid.
     """
-    spec, flown = setting.spec, msgspec.structs.replace(setting.base, plant=setting.plant)
-    plant, judged = build_plant(flown), build_problem(setting.base)
-    chances = draw(spec.master, first, runs, spec.steps, plant.n_w)
-    scene = Scene(
+    spec, flown_config = setting.spec, msgspec.structs.replace(setting.base, plant=setting.plant)
+    plant, problem = build_plant(flown_config), build_problem(setting.base)
+    draws = draw(spec.master, first, runs, spec.steps, plant.n_w)
+    world = LinearWorld(
         plant=plant,
-        state_set=judged.state_set,
-        input_set=judged.input_set,
-        q_x=judged.q_x,
-        q_u=judged.q_u,
-        target=judged.target,
-        u_target=judged.u_target,
-        start=_starts(setting, first, runs),
+        state_set=problem.state_set,
+        input_set=problem.input_set,
+        q_x=problem.q_x,
+        q_u=problem.q_u,
+        target=problem.target,
+        u_target=problem.u_target,
+        start=_draw_start_states(setting, first, runs),
     )
-    first_known = known(setting.link, plant.dt_s, chances.link)
+    known_steps = compute_known_steps(setting.link, plant.dt_s, draws.link)
     noise = None
     if spec.measured == "position":
         std_m = setting.base.sim.camera.noise_std_m
         noise = std_m * draw_noise(spec.master, first, runs, spec.steps, len(plant.axes))
-    return Met(
-        scene, newest_of(first_known), disturbances(setting.disturbance, plant.w, chances.normal), first_known, noise
+    return RunConditions(
+        world,
+        select_newest_captures(known_steps),
+        shape_disturbances(setting.disturbance, plant.w, draws.normal),
+        known_steps,
+        noise,
     )
 
 
-def start_of(spec: CampaignSpec, base: Config) -> Array:
+def get_start_state(spec: CampaignSpec, base: Config) -> Array:
     """Return the state in which runs start (n_x,); with a box, its middle."""
     if spec.start:
         return np.array(spec.start, dtype=np.float64)
@@ -155,27 +166,24 @@ def start_of(spec: CampaignSpec, base: Config) -> Array:
     return start_state(base, build_plant(base))
 
 
-def _starts(setting: Setting, first: int, runs: int) -> Array:
+def _draw_start_states(setting: CellSetting, first: int, runs: int) -> Array:
     """Return x(0) of every run (N, n_x)."""
     spec = setting.spec
     if not spec.start_box:
-        return np.tile(start_of(spec, setting.base), (runs, 1))
+        return np.tile(get_start_state(spec, setting.base), (runs, 1))
     lower, upper = np.array(spec.start_box, dtype=np.float64)
     draws = np.empty((runs, lower.size))
     for i in range(runs):
-        seed = np.random.SeedSequence([spec.master, first + i]).spawn(_START + 1)[_START]
+        seed = np.random.SeedSequence([spec.master, first + i]).spawn(_START_CHILD + 1)[_START_CHILD]
         np.random.default_rng(seed).random(out=draws[i])
     return np.asarray(lower + (upper - lower) * draws, dtype=np.float64)
-
-
-# From what a controller is to believe to the controller: first a recipe, once, then as many controllers as workers.
 
 
 # Runs that a PID is tuned on: beyond the last index that a campaign can fly.
 TUNING_FIRST, TUNING_RUNS = 10_000_000, 64
 TUNING_STEPS = 200  # longer runs show nothing new, and every candidate flies them all
 
-_OF_POSITIONS = ("pid",)  # it goes by positions and velocities, whatever else a plant has
+_POSITION_KINDS = ("pid",)  # kinds that use positions and velocities alone
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,10 +197,10 @@ class Recipe:
     gains: PidGains | None = None  # the gains of a PID
     margin: float = 0.0  # of an MPC without back-offs, see `ControllerSpec`
     # Covariance (n_x, n_x) that the simple margins begin with; None: the state is measured
-    cov: NDArray[np.float64] | None = None
+    cov: Array | None = None
 
 
-def recipe_for(given: ControllerSpec, config: Config, spec: CampaignSpec) -> Recipe:
+def make_recipe(controller: ControllerSpec, config: Config, spec: CampaignSpec) -> Recipe:
     """Make a recipe: design and gains, which take time or depend on chance.
 
     Args:
@@ -201,24 +209,24 @@ def recipe_for(given: ControllerSpec, config: Config, spec: CampaignSpec) -> Rec
     Raises:
         DesignError: There is no such controller.
     """
-    kind = config.smpc.controller or "smpc" if given.kind == "smpc" else given.kind
-    made = Recipe("", kind, config, margin=given.margin)
-    if kind in _OF_POSITIONS or spec.measured == "position":
+    kind = config.smpc.controller or "smpc" if controller.kind == "smpc" else controller.kind
+    recipe = Recipe("", kind, config, margin=controller.margin)
+    if kind in _POSITION_KINDS or spec.measured == "position":
         check_axes(config)
     if spec.measured == "position":
-        sight = sight_of(config)
-        made = replace(made, cov=innovations(sight.plant, sight.position_std_m, 0.0, 0).estimate_cov)
+        belief = make_filter_belief(config)
+        recipe = replace(recipe, cov=innovations(belief.plant, belief.position_std_m, 0.0, 0).estimate_cov)
     if kind == "smpc" and not config.is_age_conditioned:
-        made = replace(made, design=build_design(config))
+        recipe = replace(recipe, design=build_design(config))
     elif kind == "pid":
-        made = replace(made, gains=_tuned(config, spec))
-    made = replace(made, key=hashlib.sha256(pickle.dumps(made)).hexdigest())
-    if made.design is None:
-        build(made)  # what needs no design is refused here, not in a worker
-    return made
+        recipe = replace(recipe, gains=_tune_gains(config, spec))
+    recipe = replace(recipe, key=hashlib.sha256(pickle.dumps(recipe)).hexdigest())
+    if recipe.design is None:
+        build_from_recipe(recipe)  # without a design, refuse here and not in a worker
+    return recipe
 
 
-def build(recipe: Recipe) -> BatchController:
+def build_from_recipe(recipe: Recipe) -> BatchController:
     """Build a controller from a recipe.
 
     Raises:
@@ -226,7 +234,7 @@ def build(recipe: Recipe) -> BatchController:
     """
     config = recipe.config
     if recipe.kind == "smpc":
-        return _smpc(recipe)
+        return _build_smpc(recipe)
     problem = build_problem(config)
     if recipe.kind == "lqg":
         return Lqg(problem)
@@ -250,25 +258,25 @@ def build(recipe: Recipe) -> BatchController:
     return make_controller(recipe.kind, problem)
 
 
-def sight_of(config: Config) -> FilterBelief:
-    """Return what a controller with this configuration believes of positions."""
+def make_filter_belief(config: Config) -> FilterBelief:
+    """Return plant and noise that a controller with this configuration assumes of positions."""
     return FilterBelief(build_plant(config), config.estimator.position_std_m, config.estimator.initial_std)
 
 
-_built = threading.local()  # a controller has a state: each thread of a worker has its own
+_cache = threading.local()  # a controller has a state: each thread of a worker has its own
 
 
-def built(recipe: Recipe) -> BatchController:
-    """Return a controller of a recipe; the last one is kept, as a worker mostly goes on with the same."""
-    if getattr(_built, "key", None) != recipe.key:
-        _built.key = None
-        _built.controller = build(recipe)
-        _built.key = recipe.key
-    controller: BatchController = _built.controller
+def get_controller(recipe: Recipe) -> BatchController:
+    """Return the controller of a recipe; the last one is cached, as a worker mostly flies the same again."""
+    if getattr(_cache, "key", None) != recipe.key:
+        _cache.key = None
+        _cache.controller = build_from_recipe(recipe)
+        _cache.key = recipe.key
+    controller: BatchController = _cache.controller
     return controller
 
 
-def _smpc(recipe: Recipe) -> BatchSmpc:
+def _build_smpc(recipe: Recipe) -> BatchSmpc:
     config, design, plant = recipe.config, recipe.design, build_plant(recipe.config)
     brake_gain_1ps = config.fallback.brake_gain_1ps
     if config.is_age_conditioned:
@@ -286,16 +294,13 @@ def _smpc(recipe: Recipe) -> BatchSmpc:
     return BatchSmpc(decider, plant, design.horizon, len(design.late), brake_gain_1ps)
 
 
-def _tuned(config: Config, spec: CampaignSpec) -> PidGains:
-    """Return gains tuned for what the PID believes in, from the campaign's start."""
+def _tune_gains(config: Config, spec: CampaignSpec) -> PidGains:
+    """Return gains tuned for the plant and link that the PID believes in, from the campaign's start."""
     spec = msgspec.structs.replace(spec, steps=min(spec.steps, TUNING_STEPS))
-    believed = Setting(spec, config, config.plant, config.link, DisturbanceSpec(name="believed"))
-    meets = met(believed, TUNING_FIRST, TUNING_RUNS)
-    start = start_of(spec, config)
-    return tune(build_problem(config), np.asarray(start), meets.newest, meets.disturbances)
-
-
-# Controllers of ours in place of the SMPC, within the flight core: its filter, fallback and last gate stay.
+    believed = CellSetting(spec, config, config.plant, config.link, DisturbanceSpec(name="believed"))
+    conditions = draw_conditions(believed, TUNING_FIRST, TUNING_RUNS)
+    start = get_start_state(spec, config)
+    return tune(build_problem(config), np.asarray(start), conditions.newest_captures, conditions.disturbances)
 
 
 class BaselineSolver:
@@ -310,14 +315,17 @@ class BaselineSolver:
         self._name, self._rehearsal = name, Rehearsal(make)
 
     def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:
-        """See `Solver`; `outlook` is not used."""
+        """See `Solver`; the preview is not used."""
         del outlook
         problem, inputs = self._rehearsal.inputs(seq, x, target)
         if not np.isfinite(inputs).all():
             return Answer.failed(seq, SolveStatus.FAILED, self._name)
         low, high = problem.input_set.bounds
-        acts, states = np.clip(inputs, low, high), [x]
-        for u in acts:
+        applied, states = np.clip(inputs, low, high), [x]
+        for u in applied:
             states.append(problem.plant.a @ states[-1] + problem.plant.b @ u)
-        wanted, held = problem.target[np.newaxis], problem.u_target[np.newaxis]
-        return replace(make_answer(seq, self._name, problem, np.array(states), acts, wanted, held), inputs=inputs)
+        target_states, target_inputs = problem.target[np.newaxis], problem.u_target[np.newaxis]
+        return replace(
+            make_answer(seq, self._name, problem, np.array(states), applied, target_states, target_inputs),
+            inputs=inputs,
+        )

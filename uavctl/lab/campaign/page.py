@@ -1,4 +1,4 @@
-"""Pages of campaigns, in the linear world and of quadrotor trials."""
+"""Pages of campaigns, in the linear world and of quadrotor trials; each is one complete HTML file."""
 
 from __future__ import annotations
 
@@ -17,63 +17,60 @@ from logs.report.page import Mark, PageSection
 from logs.report.run_statistics import Interval
 from uavctl.errors import UavctlError
 from uavctl.lab.campaign import plots
-from uavctl.lab.campaign.plots import Looks
+from uavctl.lab.campaign.plots import ControllerStyles
 from uavctl.lab.campaign.results import (
     SMPC,
     CampaignVerdict,
     CellSummary,
     Group,
     Results,
-    brief,
-    cell_summary,
+    describe_briefly,
+    describe_verdict,
     exceeds,
-    group_of,
-    grouped,
-    in_words,
-    percent,
+    format_percent,
+    get_group,
+    get_verdict_word,
+    group_cells,
+    make_verdicts,
     read_results,
-    verdicts,
-    word_of,
+    summarise_cell,
 )
 from uavctl.lab.campaign.store import SPECIFICATION
-from uavctl.lab.campaign.trials import ToldTrial, TrialSummary, summarise_trial
-from uavctl.lab.trial import BEYOND, MEANING, SHOWN
+from uavctl.lab.campaign.trials import TrialRecord, TrialSummary, summarise_trial
+from uavctl.lab.trial import EXCESS_FIGURE, FIGURE_NOTE, SCENARIO_FIGURES
 
-# A campaign with all that its page shows worked out.
-
-
-_WHAT = ("link", "disturbance", "plant")
+_GROUP_PARTS = ("link", "disturbance", "plant")
 
 
 @dataclass(frozen=True, eq=False)
 class CampaignView:
-    """A campaign with everything worked out that its page shows."""
+    """Campaign with all figures that its page shows."""
 
     results: Results  # the campaign
     cells: list[CellSummary]  # the figures of its cells
     groups: dict[Group, list[CellSummary]]  # cells by link, disturbance and plant
     verdicts: list[CampaignVerdict]  # each SMPC against the baselines of its group
-    looks: Looks  # how controllers are drawn
+    styles: ControllerStyles  # how controllers are drawn
 
     @classmethod
-    def of(cls, results: Results) -> Self:
-        """Work out the figures of a campaign."""
-        cells = [cell_summary(results, cell) for cell in results.cells]
-        groups = grouped(cells)
-        first = [cell.controller for cell in cells if cell.kind == SMPC]
-        looks = Looks(tuple(dict.fromkeys([*first, *(cell.controller for cell in cells)])))
-        return cls(results, cells, groups, list(verdicts(results, groups)), looks)
+    def make(cls, results: Results) -> Self:
+        """Compute the figures of a campaign."""
+        cells = [summarise_cell(results, cell) for cell in results.cells]
+        groups = group_cells(cells)
+        smpc_names = [cell.controller for cell in cells if cell.kind == SMPC]
+        styles = ControllerStyles(tuple(dict.fromkeys([*smpc_names, *(cell.controller for cell in cells)])))
+        return cls(results, cells, groups, list(make_verdicts(results, groups)), styles)
 
-    def place(self, group: Group) -> str:
-        """Return the name of a group: its link, and what else is not the same for all groups."""
+    def name_group(self, group: Group) -> str:
+        """Return the name of a group: its link, and its disturbance and plant if groups differ in them."""
         names = list(group[:1])
-        for which in (1, 2):
-            if len({other[which] for other in self.groups}) > 1:
-                names.append(f"{_WHAT[which]} {group[which]}")
+        for part in (1, 2):
+            if len({group_key[part] for group_key in self.groups}) > 1:
+                names.append(f"{_GROUP_PARTS[part]} {group[part]}")
         return ", ".join(names)
 
     @property
-    def scenes(self) -> dict[tuple[str, str], list[CellSummary]]:
+    def cells_by_scene(self) -> dict[tuple[str, str], list[CellSummary]]:
         """Cells by disturbance and plant."""
         scenes: dict[tuple[str, str], list[CellSummary]] = {}
         for cell in self.cells:
@@ -81,10 +78,7 @@ class CampaignView:
         return scenes
 
 
-# What a campaign came to, in sentences made from its figures.
-
-
-def story(view: CampaignView) -> Iterator[str]:
+def describe_outcome(view: CampaignView) -> Iterator[str]:
     """Yield sentences on the outcome of a campaign, made from its figures."""
     results, cells = view.results, view.cells
     refused = sum(bool(cell.refused) for cell in cells)
@@ -99,96 +93,97 @@ def story(view: CampaignView) -> Iterator[str]:
     yield f"{count(failed, 'run')} failed; they are listed below." if failed else "No run failed."
     judged = [verdict for verdict in view.verdicts if verdict.comparisons]
     if judged:
-        yield _outcome(judged)
-    yield from _step_by_step(view)
+        yield _describe_verdicts(judged)
+    yield from _describe_steps(view)
 
 
-def _outcome(judged: Sequence[CampaignVerdict]) -> str:
+def _describe_verdicts(judged: Sequence[CampaignVerdict]) -> str:
     """Return a sentence on how often the SMPC beat all baselines, and how often a baseline beat it."""
-    holds, beaten = sum(v.holds for v in judged), sum(v.beaten for v in judged)
-    outright = sum(v.outright for v in judged)
+    unmatched, beaten_count = sum(v.is_unmatched for v in judged), sum(v.is_beaten for v in judged)
+    better = sum(v.is_better_than_all for v in judged)
     text = (
-        f"In {holds} of {count(len(judged), 'case')} no baseline is as cheap as the SMPC at equal or lower violation "
-        f"rates; in {outright} of these each one costs more and keeps limits no better. In {beaten} a baseline costs "
-        "less and breaks limits no more often."
+        f"In {unmatched} of {count(len(judged), 'case')} no baseline is as cheap as the SMPC at equal or lower "
+        f"violation rates; in {better} of these each one costs more and keeps limits no better. In {beaten_count} a "
+        "baseline costs less and breaks limits no more often."
     )
-    left = len(judged) - holds - beaten
-    return f"{text} In {left} the costs of such a baseline and the SMPC cannot be told apart." if left else text
+    undecided = len(judged) - unmatched - beaten_count
+    return (
+        f"{text} In {undecided} the costs of such a baseline and the SMPC cannot be told apart." if undecided else text
+    )
 
 
-def _judged(view: CampaignView) -> tuple[list[CellSummary], list[CellSummary], list[CellSummary]]:
-    """Return the cells with a promise, those that broke it, and of these the ones beyond chance."""
-    kept = [cell for cell in view.cells if cell.promised_x is not None and cell.violation_ci is not None]
-    above = [cell for cell in kept if exceeds(cell.violation_rate or 0.0, cell.promised_x or 0.0)]
-    over = [c for c in above if c.violation_ci is not None and c.violation_ci[0] > (c.promised_x or 0.0)]
-    return kept, above, over
+def _group_by_promise(view: CampaignView) -> tuple[list[CellSummary], list[CellSummary], list[CellSummary]]:
+    """Return the cells with an allowed rate, those above it, and those above it beyond chance."""
+    promising = [cell for cell in view.cells if cell.promised_x is not None and cell.violation_ci is not None]
+    exceeding = [cell for cell in promising if exceeds(cell.violation_rate or 0.0, cell.promised_x or 0.0)]
+    significant = [c for c in exceeding if c.violation_ci is not None and c.violation_ci[0] > (c.promised_x or 0.0)]
+    return promising, exceeding, significant
 
 
-def _main(view: CampaignView) -> Markup:
-    """Return the line on what matters most as HTML: failures, and whether promises were kept."""
+def _render_banner(view: CampaignView) -> Markup:
+    """Return the banner as HTML: failed runs, and whether rates stayed within the allowed ones."""
     failed, flown = sum(cell.failed for cell in view.cells), sum(cell.runs for cell in view.cells)
-    promise = _promise(view)
+    promise = _judge_promise(view)
     if failed:
-        why = () if promise is None else (f"{promise[1]}: {promise[2]}",)
+        details = () if promise is None else (f"{promise[1]}: {promise[2]}",)
         return page.render_banner(
-            "bad", "Runs failed", f"{failed} of {count(flown, 'run')}; they are in no figure.", why
+            "bad", "Runs failed", f"{failed} of {count(flown, 'run')}; they are in no figure.", details
         )
     return page.NOTHING if promise is None else page.render_banner(*promise, ())
 
 
-def _promise(view: CampaignView) -> tuple[str, str, str] | None:
-    """Return whether the promised risk was kept: tone, word and text; None where nothing was promised."""
-    kept, above, over = _judged(view)
-    if not kept:
+def _judge_promise(view: CampaignView) -> tuple[str, str, str] | None:
+    """Return whether rates stayed within the allowed ones: tone, title and text; None without any allowed rate."""
+    promising, exceeding, significant = _group_by_promise(view)
+    if not promising:
         return None
-    worst = max(kept, key=lambda cell: (cell.violation_rate or 0.0) / (cell.promised_x or 1.0))
-    most = (
-        f"the most was {percent(worst.violation_rate)} of steps where {percent(worst.promised_x)} are allowed "
-        f"({worst.controller}, {view.place(group_of(worst))})"
+    worst = max(promising, key=lambda cell: (cell.violation_rate or 0.0) / (cell.promised_x or 1.0))
+    worst_text = (
+        f"the most was {format_percent(worst.violation_rate)} of steps where {format_percent(worst.promised_x)} are "
+        f"allowed ({worst.controller}, {view.name_group(get_group(worst))})"
     )
-    cells = count(len(kept), "cell")
-    if over:
-        more = f", and {len(above) - len(over)} within chance" if len(above) > len(over) else ""
-        return "bad", "Promise broken", f"by {len(over)} of {cells}, beyond chance{more}; {most}."
-    if above:
-        return "mind", "Perhaps too often", f"in {len(above)} of {cells}, within chance; {most}."
-    return "good", "Promise kept", f"by all of {cells}; {most}."
-
-
-def _step_by_step(view: CampaignView) -> Iterator[str]:
-    """Yield a sentence on whether the promised risk was kept in each step."""
-    kept, _, _ = _judged(view)
-    stepped = [c for c in kept if c.worst_step_rate is not None and c.worst_step_ci is not None]
-    if stepped:
-        broke = sum(1 for c in stepped if c.worst_step_ci and c.worst_step_ci[0] > (c.promised_x or 0.0))
-        highest = max(stepped, key=lambda cell: cell.worst_step_rate or 0.0)
-        yield (
-            f"Step by step, {count(broke, 'cell')} of {len(stepped)} left the limits more often than allowed in some "
-            f"step, beyond chance; the worst step of all had {percent(highest.worst_step_rate)} "
-            f"({highest.controller}, {view.place(group_of(highest))})."
+    cells = count(len(promising), "cell")
+    if significant:
+        others_text = (
+            f", and {len(exceeding) - len(significant)} within chance" if len(exceeding) > len(significant) else ""
         )
+        return "bad", "Promise broken", f"by {len(significant)} of {cells}, beyond chance{others_text}; {worst_text}."
+    if exceeding:
+        return "mind", "Perhaps too often", f"in {len(exceeding)} of {cells}, within chance; {worst_text}."
+    return "good", "Promise kept", f"by all of {cells}; {worst_text}."
 
 
-# The page of a campaign: one HTML file, complete in itself.
+def _describe_steps(view: CampaignView) -> Iterator[str]:
+    """Yield a sentence on whether the rate of each step stayed within the allowed one."""
+    promising, _, _ = _group_by_promise(view)
+    judged = [c for c in promising if c.worst_step_rate is not None and c.worst_step_ci is not None]
+    if judged:
+        broken = sum(1 for c in judged if c.worst_step_ci and c.worst_step_ci[0] > (c.promised_x or 0.0))
+        worst = max(judged, key=lambda cell: cell.worst_step_rate or 0.0)
+        yield (
+            f"Step by step, {count(broken, 'cell')} of {len(judged)} left the limits more often than allowed in some "
+            f"step, beyond chance; the worst step of all had {format_percent(worst.worst_step_rate)} "
+            f"({worst.controller}, {view.name_group(get_group(worst))})."
+        )
 
 
 PAGE = "report.html"
 _SHOWN_FAILURES = 50
-_PROMISED = "allowed by the SMPC's design"
-_HOW_SURE = (
+_LIMIT_LABEL = "allowed by the SMPC's design"
+_INTERVAL_NOTE = (
     "Intervals are at 95 %. The steps of a run are not independent, so the interval of a rate of steps is a bootstrap "
     "over runs (with fewer than 20 runs concerned: the exact interval of the share of such runs, times what a run of "
     "them has on average). The exact interval (Clopper and Pearson) is that of the share of runs with any step "
     "outside. Costs have a bootstrap over runs, beyond 2000 runs its normal approximation. Runs that failed are in no "
     "figure."
 )
-_DIFFERENCE = "What each baseline costs more than the SMPC"
-_QUESTION = "Does the SMPC cost less, at equal or lower violation rates?"
-_DIFFERENCES = (
+_DIFFERENCE_TITLE = "What each baseline costs more than the SMPC"
+_VERDICT_TITLE = "Does the SMPC cost less, at equal or lower violation rates?"
+_DIFFERENCE_NOTE = (
     "All controllers meet the same disturbances and the same losses, so their costs are subtracted run by run; the "
     "interval is that of the mean difference, over the SMPC's mean cost. Right of zero the SMPC costs less."
 )
-_VERDICT = (
+_VERDICT_NOTE = (
     "“Yes” where every baseline costs more than the SMPC, or breaks state or input limits more often: none is as cheap "
     "at equal or lower rates. The columns say what each baseline costs, over the SMPC's cost. Less and more are judged "
     "by the intervals of the differences run by run."
@@ -204,10 +199,10 @@ def write_report(folder: Path) -> Path:
     Raises:
         UavctlError: The results cannot be read, or the page not be written.
     """
-    return _write(folder, report_html(read_results(folder)))
+    return _write_page(folder, render_report(read_results(folder)))
 
 
-def _write(folder: Path, text: str) -> Path:
+def _write_page(folder: Path, text: str) -> Path:
     path = folder / PAGE
     try:
         path.write_text(text, encoding="utf-8")
@@ -216,7 +211,7 @@ def _write(folder: Path, text: str) -> Path:
     return path
 
 
-def _specification(folder: Path) -> Markup:
+def _render_specification(folder: Path) -> Markup:
     """Return the campaign's file as folded HTML; empty where it is missing."""
     try:
         return page.render_folded("Specification", (folder / SPECIFICATION).read_text(encoding="utf-8"))
@@ -224,118 +219,126 @@ def _specification(folder: Path) -> Markup:
         return page.NOTHING
 
 
-def report_html(results: Results) -> str:
+def render_report(results: Results) -> str:
     """Return the page of a campaign as HTML."""
-    view = CampaignView.of(results)
+    view = CampaignView.make(results)
     subtitle = f"{count(len(view.cells), 'cell')} · seed {results.master} · uavctl {results.version}"
-    return page.render_page(f"Campaign “{results.name}”", subtitle, story(view), _sections(view), top=_main(view))
+    return page.render_page(
+        f"Campaign “{results.name}”", subtitle, describe_outcome(view), _make_sections(view), top=_render_banner(view)
+    )
 
 
-def _sections(view: CampaignView) -> Iterator[PageSection]:
-    yield _compared_section(view)
-    yield _verdict_section(view)
-    yield _difference_section(view)
-    for place, (scene, cells) in enumerate(view.scenes.items()):
-        yield from _scene_section(view, scene, cells, f"s{place}")
-    yield from _ways_section(view)
-    yield _age_section(view)
-    yield _cells_section(view)
-    yield _failures_section(view)
+def _make_sections(view: CampaignView) -> Iterator[PageSection]:
+    yield _make_compared_section(view)
+    yield _make_verdict_section(view)
+    yield _make_difference_section(view)
+    for place, (scene, cells) in enumerate(view.cells_by_scene.items()):
+        yield from _make_scene_section(view, scene, cells, f"s{place}")
+    yield from _make_path_section(view)
+    yield _make_age_section(view)
+    yield _make_cells_section(view)
+    yield _make_failures_section(view)
 
 
-def _compared_section(view: CampaignView) -> PageSection:
+def _make_compared_section(view: CampaignView) -> PageSection:
     cells, results = view.cells, view.results
 
-    def named(values: Iterator[str]) -> str:
+    def join_names(values: Iterator[str]) -> str:
         return ", ".join(dict.fromkeys(values))
 
     rows = [
-        ("Controllers", ", ".join(view.looks.controllers)),
-        ("Links", named(cell.link for cell in cells)),
-        ("Disturbances", named(cell.disturbance for cell in cells)),
-        ("Plants", named(cell.plant for cell in cells)),
+        ("Controllers", ", ".join(view.styles.controllers)),
+        ("Links", join_names(cell.link for cell in cells)),
+        ("Disturbances", join_names(cell.disturbance for cell in cells)),
+        ("Plants", join_names(cell.plant for cell in cells)),
         ("Runs of a cell", f"{results.planned} of {count(results.steps, 'step')}"),
         ("Seed", f"{results.master}; run i of every cell has the draws of (seed, i)"),
     ]
-    return PageSection("What was compared", "", page.render_facts(rows) + _specification(results.folder))
+    return PageSection("What was compared", "", page.render_facts(rows) + _render_specification(results.folder))
 
 
-def _verdict_section(view: CampaignView) -> PageSection:
+def _make_verdict_section(view: CampaignView) -> PageSection:
     if not view.verdicts:
-        return PageSection(_QUESTION, "", page.render_paragraph("No SMPC was flown."))
-    baselines = dict.fromkeys(one.baseline.controller for v in view.verdicts for one in v.comparisons)
-    rows, words = [], []
+        return PageSection(_VERDICT_TITLE, "", page.render_paragraph("No SMPC was flown."))
+    baselines = dict.fromkeys(comparison.baseline.controller for v in view.verdicts for comparison in v.comparisons)
+    rows, explanations = [], []
     for verdict in view.verdicts:
-        name = _name(view, verdict)
-        said = {one.baseline.controller: brief(one) for one in verdict.comparisons}
+        name = _name_verdict(view, verdict)
+        texts = {comparison.baseline.controller: describe_briefly(comparison) for comparison in verdict.comparisons}
         if verdict.comparisons:
-            rows.append((name, word_of(verdict), *(said.get(baseline, "–") for baseline in baselines)))
-        words += [page.render_strong(name), page.render_list(in_words(verdict))]
-    folded = page.render_folded("In words, with figures and reasons", page.join(words))
+            rows.append((name, get_verdict_word(verdict), *(texts.get(baseline, "–") for baseline in baselines)))
+        explanations += [page.render_strong(name), page.render_list(describe_verdict(verdict))]
+    folded = page.render_folded("In words, with figures and reasons", page.join(explanations))
     if not rows:
-        return PageSection(_QUESTION, _VERDICT, folded)
+        return PageSection(_VERDICT_TITLE, _VERDICT_NOTE, folded)
     columns = ("", "best at its rate", *baselines)
-    return PageSection(_QUESTION, _VERDICT, page.render_table(columns, rows, frozenset(), kind="dense") + folded)
+    return PageSection(
+        _VERDICT_TITLE, _VERDICT_NOTE, page.render_table(columns, rows, frozenset(), kind="dense") + folded
+    )
 
 
-def _name(view: CampaignView, verdict: CampaignVerdict) -> str:
-    place = view.place(verdict.group)
-    several = len({cell.controller for cell in view.cells if cell.kind == SMPC}) > 1
-    return f"{verdict.smpc.controller}, {place}" if several else place
+def _name_verdict(view: CampaignView, verdict: CampaignVerdict) -> str:
+    group_name = view.name_group(verdict.group)
+    has_several_smpcs = len({cell.controller for cell in view.cells if cell.kind == SMPC}) > 1
+    return f"{verdict.smpc.controller}, {group_name}" if has_several_smpcs else group_name
 
 
-def _scene_section(
+def _make_scene_section(
     view: CampaignView, scene: tuple[str, str], cells: Sequence[CellSummary], key: str
 ) -> Iterator[PageSection]:
     losses = {
         cell.link: cell.link_loss for cell in view.results.cells if cell.link_loss is not None and not cell.refused
     }
-    drawings = list(plots.compared(cells, losses, view.looks, key))
+    drawings = list(plots.draw_quantities(cells, losses, view.styles, key))
     if drawings:
-        note = "" if key != "s0" else _HOW_SURE + " An arrow stands at the upper end of the interval of a rate of zero."
-        flown = {cell.controller for cell in cells if cell.cost is not None}
-        body = page.render_legend([*view.looks.entries(flown), Mark("dashed", "limit", _PROMISED)]) + page.render_grid(
-            drawings
+        note = (
+            ""
+            if key != "s0"
+            else _INTERVAL_NOTE + " An arrow stands at the upper end of the interval of a rate of zero."
         )
-        yield PageSection(f"Costs and limits{_suffix(view, scene)}", note, body)
+        flown = {cell.controller for cell in cells if cell.cost is not None}
+        body = page.render_legend(
+            [*view.styles.make_marks(flown), Mark("dashed", "limit", _LIMIT_LABEL)]
+        ) + page.render_grid(drawings)
+        yield PageSection(f"Costs and limits{_make_suffix(view, scene)}", note, body)
 
 
-def _difference_section(view: CampaignView) -> PageSection:
+def _make_difference_section(view: CampaignView) -> PageSection:
     drawings = []
-    for place, scene in enumerate(view.scenes):
-        for number, controller in enumerate(view.looks.controllers):
-            mine = [v for v in view.verdicts if v.smpc.controller == controller and v.group[1:] == scene]
-            title = f"Beside {controller}{_suffix(view, scene)}"
-            drawing = plots.differences(mine, view.looks, title, f"s{place}-{number}")
+    for scene_index, scene in enumerate(view.cells_by_scene):
+        for number, controller in enumerate(view.styles.controllers):
+            scene_verdicts = [v for v in view.verdicts if v.smpc.controller == controller and v.group[1:] == scene]
+            title = f"Beside {controller}{_make_suffix(view, scene)}"
+            drawing = plots.draw_differences(scene_verdicts, view.styles, title, f"s{scene_index}-{number}")
             if drawing is not None:
                 drawings.append(drawing)
-    compared = [one for verdict in view.verdicts for one in verdict.comparisons]
+    compared = [comparison for verdict in view.verdicts for comparison in verdict.comparisons]
     if not drawings:
-        return PageSection(_DIFFERENCE, "", page.render_paragraph("There is nothing to compare."))
-    who = {one.baseline.controller for one in compared}
-    marks = [*view.looks.entries(who)]
-    if not all(one.as_safe for one in compared):
+        return PageSection(_DIFFERENCE_TITLE, "", page.render_paragraph("There is nothing to compare."))
+    baselines = {comparison.baseline.controller for comparison in compared}
+    marks = [*view.styles.make_marks(baselines)]
+    if not all(comparison.is_as_safe for comparison in compared):
         marks.append(Mark("cross", "ink", "the SMPC breaks limits more often"))
     body = page.render_legend(marks) + page.render_grid(drawings)
-    return PageSection(_DIFFERENCE, _DIFFERENCES, body)
+    return PageSection(_DIFFERENCE_TITLE, _DIFFERENCE_NOTE, body)
 
 
-def _suffix(view: CampaignView, scene: tuple[str, str]) -> str:
+def _make_suffix(view: CampaignView, scene: tuple[str, str]) -> str:
     """Return the scene's name to follow a title; empty where there is one scene only."""
-    where = view.place(("", *scene)).removeprefix(", ")
-    return f": {where}" if where else ""
+    scene_name = view.name_group(("", *scene)).removeprefix(", ")
+    return f": {scene_name}" if scene_name else ""
 
 
-def _age_section(view: CampaignView) -> PageSection:
+def _make_age_section(view: CampaignView) -> PageSection:
     note = "Every controller meets the same losses, so the ages are those of the link."
     if not any(cell.ages for cell in view.cells):
         return PageSection("Age of information", "", page.render_paragraph("No run ended in order."))
-    figures = page.render_grid([plots.ages(view.cells, view.results)])
-    return PageSection("Age of information", note, page.render_legend(plots.age_entries(view.cells)) + figures)
+    figures = page.render_grid([plots.draw_ages(view.cells, view.results)])
+    return PageSection("Age of information", note, page.render_legend(plots.make_age_legend(view.cells)) + figures)
 
 
-def _ways_section(view: CampaignView) -> Iterator[PageSection]:
-    """Return the section on ways through a room; none for a box of other units, which has no walls."""
+def _make_path_section(view: CampaignView) -> Iterator[PageSection]:
+    """Yield the section on paths through the room; none for a box of other units, which has no walls."""
     if all(cell.beyond_m is None for cell in view.cells):
         return
     columns = (
@@ -350,10 +353,10 @@ def _ways_section(view: CampaignView) -> Iterator[PageSection]:
     rows = [
         (
             cell.controller,
-            view.place(group_of(cell)),
+            view.name_group(get_group(cell)),
             *("–" if value is None else f"{value:.3g}" for value in (cell.near_s, cell.nearer_s, cell.hold_rms_m)),
             "–" if cell.beyond_m is None else f"{cell.beyond_m:.2f}",
-            "–" if cell.usable_room is None else f"{percent(cell.usable_room)}",
+            "–" if cell.usable_room is None else f"{format_percent(cell.usable_room)}",
         )
         for cell in view.cells
         if not cell.refused
@@ -366,19 +369,19 @@ def _ways_section(view: CampaignView) -> Iterator[PageSection]:
     yield PageSection("Through the room", note, page.render_table(columns, rows, frozenset(range(2, 7)), kind="dense"))
 
 
-_COLUMNS = (
+_CELL_COLUMNS = (
     "cell", "controller", "cost of a run", "settled, a step", "states outside", "worst step", "runs with any",
     "inputs outside", "mean square input", "no plan left", "no plan found", "limits eased", "oldest", "failed",
 )  # fmt: skip
 
 
-def _cells_section(view: CampaignView) -> PageSection:
+def _make_cells_section(view: CampaignView) -> PageSection:
     tables = []
     for group, cells in view.groups.items():
-        rows = [_row(cell) for cell in cells if not cell.refused]
+        rows = [_make_row(cell) for cell in cells if not cell.refused]
         refused = [f"{cell.index} {cell.controller}: no design; {cell.refused}" for cell in cells if cell.refused]
-        body = page.render_table(_COLUMNS, rows, frozenset(range(len(_COLUMNS))) - {1}, refused, kind="dense")
-        tables.append(page.render_folded(view.place(group), body))
+        body = page.render_table(_CELL_COLUMNS, rows, frozenset(range(len(_CELL_COLUMNS))) - {1}, refused, kind="dense")
+        tables.append(page.render_folded(view.name_group(group), body))
     note = (
         "States and inputs outside: share of steps. Worst step: share of runs with a state outside in the step with "
         "the most, its exact interval for all steps at once (Bonferroni). Runs with any: share of runs with a state "
@@ -388,42 +391,42 @@ def _cells_section(view: CampaignView) -> PageSection:
     return PageSection("All figures", note, page.join(tables))
 
 
-def _row(cell: CellSummary) -> tuple[str, ...]:
-    planned = cell.decisions > 0
+def _make_row(cell: CellSummary) -> tuple[str, ...]:
+    has_decisions = cell.decisions > 0
     return (
         str(cell.index),
         cell.controller,
-        _mean(cell.cost, cell.cost_ci),
-        _mean(cell.settled_cost, cell.settled_cost_ci),
-        _rate(cell.violation_rate, cell.violation_ci),
-        _rate(cell.worst_step_rate, cell.worst_step_ci),
-        _rate(cell.run_violation_rate, cell.run_violation_ci),
-        _rate(cell.input_violation_rate, cell.input_violation_ci),
+        _format_mean(cell.cost, cell.cost_ci),
+        _format_mean(cell.settled_cost, cell.settled_cost_ci),
+        _format_rate(cell.violation_rate, cell.violation_ci),
+        _format_rate(cell.worst_step_rate, cell.worst_step_ci),
+        _format_rate(cell.run_violation_rate, cell.run_violation_ci),
+        _format_rate(cell.input_violation_rate, cell.input_violation_ci),
         "–" if cell.mean_square_input is None else f"{cell.mean_square_input:.4g}",
-        *(str(number) if planned else "–" for number in (cell.fallbacks, cell.infeasible, cell.slack_used)),
+        *(str(number) if has_decisions else "–" for number in (cell.fallbacks, cell.infeasible, cell.slack_used)),
         str(cell.max_age),
         str(cell.failed),
     )
 
 
-def _mean(value: float | None, interval: Interval | None) -> str:
-    return "–" if value is None or interval is None else f"{value:.5g} {_whole(interval, 5)}"
+def _format_mean(value: float | None, interval: Interval | None) -> str:
+    return "–" if value is None or interval is None else f"{value:.5g} {_format_interval(interval, 5)}"
 
 
-def _rate(value: float | None, interval: Interval | None) -> str:
+def _format_rate(value: float | None, interval: Interval | None) -> str:
     if value is None or interval is None:
         return "–"
-    return f"{percent(value)} {_whole((100 * interval[0], 100 * interval[1]), 3)}"
+    return f"{format_percent(value)} {_format_interval((100 * interval[0], 100 * interval[1]), 3)}"
 
 
-def _whole(interval: Interval, digits: int) -> str:
+def _format_interval(interval: Interval, digits: int) -> str:
     """Return an interval as text that no line break splits."""
     return f"({interval[0]:.{digits}g} to {interval[1]:.{digits}g})".replace(" ", "\N{NO-BREAK SPACE}")
 
 
-def _failures_section(view: CampaignView) -> PageSection:
+def _make_failures_section(view: CampaignView) -> PageSection:
     failed = [
-        (str(cell.index), cell.controller, view.place(group_of(cell)), str(run), error)
+        (str(cell.index), cell.controller, view.name_group(get_group(cell)), str(run), error)
         for cell in view.cells
         for run, error in view.results.runs[cell.index].failed
     ]
@@ -438,15 +441,12 @@ def _failures_section(view: CampaignView) -> PageSection:
     return PageSection("Runs that failed", note, body)
 
 
-# The page of a campaign in the world of the quadrotor: one HTML file, complete in itself.
-
-
-_TITLES = {
+_SCENARIO_TITLES = {
     "hold": "Flying to a place and holding it",
     "eight": "Following a figure of eight",
     "blackout": "Four seconds without any position",
 }
-_OWN = (
+_OWN_LOOP_NOTE = (
     "`own-loop` is the vehicle's own position loop: its estimator gets the very positions that the others get on the "
     "same flight, and nothing else, and it is told where to be, or along a motion position, velocity and acceleration. "
     "The simulated vehicle's inertial sensors are nearly perfect (a constant bias, no noise, attitude without error), "
@@ -463,18 +463,20 @@ def write_trial_report(folder: Path) -> Path:
     Raises:
         UavctlError: The results cannot be read, or the page not be written.
     """
-    return _write(folder, trial_html(*summarise_trial(folder), _specification(folder)))
+    return _write_page(folder, render_trial_report(*summarise_trial(folder), _render_specification(folder)))
 
 
-def trial_html(told: ToldTrial, cells: Sequence[TrialSummary], specification: Markup = page.NOTHING) -> str:
+def render_trial_report(
+    record: TrialRecord, cells: Sequence[TrialSummary], specification: Markup = page.NOTHING
+) -> str:
     """Return the page of a campaign of trials as HTML."""
-    subtitle = f"{count(len(cells), 'cell')} · seed {told.master} · uavctl {told.uavctl_version}"
-    title, sections = f"Campaign “{told.name}”", _trial_sections(told, cells, specification)
-    return page.render_page(title, subtitle, _story(cells), sections, top=_trial_main(cells))
+    subtitle = f"{count(len(cells), 'cell')} · seed {record.master} · uavctl {record.uavctl_version}"
+    title, sections = f"Campaign “{record.name}”", _make_trial_sections(record, cells, specification)
+    return page.render_page(title, subtitle, _describe_trials(cells), sections, top=_render_trial_banner(cells))
 
 
-def _trial_main(cells: Sequence[TrialSummary]) -> Markup:
-    """Return the line on what matters most as HTML: failures, else the furthest beyond a wall that any flight was."""
+def _render_trial_banner(cells: Sequence[TrialSummary]) -> Markup:
+    """Return the banner as HTML: failed flights, else the largest distance of any flight beyond a wall."""
     failed = sum(cell.failed for cell in cells)
     runs = sum(cell.runs for cell in cells)
     if failed:
@@ -484,85 +486,91 @@ def _trial_main(cells: Sequence[TrialSummary]) -> Markup:
     beyond = [
         (value, cell)
         for cell in cells
-        for value in cell.values.get("blackout_beyond_m" if cell.place.scenario == "blackout" else BEYOND.key, ())
+        for value in cell.values.get(
+            "blackout_beyond_m" if cell.place.scenario == "blackout" else EXCESS_FIGURE.key, ()
+        )
         if math.isfinite(value)
     ]
     if not beyond:
         return page.NOTHING
-    worst_m, worst = max(beyond, key=lambda one: one[0])
-    where = f"{worst.place.controller}, {_TITLES[worst.place.scenario].lower()}, {', '.join(_where(worst))}"
-    left = sum(value > 0.0 for value, _ in beyond)
-    if not left:
+    worst_m, worst = max(beyond, key=lambda value_and_cell: value_and_cell[0])
+    place = worst.place
+    where = f"{place.controller}, {_SCENARIO_TITLES[place.scenario].lower()}, {', '.join(_get_conditions(worst))}"
+    outside = sum(value > 0.0 for value, _ in beyond)
+    if not outside:
         text = f"{count(len(beyond), 'flight')}, of which the nearest to a wall had {-worst_m:.2f} m left ({where})."
         return page.render_banner("good", "All inside", text, ())
-    text = f"{left} of {count(len(beyond), 'flight')}, the furthest by {worst_m:.2f} m ({where})."
+    text = f"{outside} of {count(len(beyond), 'flight')}, the furthest by {worst_m:.2f} m ({where})."
     return page.render_banner("bad" if worst_m >= GRAVE_M else "mind", "Left their limits", text, ())
 
 
-def _story(cells: Sequence[TrialSummary]) -> Iterator[str]:
+def _describe_trials(cells: Sequence[TrialSummary]) -> Iterator[str]:
     flown = [cell for cell in cells if not cell.place.refused]
     yield f"{count(sum(cell.runs for cell in flown), 'flight')} of the true quadrotor, judged on the truth."
-    for scenario, shown in SHOWN.items():
-        mine = [cell for cell in flown if cell.place.scenario == scenario]
-        best = _best(mine, shown[0].key)
-        if best:
-            places = len({_where(cell) for cell in mine})
-            wins = ", ".join(f"{name} in {number}" for name, number in best.items())
-            yield f"{_TITLES[scenario]}, {shown[0].heading}: of {places} places the least (median) was that of {wins}."
+    for scenario, shown in SCENARIO_FIGURES.items():
+        scenario_cells = [cell for cell in flown if cell.place.scenario == scenario]
+        wins = _count_wins(scenario_cells, shown[0].key)
+        if wins:
+            conditions = len({_get_conditions(cell) for cell in scenario_cells})
+            wins_text = ", ".join(f"{name} in {number}" for name, number in wins.items())
+            title = f"{_SCENARIO_TITLES[scenario]}, {shown[0].heading}"
+            yield f"{title}: of {conditions} places the least (median) was that of {wins_text}."
     if any(cell.failed for cell in flown):
         yield f"{count(sum(cell.failed for cell in flown), 'flight')} failed, and are in no figure."
 
 
-def _best(cells: Sequence[TrialSummary], key: str) -> dict[str, int]:
+def _count_wins(cells: Sequence[TrialSummary], key: str) -> dict[str, int]:
     """Return how often each controller had the least median of a figure."""
     wins: dict[str, int] = {}
-    for where in dict.fromkeys(map(_where, cells)):
-        found = {c.place.controller: c.median[key] for c in cells if _where(c) == where}
-        known = {name: value for name, value in found.items() if value is not None}
-        if known:
-            name = min(known, key=lambda one: known[one])
+    for conditions in dict.fromkeys(map(_get_conditions, cells)):
+        medians = {c.place.controller: c.median[key] for c in cells if _get_conditions(c) == conditions}
+        finite = {name: value for name, value in medians.items() if value is not None}
+        if finite:
+            name = min(finite, key=lambda controller: finite[controller])
             wins[name] = wins.get(name, 0) + 1
     return wins
 
 
-def _where(cell: TrialSummary) -> tuple[str, ...]:
+def _get_conditions(cell: TrialSummary) -> tuple[str, ...]:
     place = cell.place
     return place.autopilot, f"{place.rate_hz:g} Hz", place.link, place.air
 
 
-def _trial_sections(told: ToldTrial, cells: Sequence[TrialSummary], specification: Markup) -> Iterator[PageSection]:
+def _make_trial_sections(
+    record: TrialRecord, cells: Sequence[TrialSummary], specification: Markup
+) -> Iterator[PageSection]:
     rows = [
-        ("Flights of a cell", str(told.runs)),
-        ("Seed", f"{told.master}; flight i of every cell has the draws of (seed, i)"),
+        ("Flights of a cell", str(record.runs)),
+        ("Seed", f"{record.master}; flight i of every cell has the draws of (seed, i)"),
     ]
     rooms = {c.place.controller: c.place.usable_room for c in cells if c.place.usable_room is not None}
     rows += [
         (f"Usable room, {name}", f"{100 * share:.0f} % of it is where a plan may rest") for name, share in rooms.items()
     ]
-    yield PageSection("What was compared", _OWN, page.render_facts(rows) + specification)
-    for number, (scenario, shown) in enumerate(SHOWN.items()):
-        mine = [cell for cell in cells if cell.place.scenario == scenario and not cell.place.refused]
-        if not mine:
+    yield PageSection("What was compared", _OWN_LOOP_NOTE, page.render_facts(rows) + specification)
+    for number, (scenario, shown) in enumerate(SCENARIO_FIGURES.items()):
+        scenario_cells = [cell for cell in cells if cell.place.scenario == scenario and not cell.place.refused]
+        if not scenario_cells:
             continue
-        columns = ("vehicle", "cameras", "link", "air", "controller", *(one.heading for one in shown), "ended in")
+        columns = ("vehicle", "cameras", "link", "air", "controller", *(figure.heading for figure in shown), "ended in")
         table = [
             (
-                *(*_where(cell), cell.place.controller),
-                *(one.told(cell.values[one.key]) for one in shown),
+                *(*_get_conditions(cell), cell.place.controller),
+                *(figure.format_values(cell.values[figure.key]) for figure in shown),
                 ", ".join(f"{mode} {number}" for mode, number in cell.modes.items()),
             )
-            for cell in mine
+            for cell in scenario_cells
         ]
         body = page.render_table(columns, table, frozenset(range(5, 5 + len(shown))), kind="dense")
-        yield PageSection(_TITLES[scenario], MEANING if number == 0 else "", body)
-    yield _amiss(cells)
+        yield PageSection(_SCENARIO_TITLES[scenario], FIGURE_NOTE if number == 0 else "", body)
+    yield _make_trial_failures_section(cells)
 
 
-def _amiss(cells: Sequence[TrialSummary]) -> PageSection:
+def _make_trial_failures_section(cells: Sequence[TrialSummary]) -> PageSection:
     rows = [
-        (str(cell.place.index), cell.place.controller, ", ".join(_where(cell)), why)
+        (str(cell.place.index), cell.place.controller, ", ".join(_get_conditions(cell)), reason)
         for cell in cells
-        for why in ([cell.place.refused] if cell.place.refused else cell.errors)
+        for reason in ([cell.place.refused] if cell.place.refused else cell.errors)
     ]
     body = (
         page.render_table(("cell", "controller", "where", "why"), rows, frozenset({0}))

@@ -1,8 +1,8 @@
 """Pool of workers that fly tasks: processes of this machine, or the workers of a Dask cluster.
 
-Every worker computes with one BLAS thread. With more, the last bits of a product depend on their number, and then the
-results would; the libraries read it from the environment before numpy is imported, so a campaign with one worker flies
-in a process of its own too.
+Every worker computes with one BLAS thread. With more, the last bits of a product, and so the results, depend on their
+number. The libraries read that number from the environment when numpy is imported, so a campaign with one worker flies
+in a separate process too.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from uavctl import __version__
 from uavctl.errors import UavctlError, UsageError, need
 
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-_CONNECT_S = 10.0
-_WORKERS_S = 60.0
+_CONNECT_TIMEOUT_S = 10.0
+_WORKERS_TIMEOUT_S = 60.0
 
 
 Columns = dict[str, NDArray[np.generic]]  # a row a run, by column of the results
@@ -52,10 +52,10 @@ class Work(ABC):
 
     @abstractmethod
     def fly(self) -> Columns:
-        """Fly the runs; an error of a run is put into its row, and stops nothing."""
+        """Fly the runs; an error of a run is stored in its row, and the others continue."""
 
     @abstractmethod
-    def lost(self, error: str) -> Columns:
+    def make_lost_rows(self, error: str) -> Columns:
         """Return rows for runs that all ended without figures."""
 
 
@@ -68,12 +68,12 @@ class Workers(Protocol):
         """Submit a task."""
         ...
 
-    def broken(self, error: BaseException) -> bool:
-        """Return whether an error means that a worker died, and is not of its task's code."""
+    def is_worker_death(self, error: BaseException) -> bool:
+        """Return whether an error means that a worker died; false for an error of the task's code."""
         ...
 
-    def renew(self) -> None:
-        """Make ready for tasks again after a worker died."""
+    def restart(self) -> None:
+        """Restart the workers after one died."""
         ...
 
 
@@ -82,50 +82,50 @@ class Processes:
 
     def __init__(self, workers: int) -> None:
         self.size = workers
-        self._pool = _pool(workers)
+        self._executor = _make_executor(workers)
 
     def submit(self, task: Work) -> Future[Columns]:
         """See `Workers`."""
         try:
-            return self._pool.submit(task.fly)
+            return self._executor.submit(task.fly)
         except BrokenProcessPool as error:  # it broke under another task
-            ended: Future[Columns] = Future()
-            ended.set_exception(error)
-            return ended
+            future: Future[Columns] = Future()
+            future.set_exception(error)
+            return future
 
-    def each(self, done: Callable[[T], R], given: Iterable[T]) -> Iterator[R]:
+    def map(self, function: Callable[[T], R], values: Iterable[T]) -> Iterator[R]:
         """Return the results of a function for each of the given values, in order.
 
         Raises:
             BrokenProcessPool: A process died.
         """
-        return self._pool.map(done, given)
+        return self._executor.map(function, values)
 
-    def broken(self, error: BaseException) -> bool:
+    def is_worker_death(self, error: BaseException) -> bool:
         """See `Workers`."""
         return isinstance(error, BrokenProcessPool)
 
-    def renew(self) -> None:
+    def restart(self) -> None:
         """See `Workers`."""
         self.close()
-        self._pool = _pool(self.size)
+        self._executor = _make_executor(self.size)
 
     def close(self) -> None:
-        """End the processes once they have done what was submitted."""
-        self._pool.shutdown(wait=True, cancel_futures=True)
+        """End the processes after the submitted tasks."""
+        self._executor.shutdown(wait=True, cancel_futures=True)
 
 
 @contextmanager
-def processes(workers: int) -> Iterator[Processes]:
+def open_processes(workers: int) -> Iterator[Processes]:
     """Return a pool of `workers` processes."""
-    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    saved = {name: os.environ.get(name) for name in ONE_THREAD}
     os.environ.update(ONE_THREAD)  # children inherit it
-    crew = Processes(workers)
+    pool = Processes(workers)
     try:
-        yield crew
+        yield pool
     finally:
-        crew.close()
-        for name, value in before.items():
+        pool.close()
+        for name, value in saved.items():
             if value is None:
                 del os.environ[name]
             else:
@@ -135,26 +135,26 @@ def processes(workers: int) -> Iterator[Processes]:
 class Cluster:
     """Workers of a Dask scheduler."""
 
-    def __init__(self, pool: Executor, size: int) -> None:
+    def __init__(self, executor: Executor, size: int) -> None:
         self.size = size
-        self._pool = pool
+        self._executor = executor
 
     def submit(self, task: Work) -> Future[Columns]:
         """See `Workers`."""
-        return self._pool.submit(task.fly)
+        return self._executor.submit(task.fly)
 
-    def broken(self, error: BaseException) -> bool:
+    def is_worker_death(self, error: BaseException) -> bool:
         """See `Workers`."""
         from distributed.scheduler import KilledWorker  # an extra, and slow to import
 
         return isinstance(error, KilledWorker)
 
-    def renew(self) -> None:
+    def restart(self) -> None:
         """Do nothing: the scheduler replaces workers that died."""
 
 
 @contextmanager
-def cluster(address: str) -> Iterator[Cluster]:
+def open_cluster(address: str) -> Iterator[Cluster]:
     """Return the workers of the Dask scheduler at an address, as many as it has now.
 
     Raises:
@@ -163,19 +163,19 @@ def cluster(address: str) -> Iterator[Cluster]:
     """
     connect: Callable[..., Any] = need("distributed", "cluster").Client
     try:
-        client = connect(address, timeout=_CONNECT_S, set_as_default=False)
+        client = connect(address, timeout=_CONNECT_TIMEOUT_S, set_as_default=False)
     except (OSError, ValueError) as error:
         raise UsageError(
             f"--dask {address}: no scheduler answers there ({error}); start one with `dask scheduler`"
         ) from error
     with client:
         try:
-            client.wait_for_workers(1, timeout=_WORKERS_S)
+            client.wait_for_workers(1, timeout=_WORKERS_TIMEOUT_S)
         except TimeoutError as error:
             raise UsageError(
                 f"--dask {address}: the scheduler has no workers; start some with `dask worker`"
             ) from error
-        _check(address, client.run(_about))
+        _check_workers(address, client.run(_get_version_and_threads))
         try:
             yield Cluster(client.get_executor(), sum(client.nthreads().values()))
         except CancelledError as error:
@@ -184,13 +184,13 @@ def cluster(address: str) -> Iterator[Cluster]:
             ) from error
 
 
-def _about() -> tuple[str, str]:
-    """Return version and BLAS threads of the process that this runs in."""
+def _get_version_and_threads() -> tuple[str, str]:
+    """Return version and BLAS threads of this process."""
     threads = os.environ.get("OPENBLAS_NUM_THREADS", os.environ.get("OMP_NUM_THREADS", "all"))
     return __version__, threads
 
 
-def _check(address: str, workers: dict[str, tuple[str, str]]) -> None:
+def _check_workers(address: str, workers: dict[str, tuple[str, str]]) -> None:
     for worker, (version, threads) in workers.items():
         if version != __version__:
             raise UsageError(
@@ -203,87 +203,84 @@ def _check(address: str, workers: dict[str, tuple[str, str]]) -> None:
             )
 
 
-def _pool(workers: int) -> ProcessPoolExecutor:
-    return ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), initializer=_begin)
+def _make_executor(workers: int) -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), initializer=_prepare_worker)
 
 
-def _begin() -> None:
-    """Prepare a worker: leave Ctrl-C and standard output to the parent, and end with the parent however it ends."""
+def _prepare_worker() -> None:
+    """Prepare a worker: leave Ctrl-C and standard output to the parent, and exit when the parent exits."""
     sys.stdout = sys.stderr  # a controller of another package may print
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     if parent is not None:
-        threading.Thread(target=_end_after, args=(parent.sentinel,), name="parent", daemon=True).start()
+        threading.Thread(target=_exit_with_parent, args=(parent.sentinel,), name="parent", daemon=True).start()
 
 
-def _end_after(sentinel: int) -> None:
+def _exit_with_parent(sentinel: int) -> None:
     connection.wait([sentinel])
     os._exit(1)
 
 
-# Flying a campaign: every task that is not there yet, whatever becomes of the workers.
+KeepRows = Callable[[Work, Columns], None]
+_POLL_S = 0.2
+_TASKS_PER_WORKER = 2  # the running task, and the next
 
 
-Keep = Callable[[Work, Columns], None]
-_LOOK_S = 0.2
-_AHEAD = 2  # tasks for each worker: the one that it flies, and the next
-
-
-def fly_tasks(tasks: Iterable[Work], crew: Workers, keep: Keep, stopped: Callable[[], bool]) -> None:
+def fly_tasks(tasks: Iterable[Work], workers: Workers, keep: KeepRows, is_stopped: Callable[[], bool]) -> None:
     """Fly tasks and keep their rows, in any order.
 
     A task whose worker dies is flown once more, alone; if that ends the same way, its runs are kept as lost.
 
     Args:
-        keep: Is given each task with its rows.
-        stopped: Asked from time to time: whether to end. What is under way is still kept.
+        keep: Called with each task and its rows.
+        is_stopped: Called from time to time; true ends the work. Rows of running tasks are still kept.
     """
     waiting = iter(tasks)
-    under_way: dict[Future[Columns], Work] = {}
+    pending: dict[Future[Columns], Work] = {}
     while True:
-        while len(under_way) < _AHEAD * crew.size and not stopped():
+        while len(pending) < _TASKS_PER_WORKER * workers.size and not is_stopped():
             task = next(waiting, None)
             if task is None:
                 break
-            under_way[crew.submit(task)] = task
-        if not under_way:
+            pending[workers.submit(task)] = task
+        if not pending:
             return
-        if stopped():
-            for future in list(under_way):
+        if is_stopped():
+            for future in list(pending):
                 if future.cancel():
-                    del under_way[future]
-        done, _ = wait(under_way, _LOOK_S, FIRST_COMPLETED)
-        broken = [task for future in done if not _kept(future, task := under_way.pop(future), crew, keep)]
-        if broken:
-            # All that was under way in a broken pool is lost, and any of it may have broken it.
-            suspects = sorted([*broken, *under_way.values()], key=lambda task: task.name)
-            for future in under_way:
+                    del pending[future]
+        done, _ = wait(pending, _POLL_S, FIRST_COMPLETED)
+        failed_tasks = [task for future in done if not _keep_rows(future, task := pending.pop(future), workers, keep)]
+        if failed_tasks:
+            # All pending tasks of a broken pool are lost, and any of them may have broken it.
+            suspects = sorted([*failed_tasks, *pending.values()], key=lambda task: task.name)
+            for future in pending:
                 future.cancel()
-            under_way.clear()
-            crew.renew()
-            _fly_alone(suspects, crew, keep, stopped)
+            pending.clear()
+            workers.restart()
+            _fly_one_by_one(suspects, workers, keep, is_stopped)
 
 
-def _fly_alone(tasks: Iterable[Work], crew: Workers, keep: Keep, stopped: Callable[[], bool]) -> None:
+def _fly_one_by_one(tasks: Iterable[Work], workers: Workers, keep: KeepRows, is_stopped: Callable[[], bool]) -> None:
     """Fly tasks one after the other, to find the one that kills its worker."""
     for task in tasks:
-        if stopped():
+        if is_stopped():
             return
-        future = crew.submit(task)
+        future = workers.submit(task)
         wait([future])
-        if not _kept(future, task, crew, keep):
-            if stopped():
-                return  # who asked for the end may have ended the worker too
-            keep(task, task.lost("the worker died, twice"))
-            crew.renew()
+        if not _keep_rows(future, task, workers, keep):
+            if is_stopped():
+                return  # the same interrupt may have ended the worker
+            keep(task, task.make_lost_rows("the worker died, twice"))
+            workers.restart()
 
 
-def _kept(future: Future[Columns], task: Work, crew: Workers, keep: Keep) -> bool:
+def _keep_rows(future: Future[Columns], task: Work, workers: Workers, keep: KeepRows) -> bool:
     """Keep the rows of a task; return False if its worker died."""
     error = future.exception()
     if error is None:
         keep(task, future.result())
-    elif crew.broken(error):
+    elif workers.is_worker_death(error):
         return False
     else:
         raise error

@@ -1,4 +1,8 @@
-"""Results of a campaign: figures of its cells, and verdicts on the SMPC."""
+"""Results of a campaign: its folder as read, figures of its cells, and verdicts on the SMPC.
+
+Each figure has a confidence interval; see `logs.report.run_statistics`. A verdict states whether a baseline is as cheap
+as the SMPC at equal or lower violation rates.
+"""
 
 from __future__ import annotations
 
@@ -23,22 +27,20 @@ from logs.report.run_statistics import (
     step_rate,
 )
 from logs.report.statistics import replace_infinite
+from uavctl.arrays import Array
 from uavctl.errors import UavctlError
-
-# A finished campaign's folder, read: what was compared, and what each run came to.
-
 
 DOCUMENT, RUNS = "campaign.json", "runs.parquet"
 
-Values = NDArray[np.float64]
+Values = Array
 
-_COUNTED = ("saturated", "decisions", "infeasible", "slack_used", "fallbacks")
-_REAL = ("cost", "settled_cost", "mean_square_input", "largest_gap")
-_FIGURES = (*_REAL, "state_violations", "input_violations", *_COUNTED)
-_SINCE = ("near_s", "nearer_s", "hold_rms_m", "beyond_m")  # tables of older versions have them not
+_COUNT_COLUMNS = ("saturated", "decisions", "infeasible", "slack_used", "fallbacks")
+_FLOAT_COLUMNS = ("cost", "settled_cost", "mean_square_input", "largest_gap")
+_FIGURE_COLUMNS = (*_FLOAT_COLUMNS, "state_violations", "input_violations", *_COUNT_COLUMNS)
+_LATER_COLUMNS = ("near_s", "nearer_s", "hold_rms_m", "beyond_m")  # tables of older versions lack them
 
 
-class ToldCell(msgspec.Struct, frozen=True, kw_only=True):
+class CellRecord(msgspec.Struct, frozen=True, kw_only=True):
     """One cell of a campaign in any world."""
 
     index: int
@@ -52,10 +54,10 @@ class ToldCell(msgspec.Struct, frozen=True, kw_only=True):
 
 D = TypeVar("D")
 F = TypeVar("F")
-C = TypeVar("C", bound=ToldCell)
+C = TypeVar("C", bound=CellRecord)
 
 
-class CellFigures(ToldCell, frozen=True, kw_only=True):
+class CellFigures(CellRecord, frozen=True, kw_only=True):
     """One cell of a campaign: a combination of controller, link, disturbance and plant."""
 
     disturbance: str
@@ -65,7 +67,9 @@ class CellFigures(ToldCell, frozen=True, kw_only=True):
     link_loss: float | None = None  # of the flown link, where losses are independent and nothing else acts
 
 
-class _Document(msgspec.Struct, frozen=True, kw_only=True):
+class CampaignRecord(msgspec.Struct, frozen=True, kw_only=True):
+    """A campaign as `campaign.json` has it."""
+
     name: str
     uavctl_version: str
     master: int
@@ -110,16 +114,19 @@ def read_results(folder: Path) -> Results:
     Raises:
         UavctlError: One of them is missing or damaged.
     """
-    told = read_document(folder, _Document)
-    runs = {cell.index: found for cell, found in zip(told.cells, read_cells(folder, told.cells, _of_cell), strict=True)}
+    record = read_document(folder, CampaignRecord)
+    runs = {
+        cell.index: cell_runs
+        for cell, cell_runs in zip(record.cells, read_cells(folder, record.cells, _collect_runs), strict=True)
+    }
     return Results(
         folder=folder,
-        name=told.name,
-        version=told.uavctl_version,
-        master=told.master,
-        planned=told.runs,
-        steps=told.steps,
-        cells=tuple(told.cells),
+        name=record.name,
+        version=record.uavctl_version,
+        master=record.master,
+        planned=record.runs,
+        steps=record.steps,
+        cells=tuple(record.cells),
         runs=runs,
     )
 
@@ -153,42 +160,43 @@ def read_cells(folder: Path, cells: Sequence[C], figures: Callable[[pa.Table, C]
         ) from error
 
 
-def _of_cell(rows: pa.Table, cell: CellFigures) -> CampaignRuns:  # noqa: ARG001 all are alike
+def _collect_runs(rows: pa.Table, cell: CellFigures) -> CampaignRuns:  # noqa: ARG001 all are alike
     errors = rows["error"].to_pylist()
-    numbers = rows["run"].to_numpy()
-    good = np.array([not error for error in errors], dtype=np.bool_) & np.isfinite(rows["cost"].to_numpy())
-    failed = tuple((int(numbers[i]), errors[i] or "the cost is not a finite number") for i in np.flatnonzero(~good))
+    run_numbers = rows["run"].to_numpy()
+    is_complete = np.array([not error for error in errors], dtype=np.bool_) & np.isfinite(rows["cost"].to_numpy())
+    failed = tuple(
+        (int(run_numbers[i]), errors[i] or "the cost is not a finite number") for i in np.flatnonzero(~is_complete)
+    )
     return CampaignRuns(
-        index=numbers[good],
-        figures={name: _column(rows, name, good) for name in (*_FIGURES, *_SINCE)},
-        ages=_histogram(rows["ages"], good),
-        outside=_histogram(rows["outside"], good) if "outside" in rows.column_names else np.zeros(0, dtype=np.int64),
+        index=run_numbers[is_complete],
+        figures={name: _read_column(rows, name, is_complete) for name in (*_FIGURE_COLUMNS, *_LATER_COLUMNS)},
+        ages=_sum_histograms(rows["ages"], is_complete),
+        outside=_sum_histograms(rows["outside"], is_complete)
+        if "outside" in rows.column_names
+        else np.zeros(0, dtype=np.int64),
         failed=failed,
     )
 
 
-def _column(rows: pa.Table, name: str, good: NDArray[np.bool_]) -> Values:
-    if name in _SINCE and name not in rows.column_names:
-        return np.full(int(good.sum()), np.nan)
-    return np.asarray(rows[name].to_numpy()[good], dtype=np.float64)
+def _read_column(rows: pa.Table, name: str, is_complete: NDArray[np.bool_]) -> Values:
+    if name in _LATER_COLUMNS and name not in rows.column_names:
+        return np.full(int(is_complete.sum()), np.nan)
+    return np.asarray(rows[name].to_numpy()[is_complete], dtype=np.float64)
 
 
-def _histogram(lists: pa.ChunkedArray, good: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _sum_histograms(lists: pa.ChunkedArray, is_complete: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Return the sum of histograms of any lengths."""
-    column = lists.combine_chunks().filter(pa.array(good))
+    column = lists.combine_chunks().filter(pa.array(is_complete))
     counts = column.flatten().to_numpy()
     lengths = column.value_lengths().to_numpy().astype(np.int64)
     ends = np.cumsum(lengths)
-    places = np.arange(counts.size) - np.repeat(ends - lengths, lengths)
+    positions = np.arange(counts.size) - np.repeat(ends - lengths, lengths)
     summed = np.zeros(int(lengths.max(initial=0)), dtype=np.int64)
-    np.add.at(summed, places, counts)
+    np.add.at(summed, positions, counts)
     return summed
 
 
 # The figures of a campaign's cells, each with a confidence interval; see `intervals` for how.
-
-
-Array = NDArray[np.float64]
 Figure = tuple[float, Interval] | tuple[None, None]
 
 
@@ -232,42 +240,44 @@ class CellSummary(msgspec.Struct, frozen=True, kw_only=True):
     beyond_m: float | None = None  # furthest beyond a wall of all runs; negative is the room that was left
     usable_room: float | None = None  # share of it in which a plan may rest
     worst_step_rate: float | None = None  # share of runs with a state outside, in the step with the most
-    worst_step_ci: Interval | None = None  # for all steps at once, see `intervals.worst_step`
+    worst_step_ci: Interval | None = None  # for all steps at once, see `max_step_rate`
 
 
 def summarise(folder: Path) -> list[CellSummary]:
     """Return the figures of every cell of a campaign.
 
     Raises:
-        CampaignError: The folder has no results that can be read.
+        UavctlError: The folder has no results that can be read.
     """
     results = read_results(folder)
-    return [cell_summary(results, cell) for cell in results.cells]
+    return [summarise_cell(results, cell) for cell in results.cells]
 
 
-def cell_summary(results: Results, cell: CellFigures) -> CellSummary:
+def summarise_cell(results: Results, cell: CellFigures) -> CellSummary:
     """Return the figures of one cell."""
     runs = results.runs[cell.index]
     n = runs.index.size
-    state, any_state = _step_and_run_rate(runs["state_violations"], results.steps)
-    inputs, _ = _step_and_run_rate(runs["input_violations"], results.steps)
-    cost, settled = _mean(runs["cost"]), _mean(runs["settled_cost"])
+    state, runs_outside = _estimate_rates(runs["state_violations"], results.steps)
+    inputs, _ = _estimate_rates(runs["input_violations"], results.steps)
+    cost, settled = _estimate_mean(runs["cost"]), _estimate_mean(runs["settled_cost"])
     gaps = runs["largest_gap"][np.isfinite(runs["largest_gap"])]
-    counted = n > 0 and (runs.outside.sum() > 0 or not runs["state_violations"].any())
-    worst = max_step_rate(runs.outside, n, results.steps) if counted else (None, None)
+    has_outside_counts = n > 0 and (runs.outside.sum() > 0 or not runs["state_violations"].any())
+    worst = max_step_rate(runs.outside, n, results.steps) if has_outside_counts else (None, None)
     (ages,) = np.nonzero(runs.ages)
-    told = CellSummary.__struct_fields__
-    same: dict[str, Any] = {name: getattr(cell, name) for name in cell.__struct_fields__ if name in told}
-    same |= {name: int(runs[name].sum()) for name in _COUNTED}
-    same |= {name: _finite(np.median, runs[name]) for name in ("near_s", "nearer_s", "hold_rms_m")}
+    summary_fields = CellSummary.__struct_fields__
+    shared_fields: dict[str, Any] = {
+        name: getattr(cell, name) for name in cell.__struct_fields__ if name in summary_fields
+    }
+    shared_fields |= {name: int(runs[name].sum()) for name in _COUNT_COLUMNS}
+    shared_fields |= {name: _compute_finite(np.median, runs[name]) for name in ("near_s", "nearer_s", "hold_rms_m")}
     return CellSummary(
-        **same,
+        **shared_fields,
         runs=n + len(runs.failed),
         failed=len(runs.failed),
         violation_rate=state[0],
         violation_ci=state[1],
-        run_violation_rate=any_state[0],
-        run_violation_ci=any_state[1],
+        run_violation_rate=runs_outside[0],
+        run_violation_ci=runs_outside[1],
         cost=cost[0],
         cost_ci=cost[1],
         max_age=int(ages[-1]) if ages.size else 0,
@@ -275,40 +285,37 @@ def cell_summary(results: Results, cell: CellFigures) -> CellSummary:
         input_violation_ci=inputs[1],
         settled_cost=settled[0],
         settled_cost_ci=settled[1],
-        mean_square_input=_mean(runs["mean_square_input"])[0],
+        mean_square_input=_estimate_mean(runs["mean_square_input"])[0],
         largest_gap=float(gaps.max()) if gaps.size else None,
         mean_age=float(np.average(np.arange(runs.ages.size), weights=runs.ages)) if ages.size else None,
         ages=runs.ages.tolist(),
-        beyond_m=_finite(np.max, runs["beyond_m"]),
+        beyond_m=_compute_finite(np.max, runs["beyond_m"]),
         worst_step_rate=worst[0],
         worst_step_ci=worst[1],
     )
 
 
-def _finite(figure: Callable[[Array], np.float64], values: Array) -> float | None:
+def _compute_finite(figure: Callable[[Array], np.float64], values: Array) -> float | None:
     """Return a figure of values; None of no values, and where the figure is not finite."""
     return replace_infinite(float(figure(values))) if values.size else None
 
 
-def difference(a: CampaignRuns, b: CampaignRuns, column: str, per: float = 1.0) -> PairedDifference | None:
+def compute_difference(a: CampaignRuns, b: CampaignRuns, column: str, per: float = 1.0) -> PairedDifference | None:
     """Return the paired difference of a column over `per`, for runs that ended in order in both; None without any."""
-    _, of_a, of_b = np.intersect1d(a.index, b.index, assume_unique=True, return_indices=True)
-    return paired_difference(a[column][of_a] / per, b[column][of_b] / per) if of_a.size else None
+    _, in_a, in_b = np.intersect1d(a.index, b.index, assume_unique=True, return_indices=True)
+    return paired_difference(a[column][in_a] / per, b[column][in_b] / per) if in_a.size else None
 
 
-def _mean(values: Array) -> Figure:
+def _estimate_mean(values: Array) -> Figure:
     return (float(values.mean()), bootstrap_mean(values)) if values.size else (None, None)
 
 
-def _step_and_run_rate(hits: Array, steps: int) -> tuple[Figure, Figure]:
+def _estimate_rates(hits: Array, steps: int) -> tuple[Figure, Figure]:
     """Return the share of steps in which something happened, and of the runs with any such step."""
     if not hits.size:
         return (None, None), (None, None)
-    some = int(np.count_nonzero(hits))
-    return step_rate(hits, steps), (some / hits.size, clopper_pearson(some, hits.size))
-
-
-# Whether a baseline is as cheap as the SMPC at equal or lower violation rates, and what each one pays for what.
+    hit_runs = int(np.count_nonzero(hits))
+    return step_rate(hits, steps), (hit_runs / hits.size, clopper_pearson(hit_runs, hits.size))
 
 
 SMPC = "smpc"
@@ -319,34 +326,36 @@ Group = tuple[str, str, str]  # link, disturbance, plant
 class BaselineComparison:
     """An SMPC and a baseline of the same group, run against run; differences are SMPC minus baseline."""
 
-    smpc: CellSummary  # the one
-    baseline: CellSummary  # the other
+    smpc: CellSummary
+    baseline: CellSummary
     cost: PairedDifference | None  # of a run; None where no run ended in order in both
     state: PairedDifference | None  # share of steps with a state outside
     inputs: PairedDifference | None  # share of steps in which an input outside was asked for
 
     @property
-    def cheaper(self) -> int:
-        """-1 where the SMPC costs less, 1 where it costs more, 0 where that cannot be told."""
+    def cost_sign(self) -> int:
+        """Sign of the cost difference: -1 where the SMPC costs less, 1 where more, 0 where it is not significant."""
         return 0 if self.cost is None else self.cost.sign
 
     @property
-    def as_safe(self) -> bool:
-        """Whether the SMPC breaks neither limit more often, as far as can be told."""
-        return not any(kind is not None and kind.sign > 0 for kind in (self.state, self.inputs))
+    def is_as_safe(self) -> bool:
+        """Whether the SMPC breaks neither limit significantly more often."""
+        return not any(difference is not None and difference.sign > 0 for difference in (self.state, self.inputs))
 
     @property
-    def safer(self) -> bool:
+    def is_safer(self) -> bool:
         """Whether the SMPC breaks neither limit more often, and one of them less often."""
-        return self.as_safe and any(kind is not None and kind.sign < 0 for kind in (self.state, self.inputs))
+        return self.is_as_safe and any(
+            difference is not None and difference.sign < 0 for difference in (self.state, self.inputs)
+        )
 
     @property
-    def holds(self) -> bool:
+    def is_better(self) -> bool:
         """Whether the SMPC costs less and is as safe."""
-        return self.cheaper < 0 and self.as_safe
+        return self.cost_sign < 0 and self.is_as_safe
 
     @property
-    def share(self) -> tuple[float, float, float] | None:
+    def extra_cost_share(self) -> tuple[float, float, float] | None:
         """Extra cost of the baseline over the SMPC's cost, with its interval; None where that cost is not positive."""
         if self.cost is None or not self.smpc.cost:
             return None
@@ -363,71 +372,79 @@ class CampaignVerdict:
     comparisons: tuple[BaselineComparison, ...]
 
     @property
-    def holds(self) -> bool:
+    def is_unmatched(self) -> bool:
         """Whether each baseline costs more, or breaks limits more often: none is as cheap at equal or lower rates."""
-        return bool(self.comparisons) and all(one.cheaper < 0 or one.safer for one in self.comparisons)
+        return bool(self.comparisons) and all(
+            comparison.cost_sign < 0 or comparison.is_safer for comparison in self.comparisons
+        )
 
     @property
-    def outright(self) -> bool:
+    def is_better_than_all(self) -> bool:
         """Whether the SMPC costs less than each baseline, and breaks limits no more often than any."""
-        return bool(self.comparisons) and all(one.holds for one in self.comparisons)
+        return bool(self.comparisons) and all(comparison.is_better for comparison in self.comparisons)
 
     @property
-    def beaten(self) -> bool:
+    def is_beaten(self) -> bool:
         """Whether a baseline that breaks no limit more often costs less."""
-        return any(one.cheaper > 0 and not one.safer for one in self.comparisons)
+        return any(comparison.cost_sign > 0 and not comparison.is_safer for comparison in self.comparisons)
 
 
-def group_of(cell: CellSummary) -> Group:
+def get_group(cell: CellSummary) -> Group:
     """Return the group of a cell: link, disturbance and plant."""
     return cell.link, cell.disturbance, cell.plant
 
 
-def grouped(cells: Sequence[CellSummary]) -> dict[Group, list[CellSummary]]:
+def group_cells(cells: Sequence[CellSummary]) -> dict[Group, list[CellSummary]]:
     """Return the cells by group, in the order of the specification."""
     groups: dict[Group, list[CellSummary]] = {}
     for cell in cells:
-        groups.setdefault(group_of(cell), []).append(cell)
+        groups.setdefault(get_group(cell), []).append(cell)
     return groups
 
 
-def verdicts(results: Results, groups: Mapping[Group, Sequence[CellSummary]]) -> Iterator[CampaignVerdict]:
+def make_verdicts(results: Results, groups: Mapping[Group, Sequence[CellSummary]]) -> Iterator[CampaignVerdict]:
     """Yield the verdict on each SMPC of each group, against the group's baselines that have runs."""
     for group, cells in groups.items():
         baselines = [cell for cell in cells if cell.kind != SMPC and cell.cost is not None]
         for smpc in cells:
             if smpc.kind == SMPC:
                 flown = baselines if smpc.cost is not None else []
-                yield CampaignVerdict(group, smpc, tuple(_compare(results, smpc, baseline) for baseline in flown))
+                yield CampaignVerdict(
+                    group, smpc, tuple(_compare_with_baseline(results, smpc, baseline) for baseline in flown)
+                )
 
 
-def _compare(results: Results, smpc: CellSummary, baseline: CellSummary) -> BaselineComparison:
+def _compare_with_baseline(results: Results, smpc: CellSummary, baseline: CellSummary) -> BaselineComparison:
     a, b = results.runs[smpc.index], results.runs[baseline.index]
-    cost = difference(a, b, "cost")
-    state, inputs = (difference(a, b, column, results.steps) for column in ("state_violations", "input_violations"))
+    cost = compute_difference(a, b, "cost")
+    state, inputs = (
+        compute_difference(a, b, column, results.steps) for column in ("state_violations", "input_violations")
+    )
     return BaselineComparison(smpc, baseline, cost, state, inputs)
 
 
-def word_of(verdict: CampaignVerdict) -> str:
-    """Return the verdict in a word."""
+def get_verdict_word(verdict: CampaignVerdict) -> str:
+    """Return the verdict as one word."""
     if not verdict.comparisons:
         return "–"
-    return "yes" if verdict.holds else "no"
+    return "yes" if verdict.is_unmatched else "no"
 
 
-def brief(one: BaselineComparison) -> str:
+def describe_briefly(comparison: BaselineComparison) -> str:
     """Return a comparison in a few words, from the baseline's side."""
-    if one.cost is None:
+    if comparison.cost is None:
         return "no pairs of runs"
     limits = ""
-    if not one.as_safe:
+    if not comparison.is_as_safe:
         limits = ", keeps limits better"
-    elif one.safer:
+    elif comparison.is_safer:
         limits = ", breaks limits more often"
-    return (_signed(one, "costs ", interval=False) if one.cheaper else "costs the same") + limits
+    return (
+        _describe_extra_cost(comparison, "costs ", interval=False) if comparison.cost_sign else "costs the same"
+    ) + limits
 
 
-def in_words(verdict: CampaignVerdict) -> list[str]:
+def describe_verdict(verdict: CampaignVerdict) -> list[str]:
     """Return the verdict in sentences with figures; first the baselines that the SMPC does not beat."""
     smpc = verdict.smpc
     if smpc.refused:
@@ -436,74 +453,92 @@ def in_words(verdict: CampaignVerdict) -> list[str]:
         return [f"No run ended in order; all {smpc.failed} failed."]
     if not verdict.comparisons:
         return ["There is no baseline to compare with."]
-    won = [one for one in verdict.comparisons if one.holds]
-    sentences = [_why_not(one) for one in verdict.comparisons if not one.holds]
-    if won:
-        named = "; ".join(f"{one.baseline.controller} ({_signed(one)})" for one in won)
-        sentences.append(f"The SMPC costs less, and breaks limits no more often, than {named}.")
+    better = [comparison for comparison in verdict.comparisons if comparison.is_better]
+    sentences = [_describe_comparison(comparison) for comparison in verdict.comparisons if not comparison.is_better]
+    if better:
+        names = "; ".join(
+            f"{comparison.baseline.controller} ({_describe_extra_cost(comparison)})" for comparison in better
+        )
+        sentences.append(f"The SMPC costs less, and breaks limits no more often, than {names}.")
     return sentences
 
 
-def _why_not(one: BaselineComparison) -> str:
-    name = one.baseline.controller
-    if one.cost is None:
+def _describe_comparison(comparison: BaselineComparison) -> str:
+    name = comparison.baseline.controller
+    if comparison.cost is None:
         return f"{name}: no run ended in order in both."
-    costs = f"costs {_signed(one)}" if one.cheaper else f"cannot be told apart by cost ({_signed(one)})"
-    if not one.as_safe:
-        how = ", but keeps limits better" if one.cheaper < 0 else " and keeps limits better"
-    elif one.safer:
+    costs = (
+        f"costs {_describe_extra_cost(comparison)}"
+        if comparison.cost_sign
+        else f"cannot be told apart by cost ({_describe_extra_cost(comparison)})"
+    )
+    if not comparison.is_as_safe:
+        how = ", but keeps limits better" if comparison.cost_sign < 0 else " and keeps limits better"
+    elif comparison.is_safer:
         how = ", but breaks limits more often"
     else:
         how = " and breaks limits no more often"
-    return f"{name} {costs}{how}: {_limits(one)}.{_unused(one)}"
+    return f"{name} {costs}{how}: {_describe_limits(comparison)}.{_describe_allowance(comparison)}"
 
 
-def _unused(one: BaselineComparison) -> str:
+def _describe_allowance(comparison: BaselineComparison) -> str:
     """Return a sentence on whether a cheaper baseline breaks limits more often than the SMPC's design allows."""
-    promised, allowed = one.smpc.promised_x, one.smpc.promised_u
-    state, inputs = one.baseline.violation_ci, one.baseline.input_violation_ci
-    if one.cheaper < 0 or not one.safer or promised is None or allowed is None or state is None or inputs is None:
+    allowed_states, allowed_inputs = comparison.smpc.promised_x, comparison.smpc.promised_u
+    state, inputs = comparison.baseline.violation_ci, comparison.baseline.input_violation_ci
+    if (
+        comparison.cost_sign < 0
+        or not comparison.is_safer
+        or allowed_states is None
+        or allowed_inputs is None
+        or state is None
+        or inputs is None
+    ):
         return ""
-    rates = (one.baseline.violation_rate or 0.0, one.baseline.input_violation_rate or 0.0)
-    judged = tuple(zip(("states", "inputs"), rates, (state[0], inputs[0]), (promised, allowed), strict=True))
-    over = [f"{what} ({percent(share)})" for what, _, least, share in judged if least > share]
-    perhaps = [
-        f"the {percent(share)} allowed for {what}"
-        for what, rate, least, share in judged
-        if least <= share and exceeds(rate, share)
+    rates = (comparison.baseline.violation_rate or 0.0, comparison.baseline.input_violation_rate or 0.0)
+    rows = tuple(zip(("states", "inputs"), rates, (state[0], inputs[0]), (allowed_states, allowed_inputs), strict=True))
+    exceeded = [f"{noun} ({format_percent(share)})" for noun, _, low, share in rows if low > share]
+    possibly_exceeded = [
+        f"the {format_percent(share)} allowed for {noun}"
+        for noun, rate, low, share in rows
+        if low <= share and exceeds(rate, share)
     ]
-    sentences = [f" That is more than the SMPC's design allows for {' and '.join(over)}."] if over else []
-    if perhaps:
-        sentences.append(f" That is more than {' and '.join(perhaps)}, which may still be chance at so few runs.")
+    sentences = [f" That is more than the SMPC's design allows for {' and '.join(exceeded)}."] if exceeded else []
+    if possibly_exceeded:
+        sentences.append(
+            f" That is more than {' and '.join(possibly_exceeded)}, which may still be chance at so few runs."
+        )
     if sentences:
         return "".join(sentences)
-    within = f"states {percent(promised)}, inputs {percent(allowed)}"
-    return f" That is within what the SMPC's design allows ({within}): its caution is what costs."
+    allowance = f"states {format_percent(allowed_states)}, inputs {format_percent(allowed_inputs)}"
+    return f" That is within what the SMPC's design allows ({allowance}): its caution is what costs."
 
 
-def _limits(one: BaselineComparison) -> str:
-    smpc, baseline = one.smpc, one.baseline
+def _describe_limits(comparison: BaselineComparison) -> str:
+    smpc, baseline = comparison.smpc, comparison.baseline
     parts = (
         ("states", smpc.violation_rate, baseline.violation_rate),
         ("inputs", smpc.input_violation_rate, baseline.input_violation_rate),
     )
-    shares = ", ".join(f"{what} in {percent(theirs)} of steps (SMPC {percent(ours)})" for what, ours, theirs in parts)
+    shares = ", ".join(
+        f"{noun} in {format_percent(baseline_rate)} of steps (SMPC {format_percent(smpc_rate)})"
+        for noun, smpc_rate, baseline_rate in parts
+    )
     return f"outside {shares}"
 
 
-def _signed(one: BaselineComparison, verb: str = "", *, interval: bool = True) -> str:
+def _describe_extra_cost(comparison: BaselineComparison, verb: str = "", *, interval: bool = True) -> str:
     """Return the extra or saved cost of the baseline, in percent of the SMPC's cost."""
-    if one.share is None:
+    if comparison.extra_cost_share is None:
         return "no share of nothing"
-    mean, low, high = (100.0 * part for part in one.share)
+    mean, low, high = (100.0 * bound for bound in comparison.extra_cost_share)
     ends = sorted((abs(low), abs(high)))
     if low * high <= 0:
         return f"{mean:+.2g} %, {low:+.2g} to {high:+.2g} %"
-    text = f"{verb}{_short(abs(mean))} % {'less' if mean < 0 else 'more'}"
-    return f"{text}, {_short(ends[0])} to {_short(ends[1])} %" if interval else text
+    text = f"{verb}{_format_short(abs(mean))} % {'less' if mean < 0 else 'more'}"
+    return f"{text}, {_format_short(ends[0])} to {_format_short(ends[1])} %" if interval else text
 
 
-def _short(value: float) -> str:
+def _format_short(value: float) -> str:
     """Return a number with three digits, without an exponent below a million."""
     return f"{value:.3g}" if value < 1000.0 else f"{value:.0f}" if value < 1e6 else f"{value:.1e}"
 
@@ -513,6 +548,6 @@ def exceeds(rate: float, allowed: float) -> bool:
     return rate > allowed * (1.0 + 1e-9)
 
 
-def percent(share: float | None) -> str:
+def format_percent(share: float | None) -> str:
     """Return a share in percent."""
     return "–" if share is None else f"{100.0 * share:.3g} %"

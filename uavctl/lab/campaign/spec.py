@@ -1,4 +1,9 @@
-"""Specification of a campaign: its file, its types and kinds of controllers, and the configurations that come of it."""
+"""Specification of a campaign: its file, its types, and the configurations that it describes.
+
+1. The sections are the TOML tables of the file. Every key has its unit and meaning in `Meta(description=...)`.
+2. `compose` makes every configuration: those of the flown links and plants, and the belief of each controller.
+3. `read_campaign` reads a file and reports all problems at once.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +39,7 @@ from uavctl.smpc.batch import BatchController
 from uavctl.smpc.nominal import ControlProblem
 
 KINDS = ("smpc", "lqg", "packetised", "mean-qp", "governor", "worst-case-delay", "hold-last", "zero-on-loss", "pid")
-KEY = "kind"
+KIND_KEY = "kind"
 
 
 def check_kind(kind: str) -> None:
@@ -43,7 +48,7 @@ def check_kind(kind: str) -> None:
     Raises:
         DesignError: Nothing has that name, it cannot be imported, or it is no controller.
     """
-    controller_class(kind, KEY, (ACTS,), KINDS)
+    controller_class(kind, KIND_KEY, (ACTS,), KINDS)
 
 
 def make_controller(kind: str, problem: ControlProblem) -> BatchController:
@@ -52,26 +57,21 @@ def make_controller(kind: str, problem: ControlProblem) -> BatchController:
     Raises:
         DesignError: There is none, or its class does not take the problem.
     """
-    return cast(BatchController, make(controller_class(kind, KEY, (ACTS,), KINDS), kind, KEY, problem))
+    return cast(BatchController, make(controller_class(kind, KIND_KEY, (ACTS,), KINDS), kind, KIND_KEY, problem))
 
 
-# What a campaign is asked to fly, as its TOML file says it.
-#
-# Every key has its unit and meaning in `Meta(description=...)`, as in the flight configuration.
+TRUE_LINK = "true"  # a controller that believes in the link it flies on
 
-
-TRUE = "true"  # a controller that believes in the link it flies on
-
-Measured = Literal["state", "position"]
-Shape = Literal["gaussian", "uniform", "heavy", "gusts"]
+MeasuredQuantity = Literal["state", "position"]
+DisturbanceKind = Literal["gaussian", "uniform", "heavy", "gusts"]
 Name = Annotated[str, Meta(min_length=1, max_length=60, description="what it is called in tables and plots")]
 Overrides = Annotated[tuple[str, ...], Meta(max_length=100)]
-MOST_OF_A_KIND = 100
-MOST_DESIGNS, MOST_CELLS = 200, 10_000
-MOST_RUNS = 10_000_000
+MAX_TABLES = 100
+MAX_DESIGNS, MAX_CELLS = 200, 10_000
+MAX_RUNS = 10_000_000
 # Part of the result: the last bits of a product depend on how many runs it is made for.
 CHUNK = 1000
-MOST_STEPS_AT_ONCE = 2_000_000  # their states are held in memory
+MAX_STEPS_AT_ONCE = 2_000_000  # their states are held in memory
 
 
 class ControllerSpec(Section, frozen=True, kw_only=True):
@@ -92,7 +92,7 @@ class ControllerSpec(Section, frozen=True, kw_only=True):
     ] = ()
     link: Annotated[
         str, Meta(description="the link that it believes in: `true`, the one it flies on, or the name of a [[link]]")
-    ] = TRUE
+    ] = TRUE_LINK
     margin: Annotated[
         float,
         Meta(
@@ -117,7 +117,7 @@ class DisturbanceSpec(Section, frozen=True, kw_only=True):
 
     name: Name
     kind: Annotated[
-        Shape,
+        DisturbanceKind,
         Meta(
             description="`gaussian`; `uniform`; `heavy`: Student's t with 4 degrees; `gusts`: each step keeps `memory` "
             "of the last one's. All have the plant's covariance W, times scale²"
@@ -141,11 +141,11 @@ class TuningSpec(Section, frozen=True, kw_only=True):
     """Settings that differ for some controllers on the links that they believe in."""
 
     controllers: Annotated[
-        tuple[str, ...], Meta(min_length=1, max_length=MOST_OF_A_KIND, description="names of [[controller]]s")
+        tuple[str, ...], Meta(min_length=1, max_length=MAX_TABLES, description="names of [[controller]]s")
     ]
     links: Annotated[
         tuple[str, ...],
-        Meta(min_length=1, max_length=MOST_OF_A_KIND, description="names of [[link]]s that they believe in"),
+        Meta(min_length=1, max_length=MAX_TABLES, description="names of [[link]]s that they believe in"),
     ]
     set: Annotated[Overrides, Meta(description="overrides of the design; they win over the controller's")] = ()
     margin: Annotated[
@@ -164,12 +164,12 @@ class CampaignSpec(Section, frozen=True, kw_only=True):
     config: Annotated[str, Meta(description="flight configuration: a preset, or a file, seen from the campaign's")]
     set: Annotated[Overrides, Meta(description="overrides of the configuration, for all")] = ()
     steps: Annotated[int, Meta(ge=2, le=100_000, description="steps of a run")] = 50
-    runs: Annotated[int, Meta(ge=1, le=MOST_RUNS, description="runs of each cell")] = 1000
+    runs: Annotated[int, Meta(ge=1, le=MAX_RUNS, description="runs of each cell")] = 1000
     master: Annotated[
         int, Meta(ge=0, le=MAX_SEED, description="seed: run i's draws come from (master, i), in every cell")
     ] = 0
     measured: Annotated[
-        Measured,
+        MeasuredQuantity,
         Meta(
             description="what a controller is told of a step whose position comes: `state`, all of it, exactly; or "
             "`position`, with the noise of `sim.camera.noise_std_m`, of which the flight's filter (its `[estimator]`, "
@@ -186,28 +186,25 @@ class CampaignSpec(Section, frozen=True, kw_only=True):
             description="[lower, upper] (n_x each): each run starts at a state drawn uniformly from this box",
         ),
     ] = ()
-    controller: Annotated[tuple[ControllerSpec, ...], Meta(max_length=MOST_OF_A_KIND, description="controllers")]
-    link: Annotated[tuple[LinkSpec, ...], Meta(max_length=MOST_OF_A_KIND, description="links")] = (
+    controller: Annotated[tuple[ControllerSpec, ...], Meta(max_length=MAX_TABLES, description="controllers")]
+    link: Annotated[tuple[LinkSpec, ...], Meta(max_length=MAX_TABLES, description="links")] = (
         LinkSpec(name="as configured"),
     )
-    disturbance: Annotated[tuple[DisturbanceSpec, ...], Meta(max_length=MOST_OF_A_KIND, description="disturbances")] = (
+    disturbance: Annotated[tuple[DisturbanceSpec, ...], Meta(max_length=MAX_TABLES, description="disturbances")] = (
         DisturbanceSpec(name="gaussian"),
     )
-    plant: Annotated[tuple[PlantSpec, ...], Meta(max_length=MOST_OF_A_KIND, description="plants")] = (
+    plant: Annotated[tuple[PlantSpec, ...], Meta(max_length=MAX_TABLES, description="plants")] = (
         PlantSpec(name="as modelled"),
     )
     tuning: Annotated[
-        tuple[TuningSpec, ...], Meta(max_length=MOST_OF_A_KIND, description="settings of controllers on some links")
+        tuple[TuningSpec, ...], Meta(max_length=MAX_TABLES, description="settings of controllers on some links")
     ] = ()
 
 
-# Every configuration that a campaign's specification asks for: what flies, and what each controller believes.
-
-
 CONFIGURATION = "the configuration"
-_OWN_PLACE = re.compile(rf"{CONFIGURATION}:\d+: ")
+_CONFIGURATION_LINE = re.compile(rf"{CONFIGURATION}:\d+: ")
 
-Placed = tuple[tuple[str, str], ...]  # (key path in the campaign's file, override) of each
+LocatedOverrides = tuple[tuple[str, str], ...]  # (key path in the campaign's file, override) of each
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,42 +214,42 @@ class Campaign:
     spec: CampaignSpec  # the specification, every default written out
     configuration: str  # TOML text of the base configuration, the overrides for all applied
     base: Config  # the base configuration: limits, costs and target by which every cell is judged
-    flown_link: tuple[Config, ...]  # configuration whose [link] each link of the specification is
-    flown_plant: tuple[Config, ...]  # configuration whose [plant] each plant of it is
+    flown_links: tuple[Config, ...]  # configuration whose [link] each link of the specification is
+    flown_plants: tuple[Config, ...]  # configuration whose [plant] each plant of it is
     # Configuration that each controller is designed from, by (controller's index, name of the link that it believes in)
-    believed: Mapping[tuple[int, str], Config]
+    believed_configs: Mapping[tuple[int, str], Config]
 
-    def believed_link(self, controller: int, link: int) -> str:
+    def get_believed_link(self, controller: int, link: int) -> str:
         """Return the name of the link that a controller believes in when it flies on `link`."""
-        own = self.spec.controller[controller].link
-        return self.spec.link[link].name if own == TRUE else own
+        believed_name = self.spec.controller[controller].link
+        return self.spec.link[link].name if believed_name == TRUE_LINK else believed_name
 
-    def tuned(self, controller: int, believed: str) -> ControllerSpec:
+    def get_tuned_controller(self, controller: int, link: str) -> ControllerSpec:
         """Return a controller with its margin for the link that it believes in; the last tuning wins."""
-        one = self.spec.controller[controller]
+        found = self.spec.controller[controller]
         for tuning in self.spec.tuning:
-            if tuning.margin is not None and one.name in tuning.controllers and believed in tuning.links:
-                one = msgspec.structs.replace(one, margin=tuning.margin)
-        return one
+            if tuning.margin is not None and found.name in tuning.controllers and link in tuning.links:
+                found = msgspec.structs.replace(found, margin=tuning.margin)
+        return found
 
 
-class SpecProblems:
+class ProblemCollector:
     """Problems with their places in the campaign's file, each listed once."""
 
     def __init__(self, source: Source) -> None:
         self._source = source
         self._problems: dict[str, None] = {}
 
-    def tell(self, problems: Iterable[ConfigProblem]) -> None:
+    def add(self, problems: Iterable[ConfigProblem]) -> None:
         """Add problems."""
         self._problems.update((self._source.describe(problem), None) for problem in problems)
 
-    def load(self, configure: Callable[[Sequence[str]], Config], placed: Placed) -> Config | None:
+    def load(self, configure: Callable[[Sequence[str]], Config], placed: LocatedOverrides) -> Config | None:
         """Load the configuration with these overrides; add its problems and return None if it has any."""
         try:
             return configure([text for _, text in placed])
         except ConfigError as error:
-            self._problems.update((self._located(problem, placed), None) for problem in error.problems)
+            self._problems.update((self._describe(problem, placed), None) for problem in error.problems)
             return None
 
     @property
@@ -260,76 +257,90 @@ class SpecProblems:
         """All problems added so far."""
         return tuple(self._problems)
 
-    def _located(self, problem: str, placed: Placed) -> str:
+    def _describe(self, problem: str, placed: LocatedOverrides) -> str:
         for key, text in reversed(placed):
             if problem.startswith(f"--set {text}: "):
                 return f"{self._source.locate(key)}: {key}: {problem.removeprefix('--set ')}"
-        own = _OWN_PLACE.match(problem)
-        if own and placed:  # a check of several keys, which the overrides made fail
+        line = _CONFIGURATION_LINE.match(problem)
+        if line and placed:  # a check of several keys, which the overrides made fail
             key = placed[-1][0].rpartition("[")[0]
-            return f"{self._source.locate(key)}: {key}: {problem[own.end() :]}"
+            return f"{self._source.locate(key)}: {key}: {problem[line.end() :]}"
         return problem
 
 
-def placed(key: str, overrides: Sequence[str]) -> Placed:
+def locate_overrides(key: str, overrides: Sequence[str]) -> LocatedOverrides:
     """Return overrides with the keys where they stand."""
     return tuple((f"{key}[{i}]", text) for i, text in enumerate(overrides))
 
 
-def compose(spec: CampaignSpec, configuration: str, told: SpecProblems | None = None) -> Campaign:
+def compose(spec: CampaignSpec, configuration: str, collector: ProblemCollector | None = None) -> Campaign:
     """Make every configuration of a campaign.
 
     Args:
         spec: The specification; its names are known to be right.
         configuration: TOML text of the base configuration, the overrides for all applied.
-        told: Where the problems go that were found before.
+        collector: Problems found before; new ones are added to it. None: there are none.
 
     Raises:
         ConfigError: With all problems found.
     """
-    told = told or SpecProblems(Source(spec.name, {}))
+    collector = collector or ProblemCollector(Source(spec.name, {}))
 
-    def configured(overrides: Sequence[str]) -> Config:
+    def configure(overrides: Sequence[str]) -> Config:
         return parse(configuration, CONFIGURATION, overrides).config
 
-    base = configured(())
-    links = [told.load(configured, _own(told, "link", i, one.set)) for i, one in enumerate(spec.link)]
-    plants = [told.load(configured, _own(told, "plant", i, one.set)) for i, one in enumerate(spec.plant)]
-    told.tell(_fits(f"plant[{i}].set", base, one) for i, one in enumerate(plants) if one and _differs(base, one))
+    def check_dimensions(key: str, config: Config) -> None:
+        if _has_other_dimensions(base, config):
+            collector.add([_describe_other_dimensions(key, base, config)])
+
+    base = configure(())
+    links = [
+        collector.load(configure, _locate_section_overrides(collector, "link", i, link.set))
+        for i, link in enumerate(spec.link)
+    ]
+    plants = [
+        collector.load(configure, _locate_section_overrides(collector, "plant", i, plant.set))
+        for i, plant in enumerate(spec.plant)
+    ]
+    for i, config in enumerate(plants):
+        if config:
+            check_dimensions(f"plant[{i}].set", config)
     believed: dict[tuple[int, str], Config | None] = {}
     for i, controller in enumerate(spec.controller):
         for j, link in enumerate(spec.link):
-            if controller.link in (TRUE, link.name):
-                beliefs = _beliefs(spec, i, j)
-                one = believed[i, link.name] = told.load(configured, beliefs)
-                if one and base.sim.plant == "linear":
-                    told.tell(flown(one, beliefs, f"controller[{i}].set"))
-    told.tell(
-        _fits(f"controller[{i}].set", base, one) for (i, _), one in believed.items() if one and _differs(base, one)
-    )
-    if told.problems:
-        raise ConfigError(told.problems)
+            if controller.link in (TRUE_LINK, link.name):
+                beliefs = _collect_beliefs(spec, i, j)
+                config = believed[i, link.name] = collector.load(configure, beliefs)
+                if config and base.sim.plant == "linear":
+                    collector.add(find_plant_problems(config, beliefs, f"controller[{i}].set"))
+    for (i, _), config in believed.items():
+        if config:
+            check_dimensions(f"controller[{i}].set", config)
+    if collector.problems:
+        raise ConfigError(collector.problems)
     return Campaign(
         spec=spec,
         configuration=configuration,
         base=base,
-        flown_link=tuple(one for one in links if one),
-        flown_plant=tuple(one for one in plants if one),
-        believed={key: _one_a_step(one) for key, one in believed.items() if one},
+        flown_links=tuple(config for config in links if config),
+        flown_plants=tuple(config for config in plants if config),
+        believed_configs={key: _limit_to_one_position(config) for key, config in believed.items() if config},
     )
 
 
-def _one_a_step(believed: Config) -> Config:
+def _limit_to_one_position(config: Config) -> Config:
     """Return the belief with one position a step, which campaigns carry; a scheme that counts on more has to know."""
-    if not believed.is_age_conditioned:
-        return believed
-    return msgspec.structs.replace(believed, source=msgspec.structs.replace(believed.source, rate_hz=0.0))
+    if not config.is_age_conditioned:
+        return config
+    return msgspec.structs.replace(config, source=msgspec.structs.replace(config.source, rate_hz=0.0))
 
 
-def _own(told: SpecProblems, table: str, index: int, overrides: Sequence[str]) -> Placed:
+def _locate_section_overrides(
+    collector: ProblemCollector, table: str, index: int, overrides: Sequence[str]
+) -> LocatedOverrides:
     """Return the overrides of a [[link]] or a [[plant]]; they must act on the section of that name alone."""
-    pairs = placed(f"{table}[{index}].set", overrides)
-    told.tell(
+    pairs = locate_overrides(f"{table}[{index}].set", overrides)
+    collector.add(
         ConfigProblem(key, f"{text}: only {table}.* acts on what is flown", f"write {table}.…, or move it to `set`")
         for key, text in pairs
         if "=" in text and not text.strip().startswith(f"{table}.")
@@ -337,49 +348,48 @@ def _own(told: SpecProblems, table: str, index: int, overrides: Sequence[str]) -
     return pairs
 
 
-def _beliefs(spec: CampaignSpec, controller: int, link: int) -> Placed:
+def _collect_beliefs(spec: CampaignSpec, controller_index: int, link_index: int) -> LocatedOverrides:
     """Return all overrides that a controller believes, the strongest last."""
-    one, other = spec.controller[controller], spec.link[link]
+    controller, link = spec.controller[controller_index], spec.link[link_index]
     tunings = (
-        placed(f"tuning[{i}].set", tuning.set)
+        locate_overrides(f"tuning[{i}].set", tuning.set)
         for i, tuning in enumerate(spec.tuning)
-        if one.name in tuning.controllers and other.name in tuning.links
+        if controller.name in tuning.controllers and link.name in tuning.links
     )
     return (
-        *placed(f"link[{link}].set", other.set),
-        *placed(f"controller[{controller}].set", one.set),
-        *(pair for pairs in tunings for pair in pairs),
+        *locate_overrides(f"link[{link_index}].set", link.set),
+        *locate_overrides(f"controller[{controller_index}].set", controller.set),
+        *(pair for overrides in tunings for pair in overrides),
     )
 
 
-def flown(one: Config, given: Placed, key: str) -> Iterator[ConfigProblem]:
+def find_plant_problems(config: Config, overrides: LocatedOverrides, key: str) -> Iterator[ConfigProblem]:
     """Yield the problem that a configuration flies a vehicle that campaigns do not.
 
     Args:
         key: Where it stands, if none of them named the vehicle.
     """
-    if one.sim.plant != "linear":
-        named = (at for at, text in reversed(given) if text.partition("=")[0].strip() == "sim.plant")
+    if config.sim.plant != "linear":
+        keys = (
+            override_key for override_key, text in reversed(overrides) if text.partition("=")[0].strip() == "sim.plant"
+        )
         yield ConfigProblem(
-            next(named, key),
-            f'sim.plant is "{one.sim.plant}", and campaigns fly the linear plant',
+            next(keys, key),
+            f'sim.plant is "{config.sim.plant}", and campaigns fly the linear plant',
             'set sim.plant = "linear", and fly the quadrotor with uavctl loopback',
         )
 
 
-def _differs(base: Config, one: Config) -> bool:
-    return get_dimensions(base.plant) != get_dimensions(one.plant) or base.plant.dt_s != one.plant.dt_s
+def _has_other_dimensions(base: Config, config: Config) -> bool:
+    return get_dimensions(base.plant) != get_dimensions(config.plant) or base.plant.dt_s != config.plant.dt_s
 
 
-def _fits(key: str, base: Config, one: Config) -> ConfigProblem:
+def _describe_other_dimensions(key: str, base: Config, config: Config) -> ConfigProblem:
     """Return the problem that a plant has other sizes or another step than the base configuration's."""
-    sizes = (f"n_x, n_u = {get_dimensions(plant)}, Δt = {plant.dt_s:g} s" for plant in (one.plant, base.plant))
+    sizes = (f"n_x, n_u = {get_dimensions(plant)}, Δt = {plant.dt_s:g} s" for plant in (config.plant, base.plant))
     return ConfigProblem(
         key, f"the plant has {' where the configuration has '.join(sizes)}", "keep its sizes and its step"
     )
-
-
-# A campaign's file in, its specification out, with every configuration that it asks for; all problems at once.
 
 
 def read_campaign(path: Path, runs: int | None = None) -> tuple[Campaign, str]:
@@ -388,51 +398,51 @@ def read_campaign(path: Path, runs: int | None = None) -> tuple[Campaign, str]:
     Raises:
         ConfigError: With all problems found, one a line: place, key, reason, what to do.
     """
-    spec, told, text = read_spec(path, CampaignSpec)
+    spec, collector, text = read_spec(path, CampaignSpec)
     spec = spec if runs is None else msgspec.structs.replace(spec, runs=runs)
-    told.tell(_sizes(spec))
-    if told.problems:  # the rest is work for each of them
-        raise ConfigError(told.problems)
-    told.tell(_names(spec))
-    name = configuration_of(path, spec.config)
-    base = told.load(lambda overrides: load(name, overrides).config, placed("set", spec.set))
+    collector.add(_find_size_problems(spec))
+    if collector.problems:  # the rest is work for each of them
+        raise ConfigError(collector.problems)
+    collector.add(_find_name_problems(spec))
+    name = resolve_configuration(path, spec.config)
+    base = collector.load(lambda overrides: load(name, overrides).config, locate_overrides("set", spec.set))
     if base is None:
-        raise ConfigError(told.problems)
-    told.tell(flown(base, placed("set", spec.set), "config"))
-    told.tell(_starts(spec, base))
+        raise ConfigError(collector.problems)
+    collector.add(find_plant_problems(base, locate_overrides("set", spec.set), "config"))
+    collector.add(_find_start_problems(spec, base))
     base = msgspec.structs.replace(base, mission=MissionConfig(), fence=())  # runs go to the target, and nowhere else
-    return compose(spec, dump_config(base), told), text
+    return compose(spec, dump_config(base), collector), text
 
 
 Spec = TypeVar("Spec", bound=Section)
 
 
-def read_spec(path: Path, kind: type[Spec]) -> tuple[Spec, SpecProblems, str]:
+def read_spec(path: Path, kind: type[Spec]) -> tuple[Spec, ProblemCollector, str]:
     """Read the specification in a file; return it, its problems so far, and the file's text.
 
     Raises:
         ConfigError: There is none; with all problems found.
     """
-    text = text_of(path)
+    text = read_specification(path)
     table = parse_toml(text, str(path))  # refuses what is too deep to be gone through
-    found: list[ConfigProblem] = []
-    told = SpecProblems(Source(str(path), find_key_lines(text)))
-    told.tell(find_oversized(table))
-    if told.problems:
-        raise ConfigError(told.problems)
-    spec = cast("Spec | None", decode(kind, table, "", found, {}))
-    told.tell([*found, *(_kinds(table) if kind is CampaignSpec else ())])
+    problems: list[ConfigProblem] = []
+    collector = ProblemCollector(Source(str(path), find_key_lines(text)))
+    collector.add(find_oversized(table))
+    if collector.problems:
+        raise ConfigError(collector.problems)
+    spec = cast("Spec | None", decode(kind, table, "", problems, {}))
+    collector.add([*problems, *(_find_unknown_kinds(table) if kind is CampaignSpec else ())])
     if spec is None:
-        raise ConfigError(told.problems)
-    return spec, told, text
+        raise ConfigError(collector.problems)
+    return spec, collector, text
 
 
-def configuration_of(path: Path, config: str) -> str:
+def resolve_configuration(path: Path, config: str) -> str:
     """Return the `config` of a campaign's file as `load_config` takes it: a preset, or a path relative to the file."""
     return config if config in presets() else str(path.parent / config)
 
 
-def text_of(path: Path) -> str:
+def read_specification(path: Path) -> str:
     """Read the text of a campaign's file.
 
     Raises:
@@ -444,46 +454,46 @@ def text_of(path: Path) -> str:
         raise ConfigError(tuple(f"{reason}; give the TOML file of a campaign" for reason in error.reasons)) from error
 
 
-def _sizes(spec: CampaignSpec) -> Iterator[ConfigProblem]:
+def _find_size_problems(spec: CampaignSpec) -> Iterator[ConfigProblem]:
     """Yield the problems of a campaign too large to design in minutes, or to hold in memory."""
-    together = min(spec.runs, CHUNK)
-    if spec.steps * together > MOST_STEPS_AT_ONCE:
-        reason = f"{spec.steps} steps of {together} runs are flown at once"
-        yield ConfigProblem("steps", reason, f"give so few that they are {MOST_STEPS_AT_ONCE} in all, or fewer runs")
+    runs_at_once = min(spec.runs, CHUNK)
+    if spec.steps * runs_at_once > MAX_STEPS_AT_ONCE:
+        reason = f"{spec.steps} steps of {runs_at_once} runs are flown at once"
+        yield ConfigProblem("steps", reason, f"give so few that they are {MAX_STEPS_AT_ONCE} in all, or fewer runs")
     designs = len(spec.controller) * len(spec.link)
-    if designs > MOST_DESIGNS:
+    if designs > MAX_DESIGNS:
         yield ConfigProblem(
-            "controller", f"with the links there are {designs} designs", f"take fewer, {MOST_DESIGNS} in all"
+            "controller", f"with the links there are {designs} designs", f"take fewer, {MAX_DESIGNS} in all"
         )
     cells = designs * len(spec.disturbance) * len(spec.plant)
-    if cells > MOST_CELLS:
+    if cells > MAX_CELLS:
         reason = f"with links, disturbances and plants there are {cells} cells"
-        yield ConfigProblem("controller", reason, f"at most {MOST_CELLS} are flown; take fewer of them")
+        yield ConfigProblem("controller", reason, f"at most {MAX_CELLS} are flown; take fewer of them")
 
 
-def _names(spec: CampaignSpec) -> Iterator[ConfigProblem]:
+def _find_name_problems(spec: CampaignSpec) -> Iterator[ConfigProblem]:
     """Yield the problems of names that are taken twice, or that name nothing."""
-    controllers, links = [one.name for one in spec.controller], [one.name for one in spec.link]
-    lists = {
+    controllers, links = [section.name for section in spec.controller], [section.name for section in spec.link]
+    names_by_table = {
         "controller": controllers,
         "link": links,
-        "disturbance": [one.name for one in spec.disturbance],
-        "plant": [one.name for one in spec.plant],
+        "disturbance": [section.name for section in spec.disturbance],
+        "plant": [section.name for section in spec.plant],
     }
-    for key, names in lists.items():
+    for key, names in names_by_table.items():
         if not names:
             yield ConfigProblem(key, "is empty: there is nothing to fly", f"add a [[{key}]]")
-        yield from taken_twice(key, names)
-    if TRUE in links:
-        place = f"link[{links.index(TRUE)}].name"
-        yield ConfigProblem(place, f'"{TRUE}" means the link that is flown on', "give it another name")
-    for i, one in enumerate(spec.controller):
-        yield from _known(f"controller[{i}].link", one.link, [TRUE, *links], "link")
+        yield from find_duplicates(key, names)
+    if TRUE_LINK in links:
+        key_path = f"link[{links.index(TRUE_LINK)}].name"
+        yield ConfigProblem(key_path, f'"{TRUE_LINK}" means the link that is flown on', "give it another name")
+    for i, controller in enumerate(spec.controller):
+        yield from _find_unknown_name(f"controller[{i}].link", controller.link, [TRUE_LINK, *links], "link")
     for i, tuning in enumerate(spec.tuning):
         for j, name in enumerate(tuning.controllers):
-            yield from _known(f"tuning[{i}].controllers[{j}]", name, controllers, "controller")
+            yield from _find_unknown_name(f"tuning[{i}].controllers[{j}]", name, controllers, "controller")
         for j, name in enumerate(tuning.links):
-            yield from _known(f"tuning[{i}].links[{j}]", name, links, "link")
+            yield from _find_unknown_name(f"tuning[{i}].links[{j}]", name, links, "link")
     for i, disturbance in enumerate(spec.disturbance):
         if disturbance.memory and disturbance.kind != "gusts":
             yield ConfigProblem(
@@ -491,11 +501,11 @@ def _names(spec: CampaignSpec) -> Iterator[ConfigProblem]:
             )
 
 
-def _kinds(table: Mapping[str, object]) -> Iterator[ConfigProblem]:
+def _find_unknown_kinds(table: Mapping[str, object]) -> Iterator[ConfigProblem]:
     """Yield the problems of controllers that are neither ours nor found."""
-    given = table.get("controller")
-    for i, one in enumerate(given if isinstance(given, list) else ()):
-        kind = one.get("kind") if isinstance(one, dict) else None
+    controllers = table.get("controller")
+    for i, controller in enumerate(controllers if isinstance(controllers, list) else ()):
+        kind = controller.get("kind") if isinstance(controller, dict) else None
         if isinstance(kind, str) and kind and kind not in KINDS:
             try:
                 check_kind(kind)
@@ -503,21 +513,21 @@ def _kinds(table: Mapping[str, object]) -> Iterator[ConfigProblem]:
                 yield ConfigProblem(f"controller[{i}].kind", error.reason, error.hint)
 
 
-def taken_twice(key: str, names: Sequence[str]) -> Iterator[ConfigProblem]:
+def find_duplicates(key: str, names: Sequence[str]) -> Iterator[ConfigProblem]:
     """Yield the problems of names that occur twice in the tables [[key]]."""
     for i, name in enumerate(names):
         if name in names[:i]:
             yield ConfigProblem(f"{key}[{i}].name", f'"{name}" is there twice', "give each a name of its own")
 
 
-def _known(key: str, name: str, names: Sequence[str], what: str) -> Iterator[ConfigProblem]:
+def _find_unknown_name(key: str, name: str, names: Sequence[str], noun: str) -> Iterator[ConfigProblem]:
     if name not in names:
         yield ConfigProblem(
-            key, f'there is no {what} "{name}"{find_nearest(name, names)}', f"give one of {', '.join(names)}"
+            key, f'there is no {noun} "{name}"{find_nearest(name, names)}', f"give one of {', '.join(names)}"
         )
 
 
-def _starts(spec: CampaignSpec, base: Config) -> Iterator[ConfigProblem]:
+def _find_start_problems(spec: CampaignSpec, base: Config) -> Iterator[ConfigProblem]:
     n_x, _ = get_dimensions(base.plant)
     if spec.start and spec.start_box:
         yield ConfigProblem("start_box", "there is a start too", "give one of them")

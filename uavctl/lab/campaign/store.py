@@ -1,7 +1,7 @@
-"""Folder of a campaign: its document, finished tasks as parts, and in the end one table of all runs.
+"""Folder of a campaign: its document, finished tasks as parts, and at the end one table of all runs.
 
-A task is there whole or not at all, so a campaign that was killed goes on where it was; the table's bytes depend on the
-runs alone.
+A task is stored completely or not at all, so a killed campaign can continue. The bytes of the table depend on the runs
+alone.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from uavctl.lab.campaign.pool import Columns, Work
 
 DOCUMENT, SPECIFICATION, RUNS, PARTS = "campaign.json", "campaign.toml", "runs.parquet", "parts"
 _GROUP_ROWS = 65_536
-# What tells a cell from the others, in either world: named in each row, so that the table speaks for itself.
-NAMES = ("scenario", "autopilot", "rate_hz", "controller", "link", "air", "disturbance", "plant")
+# Columns that name the cell of each row, in either world, so that the table can be read alone.
+CELL_COLUMNS = ("scenario", "autopilot", "rate_hz", "controller", "link", "air", "disturbance", "plant")
 _WRITER: dict[str, Any] = {
     "version": "2.6",
     "compression": "zstd",
     "compression_level": 3,
-    "use_dictionary": ["error", *NAMES],
+    "use_dictionary": ["error", *CELL_COLUMNS],
 }
 
 _I32, _I64, _F64 = pa.int32(), pa.int64(), pa.float64()
@@ -74,48 +74,48 @@ class Store:
         self._parts = folder / PARTS
 
     @contextmanager
-    def opened(self, document: Mapping[str, object], specification: str, resume: bool) -> Iterator[None]:
-        """Begin a campaign or go on with one, while nobody else can.
+    def open(self, document: Mapping[str, object], specification: str, resume: bool) -> Iterator[None]:
+        """Begin or continue a campaign; other processes are locked out.
 
         Args:
-            resume: Whether the folder's campaign is to go on.
+            resume: Whether to continue the folder's campaign.
 
         Raises:
-            UsageError: There is a campaign and it is not to go on, there is none, it is another one, or another process
-                is at it.
+            UsageError: There is a campaign but `resume` is false, there is none, it is another one, or another process
+                flies it.
             UavctlError: The folder cannot be made or written.
         """
         with ExitStack() as stack:
-            with self._disk():
+            with self._convert_disk_errors():
                 self.folder.mkdir(parents=True, exist_ok=True)
                 lock = stack.enter_context((self.folder / ".lock").open("ab"))
-                _alone(lock.fileno(), self.folder)
+                _lock_folder(lock.fileno(), self.folder)
                 self._begin(document, specification, resume)
                 self._parts.mkdir(exist_ok=True)
             yield
 
-    def begun(self) -> bool:
-        """Return whether there is a campaign that can go on."""
+    def has_begun(self) -> bool:
+        """Return whether the folder has a campaign."""
         return (self.folder / DOCUMENT).exists()
 
     def check(self, resume: bool) -> None:
-        """Check that there is a campaign if one is to go on, and none if not.
+        """Check that there is a campaign to continue, or none to overwrite.
 
         Raises:
-            UsageError: It is the other way round.
+            UsageError: There is none to continue, or one although `resume` is false.
         """
-        if self.begun() and not resume:
+        if self.has_begun() and not resume:
             raise UsageError(f"{self.folder} holds a campaign; go on with it by --resume, or choose another folder")
-        if resume and not self.begun():
+        if resume and not self.has_begun():
             raise UsageError(f"{self.folder} holds no campaign that could go on; leave out --resume")
 
-    def complete(self) -> bool:
+    def is_complete(self) -> bool:
         """Return whether all runs are in the table."""
         return (self.folder / RUNS).exists()
 
-    def kept(self, tasks: Sequence[Work]) -> set[str]:
+    def find_finished(self, tasks: Sequence[Work]) -> set[str]:
         """Return the names of the finished tasks."""
-        return {task.name for task in tasks if self._part(task).exists()}
+        return {task.name for task in tasks if self._get_part_path(task).exists()}
 
     def keep(self, task: Work, columns: Columns) -> None:
         """Write a task's rows; once this returns, they survive a kill.
@@ -123,10 +123,10 @@ class Store:
         Raises:
             UavctlError: They cannot be written.
         """
-        draft = self._part(task).with_suffix(".draft")
-        with self._disk():
-            pq.write_table(table_of(columns, self._schema), draft, **_WRITER)
-            _settle(draft, self._part(task))
+        draft = self._get_part_path(task).with_suffix(".draft")
+        with self._convert_disk_errors():
+            pq.write_table(make_table(columns, self._schema), draft, **_WRITER)
+            _rename_synced(draft, self._get_part_path(task))
 
     def finish(self, tasks: Sequence[Work]) -> Path:
         """Put all parts together, in order, and remove them.
@@ -135,34 +135,34 @@ class Store:
             UavctlError: A part is damaged, or the table cannot be written.
         """
         path = self.folder / RUNS
-        with self._disk():
-            if not self.complete():
+        with self._convert_disk_errors():
+            if not self.is_complete():
                 draft = path.with_suffix(".draft")
-                told = msgspec.json.decode((self.folder / DOCUMENT).read_bytes())["cells"]
-                cells = {one["index"]: one for one in told}
-                kinds = {
+                cell_records = msgspec.json.decode((self.folder / DOCUMENT).read_bytes())["cells"]
+                cells = {record["index"]: record for record in cell_records}
+                types = {
                     name: _F64 if name == "rate_hz" else pa.string()
-                    for name in NAMES
-                    if all(name in cell for cell in told)
+                    for name in CELL_COLUMNS
+                    if all(name in cell for cell in cell_records)
                 }
-                names = list(kinds.items())
-                fields = [self._schema.field(place) for place in range(len(self._schema.names))]
+                names = list(types.items())
+                fields = [self._schema.field(position) for position in range(len(self._schema.names))]
                 schema = pa.schema([fields[0], *names, *fields[1:]])
                 with pq.ParquetWriter(draft, schema, **_WRITER) as writer:
-                    for cell, of_cell in groupby(tasks, lambda task: task.cell):
-                        table = pa.concat_tables([self._read(task) for task in of_cell]).combine_chunks()
-                        for place, (name, kind) in enumerate(kinds.items(), 1):
-                            values = pa.array([cells[cell][name]] * table.num_rows, type=kind)
-                            table = table.add_column(place, name, values)
+                    for cell, cell_tasks in groupby(tasks, lambda task: task.cell):
+                        table = pa.concat_tables([self._read_part(task) for task in cell_tasks]).combine_chunks()
+                        for position, (name, column_type) in enumerate(types.items(), 1):
+                            values = pa.array([cells[cell][name]] * table.num_rows, type=column_type)
+                            table = table.add_column(position, name, values)
                         writer.write_table(table, row_group_size=_GROUP_ROWS)
-                _settle(draft, path)
+                _rename_synced(draft, path)
             for part in self._parts.iterdir():
                 part.unlink()
             self._parts.rmdir()
         return path
 
     @contextmanager
-    def _disk(self) -> Iterator[None]:
+    def _convert_disk_errors(self) -> Iterator[None]:
         try:
             yield
         except OSError as error:
@@ -170,78 +170,88 @@ class Store:
                 f"{self.folder}: {error.strerror or error}; make room or mend it, and go on with --resume"
             ) from error
 
-    def _part(self, task: Work) -> Path:
+    def _get_part_path(self, task: Work) -> Path:
         return self._parts / f"{task.name}.parquet"
 
-    def _read(self, task: Work) -> pa.Table:
+    def _read_part(self, task: Work) -> pa.Table:
         try:
-            return pq.read_table(self._part(task), schema=self._schema)
+            return pq.read_table(self._get_part_path(task), schema=self._schema)
         except (pa.ArrowException, OSError) as error:
-            raise UavctlError(f"{self._part(task)} is damaged ({error}); remove it and go on with --resume") from error
+            raise UavctlError(
+                f"{self._get_part_path(task)} is damaged ({error}); remove it and go on with --resume"
+            ) from error
 
     def _begin(self, document: Mapping[str, object], specification: str, resume: bool) -> None:
         self.check(resume)
         path = self.folder / DOCUMENT
         if resume:
-            there = msgspec.json.decode(path.read_bytes())
-            here = msgspec.json.decode(msgspec.json.encode(document))
-            different = first_difference(there, here)
-            if different is not None:
-                raise UsageError(f"{self.folder} holds another campaign: {different}; choose another folder")
+            stored = msgspec.json.decode(path.read_bytes())
+            current = msgspec.json.decode(msgspec.json.encode(document))
+            difference = find_first_difference(stored, current)
+            if difference is not None:
+                raise UsageError(f"{self.folder} holds another campaign: {difference}; choose another folder")
             return
-        _write(self.folder / SPECIFICATION, specification.encode())
-        _write(path, msgspec.json.format(msgspec.json.encode(document), indent=1) + b"\n")  # the last: now it is one
+        _write_file(self.folder / SPECIFICATION, specification.encode())
+        _write_file(
+            path, msgspec.json.format(msgspec.json.encode(document), indent=1) + b"\n"
+        )  # last, as it makes the folder a campaign
 
 
-def table_of(columns: Columns, schema: pa.Schema = SCHEMA) -> pa.Table:
-    """Return the rows of a task as they are stored."""
+def make_table(columns: Columns, schema: pa.Schema = SCHEMA) -> pa.Table:
+    """Return the stored table of a task's rows."""
     arrays = []
     for name in schema.names:
         field, values = schema.field(name), columns[name]
-        counted = name in ("ages", "outside")
-        arrays.append(_histograms(values) if counted else pa.array(values, type=field.type, from_pandas=False))
+        is_histogram = name in ("ages", "outside")
+        arrays.append(
+            _trim_histograms(values) if is_histogram else pa.array(values, type=field.type, from_pandas=False)
+        )
     return pa.Table.from_arrays(arrays, schema=schema)
 
 
-def first_difference(there: object, here: object) -> str | None:
+def find_first_difference(stored: object, current: object) -> str | None:
     """Return the first place in which two JSON documents differ, in words."""
-    found = next(unequal(there, here), None)
-    return None if found is None else f"{found[0]} is {_short(found[1])} there and {_short(found[2])} here"
+    difference = next(unequal(stored, current), None)
+    return (
+        None
+        if difference is None
+        else f"{difference[0]} is {_shorten(difference[1])} there and {_shorten(difference[2])} here"
+    )
 
 
-def _short(value: object) -> str:
+def _shorten(value: object) -> str:
     text = msgspec.json.encode(value).decode()
     return text if len(text) <= 60 else f"{text[:59]}…"
 
 
-def _histograms(counts: NDArray[np.generic]) -> pa.ListArray:
+def _trim_histograms(counts: NDArray[np.generic]) -> pa.ListArray:
     """Return rows (N, T) as lists up to their last entry that is not 0."""
-    used = counts.shape[1] - (counts[:, ::-1] != 0).argmax(axis=1)
-    used = np.where(counts.any(axis=1), used, 0)
-    inside = np.arange(counts.shape[1]) < used[:, None]
-    offsets = np.concatenate([[0], np.cumsum(used)]).astype(np.int32)
-    return pa.ListArray.from_arrays(pa.array(offsets), pa.array(counts[inside], type=_I64))
+    lengths = counts.shape[1] - (counts[:, ::-1] != 0).argmax(axis=1)
+    lengths = np.where(counts.any(axis=1), lengths, 0)
+    is_used = np.arange(counts.shape[1]) < lengths[:, None]
+    offsets = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
+    return pa.ListArray.from_arrays(pa.array(offsets), pa.array(counts[is_used], type=_I64))
 
 
-def _alone(descriptor: int, folder: Path) -> None:
+def _lock_folder(descriptor: int, folder: Path) -> None:
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
         raise UsageError(f"{folder}: another process flies this campaign; wait for it") from error
 
 
-def _write(path: Path, data: bytes) -> None:
+def _write_file(path: Path, data: bytes) -> None:
     draft = path.with_name(f"{path.name}.draft")
     draft.write_bytes(data)
-    _settle(draft, path)
+    _rename_synced(draft, path)
 
 
-def _settle(draft: Path, path: Path) -> None:
+def _rename_synced(draft: Path, path: Path) -> None:
     """Rename a temporary file once it is on the disk."""
-    for one in (draft, path.parent):
-        if one == path.parent:
+    for synced in (draft, path.parent):
+        if synced == path.parent:
             draft.replace(path)
-        descriptor = os.open(one, os.O_RDONLY)
+        descriptor = os.open(synced, os.O_RDONLY)
         try:
             os.fsync(descriptor)
         finally:

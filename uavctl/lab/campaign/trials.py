@@ -1,4 +1,4 @@
-"""Campaigns of quadrotor trials: specification, cells, tasks, figures."""
+"""Campaigns of quadrotor trials: specification, reading of their file, cells, tasks and figures."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ from uavctl.config.document import MAX_SEED, ConfigProblem, Section
 from uavctl.config.load import parse_toml
 from uavctl.errors import RAISED, ConfigError, DesignError, in_words
 from uavctl.lab.campaign.pool import Columns, Work
-from uavctl.lab.campaign.results import ToldCell, read_cells, read_document
+from uavctl.lab.campaign.results import CellRecord, read_cells, read_document
 from uavctl.lab.campaign.spec import (
     CONFIGURATION,
-    MOST_CELLS,
-    MOST_OF_A_KIND,
+    MAX_CELLS,
+    MAX_TABLES,
     LinkSpec,
     Name,
     Overrides,
-    configuration_of,
-    placed,
+    find_duplicates,
+    locate_overrides,
     read_spec,
-    taken_twice,
-    text_of,
+    read_specification,
+    resolve_configuration,
 )
-from uavctl.lab.own_loop import TUNED, OwnTuning
+from uavctl.lab.position_loop import TUNED_LOOPS, PositionLoopTuning
 from uavctl.lab.trial import (
     AUTOPILOTS,
     SCENARIOS,
@@ -47,16 +47,13 @@ from uavctl.lab.trial import (
     TrialCell,
     TrialFlight,
     TrialPilot,
-    believed,
-    fly,
-    usable_room,
+    compute_usable_share,
+    fly_trial,
+    make_design_config,
 )
 
-# What a campaign in the world of the quadrotor is asked to fly, as its TOML file says it.
-
-
 QUADROTOR = "quadrotor"
-MOST_TRIALS = 100_000
+MAX_TRIALS = 100_000
 Rate = Annotated[float, Meta(ge=0.01, le=1000)]
 
 
@@ -90,7 +87,7 @@ class TrialSpec(Section, frozen=True, kw_only=True):
     ]
     config: Annotated[str, Meta(description="flight configuration: a preset, or a file, seen from the campaign's")]
     set: Annotated[Overrides, Meta(description="overrides of the configuration, for all")] = ()
-    runs: Annotated[int, Meta(ge=1, le=MOST_TRIALS, description="flights of each cell")] = 20
+    runs: Annotated[int, Meta(ge=1, le=MAX_TRIALS, description="flights of each cell")] = 20
     master: Annotated[
         int, Meta(ge=0, le=MAX_SEED, description="seed: flight i's draws come from (master, i), in every cell")
     ] = 0
@@ -112,7 +109,7 @@ class TrialSpec(Section, frozen=True, kw_only=True):
     ] = AUTOPILOTS
     rate_hz: Annotated[
         tuple[Rate, ...],
-        Meta(min_length=1, max_length=MOST_OF_A_KIND, description="positions a second that the cameras give [1/s]"),
+        Meta(min_length=1, max_length=MAX_TABLES, description="positions a second that the cameras give [1/s]"),
     ] = (5.0, 50.0)
     air: Annotated[
         tuple[Air, ...],
@@ -123,69 +120,70 @@ class TrialSpec(Section, frozen=True, kw_only=True):
         ),
     ] = ("gusts",)
     controller: Annotated[
-        tuple[TrialControllerSpec, ...], Meta(min_length=1, max_length=MOST_OF_A_KIND, description="who flies")
+        tuple[TrialControllerSpec, ...], Meta(min_length=1, max_length=MAX_TABLES, description="who flies")
     ]
-    link: Annotated[tuple[LinkSpec, ...], Meta(min_length=1, max_length=MOST_OF_A_KIND, description="links")] = (
+    link: Annotated[tuple[LinkSpec, ...], Meta(min_length=1, max_length=MAX_TABLES, description="links")] = (
         LinkSpec(name="as configured"),
     )
 
 
-# The cells of a campaign in the world of the quadrotor, and the tasks that fly them.
-
-
 VERSION = 1
 CHUNK = 5  # flights of a task: a minute or less
-_WHOLE = ("positions",)
-_WORDS = ("mode",)
-REAL = tuple(one.name for one in fields(TrialFlight) if one.name not in ("seed", *_WHOLE, *_WORDS))
+_INTEGER_COLUMNS = ("positions",)
+_TEXT_COLUMNS = ("mode",)
+FLOAT_COLUMNS = tuple(
+    section.name for section in fields(TrialFlight) if section.name not in ("seed", *_INTEGER_COLUMNS, *_TEXT_COLUMNS)
+)
 SCHEMA = pa.schema(
     [
         ("cell", pa.int32()),
         ("run", pa.int64()),
         ("error", pa.string()),
         ("seed", pa.int64()),
-        *((name, pa.float64()) for name in REAL),
-        *((name, pa.int32()) for name in _WHOLE),
-        *((name, pa.string()) for name in _WORDS),
+        *((name, pa.float64()) for name in FLOAT_COLUMNS),
+        *((name, pa.int32()) for name in _INTEGER_COLUMNS),
+        *((name, pa.string()) for name in _TEXT_COLUMNS),
     ]
 )
 
 
 @dataclass(frozen=True)
-class TrialPlace:
+class NumberedTrialCell:
     """One cell of a trial campaign."""
 
     index: int  # its number
     cell: TrialCell  # what is flown
-    kind: str  # kind of who flies
-    design_id: str | None  # of the design of ours; None of the vehicle's own loop
-    usable_room: float | None  # share of the room in which ours may rest; None likewise
-    refused: str  # why nobody flies there; empty if somebody does
+    kind: str  # kind of the controller
+    design_id: str | None  # identifies the controller's design; None for the vehicle's own loop
+    usable_room: float | None  # share of the room in which a plan may rest; None for the vehicle's own loop
+    refused: str  # why the cell is not flown; empty if it is
 
 
 @dataclass(frozen=True)
 class TrialTask(Work):
     """Task of a trial campaign: flights `first` … `first` + `runs` - 1 of a cell."""
 
-    flown: TrialCell
+    trial_cell: TrialCell
     seconds: float
     from_s: float
     master: int
 
     def fly(self) -> Columns:
-        """Fly the task; a flight that raises has the error in its row, and stops nothing."""
+        """Fly the task; an error of a flight is stored in its row, and the others continue."""
         rows = []
         for run in range(self.first, self.first + self.runs):
-            seed = seed_of(self.master, run)
+            seed = get_flight_seed(self.master, run)
             try:
-                rows.append((fly(self.flown, seed, seconds=self.seconds, from_s=self.from_s), ""))
+                rows.append((fly_trial(self.trial_cell, seed, seconds=self.seconds, from_s=self.from_s), ""))
             except RAISED as error:  # a crashed run is reported and stops nothing
                 rows.append((TrialFlight(seed), in_words(error)))
         return self._columns(rows)
 
-    def lost(self, error: str) -> Columns:
+    def make_lost_rows(self, error: str) -> Columns:
         """See `Work`."""
-        return self._columns([(TrialFlight(seed_of(self.master, self.first + i)), error) for i in range(self.runs)])
+        return self._columns(
+            [(TrialFlight(get_flight_seed(self.master, self.first + i)), error) for i in range(self.runs)]
+        )
 
     def _columns(self, rows: Sequence[tuple[TrialFlight, str]]) -> Columns:
         columns: Columns = {
@@ -196,60 +194,60 @@ class TrialTask(Work):
         for name in SCHEMA.names:
             if name not in columns:
                 values = [getattr(flight, name) for flight, _ in rows]
-                columns[name] = np.array(values, dtype=object if name in _WORDS else None)
+                columns[name] = np.array(values, dtype=object if name in _TEXT_COLUMNS else None)
         return columns
 
 
-def seed_of(master: int, run: int) -> int:
+def get_flight_seed(master: int, run: int) -> int:
     """Return the seed of a flight: run i has the same in every cell."""
     return int(np.random.SeedSequence([master, run]).generate_state(1)[0])
 
 
-def places_of(spec: TrialSpec) -> tuple[TrialPlace, ...]:
+def make_trial_cells(spec: TrialSpec) -> tuple[NumberedTrialCell, ...]:
     """Return every cell of a campaign; a design that cannot be made is refused here."""
     text = dump_config(load_config(spec.config, spec.set))
-    made: dict[Config, tuple[str | None, float | None, str]] = {}
+    designs: dict[Config, tuple[str | None, float | None, str]] = {}
     axes = (spec.scenario, spec.autopilot, spec.rate_hz, spec.air, spec.link, spec.controller)
-    places = []
+    cells = []
     for index, (scenario, autopilot, rate_hz, air, link, controller) in enumerate(product(*axes)):
-        pilot = _pilot(spec, controller, autopilot, text)
+        pilot = _make_pilot(spec, controller, autopilot, text)
         cell = TrialCell(pilot, scenario, autopilot, rate_hz, link.name, link.set, air)
-        found: tuple[str | None, float | None, str] = (None, None, "")
-        if pilot.own is None:
-            config = believed(cell)
-            if config not in made:
-                made[config] = _designed(config)
-            found = made[config]
-        places.append(TrialPlace(index, cell, controller.kind, *found))
-    return tuple(places)
+        design: tuple[str | None, float | None, str] = (None, None, "")
+        if pilot.position_loop is None:
+            config = make_design_config(cell)
+            if config not in designs:
+                designs[config] = _make_design(config)
+            design = designs[config]
+        cells.append(NumberedTrialCell(index, cell, controller.kind, *design))
+    return tuple(cells)
 
 
-def _pilot(spec: TrialSpec, given: TrialControllerSpec, autopilot: AutopilotName, text: str) -> TrialPilot:
-    own = None
-    if given.kind == "own-loop":
-        own = TUNED[autopilot] if given.tuned else OwnTuning()
-    return TrialPilot(given.name, spec.config, given.set, own, given.link == "true", text)
+def _make_pilot(spec: TrialSpec, controller: TrialControllerSpec, autopilot: AutopilotName, text: str) -> TrialPilot:
+    own_loop = None
+    if controller.kind == "own-loop":
+        own_loop = TUNED_LOOPS[autopilot] if controller.tuned else PositionLoopTuning()
+    return TrialPilot(controller.name, spec.config, controller.set, own_loop, controller.link == "true", text)
 
 
-def _designed(knows: Config) -> tuple[str | None, float | None, str]:
+def _make_design(config: Config) -> tuple[str | None, float | None, str]:
     try:
-        design = design_of(knows)
-        build_controller(knows, design)
-        return design.design_id, usable_room(knows, design), ""
+        design = design_of(config)
+        build_controller(config, design)
+        return design.design_id, compute_usable_share(config, design), ""
     except DesignError as error:
         return None, None, str(error)
 
 
-def trial_tasks(spec: TrialSpec, places: Sequence[TrialPlace]) -> Iterator[TrialTask]:
+def make_trial_tasks(spec: TrialSpec, cells: Sequence[NumberedTrialCell]) -> Iterator[TrialTask]:
     """Return all tasks of a campaign, in order."""
-    for place in places:
-        if not place.refused:
+    for numbered in cells:
+        if not numbered.refused:
             for first in range(0, spec.runs, CHUNK):
                 runs = min(CHUNK, spec.runs - first)
-                yield TrialTask(place.index, first, runs, place.cell, spec.seconds, spec.from_s, spec.master)
+                yield TrialTask(numbered.index, first, runs, numbered.cell, spec.seconds, spec.from_s, spec.master)
 
 
-def trial_document(spec: TrialSpec, places: Sequence[TrialPlace]) -> dict[str, object]:
+def make_trial_document(spec: TrialSpec, cells: Sequence[NumberedTrialCell]) -> dict[str, object]:
     """Return the content of `campaign.json`."""
     return {
         "version": VERSION,
@@ -260,38 +258,35 @@ def trial_document(spec: TrialSpec, places: Sequence[TrialPlace]) -> dict[str, o
         "runs": spec.runs,
         "spec": msgspec.to_builtins(spec),
         "configuration": dump_config(load_config(spec.config, spec.set)),
-        "cells": [_told(place) for place in places],
+        "cells": [_describe_cell(cell) for cell in cells],
     }
 
 
-def _told(place: TrialPlace) -> dict[str, object]:
-    cell, own = place.cell, place.cell.pilot.own
+def _describe_cell(numbered: NumberedTrialCell) -> dict[str, object]:
+    cell, own_loop = numbered.cell, numbered.cell.pilot.position_loop
     return {
-        "index": place.index,
+        "index": numbered.index,
         "controller": cell.pilot.name,
-        "kind": place.kind,
+        "kind": numbered.kind,
         "scenario": cell.scenario,
         "autopilot": cell.autopilot,
         "rate_hz": cell.rate_hz,
         "air": cell.air,
         "link": cell.link_name,
-        "design_id": place.design_id,
-        "usable_room": place.usable_room,
-        "own": None if own is None else {**asdict(own), "gains": dict(own.gains)},
-        "refused": place.refused,
+        "design_id": numbered.design_id,
+        "usable_room": numbered.usable_room,
+        "own": None if own_loop is None else {**asdict(own_loop), "gains": dict(own_loop.gains)},
+        "refused": numbered.refused,
     }
 
 
-# The file of a campaign in the world of the quadrotor in, its specification out; all problems at once.
-
-
-def is_trial(path: Path) -> bool:
+def is_trial_file(path: Path) -> bool:
     """Return whether a campaign's file is one of quadrotor flights.
 
     Raises:
         ConfigError: It cannot be read.
     """
-    return parse_toml(text_of(path), str(path)).get("world") == QUADROTOR
+    return parse_toml(read_specification(path), str(path)).get("world") == QUADROTOR
 
 
 def read_trial(path: Path, runs: int | None = None) -> tuple[TrialSpec, str]:
@@ -302,31 +297,33 @@ def read_trial(path: Path, runs: int | None = None) -> tuple[TrialSpec, str]:
     Raises:
         ConfigError: With all problems found, one a line: place, key, reason, what to do.
     """
-    spec, told, text = read_spec(path, TrialSpec)
-    name = configuration_of(path, spec.config)
+    spec, collector, text = read_spec(path, TrialSpec)
+    name = resolve_configuration(path, spec.config)
     spec = msgspec.structs.replace(spec, config=name, runs=spec.runs if runs is None else runs)
-    told.tell(_wrong(spec))
-    base = told.load(lambda overrides: load(name, overrides).config, placed("set", spec.set))
+    collector.add(_find_problems(spec))
+    base = collector.load(lambda overrides: load(name, overrides).config, locate_overrides("set", spec.set))
     if base is not None:
-        written = dump_config(base)
-        of_controllers = [placed(f"controller[{i}].set", one.set) for i, one in enumerate(spec.controller)]
-        of_links = [placed(f"link[{i}].set", one.set) for i, one in enumerate(spec.link)]
-        for each in (*of_controllers, *of_links):
-            told.load(lambda overrides: parse(written, CONFIGURATION, overrides).config, each)
-    if told.problems:
-        raise ConfigError(told.problems)
+        base_text = dump_config(base)
+        controller_overrides = [
+            locate_overrides(f"controller[{i}].set", section.set) for i, section in enumerate(spec.controller)
+        ]
+        link_overrides = [locate_overrides(f"link[{i}].set", section.set) for i, section in enumerate(spec.link)]
+        for located in (*controller_overrides, *link_overrides):
+            collector.load(lambda overrides: parse(base_text, CONFIGURATION, overrides).config, located)
+    if collector.problems:
+        raise ConfigError(collector.problems)
     return spec, text
 
 
-def _wrong(spec: TrialSpec) -> Iterator[ConfigProblem]:
-    yield from taken_twice("controller", [one.name for one in spec.controller])
-    yield from taken_twice("link", [one.name for one in spec.link])
-    for i, one in enumerate(spec.controller):
-        if one.kind == "own-loop" and (one.set or one.link != "true"):
+def _find_problems(spec: TrialSpec) -> Iterator[ConfigProblem]:
+    yield from find_duplicates("controller", [section.name for section in spec.controller])
+    yield from find_duplicates("link", [section.name for section in spec.link])
+    for i, section in enumerate(spec.controller):
+        if section.kind == "own-loop" and (section.set or section.link != "true"):
             yield ConfigProblem(
                 f"controller[{i}]", "the vehicle's own loop has no design", "leave out `set` and `link`"
             )
-        if one.kind == "smpc" and one.tuned:
+        if section.kind == "smpc" and section.tuned:
             yield ConfigProblem(f"controller[{i}].tuned", "is of the vehicle's own loop", "leave it out")
     for i, link in enumerate(spec.link):
         for j, text in enumerate(link.set):
@@ -338,16 +335,13 @@ def _wrong(spec: TrialSpec) -> Iterator[ConfigProblem]:
         yield ConfigProblem("from_s", f"{spec.from_s:g} s is not within the flight", "give less than `seconds`")
     cells = len(spec.scenario) * len(spec.autopilot) * len(spec.rate_hz) * len(spec.air)
     cells *= len(spec.controller) * len(spec.link)
-    if cells > MOST_CELLS:
+    if cells > MAX_CELLS:
         yield ConfigProblem(
-            "controller", f"there are {cells} cells", f"at most {MOST_CELLS} are flown; take fewer of them"
+            "controller", f"there are {cells} cells", f"at most {MAX_CELLS} are flown; take fewer of them"
         )
 
 
-# What the flights of a campaign in the world of the quadrotor came to.
-
-
-class ToldPlace(ToldCell, frozen=True, kw_only=True):
+class TrialCellRecord(CellRecord, frozen=True, kw_only=True):
     """A cell as `campaign.json` has it."""
 
     scenario: Scenario
@@ -356,7 +350,7 @@ class ToldPlace(ToldCell, frozen=True, kw_only=True):
     air: str
 
 
-class ToldTrial(msgspec.Struct, frozen=True, kw_only=True):
+class TrialRecord(msgspec.Struct, frozen=True, kw_only=True):
     """A campaign as `campaign.json` has it."""
 
     name: str
@@ -364,13 +358,13 @@ class ToldTrial(msgspec.Struct, frozen=True, kw_only=True):
     uavctl_version: str
     master: int
     runs: int
-    cells: list[ToldPlace]
+    cells: list[TrialCellRecord]
 
 
 class TrialSummary(msgspec.Struct, frozen=True, kw_only=True):
     """Figures of a cell; null where a figure does not apply to its scenario, or is infinite."""
 
-    place: ToldPlace
+    place: TrialCellRecord
     runs: int
     failed: int
     median: dict[str, float | None]
@@ -380,28 +374,28 @@ class TrialSummary(msgspec.Struct, frozen=True, kw_only=True):
     values: dict[str, list[float]]
 
 
-def summarise_trial(folder: Path) -> tuple[ToldTrial, list[TrialSummary]]:
+def summarise_trial(folder: Path) -> tuple[TrialRecord, list[TrialSummary]]:
     """Return the figures of every cell of a campaign.
 
     Raises:
         UavctlError: The folder has no results that can be read.
     """
-    told = read_document(folder, ToldTrial)
-    return told, read_cells(folder, told.cells, _summary)
+    record = read_document(folder, TrialRecord)
+    return record, read_cells(folder, record.cells, _summarise_cell)
 
 
-def _summary(rows: pa.Table, place: ToldPlace) -> TrialSummary:
+def _summarise_cell(rows: pa.Table, place: TrialCellRecord) -> TrialSummary:
     errors = rows["error"].to_pylist()
-    good = [i for i, error in enumerate(errors) if not error]
-    columns = {name: rows[name].to_pylist() for name in (*REAL, "mode")}
-    values = {name: [float(columns[name][i]) for i in good] for name in REAL}
-    modes = Counter(columns["mode"][i] for i in good)
+    finished = [i for i, error in enumerate(errors) if not error]
+    columns = {name: rows[name].to_pylist() for name in (*FLOAT_COLUMNS, "mode")}
+    values = {name: [float(columns[name][i]) for i in finished] for name in FLOAT_COLUMNS}
+    modes = Counter(columns["mode"][i] for i in finished)
     return TrialSummary(
         place=place,
         runs=len(errors),
-        failed=len(errors) - len(good),
-        median={name: replace_infinite(median(found)) if found else None for name, found in values.items()},
-        worst={name: replace_infinite(max(found)) if found else None for name, found in values.items()},
+        failed=len(errors) - len(finished),
+        median={name: replace_infinite(median(samples)) if samples else None for name, samples in values.items()},
+        worst={name: replace_infinite(max(samples)) if samples else None for name, samples in values.items()},
         modes=dict(modes),
         errors=[error for error in dict.fromkeys(errors) if error],
         values=values,

@@ -1,4 +1,10 @@
-"""Linear world of campaigns: many runs in step, their link, filter and random numbers."""
+"""Linear world of campaigns: many runs in step, in memory, with their draws, link and filter.
+
+1. All random numbers of a run come from (master, index) alone, so all cells share them.
+2. The link determines when each position is known, and which known one is the newest.
+3. Where positions alone are measured, the flight's filter estimates the state, for all runs in step.
+4. `simulate` steps all runs with one controller.
+"""
 
 from __future__ import annotations
 
@@ -8,21 +14,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.config.link import LinkConfig
 from uavctl.smpc.batch import BatchController, Counts, News
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope
 
-# All that is random in a run, from (master, index) alone: common random numbers for every cell of a campaign.
-
-
-Array = NDArray[np.float64]
-
 _NOISE = 3  # child of a run's seed: 0 and 1 are those of `draw`, 2 draws its start
 
 
 @dataclass(frozen=True, eq=False)
-class Chances:
+class RandomDraws:
     """Random draws of N runs of T steps."""
 
     normal: Array  # standard normal draws (N, T, n_w): the disturbances'
@@ -30,14 +32,14 @@ class Chances:
     link: Array
 
 
-def draw(master: int, first: int, runs: int, steps: int, n_w: int) -> Chances:
+def draw(master: int, first: int, runs: int, steps: int, n_w: int) -> RandomDraws:
     """Draw for the runs `first` … `first` + `runs` - 1 of a campaign; longer runs begin with the same draws."""
     normal, link = np.empty((runs, steps, n_w)), np.empty((runs, steps + 1, 3))
     for i in range(runs):
         for_plant, for_link = np.random.SeedSequence([master, first + i]).spawn(2)
         np.random.default_rng(for_plant).standard_normal(out=normal[i])
         np.random.default_rng(for_link).random(out=link[i])
-    return Chances(normal, link)
+    return RandomDraws(normal, link)
 
 
 def draw_noise(master: int, first: int, runs: int, steps: int, axes: int) -> Array:
@@ -49,113 +51,111 @@ def draw_noise(master: int, first: int, runs: int, steps: int, axes: int) -> Arr
     return noise
 
 
-# What the link of a configuration does to the positions of many runs: when each is known, and which is the newest.
-
-
 Flags = NDArray[np.bool_]
 
-_ROUNDING = 1e-9
+_ROUNDING = 1e-9  # share of a limit, or of a step; less is rounding
 
 
-def known(link: LinkConfig, dt_s: float, chances: Array) -> Counts:
-    """Return the first step that knows the position of each step; T or more for those that no step does.
+def compute_known_steps(link: LinkConfig, dt_s: float, draws: Array) -> Counts:
+    """Return the first step that knows the position of each step; T or more where none does.
 
     One position is captured a step; the first one is known at once, as in the paper. As in the design, the age counts
-    whole steps: where every delay is below Δt, a position is known in its own step; else one that is under way for
-    up to i Δt is known i steps later.
+    whole steps: where every delay is below Δt, a position is known in its own step; else one with a delay of up to
+    i Δt is known i steps later.
 
     Args:
         link: The link; losses of every model, delay, jitter and blackouts act.
         dt_s: Δt [s].
-        chances: Uniform draws (N, T+1, 3), see `Chances.link`.
+        draws: Uniform draws (N, T+1, 3), see `RandomDraws.link`.
 
     Returns:
         Steps (N, T).
     """
-    steps = chances.shape[1] - 1
-    lost = _lost(link, dt_s, chances[:, :steps])
-    under_way_s = link.delay_s + link.jitter_s * chances[:, :steps, 2]
+    steps = draws.shape[1] - 1
+    lost = _find_losses(link, dt_s, draws[:, :steps])
+    under_way_s = link.delay_s + link.jitter_s * draws[:, :steps, 2]
     longest_s = link.delay_s + link.jitter_s
     if link.model == "trace":
-        under_way_s = _traced(link, chances[:, :steps])
+        under_way_s = _get_trace_delays(link, draws[:, :steps])
         lost |= np.isinf(under_way_s)
         under_way_s[lost] = 0.0
         longest_s = max(filter(math.isfinite, link.trace_s))
-    within = longest_s < dt_s
-    late = np.zeros(lost.shape, np.intp) if within else np.ceil(under_way_s / dt_s - _ROUNDING).astype(np.intp)
-    first = np.where(lost, steps, np.arange(steps) + late)
+    is_within_step = longest_s < dt_s
+    delay_steps = (
+        np.zeros(lost.shape, np.intp) if is_within_step else np.ceil(under_way_s / dt_s - _ROUNDING).astype(np.intp)
+    )
+    first = np.where(lost, steps, np.arange(steps) + delay_steps)
     first[:, 0] = 0
     return first
 
 
-def newest(link: LinkConfig, dt_s: float, chances: Array) -> Counts:
+def compute_newest_captures(link: LinkConfig, dt_s: float, draws: Array) -> Counts:
     """Return the capture step (N, T) of the newest position known at the beginning of each step; see `known`."""
-    return newest_of(known(link, dt_s, chances))
+    return select_newest_captures(compute_known_steps(link, dt_s, draws))
 
 
-def newest_of(known: Counts) -> Counts:
+def select_newest_captures(known_steps: Counts) -> Counts:
     """Return the capture step (N, T) of the newest position, from the first step (N, T) that knows each one."""
-    steps = known.shape[1]
-    found = np.zeros(known.shape, dtype=np.intp)
-    runs = np.arange(known.shape[0])
+    steps = known_steps.shape[1]
+    captures = np.zeros(known_steps.shape, dtype=np.intp)
+    runs = np.arange(known_steps.shape[0])
     for step in range(steps):
-        first = known[:, step]
-        (there,) = np.nonzero(first < steps)
-        found[runs[there], first[there]] = np.maximum(found[runs[there], first[there]], step)
-    return np.maximum.accumulate(found, axis=1)
+        first = known_steps[:, step]
+        (known_runs,) = np.nonzero(first < steps)
+        captures[runs[known_runs], first[known_runs]] = np.maximum(captures[runs[known_runs], first[known_runs]], step)
+    return np.maximum.accumulate(captures, axis=1)
 
 
-def _traced(link: LinkConfig, chances: Array) -> Array:
+def _get_trace_delays(link: LinkConfig, draws: Array) -> Array:
     """Return the delay of each position (N, T) in the trace [s], infinite if lost; each run has its own start in it."""
     trace = np.array(link.trace_s)
-    first = (chances[:, 0, 0] * len(trace)).astype(np.intp)
-    index = (first[:, np.newaxis] + np.arange(chances.shape[1])) % len(trace)
+    first = (draws[:, 0, 0] * len(trace)).astype(np.intp)
+    index = (first[:, np.newaxis] + np.arange(draws.shape[1])) % len(trace)
     return np.asarray(trace[index], dtype=np.float64)
 
 
-def _lost(link: LinkConfig, dt_s: float, chances: Array) -> Flags:
+def _find_losses(link: LinkConfig, dt_s: float, draws: Array) -> Flags:
     """Return which positions (N, T) never arrive."""
-    steps = chances.shape[1]
+    steps = draws.shape[1]
     at_s = np.arange(steps) * dt_s
-    dark = np.any([(begin <= at_s) & (at_s <= end) for begin, end in link.blackout] or [np.zeros(steps, bool)], axis=0)
+    is_blackout = np.any(
+        [(begin <= at_s) & (at_s <= end) for begin, end in link.blackout] or [np.zeros(steps, bool)], axis=0
+    )
     if link.model == "gilbert-elliott":
-        lost = _bursts(link, chances)
+        is_lost = _draw_burst_losses(link, draws)
     elif link.model == "empirical":
-        lost = _gaps(link, chances)
+        is_lost = _draw_gap_losses(link, draws)
     elif link.model == "trace":
-        lost = np.zeros(chances.shape[:2], dtype=np.bool_)
+        is_lost = np.zeros(draws.shape[:2], dtype=np.bool_)
     elif link.probability:
-        arrives = np.array(link.probability)[np.minimum(np.arange(steps), len(link.probability) - 1)]
-        lost = chances[:, :, 1] >= arrives
+        arrival_chances = np.array(link.probability)[np.minimum(np.arange(steps), len(link.probability) - 1)]
+        is_lost = draws[:, :, 1] >= arrival_chances
     else:
-        lost = chances[:, :, 1] < link.loss
-    return np.asarray(lost | dark, dtype=np.bool_)
+        is_lost = draws[:, :, 1] < link.loss
+    return np.asarray(is_lost | is_blackout, dtype=np.bool_)
 
 
-def _bursts(link: LinkConfig, chances: Array) -> Flags:
+def _draw_burst_losses(link: LinkConfig, draws: Array) -> Flags:
     """Return losses of a Gilbert-Elliott channel: good before the first packet, a step of the chain before each."""
-    lost = np.zeros(chances.shape[:2], dtype=np.bool_)
-    bad = np.zeros(chances.shape[0], dtype=np.bool_)
-    for k in range(chances.shape[1]):
-        step, draw = chances[:, k, 0], chances[:, k, 1]
-        bad = np.where(bad, step >= link.burst_leave, step < link.burst_enter)
-        lost[:, k] = draw < np.where(bad, link.burst_loss, link.loss)
-    return lost
+    is_lost = np.zeros(draws.shape[:2], dtype=np.bool_)
+    is_bad = np.zeros(draws.shape[0], dtype=np.bool_)
+    for k in range(draws.shape[1]):
+        state_draws, loss_draws = draws[:, k, 0], draws[:, k, 1]
+        is_bad = np.where(is_bad, state_draws >= link.burst_leave, state_draws < link.burst_enter)
+        is_lost[:, k] = loss_draws < np.where(is_bad, link.burst_loss, link.loss)
+    return is_lost
 
 
-def _gaps(link: LinkConfig, chances: Array) -> Flags:
+def _draw_gap_losses(link: LinkConfig, draws: Array) -> Flags:
     """Return runs of losses as measured: one is drawn before the first packet, and after each that arrives."""
-    runs = np.cumsum(link.gaps)
-    lost = np.zeros(chances.shape[:2], dtype=np.bool_)
-    to_lose = np.full(chances.shape[0], -1, dtype=np.intp)
-    for k in range(chances.shape[1]):
-        drawn = np.searchsorted(runs, chances[:, k, 0] * runs[-1], side="right")
-        to_lose = np.where(to_lose < 0, drawn, to_lose) - 1
-        lost[:, k] = to_lose >= 0
-    return lost
-
-
-# What controllers know where positions alone are measured: the flight's filter, for many runs in step.
+    cumulated = np.cumsum(link.gaps)
+    is_lost = np.zeros(draws.shape[:2], dtype=np.bool_)
+    remaining_losses = np.full(draws.shape[0], -1, dtype=np.intp)
+    for k in range(draws.shape[1]):
+        drawn = np.searchsorted(cumulated, draws[:, k, 0] * cumulated[-1], side="right")
+        remaining_losses = np.where(remaining_losses < 0, drawn, remaining_losses) - 1
+        is_lost[:, k] = remaining_losses >= 0
+    return is_lost
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,88 +171,84 @@ class PositionFilter:
     """Kalman filter of N runs, one position a step, in whatever order they come.
 
     A position is captured where a step begins. There the flight's filter (`uavctl.flight.kalman`) has drawn its
-    disturbance anew, so that of its z = (x, w) nothing but x is carried on, and a step of it is A, B and E W E'. The
-    first position shows itself, and the other states begin with zero and `initial_std`. After a late one the steps
-    since its capture are filtered again: the numbers are the same as if all had come in order.
+    new disturbance, so only x of its z = (x, w) is kept, and one step is x := A x + B u with noise E W E'. The first
+    position initialises its own states; the other states begin with zero and `initial_std`. After a delayed position
+    the steps since its capture are filtered again, so the result is the same as if all had arrived in order.
 
     Args:
-        sight: Plant and noise assumed of the positions.
-        known: Step (N, T) that knows the position of each step first, T or more where none does; the first position of
-            all is known at once.
+        belief: Plant and noise assumed of the positions.
+        known_steps: First step (N, T) that knows the position of each step, T or more where none does; the position of
+            step 0 is known at once.
     """
 
-    def __init__(self, sight: FilterBelief, known: Counts) -> None:
-        plant = sight.plant
-        runs, steps = known.shape
-        self._plant, self._known = plant, known
+    def __init__(self, belief: FilterBelief, known_steps: Counts) -> None:
+        plant = belief.plant
+        runs, steps = known_steps.shape
+        self._plant, self._known_steps = plant, known_steps
         self._noise = plant.e @ plant.w @ plant.e.T
         self._index = list(plant.position_index)
-        self._shown = np.eye(len(self._index)) * sight.position_std_m**2
-        self._latest = int((known - np.arange(steps))[known < steps].max(initial=0))
-        mean, cov = np.zeros((runs, plant.n_x)), np.tile(np.eye(plant.n_x) * sight.initial_std**2, (runs, 1, 1))
+        self._position_cov = np.eye(len(self._index)) * belief.position_std_m**2
+        self._max_delay_steps = int((known_steps - np.arange(steps))[known_steps < steps].max(initial=0))
+        mean, cov = np.zeros((runs, plant.n_x)), np.tile(np.eye(plant.n_x) * belief.initial_std**2, (runs, 1, 1))
         self._before = {0: (mean, cov)}  # of a step, without its own position
         self._after = mean, cov  # of the newest step, with it
         self._positions: dict[int, Array] = {}
         self._mean, self._cov = mean.copy(), cov.copy()
 
-    def told(self, step: int, positions: Array, newest: Counts, inputs: Array) -> tuple[Array, Array]:
-        """Return the state (N, n_x) at the capture of the newest position known, and its covariance.
+    def update(self, step: int, positions: Array, newest_captures: Counts, inputs: Array) -> tuple[Array, Array]:
+        """Take the positions of a step; return the state (N, n_x) at the newest known capture, and its covariance.
 
         Args:
-            step: The step that begins; called for 0, 1, … in turn.
-            positions: The positions (N, n_axes) that are captured now, whether they come or not.
-            newest: Capture step (N,) of the newest position known.
+            step: Number of the step; call for 0, 1, … in turn.
+            positions: Positions (N, n_axes) captured now, also those that never arrive.
+            newest_captures: Capture step (N,) of the newest position known.
             inputs: Inputs (N, step, n_u) that have acted.
         """
         self._positions[step] = positions
         if step:
-            self._before[step] = self._moved(*self._after, inputs[:, step - 1])
-        (come,) = np.nonzero((self._known[:, : step + 1] == step).any(axis=0))
-        for past in range(int(come[0]) if come.size else step, step + 1):
-            mean, cov = self._after = self._seen(past, step)
-            own = newest == past
-            self._mean[own], self._cov[own] = mean[own], cov[own]
-            if past < step:
-                self._before[past + 1] = self._moved(mean, cov, inputs[:, past])
-        for past in [one for one in self._before if one < step - self._latest]:
-            del self._before[past], self._positions[past]
+            self._before[step] = self._predict(*self._after, inputs[:, step - 1])
+        (arrived,) = np.nonzero((self._known_steps[:, : step + 1] == step).any(axis=0))
+        for capture in range(int(arrived[0]) if arrived.size else step, step + 1):
+            mean, cov = self._after = self._correct(capture, step)
+            is_newest = newest_captures == capture
+            self._mean[is_newest], self._cov[is_newest] = mean[is_newest], cov[is_newest]
+            if capture < step:
+                self._before[capture + 1] = self._predict(mean, cov, inputs[:, capture])
+        for capture in [step_before for step_before in self._before if step_before < step - self._max_delay_steps]:
+            del self._before[capture], self._positions[capture]
         return self._mean.copy(), self._cov.copy()
 
-    def _moved(self, mean: Array, cov: Array, u: Array) -> tuple[Array, Array]:
-        """Move beliefs on by a step, under the inputs (N, n_u)."""
+    def _predict(self, mean: Array, cov: Array, u: Array) -> tuple[Array, Array]:
+        """Predict states and covariances one step ahead, under the inputs (N, n_u)."""
         plant = self._plant
         return mean @ plant.a.T + u @ plant.b.T, plant.a @ cov @ plant.a.T + self._noise
 
-    def _seen(self, past: int, step: int) -> tuple[Array, Array]:
-        """Return the belief of a step by its own position too, in the runs that know it in `step`."""
-        mean, cov = (one.copy() for one in self._before[past])
+    def _correct(self, capture: int, step: int) -> tuple[Array, Array]:
+        """Correct the belief of step `capture` by its position, in the runs that know it in `step`."""
+        mean, cov = (array.copy() for array in self._before[capture])
         index = self._index
-        if not past:
+        if not capture:
             mean[:, index] = self._positions[0]
-            cov[np.ix_(range(len(cov)), index, index)] = self._shown
+            cov[np.ix_(range(len(cov)), index, index)] = self._position_cov
             return mean, cov
-        (who,) = np.nonzero(self._known[:, past] <= step)
-        held = cov[who]
-        ph = held[:, :, index]
-        gain = np.linalg.solve(ph[:, index] + self._shown, ph.transpose(0, 2, 1)).transpose(0, 2, 1)
-        off = self._positions[past][who] - mean[who][:, index]
-        keep = np.tile(np.eye(mean.shape[1]), (who.size, 1, 1))
-        keep[:, :, index] -= gain
-        mean[who] += (gain @ off[:, :, None])[:, :, 0]
-        # Joseph's form: symmetric and positive semidefinite whatever rounding does.
-        cov[who] = keep @ held @ keep.transpose(0, 2, 1) + gain @ self._shown @ gain.transpose(0, 2, 1)
+        (updated_runs,) = np.nonzero(self._known_steps[:, capture] <= step)
+        prior_cov = cov[updated_runs]
+        ph = prior_cov[:, :, index]
+        gain = np.linalg.solve(ph[:, index] + self._position_cov, ph.transpose(0, 2, 1)).transpose(0, 2, 1)
+        innovation = self._positions[capture][updated_runs] - mean[updated_runs][:, index]
+        complement = np.tile(np.eye(mean.shape[1]), (updated_runs.size, 1, 1))
+        complement[:, :, index] -= gain
+        mean[updated_runs] += (gain @ innovation[:, :, None])[:, :, 0]
+        # Joseph's form, P := (I - K H) P (I - K H)' + K R K': symmetric and positive semidefinite in spite of rounding.
+        cov[updated_runs] = complement @ prior_cov @ complement.transpose(
+            0, 2, 1
+        ) + gain @ self._position_cov @ gain.transpose(0, 2, 1)
         return mean, cov
 
 
-# The linear world of a campaign: N runs in step, one controller, in memory.
-
-
-# Beyond a limit by less than this share of it is rounding.
-
-
 @dataclass(frozen=True, eq=False)
-class Scene:
-    """Plant that is flown, and the limits and costs by which it is judged."""
+class LinearWorld:
+    """Plant that is flown, and the limits and costs by which runs are judged."""
 
     plant: Plant  # the plant that flies; the controllers may believe in another one
     state_set: Polytope  # X
@@ -265,12 +261,12 @@ class Scene:
 
 
 @dataclass(frozen=True, eq=False)
-class Flown:
+class Trajectories:
     """Trajectories of N runs of T steps."""
 
     states: Array  # (N, T+1, n_x)
     inputs: Array  # inputs that acted (N, T, n_u), within the limits
-    asked: Array  # inputs that the controller asked for (N, T, n_u)
+    requested: Array  # inputs that the controller asked for (N, T, n_u)
     age: Counts  # age of information (N, T)
     cost: Array  # stage costs (N, T): (x - x_target)'Q_x(…) + (u - u_target)'Q_u(…) of each step
     state_violated: Flags  # whether x(1) … x(T) left X (N, T)
@@ -286,54 +282,56 @@ class MeasuredPositions:
     noise: Array  # noise of the positions (N, T, n_axes) [m]
 
 
-def fly(
-    scene: Scene,
+def simulate(
+    world: LinearWorld,
     controller: BatchController,
-    newest: Counts,
+    newest_captures: Counts,
     disturbances: Array,
-    seen: MeasuredPositions | None = None,
-) -> Flown:
-    """Fly all runs at once.
+    measured: MeasuredPositions | None = None,
+) -> Trajectories:
+    """Simulate all runs at once.
 
     Args:
-        newest: Capture step of the newest position known in each step (N, T), see `links.newest`.
+        newest_captures: Capture step of the newest position known in each step (N, T).
         disturbances: w (N, T, n_w).
-        seen: Filter and noise of measured positions; None: the controller knows the exact state.
+        measured: Filter and noise of measured positions; None: the controller knows the exact state.
     """
-    plant, (runs, steps) = scene.plant, newest.shape
+    plant, (runs, steps) = world.plant, newest_captures.shape
     states, inputs = np.zeros((runs, steps + 1, plant.n_x)), np.zeros((runs, steps, plant.n_u))
-    asked = np.zeros_like(inputs)
-    states[:, 0] = scene.start
+    requested = np.zeros_like(inputs)
+    states[:, 0] = world.start
     failed = np.zeros(runs, dtype=np.bool_)
-    every = np.arange(runs)
-    low, high = scene.input_set.bounds
+    run_indices = np.arange(runs)
+    low, high = world.input_set.bounds
     controller.begin(runs)
-    where = list(plant.position_index)
+    position_index = list(plant.position_index)
     for k in range(steps):
-        if seen is None:
-            state, cov = states[every, newest[:, k]], None
+        if measured is None:
+            state, cov = states[run_indices, newest_captures[:, k]], None
         else:
-            state, cov = seen.filter.told(k, states[:, k, where] + seen.noise[:, k], newest[:, k], inputs[:, :k])
-        news = News(k, newest[:, k], state, inputs[:, :k], cov)
-        wanted = controller.act(news)
-        failed |= ~np.isfinite(wanted).all(axis=1)
-        asked[:, k] = np.where(failed[:, None], 0.0, wanted)
-        inputs[:, k] = np.clip(asked[:, k], low, high)
+            state, cov = measured.filter.update(
+                k, states[:, k, position_index] + measured.noise[:, k], newest_captures[:, k], inputs[:, :k]
+            )
+        measurement = News(k, newest_captures[:, k], state, inputs[:, :k], cov)
+        wanted_inputs = controller.act(measurement)
+        failed |= ~np.isfinite(wanted_inputs).all(axis=1)
+        requested[:, k] = np.where(failed[:, None], 0.0, wanted_inputs)
+        inputs[:, k] = np.clip(requested[:, k], low, high)
         states[:, k + 1] = states[:, k] @ plant.a.T + inputs[:, k] @ plant.b.T + disturbances[:, k] @ plant.e.T
-    x, u = states[:, :-1] - scene.target, inputs - scene.u_target
-    return Flown(
+    x, u = states[:, :-1] - world.target, inputs - world.u_target
+    return Trajectories(
         states=states,
         inputs=inputs,
-        asked=asked,
-        age=np.arange(steps) - newest,
-        cost=np.einsum("nti,ij,ntj->nt", x, scene.q_x, x) + np.einsum("nti,ij,ntj->nt", u, scene.q_u, u),
-        state_violated=_outside(scene.state_set, states[:, 1:]),
-        input_violated=_outside(scene.input_set, asked),
+        requested=requested,
+        age=np.arange(steps) - newest_captures,
+        cost=np.einsum("nti,ij,ntj->nt", x, world.q_x, x) + np.einsum("nti,ij,ntj->nt", u, world.q_u, u),
+        state_violated=_is_outside(world.state_set, states[:, 1:]),
+        input_violated=_is_outside(world.input_set, requested),
         failed=failed,
     )
 
 
-def _outside(limits: Polytope, points: Array) -> Flags:
+def _is_outside(limits: Polytope, points: Array) -> Flags:
     """Return which points (…, n) are outside the set."""
-    room = limits.b * (1.0 + _ROUNDING * np.sign(limits.b)) + _ROUNDING
-    return np.asarray((points @ limits.c.T > room).any(axis=-1), dtype=np.bool_)
+    bounds = limits.b * (1.0 + _ROUNDING * np.sign(limits.b)) + _ROUNDING
+    return np.asarray((points @ limits.c.T > bounds).any(axis=-1), dtype=np.bool_)

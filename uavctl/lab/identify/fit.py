@@ -1,11 +1,14 @@
-"""Fit of a plant to a flight: its parameters, its dead time, and how well it predicts the half it was not fitted to.
+"""Fit of a plant to a flight: its parameters, its dead time, and its prediction errors on held-out halves.
 
-The dead time is where the deviance of the whole flight, summed over the axes, is least. Prediction tells plants apart
-and not dead times: a lag stands in for one with hardly a difference at 0.25 s and more. It is judged by halves, blocks
-in turn so that each has something of every manoeuvre, on the motion of the next 0.25 to 2 s; the figure is the
-geometric mean of the rms errors over these times and the axes, in which each counts alike. For the fit as for the
-judgement the filter goes through the whole flight, and only the innovations in a half, or the motions, count: where it
-began anew in each block, they would tell how it finds the state and little of the plant.
+1. The parameters of an axis maximise the likelihood of the filter's innovations. The search is Fisher scoring with
+   Levenberg-Marquardt damping: the slopes of innovations and variances give gradient and expected curvature at once.
+2. The dead time minimises the deviance of the whole flight, summed over the axes. Prediction errors tell plants apart
+   but not dead times: a lag replaces a dead time with hardly a difference at 0.25 s and more.
+3. Plants are compared on halves of the flight. The halves are alternating blocks, so each has a part of every
+   manoeuvre. The measure is the motion of the next 0.25 to 2 s: the geometric mean of the rms errors over these times
+   and the axes.
+4. The filter always runs over the whole flight; only innovations or motions within a half count. A restart in each
+   block would measure how the filter converges, and little of the plant.
 """
 
 from __future__ import annotations
@@ -20,39 +23,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from logs.report.statistics import autocorrelation
+from uavctl.arrays import Array
 from uavctl.errors import RecordingError
-from uavctl.lab.identify.history import LEAST_SAMPLES, Stretch
+from uavctl.lab.identify.history import MIN_SAMPLES, Stretch
 from uavctl.lab.identify.response import (
-    INSTANT_S,
     OUTLIER,
+    TIME_UNIT_S,
     AxisModel,
     Likelihood,
     Timeline,
-    Tried,
-    advance,
-    filtered,
-    likelihood,
-    places,
-    timeline,
-    values,
+    Trial,
+    compute_likelihood,
+    compute_transition,
+    get_values,
+    make_parameters,
+    make_timeline,
+    run_filter,
 )
 
-# The most likely parameters of an axis, by maximum likelihood of the filter's innovations.
-#
-# The search is Fisher's scoring with Levenberg and Marquardt's damping: what the innovations and their variances
-# change by with each parameter gives the gradient and the expected curvature at once.
-
-
-Array = NDArray[np.float64]
-
 _HESSIAN_STEP = 1e-2
-_STEP = 1e-5  # of the difference quotients: its error and that of rounding move no result by a millionth
+_DIFFERENCE_STEP = 1e-5  # of the difference quotients: truncation and rounding change no result by a millionth
 # Gain of the deviance by one more step, below which the search ends; a standard error is a gain of 1.
-CLOSE, ROUGH = 1e-9, 1e-6
-_MOST_STEPS = 60
-_LONGEST = 1.0  # step of a parameter; of a logarithm, a factor of e
-_NEAR = 0.1  # where the gradient is about linear
-_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-4, 1e6
+TOLERANCE, ROUGH_TOLERANCE = 1e-9, 1e-6
+_MAX_STEPS = 60
+_MAX_STEP = 1.0  # largest change of a parameter; for a logarithm, a factor of e
+_LINEAR_RANGE = 0.1  # within this step the gradient is about linear
+_DAMPING, _MIN_DAMPING, _MAX_DAMPING = 1e-2, 1e-4, 1e6
 
 
 @dataclass(frozen=True)
@@ -61,12 +57,12 @@ class AxisFit:
 
     model: AxisModel  # the plant
     dead_time_s: float  # d [s]
-    parameters: tuple[float, ...]  # what was fitted, as `axis_model.places` has it
+    parameters: tuple[float, ...]  # on the scale of the search, see `make_parameters`
     deviance: float  # -2 log likelihood, up to a constant
 
     def value(self, name: str) -> float:
         """Return a fitted value by its name."""
-        return values(self.model, self.parameters)[name]
+        return get_values(self.model, self.parameters)[name]
 
 
 def fit_axes(
@@ -75,60 +71,74 @@ def fit_axes(
     models: Sequence[AxisModel],
     dead_time_s: float,
     starts: Sequence[Sequence[float] | None],
-    close: float = CLOSE,
+    tolerance: float = TOLERANCE,
 ) -> tuple[AxisFit, ...]:
-    """Fit some axes with a given dead time, each by itself, in as many passes as the slowest of them needs.
+    """Fit some axes with a given dead time, independently, in as many passes as the slowest search needs.
 
     Args:
         axes: 0 north, 1 east, 2 down.
         models: The plant of each axis, all of one kind.
         dead_time_s: d [s].
-        starts: Parameter vector of each axis to begin with; None is where the model says, and the best of these.
-        close: Gain of the deviance by one more step, below which a search ends.
+        starts: Parameter vector of each axis to begin with; None: the model's starts, and the best result of these.
+        tolerance: Gain of the deviance by one more step, below which a search ends.
     """
-    parts = [timeline(stretch, axes, dead_time_s) for stretch in flown]
-    begins = [
-        (place, np.array(begin))
-        for place, (model, start) in enumerate(zip(models, starts, strict=True))
-        for begin in ([places(model, one) for one in model.starts] if start is None else [start])
+    parts = [make_timeline(stretch, axes, dead_time_s) for stretch in flown]
+    starting_points = [
+        (axis_index, np.array(vector))
+        for axis_index, (model, start) in enumerate(zip(models, starts, strict=True))
+        for vector in (
+            [make_parameters(model, start_values) for start_values in model.starts] if start is None else [start]
+        )
     ]
-    searches = [_search(x, models[place], close) for place, x in begins]
-    asked = {i: next(search) for i, search in enumerate(searches)}
-    ends: dict[int, tuple[Array, float]] = {}
-    while asked:
-        slopes = _slopes(parts, [(begins[i][0], models[begins[i][0]], x) for i, x in asked.items()])
-        for i, slope in zip(list(asked), slopes, strict=True):
+    searches = [_search_minimum(x, models[axis_index], tolerance) for axis_index, x in starting_points]
+    requested = {i: next(search) for i, search in enumerate(searches)}
+    results: dict[int, tuple[Array, float]] = {}
+    while requested:
+        slopes = _compute_slopes(
+            parts, [(starting_points[i][0], models[starting_points[i][0]], x) for i, x in requested.items()]
+        )
+        for i, slope in zip(list(requested), slopes, strict=True):
             try:
-                asked[i] = searches[i].send(slope)
+                requested[i] = searches[i].send(slope)
             except StopIteration as end:
-                ends[i] = end.value
-                del asked[i]
-    found = []
-    for place, model in enumerate(models):
-        x, least = min((ends[i] for i, (at, _) in enumerate(begins) if at == place), key=lambda one: one[1])
-        found.append(AxisFit(model, dead_time_s, tuple(x.tolist()), least))
-    return tuple(found)
+                results[i] = end.value
+                del requested[i]
+    fits = []
+    for axis_index, model in enumerate(models):
+        x, least = min(
+            (results[i] for i, (index, _) in enumerate(starting_points) if index == axis_index),
+            key=lambda start_values: start_values[1],
+        )
+        fits.append(AxisFit(model, dead_time_s, tuple(x.tolist()), least))
+    return tuple(fits)
 
 
-def standard_errors(flown: Sequence[Stretch], axis: int, fit: AxisFit) -> dict[str, float]:
+def compute_standard_errors(flown: Sequence[Stretch], axis: int, fit: AxisFit) -> dict[str, float]:
     """Return the standard error of each fitted value with the dead time given, by the curvature at the optimum.
 
-    Infinite where the flight tells nothing, or where the value is at its bound.
+    Infinite where the flight does not determine the value, or where the value is at its bound.
     """
-    parts = [timeline(stretch, (axis,), fit.dead_time_s) for stretch in flown]
+    parts = [make_timeline(stretch, (axis,), fit.dead_time_s) for stretch in flown]
     x = np.array(fit.parameters)
-    moves = _HESSIAN_STEP * np.eye(len(x))
-    slopes = _slopes(parts, [(0, fit.model, at) for at in (*(x + moves), *(x - moves))])
-    up, down = slopes[: len(x)], slopes[len(x) :]
-    rows = [(above.gradient - below.gradient) / (2.0 * _HESSIAN_STEP) for above, below in zip(up, down, strict=True)]
+    offsets = _HESSIAN_STEP * np.eye(len(x))
+    slopes = _compute_slopes(parts, [(0, fit.model, x_moved) for x_moved in (*(x + offsets), *(x - offsets))])
+    forward, backward = slopes[: len(x)], slopes[len(x) :]
+    rows = [
+        (plus.gradient - minus.gradient) / (2.0 * _HESSIAN_STEP) for plus, minus in zip(forward, backward, strict=True)
+    ]
     curvature = (np.array(rows) + np.array(rows).T) / 4.0  # of the log likelihood: half the deviance's
-    free = np.diag(curvature) > 0.0  # what is at its bound may go on falling beyond
+    is_free = np.diag(curvature) > 0.0  # false at a bound, beyond which the deviance may fall further
     variances = np.full(len(x), np.inf)
     with suppress(np.linalg.LinAlgError):
-        variances[free] = np.diag(np.linalg.inv(curvature[np.ix_(free, free)]))
-    spread = np.sqrt(np.where(variances > 0.0, variances, np.inf))
-    scale = [one.outside(place) if one.logarithmic else 1.0 for one, place in zip(fit.model.free, x, strict=True)]
-    return {one.name: float(s * size) for one, s, size in zip(fit.model.free, spread, scale, strict=True)}
+        variances[is_free] = np.diag(np.linalg.inv(curvature[np.ix_(is_free, is_free)]))
+    stds = np.sqrt(np.where(variances > 0.0, variances, np.inf))
+    scales = [
+        parameter.from_search_scale(scaled) if parameter.logarithmic else 1.0
+        for parameter, scaled in zip(fit.model.free, x, strict=True)
+    ]
+    return {
+        parameter.name: float(std * factor) for parameter, std, factor in zip(fit.model.free, stds, scales, strict=True)
+    }
 
 
 class _Slope(NamedTuple):
@@ -139,80 +149,93 @@ class _Slope(NamedTuple):
     curvature: Array
 
 
-def _search(x: Array, model: AxisModel, close: float) -> Generator[Array, _Slope, tuple[Array, float]]:
-    """Search the least deviance by damped Newton steps: yield parameter vectors, take their slopes."""
-    least, most = np.array([(one.inside(one.least), one.inside(one.most)) for one in model.free]).T
-    now, damping = (yield x), _DAMPING
-    for _ in range(_MOST_STEPS):
-        free = ~(((x <= least) & (now.gradient > 0.0)) | ((x >= most) & (now.gradient < 0.0)))
-        free &= np.diag(now.curvature) > 0.0  # what tells nothing stays
-        gradient, curvature = now.gradient[free], now.curvature[np.ix_(free, free)]
-        if not free.any() or gradient @ _damped(curvature, gradient, _LEAST_DAMPING) < 2.0 * close:
+def _search_minimum(x: Array, model: AxisModel, tolerance: float) -> Generator[Array, _Slope, tuple[Array, float]]:
+    """Minimise the deviance by damped Newton steps: yield parameter vectors, receive their slopes."""
+    lower, upper = np.array(
+        [
+            (parameter.to_search_scale(parameter.lower), parameter.to_search_scale(parameter.upper))
+            for parameter in model.free
+        ]
+    ).T
+    current, damping = (yield x), _DAMPING
+    for _ in range(_MAX_STEPS):
+        is_free = ~(((x <= lower) & (current.gradient > 0.0)) | ((x >= upper) & (current.gradient < 0.0)))
+        is_free &= np.diag(current.curvature) > 0.0  # a parameter without effect stays unchanged
+        gradient, curvature = current.gradient[is_free], current.curvature[np.ix_(is_free, is_free)]
+        if not is_free.any() or gradient @ _compute_damped_step(curvature, gradient, _MIN_DAMPING) < 2.0 * tolerance:
             break
-        while damping < _MOST_DAMPING:
+        while damping < _MAX_DAMPING:
             step = np.zeros(len(x))
-            step[free] = -_damped(curvature, gradient, damping)
-            trial = np.clip(x + np.clip(step, -_LONGEST, _LONGEST), least, most)
-            then = yield trial
-            if then.deviance < now.deviance:
+            step[is_free] = -_compute_damped_step(curvature, gradient, damping)
+            trial = np.clip(x + np.clip(step, -_MAX_STEP, _MAX_STEP), lower, upper)
+            next_slope = yield trial
+            if next_slope.deviance < current.deviance:
                 break
             damping *= 10.0
         else:
             break
-        corrected = _corrected(then.curvature, trial - x, then.gradient - now.gradient)
-        x, now, damping = trial, then._replace(curvature=corrected), max(0.1 * damping, _LEAST_DAMPING)
-    return x, now.deviance
+        corrected = _correct_curvature(next_slope.curvature, trial - x, next_slope.gradient - current.gradient)
+        x, current, damping = trial, next_slope._replace(curvature=corrected), max(0.1 * damping, _MIN_DAMPING)
+    return x, current.deviance
 
 
-def _damped(curvature: Array, gradient: Array, damping: float) -> Array:
-    """Return the Newton step uphill, shorter the more it is damped."""
+def _compute_damped_step(curvature: Array, gradient: Array, damping: float) -> Array:
+    """Return the damped Newton step uphill."""
     return np.asarray(np.linalg.solve(curvature + damping * np.diag(np.diag(curvature)), gradient), dtype=np.float64)
 
 
-def _corrected(curvature: Array, step: Array, change: Array) -> Array:
-    """Return the expected curvature, corrected by how the gradient changed along a step (BFGS)."""
-    bent = curvature @ step
-    if step @ change <= 0.0 or np.abs(step).max() > _NEAR:
+def _correct_curvature(curvature: Array, step: Array, change: Array) -> Array:
+    """Return the expected curvature, corrected by the change of the gradient along a step (BFGS)."""
+    # H := H - H s (H s)' / (s' H s) + y y' / (s' y), with step s and change y of the gradient
+    curvature_step = curvature @ step
+    if step @ change <= 0.0 or np.abs(step).max() > _LINEAR_RANGE:
         return curvature
     return np.asarray(
-        curvature - np.outer(bent, bent) / (step @ bent) + np.outer(change, change) / (step @ change), dtype=np.float64
+        curvature
+        - np.outer(curvature_step, curvature_step) / (step @ curvature_step)
+        + np.outer(change, change) / (step @ change),
+        dtype=np.float64,
     )
 
 
-def _slopes(parts: Sequence[Timeline], asked: Sequence[tuple[int, AxisModel, Array]]) -> list[_Slope]:
+def _compute_slopes(parts: Sequence[Timeline], points: Sequence[tuple[int, AxisModel, Array]]) -> list[_Slope]:
     """Return the slope at each of some (place of the axis, plant, parameter vector), all in one pass."""
-    tried = [Tried(place, model, np.vstack([x, x + _STEP * np.eye(len(x))])) for place, model, x in asked]
-    return [_slope(one) for one in likelihood(parts, tried)]
+    trials = [
+        Trial(axis_index, model, np.vstack([x, x + _DIFFERENCE_STEP * np.eye(len(x))]))
+        for axis_index, model, x in points
+    ]
+    return [_compute_slope(result) for result in compute_likelihood(parts, trials)]
 
 
-def _slope(found: Likelihood) -> _Slope:
+def _compute_slope(result: Likelihood) -> _Slope:
     """Return the slope by finite differences of the other parameter vectors from the first."""
-    std = np.sqrt(found.variances_m2[:, 0])
-    pulls = (found.innovations_m[:, 1:] - found.innovations_m[:, :1]) / (_STEP * std[:, None])
-    pulls[np.abs(found.innovations_m[:, 0]) > OUTLIER * std] = 0.0  # an outlier pulls the same wherever it is
-    swells = (found.variances_m2[:, 1:] - found.variances_m2[:, :1]) / (_STEP * std[:, None] ** 2)
-    curvature = 2.0 * pulls.T @ pulls + swells.T @ swells
-    # The difference goes up by the gradient and by half a step of the curvature.
-    gradient = (found.deviances[1:] - found.deviances[0]) / _STEP - 0.5 * _STEP * np.diag(curvature)
-    return _Slope(float(found.deviances[0]), gradient, curvature)
-
-
-# How well a fitted response predicts: what one step leaves unexplained, and the motion of the next seconds.
+    std = np.sqrt(result.variances_m2[:, 0])
+    innovation_slopes = (result.innovations_m[:, 1:] - result.innovations_m[:, :1]) / (_DIFFERENCE_STEP * std[:, None])
+    innovation_slopes[np.abs(result.innovations_m[:, 0]) > OUTLIER * std] = (
+        0.0  # the slope of an outlier's Huber loss is constant
+    )
+    variance_slopes = (result.variances_m2[:, 1:] - result.variances_m2[:, :1]) / (_DIFFERENCE_STEP * std[:, None] ** 2)
+    curvature = 2.0 * innovation_slopes.T @ innovation_slopes + variance_slopes.T @ variance_slopes
+    # f(x + h) - f(x) = h g + h² H / 2
+    gradient = (result.deviances[1:] - result.deviances[0]) / _DIFFERENCE_STEP - 0.5 * _DIFFERENCE_STEP * np.diag(
+        curvature
+    )
+    return _Slope(float(result.deviances[0]), gradient, curvature)
 
 
 AHEAD_S = (0.25, 0.5, 1.0, 2.0)
-SHOWN_S = 1.0
+R2_AHEAD_S = 1.0
 LAGS = 20
-_SETTLED = 4.0  # where a stretch begins, the filter does not know the velocity yet
+_SETTLED_RATIO = 4.0  # over the median standard deviation; larger where a stretch begins, before the velocity is known
 
 
 @dataclass(frozen=True, eq=False)
-class Ahead:
-    """Motion from each position to the first one at least a given time later."""
+class MotionAhead:
+    """Motion from each position to the first one at least a given time later, flown and predicted."""
 
     times_s: Array  # (k,), where it begins [s]
-    moved_m: Array  # (k,), how far the vehicle went [m]
-    predicted_m: Array  # (k,), how far it was predicted to go [m]
+    moved_m: Array  # (k,), flown motion [m]
+    predicted_m: Array  # (k,), predicted motion [m]
 
     @property
     def errors_m(self) -> Array:
@@ -227,8 +250,8 @@ class Prediction:
     times_s: Array  # (m,), of the positions [s]
     innovations_m: Array  # (m,), position minus its prediction from the one before [m]
     stds_m: Array  # (m,), standard deviation that the fit gives them [m]
-    moved_m: Array  # (k,), how far the vehicle went in the next `SHOWN_S` [m]
-    predicted_m: Array  # (k,), how far it was predicted to go [m]
+    moved_m: Array  # (k,), flown motion of the next `R2_AHEAD_S` [m]
+    predicted_m: Array  # (k,), predicted motion of that time [m]
     correlation: Array  # (LAGS,), of innovations one, two ... positions apart.
 
     @property
@@ -247,71 +270,73 @@ def predict(flown: Sequence[Stretch], axis: int, fit: AxisFit) -> Prediction:
     """Predict each position of a flight from the ones before it."""
     times, innovations, stds = [], [], []
     for stretch in flown:
-        cut = timeline(stretch, (axis,), fit.dead_time_s)
-        one = filtered(cut, fit.model, np.array(fit.parameters))
-        times.append(stretch.times_s[0] + cut.captured[1:] * INSTANT_S)
-        innovations.append(one.innovations_m[1:])  # the first one's is nothing but its distance from zero
-        stds.append(one.stds_m[1:])
-    known = np.concatenate(stds)
-    settled = known < _SETTLED * np.median(known)
-    left = np.concatenate(innovations)[settled]
-    (second,) = predict_ahead(flown, axis, fit, (SHOWN_S,))
+        axis_timeline = make_timeline(stretch, (axis,), fit.dead_time_s)
+        result = run_filter(axis_timeline, fit.model, np.array(fit.parameters))
+        times.append(stretch.times_s[0] + axis_timeline.captured[1:] * TIME_UNIT_S)
+        innovations.append(result.innovations_m[1:])  # without the first, which is only its distance from zero
+        stds.append(result.stds_m[1:])
+    all_stds = np.concatenate(stds)
+    is_settled = all_stds < _SETTLED_RATIO * np.median(all_stds)
+    residuals = np.concatenate(innovations)[is_settled]
+    (ahead,) = predict_ahead(flown, axis, fit, (R2_AHEAD_S,))
     return Prediction(
-        times_s=np.concatenate(times)[settled],
-        innovations_m=left,
-        stds_m=known[settled],
-        moved_m=second.moved_m,
-        predicted_m=second.predicted_m,
-        correlation=autocorrelation(left / known[settled], min(LAGS, len(left) - 1)),
+        times_s=np.concatenate(times)[is_settled],
+        innovations_m=residuals,
+        stds_m=all_stds[is_settled],
+        moved_m=ahead.moved_m,
+        predicted_m=ahead.predicted_m,
+        correlation=autocorrelation(residuals / all_stds[is_settled], min(LAGS, len(residuals) - 1)),
     )
 
 
 def predict_ahead(
     flown: Sequence[Stretch], axis: int, fit: AxisFit, ahead_s: Sequence[float] = AHEAD_S
-) -> tuple[Ahead, ...]:
+) -> tuple[MotionAhead, ...]:
     """Predict the motion over some times from every position, with the setpoints as they were sent.
 
-    The state there is the filter's, by that position and those before; what follows is known of the setpoints alone.
+    The state at each position is the filter's, from that position and those before; after it only setpoints are known.
     """
-    parts = [_ahead(stretch, axis, fit, ahead_s) for stretch in flown]
+    parts = [_predict_ahead(stretch, axis, fit, ahead_s) for stretch in flown]
     return tuple(
-        Ahead(*(np.concatenate([getattr(part[i], key) for part in parts]) for key in Ahead.__dataclass_fields__))
+        MotionAhead(
+            *(np.concatenate([getattr(part[i], key) for part in parts]) for key in MotionAhead.__dataclass_fields__)
+        )
         for i in range(len(ahead_s))
     )
 
 
-def _ahead(stretch: Stretch, axis: int, fit: AxisFit, ahead_s: Sequence[float]) -> list[Ahead]:
-    cut = timeline(stretch, (axis,), fit.dead_time_s)
+def _predict_ahead(stretch: Stretch, axis: int, fit: AxisFit, ahead_s: Sequence[float]) -> list[MotionAhead]:
+    axis_timeline = make_timeline(stretch, (axis,), fit.dead_time_s)
     parameters = np.array(fit.parameters)
-    one = filtered(cut, fit.model, parameters)
+    result = run_filter(axis_timeline, fit.model, parameters)
     motion = fit.model.motion(parameters[None])
-    captured = cut.captured
-    settled = one.stds_m < _SETTLED * np.median(one.stds_m)
-    found = []
+    captured = axis_timeline.captured
+    is_settled = result.stds_m < _SETTLED_RATIO * np.median(result.stds_m)
+    predictions = []
     for time_s in ahead_s:
-        later = np.searchsorted(captured, captured + round(time_s / INSTANT_S))
-        begins = np.flatnonzero(settled & (later < len(captured)))
+        later = np.searchsorted(captured, captured + round(time_s / TIME_UNIT_S))
+        begins = np.flatnonzero(is_settled & (later < len(captured)))
         later = later[begins]
-        different, which = np.unique(captured[later] - captured[begins], return_inverse=True)
-        rows = advance(motion, different).move[which, 0, 0]  # of the position
-        predicted = one.driven[later, 0] + np.einsum("kn,kn->k", rows, one.rest[begins])
-        found.append(
-            Ahead(
-                times_s=stretch.times_s[0] + captured[begins] * INSTANT_S,
-                moved_m=cut.positions_m[later, 0] - cut.positions_m[begins, 0],
-                predicted_m=predicted - one.driven[begins, 0] - one.rest[begins, 0],
+        lengths, lengths_index = np.unique(captured[later] - captured[begins], return_inverse=True)
+        rows = compute_transition(motion, lengths).transition[lengths_index, 0, 0]  # of the position
+        predicted = result.driven[later, 0] + np.einsum("kn,kn->k", rows, result.undriven[begins])
+        predictions.append(
+            MotionAhead(
+                times_s=stretch.times_s[0] + captured[begins] * TIME_UNIT_S,
+                moved_m=axis_timeline.positions_m[later, 0] - axis_timeline.positions_m[begins, 0],
+                predicted_m=predicted - result.driven[begins, 0] - result.undriven[begins, 0],
             )
         )
-    return found
+    return predictions
 
 
 COARSE_S = tuple(round(0.04 * i, 2) for i in range(9))
 FINE_S = 0.02
-TRIES = len(COARSE_S) + 3  # the coarse grid, two neighbours of its best, and the halves
-_RISE = 4.0  # of the deviance: two standard errors
+MAX_TRIES = len(COARSE_S) + 3  # the coarse grid, two neighbours of its best, and the halves
+_DEVIANCE_RISE = 4.0  # of the deviance: two standard errors
 BLOCK_S = 8.0
 _GROUP_S = 4.0  # errors nearer to each other in time are not independent
-_CERTAIN = 2.0  # standard errors
+_CONFIDENCE_STDS = 2.0  # standard errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -319,15 +344,15 @@ class HeldOutError:
     """Prediction errors of a plant on the halves that it was not fitted to."""
 
     squares: Array  # sums of squared errors by group of time, axis and time ahead (groups, axes, ahead) [m²]
-    counts: Array  # how many they are, alike
+    counts: Array  # numbers of these errors (groups, axes, ahead)
 
     @property
     def rms_m(self) -> Array:
         """Rms error (axes, ahead) [m]."""
         return np.asarray(np.sqrt(self.squares.sum(axis=0) / np.maximum(self.counts.sum(axis=0), 1.0)))
 
-    def scores(self) -> Array:
-        """Return the logarithm of `error_m` without each group in turn (groups + 1,), and last with all."""
+    def compute_scores(self) -> Array:
+        """Return the logarithm of `error_m` without each group (groups + 1,); the last is with all groups."""
         squares = np.vstack([self.squares.sum(axis=0) - self.squares, self.squares.sum(axis=0)[None]])
         counts = np.vstack([self.counts.sum(axis=0) - self.counts, self.counts.sum(axis=0)[None]])
         return np.asarray(0.5 * np.log(np.maximum(squares, 1e-12) / np.maximum(counts, 1.0)).mean(axis=(1, 2)))
@@ -335,19 +360,19 @@ class HeldOutError:
     @property
     def error_m(self) -> float:
         """Geometric mean of the rms errors [m]."""
-        return float(np.exp(self.scores()[-1]))
+        return float(np.exp(self.compute_scores()[-1]))
 
 
 @dataclass(frozen=True, eq=False)
 class ChosenPlant:
-    """One kind of plant with its likeliest dead time."""
+    """Plant model with its likeliest dead time."""
 
     # Dead times that were tried [s], in order, and the deviance of each above the least
     curve: tuple[tuple[float, float], ...]
     dead_time_s: float  # the one with the least deviance [s]
-    range_s: tuple[float, float]  # where the deviance is less than 4 above it, between tried ones by straight lines [s]
+    range_s: tuple[float, float]  # where the deviance is less than 4 above its least, linear between tried ones [s]
     fits: tuple[AxisFit, ...]  # each axis, fitted to the whole flight with it
-    judged: HeldOutError  # what it predicts of the halves
+    held_out: HeldOutError  # prediction errors on the halves that it was not fitted to
 
     @property
     def name(self) -> str:
@@ -356,7 +381,7 @@ class ChosenPlant:
 
 
 def choose_dead_time(
-    flown: Sequence[Stretch], axes: Sequence[int], models: Sequence[AxisModel], advance: Callable[[], None]
+    flown: Sequence[Stretch], axes: Sequence[int], models: Sequence[AxisModel], on_fit: Callable[[], None]
 ) -> ChosenPlant:
     """Choose the likeliest dead time, one for all axes.
 
@@ -366,69 +391,84 @@ def choose_dead_time(
     Raises:
         RecordingError: The flight is too short for two halves.
     """
-    both = halves(flown)
-    tried: dict[float, tuple[AxisFit, ...]] = {}
+    both_halves = split_halves(flown)
+    fits_by_dead_time: dict[float, tuple[AxisFit, ...]] = {}
 
     def fit(dead_time_s: float) -> None:
         dead_time_s = round(dead_time_s, 3)
-        if dead_time_s >= 0.0 and dead_time_s not in tried:
-            near = min(tried, key=lambda one: abs(one - dead_time_s), default=None)
-            starts = [None] * len(axes) if near is None else [one.parameters for one in tried[near]]
-            tried[dead_time_s] = fit_axes(flown, axes, models, dead_time_s, starts, ROUGH)
-        advance()
+        if dead_time_s >= 0.0 and dead_time_s not in fits_by_dead_time:
+            nearest_s = min(fits_by_dead_time, key=lambda fitted_s: abs(fitted_s - dead_time_s), default=None)
+            starts = (
+                [None] * len(axes)
+                if nearest_s is None
+                else [fitted_s.parameters for fitted_s in fits_by_dead_time[nearest_s]]
+            )
+            fits_by_dead_time[dead_time_s] = fit_axes(flown, axes, models, dead_time_s, starts, ROUGH_TOLERANCE)
+        on_fit()
 
-    def least() -> float:
-        return min(tried, key=lambda one: _total(tried[one]))
+    def find_best() -> float:
+        return min(fits_by_dead_time, key=lambda fitted_s: _sum_deviance(fits_by_dead_time[fitted_s]))
 
     for dead_time_s in COARSE_S:
         fit(dead_time_s)
-    near_s = least()
-    for dead_time_s in (near_s - FINE_S, near_s + FINE_S):
+    coarse_s = find_best()
+    for dead_time_s in (coarse_s - FINE_S, coarse_s + FINE_S):
         fit(dead_time_s)
-    best_s = least()
-    tried[best_s] = fit_axes(flown, axes, models, best_s, [one.parameters for one in tried[best_s]])
-    curve = tuple((key, _total(tried[key]) - _total(tried[best_s])) for key in sorted(tried))
-    models, starts = [one.model for one in tried[best_s]], [one.parameters for one in tried[best_s]]
-    judged = held_out(flown, both, axes, models, best_s, starts)
-    advance()
-    return ChosenPlant(curve, best_s, _range_s(curve, best_s), tried[best_s], judged)
+    best_s = find_best()
+    fits_by_dead_time[best_s] = fit_axes(
+        flown, axes, models, best_s, [fitted_s.parameters for fitted_s in fits_by_dead_time[best_s]]
+    )
+    curve = tuple(
+        (key, _sum_deviance(fits_by_dead_time[key]) - _sum_deviance(fits_by_dead_time[best_s]))
+        for key in sorted(fits_by_dead_time)
+    )
+    models, starts = (
+        [fitted_s.model for fitted_s in fits_by_dead_time[best_s]],
+        [fitted_s.parameters for fitted_s in fits_by_dead_time[best_s]],
+    )
+    held_out = compute_held_out_error(flown, both_halves, axes, models, best_s, starts)
+    on_fit()
+    return ChosenPlant(curve, best_s, _find_range_s(curve, best_s), fits_by_dead_time[best_s], held_out)
 
 
-def _total(fits: Sequence[AxisFit]) -> float:
+def _sum_deviance(fits: Sequence[AxisFit]) -> float:
     return sum(fit.deviance for fit in fits)
 
 
-def _range_s(curve: Sequence[tuple[float, float]], best_s: float) -> tuple[float, float]:
-    """Return where the deviance is 4 above its least on either side [s]; the end of the curve where it never is."""
-    ends = []
-    for side in ([one for one in curve if one[0] <= best_s][::-1], [one for one in curve if one[0] >= best_s]):
-        end_s = side[-1][0]
-        for (near_s, low), (far_s, high) in pairwise(side):
-            if high >= _RISE:
-                end_s = near_s + (far_s - near_s) * (_RISE - low) / (high - low)
+def _find_range_s(curve: Sequence[tuple[float, float]], best_s: float) -> tuple[float, float]:
+    """Return the bounds at which the deviance is 4 above its least [s]; the end of the curve where it is never."""
+    bounds = []
+    for branch in (
+        [point for point in curve if point[0] <= best_s][::-1],
+        [point for point in curve if point[0] >= best_s],
+    ):
+        end_s = branch[-1][0]
+        for (inner_s, inner_rise), (outer_s, outer_rise) in pairwise(branch):
+            if outer_rise >= _DEVIANCE_RISE:
+                end_s = inner_s + (outer_s - inner_s) * (_DEVIANCE_RISE - inner_rise) / (outer_rise - inner_rise)
                 break
-        ends.append(end_s)
-    return ends[0], ends[1]
+        bounds.append(end_s)
+    return bounds[0], bounds[1]
 
 
-def is_worse(one: HeldOutError, other: HeldOutError) -> bool:
+def is_worse(error: HeldOutError, other: HeldOutError) -> bool:
     """Return whether an error is larger by over two standard errors of the difference (jackknife, groups of 4 s)."""
-    difference = one.scores() - other.scores()
-    without, whole = difference[:-1], difference[-1]
-    count = len(without)
-    spread = np.sqrt((count - 1) / count * np.sum((without - without.mean()) ** 2))
-    return bool(whole > _CERTAIN * spread and whole > 0.0)
+    difference = error.compute_scores() - other.compute_scores()
+    leave_one_out, overall = difference[:-1], difference[-1]
+    count = len(leave_one_out)
+    std = np.sqrt((count - 1) / count * np.sum((leave_one_out - leave_one_out.mean()) ** 2))
+    return bool(overall > _CONFIDENCE_STDS * std and overall > 0.0)
 
 
 class Block(NamedTuple):
-    """Begin and end of a part of a stretch [s]."""
+    """Start and end of a part of a stretch [s]."""
 
     begin_s: float
     end_s: float
 
 
-def halves(flown: Sequence[Stretch]) -> tuple[tuple[Block, ...], tuple[Block, ...]]:
-    """Return two halves of a flight: blocks of each stretch in turn.
+def split_halves(flown: Sequence[Stretch]) -> tuple[tuple[Block, ...], tuple[Block, ...]]:
+    """Return two halves of a flight: alternating blocks of each stretch.
 
     Raises:
         RecordingError: There are no two blocks.
@@ -438,43 +478,43 @@ def halves(flown: Sequence[Stretch]) -> tuple[tuple[Block, ...], tuple[Block, ..
         count = max(round(stretch.length_s / BLOCK_S), 1 if len(flown) > 1 else 2)
         edges = np.linspace(stretch.times_s[0], stretch.times_s[-1] + 1e-6, count + 1)
         for begin, end in pairwise(edges.tolist()):
-            held = stretch.times_s[(stretch.times_s >= begin) & (stretch.times_s < end)]
-            if len(held) >= LEAST_SAMPLES:
-                blocks.append(Block(float(held[0]), float(held[-1])))
+            times_s = stretch.times_s[(stretch.times_s >= begin) & (stretch.times_s < end)]
+            if len(times_s) >= MIN_SAMPLES:
+                blocks.append(Block(float(times_s[0]), float(times_s[-1])))
     if len(blocks) < 2:
         raise RecordingError(
-            f"the flight has {len(blocks)} block of {BLOCK_S:g} s with {LEAST_SAMPLES} positions: a fit to one half "
+            f"the flight has {len(blocks)} block of {BLOCK_S:g} s with {MIN_SAMPLES} positions: a fit to one half "
             "cannot be judged by the other. Fly for longer, or with more positions"
         )
     return tuple(blocks[::2]), tuple(blocks[1::2])
 
 
-def held_out(
+def compute_held_out_error(
     flown: Sequence[Stretch],
-    both: tuple[tuple[Block, ...], tuple[Block, ...]],
+    both_halves: tuple[tuple[Block, ...], tuple[Block, ...]],
     axes: Sequence[int],
     models: Sequence[AxisModel],
     dead_time_s: float,
     starts: Sequence[Sequence[float] | None],
     ahead_s: Sequence[float] = AHEAD_S,
-    close: float = CLOSE,
+    tolerance: float = TOLERANCE,
 ) -> HeldOutError:
-    """Errors on each half by plants that were fitted to the other; arguments beside the halves as of `fit_axes`."""
+    """Compute errors on each half by plants that were fitted to the other; other arguments as of `fit_axes`."""
     begin = min(stretch.times_s[0] for stretch in flown)
     groups = 1 + int((max(stretch.times_s[-1] for stretch in flown) - begin) / _GROUP_S)
     squares, counts = (np.zeros((groups, len(axes), len(ahead_s))) for _ in range(2))
-    for half, other in (both, both[::-1]):
-        counting = [replace(stretch, counted=_within(half, stretch.times_s)) for stretch in flown]
-        for i, fit in enumerate(fit_axes(counting, axes, models, dead_time_s, starts, close)):
-            for j, one in enumerate(predict_ahead(flown, axes[i], fit, ahead_s)):
-                held_out = _within(other, one.times_s, ahead_s[j])
-                group = ((one.times_s[held_out] - begin) / _GROUP_S).astype(np.int64)
-                squares[:, i, j] += np.bincount(group, weights=one.errors_m[held_out] ** 2, minlength=groups)
+    for fitted_half, judged_half in (both_halves, both_halves[::-1]):
+        fitted_flight = [replace(stretch, counts_for_fit=_is_within(fitted_half, stretch.times_s)) for stretch in flown]
+        for i, fit in enumerate(fit_axes(fitted_flight, axes, models, dead_time_s, starts, tolerance)):
+            for j, ahead in enumerate(predict_ahead(flown, axes[i], fit, ahead_s)):
+                in_judged_half = _is_within(judged_half, ahead.times_s, ahead_s[j])
+                group = ((ahead.times_s[in_judged_half] - begin) / _GROUP_S).astype(np.int64)
+                squares[:, i, j] += np.bincount(group, weights=ahead.errors_m[in_judged_half] ** 2, minlength=groups)
                 counts[:, i, j] += np.bincount(group, minlength=groups)
     return HeldOutError(squares, counts)
 
 
-def _within(half: Sequence[Block], times_s: Array, ahead_s: float = 0.0) -> NDArray[np.bool_]:
-    """Return whether one block of a half contains both each of some times and the time so much later."""
-    held = [(times_s >= block.begin_s) & (times_s + ahead_s <= block.end_s) for block in half]
-    return np.asarray(np.logical_or.reduce(held), dtype=np.bool_)
+def _is_within(half: Sequence[Block], times_s: Array, ahead_s: float = 0.0) -> NDArray[np.bool_]:
+    """Return whether one block of a half contains each time and also the time `ahead_s` later."""
+    in_blocks = [(times_s >= block.begin_s) & (times_s + ahead_s <= block.end_s) for block in half]
+    return np.asarray(np.logical_or.reduce(in_blocks), dtype=np.bool_)

@@ -1,4 +1,8 @@
-"""Flight history for identification, from recordings: setpoints, positions, messages and their senders."""
+"""Flight history for identification, from recordings: setpoints, positions, messages and their senders.
+
+A history is read from our recordings or from any `.tlog`. The TIMESYNC exchange of a recorded client gives the
+vehicle's clock although no client asks any more.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +19,7 @@ from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from logs.recording.tlog import TlogPacket
+from uavctl.arrays import Array
 from uavctl.config import Config
 from uavctl.errors import RecordingError
 from uavctl.loop import MOCAP, make_links
@@ -23,22 +28,19 @@ from uavctl.mavlink.framing import scan_frames
 from uavctl.mavlink.profile import PROFILES, find_autopilot_name
 from uavctl.records import Datagram, PositionSample, Record, Setpoint, StepInput
 
-# The TIMESYNC exchange of a recorded client: what tells a vehicle's clock though nobody asks any more.
-
-
-_OPEN = 64  # requests whose answers are still taken
+_MAX_OPEN_REQUESTS = 64  # older requests are dropped
 Address = tuple[int, int]
 
 
-class RoundTrip(NamedTuple):
-    """Answer to a client's request: who gave it, when the request was sent [ns], the time in the answer [ns]."""
+class TimesyncAnswer(NamedTuple):
+    """Answer to a client's request: its sender, when the request was sent [ns], the time in the answer [ns]."""
 
     address: Address
     sent_ns: int
     remote_ns: int
 
 
-class Exchange:
+class TimesyncExchange:
     """Pairs a client's requests with their answers, by the client's stamp that both carry.
 
     Times are the recorder's, so those of the client's clock do not matter.
@@ -48,31 +50,26 @@ class Exchange:
         self._sent: OrderedDict[int, int] = OrderedDict()  # by the client's stamp
         self._parser = mavlink.MAVLink(None)
 
-    def take(self, data: bytes, at_ns: int, *, outgoing: bool) -> Iterator[RoundTrip]:
-        """Take a packet; return the round trip that it completes, if any."""
+    def take(self, data: bytes, at_ns: int, *, outgoing: bool) -> Iterator[TimesyncAnswer]:
+        """Take a packet; yield the answer in it, if it has one."""
         for frame in scan_frames(data, final=True).frames:
             if frame.message_id != mavlink.MAVLINK_MSG_ID_TIMESYNC:
                 continue
             message = self._parser.decode(bytearray(frame.data))
             if outgoing and message.tc1 == 0:
                 self._sent[message.ts1] = at_ns
-                if len(self._sent) > _OPEN:
+                if len(self._sent) > _MAX_OPEN_REQUESTS:
                     self._sent.popitem(last=False)
             elif not outgoing and message.tc1 != 0 and message.ts1 in self._sent:
                 address = message.get_srcSystem(), message.get_srcComponent()
-                yield RoundTrip(address, self._sent[message.ts1], message.tc1)
+                yield TimesyncAnswer(address, self._sent[message.ts1], message.tc1)
 
 
-# What was asked for and what was seen, axis by axis: all that identification needs of a flight.
-
-
-Array = NDArray[np.float64]
-
-LONGEST_PAUSE_S = 0.5  # without a setpoint for longer than this, the vehicle does as it likes
-SHORTEST_S = 5.0  # a stretch says nothing of drag below this
-LEAST_SAMPLES = 20
+MAX_PAUSE_S = 0.5  # without a setpoint for longer, the vehicle leaves its external mode
+MIN_STRETCH_S = 5.0  # a shorter stretch does not show drag
+MIN_SAMPLES = 20
 _NEIGHBOURS = 5
-_JUMP_M, _JUMP = 0.3, 8.0  # a position this far from its neighbours is none, nor at so many times the usual distance
+_MIN_JUMP_M, _JUMP_FACTOR = (0.3, 8.0)  # from the neighbours' median; farther is an error of the cameras
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +78,7 @@ class SetpointHistory:
 
     times_s: Array  # (n,) [s]
     accel_mps2: Array  # (n, 3), north, east, down [m/s²]
-    flown: NDArray[np.bool_]  # (n,), whether the vehicle took setpoints then
+    is_flown: NDArray[np.bool_]  # (n,), whether the vehicle took setpoints then
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,13 +92,15 @@ class PositionHistory:
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """A part of a flight in which setpoints streamed and the vehicle took them."""
+    """Part of a flight in which setpoints streamed and the vehicle used them."""
 
-    input_times_s: Array  # (n,), when the setpoint changed [s]; the first is the begin
+    input_times_s: Array  # (n,), when the setpoint changed [s]; the first is the start
     inputs_mps2: Array  # (n, 3), the setpoint from then on [m/s²]
     times_s: Array  # (m,), of capture [s]
     positions_m: Array  # (m, 3) [m]
-    counted: NDArray[np.bool_] | None = None  # (m,), whether a position counts when parameters are fitted; None is all
+    counts_for_fit: NDArray[np.bool_] | None = (
+        None  # (m,), whether a position counts when parameters are fitted; None is all
+    )
 
     @property
     def length_s(self) -> float:
@@ -109,118 +108,128 @@ class Stretch:
         return float(self.times_s[-1] - self.times_s[0])
 
 
-def stretches(asked: SetpointHistory, seen: PositionHistory) -> tuple[Stretch, ...]:
+def find_stretches(setpoints: SetpointHistory, positions: PositionHistory) -> tuple[Stretch, ...]:
     """Return the parts of a flight that show how the vehicle responds.
 
     Raises:
-        RecordingError: There is none that is long enough; says what is missing.
+        RecordingError: No part is long enough.
     """
-    found = tuple(
+    long_enough = tuple(
         stretch
-        for stretch in _all(asked, seen)
-        if len(stretch.times_s) >= LEAST_SAMPLES and stretch.length_s >= SHORTEST_S
+        for stretch in _cut_stretches(setpoints, positions)
+        if len(stretch.times_s) >= MIN_SAMPLES and stretch.length_s >= MIN_STRETCH_S
     )
-    if not found:
-        flown_s = sum(end - begin for begin, end in _spans(asked))
+    if not long_enough:
+        flown_s = sum(end - begin for begin, end in _find_setpoint_spans(setpoints))
         raise RecordingError(
-            f"setpoints were flown for {flown_s:.1f} s, and {len(seen.times_s)} positions are there: no stretch of at "
-            f"least {SHORTEST_S:g} s with {LEAST_SAMPLES} positions. Fly some waypoints under setpoints, with positions"
+            f"setpoints were flown for {flown_s:.1f} s, and {len(positions.times_s)} positions are there: no stretch "
+            f"of at least {MIN_STRETCH_S:g} s with {MIN_SAMPLES} positions. Fly some waypoints under setpoints, with "
+            "positions"
         )
-    return found
+    return long_enough
 
 
-def thinned(stretch: Stretch, spacing_s: float) -> Stretch:
+def thin_positions(stretch: Stretch, spacing_s: float) -> Stretch:
     """Return a stretch with positions thinned to at least `spacing_s` apart, the controller's own step."""
-    kept, last_s = [], -np.inf
+    kept_indices, last_s = [], -np.inf
     for index, at_s in enumerate(stretch.times_s):
         if at_s - last_s >= spacing_s:
-            kept.append(index)
+            kept_indices.append(index)
             last_s = at_s
-    return replace(stretch, times_s=stretch.times_s[kept], positions_m=stretch.positions_m[kept])
+    return replace(stretch, times_s=stretch.times_s[kept_indices], positions_m=stretch.positions_m[kept_indices])
 
 
-def seen_from(rows: Sequence[tuple[float, float, tuple[float, float, float]]]) -> PositionHistory:
+def make_position_history(rows: Sequence[tuple[float, float, tuple[float, float, float]]]) -> PositionHistory:
     """Sort positions (capture [s], arrival [s], position [m]) by capture; drop repeated and implausible ones."""
-    captured = np.array([row[0] for row in rows])
-    _, first = np.unique(captured, return_index=True)
-    arrived = np.array([row[1] for row in rows])
-    positions = np.array([row[2] for row in rows], dtype=np.float64).reshape(-1, 3)[first]
-    good = _plausible(positions)
-    return PositionHistory(captured[first][good], (arrived - captured)[first][good], positions[good])
+    captured_s = np.array([row[0] for row in rows])
+    _, first_index = np.unique(captured_s, return_index=True)
+    arrived_s = np.array([row[1] for row in rows])
+    positions = np.array([row[2] for row in rows], dtype=np.float64).reshape(-1, 3)[first_index]
+    is_plausible = _is_plausible(positions)
+    return PositionHistory(
+        captured_s[first_index][is_plausible],
+        (arrived_s - captured_s)[first_index][is_plausible],
+        positions[is_plausible],
+    )
 
 
-def _plausible(positions_m: Array) -> NDArray[np.bool_]:
+def _is_plausible(positions_m: Array) -> NDArray[np.bool_]:
     """Return whether each position (m, 3) is near its neighbours' median, unlike swapped bodies and reflections."""
     if len(positions_m) < _NEIGHBOURS:
         return np.ones(len(positions_m), dtype=np.bool_)
     half = _NEIGHBOURS // 2
     padded = np.pad(positions_m, ((half, half), (0, 0)), mode="edge")
     medians = np.median(np.lib.stride_tricks.sliding_window_view(padded, _NEIGHBOURS, axis=0), axis=-1)
-    off_m = np.linalg.norm(positions_m - medians, axis=1)
-    return np.asarray(off_m <= max(_JUMP_M, _JUMP * float(np.median(off_m))))
+    distances_m = np.linalg.norm(positions_m - medians, axis=1)
+    return np.asarray(distances_m <= max(_MIN_JUMP_M, _JUMP_FACTOR * float(np.median(distances_m))))
 
 
-def _spans(asked: SetpointHistory) -> Iterator[tuple[float, float]]:
+def _find_setpoint_spans(setpoints: SetpointHistory) -> Iterator[tuple[float, float]]:
     """Return begin and end of each run of setpoints that were flown without a pause [s]."""
     begin: float | None = None
-    for now, then in pairwise(range(len(asked.times_s))):
-        if begin is None and asked.flown[now]:
-            begin = float(asked.times_s[now])
-        gap_s = asked.times_s[then] - asked.times_s[now]
-        if begin is not None and (not asked.flown[then] or gap_s > LONGEST_PAUSE_S):
-            yield begin, float(asked.times_s[now])
+    for index, next_index in pairwise(range(len(setpoints.times_s))):
+        if begin is None and setpoints.is_flown[index]:
+            begin = float(setpoints.times_s[index])
+        gap_s = setpoints.times_s[next_index] - setpoints.times_s[index]
+        if begin is not None and (not setpoints.is_flown[next_index] or gap_s > MAX_PAUSE_S):
+            yield begin, float(setpoints.times_s[index])
             begin = None
     if begin is not None:
-        yield begin, float(asked.times_s[-1])
+        yield begin, float(setpoints.times_s[-1])
 
 
-def _all(asked: SetpointHistory, seen: PositionHistory) -> Iterator[Stretch]:
-    for begin, end in _spans(asked):
-        within = (asked.times_s >= begin) & (asked.times_s <= end)
-        times_s, accel = asked.times_s[within], asked.accel_mps2[within]
-        changed = np.concatenate([[True], np.any(np.diff(accel, axis=0) != 0.0, axis=1)])
-        held = (seen.times_s > begin) & (seen.times_s <= end)
-        yield Stretch(times_s[changed], accel[changed], seen.times_s[held], seen.positions_m[held])
+def _cut_stretches(setpoints: SetpointHistory, positions: PositionHistory) -> Iterator[Stretch]:
+    for begin, end in _find_setpoint_spans(setpoints):
+        in_span = (setpoints.times_s >= begin) & (setpoints.times_s <= end)
+        times_s, accel = setpoints.times_s[in_span], setpoints.accel_mps2[in_span]
+        is_changed = np.concatenate([[True], np.any(np.diff(accel, axis=0) != 0.0, axis=1)])
+        positions_in_span = (positions.times_s > begin) & (positions.times_s <= end)
+        yield Stretch(
+            times_s[is_changed],
+            accel[is_changed],
+            positions.times_s[positions_in_span],
+            positions.positions_m[positions_in_span],
+        )
 
 
-# The history of a flight out of its recording: our own, or a `.tlog` of anybody's.
-
-
-_NO_POSITION_NO_VELOCITY = 0x03F  # bits of type_mask: ignored
-_MASK = 0x3FF  # of position, velocity, acceleration, and of acceleration as a force; whatever yaw does
+_ACCELERATION_ONLY = 0x03F  # bits of type_mask: position and velocity are ignored
+_TYPE_MASK = 0x3FF  # bits of position, velocity, acceleration and force; those of yaw do not matter
 _LOCAL_NED = (mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_FRAME_LOCAL_OFFSET_NED)
 
-_SHORTEST = 10  # bytes of the longer head
-_STAMPED = {  # positions that begin with their time [µs]
+_MIN_HEADER_BYTES = 10  # of the longer header
+_STAMPED_MESSAGES = {  # positions that begin with their time [µs]
     mavlink.MAVLINK_MSG_ID_VISION_POSITION_ESTIMATE,
     mavlink.MAVLINK_MSG_ID_VICON_POSITION_ESTIMATE,
     mavlink.MAVLINK_MSG_ID_ATT_POS_MOCAP,
     mavlink.MAVLINK_MSG_ID_ODOMETRY,
 }
-_SHORT_S = 0.1  # clocks that know nothing of each other are no tenth of a second apart
-_QUICK = 0.2  # share of spacings without a loss, at the least
-_REGULAR, _MOSTLY = 0.25, 0.9  # of a period, and the share of spacings that are nearer to a multiple of it
-_REMEMBERED = 64  # messages among which the newest is looked for: one may be overtaken by others
+_MAX_DELAY_S = 0.1  # unrelated clocks differ by more than this
+_PERIOD_QUANTILE = 0.2  # at least this share of spacings is without a loss
+_REGULAR_TOLERANCE, _MIN_REGULAR_SHARE = (
+    0.25,
+    0.9,
+)  # of a period, and the least share of spacings so near to a multiple of it
+_REORDER_WINDOW = 64  # messages may arrive in another order within so many
 
-Row = tuple[float, float, tuple[float, float, float]]
+PositionRow = tuple[float, float, tuple[float, float, float]]
 
 
 @dataclass(frozen=True, eq=False)
 class FlightHistory:
     """Setpoints, positions and losses of a flight; times count from its first position [s]."""
 
-    asked: SetpointHistory  # setpoints
-    seen: PositionHistory  # positions
-    gaps: NDArray[np.int64]  # messages lost after each one that came from the positions' sender
-    autopilot: str = ""  # whose software flew, "px4" or "ardupilot"; empty where nobody said so
-    # The vehicle's own that begin with PSC_, by name, as far as they were asked for
+    setpoints: SetpointHistory  # setpoints
+    positions: PositionHistory  # positions
+    losses: NDArray[np.int64]  # messages lost after each one that came from the positions' sender
+    autopilot: str = ""  # "px4" or "ardupilot"; empty where no heartbeat reported it
+    # Reported parameters of the vehicle that begin with PSC_, by name
     parameters: Mapping[str, float] = field(default_factory=dict)
-    # The shortest delay from capture to arrival [s], where the stamps tell it; else None
+    # The shortest delay from capture to arrival [s], where the stamps show it; else None
     latency_s: float | None = None
 
 
-class VehicleWords:
-    """What the vehicle says of itself: its autopilot, and its parameters of the position loops."""
+class VehicleReports:
+    """Reports of the vehicle about itself: its autopilot, and its parameters of the position loops."""
 
     def __init__(self) -> None:
         self.autopilot = ""
@@ -248,48 +257,48 @@ class Senders:
 
     def take(self, data: bytes, at_ns: int) -> None:
         """Count the messages of a datagram or packet, those of unknown ids too, by their lengths."""
-        for head in _heads(data):
-            known = self._numbers[head.sender]
-            newest = max(known[-_REMEMBERED:], default=head.number)
-            known.append(newest + (head.number - newest + 128) % 256 - 128)
-            if head.message_id in _STAMPED:
-                self._stamps[head.sender].append((int.from_bytes(head.payload[:8], "little"), at_ns))
+        for header in _read_headers(data):
+            numbers_before = self._numbers[header.sender]
+            newest = max(numbers_before[-_REORDER_WINDOW:], default=header.number)
+            numbers_before.append(newest + (header.number - newest + 128) % 256 - 128)
+            if header.message_id in _STAMPED_MESSAGES:
+                self._stamps[header.sender].append((int.from_bytes(header.payload[:8], "little"), at_ns))
 
-    def gaps(self, sender: Address) -> NDArray[np.int64]:
-        """Return how many messages of a sender were lost after each one: by regular stamps, else by sequence numbers.
+    def count_losses(self, sender: Address) -> NDArray[np.int64]:
+        """Return the number of lost messages after each one of a sender: by regular stamps, else by sequence numbers.
 
-        A bridge numbers what it sends, and tells nothing of what was lost on the way to it.
+        A bridge numbers its own messages, so its numbers do not show what was lost before it.
         """
         stamps = np.unique([stamp for stamp, _ in self._stamps.get(sender, ())])
-        by_times = _missing_of(np.diff(stamps))
-        if by_times is not None:
-            return by_times
+        losses_by_stamps = _count_missing_frames(np.diff(stamps))
+        if losses_by_stamps is not None:
+            return losses_by_stamps
         numbers = sorted(set(self._numbers[sender]))
         return np.array([after - before - 1 for before, after in pairwise(numbers)], dtype=np.int64)
 
-    def shortest_delay_s(self, sender: Address) -> float | None:
-        """Return the least time from a stamp to its arrival [s], if both are of one clock; else None."""
+    def estimate_min_delay_s(self, sender: Address) -> float | None:
+        """Return the least time from a stamp to its arrival [s], if both use the same clock; else None."""
         delays_s = [1e-9 * (at_ns - 1000 * stamp) for stamp, at_ns in self._stamps.get(sender, ())]
-        return min(delays_s) if delays_s and 0.0 <= min(delays_s) <= _SHORT_S else None
+        return min(delays_s) if delays_s and 0.0 <= min(delays_s) <= _MAX_DELAY_S else None
 
 
-def _missing_of(spacings: NDArray[np.int64]) -> NDArray[np.int64] | None:
-    """Return how many frames a regular camera's stamps lack between each two; None if it is not regular."""
-    if len(spacings) < LEAST_SAMPLES:
+def _count_missing_frames(spacings: NDArray[np.int64]) -> NDArray[np.int64] | None:
+    """Return the number of missing frames between stamps of a regular camera; None if it is not regular."""
+    if len(spacings) < MIN_SAMPLES:
         return None
-    period = float(np.quantile(spacings, _QUICK))
-    for most in (2.0, 4.0, 16.0):  # the better the period is known, the longer a gap tells of it
-        near = spacings[(spacings > 0.5 * period) & (spacings < (most + 0.5) * period)]
-        period = float(near.sum() / np.rint(near / period).sum())
+    period = float(np.quantile(spacings, _PERIOD_QUANTILE))
+    for max_frames in (2.0, 4.0, 16.0):  # a better known period lets longer gaps refine it
+        short_spacings = spacings[(spacings > 0.5 * period) & (spacings < (max_frames + 0.5) * period)]
+        period = float(short_spacings.sum() / np.rint(short_spacings / period).sum())
     frames = spacings / period
-    off = np.abs(frames - np.rint(frames))[frames < 16.5]
-    if np.mean(off < _REGULAR) < _MOSTLY:
+    offsets = np.abs(frames - np.rint(frames))[frames < 16.5]
+    if np.mean(offsets < _REGULAR_TOLERANCE) < _MIN_REGULAR_SHARE:
         return None
     return np.maximum(np.rint(frames).astype(np.int64) - 1, 0)
 
 
-class _Head(NamedTuple):
-    """Head of a frame, with its payload."""
+class _FrameHeader(NamedTuple):
+    """Header of a frame, with its payload."""
 
     number: int
     sender: Address
@@ -297,24 +306,32 @@ class _Head(NamedTuple):
     payload: bytes
 
 
-def _heads(data: bytes) -> Iterator[_Head]:
-    """Yield the head of each frame, up to the first byte that begins none."""
-    at = 0
-    while at + _SHORTEST <= len(data):
-        length = data[at + 1]
-        if data[at] == mavlink.PROTOCOL_MARKER_V2:
-            signature = mavlink.MAVLINK_SIGNATURE_BLOCK_LEN if data[at + 2] & mavlink.MAVLINK_IFLAG_SIGNED else 0
-            sender, kind = (data[at + 5], data[at + 6]), int.from_bytes(data[at + 7 : at + 10], "little")
-            yield _Head(data[at + 4], sender, kind, data[at + 10 : at + 10 + length])
-            at += 12 + length + signature
-        elif data[at] == mavlink.PROTOCOL_MARKER_V1:
-            yield _Head(data[at + 2], (data[at + 3], data[at + 4]), data[at + 5], data[at + 6 : at + 6 + length])
-            at += 8 + length
+def _read_headers(data: bytes) -> Iterator[_FrameHeader]:
+    """Yield the header of each frame, up to the first byte that begins no frame."""
+    position = 0
+    while position + _MIN_HEADER_BYTES <= len(data):
+        length = data[position + 1]
+        if data[position] == mavlink.PROTOCOL_MARKER_V2:
+            signature = mavlink.MAVLINK_SIGNATURE_BLOCK_LEN if data[position + 2] & mavlink.MAVLINK_IFLAG_SIGNED else 0
+            sender, message_id = (
+                (data[position + 5], data[position + 6]),
+                int.from_bytes(data[position + 7 : position + 10], "little"),
+            )
+            yield _FrameHeader(data[position + 4], sender, message_id, data[position + 10 : position + 10 + length])
+            position += 12 + length + signature
+        elif data[position] == mavlink.PROTOCOL_MARKER_V1:
+            yield _FrameHeader(
+                data[position + 2],
+                (data[position + 3], data[position + 4]),
+                data[position + 5],
+                data[position + 6 : position + 6 + length],
+            )
+            position += 8 + length
         else:
             return
 
 
-def from_records(records: Iterable[tuple[str, int, Record]]) -> FlightHistory:
+def read_recorded_history(records: Iterable[tuple[str, int, Record]]) -> FlightHistory:
     """Make the history of one of our recordings.
 
     Raises:
@@ -322,113 +339,129 @@ def from_records(records: Iterable[tuple[str, int, Record]]) -> FlightHistory:
     """
     samples: list[PositionSample] = []
     sent: list[tuple[int, tuple[float, float, float], bool]] = []
-    senders, told = Senders(), VehicleWords()
-    flown = False
+    senders, reports = Senders(), VehicleReports()
+    takes_setpoints = False
     for _, at_ns, record in records:
         if isinstance(record, Datagram) and not record.outgoing:
             senders.take(record.data, at_ns)
-            told.take(record.data)
+            reports.take(record.data)
         elif isinstance(record, StepInput):
             samples.extend(record.samples)
-            flown = record.vehicle is not None and record.vehicle.armed and record.vehicle.external
+            takes_setpoints = record.vehicle is not None and record.vehicle.armed and record.vehicle.external
         elif isinstance(record, Setpoint):
-            sent.append((record.at_ns, record.accel_mps2, flown))
-    return _history(sent, samples, senders, told)
+            sent.append((record.at_ns, record.accel_mps2, takes_setpoints))
+    return _make_history(sent, samples, senders, reports)
 
 
-def from_tlog(packets: Iterable[TlogPacket], config: Config) -> FlightHistory:
+def read_tlog_history(packets: Iterable[TlogPacket], config: Config) -> FlightHistory:
     """Make the history of a `.tlog`: positions as the daemon would take them, setpoints as they were sent.
 
     Args:
-        config: Says which messages count as positions, how their frame and clock are turned into ours, and whose
-            setpoints they are (`daemon.vehicle_system_id`; 0: any vehicle's).
+        config: Configuration of the messages that count as positions, of their frame and clock, and of the vehicle that
+            the setpoints are for (`daemon.vehicle_system_id`; 0: any vehicle).
 
     Raises:
         RecordingError: No position or no acceleration setpoint in it.
     """
-    whole, system = tuple(packets), config.daemon.vehicle_system_id
+    all_packets, system_id = tuple(packets), config.daemon.vehicle_system_id
     sent: list[tuple[int, tuple[float, float, float], bool]] = []
-    senders, told = Senders(), VehicleWords()
-    for packet in whole:
+    senders, reports = Senders(), VehicleReports()
+    for packet in all_packets:
         if packet.outgoing:
-            sent.extend((packet.at_ns, accel, alone) for accel, alone in _accelerations(packet.data, system))
+            sent.extend(
+                (packet.at_ns, accel, is_accel_only)
+                for accel, is_accel_only in _read_accelerations(packet.data, system_id)
+            )
         else:
             senders.take(packet.data, packet.at_ns)
-            told.take(packet.data)
-    samples, answered = _samples(whole, config)
-    latency_s = senders.shortest_delay_s(_source(samples)) if samples else None
+            reports.take(packet.data)
+    samples, answered = _collect_samples(all_packets, config)
+    latency_s = senders.estimate_min_delay_s(_find_source(samples)) if samples else None
     if latency_s is not None:
         clock = msgspec.structs.replace(config.clock, latency_s=round(latency_s, 4))
-        samples, _ = _samples(whole, msgspec.structs.replace(config, clock=clock))
+        samples, _ = _collect_samples(all_packets, msgspec.structs.replace(config, clock=clock))
     elif answered:
-        latency_s = max(0.0, min(1e-9 * (one.received_ns - one.captured_ns) for one in answered))
-        # Those from before the clock was known count by what stamps alone tell: how late they are is not known.
+        latency_s = max(0.0, min(1e-9 * (sample.received_ns - sample.captured_ns) for sample in answered))
+        # Before the first answer the stamps alone count, and the delay of those positions is unknown.
         samples = answered if len(answered) > len(samples) // 2 else samples
-    return replace(_history(sent, samples, senders, told), latency_s=latency_s)
+    return replace(_make_history(sent, samples, senders, reports), latency_s=latency_s)
 
 
-def _samples(packets: Sequence[TlogPacket], config: Config) -> tuple[list[PositionSample], list[PositionSample]]:
-    """Return positions as the daemon would take them, and those with a clock known by the client's own exchange.
+def _collect_samples(
+    packets: Sequence[TlogPacket], config: Config
+) -> tuple[list[PositionSample], list[PositionSample]]:
+    """Return positions as the daemon would take them, and those with a clock known from the client's own exchange.
 
-    A source that answers nothing may stamp by the vehicle's clock: its answers are tried for such stamps too.
+    A source that does not answer may stamp by the vehicle's clock, so the vehicle's answers are tried for it too.
     """
     links = make_links(config)
     link = links.get(MOCAP) or next(iter(links.values()))
-    exchange, senders = Exchange(), {head.sender for one in packets if not one.outgoing for head in _heads(one.data)}
-    found, answered = [], []
-    for one in packets:
-        for trip in exchange.take(one.data, one.at_ns, outgoing=one.outgoing):
+    exchange, senders = (
+        TimesyncExchange(),
+        {header.sender for packet in packets if not packet.outgoing for header in _read_headers(packet.data)},
+    )
+    samples, answered_samples = [], []
+    for packet in packets:
+        for trip in exchange.take(packet.data, packet.at_ns, outgoing=packet.outgoing):
             for address in senders:
-                link.add_timesync_answer(address, trip.sent_ns, trip.remote_ns, one.at_ns)
-        if one.outgoing:
+                link.add_timesync_answer(address, trip.sent_ns, trip.remote_ns, packet.at_ns)
+        if packet.outgoing:
             continue
-        understood = link.receive(one.data, one.at_ns)
-        for item in understood.items:
-            if isinstance(item, PositionSample):
-                found.append(item)
-                if understood.clock_source is ClockSource.TIMESYNC:
-                    answered.append(item)
-    return found, answered
+        received = link.receive(packet.data, packet.at_ns)
+        for sample in received.items:
+            if isinstance(sample, PositionSample):
+                samples.append(sample)
+                if received.clock_source is ClockSource.TIMESYNC:
+                    answered_samples.append(sample)
+    return samples, answered_samples
 
 
-def _source(samples: Iterable[PositionSample]) -> Address:
+def _find_source(samples: Iterable[PositionSample]) -> Address:
     """Return system and component that sent most of the accepted positions."""
-    ((source, _),) = Counter(one.source for one in samples).most_common(1)
+    ((source, _),) = Counter(sample.source for sample in samples).most_common(1)
     system, component = source.rsplit(" ", 1)[-1].split("/")
     return int(system), int(component)
 
 
-def _history(
+def _make_history(
     sent: list[tuple[int, tuple[float, float, float], bool]],
     samples: list[PositionSample],
     senders: Senders,
-    told: VehicleWords,
+    reports: VehicleReports,
 ) -> FlightHistory:
     if not samples or not sent:
         missing = "no position" if not samples else "no acceleration setpoint"
         raise RecordingError(f"the recording has {missing}: there is nothing to identify a vehicle from")
     origin_ns = min(sample.captured_ns for sample in samples)
-    rows: list[Row] = [
-        ((one.captured_ns - origin_ns) * 1e-9, (one.received_ns - origin_ns) * 1e-9, one.position_m)
-        for one in samples
-        if all(map(math.isfinite, one.position_m))
+    rows: list[PositionRow] = [
+        ((sample.captured_ns - origin_ns) * 1e-9, (sample.received_ns - origin_ns) * 1e-9, sample.position_m)
+        for sample in samples
+        if all(map(math.isfinite, sample.position_m))
     ]
-    asked = SetpointHistory(
+    setpoints = SetpointHistory(
         times_s=np.array([(at_ns - origin_ns) * 1e-9 for at_ns, _, _ in sent]),
         accel_mps2=np.array([accel for _, accel, _ in sent]),
-        flown=np.array([flown for _, _, flown in sent]),
+        is_flown=np.array([is_flown for _, _, is_flown in sent]),
     )
-    return FlightHistory(asked, seen_from(rows), senders.gaps(_source(samples)), told.autopilot, told.parameters)
+    return FlightHistory(
+        setpoints,
+        make_position_history(rows),
+        senders.count_losses(_find_source(samples)),
+        reports.autopilot,
+        reports.parameters,
+    )
 
 
-def _accelerations(data: bytes, system: int) -> Iterable[tuple[tuple[float, float, float], bool]]:
+def _read_accelerations(data: bytes, system_id: int) -> Iterable[tuple[tuple[float, float, float], bool]]:
     """Return the setpoints for a system in a client's packet, with whether each asks for an acceleration only."""
     parser = mavlink.MAVLink(None)
     for frame in scan_frames(data, final=True).frames:
         if frame.message_id == mavlink.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED:
             message = parser.decode(bytearray(frame.data))
-            if system and message.target_system not in (0, system):
+            if system_id and message.target_system not in (0, system_id):
                 continue
-            alone = message.type_mask & _MASK == _NO_POSITION_NO_VELOCITY and message.coordinate_frame in _LOCAL_NED
+            is_accel_only = (
+                message.type_mask & _TYPE_MASK == _ACCELERATION_ONLY and message.coordinate_frame in _LOCAL_NED
+            )
             accel = (message.afx, message.afy, message.afz)
-            yield (accel, True) if alone and all(map(math.isfinite, accel)) else ((0.0, 0.0, 0.0), False)
+            yield (accel, True) if is_accel_only and all(map(math.isfinite, accel)) else ((0.0, 0.0, 0.0), False)

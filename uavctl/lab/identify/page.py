@@ -11,38 +11,40 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 from logs.report.page import PageSection, render_folded, render_grid, render_page, render_table
 from logs.report.svg import Drawing, colour, draw_dots, open_canvas
 from uavctl.config.load import dump_config
-from uavctl.lab.identify.fit import LAGS, SHOWN_S, Prediction
+from uavctl.lab.identify.fit import LAGS, R2_AHEAD_S, Prediction
 from uavctl.lab.identify.history import PositionHistory
-from uavctl.lab.identify.result import Identification, Identified, loss_words
+from uavctl.lab.identify.result import Identification, Identified, describe_loss
 
 _HEIGHT_IN = 2.6
-_LEFT_IN = 0.85  # room for differences with a sign and three decimals or four
-_MOST_DELAYS = 2000  # dots of a picture
+_LEFT_IN = 0.85  # room for numbers with a sign and four decimals
+_MAX_DELAYS = 2000  # dots of a figure
 
 
-def write_page(found: Identification, seen: PositionHistory, source: str) -> str:
+def render_identify_page(identification: Identification, positions: PositionHistory, source: str) -> str:
     """Return the page of an identification as HTML.
 
     Args:
-        seen: The positions that it was made from.
-        source: The recording, as the page names it.
+        positions: Positions of the flight.
+        source: Name of the recording on the page.
     """
-    result = found.result
-    story = [
-        f"{result.flown_s:.0f} s were flown under setpoints; {found.link.received} positions came, {found.link.lost} "
-        f"did not: {loss_words(found.link)}.",
+    result, link = identification.result, identification.link
+    sentences = [
+        f"{result.flown_s:.0f} s were flown under setpoints; {link.received} positions came, {link.lost} "
+        f"did not: {describe_loss(link)}.",
         *(
-            f"{one.axis}: {100 * one.r2:.1f} % of the motion of the next {SHOWN_S:g} s is predicted."
-            for one in result.response
-            if one.is_well_predicted  # else a warning says it
+            f"{response.axis}: {100 * response.r2:.1f} % of the motion of the next {R2_AHEAD_S:g} s is predicted."
+            for response in result.response
+            if not any(
+                warning.startswith(f"{response.axis}: only ") for warning in result.warnings
+            )  # which says it already
         ),
-        *_ramps(result),
+        *_describe_ramp(result),
         *(f"{warning}." for warning in result.warnings),
     ]
-    return render_page("Identified plant and link", source, story, _sections(found, seen))
+    return render_page("Identified plant and link", source, sentences, _make_sections(identification, positions))
 
 
-def _ramps(result: Identified) -> Iterator[str]:
+def _describe_ramp(result: Identified) -> Iterator[str]:
     if result.ramp_s > 0.0:
         yield (
             "The autopilot ramps setpoints by its jerk limit. The fit knows that, the plant of a controller does not: "
@@ -50,146 +52,166 @@ def _ramps(result: Identified) -> Iterator[str]:
         )
 
 
-def _sections(found: Identification, seen: PositionHistory) -> Iterator[PageSection]:
-    names = [one.axis for one in found.result.response]
-    yield PageSection("Response", _RESPONSE, render_table(_COLUMNS, _rows(found), frozenset(range(1, len(_COLUMNS)))))
-    yield PageSection("Dead time and plant", _DEAD, _candidates(found) + render_grid([_curves(found)]))
-    drawings = [_moved(name, one) for name, one in zip(names, found.predictions, strict=True)]
-    yield PageSection(f"Motion of the next {SHOWN_S:g} s", _MOVED, render_grid(drawings))
-    rest = [_innovations(name, one) for name, one in zip(names, found.predictions, strict=True)]
-    white = [_whiteness(name, one) for name, one in zip(names, found.predictions, strict=True)]
+def _make_sections(identification: Identification, positions: PositionHistory) -> Iterator[PageSection]:
+    names = [one.axis for one in identification.result.response]
     yield PageSection(
-        "What is left unexplained", _REST, render_grid([one for pair in zip(rest, white, strict=True) for one in pair])
+        "Response",
+        _RESPONSE_NOTE,
+        render_table(_COLUMNS, _make_response_rows(identification), frozenset(range(1, len(_COLUMNS)))),
     )
-    yield PageSection("Link", _LINK, render_grid([_delays(seen), _runs(found)]))
-    yield PageSection("Configuration", "", render_folded("TOML with what was identified", dump_config(found.config)))
+    yield PageSection(
+        "Dead time and plant",
+        _DEAD_TIME_NOTE,
+        _render_candidates(identification) + render_grid([_draw_deviance(identification)]),
+    )
+    drawings = [_draw_motion(name, one) for name, one in zip(names, identification.predictions, strict=True)]
+    yield PageSection(f"Motion of the next {R2_AHEAD_S:g} s", _MOTION_NOTE, render_grid(drawings))
+    innovation_drawings = [
+        _draw_innovations(name, one) for name, one in zip(names, identification.predictions, strict=True)
+    ]
+    correlation_drawings = [
+        _draw_correlation(name, one) for name, one in zip(names, identification.predictions, strict=True)
+    ]
+    yield PageSection(
+        "What is left unexplained",
+        _RESIDUAL_NOTE,
+        render_grid([one for pair in zip(innovation_drawings, correlation_drawings, strict=True) for one in pair]),
+    )
+    yield PageSection("Link", _LINK_NOTE, render_grid([_draw_delays(positions), _draw_loss_runs(identification)]))
+    yield PageSection(
+        "Configuration", "", render_folded("TOML with what was identified", dump_config(identification.config))
+    )
 
 
 _COLUMNS = ("axis", "lag [s]", "drag [1/s]", "gain", "wind [m/s²]", "noise [mm]", "R²")
-_RESPONSE = (
+_RESPONSE_NOTE = (
     "With the dead time below, one for all axes. ± is the standard error with that dead time. The wind is the standard "
     "deviation of an acceleration that is constant over a step."
 )
-_DEAD = (
+_DEAD_TIME_NOTE = (
     "The dead time is the likeliest for the whole flight and all axes, its range where the deviance is less than 4 "
     "above its least. The errors compare plants: fitted to one half of the flight and judged by the other, blocks of "
     "8 s in turn, rms of the motion of the next seconds, from each position on, with the setpoints known."
 )
-_REST = (
+_RESIDUAL_NOTE = (
     "Each position minus its prediction from those before: with a right model, 95 % are between the lines, and "
     "one does not tell the next (bars between the lines)."
 )
-_LINK = "Delays by capture stamps and arrival; runs of losses (bars) beside those of independent losses (dots)."
-_MOVED = "Each dot is a position: how far the vehicle went from there, and how far the model said it would."
+_LINK_NOTE = "Delays by capture stamps and arrival; runs of losses (bars) beside those of independent losses (dots)."
+_MOTION_NOTE = "Each dot is a position: how far the vehicle went from there, and how far the model said it would."
 
 
-def _rows(found: Identification) -> Iterator[tuple[str, ...]]:
-    for one in found.result.response:
+def _make_response_rows(identification: Identification) -> Iterator[tuple[str, ...]]:
+    for response in identification.result.response:
         yield (
-            one.axis,
-            _with_error(one.lag_s, one.lag_std_s),
-            _with_error(one.drag_1ps, one.drag_std_1ps),
-            "–" if one.gain is None else _with_error(one.gain, one.gain_std),
-            f"{one.wind_std_mps2:.3f}",
-            f"{one.position_std_m * 1e3:.1f}",
-            f"{one.r2:.3f}",
+            response.axis,
+            _format_with_error(response.lag_s, response.lag_std_s),
+            _format_with_error(response.drag_1ps, response.drag_std_1ps),
+            "–" if response.gain is None else _format_with_error(response.gain, response.gain_std),
+            f"{response.wind_std_mps2:.3f}",
+            f"{response.position_std_m * 1e3:.1f}",
+            f"{response.r2:.3f}",
         )
 
 
-def _candidates(found: Identification) -> Markup:
-    candidates = found.result.candidates
+def _render_candidates(identification: Identification) -> Markup:
+    candidates = identification.result.candidates
     ahead = [f"{time_s:g} s on [mm]" for time_s in candidates[0].ahead_s]
     rows = [
         (
-            one.model,
-            f"{one.dead_time_s:.2f} ({one.dead_time_range_s[0]:.2f} to {one.dead_time_range_s[1]:.2f})",
+            candidate.model,
+            f"{candidate.dead_time_s:.2f} ({' to '.join(f'{end:.2f}' for end in candidate.dead_time_range_s)})",
             response.axis,
             f"{lag_s:.3f}",
             *(f"{1e3 * value:.1f}" for value in errors),
         )
-        for one in candidates
-        for response, lag_s, errors in zip(found.result.response, one.lag_s, one.rms_m, strict=True)
+        for candidate in candidates
+        for response, lag_s, errors in zip(
+            identification.result.response, candidate.lag_s, candidate.rms_m, strict=True
+        )
     ]
     columns = ("plant", "dead time [s]", "axis", "lag [s]", *ahead)
     # Names of axes are no paths: they stay whole, and the columns are as wide as they need.
     return render_table(columns, rows, frozenset(range(3, len(columns))), kind="words")
 
 
-def _curves(found: Identification) -> Drawing:
-    with open_canvas("dead-time", _HEIGHT_IN) as drawn:
-        ax = drawn.axes("Deviance over the dead time", "dead time [s]", "rise of the deviance", _LEFT_IN)
-        for one, name in zip(found.result.candidates, ("estimate", "lost"), strict=False):
-            curve = np.array(one.curve)
-            ax.plot(curve[:, 0], curve[:, 1], color=colour(name), marker="o", markersize=3, label=one.model)
+def _draw_deviance(identification: Identification) -> Drawing:
+    with open_canvas("dead-time", _HEIGHT_IN) as canvas:
+        ax = canvas.axes("Deviance over the dead time", "dead time [s]", "rise of the deviance", _LEFT_IN)
+        for candidate, name in zip(identification.result.candidates, ("estimate", "lost"), strict=False):
+            curve = np.array(candidate.curve)
+            ax.plot(curve[:, 0], curve[:, 1], color=colour(name), marker="o", markersize=3, label=candidate.model)
         ax.legend()
-    return Drawing("dead-time", drawn.svg, "rise of the deviance of each plant over the dead time")
+    return Drawing("dead-time", canvas.svg, "rise of the deviance of each plant over the dead time")
 
 
-def _with_error(value: float, error: float | None) -> str:
+def _format_with_error(value: float, error: float | None) -> str:
     return f"{value:.3f}" if error is None else f"{value:.3f} ± {error:.3f}"
 
 
-def _moved(name: str, one: Prediction) -> Drawing:
-    with open_canvas(f"moved-{name}", _HEIGHT_IN) as drawn:
-        ax = drawn.axes(name, "predicted [m]", "flown [m]")
-        ends = [
-            float(min(one.predicted_m.min(), one.moved_m.min())),
-            float(max(one.predicted_m.max(), one.moved_m.max())),
+def _draw_motion(name: str, prediction: Prediction) -> Drawing:
+    with open_canvas(f"moved-{name}", _HEIGHT_IN) as canvas:
+        ax = canvas.axes(name, "predicted [m]", "flown [m]")
+        range_m = [
+            float(min(prediction.predicted_m.min(), prediction.moved_m.min())),
+            float(max(prediction.predicted_m.max(), prediction.moved_m.max())),
         ]
-        ax.plot(ends, ends, color=colour("limit"), linewidth=1.0)
-        draw_dots(ax, one.predicted_m, one.moved_m, "estimate", 2.5)
+        ax.plot(range_m, range_m, color=colour("limit"), linewidth=1.0)
+        draw_dots(ax, prediction.predicted_m, prediction.moved_m, "estimate", 2.5)
         ax.autoscale_view()
-    return Drawing(f"moved-{name}", drawn.svg, f"{name}: motion flown against motion predicted, R² {one.r2:.3f}")
+    return Drawing(
+        f"moved-{name}", canvas.svg, f"{name}: motion flown against motion predicted, R² {prediction.r2:.3f}"
+    )
 
 
-def _innovations(name: str, one: Prediction) -> Drawing:
-    with open_canvas(f"innovations-{name}", _HEIGHT_IN) as drawn:
-        ax = drawn.axes(f"{name}: position minus prediction", "time [s]", "difference [m]", _LEFT_IN)
+def _draw_innovations(name: str, prediction: Prediction) -> Drawing:
+    with open_canvas(f"innovations-{name}", _HEIGHT_IN) as canvas:
+        ax = canvas.axes(f"{name}: position minus prediction", "time [s]", "difference [m]", _LEFT_IN)
         for sign in (-2.0, 2.0):
-            ax.plot(one.times_s, sign * one.stds_m, color=colour("limit"), linewidth=0.8)
-        draw_dots(ax, one.times_s, one.innovations_m, "estimate", 2.5)
-    inside = float(np.mean(np.abs(one.innovations_m) <= 2.0 * one.stds_m))
+            ax.plot(prediction.times_s, sign * prediction.stds_m, color=colour("limit"), linewidth=0.8)
+        draw_dots(ax, prediction.times_s, prediction.innovations_m, "estimate", 2.5)
+    inside = float(np.mean(np.abs(prediction.innovations_m) <= 2.0 * prediction.stds_m))
     label = f"{name}: innovations with two standard deviations; {100 * inside:.0f} % are inside, 95 % should be"
-    return Drawing(f"innovations-{name}", drawn.svg, label)
+    return Drawing(f"innovations-{name}", canvas.svg, label)
 
 
-def _whiteness(name: str, one: Prediction) -> Drawing:
-    lags = np.arange(1, len(one.correlation) + 1)
-    band = 1.96 / np.sqrt(max(len(one.innovations_m), 1))
-    with open_canvas(f"white-{name}", _HEIGHT_IN) as drawn:
-        ax = drawn.axes(f"{name}: correlation of innovations", "positions apart", "correlation")
-        ax.bar(lags, one.correlation, color=colour("estimate"), width=0.6)
+def _draw_correlation(name: str, prediction: Prediction) -> Drawing:
+    lags = np.arange(1, len(prediction.correlation) + 1)
+    band = 1.96 / np.sqrt(max(len(prediction.innovations_m), 1))
+    with open_canvas(f"white-{name}", _HEIGHT_IN) as canvas:
+        ax = canvas.axes(f"{name}: correlation of innovations", "positions apart", "correlation")
+        ax.bar(lags, prediction.correlation, color=colour("estimate"), width=0.6)
         for sign in (-band, band):
             ax.axhline(sign, color=colour("limit"), linewidth=0.8)
         ax.set_xlim(0, LAGS + 1)
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    outside = int(np.count_nonzero(np.abs(one.correlation) > band))
+    outside = int(np.count_nonzero(np.abs(prediction.correlation) > band))
     label = f"{name}: {outside} of {len(lags)} correlations are outside the 95 % band of white noise"
-    return Drawing(f"white-{name}", drawn.svg, label)
+    return Drawing(f"white-{name}", canvas.svg, label)
 
 
-def _delays(seen: PositionHistory) -> Drawing:
-    with open_canvas("delays", _HEIGHT_IN) as drawn:
-        ax = drawn.axes("Delay from capture to arrival", "time [s]", "delay [ms]")
-        every = slice(None, None, max(1, len(seen.times_s) // _MOST_DELAYS))
-        draw_dots(ax, seen.times_s[every], 1e3 * seen.delays_s[every], "sample", 2.0)
-        ax.set_xlim(float(seen.times_s[0]), float(seen.times_s[-1]))
-        ax.set_ylim(0.0, max(1.0, 1.05e3 * float(seen.delays_s.max())))
-    return Drawing("delays", drawn.svg, "delay of each position over the flight")
+def _draw_delays(positions: PositionHistory) -> Drawing:
+    with open_canvas("delays", _HEIGHT_IN) as canvas:
+        ax = canvas.axes("Delay from capture to arrival", "time [s]", "delay [ms]")
+        thinning = slice(None, None, max(1, len(positions.times_s) // _MAX_DELAYS))
+        draw_dots(ax, positions.times_s[thinning], 1e3 * positions.delays_s[thinning], "sample", 2.0)
+        ax.set_xlim(float(positions.times_s[0]), float(positions.times_s[-1]))
+        ax.set_ylim(0.0, max(1.0, 1.05e3 * float(positions.delays_s.max())))
+    return Drawing("delays", canvas.svg, "delay of each position over the flight")
 
 
-def _runs(found: Identification) -> Drawing:
-    link = found.link
+def _draw_loss_runs(identification: Identification) -> Drawing:
+    link = identification.link
     count = np.arange(len(link.runs))
-    alone = (1.0 - link.loss) * link.loss**count
-    with open_canvas("runs", _HEIGHT_IN) as drawn:
-        ax = drawn.axes("Losses in a row after a position", "lost in a row", "share")
+    independent = (1.0 - link.loss) * link.loss**count
+    with open_canvas("runs", _HEIGHT_IN) as canvas:
+        ax = canvas.axes("Losses in a row after a position", "lost in a row", "share")
         ax.bar(count, link.runs, color=colour("lost"), width=0.6)
-        ax.plot(count, alone, color=colour("estimate"), marker="o", markersize=3)
+        ax.plot(count, independent, color=colour("estimate"), marker="o", markersize=3)
         ax.set_yscale("log")
         ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
         ax.yaxis.set_minor_formatter(NullFormatter())
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     return Drawing(
-        "runs", drawn.svg, "share of the runs of losses as measured (bars) and as independent losses make them"
+        "runs", canvas.svg, "share of the runs of losses as measured (bars) and as independent losses make them"
     )

@@ -1,9 +1,20 @@
 """Likelihood of a recorded axis under one of the plants, by the innovations of a Kalman filter.
 
-The motion is linear, so the filter steps from position to position, however many inputs lie between: what they do is
-summed beforehand. So are its gains, which come of the times alone. All times are counted in instants of half a
-millisecond, so few different lengths occur, and each is a product of powers of one instant's motion. Several parameter
-vectors, of several axes, go through at once: the gradients of three axes cost one pass.
+The two plants are continuous motions under white noise, with the parameters that a flight can show:
+
+    drag-lag              p' = v,  v' = a − c v + b + w,  T a' = g u(t − d) − a,  b' = n
+    velocity-reference    `uavctl.smpc.plant`, with input u(t − d) + e
+
+w, e and n are white. The dead time d shifts the inputs and is no part of the motion.
+
+The motion is linear, so the filter steps from position to position; the effect of all inputs in between is summed
+beforehand. So are its gains, which depend on the times alone. All times are counted in units of half a millisecond, so
+few different lengths occur, and each transition is a product of powers of one unit's. Several parameter vectors, of
+several axes, are filtered at once: the gradients of three axes cost one pass.
+
+ArduPilot limits the jerk of its reference, so its acceleration moves towards each setpoint no faster. North and east
+share one limit (PSC_JERK_XY), so setpoints within it on each axis may exceed it together; the reference never reaches
+those. Down has its own limit (PSC_JERK_Z).
 """
 
 from __future__ import annotations
@@ -18,37 +29,28 @@ from typing import ClassVar, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.lab.identify.history import Stretch
-
-# The two plants of an axis as continuous motion under white noise, with the parameters that a flight may tell.
-#
-#     drag-lag              p' = v,  v' = a − c v + b + w,  T a' = g u(t − d) − a,  b' = n
-#     velocity-reference    `uavctl.smpc.plant`, with input u(t − d) + e
-#
-# w, e and n are white. The dead time d shifts the inputs and is no part of the motion.
-
-
-Array = NDArray[np.float64]
 
 DRAG_LAG, VELOCITY_REFERENCE = "drag-lag", "velocity-reference"
 
 
-class Free(NamedTuple):
-    """A parameter that is fitted, with its bounds."""
+class FreeParameter(NamedTuple):
+    """Fitted parameter with its bounds."""
 
-    name: str  # what it is, with its unit
-    least: float  # least value
-    most: float  # largest value
-    logarithmic: bool  # whether its logarithm is what is fitted
+    name: str  # with its unit
+    lower: float  # lower bound
+    upper: float  # upper bound
+    logarithmic: bool  # whether its logarithm is fitted
 
-    def inside(self, value: float) -> float:
-        """Return the place of a value within the bounds, on the scale of the search."""
-        value = min(max(value, self.least), self.most)
+    def to_search_scale(self, value: float) -> float:
+        """Return a value, clipped to the bounds, on the scale of the search."""
+        value = min(max(value, self.lower), self.upper)
         return math.log(value) if self.logarithmic else value
 
-    def outside(self, place: float) -> float:
-        """Return the value at a place on the scale of the search."""
-        return math.exp(place) if self.logarithmic else place
+    def from_search_scale(self, scaled: float) -> float:
+        """Return the value of a number on the scale of the search."""
+        return math.exp(scaled) if self.logarithmic else scaled
 
 
 class LinearMotion(NamedTuple):
@@ -67,7 +69,7 @@ class AxisModel(Protocol):
         """Name as in `plant.model`."""
 
     @property
-    def free(self) -> tuple[Free, ...]:
+    def free(self) -> tuple[FreeParameter, ...]:
         """Parameters that are fitted."""
 
     @property
@@ -82,14 +84,14 @@ class AxisModel(Protocol):
         """Return the motion for k parameter vectors (k, len(free))."""
 
 
-# The lag's pole stays above the drag's: a motion does not tell which is whose.
-_LAG = Free("lag_s", 0.01, 0.6, True)
-_DRAG = Free("drag_1ps", -0.1, 1.5, False)
-_GAIN = Free("gain", 0.2, 5.0, False)
-_WIND = Free("wind_mps2_rts", 1e-4, 10.0, True)
-_NOISE = Free("noise_m", 1e-3, 1.0, True)
-_INPUT = Free("input_mps2_rts", 1e-3, 10.0, True)
-_DRIFT = Free("drift_mps2_rts", 1e-3, 10.0, True)
+# The lag's pole stays above the drag's, as a motion does not show which pole is which.
+_LAG = FreeParameter("lag_s", 0.01, 0.6, True)
+_DRAG = FreeParameter("drag_1ps", -0.1, 1.5, False)
+_GAIN = FreeParameter("gain", 0.2, 5.0, False)
+_WIND = FreeParameter("wind_mps2_rts", 1e-4, 10.0, True)
+_NOISE = FreeParameter("noise_m", 1e-3, 1.0, True)
+_INPUT = FreeParameter("input_mps2_rts", 1e-3, 10.0, True)
+_DRIFT = FreeParameter("drift_mps2_rts", 1e-3, 10.0, True)
 _MOTION_STD = (10.0, 2.0, 2.0)  # of position, velocity and acceleration
 
 
@@ -102,15 +104,15 @@ class DragLagAxis:
     start_std: ClassVar[tuple[float, ...]] = (*_MOTION_STD, 0.5)
 
     @property
-    def free(self) -> tuple[Free, ...]:
+    def free(self) -> tuple[FreeParameter, ...]:
         """Lag, drag, gain and noises."""
         return (_LAG, _DRAG, _GAIN, _WIND, _NOISE, *((_DRIFT,) if self.drifts else ()))
 
     @property
     def starts(self) -> tuple[dict[str, float], ...]:
         """Two starts, with little and with much drag, as the likelihood has more than one maximum."""
-        rest = {"lag_s": 0.2, "gain": 1.0, "wind_mps2_rts": 0.05, "noise_m": 0.01, "drift_mps2_rts": 0.05}
-        return tuple({**rest, "drag_1ps": drag} for drag in (0.1, 1.0))
+        start_values = {"lag_s": 0.2, "gain": 1.0, "wind_mps2_rts": 0.05, "noise_m": 0.01, "drift_mps2_rts": 0.05}
+        return tuple({**start_values, "drag_1ps": drag} for drag in (0.1, 1.0))
 
     def motion(self, parameters: Array) -> LinearMotion:
         """Return the motion of the states (p, v, a, b)."""
@@ -134,7 +136,7 @@ class ReferenceAxis:
     velocity_1ps: float  # gain kv of the velocity loop [1/s]
     integral_1ps2: float  # integral gain ki of the velocity loop [1/s²]
     name: ClassVar[str] = VELOCITY_REFERENCE
-    free: ClassVar[tuple[Free, ...]] = (_LAG, _DRAG, _WIND, _NOISE, _INPUT, _DRIFT)
+    free: ClassVar[tuple[FreeParameter, ...]] = (_LAG, _DRAG, _WIND, _NOISE, _INPUT, _DRIFT)
     start_std: ClassVar[tuple[float, ...]] = (*_MOTION_STD, 0.5, 0.5, 0.5)
     starts: ClassVar[tuple[dict[str, float], ...]] = (
         {
@@ -158,131 +160,130 @@ class ReferenceAxis:
         a[:, 4] = -a[:, 1]
         a[:, 5, 3:5] = ki * kp, ki
         b[:, 2], b[:, 4] = rate_1ps, 1.0
-        along = np.zeros((3, count, 6))  # what wind, input error and drift push
-        along[0, :, 1], along[0, :, 4] = 1.0, -1.0
-        along[1] = b
-        along[2, :, 2] = along[2, :, 5] = 1.0
-        for push, place in zip(along, (2, 4, 5), strict=True):
-            pushed = np.exp(parameters[:, place])[:, None] * push
-            noise += pushed[:, :, None] * pushed[:, None, :]
+        directions = np.zeros((3, count, 6))  # effect of wind, input error and drift on the states
+        directions[0, :, 1], directions[0, :, 4] = 1.0, -1.0
+        directions[1] = b
+        directions[2, :, 2] = directions[2, :, 5] = 1.0
+        for direction, column in zip(directions, (2, 4, 5), strict=True):
+            scaled_direction = np.exp(parameters[:, column])[:, None] * direction
+            noise += scaled_direction[:, :, None] * scaled_direction[:, None, :]
         return LinearMotion(a, b, noise)
 
 
-def places(model: AxisModel, values: dict[str, float]) -> Array:
+def make_parameters(model: AxisModel, values: dict[str, float]) -> Array:
     """Return the parameter vector of values by name; names that the model lacks are ignored."""
-    return np.array([one.inside(values[one.name]) for one in model.free])
+    return np.array([parameter.to_search_scale(values[parameter.name]) for parameter in model.free])
 
 
-def values(model: AxisModel, parameters: Sequence[float]) -> dict[str, float]:
+def get_values(model: AxisModel, parameters: Sequence[float]) -> dict[str, float]:
     """Return the values of a parameter vector by name."""
-    return {one.name: one.outside(place) for one, place in zip(model.free, parameters, strict=True)}
+    return {
+        parameter.name: parameter.from_search_scale(scaled)
+        for parameter, scaled in zip(model.free, parameters, strict=True)
+    }
 
 
-# Setpoints as ArduPilot takes them: its reference's acceleration moves towards each no faster than a jerk limit.
-#
-# North and east share one limit (PSC_JERK_XY), so setpoints within it on each axis may exceed it together, and are
-# then never reached. Down has its own (PSC_JERK_Z).
+_RAMP_STEP_S = 0.01  # a ramp of 5 m/s³ rises by 0.05 m/s² in it
 
 
-_PART_S = 0.01  # a ramp at 5 m/s³ is 0.05 m/s² high in it
-
-
-def ramped(stretch: Stretch, level_mps3: float, down_mps3: float) -> Stretch:
+def ramp_setpoints(stretch: Stretch, level_mps3: float, down_mps3: float) -> Stretch:
     """Return the stretch with setpoints ramped by a jerk limit instead of steps; it begins at its first setpoint.
 
     Args:
         level_mps3: Jerk limit of north and east together [m/s³].
-        down_mps3: Jerk limit of down [m/s³]; without limits it comes back as it is.
+        down_mps3: Jerk limit of down [m/s³]; without limits the stretch is unchanged.
     """
     if math.isinf(level_mps3) and math.isinf(down_mps3):
         return stretch
     times_s, inputs = [float(stretch.input_times_s[0])], [stretch.inputs_mps2[0]]
     accel = stretch.inputs_mps2[0]
     ends_s = [*stretch.input_times_s[1:], np.inf]
-    for (now_s, end_s), wanted in zip(pairwise([stretch.input_times_s[0], *ends_s]), stretch.inputs_mps2, strict=True):
-        while now_s < end_s and np.any(accel != wanted):
-            part_s = min(_PART_S, end_s - now_s)
-            after = _towards(accel, wanted, level_mps3 * part_s, down_mps3 * part_s)
+    for (now_s, end_s), setpoint in zip(
+        pairwise([stretch.input_times_s[0], *ends_s]), stretch.inputs_mps2, strict=True
+    ):
+        while now_s < end_s and np.any(accel != setpoint):
+            step_s = min(_RAMP_STEP_S, end_s - now_s)
+            next_accel = _step_towards(accel, setpoint, level_mps3 * step_s, down_mps3 * step_s)
             times_s.append(now_s)
-            inputs.append(0.5 * (accel + after))
-            accel, now_s = after, now_s + part_s
+            inputs.append(0.5 * (accel + next_accel))
+            accel, now_s = next_accel, now_s + step_s
         if now_s < end_s:
             times_s.append(now_s)
-            inputs.append(wanted)
+            inputs.append(setpoint)
     return replace(stretch, input_times_s=np.array(times_s), inputs_mps2=np.array(inputs))
 
 
-def _towards(accel: Array, wanted: Array, level_mps2: float, down_mps2: float) -> Array:
-    """Return the acceleration after a step towards the wanted one, limited in its change."""
-    change = wanted - accel
+def _step_towards(accel: Array, setpoint: Array, level_mps2: float, down_mps2: float) -> Array:
+    """Return the acceleration after a step of limited size towards the setpoint."""
+    change = setpoint - accel
     level = float(np.hypot(change[0], change[1]))
-    share = min(1.0, level_mps2 / level) if level > 0.0 else 1.0
-    steps = np.array([share * change[0], share * change[1], np.clip(change[2], -down_mps2, down_mps2)])
-    return np.where(np.abs(change - steps) > 0.0, accel + steps, wanted)
+    level_share = min(1.0, level_mps2 / level) if level > 0.0 else 1.0
+    steps = np.array([level_share * change[0], level_share * change[1], np.clip(change[2], -down_mps2, down_mps2)])
+    return np.where(np.abs(change - steps) > 0.0, accel + steps, setpoint)
 
 
 Counts = NDArray[np.int64]
 
 OUTLIER = 5.0  # standard deviations beyond which an innovation counts by its size and not by its square (Huber)
-INSTANT_S = 5e-4  # a vehicle at 1.5 m/s goes 0.4 mm in half of it, less than the noise of any camera
-_ORDER = 8  # of the series of one instant, in which no lag is shorter than twenty
+TIME_UNIT_S = 5e-4  # a vehicle at 1.5 m/s goes 0.4 mm in half of it, less than the noise of any camera
+_SERIES_ORDER = 8  # of the series of one time unit; every lag is at least twenty units long
 _GAUSS_X, _GAUSS_W = np.polynomial.legendre.leggauss(3)
 
 
 @dataclass(frozen=True, eq=False)
 class Timeline:
-    """A stretch of some axes, cut wherever an input changes or a position was captured."""
+    """Stretch of some axes, cut at each change of an input and at each capture."""
 
-    lengths: Counts  # (n,) of the parts [instants]
-    inputs_mps2: Array  # (n, axes), held in each [m/s²]
-    measured: Counts  # (m,), the part at whose end each position was captured
+    lengths: Counts  # (n,) of the segments [time units]
+    inputs_mps2: Array  # (n, axes), constant in each [m/s²]
+    measured: Counts  # (m,), the segment at whose end each position was captured
     positions_m: Array  # (m, axes) [m]
-    counted: NDArray[np.bool_]  # (m,), whether each counts for the likelihood; the filter takes all
+    counts_for_fit: NDArray[np.bool_]  # (m,), whether each counts for the likelihood; the filter uses all
 
     @cached_property
     def captured(self) -> Counts:
-        """Capture time of each position, counted from the first one (m,) [instants]."""
+        """Capture time of each position, from the first one (m,) [time units]."""
         return np.cumsum(self.lengths)[self.measured]
 
     @cached_property
     def spacings(self) -> tuple[Counts, Counts]:
-        """Distinct times between two positions [instants], and the index of each into them (m - 1,)."""
-        different, which = np.unique(np.diff(self.captured), return_inverse=True)
-        return different, which
+        """Distinct times between two positions [time units], and the index of each spacing into them (m - 1,)."""
+        distinct, index_of = np.unique(np.diff(self.captured), return_inverse=True)
+        return distinct, index_of
 
     @cached_property
-    def pieces(self) -> tuple[Counts, Counts, Counts]:
-        """Distinct lengths of pieces and of their distance to the next position; each one's index into them (n,)."""
+    def segments(self) -> tuple[Counts, Counts, Counts]:
+        """Distinct pairs of a segment's length and its distance to the next position, and each segment's index (n,)."""
         ends = np.cumsum(self.lengths)
         rests = self.captured[np.searchsorted(self.measured, np.arange(len(ends)))] - ends
-        most = int(rests.max()) + 1
-        different, which = np.unique(self.lengths * most + rests, return_inverse=True)
-        return different // most, different % most, which
+        base = int(rests.max()) + 1
+        distinct, index_of = np.unique(self.lengths * base + rests, return_inverse=True)
+        return distinct // base, distinct % base, index_of
 
 
-class Advance(NamedTuple):
+class Transition(NamedTuple):
     """Transition of the motion over different lengths, for k parameter vectors."""
 
-    move: Array  # (lengths, k, n, n)
-    push: Array  # (lengths, k, n), by a held input of one
-    spread: Array  # covariance that the noise makes (lengths, k, n, n)
+    transition: Array  # (lengths, k, n, n)
+    input_effect: Array  # (lengths, k, n), of a constant input of 1
+    noise_cov: Array  # covariance of the noise (lengths, k, n, n)
 
 
 @dataclass(frozen=True, eq=False)
-class Filtered:
+class FilterResult:
     """States and innovations of a timeline under one parameter vector."""
 
-    driven: Array  # (m, n), what the inputs alone have done since the begin
-    rest: Array  # (m, n), the state without that, with the position there
-    innovations_m: Array  # (m,): position minus what was predicted of it, in the order of capture [m]
-    stds_m: Array  # (m,), standard deviation that the filter gives each [m]
+    driven: Array  # (m, n), effect of the inputs alone since the start
+    undriven: Array  # (m, n), corrected state minus `driven`
+    innovations_m: Array  # (m,), position minus its prediction [m]
+    stds_m: Array  # (m,), their standard deviations by the filter [m]
 
 
-class Tried(NamedTuple):
-    """Parameter vectors of an axis, to be tried."""
+class Trial(NamedTuple):
+    """Parameter vectors of an axis whose likelihood is computed."""
 
-    place: int  # of the axis among those of the timeline
-    model: AxisModel  # the plant, with as many states as all that are tried in one pass
+    axis_index: int  # column of the axis in the timeline
+    model: AxisModel  # all trials of one pass have the same number of states
     parameters: Array  # (k, l)
 
 
@@ -290,180 +291,191 @@ class Likelihood(NamedTuple):
     """Likelihood of an axis' positions under k parameter vectors."""
 
     deviances: Array  # -2 log likelihood, up to a constant (k,)
-    innovations_m: Array  # of each position that counts (m, k) [m]
-    variances_m2: Array  # that the filter gives them (m, k) [m²]
+    innovations_m: Array  # of the positions that count (m, k) [m]
+    variances_m2: Array  # of these innovations, by the filter (m, k) [m²]
 
 
-class Passed(NamedTuple):
+class FilterPass(NamedTuple):
     """Result of one pass of the filter over a timeline, for k parameter vectors."""
 
     deviances: Array  # -2 log likelihood, up to a constant (k,)
-    states: Array  # with the position there (m, k, n)
+    states: Array  # after the correction by each position (m, k, n)
     innovations_m: Array  # (m, k) [m]
     variances_m2: Array  # of the innovations (m, k) [m²]
 
 
-def timeline(stretch: Stretch, axes: Sequence[int], dead_time_s: float) -> Timeline:
-    """Cut a stretch for some axes, with inputs that act `dead_time_s` after they were sent."""
-    chosen = list(axes)
-    captured, first = np.unique(_instants(stretch.times_s), return_index=True)
-    changes = _instants(stretch.input_times_s + dead_time_s)
+def make_timeline(stretch: Stretch, axes: Sequence[int], dead_time_s: float) -> Timeline:
+    """Make the timeline of some axes, with inputs that act `dead_time_s` after they were sent."""
+    columns = list(axes)
+    captured, first_index = np.unique(_to_time_units(stretch.times_s), return_index=True)
+    changes = _to_time_units(stretch.input_times_s + dead_time_s)
     begin, end = captured[0], captured[-1]
     cuts = np.unique(np.concatenate([changes[(changes > begin) & (changes < end)], captured]))
-    held = np.clip(np.searchsorted(changes, cuts[:-1], side="right") - 1, 0, None)
+    input_index = np.clip(np.searchsorted(changes, cuts[:-1], side="right") - 1, 0, None)
     return Timeline(
         lengths=np.concatenate([[0], np.diff(cuts)]),
-        inputs_mps2=np.vstack([np.zeros((1, len(chosen))), stretch.inputs_mps2[held][:, chosen]]),
+        inputs_mps2=np.vstack([np.zeros((1, len(columns))), stretch.inputs_mps2[input_index][:, columns]]),
         measured=np.searchsorted(cuts, captured),
-        positions_m=stretch.positions_m[first][:, chosen],
-        counted=np.ones(len(first), dtype=np.bool_) if stretch.counted is None else stretch.counted[first],
+        positions_m=stretch.positions_m[first_index][:, columns],
+        counts_for_fit=np.ones(len(first_index), dtype=np.bool_)
+        if stretch.counts_for_fit is None
+        else stretch.counts_for_fit[first_index],
     )
 
 
-def likelihood(parts: Sequence[Timeline], tried: Sequence[Tried]) -> tuple[Likelihood, ...]:
-    """Return the likelihood of all parts of each axis that is tried, computed in one pass."""
-    counts = [len(one.parameters) for one in tried]
-    place = np.repeat([one.place for one in tried], counts)
-    motion = LinearMotion(*map(np.concatenate, zip(*(one.model.motion(one.parameters) for one in tried), strict=True)))
-    seen_var = np.concatenate([_seen_var(one.model, one.parameters) for one in tried])
-    passed = [_pass(part, place, motion, seen_var, tried[0].model.start_std) for part in parts]
-    edges = np.cumsum([0, *counts])
+def compute_likelihood(parts: Sequence[Timeline], trials: Sequence[Trial]) -> tuple[Likelihood, ...]:
+    """Return the likelihood of each trial over all parts, computed in one pass."""
+    counts = [len(trial.parameters) for trial in trials]
+    axis_indices = np.repeat([trial.axis_index for trial in trials], counts)
+    motion = LinearMotion(
+        *map(np.concatenate, zip(*(trial.model.motion(trial.parameters) for trial in trials), strict=True))
+    )
+    noise_variance = np.concatenate([_get_noise_variance(trial.model, trial.parameters) for trial in trials])
+    passes = [_run_pass(part, axis_indices, motion, noise_variance, trials[0].model.start_std) for part in parts]
+    bounds = np.cumsum([0, *counts])
 
-    def counted(rows: Sequence[Array]) -> list[Array]:
-        return [row[part.counted] for row, part in zip(rows, parts, strict=True)]
+    def select_counted(rows: Sequence[Array]) -> list[Array]:
+        return [row[part.counts_for_fit] for row, part in zip(rows, parts, strict=True)]
 
     return tuple(
         Likelihood(
-            deviances=np.sum([one.deviances[begin:end] for one in passed], axis=0),
-            innovations_m=np.concatenate(counted([one.innovations_m[:, begin:end] for one in passed])),
-            variances_m2=np.concatenate(counted([one.variances_m2[:, begin:end] for one in passed])),
+            deviances=np.sum([trial.deviances[begin:end] for trial in passes], axis=0),
+            innovations_m=np.concatenate(select_counted([trial.innovations_m[:, begin:end] for trial in passes])),
+            variances_m2=np.concatenate(select_counted([trial.variances_m2[:, begin:end] for trial in passes])),
         )
-        for begin, end in pairwise(edges)
+        for begin, end in pairwise(bounds)
     )
 
 
-def filtered(part: Timeline, model: AxisModel, parameters: Array) -> Filtered:
+def run_filter(part: Timeline, model: AxisModel, parameters: Array) -> FilterResult:
     """Return states and innovations of one part's first axis under one parameter vector (l,)."""
-    motion, place = model.motion(parameters[None]), np.zeros(1, dtype=np.int64)
-    passed = _pass(part, place, motion, _seen_var(model, parameters[None]), model.start_std)
-    driven = _driven(part, place, motion)[:, 0]
-    return Filtered(
-        driven, passed.states[:, 0] - driven, passed.innovations_m[:, 0], np.sqrt(passed.variances_m2[:, 0])
+    motion, axis_indices = model.motion(parameters[None]), np.zeros(1, dtype=np.int64)
+    result = _run_pass(part, axis_indices, motion, _get_noise_variance(model, parameters[None]), model.start_std)
+    driven = _compute_driven_states(part, axis_indices, motion)[:, 0]
+    return FilterResult(
+        driven, result.states[:, 0] - driven, result.innovations_m[:, 0], np.sqrt(result.variances_m2[:, 0])
     )
 
 
-def advance(motion: LinearMotion, lengths: Counts) -> Advance:
-    """Return the transition over some lengths (n,) [instants], by the binary digits of each."""
-    move, push, spread = _instant(motion)
-    count, size = len(lengths), move.shape[-1]
-    moves = np.tile(np.eye(size), (count, len(move), 1, 1))
-    pushes, spreads = np.zeros((count, *push.shape)), np.zeros((count, *spread.shape))
+def compute_transition(motion: LinearMotion, lengths: Counts) -> Transition:
+    """Return the transition over some lengths (n,) [time units], by their binary digits."""
+    transition, input_effect, noise_cov = _compute_unit_transition(motion)
+    count, size = len(lengths), transition.shape[-1]
+    transitions = np.tile(np.eye(size), (count, len(transition), 1, 1))
+    input_effects, noise_covs = np.zeros((count, *input_effect.shape)), np.zeros((count, *noise_cov.shape))
     for digit in range(int(lengths.max(initial=0)).bit_length()):
-        chosen = (lengths >> digit) & 1 == 1
-        moves[chosen] = move @ moves[chosen]
-        pushes[chosen] = push + (move @ pushes[chosen][..., None])[..., 0]
-        spreads[chosen] = spread + move @ spreads[chosen] @ move.swapaxes(1, 2)
-        push = push + (move @ push[..., None])[..., 0]
-        spread = spread + move @ spread @ move.swapaxes(1, 2)
-        move = move @ move
-    return Advance(moves, pushes, spreads)
+        has_digit = (lengths >> digit) & 1 == 1
+        transitions[has_digit] = transition @ transitions[has_digit]
+        input_effects[has_digit] = input_effect + (transition @ input_effects[has_digit][..., None])[..., 0]
+        noise_covs[has_digit] = noise_cov + transition @ noise_covs[has_digit] @ transition.swapaxes(1, 2)
+        input_effect = input_effect + (transition @ input_effect[..., None])[..., 0]
+        noise_cov = noise_cov + transition @ noise_cov @ transition.swapaxes(1, 2)
+        transition = transition @ transition
+    return Transition(transitions, input_effects, noise_covs)
 
 
-def _instants(times_s: Array) -> Counts:
-    return np.rint(times_s / INSTANT_S).astype(np.int64)
+def _to_time_units(times_s: Array) -> Counts:
+    return np.rint(times_s / TIME_UNIT_S).astype(np.int64)
 
 
-def _instant(motion: LinearMotion) -> tuple[Array, Array, Array]:
-    """Return transition, effect of a held input, and covariance of the noise, for one instant."""
-    move, integral = _series(motion.a, INSTANT_S)
-    spread = np.zeros_like(motion.noise)
+def _compute_unit_transition(motion: LinearMotion) -> tuple[Array, Array, Array]:
+    """Return transition, effect of a constant input, and covariance of the noise, for one time unit."""
+    transition, integral = _compute_exponential(motion.a, TIME_UNIT_S)
+    noise_cov = np.zeros_like(motion.noise)
     for node, weight in zip(_GAUSS_X, _GAUSS_W, strict=True):
-        left, _ = _series(motion.a, INSTANT_S * (1.0 + float(node)) / 2.0)
-        spread += INSTANT_S * float(weight) / 2.0 * (left @ motion.noise @ left.swapaxes(1, 2))
-    return move, (integral @ motion.b[..., None])[..., 0], spread
+        partial, _ = _compute_exponential(motion.a, TIME_UNIT_S * (1.0 + float(node)) / 2.0)
+        noise_cov += TIME_UNIT_S * float(weight) / 2.0 * (partial @ motion.noise @ partial.swapaxes(1, 2))
+    return transition, (integral @ motion.b[..., None])[..., 0], noise_cov
 
 
-def _series(slope: Array, time_s: float) -> tuple[Array, Array]:
+def _compute_exponential(slope: Array, time_s: float) -> tuple[Array, Array]:
     """Return exp(A t) and its integral from 0 to t, (k, n, n) each."""
     term = np.broadcast_to(np.eye(slope.shape[-1]), slope.shape)
     power, integral = term.copy(), time_s * term
-    for order in range(1, _ORDER + 1):
+    for order in range(1, _SERIES_ORDER + 1):
         term = term @ slope * (time_s / order)
         power += term
         integral = integral + term * (time_s / (order + 1))
     return power, integral
 
 
-def _seen_var(model: AxisModel, parameters: Array) -> Array:
+def _get_noise_variance(model: AxisModel, parameters: Array) -> Array:
     """Return the variance of a position's noise (k,) [m²]."""
-    return np.exp(2.0 * parameters[:, [one.name for one in model.free].index("noise_m")])
+    return np.exp(2.0 * parameters[:, [parameter.name for parameter in model.free].index("noise_m")])
 
 
-def _pass(part: Timeline, place: Counts, motion: LinearMotion, seen_var: Array, start_std: Sequence[float]) -> Passed:
-    """Run the filter over a part, for each of k parameter vectors of the axes at `place` (k,)."""
-    different, which = part.spacings
-    moves, _, spreads = advance(motion, different)
-    gains, variances = _gains(moves, spreads, which, seen_var, start_std)
-    pushed = _pushed(part, place, motion)
-    positions_m = part.positions_m[:, place]
-    most = OUTLIER * np.sqrt(variances)
-    least = -most
+def _run_pass(
+    part: Timeline, axis_indices: Counts, motion: LinearMotion, noise_variance: Array, start_std: Sequence[float]
+) -> FilterPass:
+    """Run the filter over a part, for k parameter vectors of the axes `axis_indices` (k,)."""
+    lengths, index_of = part.spacings
+    transitions, _, noise_covs = compute_transition(motion, lengths)
+    gains, variances = _compute_gains(transitions, noise_covs, index_of, noise_variance, start_std)
+    input_effects = _compute_input_effects(part, axis_indices, motion)
+    positions_m = part.positions_m[:, axis_indices]
+    upper = OUTLIER * np.sqrt(variances)
+    lower = -upper
     state = np.zeros((*motion.b.shape, 1))
     state[:, 0, 0] = positions_m[0]
     innovations, states = np.empty_like(variances), np.empty_like(gains)
     for index, position_m in enumerate(positions_m):
         if index:
-            state = moves[which[index - 1]] @ state
-            state += pushed[index]
+            state = transitions[index_of[index - 1]] @ state
+            state += input_effects[index]
         innovation = position_m - state[:, 0, 0]
         innovations[index] = innovation
-        # Beyond the bounds an innovation counts by its size: what moves the state is no larger than they are.
-        trusted = np.minimum(np.maximum(innovation, least[index]), most[index])
-        state = state + (gains[index] * trusted[:, None])[:, :, None]
+        # Huber: beyond the bounds an innovation corrects the state no more than at them.
+        clipped = np.minimum(np.maximum(innovation, lower[index]), upper[index])
+        state = state + (gains[index] * clipped[:, None])[:, :, None]
         states[index] = state[:, :, 0]
-    size = np.abs(innovations) / np.sqrt(variances)
-    likely = np.where(size < OUTLIER, size**2, OUTLIER * (2.0 * size - OUTLIER)) + np.log(variances)
-    return Passed(likely[part.counted].sum(axis=0), states, innovations, variances)
+    scaled = np.abs(innovations) / np.sqrt(variances)
+    deviances = np.where(scaled < OUTLIER, scaled**2, OUTLIER * (2.0 * scaled - OUTLIER)) + np.log(variances)
+    return FilterPass(deviances[part.counts_for_fit].sum(axis=0), states, innovations, variances)
 
 
-def _gains(
-    moves: Array, spreads: Array, which: Counts, seen_var: Array, start_std: Sequence[float]
+def _compute_gains(
+    transitions: Array, noise_covs: Array, index_of: Counts, noise_variance: Array, start_std: Sequence[float]
 ) -> tuple[Array, Array]:
     """Return gain (m, k, n) and variance of the innovation (m, k) at each position; they depend on the times alone."""
-    turned = np.ascontiguousarray(moves.swapaxes(-1, -2))
-    size, count = len(start_std), len(seen_var)
+    transposed = np.ascontiguousarray(transitions.swapaxes(-1, -2))
+    size, count = len(start_std), len(noise_variance)
     cov = np.tile(np.diag(np.square(start_std)), (count, 1, 1))
-    gains, variances = np.empty((len(which) + 1, count, size)), np.empty((len(which) + 1, count))
-    for index in range(len(which) + 1):
+    gains, variances = np.empty((len(index_of) + 1, count, size)), np.empty((len(index_of) + 1, count))
+    for index in range(len(index_of) + 1):
         if index:
-            kind = which[index - 1]
-            cov = moves[kind] @ cov @ turned[kind]
-            cov += spreads[kind]
+            length_index = index_of[index - 1]
+            cov = transitions[length_index] @ cov @ transposed[length_index]
+            cov += noise_covs[length_index]
         variance = variances[index]
-        np.add(cov[:, 0, 0], seen_var, out=variance)
+        np.add(cov[:, 0, 0], noise_variance, out=variance)
         gain = gains[index]
         np.divide(cov[:, :, 0], variance[:, None], out=gain)
         cov = cov - gain[:, :, None] * cov[:, None, 0, :]
     return gains, variances
 
 
-def _pushed(part: Timeline, place: Counts, motion: LinearMotion) -> Array:
+def _compute_input_effects(part: Timeline, axis_indices: Counts, motion: LinearMotion) -> Array:
     """Return the effect at each position of the inputs since the position before (m, k, n, 1)."""
-    lengths, rests, which = part.pieces
-    different, held = np.unique(lengths, return_inverse=True)
-    pushes = advance(motion, different).push[held]
-    different, after = np.unique(rests, return_inverse=True)
-    carried = (advance(motion, different).move[after] @ pushes[..., None])[which]
-    carried *= part.inputs_mps2[:, place, None, None]
-    return np.add.reduceat(carried, np.concatenate([[0], part.measured[:-1] + 1]), axis=0)
+    lengths, distances, index_of = part.segments
+    distinct, input_index = np.unique(lengths, return_inverse=True)
+    effects = compute_transition(motion, distinct).input_effect[input_index]
+    distinct, distance_index = np.unique(distances, return_inverse=True)
+    effects_at_positions = (compute_transition(motion, distinct).transition[distance_index] @ effects[..., None])[
+        index_of
+    ]
+    effects_at_positions *= part.inputs_mps2[:, axis_indices, None, None]
+    return np.add.reduceat(effects_at_positions, np.concatenate([[0], part.measured[:-1] + 1]), axis=0)
 
 
-def _driven(part: Timeline, place: Counts, motion: LinearMotion) -> Array:
+def _compute_driven_states(part: Timeline, axis_indices: Counts, motion: LinearMotion) -> Array:
     """Return the effect at each position of all inputs (m, k, n)."""
-    different, which = part.spacings
-    moves, pushed = advance(motion, different).move, _pushed(part, place, motion)
-    states = np.empty(pushed.shape)
-    state = states[0] = pushed[0]
-    for index, kind in enumerate(which):
-        state = states[index + 1] = moves[kind] @ state + pushed[index + 1]
+    lengths, index_of = part.spacings
+    transitions, input_effects = (
+        compute_transition(motion, lengths).transition,
+        _compute_input_effects(part, axis_indices, motion),
+    )
+    states = np.empty(input_effects.shape)
+    state = states[0] = input_effects[0]
+    for index, length_index in enumerate(index_of):
+        state = states[index + 1] = transitions[length_index] @ state + input_effects[index + 1]
     return states[..., 0]

@@ -1,4 +1,4 @@
-"""Result of an identification: the plant, the link, and the configuration with both."""
+"""Result of an identification: the plant, the link (rate, losses, delays), and the configuration with both."""
 
 from __future__ import annotations
 
@@ -17,81 +17,85 @@ from uavctl.errors import RecordingError
 from uavctl.flight.link_estimate import compute_loss_std
 from uavctl.lab.identify.fit import (
     AHEAD_S,
-    TRIES,
+    MAX_TRIES,
     AxisFit,
     ChosenPlant,
     Prediction,
     choose_dead_time,
+    compute_standard_errors,
     is_worse,
     predict,
-    standard_errors,
 )
-from uavctl.lab.identify.history import FlightHistory, PositionHistory, Stretch, stretches, thinned
-from uavctl.lab.identify.response import DRAG_LAG, VELOCITY_REFERENCE, AxisModel, DragLagAxis, ReferenceAxis, ramped
+from uavctl.lab.identify.history import FlightHistory, PositionHistory, Stretch, find_stretches, thin_positions
+from uavctl.lab.identify.response import (
+    DRAG_LAG,
+    VELOCITY_REFERENCE,
+    AxisModel,
+    DragLagAxis,
+    ReferenceAxis,
+    ramp_setpoints,
+)
 from uavctl.smpc.plant import AXES
 
-# What the link did: rate, losses and their runs, delays.
-
-
 _QUANTILES = (0.0, 0.05, 0.5, 0.95, 0.99)
-_BURSTS = 3.0  # standard deviations of the number of runs, below which losses come in bursts
-_ROUND = 4
-# A run of losses is an outage, not the link's own, if it lasts a second and runs like the others make none in a
-# thousand such flights.
-_OUTAGE_S, _OUTAGE_CHANCE, _LEAST_RUNS = 1.0, 1e-3, 8
+_BURST_STDS = 3.0  # standard deviations of the number of runs, below which losses come in bursts
+_TIME_DIGITS = 4
+# A run of losses is an outage, and no loss of the link, if it lasts a second and the distribution of the other runs
+# makes such a run in less than one of a thousand flights.
+_OUTAGE_S, _OUTAGE_CHANCE, _MIN_RUNS = 1.0, 1e-3, 8
 
 
 @dataclass(frozen=True)
 class LinkFit:
     """Losses and delays of positions."""
 
-    rate_hz: float  # positions sent a second: those that came, and their share of the lost messages
-    received: int  # messages of the positions' sender that came
-    lost: int  # messages between the first and the last that did not, in outages too
-    loss: float  # share of messages that did not come, outages apart
-    loss_std: float  # its standard error: losses that come in bursts tell less than as many that are each by themselves
-    outages_s: tuple[float, ...]  # how long nothing came, where that was no burst of the link's [s]
-    runs: tuple[float, ...]  # share of the runs of 0, 1, ... losses after a message that came.
-    burst_statistic: float  # how many standard deviations fewer runs there are than independent losses would make
+    rate_hz: float  # positions sent a second: received ones, and their share of the lost messages
+    received: int  # received messages of the positions' sender
+    lost: int  # lost messages between the first and the last, also in outages
+    loss: float  # share of lost messages, without outages
+    loss_std: float  # its standard error, larger for losses in bursts
+    outages_s: tuple[float, ...]  # lengths of outages [s]
+    runs: tuple[float, ...]  # share of the runs of 0, 1, ... losses after a received message
+    burst_statistic: float  # runs missing from those of independent losses [standard deviations]
     bursts: bool  # whether losses come in bursts
     delay_s: float  # shortest delay [s]
     jitter_s: float  # from there to the delay that 99 % of positions keep [s]
     delay_quantiles_s: tuple[float, ...]  # at 0, 5, 50, 95 and 99 % [s]
 
 
-def fit_link(seen: PositionHistory, missing: NDArray[np.int64]) -> LinkFit:
+def fit_link(positions: PositionHistory, missing: NDArray[np.int64]) -> LinkFit:
     """Fit the link by the messages' numbers, capture stamps and arrival times.
 
     Args:
-        missing: Messages lost after each one that came.
+        missing: Number of lost messages after each received one.
     """
-    lost, came = int(missing.sum()), len(missing) + 1
-    length_s = float(seen.times_s[-1] - seen.times_s[0])
-    rate_hz = (len(seen.times_s) - 1) / length_s / (1.0 - lost / (lost + came))
-    outages = _outages(missing, rate_hz)
-    usual = missing[~outages]
-    loss = int(usual.sum()) / (int(usual.sum()) + came)
-    statistic = _burst_statistic(usual)
-    quantiles = tuple(round(float(q), _ROUND) for q in np.quantile(seen.delays_s, _QUANTILES))
-    counts = np.bincount(np.minimum(usual, MAX_LOSS_RUN), minlength=1)
+    lost, received_count = int(missing.sum()), len(missing) + 1
+    length_s = float(positions.times_s[-1] - positions.times_s[0])
+    rate_hz = (len(positions.times_s) - 1) / length_s / (1.0 - lost / (lost + received_count))
+    is_outage = _find_outages(missing, rate_hz)
+    usual_losses = missing[~is_outage]
+    loss = int(usual_losses.sum()) / (int(usual_losses.sum()) + received_count)
+    statistic = _compute_burst_statistic(usual_losses)
+    quantiles = tuple(round(float(q), _TIME_DIGITS) for q in np.quantile(positions.delays_s, _QUANTILES))
+    counts = np.bincount(np.minimum(usual_losses, MAX_LOSS_RUN), minlength=1)
     return LinkFit(
         rate_hz=rate_hz,
-        received=came,
+        received=received_count,
         lost=lost,
         loss=loss,
-        loss_std=compute_loss_std(usual),
-        outages_s=tuple(round(float(n) / rate_hz, _ROUND) for n in missing[outages]),
+        loss_std=compute_loss_std(usual_losses),
+        outages_s=tuple(round(float(n) / rate_hz, _TIME_DIGITS) for n in missing[is_outage]),
         runs=tuple((counts / max(int(counts.sum()), 1)).tolist()),
         burst_statistic=statistic,
-        bursts=statistic > _BURSTS,
+        bursts=statistic > _BURST_STDS,
         delay_s=max(0.0, quantiles[0]),
-        jitter_s=round(max(0.0, quantiles[-1] - max(0.0, quantiles[0])), _ROUND),
+        jitter_s=round(max(0.0, quantiles[-1] - max(0.0, quantiles[0])), _TIME_DIGITS),
         delay_quantiles_s=quantiles,
     )
 
 
-def loss_words(link: LinkFit) -> str:
-    """Return the loss in words, with its uncertainty and the outages beside it."""
+def describe_loss(link: LinkFit) -> str:
+    """Describe the loss with its uncertainty, and the outages."""
     text = f"{link.loss:.1%} ± {link.loss_std:.1%}, {'in bursts' if link.bursts else 'each by itself'}"
     if not link.outages_s:
         return text
@@ -99,40 +103,37 @@ def loss_words(link: LinkFit) -> str:
     return f"{text}; outages: {outages}"
 
 
-def _outages(missing: NDArray[np.int64], rate_hz: float) -> NDArray[np.bool_]:
+def _find_outages(missing: NDArray[np.int64], rate_hz: float) -> NDArray[np.bool_]:
     """Return which runs of losses are longer than a geometric distribution of the others explains."""
-    found = np.zeros(len(missing), dtype=np.bool_)
-    for place in np.argsort(missing)[::-1].tolist():
-        others = missing[(missing > 0) & ~found]
-        if len(others) <= _LEAST_RUNS or missing[place] < _OUTAGE_S * rate_hz:
+    is_outage = np.zeros(len(missing), dtype=np.bool_)
+    for index in np.argsort(missing)[::-1].tolist():
+        others = missing[(missing > 0) & ~is_outage]
+        if len(others) <= _MIN_RUNS or missing[index] < _OUTAGE_S * rate_hz:
             break
-        mean = (float(others.sum() - missing[place]) + 1.0) / (len(others) - 1)
-        if len(others) * (1.0 - 1.0 / mean) ** float(missing[place] - 1) > _OUTAGE_CHANCE:
+        mean = (float(others.sum() - missing[index]) + 1.0) / (len(others) - 1)
+        if len(others) * (1.0 - 1.0 / mean) ** float(missing[index] - 1) > _OUTAGE_CHANCE:
             break
-        found[place] = True
-    return found
+        is_outage[index] = True
+    return is_outage
 
 
-def _burst_statistic(missing: NDArray[np.int64]) -> float:
+def _compute_burst_statistic(missing: NDArray[np.int64]) -> float:
     """Return the runs test of Wald and Wolfowitz on arrivals and losses; positive if there are too few runs."""
-    lost, came = float(missing.sum()), float(len(missing))
-    if lost < 2 or came < 2:
+    lost, received_count = float(missing.sum()), float(len(missing))
+    if lost < 2 or received_count < 2:
         return 0.0
-    total = lost + came
+    total = lost + received_count
     runs = 2.0 * np.count_nonzero(missing)
-    mean = 2.0 * lost * came / total + 1.0
+    mean = 2.0 * lost * received_count / total + 1.0
     variance = (mean - 1.0) * (mean - 2.0) / (total - 1.0)
     return float((mean - runs) / np.sqrt(variance))
 
 
-# What was identified, and the configuration that it makes.
-
-
-_LEAST_INPUT_STD = 0.02  # m/s²; an axis that was hardly steered shows nothing of how it answers
+_MIN_INPUT_STD = 0.02  # m/s²; below it, an axis does not show its response
 _DIGITS = 4
-_JERK_AS_SHIPPED_MPS3 = 5.0
-_AS_SHIPPED = {"XY": (1.0, 2.0, 1.0), "Z": (1.0, 5.0, 1.0)}  # position, velocity, integral
-_OF_OTHER_MODELS = (
+_DEFAULT_JERK_MPS3 = 5.0
+_DEFAULT_GAINS = {"XY": (1.0, 2.0, 1.0), "Z": (1.0, 5.0, 1.0)}  # position, velocity, integral
+_MODEL_KEYS = (
     *("a", "b", "e", "w", "position_index", "velocity_index", "accel_per_input"),
     *("gain", "position_1ps", "velocity_1ps", "integral_1ps2", "input_std_mps2", "force_drift_mps2_rts"),
 )
@@ -154,11 +155,6 @@ class AxisResponse(msgspec.Struct, frozen=True, kw_only=True):
     gain_std: float | None
     residual_std_m: float
     r2: float
-
-    @property
-    def is_well_predicted(self) -> bool:
-        """Whether at least half of the motion of the next second is predicted."""
-        return self.r2 >= 0.5
 
 
 class Candidate(msgspec.Struct, frozen=True, kw_only=True):
@@ -193,164 +189,172 @@ class Identified(msgspec.Struct, frozen=True, kw_only=True):
 class Identification:
     """Result of an identification, the configuration with it, and the data that it is from."""
 
-    result: Identified  # what is told
+    result: Identified
     config: Config  # the configuration with it
-    link: LinkFit  # what the link did
-    predictions: tuple[Prediction, ...]  # what the plots show, each axis
+    link: LinkFit
+    predictions: tuple[Prediction, ...]  # of each axis, for plots
     # The flight as it was fitted to: positions thinned, setpoints ramped as the autopilot does
     flown: tuple[Stretch, ...]
     fits: tuple[AxisFit, ...]  # the chosen plant of each axis
 
 
-def fits_of(history: FlightHistory, config: Config) -> int:
-    """Return how often `identify` advances."""
-    return TRIES * len(kinds_of(history, config))
+def count_fits(history: FlightHistory, config: Config) -> int:
+    """Return how often `identify` calls `on_fit`."""
+    return MAX_TRIES * len(get_candidate_models(history, config))
 
 
-def identify(history: FlightHistory, config: Config, advance: Callable[[], None]) -> Identification:
+def identify(history: FlightHistory, config: Config, on_fit: Callable[[], None]) -> Identification:
     """Identify plant and link of a flight.
 
     Args:
         config: Configuration that the result goes into; its kind of plant, axes and Δt are kept.
-        advance: Called as often as `fits_of` says.
+        on_fit: Called after each fit, `count_fits` times.
 
     Raises:
         RecordingError: The flight does not show enough.
     """
     dt_s = config.plant.dt_s
-    flown = flown_stretches(history, config)
+    flown = make_fitted_stretches(history, config)
     axes = [AXES.index(name) for name in config.plant.axes]
     for axis in axes:
         _check_moved(flown, axis)
-    kinds = kinds_of(history, config)
-    candidates = [choose_dead_time(flown, axes, kind, advance) for kind in kinds]
+    models = get_candidate_models(history, config)
+    candidates = [choose_dead_time(flown, axes, axis_models, on_fit) for axis_models in models]
     chosen = candidates[0]
     predictions = [predict(flown, axis, fit) for axis, fit in zip(axes, chosen.fits, strict=True)]
     responses = tuple(
-        _response(name, flown, fit, prediction, dt_s)
+        _make_response(name, flown, fit, prediction, dt_s)
         for name, fit, prediction in zip(config.plant.axes, chosen.fits, predictions, strict=True)
     )
-    link = fit_link(history.seen, history.gaps)
-    ramp_s = ramp_of(history, config)
-    made = _config(config, chosen, ramp_s, responses, link)
+    link = fit_link(history.positions, history.losses)
+    ramp_s = compute_ramp_delay_s(history, config)
+    identified_config = _make_config(config, chosen, ramp_s, responses, link)
     if history.latency_s is not None:
-        made = msgspec.structs.replace(
-            made, clock=msgspec.structs.replace(made.clock, latency_s=round(history.latency_s, _DIGITS))
+        identified_config = msgspec.structs.replace(
+            identified_config,
+            clock=msgspec.structs.replace(identified_config.clock, latency_s=round(history.latency_s, _DIGITS)),
         )
     result = Identified(
         flown_s=sum(stretch.length_s for stretch in flown),
         positions=link.received,
-        plant=_plant_section(made),
-        candidates=tuple(_candidate(one) for one in candidates),
+        plant=_make_plant_section(identified_config),
+        candidates=tuple(_make_candidate(response) for response in candidates),
         ramp_s=ramp_s,
         response=responses,
-        residual_std=tuple(one.residual_std_m for one in responses),
-        r2=tuple(one.r2 for one in responses),
-        link=_link_section(link),
-        warnings=(*_doubts(responses), *_better(chosen, candidates[1:])),
+        residual_std=tuple(response.residual_std_m for response in responses),
+        r2=tuple(response.r2 for response in responses),
+        link=_make_link_section(link),
+        warnings=(*_describe_uncertain_axes(responses), *_describe_better_plants(chosen, candidates[1:])),
     )
-    return Identification(result, made, link, tuple(predictions), flown, chosen.fits)
+    return Identification(result, identified_config, link, tuple(predictions), flown, chosen.fits)
 
 
-def flown_stretches(history: FlightHistory, config: Config) -> tuple[Stretch, ...]:
+def make_fitted_stretches(history: FlightHistory, config: Config) -> tuple[Stretch, ...]:
     """Return a flight as a plant is fitted to it: one position a step at most, setpoints ramped as the autopilot does.
 
     Raises:
         RecordingError: No stretch is long enough.
     """
-    spacing_s, limits_mps3 = config.plant.dt_s * (1.0 - 1e-6), _jerk_limits(history, config)
+    spacing_s, limits_mps3 = config.plant.dt_s * (1.0 - 1e-6), _get_jerk_limits(history, config)
     return tuple(
-        ramped(thinned(stretch, spacing_s), *limits_mps3) for stretch in stretches(history.asked, history.seen)
+        ramp_setpoints(thin_positions(stretch, spacing_s), *limits_mps3)
+        for stretch in find_stretches(history.setpoints, history.positions)
     )
 
 
-def kinds_of(history: FlightHistory, config: Config) -> list[tuple[AxisModel, ...]]:
+def get_candidate_models(history: FlightHistory, config: Config) -> list[tuple[AxisModel, ...]]:
     """Return the plants to fit to each axis, the configuration's own first."""
     plant = config.plant
-    own = plant.model == VELOCITY_REFERENCE
-    drifts = own or config.estimator.bias_drift > 0.0
-    kinds: list[tuple[AxisModel, ...]] = [tuple(DragLagAxis(drifts) for _ in plant.axes)]
-    if own or history.autopilot == "ardupilot":
-        kinds.append(tuple(ReferenceAxis(*gains) for gains in _gains(history, config)))
-    return kinds[::-1] if own else kinds
+    is_reference = plant.model == VELOCITY_REFERENCE
+    drifts = is_reference or config.estimator.bias_drift > 0.0
+    models: list[tuple[AxisModel, ...]] = [tuple(DragLagAxis(drifts) for _ in plant.axes)]
+    if is_reference or history.autopilot == "ardupilot":
+        models.append(tuple(ReferenceAxis(*gains) for gains in _get_loop_gains(history, config)))
+    return models[::-1] if is_reference else models
 
 
-def _gains(history: FlightHistory, config: Config) -> list[tuple[float, float, float]]:
-    """Return the loop gains of each axis: as the vehicle told them, else as configured, else ArduPilot's defaults.
+def _get_loop_gains(history: FlightHistory, config: Config) -> list[tuple[float, float, float]]:
+    """Return the loop gains of each axis: as reported by the vehicle, else as configured, else ArduPilot's defaults.
 
-    The plant has no loop without an integral (PSC_VELZ_I is 0 as shipped): there the acceleration loop's does its work.
+    The plant has no loop without an integral. PSC_VELZ_I is 0 by default, and the acceleration loop integrates instead.
     """
-    plant, found = config.plant, []
-    for place, name in enumerate(config.plant.axes):
-        side = "Z" if name == "down" else "XY"
-        own = (plant.position_1ps, plant.velocity_1ps, plant.integral_1ps2)
-        given = [one[place] for one in own] if plant.model == VELOCITY_REFERENCE else _AS_SHIPPED[side]
-        told = (history.parameters.get(key.format(side), 0.0) for key in ("PSC_POS{}_P", "PSC_VEL{}_P", "PSC_VEL{}_I"))
-        kp, kv, ki = (value if value > 0.0 else other for value, other in zip(told, given, strict=True))
-        found.append((kp, kv, ki))
-    return found
+    plant, gains = config.plant, []
+    for row, name in enumerate(config.plant.axes):
+        suffix = "Z" if name == "down" else "XY"
+        configured = (plant.position_1ps, plant.velocity_1ps, plant.integral_1ps2)
+        defaults = (
+            [values[row] for values in configured] if plant.model == VELOCITY_REFERENCE else _DEFAULT_GAINS[suffix]
+        )
+        reported = (
+            history.parameters.get(key.format(suffix), 0.0) for key in ("PSC_POS{}_P", "PSC_VEL{}_P", "PSC_VEL{}_I")
+        )
+        kp, kv, ki = (value if value > 0.0 else default for value, default in zip(reported, defaults, strict=True))
+        gains.append((kp, kv, ki))
+    return gains
 
 
-def _jerk_limits(history: FlightHistory, config: Config) -> tuple[float, float]:
-    """Return the horizontal and vertical jerk limits of an autopilot's ramps [m/s³]: as told, else its defaults."""
+def _get_jerk_limits(history: FlightHistory, config: Config) -> tuple[float, float]:
+    """Return the horizontal and vertical jerk limits of an autopilot's ramps [m/s³]: as reported, else its defaults."""
     if history.autopilot != "ardupilot" and config.plant.model != VELOCITY_REFERENCE:
         return math.inf, math.inf
-    told = (history.parameters.get(f"PSC_JERK_{side}", 0.0) for side in ("XY", "Z"))
-    level, down = (value if value > 0.0 else _JERK_AS_SHIPPED_MPS3 for value in told)
+    reported = (history.parameters.get(f"PSC_JERK_{suffix}", 0.0) for suffix in ("XY", "Z"))
+    level, down = (value if value > 0.0 else _DEFAULT_JERK_MPS3 for value in reported)
     return level, down
 
 
-def ramp_of(history: FlightHistory, config: Config) -> float:
+def compute_ramp_delay_s(history: FlightHistory, config: Config) -> float:
     """Return the mean delay of the ramp to each of the configuration's setpoints [s], which its plant lacks.
 
-    That of a level setpoint that changes as much as it may; it ends with the next setpoint at the latest.
+    It is that of a level setpoint with the largest allowed change; it ends with the next setpoint at the latest.
     """
-    level_mps3, _ = _jerk_limits(history, config)
+    level_mps3, _ = _get_jerk_limits(history, config)
     return 0.5 * config.daemon.tick_s * min(config.limits.slew_mps3 / level_mps3, 1.0)
 
 
-def _candidate(one: ChosenPlant) -> Candidate:
+def _make_candidate(chosen: ChosenPlant) -> Candidate:
     return Candidate(
-        model=one.name,
-        dead_time_s=one.dead_time_s,
-        dead_time_range_s=one.range_s,
-        lag_s=tuple(fit.value("lag_s") for fit in one.fits),
-        error_m=one.judged.error_m,
+        model=chosen.name,
+        dead_time_s=chosen.dead_time_s,
+        dead_time_range_s=chosen.range_s,
+        lag_s=tuple(fit.value("lag_s") for fit in chosen.fits),
+        error_m=chosen.held_out.error_m,
         ahead_s=AHEAD_S,
-        rms_m=tuple(tuple(row) for row in one.judged.rms_m.tolist()),
-        curve=one.curve,
+        rms_m=tuple(tuple(row) for row in chosen.held_out.rms_m.tolist()),
+        curve=chosen.curve,
     )
 
 
-def _better(chosen: ChosenPlant, others: Sequence[ChosenPlant]) -> list[str]:
+def _describe_better_plants(chosen: ChosenPlant, others: Sequence[ChosenPlant]) -> list[str]:
     return [
-        f'plant.model "{other.name}" predicts better: error {1e3 * other.judged.error_m:.1f} mm instead of '
-        f"{1e3 * chosen.judged.error_m:.1f} mm; start from a configuration that has it"
-        for other in others
-        if is_worse(chosen.judged, other.judged)
+        f'plant.model "{candidate.name}" predicts better: error {1e3 * candidate.held_out.error_m:.1f} mm instead of '
+        f"{1e3 * chosen.held_out.error_m:.1f} mm; start from a configuration that has it"
+        for candidate in others
+        if is_worse(chosen.held_out, candidate.held_out)
     ]
 
 
 def _check_moved(flown: Sequence[Stretch], axis: int) -> None:
     inputs = [float(stretch.inputs_mps2[:, axis].std()) for stretch in flown]
-    if max(inputs) < _LEAST_INPUT_STD:
+    if max(inputs) < _MIN_INPUT_STD:
         raise RecordingError(
             f"setpoints hardly changed in {AXES[axis]} (standard deviation {max(inputs):.2g} m/s²): the flight does "
             "not show how the vehicle answers there; fly waypoints that differ in every axis"
         )
 
 
-def _response(name: str, flown: Sequence[Stretch], fit: AxisFit, prediction: Prediction, dt_s: float) -> AxisResponse:
-    errors = standard_errors(flown, AXES.index(name), fit)
-    reference = isinstance(fit.model, ReferenceAxis)
+def _make_response(
+    name: str, flown: Sequence[Stretch], fit: AxisFit, prediction: Prediction, dt_s: float
+) -> AxisResponse:
+    errors = compute_standard_errors(flown, AXES.index(name), fit)
+    is_reference = isinstance(fit.model, ReferenceAxis)
     return AxisResponse(
         axis=name,
         lag_s=fit.value("lag_s"),
         drag_1ps=max(fit.value("drag_1ps"), 0.0),
-        gain=None if reference else fit.value("gain"),
+        gain=None if is_reference else fit.value("gain"),
         wind_std_mps2=fit.value("wind_mps2_rts") / math.sqrt(dt_s),
-        input_std_mps2=fit.value("input_mps2_rts") / math.sqrt(dt_s) if reference else None,
-        force_drift_mps2_rts=fit.value("drift_mps2_rts") if reference else None,
+        input_std_mps2=fit.value("input_mps2_rts") / math.sqrt(dt_s) if is_reference else None,
+        force_drift_mps2_rts=fit.value("drift_mps2_rts") if is_reference else None,
         position_std_m=fit.value("noise_m"),
         lag_std_s=replace_infinite(errors["lag_s"]),
         drag_std_1ps=replace_infinite(errors["drag_1ps"]),
@@ -360,34 +364,38 @@ def _response(name: str, flown: Sequence[Stretch], fit: AxisFit, prediction: Pre
     )
 
 
-def _doubts(responses: Sequence[AxisResponse]) -> list[str]:
-    found = []
-    for one in responses:
-        if not one.is_well_predicted:
-            found.append(f"{one.axis}: only {100 * one.r2:.0f} % of the motion of the next second is predicted")
-        if one.lag_std_s is None or one.lag_std_s > 0.5 * one.lag_s:
-            found.append(f"{one.axis}: the lag of {one.lag_s:.2f} s is uncertain; fly more changes of direction")
-    return found
+def _describe_uncertain_axes(responses: Sequence[AxisResponse]) -> list[str]:
+    texts = []
+    for response in responses:
+        if response.r2 < 0.5:
+            texts.append(
+                f"{response.axis}: only {100 * response.r2:.0f} % of the motion of the next second is predicted"
+            )
+        if response.lag_std_s is None or response.lag_std_s > 0.5 * response.lag_s:
+            texts.append(
+                f"{response.axis}: the lag of {response.lag_s:.2f} s is uncertain; fly more changes of direction"
+            )
+    return texts
 
 
-def _config(
+def _make_config(
     config: Config, chosen: ChosenPlant, ramp_s: float, responses: Sequence[AxisResponse], link: LinkFit
 ) -> Config:
-    """Return the configuration with what was identified."""
+    """Return the configuration with the identified plant and link."""
     plant = msgspec.structs.replace(
         config.plant,
         model=chosen.name,
         dead_time_s=round(chosen.dead_time_s + ramp_s, _DIGITS),
-        drag_1ps=_rounded(one.drag_1ps for one in responses),
-        lag_s=_rounded(one.lag_s for one in responses),
-        wind_std_mps2=_rounded(one.wind_std_mps2 for one in responses),
-        **{**dict.fromkeys(_OF_OTHER_MODELS, ()), **_of_model(chosen, responses)},
+        drag_1ps=_round_values(response.drag_1ps for response in responses),
+        lag_s=_round_values(response.lag_s for response in responses),
+        wind_std_mps2=_round_values(response.wind_std_mps2 for response in responses),
+        **{**dict.fromkeys(_MODEL_KEYS, ()), **_get_model_values(chosen, responses)},
     )
     estimator = msgspec.structs.replace(
-        config.estimator, position_std_m=round(max(one.position_std_m for one in responses), 6)
+        config.estimator, position_std_m=round(max(response.position_std_m for response in responses), 6)
     )
-    # Slower cameras than two positions a step, or than one in what the delay leaves of it, are counted on for one a
-    # step, which is what 0 says.
+    # The design uses more than one position a step only if two come in a step, and one in the rest of it after the
+    # delay. Else the rate is 0: one position a step.
     dt_s, rate_hz = config.plant.dt_s, float(math.floor(link.rate_hz))
     if rate_hz * dt_s < 2.0 or rate_hz * (dt_s - link.delay_s - link.jitter_s) < 1.0:
         rate_hz = 0.0
@@ -398,31 +406,31 @@ def _config(
         plant=plant,
         estimator=estimator,
         source=source,
-        link=msgspec.structs.replace(config.link, **_link_section(link)),
+        link=msgspec.structs.replace(config.link, **_make_link_section(link)),
     )
 
 
-def _of_model(chosen: ChosenPlant, responses: Sequence[AxisResponse]) -> dict[str, tuple[float, ...]]:
-    """Return the keys of `[plant]` that only one kind of plant has."""
+def _get_model_values(chosen: ChosenPlant, responses: Sequence[AxisResponse]) -> dict[str, tuple[float, ...]]:
+    """Return the keys of `[plant]` that only one model has."""
     if chosen.name == DRAG_LAG:
-        return {"gain": _rounded(one.gain or 0.0 for one in responses)}
+        return {"gain": _round_values(response.gain or 0.0 for response in responses)}
     models = [fit.model for fit in chosen.fits if isinstance(fit.model, ReferenceAxis)]
     return {
         **{
             key: tuple(getattr(model, key) for model in models)
             for key in ("position_1ps", "velocity_1ps", "integral_1ps2")
         },
-        "input_std_mps2": _rounded(one.input_std_mps2 or 0.0 for one in responses),
-        "force_drift_mps2_rts": _rounded(one.force_drift_mps2_rts or 0.0 for one in responses),
+        "input_std_mps2": _round_values(response.input_std_mps2 or 0.0 for response in responses),
+        "force_drift_mps2_rts": _round_values(response.force_drift_mps2_rts or 0.0 for response in responses),
     }
 
 
-def _plant_section(config: Config) -> dict[str, object]:
-    keys = ("model", "dt_s", "axes", "dead_time_s", "drag_1ps", "lag_s", "wind_std_mps2", *_OF_OTHER_MODELS)
+def _make_plant_section(config: Config) -> dict[str, object]:
+    keys = ("model", "dt_s", "axes", "dead_time_s", "drag_1ps", "lag_s", "wind_std_mps2", *_MODEL_KEYS)
     return {key: value for key in keys if (value := getattr(config.plant, key)) != ()}
 
 
-def _link_section(link: LinkFit) -> dict[str, object]:
+def _make_link_section(link: LinkFit) -> dict[str, object]:
     """Return the keys of `[link]`: independent losses if the data allow that, else runs as measured."""
     times: dict[str, object] = {"delay_s": link.delay_s, "jitter_s": link.jitter_s}
     if not link.bursts:
@@ -430,5 +438,5 @@ def _link_section(link: LinkFit) -> dict[str, object]:
     return {"model": "empirical", "loss": 0.0, "gaps": link.runs, **times}
 
 
-def _rounded(values: Iterable[float]) -> tuple[float, ...]:
+def _round_values(values: Iterable[float]) -> tuple[float, ...]:
     return tuple(round(value, _DIGITS) for value in values)

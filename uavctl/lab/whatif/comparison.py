@@ -1,4 +1,7 @@
-"""Comparison of a what-if with the recorded flight, and its page."""
+"""Comparison of a what-if with the recorded flight, its validity, and its page.
+
+The recorded flight is flown again unchanged too; that reproduction shows what a what-if of this recording is worth.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,6 @@ from typing import TypeVar
 import msgspec
 import numpy as np
 from msgspec.structs import replace
-from numpy.typing import NDArray
 
 from logs.recording.flight import FlightData
 from logs.recording.notes import RecorderNote
@@ -19,24 +21,22 @@ from logs.report.page import Mark, PageSection, render_grid, render_page, render
 from logs.report.plots import DASHED, DOTTED, draw_limits
 from logs.report.svg import Drawing, colour, open_canvas
 from sim.vehicle.linear import CACHED_TRANSITIONS
-from uavctl.lab.whatif.flight import Entry, RecordedFlight, Response
+from uavctl.arrays import Array
+from uavctl.lab.whatif.flight import Entry, RecordedFlight, VehicleResponse
 from uavctl.records import Decision, Estimate, Plan, Record, Setpoint, Truth
 
 # What a what-if is worth, and its figures: the recorded flight, the same reproduced, the one that might have been.
-
-
-Array = NDArray[np.float64]
 AHEAD_S = 1.0
-_COMPARED = (Decision, Plan, Setpoint)
+_COMPARED_KINDS = (Decision, Plan, Setpoint)
 R = TypeVar("R", bound=Record)
 _Transition = Callable[[int], tuple[Array, Array, Array]]
 
 
 class Reproduction(msgspec.Struct, frozen=True, kw_only=True):
-    """Recorded flight flown again with nothing changed, against the recording: shows differences not of our making."""
+    """Unchanged reproduction of the recorded flight against the recording: shows differences of version and model."""
 
     identical: bool  # every plan, decision and setpoint, bit for bit
-    decisions: int  # compared
+    decisions: int  # number of compared decisions
     largest_state: float  # difference at a tick [m, m/s, m/s²]
     largest_input: float  # difference of inputs as decided [input units]
 
@@ -46,9 +46,9 @@ class ModelFit(msgspec.Struct, frozen=True, kw_only=True):
 
     source: str
     ahead_s: float
-    moves: int  # that were predicted: from each boundary, under the setpoints flown
-    r2: float | None  # share of their variance that was predicted, over all axes; None with fewer than two
-    rms_m: float | None  # of what was not
+    moves: int  # number of predictions: one from each boundary, under the flown setpoints
+    r2: float | None  # share of the variance that was predicted, over all axes; None with fewer than two
+    rms_m: float | None  # of the prediction errors
 
 
 class WhatIf(msgspec.Struct, frozen=True, kw_only=True):
@@ -58,219 +58,237 @@ class WhatIf(msgspec.Struct, frozen=True, kw_only=True):
     reproduction: Reproduction
     model: ModelFit
     controller: str
-    link: str  # "recorded", "configured": simulated from [link], or the keys that were changed for what is flown alone
-    changed: tuple[str, ...]  # as they were given
-    compared_s: float  # up to here both can be told
-    ended: str  # why not further
-    largest_departure_m: float  # of the position, from the recorded one
-    inertial_moved: int  # messages of the vehicle's inertial sensors with the other course's acceleration
-    inertial_left_out: int  # and those left out of it: without an attitude of their time, late, or frozen
-    recorded: FlightSummary  # up to compared_s, as the others
+    link: str  # "recorded"; "configured" if simulated from [link]; or the keys changed for the flown link alone
+    changed: tuple[str, ...]  # overrides as given
+    compared_s: float  # both flights are known up to here
+    ended: str  # why the comparison ends
+    largest_departure_m: float  # largest distance between both positions
+    inertial_moved: int  # inertial messages of the vehicle with the other course's acceleration
+    inertial_left_out: int  # dropped inertial messages: without an attitude of their time, late, or frozen
+    recorded: FlightSummary  # all summaries end at compared_s
     reproduced: FlightSummary
     what_if: FlightSummary
-    recording: str  # of the flight that might have been
+    recording: str  # recording of the other flight
     report: str
     page: str
 
 
-def until(entries: Iterable[Entry], end_ns: int) -> list[Entry]:
-    """Yield the part of a recording up to and including a tick [ns], with all notes of the recorder."""
+def cut_entries(entries: Iterable[Entry], end_ns: int) -> list[Entry]:
+    """Return the entries of a recording up to and including a tick [ns], with all notes of the recorder."""
     return [entry for entry in entries if entry[1] <= end_ns or isinstance(entry[2], RecorderNote)]
 
 
-def reproduction(recorded: FlightData, again: FlightData) -> Reproduction:
-    """Compare a flight that should equal the recorded one with it."""
+def compare_reproduction(recorded: FlightData, reproduced: FlightData) -> Reproduction:
+    """Compare the recorded flight with its unchanged reproduction."""
     return Reproduction(
-        identical=all(_same(_of(recorded, kind), _of(again, kind)) for kind in _COMPARED),
+        identical=all(
+            _are_equal(_get_records(recorded, kind), _get_records(reproduced, kind)) for kind in _COMPARED_KINDS
+        ),
         decisions=len(recorded.decisions),
         largest_state=max(
-            _largest({one.at_ns: one.state for one in flight.truths} for flight in (recorded, again)),
-            _largest({one.at_ns: one.mean for one in flight.estimates} for flight in (recorded, again)),
+            _compute_max_difference(
+                {sample.at_ns: sample.state for sample in flight.truths} for flight in (recorded, reproduced)
+            ),
+            _compute_max_difference(
+                {sample.at_ns: sample.mean for sample in flight.estimates} for flight in (recorded, reproduced)
+            ),
         ),
-        largest_input=_largest(
-            {one.at_ns: one.input for one in flight.decisions if one.input is not None} for flight in (recorded, again)
+        largest_input=_compute_max_difference(
+            {sample.at_ns: sample.input for sample in flight.decisions if sample.input is not None}
+            for flight in (recorded, reproduced)
         ),
     )
 
 
-def model_fit(history: RecordedFlight, response: Response, source: str) -> ModelFit:
+def fit_model(history: RecordedFlight, response: VehicleResponse, source: str) -> ModelFit:
     """Predict the motion of the next second from each boundary of the recorded flight.
 
-    From the true states where they are known, else from the estimates; in stretches without a setpoint nothing is.
+    From the true states if known, else from the estimates; parts without setpoints are skipped.
 
     Args:
         response: The model, of as many states as the recorded plant, and its dead time.
     """
     flight, model = history.flight, response.model
-    known: Sequence[Truth] | Sequence[Estimate] = flight.truths or flight.estimates
-    states = {one.at_ns: np.array(one.state if isinstance(one, Truth) else one.mean) for one in known}
+    samples: Sequence[Truth] | Sequence[Estimate] = flight.truths or flight.estimates
+    states = {sample.at_ns: np.array(sample.state if isinstance(sample, Truth) else sample.mean) for sample in samples}
     steps = max(1, round(AHEAD_S * 1e9 / model.dt_ns))
     ahead_ns = steps * model.dt_ns
     boundaries = [
         d.at_ns for d in flight.decisions if d.boundary and d.at_ns in states and d.at_ns + ahead_ns in states
     ]
-    moved, told = [], []
+    motions, predictions = [], []
     transition = lru_cache(maxsize=CACHED_TRANSITIONS)(model.transition)
     for at_ns in boundaries:
-        predicted = _predicted(history, response, transition, states[at_ns], at_ns, at_ns + ahead_ns)
+        predicted = _predict_state(history, response, transition, states[at_ns], at_ns, at_ns + ahead_ns)
         if predicted is not None:
             index = list(model.position_index)
-            moved.append((states[at_ns + ahead_ns] - states[at_ns])[index])
-            told.append((predicted - states[at_ns])[index])
-    rest = np.array(moved) - np.array(told)
-    spread = float(np.sum(np.square(np.array(moved) - np.mean(moved, axis=0)))) if len(moved) > 1 else 0.0
+            motions.append((states[at_ns + ahead_ns] - states[at_ns])[index])
+            predictions.append((predicted - states[at_ns])[index])
+    residuals = np.array(motions) - np.array(predictions)
+    variation = float(np.sum(np.square(np.array(motions) - np.mean(motions, axis=0)))) if len(motions) > 1 else 0.0
     return ModelFit(
         source=source,
         ahead_s=ahead_ns * 1e-9,
-        moves=len(moved),
-        r2=1.0 - float(np.sum(np.square(rest))) / spread if spread > 0.0 else None,
-        rms_m=float(np.sqrt(np.mean(np.sum(np.square(rest), axis=1)))) if moved else None,
+        moves=len(motions),
+        r2=1.0 - float(np.sum(np.square(residuals))) / variation if variation > 0.0 else None,
+        rms_m=float(np.sqrt(np.mean(np.sum(np.square(residuals), axis=1)))) if motions else None,
     )
 
 
-def _predicted(
-    history: RecordedFlight, response: Response, transition: _Transition, x: Array, begin_ns: int, end_ns: int
+def _predict_state(
+    history: RecordedFlight, response: VehicleResponse, transition: _Transition, x: Array, begin_ns: int, end_ns: int
 ) -> Array | None:
-    """Return the state at the end under the setpoints that were flown; None if any was not."""
+    """Return the state at the end under the flown setpoints; None if one is missing or was not flown."""
     tick_ns, model = max(1, history.flight.tick_ns), response.model
-    late = -(-response.dead_ns // tick_ns)  # ticks in which what acts at the begin was sent
-    for sent_ns in range(begin_ns - late * tick_ns, end_ns - response.dead_ns, tick_ns):
+    delay_ticks = -(
+        -response.dead_time_ns // tick_ns
+    )  # the input that acts at the beginning was sent so many ticks before
+    for sent_ns in range(begin_ns - delay_ticks * tick_ns, end_ns - response.dead_time_ns, tick_ns):
         accel = history.setpoints.get(sent_ns)
-        if accel is None or not history.taken.get(sent_ns, False):
+        if accel is None or not history.takes_setpoints.get(sent_ns, False):
             return None
-        acts_ns = sent_ns + response.dead_ns
+        acts_ns = sent_ns + response.dead_time_ns
         u = np.array([accel[axis] for axis in model.axes]) / model.accel_per_input
         a, b, _ = transition(min(acts_ns + tick_ns, end_ns) - max(acts_ns, begin_ns))
         x = a @ x + b @ u
     return x
 
 
-def departure_m(recorded: FlightData, other: FlightData) -> float:
+def compute_max_distance_m(recorded: FlightData, other: FlightData) -> float:
     """Return the largest distance between two flights at a boundary [m], by true states if known, else by estimates."""
     index = list(recorded.design.position_index)
-    sides = [
-        {one.at_ns: np.array(one.state)[index] for one in flight.truths}
+    positions = [
+        {sample.at_ns: np.array(sample.state)[index] for sample in flight.truths}
         if recorded.truths
-        else {one.at_ns: np.array(one.mean)[index] for one in flight.estimates}
+        else {sample.at_ns: np.array(sample.mean)[index] for sample in flight.estimates}
         for flight in (recorded, other)
     ]
-    common = sides[0].keys() & sides[1].keys()
-    return max((float(np.linalg.norm(sides[1][at_ns] - sides[0][at_ns])) for at_ns in common), default=0.0)
+    common = positions[0].keys() & positions[1].keys()
+    return max((float(np.linalg.norm(positions[1][at_ns] - positions[0][at_ns])) for at_ns in common), default=0.0)
 
 
-def _of(flight: FlightData, kind: type[Record]) -> tuple[Record, ...]:
+def _get_records(flight: FlightData, kind: type[Record]) -> tuple[Record, ...]:
     return {Decision: flight.decisions, Plan: flight.plans, Setpoint: flight.setpoints}[kind]
 
 
-def _same(some: tuple[Record, ...], others: tuple[Record, ...]) -> bool:
-    return len(some) == len(others) and all(encode(a) == encode(b) for a, b in zip(some, others, strict=True))
+def _are_equal(records: tuple[Record, ...], other_records: tuple[Record, ...]) -> bool:
+    return len(records) == len(other_records) and all(
+        encode(a) == encode(b) for a, b in zip(records, other_records, strict=True)
+    )
 
 
-def _largest(sides: Iterable[dict[int, tuple[float, ...]]]) -> float:
+def _compute_max_difference(both: Iterable[dict[int, tuple[float, ...]]]) -> float:
     """Return the largest difference of vectors of the same time."""
-    some, others = sides
-    gaps = (np.abs(np.array(some[at]) - np.array(others[at])).max(initial=0.0) for at in some.keys() & others.keys())
-    return max(map(float, gaps), default=0.0)
-
-
-# The page of a what-if: both flights in the same plots, beside their figures.
+    vectors, other_vectors = both
+    differences = (
+        np.abs(np.array(vectors[at]) - np.array(other_vectors[at])).max(initial=0.0)
+        for at in vectors.keys() & other_vectors.keys()
+    )
+    return max(map(float, differences), default=0.0)
 
 
 _HEIGHT_IN = 2.6
-RECORDED, MIGHT = "truth", "plan"  # roles of the colours
+RECORDED_ROLE, WHAT_IF_ROLE = "truth", "plan"  # roles of the colours
 HEADINGS = ("", "recorded", "reproduced", "what-if")
-_NOT_FLOWN = ("Decision time", "Clock", "Tick lateness")  # of the computer, which was another, or did something else
-_WORTH_TELLING = 0.01  # of the inertial messages: a few are always older than the first attitude, or late
+_COMPUTER_ROWS = ("Decision time", "Clock", "Tick lateness")  # depend on the computer
+_MIN_DROPPED_SHARE = 0.01  # of the inertial messages; a few are always older than the first attitude, or late
 _MARKS = (
-    Mark("line", RECORDED, "recorded"),
-    Mark("line", MIGHT, "what-if"),
+    Mark("line", RECORDED_ROLE, "recorded"),
+    Mark("line", WHAT_IF_ROLE, "what-if"),
     Mark("dotted", "target", "target"),
     Mark("dashed", "limit", "limit"),
     Mark("band", "limit", "reserve kept"),
 )
-_WORTH = (
+_VALIDITY_NOTE = (
     "The recorded flight flown again with nothing changed tells whether this version decides as the one that flew. "
     "How far the model goes wrong within a second is what the what-if column cannot know: the same happens to it, "
     "counted as disturbance."
 )
-_MOTION = (
+_MOTION_NOTE = (
     "Positions, by the true states if they were recorded, else by the controllers' estimates. Target, limits and the "
     "band along them, the largest reserve that the plan of the moment kept, are those of the what-if."
 )
-_AGE = "Age of the newest position at each decision: a link that loses more, or later positions, is higher."
+_AGE_NOTE = "Age of the newest position at each decision: a link that loses more, or later positions, is higher."
 
 
-def write_page(found: WhatIf, recorded: FlightData, other: FlightData) -> str:
+def render_what_if_page(what_if: WhatIf, recorded: FlightData, other: FlightData) -> str:
     """Return the page of a what-if as HTML.
 
     Args:
-        recorded: The recorded flight, as far as it is compared.
+        recorded: The recorded flight, cut to the compared part.
     """
-    return render_page("What if", found.flight, story(found), _sections(found, recorded, other))
+    return render_page("What if", what_if.flight, describe_what_if(what_if), _make_sections(what_if, recorded, other))
 
 
-def story(found: WhatIf) -> list[str]:
-    """Return sentences on what was done, and how far it can be trusted."""
-    again, model = found.reproduction, found.model
-    same = "bit for bit"
-    if not again.identical:
-        same = f"not bit for bit: states within {again.largest_state:.1e}, inputs within {again.largest_input:.1e}"
-    within = "" if model.rms_m is None else f", wrong by {model.rms_m:.3g} m (rms)"
-    explained = "" if model.r2 is None else f": {100 * model.r2:.1f} % of it is told{within}"
-    changed = f"Changed: {', '.join(found.changed)}" if found.changed else "No key of the configuration was changed"
+def describe_what_if(what_if: WhatIf) -> list[str]:
+    """Return sentences on the changes, the results and their validity."""
+    reproduced, model = what_if.reproduction, what_if.model
+    equality = "bit for bit"
+    if not reproduced.identical:
+        state, input_ = reproduced.largest_state, reproduced.largest_input
+        equality = f"not bit for bit: states within {state:.1e}, inputs within {input_:.1e}"
+    error_text = "" if model.rms_m is None else f", wrong by {model.rms_m:.3g} m (rms)"
+    prediction_text = "" if model.r2 is None else f": {100 * model.r2:.1f} % of it is told{error_text}"
+    changed = f"Changed: {', '.join(what_if.changed)}" if what_if.changed else "No key of the configuration was changed"
     inertial = []
-    total = found.inertial_moved + found.inertial_left_out
-    if found.inertial_left_out > _WORTH_TELLING * total:
+    total = what_if.inertial_moved + what_if.inertial_left_out
+    if what_if.inertial_left_out > _MIN_DROPPED_SHARE * total:
         inertial.append(
-            f"{found.inertial_left_out} of {total} inertial messages of the vehicle are left out of the other course: "
-            "late, frozen, or without an attitude that turns its acceleration."
+            f"{what_if.inertial_left_out} of {total} inertial messages of the vehicle are left out of the other "
+            "course: late, frozen, or without an attitude that turns its acceleration."
         )
     return [
-        f"Reproduced with nothing changed, {same}.",
-        f"Model ({model.source}): motion of the next {model.ahead_s:g} s, predicted {model.moves} times{explained}.",
-        f"{changed}; controller {found.controller}; link: {found.link}.",
-        f"Compared over {found.compared_s:.1f} s: {found.ended}. The flights came {found.largest_departure_m:.3g} m "
-        "apart.",
+        f"Reproduced with nothing changed, {equality}.",
+        f"Model ({model.source}): motion of the next {model.ahead_s:g} s, predicted {model.moves} times"
+        f"{prediction_text}.",
+        f"{changed}; controller {what_if.controller}; link: {what_if.link}.",
+        f"Compared over {what_if.compared_s:.1f} s: {what_if.ended}. The flights came "
+        f"{what_if.largest_departure_m:.3g} m apart.",
         *inertial,
     ]
 
 
-def side_by_side(found: WhatIf) -> Iterator[tuple[str, ...]]:
+def make_comparison_rows(what_if: WhatIf) -> Iterator[tuple[str, ...]]:
     """Return rows of the figures: name, recorded, reproduced, what-if."""
-    bare = [replace(one, recording=None, report=None) for one in (found.recorded, found.reproduced, found.what_if)]
-    columns = [dict(list_summary_rows(one)) for one in bare]
+    summaries = [
+        replace(summary, recording=None, report=None)
+        for summary in (what_if.recorded, what_if.reproduced, what_if.what_if)
+    ]
+    columns = [dict(list_summary_rows(summary)) for summary in summaries]
     for name in dict.fromkeys(name for column in columns for name in column):
-        if name not in _NOT_FLOWN:
+        if name not in _COMPUTER_ROWS:
             yield (name, *(column.get(name, "-") for column in columns))
 
 
-def _sections(found: WhatIf, recorded: FlightData, other: FlightData) -> Iterator[PageSection]:
-    index = recorded.design.position_index
-    axes = [_axis(recorded, other, place, name) for place, name in zip(index, recorded.design.axes, strict=True)]
-    yield PageSection("Motion", _MOTION, render_grid(axes), _MARKS)
+def _make_sections(what_if: WhatIf, recorded: FlightData, other: FlightData) -> Iterator[PageSection]:
+    indices = recorded.design.position_index
+    axes = [_draw_axis(recorded, other, index, name) for index, name in zip(indices, recorded.design.axes, strict=True)]
+    yield PageSection("Motion", _MOTION_NOTE, render_grid(axes), _MARKS)
     horizon = Mark("dashed", "limit", f"horizon H = {other.design.horizon}")
-    yield PageSection("Link", _AGE, render_grid([_ages(recorded, other)]), (*_MARKS[:2], horizon))
-    yield PageSection("Side by side", _WORTH, render_table(HEADINGS, side_by_side(found), frozenset()))
+    yield PageSection("Link", _AGE_NOTE, render_grid([_draw_ages(recorded, other)]), (*_MARKS[:2], horizon))
+    yield PageSection(
+        "Side by side", _VALIDITY_NOTE, render_table(HEADINGS, make_comparison_rows(what_if), frozenset())
+    )
 
 
-def _axis(recorded: FlightData, other: FlightData, place: int, name: str) -> Drawing:
-    with open_canvas(f"motion-{name}", _HEIGHT_IN) as drawn:
-        ax = drawn.axes(name, "time [s]", "position [m]")
-        draw_limits(ax, other, place, 1.0)
-        for flight, role in ((recorded, RECORDED), (other, MIGHT)):
+def _draw_axis(recorded: FlightData, other: FlightData, index: int, name: str) -> Drawing:
+    with open_canvas(f"motion-{name}", _HEIGHT_IN) as canvas:
+        ax = canvas.axes(name, "time [s]", "position [m]")
+        draw_limits(ax, other, index, 1.0)
+        for flight, role in ((recorded, RECORDED_ROLE), (other, WHAT_IF_ROLE)):
             steps = flight.steps
-            ax.plot(steps.t_s, steps.state[:, place], color=colour(role))
-        ax.plot(other.steps.t_s, other.steps.target[:, place], color=colour("target"), ls=DOTTED, lw=1.1)
+            ax.plot(steps.t_s, steps.state[:, index], color=colour(role))
+        ax.plot(other.steps.t_s, other.steps.target[:, index], color=colour("target"), ls=DOTTED, lw=1.1)
     label = f"position {name} of the recorded flight and of the other over time, against the limits of the other"
-    return Drawing(f"motion-{name}", drawn.svg, label)
+    return Drawing(f"motion-{name}", canvas.svg, label)
 
 
-def _ages(recorded: FlightData, other: FlightData) -> Drawing:
-    with open_canvas("ages", _HEIGHT_IN) as drawn:
-        ax = drawn.axes("Age of the newest position", "time [s]", "steps")
-        for flight, role in ((recorded, RECORDED), (other, MIGHT)):
+def _draw_ages(recorded: FlightData, other: FlightData) -> Drawing:
+    with open_canvas("ages", _HEIGHT_IN) as canvas:
+        ax = canvas.axes("Age of the newest position", "time [s]", "steps")
+        for flight, role in ((recorded, RECORDED_ROLE), (other, WHAT_IF_ROLE)):
             steps = flight.steps
             ages = np.array([np.nan if d.age_steps is None else d.age_steps for d in steps.decisions])
             ax.plot(steps.t_s, ages, color=colour(role), drawstyle="steps-post")
         ax.axhline(other.design.horizon, color=colour("limit"), lw=1.2, ls=DASHED)
-    return Drawing("ages", drawn.svg, "age of the newest position at each decision of both flights, and the horizon")
+    return Drawing("ages", canvas.svg, "age of the newest position at each decision of both flights, and the horizon")
