@@ -297,10 +297,11 @@ def fly_all(setups: Sequence[Setup], runs: int, steps: int, seed: int, workers: 
     Raises:
         UavctlError: A worker process ended.
     """
+    # Designs alternate: two workers with two designs then build the programs of one design each.
     tasks = [
         ChunkTask(which, seed, first, min(CHUNK, runs - first), steps)
-        for which in range(len(setups))
         for first in range(0, runs, CHUNK)
+        for which in range(len(setups))
     ]
     results = []
     with _flier(setups, runs, workers) as flown:
@@ -323,7 +324,8 @@ def _flier(
 ) -> Iterator[Callable[[Sequence[ChunkTask]], Iterator[Flights]]]:
     """Yield a function that maps tasks to their results, in order."""
     if runs <= HERE_UP_TO:
-        yield lambda tasks: map(partial(_flown, [ChunkRunner(setup) for setup in setups]), tasks)
+        runners = [ChunkRunner(setup) for setup in setups]
+        yield lambda tasks: (_fly_chunk(runners[task.which], task) for task in tasks)
         return
     with processes(workers) as pool, TemporaryDirectory() as folder:
         # Not with each task: designs are larger than what a pipe holds.
@@ -336,18 +338,17 @@ def _flier(
 
 
 @cache
-def _crew(path: Path) -> list[ChunkRunner]:
-    """One runner a design, of a worker process; made for its first task."""
-    return [ChunkRunner(setup) for setup in pickle.loads(path.read_bytes())]
+def _load_runner(path: Path, which: int) -> ChunkRunner:
+    """Build the runner of one design in a worker process, for its first task with that design."""
+    return ChunkRunner(pickle.loads(path.read_bytes())[which])
 
 
 def _fly(path: Path, task: ChunkTask) -> Flights:
-    return _flown(_crew(path), task)
+    return _fly_chunk(_load_runner(path, task.which), task)
 
 
-def _flown(crew: Sequence[ChunkRunner], task: ChunkTask) -> Flights:
-    """The runs of one task; the first of all runs are kept for the figures."""
-    runner = crew[task.which]
+def _fly_chunk(runner: ChunkRunner, task: ChunkTask) -> Flights:
+    """Fly the runs of one task; keep the trajectories of the first runs for the figures."""
     chunk = runner.fly(task.seed, task.first, task.runs, task.steps)
     kept = max(0, DRAWN - task.first)
     return Flights(total(chunk, runner.design), chunk.flown.states[:kept].copy())
