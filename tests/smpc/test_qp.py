@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.smpc.qp import EQUAL, LEAST_CURVE, OPEN, SOFT, QuadraticProgram
-
-Array = NDArray[np.float64]
 
 
 class Drawn:

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from quadrotor_rig import S, quadrotor, steady
 from scipy.integrate import solve_ivp
 
 from sim.vehicle.linear import make_linear_model
 from sim.wind import Wind
+from uavctl.arrays import Array
 from uavctl.build.controller import build_plant
 from uavctl.cli.app import run as main
 from uavctl.config import load_config
@@ -23,8 +23,6 @@ from uavctl.errors import ConfigError, DesignError
 from uavctl.records import names_of
 from uavctl.smpc.nominal import lqr
 from uavctl.smpc.plant import STATES, HeldAxis, Plant, steps_to_reach, velocity_reference
-
-Array = NDArray[np.float64]
 
 DT = 0.05
 AXIS = HeldAxis(

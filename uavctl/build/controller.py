@@ -37,7 +37,7 @@ from uavctl.smpc.conditioned.planner import (
     conditioned_id,
     conditioned_record,
 )
-from uavctl.smpc.estimate import InnovationForm, innovations, with_bias
+from uavctl.smpc.estimate import InnovationForm, add_bias, innovation_form
 from uavctl.smpc.nominal import ControlProblem
 from uavctl.smpc.plant import AXES, HeldAxis, Plant, drag_lag, velocity_reference
 from uavctl.smpc.sets import Polytope
@@ -185,7 +185,7 @@ def build_conditioned(
             None: what the configuration says of it.
 
     Raises:
-        DesignError: See `build_problem`, `build_ages`, `ConditionedSolver` and `innovations`.
+        DesignError: See `build_problem`, `build_ages`, `ConditionedSolver` and `innovation_form`.
     """
     problem = replace(build_problem(config), input_set=_planned_inputs(config))
     flown = flown and bool(config.plant.axes)
@@ -193,7 +193,7 @@ def build_conditioned(
     slew_mps3 = config.limits.slew_mps3 if flown else math.inf
     plant, estimator, seen = problem.plant, config.estimator, None
     if flown and estimator.bias_drift:
-        seen = with_bias(plant, estimator.bias_drift, force=estimator.inertial_std_mps2 > 0.0)
+        seen = add_bias(plant, estimator.bias_drift, force=estimator.inertial_std_mps2 > 0.0)
     if cov is None and flown:
         cov = _settled(config, plant)
     elif cov is None:
@@ -214,7 +214,7 @@ def _innovations(config: Config, plant: Plant, losses: int) -> InnovationForm:
     """The plant as the configured filter sees it, and what that does not know after so many losses in a row."""
     estimator = config.estimator
     age_s = _position_age_s(config)
-    return innovations(plant, estimator.position_std_m, age_s, losses, estimator.bias_drift)
+    return innovation_form(plant, estimator.position_std_m, age_s, losses, estimator.bias_drift)
 
 
 def _position_age_s(config: Config) -> float:

@@ -11,15 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_lyapunov
 
+from uavctl.arrays import Array
 from uavctl.errors import DesignError
-from uavctl.smpc.batch import Counts, News, predict
+from uavctl.smpc.batch import Counts, Information, predict
 from uavctl.smpc.nominal import BatchMpc, ControlProblem, Part, deviations, lqr, parts, unseen
 from uavctl.smpc.qp import SOFT, QuadraticProgram
 
 # Constrained MPC on receipt, and three ways to fill the silence: play the plan out, hold, or let go.
 
 
-Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 
@@ -50,14 +50,14 @@ class _OnReceipt(ABC):
         self._made = np.zeros(runs, dtype=np.intp)
         self._captured = np.full(runs, -1, dtype=np.intp)
 
-    def act(self, news: News) -> Array:
+    def act(self, information: Information) -> Array:
         """See `BatchController`."""
-        (fresh,) = np.nonzero(news.newest > self._captured)
+        (fresh,) = np.nonzero(information.newest > self._captured)
         # x(0) is always known: every run has a plan from the first step on.
-        self._plans[fresh] = self._mpc.plans(predict(self._problem.plant, news)[fresh])
-        self._made[fresh] = news.step
-        self._captured[fresh] = news.newest[fresh]
-        return self._played(news.step - self._made)
+        self._plans[fresh] = self._mpc.plans(predict(self._problem.plant, information)[fresh])
+        self._made[fresh] = information.step
+        self._captured[fresh] = information.newest[fresh]
+        return self._played(information.step - self._made)
 
     @abstractmethod
     def _played(self, index: Index, /) -> Array:
@@ -148,21 +148,21 @@ class WorstCaseDelay:
         self._states = np.zeros((runs, self._delay + 1, n_x))
         self._used, self._state = np.zeros(runs, dtype=np.intp), np.zeros((runs, n_x))
 
-    def act(self, news: News) -> Array:
+    def act(self, information: Information) -> Array:
         """See `BatchController`."""
-        self._take(news)
-        x = predict(self._problem.plant, News(news.step, self._used, self._state, news.inputs))
+        self._take(information)
+        x = predict(self._problem.plant, Information(information.step, self._used, self._state, information.inputs))
         first: Array = self._mpc.plans(x)[:, 0]
         return first
 
-    def _take(self, news: News) -> None:
+    def _take(self, information: Information) -> None:
         """Let the newest position that is old enough be the one that is used; x(0) is known at first."""
-        every, slot = np.arange(len(news.newest)), news.newest % (self._delay + 1)
-        self._waiting[every, slot], self._states[every, slot] = news.newest, news.state
-        if news.step == 0:
-            self._state = news.state.copy()
+        every, slot = np.arange(len(information.newest)), information.newest % (self._delay + 1)
+        self._waiting[every, slot], self._states[every, slot] = information.newest, information.state
+        if information.step == 0:
+            self._state = information.state.copy()
             return
-        due = news.step - self._delay
+        due = information.step - self._delay
         old = np.where((self._waiting >= 0) & (self._waiting <= due), self._waiting, -1)
         best = old.argmax(axis=1)
         newer = np.flatnonzero(old[every, best] > self._used)
@@ -243,12 +243,12 @@ class Governor:
     def begin(self, runs: int) -> None:
         """See `BatchController`."""
 
-    def act(self, news: News) -> Array:
+    def act(self, information: Information) -> Array:
         """See `BatchController`."""
         problem = self._problem
-        plant, x = problem.plant, predict(problem.plant, news)
+        plant, x = problem.plant, predict(problem.plant, information)
         asked = np.clip(problem.u_target + (x - problem.target) @ self._law.k.T, self._low, self._high)
-        backoff = self._upto(int(news.age.max(initial=0)) + 1)[news.age + 1]
+        backoff = self._upto(int(information.age.max(initial=0)) + 1)[information.age + 1]
         drift = x @ plant.a.T @ problem.state_set.c.T
         room = problem.state_set.b - backoff - drift
         short = asked @ (problem.state_set.c @ plant.b).T > room
@@ -310,9 +310,9 @@ class Lqg:
     def begin(self, runs: int) -> None:
         """See `BatchController`."""
 
-    def act(self, news: News) -> Array:
+    def act(self, information: Information) -> Array:
         """See `BatchController`."""
-        off = predict(self._problem.plant, news) - self._problem.target
+        off = predict(self._problem.plant, information) - self._problem.target
         asked: Array = self._problem.u_target + off @ self._k.T
         return asked
 
@@ -361,12 +361,12 @@ class CascadedPid:
         self._integral, self._accel, self._last = np.zeros((3, runs, axes))
         self._captured = np.full(runs, -1, dtype=np.intp)
 
-    def act(self, news: News) -> Array:
+    def act(self, information: Information) -> Array:
         """See `BatchController`."""
         gains, target, dt_s = self._gains, self._problem.target, self._problem.plant.dt_s
-        fresh = (news.newest > self._captured)[:, None]
-        position, velocity = news.state[:, self._position], news.state[:, self._velocity]
-        self._differentiate(news, velocity, fresh)
+        fresh = (information.newest > self._captured)[:, None]
+        position, velocity = information.state[:, self._position], information.state[:, self._velocity]
+        self._differentiate(information, velocity, fresh)
         wanted = gains.position_1ps * (target[self._position] - position)
         # No limit, no share of it: 0 · inf is no number.
         wanted = np.clip(wanted, gains.speed * self._slowest, gains.speed * self._fastest)
@@ -378,13 +378,13 @@ class CascadedPid:
         self._integral = np.where(winding, self._integral, grown)
         return self._within(rest + self._integral)
 
-    def _differentiate(self, news: News, velocity: Array, fresh: Flags) -> None:
+    def _differentiate(self, information: Information, velocity: Array, fresh: Flags) -> None:
         """Acceleration between the two newest velocities known."""
-        span_s = np.maximum(news.newest - self._captured, 1)[:, None] * self._problem.plant.dt_s
+        span_s = np.maximum(information.newest - self._captured, 1)[:, None] * self._problem.plant.dt_s
         seen = fresh & (self._captured >= 0)[:, None]
         self._accel = np.where(seen, (velocity - self._last) / span_s, self._accel)
         self._last = np.where(fresh, velocity, self._last)
-        self._captured = np.maximum(self._captured, news.newest)
+        self._captured = np.maximum(self._captured, information.newest)
 
     def _within(self, accel: Array) -> Array:
         """Input (N, n_u) of an acceleration (N, n_axes), at most at its limits."""
@@ -468,7 +468,7 @@ def _costs(problem: ControlProblem, candidates: Array, start: Array, newest: Cou
     total = np.zeros(every.size)
     with np.errstate(over="ignore", invalid="ignore"):
         for k in range(steps):
-            inputs[:, k] = pid.act(News(k, known[:, k], states[every, known[:, k]], inputs[:, :k]))
+            inputs[:, k] = pid.act(Information(k, known[:, k], states[every, known[:, k]], inputs[:, :k]))
             states[:, k + 1] = states[:, k] @ plant.a.T + inputs[:, k] @ plant.b.T + noise[:, k]
             total += _stage(problem, states[:, k], inputs[:, k], states[:, k + 1])
     mean = total.reshape(count, runs).mean(axis=1)

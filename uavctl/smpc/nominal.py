@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.linalg import solve_discrete_are
 
+from uavctl.arrays import Array
 from uavctl.errors import DesignError
 from uavctl.smpc.link import LinkModel
 from uavctl.smpc.plant import Plant
@@ -117,7 +118,6 @@ def _endless(reason: str) -> DesignError:
 # Problem that every baseline is given: the same plant, limits and weights as the SMPC.
 
 
-Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field, fields, is_dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag, matrix_balance, sqrtm
 
+from uavctl.arrays import Array
 from uavctl.errors import DesignError
 from uavctl.records import Vec3
 
@@ -49,9 +49,6 @@ def digest(value: object) -> str:
 
 
 # Sampled and continuous plants: matrix exponential and logarithm of [[A, B, E], [0, I]], in balanced units.
-
-
-Array = NDArray[np.float64]
 
 
 def exponential(matrix: Array) -> Array:

@@ -15,13 +15,14 @@ import daqp
 import numpy as np
 from numpy.typing import NDArray
 
+from uavctl.arrays import Array
+
 # Quadratic programs in DAQP: min ½ zᵀHz + fᵀz, lower <= A z <= upper, soft rows at a linear and a quadratic price.
 #
 # DAQP starts from the state of its rows, and an update that does not name them keeps those of the last solve: here
 # they are named every time, so that the same question gives the same bits whatever was asked before.
 
 
-Array = NDArray[np.float64]
 Sense = NDArray[np.int32]
 
 OPEN = 1e30  # DAQP's infinity

@@ -9,10 +9,10 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from uavctl.arrays import Array
+
 # Units do not matter: ranks are decided, and programs solved, in numbers of similar size.
 
-
-Array = NDArray[np.float64]
 
 # Singular values below this share of the largest, in equilibrated units, count as 0.
 RANK_TOLERANCE = 1e-10

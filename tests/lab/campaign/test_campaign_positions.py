@@ -23,8 +23,8 @@ from uavctl.lab.campaign.tasks import Cell, flown, tasks_of
 from uavctl.lab.campaign.world import PositionFilter, draw, draw_noise, known, newest_of
 from uavctl.records import PositionSample
 from uavctl.smpc.baselines import Governor, MeanQp
-from uavctl.smpc.batch import Counts, News, predict, predicted_cov
-from uavctl.smpc.estimate import innovations
+from uavctl.smpc.batch import Counts, Information, predict, predict_covariance
+from uavctl.smpc.estimate import innovation_form
 from uavctl.smpc.nominal import unseen
 
 Array = NDArray[np.float64]
@@ -112,9 +112,9 @@ def test_errors_are_as_large_as_the_covariance_says_and_the_covariance_of_a_pred
     pushes = chances.normal @ np.linalg.cholesky(plant.w).T
     for k in range(steps):
         mean, cov = looked.told(k, state[:, k, index] + noise[:, k], newest[:, k], inputs[:, :k])
-        news = News(k, newest[:, k], mean, inputs[:, :k], cov)
+        news = Information(k, newest[:, k], mean, inputs[:, :k], cov)
         state[:, k + 1] = state[:, k] @ plant.a.T + inputs[:, k] @ plant.b.T + pushes[:, k] @ plant.e.T
-        spread = predicted_cov(plant, news)
+        spread = predict_covariance(plant, news)
         assert spread is not None
         for said, error in (
             (cov, state[np.arange(runs), newest[:, k]] - mean),
@@ -127,7 +127,10 @@ def test_errors_are_as_large_as_the_covariance_says_and_the_covariance_of_a_pred
 
 def test_an_exact_state_s_prediction_has_no_covariance_of_its_own() -> None:
     plant = build_plant(load_config("paper"))
-    assert predicted_cov(plant, News(0, np.zeros(1, dtype=np.intp), np.zeros((1, 4)), np.zeros((1, 0, 2)))) is None
+    assert (
+        predict_covariance(plant, Information(0, np.zeros(1, dtype=np.intp), np.zeros((1, 4)), np.zeros((1, 0, 2))))
+        is None
+    )
 
 
 def test_noise_is_drawn_apart_from_everything_else_and_longer_runs_begin_alike() -> None:
@@ -139,7 +142,7 @@ def test_noise_is_drawn_apart_from_everything_else_and_longer_runs_begin_alike()
 def test_simple_margins_begin_with_what_the_filter_leaves_open() -> None:
     given = build_problem(load_config("paper", ["target.position_m=[0, 19.5, 0]"]))
     plant = given.plant
-    cov = innovations(plant, 0.3, 0.0, 0).estimate_cov
+    cov = innovation_form(plant, 0.3, 0.0, 0).estimate_cov
     # What the filter leaves is what it ends at where every position comes.
     looked = PositionFilter(
         sight_of(load_config("paper", ["estimator.position_std_m=0.3"])), np.arange(80, dtype=np.intp)[None]
@@ -148,7 +151,7 @@ def test_simple_margins_begin_with_what_the_filter_leaves_open() -> None:
         _, last = looked.told(k, np.zeros((1, 2)), np.array([k]), np.zeros((1, k, 2)))
     assert last[0] == pytest.approx(cov, abs=1e-9)
     assert unseen(plant, 1, cov)[1] == pytest.approx(plant.a @ cov @ plant.a.T + unseen(plant, 1)[1])
-    toward = News(0, np.zeros(1, dtype=np.intp), np.array([[0.0, 0.0, 18.9, 0.3]]), np.zeros((1, 0, 2)))
+    toward = Information(0, np.zeros(1, dtype=np.intp), np.array([[0.0, 0.0, 18.9, 0.3]]), np.zeros((1, 0, 2)))
     for kind in (Governor, MeanQp):
         wary, bold = kind(given, 1.5, cov), kind(given, 1.5)
         for one in (wary, bold):

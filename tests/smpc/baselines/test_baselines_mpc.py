@@ -11,13 +11,11 @@ import cvxpy as cp
 import numpy as np
 import pytest
 from baseline_rig import PAPER_START, arrivals, cube, flown, noise, problem, unlimited
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.smpc.baselines import HoldLast, Lqg, PacketisedPredictive, ZeroOnLoss
 from uavctl.smpc.nominal import BatchMpc, ControlProblem, lqr
 from uavctl.smpc.sets import Polytope
-
-Array = NDArray[np.float64]
 
 GENERAL = ("coupled 1", "second input 0", "free chain 0", "lagged 0", "redundant inputs 1")
 

@@ -9,11 +9,11 @@ import pytest
 from baseline_rig import PAPER_START, Fed, arrivals, cube, flown, gains, noise, problem
 from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.smpc.baselines import CascadedPid, PidGains, _costs, tune
-from uavctl.smpc.batch import News
+from uavctl.smpc.batch import Information
 from uavctl.smpc.nominal import ControlProblem
 
-Array = NDArray[np.float64]
 Scene = tuple[ControlProblem, NDArray[np.intp], Array]
 ACCEL = 0.49429632181478  # [m/s²] per unit of input
 
@@ -28,7 +28,7 @@ def heard(controller: CascadedPid, states: list[list[float]]) -> Array:
     controller.begin(1)
     inputs = np.zeros((1, len(states), 2))
     return np.array(
-        [controller.act(News(k, np.array([k]), np.array([x]), inputs[:, :k]))[0] for k, x in enumerate(states)]
+        [controller.act(Information(k, np.array([k]), np.array([x]), inputs[:, :k]))[0] for k, x in enumerate(states)]
     )
 
 
@@ -59,8 +59,8 @@ def test_the_derivative_spans_a_gap() -> None:
     pid = CascadedPid(problem("paper"), only(derivative=0.5))
     pid.begin(1)
     inputs = np.zeros((1, 4, 2))
-    pid.act(News(0, np.array([0]), np.zeros((1, 4)), inputs[:, :0]))
-    asked = pid.act(News(3, np.array([3]), np.array([[0.0, 0.6, 0.0, 0.0]]), inputs[:, :3]))
+    pid.act(Information(0, np.array([0]), np.zeros((1, 4)), inputs[:, :0]))
+    asked = pid.act(Information(3, np.array([3]), np.array([[0.0, 0.6, 0.0, 0.0]]), inputs[:, :3]))
     assert asked[0] * ACCEL == pytest.approx([-0.1, 0.0], abs=1e-9)
 
 

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from optimisation_cases import START, paper_plant, paper_spec
 from plant_cases import NAMED, SHAPES, case, kept, sampled, spec_of
 from plant_oracle import margins, reduced_cost
 from scipy.linalg import block_diag
 
+from uavctl.arrays import Array
 from uavctl.errors import DesignError
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import NOMINAL
@@ -21,8 +21,6 @@ from uavctl.smpc.hahn_stursberg.horizon import decompose, horizon_of, whole
 from uavctl.smpc.hahn_stursberg.printed import PrintedProblem, PrintedSolver
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import equilibria
-
-Array = NDArray[np.float64]
 
 # Those that the printed form solves at all: elsewhere its empty interior makes it end inaccurate or not.
 PRINTED = (

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from plant_cases import Model, Shape, spec_of
 from scipy.optimize import linprog
 
@@ -16,8 +15,6 @@ from uavctl.smpc.hahn_stursberg.design import DesignSpec, make_design
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver
 from uavctl.smpc.hahn_stursberg.synthesis import synthesize, terminal_factors
 from uavctl.smpc.sets import Polytope, rest_input
-
-Array = NDArray[np.float64]
 
 # At 2 m the spring pulls with 1, which the inputs share as u_1 + u_2 / 2 = 1. Of those the cheapest, with weights of
 # 100 and 1, is u_1 = 0.01 / 0.26, u_2 = 0.5 / 0.26; the smallest is (0.8, 0.4).

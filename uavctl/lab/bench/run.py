@@ -29,7 +29,7 @@ from uavctl.lab.bench.timing import (
 )
 from uavctl.loop import ControlLoop
 from uavctl.records import Record, SolveStatus
-from uavctl.smpc.answer import KEPT, NOMINAL, Answer, Preview, Solver
+from uavctl.smpc.answer import KEPT_TOLERANCE, NOMINAL, Answer, Preview, Solver
 from uavctl.smpc.conditioned.planner import ConditionedSolver
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.exact import METHOD, ConicSolver, PartSolver
@@ -56,13 +56,13 @@ class InFlight:
         self._solver, plant = solver, solver.problem.plant
         noise = plant.e @ plant.w @ plant.e.T
         shares = np.linspace(0.1, 0.5, _COVARIANCES)
-        self._outlooks = [Preview(cov=share * noise, sent=solver.problem.u_target) for share in shares]
+        self._previews = [Preview(cov=share * noise, sent=solver.problem.u_target) for share in shares]
         self._asked = 0
 
-    def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:  # noqa: ARG002
-        """See `Solver`; the outlook is its own."""
+    def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:  # noqa: ARG002
+        """See `Solver`; the preview is its own."""
         self._asked = (self._asked + 1) % _COVARIANCES
-        return self._solver.solve(seq, x, target, self._outlooks[self._asked])
+        return self._solver.solve(seq, x, target, self._previews[self._asked])
 
 
 # The states of a benchmark: half uniform over the feasible box, half along closed loops, in turns.
@@ -122,7 +122,10 @@ def _box_states(
             x[component.states] = rng.uniform(lower, upper)
             answer = solver.solve(x, design.target)
             tried += 1
-            if answer.status is SolveStatus.OPTIMAL and answer.slack + answer.offset + answer.terminal_miss < KEPT:
+            if (
+                answer.status is SolveStatus.OPTIMAL
+                and answer.slack + answer.offset + answer.terminal_miss < KEPT_TOLERANCE
+            ):
                 found[done, component.states] = x[component.states]
                 done, misses = done + 1, 0
                 told(done)
@@ -326,16 +329,16 @@ class QuestionRecorder:
 
     def __init__(self, solver: Solver) -> None:
         self._solver = solver
-        self.questions: list[tuple[Array, Array, Preview]] = []  # state (n_x,), target (n_x,) and outlook of each
+        self.questions: list[tuple[Array, Array, Preview]] = []  # state (n_x,), target (n_x,) and preview of each
         self.first_us = np.nan  # how long the first one took [µs]
 
-    def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:
+    def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:
         """See `Solver`."""
         start = time.perf_counter()
-        answer = self._solver.solve(seq, x, target, outlook)
+        answer = self._solver.solve(seq, x, target, preview)
         if not self.questions:
             self.first_us = (time.perf_counter() - start) * 1e6
-        self.questions.append((x, target, outlook))
+        self.questions.append((x, target, preview))
         return answer
 
 
@@ -412,7 +415,7 @@ class DecisionBench(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def questions(solver: ConditionedSolver, count: int, seed: int) -> Iterator[tuple[Array, Array, Preview]]:
-    """Yield state (n_x,), target (n_x,) and outlook, drawn within the limits of position and input.
+    """Yield state (n_x,), target (n_x,) and preview, drawn within the limits of position and input.
 
     Args:
         solver: Solver to ask; all its axes have limits of position and input.
@@ -439,13 +442,13 @@ def time_decisions(
     Args:
         told: Called with the number of decisions done.
     """
-    for x, target, outlook in questions(solver, _WARM, seed + 1):
-        solver.solve(0, x, target, outlook)
+    for x, target, preview in questions(solver, _WARM, seed + 1):
+        solver.solve(0, x, target, preview)
     us, iterations, slack, planned = np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count, dtype=bool)
     with quiet():
-        for i, (x, target, outlook) in enumerate(questions(solver, count, seed)):
+        for i, (x, target, preview) in enumerate(questions(solver, count, seed)):
             start = time.perf_counter()
-            answer = solver.solve(i, x, target, outlook)
+            answer = solver.solve(i, x, target, preview)
             us[i] = (time.perf_counter() - start) * 1e6
             iterations[i], slack[i] = answer.iterations, answer.slack
             planned[i] = answer.inputs.size > 0  # an inaccurate answer is a plan, too

@@ -42,13 +42,13 @@ from uavctl.smpc.baselines import (
     ZeroOnLoss,
     tune,
 )
-from uavctl.smpc.batch import BatchController, BatchSmpc, Counts, Decider, OneByOne
+from uavctl.smpc.batch import BatchController, BatchSmpc, Counts, Decider, SequentialDecider
 from uavctl.smpc.conditioned.planner import ConditionedDecider
-from uavctl.smpc.estimate import innovations
+from uavctl.smpc.estimate import innovation_form
 from uavctl.smpc.hahn_stursberg.design import Design, kappa
 from uavctl.smpc.hahn_stursberg.frozen import ShortcutDecider, ShortcutSolver
 from uavctl.smpc.nominal import ControlProblem
-from uavctl.smpc.outside import Rehearsal, make_answer
+from uavctl.smpc.outside import SilencePlanner, make_answer
 
 # Disturbances of many runs: each kind a transform of the same standard normal draws.
 
@@ -207,7 +207,7 @@ def recipe_for(given: ControllerSpec, config: Config, spec: CampaignSpec) -> Rec
         check_axes(config)
     if spec.measured == "position":
         sight = sight_of(config)
-        made = replace(made, cov=innovations(sight.plant, sight.position_std_m, 0.0, 0).estimate_cov)
+        made = replace(made, cov=innovation_form(sight.plant, sight.position_std_m, 0.0, 0).estimate_cov)
     if kind == "smpc" and not config.is_age_conditioned:
         made = replace(made, design=build_design(config))
     elif kind == "pid":
@@ -282,7 +282,7 @@ def _smpc(recipe: Recipe) -> BatchSmpc:
     if isinstance(solver, ShortcutSolver):
         decider: Decider = ShortcutDecider(solver, design.target)
     else:
-        decider = OneByOne(solver, design.target, (design.horizon, design.plant.n_u))
+        decider = SequentialDecider(solver, design.target, (design.horizon, design.plant.n_u))
     return BatchSmpc(decider, plant, design.horizon, len(design.late), brake_gain_1ps)
 
 
@@ -307,11 +307,11 @@ class BaselineSolver:
     """
 
     def __init__(self, name: str, make: Callable[[Array], tuple[ControlProblem, BatchController]]) -> None:
-        self._name, self._rehearsal = name, Rehearsal(make)
+        self._name, self._rehearsal = name, SilencePlanner(make)
 
-    def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:
-        """See `Solver`; `outlook` is not used."""
-        del outlook
+    def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:
+        """See `Solver`; `preview` is not used."""
+        del preview
         problem, inputs = self._rehearsal.inputs(seq, x, target)
         if not np.isfinite(inputs).all():
             return Answer.failed(seq, SolveStatus.FAILED, self._name)

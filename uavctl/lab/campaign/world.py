@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uavctl.config.link import LinkConfig
-from uavctl.smpc.batch import BatchController, Counts, News
+from uavctl.smpc.batch import BatchController, Counts, Information
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope
 
@@ -314,7 +314,7 @@ def fly(
             state, cov = states[every, newest[:, k]], None
         else:
             state, cov = seen.filter.told(k, states[:, k, where] + seen.noise[:, k], newest[:, k], inputs[:, :k])
-        news = News(k, newest[:, k], state, inputs[:, :k], cov)
+        news = Information(k, newest[:, k], state, inputs[:, :k], cov)
         wanted = controller.act(news)
         failed |= ~np.isfinite(wanted).all(axis=1)
         asked[:, k] = np.where(failed[:, None], 0.0, wanted)

@@ -11,14 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
+from uavctl.arrays import Array
 from uavctl.errors import DesignError
 from uavctl.smpc.conditioned.program import SlewRows
 from uavctl.smpc.link import AgeModel
 from uavctl.smpc.nominal import ControlProblem, Part, unseen
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.qp import pairs_of
-
-Array = NDArray[np.float64]
 
 # The allowed risk, spread over the ages of the information that a plan may be based on.
 

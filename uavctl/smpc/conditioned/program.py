@@ -9,6 +9,7 @@ from operator import le
 import numpy as np
 from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.smpc.nominal import ControlProblem, Lqr, Part, regulated
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.qp import ACTIVE, BELOW, OPEN, SOFT, FirstRows, QuadraticProgram, Sense, pairs_of
@@ -21,7 +22,6 @@ from uavctl.smpc.sets import Equilibria, Polytope
 # is sent is behind the plan by half a step in the mean.
 
 
-Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 _APART = 1e-8  # of a setpoint: what the first row and the set of inputs have in common is wider than this

@@ -15,9 +15,9 @@ from typing import TypeVar
 
 import clarabel
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
+from uavctl.arrays import Array
 from uavctl.smpc.sets import Scale
 
 # Settings of Clarabel for direct calls.
@@ -46,7 +46,6 @@ def conic_settings(max_iterations: int, rows: int) -> clarabel.DefaultSettings:
     return settings
 
 
-Array = NDArray[np.float64]
 Result = TypeVar("Result")
 
 # A linear cost above _STEEPEST, as far outside the limits, would pass for an unbounded problem: it becomes _STEEP.

@@ -22,6 +22,7 @@ from scipy import sparse
 from scipy.linalg import block_diag, qr
 from scipy.sparse.csgraph import connected_components
 
+from uavctl.arrays import Array
 from uavctl.errors import DesignError
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.schedule import Schedule
@@ -34,7 +35,6 @@ from uavctl.smpc.sets import RANK_TOLERANCE, equilibrated, equilibria
 # gains across components only add cost and covariance. The χ² quantiles stay those of the whole plant.
 
 
-Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 

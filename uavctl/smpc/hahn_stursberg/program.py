@@ -10,8 +10,8 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.smpc.answer import NOMINAL, Preview
 from uavctl.smpc.hahn_stursberg.cones import ConicProgram, Expression, ProgramBuilder, join
 from uavctl.smpc.hahn_stursberg.design import Design
@@ -24,9 +24,6 @@ from uavctl.smpc.sets import NaturalSizes, Scale
 # The plan that rests at the place in the limits nearest to where the state would drift, with the slack that this
 # takes. From far outside the limits the answer differs from it by numbers of the usual size, which the solver finds
 # with its usual accuracy; the large ones are in the point.
-
-
-Array = NDArray[np.float64]
 
 
 class RestingPoint:
@@ -153,17 +150,17 @@ class Program:
         scale = Scale(self._variable_sizes(), cost)
         self.conic: ConicProgram = self._builder.build(design.max_iterations, scale, origin)
 
-    def parameters(self, x: Array, target: Array, outlook: Preview = NOMINAL) -> Array:
-        """Parameters for a state (n_x,) and a target (n_x,) of this component, and the whole plant's outlook."""
+    def parameters(self, x: Array, target: Array, preview: Preview = NOMINAL) -> Array:
+        """Parameters for a state (n_x,) and a target (n_x,) of this component, and the whole plant's preview."""
         part, free = self.part, self.horizon.free
         here, there = part.coordinates @ x, part.coordinates @ target
         limits = np.tile(part.b_x, self._last + 1)
-        if outlook.limits is not None:
-            b = outlook.limits[:, part.rows_x]
+        if preview.limits is not None:
+            b = preview.limits[:, part.rows_x]
             limits = np.concatenate([b[1 : self._last + 1], b[free:].min(axis=0)[None]]).ravel()
         path = np.zeros(free * (part.x_eq.shape[0] + part.b.shape[1]))
-        if outlook.path is not None:
-            states, inputs = outlook.path.states[:free, part.states], outlook.path.inputs[:free, part.inputs]
+        if preview.path is not None:
+            states, inputs = preview.path.states[:free, part.states], preview.path.inputs[:free, part.inputs]
             path = np.concatenate([states.ravel(), inputs.ravel()])
         return np.concatenate([x - part.x_eq @ here, there - here, here, limits, path])
 

@@ -17,6 +17,7 @@ from scipy.linalg import solve_discrete_are
 from scipy.optimize import minimize
 from scipy.sparse.csgraph import connected_components
 
+from uavctl.arrays import Array
 from uavctl.errors import DesignError
 from uavctl.smpc.hahn_stursberg.design import DesignSpec, kappa
 from uavctl.smpc.hahn_stursberg.schedule import ScheduleDemand, fixed, greedy
@@ -30,8 +31,6 @@ from uavctl.smpc.sets import Polytope, rest_input
 # variance along one row of a set with weights of rank one. A second Lyapunov equation, P = Fᵀ P F + Q, gives the
 # gradient 2 (Q_u K R + Sᵀ P F) Σ Rᵀ.
 
-
-Array = NDArray[np.float64]
 
 # The sums of Lyapunov's equations are cut where a power of F has shrunk below this.
 _NEGLIGIBLE = 1e-20

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.errors import DesignError
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope, rest_input
@@ -14,7 +15,6 @@ from uavctl.smpc.sets import Polytope, rest_input
 # Terminal system, invariant covariance, terminal weight (Sec. 4.3), and Assumption 4 with figures.
 
 
-Array = NDArray[np.float64]
 _DOUBLINGS = 40  # 2^40 steps: enough for the largest radius that is taken
 
 
