@@ -82,7 +82,7 @@ def test_a_motion_begins_without_what_the_vehicles_own_loops_have_not_done_yet(p
     plant = build_plant(load_config(preset))
     t = times(plant.dt_s, 100)
     motion = follow_positions(plant, place(t + 3.0), None)  # it begins under way
-    loops = [i for i, (name, _) in enumerate(plant.further) if i > 0 and name]
+    loops = [i for i, (name, _) in enumerate(plant.extra_states) if i > 0 and name]
     for velocity in plant.velocity_index:
         np.testing.assert_allclose(motion.states[0, [velocity + 1 + i for i in loops]], 0.0, atol=1e-6)
 

@@ -101,7 +101,7 @@ _SUFFIXES = {"m": "_m", "m/s": "_mps", "m/s²": "_mps2"}
 def signals(config: Config) -> tuple[tuple[Signal, ...], tuple[Signal, ...]]:
     """Return the states and the inputs of a configuration's plant, in order."""
     of = build_plant(config)
-    states = names_of((), of.n_x, of.axes, of.position_index, of.velocity_index, of.further).states
+    states = names_of((), of.n_x, of.axes, of.position_index, of.velocity_index, of.extra_states).states
     unit = "" if config.plant.model == "matrices" else "m/s²"
     inputs = [(f"{axis} input", unit) for axis in of.axes] or [(f"input {i}", "") for i in range(of.n_u)]
     made = (

@@ -39,7 +39,7 @@ from uavctl.smpc.conditioned.planner import (
 )
 from uavctl.smpc.estimate import InnovationForm, add_bias, innovation_form
 from uavctl.smpc.nominal import ControlProblem
-from uavctl.smpc.plant import AXES, HeldAxis, Plant, drag_lag, velocity_reference
+from uavctl.smpc.plant import AXES, Plant, VelocityReferenceAxis, drag_lag, velocity_reference
 from uavctl.smpc.sets import Polytope
 
 # The paper's scheme is loaded only where it is flown: loading it takes a tenth of the time of all else.
@@ -68,8 +68,10 @@ def build_plant(config: Config) -> Plant:
     if plant.model == "drag-lag":
         return drag_lag(plant.drag_1ps, plant.lag_s, plant.gain, plant.wind_std_mps2, plant.dt_s, plant.axes)
     if plant.model == "velocity-reference":
-        numbers = (getattr(plant, key) for key in HeldAxis._fields)
-        return velocity_reference([HeldAxis(*one) for one in zip(*numbers, strict=True)], plant.dt_s, plant.axes)
+        numbers = (getattr(plant, key) for key in VelocityReferenceAxis._fields)
+        return velocity_reference(
+            [VelocityReferenceAxis(*one) for one in zip(*numbers, strict=True)], plant.dt_s, plant.axes
+        )
     a, b, e, w, accel = (
         np.array(rows, dtype=np.float64) for rows in (plant.a, plant.b, plant.e, plant.w, plant.accel_per_input)
     )

@@ -24,7 +24,7 @@ from uavctl.records import SolveStatus
 from uavctl.smpc.answer import NOMINAL, Answer, Preview, are_finite
 from uavctl.smpc.batch import BatchController, Information
 from uavctl.smpc.nominal import ControlProblem, lqr
-from uavctl.smpc.sets import equilibria
+from uavctl.smpc.sets import find_equilibria
 
 MAX_ERROR_CHARACTERS = 200  # longest text of an exception in a fault [characters]
 
@@ -224,7 +224,7 @@ def retarget(problem: ControlProblem, target: Array) -> ControlProblem:
 def _rest_input(problem: ControlProblem) -> Callable[[Array], Array]:
     """Return the function from an equilibrium (n_x,) to the input (n_u,) that keeps it."""
     plant = problem.plant
-    rests = equilibria(plant.a, plant.b, problem.q_x, problem.q_u, np.array(plant.position_index, dtype=np.intp))
+    rests = find_equilibria(plant.a, plant.b, problem.q_x, problem.q_u, np.array(plant.position_index, dtype=np.intp))
     return lambda target: np.asarray(rests.u_eq @ target[rests.held])
 
 

@@ -25,7 +25,7 @@ from uavctl.records import PositionSample
 from uavctl.smpc.baselines import Governor, MeanQp
 from uavctl.smpc.batch import Counts, Information, predict, predict_covariance
 from uavctl.smpc.estimate import innovation_form
-from uavctl.smpc.nominal import unseen
+from uavctl.smpc.nominal import propagate_covariance
 
 Array = NDArray[np.float64]
 S = 1_000_000_000
@@ -150,7 +150,9 @@ def test_simple_margins_begin_with_what_the_filter_leaves_open() -> None:
     for k in range(80):
         _, last = looked.told(k, np.zeros((1, 2)), np.array([k]), np.zeros((1, k, 2)))
     assert last[0] == pytest.approx(cov, abs=1e-9)
-    assert unseen(plant, 1, cov)[1] == pytest.approx(plant.a @ cov @ plant.a.T + unseen(plant, 1)[1])
+    assert propagate_covariance(plant, 1, cov)[1] == pytest.approx(
+        plant.a @ cov @ plant.a.T + propagate_covariance(plant, 1)[1]
+    )
     toward = Information(0, np.zeros(1, dtype=np.intp), np.array([[0.0, 0.0, 18.9, 0.3]]), np.zeros((1, 0, 2)))
     for kind in (Governor, MeanQp):
         wary, bold = kind(given, 1.5, cov), kind(given, 1.5)

@@ -18,7 +18,7 @@ from uavctl.smpc.conditioned.planner import ConditionedSolver
 from uavctl.smpc.conditioned.program import SlewRows
 from uavctl.smpc.estimate import innovation_form
 from uavctl.smpc.link import AgeModel, bernoulli, gilbert_elliott
-from uavctl.smpc.nominal import unseen
+from uavctl.smpc.nominal import propagate_covariance
 
 ALLOWED = 0.05
 EAST = np.array([[0.0, 0.0, 1.0, 0.0]])  # its upper limit
@@ -30,7 +30,7 @@ def steps_for(loss: float) -> int:
 
 def distances(link: AgeModel, steps: int, cov: Array | None = None, slew_mps3: float = np.inf, most: int = 1) -> Array:
     given = replace(problem("paper"), horizon=steps)
-    deviations = np.sqrt([EAST[0] @ one @ EAST[0] for one in unseen(given.plant, steps)[1:]])
+    deviations = np.sqrt([EAST[0] @ one @ EAST[0] for one in propagate_covariance(given.plant, steps)[1:]])
     risk = age_risk(link, deviations, ALLOWED, corner=2)
     slew = SlewRows(given.plant, given.input_set, slew_mps3)
     return rest_backoffs(given, risk, ALLOWED, slew, EAST, cov, most)
@@ -48,7 +48,7 @@ def test_the_share_of_new_plans_that_need_slack_is_the_one_it_is_made_for(loss: 
     risk = age_risk(bernoulli(np.array([1.0 - loss])), sigma(steps, np.zeros((4, 4))), ALLOWED, corner=2)
     backoff = quantile(risk.shares) * sigma(steps, cov)
     gap = np.minimum(rng.geometric(1.0 - loss, draws), steps)
-    spread = unseen(plant, steps, cov) - cov
+    spread = propagate_covariance(plant, steps, cov) - cov
     state = np.zeros((draws, 4))
     for t in np.unique(gap):
         values, vectors = np.linalg.eigh(spread[t])
@@ -72,7 +72,7 @@ def test_the_share_of_new_plans_that_need_slack_is_the_one_it_is_made_for(loss: 
 
 def sigma(steps: int, cov: Array) -> Array:
     """Deviations (H,) of the row in the stages of a plan."""
-    return np.sqrt([EAST[0] @ one @ EAST[0] for one in unseen(problem("paper").plant, steps, cov)[1:]])
+    return np.sqrt([EAST[0] @ one @ EAST[0] for one in propagate_covariance(problem("paper").plant, steps, cov)[1:]])
 
 
 def test_in_bursts_it_is_where_resting_at_all_ages_is_outside_as_often_as_allowed() -> None:

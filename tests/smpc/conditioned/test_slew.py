@@ -14,7 +14,7 @@ from uavctl.smpc.answer import Preview
 from uavctl.smpc.conditioned.planner import ConditionedSolver
 from uavctl.smpc.conditioned.program import SlewRows
 from uavctl.smpc.link import bernoulli
-from uavctl.smpc.nominal import ControlProblem, parts
+from uavctl.smpc.nominal import ControlProblem, find_parts
 from uavctl.smpc.sets import Polytope
 
 LINK = bernoulli(np.array([0.7]))
@@ -102,10 +102,10 @@ def test_without_a_word_of_what_was_sent_the_first_input_is_free() -> None:
 
 def test_axes_that_share_inputs_are_one_part() -> None:
     given = problem("paper")
-    assert len(parts(given)) == 2
+    assert len(find_parts(given)) == 2
     mixed = replace(given.plant, accel_per_input=np.array([[0.5, 0.1], [0.0, 0.5]]))
     shared = replace(given, plant=mixed)
-    assert len(parts(shared, SlewRows(mixed, given.input_set, 0.9).d)) == 1
+    assert len(find_parts(shared, SlewRows(mixed, given.input_set, 0.9).d)) == 1
     sent = np.array([6.0, -9.0])
     answer = solver_of(shared, 0.9).solve(0, np.array([20.0, 2.0, -10.0, 1.0]), given.target, Preview(sent=sent))
     change = np.diff(answer.inputs, axis=0, prepend=sent[None]) @ mixed.accel_map.T

@@ -48,10 +48,10 @@ from uavctl.smpc.conditioned.backoffs import (
 )
 from uavctl.smpc.conditioned.program import PartProgram, RegulatedRows, RestPlaces, SlewRows
 from uavctl.smpc.link import AgeModel
-from uavctl.smpc.nominal import ControlProblem, lqr, parts, unseen
+from uavctl.smpc.nominal import ControlProblem, find_parts, lqr, propagate_covariance
 from uavctl.smpc.plant import Plant, digest
 from uavctl.smpc.qp import OPEN
-from uavctl.smpc.sets import Polytope, equilibria
+from uavctl.smpc.sets import Polytope, find_equilibria
 
 if TYPE_CHECKING:
     from uavctl.smpc.hahn_stursberg.design import Design
@@ -129,7 +129,7 @@ class ConditionedSolver:
         plant, steps, law = problem.plant, problem.horizon, lqr(problem.plant, problem.q_x, problem.q_u)
         self._tail = law.p
         self._slew = SlewRows(plant, problem.input_set, slew_mps3)
-        found = parts(problem, self._slew.d)
+        found = find_parts(problem, self._slew.d)
         moved = {int(state) for part in found for state in part.states}
         if len(moved) < plant.n_x:
             adrift = sorted(set(range(plant.n_x)) - moved)
@@ -144,7 +144,7 @@ class ConditionedSolver:
         ]
         self._in_order = bool((self._rows == np.arange(problem.state_set.b.size)).all())
         self._c, self._b = problem.state_set.c[self._rows], problem.state_set.b[self._rows]
-        self._rests = equilibria(
+        self._rests = find_equilibria(
             plant.a, plant.b, problem.q_x, problem.q_u, np.array(plant.position_index, dtype=np.intp)
         )
         self._holds = bool(self._rests.u_eq.any())
@@ -432,7 +432,7 @@ class ConditionedDecider:
 
     def __init__(self, solver: ConditionedSolver, target: Array) -> None:
         self._solver, self._target = solver, target
-        self._unseen = unseen(solver.problem.plant, solver.problem.horizon)
+        self._unseen = propagate_covariance(solver.problem.plant, solver.problem.horizon)
 
     def decide(self, x: Array, late: int, cov: Array | None = None) -> Decisions:
         """See `Decider`."""

@@ -264,7 +264,7 @@ class ConicProgram:
             b = self._b_const + self._b_par @ parameters
             origin = np.zeros(q.size)
             if self._origin is not None:
-                origin = self._scale.beyond_usual(self._origin(parameters))
+                origin = self._scale.excess_over_usual(self._origin(parameters))
                 slope = self._p @ origin
                 constant += float((q + 0.5 * slope) @ origin)
                 q, b = q + slope, b - self._a @ origin

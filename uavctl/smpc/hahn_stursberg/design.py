@@ -22,7 +22,7 @@ from uavctl.smpc.hahn_stursberg.terminal import (
     stationary_cost,
 )
 from uavctl.smpc.link import LinkModel, age_cdf
-from uavctl.smpc.plant import Plant, digest, steps_to_reach
+from uavctl.smpc.plant import Plant, count_reach_steps, digest
 from uavctl.smpc.sets import Polytope
 
 # Risk allocation: how a likelihood becomes the factor of a back-off.
@@ -140,7 +140,7 @@ def make_design(spec: DesignSpec, cost_of: Callable[[Design, Array], float | Non
 
 def _check_horizon(spec: DesignSpec) -> None:
     """The mean is at the target from stage N = H - τ on: N steps have to suffice from any state."""
-    free, least = spec.horizon - spec.tau, steps_to_reach(spec.plant)
+    free, least = spec.horizon - spec.tau, count_reach_steps(spec.plant)
     if free < least:
         raise DesignError(
             "smpc.tau",

@@ -19,7 +19,7 @@ from uavctl.smpc.answer import NOMINAL, Preview
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.horizon import Affine, Horizon
 from uavctl.smpc.hahn_stursberg.program import factor, terminal_backoff_u, terminal_backoff_x
-from uavctl.smpc.qp import OPEN, pairs_of
+from uavctl.smpc.qp import OPEN, find_pairs
 
 Index = NDArray[np.intp]
 
@@ -284,7 +284,7 @@ def dot_rows(left: Array, right: Array) -> Array:
 def _directions(c: Array) -> list[tuple[Array, tuple[int, int]]]:
     """Directions of a set's rows, each with the rows that limit +c and -c (-1 for none)."""
     found = []
-    for pair in pairs_of(c):
+    for pair in find_pairs(c):
         rows = dict(pair.sides)
         found.append((np.array(pair.c), (rows.get(1.0, -1), rows.get(-1.0, -1))))
     return found

@@ -16,7 +16,7 @@ from uavctl.smpc.answer import NOMINAL, Preview
 from uavctl.smpc.hahn_stursberg.cones import ConicProgram, Expression, ProgramBuilder, join
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.horizon import Affine, Component, Horizon, terminal_bound
-from uavctl.smpc.qp import Pair, VariableLayout, pairs_of
+from uavctl.smpc.qp import Pair, VariableLayout, find_pairs
 from uavctl.smpc.sets import NaturalSizes, Scale
 
 # A point near a question's answer, for numbers to be relative to.
@@ -112,13 +112,13 @@ class Program:
     def __init__(self, design: Design, horizon: Horizon, *, soft_terminal: bool) -> None:
         self.design, self.horizon, self.part = design, horizon, horizon.component
         self._last = horizon.steps if soft_terminal else horizon.free - 1  # last stage with state rows
-        self._pairs_x = pairs_of(self.part.c_x)
-        self._pairs_u = pairs_of(self.part.c_u)
+        self._pairs_x = find_pairs(self.part.c_x)
+        self._pairs_u = find_pairs(self.part.c_u)
         n_x, n_y = self.part.x_eq.shape
         self._placed = np.any(self.part.c_x @ self.part.x_eq != 0, axis=1)  # rows of x_s that y moves
         self._sizes = _sizes(self.part, horizon.free)
         self._backoff_sizes: list[float] = []
-        self.layout = VariableLayout.of(
+        self.layout = VariableLayout.make(
             v=horizon.gamma.shape[2],
             theta=horizon.n_theta,
             y=n_y,
@@ -318,7 +318,9 @@ class Program:
 
 
 def _sizes(part: Component, free: int) -> NaturalSizes:
-    return NaturalSizes.of(part.a, part.b, part.q_x, part.q_u, part.c_u, part.b_u, part.sigma_x, part.k, free)
+    return NaturalSizes.from_component(
+        part.a, part.b, part.q_x, part.q_u, part.c_u, part.b_u, part.sigma_x, part.k, free
+    )
 
 
 def terminal_backoff_x(design: Design, part: Component) -> Array:
