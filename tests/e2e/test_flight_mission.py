@@ -245,7 +245,7 @@ def test_a_mission_goes_on_where_it_was_after_the_pilot_had_the_vehicle() -> Non
 
 def test_a_plan_that_gives_way_is_one_event_with_the_worst_and_the_number_of_others() -> None:
     given = tuple(GaveWay(constraint="equilibrium", stage=3, index=i, amount=0.1 * (i + 1)) for i in range(3))
-    solver = StubSolver(small_plant(), faults={1: lambda answer: replace(answer, gave_way=given)})
+    solver = StubSolver(small_plant(), faults={1: lambda answer: replace(answer, relaxed=given)})
     outputs = run(make_controller(solver), inputs_of(range(3 * TICKS), one_a_step()))
     told = [(number, output) for number, output in enumerate(outputs) if "gave-way" in codes(output)]
     assert [number for number, _ in told] == [TICKS]
@@ -261,9 +261,9 @@ class ListeningSolver(StubSolver):
 
     told: list[Preview] = field(default_factory=list)
 
-    def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:
-        self.told.append(outlook)
-        return super().solve(seq, x, target, outlook)
+    def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:
+        self.told.append(preview)
+        return super().solve(seq, x, target, preview)
 
 
 @pytest.mark.parametrize(("late_steps", "wanted"), [(0, 0), (1, 1), (3, 2)])
@@ -271,4 +271,4 @@ def test_a_late_position_is_told_as_far_as_the_design_counts_with_it(late_steps:
     solver = ListeningSolver(small_plant())
     controller = replace(make_controller(solver), late_steps=late_steps)
     run(controller, inputs_of(range(8 * TICKS), one_a_step(delay_ns=430 * MS)))
-    assert {outlook.late for outlook in solver.told} == {wanted}
+    assert {preview.age for preview in solver.told} == {wanted}

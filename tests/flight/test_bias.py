@@ -41,7 +41,7 @@ from uavctl.flight.tick import make_initial_state
 from uavctl.flight.tick import tick as run_tick
 from uavctl.records import ControlMode, PositionSample, StepInput, VehicleMotion
 from uavctl.smpc.answer import NOMINAL, Answer, Preview
-from uavctl.smpc.estimate import innovations, with_bias
+from uavctl.smpc.estimate import add_bias, innovation_form
 
 Array = NDArray[np.float64]
 
@@ -56,7 +56,7 @@ def test_the_larger_plant_is_the_matrix_exponential_of_input_and_bias_together()
     g[:, 5] = g[:, 4]
     g[5, 6] = 1.0 / 0.2
     want = expm(0.2 * g)
-    plant = with_bias(small_plant(), DRIFT)
+    plant = add_bias(small_plant(), DRIFT)
     kept = [0, 1, 2, 5]
     np.testing.assert_allclose(plant.a, want[np.ix_(kept, kept)], atol=1e-12)
     np.testing.assert_allclose(plant.b[:, 0], want[kept, 4], atol=1e-12)
@@ -110,10 +110,10 @@ def test_the_real_filter_settles_at_the_design_s_covariance() -> None:
         history, _, _ = absorb_samples(kalman, history, at_ns, [sample(at_ns - 150 * MS, at_ns)])
     now = estimate_at(kalman, history, at_ns)
     assert now is not None
-    form = innovations(plant, parameters.position_std_m, 0.15, 0, DRIFT)
+    form = innovation_form(plant, parameters.position_std_m, 0.15, 0, DRIFT)
     np.testing.assert_allclose(np.array(now.cov), form.estimate_cov, rtol=1e-6)
     assert form.plant.e.shape == (3, 1)
-    without = innovations(plant, parameters.position_std_m, 0.15, 0)
+    without = innovation_form(plant, parameters.position_std_m, 0.15, 0)
     assert np.linalg.eigvalsh(form.estimate_cov - without.estimate_cov)[0] > -1e-12  # to find more takes more noise
 
 
@@ -204,8 +204,8 @@ def test_a_plan_is_shifted_by_it_and_says_so() -> None:
 class Steady(StubSolver):
     """Asks for the same all the time."""
 
-    def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:
-        answer = super().solve(seq, x, target, outlook)
+    def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:
+        answer = super().solve(seq, x, target, preview)
         return replace(answer, inputs=np.full_like(answer.inputs, 0.2))
 
 

@@ -84,9 +84,9 @@ def test_an_estimate_that_is_no_number_reaches_nothing() -> None:
 
 def test_the_target_is_the_waypoint_and_what_is_wanted() -> None:
     mission = on_a_line(0.3, 1.0)
-    target, outlook = make_question(mission, MissionState(start_ns=0, waypoint=1), DT_NS)
+    target, preview = make_question(mission, MissionState(start_ns=0, waypoint=1), DT_NS)
     assert target.tolist() == [1.0, 0.0]
-    assert outlook.nominal
+    assert preview.nominal
     assert find_target(mission, MissionState(start_ns=0, waypoint=1), DT_NS) == (1.0, 0.0)
 
 
@@ -145,23 +145,23 @@ def test_no_axis_leads_on_a_trajectory_or_without_a_room() -> None:
 def test_a_fence_is_a_line_between_its_samples_and_constant_outside() -> None:
     fence = Fence(row=1, times_ns=np.array([1.0, 2.0]) * SECOND_NS, values=np.array([4.0, 2.0]))
     mission = on_a_line(0.0, fences=(fence,))
-    _, outlook = make_question(mission, MissionState(start_ns=7 * SECOND_NS), 8 * SECOND_NS)
-    assert outlook.limits is not None
-    assert outlook.limits[:, 0].tolist() == [5.0] * 5
-    assert outlook.limits[:, 1] == pytest.approx([4.0, 3.6, 3.2, 2.8, 2.4])
-    _, outlook = make_question(mission, MissionState(start_ns=7 * SECOND_NS), 20 * SECOND_NS)
-    assert outlook.limits is not None
-    assert outlook.limits[:, 1].tolist() == [2.0] * 5
+    _, preview = make_question(mission, MissionState(start_ns=7 * SECOND_NS), 8 * SECOND_NS)
+    assert preview.limits is not None
+    assert preview.limits[:, 0].tolist() == [5.0] * 5
+    assert preview.limits[:, 1] == pytest.approx([4.0, 3.6, 3.2, 2.8, 2.4])
+    _, preview = make_question(mission, MissionState(start_ns=7 * SECOND_NS), 20 * SECOND_NS)
+    assert preview.limits is not None
+    assert preview.limits[:, 1].tolist() == [2.0] * 5
 
 
 def test_a_fence_that_is_no_closer_than_the_limits_is_none_and_of_several_the_closest_counts() -> None:
     wide = Fence(row=0, times_ns=np.array([0.0]), values=np.array([9.0]))
-    _, outlook = make_question(on_a_line(0.0, fences=(wide,)), MissionState(start_ns=0), 0)
-    assert outlook.limits is None
+    _, preview = make_question(on_a_line(0.0, fences=(wide,)), MissionState(start_ns=0), 0)
+    assert preview.limits is None
     near, nearer = (Fence(row=0, times_ns=np.array([0.0]), values=np.array([side])) for side in (3.0, 2.5))
-    _, outlook = make_question(on_a_line(0.0, fences=(near, wide, nearer)), MissionState(start_ns=0), 0)
-    assert outlook.limits is not None
-    assert outlook.limits[:, 0].tolist() == [2.5] * 5
+    _, preview = make_question(on_a_line(0.0, fences=(near, wide, nearer)), MissionState(start_ns=0), 0)
+    assert preview.limits is not None
+    assert preview.limits[:, 0].tolist() == [2.5] * 5
 
 
 def moving_north(rows: int) -> Mission:
@@ -180,16 +180,16 @@ def test_a_trajectory_stands_still_for_an_order_and_a_fence_does_not() -> None:
     left = stay_at(stay_at(state, (0.5, 0.0), 3 * DT_NS), (0.7, 0.0), 4 * DT_NS)
     assert find_target(mission, left, 5 * DT_NS) == (0.7, 0.0)
     assert advance_mission(mission, left, (0.0, 0.0), 5 * DT_NS) == left
-    target, outlook = make_question(mission, left, 5 * DT_NS)
+    target, preview = make_question(mission, left, 5 * DT_NS)
     assert target.tolist() == [0.7, 0.0]
-    assert outlook.path is None
-    assert outlook.limits is not None
-    assert outlook.limits[0, 0] == pytest.approx(4.5)  # after 1 s of its own time
+    assert preview.path is None
+    assert preview.limits is not None
+    assert preview.limits[0, 0] == pytest.approx(4.5)  # after 1 s of its own time
     again = resume(left, 8 * DT_NS)
     assert [find_target(mission, again, n * DT_NS)[0] for n in (8, 9, 12, 13)] == [3.0, 4.0, 7.0, 7.0]
-    _, outlook = make_question(mission, again, 10 * DT_NS)
-    assert outlook.limits is not None
-    assert outlook.limits[0, 0] == pytest.approx(4.0)
+    _, preview = make_question(mission, again, 10 * DT_NS)
+    assert preview.limits is not None
+    assert preview.limits[0, 0] == pytest.approx(4.0)
     assert resume(again, 9 * DT_NS) == again
 
 
@@ -310,9 +310,9 @@ def test_too_fast_a_motion_is_refused_with_the_figures() -> None:
 def test_without_a_mission_the_target_is_held() -> None:
     config, design = room_with()
     mission = build_controller(config, design).mission
-    target, outlook = make_question(mission, MissionState(start_ns=0), 0)
+    target, preview = make_question(mission, MissionState(start_ns=0), 0)
     assert target.tolist() == design.target.tolist()
-    assert outlook.nominal
+    assert preview.nominal
 
 
 def test_a_fence_becomes_a_row_of_the_state_set() -> None:

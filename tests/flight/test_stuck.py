@@ -46,8 +46,8 @@ class Steering(StubSolver):
         super().__init__(small_plant(), HORIZON)
         self.want, self.gain = want, gain
 
-    def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:
-        answer = super().solve(seq, x, target, outlook)
+    def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:
+        answer = super().solve(seq, x, target, preview)
         u = float(np.clip(self.gain * (self.want(seq) - x[0]) - 1.2 * x[1] - 0.3 * x[2], -1.5, 1.5))
         return replace(answer, inputs=np.full_like(answer.inputs, u))
 

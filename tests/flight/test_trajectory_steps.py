@@ -82,7 +82,7 @@ def test_a_motion_begins_without_what_the_vehicles_own_loops_have_not_done_yet(p
     plant = build_plant(load_config(preset))
     t = times(plant.dt_s, 100)
     motion = follow_positions(plant, place(t + 3.0), None)  # it begins under way
-    loops = [i for i, (name, _) in enumerate(plant.further) if i > 0 and name]
+    loops = [i for i, (name, _) in enumerate(plant.extra_states) if i > 0 and name]
     for velocity in plant.velocity_index:
         np.testing.assert_allclose(motion.states[0, [velocity + 1 + i for i in loops]], 0.0, atol=1e-6)
 
@@ -97,9 +97,9 @@ def test_what_is_sent_at_a_boundary_follows_the_motion_of_when_it_acts(preset: s
     state = MissionState(start_ns=begin_ns)
     for step in (0, 1, 57, 130):
         at_ns = begin_ns + round(step * dt_s * 1e9)
-        target, outlook = make_question(mission, state, at_ns)
-        assert outlook.path is not None
-        first = (outlook.path.states[0] + target)[index]
+        target, preview = make_question(mission, state, at_ns)
+        assert preview.path is not None
+        first = (preview.path.states[0] + target)[index]
         np.testing.assert_allclose(first, place(np.array([step * dt_s + dead_s]))[0], atol=5e-3)
         # Judged is where it is to be now, between rows too.
         for later_ns in (0, 20_000_000):
@@ -112,7 +112,7 @@ def test_a_fence_is_known_for_when_a_plan_acts() -> None:
     fence = "fence=[{state='north',side='upper',times_s=[0.0,10.0],values=[3.0,2.0]}]"
     for dead_s in (0.0, 0.1):
         mission = build_controller(load_config("room-px4", [fence, f"plant.dead_time_s={dead_s}"])).mission
-        _, outlook = make_question(mission, MissionState(start_ns=0), 4_000_000_000)
-        assert outlook.limits is not None
+        _, preview = make_question(mission, MissionState(start_ns=0), 4_000_000_000)
+        assert preview.limits is not None
         row = mission.fences[0].row
-        np.testing.assert_allclose(outlook.limits[[0, 20], row], [2.6 - 0.1 * dead_s, 2.5 - 0.1 * dead_s], atol=1e-9)
+        np.testing.assert_allclose(preview.limits[[0, 20], row], [2.6 - 0.1 * dead_s, 2.5 - 0.1 * dead_s], atol=1e-9)

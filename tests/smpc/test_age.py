@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.errors import DesignError
-from uavctl.smpc.link import at_most, bernoulli, information_probability
+from uavctl.smpc.link import age_cdf, bernoulli, information_probability
 
-Array = NDArray[np.float64]
 LINKS = st.lists(st.floats(0.0, 1.0), min_size=1, max_size=8).map(np.array)
 
 
@@ -66,9 +65,9 @@ def test_counted_ages_follow_the_distribution() -> None:
 def test_threshold_of_the_paper() -> None:
     mu = bernoulli(np.array([0.7])).age(12)
     # 99.19 % as printed is P(a <= 3); P(a <= 4) is 99.76 %.
-    assert at_most(mu, 12, 3) == pytest.approx(0.9919)
-    assert at_most(mu, 12, 4) == pytest.approx(0.99757)
-    assert at_most(mu, 12, -1) == 0.0
+    assert age_cdf(mu, 12, 3) == pytest.approx(0.9919)
+    assert age_cdf(mu, 12, 4) == pytest.approx(0.99757)
+    assert age_cdf(mu, 12, -1) == 0.0
 
 
 def test_information_probability() -> None:

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from question_rig import case, near, small, uniform
 
+from uavctl.arrays import Array
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import NOMINAL, Answer, Preview
-from uavctl.smpc.batch import BatchSmpc, News, OneByOne
+from uavctl.smpc.batch import BatchSmpc, Information, SequentialDecider
 from uavctl.smpc.hahn_stursberg.frozen import FROZEN, ShortcutDecider, ShortcutSolver
-
-Array = NDArray[np.float64]
 
 
 def decider() -> ShortcutDecider:
@@ -41,7 +39,7 @@ class Counting:
     def __init__(self) -> None:
         self.count = 0
 
-    def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:
+    def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:
         self.count += 1
         return Answer.failed(seq, SolveStatus.FAILED, FROZEN)
 
@@ -49,7 +47,7 @@ class Counting:
 def test_equal_states_are_asked_once() -> None:
     counting = Counting()
     x = np.tile([[35.0, -2.0, -20.0, -4.0], [1.0, 0.0, 0.0, 0.0]], (50, 1))
-    found = OneByOne(counting, np.zeros(4), (12, 2)).decide(x, 0)
+    found = SequentialDecider(counting, np.zeros(4), (12, 2)).decide(x, 0)
     assert counting.count == 2
     assert found.inputs.shape == (100, 12, 2)
     assert not found.solved.any()
@@ -78,7 +76,7 @@ def test_late_positions_are_answered_by_the_late_design() -> None:
     x = np.array([uniform(design, rng) for _ in range(10)])
     for late in (0, 1):
         found = one.decide(x, late)
-        wanted = [solver.solve(0, state, design.target, Preview(late=late)) for state in x]
+        wanted = [solver.solve(0, state, design.target, Preview(age=late)) for state in x]
         np.testing.assert_array_equal(found.cost, [answer.cost for answer in wanted])
     assert not one.decide(x, 2).solved.any()
 
@@ -94,6 +92,6 @@ def test_a_run_whose_state_is_not_finite_has_no_plan_and_disturbs_no_other() -> 
         pilot = BatchSmpc(decider(), design.plant, design.horizon, len(design.late), 0.5)
         pilot.begin(6)
         with np.errstate(invalid="ignore"):  # the brake of the three without a state
-            asked.append(pilot.act(News(0, np.zeros(6, dtype=np.intp), states, np.zeros((6, 0, 2)))))
+            asked.append(pilot.act(Information(0, np.zeros(6, dtype=np.intp), states, np.zeros((6, 0, 2)))))
         assert pilot.tally.decisions.sum() == np.isfinite(states).all(axis=1).sum()
     np.testing.assert_array_equal(asked[0][[0, 2, 5]], asked[1][[0, 2, 5]])

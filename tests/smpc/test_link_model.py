@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.errors import DesignError
 from uavctl.smpc.link import Arrivals, LatePackets, LinkModel, bernoulli, empirical, gilbert_elliott
 
-Array = NDArray[np.float64]
 T = 10
 PROBABILITY = st.floats(0.0, 1.0)
 GAPS = np.array([0.6, 0.15, 0.0, 0.2, 0.05])
@@ -61,14 +60,14 @@ def test_independent_losses_have_the_closed_form_at_every_age_of_the_base() -> N
     for late, t, delay in product(range(5), range(T), range(1, 7)):
         newest = t - delay
         expected = 1.0 if newest < 0 else 1.0 - q ** max(0, min(delay, t - late))
-        assert link.available(t, newest, late) == pytest.approx(expected, abs=1e-14)
+        assert link.availability(t, newest, late) == pytest.approx(expected, abs=1e-14)
     assert [link.outage(n) for n in range(5)] == pytest.approx([q**n for n in range(5)])
 
 
 def test_a_loss_that_cannot_be_leaves_the_link_as_it_was() -> None:
-    assert bernoulli(np.array([1.0])).available(5, 1, late=3) == 1.0
+    assert bernoulli(np.array([1.0])).availability(5, 1, late=3) == 1.0
     # A run of two at most, and three are seen: the next position comes as after an arrival.
-    assert empirical(np.array([0.5, 0.2, 0.3])).available(4, 3, late=3) == pytest.approx(0.5)
+    assert empirical(np.array([0.5, 0.2, 0.3])).availability(4, 3, late=3) == pytest.approx(0.5)
 
 
 def test_varying_probabilities_go_by_their_step_and_the_last_one_is_repeated() -> None:
@@ -79,7 +78,7 @@ def test_varying_probabilities_go_by_their_step_and_the_last_one_is_repeated() -
         if t >= delay and t > late:
             first = max(t - delay + 1, late + 1)
             expected = 1.0 - np.prod(1.0 - every[first - 1 : t])
-            assert link.available(t, t - delay, late) == pytest.approx(expected)
+            assert link.availability(t, t - delay, late) == pytest.approx(expected)
 
 
 def test_a_chain_without_memory_is_the_bernoulli_link() -> None:
@@ -96,8 +95,10 @@ def test_geometric_runs_are_a_chain_that_loses_all_in_its_bad_state(packets: int
     np.testing.assert_allclose(chain.age(T), runs.age(T), atol=1e-12)
     assert [chain.outage(n) for n in range(1, 6)] == pytest.approx([runs.outage(n) for n in range(1, 6)])
     for late in range(4):
-        assert chain.available(8, 4, late) == pytest.approx(runs.available(8, 4, late))
-    np.testing.assert_allclose(chain.jointly([3] * T, late=0), runs.jointly([3] * T, late=0), atol=1e-12)
+        assert chain.availability(8, 4, late) == pytest.approx(runs.availability(8, 4, late))
+    np.testing.assert_allclose(
+        chain.joint_availability([3] * T, late=0), runs.joint_availability([3] * T, late=0), atol=1e-12
+    )
 
 
 def test_geometric_runs_by_hand() -> None:
@@ -133,15 +134,15 @@ def test_late_positions_have_the_product_form_of_what_is_under_way() -> None:
         for i in range(min(delay, t)):
             waited = late - (t - i)
             missing *= beyond[i + 1] / (beyond[waited + 1] if waited >= 0 else 1.0)
-        assert link.available(t, t - delay, late) == pytest.approx(1.0 - missing, abs=1e-14)
+        assert link.availability(t, t - delay, late) == pytest.approx(1.0 - missing, abs=1e-14)
 
 
 def test_a_position_is_lost_or_here_if_the_tail_is_flat() -> None:
     flat = LatePackets(np.array([0.3]))
     np.testing.assert_allclose(flat.age(T), LINKS["bernoulli"].age(T), atol=1e-15)
     for late in range(4):
-        assert flat.available(7, 4, late) == pytest.approx(LINKS["bernoulli"].available(7, 4, late))
-    np.testing.assert_allclose(flat.jointly([4] * T), LINKS["bernoulli"].jointly([4] * T))
+        assert flat.availability(7, 4, late) == pytest.approx(LINKS["bernoulli"].availability(7, 4, late))
+    np.testing.assert_allclose(flat.joint_availability([4] * T), LINKS["bernoulli"].joint_availability([4] * T))
 
 
 @pytest.mark.parametrize("late", [0, 2])
@@ -169,7 +170,7 @@ def test_joint_probability_is_the_sum_over_all_histories(name: str, late: int) -
             age = 0 if t == 0 else (age + 1 if history[t - 1] else 0)
             usable = usable and (t < delay or age < delay)
             good[t] += usable * weight(history)
-    np.testing.assert_allclose(link.jointly(delays, late), good / known, atol=1e-12)
+    np.testing.assert_allclose(link.joint_availability(delays, late), good / known, atol=1e-12)
 
 
 @pytest.mark.parametrize("late", [0, 1, 3])
@@ -184,7 +185,7 @@ def test_joint_probability_of_late_positions_is_counted(late: int) -> None:
     age = age[age[:, late] == late]
     delays = [9, 9, 9, 9, 3, 4, 2, 3, 3]
     usable = np.logical_and.accumulate([(t < d) | (age[:, t] < d) for t, d in enumerate(delays)], axis=0)
-    expected = link.jointly(delays, late)
+    expected = link.joint_availability(delays, late)
     spread = np.sqrt(expected * (1.0 - expected) / len(age))
     assert np.all(np.abs(usable.mean(axis=1) - expected) <= 5.0 * spread + 1e-12)
     if not late:
@@ -207,11 +208,11 @@ def test_counted_ages_after_bursts_follow_the_distribution(shape: tuple[int, int
     packets, idle = shape
     link = bursts(packets=packets, idle=idle)
     lost = packets_lost(np.random.default_rng(5), 90_000, 0.1, 0.3, 0.1, 0.9)
-    news = np.asarray(lost.reshape(-1, packets + idle)[:, :packets].min(axis=1) == 0.0, dtype=np.bool_)
-    base = np.flatnonzero(news[:-8])[::3]  # apart, so that runs are all but independent
+    information = np.asarray(lost.reshape(-1, packets + idle)[:, :packets].min(axis=1) == 0.0, dtype=np.bool_)
+    base = np.flatnonzero(information[:-8])[::3]  # apart, so that runs are all but independent
     mu = link.age(6)
     for t in range(1, 7):
-        age = np.array([next(j for j in range(t + 1) if news[b + t - j]) for b in base])
+        age = np.array([next(j for j in range(t + 1) if information[b + t - j]) for b in base])
         share = np.bincount(age, minlength=7) / len(base)
         assert np.all(np.abs(share - mu[t]) <= 6.0 * np.sqrt(mu[t] * (1.0 - mu[t]) / len(base)) + 1e-12)
 
@@ -219,8 +220,8 @@ def test_counted_ages_after_bursts_follow_the_distribution(shape: tuple[int, int
 @pytest.mark.parametrize("name", LINKS)
 def test_each_stage_alone_is_at_least_as_likely_as_all_together(name: str) -> None:
     link, delays = LINKS[name], [2, 3, 3, 2, 4, 3, 3, 2, 3, 3]
-    joint = link.jointly(delays)
-    alone = [link.available(t, t - d) for t, d in enumerate(delays)]
+    joint = link.joint_availability(delays)
+    alone = [link.availability(t, t - d) for t, d in enumerate(delays)]
     assert np.all(np.diff(joint) <= 1e-15)
     assert np.all(joint <= np.minimum.accumulate(alone) + 1e-12)
 
@@ -229,8 +230,8 @@ def test_each_stage_alone_is_at_least_as_likely_as_all_together(name: str) -> No
 def test_more_loss_never_makes_news_likelier(p: float, other: float, delay: int, late: int) -> None:
     worse, better = (bernoulli(np.array([one])) for one in sorted((p, other)))
     for t in range(T):
-        assert better.available(t, t - delay, late) >= worse.available(t, t - delay, late) - 1e-12
-    assert np.all(better.jointly([delay] * T) >= worse.jointly([delay] * T) - 1e-12)
+        assert better.availability(t, t - delay, late) >= worse.availability(t, t - delay, late) - 1e-12
+    assert np.all(better.joint_availability([delay] * T) >= worse.joint_availability([delay] * T) - 1e-12)
     assert better.outage(delay) <= worse.outage(delay) + 1e-12
 
 
@@ -255,14 +256,14 @@ def test_bursts_more_often_or_longer_never_make_news_likelier(
         gilbert_elliott(enter=rare, leave=long, good_loss=0.0, bad_loss=1.0),
     ):
         for t in range(T):
-            assert better.available(t, t - delay) >= worse.available(t, t - delay) - 1e-9
+            assert better.availability(t, t - delay) >= worse.availability(t, t - delay) - 1e-9
         assert better.outage(delay) <= worse.outage(delay) + 1e-9
 
 
 @given(st.lists(PROBABILITY, min_size=1, max_size=5), st.integers(0, 4), st.integers(1, 6), st.integers(0, T))
 def test_an_older_base_never_makes_news_likelier(p: list[float], late: int, delay: int, t: int) -> None:
     link = bernoulli(np.array(p))
-    assert link.available(t, t - delay, late + 1) <= link.available(t, t - delay, late) + 1e-12
+    assert link.availability(t, t - delay, late + 1) <= link.availability(t, t - delay, late) + 1e-12
 
 
 @given(st.lists(PROBABILITY, min_size=1, max_size=6).filter(lambda runs: sum(runs) > 0.1), st.integers(1, 3))

@@ -8,16 +8,15 @@ import numpy as np
 import pytest
 from baseline_rig import MAKERS, PAPER_START, arrivals, flown, noise, problem, unlimited
 from design_rig import one_axis, paper_plant
-from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_lyapunov
 
+from uavctl.arrays import Array
 from uavctl.errors import DesignError
 from uavctl.smpc.baselines import Lqg
 from uavctl.smpc.link import LatePackets, LinkModel, bernoulli, empirical, gilbert_elliott
 from uavctl.smpc.nominal import lqr, stationary_bound
 from uavctl.smpc.plant import Plant
 
-Array = NDArray[np.float64]
 STEPS = 50
 
 

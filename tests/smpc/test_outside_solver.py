@@ -8,16 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 from baseline_rig import problem
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.errors import EndedBySignal
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import Path, Preview
-from uavctl.smpc.batch import News
+from uavctl.smpc.batch import Information
 from uavctl.smpc.nominal import ControlProblem, lqr
-from uavctl.smpc.outside import OutsideSolver, PlanRequest, Rehearsal, moved
-
-Array = NDArray[np.float64]
+from uavctl.smpc.outside import OutsideSolver, PlanRequest, SilencePlanner, retarget
 
 
 class Saying:
@@ -47,7 +45,7 @@ def test_it_is_told_all_that_a_scheme_is_and_can_change_nothing_of_it(paper: Con
     path = Path(states=rng.normal(size=(steps, n_x)), inputs=0.1 * rng.normal(size=(steps, n_u)))
     limits = rng.normal(size=(steps + 1, paper.state_set.b.size))
     cov, sent, x = np.eye(n_x), rng.normal(size=n_u), here(paper)
-    answer = solver.solve(7, x, paper.target, Preview(limits=limits, path=path, late=3, cov=cov, sent=sent))
+    answer = solver.solve(7, x, paper.target, Preview(limits=limits, path=path, age=3, cov=cov, sent=sent))
     (told,) = saying.asked
     assert (told.step, told.age) == (7, 3)
     np.testing.assert_array_equal(told.state, x)
@@ -164,13 +162,13 @@ class Shrinking:
     def begin(self, runs: int) -> None:
         self.gain = np.ones(runs)
 
-    def act(self, news: News) -> Array:
+    def act(self, information: Information) -> Array:
         self.gain *= 0.5
         return self.gain[:, None] * np.ones((1, self.problem.plant.n_u))
 
 
 def test_a_campaign_s_controller_is_asked_for_each_step_of_silence_and_forgets_that(paper: ControlProblem) -> None:
-    solver = OutsideSolver("ours", paper, Rehearsal(lambda target: (moved(paper, target), Shrinking(paper))))
+    solver = OutsideSolver("ours", paper, SilencePlanner(lambda target: (retarget(paper, target), Shrinking(paper))))
     halves = 0.5 ** np.arange(1, paper.horizon + 2)
     for seq in range(2):  # asked twice: the first input of each plan is what it has really done
         answer = solver.solve(seq, here(paper), paper.target)

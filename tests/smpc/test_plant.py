@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from uavctl.errors import DesignError
-from uavctl.smpc.plant import Plant, digest, drag_lag, steps_to_reach
+from uavctl.smpc.plant import Plant, count_reach_steps, digest, drag_lag
 from uavctl.smpc.sets import Polytope
 
 DRAG, LAG, GAIN, DT = 0.3, 0.25, 0.9, 0.2
@@ -190,14 +190,14 @@ def test_a_place_without_rest_is_refused() -> None:
 
 
 def test_steps_to_reach_any_state() -> None:
-    assert steps_to_reach(paper_plant()) == 2
-    assert steps_to_reach(room_plant()) == 3
+    assert count_reach_steps(paper_plant()) == 2
+    assert count_reach_steps(room_plant()) == 3
 
 
 def test_a_state_that_no_input_moves_is_refused() -> None:
     plant = replace(one_axis(paper_plant()), a=np.diag([0.9, 0.61]), b=np.array([[0.0], [0.39]]))
     with pytest.raises(DesignError, match=r"plant\.b: the inputs reach 1 of 2 states"):
-        steps_to_reach(plant)
+        count_reach_steps(plant)
 
 
 @pytest.mark.parametrize(
@@ -278,5 +278,5 @@ def test_box_without_limits_has_no_rows() -> None:
 
 def test_what_states_are_called_makes_no_other_design() -> None:
     plant = drag_lag([0.3], [0.2], [1.0], [0.1], 0.2, ("north",))
-    assert digest(replace(plant, further=(("something", "m"),))) == digest(plant)
+    assert digest(replace(plant, extra_states=(("something", "m"),))) == digest(plant)
     assert digest(replace(plant, dt_s=0.2000001)) != digest(plant)

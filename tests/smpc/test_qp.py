@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.smpc.qp import EQUAL, LEAST_CURVE, OPEN, SOFT, QuadraticProgram
-
-Array = NDArray[np.float64]
 
 
 class Drawn:
@@ -140,7 +138,7 @@ def test_same_question_same_bits_whatever_came_before(seed: int) -> None:
     again = used.solve(drawn.f, drawn.upper, drawn.lower)
     assert again is not None
     assert [part.tobytes() for part in again] == [part.tobytes() for part in fresh]
-    anew = used.solve_anew(drawn.h, drawn.f, drawn.a, drawn.upper, drawn.lower)
+    anew = used.solve_with_matrices(drawn.h, drawn.f, drawn.a, drawn.upper, drawn.lower)
     assert anew is not None
     assert [part.tobytes() for part in anew] == [part.tobytes() for part in fresh]
 
@@ -164,7 +162,7 @@ def test_new_matrices_are_a_new_program() -> None:
     other = Drawn(8)
     other.h, other.a = other.h + np.eye(other.f.size), other.a * rng.uniform(0.9, 1.1, (len(other.a), 1))
     other.upper[0] = other.lower[0] = 0.0
-    anew = used.solve_anew(other.h, other.f, other.a, other.upper, other.lower)
+    anew = used.solve_with_matrices(other.h, other.f, other.a, other.upper, other.lower)
     assert anew is not None
     assert other.cost(anew[0]) == pytest.approx(other.optimum(), rel=1e-6)
     fresh = other.program().solve(other.f, other.upper, other.lower)

@@ -10,24 +10,22 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from quadrotor_rig import S, quadrotor, steady
 from scipy.integrate import solve_ivp
 
 from sim.vehicle.linear import make_linear_model
 from sim.wind import Wind
+from uavctl.arrays import Array
 from uavctl.build.controller import build_plant
 from uavctl.cli.app import run as main
 from uavctl.config import load_config
 from uavctl.errors import ConfigError, DesignError
 from uavctl.records import names_of
 from uavctl.smpc.nominal import lqr
-from uavctl.smpc.plant import STATES, HeldAxis, Plant, steps_to_reach, velocity_reference
-
-Array = NDArray[np.float64]
+from uavctl.smpc.plant import STATES_PER_AXIS, Plant, VelocityReferenceAxis, count_reach_steps, velocity_reference
 
 DT = 0.05
-AXIS = HeldAxis(
+AXIS = VelocityReferenceAxis(
     drag_1ps=0.2,
     lag_s=0.15,
     position_1ps=1.0,
@@ -59,7 +57,7 @@ def held(**changes: float) -> Plant:
     return velocity_reference([AXIS._replace(**changes)], DT, ("north",))
 
 
-def loops(axis: HeldAxis, u: float, wind: float, gains: float) -> Any:
+def loops(axis: VelocityReferenceAxis, u: float, wind: float, gains: float) -> Any:
     """Slope of (p, v, b, P, V, j, f), as an autopilot's loops are written down."""
 
     def slope(_t: float, y: Array) -> list[float]:
@@ -120,7 +118,7 @@ def test_every_such_plant_has_a_motion_within_the_step(
     drag: float, lag: float, gains: tuple[float, float, float], dt_s: float
 ) -> None:
     position, velocity, integral = gains
-    axis = HeldAxis(drag, lag, position, velocity, integral, 0.1, 0.1, 0.1)
+    axis = VelocityReferenceAxis(drag, lag, position, velocity, integral, 0.1, 0.1, 0.1)
     plant = velocity_reference([axis], dt_s, ("down",))
     a, b, e = plant.transition(0.5 * dt_s)
     np.testing.assert_allclose(a @ a, plant.a, rtol=0.0, atol=1e-8)
@@ -149,37 +147,37 @@ def test_a_steady_force_is_held_without_an_input() -> None:
 
 def test_it_rests_and_reaches_and_has_a_regulator() -> None:
     plant = build_plant(load_config("room-hahn-stursberg", list(OVERRIDES)))
-    assert (plant.n_x, plant.n_u, plant.n_w) == (3 * STATES, 3, 9)
+    assert (plant.n_x, plant.n_u, plant.n_w) == (3 * STATES_PER_AXIS, 3, 9)
     rest = plant.equilibrium((1.0, -2.0, -0.5))
     assert rest[list(plant.position_index)].tolist() == [1.0, -2.0, -0.5]
     assert np.count_nonzero(rest) == 3
-    assert steps_to_reach(plant) == STATES
+    assert count_reach_steps(plant) == STATES_PER_AXIS
     law = lqr(plant, np.diag([10.0, 1.0, 0.1, 0.0, 0.0, 0.0] * 3), np.eye(3))
     assert np.abs(np.linalg.eigvals(plant.a + plant.b @ law.k)).max() < 1.0
 
 
 def test_positions_show_all_of_it() -> None:
     plant = held()
-    rows = [np.eye(STATES)[0]]
-    for _ in range(STATES - 1):
+    rows = [np.eye(STATES_PER_AXIS)[0]]
+    for _ in range(STATES_PER_AXIS - 1):
         rows.append(rows[-1] @ plant.a)
-    assert np.linalg.matrix_rank(np.array(rows) / np.linalg.norm(rows, axis=1)[:, None]) == STATES
+    assert np.linalg.matrix_rank(np.array(rows) / np.linalg.norm(rows, axis=1)[:, None]) == STATES_PER_AXIS
 
 
 def test_a_filter_of_positions_goes_on_correcting_the_reference() -> None:
     """Whatever moved it: the covariance of its lead settles, and the error of an estimate dies out."""
     plant, noise_m = held(), 0.003
-    cov, shows = np.eye(STATES), np.eye(STATES)[:1]
+    cov, shows = np.eye(STATES_PER_AXIS), np.eye(STATES_PER_AXIS)[:1]
     for _ in range(round(60.0 / DT)):
         gain = cov @ shows.T / (shows @ cov @ shows.T + noise_m**2)
         cov = plant.a @ (cov - gain @ shows @ cov) @ plant.a.T + plant.e @ plant.w @ plant.e.T
-    loop = plant.a @ (np.eye(STATES) - gain @ shows)
+    loop = plant.a @ (np.eye(STATES_PER_AXIS) - gain @ shows)
     assert np.abs(np.linalg.eigvals(loop)).max() < 0.999
 
 
 def test_its_states_have_names() -> None:
     plant = held()
-    names = names_of([], plant.n_x, plant.axes, plant.position_index, plant.velocity_index, plant.further)
+    names = names_of([], plant.n_x, plant.axes, plant.position_index, plant.velocity_index, plant.extra_states)
     assert names.states == (
         ("north position", "m"),
         ("north velocity", "m/s"),
@@ -205,7 +203,7 @@ def flown(plant: Plant, wind: Wind, plan: list[tuple[float, float]], delay_s: fl
     late = round(delay_s / DT)
     delayed = np.concatenate([np.zeros(late), inputs])[: len(inputs)]
     vehicle = quadrotor("ardupilot", wind=wind)
-    x = np.zeros(STATES)
+    x = np.zeros(STATES_PER_AXIS)
     ours, theirs = [], []
     for step, (now, then) in enumerate(zip(inputs, delayed, strict=True)):
         vehicle.accelerate((float(now), 0.0, 0.0))
@@ -288,4 +286,4 @@ def test_a_design_of_it_is_told(capsys: pytest.CaptureFixture[str], tmp_path: Pa
     arguments = [part for one in (*OVERRIDES, "smpc.scheme=age-conditioned") for part in ("--set", one)]
     assert main(["design", "--config", "room-hahn-stursberg", "--json", *arguments]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert len(found["rests"]) == 2 * 3 * STATES
+    assert len(found["rests"]) == 2 * 3 * STATES_PER_AXIS

@@ -13,7 +13,7 @@ from plant_cases import NAMED, spec_of
 
 from uavctl.lab.campaign.world import LinearWorld, Trajectories, simulate
 from uavctl.smpc.baselines import CascadedPid, HoldLast, Lqg, PacketisedPredictive, PidGains, WorstCaseDelay, ZeroOnLoss
-from uavctl.smpc.batch import BatchController, News
+from uavctl.smpc.batch import BatchController, Information
 from uavctl.smpc.hahn_stursberg.design import DesignSpec
 from uavctl.smpc.nominal import ControlProblem
 from uavctl.smpc.sets import Polytope
@@ -115,9 +115,9 @@ class Fed:
     def step(self, newest: int) -> Array:
         """Input (n_u,) when the position of step `newest` is the newest one known."""
         k = self.inputs.shape[1]
-        asked: Array = self._controller.act(News(k, np.array([newest]), self.states[newest][None].copy(), self.inputs))[
-            0
-        ]
+        asked: Array = self._controller.act(
+            Information(k, np.array([newest]), self.states[newest][None].copy(), self.inputs)
+        )[0]
         self.inputs = np.concatenate([self.inputs, asked[None, None]], axis=1)
         self.states.append(self._plant.a @ self.states[-1] + self._plant.b @ asked)
         return asked

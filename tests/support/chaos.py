@@ -64,10 +64,10 @@ class WildSolver(StubSolver):
         super().__init__(small_plant(("north", "east")), HORIZON)
         self.rng = rng
 
-    def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:
+    def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:
         """A steady answer, spoiled in a third of the cases."""
         self.asked.clear()  # a long run is not to fill the memory
-        answer = super().solve(seq, x, target, outlook)
+        answer = super().solve(seq, x, target, preview)
         kind = int(self.rng.integers(12))
         if kind == 0:
             raise OverflowError("too large")

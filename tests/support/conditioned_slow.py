@@ -50,7 +50,7 @@ def deviations(given: ControlProblem, cov: Array | None) -> Array:
 
 
 def plan_slowly(
-    given: ControlProblem, budgets: Array, x: Array, reference: Array, outlook: Preview, slew_mps3: float = np.inf
+    given: ControlProblem, budgets: Array, x: Array, reference: Array, preview: Preview, slew_mps3: float = np.inf
 ) -> SlowPlan:
     """The plan to a reference; every stage and every row is in every program."""
     plant, steps, n_u = given.plant, given.horizon, given.plant.n_u
@@ -68,11 +68,11 @@ def plan_slowly(
         states.append(state)
     of_x, of_u = np.array(states), np.array(inputs)
     linear = np.zeros(n)
-    if outlook.path is not None:
+    if preview.path is not None:
         dx = np.concatenate([np.column_stack([x - reference, np.zeros((plant.n_x, n))])[None], of_x[:-1]])
-        linear -= 2.0 * np.einsum("tij,ik,tk->j", dx[:, :, 1:], given.q_x, outlook.path.states)
-        linear -= 2.0 * np.einsum("tij,ik,tk->j", of_u[:, :, 1:], given.q_u, outlook.path.inputs)
-    limits = np.tile(given.state_set.b, (steps, 1)) if outlook.limits is None else outlook.limits[1:]
+        linear -= 2.0 * np.einsum("tij,ik,tk->j", dx[:, :, 1:], given.q_x, preview.path.states)
+        linear -= 2.0 * np.einsum("tij,ik,tk->j", of_u[:, :, 1:], given.q_u, preview.path.inputs)
+    limits = np.tile(given.state_set.b, (steps, 1)) if preview.limits is None else preview.limits[1:]
     rows_x = given.state_set.c @ of_x
     room_x = limits - given.state_set.c @ reference - rows_x[:, :, 0]
     d, side = plant.accel_map, slew_mps3 * plant.dt_s
@@ -82,9 +82,9 @@ def plan_slowly(
         at, most = np.zeros((steps, len(d))), np.full((steps, len(d)), side)
         at[0] = -d @ hold
         most[0] = OPEN
-        if outlook.sent is not None:
-            at[0] += d @ outlook.sent
-            most[0] = first_side(given, side, outlook.sent)
+        if preview.sent is not None:
+            at[0] += d @ preview.sent
+            most[0] = first_side(given, side, preview.sent)
         hard += [change, -change]
         room += [most + at - change[:, :, 0], most - at + change[:, :, 0]]
     of_hard, room_u = np.concatenate(hard, axis=1).reshape(-1, n + 1), np.concatenate(room, axis=1).ravel()
@@ -104,7 +104,7 @@ def plan_slowly(
         assert found is not None
         return found[0]
 
-    sigma, budgets = deviations(given, outlook.cov), budgets[np.minimum(np.arange(steps) + outlook.late, steps - 1)]
+    sigma, budgets = deviations(given, preview.cov), budgets[np.minimum(np.arange(steps) + preview.age, steps - 1)]
     backoff = norm.isf(np.minimum(budgets / sigma.shape[1], 0.5))[:, None] * sigma
     z = -0.5 * linear
     now = room_x - (rows_x[:, :, 1:] @ z)

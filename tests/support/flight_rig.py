@@ -106,7 +106,7 @@ class StubSolver:
     faults: Mapping[int, Fault] = field(default_factory=dict)
     asked: list[tuple[int, Array]] = field(default_factory=list)
 
-    def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:
+    def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:
         self.asked.append((seq, x))
         answer = answer_of(self.plant, seq, x, stub_inputs(seq, self.horizon, self.plant.n_u))
         fault = self.faults.get(seq)

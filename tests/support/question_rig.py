@@ -31,7 +31,7 @@ PRESETS = ("paper", "room-hahn-stursberg")
 # For most tests of both, two axes will do for a person who waits.
 EACH_PRESET = ("paper", pytest.param("room-hahn-stursberg", marks=pytest.mark.slow))
 # Stages and rows that a margin may miss by: 1e-6 of the row's unit.
-KEPT = 1e-6
+KEPT_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,9 +62,9 @@ class Case:
     def solver(self) -> ShortcutSolver:
         return ShortcutSolver(self.design)
 
-    def question(self, i: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Question:
+    def question(self, i: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Question:
         part = self.components[i]
-        return self.problems[i].question(x[part.states], target[part.states], outlook)
+        return self.problems[i].question(x[part.states], target[part.states], preview)
 
 
 @cache
@@ -139,7 +139,7 @@ class Asked:
     kind: str
     x: Array
     target: Array
-    outlook: Preview = NOMINAL
+    preview: Preview = NOMINAL
 
 
 KINDS = ("uniform", "near", "far target", "outside", "limits", "path", "limits and path")
@@ -241,7 +241,7 @@ def exact_gains(one: Case, i: int, ask: Asked) -> Array:
     """Gains (n_θ,) of the exact program's answer for a component."""
     part = one.components[i]
     for program in (one.exact[i]._exact, one.exact[i]._missing):
-        solution = program.conic.solve(program.parameters(ask.x[part.states], ask.target[part.states], ask.outlook))
+        solution = program.conic.solve(program.parameters(ask.x[part.states], ask.target[part.states], ask.preview))
         if solution.status == "Solved":
             break
     return np.asarray(solution.variables[program.layout.theta])

@@ -23,7 +23,7 @@ from uavctl.config.mission import MissionConfig
 from uavctl.errors import ConfigError, UavctlError, UsageError, need
 from uavctl.records import names_of
 from uavctl.smpc.answer import Answer, Solver
-from uavctl.smpc.batch import BatchController, News
+from uavctl.smpc.batch import BatchController, Information
 from uavctl.smpc.conditioned.planner import AnyDesign
 from uavctl.smpc.link import AgeModel
 from uavctl.smpc.nominal import ControlProblem
@@ -101,7 +101,7 @@ _SUFFIXES = {"m": "_m", "m/s": "_mps", "m/s²": "_mps2"}
 def signals(config: Config) -> tuple[tuple[Signal, ...], tuple[Signal, ...]]:
     """Return the states and the inputs of a configuration's plant, in order."""
     of = build_plant(config)
-    states = names_of((), of.n_x, of.axes, of.position_index, of.velocity_index, of.further).states
+    states = names_of((), of.n_x, of.axes, of.position_index, of.velocity_index, of.extra_states).states
     unit = "" if config.plant.model == "matrices" else "m/s²"
     inputs = [(f"{axis} input", unit) for axis in of.axes] or [(f"input {i}", "") for i in range(of.n_u)]
     made = (
@@ -226,7 +226,7 @@ class SteppedController:
         elif not step:
             raise UsageError("the first step needs a state: a controller has to know where it begins")
         acted = np.array(self._inputs).reshape(1, step, plant.n_u)
-        news = News(step, np.array([self._newest]), self._state[np.newaxis], acted)
+        news = Information(step, np.array([self._newest]), self._state[np.newaxis], acted)
         with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is told
             asked = self._controller.act(news)[0]
         if not np.isfinite(asked).all():

@@ -37,9 +37,9 @@ from uavctl.smpc.conditioned.planner import (
     conditioned_id,
     conditioned_record,
 )
-from uavctl.smpc.estimate import InnovationForm, innovations, with_bias
+from uavctl.smpc.estimate import InnovationForm, add_bias, innovation_form
 from uavctl.smpc.nominal import ControlProblem
-from uavctl.smpc.plant import AXES, HeldAxis, Plant, drag_lag, velocity_reference
+from uavctl.smpc.plant import AXES, Plant, VelocityReferenceAxis, drag_lag, velocity_reference
 from uavctl.smpc.sets import Polytope
 
 # The paper's scheme is loaded only where it is flown: loading it takes a tenth of the time of all else.
@@ -68,8 +68,10 @@ def build_plant(config: Config) -> Plant:
     if plant.model == "drag-lag":
         return drag_lag(plant.drag_1ps, plant.lag_s, plant.gain, plant.wind_std_mps2, plant.dt_s, plant.axes)
     if plant.model == "velocity-reference":
-        numbers = (getattr(plant, key) for key in HeldAxis._fields)
-        return velocity_reference([HeldAxis(*one) for one in zip(*numbers, strict=True)], plant.dt_s, plant.axes)
+        numbers = (getattr(plant, key) for key in VelocityReferenceAxis._fields)
+        return velocity_reference(
+            [VelocityReferenceAxis(*one) for one in zip(*numbers, strict=True)], plant.dt_s, plant.axes
+        )
     a, b, e, w, accel = (
         np.array(rows, dtype=np.float64) for rows in (plant.a, plant.b, plant.e, plant.w, plant.accel_per_input)
     )
@@ -185,7 +187,7 @@ def build_conditioned(
             None: what the configuration says of it.
 
     Raises:
-        DesignError: See `build_problem`, `build_ages`, `ConditionedSolver` and `innovations`.
+        DesignError: See `build_problem`, `build_ages`, `ConditionedSolver` and `innovation_form`.
     """
     problem = replace(build_problem(config), input_set=_planned_inputs(config))
     flown = flown and bool(config.plant.axes)
@@ -193,7 +195,7 @@ def build_conditioned(
     slew_mps3 = config.limits.slew_mps3 if flown else math.inf
     plant, estimator, seen = problem.plant, config.estimator, None
     if flown and estimator.bias_drift:
-        seen = with_bias(plant, estimator.bias_drift, force=estimator.inertial_std_mps2 > 0.0)
+        seen = add_bias(plant, estimator.bias_drift, force=estimator.inertial_std_mps2 > 0.0)
     if cov is None and flown:
         cov = _settled(config, plant)
     elif cov is None:
@@ -214,7 +216,7 @@ def _innovations(config: Config, plant: Plant, losses: int) -> InnovationForm:
     """The plant as the configured filter sees it, and what that does not know after so many losses in a row."""
     estimator = config.estimator
     age_s = _position_age_s(config)
-    return innovations(plant, estimator.position_std_m, age_s, losses, estimator.bias_drift)
+    return innovation_form(plant, estimator.position_std_m, age_s, losses, estimator.bias_drift)
 
 
 def _position_age_s(config: Config) -> float:

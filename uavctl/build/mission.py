@@ -16,7 +16,7 @@ from uavctl.flight.trajectory import PlantMotion, follow_positions, make_room, p
 from uavctl.records import Names, names_of
 from uavctl.smpc.conditioned.planner import AnyDesign
 from uavctl.smpc.plant import Plant
-from uavctl.smpc.sets import Polytope, equilibria
+from uavctl.smpc.sets import Polytope, find_equilibria
 
 if TYPE_CHECKING:
     from uavctl.smpc.hahn_stursberg.design import Design
@@ -69,7 +69,12 @@ def build_names(design: AnyDesign) -> Names:
     """Return the names of the design's rows and states."""
     plant = design.plant
     return names_of(
-        design.state_set.c.tolist(), plant.n_x, plant.axes, plant.position_index, plant.velocity_index, plant.further
+        design.state_set.c.tolist(),
+        plant.n_x,
+        plant.axes,
+        plant.position_index,
+        plant.velocity_index,
+        plant.extra_states,
     )
 
 
@@ -184,7 +189,7 @@ def _check_room(key: str, row: int, least: float, design: AnyDesign, rests: Arra
     plant = design.plant
     # Weights choose among the inputs that hold a place, and not among the places.
     weights = np.eye(plant.n_x), np.eye(plant.n_u)
-    places = equilibria(plant.a, plant.b, *weights, np.array(plant.position_index, dtype=np.intp)).x_eq
+    places = find_equilibria(plant.a, plant.b, *weights, np.array(plant.position_index, dtype=np.intp)).x_eq
     if np.any(design.state_set.c[row] @ places):
         return
     needed = float(design.state_set.b[row] - rests[row])

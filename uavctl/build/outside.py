@@ -24,7 +24,7 @@ from uavctl.config.load import find_nearest
 from uavctl.errors import RAISED, DesignError, in_words
 from uavctl.smpc.batch import BatchController
 from uavctl.smpc.nominal import ControlProblem
-from uavctl.smpc.outside import FlightPlanner, OutsideSolver, Rehearsal, moved
+from uavctl.smpc.outside import FlightPlanner, OutsideSolver, SilencePlanner, retarget
 from uavctl.smpc.plant import digest
 
 
@@ -137,10 +137,10 @@ def flown_outside(config: Config, problem: ControlProblem) -> OutsideSolver:
     make(made, name, KEY, problem)  # what cannot be made is refused here, not in flight
 
     def to(target: NDArray[np.float64]) -> tuple[ControlProblem, BatchController]:
-        there = moved(problem, target)
+        there = retarget(problem, target)
         return there, cast(BatchController, made(there))
 
-    return OutsideSolver(name, problem, Rehearsal(to))
+    return OutsideSolver(name, problem, SilencePlanner(to))
 
 
 def controller_id(name: str) -> str:

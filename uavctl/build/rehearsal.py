@@ -152,13 +152,13 @@ def _fly(
     passed: list[Array] = []
     for k in range(steps):
         state = advance_mission(mission, state, _vector(x), k * dt_ns)
-        target, outlook = make_question(mission, state, k * dt_ns)
+        target, preview = make_question(mission, state, k * dt_ns)
         late = int(lates[k])
-        ahead = Preview(limits=outlook.limits, path=outlook.path, late=late, cov=design.estimate_cov, sent=sent)
+        ahead = Preview(limits=preview.limits, path=preview.path, age=late, cov=design.estimate_cov, sent=sent)
         answer = design.solver.solve(k, x, target, ahead)
         passed.append(x[index])
-        relaxed += bool(answer.gave_way)
-        for one in answer.gave_way:
+        relaxed += bool(answer.relaxed)
+        for one in answer.relaxed:
             name, unit, size = controller.names.rows[one.index] if one.constraint == "state" else ("slew", "m/s²", 1.0)
             if one.amount / size > worst[2]:
                 worst, ahead_s = (name, unit, one.amount / size), (late + one.stage) * plant.dt_s

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from uavctl.config.types import Config
 from uavctl.errors import DesignError
 from uavctl.smpc.plant import Plant
-from uavctl.smpc.sets import equilibria
+from uavctl.smpc.sets import find_equilibria
 
 Array = NDArray[np.float64]
 
@@ -40,7 +40,7 @@ def resting_target(config: Config, plant: Plant) -> tuple[Array, Array]:
         DesignError: The plant cannot rest there, or nowhere within its limits.
     """
     sets = config.sets
-    rests = equilibria(
+    rests = find_equilibria(
         plant.a, plant.b, np.diag(config.cost.state), np.diag(config.cost.input), np.array(plant.position_index, int)
     )
     state = plant.equilibrium(config.target.position_m)

@@ -270,7 +270,7 @@ def render_solution(answer: Answer, design: AnyDesign, config: Config, solve_us:
     if math.isfinite(answer.gap):
         bound = f"at least {answer.cost_lower:.2f}, gap {answer.gap:.1e}"
     facts = f"cost {answer.cost:.2f} ({bound}), slack {answer.slack:.3g}, offset {answer.offset:.3g}"
-    relaxed_lines = [tell_all(build_names(design), answer.gave_way)] if answer.gave_way else []
+    relaxed_lines = [tell_all(build_names(design), answer.relaxed)] if answer.relaxed else []
     return Group(
         head,
         facts,

@@ -252,7 +252,7 @@ def _complete_preview(preview: Preview, base: Estimate, cov: Array, phase: _Phas
     return Preview(
         limits=preview.limits,
         path=preview.path,
-        late=min(phase.view.age_steps or 0, controller.late_steps),
+        age=min(phase.view.age_steps or 0, controller.late_steps),
         cov=cov,
         sent=sent + np.array(base.bias) if base.bias else sent,
         inputs=_shift_inputs(base.bias, controller),

@@ -25,7 +25,7 @@ from uavctl.flight.monitors import inertial
 from uavctl.flight.monitors.inertial import UNUSED, InertialObservation, InertialTrust, Source
 from uavctl.flight.propagation import Propagation, make_propagation
 from uavctl.records import PositionSample, Vec3
-from uavctl.smpc.estimate import at_once, with_bias, with_wander
+from uavctl.smpc.estimate import add_bias, add_gauss_markov, force_jump
 from uavctl.smpc.plant import Plant
 
 # Only inertial data show a bias that drifts fast. Positions alone show it late, with their noise and the model's
@@ -102,14 +102,14 @@ class Belief(msgspec.Struct, frozen=True, eq=False):
 def make_kalman(plant: Plant, parameters: EstimatorParameters, dt_ns: int) -> Kalman:
     """Make the filter of a plant, with `dt_ns` the integer Δt of the grid [ns]."""
     n_bias, uses_inertial = plant.n_u if parameters.bias_drift else 0, parameters.inertial_std_mps2 > 0.0
-    model = with_bias(plant, parameters.bias_drift, force=uses_inertial) if n_bias else plant
+    model = add_bias(plant, parameters.bias_drift, force=uses_inertial) if n_bias else plant
     n_inertial = len(plant.axes) if uses_inertial else 0
     if n_inertial:
-        model = with_wander(model, np.full(n_inertial, parameters.inertial_bias_mps2), parameters.inertial_bias_s)
+        model = add_gauss_markov(model, np.full(n_inertial, parameters.inertial_bias_mps2), parameters.inertial_bias_s)
     inertial_z, inertial_u = _make_inertial_model(plant, model, n_inertial)
     push = np.zeros((model.n_x + model.n_w, n_bias))
     if n_bias and n_inertial:
-        push[: plant.n_x] = at_once(plant)
+        push[: plant.n_x] = force_jump(plant)
         push[plant.n_x : plant.n_x + n_bias] = np.eye(n_bias)
     w_without_inertial = model.w.copy()
     if n_inertial and n_bias:

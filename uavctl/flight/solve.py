@@ -13,7 +13,7 @@ import numpy as np
 from uavctl.arrays import Array
 from uavctl.errors import in_words
 from uavctl.records import Estimate, Matrix, Plan, SolveStatus, Vector
-from uavctl.smpc.answer import Answer, Preview, Solver, all_finite
+from uavctl.smpc.answer import Answer, Preview, Solver, are_finite
 
 # Errors that arithmetic and the solvers' bindings raise; anything else is a programming error and must be seen.
 SOLVER_ERRORS = (ArithmeticError, ValueError, RuntimeError, np.linalg.LinAlgError)
@@ -57,7 +57,7 @@ def _is_complete(answer: Answer, shape: tuple[int, int], n_x: int) -> bool:
     return (
         answer.inputs.shape == shape
         and answer.states.shape == (shape[0] + 1, n_x)
-        and all_finite((answer.inputs, answer.states, answer.reference))
+        and are_finite((answer.inputs, answer.states, answer.reference))
     )
 
 
@@ -81,7 +81,7 @@ def _make_plan(answer: Answer, inputs: Array, base: Estimate, design_id: str) ->
         gap=float(answer.gap),
         iterations=int(answer.iterations),
         design_id=design_id,
-        gave_way=answer.gave_way,
+        gave_way=answer.relaxed,
         bias=base.bias,
     )
 

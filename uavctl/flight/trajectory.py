@@ -86,7 +86,7 @@ def _of_loops(plant: Plant) -> NDArray[np.bool_]:
     """
     loops = np.zeros(plant.n_x, dtype=np.bool_)
     for place in plant.velocity_index:
-        loops[place + 2 : place + 1 + len(plant.further)] = True  # behind position, velocity and acceleration
+        loops[place + 2 : place + 1 + len(plant.extra_states)] = True  # behind position, velocity and acceleration
     return loops
 
 

@@ -1,4 +1,10 @@
-"""Many runs in step; the SMPC for many runs."""
+"""Controllers of many runs in step, and the SMPC for many runs.
+
+1. A campaign compares controllers on the same noise and the same losses. Each controller gets the same information: the
+   state at the capture of the newest position that has arrived, exact or as a filter estimates it, its age, and the
+   inputs that have acted since.
+2. The SMPC replans on a new position, plays its plan out in silence, and brakes where the plan has run out.
+"""
 
 from __future__ import annotations
 
@@ -8,23 +14,17 @@ from typing import Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.records import SolveStatus
-from uavctl.smpc.answer import KEPT, Answer, Preview, Solver
+from uavctl.smpc.answer import KEPT_TOLERANCE, Answer, Preview, Solver
 from uavctl.smpc.plant import Plant
 
-# Many runs of one plant in step: what a controller of all of them sees, and what it answers.
-#
-# A campaign compares controllers on the same noise and the same losses. Every controller is given the same news: the
-# state at the capture of the newest position that has arrived, exact or as a filter knows it, its age, and the inputs
-# that have acted since.
-
-
-Array = NDArray[np.float64]
 Counts = NDArray[np.intp]
+Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
-class News:
+class Information:
     """Information at the beginning of step k, for N runs."""
 
     step: int  # k
@@ -40,44 +40,42 @@ class News:
 
 
 class BatchController(Protocol):
-    """A controller of N runs at once. Runs do not influence each other."""
+    """Interface of a controller of N runs at once. Runs do not influence each other."""
 
     def begin(self, runs: int) -> None:
-        """Forget everything, for `runs` new runs."""
+        """Reset the controller for `runs` new runs."""
         ...
 
-    def act(self, news: News) -> Array:
-        """Inputs (N, n_u) for step `news.step`, not clipped to the actuators' limits; called for k = 0, 1, … in turn.
+    def act(self, information: Information) -> Array:
+        """Return the inputs (N, n_u) of step `information.step`; called for k = 0, 1, … in turn.
+
+        They are not clipped to the actuators' limits.
 
         Entries that are not finite end the run as failed.
         """
         ...
 
 
-def predict(plant: Plant, news: News) -> Array:
-    """Mean of the state now (N, n_x): the newest known state, moved on by the inputs that have acted since."""
-    x = news.state.copy()
-    for past in range(int(news.age.max(initial=0)), 0, -1):
-        (moved,) = np.nonzero(news.age >= past)
-        x[moved] = x[moved] @ plant.a.T + news.inputs[moved, news.step - past] @ plant.b.T
+def predict(plant: Plant, information: Information) -> Array:
+    """Predict the mean of the state now (N, n_x) from the newest known state and the inputs since."""
+    x = information.state.copy()
+    # x̂(i+1) = A x̂(i) + B u(i),  i = k-a … k-1
+    for back in range(int(information.age.max(initial=0)), 0, -1):
+        (moved,) = np.nonzero(information.age >= back)
+        x[moved] = x[moved] @ plant.a.T + information.inputs[moved, information.step - back] @ plant.b.T
     return x
 
 
-def predicted_cov(plant: Plant, news: News) -> Array | None:
-    """Covariance (N, n_x, n_x) of the error of `predict`, where the newest known state is not exact."""
-    if news.cov is None:
+def predict_covariance(plant: Plant, information: Information) -> Array | None:
+    """Predict the covariance (N, n_x, n_x) of the error of `predict`; None where the newest known state is exact."""
+    if information.cov is None:
         return None
-    cov, noise = news.cov.copy(), plant.e @ plant.w @ plant.e.T
-    for past in range(int(news.age.max(initial=0)), 0, -1):
-        (moved,) = np.nonzero(news.age >= past)
-        cov[moved] = plant.a @ cov[moved] @ plant.a.T + noise
+    # P(i+1) = A P(i) A' + E W E',  i = k-a … k-1
+    cov, noise_cov = information.cov.copy(), plant.e @ plant.w @ plant.e.T
+    for back in range(int(information.age.max(initial=0)), 0, -1):
+        (moved,) = np.nonzero(information.age >= back)
+        cov[moved] = plant.a @ cov[moved] @ plant.a.T + noise_cov
     return cov
-
-
-# The SMPC for many runs: re-plan on news, play out on silence, brake where the plan has run out.
-
-
-Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,34 +90,34 @@ class Decisions:
 
 
 class Decider(Protocol):
-    """Answers many questions towards one target."""
+    """Interface of a solver of many questions with one target."""
 
-    def decide(self, x: Array, late: int, cov: Array | None = None) -> Decisions:
-        """Plans from states (M, n_x), predicted from positions `late` steps old.
+    def decide(self, x: Array, age: int, cov: Array | None = None) -> Decisions:
+        """Plans from states (M, n_x), predicted from positions `age` steps old.
 
         Args:
-            cov: Covariances (M, n_x, n_x) of their errors; None: the positions showed the state exactly.
+            cov: Covariances (M, n_x, n_x) of their errors; None: the states are exact.
         """
         ...
 
 
-class OneByOne:
-    """Decisions by the solver that flies, one after the other; equal states are asked once."""
+class SequentialDecider:
+    """Decisions by the solver that flies, one after the other; equal states are solved once."""
 
     def __init__(self, solver: Solver, target: Array, shape: tuple[int, int]) -> None:
-        """Args: the solver; the target (n_x,); (H, n_u)."""
+        """Take the solver, the target (n_x,), and the shape (H, n_u) of a plan."""
         self._solver, self._target, self._shape = solver, target, shape
 
-    def decide(self, x: Array, late: int, cov: Array | None = None) -> Decisions:  # noqa: ARG002 a design has its own
+    def decide(self, x: Array, age: int, cov: Array | None = None) -> Decisions:  # noqa: ARG002 a design has its own
         """See `Decider`."""
-        outlook = Preview(late=late)
+        preview = Preview(age=age)
         states, which = np.unique(x, axis=0, return_inverse=True)  # runs begin in one state
-        answers = [self._solver.solve(i, row, self._target, outlook) for i, row in enumerate(states)]
-        return gathered([answers[i] for i in which.reshape(-1)], self._shape)
+        answers = [self._solver.solve(i, row, self._target, preview) for i, row in enumerate(states)]
+        return gather_answers([answers[i] for i in which.reshape(-1)], self._shape)
 
 
-def gathered(answers: list[Answer], shape: tuple[int, int]) -> Decisions:
-    """Answers of a solver side by side."""
+def gather_answers(answers: list[Answer], shape: tuple[int, int]) -> Decisions:
+    """Gather the answers of a solver side by side."""
     solved = np.array([answer.status is SolveStatus.OPTIMAL for answer in answers], dtype=np.bool_)
     inputs = np.zeros((len(answers), *shape))
     for i in np.flatnonzero(solved):
@@ -134,10 +132,10 @@ def gathered(answers: list[Answer], shape: tuple[int, int]) -> Decisions:
 class Tally:
     """Counts of plans and fallbacks, by run (N,)."""
 
-    decisions: NDArray[np.intp]  # plans asked for
-    infeasible: NDArray[np.intp]  # those that were not found
-    slack_used: NDArray[np.intp]  # plans that leave a state row
-    fallbacks: NDArray[np.intp]  # steps in which no plan was left and it braked
+    decisions: Counts  # questions
+    infeasible: Counts  # questions without a plan
+    slack_used: Counts  # plans that leave a state row
+    fallbacks: Counts  # steps without a plan, in which the run brakes
     largest_gap: Array  # largest certified gap of a plan
 
     @classmethod
@@ -150,19 +148,19 @@ class Tally:
 class BatchSmpc:
     """The SMPC as the flight core flies it, for N runs.
 
-    A position that is newer than the plan's makes a new plan, if it is less than H steps old; without one, the plan is
-    played out; where it has run out, the predicted velocity is braked until a plan is there again.
+    A position newer than the plan's makes a new plan if it is less than H steps old. Without one, the plan is played
+    out. Where it has run out, the predicted velocity is braked until there is a plan again.
 
     Args:
-        plant: The plant that is predicted with; a design's own may be an estimator's.
+        plant: Plant of the predictions; the plant of the design may be that of an estimator.
         horizon: H [steps].
-        late: Age up to which the decider counts what it has not seen since [steps].
-        brake_gain_1ps: Deceleration per predicted speed once no plan is left [1/s].
+        max_age: Largest age that the decider distinguishes [steps].
+        brake_gain_1ps: Deceleration per predicted speed without a plan [1/s].
     """
 
-    def __init__(self, decider: Decider, plant: Plant, horizon: int, late: int, brake_gain_1ps: float) -> None:
+    def __init__(self, decider: Decider, plant: Plant, horizon: int, max_age: int, brake_gain_1ps: float) -> None:
         self._decider, self._plant = decider, plant
-        self._horizon, self._late = horizon, late
+        self._horizon, self._max_age = horizon, max_age
         self._brake = brake_gain_1ps
         self._input_of_accel = np.linalg.pinv(plant.accel_map)
         self.begin(0)
@@ -175,34 +173,35 @@ class BatchSmpc:
         self._captured = np.full(runs, -1, dtype=np.intp)
         self.tally = Tally.zero(runs)
 
-    def act(self, news: News) -> Array:
+    def act(self, information: Information) -> Array:
         """See `BatchController`."""
-        steps, age = self._horizon, news.age
-        x = predict(self._plant, news)
-        fresh = (news.newest > self._captured) & (age < steps) & np.isfinite(x).all(axis=1)
-        late = np.minimum(age, self._late)
-        cov = predicted_cov(self._plant, news)
-        for j in np.unique(late[fresh]):
-            self._replan(news, x, cov, np.flatnonzero(fresh & (late == j)), int(j))
-        index = news.step - self._made
+        steps, age = self._horizon, information.age
+        x = predict(self._plant, information)
+        has_new = (information.newest > self._captured) & (age < steps) & np.isfinite(x).all(axis=1)
+        known_age = np.minimum(age, self._max_age)
+        cov = predict_covariance(self._plant, information)
+        for j in np.unique(known_age[has_new]):
+            self._replan(information, x, cov, np.flatnonzero(has_new & (known_age == j)), int(j))
+        index = information.step - self._made
         playing = (index < steps) & (age < steps)
         self._made[~playing] = -steps
-        asked = np.zeros((x.shape[0], self._plant.n_u))
-        (who,) = np.nonzero(playing)
-        asked[who] = self._plans[who, index[who]]
+        inputs = np.zeros((x.shape[0], self._plant.n_u))
+        (runs_playing,) = np.nonzero(playing)
+        inputs[runs_playing] = self._plans[runs_playing, index[runs_playing]]
         (lost,) = np.nonzero(~playing)
-        asked[lost] = -self._brake * x[lost][:, list(self._plant.velocity_index)] @ self._input_of_accel.T
+        # u = -k v, as an acceleration
+        inputs[lost] = -self._brake * x[lost][:, list(self._plant.velocity_index)] @ self._input_of_accel.T
         self.tally.fallbacks[lost] += 1
-        return asked
+        return inputs
 
-    def _replan(self, news: News, x: Array, cov: Array | None, who: NDArray[np.intp], late: int) -> None:
-        answers = self._decider.decide(x[who], late, None if cov is None else cov[who])
-        found = who[answers.solved]
-        self._plans[found] = answers.inputs[answers.solved]
-        self._made[found] = news.step
-        self._captured[found] = news.newest[found]
+    def _replan(self, information: Information, x: Array, cov: Array | None, asking: Counts, age: int) -> None:
+        answers = self._decider.decide(x[asking], age, None if cov is None else cov[asking])
+        planned = asking[answers.solved]
+        self._plans[planned] = answers.inputs[answers.solved]
+        self._made[planned] = information.step
+        self._captured[planned] = information.newest[planned]
         tally = self.tally
-        tally.decisions[who] += 1
-        tally.infeasible[who] += ~answers.solved
-        tally.slack_used[who] += answers.solved & (answers.slack > KEPT)
-        tally.largest_gap[found] = np.maximum(tally.largest_gap[found], answers.gap[answers.solved])
+        tally.decisions[asking] += 1
+        tally.infeasible[asking] += ~answers.solved
+        tally.slack_used[asking] += answers.solved & (answers.slack > KEPT_TOLERANCE)
+        tally.largest_gap[planned] = np.maximum(tally.largest_gap[planned], answers.gap[answers.solved])

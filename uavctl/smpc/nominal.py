@@ -1,8 +1,18 @@
-"""Constrained MPC without disturbances, for many states at once; its regulator, and the cost that bounds it below.
+"""Constrained MPC without disturbances, for many states at once; its regulator, and a lower bound of the cost.
 
-With u_t = K x_t + c_t, K the regulator's gain and its Riccati solution as the terminal cost, the cost is
-x'Px + Σ_t c_t'(R + B'PB)c_t: where the regulator's own plan keeps every row, c = 0 is the optimum, and no program has
-to be solved. Elsewhere c is the shortest vector that keeps the rows; state rows give way at the price of their slack.
+1. `lqr` solves the Riccati equation: gain K, terminal cost P.
+2. With u_t = K x_t + c_t and P as the terminal cost, the cost is x'Px + Σ_t c_t'(R + B'PB)c_t. Where the regulator's
+   plan keeps every row, c = 0 is the optimum without a program. Elsewhere c is the shortest vector that keeps the rows;
+   state rows are soft.
+3. `stationary_bound` is the least expected quadratic cost with lost or late positions and without limits. The state is
+   known exactly at its capture, and losses and delays do not depend on the inputs, so certainty equivalence holds
+   (Schenato et al. 2007, Foundations of control and estimation over lossy networks, TCP-like case). The optimal input
+   is K times the mean of the state. The cost is that of the known state and of the error of the mean:
+
+       x_0'P_0 x_0 + Σ_t tr(P_{t+1} N) + Σ_t tr(M_t S_t),   N = E W E',   M_t = K_t'(R + B'P_{t+1} B)K_t,
+       S_t = Σ_i P(a(t) > i) A^i N A'^i
+
+   Limits of inputs or states only add to it.
 """
 
 from __future__ import annotations
@@ -14,16 +24,17 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.linalg import solve_discrete_are
 
+from uavctl.arrays import Array
 from uavctl.errors import DesignError
 from uavctl.smpc.link import LinkModel
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.qp import OPEN, SOFT, QuadraticProgram
 from uavctl.smpc.sets import Polytope
 
-# The series over the ages is cut where a whole state's number of terms is below this share of the sum.
+# The series over the ages ends when n_x successive terms are below this share of the sum.
 _NEGLIGIBLE = 1e-15
-_LONGEST_AGE = 20_000
-# Ages by which the link's long runs of losses have settled to a constant rate.
+_MAX_AGE = 20_000
+# Ages between which P(a > i) falls by a constant factor a step
 _EARLY, _LATE = 60, 120
 
 
@@ -37,15 +48,16 @@ class Lqr:
 
 
 def lqr(plant: Plant, q_x: Array, q_u: Array) -> Lqr:
-    """The regulator of least Σ x'Q_x x + u'Q_u u.
+    """Solve for the regulator of least Σ x'Q_x x + u'Q_u u.
 
     Args:
         q_x: Q_x (n_x, n_x).
         q_u: Q_u (n_u, n_u), positive definite.
 
     Raises:
-        DesignError: There is none: a state that costs cannot be brought to rest.
+        DesignError: There is none: a state with a cost cannot be brought to rest.
     """
+    # P = Q_x + A'PA - A'PB (Q_u + B'PB)⁻¹ B'PA,  K = -(Q_u + B'PB)⁻¹ B'PA
     try:
         p = np.asarray(solve_discrete_are(plant.a, plant.b, q_x, q_u), dtype=np.float64)
     except (np.linalg.LinAlgError, ValueError) as error:
@@ -59,16 +71,8 @@ def lqr(plant: Plant, q_x: Array, q_u: Array) -> Lqr:
     return Lqr(p, np.asarray(k, dtype=np.float64), weight)
 
 
-# Cost that no controller can beat: the expected quadratic cost with lost or late positions, and nothing limited. The
-# state is known exactly at its capture, and neither losses nor delays depend on the inputs: certainty equivalence holds
-# (Schenato et al. 2007, Foundations of control and estimation over lossy networks, TCP-like case). The best input is
-# the LQR's of the mean of the state, and the cost is that of the known state plus what the error of the mean costs:
-# x_0'P_0 x_0 + Σ_t tr(P_{t+1} N) + Σ_t tr(M_t S_t), with N = E W E', M_t = K_t'(R + B'P_{t+1} B)K_t and the error's
-# covariance S_t = Σ_i P(a(t) > i) A^i N A'^i. Limits, of inputs or states, only add to it.
-
-
 def stationary_bound(plant: Plant, q_x: Array, q_u: Array, link: LinkModel) -> float:
-    """Least mean stage cost in the long run.
+    """Return the least mean stage cost in the long run.
 
     Args:
         q_x: Q_x (n_x, n_x).
@@ -76,56 +80,54 @@ def stationary_bound(plant: Plant, q_x: Array, q_u: Array, link: LinkModel) -> f
         link: Model of the link; `bernoulli` for independent losses.
 
     Raises:
-        DesignError: The cost grows without end: r ρ(A)² >= 1, with ρ(A) the spectral radius and r the rate by which
-            P(a > i) falls off, which is the loss where losses are independent; or no regulator exists.
+        DesignError: The cost grows without bound: r ρ(A)² >= 1, with the spectral radius ρ(A) and the factor r by which
+            P(a > i) falls in a step (the loss, for independent losses); or there is no regulator.
     """
-    best = lqr(plant, q_x, q_u)
+    regulator = lqr(plant, q_x, q_u)
     noise = plant.e @ plant.w @ plant.e.T
-    price = best.k.T @ best.weight @ best.k
-    return float(np.trace(best.p @ noise)) + _ignorance(plant, noise, price, link)
+    # tr(P N) + Σ_i P(a > i) tr(M A^i N A'^i),  M = K'(R + B'PB)K
+    weight = regulator.k.T @ regulator.weight @ regulator.k
+    return float(np.trace(regulator.p @ noise)) + _prediction_error_cost(plant, noise, weight, link)
 
 
-def _ignorance(plant: Plant, noise: Array, price: Array, link: LinkModel) -> float:
-    """Σ_i P(a > i) tr(M A^i N A'^i) for M = `price`."""
+def _prediction_error_cost(plant: Plant, noise: Array, weight: Array, link: LinkModel) -> float:
+    """Return Σ_i P(a > i) tr(M A^i N A'^i) for M = `weight`."""
     _check_decay(plant, link)
-    total, small, grown = 0.0, 0, noise
-    for age in range(_LONGEST_AGE):
-        term = link.outage(age + 1) * float(np.sum(price * grown))
+    total, negligible, noise_at_age = 0.0, 0, noise
+    for age in range(_MAX_AGE):
+        term = link.outage(age + 1) * float(np.sum(weight * noise_at_age))
         total += term
-        # As many terms of nothing as there are states: by Cayley and Hamilton, nothing follows.
-        small = small + 1 if term <= _NEGLIGIBLE * total else 0
-        if small > plant.n_x:
+        # After n_x negligible terms all others are negligible (Cayley-Hamilton).
+        negligible = negligible + 1 if term <= _NEGLIGIBLE * total else 0
+        if negligible > plant.n_x:
             return total
-        grown = plant.a @ grown @ plant.a.T
-    raise _endless(f"the sum over the ages has not settled at an age of {_LONGEST_AGE} steps")
+        noise_at_age = plant.a @ noise_at_age @ plant.a.T
+    raise _unbounded_cost(f"the sum over the ages has not settled at an age of {_MAX_AGE} steps")
 
 
 def _check_decay(plant: Plant, link: LinkModel) -> None:
+    # r ρ(A)² < 1,  r = (P(a > 120) / P(a > 60))^(1/60)
     early, late = link.outage(_EARLY), link.outage(_LATE)
     if late <= 0.0:
         return
     radius = float(np.abs(np.linalg.eigvals(plant.a)).max())
     rate = (late / early) ** (1.0 / (_LATE - _EARLY))
     if rate * radius**2 >= 1.0 - 1e-9:
-        raise _endless(f"P(a > i) falls by {rate:.6g} a step, and A's spectral radius is {radius:.6g}")
+        raise _unbounded_cost(f"P(a > i) falls by {rate:.6g} a step, and A's spectral radius is {radius:.6g}")
 
 
-def _endless(reason: str) -> DesignError:
+def _unbounded_cost(reason: str) -> DesignError:
     return DesignError("link.loss", f"the mean cost has no bound: {reason}", "lower the losses")
 
 
-# Problem that every baseline is given: the same plant, limits and weights as the SMPC.
-
-
-Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
 class ControlProblem:
-    """A control problem with a target."""
+    """A control problem with a target: plant, limits and weights of the SMPC and of every baseline."""
 
-    plant: Plant  # the plant that is predicted with
+    plant: Plant  # plant of the predictions
     state_set: Polytope  # X
     input_set: Polytope  # U
     q_x: Array  # Q_x (n_x, n_x)
@@ -139,7 +141,7 @@ class ControlProblem:
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """States, inputs and rows of the sets (their indices) that have to do with no others."""
+    """Indices of states, inputs and rows of the sets that are independent of all others."""
 
     states: Index
     inputs: Index
@@ -147,33 +149,33 @@ class Part:
     rows_u: Index
 
 
-def parts(problem: ControlProblem, beside: Array | None = None) -> tuple[Part, ...]:
-    """Independent parts of a problem without disturbances; those without an input are left out.
+def find_parts(problem: ControlProblem, extra_rows: Array | None = None) -> tuple[Part, ...]:
+    """Find the independent parts of a problem without disturbances; those without an input are left out.
 
     Args:
-        beside: Rows (m, n_u) on inputs that tie them together beside those of the problem.
+        extra_rows: Further rows (m, n_u) that couple inputs.
     """
     plant, c_x, c_u = problem.plant, problem.state_set.c, problem.input_set.c
-    if beside is not None:
-        c_u = np.vstack([c_u, beside])
-    coupled = np.block(
+    if extra_rows is not None:
+        c_u = np.vstack([c_u, extra_rows])
+    edges = np.block(
         [
             [(plant.a != 0) | (problem.q_x != 0) | (np.abs(c_x.T) @ np.abs(c_x) != 0), plant.b != 0],
             [np.zeros((plant.n_u, plant.n_x), dtype=bool), (problem.q_u != 0) | (np.abs(c_u.T) @ np.abs(c_u) != 0)],
         ]
     )
-    from scipy.sparse.csgraph import connected_components  # loaded where a design is made, for it takes long
+    from scipy.sparse.csgraph import connected_components  # slow to import, needed for a design only
 
-    _, label = connected_components(sparse.csr_array(coupled), directed=False)
-    of_x, of_u = label[: plant.n_x], label[plant.n_x :]
+    _, label = connected_components(sparse.csr_array(edges), directed=False)
+    label_x, label_u = label[: plant.n_x], label[plant.n_x :]
     return tuple(
         Part(
-            states=np.flatnonzero(of_x == i),
-            inputs=np.flatnonzero(of_u == i),
-            rows_x=_rows(problem.state_set, of_x == i),
-            rows_u=_rows(problem.input_set, of_u == i),
+            states=np.flatnonzero(label_x == i),
+            inputs=np.flatnonzero(label_u == i),
+            rows_x=_rows(problem.state_set, label_x == i),
+            rows_u=_rows(problem.input_set, label_u == i),
         )
-        for i in dict.fromkeys(of_u.tolist())
+        for i in dict.fromkeys(label_u.tolist())
     )
 
 
@@ -181,19 +183,21 @@ def _rows(limits: Polytope, variables: NDArray[np.bool_]) -> Index:
     return np.flatnonzero(np.any(limits.c[:, variables] != 0, axis=1) & np.isfinite(limits.b))
 
 
-def deviations(limits: Polytope, covariance: Array) -> Array:
-    """Standard deviation along each row (m,)."""
+def row_deviations(limits: Polytope, covariance: Array) -> Array:
+    """Return the standard deviation along each row (m,)."""
+    # σ_i = (c_i' Σ c_i)^½
     variance = np.einsum("mi,ij,mj->m", limits.c, covariance, limits.c)
     along: Array = np.sqrt(np.maximum(variance, 0.0))
     return along
 
 
-def unseen(plant: Plant, steps: int, cov: Array | None = None) -> Array:
-    """Covariance (steps+1, n_x, n_x) of a prediction over 0, 1 … `steps` steps.
+def propagate_covariance(plant: Plant, steps: int, cov: Array | None = None) -> Array:
+    """Return the covariance (steps+1, n_x, n_x) of a prediction over 0, 1 … `steps` steps.
 
     Args:
-        cov: Covariance (n_x, n_x) of the state that it begins with; None: that was exact.
+        cov: Covariance (n_x, n_x) of the first state; None: it is exact.
     """
+    # P_{t+1} = A P_t A' + E W E'
     noise = plant.e @ plant.w @ plant.e.T
     spread = [np.zeros_like(noise) if cov is None else cov]
     for _ in range(steps):
@@ -205,7 +209,7 @@ class BatchMpc:
     """Plans of H steps from many states; inputs within their limits, state limits soft.
 
     Args:
-        backoff_x: What is taken off the state rows in the stages 0 … H (H+1, m_x); nothing by default.
+        backoff_x: Back-offs of the state rows in the stages 0 … H (H+1, m_x); none by default.
         backoff_u: The same of the input rows (H, m_u).
 
     Raises:
@@ -219,76 +223,80 @@ class BatchMpc:
         room_u = problem.input_set.margin(problem.u_target) - (0.0 if backoff_u is None else backoff_u)
         sides_x = np.broadcast_to(room_x, (problem.horizon + 1, problem.state_set.b.size))
         sides_u = np.broadcast_to(room_u, (problem.horizon, problem.input_set.b.size))
-        self._parts = [_PartMpc(problem, law, part, sides_x, sides_u) for part in parts(problem)]
+        self._parts = [_PartMpc(problem, law, part, sides_x, sides_u) for part in find_parts(problem)]
 
-    def plans(self, x: Array) -> Array:
-        """Inputs (M, H, n_u) from states (M, n_x); NaN where the state is not finite or a program found no optimum."""
+    def compute_plans(self, x: Array) -> Array:
+        """Return inputs (M, H, n_u) from states (M, n_x); NaN for a state that is not finite, or without an optimum."""
         problem = self._problem
         plans = np.empty((len(x), problem.horizon, problem.plant.n_u))
         plans[:] = problem.u_target
         for part in self._parts:
-            plans[:, :, part.inputs] += part.plans(x[:, part.states] - problem.target[part.states])
+            plans[:, :, part.inputs] += part.compute_plans(x[:, part.states] - problem.target[part.states])
         return plans
 
 
 class _PartMpc:
-    """One independent part, in deviations from the target: rows of_x x + of_z z <= room, cost |z|²."""
+    """One independent part, in deviations from the target: min |z|², X x + Z z <= room.
+
+    X and Z are `_x_rows` and `_z_rows`.
+    """
 
     def __init__(self, problem: ControlProblem, law: Lqr, part: Part, sides_x: Array, sides_u: Array) -> None:
         self.states, self.inputs, self._steps = part.states, part.inputs, problem.horizon
-        states_of, inputs_of = regulated(problem, law, part)
+        x_maps, u_maps = predict_regulated(problem, law, part)
         n_x = part.states.size
-        of_x = np.einsum("mi,tij->tmj", problem.state_set.c[np.ix_(part.rows_x, part.states)], states_of[1:])
-        of_u = np.einsum("mi,tij->tmj", problem.input_set.c[np.ix_(part.rows_u, part.inputs)], inputs_of)
-        rows = np.concatenate([of_x.reshape(-1, of_x.shape[2]), of_u.reshape(-1, of_u.shape[2])])
-        self._of_x, self._of_z = rows[:, :n_x], rows[:, n_x:]
+        x_rows = np.einsum("mi,tij->tmj", problem.state_set.c[np.ix_(part.rows_x, part.states)], x_maps[1:])
+        u_rows = np.einsum("mi,tij->tmj", problem.input_set.c[np.ix_(part.rows_u, part.inputs)], u_maps)
+        rows = np.concatenate([x_rows.reshape(-1, x_rows.shape[2]), u_rows.reshape(-1, u_rows.shape[2])])
+        self._x_rows, self._z_rows = rows[:, :n_x], rows[:, n_x:]
         self._room = np.concatenate([sides_x[1:, part.rows_x].ravel(), sides_u[:, part.rows_u].ravel()])
-        self._plan_x, self._plan_z = np.split(inputs_of.reshape(-1, rows.shape[1]), [n_x], axis=1)
+        self._plan_x, self._plan_z = np.split(u_maps.reshape(-1, rows.shape[1]), [n_x], axis=1)
         soft = np.arange(len(rows)) < problem.horizon * part.rows_x.size
         self._open = np.full(len(rows), -OPEN)
         low, high = problem.input_set.bounds
         self._low, self._high = ((side - problem.u_target)[part.inputs] for side in (low, high))
         self._program = QuadraticProgram(
-            2.0 * np.eye(self._of_z.shape[1]),
-            np.ascontiguousarray(self._of_z),
+            2.0 * np.eye(self._z_rows.shape[1]),
+            np.ascontiguousarray(self._z_rows),
             np.where(soft, SOFT, 0).astype(np.int32),
             np.where(soft, problem.slack_linear, 0.0),
             np.where(soft, problem.slack_quadratic, 0.0),
         )
 
-    def plans(self, x: Array) -> Array:
-        """Deviations of the inputs (M, H, n_u) from states (M, n_x)."""
+    def compute_plans(self, x: Array) -> Array:
+        """Return the deviations of the inputs (M, H, n_u) from states (M, n_x)."""
         plans = x @ self._plan_x.T
-        room = self._room - x @ self._of_x.T
+        room = self._room - x @ self._x_rows.T
         for i in np.flatnonzero(~np.all(room >= 0.0, axis=1)):
-            plans[i] += self._plan_z @ self._steered(room[i])
-        # All that is cut is the program's tolerance.
+            plans[i] += self._plan_z @ self._solve_program(room[i])
+        # The clip removes the program's tolerance only.
         return np.clip(plans.reshape(len(x), self._steps, self.inputs.size), self._low, self._high)
 
-    def _steered(self, room: Array) -> Array:
-        """z, NaN without an optimum."""
-        nothing = np.full(self._of_z.shape[1], np.nan)
+    def _solve_program(self, room: Array) -> Array:
+        """Solve for z; NaN without an optimum."""
+        nothing = np.full(self._z_rows.shape[1], np.nan)
         if not np.isfinite(room).all():
             return nothing
         solved = self._program.solve(np.zeros_like(nothing), room, self._open)
         return nothing if solved is None else solved[0]
 
 
-def regulated(problem: ControlProblem, law: Lqr, part: Part) -> tuple[Array, Array]:
-    """Regulated predictions: x_t (H+1, n_x, n_x + H n_u) and u_t (H, n_u, …) as maps of (x, z), z = L'c.
+def predict_regulated(problem: ControlProblem, law: Lqr, part: Part) -> tuple[Array, Array]:
+    """Predict x_t (H+1, n_x, n_x + H n_u) and u_t (H, n_u, …) under the regulator, as maps of (x, z), z = L'c.
 
-    L L' = R + B'PB, and c is what is added to the regulator's inputs.
+    L L' = R + B'PB, and c is added to the regulator's inputs.
     """
     plant, steps = problem.plant, problem.horizon
     n_x, n_u = part.states.size, part.inputs.size
     a, b = plant.a[np.ix_(part.states, part.states)], plant.b[np.ix_(part.states, part.inputs)]
     k = law.k[np.ix_(part.inputs, part.states)]
-    of_z = np.linalg.inv(np.linalg.cholesky(law.weight[np.ix_(part.inputs, part.inputs)])).T
+    input_of_z = np.linalg.inv(np.linalg.cholesky(law.weight[np.ix_(part.inputs, part.inputs)])).T
     states, inputs = np.zeros((steps + 1, n_x, n_x + steps * n_u)), np.zeros((steps, n_u, n_x + steps * n_u))
     states[0, :, :n_x] = np.eye(n_x)
+    # u_t = K x_t + L'⁻¹ z_t,  x_{t+1} = A x_t + B u_t
     for t in range(steps):
-        own = slice(n_x + t * n_u, n_x + (t + 1) * n_u)
+        columns = slice(n_x + t * n_u, n_x + (t + 1) * n_u)
         inputs[t] = k @ states[t]
-        inputs[t, :, own] += of_z
+        inputs[t, :, columns] += input_of_z
         states[t + 1] = a @ states[t] + b @ inputs[t]
     return states, inputs

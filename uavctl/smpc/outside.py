@@ -1,8 +1,11 @@
-"""Controllers of other packages in the place of a scheme: what they are told, what they answer, what of it may fly.
+"""Controllers of other packages in place of a scheme: their request, their answer, and its checks.
 
-One is asked where a scheme would be: with each newer position, and where inertial data move the estimate. Its answer is
-played out in silence. What it raises, and what it answers that cannot be flown, becomes an answer with a `fault`: it is
-not asked again in that flight, and the fallback brings the vehicle down.
+1. `OutsideSolver` asks a controller for a plan with each newer position, and where inertial data move the estimate, as
+   it would ask a scheme. The plan is played out in silence.
+2. An exception, or an answer that cannot be flown, becomes an answer with a `fault`: the controller is not asked again
+   in that flight, and the fallback brings the vehicle down.
+3. `SilencePlanner` makes a plan from a campaign's controller: its inputs of this step, and of the next steps if no
+   position arrives.
 """
 
 from __future__ import annotations
@@ -14,49 +17,47 @@ from types import TracebackType
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.errors import RAISED, EndedBySignal, in_words
 from uavctl.records import SolveStatus
-from uavctl.smpc.answer import NOMINAL, Answer, Preview, all_finite
-from uavctl.smpc.batch import BatchController, News
+from uavctl.smpc.answer import NOMINAL, Answer, Preview, are_finite
+from uavctl.smpc.batch import BatchController, Information
 from uavctl.smpc.nominal import ControlProblem, lqr
-from uavctl.smpc.sets import equilibria
+from uavctl.smpc.sets import find_equilibria
 
-Array = NDArray[np.float64]
-
-LONGEST_WORDS = 200  # of what a controller says when it raises [characters]
+MAX_ERROR_CHARACTERS = 200  # longest text of an exception in a fault [characters]
 
 
 @dataclass(frozen=True, eq=False)
 class PlanRequest:
-    """What a controller is told when a plan is asked for: the estimate, what was sent, and where to be.
+    """Request for a plan: the estimate, the input sent last, and the reference.
 
-    States are in the order of the plant's (`ControlProblem.plant`) in m, m/s and m/s², local NED; inputs are in the
-    plant's input units, m/s² unless its matrices say otherwise. A lasting push, as wind, is estimated and taken off
-    what is answered: inputs are what is to act on the vehicle in all. Nothing of it can be written to.
+    States are in the order of the plant's (`ControlProblem.plant`) in m, m/s and m/s², local NED. Inputs are in the
+    plant's input units, m/s² unless its matrices have others, and are all that acts on the vehicle: an estimated
+    lasting acceleration, as of wind, is subtracted from the answer. All arrays are read-only.
     """
 
     step: int  # number k of the step that the plan begins with; a step takes plant.dt_s
-    state: Array  # estimated mean (n_x,) when what is sent now begins to act
+    state: Array  # estimated mean (n_x,) when the next input begins to act
     cov: Array | None  # covariance of its error (n_x, n_x), biases of the inputs behind it; None: it is exact
-    age: int  # age of the newest position in it [steps]; 0 is one of the last step
-    sent: Array | None  # input (n_u,) that acts until the plan begins; None: nothing is known of it
+    age: int  # age of the newest position in the estimate [steps]; 0: from the last step
+    sent: Array | None  # input (n_u,) that acts until the plan begins; None: unknown
     target: Array  # equilibrium to go to (n_x,)
-    states: Array  # where to be in stage t = 0 … H-1 (H, n_x): along a trajectory, or the target
-    inputs: Array  # what keeps it there without disturbances (H, n_u)
+    states: Array  # reference in stage t = 0 … H-1 (H, n_x): along a trajectory, or the target
+    inputs: Array  # inputs that keep the reference without disturbances (H, n_u)
     limits: Array  # right sides of `ControlProblem.state_set` in stage t = 0 … H (H+1, m_x): fences close in
 
 
 class FlightPlanner(Protocol):
-    """A controller that flies: it is made with the `ControlProblem`, and asked for a plan from then on."""
+    """Interface of a controller that flies: it is made with the `ControlProblem`, and then asked for plans."""
 
     def plan(self, request: PlanRequest) -> Array:
-        """Inputs (H, n_u) of the steps from now on, played out while nothing newer is known; or one input (n_u,).
+        """Return inputs (H, n_u) from now on, played out while no newer position arrives; or one input (n_u,).
 
-        Behind one input the regulator of `[cost]` plays on. What is beyond `sets.input_lower` and `input_upper` is cut
-        back. An answer depends on what the controller has been told since it was made, and on nothing else: neither
-        time nor chance, so that a replay decides alike.
+        After one input, the regulator of `[cost]` continues. Inputs are clipped to `sets.input_lower` and
+        `input_upper`. An answer may depend on earlier requests, but neither on time nor on chance, so that a replay
+        decides alike.
         """
         ...
 
@@ -65,7 +66,7 @@ class OutsideSolver:
     """A controller of another package as a solver; implements `uavctl.smpc.answer.Solver`.
 
     Args:
-        name: As which people know it.
+        name: Name for people.
 
     Raises:
         DesignError: The plant has no regulator.
@@ -74,56 +75,57 @@ class OutsideSolver:
     def __init__(self, name: str, problem: ControlProblem, planner: FlightPlanner) -> None:
         self._name, self._problem, self._planner = name, problem, planner
         self._gain = lqr(problem.plant, problem.q_x, problem.q_u).k
-        self._rests = _rests(problem)
+        self._rest_input = _rest_input(problem)
 
-    def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:
+    def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:
         """See `Solver`."""
-        request = self._request(seq, x, target, outlook)
+        request = self._request(seq, x, target, preview)
         shapes = ((self._problem.plant.n_u,), request.inputs.shape)
         try:
-            with np.errstate():  # how it takes its own overflows is not to be how ours are taken
-                told = self._planner.plan(request)
+            with np.errstate():  # its numpy error settings stay its own
+                reply = self._planner.plan(request)
         except EndedBySignal:
             raise
         except RAISED as error:  # a vehicle is in the air
-            return self._refused(seq, f"raised {in_words(error, LONGEST_WORDS)}{_where(error)}")
+            return self._fail(seq, f"raised {in_words(error, MAX_ERROR_CHARACTERS)}{_locate_error(error)}")
         try:
-            given = _numbers(told)
-        except RAISED:  # a conversion of its own may raise anything
-            return self._refused(seq, f"answered with {type(told).__name__}, which is no array of numbers")
-        if given.shape not in shapes:
-            return self._refused(seq, f"answered with shape {given.shape}; give {shapes[1]}, or {shapes[0]}")
-        if not all_finite((given,)):
-            return self._refused(seq, "answered with what is not finite")
-        return self._answer(request, given)
+            inputs = _to_array(reply)
+        except RAISED:  # its own conversion may raise anything
+            return self._fail(seq, f"answered with {type(reply).__name__}, which is no array of numbers")
+        if inputs.shape not in shapes:
+            return self._fail(seq, f"answered with shape {inputs.shape}; give {shapes[1]}, or {shapes[0]}")
+        if not are_finite((inputs,)):
+            return self._fail(seq, "answered with what is not finite")
+        return self._answer(request, inputs)
 
-    def _request(self, seq: int, x: Array, target: Array, outlook: Preview) -> PlanRequest:
-        problem, path = self._problem, outlook.path
+    def _request(self, seq: int, x: Array, target: Array, preview: Preview) -> PlanRequest:
+        problem, path = self._problem, preview.path
         steps = problem.horizon
-        states, inputs = np.tile(target, (steps, 1)), np.tile(self._rests(target), (steps, 1))
+        states, inputs = np.tile(target, (steps, 1)), np.tile(self._rest_input(target), (steps, 1))
         if path is not None:
             states, inputs = states + path.states, inputs + path.inputs
-        limits = np.tile(problem.state_set.b, (steps + 1, 1)) if outlook.limits is None else outlook.limits
+        limits = np.tile(problem.state_set.b, (steps + 1, 1)) if preview.limits is None else preview.limits
         return PlanRequest(
             step=seq,
             state=_read_only(x),
-            cov=None if outlook.cov is None else _read_only(outlook.cov),
-            age=outlook.late,
-            sent=None if outlook.sent is None else _read_only(outlook.sent),
+            cov=None if preview.cov is None else _read_only(preview.cov),
+            age=preview.age,
+            sent=None if preview.sent is None else _read_only(preview.sent),
             target=_read_only(target),
             states=_read_only(states),
             inputs=_read_only(inputs),
             limits=_read_only(limits),
         )
 
-    def _answer(self, request: PlanRequest, given: Array) -> Answer:
+    def _answer(self, request: PlanRequest, planned: Array) -> Answer:
         problem, plant = self._problem, self._problem.plant
-        low, high = problem.input_set.bounds
+        lower, upper = problem.input_set.bounds
         x, states, inputs = request.state, [request.state], []
-        for t, (wanted, held) in enumerate(zip(request.states, request.inputs, strict=True)):
-            asked = given if given.ndim == 1 else given[t]
-            u = asked if given.ndim == 2 or t == 0 else held + self._gain @ (x - wanted)
-            u = np.minimum(np.maximum(u, low), high)
+        for t, (x_ref, u_ref) in enumerate(zip(request.states, request.inputs, strict=True)):
+            planned_t = planned if planned.ndim == 1 else planned[t]
+            # u_t = u_ref_t + K (x_t - x_ref_t) after one input,  x_{t+1} = A x_t + B u_t
+            u = planned_t if planned.ndim == 2 or t == 0 else u_ref + self._gain @ (x - x_ref)
+            u = np.minimum(np.maximum(u, lower), upper)
             x = plant.a @ x + plant.b @ u
             inputs.append(u)
             states.append(x)
@@ -131,20 +133,28 @@ class OutsideSolver:
             request.step, self._name, problem, np.array(states), np.array(inputs), request.states, request.inputs
         )
 
-    def _refused(self, seq: int, what: str) -> Answer:
-        return Answer.failed(seq, SolveStatus.FAILED, self._name, fault=f"the controller {self._name} {what}")
+    def _fail(self, seq: int, reason: str) -> Answer:
+        return Answer.failed(seq, SolveStatus.FAILED, self._name, fault=f"the controller {self._name} {reason}")
 
 
 def make_answer(
-    seq: int, method: str, problem: ControlProblem, states: Array, inputs: Array, wanted: Array, held: Array
+    seq: int,
+    method: str,
+    problem: ControlProblem,
+    states: Array,
+    inputs: Array,
+    reference_states: Array,
+    reference_inputs: Array,
 ) -> Answer:
-    """A plan without back-offs, with its cost.
+    """Make the answer of a plan without back-offs, with its cost.
 
     Args:
         states: Predicted states (H+1, n_x) of `inputs` (H, n_u).
-        wanted: States (H, n_x) that deviations are counted from, and the inputs `held` (H, n_u) that keep them.
+        reference_states: Reference (H, n_x) of the deviations.
+        reference_inputs: Inputs (H, n_u) that keep it.
     """
-    off_x, off_u = states[:-1] - wanted, inputs - held
+    # Σ_t (x_t - x_ref)' Q_x (x_t - x_ref) + (u_t - u_ref)' Q_u (u_t - u_ref)
+    off_x, off_u = states[:-1] - reference_states, inputs - reference_inputs
     cost = np.einsum("ti,ij,tj->", off_x, problem.q_x, off_x) + np.einsum("ti,ij,tj->", off_u, problem.q_u, off_u)
     return Answer(
         seq=seq,
@@ -154,7 +164,7 @@ def make_answer(
         states=states,
         backoff_x=np.zeros((len(states), problem.state_set.b.size)),
         backoff_u=np.zeros((len(inputs), problem.input_set.b.size)),
-        reference=wanted[-1],
+        reference=reference_states[-1],
         slack=0.0,
         offset=0.0,
         terminal_miss=0.0,
@@ -165,11 +175,11 @@ def make_answer(
     )
 
 
-class Rehearsal:
-    """A campaign's controller as one that flies; implements `FlightPlanner`.
+class SilencePlanner:
+    """A campaign's controller that flies; implements `FlightPlanner`.
 
-    It is asked now, and again for each step of silence to come: what it would do then is its plan. It is told the
-    filter's estimate as its state, and made anew for each target.
+    Its plan is its inputs of this step, and of the next steps if no position arrives. Its state is the filter's
+    estimate. It is made again for each target.
 
     Args:
         make: Makes the problem and the controller that fly to a target (n_x,).
@@ -178,48 +188,48 @@ class Rehearsal:
     def __init__(self, make: Callable[[Array], tuple[ControlProblem, BatchController]]) -> None:
         self._make = make
         self._target: Array | None = None
-        self._begun = 0  # step in which it was asked first
-        self._asked: list[Array] = []  # its inputs (n_u,) step by step, as far as they are flown
+        self._first_step = 0  # step of the first request
+        self._inputs: list[Array] = []  # its inputs (n_u,) step by step, as flown, and its last plan
 
     def plan(self, request: PlanRequest) -> Array:
         """See `FlightPlanner`."""
         return self.inputs(request.step, request.state, request.target)[1]
 
     def inputs(self, seq: int, x: Array, target: Array) -> tuple[ControlProblem, Array]:
-        """The problem of a target, and inputs (H, n_u) from state `x` in step `seq`."""
+        """Return the problem of a target, and inputs (H, n_u) from state `x` in step `seq`."""
         if self._target is None or not np.array_equal(target, self._target):
             self._problem, self._controller = self._make(target)
             self._controller.begin(1)
-            self._target, self._begun, self._asked = target.copy(), seq, []
-        problem, step = self._problem, seq - self._begun
-        # What was flown since: its own plan, and nothing where that had run out.
-        flown = [*self._asked[:step], *([problem.u_target] * max(0, step - len(self._asked)))]
+            self._target, self._first_step, self._inputs = target.copy(), seq, []
+        problem, step = self._problem, seq - self._first_step
+        # Inputs since then: its own plan, and u_target where that had run out.
+        past = [*self._inputs[:step], *([problem.u_target] * max(0, step - len(self._inputs)))]
         inputs: list[Array] = []
-        later = self._controller
-        low, high = problem.input_set.bounds
-        for silence in range(problem.horizon):
-            if silence == 1:
-                later = _twin(self._controller)
-            acted = np.clip(np.array([*flown, *inputs]).reshape(1, -1, problem.plant.n_u), low, high)
-            inputs.append(later.act(News(step + silence, np.array([step]), x[np.newaxis], acted))[0])
-        self._asked = [*flown, *inputs]
+        controller = self._controller
+        lower, upper = problem.input_set.bounds
+        for steps_ahead in range(problem.horizon):
+            if steps_ahead == 1:
+                controller = _copy_controller(self._controller)
+            acting = np.clip(np.array([*past, *inputs]).reshape(1, -1, problem.plant.n_u), lower, upper)
+            inputs.append(controller.act(Information(step + steps_ahead, np.array([step]), x[np.newaxis], acting))[0])
+        self._inputs = [*past, *inputs]
         return problem, np.array(inputs)
 
 
-def moved(problem: ControlProblem, target: Array) -> ControlProblem:
-    """The same problem with another equilibrium (n_x,) to go to."""
-    return replace(problem, target=target, u_target=_rests(problem)(target))
+def retarget(problem: ControlProblem, target: Array) -> ControlProblem:
+    """Return the same problem with another target (n_x,)."""
+    return replace(problem, target=target, u_target=_rest_input(problem)(target))
 
 
-def _rests(problem: ControlProblem) -> Callable[[Array], Array]:
-    """Return what gives the input (n_u,) that keeps an equilibrium (n_x,)."""
+def _rest_input(problem: ControlProblem) -> Callable[[Array], Array]:
+    """Return the function from an equilibrium (n_x,) to the input (n_u,) that keeps it."""
     plant = problem.plant
-    rests = equilibria(plant.a, plant.b, problem.q_x, problem.q_u, np.array(plant.position_index, dtype=np.intp))
+    rests = find_equilibria(plant.a, plant.b, problem.q_x, problem.q_u, np.array(plant.position_index, dtype=np.intp))
     return lambda target: np.asarray(rests.u_eq @ target[rests.held])
 
 
-def _twin(controller: BatchController) -> BatchController:
-    """Return a copy of a controller with a state of its own; the state of every baseline is in arrays."""
+def _copy_controller(controller: BatchController) -> BatchController:
+    """Return a copy of a controller with its own arrays; the state of every baseline is in arrays."""
     twin = copy(controller)
     for name, value in vars(twin).items():
         if isinstance(value, np.ndarray):
@@ -228,21 +238,21 @@ def _twin(controller: BatchController) -> BatchController:
 
 
 def _read_only(values: Array) -> Array:
-    kept = values.copy()
-    kept.flags.writeable = False
-    return kept
+    copied = values.copy()
+    copied.flags.writeable = False
+    return copied
 
 
-def _numbers(told: object) -> Array:
-    raw = np.array(told)
-    if raw.dtype.kind not in "biufO":  # complex numbers and words would be made to fit
-        raise TypeError(raw.dtype)
-    return raw.astype(np.float64)
+def _to_array(reply: object) -> Array:
+    array = np.array(reply)
+    if array.dtype.kind not in "biufO":  # complex numbers and text would be converted silently
+        raise TypeError(array.dtype)
+    return array.astype(np.float64)
 
 
-def _where(error: BaseException) -> str:
+def _locate_error(error: BaseException) -> str:
     """Return the file and line that raised, in brackets."""
-    found: TracebackType | None = error.__traceback__
-    while found is not None and found.tb_next is not None:
-        found = found.tb_next
-    return "" if found is None else f" ({found.tb_frame.f_code.co_filename.rpartition('/')[2]}, line {found.tb_lineno})"
+    frame: TracebackType | None = error.__traceback__
+    while frame is not None and frame.tb_next is not None:
+        frame = frame.tb_next
+    return "" if frame is None else f" ({frame.tb_frame.f_code.co_filename.rpartition('/')[2]}, line {frame.tb_lineno})"

@@ -1,4 +1,25 @@
-"""The plant (1): sampling, velocity reference, digest."""
+"""The plant (1): sampled matrices, the meaning of its states, and the plants of the presets.
+
+1. x(k+1) = A x(k) + B u(k) + E w(k), w(k) ~ N(0, W), with u and w held over Δt.
+2. Parts of a step: [[A, B, E], [0, I]] = exp(G Δt). G is its matrix logarithm, computed in balanced units.
+3. `drag_lag`: axes with drag and a lag of the acceleration.
+4. `velocity_reference`: an autopilot integrates the acceleration setpoint into a velocity and a position that its own
+   loops hold. Each axis moves under a force f (wind, an error of the hover thrust), a random walk f' = n:
+
+       p' = v,    v' = b + f - c v + w,    T b' = u + kv (s + kp q) + j - b,    j' = ki (s + kp q),
+       q' = s,    s' = u - v'
+
+   with the reference's lead q, s over position and velocity, the acceleration b that the loops make, and their integral
+   j. Only the sums a = b + f and i = j + f act on the motion, and both follow a change of f at once:
+
+       v' = a - c v + w,    T a' = u + kv (s + kp q) + i - a + T n,    i' = ki (s + kp q) + n
+
+   So a lasting force needs no state, and the loops compensate a known one already. The state is the lead, not the
+   reference: it is zero where the loops begin. The input is u = r + e, with the setpoint r and an error e: jerk limits,
+   late or missing setpoints, and a drifting estimate of the vehicle move the reference by what was not sent. Without e,
+   the reference would be the sum of all setpoints, and no position could correct it.
+5. A digest hashes all that a design is made of. It contains the names of fields, so these names are fixed.
+"""
 
 from __future__ import annotations
 
@@ -9,23 +30,20 @@ from dataclasses import dataclass, field, fields, is_dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag, matrix_balance, sqrtm
 
+from uavctl.arrays import Array
 from uavctl.errors import DesignError
 from uavctl.records import Vec3
 
-# Hash of everything that a design is made from.
-
-
-WORDS = {"words": True}
+DESCRIPTION = {"description": True}  # metadata of a field that no answer depends on
 
 
 def digest(value: object) -> str:
-    """First 16 hexadecimal digits of SHA-256 over a tree of dataclasses, tuples, arrays and numbers.
+    """Return the first 16 hexadecimal digits of SHA-256 over a tree of dataclasses, tuples, arrays and numbers.
 
-    Fields with a leading underscore are left out: they are derived from the others. So are those with the metadata
-    `WORDS`, which say what something is called: no answer depends on them.
+    Fields with a leading underscore are left out, because they are derived from the others. So are those with the
+    metadata `DESCRIPTION`.
     """
     hasher = hashlib.sha256()
 
@@ -33,14 +51,14 @@ def digest(value: object) -> str:
         if isinstance(part, np.ndarray):
             hasher.update(f"{part.dtype.str}{part.shape}".encode() + np.ascontiguousarray(part).tobytes())
         elif is_dataclass(part) and not isinstance(part, type):
-            for one in fields(part):
-                if not one.name.startswith("_") and one.metadata != WORDS:
-                    hasher.update(one.name.encode())
-                    feed(getattr(part, one.name))
+            for entry in fields(part):
+                if not entry.name.startswith("_") and entry.metadata != DESCRIPTION:
+                    hasher.update(entry.name.encode())
+                    feed(getattr(part, entry.name))
         elif isinstance(part, tuple):
             hasher.update(f"({len(part)}".encode())
-            for one in part:
-                feed(one)
+            for entry in part:
+                feed(entry)
         else:
             hasher.update(f"{part!r};".encode())
 
@@ -48,18 +66,13 @@ def digest(value: object) -> str:
     return hasher.hexdigest()[:16]
 
 
-# Sampled and continuous plants: matrix exponential and logarithm of [[A, B, E], [0, I]], in balanced units.
-
-
-Array = NDArray[np.float64]
-
-
 def exponential(matrix: Array) -> Array:
-    """Matrix exponential by scaling, series and squaring.
+    """Return the matrix exponential, by scaling, series and squaring.
 
     scipy's `expm` divides differences of nearly equal diagonal entries of a triangular matrix (SciPy 1.17: an error
-    of 0.05 for drags of 1e-15), and plants with an integrator and little drag are just that.
+    of 0.05 for drags of 1e-15), and plants with an integrator and little drag have these.
     """
+    # exp(M) = (Σ_{n<=14} (M / 2^h)^n / n!)^(2^h)
     norm = float(np.abs(matrix).sum(axis=1).max())
     halvings = max(0, math.ceil(math.log2(max(norm, 0.25) / 0.25)))
     scaled = matrix / 2.0**halvings
@@ -73,15 +86,15 @@ def exponential(matrix: Array) -> Array:
 
 
 def logarithm(matrix: Array) -> Array:
-    """Principal matrix logarithm by square roots and series.
+    """Return the principal matrix logarithm, by square roots and series.
 
-    scipy's `logm` judges itself by its `expm` and warns in vain.
+    scipy's `logm` checks itself with its `expm` and warns without a reason.
     """
     identity = np.eye(len(matrix))
     root, halvings = matrix, 0
     while np.abs(root - identity).sum(axis=1).max() > 0.1 and halvings < 60:
         root, halvings = np.real(sqrtm(root)), halvings + 1
-    # log R = 2 artanh Z with Z = (R + I)⁻¹ (R - I); |Z| <= 0.053, so that |Z|^17 is below 1e-21
+    # log M = 2^h log R,  log R = 2 Σ_{n odd} Z^n / n  with Z = (R + I)⁻¹ (R - I);  |Z| <= 0.053: |Z|^17 < 1e-21
     z = np.linalg.solve(root + identity, root - identity)
     square = z @ z
     power = total = z
@@ -92,9 +105,9 @@ def logarithm(matrix: Array) -> Array:
 
 
 def balanced_units(a: Array, b: Array, e: Array) -> Array:
-    """Units (n_x + n_u + n_w,), powers of 2, in which the entries of A, B and E are of similar size.
+    """Return units (n_x + n_u + n_w,), powers of 2, in which the entries of A, B and E are of similar size.
 
-    A plant in metres and one in millimetres are the same numbers in these units, up to a factor of 2.
+    A plant in metres and one in millimetres have the same numbers in these units, up to a factor of 2.
     """
     _, (unit_x, _) = matrix_balance(a, permute=False, separate=True)
     reach = np.abs(np.hstack([b, e]) / unit_x[:, None]).max(axis=0, initial=0.0)
@@ -102,19 +115,16 @@ def balanced_units(a: Array, b: Array, e: Array) -> Array:
     return np.concatenate([unit_x, unit_u])
 
 
-# The plant (1): x(k+1) = A x(k) + B u(k) + E w(k), w(k) ~ N(0, W).
-
-
 AXES = ("north", "east", "down")
-_ROUNDING = 1e-12
-_DRIFT = 1e-9
+_ROUNDING = 1e-12  # smaller shares are rounding
+_DRIFT = 1e-9  # drift in a step, as a share of the state, that counts as rest
 
 
 @dataclass(frozen=True, eq=False)
 class Plant:
     """A linear plant with the meaning of its states; the arrays are copied and read-only.
 
-    One without axes has states that mean nothing in a room: it has steps, and no part of a step.
+    The states of a plant without axes have no place in a room, and it has no parts of a step.
 
     Raises:
         DesignError: Shapes do not fit, W is no covariance, or A of a plant with axes has no real logarithm.
@@ -131,8 +141,8 @@ class Plant:
     # Acceleration setpoint per unit of input [m/s² per unit]: a number an axis (n_axes,) where each axis has its own
     # input, in the axes' order; else a map (n_axes, n_u)
     accel_per_input: Array
-    # (name, unit) of the states that follow position and velocity in each axis; empty where that is not known
-    further: tuple[tuple[str, str], ...] = field(default=(), metadata=WORDS)
+    # (name, unit) of the states after position and velocity in each axis; empty where unknown
+    extra_states: tuple[tuple[str, str], ...] = field(default=(), metadata=DESCRIPTION)
     _accel_map: Array = field(init=False, repr=False)
     _columns: tuple[int, ...] = field(init=False, repr=False)  # place of each axis in a vector of all three
     _units: Array = field(init=False, repr=False)  # of x, u and w, in which all numbers are of similar size
@@ -140,15 +150,15 @@ class Plant:
 
     def __post_init__(self) -> None:
         for name in ("a", "b", "e", "w", "accel_per_input"):
-            object.__setattr__(self, name, _frozen(getattr(self, name)))
+            object.__setattr__(self, name, _freeze(getattr(self, name)))
         _check(self)
         accel = self.accel_per_input
-        object.__setattr__(self, "_accel_map", _frozen(np.diag(accel)) if accel.ndim == 1 else accel)
+        object.__setattr__(self, "_accel_map", _freeze(np.diag(accel)) if accel.ndim == 1 else accel)
         object.__setattr__(self, "_columns", tuple(AXES.index(axis) for axis in self.axes))
-        object.__setattr__(self, "_units", _frozen(balanced_units(self.a, self.b, self.e)))
+        object.__setattr__(self, "_units", _freeze(balanced_units(self.a, self.b, self.e)))
         size = self._units.size
-        generator = _logarithm(self) / self.dt_s if self.axes else np.full((size, size), np.nan)
-        object.__setattr__(self, "_generator", _frozen(generator))
+        generator = _make_generator(self) / self.dt_s if self.axes else np.full((size, size), np.nan)
+        object.__setattr__(self, "_generator", _freeze(generator))
 
     def __repr__(self) -> str:
         """Return one line: sizes, step, axes; the matrices are `a`, `b`, `e`, `w`."""
@@ -171,7 +181,7 @@ class Plant:
         return int(self.e.shape[1])
 
     def transition(self, dt_s: float) -> tuple[Array, Array, Array]:
-        """A, B, E of a part of a step, with u and w held: exact, by the matrix logarithm of [[A, B, E], [0, I]].
+        """Return the exact A, B, E of a part of a step, with u and w held.
 
         Args:
             dt_s: Length of the part, 0 <= dt <= Δt [s]; Δt gives back the plant's own matrices.
@@ -183,19 +193,20 @@ class Plant:
             return self.a, self.b, self.e
         if not 0.0 <= dt_s < self.dt_s:
             raise ValueError(f"{dt_s} s is not within a step of {self.dt_s} s")
-        lifted = (exponential(self._generator * dt_s) * (self._units[:, None] / self._units))[: self.n_x]
-        a, b, e = np.split(lifted, [self.n_x, self.n_x + self.n_u], axis=1)
+        # [[A, B, E], [0, I]](dt) = exp(G dt)
+        augmented = (exponential(self._generator * dt_s) * (self._units[:, None] / self._units))[: self.n_x]
+        a, b, e = np.split(augmented, [self.n_x, self.n_x + self.n_u], axis=1)
         return a, b, e
 
     @property
     def slope(self) -> tuple[Array, Array]:
-        """Continuous-time slopes of the state: of the states (n_x, n_x) and of the inputs (n_x, n_u) [per s]."""
+        """Continuous-time matrices of x' = F x + G u: F (n_x, n_x) and G (n_x, n_u) [per s]."""
         generator = self.generator
         return generator[:, : self.n_x], generator[:, self.n_x : self.n_x + self.n_u]
 
     @property
     def generator(self) -> Array:
-        """x' = G [x; u; w] in continuous time: G (n_x, n_x + n_u + n_w) [per s]; what is only rounding is zero."""
+        """G (n_x, n_x + n_u + n_w) of x' = G [x; u; w] in continuous time [per s]; rounding is set to zero."""
         slopes = self._generator[: self.n_x]
         kept = np.where(np.abs(slopes) < _DRIFT * np.abs(slopes).max(), 0.0, slopes)
         return np.asarray(kept * (self._units[: self.n_x, None] / self._units))
@@ -206,16 +217,16 @@ class Plant:
         return self._accel_map
 
     def to_accel(self, u: Array) -> Vec3:
-        """Acceleration setpoint [m/s²] of an input (n_u,); 0 in the axes that the plant lacks."""
+        """Return the acceleration setpoint [m/s²] of an input (n_u,); 0 in axes that the plant lacks."""
         accel = [0.0, 0.0, 0.0]
         for column, value in zip(self._columns, (self._accel_map @ u).tolist(), strict=True):
             accel[column] = value
         return accel[0], accel[1], accel[2]
 
     def to_input(self, accel: Vec3) -> Array:
-        """Input (n_u,) of an acceleration setpoint [m/s²]: the smallest of those nearest to it.
+        """Return the input (n_u,) of an acceleration setpoint [m/s²]: the smallest of the nearest ones.
 
-        Only where each axis has its own input is it the one input that asks for this acceleration.
+        It is unique only where each axis has its own input.
         """
         wanted: Array = np.array([accel[column] for column in self._columns])
         if self.accel_per_input.ndim == 1:
@@ -224,28 +235,31 @@ class Plant:
         return nearest
 
     def equilibrium(self, position_m: Vec3) -> Array:
-        """State (n_x,) at rest at a position [m]; the origin of a plant without axes.
+        """Return the state (n_x,) at rest at a position [m]; the origin for a plant without axes.
 
         Raises:
-            DesignError: The plant cannot rest there; the axes that it cannot hold by themselves are named.
+            DesignError: The plant cannot rest there; the message names the axes.
         """
         if not self.axes:
             return np.zeros(self.n_x)
         positions = np.array([position_m[AXES.index(axis)] for axis in self.axes])
-        state, drift = self._rest(positions)
+        state, drift = self._find_rest(positions)
         if drift > _DRIFT:
-            alone = np.diag(np.where(positions == 0.0, 1.0, positions))
-            adrift = [axis for axis, one in zip(self.axes, alone, strict=True) if self._rest(one)[1] > _DRIFT]
+            single = np.diag(np.where(positions == 0.0, 1.0, positions))
+            unheld = [
+                axis for axis, position in zip(self.axes, single, strict=True) if self._find_rest(position)[1] > _DRIFT
+            ]
             raise DesignError(
                 "target.position_m",
-                f"the plant cannot rest there (drift {drift:.3g} of the way a step): no input holds {', '.join(adrift)}"
+                f"the plant cannot rest there (drift {drift:.3g} of the way a step): no input holds {', '.join(unheld)}"
                 " by itself",
                 "move it to a place where the plant can rest, or add an input",
             )
         return state
 
-    def _rest(self, positions: Array) -> tuple[Array, float]:
-        """State (n_x,) that rests best at the positions (n_axes,), and its drift in a step as a share of it."""
+    def _find_rest(self, positions: Array) -> tuple[Array, float]:
+        """Return the state (n_x,) nearest to rest at the positions (n_axes,), and its relative drift in a step."""
+        # min |(I - A) x - B u| over u and the free states, in balanced units
         held, free = list(self.position_index), [i for i in range(self.n_x) if i not in self.position_index]
         unit_x, unit_u = self._units[: self.n_x], self._units[self.n_x : self.n_x + self.n_u]
         drift = (np.eye(self.n_x) - self.a) / unit_x[:, None]
@@ -267,7 +281,7 @@ def drag_lag(
     dt_s: float,
     axes: tuple[str, ...],
 ) -> Plant:
-    """Axes with p' = v, v' = a - c v + w, T a' = g u - a, input and disturbance held over Δt.
+    """Make axes with p' = v, v' = a - c v + w, T a' = g u - a, with input and disturbance held over Δt.
 
     Args:
         drag_1ps: Drag c of each axis [1/s].
@@ -278,19 +292,20 @@ def drag_lag(
     Raises:
         DesignError: Not one number for each axis, or a lag that is not positive.
     """
-    given = {"drag_1ps": drag_1ps, "lag_s": lag_s, "gain": gain, "wind_std_mps2": wind_std_mps2}
-    for key, values in given.items():
+    numbers = {"drag_1ps": drag_1ps, "lag_s": lag_s, "gain": gain, "wind_std_mps2": wind_std_mps2}
+    for key, values in numbers.items():
         if len(values) != len(axes):
             raise DesignError(f"plant.{key}", f"{len(values)} numbers for {len(axes)} axes", "give one an axis")
     if min(lag_s, default=1.0) <= 0.0:
         raise DesignError("plant.lag_s", f"{list(lag_s)} has a lag that is not positive", "give times above 0")
     parts = []
-    for drag, lag, reach in zip(drag_1ps, lag_s, gain, strict=True):
-        lifted = np.zeros((5, 5))
-        lifted[0, 1] = 1.0
-        lifted[1, 1:] = [-drag, 1.0, 0.0, 1.0]
-        lifted[2, 2:4] = [-1.0 / lag, reach / lag]
-        parts.append(exponential(lifted * dt_s)[:3])
+    for drag, lag, axis_gain in zip(drag_1ps, lag_s, gain, strict=True):
+        # (p, v, a, u, w)' = M (p, v, a, u, w)
+        augmented = np.zeros((5, 5))
+        augmented[0, 1] = 1.0
+        augmented[1, 1:] = [-drag, 1.0, 0.0, 1.0]
+        augmented[2, 2:4] = [-1.0 / lag, axis_gain / lag]
+        parts.append(exponential(augmented * dt_s)[:3])
     return Plant(
         a=block_diag(*(part[:, :3] for part in parts)),
         b=block_diag(*(part[:, 3:4] for part in parts)),
@@ -301,17 +316,18 @@ def drag_lag(
         position_index=tuple(range(0, 3 * len(axes), 3)),
         velocity_index=tuple(range(1, 3 * len(axes), 3)),
         accel_per_input=np.ones(len(axes)),
-        further=(("acceleration", "m/s²"),),
+        extra_states=(("acceleration", "m/s²"),),
     )
 
 
-def steps_to_reach(plant: Plant) -> int:
-    """Fewest steps in which inputs without limits take the mean from any state to any other.
+def count_reach_steps(plant: Plant) -> int:
+    """Return the least number of steps in which unlimited inputs take the mean from any state to any other.
 
     Raises:
-        DesignError: No number of steps does.
+        DesignError: There is none.
     """
     unit_x = plant._units[: plant.n_x]
+    # rank [B, A B, …, A^{n-1} B] = n_x
     reach = np.zeros((plant.n_x, 0))
     for steps in range(1, plant.n_x + 1):
         reach = np.hstack([plant.b, plant.a @ reach])
@@ -326,7 +342,7 @@ def steps_to_reach(plant: Plant) -> int:
     )
 
 
-def _frozen(array: Array) -> Array:
+def _freeze(array: Array) -> Array:
     copy = np.array(array, dtype=np.float64)
     copy.setflags(write=False)
     return copy
@@ -383,59 +399,39 @@ def _check_shapes(plant: Plant) -> None:
             )
 
 
-def _logarithm(plant: Plant) -> Array:
+def _make_generator(plant: Plant) -> Array:
     """Real logarithm of [[A, B, E], [0, I]], in the plant's balanced units."""
     eigenvalues = np.linalg.eigvals(plant.a)
     size = float(np.abs(eigenvalues).max())
     # The principal logarithm is real where no eigenvalue is 0 or negative.
-    barred = (np.abs(eigenvalues.imag) <= _ROUNDING * size) & (eigenvalues.real <= _ROUNDING * size)
-    refused = DesignError(
+    has_no_logarithm = (np.abs(eigenvalues.imag) <= _ROUNDING * size) & (eigenvalues.real <= _ROUNDING * size)
+    error = DesignError(
         "plant.a",
         f"A has no real logarithm (eigenvalues {', '.join(f'{value:.4g}' for value in eigenvalues)})",
         "a sampled continuous plant has no eigenvalue that is 0 or negative: check A, or model the plant at another Δt",
     )
-    if barred.any():
-        raise refused
-    lifted = np.eye(plant.n_x + plant.n_u + plant.n_w)
-    lifted[: plant.n_x] = np.hstack([plant.a, plant.b, plant.e])
-    lifted *= plant._units / plant._units[:, None]
-    generator = logarithm(lifted)
-    if np.abs(exponential(generator) - lifted).max() > 1e-9 * max(1.0, float(np.abs(lifted).max())):
-        raise refused
-    return _frozen(generator)
+    if has_no_logarithm.any():
+        raise error
+    augmented = np.eye(plant.n_x + plant.n_u + plant.n_w)
+    augmented[: plant.n_x] = np.hstack([plant.a, plant.b, plant.e])
+    augmented *= plant._units / plant._units[:, None]
+    generator = logarithm(augmented)
+    if np.abs(exponential(generator) - augmented).max() > 1e-9 * max(1.0, float(np.abs(augmented).max())):
+        raise error
+    return _freeze(generator)
 
 
-# A plant whose autopilot integrates an acceleration setpoint into a velocity and position that its own loops hold.
-#
-# Each axis moves under a force f (wind, an error of the hover thrust) that is a random walk, f' = n:
-#
-#     p' = v,    v' = b + f - c v + w,    T b' = u + kv (s + kp q) + j - b,    j' = ki (s + kp q),
-#     q' = s,    s' = u - v',
-#
-# with the reference's lead q, s over position and velocity, the acceleration b that the loops make and their integral
-# j. Only the sums a = b + f and i = j + f meet a motion, and both take a change of f at once:
-#
-#     v' = a - c v + w,    T a' = u + kv (s + kp q) + i - a + T n,    i' = ki (s + kp q) + n
-#
-# So a force that stays needs no state, and where it is learnt the loops are known to fly against it already. The lead
-# and not the reference is the state: it is zero where the loops begin, wherever that is.
-#
-# The input is u = r + e of what was sent, r, and an error e: jerk limits, setpoints that come late or not at all, and
-# a vehicle's own estimate that wanders, move the reference by what nobody sent. Without it the reference would be the
-# sum of all that was ever sent, and no position could correct it.
-
-
-_FURTHER = (
+_EXTRA_STATES = (
     ("acceleration", "m/s²"),
     ("reference's lead in position", "m"),
     ("reference's lead in velocity", "m/s"),
     ("own integral", "m/s²"),
 )
-STATES = 2 + len(_FURTHER)  # of an axis: p, v, a, q, s, i
+STATES_PER_AXIS = 2 + len(_EXTRA_STATES)  # of an axis: p, v, a, q, s, i
 
 
-class HeldAxis(NamedTuple):
-    """Numbers of one axis."""
+class VelocityReferenceAxis(NamedTuple):
+    """Numbers of one axis of `velocity_reference`."""
 
     drag_1ps: float  # drag c [1/s]
     lag_s: float  # lag T of the acceleration [s]
@@ -444,11 +440,11 @@ class HeldAxis(NamedTuple):
     integral_1ps2: float  # integral gain ki of the velocity loop [1/s²]
     wind_std_mps2: float  # standard deviation of w, held over Δt [m/s²]
     input_std_mps2: float  # standard deviation of e, held over Δt [m/s²]
-    force_drift_mps2_rts: float  # standard deviation of what f gains in a second [m/s² / √s]
+    force_drift_mps2_rts: float  # standard deviation of the change of f in a second [m/s² / √s]
 
 
-def velocity_reference(held: Sequence[HeldAxis], dt_s: float, axes: tuple[str, ...]) -> Plant:
-    """Axes with the states (p, v, a, q, s, i), input r, and the disturbances (w, e, n), all held over Δt.
+def velocity_reference(numbers: Sequence[VelocityReferenceAxis], dt_s: float, axes: tuple[str, ...]) -> Plant:
+    """Make axes with the states (p, v, a, q, s, i), input r, and the disturbances (w, e, n), all held over Δt.
 
     Args:
         dt_s: Δt [s].
@@ -457,38 +453,38 @@ def velocity_reference(held: Sequence[HeldAxis], dt_s: float, axes: tuple[str, .
         DesignError: Not one entry for each axis, or a lag or gain that is not positive: without one of the gains
             there are states that no input moves.
     """
-    if len(held) != len(axes):
-        raise DesignError("plant.lag_s", f"{len(held)} entries for {len(axes)} axes", "give one an axis")
+    if len(numbers) != len(axes):
+        raise DesignError("plant.lag_s", f"{len(numbers)} entries for {len(axes)} axes", "give one an axis")
     for key in ("lag_s", "position_1ps", "velocity_1ps", "integral_1ps2"):
-        values = [getattr(one, key) for one in held]
+        values = [getattr(axis, key) for axis in numbers]
         if min(values, default=1.0) <= 0.0:
             raise DesignError(f"plant.{key}", f"{values} has a number that is not positive", "give numbers above 0")
-    parts = [exponential(_generator(one) * dt_s)[:STATES] for one in held]
-    # n is what f gains in a second: over a step it gains n Δt, with the deviation drift √Δt.
-    spread = [(one.wind_std_mps2, one.input_std_mps2, one.force_drift_mps2_rts / np.sqrt(dt_s)) for one in held]
+    parts = [exponential(_make_axis_generator(axis) * dt_s)[:STATES_PER_AXIS] for axis in numbers]
+    # f changes by n Δt in a step, with the deviation drift √Δt: std n = drift / √Δt
+    spread = [(axis.wind_std_mps2, axis.input_std_mps2, axis.force_drift_mps2_rts / np.sqrt(dt_s)) for axis in numbers]
     return Plant(
-        a=block_diag(*(part[:, :STATES] for part in parts)),
-        b=block_diag(*(part[:, STATES : STATES + 1] for part in parts)),
-        e=block_diag(*(part[:, [STATES + 1, STATES, STATES + 2]] for part in parts)),
+        a=block_diag(*(part[:, :STATES_PER_AXIS] for part in parts)),
+        b=block_diag(*(part[:, STATES_PER_AXIS : STATES_PER_AXIS + 1] for part in parts)),
+        e=block_diag(*(part[:, [STATES_PER_AXIS + 1, STATES_PER_AXIS, STATES_PER_AXIS + 2]] for part in parts)),
         w=np.diag(np.square(np.array(spread, dtype=np.float64)).ravel()),
         dt_s=dt_s,
         axes=axes,
-        position_index=tuple(range(0, STATES * len(axes), STATES)),
-        velocity_index=tuple(range(1, STATES * len(axes), STATES)),
+        position_index=tuple(range(0, STATES_PER_AXIS * len(axes), STATES_PER_AXIS)),
+        velocity_index=tuple(range(1, STATES_PER_AXIS * len(axes), STATES_PER_AXIS)),
         accel_per_input=np.ones(len(axes)),
-        further=_FURTHER,
+        extra_states=_EXTRA_STATES,
     )
 
 
-def _generator(one: HeldAxis) -> Array:
-    """Slope (9, 9) of (p, v, a, q, s, i, u, w, n)."""
-    slope = np.zeros((STATES + 3, STATES + 3))
-    _, v, a, q, s, i, u, w, n = np.eye(STATES + 3)
-    error = s + one.position_1ps * q
+def _make_axis_generator(axis: VelocityReferenceAxis) -> Array:
+    """Return M (9, 9) of (p, v, a, q, s, i, u, w, n)' = M (p, v, a, q, s, i, u, w, n)."""
+    slope = np.zeros((STATES_PER_AXIS + 3, STATES_PER_AXIS + 3))
+    _, v, a, q, s, i, u, w, n = np.eye(STATES_PER_AXIS + 3)
+    error = s + axis.position_1ps * q
     slope[0] = v
-    slope[1] = a - one.drag_1ps * v + w
-    slope[2] = (u + one.velocity_1ps * error + i - a) / one.lag_s + n
+    slope[1] = a - axis.drag_1ps * v + w
+    slope[2] = (u + axis.velocity_1ps * error + i - a) / axis.lag_s + n
     slope[3] = s
     slope[4] = u - slope[1]
-    slope[5] = one.integral_1ps2 * error + n
+    slope[5] = axis.integral_1ps2 * error + n
     return slope

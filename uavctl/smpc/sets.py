@@ -1,4 +1,9 @@
-"""Admissible sets, equilibria, scaling of units."""
+"""Admissible sets (2a), (2b), equilibria, and scaling of units.
+
+1. Units do not matter: ranks are decided, and programs solved, in numbers of similar size.
+2. Equilibria are the states with (I - A) x_s = B u_s. They have coordinates y: the values of chosen states.
+3. A `Polytope` is an admissible set C x <= b.
+"""
 
 from __future__ import annotations
 
@@ -9,78 +14,78 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-# Units do not matter: ranks are decided, and programs solved, in numbers of similar size.
-
-
-Array = NDArray[np.float64]
+from uavctl.arrays import Array
 
 # Singular values below this share of the largest, in equilibrated units, count as 0.
 RANK_TOLERANCE = 1e-10
 
-_SWEEPS = 20
-_USUAL = 10.0
-_NO_NOISE = 1e-7
+_SWEEPS = 20  # sweeps over rows and columns that bring both close to 1
+_USUAL_SIZES = 10.0  # natural sizes up to which a solver is accurate by itself
+_ROUNDING_DEVIATION = 1e-7  # deviations below this share of the natural size are rounding
 
 
-def equilibrated(matrix: Array) -> tuple[Array, Array]:
-    """Factors of rows (m,) and columns (n,) that bring the largest entry of each to 1; 1 for empty ones."""
+def equilibrate(matrix: Array) -> tuple[Array, Array]:
+    """Return factors of rows (m,) and columns (n,) that bring the largest entry of each to 1; 1 for empty ones."""
     rows, columns = np.ones(matrix.shape[0]), np.ones(matrix.shape[1])
     for _ in range(_SWEEPS):
         scaled = np.abs(matrix) * np.outer(rows, columns)
-        rows /= np.sqrt(_or_one(scaled.max(axis=1, initial=0.0)))
-        columns /= np.sqrt(_or_one(scaled.max(axis=0, initial=0.0)))
+        rows /= np.sqrt(_replace_zeros(scaled.max(axis=1, initial=0.0)))
+        columns /= np.sqrt(_replace_zeros(scaled.max(axis=0, initial=0.0)))
     return rows, columns
 
 
-def _or_one(sizes: Array) -> Array:
+def _replace_zeros(sizes: Array) -> Array:
     return np.where(sizes > 0.0, sizes, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
 class NaturalSizes:
-    """Natural sizes of one component's numbers, each in the number's own unit; all are positive."""
+    """Natural sizes of one component's numbers, each in its own unit; all are positive."""
 
-    state: Array  # what inputs of their size make of a state in N steps (n_x,)
+    state: Array  # size of a state after N steps of inputs of their size (n_x,)
     input: Array  # half of the room between an input's limits (n_u,); without limits its stationary deviation
-    state_std: Array  # stationary deviation of a state under the terminal law (n_x,), `state` where it is but rounding
+    state_std: Array  # stationary deviation of a state under the terminal law (n_x,), `state` where it is rounding
     input_std: Array  # the same of an input (n_u,)
     cost: float  # stage cost of a state and an input of their sizes
 
     @classmethod
-    def of(
+    def from_component(
         cls, a: Array, b: Array, q_x: Array, q_u: Array, c_u: Array, b_u: Array, sigma_x: Array, k: Array, free: int
     ) -> NaturalSizes:
-        """Sizes of a component, whose matrices have the names that they have there, for N = `free`."""
+        """Compute the sizes from the matrices of a component, for N = `free`."""
+        # std u = diag(K Σ_x K')^½
         input_std = np.sqrt(np.maximum(np.diagonal(k @ sigma_x @ k.T), 0.0))
         weight = np.diagonal(q_u)
-        unlimited = np.where(input_std > 0.0, input_std, 1.0 / np.sqrt(_or_one(weight)))
-        size_u = _room(c_u, b_u, unlimited)
+        unlimited = np.where(input_std > 0.0, input_std, 1.0 / np.sqrt(_replace_zeros(weight)))
+        size_u = _find_half_ranges(c_u, b_u, unlimited)
+        # size x² = Σ_{i<N} Σ_j (A^i B)²_j size u_j²
         reach, power = np.zeros(len(a)), b * size_u
         for _ in range(free):
             reach += np.sum(power**2, axis=1)
             power = a @ power
-        size_x = np.sqrt(_or_one(reach))
+        size_x = np.sqrt(_replace_zeros(reach))
         state_std = np.sqrt(np.maximum(np.diagonal(sigma_x), 0.0))
+        # cost = Σ Q_x,ii size x_i² + Σ Q_u,jj size u_j²
         cost = float(np.diagonal(q_x) @ size_x**2 + weight @ size_u**2)
         return cls(
             state=size_x,
             input=size_u,
-            state_std=np.where(state_std > _NO_NOISE * size_x, state_std, size_x),
-            input_std=np.where(input_std > _NO_NOISE * size_u, input_std, size_u),
+            state_std=np.where(state_std > _ROUNDING_DEVIATION * size_x, state_std, size_x),
+            input_std=np.where(input_std > _ROUNDING_DEVIATION * size_u, input_std, size_u),
             cost=cost if cost > 0.0 else 1.0,
         )
 
 
-def _room(c: Array, b: Array, otherwise: Array) -> Array:
-    """Size of each variable of {z | c z <= b}: half the way between two opposite rows, or to the only one."""
-    least = np.full(c.shape[1], np.inf)
+def _find_half_ranges(c: Array, b: Array, default: Array) -> Array:
+    """Return half the range of each variable in {z | c z <= b}: from opposite rows, or a single one."""
+    half_range = np.full(c.shape[1], np.inf)
     for row, side in zip(c, b, strict=True):
         opposite = np.flatnonzero(np.all(c == -row, axis=1))
         room = (side + float(b[opposite].min())) / 2.0 if opposite.size else abs(side)
         used = row != 0.0
         if room > 0.0:
-            least[used] = np.minimum(least[used], room / np.abs(row[used]))
-    return np.where(np.isfinite(least), least, otherwise)
+            half_range[used] = np.minimum(half_range[used], room / np.abs(row[used]))
+    return np.where(np.isfinite(half_range), half_range, default)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,21 +95,18 @@ class Scale:
     variables: Array
     cost: float
 
-    def beyond_usual(self, point: Array) -> Array:
-        """Return the part of a point (n,) too large for the solver to be as accurate by itself, in natural sizes."""
+    def excess_over_usual(self, point: Array) -> Array:
+        """Return the part of a point (n,) beyond `_USUAL_SIZES`, in natural sizes."""
         point = point / self.variables
-        return point - np.clip(point, -_USUAL, _USUAL)
-
-
-# States at which a plant can rest, (I - A) x_s = B u_s, and coordinates of them.
+        return point - np.clip(point, -_USUAL_SIZES, _USUAL_SIZES)
 
 
 Index = NDArray[np.intp]
 
-# A state whose value is determined by those already chosen, up to this share, tells nothing new of an equilibrium.
-_NEW = 1e-6
+# A state that the chosen ones determine up to this share is no further coordinate.
+_MIN_INDEPENDENT = 1e-6
 
-_ROUNDING = 1e-12
+_ROUNDING = 1e-12  # smaller shares are rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,15 +114,15 @@ class Equilibria:
     """x_s = x_eq y, u_s = u_eq y, for y the values of the states `held`."""
 
     held: Index  # indices of the states whose values are y (n_y,); positions as far as they can be chosen freely
-    # (n_y, n_x): y of any state: its values, or where several positions depend on one y, that of the equilibrium whose
-    # positions are nearest, weighted as in the stage cost
+    # (n_y, n_x): y of any state: its values. Where several positions depend on one y: y of the equilibrium with the
+    # nearest positions, weighted as in the stage cost
     coordinates: Array
     x_eq: Array  # (n_x, n_y)
-    u_eq: Array  # (n_u, n_y): where several inputs hold the same state, the one of least cost
+    u_eq: Array  # (n_u, n_y): of several inputs that hold a state, the cheapest
 
 
-def equilibria(a: Array, b: Array, q_x: Array, q_u: Array, positions: Index) -> Equilibria:
-    """The equilibria of a plant.
+def find_equilibria(a: Array, b: Array, q_x: Array, q_u: Array, positions: Index) -> Equilibria:
+    """Find the equilibria of a plant.
 
     Args:
         a: A (n_x, n_x).
@@ -130,48 +132,51 @@ def equilibria(a: Array, b: Array, q_x: Array, q_u: Array, positions: Index) -> 
         positions: Indices of the positions among the states.
     """
     n_x = len(a)
-    basis, unit_x = _resting(a, b)
-    held = _held(basis, positions)
+    basis, unit_x = _find_rest_basis(a, b)
+    held = _choose_held(basis, positions)
     x_eq = basis @ np.linalg.inv(basis[held])
     x_eq[np.abs(x_eq) < RANK_TOLERANCE] = 0.0  # rounding, in units of similar size
     x_eq *= np.outer(unit_x, 1.0 / unit_x[held])
     x_eq[held] = np.eye(len(held))
     coordinates = np.eye(n_x)[held]
     if len(held) < len(positions):
-        at, weight = x_eq[positions], q_x[np.ix_(positions, positions)]
-        normal = at.T @ weight @ at
+        x_positions, weight = x_eq[positions], q_x[np.ix_(positions, positions)]
+        # min_y |X_p y - p|²_Q:  y = (X_p' Q X_p)⁻¹ X_p' Q p
+        normal = x_positions.T @ weight @ x_positions
         if np.linalg.matrix_rank(normal) == len(held):
-            coordinates = np.linalg.solve(normal, at.T @ weight) @ np.eye(n_x)[positions]
+            coordinates = np.linalg.solve(normal, x_positions.T @ weight) @ np.eye(n_x)[positions]
+    # B u_eq = (I - A) x_eq
     pull = x_eq - a @ x_eq
     pull[np.abs(pull) < _ROUNDING * (np.abs(x_eq) + np.abs(a) @ np.abs(x_eq))] = 0.0
-    return Equilibria(held, coordinates, x_eq, holding(b, q_u, pull))
+    return Equilibria(held, coordinates, x_eq, find_holding_inputs(b, q_u, pull))
 
 
-def _resting(a: Array, b: Array) -> tuple[Array, Array]:
-    """Basis (n_x, n_y) of {x | (I - A) x in range B}, and the units (n_x,) that its rows are in."""
-    unit_x, unit_u = equilibrated(b)
+def _find_rest_basis(a: Array, b: Array) -> tuple[Array, Array]:
+    """Return a basis (n_x, n_y) of {x | (I - A) x in range B}, and the units (n_x,) of its rows."""
+    # L' B = 0:  the null space of L' (I - A)
+    unit_x, unit_u = equilibrate(b)
     left, singular, _ = np.linalg.svd(unit_x[:, None] * b * unit_u)
     rank = int(np.sum(singular > RANK_TOLERANCE * singular.max(initial=0.0)))
-    beside, identity = left[:, rank:].T, np.eye(len(a))
-    drift = beside @ (unit_x[:, None] * (identity - a))
-    terms = np.abs(beside) @ (unit_x[:, None] * (identity + np.abs(a)))
+    left_null, identity = left[:, rank:].T, np.eye(len(a))
+    drift = left_null @ (unit_x[:, None] * (identity - a))
+    terms = np.abs(left_null) @ (unit_x[:, None] * (identity + np.abs(a)))
     drift[np.abs(drift) < _ROUNDING * terms] = 0.0
-    rows, columns = equilibrated(drift)
+    rows, columns = equilibrate(drift)
     _, singular, right = np.linalg.svd(drift * np.outer(rows, columns))
-    kept = int(np.sum(singular > RANK_TOLERANCE * singular.max(initial=0.0)))
-    return right[kept:].T, columns
+    drift_rank = int(np.sum(singular > RANK_TOLERANCE * singular.max(initial=0.0)))
+    return right[drift_rank:].T, columns
 
 
-def _held(basis: Array, positions: Index) -> Index:
-    """States whose values determine a point of the basis' span: positions first, then the ones that tell most."""
+def _choose_held(basis: Array, positions: Index) -> Index:
+    """Choose states whose values determine a point of the span: positions first, then by pivots as in QR."""
     rest = basis.copy()
     chosen: list[int] = []
-    others = np.setdiff1d(np.arange(len(basis)), positions)
-    for candidates in (positions, others):
+    remaining = np.setdiff1d(np.arange(len(basis)), positions)
+    for candidates in (positions, remaining):
         while len(chosen) < basis.shape[1] and candidates.size:
             size = np.linalg.norm(rest[candidates], axis=1)
             best = int(np.argmax(size))
-            if size[best] <= _NEW:
+            if size[best] <= _MIN_INDEPENDENT:
                 break
             row = int(candidates[best])
             chosen.append(row)
@@ -180,14 +185,15 @@ def _held(basis: Array, positions: Index) -> Index:
     return np.array(sorted(chosen), dtype=np.intp)
 
 
-def rest_input(a: Array, b: Array, q_u: Array, x: Array) -> Array:
-    """The input (n_u,) that plans rest with in the equilibrium `x` (n_x,): of several the one of least cost."""
-    return holding(b, q_u, (x - a @ x)[:, None])[:, 0]
+def find_rest_input(a: Array, b: Array, q_u: Array, x: Array) -> Array:
+    """Return the input (n_u,) of a plan at rest in the equilibrium `x` (n_x,): of several the cheapest."""
+    return find_holding_inputs(b, q_u, (x - a @ x)[:, None])[:, 0]
 
 
-def holding(b: Array, q_u: Array, pull: Array) -> Array:
-    """Inputs (n_u, n_y) with B u = `pull` (n_x, n_y); of several the cheapest by Q_u, and of those the smallest."""
-    rows, columns = equilibrated(b)
+def find_holding_inputs(b: Array, q_u: Array, pull: Array) -> Array:
+    """Return inputs (n_u, n_y) with B u = `pull` (n_x, n_y); of several the cheapest by Q_u, then the smallest."""
+    # u = B⁺ pull;  u <- u - Z (Z' Q_u Z)⁺ Z' Q_u u  with B Z = 0
+    rows, columns = equilibrate(b)
     left, singular, right = np.linalg.svd(b * np.outer(rows, columns))
     rank = int(np.sum(singular > RANK_TOLERANCE * singular.max(initial=0.0)))
     particular = right[:rank].T @ ((left[:, :rank].T @ (rows[:, None] * pull)) / singular[:rank, None])
@@ -195,9 +201,6 @@ def holding(b: Array, q_u: Array, pull: Array) -> Array:
     null = columns[:, None] * right[rank:].T
     u -= null @ np.linalg.pinv(null.T @ q_u @ null) @ null.T @ q_u @ u
     return np.asarray(u)
-
-
-# Polytopic admissible sets (2a), (2b).
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,7 +212,7 @@ class Polytope:
 
     @classmethod
     def from_box(cls, lower: Sequence[float], upper: Sequence[float]) -> Self:
-        """Box with open sides where a limit is infinite; the rows of a two-sided limit are adjacent, + then -."""
+        """Make a box, open where a limit is infinite; the rows of a two-sided limit are adjacent, + then -."""
         rows: list[Array] = []
         limits: list[float] = []
         for i, (low, high) in enumerate(zip(lower, upper, strict=True)):
@@ -224,7 +227,7 @@ class Polytope:
 
     @property
     def bounds(self) -> tuple[Array, Array]:
-        """Limits of each variable (n,), (n,), by the rows of that variable alone; infinite where there is none."""
+        """Limits of each variable (n,), (n,), from the rows of that variable alone; infinite without such a row."""
         low, high = np.full(self.c.shape[1], -np.inf), np.full(self.c.shape[1], np.inf)
         for row, side in zip(self.c, self.b, strict=True):
             (used,) = np.nonzero(row)
@@ -238,6 +241,6 @@ class Polytope:
         return low, high
 
     def margin(self, x: Array) -> Array:
-        """b - C x (m,): negative where a limit is broken."""
+        """Return b - C x (m,): negative where a limit is broken."""
         margin: Array = self.b - self.c @ x
         return margin

@@ -95,9 +95,9 @@ def test_no_question_in_flight_has_the_covariance_of_the_last_one() -> None:
     asked: list[Preview] = []
 
     class Recorder(ConditionedSolver):
-        def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:
-            asked.append(outlook)
-            return super().solve(seq, x, target, outlook)
+        def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:
+            asked.append(preview)
+            return super().solve(seq, x, target, preview)
 
     given = problem("paper")
     in_flight = VariedPreviewSolver(Recorder(given, bernoulli(np.array([0.7])), 0.05))
@@ -115,7 +115,7 @@ def test_decisions_from_anywhere_within_the_limits_are_counted_as_they_are() -> 
     low, high = solver.problem.state_set.bounds
     assert all((low <= x).all() and (x <= high).all() for x, _, _ in asked)
     assert all((low <= target).all() and (target <= high).all() for _, target, _ in asked)
-    assert len({outlook.cov[0, 0] for _, _, outlook in asked if outlook.cov is not None}) == 30
+    assert len({preview.cov[0, 0] for _, _, preview in asked if preview.cov is not None}) == 30
     told: list[int] = []
     found = time_decisions(solver, 30, 4, told.append)
     answers = [solver.solve(i, *one) for i, one in enumerate(asked)]
@@ -236,7 +236,7 @@ class Stub:
         self.asked: list[float] = []
         self.collected: list[bool] = []
 
-    def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:
+    def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:
         self.asked.append(float(x[0]))
         self.collected.append(gc.isenabled())
         return Answer.failed(seq, SolveStatus.FAILED, FROZEN)
@@ -245,10 +245,10 @@ class Stub:
 class Breaks(Stub):
     """Breaks down once it is timed."""
 
-    def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:
+    def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:
         if not gc.isenabled():
             raise ArithmeticError
-        return super().solve(seq, x, target, outlook)
+        return super().solve(seq, x, target, preview)
 
 
 def test_a_loop_without_plans_is_given_up(design: Design) -> None:

@@ -23,9 +23,9 @@ from uavctl.lab.campaign.tasks import Cell, fly_task, make_tasks
 from uavctl.lab.campaign.world import PositionFilter, compute_known_steps, draw, draw_noise, select_newest_captures
 from uavctl.records import PositionSample
 from uavctl.smpc.baselines import Governor, MeanQp
-from uavctl.smpc.batch import Counts, News, predict, predicted_cov
-from uavctl.smpc.estimate import innovations
-from uavctl.smpc.nominal import unseen
+from uavctl.smpc.batch import Counts, Information, predict, predict_covariance
+from uavctl.smpc.estimate import innovation_form
+from uavctl.smpc.nominal import propagate_covariance
 
 S = 1_000_000_000
 RUNS, STEPS = 4, 25
@@ -111,9 +111,9 @@ def test_errors_are_as_large_as_the_covariance_says_and_the_covariance_of_a_pred
     pushes = chances.normal @ np.linalg.cholesky(plant.w).T
     for k in range(steps):
         mean, cov = looked.update(k, state[:, k, index] + noise[:, k], newest[:, k], inputs[:, :k])
-        news = News(k, newest[:, k], mean, inputs[:, :k], cov)
+        news = Information(k, newest[:, k], mean, inputs[:, :k], cov)
         state[:, k + 1] = state[:, k] @ plant.a.T + inputs[:, k] @ plant.b.T + pushes[:, k] @ plant.e.T
-        spread = predicted_cov(plant, news)
+        spread = predict_covariance(plant, news)
         assert spread is not None
         for said, error in (
             (cov, state[np.arange(runs), newest[:, k]] - mean),
@@ -126,7 +126,10 @@ def test_errors_are_as_large_as_the_covariance_says_and_the_covariance_of_a_pred
 
 def test_an_exact_state_s_prediction_has_no_covariance_of_its_own() -> None:
     plant = build_plant(load_config("paper"))
-    assert predicted_cov(plant, News(0, np.zeros(1, dtype=np.intp), np.zeros((1, 4)), np.zeros((1, 0, 2)))) is None
+    assert (
+        predict_covariance(plant, Information(0, np.zeros(1, dtype=np.intp), np.zeros((1, 4)), np.zeros((1, 0, 2))))
+        is None
+    )
 
 
 def test_noise_is_drawn_apart_from_everything_else_and_longer_runs_begin_alike() -> None:
@@ -138,7 +141,7 @@ def test_noise_is_drawn_apart_from_everything_else_and_longer_runs_begin_alike()
 def test_simple_margins_begin_with_what_the_filter_leaves_open() -> None:
     given = build_problem(load_config("paper", ["target.position_m=[0, 19.5, 0]"]))
     plant = given.plant
-    cov = innovations(plant, 0.3, 0.0, 0).estimate_cov
+    cov = innovation_form(plant, 0.3, 0.0, 0).estimate_cov
     # What the filter leaves is what it ends at where every position comes.
     looked = PositionFilter(
         make_filter_belief(load_config("paper", ["estimator.position_std_m=0.3"])), np.arange(80, dtype=np.intp)[None]
@@ -146,8 +149,10 @@ def test_simple_margins_begin_with_what_the_filter_leaves_open() -> None:
     for k in range(80):
         _, last = looked.update(k, np.zeros((1, 2)), np.array([k]), np.zeros((1, k, 2)))
     assert last[0] == pytest.approx(cov, abs=1e-9)
-    assert unseen(plant, 1, cov)[1] == pytest.approx(plant.a @ cov @ plant.a.T + unseen(plant, 1)[1])
-    toward = News(0, np.zeros(1, dtype=np.intp), np.array([[0.0, 0.0, 18.9, 0.3]]), np.zeros((1, 0, 2)))
+    assert propagate_covariance(plant, 1, cov)[1] == pytest.approx(
+        plant.a @ cov @ plant.a.T + propagate_covariance(plant, 1)[1]
+    )
+    toward = Information(0, np.zeros(1, dtype=np.intp), np.array([[0.0, 0.0, 18.9, 0.3]]), np.zeros((1, 0, 2)))
     for kind in (Governor, MeanQp):
         wary, bold = kind(given, 1.5, cov), kind(given, 1.5)
         for one in (wary, bold):

@@ -16,7 +16,7 @@ from uavctl.lab.campaign.controllers import build_from_recipe, draw_conditions
 from uavctl.lab.campaign.pool import Columns, Work, fly_tasks
 from uavctl.lab.campaign.tasks import Task, make_tasks
 from uavctl.lab.campaign.world import simulate
-from uavctl.smpc.batch import BatchSmpc, News
+from uavctl.smpc.batch import BatchSmpc, Information
 
 FIGURES = ("cost", "settled_cost", "mean_square_input", "largest_gap")
 # B of preset paper a million times stronger: whatever is asked for drives the state out of all numbers.
@@ -72,7 +72,7 @@ class Crashing:
 
     def begin(self, runs: int) -> None: ...
 
-    def act(self, news: News) -> np.ndarray:
+    def act(self, news: Information) -> np.ndarray:
         if news.step == 0 and (news.state[:, 0] > self._limit).any():
             raise ZeroDivisionError("out of range")
         return np.zeros((len(news.state), 2))

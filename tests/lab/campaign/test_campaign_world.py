@@ -11,7 +11,7 @@ from uavctl.build.controller import build_design, build_plant
 from uavctl.build.link import build_delayed_link
 from uavctl.config import Config, load_config
 from uavctl.lab.campaign.world import LinearWorld, compute_newest_captures, draw, simulate
-from uavctl.smpc.batch import BatchSmpc, Decisions, News, predict
+from uavctl.smpc.batch import BatchSmpc, Decisions, Information, predict
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope
 
@@ -116,7 +116,7 @@ class _Linear:
     def begin(self, runs: int) -> None:
         self.runs = runs
 
-    def act(self, news: News) -> Array:
+    def act(self, news: Information) -> Array:
         asked = predict(self._plant, news) @ self._gain.T
         if news.step == 3 and self._bad >= 0:
             asked[self._bad] = np.nan
@@ -205,7 +205,7 @@ def test_plans_play_out_fail_and_run_out() -> None:
     known = [0, 1, 1, 1, *[4] * 14]
     state, asked = np.array([[1.0, 2.0, 3.0, -4.0]]), []
     for k, last in enumerate(known):
-        asked.append(pilot.act(News(k, np.array([last]), state, np.zeros((1, k, 2))))[0])
+        asked.append(pilot.act(Information(k, np.array([last]), state, np.zeros((1, k, 2))))[0])
     # From step 4 on its position is newer than the plan's, so each step asks again until there is a plan.
     assert [u[0] for u in asked[:6]] == [100.0, 200.0, 201.0, 202.0, 203.0, 400.0]
     made = 5

@@ -49,7 +49,7 @@ from uavctl.lab.identify.response import (
     make_parameters,
 )
 from uavctl.lab.identify.result import fit_link, identify
-from uavctl.smpc.plant import HeldAxis, Plant, drag_lag, velocity_reference
+from uavctl.smpc.plant import Plant, VelocityReferenceAxis, drag_lag, velocity_reference
 
 DRAG_LAG, HELD = DragLagAxis(drifts=False), ReferenceAxis(1.0, 2.0, 1.0)
 TICK_S, NOISE_M, WIND_MPS2, DT_S = 0.05, 0.003, 0.15, 0.2
@@ -115,7 +115,7 @@ def test_the_likeliest_dead_time_is_the_one_that_made_the_data(seed: int) -> Non
 def flown_by_reference(seed: int) -> Stretch:
     """The plant velocity-reference under random setpoints, two ticks late."""
     rng = np.random.default_rng(seed)
-    held = HeldAxis(0.25, 0.1, 1.0, 2.0, 1.0, 0.03, 0.1, 0.05)
+    held = VelocityReferenceAxis(0.25, 0.1, 1.0, 2.0, 1.0, 0.03, 0.1, 0.05)
     plant = velocity_reference([held], TICK_S, ("north",))
     asked = np.repeat(np.diff(rng.uniform(-0.6, 0.6, 77)) / (16 * TICK_S), 16)  # the reference stays below 0.6 m/s
     acting = np.concatenate([np.zeros(2), asked])
@@ -203,12 +203,12 @@ def test_the_motion_is_that_of_the_plant(lag_s: float, drag_1ps: float) -> None:
         DRAG_LAG.motion(make_parameters(DRAG_LAG, given)[None]),
         drag_lag([drag_1ps], [lag_s], [0.9], [1.0], 0.13, ("north",)),
     )
-    held = HeldAxis(drag_1ps, lag_s, 1.0, 2.0, 1.0, 0.7, 0.2, 0.3)
+    held = VelocityReferenceAxis(drag_1ps, lag_s, 1.0, 2.0, 1.0, 0.7, 0.2, 0.3)
     motion = HELD.motion(make_parameters(HELD, given)[None])
     advanced(motion, velocity_reference([held], 0.13, ("north",)))
     # White noise as the limit of noise that is held over ever shorter parts.
     fine_s = 0.13 / 4000
-    white = HeldAxis(drag_1ps, lag_s, 1.0, 2.0, 1.0, 0.7 / np.sqrt(fine_s), 0.2 / np.sqrt(fine_s), 0.3)
+    white = VelocityReferenceAxis(drag_1ps, lag_s, 1.0, 2.0, 1.0, 0.7 / np.sqrt(fine_s), 0.2 / np.sqrt(fine_s), 0.3)
     part = velocity_reference([white], fine_s, ("north",))
     cov = np.zeros((6, 6))
     for _ in range(4000):

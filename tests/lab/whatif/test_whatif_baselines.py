@@ -14,7 +14,7 @@ from uavctl.lab.campaign.controllers import BaselineSolver, build_from_recipe, m
 from uavctl.lab.campaign.spec import CampaignSpec, ControllerSpec
 from uavctl.lab.whatif.flight import make_response, refly
 from uavctl.records import Plan, Truth
-from uavctl.smpc.batch import News
+from uavctl.smpc.batch import Information
 
 
 @pytest.mark.slow
@@ -42,7 +42,7 @@ def test_a_baseline_s_plan_is_what_it_does_in_silence(kind: str) -> None:
                 problem.plant.a @ answer.states[0] + problem.plant.b @ np.clip(answer.inputs[0], low, high),
             )
             plan = answer.inputs
-        asked = alone.act(News(step, np.array([newest]), states[newest][np.newaxis], acted))
+        asked = alone.act(Information(step, np.array([newest]), states[newest][np.newaxis], acted))
         np.testing.assert_allclose(plan[step - newest], asked[0], atol=1e-9)
         acted = np.concatenate([acted, np.clip(asked, low, high)[:, np.newaxis]], axis=1)
 

@@ -7,11 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from baseline_rig import MAKERS, arrivals, cube, flown, noise, problem
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.smpc.nominal import ControlProblem
 
-Array = NDArray[np.float64]
 RUNS, STEPS, LOSS = 12, 30, 0.4
 GENERAL = ("coupled 1", "second input 0", "free chain 0", "lagged 0", "redundant inputs 1", "calm axis, no column")
 

@@ -6,13 +6,11 @@ import cvxpy as cp
 import numpy as np
 import pytest
 from baseline_rig import PAPER_START, arrivals, flown, noise, problem, unlimited
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.smpc.baselines import Governor, Lqg, MeanQp, PacketisedPredictive
-from uavctl.smpc.batch import News, predict
+from uavctl.smpc.batch import Information, predict
 from uavctl.smpc.nominal import ControlProblem, lqr
-
-Array = NDArray[np.float64]
 
 
 def sigma(given: ControlProblem, steps: int) -> Array:
@@ -33,8 +31,8 @@ def test_the_governor_keeps_the_next_mean_its_margin_and_is_as_near_to_the_regul
     for age in (0, 0, 1, 3, 0, 2, 0, 1):
         states = rng.uniform(0.95 * low, 0.95 * high, (20, plant.n_x))
         inputs = 0.1 * rng.normal(size=(20, 5, plant.n_u))
-        news = News(5, np.full(20, 5 - age), states, inputs)
-        asked, x = controller.act(news), predict(plant, news)
+        information = Information(5, np.full(20, 5 - age), states, inputs)
+        asked, x = controller.act(information), predict(plant, information)
         wanted = given.u_target + (x - given.target) @ lqr(plant, given.q_x, given.q_u).k.T
         for i in range(0, 20, 4):
             u, slack = cp.Variable(plant.n_u), cp.Variable(given.state_set.b.size, nonneg=True)
@@ -67,10 +65,10 @@ def test_without_limits_the_governor_is_the_regulator() -> None:
 def test_the_plans_of_the_mean_qp_keep_a_margin_that_grows_with_the_age() -> None:
     given, margin = problem("paper"), 2.0
     controller, plain = MeanQp(given, margin), PacketisedPredictive(given)
-    news = News(0, np.zeros(1, dtype=np.intp), PAPER_START[None], np.zeros((1, 0, 2)))
+    information = Information(0, np.zeros(1, dtype=np.intp), PAPER_START[None], np.zeros((1, 0, 2)))
     for one in (controller, plain):
         one.begin(1)
-        one.act(news)
+        one.act(information)
 
     def left(one: PacketisedPredictive) -> Array:
         """What a plan leaves of the room of each row, in standard deviations (H, m)."""

@@ -11,13 +11,11 @@ import cvxpy as cp
 import numpy as np
 import pytest
 from baseline_rig import PAPER_START, arrivals, cube, flown, noise, problem, unlimited
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.smpc.baselines import HoldLast, Lqg, PacketisedPredictive, ZeroOnLoss
 from uavctl.smpc.nominal import BatchMpc, ControlProblem, lqr
 from uavctl.smpc.sets import Polytope
-
-Array = NDArray[np.float64]
 
 GENERAL = ("coupled 1", "second input 0", "free chain 0", "lagged 0", "redundant inputs 1")
 
@@ -99,7 +97,7 @@ def test_the_plan_is_cvxpy_s_optimum(name: str) -> None:
     backoff_u = np.outer(np.linspace(0.0, 0.2, given.horizon), np.abs(given.input_set.b))
     way = reach(given) * rng.uniform(-1.0, 1.0, (9, given.plant.n_x))
     states = given.target + np.logspace(-2, 0.4, 9)[:, None] * way
-    plans = BatchMpc(given, backoff_x, backoff_u).plans(states)
+    plans = BatchMpc(given, backoff_x, backoff_u).compute_plans(states)
     printed, steered, slack = Printed(given, backoff_x, backoff_u), 0, 0.0
     k = lqr(given.plant, given.q_x, given.q_u).k
     for x, plan in zip(states, plans, strict=True):
@@ -117,7 +115,7 @@ def test_where_no_row_is_met_the_plan_is_the_regulator_s(name: str) -> None:
     given = unlimited(problem(name))
     k = lqr(given.plant, given.q_x, given.q_u).k
     states = given.target + np.random.default_rng(5).normal(size=(6, given.plant.n_x))
-    for x, plan in zip(states, BatchMpc(given).plans(states), strict=True):
+    for x, plan in zip(states, BatchMpc(given).compute_plans(states), strict=True):
         now = x
         for u in plan:
             assert u == pytest.approx(given.u_target + k @ (now - given.target), rel=1e-8, abs=1e-8)
@@ -143,7 +141,7 @@ def test_the_program_takes_over_where_the_regulator_just_meets_a_row() -> None:
     given = problem("paper")
     k = lqr(given.plant, given.q_x, given.q_u).k
     edge = np.array([7.5 / abs(k[0, 0]), 0.0, 0.0, 0.0])
-    inside, outside = BatchMpc(given).plans(np.array([edge * (1 - 1e-9), edge * (1 + 1e-9)]))
+    inside, outside = BatchMpc(given).compute_plans(np.array([edge * (1 - 1e-9), edge * (1 + 1e-9)]))
     assert inside[0, 0] == pytest.approx(-7.5, abs=1e-6)
     assert outside == pytest.approx(inside, abs=1e-6)
 
@@ -151,7 +149,7 @@ def test_the_program_takes_over_where_the_regulator_just_meets_a_row() -> None:
 def test_far_outside_everything_there_is_still_a_plan_within_the_input_limits() -> None:
     given = problem("paper")
     far = np.array([[s * 10.0**e, 50.0 * s, -s * 10.0**e, 80.0] for s in (-1.0, 1.0) for e in range(2, 6)])
-    plans = BatchMpc(given).plans(far)
+    plans = BatchMpc(given).compute_plans(far)
     assert np.isfinite(plans).all()
     assert np.abs(plans).max() <= 7.5
     assert plans[:, 0, 0] == pytest.approx(-7.5 * np.sign(far[:, 0]))
@@ -160,9 +158,9 @@ def test_far_outside_everything_there_is_still_a_plan_within_the_input_limits() 
 def test_a_state_that_is_no_number_spoils_its_own_run_only() -> None:
     given = problem("paper")
     states = np.array([PAPER_START, [np.nan, 0.0, 0.0, 0.0], PAPER_START, [np.inf, 1.0, 1.0, 1.0]])
-    plans = BatchMpc(given).plans(states)
+    plans = BatchMpc(given).compute_plans(states)
     assert np.isnan(plans[[1, 3]]).any(axis=(1, 2)).all()
-    assert plans[[0, 2]] == pytest.approx(np.repeat(BatchMpc(given).plans(states[:1]), 2, axis=0), abs=1e-9)
+    assert plans[[0, 2]] == pytest.approx(np.repeat(BatchMpc(given).compute_plans(states[:1]), 2, axis=0), abs=1e-9)
 
 
 def test_an_axis_without_limits_beside_one_with_limits() -> None:
@@ -170,5 +168,5 @@ def test_an_axis_without_limits_beside_one_with_limits() -> None:
     one_sided = replace(given, state_set=cube(4, 1e9))
     alone, both = BatchMpc(one_sided), BatchMpc(given)
     x = np.array([[-28.0, 6.5, 0.5, 0.2]])  # at full input the first axis would pass its 7 m/s
-    assert both.plans(x)[:, :, 1] == pytest.approx(alone.plans(x)[:, :, 1], abs=1e-12)
-    assert np.abs(both.plans(x)[:, :, 0] - alone.plans(x)[:, :, 0]).max() > 1e-3
+    assert both.compute_plans(x)[:, :, 1] == pytest.approx(alone.compute_plans(x)[:, :, 1], abs=1e-12)
+    assert np.abs(both.compute_plans(x)[:, :, 0] - alone.compute_plans(x)[:, :, 0]).max() > 1e-3

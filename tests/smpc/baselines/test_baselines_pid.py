@@ -9,11 +9,11 @@ import pytest
 from baseline_rig import PAPER_START, Fed, arrivals, cube, flown, gains, noise, problem
 from numpy.typing import NDArray
 
-from uavctl.smpc.baselines import CascadedPid, PidGains, _costs, tune
-from uavctl.smpc.batch import News
+from uavctl.arrays import Array
+from uavctl.smpc.baselines import CascadedPid, PidGains, _evaluate, tune
+from uavctl.smpc.batch import Information
 from uavctl.smpc.nominal import ControlProblem
 
-Array = NDArray[np.float64]
 Scene = tuple[ControlProblem, NDArray[np.intp], Array]
 ACCEL = 0.49429632181478  # [m/s²] per unit of input
 
@@ -28,7 +28,7 @@ def heard(controller: CascadedPid, states: list[list[float]]) -> Array:
     controller.begin(1)
     inputs = np.zeros((1, len(states), 2))
     return np.array(
-        [controller.act(News(k, np.array([k]), np.array([x]), inputs[:, :k]))[0] for k, x in enumerate(states)]
+        [controller.act(Information(k, np.array([k]), np.array([x]), inputs[:, :k]))[0] for k, x in enumerate(states)]
     )
 
 
@@ -59,8 +59,8 @@ def test_the_derivative_spans_a_gap() -> None:
     pid = CascadedPid(problem("paper"), only(derivative=0.5))
     pid.begin(1)
     inputs = np.zeros((1, 4, 2))
-    pid.act(News(0, np.array([0]), np.zeros((1, 4)), inputs[:, :0]))
-    asked = pid.act(News(3, np.array([3]), np.array([[0.0, 0.6, 0.0, 0.0]]), inputs[:, :3]))
+    pid.act(Information(0, np.array([0]), np.zeros((1, 4)), inputs[:, :0]))
+    asked = pid.act(Information(3, np.array([3]), np.array([[0.0, 0.6, 0.0, 0.0]]), inputs[:, :3]))
     assert asked[0] * ACCEL == pytest.approx([-0.1, 0.0], abs=1e-9)
 
 
@@ -146,7 +146,7 @@ def test_the_tuner_s_cost_is_the_world_s(scene: Scene) -> None:
     slack = given.slack_linear * beyond + given.slack_quadratic * beyond**2
     wanted = (result.cost.sum() + slack.sum()) / len(newest)
     some = np.array([values(gains(2)), 2.0 * values(gains(2))])
-    assert _costs(given, some, PAPER_START, newest, disturbances)[0] == pytest.approx(wanted, rel=1e-9)
+    assert _evaluate(given, some, PAPER_START, newest, disturbances)[0] == pytest.approx(wanted, rel=1e-9)
 
 
 @pytest.mark.slow
@@ -156,13 +156,13 @@ def test_tuned_gains_beat_all_of_300_random_ones_and_are_the_same_each_time(scen
     assert values(tune(given, PAPER_START, newest, disturbances)).tobytes() == values(tuned).tobytes()
     rng = np.random.default_rng(5)
     drawn = np.exp(rng.uniform(np.log([0.05, 0.05, 1e-4, 1e-4, 0.3]), np.log([1.5, 1.5, 0.3, 0.3, 2.0]), (300, 5)))
-    others = _costs(given, np.repeat(drawn[:, :, None], 2, axis=2), PAPER_START, newest, disturbances)
-    ours = _costs(given, values(tuned)[None], PAPER_START, newest, disturbances)[0]
+    others = _evaluate(given, np.repeat(drawn[:, :, None], 2, axis=2), PAPER_START, newest, disturbances)
+    ours = _evaluate(given, values(tuned)[None], PAPER_START, newest, disturbances)[0]
     assert ours < others.min()
 
 
 def test_gains_that_fly_away_cost_without_end(scene: Scene) -> None:
     given, newest, disturbances = scene
     unstable = replace(given, plant=replace(given.plant, a=given.plant.a * 1e30), input_set=cube(2, np.inf))
-    cost = _costs(unstable, values(gains(2))[None], PAPER_START, newest, disturbances)
+    cost = _evaluate(unstable, values(gains(2))[None], PAPER_START, newest, disturbances)
     assert cost == np.inf

@@ -24,7 +24,7 @@ def test_silence(maker: type[PacketisedPredictive | HoldLast | ZeroOnLoss]) -> N
     made, plan = 0, np.zeros((given.horizon, 2))
     for k, newest in enumerate(NEWEST):
         if k in FRESH:  # without noise, the prediction from any old position is the state itself
-            made, plan = k, mpc.plans(fed.states[k][None])[0]
+            made, plan = k, mpc.compute_plans(fed.states[k][None])[0]
         asked = fed.step(newest)
         if k == made:
             wanted = plan[0]
@@ -63,7 +63,7 @@ def test_news_from_the_past_is_predicted_with_the_inputs_that_acted() -> None:
     x = fed.states[1]
     for u in fed.inputs[0, 1:]:
         x = given.plant.a @ x + given.plant.b @ u
-    assert fed.step(1) == pytest.approx(mpc.plans(x[None])[0, 0], abs=1e-9)
+    assert fed.step(1) == pytest.approx(mpc.compute_plans(x[None])[0, 0], abs=1e-9)
 
 
 def test_a_margin_keeps_the_plan_that_far_from_the_state_limits() -> None:
@@ -74,6 +74,6 @@ def test_a_margin_keeps_the_plan_that_far_from_the_state_limits() -> None:
     drawn_in = given.state_set.b - 3.0 * np.abs(given.state_set.c) @ sigma
     narrower = replace(given, state_set=Polytope(given.state_set.c, drawn_in))
     fed = Fed(given, PacketisedPredictive(given, 3.0), PAPER_START)
-    plan = BatchMpc(narrower).plans(PAPER_START[None])[0]
+    plan = BatchMpc(narrower).compute_plans(PAPER_START[None])[0]
     assert np.array([fed.step(0) for _ in range(6)]) == pytest.approx(plan[:6], abs=1e-9)
-    assert np.abs(plan - BatchMpc(given).plans(PAPER_START[None])[0]).max() > 0.1
+    assert np.abs(plan - BatchMpc(given).compute_plans(PAPER_START[None])[0]).max() > 0.1

@@ -9,12 +9,12 @@ import pytest
 from baseline_rig import PAPER_START, Fed, arrivals, cube, flown, noise, problem, unlimited
 from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.errors import DesignError
 from uavctl.smpc.baselines import Lqg, WorstCaseDelay, _backoffs, _prediction_gain
-from uavctl.smpc.batch import News
+from uavctl.smpc.batch import Information
 from uavctl.smpc.nominal import ControlProblem, lqr
 
-Array = NDArray[np.float64]
 DELAY = 4
 
 
@@ -24,7 +24,7 @@ def asked_in(given: ControlProblem, states: Array, newest: NDArray[np.intp], inp
     controller.begin(1)
     return np.array(
         [
-            controller.act(News(k, newest[k : k + 1], states[newest[k]][None].copy(), inputs[None, :k]))[0]
+            controller.act(Information(k, newest[k : k + 1], states[newest[k]][None].copy(), inputs[None, :k]))[0]
             for k in range(len(newest))
         ]
     )

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from baseline_rig import PAPER_START, arrivals, flown, noise, problem, unlimited
 from conditioned_slow import first_side, met, plan_slowly
-from numpy.typing import NDArray
 from scipy.stats import binomtest, norm
 
+from uavctl.arrays import Array
 from uavctl.errors import DesignError
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import NOMINAL, Answer, Path, Preview
@@ -23,7 +23,6 @@ from uavctl.smpc.conditioned.planner import METHOD, MOST_SHIFTING, ConditionedDe
 from uavctl.smpc.link import bernoulli, gilbert_elliott
 from uavctl.smpc.nominal import ControlProblem, lqr
 
-Array = NDArray[np.float64]
 LOSS, ALLOWED = 0.3, 0.05
 LINK = bernoulli(np.array([1.0 - LOSS]))
 # How far a setpoint may go in a second: about a quarter of what it may be, in a step.
@@ -32,13 +31,13 @@ KINDS = ["plain", "covariance", "fence", "path", "sent"]
 
 
 def in_cvxpy(
-    given: ControlProblem, x: Array, answer: Answer, outlook: Preview, slew_mps3: float = np.inf
+    given: ControlProblem, x: Array, answer: Answer, preview: Preview, slew_mps3: float = np.inf
 ) -> tuple[float, Array]:
     """Least cost and inputs (H, n_u) with the back-offs, the reference and the limits of an answer."""
     plant, steps, reference = given.plant, given.horizon, answer.reference
     hold = np.linalg.lstsq(plant.b, reference - plant.a @ reference)[0]
-    limits = np.tile(given.state_set.b, (steps + 1, 1)) if outlook.limits is None else outlook.limits
-    path = outlook.path or Path(np.zeros((steps, plant.n_x)), np.zeros((steps, plant.n_u)))
+    limits = np.tile(given.state_set.b, (steps + 1, 1)) if preview.limits is None else preview.limits
+    path = preview.path or Path(np.zeros((steps, plant.n_x)), np.zeros((steps, plant.n_u)))
     states, inputs = cp.Variable((steps + 1, plant.n_x)), cp.Variable((steps, plant.n_u))
     slack = cp.Variable((steps, given.state_set.b.size), nonneg=True)
     rules = [states[0] == x]
@@ -51,8 +50,8 @@ def in_cvxpy(
     d, side = plant.accel_map, slew_mps3 * plant.dt_s
     if np.isfinite(side):
         rules += [cp.abs(d @ (inputs[t] - inputs[t - 1])) <= side for t in range(1, steps)]
-        if outlook.sent is not None:
-            rules.append(cp.abs(d @ (inputs[0] - outlook.sent)) <= first_side(given, side, outlook.sent))
+        if preview.sent is not None:
+            rules.append(cp.abs(d @ (inputs[0] - preview.sent)) <= first_side(given, side, preview.sent))
     dx, du = states[:-1] - reference - path.states, inputs - hold - path.inputs
     root_x, root_u = np.linalg.cholesky(given.q_x).T, np.linalg.cholesky(given.q_u).T
     tail = np.linalg.cholesky(lqr(plant, given.q_x, given.q_u).p).T
@@ -78,11 +77,11 @@ def somewhere(given: ControlProblem, rng: np.random.Generator) -> tuple[Array, A
     return x, given.plant.equilibrium((at.get("north", 0.0), at.get("east", 0.0), at.get("down", 0.0)))
 
 
-def outlook_of(kind: str, given: ControlProblem, rng: np.random.Generator) -> Preview:
+def draw_preview(kind: str, given: ControlProblem, rng: np.random.Generator) -> Preview:
     steps, n_x, n_u = given.horizon, given.plant.n_x, given.plant.n_u
     if kind == "covariance":
         root = rng.normal(size=(n_x, n_x)) * 0.1
-        return Preview(cov=root @ root.T, late=2)
+        return Preview(cov=root @ root.T, age=2)
     if kind == "fence":
         return Preview(limits=given.state_set.b * rng.uniform(0.8, 1.0, (steps + 1, given.state_set.b.size)))
     if kind == "path":
@@ -103,14 +102,14 @@ def test_the_answer_is_the_optimum_of_the_same_problem(name: str, kind: str, sle
     compared = 0
     for seq in range(6):
         x, target = somewhere(given, rng)
-        outlook = outlook_of(kind, given, rng)
-        answer = solver.solve(seq, x, target, outlook)
+        preview = draw_preview(kind, given, rng)
+        answer = solver.solve(seq, x, target, preview)
         assert (answer.seq, answer.status, answer.method) == (seq, SolveStatus.OPTIMAL, METHOD)
-        sides = (given.state_set.b if outlook.limits is None else outlook.limits) - answer.backoff_x
+        sides = (given.state_set.b if preview.limits is None else preview.limits) - answer.backoff_x
         if (met(given, sides) != sides).any():
             continue  # where two back-offs meet the mean keeps to their middle, and the slack may be elsewhere here
         compared += 1
-        cost, inputs = in_cvxpy(given, x, answer, outlook, slew_mps3)
+        cost, inputs = in_cvxpy(given, x, answer, preview, slew_mps3)
         assert answer.cost == pytest.approx(cost, rel=1e-7)
         # The cost rises at least as the square of what z is off by, and theirs is known to about 1e-11 of it.
         assert answer.inputs == pytest.approx(inputs, abs=2e-4 + np.sqrt(1e-11 * cost))
@@ -139,13 +138,13 @@ def test_no_short_cut_changes_the_answer(
     compared = 0
     for seq in range(12):
         x, target = where(given, rng)
-        outlook = outlook_of(kind, given, rng)
-        answer = solver.solve(seq, x, target, outlook)
+        preview = draw_preview(kind, given, rng)
+        answer = solver.solve(seq, x, target, preview)
         if answer.iterations > MOST_SHIFTING:
             continue  # it has ended its rounds early
         compared += 1
         slow = plan_slowly(
-            given, solver.risk_towards(target, outlook).shares, x, answer.reference, outlook, SLEW_MPS3[name]
+            given, solver.risk_towards(target, preview).shares, x, answer.reference, preview, SLEW_MPS3[name]
         )
         assert answer.inputs == pytest.approx(slow.inputs, abs=1e-6)
         assert answer.slack == pytest.approx(slow.slack, abs=1e-6)
@@ -175,9 +174,9 @@ def test_a_plan_without_slack_spends_no_more_than_the_budget_of_each_age(name: s
         if answer.slack == 0.0:
             kept += 1
             assert (spent(given, answer, cov) <= solver.risk_towards(target).shares + 1e-9).all()
-            assert not answer.gave_way
+            assert not answer.relaxed
         else:
-            assert sum(way.amount for way in answer.gave_way) == pytest.approx(answer.slack, abs=1e-3)
+            assert sum(way.amount for way in answer.relaxed) == pytest.approx(answer.slack, abs=1e-3)
     assert kept > 15
 
 
@@ -256,13 +255,13 @@ def test_which_spread_a_plan_has_goes_by_the_place_alone(name: str) -> None:
         target = given.target + share * margin[row] * given.state_set.c[row] / np.vdot(*[given.state_set.c[row]] * 2)
         chosen = solver.risk_towards(target)
         for kind in ("covariance", "sent"):  # the first is late, too
-            assert solver.risk_towards(target, outlook_of(kind, given, rng)) is chosen
+            assert solver.risk_towards(target, draw_preview(kind, given, rng)) is chosen
         told.append(chosen is solver.risk_in_transit)
         assert told[-1] or chosen is solver.risk
     assert told[0]
     assert not told[-1]
     assert (np.diff(np.array(told, dtype=int)) <= 0).all()
-    assert solver.risk_towards(given.target, outlook_of("path", given, rng)) is solver.risk
+    assert solver.risk_towards(given.target, draw_preview("path", given, rng)) is solver.risk
     narrow = np.tile(given.state_set.b - margin, (given.horizon + 1, 1))  # a fence that has come to the target
     assert solver.risk_towards(given.target, replace(NOMINAL, limits=narrow)) is solver.risk
 
@@ -316,14 +315,14 @@ def test_the_reference_is_as_near_to_a_wall_as_it_may_rest() -> None:
 def test_numbers_that_are_none_get_no_plan() -> None:
     given = problem("paper")
     solver = ConditionedSolver(given, LINK, ALLOWED)
-    for x, outlook in ((PAPER_START * np.nan, NOMINAL), (PAPER_START, Preview(cov=np.full((4, 4), np.nan)))):
-        answer = solver.solve(4, x, given.target, outlook)
+    for x, preview in ((PAPER_START * np.nan, NOMINAL), (PAPER_START, Preview(cov=np.full((4, 4), np.nan)))):
+        answer = solver.solve(4, x, given.target, preview)
         assert (answer.seq, answer.status) == (4, SolveStatus.FAILED)
 
 
 def test_the_same_question_gives_the_same_bits_whatever_was_asked_before() -> None:
     given, rng = problem("room-hahn-stursberg"), np.random.default_rng(3)
-    questions = [(*somewhere(given, rng), outlook_of("sent", given, rng)) for _ in range(8)]
+    questions = [(*somewhere(given, rng), draw_preview("sent", given, rng)) for _ in range(8)]
     first, second = (ConditionedSolver(given, LINK, ALLOWED, slew_mps3=2.5) for _ in range(2))
     forth = [first.solve(0, *question).inputs for question in questions]
     back = [second.solve(0, *question).inputs for question in reversed(questions)]

@@ -23,7 +23,7 @@ def asked(name: str) -> list[Answer]:
 @pytest.mark.parametrize("name", ["room-px4", "room-ardupilot"])
 def test_a_guess_saves_iterations_and_changes_no_plan(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     guessed = asked(name)
-    monkeypatch.setattr(FirstRows, "suits", lambda *_: False)
+    monkeypatch.setattr(FirstRows, "is_suitable", lambda *_: False)
     without = asked(name)
     compared = 0
     for one, other in zip(guessed, without, strict=True):
@@ -51,13 +51,13 @@ def test_where_the_fastest_brake_leaves_a_row_it_gives_way() -> None:
     first = FirstRows(of_x, of_u, np.zeros(3 * steps, dtype=np.int32))
     upper, lower = np.full(3 * steps, 10.0), np.full(3 * steps, -10.0)
     upper[7::2], lower[7::2] = 1.0, -1.0
-    assert first.of(upper, lower) is None
+    assert first.guess(upper, lower) is None
     # The brake makes -0.5 and -1.75 of it; then it is two steps behind, of which the next makes up one.
     upper[:2] = -3.0
-    begin = first.of(upper, lower)
+    begin = first.guess(upper, lower)
     assert begin is not None
     assert begin.tolist() == [1, 1, 0, 0, 0, 0] + [0, 3, 0, 3, 0, 1] + [0] * 6
-    begin = first.of(-lower, -upper)
+    begin = first.guess(-lower, -upper)
     assert begin is not None
     assert begin.tolist() == [3, 3, 0, 0, 0, 0] + [0, 1, 0, 1, 0, 3] + [0] * 6
 
@@ -69,6 +69,6 @@ def test_a_setpoint_far_from_the_regulators_goes_there_as_fast_as_it_may() -> No
     upper, lower = np.full(3 * steps, 10.0), np.full(3 * steps, -10.0)
     upper[7::2], lower[7::2] = 1.0, -1.0
     upper[7] = -2.0  # what was sent last is two steps behind
-    begin = first.of(upper, lower)
+    begin = first.guess(upper, lower)
     assert begin is not None
     assert begin.tolist() == [0] * 6 + [0, 1, 0, 1] + [0] * 8

@@ -9,18 +9,17 @@ import campaign_rig as rig
 import numpy as np
 import pytest
 from baseline_rig import problem
-from numpy.typing import NDArray
 from scipy.stats import norm
 
+from uavctl.arrays import Array
 from uavctl.lab.campaign.tasks import Cell, make_tasks
 from uavctl.smpc.conditioned.backoffs import SLACK, age_risk, quantile, rest_backoffs
 from uavctl.smpc.conditioned.planner import ConditionedSolver
 from uavctl.smpc.conditioned.program import SlewRows
-from uavctl.smpc.estimate import innovations
+from uavctl.smpc.estimate import innovation_form
 from uavctl.smpc.link import AgeModel, bernoulli, gilbert_elliott
-from uavctl.smpc.nominal import unseen
+from uavctl.smpc.nominal import propagate_covariance
 
-Array = NDArray[np.float64]
 ALLOWED = 0.05
 EAST = np.array([[0.0, 0.0, 1.0, 0.0]])  # its upper limit
 
@@ -31,7 +30,7 @@ def steps_for(loss: float) -> int:
 
 def distances(link: AgeModel, steps: int, cov: Array | None = None, slew_mps3: float = np.inf, most: int = 1) -> Array:
     given = replace(problem("paper"), horizon=steps)
-    deviations = np.sqrt([EAST[0] @ one @ EAST[0] for one in unseen(given.plant, steps)[1:]])
+    deviations = np.sqrt([EAST[0] @ one @ EAST[0] for one in propagate_covariance(given.plant, steps)[1:]])
     risk = age_risk(link, deviations, ALLOWED, corner=2)
     slew = SlewRows(given.plant, given.input_set, slew_mps3)
     return rest_backoffs(given, risk, ALLOWED, slew, EAST, cov, most)
@@ -44,12 +43,12 @@ def test_the_share_of_new_plans_that_need_slack_is_the_one_it_is_made_for(loss: 
     steps, rng, draws = steps_for(loss), np.random.default_rng(8), 40_000
     given = replace(problem("paper"), horizon=steps)
     plant = given.plant
-    cov = innovations(plant, 0.1, 0.0, 0).estimate_cov if noisy else np.zeros((4, 4))
+    cov = innovation_form(plant, 0.1, 0.0, 0).estimate_cov if noisy else np.zeros((4, 4))
     (d,) = distances(bernoulli(np.array([1.0 - loss])), steps, cov)[0]
     risk = age_risk(bernoulli(np.array([1.0 - loss])), sigma(steps, np.zeros((4, 4))), ALLOWED, corner=2)
     backoff = quantile(risk.shares) * sigma(steps, cov)
     gap = np.minimum(rng.geometric(1.0 - loss, draws), steps)
-    spread = unseen(plant, steps, cov) - cov
+    spread = propagate_covariance(plant, steps, cov) - cov
     state = np.zeros((draws, 4))
     for t in np.unique(gap):
         values, vectors = np.linalg.eigh(spread[t])
@@ -73,7 +72,7 @@ def test_the_share_of_new_plans_that_need_slack_is_the_one_it_is_made_for(loss: 
 
 def sigma(steps: int, cov: Array) -> Array:
     """Deviations (H,) of the row in the stages of a plan."""
-    return np.sqrt([EAST[0] @ one @ EAST[0] for one in unseen(problem("paper").plant, steps, cov)[1:]])
+    return np.sqrt([EAST[0] @ one @ EAST[0] for one in propagate_covariance(problem("paper").plant, steps, cov)[1:]])
 
 
 def test_in_bursts_it_is_where_resting_at_all_ages_is_outside_as_often_as_allowed() -> None:
@@ -86,7 +85,7 @@ def test_in_bursts_it_is_where_resting_at_all_ages_is_outside_as_often_as_allowe
 def test_sharing_an_error_of_the_estimate_and_a_slow_gate_ask_for_more() -> None:
     link, plant = bernoulli(np.array([0.7])), problem("paper").plant
     (alone,), (shared,) = distances(link, 16, most=2)
-    (unsure,) = distances(link, 16, innovations(plant, 0.1, 0.0, 0).estimate_cov)[0]
+    (unsure,) = distances(link, 16, innovation_form(plant, 0.1, 0.0, 0).estimate_cov)[0]
     (slow,) = distances(link, 16, slew_mps3=0.9)[0]
     assert shared > alone + 0.3
     assert unsure > alone + 0.2

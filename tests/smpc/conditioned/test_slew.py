@@ -7,17 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from baseline_rig import problem
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.records import GaveWay, SolveStatus, names_of, tell, worst
 from uavctl.smpc.answer import Preview
 from uavctl.smpc.conditioned.planner import ConditionedSolver
 from uavctl.smpc.conditioned.program import SlewRows
 from uavctl.smpc.link import bernoulli
-from uavctl.smpc.nominal import ControlProblem, parts
+from uavctl.smpc.nominal import ControlProblem, find_parts
 from uavctl.smpc.sets import Polytope
 
-Array = NDArray[np.float64]
 LINK = bernoulli(np.array([0.7]))
 ROOM_MPS3 = 5.0
 
@@ -54,7 +53,7 @@ def test_there_is_a_plan_from_everywhere_and_its_setpoints_change_no_faster(name
         assert (answer.inputs >= low).all() and (answer.inputs <= high).all()
         assert np.abs(np.diff(answer.inputs, axis=0) @ d.T).max() <= side + 1e-8
         over = np.abs(d @ (answer.inputs[0] - sent)) - side
-        told = {one.index: one.amount for one in answer.gave_way if one.constraint == "slew"}
+        told = {one.index: one.amount for one in answer.relaxed if one.constraint == "slew"}
         needed = np.abs(d @ (np.clip(sent, low, high) - sent)) - side
         # Up to what the first rows are apart by: two sets that only touch are no program.
         assert told == pytest.approx({i: needed[i] for i in np.flatnonzero(needed > 1e-6)}, abs=1e-7)
@@ -103,10 +102,10 @@ def test_without_a_word_of_what_was_sent_the_first_input_is_free() -> None:
 
 def test_axes_that_share_inputs_are_one_part() -> None:
     given = problem("paper")
-    assert len(parts(given)) == 2
+    assert len(find_parts(given)) == 2
     mixed = replace(given.plant, accel_per_input=np.array([[0.5, 0.1], [0.0, 0.5]]))
     shared = replace(given, plant=mixed)
-    assert len(parts(shared, SlewRows(mixed, given.input_set, 0.9).d)) == 1
+    assert len(find_parts(shared, SlewRows(mixed, given.input_set, 0.9).d)) == 1
     sent = np.array([6.0, -9.0])
     answer = solver_of(shared, 0.9).solve(0, np.array([20.0, 2.0, -10.0, 1.0]), given.target, Preview(sent=sent))
     change = np.diff(answer.inputs, axis=0, prepend=sent[None]) @ mixed.accel_map.T

@@ -5,7 +5,6 @@ from __future__ import annotations
 import clarabel
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from optimisation_cases import (
     ORIGIN,
     PAPER_COST,
@@ -22,8 +21,9 @@ from optimisation_cases import (
     room,
 )
 
+from uavctl.arrays import Array
 from uavctl.records import SolveStatus
-from uavctl.smpc.answer import Answer, inside
+from uavctl.smpc.answer import Answer, clip_inputs
 from uavctl.smpc.hahn_stursberg import exact as conic
 from uavctl.smpc.hahn_stursberg.cones import ConicProgram
 from uavctl.smpc.hahn_stursberg.design import Design
@@ -32,8 +32,6 @@ from uavctl.smpc.hahn_stursberg.horizon import Horizon, decompose
 from uavctl.smpc.hahn_stursberg.printed import PrintedProblem, PrintedSolver
 from uavctl.smpc.hahn_stursberg.program import Program
 from uavctl.smpc.sets import Polytope
-
-Array = NDArray[np.float64]
 
 
 @pytest.fixture(scope="module")
@@ -303,13 +301,13 @@ def test_other_endings_are_passed_on(
 def test_inputs_are_cut_back_to_the_limits_and_more_than_a_tolerance_is_told() -> None:
     box = Polytope.from_box([-7.5, -1.1], [7.5, 1.1])
     wanted = np.array([[7.5 + 1e-9, -1.1 - 3e-10], [0.1, 0.2]])
-    cut, kept = inside(wanted, box.c, box.b)
+    cut, kept = clip_inputs(wanted, box.c, box.b)
     assert kept
     assert cut.tolist() == [[7.5, -1.1], [0.1, 0.2]]
-    cut, kept = inside(wanted + 1e-3, box.c, box.b)
+    cut, kept = clip_inputs(wanted + 1e-3, box.c, box.b)
     assert not kept
     assert cut[0, 0] == 7.5
-    oblique, kept = inside(np.array([[1.0 + 1e-7, 1.0]]), np.array([[1.0, 1.0]]), np.array([2.0]))
+    oblique, kept = clip_inputs(np.array([[1.0 + 1e-7, 1.0]]), np.array([[1.0, 1.0]]), np.array([2.0]))
     assert kept
     assert oblique.sum() == pytest.approx(2.0, abs=1e-15)
 

@@ -9,16 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 from design_rig import spec
-from numpy.typing import NDArray
 from scipy.stats import chi2, norm
 
+from uavctl.arrays import Array
 from uavctl.errors import DesignError
 from uavctl.smpc.hahn_stursberg import design as design_module
 from uavctl.smpc.hahn_stursberg.design import Design, design_record, kappa, make_design
 from uavctl.smpc.link import bernoulli
 from uavctl.smpc.sets import Polytope
 
-Array = NDArray[np.float64]
 STATES = np.array([[35.0, -2.0, -20.0, -4.0], [0.0, 0.0, 0.0, 0.0]])
 
 

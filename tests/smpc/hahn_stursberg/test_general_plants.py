@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from optimisation_cases import START, paper_plant, paper_spec
 from plant_cases import NAMED, SHAPES, case, kept, sampled, spec_of
 from plant_oracle import margins, reduced_cost
 from scipy.linalg import block_diag
 
+from uavctl.arrays import Array
 from uavctl.errors import DesignError
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import NOMINAL
@@ -20,9 +20,7 @@ from uavctl.smpc.hahn_stursberg.exact import ConicSolver, PartSolver
 from uavctl.smpc.hahn_stursberg.horizon import decompose, horizon_of, whole
 from uavctl.smpc.hahn_stursberg.printed import PrintedProblem, PrintedSolver
 from uavctl.smpc.plant import Plant
-from uavctl.smpc.sets import equilibria
-
-Array = NDArray[np.float64]
+from uavctl.smpc.sets import find_equilibria
 
 # Those that the printed form solves at all: elsewhere its empty interior makes it end inaccurate or not.
 PRINTED = (
@@ -117,11 +115,11 @@ def test_inputs_at_rest_cost_the_least_of_those_that_hold_the_place() -> None:
     # A spring to the origin; u_1 + 2 u_2 = 1 holds p = 1. Lagrange: u_i = g_i / q_i · 1 / Σ g² / q.
     a = np.array([[1.0, 0.5], [-0.3, 0.6]])
     b = np.array([[0.0, 0.0], [0.3, 0.6]])
-    found = equilibria(a, b, np.eye(2), np.diag([1.0, 2.0]), np.array([0]))
+    found = find_equilibria(a, b, np.eye(2), np.diag([1.0, 2.0]), np.array([0]))
     assert found.x_eq == pytest.approx(np.array([[1.0], [0.0]]), abs=1e-12)
     assert found.u_eq[:, 0] == pytest.approx(np.array([1.0, 1.0]) / 3.0)
     # An input that costs nothing beside the other does it all.
-    free = equilibria(a, b, np.eye(2), np.diag([1.0, 0.0]), np.array([0]))
+    free = find_equilibria(a, b, np.eye(2), np.diag([1.0, 0.0]), np.array([0]))
     assert free.u_eq[:, 0] == pytest.approx([0.0, 0.5])
 
 

@@ -6,15 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from optimisation_cases import TAU_3, coupled, paper, paper_plant, room
 
+from uavctl.arrays import Array
 from uavctl.errors import DesignError
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.horizon import Component, Horizon, decompose, terminal_bound, whole
 from uavctl.smpc.sets import Polytope
-
-Array = NDArray[np.float64]
 
 
 def horizon_of(design: Design, component: Component) -> Horizon:

@@ -9,9 +9,9 @@ import pytest
 from design_rig import room_plant, spec
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_are
 
+from uavctl.arrays import Array
 from uavctl.build.controller import build_controller, build_design, build_plant, build_spec
 from uavctl.config import load_config
 from uavctl.errors import DesignError
@@ -25,13 +25,11 @@ from uavctl.flight.kalman import (
     update_with_position,
 )
 from uavctl.records import PositionSample
-from uavctl.smpc.estimate import innovations, with_bias
+from uavctl.smpc.estimate import add_bias, innovation_form
 from uavctl.smpc.hahn_stursberg.design import Design, make_design
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver, check_schedule
 from uavctl.smpc.hahn_stursberg.horizon import decompose
 from uavctl.smpc.plant import Plant, drag_lag
-
-Array = NDArray[np.float64]
 
 STEP_NS = 200_000_000
 STD_M = 0.005
@@ -40,7 +38,7 @@ START = np.array([-2.4, 0, 0, -1.9, 0, 0, -0.7, 0, 0])
 
 
 def room(sample_age_s: float = 0.2) -> Design:
-    form = innovations(ROOM, STD_M, sample_age_s, losses=5)
+    form = innovation_form(ROOM, STD_M, sample_age_s, losses=5)
     return make_design(replace(spec("room-hahn-stursberg"), plant=form.plant, estimate_cov=form.estimate_cov))
 
 
@@ -77,7 +75,7 @@ def coupled() -> Plant:
 
 def test_samples_at_the_boundary_give_the_textbook_filter() -> None:
     plant = coupled()
-    form = innovations(plant, 0.01, 0.0, losses=0)
+    form = innovation_form(plant, 0.01, 0.0, losses=0)
     c = np.zeros((2, 6))
     c[0, 0] = c[1, 3] = 1.0
     noise = plant.e @ plant.w @ plant.e.T
@@ -92,7 +90,7 @@ def test_samples_at_the_boundary_give_the_textbook_filter() -> None:
 @pytest.mark.parametrize("age_s", [0.0, 0.07, 0.1, 0.2])
 def test_open_loop_covariance_is_that_of_the_state(plant: Plant, age_s: float) -> None:
     """Cov x̂ + P is A^t P A^tᵀ + Σ A^i E W Eᵀ A^iᵀ, whatever the phase of the positions."""
-    form = innovations(plant, STD_M, age_s, losses=0)
+    form = innovation_form(plant, STD_M, age_s, losses=0)
     n_y = len(plant.axes)
     assert form.plant.n_w == n_y
     np.testing.assert_array_equal(form.plant.w, np.eye(n_y))
@@ -132,7 +130,7 @@ def arrivals(loss: float, steps: int, phase_ns: int, seed: int) -> tuple[list[Be
 
 def test_the_real_filter_settles_at_the_design_s_covariance() -> None:
     beliefs, _, _ = arrivals(0.0, 200, 100_000_000, seed=1)
-    form = innovations(ROOM, STD_M, 0.1, losses=0)
+    form = innovation_form(ROOM, STD_M, 0.1, losses=0)
     np.testing.assert_allclose(beliefs[-1].cov[:9, :9], form.estimate_cov, rtol=0, atol=1e-9)
 
 
@@ -140,7 +138,7 @@ def test_the_real_filter_settles_at_the_design_s_covariance() -> None:
 def test_the_bound_holds_at_nearly_every_arrival() -> None:
     """Loss 0.3: every deviation in at least 99 % of arrivals, whatever the phase of the positions."""
     moved = [0, 1, 3, 4, 6, 7]  # nothing disturbs the accelerations
-    bound = np.diagonal(innovations(ROOM, STD_M, 0.2, losses=5).estimate_cov)[moved]
+    bound = np.diagonal(innovation_form(ROOM, STD_M, 0.2, losses=5).estimate_cov)[moved]
     for phase_ns in (20_000_000, 100_000_000, 199_000_000):
         beliefs, _, _ = arrivals(0.3, 2000, phase_ns, seed=2)
         variances = np.array([np.diagonal(belief.cov)[moved] for belief in beliefs[50:]])
@@ -199,16 +197,16 @@ def test_the_terminal_set_has_the_estimate_s_error_in_it() -> None:
 def test_older_positions_longer_gaps_and_more_noise_never_help(
     age_s: float, more_s: float, gap: int, std_m: float
 ) -> None:
-    one = innovations(ROOM, std_m, age_s, gap).estimate_cov
-    older = innovations(ROOM, std_m, age_s + more_s, gap).estimate_cov
+    one = innovation_form(ROOM, std_m, age_s, gap).estimate_cov
+    older = innovation_form(ROOM, std_m, age_s + more_s, gap).estimate_cov
     assert np.all(np.diagonal(older) >= np.diagonal(one))
-    for other in (innovations(ROOM, std_m, age_s, gap + 1), innovations(ROOM, 1.5 * std_m, age_s, gap)):
+    for other in (innovation_form(ROOM, std_m, age_s, gap + 1), innovation_form(ROOM, 1.5 * std_m, age_s, gap)):
         assert np.linalg.eigvalsh(other.estimate_cov - one)[0] >= -1e-9 * np.abs(one).max()
 
 
 def test_an_axis_that_nothing_disturbs_is_known() -> None:
     plant = drag_lag([0.3, 0.3], [0.25, 0.25], [1.0, 1.0], [0.15, 0.0], 0.2, ("north", "east"))
-    form, alone = innovations(plant, STD_M, 0.1, 4), innovations(one_axis(0.15), STD_M, 0.1, 4)
+    form, alone = innovation_form(plant, STD_M, 0.1, 4), innovation_form(one_axis(0.15), STD_M, 0.1, 4)
     np.testing.assert_allclose(form.estimate_cov[:3, :3], alone.estimate_cov, rtol=1e-9, atol=0)
     assert not form.estimate_cov[3:].any()
     assert not form.plant.e[3:].any()
@@ -227,7 +225,7 @@ def test_a_disturbed_state_that_no_position_shows_is_refused() -> None:
         accel_per_input=np.ones(1),
     )
     with pytest.raises(DesignError, match="does not settle") as caught:
-        innovations(hidden, STD_M, 0.1, 4)
+        innovation_form(hidden, STD_M, 0.1, 4)
     assert caught.value.key == "risk.estimate"
 
 
@@ -238,13 +236,13 @@ def test_a_configuration_plans_with_one_plant_and_estimates_with_the_other() -> 
     np.testing.assert_array_equal(controller.plant.e, plant.e)
     np.testing.assert_array_equal(controller.plant.w, plant.w)
     drift = config.estimator.bias_drift
-    np.testing.assert_array_equal(controller.kalman.w, with_bias(plant, drift).w)
-    form = innovations(plant, 0.005, 0.2, 5, drift)
+    np.testing.assert_array_equal(controller.kalman.w, add_bias(plant, drift).w)
+    form = innovation_form(plant, 0.005, 0.2, 5, drift)
     np.testing.assert_array_equal(design.estimate_cov, form.estimate_cov)
     np.testing.assert_array_equal(design.plant.e, form.plant.e)
     # Ten positions a second, 0.07 s on their way at most: the newest is 0.17 s old at most.
     often = build_spec(load_config("room-hahn-stursberg", ["risk.estimate=innovations", "source.rate_hz=10"]))
-    np.testing.assert_array_equal(often.estimate_cov, innovations(plant, 0.005, 0.17, 5, drift).estimate_cov)
+    np.testing.assert_array_equal(often.estimate_cov, innovation_form(plant, 0.005, 0.17, 5, drift).estimate_cov)
 
 
 def test_exact_plans_with_the_plant_itself() -> None:

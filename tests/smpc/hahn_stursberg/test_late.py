@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from design_rig import one_axis, paper_plant, spec
 from loopback_rig import Memory, flight, lockstep, make_loop
-from numpy.typing import NDArray
 from optimisation_cases import paper_spec
 from scipy.linalg import solve_discrete_lyapunov
 
 from logs.recording.replay import replay
+from uavctl.arrays import Array
 from uavctl.build.controller import build_conditioned, build_design, build_solver
 from uavctl.build.link import build_delayed_link, late_steps
 from uavctl.config import Config, load_config
@@ -28,8 +28,6 @@ from uavctl.smpc.hahn_stursberg.exact import ConicSolver, make_late, with_late
 from uavctl.smpc.hahn_stursberg.frozen import ShortcutSolver
 from uavctl.smpc.link import LatePackets, gilbert_elliott
 from uavctl.smpc.sets import Polytope
-
-Array = NDArray[np.float64]
 
 
 def axis_spec(**changes: Any) -> DesignSpec:
@@ -142,12 +140,12 @@ def test_plans_on_time_have_the_same_bits_beside_late_ones() -> None:
     assert [late.past for late in both.late] == [1, 2]
     x, target = np.array([35.0, -2.0, -20.0, -4.0]), np.zeros(4)
     solver = ConicSolver(both)
-    solver.solve(0, x, target, Preview(late=2))
+    solver.solve(0, x, target, Preview(age=2))
     one, other = solver.solve(0, x, target), ConicSolver(design).solve(0, x, target)
     assert one.cost == other.cost
     np.testing.assert_array_equal(one.inputs, other.inputs)
     np.testing.assert_array_equal(one.backoff_x, other.backoff_x)
-    assert solver.solve(0, x, target, Preview(late=3)).status is SolveStatus.FAILED
+    assert solver.solve(0, x, target, Preview(age=3)).status is SolveStatus.FAILED
 
 
 @pytest.mark.slow
@@ -157,7 +155,7 @@ def test_back_offs_grow_with_the_age(preset: str) -> None:
     asked = spec(preset)
     solver = ConicSolver(with_late(make_design(asked), asked, 3))
     target = asked.plant.equilibrium(asked.target_m)
-    answers = [solver.solve(0, target, target, Preview(late=j)) for j in range(4)]
+    answers = [solver.solve(0, target, target, Preview(age=j)) for j in range(4)]
     for younger, older in pairwise(answers):
         assert older.status is SolveStatus.OPTIMAL
         assert older.cost > younger.cost
@@ -329,7 +327,7 @@ def test_a_flight_on_late_positions_plans_with_their_age(late_flight: Memory) ->
     assert max(age for age in ages.values() if age is not None) >= 2
     for plan in plans[:: len(plans) // 5]:
         x, target = np.array(plan.states[0]), design.target
-        late = solver.solve(plan.seq, x, target, Preview(late=1))
+        late = solver.solve(plan.seq, x, target, Preview(age=1))
         # The solver plans what acts in all, of which the estimated bias is there without us.
         np.testing.assert_array_equal(np.array(plan.inputs), late.inputs - np.array(plan.bias))
         on_time = solver.solve(plan.seq, x, target)

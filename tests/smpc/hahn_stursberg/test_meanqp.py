@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from optimisation_cases import coupled
 from question_rig import EACH_PRESET, KINDS, PRESETS, Case, all_kinds, asked, design_of, exact_gains, mean_optimum
 from scipy.linalg import null_space
 
+from uavctl.arrays import Array
 from uavctl.smpc.answer import Preview
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.horizon import Component, decompose, horizon_of
 from uavctl.smpc.hahn_stursberg.mean import MeanProblem, Row, RowKind
 from uavctl.smpc.hahn_stursberg.policy import Covariance
-
-Array = NDArray[np.float64]
 
 
 def problem_of(design: Design, i: int) -> MeanProblem:
@@ -58,7 +56,7 @@ def test_cost_rows_and_inputs_are_those_of_a_simulation(design: Design, i: int, 
     free = design.horizon - design.terminal.tau
     for _ in range(5):
         ask = asked(design, kind, rng)
-        question = problem.question(ask.x[part.states], ask.target[part.states], ask.outlook)
+        question = problem.question(ask.x[part.states], ask.target[part.states], ask.preview)
         q = rng.normal(size=problem.h.shape[0]) * np.abs(design.input_set.b).max()
         w = problem.z @ q + problem.w @ question.p
         here, there = part.coordinates @ ask.x[part.states], part.coordinates @ ask.target[part.states]
@@ -69,9 +67,9 @@ def test_cost_rows_and_inputs_are_those_of_a_simulation(design: Design, i: int, 
         assert problem.inputs(w, here) == pytest.approx(inputs, abs=1e-12 * size)
         assert states[free:] == pytest.approx(np.tile(part.x_eq @ y, (len(states) - free, 1)), abs=1e-10 * size)
         path_x, path_u = np.zeros((free, part.states.size)), np.zeros((free, part.inputs.size))
-        if ask.outlook.path is not None:
-            path_x = ask.outlook.path.states[:free, part.states]
-            path_u = ask.outlook.path.inputs[:free, part.inputs]
+        if ask.preview.path is not None:
+            path_x = ask.preview.path.states[:free, part.states]
+            path_u = ask.preview.path.inputs[:free, part.inputs]
         wanted = sum(
             (a := states[t] - part.x_eq @ y - path_x[t]) @ part.q_x @ a
             + (b := inputs[t] - part.u_eq @ y - path_u[t]) @ part.q_u @ b
@@ -180,14 +178,14 @@ def test_the_exact_program_s_answer_costs_the_same_here_and_is_the_best_under_it
     checked = 0
     for ask in all_kinds(design, 5, 3):
         for i in range(len(one.components)):
-            answer = one.exact[i].solve(ask.x, ask.target, ask.outlook)
+            answer = one.exact[i].solve(ask.x, ask.target, ask.preview)
             if answer.terminal_miss > 1e-6:
                 continue  # from there no equilibrium is in reach
             problem, theta = one.problems[i], exact_gains(one, i, ask)
             covariance = Covariance(problem.horizon, [problem.rows[k] for k in problem.links])
             backoff = problem.backoff.copy()
             backoff[problem.links] = covariance.backoffs(theta)
-            question = one.question(i, ask.x, ask.target, ask.outlook)
+            question = one.question(i, ask.x, ask.target, ask.preview)
             mean = mean_optimum(problem, question, backoff)
             assert mean + covariance.cost(theta) == pytest.approx(answer.cost, rel=1e-6)
             checked += 1

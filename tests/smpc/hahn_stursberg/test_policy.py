@@ -9,16 +9,15 @@ import pytest
 from full_problem import Margins, gains, horizons, margins
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from optimisation_cases import coupled
 from question_rig import EACH_PRESET, PRESETS, asked, case, design_of, exact_gains
 
+from uavctl.arrays import Array
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.horizon import decompose, horizon_of
 from uavctl.smpc.hahn_stursberg.mean import MeanProblem, RowKind
 from uavctl.smpc.hahn_stursberg.policy import Covariance, Policy, cheapest_policy
 
-Array = NDArray[np.float64]
 Multipliers = tuple[Array, Array, Array, list[Array]]
 
 

@@ -12,11 +12,11 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from optimisation_cases import ORIGIN, PAPER_LOWER, PAPER_UPPER, START, paper, paper_plant, paper_spec
 from plant_cases import case, kept
 from plant_units import Units, in_units
 
+from uavctl.arrays import Array
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import Answer, Solver
 from uavctl.smpc.hahn_stursberg import exact as conic
@@ -26,8 +26,6 @@ from uavctl.smpc.hahn_stursberg.frozen import ShortcutSolver
 from uavctl.smpc.hahn_stursberg.horizon import Horizon, decompose, horizon_of, whole
 from uavctl.smpc.link import bernoulli
 from uavctl.smpc.sets import Polytope
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

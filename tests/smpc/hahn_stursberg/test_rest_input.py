@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from plant_cases import Model, Shape, spec_of
 from scipy.optimize import linprog
 
@@ -15,9 +14,7 @@ from uavctl.smpc.answer import Answer
 from uavctl.smpc.hahn_stursberg.design import DesignSpec, make_design
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver
 from uavctl.smpc.hahn_stursberg.synthesis import synthesize, terminal_factors
-from uavctl.smpc.sets import Polytope, rest_input
-
-Array = NDArray[np.float64]
+from uavctl.smpc.sets import Polytope, find_rest_input
 
 # At 2 m the spring pulls with 1, which the inputs share as u_1 + u_2 / 2 = 1. Of those the cheapest, with weights of
 # 100 and 1, is u_1 = 0.01 / 0.26, u_2 = 0.5 / 0.26; the smallest is (0.8, 0.4).
@@ -62,7 +59,7 @@ def some_rest_fits(given: DesignSpec) -> bool:
 def test_the_rest_input_is_the_cheapest() -> None:
     given = asked(FITS_CHEAPEST)
     x, (a, b) = given.plant.equilibrium(PLACE_M), (given.plant.a, given.plant.b)
-    found = rest_input(a, b, given.q_u, x)
+    found = find_rest_input(a, b, given.q_u, x)
     assert found == pytest.approx(CHEAPEST, rel=1e-9)
     assert a @ x + b @ found == pytest.approx(x, rel=1e-9, abs=1e-12)
 

@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 from hypothesis import given as hypothesis_given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.errors import DesignError
 from uavctl.smpc.hahn_stursberg.schedule import ScheduleDemand, fixed, greedy, nested
 from uavctl.smpc.link import bernoulli, gilbert_elliott
 
-Array = NDArray[np.float64]
 H = 12
 
 

@@ -8,10 +8,9 @@ from functools import cache
 import numpy as np
 import pytest
 from full_problem import gains, margins
-from numpy.typing import NDArray
 from question_rig import (
     EACH_PRESET,
-    KEPT,
+    KEPT_TOLERANCE,
     KINDS,
     PRESETS,
     Asked,
@@ -32,7 +31,6 @@ from uavctl.smpc.hahn_stursberg.exact import ConicSolver, gave_way
 from uavctl.smpc.hahn_stursberg.frozen import ShortcutSolver
 from uavctl.smpc.hahn_stursberg.mean import RowKind
 
-Array = NDArray[np.float64]
 OK = SolveStatus.OPTIMAL
 
 
@@ -46,7 +44,7 @@ def answered(name: str) -> list[tuple[Asked, Answer, Answer]]:
     """Questions of every kind with the answer as flown and the exact program's."""
     one, exact = case(name), exact_solver(name)
     return [
-        (ask, one.solver.solve(7, ask.x, ask.target, ask.outlook), exact.solve(7, ask.x, ask.target, ask.outlook))
+        (ask, one.solver.solve(7, ask.x, ask.target, ask.preview), exact.solve(7, ask.x, ask.target, ask.preview))
         for ask in all_kinds(one.design, 41, 10)
     ]
 
@@ -69,7 +67,7 @@ def test_frozen_answers_are_the_exact_program_s(name: str) -> None:
                 assert answer.inputs[:, part.inputs] == pytest.approx(exact.inputs[:, part.inputs], abs=2e-3 * most)
         if answer.method == "frozen":
             assert answer.gap < 1e-7
-            assert (answer.slack, answer.terminal_miss, answer.gave_way) == (0.0, 0.0, ())
+            assert (answer.slack, answer.terminal_miss, answer.relaxed) == (0.0, 0.0, ())
             assert answer.reference == pytest.approx(exact.reference, abs=1e-3)
     assert min(methods["frozen"], methods["exact"]) >= 10
 
@@ -88,14 +86,16 @@ def test_near_the_target_it_is_nearly_always_accepted(name: str) -> None:
 def test_where_it_is_refused_its_best_mean_would_cost_more_than_the_optimum(name: str) -> None:
     """Without the KKT test wrong answers would pass."""
     one = case(name)
-    refused = [found for found in answered(name) if found[1].method != "frozen" and found[2].terminal_miss < KEPT]
+    refused = [
+        found for found in answered(name) if found[1].method != "frozen" and found[2].terminal_miss < KEPT_TOLERANCE
+    ]
     dearer = 0
     for ask, _, exact in refused[:25]:
         cost = 0.0
         for i, policy in enumerate(one.policies):
             problem, backoff = one.problems[i], one.problems[i].backoff.copy()
             backoff[problem.links] = policy.backoff * (1.0 - 1e-9)
-            question = one.question(i, ask.x, ask.target, ask.outlook)
+            question = one.question(i, ask.x, ask.target, ask.preview)
             cost += policy.cost + mean_optimum(problem, question, backoff)
         assert cost >= exact.cost_lower - 1e-6 * max(1.0, abs(exact.cost))
         dearer += cost > exact.cost * (1.0 + 1e-5)
@@ -107,13 +107,13 @@ def independent_cost(design: Design, name: str, ask: Asked, answer: Answer, cova
     free = design.horizon - design.terminal.tau
     rest = np.zeros(design.plant.n_u)
     path_x, path_u = np.zeros((free, design.plant.n_x)), np.zeros((free, design.plant.n_u))
-    if ask.outlook.path is not None:
-        path_x, path_u = ask.outlook.path.states[:free], ask.outlook.path.inputs[:free]
+    if ask.preview.path is not None:
+        path_x, path_u = ask.preview.path.states[:free], ask.preview.path.inputs[:free]
     cost, slacks = covariance + design.offset_weight * answer.offset, 0.0
     for t in range(free):
         x, u = answer.states[t] - answer.reference - path_x[t], answer.inputs[t] - rest - path_u[t]
         cost += float(x @ design.q_x @ x + u @ design.q_u @ u)
-    limits = np.tile(design.state_set.b, (design.horizon + 1, 1)) if ask.outlook.limits is None else ask.outlook.limits
+    limits = np.tile(design.state_set.b, (design.horizon + 1, 1)) if ask.preview.limits is None else ask.preview.limits
     beyond = answer.states @ design.state_set.c.T + answer.backoff_x - limits
     for problem, part in zip(case(name).problems, case(name).components, strict=True):
         for row in problem.rows:
@@ -132,12 +132,12 @@ def test_the_policy_flown_keeps_every_constraint_of_the_full_problem(name: str) 
     one = case(name)
     design, checked = one.design, Counter[str]()
     for ask, answer, exact in answered(name):
-        assert (answer.terminal_miss > KEPT) == (exact.terminal_miss > KEPT)
-        if answer.terminal_miss > KEPT:
+        assert (answer.terminal_miss > KEPT_TOLERANCE) == (exact.terminal_miss > KEPT_TOLERANCE)
+        if answer.terminal_miss > KEPT_TOLERANCE:
             continue  # from there nothing keeps all of (19)
         thetas = flown(one, ask, answer)
         m = gains(design, [theta[None] for theta in thetas])
-        found = margins(design, m, ask.x[None], answer.inputs[None], answer.reference[None], ask.outlook.limits)
+        found = margins(design, m, ask.x[None], answer.inputs[None], answer.reference[None], ask.preview.limits)
         worst = {
             "input": found.inputs.min(),
             "place": found.place.min(),
@@ -146,7 +146,7 @@ def test_the_policy_flown_keeps_every_constraint_of_the_full_problem(name: str) 
             "state": -np.maximum(-found.state, 0.0).sum() + answer.slack,
             "terminal": 10.0 * found.lmi().min(),  # -1e-7 of its size
         }
-        assert {row: margin for row, margin in worst.items() if margin < -KEPT} == {}
+        assert {row: margin for row, margin in worst.items() if margin < -KEPT_TOLERANCE} == {}
         # Where a gain is zero but for rounding, the norm is that rounding's root.
         assert answer.backoff_x == pytest.approx(found.backoff_x[0], abs=1e-7)
         assert answer.backoff_u == pytest.approx(found.backoff_u[0], abs=1e-7)
@@ -163,15 +163,15 @@ def test_what_the_constraints_are_held_to_can_be_missed(name: str) -> None:
     """Gains a tenth larger, or a mean that is moved, are found out."""
     one = case(name)
     ask, answer, _ = next(
-        found for found in answered(name) if found[1].method == "exact" and found[1].terminal_miss < KEPT
+        found for found in answered(name) if found[1].method == "exact" and found[1].terminal_miss < KEPT_TOLERANCE
     )
     thetas = [1.1 * theta[None] for theta in flown(one, ask, answer)]
     m = gains(one.design, thetas)
-    assert margins(one.design, m, ask.x[None], answer.inputs[None], answer.reference[None]).worst()[0] < -KEPT
+    assert margins(one.design, m, ask.x[None], answer.inputs[None], answer.reference[None]).worst()[0] < -KEPT_TOLERANCE
     moved = answer.inputs.copy()
     moved[0] += 1e-3
     m = gains(one.design, [theta / 1.1 for theta in thetas])
-    assert margins(one.design, m, ask.x[None], moved[None], answer.reference[None]).rest[0] < -KEPT
+    assert margins(one.design, m, ask.x[None], moved[None], answer.reference[None]).rest[0] < -KEPT_TOLERANCE
 
 
 # --- bits ------------------------------------------------------------------------------------------------------------
@@ -184,7 +184,7 @@ def bits(answer: Answer) -> bytes:
 
 
 def bits_of(solver: ShortcutSolver, asks: list[Asked]) -> list[bytes]:
-    return [bits(solver.solve(0, ask.x, ask.target, ask.outlook)) for ask in asks]
+    return [bits(solver.solve(0, ask.x, ask.target, ask.preview)) for ask in asks]
 
 
 @pytest.mark.slow
@@ -210,24 +210,24 @@ def test_an_answer_every_time_and_what_gave_way_is_named(name: str) -> None:
     one = case(name)
     design, kinds = one.design, Counter[str]()
     for ask in hard_questions(design):
-        answer = one.solver.solve(1, ask.x, ask.target, ask.outlook)
+        answer = one.solver.solve(1, ask.x, ask.target, ask.preview)
         assert answer.status is OK, ask.kind
         assert np.all(answer.inputs @ design.input_set.c.T <= design.input_set.b)
-        told = gave_way(design, answer, one.components, ask.outlook)
-        if max(answer.slack, answer.terminal_miss) > KEPT:
-            assert answer.gave_way == told
+        told = gave_way(design, answer, one.components, ask.preview)
+        if max(answer.slack, answer.terminal_miss) > KEPT_TOLERANCE:
+            assert answer.relaxed == told
             assert told
-            kinds.update({way.constraint for way in answer.gave_way})
-            state = {(way.stage, way.index) for way in answer.gave_way if way.constraint == "state"}
-            b = limits(design) if ask.outlook.limits is None else ask.outlook.limits
+            kinds.update({way.constraint for way in answer.relaxed})
+            state = {(way.stage, way.index) for way in answer.relaxed if way.constraint == "state"}
+            b = limits(design) if ask.preview.limits is None else ask.preview.limits
             over = answer.states @ design.state_set.c.T + answer.backoff_x - b
-            assert state == {(int(t), int(i)) for t, i in np.argwhere(over > KEPT) if t > 0}
+            assert state == {(int(t), int(i)) for t, i in np.argwhere(over > KEPT_TOLERANCE) if t > 0}
         else:
-            assert answer.gave_way == ()
+            assert answer.relaxed == ()
         if ask.kind == "target out of reach":
             assert answer.offset > 1.0
         if ask.kind.startswith(("fence", "no place", "100", "10.0")):
-            assert answer.gave_way
+            assert answer.relaxed
     assert {"state", "equilibrium"} <= set(kinds)
 
 
@@ -242,15 +242,15 @@ def test_numbers_that_are_none_fail_without_a_plan(name: str, bad: float) -> Non
     questions = [(spoilt, home, Preview()), (home, spoilt, Preview()), (home, home, Preview(path=path))]
     if not np.isfinite(bad):
         questions.append((home, home, Preview(limits=np.full_like(limits(design), bad))))
-    for x, target, outlook in questions:
-        answer = one.solver.solve(9, x, target, outlook)
+    for x, target, preview in questions:
+        answer = one.solver.solve(9, x, target, preview)
         assert (answer.seq, answer.status) == (9, SolveStatus.FAILED)
         assert answer.inputs.size == 0
 
 
 def test_a_position_later_than_the_design_knows_fails() -> None:
     one = case("paper")
-    answer = one.solver.solve(0, one.design.target, one.design.target, Preview(late=1))
+    answer = one.solver.solve(0, one.design.target, one.design.target, Preview(age=1))
     assert (answer.status, answer.inputs.size) == (SolveStatus.FAILED, 0)
 
 
@@ -265,8 +265,8 @@ def test_late_positions_have_policies_of_their_own_that_agree_with_the_exact_pro
     costs, methods = [], Counter[str]()
     for _ in range(40):
         x = rng.uniform([-20.0, -5.0], [30.0, 5.0])
-        fresh, late = (solver.solve(0, x, design.target, Preview(late=j)) for j in (0, 1))
-        wanted = exact.solve(0, x, design.target, Preview(late=1))
+        fresh, late = (solver.solve(0, x, design.target, Preview(age=j)) for j in (0, 1))
+        wanted = exact.solve(0, x, design.target, Preview(age=1))
         assert (late.status, wanted.status) == (OK, OK)
         assert late.cost == pytest.approx(wanted.cost, rel=1e-7)
         costs.append(late.cost - fresh.cost)

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 from design_rig import one_axis, paper_plant, spec
-from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
+from uavctl.arrays import Array
 from uavctl.errors import DesignError
 from uavctl.smpc.hahn_stursberg.design import DesignSpec, make_design
 from uavctl.smpc.hahn_stursberg.exact import check_schedule
@@ -26,7 +26,6 @@ from uavctl.smpc.hahn_stursberg.terminal import make_terminal, stationary_cost
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope
 
-Array = NDArray[np.float64]
 INF = np.inf
 
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from design_rig import one_axis, paper_plant, room_plant, spec
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from uavctl.arrays import Array
 from uavctl.errors import DesignError
 from uavctl.smpc.hahn_stursberg.terminal import (
     AssumptionCheck,
@@ -22,7 +22,6 @@ from uavctl.smpc.hahn_stursberg.terminal import (
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope
 
-Array = NDArray[np.float64]
 K_AXIS = np.array([[-0.058, -1.172]])
 Q_X, Q_U = np.diag([10.0, 0.1]), np.array([[0.1]])
 

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 from design_rig import spec
-from numpy.typing import NDArray
 
 from uavctl.build.controller import start_state
 from uavctl.cli.app import run
@@ -19,7 +18,6 @@ from uavctl.lab.terminal_gain import compare_gains
 from uavctl.smpc.hahn_stursberg.design import make_design
 from uavctl.smpc.hahn_stursberg.exact import check_schedule, optimal_cost
 
-Array = NDArray[np.float64]
 BEST = [[-0.151872, -0.787386, 0.0, 0.0], [0.0, 0.0, -0.151872, -0.787386]]
 START = np.array([35.0, -2.0, -20.0, -4.0])
 

@@ -34,7 +34,7 @@ from uavctl.lab.bench.timing import (
 )
 from uavctl.loop import ControlLoop
 from uavctl.records import Record, SolveStatus
-from uavctl.smpc.answer import KEPT, NOMINAL, Answer, Preview, Solver
+from uavctl.smpc.answer import KEPT_TOLERANCE, NOMINAL, Answer, Preview, Solver
 from uavctl.smpc.conditioned.planner import ConditionedSolver
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.exact import METHOD, ConicSolver, PartSolver
@@ -59,8 +59,8 @@ class VariedPreviewSolver:
         self._previews = [Preview(cov=share * noise, sent=solver.problem.u_target) for share in shares]
         self._count = 0
 
-    def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:  # noqa: ARG002
-        """See `Solver`; the outlook is its own."""
+    def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:  # noqa: ARG002
+        """See `Solver`; the preview is its own."""
         self._count = (self._count + 1) % _N_COVARIANCES
         return self._solver.solve(seq, x, target, self._previews[self._count])
 
@@ -121,7 +121,10 @@ def _draw_box_states(
             x[component.states] = rng.uniform(lower, upper)
             answer = solver.solve(x, design.target)
             tries += 1
-            if answer.status is SolveStatus.OPTIMAL and answer.slack + answer.offset + answer.terminal_miss < KEPT:
+            if (
+                answer.status is SolveStatus.OPTIMAL
+                and answer.slack + answer.offset + answer.terminal_miss < KEPT_TOLERANCE
+            ):
                 states[count_done, component.states] = x[component.states]
                 count_done, misses = count_done + 1, 0
                 on_progress(count_done)
@@ -328,13 +331,13 @@ class QuestionRecorder:
         self.questions: list[tuple[Array, Array, Preview]] = []  # state (n_x,), target (n_x,) and preview of each
         self.first_us = np.nan  # time of the first decision [µs]
 
-    def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:
+    def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:
         """See `Solver`."""
         start = time.perf_counter()
-        answer = self._solver.solve(seq, x, target, outlook)
+        answer = self._solver.solve(seq, x, target, preview)
         if not self.questions:
             self.first_us = (time.perf_counter() - start) * 1e6
-        self.questions.append((x, target, outlook))
+        self.questions.append((x, target, preview))
         return answer
 
 
@@ -438,13 +441,13 @@ def time_decisions(
     Args:
         on_progress: Called with the number of finished decisions.
     """
-    for x, target, outlook in draw_questions(solver, _WARM_UP, seed + 1):
-        solver.solve(0, x, target, outlook)
+    for x, target, preview in draw_questions(solver, _WARM_UP, seed + 1):
+        solver.solve(0, x, target, preview)
     us, iterations, slack, has_plan = np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count, dtype=bool)
     with suspend_garbage_collection():
-        for i, (x, target, outlook) in enumerate(draw_questions(solver, count, seed)):
+        for i, (x, target, preview) in enumerate(draw_questions(solver, count, seed)):
             start = time.perf_counter()
-            answer = solver.solve(i, x, target, outlook)
+            answer = solver.solve(i, x, target, preview)
             us[i] = (time.perf_counter() - start) * 1e6
             iterations[i], slack[i] = answer.iterations, answer.slack
             has_plan[i] = answer.inputs.size > 0  # an inaccurate answer is also a plan

@@ -55,13 +55,13 @@ from uavctl.smpc.baselines import (
     ZeroOnLoss,
     tune,
 )
-from uavctl.smpc.batch import BatchController, BatchSmpc, Counts, Decider, OneByOne
+from uavctl.smpc.batch import BatchController, BatchSmpc, Counts, Decider, SequentialDecider
 from uavctl.smpc.conditioned.planner import ConditionedDecider
-from uavctl.smpc.estimate import innovations
+from uavctl.smpc.estimate import innovation_form
 from uavctl.smpc.hahn_stursberg.design import Design, kappa
 from uavctl.smpc.hahn_stursberg.frozen import ShortcutDecider, ShortcutSolver
 from uavctl.smpc.nominal import ControlProblem
-from uavctl.smpc.outside import Rehearsal, make_answer
+from uavctl.smpc.outside import SilencePlanner, make_answer
 
 _STUDENT_DEGREES = 4.0  # of Student's t; its variance is degrees / (degrees - 2)
 
@@ -215,7 +215,7 @@ def make_recipe(controller: ControllerSpec, config: Config, spec: CampaignSpec) 
         check_axes(config)
     if spec.measured == "position":
         belief = make_filter_belief(config)
-        recipe = replace(recipe, cov=innovations(belief.plant, belief.position_std_m, 0.0, 0).estimate_cov)
+        recipe = replace(recipe, cov=innovation_form(belief.plant, belief.position_std_m, 0.0, 0).estimate_cov)
     if kind == "smpc" and not config.is_age_conditioned:
         recipe = replace(recipe, design=build_design(config))
     elif kind == "pid":
@@ -290,7 +290,7 @@ def _build_smpc(recipe: Recipe) -> BatchSmpc:
     if isinstance(solver, ShortcutSolver):
         decider: Decider = ShortcutDecider(solver, design.target)
     else:
-        decider = OneByOne(solver, design.target, (design.horizon, design.plant.n_u))
+        decider = SequentialDecider(solver, design.target, (design.horizon, design.plant.n_u))
     return BatchSmpc(decider, plant, design.horizon, len(design.late), brake_gain_1ps)
 
 
@@ -312,11 +312,11 @@ class BaselineSolver:
     """
 
     def __init__(self, name: str, make: Callable[[Array], tuple[ControlProblem, BatchController]]) -> None:
-        self._name, self._rehearsal = name, Rehearsal(make)
+        self._name, self._rehearsal = name, SilencePlanner(make)
 
-    def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:
+    def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:
         """See `Solver`; the preview is not used."""
-        del outlook
+        del preview
         problem, inputs = self._rehearsal.inputs(seq, x, target)
         if not np.isfinite(inputs).all():
             return Answer.failed(seq, SolveStatus.FAILED, self._name)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from uavctl.arrays import Array
 from uavctl.config.link import LinkConfig
-from uavctl.smpc.batch import BatchController, Counts, News
+from uavctl.smpc.batch import BatchController, Counts, Information
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope
 
@@ -312,7 +312,7 @@ def simulate(
             state, cov = measured.filter.update(
                 k, states[:, k, position_index] + measured.noise[:, k], newest_captures[:, k], inputs[:, :k]
             )
-        measurement = News(k, newest_captures[:, k], state, inputs[:, :k], cov)
+        measurement = Information(k, newest_captures[:, k], state, inputs[:, :k], cov)
         wanted_inputs = controller.act(measurement)
         failed |= ~np.isfinite(wanted_inputs).all(axis=1)
         requested[:, k] = np.where(failed[:, None], 0.0, wanted_inputs)

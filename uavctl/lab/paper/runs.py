@@ -304,10 +304,11 @@ def fly_all(
     Raises:
         UavctlError: A worker process ended.
     """
+    # Designs alternate: two workers with two designs then build the programs of one design each.
     tasks = [
         ChunkTask(design_index, seed, first, min(CHUNK, runs - first), steps)
-        for design_index in range(len(setups))
         for first in range(0, runs, CHUNK)
+        for design_index in range(len(setups))
     ]
     results = []
     with _open_flier(setups, runs, workers) as fly_tasks:
@@ -330,7 +331,8 @@ def _open_flier(
 ) -> Iterator[Callable[[Sequence[ChunkTask]], Iterator[Flights]]]:
     """Yield a function that maps tasks to their results, in order."""
     if runs <= MAX_LOCAL_RUNS:
-        yield lambda tasks: map(partial(_fly_chunk, [ChunkRunner(setup) for setup in setups]), tasks)
+        runners = [ChunkRunner(setup) for setup in setups]
+        yield lambda tasks: (_fly_chunk(runners[task.design_index], task) for task in tasks)
         return
     with open_processes(workers) as pool, TemporaryDirectory() as folder:
         # Through a file and not with each task, as designs are larger than the buffer of a pipe.
@@ -343,18 +345,17 @@ def _open_flier(
 
 
 @cache
-def _get_runners(path: Path) -> list[ChunkRunner]:
-    """Return one runner for each design, made once in each worker process."""
-    return [ChunkRunner(setup) for setup in pickle.loads(path.read_bytes())]
+def _get_runner(path: Path, design_index: int) -> ChunkRunner:
+    """Build the runner of one design in a worker process, for its first task with that design."""
+    return ChunkRunner(pickle.loads(path.read_bytes())[design_index])
 
 
 def _fly_in_worker(path: Path, task: ChunkTask) -> Flights:
-    return _fly_chunk(_get_runners(path), task)
+    return _fly_chunk(_get_runner(path, task.design_index), task)
 
 
-def _fly_chunk(runners: Sequence[ChunkRunner], task: ChunkTask) -> Flights:
+def _fly_chunk(runner: ChunkRunner, task: ChunkTask) -> Flights:
     """Fly the runs of one task; keep the trajectories of the first runs for the figures."""
-    runner = runners[task.design_index]
     chunk = runner.fly(task.seed, task.first, task.runs, task.steps)
     kept_runs = max(0, MAX_DRAWN - task.first)
     return Flights(compute_totals(chunk, runner.design), chunk.trajectories.states[:kept_runs].copy())

@@ -11,14 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
+from uavctl.arrays import Array
 from uavctl.errors import DesignError
 from uavctl.smpc.conditioned.program import SlewRows
 from uavctl.smpc.link import AgeModel
-from uavctl.smpc.nominal import ControlProblem, Part, unseen
+from uavctl.smpc.nominal import ControlProblem, Part, propagate_covariance
 from uavctl.smpc.plant import Plant
-from uavctl.smpc.qp import pairs_of
-
-Array = NDArray[np.float64]
+from uavctl.smpc.qp import find_pairs
 
 # The allowed risk, spread over the ages of the information that a plan may be based on.
 
@@ -255,7 +254,7 @@ def _of_part(problem: ControlProblem, part: Part, seen: Plant, noise: Array) -> 
     states = _states(problem, part, seen)
     index = np.ix_(states, states)
     a, noise = seen.a[index], noise[index]
-    pairs = pairs_of(problem.state_set.c[np.ix_(part.rows_x, part.states)])
+    pairs = find_pairs(problem.state_set.c[np.ix_(part.rows_x, part.states)])
     c = np.array([pair.c for pair in pairs]).reshape(-1, part.states.size)
     c = np.pad(c, ((0, 0), (0, states.size - part.states.size)))
     own = np.zeros(part.rows_x.size, dtype=np.intp)
@@ -344,7 +343,7 @@ def _asked(
 ) -> _RestingRows:
     plant, steps = problem.plant, problem.horizon
     late = int(risk.weights.argmax())
-    spread = unseen(filtered, late + steps, cov)[late:, : plant.n_x, : plant.n_x]
+    spread = propagate_covariance(filtered, late + steps, cov)[late:, : plant.n_x, : plant.n_x]
     # Share of plans that are still flown at each age of their information, from the shares of time π.
     flown = np.minimum.accumulate(risk.weights[late:] / risk.weights[late])
     gaps = flown - np.append(flown[1:], 0.0)

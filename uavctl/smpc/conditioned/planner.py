@@ -25,12 +25,12 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.errors import DesignError
 from uavctl.records import GaveWay, SolveStatus
-from uavctl.smpc.answer import INPUT_TOLERANCE, KEPT, NOMINAL, Answer, Preview, finite, inside
-from uavctl.smpc.batch import Decisions, gathered
+from uavctl.smpc.answer import INPUT_TOLERANCE, KEPT_TOLERANCE, NOMINAL, Answer, Preview, clip_inputs, is_finite
+from uavctl.smpc.batch import Decisions, gather_answers
 from uavctl.smpc.conditioned.backoffs import (
     DISTANT,
     LARGEST_RISK,
@@ -48,16 +48,14 @@ from uavctl.smpc.conditioned.backoffs import (
 )
 from uavctl.smpc.conditioned.program import PartProgram, RegulatedRows, RestPlaces, SlewRows
 from uavctl.smpc.link import AgeModel
-from uavctl.smpc.nominal import ControlProblem, lqr, parts, unseen
+from uavctl.smpc.nominal import ControlProblem, find_parts, lqr, propagate_covariance
 from uavctl.smpc.plant import Plant, digest
 from uavctl.smpc.qp import OPEN
-from uavctl.smpc.sets import Polytope, equilibria
+from uavctl.smpc.sets import Polytope, find_equilibria
 
 if TYPE_CHECKING:
     from uavctl.smpc.hahn_stursberg.design import Design
 
-
-Array = NDArray[np.float64]
 
 METHOD = "age-conditioned"
 ROUNDS = 2  # programs of an allocation
@@ -131,7 +129,7 @@ class ConditionedSolver:
         plant, steps, law = problem.plant, problem.horizon, lqr(problem.plant, problem.q_x, problem.q_u)
         self._tail = law.p
         self._slew = SlewRows(plant, problem.input_set, slew_mps3)
-        found = parts(problem, self._slew.d)
+        found = find_parts(problem, self._slew.d)
         moved = {int(state) for part in found for state in part.states}
         if len(moved) < plant.n_x:
             adrift = sorted(set(range(plant.n_x)) - moved)
@@ -146,7 +144,7 @@ class ConditionedSolver:
         ]
         self._in_order = bool((self._rows == np.arange(problem.state_set.b.size)).all())
         self._c, self._b = problem.state_set.c[self._rows], problem.state_set.b[self._rows]
-        self._rests = equilibria(
+        self._rests = find_equilibria(
             plant.a, plant.b, problem.q_x, problem.q_u, np.array(plant.position_index, dtype=np.intp)
         )
         self._holds = bool(self._rests.u_eq.any())
@@ -195,9 +193,9 @@ class ConditionedSolver:
         """The risk by age where the target leaves room."""
         return self._transit.risk
 
-    def risk_towards(self, target: Array, outlook: Preview = NOMINAL) -> AgeRisk:
+    def risk_towards(self, target: Array, preview: Preview = NOMINAL) -> AgeRisk:
         """The spread of a plan towards `target` (n_x,): by the target, the limits and whether there is a motion."""
-        return self._towards(self._placed.dot(target[self._rests.held]), self._limits(outlook), outlook).risk
+        return self._towards(self._placed.dot(target[self._rests.held]), self._limits(preview), preview).risk
 
     def rests(self) -> Array:
         """Right sides (m_x,) of the state rows, less what a plan keeps from them that rests, whatever others do."""
@@ -205,22 +203,22 @@ class ConditionedSolver:
         sides[self._rows] -= self._near.rest[-1]
         return sides
 
-    def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:
+    def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:
         """Plan from `x` (n_x,) towards `target` (n_x,), an equilibrium; see `Solver`."""
-        if not finite(x, target, outlook):
+        if not is_finite(x, target, preview):
             return Answer.failed(seq, SolveStatus.FAILED, METHOD)
-        limits = self._limits(outlook)
+        limits = self._limits(preview)
         placed = self._placed.dot(target[self._rests.held])
-        margins = self._margins(self._towards(placed, limits, outlook), outlook)
+        margins = self._margins(self._towards(placed, limits, preview), preview)
         reference = self._reference(target, placed, limits)
         hold = self._rests.u_eq @ reference[self._rests.held] if self._holds else None
-        first = None if outlook.sent is None or not self._slew.axes.size else self._slew.first(outlook.sent)
+        first = None if preview.sent is None or not self._slew.axes.size else self._slew.first(preview.sent)
         dx = x - reference
-        low, high, less = self._reach(outlook)
+        low, high, less = self._reach(preview)
         room, hard = self._regulated.room(dx, limits - self._c @ reference, hold, first, less)
         along: list[tuple[PartProgram, Array]] = []
-        if outlook.path is not None:
-            along = [(one, one.along(outlook.path.states, outlook.path.inputs)) for one in self._parts]
+        if preview.path is not None:
+            along = [(one, one.along(preview.path.states, preview.path.inputs)) for one in self._parts]
             for one, z in along:
                 one.take(z, room, hard)
         found = self._spread(room, hard, margins)
@@ -229,9 +227,9 @@ class ConditionedSolver:
         inputs, states = self._regulated.plan(dx)
         for one, z in (*along, *found.left):
             one.add(z, inputs, states)
-        cost, slack, gave_way = self._price(inputs, states, found, outlook)
-        if first is not None and max(first[1].tolist()) > self._slew.side + KEPT:
-            gave_way += self._slew_gave_way(first[1])
+        cost, slack, relaxed = self._price(inputs, states, found, preview)
+        if first is not None and max(first[1].tolist()) > self._slew.side + KEPT_TOLERANCE:
+            relaxed += self._find_relaxed_slew(first[1])
         states += reference
         states[0] = x
         if hold is not None:
@@ -258,34 +256,34 @@ class ConditionedSolver:
             cost_lower=-np.inf,  # the spread of the risk is no convex program, and each spread's is solved to rounding
             gap=np.inf,
             iterations=found.iterations,
-            gave_way=gave_way,
+            relaxed=relaxed,
         )
 
-    def _limits(self, outlook: Preview) -> Array:
+    def _limits(self, preview: Preview) -> Array:
         """Right sides of the state rows, in each stage (H, m) or in all alike (m,)."""
         limits: Array = self._b
-        if outlook.limits is not None:
-            limits = outlook.limits[1:] if self._in_order else outlook.limits[1:, self._rows]
+        if preview.limits is not None:
+            limits = preview.limits[1:] if self._in_order else preview.limits[1:, self._rows]
         return limits
 
-    def _towards(self, placed: Array, limits: Array, outlook: Preview) -> _Spread:
+    def _towards(self, placed: Array, limits: Array, preview: Preview) -> _Spread:
         """The spread that a plan has: no age may choose its own, so it goes by nothing that an age decides.
 
         Args:
             placed: The rows that places of rest are in, at the target.
         """
-        if outlook.path is not None:
+        if preview.path is not None:
             return self._near
         kept = self._plain_far
         if limits is not self._b:
             kept = ((limits if limits.ndim == 1 else limits.min(axis=0)) - self._far)[self._resting]
         return self._transit if np.count_nonzero(placed <= kept) == kept.size else self._near
 
-    def _margins(self, spread: _Spread, outlook: Preview) -> _Margins:
-        """Return the margins of an outlook; the last ones are cached, by the exact bits that they are made of."""
-        key = spread is self._transit, outlook.late, b"" if outlook.cov is None else outlook.cov.tobytes()
+    def _margins(self, spread: _Spread, preview: Preview) -> _Margins:
+        """Return the margins of a preview; the last ones are cached, by the exact bits that they are made of."""
+        key = spread is self._transit, preview.age, b"" if preview.cov is None else preview.cov.tobytes()
         if self._last is None or self._last[0] != key:
-            sigma, late = self._deviations.of(outlook.cov), min(outlook.late, self.problem.horizon - 1)
+            sigma, late = self._deviations.of(preview.cov), min(preview.age, self.problem.horizon - 1)
             self._last = key, _Margins(sigma, spread.budgets[late], spread.shared[late] * sigma, spread.distant[late])
         return self._last[1]
 
@@ -344,7 +342,7 @@ class ConditionedSolver:
         iterations = 0
         for number in range(MOST_ROUNDS):
             if number:
-                if number >= ROUNDS and (backoff - now).max() <= KEPT:
+                if number >= ROUNDS and (backoff - now).max() <= KEPT_TOLERANCE:
                     break
                 binds = binding(backoff, now, sigma)
                 todo = [one for one in todo if np.count_nonzero(binds[:, one.columns])]
@@ -366,14 +364,14 @@ class ConditionedSolver:
             found = _Found(tuple(left.items()), backoff, now, iterations)
         return found
 
-    def _price(self, du: Array, dx: Array, found: _Found, outlook: Preview) -> tuple[float, float, tuple[GaveWay, ...]]:
+    def _price(self, du: Array, dx: Array, found: _Found, preview: Preview) -> tuple[float, float, tuple[GaveWay, ...]]:
         """Cost of a plan, from its deviations (H, n_u) and (H+1, n_x), the sum of its slacks, and what they are."""
         problem = self.problem
-        if outlook.path is None:
+        if preview.path is None:
             # The regulator's own cost, and the square of the deviation from it.
             cost = dx[0] @ self._tail @ dx[0] + sum([z.dot(z) for _, z in found.left])
         else:
-            last, dx, du = dx[-1], dx[:-1] - outlook.path.states, du - outlook.path.inputs
+            last, dx, du = dx[-1], dx[:-1] - preview.path.states, du - preview.path.inputs
             cost = np.vdot(dx @ problem.q_x, dx) + np.vdot(du @ problem.q_u, du) + last @ self._tail @ last
         if not found.left:
             return float(cost), 0.0, ()
@@ -382,30 +380,30 @@ class ConditionedSolver:
         if slack == 0.0:
             return float(cost), 0.0, ()
         cost += problem.slack_linear * slack + problem.slack_quadratic * np.vdot(over, over)
-        if slack <= KEPT:  # rounding
+        if slack <= KEPT_TOLERANCE:  # rounding
             return float(cost), slack, ()
-        stages, columns = (over > KEPT).nonzero()
-        gave_way = tuple(
+        stages, columns = (over > KEPT_TOLERANCE).nonzero()
+        relaxed = tuple(
             GaveWay(constraint="state", stage=t + 1, index=i, amount=amount)
             for t, i, amount in zip(
                 stages.tolist(), self._rows[columns].tolist(), over[stages, columns].tolist(), strict=True
             )
         )
-        return float(cost), slack, gave_way
+        return float(cost), slack, relaxed
 
-    def _slew_gave_way(self, side: Array) -> tuple[GaveWay, ...]:
+    def _find_relaxed_slew(self, side: Array) -> tuple[GaveWay, ...]:
         """The rows of the first step that leave more than the gate lets through, by `side` (m,)."""
         over = side - self._slew.side
         return tuple(
             GaveWay(constraint="slew", stage=0, index=int(self._slew.axes[i]), amount=float(over[i]))
-            for i in np.flatnonzero(over > KEPT)
+            for i in np.flatnonzero(over > KEPT_TOLERANCE)
         )
 
-    def _reach(self, outlook: Preview) -> tuple[Array, Array, Array | None]:
+    def _reach(self, preview: Preview) -> tuple[Array, Array, Array | None]:
         """Return the least and the largest inputs of each stage, and how much smaller the rows of U are for it (m,)."""
-        if outlook.inputs is None or not self._box:
+        if preview.inputs is None or not self._box:
             return self._low, self._high, None
-        low, high = (side.clip(self._low[0], self._high[0]) for side in outlook.inputs)
+        low, high = (side.clip(self._low[0], self._high[0]) for side in preview.inputs)
         c, b = self.problem.input_set.c, self.problem.input_set.b
         column = (c != 0.0).argmax(axis=1)
         each = c[np.arange(len(b)), column]
@@ -414,7 +412,7 @@ class ConditionedSolver:
     def _inside(self, inputs: Array, solved: bool, low: Array, high: Array) -> tuple[Array, bool]:
         """Inputs (H, n_u) within their limits to the last bit, and whether they were but for rounding."""
         if not self._box:
-            return inside(inputs, self.problem.input_set.c, self.problem.input_set.b)
+            return clip_inputs(inputs, self.problem.input_set.c, self.problem.input_set.b)
         cut: Array = np.minimum(np.maximum(inputs, low), high)
         return cut, not solved or float(np.abs(cut - inputs).max()) <= INPUT_TOLERANCE
 
@@ -434,17 +432,17 @@ class ConditionedDecider:
 
     def __init__(self, solver: ConditionedSolver, target: Array) -> None:
         self._solver, self._target = solver, target
-        self._unseen = unseen(solver.problem.plant, solver.problem.horizon)
+        self._unseen = propagate_covariance(solver.problem.plant, solver.problem.horizon)
 
     def decide(self, x: Array, late: int, cov: Array | None = None) -> Decisions:
         """See `Decider`."""
-        exact, problem = Preview(late=late, cov=self._unseen[late] if late else None), self._solver.problem
-        outlooks = [exact] * len(x) if cov is None else [Preview(late=late, cov=one) for one in cov]
+        exact, problem = Preview(age=late, cov=self._unseen[late] if late else None), self._solver.problem
+        previews = [exact] * len(x) if cov is None else [Preview(age=late, cov=one) for one in cov]
         answers = [
-            self._solver.solve(i, row, self._target, outlook)
-            for i, (row, outlook) in enumerate(zip(x, outlooks, strict=True))
+            self._solver.solve(i, row, self._target, preview)
+            for i, (row, preview) in enumerate(zip(x, previews, strict=True))
         ]
-        return gathered(answers, (problem.horizon, problem.plant.n_u))
+        return gather_answers(answers, (problem.horizon, problem.plant.n_u))
 
 
 # Design for flights with risk conditioned on the age: the counterpart of a design, made at once.

@@ -9,9 +9,10 @@ from operator import le
 import numpy as np
 from numpy.typing import NDArray
 
-from uavctl.smpc.nominal import ControlProblem, Lqr, Part, regulated
+from uavctl.arrays import Array
+from uavctl.smpc.nominal import ControlProblem, Lqr, Part, predict_regulated
 from uavctl.smpc.plant import Plant
-from uavctl.smpc.qp import ACTIVE, BELOW, OPEN, SOFT, FirstRows, QuadraticProgram, Sense, pairs_of
+from uavctl.smpc.qp import ACTIVE, BELOW, OPEN, SOFT, FirstRows, QuadraticProgram, Sense, find_pairs
 from uavctl.smpc.sets import Equilibria, Polytope
 
 # Rows on how far the acceleration setpoint may go from one step to the next, as the last gate lets it.
@@ -21,7 +22,6 @@ from uavctl.smpc.sets import Equilibria, Polytope
 # is sent is behind the plan by half a step in the mean.
 
 
-Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 _APART = 1e-8  # of a setpoint: what the first row and the set of inputs have in common is wider than this
@@ -83,7 +83,7 @@ class SlewRows:
 # The program of one independent part: how to leave the regulator's plan so that rows are kept, at the least cost.
 
 
-MOST_ITERATIONS = 2000  # of one program
+MAX_ITERATIONS = 2000  # of one program
 
 
 class PartProgram:
@@ -114,7 +114,7 @@ class PartProgram:
     ) -> None:
         self.part, self.columns, self.hard = part, columns, hard
         self._steps = steps = problem.horizon
-        states, inputs = (of[:, :, part.states.size :] for of in regulated(problem, law, part))
+        states, inputs = (of[:, :, part.states.size :] for of in predict_regulated(problem, law, part))
         n = states.shape[2]
         self._plan = np.vstack([inputs.reshape(-1, n), states[1:].reshape(-1, n)])
         self._inputs, self._states = _slice(part.inputs), _slice(part.states)
@@ -151,11 +151,11 @@ class PartProgram:
             np.where(soft, SOFT, 0).astype(np.int32),
             np.where(soft, problem.slack_linear, 0.0),
             np.where(soft, problem.slack_quadratic, 0.0),
-            most=MOST_ITERATIONS,
+            max_iterations=MAX_ITERATIONS,
             linear=False,
         )
-        suits = FirstRows.suits(*by_stage, len(d))
-        self._first = FirstRows(*by_stage, self._program.sense).of if suits else self._ramps
+        is_suitable = FirstRows.is_suitable(*by_stage, len(d))
+        self._first = FirstRows(*by_stage, self._program.sense).guess if is_suitable else self._ramps
 
     def along(self, path_x: Array, path_u: Array) -> Array:
         """z (n,) that follows a path of the whole plant (H, n_x), (H, n_u) at the least cost, without limits."""
@@ -237,7 +237,7 @@ def _add(change: Array, to: Array, columns: slice | Index) -> None:
 
 def _sides(c: Array) -> tuple[Index, Index]:
     """Rows that limit each direction from above and from below, -1 for none: (d,), (d,)."""
-    rows = [dict(pair.sides) for pair in pairs_of(c)]
+    rows = [dict(pair.sides) for pair in find_pairs(c)]
     above, below = (np.array([sides.get(sign, -1) for sides in rows], dtype=np.intp) for sign in (1.0, -1.0))
     return above, below
 
@@ -296,7 +296,7 @@ class RegulatedRows:
         self._steps, self._n_x, self._n_u = steps, n_x, plant.n_u
         states, inputs = np.zeros((steps + 1, n_x, n_x)), np.zeros((steps, plant.n_u, n_x))
         for part in parts:
-            of_x, of_u = (of[:, :, : part.states.size] for of in regulated(problem, law, part))
+            of_x, of_u = (of[:, :, : part.states.size] for of in predict_regulated(problem, law, part))
             states[:, part.states[:, None], part.states] = of_x
             inputs[:, part.inputs[:, None], part.states] = of_u
         # Tall matrices, column by column: the product is a few long sums then.

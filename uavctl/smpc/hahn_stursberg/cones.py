@@ -15,9 +15,9 @@ from typing import TypeVar
 
 import clarabel
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
+from uavctl.arrays import Array
 from uavctl.smpc.sets import Scale
 
 # Settings of Clarabel for direct calls.
@@ -46,7 +46,6 @@ def conic_settings(max_iterations: int, rows: int) -> clarabel.DefaultSettings:
     return settings
 
 
-Array = NDArray[np.float64]
 Result = TypeVar("Result")
 
 # A linear cost above _STEEPEST, as far outside the limits, would pass for an unbounded problem: it becomes _STEEP.
@@ -265,7 +264,7 @@ class ConicProgram:
             b = self._b_const + self._b_par @ parameters
             origin = np.zeros(q.size)
             if self._origin is not None:
-                origin = self._scale.beyond_usual(self._origin(parameters))
+                origin = self._scale.excess_over_usual(self._origin(parameters))
                 slope = self._p @ origin
                 constant += float((q + 0.5 * slope) @ origin)
                 q, b = q + slope, b - self._a @ origin

@@ -8,9 +8,9 @@ from itertools import islice
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import gammaincinv, ndtri
 
+from uavctl.arrays import Array
 from uavctl.errors import DesignError
 from uavctl.records import Vec3
 from uavctl.smpc.hahn_stursberg.schedule import Schedule, ScheduleDemand, fixed, greedy, nested
@@ -21,8 +21,8 @@ from uavctl.smpc.hahn_stursberg.terminal import (
     make_terminal,
     stationary_cost,
 )
-from uavctl.smpc.link import LinkModel, at_most
-from uavctl.smpc.plant import Plant, digest, steps_to_reach
+from uavctl.smpc.link import LinkModel, age_cdf
+from uavctl.smpc.plant import Plant, count_reach_steps, digest
 from uavctl.smpc.sets import Polytope
 
 # Risk allocation: how a likelihood becomes the factor of a back-off.
@@ -47,7 +47,6 @@ def kappa(gamma: float, n: int, rows: int, allocation: Allocation) -> float:
 # A complete design: what the decision problem is made from, checked against Assumption 4 and frozen.
 
 
-Array = NDArray[np.float64]
 Rule = Literal["fixed", "search", "greedy"]
 # A candidate costs one program built and solved for each search state: this many are minutes.
 MOST_CANDIDATES = 500
@@ -141,7 +140,7 @@ def make_design(spec: DesignSpec, cost_of: Callable[[Design, Array], float | Non
 
 def _check_horizon(spec: DesignSpec) -> None:
     """The mean is at the target from stage N = H - τ on: N steps have to suffice from any state."""
-    free, least = spec.horizon - spec.tau, steps_to_reach(spec.plant)
+    free, least = spec.horizon - spec.tau, count_reach_steps(spec.plant)
     if free < least:
         raise DesignError(
             "smpc.tau",
@@ -224,7 +223,7 @@ def assembled(spec: DesignSpec, schedule: Schedule, terminal: Terminal, past: in
         kappa_x=kappa_x_terminal,
         kappa_u=kappa_u_terminal,
         # (17) is asked of all times: those of the horizon, and the long run.
-        age_within_tau=min(1.0 - spec.link.outage(spec.tau + 1), *(at_most(mu, t, spec.tau) for t in range(len(mu)))),
+        age_within_tau=min(1.0 - spec.link.outage(spec.tau + 1), *(age_cdf(mu, t, spec.tau) for t in range(len(mu)))),
         delta_tau=spec.delta_tau,
     )
     design = Design(

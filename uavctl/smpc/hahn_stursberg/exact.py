@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.errors import DesignError
 from uavctl.records import GaveWay, SolveStatus
-from uavctl.smpc.answer import KEPT, NOMINAL, Answer, Preview, finite, inside, relative_gap
+from uavctl.smpc.answer import KEPT_TOLERANCE, NOMINAL, Answer, Preview, clip_inputs, is_finite, relative_gap
 from uavctl.smpc.hahn_stursberg.cones import BREAKDOWN, Expression, ProgramBuilder, Solution
 from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec, assembled
 from uavctl.smpc.hahn_stursberg.horizon import (
@@ -35,8 +35,6 @@ from uavctl.smpc.plant import digest
 
 # From the answers of independent components to the answer for the whole plant.
 
-
-Array = NDArray[np.float64]
 
 # The worst of several components' endings is the plan's: the later in this list, the worse.
 _ORDER = (
@@ -77,7 +75,7 @@ def assemble(
     method: str,
     x: Array,
     parts: Sequence[tuple[Component, PartAnswer]],
-    outlook: Preview = NOMINAL,
+    preview: Preview = NOMINAL,
 ) -> Answer:
     """Answer for the whole plant from `x` (n_x,); without a plan if a component has none."""
     status = max((part.status for _, part in parts), key=_ORDER.index)
@@ -111,26 +109,26 @@ def assemble(
         gap=relative_gap(cost, cost_lower),
         iterations=iterations,
     )
-    return told(design, answer, [component for component, _ in parts], outlook)
+    return told(design, answer, [component for component, _ in parts], preview)
 
 
-def told(design: Design, answer: Answer, components: Sequence[Component], outlook: Preview) -> Answer:
+def told(design: Design, answer: Answer, components: Sequence[Component], preview: Preview) -> Answer:
     """The answer with the names of what gave way, if anything did."""
-    if max(answer.slack, answer.terminal_miss) <= KEPT and outlook.limits is None:
+    if max(answer.slack, answer.terminal_miss) <= KEPT_TOLERANCE and preview.limits is None:
         return answer
-    return replace(answer, gave_way=gave_way(design, answer, components, outlook))
+    return replace(answer, relaxed=gave_way(design, answer, components, preview))
 
 
-def gave_way(design: Design, answer: Answer, components: Sequence[Component], outlook: Preview) -> tuple[GaveWay, ...]:
+def gave_way(design: Design, answer: Answer, components: Sequence[Component], preview: Preview) -> tuple[GaveWay, ...]:
     """Constraints that an answer does not keep: tightened state rows, terminal rows, the terminal equality."""
-    limits = outlook.limits
+    limits = preview.limits
     if limits is None:
         limits = np.tile(design.state_set.b, (design.horizon + 1, 1))
     free = design.horizon - design.terminal.tau
     given: list[GaveWay] = []
 
     def add(constraint: str, stage: int, excess: Array) -> None:
-        for i in np.flatnonzero(excess > KEPT):
+        for i in np.flatnonzero(excess > KEPT_TOLERANCE):
             given.append(GaveWay(constraint=constraint, stage=stage, index=int(i), amount=float(excess[i])))
 
     excess = answer.states @ design.state_set.c.T + answer.backoff_x - limits
@@ -191,17 +189,17 @@ class ConicSolver:
         self._parts = tuple(PartSolver(design, component) for component in decompose(design))
         self._late: dict[int, ConicSolver] = {}
 
-    def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:
+    def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:
         """Plan from `x` (n_x,) towards the equilibrium `target` (n_x,), with what is known ahead.
 
         Numbers that are not finite give an answer FAILED, as does a solver that breaks down; nothing is raised.
         """
-        if not finite(x, target, outlook) or outlook.late > len(self._design.late):
+        if not is_finite(x, target, preview) or preview.age > len(self._design.late):
             return Answer.failed(seq, SolveStatus.FAILED, METHOD)
-        if outlook.late:
-            return self._of_late(outlook.late).solve(seq, x, target, replace(outlook, late=0))
-        parts = [(part.component, part.solve(x, target, outlook)) for part in self._parts]
-        return assemble(self._design, seq, METHOD, x, parts, outlook)
+        if preview.age:
+            return self._of_late(preview.age).solve(seq, x, target, replace(preview, age=0))
+        parts = [(part.component, part.solve(x, target, preview)) for part in self._parts]
+        return assemble(self._design, seq, METHOD, x, parts, preview)
 
     def _of_late(self, late: int) -> ConicSolver:
         """The solver of the design for positions `late` steps old; built when it is first asked for."""
@@ -223,15 +221,15 @@ class PartSolver:
         self._noise_x = stack([self.horizon.state_noise(t, component.c_x) for t in range(design.horizon + 1)])
         self._noise_u = stack([self.horizon.input_noise(t, component.c_u) for t in range(design.horizon)])
 
-    def solve(self, x: Array, target: Array, outlook: Preview = NOMINAL) -> PartAnswer:
-        """Solve for the whole plant's state, target and outlook."""
+    def solve(self, x: Array, target: Array, preview: Preview = NOMINAL) -> PartAnswer:
+        """Solve for the whole plant's state, target and preview."""
         x, target = x[self.component.states], target[self.component.states]
         program = self._exact
-        solution = program.conic.solve(program.parameters(x, target, outlook))
+        solution = program.conic.solve(program.parameters(x, target, preview))
         status, iterations = _STATUS[solution.status], solution.iterations
         if status not in (SolveStatus.OPTIMAL, SolveStatus.ITERATION_LIMIT):
             program = self._missing
-            solution = program.conic.solve(program.parameters(x, target, outlook))
+            solution = program.conic.solve(program.parameters(x, target, preview))
             status = _STATUS[solution.status]
             iterations += solution.iterations
         if not (np.all(np.isfinite(solution.variables)) and np.isfinite(solution.cost)):
@@ -256,7 +254,7 @@ class PartSolver:
         y = here + values[layout.y]
         wanted = np.repeat((part.u_eq @ y)[None], horizon.steps, axis=0)
         wanted[: horizon.free] = values[layout.v].reshape(horizon.free, -1) + part.u_eq @ here
-        inputs, kept = inside(wanted, part.c_u, part.b_u)
+        inputs, kept = clip_inputs(wanted, part.c_u, part.b_u)
         unproven = relative_gap(solution.cost, solution.cost_lower) > _PROVEN
         if (unproven or not kept) and status is SolveStatus.OPTIMAL:
             status = SolveStatus.INACCURATE
@@ -366,7 +364,7 @@ def optimal_cost(design: Design, x: Array) -> float | None:
     answer = solver.solve(0, x, design.target)
     if answer.status is not SolveStatus.OPTIMAL:
         return None
-    return None if max(answer.slack, answer.offset, answer.terminal_miss) > KEPT else answer.cost
+    return None if max(answer.slack, answer.offset, answer.terminal_miss) > KEPT_TOLERANCE else answer.cost
 
 
 # Plans that are based on late positions (re-basing).
@@ -386,13 +384,13 @@ class LateDemand(ScheduleDemand):
     def alpha(self, t: int, delay: int) -> float:
         """P(w(k+t-d) is known at stage t | a(k) = late); 1 where that is not a disturbance since the base."""
         newest = t - delay + self.late
-        return 1.0 if newest < 0 else self.link.available(t + self.late, newest, self.late)
+        return 1.0 if newest < 0 else self.link.availability(t + self.late, newest, self.late)
 
     def usable(self, delays: Sequence[int]) -> Array:
         """See `ScheduleDemand`."""
         if self.joint:
             sunk = range(1, self.late + 1)  # longer than the time since the base: no feedback
-            return self.link.jointly((*sunk, *(delays)), self.late)[self.late :]
+            return self.link.joint_availability((*sunk, *(delays)), self.late)[self.late :]
         return super().usable(delays)
 
 

@@ -16,8 +16,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.records import SolveStatus
-from uavctl.smpc.answer import NOMINAL, Answer, Preview, inside, relative_gap
+from uavctl.smpc.answer import NOMINAL, Answer, Preview, clip_inputs, relative_gap
 from uavctl.smpc.batch import Decisions
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.exact import METHOD, PartAnswer, PartSolver, assemble
@@ -25,8 +26,6 @@ from uavctl.smpc.hahn_stursberg.horizon import Component, decompose
 from uavctl.smpc.hahn_stursberg.mean import MeanProblem, RowKind, by_rows, dot_rows
 from uavctl.smpc.hahn_stursberg.policy import Policy, cheapest_policy
 from uavctl.smpc.qp import EQUAL, SOFT, QuadraticProgram
-
-Array = NDArray[np.float64]
 
 FROZEN = "frozen"  # the method of an answer that no component needed the exact program for
 
@@ -75,13 +74,13 @@ class Shortcut:
         half_room = 0.5 * (problem.upper - problem.lower)[self._pins]
         self._level = policy.level - float(slope[self._pins] @ half_room)
 
-    def solve(self, x: Array, target: Array, outlook: Preview) -> list[PartAnswer | None]:
-        """Answers for states (M, n_x) of the whole plant, with one target (n_x,) and outlook.
+    def solve(self, x: Array, target: Array, preview: Preview) -> list[PartAnswer | None]:
+        """Answers for states (M, n_x) of the whole plant, with one target (n_x,) and preview.
 
         None where the policy is not proven optimal.
         """
         problem, part = self._problem, self._problem.horizon.component
-        ask = problem.question(x[:, part.states], target[part.states], outlook)
+        ask = problem.question(x[:, part.states], target[part.states], preview)
         above, below = ask.upper - ask.offset - self._backoff, ask.lower - ask.offset + self._backoff
         above[:, self._pins] = below[:, self._pins] = 0.5 * (above + below)[:, self._pins]
         q, net = np.full_like(ask.f, np.nan), np.full_like(ask.offset, np.nan)  # NaN where there is no optimum
@@ -100,7 +99,7 @@ class Shortcut:
         cost_lower = ask.constant + self._level - bound
         w, here = by_rows(q, problem.z.T) + by_rows(ask.p, problem.w.T), ask.p[:, problem.n_p - problem.n_y :]
         inputs = problem.inputs(w, here)
-        inputs = inside(inputs.reshape(-1, inputs.shape[2]), part.c_u, part.b_u)[0].reshape(inputs.shape)
+        inputs = clip_inputs(inputs.reshape(-1, inputs.shape[2]), part.c_u, part.b_u)[0].reshape(inputs.shape)
         reference = by_rows(w[:, problem.n_v :] + here, part.x_eq.T)
         fits: NDArray[np.bool_] = np.all(np.abs(net) <= self._largest, axis=1)
         return [
@@ -123,11 +122,11 @@ class Shortcut:
         ]
 
 
-def _answerable(x: Array, target: Array, outlook: Preview) -> NDArray[np.bool_]:
+def _answerable(x: Array, target: Array, preview: Preview) -> NDArray[np.bool_]:
     """Which questions (M,) are finite, and small enough for their squares to be."""
-    given = [target] if outlook.limits is None else [target, outlook.limits]
-    if outlook.path is not None:
-        given += [outlook.path.states, outlook.path.inputs]
+    given = [target] if preview.limits is None else [target, preview.limits]
+    if preview.path is not None:
+        given += [preview.path.states, preview.path.inputs]
     common = all(bool((np.abs(values) < _ABSURD).all()) for values in given)
     which: NDArray[np.bool_] = np.all(np.abs(x) < _ABSURD, axis=1)
     return which & common
@@ -161,13 +160,13 @@ class _Part:
         # None where there is no frozen policy
         self._shortcut = None if policy is None else Shortcut(problem, policy, *self.exact.backoffs(policy.theta))
 
-    def solve(self, x: Array, target: Array, outlook: Preview) -> list[Share]:
+    def solve(self, x: Array, target: Array, preview: Preview) -> list[Share]:
         """Shares of the answers from the whole plant's states (M, n_x)."""
         if not len(x):
             return []
-        frozen = [None] * len(x) if self._shortcut is None else self._shortcut.solve(x, target, outlook)
+        frozen = [None] * len(x) if self._shortcut is None else self._shortcut.solve(x, target, preview)
         return [
-            Share(METHOD, self.exact.solve(state, target, outlook)) if answer is None else Share(FROZEN, answer)
+            Share(METHOD, self.exact.solve(state, target, preview)) if answer is None else Share(FROZEN, answer)
             for state, answer in zip(x, frozen, strict=True)
         ]
 
@@ -190,24 +189,24 @@ class ShortcutSolver:
             for variant in (design, *design.late)
         )
 
-    def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:
+    def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:
         """Plan from `x` (n_x,) towards the equilibrium `target` (n_x,), with what is known ahead.
 
         Numbers that are not finite, or absurdly large, give an answer FAILED, as does a solver that breaks down;
         nothing is raised.
         """
-        design, shares = self.shares(x[None], target, outlook)
+        design, shares = self.shares(x[None], target, preview)
         method = FROZEN if all(share.method == FROZEN for _, (share,) in shares) else METHOD
-        return assemble(design, seq, method, x, [(part, share.answer) for part, (share,) in shares], outlook)
+        return assemble(design, seq, method, x, [(part, share.answer) for part, (share,) in shares], preview)
 
-    def shares(self, x: Array, target: Array, outlook: Preview) -> tuple[Design, list[tuple[Component, list[Share]]]]:
+    def shares(self, x: Array, target: Array, preview: Preview) -> tuple[Design, list[tuple[Component, list[Share]]]]:
         """Each component's shares of the answers from states (M, n_x), with the design that they are made by."""
-        known = outlook.late < len(self._variants)
-        design, parts = self._variants[outlook.late if known else 0]
-        asked = _answerable(x, target, outlook) & known
+        known = preview.age < len(self._variants)
+        design, parts = self._variants[preview.age if known else 0]
+        asked = _answerable(x, target, preview) & known
         shares = []
         for part in parts:
-            found = iter(part.solve(x[asked], target, outlook))
+            found = iter(part.solve(x[asked], target, preview))
             failed = Share(METHOD, PartAnswer.failed(SolveStatus.FAILED))
             shares.append((part.exact.component, [next(found) if one else failed for one in asked]))
         return design, shares
@@ -225,7 +224,7 @@ class ShortcutDecider:
     def decide(self, x: Array, late: int, cov: Array | None = None) -> Decisions:  # noqa: ARG002 a design has its own
         """See `Decider`."""
         states, which = np.unique(x, axis=0, return_inverse=True)  # runs begin in one state
-        design, shares = self._solver.shares(states, self._target, Preview(late=late))
+        design, shares = self._solver.shares(states, self._target, Preview(age=late))
         solved = np.ones(len(states), dtype=np.bool_)
         inputs = np.zeros((len(states), design.horizon, design.plant.n_u))
         slack, cost, cost_lower = np.zeros((3, len(states)))

@@ -22,10 +22,11 @@ from scipy import sparse
 from scipy.linalg import block_diag, qr
 from scipy.sparse.csgraph import connected_components
 
+from uavctl.arrays import Array
 from uavctl.errors import DesignError
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.schedule import Schedule
-from uavctl.smpc.sets import RANK_TOLERANCE, equilibrated, equilibria
+from uavctl.smpc.sets import RANK_TOLERANCE, equilibrate, find_equilibria
 
 # Decomposition of the decision problem into independent parts.
 #
@@ -34,7 +35,6 @@ from uavctl.smpc.sets import RANK_TOLERANCE, equilibrated, equilibria
 # gains across components only add cost and covariance. The χ² quantiles stay those of the whole plant.
 
 
-Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 
@@ -124,7 +124,7 @@ def _component(design: Design, states: Index, inputs: Index, disturbances: Index
     z = np.concatenate([states, *(plant.n_x + i * plant.n_u + inputs for i in range(terminal.tau))])
     a, b = plant.a[np.ix_(states, states)], plant.b[np.ix_(states, inputs)]
     q_x, q_u = design.q_x[np.ix_(states, states)], design.q_u[np.ix_(inputs, inputs)]
-    rest = equilibria(a, b, q_x, q_u, np.flatnonzero(np.isin(states, plant.position_index)))
+    rest = find_equilibria(a, b, q_x, q_u, np.flatnonzero(np.isin(states, plant.position_index)))
     return Component(
         states=states,
         inputs=inputs,
@@ -343,7 +343,7 @@ def _shown(e: Array, w: Array) -> tuple[Array, Array, Array]:
 
 def _felt(b: Array) -> Array:
     """Rows of B, as many as its rank, that tell what of an input the state feels: the identity if that is all of it."""
-    unit_x, unit_u = equilibrated(b)
+    unit_x, unit_u = equilibrate(b)
     scaled = b * np.outer(unit_x, unit_u)
     _, triangle, order = qr(scaled.T, mode="economic", pivoting=True)
     rank = int(np.sum(np.abs(np.diagonal(triangle)) > RANK_TOLERANCE))

@@ -14,13 +14,13 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.smpc.answer import NOMINAL, Preview
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.horizon import Affine, Horizon
 from uavctl.smpc.hahn_stursberg.program import factor, terminal_backoff_u, terminal_backoff_x
-from uavctl.smpc.qp import OPEN, pairs_of
+from uavctl.smpc.qp import OPEN, find_pairs
 
-Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 # A reference that N steps cannot reach from every state leaves rows of the terminal equality without an input.
@@ -55,7 +55,7 @@ class Row:
 
 @dataclass(frozen=True, eq=False)
 class Question:
-    """One question, or several with the same target and outlook, in the numbers of the QPs."""
+    """One question, or several with the same target and preview, in the numbers of the QPs."""
 
     f: Array  # linear term of the cost (…, n_q)
     constant: Array  # its constant (…)
@@ -116,24 +116,24 @@ class MeanProblem:
         here, there = by_rows(x, part.coordinates.T), part.coordinates @ target
         return np.concatenate([x - by_rows(here, part.x_eq.T), there - here, here], axis=-1)
 
-    def residual(self, p: Array, outlook: Preview) -> Array:
+    def residual(self, p: Array, preview: Preview) -> Array:
         """The cost's residuals at q = 0 (…, n_r)."""
         residual = by_rows(p, self.residual_p.T)
-        if outlook.path is None:
+        if preview.path is None:
             return residual
         part, free = self.horizon.component, self.horizon.free
-        path = (outlook.path.states[:free, part.states], outlook.path.inputs[:free, part.inputs])
+        path = (preview.path.states[:free, part.states], preview.path.inputs[:free, part.inputs])
         roots = (factor(part.q_x), factor(part.q_u))
         wanted = np.concatenate([(values @ root.T).ravel() for values, root in zip(path, roots, strict=True)])
         residual -= wanted
         return residual
 
-    def sides(self, outlook: Preview) -> tuple[Array, Array]:
+    def sides(self, preview: Preview) -> tuple[Array, Array]:
         """Upper and lower limits (m,) of every row, without back-offs."""
-        if outlook.limits is None:
+        if preview.limits is None:
             return self.upper, self.lower
         part, free = self.horizon.component, self.horizon.free
-        limits = outlook.limits[:, part.rows_x]
+        limits = preview.limits[:, part.rows_x]
         last = limits[free:].min(axis=0)
         upper, lower = self.upper.copy(), self.lower.copy()
         for i in self._moving:
@@ -143,12 +143,12 @@ class MeanProblem:
             lower[i] = -b[row.lower] if row.lower >= 0 else -np.inf
         return upper, lower
 
-    def question(self, x: Array, target: Array, outlook: Preview = NOMINAL) -> Question:
-        """Questions in numbers: states (…, n_x) and target (n_x,) of this component, outlook of the whole plant."""
+    def question(self, x: Array, target: Array, preview: Preview = NOMINAL) -> Question:
+        """Questions in numbers: states (…, n_x) and target (n_x,) of this component, preview of the whole plant."""
         p = self.parameters(x, target)
         # cost = ½ qᵀHq + fᵀq + c, with f = 2 R_qᵀ r, c = rᵀr and the residuals r at q = 0
-        residual = self.residual(p, outlook)
-        upper, lower = self.sides(outlook)
+        residual = self.residual(p, preview)
+        upper, lower = self.sides(preview)
         return Question(
             f=by_rows(2.0 * residual, self.residual_q),
             constant=dot_rows(residual, residual),
@@ -284,7 +284,7 @@ def dot_rows(left: Array, right: Array) -> Array:
 def _directions(c: Array) -> list[tuple[Array, tuple[int, int]]]:
     """Directions of a set's rows, each with the rows that limit +c and -c (-1 for none)."""
     found = []
-    for pair in pairs_of(c):
+    for pair in find_pairs(c):
         rows = dict(pair.sides)
         found.append((np.array(pair.c), (rows.get(1.0, -1), rows.get(-1.0, -1))))
     return found

@@ -18,11 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from uavctl.arrays import Array
 from uavctl.smpc.hahn_stursberg.cones import conic_settings, unless_panic
 from uavctl.smpc.hahn_stursberg.horizon import Affine, Horizon, terminal_bound
 from uavctl.smpc.hahn_stursberg.mean import MeanProblem, Row
-
-Array = NDArray[np.float64]
 
 # A multiplier that weighs less than this share of the cost is the solver's rounding.
 _NOTHING = 1e-7

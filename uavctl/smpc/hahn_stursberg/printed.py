@@ -15,16 +15,14 @@ import warnings
 
 import cvxpy as cp
 import numpy as np
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.records import SolveStatus
-from uavctl.smpc.answer import NOMINAL, Answer, Preview, finite, inside
+from uavctl.smpc.answer import NOMINAL, Answer, Preview, clip_inputs, is_finite
 from uavctl.smpc.hahn_stursberg.cones import unless_panic
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.exact import PartAnswer, assemble
 from uavctl.smpc.hahn_stursberg.horizon import Component, decompose, whole
-
-Array = NDArray[np.float64]
 
 METHOD = "printed"
 
@@ -116,7 +114,7 @@ class PrintedProblem:
             return PartAnswer(
                 status, iterations, empty, empty, empty, np.zeros(0), np.inf, np.inf, np.inf, np.inf, -np.inf
             )
-        inputs, kept = inside(self._v.value, part.c_u, part.b_u)
+        inputs, kept = clip_inputs(self._v.value, part.c_u, part.b_u)
         effect = np.array([part.c_x @ g.value for g in self._effect])
         gain = np.array([part.c_u @ m.value for m in self._gain])
         return PartAnswer(
@@ -172,12 +170,12 @@ class PrintedSolver:
         components = (whole(design),) if joint else decompose(design)
         self._problems = tuple(PrintedProblem(design, component, regularization) for component in components)
 
-    def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:
+    def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:
         """Plan from `x` (n_x,) to the equilibrium `target` (n_x,); never raises on numbers.
 
-        The printed problem knows no outlook: with limits of their own, a path or a late position the answer is FAILED.
+        The printed problem knows no preview: with limits of their own, a path or a late position the answer is FAILED.
         """
-        if not finite(x, target, outlook) or not outlook.nominal:
+        if not is_finite(x, target, preview) or not preview.nominal:
             return Answer.failed(seq, SolveStatus.FAILED, METHOD)
         parts = [(problem.component, problem.solve(x, target)) for problem in self._problems]
         return assemble(self._design, seq, METHOD, x, parts)

@@ -10,13 +10,13 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.smpc.answer import NOMINAL, Preview
 from uavctl.smpc.hahn_stursberg.cones import ConicProgram, Expression, ProgramBuilder, join
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.horizon import Affine, Component, Horizon, terminal_bound
-from uavctl.smpc.qp import Pair, VariableLayout, pairs_of
+from uavctl.smpc.qp import Pair, VariableLayout, find_pairs
 from uavctl.smpc.sets import NaturalSizes, Scale
 
 # A point near a question's answer, for numbers to be relative to.
@@ -24,9 +24,6 @@ from uavctl.smpc.sets import NaturalSizes, Scale
 # The plan that rests at the place in the limits nearest to where the state would drift, with the slack that this
 # takes. From far outside the limits the answer differs from it by numbers of the usual size, which the solver finds
 # with its usual accuracy; the large ones are in the point.
-
-
-Array = NDArray[np.float64]
 
 
 class RestingPoint:
@@ -115,13 +112,13 @@ class Program:
     def __init__(self, design: Design, horizon: Horizon, *, soft_terminal: bool) -> None:
         self.design, self.horizon, self.part = design, horizon, horizon.component
         self._last = horizon.steps if soft_terminal else horizon.free - 1  # last stage with state rows
-        self._pairs_x = pairs_of(self.part.c_x)
-        self._pairs_u = pairs_of(self.part.c_u)
+        self._pairs_x = find_pairs(self.part.c_x)
+        self._pairs_u = find_pairs(self.part.c_u)
         n_x, n_y = self.part.x_eq.shape
         self._placed = np.any(self.part.c_x @ self.part.x_eq != 0, axis=1)  # rows of x_s that y moves
         self._sizes = _sizes(self.part, horizon.free)
         self._backoff_sizes: list[float] = []
-        self.layout = VariableLayout.of(
+        self.layout = VariableLayout.make(
             v=horizon.gamma.shape[2],
             theta=horizon.n_theta,
             y=n_y,
@@ -153,17 +150,17 @@ class Program:
         scale = Scale(self._variable_sizes(), cost)
         self.conic: ConicProgram = self._builder.build(design.max_iterations, scale, origin)
 
-    def parameters(self, x: Array, target: Array, outlook: Preview = NOMINAL) -> Array:
-        """Parameters for a state (n_x,) and a target (n_x,) of this component, and the whole plant's outlook."""
+    def parameters(self, x: Array, target: Array, preview: Preview = NOMINAL) -> Array:
+        """Parameters for a state (n_x,) and a target (n_x,) of this component, and the whole plant's preview."""
         part, free = self.part, self.horizon.free
         here, there = part.coordinates @ x, part.coordinates @ target
         limits = np.tile(part.b_x, self._last + 1)
-        if outlook.limits is not None:
-            b = outlook.limits[:, part.rows_x]
+        if preview.limits is not None:
+            b = preview.limits[:, part.rows_x]
             limits = np.concatenate([b[1 : self._last + 1], b[free:].min(axis=0)[None]]).ravel()
         path = np.zeros(free * (part.x_eq.shape[0] + part.b.shape[1]))
-        if outlook.path is not None:
-            states, inputs = outlook.path.states[:free, part.states], outlook.path.inputs[:free, part.inputs]
+        if preview.path is not None:
+            states, inputs = preview.path.states[:free, part.states], preview.path.inputs[:free, part.inputs]
             path = np.concatenate([states.ravel(), inputs.ravel()])
         return np.concatenate([x - part.x_eq @ here, there - here, here, limits, path])
 
@@ -321,7 +318,9 @@ class Program:
 
 
 def _sizes(part: Component, free: int) -> NaturalSizes:
-    return NaturalSizes.of(part.a, part.b, part.q_x, part.q_u, part.c_u, part.b_u, part.sigma_x, part.k, free)
+    return NaturalSizes.from_component(
+        part.a, part.b, part.q_x, part.q_u, part.c_u, part.b_u, part.sigma_x, part.k, free
+    )
 
 
 def terminal_backoff_x(design: Design, part: Component) -> Array:

@@ -13,12 +13,11 @@ from itertools import accumulate
 from operator import mul
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.errors import DesignError
 from uavctl.smpc.link import LinkModel, information_probability
 
-Array = NDArray[np.float64]
 # The bounds of α and of their product are strict: equality makes γ = 1 and the back-off infinite.
 _STRICT = 1e-9
 LONGEST_DELAY = 8
@@ -69,7 +68,7 @@ class ScheduleDemand:
     def usable(self, delays: Sequence[int]) -> Array:
         """P(the feedback of all stages 0 … t is usable), or what (6) takes for it (n,)."""
         if self.joint:
-            return self.link.jointly(delays)
+            return self.link.joint_availability(delays)
         return np.array(
             list(accumulate((self.alpha(t, delay) for t, delay in enumerate(delays)), mul)), dtype=np.float64
         )

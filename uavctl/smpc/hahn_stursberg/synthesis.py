@@ -17,11 +17,12 @@ from scipy.linalg import solve_discrete_are
 from scipy.optimize import minimize
 from scipy.sparse.csgraph import connected_components
 
+from uavctl.arrays import Array
 from uavctl.errors import DesignError
 from uavctl.smpc.hahn_stursberg.design import DesignSpec, kappa
 from uavctl.smpc.hahn_stursberg.schedule import ScheduleDemand, fixed, greedy
 from uavctl.smpc.plant import Plant
-from uavctl.smpc.sets import Polytope, rest_input
+from uavctl.smpc.sets import Polytope, find_rest_input
 
 # The loop under u(k) = K x(k-τ): stationary cost and variances as functions of K, with their gradients.
 #
@@ -30,8 +31,6 @@ from uavctl.smpc.sets import Polytope, rest_input
 # variance along one row of a set with weights of rank one. A second Lyapunov equation, P = Fᵀ P F + Q, gives the
 # gradient 2 (Q_u K R + Sᵀ P F) Σ Rᵀ.
 
-
-Array = NDArray[np.float64]
 
 # The sums of Lyapunov's equations are cut where a power of F has shrunk below this.
 _NEGLIGIBLE = 1e-20
@@ -388,7 +387,7 @@ def synthesize(
     if tau < 1:
         raise DesignError("smpc.tau", f"{tau} is no delay", "give at least 1 step")
     noise = plant.e @ plant.w @ plant.e.T
-    rest = rest_input(plant.a, plant.b, q_u, target)
+    rest = find_rest_input(plant.a, plant.b, q_u, target)
     error = np.zeros_like(plant.a) if estimate_cov is None else estimate_cov
     k = np.zeros((plant.n_u, plant.n_x))
     tasks, starts = [], 0

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.errors import DesignError
 from uavctl.smpc.plant import Plant
-from uavctl.smpc.sets import Polytope, rest_input
+from uavctl.smpc.sets import Polytope, find_rest_input
 
 # Terminal system, invariant covariance, terminal weight (Sec. 4.3), and Assumption 4 with figures.
 
 
-Array = NDArray[np.float64]
 _DOUBLINGS = 40  # 2^40 steps: enough for the largest radius that is taken
 
 
@@ -173,7 +173,7 @@ def check_assumptions(
         DesignError: An item fails; it is named with its figures.
     """
     k_sigma = terminal.k @ terminal.sigma_x @ terminal.k.T
-    rest = rest_input(plant.a, plant.b, q_u, target)
+    rest = find_rest_input(plant.a, plant.b, q_u, target)
     radius, residual = terminal.spectral_radius, invariance_residual(terminal, plant.w)
     drop = lyapunov_residual(terminal)
     checks = (

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from uavctl.smpc.batch import News, predict
+from uavctl.smpc.batch import Information, predict
 from uavctl.smpc.nominal import ControlProblem, lqr
 from uavctl.smpc.outside import PlanRequest
 
@@ -25,7 +25,7 @@ class Careful:
     def begin(self, runs: int) -> None:
         """Forget everything: `runs` new runs of a campaign begin."""
 
-    def act(self, news: News) -> np.ndarray:
-        """Inputs (runs, n_u) of step `news.step` of a campaign."""
-        x = predict(self.problem.plant, news)
+    def act(self, information: Information) -> np.ndarray:
+        """Inputs (runs, n_u) of step `information.step` of a campaign."""
+        x = predict(self.problem.plant, information)
         return self.problem.u_target + (x - self.problem.target) @ self.k.T

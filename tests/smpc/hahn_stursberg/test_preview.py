@@ -9,17 +9,15 @@ from functools import cache
 import cvxpy as cp
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from optimisation_cases import ORIGIN, PAPER_COST, PAPER_LOWER, PAPER_UPPER, ROOM_CORNER, START, paper, room
 from scipy.linalg import null_space, solve_discrete_lyapunov
 
+from uavctl.arrays import Array
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import Answer, Path, Preview
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver
 from uavctl.smpc.hahn_stursberg.horizon import Component, decompose
-
-Array = NDArray[np.float64]
 
 
 @cache
@@ -146,13 +144,13 @@ def questions() -> list[tuple[str, Array, Array, Preview]]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("x", "target", "outlook"), [pytest.param(*q[1:], id=q[0]) for q in questions()])
-def test_agrees_with_the_same_problem_written_in_cvxpy(x: Array, target: Array, outlook: Preview) -> None:
+@pytest.mark.parametrize(("x", "target", "preview"), [pytest.param(*q[1:], id=q[0]) for q in questions()])
+def test_agrees_with_the_same_problem_written_in_cvxpy(x: Array, target: Array, preview: Preview) -> None:
     design, solver = paper_case()
-    limits = constant_limits(design) if outlook.limits is None else outlook.limits
-    path = no_path(design) if outlook.path is None else outlook.path
+    limits = constant_limits(design) if preview.limits is None else preview.limits
+    path = no_path(design) if preview.path is None else preview.path
     wanted = sum(oracle(design, part, x, target, limits, path) for part in decompose(design))
-    answer = solver.solve(0, x, target, outlook)
+    answer = solver.solve(0, x, target, preview)
     assert answer.status is SolveStatus.OPTIMAL
     assert answer.terminal_miss < 1e-6
     assert answer.cost == pytest.approx(wanted, rel=1e-6)
@@ -162,13 +160,13 @@ def bits(answer: Answer) -> tuple[bytes, ...]:
     return tuple(np.asarray(value).tobytes() for value in (answer.inputs, answer.states, answer.cost, answer.backoff_x))
 
 
-def test_without_an_outlook_it_is_the_papers_answer_bit_for_bit() -> None:
+def test_without_preview_the_answer_is_that_of_the_paper_bit_for_bit() -> None:
     design, solver = paper_case()
     plain = solver.solve(0, START, ORIGIN)
     assert plain.cost == pytest.approx(PAPER_COST, abs=0.01)
-    assert plain.gave_way == ()
-    for outlook in (Preview(limits=constant_limits(design)), Preview(path=no_path(design)), Preview()):
-        assert bits(solver.solve(0, START, ORIGIN, outlook)) == bits(plain)
+    assert plain.relaxed == ()
+    for preview in (Preview(limits=constant_limits(design)), Preview(path=no_path(design)), Preview()):
+        assert bits(solver.solve(0, START, ORIGIN, preview)) == bits(plain)
 
 
 def test_a_path_that_the_plant_can_fly_to_rest_is_flown_exactly() -> None:
@@ -206,14 +204,14 @@ def check_told(design: Design, answer: Answer, limits: Array) -> None:
     for i, miss in enumerate(np.abs(means[rest] - answer.reference)):
         if miss > 1e-6:
             wanted["equilibrium", rest, i] = miss
-    told = {(one.constraint, one.stage, one.index): one.amount for one in answer.gave_way}
+    told = {(one.constraint, one.stage, one.index): one.amount for one in answer.relaxed}
     assert set(told) == set(wanted)
     for key, amount in told.items():
         assert amount == pytest.approx(wanted[key], rel=1e-6, abs=1e-8)
 
 
 def kinds(answer: Answer) -> set[str]:
-    return {one.constraint for one in answer.gave_way}
+    return {one.constraint for one in answer.relaxed}
 
 
 def test_a_fence_that_shuts_the_drone_out_is_answered_and_told() -> None:
@@ -223,9 +221,9 @@ def test_a_fence_that_shuts_the_drone_out_is_answered_and_told() -> None:
     x = np.array([22.0, 0.0, 0.0, 0.0])
     answer = solver.solve(0, x, ORIGIN, Preview(limits=limits))
     assert answer.status is SolveStatus.OPTIMAL
-    assert {(one.constraint, one.index) for one in answer.gave_way} == {("state", row)}
-    assert {one.stage for one in answer.gave_way} == set(range(1, 1 + len(answer.gave_way)))
-    amounts = [one.amount for one in answer.gave_way]
+    assert {(one.constraint, one.index) for one in answer.relaxed} == {("state", row)}
+    assert {one.stage for one in answer.relaxed} == set(range(1, 1 + len(answer.relaxed)))
+    amounts = [one.amount for one in answer.relaxed]
     assert amounts == sorted(amounts, reverse=True)
     assert 1.5 < amounts[0] < 5.0
     assert answer.slack == pytest.approx(sum(amounts), abs=1e-5)
@@ -247,7 +245,7 @@ def test_a_target_out_of_reach_or_outside_gives_the_nearest_place_and_no_constra
     for target in ([1000.0, 0.0, 0.0, 0.0], [49.9, 0.0, -24.9, 0.0]):
         answer = solver.solve(0, START, np.array(target), Preview())
         assert answer.status is SolveStatus.OPTIMAL
-        assert answer.gave_way == ()
+        assert answer.relaxed == ()
         assert answer.offset > 1.0
         check_told(design, answer, constant_limits(design))
 
@@ -276,7 +274,7 @@ def test_in_a_room_everything_that_gives_way_is_told() -> None:
     for x in (ROOM_CORNER, ROOM_CORNER + np.array([0.0, 1.4, 0, 0, 0, 0, 0, 0, 0])):
         answer = solver.solve(0, x, design.target, Preview(limits=limits))
         assert answer.status is SolveStatus.OPTIMAL
-        assert answer.gave_way
+        assert answer.relaxed
         check_told(design, answer, limits)
 
 
@@ -286,8 +284,8 @@ def test_a_kept_plan_tells_nothing() -> None:
     seen = 0
     for x in rng.uniform(PAPER_LOWER, PAPER_UPPER, size=(20, 4)) * 0.5:
         answer = solver.solve(0, x, ORIGIN)
-        assert (answer.gave_way == ()) == (max(answer.slack, answer.terminal_miss) <= 1e-6)
-        seen += answer.gave_way == ()
+        assert (answer.relaxed == ()) == (max(answer.slack, answer.terminal_miss) <= 1e-6)
+        seen += answer.relaxed == ()
     assert seen > 5
 
 
@@ -311,5 +309,5 @@ def extremes(
 def test_states_and_limits_far_beyond_sense_have_an_answer(count: int, farthest: float) -> None:
     design, solver = paper_case()
     cases = extremes(design, PAPER_LOWER, PAPER_UPPER, count, farthest)
-    endings = Counter(solver.solve(0, x, ORIGIN, outlook).status for x, outlook in cases)
+    endings = Counter(solver.solve(0, x, ORIGIN, preview).status for x, preview in cases)
     assert endings == {SolveStatus.OPTIMAL: count}
