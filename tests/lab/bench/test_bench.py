@@ -91,7 +91,7 @@ def test_the_conditioned_decision_is_timed_on_the_same_states(result: BenchResul
     assert ours.iterations.max == round(ours.iterations.max) > 0
 
 
-def test_no_question_in_flight_has_the_covariance_of_the_last_one() -> None:
+def test_each_decision_has_another_covariance_than_the_last() -> None:
     asked: list[Preview] = []
 
     class Recorder(ConditionedSolver):
@@ -109,7 +109,7 @@ def test_no_question_in_flight_has_the_covariance_of_the_last_one() -> None:
     assert all(one.sent is given.u_target for one in asked)
 
 
-def test_decisions_from_anywhere_within_the_limits_are_counted_as_they_are() -> None:
+def test_decisions_within_the_limits_are_counted() -> None:
     solver = build_conditioned(load_config("room-hahn-stursberg", ["smpc.scheme=age-conditioned"])).solver
     asked = [*draw_questions(solver, 30, 4)]
     low, high = solver.problem.state_set.bounds
@@ -127,7 +127,7 @@ def test_decisions_from_anywhere_within_the_limits_are_counted_as_they_are() -> 
 
 
 @pytest.mark.slow
-def test_a_flight_s_own_decisions_are_asked_again() -> None:
+def test_decisions_of_a_flight_are_timed() -> None:
     """As many as the flight's plans, and each as hard."""
     config = load_config(
         "room-hahn-stursberg", ["smpc.scheme=age-conditioned", "duration_s=6", "sim.start_velocity_mps=[1.4, 1.4, 0]"]
@@ -151,12 +151,12 @@ def test_a_flight_s_own_decisions_are_asked_again() -> None:
     assert told == [(done, ROUNDS) for done in range(ROUNDS)]
 
 
-def test_a_flight_that_asks_nothing_has_no_decisions() -> None:
+def test_a_flight_without_decisions_has_no_times() -> None:
     assert time_flight(load_config("room", ["smpc.scheme=age-conditioned", "duration_s=0.1"])) is None
 
 
 @pytest.mark.slow
-def test_the_command_tells_the_decisions_of_the_conditioned_scheme(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_shows_the_decisions_of_the_conditioned_scheme(capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--set", "smpc.scheme=age-conditioned", "--set", "duration_s=4", "--states", "5"]
     assert command(["bench", *options, "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
@@ -218,7 +218,7 @@ def undisturbed(design: Design) -> Design:
 
 
 @pytest.mark.parametrize(("loss", "stage"), [(0.0, 1), (1.0, 12)])
-def test_a_loop_asks_on_news_and_plays_the_plan_out_without(design: Design, loss: float, stage: int) -> None:
+def test_a_loop_decides_on_a_measurement_and_else_continues_its_plan(design: Design, loss: float, stage: int) -> None:
     # Without disturbance the next question is where the plan says; without news, where the plan ends.
     solver = ConicSolver(design)
     rng = np.random.default_rng(0)
@@ -251,7 +251,7 @@ class Breaks(Stub):
         return super().solve(seq, x, target, outlook)
 
 
-def test_a_loop_without_plans_is_given_up(design: Design) -> None:
+def test_a_loop_without_plans_ends(design: Design) -> None:
     stub = Stub()
     assert collect_loop_states(design, stub, [START], 3, 0.3, np.random.default_rng(0), lambda _: None) == []
     assert 0 < len(stub.asked) < LOOP_STEPS

@@ -32,7 +32,7 @@ def test_a_spread_is_in_microseconds() -> None:
     assert (times.p50, times.p99, times.p999, times.max) == (500.0, 990.0, 999.0, 1000.0)
 
 
-def test_the_middle_of_runs_is_the_median_of_each_figure() -> None:
+def test_several_runs_give_the_median_of_each_figure() -> None:
     middle = LoopRun.middle([one(3.0, missed=9.0), one(1.0), one(2.0)])
     assert middle.in_to_out_us == spread(2.0) and middle.above_empty_us == 1.0
     assert middle.missed_ticks == 0.0 and middle.memory_growth_kib == 2.0
@@ -51,7 +51,7 @@ def test_a_short_bench_gives_its_keys(capsys: pytest.CaptureFixture[str]) -> Non
         assert measured.memory_mib > 10.0
 
 
-def test_a_daemon_that_does_not_start_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_daemon_that_does_not_start_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["bench", "--loop", "--seconds", "1", *NO_LIBRARY, "--set", f"log.free_bytes={10**15}"]) == 1
     assert "the daemon did not start" in capsys.readouterr().err
     assert run(["bench", "--loop", "--seconds", "0"]) == 2

@@ -58,7 +58,7 @@ def test_a_margin_may_be_tuned_for_a_link(tmp_path: Path) -> None:
     assert [one.recipe.margin for one in (good, bad) if one.recipe] == [1.5, 2.25]
 
 
-def test_what_is_flown_and_what_is_believed_are_two_things(tmp_path: Path) -> None:
+def test_the_flown_link_and_the_believed_one_may_differ(tmp_path: Path) -> None:
     first, weak = cells(tmp_path, controller("lqg", 'link = "good"'), LINKS, table("plant", "b"), WEAK)[2:]
     assert first.recipe is weak.recipe and weak.recipe is not None
     assert weak.recipe.config.link.loss == 0.1 and weak.setting.link.loss == 0.6
@@ -87,7 +87,7 @@ def test_a_plant_that_cannot_be_flown_is_refused_too(tmp_path: Path) -> None:
     assert found.refused.startswith("plant.a: A has no real logarithm") and found.recipe is None
 
 
-def test_every_cell_meets_the_same_chance(tmp_path: Path) -> None:
+def test_every_cell_has_the_same_draws(tmp_path: Path) -> None:
     lines = 'steps = 9\nmaster = 5\nset = ["plant.w=[[0.5, 0.1], [0.1, 0.3]]"]\n'
     found = cells(tmp_path, lines, controller("lqg"), controller("hold-last"), LINKS)
     one, other = (draw_conditions(cell.setting, 3, 4) for cell in (found[0], found[2]))
@@ -106,7 +106,7 @@ def test_every_cell_meets_the_same_chance(tmp_path: Path) -> None:
     np.testing.assert_array_equal(draw_conditions(found[0].setting, 4, 1).disturbances[0], one.disturbances[1])
 
 
-def test_runs_start_where_they_are_told(tmp_path: Path) -> None:
+def test_runs_start_at_the_configured_states(tmp_path: Path) -> None:
     def starts(line: str) -> RunConditions:
         (found,) = cells(tmp_path, line, controller("lqg"))
         return draw_conditions(found.setting, 2, 50)
@@ -152,7 +152,7 @@ def test_the_worst_case_delay_is_tau_with_the_promised_likelihoods(tmp_path: Pat
     np.testing.assert_array_equal(one.inputs, other.inputs)
 
 
-def test_a_margin_goes_to_the_plans_that_it_is_for(tmp_path: Path) -> None:
+def test_a_margin_acts_on_the_plans_of_its_controllers(tmp_path: Path) -> None:
     found = cells(
         tmp_path, controller("packetised"), controller("packetised", "margin = 3.0").replace('d"\n', 'd2"\n', 1)
     )
@@ -169,7 +169,7 @@ def test_a_margin_goes_to_the_plans_that_it_is_for(tmp_path: Path) -> None:
     assert np.abs(own.inputs - without.inputs).max() > 0.1
 
 
-def test_tasks_are_fixed_chunks_and_tuning_runs_are_nobody_s(tmp_path: Path) -> None:
+def test_tasks_are_fixed_chunks_and_no_task_has_tuning_runs(tmp_path: Path) -> None:
     found = cells(tmp_path, f"runs = {2 * CHUNK + 7}\n", controller("lqg"), LINKS)
     tasks = list(make_tasks(found))
     assert [(task.cell, task.first, task.runs) for task in tasks] == [

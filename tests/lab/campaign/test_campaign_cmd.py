@@ -145,7 +145,7 @@ def test_killed_half_way_and_resumed_it_gives_the_same(spec: Path, flown: Path, 
 
 
 @pytest.mark.slow
-def test_ctrl_c_ends_it_and_tells_how_to_go_on(spec: Path, tmp_path: Path) -> None:
+def test_ctrl_c_ends_it_and_names_the_command_to_continue(spec: Path, tmp_path: Path) -> None:
     folder = tmp_path / "stopped"
     process = started(spec, folder, workers=2)
     os.killpg(process.pid, signal.SIGINT)
@@ -155,7 +155,7 @@ def test_ctrl_c_ends_it_and_tells_how_to_go_on(spec: Path, tmp_path: Path) -> No
     assert list(folder.glob("parts/*.parquet")) and not (folder / "runs.parquet").exists()
 
 
-def test_ctrl_c_before_the_first_run_leaves_nothing_to_go_on_with(
+def test_ctrl_c_before_the_first_run_leaves_no_campaign(
     spec: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupted(*arguments: object) -> None:
@@ -194,7 +194,9 @@ def test_fewer_runs_and_a_table_for_people(
     assert {row["error"] for row in rows if row["cell"] == 1} == {"ended in numbers that are not finite"}
 
 
-def test_nothing_to_fly_is_told_with_exit_code_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_campaign_without_flown_cells_ends_with_exit_code_1(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "c.toml").write_text(HEAD + 'set = ["link.loss=0.6"]\n' + controller("smpc"))
     assert run(["campaign", str(tmp_path / "c.toml"), "--out", str(tmp_path / "out")]) == 1
     assert "smpc.delta_x: 0.95 is out of reach" in capsys.readouterr().out
@@ -216,7 +218,7 @@ def test_options_that_do_not_go_together(
     assert told in capsys.readouterr().err
 
 
-def test_a_wrong_file_is_told_with_its_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_problems_of_a_file_are_reported_with_their_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "c.toml").write_text(HEAD + "step = 6\n" + controller("lqq"))
     assert run(["campaign", str(tmp_path / "c.toml")]) == 2
     told = capsys.readouterr().err

@@ -26,7 +26,7 @@ REFUSED = {
 }
 
 
-def test_they_are_there() -> None:
+def test_campaign_files_exist() -> None:
     assert [file.stem for file in EVERY] == [
         "bursts",
         "corners",

@@ -96,7 +96,7 @@ def test_every_text_is_within_the_figure(which: str, drawings: dict[str, Drawing
 
 
 @pytest.mark.parametrize("which", ["cost", "difference"])
-def test_names_of_links_are_whole_and_beside_the_axes(which: str, drawings: dict[str, Drawing]) -> None:
+def test_names_of_links_are_complete_and_beside_the_axes(which: str, drawings: dict[str, Drawing]) -> None:
     svg = drawings[which].svg
     names = names_of(svg)
     assert ["".join(line.text for line in name).replace(" ", "") for name in names] == [
@@ -107,7 +107,7 @@ def test_names_of_links_are_whole_and_beside_the_axes(which: str, drawings: dict
 
 
 @pytest.mark.parametrize("which", ["cost", "difference"])
-def test_names_of_links_are_not_on_each_other(which: str, drawings: dict[str, Drawing]) -> None:
+def test_names_of_links_do_not_overlap(which: str, drawings: dict[str, Drawing]) -> None:
     names = names_of(drawings[which].svg)
     lines = [line for name in names for line in name]
     assert all(below.top >= above.bottom for above, below in pairwise(lines))

@@ -86,13 +86,13 @@ def test_cheaper_and_as_safe_is_yes(tmp_path: Path) -> None:
     assert "theirs (10 % more" in sentence  # among those that are beaten
 
 
-def test_a_difference_that_pairs_tell_is_told(tmp_path: Path) -> None:
+def test_a_paired_difference_is_reported(tmp_path: Path) -> None:
     # Both costs lie within 99.7 to 100.3; the difference of 0.02 is the same in every run.
     found = judged(tmp_path, runs(1, (SMPC + 0.02).tolist()))
     assert found.is_unmatched
 
 
-def test_a_baseline_that_saves_by_breaking_limits_is_named_with_what_it_breaks(tmp_path: Path) -> None:
+def test_a_cheaper_baseline_is_named_with_the_limits_that_it_breaks(tmp_path: Path) -> None:
     cheaper = runs(1, (SMPC * 0.97).tolist(), state_violations=outside(1), input_violations=outside(15))
     found = judged(tmp_path, cheaper)
     assert (found.is_unmatched, found.is_better_than_all, found.is_beaten, get_verdict_word(found)) == (
@@ -108,13 +108,13 @@ def test_a_baseline_that_saves_by_breaking_limits_is_named_with_what_it_breaks(t
     assert "inputs (10 %)" in sentence and "caution" not in sentence and "chance" not in sentence
 
 
-def test_caution_that_was_not_asked_for_is_told(tmp_path: Path) -> None:
+def test_unused_allowance_is_reported(tmp_path: Path) -> None:
     found = judged(tmp_path, runs(1, (SMPC * 0.97).tolist(), state_violations=outside(1)))
     (sentence,) = describe_verdict(found)
     assert "(states 5 %, inputs 10 %)" in sentence and "caution" in sentence
 
 
-def test_a_rate_above_the_allowance_is_never_told_as_within_it(tmp_path: Path) -> None:
+def test_a_rate_above_the_allowance_is_never_reported_as_within_it(tmp_path: Path) -> None:
     # 3 runs with 14 of 50 steps on average; every interval reaches below 10 %.
     rows = runs(1, (SMPC[:3] * 0.9).tolist(), input_violations=[42, 0, 0])
     found = judged(tmp_path, rows, runs(0, SMPC[:3].tolist()))
@@ -140,7 +140,7 @@ def test_a_rate_at_the_allowance_is_within_it(tmp_path: Path) -> None:
     ("hits", "cells", "chance", "most"),
     [([2, 2, 2], [1.0], False, 4.0), ([30, 0, 0], [1.0, 1.0], True, 20.0), ([30] * 60, [1.0, 1.0], False, 60.0)],
 )  # `cells`: all of them where none broke its promise, else those that did and all
-def test_the_promise_is_told_by_what_was_measured(
+def test_the_promise_is_judged_by_the_measured_rates(
     hits: list[int], cells: list[float], chance: bool, most: float, tmp_path: Path
 ) -> None:
     rows = runs(0, SMPC[: len(hits)].tolist(), state_violations=hits)
@@ -152,7 +152,7 @@ def test_the_promise_is_told_by_what_was_measured(
     assert numbers_in(first) == [*cells, most, 5.0]
 
 
-def test_a_baseline_that_is_better_outright_is_told(tmp_path: Path) -> None:
+def test_a_better_baseline_is_reported(tmp_path: Path) -> None:
     found = judged(tmp_path, runs(1, (SMPC * 0.5).tolist()))
     assert (found.is_unmatched, found.is_beaten, get_verdict_word(found)) == (False, True, "no")
     assert "theirs costs 50 % less" in describe_verdict(found)[0]
@@ -167,7 +167,7 @@ def test_cheaper_at_a_higher_violation_rate_is_not_outright(tmp_path: Path) -> N
     assert numbers_in(costs) == [10.0] and "more" in costs and "better" in limits
 
 
-def test_costs_that_cannot_be_told_apart_are_no(tmp_path: Path) -> None:
+def test_costs_without_a_significant_difference_are_no(tmp_path: Path) -> None:
     found = judged(tmp_path, runs(1, (SMPC + np.tile([1.0, -1.0], N // 2)).tolist()))
     assert (found.is_unmatched, found.is_beaten) == (False, False)
     assert describe_briefly(found.comparisons[0]) == "costs the same"
@@ -202,7 +202,7 @@ def test_the_page_is_complete_in_itself(grid: Path) -> None:
     assert set(re.findall(r'(?:href="#|url\(#)([^")]+)', html)) <= set(ids)
 
 
-def test_the_page_says_what_was_compared_and_what_came_of_it(grid: Path) -> None:
+def test_the_page_lists_cells_and_results(grid: Path) -> None:
     text = text_of(grid / "report.html")
     for label in ("Campaign “by hand”", "12 cells", "seed 7", "uavctl 9.9", f"Not flown: {REFUSED}"):
         assert label in text
@@ -233,7 +233,7 @@ def test_links_that_are_a_loss_make_a_line_and_others_dots(grid: Path) -> None:
     assert "var(--limit" not in cost
 
 
-def test_every_figure_has_words_for_those_who_do_not_see_it(grid: Path) -> None:
+def test_every_figure_has_a_text_alternative(grid: Path) -> None:
     html = (grid / "report.html").read_text(encoding="utf-8")
     labels = re.findall(r'<figure [^>]*><svg role="img" aria-label="([^"]+)"', html)
     assert len(labels) == html.count("<figure")
@@ -255,7 +255,7 @@ def test_campaigns_of_odd_shapes_have_a_page(cells: Any, rows: Any, said: str, t
     assert said in text_of(write_report(write(tmp_path, cells, rows)))
 
 
-def test_a_page_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+def test_a_page_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
     folder = write(tmp_path, [cell(0, "a")], runs(0, [1.0]))
     (folder / "report.html").mkdir()
     with pytest.raises(UavctlError, match="cannot be written"):

@@ -29,9 +29,7 @@ if __name__ == "__main__":
 
 
 @pytest.mark.slow
-def test_a_worker_that_is_killed_is_replaced_and_nothing_is_lost(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_killed_worker_is_replaced_and_no_run_is_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "2")
     tasks = list(make_tasks(cells(tmp_path, f"steps = 3\nruns = {5 * CHUNK}\n", controller("lqg"))))
@@ -64,7 +62,7 @@ def test_workers_end_with_their_parent_however_it_ends(tmp_path: Path) -> None:
     until(lambda: not _runs(worker), "the worker ends with its parent")
 
 
-def test_workers_that_would_give_other_numbers_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_workers_with_other_versions_or_threads_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
     here = pool._get_version_and_threads()

@@ -57,7 +57,7 @@ def told(config: Config, first_known: Counts, positions: Array, inputs: Array) -
 
 @pytest.mark.parametrize("link", LINKS)
 @pytest.mark.parametrize("preset", FLIGHTS)
-def test_what_is_told_is_what_the_flight_s_filter_says_of_the_same_positions(preset: str, link: str) -> None:
+def test_estimates_are_those_of_the_flight_s_filter(preset: str, link: str) -> None:
     config = load_config(preset, FLIGHTS[preset])
     plant, first_known, rng = build_plant(config), arrived(config, LINKS[link], 11), np.random.default_rng(3)
     axes = len(plant.axes)
@@ -95,7 +95,7 @@ def sample(axes: tuple[str, ...], position: Array, captured_ns: int, received_ns
     )
 
 
-def test_errors_are_as_large_as_the_covariance_says_and_the_covariance_of_a_prediction_too() -> None:
+def test_errors_and_prediction_errors_have_the_covariance_of_the_filter() -> None:
     """e'P⁻¹e of a Gaussian has the mean n; each run's steps are correlated, so runs are counted."""
     config = load_config("paper", FLIGHTS["paper"])
     plant, runs, steps = build_plant(config), 3000, 12
@@ -129,13 +129,13 @@ def test_an_exact_state_s_prediction_has_no_covariance_of_its_own() -> None:
     assert predicted_cov(plant, News(0, np.zeros(1, dtype=np.intp), np.zeros((1, 4)), np.zeros((1, 0, 2)))) is None
 
 
-def test_noise_is_drawn_apart_from_everything_else_and_longer_runs_begin_alike() -> None:
+def test_noise_is_independent_of_other_draws_and_longer_runs_begin_alike() -> None:
     many, one = draw_noise(7, 10, 5, 20, 2), draw_noise(7, 13, 1, 30, 2)
     assert np.array_equal(many[3], one[0, :20])
     assert abs(np.corrcoef(many.ravel(), draw(7, 10, 5, 20, 2).normal.ravel())[0, 1]) < 0.3
 
 
-def test_simple_margins_begin_with_what_the_filter_leaves_open() -> None:
+def test_simple_margins_begin_with_the_filter_s_covariance() -> None:
     given = build_problem(load_config("paper", ["target.position_m=[0, 19.5, 0]"]))
     plant = given.plant
     cov = innovations(plant, 0.3, 0.0, 0).estimate_cov
@@ -187,7 +187,7 @@ def test_the_promise_is_kept_on_positions_alone_and_only_with_the_filter_s_covar
     assert binom.sf(round(rate * 400), 400, 0.05) < 1e-3
 
 
-def test_what_is_not_asked_for_changes_nothing(tmp_path: Path) -> None:
+def test_measured_states_fly_without_a_filter(tmp_path: Path) -> None:
     as_ever, exact = cell(tmp_path), cell(tmp_path, 'measured = "state"\n')
     first, second = (rows(of_runs(made, 20)) for made in (as_ever, exact))
     assert all(np.array_equal(first[name], second[name], equal_nan=name not in ("error",)) for name in first)

@@ -42,7 +42,7 @@ def test_a_short_file_has_all_defaults(tmp_path: Path) -> None:
     )
 
 
-def test_each_controller_believes_what_it_is_told(tmp_path: Path) -> None:
+def test_each_controller_has_its_own_belief(tmp_path: Path) -> None:
     campaign = read(
         tmp_path,
         'set = ["smpc.delta_u=0.8"]\n',
@@ -78,7 +78,7 @@ def test_another_number_of_runs(tmp_path: Path) -> None:
     assert read_campaign(tmp_path / "small.toml", 7)[0].spec.runs == 7
 
 
-def test_wrong_keys_and_values_are_told_at_once_with_line_and_nearest_name(tmp_path: Path) -> None:
+def test_wrong_keys_and_values_are_reported_together_with_line_and_nearest_name(tmp_path: Path) -> None:
     told = problems(
         tmp_path, "stps = 20\nruns = 0\n", table("controller", "a", 'kind = "lgq"'), table("disturbance", "b")
     )
@@ -104,7 +104,7 @@ def test_a_quadrotor_which_campaigns_do_not_fly_is_refused_where_it_stands(tmp_p
     assert refused.value.problems[0].startswith(f"{file}:2: config: {why}")
 
 
-def test_wrong_overrides_are_told_where_they_stand(tmp_path: Path) -> None:
+def test_wrong_overrides_are_reported_with_their_lines(tmp_path: Path) -> None:
     told = problems(
         tmp_path,
         controller("smpc", 'set = ["smpc.tua=3"]'),
@@ -167,7 +167,7 @@ def test_a_plant_of_another_size_is_refused(tmp_path: Path) -> None:
     assert "(4, 2)" in what and "Δt = 2 s" in what
 
 
-def test_a_file_that_is_none(tmp_path: Path) -> None:
+def test_a_missing_or_unreadable_file_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="cannot be read"):
         read_campaign(tmp_path / "none.toml")
     (tmp_path / "bad.toml").write_text(HEAD + "runs = \n")

@@ -25,7 +25,7 @@ from uavctl.lab.campaign.results import compute_difference, read_results, summar
 
 
 @pytest.mark.parametrize(("hits", "trials"), [(1, 10), (3, 7), (50, 200), (199, 200), (2, 200_000)])
-def test_the_exact_interval_is_where_the_binomial_tails_are_what_is_left(hits: int, trials: int) -> None:
+def test_the_exact_interval_leaves_the_binomial_tails(hits: int, trials: int) -> None:
     # The definition: at the lower end `hits` or more, at the upper end `hits` or fewer, have a probability of 2.5 %.
     low = brentq(lambda p: binom.sf(hits - 1, trials, p) - 0.025, 1e-12, 1.0 - 1e-12, xtol=1e-15)
     high = brentq(lambda p: binom.cdf(hits, trials, p) - 0.025, 1e-12, 1.0 - 1e-12, xtol=1e-15)
@@ -87,7 +87,7 @@ def test_one_value_is_its_own_interval_and_none_has_none() -> None:
         bootstrap_mean(np.empty(0))
 
 
-def test_pairs_tell_what_the_costs_alone_do_not() -> None:
+def test_pairs_show_a_difference_that_separate_costs_hide() -> None:
     rng = np.random.default_rng(2)
     shared = rng.normal(1000.0, 200.0, 400)
     a, b = shared + rng.normal(0.0, 1.0, 400), shared + 2.0 + rng.normal(0.0, 1.0, 400)
@@ -150,7 +150,7 @@ def test_the_worst_step_is_that_of_all_runs_together(tmp_path: Path) -> None:
     assert unknown.worst_step_rate is None
 
 
-def test_a_folder_by_hand(tmp_path: Path) -> None:
+def test_results_of_a_small_folder(tmp_path: Path) -> None:
     nan = float("nan")
     folder = write(
         tmp_path,

@@ -66,7 +66,7 @@ def test_a_part_that_is_damaged_is_named(tmp_path: Path, given: list[Task]) -> N
             store.finish(given)
 
 
-def test_only_the_same_campaign_goes_on_and_only_if_it_is_asked_to(tmp_path: Path) -> None:
+def test_only_the_same_campaign_continues_and_only_with_resume(tmp_path: Path) -> None:
     store = Store(tmp_path / "one")
     with pytest.raises(UsageError, match="leave out --resume"), store.open(DOCUMENT, "text", resume=True):
         pass
@@ -86,7 +86,7 @@ def test_only_the_same_campaign_goes_on_and_only_if_it_is_asked_to(tmp_path: Pat
         pass
 
 
-def test_the_first_difference_is_told() -> None:
+def test_the_first_difference_is_described() -> None:
     one = {"a": 1, "b": {"c": [1, {"d": "x"}]}, "e": None}
     assert find_first_difference(one, {**one}) is None
     assert find_first_difference(one, {**one, "b": {"c": [1, {"d": "y"}]}}) == 'b.c[1].d is "x" there and "y" here'
@@ -94,13 +94,13 @@ def test_the_first_difference_is_told() -> None:
     assert find_first_difference({}, {"f": 2}) == "f is null there and 2 here"
 
 
-def test_a_folder_that_cannot_be_is_told(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_made_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(UavctlError, match="file"), Store(tmp_path / "file").open(DOCUMENT, "text", resume=False):
         pass
 
 
-def test_a_run_alone_is_that_of_its_chunk(tmp_path: Path) -> None:
+def test_a_single_run_equals_that_of_its_chunk(tmp_path: Path) -> None:
     made = cells(tmp_path, f"steps = 6\nruns = {CHUNK + 4}\nmaster = 2\n", controller("lqg"), controller("smpc"), TWO)
     task = list(make_tasks(made))[3]
     assert (task.cell, task.first, task.runs) == (1, CHUNK, 4)

@@ -76,7 +76,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (HEAD + "steps = 4\n" + OWN, "steps"),
     ],
 )
-def test_what_is_wrong_with_a_file_is_told_with_its_place(tmp_path: Path, text: str, told: str) -> None:
+def test_problems_of_a_trial_file_are_reported_with_their_keys(tmp_path: Path, text: str, told: str) -> None:
     file = written(tmp_path, text)
     assert is_trial_file(file)
     with pytest.raises(ConfigError) as caught:
@@ -84,7 +84,7 @@ def test_what_is_wrong_with_a_file_is_told_with_its_place(tmp_path: Path, text: 
     assert told in str(caught.value) and str(file) in str(caught.value)
 
 
-def test_every_controller_meets_the_same_seeds_and_the_same_link(tmp_path: Path) -> None:
+def test_every_controller_has_the_same_seeds_and_link(tmp_path: Path) -> None:
     spec, _ = read_trial(written(tmp_path, HEAD + OWN + OURS))
     places = make_trial_cells(spec)
     assert [(one.cell.scenario, one.cell.pilot.name) for one in places] == [
@@ -102,7 +102,7 @@ def test_every_controller_meets_the_same_seeds_and_the_same_link(tmp_path: Path)
 
 
 @pytest.mark.slow
-def test_the_table_has_each_flight_as_it_is_flown_alone(flown: Path) -> None:
+def test_the_table_equals_separate_flights(flown: Path) -> None:
     rows = pq.read_table(flown / "runs.parquet").to_pylist()
     assert [(row["cell"], row["run"]) for row in rows] == [(c, i) for c in (0, 1, 3, 4) for i in range(RUNS)]
     assert not any(row["error"] for row in rows)
@@ -115,7 +115,7 @@ def test_the_table_has_each_flight_as_it_is_flown_alone(flown: Path) -> None:
 
 
 @pytest.mark.slow
-def test_one_that_was_interrupted_goes_on_to_the_same_bytes(flown: Path, tmp_path: Path) -> None:
+def test_an_interrupted_campaign_continues_to_the_same_bytes(flown: Path, tmp_path: Path) -> None:
     path = flown.parent / "small.toml"
     spec, text = read_trial(path)
     places = make_trial_cells(spec)
@@ -128,7 +128,9 @@ def test_one_that_was_interrupted_goes_on_to_the_same_bytes(flown: Path, tmp_pat
     assert run(["campaign", str(path), "--runs", "2", "--out", str(store.folder), "--resume"]) != 0
 
 
-def test_a_flight_that_raises_is_told_and_stops_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_of_a_flight_is_recorded_and_the_others_continue(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def fails(cell: TrialCell, seed: int, *, seconds: float, from_s: float) -> TrialFlight:
         if seed == get_flight_seed(0, 1):
             raise RuntimeError("no more")
@@ -163,7 +165,9 @@ def test_the_summary_has_the_medians_and_the_worst_of_the_table(flown: Path) -> 
 
 
 @pytest.mark.slow
-def test_it_is_told_as_json_and_is_no_campaign_of_runs(flown: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_trials_have_a_json_document_and_are_no_campaign_of_runs(
+    flown: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = flown.parent / "small.toml"
     capsys.readouterr()
     assert run(["campaign", str(path), "--out", str(flown), "--resume", "--json"]) == 0

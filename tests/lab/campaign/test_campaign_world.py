@@ -137,7 +137,7 @@ def scene(plant: Plant, runs: int) -> LinearWorld:
     )
 
 
-def test_a_flight_is_what_a_plain_loop_says() -> None:
+def test_the_simulation_equals_a_plain_loop() -> None:
     plant = build_plant(config())
     gain = np.array([[-0.2, -0.8, 0.0, 0.0], [0.0, 0.0, -0.3, -0.9]])
     runs, steps = 6, 15
@@ -170,7 +170,7 @@ def test_a_flight_is_what_a_plain_loop_says() -> None:
     assert not flown.failed.any()
 
 
-def test_a_run_that_asks_for_no_number_fails_alone() -> None:
+def test_a_run_with_an_invalid_input_fails_alone() -> None:
     plant = build_plant(config())
     gain = np.zeros((2, 4))
     chances = draw(1, 0, 3, 8, plant.n_w)
@@ -196,7 +196,7 @@ class _Numbered:
         return Decisions(solved, inputs, np.where(solved, 0.5, np.inf), np.ones(len(x)), np.full(len(x), 1e-5))
 
 
-def test_plans_play_out_fail_and_run_out() -> None:
+def test_plans_continue_fail_and_end() -> None:
     """News in steps 0, 1, 4, then silence: plan 1, plan 2 played to step 3, no plan in step 4, then the brake."""
     given = config()
     design, plant = build_design(given), build_plant(given)

@@ -83,12 +83,12 @@ def test_a_relative_name_is_beside_the_file_or_where_the_command_is_typed(
         ("inf\n\n", "trace.csv: link.trace_s: every packet is lost"),
     ],
 )
-def test_what_is_wrong_with_a_file_is_told_with_file_and_line(tmp_path: Path, text: str, told: str) -> None:
+def test_problems_of_a_trace_are_reported_with_file_and_line(tmp_path: Path, text: str, told: str) -> None:
     (tmp_path / "trace.csv").write_text(text, encoding="utf-8")
     assert told in problems(*PAPER, f"link.trace_file={tmp_path / 'trace.csv'}")
 
 
-def test_files_that_are_not_there_or_no_text_are_told(tmp_path: Path) -> None:
+def test_missing_or_binary_trace_files_are_errors(tmp_path: Path) -> None:
     assert "nowhere.csv: cannot be read" in problems(*PAPER, "link.trace_file=nowhere.csv")
     (tmp_path / "bytes.csv").write_bytes(b"\xff\xfe\x00")
     assert "is not UTF-8 text" in problems(*PAPER, f"link.trace_file={tmp_path / 'bytes.csv'}")
@@ -103,7 +103,7 @@ def test_files_that_are_not_there_or_no_text_are_told(tmp_path: Path) -> None:
         (["link.trace_s=[0.1]", "link.trace_file=x.csv"], "there are delays in link.trace_s as well"),
     ],
 )
-def test_a_trace_that_cannot_be_is_refused(overrides: list[str], told: str) -> None:
+def test_an_invalid_trace_is_refused(overrides: list[str], told: str) -> None:
     assert told in problems(*overrides)
 
 

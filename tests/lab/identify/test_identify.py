@@ -269,7 +269,7 @@ def test_independent_losses_and_delays_are_measured() -> None:
     assert link.jitter_s == pytest.approx(0.099, abs=0.004)
 
 
-def test_bursts_are_told_from_independent_losses() -> None:
+def test_bursts_are_distinguished_from_independent_losses() -> None:
     rng = np.random.default_rng(2)
     lost, bad = np.zeros(4000, dtype=bool), False
     for i in range(4000):
@@ -304,7 +304,7 @@ def test_numbers_of_messages_wrap_and_overtake() -> None:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.6])
-def test_losses_before_numbering_are_told_by_the_stamps(share: float) -> None:
+def test_losses_before_numbering_are_counted_by_the_stamps(share: float) -> None:
     rng = np.random.default_rng(5)
     senders, came = Senders(), np.flatnonzero(rng.random(2000) >= share)
     for number, frame in enumerate(came.tolist()):
@@ -316,7 +316,7 @@ def test_losses_before_numbering_are_told_by_the_stamps(share: float) -> None:
     assert shortest_s == pytest.approx(0.010, abs=0.001)
 
 
-def test_a_stamp_of_another_clock_tells_no_delay() -> None:
+def test_a_stamp_of_another_clock_gives_no_delay() -> None:
     for ahead_us in (-30_000_000, 500_000):
         senders = Senders()
         for number in range(100):

@@ -81,13 +81,13 @@ def sentences(page: str) -> list[str]:
     return [unescape(text) for text in re.findall(r"<li>(.*?)</li>", page)]
 
 
-def test_what_is_predicted_of_an_axis_is_said_once() -> None:
+def test_the_prediction_of_an_axis_is_reported_once() -> None:
     said = sentences(render_identify_page(found(HARDLY), seen(), "flight"))
     assert [sum(one.startswith(f"{axis}:") for one in said) for axis in AXES] == [1, 1, 1]
     assert f"{HARDLY}." in said
 
 
-def test_another_warning_takes_no_axis_its_line() -> None:
+def test_another_warning_removes_no_axis() -> None:
     uncertain = "down: the lag of 0.25 s is uncertain; fly more changes of direction"
     said = sentences(render_identify_page(found(uncertain), seen(), "flight"))
     assert [sum(one.startswith(f"{axis}:") and "predicted" in one for one in said) for axis in AXES] == [1, 1, 1]
@@ -109,7 +109,7 @@ def test_differences_of_millimetres_leave_room_for_the_name_of_their_axis(monkey
     assert left_px and left_px[0] >= 0.0
 
 
-def test_what_speaks_against_a_design_is_on_the_page_too(
+def test_the_refusal_of_a_design_is_on_the_page(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def refused(*_: object) -> None:

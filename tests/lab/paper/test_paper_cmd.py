@@ -78,7 +78,7 @@ def test_the_document_of_several_chunks_is_plain_numbers(
     assert json.loads(capsys.readouterr().out)["runs"] == 5
 
 
-def test_people_get_the_claims_and_where_the_figures_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_terminal_shows_claims_and_paths_of_the_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert command(["paper", "--runs", "2", "--steps", "12", "--tau", "3", "--out", str(tmp_path)]) == 0
     shown = capsys.readouterr().out
     for words in ("claim", "τ = 3", "yes:", "no:", "paper-runs-tau3.svg", "paper-ages.svg", "slack variable"):
@@ -99,7 +99,7 @@ def test_people_get_the_claims_and_where_the_figures_are(tmp_path: Path, capsys:
         (["--run", "5"], "--run"),
     ],
 )
-def test_what_cannot_be_is_refused_by_name(
+def test_invalid_options_are_refused_by_name(
     arguments: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert command(["paper", "--out", str(tmp_path), *arguments]) == 2
@@ -107,7 +107,7 @@ def test_what_cannot_be_is_refused_by_name(
     assert told in (out + err).lower()
 
 
-def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_that_cannot_be_made_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "file").write_text("")
     assert command(["paper", "--runs", "1", "--out", str(tmp_path / "file" / "below")]) == 2
     assert "--out" in capsys.readouterr().err

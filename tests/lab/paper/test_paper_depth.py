@@ -72,14 +72,14 @@ def test_limits_cost_and_clipped_lqg_is_not_below_the_least(axis: Design) -> Non
     assert by_run.mean() < 1.02 * least + 3 * error  # and it is nearly the least
 
 
-def test_a_plant_of_several_axes_has_to_be_taken_apart(axis: Design) -> None:
+def test_a_plant_of_several_axes_is_refused(axis: Design) -> None:
     design = build_design(load_config("paper"))
     with pytest.raises(UavctlError, match="one axis"):
         compute_least_settled_cost(design.plant, design.input_set, design.q_x, design.q_u, 0.3, COARSE)
 
 
 @pytest.mark.slow
-def test_designs_that_were_tried_are_told_with_the_reason(depth: Depth) -> None:
+def test_tried_designs_are_listed_with_the_reason(depth: Depth) -> None:
     tried = {one.schedule: one for one in depth.designs if one.tau == 3}
     assert "0.9370" in tried["d_t = 4"].refused and tried["d_t = 4"].delays is None
     assert "slower than the terminal law" in tried["d_t = 5"].refused

@@ -109,13 +109,13 @@ def test_the_room_is_that_of_the_state_limits_in_any_order_of_axes() -> None:
     assert lower.tolist() == [-3.0, -2.5, -2.5] and upper.tolist() == [3.0, 2.5, 0.0]
 
 
-def test_who_knows_the_link_is_made_for_it_and_others_for_that_of_their_configuration() -> None:
+def test_a_controller_is_designed_for_the_flown_link_or_for_that_of_its_configuration() -> None:
     assert make_design_config(replace(OURS, link=LOSES)).link.loss == 0.6
     unknowing = replace(OURS, pilot=replace(OURS.pilot, knows_link=False), link=LOSES)
     assert make_design_config(unknowing).link.loss == 0.3
 
 
-def test_all_who_fly_meet_the_same_air_cameras_and_link() -> None:
+def test_all_pilots_have_the_same_air_cameras_and_link() -> None:
     mine, theirs = (make_flight_config(replace(cell, scenario="blackout"), 5, 9.0) for cell in (OURS, OWN))
     assert (mine.sim, mine.link) == (theirs.sim, theirs.link)
     ((begin, end),) = mine.link.blackout
@@ -139,7 +139,7 @@ def test_a_flight_is_judged_by_the_truth(cell: TrialCell) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("autopilot", AUTOPILOTS)
-def test_who_has_arrived_hangs_still_in_calm_air(autopilot: AutopilotName) -> None:
+def test_a_held_position_is_steady_in_calm_air(autopilot: AutopilotName) -> None:
     """The recorded ArduCopter held 3 to 5 mm; the simulated one swung by 50 to 180 mm after the same way."""
     ours = TrialPilot("ours", config=f"room-{autopilot}")
     found = fly_trial(
@@ -159,7 +159,7 @@ def test_an_eight_is_tracked_along_its_own_time() -> None:
 
 
 @pytest.mark.slow
-def test_the_tool_tells_every_flight_as_json(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_tool_writes_every_flight_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     arguments = "--pilots own own-tuned --autopilots px4 --seeds 2 --rates 10 --losses 0.3 --seconds 6 --from 4 --json"
     assert trials.main(arguments.split()) == 0
     cells = json.loads(capsys.readouterr().out)["cells"]
@@ -171,13 +171,13 @@ def test_the_tool_tells_every_flight_as_json(capsys: pytest.CaptureFixture[str])
         assert cell["flights"][0]["limited"] is None
 
 
-def test_the_tool_says_why_nobody_flies(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_tool_reports_why_no_controller_flies(capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["--pilots", "--variant", "long", "smpc.scheme=age-conditioned", "smpc.horizon=4"]
     assert trials.main([*arguments, "--autopilots", "px4", "--rates", "5", "--losses", "0.6", "--seeds", "1"]) == 1
     assert "refused" in capsys.readouterr().out
 
 
-def test_variants_and_configurations_are_pilots_of_their_own() -> None:
+def test_variants_and_configurations_are_separate_pilots() -> None:
     arguments = ["--config", "room", "paper", "--pilots", "configured", "own", "--set", "cost.input=[1]"]
     given = trials._parser().parse_args([*arguments, "--variant", "deep", "smpc.horizon=16"])
     named = {one.name: one for one in trials.pilots(given, AUTOPILOTS[0])}

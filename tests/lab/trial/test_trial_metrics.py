@@ -50,7 +50,7 @@ def test_an_exponential_settles_at_its_logarithm() -> None:
         assert compute_settling_time_s(TIMES, off, radius_m) == pytest.approx(1.5 * math.log(3.0 / radius_m), abs=0.011)
 
 
-def test_settled_is_to_stay() -> None:
+def test_the_settling_time_ignores_a_passage() -> None:
     off = np.zeros(10)
     off[[0, 1, 6]] = 1.0
     times = np.arange(10.0)
@@ -66,5 +66,5 @@ def test_beyond_is_of_the_nearest_wall_and_negative_inside() -> None:
     assert compute_excess_m(where, lower, upper) == pytest.approx([-1.2, -0.1, 0.4, 0.2])
 
 
-def test_of_nothing_there_is_no_figure() -> None:
+def test_figures_of_no_values_are_nan() -> None:
     assert all(math.isnan(figure(np.empty(0))) for figure in (compute_rms_m, compute_max, compute_mean))

@@ -90,7 +90,7 @@ def arrivals(samples: Iterable[PositionSample]) -> list[tuple[int, int]]:
 
 @pytest.mark.slow
 @BOTH
-def test_it_gets_the_positions_that_ours_get_no_more_and_no_fewer(autopilot: AutopilotName) -> None:
+def test_the_position_loop_gets_the_same_positions_as_a_controller(autopilot: AutopilotName) -> None:
     overheard, _, _ = flight_of_own(autopilot, AS_DELIVERED)
     one, sink = cell(OURS, autopilot), Samples()
     knows = make_design_config(one)
@@ -106,9 +106,7 @@ def test_it_gets_the_positions_that_ours_get_no_more_and_no_fewer(autopilot: Aut
 @pytest.mark.slow
 @BOTH
 @pytest.mark.parametrize("tuning", [AS_DELIVERED, TUNED])
-def test_all_of_them_go_on_to_the_vehicle_but_for_those_that_were_overtaken(
-    autopilot: AutopilotName, tuning: PositionLoopTuning
-) -> None:
+def test_all_positions_are_relayed_but_overtaken_ones(autopilot: AutopilotName, tuning: PositionLoopTuning) -> None:
     overheard, _, _ = flight_of_own(autopilot, tuning)
     own, passed = overheard.own, overheard.of("VISION_POSITION_ESTIMATE")
     kept = {reason: count for reason, count in own.relay.kept.items() if count}
@@ -122,7 +120,7 @@ def test_all_of_them_go_on_to_the_vehicle_but_for_those_that_were_overtaken(
 
 @pytest.mark.slow
 @BOTH
-def test_it_is_sent_places_alone_and_knows_of_no_other_position(autopilot: AutopilotName) -> None:
+def test_the_vehicle_gets_position_setpoints_and_no_other_position_source(autopilot: AutopilotName) -> None:
     overheard, peers, config = flight_of_own(autopilot, TUNED)
     setpoints = overheard.of("SET_POSITION_TARGET_LOCAL_NED")
     assert len(setpoints) >= SECONDS / config.daemon.tick_s - 2
@@ -138,7 +136,7 @@ def test_it_is_sent_places_alone_and_knows_of_no_other_position(autopilot: Autop
 
 @pytest.mark.slow
 @BOTH
-def test_without_wind_and_losses_it_holds_its_place(autopilot: AutopilotName) -> None:
+def test_without_wind_and_losses_the_position_is_held(autopilot: AutopilotName) -> None:
     one = TrialCell(
         TrialPilot("own", position_loop=AS_DELIVERED), "hold", autopilot, 50.0, "", ("link.loss=0.0",), "calm"
     )
@@ -148,7 +146,7 @@ def test_without_wind_and_losses_it_holds_its_place(autopilot: AutopilotName) ->
 
 @pytest.mark.slow
 @BOTH
-def test_told_of_the_motion_it_follows_closer_than_by_places(autopilot: AutopilotName) -> None:
+def test_motion_setpoints_are_followed_closer_than_position_setpoints(autopilot: AutopilotName) -> None:
     one = TrialCell(
         TrialPilot("own", position_loop=PositionLoopTuning(relays_at_once=True, delay_s=0.05)),
         "eight",
@@ -179,7 +177,7 @@ def test_told_of_the_motion_it_follows_closer_than_by_places(autopilot: Autopilo
     assert errors[0] < 0.25 and errors[0] < 0.5 * errors[1]
 
 
-def test_a_parameter_that_the_vehicle_does_not_take_is_told() -> None:
+def test_a_parameter_that_the_vehicle_rejects_is_an_error() -> None:
     one = cell(TrialPilot("own", position_loop=PositionLoopTuning(delay_s=1e9)), "px4")
     config = make_flight_config(one, 0, 1.0)
     own = make_position_loop(one, config)

@@ -48,7 +48,7 @@ def test_any_two_opposite_corners_make_the_box() -> None:
 
 
 @pytest.mark.parametrize("text", ["1,2,3", "a,b,c,d,e,f", "1,2,3,4,5,nan", ""])
-def test_what_is_no_box_is_refused(text: str) -> None:
+def test_an_invalid_box_is_refused(text: str) -> None:
     with pytest.raises(UsageError, match="--box"):
         parse_box(text)
 
@@ -145,7 +145,9 @@ def rows(told: TunedResult, key: str) -> list[Change]:
 
 
 @pytest.mark.slow
-def test_a_flight_changes_what_it_tells_and_predicts_better(flight: tuple[Config, FlightData, Identification]) -> None:
+def test_a_flight_changes_the_values_that_it_determines_and_predicts_better(
+    flight: tuple[Config, FlightData, Identification],
+) -> None:
     config, _, found = flight
     made = tune_config(config, found)
     told = made.result
@@ -178,7 +180,7 @@ def test_an_axis_that_is_not_predicted_is_kept_with_the_reason(
 
 
 @pytest.mark.slow
-def test_a_dead_time_that_is_not_told_is_kept(flight: tuple[Config, FlightData, Identification]) -> None:
+def test_an_undetermined_dead_time_is_kept(flight: tuple[Config, FlightData, Identification]) -> None:
     config, _, found = flight
     flat = msgspec.structs.replace(found.result.candidates[0], dead_time_range_s=(0.02, 0.021 + MAX_DEAD_TIME_RANGE_S))
     result = msgspec.structs.replace(found.result, candidates=(flat,))
@@ -205,7 +207,7 @@ def test_noise_and_losses_that_were_worse_are_raised(flight: tuple[Config, Fligh
 
 
 @pytest.mark.slow
-def test_a_computer_that_stood_still_is_no_link(flight: tuple[Config, FlightData, Identification]) -> None:
+def test_a_halt_of_a_computer_does_not_change_the_link(flight: tuple[Config, FlightData, Identification]) -> None:
     config, _, found = flight
     stalled = dataclasses.replace(found, link=dataclasses.replace(found.link, jitter_s=3.0))
     late = dataclasses.replace(found, link=dataclasses.replace(found.link, jitter_s=0.1))
@@ -255,7 +257,7 @@ def test_a_folder_goes_on_and_refuses_other_runs(tmp_path: Path) -> None:
         TuneFolder.open(tmp_path / "run", room(), ASKED)
 
 
-def test_attempts_have_folders_of_their_own(tmp_path: Path) -> None:
+def test_each_attempt_has_a_separate_folder(tmp_path: Path) -> None:
     folder = TuneFolder.open(tmp_path, room(), ASKED)
     folder.find_free_folder("before").mkdir()
     assert folder.find_free_folder("before").name == "before-2"

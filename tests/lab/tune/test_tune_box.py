@@ -154,7 +154,7 @@ def test_a_flight_that_stays_inside_gets_no_order(orders: Orders) -> None:
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
-def test_what_cannot_stop_at_half_the_deceleration_is_turned_back_and_repeated_at_half_the_size(
+def test_a_vehicle_that_cannot_stop_at_half_the_deceleration_returns_and_repeats_at_half_the_size(
     orders: Orders, side: float
 ) -> None:
     first = orders.config.mission.waypoints[0]
@@ -185,7 +185,7 @@ def test_only_the_axis_that_came_too_near_gets_smaller(orders: Orders) -> None:
     assert orders.place == pytest.approx((0.5 * north, east, down), abs=1e-3)
 
 
-def test_a_motion_too_small_to_tell_anything_ends_the_flight(orders: Orders) -> None:
+def test_a_motion_below_the_smallest_step_ends_the_flight(orders: Orders) -> None:
     size = abs(orders.config.mission.waypoints[0][0])
     for _ in range(9):
         orders.see(1.4, 0.0, waypoint=0)
@@ -201,7 +201,7 @@ def test_a_motion_too_small_to_tell_anything_ends_the_flight(orders: Orders) -> 
     assert len(orders.given) == given
 
 
-def test_what_leaves_the_box_is_landed_at_once(orders: Orders) -> None:
+def test_a_vehicle_that_leaves_the_box_lands_at_once(orders: Orders) -> None:
     orders.see(1.49, 0.2, waypoint=5)
     assert [one.order for one in orders.given] == [Order.LAND] and orders.monitor.reason
 
@@ -231,7 +231,7 @@ def test_motions_that_no_longer_fit_in_the_time_are_left_out(orders: Orders) -> 
 
 
 @pytest.mark.parametrize("order", [Order.HOLD, Order.GOTO, Order.RESUME, Order.LAND])
-def test_an_order_of_a_person_ends_the_monitor(orders: Orders, order: Order) -> None:
+def test_an_order_of_an_operator_ends_the_monitor(orders: Orders, order: Order) -> None:
     orders.see(0.0, 0.0, waypoint=0, by=Command(order=order, position_m=CENTRE))
     orders.see(1.6, 1.0, waypoint=0)
     assert not orders.given

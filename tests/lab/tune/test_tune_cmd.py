@@ -94,7 +94,7 @@ def test_the_second_flight_is_the_same_mission_with_the_tuned_configuration(done
 
 
 @pytest.mark.slow
-def test_the_page_has_its_pictures_in_words(done: Path) -> None:
+def test_every_figure_of_the_page_has_a_text_alternative(done: Path) -> None:
     page = (done / PAGE_FILE).read_text()
     figures = re.findall(r'<figure id="([\w-]+)"', page)
     assert {"held", "growing-first", "growing-second", "motion-north", "motion-east", "motion-down"} <= set(figures)
@@ -114,7 +114,7 @@ def test_a_run_that_is_done_flies_no_more(done: Path, capsys: pytest.CaptureFixt
 
 
 @pytest.mark.slow
-def test_a_run_goes_on_after_the_last_step_that_is_done(
+def test_a_run_continues_after_the_last_complete_step(
     done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     state = json.loads((done / STATE_FILE).read_text())
@@ -222,7 +222,7 @@ def test_a_recording_takes_the_place_of_the_first_flight(
         ((BOX, "--loopback", "--arm", "--takeoff", "nan", "--set", START), "--takeoff"),
     ],
 )
-def test_what_cannot_be_is_refused_before_anything_is_made(
+def test_invalid_arguments_are_refused_before_a_folder_is_made(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], more: tuple[str, ...], told: str
 ) -> None:
     folder = tmp_path / "run"
@@ -232,7 +232,7 @@ def test_what_cannot_be_is_refused_before_anything_is_made(
     assert not folder.exists()
 
 
-def test_nobody_to_agree_is_a_no(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_terminal_the_answer_is_no(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = iter(["", "\n"])
     monkeypatch.setattr("sys.stdin.readline", lambda: next(asked), raising=False)
     assert [tune_cmd.agreed(), tune_cmd.agreed()] == [False, True]
@@ -265,7 +265,7 @@ def again(capsys: pytest.CaptureFixture[str], folder: Path) -> tuple[int, str, s
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_flight")
-def test_flights_that_came_to_their_end_count_though_nobody_was_left_to_note_them(
+def test_complete_flights_count_without_a_note(
     copy: Callable[..., Path], done: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = copy(before="", after="", tuned=None)
@@ -286,7 +286,7 @@ def test_a_flight_of_another_configuration_or_without_its_end_does_not_count(don
     assert left_whole(config, tmp_path) is None
 
 
-def test_a_tuned_configuration_that_was_cut_is_not_flown(begun: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_incomplete_tuned_configuration_is_not_flown(begun: Path, capsys: pytest.CaptureFixture[str]) -> None:
     errors: dict[str, list[float]] = {"axes": [], "ahead_s": [], "rms_m": []}
     ranges = {"dead_time_range_s": [0.0, 0.1], "old_errors": errors, "new_errors": errors}
     link = {"link_loss": 0.0, "link_bursts": False, "link_delay_s": 0.0, "link_jitter_s": 0.0}
@@ -303,7 +303,7 @@ def test_a_tuned_configuration_that_was_cut_is_not_flown(begun: Path, capsys: py
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_flight")
-def test_ctrl_c_beside_a_flight_keeps_what_is_done(
+def test_ctrl_c_outside_a_flight_keeps_finished_steps(
     copy: Callable[..., Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def pressed(*_: object) -> None:
@@ -325,7 +325,7 @@ def test_a_second_run_in_the_same_folder_is_refused(begun: Path, capsys: pytest.
     assert (begun / STATE_FILE).read_bytes() == stamp
 
 
-def test_a_folder_that_takes_no_more_is_told_before_a_flight(begun: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_full_folder_is_reported_before_a_flight(begun: Path, capsys: pytest.CaptureFixture[str]) -> None:
     stamp = (begun / STATE_FILE).read_bytes()
     (begun / f"{STATE_FILE}.part").mkdir()  # root may write into any folder; nobody writes a file over this one
     code, out, err = again(capsys, begun)
@@ -333,7 +333,7 @@ def test_a_folder_that_takes_no_more_is_told_before_a_flight(begun: Path, capsys
     assert (begun / STATE_FILE).read_bytes() == stamp
 
 
-def test_a_folder_that_was_cut_off_at_its_first_file_is_begun_anew(tmp_path: Path) -> None:
+def test_a_folder_interrupted_at_its_first_file_restarts(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     folder.mkdir()
     (folder / f"{STATE_FILE}.part").write_text("{")
@@ -345,7 +345,7 @@ def test_a_folder_that_was_cut_off_at_its_first_file_is_begun_anew(tmp_path: Pat
 
 
 @pytest.mark.parametrize("content", [b"", b"no recording", b"\x89MCAP0\r\n"])
-def test_what_is_no_flight_is_refused_before_anything_is_made(
+def test_a_recording_without_a_flight_is_refused_before_a_folder_is_made(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], content: bytes
 ) -> None:
     flight, folder = tmp_path / "f.mcap", tmp_path / "run"
@@ -356,7 +356,9 @@ def test_what_is_no_flight_is_refused_before_anything_is_made(
 
 
 @pytest.mark.parametrize("below", ["file", "file/run"])
-def test_a_folder_that_cannot_be_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str], below: str) -> None:
+def test_a_folder_that_cannot_be_made_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], below: str
+) -> None:
     (tmp_path / "file").write_text("mine")
     code, out, err = typed(capsys, *words(tmp_path / below))
     assert (code, out) == (2, "") and "--folder" in err

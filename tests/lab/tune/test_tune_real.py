@@ -82,7 +82,7 @@ def test_the_pilots_stick_in_the_climb_stops_the_run(in_the_climb: tuple[Tuned, 
 
 
 @pytest.mark.slow
-def test_it_goes_on_with_a_new_flight_and_the_stick_stops_that_too(under_way: tuple[Tuned, int], folder: Path) -> None:
+def test_the_next_try_is_a_new_flight_and_the_stick_stops_that_too(under_way: tuple[Tuned, int], folder: Path) -> None:
     result, since_ns = under_way
     assert result.code == result.document["exit_code"] == tune_cmd.PILOT
     assert Cause.PILOT_LANDED in result.document["stopped"].lower() and result.document["before"] == ""
@@ -111,7 +111,7 @@ def test_ctrl_c_at_enter_is_a_no_too(not_agreed: Tuned, folder: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_stick_in_the_second_flight_keeps_what_is_done(in_the_second: tuple[Tuned, int], folder: Path) -> None:
+def test_the_stick_in_the_second_flight_keeps_finished_steps(in_the_second: tuple[Tuned, int], folder: Path) -> None:
     result, since_ns = in_the_second
     assert result.code == result.document["exit_code"] == tune_cmd.PILOT
     assert result.document["before"] == f"{BEFORE_FOLDER}-3/flight.mcap" and result.document["after"] == ""
@@ -120,7 +120,7 @@ def test_the_stick_in_the_second_flight_keeps_what_is_done(in_the_second: tuple[
 
 
 @pytest.mark.slow
-def test_it_comes_to_its_end(done: Tuned, folder: Path) -> None:
+def test_a_real_run_finishes(done: Tuned, folder: Path) -> None:
     assert (done.code, done.document["stopped"]) == (0, "")
     assert done.document["after"] == f"{AFTER_FOLDER}-2/flight.mcap" and (folder / PAGE_FILE).exists()
     comparison = done.document["comparison"]
@@ -147,7 +147,7 @@ def test_without_positions_nothing_is_flown(tmp_path: Path) -> None:
     assert not (tmp_path / "run" / BEFORE_FOLDER).exists()
 
 
-def test_a_vehicle_that_another_daemon_flies_is_not_spoken_to() -> None:
+def test_a_vehicle_of_another_daemon_gets_no_message() -> None:
     config = load_config("room", ["daemon.vehicle='udpin://127.0.0.1:1'"])
     with lock_vehicle(config.daemon.vehicle), pytest.raises(VehicleTakenError):
         tune_flight.where_it_stands(config)

@@ -50,7 +50,7 @@ def test_nothing_changed_is_the_recorded_flight_bit_for_bit(case: Case) -> None:
     ],
     ids=["paper-target", "paper-cost", "paper-schedule", "room-target"],
 )
-def test_the_flight_that_might_have_been_is_the_one_that_is_then_flown(
+def test_the_what_if_equals_a_flight_with_the_changed_configuration(
     case: Case, changes: tuple[str, ...], least: float
 ) -> None:
     memory, _ = again(case, *changes)
@@ -62,7 +62,7 @@ def test_the_flight_that_might_have_been_is_the_one_that_is_then_flown(
 
 
 @pytest.mark.slow
-def test_another_link_loses_what_it_would_have_lost() -> None:
+def test_another_link_loses_the_same_positions_as_in_a_flight() -> None:
     changes = ("link.loss=0.1", "schedule.delays=5")
     other = SimulatedLink(history(PAPER), config_of(PAPER, *changes).link, config_of(PAPER).sim.seed, 0.0)
     memory, _ = again(PAPER, *changes, other=other)
@@ -75,7 +75,7 @@ def test_another_link_loses_what_it_would_have_lost() -> None:
 
 
 @pytest.mark.slow
-def test_another_link_between_the_boundaries_puts_lost_positions_back_to_a_millimetre() -> None:
+def test_another_link_restores_lost_positions_between_the_boundaries_to_a_millimetre() -> None:
     quiet: Case = ("room-hahn-stursberg", 8.0, (*EXACT, "sim.camera.noise_std_m=0.0"))
     change = "link.loss=0.1"
     other = SimulatedLink(history(quiet), config_of(quiet, change).link, config_of(quiet).sim.seed, 0.0)
@@ -86,7 +86,7 @@ def test_another_link_between_the_boundaries_puts_lost_positions_back_to_a_milli
     assert far(memory, real) < 2e-3
 
 
-def test_positions_that_were_lost_are_put_back_in_their_places() -> None:
+def test_lost_positions_are_restored_in_order() -> None:
     recorded = history(ROOM)
     camera = recorded.config.sim.camera
     found = find_captures(recorded, lambda: np.zeros(3))
@@ -106,7 +106,7 @@ def test_a_link_that_loses_all_ends_in_the_fallback() -> None:
 
 
 @pytest.mark.slow
-def test_quadrotor_and_model_disagree_and_the_fit_says_so() -> None:
+def test_the_fit_shows_the_model_error_of_a_quadrotor() -> None:
     change = "target.position_m=[0.5, 0.5, -1.0]"
     memory, _ = again(QUADROTOR, change)
     real = flight(flown(QUADROTOR, change))
@@ -122,7 +122,7 @@ def test_quadrotor_and_model_disagree_and_the_fit_says_so() -> None:
     assert (fits[0].rms_m or 1.0) < (fits[1].rms_m or 0.0)
 
 
-def test_departure_is_the_difference_of_two_vehicles_in_the_same_wind() -> None:
+def test_the_deviation_is_the_difference_of_two_vehicles_in_the_same_wind() -> None:
     config = config_of(ROOM)
     one, other = (LinearVehicle(config, np.random.SeedSequence(3), 0) for _ in range(2))
     departure = Deviation(VehicleResponse(one.model))
@@ -158,7 +158,7 @@ def test_departure_is_the_difference_of_two_vehicles_in_the_same_wind() -> None:
     )
 
 
-def test_what_is_sent_acts_after_the_dead_time() -> None:
+def test_a_setpoint_acts_after_the_dead_time() -> None:
     model = make_linear_model(config_of(ROOM).plant)
     at_once, late = Deviation(VehicleResponse(model)), Deviation(VehicleResponse(model, 120_000_000))
     for at_ns, accel in ((0, (1.0, -0.5, 0.2)), (50_000_000, (0.3, 0.0, -0.1)), (900_000_000, (0.0, 0.0, 0.0))):

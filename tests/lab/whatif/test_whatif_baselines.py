@@ -19,7 +19,7 @@ from uavctl.smpc.batch import News
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["lqg", "packetised", "hold-last", "zero-on-loss", "pid", "worst-case-delay"])
-def test_a_baseline_s_plan_is_what_it_does_in_silence(kind: str) -> None:
+def test_a_baseline_s_plan_is_its_behaviour_without_measurements(kind: str) -> None:
     config = config_of(PAPER)
     spec = ControllerSpec(name=kind, kind=kind)
     campaign = CampaignSpec(name="x", config="paper", controller=(spec,))
@@ -47,7 +47,7 @@ def test_a_baseline_s_plan_is_what_it_does_in_silence(kind: str) -> None:
         acted = np.concatenate([acted, np.clip(asked, low, high)[:, np.newaxis]], axis=1)
 
 
-def test_a_baseline_flies_and_its_plans_say_so() -> None:
+def test_a_baseline_flies_and_its_plans_name_it() -> None:
     config = config_of(PAPER)
     spec = ControllerSpec(name="lqg", kind="lqg")
     recipe = make_recipe(spec, config, CampaignSpec(name="x", config="paper", controller=(spec,)))

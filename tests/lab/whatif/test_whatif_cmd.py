@@ -75,7 +75,7 @@ def test_another_cost_is_recorded_reported_and_replays(
 
 
 @pytest.mark.usefixtures("no_figures")
-def test_people_get_the_worth_of_it_first_and_then_the_figures(
+def test_the_terminal_shows_the_validity_before_the_figures(
     flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     code, text, _ = typed(
@@ -137,7 +137,7 @@ def test_a_model_that_was_identified(flown: Path, tmp_path: Path, capsys: pytest
         (("--controller", "genius"), "genius"),
     ],
 )
-def test_what_cannot_be_changed_is_told(
+def test_keys_that_cannot_change_are_reported(
     flown: Path, arguments: tuple[str, ...], words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     code, out, errors = typed(capsys, "log", "whatif", str(flown), *arguments)
@@ -145,7 +145,7 @@ def test_what_cannot_be_changed_is_told(
     assert words in " ".join(errors.split())
 
 
-def test_other_files_are_told(flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_other_files_are_refused(flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code, _, errors = typed(capsys, "log", "whatif", str(DATA / "arducopter-vicon.tlog"))
     assert code == 2 and "another program's recording" in errors
     code, _, errors = typed(capsys, "log", "whatif", str(tmp_path / "none.mcap"))

@@ -85,7 +85,7 @@ def force_of(frame: bytes) -> Vec3:
 @pytest.mark.parametrize(
     ("kind", "resolution"), [("highres_imu", 2e-6), ("raw_imu", MILLI_G_MPS2 / 2), ("scaled_imu2", MILLI_G_MPS2 / 2)]
 )
-def test_a_shifted_specific_force_is_the_acceleration_more(kind: str, resolution: float, first_version: bool) -> None:
+def test_a_shifted_specific_force_adds_the_acceleration(kind: str, resolution: float, first_version: bool) -> None:
     speaker, attitude = Speaker(number=200), turn(LEANING)
     frame = speaker.feels(kind, 5_000_000, (0.31, -0.42, -9.77), first_version=first_version)
     moved = add_acceleration(frame, attitude, BY)
@@ -100,7 +100,7 @@ def test_a_shifted_specific_force_is_the_acceleration_more(kind: str, resolution
     assert add_acceleration(frame, attitude, (0.0, 0.0, 0.0)) == frame.data
 
 
-def test_what_does_not_fit_into_a_message_stays_at_its_end() -> None:
+def test_values_beyond_the_range_of_a_message_are_clipped() -> None:
     frame = Speaker().feels("raw_imu", 5_000_000, (310.0, 0.0, -310.0))
     assert force_of(add_acceleration(frame, (1.0, 0.0, 0.0, 0.0), (50.0, 0.0, -50.0))) == pytest.approx(
         (32767 * MILLI_G_MPS2, 0.0, -32768 * MILLI_G_MPS2)
@@ -115,7 +115,7 @@ def test_what_does_not_fit_into_a_message_stays_at_its_end() -> None:
     ],
     ids=["px4", "ardupilot"],
 )
-def test_the_controller_reads_the_acceleration_more(
+def test_the_controller_reads_the_added_acceleration(
     autopilot: int, quaternion: bool, kind: str, resolution: float
 ) -> None:
     speaker = Speaker(autopilot)
@@ -137,7 +137,7 @@ def test_the_controller_reads_the_acceleration_more(
     np.testing.assert_allclose(more, [BY] * 20, atol=math.sqrt(3.0) * resolution)
 
 
-def test_frames_that_cannot_be_mended_are_left_out_once_the_courses_part() -> None:
+def test_frames_that_cannot_be_rewritten_are_dropped_once_the_courses_differ() -> None:
     speaker, frames = Speaker(), InertialFrames(config_of(LINEAR).daemon)
 
     def heard(frame: RawFrame, at_ms: int, by: Vec3 | None = BY) -> bool:
@@ -172,7 +172,7 @@ def test_nothing_changed_is_the_recorded_flight_bit_for_bit(case: Case) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("case", [LINEAR, LINEAR_ARDUPILOT], ids=["px4", "ardupilot"])
 @pytest.mark.parametrize("change", [ELSEWHERE, "cost.input=[3.0, 3.0, 3.0]"], ids=["target", "cost"])
-def test_on_the_linear_plant_the_sensors_say_what_they_then_really_say(case: Case, change: str) -> None:
+def test_on_the_linear_plant_rewritten_inertial_data_equal_those_of_a_flight(case: Case, change: str) -> None:
     memory, course = again(case, change)
     real = flown(case, change)
     feels, truly, recorded = (felt(side) for side in (memory, real, flown(case)))
@@ -198,7 +198,7 @@ def test_on_the_linear_plant_the_sensors_say_what_they_then_really_say(case: Cas
     ],
     ids=["px4-target", "ardupilot-target", "px4-cost", "ardupilot-loss"],
 )
-def test_the_true_quadrotor_holds_as_it_then_really_does(case: Case, change: str, target: Vec3 | None) -> None:
+def test_the_what_if_of_a_quadrotor_holds_as_a_flight_does(case: Case, change: str, target: Vec3 | None) -> None:
     most = 0.04
     other = None
     if change.startswith("link."):
@@ -215,7 +215,7 @@ def test_the_true_quadrotor_holds_as_it_then_really_does(case: Case, change: str
 
 
 @pytest.mark.slow
-def test_without_an_attitude_inertial_data_are_left_out_and_positions_fly_on() -> None:
+def test_without_an_attitude_inertial_data_are_dropped_and_positions_continue() -> None:
     def blind(data: bytes) -> bytes:
         return b"".join(
             one.data for one in scan_frames(data, final=True).frames if one.message_id not in (ATTITUDE, QUATERNION)

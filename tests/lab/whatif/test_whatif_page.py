@@ -70,7 +70,7 @@ def levels(ax: Axes) -> list[float]:
     return sorted(float(np.asarray(line.get_ydata())[0]) for line in lines)
 
 
-def test_limits_are_those_of_the_flight_that_might_have_been(recorded: FlightData, other: FlightData) -> None:
+def test_limits_are_those_of_the_what_if(recorded: FlightData, other: FlightData) -> None:
     axes, _ = figures(recorded, other)
     box = other.design.state_box
     for name, index in zip(other.design.axes, other.design.position_index, strict=True):
@@ -93,13 +93,13 @@ def test_the_reserve_is_the_largest_of_each_plan(recorded: FlightData, other: Fl
         assert above.y0 == pytest.approx(design.state_box.upper[index] - max(kept))
 
 
-def test_another_link_is_not_called_nothing(recorded: FlightData) -> None:
+def test_another_link_is_listed_as_a_change(recorded: FlightData) -> None:
     summary = summarise(recorded, wall_s=None)
     (said,) = (text for text in describe_what_if(worse_link(summary)) if "link: loss=0.5" in text)
     assert "nothing" not in said
 
 
-def test_inertial_messages_that_are_left_out_are_told(recorded: FlightData) -> None:
+def test_dropped_inertial_messages_are_reported(recorded: FlightData) -> None:
     found = worse_link(summarise(recorded, wall_s=None))
     assert not any("inertial" in text for text in describe_what_if(found))
     lacking = msgspec.structs.replace(found, inertial_moved=30, inertial_left_out=12)

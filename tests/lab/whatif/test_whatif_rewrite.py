@@ -41,7 +41,7 @@ def camera_of(message: str) -> CameraConfig:
 
 @pytest.mark.parametrize("frame", FRAMES, ids=["ned", "enu", "enu-turned", "ned-turned"])
 @pytest.mark.parametrize("message", ["vision", "vicon", "mocap", "odometry"])
-def test_what_cameras_would_have_said(message: str, frame: FrameConfig) -> None:
+def test_positions_of_cameras_are_moved(message: str, frame: FrameConfig) -> None:
     camera, axes = camera_of(message), SourceFrames(frame)
     (seen,) = axes.find_positions(said(camera, frame, HERE))
     np.testing.assert_allclose(seen.position_m, HERE[0], atol=1e-6)
@@ -78,6 +78,6 @@ def test_the_vehicle_s_own_estimate_is_moved_as_it_stands_and_in_its_own_version
     assert (found.x, found.y, found.z, found.vx, found.vy, found.time_boot_ms) == (1.5, 2.0, -2.75, 0.5, 1.0, 7000)
 
 
-def test_what_is_no_position_is_not_seen() -> None:
+def test_other_messages_have_no_position() -> None:
     beat = mavlink.MAVLink_heartbeat_message(2, 3, 81, 0, 4, 3).pack(mavlink.MAVLink(None, 1, 1))
     assert list(SourceFrames(FrameConfig()).find_positions(bytes(beat) + b"\xfd\x00garbage")) == []
