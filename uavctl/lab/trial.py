@@ -567,8 +567,8 @@ def _compute_figures(
     return TrialFlight(seed=config.sim.seed, **figures, **counts)  # type: ignore[arg-type]
 
 
-def _compute_share(part: int, whole: int) -> float:
-    return part / whole if whole else math.nan
+def _compute_share(part: int, total: int) -> float:
+    return part / total if total else math.nan
 
 
 def to_vec3(values: Array) -> Vec3:

@@ -72,10 +72,10 @@ class Crashing:
 
     def begin(self, runs: int) -> None: ...
 
-    def act(self, news: News) -> np.ndarray:
-        if news.step == 0 and (news.state[:, 0] > self._limit).any():
+    def act(self, measurement: News) -> np.ndarray:
+        if measurement.step == 0 and (measurement.state[:, 0] > self._limit).any():
             raise ZeroDivisionError("out of range")
-        return np.zeros((len(news.state), 2))
+        return np.zeros((len(measurement.state), 2))
 
 
 def test_an_error_of_a_run_is_recorded_and_the_others_continue(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -147,20 +147,20 @@ def several(folder: Path) -> list[Task]:
 
 @pytest.mark.parametrize("deaths", [1, 2])
 def test_a_worker_that_dies_costs_at_most_the_task_that_kills_it(tmp_path: Path, deaths: int) -> None:
-    given, kept = several(tmp_path), dict[str, str]()
-    crew = FakeCrew({given[1].name: deaths})
-    fly_tasks(given, crew, lambda task, columns: kept.update({task.name: str(columns["error"][0])}), never)
-    assert sorted(kept) == [task.name for task in given]
+    tasks, kept_tasks = several(tmp_path), dict[str, str]()
+    crew = FakeCrew({tasks[1].name: deaths})
+    fly_tasks(tasks, crew, lambda task, columns: kept_tasks.update({task.name: str(columns["error"][0])}), never)
+    assert sorted(kept_tasks) == [task.name for task in tasks]
     expected = "the worker died, twice" if deaths == 2 else ""
-    assert kept.pop(given[1].name) == expected
-    assert set(kept.values()) == {""} and crew.renewed == deaths
+    assert kept_tasks.pop(tasks[1].name) == expected
+    assert set(kept_tasks.values()) == {""} and crew.renewed == deaths
 
 
 def test_a_stop_keeps_pending_tasks(tmp_path: Path) -> None:
-    given, kept = several(tmp_path), list[str]()
-    asked: Callable[[], bool] = lambda: len(kept) >= 1  # noqa: E731
-    fly_tasks(given, FakeCrew({}), lambda task, columns: kept.append(task.name), asked)
-    assert 1 <= len(kept) <= 4 and len(kept) < len(given)
+    tasks, kept_tasks = several(tmp_path), list[str]()
+    is_stopped: Callable[[], bool] = lambda: len(kept_tasks) >= 1  # noqa: E731
+    fly_tasks(tasks, FakeCrew({}), lambda task, columns: kept_tasks.append(task.name), is_stopped)
+    assert 1 <= len(kept_tasks) <= 4 and len(kept_tasks) < len(tasks)
 
 
 def test_another_error_than_a_dead_worker_is_raised(tmp_path: Path) -> None:

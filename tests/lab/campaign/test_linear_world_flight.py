@@ -138,8 +138,8 @@ def in_lockstep(run: Run) -> Memory:
     assert build_design(config).design_id == DESIGN.design_id
     loop = make_loop(config, memory, DESIGN)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(simulation, "LinearVehicle", lambda *given: GivenDisturbances(run, *given))
-        patch.setattr(simulation, "Channel", lambda *given: GivenDelays(run, *given))
+        patch.setattr(simulation, "LinearVehicle", lambda *arguments: GivenDisturbances(run, *arguments))
+        patch.setattr(simulation, "Channel", lambda *arguments: GivenDelays(run, *arguments))
         world = World(config, loop, lambda truth: memory.put("/sim/truth", truth.at_ns, truth))
     world.run(config.duration_s)
     world.peers.advance(STEPS * DT_NS)
@@ -182,5 +182,5 @@ def test_flight_and_run_are_equal_until_the_plan_ends() -> None:
 
 def test_positions_are_delayed_or_lost_as_in_the_run() -> None:
     known = np.array([0, 0, 0, 1, 4, 4, 5])  # 1 is two steps late, 4 and 0 are not, 5 is one; 2, 3, 6 are lost
-    wanted = [0, 2, None, None, 0, 1, None]
-    assert list(delays_ns(known)) == [None if steps is None else steps * DT_NS for steps in wanted]
+    expected = [0, 2, None, None, 0, 1, None]
+    assert list(delays_ns(known)) == [None if steps is None else steps * DT_NS for steps in expected]

@@ -31,8 +31,8 @@ def land(rig: Endings) -> None:
 def taken(state: HandoverState, after_s: float, folder: Path, *, lands: bool) -> tuple[Tuned, int]:
     """A call in which the pilot takes over, and lands or leaves the end to the operator; and when we had heard it."""
     released_ns: list[int] = []
-    rig = real_rig().at(state, lambda one: one.stick(STICK), after_s=after_s)
-    rig.at(HandoverState.RELEASED, lambda one: released_ns.append(one.now_ns))
+    rig = real_rig().at(state, lambda real: real.stick(STICK), after_s=after_s)
+    rig.at(HandoverState.RELEASED, lambda real: released_ns.append(real.now_ns))
     rig.at(HandoverState.RELEASED, land if lands else interrupt, after_s=2.0)
     result = fly_real(rig, folder, enter="\n")
     return result, released_ns[0]
@@ -64,7 +64,7 @@ def in_the_second(folder: Path, not_agreed: Tuned) -> tuple[Tuned, int]:
 
 
 @pytest.fixture(scope="module")
-def done(folder: Path, in_the_second: tuple[Tuned, int]) -> Tuned:
+def finished_run(folder: Path, in_the_second: tuple[Tuned, int]) -> Tuned:
     return fly_real(real_rig(), folder, "--yes")
 
 
@@ -104,10 +104,10 @@ def test_a_no_at_enter_stops_before_the_second_flight(not_agreed: Tuned, folder:
 @pytest.mark.slow
 def test_ctrl_c_at_enter_is_a_no_too(not_agreed: Tuned, folder: Path) -> None:
     stamp = (folder / STATE_FILE).read_bytes()
-    again = fly_real(real_rig(), folder, enter=KeyboardInterrupt)
-    assert again.code == again.document["exit_code"] == tune_cmd.INTERRUPTED
-    assert again.document["stopped"] and str(folder) in again.told
-    assert not again.rig.sent and (folder / STATE_FILE).read_bytes() == stamp
+    repeated = fly_real(real_rig(), folder, enter=KeyboardInterrupt)
+    assert repeated.code == repeated.document["exit_code"] == tune_cmd.INTERRUPTED
+    assert repeated.document["stopped"] and str(folder) in repeated.told
+    assert not repeated.rig.sent and (folder / STATE_FILE).read_bytes() == stamp
 
 
 @pytest.mark.slow
@@ -120,13 +120,13 @@ def test_the_stick_in_the_second_flight_keeps_finished_steps(in_the_second: tupl
 
 
 @pytest.mark.slow
-def test_a_real_run_finishes(done: Tuned, folder: Path) -> None:
-    assert (done.code, done.document["stopped"]) == (0, "")
-    assert done.document["after"] == f"{AFTER_FOLDER}-2/flight.mcap" and (folder / PAGE_FILE).exists()
-    comparison = done.document["comparison"]
+def test_a_real_run_finishes(finished_run: Tuned, folder: Path) -> None:
+    assert (finished_run.code, finished_run.document["stopped"]) == (0, "")
+    assert finished_run.document["after"] == f"{AFTER_FOLDER}-2/flight.mcap" and (folder / PAGE_FILE).exists()
+    comparison = finished_run.document["comparison"]
     assert comparison["new_errors"]["rms_m"][0][3] < comparison["old_errors"]["rms_m"][0][3]
     assert comparison["after"]["hold_s"] > 2.0 and comparison["after"]["judged_by"] == "estimate"
-    assert not done.rig.peers.autopilot.pilot.is_armed
+    assert not finished_run.rig.peers.autopilot.pilot.is_armed
     before, after = (
         parse(recorded(folder, f"{name}"), name).config for name in (f"{BEFORE_FOLDER}-3", f"{AFTER_FOLDER}-2")
     )
@@ -154,6 +154,6 @@ def test_a_vehicle_of_another_daemon_gets_no_message() -> None:
 
 
 @pytest.mark.slow
-def test_the_state_is_that_of_the_document(done: Tuned, folder: Path) -> None:
+def test_the_state_is_that_of_the_document(finished_run: Tuned, folder: Path) -> None:
     state = json.loads((folder / STATE_FILE).read_text())
-    assert all(done.document[key] == value for key, value in state.items())
+    assert all(finished_run.document[key] == value for key, value in state.items())

@@ -97,7 +97,7 @@ def draw_states(
     rng = np.random.default_rng(seed)
     box_states, share = _draw_box_states(design, count - count // 2, rng, on_progress)
     loop_states = collect_loop_states(
-        design, solver, box_states, count // 2, loss, rng, lambda done: on_progress(len(box_states) + done)
+        design, solver, box_states, count // 2, loss, rng, lambda n_done: on_progress(len(box_states) + n_done)
     )
     alternating = chain.from_iterable(zip_longest(box_states, loop_states))
     return BenchStates(tuple(x for x in alternating if x is not None), share)
@@ -200,7 +200,7 @@ def run_bench(
     design: Design,
     loss: float,
     seed: int,
-    advance: ReportProgress,
+    on_progress: ReportProgress,
     sizes: BenchSizes = DEFAULT_SIZES,
     conditioned: ConditionedSolver | None = None,
 ) -> BenchResult:
@@ -218,8 +218,8 @@ def run_bench(
     ready_s = time.perf_counter() - begin
 
     def begin_phase(name: str, total: int) -> Callable[[int], None]:
-        advance(name, 0, total)
-        return lambda done: advance(name, done, total)
+        on_progress(name, 0, total)
+        return lambda n_done: on_progress(name, n_done, total)
 
     states = draw_states(design, solver, sizes.states, loss, seed, begin_phase("states", sizes.states))
     points, target = states.points, design.target

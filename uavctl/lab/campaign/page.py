@@ -495,12 +495,14 @@ def _render_trial_banner(cells: Sequence[TrialSummary]) -> Markup:
         return page.NOTHING
     worst_m, worst = max(beyond, key=lambda value_and_cell: value_and_cell[0])
     place = worst.place
-    where = f"{place.controller}, {_SCENARIO_TITLES[place.scenario].lower()}, {', '.join(_get_conditions(worst))}"
+    description = f"{place.controller}, {_SCENARIO_TITLES[place.scenario].lower()}, {', '.join(_get_conditions(worst))}"
     outside = sum(value > 0.0 for value, _ in beyond)
     if not outside:
-        text = f"{count(len(beyond), 'flight')}, of which the nearest to a wall had {-worst_m:.2f} m left ({where})."
+        text = (
+            f"{count(len(beyond), 'flight')}, of which the nearest to a wall had {-worst_m:.2f} m left ({description})."
+        )
         return page.render_banner("good", "All inside", text, ())
-    text = f"{outside} of {count(len(beyond), 'flight')}, the furthest by {worst_m:.2f} m ({where})."
+    text = f"{outside} of {count(len(beyond), 'flight')}, the furthest by {worst_m:.2f} m ({description})."
     return page.render_banner("bad" if worst_m >= GRAVE_M else "mind", "Left their limits", text, ())
 
 

@@ -191,12 +191,12 @@ def draw_quantities(
     numeric_losses = {link: loss for link, loss in losses.items() if link in link_names}
     if len(set(numeric_losses.values())) < _MIN_NUMERIC_LINKS:
         numeric_losses = {}
-    others = [cell for cell in flown if cell.link not in numeric_losses]
+    other_cells = [cell for cell in flown if cell.link not in numeric_losses]
     if numeric_losses:
         shown = [cell for cell in flown if cell.link in numeric_losses]
         yield from (_draw_over_loss(quantity, shown, numeric_losses, styles, key) for quantity in QUANTITIES)
-    if others:
-        yield from (_draw_by_link(quantity, others, styles, key) for quantity in QUANTITIES)
+    if other_cells:
+        yield from (_draw_by_link(quantity, other_cells, styles, key) for quantity in QUANTITIES)
 
 
 def _draw_over_loss(

@@ -473,12 +473,12 @@ def _describe_comparison(comparison: BaselineComparison) -> str:
         else f"cannot be told apart by cost ({_describe_extra_cost(comparison)})"
     )
     if not comparison.is_as_safe:
-        how = ", but keeps limits better" if comparison.cost_sign < 0 else " and keeps limits better"
+        limits_text = ", but keeps limits better" if comparison.cost_sign < 0 else " and keeps limits better"
     elif comparison.is_safer:
-        how = ", but breaks limits more often"
+        limits_text = ", but breaks limits more often"
     else:
-        how = " and breaks limits no more often"
-    return f"{name} {costs}{how}: {_describe_limits(comparison)}.{_describe_allowance(comparison)}"
+        limits_text = " and breaks limits no more often"
+    return f"{name} {costs}{limits_text}: {_describe_limits(comparison)}.{_describe_allowance(comparison)}"
 
 
 def _describe_allowance(comparison: BaselineComparison) -> str:

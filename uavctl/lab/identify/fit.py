@@ -105,11 +105,11 @@ def fit_axes(
                 del requested[i]
     fits = []
     for axis_index, model in enumerate(models):
-        x, least = min(
+        x, deviance = min(
             (results[i] for i, (index, _) in enumerate(starting_points) if index == axis_index),
             key=lambda start_values: start_values[1],
         )
-        fits.append(AxisFit(model, dead_time_s, tuple(x.tolist()), least))
+        fits.append(AxisFit(model, dead_time_s, tuple(x.tolist()), deviance))
     return tuple(fits)
 
 

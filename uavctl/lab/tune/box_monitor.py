@@ -101,7 +101,9 @@ class BoxMonitor:
             self._index = decision.waypoint
         position_m, velocity = read_position(estimate, self._plant), read_velocity(estimate, self._plant)
         observation = Observation(at_ns, (), ZERO, position_m, velocity, None, braking=False)
-        near_axes = [axis for axis, one in enumerate(self._near_envelopes) if is_outside(observation, one)]
+        near_axes = [
+            axis for axis, near_envelope in enumerate(self._near_envelopes) if is_outside(observation, near_envelope)
+        ]
         if is_outside(observation, self._leaving_envelope):
             self._end_flight(loop, f"the vehicle was about to leave the box: {self._describe_distance(observation)}")
         elif near_axes and self._is_clear and self._index < self._last_index:

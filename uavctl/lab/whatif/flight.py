@@ -225,9 +225,9 @@ class _FrameStream:
     def take_whole_frames(self, chunk: bytes) -> bytes:
         """Return the complete frames so far; keep an incomplete one for the next chunk."""
         data = self._rest + chunk
-        found = scan_frames(data, final=False, is_aligned=self._in_step)
-        self._rest, self._in_step = data[found.consumed :], found.is_aligned
-        return data[: found.consumed]
+        result = scan_frames(data, final=False, is_aligned=self._in_step)
+        self._rest, self._in_step = data[result.consumed :], result.is_aligned
+        return data[: result.consumed]
 
 
 TRUTH = "/sim/truth"

@@ -137,9 +137,9 @@ class InertialFrames:
     """
 
     def __init__(self, daemon: DaemonConfig) -> None:
-        own = daemon.system_id, daemon.component_id
+        own_address = daemon.system_id, daemon.component_id
         self._monitor = VehicleMonitor(
-            lambda _: None, own, daemon.vehicle_system_id, daemon.vehicle_component_id, inertial=True
+            lambda _: None, own_address, daemon.vehicle_system_id, daemon.vehicle_component_id, inertial=True
         )
         self.moved = self.dropped = 0
 
