@@ -21,12 +21,13 @@ from uavctl.cli import INTERRUPTED
 from uavctl.cli.common import Common, bars, columns, messages
 from uavctl.cli.flying import stop_on_signals
 from uavctl.errors import UsageError
-from uavctl.lab.campaign.page import write_report, write_trial_report
+from uavctl.lab.campaign.page import write_report
 from uavctl.lab.campaign.pool import Columns, Work, Workers, fly_tasks, open_cluster, open_processes
 from uavctl.lab.campaign.results import CellSummary, summarise
 from uavctl.lab.campaign.spec import read_campaign
 from uavctl.lab.campaign.store import SCHEMA, Store
 from uavctl.lab.campaign.tasks import make_cells, make_document, make_tasks
+from uavctl.lab.campaign.trial_page import write_trial_report
 from uavctl.lab.campaign.trials import SCHEMA as TRIALS
 from uavctl.lab.campaign.trials import (
     TrialSummary,
@@ -208,7 +209,7 @@ def _progress(tasks: Sequence[Work], kept: set[str]) -> Iterator[Callable[[Work]
 
 def _interrupted(store: Store, spec: Path, runs: int | None) -> str:
     """Say after an interruption what is done, and how to go on."""
-    if not store.has_begun():
+    if not store.has_campaign():
         return "interrupted before the first run"
     number = () if runs is None else ("--runs", str(runs))
     again = shlex.join(["uavctl", "campaign", str(spec), *number, "--out", str(store.folder), "--resume"])

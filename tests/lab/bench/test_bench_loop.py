@@ -28,12 +28,12 @@ def make_run(us: float, missed: float = 0.0) -> LoopRun:
 
 
 def test_a_spread_is_in_microseconds() -> None:
-    times = TimeQuantiles.of(np.arange(1001) * 1000)
+    times = TimeQuantiles.compute(np.arange(1001) * 1000)
     assert (times.p50, times.p99, times.p999, times.max) == (500.0, 990.0, 999.0, 1000.0)
 
 
 def test_several_runs_give_the_median_of_each_figure() -> None:
-    middle = LoopRun.middle([make_run(3.0, missed=9.0), make_run(1.0), make_run(2.0)])
+    middle = LoopRun.compute_median([make_run(3.0, missed=9.0), make_run(1.0), make_run(2.0)])
     assert middle.in_to_out_us == spread(2.0) and middle.above_empty_us == 1.0
     assert middle.missed_ticks == 0.0 and middle.memory_growth_kib == 2.0
 

@@ -10,6 +10,7 @@ from campaign_rig import cells, controller, read, table
 
 from uavctl.build.controller import build_problem
 from uavctl.config import load_config
+from uavctl.lab.campaign.arrivals import compute_newest_captures
 from uavctl.lab.campaign.controllers import (
     TUNING_FIRST,
     RunConditions,
@@ -18,9 +19,10 @@ from uavctl.lab.campaign.controllers import (
     get_controller,
     get_start_state,
 )
+from uavctl.lab.campaign.draws import draw
 from uavctl.lab.campaign.spec import CHUNK
 from uavctl.lab.campaign.tasks import describe_cell, make_cells, make_document, make_tasks
-from uavctl.lab.campaign.world import compute_newest_captures, draw, simulate
+from uavctl.lab.campaign.world import simulate
 from uavctl.smpc.baselines import Lqg, PacketisedPredictive, WorstCaseDelay
 from uavctl.smpc.batch import BatchSmpc
 from uavctl.smpc.hahn_stursberg.design import kappa

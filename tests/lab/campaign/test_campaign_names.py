@@ -15,7 +15,8 @@ from matplotlib.textpath import TextPath
 from logs.report.svg import Drawing
 from uavctl.lab.campaign import plots
 from uavctl.lab.campaign.plots import ControllerStyles
-from uavctl.lab.campaign.results import group_cells, make_verdicts, read_results, summarise
+from uavctl.lab.campaign.results import read_results, summarise
+from uavctl.lab.campaign.verdicts import group_cells, make_verdicts
 
 LINKS = (
     "30 %",

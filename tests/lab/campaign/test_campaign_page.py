@@ -19,15 +19,14 @@ from logs.report.run_statistics import PairedDifference
 from uavctl.errors import UavctlError
 from uavctl.lab.campaign.page import CampaignView, describe_outcome, write_report
 from uavctl.lab.campaign.plots import ControllerStyles
-from uavctl.lab.campaign.results import (
+from uavctl.lab.campaign.results import read_results, summarise
+from uavctl.lab.campaign.verdicts import (
     CampaignVerdict,
     describe_briefly,
     describe_verdict,
     get_verdict_word,
     group_cells,
     make_verdicts,
-    read_results,
-    summarise,
 )
 
 N = 60

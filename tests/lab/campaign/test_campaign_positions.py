@@ -17,10 +17,12 @@ from uavctl.build.controller import build_estimator, build_plant, build_problem
 from uavctl.config import Config, load_config
 from uavctl.flight.estimator import absorb_samples, begin_history, estimate_at, note_input
 from uavctl.flight.kalman import make_kalman
+from uavctl.lab.campaign.arrivals import compute_known_steps, select_newest_captures
 from uavctl.lab.campaign.controllers import draw_conditions, make_filter_belief
+from uavctl.lab.campaign.draws import draw, draw_noise
 from uavctl.lab.campaign.pool import Columns
+from uavctl.lab.campaign.position_filter import PositionFilter
 from uavctl.lab.campaign.tasks import Cell, fly_task, make_tasks
-from uavctl.lab.campaign.world import PositionFilter, compute_known_steps, draw, draw_noise, select_newest_captures
 from uavctl.records import PositionSample
 from uavctl.smpc.baselines import Governor, MeanQp
 from uavctl.smpc.batch import Counts, News, predict, predicted_cov

@@ -14,8 +14,8 @@ import pytest
 from uavctl.cli.app import run
 from uavctl.errors import ConfigError
 from uavctl.lab.campaign import trials as trial_cells
-from uavctl.lab.campaign.page import render_trial_report
 from uavctl.lab.campaign.store import Store, make_table
+from uavctl.lab.campaign.trial_page import render_trial_report
 from uavctl.lab.campaign.trials import (
     CHUNK,
     SCHEMA,

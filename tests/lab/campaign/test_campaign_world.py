@@ -10,7 +10,9 @@ from uavctl.arrays import Array
 from uavctl.build.controller import build_design, build_plant
 from uavctl.build.link import build_delayed_link
 from uavctl.config import Config, load_config
-from uavctl.lab.campaign.world import LinearWorld, compute_newest_captures, draw, simulate
+from uavctl.lab.campaign.arrivals import compute_newest_captures
+from uavctl.lab.campaign.draws import draw
+from uavctl.lab.campaign.world import LinearWorld, simulate
 from uavctl.smpc.batch import BatchSmpc, Decisions, News, predict
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope

@@ -20,7 +20,9 @@ from uavctl.build.controller import build_design, build_plant
 from uavctl.config import Config, load_config
 from uavctl.config.connections import ClockConfig
 from uavctl.config.link import LinkConfig
-from uavctl.lab.campaign.world import LinearWorld, Trajectories, compute_newest_captures, draw, simulate
+from uavctl.lab.campaign.arrivals import compute_newest_captures
+from uavctl.lab.campaign.draws import draw
+from uavctl.lab.campaign.world import LinearWorld, Trajectories, simulate
 from uavctl.records import Decision, Truth
 from uavctl.smpc.batch import BatchSmpc, Counts
 from uavctl.smpc.hahn_stursberg.frozen import ShortcutDecider, ShortcutSolver

@@ -15,7 +15,8 @@ from uavctl.build.link import build_delayed_link, build_link, promised
 from uavctl.config import load, load_config
 from uavctl.config.load import dump_config, parse
 from uavctl.errors import ConfigError, DesignError
-from uavctl.lab.campaign.world import compute_newest_captures, draw
+from uavctl.lab.campaign.arrivals import compute_newest_captures
+from uavctl.lab.campaign.draws import draw
 from uavctl.records import Truth
 
 S = 1_000_000_000

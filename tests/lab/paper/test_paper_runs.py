@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from uavctl.arrays import Array
 from uavctl.build.controller import build_design, build_plant, start_state
 from uavctl.config import load_config
-from uavctl.lab.campaign.world import LinearWorld, Trajectories, compute_newest_captures, draw, simulate
+from uavctl.lab.campaign.arrivals import compute_newest_captures
+from uavctl.lab.campaign.draws import draw
+from uavctl.lab.campaign.world import LinearWorld, Trajectories, simulate
 from uavctl.lab.paper import runs as run
 from uavctl.lab.paper.claims import (
     PRINTED,

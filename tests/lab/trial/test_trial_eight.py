@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from uavctl.lab.trial import (
+from uavctl.lab.figure_eight import (
     CENTRE_M,
     HALF_M,
     MAX_MPS,
@@ -13,9 +13,9 @@ from uavctl.lab.trial import (
     ROUNDS,
     WIDTH_M,
     make_figure_eight,
-    make_path,
     sample_figure_eight,
 )
+from uavctl.lab.trial import make_path
 
 
 def test_its_mean_and_largest_speeds_are_those_of_the_paper() -> None:

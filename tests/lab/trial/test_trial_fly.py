@@ -15,6 +15,7 @@ sys.path.insert(0, str(ROOT / "tools"))
 
 import trials
 
+from uavctl.lab.figure_eight import make_figure_eight
 from uavctl.lab.position_loop import PositionLoopTuning
 from uavctl.lab.trial import (
     AUTOPILOTS,
@@ -27,7 +28,6 @@ from uavctl.lab.trial import (
     get_flight_length_s,
     get_room_limits,
     make_design_config,
-    make_figure_eight,
     make_flight_config,
 )
 from uavctl.records import ControlMode, Decision, Plan, Setpoint, SetpointSource, SolveStatus

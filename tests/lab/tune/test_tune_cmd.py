@@ -290,9 +290,8 @@ def test_a_flight_of_another_configuration_or_without_its_end_does_not_count(
     config = parse(header(finished_run / BEFORE_FOLDER / "flight.mcap").config_toml, "before").config
     assert left_whole(config, finished_run / BEFORE_FOLDER) == finished_run / BEFORE_FOLDER / "flight.mcap"
     assert left_whole(config, finished_run / AFTER_FOLDER) is None and left_whole(config, tmp_path) is None
-    (tmp_path / "flight.mcap").write_bytes(
-        (finished_run / BEFORE_FOLDER / "flight.mcap").read_bytes()
-    )  # its first file alone
+    # The first file of the recording alone
+    (tmp_path / "flight.mcap").write_bytes((finished_run / BEFORE_FOLDER / "flight.mcap").read_bytes())
     assert left_whole(config, tmp_path) is None
 
 

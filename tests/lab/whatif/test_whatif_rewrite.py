@@ -49,9 +49,8 @@ def test_positions_of_cameras_are_moved(message: str, frame: FrameConfig) -> Non
     expected = capture(camera, frame, THERE)
     mav = mavlink.MAVLink(None)
     moved_message, expected_message = (mav.decode(bytearray(data)) for data in (moved, expected))
-    assert (
-        moved_message.get_type() == expected_message.get_type() and moved[:10] == expected[:10]
-    )  # length, number, sender
+    assert moved_message.get_type() == expected_message.get_type()
+    assert moved[:10] == expected[:10]  # length, number, sender
     for name in moved_message.fieldnames:
         np.testing.assert_allclose(
             getattr(moved_message, name), getattr(expected_message, name), atol=2e-6, err_msg=name

@@ -256,14 +256,14 @@ def run_bench(
         exact_axis_ms=exact_ms / components,
         exact_ms=exact_ms,
         exact_states=len(exact.answers),
-        flown_us=Quantiles.of(flown.us),
+        flown_us=Quantiles.compute(flown.us),
         frozen_us=compute_median(flown.get_times_us(FROZEN)),
         program_us=compute_median(flown.get_times_us(METHOD)),
         ratio_printed=joint_ms / exact_ms,
         ratio_cvxpy=axes_ms / exact_ms,
         conditioned=_make_conditioned_times(conditioned_times[0], axes_ms) if conditioned_times else None,
         shares=_compute_shares(flown),
-        gap=Quantiles.of(np.array([answer.gap for answer in flown.answers])),
+        gap=Quantiles.compute(np.array([answer.gap for answer in flown.answers])),
         certificate_excess=_compute_excess(flown.answers, exact.answers),
         cost_difference=None if design.estimate_cov.any() else _compute_cost_difference(axes.answers, exact.answers),
         ready_s=ready_s,
@@ -273,10 +273,10 @@ def run_bench(
 
 
 def _make_conditioned_times(result: TimedAnswers, axes_ms: float) -> ConditionedTimes:
-    us = Quantiles.of(result.us)
+    us = Quantiles.compute(result.us)
     return ConditionedTimes(
         us=us,
-        iterations=Quantiles.of(np.array([answer.iterations for answer in result.answers])),
+        iterations=Quantiles.compute(np.array([answer.iterations for answer in result.answers])),
         left_alone=sum(answer.iterations == 0 for answer in result.answers) / len(result.answers),
         ratio_cvxpy=axes_ms * 1e3 / us.p50,
     )
@@ -381,8 +381,8 @@ def time_flight(config: Config, on_progress: Callable[[int, int], None] = lambda
     has_plan = np.array([answer.inputs.size > 0 for answer in answers])
     return FlightBench(
         questions=len(answers),
-        us=Quantiles.of(us.min(axis=0)),
-        iterations=Quantiles.of(iterations),
+        us=Quantiles.compute(us.min(axis=0)),
+        iterations=Quantiles.compute(iterations),
         left_alone=float(np.mean(has_plan & (iterations == 0))),
         gave_way=float(np.mean([answer.slack > 0.0 for answer in answers] & has_plan)),
         first_us=recorder.first_us,
@@ -451,8 +451,8 @@ def time_decisions(
             on_progress(i + 1)
     return DecisionBench(
         states=count,
-        us=Quantiles.of(us),
-        iterations=Quantiles.of(iterations),
+        us=Quantiles.compute(us),
+        iterations=Quantiles.compute(iterations),
         left_alone=float(np.mean(has_plan & (iterations == 0))),
         gave_way=float(np.mean(has_plan & (slack > 0.0))),
         without=int(count - has_plan.sum()),

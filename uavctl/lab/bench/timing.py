@@ -26,7 +26,7 @@ class Quantiles(msgspec.Struct, frozen=True, kw_only=True):
     max: float
 
     @staticmethod
-    def of(values: Array) -> Quantiles:
+    def compute(values: Array) -> Quantiles:
         """Return the quantiles of values (n,)."""
         p50, p99, max_value = np.quantile(values, [0.5, 0.99, 1.0]).tolist()
         return Quantiles(p50=p50, p99=p99, max=max_value)

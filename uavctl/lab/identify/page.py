@@ -34,9 +34,8 @@ def render_identify_page(identification: Identification, positions: PositionHist
         *(
             f"{response.axis}: {100 * response.r2:.1f} % of the motion of the next {R2_AHEAD_S:g} s is predicted."
             for response in result.response
-            if not any(
-                warning.startswith(f"{response.axis}: only ") for warning in result.warnings
-            )  # which says it already
+            # A warning on the prediction of an axis already reports it.
+            if not any(warning.startswith(f"{response.axis}: only ") for warning in result.warnings)
         ),
         *_describe_ramp(result),
         *(f"{warning}." for warning in result.warnings),
