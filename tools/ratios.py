@@ -16,7 +16,8 @@ import numpy as np
 from logs.report.run_statistics import RUNS_LEVEL, Interval, paired_difference
 from uavctl.arrays import Array
 from uavctl.errors import UsageError
-from uavctl.lab.campaign.results import CellSummary, Results, group_cells, read_results, summarise_cell
+from uavctl.lab.campaign.results import CellSummary, Results, read_results, summarise_cell
+from uavctl.lab.campaign.verdicts import group_cells
 
 COLUMNS = ("cost", "settled_cost")
 

@@ -12,7 +12,8 @@ from uavctl.build.controller import build_conditioned
 from uavctl.build.link import build_ages, build_delayed_link
 from uavctl.config import Config, load_config
 from uavctl.errors import DesignError
-from uavctl.lab.campaign.world import compute_newest_captures, draw
+from uavctl.lab.campaign.arrivals import compute_newest_captures
+from uavctl.lab.campaign.draws import draw
 
 Array = NDArray[np.float64]
 RUNS, STEPS, OLDEST = 20_000, 80, 12

@@ -10,7 +10,8 @@ from sim.simulation import World
 from uavctl.build.controller import build_conditioned, build_controller
 from uavctl.build.rehearsal import LARGE_DRAG_1PS, RehearsalResult, rehearse
 from uavctl.config import Config, load_config
-from uavctl.lab.trial import FlightCounts, TrackedFlyer, compute_distances_m, make_figure_eight, make_path
+from uavctl.lab.figure_eight import make_figure_eight
+from uavctl.lab.trial import FlightCounts, TrackedFlyer, compute_distances_m, make_path
 from uavctl.loop import ControlLoop
 
 BURSTS = ("link.model=gilbert-elliott", "link.loss=0.0", "link.burst_loss=1.0")

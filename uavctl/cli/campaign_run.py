@@ -21,12 +21,13 @@ from uavctl.cli import INTERRUPTED
 from uavctl.cli.common import Common, make_progress, make_table, print_message
 from uavctl.cli.flying import stop_on_signals
 from uavctl.errors import UsageError
-from uavctl.lab.campaign.page import write_report, write_trial_report
+from uavctl.lab.campaign.page import write_report
 from uavctl.lab.campaign.pool import Columns, Work, Workers, fly_tasks, open_cluster, open_processes
 from uavctl.lab.campaign.results import CellSummary, summarise
 from uavctl.lab.campaign.spec import read_campaign
 from uavctl.lab.campaign.store import SCHEMA, Store
 from uavctl.lab.campaign.tasks import make_cells, make_document, make_tasks
+from uavctl.lab.campaign.trial_page import write_trial_report
 from uavctl.lab.campaign.trials import SCHEMA as TRIAL_SCHEMA
 from uavctl.lab.campaign.trials import (
     TrialSummary,
@@ -216,7 +217,7 @@ def _show_progress(tasks: Sequence[Work], finished: set[str]) -> Iterator[Callab
 
 def _describe_interruption(store: Store, spec: Path, runs: int | None) -> str:
     """Return the message of an interruption: finished runs, and the command to go on."""
-    if not store.has_begun():
+    if not store.has_campaign():
         return "interrupted before the first run"
     run_options = () if runs is None else ("--runs", str(runs))
     command = shlex.join(["uavctl", "campaign", str(spec), *run_options, "--out", str(store.folder), "--resume"])

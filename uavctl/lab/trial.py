@@ -1,9 +1,5 @@
 """Trials with the simulated quadrotor: case, flight in lockstep, figures from its true positions.
 
-The figure of eight has the speeds and rounds of J. A. Preiss, W. Hönig, G. S. Sukhatme and N. Ayanian, "Crazyswarm: A
-large nano-quadcopter swarm", ICRA 2017: three times around, 0.76 m/s in the mean, 1.5 m/s at most. The curve is our
-own, (a sin θ, b sin θ cos θ), and θ runs faster through the crossing than around the tips.
-
 The figures of a flight are pure functions, in metres and seconds; a larger figure is always worse.
 """
 
@@ -19,7 +15,6 @@ from typing import Literal
 import msgspec
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
-from scipy.optimize import brentq
 
 from sim.simulation import World
 from uavctl.arrays import Array
@@ -29,90 +24,13 @@ from uavctl.config import Config, load_config, parse
 from uavctl.config.checks import get_position_limits_m
 from uavctl.config.mission import TrajectoryConfig
 from uavctl.flight.controller import Controller
+from uavctl.lab.figure_eight import CENTRE_M, make_figure_eight, to_vec3
 from uavctl.lab.position_loop import MotionPath, MotionPoint, PositionLoopFlyer, PositionLoopTuning
 from uavctl.loop import ControlLoop
 from uavctl.records import ControlMode, Decision, Flyer, Plan, Received, Record, Send, Setpoint, Vec3
 from uavctl.smpc.conditioned.planner import AnyDesign
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.plant import AXES
-
-MEAN_MPS, MAX_MPS, ROUNDS = 0.76, 1.5, 3
-CENTRE_M: Vec3 = (0.0, 0.0, -1.2)
-HALF_M, WIDTH_M = 1.0, 1.0  # a and b: 2 m long, 1 m wide
-RAMP_S = 2.0  # from rest to full speed, and back
-_POINTS_PER_ROUND = 20_000  # points of a round by which its length and time are found
-_SAMPLE_S = 0.05
-
-
-@lru_cache(maxsize=1)
-def make_figure_eight() -> TrajectoryConfig:
-    """Return the figure of eight as a sampled trajectory with velocities."""
-    times, positions, velocities = sample_figure_eight(_SAMPLE_S)
-    return TrajectoryConfig(
-        times_s=tuple(times.tolist()),
-        positions_m=tuple(to_vec3(row) for row in positions),
-        velocities_mps=tuple(to_vec3(row) for row in velocities),
-    )
-
-
-def sample_figure_eight(step_s: float) -> tuple[Array, Array, Array]:
-    """Return times (n,) [s], positions (n, 3) [m] and velocities (n, 3) [m/s] of the figure of eight, its end last."""
-    angle, rate, duration_s = _make_schedule()
-    times = np.append(np.arange(0.0, duration_s, step_s), duration_s)
-    angles = np.interp(times, *angle)
-    speed = _compute_full_speed(angles, rate) * _compute_easing(times, duration_s)
-    north, east = HALF_M * np.sin(angles), 0.5 * WIDTH_M * np.sin(2.0 * angles)
-    tangents = np.column_stack([HALF_M * np.cos(angles), WIDTH_M * np.cos(2.0 * angles), np.zeros_like(angles)])
-    positions = np.column_stack([north, east, np.zeros_like(angles)]) + np.array(CENTRE_M)
-    return times, positions, tangents * speed[:, None]
-
-
-def _compute_full_speed(angle: Array, rate: tuple[float, float]) -> Array:
-    """Return θ' at full speed [1/s]: a mean rate, faster where the figure crosses itself."""
-    base, crossing_gain = rate
-    return np.asarray(base * (1.0 + crossing_gain * np.cos(2.0 * angle)))
-
-
-def _compute_easing(times: Array, duration_s: float) -> Array:
-    """Return the share of full speed (n,): smooth from 0 to 1 and back."""
-    progress = np.clip(np.minimum(times, duration_s - times) / RAMP_S, 0.0, 1.0)
-    return np.asarray(progress * progress * progress * (10.0 - 15.0 * progress + 6.0 * progress * progress))
-
-
-def _make_schedule() -> tuple[tuple[Array, Array], tuple[float, float], float]:
-    """Return θ over time, the rate, and the length of the motion [s]."""
-    max_tangent = math.hypot(HALF_M, WIDTH_M)
-
-    def make_schedule(crossing_gain: float) -> tuple[tuple[Array, Array], tuple[float, float], float]:
-        rate = (MAX_MPS / (max_tangent * (1.0 + crossing_gain)), crossing_gain)
-        angle = np.linspace(0.0, 2.0 * math.pi * ROUNDS, ROUNDS * _POINTS_PER_ROUND + 1)
-        # Time at full speed; easing in and out takes RAMP_S longer in all, half of it at each end.
-        seconds_per_radian = 1.0 / _compute_full_speed(angle, rate)
-        full_speed_times = np.concatenate(
-            [[0.0], np.cumsum(0.5 * (seconds_per_radian[1:] + seconds_per_radian[:-1]) * np.diff(angle))]
-        )
-        duration_s = float(full_speed_times[-1]) + RAMP_S
-        times = np.linspace(0.0, duration_s, 4 * _POINTS_PER_ROUND)
-        easing = _compute_easing(times, duration_s)
-        eased_times = np.concatenate([[0.0], np.cumsum(0.5 * (easing[1:] + easing[:-1]) * np.diff(times))])
-        return (
-            (times, np.interp(eased_times * (full_speed_times[-1] / eased_times[-1]), full_speed_times, angle)),
-            rate,
-            duration_s,
-        )
-
-    def compute_mean_error(crossing_gain: float) -> float:
-        return _compute_round_length_m() * ROUNDS / make_schedule(crossing_gain)[2] - MEAN_MPS
-
-    return make_schedule(float(brentq(compute_mean_error, -0.5, 0.8, xtol=1e-6)))
-
-
-def _compute_round_length_m() -> float:
-    """Return the length of one round [m]."""
-    angle = np.linspace(0.0, 2.0 * math.pi, _POINTS_PER_ROUND + 1)
-    points = np.column_stack([HALF_M * np.sin(angle), 0.5 * WIDTH_M * np.sin(2.0 * angle)])
-    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
-
 
 Scenario = Literal["hold", "eight", "blackout"]
 AutopilotName = Literal["px4", "ardupilot"]
@@ -380,7 +298,7 @@ class TrialFlight:
     tracking_max_m: float = math.nan  # the largest
     blackout_beyond_m: float = math.nan  # furthest beyond a wall from a blackout's begin on
     limited: float = math.nan  # share of setpoints that the last gate changed
-    gave_way: float = math.nan  # share of plans in which a constraint gave way
+    gave_way: float = math.nan  # share of plans in which a constraint was relaxed
     fallback: float = math.nan  # share of ticks, from the first order on, in which no plan was flown
     positions: int = 0  # that arrived
     mode: str = ""  # of the vehicle at the end
@@ -461,12 +379,12 @@ def _fly_controller(cell: TrialCell, config: Config, from_s: float) -> TrialFlig
     config_of_design = make_design_config(cell)
     tracked = TrackedFlyer(ControlLoop(config_of_design, get_cached_controller(config_of_design), counts, lambda: 0))
     world = _run_world(config, tracked)
-    begun_s = None if counts.first_target_ns is None else counts.first_target_ns * 1e-9
+    start_s = None if counts.first_target_ns is None else counts.first_target_ns * 1e-9
     return _compute_figures(
         cell,
         config,
         tracked,
-        begun_s,
+        start_s,
         from_s,
         limited=_compute_share(counts.limited, counts.setpoints),
         gave_way=_compute_share(counts.gave_way, counts.plans),
@@ -537,41 +455,35 @@ def _compute_figures(
     cell: TrialCell,
     config: Config,
     tracked: TrackedFlyer,
-    begun_s: float | None,
+    start_s: float | None,
     from_s: float,
     **counts: float | int | str,
 ) -> TrialFlight:
     times, positions_m = np.array(tracked.times_s), np.array(tracked.positions_m)
     excess_m = compute_excess_m(positions_m, *get_room_limits(config))
     figures: dict[str, float] = {"beyond_m": compute_max(excess_m)}
-    if begun_s is None:
+    if start_s is None:
         pass
     elif cell.scenario == "eight":
         path = make_path(config.mission.trajectory)
-        is_flying = (times >= begun_s) & (times <= begun_s + config.mission.trajectory.times_s[-1])
-        reference = np.array([path(t - begun_s)[0] for t in times[is_flying]])
+        is_flying = (times >= start_s) & (times <= start_s + config.mission.trajectory.times_s[-1])
+        reference = np.array([path(t - start_s)[0] for t in times[is_flying]])
         distances_m = compute_distances_m(positions_m[is_flying], reference)
         figures |= {"tracking_m": compute_mean(distances_m), "tracking_max_m": compute_max(distances_m)}
     else:
-        is_flying = times >= begun_s
+        is_flying = times >= start_s
         distances_m = compute_distances_m(positions_m, np.array(config.target.position_m))
         hold_distances_m = distances_m[times >= from_s]
         figures |= {
             "hold_rms_m": compute_rms_m(hold_distances_m),
             "hold_max_m": compute_max(hold_distances_m),
-            "near_s": compute_settling_time_s(times[is_flying] - begun_s, distances_m[is_flying], NEAR_M),
-            "nearer_s": compute_settling_time_s(times[is_flying] - begun_s, distances_m[is_flying], NEARER_M),
+            "near_s": compute_settling_time_s(times[is_flying] - start_s, distances_m[is_flying], NEAR_M),
+            "nearer_s": compute_settling_time_s(times[is_flying] - start_s, distances_m[is_flying], NEARER_M),
         }
     if cell.scenario == "blackout":
         figures["blackout_beyond_m"] = compute_max(excess_m[times >= draw_blackout_begin_s(config.sim.seed)])
     return TrialFlight(seed=config.sim.seed, **figures, **counts)  # type: ignore[arg-type]
 
 
-def _compute_share(part: int, whole: int) -> float:
-    return part / whole if whole else math.nan
-
-
-def to_vec3(values: Array) -> Vec3:
-    """Return three numbers as a tuple of floats."""
-    north, east, down = np.asarray(values, dtype=np.float64).tolist()
-    return north, east, down
+def _compute_share(part: int, total: int) -> float:
+    return part / total if total else math.nan

@@ -54,24 +54,24 @@ def design() -> Design:
 
 
 @pytest.fixture(scope="module")
-def told() -> list[tuple[str, int, int | None]]:
+def progress() -> list[tuple[str, int, int | None]]:
     return []
 
 
 @pytest.fixture(scope="module")
-def result(design: Design, told: list[tuple[str, int, int | None]]) -> BenchResult:
+def result(design: Design, progress: list[tuple[str, int, int | None]]) -> BenchResult:
     conditioned = build_conditioned(load_config("paper")).solver
-    return run_bench(design, 0.3, 0, lambda *what: told.append(what), SMALL, conditioned)
+    return run_bench(design, 0.3, 0, lambda *phase: progress.append(phase), SMALL, conditioned)
 
 
 @pytest.mark.slow
 def test_one_run_has_all_figures(result: BenchResult) -> None:
-    found = msgspec.to_builtins(result)
-    assert found.keys() >= WANTED
-    assert found["flown_us"].keys() == found["gap"].keys() == {"p50", "p99", "max"}
+    bench_figures = msgspec.to_builtins(result)
+    assert bench_figures.keys() >= WANTED
+    assert bench_figures["flown_us"].keys() == bench_figures["gap"].keys() == {"p50", "p99", "max"}
     assert (result.states, result.components) == (12, 2)
     assert (result.printed_states, result.cvxpy_states, result.exact_states) == (1, 3, 6)
-    assert json.loads(msgspec.json.encode(result)) == json.loads(json.dumps(found, allow_nan=False))
+    assert json.loads(msgspec.json.encode(result)) == json.loads(json.dumps(bench_figures, allow_nan=False))
 
 
 @pytest.mark.slow
@@ -83,51 +83,51 @@ def test_ratios_are_of_the_medians_shown(result: BenchResult) -> None:
 
 @pytest.mark.slow
 def test_the_conditioned_decision_is_timed_on_the_same_states(result: BenchResult) -> None:
-    ours = result.conditioned
-    assert ours is not None
-    assert 0.0 < ours.us.p50 <= ours.us.p99 <= ours.us.max
-    assert ours.ratio_cvxpy == pytest.approx(result.cvxpy_ms * 1e3 / ours.us.p50)
-    assert 0.0 < ours.left_alone < 1.0
-    assert ours.iterations.max == round(ours.iterations.max) > 0
+    conditioned_times = result.conditioned
+    assert conditioned_times is not None
+    assert 0.0 < conditioned_times.us.p50 <= conditioned_times.us.p99 <= conditioned_times.us.max
+    assert conditioned_times.ratio_cvxpy == pytest.approx(result.cvxpy_ms * 1e3 / conditioned_times.us.p50)
+    assert 0.0 < conditioned_times.left_alone < 1.0
+    assert conditioned_times.iterations.max == round(conditioned_times.iterations.max) > 0
 
 
-def test_no_question_in_flight_has_the_covariance_of_the_last_one() -> None:
-    asked: list[Preview] = []
+def test_each_decision_has_another_covariance_than_the_last() -> None:
+    problems: list[Preview] = []
 
     class Recorder(ConditionedSolver):
         def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:
-            asked.append(preview)
+            problems.append(preview)
             return super().solve(seq, x, target, preview)
 
-    given = problem("paper")
-    in_flight = VariedPreviewSolver(Recorder(given, bernoulli(np.array([0.7])), 0.05))
+    control_problem = problem("paper")
+    in_flight = VariedPreviewSolver(Recorder(control_problem, bernoulli(np.array([0.7])), 0.05))
     for seq in range(9):
-        assert in_flight.solve(seq, START, given.target).status is SolveStatus.OPTIMAL
-    covs = [one.cov for one in asked if one.cov is not None]
+        assert in_flight.solve(seq, START, control_problem.target).status is SolveStatus.OPTIMAL
+    covs = [preview.cov for preview in problems if preview.cov is not None]
     assert len(covs) == 9
     assert all((one != other).any() for one, other in pairwise(covs))
-    assert all(one.sent is given.u_target for one in asked)
+    assert all(preview.sent is control_problem.u_target for preview in problems)
 
 
-def test_decisions_from_anywhere_within_the_limits_are_counted_as_they_are() -> None:
+def test_decisions_within_the_limits_are_counted() -> None:
     solver = build_conditioned(load_config("room-hahn-stursberg", ["smpc.scheme=age-conditioned"])).solver
-    asked = [*draw_questions(solver, 30, 4)]
+    problems = [*draw_questions(solver, 30, 4)]
     low, high = solver.problem.state_set.bounds
-    assert all((low <= x).all() and (x <= high).all() for x, _, _ in asked)
-    assert all((low <= target).all() and (target <= high).all() for _, target, _ in asked)
-    assert len({preview.cov[0, 0] for _, _, preview in asked if preview.cov is not None}) == 30
-    told: list[int] = []
-    found = time_decisions(solver, 30, 4, told.append)
-    answers = [solver.solve(i, *one) for i, one in enumerate(asked)]
-    assert told == list(range(1, 31))
-    assert found.iterations.max == max(answer.iterations for answer in answers) > 0
-    assert found.gave_way == pytest.approx(sum(answer.slack > 0.0 for answer in answers) / 30)
-    assert found.without == sum(answer.status is not SolveStatus.OPTIMAL for answer in answers)
-    assert 0.0 < found.us.p50 <= found.us.p99 <= found.us.max
+    assert all((low <= x).all() and (x <= high).all() for x, _, _ in problems)
+    assert all((low <= target).all() and (target <= high).all() for _, target, _ in problems)
+    assert len({preview.cov[0, 0] for _, _, preview in problems if preview.cov is not None}) == 30
+    progress: list[int] = []
+    bench_figures = time_decisions(solver, 30, 4, progress.append)
+    answers = [solver.solve(i, *problem) for i, problem in enumerate(problems)]
+    assert progress == list(range(1, 31))
+    assert bench_figures.iterations.max == max(answer.iterations for answer in answers) > 0
+    assert bench_figures.gave_way == pytest.approx(sum(answer.slack > 0.0 for answer in answers) / 30)
+    assert bench_figures.without == sum(answer.status is not SolveStatus.OPTIMAL for answer in answers)
+    assert 0.0 < bench_figures.us.p50 <= bench_figures.us.p99 <= bench_figures.us.max
 
 
 @pytest.mark.slow
-def test_a_flight_s_own_decisions_are_asked_again() -> None:
+def test_decisions_of_a_flight_are_timed() -> None:
     """As many as the flight's plans, and each as hard."""
     config = load_config(
         "room-hahn-stursberg", ["smpc.scheme=age-conditioned", "duration_s=6", "sim.start_velocity_mps=[1.4, 1.4, 0]"]
@@ -141,22 +141,22 @@ def test_a_flight_s_own_decisions_are_asked_again() -> None:
                 plans.append(record)
 
     World(config, ControlLoop(config, build_controller(config), Plans(), lambda: 0)).run(config.duration_s)
-    told: list[tuple[int, int]] = []
-    found = time_flight(config, lambda *now: told.append(now))
-    assert found is not None and found.questions == len(plans) > 10
-    assert found.iterations.max == max(plan.iterations for plan in plans) > 0
-    assert found.left_alone == pytest.approx(sum(plan.iterations == 0 for plan in plans) / len(plans))
-    assert found.gave_way == pytest.approx(sum(plan.slack > 0.0 for plan in plans) / len(plans))
-    assert 0.0 < found.us.p50 <= found.us.p99 <= found.us.max and found.first_us > 0.0
-    assert told == [(done, ROUNDS) for done in range(ROUNDS)]
+    progress: list[tuple[int, int]] = []
+    bench_figures = time_flight(config, lambda *counts: progress.append(counts))
+    assert bench_figures is not None and bench_figures.questions == len(plans) > 10
+    assert bench_figures.iterations.max == max(plan.iterations for plan in plans) > 0
+    assert bench_figures.left_alone == pytest.approx(sum(plan.iterations == 0 for plan in plans) / len(plans))
+    assert bench_figures.gave_way == pytest.approx(sum(plan.slack > 0.0 for plan in plans) / len(plans))
+    assert 0.0 < bench_figures.us.p50 <= bench_figures.us.p99 <= bench_figures.us.max and bench_figures.first_us > 0.0
+    assert progress == [(finished, ROUNDS) for finished in range(ROUNDS)]
 
 
-def test_a_flight_that_asks_nothing_has_no_decisions() -> None:
+def test_a_flight_without_decisions_has_no_times() -> None:
     assert time_flight(load_config("room", ["smpc.scheme=age-conditioned", "duration_s=0.1"])) is None
 
 
 @pytest.mark.slow
-def test_the_command_tells_the_decisions_of_the_conditioned_scheme(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_shows_the_decisions_of_the_conditioned_scheme(capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--set", "smpc.scheme=age-conditioned", "--set", "duration_s=4", "--states", "5"]
     assert command(["bench", *options, "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
@@ -180,19 +180,21 @@ def test_all_methods_agree_on_the_same_states(result: BenchResult) -> None:
 
 
 @pytest.mark.slow
-def test_progress_reaches_the_end_of_every_phase(result: BenchResult, told: list[tuple[str, int, int | None]]) -> None:
-    last = {what: (done, total) for what, done, total in told}
+def test_progress_reaches_the_end_of_every_phase(
+    result: BenchResult, progress: list[tuple[str, int, int | None]]
+) -> None:
+    last = {phase: (finished, total) for phase, finished, total in progress}
     assert {"states", "all methods in turns", "printed, jointly"} == last.keys()
-    assert all(done == total for done, total in last.values())
+    assert all(finished == total for finished, total in last.values())
     decisions = SMALL.runs * (2 * result.states + result.exact_states) + result.cvxpy_states
     assert last["all methods in turns"] == (decisions, decisions)
 
 
 def test_states_are_seeded_feasible_and_in_turns(design: Design) -> None:
     exact = ConicSolver(design)
-    one, again = (draw_states(design, exact, 7, 0.3, 4, lambda _: None) for _ in range(2))
+    one, repeated = (draw_states(design, exact, 7, 0.3, 4, lambda _: None) for _ in range(2))
     other = draw_states(design, exact, 7, 0.3, 5, lambda _: None)
-    assert np.array_equal(one.points, again.points)
+    assert np.array_equal(one.points, repeated.points)
     assert not np.any(np.all(np.array(one.points) == np.array(other.points), axis=1))
     assert len(one.points) == 7
     assert 0.0 < one.feasible_share <= 1.0
@@ -218,15 +220,15 @@ def undisturbed(design: Design) -> Design:
 
 
 @pytest.mark.parametrize(("loss", "stage"), [(0.0, 1), (1.0, 12)])
-def test_a_loop_asks_on_news_and_plays_the_plan_out_without(design: Design, loss: float, stage: int) -> None:
+def test_a_loop_decides_on_a_measurement_and_else_continues_its_plan(design: Design, loss: float, stage: int) -> None:
     # Without disturbance the next question is where the plan says; without news, where the plan ends.
     solver = ConicSolver(design)
     rng = np.random.default_rng(0)
-    asked = collect_loop_states(undisturbed(design), solver, [START], 2, loss, rng, lambda _: None)
+    problems = collect_loop_states(undisturbed(design), solver, [START], 2, loss, rng, lambda _: None)
     first = solver.solve(0, START, design.target)
-    assert asked[0] == pytest.approx(first.states[stage], abs=1e-9)
-    second = solver.solve(0, asked[0], design.target)
-    assert asked[1] == pytest.approx(second.states[stage], abs=1e-9)
+    assert problems[0] == pytest.approx(first.states[stage], abs=1e-9)
+    second = solver.solve(0, problems[0], design.target)
+    assert problems[1] == pytest.approx(second.states[stage], abs=1e-9)
 
 
 class Stub:
@@ -251,36 +253,36 @@ class Breaks(Stub):
         return super().solve(seq, x, target, preview)
 
 
-def test_a_loop_without_plans_is_given_up(design: Design) -> None:
+def test_a_loop_without_plans_ends(design: Design) -> None:
     stub = Stub()
     assert collect_loop_states(design, stub, [START], 3, 0.3, np.random.default_rng(0), lambda _: None) == []
     assert 0 < len(stub.asked) < LOOP_STEPS
 
 
 def test_cases_are_run_in_turns_without_garbage_collection() -> None:
-    stub, done = Stub(), list[int]()
+    stub, finished = Stub(), list[int]()
     cases = [TimedCase(stub, [np.array([float(i)]) for i in points], np.zeros(1)) for points in ((1, 2), (), (3,))]
-    found = time_cases(cases, 2, done.append)
+    bench_figures = time_cases(cases, 2, finished.append)
     assert stub.asked == [1, 2, 3, *[1, 2, 3] * 2]  # warmed up, then two runs
     assert stub.collected == [True] * 3 + [False] * 6
-    assert done == [1, 2, 3, 4, 5, 6]
+    assert finished == [1, 2, 3, 4, 5, 6]
     assert gc.isenabled()
-    assert [each.us.shape for each in found] == [(2,), (0,), (1,)]
-    assert [len(each.answers) for each in found] == [2, 0, 1]
-    assert found[0].get_times_us(FROZEN).size == 0  # none has a plan
+    assert [times.us.shape for times in bench_figures] == [(2,), (0,), (1,)]
+    assert [len(times.answers) for times in bench_figures] == [2, 0, 1]
+    assert bench_figures[0].get_times_us(FROZEN).size == 0  # none has a plan
 
 
 @pytest.mark.slow
 def test_a_slow_case_is_spread_over_the_runs() -> None:
     often, once = Stub(), Stub()
     points = [np.array([float(i)]) for i in range(5)]
-    found = time_cases(
+    bench_figures = time_cases(
         [TimedCase(often, points[:1], np.zeros(1)), TimedCase(once, points, np.zeros(1), is_asked_once=True)], 2
     )
     assert often.asked == [0, 0, 0]
     assert once.asked == [0, 1, 2, 3, 4, 0, 2, 4, 1, 3]  # warmed up, then each state once
-    assert np.isfinite(found[1].us).all() and found[1].us.shape == (5,)
-    assert len(found[1].answers) == 5
+    assert np.isfinite(bench_figures[1].us).all() and bench_figures[1].us.shape == (5,)
+    assert len(bench_figures[1].answers) == 5
 
 
 def test_garbage_is_collected_again_after_an_error() -> None:
@@ -292,7 +294,7 @@ def test_garbage_is_collected_again_after_an_error() -> None:
 @pytest.fixture
 def measured(result: BenchResult, monkeypatch: pytest.MonkeyPatch) -> list[tuple[float, int, int]]:
     """The command with its measurement replaced by one that was made; the arguments it was given."""
-    given: list[tuple[float, int, int]] = []
+    control_problem: list[tuple[float, int, int]] = []
 
     def fake(
         _design: Design,
@@ -303,13 +305,13 @@ def measured(result: BenchResult, monkeypatch: pytest.MonkeyPatch) -> list[tuple
         conditioned: ConditionedSolver,
     ) -> BenchResult:
         assert conditioned.problem.horizon == 12
-        for done in range(3):
-            advance("states", done, 2)
-        given.append((loss, seed, sizes.states))
+        for finished in range(3):
+            advance("states", finished, 2)
+        control_problem.append((loss, seed, sizes.states))
         return result
 
     monkeypatch.setattr(bench_cmd, "run_bench", fake)
-    return given
+    return control_problem
 
 
 @pytest.mark.slow
@@ -332,6 +334,6 @@ def test_the_command_shows_ratios_and_shares(
     out = capsys.readouterr().out
     assert f"{result.ratio_cvxpy:.0f} ×" in out
     assert f"{result.shares.frozen:.1%}" in out
-    for words in ("as printed, jointly", "as flown", "conditioned on the age", "Certified gap"):
-        assert words in out
+    for text in ("as printed, jointly", "as flown", "conditioned on the age", "Certified gap"):
+        assert text in out
     assert measured[0][2] == 300

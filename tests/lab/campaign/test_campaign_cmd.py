@@ -99,11 +99,11 @@ def started(spec: Path, folder: Path, workers: int) -> subprocess.Popen[str]:
 @pytest.mark.slow
 def test_one_worker_gives_every_run_in_order(flown: Path) -> None:
     assert contents(flown)
-    found = pq.read_table(flown / "runs.parquet")
-    cells, runs = found["cell"].to_numpy(), found["run"].to_numpy()
+    stored_runs = pq.read_table(flown / "runs.parquet")
+    cells, runs = stored_runs["cell"].to_numpy(), stored_runs["run"].to_numpy()
     assert list(dict.fromkeys(cells.tolist())) == [0, 2, 3]  # the SMPC of the bad link is refused
     assert all((runs[cells == cell] == range(RUNS)).all() for cell in (0, 2, 3))
-    assert set(found["error"].to_pylist()) == {""}
+    assert set(stored_runs["error"].to_pylist()) == {""}
 
 
 @pytest.mark.slow
@@ -112,11 +112,11 @@ def test_two_workers_give_the_same(spec: Path, flown: Path, tmp_path: Path, caps
     out = capsys.readouterr().out
     assert out.count("\n") == 1
     assert contents(tmp_path / "two") == contents(flown)
-    told: dict[str, Any] = json.loads(out)
-    assert told.keys() == {"schema", "name", "runs_file", "report", "wall_s", "cells"} and told["name"] == "small"
-    assert told["runs_file"] == str(tmp_path / "two" / "runs.parquet") and Path(told["report"]).exists()
-    assert all(list(cell)[: len(KEYS)] == KEYS for cell in told["cells"])
-    smpc, refused, lqg, _ = told["cells"]
+    text: dict[str, Any] = json.loads(out)
+    assert text.keys() == {"schema", "name", "runs_file", "report", "wall_s", "cells"} and text["name"] == "small"
+    assert text["runs_file"] == str(tmp_path / "two" / "runs.parquet") and Path(text["report"]).exists()
+    assert all(list(cell)[: len(KEYS)] == KEYS for cell in text["cells"])
+    smpc, refused, lqg, _ = text["cells"]
     assert (smpc["runs"], smpc["failed"], smpc["refused"]) == (RUNS, 0, "")
     assert refused["runs"] == 0 and refused["refused"].startswith("smpc.delta_x") and refused["cost"] is None
     assert smpc["cost_ci"][0] < smpc["cost"] < smpc["cost_ci"][1]
@@ -135,27 +135,27 @@ def test_killed_half_way_and_resumed_it_gives_the_same(spec: Path, flown: Path, 
     process = started(spec, folder, workers=1)
     os.killpg(process.pid, signal.SIGKILL)
     process.communicate(timeout=LIMIT_S)
-    kept = {path: path.stat().st_mtime_ns for path in folder.glob("parts/*.parquet")}
-    assert process.returncode == -signal.SIGKILL and len(kept) == 1
+    part_times = {path: path.stat().st_mtime_ns for path in folder.glob("parts/*.parquet")}
+    assert process.returncode == -signal.SIGKILL and len(part_times) == 1
     assert not (folder / "runs.parquet").exists()
     assert run(["campaign", str(spec), "--out", str(folder)]) == 2  # not without --resume
-    assert {path: path.stat().st_mtime_ns for path in folder.glob("parts/*.parquet")} == kept
+    assert {path: path.stat().st_mtime_ns for path in folder.glob("parts/*.parquet")} == part_times
     assert run(["campaign", str(spec), "--workers", "1", "--out", str(folder), "--resume"]) == 0
     assert contents(folder) == contents(flown)
 
 
 @pytest.mark.slow
-def test_ctrl_c_ends_it_and_tells_how_to_go_on(spec: Path, tmp_path: Path) -> None:
+def test_ctrl_c_ends_it_and_names_the_command_to_continue(spec: Path, tmp_path: Path) -> None:
     folder = tmp_path / "stopped"
     process = started(spec, folder, workers=2)
     os.killpg(process.pid, signal.SIGINT)
-    _, told = process.communicate(timeout=LIMIT_S)
-    assert process.returncode == 130 and "interrupted" in told and "Traceback" not in told
-    assert told.strip().splitlines()[-1] == f"uavctl campaign {spec} --out {folder} --resume"
+    _, text = process.communicate(timeout=LIMIT_S)
+    assert process.returncode == 130 and "interrupted" in text and "Traceback" not in text
+    assert text.strip().splitlines()[-1] == f"uavctl campaign {spec} --out {folder} --resume"
     assert list(folder.glob("parts/*.parquet")) and not (folder / "runs.parquet").exists()
 
 
-def test_ctrl_c_before_the_first_run_leaves_nothing_to_go_on_with(
+def test_ctrl_c_before_the_first_run_leaves_no_campaign(
     spec: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupted(*arguments: object) -> None:
@@ -194,14 +194,16 @@ def test_fewer_runs_and_a_table_for_people(
     assert {row["error"] for row in rows if row["cell"] == 1} == {"ended in numbers that are not finite"}
 
 
-def test_nothing_to_fly_is_told_with_exit_code_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_campaign_without_flown_cells_ends_with_exit_code_1(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "c.toml").write_text(HEAD + 'set = ["link.loss=0.6"]\n' + controller("smpc"))
     assert run(["campaign", str(tmp_path / "c.toml"), "--out", str(tmp_path / "out")]) == 1
     assert "smpc.delta_x: 0.95 is out of reach" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "text"),
     [
         (["--dask", "tcp://127.0.0.1:9", "--workers", "2"], "give one of them"),
         (["--resume"], "with --out"),
@@ -209,16 +211,16 @@ def test_nothing_to_fly_is_told_with_exit_code_1(tmp_path: Path, capsys: pytest.
     ],
 )
 def test_options_that_do_not_go_together(
-    spec: Path, tmp_path: Path, options: list[str], told: str, capsys: pytest.CaptureFixture[str]
+    spec: Path, tmp_path: Path, options: list[str], text: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = [] if options == ["--resume"] else ["--out", str(tmp_path / "out")]
     assert run(["campaign", str(spec), *options, *out]) == 2
-    assert told in capsys.readouterr().err
+    assert text in capsys.readouterr().err
 
 
-def test_a_wrong_file_is_told_with_its_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_problems_of_a_file_are_reported_with_their_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "c.toml").write_text(HEAD + "step = 6\n" + controller("lqq"))
     assert run(["campaign", str(tmp_path / "c.toml")]) == 2
-    told = capsys.readouterr().err
-    assert 'c.toml:3: step: unknown key (nearest valid name "steps")' in told
-    assert 'c.toml:6: controller[0].kind: there is no controller "lqq" (nearest valid name "lqg")' in told
+    text = capsys.readouterr().err
+    assert 'c.toml:3: step: unknown key (nearest valid name "steps")' in text
+    assert 'c.toml:6: controller[0].kind: there is no controller "lqq" (nearest valid name "lqg")' in text

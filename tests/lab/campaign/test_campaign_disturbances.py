@@ -16,13 +16,15 @@ W = np.array([[0.6, 0.2], [0.2, 0.3]])
 SHAPES: tuple[DisturbanceKind, ...] = ("gaussian", "uniform", "heavy", "gusts")
 
 
-def made(kind: DisturbanceKind, scale: float = 1.0, bias: float = 0.0, memory: float = 0.0, w: Array = W) -> Array:
+def make_disturbances(
+    kind: DisturbanceKind, scale: float = 1.0, bias: float = 0.0, memory: float = 0.0, w: Array = W
+) -> Array:
     return shape_disturbances(DisturbanceSpec(name="d", kind=kind, scale=scale, bias=bias, memory=memory), w, NORMAL)
 
 
 @pytest.mark.parametrize("kind", SHAPES)
 def test_every_kind_has_the_covariance_and_the_mean_asked_for(kind: DisturbanceKind) -> None:
-    flat = made(kind, scale=1.5, bias=0.4, memory=0.6 if kind == "gusts" else 0.0).reshape(-1, 2)
+    flat = make_disturbances(kind, scale=1.5, bias=0.4, memory=0.6 if kind == "gusts" else 0.0).reshape(-1, 2)
     # 200,000 draws; the fourth moment of Student's t with 4 degrees is infinite, so its covariance converges slowly.
     tolerance = 0.1 if kind == "heavy" else 0.02
     np.testing.assert_allclose(np.cov(flat.T), 2.25 * W, rtol=tolerance, atol=tolerance * 0.2)
@@ -31,19 +33,19 @@ def test_every_kind_has_the_covariance_and_the_mean_asked_for(kind: DisturbanceK
 
 def test_a_covariance_without_full_rank_has_a_root() -> None:
     w = np.array([[1.0, 1.0], [1.0, 1.0]])
-    flat = made("gaussian", w=w)
+    flat = make_disturbances("gaussian", w=w)
     np.testing.assert_allclose(flat[..., 0], flat[..., 1], atol=1e-12)
     np.testing.assert_allclose(np.cov(flat.reshape(-1, 2).T), w, rtol=0.02)
 
 
 def test_shapes_are_quantiles_of_the_same_draws() -> None:
     one = np.eye(2)
-    heavy, uniform = made("heavy", w=one), made("uniform", w=one)
+    heavy, uniform = make_disturbances("heavy", w=one), make_disturbances("uniform", w=one)
     probability = norm.cdf(NORMAL)
     inner = np.abs(NORMAL) < 3.0
     np.testing.assert_allclose(t.cdf(heavy * np.sqrt(2.0), 4)[inner], probability[inner], atol=1e-9)
     np.testing.assert_allclose(uniform, np.sqrt(12.0) * (probability - 0.5), atol=1e-9)
-    np.testing.assert_array_equal(made("gaussian", w=one), NORMAL)
+    np.testing.assert_array_equal(make_disturbances("gaussian", w=one), NORMAL)
 
 
 def test_heavy_tails_stay_finite_and_symmetric_far_out() -> None:
@@ -56,8 +58,8 @@ def test_heavy_tails_stay_finite_and_symmetric_far_out() -> None:
 
 
 def test_gusts_remember() -> None:
-    gusts = made("gusts", memory=0.8, w=np.eye(2))[..., 0]
+    gusts = make_disturbances("gusts", memory=0.8, w=np.eye(2))[..., 0]
     for lag in (1, 3):
         correlation = np.mean(gusts[:, lag:] * gusts[:, :-lag])
         assert correlation == pytest.approx(0.8**lag, abs=0.02)
-    np.testing.assert_array_equal(made("gusts", memory=0.0), made("gaussian"))
+    np.testing.assert_array_equal(make_disturbances("gusts", memory=0.0), make_disturbances("gaussian"))

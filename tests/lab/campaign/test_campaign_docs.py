@@ -26,7 +26,7 @@ REFUSED = {
 }
 
 
-def test_they_are_there() -> None:
+def test_campaign_files_exist() -> None:
     assert [file.stem for file in EVERY] == [
         "bursts",
         "corners",
@@ -62,6 +62,6 @@ def test_what_is_refused_is_what_the_file_says(file: Path) -> None:
                 build_design(config)
             except DesignError:
                 refused.add((file.stem, spec.controller[i].name, link))
-    assert refused == {one for one in REFUSED if one[0] == file.stem}
+    assert refused == {entry for entry in REFUSED if entry[0] == file.stem}
     for flown, disturbance in product(campaign.flown_plants, spec.disturbance):
         draw_conditions(CellSetting(spec, campaign.base, flown.plant, campaign.flown_links[0].link, disturbance), 0, 1)

@@ -15,7 +15,8 @@ from matplotlib.textpath import TextPath
 from logs.report.svg import Drawing
 from uavctl.lab.campaign import plots
 from uavctl.lab.campaign.plots import ControllerStyles
-from uavctl.lab.campaign.results import group_cells, make_verdicts, read_results, summarise
+from uavctl.lab.campaign.results import read_results, summarise
+from uavctl.lab.campaign.verdicts import group_cells, make_verdicts
 
 LINKS = (
     "30 %",
@@ -43,7 +44,7 @@ class Box:
 
 def boxes(svg: str) -> list[Box]:
     """Every line of text of a figure, by the glyphs of the widest font."""
-    found = []
+    verdicts = []
     for attributes, content in re.findall(r"<text ([^>]*)>([^<]*)</text>", svg):
         text = unescape(content)
         size = float(re.findall(rf"font-size: {_NUMBER}px", attributes)[0])
@@ -54,8 +55,8 @@ def boxes(svg: str) -> list[Box]:
         width = extent.x1
         anchor = re.search(r"text-anchor: (\w+)", attributes)
         shift = {"middle": 0.5, "end": 1.0}.get(anchor[1] if anchor else "start", 0.0)
-        found.append(Box(text, x - shift * width, x + (1.0 - shift) * width, y - extent.y1, y - extent.y0))
-    return found
+        verdicts.append(Box(text, x - shift * width, x + (1.0 - shift) * width, y - extent.y1, y - extent.y0))
+    return verdicts
 
 
 def size_of(svg: str) -> tuple[float, float]:
@@ -69,13 +70,13 @@ def drawings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Drawing]:
     """A figure of costs by link, and one of differences."""
     cells, rows = [], []
     for place, link in enumerate(LINKS):
-        for who, controller in enumerate(CONTROLLERS):
-            cells.append(cell(2 * place + who, controller, "lqg" if who else "smpc", link=link))
-            rows += runs(2 * place + who, [100.0 + who, 110.0, 105.0])
+        for index, controller in enumerate(CONTROLLERS):
+            cells.append(cell(2 * place + index, controller, "lqg" if index else "smpc", link=link))
+            rows += runs(2 * place + index, [100.0 + index, 110.0, 105.0])
     folder = write(tmp_path_factory.mktemp("names"), cells, rows)
     summaries, looks = summarise(folder), ControllerStyles(CONTROLLERS)
-    found = list(make_verdicts(read_results(folder), group_cells(summaries)))
-    difference = plots.draw_differences(found, looks, f"Beside {CONTROLLERS[0]}", "0")
+    verdicts = list(make_verdicts(read_results(folder), group_cells(summaries)))
+    difference = plots.draw_differences(verdicts, looks, f"Beside {CONTROLLERS[0]}", "0")
     assert difference is not None
     return {"cost": next(plots.draw_quantities(summaries, {}, looks, "0")), "difference": difference}
 
@@ -86,18 +87,18 @@ def names_of(svg: str) -> list[list[Box]]:
     return [boxes(tick) for tick in ticks]
 
 
-@pytest.mark.parametrize("which", ["cost", "difference"])
-def test_every_text_is_within_the_figure(which: str, drawings: dict[str, Drawing]) -> None:
-    svg = drawings[which].svg
+@pytest.mark.parametrize("figure", ["cost", "difference"])
+def test_every_text_is_within_the_figure(figure: str, drawings: dict[str, Drawing]) -> None:
+    svg = drawings[figure].svg
     width, height = size_of(svg)
-    for one in boxes(svg):
-        assert one.left >= -_ROOM and one.right <= width + _ROOM, one
-        assert one.top >= -_ROOM and one.bottom <= height + _ROOM, one
+    for box in boxes(svg):
+        assert box.left >= -_ROOM and box.right <= width + _ROOM, box
+        assert box.top >= -_ROOM and box.bottom <= height + _ROOM, box
 
 
-@pytest.mark.parametrize("which", ["cost", "difference"])
-def test_names_of_links_are_whole_and_beside_the_axes(which: str, drawings: dict[str, Drawing]) -> None:
-    svg = drawings[which].svg
+@pytest.mark.parametrize("figure", ["cost", "difference"])
+def test_names_of_links_are_complete_and_beside_the_axes(figure: str, drawings: dict[str, Drawing]) -> None:
+    svg = drawings[figure].svg
     names = names_of(svg)
     assert ["".join(line.text for line in name).replace(" ", "") for name in names] == [
         link.replace(" ", "") for link in LINKS
@@ -106,8 +107,8 @@ def test_names_of_links_are_whole_and_beside_the_axes(which: str, drawings: dict
     assert all(line.right <= axis for name in names for line in name)
 
 
-@pytest.mark.parametrize("which", ["cost", "difference"])
-def test_names_of_links_are_not_on_each_other(which: str, drawings: dict[str, Drawing]) -> None:
-    names = names_of(drawings[which].svg)
+@pytest.mark.parametrize("figure", ["cost", "difference"])
+def test_names_of_links_do_not_overlap(figure: str, drawings: dict[str, Drawing]) -> None:
+    names = names_of(drawings[figure].svg)
     lines = [line for name in names for line in name]
     assert all(below.top >= above.bottom for above, below in pairwise(lines))

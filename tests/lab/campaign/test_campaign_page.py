@@ -19,15 +19,14 @@ from logs.report.run_statistics import PairedDifference
 from uavctl.errors import UavctlError
 from uavctl.lab.campaign.page import CampaignView, describe_outcome, write_report
 from uavctl.lab.campaign.plots import ControllerStyles
-from uavctl.lab.campaign.results import (
+from uavctl.lab.campaign.results import read_results, summarise
+from uavctl.lab.campaign.verdicts import (
     CampaignVerdict,
     describe_briefly,
     describe_verdict,
     get_verdict_word,
     group_cells,
     make_verdicts,
-    read_results,
-    summarise,
 )
 
 N = 60
@@ -65,8 +64,8 @@ def text_of(path: Path) -> str:
 def judged(tmp_path: Path, baseline: list[dict[str, Any]], smpc: list[dict[str, Any]] | None = None) -> CampaignVerdict:
     rows = [*(smpc or runs(0, SMPC.tolist())), *baseline]
     results = read_results(write(tmp_path, [cell(0, "ours", "smpc"), cell(1, "theirs")], rows))
-    (found,) = make_verdicts(results, group_cells(summarise(tmp_path)))
-    return found
+    (verdict,) = make_verdicts(results, group_cells(summarise(tmp_path)))
+    return verdict
 
 
 def outside(steps: int) -> list[int]:
@@ -74,55 +73,55 @@ def outside(steps: int) -> list[int]:
 
 
 def test_cheaper_and_as_safe_is_yes(tmp_path: Path) -> None:
-    found = judged(tmp_path, runs(1, (SMPC * 1.1).tolist()))
-    assert (found.is_unmatched, found.is_better_than_all, found.is_beaten, get_verdict_word(found)) == (
+    verdict = judged(tmp_path, runs(1, (SMPC * 1.1).tolist()))
+    assert (verdict.is_unmatched, verdict.is_better_than_all, verdict.is_beaten, get_verdict_word(verdict)) == (
         True,
         True,
         False,
         "yes",
     )
-    assert describe_briefly(found.comparisons[0]) == "costs 10 % more"
-    (sentence,) = describe_verdict(found)
+    assert describe_briefly(verdict.comparisons[0]) == "costs 10 % more"
+    (sentence,) = describe_verdict(verdict)
     assert "theirs (10 % more" in sentence  # among those that are beaten
 
 
-def test_a_difference_that_pairs_tell_is_told(tmp_path: Path) -> None:
+def test_a_paired_difference_is_reported(tmp_path: Path) -> None:
     # Both costs lie within 99.7 to 100.3; the difference of 0.02 is the same in every run.
-    found = judged(tmp_path, runs(1, (SMPC + 0.02).tolist()))
-    assert found.is_unmatched
+    verdict = judged(tmp_path, runs(1, (SMPC + 0.02).tolist()))
+    assert verdict.is_unmatched
 
 
-def test_a_baseline_that_saves_by_breaking_limits_is_named_with_what_it_breaks(tmp_path: Path) -> None:
+def test_a_cheaper_baseline_is_named_with_the_limits_that_it_breaks(tmp_path: Path) -> None:
     cheaper = runs(1, (SMPC * 0.97).tolist(), state_violations=outside(1), input_violations=outside(15))
-    found = judged(tmp_path, cheaper)
-    assert (found.is_unmatched, found.is_better_than_all, found.is_beaten, get_verdict_word(found)) == (
+    verdict = judged(tmp_path, cheaper)
+    assert (verdict.is_unmatched, verdict.is_better_than_all, verdict.is_beaten, get_verdict_word(verdict)) == (
         True,
         False,
         False,
         "yes",
     )
-    costs, limits = describe_briefly(found.comparisons[0]).split(", ")
+    costs, limits = describe_briefly(verdict.comparisons[0]).split(", ")
     assert numbers_in(costs) == [3.0] and "less" in costs and "more often" in limits
-    (sentence,) = describe_verdict(found)
+    (sentence,) = describe_verdict(verdict)
     assert numbers_in(sentence)[-5:] == [2.0, 0.0, 30.0, 0.0, 10.0]  # states, SMPC's, inputs, SMPC's; allowed
     assert "inputs (10 %)" in sentence and "caution" not in sentence and "chance" not in sentence
 
 
-def test_caution_that_was_not_asked_for_is_told(tmp_path: Path) -> None:
-    found = judged(tmp_path, runs(1, (SMPC * 0.97).tolist(), state_violations=outside(1)))
-    (sentence,) = describe_verdict(found)
+def test_unused_allowance_is_reported(tmp_path: Path) -> None:
+    verdict = judged(tmp_path, runs(1, (SMPC * 0.97).tolist(), state_violations=outside(1)))
+    (sentence,) = describe_verdict(verdict)
     assert "(states 5 %, inputs 10 %)" in sentence and "caution" in sentence
 
 
-def test_a_rate_above_the_allowance_is_never_told_as_within_it(tmp_path: Path) -> None:
+def test_a_rate_above_the_allowance_is_never_reported_as_within_it(tmp_path: Path) -> None:
     # 3 runs with 14 of 50 steps on average; every interval reaches below 10 %.
     rows = runs(1, (SMPC[:3] * 0.9).tolist(), input_violations=[42, 0, 0])
-    found = judged(tmp_path, rows, runs(0, SMPC[:3].tolist()))
-    one = found.comparisons[0]
+    verdict = judged(tmp_path, rows, runs(0, SMPC[:3].tolist()))
+    one = verdict.comparisons[0]
     rate, interval = one.baseline.input_violation_rate, one.baseline.input_violation_ci
     assert rate is not None and interval is not None and interval[0] <= 0.1 < rate
     safer = replace(one, inputs=PairedDifference(mean=-rate, low=-rate, high=-rate, runs=3))
-    (sentence,) = describe_verdict(replace(found, comparisons=(safer,)))
+    (sentence,) = describe_verdict(replace(verdict, comparisons=(safer,)))
     assert numbers_in(sentence)[-3:] == [28.0, 0.0, 10.0]  # inputs, SMPC's; allowed
     assert "10 % allowed for inputs" in sentence and "chance" in sentence and "caution" not in sentence
 
@@ -131,46 +130,46 @@ def test_a_rate_at_the_allowance_is_within_it(tmp_path: Path) -> None:
     cells = [cell(0, "ours", "smpc", promised_u=1.0 - 0.9), cell(1, "theirs")]  # below 0.1 by rounding
     rows = [*runs(0, SMPC.tolist()), *runs(1, (SMPC * 0.9).tolist(), input_violations=[10, 0] * (N // 2))]
     results = read_results(write(tmp_path, cells, rows))
-    (found,) = make_verdicts(results, group_cells(summarise(tmp_path)))
-    (sentence,) = describe_verdict(found)
+    (verdict,) = make_verdicts(results, group_cells(summarise(tmp_path)))
+    (sentence,) = describe_verdict(verdict)
     assert "inputs in 10 %" in sentence and "caution" in sentence
 
 
 @pytest.mark.parametrize(
-    ("hits", "cells", "chance", "most"),
+    ("hits", "cells", "chance", "rate"),
     [([2, 2, 2], [1.0], False, 4.0), ([30, 0, 0], [1.0, 1.0], True, 20.0), ([30] * 60, [1.0, 1.0], False, 60.0)],
 )  # `cells`: all of them where none broke its promise, else those that did and all
-def test_the_promise_is_told_by_what_was_measured(
-    hits: list[int], cells: list[float], chance: bool, most: float, tmp_path: Path
+def test_the_promise_is_judged_by_the_measured_rates(
+    hits: list[int], cells: list[float], chance: bool, rate: float, tmp_path: Path
 ) -> None:
     rows = runs(0, SMPC[: len(hits)].tolist(), state_violations=hits)
     folder = write(tmp_path, [cell(0, "ours", "smpc")], rows)
     with unwritten():
         text = text_of(write_report(folder))
-    word = "Promise kept" if len(cells) == 1 and most <= 5.0 else "Perhaps too often" if chance else "Promise broken"
+    word = "Promise kept" if len(cells) == 1 and rate <= 5.0 else "Perhaps too often" if chance else "Promise broken"
     (first,) = re.findall(rf"{word}: (.*?allowed)", text)
-    assert numbers_in(first) == [*cells, most, 5.0]
+    assert numbers_in(first) == [*cells, rate, 5.0]
 
 
-def test_a_baseline_that_is_better_outright_is_told(tmp_path: Path) -> None:
-    found = judged(tmp_path, runs(1, (SMPC * 0.5).tolist()))
-    assert (found.is_unmatched, found.is_beaten, get_verdict_word(found)) == (False, True, "no")
-    assert "theirs costs 50 % less" in describe_verdict(found)[0]
-    assert "breaks limits no more often" in describe_verdict(found)[0]
+def test_a_better_baseline_is_reported(tmp_path: Path) -> None:
+    verdict = judged(tmp_path, runs(1, (SMPC * 0.5).tolist()))
+    assert (verdict.is_unmatched, verdict.is_beaten, get_verdict_word(verdict)) == (False, True, "no")
+    assert "theirs costs 50 % less" in describe_verdict(verdict)[0]
+    assert "breaks limits no more often" in describe_verdict(verdict)[0]
 
 
 def test_cheaper_at_a_higher_violation_rate_is_not_outright(tmp_path: Path) -> None:
     worse = runs(0, SMPC.tolist(), state_violations=outside(2))
-    found = judged(tmp_path, runs(1, (SMPC * 1.1).tolist()), worse)
-    assert (found.is_unmatched, found.is_better_than_all, found.is_beaten) == (True, False, False)
-    costs, limits = describe_briefly(found.comparisons[0]).split(", ")
+    verdict = judged(tmp_path, runs(1, (SMPC * 1.1).tolist()), worse)
+    assert (verdict.is_unmatched, verdict.is_better_than_all, verdict.is_beaten) == (True, False, False)
+    costs, limits = describe_briefly(verdict.comparisons[0]).split(", ")
     assert numbers_in(costs) == [10.0] and "more" in costs and "better" in limits
 
 
-def test_costs_that_cannot_be_told_apart_are_no(tmp_path: Path) -> None:
-    found = judged(tmp_path, runs(1, (SMPC + np.tile([1.0, -1.0], N // 2)).tolist()))
-    assert (found.is_unmatched, found.is_beaten) == (False, False)
-    assert describe_briefly(found.comparisons[0]) == "costs the same"
+def test_costs_without_a_significant_difference_are_no(tmp_path: Path) -> None:
+    verdict = judged(tmp_path, runs(1, (SMPC + np.tile([1.0, -1.0], N // 2)).tolist()))
+    assert (verdict.is_unmatched, verdict.is_beaten) == (False, False)
+    assert describe_briefly(verdict.comparisons[0]) == "costs the same"
 
 
 @pytest.fixture(scope="module")
@@ -178,14 +177,14 @@ def grid(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three losses and a burst link, a refused cell, failed runs, a name that is no HTML."""
     cells, rows = [], []
     for place, (link, loss) in enumerate([("10 %", 0.1), ("30 %", 0.3), ("50 %", 0.5), ("bursts", None)]):
-        told: dict[str, Any] = {"link": link, "link_loss": loss}
-        cells += [cell(3 * place, "smpc", "smpc", **told), cell(3 * place + 1, "lqg <b>", **told)]
-        cells.append(cell(3 * place + 2, "far", "smpc", refused=REFUSED, **told))
+        reported: dict[str, Any] = {"link": link, "link_loss": loss}
+        cells += [cell(3 * place, "smpc", "smpc", **reported), cell(3 * place + 1, "lqg <b>", **reported)]
+        cells.append(cell(3 * place + 2, "far", "smpc", refused=REFUSED, **reported))
         cost = (100.0 + 10.0 * place) + NOISE
         rows += runs(3 * place, cost.tolist())
-        theirs = 0.9 * cost
-        theirs[7] = np.nan if place == 1 else theirs[7]
-        rows += runs(3 * place + 1, theirs.tolist(), state_violations=outside(3))
+        baseline_cost = 0.9 * cost
+        baseline_cost[7] = np.nan if place == 1 else baseline_cost[7]
+        rows += runs(3 * place + 1, baseline_cost.tolist(), state_violations=outside(3))
     folder = write(tmp_path_factory.mktemp("grid"), cells, rows)
     (folder / "campaign.toml").write_text('name = "by hand"\n')
     write_report(folder)
@@ -202,15 +201,15 @@ def test_the_page_is_complete_in_itself(grid: Path) -> None:
     assert set(re.findall(r'(?:href="#|url\(#)([^")]+)', html)) <= set(ids)
 
 
-def test_the_page_says_what_was_compared_and_what_came_of_it(grid: Path) -> None:
+def test_the_page_lists_cells_and_results(grid: Path) -> None:
     text = text_of(grid / "report.html")
     for label in ("Campaign “by hand”", "12 cells", "seed 7", "uavctl 9.9", f"Not flown: {REFUSED}"):
         assert label in text
-    told = list(describe_outcome(CampaignView.make(read_results(grid))))
-    assert all(sentence in text for sentence in told)
-    assert numbers_in(told[0])[:2] == [480.0, 50.0]  # runs, steps
-    assert numbers_in(told[1]) == [4.0] and "no design" in told[1]
-    assert numbers_in(told[3]) == [4.0, 4.0, 0.0, 0.0]  # SMPC best at its rate, of so many; outright; beaten
+    reported = list(describe_outcome(CampaignView.make(read_results(grid))))
+    assert all(sentence in text for sentence in reported)
+    assert numbers_in(reported[0])[:2] == [480.0, 50.0]  # runs, steps
+    assert numbers_in(reported[1]) == [4.0] and "no design" in reported[1]
+    assert numbers_in(reported[3]) == [4.0, 4.0, 0.0, 0.0]  # SMPC best at its rate, of so many; outright; beaten
     assert 'name = "by hand"' in text
     assert "lqg <b>" in text
 
@@ -233,7 +232,7 @@ def test_links_that_are_a_loss_make_a_line_and_others_dots(grid: Path) -> None:
     assert "var(--limit" not in cost
 
 
-def test_every_figure_has_words_for_those_who_do_not_see_it(grid: Path) -> None:
+def test_every_figure_has_a_text_alternative(grid: Path) -> None:
     html = (grid / "report.html").read_text(encoding="utf-8")
     labels = re.findall(r'<figure [^>]*><svg role="img" aria-label="([^"]+)"', html)
     assert len(labels) == html.count("<figure")
@@ -241,7 +240,7 @@ def test_every_figure_has_words_for_those_who_do_not_see_it(grid: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("cells", "rows", "said"),
+    ("cells", "rows", "text"),
     [
         ([cell(0, "lqg")], runs(0, [1.0, 2.0]), "No SMPC was flown."),
         ([cell(0, "smpc", "smpc")], runs(0, [1.0]), "no baseline to compare"),
@@ -251,11 +250,11 @@ def test_every_figure_has_words_for_those_who_do_not_see_it(grid: Path) -> None:
         ([cell(0, "smpc", "smpc"), cell(1, "lqg")], [*runs(0, [0.0, 0.0]), *runs(1, [0.0, 0.0])], "costs the same"),
     ],
 )  # fmt: skip
-def test_campaigns_of_odd_shapes_have_a_page(cells: Any, rows: Any, said: str, tmp_path: Path) -> None:
-    assert said in text_of(write_report(write(tmp_path, cells, rows)))
+def test_campaigns_of_odd_shapes_have_a_page(cells: Any, rows: Any, text: str, tmp_path: Path) -> None:
+    assert text in text_of(write_report(write(tmp_path, cells, rows)))
 
 
-def test_a_page_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+def test_a_page_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
     folder = write(tmp_path, [cell(0, "a")], runs(0, [1.0]))
     (folder / "report.html").mkdir()
     with pytest.raises(UavctlError, match="cannot be written"):
@@ -280,7 +279,9 @@ def test_numbers_below_the_axis_of_differences_do_not_touch(tmp_path: Path) -> N
 def test_a_legend_has_the_markers_of_its_figure() -> None:
     looks = ControllerStyles(tuple(f"controller {place}" for place in range(12)))
     entries = list(looks.make_marks(looks.controllers))
-    assert len({(one.role, one.path, one.full) for one in entries}) == 12
+    assert len({(entry.role, entry.path, entry.full) for entry in entries}) == 12
     drawn = re.findall(r"<li>.*?</li>", render_legend(entries))
-    assert len({re.sub(r"controller \d+", "", one) for one in drawn}) == 12
-    assert all(f"var(--{one.role})" in text and one.path in text for one, text in zip(entries, drawn, strict=True))
+    assert len({re.sub(r"controller \d+", "", label) for label in drawn}) == 12
+    assert all(
+        f"var(--{entry.role})" in text and entry.path in text for entry, text in zip(entries, drawn, strict=True)
+    )

@@ -31,23 +31,23 @@ def approaching(far_m: float, tau_s: float, steps: int) -> Array:
 
 
 def test_an_exponential_is_near_at_its_logarithm() -> None:
-    found = compute_path_figures(CONFIG, approaching(2.0, 1.0, 100))
+    path_figures = compute_path_figures(CONFIG, approaching(2.0, 1.0, 100))
     for name, radius_m in (("near_s", 0.3), ("nearer_s", 0.1)):
         exact = math.log(2.0 / radius_m)
-        assert exact <= found[name][0] < exact + DT_S
-    assert found["beyond_m"][0] == pytest.approx(0.5)  # it began at 3.5 m
+        assert exact <= path_figures[name][0] < exact + DT_S
+    assert path_figures["beyond_m"][0] == pytest.approx(0.5)  # it began at 3.5 m
 
 
-def test_who_is_never_near_has_no_time_and_a_steady_distance_is_held() -> None:
+def test_without_coming_near_the_time_is_infinite_and_a_steady_distance_is_the_hold() -> None:
     states = approaching(0.0, 1.0, 40)
     states[0, :, 3] += 0.4
-    found = compute_path_figures(CONFIG, states)
-    assert found["near_s"][0] == found["nearer_s"][0] == math.inf
-    assert found["hold_rms_m"][0] == pytest.approx(0.4)
-    assert found["beyond_m"][0] == pytest.approx(-1.1)  # north and east leave more
+    path_figures = compute_path_figures(CONFIG, states)
+    assert path_figures["near_s"][0] == path_figures["nearer_s"][0] == math.inf
+    assert path_figures["hold_rms_m"][0] == pytest.approx(0.4)
+    assert path_figures["beyond_m"][0] == pytest.approx(-1.1)  # north and east leave more
 
 
-def test_the_room_that_can_be_used_is_that_between_the_places_to_rest() -> None:
+def test_the_usable_room_lies_between_the_resting_positions() -> None:
     config = load_config("room-hahn-stursberg", ["smpc.scheme=age-conditioned"])
     exact = build_conditioned(config, flown=False, cov=np.zeros((9, 9)))
     assert compute_exact_usable_share(config, None) == pytest.approx(share(exact.rests))
@@ -69,12 +69,17 @@ def share(rests: Array) -> float:
 
 
 @pytest.mark.slow
-def test_the_page_shows_them_and_older_tables_have_none(tmp_path: Path) -> None:
+def test_the_page_shows_path_figures_and_older_tables_have_none(tmp_path: Path) -> None:
     figures = {"near_s": [3.0, 4.0, 9.0], "nearer_s": [5.0, math.inf, math.inf], "hold_rms_m": [0.1, 0.2, 0.4]}
     figures["beyond_m"] = [-0.5, 0.25, -0.5]
     new = write(tmp_path / "new", [cell(0, "ours", "smpc", usable_room=0.79)], runs(0, [1.0, 2.0, 3.0], **figures))
-    (found,) = summarise(new)
-    assert (found.near_s, found.nearer_s, found.hold_rms_m, found.beyond_m) == (4.0, None, 0.2, 0.25)
+    (path_figures,) = summarise(new)
+    assert (path_figures.near_s, path_figures.nearer_s, path_figures.hold_rms_m, path_figures.beyond_m) == (
+        4.0,
+        None,
+        0.2,
+        0.25,
+    )
     page = render_report(read_results(new))
     assert "Through the room" in page and "79" in page and "0.25" in page
     old = write(tmp_path / "old", [cell(0, "ours", "smpc")], runs(0, [1.0, 2.0]))

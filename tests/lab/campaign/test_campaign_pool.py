@@ -29,24 +29,22 @@ if __name__ == "__main__":
 
 
 @pytest.mark.slow
-def test_a_worker_that_is_killed_is_replaced_and_nothing_is_lost(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_killed_worker_is_replaced_and_no_run_is_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "2")
     tasks = list(make_tasks(cells(tmp_path, f"steps = 3\nruns = {5 * CHUNK}\n", controller("lqg"))))
-    kept: dict[str, Columns] = {}
+    rows_by_task: dict[str, Columns] = {}
     with open_processes(1) as crew:
         assert crew._executor.submit(os.getenv, "OPENBLAS_NUM_THREADS").result() == "1"
 
         def keep(task: Work, columns: Columns) -> None:
-            if not kept:
+            if not rows_by_task:
                 os.kill(crew._executor.submit(os.getpid).result(), signal.SIGKILL)
-            kept[task.name] = columns
+            rows_by_task[task.name] = columns
 
         fly_tasks(tasks, crew, keep, lambda: False)
-    assert sorted(kept) == [task.name for task in tasks]
-    assert {error for columns in kept.values() for error in columns["error"]} == {""}
+    assert sorted(rows_by_task) == [task.name for task in tasks]
+    assert {error for columns in rows_by_task.values() for error in columns["error"]} == {""}
     # The environment is as it was.
     assert os.environ["OPENBLAS_NUM_THREADS"] == "2" and "MKL_NUM_THREADS" not in os.environ
 
@@ -64,14 +62,14 @@ def test_workers_end_with_their_parent_however_it_ends(tmp_path: Path) -> None:
     until(lambda: not _runs(worker), "the worker ends with its parent")
 
 
-def test_workers_that_would_give_other_numbers_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_workers_with_other_versions_or_threads_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
-    here = pool._get_version_and_threads()
-    assert here[1] == "1"
-    pool._check_workers("tcp://a", {"w": here})
+    current = pool._get_version_and_threads()
+    assert current[1] == "1"
+    pool._check_workers("tcp://a", {"w": current})
     with pytest.raises(UsageError, match=r"worker w has uavctl 0\.0, this is"):
-        pool._check_workers("tcp://a", {"v": here, "w": ("0.0", "1")})
+        pool._check_workers("tcp://a", {"v": current, "w": ("0.0", "1")})
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "4")  # it wins over the other
     with pytest.raises(UsageError, match=r"computes with 4 BLAS threads.*OPENBLAS_NUM_THREADS=1"):
         pool._check_workers("tcp://a", {"w": pool._get_version_and_threads()})

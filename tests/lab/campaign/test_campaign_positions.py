@@ -17,10 +17,12 @@ from uavctl.build.controller import build_estimator, build_plant, build_problem
 from uavctl.config import Config, load_config
 from uavctl.flight.estimator import absorb_samples, begin_history, estimate_at, note_input
 from uavctl.flight.kalman import make_kalman
+from uavctl.lab.campaign.arrivals import compute_known_steps, select_newest_captures
 from uavctl.lab.campaign.controllers import draw_conditions, make_filter_belief
+from uavctl.lab.campaign.draws import draw, draw_noise
 from uavctl.lab.campaign.pool import Columns
+from uavctl.lab.campaign.position_filter import PositionFilter
 from uavctl.lab.campaign.tasks import Cell, fly_task, make_tasks
-from uavctl.lab.campaign.world import PositionFilter, compute_known_steps, draw, draw_noise, select_newest_captures
 from uavctl.records import PositionSample
 from uavctl.smpc.baselines import Governor, MeanQp
 from uavctl.smpc.batch import Counts, Information, predict, predict_covariance
@@ -47,7 +49,9 @@ def arrived(config: Config, overrides: list[str], seed: int) -> Counts:
     return compute_known_steps(link, 1.0, draw(seed, 0, RUNS, STEPS, 1).link)
 
 
-def told(config: Config, first_known: Counts, positions: Array, inputs: Array) -> tuple[list[Array], list[Array]]:
+def filter_positions(
+    config: Config, first_known: Counts, positions: Array, inputs: Array
+) -> tuple[list[Array], list[Array]]:
     """What the campaign's filter says at the begin of each step, of all runs."""
     looked = PositionFilter(make_filter_belief(config), first_known)
     newest = select_newest_captures(first_known)
@@ -57,12 +61,12 @@ def told(config: Config, first_known: Counts, positions: Array, inputs: Array) -
 
 @pytest.mark.parametrize("link", LINKS)
 @pytest.mark.parametrize("preset", FLIGHTS)
-def test_what_is_told_is_what_the_flight_s_filter_says_of_the_same_positions(preset: str, link: str) -> None:
+def test_estimates_are_those_of_the_flight_s_filter(preset: str, link: str) -> None:
     config = load_config(preset, FLIGHTS[preset])
     plant, first_known, rng = build_plant(config), arrived(config, LINKS[link], 11), np.random.default_rng(3)
     axes = len(plant.axes)
     positions, inputs = 3.0 * rng.normal(size=(RUNS, STEPS, axes)), rng.normal(size=(RUNS, STEPS, plant.n_u))
-    means, covs = told(config, first_known, positions, inputs)
+    means, covs = filter_positions(config, first_known, positions, inputs)
     newest = select_newest_captures(first_known)
     dt_ns = round(config.plant.dt_s * 1e9)
     overtaken = 0
@@ -75,10 +79,10 @@ def test_what_is_told_is_what_the_flight_s_filter_says_of_the_same_positions(pre
             samples = [sample(plant.axes, positions[run, c], c * dt_ns, k * dt_ns) for c in come]
             history, _, refused = absorb_samples(kalman, history, k * dt_ns, samples)
             assert not refused
-            said = estimate_at(kalman, history, int(newest[run, k]) * dt_ns)
-            assert said is not None
-            assert means[k][run] == pytest.approx(said.mean, abs=1e-8)
-            assert covs[k][run] == pytest.approx(np.array(said.cov), rel=1e-7, abs=1e-10)
+            reported = estimate_at(kalman, history, int(newest[run, k]) * dt_ns)
+            assert reported is not None
+            assert means[k][run] == pytest.approx(reported.mean, abs=1e-8)
+            assert covs[k][run] == pytest.approx(np.array(reported.cov), rel=1e-7, abs=1e-10)
             history = note_input(kalman, history, k * dt_ns, inputs[run, k])
     assert (overtaken > 0) == (link != "losses")
 
@@ -95,7 +99,7 @@ def sample(axes: tuple[str, ...], position: Array, captured_ns: int, received_ns
     )
 
 
-def test_errors_are_as_large_as_the_covariance_says_and_the_covariance_of_a_prediction_too() -> None:
+def test_errors_and_prediction_errors_have_the_covariance_of_the_filter() -> None:
     """e'P⁻¹e of a Gaussian has the mean n; each run's steps are correlated, so runs are counted."""
     config = load_config("paper", FLIGHTS["paper"])
     plant, runs, steps = build_plant(config), 3000, 12
@@ -111,15 +115,15 @@ def test_errors_are_as_large_as_the_covariance_says_and_the_covariance_of_a_pred
     pushes = chances.normal @ np.linalg.cholesky(plant.w).T
     for k in range(steps):
         mean, cov = looked.update(k, state[:, k, index] + noise[:, k], newest[:, k], inputs[:, :k])
-        news = Information(k, newest[:, k], mean, inputs[:, :k], cov)
+        measurement = Information(k, newest[:, k], mean, inputs[:, :k], cov)
         state[:, k + 1] = state[:, k] @ plant.a.T + inputs[:, k] @ plant.b.T + pushes[:, k] @ plant.e.T
-        spread = predict_covariance(plant, news)
+        spread = predict_covariance(plant, measurement)
         assert spread is not None
-        for said, error in (
+        for reported, error in (
             (cov, state[np.arange(runs), newest[:, k]] - mean),
-            (spread, state[:, k] - predict(plant, news)),
+            (spread, state[:, k] - predict(plant, measurement)),
         ):
-            squared = np.einsum("ni,nij,nj->n", error, np.linalg.inv(said), error)
+            squared = np.einsum("ni,nij,nj->n", error, np.linalg.inv(reported), error)
             # The variance of a χ² with n degrees is 2n; five standard deviations of the mean over runs.
             assert squared.mean() == pytest.approx(plant.n_x, abs=5.0 * np.sqrt(2.0 * plant.n_x / runs))
 
@@ -132,15 +136,15 @@ def test_an_exact_state_s_prediction_has_no_covariance_of_its_own() -> None:
     )
 
 
-def test_noise_is_drawn_apart_from_everything_else_and_longer_runs_begin_alike() -> None:
-    many, one = draw_noise(7, 10, 5, 20, 2), draw_noise(7, 13, 1, 30, 2)
-    assert np.array_equal(many[3], one[0, :20])
-    assert abs(np.corrcoef(many.ravel(), draw(7, 10, 5, 20, 2).normal.ravel())[0, 1]) < 0.3
+def test_noise_is_independent_of_other_draws_and_longer_runs_begin_alike() -> None:
+    noise, single = draw_noise(7, 10, 5, 20, 2), draw_noise(7, 13, 1, 30, 2)
+    assert np.array_equal(noise[3], single[0, :20])
+    assert abs(np.corrcoef(noise.ravel(), draw(7, 10, 5, 20, 2).normal.ravel())[0, 1]) < 0.3
 
 
-def test_simple_margins_begin_with_what_the_filter_leaves_open() -> None:
-    given = build_problem(load_config("paper", ["target.position_m=[0, 19.5, 0]"]))
-    plant = given.plant
+def test_simple_margins_begin_with_the_filter_s_covariance() -> None:
+    problem = build_problem(load_config("paper", ["target.position_m=[0, 19.5, 0]"]))
+    plant = problem.plant
     cov = innovation_form(plant, 0.3, 0.0, 0).estimate_cov
     # What the filter leaves is what it ends at where every position comes.
     looked = PositionFilter(
@@ -154,66 +158,69 @@ def test_simple_margins_begin_with_what_the_filter_leaves_open() -> None:
     )
     toward = Information(0, np.zeros(1, dtype=np.intp), np.array([[0.0, 0.0, 18.9, 0.3]]), np.zeros((1, 0, 2)))
     for kind in (Governor, MeanQp):
-        wary, bold = kind(given, 1.5, cov), kind(given, 1.5)
-        for one in (wary, bold):
-            one.begin(1)
+        wary, bold = kind(problem, 1.5, cov), kind(problem, 1.5)
+        for single in (wary, bold):
+            single.begin(1)
         assert wary.act(toward)[0, 1] < bold.act(toward)[0, 1] - 0.1
 
 
 def cell(tmp_path: Path, *more: str, overrides: str = "", master: int = 0) -> Cell:
     """A target one metre from a wall at 30 % loss, under the age-conditioned scheme on noisy positions."""
-    (made,) = rig.cells(
+    (campaign_cell,) = rig.cells(
         tmp_path,
         f'{NOISY}, "target.position_m=[0, 19, 0]", "link.loss=0.3"]\n',
         f"runs = 400\nsteps = 40\nmaster = {master}\nstart = [0, 0, 15, 0]\n" + "".join(more),
         rig.controller("smpc", f'set = ["smpc.scheme=age-conditioned"{overrides}]'),
     )
-    return made
+    return campaign_cell
 
 
-def rows(made: Cell) -> Columns:
-    (task,) = make_tasks([made])
+def rows(campaign_cell: Cell) -> Columns:
+    (task,) = make_tasks([campaign_cell])
     return task.fly()
 
 
 @pytest.mark.slow
 def test_the_promise_is_kept_on_positions_alone_and_only_with_the_filter_s_covariance(tmp_path: Path) -> None:
     """The worst step's interval begins below the 5 % that are allowed, and without P in the margins it does not."""
-    found = rows(cell(tmp_path, 'measured = "position"\n'))
-    assert not any(found["error"])
-    hits = np.asarray(found["outside"], dtype=np.int64).sum(axis=0)
+    columns = rows(cell(tmp_path, 'measured = "position"\n'))
+    assert not any(columns["error"])
+    hits = np.asarray(columns["outside"], dtype=np.int64).sum(axis=0)
     worst, (low, _) = max_step_rate(hits, 400, 40)
     assert low <= 0.05 and worst > 0.01
-    assert found["slack_used"].sum() <= 0.05 * found["decisions"].sum()
+    assert columns["slack_used"].sum() <= 0.05 * columns["decisions"].sum()
     # The same scheme told that what it knows is exact: steps of the second half, 8000 of them.
     believed = rows(cell(tmp_path, 'measured = "position"\n', overrides=', "estimator.position_std_m=1e-5"'))
     rate = float(np.asarray(believed["outside"])[:, 20:].mean())
-    assert rate > 2.0 * float(np.asarray(found["outside"])[:, 20:].mean())
+    assert rate > 2.0 * float(np.asarray(columns["outside"])[:, 20:].mean())
     assert binom.sf(round(rate * 400), 400, 0.05) < 1e-3
 
 
-def test_what_is_not_asked_for_changes_nothing(tmp_path: Path) -> None:
-    as_ever, exact = cell(tmp_path), cell(tmp_path, 'measured = "state"\n')
-    first, second = (rows(of_runs(made, 20)) for made in (as_ever, exact))
+def test_measured_states_fly_without_a_filter(tmp_path: Path) -> None:
+    by_default, exact = cell(tmp_path), cell(tmp_path, 'measured = "state"\n')
+    first, second = (rows(of_runs(campaign_cell, 20)) for campaign_cell in (by_default, exact))
     assert all(np.array_equal(first[name], second[name], equal_nan=name not in ("error",)) for name in first)
-    assert draw_conditions(as_ever.setting, 0, 3).noise is None
+    assert draw_conditions(by_default.setting, 0, 3).noise is None
 
 
-def of_runs(made: Cell, runs: int) -> Cell:
+def of_runs(campaign_cell: Cell, runs: int) -> Cell:
     """A cell with so many runs."""
-    return replace(made, setting=replace(made.setting, spec=msgspec.structs.replace(made.setting.spec, runs=runs)))
+    return replace(
+        campaign_cell,
+        setting=replace(campaign_cell.setting, spec=msgspec.structs.replace(campaign_cell.setting.spec, runs=runs)),
+    )
 
 
 def test_every_kind_flies_on_positions_and_runs_do_not_depend_on_each_other(tmp_path: Path) -> None:
     kinds = ("lqg", "mean-qp", "governor", "packetised", "hold-last", "worst-case-delay")
-    made = rig.cells(
+    campaign_cell = rig.cells(
         tmp_path,
         f'{NOISY}]\nmeasured = "position"\nruns = 6\nsteps = 15\n',
         *(rig.controller(kind) for kind in kinds),
         rig.table("link", "late", 'set = ["link.loss=0.2", "link.delay_s=1.0", "link.jitter_s=1.0"]'),
     )
-    for task in make_tasks(made):
-        together, _ = fly_task(task, 0, 6)
-        alone, _ = fly_task(task, 4, 1)
-        assert not together.failed.any()
-        assert together.states[4] == pytest.approx(alone.states[0], abs=1e-9)
+    for task in make_tasks(campaign_cell):
+        all_runs, _ = fly_task(task, 0, 6)
+        single_run, _ = fly_task(task, 4, 1)
+        assert not all_runs.failed.any()
+        assert all_runs.states[4] == pytest.approx(single_run.states[0], abs=1e-9)

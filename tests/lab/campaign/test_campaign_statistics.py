@@ -25,7 +25,7 @@ from uavctl.lab.campaign.results import compute_difference, read_results, summar
 
 
 @pytest.mark.parametrize(("hits", "trials"), [(1, 10), (3, 7), (50, 200), (199, 200), (2, 200_000)])
-def test_the_exact_interval_is_where_the_binomial_tails_are_what_is_left(hits: int, trials: int) -> None:
+def test_the_exact_interval_leaves_the_binomial_tails(hits: int, trials: int) -> None:
     # The definition: at the lower end `hits` or more, at the upper end `hits` or fewer, have a probability of 2.5 %.
     low = brentq(lambda p: binom.sf(hits - 1, trials, p) - 0.025, 1e-12, 1.0 - 1e-12, xtol=1e-15)
     high = brentq(lambda p: binom.cdf(hits, trials, p) - 0.025, 1e-12, 1.0 - 1e-12, xtol=1e-15)
@@ -87,14 +87,14 @@ def test_one_value_is_its_own_interval_and_none_has_none() -> None:
         bootstrap_mean(np.empty(0))
 
 
-def test_pairs_tell_what_the_costs_alone_do_not() -> None:
+def test_pairs_show_a_difference_that_separate_costs_hide() -> None:
     rng = np.random.default_rng(2)
     shared = rng.normal(1000.0, 200.0, 400)
     a, b = shared + rng.normal(0.0, 1.0, 400), shared + 2.0 + rng.normal(0.0, 1.0, 400)
-    found = paired_difference(a, b)
-    assert found.sign == -1
-    assert found.mean == pytest.approx(a.mean() - b.mean())
-    assert found.high - found.low < 0.02 * (bootstrap_mean(a)[1] - bootstrap_mean(a)[0])
+    difference = paired_difference(a, b)
+    assert difference.sign == -1
+    assert difference.mean == pytest.approx(a.mean() - b.mean())
+    assert difference.high - difference.low < 0.02 * (bootstrap_mean(a)[1] - bootstrap_mean(a)[0])
     assert paired_difference(a, a).sign == 0
 
 
@@ -130,14 +130,14 @@ def test_steps_of_a_run_that_come_together_do_not_make_the_interval_narrow() -> 
 
 def test_the_worst_step_s_interval_goes_for_all_steps_at_once() -> None:
     """It misses a rate that all steps have in at most 5 % of all campaigns; the step's own interval does in many."""
-    rng, missed, alone = np.random.default_rng(4), 0, 0
+    rng, missed, separate_misses = np.random.default_rng(4), 0, 0
     for _ in range(400):
         hits = rng.binomial(300, 0.05, 40)
         rate, (low, high) = max_step_rate(hits, 300, 40)
         assert rate == hits.max() / 300 and low <= rate <= high
         missed += low > 0.05
-        alone += clopper_pearson(int(hits.max()), 300)[0] > 0.05
-    assert missed <= 0.05 * 400 < 100 < alone
+        separate_misses += clopper_pearson(int(hits.max()), 300)[0] > 0.05
+    assert missed <= 0.05 * 400 < 100 < separate_misses
 
 
 def test_the_worst_step_is_that_of_all_runs_together(tmp_path: Path) -> None:
@@ -150,7 +150,7 @@ def test_the_worst_step_is_that_of_all_runs_together(tmp_path: Path) -> None:
     assert unknown.worst_step_rate is None
 
 
-def test_a_folder_by_hand(tmp_path: Path) -> None:
+def test_results_of_a_small_folder(tmp_path: Path) -> None:
     nan = float("nan")
     folder = write(
         tmp_path,
@@ -182,13 +182,13 @@ def test_a_folder_by_hand(tmp_path: Path) -> None:
 def test_differences_are_over_the_runs_that_both_ended(tmp_path: Path) -> None:
     nan = float("nan")
     rows = [*runs(0, [10.0, nan, 30.0, 40.0]), *runs(1, [1.0, 2.0, nan, 4.0])]
-    found = read_results(write(tmp_path, [cell(0, "a"), cell(1, "b"), cell(2, "c")], rows))
-    both = compute_difference(found.runs[0], found.runs[1], "cost")
+    difference = read_results(write(tmp_path, [cell(0, "a"), cell(1, "b"), cell(2, "c")], rows))
+    both = compute_difference(difference.runs[0], difference.runs[1], "cost")
     assert both is not None
     assert both.runs == 2
     assert both.mean == pytest.approx((9 + 36) / 2)
-    assert found.runs[0].failed == ((1, "it broke"),)
-    assert compute_difference(found.runs[0], found.runs[2], "cost") is None
+    assert difference.runs[0].failed == ((1, "it broke"),)
+    assert compute_difference(difference.runs[0], difference.runs[2], "cost") is None
 
 
 def test_a_folder_without_a_campaign_is_refused(tmp_path: Path) -> None:
@@ -205,10 +205,10 @@ def test_a_ratio_of_means_has_the_interval_of_resampled_pairs() -> None:
     common = rng.gamma(4.0, size=500)
     a, b = common + 0.1 * rng.normal(size=500), 1.25 * common + 0.1 * rng.normal(size=500)
     ratio, (low, high) = paired_ratio(a, b)
-    which = rng.integers(0, 500, (4000, 500))
-    wanted = np.quantile(a[which].mean(axis=1) / b[which].mean(axis=1), [0.025, 0.975])
+    indices = rng.integers(0, 500, (4000, 500))
+    expected = np.quantile(a[indices].mean(axis=1) / b[indices].mean(axis=1), [0.025, 0.975])
     assert ratio == pytest.approx(a.mean() / b.mean())
-    assert (low, high) == pytest.approx(tuple(wanted), abs=0.1 * (wanted[1] - wanted[0]))
+    assert (low, high) == pytest.approx(tuple(expected), abs=0.1 * (expected[1] - expected[0]))
     assert high - low < 0.02  # each mean by itself is known to 9 %
 
 

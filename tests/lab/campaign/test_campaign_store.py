@@ -20,53 +20,53 @@ DOCUMENT = {"name": "one", "runs": 3, "cells": CELLS}
 
 
 @pytest.fixture
-def given(tmp_path: Path) -> list[Task]:
+def tasks(tmp_path: Path) -> list[Task]:
     return list(make_tasks(cells(tmp_path, f"steps = 3\nruns = {CHUNK + 4}\n", controller("lqg"), TWO)))
 
 
-def test_the_table_is_sorted_whatever_the_order_of_the_tasks(tmp_path: Path, given: list[Task]) -> None:
+def test_the_table_is_sorted_whatever_the_order_of_the_tasks(tmp_path: Path, tasks: list[Task]) -> None:
     files = []
-    for name, order in (("one", given), ("other", given[::-1])):
+    for name, order in (("one", tasks), ("other", tasks[::-1])):
         store = Store(tmp_path / name)
         with store.open(DOCUMENT, "text", resume=False):
             for task in order:
                 store.keep(task, task.fly())
-            assert store.find_finished(given) == {task.name for task in given} and not store.is_complete()
-            files.append(store.finish(given))
+            assert store.find_finished(tasks) == {task.name for task in tasks} and not store.is_complete()
+            files.append(store.finish(tasks))
         assert store.is_complete() and not (tmp_path / name / "parts").exists()
     assert files[0].read_bytes() == files[1].read_bytes()
-    found = pq.read_table(files[0])
-    assert found.schema.names == ["cell", "controller", "link", *SCHEMA.names[1:]]
-    assert set(zip(*(found[name].to_pylist() for name in ("cell", "controller", "link")), strict=True)) == {
+    figures = pq.read_table(files[0])
+    assert figures.schema.names == ["cell", "controller", "link", *SCHEMA.names[1:]]
+    assert set(zip(*(figures[name].to_pylist() for name in ("cell", "controller", "link")), strict=True)) == {
         (0, "lqg", "a"), (1, "lqg", "b"),
     }  # fmt: skip
-    assert list(found["cell"].to_numpy()) == [0] * (CHUNK + 4) + [1] * (CHUNK + 4)
-    assert list(found["run"].to_numpy()) == [*range(CHUNK + 4)] * 2
-    whole = given[1].fly()
-    row = found.slice(CHUNK + 2, 1).to_pylist()[0]
-    assert row["cost"] == whole["cost"][2] and row["run"] == CHUNK + 2 and row["error"] == ""
-    ages = [int(count) for count in whole["ages"][2]]
+    assert list(figures["cell"].to_numpy()) == [0] * (CHUNK + 4) + [1] * (CHUNK + 4)
+    assert list(figures["run"].to_numpy()) == [*range(CHUNK + 4)] * 2
+    columns = tasks[1].fly()
+    row = figures.slice(CHUNK + 2, 1).to_pylist()[0]
+    assert row["cost"] == columns["cost"][2] and row["run"] == CHUNK + 2 and row["error"] == ""
+    ages = [int(count) for count in columns["ages"][2]]
     assert row["ages"] == ages[: row["max_age"] + 1] and not any(ages[row["max_age"] + 1 :])
 
 
-def test_rows_without_figures_are_kept(given: list[Task]) -> None:
-    rows = make_table(given[1].make_lost_rows("it died")).to_pylist()
+def test_rows_without_figures_are_kept(tasks: list[Task]) -> None:
+    rows = make_table(tasks[1].make_lost_rows("it died")).to_pylist()
     assert len(rows) == 4 and rows[0]["error"] == "it died" and rows[0]["ages"] == []
     assert np.isnan(rows[0]["cost"]) and rows[0]["steps"] == 0
 
 
-def test_a_part_that_is_damaged_is_named(tmp_path: Path, given: list[Task]) -> None:
+def test_a_part_that_is_damaged_is_named(tmp_path: Path, tasks: list[Task]) -> None:
     store = Store(tmp_path / "one")
     with store.open(DOCUMENT, "text", resume=False):
-        for task in given:
+        for task in tasks:
             store.keep(task, task.fly())
-        part = tmp_path / "one" / "parts" / f"{given[1].name}.parquet"
+        part = tmp_path / "one" / "parts" / f"{tasks[1].name}.parquet"
         part.write_bytes(part.read_bytes()[:-20])
-        with pytest.raises(UavctlError, match=rf"{given[1].name}\.parquet is damaged.*remove it"):
-            store.finish(given)
+        with pytest.raises(UavctlError, match=rf"{tasks[1].name}\.parquet is damaged.*remove it"):
+            store.finish(tasks)
 
 
-def test_only_the_same_campaign_goes_on_and_only_if_it_is_asked_to(tmp_path: Path) -> None:
+def test_only_the_same_campaign_continues_and_only_with_resume(tmp_path: Path) -> None:
     store = Store(tmp_path / "one")
     with pytest.raises(UsageError, match="leave out --resume"), store.open(DOCUMENT, "text", resume=True):
         pass
@@ -86,7 +86,7 @@ def test_only_the_same_campaign_goes_on_and_only_if_it_is_asked_to(tmp_path: Pat
         pass
 
 
-def test_the_first_difference_is_told() -> None:
+def test_the_first_difference_is_described() -> None:
     one = {"a": 1, "b": {"c": [1, {"d": "x"}]}, "e": None}
     assert find_first_difference(one, {**one}) is None
     assert find_first_difference(one, {**one, "b": {"c": [1, {"d": "y"}]}}) == 'b.c[1].d is "x" there and "y" here'
@@ -94,16 +94,18 @@ def test_the_first_difference_is_told() -> None:
     assert find_first_difference({}, {"f": 2}) == "f is null there and 2 here"
 
 
-def test_a_folder_that_cannot_be_is_told(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_made_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(UavctlError, match="file"), Store(tmp_path / "file").open(DOCUMENT, "text", resume=False):
         pass
 
 
-def test_a_run_alone_is_that_of_its_chunk(tmp_path: Path) -> None:
-    made = cells(tmp_path, f"steps = 6\nruns = {CHUNK + 4}\nmaster = 2\n", controller("lqg"), controller("smpc"), TWO)
-    task = list(make_tasks(made))[3]
+def test_a_single_run_equals_that_of_its_chunk(tmp_path: Path) -> None:
+    campaign_cells = cells(
+        tmp_path, f"steps = 6\nruns = {CHUNK + 4}\nmaster = 2\n", controller("lqg"), controller("smpc"), TWO
+    )
+    task = list(make_tasks(campaign_cells))[3]
     assert (task.cell, task.first, task.runs) == (1, CHUNK, 4)
-    found, _ = fly_task(task, CHUNK + 2, 1)
-    assert found.cost.shape == (1, 6)
-    assert found.cost.sum() == pytest.approx(task.fly()["cost"][2], rel=1e-12)
+    figures, _ = fly_task(task, CHUNK + 2, 1)
+    assert figures.cost.shape == (1, 6)
+    assert figures.cost.sum() == pytest.approx(task.fly()["cost"][2], rel=1e-12)

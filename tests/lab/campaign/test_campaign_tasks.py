@@ -57,7 +57,7 @@ def test_a_controller_that_counts_nothing_has_no_gap(tmp_path: Path) -> None:
     assert np.isfinite(columns["cost"]).all() and (columns["steps"] == 5).all()
 
 
-def test_numbers_that_leave_all_bounds_are_told_as_an_error(tmp_path: Path) -> None:
+def test_infinite_numbers_are_an_error(tmp_path: Path) -> None:
     columns = task(tmp_path, "steps = 60\nruns = 3\n", controller("lqg"), table("plant", "wild", WILD)).fly()
     assert set(columns["error"]) == {"ended in numbers that are not finite"}
     assert all(np.isnan(columns[name]).all() for name in FIGURES)
@@ -72,13 +72,13 @@ class Crashing:
 
     def begin(self, runs: int) -> None: ...
 
-    def act(self, news: Information) -> np.ndarray:
-        if news.step == 0 and (news.state[:, 0] > self._limit).any():
+    def act(self, measurement: Information) -> np.ndarray:
+        if measurement.step == 0 and (measurement.state[:, 0] > self._limit).any():
             raise ZeroDivisionError("out of range")
-        return np.zeros((len(news.state), 2))
+        return np.zeros((len(measurement.state), 2))
 
 
-def test_a_run_that_raises_is_told_and_stops_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_of_a_run_is_recorded_and_the_others_continue(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     box = "start_box = [[0, 0, 0, 0], [10, 0, 0, 0]]\nsteps = 2\nruns = 40\n"
     one = task(tmp_path, box, controller("lqg"))
     starts = draw_conditions(one.setting, 0, 40).world.start[:, 0]
@@ -147,23 +147,23 @@ def several(folder: Path) -> list[Task]:
 
 @pytest.mark.parametrize("deaths", [1, 2])
 def test_a_worker_that_dies_costs_at_most_the_task_that_kills_it(tmp_path: Path, deaths: int) -> None:
-    given, kept = several(tmp_path), dict[str, str]()
-    crew = FakeCrew({given[1].name: deaths})
-    fly_tasks(given, crew, lambda task, columns: kept.update({task.name: str(columns["error"][0])}), never)
-    assert sorted(kept) == [task.name for task in given]
+    tasks, kept_tasks = several(tmp_path), dict[str, str]()
+    crew = FakeCrew({tasks[1].name: deaths})
+    fly_tasks(tasks, crew, lambda task, columns: kept_tasks.update({task.name: str(columns["error"][0])}), never)
+    assert sorted(kept_tasks) == [task.name for task in tasks]
     expected = "the worker died, twice" if deaths == 2 else ""
-    assert kept.pop(given[1].name) == expected
-    assert set(kept.values()) == {""} and crew.renewed == deaths
+    assert kept_tasks.pop(tasks[1].name) == expected
+    assert set(kept_tasks.values()) == {""} and crew.renewed == deaths
 
 
-def test_what_is_asked_to_stop_keeps_what_is_under_way(tmp_path: Path) -> None:
-    given, kept = several(tmp_path), list[str]()
-    asked: Callable[[], bool] = lambda: len(kept) >= 1  # noqa: E731
-    fly_tasks(given, FakeCrew({}), lambda task, columns: kept.append(task.name), asked)
-    assert 1 <= len(kept) <= 4 and len(kept) < len(given)
+def test_a_stop_keeps_pending_tasks(tmp_path: Path) -> None:
+    tasks, kept_tasks = several(tmp_path), list[str]()
+    is_stopped: Callable[[], bool] = lambda: len(kept_tasks) >= 1  # noqa: E731
+    fly_tasks(tasks, FakeCrew({}), lambda task, columns: kept_tasks.append(task.name), is_stopped)
+    assert 1 <= len(kept_tasks) <= 4 and len(kept_tasks) < len(tasks)
 
 
-def test_an_error_that_is_no_worker_s_death_is_raised(tmp_path: Path) -> None:
+def test_another_error_than_a_dead_worker_is_raised(tmp_path: Path) -> None:
     class Broken(FakeCrew):
         def is_worker_death(self, error: BaseException) -> bool:
             return False

@@ -14,8 +14,8 @@ import pytest
 from uavctl.cli.app import run
 from uavctl.errors import ConfigError
 from uavctl.lab.campaign import trials as trial_cells
-from uavctl.lab.campaign.page import render_trial_report
 from uavctl.lab.campaign.store import Store, make_table
+from uavctl.lab.campaign.trial_page import render_trial_report
 from uavctl.lab.campaign.trials import (
     CHUNK,
     SCHEMA,
@@ -64,7 +64,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         (HEAD + OWN + OWN, 'controller[1].name: "own loop" is there twice'),
         (HEAD + OWN + 'set = ["smpc.horizon=10"]\n', "the vehicle's own loop has no design"),
@@ -76,46 +76,46 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (HEAD + "steps = 4\n" + OWN, "steps"),
     ],
 )
-def test_what_is_wrong_with_a_file_is_told_with_its_place(tmp_path: Path, text: str, told: str) -> None:
+def test_problems_of_a_trial_file_are_reported_with_their_keys(tmp_path: Path, text: str, message: str) -> None:
     file = written(tmp_path, text)
     assert is_trial_file(file)
     with pytest.raises(ConfigError) as caught:
         read_trial(file)
-    assert told in str(caught.value) and str(file) in str(caught.value)
+    assert message in str(caught.value) and str(file) in str(caught.value)
 
 
-def test_every_controller_meets_the_same_seeds_and_the_same_link(tmp_path: Path) -> None:
+def test_every_controller_has_the_same_seeds_and_link(tmp_path: Path) -> None:
     spec, _ = read_trial(written(tmp_path, HEAD + OWN + OURS))
     places = make_trial_cells(spec)
-    assert [(one.cell.scenario, one.cell.pilot.name) for one in places] == [
+    assert [(place.cell.scenario, place.cell.pilot.name) for place in places] == [
         ("hold", "own loop"), ("hold", "ours"), ("blackout", "own loop"), ("blackout", "ours")
     ]  # fmt: skip
     tasks = list(make_trial_tasks(spec, places))
-    assert [(one.cell, one.first, one.runs) for one in tasks] == [
+    assert [(task.cell, task.first, task.runs) for task in tasks] == [
         (c, f, r) for c in range(4) for f, r in ((0, 5), (5, 1))
     ]
     assert len({get_flight_seed(spec.master, i) for i in range(1000)}) == 1000
     assert get_flight_seed(0, 3) != get_flight_seed(1, 3)
-    ours, own = places[1], places[0]
-    assert ours.usable_room is not None and 0.3 < ours.usable_room < 1.0
-    assert (own.usable_room, own.design_id) == (None, None)
+    controller_cell, position_loop_cell = places[1], places[0]
+    assert controller_cell.usable_room is not None and 0.3 < controller_cell.usable_room < 1.0
+    assert (position_loop_cell.usable_room, position_loop_cell.design_id) == (None, None)
 
 
 @pytest.mark.slow
-def test_the_table_has_each_flight_as_it_is_flown_alone(flown: Path) -> None:
+def test_the_table_equals_separate_flights(flown: Path) -> None:
     rows = pq.read_table(flown / "runs.parquet").to_pylist()
     assert [(row["cell"], row["run"]) for row in rows] == [(c, i) for c in (0, 1, 3, 4) for i in range(RUNS)]
     assert not any(row["error"] for row in rows)
     spec, _ = read_trial(flown.parent / "small.toml")
     cell = make_trial_cells(spec)[1].cell
-    alone = fly_trial(cell, get_flight_seed(spec.master, 5), seconds=2.0, from_s=1.0)
+    single = fly_trial(cell, get_flight_seed(spec.master, 5), seconds=2.0, from_s=1.0)
     row = next(row for row in rows if (row["cell"], row["run"]) == (1, 5))
     for name in (*trial_cells.FLOAT_COLUMNS, "positions", "mode", "seed"):
-        assert row[name] == getattr(alone, name) or np.isnan(row[name]), name
+        assert row[name] == getattr(single, name) or np.isnan(row[name]), name
 
 
 @pytest.mark.slow
-def test_one_that_was_interrupted_goes_on_to_the_same_bytes(flown: Path, tmp_path: Path) -> None:
+def test_an_interrupted_campaign_continues_to_the_same_bytes(flown: Path, tmp_path: Path) -> None:
     path = flown.parent / "small.toml"
     spec, text = read_trial(path)
     places = make_trial_cells(spec)
@@ -128,7 +128,9 @@ def test_one_that_was_interrupted_goes_on_to_the_same_bytes(flown: Path, tmp_pat
     assert run(["campaign", str(path), "--runs", "2", "--out", str(store.folder), "--resume"]) != 0
 
 
-def test_a_flight_that_raises_is_told_and_stops_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_of_a_flight_is_recorded_and_the_others_continue(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def fails(cell: TrialCell, seed: int, *, seconds: float, from_s: float) -> TrialFlight:
         if seed == get_flight_seed(0, 1):
             raise RuntimeError("no more")
@@ -147,23 +149,25 @@ def test_a_flight_that_raises_is_told_and_stops_nothing(tmp_path: Path, monkeypa
 @pytest.mark.slow
 def test_the_summary_has_the_medians_and_the_worst_of_the_table(flown: Path) -> None:
     rows = pq.read_table(flown / "runs.parquet").to_pylist()
-    told, cells = summarise_trial(flown)
+    message, cells = summarise_trial(flown)
     assert [cell.place.refused[:12] for cell in cells] == ["", "", "smpc.horizon"] * 2
     for cell in cells:
-        mine = [row for row in rows if row["cell"] == cell.place.index]
-        assert (cell.runs, cell.failed) == (len(mine), 0)
-        if mine:
-            holds = [row["hold_rms_m"] for row in mine]
+        cell_rows = [row for row in rows if row["cell"] == cell.place.index]
+        assert (cell.runs, cell.failed) == (len(cell_rows), 0)
+        if cell_rows:
+            holds = [row["hold_rms_m"] for row in cell_rows]
             assert cell.median["hold_rms_m"] == median(holds) and cell.worst["hold_rms_m"] == max(holds)
             assert cell.modes == {"GUIDED": RUNS}
-    page = render_trial_report(told, cells)
+    page = render_trial_report(message, cells)
     assert "own loop" in page and "Not flown, or failed" in page and "too sure" in page
     beyond_m = max(row["beyond_m"] for row in rows if np.isfinite(row["beyond_m"]))
     assert (f"had {-beyond_m:.2f} m left" if beyond_m <= 0.0 else f"the furthest by {beyond_m:.2f} m") in page
 
 
 @pytest.mark.slow
-def test_it_is_told_as_json_and_is_no_campaign_of_runs(flown: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_trials_have_a_json_document_and_are_no_campaign_of_runs(
+    flown: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = flown.parent / "small.toml"
     capsys.readouterr()
     assert run(["campaign", str(path), "--out", str(flown), "--resume", "--json"]) == 0

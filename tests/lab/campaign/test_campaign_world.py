@@ -10,7 +10,9 @@ from uavctl.arrays import Array
 from uavctl.build.controller import build_design, build_plant
 from uavctl.build.link import build_delayed_link
 from uavctl.config import Config, load_config
-from uavctl.lab.campaign.world import LinearWorld, compute_newest_captures, draw, simulate
+from uavctl.lab.campaign.arrivals import compute_newest_captures
+from uavctl.lab.campaign.draws import draw
+from uavctl.lab.campaign.world import LinearWorld, simulate
 from uavctl.smpc.batch import BatchSmpc, Decisions, Information, predict
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope
@@ -41,25 +43,25 @@ def config(*overrides: str) -> Config:
 )
 def test_the_age_is_distributed_as_the_theory_says(name: str, base: int) -> None:
     """From a position that came by itself: after a while, where the channel remembers how it began."""
-    given = config(*LINKS[name])
-    found = compute_newest_captures(given.link, 1.0, draw(3, 0, RUNS, base + STEPS, 1).link)
-    found = found[found[:, base] == base][:, base:] - base
-    age = np.arange(STEPS) - found
-    wanted = build_delayed_link(given).age(STEPS - 1)
+    configured = config(*LINKS[name])
+    captures = compute_newest_captures(configured.link, 1.0, draw(3, 0, RUNS, base + STEPS, 1).link)
+    captures = captures[captures[:, base] == base][:, base:] - base
+    age = np.arange(STEPS) - captures
+    expected = build_delayed_link(configured).age(STEPS - 1)
     assert len(age) > 0.3 * RUNS
     for t in range(STEPS):
         measured = np.bincount(age[:, t], minlength=STEPS)[:STEPS] / len(age)
         # Five standard deviations of a binomial share: 144 of them may not fail by chance.
-        assert np.abs(measured - wanted[t]).max() < 5.0 * 0.5 / np.sqrt(len(age)), t
+        assert np.abs(measured - expected[t]).max() < 5.0 * 0.5 / np.sqrt(len(age)), t
 
 
 @pytest.mark.slow
 def test_probabilities_of_each_step_lose_that_share() -> None:
-    given = config(*LINKS["p(k)"])
-    found = compute_newest_captures(given.link, 1.0, draw(3, 0, RUNS, STEPS, 1).link)
+    configured = config(*LINKS["p(k)"])
+    captures = compute_newest_captures(configured.link, 1.0, draw(3, 0, RUNS, STEPS, 1).link)
     for k in range(1, STEPS):
-        share = float((found[:, k] == k).mean())
-        assert share == pytest.approx(given.link.probability[min(k, 4)], abs=5.0 * 0.5 / np.sqrt(RUNS))
+        share = float((captures[:, k] == k).mean())
+        assert share == pytest.approx(configured.link.probability[min(k, 4)], abs=5.0 * 0.5 / np.sqrt(RUNS))
 
 
 @pytest.mark.parametrize("name", ["independent", "bursts", "runs as measured"])
@@ -67,7 +69,7 @@ def test_losses_are_the_channel_s_for_the_same_draws(name: str) -> None:
     """The simulator's own channel, fed the same uniform numbers, loses the same packets."""
     link = config(*LINKS[name]).link
     chances = draw(5, 0, 40, 30, 1).link
-    found = compute_newest_captures(link, 1.0, chances)
+    captures = compute_newest_captures(link, 1.0, chances)
     for run in range(len(chances)):
         channel = Channel(link, np.random.SeedSequence(0), 0, 1_000_000_000)
         channel._loss = _Fed(chances[run, :, :2])  # type: ignore[assignment]
@@ -75,7 +77,7 @@ def test_losses_are_the_channel_s_for_the_same_draws(name: str) -> None:
         for k in range(30):
             channel.push(k * 1_000_000_000, b"x", is_certain=k == 0)
             known = k if channel.pop_due(k * 1_000_000_000) else known
-            assert found[run, k] == known, (run, k)
+            assert captures[run, k] == known, (run, k)
 
 
 class _Fed:
@@ -91,20 +93,20 @@ class _Fed:
 
 
 def test_a_blackout_loses_all() -> None:
-    found = compute_newest_captures(
+    captures = compute_newest_captures(
         config("link.blackout=[[3, 6]]", "link.loss=0.0").link, 1.0, draw(0, 0, 2, 10, 1).link
     )
-    assert found.tolist() == [[0, 1, 2, 2, 2, 2, 2, 7, 8, 9]] * 2
+    assert captures.tolist() == [[0, 1, 2, 2, 2, 2, 2, 7, 8, 9]] * 2
 
 
 def test_a_run_s_draws_depend_on_master_and_index_alone() -> None:
-    many, one, longer = draw(7, 10, 5, 20, 2), draw(7, 13, 1, 20, 2), draw(7, 13, 1, 30, 2)
-    assert np.array_equal(many.normal[3], one.normal[0])
-    assert np.array_equal(many.link[3], one.link[0])
+    several, one, longer = draw(7, 10, 5, 20, 2), draw(7, 13, 1, 20, 2), draw(7, 13, 1, 30, 2)
+    assert np.array_equal(several.normal[3], one.normal[0])
+    assert np.array_equal(several.link[3], one.link[0])
     assert np.array_equal(longer.normal[0, :20], one.normal[0])
     assert np.array_equal(longer.link[0, :21], one.link[0])
     assert not np.array_equal(draw(8, 13, 1, 20, 2).normal, one.normal)
-    assert not np.array_equal(many.normal[3], many.normal[2])
+    assert not np.array_equal(several.normal[3], several.normal[2])
 
 
 class _Linear:
@@ -116,11 +118,11 @@ class _Linear:
     def begin(self, runs: int) -> None:
         self.runs = runs
 
-    def act(self, news: Information) -> Array:
-        asked = predict(self._plant, news) @ self._gain.T
-        if news.step == 3 and self._bad >= 0:
-            asked[self._bad] = np.nan
-        return asked
+    def act(self, measurement: Information) -> Array:
+        requested_input = predict(self._plant, measurement) @ self._gain.T
+        if measurement.step == 3 and self._bad >= 0:
+            requested_input[self._bad] = np.nan
+        return requested_input
 
 
 def scene(plant: Plant, runs: int) -> LinearWorld:
@@ -137,26 +139,26 @@ def scene(plant: Plant, runs: int) -> LinearWorld:
     )
 
 
-def test_a_flight_is_what_a_plain_loop_says() -> None:
+def test_the_simulation_equals_a_plain_loop() -> None:
     plant = build_plant(config())
     gain = np.array([[-0.2, -0.8, 0.0, 0.0], [0.0, 0.0, -0.3, -0.9]])
     runs, steps = 6, 15
     chances = draw(1, 0, runs, steps, plant.n_w)
     known = compute_newest_captures(config("link.loss=0.6").link, 1.0, chances.link)
-    given = scene(plant, runs)
-    flown = simulate(given, _Linear(plant, gain), known, chances.normal)
+    configured = scene(plant, runs)
+    flown = simulate(configured, _Linear(plant, gain), known, chances.normal)
     for i in range(runs):
-        x, states = given.start[i], [given.start[i]]
+        x, states = configured.start[i], [configured.start[i]]
         past: list[Array] = []
         for k in range(steps):
-            seen = states[known[i, k]]
+            known_state = states[known[i, k]]
             for u in past[known[i, k] :]:
-                seen = plant.a @ seen + plant.b @ u
-            asked = gain @ seen
-            u = np.minimum(np.maximum(asked, -0.5), 0.4)
-            dx, du = x - given.target, u - given.u_target
-            assert flown.cost[i, k] == pytest.approx(dx @ given.q_x @ dx + du @ given.q_u @ du)
-            assert flown.input_violated[i, k] == (asked.max() > 0.4 or asked.min() < -0.5)
+                known_state = plant.a @ known_state + plant.b @ u
+            requested_input = gain @ known_state
+            u = np.minimum(np.maximum(requested_input, -0.5), 0.4)
+            dx, du = x - configured.target, u - configured.u_target
+            assert flown.cost[i, k] == pytest.approx(dx @ configured.q_x @ dx + du @ configured.q_u @ du)
+            assert flown.input_violated[i, k] == (requested_input.max() > 0.4 or requested_input.min() < -0.5)
             assert flown.age[i, k] == k - known[i, k]
             past.append(u)
             x = plant.a @ x + plant.b @ u + plant.e @ chances.normal[i, k]
@@ -170,7 +172,7 @@ def test_a_flight_is_what_a_plain_loop_says() -> None:
     assert not flown.failed.any()
 
 
-def test_a_run_that_asks_for_no_number_fails_alone() -> None:
+def test_a_run_with_an_invalid_input_fails_alone() -> None:
     plant = build_plant(config())
     gain = np.zeros((2, 4))
     chances = draw(1, 0, 3, 8, plant.n_w)
@@ -196,23 +198,23 @@ class _Numbered:
         return Decisions(solved, inputs, np.where(solved, 0.5, np.inf), np.ones(len(x)), np.full(len(x), 1e-5))
 
 
-def test_plans_play_out_fail_and_run_out() -> None:
+def test_plans_continue_fail_and_end() -> None:
     """News in steps 0, 1, 4, then silence: plan 1, plan 2 played to step 3, no plan in step 4, then the brake."""
-    given = config()
-    design, plant = build_design(given), build_plant(given)
+    configured = config()
+    design, plant = build_design(configured), build_plant(configured)
     pilot = BatchSmpc(_Numbered(design.horizon), plant, design.horizon, len(design.late), brake_gain_1ps=0.5)
     pilot.begin(1)
     known = [0, 1, 1, 1, *[4] * 14]
-    state, asked = np.array([[1.0, 2.0, 3.0, -4.0]]), []
+    state, requested_input = np.array([[1.0, 2.0, 3.0, -4.0]]), []
     for k, last in enumerate(known):
-        asked.append(pilot.act(Information(k, np.array([last]), state, np.zeros((1, k, 2))))[0])
+        requested_input.append(pilot.act(Information(k, np.array([last]), state, np.zeros((1, k, 2))))[0])
     # From step 4 on its position is newer than the plan's, so each step asks again until there is a plan.
-    assert [u[0] for u in asked[:6]] == [100.0, 200.0, 201.0, 202.0, 203.0, 400.0]
-    made = 5
-    assert [u[0] for u in asked[6:16]] == [400.0 + k - made for k in range(6, 16)]
+    assert [u[0] for u in requested_input[:6]] == [100.0, 200.0, 201.0, 202.0, 203.0, 400.0]
+    solved = 5
+    assert [u[0] for u in requested_input[6:16]] == [400.0 + k - solved for k in range(6, 16)]
     # Step 16: the position is 12 = H steps old. Brake: a = -0.5 v, of the velocity predicted without inputs.
     speed = plant.a[1, 1] ** 12 * 2.0
-    assert asked[16][0] == pytest.approx(-0.5 * speed / plant.accel_per_input[0])
+    assert requested_input[16][0] == pytest.approx(-0.5 * speed / plant.accel_per_input[0])
     tally = pilot.tally
     assert (tally.decisions[0], tally.infeasible[0], tally.slack_used[0], tally.fallbacks[0]) == (4, 1, 3, 2)
     assert tally.largest_gap[0] == 1e-5

@@ -20,7 +20,9 @@ from uavctl.build.controller import build_design, build_plant
 from uavctl.config import Config, load_config
 from uavctl.config.connections import ClockConfig
 from uavctl.config.link import LinkConfig
-from uavctl.lab.campaign.world import LinearWorld, Trajectories, compute_newest_captures, draw, simulate
+from uavctl.lab.campaign.arrivals import compute_newest_captures
+from uavctl.lab.campaign.draws import draw
+from uavctl.lab.campaign.world import LinearWorld, Trajectories, simulate
 from uavctl.records import Decision, Truth
 from uavctl.smpc.batch import BatchSmpc, Counts
 from uavctl.smpc.hahn_stursberg.frozen import ShortcutDecider, ShortcutSolver
@@ -138,8 +140,8 @@ def in_lockstep(run: Run) -> Memory:
     assert build_design(config).design_id == DESIGN.design_id
     loop = make_loop(config, memory, DESIGN)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(simulation, "LinearVehicle", lambda *given: GivenDisturbances(run, *given))
-        patch.setattr(simulation, "Channel", lambda *given: GivenDelays(run, *given))
+        patch.setattr(simulation, "LinearVehicle", lambda *arguments: GivenDisturbances(run, *arguments))
+        patch.setattr(simulation, "Channel", lambda *arguments: GivenDelays(run, *arguments))
         world = World(config, loop, lambda truth: memory.put("/sim/truth", truth.at_ns, truth))
     world.run(config.duration_s)
     world.peers.advance(STEPS * DT_NS)
@@ -160,7 +162,7 @@ SAME = 2e-5
 
 @pytest.mark.slow
 @pytest.mark.parametrize("link", [LOSSES, LATE], ids=["lost", "late"])
-def test_a_flight_is_the_run_to_what_float32_leaves(link: LinkConfig) -> None:
+def test_a_flight_equals_the_run_within_float32(link: LinkConfig) -> None:
     run = in_the_linear_world(link, 3)
     memory = in_lockstep(run)
     truths = memory.of(Truth)
@@ -172,7 +174,7 @@ def test_a_flight_is_the_run_to_what_float32_leaves(link: LinkConfig) -> None:
 
 
 @pytest.mark.slow
-def test_they_are_the_same_until_no_plan_is_left() -> None:
+def test_flight_and_run_are_equal_until_the_plan_ends() -> None:
     """Then the flight core brakes tick by tick, and the linear world step by step."""
     run = in_the_linear_world(BURSTS, 6)
     (without,) = np.nonzero(run.flown.age[0] >= DESIGN.horizon)
@@ -180,7 +182,7 @@ def test_they_are_the_same_until_no_plan_is_left() -> None:
     assert largest_difference(run, in_lockstep(run).of(Truth), int(without[0])) < SAME
 
 
-def test_positions_are_late_or_lost_as_the_newest_known_says() -> None:
+def test_positions_are_delayed_or_lost_as_in_the_run() -> None:
     known = np.array([0, 0, 0, 1, 4, 4, 5])  # 1 is two steps late, 4 and 0 are not, 5 is one; 2, 3, 6 are lost
-    wanted = [0, 2, None, None, 0, 1, None]
-    assert list(delays_ns(known)) == [None if steps is None else steps * DT_NS for steps in wanted]
+    expected = [0, 2, None, None, 0, 1, None]
+    assert list(delays_ns(known)) == [None if steps is None else steps * DT_NS for steps in expected]

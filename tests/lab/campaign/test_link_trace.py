@@ -15,7 +15,8 @@ from uavctl.build.link import build_delayed_link, build_link, promised
 from uavctl.config import load, load_config
 from uavctl.config.load import dump_config, parse
 from uavctl.errors import ConfigError, DesignError
-from uavctl.lab.campaign.world import compute_newest_captures, draw
+from uavctl.lab.campaign.arrivals import compute_newest_captures
+from uavctl.lab.campaign.draws import draw
 from uavctl.records import Truth
 
 S = 1_000_000_000
@@ -48,8 +49,8 @@ def test_a_file_gives_one_delay_a_line_nothing_or_inf_for_a_lost_packet(tmp_path
     config = load_config("paper", [*PAPER, f"link.trace_file={tmp_path / 'trace.csv'}"])
     assert config.link.trace_s == MEASURED
     assert config.link.trace_file == ""
-    again = parse(dump_config(config), "again").config  # a recording holds the trace itself
-    assert again == config
+    reloaded = parse(dump_config(config), "again").config  # a recording holds the trace itself
+    assert reloaded == config
 
 
 def test_a_relative_name_is_beside_the_file_or_where_the_command_is_typed(
@@ -58,18 +59,18 @@ def test_a_relative_name_is_beside_the_file_or_where_the_command_is_typed(
     for folder, delay in (("beside", 0.01), ("here", 0.02)):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "trace.csv").write_text(f"{delay}\n", encoding="utf-8")
-    mine = tmp_path / "beside" / "mine.toml"
-    mine.write_text(dump_config(load_config("paper")), encoding="utf-8")
-    text = mine.read_text(encoding="utf-8").replace('trace_file = ""', 'trace_file = "trace.csv"')
-    mine.write_text(text, encoding="utf-8")
+    path = tmp_path / "beside" / "mine.toml"
+    path.write_text(dump_config(load_config("paper")), encoding="utf-8")
+    text = path.read_text(encoding="utf-8").replace('trace_file = ""', 'trace_file = "trace.csv"')
+    path.write_text(text, encoding="utf-8")
     monkeypatch.chdir(tmp_path / "here")
-    assert load_config(str(mine)).link.trace_s == (0.01,)
-    assert load_config(str(mine), ["link.trace_file=trace.csv"]).link.trace_s == (0.02,)
+    assert load_config(str(path)).link.trace_s == (0.01,)
+    assert load_config(str(path), ["link.trace_file=trace.csv"]).link.trace_s == (0.02,)
     assert load_config("paper", ["link.trace_file=trace.csv"]).link.trace_s == (0.02,)
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("0.1\nfast\n0.2\n", 'trace.csv:2: "fast" is not a number'),
         ("0.1\n0.2\n-0.5\n", "trace.csv:3: -0.5 is not a delay in s"),
@@ -83,19 +84,19 @@ def test_a_relative_name_is_beside_the_file_or_where_the_command_is_typed(
         ("inf\n\n", "trace.csv: link.trace_s: every packet is lost"),
     ],
 )
-def test_what_is_wrong_with_a_file_is_told_with_file_and_line(tmp_path: Path, text: str, told: str) -> None:
+def test_problems_of_a_trace_are_reported_with_file_and_line(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "trace.csv").write_text(text, encoding="utf-8")
-    assert told in problems(*PAPER, f"link.trace_file={tmp_path / 'trace.csv'}")
+    assert message in problems(*PAPER, f"link.trace_file={tmp_path / 'trace.csv'}")
 
 
-def test_files_that_are_not_there_or_no_text_are_told(tmp_path: Path) -> None:
+def test_missing_or_binary_trace_files_are_errors(tmp_path: Path) -> None:
     assert "nowhere.csv: cannot be read" in problems(*PAPER, "link.trace_file=nowhere.csv")
     (tmp_path / "bytes.csv").write_bytes(b"\xff\xfe\x00")
     assert "is not UTF-8 text" in problems(*PAPER, f"link.trace_file={tmp_path / 'bytes.csv'}")
 
 
 @pytest.mark.parametrize(
-    ("overrides", "told"),
+    ("overrides", "message"),
     [
         (["link.model=trace"], 'link.trace_file: is missing, and model "trace" needs it'),
         (["link.model=trace", "link.trace_s=[0.1, -1.0]"], "link.trace_s[1]: -1 is not a delay"),
@@ -103,8 +104,8 @@ def test_files_that_are_not_there_or_no_text_are_told(tmp_path: Path) -> None:
         (["link.trace_s=[0.1]", "link.trace_file=x.csv"], "there are delays in link.trace_s as well"),
     ],
 )
-def test_a_trace_that_cannot_be_is_refused(overrides: list[str], told: str) -> None:
-    assert told in problems(*overrides)
+def test_an_invalid_trace_is_refused(overrides: list[str], message: str) -> None:
+    assert message in problems(*overrides)
 
 
 def test_the_channel_loses_and_delays_each_packet_as_the_trace_did_over_and_over_again() -> None:
@@ -129,7 +130,7 @@ def test_a_certain_packet_that_the_trace_lost_comes_at_once_and_one_not_sent_tak
 def test_a_flight_over_a_trace_gets_what_the_trace_lets_through() -> None:
     memory = lockstep("paper", 24.0, *PAPER, listed((0.05, 0.01, INF, 0.02)))
     truths = memory.of(Truth)
-    assert [one.lost for one in truths] == [(k + 2) // 4 for k in range(24)]  # packet 2 and every fourth after it
+    assert [truth.lost for truth in truths] == [(k + 2) // 4 for k in range(24)]  # packet 2 and every fourth after it
 
 
 def test_the_design_counts_the_trace_s_own_runs_and_late_packets_as_lost() -> None:
@@ -166,24 +167,26 @@ def test_delays_of_a_step_and_more_are_for_independent_losses_only() -> None:
 
 def known(delays: Array, dt_s: float) -> list[int]:
     """Newest capture known at each step, by going through the packets: late ones by whole steps, rounded up."""
-    whole = max(delay for delay in MEASURED if delay < INF) < dt_s
-    found, best = [], 0
+    is_within_step = max(delay for delay in MEASURED if delay < INF) < dt_s
+    captures, best = [], 0
     for k in range(len(delays)):
         for j in range(k + 1):
-            late = 0 if whole or j == 0 else math.ceil(delays[j] / dt_s - 1e-9) if delays[j] < INF else 10**6
-            if (delays[j] < INF or j == 0) and j + late <= k:
+            delay_steps = (
+                0 if is_within_step or j == 0 else math.ceil(delays[j] / dt_s - 1e-9) if delays[j] < INF else 10**6
+            )
+            if (delays[j] < INF or j == 0) and j + delay_steps <= k:
                 best = max(best, j)
-        found.append(best)
-    return found
+        captures.append(best)
+    return captures
 
 
 @pytest.mark.parametrize("dt_s", [1.0, 0.25])
 def test_runs_of_a_campaign_begin_at_drawn_packets_and_follow_the_trace(dt_s: float) -> None:
     link = load_config("paper", [*PAPER, listed(MEASURED)]).link
     chances = draw(3, 0, 200, 20, 1).link
-    found = compute_newest_captures(link, dt_s, chances)
+    captures = compute_newest_captures(link, dt_s, chances)
     first = (chances[:, 0, 0] * 8).astype(int)
     assert set(first) == set(range(8))
     for run in range(200):
         delays = np.array([MEASURED[(first[run] + k) % 8] for k in range(20)])
-        assert found[run].tolist() == known(delays, dt_s)
+        assert captures[run].tolist() == known(delays, dt_s)

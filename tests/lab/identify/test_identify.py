@@ -62,8 +62,8 @@ def fly(
     rng = np.random.default_rng(seed)
     plant = drag_lag([drag_1ps], [lag_s], [gain], [1.0], TICK_S, ("north",))
     count = round(seconds / TICK_S)
-    asked = np.repeat(rng.uniform(-1.5, 1.5, count // 16 + 1), 16)[:count]
-    acting = np.concatenate([np.zeros(dead_ticks), asked])[:count]
+    setpoints = np.repeat(rng.uniform(-1.5, 1.5, count // 16 + 1), 16)[:count]
+    acting = np.concatenate([np.zeros(dead_ticks), setpoints])[:count]
     wind = WIND_MPS2 * np.sqrt(DT_S / TICK_S) * rng.standard_normal(count)
     state, times, places = np.zeros(3), [], []
     for tick in range(count):
@@ -71,7 +71,7 @@ def fly(
             times.append(tick * TICK_S)
             places.append((state[0] + NOISE_M * rng.standard_normal(), 0.0, 0.0))
         state = plant.a @ state + plant.b[:, 0] * acting[tick] + plant.e[:, 0] * wind[tick]
-    inputs = np.column_stack([asked, np.zeros(count), np.zeros(count)])
+    inputs = np.column_stack([setpoints, np.zeros(count), np.zeros(count)])
     return Stretch(np.linspace(0.0, (count - 1) * TICK_S, count), inputs, np.array(times), np.array(places))
 
 
@@ -84,10 +84,10 @@ def test_the_plant_that_made_the_data_is_found_within_its_standard_errors() -> N
     for seed, (lag_s, drag_1ps, gain) in enumerate([(0.25, 0.3, 1.0), (0.4, 0.8, 1.1)]):
         flown = (fly(lag_s, drag_1ps, gain, seed=seed),)
         fit = fit_axis(flown, 0, DRAG_LAG, 0.0)
-        told = compute_standard_errors(flown, 0, fit)
-        errors = tuple(told[name] for name in ("lag_s", "drag_1ps", "gain"))
-        found = tuple(fit.value(name) for name in ("lag_s", "drag_1ps", "gain"))
-        misses += [(a - b) / e for a, b, e in zip(found, (lag_s, drag_1ps, gain), errors, strict=True)]
+        standard_errors = compute_standard_errors(flown, 0, fit)
+        errors = tuple(standard_errors[name] for name in ("lag_s", "drag_1ps", "gain"))
+        result = tuple(fit.value(name) for name in ("lag_s", "drag_1ps", "gain"))
+        misses += [(a - b) / e for a, b, e in zip(result, (lag_s, drag_1ps, gain), errors, strict=True)]
         assert max(errors) < 0.1
         assert fit.value("wind_mps2_rts") / np.sqrt(DT_S) == pytest.approx(WIND_MPS2, rel=0.15)
         assert fit.value("noise_m") == pytest.approx(NOISE_M, rel=0.5)
@@ -100,39 +100,39 @@ def test_the_plant_that_made_the_data_is_found_within_its_standard_errors() -> N
 def test_the_likeliest_dead_time_is_the_one_that_made_the_data(seed: int) -> None:
     flown = (fly(0.1, 0.1, 1.0, seed=seed, dead_ticks=3),)
     tries: list[int] = []
-    found = choose_dead_time(flown, (0,), (DRAG_LAG,), lambda: tries.append(1))
-    assert found.dead_time_s == pytest.approx(0.15, abs=0.03)
-    assert found.range_s[0] - FINE_S <= 0.15 <= found.range_s[1] + FINE_S
-    assert found.range_s[1] - found.range_s[0] < 0.15
-    assert found.fits[0].value("lag_s") == pytest.approx(0.1, abs=0.03)
+    result = choose_dead_time(flown, (0,), (DRAG_LAG,), lambda: tries.append(1))
+    assert result.dead_time_s == pytest.approx(0.15, abs=0.03)
+    assert result.range_s[0] - FINE_S <= 0.15 <= result.range_s[1] + FINE_S
+    assert result.range_s[1] - result.range_s[0] < 0.15
+    assert result.fits[0].value("lag_s") == pytest.approx(0.1, abs=0.03)
     # What was tried in a chain is no other hill than a search from the start finds.
-    for dead_time_s, rise in found.curve[::3]:
-        alone = fit_axis(flown, 0, DRAG_LAG, dead_time_s)
-        assert found.fits[0].deviance + rise == pytest.approx(alone.deviance, abs=0.1)
+    for dead_time_s, rise in result.curve[::3]:
+        single = fit_axis(flown, 0, DRAG_LAG, dead_time_s)
+        assert result.fits[0].deviance + rise == pytest.approx(single.deviance, abs=0.1)
     assert len(tries) == MAX_TRIES
 
 
 def flown_by_reference(seed: int) -> Stretch:
     """The plant velocity-reference under random setpoints, two ticks late."""
     rng = np.random.default_rng(seed)
-    held = VelocityReferenceAxis(0.25, 0.1, 1.0, 2.0, 1.0, 0.03, 0.1, 0.05)
-    plant = velocity_reference([held], TICK_S, ("north",))
-    asked = np.repeat(np.diff(rng.uniform(-0.6, 0.6, 77)) / (16 * TICK_S), 16)  # the reference stays below 0.6 m/s
-    acting = np.concatenate([np.zeros(2), asked])
+    vehicle = VelocityReferenceAxis(0.25, 0.1, 1.0, 2.0, 1.0, 0.03, 0.1, 0.05)
+    plant = velocity_reference([vehicle], TICK_S, ("north",))
+    setpoints = np.repeat(np.diff(rng.uniform(-0.6, 0.6, 77)) / (16 * TICK_S), 16)  # the reference stays below 0.6 m/s
+    acting = np.concatenate([np.zeros(2), setpoints])
     state, times, rows = np.zeros(6), [], []
-    for tick in range(len(asked)):
+    for tick in range(len(setpoints)):
         if rng.random() > 0.3:
             times.append(tick * TICK_S)
             rows.append((state[0] + NOISE_M * rng.standard_normal(), 0.0, 0.0))
         kicks = np.sqrt(np.diag(plant.w)) * rng.standard_normal(3)
         state = plant.a @ state + plant.b[:, 0] * acting[tick] + plant.e @ kicks
-    inputs = np.column_stack([asked, np.zeros((len(asked), 2))])
-    return Stretch(TICK_S * np.arange(len(asked), dtype=np.float64), inputs, np.array(times), np.array(rows))
+    inputs = np.column_stack([setpoints, np.zeros((len(setpoints), 2))])
+    return Stretch(TICK_S * np.arange(len(setpoints), dtype=np.float64), inputs, np.array(times), np.array(rows))
 
 
 def missed(flown: Stretch, fit: AxisFit) -> Array:
     """Rms errors of the motion of the next times [m]."""
-    return np.array([np.sqrt(np.mean(one.errors_m**2)) for one in predict_ahead((flown,), 0, fit)])
+    return np.array([np.sqrt(np.mean(ahead.errors_m**2)) for ahead in predict_ahead((flown,), 0, fit)])
 
 
 @pytest.mark.slow
@@ -181,16 +181,16 @@ def test_a_right_model_leaves_white_innovations_and_a_wrong_one_does_not() -> No
 def advanced(motion: LinearMotion, plant: Plant) -> None:
     """Compare the motion over many instants with the plant's own."""
     count = round(plant.dt_s / TIME_UNIT_S)
-    found = compute_transition(motion, np.array([0, count]))
+    result = compute_transition(motion, np.array([0, count]))
     n_x = plant.n_x
-    np.testing.assert_allclose(found.transition[1, 0, :n_x, :n_x], plant.a, atol=1e-11)
-    np.testing.assert_allclose(found.input_effect[1, 0, :n_x], plant.b[:, 0], atol=1e-11)
-    np.testing.assert_array_equal(found.transition[0, 0], np.eye(motion.a.shape[-1]))
+    np.testing.assert_allclose(result.transition[1, 0, :n_x, :n_x], plant.a, atol=1e-11)
+    np.testing.assert_allclose(result.input_effect[1, 0, :n_x], plant.b[:, 0], atol=1e-11)
+    np.testing.assert_array_equal(result.transition[0, 0], np.eye(motion.a.shape[-1]))
 
 
 @pytest.mark.parametrize(("lag_s", "drag_1ps"), [(0.25, 0.3), (0.02, 0.0), (0.5, 1.4)])
 def test_the_motion_is_that_of_the_plant(lag_s: float, drag_1ps: float) -> None:
-    given = {
+    parameters = {
         "lag_s": lag_s,
         "drag_1ps": drag_1ps,
         "gain": 0.9,
@@ -200,12 +200,12 @@ def test_the_motion_is_that_of_the_plant(lag_s: float, drag_1ps: float) -> None:
         "drift_mps2_rts": 0.3,
     }
     advanced(
-        DRAG_LAG.motion(make_parameters(DRAG_LAG, given)[None]),
+        DRAG_LAG.motion(make_parameters(DRAG_LAG, parameters)[None]),
         drag_lag([drag_1ps], [lag_s], [0.9], [1.0], 0.13, ("north",)),
     )
-    held = VelocityReferenceAxis(drag_1ps, lag_s, 1.0, 2.0, 1.0, 0.7, 0.2, 0.3)
-    motion = HELD.motion(make_parameters(HELD, given)[None])
-    advanced(motion, velocity_reference([held], 0.13, ("north",)))
+    vehicle = VelocityReferenceAxis(drag_1ps, lag_s, 1.0, 2.0, 1.0, 0.7, 0.2, 0.3)
+    motion = HELD.motion(make_parameters(HELD, parameters)[None])
+    advanced(motion, velocity_reference([vehicle], 0.13, ("north",)))
     # White noise as the limit of noise that is held over ever shorter parts.
     fine_s = 0.13 / 4000
     white = VelocityReferenceAxis(drag_1ps, lag_s, 1.0, 2.0, 1.0, 0.7 / np.sqrt(fine_s), 0.2 / np.sqrt(fine_s), 0.3)
@@ -215,7 +215,7 @@ def test_the_motion_is_that_of_the_plant(lag_s: float, drag_1ps: float) -> None:
         cov = part.a @ cov @ part.a.T + part.e @ part.w @ part.e.T
     spread = compute_transition(motion, np.array([round(0.13 / TIME_UNIT_S)])).noise_cov[0, 0]
     np.testing.assert_allclose(spread, cov, rtol=2e-3, atol=1e-5)
-    assert get_values(HELD, make_parameters(HELD, given).tolist())["lag_s"] == pytest.approx(lag_s)
+    assert get_values(HELD, make_parameters(HELD, parameters).tolist())["lag_s"] == pytest.approx(lag_s)
 
 
 def test_an_outlier_does_not_spoil_the_fit() -> None:
@@ -223,13 +223,13 @@ def test_an_outlier_does_not_spoil_the_fit() -> None:
     bad = clean.positions_m.copy()
     bad[::25, 0] += 2.0
     rows = zip(clean.times_s, bad[:, 0], strict=True)
-    seen = make_position_history([(float(t), float(t), (float(x), 0.0, 0.0)) for t, x in rows])
-    gone = ~np.isin(clean.times_s, seen.times_s)
+    positions = make_position_history([(float(t), float(t), (float(x), 0.0, 0.0)) for t, x in rows])
+    gone = ~np.isin(clean.times_s, positions.times_s)
     assert gone[::25][1:].all()
     assert np.count_nonzero(gone) <= len(bad[::25]) + 3
-    few = clean.positions_m.copy()
-    few[::25, 0] += 0.1  # too small to be told beforehand
-    fit = fit_axis((replace(clean, positions_m=few),), 0, DRAG_LAG, 0.0)
+    outliers = clean.positions_m.copy()
+    outliers[::25, 0] += 0.1  # too small to be told beforehand
+    fit = fit_axis((replace(clean, positions_m=outliers),), 0, DRAG_LAG, 0.0)
     assert fit.value("lag_s") == pytest.approx(0.25, abs=0.1)
 
 
@@ -241,15 +241,15 @@ def asked_for(times_s: list[float], flown: list[bool]) -> SetpointHistory:
 def test_a_pause_and_a_pilot_end_a_stretch() -> None:
     ticks = [0.05 * i for i in range(600)]
     times = [t for t in ticks if not 10.0 < t < 11.0]
-    seen = make_position_history([(0.1 * i, 0.1 * i + 0.02, (0.0, 0.0, -1.0)) for i in range(300)])
-    found = find_stretches(asked_for(times, [t < 20.0 for t in times]), seen)
-    assert [(round(s.times_s[0], 3), round(s.times_s[-1], 3)) for s in found] == [(0.1, 10.0), (11.1, 19.9)]
+    positions = make_position_history([(0.1 * i, 0.1 * i + 0.02, (0.0, 0.0, -1.0)) for i in range(300)])
+    result = find_stretches(asked_for(times, [t < 20.0 for t in times]), positions)
+    assert [(round(s.times_s[0], 3), round(s.times_s[-1], 3)) for s in result] == [(0.1, 10.0), (11.1, 19.9)]
 
 
 def test_too_little_is_refused_with_what_is_missing() -> None:
-    seen = make_position_history([(0.1 * i, 0.1 * i, (0.0, 0.0, 0.0)) for i in range(30)])
+    positions = make_position_history([(0.1 * i, 0.1 * i, (0.0, 0.0, 0.0)) for i in range(30)])
     with pytest.raises(RecordingError, match=r"flown for 3\.0 s, and 30 positions .* at least 5 s"):
-        find_stretches(asked_for([0.05 * i for i in range(60)], [True] * 60), seen)
+        find_stretches(asked_for([0.05 * i for i in range(60)], [True] * 60), positions)
 
 
 def sent(lost: NDArray[np.bool_]) -> tuple[PositionHistory, NDArray[np.int64]]:
@@ -269,7 +269,7 @@ def test_independent_losses_and_delays_are_measured() -> None:
     assert link.jitter_s == pytest.approx(0.099, abs=0.004)
 
 
-def test_bursts_are_told_from_independent_losses() -> None:
+def test_bursts_are_distinguished_from_independent_losses() -> None:
     rng = np.random.default_rng(2)
     lost, bad = np.zeros(4000, dtype=bool), False
     for i in range(4000):
@@ -304,7 +304,7 @@ def test_numbers_of_messages_wrap_and_overtake() -> None:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.6])
-def test_losses_before_numbering_are_told_by_the_stamps(share: float) -> None:
+def test_losses_before_numbering_are_counted_by_the_stamps(share: float) -> None:
     rng = np.random.default_rng(5)
     senders, came = Senders(), np.flatnonzero(rng.random(2000) >= share)
     for number, frame in enumerate(came.tolist()):
@@ -316,7 +316,7 @@ def test_losses_before_numbering_are_told_by_the_stamps(share: float) -> None:
     assert shortest_s == pytest.approx(0.010, abs=0.001)
 
 
-def test_a_stamp_of_another_clock_tells_no_delay() -> None:
+def test_a_stamp_of_another_clock_gives_no_delay() -> None:
     for ahead_us in (-30_000_000, 500_000):
         senders = Senders()
         for number in range(100):
@@ -349,7 +349,7 @@ def test_the_recorded_arducopter_answers_as_its_own_log_says() -> None:
     """
     config = load_config("room-hahn-stursberg", ["daemon.mocap=tlog", "daemon.vehicle=tlog"])
     history = read_tlog_history(read_tlog(DATA / "arducopter-vicon-loop.tlog").packets, config)
-    flown = [thin_positions(one, 0.2) for one in find_stretches(history.setpoints, history.positions)]
+    flown = [thin_positions(stretch, 0.2) for stretch in find_stretches(history.setpoints, history.positions)]
     fit = fit_axis(flown, 0, DRAG_LAG, 0.0)
     assert 0.9 < fit.value("gain") < 1.2
     assert 0.16 < fit.value("lag_s") < 0.32
@@ -364,11 +364,13 @@ def test_the_recorded_arducopter_answers_as_its_own_log_says() -> None:
 
 def test_an_axis_that_was_not_steered_is_refused_by_name() -> None:
     flown = fly(0.25, 0.3, 1.0, seed=1, seconds=20.0)
-    asked = SetpointHistory(flown.input_times_s, flown.inputs_mps2, np.ones(len(flown.input_times_s), dtype=bool))
-    seen = PositionHistory(flown.times_s, np.zeros(len(flown.times_s)), flown.positions_m)
+    setpoints = SetpointHistory(flown.input_times_s, flown.inputs_mps2, np.ones(len(flown.input_times_s), dtype=bool))
+    positions = PositionHistory(flown.times_s, np.zeros(len(flown.times_s)), flown.positions_m)
     with pytest.raises(RecordingError, match="hardly changed in east"):
         identify(
-            FlightHistory(asked, seen, np.zeros(0, dtype=np.int64)), load_config("room-hahn-stursberg"), lambda: None
+            FlightHistory(setpoints, positions, np.zeros(0, dtype=np.int64)),
+            load_config("room-hahn-stursberg"),
+            lambda: None,
         )
 
 
@@ -391,15 +393,15 @@ def test_the_command_writes_a_configuration_that_loads(tmp_path: Path, capsys: p
     assert run(flying) == 0
     capsys.readouterr()
     assert run(["identify", str(tmp_path / "flight.mcap"), "--json"]) == 0
-    told = msgspec.json.decode(capsys.readouterr().out)
-    assert {"plant", "residual_std", "r2"} <= told.keys()
-    config = load_config(told["config"])
-    assert config.plant.lag_s == tuple(told["plant"]["lag_s"])
-    assert told["plant"]["dead_time_s"] <= 0.04
+    standard_errors = msgspec.json.decode(capsys.readouterr().out)
+    assert {"plant", "residual_std", "r2"} <= standard_errors.keys()
+    config = load_config(standard_errors["config"])
+    assert config.plant.lag_s == tuple(standard_errors["plant"]["lag_s"])
+    assert standard_errors["plant"]["dead_time_s"] <= 0.04
     flown = load_config("room-hahn-stursberg").plant.lag_s  # `clock.latency_s` stands for the shortest delay
-    for one, lag_s in zip(told["response"], flown, strict=True):
-        assert abs(told["plant"]["dead_time_s"] + one["lag_s"] - lag_s) < 0.06
-    page = Path(told["report"]).read_text(encoding="utf-8")
+    for standard_error, lag_s in zip(standard_errors["response"], flown, strict=True):
+        assert abs(standard_errors["plant"]["dead_time_s"] + standard_error["lag_s"] - lag_s) < 0.06
+    page = Path(standard_errors["report"]).read_text(encoding="utf-8")
     assert page.count("<svg") == 12
     assert run(["identify", str(tmp_path / "flight.mcap")]) == 0
     told_in_words = capsys.readouterr().out

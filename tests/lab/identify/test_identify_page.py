@@ -36,7 +36,7 @@ def _no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("uavctl.lab.identify.page._make_sections", lambda *_: iter(()))
 
 
-def seen() -> PositionHistory:
+def make_positions() -> PositionHistory:
     times_s = np.arange(0.0, 20.0, 0.2)
     return PositionHistory(times_s, np.zeros(len(times_s)), np.zeros((len(times_s), 3)))
 
@@ -59,7 +59,7 @@ def response(axis: str, r2: float) -> AxisResponse:
     )
 
 
-def found(*warnings: str) -> Identification:
+def make_identification(*warnings: str) -> Identification:
     """An identification whose last axis is hardly predicted."""
     result = Identified(
         flown_s=20.0,
@@ -73,7 +73,7 @@ def found(*warnings: str) -> Identification:
         link={},
         warnings=warnings,
     )
-    link = fit_link(seen(), np.ones(99, dtype=np.int64))
+    link = fit_link(make_positions(), np.ones(99, dtype=np.int64))
     return Identification(result, load_config("room-hahn-stursberg"), link, (), (), ())
 
 
@@ -81,17 +81,17 @@ def sentences(page: str) -> list[str]:
     return [unescape(text) for text in re.findall(r"<li>(.*?)</li>", page)]
 
 
-def test_what_is_predicted_of_an_axis_is_said_once() -> None:
-    said = sentences(render_identify_page(found(HARDLY), seen(), "flight"))
-    assert [sum(one.startswith(f"{axis}:") for one in said) for axis in AXES] == [1, 1, 1]
-    assert f"{HARDLY}." in said
+def test_the_prediction_of_an_axis_is_reported_once() -> None:
+    texts = sentences(render_identify_page(make_identification(HARDLY), make_positions(), "flight"))
+    assert [sum(text.startswith(f"{axis}:") for text in texts) for axis in AXES] == [1, 1, 1]
+    assert f"{HARDLY}." in texts
 
 
-def test_another_warning_takes_no_axis_its_line() -> None:
+def test_another_warning_removes_no_axis() -> None:
     uncertain = "down: the lag of 0.25 s is uncertain; fly more changes of direction"
-    said = sentences(render_identify_page(found(uncertain), seen(), "flight"))
-    assert [sum(one.startswith(f"{axis}:") and "predicted" in one for one in said) for axis in AXES] == [1, 1, 1]
-    assert said.count(f"{uncertain}.") == 1
+    texts = sentences(render_identify_page(make_identification(uncertain), make_positions(), "flight"))
+    assert [sum(text.startswith(f"{axis}:") and "predicted" in text for text in texts) for axis in AXES] == [1, 1, 1]
+    assert texts.count(f"{uncertain}.") == 1
 
 
 def test_differences_of_millimetres_leave_room_for_the_name_of_their_axis(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -104,27 +104,29 @@ def test_differences_of_millimetres_leave_room_for_the_name_of_their_axis(monkey
 
     monkeypatch.setattr(Figure, "savefig", keep)
     differences_m = np.linspace(-0.08, 0.06, 30)
-    rest = np.ones(30)
-    _draw_innovations("north", Prediction(np.arange(30.0), differences_m, 0.02 * rest, rest, rest, np.zeros(20)))
+    residuals = np.ones(30)
+    _draw_innovations(
+        "north", Prediction(np.arange(30.0), differences_m, 0.02 * residuals, residuals, residuals, np.zeros(20))
+    )
     assert left_px and left_px[0] >= 0.0
 
 
-def test_what_speaks_against_a_design_is_on_the_page_too(
+def test_the_refusal_of_a_design_is_on_the_page(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def refused(*_: object) -> None:
         raise DesignError("here", "the gain is too high", "take another")
 
-    asked = SetpointHistory(np.zeros(1), np.zeros((1, 3)), np.ones(1, dtype=bool))
-    history = FlightHistory(asked, seen(), np.zeros(0, dtype=np.int64))
-    monkeypatch.setattr(identify_cmd, "_read_history", lambda *_: (history, load_config("room-hahn-stursberg")))
-    monkeypatch.setattr(identify_cmd, "identify", lambda *_: found(HARDLY))
+    setpoints = SetpointHistory(np.zeros(1), np.zeros((1, 3)), np.ones(1, dtype=bool))
+    history = FlightHistory(setpoints, make_positions(), np.zeros(0, dtype=np.int64))
+    monkeypatch.setattr(identify_cmd, "_history", lambda *_: (history, load_config("room-hahn-stursberg")))
+    monkeypatch.setattr(identify_cmd, "identify", lambda *_: make_identification(HARDLY))
     monkeypatch.setattr(identify_cmd, "design_of", refused)
     assert identify_cmd.identify_command(tmp_path / "flight.mcap") == 0
-    said = sentences((tmp_path / "identified.html").read_text(encoding="utf-8"))
+    texts = sentences((tmp_path / "identified.html").read_text(encoding="utf-8"))
     shown = " ".join(capsys.readouterr().out.split())
     for text in (HARDLY, "the gain is too high"):
-        assert sum(text in one for one in said) == shown.count(text) == 1
+        assert sum(text in sentence for sentence in texts) == shown.count(text) == 1
 
 
 @pytest.mark.parametrize("system", [None, 1])
@@ -145,10 +147,10 @@ def test_a_second_vehicle_in_a_log_changes_nothing(tmp_path: Path, system: int |
     both = tmp_path / "both.tlog"
     both.write_bytes(b"".join(struct.pack(">Q", at_ns // 1000) + data for at_ns, data in rows))
     common = Common(config="room-px4")
-    alone, _ = identify_cmd._read_history(DATA / "px4-relay.tlog", common, None)
-    found, _ = identify_cmd._read_history(both, common, system)
-    assert len(rows) > len(packets) + 10 and len(alone.setpoints.times_s)
-    assert np.array_equal(found.setpoints.accel_mps2, alone.setpoints.accel_mps2)
-    assert np.array_equal(found.positions.times_s, alone.positions.times_s)
+    expected, _ = identify_cmd._read_history(DATA / "px4-relay.tlog", common, None)
+    make_identification, _ = identify_cmd._read_history(both, common, system)
+    assert len(rows) > len(packets) + 10 and len(expected.setpoints.times_s)
+    assert np.array_equal(make_identification.setpoints.accel_mps2, expected.setpoints.accel_mps2)
+    assert np.array_equal(make_identification.positions.times_s, expected.positions.times_s)
     with pytest.raises(UsageError):
         identify_cmd._read_history(both, common, 9)

@@ -38,33 +38,33 @@ DEPTH = Depth(
 
 
 @pytest.fixture(scope="module")
-def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+def document(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """The document of five runs."""
     out = io.StringIO()
     with redirect_stdout(out):
         folder = tmp_path_factory.mktemp("paper") / "new" / "folder"
         assert command(["paper", "--runs", "5", "--json", "--out", str(folder)]) == 0
-    told: dict[str, Any] = json.loads(out.getvalue())
-    return told
+    text: dict[str, Any] = json.loads(out.getvalue())
+    return text
 
 
 @pytest.mark.slow
-def test_the_document_has_every_figure_and_both_designs(found: dict[str, Any]) -> None:
-    assert found.keys() >= WANTED
-    assert [variant["tau"] for variant in found["variants"]] == [4, 3]
-    printed = found["variants"][0]
-    assert {key: found[key] for key in printed} == printed  # at the top: τ = 4 as printed
-    assert found["runs"] == 5 and found["steps"] == 50 and found["seed"] == 0
-    assert found["depth"] is None
-    assert all(claim.keys() == {"key", "claim", "paper", "measured", "holds"} for claim in found["claims"])
-    assert len(found["figures"]) == 3
-    for name in found["figures"]:
+def test_the_document_has_every_figure_and_both_designs(document: dict[str, Any]) -> None:
+    assert document.keys() >= WANTED
+    assert [variant["tau"] for variant in document["variants"]] == [4, 3]
+    printed = document["variants"][0]
+    assert {key: document[key] for key in printed} == printed  # at the top: τ = 4 as printed
+    assert document["runs"] == 5 and document["steps"] == 50 and document["seed"] == 0
+    assert document["depth"] is None
+    assert all(claim.keys() == {"key", "claim", "paper", "measured", "holds"} for claim in document["claims"])
+    assert len(document["figures"]) == 3
+    for name in document["figures"]:
         assert ElementTree.parse(name).getroot().tag.endswith("svg")
 
 
 @pytest.mark.slow
-def test_both_designs_meet_the_same_losses(found: dict[str, Any]) -> None:
-    four, three = found["variants"]
+def test_both_designs_meet_the_same_losses(document: dict[str, Any]) -> None:
+    four, three = document["variants"]
     assert four["age_distribution"] == three["age_distribution"]
     assert four["mean_cost"] != three["mean_cost"]
     assert four["mean_cost"] == pytest.approx(three["mean_cost"], rel=0.01)
@@ -78,17 +78,17 @@ def test_the_document_of_several_chunks_is_plain_numbers(
     assert json.loads(capsys.readouterr().out)["runs"] == 5
 
 
-def test_people_get_the_claims_and_where_the_figures_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_terminal_shows_claims_and_paths_of_the_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert command(["paper", "--runs", "2", "--steps", "12", "--tau", "3", "--out", str(tmp_path)]) == 0
     shown = capsys.readouterr().out
-    for words in ("claim", "τ = 3", "yes:", "no:", "paper-runs-tau3.svg", "paper-ages.svg", "slack variable"):
-        assert words in shown
+    for text in ("claim", "τ = 3", "yes:", "no:", "paper-runs-tau3.svg", "paper-ages.svg", "slack variable"):
+        assert text in shown
     assert "τ = 4:" not in shown
     assert sorted(path.name for path in tmp_path.iterdir()) == ["paper-ages.svg", "paper-runs-tau3.svg"]
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "text"),
     [
         (["--runs", "0"], "runs"),
         (["--runs", "-3"], "runs"),
@@ -99,15 +99,15 @@ def test_people_get_the_claims_and_where_the_figures_are(tmp_path: Path, capsys:
         (["--run", "5"], "--run"),
     ],
 )
-def test_what_cannot_be_is_refused_by_name(
-    arguments: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_invalid_options_are_refused_by_name(
+    arguments: list[str], text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert command(["paper", "--out", str(tmp_path), *arguments]) == 2
     out, err = capsys.readouterr()
-    assert told in (out + err).lower()
+    assert text in (out + err).lower()
 
 
-def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_that_cannot_be_made_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "file").write_text("")
     assert command(["paper", "--runs", "1", "--out", str(tmp_path / "file" / "below")]) == 2
     assert "--out" in capsys.readouterr().err
@@ -117,13 +117,13 @@ def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path, capsys: pytest.Cap
 def test_the_slow_part_is_in_the_document_when_asked_for(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(deep, "measure_depth", lambda seed, told: DEPTH)
+    monkeypatch.setattr(deep, "measure_depth", lambda seed, text: DEPTH)
     arguments = ["paper", "--runs", "2", "--steps", "8", "--tau", "4", "--full", "--out", str(tmp_path)]
     assert command([*arguments, "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert {claim["key"] for claim in found["claims"]} >= {"complexity", "optimum"}
-    assert found["depth"] == msgspec.to_builtins(DEPTH)
-    claims = {claim["key"]: claim for claim in found["claims"]}
+    document = json.loads(capsys.readouterr().out)
+    assert {claim["key"] for claim in document["claims"]} >= {"complexity", "optimum"}
+    assert document["depth"] == msgspec.to_builtins(DEPTH)
+    claims = {claim["key"]: claim for claim in document["claims"]}
     assert claims["complexity"]["holds"] is False  # as printed, 100 ms become 151
     assert "100 to 151 ms" in claims["complexity"]["measured"]
     assert command(arguments) == 0

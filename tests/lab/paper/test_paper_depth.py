@@ -30,9 +30,9 @@ def axis() -> Design:
 @pytest.fixture(scope="module")
 def depth() -> Depth:
     """All of it, with fewer designs, states and points."""
-    some = [one for one in deep._list_schedules() if "search" not in one[1]][:3]
+    schedules = [schedule for schedule in deep._list_schedules() if "search" not in schedule[1]][:3]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(deep, "_list_schedules", lambda: iter(some))
+        patch.setattr(deep, "_list_schedules", lambda: iter(schedules))
         for name, value in (("_TAUS", (2, 3, 4)), ("_STATES", 2), ("_RUNS", 1)):
             patch.setattr(deep, name, value)
         patch.setattr(
@@ -46,14 +46,14 @@ def depth() -> Depth:
 def test_without_limits_the_least_cost_is_the_lqg_bound(axis: Design) -> None:
     link = build_spec(load_config("paper")).link
     open_sides = Polytope(axis.input_set.c, 20 * axis.input_set.b)
-    found = compute_least_settled_cost(axis.plant, open_sides, axis.q_x, axis.q_u, 0.3, GridSize(states=25, inputs=61))
-    assert found == pytest.approx(stationary_bound(axis.plant, axis.q_x, axis.q_u, link), rel=2e-3)
+    cost = compute_least_settled_cost(axis.plant, open_sides, axis.q_x, axis.q_u, 0.3, GridSize(states=25, inputs=61))
+    assert cost == pytest.approx(stationary_bound(axis.plant, axis.q_x, axis.q_u, link), rel=2e-3)
 
 
 @pytest.mark.slow
 def test_limits_cost_and_clipped_lqg_is_not_below_the_least(axis: Design) -> None:
-    least = compute_least_settled_cost(axis.plant, axis.input_set, axis.q_x, axis.q_u, 0.3, COARSE)
-    assert least == pytest.approx(11.95, abs=0.05)
+    least_cost = compute_least_settled_cost(axis.plant, axis.input_set, axis.q_x, axis.q_u, 0.3, COARSE)
+    assert least_cost == pytest.approx(11.95, abs=0.05)
     # LQG with its input clipped, simulated by itself: an upper bound of the least.
     rng, k = np.random.default_rng(0), lqr(axis.plant, axis.q_x, axis.q_u).k
     a, b, e = axis.plant.a, axis.plant.b, axis.plant.e
@@ -68,19 +68,19 @@ def test_limits_cost_and_clipped_lqg_is_not_below_the_least(axis: Design) -> Non
         known = known @ a.T + u @ b.T
     by_run = np.mean(costs, axis=0)
     error = by_run.std() / np.sqrt(4000)
-    assert least < by_run.mean() + 3 * error
-    assert by_run.mean() < 1.02 * least + 3 * error  # and it is nearly the least
+    assert least_cost < by_run.mean() + 3 * error
+    assert by_run.mean() < 1.02 * least_cost + 3 * error  # and it is nearly the least
 
 
-def test_a_plant_of_several_axes_has_to_be_taken_apart(axis: Design) -> None:
+def test_a_plant_of_several_axes_is_refused(axis: Design) -> None:
     design = build_design(load_config("paper"))
     with pytest.raises(UavctlError, match="one axis"):
         compute_least_settled_cost(design.plant, design.input_set, design.q_x, design.q_u, 0.3, COARSE)
 
 
 @pytest.mark.slow
-def test_designs_that_were_tried_are_told_with_the_reason(depth: Depth) -> None:
-    tried = {one.schedule: one for one in depth.designs if one.tau == 3}
+def test_tried_designs_are_listed_with_the_reason(depth: Depth) -> None:
+    tried = {design.schedule: design for design in depth.designs if design.tau == 3}
     assert "0.9370" in tried["d_t = 4"].refused and tried["d_t = 4"].delays is None
     assert "slower than the terminal law" in tried["d_t = 5"].refused
     joint = tried["d_t = 4, joint"]
@@ -91,13 +91,13 @@ def test_designs_that_were_tried_are_told_with_the_reason(depth: Depth) -> None:
 
 @pytest.mark.slow
 def test_complexity_is_measured_where_there_is_a_design(depth: Depth) -> None:
-    assert [(one.tau, one.horizon) for one in depth.complexity] == [(2, 12), (3, 12), (4, 12), (2, 10), (3, 11)]
-    for one in depth.complexity:
-        assert one.lifted == 2 * (one.tau + 1)
-        times = (one.exact_ms, one.printed_ms)
-        if one.tau == 2:
-            assert "out of reach" in one.refused and times == (None, None)
+    assert [(entry.tau, entry.horizon) for entry in depth.complexity] == [(2, 12), (3, 12), (4, 12), (2, 10), (3, 11)]
+    for entry in depth.complexity:
+        assert entry.lifted == 2 * (entry.tau + 1)
+        times = (entry.exact_ms, entry.printed_ms)
+        if entry.tau == 2:
+            assert "out of reach" in entry.refused and times == (None, None)
         else:
-            assert one.refused == "" and all(time is not None and time > 0.0 for time in times)
-    gains = {(one.tau, one.horizon): one.gains for one in depth.complexity}
+            assert entry.refused == "" and all(time is not None and time > 0.0 for time in times)
+    gains = {(entry.tau, entry.horizon): entry.gains for entry in depth.complexity}
     assert gains[3, 12] == 36 and gains[4, 12] == 28 and gains[3, 11] == 28

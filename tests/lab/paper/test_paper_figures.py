@@ -28,18 +28,18 @@ def design() -> Design:
 
 def drawn(root: ElementTree.Element, name: str) -> ElementTree.Element:
     """What was drawn under a name, which the picture's own is before."""
-    (found,) = (one for one in root.iter() if (one.get("id") or "").endswith(f"-{name}"))
-    return found
+    (elements,) = (element for element in root.iter() if (element.get("id") or "").endswith(f"-{name}"))
+    return elements
 
 
 def courses(root: ElementTree.Element, name: str) -> list[Array]:
     """The lines that were drawn under a name, as places (n, 2); those in the file are steps from the last place."""
-    found = []
+    elements = []
     for path in drawn(root, name).iter(f"{SVG}path"):
         for part in path.get("d", "").split("m"):
             if numbers := re.findall(r"-?(?:\d+\.?\d*|\.\d+)", part):
-                found.append(np.array(numbers, dtype=np.float64).reshape(-1, 2))
-    return found
+                elements.append(np.array(numbers, dtype=np.float64).reshape(-1, 2))
+    return elements
 
 
 def size(root: ElementTree.Element, name: str) -> Array:
@@ -54,8 +54,8 @@ def states(runs: int) -> Array:
     return walk
 
 
-def words(root: ElementTree.Element) -> set[str]:
-    return {"".join(one.itertext()).strip() for one in root.iter(f"{SVG}text")}
+def collect_texts(root: ElementTree.Element) -> set[str]:
+    return {"".join(element.itertext()).strip() for element in root.iter(f"{SVG}text")}
 
 
 @pytest.mark.slow
@@ -66,9 +66,9 @@ def test_trajectories_show_box_ellipsoid_start_and_every_run(design: Design, run
     assert f"{runs} runs" in (root.findtext(f"{SVG}title") or "")
     for plane in PLANES:
         assert len(courses(root, f"runs-{plane}")) == runs
-        for what in ("box", "set", "start"):
-            drawn(root, f"{what}-{plane}")
-    assert {"p_x", "v_x", "p_y", "v_y", "admissible states", "initial state", f"{runs} runs"} <= words(root)
+        for part in ("box", "set", "start"):
+            drawn(root, f"{part}-{plane}")
+    assert {"p_x", "v_x", "p_y", "v_y", "admissible states", "initial state", f"{runs} runs"} <= collect_texts(root)
 
 
 def test_box_start_and_ellipse_are_to_scale(design: Design) -> None:
@@ -87,10 +87,10 @@ def test_box_start_and_ellipse_are_to_scale(design: Design) -> None:
 
 
 def test_the_largest_picture_stays_small_and_is_always_the_same(design: Design) -> None:
-    many = states(200)
-    svg = draw_trajectories_svg(many, design)
+    trajectories = states(200)
+    svg = draw_trajectories_svg(trajectories, design)
     assert len(svg.encode()) < 1_000_000
-    assert svg == draw_trajectories_svg(many, design)
+    assert svg == draw_trajectories_svg(trajectories, design)
 
 
 def test_ages_are_stacked_to_all_runs_in_each_step() -> None:
@@ -109,13 +109,13 @@ def test_ages_are_stacked_to_all_runs_in_each_step() -> None:
         edges = [a[1] for a, b in pairwise(outline) if a[1] == b[1] and min(a[0], b[0]) < middle < max(a[0], b[0])]
         return float(np.ptp(edges)) / high
 
-    assert [height(one) for one in outlines[:5]] == pytest.approx([0.6, 0.2, 0.1, 0.04, 0.03], abs=2e-3)
+    assert [height(part) for part in outlines[:5]] == pytest.approx([0.6, 0.2, 0.1, 0.04, 0.03], abs=2e-3)
     assert len(drawn(root, "measured").findall(f".//{SVG}use")) == 8  # ages 0 … 7
-    assert {"age a(k)", "5 or more", "measured", "Markov chain (4)"} <= words(root)
+    assert {"age a(k)", "5 or more", "measured", "Markov chain (4)"} <= collect_texts(root)
 
 
 def test_ages_without_loss_and_of_few_steps_are_drawn() -> None:
     ages = np.zeros((4, 4), dtype=np.intp)
     ages[:, 0] = 5
     root = ElementTree.fromstring(draw_ages_svg(ages, AgeReference(tau=4, horizon=12, loss=0.0)))
-    assert sum("-age-" in (one.get("id") or "") for one in root.iter()) == 4
+    assert sum("-age-" in (element.get("id") or "") for element in root.iter()) == 4

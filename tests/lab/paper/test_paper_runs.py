@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from uavctl.arrays import Array
 from uavctl.build.controller import build_design, build_plant, start_state
 from uavctl.config import load_config
-from uavctl.lab.campaign.world import LinearWorld, Trajectories, compute_newest_captures, draw, simulate
+from uavctl.lab.campaign.arrivals import compute_newest_captures
+from uavctl.lab.campaign.draws import draw
+from uavctl.lab.campaign.world import LinearWorld, Trajectories, simulate
 from uavctl.lab.paper import runs as run
 from uavctl.lab.paper.claims import (
     PRINTED,
@@ -90,17 +92,17 @@ def test_figures_are_those_of_the_runs(result: VariantResult, directly: tuple[Tr
 
 def test_chunks_change_nothing(setup: Setup, result: VariantResult, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run, "CHUNK", 7)
-    told: list[int] = []
-    (flights,) = fly_all([setup], RUNS, STEPS, SEED, 1, told.append)
-    again = assess(setup, PRINTED.note, flights, SEED)
-    assert told == [7, 7, 6]
+    progress: list[int] = []
+    (flights,) = fly_all([setup], RUNS, STEPS, SEED, 1, progress.append)
+    repeated = assess(setup, PRINTED.note, flights, SEED)
+    assert progress == [7, 7, 6]
     assert flights.drawn.shape == (RUNS, STEPS + 1, 4)
     for name in ("decisions", "state_violations", "max_age", "age_distribution", "aged_share", "runs_outside"):
-        assert getattr(again, name) == getattr(result, name)
-    assert again.closest == pytest.approx(result.closest, abs=1e-9)
-    assert again.neighbourhood.area_ratio == pytest.approx(result.neighbourhood.area_ratio, rel=1e-9)
-    assert again.mean_cost == pytest.approx(result.mean_cost, rel=1e-12)
-    assert again.cost_stderr == pytest.approx(result.cost_stderr, rel=1e-9)
+        assert getattr(repeated, name) == getattr(result, name)
+    assert repeated.closest == pytest.approx(result.closest, abs=1e-9)
+    assert repeated.neighbourhood.area_ratio == pytest.approx(result.neighbourhood.area_ratio, rel=1e-9)
+    assert repeated.mean_cost == pytest.approx(result.mean_cost, rel=1e-12)
+    assert repeated.cost_stderr == pytest.approx(result.cost_stderr, rel=1e-9)
 
 
 @pytest.mark.slow
@@ -119,8 +121,8 @@ def test_workers_change_nothing(setup: Setup, result: VariantResult, monkeypatch
 
 def test_longer_campaigns_begin_with_the_same_runs(setup: Setup) -> None:
     pilot = ChunkRunner(setup)
-    few, more = pilot.fly(SEED, 0, 3, STEPS), pilot.fly(SEED, 2, 4, STEPS)
-    assert few.trajectories.states[2] == pytest.approx(more.trajectories.states[0], abs=1e-9)
+    first_runs, more = pilot.fly(SEED, 0, 3, STEPS), pilot.fly(SEED, 2, 4, STEPS)
+    assert first_runs.trajectories.states[2] == pytest.approx(more.trajectories.states[0], abs=1e-9)
 
 
 def test_the_start_is_the_printed_one(setup: Setup) -> None:
@@ -130,10 +132,10 @@ def test_the_start_is_the_printed_one(setup: Setup) -> None:
 def test_moments_of_parts_are_those_of_all() -> None:
     values = np.random.default_rng(0).normal(5e4, 3.0, 1000)
     parts = [Moments.compute(part) for part in np.split(values, [1, 10, 400])]
-    found = parts[0] + parts[1] + parts[2] + parts[3]
-    assert found.count == 1000
-    assert found.mean == pytest.approx(values.mean(), rel=1e-14)
-    assert found.stderr == pytest.approx(values.std(ddof=1) / np.sqrt(1000), rel=1e-9)
+    total = parts[0] + parts[1] + parts[2] + parts[3]
+    assert total.count == 1000
+    assert total.mean == pytest.approx(values.mean(), rel=1e-14)
+    assert total.stderr == pytest.approx(values.std(ddof=1) / np.sqrt(1000), rel=1e-9)
     assert Moments.compute(values[:1]).stderr == np.inf
 
 
@@ -142,7 +144,7 @@ def test_the_ellipsoid_holds_its_share_of_what_it_is_made_for(setup: Setup) -> N
     assert is_in_ellipsoid(draws, setup.design).mean() == pytest.approx(0.95, abs=0.004)  # 3.7 standard errors
 
 
-def made(states: Array, ages: NDArray[np.intp]) -> Chunk:
+def make_chunk(states: Array, ages: NDArray[np.intp]) -> Chunk:
     """Runs along given states."""
     runs, steps = ages.shape
     flat, flags = np.zeros((runs, steps, 2)), np.zeros((runs, steps), dtype=bool)
@@ -156,16 +158,16 @@ def made(states: Array, ages: NDArray[np.intp]) -> Chunk:
 def test_totals_of_made_up_runs(setup: Setup) -> None:
     states = np.full((2, 5, 4), 100.0)
     states[0, 2:] = 0.0  # the first run arrives in step 2, the second never
-    found = add_totals([compute_totals(made(states, np.array([[0, 1, 0, 1], [0, 1, 2, 3]])), setup.design)] * 2)
-    assert found.arrived.tolist() == [0, 0, 2, 0, 0, 2]
-    assert (found.ended_inside, found.settled_inside, found.settled) == (2, 6, 12)
-    assert found.outside.tolist() == [0, 2, 2, 2]
-    assert (found.runs_outside, found.runs_asking, found.decisions, found.slack_used, found.missed) == (2, 2, 6, 2, 4)
-    assert found.ages[3].tolist() == [0, 2, 0, 2]
-    assert compute_age_distribution(found) == [0.375, 0.375, 0.125, 0.125]
+    total = add_totals([compute_totals(make_chunk(states, np.array([[0, 1, 0, 1], [0, 1, 2, 3]])), setup.design)] * 2)
+    assert total.arrived.tolist() == [0, 0, 2, 0, 0, 2]
+    assert (total.ended_inside, total.settled_inside, total.settled) == (2, 6, 12)
+    assert total.outside.tolist() == [0, 2, 2, 2]
+    assert (total.runs_outside, total.runs_asking, total.decisions, total.slack_used, total.missed) == (2, 2, 6, 2, 4)
+    assert total.ages[3].tolist() == [0, 2, 0, 2]
+    assert compute_age_distribution(total) == [0.375, 0.375, 0.125, 0.125]
     # Beyond the upper limits by 100 - limit; from the lower ones, the nearest was the origin.
-    assert found.closest.tolist() == [50.0, -30.0, 93.0, -8.0, 80.0, -25.0, 92.0, -8.0]
-    assert found.largest_gap == 0.5
+    assert total.closest.tolist() == [50.0, -30.0, 93.0, -8.0, 80.0, -25.0, 92.0, -8.0]
+    assert total.largest_gap == 0.5
 
 
 def test_plans_that_end_elsewhere_are_counted(setup: Setup) -> None:
@@ -190,13 +192,13 @@ def test_plans_that_end_elsewhere_are_counted(setup: Setup) -> None:
 
 
 def by_key(claims: list[Claim]) -> dict[str, Claim]:
-    return {one.key: one for one in claims}
+    return {claim.key: claim for claim in claims}
 
 
 def test_claims_hold_or_not_by_what_was_measured(result: VariantResult) -> None:
     def holds(**changes: object) -> dict[str, bool | None]:
         claims = make_claims(replace(result, **changes), 0.3, 12, 0.95, 0.9)
-        return {key: one.holds for key, one in by_key(claims).items()}
+        return {key: claim.holds for key, claim in by_key(claims).items()}
 
     as_flown = holds()
     assert as_flown["slack"] and as_flown["box"] and as_flown["neighbourhood"] and as_flown["worst-case"]

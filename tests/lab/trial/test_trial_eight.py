@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from uavctl.lab.trial import (
+from uavctl.lab.figure_eight import (
     CENTRE_M,
     HALF_M,
     MAX_MPS,
@@ -13,9 +13,9 @@ from uavctl.lab.trial import (
     ROUNDS,
     WIDTH_M,
     make_figure_eight,
-    make_path,
     sample_figure_eight,
 )
+from uavctl.lab.trial import make_path
 
 
 def test_its_mean_and_largest_speeds_are_those_of_the_paper() -> None:
@@ -44,8 +44,8 @@ def test_its_velocities_are_the_differences_of_its_positions() -> None:
 def test_what_is_sampled_is_the_motion_and_rests_outside_of_its_time() -> None:
     at, (times, positions, velocities) = make_path(make_figure_eight()), sample_figure_eight(0.013)
     for time, place, speed in zip(times[1:-1:7], positions[1:-1:7], velocities[1:-1:7], strict=True):
-        found = at(float(time))
-        assert found[0] == pytest.approx(place, abs=1e-3) and found[1] == pytest.approx(speed, abs=0.02)
+        point = at(float(time))
+        assert point[0] == pytest.approx(place, abs=1e-3) and point[1] == pytest.approx(speed, abs=0.02)
     for time in (-1.0, float(times[-1]) + 1.0):
-        place, *still = at(time)
-        assert place == pytest.approx(CENTRE_M) and still == [(0.0, 0.0, 0.0)] * 2
+        place, *derivatives = at(time)
+        assert place == pytest.approx(CENTRE_M) and derivatives == [(0.0, 0.0, 0.0)] * 2

@@ -15,6 +15,7 @@ sys.path.insert(0, str(ROOT / "tools"))
 
 import trials
 
+from uavctl.lab.figure_eight import make_figure_eight
 from uavctl.lab.position_loop import PositionLoopTuning
 from uavctl.lab.trial import (
     AUTOPILOTS,
@@ -27,7 +28,6 @@ from uavctl.lab.trial import (
     get_flight_length_s,
     get_room_limits,
     make_design_config,
-    make_figure_eight,
     make_flight_config,
 )
 from uavctl.records import ControlMode, Decision, Plan, Setpoint, SetpointSource, SolveStatus
@@ -109,16 +109,16 @@ def test_the_room_is_that_of_the_state_limits_in_any_order_of_axes() -> None:
     assert lower.tolist() == [-3.0, -2.5, -2.5] and upper.tolist() == [3.0, 2.5, 0.0]
 
 
-def test_who_knows_the_link_is_made_for_it_and_others_for_that_of_their_configuration() -> None:
+def test_a_controller_is_designed_for_the_flown_link_or_for_that_of_its_configuration() -> None:
     assert make_design_config(replace(OURS, link=LOSES)).link.loss == 0.6
     unknowing = replace(OURS, pilot=replace(OURS.pilot, knows_link=False), link=LOSES)
     assert make_design_config(unknowing).link.loss == 0.3
 
 
-def test_all_who_fly_meet_the_same_air_cameras_and_link() -> None:
-    mine, theirs = (make_flight_config(replace(cell, scenario="blackout"), 5, 9.0) for cell in (OURS, OWN))
-    assert (mine.sim, mine.link) == (theirs.sim, theirs.link)
-    ((begin, end),) = mine.link.blackout
+def test_all_pilots_have_the_same_air_cameras_and_link() -> None:
+    our_config, other_config = (make_flight_config(replace(cell, scenario="blackout"), 5, 9.0) for cell in (OURS, OWN))
+    assert (our_config.sim, our_config.link) == (other_config.sim, other_config.link)
+    ((begin, end),) = our_config.link.blackout
     assert (begin, round(end - begin, 9)) == (draw_blackout_begin_s(5), 4.0)
     moments = np.array([draw_blackout_begin_s(seed) for seed in range(200)])
     assert moments.min() >= 1.0 and moments.max() <= 6.0 and np.unique(moments).size > 190
@@ -127,59 +127,59 @@ def test_all_who_fly_meet_the_same_air_cameras_and_link() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("cell", [OURS, OWN])
 def test_a_flight_is_judged_by_the_truth(cell: TrialCell) -> None:
-    found = fly_trial(cell, 2, seconds=14.0, from_s=10.0)
-    assert 0.0 < found.hold_rms_m <= found.hold_max_m < 0.5
-    assert 1.0 < found.near_s <= found.nearer_s
-    assert -2.5 < found.beyond_m < 0.0
-    assert found.positions == pytest.approx(0.7 * 20.0 * 14.0, rel=0.15)
-    assert found.mode == "GUIDED" and math.isnan(found.tracking_m)
-    assert math.isnan(found.limited) is (cell is OWN)
-    assert fly_trial(cell, 2, seconds=14.0, from_s=10.0) == found or cell is OWN  # NaN is not itself
+    result = fly_trial(cell, 2, seconds=14.0, from_s=10.0)
+    assert 0.0 < result.hold_rms_m <= result.hold_max_m < 0.5
+    assert 1.0 < result.near_s <= result.nearer_s
+    assert -2.5 < result.beyond_m < 0.0
+    assert result.positions == pytest.approx(0.7 * 20.0 * 14.0, rel=0.15)
+    assert result.mode == "GUIDED" and math.isnan(result.tracking_m)
+    assert math.isnan(result.limited) is (cell is OWN)
+    assert fly_trial(cell, 2, seconds=14.0, from_s=10.0) == result or cell is OWN  # NaN is not itself
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("autopilot", AUTOPILOTS)
-def test_who_has_arrived_hangs_still_in_calm_air(autopilot: AutopilotName) -> None:
+def test_a_held_position_is_steady_in_calm_air(autopilot: AutopilotName) -> None:
     """The recorded ArduCopter held 3 to 5 mm; the simulated one swung by 50 to 180 mm after the same way."""
-    ours = TrialPilot("ours", config=f"room-{autopilot}")
-    found = fly_trial(
-        TrialCell(ours, "hold", autopilot, 20.0, "30 %", ("link.loss=0.3",), "calm"), 0, seconds=20.0, from_s=12.0
+    pilot = TrialPilot("ours", config=f"room-{autopilot}")
+    result = fly_trial(
+        TrialCell(pilot, "hold", autopilot, 20.0, "30 %", ("link.loss=0.3",), "calm"), 0, seconds=20.0, from_s=12.0
     )
-    assert found.nearer_s < 12.0
-    assert found.hold_rms_m < 0.03
-    assert found.fallback == 0.0
+    assert result.nearer_s < 12.0
+    assert result.hold_rms_m < 0.03
+    assert result.fallback == 0.0
 
 
 @pytest.mark.slow
 def test_an_eight_is_tracked_along_its_own_time() -> None:
-    found = fly_trial(replace(OWN, scenario="eight", air="calm"), 0, seconds=1.0, from_s=0.0)
-    assert 0.0 < found.tracking_m < found.tracking_max_m < 0.6
-    assert math.isnan(found.hold_rms_m)
+    result = fly_trial(replace(OWN, scenario="eight", air="calm"), 0, seconds=1.0, from_s=0.0)
+    assert 0.0 < result.tracking_m < result.tracking_max_m < 0.6
+    assert math.isnan(result.hold_rms_m)
     assert get_flight_length_s("eight", 1.0) > make_figure_eight().times_s[-1]
 
 
 @pytest.mark.slow
-def test_the_tool_tells_every_flight_as_json(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_tool_writes_every_flight_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     arguments = "--pilots own own-tuned --autopilots px4 --seeds 2 --rates 10 --losses 0.3 --seconds 6 --from 4 --json"
     assert trials.main(arguments.split()) == 0
     cells = json.loads(capsys.readouterr().out)["cells"]
     assert [cell["pilot"]["name"] for cell in cells] == ["own", "own-tuned"]
     for cell in cells:
-        assert [one["seed"] for one in cell["flights"]] == [0, 1]
-        worst = max(one["hold_rms_m"] for one in cell["flights"])
+        assert [flight["seed"] for flight in cell["flights"]] == [0, 1]
+        worst = max(flight["hold_rms_m"] for flight in cell["flights"])
         assert cell["worst"]["hold_rms_m"] == worst >= cell["median"]["hold_rms_m"]
         assert cell["flights"][0]["limited"] is None
 
 
-def test_the_tool_says_why_nobody_flies(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_tool_reports_why_no_controller_flies(capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["--pilots", "--variant", "long", "smpc.scheme=age-conditioned", "smpc.horizon=4"]
     assert trials.main([*arguments, "--autopilots", "px4", "--rates", "5", "--losses", "0.6", "--seeds", "1"]) == 1
     assert "refused" in capsys.readouterr().out
 
 
-def test_variants_and_configurations_are_pilots_of_their_own() -> None:
+def test_variants_and_configurations_are_separate_pilots() -> None:
     arguments = ["--config", "room", "paper", "--pilots", "configured", "own", "--set", "cost.input=[1]"]
-    given = trials._parser().parse_args([*arguments, "--variant", "deep", "smpc.horizon=16"])
-    named = {one.name: one for one in trials.pilots(given, AUTOPILOTS[0])}
+    parsed = trials._parser().parse_args([*arguments, "--variant", "deep", "smpc.horizon=16"])
+    named = {pilot.name: pilot for pilot in trials.pilots(parsed, AUTOPILOTS[0])}
     assert list(named) == ["room", "room: deep", "paper", "paper: deep", "own"]
     assert named["room: deep"].overrides == ("cost.input=[1]", "smpc.horizon=16")

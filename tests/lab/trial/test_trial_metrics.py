@@ -31,9 +31,9 @@ def test_on_a_circle_about_the_target_every_distance_is_its_radius() -> None:
 
 
 def test_a_sine_has_its_amplitude_by_root_two_as_rms_and_two_by_pi_of_it_as_mean() -> None:
-    whole = np.linspace(0.0, 2.0 * math.pi, 100_001)[:-1]
-    wave = np.zeros((whole.size, 3))
-    wave[:, 2] = 0.5 * np.sin(whole)
+    angles = np.linspace(0.0, 2.0 * math.pi, 100_001)[:-1]
+    wave = np.zeros((angles.size, 3))
+    wave[:, 2] = 0.5 * np.sin(angles)
     off = compute_distances_m(wave, np.zeros(3))
     assert compute_rms_m(off) == pytest.approx(0.5 / math.sqrt(2.0), rel=1e-6)
     assert compute_mean(off) == pytest.approx(0.5 * 2.0 / math.pi, rel=1e-6)
@@ -50,7 +50,7 @@ def test_an_exponential_settles_at_its_logarithm() -> None:
         assert compute_settling_time_s(TIMES, off, radius_m) == pytest.approx(1.5 * math.log(3.0 / radius_m), abs=0.011)
 
 
-def test_settled_is_to_stay() -> None:
+def test_the_settling_time_ignores_a_passage() -> None:
     off = np.zeros(10)
     off[[0, 1, 6]] = 1.0
     times = np.arange(10.0)
@@ -62,9 +62,9 @@ def test_settled_is_to_stay() -> None:
 
 def test_beyond_is_of_the_nearest_wall_and_negative_inside() -> None:
     lower, upper = np.array([-3.0, -np.inf, -2.5]), np.array([3.0, np.inf, 0.0])
-    where = np.array([[0.0, 1e3, -1.2], [2.9, 0.0, -1.2], [3.4, 0.0, -1.2], [0.0, 0.0, -2.7]])
-    assert compute_excess_m(where, lower, upper) == pytest.approx([-1.2, -0.1, 0.4, 0.2])
+    positions_m = np.array([[0.0, 1e3, -1.2], [2.9, 0.0, -1.2], [3.4, 0.0, -1.2], [0.0, 0.0, -2.7]])
+    assert compute_excess_m(positions_m, lower, upper) == pytest.approx([-1.2, -0.1, 0.4, 0.2])
 
 
-def test_of_nothing_there_is_no_figure() -> None:
+def test_figures_of_no_values_are_nan() -> None:
     assert all(math.isnan(figure(np.empty(0))) for figure in (compute_rms_m, compute_max, compute_mean))

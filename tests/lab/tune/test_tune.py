@@ -48,7 +48,7 @@ def test_any_two_opposite_corners_make_the_box() -> None:
 
 
 @pytest.mark.parametrize("text", ["1,2,3", "a,b,c,d,e,f", "1,2,3,4,5,nan", ""])
-def test_what_is_no_box_is_refused(text: str) -> None:
+def test_an_invalid_box_is_refused(text: str) -> None:
     with pytest.raises(UsageError, match="--box"):
         parse_box(text)
 
@@ -56,15 +56,15 @@ def test_what_is_no_box_is_refused(text: str) -> None:
 @pytest.mark.parametrize("preset", ["room", "room-px4", "room-ardupilot"])
 def test_each_axis_is_stepped_by_itself_well_inside_the_box(preset: str) -> None:
     config = load_config(preset, ("sim.plant=quadrotor",))
-    made = add_excitation(config, design_of(config), BOX, lands=False)
-    points = np.array(made.mission.waypoints)
+    tuned = add_excitation(config, design_of(config), BOX, lands=False)
+    points = np.array(tuned.mission.waypoints)
     assert np.all(points > np.array(BOX.lower) + 0.1) and np.all(points < np.array(BOX.upper) - 0.1)
     steps = np.abs(np.diff(points, axis=0))
     for axis, least_m in enumerate(MIN_STEP_M):
-        alone = (steps[:, axis] >= least_m) & (np.delete(steps, axis, axis=1).max(axis=1) == 0.0)
-        assert np.count_nonzero(alone) >= 3
+        is_single_axis = (steps[:, axis] >= least_m) & (np.delete(steps, axis, axis=1).max(axis=1) == 0.0)
+        assert np.count_nonzero(is_single_axis) >= 3
     assert tuple(points[-1]) == BOX.centre
-    assert {(one.state, one.side): one.values[0] for one in made.fence} == {
+    assert {(fence.state, fence.side): fence.values[0] for fence in tuned.fence} == {
         (name, side): values[axis]
         for axis, name in enumerate(("north", "east", "down"))
         for side, values in (("lower", BOX.lower), ("upper", BOX.upper))
@@ -89,9 +89,9 @@ def test_a_box_that_is_too_small_says_how_large_it_must_be() -> None:
     design = design_of(config)
     with pytest.raises(UsageError) as refused:
         add_excitation(config, design, parse_box("-0.2,-1,-2,0.2,1,-0.4"), lands=False)
-    found = re.search(r"north: .* at least ([\d.]+) m", str(refused.value))
-    assert found is not None
-    half = float(found[1]) / 2.0
+    identification = re.search(r"north: .* at least ([\d.]+) m", str(refused.value))
+    assert identification is not None
+    half = float(identification[1]) / 2.0
     add_excitation(config, design, parse_box(f"{-half},-1,-2,{half},1,-0.4"), lands=False)
     with pytest.raises(UsageError):
         add_excitation(config, design, parse_box(f"{-half + 0.02},-1,-2,{half - 0.02},1,-0.4"), lands=False)
@@ -120,9 +120,9 @@ def test_a_pinned_axis_moves_as_its_model_with_these_values() -> None:
         "drift_mps2_rts": 0.02,
     }
     pinned = PinnedAxisModel(model, {"lag_s": 0.2, "gain": 0.9, "unknown": 1.0})
-    whole, fitted = make_parameters(model, values)[None], make_parameters(pinned, values)[None]
-    assert fitted.shape[1] == whole.shape[1] - 2
-    for one, other in zip(model.motion(whole), pinned.motion(fitted), strict=True):
+    all_parameters, fitted = make_parameters(model, values)[None], make_parameters(pinned, values)[None]
+    assert fitted.shape[1] == all_parameters.shape[1] - 2
+    for one, other in zip(model.motion(all_parameters), pinned.motion(fitted), strict=True):
         assert one == pytest.approx(other)
 
 
@@ -136,28 +136,30 @@ def flight() -> tuple[Config, FlightData, Identification]:
     )
     memory = lockstep("room", 30.0, *overrides)
     config = load_config("room", overrides)
-    found = identify(read_recorded_history(memory.entries), config, lambda: None)
-    return config, FlightData.from_records(memory.entries), found
+    identification = identify(read_recorded_history(memory.entries), config, lambda: None)
+    return config, FlightData.from_records(memory.entries), identification
 
 
-def rows(told: TunedResult, key: str) -> list[Change]:
-    return [one for one in told.changes if one.key == key]
+def rows(tuned_result: TunedResult, key: str) -> list[Change]:
+    return [change for change in tuned_result.changes if change.key == key]
 
 
 @pytest.mark.slow
-def test_a_flight_changes_what_it_tells_and_predicts_better(flight: tuple[Config, FlightData, Identification]) -> None:
-    config, _, found = flight
-    made = tune_config(config, found)
-    told = made.result
-    assert told.new_errors.overall_m < 0.6 * told.old_errors.overall_m
-    for row in rows(told, "plant.lag_s")[:2] + rows(told, "plant.drag_1ps"):
+def test_a_flight_changes_the_values_that_it_determines_and_predicts_better(
+    flight: tuple[Config, FlightData, Identification],
+) -> None:
+    config, _, identification = flight
+    tuned = tune_config(config, identification)
+    tuned_result = tuned.result
+    assert tuned_result.new_errors.overall_m < 0.6 * tuned_result.old_errors.overall_m
+    for row in rows(tuned_result, "plant.lag_s")[:2] + rows(tuned_result, "plant.drag_1ps"):
         assert row.is_changed and row.new == row.flight
-    assert made.config.plant.drag_1ps == tuple(one.new for one in rows(told, "plant.drag_1ps"))
-    assert made.config.plant.drag_1ps[0] == pytest.approx(0.25, abs=0.05)
+    assert tuned.config.plant.drag_1ps == tuple(change.new for change in rows(tuned_result, "plant.drag_1ps"))
+    assert tuned.config.plant.drag_1ps[0] == pytest.approx(0.25, abs=0.05)
     # A calm half minute lowers no noise, and a link that was as believed stays so.
-    assert made.config.plant.wind_std_mps2 == config.plant.wind_std_mps2
-    assert made.config.link == config.link
-    assert msgspec.structs.replace(made.config, name="", plant=config.plant, cost=config.cost) == (
+    assert tuned.config.plant.wind_std_mps2 == config.plant.wind_std_mps2
+    assert tuned.config.link == config.link
+    assert msgspec.structs.replace(tuned.config, name="", plant=config.plant, cost=config.cost) == (
         msgspec.structs.replace(config, name="")
     )
 
@@ -166,30 +168,32 @@ def test_a_flight_changes_what_it_tells_and_predicts_better(flight: tuple[Config
 def test_an_axis_that_is_not_predicted_is_kept_with_the_reason(
     flight: tuple[Config, FlightData, Identification],
 ) -> None:
-    config, _, found = flight
-    north, *others = found.result.response
-    doubtful = (msgspec.structs.replace(north, r2=0.3), *others)
-    result = msgspec.structs.replace(found.result, response=doubtful)
-    made = tune_config(config, dataclasses.replace(found, result=result))
+    config, _, identification = flight
+    north, *other_axes = identification.result.response
+    doubtful = (msgspec.structs.replace(north, r2=0.3), *other_axes)
+    result = msgspec.structs.replace(identification.result, response=doubtful)
+    tuned = tune_config(config, dataclasses.replace(identification, result=result))
     for key in ("plant.lag_s", "plant.drag_1ps", "plant.gain"):
-        row = rows(made.result, key)[0]
+        row = rows(tuned.result, key)[0]
         assert not row.is_changed and "30 %" in row.reason
-        assert rows(made.result, key)[1].reason != row.reason
+        assert rows(tuned.result, key)[1].reason != row.reason
 
 
 @pytest.mark.slow
-def test_a_dead_time_that_is_not_told_is_kept(flight: tuple[Config, FlightData, Identification]) -> None:
-    config, _, found = flight
-    flat = msgspec.structs.replace(found.result.candidates[0], dead_time_range_s=(0.02, 0.021 + MAX_DEAD_TIME_RANGE_S))
-    result = msgspec.structs.replace(found.result, candidates=(flat,))
-    made = tune_config(config, dataclasses.replace(found, result=result))
-    assert made.config.plant.dead_time_s == config.plant.dead_time_s
-    assert made.config.plant.drag_1ps != config.plant.drag_1ps
+def test_an_undetermined_dead_time_is_kept(flight: tuple[Config, FlightData, Identification]) -> None:
+    config, _, identification = flight
+    flat = msgspec.structs.replace(
+        identification.result.candidates[0], dead_time_range_s=(0.02, 0.021 + MAX_DEAD_TIME_RANGE_S)
+    )
+    result = msgspec.structs.replace(identification.result, candidates=(flat,))
+    tuned = tune_config(config, dataclasses.replace(identification, result=result))
+    assert tuned.config.plant.dead_time_s == config.plant.dead_time_s
+    assert tuned.config.plant.drag_1ps != config.plant.drag_1ps
 
 
 @pytest.mark.slow
 def test_noise_and_losses_that_were_worse_are_raised(flight: tuple[Config, FlightData, Identification]) -> None:
-    config, _, found = flight
+    config, _, identification = flight
     replace = msgspec.structs.replace
     hopeful = replace(
         config,
@@ -197,30 +201,30 @@ def test_noise_and_losses_that_were_worse_are_raised(flight: tuple[Config, Fligh
         link=replace(config.link, loss=0.1, jitter_s=0.0),
         estimator=replace(config.estimator, position_std_m=1e-4),
     )
-    made = tune_config(hopeful, found).config
-    assert made.plant.wind_std_mps2 == found.config.plant.wind_std_mps2
-    assert made.estimator.position_std_m == found.config.estimator.position_std_m
-    assert made.link.loss == pytest.approx(0.3, abs=0.08)
-    assert made.link.jitter_s == pytest.approx(0.04, abs=0.005)
+    tuned = tune_config(hopeful, identification).config
+    assert tuned.plant.wind_std_mps2 == identification.config.plant.wind_std_mps2
+    assert tuned.estimator.position_std_m == identification.config.estimator.position_std_m
+    assert tuned.link.loss == pytest.approx(0.3, abs=0.08)
+    assert tuned.link.jitter_s == pytest.approx(0.04, abs=0.005)
 
 
 @pytest.mark.slow
-def test_a_computer_that_stood_still_is_no_link(flight: tuple[Config, FlightData, Identification]) -> None:
-    config, _, found = flight
-    stalled = dataclasses.replace(found, link=dataclasses.replace(found.link, jitter_s=3.0))
-    late = dataclasses.replace(found, link=dataclasses.replace(found.link, jitter_s=0.1))
+def test_a_halt_of_a_computer_does_not_change_the_link(flight: tuple[Config, FlightData, Identification]) -> None:
+    config, _, identification = flight
+    stalled = dataclasses.replace(identification, link=dataclasses.replace(identification.link, jitter_s=3.0))
+    delayed = dataclasses.replace(identification, link=dataclasses.replace(identification.link, jitter_s=0.1))
     assert tune_config(config, stalled).config.link.jitter_s == config.link.jitter_s
     assert "stood still" in rows(tune_config(config, stalled).result, "link.jitter_s")[0].reason
-    assert tune_config(config, late).config.link.jitter_s == pytest.approx(0.1, abs=0.005)
+    assert tune_config(config, delayed).config.link.jitter_s == pytest.approx(0.1, abs=0.005)
 
 
 @pytest.mark.slow
 def test_a_model_that_predicts_no_better_changes_nothing(flight: tuple[Config, FlightData, Identification]) -> None:
-    config, _, found = flight
-    fitted = msgspec.structs.replace(config, plant=found.config.plant)
-    told = tune_config(fitted, found).result
-    assert told.new_errors.overall_m <= told.old_errors.overall_m
-    assert told.new_errors.overall_m == pytest.approx(told.old_errors.overall_m, rel=0.05)
+    config, _, identification = flight
+    fitted = msgspec.structs.replace(config, plant=identification.config.plant)
+    tuned_result = tune_config(fitted, identification).result
+    assert tuned_result.new_errors.overall_m <= tuned_result.old_errors.overall_m
+    assert tuned_result.new_errors.overall_m == pytest.approx(tuned_result.old_errors.overall_m, rel=0.05)
 
 
 @pytest.mark.slow
@@ -230,7 +234,7 @@ def test_the_hold_is_judged_where_the_vehicle_truly_was(flight: tuple[Config, Fl
     assert figures.judged_by == "truth"
     assert figures.hold_s > 2.0
     assert figures.hold_rms_m is not None and 0.0 < figures.hold_rms_m < 0.1
-    truth = np.array([one.state for one in flown.truths])[:, list(flown.design.position_index)]
+    truth = np.array([sample.state for sample in flown.truths])[:, list(flown.design.position_index)]
     inside = np.minimum(truth - np.array(BOX.lower), np.array(BOX.upper) - truth).min()
     assert figures.beyond_box_m == pytest.approx(-inside, abs=0.03)
     wrong = compute_plan_errors_m(flown)
@@ -240,8 +244,8 @@ def test_the_hold_is_judged_where_the_vehicle_truly_was(flight: tuple[Config, Fl
 def test_a_folder_goes_on_and_refuses_other_runs(tmp_path: Path) -> None:
     folder = TuneFolder.open(tmp_path / "run", room(), ASKED)
     folder.save_progress(before="before/flight.mcap")
-    again = TuneFolder.open(tmp_path / "run", room(), ASKED)
-    assert again.progress.before == "before/flight.mcap"
+    reopened = TuneFolder.open(tmp_path / "run", room(), ASKED)
+    assert reopened.progress.before == "before/flight.mcap"
     with pytest.raises(UsageError, match=r"link\.loss = 0\.3 there, 0\.4 here"):
         TuneFolder.open(tmp_path / "run", room("link.loss=0.4"), ASKED)
     with pytest.raises(UsageError, match="--box=b"):
@@ -255,7 +259,7 @@ def test_a_folder_goes_on_and_refuses_other_runs(tmp_path: Path) -> None:
         TuneFolder.open(tmp_path / "run", room(), ASKED)
 
 
-def test_attempts_have_folders_of_their_own(tmp_path: Path) -> None:
+def test_each_attempt_has_a_separate_folder(tmp_path: Path) -> None:
     folder = TuneFolder.open(tmp_path, room(), ASKED)
     folder.find_free_folder("before").mkdir()
     assert folder.find_free_folder("before").name == "before-2"

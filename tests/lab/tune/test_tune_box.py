@@ -49,14 +49,14 @@ def fly(
 ) -> BoxMonitor:
     """Fly the excitation on a true vehicle, and check that it stayed inside on the truth up to its own landing."""
     config = load_config(preset, ("sim.plant=quadrotor", f"sim.start_position_m={list(CENTRE)}"))
-    front, right, down = (one * drag / config.plant.drag_1ps[0] for one in CRAZYFLIE_2.rotor_drag_kg)
+    front, right, down = (rotor_drag * drag / config.plant.drag_1ps[0] for rotor_drag in CRAZYFLIE_2.rotor_drag_kg)
     defaults = quadrotor.Quadrotor.__init__.__kwdefaults__
     assert defaults is not None
     patch.setitem(defaults, "airframe", replace(CRAZYFLIE_2, rotor_drag_kg=(front, right, down)))
     patch.setattr(simulation, "Quadrotor", type("True", (TrueVehicle,), {"gain": gain, "lag_s": lag_s}))
-    made = add_excitation(config, design_of(config), box, lands=False)
-    loop = ControlLoop(made, build_controller(made), FlightCounts(), lambda: 0)
-    monitor, beyond = BoxMonitor(made, box), [-np.inf]
+    excited = add_excitation(config, design_of(config), box, lands=False)
+    loop = ControlLoop(excited, build_controller(excited), FlightCounts(), lambda: 0)
+    monitor, beyond = BoxMonitor(excited, box), [-np.inf]
     sides = np.array(box.lower), np.array(box.upper)
 
     class Followed:
@@ -67,7 +67,7 @@ def fly(
             if not monitor.reason:
                 beyond.append(float(compute_excess_m(np.array([vehicle.position_m]), *sides)[0]))
 
-    world = World(made, Followed())
+    world = World(excited, Followed())
     vehicle = world.peers.vehicle
     world.run(over_s, lambda: world.peers.autopilot.mode_name in ("AUTO.LAND", "LAND"))
     assert isinstance(vehicle, TrueVehicle) and len(beyond) > 50
@@ -154,7 +154,7 @@ def test_a_flight_that_stays_inside_gets_no_order(orders: Orders) -> None:
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
-def test_what_cannot_stop_at_half_the_deceleration_is_turned_back_and_repeated_at_half_the_size(
+def test_a_vehicle_that_cannot_stop_at_half_the_deceleration_returns_and_repeats_at_half_the_size(
     orders: Orders, side: float
 ) -> None:
     first = orders.config.mission.waypoints[0]
@@ -185,7 +185,7 @@ def test_only_the_axis_that_came_too_near_gets_smaller(orders: Orders) -> None:
     assert orders.place == pytest.approx((0.5 * north, east, down), abs=1e-3)
 
 
-def test_a_motion_too_small_to_tell_anything_ends_the_flight(orders: Orders) -> None:
+def test_a_motion_below_the_smallest_step_ends_the_flight(orders: Orders) -> None:
     size = abs(orders.config.mission.waypoints[0][0])
     for _ in range(9):
         orders.see(1.4, 0.0, waypoint=0)
@@ -201,9 +201,9 @@ def test_a_motion_too_small_to_tell_anything_ends_the_flight(orders: Orders) -> 
     assert len(orders.given) == given
 
 
-def test_what_leaves_the_box_is_landed_at_once(orders: Orders) -> None:
+def test_a_vehicle_that_leaves_the_box_lands_at_once(orders: Orders) -> None:
     orders.see(1.49, 0.2, waypoint=5)
-    assert [one.order for one in orders.given] == [Order.LAND] and orders.monitor.reason
+    assert [order.order for order in orders.given] == [Order.LAND] and orders.monitor.reason
 
 
 def test_the_rest_is_flown_by_orders_up_to_the_landing(orders: Orders) -> None:
@@ -211,9 +211,9 @@ def test_the_rest_is_flown_by_orders_up_to_the_landing(orders: Orders) -> None:
     orders.see(1.4, 0.0, waypoint=len(places) - 2)
     orders.see(0.0, 0.0)
     orders.see(0.0, 0.0, dt_s=PAUSE_S)
-    where = orders.place[0]
-    orders.see(where, 0.0)
-    orders.see(where, 0.0, dt_s=PAUSE_S)
+    position_m = orders.place[0]
+    orders.see(position_m, 0.0)
+    orders.see(position_m, 0.0, dt_s=PAUSE_S)
     assert orders.place == places[-1]
     orders.see(0.0, 0.0)
     orders.see(0.0, 0.0, dt_s=HOLD_S)
@@ -231,7 +231,7 @@ def test_motions_that_no_longer_fit_in_the_time_are_left_out(orders: Orders) -> 
 
 
 @pytest.mark.parametrize("order", [Order.HOLD, Order.GOTO, Order.RESUME, Order.LAND])
-def test_an_order_of_a_person_ends_the_monitor(orders: Orders, order: Order) -> None:
+def test_an_order_of_an_operator_ends_the_monitor(orders: Orders, order: Order) -> None:
     orders.see(0.0, 0.0, waypoint=0, by=Command(order=order, position_m=CENTRE))
     orders.see(1.6, 1.0, waypoint=0)
     assert not orders.given
@@ -243,6 +243,6 @@ def test_each_axis_begins_with_its_smaller_steps(preset: str) -> None:
     points = np.array(add_excitation(config, design_of(config), BOX, lands=False).mission.waypoints)
     steps = np.abs(np.diff(points, axis=0))
     for axis in range(3):
-        alone = (steps[:, axis] > 0.0) & (np.delete(steps, axis, axis=1).max(axis=1) == 0.0)
-        ways = steps[alone, axis]
-        assert ways[0] < 0.6 * ways[-1]
+        is_single_axis = (steps[:, axis] > 0.0) & (np.delete(steps, axis, axis=1).max(axis=1) == 0.0)
+        step_sizes = steps[is_single_axis, axis]
+        assert step_sizes[0] < 0.6 * step_sizes[-1]

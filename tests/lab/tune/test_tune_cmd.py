@@ -37,7 +37,7 @@ PILOT = 'sim.fault=[{at_s=6.0,kind="mode",name="POSCTL"}]'
 
 
 @pytest.fixture(scope="module")
-def done(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def finished_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A whole run, its recordings in several files."""
     folder = tmp_path_factory.mktemp("tune") / "run"
     with short_flights():
@@ -61,10 +61,10 @@ def begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.slow
-def test_a_run_leaves_flights_configuration_and_pages(done: Path) -> None:
+def test_a_run_leaves_flights_configuration_and_pages(finished_run: Path) -> None:
     for name in (TUNED_FILE, PAGE_FILE, FIT_PAGE_FILE, STATE_FILE):
-        assert (done / name).is_file()
-    state = json.loads((done / STATE_FILE).read_text())
+        assert (finished_run / name).is_file()
+    state = json.loads((finished_run / STATE_FILE).read_text())
     before, after = state["comparison"]["before"], state["comparison"]["after"]
     assert before["hold_s"] > 2.0 and after["hold_s"] > 2.0
     assert after["beyond_box_m"] < 0.0 and before["beyond_box_m"] < 0.0
@@ -73,59 +73,65 @@ def test_a_run_leaves_flights_configuration_and_pages(done: Path) -> None:
 
 
 @pytest.mark.slow
-def test_all_files_of_a_recording_are_read(done: Path) -> None:
-    first = done / BEFORE_FOLDER / "flight.mcap"
+def test_all_files_of_a_recording_are_read(finished_run: Path) -> None:
+    first = finished_run / BEFORE_FOLDER / "flight.mcap"
     assert len(segment_files(first)) > 1
-    state = json.loads((done / STATE_FILE).read_text())
+    state = json.loads((finished_run / STATE_FILE).read_text())
     assert state["comparison"]["before"]["flown_s"] > 25.0
 
 
 @pytest.mark.slow
-def test_the_second_flight_is_the_same_mission_with_the_tuned_configuration(done: Path) -> None:
+def test_the_second_flight_is_the_same_mission_with_the_tuned_configuration(finished_run: Path) -> None:
     flown = [
-        parse(header(done / name / "flight.mcap").config_toml, name).config for name in (BEFORE_FOLDER, AFTER_FOLDER)
+        parse(header(finished_run / name / "flight.mcap").config_toml, name).config
+        for name in (BEFORE_FOLDER, AFTER_FOLDER)
     ]
-    made = load_config(str(done / TUNED_FILE))
+    tuned = load_config(str(finished_run / TUNED_FILE))
     assert flown[0].mission == flown[1].mission and flown[0].fence == flown[1].fence
-    assert flown[1].plant == made.plant and flown[1].cost == made.cost
-    assert made.plant != flown[0].plant
-    assert made.mission.waypoints == () and made.fence == ()
-    assert "plant.dead_time_s" in (done / TUNED_FILE).read_text().split("\n\n")[0]
+    assert flown[1].plant == tuned.plant and flown[1].cost == tuned.cost
+    assert tuned.plant != flown[0].plant
+    assert tuned.mission.waypoints == () and tuned.fence == ()
+    assert "plant.dead_time_s" in (finished_run / TUNED_FILE).read_text().split("\n\n")[0]
 
 
 @pytest.mark.slow
-def test_the_page_has_its_pictures_in_words(done: Path) -> None:
-    page = (done / PAGE_FILE).read_text()
+def test_every_figure_of_the_page_has_a_text_alternative(finished_run: Path) -> None:
+    page = (finished_run / PAGE_FILE).read_text()
     figures = re.findall(r'<figure id="([\w-]+)"', page)
     assert {"held", "growing-first", "growing-second", "motion-north", "motion-east", "motion-down"} <= set(figures)
     assert page.count('aria-label="') >= len(figures)
 
 
 @pytest.mark.slow
-def test_a_run_that_is_done_flies_no_more(done: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    stamp = (done / STATE_FILE).read_bytes()
+def test_a_run_that_is_done_flies_no_more(finished_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    stamp = (finished_run / STATE_FILE).read_bytes()
     with short_flights():
-        code, out, _ = typed(capsys, *words(done, "--set", "log.segment_bytes=1000000", "--json"))
+        code, out, _ = typed(capsys, *words(finished_run, "--set", "log.segment_bytes=1000000", "--json"))
     assert code == 0
     document = json.loads(out)
-    assert document["config"] == str(done / TUNED_FILE) and document["stopped"] == ""
-    assert (done / STATE_FILE).read_bytes() == stamp
-    assert not (done / f"{BEFORE_FOLDER}-2").exists() and not (done / f"{AFTER_FOLDER}-2").exists()
+    assert document["config"] == str(finished_run / TUNED_FILE) and document["stopped"] == ""
+    assert (finished_run / STATE_FILE).read_bytes() == stamp
+    assert not (finished_run / f"{BEFORE_FOLDER}-2").exists() and not (finished_run / f"{AFTER_FOLDER}-2").exists()
 
 
 @pytest.mark.slow
-def test_a_run_goes_on_after_the_last_step_that_is_done(
-    done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+def test_a_run_continues_after_the_last_complete_step(
+    finished_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    state = json.loads((done / STATE_FILE).read_text())
+    state = json.loads((finished_run / STATE_FILE).read_text())
     folder = tmp_path / "run"
     folder.mkdir()
     (folder / STATE_FILE).write_text(
         json.dumps(
-            {**state, "before": str(done / state["before"]), "after": str(done / state["after"]), "comparison": None}
+            {
+                **state,
+                "before": str(finished_run / state["before"]),
+                "after": str(finished_run / state["after"]),
+                "comparison": None,
+            }
         )
     )
-    (folder / TUNED_FILE).write_bytes((done / TUNED_FILE).read_bytes())
+    (folder / TUNED_FILE).write_bytes((finished_run / TUNED_FILE).read_bytes())
     monkeypatch.setattr(tune_cmd, "fly_once", lambda *_, **__: pytest.fail("flown again"))
     with short_flights():
         code, _, _ = typed(capsys, *words(folder, "--set", "log.segment_bytes=1000000"))
@@ -185,13 +191,13 @@ def test_ctrl_c_ends_the_flight_and_the_run(
 
 @pytest.mark.slow
 def test_a_recording_takes_the_place_of_the_first_flight(
-    done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    finished_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    flight, folder = done / BEFORE_FOLDER / "flight.mcap", tmp_path / "run"
-    asked: list[Config] = []
+    flight, folder = finished_run / BEFORE_FOLDER / "flight.mcap", tmp_path / "run"
+    requests: list[Config] = []
 
     def pressed(config: Config, *_: object, **__: object) -> None:
-        asked.append(config)
+        requests.append(config)
         raise KeyboardInterrupt
 
     monkeypatch.setattr(tune_cmd, "fly_once", pressed)
@@ -201,12 +207,12 @@ def test_a_recording_takes_the_place_of_the_first_flight(
     document = json.loads(out)
     assert Path(document["before"]) == flight.absolute() and document["config"] == str(folder / TUNED_FILE)
     assert not (folder / BEFORE_FOLDER).exists()
-    (second,) = asked
+    (second,) = requests
     assert second.mission.waypoints == parse(header(flight).config_toml, "flight").config.mission.waypoints
 
 
 @pytest.mark.parametrize(
-    ("more", "told"),
+    ("more", "text"),
     [
         ((), "--flight"),
         ((BOX, "--flight", "f.mcap"), "--box"),
@@ -222,29 +228,29 @@ def test_a_recording_takes_the_place_of_the_first_flight(
         ((BOX, "--loopback", "--arm", "--takeoff", "nan", "--set", START), "--takeoff"),
     ],
 )
-def test_what_cannot_be_is_refused_before_anything_is_made(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], more: tuple[str, ...], told: str
+def test_invalid_arguments_are_refused_before_a_folder_is_made(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], more: tuple[str, ...], text: str
 ) -> None:
     folder = tmp_path / "run"
     code, out, err = typed(capsys, "tune", "room", "--folder", str(folder), *more)
     assert (code, out) == (2, "")
-    assert told in err
+    assert text in err
     assert not folder.exists()
 
 
-def test_nobody_to_agree_is_a_no(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = iter(["", "\n"])
-    monkeypatch.setattr("sys.stdin.readline", lambda: next(asked), raising=False)
+def test_without_a_terminal_the_answer_is_no(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    requests = iter(["", "\n"])
+    monkeypatch.setattr("sys.stdin.readline", lambda: next(requests), raising=False)
     assert [tune_cmd.ask_agreement(), tune_cmd.ask_agreement()] == [False, True]
 
 
 @pytest.fixture
-def copy(done: Path, tmp_path: Path) -> Callable[..., Path]:
+def copy(finished_run: Path, tmp_path: Path) -> Callable[..., Path]:
     """The run as it was before some of its steps were noted."""
 
     def make(**noted: object) -> Path:
         folder = tmp_path / "copy"
-        shutil.copytree(done, folder)
+        shutil.copytree(finished_run, folder)
         state = json.loads((folder / STATE_FILE).read_text())
         (folder / STATE_FILE).write_text(json.dumps({**state, "comparison": None, **noted}))
         return folder
@@ -265,28 +271,34 @@ def again(capsys: pytest.CaptureFixture[str], folder: Path) -> tuple[int, str, s
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_flight")
-def test_flights_that_came_to_their_end_count_though_nobody_was_left_to_note_them(
-    copy: Callable[..., Path], done: Path, capsys: pytest.CaptureFixture[str]
+def test_complete_flights_count_without_a_note(
+    copy: Callable[..., Path], finished_run: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = copy(before="", after="", tuned=None)
     code, out, _ = again(capsys, folder)
     document = json.loads(out)
     assert (code, document["stopped"]) == (0, "")
-    there = json.loads((done / STATE_FILE).read_text())
-    assert (document["before"], document["after"]) == (there["before"], there["after"])
-    assert document["comparison"]["new_errors"] == there["comparison"]["new_errors"]
+    state = json.loads((finished_run / STATE_FILE).read_text())
+    assert (document["before"], document["after"]) == (state["before"], state["after"])
+    assert document["comparison"]["new_errors"] == state["comparison"]["new_errors"]
 
 
 @pytest.mark.slow
-def test_a_flight_of_another_configuration_or_without_its_end_does_not_count(done: Path, tmp_path: Path) -> None:
-    config = parse(header(done / BEFORE_FOLDER / "flight.mcap").config_toml, "before").config
-    assert find_complete_flight(config, done / BEFORE_FOLDER) == done / BEFORE_FOLDER / "flight.mcap"
-    assert find_complete_flight(config, done / AFTER_FOLDER) is None and find_complete_flight(config, tmp_path) is None
-    (tmp_path / "flight.mcap").write_bytes((done / BEFORE_FOLDER / "flight.mcap").read_bytes())  # its first file alone
+def test_a_flight_of_another_configuration_or_without_its_end_does_not_count(
+    finished_run: Path, tmp_path: Path
+) -> None:
+    config = parse(header(finished_run / BEFORE_FOLDER / "flight.mcap").config_toml, "before").config
+    assert find_complete_flight(config, finished_run / BEFORE_FOLDER) == finished_run / BEFORE_FOLDER / "flight.mcap"
+    assert (
+        find_complete_flight(config, finished_run / AFTER_FOLDER) is None
+        and find_complete_flight(config, tmp_path) is None
+    )
+    # The first file of the recording alone
+    (tmp_path / "flight.mcap").write_bytes((finished_run / BEFORE_FOLDER / "flight.mcap").read_bytes())
     assert find_complete_flight(config, tmp_path) is None
 
 
-def test_a_tuned_configuration_that_was_cut_is_not_flown(begun: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_incomplete_tuned_configuration_is_not_flown(begun: Path, capsys: pytest.CaptureFixture[str]) -> None:
     errors: dict[str, list[float]] = {"axes": [], "ahead_s": [], "rms_m": []}
     ranges = {"dead_time_range_s": [0.0, 0.1], "old_errors": errors, "new_errors": errors}
     link = {"link_loss": 0.0, "link_bursts": False, "link_delay_s": 0.0, "link_jitter_s": 0.0}
@@ -303,7 +315,7 @@ def test_a_tuned_configuration_that_was_cut_is_not_flown(begun: Path, capsys: py
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_flight")
-def test_ctrl_c_beside_a_flight_keeps_what_is_done(
+def test_ctrl_c_outside_a_flight_keeps_finished_steps(
     copy: Callable[..., Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def pressed(*_: object) -> None:
@@ -325,7 +337,7 @@ def test_a_second_run_in_the_same_folder_is_refused(begun: Path, capsys: pytest.
     assert (begun / STATE_FILE).read_bytes() == stamp
 
 
-def test_a_folder_that_takes_no_more_is_told_before_a_flight(begun: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_full_folder_is_reported_before_a_flight(begun: Path, capsys: pytest.CaptureFixture[str]) -> None:
     stamp = (begun / STATE_FILE).read_bytes()
     (begun / f"{STATE_FILE}.part").mkdir()  # root may write into any folder; nobody writes a file over this one
     code, out, err = again(capsys, begun)
@@ -333,19 +345,19 @@ def test_a_folder_that_takes_no_more_is_told_before_a_flight(begun: Path, capsys
     assert (begun / STATE_FILE).read_bytes() == stamp
 
 
-def test_a_folder_that_was_cut_off_at_its_first_file_is_begun_anew(tmp_path: Path) -> None:
+def test_a_folder_interrupted_at_its_first_file_restarts(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     folder.mkdir()
     (folder / f"{STATE_FILE}.part").write_text("{")
-    asked = TuneSettings(box="b", flight="", simulated=True, take_off_m=None)
-    TuneFolder.open(folder, load_config("room"), asked)
+    requests = TuneSettings(box="b", flight="", simulated=True, take_off_m=None)
+    TuneFolder.open(folder, load_config("room"), requests)
     (folder / SETTINGS_FILE).unlink()
-    TuneFolder.open(folder, load_config("room"), asked)
+    TuneFolder.open(folder, load_config("room"), requests)
     assert (folder / STATE_FILE).is_file() and (folder / SETTINGS_FILE).is_file()
 
 
 @pytest.mark.parametrize("content", [b"", b"no recording", b"\x89MCAP0\r\n"])
-def test_what_is_no_flight_is_refused_before_anything_is_made(
+def test_a_recording_without_a_flight_is_refused_before_a_folder_is_made(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], content: bytes
 ) -> None:
     flight, folder = tmp_path / "f.mcap", tmp_path / "run"
@@ -356,7 +368,9 @@ def test_what_is_no_flight_is_refused_before_anything_is_made(
 
 
 @pytest.mark.parametrize("below", ["file", "file/run"])
-def test_a_folder_that_cannot_be_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str], below: str) -> None:
+def test_a_folder_that_cannot_be_made_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], below: str
+) -> None:
     (tmp_path / "file").write_text("mine")
     code, out, err = typed(capsys, *words(tmp_path / below))
     assert (code, out) == (2, "") and "--folder" in err

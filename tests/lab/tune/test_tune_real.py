@@ -31,8 +31,8 @@ def land(rig: Endings) -> None:
 def taken(state: HandoverState, after_s: float, folder: Path, *, lands: bool) -> tuple[Tuned, int]:
     """A call in which the pilot takes over, and lands or leaves the end to the operator; and when we had heard it."""
     released_ns: list[int] = []
-    rig = real_rig().at(state, lambda one: one.stick(STICK), after_s=after_s)
-    rig.at(HandoverState.RELEASED, lambda one: released_ns.append(one.now_ns))
+    rig = real_rig().at(state, lambda real: real.stick(STICK), after_s=after_s)
+    rig.at(HandoverState.RELEASED, lambda real: released_ns.append(real.now_ns))
     rig.at(HandoverState.RELEASED, land if lands else interrupt, after_s=2.0)
     result = fly_real(rig, folder, enter="\n")
     return result, released_ns[0]
@@ -64,7 +64,7 @@ def in_the_second(folder: Path, not_agreed: Tuned) -> tuple[Tuned, int]:
 
 
 @pytest.fixture(scope="module")
-def done(folder: Path, in_the_second: tuple[Tuned, int]) -> Tuned:
+def finished_run(folder: Path, in_the_second: tuple[Tuned, int]) -> Tuned:
     return fly_real(real_rig(), folder, "--yes")
 
 
@@ -82,7 +82,7 @@ def test_the_pilots_stick_in_the_climb_stops_the_run(in_the_climb: tuple[Tuned, 
 
 
 @pytest.mark.slow
-def test_it_goes_on_with_a_new_flight_and_the_stick_stops_that_too(under_way: tuple[Tuned, int], folder: Path) -> None:
+def test_the_next_try_is_a_new_flight_and_the_stick_stops_that_too(under_way: tuple[Tuned, int], folder: Path) -> None:
     result, since_ns = under_way
     assert result.code == result.document["exit_code"] == tune_cmd.PILOT
     assert CAUSES[Cause.PILOT_LANDED].phrase in result.document["stopped"].lower() and result.document["before"] == ""
@@ -104,14 +104,14 @@ def test_a_no_at_enter_stops_before_the_second_flight(not_agreed: Tuned, folder:
 @pytest.mark.slow
 def test_ctrl_c_at_enter_is_a_no_too(not_agreed: Tuned, folder: Path) -> None:
     stamp = (folder / STATE_FILE).read_bytes()
-    again = fly_real(real_rig(), folder, enter=KeyboardInterrupt)
-    assert again.code == again.document["exit_code"] == tune_cmd.INTERRUPTED
-    assert again.document["stopped"] and str(folder) in again.told
-    assert not again.rig.sent and (folder / STATE_FILE).read_bytes() == stamp
+    repeated = fly_real(real_rig(), folder, enter=KeyboardInterrupt)
+    assert repeated.code == repeated.document["exit_code"] == tune_cmd.INTERRUPTED
+    assert repeated.document["stopped"] and str(folder) in repeated.told
+    assert not repeated.rig.sent and (folder / STATE_FILE).read_bytes() == stamp
 
 
 @pytest.mark.slow
-def test_the_stick_in_the_second_flight_keeps_what_is_done(in_the_second: tuple[Tuned, int], folder: Path) -> None:
+def test_the_stick_in_the_second_flight_keeps_finished_steps(in_the_second: tuple[Tuned, int], folder: Path) -> None:
     result, since_ns = in_the_second
     assert result.code == result.document["exit_code"] == tune_cmd.PILOT
     assert result.document["before"] == f"{BEFORE_FOLDER}-3/flight.mcap" and result.document["after"] == ""
@@ -120,13 +120,13 @@ def test_the_stick_in_the_second_flight_keeps_what_is_done(in_the_second: tuple[
 
 
 @pytest.mark.slow
-def test_it_comes_to_its_end(done: Tuned, folder: Path) -> None:
-    assert (done.code, done.document["stopped"]) == (0, "")
-    assert done.document["after"] == f"{AFTER_FOLDER}-2/flight.mcap" and (folder / PAGE_FILE).exists()
-    comparison = done.document["comparison"]
+def test_a_real_run_finishes(finished_run: Tuned, folder: Path) -> None:
+    assert (finished_run.code, finished_run.document["stopped"]) == (0, "")
+    assert finished_run.document["after"] == f"{AFTER_FOLDER}-2/flight.mcap" and (folder / PAGE_FILE).exists()
+    comparison = finished_run.document["comparison"]
     assert comparison["new_errors"]["rms_m"][0][3] < comparison["old_errors"]["rms_m"][0][3]
     assert comparison["after"]["hold_s"] > 2.0 and comparison["after"]["judged_by"] == "estimate"
-    assert not done.rig.peers.autopilot.pilot.is_armed
+    assert not finished_run.rig.peers.autopilot.pilot.is_armed
     before, after = (
         parse(recorded(folder, f"{name}"), name).config for name in (f"{BEFORE_FOLDER}-3", f"{AFTER_FOLDER}-2")
     )
@@ -147,13 +147,13 @@ def test_without_positions_nothing_is_flown(tmp_path: Path) -> None:
     assert not (tmp_path / "run" / BEFORE_FOLDER).exists()
 
 
-def test_a_vehicle_that_another_daemon_flies_is_not_spoken_to() -> None:
+def test_a_vehicle_of_another_daemon_gets_no_message() -> None:
     config = load_config("room", ["daemon.vehicle='udpin://127.0.0.1:1'"])
     with lock_vehicle(config.daemon.vehicle), pytest.raises(VehicleTakenError):
         tune_flights.measure_position(config)
 
 
 @pytest.mark.slow
-def test_the_state_is_that_of_the_document(done: Tuned, folder: Path) -> None:
+def test_the_state_is_that_of_the_document(finished_run: Tuned, folder: Path) -> None:
     state = json.loads((folder / STATE_FILE).read_text())
-    assert all(done.document[key] == value for key, value in state.items())
+    assert all(finished_run.document[key] == value for key, value in state.items())

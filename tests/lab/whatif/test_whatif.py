@@ -31,17 +31,17 @@ from uavctl.records import Datagram, Decision, Plan, PositionSample, Record, Set
 def test_nothing_changed_is_the_recorded_flight_bit_for_bit(case: Case) -> None:
     memory, course = again(case)
     for kind in (StepInput, Decision, Plan, Setpoint, Datagram, Truth):
-        mine, recorded = memory.of(kind), flown(case).of(kind)
-        assert len(mine) == len(recorded) > 0
-        assert [encode(one) for one in mine] == [encode(one) for one in recorded]
+        reproduced, recorded = memory.of(kind), flown(case).of(kind)
+        assert len(reproduced) == len(recorded) > 0
+        assert [encode(record) for record in reproduced] == [encode(record) for record in recorded]
     assert course.deviation.first_acting_ns is None and course.ended == "the recording ends"
-    found = compare_reproduction(flight(flown(case)), flight(memory))
-    assert found.identical and found.largest_state == found.largest_input == 0.0
+    result = compare_reproduction(flight(flown(case)), flight(memory))
+    assert result.identical and result.largest_state == result.largest_input == 0.0
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("case", "changes", "least"),
+    ("case", "changes", "min_difference"),
     [
         (PAPER, ("target.position_m=[3.0, 1.0, 0.0]",), 1.0),
         (PAPER, ("cost.input=[20.0, 20.0]",), 1.0),
@@ -50,32 +50,32 @@ def test_nothing_changed_is_the_recorded_flight_bit_for_bit(case: Case) -> None:
     ],
     ids=["paper-target", "paper-cost", "paper-schedule", "room-target"],
 )
-def test_the_flight_that_might_have_been_is_the_one_that_is_then_flown(
-    case: Case, changes: tuple[str, ...], least: float
+def test_the_what_if_equals_a_flight_with_the_changed_configuration(
+    case: Case, changes: tuple[str, ...], min_difference: float
 ) -> None:
     memory, _ = again(case, *changes)
     real = flown(case, *changes)
-    assert far(memory, flown(case)) > least  # it is another flight than the recorded one
+    assert far(memory, flown(case)) > min_difference  # it is another flight than the recorded one
     assert far(memory, real) < WIRE
-    ages = [[one.age_steps for one in side.of(Decision)] for side in (memory, real)]
+    ages = [[decision.age_steps for decision in side.of(Decision)] for side in (memory, real)]
     assert ages[0] == ages[1]
 
 
 @pytest.mark.slow
-def test_another_link_loses_what_it_would_have_lost() -> None:
+def test_another_link_loses_the_same_positions_as_in_a_flight() -> None:
     changes = ("link.loss=0.1", "schedule.delays=5")
     other = SimulatedLink(history(PAPER), config_of(PAPER, *changes).link, config_of(PAPER).sim.seed, 0.0)
     memory, _ = again(PAPER, *changes, other=other)
     real = flown(PAPER, *changes)
     assert memory.of(Truth)[-1].lost == real.of(Truth)[-1].lost != flown(PAPER).of(Truth)[-1].lost
     assert memory.of(Truth)[-1].sent == real.of(Truth)[-1].sent
-    ages = [[one.age_steps for one in side.of(Decision)] for side in (memory, real)]
+    ages = [[decision.age_steps for decision in side.of(Decision)] for side in (memory, real)]
     assert ages[0] == ages[1]
     assert far(memory, real) < WIRE  # the cameras of `paper` see at the boundaries, where the truth is recorded
 
 
 @pytest.mark.slow
-def test_another_link_between_the_boundaries_puts_lost_positions_back_to_a_millimetre() -> None:
+def test_another_link_restores_lost_positions_between_the_boundaries_to_a_millimetre() -> None:
     quiet: Case = ("room-hahn-stursberg", 8.0, (*EXACT, "sim.camera.noise_std_m=0.0"))
     change = "link.loss=0.1"
     other = SimulatedLink(history(quiet), config_of(quiet, change).link, config_of(quiet).sim.seed, 0.0)
@@ -86,27 +86,27 @@ def test_another_link_between_the_boundaries_puts_lost_positions_back_to_a_milli
     assert far(memory, real) < 2e-3
 
 
-def test_positions_that_were_lost_are_put_back_in_their_places() -> None:
+def test_lost_positions_are_restored_in_order() -> None:
     recorded = history(ROOM)
     camera = recorded.config.sim.camera
-    found = find_captures(recorded, lambda: np.zeros(3))
+    result = find_captures(recorded, lambda: np.zeros(3))
     # All but those after the last that came, which nobody knows of; the last truth is from before the last capture.
-    assert -1 <= recorded.flight.truths[-1].sent - len(found) < 5
-    expected = [round((camera.phase_s + i / camera.rate_hz) * 1e9) for i in range(len(found))]
-    assert np.abs(np.array([one.at_ns for one in found]) - np.array(expected)).max() <= 1000
-    assert sum(one.stamp_us is not None for one in found) > 5
+    assert -1 <= recorded.flight.truths[-1].sent - len(result) < 5
+    expected = [round((camera.phase_s + i / camera.rate_hz) * 1e9) for i in range(len(result))]
+    assert np.abs(np.array([capture.at_ns for capture in result]) - np.array(expected)).max() <= 1000
+    assert sum(capture.stamp_us is not None for capture in result) > 5
 
 
 def test_a_link_that_loses_all_ends_in_the_fallback() -> None:
     link = msgspec.structs.replace(config_of(ROOM).link, blackout=((1.0, 100.0),))
     memory, course = again(ROOM, other=SimulatedLink(history(ROOM), link, 1, 0.0))
-    assert {one.mode.value for one in memory.of(Decision)} >= {"track", "brake"}
+    assert {decision.mode.value for decision in memory.of(Decision)} >= {"track", "brake"}
     assert "landing" in course.ended or course.ended == "the recording ends"
     assert memory.of(Truth)[-1].lost > 0
 
 
 @pytest.mark.slow
-def test_quadrotor_and_model_disagree_and_the_fit_says_so() -> None:
+def test_the_fit_shows_the_model_error_of_a_quadrotor() -> None:
     change = "target.position_m=[0.5, 0.5, -1.0]"
     memory, _ = again(QUADROTOR, change)
     real = flight(flown(QUADROTOR, change))
@@ -122,7 +122,7 @@ def test_quadrotor_and_model_disagree_and_the_fit_says_so() -> None:
     assert (fits[0].rms_m or 1.0) < (fits[1].rms_m or 0.0)
 
 
-def test_departure_is_the_difference_of_two_vehicles_in_the_same_wind() -> None:
+def test_the_deviation_is_the_difference_of_two_vehicles_in_the_same_wind() -> None:
     config = config_of(ROOM)
     one, other = (LinearVehicle(config, np.random.SeedSequence(3), 0) for _ in range(2))
     departure = Deviation(VehicleResponse(one.model))
@@ -158,21 +158,21 @@ def test_departure_is_the_difference_of_two_vehicles_in_the_same_wind() -> None:
     )
 
 
-def test_what_is_sent_acts_after_the_dead_time() -> None:
+def test_a_setpoint_acts_after_the_dead_time() -> None:
     model = make_linear_model(config_of(ROOM).plant)
-    at_once, late = Deviation(VehicleResponse(model)), Deviation(VehicleResponse(model, 120_000_000))
+    at_once, delayed = Deviation(VehicleResponse(model)), Deviation(VehicleResponse(model, 120_000_000))
     for at_ns, accel in ((0, (1.0, -0.5, 0.2)), (50_000_000, (0.3, 0.0, -0.1)), (900_000_000, (0.0, 0.0, 0.0))):
         at_once.steer(at_ns, accel)
-        late.steer(at_ns, accel)
-        np.testing.assert_array_equal(late.get_input(at_ns), at_once.get_input(at_ns))  # it is sent all the same
-    assert late.first_acting_ns == 120_000_000
+        delayed.steer(at_ns, accel)
+        np.testing.assert_array_equal(delayed.get_input(at_ns), at_once.get_input(at_ns))  # it is sent all the same
+    assert delayed.first_acting_ns == 120_000_000
     for at_ns in (0, 33_000_000, 50_000_000, 700_000_000, 2_000_000_000):
         then_ns = at_ns + 120_000_000
-        np.testing.assert_allclose(late.get_state(then_ns), at_once.get_state(at_ns), atol=1e-15)
+        np.testing.assert_allclose(delayed.get_state(then_ns), at_once.get_state(at_ns), atol=1e-15)
         np.testing.assert_allclose(
-            late.get_acceleration_mps2(then_ns), at_once.get_acceleration_mps2(at_ns), atol=1e-15
+            delayed.get_acceleration_mps2(then_ns), at_once.get_acceleration_mps2(at_ns), atol=1e-15
         )
-    assert late.get_acceleration_mps2(119_999_999) == (0.0, 0.0, 0.0)
+    assert delayed.get_acceleration_mps2(119_999_999) == (0.0, 0.0, 0.0)
 
 
 def test_too_few_positions_and_no_setpoints_are_refused() -> None:
@@ -204,31 +204,33 @@ def test_a_recorded_flight_that_ends_early_ends_the_comparison() -> None:
 def test_bytes_of_a_stream_are_read_in_whole_frames_wherever_they_are_cut() -> None:
     config = config_of(PAPER, "daemon.mocap=tcp:127.0.0.1:1")
     cut: list[Entry] = []
-    rest = b""
+    remaining = b""
     for topic, at_ns, record in flown(PAPER).entries:
         if isinstance(record, Datagram) and record.link == "mocap" and not record.outgoing:
-            data = rest + record.data
+            data = remaining + record.data
             cut.append((topic, at_ns, msgspec.structs.replace(record, data=data[:-7])))
-            rest = data[-7:]
+            remaining = data[-7:]
         else:
             cut.append((topic, at_ns, record))
-    whole = [one.data for one in flown(PAPER).of(Datagram) if one.link == "mocap" and not one.outgoing]
+    datagrams = [
+        datagram.data for datagram in flown(PAPER).of(Datagram) if datagram.link == "mocap" and not datagram.outgoing
+    ]
     read = [
         one.data
         for _, _, one in make_recorded_flight(cut, config, "x").entries
         if isinstance(one, Datagram) and one.link == "mocap" and not one.outgoing
     ]
-    assert read[0] == b"" and read[1:] == whole[:-1]
+    assert read[0] == b"" and read[1:] == datagrams[:-1]
 
 
 def test_captures_know_the_simulated_cameras_clock() -> None:
     recorded = history(ROOM)
-    believed: list[PositionSample] = [one for some in recorded.samples.values() for one in some]
+    believed: list[PositionSample] = [sample for samples in recorded.samples.values() for sample in samples]
     assert len(believed) > 10
-    found = find_captures(recorded, lambda: np.zeros(3))
-    delays_s = [(one.captured_ns % 200_000_000 - 100_000_000) * 1e-9 for one in believed]
+    result = find_captures(recorded, lambda: np.zeros(3))
+    delays_s = [(sample.captured_ns % 200_000_000 - 100_000_000) * 1e-9 for sample in believed]
     assert min(delays_s) > 0.025  # the controller, which knows no shortest delay, takes them for newer than they are
-    assert all(abs(one.at_ns % 200_000_000 - 100_000_000) <= 1000 for one in found)
+    assert all(abs(capture.at_ns % 200_000_000 - 100_000_000) <= 1000 for capture in result)
 
 
 @pytest.mark.slow
@@ -238,25 +240,32 @@ def test_without_the_truth_estimates_and_a_spline_take_its_place() -> None:
     controller, response = build_controller(config), make_response(blind, config.plant)
     same, other = Memory(), Memory()
     refly(blind, config, controller, response, same, lambda: 0)
-    assert [encode(one) for one in same.of(Decision)] == [encode(one) for one in flown(ROOM).of(Decision)]
+    assert [encode(decision) for decision in same.of(Decision)] == [
+        encode(decision) for decision in flown(ROOM).of(Decision)
+    ]
     link = msgspec.structs.replace(config.link, loss=0.0)
     refly(blind, config, controller, response, other, lambda: 0, SimulatedLink(blind, link, 2, 0.005))
     for memory in (same, other):
         memory.put("/uavctl/header", 0, header(config, build_design(config)))
     assert not other.of(Truth)
     assert 0.001 < compute_max_distance_m(flight(same), flight(other)) < 0.5
-    assert sum(one.accepted for one in other.of(Decision)) > sum(one.accepted for one in same.of(Decision)) + 5
+    assert (
+        sum(decision.accepted for decision in other.of(Decision))
+        > sum(decision.accepted for decision in same.of(Decision)) + 5
+    )
     fit = fit_model(blind, response, "own")
     assert fit.moves > 20 and fit.r2 is not None and fit.r2 > 0.8
-    put_back = [one for one in find_captures(blind, lambda: np.zeros(3)) if one.stamp_us is not None]
+    put_back = [capture for capture in find_captures(blind, lambda: np.zeros(3)) if capture.stamp_us is not None]
     known = {
-        one.stamp_us or 0: one for one in find_captures(history(ROOM), lambda: np.zeros(3)) if one.stamp_us is not None
+        capture.stamp_us or 0: capture
+        for capture in find_captures(history(ROOM), lambda: np.zeros(3))
+        if capture.stamp_us is not None
     }
     off_m = [
         np.linalg.norm(
-            np.add(one.position_frame.position_m, one.offset_m)
-            - np.add(known[one.stamp_us or 0].position_frame.position_m, known[one.stamp_us or 0].offset_m)
+            np.add(capture.position_frame.position_m, capture.offset_m)
+            - np.add(known[capture.stamp_us or 0].position_frame.position_m, known[capture.stamp_us or 0].offset_m)
         )
-        for one in put_back
+        for capture in put_back
     ]
     assert len(put_back) == len(known) and max(off_m) < 0.1

@@ -19,14 +19,14 @@ from uavctl.smpc.batch import Information
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["lqg", "packetised", "hold-last", "zero-on-loss", "pid", "worst-case-delay"])
-def test_a_baseline_s_plan_is_what_it_does_in_silence(kind: str) -> None:
+def test_a_baseline_s_plan_is_its_behaviour_without_measurements(kind: str) -> None:
     config = config_of(PAPER)
     spec = ControllerSpec(name=kind, kind=kind)
     campaign = CampaignSpec(name="x", config="paper", controller=(spec,))
     recipe = make_recipe(spec, config, campaign)
     solver = BaselineSolver(kind, lambda target: (build_problem(config), build_from_recipe(recipe)))
-    alone, problem = build_from_recipe(recipe), build_problem(config)
-    alone.begin(1)
+    controller, problem = build_from_recipe(recipe), build_problem(config)
+    controller.begin(1)
     low, high = problem.input_set.bounds
     acted = np.zeros((1, 0, 2))
     newest, states = 0, {0: np.array([35.0, -2.0, -20.0, -4.0])}
@@ -42,12 +42,12 @@ def test_a_baseline_s_plan_is_what_it_does_in_silence(kind: str) -> None:
                 problem.plant.a @ answer.states[0] + problem.plant.b @ np.clip(answer.inputs[0], low, high),
             )
             plan = answer.inputs
-        asked = alone.act(Information(step, np.array([newest]), states[newest][np.newaxis], acted))
-        np.testing.assert_allclose(plan[step - newest], asked[0], atol=1e-9)
-        acted = np.concatenate([acted, np.clip(asked, low, high)[:, np.newaxis]], axis=1)
+        inputs = controller.act(Information(step, np.array([newest]), states[newest][np.newaxis], acted))
+        np.testing.assert_allclose(plan[step - newest], inputs[0], atol=1e-9)
+        acted = np.concatenate([acted, np.clip(inputs, low, high)[:, np.newaxis]], axis=1)
 
 
-def test_a_baseline_flies_and_its_plans_say_so() -> None:
+def test_a_baseline_flies_and_its_plans_name_it() -> None:
     config = config_of(PAPER)
     spec = ControllerSpec(name="lqg", kind="lqg")
     recipe = make_recipe(spec, config, CampaignSpec(name="x", config="paper", controller=(spec,)))

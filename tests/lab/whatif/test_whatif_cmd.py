@@ -27,9 +27,9 @@ def typed(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("flown")
-    words = ["loopback", "--config", "paper", "--set", "solver.method=exact", "--duration", "20", "--out", str(folder)]
+    text = ["loopback", "--config", "paper", "--set", "solver.method=exact", "--duration", "20", "--out", str(folder)]
     with unpaged():
-        assert run(words) == 0
+        assert run(text) == 0
     return folder / "flight.mcap"
 
 
@@ -43,19 +43,24 @@ def no_figures() -> Iterator[None]:
 def document(capsys: pytest.CaptureFixture[str], flown: Path, out: Path, *more: str) -> dict[str, Any]:
     code, text, errors = typed(capsys, "log", "whatif", str(flown), "--out", str(out), "--json", *more)
     assert code == 0, errors
-    found: dict[str, Any] = json.loads(text)
-    return found
+    result: dict[str, Any] = json.loads(text)
+    return result
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_figures")
 def test_nothing_changed_reproduces_the_flight(flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    found = document(capsys, flown, tmp_path)
-    assert found["reproduction"] == {"identical": True, "decisions": 200, "largest_state": 0.0, "largest_input": 0.0}
-    assert found["recorded"]["cost"] == found["reproduced"]["cost"] == found["what_if"]["cost"]
-    assert (found["link"], found["controller"], found["changed"], found["compared_s"]) == ("recorded", "smpc", [], 20.0)
-    assert found["largest_departure_m"] == found["inertial_moved"] == found["inertial_left_out"] == 0
-    assert found["model"]["moves"] == 19 and 0.9 < found["model"]["r2"] < 1.0
+    result = document(capsys, flown, tmp_path)
+    assert result["reproduction"] == {"identical": True, "decisions": 200, "largest_state": 0.0, "largest_input": 0.0}
+    assert result["recorded"]["cost"] == result["reproduced"]["cost"] == result["what_if"]["cost"]
+    assert (result["link"], result["controller"], result["changed"], result["compared_s"]) == (
+        "recorded",
+        "smpc",
+        [],
+        20.0,
+    )
+    assert result["largest_departure_m"] == result["inertial_moved"] == result["inertial_left_out"] == 0
+    assert result["model"]["moves"] == 19 and 0.9 < result["model"]["r2"] < 1.0
 
 
 @pytest.mark.slow
@@ -63,19 +68,19 @@ def test_another_cost_is_recorded_reported_and_replays(
     flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "other"
-    found = document(capsys, flown, out, "--set", "cost.input=[20.0, 20.0]")
-    assert found["reproduction"]["identical"] and found["largest_departure_m"] > 1.0
-    assert found["what_if"]["cost"] > found["recorded"]["cost"] + 1.0
-    assert found["changed"] == ["cost.input=[20.0, 20.0]"]
+    result = document(capsys, flown, out, "--set", "cost.input=[20.0, 20.0]")
+    assert result["reproduction"]["identical"] and result["largest_departure_m"] > 1.0
+    assert result["what_if"]["cost"] > result["recorded"]["cost"] + 1.0
+    assert result["changed"] == ["cost.input=[20.0, 20.0]"]
     assert header(out / "flight.mcap").config_toml.count("input = [20.0, 20.0]") == 1
     for key, text in (("page", "<svg"), ("report", "<svg")):
-        assert text in Path(found[key]).read_text(encoding="utf-8")
+        assert text in Path(result[key]).read_text(encoding="utf-8")
     code, text, _ = typed(capsys, "log", "replay", str(out / "flight.mcap"), "--json")
     assert code == 0 and json.loads(text)["identical"]
 
 
 @pytest.mark.usefixtures("no_figures")
-def test_people_get_the_worth_of_it_first_and_then_the_figures(
+def test_the_terminal_shows_the_validity_before_the_figures(
     flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     code, text, _ = typed(
@@ -85,7 +90,7 @@ def test_people_get_the_worth_of_it_first_and_then_the_figures(
     assert text.startswith("Reproduced")
     assert text.index("Reproduced") < text.index("Model (the recording's [plant])") < text.index("what-if")
     (changed,) = [line for line in text.splitlines() if line.startswith("Changed: ")]
-    assert all(one in changed for one in ("link.loss=0.2", "controller lqg", "link: configured"))
+    assert all(change in changed for change in ("link.loss=0.2", "controller lqg", "link: configured"))
     assert "lqg" in text and "Decision time" not in text
 
 
@@ -94,15 +99,15 @@ def test_people_get_the_worth_of_it_first_and_then_the_figures(
 def test_the_design_may_believe_in_another_link_than_the_one_flown(
     flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    found = document(capsys, flown, tmp_path / "a", "--set", "link.loss=0.1", "--link", "recorded")
-    assert found["link"] == "recorded" and found["what_if"]["lost"] == found["recorded"]["lost"]
-    found = document(capsys, flown, tmp_path / "b", "--link", "configured", "--seed", "5")
-    assert found["link"] == "configured" and found["what_if"]["lost"] != found["recorded"]["lost"]
-    assert found["changed"] == ["--seed 5"]
+    result = document(capsys, flown, tmp_path / "a", "--set", "link.loss=0.1", "--link", "recorded")
+    assert result["link"] == "recorded" and result["what_if"]["lost"] == result["recorded"]["lost"]
+    result = document(capsys, flown, tmp_path / "b", "--link", "configured", "--seed", "5")
+    assert result["link"] == "configured" and result["what_if"]["lost"] != result["recorded"]["lost"]
+    assert result["changed"] == ["--seed 5"]
     # A link that no design could count on is flown by one that knows nothing of it.
-    found = document(capsys, flown, tmp_path / "c", "--link", "loss=0.7", "--link", "jitter_s=0.2")
-    assert found["link"] == "loss=0.7, jitter_s=0.2"
-    assert found["what_if"]["lost"] > 10 and found["what_if"]["max_age"] > found["recorded"]["max_age"]
+    result = document(capsys, flown, tmp_path / "c", "--link", "loss=0.7", "--link", "jitter_s=0.2")
+    assert result["link"] == "loss=0.7, jitter_s=0.2"
+    assert result["what_if"]["lost"] > 10 and result["what_if"]["max_age"] > result["recorded"]["max_age"]
 
 
 @pytest.mark.slow
@@ -111,15 +116,17 @@ def test_a_model_that_was_identified(flown: Path, tmp_path: Path, capsys: pytest
     config = load_config("paper", ["plant.b=[[0.25, 0.0], [0.45, 0.0], [0.0, 0.25], [0.0, 0.45]]"])
     model = tmp_path / "identified.toml"
     model.write_text(dump_config(config), encoding="utf-8")
-    found = document(capsys, flown, tmp_path / "a", "--model", str(model), "--set", "target.position_m=[1.0, 0.0, 0.0]")
-    assert found["model"]["source"] == f"[plant] of {model}" and found["reproduction"]["identical"]
+    result = document(
+        capsys, flown, tmp_path / "a", "--model", str(model), "--set", "target.position_m=[1.0, 0.0, 0.0]"
+    )
+    assert result["model"]["source"] == f"[plant] of {model}" and result["reproduction"]["identical"]
     own = document(capsys, flown, tmp_path / "b", "--set", "target.position_m=[1.0, 0.0, 0.0]")
-    assert found["model"]["rms_m"] > own["model"]["rms_m"]
-    assert found["what_if"]["cost"] != own["what_if"]["cost"]
+    assert result["model"]["rms_m"] > own["model"]["rms_m"]
+    assert result["what_if"]["cost"] != own["what_if"]["cost"]
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("arguments", "text"),
     [
         (("--set", "sim.seed=3"), "sim.seed is part of"),
         (("--set", "source.system_id=3"), "source.system_id is part of"),
@@ -137,15 +144,15 @@ def test_a_model_that_was_identified(flown: Path, tmp_path: Path, capsys: pytest
         (("--controller", "genius"), "genius"),
     ],
 )
-def test_what_cannot_be_changed_is_told(
-    flown: Path, arguments: tuple[str, ...], words: str, capsys: pytest.CaptureFixture[str]
+def test_keys_that_cannot_change_are_reported(
+    flown: Path, arguments: tuple[str, ...], text: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     code, out, errors = typed(capsys, "log", "whatif", str(flown), *arguments)
     assert code == 2 and not out
-    assert words in " ".join(errors.split())
+    assert text in " ".join(errors.split())
 
 
-def test_other_files_are_told(flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_other_files_are_refused(flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code, _, errors = typed(capsys, "log", "whatif", str(DATA / "arducopter-vicon.tlog"))
     assert code == 2 and "another program's recording" in errors
     code, _, errors = typed(capsys, "log", "whatif", str(tmp_path / "none.mcap"))
@@ -166,8 +173,8 @@ def test_a_torn_recording_is_flown_to_its_end(flown: Path, tmp_path: Path, capsy
     torn.write_bytes(data[: len(data) * 6 // 10])
     code, text, errors = typed(capsys, "log", "whatif", str(torn), "--out", str(tmp_path / "out"), "--json")
     assert code == 0 and "torn" in errors
-    found = json.loads(text)
-    assert found["compared_s"] < 20.0 and found["recorded"]["steps"] == found["what_if"]["steps"] > 2
+    result = json.loads(text)
+    assert result["compared_s"] < 20.0 and result["recorded"]["steps"] == result["what_if"]["steps"] > 2
     torn.write_bytes(data[:3000])
     code, _, errors = typed(capsys, "log", "whatif", str(torn), "--out", os.devnull)
     assert code == 1 and "no header" in errors

@@ -64,15 +64,15 @@ class Speaker:
     def feels(self, kind: str, stamp_us: int, force: Vec3, *, first_version: bool = False) -> RawFrame:
         if kind == "highres_imu":
             return self.says(kind, stamp_us, *force, *(0.01, 0.02, 0.03), *(0.0,) * 7, 63, first_version=first_version)
-        whole = [round(one / MILLI_G_MPS2) for one in force]
+        milli_g = [round(component / MILLI_G_MPS2) for component in force]
         stamp = stamp_us if kind == "raw_imu" else stamp_us // 1000
-        return self.says(kind, stamp, *whole, 1, 2, 3, 0, 0, 0, first_version=first_version)
+        return self.says(kind, stamp, *milli_g, 1, 2, 3, 0, 0, 0, first_version=first_version)
 
 
 def turn(angles: Vec3) -> Quaternion:
-    found = quaternion_from_euler(angles)
-    assert found is not None
-    return found
+    attitude = quaternion_from_euler(angles)
+    assert attitude is not None
+    return attitude
 
 
 def force_of(frame: bytes) -> Vec3:
@@ -85,22 +85,22 @@ def force_of(frame: bytes) -> Vec3:
 @pytest.mark.parametrize(
     ("kind", "resolution"), [("highres_imu", 2e-6), ("raw_imu", MILLI_G_MPS2 / 2), ("scaled_imu2", MILLI_G_MPS2 / 2)]
 )
-def test_a_shifted_specific_force_is_the_acceleration_more(kind: str, resolution: float, first_version: bool) -> None:
+def test_a_shifted_specific_force_adds_the_acceleration(kind: str, resolution: float, first_version: bool) -> None:
     speaker, attitude = Speaker(number=200), turn(LEANING)
     frame = speaker.feels(kind, 5_000_000, (0.31, -0.42, -9.77), first_version=first_version)
     moved = add_acceleration(frame, attitude, BY)
-    was, now = (rotate_vector(attitude, force_of(one)) for one in (frame.data, moved))
-    assert was is not None and now is not None
+    was, moved_force = (rotate_vector(attitude, force_of(data)) for data in (frame.data, moved))
+    assert was is not None and moved_force is not None
     # The rounding of three fields, turned.
-    np.testing.assert_allclose(np.subtract(now, was), BY, atol=math.sqrt(3.0) * resolution)
-    before, after = (mavlink.MAVLink(None).decode(bytearray(one)) for one in (frame.data, moved))
+    np.testing.assert_allclose(np.subtract(moved_force, was), BY, atol=math.sqrt(3.0) * resolution)
+    before, after = (mavlink.MAVLink(None).decode(bytearray(data)) for data in (frame.data, moved))
     assert moved[0] == frame.data[0] and after.get_seq() == 200 and after.get_srcSystem() == 1
     for name in set(before.fieldnames) - {"xacc", "yacc", "zacc"}:
         assert getattr(before, name) == getattr(after, name)
     assert add_acceleration(frame, attitude, (0.0, 0.0, 0.0)) == frame.data
 
 
-def test_what_does_not_fit_into_a_message_stays_at_its_end() -> None:
+def test_values_beyond_the_range_of_a_message_are_clipped() -> None:
     frame = Speaker().feels("raw_imu", 5_000_000, (310.0, 0.0, -310.0))
     assert force_of(add_acceleration(frame, (1.0, 0.0, 0.0, 0.0), (50.0, 0.0, -50.0))) == pytest.approx(
         (32767 * MILLI_G_MPS2, 0.0, -32768 * MILLI_G_MPS2)
@@ -115,29 +115,29 @@ def test_what_does_not_fit_into_a_message_stays_at_its_end() -> None:
     ],
     ids=["px4", "ardupilot"],
 )
-def test_the_controller_reads_the_acceleration_more(
+def test_the_controller_reads_the_added_acceleration(
     autopilot: int, quaternion: bool, kind: str, resolution: float
 ) -> None:
     speaker = Speaker(autopilot)
     frames = InertialFrames(config_of(LINEAR).daemon)
     recorded, other = (VehicleMonitor(lambda _: None, (245, 191), inertial=True) for _ in range(2))
     read: tuple[list[InertialSample], list[InertialSample]] = ([], [])
-    said = [speaker.beat()]
+    sent_frames = [speaker.beat()]
     for i in range(20):
-        said.append(speaker.leans(1000 + 20 * i, quaternion=quaternion, angles=(0.01 * i, -0.02 * i, 0.3 * i)))
-        said.append(speaker.feels(kind, 1_000_000 + 20_000 * i, (0.3 + 0.1 * i, -0.1 * i, -9.8)))
-    for place, frame in enumerate(said):
+        sent_frames.append(speaker.leans(1000 + 20 * i, quaternion=quaternion, angles=(0.01 * i, -0.02 * i, 0.3 * i)))
+        sent_frames.append(speaker.feels(kind, 1_000_000 + 20_000 * i, (0.3 + 0.1 * i, -0.1 * i, -9.8)))
+    for place, frame in enumerate(sent_frames):
         at_ns = 10_000_000 * place
         data = frames.rewrite(frame, at_ns, BY)
         for bytes_of, watch, heard in ((frame.data, recorded, read[0]), (data, other, read[1])):
             for message in decode(bytes_of).messages:
-                heard += [one for one in watch.handle_message(message, at_ns) if isinstance(one, InertialSample)]
+                heard += [item for item in watch.handle_message(message, at_ns) if isinstance(item, InertialSample)]
     assert len(read[0]) == len(read[1]) == frames.moved == 20 and frames.dropped == 0
-    more = [np.subtract(now.accel_mps2, was.accel_mps2) for was, now in zip(*read, strict=True)]
+    more = [np.subtract(moved_force.accel_mps2, was.accel_mps2) for was, moved_force in zip(*read, strict=True)]
     np.testing.assert_allclose(more, [BY] * 20, atol=math.sqrt(3.0) * resolution)
 
 
-def test_frames_that_cannot_be_mended_are_left_out_once_the_courses_part() -> None:
+def test_frames_that_cannot_be_rewritten_are_dropped_once_the_courses_differ() -> None:
     speaker, frames = Speaker(), InertialFrames(config_of(LINEAR).daemon)
 
     def heard(frame: RawFrame, at_ms: int, by: Vec3 | None = BY) -> bool:
@@ -162,17 +162,17 @@ def test_frames_that_cannot_be_mended_are_left_out_once_the_courses_part() -> No
 def test_nothing_changed_is_the_recorded_flight_bit_for_bit(case: Case) -> None:
     memory, course = again(case)
     for kind in (StepInput, Decision, Plan, Setpoint, Datagram, Truth):
-        mine, recorded = memory.of(kind), flown(case).of(kind)
-        assert len(mine) == len(recorded) > 0
-        assert [encode(one) for one in mine] == [encode(one) for one in recorded]
-    assert sum(len(one.inertial) for one in memory.of(StepInput)) > 500
+        reproduced, recorded = memory.of(kind), flown(case).of(kind)
+        assert len(reproduced) == len(recorded) > 0
+        assert [encode(record) for record in reproduced] == [encode(record) for record in recorded]
+    assert sum(len(step_input.inertial) for step_input in memory.of(StepInput)) > 500
     assert course.deviation.first_acting_ns is None and course.inertial_moved == course.inertial_dropped == 0
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", [LINEAR, LINEAR_ARDUPILOT], ids=["px4", "ardupilot"])
 @pytest.mark.parametrize("change", [ELSEWHERE, "cost.input=[3.0, 3.0, 3.0]"], ids=["target", "cost"])
-def test_on_the_linear_plant_the_sensors_say_what_they_then_really_say(case: Case, change: str) -> None:
+def test_on_the_linear_plant_rewritten_inertial_data_equal_those_of_a_flight(case: Case, change: str) -> None:
     memory, course = again(case, change)
     real = flown(case, change)
     feels, truly, recorded = (felt(side) for side in (memory, real, flown(case)))
@@ -182,8 +182,8 @@ def test_on_the_linear_plant_the_sensors_say_what_they_then_really_say(case: Cas
     # that in each step from the first on, and where they all but tie they go another way for a few ticks.
     off = np.abs(feels - truly).max(axis=1)
     assert np.quantile(off, 0.9) < 0.035
-    own, truly_own = (velocities(side) for side in (memory, real))
-    assert len(own) > 100 and np.abs(own - truly_own).max() < 0.04
+    predicted, truly_own = (velocities(side) for side in (memory, real))
+    assert len(predicted) > 100 and np.abs(predicted - truly_own).max() < 0.04
     assert largest_m(memory, real) < 0.02
 
 
@@ -198,8 +198,8 @@ def test_on_the_linear_plant_the_sensors_say_what_they_then_really_say(case: Cas
     ],
     ids=["px4-target", "ardupilot-target", "px4-cost", "ardupilot-loss"],
 )
-def test_the_true_quadrotor_holds_as_it_then_really_does(case: Case, change: str, target: Vec3 | None) -> None:
-    most = 0.04
+def test_the_what_if_of_a_quadrotor_holds_as_a_flight_does(case: Case, change: str, target: Vec3 | None) -> None:
+    max_error_m = 0.04
     other = None
     if change.startswith("link."):
         before = config_of(case).sim
@@ -210,15 +210,17 @@ def test_the_true_quadrotor_holds_as_it_then_really_does(case: Case, change: str
     assert not inertial_events(real) and not inertial_events(memory)
     assert 0.9 < hold_m(memory, place) / hold_m(real, place) < 1.1
     assert hold_m(memory, place) < 0.02
-    assert largest_m(memory, real) < most < largest_m(real, flown(case)) + most
+    assert largest_m(memory, real) < max_error_m < largest_m(real, flown(case)) + max_error_m
     assert course.inertial_moved > 500 and course.inertial_dropped <= 1
 
 
 @pytest.mark.slow
-def test_without_an_attitude_inertial_data_are_left_out_and_positions_fly_on() -> None:
+def test_without_an_attitude_inertial_data_are_dropped_and_positions_continue() -> None:
     def blind(data: bytes) -> bytes:
         return b"".join(
-            one.data for one in scan_frames(data, final=True).frames if one.message_id not in (ATTITUDE, QUATERNION)
+            frame.data
+            for frame in scan_frames(data, final=True).frames
+            if frame.message_id not in (ATTITUDE, QUATERNION)
         )
 
     entries = [
@@ -230,11 +232,14 @@ def test_without_an_attitude_inertial_data_are_left_out_and_positions_fly_on() -
     course = refly(recorded, config, build_controller(config), make_response(recorded, config.plant), memory, lambda: 0)
     assert course.inertial_moved == 0 and course.inertial_dropped > 500
     came = [
-        frame for one in memory.of(Datagram) if not one.outgoing for frame in scan_frames(one.data, final=True).frames
+        frame
+        for datagram in memory.of(Datagram)
+        if not datagram.outgoing
+        for frame in scan_frames(datagram.data, final=True).frames
     ]
     parted_ns = course.deviation.first_acting_ns
     assert parted_ns is not None and sum(frame.message_id == HIGHRES for frame in came) < 20
-    assert not any(one.inertial for one in memory.of(StepInput))
+    assert not any(step_input.inertial for step_input in memory.of(StepInput))
     assert "inertial-doubted" not in inertial_events(memory) and hold_m(memory, TARGET) < 0.2
 
 
@@ -243,32 +248,43 @@ def test_without_an_attitude_inertial_data_are_left_out_and_positions_fly_on() -
 def test_the_dead_time_belongs_to_the_model(case: Case) -> None:
     response = make_response(history(case), config_of(case).plant)
     assert response.dead_time_ns == round(config_of(case).plant.dead_time_s * 1e9) > 0
-    late, at_once = (fit_model(history(case), one, "own") for one in (response, VehicleResponse(response.model)))
-    assert late.rms_m is not None and at_once.rms_m is not None
-    assert late.rms_m < at_once.rms_m and late.moves > 250
+    delayed, at_once = (
+        fit_model(history(case), candidate, "own") for candidate in (response, VehicleResponse(response.model))
+    )
+    assert delayed.rms_m is not None and at_once.rms_m is not None
+    assert delayed.rms_m < at_once.rms_m and delayed.moves > 250
     assert make_response(history(LINEAR), config_of(LINEAR).plant).dead_time_ns == 0
 
 
 def inertial_events(memory: Memory) -> Counter[str]:
-    return Counter(one.code for one in memory.of(Event) if one.code.startswith("inertial-"))
+    return Counter(event.code for event in memory.of(Event) if event.code.startswith("inertial-"))
 
 
 def felt(memory: Memory) -> Array:
     """Accelerations (n, 3) that the controller read of inertial data."""
-    return np.array([sample.accel_mps2 for one in memory.of(StepInput) for sample in one.inertial])
+    return np.array([sample.accel_mps2 for step_input in memory.of(StepInput) for sample in step_input.inertial])
 
 
 def velocities(memory: Memory) -> Array:
     """The vehicle's own velocities (n, 3), as ticks knew them."""
-    return np.array([one.motion.velocity_mps for one in memory.of(StepInput) if one.motion and one.motion.velocity_mps])
+    return np.array(
+        [
+            step_input.motion.velocity_mps
+            for step_input in memory.of(StepInput)
+            if step_input.motion and step_input.motion.velocity_mps
+        ]
+    )
 
 
 def hold_m(memory: Memory, place: Vec3) -> float:
     """Distance of the true positions from a place, root mean square."""
-    held = [one.position_m for one in memory.of(Truth) if one.at_ns >= HOLDS_FROM_NS]
-    return float(np.sqrt(np.mean(np.sum(np.square(np.array(held) - np.array(place)), axis=1))))
+    positions = [truth.position_m for truth in memory.of(Truth) if truth.at_ns >= HOLDS_FROM_NS]
+    return float(np.sqrt(np.mean(np.sum(np.square(np.array(positions) - np.array(place)), axis=1))))
 
 
-def largest_m(some: Memory, others: Memory) -> float:
+def largest_m(first_memory: Memory, other_memory: Memory) -> float:
     """Largest distance of the true positions."""
-    return max(math.dist(a.position_m, b.position_m) for a, b in zip(some.of(Truth), others.of(Truth), strict=True))
+    return max(
+        math.dist(a.position_m, b.position_m)
+        for a, b in zip(first_memory.of(Truth), other_memory.of(Truth), strict=True)
+    )

@@ -36,9 +36,9 @@ def other(recorded: FlightData) -> FlightData:
 def figures(recorded: FlightData, other: FlightData) -> tuple[dict[str, Axes], str]:
     """The page's axes by their titles, and its text."""
     summary = summarise(recorded, wall_s=None)
-    with drawn() as kept:
+    with drawn() as drawings:
         text = render_what_if_page(worse_link(summary), recorded, other)
-    return {title: figure.axes[0] for title, figure in kept.items()}, text
+    return {title: figure.axes[0] for title, figure in drawings.items()}, text
 
 
 def worse_link(summary: FlightSummary) -> WhatIf:
@@ -70,7 +70,7 @@ def levels(ax: Axes) -> list[float]:
     return sorted(float(np.asarray(line.get_ydata())[0]) for line in lines)
 
 
-def test_limits_are_those_of_the_flight_that_might_have_been(recorded: FlightData, other: FlightData) -> None:
+def test_limits_are_those_of_the_what_if(recorded: FlightData, other: FlightData) -> None:
     axes, _ = figures(recorded, other)
     box = other.design.state_box
     for name, index in zip(other.design.axes, other.design.position_index, strict=True):
@@ -85,26 +85,26 @@ def test_the_reserve_is_the_largest_of_each_plan(recorded: FlightData, other: Fl
     for name, index in zip(design.axes, design.position_index, strict=True):
         row = design.state_box.row_upper[index]
         scale = abs(design.c_x[row][index])
-        kept = [max(stage[row] for stage in plan.backoff_x) / scale for plan in other.flown_plans.values()]
+        drawings = [max(stage[row] for stage in plan.backoff_x) / scale for plan in other.flown_plans.values()]
         edges = [band.get_paths()[0].get_extents() for band in axes[name].collections]
         assert len(edges) == 2
-        above = max(edges, key=lambda one: one.y1)
+        above = max(edges, key=lambda edge: edge.y1)
         assert above.y1 == pytest.approx(design.state_box.upper[index])
-        assert above.y0 == pytest.approx(design.state_box.upper[index] - max(kept))
+        assert above.y0 == pytest.approx(design.state_box.upper[index] - max(drawings))
 
 
-def test_another_link_is_not_called_nothing(recorded: FlightData) -> None:
+def test_another_link_is_listed_as_a_change(recorded: FlightData) -> None:
     summary = summarise(recorded, wall_s=None)
-    (said,) = (text for text in describe_what_if(worse_link(summary)) if "link: loss=0.5" in text)
-    assert "nothing" not in said
+    (sentence,) = (text for text in describe_what_if(worse_link(summary)) if "link: loss=0.5" in text)
+    assert "nothing" not in sentence
 
 
-def test_inertial_messages_that_are_left_out_are_told(recorded: FlightData) -> None:
-    found = worse_link(summarise(recorded, wall_s=None))
-    assert not any("inertial" in text for text in describe_what_if(found))
-    lacking = msgspec.structs.replace(found, inertial_moved=30, inertial_left_out=12)
-    (said,) = (text for text in describe_what_if(lacking) if "inertial" in text)
-    assert said.startswith("12 of 42 inertial messages")
+def test_dropped_inertial_messages_are_reported(recorded: FlightData) -> None:
+    what_if = worse_link(summarise(recorded, wall_s=None))
+    assert not any("inertial" in text for text in describe_what_if(what_if))
+    with_dropped = msgspec.structs.replace(what_if, inertial_moved=30, inertial_left_out=12)
+    (sentence,) = (text for text in describe_what_if(with_dropped) if "inertial" in text)
+    assert sentence.startswith("12 of 42 inertial messages")
 
 
 def test_the_age_is_drawn_against_the_horizon(recorded: FlightData, other: FlightData) -> None:

@@ -28,10 +28,10 @@ THERE: tuple[Vec3, Vec3] = tuple(tuple(np.add(a, b).tolist()) for a, b in zip(HE
 TURNED: Quaternion = (math.cos(0.4), 0.0, math.sin(0.4) * 0.6, math.sin(0.4) * 0.8)
 
 
-def said(camera: CameraConfig, frame: FrameConfig, where: tuple[Vec3, Vec3]) -> bytes:
-    found = Cameras(camera, frame, np.random.SeedSequence(1), 0).capture(*where, TURNED)
-    assert found is not None
-    return found[1]
+def capture(camera: CameraConfig, frame: FrameConfig, motion: tuple[Vec3, Vec3]) -> bytes:
+    decoded = Cameras(camera, frame, np.random.SeedSequence(1), 0).capture(*motion, TURNED)
+    assert decoded is not None
+    return decoded[1]
 
 
 def camera_of(message: str) -> CameraConfig:
@@ -41,28 +41,31 @@ def camera_of(message: str) -> CameraConfig:
 
 @pytest.mark.parametrize("frame", FRAMES, ids=["ned", "enu", "enu-turned", "ned-turned"])
 @pytest.mark.parametrize("message", ["vision", "vicon", "mocap", "odometry"])
-def test_what_cameras_would_have_said(message: str, frame: FrameConfig) -> None:
+def test_positions_of_cameras_are_moved(message: str, frame: FrameConfig) -> None:
     camera, axes = camera_of(message), SourceFrames(frame)
-    (seen,) = axes.find_positions(said(camera, frame, HERE))
-    np.testing.assert_allclose(seen.position_m, HERE[0], atol=1e-6)
-    moved = axes.move(seen, *BY)
-    expected = said(camera, frame, THERE)
+    (position_frame,) = axes.find_positions(capture(camera, frame, HERE))
+    np.testing.assert_allclose(position_frame.position_m, HERE[0], atol=1e-6)
+    moved = axes.move(position_frame, *BY)
+    expected = capture(camera, frame, THERE)
     mav = mavlink.MAVLink(None)
-    mine, theirs = (mav.decode(bytearray(one)) for one in (moved, expected))
-    assert mine.get_type() == theirs.get_type() and moved[:10] == expected[:10]  # length, number, sender
-    for name in mine.fieldnames:
-        np.testing.assert_allclose(getattr(mine, name), getattr(theirs, name), atol=2e-6, err_msg=name)
-    (again,) = axes.find_positions(moved)
-    np.testing.assert_allclose(again.position_m, THERE[0], atol=2e-6)
+    moved_message, expected_message = (mav.decode(bytearray(data)) for data in (moved, expected))
+    assert moved_message.get_type() == expected_message.get_type()
+    assert moved[:10] == expected[:10]  # length, number, sender
+    for name in moved_message.fieldnames:
+        np.testing.assert_allclose(
+            getattr(moved_message, name), getattr(expected_message, name), atol=2e-6, err_msg=name
+        )
+    (moved_position,) = axes.find_positions(moved)
+    np.testing.assert_allclose(moved_position.position_m, THERE[0], atol=2e-6)
 
 
 @pytest.mark.parametrize("message", ["vision", "odometry"])
 def test_a_stamp_is_replaced(message: str) -> None:
     axes = SourceFrames(FrameConfig())
-    (seen,) = axes.find_positions(said(camera_of(message), FrameConfig(), HERE))
-    moved = axes.move(seen, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), stamp_us=123_456_789)
-    (again,) = axes.find_positions(moved)
-    assert again.position.stamp_us == 123_456_789 and again.position_m == seen.position_m
+    (position_frame,) = axes.find_positions(capture(camera_of(message), FrameConfig(), HERE))
+    moved = axes.move(position_frame, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), stamp_us=123_456_789)
+    (moved_position,) = axes.find_positions(moved)
+    assert moved_position.position.stamp_us == 123_456_789 and moved_position.position_m == position_frame.position_m
 
 
 def test_the_vehicle_s_own_estimate_is_moved_as_it_stands_and_in_its_own_version() -> None:
@@ -71,13 +74,20 @@ def test_the_vehicle_s_own_estimate_is_moved_as_it_stands_and_in_its_own_version
     frame = FRAMES[2]
     message = mavlink.MAVLink_local_position_ned_message(5000, 1.0, 2.0, -3.0, 0.5, 0.0, 0.0)
     axes = SourceFrames(frame)
-    (seen,) = axes.find_positions(bytes(message.pack(mav, force_mavlink1=True)))
-    moved = axes.move(seen, (0.5, 0.0, 0.25), (0.0, 1.0, 0.0), stamp_us=7_000_000)
+    (position_frame,) = axes.find_positions(bytes(message.pack(mav, force_mavlink1=True)))
+    moved = axes.move(position_frame, (0.5, 0.0, 0.25), (0.0, 1.0, 0.0), stamp_us=7_000_000)
     assert moved[0] == 0xFE and moved[2] == 77
-    found = mavlink.MAVLink(None).decode(bytearray(moved))
-    assert (found.x, found.y, found.z, found.vx, found.vy, found.time_boot_ms) == (1.5, 2.0, -2.75, 0.5, 1.0, 7000)
+    decoded = mavlink.MAVLink(None).decode(bytearray(moved))
+    assert (decoded.x, decoded.y, decoded.z, decoded.vx, decoded.vy, decoded.time_boot_ms) == (
+        1.5,
+        2.0,
+        -2.75,
+        0.5,
+        1.0,
+        7000,
+    )
 
 
-def test_what_is_no_position_is_not_seen() -> None:
+def test_other_messages_have_no_position() -> None:
     beat = mavlink.MAVLink_heartbeat_message(2, 3, 81, 0, 4, 3).pack(mavlink.MAVLink(None, 1, 1))
     assert list(SourceFrames(FrameConfig()).find_positions(bytes(beat) + b"\xfd\x00garbage")) == []

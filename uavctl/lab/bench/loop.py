@@ -140,13 +140,13 @@ class TimeQuantiles(msgspec.Struct, frozen=True, kw_only=True):
     max: float
 
     @staticmethod
-    def of(times_ns: NDArray[np.int64]) -> TimeQuantiles:
+    def compute(times_ns: NDArray[np.int64]) -> TimeQuantiles:
         """Return the quantiles of one run's times [ns] (n,)."""
         p50, p99, p999, worst = (np.quantile(times_ns, [0.5, 0.99, 0.999, 1.0]) * 1e-3).tolist()
         return TimeQuantiles(p50=p50, p99=p99, p999=p999, max=worst)
 
     @staticmethod
-    def middle(runs: Sequence[TimeQuantiles]) -> TimeQuantiles:
+    def compute_median(runs: Sequence[TimeQuantiles]) -> TimeQuantiles:
         """Return the median over runs, quantile by quantile."""
         return TimeQuantiles(
             **{key: median(getattr(run, key) for run in runs) for key in TimeQuantiles.__struct_fields__}
@@ -156,9 +156,8 @@ class TimeQuantiles(msgspec.Struct, frozen=True, kw_only=True):
 class LoopRun(msgspec.Struct, frozen=True, kw_only=True):
     """One run, or the median of several."""
 
-    in_to_out_us: (
-        TimeQuantiles  # a position arrives in time for a tick: tick deadline -> its setpoint arrives at the vehicle
-    )
+    # Tick deadline of a position that arrives in time -> arrival of its setpoint at the vehicle
+    in_to_out_us: TimeQuantiles
     lateness_us: TimeQuantiles  # tick deadline -> start of the tick
     empty_lateness_us: TimeQuantiles  # the same of an empty loop that ran at the same time
     above_empty_us: float  # p99.9 of the lateness less that of the empty loop
@@ -172,14 +171,16 @@ class LoopRun(msgspec.Struct, frozen=True, kw_only=True):
     memory_mib: float  # at the end
 
     @staticmethod
-    def middle(runs: Sequence[LoopRun]) -> LoopRun:
+    def compute_median(runs: Sequence[LoopRun]) -> LoopRun:
         """Return the median over runs, figure by figure."""
         columns = {name: [getattr(run, name) for run in runs] for name in LoopRun.__struct_fields__}
-        middle: dict[str, Any] = {
-            name: TimeQuantiles.middle(values) if isinstance(values[0], TimeQuantiles) else float(median(values))
+        figures: dict[str, Any] = {
+            name: TimeQuantiles.compute_median(values)
+            if isinstance(values[0], TimeQuantiles)
+            else float(median(values))
             for name, values in columns.items()
         }
-        return LoopRun(**middle)
+        return LoopRun(**figures)
 
 
 class LoopBench(msgspec.Struct, frozen=True, kw_only=True):
@@ -223,8 +224,8 @@ def run_loop_bench(
         seconds=seconds,
         runs=runs,
         tick_s=config.daemon.tick_s,
-        plain=LoopRun.middle(runs_by_mode[False]),
-        realtime=LoopRun.middle(runs_by_mode[True]),
+        plain=LoopRun.compute_median(runs_by_mode[False]),
+        realtime=LoopRun.compute_median(runs_by_mode[True]),
         permitted=permitted,
     )
 
@@ -269,14 +270,14 @@ def _make_loop_run(
             missed += record.missed_ticks
         elif isinstance(record, RecorderNote):
             dropped = record.dropped + record.refused
-    lateness = TimeQuantiles.of(np.array([timing.lateness_ns for timing in timings]))
-    empty = TimeQuantiles.of(np.array(empty_lateness_ns))
+    lateness = TimeQuantiles.compute(np.array([timing.lateness_ns for timing in timings]))
+    empty = TimeQuantiles.compute(np.array(empty_lateness_ns))
     return LoopRun(
-        in_to_out_us=TimeQuantiles.of(np.array(vehicle.in_to_out_ns)),
+        in_to_out_us=TimeQuantiles.compute(np.array(vehicle.in_to_out_ns)),
         lateness_us=lateness,
         empty_lateness_us=empty,
         above_empty_us=lateness.p999 - empty.p999,
-        step_us=TimeQuantiles.of(np.array([timing.step_ns for timing in timings])),
+        step_us=TimeQuantiles.compute(np.array([timing.step_ns for timing in timings])),
         positions=vehicle.positions,
         unanswered=vehicle.positions - len(vehicle.in_to_out_ns),
         missed_ticks=missed,

@@ -97,7 +97,7 @@ def draw_states(
     rng = np.random.default_rng(seed)
     box_states, share = _draw_box_states(design, count - count // 2, rng, on_progress)
     loop_states = collect_loop_states(
-        design, solver, box_states, count // 2, loss, rng, lambda done: on_progress(len(box_states) + done)
+        design, solver, box_states, count // 2, loss, rng, lambda n_done: on_progress(len(box_states) + n_done)
     )
     alternating = chain.from_iterable(zip_longest(box_states, loop_states))
     return BenchStates(tuple(x for x in alternating if x is not None), share)
@@ -203,7 +203,7 @@ def run_bench(
     design: Design,
     loss: float,
     seed: int,
-    advance: ReportProgress,
+    on_progress: ReportProgress,
     sizes: BenchSizes = DEFAULT_SIZES,
     conditioned: ConditionedSolver | None = None,
 ) -> BenchResult:
@@ -221,8 +221,8 @@ def run_bench(
     ready_s = time.perf_counter() - begin
 
     def begin_phase(name: str, total: int) -> Callable[[int], None]:
-        advance(name, 0, total)
-        return lambda done: advance(name, done, total)
+        on_progress(name, 0, total)
+        return lambda n_done: on_progress(name, n_done, total)
 
     states = draw_states(design, solver, sizes.states, loss, seed, begin_phase("states", sizes.states))
     points, target = states.points, design.target
@@ -259,14 +259,14 @@ def run_bench(
         exact_axis_ms=exact_ms / components,
         exact_ms=exact_ms,
         exact_states=len(exact.answers),
-        flown_us=Quantiles.of(flown.us),
+        flown_us=Quantiles.compute(flown.us),
         frozen_us=compute_median(flown.get_times_us(FROZEN)),
         program_us=compute_median(flown.get_times_us(METHOD)),
         ratio_printed=joint_ms / exact_ms,
         ratio_cvxpy=axes_ms / exact_ms,
         conditioned=_make_conditioned_times(conditioned_times[0], axes_ms) if conditioned_times else None,
         shares=_compute_shares(flown),
-        gap=Quantiles.of(np.array([answer.gap for answer in flown.answers])),
+        gap=Quantiles.compute(np.array([answer.gap for answer in flown.answers])),
         certificate_excess=_compute_excess(flown.answers, exact.answers),
         cost_difference=None if design.estimate_cov.any() else _compute_cost_difference(axes.answers, exact.answers),
         ready_s=ready_s,
@@ -276,10 +276,10 @@ def run_bench(
 
 
 def _make_conditioned_times(result: TimedAnswers, axes_ms: float) -> ConditionedTimes:
-    us = Quantiles.of(result.us)
+    us = Quantiles.compute(result.us)
     return ConditionedTimes(
         us=us,
-        iterations=Quantiles.of(np.array([answer.iterations for answer in result.answers])),
+        iterations=Quantiles.compute(np.array([answer.iterations for answer in result.answers])),
         left_alone=sum(answer.iterations == 0 for answer in result.answers) / len(result.answers),
         ratio_cvxpy=axes_ms * 1e3 / us.p50,
     )
@@ -384,8 +384,8 @@ def time_flight(config: Config, on_progress: Callable[[int, int], None] = lambda
     has_plan = np.array([answer.inputs.size > 0 for answer in answers])
     return FlightBench(
         questions=len(answers),
-        us=Quantiles.of(us.min(axis=0)),
-        iterations=Quantiles.of(iterations),
+        us=Quantiles.compute(us.min(axis=0)),
+        iterations=Quantiles.compute(iterations),
         left_alone=float(np.mean(has_plan & (iterations == 0))),
         gave_way=float(np.mean([answer.slack > 0.0 for answer in answers] & has_plan)),
         first_us=recorder.first_us,
@@ -454,8 +454,8 @@ def time_decisions(
             on_progress(i + 1)
     return DecisionBench(
         states=count,
-        us=Quantiles.of(us),
-        iterations=Quantiles.of(iterations),
+        us=Quantiles.compute(us),
+        iterations=Quantiles.compute(iterations),
         left_alone=float(np.mean(has_plan & (iterations == 0))),
         gave_way=float(np.mean(has_plan & (slack > 0.0))),
         without=int(count - has_plan.sum()),

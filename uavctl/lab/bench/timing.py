@@ -26,10 +26,10 @@ class Quantiles(msgspec.Struct, frozen=True, kw_only=True):
     max: float
 
     @staticmethod
-    def of(values: Array) -> Quantiles:
+    def compute(values: Array) -> Quantiles:
         """Return the quantiles of values (n,)."""
-        p50, p99, most = np.quantile(values, [0.5, 0.99, 1.0]).tolist()
-        return Quantiles(p50=p50, p99=p99, max=most)
+        p50, p99, max_value = np.quantile(values, [0.5, 0.99, 1.0]).tolist()
+        return Quantiles(p50=p50, p99=p99, max=max_value)
 
 
 class Shares(msgspec.Struct, frozen=True, kw_only=True):
@@ -139,7 +139,7 @@ def time_cases(
             case.solver.solve(0, x, case.target)
     us = [np.full((runs, len(case.points)), np.nan) for case in cases]
     answers: list[dict[int, Answer]] = [{} for _ in cases]
-    done = 0
+    n_done = 0
     with suspend_garbage_collection():
         for run in range(runs):
             gc.collect()
@@ -150,8 +150,8 @@ def time_cases(
                     answer = case.solver.solve(0, x, case.target)
                     us[i][run, j] = (time.perf_counter() - start) * 1e6
                     answers[i][j] = answer
-                    done += 1
-                    on_progress(done)
+                    n_done += 1
+                    on_progress(n_done)
     return [
         TimedAnswers(np.nanmedian(times, axis=0), tuple(by_state[j] for j in range(len(by_state))))
         for times, by_state in zip(us, answers, strict=True)

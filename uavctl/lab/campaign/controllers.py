@@ -32,15 +32,11 @@ from uavctl.build.rest import check_axes
 from uavctl.config import Config
 from uavctl.config.link import LinkConfig
 from uavctl.config.types import PlantConfig
+from uavctl.lab.campaign.arrivals import compute_known_steps, select_newest_captures
+from uavctl.lab.campaign.draws import draw, draw_noise
+from uavctl.lab.campaign.position_filter import FilterBelief
 from uavctl.lab.campaign.spec import CampaignSpec, ControllerSpec, DisturbanceSpec, make_controller
-from uavctl.lab.campaign.world import (
-    FilterBelief,
-    LinearWorld,
-    compute_known_steps,
-    draw,
-    draw_noise,
-    select_newest_captures,
-)
+from uavctl.lab.campaign.world import LinearWorld
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import NOMINAL, Answer, Preview
 from uavctl.smpc.baselines import (
@@ -98,7 +94,7 @@ def _shape_draws(spec: DisturbanceSpec, normal: Array) -> Array:
     return normal
 
 
-_START_CHILD = 2  # child of a run's seed that draws its start; 0 and 1 are those of `world.draw`
+_START_CHILD = 2  # child of a run's seed that draws its start; 0 and 1 are those of `draws.draw`
 
 
 @dataclass(frozen=True, eq=False)

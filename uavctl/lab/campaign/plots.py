@@ -19,7 +19,8 @@ from logs.report.page import Mark
 from logs.report.plots import DASHED, DOTTED
 from logs.report.run_statistics import Interval
 from logs.report.svg import Drawing, colour, open_canvas
-from uavctl.lab.campaign.results import BaselineComparison, CampaignVerdict, CellSummary, Results
+from uavctl.lab.campaign.results import CellSummary, Results
+from uavctl.lab.campaign.verdicts import BaselineComparison, CampaignVerdict
 
 # By matplotlib's name of the marker, around (13, 7).
 _MARKER_PATHS = {
@@ -191,12 +192,12 @@ def draw_quantities(
     numeric_losses = {link: loss for link, loss in losses.items() if link in link_names}
     if len(set(numeric_losses.values())) < _MIN_NUMERIC_LINKS:
         numeric_losses = {}
-    others = [cell for cell in flown if cell.link not in numeric_losses]
+    other_cells = [cell for cell in flown if cell.link not in numeric_losses]
     if numeric_losses:
         shown = [cell for cell in flown if cell.link in numeric_losses]
         yield from (_draw_over_loss(quantity, shown, numeric_losses, styles, key) for quantity in QUANTITIES)
-    if others:
-        yield from (_draw_by_link(quantity, others, styles, key) for quantity in QUANTITIES)
+    if other_cells:
+        yield from (_draw_by_link(quantity, other_cells, styles, key) for quantity in QUANTITIES)
 
 
 def _draw_over_loss(
@@ -323,7 +324,7 @@ def _draw_tails(ax: Axes, histograms: list[list[int]]) -> None:
 
 
 def make_age_legend(cells: Sequence[CellSummary]) -> Iterator[Mark]:
-    """Return the legend of `ages`."""
+    """Return the legend of `draw_ages`."""
     links = dict.fromkeys(cell.link for cell in cells if cell.ages)
     return (_STYLES[place % len(_STYLES)].make_mark(link) for place, link in enumerate(links))
 

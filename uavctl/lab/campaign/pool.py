@@ -249,8 +249,10 @@ def fly_tasks(tasks: Iterable[Work], workers: Workers, keep: KeepRows, is_stoppe
             for future in list(pending):
                 if future.cancel():
                     del pending[future]
-        done, _ = wait(pending, _POLL_S, FIRST_COMPLETED)
-        failed_tasks = [task for future in done if not _keep_rows(future, task := pending.pop(future), workers, keep)]
+        finished, _ = wait(pending, _POLL_S, FIRST_COMPLETED)
+        failed_tasks = [
+            task for future in finished if not _keep_rows(future, task := pending.pop(future), workers, keep)
+        ]
         if failed_tasks:
             # All pending tasks of a broken pool are lost, and any of them may have broken it.
             suspects = sorted([*failed_tasks, *pending.values()], key=lambda task: task.name)

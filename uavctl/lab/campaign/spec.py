@@ -226,11 +226,11 @@ class Campaign:
 
     def get_tuned_controller(self, controller: int, link: str) -> ControllerSpec:
         """Return a controller with its margin for the link that it believes in; the last tuning wins."""
-        found = self.spec.controller[controller]
+        spec = self.spec.controller[controller]
         for tuning in self.spec.tuning:
-            if tuning.margin is not None and found.name in tuning.controllers and link in tuning.links:
-                found = msgspec.structs.replace(found, margin=tuning.margin)
-        return found
+            if tuning.margin is not None and spec.name in tuning.controllers and link in tuning.links:
+                spec = msgspec.structs.replace(spec, margin=tuning.margin)
+        return spec
 
 
 class ProblemCollector:

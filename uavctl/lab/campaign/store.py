@@ -94,7 +94,7 @@ class Store:
                 self._parts.mkdir(exist_ok=True)
             yield
 
-    def has_begun(self) -> bool:
+    def has_campaign(self) -> bool:
         """Return whether the folder has a campaign."""
         return (self.folder / DOCUMENT).exists()
 
@@ -104,9 +104,9 @@ class Store:
         Raises:
             UsageError: There is none to continue, or one although `resume` is false.
         """
-        if self.has_begun() and not resume:
+        if self.has_campaign() and not resume:
             raise UsageError(f"{self.folder} holds a campaign; go on with it by --resume, or choose another folder")
-        if resume and not self.has_begun():
+        if resume and not self.has_campaign():
             raise UsageError(f"{self.folder} holds no campaign that could go on; leave out --resume")
 
     def is_complete(self) -> bool:
@@ -192,9 +192,8 @@ class Store:
                 raise UsageError(f"{self.folder} holds another campaign: {difference}; choose another folder")
             return
         _write_file(self.folder / SPECIFICATION, specification.encode())
-        _write_file(
-            path, msgspec.json.format(msgspec.json.encode(document), indent=1) + b"\n"
-        )  # last, as it makes the folder a campaign
+        # The document comes last, as it makes the folder a campaign.
+        _write_file(path, msgspec.json.format(msgspec.json.encode(document), indent=1) + b"\n")
 
 
 def make_table(columns: Columns, schema: pa.Schema = SCHEMA) -> pa.Table:

@@ -30,9 +30,10 @@ from uavctl.lab.campaign.controllers import (
     make_recipe,
 )
 from uavctl.lab.campaign.pool import Columns, Work
-from uavctl.lab.campaign.results import SMPC
+from uavctl.lab.campaign.position_filter import PositionFilter
 from uavctl.lab.campaign.spec import CHUNK, Campaign
-from uavctl.lab.campaign.world import MeasuredPositions, PositionFilter, Trajectories, simulate
+from uavctl.lab.campaign.verdicts import SMPC
+from uavctl.lab.campaign.world import MeasuredPositions, Trajectories, simulate
 from uavctl.lab.trial import NEAR_M, NEARER_M, compute_exact_usable_share, get_room_limits
 from uavctl.smpc.batch import Tally
 from uavctl.smpc.plant import AXES

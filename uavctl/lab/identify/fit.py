@@ -91,25 +91,25 @@ def fit_axes(
         )
     ]
     searches = [_search_minimum(x, models[axis_index], tolerance) for axis_index, x in starting_points]
-    requested = {i: next(search) for i, search in enumerate(searches)}
+    points = {i: next(search) for i, search in enumerate(searches)}
     results: dict[int, tuple[Array, float]] = {}
-    while requested:
+    while points:
         slopes = _compute_slopes(
-            parts, [(starting_points[i][0], models[starting_points[i][0]], x) for i, x in requested.items()]
+            parts, [(starting_points[i][0], models[starting_points[i][0]], x) for i, x in points.items()]
         )
-        for i, slope in zip(list(requested), slopes, strict=True):
+        for i, slope in zip(list(points), slopes, strict=True):
             try:
-                requested[i] = searches[i].send(slope)
+                points[i] = searches[i].send(slope)
             except StopIteration as end:
                 results[i] = end.value
-                del requested[i]
+                del points[i]
     fits = []
     for axis_index, model in enumerate(models):
-        x, least = min(
+        x, deviance = min(
             (results[i] for i, (index, _) in enumerate(starting_points) if index == axis_index),
-            key=lambda start_values: start_values[1],
+            key=lambda result: result[1],
         )
-        fits.append(AxisFit(model, dead_time_s, tuple(x.tolist()), least))
+        fits.append(AxisFit(model, dead_time_s, tuple(x.tolist()), deviance))
     return tuple(fits)
 
 
@@ -199,7 +199,7 @@ def _correct_curvature(curvature: Array, step: Array, change: Array) -> Array:
 
 
 def _compute_slopes(parts: Sequence[Timeline], points: Sequence[tuple[int, AxisModel, Array]]) -> list[_Slope]:
-    """Return the slope at each of some (place of the axis, plant, parameter vector), all in one pass."""
+    """Return the slope at each of some (index of the axis, model, parameter vector), all in one pass."""
     trials = [
         Trial(axis_index, model, np.vstack([x, x + _DIFFERENCE_STEP * np.eye(len(x))]))
         for axis_index, model, x in points
@@ -211,9 +211,8 @@ def _compute_slope(result: Likelihood) -> _Slope:
     """Return the slope by finite differences of the other parameter vectors from the first."""
     std = np.sqrt(result.variances_m2[:, 0])
     innovation_slopes = (result.innovations_m[:, 1:] - result.innovations_m[:, :1]) / (_DIFFERENCE_STEP * std[:, None])
-    innovation_slopes[np.abs(result.innovations_m[:, 0]) > OUTLIER * std] = (
-        0.0  # the slope of an outlier's Huber loss is constant
-    )
+    # The slope of an outlier's Huber loss is constant.
+    innovation_slopes[np.abs(result.innovations_m[:, 0]) > OUTLIER * std] = 0.0
     variance_slopes = (result.variances_m2[:, 1:] - result.variances_m2[:, :1]) / (_DIFFERENCE_STEP * std[:, None] ** 2)
     curvature = 2.0 * innovation_slopes.T @ innovation_slopes + variance_slopes.T @ variance_slopes
     # f(x + h) - f(x) = h g + h² H / 2

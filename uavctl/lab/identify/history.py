@@ -98,9 +98,8 @@ class Stretch:
     inputs_mps2: Array  # (n, 3), the setpoint from then on [m/s²]
     times_s: Array  # (m,), of capture [s]
     positions_m: Array  # (m, 3) [m]
-    counts_for_fit: NDArray[np.bool_] | None = (
-        None  # (m,), whether a position counts when parameters are fitted; None is all
-    )
+    # (m,), whether a position counts when parameters are fitted; None is all
+    counts_for_fit: NDArray[np.bool_] | None = None
 
     @property
     def length_s(self) -> float:

@@ -34,9 +34,8 @@ def render_identify_page(identification: Identification, positions: PositionHist
         *(
             f"{response.axis}: {100 * response.r2:.1f} % of the motion of the next {R2_AHEAD_S:g} s is predicted."
             for response in result.response
-            if not any(
-                warning.startswith(f"{response.axis}: only ") for warning in result.warnings
-            )  # which says it already
+            # A warning on the prediction of an axis already reports it.
+            if not any(warning.startswith(f"{response.axis}: only ") for warning in result.warnings)
         ),
         *_describe_ramp(result),
         *(f"{warning}." for warning in result.warnings),
@@ -53,7 +52,7 @@ def _describe_ramp(result: Identified) -> Iterator[str]:
 
 
 def _make_sections(identification: Identification, positions: PositionHistory) -> Iterator[PageSection]:
-    names = [one.axis for one in identification.result.response]
+    names = [response.axis for response in identification.result.response]
     yield PageSection(
         "Response",
         _RESPONSE_NOTE,
@@ -64,18 +63,22 @@ def _make_sections(identification: Identification, positions: PositionHistory) -
         _DEAD_TIME_NOTE,
         _render_candidates(identification) + render_grid([_draw_deviance(identification)]),
     )
-    drawings = [_draw_motion(name, one) for name, one in zip(names, identification.predictions, strict=True)]
+    drawings = [
+        _draw_motion(name, prediction) for name, prediction in zip(names, identification.predictions, strict=True)
+    ]
     yield PageSection(f"Motion of the next {R2_AHEAD_S:g} s", _MOTION_NOTE, render_grid(drawings))
     innovation_drawings = [
-        _draw_innovations(name, one) for name, one in zip(names, identification.predictions, strict=True)
+        _draw_innovations(name, prediction) for name, prediction in zip(names, identification.predictions, strict=True)
     ]
     correlation_drawings = [
-        _draw_correlation(name, one) for name, one in zip(names, identification.predictions, strict=True)
+        _draw_correlation(name, prediction) for name, prediction in zip(names, identification.predictions, strict=True)
     ]
     yield PageSection(
         "What is left unexplained",
         _RESIDUAL_NOTE,
-        render_grid([one for pair in zip(innovation_drawings, correlation_drawings, strict=True) for one in pair]),
+        render_grid(
+            [drawing for pair in zip(innovation_drawings, correlation_drawings, strict=True) for drawing in pair]
+        ),
     )
     yield PageSection("Link", _LINK_NOTE, render_grid([_draw_delays(positions), _draw_loss_runs(identification)]))
     yield PageSection(

@@ -107,11 +107,11 @@ def _find_outages(missing: NDArray[np.int64], rate_hz: float) -> NDArray[np.bool
     """Return which runs of losses are longer than a geometric distribution of the others explains."""
     is_outage = np.zeros(len(missing), dtype=np.bool_)
     for index in np.argsort(missing)[::-1].tolist():
-        others = missing[(missing > 0) & ~is_outage]
-        if len(others) <= _MIN_RUNS or missing[index] < _OUTAGE_S * rate_hz:
+        other_runs = missing[(missing > 0) & ~is_outage]
+        if len(other_runs) <= _MIN_RUNS or missing[index] < _OUTAGE_S * rate_hz:
             break
-        mean = (float(others.sum() - missing[index]) + 1.0) / (len(others) - 1)
-        if len(others) * (1.0 - 1.0 / mean) ** float(missing[index] - 1) > _OUTAGE_CHANCE:
+        mean = (float(other_runs.sum() - missing[index]) + 1.0) / (len(other_runs) - 1)
+        if len(other_runs) * (1.0 - 1.0 / mean) ** float(missing[index] - 1) > _OUTAGE_CHANCE:
             break
         is_outage[index] = True
     return is_outage
@@ -324,11 +324,11 @@ def _make_candidate(chosen: ChosenPlant) -> Candidate:
     )
 
 
-def _describe_better_plants(chosen: ChosenPlant, others: Sequence[ChosenPlant]) -> list[str]:
+def _describe_better_plants(chosen: ChosenPlant, candidates: Sequence[ChosenPlant]) -> list[str]:
     return [
         f'plant.model "{candidate.name}" predicts better: error {1e3 * candidate.held_out.error_m:.1f} mm instead of '
         f"{1e3 * chosen.held_out.error_m:.1f} mm; start from a configuration that has it"
-        for candidate in others
+        for candidate in candidates
         if is_worse(chosen.held_out, candidate.held_out)
     ]
 

@@ -372,10 +372,10 @@ def fly_lqg(setup: Setup, seed: int, runs: int, steps: int) -> float:
     open_sides = Polytope(limits.c, np.full(limits.b.size, np.inf))
     problem = replace(build_problem(setup.config), input_set=open_sides)
     trajectories = fly_runs(setup, Lqg(problem), seed, range(runs), steps, open_sides)
-    is_beyond = (
-        trajectories.requested[:, steps // 2 :] @ limits.c.T > limits.b
-    )  # opposite rows are never broken together
-    return float(is_beyond.sum() / trajectories.requested[:, steps // 2 :].size)
+    requested = trajectories.requested[:, steps // 2 :]
+    # An input never breaks two opposite rows at once, so each true entry is one input.
+    is_beyond = requested @ limits.c.T > limits.b
+    return float(is_beyond.sum() / requested.size)
 
 
 def compute_area_ratios(covariance: Array, design: Design) -> list[float]:

@@ -24,8 +24,10 @@ from uavctl.arrays import Array
 from uavctl.build.controller import build_plant, build_problem, start_state
 from uavctl.config import Config
 from uavctl.errors import UavctlError
+from uavctl.lab.campaign.arrivals import compute_newest_captures
+from uavctl.lab.campaign.draws import draw
 from uavctl.lab.campaign.pool import open_processes
-from uavctl.lab.campaign.world import LinearWorld, Trajectories, compute_newest_captures, draw, simulate
+from uavctl.lab.campaign.world import LinearWorld, Trajectories, simulate
 from uavctl.smpc.batch import BatchController, BatchSmpc, Decider, Decisions
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.frozen import ShortcutDecider, ShortcutSolver

@@ -30,13 +30,11 @@ from uavctl.records import Command, ControlMode, Order, Ticked, Vec3
 from uavctl.smpc.plant import AXES
 
 MIN_BRAKE_SHARE = 0.5  # of the commanded deceleration: the least gain that a tuning adopts
-TUNED_BRAKE_SHARE = (
-    0.8  # the same of a tuned plant: an adopted gain has a standard error of at most 0.1, of which this takes two
-)
+# The same of a tuned plant: an adopted gain has a standard error of at most 0.1, of which this takes two
+TUNED_BRAKE_SHARE = 0.8
 REPEAT_SCALE = 0.5  # times the size of a motion that did not stay inside
-MIN_REPEAT_SHARE = (
-    0.25  # of the least step, from the centre: the first step in the smallest box; a smaller one shows nothing
-)
+# Of the least step, from the centre: the first step in the smallest box; a smaller one shows nothing
+MIN_REPEAT_SHARE = 0.25
 _RETURN_S = 3.0  # time to fly to the last waypoint, before its hold
 _ORDER_DELAY_S = 1.0  # after which an order must have taken effect
 _MOTION_ORDERS = frozenset({Order.GOTO, Order.HOLD, Order.RESUME, Order.LAND})
@@ -82,7 +80,7 @@ class BoxMonitor:
         self._index = 0  # of the waypoint that is flown to, or comes next
         self._goal: Vec3 | None = None  # position of our last order; None while the mission flies
         self._is_returning = False  # whether it flies to the centre before it repeats a motion
-        self._ordered_ns = self._begun_ns = 0
+        self._ordered_ns = self._start_ns = 0
         self._arrived_ns: int | None = None
         self._is_clear = True  # whether the vehicle was away from all sides since the last ended motion
         self._commands: list[Command] = []
@@ -93,15 +91,19 @@ class BoxMonitor:
     def handle_tick(self, loop: ControlLoop, ticked: Ticked) -> None:
         """Check the tick that has just run; do nothing more once an operator has given an order."""
         decision, estimate, at_ns = ticked.decision, ticked.estimate, ticked.decision.at_ns
-        self._has_ended |= any(one.order in _MOTION_ORDERS and one not in self._commands for one, _ in ticked.answers)
+        self._has_ended |= any(
+            command.order in _MOTION_ORDERS and command not in self._commands for command, _ in ticked.answers
+        )
         if self._has_ended or estimate is None or decision.mode is not ControlMode.TRACK:
             return
-        self._begun_ns = self._begun_ns or at_ns
+        self._start_ns = self._start_ns or at_ns
         if self._goal is None and decision.waypoint is not None:
             self._index = decision.waypoint
         position_m, velocity = read_position(estimate, self._plant), read_velocity(estimate, self._plant)
         observation = Observation(at_ns, (), ZERO, position_m, velocity, None, braking=False)
-        near_axes = [axis for axis, one in enumerate(self._near_envelopes) if is_outside(observation, one)]
+        near_axes = [
+            axis for axis, near_envelope in enumerate(self._near_envelopes) if is_outside(observation, near_envelope)
+        ]
         if is_outside(observation, self._leaving_envelope):
             self._end_flight(loop, f"the vehicle was about to leave the box: {self._describe_distance(observation)}")
         elif near_axes and self._is_clear and self._index < self._last_index:
@@ -134,7 +136,7 @@ class BoxMonitor:
             self._order_goto(loop, self._goal, at_ns)  # the mission has started again, as after a pilot
         if self._arrived_ns is None and math.dist(position_m, self._goal) <= self._config.mission.accept_m:
             self._arrived_ns = at_ns
-        is_overdue = at_ns - self._begun_ns > (self._config.duration_s - self._holds_s[-1] - _RETURN_S) * 1e9
+        is_overdue = at_ns - self._start_ns > (self._config.duration_s - self._holds_s[-1] - _RETURN_S) * 1e9
         if self._index < self._last_index and is_overdue:
             self._index, self._is_returning = self._last_index, False
             self._order_goto(loop, self._waypoints[self._last_index], at_ns)

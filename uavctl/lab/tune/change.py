@@ -233,8 +233,8 @@ def tune_config(config: Config, identification: Identification) -> TunedConfig:
         {_get_parameter_name(row): row.old for row in axis_rows if row.reason != _ADOPTED} for axis_rows in rows
     ]
     models = [
-        PinnedAxisModel(fit.model, axis_rows) if axis_rows else fit.model
-        for fit, axis_rows in zip(fits, kept_values, strict=True)
+        PinnedAxisModel(fit.model, pinned) if pinned else fit.model
+        for fit, pinned in zip(fits, kept_values, strict=True)
     ]
     rows = _refit(identification, axis_indices, models, fits[0].dead_time_s, rows) if any(kept_values) else rows
     new_errors = compute_held_out_errors(identification.flown, names, axis_indices, models, fits[0].dead_time_s, dt_s)

@@ -184,7 +184,7 @@ class TuneFolder:
         self.progress = progress  # how far the run has come
 
     @classmethod
-    def open(cls, path: Path, config: Config, asked: TuneSettings) -> TuneFolder:
+    def open(cls, path: Path, config: Config, settings: TuneSettings) -> TuneFolder:
         """Begin a run, or continue the existing one.
 
         Raises:
@@ -199,7 +199,7 @@ class TuneFolder:
             ):
                 raise UsageError(f"--folder {path}: is no run of `uavctl tune`, and not empty; choose another folder")
             path.mkdir(parents=True, exist_ok=True)
-            folder = cls(path, TuneProgress(asked=asked, digest=digest))
+            folder = cls(path, TuneProgress(asked=settings, digest=digest))
             folder.save_progress()
             write_atomically(path / SETTINGS_FILE, text)
             return folder
@@ -210,8 +210,8 @@ class TuneFolder:
                 f"--folder {path}: is a run of another configuration ({description}). Give that one to go on, or "
                 "choose another folder"
             )
-        if progress.asked != asked:
-            description = ", ".join(_describe_other_settings(progress.asked, asked))
+        if progress.asked != settings:
+            description = ", ".join(_describe_other_settings(progress.asked, settings))
             raise UsageError(
                 f"--folder {path}: is a run that was begun with {description}. Go on with the same, or choose "
                 "another folder"
@@ -223,13 +223,13 @@ class TuneFolder:
             folder.save_progress()  # fails before a flight if the folder cannot be written
         return folder
 
-    def save_progress(self, **done: object) -> None:
+    def save_progress(self, **changes: object) -> None:
         """Save the results of a finished step.
 
         Raises:
             RecordingError: It cannot be written.
         """
-        self.progress = msgspec.structs.replace(self.progress, **done)
+        self.progress = msgspec.structs.replace(self.progress, **changes)
         write_atomically(
             self.path / STATE_FILE, msgspec.json.format(msgspec.json.encode(self.progress)).decode() + "\n"
         )
@@ -295,9 +295,9 @@ def read_tuned(path: Path) -> Config:
     keys = dict(flatten_keys(tomllib.loads(text)))
     missing = [key for key, _ in flatten_keys(tomllib.loads(dump_config(config))) if key not in keys]
     if missing:
-        others = f" and {len(missing) - 1} more keys" if len(missing) > 1 else ""
+        others_text = f" and {len(missing) - 1} more keys" if len(missing) > 1 else ""
         raise UsageError(
-            f"{path}: is not whole, {missing[0]}{others} are missing; put them back, or remove the file: the same "
+            f"{path}: is not whole, {missing[0]}{others_text} are missing; put them back, or remove the file: the same "
             "command then writes it anew"
         )
     return config

@@ -140,9 +140,8 @@ def _predict_state(
 ) -> Array | None:
     """Return the state at the end under the flown setpoints; None if one is missing or was not flown."""
     tick_ns, model = max(1, history.flight.tick_ns), response.model
-    delay_ticks = -(
-        -response.dead_time_ns // tick_ns
-    )  # the input that acts at the beginning was sent so many ticks before
+    # The input that acts at the beginning was sent so many ticks before; rounded up.
+    delay_ticks = -(-response.dead_time_ns // tick_ns)
     for sent_ns in range(begin_ns - delay_ticks * tick_ns, end_ns - response.dead_time_ns, tick_ns):
         accel = history.setpoints.get(sent_ns)
         if accel is None or not history.takes_setpoints.get(sent_ns, False):

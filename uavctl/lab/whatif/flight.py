@@ -31,7 +31,7 @@ from uavctl.config.link import LinkConfig
 from uavctl.config.types import PlantConfig
 from uavctl.errors import RecordingError
 from uavctl.flight.controller import Controller
-from uavctl.lab.trial import to_vec3
+from uavctl.lab.figure_eight import to_vec3
 from uavctl.lab.whatif.rewrite import InertialFrames, PositionFrame, SourceFrames
 from uavctl.loop import MOCAP, VEHICLE, ControlLoop
 from uavctl.mavlink.connection import STREAM_SCHEMES
@@ -225,9 +225,9 @@ class _FrameStream:
     def take_whole_frames(self, chunk: bytes) -> bytes:
         """Return the complete frames so far; keep an incomplete one for the next chunk."""
         data = self._rest + chunk
-        found = scan_frames(data, final=False, is_aligned=self._in_step)
-        self._rest, self._in_step = data[found.consumed :], found.is_aligned
-        return data[: found.consumed]
+        result = scan_frames(data, final=False, is_aligned=self._in_step)
+        self._rest, self._in_step = data[result.consumed :], result.is_aligned
+        return data[: result.consumed]
 
 
 TRUTH = "/sim/truth"
@@ -333,7 +333,7 @@ class _ReflownLoop:
         self._positions_link = VEHICLE if daemon.vehicle == daemon.mocap else MOCAP
         self._source_frames = SourceFrames(history.config.frame)
         self._inertial = InertialFrames(daemon)
-        self._has_begun = False
+        self._has_flown_setpoints = False
         self._ended_ns: int | None = None  # since when one of the two flights has no setpoint
 
     def handle_datagram(self, record: Datagram) -> None:
@@ -381,12 +381,12 @@ class _ReflownLoop:
         course, recorded_accel, new_accel = self.course, self._history.setpoints.get(at_ns), self._tap.setpoint
         takes_setpoints = self._history.takes_setpoints[at_ns]
         if recorded_accel is not None and new_accel is not None and takes_setpoints:
-            self._has_begun, self._ended_ns = True, None
+            self._has_flown_setpoints, self._ended_ns = True, None
             course.deviation.steer(
                 at_ns,
                 (new_accel[0] - recorded_accel[0], new_accel[1] - recorded_accel[1], new_accel[2] - recorded_accel[2]),
             )
-        elif self._has_begun and self._ended_ns is None:
+        elif self._has_flown_setpoints and self._ended_ns is None:
             self._ended_ns = at_ns
             course.ended = (
                 "no setpoint of the recording flies the vehicle any more" if new_accel is not None else reason

@@ -78,9 +78,8 @@ class SourceFrames:
                 and message.child_frame_id in _BODY_AXES
             ):
                 inverse_attitude: Quaternion = (message.q[0], -message.q[1], -message.q[2], -message.q[3])
-                vx, vy, vz = (
-                    rotate_vector(inverse_attitude, (vx, vy, vz)) or ZERO
-                )  # a velocity is only read with a rotation
+                # A velocity is only read with a rotation, so the result is never None.
+                vx, vy, vz = rotate_vector(inverse_attitude, (vx, vy, vz)) or ZERO
             message.vx, message.vy, message.vz = message.vx + vx, message.vy + vy, message.vz + vz
         if stamp_us is not None:
             _set_stamp(message, stamp_us)
@@ -137,9 +136,9 @@ class InertialFrames:
     """
 
     def __init__(self, daemon: DaemonConfig) -> None:
-        own = daemon.system_id, daemon.component_id
+        own_address = daemon.system_id, daemon.component_id
         self._monitor = VehicleMonitor(
-            lambda _: None, own, daemon.vehicle_system_id, daemon.vehicle_component_id, inertial=True
+            lambda _: None, own_address, daemon.vehicle_system_id, daemon.vehicle_component_id, inertial=True
         )
         self.moved = self.dropped = 0
 

@@ -37,8 +37,8 @@ def cell(pilot: TrialPilot, autopilot: AutopilotName, scenario: Scenario = "hold
     return TrialCell(pilot, scenario, autopilot, 20.0, "", (f"link.loss={loss}",), "gusts")
 
 
-class Overheard:
-    """What goes to the vehicle, by kind of message."""
+class RecordedTraffic:
+    """Flyer that records the messages to the vehicle, by kind."""
 
     def __init__(self, own: PositionLoopFlyer) -> None:
         self.own = own
@@ -53,11 +53,11 @@ class Overheard:
         outgoing: list[Outgoing] = []
         self.own.tick(tick, at_ns, outgoing.append)
         self._keep(outgoing)
-        for one in outgoing:
-            send(one)
+        for datagram in outgoing:
+            send(datagram)
 
     def _keep(self, outgoing: Iterable[Outgoing]) -> None:
-        self.sent += [msg for one in outgoing if one.link == VEHICLE for msg in read(one.data)]
+        self.sent += [msg for datagram in outgoing if datagram.link == VEHICLE for msg in read(datagram.data)]
 
     def of(self, kind: str) -> list[Any]:
         return [msg for msg in self.sent if msg.get_type() == kind]
@@ -74,31 +74,31 @@ class Samples:
             self.seen += record.samples
 
 
-def flight_of_own(autopilot: AutopilotName, tuning: PositionLoopTuning) -> tuple[Overheard, Peers, Config]:
+def flight_of_own(autopilot: AutopilotName, tuning: PositionLoopTuning) -> tuple[RecordedTraffic, Peers, Config]:
     one = cell(TrialPilot("own", position_loop=tuning), autopilot)
     config = make_flight_config(one, 3, SECONDS)
-    overheard = Overheard(make_position_loop(one, config))
-    world = World(config, overheard)
-    overheard.own.configure_vehicle(world.peers.autopilot)
+    traffic = RecordedTraffic(make_position_loop(one, config))
+    world = World(config, traffic)
+    traffic.own.configure_vehicle(world.peers.autopilot)
     world.run(SECONDS)
-    return overheard, world.peers, config
+    return traffic, world.peers, config
 
 
 def arrivals(samples: Iterable[PositionSample]) -> list[tuple[int, int]]:
-    return sorted((one.captured_ns, one.received_ns) for one in samples)
+    return sorted((sample.captured_ns, sample.received_ns) for sample in samples)
 
 
 @pytest.mark.slow
 @BOTH
-def test_it_gets_the_positions_that_ours_get_no_more_and_no_fewer(autopilot: AutopilotName) -> None:
-    overheard, _, _ = flight_of_own(autopilot, AS_DELIVERED)
+def test_the_position_loop_gets_the_same_positions_as_a_controller(autopilot: AutopilotName) -> None:
+    traffic, _, _ = flight_of_own(autopilot, AS_DELIVERED)
     one, sink = cell(OURS, autopilot), Samples()
     knows = make_design_config(one)
     World(make_flight_config(one, 3, SECONDS), ControlLoop(knows, get_cached_controller(knows), sink, lambda: 0)).run(
         SECONDS
     )
     last_ns = max(received for _, received in arrivals(sink.seen))  # what comes after the last tick nobody uses
-    own = [found for found in arrivals(overheard.own.samples) if found[1] <= last_ns]
+    own = [result for result in arrivals(traffic.own.samples) if result[1] <= last_ns]
     assert own == arrivals(sink.seen)
     assert 0.3 < len(own) / (20.0 * SECONDS) < 0.5
 
@@ -106,25 +106,23 @@ def test_it_gets_the_positions_that_ours_get_no_more_and_no_fewer(autopilot: Aut
 @pytest.mark.slow
 @BOTH
 @pytest.mark.parametrize("tuning", [AS_DELIVERED, TUNED])
-def test_all_of_them_go_on_to_the_vehicle_but_for_those_that_were_overtaken(
-    autopilot: AutopilotName, tuning: PositionLoopTuning
-) -> None:
-    overheard, _, _ = flight_of_own(autopilot, tuning)
-    own, passed = overheard.own, overheard.of("VISION_POSITION_ESTIMATE")
-    kept = {reason: count for reason, count in own.relay.kept.items() if count}
-    assert set(kept) <= {"late", "no clock"} and kept.get("no clock", 0) <= 2
+def test_all_positions_are_relayed_but_overtaken_ones(autopilot: AutopilotName, tuning: PositionLoopTuning) -> None:
+    traffic, _, _ = flight_of_own(autopilot, tuning)
+    own, passed = traffic.own, traffic.of("VISION_POSITION_ESTIMATE")
+    refused = {reason: count for reason, count in own.relay.kept.items() if count}
+    assert set(refused) <= {"late", "no clock"} and refused.get("no clock", 0) <= 2
     assert len(passed) == own.relay.sent
-    assert len(own.samples) - own.relay.sent - sum(kept.values()) in (0, 1)  # the last one may still wait for a tick
-    told = Counter((round(p.x, 4), round(p.y, 4), round(p.z, 4)) for p in passed)
+    assert len(own.samples) - own.relay.sent - sum(refused.values()) in (0, 1)  # the last one may still wait for a tick
+    relayed = Counter((round(p.x, 4), round(p.y, 4), round(p.z, 4)) for p in passed)
     heard = Counter((round(x, 4), round(y, 4), round(z, 4)) for x, y, z in (s.position_m for s in own.samples))
-    assert (told - heard).total() <= 0.05 * len(passed)  # single precision rounds some of them otherwise
+    assert (relayed - heard).total() <= 0.05 * len(passed)  # single precision rounds some of them otherwise
 
 
 @pytest.mark.slow
 @BOTH
-def test_it_is_sent_places_alone_and_knows_of_no_other_position(autopilot: AutopilotName) -> None:
-    overheard, peers, config = flight_of_own(autopilot, TUNED)
-    setpoints = overheard.of("SET_POSITION_TARGET_LOCAL_NED")
+def test_the_vehicle_gets_position_setpoints_and_no_other_position_source(autopilot: AutopilotName) -> None:
+    traffic, peers, config = flight_of_own(autopilot, TUNED)
+    setpoints = traffic.of("SET_POSITION_TARGET_LOCAL_NED")
     assert len(setpoints) >= SECONDS / config.daemon.tick_s - 2
     assert {msg.type_mask for msg in setpoints} == {0x9F8}
     places = np.unique([(msg.x, msg.y, msg.z) for msg in setpoints], axis=0)
@@ -138,17 +136,17 @@ def test_it_is_sent_places_alone_and_knows_of_no_other_position(autopilot: Autop
 
 @pytest.mark.slow
 @BOTH
-def test_without_wind_and_losses_it_holds_its_place(autopilot: AutopilotName) -> None:
+def test_without_wind_and_losses_the_position_is_held(autopilot: AutopilotName) -> None:
     one = TrialCell(
         TrialPilot("own", position_loop=AS_DELIVERED), "hold", autopilot, 50.0, "", ("link.loss=0.0",), "calm"
     )
-    found = fly_trial(one, 0, seconds=16.0, from_s=12.0)
-    assert found.hold_rms_m < 0.03 and found.nearer_s < 12.0 and found.beyond_m < 0.0
+    result = fly_trial(one, 0, seconds=16.0, from_s=12.0)
+    assert result.hold_rms_m < 0.03 and result.nearer_s < 12.0 and result.beyond_m < 0.0
 
 
 @pytest.mark.slow
 @BOTH
-def test_told_of_the_motion_it_follows_closer_than_by_places(autopilot: AutopilotName) -> None:
+def test_motion_setpoints_are_followed_closer_than_position_setpoints(autopilot: AutopilotName) -> None:
     one = TrialCell(
         TrialPilot("own", position_loop=PositionLoopTuning(relays_at_once=True, delay_s=0.05)),
         "eight",
@@ -160,26 +158,26 @@ def test_told_of_the_motion_it_follows_closer_than_by_places(autopilot: Autopilo
     )
     config = make_flight_config(one, 0, 12.0)
     errors = []
-    for whole in (True, False):
+    for follows_motion in (True, False):
         own = make_position_loop(one, config)
         path = own.path
         assert path is not None
-        world = World(config, overheard := Overheard(own))
+        world = World(config, traffic := RecordedTraffic(own))
         own.configure_vehicle(world.peers.autopilot)
         off = []
         for tick in range(1, 240):
-            if not whole:
+            if not follows_motion:
                 own.path, own.target_m = None, path(tick * 0.05)[0]
             world.run(tick * 0.05)
             off.append(np.linalg.norm(np.subtract(world.peers.vehicle.position_m, path(tick * 0.05)[0])))
-        assert {msg.type_mask for msg in overheard.of("SET_POSITION_TARGET_LOCAL_NED")} == (
-            {0x800} if whole else {0x9F8}
+        assert {msg.type_mask for msg in traffic.of("SET_POSITION_TARGET_LOCAL_NED")} == (
+            {0x800} if follows_motion else {0x9F8}
         )
         errors.append(float(np.mean(off)))
     assert errors[0] < 0.25 and errors[0] < 0.5 * errors[1]
 
 
-def test_a_parameter_that_the_vehicle_does_not_take_is_told() -> None:
+def test_a_parameter_that_the_vehicle_rejects_is_an_error() -> None:
     one = cell(TrialPilot("own", position_loop=PositionLoopTuning(delay_s=1e9)), "px4")
     config = make_flight_config(one, 0, 1.0)
     own = make_position_loop(one, config)

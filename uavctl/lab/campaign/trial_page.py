@@ -1,0 +1,157 @@
+"""Page of a campaign of quadrotor trials: one complete HTML file."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from markupsafe import Markup
+
+from logs.recording.summary import count
+from logs.report import page
+from logs.report.excursion import GRAVE_M
+from logs.report.page import PageSection
+from uavctl.lab.campaign.page import render_specification, write_html
+from uavctl.lab.campaign.trials import TrialRecord, TrialSummary, summarise_trial
+from uavctl.lab.trial import EXCESS_FIGURE, FIGURE_NOTE, SCENARIO_FIGURES
+
+_SCENARIO_TITLES = {
+    "hold": "Flying to a place and holding it",
+    "eight": "Following a figure of eight",
+    "blackout": "Four seconds without any position",
+}
+_OWN_LOOP_NOTE = (
+    "`own-loop` is the vehicle's own position loop: its estimator gets the very positions that the others get on the "
+    "same flight, and nothing else, and it is told where to be, or along a motion position, velocity and acceleration. "
+    "The simulated vehicle's inertial sensors are nearly perfect (a constant bias, no noise, attitude without error), "
+    "so what it does without positions is better than a real one's."
+)
+
+
+def write_trial_report(folder: Path) -> Path:
+    """Write the page of a campaign into its folder.
+
+    Returns:
+        Its path.
+
+    Raises:
+        UavctlError: The results cannot be read, or the page not be written.
+    """
+    return write_html(folder, render_trial_report(*summarise_trial(folder), render_specification(folder)))
+
+
+def render_trial_report(
+    record: TrialRecord, cells: Sequence[TrialSummary], specification: Markup = page.NOTHING
+) -> str:
+    """Return the page of a campaign of trials as HTML."""
+    subtitle = f"{count(len(cells), 'cell')} · seed {record.master} · uavctl {record.uavctl_version}"
+    title, sections = f"Campaign “{record.name}”", _make_trial_sections(record, cells, specification)
+    return page.render_page(title, subtitle, _describe_trials(cells), sections, top=_render_trial_banner(cells))
+
+
+def _render_trial_banner(cells: Sequence[TrialSummary]) -> Markup:
+    """Return the banner as HTML: failed flights, else the largest distance of any flight beyond a wall."""
+    failed = sum(cell.failed for cell in cells)
+    runs = sum(cell.runs for cell in cells)
+    if failed:
+        return page.render_banner(
+            "bad", "Flights failed", f"{failed} of {count(runs, 'flight')}; they are in no figure.", ()
+        )
+    beyond = [
+        (value, cell)
+        for cell in cells
+        for value in cell.values.get(
+            "blackout_beyond_m" if cell.place.scenario == "blackout" else EXCESS_FIGURE.key, ()
+        )
+        if math.isfinite(value)
+    ]
+    if not beyond:
+        return page.NOTHING
+    worst_m, worst = max(beyond, key=lambda value_and_cell: value_and_cell[0])
+    place = worst.place
+    description = f"{place.controller}, {_SCENARIO_TITLES[place.scenario].lower()}, {', '.join(_get_conditions(worst))}"
+    outside = sum(value > 0.0 for value, _ in beyond)
+    if not outside:
+        text = (
+            f"{count(len(beyond), 'flight')}, of which the nearest to a wall had {-worst_m:.2f} m left ({description})."
+        )
+        return page.render_banner("good", "All inside", text, ())
+    text = f"{outside} of {count(len(beyond), 'flight')}, the furthest by {worst_m:.2f} m ({description})."
+    return page.render_banner("bad" if worst_m >= GRAVE_M else "mind", "Left their limits", text, ())
+
+
+def _describe_trials(cells: Sequence[TrialSummary]) -> Iterator[str]:
+    flown = [cell for cell in cells if not cell.place.refused]
+    yield f"{count(sum(cell.runs for cell in flown), 'flight')} of the true quadrotor, judged on the truth."
+    for scenario, shown in SCENARIO_FIGURES.items():
+        scenario_cells = [cell for cell in flown if cell.place.scenario == scenario]
+        wins = _count_wins(scenario_cells, shown[0].key)
+        if wins:
+            conditions = len({_get_conditions(cell) for cell in scenario_cells})
+            wins_text = ", ".join(f"{name} in {number}" for name, number in wins.items())
+            title = f"{_SCENARIO_TITLES[scenario]}, {shown[0].heading}"
+            yield f"{title}: of {conditions} places the least (median) was that of {wins_text}."
+    if any(cell.failed for cell in flown):
+        yield f"{count(sum(cell.failed for cell in flown), 'flight')} failed, and are in no figure."
+
+
+def _count_wins(cells: Sequence[TrialSummary], key: str) -> dict[str, int]:
+    """Return how often each controller had the least median of a figure."""
+    wins: dict[str, int] = {}
+    for conditions in dict.fromkeys(map(_get_conditions, cells)):
+        medians = {c.place.controller: c.median[key] for c in cells if _get_conditions(c) == conditions}
+        finite = {name: value for name, value in medians.items() if value is not None}
+        if finite:
+            name = min(finite, key=lambda controller: finite[controller])
+            wins[name] = wins.get(name, 0) + 1
+    return wins
+
+
+def _get_conditions(cell: TrialSummary) -> tuple[str, ...]:
+    place = cell.place
+    return place.autopilot, f"{place.rate_hz:g} Hz", place.link, place.air
+
+
+def _make_trial_sections(
+    record: TrialRecord, cells: Sequence[TrialSummary], specification: Markup
+) -> Iterator[PageSection]:
+    rows = [
+        ("Flights of a cell", str(record.runs)),
+        ("Seed", f"{record.master}; flight i of every cell has the draws of (seed, i)"),
+    ]
+    rooms = {c.place.controller: c.place.usable_room for c in cells if c.place.usable_room is not None}
+    rows += [
+        (f"Usable room, {name}", f"{100 * share:.0f} % of it is where a plan may rest") for name, share in rooms.items()
+    ]
+    yield PageSection("What was compared", _OWN_LOOP_NOTE, page.render_facts(rows) + specification)
+    for number, (scenario, shown) in enumerate(SCENARIO_FIGURES.items()):
+        scenario_cells = [cell for cell in cells if cell.place.scenario == scenario and not cell.place.refused]
+        if not scenario_cells:
+            continue
+        columns = ("vehicle", "cameras", "link", "air", "controller", *(figure.heading for figure in shown), "ended in")
+        table = [
+            (
+                *(*_get_conditions(cell), cell.place.controller),
+                *(figure.format_values(cell.values[figure.key]) for figure in shown),
+                ", ".join(f"{mode} {number}" for mode, number in cell.modes.items()),
+            )
+            for cell in scenario_cells
+        ]
+        body = page.render_table(columns, table, frozenset(range(5, 5 + len(shown))), kind="dense")
+        yield PageSection(_SCENARIO_TITLES[scenario], FIGURE_NOTE if number == 0 else "", body)
+    yield _make_trial_failures_section(cells)
+
+
+def _make_trial_failures_section(cells: Sequence[TrialSummary]) -> PageSection:
+    rows = [
+        (str(cell.place.index), cell.place.controller, ", ".join(_get_conditions(cell)), reason)
+        for cell in cells
+        for reason in ([cell.place.refused] if cell.place.refused else cell.errors)
+    ]
+    body = (
+        page.render_table(("cell", "controller", "where", "why"), rows, frozenset({0}))
+        if rows
+        else page.render_paragraph("None.")
+    )
+    return PageSection("Not flown, or failed", "", body)
