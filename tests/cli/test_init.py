@@ -8,7 +8,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from uavctl.build.controller import design_of
+from uavctl.build.controller import build_flight_design
 from uavctl.cli.app import run
 from uavctl.cli.init import WALL_M, format_room, parse_sizes
 from uavctl.cli.sim import DEFAULT_VEHICLE_URLS
@@ -35,7 +35,7 @@ def test_the_file_has_a_dozen_keys_and_is_the_room(autopilot: str, tmp_path: Pat
     }
     assert config.name == "mine"
     assert config.sim.autopilot == autopilot
-    assert design_of(config).plant.axes == ("north", "east", "down")
+    assert build_flight_design(config).plant.axes == ("north", "east", "down")
     for axis, (low, high) in get_position_limits_m(config).items():
         place = ("north", "east", "down").index(axis)
         assert low < config.target.position_m[place] < high

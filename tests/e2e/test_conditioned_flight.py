@@ -10,7 +10,7 @@ import pytest
 from loopback_rig import Memory, lockstep, make_loop
 
 from logs.recording.replay import replay
-from uavctl.build.controller import build_conditioned, build_design, resting
+from uavctl.build.controller import build_conditioned, build_design, compute_rest_limits
 from uavctl.cli.app import run as main
 from uavctl.config import load_config
 from uavctl.lab.campaign.controllers import build, met
@@ -85,7 +85,7 @@ def test_a_fence_that_closes_in_is_kept() -> None:
 @pytest.mark.slow
 def test_at_a_wall_it_settles_where_the_design_lets_it_rest_and_nothing_gives_way() -> None:
     found = lockstep("room", 30.0, "sim.seed=4", "target.position_m=[3.0,1.0,-1.2]")
-    rests = resting(build_conditioned(load_config("room")))[0]
+    rests = compute_rest_limits(build_conditioned(load_config("room")))[0]
     settled = [plan for plan in found.of(Plan) if plan.base_ns > 12e9]
     assert [plan.reference[0] for plan in settled] == pytest.approx([rests] * len(settled), abs=0.03)
     assert sum(bool(plan.gave_way) for plan in settled) <= 0.05 * len(settled)
@@ -97,7 +97,7 @@ def test_at_a_wall_it_settles_where_the_design_lets_it_rest_and_nothing_gives_wa
 def test_a_design_may_rest_nearer_to_the_walls() -> None:
     config = load_config("room")
     conditioned, design = build_conditioned(config), build_design(load_config("room-hahn-stursberg"))
-    ours, theirs = resting(conditioned), resting(design)
+    ours, theirs = compute_rest_limits(conditioned), compute_rest_limits(design)
     rows = [int(np.flatnonzero((design.state_set.c == row).all(axis=1))[0]) for row in np.eye(9)[[0, 3, 6]]]
     assert (ours[rows] > theirs[rows] + 0.1).all()
     # What it says is where a plan rests, in the middle of the other walls.

@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from soak_pairs import OUTSIDE_M, SPEED_MPS, WORLDS, TrueFlight, fly_pair, fly_true
 from soak_rig import prepared_for
 
-from uavctl.build.controller import Prepared, design_of, prepare
+from uavctl.build.controller import Prepared, build_flight_design, prepare
 from uavctl.config import Config, load_config
 from uavctl.config.sim import FaultConfig
 
@@ -47,7 +47,7 @@ def quadrotor(request: pytest.FixtureRequest) -> Config:
 @pytest.fixture(scope="module")
 def as_flown() -> Prepared:
     config = load_config("room")
-    return prepare(config, design_of(config))
+    return prepare(config, build_flight_design(config))
 
 
 def with_faults(config: Config, *faults: FaultConfig) -> Config:

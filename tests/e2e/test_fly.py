@@ -109,7 +109,7 @@ def test_a_foreign_source_gets_acceleration_setpoints_and_is_flown_to_the_target
 def test_a_second_daemon_is_refused_before_it_makes_anything(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, control: str
 ) -> None:
-    monkeypatch.delattr("uavctl.cli.fly.design_of")
+    monkeypatch.delattr("uavctl.cli.fly.build_flight_design")
     url = f"udpin://127.0.0.1:{free_port()}"
     words = ["fly", "--vehicle", url, "--control", control, "--out", str(tmp_path / "flight")]
     with lock_vehicle(url):

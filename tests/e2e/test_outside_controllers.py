@@ -14,7 +14,7 @@ from soak_pairs import SPEED_MPS, WORLDS, beyond_m
 from soak_rig import Watch, fly
 
 from sim.simulation import World
-from uavctl.build.controller import Prepared, design_of, prepare
+from uavctl.build.controller import Prepared, build_flight_design, prepare
 from uavctl.cli.app import run
 from uavctl.config import Config, load_config
 from uavctl.outcome import Cause
@@ -30,7 +30,7 @@ TRUE_WORLDS = pytest.mark.parametrize(("plant", "autopilot"), [world for world i
 @pytest.fixture(scope="module")
 def ready() -> Callable[[str], Prepared]:
     """Makes preset `room` with a controller of the module; the design is made once."""
-    design = design_of(load_config("room"))
+    design = build_flight_design(load_config("room"))
 
     def make(name: str) -> Prepared:
         return prepare(load_config("room", [f"smpc.controller={MODULE}:{name}"]), design)

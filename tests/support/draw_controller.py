@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from uavctl.build.controller import Prepared, design_of, prepare
+from uavctl.build.controller import Prepared, build_flight_design, prepare
 from uavctl.config import Config, load_config
 from uavctl.errors import ConfigError, DesignError
 
@@ -35,7 +35,7 @@ def draw_controller(rng: np.random.Generator, seed: int) -> Config:
     for _ in range(TRIES):
         try:
             config = load_config(*_controller(rng))
-            design_of(config)
+            build_flight_design(config)
         except (ConfigError, DesignError):
             continue
         return config
@@ -105,7 +105,7 @@ def _believed_link(rng: np.random.Generator) -> dict[str, object]:
 @lru_cache(maxsize=2)
 def prepared_of(config: Config) -> Prepared:
     """What flies with a drawn configuration."""
-    return prepare(config, design_of(config))
+    return prepare(config, build_flight_design(config))
 
 
 def fits(config: Config) -> bool:

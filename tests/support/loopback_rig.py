@@ -9,7 +9,7 @@ import msgspec
 
 from logs.recording.flight import FlightData
 from sim.simulation import World
-from uavctl.build.controller import build_controller, design_of, record_of
+from uavctl.build.controller import build_controller, build_flight_design, make_design_record
 from uavctl.config import Config, load_config
 from uavctl.config.load import dump_config
 from uavctl.flight.controller import Controller
@@ -47,7 +47,7 @@ def shared(config: Config) -> tuple[AnyDesign, Controller]:
 
 @lru_cache(maxsize=8)
 def _made(config: Config) -> tuple[AnyDesign, Controller]:
-    design = design_of(config)
+    design = build_flight_design(config)
     return design, build_controller(config, design)
 
 
@@ -75,7 +75,7 @@ def header(config: Config, design: AnyDesign) -> Header:
         command="test",
         config_toml=dump_config(config),
         design_id=design.design_id,
-        design=record_of(design),
+        design=make_design_record(design),
         versions={},
         cpu="",
     )

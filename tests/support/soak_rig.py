@@ -10,7 +10,7 @@ from pathlib import Path
 from logs.recording.ends import put_header
 from logs.recording.recorder import SyncRecorder
 from sim.simulation import World
-from uavctl.build.controller import Prepared, design_of, prepare
+from uavctl.build.controller import Prepared, build_flight_design, prepare
 from uavctl.config import Config, load_config
 from uavctl.daemon.engagement import compute_stop_limit_s
 from uavctl.loop import ControlLoop
@@ -37,7 +37,7 @@ MOST_FINDINGS = 20  # of one flight: the first ones tell
 def prepared_for(*overrides: str) -> Prepared:
     """Design and controller of preset `room`."""
     config = load_config("room-hahn-stursberg", overrides)
-    return prepare(config, design_of(config))
+    return prepare(config, build_flight_design(config))
 
 
 @dataclass

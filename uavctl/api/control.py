@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sim.faults import check_fault_support
-from uavctl.build.controller import build_plant, build_problem, build_solver, design_of
+from uavctl.build.controller import build_flight_design, build_plant, build_problem, build_solver
 from uavctl.build.link import build_ages
 from uavctl.config import Config, dump_config, parse
 from uavctl.config import load as load_file
@@ -164,7 +164,7 @@ def solve(config: Source, state: ArrayLike, target: ArrayLike | None = None) -> 
 
 @lru_cache(maxsize=8)
 def _solver(config: Config) -> tuple[AnyDesign, Solver]:
-    design = design_of(config)
+    design = build_flight_design(config)
     return design, build_solver(design, config)
 
 

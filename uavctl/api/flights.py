@@ -19,7 +19,7 @@ from logs.recording.reader import header, lacks_end, records
 from logs.recording.reader import read as read_records
 from logs.recording.summary import FlightSummary, summarise
 from uavctl.api.control import Array, Plan, Runs, Signal, Source, limits_of, load, loaded, signals
-from uavctl.build.controller import build_problem, design_of, prepare
+from uavctl.build.controller import build_flight_design, build_problem, prepare
 from uavctl.config import Config
 from uavctl.config.load import parse_recorded
 from uavctl.daemon.engagement import Engagement, check_places, compute_stop_limit_s, make_goto_keys
@@ -195,7 +195,7 @@ def fly(
         raise UsageError(f"take_off_m {take_off_m}: give a height above the ground [m]")
     found = load(loaded(config), {key: value for key, value in given.items() if value is not None})
     check_length(found)
-    design = design_of(found)
+    design = build_flight_design(found)
     engagement = Engagement(found, take_off_m=take_off_m, goto=goto is not None)
     check_places(found, design, take_off_m, engagement.goal)
     prepared = prepare(found, design)

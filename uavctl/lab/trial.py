@@ -16,8 +16,8 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.optimize import brentq
 
 from sim.simulation import World
-from uavctl.build.controller import build_conditioned, build_controller, build_plant, resting
-from uavctl.build.mission import build_rests, resting_places
+from uavctl.build.controller import build_conditioned, build_controller, build_plant, compute_rest_limits
+from uavctl.build.mission import build_rest_limits, compute_rest_range
 from uavctl.config import Config, load_config, parse
 from uavctl.config.checks import get_position_limits_m
 from uavctl.config.mission import TrajectoryConfig
@@ -336,7 +336,7 @@ def usable_room(config: Config, design: AnyDesign) -> float:
     Raises:
         DesignError: There is no such scheme.
     """
-    return _volume_share(config, *resting_places(design.plant, design.state_set, resting(design)))
+    return _volume_share(config, *compute_rest_range(design.plant, design.state_set, compute_rest_limits(design)))
 
 
 def usable_seen(config: Config, design: Design | None) -> float:
@@ -346,10 +346,10 @@ def usable_seen(config: Config, design: Design | None) -> float:
         DesignError: There is no such scheme.
     """
     if design is not None:
-        return _volume_share(config, *resting_places(design.plant, design.state_set, build_rests(design)))
+        return _volume_share(config, *compute_rest_range(design.plant, design.state_set, build_rest_limits(design)))
     n_x = build_plant(config).n_x
-    exact = build_conditioned(config, flown=False, cov=np.zeros((n_x, n_x)))
-    return _volume_share(config, *resting_places(exact.plant, exact.state_set, exact.rests))
+    exact = build_conditioned(config, for_flight=False, cov=np.zeros((n_x, n_x)))
+    return _volume_share(config, *compute_rest_range(exact.plant, exact.state_set, exact.rests))
 
 
 def _volume_share(config: Config, least: Array, most: Array) -> float:

@@ -11,7 +11,7 @@ from campaign_results import cell, runs, write
 from numpy.typing import NDArray
 
 from uavctl.build.controller import build_conditioned, build_design
-from uavctl.build.mission import build_rests
+from uavctl.build.mission import build_rest_limits
 from uavctl.config import load_config
 from uavctl.lab.campaign.page import report_html
 from uavctl.lab.campaign.results import read_results, summarise
@@ -49,10 +49,10 @@ def test_who_is_never_near_has_no_time_and_a_steady_distance_is_held() -> None:
 
 def test_the_room_that_can_be_used_is_that_between_the_places_to_rest() -> None:
     config = load_config("room-hahn-stursberg", ["smpc.scheme=age-conditioned"])
-    exact = build_conditioned(config, flown=False, cov=np.zeros((9, 9)))
+    exact = build_conditioned(config, for_flight=False, cov=np.zeros((9, 9)))
     assert usable_seen(config, None) == pytest.approx(share(exact.rests))
     design = build_design(CONFIG)
-    assert usable_seen(CONFIG, design) == pytest.approx(share(build_rests(design)))
+    assert usable_seen(CONFIG, design) == pytest.approx(share(build_rest_limits(design)))
     assert usable_seen(CONFIG, design) < usable_seen(config, None) < 1.0
 
 

@@ -119,7 +119,7 @@ def test_what_speaks_against_a_design_is_on_the_page_too(
     history = FlightHistory(asked, seen(), np.zeros(0, dtype=np.int64))
     monkeypatch.setattr(identify_cmd, "_read_history", lambda *_: (history, load_config("room-hahn-stursberg")))
     monkeypatch.setattr(identify_cmd, "identify", lambda *_: found(HARDLY))
-    monkeypatch.setattr(identify_cmd, "design_of", refused)
+    monkeypatch.setattr(identify_cmd, "build_flight_design", refused)
     assert identify_cmd.identify_command(tmp_path / "flight.mcap") == 0
     said = sentences((tmp_path / "identified.html").read_text(encoding="utf-8"))
     shown = " ".join(capsys.readouterr().out.split())

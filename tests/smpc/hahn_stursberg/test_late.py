@@ -18,7 +18,7 @@ from scipy.linalg import solve_discrete_lyapunov
 
 from logs.recording.replay import replay
 from uavctl.build.controller import build_conditioned, build_design, build_solver
-from uavctl.build.link import build_delayed_link, late_steps
+from uavctl.build.link import build_delayed_link, compute_late_steps
 from uavctl.config import Config, load_config
 from uavctl.errors import DesignError
 from uavctl.records import Decision, Plan, SolveStatus
@@ -210,7 +210,7 @@ def test_delays_of_a_step_and_more_ask_for_late_designs(
     overrides: list[str], steps: int, tail: list[float] | None
 ) -> None:
     config = load_config("room-hahn-stursberg", ["link.loss=0.1", *overrides])
-    assert late_steps(config) == steps
+    assert compute_late_steps(config) == steps
     link = build_delayed_link(config)
     if tail is None:
         assert link.outage(1) == pytest.approx(0.1)

@@ -17,7 +17,7 @@ from msgspec import Meta
 
 from logs.report.statistics import replace_infinite
 from uavctl import __version__
-from uavctl.build.controller import build_controller, design_of
+from uavctl.build.controller import build_controller, build_flight_design
 from uavctl.config import Config, dump_config, load, load_config, parse
 from uavctl.config.document import MAX_SEED, ConfigProblem, Section
 from uavctl.config.load import parse_toml
@@ -233,7 +233,7 @@ def _pilot(spec: TrialSpec, given: TrialControllerSpec, autopilot: AutopilotName
 
 def _designed(knows: Config) -> tuple[str | None, float | None, str]:
     try:
-        design = design_of(knows)
+        design = build_flight_design(knows)
         build_controller(knows, design)
         return design.design_id, usable_room(knows, design), ""
     except DesignError as error:

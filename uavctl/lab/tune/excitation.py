@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import msgspec
 
-from uavctl.build.controller import resting
-from uavctl.build.mission import resting_places
+from uavctl.build.controller import compute_rest_limits
+from uavctl.build.mission import compute_rest_range
 from uavctl.config import Config
 from uavctl.config.mission import FenceConfig, MissionConfig
 from uavctl.errors import UsageError
@@ -135,7 +135,7 @@ def _sides(config: Config, design: AnyDesign, box: SafeBox) -> list[BoxAxis]:
         raise UsageError(f"plant.axes = {list(plant.axes)}: a box has three axes, and so must the plant that is tuned")
     lower, upper = room_of(config)
     tight_lower, tight_upper = _fenced(config, lower.tolist(), upper.tolist())
-    least, most = resting_places(design.plant, design.state_set, resting(design))
+    least, most = compute_rest_range(design.plant, design.state_set, compute_rest_limits(design))
     problems, sides = [], []
     for place, name in enumerate(plant.axes):
         axis = AXES.index(name)
