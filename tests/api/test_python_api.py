@@ -125,9 +125,9 @@ def test_a_configuration_can_be_changed_again_and_read_from_a_file(tmp_path: Pat
 def test_a_decision_is_that_of_the_command_line(
     config: str, state: list[float], typed: tuple[str, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    given = dict(one.split("=") for one in typed)
+    given = dict(setting.split("=") for setting in typed)
     answer = uavctl.solve(uavctl.load(config, given), state)
-    words = [word for one in typed for word in ("--set", one)]
+    words = [word for setting in typed for word in ("--set", setting)]
     run(["solve", "--config", config, "--state", ",".join(map(str, state)), "--json", *words])
     told = json.loads(capsys.readouterr().out)
     assert told["status"] == answer.status.value == SolveStatus.OPTIMAL
@@ -172,7 +172,7 @@ def test_controllers_meet_the_same_draws() -> None:
     assert np.array_equal(ours.age_steps, theirs.age_steps)
     assert not np.array_equal(other.age_steps, theirs.age_steps)
     plant = uavctl.plant(config)
-    moved = [one.states[:, 1:] - one.states[:, :-1] @ plant.a.T - one.inputs @ plant.b.T for one in (ours, theirs)]
+    moved = [runs.states[:, 1:] - runs.states[:, :-1] @ plant.a.T - runs.inputs @ plant.b.T for runs in (ours, theirs)]
     assert np.allclose(moved[0], moved[1], rtol=0.0, atol=1e-9)
     assert np.abs(moved[0]).max() > 1e-3
     longer = uavctl.simulate(config, "lqg", runs=2, steps=25, seed=1)
@@ -224,8 +224,10 @@ _MEASURED = ("/uavctl/header", "/uavctl/timing", "/plot/timing", "/uavctl/record
 def recorded(path: Path) -> list[tuple[str, int, bytes]]:
     """All messages by mcap's own reader, but what is measured with a clock, and when it was."""
     with path.open("rb") as file:
-        found = [(channel.topic, one.log_time, one.data) for _, channel, one in make_reader(file).iter_messages()]
-    return [one for one in found if one[0] not in _MEASURED]
+        found = [
+            (channel.topic, message.log_time, message.data) for _, channel, message in make_reader(file).iter_messages()
+        ]
+    return [message for message in found if message[0] not in _MEASURED]
 
 
 @pytest.mark.parametrize(("name", "more"), [("paper", PAPER), ("room", {"link.loss": 0.4})])
@@ -248,9 +250,9 @@ def test_a_flight_records_the_bytes_that_the_command_line_records(
 def test_a_flight_tells_where_the_vehicle_truly_was(tmp_path: Path) -> None:
     flight = uavctl.fly(uavctl.load("paper", PAPER), tmp_path, seed=3, duration_s=4)
     with flight.recording.path.open("rb") as file:
-        truth = [json.loads(one.data) for _, _, one in make_reader(file).iter_messages(topics=["/sim/truth"])]
-    assert flight.position_m.tolist() == [one["position_m"] for one in truth]
-    assert flight.velocity_mps.tolist() == [one["velocity_mps"] for one in truth]
+        truth = [json.loads(message.data) for _, _, message in make_reader(file).iter_messages(topics=["/sim/truth"])]
+    assert flight.position_m.tolist() == [truth_record["position_m"] for truth_record in truth]
+    assert flight.velocity_mps.tolist() == [truth_record["velocity_mps"] for truth_record in truth]
     assert np.allclose(np.diff(flight.time_s), flight.config.plant.dt_s)
     assert flight.config == flight.recording.config
     assert flight.config.sim.seed == 3
@@ -266,7 +268,7 @@ def test_a_flight_from_python_has_its_page_and_its_figure(tmp_path: Path) -> Non
     for what in (flight, flight.recording):
         (ax,) = uavctl.plot(what).axes
         drawn = [np.asarray(line.get_xydata()) for line in ax.lines]
-        assert any(np.allclose(one[-1], flight.position_m[-1, [1, 0]]) for one in drawn if len(one) > 1)
+        assert any(np.allclose(line[-1], flight.position_m[-1, [1, 0]]) for line in drawn if len(line) > 1)
 
 
 def test_a_figure_shows_the_plan() -> None:
@@ -282,10 +284,10 @@ def test_a_figure_of_runs_shows_paths_target_and_limits() -> None:
     for number, (ax, place) in enumerate(zip(axes, config.target.position_m, strict=True)):
         drawn = [np.asarray(line.get_ydata()) for line in ax.lines]
         path = np.median(runs.states[:, :, 3 * number], axis=0)
-        assert any(len(one) == len(path) and np.allclose(one, path) for one in drawn)
-        levels = [float(one[0]) for one in drawn if len(one) and np.allclose(one, one[0])]
+        assert any(len(line) == len(path) and np.allclose(line, path) for line in drawn)
+        levels = [float(line[0]) for line in drawn if len(line) and np.allclose(line, line[0])]
         for level in (place, config.sets.state_lower[3 * number], config.sets.state_upper[3 * number]):
-            assert any(level == pytest.approx(one) for one in levels)
+            assert any(level == pytest.approx(drawn_level) for drawn_level in levels)
 
 
 FILE = "nothing-here.toml"

@@ -34,12 +34,12 @@ def source(cell: Any) -> str:
 
 
 def printed(cell: Any) -> str:
-    return "".join(one.text for one in cell.outputs if one.output_type == "stream" and one.name == "stdout")
+    return "".join(output.text for output in cell.outputs if output.output_type == "stream" and output.name == "stdout")
 
 
 def kinds(cell: Any) -> set[str]:
     """Kinds of what a cell shows beside text."""
-    return {kind for one in cell.outputs if one.output_type != "stream" for kind in one.get("data", {})}
+    return {kind for output in cell.outputs if output.output_type != "stream" for kind in output.get("data", {})}
 
 
 def public(code: str) -> list[str]:
@@ -96,7 +96,7 @@ def test_a_notebook_is_whole_and_public(path: Path) -> None:
     assert len(found) >= 5
     assert [cell.execution_count for cell in found] == list(range(1, len(found) + 1))
     assert all(cell.outputs for cell in found)
-    assert not [one for cell in found for one in cell.outputs if one.output_type == "error"]
+    assert not [output for cell in found for output in cell.outputs if output.output_type == "error"]
     assert any("image/png" in kinds(cell) for cell in found)
     code = "\n".join(map(source, found))
     assert set(public(code)) <= set(uavctl.__all__)

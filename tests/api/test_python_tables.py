@@ -27,7 +27,9 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 def messages(path: Path, topic: str) -> list[tuple[float, bytes]]:
     """Times [s] since the first message of the file, and bytes, by mcap's own reader."""
     with path.open("rb") as file:
-        found = [(channel.topic, one.log_time, one.data) for _, channel, one in make_reader(file).iter_messages()]
+        found = [
+            (channel.topic, message.log_time, message.data) for _, channel, message in make_reader(file).iter_messages()
+        ]
     begun = next(at_ns for name, at_ns, _ in found if name == "/uavctl/header")
     return [((at_ns - begun) * 1e-9, data) for name, at_ns, data in found if name == topic]
 
@@ -35,13 +37,17 @@ def messages(path: Path, topic: str) -> list[tuple[float, bytes]]:
 def cells(value: object, name: str) -> dict[str, object]:
     """A JSON value by the columns that docs/recordings.md says it has; lists of records are counted."""
     if isinstance(value, dict):
-        return {key: cell for part, one in value.items() for key, cell in cells(one, f"{name}.{part}").items()}
-    if isinstance(value, list) and any(isinstance(one, dict) for one in value):
+        return {
+            key: cell
+            for part, field_value in value.items()
+            for key, cell in cells(field_value, f"{name}.{part}").items()
+        }
+    if isinstance(value, list) and any(isinstance(entry, dict) for entry in value):
         return {name: len(value)}
     if isinstance(value, list):
         marks = "xyz" if name.endswith(("_m", "_mps", "_mps2", "_rad")) and len(value) == 3 else range(len(value))
         each = zip(marks, value, strict=True)
-        return {key: cell for mark, one in each for key, cell in cells(one, f"{name}_{mark}").items()}
+        return {key: cell for mark, entry in each for key, cell in cells(entry, f"{name}_{mark}").items()}
     return {name: value}
 
 
@@ -66,7 +72,7 @@ def agree(rows: list[dict[str, Any]], told: list[tuple[float, bytes]]) -> int:
                 compared += 1
             else:  # an empty list, or null where others have a record
                 assert cell in (None, 0), name
-        spare = {name for name, cell in row.items() if cell is not None} - {one.removeprefix(".") for one in want}
+        spare = {name for name, cell in row.items() if cell is not None} - {name.removeprefix(".") for name in want}
         assert all(name in ("log_time_ns", "time_s", "utc") or row[name] == 0 for name in spare), spare
     return compared
 
@@ -96,8 +102,12 @@ def test_pandas_holds_it_too_and_whole_numbers_stay_whole(flown: Recording, topi
     for name in table.column_names:
         want = table[name].to_pylist()
         cells = [None if cell is pd.NA else cell for cell in frame[name].tolist()]  # type: ignore[attr-defined]
-        for one, other in zip(want, cells, strict=True):
-            assert one == other or (one is None and other != other) or (one != one and other != other), name
+        for wanted_cell, other in zip(want, cells, strict=True):
+            assert (
+                wanted_cell == other
+                or (wanted_cell is None and other != other)
+                or (wanted_cell != wanted_cell and other != other)
+            ), name
         if str(table.schema.field(name).type) == "int64":
             assert str(frame[name].dtype) == "Int64"
 
@@ -105,7 +115,7 @@ def test_pandas_holds_it_too_and_whole_numbers_stay_whole(flown: Recording, topi
 def test_lists_within_are_tables(flown: Recording) -> None:
     told = [sample for _, data in messages(flown.path, "/uavctl/step_input") for sample in json.loads(data)["samples"]]
     rows = flown.arrow("/uavctl/step_input.samples").to_pylist()
-    assert [[row[f"position_m_{axis}"] for axis in "xyz"] for row in rows] == [one["position_m"] for one in told]
+    assert [[row[f"position_m_{axis}"] for axis in "xyz"] for row in rows] == [record["position_m"] for record in told]
     assert flown.arrow("/uavctl/step_input").num_rows > len({row["row"] for row in rows}) > 5
     assert flown.arrow("/uavctl/step_input.commands").num_rows == 0
 
@@ -121,9 +131,9 @@ def test_topics_are_those_that_mcap_counts(flown: Recording) -> None:
     with flown.path.open("rb") as file:
         summary = make_reader(file).get_summary()
     assert summary is not None
-    held = {one.topic for one in summary.channels.values()}
-    assert {one for one in flown.topics if "." not in one} == {
-        one for one in held if one.startswith(("/uavctl", "/sim", "/raw"))
+    held = {channel.topic for channel in summary.channels.values()}
+    assert {topic for topic in flown.topics if "." not in topic} == {
+        topic for topic in held if topic.startswith(("/uavctl", "/sim", "/raw"))
     }
     for topic in flown.topics:
         flown.arrow(topic)

@@ -67,7 +67,7 @@ def test_a_fleet_that_can_be_flown_is_told_with_its_nearest_boxes(
 ) -> None:
     assert run(["fleet", "check", str(file), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert [one["name"] for one in found["vehicles"]] == ["west", "east"]
+    assert [entry["name"] for entry in found["vehicles"]] == ["west", "east"]
     assert found["nearest_m"] == pytest.approx(EAST[0] - WEST[1])
 
 
@@ -144,10 +144,10 @@ def test_places_in_two_boxes_are_as_far_apart_as_is_said(
     """By the corners, and where boxes overlap along an axis by a place that both have there."""
     apart_m = compute_gap_m(member(north, east), member(other_north, other_east))
     nearest = [
-        min((abs(a - b) for a, b in product(one, other)), default=0.0)
-        if one[1] < other[0] or other[1] < one[0]
+        min((abs(a - b) for a, b in product(state, other)), default=0.0)
+        if state[1] < other[0] or other[1] < state[0]
         else 0.0
-        for one, other in ((north, other_north), (east, other_east))
+        for state, other in ((north, other_north), (east, other_east))
     ]
     assert max(apart_m, 0.0) == pytest.approx(max(nearest))
 
@@ -160,7 +160,7 @@ def flying() -> Iterator[tuple[Path, dict[str, list[Truth]], subprocess.Popen[st
     for number, (name, limits) in enumerate({"west": WEST, "east": EAST}.items()):
         with port() as one, port() as other:
             ports = int(one.getsockname()[1]), int(other.getsockname()[1])
-        vehicle, mocap = (f"127.0.0.1:{one}" for one in ports)
+        vehicle, mocap = (f"127.0.0.1:{number}" for number in ports)
         start = f"sim.start_position_m=[0,{sum(limits) / 2},-1]"
         config = load_config("room-px4", [PATIENT_VEHICLE, start, f"sim.system_id={number + 1}"])
         seats.append(VehicleSetup(config, f"udpout://{vehicle}", f"udpout://{mocap}", truths[name].append))
@@ -181,9 +181,9 @@ def flying() -> Iterator[tuple[Path, dict[str, list[Truth]], subprocess.Popen[st
             )
             with ended(fleet):
                 # Nobody would fly them while the daemons begin.
-                until(lambda: all(one["pid"] for one in status(path)), "both daemons listen", pause_s=0.5)
+                until(lambda: all(health["pid"] for health in status(path)), "both daemons listen", pause_s=0.5)
                 peers.start()
-                until(lambda: all(one["mode"] == "track" for one in status(path)), "both are flown", pause_s=0.5)
+                until(lambda: all(health["mode"] == "track" for health in status(path)), "both are flown", pause_s=0.5)
                 yield path, truths, fleet
         finally:
             done.set()
@@ -193,9 +193,9 @@ def flying() -> Iterator[tuple[Path, dict[str, list[Truth]], subprocess.Popen[st
 
 def status(path: Path) -> list[dict[str, Any]]:
     found = []
-    for one in read_fleet(path).members:
+    for fleet_member in read_fleet(path).members:
         try:
-            health = send_request(ControlRequest(ask="status"), path.parent / "c", one.daemon).status
+            health = send_request(ControlRequest(ask="status"), path.parent / "c", fleet_member.daemon).status
         except NotReachedError:
             health = None
         found.append({"mode": None, "pid": 0} if health is None else {"mode": health.mode, "pid": health.pid})
@@ -218,12 +218,12 @@ def test_all_land_together_and_have_never_been_near_each_other(how: str) -> None
         else:
             fleet.kill()
         for name in lands:
-            until(lambda name=name: any(one.mode == "AUTO.LAND" for one in truths[name]), f"{name} lands")  # type: ignore[misc]
+            until(lambda name=name: any(truth.mode == "AUTO.LAND" for truth in truths[name]), f"{name} lands")  # type: ignore[misc]
         until(lambda: fleet.poll() is not None, "the end")
     places = zip(truths["west"], truths["east"], strict=False)
-    flown = [(one.position_m, other.position_m) for one, other in places if one.mode == other.mode == "OFFBOARD"]
+    flown = [(west.position_m, other.position_m) for west, other in places if west.mode == other.mode == "OFFBOARD"]
     assert len(flown) > 5
-    assert min(max(abs(a - b) for a, b in zip(one[:2], other[:2], strict=True)) for one, other in flown) >= SPACING_M
+    assert min(max(abs(a - b) for a, b in zip(west[:2], other[:2], strict=True)) for west, other in flown) >= SPACING_M
 
 
 def test_a_daemon_that_refuses_to_arm_ends_with_its_own_exit_code(

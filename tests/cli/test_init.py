@@ -26,7 +26,7 @@ def test_the_file_has_a_dozen_keys_and_is_the_room(autopilot: str, tmp_path: Pat
     path = tmp_path / "mine.toml"
     assert run(["init", "--autopilot", autopilot, "--room", "8x4x3", "--out", str(path)]) == 0
     table = tomllib.loads(path.read_text())
-    assert sum(len(one) if isinstance(one, dict) else 1 for one in table.values()) <= 16
+    assert sum(len(value) if isinstance(value, dict) else 1 for value in table.values()) <= 16
     config = load(str(path)).config
     assert get_position_limits_m(config) == {
         "north": (-4.0 + WALL_M, 4.0 - WALL_M),

@@ -22,7 +22,7 @@ from uavctl.cli.usage import EXAMPLES, format_example, list_commands
 from uavctl.config.load import find_keys
 from uavctl.frames import suggest_height_sign
 
-COMMANDS = {" ".join(chain): one for chain, one in list_commands(app)}
+COMMANDS = {" ".join(chain): command for chain, command in list_commands(app)}
 EXIT_CODES = "130 interrupted"  # told once, by `uavctl --help`
 
 
@@ -88,7 +88,7 @@ def test_a_wrong_word_is_told_with_what_was_meant(
     capsys: pytest.CaptureFixture[str], words: str, suggested: list[str]
 ) -> None:
     text = told(capsys, words.split())
-    assert suggested and all(one in text for one in suggested)
+    assert suggested and all(suggestion in text for suggestion in suggested)
 
 
 def test_a_command_without_overrides_is_not_told_to_set_a_key(capsys: pytest.CaptureFixture[str]) -> None:
@@ -112,7 +112,7 @@ def test_words_too_many_or_too_few_are_told_with_what_the_command_takes(
     capsys: pytest.CaptureFixture[str], words: str, unknown: list[str], takes: str
 ) -> None:
     text = told(capsys, words.split())
-    assert takes in text and all(one in text for one in unknown)
+    assert takes in text and all(word in text for word in unknown)
     assert "Unused Tokens" not in text
 
 
@@ -136,13 +136,15 @@ def extras() -> set[str]:
     """Modules of the optional packages, but for those of development."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     names = {
-        one.partition(">")[0].strip().lower()
+        distribution.partition(">")[0].strip().lower()
         for extra, needed in project["optional-dependencies"].items()
         if extra != "dev"
-        for one in needed
+        for distribution in needed
     }
     modules = packages_distributions()
-    return {module for module, of in modules.items() if names & {one.lower() for one in of}} | {"dask"}
+    return {module for module, of in modules.items() if names & {distribution.lower() for distribution in of}} | {
+        "dask"
+    }
 
 
 def test_without_any_extra_every_help_and_every_refusal_works(tmp_path: Path) -> None:

@@ -104,15 +104,15 @@ def test_px4_s_own_climb_to_another_height_ends_at_the_ceiling() -> None:
 
 def flown(folder: Path, seed: int, seconds: float, *settings: str) -> tuple[int, float]:
     """Exit code of a loopback flight of an ArduPilot with GPS, and how far outside the true vehicle was at most [m]."""
-    words = [word for one in settings for word in ("--set", one)]
+    words = [word for setting in settings for word in ("--set", setting)]
     code = run(["loopback", "--config", "room-ardupilot", "--arm", "--takeoff", "1.2", "--seed", str(seed),
                 "--duration", str(seconds), "--out", str(folder), "--json", *words])  # fmt: skip
     config = load_config("room-ardupilot")
     sides = [(config.sets.state_lower[i], config.sets.state_upper[i]) for i in get_position_index(config.plant)]
     beyond = [
         max(low - place, place - high)
-        for one in records(folder / "flight.mcap", Truth)
-        for (low, high), place in zip(sides, one.position_m, strict=True)
+        for truth in records(folder / "flight.mcap", Truth)
+        for (low, high), place in zip(sides, truth.position_m, strict=True)
     ]
     return code, max(beyond)
 

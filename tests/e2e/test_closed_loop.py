@@ -55,8 +55,8 @@ def test_paper_costs_what_the_paper_s_example_costs() -> None:
         entries = paper_flight(seed, 200 if seed in LONG else 50).entries
         first = FlightData.from_records(entry for entry in entries if entry[1] < 50_000_000_000)
         flights.append(summarise(first, wall_s=1.0))
-    assert {one.steps for one in flights} == {50}
-    assert np.mean([one.cost for one in flights]) == pytest.approx(56.2e3, rel=0.03)
+    assert {flight.steps for flight in flights} == {50}
+    assert np.mean([flight.cost for flight in flights]) == pytest.approx(56.2e3, rel=0.03)
 
 
 def test_the_true_state_follows_the_plant_and_the_applied_inputs() -> None:

@@ -45,11 +45,11 @@ def test_without_inertial_data_the_setpoints_play_the_plans_out() -> None:
     """What is decided at a boundary is the plan's input of that step."""
     flight = lockstep("room", 20.0, "sim.seed=4", "estimator.inertial_std_mps2=0")
     plans = {plan.seq: plan for plan in flight.of(Plan)}
-    played = [one for one in flight.of(Decision) if one.boundary and one.plan_index]
+    played = [decision for decision in flight.of(Decision) if decision.boundary and decision.plan_index]
     assert len(played) > 10
-    for one in played:
-        assert one.plan_seq is not None and one.plan_index is not None
-        assert len(plans[one.plan_seq].inputs) > one.plan_index
+    for decision in played:
+        assert decision.plan_seq is not None and decision.plan_index is not None
+        assert len(plans[decision.plan_seq].inputs) > decision.plan_index
 
 
 def test_what_is_planned_has_arrived_by_the_end_of_its_step() -> None:
@@ -57,14 +57,17 @@ def test_what_is_planned_has_arrived_by_the_end_of_its_step() -> None:
     flight = lockstep("room-hahn-stursberg", 16.0, SCHEME, "sim.seed=4")
     config = load_config("room-hahn-stursberg")
     ticks = round(config.plant.dt_s / config.daemon.tick_s)
-    plans, setpoints = {plan.seq: plan for plan in flight.of(Plan)}, {one.at_ns: one for one in flight.of(Setpoint)}
+    plans, setpoints = (
+        {plan.seq: plan for plan in flight.of(Plan)},
+        {setpoint.at_ns: setpoint for setpoint in flight.of(Setpoint)},
+    )
     moving = 0
-    for one in flight.of(Decision):
-        if one.tick % ticks != ticks - 1 or one.plan_seq is None or one.plan_index is None:
+    for decision in flight.of(Decision):
+        if decision.tick % ticks != ticks - 1 or decision.plan_seq is None or decision.plan_index is None:
             continue
-        moving += bool(setpoints[one.at_ns - round(config.daemon.tick_s * 1e9)].limited)
-        planned = plans[one.plan_seq].inputs[one.plan_index]
-        assert setpoints[one.at_ns].accel_mps2 == pytest.approx(planned, abs=1e-6)
+        moving += bool(setpoints[decision.at_ns - round(config.daemon.tick_s * 1e9)].limited)
+        planned = plans[decision.plan_seq].inputs[decision.plan_index]
+        assert setpoints[decision.at_ns].accel_mps2 == pytest.approx(planned, abs=1e-6)
     assert moving > 2
 
 

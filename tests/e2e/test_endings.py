@@ -410,10 +410,10 @@ def test_the_operator_is_answered_while_the_relay_goes_on_alone(tmp_path: Path, 
     flying, alone, landing = rig.statuses
     assert (flying["ending"], flying["relay"]["alone"]) == ("", False)
     assert flying["relay"]["sent"] < alone["relay"]["sent"] < landing["relay"]["sent"]
-    for one, mode in ((alone, "POSCTL"), (landing, "AUTO.LAND")):
-        assert one["relay"]["alone"] and one["relay"]["sent_hz"] > 0.0 and one["relay"]["last_s"] < 3.0
-        assert one["ending"].lower().startswith(Cause.PILOT) and f"in the air, in mode {mode}" in one["ending"]
-        assert one["who_flies"] == HandoverState.RELEASED
+    for status, mode in ((alone, "POSCTL"), (landing, "AUTO.LAND")):
+        assert status["relay"]["alone"] and status["relay"]["sent_hz"] > 0.0 and status["relay"]["last_s"] < 3.0
+        assert status["ending"].lower().startswith(Cause.PILOT) and f"in the air, in mode {mode}" in status["ending"]
+        assert status["who_flies"] == HandoverState.RELEASED
     assert told.relay is not None and told.relay.alone
 
 
@@ -493,7 +493,7 @@ def test_a_simulated_flight_that_is_still_flying_is_told_everywhere(
     assert f"ended: {ending['sentence']}" in " ".join(err.split())
     assert ending["sentence"] in words_of(path.with_suffix(".html"))
     flight = FlightData.from_records(read(path))
-    assert [msgspec.to_builtins(one) for one in flight.endings] == [ending]
+    assert [msgspec.to_builtins(recorded_ending) for recorded_ending in flight.endings] == [ending]
     assert summarise(flight, wall_s=None).ending.sentence == ending["sentence"]
 
 

@@ -145,7 +145,10 @@ def test_row_5_a_packet_older_than_the_window_is_dropped_and_counted() -> None:
 @pytest.mark.fault(6)
 def test_row_6_duplicates_are_dropped_and_counted() -> None:
     samples = one_a_step()
-    twice = [*samples, *(msgspec.structs.replace(one, received_ns=one.received_ns + 40 * MS) for one in samples)]
+    twice = [
+        *samples,
+        *(msgspec.structs.replace(sample, received_ns=sample.received_ns + 40 * MS) for sample in samples),
+    ]
     plain = run(make_controller(), inputs_of(range(8 * TICKS), samples))
     outputs = run(make_controller(), inputs_of(range(8 * TICKS), twice))
     assert [output.setpoint for output in outputs] == [output.setpoint for output in plain]
@@ -194,7 +197,7 @@ BAD_SAMPLES = {
 @pytest.mark.parametrize("fault", BAD_SAMPLES)
 def test_row_12_a_sample_that_is_not_finite_or_absurd_counts_as_lost(fault: str) -> None:
     spoil = BAD_SAMPLES[fault]
-    samples = [spoil(one) if number in (3, 4) else one for number, one in enumerate(one_a_step())]
+    samples = [spoil(sample) if number in (3, 4) else sample for number, sample in enumerate(one_a_step())]
     lost = run(make_controller(), inputs_of(range(6 * TICKS), one_a_step(lost=[3, 4])))
     outputs = run(make_controller(), inputs_of(range(6 * TICKS), samples))
     assert [output.setpoint for output in outputs] == [output.setpoint for output in lost]

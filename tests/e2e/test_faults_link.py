@@ -99,7 +99,7 @@ def test_rows_10_and_11_are_reported_once_a_second() -> None:
 def test_row_12_a_sample_with_such_a_value_counts_as_lost(make: Callable[..., bytes], axis: str, value: float) -> None:
     link = make_link(source=SourceConfig(messages=("VISION_POSITION_ESTIMATE", "LOCAL_POSITION_NED")))
     found = samples(link.receive(make(9, **{axis: value}), NOW).items)
-    assert [find_refusal(one, NOW, build_estimator(load_config("room-hahn-stursberg"))) for one in found] == [
+    assert [find_refusal(item, NOW, build_estimator(load_config("room-hahn-stursberg"))) for item in found] == [
         "sample-invalid"
     ] * len(found)
     assert bool(found) == math.isfinite(value)

@@ -38,17 +38,17 @@ class Flight:
                     self.loop.receive(link, data, arrival_ns)
             outgoing: list[Outgoing] = []
             self.ticked = self.loop.tick(self._tick, at_ns, outgoing.append)
-            for one in outgoing:
-                if one.link == "vehicle":
-                    sent += [message.get_type() for message in decode(one.data)]
-                if uplink or one.link != "vehicle":
-                    self.peers.receive(one.link, one.data, at_ns)
+            for datagram in outgoing:
+                if datagram.link == "vehicle":
+                    sent += [message.get_type() for message in decode(datagram.data)]
+                if uplink or datagram.link != "vehicle":
+                    self.peers.receive(datagram.link, datagram.data, at_ns)
             self.modes.append(self.ticked.decision.mode)
             self._tick += 1
         return sent
 
     def outgoing(self) -> list[Datagram]:
-        return [one for one in self.memory.of(Datagram) if one.outgoing]
+        return [datagram for datagram in self.memory.of(Datagram) if datagram.outgoing]
 
     @property
     def speed_mps(self) -> float:
@@ -67,8 +67,10 @@ def test_px4_that_hears_no_setpoints_leaves_offboard_by_itself_and_we_stop() -> 
     # Nothing is streamed any more, and no mode is asked for: not even once the way is free again.
     since = len(flight.outgoing())
     assert SETPOINT not in flight.run(5.0)
-    commands = [one for d in flight.outgoing()[since:] for one in decode(d.data) if one.get_type() == "COMMAND_LONG"]
-    assert {one.command for one in commands} <= {mavlink.MAV_CMD_SET_MESSAGE_INTERVAL}
+    commands = [
+        message for d in flight.outgoing()[since:] for message in decode(d.data) if message.get_type() == "COMMAND_LONG"
+    ]
+    assert {command.command for command in commands} <= {mavlink.MAV_CMD_SET_MESSAGE_INTERVAL}
     assert flight.modes[-1] is ControlMode.WAIT
     assert any(event.code == "hand-over" and "engaged -> released" in event.text for event in flight.memory.of(Event))
 
@@ -124,6 +126,8 @@ def test_setpoints_die_with_the_control_loop() -> None:
             flight.loop.receive(link, data, arrival_ns)
     assert len(flight.memory.of(Setpoint)) == before
     # Who asks for the time is answered as long as anybody listens, and that is all.
-    late = [message for one in flight.outgoing() if one.at_ns > 60 * TICK_NS for message in decode(one.data)]
+    late = [
+        message for datagram in flight.outgoing() if datagram.at_ns > 60 * TICK_NS for message in decode(datagram.data)
+    ]
     assert {message.get_type() for message in late} == {"TIMESYNC"}
     assert flight.truths[-1].mode != "OFFBOARD"

@@ -63,7 +63,11 @@ def flown(seconds: float, *overrides: str) -> Memory:
 def steps(memory: Memory) -> list[tuple[Decision, Truth]]:
     """Decisions at boundaries with the truth of that moment."""
     truths = {truth.at_ns: truth for truth in memory.of(Truth)}
-    return [(one, truths[one.at_ns]) for one in memory.of(Decision) if one.boundary and one.at_ns in truths]
+    return [
+        (decision, truths[decision.at_ns])
+        for decision in memory.of(Decision)
+        if decision.boundary and decision.at_ns in truths
+    ]
 
 
 def distance_m(decision: Decision, truth: Truth) -> float:
@@ -165,7 +169,7 @@ def test_a_fence_that_shuts_the_vehicle_out_gives_way_is_told_and_left() -> None
     memory = flown(12.0, *SHUT_OUT)
     given = [plan for plan in memory.of(Plan) if plan.gave_way]
     assert given
-    assert {"state", "equilibrium"} <= {one.constraint for plan in given for one in plan.gave_way}
+    assert {"state", "equilibrium"} <= {relaxation.constraint for plan in given for relaxation in plan.gave_way}
     events = [event for event in memory.of(Event) if event.code == "gave-way"]
     assert [event.at_ns for event in events] == [plan.base_ns for plan in given]
     assert {event.text.split(" by ")[0] for event in events} >= {"upper limit of north position gave way"}

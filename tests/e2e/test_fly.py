@@ -118,14 +118,14 @@ def test_a_second_daemon_is_refused_before_it_makes_anything(
     with open_listener(Path(control), make_daemon_name(load_config("room", [f'daemon.vehicle="{url}"']))):
         assert run(words) == 1
     assert "is running" in " ".join(capsys.readouterr().err.split())
-    assert not list(tmp_path.rglob("*.mcap")) and not any(one.exists() for one in find_lock_paths(url))
+    assert not list(tmp_path.rglob("*.mcap")) and not any(lock_path.exists() for lock_path in find_lock_paths(url))
 
 
 @pytest.mark.slow
 def test_an_end_that_was_asked_for_leaves_no_word_for_the_next_daemon(flown: Flown) -> None:
     """The source neither lands nor disarms; yet the next one on this port is flown like any other."""
     url = next(iter(records(flown[3], Header))).command.split("--vehicle ")[1].split()[0]
-    assert not any(one.exists() for one in find_lock_paths(url))
+    assert not any(lock_path.exists() for lock_path in find_lock_paths(url))
 
 
 def test_age_rises_in_the_pause_fallback_at_h_recovery_after(flown: Flown) -> None:

@@ -61,11 +61,11 @@ class Rig:
             ticked = self.loop.tick(self.tick, at_ns, outgoing.append, stop=stop)
             self.mode, self.answers = ticked.decision.mode, ticked.answers
             self.notices = [event.code for event in ticked.notices]
-            for one in outgoing:
-                if one.link == "vehicle":
-                    sent += [message.get_type() for message in decode(one.data) if not asks_for_a_stream(message)]
+            for datagram in outgoing:
+                if datagram.link == "vehicle":
+                    sent += [message.get_type() for message in decode(datagram.data) if not asks_for_a_stream(message)]
                 if listening:
-                    self.peers.receive(one.link, one.data, at_ns)
+                    self.peers.receive(datagram.link, datagram.data, at_ns)
             self.tick += 1
         return sent
 
@@ -173,8 +173,8 @@ def test_of_a_flood_of_positions_a_tick_looks_at_the_newest() -> None:
     rig.run(1, deaf=True)
     newest = rig.memory.of(StepInput)[-1].samples
     assert len(newest) == MAX_SAMPLES and newest[-1].received_ns == rig.tick * TICK_NS - TICK_NS - 1
-    assert [one.received_ns for one in newest] == sorted(one.received_ns for one in newest)
-    assert [one.source for one in newest].count("VISION_POSITION_ESTIMATE 17/19") == 1
+    assert [sample.received_ns for sample in newest] == sorted(sample.received_ns for sample in newest)
+    assert [sample.source for sample in newest].count("VISION_POSITION_ESTIMATE 17/19") == 1
 
 
 def test_a_silent_vehicle_is_braked_and_held_for_a_while_and_then_left_to_its_own_failsafe() -> None:
@@ -212,7 +212,7 @@ def test_landing_is_asked_for_again_by_the_heartbeats_and_five_times_at_most() -
         sent += rig.run(1, deaf=True, listening=False)
     assert sent.count(LAND) == 5
     commands = [(d.at_ns, decode(d.data)[0]) for d in rig.memory.of(Datagram) if d.outgoing]
-    asked = [at_ns for at_ns, one in commands if one.get_type() == LAND and not asks_for_a_stream(one)]
+    asked = [at_ns for at_ns, message in commands if message.get_type() == LAND and not asks_for_a_stream(message)]
     first, *again = [at_ns // 50_000_000 for at_ns in asked]
     # Right after the first heartbeat that comes a second later; the next ones come with the heartbeats.
     expected = next(beat for beat in beats if beat >= first + 20)

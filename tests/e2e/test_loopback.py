@@ -75,7 +75,7 @@ def test_the_recording_says_how_it_was_made(flown: Path) -> None:
 def test_replay_is_identical_and_info_counts(flown: Path, capsys: pytest.CaptureFixture[str]) -> None:
     replayed = document(capsys, "log", "replay", str(flown))
     assert replayed["identical"] and replayed["decisions"] == 120 and replayed["first_difference"] is None
-    topics = {one["topic"]: one["messages"] for one in document(capsys, "log", "info", str(flown))["topics"]}
+    topics = {entry["topic"]: entry["messages"] for entry in document(capsys, "log", "info", str(flown))["topics"]}
     assert topics["/uavctl/decision"] == topics["/uavctl/step_input"] == 120
     assert topics["/sim/truth"] == 12 and topics["/raw/vehicle/out"] > 120
 
@@ -111,7 +111,7 @@ def test_recover_restores_a_cut_file_and_says_so_in_its_exit_code(
     found = document(capsys, "log", "recover", str(cut), str(whole), code=3)
     # the clean file has one message more: the recorder's note of where it comes from
     assert found["lost_bytes"] > 0 and found["messages"] + 1 == sum(
-        isinstance(one, RecordedMessage) for one in walk(whole)
+        isinstance(entry, RecordedMessage) for entry in walk(whole)
     )
     # a prefix of what was recorded, to the record; what is made for viewers is no record
     kept = list(read(whole))

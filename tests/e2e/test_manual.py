@@ -147,7 +147,7 @@ AUTOPILOTS = {"px4": "udpin://0.0.0.0:14540", "ardupilot": "tcp://127.0.0.1:5760
 @pytest.mark.parametrize("autopilot", AUTOPILOTS)
 def test_the_first_flight_as_the_page_says(autopilot: str, at_desk: Desk) -> None:
     def on_page(section: str) -> list[str]:
-        lines = [typed(one.replace("VEHICLE", AUTOPILOTS[autopilot])) for one in commands(FIRST, section)]
+        lines = [typed(line.replace("VEHICLE", AUTOPILOTS[autopilot])) for line in commands(FIRST, section)]
         return [line.replace("--autopilot px4", f"--autopilot {autopilot}") for line in lines if is_typed(line)]
 
     init, design = on_page("1. ")
@@ -186,7 +186,7 @@ def test_the_first_flight_as_the_page_says(autopilot: str, at_desk: Desk) -> Non
 def test_a_fleet_flies_as_the_page_says(at_desk: Desk) -> None:
     page = "docs/fleet.md"
     (sim,) = commands(page, "Try it")
-    check, fly, *orders = (one for one in commands(page) if one != sim)
+    check, fly, *orders = (order for order in commands(page) if order != sim)
     at_desk.run(check)
     duo = at_desk.folder / "duo.toml"
     accepted = f"check.accept={json.dumps(OF_TIME + TIMEOUTS)}"

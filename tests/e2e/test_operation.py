@@ -78,7 +78,7 @@ def test_after_sigkill_nothing_is_sent_and_the_vehicle_s_own_failsafe_acts(air: 
     with ended(air.fly("f")) as process:
         wait_for_flight(air)
         # What is on the disk once stays there: the last second at most may be lost.
-        until(lambda: ControlMode.TRACK in [one.mode for one in decisions(air)], "the flight is on the disk")
+        until(lambda: ControlMode.TRACK in [decision.mode for decision in decisions(air)], "the flight is on the disk")
         kept = len(decisions(air))
         assert air.mode == "OFFBOARD"
         process.send_signal(signal.SIGKILL)
@@ -105,9 +105,9 @@ def test_after_sigkill_nothing_is_sent_and_the_vehicle_s_own_failsafe_acts(air: 
     assert orders == [Order.STAND_BY, Order.ENGAGE]
     sent = [
         message.get_type()
-        for one in records(air.folder / "again" / "flight.mcap", Datagram)
-        if one.outgoing
-        for message in decode(one.data)
+        for datagram in records(air.folder / "again" / "flight.mcap", Datagram)
+        if datagram.outgoing
+        for message in decode(datagram.data)
         if message.get_type() == "SET_POSITION_TARGET_LOCAL_NED"
         or getattr(message, "command", 0) == mavlink.MAV_CMD_DO_SET_MODE
     ]
@@ -151,7 +151,7 @@ def test_the_service_manager_hears_of_the_flight_and_nothing_of_a_hanging_loop(a
             until(heard_enough, "what the manager is to be told", pause_s=0.0)
 
         with ended(air.fly("f", environ=environ)) as process:
-            hear(lambda: heard.count("WATCHDOG=1") > 10 and any("OFFBOARD armed" in one for one in heard))
+            hear(lambda: heard.count("WATCHDOG=1") > 10 and any("OFFBOARD armed" in text for text in heard))
             process.send_signal(signal.SIGSTOP)
             manager.settimeout(1.0)
             with pytest.raises(TimeoutError):

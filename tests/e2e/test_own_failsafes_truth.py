@@ -75,6 +75,6 @@ def test_px4_s_blind_descent_is_a_failsafe_and_positions_go_on_as_soon_as_they_a
     poses = [at_ns for at_ns, _ in flight.sent("VISION_POSITION_ESTIMATE") if at_ns > back_ns]
     if descent[-1] > back_ns + SECOND:  # it is still in its failsafe then
         assert flight.loop.ending.cause == Cause.FAILSAFE_LANDED
-        assert poses[0] - back_ns < SECOND and len([one for one in poses if one < descent[-1]]) > 20
+        assert poses[0] - back_ns < SECOND and len([pose for pose in poses if pose < descent[-1]]) > 20
     else:
         assert dark_s > 10.0

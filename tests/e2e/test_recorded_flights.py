@@ -107,11 +107,11 @@ def test_a_recorded_failsafe_that_holds_is_told_from_a_pilot_who_holds() -> None
 def test_the_client_s_exchange_foretells_the_vehicle_s_clock_until_the_next_answer(name: str) -> None:
     """To half of the longest round trip that counts; simulated clocks run up to 3.4 % slow, and unevenly."""
     exchange, trips, off_ms = Exchange(), TimesyncClock(10_000_000_000), []
-    for one in packets(name):
-        for trip in exchange.take(one.data, one.at_ns, outgoing=one.outgoing):
-            foretold = trips.offset_ns(one.at_ns)
-            measured = (trip.sent_ns + one.at_ns) // 2 - trip.remote_ns
-            if trips.add_answer(trip.sent_ns, trip.remote_ns, one.at_ns) and foretold is not None:
+    for packet in packets(name):
+        for trip in exchange.take(packet.data, packet.at_ns, outgoing=packet.outgoing):
+            foretold = trips.offset_ns(packet.at_ns)
+            measured = (trip.sent_ns + packet.at_ns) // 2 - trip.remote_ns
+            if trips.add_answer(trip.sent_ns, trip.remote_ns, packet.at_ns) and foretold is not None:
                 off_ms.append(abs(measured - foretold) * 1e-6)
     assert len(off_ms) > 40
     assert np.median(off_ms) < (3.0 if name in OF_OTHERS else 5.0)
@@ -173,9 +173,9 @@ def frames(name: str) -> Frames:
     """What the rig sent and what of it came: nothing of `identify` is asked."""
     first_ns = packets(name)[0].at_ns
     arrivals_ns: dict[int, int] = {}
-    for one in packets(name):
-        if one.data[5] == 20 and one.data[7] == 102:
-            arrivals_ns.setdefault(1000 * int.from_bytes(one.data[10:18], "little"), one.at_ns)
+    for packet in packets(name):
+        if packet.data[5] == 20 and packet.data[7] == 102:
+            arrivals_ns.setdefault(1000 * int.from_bytes(packet.data[10:18], "little"), packet.at_ns)
     stamps_s = (np.array(sorted(arrivals_ns)) - first_ns) * 1e-9
     dark = np.zeros(stamps_s.size, dtype=np.bool_)
     dark_s = 0.0
@@ -226,7 +226,7 @@ def test_all_but_a_hundredth_of_the_positions_come_as_late_as_the_rig_was_told(n
     """Of one flight only those before its wind: 3 s later, and for 43 s, 7 % of the frames came 50 to 95 ms late."""
     until_s = seen_s(BLOWN, "ORDER set SIH_WIND")[0] if name == BLOWN else np.inf
     until_ns = packets(name)[0].at_ns + until_s * 1e9
-    found = from_tlog([one for one in packets(name) if one.at_ns < until_ns], config_of(name))
+    found = from_tlog([packet for packet in packets(name) if packet.at_ns < until_ns], config_of(name))
     late_s = fit_link(found.seen, found.gaps).delay_quantiles_s[4]
     assert late_s == pytest.approx(SLOWEST_S - 0.01 * (SLOWEST_S - QUICKEST_S), abs=0.010)
 
@@ -238,7 +238,7 @@ def test_the_loss_of_arducopter_s_long_flight_is_also_the_one_the_rig_was_told()
 
 
 def test_what_px4_says_of_itself_is_no_camera_s_though_there_is_more_of_it() -> None:
-    kinds = [one.data[7] | one.data[8] << 8 for one in packets(WAYPOINTS) if one.data[5] in (1, 20)]
+    kinds = [packet.data[7] | packet.data[8] << 8 for packet in packets(WAYPOINTS) if packet.data[5] in (1, 20)]
     assert kinds.count(331) >= kinds.count(102)  # ODOMETRY, VISION_POSITION_ESTIMATE
     assert link(WAYPOINTS).rate_hz == pytest.approx(40.0, rel=0.01)
 
@@ -261,9 +261,9 @@ def test_positions_are_captured_where_the_vehicle_truly_was(name: str) -> None:
 def _first_capture_s(name: str) -> float:
     """Stamp of the first position, which is of the recorder's clock, since the first packet."""
     stamps = [
-        int.from_bytes(one.data[10:18], "little") * 1000
-        for one in packets(name)
-        if one.data[5] == 20 and one.data[7] == 102
+        int.from_bytes(packet.data[10:18], "little") * 1000
+        for packet in packets(name)
+        if packet.data[5] == 20 and packet.data[7] == 102
     ]
     return (min(stamps) - packets(name)[0].at_ns) * 1e-9
 
@@ -273,10 +273,10 @@ def test_px4_s_response_is_that_of_its_own_log_though_its_clock_ran_slow() -> No
     """By its log: dead time and lag together 0.24 and 0.32 s, drag 0.97 and 1.08 1/s, gain 0.98 and 1.10."""
     config = load_config("room-hahn-stursberg", ["daemon.mocap=tlog", "daemon.vehicle=tlog", OWN_ESTIMATE])
     found = identify(from_tlog(packets(OFFBOARD), config), config, lambda: None).result
-    together_s = [found.candidates[0].dead_time_s + one.lag_s for one in found.response[:2]]
+    together_s = [found.candidates[0].dead_time_s + axis.lag_s for axis in found.response[:2]]
     assert together_s == pytest.approx([0.24, 0.32], abs=0.09)
-    assert [one.drag_1ps for one in found.response[:2]] == pytest.approx([0.974, 1.080], abs=0.1)
-    assert [one.r2 > 0.99 for one in found.response[:2]] == [True, True]
+    assert [axis.drag_1ps for axis in found.response[:2]] == pytest.approx([0.974, 1.080], abs=0.1)
+    assert [axis.r2 > 0.99 for axis in found.response[:2]] == [True, True]
 
 
 STEP_RAMP_S = 1.0 / 5.0  # which ArduPilot makes of a step of 1 m/s² at PSC_JERK_XY 5
@@ -292,10 +292,10 @@ def test_arducopter_s_response_to_steps_is_that_of_its_own_log() -> None:
     """
     config = load_config("room-hahn-stursberg", ["daemon.mocap=tlog", "daemon.vehicle=tlog", OWN_ESTIMATE])
     boot_ns, estimates = _own_estimates(GPS)
-    steps = from_tlog([one for one in packets(GPS) if one.at_ns < boot_ns + 87.4e9], config)
+    steps = from_tlog([packet for packet in packets(GPS) if packet.at_ns < boot_ns + 87.4e9], config)
     flown = flown_stretches(steps, config)
     found = choose_dead_time(flown, (0, 1), kinds_of(steps, config)[0][:2], lambda: None)
-    assert found.name == "drag-lag" and sum(one.length_s for one in flown) > 30.0
+    assert found.name == "drag-lag" and sum(stretch.length_s for stretch in flown) > 30.0
     for axis, gain, drag_1ps in ((0, 1.027, 0.009), (1, 1.026, 0.011)):
         fit = found.fits[axis]
         late_s = _lateness_s(estimates, axis, (55.4, 71.4) if axis == 0 else (71.4, 87.4))
@@ -309,10 +309,10 @@ def test_arducopter_s_response_to_steps_is_that_of_its_own_log() -> None:
 def _own_estimates(name: str) -> tuple[int, NDArray[np.float64]]:
     """When the autopilot booted [ns], and rows of its own estimate: time since then [s], position [m]."""
     boot_ns, rows = 0, []
-    for one in packets(name):
-        if not one.outgoing and one.data[7:10] == b"\x20\x00\x00":  # LOCAL_POSITION_NED, zeros at its end cut
-            boot_ms, *position_m = struct.unpack("<I3f", one.data[10:-2].ljust(16, b"\0")[:16])
-            boot_ns = boot_ns or one.at_ns - 1_000_000 * boot_ms
+    for packet in packets(name):
+        if not packet.outgoing and packet.data[7:10] == b"\x20\x00\x00":  # LOCAL_POSITION_NED, zeros at its end cut
+            boot_ms, *position_m = struct.unpack("<I3f", packet.data[10:-2].ljust(16, b"\0")[:16])
+            boot_ns = boot_ns or packet.at_ns - 1_000_000 * boot_ms
             rows.append((boot_ms * 1e-3, *position_m))
     return boot_ns, np.array(rows)
 
@@ -322,7 +322,7 @@ def _lateness_s(estimates: NDArray[np.float64], axis: int, span_s: tuple[float, 
     rows = truth(GPS_TRUTH)
     part = estimates[(estimates[:, 0] > span_s[0]) & (estimates[:, 0] < span_s[1])]
     tried_s = np.arange(-0.1, 0.2, 0.005)
-    apart = [part[:, 1 + axis] - np.interp(part[:, 0] - one, rows[:, 0], rows[:, 1 + axis]) for one in tried_s]
+    apart = [part[:, 1 + axis] - np.interp(part[:, 0] - shift_s, rows[:, 0], rows[:, 1 + axis]) for shift_s in tried_s]
     return float(tried_s[np.argmin(np.std(apart, axis=1))])
 
 
@@ -346,7 +346,7 @@ def test_a_good_set_up_passes_the_check_over_a_link_that_loses_in_bursts(
     name: str, since_s: float, seconds: float
 ) -> None:
     items = checked(name, since_s, seconds)
-    assert [one for one, state in items.items() if state == BAD] == []
+    assert [name for name, state in items.items() if state == BAD] == []
     assert items["own position"] == GOOD
     assert items["position loss"] == GOOD
     assert items["position in the room"] == GOOD
@@ -377,11 +377,11 @@ def test_parameters_that_another_client_read_are_judged_as_that_flight_was_set_u
     items = checked(name, 0.0, seconds)
     # An ArduPilot's 3 s, as shipped, are more than a room holds; so is PX4's second at the preset's 4 m/s².
     timeout = "COM_OF_LOSS_T" if name == OFFBOARD else "GUID_TIMEOUT"
-    assert [one for one, state in items.items() if state == BAD] == [timeout]
-    assert {one: items[one] for one in noted} == dict.fromkeys(noted, NOTE)
-    assert {one: items[one] for one in good} == dict.fromkeys(good, GOOD)
+    assert [name for name, state in items.items() if state == BAD] == [timeout]
+    assert {name: items[name] for name in noted} == dict.fromkeys(noted, NOTE)
+    assert {name: items[name] for name in good} == dict.fromkeys(good, GOOD)
     standing = ["vehicle", "armed", "landed", "position rate", "position loss", "position in the room"]
-    assert {one: items[one] for one in standing} == dict.fromkeys(standing, GOOD)
+    assert {name: items[name] for name in standing} == dict.fromkeys(standing, GOOD)
     assert items["vehicle clock"] == NOTE
 
 
@@ -391,7 +391,7 @@ def test_a_vehicle_that_flies_above_the_room_is_found_out_of_it(name: str, since
     lower, _ = room_of(config_of(name))
     assert lower[2] > -5.0
     items = checked(name, since_s, 10.0)
-    assert [one for one, state in items.items() if state == BAD] == ["position in the room"]
+    assert [name for name, state in items.items() if state == BAD] == ["position in the room"]
     assert (items["armed"], items["landed"], items["position loss"]) == (NOTE, NOTE, GOOD)
 
 
@@ -441,7 +441,7 @@ def codes(memory: Memory) -> list[str]:
 
 def _lost(memory: Memory) -> None:
     decisions = memory.of(Decision)
-    assert any(one.mode is not ControlMode.TRACK for one in decisions)
+    assert any(decision.mode is not ControlMode.TRACK for decision in decisions)
     assert "fallback-brake" in codes(memory)
 
 
@@ -500,7 +500,7 @@ def test_the_page_of_each_says_what_matters(
 def times_s(heard: Listened, begin: str, code: str = "hand-over") -> list[float]:
     """When events of a code came whose texts begin so, since the first packet [s]."""
     found = heard.memory.of(Event)
-    return [heard.since_s(one.at_ns) for one in found if one.code == code and one.text.startswith(begin)]
+    return [heard.since_s(event.at_ns) for event in found if event.code == code and event.text.startswith(begin)]
 
 
 def test_the_wind_beyond_the_authority_is_met_before_it_has_blown_the_vehicle_out_of_the_room() -> None:
@@ -515,10 +515,10 @@ def test_the_wind_beyond_the_authority_is_met_before_it_has_blown_the_vehicle_ou
     assert codes(heard.memory).index("envelope-response") < codes(heard.memory).index("fallback-land")
 
     # What the console, the exit code and the page say of it: the reason is the envelope's own.
-    (reason,) = [one.text for one in heard.memory.of(Event) if one.code == "envelope-response"]
+    (reason,) = [event.text for event in heard.memory.of(Event) if event.code == "envelope-response"]
     assert heard.loop.let_go == reason and reason in heard.loop.ending.sentence
     assert heard.loop.ending.exit_code == 1
-    assert [one.text for one in heard.notices if "engaged -> landing" in one.text]
+    assert [notice.text for notice in heard.notices if "engaged -> landing" in notice.text]
     assert reason in " ".join(words_of(page_of(heard.memory)).text)
 
     rows = truth(BLOWN)
@@ -558,9 +558,9 @@ def test_a_failsafe_in_the_climb_the_pilot_and_the_order_are_each_told_at_their_
     answers_s = times_s(heard, "DO_SET_MODE: ACCEPTED", "command-ack")
     assert ordered_s < answers_s[-1] < ordered_s + 0.5
     assert seen_s(RELEASED, "ACK 176 result 1")[0] > pilot_s[1]
-    assert not any("REJECTED" in one.text or "DENIED" in one.text for one in heard.memory.of(Event))
+    assert not any("REJECTED" in event.text or "DENIED" in event.text for event in heard.memory.of(Event))
 
-    noticed = " ".join(one.text for one in heard.notices)
+    noticed = " ".join(notice.text for notice in heard.notices)
     assert all(begin in noticed for begin in passages if "failsafe" in begin or "released (" in begin)
     on_the_page = " ".join(words_of(page_of(heard.memory)).text)
     assert all(begin in on_the_page for begin in passages)

@@ -17,8 +17,8 @@ SEEDS = (0, 5, 13, 14, 15)  # quick ones that together have what is asked for be
 @pytest.mark.slow
 def test_flights_with_everything_amiss_replay_bit_for_bit(tmp_path: Path) -> None:
     found = [replayed(seed, tmp_path) for seed in SEEDS]
-    assert {one.seed: one.result.first_difference for one in found if not one.good} == {}
-    had = {word for one in found for word in one.words}
+    assert {flight.seed: flight.result.first_difference for flight in found if not flight.good} == {}
+    had = {word for flight in found for word in flight.words}
     assert {
         "px4",
         "ardupilot",
@@ -35,10 +35,10 @@ def test_flights_with_everything_amiss_replay_bit_for_bit(tmp_path: Path) -> Non
         "one connection",
     } <= had
     seen = Counter[str]()
-    for one in found:
-        seen.update(one.seen)
+    for flight in found:
+        seen.update(flight.seen)
     assert {f"Decision {mode}" for mode in ("wait", "track", "brake", "hold", "land", "stopped")} <= seen.keys()
-    assert max(len(segment_files(one.path)) for one in found) > 1
+    assert max(len(segment_files(flight.path)) for flight in found) > 1
     report = tally(found)
     assert (report["replayed"], report["identical"], report["wrong"]) == (len(SEEDS), len(SEEDS), {})
 

@@ -95,7 +95,7 @@ def test_the_pilot_s_stick_in_the_climb_is_told_and_keeps_positions_until_the_gr
     flight.run(6.0)  # its rotors have spun up
     flight.stick("POSCTL")
     flight.run(3.0, until=HandoverState.RELEASED)
-    assert [one.severity for one in flight.notices if one.code == "hand-over"] == [Severity.WARNING]
+    assert [notice.severity for notice in flight.notices if notice.code == "hand-over"] == [Severity.WARNING]
     before = flight.commands()
     flight.run(10.0, stop=True)
     assert not flight.loop.finished and flight.commands() == before
@@ -126,7 +126,7 @@ SET_MODE = 176
 
 @pytest.mark.fault(25, 65)
 @pytest.mark.parametrize(
-    "after", [one if one % 5 == 0 else pytest.param(one, marks=pytest.mark.slow) for one in range(1, 26)]
+    "after", [step if step % 5 == 0 else pytest.param(step, marks=pytest.mark.slow) for step in range(1, 26)]
 )
 def test_a_request_that_was_not_answered_is_not_repeated_after_the_pilot_s_switch(after: int) -> None:
     """Heartbeats show a mode up to a second late: a repetition meanwhile would take it from the pilot."""

@@ -49,8 +49,8 @@ class Watched:
         kinds = {type(record) for _, _, record in self.memory.entries[before:]}
         if Plan in kinds and LinkStats not in kinds and self.at_s > WARM_S:  # counters of a second are not of the tick
             self.planning.append(files)
-        for one in outgoing:
-            send(one)
+        for datagram in outgoing:
+            send(datagram)
 
 
 def crossed(call: Callable[[], T]) -> tuple[T, frozenset[str]]:

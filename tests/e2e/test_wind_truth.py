@@ -203,8 +203,8 @@ def watched(*, feels: bool) -> tuple[MonitorState, str | None, float]:
     setpoint: Vec3 | None = None
     acts, samples = ZERO, list[PositionSample]()
     begin_ns = now_ns = packets(STEADY)[0].at_ns
-    for one in packets(STEADY):
-        if one.at_ns >= now_ns + TICK_NS:
+    for packet in packets(STEADY):
+        if packet.at_ns >= now_ns + TICK_NS:
             now_ns += TICK_NS
             if setpoint is not None:
                 seen = Observation(
@@ -221,11 +221,11 @@ def watched(*, feels: bool) -> tuple[MonitorState, str | None, float]:
                 if breach.cause is not None:
                     return watching, breach.cause, (now_ns - begin_ns) * 1e-9
             acts, samples = setpoint or ZERO, []
-        if one.outgoing:
-            (frame,) = scan_frames(one.data, final=True).frames
+        if packet.outgoing:
+            (frame,) = scan_frames(packet.data, final=True).frames
             setpoint = struct.unpack_from("<3f", frame.data, SETPOINT_ACCEL)
             continue
-        for item in link.receive(one.data, one.at_ns).items:
+        for item in link.receive(packet.data, packet.at_ns).items:
             if isinstance(item, PositionSample):
                 samples.append(item)
             elif isinstance(item, VehicleMotion):

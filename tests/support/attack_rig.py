@@ -55,8 +55,8 @@ class FakeVehicle:
         self._vehicle, self._cameras = port(), port()
         self._vehicle.connect(("127.0.0.1", vehicle_port))
         self._cameras.connect(("127.0.0.1", mocap_port))
-        for one in (self._vehicle, self._cameras):
-            one.setblocking(False)
+        for connection in (self._vehicle, self._cameras):
+            connection.setblocking(False)
         stamp = int((time.time() - EPOCH_S) * SECOND)
         self._voice: Peer = SignedPeer(KEY, stamp) if signed else Peer()
         self._eyes: Peer = SignedPeer(KEY, stamp, 4, 17, 18) if signed else Peer(17, 18)
@@ -151,7 +151,7 @@ class FakeVehicle:
 
     def _place(self) -> tuple[float, float, float]:
         """Where it is, with the cameras' noise: positions that are all the same count as stuck."""
-        north, east, down = (one + self._chance.gauss(0.0, NOISE_M) for one in self.position)
+        north, east, down = (coordinate + self._chance.gauss(0.0, NOISE_M) for coordinate in self.position)
         return north, east, down
 
     def _move(self, now_s: float) -> None:
@@ -208,7 +208,7 @@ class Flight:
         self.folder = folder
         with port() as one, port() as other:
             self.vehicle_port, self.mocap_port = int(one.getsockname()[1]), int(other.getsockname()[1])
-        urls = [f"udpin://127.0.0.1:{one}" for one in (self.vehicle_port, self.mocap_port)]
+        urls = [f"udpin://127.0.0.1:{port}" for port in (self.vehicle_port, self.mocap_port)]
         options = ["--vehicle", urls[0], "--mocap", urls[1], "--set", "clock.latency_s=0.0"]
         if not listed:
             options += ["--set", 'security.allow=["127.0.0.1"]']
@@ -325,7 +325,7 @@ class Flight:
 
     def recorder_dropped(self) -> int:
         """Records that the recorder could not keep."""
-        notes = [one for _, _, one in read(self.folder / "f" / "flight.mcap") if isinstance(one, RecorderNote)]
+        notes = [record for _, _, record in read(self.folder / "f" / "flight.mcap") if isinstance(record, RecorderNote)]
         return notes[-1].dropped if notes else -1
 
 

@@ -174,9 +174,9 @@ def flood(
     say()
     sent = 0
     sockets = [socket.socket(type=socket.SOCK_DGRAM) for _ in range(senders)]
-    for one in sockets:
-        one.bind((source, 0))
-        one.setblocking(False)
+    for sock in sockets:
+        sock.bind((source, 0))
+        sock.setblocking(False)
     if log is not None:
         log.touch()
     begun_s = time.monotonic()
@@ -185,9 +185,9 @@ def flood(
         due = min(due, sent + 20)  # a machine that was asleep sends no burst
         for _ in range(due - sent):
             data = say()
-            for one in sockets:
+            for sock in sockets:
                 try:
-                    one.sendto(data, to)
+                    sock.sendto(data, to)
                 except OSError:
                     continue
         behind = int(now_s * per_s) - due
@@ -195,8 +195,8 @@ def flood(
             begun_s += behind / per_s
         sent = due
         time.sleep(BATCH_S)
-    for one in sockets:
-        one.close()
+    for sock in sockets:
+        sock.close()
     return sent * senders
 
 

@@ -57,7 +57,7 @@ class Flight:
         while True:
             times = [self.autopilot.next_ns, self._coming[0][0] if self._coming else None]
             times.append(self._next_ns if self.external else None)
-            at_ns = max(min((one for one in times if one is not None), default=end_ns), self.now_ns)
+            at_ns = max(min((time_ns for time_ns in times if time_ns is not None), default=end_ns), self.now_ns)
             if at_ns > end_ns:
                 break
             self.vehicle.advance(at_ns)

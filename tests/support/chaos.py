@@ -119,8 +119,8 @@ class World:
 
     def arrived(self, at_ns: int) -> tuple[PositionSample, ...]:
         """What has come in by a tick."""
-        here = tuple(one for one in self._waiting if one.received_ns <= at_ns)
-        self._waiting = [one for one in self._waiting if one.received_ns > at_ns]
+        here = tuple(sample for sample in self._waiting if sample.received_ns <= at_ns)
+        self._waiting = [sample for sample in self._waiting if sample.received_ns > at_ns]
         return here
 
 

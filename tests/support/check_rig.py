@@ -27,14 +27,14 @@ class Checked:
 
     def __init__(self, flight: Preflight, at_ns: int) -> None:
         self.flight = flight
-        self.items = {one.name: one for one in flight.make_items(at_ns)}
+        self.items = {item.name: item for item in flight.make_items(at_ns)}
 
     def __getitem__(self, name: str) -> Item:
         return self.items[name]
 
     @property
     def bad(self) -> list[str]:
-        return [name for name, one in self.items.items() if one.state is ItemState.BAD]
+        return [name for name, item in self.items.items() if item.state is ItemState.BAD]
 
 
 def look(

@@ -162,16 +162,16 @@ def toml_document(table: dict[str, Any], path: str = "") -> Iterator[str]:
     lists = {
         key: value
         for key, value in table.items()
-        if isinstance(value, list) and value and all(isinstance(one, dict) for one in value)
+        if isinstance(value, list) and value and all(isinstance(entry, dict) for entry in value)
     }
     yield from (f"{key} = {toml_text(value)}" for key, value in table.items() if key not in tables and key not in lists)
     for key, value in tables.items():
         yield f"[{path}{key}]"
         yield from toml_document(value, f"{path}{key}.")
     for key, listed in lists.items():
-        for one in listed:
+        for entry in listed:
             yield f"[[{path}{key}]]"
-            yield from toml_document(one, f"{path}{key}.")
+            yield from toml_document(entry, f"{path}{key}.")
 
 
 def leaves(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
@@ -180,18 +180,18 @@ def leaves(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
         yield path
     if isinstance(value, dict | list):
         inner: Any = value.items() if isinstance(value, dict) else enumerate(value)
-        for key, one in inner:
-            yield from leaves(one, (*path, key))
+        for key, value in inner:
+            yield from leaves(value, (*path, key))
 
 
 def ranges(section: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], tuple[float, float, bool]]]:
     """Least and largest number that a key takes, and whether it is a whole one, by the key's path; of lists too."""
-    for one in msgspec.structs.fields(section):
-        here = (*path, one.encode_name)
-        if isinstance(one.type, type) and issubclass(one.type, msgspec.Struct):
-            yield from ranges(one.type, here)
+    for section_field in msgspec.structs.fields(section):
+        here = (*path, section_field.encode_name)
+        if isinstance(section_field.type, type) and issubclass(section_field.type, msgspec.Struct):
+            yield from ranges(section_field.type, here)
         else:
-            found = next(_numbers(one.type), None)
+            found = next(_numbers(section_field.type), None)
             if found is not None:
                 yield here, found
 
@@ -341,9 +341,9 @@ class Mutants:
             return f"text {str(new)[:20]!r}", new
         if isinstance(value, list):
             how = rng.choice(("longer", "shorter", "much longer", "odd", "nested", "bigger", "shifted"))
-            if how == "shifted" and all(isinstance(one, int | float) for one in value):
+            if how == "shifted" and all(isinstance(number, int | float) for number in value):
                 offset = rng.choice((-3.0, -0.7, 0.7, 3.0))  # limits that leave zero out, targets beyond a wall
-                return f"shifted by {offset:g}", [one + offset for one in value]
+                return f"shifted by {offset:g}", [number + offset for number in value]
             if how in ("bigger", "shifted"):
                 factor = rng.choice((*FACTORS, 1e9, 1e200))
                 return f"times {factor:g}", _scaled(value, factor)
@@ -590,7 +590,7 @@ def _number(word: str) -> float:
 
 def _scaled(value: Any, factor: float) -> Any:
     if isinstance(value, list):
-        return [_scaled(one, factor) for one in value]
+        return [_scaled(number, factor) for number in value]
     return value * factor if isinstance(value, int | float) and not isinstance(value, bool) else value
 
 

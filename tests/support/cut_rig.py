@@ -62,10 +62,10 @@ class Cuts:
 
     def places(self) -> list[tuple[int, int]]:
         """File and size of every cut beside the end of a chunk, of its index, and around what is not a chunk."""
-        offsets = {(one.file, offset) for one in self.chunks for offset in (one.end, one.indexed)}
+        offsets = {(chunk.file, offset) for chunk in self.chunks for offset in (chunk.end, chunk.indexed)}
         near = {(file, offset + by) for file, offset in offsets for by in (-1, 0, 1)}
         for file, size in enumerate(self._sizes):
-            last = max(one.indexed for one in self.chunks if one.file == file)
+            last = max(chunk.indexed for chunk in self.chunks if chunk.file == file)
             others = (0, 1, 8, 9, (last + size) // 2, size - 40, size - 9, size - 8, size - 1, size)
             near |= {(file, at) for at in others}
         return sorted(near)
@@ -81,7 +81,7 @@ class Cuts:
         for whole in self.files[:file]:
             shutil.copy(whole, folder)
         (folder / self.files[file].name).write_bytes(self.files[file].read_bytes()[:size])
-        whole_chunks = [one for one in self.chunks if (one.file, one.end) <= (file, size)]
+        whole_chunks = [chunk for chunk in self.chunks if (chunk.file, chunk.end) <= (file, size)]
         at_the_end = file == len(self.files) - 1 and size == self._sizes[file]
         if not whole_chunks:
             return refused(folder)
@@ -145,9 +145,13 @@ def _chunks(files: tuple[Path, ...]) -> Iterator[Chunk]:
             summary = make_reader(file).get_summary()
             assert summary is not None, path
             file.seek(0)
-            chunks = [one for one in StreamReader(file, emit_chunks=True).records if isinstance(one, records.Chunk)]
+            chunks = [
+                record for record in StreamReader(file, emit_chunks=True).records if isinstance(record, records.Chunk)
+            ]
         for index, chunk in zip(summary.chunk_indexes, chunks, strict=True):
             held = breakup_chunk(chunk, validate_crc=True)
-            counts.update(summary.channels[one.channel_id].topic for one in held if isinstance(one, records.Message))
+            counts.update(
+                summary.channels[record.channel_id].topic for record in held if isinstance(record, records.Message)
+            )
             end = index.chunk_start_offset + index.chunk_length
             yield Chunk(number, end, end + index.message_index_length, counts[TICK], counts[DECISION])

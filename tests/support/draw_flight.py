@@ -80,7 +80,7 @@ class Drawn:
             "reboot": self.reboot_step is not None,
             "signed": self.signed,
             "viewers": self.viewers,
-            **{f"fault {one.kind}": True for one in config.sim.fault},
+            **{f"fault {fault.kind}": True for fault in config.sim.fault},
         }
         return tuple(word for word, is_so in said.items() if is_so)
 

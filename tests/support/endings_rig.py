@@ -232,7 +232,7 @@ class Told:
         self.console = " ".join(err.split())
         self.path = rig.folder / "flight.mcap"
         self.records = [record for _, _, record in read(self.path)]
-        self.recorded = [one for one in self.records if isinstance(one, Ending)]
+        self.recorded = [record for record in self.records if isinstance(record, Ending)]
         page = self.path.with_suffix(".html")
         self.page = words_of(page) if page.exists() else ""
         health = None if rig.watch is None else rig.watch.make_health()
@@ -256,7 +256,7 @@ class Told:
         assert sentence in self.page
         assert self.ending["exit_code"] == self.code == (0 if self.ending["as_ordered"] else 1)
         assert self.ending["cause"] == self.summary["ended"]
-        assert [one.sentence for one in self.recorded] == [sentence]
+        assert [ending.sentence for ending in self.recorded] == [sentence]
         again = summarise(FlightData.from_records(read(self.path)), wall_s=None)
         assert (again.ending.sentence, again.ending.exit_code) == (sentence, self.code)
 
@@ -268,9 +268,9 @@ class Told:
         if self.relay is None:
             return
         count, kept = self.relay.sent, sum(self.relay.kept.values())
-        assert [int(one) for one in re.findall(r"\d+(?= positions| back)", recorded.relay)] == [count, kept]
+        assert [int(number) for number in re.findall(r"\d+(?= positions| back)", recorded.relay)] == [count, kept]
         assert self.relay.last_s is not None and self.relay.last_s < 5.0
-        stats = [one for one in self.records if isinstance(one, RelayStats)]
+        stats = [record for record in self.records if isinstance(record, RelayStats)]
         assert stats and stats[-1].sent <= count and stats[-1].alone == self.relay.alone
         assert f"relay: {recorded.relay}" in self.console and recorded.relay in self.page
 

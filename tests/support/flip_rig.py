@@ -107,14 +107,16 @@ class Flips:
 
 
 def _without_state(found: RecordingInfo) -> RecordingInfo:
-    segments = tuple(msgspec.structs.replace(one, finished=False) for one in found.segments)
+    segments = tuple(msgspec.structs.replace(segment, finished=False) for segment in found.segments)
     return msgspec.structs.replace(found, finished=False, damage=(), segments=segments, attachments=())
 
 
 def _check_parts(path: Path, entries: list[Item]) -> None:
     """Statistics, channels, schemas and index of a file, by the format's own readers, are those of its messages."""
     with path.open("rb") as file:
-        linear = [one for one in StreamReader(file, validate_crcs=True).records if type(one).__name__ == "Message"]
+        linear = [
+            record for record in StreamReader(file, validate_crcs=True).records if type(record).__name__ == "Message"
+        ]
         file.seek(0)
         reader = make_reader(file, validate_crcs=True)
         summary = reader.get_summary()
@@ -127,7 +129,7 @@ def _check_parts(path: Path, entries: list[Item]) -> None:
     assert (statistics.chunk_count, statistics.channel_count) == (len(summary.chunk_indexes), len(summary.channels))
     topics = Counter(topic for topic, _, _ in entries)
     assert {summary.channels[key].topic: n for key, n in statistics.channel_message_counts.items()} == topics
-    assert [(channel.topic, one.log_time) for _, channel, one in indexed] == [entry[:2] for entry in entries]
+    assert [(channel.topic, message.log_time) for _, channel, message in indexed] == [entry[:2] for entry in entries]
     for schema, channel, _ in indexed:
         wanted = get_definition(channel.topic)
         assert channel.message_encoding == wanted.encoding

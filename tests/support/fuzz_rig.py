@@ -97,7 +97,7 @@ class Mutants:
             "type_mask": (3135, 2111, 0xDF8, 0xDC7, 3135 | 0x40, 3135 | 0x200, 0xFFFF),
             "param_index": (-1, 0, 5, 4000),
             "param_type": (9, 9, 6, 2, 4),
-            "param_id": tuple(one.encode() for one in self._names),
+            "param_id": tuple(parameter_name.encode() for parameter_name in self._names),
             "start_stop": (0, 1),
             "req_stream_id": (0, 6, 10),
             "frame_id": (20, 1),
@@ -206,7 +206,7 @@ class Judge:
         (msg,) = decode(data)
         before = self._known or snapshot(self._one)
         peers = self._one.peers  # time stands still: what follows is of this message alone
-        answers = [one for out in peers.autopilot.receive(data, peers.now_ns) for one in decode(out)]
+        answers = [message for out in peers.autopilot.receive(data, peers.now_ns) for message in decode(out)]
         after = self._known = snapshot(self._one)
         kind = msg.get_type()
         changed = {part for part in before if before[part] != after[part]}
@@ -216,7 +216,7 @@ class Judge:
             assert answers == [] and not changed, (str(msg), changed)
             return
         if kind in ANSWERED and before["crashed"] is None:
-            acks = [one.result for one in answers if one.get_type() == "COMMAND_ACK"]
+            acks = [answer.result for answer in answers if answer.get_type() == "COMMAND_ACK"]
             assert len(acks) == 1, (str(msg), answers)
             self.results[acks[0]] += 1
             allowed = allowed if acks == [0] else set()

@@ -132,7 +132,7 @@ def _look(folder: Path, kind: str, put: int, taken: int, items: list[Item]) -> K
 def _independent(out: Path) -> int:
     """Messages of a recovered file by the format's own reader, each chunk's checksum looked at."""
     with out.open("rb") as file:
-        return sum(type(one).__name__ == "Message" for one in StreamReader(file, validate_crcs=True).records)
+        return sum(type(record).__name__ == "Message" for record in StreamReader(file, validate_crcs=True).records)
 
 
 def truth() -> list[Item]:

@@ -100,7 +100,7 @@ class Scene:
     def __init__(self, folder: Path, tap: Tap, vehicle_port: int, mocap_port: int) -> None:
         self.folder, self.tap, self.control = folder, tap, folder / "control"
         self.truths: list[Truth] = []
-        self.vehicle, self.mocap = (f"udpin://127.0.0.1:{one}" for one in (vehicle_port, mocap_port))
+        self.vehicle, self.mocap = (f"udpin://127.0.0.1:{port_number}" for port_number in (vehicle_port, mocap_port))
 
     @property
     def mode(self) -> str:
@@ -109,7 +109,7 @@ class Scene:
     @property
     def has_landed(self) -> bool:
         """Whether it has been landing; once disarmed, a PX4 takes up the mode of before."""
-        return any(one.mode == "AUTO.LAND" for one in self.truths)
+        return any(truth.mode == "AUTO.LAND" for truth in self.truths)
 
     def wait_on_board(self, seconds: float) -> None:
         """Let some of the vehicle's own time go by."""

@@ -79,12 +79,12 @@ def checked(name: str, since_s: float, seconds: float, *overrides: str) -> dict[
     begin_ns = whole[0].at_ns + round(since_s * SECOND)
     flight = Preflight(config_of(name, *overrides), make_links, begin_ns)
     tick = 0
-    for one in _between(whole, begin_ns, begin_ns + round(seconds * SECOND)):
-        while begin_ns + tick * TICK_NS <= one.at_ns:
+    for datagram in _between(whole, begin_ns, begin_ns + round(seconds * SECOND)):
+        while begin_ns + tick * TICK_NS <= datagram.at_ns:
             flight.tick(tick, begin_ns + tick * TICK_NS, to_nobody)
             tick += 1
-        flight.receive(VEHICLE, one.data, one.at_ns)
-    return {one.name: one.state.value for one in flight.make_items(begin_ns + tick * TICK_NS)}
+        flight.receive(VEHICLE, datagram.data, datagram.at_ns)
+    return {item.name: item.state.value for item in flight.make_items(begin_ns + tick * TICK_NS)}
 
 
 @dataclass(frozen=True)
@@ -115,15 +115,15 @@ def listened(
     news: list[Event] = []
     notices: list[Event] = []
     waiting = deque((whole[0].at_ns + round(time_s * SECOND), command) for time_s, command in orders)
-    for one in _between(whole, begin_ns, begin_ns + round(seconds * SECOND)):
-        while (now_ns := begin_ns + tick * TICK_NS) < one.at_ns:
+    for datagram in _between(whole, begin_ns, begin_ns + round(seconds * SECOND)):
+        while (now_ns := begin_ns + tick * TICK_NS) < datagram.at_ns:
             while waiting and waiting[0][0] <= now_ns:
                 assert loop.order(waiting.popleft()[1])
             ticked = loop.tick(tick, now_ns, to_nobody)
             news += ticked.news
             notices += ticked.notices
             tick += 1
-        news += loop.receive(VEHICLE, one.data, one.at_ns).news
+        news += loop.receive(VEHICLE, datagram.data, datagram.at_ns).news
     return Listened(name, loop, memory, news, notices)
 
 
@@ -141,9 +141,16 @@ def statuses(name: str) -> list[tuple[float, VehicleStatus]]:
     """What a link makes of the vehicle's words, with times since the first packet [s]."""
     whole = packets(name)
     link = make_links(config_of(name))[VEHICLE]
-    heard = ((one, item) for one in whole if not one.outgoing for item in link.receive(one.data, one.at_ns).items)
-    return [((one.at_ns - whole[0].at_ns) * 1e-9, item) for one, item in heard if isinstance(item, VehicleStatus)]
+    heard = (
+        (datagram, item)
+        for datagram in whole
+        if not datagram.outgoing
+        for item in link.receive(datagram.data, datagram.at_ns).items
+    )
+    return [
+        ((datagram.at_ns - whole[0].at_ns) * 1e-9, item) for datagram, item in heard if isinstance(item, VehicleStatus)
+    ]
 
 
 def _between(whole: Sequence[TlogPacket], since_ns: int, until_ns: int) -> Iterator[TlogPacket]:
-    return (one for one in whole if since_ns <= one.at_ns <= until_ns and not one.outgoing)
+    return (datagram for datagram in whole if since_ns <= datagram.at_ns <= until_ns and not datagram.outgoing)

@@ -35,7 +35,9 @@ Item = tuple[str, int, Record]
 
 def as_recorded(items: Sequence[Item]) -> list[Item]:
     """Return records as a recording gives them back: of a plan's matrices it has four digits."""
-    return [(topic, at_ns, round_plan(one) if isinstance(one, Plan) else one) for topic, at_ns, one in items]
+    return [
+        (topic, at_ns, round_plan(record) if isinstance(record, Plan) else record) for topic, at_ns, record in items
+    ]
 
 
 def stored_byte(path: Path, needle: bytes) -> int:

@@ -109,9 +109,9 @@ class Rig:
         elif tick in plan.late:
             self._late.append((tick, at_ns))
         else:
-            for one, its_ns in [*self._late, (tick, at_ns)]:
-                stop = self.stop or (plan.stop_tick is not None and one >= plan.stop_tick)
-                self.loop.tick(one, its_ns, send, self.missed, stop=stop)
+            for past_tick, its_ns in [*self._late, (tick, at_ns)]:
+                stop = self.stop or (plan.stop_tick is not None and past_tick >= plan.stop_tick)
+                self.loop.tick(past_tick, its_ns, send, self.missed, stop=stop)
                 self.missed = 0
             self._late.clear()
         if self._doors is not None and at_ns % SECOND_NS == 0:
@@ -237,21 +237,21 @@ def tally(found: Iterable[Replayed]) -> dict[str, object]:
     """Figures of many flights."""
     flights = sorted(found, key=lambda one: one.seed)
     words, seen = Counter[str](), Counter[str]()
-    for one in flights:
-        words.update(one.words)
-        seen.update(one.seen)
+    for flight in flights:
+        words.update(flight.words)
+        seen.update(flight.seen)
     return {
         "replayed": len(flights),
-        "identical": sum(one.good for one in flights),
-        "decisions": sum(one.result.decisions for one in flights),
-        "records": sum(one.result.compared for one in flights),
-        "in_several_files": sum(one.files > 1 for one in flights),
-        "virtual_s": round(sum(one.flight_s for one in flights), 1),
+        "identical": sum(flight.good for flight in flights),
+        "decisions": sum(flight.result.decisions for flight in flights),
+        "records": sum(flight.result.compared for flight in flights),
+        "in_several_files": sum(flight.files > 1 for flight in flights),
+        "virtual_s": round(sum(flight.flight_s for flight in flights), 1),
         "had": dict(sorted(words.items())),
         "seen": dict(sorted(seen.items())),
         "wrong": {
-            str(one.seed): one.apart or msgspec.to_builtins(one.result.first_difference)
-            for one in flights
-            if not one.good
+            str(flight.seed): flight.apart or msgspec.to_builtins(flight.result.first_difference)
+            for flight in flights
+            if not flight.good
         },
     }

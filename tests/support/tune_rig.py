@@ -68,8 +68,8 @@ class Tuned:
     def flies_after(self, at_ns: int) -> list[str]:
         """What we sent after a time that makes a vehicle move, or asks it for anything."""
         found = [message for sent_ns, data in self.rig.sent if sent_ns > at_ns for message in decode(data)]
-        asks = [one for one in found if getattr(one, "command", None) != REQUEST_STREAM]
-        return [name for one in asks if (name := one.get_type()) in FLIES]
+        asks = [message for message in found if getattr(message, "command", None) != REQUEST_STREAM]
+        return [name for message in asks if (name := message.get_type()) in FLIES]
 
 
 def real_rig(*overrides: str) -> Endings:

@@ -31,7 +31,9 @@ def fly_over_udp(out: Path, enough: Callable[[list[Truth]], bool], *options: str
         assert process.poll() is None, "it ended by itself"
         if not recording.exists():
             return False
-        planned = sum(one.boundary and one.mode is ControlMode.TRACK for one in records(recording, Decision))
+        planned = sum(
+            decision.boundary and decision.mode is ControlMode.TRACK for decision in records(recording, Decision)
+        )
         truths = list(records(recording, Truth))
         return planned >= 15 and bool(truths) and enough(truths)
 
@@ -52,10 +54,10 @@ def fly_over_udp(out: Path, enough: Callable[[list[Truth]], bool], *options: str
 def assert_in_order(recording: Path, dt_ns: int) -> None:
     """No tick and no step is unaccounted for, and what the vehicle flew is what it was told."""
     decisions, truths = list(records(recording, Decision)), list(records(recording, Truth))
-    assert sum(1 + one.missed_ticks for one in decisions) == decisions[-1].tick + 1
+    assert sum(1 + decision.missed_ticks for decision in decisions) == decisions[-1].tick + 1
     assert {after.at_ns - before.at_ns for before, after in pairwise(truths)} == {dt_ns}
-    told = np.array([(0.0, 0.0, 0.0), *(one.accel_mps2 for one in records(recording, Setpoint))])
-    flown = np.unique([one.input for one in truths], axis=0)
+    told = np.array([(0.0, 0.0, 0.0), *(setpoint.accel_mps2 for setpoint in records(recording, Setpoint))])
+    flown = np.unique([truth.input for truth in truths], axis=0)
     assert flown.any()
-    for one in flown:
-        assert np.abs(told - one).max(axis=1).min() < 1e-6
+    for applied in flown:
+        assert np.abs(told - applied).max(axis=1).min() < 1e-6

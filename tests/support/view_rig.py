@@ -22,9 +22,9 @@ SECONDS = 6.0
 def flown() -> Memory:
     """Six seconds in the room, with times as a shell measures them."""
     memory = lockstep("room-hahn-stursberg", SECONDS, "solver.method=exact")
-    for one in memory.of(Decision):
-        timing = Timing(tick=one.tick, at_ns=one.at_ns, lateness_ns=1500, step_ns=250_000, send_ns=400_000)
-        memory.put("/uavctl/timing", one.at_ns, timing)
+    for decision in memory.of(Decision):
+        timing = Timing(tick=decision.tick, at_ns=decision.at_ns, lateness_ns=1500, step_ns=250_000, send_ns=400_000)
+        memory.put("/uavctl/timing", decision.at_ns, timing)
     memory.entries.sort(key=lambda entry: entry[1])
     return memory
 

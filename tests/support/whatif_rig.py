@@ -49,9 +49,9 @@ def again(case: Case, *changes: str, other: OtherLink | None = None) -> tuple[Me
 def far(some: Memory, others: Memory) -> float:
     """Largest difference of the true states, and of the inputs that acted."""
     left, right = some.of(Truth), others.of(Truth)
-    assert [one.at_ns for one in left] == [one.at_ns for one in right]
-    states = np.array([one.state for one in left]) - np.array([one.state for one in right])
-    inputs = np.array([one.input for one in left]) - np.array([one.input for one in right])
+    assert [decision.at_ns for decision in left] == [decision.at_ns for decision in right]
+    states = np.array([decision.state for decision in left]) - np.array([decision.state for decision in right])
+    inputs = np.array([decision.input for decision in left]) - np.array([decision.input for decision in right])
     return float(max(np.abs(states).max(), np.abs(inputs).max()))
 
 
