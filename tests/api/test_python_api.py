@@ -44,11 +44,11 @@ def test_loading_and_solving_loads_neither_matplotlib_nor_cvxpy() -> None:
 def test_types_are_told_of_exactly_the_public_names() -> None:
     stub = ast.parse((ROOT / "uavctl" / "__init__.pyi").read_text(encoding="utf-8"))
     imports = [node for node in stub.body if isinstance(node, ast.ImportFrom)]
-    told = {str(alias.asname): str(node.module) for node in imports for alias in node.names}
-    assert sorted(told) == sorted(uavctl.__all__)
-    for name, module in told.items():
+    module_by_name = {str(alias.asname): str(node.module) for node in imports for alias in node.names}
+    assert sorted(module_by_name) == sorted(uavctl.__all__)
+    for name, module in module_by_name.items():
         assert getattr(uavctl, name) is getattr(sys.modules[module], name)
-    assert set(told) <= set(dir(uavctl))
+    assert set(module_by_name) <= set(dir(uavctl))
 
 
 def test_a_name_that_is_none_is_refused_as_of_any_module() -> None:
@@ -127,14 +127,14 @@ def test_a_decision_is_that_of_the_command_line(
 ) -> None:
     given = dict(setting.split("=") for setting in typed)
     answer = uavctl.solve(uavctl.load(config, given), state)
-    words = [word for setting in typed for word in ("--set", setting)]
-    run(["solve", "--config", config, "--state", ",".join(map(str, state)), "--json", *words])
-    told = json.loads(capsys.readouterr().out)
-    assert told["status"] == answer.status.value == SolveStatus.OPTIMAL
+    arguments = [argument for setting in typed for argument in ("--set", setting)]
+    run(["solve", "--config", config, "--state", ",".join(map(str, state)), "--json", *arguments])
+    output = json.loads(capsys.readouterr().out)
+    assert output["status"] == answer.status.value == SolveStatus.OPTIMAL
     for name in ("inputs", "states", "backoff_x", "backoff_u", "reference"):
-        assert told[name] == getattr(answer, name).tolist()
+        assert output[name] == getattr(answer, name).tolist()
     for name in ("cost", "slack", "offset", "iterations", "method"):
-        assert told[name] == getattr(answer, name)
+        assert output[name] == getattr(answer, name)
 
 
 def test_a_plan_follows_the_plant() -> None:
@@ -165,12 +165,12 @@ def test_a_stepped_controller_does_as_a_simulated_run_did(kind: str) -> None:
 
 def test_controllers_meet_the_same_draws() -> None:
     config = uavctl.load("room", link={"loss": 0.5})
-    ours, theirs, other = (
+    ours, theirs, other_seed = (
         uavctl.simulate(config, kind, runs=4, steps=20, seed=seed)
         for kind, seed in (("smpc", 1), ("lqg", 1), ("lqg", 2))
     )
     assert np.array_equal(ours.age_steps, theirs.age_steps)
-    assert not np.array_equal(other.age_steps, theirs.age_steps)
+    assert not np.array_equal(other_seed.age_steps, theirs.age_steps)
     plant = uavctl.plant(config)
     moved = [runs.states[:, 1:] - runs.states[:, :-1] @ plant.a.T - runs.inputs @ plant.b.T for runs in (ours, theirs)]
     assert np.allclose(moved[0], moved[1], rtol=0.0, atol=1e-9)
@@ -205,7 +205,7 @@ def test_simulated_runs_are_those_of_a_campaign(
     assert run(["campaign", str(spec), "--out", str(tmp_path / "out"), "--workers", "1", "--json"]) == 0
     capsys.readouterr()
     table = pq.read_table(tmp_path / "out" / "runs.parquet")
-    found = uavctl.simulate(
+    result = uavctl.simulate(
         uavctl.load("room", {"link.loss": 0.5}),
         kind,
         runs=runs,
@@ -213,9 +213,9 @@ def test_simulated_runs_are_those_of_a_campaign(
         seed=9,
         measured=measured,  # type: ignore[arg-type]
     )
-    assert found.cost.sum(axis=1).tolist() == table["cost"].to_pylist()
-    assert found.state_violated.sum(axis=1).tolist() == table["state_violations"].to_pylist()
-    assert found.age_steps.max(axis=1).tolist() == table["max_age"].to_pylist()
+    assert result.cost.sum(axis=1).tolist() == table["cost"].to_pylist()
+    assert result.state_violated.sum(axis=1).tolist() == table["state_violations"].to_pylist()
+    assert result.age_steps.max(axis=1).tolist() == table["max_age"].to_pylist()
 
 
 _MEASURED = ("/uavctl/header", "/uavctl/timing", "/plot/timing", "/uavctl/recorder")
@@ -224,10 +224,10 @@ _MEASURED = ("/uavctl/header", "/uavctl/timing", "/plot/timing", "/uavctl/record
 def recorded(path: Path) -> list[tuple[str, int, bytes]]:
     """All messages by mcap's own reader, but what is measured with a clock, and when it was."""
     with path.open("rb") as file:
-        found = [
+        results = [
             (channel.topic, message.log_time, message.data) for _, channel, message in make_reader(file).iter_messages()
         ]
-    return [message for message in found if message[0] not in _MEASURED]
+    return [message for message in results if message[0] not in _MEASURED]
 
 
 @pytest.mark.parametrize(("name", "more"), [("paper", PAPER), ("room", {"link.loss": 0.4})])
@@ -235,16 +235,16 @@ def test_a_flight_records_the_bytes_that_the_command_line_records(
     name: str, more: dict[str, object], tmp_path: Path, capsys: pytest.CaptureFixture[str], no_page: None
 ) -> None:
     flight = uavctl.fly(uavctl.load(name, more), tmp_path / "python", seed=3, duration_s=3)
-    words = [word for key, value in more.items() for word in ("--set", f"{key}={value}")]
+    arguments = [argument for key, value in more.items() for argument in ("--set", f"{key}={value}")]
     out = ["--out", str(tmp_path / "typed")]
-    assert run(["loopback", "--config", name, *words, "--seed", "3", "--duration", "3", "--json", *out]) == 0
-    told = json.loads(capsys.readouterr().out)
+    assert run(["loopback", "--config", name, *arguments, "--seed", "3", "--duration", "3", "--json", *out]) == 0
+    output = json.loads(capsys.readouterr().out)
     assert flight.recording.path == tmp_path / "python" / "flight.mcap"
-    ours, theirs = recorded(flight.recording.path), recorded(Path(told["recording"]))
+    ours, theirs = recorded(flight.recording.path), recorded(Path(output["recording"]))
     assert len(ours) > 100
     assert {topic for topic, _, _ in ours} >= {"/uavctl/decision", "/uavctl/step_input", "/uavctl/end"}
     assert ours == theirs
-    assert told["ending"] == {name: getattr(flight.ending, name) for name in flight.ending.__struct_fields__}
+    assert output["ending"] == {name: getattr(flight.ending, name) for name in flight.ending.__struct_fields__}
 
 
 def test_a_flight_tells_where_the_vehicle_truly_was(tmp_path: Path) -> None:
@@ -294,7 +294,7 @@ FILE = "nothing-here.toml"
 
 
 @pytest.mark.parametrize(
-    ("wrong", "error", "told"),
+    ("wrong", "error", "message"),
     [
         (lambda: uavctl.load("rom"), ConfigError, 'nearest valid name "room"'),
         (lambda: uavctl.load(Path(FILE)), ConfigError, FILE),
@@ -330,10 +330,10 @@ FILE = "nothing-here.toml"
         (lambda: uavctl.plot(3), UsageError, "a int has no figure"),  # type: ignore[arg-type]
     ],
 )
-def test_what_is_wrong_is_told_plainly(wrong: Callable[[], object], error: type[Exception], told: str) -> None:
+def test_what_is_wrong_is_told_plainly(wrong: Callable[[], object], error: type[Exception], message: str) -> None:
     with pytest.raises(error) as raised:
         wrong()
-    assert told in str(raised.value)
+    assert message in str(raised.value)
 
 
 def test_a_controller_that_asks_for_no_number_is_told() -> None:
@@ -377,10 +377,10 @@ def test_a_flight_may_begin_on_the_ground_as_the_command_line_s_does(
 ) -> None:
     given = uavctl.load("room", {"link.loss": 0.3})
     flight = uavctl.fly(given, tmp_path / "python", seed=3, duration_s=18, take_off_m=1.0, goto=(0.5, 0.0, -1.1))
-    words = "loopback --set link.loss=0.3 --seed 3 --duration 18 --arm --takeoff 1.0 --goto 0.5,0,-1.1 --json --out"
-    assert run([*words.split(), str(tmp_path / "typed")]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert recorded(flight.recording.path) == recorded(Path(told["recording"]))
+    arguments = "loopback --set link.loss=0.3 --seed 3 --duration 18 --arm --takeoff 1.0 --goto 0.5,0,-1.1 --json --out"
+    assert run([*arguments.split(), str(tmp_path / "typed")]) == 0
+    output = json.loads(capsys.readouterr().out)
+    assert recorded(flight.recording.path) == recorded(Path(output["recording"]))
     heights_m = -flight.position_m[:, 2]
     assert heights_m[0] == 0.0 and heights_m.max() > 0.9 and heights_m[-1] < 0.05
     assert np.hypot(flight.position_m[:, 0] - 0.5, flight.position_m[:, 1]).min() < 0.1

@@ -27,11 +27,11 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 def messages(path: Path, topic: str) -> list[tuple[float, bytes]]:
     """Times [s] since the first message of the file, and bytes, by mcap's own reader."""
     with path.open("rb") as file:
-        found = [
+        results = [
             (channel.topic, message.log_time, message.data) for _, channel, message in make_reader(file).iter_messages()
         ]
-    begun = next(at_ns for name, at_ns, _ in found if name == "/uavctl/header")
-    return [((at_ns - begun) * 1e-9, data) for name, at_ns, data in found if name == topic]
+    begun = next(at_ns for name, at_ns, _ in results if name == "/uavctl/header")
+    return [((at_ns - begun) * 1e-9, data) for name, at_ns, data in results if name == topic]
 
 
 def cells(value: object, name: str) -> dict[str, object]:
@@ -54,16 +54,16 @@ def cells(value: object, name: str) -> dict[str, object]:
 NON_FINITE = {"NaN": float("nan"), "Infinity": float("inf"), "-Infinity": float("-inf")}
 
 
-def same(one: object, other: object) -> bool:
-    other = NON_FINITE.get(other, other) if isinstance(one, float) and isinstance(other, str) else other
-    return one == other or (one != one and other != other)
+def same(first: object, second: object) -> bool:
+    second = NON_FINITE.get(second, second) if isinstance(first, float) and isinstance(second, str) else second
+    return first == second or (first != first and second != second)
 
 
-def agree(rows: list[dict[str, Any]], told: list[tuple[float, bytes]]) -> int:
+def agree(rows: list[dict[str, Any]], records: list[tuple[float, bytes]]) -> int:
     """Look at every cell; how many of them were compared."""
-    assert len(rows) == len(told)
+    assert len(rows) == len(records)
     compared = 0
-    for row, (time_s, data) in zip(rows, told, strict=True):
+    for row, (time_s, data) in zip(rows, records, strict=True):
         assert row["time_s"] == pytest.approx(time_s, abs=1e-9)
         want = cells(json.loads(data), "")
         for name, cell in want.items():
@@ -82,9 +82,9 @@ TOPICS = ("/uavctl/decision", "/uavctl/estimate", "/uavctl/setpoint", "/sim/trut
 
 @pytest.mark.parametrize("topic", TOPICS)
 def test_tables_hold_what_mcap_reads(flown: Recording, topic: str) -> None:
-    told = messages(flown.path, topic)
+    records = messages(flown.path, topic)
     rows = flown.arrow(topic).to_pylist()
-    assert agree(rows, told) > 4 * len(told)
+    assert agree(rows, records) > 4 * len(records)
     assert undated(flown.polars(topic).to_dicts()) == undated(rows)
 
 
@@ -102,29 +102,33 @@ def test_pandas_holds_it_too_and_whole_numbers_stay_whole(flown: Recording, topi
     for name in table.column_names:
         want = table[name].to_pylist()
         cells = [None if cell is pd.NA else cell for cell in frame[name].tolist()]  # type: ignore[attr-defined]
-        for wanted_cell, other in zip(want, cells, strict=True):
+        for wanted_cell, cell in zip(want, cells, strict=True):
             assert (
-                wanted_cell == other
-                or (wanted_cell is None and other != other)
-                or (wanted_cell != wanted_cell and other != other)
+                wanted_cell == cell
+                or (wanted_cell is None and cell != cell)
+                or (wanted_cell != wanted_cell and cell != cell)
             ), name
         if str(table.schema.field(name).type) == "int64":
             assert str(frame[name].dtype) == "Int64"
 
 
 def test_lists_within_are_tables(flown: Recording) -> None:
-    told = [sample for _, data in messages(flown.path, "/uavctl/step_input") for sample in json.loads(data)["samples"]]
+    records = [
+        sample for _, data in messages(flown.path, "/uavctl/step_input") for sample in json.loads(data)["samples"]
+    ]
     rows = flown.arrow("/uavctl/step_input.samples").to_pylist()
-    assert [[row[f"position_m_{axis}"] for axis in "xyz"] for row in rows] == [record["position_m"] for record in told]
+    assert [[row[f"position_m_{axis}"] for axis in "xyz"] for row in rows] == [
+        record["position_m"] for record in records
+    ]
     assert flown.arrow("/uavctl/step_input").num_rows > len({row["row"] for row in rows}) > 5
     assert flown.arrow("/uavctl/step_input.commands").num_rows == 0
 
 
 def test_raw_bytes_are_a_table(flown: Recording) -> None:
-    told = messages(flown.path, "/raw/vehicle/out")
+    records = messages(flown.path, "/raw/vehicle/out")
     rows = flown.arrow("/raw/vehicle/out").to_pylist()
-    assert [row["data"] for row in rows] == [data for _, data in told]
-    assert flown.polars("/raw/vehicle/out")["data"].to_list() == [data for _, data in told]
+    assert [row["data"] for row in rows] == [data for _, data in records]
+    assert flown.polars("/raw/vehicle/out")["data"].to_list() == [data for _, data in records]
 
 
 def test_topics_are_those_that_mcap_counts(flown: Recording) -> None:
@@ -140,7 +144,7 @@ def test_topics_are_those_that_mcap_counts(flown: Recording) -> None:
 
 
 @pytest.mark.parametrize(
-    ("topic", "told"),
+    ("topic", "records"),
     [
         ("/uavctl/decison", 'nearest valid name "/uavctl/decision"'),
         ("decision", "there are /raw/mocap/in"),
@@ -150,10 +154,10 @@ def test_topics_are_those_that_mcap_counts(flown: Recording) -> None:
         ("", "is not in it"),
     ],
 )
-def test_a_topic_that_is_not_there(flown: Recording, topic: str, told: str) -> None:
+def test_a_topic_that_is_not_there(flown: Recording, topic: str, records: str) -> None:
     with pytest.raises(RecordingError) as raised:
         flown.arrow(topic)
-    assert told in str(raised.value)
+    assert records in str(raised.value)
 
 
 def test_a_torn_recording_is_refused_and_read_when_asked(flown: Recording, tmp_path: Path) -> None:

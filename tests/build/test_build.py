@@ -88,8 +88,8 @@ def test_every_preset_can_be_flown(preset: str) -> None:
 
 
 def test_another_likelihood_is_another_design() -> None:
-    one, other = load_config("paper"), load_config("paper", ["smpc.delta_x=0.94"])
-    assert build_design(one).design_id != build_design(other).design_id
+    first, second = load_config("paper"), load_config("paper", ["smpc.delta_x=0.94"])
+    assert build_design(first).design_id != build_design(second).design_id
 
 
 @pytest.mark.parametrize(

@@ -63,9 +63,9 @@ def test_ages_are_those_of_the_campaign_s_link(name: str) -> None:
 @pytest.mark.parametrize("loss", [0.3, 0.8])
 def test_a_channel_without_memory_has_the_ages_of_independent_losses(loss: float) -> None:
     chain = ["link.model=gilbert-elliott", f"link.loss={loss}", f"link.burst_loss={loss}", "link.burst_enter=0.3"]
-    one, other = (build_ages(config(*LATE, *given)) for given in (chain, [f"link.loss={loss}"]))
+    first, second = (build_ages(config(*LATE, *given)) for given in (chain, [f"link.loss={loss}"]))
     for steps in range(OLDEST):
-        assert one.outage(steps) == pytest.approx(other.outage(steps), rel=1e-12)
+        assert first.outage(steps) == pytest.approx(second.outage(steps), rel=1e-12)
 
 
 def test_several_positions_of_a_step_come_one_after_the_other() -> None:

@@ -70,23 +70,23 @@ def test_an_entry_point_has_a_short_name(module: str, monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize(
-    ("name", "told"),
+    ("name", "message"),
     [("Nothing", "AttributeError"), ("Half", "no act"), ("Resting", "no begin"), ("Broken", "no gain")],
 )
-def test_what_a_campaign_cannot_ask_is_refused_with_the_reason(module: str, name: str, told: str) -> None:
-    with pytest.raises(DesignError, match=told) as found:
+def test_what_a_campaign_cannot_ask_is_refused_with_the_reason(module: str, name: str, message: str) -> None:
+    with pytest.raises(DesignError, match=message) as caught:
         make_controller(f"{module}:{name}", problem("paper"))
-    assert found.value.key == "kind"
+    assert caught.value.key == "kind"
 
 
 @pytest.mark.parametrize(
-    ("name", "told"), [("Nothing", "AttributeError"), ("Half", "plan or with begin and act"), ("Broken", "no gain")]
+    ("name", "message"), [("Nothing", "AttributeError"), ("Half", "plan or with begin and act"), ("Broken", "no gain")]
 )
-def test_what_cannot_fly_is_refused_with_the_reason(module: str, name: str, told: str) -> None:
+def test_what_cannot_fly_is_refused_with_the_reason(module: str, name: str, message: str) -> None:
     config = load_config("room", [f"smpc.controller={module}:{name}"])
-    with pytest.raises(DesignError, match=told) as found:
+    with pytest.raises(DesignError, match=message) as caught:
         outside.build_outside_solver(config, build_problem(config))
-    assert found.value.key == "smpc.controller"
+    assert caught.value.key == "smpc.controller"
 
 
 def test_a_module_that_is_not_there(module: str) -> None:

@@ -171,10 +171,10 @@ def test_cameras_that_see_another_body_are_caught() -> None:
 
 
 def test_a_vehicle_that_counts_from_elsewhere_is_told_apart_by_its_movement() -> None:
-    hand = Hand("check.same_origin=false", own=True)
+    hand = Hand("check.same_origin=false", has_estimate=True)
     hand.follow()
     assert hand.done()["axes"].state is ItemState.GOOD
-    hand = Hand("check.same_origin=false", own=True)
+    hand = Hand("check.same_origin=false", has_estimate=True)
     hand.matrix = DOWN
     hand.follow()
     assert "up is taken for down" in hand.done()["axes"].value
@@ -190,7 +190,7 @@ def test_a_level_attitude_is_meant_if_the_vehicle_takes_its_heading_from_it(
 ) -> None:
     """At rest on the origin: a source that is level to the north to the last bit, as simulators are."""
     for fuses in (False, True):
-        hand = Hand(*wrong, own=True)
+        hand = Hand(*wrong, has_estimate=True)
         hand.place = [0.0, 0.0, -0.05]
         if fuses:
             (as_float,) = struct.unpack("<f", struct.pack("<i", 11))

@@ -360,7 +360,7 @@ def test_with_the_relay_the_check_itself_gives_the_vehicle_its_position(autopilo
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 3e38, -3e38, 1e-45])
 @pytest.mark.parametrize("autopilot", [3, 12])
 def test_absurd_values_of_a_vehicle_never_raise(autopilot: int, value: float) -> None:
-    hand = Hand(own=True)
+    hand = Hand(has_estimate=True)
     hand.rest(2.0)
     hand.tell(hand.vehicle.heartbeat(autopilot=autopilot, custom_mode=4))
     for name in list_parameters(autopilot):

@@ -66,9 +66,9 @@ def test_a_fleet_that_can_be_flown_is_told_with_its_nearest_boxes(
     file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(["fleet", "check", str(file), "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert [entry["name"] for entry in found["vehicles"]] == ["west", "east"]
-    assert found["nearest_m"] == pytest.approx(EAST[0] - WEST[1])
+    document = json.loads(capsys.readouterr().out)
+    assert [entry["name"] for entry in document["vehicles"]] == ["west", "east"]
+    assert document["nearest_m"] == pytest.approx(EAST[0] - WEST[1])
 
 
 def test_the_example_is_that_of_the_page_and_can_be_flown(capsys: pytest.CaptureFixture[str]) -> None:
@@ -79,7 +79,7 @@ def test_the_example_is_that_of_the_page_and_can_be_flown(capsys: pytest.Capture
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "expected_texts"),
     [
         (HEAD + entry("a", WEST, A) + entry("b", (-0.2, 2.5), B), ("a and b", "0.20 m apart", "spacing_m")),
         (HEAD + entry("a", WEST, A) + entry("b", (-1.0, 2.5), B), ("overlap by 0.60 m",)),
@@ -96,16 +96,16 @@ def test_the_example_is_that_of_the_page_and_can_be_flown(capsys: pytest.Capture
     ],
 )
 def test_a_fleet_that_cannot_be_flown_is_refused_with_the_place(
-    tmp_path: Path, text: str, words: tuple[str, ...]
+    tmp_path: Path, text: str, expected_texts: tuple[str, ...]
 ) -> None:
     path = tmp_path / "fleet.toml"
     path.write_text(text)
     with pytest.raises(ConfigError) as caught:
         read_fleet(path)
-    told = str(caught.value)
-    assert "fleet.toml:" in told
-    for word in words:
-        assert word in told
+    error_text = str(caught.value)
+    assert "fleet.toml:" in error_text
+    for expected_text in expected_texts:
+        assert expected_text in error_text
 
 
 def test_a_file_that_is_not_there_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -119,8 +119,8 @@ def test_without_daemons_status_and_land_say_so(file: Path, capsys: pytest.Captu
     assert run(["fleet", "status", str(file), "--json"]) == 1
     assert json.loads(capsys.readouterr().out)["vehicles"] == {"west": None, "east": None}
     assert run(["fleet", "land", str(file)]) == 1
-    told = capsys.readouterr().err
-    assert "west: land not reached" in told and "east: land not reached" in told
+    output = capsys.readouterr().err
+    assert "west: land not reached" in output and "east: land not reached" in output
 
 
 INTERVAL = st.tuples(st.floats(-5, 5), st.floats(0.01, 3)).map(lambda one: (one[0], one[0] + one[1]))
@@ -144,10 +144,10 @@ def test_places_in_two_boxes_are_as_far_apart_as_is_said(
     """By the corners, and where boxes overlap along an axis by a place that both have there."""
     apart_m = compute_gap_m(member(north, east), member(other_north, other_east))
     nearest = [
-        min((abs(a - b) for a, b in product(state, other)), default=0.0)
-        if state[1] < other[0] or other[1] < state[0]
+        min((abs(a - b) for a, b in product(state, other_state)), default=0.0)
+        if state[1] < other_state[0] or other_state[1] < state[0]
         else 0.0
-        for state, other in ((north, other_north), (east, other_east))
+        for state, other_state in ((north, other_north), (east, other_east))
     ]
     assert max(apart_m, 0.0) == pytest.approx(max(nearest))
 
@@ -158,8 +158,8 @@ def flying() -> Iterator[tuple[Path, dict[str, list[Truth]], subprocess.Popen[st
     truths: dict[str, list[Truth]] = {"west": [], "east": []}
     done, seats, tables = threading.Event(), [], []
     for number, (name, limits) in enumerate({"west": WEST, "east": EAST}.items()):
-        with port() as one, port() as other:
-            ports = int(one.getsockname()[1]), int(other.getsockname()[1])
+        with port() as first, port() as second:
+            ports = int(first.getsockname()[1]), int(second.getsockname()[1])
         vehicle, mocap = (f"127.0.0.1:{number}" for number in ports)
         start = f"sim.start_position_m=[0,{sum(limits) / 2},-1]"
         config = load_config("room-px4", [PATIENT_VEHICLE, start, f"sim.system_id={number + 1}"])
@@ -192,14 +192,14 @@ def flying() -> Iterator[tuple[Path, dict[str, list[Truth]], subprocess.Popen[st
 
 
 def status(path: Path) -> list[dict[str, Any]]:
-    found = []
+    results = []
     for fleet_member in read_fleet(path).members:
         try:
             health = send_request(ControlRequest(ask="status"), path.parent / "c", fleet_member.daemon).status
         except NotReachedError:
             health = None
-        found.append({"mode": None, "pid": 0} if health is None else {"mode": health.mode, "pid": health.pid})
-    return found
+        results.append({"mode": None, "pid": 0} if health is None else {"mode": health.mode, "pid": health.pid})
+    return results
 
 
 @pytest.mark.slow
@@ -221,9 +221,9 @@ def test_all_land_together_and_have_never_been_near_each_other(how: str) -> None
             until(lambda name=name: any(truth.mode == "AUTO.LAND" for truth in truths[name]), f"{name} lands")  # type: ignore[misc]
         until(lambda: fleet.poll() is not None, "the end")
     places = zip(truths["west"], truths["east"], strict=False)
-    flown = [(west.position_m, other.position_m) for west, other in places if west.mode == other.mode == "OFFBOARD"]
+    flown = [(west.position_m, east.position_m) for west, east in places if west.mode == east.mode == "OFFBOARD"]
     assert len(flown) > 5
-    assert min(max(abs(a - b) for a, b in zip(west[:2], other[:2], strict=True)) for west, other in flown) >= SPACING_M
+    assert min(max(abs(a - b) for a, b in zip(west[:2], east[:2], strict=True)) for west, east in flown) >= SPACING_M
 
 
 def test_a_daemon_that_refuses_to_arm_ends_with_its_own_exit_code(
@@ -234,8 +234,8 @@ def test_a_daemon_that_refuses_to_arm_ends_with_its_own_exit_code(
     monkeypatch.setenv(FOLDER_VARIABLE, str(short))
     path = tmp_path / "fleet.toml"
     path.write_text(HEAD + entry("west", WEST, "udpin://127.0.0.1:0", "udpin://127.0.0.1:0", "check.seconds=0.2"))
-    (one,) = read_fleet(path).members
-    flight = FleetFlight(one, ["--arm", "--takeoff", "1.2", "--out", str(tmp_path / "out")])
+    (fleet_member,) = read_fleet(path).members
+    flight = FleetFlight(fleet_member, ["--arm", "--takeoff", "1.2", "--out", str(tmp_path / "out")])
     flight.start()
     until(lambda: not flight.is_running(), "the end of the daemon")
     flight.join_output()

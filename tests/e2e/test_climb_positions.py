@@ -104,9 +104,9 @@ def test_px4_s_own_climb_to_another_height_ends_at_the_ceiling() -> None:
 
 def flown(folder: Path, seed: int, seconds: float, *settings: str) -> tuple[int, float]:
     """Exit code of a loopback flight of an ArduPilot with GPS, and how far outside the true vehicle was at most [m]."""
-    words = [word for setting in settings for word in ("--set", setting)]
+    arguments = [argument for setting in settings for argument in ("--set", setting)]
     code = run(["loopback", "--config", "room-ardupilot", "--arm", "--takeoff", "1.2", "--seed", str(seed),
-                "--duration", str(seconds), "--out", str(folder), "--json", *words])  # fmt: skip
+                "--duration", str(seconds), "--out", str(folder), "--json", *arguments])  # fmt: skip
     config = load_config("room-ardupilot")
     sides = [(config.sets.state_lower[i], config.sets.state_upper[i]) for i in get_position_index(config.plant)]
     beyond = [

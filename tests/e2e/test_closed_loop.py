@@ -139,8 +139,8 @@ def test_plans_are_optimal_and_certified() -> None:
         assert abs(plan.gap) < 1e-6
         wanted = exact.solve(plan.seq, np.array(plan.states[0]), design.target)
         assert plan.cost == pytest.approx(wanted.cost, rel=1e-7)
-        most = np.abs(design.input_set.b).max()
-        assert np.array(plan.inputs) + plan.bias == pytest.approx(wanted.inputs, abs=2e-3 * most)
+        max_input = np.abs(design.input_set.b).max()
+        assert np.array(plan.inputs) + plan.bias == pytest.approx(wanted.inputs, abs=2e-3 * max_input)
     assert {plan.method for plan in plans} == {"frozen", "exact"}
 
 

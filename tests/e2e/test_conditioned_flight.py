@@ -78,21 +78,21 @@ def test_a_flight_replays_bit_for_bit() -> None:
 
 @pytest.mark.slow
 def test_a_fence_that_closes_in_is_kept() -> None:
-    found = lockstep("room", 20.0, FENCE, "target.position_m=[1.5,1.0,-1.2]")
-    assert max(truth.position_m[0] for truth in found.of(Truth) if truth.at_ns > 14e9) < 1.2
-    last = found.of(Plan)[-1]
+    result = lockstep("room", 20.0, FENCE, "target.position_m=[1.5,1.0,-1.2]")
+    assert max(truth.position_m[0] for truth in result.of(Truth) if truth.at_ns > 14e9) < 1.2
+    last = result.of(Plan)[-1]
     assert last.reference[0] < 1.2  # the target itself is outside
     assert np.array(last.backoff_x)[1:4, 0].min() > 0.0
 
 
 @pytest.mark.slow
 def test_at_a_wall_it_settles_where_the_design_lets_it_rest_and_nothing_gives_way() -> None:
-    found = lockstep("room", 30.0, "sim.seed=4", "target.position_m=[3.0,1.0,-1.2]")
+    result = lockstep("room", 30.0, "sim.seed=4", "target.position_m=[3.0,1.0,-1.2]")
     rests = compute_rest_limits(build_conditioned(load_config("room")))[0]
-    settled = [plan for plan in found.of(Plan) if plan.base_ns > 12e9]
+    settled = [plan for plan in result.of(Plan) if plan.base_ns > 12e9]
     assert [plan.reference[0] for plan in settled] == pytest.approx([rests] * len(settled), abs=0.03)
     assert sum(bool(plan.gave_way) for plan in settled) <= 0.05 * len(settled)
-    places = [truth.position_m[0] for truth in found.of(Truth) if truth.at_ns > 12e9]
+    places = [truth.position_m[0] for truth in result.of(Truth) if truth.at_ns > 12e9]
     assert np.mean(places) == pytest.approx(settled[-1].reference[0], abs=0.04)
     assert max(places) < 3.0
 
@@ -151,9 +151,9 @@ def test_a_campaign_flies_it_where_the_printed_design_is_refused(tmp_path: Path)
     for cell in others:
         assert cell.recipe is not None and cell.recipe.design is None
         meets = met(cell.setting, 0, 40)
-        found = fly(meets.scene, build(cell.recipe), meets.newest, meets.disturbances)
-        assert not found.failed.any()
-        costs.append(found.cost.sum(axis=1).mean())
+        result = fly(meets.scene, build(cell.recipe), meets.newest, meets.disturbances)
+        assert not result.failed.any()
+        costs.append(result.cost.sum(axis=1).mean())
     assert told(others[0])["promised_x"] == pytest.approx(0.05)
     assert told(others[1])["promised_x"] is None
     assert max(costs) < 1.03 * min(costs)
@@ -176,11 +176,11 @@ def test_a_campaign_s_links_carry_one_position_a_step(tmp_path: Path) -> None:
 
 def test_design_shows_the_risk_of_each_age(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["design", "--config", "paper", "--set", SCHEME, "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["scheme"] == METHOD
-    weights = np.array(found["weights"])
-    for budgets in (found["budgets"], found["budgets_in_transit"]):
-        assert weights @ np.array(budgets) + found["beyond"] == pytest.approx(0.05)
+    document = json.loads(capsys.readouterr().out)
+    assert document["scheme"] == METHOD
+    weights = np.array(document["weights"])
+    for budgets in (document["budgets"], document["budgets_in_transit"]):
+        assert weights @ np.array(budgets) + document["beyond"] == pytest.approx(0.05)
     assert main(["design", "--config", "paper", "--set", SCHEME]) == 0
     assert "upper limit of east position" in capsys.readouterr().out
 

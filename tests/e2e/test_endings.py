@@ -37,13 +37,13 @@ NO_COMMANDS = is_a("COMMAND_LONG")
 def typed(capsys: pytest.CaptureFixture[str]) -> Type:
     """Flies, and has all places agree on one sentence."""
 
-    def fly(rig: Endings, cause: Cause, *words: str, good: bool = False) -> Told:
-        told = flown(rig, capsys, *words)
-        assert told.summary, told.console
-        assert told.ending["cause"] == cause, told.ending
-        told.agrees()
-        assert told.code == (0 if good else 1), told.ending
-        return told
+    def fly(rig: Endings, cause: Cause, *arguments: str, good: bool = False) -> Told:
+        report = flown(rig, capsys, *arguments)
+        assert report.summary, report.console
+        assert report.ending["cause"] == cause, report.ending
+        report.agrees()
+        assert report.code == (0 if good else 1), report.ending
+        return report
 
     return fly
 
@@ -87,8 +87,8 @@ def hear(rig: Endings) -> None:
 @pytest.mark.slow
 def test_the_mission_is_over(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path, "mission.waypoints=[[0.3,0.0,-1.2]]", "mission.hold_s=0.5", "mission.then='land'")
-    told = typed(rig, Cause.MISSION, *TAKE_OFF, good=True)
-    assert "landed and disarmed" in told.ending["sentence"]
+    report = typed(rig, Cause.MISSION, *TAKE_OFF, good=True)
+    assert "landed and disarmed" in report.ending["sentence"]
 
 
 @pytest.mark.slow
@@ -100,15 +100,15 @@ def test_the_operator_orders_the_landing(tmp_path: Path, typed: Type) -> None:
 @pytest.mark.slow
 def test_the_operator_ends_it(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path).at(HandoverState.ENGAGED, interrupt, after_s=2.0)
-    told = typed(rig, Cause.OPERATOR, *TAKE_OFF, good=True)
-    assert "landed and disarmed" in told.ending["sentence"]
+    report = typed(rig, Cause.OPERATOR, *TAKE_OFF, good=True)
+    assert "landed and disarmed" in report.ending["sentence"]
 
 
 @pytest.mark.slow
 def test_the_operator_hands_over_a_flight_that_the_pilot_began(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path, "fallback.land=false", airborne=True).at(HandoverState.ENGAGED, interrupt, after_s=3.0)
-    told = typed(rig, Cause.OPERATOR, good=True)
-    assert "in mode OFFBOARD" in told.ending["sentence"]
+    report = typed(rig, Cause.OPERATOR, good=True)
+    assert "in mode OFFBOARD" in report.ending["sentence"]
 
 
 @pytest.mark.slow
@@ -121,8 +121,8 @@ def test_its_time_is_over(tmp_path: Path, typed: Type) -> None:
 def test_the_pilot_takes_over(tmp_path: Path, typed: Type, autopilot: str, mode: str) -> None:
     rig = Endings(tmp_path, f"sim.autopilot={autopilot}").at(HandoverState.ENGAGED, stick(mode), after_s=2.0)
     rig.at(HandoverState.RELEASED, interrupt, after_s=3.0)
-    told = typed(rig, Cause.PILOT, *TAKE_OFF, good=True)
-    assert f"in the air, in mode {mode}" in told.ending["sentence"]
+    report = typed(rig, Cause.PILOT, *TAKE_OFF, good=True)
+    assert f"in the air, in mode {mode}" in report.ending["sentence"]
 
 
 @pytest.mark.slow
@@ -136,8 +136,8 @@ def test_the_pilot_takes_over_and_lands(tmp_path: Path, typed: Type) -> None:
 def test_a_failsafe_that_ended_in_the_climb_is_told_with_what_came_after(tmp_path: Path, typed: Type) -> None:
     # The vehicle's own climb is longer than ours, so that its failsafe acts before the controller is in charge.
     rig = Endings(tmp_path, "sim.checks.invalid=[[0.2, 1.4]]", "sim.checks.clears=true")
-    told = typed(rig, Cause.TIME, *TAKE_OFF, "--duration", "15", good=True)
-    assert "had acted and ended" in told.ending["sentence"]
+    report = typed(rig, Cause.TIME, *TAKE_OFF, "--duration", "15", good=True)
+    assert "had acted and ended" in report.ending["sentence"]
 
 
 # The take-off
@@ -147,8 +147,8 @@ def test_a_failsafe_that_ended_in_the_climb_is_told_with_what_came_after(tmp_pat
 def test_the_pilot_takes_over_in_the_climb(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path).at(HandoverState.CLIMBING, stick("POSCTL"), after_s=0.6)
     rig.at(HandoverState.RELEASED, interrupt, after_s=2.0)
-    told = typed(rig, Cause.PILOT, *TAKE_OFF)
-    assert "before the controller" in told.ending["sentence"]
+    report = typed(rig, Cause.PILOT, *TAKE_OFF)
+    assert "before the controller" in report.ending["sentence"]
 
 
 @pytest.mark.slow
@@ -164,38 +164,38 @@ def test_the_operator_orders_the_landing_in_the_climb(tmp_path: Path, typed: Typ
 @pytest.mark.slow
 def test_arming_is_refused_in_the_vehicle_s_words(tmp_path: Path, typed: Type) -> None:
     poor = ("hand_over.ground_s=4.0", "sim.plant=quadrotor", "sim.quadrotor.charge=0.1")
-    told = typed(Endings(tmp_path, *poor), Cause.NOT_ARMED, *TAKE_OFF)
-    assert "low battery" in told.ending["sentence"] and "was not armed" in told.ending["sentence"]
+    report = typed(Endings(tmp_path, *poor), Cause.NOT_ARMED, *TAKE_OFF)
+    assert "low battery" in report.ending["sentence"] and "was not armed" in report.ending["sentence"]
 
 
 @pytest.mark.slow
 def test_the_mode_to_take_off_in_is_refused(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path, "hand_over.ground_s=4.0")
     rig.hears = lambda data: not NO_COMMANDS(data)
-    told = typed(rig, Cause.NO_MODE, *TAKE_OFF)
-    assert "did not answer" in told.ending["sentence"]
+    report = typed(rig, Cause.NO_MODE, *TAKE_OFF)
+    assert "did not answer" in report.ending["sentence"]
 
 
 @pytest.mark.slow
 def test_the_take_off_is_refused(tmp_path: Path, typed: Type, monkeypatch: pytest.MonkeyPatch) -> None:
     rig = Endings(tmp_path, "sim.autopilot=ardupilot", "hand_over.climb_s=4.0")
     monkeypatch.setattr(rig.peers.autopilot.pilot, "take_off", lambda height_m, at_ns: FAILED)
-    told = typed(rig, Cause.NO_TAKE_OFF, *TAKE_OFF)
-    assert "FAILED" in told.ending["sentence"]
+    report = typed(rig, Cause.NO_TAKE_OFF, *TAKE_OFF)
+    assert "FAILED" in report.ending["sentence"]
 
 
 @pytest.mark.slow
 def test_the_climb_takes_too_long(tmp_path: Path, typed: Type) -> None:
-    told = typed(Endings(tmp_path, "hand_over.climb_s=1.0"), Cause.NO_CLIMB, *TAKE_OFF)
-    assert "landed and disarmed" in told.ending["sentence"]
+    report = typed(Endings(tmp_path, "hand_over.climb_s=1.0"), Cause.NO_CLIMB, *TAKE_OFF)
+    assert "landed and disarmed" in report.ending["sentence"]
 
 
 @pytest.mark.slow
 def test_the_mode_that_takes_setpoints_is_refused(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path, "hand_over.engage_s=3.0")
     rig.at(HandoverState.CLIMBING, deafen("SET_POSITION_TARGET_LOCAL_NED"))
-    told = typed(rig, Cause.NOT_GRANTED, *TAKE_OFF)
-    assert "landed and disarmed" in told.ending["sentence"]
+    report = typed(rig, Cause.NOT_GRANTED, *TAKE_OFF)
+    assert "landed and disarmed" in report.ending["sentence"]
 
 
 def test_no_positions_come(tmp_path: Path, typed: Type) -> None:
@@ -211,19 +211,19 @@ def test_no_vehicle_is_heard(tmp_path: Path, typed: Type) -> None:
 
 
 def test_another_vehicle_is_heard(tmp_path: Path, typed: Type) -> None:
-    other = mavlink.MAVLink(None, srcSystem=9, srcComponent=1)
-    beat = bytes(mavlink.MAVLink_heartbeat_message(2, 12, 29, 4 << 16 | 3 << 24, 3, 3).pack(other))
+    second = mavlink.MAVLink(None, srcSystem=9, srcComponent=1)
+    beat = bytes(mavlink.MAVLink_heartbeat_message(2, 12, 29, 4 << 16 | 3 << 24, 3, 3).pack(second))
     rig = Endings(tmp_path)
     for at_s in (0.3, 0.6, 1.2):
-        rig.after(at_s, lambda one: one.lines["vehicle"].arrived.append((beat, one.now_ns)))
+        rig.after(at_s, lambda rig_now: rig_now.lines["vehicle"].arrived.append((beat, rig_now.now_ns)))
     typed(rig, Cause.NOT_ALONE, *TAKE_OFF)
 
 
 def test_the_vehicle_is_in_the_air_already(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path, airborne=True)
     rig.stick("POSCTL")
-    told = typed(rig, Cause.NOT_BEGUN, *TAKE_OFF)
-    assert "armed already" in told.ending["sentence"]
+    report = typed(rig, Cause.NOT_BEGUN, *TAKE_OFF)
+    assert "armed already" in report.ending["sentence"]
 
 
 @pytest.mark.slow
@@ -242,8 +242,8 @@ def test_a_daemon_before_has_left_it_in_flight(tmp_path: Path, typed: Type, monk
 
     monkeypatch.setattr(rig, "fly", left)
     rig.after(12.0, interrupt)
-    told = typed(rig, Cause.LEFT)
-    assert "in the air" in told.ending["sentence"]
+    report = typed(rig, Cause.LEFT)
+    assert "in the air" in report.ending["sentence"]
 
 
 # In flight
@@ -252,31 +252,31 @@ def test_a_daemon_before_has_left_it_in_flight(tmp_path: Path, typed: Type, monk
 @pytest.mark.slow
 def test_the_place_is_not_reached(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path)
-    told = typed(rig, Cause.NOT_REACHED, *TAKE_OFF, "--goto", "2.2,1.2,-1.2", "--duration", "4")
-    assert "2.2,1.2,-1.2" in told.ending["sentence"]
+    report = typed(rig, Cause.NOT_REACHED, *TAKE_OFF, "--goto", "2.2,1.2,-1.2", "--duration", "4")
+    assert "2.2,1.2,-1.2" in report.ending["sentence"]
 
 
 @pytest.mark.slow
 def test_the_fallback_lands_it(tmp_path: Path, typed: Type) -> None:
-    told = typed(Endings(tmp_path, "link.blackout=[[8.0, 100.0]]"), Cause.FALLBACK, *TAKE_OFF)
-    assert "age of information" in told.ending["sentence"] and "landed and disarmed" in told.ending["sentence"]
+    report = typed(Endings(tmp_path, "link.blackout=[[8.0, 100.0]]"), Cause.FALLBACK, *TAKE_OFF)
+    assert "age of information" in report.ending["sentence"] and "landed and disarmed" in report.ending["sentence"]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("words", [TAKE_OFF, ()])
-def test_the_fallback_lets_it_go(tmp_path: Path, typed: Type, words: tuple[str, ...]) -> None:
+@pytest.mark.parametrize("arguments", [TAKE_OFF, ()])
+def test_the_fallback_lets_it_go(tmp_path: Path, typed: Type, arguments: tuple[str, ...]) -> None:
     # The cameras take another body for ours: its positions are not believed, and ours do not come back.
     swapped = 'sim.fault=[{at_s=9.0,kind="swapped",for_s=100.0}]'
-    rig = Endings(tmp_path, "fallback.land=false", swapped, airborne=not words)
-    told = typed(rig, Cause.FALLBACK_STOPPED, *words)
-    assert "jumped" in told.ending["sentence"]
+    rig = Endings(tmp_path, "fallback.land=false", swapped, airborne=not arguments)
+    report = typed(rig, Cause.FALLBACK_STOPPED, *arguments)
+    assert "jumped" in report.ending["sentence"]
 
 
 @pytest.mark.slow
 def test_landing_fails(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path, "hand_over.land_s=2.0").at(HandoverState.ENGAGED, deafen("COMMAND_LONG"), after_s=2.0)
-    told = typed(rig, Cause.LANDING_FAILED, *TAKE_OFF, "--duration", "9")
-    assert "in the air" in told.ending["sentence"]
+    report = typed(rig, Cause.LANDING_FAILED, *TAKE_OFF, "--duration", "9")
+    assert "in the air" in report.ending["sentence"]
 
 
 @pytest.mark.slow
@@ -284,21 +284,21 @@ def test_landing_fails(tmp_path: Path, typed: Type) -> None:
 def test_a_landing_that_is_long_not_heard_of_is_asked_for_until_it_is(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path, "hand_over.land_s=8.0").at(HandoverState.ENGAGED, deafen("COMMAND_LONG"), after_s=2.0)
     rig.at(HandoverState.LANDING, hear, after_s=12.0)
-    told = typed(rig, Cause.TIME, *TAKE_OFF, "--duration", "9", good=True)
-    assert "landed and disarmed" in told.ending["sentence"] and "asked on" in told.console
+    report = typed(rig, Cause.TIME, *TAKE_OFF, "--duration", "9", good=True)
+    assert "landed and disarmed" in report.ending["sentence"] and "asked on" in report.console
 
 
 @pytest.mark.slow
 def test_positions_that_jump_in_the_climb_break_it_off(tmp_path: Path, typed: Type) -> None:
     swapped = ("sim.camera.swapped=[[1.6, 60.0]]", "sim.camera.other_body_m=[2.0, 1.5, -0.5]")
-    told = typed(Endings(tmp_path, *swapped), Cause.BROKEN_OFF, *TAKE_OFF)
-    assert "jumped" in told.ending["sentence"] and "landed and disarmed" in told.ending["sentence"]
+    report = typed(Endings(tmp_path, *swapped), Cause.BROKEN_OFF, *TAKE_OFF)
+    assert "jumped" in report.ending["sentence"] and "landed and disarmed" in report.ending["sentence"]
 
 
 @pytest.mark.slow
 def test_it_disarms_before_it_has_left_the_ground(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path).at(
-        HandoverState.CLIMBING, lambda one: one.peers.autopilot.pilot._apply_disarming(), after_s=0.0
+        HandoverState.CLIMBING, lambda rig_now: rig_now.peers.autopilot.pilot._apply_disarming(), after_s=0.0
     )
     typed(rig, Cause.NOT_RISEN, *TAKE_OFF)
 
@@ -306,7 +306,7 @@ def test_it_disarms_before_it_has_left_the_ground(tmp_path: Path, typed: Type) -
 @pytest.mark.slow
 def test_it_disarms_in_flight(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path).at(
-        HandoverState.ENGAGED, lambda one: one.peers.autopilot.pilot._apply_disarming(), after_s=2.0
+        HandoverState.ENGAGED, lambda rig_now: rig_now.peers.autopilot.pilot._apply_disarming(), after_s=2.0
     )
     typed(rig, Cause.DISARMED, *TAKE_OFF)
 
@@ -314,8 +314,8 @@ def test_it_disarms_in_flight(tmp_path: Path, typed: Type) -> None:
 @pytest.mark.slow
 def test_the_envelope_lets_it_go(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path, "target.position_m=[2.0,1.0,-1.2]", peers=("frame.yaw_deg=90.0",))
-    told = typed(rig, Cause.LET_GO, *TAKE_OFF)
-    assert told.summary["let_go"] and told.summary["let_go"] in told.ending["sentence"]
+    report = typed(rig, Cause.LET_GO, *TAKE_OFF)
+    assert report.summary["let_go"] and report.summary["let_go"] in report.ending["sentence"]
 
 
 @pytest.mark.slow
@@ -328,16 +328,16 @@ def test_a_failsafe_of_the_vehicle_s_own_lands_it(tmp_path: Path, typed: Type) -
 def test_a_failsafe_of_the_vehicle_s_own_hovers_and_does_not_end(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path, "hand_over.climb_s=8.0")
     rig.at(HandoverState.ENGAGED, deafen("SET_POSITION_TARGET_LOCAL_NED"), after_s=2.0)
-    told = typed(rig, Cause.FAILSAFE, *TAKE_OFF)
-    assert "not ended in 8 s" in told.ending["sentence"] and "landed and disarmed" in told.ending["sentence"]
+    report = typed(rig, Cause.FAILSAFE, *TAKE_OFF)
+    assert "not ended in 8 s" in report.ending["sentence"] and "landed and disarmed" in report.ending["sentence"]
 
 
 @pytest.mark.slow
 def test_a_failsafe_ends_a_flight_that_the_pilot_began(tmp_path: Path, typed: Type) -> None:
     rig = Endings(tmp_path, airborne=True).at(HandoverState.ENGAGED, fail(Role.HOLD), after_s=2.0)
     rig.at(HandoverState.RELEASED, interrupt, after_s=2.0)
-    told = typed(rig, Cause.FAILSAFE)
-    assert "in the air" in told.ending["sentence"]
+    report = typed(rig, Cause.FAILSAFE)
+    assert "in the air" in report.ending["sentence"]
 
 
 @pytest.mark.slow
@@ -358,17 +358,19 @@ def test_the_vehicle_starts_anew(tmp_path: Path, typed: Type) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("words", "state"),
+    ("arguments", "state"),
     [(TAKE_OFF, HandoverState.ENGAGED), ((), HandoverState.ENGAGED), (TAKE_OFF, HandoverState.CLIMBING)],
 )
-def test_the_vehicle_falls_silent(tmp_path: Path, typed: Type, words: tuple[str, ...], state: HandoverState) -> None:
+def test_the_vehicle_falls_silent(
+    tmp_path: Path, typed: Type, arguments: tuple[str, ...], state: HandoverState
+) -> None:
     def silence(rig: Endings) -> None:
         rig.told = lambda data: False
 
-    rig = Endings(tmp_path, "hand_over.land_s=6.0", "hand_over.climb_s=2.0", airborne=not words)
+    rig = Endings(tmp_path, "hand_over.land_s=6.0", "hand_over.climb_s=2.0", airborne=not arguments)
     rig.at(state, silence, after_s=0.0 if state is HandoverState.CLIMBING else 2.0)
     rig.at(HandoverState.ENGAGED, interrupt, after_s=12.0)
-    typed(rig, Cause.SILENT, *words)
+    typed(rig, Cause.SILENT, *arguments)
 
 
 @pytest.mark.slow
@@ -389,11 +391,11 @@ def test_the_controller_fails_and_the_relay_goes_on(
 
     rig = Endings(tmp_path, "relay.enabled=true", "sim.plant=quadrotor")
     rig.at(HandoverState.ENGAGED, lambda _: monkeypatch.setattr(control, "run_tick", broken), after_s=2.0)
-    told = typed(rig, Cause.CONTROL, *TAKE_OFF)
-    assert "the core is broken" in told.ending["sentence"] and "landed and disarmed" in told.ending["sentence"]
-    assert "after the last setpoint" in told.ending["relay"] and told.ending["relay"] in told.console
-    assert told.ending["relay"] in told.page
-    assert told.relay is not None and told.relay.alone
+    report = typed(rig, Cause.CONTROL, *TAKE_OFF)
+    assert "the core is broken" in report.ending["sentence"] and "landed and disarmed" in report.ending["sentence"]
+    assert "after the last setpoint" in report.ending["relay"] and report.ending["relay"] in report.console
+    assert report.ending["relay"] in report.page
+    assert report.relay is not None and report.relay.alone
 
 
 @pytest.mark.slow
@@ -406,7 +408,7 @@ def test_the_operator_is_answered_while_the_relay_goes_on_alone(tmp_path: Path, 
     rig.at(HandoverState.RELEASED, stick("AUTO.LAND"), after_s=5.0).at(
         HandoverState.RELEASED, Endings.ask_status, after_s=6.0
     )
-    told = typed(rig, Cause.PILOT, *TAKE_OFF, good=True)
+    report = typed(rig, Cause.PILOT, *TAKE_OFF, good=True)
     flying, alone, landing = rig.statuses
     assert (flying["ending"], flying["relay"]["alone"]) == ("", False)
     assert flying["relay"]["sent"] < alone["relay"]["sent"] < landing["relay"]["sent"]
@@ -414,7 +416,7 @@ def test_the_operator_is_answered_while_the_relay_goes_on_alone(tmp_path: Path, 
         assert status["relay"]["alone"] and status["relay"]["sent_hz"] > 0.0 and status["relay"]["last_s"] < 3.0
         assert status["ending"].lower().startswith(Cause.PILOT) and f"in the air, in mode {mode}" in status["ending"]
         assert status["who_flies"] == HandoverState.RELEASED
-    assert told.relay is not None and told.relay.alone
+    assert report.relay is not None and report.relay.alone
 
 
 @pytest.mark.slow
@@ -439,14 +441,14 @@ def test_a_second_signal_ends_it_at_once(tmp_path: Path, capsys: pytest.CaptureF
         .at(HandoverState.ENGAGED, interrupt, after_s=2.0)
         .at(HandoverState.ENGAGED, interrupt, after_s=0.1)
     )
-    told = flown(rig, capsys, *TAKE_OFF)
-    (recorded,) = told.recorded
+    report = flown(rig, capsys, *TAKE_OFF)
+    (recorded,) = report.recorded
     assert (recorded.cause, recorded.exit_code) == (Cause.SIGNALLED, 130)
-    assert told.code == 130 and f"ended: {recorded.sentence}" in told.console and told.status == recorded.sentence
+    assert report.code == 130 and f"ended: {recorded.sentence}" in report.console and report.status == recorded.sentence
     assert "in the air" in recorded.sentence
-    page = told.path.with_name("again.html")
+    page = report.path.with_name("again.html")
     with unwritten():
-        code = run(["log", "report", str(told.path), "--out", str(page)])
+        code = run(["log", "report", str(report.path), "--out", str(page)])
     capsys.readouterr()
     assert code == 0 and recorded.sentence in words_of(page)
 
@@ -459,12 +461,12 @@ def test_a_disk_that_takes_no_more_is_told_with_how_it_ended(
         monkeypatch.setattr(Sync, "full", True)
 
     rig = Endings(tmp_path).at(HandoverState.ENGAGED, fill, after_s=2.0)
-    told = flown(rig, capsys, *TAKE_OFF, "--duration", "12")
-    ending = told.ending
-    assert ending["cause"] == Cause.TIME and not ending["as_ordered"] and told.code == ending["exit_code"] == 1
+    report = flown(rig, capsys, *TAKE_OFF, "--duration", "12")
+    ending = report.ending
+    assert ending["cause"] == Cause.TIME and not ending["as_ordered"] and report.code == ending["exit_code"] == 1
     assert "the recording lacks" in ending["sentence"] and "No space left on device" in ending["sentence"]
-    assert f"ended: {ending['sentence']}" in told.console and ending["sentence"] in told.page
-    assert ending["sentence"].startswith(told.status.removesuffix("."))
+    assert f"ended: {ending['sentence']}" in report.console and ending["sentence"] in report.page
+    assert ending["sentence"].startswith(report.status.removesuffix("."))
 
 
 # What the daemon has no part in
@@ -477,8 +479,8 @@ def test_an_end_that_is_cut_off_is_told_everywhere(
     # The time of a hand-over is longer than that of any request to land, so it takes a shorter one to be cut off.
     monkeypatch.setattr(engagement, "LANDING_S", 1.0)
     rig = Endings(tmp_path, airborne=True).at(HandoverState.ENGAGED, deafen("COMMAND_LONG"))
-    told = typed(rig.at(HandoverState.ENGAGED, interrupt, after_s=3.0), Cause.CUT_OFF)
-    assert Cause.OPERATOR in told.ending["sentence"] and "in the air" in told.ending["sentence"]
+    report = typed(rig.at(HandoverState.ENGAGED, interrupt, after_s=3.0), Cause.CUT_OFF)
+    assert Cause.OPERATOR in report.ending["sentence"] and "in the air" in report.ending["sentence"]
 
 
 @pytest.mark.slow

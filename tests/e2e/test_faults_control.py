@@ -103,8 +103,8 @@ def test_row_3_no_miss_in_20000_ticks_of_random_losses() -> None:
 
 @pytest.mark.fault(4)
 def test_row_4_a_late_packet_ages_from_its_capture_and_the_plan_is_rebased() -> None:
-    late = sample(boundary_ns(3) - 50 * MS, boundary_ns(5) - 10 * MS, position_m=(0.1, 0.0, 0.0))
-    samples = [*one_a_step(lost=[3, 4, 5]), late]
+    delayed_sample = sample(boundary_ns(3) - 50 * MS, boundary_ns(5) - 10 * MS, position_m=(0.1, 0.0, 0.0))
+    samples = [*one_a_step(lost=[3, 4, 5]), delayed_sample]
     solver = StubSolver(small_plant())
     outputs = run(make_controller(solver), inputs_of(range(7 * TICKS), samples))
     assert [output.decision.age_steps for output in boundaries(outputs)] == [0, 0, 0, 1, 2, 2, 0]
@@ -174,7 +174,7 @@ def test_row_7_a_backlog_burst_is_one_solve_with_the_newest() -> None:
 
 
 def bad(**changes: object) -> Callable[[PositionSample], PositionSample]:
-    return lambda one: msgspec.structs.replace(one, **changes)
+    return lambda position_sample: msgspec.structs.replace(position_sample, **changes)
 
 
 BAD_SAMPLES = {
@@ -250,8 +250,12 @@ def test_row_18_a_sample_that_arrives_after_the_tick_is_refused() -> None:
 def test_row_18_flying_across_2_to_the_32_milliseconds_changes_nothing() -> None:
     shift = 2**32 * MS - boundary_ns(3)
 
-    def shifted(one: PositionSample) -> PositionSample:
-        return msgspec.structs.replace(one, captured_ns=one.captured_ns + shift, received_ns=one.received_ns + shift)
+    def shifted(position_sample: PositionSample) -> PositionSample:
+        return msgspec.structs.replace(
+            position_sample,
+            captured_ns=position_sample.captured_ns + shift,
+            received_ns=position_sample.received_ns + shift,
+        )
 
     inputs = inputs_of(range(6 * TICKS), one_a_step(lost=[2]))
     later = [
@@ -284,11 +288,11 @@ def test_row_21_missed_ticks_are_counted_and_there_is_one_setpoint_a_tick() -> N
 
 @pytest.mark.fault(21)
 def test_row_21_a_missed_boundary_at_which_the_age_reaches_the_horizon_is_the_fallback_in_the_next_tick() -> None:
-    late = sample(
+    delayed_sample = sample(
         boundary_ns(3) - 50 * MS, boundary_ns(5) - 10 * MS
     )  # so that the plan ends after the age has reached H
     after_the_boundary = sample(boundary_ns(7) + 10 * MS)
-    samples = [*one_a_step(steps=3), late, after_the_boundary]
+    samples = [*one_a_step(steps=3), delayed_sample, after_the_boundary]
     ticks = [tick for tick in range(8 * TICKS) if tick != 7 * TICKS]
     punctual = run(make_controller(), inputs_of(range(8 * TICKS), samples))[7 * TICKS]
     woken = run(make_controller(), inputs_of(ticks, samples))[7 * TICKS]

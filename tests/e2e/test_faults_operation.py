@@ -126,8 +126,8 @@ def test_setpoints_die_with_the_control_loop() -> None:
             flight.loop.receive(link, data, arrival_ns)
     assert len(flight.memory.of(Setpoint)) == before
     # Who asks for the time is answered as long as anybody listens, and that is all.
-    late = [
+    late_messages = [
         message for datagram in flight.outgoing() if datagram.at_ns > 60 * TICK_NS for message in decode(datagram.data)
     ]
-    assert {message.get_type() for message in late} == {"TIMESYNC"}
+    assert {message.get_type() for message in late_messages} == {"TIMESYNC"}
     assert flight.truths[-1].mode != "OFFBOARD"

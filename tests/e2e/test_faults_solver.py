@@ -101,9 +101,9 @@ def test_row_23_an_answer_to_another_question_is_discarded(offset: int) -> None:
     controller, _ = with_faults({3: lambda answer: replace(answer, seq=answer.seq + offset)})
     outputs = run(controller, inputs_of(range(5 * TICKS), one_a_step()))
     assert flown(outputs) == [(0, 0), (1, 0), (2, 0), (2, 1), (4, 0)]
-    late = boundaries(outputs)[3]
-    assert (late.decision.solve, late.plan) == (SolveStatus.LATE, None)
-    assert codes(late) == {"solve-late": 1}
+    late_output = boundaries(outputs)[3]
+    assert (late_output.decision.solve, late_output.plan) == (SolveStatus.LATE, None)
+    assert codes(late_output) == {"solve-late": 1}
 
 
 def spoiled(name: str, value: float) -> Fault:

@@ -51,10 +51,10 @@ class FullFrom:
 def assert_segments_begin_once(path: Path) -> None:
     """Each file has one header, and one note of why it was begun, however often that was tried."""
     for file in segment_files(path):
-        found = [item for item in scan(file) if isinstance(item, RecordedMessage)]
-        assert [item.definition.topic for item in found].count("/uavctl/header") == 1
-        assert found[0].definition.topic == "/uavctl/header"
-        assert sum(b"after a failed write" in item.data for item in found) == (file != path)
+        results = [item for item in scan(file) if isinstance(item, RecordedMessage)]
+        assert [item.definition.topic for item in results].count("/uavctl/header") == 1
+        assert results[0].definition.topic == "/uavctl/header"
+        assert sum(b"after a failed write" in item.data for item in results) == (file != path)
 
 
 @pytest.mark.fault(29)
@@ -283,11 +283,11 @@ def test_32_other_chunks_stay_readable(tmp_path: Path) -> None:
     for offset in offsets:
         for position in (offset, offset + 3, offset + 8, offset + 33, offset + 60):
             path.write_bytes(flipped(data, position, 4))
-            found = list(scan(path))
-            assert [item for item in found if isinstance(item, RecordedMessage)] == [
+            result = list(scan(path))
+            assert [item for item in result if isinstance(item, RecordedMessage)] == [
                 item for item in whole if item.offset != offset
             ]
-            assert [(item.offset, item.torn) for item in found if isinstance(item, Damage)] == [(offset, False)]
+            assert [(item.offset, item.torn) for item in result if isinstance(item, Damage)] == [(offset, False)]
 
 
 @pytest.mark.fault(32)

@@ -112,7 +112,7 @@ def test_an_early_freeze_is_no_worse_than_a_blackout_where_the_vehicle_says_noth
         (FaultConfig(at_s=2.0, kind="frame", name="turned-180"), MOVED_M),
         (FaultConfig(at_s=5.0, kind="drift", velocity_mps=(0.0, 0.0, 0.3)), MOVED_M),
     ],
-    ids=lambda one: f"{one.kind}-{one.at_s}" if isinstance(one, FaultConfig) else "",
+    ids=lambda value: f"{value.kind}-{value.at_s}" if isinstance(value, FaultConfig) else "",
 )
 def test_as_delivered_the_preset_stays_near_the_room_too(
     as_flown: Prepared, autopilot: str, fault: FaultConfig, moved_m: float

@@ -83,15 +83,15 @@ def beyond_limits(memory: Memory) -> tuple[Array, Array]:
     """
     room = build_design(load_config("room-hahn-stursberg")).state_set
     plans = {plan.seq: plan for plan in memory.of(Plan)}
-    told = steps(memory)
-    beyond = np.array([truth.state for _, truth in told[1:]]) @ room.c.T - room.b
+    decided_steps = steps(memory)
+    beyond = np.array([truth.state for _, truth in decided_steps[1:]]) @ room.c.T - room.b
     given = np.zeros_like(beyond)
-    for row, (decision, _) in zip(given, told[:-1], strict=True):
+    for row, (decision, _) in zip(given, decided_steps[:-1], strict=True):
         if decision.plan_seq is not None and decision.plan_index is not None:
-            for way in plans[decision.plan_seq].gave_way:
-                if way.constraint == "state" and way.stage == decision.plan_index + 1:
-                    backoff = plans[decision.plan_seq].backoff_x[way.stage][way.index]
-                    row[way.index] = way.amount + backoff
+            for relaxation in plans[decision.plan_seq].gave_way:
+                if relaxation.constraint == "state" and relaxation.stage == decision.plan_index + 1:
+                    backoff = plans[decision.plan_seq].backoff_x[relaxation.stage][relaxation.index]
+                    row[relaxation.index] = relaxation.amount + backoff
     return beyond, given
 
 
@@ -118,18 +118,18 @@ def test_a_mission_is_flown_and_replayed_bit_for_bit(seconds: float, overrides: 
 
 
 def test_waypoints_are_visited_in_their_order_and_held_for_their_time() -> None:
-    told = steps(flown(22.0, *WAYPOINTS))
-    numbers = [decision.waypoint for decision, _ in told if decision.target is not None]
+    decided_steps = steps(flown(22.0, *WAYPOINTS))
+    numbers = [decision.waypoint for decision, _ in decided_steps if decision.target is not None]
     assert numbers == sorted(numbers, key=lambda number: -1 if number is None else number)
     assert set(numbers) == {0, 1, 2}
     for number, place in enumerate(PLACES_M):
-        there = [(d, t) for d, t in told if d.waypoint == number]
-        assert all(np.array(d.target)[[0, 3, 6]].tolist() == list(place) for d, _ in there)
+        at_waypoint = [(d, t) for d, t in decided_steps if d.waypoint == number]
+        assert all(np.array(d.target)[[0, 3, 6]].tolist() == list(place) for d, _ in at_waypoint)
         # Arrived as the estimate says, so the truth is near by what the estimate is off at most.
-        arrived = next(d.at_ns for d, t in there if distance_m(d, t) < ACCEPT_M + 0.15)
-        assert there[-1][0].at_ns - arrived >= (HOLD_S - 0.4) * 1e9
-        assert min(distance_m(d, t) for d, t in there) < 0.15
-    assert np.mean([distance_m(d, t) for d, t in told[-10:]]) < 0.2
+        arrived = next(d.at_ns for d, t in at_waypoint if distance_m(d, t) < ACCEPT_M + 0.15)
+        assert at_waypoint[-1][0].at_ns - arrived >= (HOLD_S - 0.4) * 1e9
+        assert min(distance_m(d, t) for d, t in at_waypoint) < 0.15
+    assert np.mean([distance_m(d, t) for d, t in decided_steps[-10:]]) < 0.2
 
 
 @pytest.mark.slow
@@ -158,8 +158,8 @@ def test_a_fence_that_closes_in_slowly_is_kept_by_every_plan() -> None:
         fence_m = np.interp(decision.at_ns * 1e-9 - begun_s, [5.0, 15.0], [3.0, 0.9])
         assert truth.state[0] <= fence_m
     # It does what it can: as near to the target as the fence and its reserve let it.
-    late = [truth.state[0] for decision, truth in steps(memory) if decision.at_ns > 18e9]
-    assert 0.2 < np.mean(late) < 0.9
+    late_positions = [truth.state[0] for decision, truth in steps(memory) if decision.at_ns > 18e9]
+    assert 0.2 < np.mean(late_positions) < 0.9
     plan = memory.of(Plan)[-1]
     assert plan.offset > 0.5
     assert plan.gave_way == ()
@@ -204,9 +204,9 @@ def test_the_report_shows_the_target_of_the_moment_and_the_moving_limit() -> Non
     assert render_report(moving, summary).startswith("<!DOCTYPE html>")
     assert summary.trajectory and "Distance from trajectory" in dict(list_summary_rows(summary))
     assert "Distance from target" in dict(list_summary_rows(summarise(data, wall_s=1.0)))
-    told = describe_flight(moving, summary)
-    (sentence,) = [text for text in told if "follow a trajectory" in text]
-    assert not any("from the target" in text or "waypoint" in text for text in told)
+    description = describe_flight(moving, summary)
+    (sentence,) = [text for text in description if "follow a trajectory" in text]
+    assert not any("from the target" in text or "waypoint" in text for text in description)
     # 40 chords of the circle, one a sample, of which each is cut into pieces of a step.
     length_m, begun_s, ended_s = numbers_in(sentence)
     error_m = compute_position_errors_m(moving)
@@ -254,11 +254,11 @@ def test_a_plan_that_gives_way_is_one_event_with_the_worst_and_the_number_of_oth
     given = tuple(GaveWay(constraint="equilibrium", stage=3, index=i, amount=0.1 * (i + 1)) for i in range(3))
     solver = StubSolver(small_plant(), faults={1: lambda answer: replace(answer, gave_way=given)})
     outputs = run(make_controller(solver), inputs_of(range(3 * TICKS), one_a_step()))
-    told = [(number, output) for number, output in enumerate(outputs) if "gave-way" in codes(output)]
-    assert [number for number, _ in told] == [TICKS]
-    (event,) = [event for event in told[0][1].events if event.code == "gave-way"]
+    relaxed_outputs = [(number, output) for number, output in enumerate(outputs) if "gave-way" in codes(output)]
+    assert [number for number, _ in relaxed_outputs] == [TICKS]
+    (event,) = [event for event in relaxed_outputs[0][1].events if event.code == "gave-way"]
     assert event.text == "rest was missed by 0.3 of state 2 in stage 3; so did 2 others"
-    plan = told[0][1].plan
+    plan = relaxed_outputs[0][1].plan
     assert plan is not None and plan.gave_way == given
 
 

@@ -129,8 +129,8 @@ def test_where_the_vehicle_s_words_were_lost_nothing_goes_out_until_it_is_heard_
     rig.loop.refused("mocap", {why: 3}, rig.tick * TICK_NS)  # of the cameras': nothing that could be the pilot's
     assert rig.run(5, deaf=True).count(SETPOINT) == 5
     rig.heartbeat(OFFBOARD)
-    told = rig.loop.refused("vehicle", {why: 3}, rig.tick * TICK_NS)
-    assert [event.code for event in told] == ["hung-up"] * (why == "hung-up")  # a person at the console is told
+    reported = rig.loop.refused("vehicle", {why: 3}, rig.tick * TICK_NS)
+    assert [event.code for event in reported] == ["hung-up"] * (why == "hung-up")  # a person at the console is told
     silent = rig.run(20, deaf=True)
     assert not {SETPOINT, LAND} & set(silent)
     rig.heartbeat(OFFBOARD, late_ns=1)
@@ -147,8 +147,8 @@ def test_a_vehicle_that_fell_silent_is_told_and_its_landing_goes_out_all_the_sam
     rig = Rig('solver.method="exact"')
     rig.run(40)
     rig.heartbeat(OFFBOARD)
-    told = rig.loop.refused("vehicle", {"went-silent": 1}, rig.tick * TICK_NS)
-    assert [event.code for event in told] == ["went-silent"]
+    reported = rig.loop.refused("vehicle", {"went-silent": 1}, rig.tick * TICK_NS)
+    assert [event.code for event in reported] == ["went-silent"]
     assert LAND in rig.run(70, stop=True, deaf=True)  # no word of a pilot's was lost: it said nothing
 
 
@@ -187,8 +187,8 @@ def test_a_silent_vehicle_is_braked_and_held_for_a_while_and_then_left_to_its_ow
     assert {s.source for s in rig.memory.of(Setpoint)[-60:]} <= {SetpointSource.BRAKE, SetpointSource.HOLD}
     rig.run(100, deaf=True)  # fallback.brake_s and hold_s are over
     assert SETPOINT not in rig.run(50, deaf=True)
-    told = [e.text for e in rig.memory.of(Event) if e.code == "heartbeat"]
-    assert len(told) == 1 and "lost" in told[0]
+    reported = [e.text for e in rig.memory.of(Event) if e.code == "heartbeat"]
+    assert len(reported) == 1 and "lost" in reported[0]
 
 
 def test_a_long_blackout_ends_in_a_landing_that_the_vehicle_obeys() -> None:

@@ -70,22 +70,22 @@ def is_typed(command: str) -> bool:
 
 @pytest.fixture
 def at_desk(tmp_path: Path) -> Iterator[Desk]:
-    with desk(tmp_path) as one:
-        yield one
+    with desk(tmp_path) as shell:
+        yield shell
 
 
 @pytest.fixture(scope="session")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Files that pages take for granted: flights by the names that they have there, other people's recordings."""
     folder = tmp_path_factory.mktemp("flown")
-    with desk(tmp_path_factory.mktemp("desk")) as one:
-        ways = "mission.waypoints=[[1.5,1.0,-1.2],[-1.5,-1.0,-0.8],[1.5,-1.0,-1.4]]"
-        flight = f"uavctl loopback --config room-px4 --duration 40 --out flights/NAME --set '{ways}'"
-        one.run(flight)
-        one.run("uavctl identify flights/NAME/flight.mcap")
+    with desk(tmp_path_factory.mktemp("desk")) as shell:
+        waypoints = "mission.waypoints=[[1.5,1.0,-1.2],[-1.5,-1.0,-0.8],[1.5,-1.0,-1.4]]"
+        flight = f"uavctl loopback --config room-px4 --duration 40 --out flights/NAME --set '{waypoints}'"
+        shell.run(flight)
+        shell.run("uavctl identify flights/NAME/flight.mcap")
         for name in ("A", "B"):
-            one.run(f"uavctl loopback --duration 8 --out flights/{name}")
-        shutil.move(one.folder / "flights", folder / "flights")
+            shell.run(f"uavctl loopback --duration 8 --out flights/{name}")
+        shutil.move(shell.folder / "flights", folder / "flights")
     shutil.copy(folder / "flights/NAME/flight.mcap", folder / "FLIGHT")
     shutil.copy(folder / "flights/NAME/identified.toml", folder / "identified.toml")
     shutil.copy(DATA / "arducopter-vicon-loop.tlog", folder / "somebody-elses.tlog")
@@ -123,12 +123,12 @@ def test_a_page_s_commands_do_what_they_say(page: str, at_desk: Desk, flown: Pat
 def test_a_page_s_configurations_load(page: str) -> None:
     """Each block overrides a preset, or what `uavctl init` writes; one with a plant's matrices stands for itself."""
     for block in blocks(page, "toml"):
-        found = keys(block)
-        overrides = [f"{table}.{key}={value.split('   #')[0]}" for table, key, value in found]
+        result = keys(block)
+        overrides = [f"{table}.{key}={value.split('   #')[0]}" for table, key, value in result]
         assert overrides
-        if any((table, key) == ("plant", "a") for table, key, _ in found):
+        if any((table, key) == ("plant", "a") for table, key, _ in result):
             parse(block, page)
-        elif any(table == "room" for table, _, _ in found):
+        elif any(table == "room" for table, _, _ in result):
             parse(format_room(parse_sizes("5x5x2.7"), "px4", page), page, overrides)
         else:
             load_config("room-px4", overrides)
@@ -161,15 +161,15 @@ def test_the_first_flight_as_the_page_says(autopilot: str, at_desk: Desk) -> Non
     assert ROOM_START in sim
     vehicle = at_desk.start(sim)
     at_desk.until_said(vehicle, "system_id")
-    own = room.read_text()
-    room.write_text(edited(own, f"[check]\naccept = {json.dumps(OF_TIME)}\n"))
+    room_text = room.read_text()
+    room.write_text(edited(room_text, f"[check]\naccept = {json.dumps(OF_TIME)}\n"))
     (check,) = on_page("6. ")
     assert "check: ready" in at_desk.run(check)
     (dry,) = on_page("7. ")
     at_desk.run(dry, code=1)  # nothing was flown
     at_desk.stop(vehicle)
     at_desk.until_said(at_desk.start(f"{sim} {PATIENT}"), "system_id")
-    room.write_text(edited(own, f"[check]\naccept = {json.dumps(OF_TIME + TIMEOUTS)}\n"))
+    room.write_text(edited(room_text, f"[check]\naccept = {json.dumps(OF_TIME + TIMEOUTS)}\n"))
     fly, *orders = on_page("9. ")
     flight = at_desk.start(f"{fly} --out flights/NAME")
     at_desk.until_good(FLIES)
@@ -195,9 +195,9 @@ def test_a_fleet_flies_as_the_page_says(at_desk: Desk) -> None:
     flight = at_desk.start(fly)
     at_desk.until_good(FLIES.replace("--json", "--json --vehicle 14540"))
     at_desk.until_good(FLIES.replace("--json", "--json --vehicle 14541"))
-    status, land, one = orders
+    status, land, wait_order = orders
     at_desk.run(status)
-    at_desk.until_good(one)
+    at_desk.until_good(wait_order)
     at_desk.run(land)
     at_desk.ends(flight, fly)
 

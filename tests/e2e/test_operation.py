@@ -27,8 +27,8 @@ from uavctl.records import ControlMode, Datagram, Decision, Order, StepInput
 
 @pytest.fixture
 def air() -> Iterator[Scene]:
-    with scene() as found:
-        yield found
+    with scene() as result:
+        yield result
 
 
 def wait_for_flight(air: Scene) -> None:
@@ -48,17 +48,17 @@ def test_orders_are_answered_with_the_decision_and_a_second_daemon_is_refused(ai
         wait_for_flight(air)
 
         with ended(air.fly("second")) as second:
-            _, told = second.communicate(timeout=LIMIT_S)
-        assert second.returncode == 1 and f"process {process.pid} flies this vehicle already" in told
+            _, errors = second.communicate(timeout=LIMIT_S)
+        assert second.returncode == 1 and f"process {process.pid} flies this vehicle already" in errors
         assert not list((air.folder / "second").glob("*"))
 
-        code, _, told = air.ctl("goto", "-1,0.5,-1.4")
-        assert code == 0 and told.startswith("goto accepted")
-        code, told, _ = air.ctl("goto", "9,0,-1", "--json")
-        assert code == 1 and "north 9 m is outside" in json.loads(told)["text"]
+        code, _, errors = air.ctl("goto", "-1,0.5,-1.4")
+        assert code == 0 and errors.startswith("goto accepted")
+        code, errors, _ = air.ctl("goto", "9,0,-1", "--json")
+        assert code == 1 and "north 9 m is outside" in json.loads(errors)["text"]
         assert air.ctl("goto", "1,2")[0] == 2 and air.ctl("goto", "nan,0,-1")[0] == 2
-        code, _, told = air.ctl("hold", "--vehicle", "another")
-        assert code == 1 and "no daemon named like 'another'" in told
+        code, _, errors = air.ctl("hold", "--vehicle", "another")
+        assert code == 1 and "no daemon named like 'another'" in errors
         name = air.status()["name"]
         # obeyed at the next boundary that has news: which one, the lossy link decides
         until(lambda: air.status()["target_m"] == {"north": -1.0, "east": 0.5, "down": -1.4}, "the order is obeyed")
@@ -99,8 +99,8 @@ def test_after_sigkill_nothing_is_sent_and_the_vehicle_s_own_failsafe_acts(air: 
         assert air.ctl("engage")[0] == 0
         wait_for_flight(air)
         process.send_signal(signal.SIGINT)
-        _, told = process.communicate(timeout=LIMIT_S)
-    assert "left the vehicle in flight" in told and "uavctl ctl engage" in told
+        _, errors = process.communicate(timeout=LIMIT_S)
+    assert "left the vehicle in flight" in errors and "uavctl ctl engage" in errors
     orders = [c.order for i in records(air.folder / "again" / "flight.mcap", StepInput) for c in i.commands]
     assert orders == [Order.STAND_BY, Order.ENGAGE]
     sent = [
@@ -141,17 +141,17 @@ def test_the_service_manager_hears_of_the_flight_and_nothing_of_a_hanging_loop(a
         manager.bind(str(air.folder / "notify"))
         manager.settimeout(LIMIT_S)
         environ = {**os.environ, "NOTIFY_SOCKET": str(air.folder / "notify"), "WATCHDOG_USEC": "400000"}
-        heard: list[str] = []
+        received: list[str] = []
 
         def hear(enough: Callable[[], bool]) -> None:
             def heard_enough() -> bool:
-                heard.append(manager.recv(4096).decode())
+                received.append(manager.recv(4096).decode())
                 return enough()
 
             until(heard_enough, "what the manager is to be told", pause_s=0.0)
 
         with ended(air.fly("f", environ=environ)) as process:
-            hear(lambda: heard.count("WATCHDOG=1") > 10 and any("OFFBOARD armed" in text for text in heard))
+            hear(lambda: received.count("WATCHDOG=1") > 10 and any("OFFBOARD armed" in text for text in received))
             process.send_signal(signal.SIGSTOP)
             manager.settimeout(1.0)
             with pytest.raises(TimeoutError):
@@ -164,11 +164,11 @@ def test_the_service_manager_hears_of_the_flight_and_nothing_of_a_hanging_loop(a
             process.send_signal(signal.SIGCONT)
             manager.settimeout(LIMIT_S)
             process.send_signal(signal.SIGINT)
-            hear(lambda: heard[-1] == "STOPPING=1")
-            _, told = process.communicate(timeout=LIMIT_S)
-    assert heard[0] == "READY=1"
-    lines = [line.removeprefix("STATUS=") for line in heard if line.startswith("STATUS=")]
-    assert lines[0] in told  # the health line of a daemon without a terminal
+            hear(lambda: received[-1] == "STOPPING=1")
+            _, errors = process.communicate(timeout=LIMIT_S)
+    assert received[0] == "READY=1"
+    lines = [line.removeprefix("STATUS=") for line in received if line.startswith("STATUS=")]
+    assert lines[0] in errors  # the health line of a daemon without a terminal
 
 
 @pytest.mark.slow
@@ -182,16 +182,16 @@ def test_a_recording_that_is_deleted_while_flying_is_told_at_once_and_in_the_end
             assert air.status()["recorder"]["ok"]
             shutil.rmtree(air.folder / "f")
             until(lambda: not air.status()["recorder"]["ok"], "the loss is seen")
-            found = air.status()["recorder"]
-            assert found["dropped"] > 0 and found["reason"].startswith("flight.mcap deleted")
+            result = air.status()["recorder"]
+            assert result["dropped"] > 0 and result["reason"].startswith("flight.mcap deleted")
             assert "in trouble, " in air.ctl("status")[1]
             until(lambda: b"flight.mcap deleted" in manager.recv(4096), "the service manager hears of it", pause_s=0.0)
             process.send_signal(signal.SIGINT)
-            _, told = process.communicate(timeout=LIMIT_S)
+            _, errors = process.communicate(timeout=LIMIT_S)
     assert process.returncode == 1
-    why = found["reason"]
-    assert f"warning: recording in trouble: {why}" in told  # as it happened
-    assert f"({why})" in told and "Traceback" not in told  # at the end
+    why = result["reason"]
+    assert f"warning: recording in trouble: {why}" in errors  # as it happened
+    assert f"({why})" in errors and "Traceback" not in errors  # at the end
     rest = list(records(air.folder / "f" / "flight-2.mcap", Decision))
     assert rest[-1].mode is not ControlMode.TRACK and rest[0].tick > 0  # up to its end it goes on in a new folder
 
@@ -219,23 +219,23 @@ def test_a_disk_that_hangs_while_flying_is_told_and_the_flight_goes_on(air: Scen
         wait_for_flight(air)
         flag.touch()
         until(lambda: not air.status()["recorder"]["ok"], "the disk's hanging is seen")
-        found = air.status()
-        assert found["mode"] == "track" and found["recorder"]["dropped"] == 0
-        assert f"last written {found['recorder']['unwritten_s']:.1f} s ago" in found["recorder"]["reason"]
+        result = air.status()
+        assert result["mode"] == "track" and result["recorder"]["dropped"] == 0
+        assert f"last written {result['recorder']['unwritten_s']:.1f} s ago" in result["recorder"]["reason"]
         flag.unlink()
         until(lambda: bool(air.status()["recorder"]["ok"]), "all is written")
         flag.touch()
         process.send_signal(signal.SIGINT)
-        _, told = process.communicate(timeout=LIMIT_S)
-    assert process.returncode == 1 and "Traceback" not in told
-    assert re.search(r"records \(.* last written \d+\.\d s ago", told.replace("\n", " "))
+        _, errors = process.communicate(timeout=LIMIT_S)
+    assert process.returncode == 1 and "Traceback" not in errors
+    assert re.search(r"records \(.* last written \d+\.\d s ago", errors.replace("\n", " "))
 
 
 @pytest.mark.slow
 def test_several_daemons_are_told_apart_by_name(air: Scene) -> None:
-    with scene("sim.seed=3") as other:
-        other.control = air.control
-        with ended(air.fly("f")) as one, ended(other.fly("f")) as two:
+    with scene("sim.seed=3") as second:
+        second.control = air.control
+        with ended(air.fly("f")) as first, ended(second.fly("f")) as two:
             until(lambda: len([*air.control.iterdir()] if air.control.exists() else []) == 2, "both listen")
             until(lambda: "several daemons run" in air.ctl("status")[2], "both answer")
             names = [path.stem for path in air.control.iterdir()]
@@ -243,7 +243,7 @@ def test_several_daemons_are_told_apart_by_name(air: Scene) -> None:
             for name in names:
                 until(lambda name=name: air.ctl("status", "--vehicle", name)[0] == 0, name)  # type: ignore[misc]
                 pids.add(json.loads(air.ctl("status", "--vehicle", name, "--json")[1])["pid"])
-            assert pids == {one.pid, two.pid}
+            assert pids == {first.pid, two.pid}
 
 
 def test_a_unit_of_systemd_s_comes_with_the_package() -> None:

@@ -42,9 +42,9 @@ def test_a_lossy_link_loses_none(autopilot: str) -> None:
     flight.hears = lambda data: not asks(data) or dice.random() > 0.3
     flight.told = lambda data: not asks(data) or dice.random() > 0.3
     flight.run(15.0)
-    found = read(flight)
-    assert TABLES[autopilot].keys() <= found.parameters().keys()
-    assert found.count == count_parameters(found.parameters()) == len(TABLES[autopilot])
+    result = read(flight)
+    assert TABLES[autopilot].keys() <= result.parameters().keys()
+    assert result.count == count_parameters(result.parameters()) == len(TABLES[autopilot])
     assert flight.sent("PARAM_REQUEST_READ")  # some were lost
     before = len(flight.sent("PARAM_REQUEST_LIST")), len(flight.sent("PARAM_REQUEST_READ"))
     flight.run(5.0)

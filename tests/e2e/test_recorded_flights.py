@@ -48,12 +48,12 @@ GPS_TRUTH = "arducopter-gps"
 
 def words(name: str) -> list[str]:
     """What the vehicle was seen to be, as it changed."""
-    seen: list[str] = []
+    observed: list[str] = []
     for _, status in statuses(name):
-        one = f"{status.mode}{'' if status.armed else ', disarmed'}{', failsafe' if status.failsafe else ''}"
-        if not seen or seen[-1] != one:
-            seen.append(one)
-    return seen
+        text = f"{status.mode}{'' if status.armed else ', disarmed'}{', failsafe' if status.failsafe else ''}"
+        if not observed or observed[-1] != text:
+            observed.append(text)
+    return observed
 
 
 # --- the vehicle's own words -------------------------------------------------------------------------------------
@@ -94,10 +94,10 @@ def test_modes_and_failsafes_are_seen_as_they_were(name: str, flown: list[str]) 
 
 
 def test_a_recorded_failsafe_that_holds_is_told_from_a_pilot_who_holds() -> None:
-    seen = words(OFFBOARD)
+    observed = words(OFFBOARD)
     # Its text comes before the heartbeat with the new mode.
     flown = ["AUTO.TAKEOFF", "AUTO.LOITER", "OFFBOARD", "OFFBOARD, failsafe", "AUTO.LOITER, failsafe"]
-    assert seen[2:7] == flown and "OFFBOARD" in seen[7:]
+    assert observed[2:7] == flown and "OFFBOARD" in observed[7:]
 
 
 # --- clocks ------------------------------------------------------------------------------------------------------
@@ -142,8 +142,8 @@ def test_the_cameras_delays_are_those_of_the_simulator() -> None:
 
 
 def link(name: str) -> LinkFit:
-    found = history(name)
-    return fit_link(found.seen, found.gaps)
+    result = history(name)
+    return fit_link(result.seen, result.gaps)
 
 
 CAMERA_HZ = 40.0
@@ -179,9 +179,9 @@ def frames(name: str) -> Frames:
     stamps_s = (np.array(sorted(arrivals_ns)) - first_ns) * 1e-9
     dark = np.zeros(stamps_s.size, dtype=np.bool_)
     dark_s = 0.0
-    for begin_s, words in events(name):
-        if words.startswith(BLACKOUT):
-            length_s = float(words.removeprefix(BLACKOUT))
+    for begin_s, arguments in events(name):
+        if arguments.startswith(BLACKOUT):
+            length_s = float(arguments.removeprefix(BLACKOUT))
             dark |= (stamps_s > begin_s) & (stamps_s < begin_s + length_s)
             dark_s += length_s
     # A late rig stamps late, but catches up: single spacings are off by up to half a period, the count is not.
@@ -200,24 +200,24 @@ def frames(name: str) -> Frames:
 )
 def test_the_loss_found_is_that_of_the_frames_that_are_missing(name: str, lost: float) -> None:
     """Within 0.5 % of the frames'; all but one flight met fewer bursts than make 30 %."""
-    found, true = link(name), frames(name)
+    result, true = link(name), frames(name)
     assert true.within <= 1
     assert true.lost == pytest.approx(lost, abs=0.001)
-    assert found.loss == pytest.approx(true.lost, abs=0.005)
-    assert 0.01 < found.loss_std < 0.05
-    assert found.bursts
+    assert result.loss == pytest.approx(true.lost, abs=0.005)
+    assert 0.01 < result.loss_std < 0.05
+    assert result.bursts
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", RELAYED)
 def test_the_rig_s_blackouts_rate_and_delays_are_found(name: str) -> None:
-    found, true = link(name), frames(name)
-    assert len(found.outages_s) == len(seen_s(name, BLACKOUT))
-    assert all(length_s == pytest.approx(4.0, abs=0.3) for length_s in found.outages_s)
-    assert found.rate_hz == pytest.approx(CAMERA_HZ, rel=0.01)
-    assert found.delay_s == pytest.approx(QUICKEST_S, abs=0.002)
-    assert found.delay_quantiles_s[3] == pytest.approx(SLOWEST_S - 0.05 * (SLOWEST_S - QUICKEST_S), abs=0.010)
-    assert found.delay_quantiles_s[4] == pytest.approx(float(np.quantile(true.delays_s, 0.99)), abs=0.002)
+    result, true = link(name), frames(name)
+    assert len(result.outages_s) == len(seen_s(name, BLACKOUT))
+    assert all(length_s == pytest.approx(4.0, abs=0.3) for length_s in result.outages_s)
+    assert result.rate_hz == pytest.approx(CAMERA_HZ, rel=0.01)
+    assert result.delay_s == pytest.approx(QUICKEST_S, abs=0.002)
+    assert result.delay_quantiles_s[3] == pytest.approx(SLOWEST_S - 0.05 * (SLOWEST_S - QUICKEST_S), abs=0.010)
+    assert result.delay_quantiles_s[4] == pytest.approx(float(np.quantile(true.delays_s, 0.99)), abs=0.002)
 
 
 @pytest.mark.slow
@@ -226,8 +226,8 @@ def test_all_but_a_hundredth_of_the_positions_come_as_late_as_the_rig_was_told(n
     """Of one flight only those before its wind: 3 s later, and for 43 s, 7 % of the frames came 50 to 95 ms late."""
     until_s = seen_s(BLOWN, "ORDER set SIH_WIND")[0] if name == BLOWN else np.inf
     until_ns = packets(name)[0].at_ns + until_s * 1e9
-    found = from_tlog([packet for packet in packets(name) if packet.at_ns < until_ns], config_of(name))
-    late_s = fit_link(found.seen, found.gaps).delay_quantiles_s[4]
+    result = from_tlog([packet for packet in packets(name) if packet.at_ns < until_ns], config_of(name))
+    late_s = fit_link(result.seen, result.gaps).delay_quantiles_s[4]
     assert late_s == pytest.approx(SLOWEST_S - 0.01 * (SLOWEST_S - QUICKEST_S), abs=0.010)
 
 
@@ -247,12 +247,12 @@ def test_what_px4_says_of_itself_is_no_camera_s_though_there_is_more_of_it() -> 
 @pytest.mark.parametrize("name", RELAYED)
 def test_positions_are_captured_where_the_vehicle_truly_was(name: str) -> None:
     """The truth is 0.1 s apart, the cameras' noise 2 mm."""
-    found, rows = history(name), truth(name)
+    result, rows = history(name), truth(name)
     first_s = _first_capture_s(name)
-    at_s = found.seen.times_s + first_s
+    at_s = result.seen.times_s + first_s
     inside = (at_s > rows[0, 0]) & (at_s < rows[-1, 0])
     off = [
-        np.interp(at_s[inside], rows[:, 0], rows[:, 1 + axis]) - found.seen.positions_m[inside, axis]
+        np.interp(at_s[inside], rows[:, 0], rows[:, 1 + axis]) - result.seen.positions_m[inside, axis]
         for axis in range(2)
     ]
     assert np.median(np.hypot(*off)) < 0.05
@@ -272,11 +272,11 @@ def _first_capture_s(name: str) -> float:
 def test_px4_s_response_is_that_of_its_own_log_though_its_clock_ran_slow() -> None:
     """By its log: dead time and lag together 0.24 and 0.32 s, drag 0.97 and 1.08 1/s, gain 0.98 and 1.10."""
     config = load_config("room-hahn-stursberg", ["daemon.mocap=tlog", "daemon.vehicle=tlog", OWN_ESTIMATE])
-    found = identify(from_tlog(packets(OFFBOARD), config), config, lambda: None).result
-    together_s = [found.candidates[0].dead_time_s + axis.lag_s for axis in found.response[:2]]
+    result = identify(from_tlog(packets(OFFBOARD), config), config, lambda: None).result
+    together_s = [result.candidates[0].dead_time_s + axis.lag_s for axis in result.response[:2]]
     assert together_s == pytest.approx([0.24, 0.32], abs=0.09)
-    assert [axis.drag_1ps for axis in found.response[:2]] == pytest.approx([0.974, 1.080], abs=0.1)
-    assert [axis.r2 > 0.99 for axis in found.response[:2]] == [True, True]
+    assert [axis.drag_1ps for axis in result.response[:2]] == pytest.approx([0.974, 1.080], abs=0.1)
+    assert [axis.r2 > 0.99 for axis in result.response[:2]] == [True, True]
 
 
 STEP_RAMP_S = 1.0 / 5.0  # which ArduPilot makes of a step of 1 m/s² at PSC_JERK_XY 5
@@ -294,13 +294,13 @@ def test_arducopter_s_response_to_steps_is_that_of_its_own_log() -> None:
     boot_ns, estimates = _own_estimates(GPS)
     steps = from_tlog([packet for packet in packets(GPS) if packet.at_ns < boot_ns + 87.4e9], config)
     flown = flown_stretches(steps, config)
-    found = choose_dead_time(flown, (0, 1), kinds_of(steps, config)[0][:2], lambda: None)
-    assert found.name == "drag-lag" and sum(stretch.length_s for stretch in flown) > 30.0
+    result = choose_dead_time(flown, (0, 1), kinds_of(steps, config)[0][:2], lambda: None)
+    assert result.name == "drag-lag" and sum(stretch.length_s for stretch in flown) > 30.0
     for axis, gain, drag_1ps in ((0, 1.027, 0.009), (1, 1.026, 0.011)):
-        fit = found.fits[axis]
+        fit = result.fits[axis]
         late_s = _lateness_s(estimates, axis, (55.4, 71.4) if axis == 0 else (71.4, 87.4))
         assert 0.0 < late_s < 0.06
-        as_sent_s = found.dead_time_s + fit.value("lag_s") + 0.5 * STEP_RAMP_S - late_s
+        as_sent_s = result.dead_time_s + fit.value("lag_s") + 0.5 * STEP_RAMP_S - late_s
         assert as_sent_s == pytest.approx(0.18, abs=GRID_S)
         assert fit.value("gain") == pytest.approx(gain, abs=0.02)
         assert fit.value("drag_1ps") == pytest.approx(drag_1ps, abs=0.01)
@@ -485,7 +485,7 @@ def _landed(memory: Memory) -> None:
         (OFFBOARD, 70.0, 12.0, _silent, "Failsafe activated"),
         (GPS, 107.0, 20.0, _landed, "Disarming motors"),
     ],
-    ids=lambda one: one if isinstance(one, str) and "-" in one else "",
+    ids=lambda value: value if isinstance(value, str) and "-" in value else "",
 )
 def test_the_page_of_each_says_what_matters(
     name: str, since_s: float, seconds: float, matters: Callable[[Memory], Any], on_the_page: str
@@ -497,29 +497,29 @@ def test_the_page_of_each_says_what_matters(
     assert page.plots
 
 
-def times_s(heard: Listened, begin: str, code: str = "hand-over") -> list[float]:
+def times_s(received: Listened, begin: str, code: str = "hand-over") -> list[float]:
     """When events of a code came whose texts begin so, since the first packet [s]."""
-    found = heard.memory.of(Event)
-    return [heard.since_s(event.at_ns) for event in found if event.code == code and event.text.startswith(begin)]
+    result = received.memory.of(Event)
+    return [received.since_s(event.at_ns) for event in result if event.code == code and event.text.startswith(begin)]
 
 
 def test_the_wind_beyond_the_authority_is_met_before_it_has_blown_the_vehicle_out_of_the_room() -> None:
     """The real flight stayed in mode `track`, without a word, until it was 24 m outside."""
-    heard = listened(BLOWN, 50.0, 12.0)
+    received = listened(BLOWN, 50.0, 12.0)
     ordered_s = seen_s(BLOWN, "ORDER set SIH_WIND")[0]
-    (noticed_s,) = times_s(heard, "", "envelope-response")
+    (noticed_s,) = times_s(received, "", "envelope-response")
     assert noticed_s == pytest.approx(57.65, abs=0.01)
     assert noticed_s - ordered_s == pytest.approx(0.95, abs=0.1)
-    (landing_s,) = times_s(heard, "engaged -> landing")
+    (landing_s,) = times_s(received, "engaged -> landing")
     assert 0.0 < landing_s - noticed_s < 0.11
-    assert codes(heard.memory).index("envelope-response") < codes(heard.memory).index("fallback-land")
+    assert codes(received.memory).index("envelope-response") < codes(received.memory).index("fallback-land")
 
     # What the console, the exit code and the page say of it: the reason is the envelope's own.
-    (reason,) = [event.text for event in heard.memory.of(Event) if event.code == "envelope-response"]
-    assert heard.loop.let_go == reason and reason in heard.loop.ending.sentence
-    assert heard.loop.ending.exit_code == 1
-    assert [notice.text for notice in heard.notices if "engaged -> landing" in notice.text]
-    assert reason in " ".join(words_of(page_of(heard.memory)).text)
+    (reason,) = [event.text for event in received.memory.of(Event) if event.code == "envelope-response"]
+    assert received.loop.let_go == reason and reason in received.loop.ending.sentence
+    assert received.loop.ending.exit_code == 1
+    assert [notice.text for notice in received.notices if "engaged -> landing" in notice.text]
+    assert reason in " ".join(words_of(page_of(received.memory)).text)
 
     rows = truth(BLOWN)
     where_m = np.array([np.interp(noticed_s, rows[:, 0], rows[:, 1 + axis]) for axis in range(2)])
@@ -531,9 +531,9 @@ def test_the_wind_beyond_the_authority_is_met_before_it_has_blown_the_vehicle_ou
 def test_before_the_wind_nothing_is_said_against_the_same_flight() -> None:
     """In 25 s of hovering, and from the blackout's end to the order of the wind."""
     for since_s, seconds in ((20.0, 25.0), (51.0, 5.6)):
-        heard = listened(BLOWN, since_s, seconds)
-        assert not heard.loop.let_go and not heard.notices
-        assert not [code for code in codes(heard.memory) if code.startswith(("envelope", "fallback"))]
+        received = listened(BLOWN, since_s, seconds)
+        assert not received.loop.let_go and not received.notices
+        assert not [code for code in codes(received.memory) if code.startswith(("envelope", "fallback"))]
 
 
 @pytest.mark.slow
@@ -542,7 +542,7 @@ def test_a_failsafe_in_the_climb_the_pilot_and_the_order_are_each_told_at_their_
     patient = ("hand_over.engage_s=60.0", "hand_over.tries=100")
     take_off, engage = Command(order=Order.TAKE_OFF, height_m=1.2), Command(order=Order.ENGAGE)
     ordered_s = seen_s(RELEASED, "ORDER mark engage")[0]
-    heard = listened(RELEASED, 0.0, 66.0, *patient, orders=[(1.45, take_off), (ordered_s, engage)])
+    received = listened(RELEASED, 0.0, 66.0, *patient, orders=[(1.45, take_off), (ordered_s, engage)])
     pilot_s = seen_s(RELEASED, "MODE 3/0")
     passages = {
         "climbing -> failsafe (AUTO.LAND": seen_s(RELEASED, "MODE 4/6"),
@@ -553,16 +553,16 @@ def test_a_failsafe_in_the_climb_the_pilot_and_the_order_are_each_told_at_their_
         "landing -> released (POSCTL": pilot_s[1:],
     }
     for begin, at_s in passages.items():
-        assert times_s(heard, begin) == pytest.approx(at_s, abs=0.15), begin
+        assert times_s(received, begin) == pytest.approx(at_s, abs=0.15), begin
     # The vehicle took the order: it is to the pilot, at 62.4 s, that it refuses OFFBOARD, on his own connection.
-    answers_s = times_s(heard, "DO_SET_MODE: ACCEPTED", "command-ack")
+    answers_s = times_s(received, "DO_SET_MODE: ACCEPTED", "command-ack")
     assert ordered_s < answers_s[-1] < ordered_s + 0.5
     assert seen_s(RELEASED, "ACK 176 result 1")[0] > pilot_s[1]
-    assert not any("REJECTED" in event.text or "DENIED" in event.text for event in heard.memory.of(Event))
+    assert not any("REJECTED" in event.text or "DENIED" in event.text for event in received.memory.of(Event))
 
-    noticed = " ".join(notice.text for notice in heard.notices)
+    noticed = " ".join(notice.text for notice in received.notices)
     assert all(begin in noticed for begin in passages if "failsafe" in begin or "released (" in begin)
-    on_the_page = " ".join(words_of(page_of(heard.memory)).text)
+    on_the_page = " ".join(words_of(page_of(received.memory)).text)
     assert all(begin in on_the_page for begin in passages)
 
 

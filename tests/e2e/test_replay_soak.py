@@ -16,9 +16,9 @@ SEEDS = (0, 5, 13, 14, 15)  # quick ones that together have what is asked for be
 
 @pytest.mark.slow
 def test_flights_with_everything_amiss_replay_bit_for_bit(tmp_path: Path) -> None:
-    found = [replayed(seed, tmp_path) for seed in SEEDS]
-    assert {flight.seed: flight.result.first_difference for flight in found if not flight.good} == {}
-    had = {word for flight in found for word in flight.words}
+    results = [replayed(seed, tmp_path) for seed in SEEDS]
+    assert {flight.seed: flight.result.first_difference for flight in results if not flight.good} == {}
+    had = {label for flight in results for label in flight.words}
     assert {
         "px4",
         "ardupilot",
@@ -34,12 +34,12 @@ def test_flights_with_everything_amiss_replay_bit_for_bit(tmp_path: Path) -> Non
         "reboot",
         "one connection",
     } <= had
-    seen = Counter[str]()
-    for flight in found:
-        seen.update(flight.seen)
-    assert {f"Decision {mode}" for mode in ("wait", "track", "brake", "hold", "land", "stopped")} <= seen.keys()
-    assert max(len(segment_files(flight.path)) for flight in found) > 1
-    report = tally(found)
+    observed = Counter[str]()
+    for flight in results:
+        observed.update(flight.seen)
+    assert {f"Decision {mode}" for mode in ("wait", "track", "brake", "hold", "land", "stopped")} <= observed.keys()
+    assert max(len(segment_files(flight.path)) for flight in results) > 1
+    report = tally(results)
     assert (report["replayed"], report["identical"], report["wrong"]) == (len(SEEDS), len(SEEDS), {})
 
 
@@ -54,9 +54,9 @@ def test_a_flight_whose_replay_differs_is_told(tmp_path: Path, monkeypatch: pyte
         return (1e-9 * memory, 0.0, 0.0), ()
 
     monkeypatch.setattr("uavctl.flight.act.limit_setpoint", forgetful)
-    found = replayed(SEEDS[0], tmp_path)
-    assert not found.good
-    report = tally([found])
+    result = replayed(SEEDS[0], tmp_path)
+    assert not result.good
+    report = tally([result])
     assert report["identical"] == 0
     wrong = report["wrong"]
     assert isinstance(wrong, dict) and wrong[str(SEEDS[0])]["topic"] == "/uavctl/decision"

@@ -40,8 +40,8 @@ def test_a_mission_of_each_autopilot_touches_no_wall_and_ends_on_the_floor() -> 
         assert flight.clearance_m > 0.1
         assert len(flight.legs) == 4
         assert max(leg.plan_rms_m for leg in flight.legs) < 0.2
-    found = summary([flights[0], replace(flights[1], seed=2, clearance_m=-0.1, landed=False)])
-    assert (found["touched"], found["landed"], found["worst"]) == (1, 1, f"seed 2, {flights[1].nearest}")
+    result = summary([flights[0], replace(flights[1], seed=2, clearance_m=-0.1, landed=False)])
+    assert (result["touched"], result["landed"], result["worst"]) == (1, 1, f"seed 2, {flights[1].nearest}")
 
 
 @pytest.mark.slow
@@ -49,9 +49,9 @@ def test_a_take_off_of_each_autopilot_and_a_judge_that_finds_what_hovers() -> No
     flights = [fly_take_off(autopilot, 1) for autopilot in AUTOPILOTS]
     assert all(flight.reached and not flight.wrong for flight in flights), flights
     hovering = replace(flights[0], what="hovers", seed=2, wrong=("nobody has it in the air",))
-    found = tally_take_offs([*flights, hovering])
-    assert (found["take_offs"], found["engaged"], found["hovers"]) == (3, 3, 1)
-    assert list(found["wrong"]) == ["2"]  # type: ignore[call-overload]
+    result = tally_take_offs([*flights, hovering])
+    assert (result["take_offs"], result["engaged"], result["hovers"]) == (3, 3, 1)
+    assert list(result["wrong"]) == ["2"]  # type: ignore[call-overload]
 
 
 def is_setpoint(data: bytes) -> bool:
@@ -75,14 +75,14 @@ def test_a_px4_that_hears_no_order_once_it_climbs_is_found_hovering(monkeypatch:
 
     monkeypatch.setattr("soak_take_off.troubled", deaf)
     monkeypatch.setattr("soak_take_off.LANDING_S", 30.0)
-    found = fly_take_off("px4", 1)
+    result = fly_take_off("px4", 1)
     (flight,) = flights
     assert flight.peers.autopilot.mode_name == "AUTO.TAKEOFF"
     assert flight.peers.vehicle.position_m[2] == pytest.approx(-1.2, abs=0.2)
-    assert found.what == "hovers"
-    assert any("not flown" in text for text in found.wrong)
-    assert any("nobody has it" in text for text in found.wrong)
-    assert tally_take_offs([found])["hovers"] == 1
+    assert result.what == "hovers"
+    assert any("not flown" in text for text in result.wrong)
+    assert any("nobody has it" in text for text in result.wrong)
+    assert tally_take_offs([result])["hovers"] == 1
 
 
 @pytest.mark.slow

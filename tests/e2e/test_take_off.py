@@ -190,9 +190,9 @@ def test_an_ardupilot_without_gps_is_told_a_place_on_the_globe_and_one_with_gps_
     for name, value in ARDUPILOT_EXTERNAL.items():
         flight.peers.autopilot.parameters.set(name, value)
     flight.take_off().run(20.0, until=HandoverState.ENGAGED)  # by the positions that we relay to it
-    told = flight.sent("SET_GPS_GLOBAL_ORIGIN")
-    assert len(told) == 1 and flight.peers.autopilot.estimator.has_origin
-    assert (told[0][1].latitude, told[0][1].altitude) == (473977420, 488000)
+    origins = flight.sent("SET_GPS_GLOBAL_ORIGIN")
+    assert len(origins) == 1 and flight.peers.autopilot.estimator.has_origin
+    assert (origins[0][1].latitude, origins[0][1].altitude) == (473977420, 488000)
 
 
 def test_without_an_order_no_place_on_the_globe_is_told() -> None:

@@ -42,8 +42,8 @@ def test_px4_whose_failsafe_ends_in_the_climb_arrives_and_a_replay_says_so_too()
     assert flown(flight) == "engaged" and not flight.loop.failure
     assert "failsafe" in flight.states and flight.ticked is not None
     assert flight.ticked.decision.mode is ControlMode.TRACK
-    told = [event.text for event in flight.notices if event.code == "hand-over"]
-    assert len(told) == 2 and all("failsafe" in text for text in told)  # in, and out again: for the console
+    texts = [event.text for event in flight.notices if event.code == "hand-over"]
+    assert len(texts) == 2 and all("failsafe" in text for text in texts)  # in, and out again: for the console
     result = replay(flight.memory.entries, lambda sink: make_loop(flight.config, sink))
     assert result.identical, result.first_difference
 
@@ -55,10 +55,10 @@ def test_a_person_is_told_on_the_console_what_the_hand_over_has_to_tell() -> Non
     flight.run(6.0)  # its rotors have spun up
     flight.stick("POSCTL")
     flight.run(3.0, until=HandoverState.RELEASED)
-    said = io.StringIO()
+    console_file = io.StringIO()
     notices = deque(flight.notices)
-    print_notices(notices, Console(file=said, width=200))
-    lines = said.getvalue().splitlines()
+    print_notices(notices, Console(file=console_file, width=200))
+    lines = console_file.getvalue().splitlines()
     assert [line.split(" (")[0] for line in lines if line.startswith("hand-over")] == [
         "hand-over: climbing -> failsafe",
         "hand-over: failsafe -> climbing",

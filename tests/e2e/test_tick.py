@@ -64,12 +64,12 @@ def crossed(call: Callable[[], T]) -> tuple[T, frozenset[str]]:
     gc.disable()  # what other tests left would be tidied up in its own files' names
     sys.setprofile(watch)
     try:
-        found = call()
+        result = call()
     finally:
         sys.setprofile(None)
         gc.enable()
     places = (name.removeprefix(f"{ROOT}/") for name in files if name.startswith(f"{ROOT}/"))
-    return found, frozenset(place for place in places if place.startswith(("uavctl/", "sim/", "logs/")))
+    return result, frozenset(place for place in places if place.startswith(("uavctl/", "sim/", "logs/")))
 
 
 @pytest.fixture(scope="module")

@@ -67,10 +67,10 @@ class _Flyer(WatchedFlyer):
         self.craft: Quadrotor | None = None
 
     def tick(self, tick: int, at_ns: int, send: Send) -> None:
-        def noting(one: Outgoing) -> None:
-            if one.data[7:10] in POSES:
+        def noting(outgoing: Outgoing) -> None:
+            if outgoing.data[7:10] in POSES:
                 self.relayed_s.append(at_ns * 1e-9)
-            send(one)
+            send(outgoing)
 
         if self.craft is not None and at_ns >= BEGINS_S * 1e9:
             north, east, down = (value / DRAG_1PS for value in self.push_mps2)
@@ -93,8 +93,8 @@ def blown(autopilot: str, push_mps2: Vec3, *overrides: str, seed: int = 3, over_
             *overrides,
         ],
     )
-    told = _Told()
-    flyer = _Flyer(ControlLoop(config, controller_of(config), told, lambda: 0), push_mps2)
+    events = _Told()
+    flyer = _Flyer(ControlLoop(config, controller_of(config), events, lambda: 0), push_mps2)
     world = World(config, flyer)
     craft = world.peers.vehicle
     assert isinstance(craft, Quadrotor)
@@ -110,9 +110,9 @@ def blown(autopilot: str, push_mps2: Vec3, *overrides: str, seed: int = 3, over_
     goals = (config.target.position_m, *config.mission.waypoints)
     off = np.linalg.norm(where - np.array(goals[-1]), axis=1)
     lower, upper = room_of(config)
-    let_go = [event.at_ns * 1e-9 for event in told.events if event.code in RELEASES]
+    let_go = [event.at_ns * 1e-9 for event in events.events if event.code in RELEASES]
     return Blown(
-        codes=[event.code for event in told.events],
+        codes=[event.code for event in events.events],
         from_target_m=float(off[times > over_s - 1.0].max()),
         worst_m=float(off[times > BEGINS_S].max()),
         beyond_m=float(beyond_m(where[-1:, :2], lower[:2], upper[:2])[0]),
@@ -207,7 +207,7 @@ def watched(*, feels: bool) -> tuple[MonitorState, str | None, float]:
         if packet.at_ns >= now_ns + TICK_NS:
             now_ns += TICK_NS
             if setpoint is not None:
-                seen = Observation(
+                observed = Observation(
                     at_ns=now_ns,
                     samples=tuple(samples),
                     sent_mps2=acts,
@@ -217,7 +217,7 @@ def watched(*, feels: bool) -> tuple[MonitorState, str | None, float]:
                     braking=False,
                     inertial_mps2=felt if feels else None,
                 )
-                watching, breach = update(watching, seen, parameters)
+                watching, breach = update(watching, observed, parameters)
                 if breach.cause is not None:
                     return watching, breach.cause, (now_ns - begin_ns) * 1e-9
             acts, samples = setpoint or ZERO, []

@@ -226,7 +226,9 @@ def test_an_acceleration_beyond_the_bound_has_to_persist_and_a_plain_one_has_not
 )
 def test_clean_is_what_nothing_speaks_against(unexplained_mps2: float, off_m: float, apart: bool, clean: bool) -> None:
     known = offsets(0.3) if apart else {}
-    watching, _ = look((unexplained_mps2, 0.0, 0.0), off_m=off_m, own=AT_REST, clean_ns=START_NS - 5, **known)
+    watching, _ = look(
+        (unexplained_mps2, 0.0, 0.0), off_m=off_m, vehicle_motion=AT_REST, clean_ns=START_NS - 5, **known
+    )
     assert (watching.velocity.apart_ns is not None) == apart
     assert watching.clean_ns == (AT_NS if clean else START_NS - 5)
 
@@ -407,7 +409,7 @@ def test_an_acceleration_of_just_so_many_standard_deviations_is_none() -> None:
 def told(velocity: Vec3, predicted: Vec3, **known: object) -> tuple[MonitorState, Observation]:
     """Half a second into a flight by what was sent, the vehicle's word, and a prediction."""
     watching = changed(monitors(tick_ns=AT_NS, began_ns=AT_NS - 500 * MS), **known)
-    return watching, structs.replace(seen(AT_NS, own=motion(velocity, AT_NS)), velocity_mps=predicted)
+    return watching, structs.replace(seen(AT_NS, vehicle_motion=motion(velocity, AT_NS)), velocity_mps=predicted)
 
 
 @pytest.mark.parametrize(
@@ -494,7 +496,7 @@ def test_what_was_sent_acts_behind_the_lag_from_tick_to_tick() -> None:
 
 
 def test_what_is_recorded_of_it_is_plain_numbers() -> None:
-    watching, _ = look((0.1, 0.2, -0.9), own=AT_REST, **offsets(0.1))
+    watching, _ = look((0.1, 0.2, -0.9), vehicle_motion=AT_REST, **offsets(0.1))
     assert [type(watching.acceleration.unexplained_mps2), type(watching.velocity.apart_mps)] == [float, float]
 
 

@@ -206,8 +206,8 @@ class Flight:
 
     def __init__(self, folder: Path, *, signed: bool, listed: bool, telemetry_hz: float = 350.0) -> None:
         self.folder = folder
-        with port() as one, port() as other:
-            self.vehicle_port, self.mocap_port = int(one.getsockname()[1]), int(other.getsockname()[1])
+        with port() as first, port() as second:
+            self.vehicle_port, self.mocap_port = int(first.getsockname()[1]), int(second.getsockname()[1])
         urls = [f"udpin://127.0.0.1:{port}" for port in (self.vehicle_port, self.mocap_port)]
         options = ["--vehicle", urls[0], "--mocap", urls[1], "--set", "clock.latency_s=0.0"]
         if not listed:
@@ -263,25 +263,27 @@ class Flight:
         began.unlink(missing_ok=True)
         to = self.mocap_port if cameras else self.vehicle_port
         script = Path(__file__).with_name("attacker.py")
-        words = [kind, str(to), "--source", "127.0.0.1" if listed else "127.0.0.2", "--per-s", str(per_s)]
+        arguments = [kind, str(to), "--source", "127.0.0.1" if listed else "127.0.0.2", "--per-s", str(per_s)]
         rest = ["--senders", str(senders), "--seconds", str(seconds + 0.5), "--log", str(began)]
-        with subprocess.Popen([sys.executable, str(script), *words, *rest], stdout=subprocess.PIPE, text=True) as one:
+        with subprocess.Popen(
+            [sys.executable, str(script), *arguments, *rest], stdout=subprocess.PIPE, text=True
+        ) as process:
             try:
                 assert self.vehicle.run(LIMIT_S, began.exists), "the attacker does not begin"
                 self.vehicle.run(0.3)
                 window = self.watch(seconds)
-                self.vehicle.run(LIMIT_S, lambda: one.poll() is not None)
-                window.sent = int(one.communicate(timeout=LIMIT_S)[0])
+                self.vehicle.run(LIMIT_S, lambda: process.poll() is not None)
+                window.sent = int(process.communicate(timeout=LIMIT_S)[0])
             finally:
-                if one.poll() is None:
-                    one.kill()
+                if process.poll() is None:
+                    process.kill()
         return window
 
     def engage(self) -> bool:
         """Order it to take the vehicle up again; whether it did."""
         ask = [sys.executable, "-m", "uavctl", "ctl", "engage", "--control", str(self.folder / "c")]
-        with subprocess.Popen(ask, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=self._environ) as one:
-            self.vehicle.run(LIMIT_S, lambda: one.poll() is not None)
+        with subprocess.Popen(ask, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=self._environ) as process:
+            self.vehicle.run(LIMIT_S, lambda: process.poll() is not None)
         before = self.vehicle.setpoints
         return self.vehicle.run(5.0, lambda: self.vehicle.mode == OFFBOARD and self.vehicle.setpoints > before + 20)
 
@@ -299,8 +301,8 @@ class Flight:
             os.kill(self.process.pid, signal.SIGCONT)
         woke_s = time.monotonic()
         vehicle.run(2.0)
-        late = vehicle.setpoint_s[len(vehicle.setpoint_s) - (vehicle.setpoints - before) :]
-        return len(late), (late[-1] - woke_s if late else 0.0)
+        late_s = vehicle.setpoint_s[len(vehicle.setpoint_s) - (vehicle.setpoints - before) :]
+        return len(late_s), (late_s[-1] - woke_s if late_s else 0.0)
 
     def end(self) -> None:
         """End the flight: the vehicle is disarmed, and there is nothing to hand over."""
@@ -311,17 +313,17 @@ class Flight:
 
     def told(self, window: Window) -> Told:
         """What the recording says of a part."""
-        found = Told()
+        result = Told()
         mode = ControlMode.TRACK
         for _, at_ns, record in read(self.folder / "f" / "flight.mcap"):
             if isinstance(record, Refused) and window.begun_ns <= at_ns <= window.ended_ns + TOLD_NS:
-                found.refused.update(record.counts)
+                result.refused.update(record.counts)
             elif isinstance(record, Decision) and window.begun_ns <= at_ns <= window.ended_ns:
-                found.ticks += 1 + record.missed_ticks
-                found.missed += record.missed_ticks
-                found.fallbacks += mode is ControlMode.TRACK and record.mode is not mode
+                result.ticks += 1 + record.missed_ticks
+                result.missed += record.missed_ticks
+                result.fallbacks += mode is ControlMode.TRACK and record.mode is not mode
                 mode = record.mode
-        return found
+        return result
 
     def recorder_dropped(self) -> int:
         """Records that the recorder could not keep."""
@@ -333,15 +335,15 @@ class Flight:
 def flight(*, signed: bool, listed: bool, telemetry_hz: float = 350.0) -> Iterator[Flight]:
     """A flight as long as the block lasts."""
     with tempfile.TemporaryDirectory(prefix="uavctl-attack-") as folder:
-        one = Flight(Path(folder), signed=signed, listed=listed, telemetry_hz=telemetry_hz)
+        rig = Flight(Path(folder), signed=signed, listed=listed, telemetry_hz=telemetry_hz)
         try:
-            one.wait_until_it_flies()
-            yield one
+            rig.wait_until_it_flies()
+            yield rig
         finally:
-            if one.process.poll() is None:
-                one.process.kill()
-            one.process.communicate()
-            one.vehicle.close()
+            if rig.process.poll() is None:
+                rig.process.kill()
+            rig.process.communicate()
+            rig.vehicle.close()
 
 
 def attacks(
@@ -358,21 +360,21 @@ def attacks(
         per_s: datagrams a second of each sender.
         cameras: the cameras' port is attacked, not the vehicle's.
     """
-    with flight(signed=signed, listed=listed) as one:
-        calm = one.watch(2.0 * seconds)
+    with flight(signed=signed, listed=listed) as rig:
+        calm = rig.watch(2.0 * seconds)
         windows = {}
         for kind in kinds:
-            windows[kind] = one.under(kind, seconds, senders=senders, listed=listed, per_s=per_s, cameras=cameras)
-            alive = one.process.poll() is None
+            windows[kind] = rig.under(kind, seconds, senders=senders, listed=listed, per_s=per_s, cameras=cameras)
+            alive = rig.process.poll() is None
             if not alive:
                 break
-            one.vehicle.run(1.0)
-        if one.process.poll() is None:
-            one.end()
-        quiet, dropped = one.told(calm), one.recorder_dropped()
+            rig.vehicle.run(1.0)
+        if rig.process.poll() is None:
+            rig.end()
+        quiet, dropped = rig.told(calm), rig.recorder_dropped()
         base = calm.cpu_s / calm.seconds
         for kind, window in windows.items():
-            told = one.told(window)
+            report = rig.told(window)
             yield {
                 "kind": kind,
                 "senders": senders,
@@ -382,26 +384,26 @@ def attacks(
                 "sent_per_s": round(window.sent / (window.seconds + 0.8)),
                 "cpu_calm": round(base, 3),
                 "cpu_added": round(window.cpu_s / window.seconds - base, 3),
-                "missed": told.missed,
-                "ticks": told.ticks,
+                "missed": report.missed,
+                "ticks": report.ticks,
                 "missed_calm": quiet.missed,
                 "ticks_calm": quiet.ticks,
                 "largest_gap_s": round(window.largest_gap_s, 3),
-                "fallbacks": told.fallbacks,
+                "fallbacks": report.fallbacks,
                 "records_dropped": dropped,
-                "refused": dict(told.refused),
+                "refused": dict(report.refused),
             }
 
 
 def stalls(runs: int, seed: int, telemetry_hz: float, *, signed: bool = False) -> Iterator[dict[str, Any]]:
     """Stop a daemon again and again while the pilot takes over; what came after it woke."""
     chance = random.Random(seed)
-    with flight(signed=signed, listed=True, telemetry_hz=telemetry_hz) as one:
+    with flight(signed=signed, listed=True, telemetry_hz=telemetry_hz) as rig:
         for number in range(runs):
-            one.vehicle.run(0.3 + chance.random())
+            rig.vehicle.run(0.3 + chance.random())
             seconds = chance.uniform(0.3, 2.5)
-            count, last_s = one.stop(seconds)
+            count, last_s = rig.stop(seconds)
             yield {"run": number, "stall_s": round(seconds, 3), "setpoints": count, "last_s": round(last_s, 3)}
-            if number + 1 < runs and not one.engage():
-                text = one.log.read_text(encoding="utf-8")
+            if number + 1 < runs and not rig.engage():
+                text = rig.log.read_text(encoding="utf-8")
                 raise AssertionError(f"it does not take the vehicle up again: {json.dumps(text[-500:])}")

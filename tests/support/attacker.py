@@ -28,13 +28,13 @@ Say = Callable[[], bytes]
 """Gives the next datagram."""
 
 
-def packed(words: Iterator[bytes]) -> bytes:
+def packed(arguments: Iterator[bytes]) -> bytes:
     """As many whole frames as fit into one datagram."""
     data = b""
-    for word in words:
-        if len(data) + len(word) > LARGEST:
+    for argument in arguments:
+        if len(data) + len(argument) > LARGEST:
             break
-        data += word
+        data += argument
     return data
 
 
@@ -47,10 +47,10 @@ def _cycle(make: Callable[[int], bytes]) -> Say:
     return itertools.cycle([make(n) for n in range(MANY)]).__next__
 
 
-def _full(word: Callable[[int], bytes]) -> Say:
+def _full(make_packet: Callable[[int], bytes]) -> Say:
     """Datagrams full of a frame whose number goes up."""
     number = itertools.count()
-    return _cycle(lambda _: packed(word(next(number)) for _ in itertools.count()))
+    return _cycle(lambda _: packed(make_packet(next(number)) for _ in itertools.count()))
 
 
 def _from(number: int) -> Peer:
@@ -62,9 +62,9 @@ def _stamp() -> int:
     return int((time.time() - EPOCH_S) * SECOND)
 
 
-def _signed(word: Callable[[], bytes], key: bytes, link_id: int, ahead: int) -> Say:
+def _signed(make_packet: Callable[[], bytes], key: bytes, link_id: int, ahead: int) -> Say:
     """Datagrams full of one frame, signed anew every few milliseconds with stamps that go up."""
-    plain = word()
+    plain = make_packet()
     body = bytearray(plain[:-2])
     body[2] |= mavlink.MAVLINK_IFLAG_SIGNED
     (message_id,) = struct.unpack("<I", plain[7:10] + b"\0")

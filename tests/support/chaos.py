@@ -114,14 +114,14 @@ class World:
         if kind == 1:
             place[0] += float(rng.choice([-2.0, 2.0]))
         received_ns = at_ns + int(rng.integers(0, DT_NS))
-        one = sample(at_ns + (2 * DT_NS if kind == 2 else 0), received_ns, (place[0], place[1], place[2]))
-        self._waiting += [one] * (2 if kind == 3 else 1)
+        new_sample = sample(at_ns + (2 * DT_NS if kind == 2 else 0), received_ns, (place[0], place[1], place[2]))
+        self._waiting += [new_sample] * (2 if kind == 3 else 1)
 
     def arrived(self, at_ns: int) -> tuple[PositionSample, ...]:
         """What has come in by a tick."""
-        here = tuple(sample for sample in self._waiting if sample.received_ns <= at_ns)
+        arrived_samples = tuple(sample for sample in self._waiting if sample.received_ns <= at_ns)
         self._waiting = [sample for sample in self._waiting if sample.received_ns > at_ns]
-        return here
+        return arrived_samples
 
 
 def runs(rng: np.random.Generator, ticks: int, orders: bool) -> Iterator[tuple[StepInput, TickOutput, bool]]:

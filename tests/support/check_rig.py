@@ -96,11 +96,13 @@ class Hand:
     Speaks through pymavlink alone; `place` is the truth in local NED, `matrix` what the cameras make of it.
     """
 
-    def __init__(self, *overrides: str, heading_rad: float = 0.0, own: bool = False, move: bool = False) -> None:
+    def __init__(
+        self, *overrides: str, heading_rad: float = 0.0, has_estimate: bool = False, move: bool = False
+    ) -> None:
         self.config = load_config("room-hahn-stursberg", [*CALM, *overrides])
         self.flight = Preflight(self.config, make_links, 0, move=move)
         self.vehicle, self.cameras = Peer(1, 1), Peer(17, 18)
-        self.heading_rad, self.own = heading_rad, own
+        self.heading_rad, self.own = heading_rad, has_estimate
         self.place = [0.3, 0.2, -0.02]
         self.matrix = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
         self.at_ns = 0
@@ -115,15 +117,15 @@ class Hand:
             self.tell(self.vehicle.send("attitude", boot_ms, 0.01, 0.0, self.heading_rad, 0.0, 0.0, 0.0))
             if self.own:
                 self.tell(self.vehicle.local_position(boot_ms, *self.place))
-            seen = [sum(a * b for a, b in zip(row, self.place, strict=True)) for row in self.matrix]
-            x, y, z = (value + self._random.gauss(0.0, 0.003) for value in seen)
+            observed = [sum(a * b for a, b in zip(row, self.place, strict=True)) for row in self.matrix]
+            x, y, z = (value + self._random.gauss(0.0, 0.003) for value in observed)
             self.flight.receive("mocap", self.cameras.vision(self.at_ns // 1000 + 10**9, x, y, z), self.at_ns)
             self.flight.tick(0, self.at_ns, to_nobody)
 
-    def carry(self, *way: float) -> None:
+    def carry(self, *displacement_m: float) -> None:
         """Carry it along a way in 1 s, and hold it for 1.5 s."""
         for _ in range(20):
-            self.place = [a + b / 20 for a, b in zip(self.place, way, strict=True)]
+            self.place = [a + b / 20 for a, b in zip(self.place, displacement_m, strict=True)]
             self.rest(0.05)
         self.rest(1.5)
 
@@ -131,8 +133,8 @@ class Hand:
         """Do what is asked, rightly."""
         c, s = 0.5 * math.cos(self.heading_rad), 0.5 * math.sin(self.heading_rad)
         self.rest(2.0)
-        for way in ((0.0, 0.0, -0.5), (c, s, 0.0), (-s, c, 0.0)):
-            self.carry(*way)
+        for displacement_m in ((0.0, 0.0, -0.5), (c, s, 0.0), (-s, c, 0.0)):
+            self.carry(*displacement_m)
 
     def done(self) -> Checked:
         return Checked(self.flight, self.at_ns)

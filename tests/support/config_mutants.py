@@ -187,13 +187,13 @@ def leaves(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
 def ranges(section: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], tuple[float, float, bool]]]:
     """Least and largest number that a key takes, and whether it is a whole one, by the key's path; of lists too."""
     for section_field in msgspec.structs.fields(section):
-        here = (*path, section_field.encode_name)
+        key_path = (*path, section_field.encode_name)
         if isinstance(section_field.type, type) and issubclass(section_field.type, msgspec.Struct):
-            yield from ranges(section_field.type, here)
+            yield from ranges(section_field.type, key_path)
         else:
-            found = next(_numbers(section_field.type), None)
-            if found is not None:
-                yield here, found
+            result = next(_numbers(section_field.type), None)
+            if result is not None:
+                yield key_path, result
 
 
 def _numbers(annotation: Any, metas: tuple[Any, ...] = ()) -> Iterator[tuple[float, float, bool]]:
@@ -211,8 +211,8 @@ def _numbers(annotation: Any, metas: tuple[Any, ...] = ()) -> Iterator[tuple[flo
 
 def within(rng: random.Random, low: float, high: float, whole: bool) -> float:
     """A number that a key takes: an end of its range, or anything between, small ones as often as large ones."""
-    least = max(low, 1e-9) if low >= 0 else min(1e-9, high)
-    value = rng.choice((low, high, math.exp(rng.uniform(math.log(least), math.log(max(high, 2 * least))))))
+    min_value = max(low, 1e-9) if low >= 0 else min(1e-9, high)
+    value = rng.choice((low, high, math.exp(rng.uniform(math.log(min_value), math.log(max(high, 2 * min_value))))))
     if low < 0 < value:
         value *= rng.choice((1, -1))
     return round(value) if whole else value
@@ -264,33 +264,36 @@ class Mutants:
         rng = random.Random(f"{self._seed}/line/{number}")
         case = Case([], {CONFIG: "\n".join(toml_document(self._bases["paper"])) + "\n", "pipe": None})
         table = self._bases["paper"]
-        words = self._any_command(rng, "paper", table, case)
-        if words[0] not in ("campaign", "paper", "log", "ctl", "key"):
-            words += ["--set", "solver.method=exact"]
+        arguments = self._any_command(rng, "paper", table, case)
+        if arguments[0] not in ("campaign", "paper", "log", "ctl", "key"):
+            arguments += ["--set", "solver.method=exact"]
         for _ in range(rng.choice((1, 1, 1, 2, 3))):
-            at = rng.randrange(1, len(words) + 1)
+            at = rng.randrange(1, len(arguments) + 1)
             how = rng.choice(("value", "value", "value", "insert", "drop", "twice", "swap"))
-            word = rng.choice(WORDS)
+            argument = rng.choice(WORDS)
             if how == "value":
-                options = [i for i in range(1, len(words)) if words[i - 1].startswith("--")] or [len(words) - 1]
+                options = [i for i in range(1, len(arguments)) if arguments[i - 1].startswith("--")] or [
+                    len(arguments) - 1
+                ]
                 at = rng.choice(options)
-                words[at] = word
+                arguments[at] = argument
             elif how == "insert":
-                words.insert(at, word)
-            elif how == "drop" and len(words) > 2:
-                del words[at - 1]
+                arguments.insert(at, argument)
+            elif how == "drop" and len(arguments) > 2:
+                del arguments[at - 1]
             elif how == "twice":
-                words.insert(at, words[at - 1])
+                arguments.insert(at, arguments[at - 1])
             else:
-                other = rng.randrange(len(words))
-                words[at - 1], words[other] = words[other], words[at - 1]
-            case.note.append(f"{how} {at} {word[:20]!r}")
-        for i, word in enumerate(words[1:], 1):  # long work that is asked for is not refused, so not asked for
-            if words[i - 1] in LONG_OPTIONS and 4.0 < _number(word) < 1e7:
-                words[i] = "1e300"
+                other_index = rng.randrange(len(arguments))
+                arguments[at - 1], arguments[other_index] = arguments[other_index], arguments[at - 1]
+            case.note.append(f"{how} {at} {argument[:20]!r}")
+        for i, argument in enumerate(arguments[1:], 1):  # long work that is asked for is not refused, so not asked for
+            if arguments[i - 1] in LONG_OPTIONS and 4.0 < _number(argument) < 1e7:
+                arguments[i] = "1e300"
         # A process cannot be given these in a word.
         case.words = [
-            word.replace("\x00", "").encode("utf-8", "surrogateescape").decode("utf-8", "replace") for word in words
+            argument.replace("\x00", "").encode("utf-8", "surrogateescape").decode("utf-8", "replace")
+            for argument in arguments
         ]
         return case
 
@@ -385,8 +388,8 @@ class Mutants:
         elif how == "keys":
             lines.insert(at, "\n".join(f"key{i} = {i}" for i in range(rng.choice((1000, 50_000)))))
         elif how == "tables":
-            one = '[[fence]]\nstate = "north"\nside = "upper"\ntimes_s = [0.0]\nvalues = [2.0]\n'
-            lines.append(one * rng.choice((100, 5000)))
+            fence_text = '[[fence]]\nstate = "north"\nside = "upper"\ntimes_s = [0.0]\nvalues = [2.0]\n'
+            lines.append(fence_text * rng.choice((100, 5000)))
         elif how == "dotted":
             lines.insert(at, f"{'a.' * rng.choice((50, 5000))}b = 1")
         else:
@@ -398,9 +401,9 @@ class Mutants:
 
     def _override(self, rng: random.Random, table: dict[str, Any], case: Case) -> str:
         """A spoilt `key.path=value`."""
-        other = copy.deepcopy(table)
+        other_table = copy.deepcopy(table)
         path = rng.choice([path for path in leaves(table) if all(isinstance(key, str) for key in path)])
-        holder: Any = other
+        holder: Any = other_table
         for key in path[:-1]:
             holder = holder[key]
         how = rng.choice(("value",) * 6 + ("nest", "no value", "deep key", "odd key", "quotes", "two"))
@@ -430,8 +433,8 @@ class Mutants:
         content: str | bytes | None = "\n".join(rows)
         name = TRACE if kind == "trace" else MOTION
         if how == "long":
-            many = rng.choice((1000, 30_000, 500_000))
-            content = "\n".join(f"{0.1 * i:.1f},0.5,0.5,-1.0" if kind == "motion" else "0.02" for i in range(many))
+            row_count = rng.choice((1000, 30_000, 500_000))
+            content = "\n".join(f"{0.1 * i:.1f},0.5,0.5,-1.0" if kind == "motion" else "0.02" for i in range(row_count))
         elif how == "wide":
             rows[at] += ",1" * rng.choice((1, 100_000))
         elif how == "word":
@@ -581,9 +584,9 @@ class Mutants:
         return ["log", "whatif", RECORDING, "--out", "again"]
 
 
-def _number(word: str) -> float:
+def _number(text: str) -> float:
     try:
-        return float(word)
+        return float(text)
     except ValueError:
         return 0.0
 
@@ -596,13 +599,13 @@ def _scaled(value: Any, factor: float) -> Any:
 
 def bases() -> dict[str, dict[str, Any]]:
     """Both presets with every key, and the first one with a mission, a fence and a fault."""
-    found = {name: tomllib.loads(dump_config(load_config(name))) for name in ("paper", "room-hahn-stursberg")}
-    for table in found.values():
+    result = {name: tomllib.loads(dump_config(load_config(name))) for name in ("paper", "room-hahn-stursberg")}
+    for table in result.values():
         table["security"]["require"] = ["vehicle", "mocap"]
     mission = [
         "mission.waypoints=[[1, 1, -1], [0, 0, -1]]",
         "fence=[{state='north', side='upper', times_s=[0.0, 5.0], values=[2.9, 2.5]}]",
         "sim.fault=[{at_s=0.5, kind='blackout', for_s=0.3}]",
     ]
-    found["mission"] = tomllib.loads(dump_config(load_config("room-hahn-stursberg", mission)))
-    return found
+    result["mission"] = tomllib.loads(dump_config(load_config("room-hahn-stursberg", mission)))
+    return result

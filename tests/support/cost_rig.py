@@ -50,10 +50,10 @@ def cost(folder: Path, ticks: list[list[Item]], seconds: float) -> dict[str, flo
     """
     recorder, nothing = Recorder(folder / "flight.mcap", onlookers=DerivedTopics(ViewBuilder())), Nothing()
     with _as_in_flight():
-        found = _measured({"": recorder, "empty_": nothing}, ticks, round(seconds / TICK_S))
+        result = _measured({"": recorder, "empty_": nothing}, ticks, round(seconds / TICK_S))
     status = recorder.close()
     assert status.waiting == 0, "the disk hangs"
-    return {**found, "dropped": status.dropped + status.refused}
+    return {**result, "dropped": status.dropped + status.refused}
 
 
 def _measured(sinks: dict[str, Sink], ticks: list[list[Item]], count: int) -> dict[str, float]:
@@ -68,13 +68,13 @@ def _measured(sinks: dict[str, Sink], ticks: list[list[Item]], count: int) -> di
         spent = [_timed(sink, item) for item in items]
         each_ns[name] += spent
         tick_ns[name].append(sum(spent))
-    found: dict[str, float] = {"records": len(each_ns[""]), "ticks": len(tick_ns[""])}
+    result: dict[str, float] = {"records": len(each_ns[""]), "ticks": len(tick_ns[""])}
     for name in sinks:
         for what, times_ns in (("record", each_ns[name]), ("tick", tick_ns[name])):
             p50, p99 = np.percentile(times_ns, (50, 99)) / 1e3
-            found |= {f"{name}{what}_p50_us": float(p50), f"{name}{what}_p99_us": float(p99)}
-        found[f"{name}record_mean_us"] = float(np.mean(each_ns[name])) / 1e3
-    return found
+            result |= {f"{name}{what}_p50_us": float(p50), f"{name}{what}_p99_us": float(p99)}
+        result[f"{name}record_mean_us"] = float(np.mean(each_ns[name])) / 1e3
+    return result
 
 
 def _timed(sink: Sink, item: Item) -> int:

@@ -99,36 +99,36 @@ def alike(folder: Path, *, ended: bool) -> tuple[str, int]:
         ended: The recorder's last word is in it.
     """
     flight, out = folder / NAME, folder / "recovered.mcap"
-    code, told, errors = _run("log", "recover", str(flight), str(out))
+    code, output, errors = _run("log", "recover", str(flight), str(out))
     if code not in (0, 3):
         return f"recover: {code}, {errors}", 0
-    if (told["ended"], code) != (ended, 0 if not told["lost_bytes"] + told["messages_lost"] else 3):
-        return f"recover: {code}, {told}", 0
-    found = set()
+    if (output["ended"], code) != (ended, 0 if not output["lost_bytes"] + output["messages_lost"] else 3):
+        return f"recover: {code}, {output}", 0
+    result = set()
     for path in (flight, out):
-        code, told, errors = _run("log", "replay", str(path))
-        if (code, told.get("identical")) != (0, True):
-            return f"{path.name}: {code}, {told or errors}", 0
+        code, output, errors = _run("log", "replay", str(path))
+        if (code, output.get("identical")) != (0, True):
+            return f"{path.name}: {code}, {output or errors}", 0
         if path == out and ("recovered from flight.mcap: " in errors and "its end is missing" in errors) is ended:
             return f"{path.name}: {errors or 'not said to be cut'}", 0
-        found.add((int(told["decisions"]), int(told["compared"])))
-    return "" if len(found) == 1 else f"recovered it is another recording: {found}", min(found)[0]
+        result.add((int(output["decisions"]), int(output["compared"])))
+    return "" if len(result) == 1 else f"recovered it is another recording: {result}", min(result)[0]
 
 
 def refused(folder: Path) -> str:
     """What is wrong with how a recording is refused that holds nothing, not even its header."""
-    for words in (("replay",), ("recover", str(folder / "recovered.mcap"))):
-        code, told, errors = _run("log", words[0], str(folder / NAME), *words[1:])
-        if code != 1 or told.get("exit_code") != code or not errors.startswith("error: ") or errors.count("\n") != 1:
-            return f"{words[0]} of nothing: {code}, {told}, {errors}"
-    return f"{words[0]} left a file" if (folder / "recovered.mcap").exists() else ""
+    for arguments in (("replay",), ("recover", str(folder / "recovered.mcap"))):
+        code, output, errors = _run("log", arguments[0], str(folder / NAME), *arguments[1:])
+        if code != 1 or output.get("exit_code") != code or not errors.startswith("error: ") or errors.count("\n") != 1:
+            return f"{arguments[0]} of nothing: {code}, {output}, {errors}"
+    return f"{arguments[0]} left a file" if (folder / "recovered.mcap").exists() else ""
 
 
-def _run(*words: str) -> tuple[int, dict[str, int | bool], str]:
+def _run(*arguments: str) -> tuple[int, dict[str, int | bool], str]:
     """Exit code, JSON document and standard error of a command."""
     out, errors = io.StringIO(), io.StringIO()
     with redirect_stdout(out), redirect_stderr(errors):
-        code = run([*words, "--json"])
+        code = run([*arguments, "--json"])
     return code, json.loads(out.getvalue() or "{}"), _plain(errors.getvalue())
 
 

@@ -53,7 +53,7 @@ class Drawn:
     def words(self) -> tuple[str, ...]:
         """What it has, for a count of what many seeds have covered."""
         config = self.config
-        said = {
+        is_present = {
             f"preset {config.name}": True,
             f"simulated {config.sim.plant}": True,
             config.sim.autopilot: True,
@@ -82,7 +82,7 @@ class Drawn:
             "viewers": self.viewers,
             **{f"fault {fault.kind}": True for fault in config.sim.fault},
         }
-        return tuple(word for word, is_so in said.items() if is_so)
+        return tuple(label for label, is_so in is_present.items() if is_so)
 
 
 def drawn(seed: int) -> Drawn:
@@ -98,7 +98,7 @@ def drawn(seed: int) -> Drawn:
     if takes_off:
         low = replace(config.sim, start_position_m=(*config.sim.start_position_m[:2], -0.05))
         config = replace(config, sim=low)
-    skipped, late = _ticks(rng, ticks, 0.4), _ticks(rng, ticks, 0.4)
+    skipped, late_ticks = _ticks(rng, ticks, 0.4), _ticks(rng, ticks, 0.4)
     return Drawn(
         config=config,
         link=_true_link(rng, config, calm),
@@ -107,7 +107,7 @@ def drawn(seed: int) -> Drawn:
         orders=_orders(rng, config, ticks),
         stop_tick=int(rng.integers(ticks // 2, ticks)) if rng.uniform() < 0.25 else None,
         skipped=skipped,
-        late=late - skipped,
+        late=late_ticks - skipped,
         noise=float(rng.choice([0.0, 0.3])),
         reboot_step=int(rng.integers(steps // 3, steps)) if rng.uniform() < 0.15 else None,
         signed=bool(rng.uniform() < 0.3 and per_step > 1),
@@ -200,7 +200,7 @@ def _faults(
     """About one in so many seconds."""
     kinds = [*SPANS, "mode", "parameter", *(("wind", "battery") if plant == "quadrotor" else ())]
     weights = np.array([0.3 if kind == "mode" else 1.0 for kind in kinds])
-    found = []
+    results = []
     for at_s in np.sort(rng.uniform(0.0, flight_s, rng.poisson(flight_s / every_s))).tolist():
         kind = str(rng.choice(kinds, p=weights / weights.sum()))
         fault = FaultConfig(at_s=at_s, kind=kind)  # type: ignore[arg-type]  # one of them
@@ -215,8 +215,8 @@ def _faults(
         else:
             name = "COM_OF_LOSS_T" if autopilot == "px4" else "GUID_TIMEOUT"
             fault = replace(fault, name=name, value=float(rng.uniform(0.5, 3.0)))
-        found.append(fault)
-    return tuple(found)
+        results.append(fault)
+    return tuple(results)
 
 
 def _mission(rng: np.random.Generator, config: Config) -> Config:
@@ -252,7 +252,7 @@ def _place(rng: np.random.Generator, config: Config) -> Vec3:
 
 def _orders(rng: np.random.Generator, config: Config, ticks: int) -> tuple[tuple[int, Command], ...]:
     """A few orders of the operator, in the midst of it."""
-    found = []
+    results = []
     for tick in np.sort(rng.integers(0, ticks, rng.poisson(1.5))).tolist():
         order = rng.choice([Order.GOTO, Order.HOLD, Order.RESUME, Order.LAND, Order.ENGAGE, Order.TAKE_OFF])
         command = Command(
@@ -260,8 +260,8 @@ def _orders(rng: np.random.Generator, config: Config, ticks: int) -> tuple[tuple
             position_m=_place(rng, config) if order == Order.GOTO else None,
             height_m=1.0 if order == Order.TAKE_OFF else None,
         )
-        found.append((tick, command))
-    return tuple(found)
+        results.append((tick, command))
+    return tuple(results)
 
 
 def _ticks(rng: np.random.Generator, ticks: int, share: float) -> frozenset[int]:

@@ -181,8 +181,8 @@ class Endings:
         """Ask the daemon as an operator does, in a process beside it; its answer comes with one of the next ticks."""
         assert self.listener is not None
         folder = Path(self.listener.getsockname()).parent
-        words = [sys.executable, "-m", "uavctl", "ctl", "status", "--json", "--control", str(folder)]
-        self._asking.append(subprocess.Popen(words, stdout=subprocess.PIPE, text=True))
+        arguments = [sys.executable, "-m", "uavctl", "ctl", "status", "--json", "--control", str(folder)]
+        self._asking.append(subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True))
         assert select.select([self.listener], [], [], LIMIT_S)[0], "nobody has asked"
 
     def _take_answers(self) -> None:
@@ -242,8 +242,8 @@ class Told:
 
     @property
     def ending(self) -> dict[str, Any]:
-        found: dict[str, Any] = self.summary["ending"]
-        return found
+        document: dict[str, Any] = self.summary["ending"]
+        return document
 
     def agrees(self) -> None:
         """All places have the one sentence, and the exit code goes with it."""
@@ -310,19 +310,19 @@ def in_virtual_time(rig: Endings) -> Iterator[None]:
         yield
 
 
-def flown(rig: Endings, capsys: pytest.CaptureFixture[str], *words: str) -> Told:
+def flown(rig: Endings, capsys: pytest.CaptureFixture[str], *arguments: str) -> Told:
     """Type `uavctl fly` and look at what has become of it."""
-    with socket.socket(type=socket.SOCK_DGRAM) as one:
-        one.bind(("127.0.0.1", 0))
-        url = f"udpin://127.0.0.1:{one.getsockname()[1]}"
+    with socket.socket(type=socket.SOCK_DGRAM) as sock:
+        sock.bind(("127.0.0.1", 0))
+        url = f"udpin://127.0.0.1:{sock.getsockname()[1]}"
     for path in find_lock_paths(url):  # what a daemon of another test has left on this port
         path.unlink(missing_ok=True)
-    sets = [word for setting in rig.overrides for word in ("--set", setting)]
+    sets = [argument for setting in rig.overrides for argument in ("--set", setting)]
     places = ["--vehicle", url, "--out", str(rig.folder), "--json"]
     try:
         # A folder with a short name: a socket's path has 107 bytes.
         with in_virtual_time(rig), tempfile.TemporaryDirectory(prefix="uavctl-") as control:
-            code = run(["fly", *PRESET, *sets, *places, "--control", control, *words])
+            code = run(["fly", *PRESET, *sets, *places, "--control", control, *arguments])
     except SystemExit as ended:
         code = int(ended.code or 0)
     finally:

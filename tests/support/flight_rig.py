@@ -48,11 +48,11 @@ def drag_lag_generator(drag: float, lag: float) -> Array:
 def small_plant(axes: tuple[str, ...] = ("north",), wind_std: float = 0.15, dt_s: float = DT_NS * 1e-9) -> Plant:
     """Drag-lag axes from the matrix exponential, independent of the project's own plants."""
     n = len(axes)
-    one = expm(drag_lag_generator(0.3, 0.25) * dt_s)
+    axis_matrix = expm(drag_lag_generator(0.3, 0.25) * dt_s)
     return Plant(
-        a=block_diag(*[one[:3, :3]] * n),
-        b=block_diag(*[one[:3, 4:5]] * n),
-        e=block_diag(*[one[:3, 3:4]] * n),
+        a=block_diag(*[axis_matrix[:3, :3]] * n),
+        b=block_diag(*[axis_matrix[:3, 4:5]] * n),
+        e=block_diag(*[axis_matrix[:3, 3:4]] * n),
         w=np.eye(n) * wind_std**2,
         dt_s=dt_s,
         axes=axes,
@@ -212,7 +212,7 @@ def inputs_of(
     status: Callable[[int], VehicleStatus | None] = lambda tick: vehicle(),
 ) -> list[StepInput]:
     """Tick inputs: every sample in the first tick after its arrival; left-out ticks count as missed."""
-    waiting = sorted(samples, key=lambda one: one.received_ns)
+    waiting = sorted(samples, key=lambda received: received.received_ns)
     result: list[StepInput] = []
     place, before = 0, None
     for tick in ticks:

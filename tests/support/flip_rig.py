@@ -81,17 +81,17 @@ class Flips:
         """Header and info: the truth, or nothing, and damage is told."""
         with contextlib.suppress(RecordingError):
             assert header(self._path) == HEADER
-        found = read_info(self._path)
-        assert found.origin in (self._info.origin, None)
-        assert found.start_ns >= self._info.start_ns and found.end_ns <= self._info.end_ns
+        result = read_info(self._path)
+        assert result.origin in (self._info.origin, None)
+        assert result.start_ns >= self._info.start_ns and result.end_ns <= self._info.end_ns
         if self._finished:
-            assert found.damage
-        lost = set(self._info.attachments) - set(found.attachments)
-        assert set(found.attachments) <= set(self._info.attachments) and (found.damage or not lost)
-        if found.messages == self._info.messages:
-            assert _without_state(found) == _without_state(self._info)
+            assert result.damage
+        lost = set(self._info.attachments) - set(result.attachments)
+        assert set(result.attachments) <= set(self._info.attachments) and (result.damage or not lost)
+        if result.messages == self._info.messages:
+            assert _without_state(result) == _without_state(self._info)
         else:
-            assert found.damage and self._info.messages - found.messages <= self._most
+            assert result.damage and self._info.messages - result.messages <= self._most
 
     def recover(self) -> None:
         """Recover: all but one chunk, losses told, and a file that is right in every part."""
@@ -106,9 +106,9 @@ class Flips:
         _check_parts(self._out, entries)
 
 
-def _without_state(found: RecordingInfo) -> RecordingInfo:
-    segments = tuple(msgspec.structs.replace(segment, finished=False) for segment in found.segments)
-    return msgspec.structs.replace(found, finished=False, damage=(), segments=segments, attachments=())
+def _without_state(result: RecordingInfo) -> RecordingInfo:
+    segments = tuple(msgspec.structs.replace(segment, finished=False) for segment in result.segments)
+    return msgspec.structs.replace(result, finished=False, damage=(), segments=segments, attachments=())
 
 
 def _check_parts(path: Path, entries: list[Item]) -> None:

@@ -50,10 +50,10 @@ PER_SESSION = 500
 
 def letters(form: str) -> list[str]:
     """One format letter for every value of a struct format; strings keep their length."""
-    found: list[str] = []
+    result: list[str] = []
     for count, letter in re.findall(r"(\d*)([a-zA-Z])", form):
-        found += [count + letter] if letter == "s" else [letter] * int(count or 1)
-    return found
+        result += [count + letter] if letter == "s" else [letter] * int(count or 1)
+    return result
 
 
 class Mutants:
@@ -140,9 +140,9 @@ class Mutants:
         return b"\xfd" + header + payload + crc.to_bytes(2, "little")
 
 
-def snapshot(one: Bench) -> dict[str, Any]:
+def snapshot(rig: Bench) -> dict[str, Any]:
     """All that a message could change and a client could notice."""
-    autopilot, vehicle = one.peers.autopilot, one.peers.vehicle
+    autopilot, vehicle = rig.peers.autopilot, rig.peers.vehicle
     pilot = autopilot.pilot
     return {
         "mode": pilot.mode.name,

@@ -56,17 +56,19 @@ class Rig:
         return self.asked[-1][1] is ask
 
     def tick(
-        self, *heard: CommandAck | StatusText, commands: tuple[Command, ...] = (), **fields: object
+        self, *received: CommandAck | StatusText, commands: tuple[Command, ...] = (), **fields: object
     ) -> HandoverOutput:
         at_ns = self.view.at_ns + TICK_NS
         if self.vehicle is not None and not self.mute:
             self.vehicle = replace(self.vehicle, at_ns=at_ns)
-        self.view = replace(self.view, at_ns=at_ns, vehicle=self.vehicle, messages=heard, commands=commands, **fields)
-        told = self.hand_over.update(self.view)
-        if told.request is not None:
-            self.asked.append((at_ns, told.request))
-        self.events += told.events
-        return told
+        self.view = replace(
+            self.view, at_ns=at_ns, vehicle=self.vehicle, messages=received, commands=commands, **fields
+        )
+        requests = self.hand_over.update(self.view)
+        if requests.request is not None:
+            self.asked.append((at_ns, requests.request))
+        self.events += requests.events
+        return requests
 
     def run(self, seconds: float, *, until: HandoverState | None = None) -> None:
         for _ in range(round(seconds * SECOND) // TICK_NS):
@@ -77,8 +79,8 @@ class Rig:
 
     def answer(self, result: int, ask: RequestKind | None = None, text: str = "") -> HandoverOutput:
         """The vehicle answers the last request, or this one."""
-        words = (StatusText(system=1, component=1, severity=2, text=text),) if text else ()
-        return self.tick(ack(result, ask or self.asked[-1][1]), *words)
+        arguments = (StatusText(system=1, component=1, severity=2, text=text),) if text else ()
+        return self.tick(ack(result, ask or self.asked[-1][1]), *arguments)
 
     def to(self, state: HandoverState) -> Rig:
         """Go on the usual way as far as a state, with a vehicle that does what it is asked for."""

@@ -57,8 +57,8 @@ class InertialRecord:
     @property
     def acceleration(self) -> Array:
         """Acceleration in NED by what was told."""
-        told: Array = np.einsum("nij,nj->ni", turning(self.attitude), self.force) + np.array([0.0, 0.0, G])
-        return told
+        accel_mps2: Array = np.einsum("nij,nj->ni", turning(self.attitude), self.force) + np.array([0.0, 0.0, G])
+        return accel_mps2
 
     @property
     def true_acceleration(self) -> Array:
@@ -86,10 +86,10 @@ class InertialRecord:
         return np.array(off)
 
 
-def ask(one: Bench, *kinds: int, period_s: float = PERIOD_S) -> None:
+def ask(rig: Bench, *kinds: int, period_s: float = PERIOD_S) -> None:
     """Ask for streams."""
     for kind in kinds:
-        assert one.ask(INTERVAL, kind, round(1e6 * period_s)) == 0
+        assert rig.ask(INTERVAL, kind, round(1e6 * period_s)) == 0
 
 
 def wave(t: float) -> tuple[float, float, float]:
@@ -98,20 +98,20 @@ def wave(t: float) -> tuple[float, float, float]:
 
 
 def recorded(
-    one: Bench, name: str, seconds: float, velocity: Callable[[float], tuple[float, ...]] = wave
+    rig: Bench, name: str, seconds: float, velocity: Callable[[float], tuple[float, ...]] = wave
 ) -> InertialRecord:
     """Fly velocities and keep what is told every 20 ms of the first unit and of the attitude."""
-    ask(one, FIRST[name], QUATERNION)
-    truth, first = [], len(one.seen)
+    ask(rig, FIRST[name], QUATERNION)
+    truth, first = [], len(rig.seen)
     for i in range(round(seconds / PERIOD_S)):
-        vehicle = one.peers.vehicle
+        vehicle = rig.peers.vehicle
         truth.append((*vehicle.attitude, *vehicle.position_m, *vehicle.velocity_mps))
         if i % 5 == 0:
-            one.send(one.client.velocity(*velocity(i * PERIOD_S)))
-        one.wait(PERIOD_S)
-    seen = [msg for _, msg in one.seen[first:]]
-    inertial = [msg for msg in seen if msg.get_type() == NAMES[FIRST[name]]][: len(truth)]
-    turns = [msg for msg in seen if msg.get_type() == "ATTITUDE_QUATERNION"][: len(truth)]
+            rig.send(rig.client.velocity(*velocity(i * PERIOD_S)))
+        rig.wait(PERIOD_S)
+    observed = [msg for _, msg in rig.seen[first:]]
+    inertial = [msg for msg in observed if msg.get_type() == NAMES[FIRST[name]]][: len(truth)]
+    turns = [msg for msg in observed if msg.get_type() == "ATTITUDE_QUATERNION"][: len(truth)]
     assert len(inertial) == len(turns) == len(truth)
     measured, rows = np.array([si(msg) for msg in inertial]), np.array(truth)
     return InertialRecord(

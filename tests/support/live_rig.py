@@ -44,15 +44,14 @@ class Viewer:
 
     def channels(self, wanted: set[str]) -> dict[str, dict[str, Any]]:
         """Read until all wanted topics are offered."""
-        found: dict[str, dict[str, Any]] = {}
-        while not wanted <= found.keys():
+        channels: dict[str, dict[str, Any]] = {}
+        while not wanted <= channels.keys():
             opcode, data = self._frame()
             if opcode == TEXT:
-                told = json.loads(data)
-                found |= {
-                    channel["topic"]: channel for channel in told.get("channels", ()) if told["op"] == "advertise"
-                }
-        return found
+                document = json.loads(data)
+                if document["op"] == "advertise":
+                    channels |= {channel["topic"]: channel for channel in document["channels"]}
+        return channels
 
     def subscribe(self, channels: dict[str, dict[str, Any]]) -> None:
         """Ask for all messages of these topics."""

@@ -42,24 +42,24 @@ def commands(page: str, section: str = "") -> list[str]:
 
 def keys(block: str) -> list[tuple[str, str, str]]:
     """Table, key and value of each line of a TOML block."""
-    found = []
+    results = []
     for table, body in _TABLE.findall(block):
         parts = (line.partition("=") for line in body.splitlines() if "=" in line)
-        found += [(table, key.strip(), value.strip()) for key, _, value in parts]
-    return found
+        results += [(table, key.strip(), value.strip()) for key, _, value in parts]
+    return results
 
 
 def edited(text: str, block: str) -> str:
     """Change the lines of a configuration as a block says, where the table is there; else add it."""
     for table, key, value in keys(block):
-        line, found = f"{key} = {value}\n", re.search(rf"^\[{table}\]\n(?:(?!^\[).*\n?)*", text, re.M)
-        if found is None:
+        line, result = f"{key} = {value}\n", re.search(rf"^\[{table}\]\n(?:(?!^\[).*\n?)*", text, re.M)
+        if result is None:
             text += f"\n[{table}]\n{line}"
             continue
         old = re.compile(rf"^{key} = (\[\n(?:.*\n)*?\]|.*)\n", re.M)
-        new, count = old.subn(line.replace("\\", r"\\"), found[0], count=1)
-        new = new if count else found[0].replace(f"[{table}]\n", f"[{table}]\n{line}", 1)
-        text = text[: found.start()] + new + text[found.end() :]
+        new, count = old.subn(line.replace("\\", r"\\"), result[0], count=1)
+        new = new if count else result[0].replace(f"[{table}]\n", f"[{table}]\n{line}", 1)
+        text = text[: result.start()] + new + text[result.end() :]
     return text
 
 
@@ -89,8 +89,8 @@ class Desk:
 
     def ends(self, process: subprocess.Popen[bytes], command: str, code: int = 0) -> str:
         """Wait for the end of a command; what it wrote."""
-        found = process.wait(LIMIT_S)
-        assert found == code, f"{command}: exit code {found}, not {code}\n{self.said(process)}"
+        result = process.wait(LIMIT_S)
+        assert result == code, f"{command}: exit code {result}, not {code}\n{self.said(process)}"
         return self.said(process)
 
     def run(self, command: str, code: int = 0) -> str:
@@ -155,14 +155,14 @@ def desk(folder: Path) -> Iterator[Desk]:
         }  # fmt: skip
         (folder / ".venv").mkdir()
         shutil.copytree(Path(short) / "bin", folder / ".venv/bin", symlinks=True)
-        one = Desk(folder, network, environment)
+        shell = Desk(folder, network, environment)
         try:
-            yield one
+            yield shell
         finally:
-            for process in one.open:
+            for process in shell.open:
                 if process.poll() is None:
                     process.send_signal(signal.SIGINT)
-            for process in one.open:
+            for process in shell.open:
                 try:
                     process.wait(20.0)
                 except subprocess.TimeoutExpired:

@@ -37,9 +37,9 @@ MARK = b"the test's own mark"
 
 def port() -> socket.socket:
     """A UDP socket on a free port of this machine."""
-    one = socket.socket(type=socket.SOCK_DGRAM)
-    one.bind(("127.0.0.1", 0))
-    return one
+    sock = socket.socket(type=socket.SOCK_DGRAM)
+    sock.bind(("127.0.0.1", 0))
+    return sock
 
 
 class Tap:
@@ -77,8 +77,8 @@ class Tap:
     def spoken_by_now(self) -> int:
         """How much the daemon has said, with what waits in the socket's queue: a mark put behind it has come out."""
         self._marked.clear()
-        with port() as here:
-            here.sendto(MARK, self._ours.getsockname())
+        with port() as port_number:
+            port_number.sendto(MARK, self._ours.getsockname())
         assert self._marked.wait(LIMIT_S)
         return self.spoken
 
@@ -119,7 +119,7 @@ class Scene:
     def fly(self, out: str, *options: str, environ: dict[str, str] | None = None) -> subprocess.Popen[str]:
         """The daemon, ready to fly or already over."""
         urls = ["--vehicle", self.vehicle, "--mocap", self.mocap]
-        patience = [word for setting in PATIENT_DAEMON for word in ("--set", setting)]
+        patience = [argument for setting in PATIENT_DAEMON for argument in ("--set", setting)]
         command = [sys.executable, "-m", "uavctl", "fly", *urls, *patience, "--json"]
         places = ["--out", str(self.folder / out), "--control", str(self.control)]
         return subprocess.Popen(
@@ -132,25 +132,25 @@ class Scene:
 
     def ctl(self, *arguments: str) -> tuple[int, str, str]:
         """Exit code, standard output and error of `uavctl ctl`."""
-        out, told = io.StringIO(), io.StringIO()
-        with redirect_stdout(out), redirect_stderr(told):
+        out, errors = io.StringIO(), io.StringIO()
+        with redirect_stdout(out), redirect_stderr(errors):
             code = run(["ctl", *arguments, "--control", str(self.control)])
-        return code, out.getvalue(), told.getvalue()
+        return code, out.getvalue(), errors.getvalue()
 
     def status(self) -> dict[str, Any]:
-        found: dict[str, Any] = json.loads(self.ctl("status", "--json")[1])
-        return found
+        document: dict[str, Any] = json.loads(self.ctl("status", "--json")[1])
+        return document
 
 
 @contextmanager
 def scene(*overrides: str) -> Iterator[Scene]:
     """A simulated vehicle in the air, as long as the block lasts."""
-    with port() as one, port() as other, tempfile.TemporaryDirectory(prefix="uavctl-") as folder:
-        vehicle_port, mocap_port = int(one.getsockname()[1]), int(other.getsockname()[1])
-        one.close()
-        other.close()
+    with port() as first, port() as second, tempfile.TemporaryDirectory(prefix="uavctl-") as folder:
+        vehicle_port, mocap_port = int(first.getsockname()[1]), int(second.getsockname()[1])
+        first.close()
+        second.close()
         tap = Tap(vehicle_port)
-        found = Scene(Path(folder), tap, vehicle_port, mocap_port)
+        result = Scene(Path(folder), tap, vehicle_port, mocap_port)
         done = threading.Event()
         config = load_config("room", [PATIENT_VEHICLE, *overrides])
 
@@ -162,7 +162,7 @@ def scene(*overrides: str) -> Iterator[Scene]:
                 duration_s=None,
                 airborne=True,
                 on_ready=lambda _: None,
-                on_truth=found.truths.append,
+                on_truth=result.truths.append,
                 stop=done.is_set,
             )
 
@@ -171,12 +171,12 @@ def scene(*overrides: str) -> Iterator[Scene]:
         try:
             with pytest.MonkeyPatch.context() as patch:
                 patch.setattr("uavctl.cli.ctl.ANSWER_LIMIT_S", LIMIT_S)
-                yield found
+                yield result
         finally:
             done.set()
             peers.join()
             tap.close()
-            for path in find_lock_paths(found.vehicle):
+            for path in find_lock_paths(result.vehicle):
                 path.unlink(missing_ok=True)  # the port's next vehicle was not left in flight
 
 

@@ -268,9 +268,9 @@ def case_of(shape: Shape) -> Case:
     solver = ConicSolver(design)
     rng = np.random.default_rng(shape.seed + 1000)
     size = np.array([min(2.0, *room) for room in zip(*_reach(spec), strict=True)])
-    way = rng.uniform(0.3, 1.0, size.size) * rng.choice([-1.0, 1.0], size.size) * size
+    displacement = rng.uniform(0.3, 1.0, size.size) * rng.choice([-1.0, 1.0], size.size) * size
     for share in 0.9 * 0.6 ** np.arange(12):
-        x = design.target + share * way
+        x = design.target + share * displacement
         answer = solver.solve(0, x, design.target)
         if kept(answer):
             return Case(design, spec, solver, x, answer)

@@ -79,7 +79,7 @@ class Record:
     ) -> Array:
         """The same setpoints flown by a simulated vehicle that starts like the recorded one; brakes in the pause."""
         first = self.truth[np.searchsorted(self.truth[:, 0], start_s)]
-        one = vehicle((0.0, 0.0, float(first[1])), (float(first[2]), float(first[3]), float(first[4])))
+        quadrotor_model = vehicle((0.0, 0.0, float(first[1])), (float(first[2]), float(first[3]), float(first[4])))
         times = [float(t) for t in self.setpoints[:, 0]]
         coming = int(np.searchsorted(self.setpoints[:, 0], start_s, side="right")) - 1
         braking = False
@@ -88,13 +88,13 @@ class Record:
             now_s = start_s + k * STEP_S
             while coming < len(times) and times[coming] <= now_s:
                 north, east, down = self.setpoints[coming, 1:].tolist()
-                one.accelerate((north, east, down))
+                quadrotor_model.accelerate((north, east, down))
                 coming += 1
             if pause[0] <= now_s < pause[1] and not braking:
-                one.brake()
+                quadrotor_model.brake()
                 braking = True
-            rows.append((now_s, one.position_m[2], *one.velocity_mps))
-            one.advance((k + 1) * STEP_NS)
+            rows.append((now_s, quadrotor_model.position_m[2], *quadrotor_model.velocity_mps))
+            quadrotor_model.advance((k + 1) * STEP_NS)
         return np.array(rows)
 
 

@@ -58,19 +58,19 @@ def events(name: str) -> tuple[tuple[float, str], ...]:
     """What an observer saw and told the rig to do: seconds since the first packet, and his words."""
     text = lzma.decompress((FLIGHTS / f"{name}-events.txt.xz").read_bytes()).decode()
     rows = (line.split(maxsplit=1) for line in text.splitlines())
-    return tuple((float(time), words) for time, words in rows)
+    return tuple((float(time), arguments) for time, arguments in rows)
 
 
 def seen_s(name: str, begin: str) -> list[float]:
     """When the observer saw or did what begins so [s]."""
-    return [time_s for time_s, words in events(name) if words.startswith(begin)]
+    return [time_s for time_s, arguments in events(name) if arguments.startswith(begin)]
 
 
 def config_of(name: str, *overrides: str) -> Config:
     """The preset of the autopilot that flew, on one link."""
     preset = "room-px4" if name.startswith("px4") else "room-ardupilot"
-    own = () if name in RELAYED or name in (AT_REST, OF_OTHERS[1]) else (OWN_ESTIMATE,)
-    return load_config(preset, ["daemon.mocap=tlog", "daemon.vehicle=tlog", *own, *overrides])
+    estimate_overrides = () if name in RELAYED or name in (AT_REST, OF_OTHERS[1]) else (OWN_ESTIMATE,)
+    return load_config(preset, ["daemon.mocap=tlog", "daemon.vehicle=tlog", *estimate_overrides, *overrides])
 
 
 def checked(name: str, since_s: float, seconds: float, *overrides: str) -> dict[str, str]:
@@ -141,14 +141,16 @@ def statuses(name: str) -> list[tuple[float, VehicleStatus]]:
     """What a link makes of the vehicle's words, with times since the first packet [s]."""
     whole = packets(name)
     link = make_links(config_of(name))[VEHICLE]
-    heard = (
+    received = (
         (datagram, item)
         for datagram in whole
         if not datagram.outgoing
         for item in link.receive(datagram.data, datagram.at_ns).items
     )
     return [
-        ((datagram.at_ns - whole[0].at_ns) * 1e-9, item) for datagram, item in heard if isinstance(item, VehicleStatus)
+        ((datagram.at_ns - whole[0].at_ns) * 1e-9, item)
+        for datagram, item in received
+        if isinstance(item, VehicleStatus)
     ]
 
 

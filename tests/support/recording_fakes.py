@@ -48,15 +48,15 @@ def stored_byte(path: Path, needle: bytes) -> int:
 
 def stored_chunks(data: bytes) -> list[tuple[int, int, bytes]]:
     """Offset and length of each chunk's stored content, and that content, by the format's own reader."""
-    found, at = [], MAGIC_SIZE
+    result, at = [], MAGIC_SIZE
     while at + 9 <= len(data) and data[at] != Opcode.DATA_END:
         length = int.from_bytes(data[at + 1 : at + 9], "little")
         if data[at] == Opcode.CHUNK:
             chunk = Chunk.read(ReadDataStream(BytesIO(data[at + 9 : at + 9 + length])))
             content = ZstdDecompressor().decompress(chunk.data) if chunk.compression else chunk.data
-            found.append((at + 9 + length - len(chunk.data), len(chunk.data), content))
+            result.append((at + 9 + length - len(chunk.data), len(chunk.data), content))
         at += 9 + length
-    return found
+    return result
 
 
 def flight(count: int) -> list[Item]:

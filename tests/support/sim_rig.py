@@ -116,10 +116,10 @@ def bench(autopilot: str, *overrides: str, airborne: bool = True) -> Bench:
     )
 
 
-def flying(one: Bench) -> tuple[float, ...]:
-    return tuple(one.peers.vehicle.input.tolist())
+def flying(rig: Bench) -> tuple[float, ...]:
+    return tuple(rig.peers.vehicle.input.tolist())
 
 
-def heartbeat(one: Bench) -> Any:
-    one.wait(1.0)
-    return one.of("HEARTBEAT")[-1]
+def heartbeat(rig: Bench) -> Any:
+    rig.wait(1.0)
+    return rig.of("HEARTBEAT")[-1]

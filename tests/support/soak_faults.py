@@ -110,9 +110,9 @@ def fly_faults(
     flights, ticks, begun_bytes, spent_s = 0, 0, 0, 0.0
     while spent_s < hours * 3600.0 or flights <= warm_up:
         seed = first + flights
-        found, flown = _flight(prepared, drawn(seed, flight_s), None)
-        if found:
-            wrong[seed] = found
+        result, flown = _flight(prepared, drawn(seed, flight_s), None)
+        if result:
+            wrong[seed] = result
             if out is not None:
                 _flight(prepared, drawn(seed, flight_s), out / f"faults-{seed}.mcap")
         flights += 1

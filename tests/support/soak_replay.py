@@ -44,9 +44,9 @@ class Doors:
 
     def take(self, link: str, data: bytes, at_ns: int) -> bytes:
         """What of a datagram passes."""
-        found = scan_frames(data, final=True)
-        if found.frames and not found.bad:
-            data = b"".join(self.peers[link].sign_frame(frame.data, at_ns) for frame in found.frames)
+        result = scan_frames(data, final=True)
+        if result.frames and not result.bad:
+            data = b"".join(self.peers[link].sign_frame(frame.data, at_ns) for frame in result.frames)
         return self.gates[link].verify_frames(data, at_ns)
 
     def tell(self, loop: ControlLoop, at_ns: int) -> None:
@@ -221,9 +221,9 @@ def record(seed: int, path: Path) -> tuple[Drawn, Counter[str]]:
 def replayed(seed: int, folder: Path) -> Replayed:
     """Fly a seed's flight into a recording, and replay it from the recording alone."""
     path = folder / f"{seed}" / "flight.mcap"
-    plan, seen = record(seed, path)
-    found = read_info(path)
-    return Replayed(seed, path, plan.words, replay_flight(path).result, seen, len(found.files), found.duration_s)
+    plan, observed = record(seed, path)
+    result = read_info(path)
+    return Replayed(seed, path, plan.words, replay_flight(path).result, observed, len(result.files), result.duration_s)
 
 
 def replayed_apart(path: Path) -> str:
@@ -233,13 +233,13 @@ def replayed_apart(path: Path) -> str:
     return "" if ended.returncode == 0 else ended.stdout or ended.stderr
 
 
-def tally(found: Iterable[Replayed]) -> dict[str, object]:
+def tally(result: Iterable[Replayed]) -> dict[str, object]:
     """Figures of many flights."""
-    flights = sorted(found, key=lambda one: one.seed)
-    words, seen = Counter[str](), Counter[str]()
+    flights = sorted(result, key=lambda flight_result: flight_result.seed)
+    arguments, observed = Counter[str](), Counter[str]()
     for flight in flights:
-        words.update(flight.words)
-        seen.update(flight.seen)
+        arguments.update(flight.words)
+        observed.update(flight.seen)
     return {
         "replayed": len(flights),
         "identical": sum(flight.good for flight in flights),
@@ -247,8 +247,8 @@ def tally(found: Iterable[Replayed]) -> dict[str, object]:
         "records": sum(flight.result.compared for flight in flights),
         "in_several_files": sum(flight.files > 1 for flight in flights),
         "virtual_s": round(sum(flight.flight_s for flight in flights), 1),
-        "had": dict(sorted(words.items())),
-        "seen": dict(sorted(seen.items())),
+        "had": dict(sorted(arguments.items())),
+        "seen": dict(sorted(observed.items())),
         "wrong": {
             str(flight.seed): flight.apart or msgspec.to_builtins(flight.result.first_difference)
             for flight in flights

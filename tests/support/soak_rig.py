@@ -117,11 +117,11 @@ class Watch:
         now = (0.0, 0.0, 0.0) if self._setpoint is None else self._setpoint.accel_mps2
         # The one leap that there is: level at once, where what is seen cannot be.
         level = now == (0.0, 0.0, 0.0) and any("envelope-" in alarm for alarm in self.alarms)
-        most = limits.slew_mps3 * self.prepared.controller.tick_ns * 1e-9
+        max_slew_mps2 = limits.slew_mps3 * self.prepared.controller.tick_ns * 1e-9
         for axis, (before, after, bound) in enumerate(zip(self._before, now, limits.accel_mps2, strict=True)):
             if not math.isfinite(after) or abs(after) > bound:
                 self.wrong.append(f"{when}: setpoint {after} m/s² of axis {axis} is beyond {bound}")
-            elif self._setpoint is not None and abs(after - before) > most + 1e-9 and not level:
+            elif self._setpoint is not None and abs(after - before) > max_slew_mps2 + 1e-9 and not level:
                 self.wrong.append(f"{when}: setpoint of axis {axis} leaps from {before} to {after} m/s²")
         self._before = now
 

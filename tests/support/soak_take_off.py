@@ -110,7 +110,7 @@ def fly_take_off(autopilot: str, seed: int) -> TakeOff:
     flight = troubled(autopilot, seed)
     what = flown(flight)
     seconds, wrong = flight.now_ns * 1e-9, []
-    told = tuple(event.text for event in flight.notices)
+    texts = tuple(event.text for event in flight.notices)
     if what == "hovers":
         while not flight.loop.finished and flight.now_ns * 1e-9 < seconds + LANDING_S and what == "hovers":
             flight.run(1.0)
@@ -118,18 +118,18 @@ def fly_take_off(autopilot: str, seed: int) -> TakeOff:
         wrong.append(f"it was in the air and not flown at {seconds:.0f} s; then: {what}")
     if what == "hovers":
         wrong.append(f"nobody has it in the air ({flight.state})")
-    if what != "engaged" and not (told and flight.loop.course.told):
+    if what != "engaged" and not (texts and flight.loop.course.told):
         wrong.append("nobody was told why")
     if flight.state not in ATTENDED and flight.peers.autopilot.pilot.is_armed:
         wrong.append(f"it was left armed ({flight.state})")
     reached = flight.loop.course.engaged
-    return TakeOff(autopilot, seed, what, reached, round(seconds, 1), told, flight.loop.ending.sentence, tuple(wrong))
+    return TakeOff(autopilot, seed, what, reached, round(seconds, 1), texts, flight.loop.ending.sentence, tuple(wrong))
 
 
 def tally_take_offs(flights: Sequence[TakeOff]) -> dict[str, object]:
     """The figures of one autopilot's take-offs."""
-    found = Counter(flight.what for flight in flights)
-    late = max(flights, key=lambda flight: flight.seconds)
+    result = Counter(flight.what for flight in flights)
+    latest_flight = max(flights, key=lambda flight: flight.seconds)
     over = [flight.sentence for flight in flights if flight.what != "engaged"]
     causes = Counter(sentence.partition(":")[0].partition(";")[0] for sentence in over)
     return {
@@ -137,10 +137,10 @@ def tally_take_offs(flights: Sequence[TakeOff]) -> dict[str, object]:
         "engaged": sum(flight.reached for flight in flights),
         "landed_again": sum(flight.reached and flight.what == "landed" for flight in flights),
         "landed": sum(not flight.reached and flight.what == "landed" for flight in flights),
-        "refused": found["refused"],
-        "hovers": found["hovers"],
-        "latest_s": late.seconds,
-        "latest_seed": late.seed,
+        "refused": result["refused"],
+        "hovers": result["hovers"],
+        "latest_s": latest_flight.seconds,
+        "latest_seed": latest_flight.seed,
         "ended": dict(causes.most_common()),
         "wrong": {str(flight.seed): [*flight.wrong, flight.sentence] for flight in flights if flight.wrong},
     }

@@ -85,9 +85,9 @@ class Flight:
         assert until is None or self.state is until, (self.state, self.texts)
         return self
 
-    def _send(self, one: Outgoing) -> None:
-        if self.hears(one.data):
-            self.peers.receive(one.link, one.data, self.now_ns)
+    def _send(self, outgoing: Outgoing) -> None:
+        if self.hears(outgoing.data):
+            self.peers.receive(outgoing.link, outgoing.data, self.now_ns)
 
     def stick(self, mode: str) -> None:
         """The pilot changes the mode."""
@@ -96,8 +96,8 @@ class Flight:
 
     @property
     def states(self) -> list[str]:
-        told = [event.text for event in self.memory.of(Event) if event.code == "hand-over"]
-        return [text.split(" -> ")[1].split(" (")[0] for text in told]
+        texts = [event.text for event in self.memory.of(Event) if event.code == "hand-over"]
+        return [text.split(" -> ")[1].split(" (")[0] for text in texts]
 
     @property
     def texts(self) -> list[str]:
@@ -105,8 +105,8 @@ class Flight:
 
     def sent(self, kind: str) -> list[tuple[int, Any]]:
         """(time, message) of what went to the vehicle."""
-        found = [d for d in self.memory.of(Datagram) if d.outgoing and d.link == "vehicle"]
-        return [(d.at_ns, m) for d in found for m in decode(d.data) if m.get_type() == kind]
+        results = [d for d in self.memory.of(Datagram) if d.outgoing and d.link == "vehicle"]
+        return [(d.at_ns, m) for d in results for m in decode(d.data) if m.get_type() == kind]
 
     def commands(self) -> list[int]:
         """Numbers of the commands that were sent, but for streams."""

@@ -67,8 +67,8 @@ class Tuned:
 
     def flies_after(self, at_ns: int) -> list[str]:
         """What we sent after a time that makes a vehicle move, or asks it for anything."""
-        found = [message for sent_ns, data in self.rig.sent if sent_ns > at_ns for message in decode(data)]
-        asks = [message for message in found if getattr(message, "command", None) != REQUEST_STREAM]
+        results = [message for sent_ns, data in self.rig.sent if sent_ns > at_ns for message in decode(data)]
+        asks = [message for message in results if getattr(message, "command", None) != REQUEST_STREAM]
         return [name for message in asks if (name := message.get_type()) in FLIES]
 
 
@@ -85,7 +85,7 @@ def fly_real(rig: Endings, folder: Path, *more: str, enter: str | type[BaseExcep
             return enter
         raise enter
 
-    sets = [word for setting in (*ON_THE_FLOOR, "sim.plant=quadrotor") for word in ("--set", setting)]
+    sets = [argument for setting in (*ON_THE_FLOOR, "sim.plant=quadrotor") for argument in ("--set", setting)]
     arguments = ["tune", "room", BOX, "--folder", str(folder), "--vehicle", VEHICLE, *sets, *TAKE_OFF, "--json", *more]
     out, err = io.StringIO(), io.StringIO()
     try:

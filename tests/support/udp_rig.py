@@ -43,12 +43,12 @@ def fly_over_udp(out: Path, enough: Callable[[list[Truth]], bool], *options: str
         try:
             until(seen, "it flies")
             process.send_signal(signal.SIGINT)
-            told, _ = process.communicate(timeout=LIMIT_S)
+            output, _ = process.communicate(timeout=LIMIT_S)
         finally:
             process.kill()
     assert process.returncode == 0
-    found: dict[str, Any] = json.loads(told)
-    return found
+    document: dict[str, Any] = json.loads(output)
+    return document
 
 
 def assert_in_order(recording: Path, dt_ns: int) -> None:
@@ -56,8 +56,8 @@ def assert_in_order(recording: Path, dt_ns: int) -> None:
     decisions, truths = list(records(recording, Decision)), list(records(recording, Truth))
     assert sum(1 + decision.missed_ticks for decision in decisions) == decisions[-1].tick + 1
     assert {after.at_ns - before.at_ns for before, after in pairwise(truths)} == {dt_ns}
-    told = np.array([(0.0, 0.0, 0.0), *(setpoint.accel_mps2 for setpoint in records(recording, Setpoint))])
+    setpoints = np.array([(0.0, 0.0, 0.0), *(setpoint.accel_mps2 for setpoint in records(recording, Setpoint))])
     flown = np.unique([truth.input for truth in truths], axis=0)
     assert flown.any()
     for applied in flown:
-        assert np.abs(told - applied).max(axis=1).min() < 1e-6
+        assert np.abs(setpoints - applied).max(axis=1).min() < 1e-6

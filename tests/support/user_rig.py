@@ -34,8 +34,8 @@ def as_other(does: Callable[[], str]) -> str:
             os.write(writing, text.encode())
             os._exit(0)
     os.close(writing)
-    with os.fdopen(reading) as told:
-        text = told.read()
+    with os.fdopen(reading) as pipe:
+        text = pipe.read()
     os.waitpid(child, 0)
     return text
 

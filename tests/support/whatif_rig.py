@@ -37,12 +37,12 @@ def history(case: Case) -> RecordedFlight:
     return history_of(flown(case).entries, config_of(case), "recording")
 
 
-def again(case: Case, *changes: str, other: OtherLink | None = None) -> tuple[Memory, FlownCourse]:
+def again(case: Case, *changes: str, other_link: OtherLink | None = None) -> tuple[Memory, FlownCourse]:
     config, memory = config_of(case, *changes), Memory()
     design, controller = shared(config)
     memory.put("/uavctl/header", 0, header(config, design))
     response = response_of(history(case), config_of(case).plant)
-    course = fly(history(case), config, controller, response, memory, lambda: 0, other)
+    course = fly(history(case), config, controller, response, memory, lambda: 0, other_link)
     return memory, course
 
 

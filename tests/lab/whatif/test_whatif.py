@@ -56,7 +56,7 @@ def test_the_flight_that_might_have_been_is_the_one_that_is_then_flown(
 def test_another_link_loses_what_it_would_have_lost() -> None:
     changes = ("link.loss=0.1", "schedule.delays=5")
     other = Relinked(history(PAPER), config_of(PAPER, *changes).link, config_of(PAPER).sim.seed, 0.0)
-    memory, _ = again(PAPER, *changes, other=other)
+    memory, _ = again(PAPER, *changes, other_link=other)
     real = flown(PAPER, *changes)
     assert memory.of(Truth)[-1].lost == real.of(Truth)[-1].lost != flown(PAPER).of(Truth)[-1].lost
     assert memory.of(Truth)[-1].sent == real.of(Truth)[-1].sent
@@ -70,7 +70,7 @@ def test_another_link_between_the_boundaries_puts_lost_positions_back_to_a_milli
     quiet: Case = ("room-hahn-stursberg", 8.0, (*EXACT, "sim.camera.noise_std_m=0.0"))
     change = "link.loss=0.1"
     other = Relinked(history(quiet), config_of(quiet, change).link, config_of(quiet).sim.seed, 0.0)
-    memory, _ = again(quiet, change, other=other)
+    memory, _ = again(quiet, change, other_link=other)
     real = flown(quiet, change)
     assert memory.of(Truth)[-1].lost == real.of(Truth)[-1].lost < flown(quiet).of(Truth)[-1].lost
     assert far(memory, flown(quiet)) > 0.05
@@ -90,7 +90,7 @@ def test_positions_that_were_lost_are_put_back_in_their_places() -> None:
 
 def test_a_link_that_loses_all_ends_in_the_fallback() -> None:
     link = msgspec.structs.replace(config_of(ROOM).link, blackout=((1.0, 100.0),))
-    memory, course = again(ROOM, other=Relinked(history(ROOM), link, 1, 0.0))
+    memory, course = again(ROOM, other_link=Relinked(history(ROOM), link, 1, 0.0))
     assert {one.mode.value for one in memory.of(Decision)} >= {"track", "brake"}
     assert "landing" in course.ended or course.ended == "the recording ends"
     assert memory.of(Truth)[-1].lost > 0

@@ -204,7 +204,7 @@ def test_the_true_quadrotor_holds_as_it_then_really_does(case: Case, change: str
     if change.startswith("link."):
         before = config_of(case).sim
         other = Relinked(history(case), config_of(case, change).link, before.seed, before.camera.noise_std_m)
-    memory, course = again(case, change, other=other)
+    memory, course = again(case, change, other_link=other)
     real = flown(case, change)
     place = target or config_of(case).target.position_m
     assert not inertial_events(real) and not inertial_events(memory)
