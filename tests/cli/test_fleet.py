@@ -19,8 +19,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
-from operation_rig import PATIENT_DAEMON, PATIENT_VEHICLE, ended, port
-from patience import until
+from operation_rig import PATIENT_DAEMON, PATIENT_VEHICLE, reserve_port, wait_for_end
+from patience import wait_until
 from places import ROOT, without_pages
 
 from sim.server import VehicleSetup, serve_all
@@ -158,7 +158,7 @@ def flying() -> Iterator[tuple[Path, dict[str, list[Truth]], subprocess.Popen[st
     truths: dict[str, list[Truth]] = {"west": [], "east": []}
     done, seats, tables = threading.Event(), [], []
     for number, (name, limits) in enumerate({"west": WEST, "east": EAST}.items()):
-        with port() as first, port() as second:
+        with reserve_port() as first, reserve_port() as second:
             ports = int(first.getsockname()[1]), int(second.getsockname()[1])
         vehicle, mocap = (f"127.0.0.1:{number}" for number in ports)
         start = f"sim.start_position_m=[0,{sum(limits) / 2},-1]"
@@ -179,11 +179,13 @@ def flying() -> Iterator[tuple[Path, dict[str, list[Truth]], subprocess.Popen[st
             fleet = subprocess.Popen(
                 [*command, "--json"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=environ
             )
-            with ended(fleet):
+            with wait_for_end(fleet):
                 # Nobody would fly them while the daemons begin.
-                until(lambda: all(health["pid"] for health in status(path)), "both daemons listen", pause_s=0.5)
+                wait_until(lambda: all(health["pid"] for health in status(path)), "both daemons listen", pause_s=0.5)
                 peers.start()
-                until(lambda: all(health["mode"] == "track" for health in status(path)), "both are flown", pause_s=0.5)
+                wait_until(
+                    lambda: all(health["mode"] == "track" for health in status(path)), "both are flown", pause_s=0.5
+                )
                 yield path, truths, fleet
         finally:
             done.set()
@@ -218,8 +220,8 @@ def test_all_land_together_and_have_never_been_near_each_other(how: str) -> None
         else:
             fleet.kill()
         for name in lands:
-            until(lambda name=name: any(truth.mode == "AUTO.LAND" for truth in truths[name]), f"{name} lands")  # type: ignore[misc]
-        until(lambda: fleet.poll() is not None, "the end")
+            wait_until(lambda name=name: any(truth.mode == "AUTO.LAND" for truth in truths[name]), f"{name} lands")  # type: ignore[misc]
+        wait_until(lambda: fleet.poll() is not None, "the end")
     places = zip(truths["west"], truths["east"], strict=False)
     flown = [(west.position_m, east.position_m) for west, east in places if west.mode == east.mode == "OFFBOARD"]
     assert len(flown) > 5
@@ -237,7 +239,7 @@ def test_a_daemon_that_refuses_to_arm_ends_with_its_own_exit_code(
     (fleet_member,) = read_fleet(path).members
     flight = FleetFlight(fleet_member, ["--arm", "--takeoff", "1.2", "--out", str(tmp_path / "out")])
     flight.start()
-    until(lambda: not flight.is_running(), "the end of the daemon")
+    wait_until(lambda: not flight.is_running(), "the end of the daemon")
     flight.join_output()
     flight.request_end()
     assert flight.exit_code == 1

@@ -7,7 +7,7 @@ from functools import cache, partial
 
 import numpy as np
 import pytest
-from loopback_rig import Memory, flight, lockstep, make_loop
+from loopback_rig import MemorySink, flight, lockstep, make_loop
 
 from logs.recording.flight import FlightData
 from logs.recording.replay import replay
@@ -21,7 +21,7 @@ LONG = range(4)  # seeds of flights of 200 steps
 
 
 @cache
-def paper_flight(seed: int, steps: int) -> Memory:
+def paper_flight(seed: int, steps: int) -> MemorySink:
     return lockstep("paper", float(steps), f"sim.seed={seed}")
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from loopback_rig import Memory, lockstep, make_loop
+from loopback_rig import MemorySink, lockstep, make_loop
 
 from logs.recording.replay import replay
 from uavctl.build.controller import build_conditioned, build_design, compute_rest_limits
@@ -25,12 +25,12 @@ FENCE = 'fence=[{state="north",side="upper",times_s=[6,14],values=[3.0,1.2]}]'
 
 
 @pytest.fixture(scope="module")
-def flight() -> Memory:
+def flight() -> MemorySink:
     return lockstep("room", 30.0, "sim.seed=4")
 
 
 @pytest.mark.slow
-def test_a_flight_arrives_on_plans_of_the_scheme(flight: Memory) -> None:
+def test_a_flight_arrives_on_plans_of_the_scheme(flight: MemorySink) -> None:
     plans = flight.of(Plan)
     assert {plan.method for plan in plans} == {METHOD}
     assert {plan.status for plan in plans} == {SolveStatus.OPTIMAL}

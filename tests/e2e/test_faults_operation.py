@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from loopback_rig import Memory, shared_loop
+from loopback_rig import MemorySink, shared_loop
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import decode
 
@@ -20,7 +20,7 @@ class Flight:
 
     def __init__(self, *overrides: str) -> None:
         config = load_config("room-hahn-stursberg", ['solver.method="exact"', "link.loss=0.0", *overrides])
-        self.memory = Memory()
+        self.memory = MemorySink()
         self.loop = shared_loop(config, self.memory)
         self.truths: list[Truth] = []
         self.peers = Peers(config, 0, on_truth=self.truths.append)

@@ -7,7 +7,7 @@ from dataclasses import replace as changed
 import pytest
 from msgspec.structs import replace
 from soak_pairs import OUTSIDE_M, SPEED_MPS, WORLDS, TrueFlight, fly_pair, fly_true
-from soak_rig import prepared_for
+from soak_rig import prepare_room
 
 from uavctl.build.controller import Prepared, build_flight_design, prepare
 from uavctl.config import Config, load_config
@@ -23,7 +23,7 @@ BLACKOUT_AND_M = 0.3
 
 @pytest.fixture(scope="module")
 def prepared() -> Prepared:
-    return prepared_for()
+    return prepare_room()
 
 
 @pytest.fixture(params=WORLDS, ids=[f"{plant}-{autopilot}" for plant, autopilot in WORLDS])

@@ -8,11 +8,22 @@ from functools import cache, partial
 import msgspec
 import numpy as np
 import pytest
-from flight_rig import MS, TICKS, StubSolver, codes, inputs_of, make_controller, one_a_step, run, small_plant, vehicle
-from loopback_rig import Memory, flight, lockstep, make_loop
+from flight_rig import (
+    MS,
+    TICKS,
+    StubSolver,
+    list_codes,
+    make_controller,
+    make_inputs,
+    make_step_samples,
+    run,
+    small_plant,
+    vehicle,
+)
+from loopback_rig import MemorySink, flight, lockstep, make_loop
 from numpy.typing import NDArray
-from report_rig import unwritten
-from told_numbers import numbers_in
+from report_rig import omit_figures
+from told_numbers import find_numbers
 
 from logs.recording.replay import replay
 from logs.recording.summary import compute_box, compute_position_errors_m, list_summary_rows, summarise
@@ -56,11 +67,11 @@ def as_waypoints(seconds: float) -> tuple[str]:
 
 
 @cache
-def flown(seconds: float, *overrides: str) -> Memory:
+def flown(seconds: float, *overrides: str) -> MemorySink:
     return lockstep("room-hahn-stursberg", seconds, *overrides)
 
 
-def steps(memory: Memory) -> list[tuple[Decision, Truth]]:
+def steps(memory: MemorySink) -> list[tuple[Decision, Truth]]:
     """Decisions at boundaries with the truth of that moment."""
     truths = {truth.at_ns: truth for truth in memory.of(Truth)}
     return [
@@ -75,7 +86,7 @@ def distance_m(decision: Decision, truth: Truth) -> float:
     return float(np.linalg.norm(np.array(truth.state)[[0, 3, 6]] - np.array(decision.target)[[0, 3, 6]]))
 
 
-def beyond_limits(memory: Memory) -> tuple[Array, Array]:
+def beyond_limits(memory: MemorySink) -> tuple[Array, Array]:
     """How far each state was beyond each limit, and how far it may be as the plan flown to it told: mostly not at all.
 
     State limits share one price: a fence that shuts the vehicle out may make it faster than it should be, too. A limit
@@ -137,7 +148,7 @@ def test_a_trajectory_is_followed_far_closer_than_by_chasing_its_samples() -> No
     """Both after 5 s, in which the vehicle comes from the corner."""
     circling, chasing = flown(22.0, *as_trajectory(20.0)), flown(22.0, *as_waypoints(20.0))
 
-    def middle(memory: Memory) -> list[tuple[Decision, Truth]]:
+    def middle(memory: MemorySink) -> list[tuple[Decision, Truth]]:
         return [(d, t) for d, t in steps(memory) if 5e9 <= d.at_ns <= 20e9]
 
     wanted = {decision.at_ns: decision for decision, _ in middle(circling)}
@@ -181,7 +192,7 @@ def test_a_fence_that_shuts_the_vehicle_out_gives_way_is_told_and_left() -> None
 
 
 @pytest.mark.slow
-@unwritten()
+@omit_figures()
 def test_the_report_shows_the_target_of_the_moment_and_the_moving_limit() -> None:
     data = flight(flown(22.0, *WAYPOINTS))
     times_s, targets = data.targets
@@ -189,7 +200,7 @@ def test_the_report_shows_the_target_of_the_moment_and_the_moving_limit() -> Non
     assert {tuple(target[[0, 3, 6]].tolist()) for target in targets} == set(PLACES_M)
     html = render_report(data, summarise(data, wall_s=1.0))
     (sentence,) = [text for text in describe_flight(data, summarise(data, wall_s=1.0)) if "set out" in text]
-    assert numbers_in(sentence)[::2] == [2.0, 3.0]  # waypoints, each with its time
+    assert find_numbers(sentence)[::2] == [2.0, 3.0]  # waypoints, each with its time
     assert sentence.replace("&", "&amp;") in html
     assert compute_position_errors_m(data)[-1] < 0.3
     fenced = flight(flown(22.0, *FENCE))
@@ -208,7 +219,7 @@ def test_the_report_shows_the_target_of_the_moment_and_the_moving_limit() -> Non
     (sentence,) = [text for text in description if "follow a trajectory" in text]
     assert not any("from the target" in text or "waypoint" in text for text in description)
     # 40 chords of the circle, one a sample, of which each is cut into pieces of a step.
-    length_m, begun_s, ended_s = numbers_in(sentence)
+    length_m, begun_s, ended_s = find_numbers(sentence)
     error_m = compute_position_errors_m(moving)
     assert length_m == pytest.approx(2 * 2 * np.pi * 0.9, rel=0.01)
     assert ended_s - begun_s == pytest.approx(20.0, abs=0.5)
@@ -232,7 +243,7 @@ def test_a_step_beyond_a_fence_counts_as_outside_the_limits() -> None:
 
 
 def test_time_counts_from_the_first_decision_with_a_vehicle_that_takes_setpoints() -> None:
-    inputs = inputs_of(range(6 * TICKS), one_a_step(), status=lambda tick: vehicle(external=tick > 2 * TICKS))
+    inputs = make_inputs(range(6 * TICKS), make_step_samples(), status=lambda tick: vehicle(external=tick > 2 * TICKS))
     outputs = run(make_controller(), inputs)
     begun = 3 * TICKS
     assert {(output.decision.target, output.decision.waypoint) for output in outputs[:begun]} == {(None, None)}
@@ -244,7 +255,7 @@ def test_a_mission_goes_on_where_it_was_after_the_pilot_had_the_vehicle() -> Non
     controller = make_controller()
     leave_at_once = tuple(Waypoint(np.zeros(3), hold_ns=0) for _ in range(9))
     controller = replace(controller, mission=replace(controller.mission, waypoints=leave_at_once))
-    inputs = inputs_of(range(6 * TICKS), one_a_step(), status=lambda tick: vehicle(external=tick not in away))
+    inputs = make_inputs(range(6 * TICKS), make_step_samples(), status=lambda tick: vehicle(external=tick not in away))
     outputs = run(controller, inputs)
     assert {outputs[tick].decision.mode for tick in away} == {ControlMode.WAIT}
     assert [output.decision.waypoint for output in outputs[::TICKS]] == [1, 2, 2, 2, 3, 4]
@@ -253,8 +264,8 @@ def test_a_mission_goes_on_where_it_was_after_the_pilot_had_the_vehicle() -> Non
 def test_a_plan_that_gives_way_is_one_event_with_the_worst_and_the_number_of_others() -> None:
     given = tuple(GaveWay(constraint="equilibrium", stage=3, index=i, amount=0.1 * (i + 1)) for i in range(3))
     solver = StubSolver(small_plant(), faults={1: lambda answer: replace(answer, gave_way=given)})
-    outputs = run(make_controller(solver), inputs_of(range(3 * TICKS), one_a_step()))
-    relaxed_outputs = [(number, output) for number, output in enumerate(outputs) if "gave-way" in codes(output)]
+    outputs = run(make_controller(solver), make_inputs(range(3 * TICKS), make_step_samples()))
+    relaxed_outputs = [(number, output) for number, output in enumerate(outputs) if "gave-way" in list_codes(output)]
     assert [number for number, _ in relaxed_outputs] == [TICKS]
     (event,) = [event for event in relaxed_outputs[0][1].events if event.code == "gave-way"]
     assert event.text == "rest was missed by 0.3 of state 2 in stage 3; so did 2 others"
@@ -277,5 +288,5 @@ class ListeningSolver(StubSolver):
 def test_a_late_position_is_told_as_far_as_the_design_counts_with_it(late_steps: int, wanted: int) -> None:
     solver = ListeningSolver(small_plant())
     controller = replace(make_controller(solver), late_steps=late_steps)
-    run(controller, inputs_of(range(8 * TICKS), one_a_step(delay_ns=430 * MS)))
+    run(controller, make_inputs(range(8 * TICKS), make_step_samples(delay_ns=430 * MS)))
     assert {outlook.late for outlook in solver.told} == {wanted}

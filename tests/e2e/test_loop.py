@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from loopback_rig import Memory, make_loop, shared_loop
+from loopback_rig import MemorySink, make_loop, shared_loop
 from mavlink_rig import Peer
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import decode
@@ -40,7 +40,7 @@ class Rig:
 
     def __init__(self, *overrides: str) -> None:
         self.config = load_config("room-hahn-stursberg", overrides)
-        self.memory = Memory()
+        self.memory = MemorySink()
         self.loop = shared_loop(self.config, self.memory)
         self.peers = Peers(self.config, 0)
         self.tick = 0

@@ -12,7 +12,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from report_rig import unpaged, unwritten
+from report_rig import omit_figures, omit_pages
 from udp_rig import assert_in_order, fly_over_udp
 
 import uavctl
@@ -33,7 +33,7 @@ KEYS = {
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("flights") / "one"
-    with unpaged():
+    with omit_pages():
         small_chunks = ("--set", "log.chunk_bytes=16384")
         arguments = [
             "loopback",
@@ -104,7 +104,7 @@ def test_the_command_tells_what_the_page_says_first(
     flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     page = tmp_path / "page.html"
-    with unwritten():
+    with omit_figures():
         main = document(capsys, "log", "report", str(flown), "--out", str(page))["headline"]
         text = " ".join(unescape(re.sub(r"<[^>]+>", " ", page.read_text(encoding="utf-8"))).split())
         assert run(["log", "report", str(flown), "--out", str(page)]) == 0

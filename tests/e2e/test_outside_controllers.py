@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 from msgspec.structs import replace
-from soak_pairs import SPEED_MPS, WORLDS, beyond_m
-from soak_rig import Watch, fly
+from soak_pairs import SPEED_MPS, WORLDS, compute_outside_m
+from soak_rig import LoopWatch, fly
 
 from sim.simulation import World
 from uavctl.build.controller import Prepared, build_flight_design, prepare
@@ -55,9 +55,9 @@ def flown(prepared: Prepared, plant: str, autopilot: str, took_ns: int = 0, path
     config = in_world(prepared.config, plant, autopilot)
     observed = Seen()
 
-    def look(world: World, watch: Watch, at_ns: int) -> None:
+    def look(world: World, watch: LoopWatch, at_ns: int) -> None:
         observed.place_m = world.peers.vehicle.position_m
-        observed.outside_m = max(observed.outside_m, beyond_m(config, observed.place_m))
+        observed.outside_m = max(observed.outside_m, compute_outside_m(config, observed.place_m))
         observed.speed_mps = max(observed.speed_mps, math.hypot(*world.peers.vehicle.velocity_mps))
         assert watch.ticked is not None
         observed.modes.add(watch.ticked.decision.mode)

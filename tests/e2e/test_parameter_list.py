@@ -7,7 +7,7 @@ import random
 import pytest
 from loopback_rig import make_loop
 from sim_rig import decode
-from take_off_rig import Flight
+from take_off_rig import TakeOffRig
 
 from logs.recording.parameters import ParameterReader, count_parameters
 from logs.recording.replay import replay
@@ -21,7 +21,7 @@ SECOND = 1_000_000_000
 BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 
 
-def read(flight: Flight) -> ParameterReader:
+def read(flight: TakeOffRig) -> ParameterReader:
     reader = ParameterReader()
     for datagram in flight.memory.of(Datagram):
         reader.take(datagram)
@@ -38,7 +38,7 @@ def value(index: int, count: int) -> ParamValue:
 
 @BOTH
 def test_a_lossy_link_loses_none(autopilot: str) -> None:
-    flight, dice = Flight(autopilot), random.Random(4)
+    flight, dice = TakeOffRig(autopilot), random.Random(4)
     flight.hears = lambda data: not asks(data) or dice.random() > 0.3
     flight.told = lambda data: not asks(data) or dice.random() > 0.3
     flight.run(15.0)
@@ -53,7 +53,7 @@ def test_a_lossy_link_loses_none(autopilot: str) -> None:
 
 
 def test_a_vehicle_that_never_answers_is_asked_a_few_times() -> None:
-    flight = Flight("px4")
+    flight = TakeOffRig("px4")
     flight.hears = lambda data: not asks(data)
     flight.run(15.0)
     assert len(flight.sent("PARAM_REQUEST_LIST")) == MAX_TRIES and not flight.sent("PARAM_REQUEST_READ")
@@ -61,7 +61,7 @@ def test_a_vehicle_that_never_answers_is_asked_a_few_times() -> None:
 
 @BOTH
 def test_nothing_is_asked_once_it_is_armed(autopilot: str) -> None:
-    flight = Flight(autopilot)
+    flight = TakeOffRig(autopilot)
     flight.told = lambda data: not asks(data)
     flight.take_off().run(10.0, until=HandoverState.CLIMBING)
     armed_ns = flight.now_ns
@@ -73,7 +73,7 @@ def test_nothing_is_asked_once_it_is_armed(autopilot: str) -> None:
 
 
 def test_it_can_be_left_out() -> None:
-    flight = Flight("px4", "daemon.parameters=false").run(3.0)
+    flight = TakeOffRig("px4", "daemon.parameters=false").run(3.0)
     assert not flight.sent("PARAM_REQUEST_LIST")
 
 

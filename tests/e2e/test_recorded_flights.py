@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from loopback_rig import Memory
+from loopback_rig import MemorySink
 from numpy.typing import NDArray
 from recorded_rig import (
     AT_REST,
@@ -19,19 +19,19 @@ from recorded_rig import (
     OF_OTHERS,
     OWN_ESTIMATE,
     RELAYED,
-    Listened,
-    checked,
-    config_of,
+    LoopRecord,
     events,
-    listened,
+    find_event_times_s,
+    listen,
+    load_flight_config,
+    make_page_data,
     packets,
-    page_of,
-    seen_s,
+    run_check,
     statuses,
     truth,
-    watched,
+    watch_records,
 )
-from report_rig import words_of
+from report_rig import read_page_text
 
 from uavctl.config import load_config
 from uavctl.lab.identify.fit import choose_dead_time
@@ -118,7 +118,7 @@ def test_the_client_s_exchange_foretells_the_vehicle_s_clock_until_the_next_answ
 
 
 def history(name: str) -> FlightHistory:
-    return from_tlog(packets(name), config_of(name))
+    return from_tlog(packets(name), load_flight_config(name))
 
 
 @pytest.mark.parametrize(("name", "most_ms"), [(GPS, 10.0), (OFFBOARD, 20.0)])
@@ -212,7 +212,7 @@ def test_the_loss_found_is_that_of_the_frames_that_are_missing(name: str, lost: 
 @pytest.mark.parametrize("name", RELAYED)
 def test_the_rig_s_blackouts_rate_and_delays_are_found(name: str) -> None:
     result, true = link(name), frames(name)
-    assert len(result.outages_s) == len(seen_s(name, BLACKOUT))
+    assert len(result.outages_s) == len(find_event_times_s(name, BLACKOUT))
     assert all(length_s == pytest.approx(4.0, abs=0.3) for length_s in result.outages_s)
     assert result.rate_hz == pytest.approx(CAMERA_HZ, rel=0.01)
     assert result.delay_s == pytest.approx(QUICKEST_S, abs=0.002)
@@ -224,9 +224,9 @@ def test_the_rig_s_blackouts_rate_and_delays_are_found(name: str) -> None:
 @pytest.mark.parametrize("name", RELAYED)
 def test_all_but_a_hundredth_of_the_positions_come_as_late_as_the_rig_was_told(name: str) -> None:
     """Of one flight only those before its wind: 3 s later, and for 43 s, 7 % of the frames came 50 to 95 ms late."""
-    until_s = seen_s(BLOWN, "ORDER set SIH_WIND")[0] if name == BLOWN else np.inf
+    until_s = find_event_times_s(BLOWN, "ORDER set SIH_WIND")[0] if name == BLOWN else np.inf
     until_ns = packets(name)[0].at_ns + until_s * 1e9
-    result = from_tlog([packet for packet in packets(name) if packet.at_ns < until_ns], config_of(name))
+    result = from_tlog([packet for packet in packets(name) if packet.at_ns < until_ns], load_flight_config(name))
     late_s = fit_link(result.seen, result.gaps).delay_quantiles_s[4]
     assert late_s == pytest.approx(SLOWEST_S - 0.01 * (SLOWEST_S - QUICKEST_S), abs=0.010)
 
@@ -332,7 +332,7 @@ GOOD, NOTE, BAD = "good", "note", "bad"
 
 
 @pytest.mark.parametrize(
-    ("name", "since_s", "seconds"),
+    ("name", "get_flight_time_s", "seconds"),
     [
         (AT_REST, 0.0, 3.4),
         (WAYPOINTS, 10.0, 10.0),
@@ -345,7 +345,7 @@ GOOD, NOTE, BAD = "good", "note", "bad"
 def test_a_good_set_up_passes_the_check_over_a_link_that_loses_in_bursts(
     name: str, since_s: float, seconds: float
 ) -> None:
-    items = checked(name, since_s, seconds)
+    items = run_check(name, since_s, seconds)
     assert [name for name, state in items.items() if state == BAD] == []
     assert items["own position"] == GOOD
     assert items["position loss"] == GOOD
@@ -374,7 +374,7 @@ def test_parameters_that_another_client_read_are_judged_as_that_flight_was_set_u
     name: str, seconds: float, noted: list[str], good: list[str]
 ) -> None:
     """At rest before the flight. TIMESYNC is noted of each: it was the other client's that was answered."""
-    items = checked(name, 0.0, seconds)
+    items = run_check(name, 0.0, seconds)
     # An ArduPilot's 3 s, as shipped, are more than a room holds; so is PX4's second at the preset's 4 m/s².
     timeout = "COM_OF_LOSS_T" if name == OFFBOARD else "GUID_TIMEOUT"
     assert [name for name, state in items.items() if state == BAD] == [timeout]
@@ -385,20 +385,20 @@ def test_parameters_that_another_client_read_are_judged_as_that_flight_was_set_u
     assert items["vehicle clock"] == NOTE
 
 
-@pytest.mark.parametrize(("name", "since_s"), [(GPS, 60.0), (OFFBOARD, 28.0)])
+@pytest.mark.parametrize(("name", "get_flight_time_s"), [(GPS, 60.0), (OFFBOARD, 28.0)])
 def test_a_vehicle_that_flies_above_the_room_is_found_out_of_it(name: str, since_s: float) -> None:
     """Both took off to 5 m."""
-    lower, _ = room_of(config_of(name))
+    lower, _ = room_of(load_flight_config(name))
     assert lower[2] > -5.0
-    items = checked(name, since_s, 10.0)
+    items = run_check(name, since_s, 10.0)
     assert [name for name, state in items.items() if state == BAD] == ["position in the room"]
     assert (items["armed"], items["landed"], items["position loss"]) == (NOTE, NOTE, GOOD)
 
 
-@pytest.mark.parametrize(("name", "since_s"), [(VICON, 84.0), (WIND, 44.0)])
+@pytest.mark.parametrize(("name", "get_flight_time_s"), [(VICON, 84.0), (WIND, 44.0)])
 def test_cameras_that_fall_silent_are_found_by_the_longest_gap(name: str, since_s: float) -> None:
     """VICON's for good, 86.4 s after the boot, WIND's for the 4 s that were ordered."""
-    items = checked(name, since_s, 8.0)
+    items = run_check(name, since_s, 8.0)
     assert items["longest gap"] == BAD
     assert items["position in the room"] == GOOD
 
@@ -407,12 +407,12 @@ def test_a_link_that_loses_half_of_the_positions_is_told_at_rest() -> None:
     """In the first 3 s of WIND its bursts took more than half of the frames."""
     stamps_s = frames(WIND).stamps_s
     assert np.count_nonzero((stamps_s > 0.0) & (stamps_s < 3.0)) < 0.5 * 3.0 * CAMERA_HZ
-    assert checked(WIND, 0.0, 3.0)["position loss"] == BAD
+    assert run_check(WIND, 0.0, 3.0)["position loss"] == BAD
 
 
 def test_a_px4_whose_position_is_not_valid_yet_is_not_called_bad() -> None:
     """RELEASED arms at 1.77 s and takes until 3.2 s to have one: then the origins are compared, before nothing is."""
-    before, after = checked(RELEASED, 0.0, 1.6), checked(RELEASED, 2.0, 1.6)
+    before, after = run_check(RELEASED, 0.0, 1.6), run_check(RELEASED, 2.0, 1.6)
     assert (before["own position"], after["own position"]) == ("undetermined", GOOD)
     assert (before["armed"], after["armed"]) == (GOOD, NOTE)
     assert BAD not in (*before.values(), *after.values())
@@ -420,62 +420,62 @@ def test_a_px4_whose_position_is_not_valid_yet_is_not_called_bad() -> None:
 
 def test_a_px4_at_rest_has_a_position_of_its_own() -> None:
     """It says CONST_POS_MODE of itself, which is no want of one."""
-    assert checked(AT_REST, 0.0, 3.4)["own position"] == GOOD
+    assert run_check(AT_REST, 0.0, 3.4)["own position"] == GOOD
 
 
 def test_a_turned_frame_is_found_in_the_recorded_flight() -> None:
-    items = checked(WAYPOINTS, 10.0, 10.0, "frame.yaw_deg=90.0")
+    items = run_check(WAYPOINTS, 10.0, 10.0, "frame.yaw_deg=90.0")
     assert items["axes"] == BAD
 
 
 # --- hand-over and page ------------------------------------------------------------------------------------------
 
 
-def told(memory: Memory) -> list[str]:
+def told(memory: MemorySink) -> list[str]:
     return [event.text for event in memory.of(Event) if event.code == "hand-over"]
 
 
-def codes(memory: Memory) -> list[str]:
+def codes(memory: MemorySink) -> list[str]:
     return [event.code for event in memory.of(Event)]
 
 
-def _lost(memory: Memory) -> None:
+def _lost(memory: MemorySink) -> None:
     decisions = memory.of(Decision)
     assert any(decision.mode is not ControlMode.TRACK for decision in decisions)
     assert "fallback-brake" in codes(memory)
 
 
-def _pilot(memory: Memory) -> None:
+def _pilot(memory: MemorySink) -> None:
     assert any("-> released (LOITER" in text for text in told(memory))
 
 
-def _rest(memory: Memory) -> None:
+def _rest(memory: MemorySink) -> None:
     assert "vehicle-reboot" not in codes(memory)
     assert any("REJECTED" in event.text for event in memory.of(Event))
 
 
-def _land(memory: Memory) -> None:
+def _land(memory: MemorySink) -> None:
     assert any("-> unclear (AUTO.LAND" in text for text in told(memory))
 
 
-def _failsafe(memory: Memory) -> None:
+def _failsafe(memory: MemorySink) -> None:
     texts = [event.text for event in memory.of(Event) if event.code == "vehicle-text"]
     assert any(text.startswith("EKF Failsafe") for text in texts)
 
 
-def _silent(memory: Memory) -> None:
+def _silent(memory: MemorySink) -> None:
     texts = [event.text for event in memory.of(Event) if event.code == "vehicle-text"]
     assert "Failsafe activated" in texts
 
 
-def _landed(memory: Memory) -> None:
+def _landed(memory: MemorySink) -> None:
     texts = [event.text for event in memory.of(Event) if event.code == "vehicle-text"]
     assert "Disarming motors" in texts
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "since_s", "seconds", "matters", "on_the_page"),
+    ("name", "get_flight_time_s", "seconds", "matters", "on_the_page"),
     [
         (WIND, 40.0, 12.0, _lost, "positions did not come back"),
         (PILOT, 10.0, 8.0, _pilot, "LOITER"),
@@ -488,25 +488,29 @@ def _landed(memory: Memory) -> None:
     ids=lambda value: value if isinstance(value, str) and "-" in value else "",
 )
 def test_the_page_of_each_says_what_matters(
-    name: str, since_s: float, seconds: float, matters: Callable[[Memory], Any], on_the_page: str
+    name: str, since_s: float, seconds: float, matters: Callable[[MemorySink], Any], on_the_page: str
 ) -> None:
-    memory = watched(name, since_s, seconds)
+    memory = watch_records(name, since_s, seconds)
     matters(memory)
-    page = words_of(page_of(memory))
+    page = read_page_text(make_page_data(memory))
     assert on_the_page in " ".join(page.text)
     assert page.plots
 
 
-def times_s(received: Listened, begin: str, code: str = "hand-over") -> list[float]:
+def times_s(received: LoopRecord, begin: str, code: str = "hand-over") -> list[float]:
     """When events of a code came whose texts begin so, since the first packet [s]."""
     result = received.memory.of(Event)
-    return [received.since_s(event.at_ns) for event in result if event.code == code and event.text.startswith(begin)]
+    return [
+        received.get_flight_time_s(event.at_ns)
+        for event in result
+        if event.code == code and event.text.startswith(begin)
+    ]
 
 
 def test_the_wind_beyond_the_authority_is_met_before_it_has_blown_the_vehicle_out_of_the_room() -> None:
     """The real flight stayed in mode `track`, without a word, until it was 24 m outside."""
-    received = listened(BLOWN, 50.0, 12.0)
-    ordered_s = seen_s(BLOWN, "ORDER set SIH_WIND")[0]
+    received = listen(BLOWN, 50.0, 12.0)
+    ordered_s = find_event_times_s(BLOWN, "ORDER set SIH_WIND")[0]
     (noticed_s,) = times_s(received, "", "envelope-response")
     assert noticed_s == pytest.approx(57.65, abs=0.01)
     assert noticed_s - ordered_s == pytest.approx(0.95, abs=0.1)
@@ -519,7 +523,7 @@ def test_the_wind_beyond_the_authority_is_met_before_it_has_blown_the_vehicle_ou
     assert received.loop.let_go == reason and reason in received.loop.ending.sentence
     assert received.loop.ending.exit_code == 1
     assert [notice.text for notice in received.notices if "engaged -> landing" in notice.text]
-    assert reason in " ".join(words_of(page_of(received.memory)).text)
+    assert reason in " ".join(read_page_text(make_page_data(received.memory)).text)
 
     rows = truth(BLOWN)
     where_m = np.array([np.interp(noticed_s, rows[:, 0], rows[:, 1 + axis]) for axis in range(2)])
@@ -531,7 +535,7 @@ def test_the_wind_beyond_the_authority_is_met_before_it_has_blown_the_vehicle_ou
 def test_before_the_wind_nothing_is_said_against_the_same_flight() -> None:
     """In 25 s of hovering, and from the blackout's end to the order of the wind."""
     for since_s, seconds in ((20.0, 25.0), (51.0, 5.6)):
-        received = listened(BLOWN, since_s, seconds)
+        received = listen(BLOWN, since_s, seconds)
         assert not received.loop.let_go and not received.notices
         assert not [code for code in codes(received.memory) if code.startswith(("envelope", "fallback"))]
 
@@ -541,15 +545,15 @@ def test_a_failsafe_in_the_climb_the_pilot_and_the_order_are_each_told_at_their_
     """Its client had let go for good in the climb, so OFFBOARD is waited for until the operator's order."""
     patient = ("hand_over.engage_s=60.0", "hand_over.tries=100")
     take_off, engage = Command(order=Order.TAKE_OFF, height_m=1.2), Command(order=Order.ENGAGE)
-    ordered_s = seen_s(RELEASED, "ORDER mark engage")[0]
-    received = listened(RELEASED, 0.0, 66.0, *patient, orders=[(1.45, take_off), (ordered_s, engage)])
-    pilot_s = seen_s(RELEASED, "MODE 3/0")
+    ordered_s = find_event_times_s(RELEASED, "ORDER mark engage")[0]
+    received = listen(RELEASED, 0.0, 66.0, *patient, orders=[(1.45, take_off), (ordered_s, engage)])
+    pilot_s = find_event_times_s(RELEASED, "MODE 3/0")
     passages = {
-        "climbing -> failsafe (AUTO.LAND": seen_s(RELEASED, "MODE 4/6"),
-        "failsafe -> climbing (AUTO.TAKEOFF": seen_s(RELEASED, "MODE 4/2")[1:],
+        "climbing -> failsafe (AUTO.LAND": find_event_times_s(RELEASED, "MODE 4/6"),
+        "failsafe -> climbing (AUTO.TAKEOFF": find_event_times_s(RELEASED, "MODE 4/2")[1:],
         "engaging -> released (POSCTL": pilot_s[:1],
         "released -> returning (POSCTL": [ordered_s],
-        "returning -> engaged": seen_s(RELEASED, "MODE 6/0"),
+        "returning -> engaged": find_event_times_s(RELEASED, "MODE 6/0"),
         "landing -> released (POSCTL": pilot_s[1:],
     }
     for begin, at_s in passages.items():
@@ -557,12 +561,12 @@ def test_a_failsafe_in_the_climb_the_pilot_and_the_order_are_each_told_at_their_
     # The vehicle took the order: it is to the pilot, at 62.4 s, that it refuses OFFBOARD, on his own connection.
     answers_s = times_s(received, "DO_SET_MODE: ACCEPTED", "command-ack")
     assert ordered_s < answers_s[-1] < ordered_s + 0.5
-    assert seen_s(RELEASED, "ACK 176 result 1")[0] > pilot_s[1]
+    assert find_event_times_s(RELEASED, "ACK 176 result 1")[0] > pilot_s[1]
     assert not any("REJECTED" in event.text or "DENIED" in event.text for event in received.memory.of(Event))
 
     noticed = " ".join(notice.text for notice in received.notices)
     assert all(begin in noticed for begin in passages if "failsafe" in begin or "released (" in begin)
-    on_the_page = " ".join(words_of(page_of(received.memory)).text)
+    on_the_page = " ".join(read_page_text(make_page_data(received.memory)).text)
     assert all(begin in on_the_page for begin in passages)
 
 

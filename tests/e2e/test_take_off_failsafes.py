@@ -9,8 +9,8 @@ import pytest
 from loopback_rig import make_loop
 from rich.console import Console
 from sim_rig import decode
-from soak_take_off import flown, outcome, troubled
-from take_off_rig import RELAYED, Flight
+from soak_take_off import is_troubled, judge_at_limit, judge_outcome
+from take_off_rig import RELAYED, TakeOffRig
 
 from logs.recording.replay import replay
 from uavctl.cli.live_line import print_notices
@@ -26,8 +26,8 @@ SEEDS = 10
 @BOTH
 @pytest.mark.parametrize("seed", range(SEEDS))
 def test_what_took_off_is_engaged_or_landed_and_who_did_not_is_told_why(autopilot: str, seed: int) -> None:
-    flight = troubled(autopilot, seed)
-    what = flown(flight)
+    flight = is_troubled(autopilot, seed)
+    what = judge_at_limit(flight)
     assert what != "hovers", (flight.state, flight.texts)
     assert what == "engaged" or flight.loop.failure, flight.texts
     assert not any("started anew" in text for text in flight.texts)
@@ -38,8 +38,8 @@ def test_what_took_off_is_engaged_or_landed_and_who_did_not_is_told_why(autopilo
 @pytest.mark.fault(61)
 def test_px4_whose_failsafe_ends_in_the_climb_arrives_and_a_replay_says_so_too() -> None:
     more = ["sim.checks.invalid=[[0.2, 1.4]]", "sim.checks.clears=true", "sim.checks.flicker_s=1.0"]
-    flight = Flight("px4", *RELAYED, *more).relayed()
-    assert flown(flight) == "engaged" and not flight.loop.failure
+    flight = TakeOffRig("px4", *RELAYED, *more).relayed()
+    assert judge_at_limit(flight) == "engaged" and not flight.loop.failure
     assert "failsafe" in flight.states and flight.ticked is not None
     assert flight.ticked.decision.mode is ControlMode.TRACK
     texts = [event.text for event in flight.notices if event.code == "hand-over"]
@@ -50,7 +50,9 @@ def test_px4_whose_failsafe_ends_in_the_climb_arrives_and_a_replay_says_so_too()
 
 @pytest.mark.fault(61)
 def test_a_person_is_told_on_the_console_what_the_hand_over_has_to_tell() -> None:
-    flight = Flight("px4", *RELAYED, "sim.checks.invalid=[[0.2, 1.4]]", "sim.checks.clears=true").relayed().take_off()
+    flight = (
+        TakeOffRig("px4", *RELAYED, "sim.checks.invalid=[[0.2, 1.4]]", "sim.checks.clears=true").relayed().take_off()
+    )
     flight.run(30.0, until=HandoverState.FAILSAFE)
     flight.run(6.0)  # its rotors have spun up
     flight.stick("POSCTL")
@@ -75,14 +77,14 @@ def test_the_operator_s_end_lands_what_is_in_the_air_with_positions_until_the_gr
     autopilot: str, after_s: float
 ) -> None:
     more = ["sim.checks.invalid=[[0.4, 2.0]]"] + (["sim.checks.clears=true"] if autopilot == "px4" else [])
-    flight = Flight(autopilot, *RELAYED, *more).relayed().take_off()
+    flight = TakeOffRig(autopilot, *RELAYED, *more).relayed().take_off()
     flight.run(30.0, until=HandoverState.CLIMBING)
     flight.run(after_s)
     for _ in range(70):
         if flight.loop.finished:
             break
         flight.run(1.0, stop=True)
-    assert flight.loop.finished and outcome(flight) == "landed"
+    assert flight.loop.finished and judge_outcome(flight) == "landed"
     last_ns = max(at_ns for at_ns, _ in flight.sent("VISION_POSITION_ESTIMATE"))
     assert flight.now_ns - last_ns < 2_000_000_000
 
@@ -90,7 +92,7 @@ def test_the_operator_s_end_lands_what_is_in_the_air_with_positions_until_the_gr
 @pytest.mark.slow
 @pytest.mark.fault(25, 63)
 def test_the_pilot_s_stick_in_the_climb_is_told_and_keeps_positions_until_the_ground() -> None:
-    flight = Flight("px4", *RELAYED).relayed().take_off()
+    flight = TakeOffRig("px4", *RELAYED).relayed().take_off()
     flight.run(30.0, until=HandoverState.CLIMBING)
     flight.run(6.0)  # its rotors have spun up
     flight.stick("POSCTL")
@@ -107,7 +109,7 @@ def test_the_pilot_s_stick_in_the_climb_is_told_and_keeps_positions_until_the_gr
 @pytest.mark.fault(62)
 @BOTH
 def test_orders_of_where_to_fly_are_refused_while_it_is_not_we_who_fly(autopilot: str) -> None:
-    flight = Flight(autopilot)
+    flight = TakeOffRig(autopilot)
     moves = (Order.GOTO, Order.HOLD, Order.RESUME)
     assert all(flight.loop.explain_refusal(order) for order in moves)
     flight.run(1.0).take_off()
@@ -130,7 +132,7 @@ SET_MODE = 176
 )
 def test_a_request_that_was_not_answered_is_not_repeated_after_the_pilot_s_switch(after: int) -> None:
     """Heartbeats show a mode up to a second late: a repetition meanwhile would take it from the pilot."""
-    flight = Flight("px4").take_off().run(10.0, until=HandoverState.CLIMBING)
+    flight = TakeOffRig("px4").take_off().run(10.0, until=HandoverState.CLIMBING)
     lost: list[bytes] = []
 
     def hears(data: bytes) -> bool:
@@ -153,7 +155,7 @@ def test_a_request_that_was_not_answered_is_not_repeated_after_the_pilot_s_switc
 @pytest.mark.fault(61)
 @pytest.mark.parametrize(("deaf_s", "lands"), [(8.8, False), (1000.0, True)])
 def test_px4_that_hovers_in_its_take_off_mode_is_engaged_from_there_or_landed(deaf_s: float, lands: bool) -> None:
-    flight = Flight("px4", *RELAYED, "sim.streams=onboard").relayed()
+    flight = TakeOffRig("px4", *RELAYED, "sim.streams=onboard").relayed()
     flight.peers.autopilot.parameters.set("MIS_TAKEOFF_ALT", 1.2)
     flight.take_off().run(30.0, until=HandoverState.CLIMBING)
     deaf_until_ns = flight.now_ns + round(deaf_s * 1e9)
@@ -168,7 +170,7 @@ def test_px4_that_hovers_in_its_take_off_mode_is_engaged_from_there_or_landed(de
     assert flight.peers.vehicle.position_m[2] == pytest.approx(-1.2, abs=0.15)
     if lands:
         flight.run(50.0, until=HandoverState.DONE)
-        assert outcome(flight) == "landed" and "landing" in flight.states and flight.loop.failure
+        assert judge_outcome(flight) == "landed" and "landing" in flight.states and flight.loop.failure
     else:
         flight.run(20.0, until=HandoverState.ENGAGED).run(3.0)
-        assert outcome(flight) == "engaged" and not flight.loop.failure
+        assert judge_outcome(flight) == "engaged" and not flight.loop.failure

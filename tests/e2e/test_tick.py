@@ -12,7 +12,7 @@ from types import FrameType
 from typing import TypeVar
 
 import pytest
-from loopback_rig import Memory, make_loop
+from loopback_rig import MemorySink, make_loop
 from places import ROOT
 
 from sim.simulation import World
@@ -31,7 +31,7 @@ class Watched:
     """A loop whose calls are watched; implements `uavctl.records.Flyer`."""
 
     loop: ControlLoop
-    memory: Memory
+    memory: MemorySink
     positions: list[frozenset[str]] = field(default_factory=list)
     planning: list[frozenset[str]] = field(default_factory=list)
     at_s: float = 0.0
@@ -75,7 +75,7 @@ def crossed(call: Callable[[], T]) -> tuple[T, frozenset[str]]:
 @pytest.fixture(scope="module")
 def watched() -> Watched:
     config = load_config("room-px4")
-    memory = Memory()
+    memory = MemorySink()
     flyer = Watched(make_loop(config, memory), memory)
     World(config, flyer).run(5.0)
     return flyer

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from flight_rig import room_of, small_plant
+from flight_rig import make_room, small_plant
 from numpy.typing import NDArray
 
 from uavctl.build.controller import build_controller, build_design
@@ -106,7 +106,7 @@ def test_the_target_is_the_waypoint_and_what_is_wanted() -> None:
 def test_the_longer_horizontal_way_follows_unless_the_vehicle_may_not_rest_there(
     begins: Vec3, ends: Vec3, first: Vec3 | None
 ) -> None:
-    room = room_of(small_plant(("north", "east", "down")))
+    room = make_room(small_plant(("north", "east", "down")))
     found = room.first(room.at(begins), room.at(ends))
     if first is None:
         assert found is None
@@ -116,12 +116,12 @@ def test_the_longer_horizontal_way_follows_unless_the_vehicle_may_not_rest_there
 
 def test_no_axis_leads_where_there_is_one_or_where_one_goes_up() -> None:
     for axes in (("north",), ("north", "down")):
-        room = room_of(small_plant(axes))
+        room = make_room(small_plant(axes))
         assert room.first(room.at((0.0, 0.0, 0.0)), room.at((3.0, 3.0, 3.0))) is None
 
 
 def test_one_axis_leads_for_a_time_where_the_first_motion_begins_and_never_again() -> None:
-    room = room_of(small_plant(("north", "east")))
+    room = make_room(small_plant(("north", "east")))
     begin, end, back = (room.at(place) for place in ((0.0, 0.0, 0.0), (3.0, 2.0, 0.0), (-3.0, -2.0, 0.0)))
     mission = replace(on_a_line(0.0), room=room, lead_ns=2 * DT_NS)
     at_rest = lead_with_one_axis(mission, stay_at(MissionState(start_ns=0), begin, 0), begin, 0)

@@ -39,7 +39,7 @@ FLOWN = (ControlMode.TRACK, ControlMode.BRAKE, ControlMode.HOLD)
 
 
 @dataclass
-class Count:
+class ChaosCounts:
     """What came of a run.
 
     Attributes:
@@ -124,7 +124,7 @@ class World:
         return arrived_samples
 
 
-def runs(rng: np.random.Generator, ticks: int, orders: bool) -> Iterator[tuple[StepInput, TickOutput, bool]]:
+def run_ticks(rng: np.random.Generator, ticks: int, orders: bool) -> Iterator[tuple[StepInput, TickOutput, bool]]:
     """Inputs and outputs of that many ticks, and whether a flight begins; a new one follows each hand-over."""
     done = 0
     while done < ticks:
@@ -156,10 +156,10 @@ def runs(rng: np.random.Generator, ticks: int, orders: bool) -> Iterator[tuple[S
             begins, done = False, done + 1
 
 
-def soak_core(ticks: int, seed: int, *, orders: bool = True) -> Count:
+def soak_core(ticks: int, seed: int, *, orders: bool = True) -> ChaosCounts:
     """Fly for that many ticks and count what must not happen."""
-    count, before, mode, age = Count(), (0.0, 0.0, 0.0), ControlMode.WAIT, 0
-    for _, output, begins in runs(np.random.default_rng(seed), ticks, orders):
+    count, before, mode, age = ChaosCounts(), (0.0, 0.0, 0.0), ControlMode.WAIT, 0
+    for _, output, begins in run_ticks(np.random.default_rng(seed), ticks, orders):
         if begins:
             count.flights, before, mode, age = count.flights + 1, (0.0, 0.0, 0.0), ControlMode.WAIT, 0
         decision, setpoint = output.decision, output.setpoint

@@ -174,22 +174,24 @@ def toml_document(table: dict[str, Any], path: str = "") -> Iterator[str]:
             yield from toml_document(entry, f"{path}{key}.")
 
 
-def leaves(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+def find_leaf_paths(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
     """Path of everything in a document, tables and lists too."""
     if path:
         yield path
     if isinstance(value, dict | list):
         inner: Any = value.items() if isinstance(value, dict) else enumerate(value)
         for key, value in inner:
-            yield from leaves(value, (*path, key))
+            yield from find_leaf_paths(value, (*path, key))
 
 
-def ranges(section: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], tuple[float, float, bool]]]:
+def find_ranges(
+    section: Any, path: tuple[str, ...] = ()
+) -> Iterator[tuple[tuple[str, ...], tuple[float, float, bool]]]:
     """Least and largest number that a key takes, and whether it is a whole one, by the key's path; of lists too."""
     for section_field in msgspec.structs.fields(section):
         key_path = (*path, section_field.encode_name)
         if isinstance(section_field.type, type) and issubclass(section_field.type, msgspec.Struct):
-            yield from ranges(section_field.type, key_path)
+            yield from find_ranges(section_field.type, key_path)
         else:
             result = next(_numbers(section_field.type), None)
             if result is not None:
@@ -209,7 +211,7 @@ def _numbers(annotation: Any, metas: tuple[Any, ...] = ()) -> Iterator[tuple[flo
             yield from _numbers(argument)
 
 
-def within(rng: random.Random, low: float, high: float, whole: bool) -> float:
+def draw_within(rng: random.Random, low: float, high: float, whole: bool) -> float:
     """A number that a key takes: an end of its range, or anything between, small ones as often as large ones."""
     min_value = max(low, 1e-9) if low >= 0 else min(1e-9, high)
     value = rng.choice((low, high, math.exp(rng.uniform(math.log(min_value), math.log(max(high, 2 * min_value))))))
@@ -218,7 +220,7 @@ def within(rng: random.Random, low: float, high: float, whole: bool) -> float:
     return round(value) if whole else value
 
 
-def nested(depth: int, brackets: str) -> str:
+def nest_value(depth: int, brackets: str) -> str:
     """A value in many brackets."""
     return "[" * depth + "]" * depth if brackets == "[" else "{a=" * depth + "1" + "}" * depth
 
@@ -226,16 +228,16 @@ def nested(depth: int, brackets: str) -> str:
 class Mutants:
     """Cases by number."""
 
-    def __init__(self, seed: int, bases: dict[str, dict[str, Any]]) -> None:
+    def __init__(self, seed: int, load_bases: dict[str, dict[str, Any]]) -> None:
         """Make cases of a seed.
 
         Args:
             seed: The seed.
-            bases: Name -> valid configuration as a table, with every key in it.
+            load_bases: Name -> valid configuration as a table, with every key in it.
         """
         self._seed = seed
-        self._bases = bases
-        self._ranges = dict(ranges(Config))
+        self._bases = load_bases
+        self._ranges = dict(find_ranges(Config))
 
     def config(self, number: int) -> Case:
         """A spoilt configuration, or a spoilt file beside one, under some command."""
@@ -305,7 +307,7 @@ class Mutants:
         return self._spoil_text(rng, "\n".join(toml_document(table)) + "\n", case)
 
     def _spoil_value(self, rng: random.Random, table: dict[str, Any], case: Case) -> None:
-        paths = [path for path in leaves(table) if len(path) > 1 or rng.random() < 0.2]
+        paths = [path for path in find_leaf_paths(table) if len(path) > 1 or rng.random() < 0.2]
         if rng.random() < 0.7:  # sections of many keys leave others that matter as much
             section = rng.choice(sorted({str(path[0]) for path in paths}))
             paths = [path for path in paths if path[0] == section]
@@ -317,7 +319,7 @@ class Mutants:
         how, new = self._other(rng, value)
         known = self._ranges.get(tuple(key for key in path if isinstance(key, str)))
         if known is not None and isinstance(value, int | float) and rng.random() < 0.7:
-            new = within(rng, *known)
+            new = draw_within(rng, *known)
             how = f"within {new:g}"
         case.note.append(f"{'.'.join(map(str, path))}: {how}")
         if how == "deleted" and isinstance(holder, dict):
@@ -382,7 +384,7 @@ class Mutants:
                 rng.choice(("\x00", "=", "[", "]]", "x", '"""', "a.b.c = 1", "ü = 1", "[a]\n[a]", "x = 1e", "\ufeff")),
             )
         elif how == "nest":
-            lines.insert(at, f"deep = {nested(rng.choice((20, 200, 5000, 100_000)), rng.choice('[{'))}")
+            lines.insert(at, f"deep = {nest_value(rng.choice((20, 200, 5000, 100_000)), rng.choice('[{'))}")
         elif how == "huge":
             lines.insert(at, f'huge = "{"a" * rng.choice((100_000, 10_000_000))}"')
         elif how == "keys":
@@ -402,7 +404,7 @@ class Mutants:
     def _override(self, rng: random.Random, table: dict[str, Any], case: Case) -> str:
         """A spoilt `key.path=value`."""
         other_table = copy.deepcopy(table)
-        path = rng.choice([path for path in leaves(table) if all(isinstance(key, str) for key in path)])
+        path = rng.choice([path for path in find_leaf_paths(table) if all(isinstance(key, str) for key in path)])
         holder: Any = other_table
         for key in path[:-1]:
             holder = holder[key]
@@ -413,7 +415,7 @@ class Mutants:
         quote = rng.choice(('"', '"""', "'", "[1,", "{a=", "#", "1 # 2", "1\n2=3"))
         text = {
             "value": f"{name}={value}",
-            "nest": f"{name}={nested(rng.choice((100, 5000, 30_000)), rng.choice('[{'))}",
+            "nest": f"{name}={nest_value(rng.choice((100, 5000, 30_000)), rng.choice('[{'))}",
             "no value": rng.choice((name, f"{name}=", "=", "=1", "")),
             "deep key": f"{'a.' * rng.choice((5, 2000, 30_000))}b=1",
             "odd key": f"{name}{tail}={value}",
@@ -597,7 +599,7 @@ def _scaled(value: Any, factor: float) -> Any:
     return value * factor if isinstance(value, int | float) and not isinstance(value, bool) else value
 
 
-def bases() -> dict[str, dict[str, Any]]:
+def load_bases() -> dict[str, dict[str, Any]]:
     """Both presets with every key, and the first one with a mission, a fence and a fault."""
     result = {name: tomllib.loads(dump_config(load_config(name))) for name in ("paper", "room-hahn-stursberg")}
     for table in result.values():

@@ -24,7 +24,7 @@ TICK_S = 0.05
 SWEPT = 1_000_000  # floats that are touched between ticks, so that caches hold as little as after a decision
 
 
-class Nothing:
+class NullSink:
     """Takes records and does nothing: what calling and measuring cost by themselves."""
 
     def put(self, topic: str, at_ns: int, record: Record) -> None:
@@ -41,14 +41,14 @@ def flown_ticks() -> list[list[Item]]:
     return ticks
 
 
-def cost(folder: Path, ticks: list[list[Item]], seconds: float) -> dict[str, float]:
+def measure_cost(folder: Path, ticks: list[list[Item]], seconds: float) -> dict[str, float]:
     """Put so many seconds of ticks, every other one into a sink that does nothing.
 
     Returns:
         Wall times [us] of a record and of a tick's records, median and 99th percentile; with `empty_`, those of the
         sink that does nothing. The clock's own time is in all of them. `dropped`, `records` and `ticks` were recorded.
     """
-    recorder, nothing = Recorder(folder / "flight.mcap", onlookers=DerivedTopics(ViewBuilder())), Nothing()
+    recorder, nothing = Recorder(folder / "flight.mcap", onlookers=DerivedTopics(ViewBuilder())), NullSink()
     with _as_in_flight():
         result = _measured({"": recorder, "empty_": nothing}, ticks, round(seconds / TICK_S))
     status = recorder.close()

@@ -60,7 +60,7 @@ class Cuts:
         self._sizes = [file.stat().st_size for file in self.files]
         self.straddled = 0
 
-    def places(self) -> list[tuple[int, int]]:
+    def cut_points(self) -> list[tuple[int, int]]:
         """File and size of every cut beside the end of a chunk, of its index, and around what is not a chunk."""
         offsets = {(chunk.file, offset) for chunk in self.chunks for offset in (chunk.end, chunk.indexed)}
         near = {(file, offset + by) for file, offset in offsets for by in (-1, 0, 1)}
@@ -70,13 +70,13 @@ class Cuts:
             near |= {(file, at) for at in others}
         return sorted(near)
 
-    def drawn(self, count: int, seed: int) -> list[tuple[int, int]]:
+    def draw_cuts(self, count: int, seed: int) -> list[tuple[int, int]]:
         """File and size of so many cuts, each byte of the recording as likely as any other."""
         dice = random.Random(seed)
         files = dice.choices(range(len(self.files)), self._sizes, k=count)
         return [(file, dice.randrange(self._sizes[file])) for file in files]
 
-    def wrong(self, folder: Path, file: int, size: int) -> str:
+    def find_problem(self, folder: Path, file: int, size: int) -> str:
         """What is wrong with the recording whose file of this number is cut to `size` bytes; nothing if all is well."""
         for whole in self.files[:file]:
             shutil.copy(whole, folder)
@@ -84,14 +84,14 @@ class Cuts:
         whole_chunks = [chunk for chunk in self.chunks if (chunk.file, chunk.end) <= (file, size)]
         at_the_end = file == len(self.files) - 1 and size == self._sizes[file]
         if not whole_chunks:
-            return refused(folder)
+            return check_refusal(folder)
         last = whole_chunks[-1]
         self.straddled += last.ticks > last.decisions
-        text, decisions = alike(folder, ended=at_the_end or last == self.chunks[-1])
+        text, decisions = check_cut(folder, ended=at_the_end or last == self.chunks[-1])
         return text or ("" if decisions == last.decisions else f"{decisions} of {last.decisions} decisions compared")
 
 
-def alike(folder: Path, *, ended: bool) -> tuple[str, int]:
+def check_cut(folder: Path, *, ended: bool) -> tuple[str, int]:
     """What is wrong with how a cut recording is recovered and replayed, and how many decisions are compared.
 
     Args:
@@ -115,7 +115,7 @@ def alike(folder: Path, *, ended: bool) -> tuple[str, int]:
     return "" if len(result) == 1 else f"recovered it is another recording: {result}", min(result)[0]
 
 
-def refused(folder: Path) -> str:
+def check_refusal(folder: Path) -> str:
     """What is wrong with how a recording is refused that holds nothing, not even its header."""
     for arguments in (("replay",), ("recover", str(folder / "recovered.mcap"))):
         code, output, errors = _run("log", arguments[0], str(folder / NAME), *arguments[1:])

@@ -105,15 +105,15 @@ def _believed_link(rng: np.random.Generator) -> dict[str, object]:
 
 
 @lru_cache(maxsize=2)
-def prepared_of(config: Config) -> Prepared:
+def prepare_config(config: Config) -> Prepared:
     """What flies with a drawn configuration."""
     return prepare(config, build_flight_design(config))
 
 
-def fits(config: Config) -> bool:
+def is_mission_feasible(config: Config) -> bool:
     """Whether the mission can be flown with this design: there is rest at its places."""
     try:
-        prepared_of(config)
+        prepare_config(config)
     except DesignError:
         return False
     return True

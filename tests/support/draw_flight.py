@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from draw_controller import draw_controller, fits
+from draw_controller import draw_controller, is_mission_feasible
 from msgspec.structs import replace
 
 from sim.autopilot.profile import SIMULATED
@@ -18,7 +18,7 @@ SPANS = ("blackout", "held", "uplink_blackout", "occluded", "swapped", "frozen")
 
 
 @dataclass(frozen=True)
-class Drawn:
+class FlightDraw:
     """What a seed draws.
 
     Attributes:
@@ -29,7 +29,7 @@ class Drawn:
         orders: Of the operator, each with the tick before which it comes.
         stop_tick: From when on the operator asks for the hand-over; None never.
         skipped: Ticks that the loop oversleeps.
-        late: Ticks that run when what arrives up to the next one is there.
+        late_ticks: Ticks that run when what arrives up to the next one is there.
         noise: Share of the ticks before which a stranger's datagram comes.
         reboot_step: Step Δt at which the vehicle starts anew; None never.
         signed: Whether there are doors on both connections.
@@ -43,14 +43,14 @@ class Drawn:
     orders: tuple[tuple[int, Command], ...]
     stop_tick: int | None
     skipped: frozenset[int]
-    late: frozenset[int]
+    late_ticks: frozenset[int]
     noise: float
     reboot_step: int | None
     signed: bool
     viewers: bool
 
     @property
-    def words(self) -> tuple[str, ...]:
+    def labels(self) -> tuple[str, ...]:
         """What it has, for a count of what many seeds have covered."""
         config = self.config
         is_present = {
@@ -75,7 +75,7 @@ class Drawn:
             "orders": bool(self.orders),
             "stop": self.stop_tick is not None,
             "missed ticks": bool(self.skipped),
-            "late ticks": bool(self.late),
+            "late ticks": bool(self.late_ticks),
             "strangers": self.noise > 0.0,
             "reboot": self.reboot_step is not None,
             "signed": self.signed,
@@ -85,7 +85,7 @@ class Drawn:
         return tuple(label for label, is_so in is_present.items() if is_so)
 
 
-def drawn(seed: int) -> Drawn:
+def draw_flight(seed: int) -> FlightDraw:
     """The flight of a seed."""
     rng = np.random.default_rng(seed)
     config = draw_controller(rng, seed)
@@ -99,7 +99,7 @@ def drawn(seed: int) -> Drawn:
         low = replace(config.sim, start_position_m=(*config.sim.start_position_m[:2], -0.05))
         config = replace(config, sim=low)
     skipped, late_ticks = _ticks(rng, ticks, 0.4), _ticks(rng, ticks, 0.4)
-    return Drawn(
+    return FlightDraw(
         config=config,
         link=_true_link(rng, config, calm),
         start_ns=int(rng.integers(0, 10**6)) * round(config.plant.dt_s * 1e9),
@@ -240,7 +240,7 @@ def _mission(rng: np.random.Generator, config: Config) -> Config:
     overrides = ["fence=[{state='north', side='upper', times_s=[2.0, 6.0], values=[3.0, 2.2]}]"] if fenced else []
     fence = load_config("room-hahn-stursberg", overrides).fence
     moved = replace(config, mission=mission, fence=fence)
-    return moved if fits(moved) else config
+    return moved if is_mission_feasible(moved) else config
 
 
 def _place(rng: np.random.Generator, config: Config) -> Vec3:

@@ -74,7 +74,7 @@ def estimator_parameters(**changes: Any) -> EstimatorParameters:
     return replace(base, **changes)
 
 
-def answer_of(plant: Plant, seq: int, x: Array, inputs: Array, status: SolveStatus = SolveStatus.OPTIMAL) -> Answer:
+def make_answer(plant: Plant, seq: int, x: Array, inputs: Array, status: SolveStatus = SolveStatus.OPTIMAL) -> Answer:
     states = [x]
     for u in inputs:
         states.append(plant.a @ states[-1] + plant.b @ u)
@@ -108,7 +108,7 @@ class StubSolver:
 
     def solve(self, seq: int, x: Array, target: Array, outlook: Preview = NOMINAL) -> Answer:
         self.asked.append((seq, x))
-        answer = answer_of(self.plant, seq, x, stub_inputs(seq, self.horizon, self.plant.n_u))
+        answer = make_answer(self.plant, seq, x, stub_inputs(seq, self.horizon, self.plant.n_u))
         fault = self.faults.get(seq)
         return answer if fault is None else fault(answer)
 
@@ -137,7 +137,7 @@ def make_controller(
         horizon=horizon,
         solver=solver or StubSolver(plant, horizon),
         mission=make_hold_mission(
-            np.zeros(plant.n_x), plant.position_index, np.zeros(0), horizon=horizon, dt_ns=DT_NS, room=room_of(plant)
+            np.zeros(plant.n_x), plant.position_index, np.zeros(0), horizon=horizon, dt_ns=DT_NS, room=make_room(plant)
         ),
         names=names_of((), plant.n_x, plant.axes, plant.position_index, plant.velocity_index),
         estimator=estimator_parameters(**changes),
@@ -150,7 +150,7 @@ def make_controller(
     )
 
 
-def room_of(plant: Plant, half_m: float = 5.0) -> Room:
+def make_room(plant: Plant, half_m: float = 5.0) -> Room:
     """Places up to `half_m` from the middle; from a speed v it comes to rest v / 2 further."""
     n = len(plant.axes)
     rest, stop = np.zeros((n, plant.n_x)), np.zeros((n, plant.n_x))
@@ -188,14 +188,14 @@ def boundary_ns(number: int) -> int:
     return START_NS + number * DT_NS
 
 
-def one_a_step(lost: Iterable[int] = (), steps: int = 1000, delay_ns: int = 20 * MS) -> list[PositionSample]:
+def make_step_samples(lost: Iterable[int] = (), steps: int = 1000, delay_ns: int = 20 * MS) -> list[PositionSample]:
     """A sample 50 ms before each boundary (arriving before it), but for those of the lost steps."""
     missing = set(lost)
     kept = [number for number in range(steps) if number not in missing]
     return [sample(boundary_ns(number) - 50 * MS, boundary_ns(number) - 50 * MS + delay_ns) for number in kept]
 
 
-def moving(step: int, speed_mps: float = 1.0) -> list[PositionSample]:
+def make_motion_samples(step: int, speed_mps: float = 1.0) -> list[PositionSample]:
     """One sample at each boundary up to `step` that shows a steady motion, then none."""
     return [
         sample(boundary_ns(n), position_m=(speed_mps * 0.2 * n, 0, 0), velocity_mps=(speed_mps, 0, 0))
@@ -203,7 +203,7 @@ def moving(step: int, speed_mps: float = 1.0) -> list[PositionSample]:
     ]
 
 
-def inputs_of(
+def make_inputs(
     ticks: Iterable[int],
     samples: Iterable[PositionSample],
     *,
@@ -244,20 +244,20 @@ def run(controller: Controller, inputs: Iterable[StepInput], state: ControlState
     return outputs
 
 
-def boundaries(outputs: list[TickOutput]) -> list[TickOutput]:
+def find_boundaries(outputs: list[TickOutput]) -> list[TickOutput]:
     return [output for output in outputs if output.decision.boundary]
 
 
-def modes(outputs: list[TickOutput]) -> list[ControlMode]:
+def list_modes(outputs: list[TickOutput]) -> list[ControlMode]:
     return [output.decision.mode for output in outputs]
 
 
-def flown(outputs: list[TickOutput]) -> list[tuple[int | None, int | None]]:
+def list_plan_steps(outputs: list[TickOutput]) -> list[tuple[int | None, int | None]]:
     """(plan, index) at each boundary."""
-    return [(output.decision.plan_seq, output.decision.plan_index) for output in boundaries(outputs)]
+    return [(output.decision.plan_seq, output.decision.plan_index) for output in find_boundaries(outputs)]
 
 
-def codes(output: TickOutput) -> dict[str, int]:
+def list_codes(output: TickOutput) -> dict[str, int]:
     return {event.code: event.count for event in output.events}
 
 

@@ -10,7 +10,7 @@ from unittest import mock
 import msgspec
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
-from recording_fakes import HEADER, Clock, Item, flight, own
+from recording_fakes import HEADER, Clock, Item, drop_recorder_notes, flight
 
 from logs.recording.info import RecordingInfo, read_info
 from logs.recording.reader import RecordedMessage, header, read, scan
@@ -23,7 +23,7 @@ from uavctl.errors import RecordingError
 DATA_END = b"\x0f\x04\0\0\0\0\0\0\0"
 
 
-class Flips:
+class FlipTest:
     """A small recording whose bytes are flipped one by one; each method raises AssertionError where a reader errs.
 
     Args:
@@ -51,7 +51,7 @@ class Flips:
         offsets = [item.offset for item in scan(self._path) if isinstance(item, RecordedMessage)]
         self._most = max(Counter(offsets).values())  # messages in one chunk
         self._info = read_info(self._path)
-        assert own(list(read(self._path))) == self._items and len(set(offsets)) > 3
+        assert drop_recorder_notes(list(read(self._path))) == self._items and len(set(offsets)) > 3
 
     def flip(self, position: int, mask: int) -> None:
         """Write the recording with one byte changed."""
@@ -69,7 +69,7 @@ class Flips:
         except RecordingError as error:
             assert str(self._path) in str(error)
             refused = True
-        got = own(got)
+        got = drop_recorder_notes(got)
         assert got == self._items[: len(got)]
         if self._finished:
             assert refused
@@ -98,7 +98,7 @@ class Flips:
         self._out.unlink(missing_ok=True)
         result = recover(self._path, self._out)
         entries = list(read(self._out))
-        kept = own(entries)
+        kept = drop_recorder_notes(entries)
         assert kept == [item for item in self._items if item in kept]
         assert len(self._items) - len(kept) <= self._most
         assert len(kept) == len(self._items) or not result.lossless

@@ -14,7 +14,7 @@ from collections import Counter
 from typing import Any, Literal
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from sim_rig import Bench, bench, decode
+from sim_rig import SimRig, decode, make_rig
 
 from sim.autopilot.parameters import TABLES
 
@@ -140,7 +140,7 @@ class Mutants:
         return b"\xfd" + header + payload + crc.to_bytes(2, "little")
 
 
-def snapshot(rig: Bench) -> dict[str, Any]:
+def snapshot(rig: SimRig) -> dict[str, Any]:
     """All that a message could change and a client could notice."""
     autopilot, vehicle = rig.peers.autopilot, rig.peers.vehicle
     pilot = autopilot.pilot
@@ -181,7 +181,7 @@ class Judge:
         self._name = autopilot
         self._mutants = Mutants(seed, autopilot)
         self._sent = 0
-        self._one = bench(autopilot, airborne=True)
+        self._one = make_rig(autopilot, airborne=True)
         self._known: dict[str, Any] | None = None  # the last snapshot, while nothing else has happened
         self.results: Counter[int] = Counter()
         self.changed: Counter[tuple[str, str]] = Counter()
@@ -192,7 +192,7 @@ class Judge:
             if self._sent % PER_SESSION == 0:
                 session = self._sent // PER_SESSION
                 plant = "sim.plant=quadrotor" if session % 3 else "sim.plant=linear"
-                self._one = bench(self._name, plant, airborne=session % 2 == 0)
+                self._one = make_rig(self._name, plant, airborne=session % 2 == 0)
                 self._known = None
             self._sent += 1
             if self._sent % 20 == 0:

@@ -20,7 +20,7 @@ from uavctl.smpc.conditioned.planner import AnyDesign
 R = TypeVar("R", bound=Record)
 
 
-class Memory:
+class MemorySink:
     """Sink that keeps everything, in order."""
 
     def __init__(self) -> None:
@@ -37,7 +37,7 @@ def make_loop(config: Config, sink: Sink, design: AnyDesign | None = None) -> Co
     return ControlLoop(config, build_controller(config, design), sink, lambda: 0)
 
 
-def shared(config: Config) -> tuple[AnyDesign, Controller]:
+def share_flight(config: Config) -> tuple[AnyDesign, Controller]:
     """Design and controller, made once for flights that differ in length and simulator alone.
 
     A flight leaves nothing in its controller; a replay, which makes one of its own, would find out.
@@ -52,15 +52,15 @@ def _made(config: Config) -> tuple[AnyDesign, Controller]:
 
 
 def shared_loop(config: Config, sink: Sink) -> ControlLoop:
-    """The loop of a flight whose controller others fly with too, see `shared`; `make_loop` makes one of its own."""
-    return ControlLoop(config, shared(config)[1], sink, lambda: 0)
+    """Return a loop with a controller that is shared, see `share_flight`; `make_loop` makes a new one."""
+    return ControlLoop(config, share_flight(config)[1], sink, lambda: 0)
 
 
-def lockstep(name: str, duration_s: float, *overrides: str) -> Memory:
+def lockstep(name: str, duration_s: float, *overrides: str) -> MemorySink:
     """Fly a preset in virtual time."""
     config = load_config(name, [f"duration_s={duration_s}", *overrides])
-    design, controller = shared(config)
-    memory = Memory()
+    design, controller = share_flight(config)
+    memory = MemorySink()
     memory.put("/uavctl/header", 0, header(config, design))
     loop = ControlLoop(config, controller, memory, lambda: 0)
     World(config, loop, on_truth=lambda truth: memory.put("/sim/truth", truth.at_ns, truth)).run(duration_s)
@@ -81,5 +81,5 @@ def header(config: Config, design: AnyDesign) -> Header:
     )
 
 
-def flight(memory: Memory) -> FlightData:
+def flight(memory: MemorySink) -> FlightData:
     return FlightData.from_records(memory.entries)

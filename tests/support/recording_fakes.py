@@ -33,7 +33,7 @@ HEADER = Header(
 Item = tuple[str, int, Record]
 
 
-def as_recorded(items: Sequence[Item]) -> list[Item]:
+def round_records(items: Sequence[Item]) -> list[Item]:
     """Return records as a recording gives them back: of a plan's matrices it has four digits."""
     return [
         (topic, at_ns, round_plan(record) if isinstance(record, Plan) else record) for topic, at_ns, record in items
@@ -80,7 +80,7 @@ def flight(count: int) -> list[Item]:
     return items
 
 
-def own(items: list[Item]) -> list[Item]:
+def drop_recorder_notes(items: list[Item]) -> list[Item]:
     """Without the recorder's own notes."""
     return [item for item in items if item[0] != "/uavctl/recorder"]
 

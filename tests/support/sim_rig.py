@@ -60,7 +60,7 @@ class Client:
         return self.pack(mavlink.MAVLink_set_mode_message(1, base, custom))
 
 
-class Bench:
+class SimRig:
     """Peers in virtual time with a client at the vehicle's link; messages are kept as (at_ns, message)."""
 
     def __init__(self, config: Config, *, airborne: bool = True) -> None:
@@ -110,16 +110,16 @@ class Bench:
         return math.hypot(*self.peers.vehicle.velocity_mps)
 
 
-def bench(autopilot: str, *overrides: str, airborne: bool = True) -> Bench:
-    return Bench(
+def make_rig(autopilot: str, *overrides: str, airborne: bool = True) -> SimRig:
+    return SimRig(
         load_config("room-hahn-stursberg", [*CALM, f"sim.autopilot={autopilot}", *overrides]), airborne=airborne
     )
 
 
-def flying(rig: Bench) -> tuple[float, ...]:
+def read_flight_state(rig: SimRig) -> tuple[float, ...]:
     return tuple(rig.peers.vehicle.input.tolist())
 
 
-def heartbeat(rig: Bench) -> Any:
+def read_heartbeat(rig: SimRig) -> Any:
     rig.wait(1.0)
     return rig.of("HEARTBEAT")[-1]

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from soak_rig import Watch, fly
+from soak_rig import LoopWatch, fly
 
 from sim.simulation import World
 from uavctl.build.controller import Prepared
@@ -118,7 +118,7 @@ class _Ground:
         self.away: dict[int, list[float]] = {}
         self._of_plan: Sequence[Sequence[float]] = ()
 
-    def look(self, world: World, watch: Watch, at_ns: int) -> None:
+    def look(self, world: World, watch: LoopWatch, at_ns: int) -> None:
         """After a tick."""
         decision = None if watch.ticked is None else watch.ticked.decision
         place = np.array(world.peers.vehicle.position_m)
@@ -174,7 +174,7 @@ def fly_mission(prepared: Prepared, autopilot: str, seed: int, path: Path | None
     ground = _Ground(prepared)
     worlds: list[World] = []
 
-    def look(world: World, watch: Watch, at_ns: int) -> None:
+    def look(world: World, watch: LoopWatch, at_ns: int) -> None:
         worlds[:] = [world]
         ground.look(world, watch, at_ns)
 

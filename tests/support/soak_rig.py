@@ -34,14 +34,14 @@ ALARMS = ("envelope-", "sample-jump", "sample-frozen")
 MOST_FINDINGS = 20  # of one flight: the first ones tell
 
 
-def prepared_for(*overrides: str) -> Prepared:
+def prepare_room(*overrides: str) -> Prepared:
     """Design and controller of preset `room`."""
     config = load_config("room-hahn-stursberg", overrides)
     return prepare(config, build_flight_design(config))
 
 
 @dataclass
-class Watch:
+class LoopWatch:
     """The loop as the world sees it; holds on to what a tick decided, and what was wrong with it.
 
     Attributes:
@@ -126,7 +126,7 @@ class Watch:
         self._before = now
 
 
-class Nowhere:
+class NullSink:
     """A sink that keeps nothing."""
 
     def put(self, topic: str, at_ns: int, record: Record) -> None:
@@ -136,12 +136,12 @@ class Nowhere:
 def fly(
     prepared: Prepared,
     config: Config,
-    after_tick: Callable[[World, Watch, int], None] = lambda *_: None,
+    after_tick: Callable[[World, LoopWatch, int], None] = lambda *_: None,
     *,
     take_off_m: float | None = None,
     path: Path | None = None,
     lands: bool = False,
-) -> Watch:
+) -> LoopWatch:
     """Fly in virtual time until it is over, on the ground where it took off.
 
     Args:
@@ -155,8 +155,8 @@ def fly(
     recorder = None if path is None else SyncRecorder(path, config.log)
     if recorder is not None:
         put_header(recorder, prepared, started_ns=0)
-    sink: Sink = recorder or Nowhere()
-    watch = Watch(prepared, sink, lambda at_ns: after_tick(world, watch, at_ns), take_off_m)
+    sink: Sink = recorder or NullSink()
+    watch = LoopWatch(prepared, sink, lambda at_ns: after_tick(world, watch, at_ns), take_off_m)
     world = World(
         config, watch, on_truth=lambda truth: sink.put("/sim/truth", truth.at_ns, truth), airborne=take_off_m is None
     )

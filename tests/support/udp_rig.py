@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from patience import LIMIT_S, until
+from patience import LIMIT_S, wait_until
 from places import without_pages
 
 from logs.recording.reader import records
@@ -41,7 +41,7 @@ def fly_over_udp(out: Path, enough: Callable[[list[Truth]], bool], *options: str
         [*command, *PATIENT, *options], stdout=subprocess.PIPE, text=True, env=without_pages()
     ) as process:
         try:
-            until(seen, "it flies")
+            wait_until(seen, "it flies")
             process.send_signal(signal.SIGINT)
             output, _ = process.communicate(timeout=LIMIT_S)
         finally:

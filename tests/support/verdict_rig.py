@@ -30,7 +30,7 @@ def plain(_step: int, w: Array) -> Array:
     return w
 
 
-def as_modelled(
+def simulate_model(
     config: Config,
     steps: int,
     *,

@@ -11,7 +11,7 @@ import cvxpy as cp
 import numpy as np
 import pytest
 from design_rig import one_axis, paper_plant, spec
-from loopback_rig import Memory, flight, lockstep, make_loop
+from loopback_rig import MemorySink, flight, lockstep, make_loop
 from numpy.typing import NDArray
 from optimisation_cases import paper_spec
 from scipy.linalg import solve_discrete_lyapunov
@@ -313,12 +313,12 @@ LATE = ("link.delay_s=0.25", "link.loss=0.1", "clock.latency_s=0.25", "envelope.
 
 
 @pytest.fixture(scope="module")
-def late_flight() -> Memory:
+def late_flight() -> MemorySink:
     return lockstep("room-hahn-stursberg", 12.0, *LATE)
 
 
 @pytest.mark.slow
-def test_a_flight_on_late_positions_plans_with_their_age(late_flight: Memory) -> None:
+def test_a_flight_on_late_positions_plans_with_their_age(late_flight: MemorySink) -> None:
     config = load_config("room-hahn-stursberg", list(LATE))
     design = build_design(config)
     solver = ShortcutSolver(design)
@@ -338,7 +338,7 @@ def test_a_flight_on_late_positions_plans_with_their_age(late_flight: Memory) ->
 
 
 @pytest.mark.slow
-def test_a_flight_on_late_positions_keeps_its_limits(late_flight: Memory) -> None:
+def test_a_flight_on_late_positions_keeps_its_limits(late_flight: MemorySink) -> None:
     config = load_config("room-hahn-stursberg", list(LATE))
     lower, upper = np.array(config.sets.state_lower), np.array(config.sets.state_upper)
     data = flight(late_flight)
@@ -350,6 +350,6 @@ def test_a_flight_on_late_positions_keeps_its_limits(late_flight: Memory) -> Non
 
 
 @pytest.mark.slow
-def test_a_flight_on_late_positions_replays(late_flight: Memory) -> None:
+def test_a_flight_on_late_positions_replays(late_flight: MemorySink) -> None:
     config = load_config("room-hahn-stursberg", ["duration_s=12.0", *LATE])
     assert replay(late_flight.entries, lambda sink: make_loop(config, sink)).identical
