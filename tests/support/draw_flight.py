@@ -107,7 +107,7 @@ def draw_flight(seed: int) -> FlightDraw:
         orders=_orders(rng, config, ticks),
         stop_tick=int(rng.integers(ticks // 2, ticks)) if rng.uniform() < 0.25 else None,
         skipped=skipped,
-        late=late_ticks - skipped,
+        late_ticks=late_ticks - skipped,
         noise=float(rng.choice([0.0, 0.3])),
         reboot_step=int(rng.integers(steps // 3, steps)) if rng.uniform() < 0.15 else None,
         signed=bool(rng.uniform() < 0.3 and per_step > 1),
