@@ -6,15 +6,14 @@ from functools import cache
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.build.controller import build_conditioned
 from uavctl.build.link import build_ages, build_delayed_link
 from uavctl.config import Config, load_config
 from uavctl.errors import DesignError
 from uavctl.lab.campaign.world import draw, newest
 
-Array = NDArray[np.float64]
 RUNS, STEPS, OLDEST = 20_000, 80, 12
 
 BURSTS = ["link.model=gilbert-elliott", "link.burst_enter=0.142857", "link.burst_leave=0.333333"]

@@ -21,7 +21,6 @@ from flight_rig import (
     vehicle,
 )
 from loopback_rig import MemorySink, flight, lockstep, make_loop
-from numpy.typing import NDArray
 from report_rig import omit_figures
 from told_numbers import find_numbers
 
@@ -32,14 +31,13 @@ from logs.report.flight_page import render_report
 from logs.report.headline import derive_headline
 from logs.report.summary_text import describe_flight
 from logs.report.verdicts import judge_flight
+from uavctl.arrays import Array
 from uavctl.build.controller import build_design
 from uavctl.config import load_config
 from uavctl.config.load import dump_config
 from uavctl.flight.mission import Waypoint
 from uavctl.records import ControlMode, Decision, Event, GaveWay, Plan, Truth
 from uavctl.smpc.answer import NOMINAL, Answer, Preview
-
-Array = NDArray[np.float64]
 
 PLACES_M = ((1.5, 1.0, -1.2), (-1.0, 1.2, -0.9), (0.0, -1.0, -1.5))
 HOLD_S, ACCEPT_M = 2.0, 0.3

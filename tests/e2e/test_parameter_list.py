@@ -12,12 +12,12 @@ from take_off_rig import TakeOffRig
 from logs.recording.parameters import ParameterReader, count_parameters
 from logs.recording.replay import replay
 from sim.autopilot.parameters import TABLES
+from uavctl.arrays import SECOND_NS
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.mavlink.messages import ParamValue
 from uavctl.mavlink.stream_requests import MAX_READ_ROUNDS, MAX_TRIES, READS_PER_BATCH, ParameterDownload
 from uavctl.records import Datagram
 
-SECOND = 1_000_000_000
 BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 
 
@@ -81,11 +81,11 @@ def test_the_lost_ones_are_asked_for_at_a_bounded_rate_and_not_for_ever() -> Non
     asking, asked = ParameterDownload(), []
     assert asking.due(0, armed=False) == (-1,)
     asking.handle_message(value(0, 1001))  # and of the others none comes, ever
-    for at_ns in range(0, 400 * SECOND, SECOND // 20):
+    for at_ns in range(0, 400 * SECOND_NS, SECOND_NS // 20):
         asked += [(at_ns, index) for index in asking.due(at_ns, armed=False)]
     assert sorted(index for _, index in asked) == sorted(MAX_READ_ROUNDS * [*range(1, 1001)])
-    for begin in range(0, 200 * SECOND, SECOND):
-        assert sum(begin <= at < begin + SECOND for at, _ in asked) <= 5 * READS_PER_BATCH
+    for begin in range(0, 200 * SECOND_NS, SECOND_NS):
+        assert sum(begin <= at < begin + SECOND_NS for at, _ in asked) <= 5 * READS_PER_BATCH
 
 
 def test_the_list_is_waited_for_while_it_comes_and_armed_ends_it_for_good() -> None:
@@ -93,10 +93,10 @@ def test_the_list_is_waited_for_while_it_comes_and_armed_ends_it_for_good() -> N
     assert asking.due(0, armed=False) == (-1,)
     for index in range(0, 40, 2):
         asking.handle_message(value(index, 41))
-        assert asking.due((index + 1) * SECOND // 10, armed=False) == ()
-    assert asking.due(5 * SECOND, armed=False) == tuple(range(1, 20, 2))
-    assert asking.due(6 * SECOND, armed=True) == ()
-    assert asking.due(7 * SECOND, armed=False) == ()
+        assert asking.due((index + 1) * SECOND_NS // 10, armed=False) == ()
+    assert asking.due(5 * SECOND_NS, armed=False) == tuple(range(1, 20, 2))
+    assert asking.due(6 * SECOND_NS, armed=True) == ()
+    assert asking.due(7 * SECOND_NS, armed=False) == ()
 
 
 def test_what_is_no_place_in_a_list_counts_for_nothing() -> None:

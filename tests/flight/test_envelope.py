@@ -8,25 +8,13 @@ from dataclasses import FrozenInstanceError, replace
 
 import numpy as np
 import pytest
-from envelope_rig import (
-    AT_NS,
-    PARAMETERS,
-    TICK_NS,
-    Array,
-    just_less,
-    just_more,
-    look,
-    monitors,
-    motion,
-    seen,
-    update,
-    vec3,
-)
+from envelope_rig import AT_NS, PARAMETERS, TICK_NS, just_less, just_more, look, monitors, motion, seen, update, vec3
 from flight_rig import MS, START_NS, drag_lag_generator, sample
 from msgspec import structs
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
+from uavctl.arrays import Array
 from uavctl.flight.limits import ZERO
 from uavctl.flight.monitors.acceleration import compute_lean_mps2
 from uavctl.flight.monitors.engaged import INITIAL

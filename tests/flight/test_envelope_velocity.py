@@ -13,8 +13,6 @@ from envelope_rig import (
     LOOK_NS,
     NAN3,
     PARAMETERS,
-    Array,
-    S,
     changed,
     just_less,
     just_more,
@@ -31,6 +29,7 @@ from flight_rig import MS, START_NS, sample
 from msgspec import structs
 from scipy.optimize import minimize_scalar
 
+from uavctl.arrays import SECOND_NS, Array
 from uavctl.flight.limits import ZERO
 from uavctl.flight.monitors.engaged import INITIAL, MonitorState
 from uavctl.flight.monitors.observer import Observer
@@ -77,7 +76,7 @@ def test_how_far_apart_two_velocities_are_is_a_line_through_what_is_between_them
             options={"xatol": 1e-9},
         )
         assert watching.velocity.apart_mps == pytest.approx(left.fun, rel=1e-6)
-    kept = [at for at in ticks_ns if at > at_ns - 3 * S]
+    kept = [at for at in ticks_ns if at > at_ns - 3 * SECOND_NS]
     assert [at for at, _ in watching.motion.vehicle_path] == kept
 
 
@@ -147,7 +146,7 @@ def test_where_the_observer_begins_anew_a_contradiction_has_to_persist() -> None
     """A position that comes three seconds late may still be compared with those before."""
     captured_ns = AT_NS - 2900 * MS
     state = monitors(
-        observer=Observer(AT_NS - 3 * S, np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)),
+        observer=Observer(AT_NS - 3 * SECOND_NS, np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)),
         tick_ns=START_NS,
         vehicle_path=((captured_ns - 50 * MS, np.zeros(3)), (START_NS, np.zeros(3))),
         offsets=tuple((captured_ns - ns * MS, np.array([-0.3e-3 * ns, 0.0, 0.0])) for ns in (500, 250)),
@@ -183,13 +182,19 @@ def creeping(off_m: float, age_ns: int, *, before: int = 0) -> tuple[MonitorStat
     """A position now, where the vehicle's own way had another place so long before the middle of the offsets."""
     known = offsets(0.0, spans_ns=(256 * MS, 512 * MS))
     middle_ns = AT_NS - 256 * MS
-    older = tuple((middle_ns - age_ns - n * S, np.zeros(3)) for n in range(before, 0, -1))
+    older = tuple((middle_ns - age_ns - n * SECOND_NS, np.zeros(3)) for n in range(before, 0, -1))
     places = (*older, (middle_ns - age_ns, np.array([0.0, -off_m, 0.0])))
     return look(ZERO, vehicle_motion=AT_REST, places=places, **known)
 
 
 @pytest.mark.parametrize(
-    ("age_ns", "within_m"), [(S, 0.25 * 2.16), (5 * S, 0.25 * 2.8), (30 * S - 1, 0.25 * 6.8), (30 * S, math.inf)]
+    ("age_ns", "within_m"),
+    [
+        (SECOND_NS, 0.25 * 2.16),
+        (5 * SECOND_NS, 0.25 * 2.8),
+        (30 * SECOND_NS - 1, 0.25 * 6.8),
+        (30 * SECOND_NS, math.inf),
+    ],
 )
 def test_positions_may_leave_the_vehicles_own_way_by_so_much(age_ns: int, within_m: float) -> None:
     for off_m, breached in ((min(within_m, 99.0) - 1e-6, False), (within_m + 1e-6, True)):
@@ -204,28 +209,31 @@ def test_positions_may_leave_the_vehicles_own_way_by_so_much(age_ns: int, within
 def test_positions_may_leave_the_vehicles_own_way_by_just_so_much() -> None:
     within_m = (2.0 + 0.16) * PARAMETERS.disagreement_mps
     for off_m, breached in ((within_m, False), (just_more(within_m), True)):
-        _, breach = creeping(off_m, S)
+        _, breach = creeping(off_m, SECOND_NS)
         assert (breach is not None) == breached
 
 
 def test_any_place_of_the_way_that_is_too_far_off_is_enough() -> None:
-    _, breach = creeping(9.0, S, before=3)
+    _, breach = creeping(9.0, SECOND_NS, before=3)
     assert breach is not None and breach.text.endswith("in 1 s")
 
 
-@pytest.mark.parametrize(("age_ns", "kept"), [(S - 1, 1), (S, 2), (30 * S - 1, 2), (30 * S, 1), (31 * S, 1)])
+@pytest.mark.parametrize(
+    ("age_ns", "kept"),
+    [(SECOND_NS - 1, 1), (SECOND_NS, 2), (30 * SECOND_NS - 1, 2), (30 * SECOND_NS, 1), (31 * SECOND_NS, 1)],
+)
 def test_a_place_of_the_way_is_remembered_each_second_for_half_a_minute(age_ns: int, kept: int) -> None:
     watching, breach = creeping(0.0, age_ns)
     assert breach is None
     assert len(watching.velocity.places) == kept
-    if kept == 2 or age_ns >= 30 * S:
+    if kept == 2 or age_ns >= 30 * SECOND_NS:
         at_ns, place = watching.velocity.places[-1]
         assert at_ns == AT_NS - 256 * MS and isinstance(at_ns, int)
         np.testing.assert_allclose(place, ZERO, atol=1e-12)
 
 
 def test_a_place_of_the_way_is_remembered_a_second_after_the_last_one() -> None:
-    watching, _ = creeping(0.0, S // 2, before=5)
+    watching, _ = creeping(0.0, SECOND_NS // 2, before=5)
     assert len(watching.velocity.places) == 6
 
 
@@ -237,7 +245,7 @@ def test_the_place_of_the_way_is_the_mean_of_the_offsets() -> None:
 
 
 def test_over_a_gap_the_way_is_not_compared() -> None:
-    places = ((START_NS - S, (9.0, 0.0, 0.0)),)
+    places = ((START_NS - SECOND_NS, (9.0, 0.0, 0.0)),)
     for spans_ns, kept in (((100 * MS,), True), ((1200 * MS,), False)):
         watching, breach = look(ZERO, vehicle_motion=AT_REST, places=places, **offsets(0.0, spans_ns=spans_ns))
         assert breach is None
@@ -253,12 +261,14 @@ def test_over_a_gap_the_way_is_not_compared() -> None:
 
 
 def test_velocities_that_contradict_each_other_are_told_before_ways_that_do() -> None:
-    places = ((START_NS - S, (9.0, 0.0, 0.0)),)
+    places = ((START_NS - SECOND_NS, (9.0, 0.0, 0.0)),)
     _, breach = look(ZERO, vehicle_motion=AT_REST, places=places, **offsets(9.0))
     assert breach is not None and breach.text.startswith("positions move otherwise")
 
 
-@pytest.mark.parametrize(("for_ns", "answered"), [(None, False), (2 * S - 1, False), (2 * S, True), (3 * S, True)])
+@pytest.mark.parametrize(
+    ("for_ns", "answered"), [(None, False), (2 * SECOND_NS - 1, False), (2 * SECOND_NS, True), (3 * SECOND_NS, True)]
+)
 def test_positions_have_answered_after_two_seconds_of_a_flight(for_ns: int | None, answered: bool) -> None:
     watching = monitors(tick_ns=AT_NS, began_ns=None if for_ns is None else AT_NS - for_ns)
     assert watching.confirms_positions == answered
@@ -314,9 +324,9 @@ def test_the_way_is_not_known_after_the_last_tick() -> None:
 
 
 def test_the_way_is_remembered_for_three_seconds() -> None:
-    way = tuple((at, np.zeros(3)) for at in (AT_NS - 3 * S, AT_NS - 3 * S + 1, START_NS))
+    way = tuple((at, np.zeros(3)) for at in (AT_NS - 3 * SECOND_NS, AT_NS - 3 * SECOND_NS + 1, START_NS))
     watching, _ = update(monitors(vehicle_path=way), seen(AT_NS, vehicle_motion=AT_REST), PARAMETERS)
-    assert [at for at, _ in watching.motion.vehicle_path] == [AT_NS - 3 * S + 1, START_NS, AT_NS]
+    assert [at for at, _ in watching.motion.vehicle_path] == [AT_NS - 3 * SECOND_NS + 1, START_NS, AT_NS]
 
 
 @pytest.mark.parametrize(

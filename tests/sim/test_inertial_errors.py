@@ -14,7 +14,6 @@ from inertial_rig import (
     QUADROTOR,
     QUATERNION,
     SECOND,
-    Array,
     G,
     InertialRecord,
     convert_to_si,
@@ -28,6 +27,7 @@ from sim_rig import SimRig, make_rig
 from sim.autopilot.inertial import DRIFT_S, ERRORS, GaussMarkov, Imu, InertialErrors, InertialSensors, draw_normals
 from sim.vehicle.interface import rotate_to_ned
 from sim.vehicle.quadrotor import Quadrotor
+from uavctl.arrays import Array
 from uavctl.config import load_config
 from uavctl.errors import ConfigError
 

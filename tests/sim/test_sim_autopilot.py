@@ -4,8 +4,9 @@ import math
 from itertools import pairwise
 
 import pytest
-from sim_rig import ARM, INTERVAL, LAND, SET_MODE, TAKE_OFF, S, SimRig, make_rig, read_flight_state, read_heartbeat
+from sim_rig import ARM, INTERVAL, LAND, SET_MODE, TAKE_OFF, SimRig, make_rig, read_flight_state, read_heartbeat
 
+from uavctl.arrays import SECOND_NS
 from uavctl.config import load_config
 
 OFFBOARD = (1, 6, 0)
@@ -159,7 +160,7 @@ def test_px4_holds_after_silence_and_comes_back_with_the_stream() -> None:
     one.wait(0.001)
     assert one.peers.autopilot.mode_name == "AUTO.LOITER"
     assert [(at_ns, msg.severity, msg.text) for at_ns, msg in one.seen if msg.get_type() == "STATUSTEXT"] == [
-        (19 * S // 10, 2, "Failsafe activated")
+        (19 * SECOND_NS // 10, 2, "Failsafe activated")
     ]
     message = read_heartbeat(one)
     assert (message.base_mode, message.custom_mode, message.system_status) == (157, 4 << 16 | 3 << 24, 5)

@@ -6,9 +6,10 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from recorded_rig import packets
-from sim_rig import ARM, LAND, SET_MODE, TAKE_OFF, S, SimRig, decode, make_rig, read_heartbeat
+from sim_rig import ARM, LAND, SET_MODE, TAKE_OFF, SimRig, decode, make_rig, read_heartbeat
 
 from sim.autopilot.parameters import TABLES
+from uavctl.arrays import SECOND_NS
 
 GUIDED, OFFBOARD, HOLD, BRAKE = (1, 4, 0), (1, 6, 0), (1, 4, 3), (1, 17, 0)
 RADIO, FENCE = 1 << 16, 1 << 20  # MAV_SYS_STATUS_SENSOR_RC_RECEIVER, MAV_SYS_STATUS_GEOFENCE
@@ -67,7 +68,7 @@ def test_px4_asks_for_the_time_ten_times_a_second_and_ardupilot_does_not() -> No
     one = make_rig("px4")
     one.wait(0.95)
     asked = [(at_ns, msg) for at_ns, msg in one.seen if msg.get_type() == "TIMESYNC"]
-    assert [(msg.tc1, msg.ts1) for _, msg in asked] == [(0, at_ns + 20 * S) for at_ns, _ in asked]
+    assert [(msg.tc1, msg.ts1) for _, msg in asked] == [(0, at_ns + 20 * SECOND_NS) for at_ns, _ in asked]
     assert len(asked) == 10
     assert one.send(one.client.timesync(5, tc1=7)) == []  # the answer needs none
     one = make_rig("ardupilot")

@@ -23,10 +23,11 @@ from inertial_rig import (
     request_streams,
 )
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from sim_rig import INTERVAL, S, SimRig, make_rig
+from sim_rig import INTERVAL, SimRig, make_rig
 
 from sim.autopilot.telemetry import convert_to_milli
 from sim.vehicle.quadrotor import Quadrotor
+from uavctl.arrays import SECOND_NS
 
 REQUEST, GET_INTERVAL, DENIED = 512, 510, 2
 EXACT = "sim.inertial.errors=0"
@@ -53,7 +54,7 @@ def test_inertial_messages_come_when_asked_for_and_at_that_rate(name: str, plant
             one.wait(1.0)
             spacing = set(np.diff(times(one, kind)[before:]))
             assert len(times(one, kind)) - before in (rate_hz, rate_hz + 1)
-            assert spacing == {S // rate_hz}
+            assert spacing == {SECOND_NS // rate_hz}
             assert one.ask(GET_INTERVAL, kind) == 0
             assert one.of("MESSAGE_INTERVAL")[-1].interval_us == 1_000_000 // rate_hz
         assert one.ask(INTERVAL, kind, -1) == 0

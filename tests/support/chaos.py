@@ -22,16 +22,14 @@ from flight_rig import (
     small_plant,
     vehicle,
 )
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.flight.controller import Controller
 from uavctl.flight.monitors.outliers import GateParameters
 from uavctl.flight.tick import TickOutput, make_initial_state
 from uavctl.flight.tick import tick as run_tick
 from uavctl.records import Command, ControlMode, Order, PositionSample, SolveStatus, StepInput, VehicleStatus
 from uavctl.smpc.answer import NOMINAL, Answer, Preview
-
-Array = NDArray[np.float64]
 
 LIMITS, SLEW = (2.0, 2.0, 1.5), 100.0 * TICK_NS * 1e-9
 ODD = (math.nan, math.inf, -math.inf, 1e9, 1e300, 999.0, -0.0)

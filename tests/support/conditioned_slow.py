@@ -5,14 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import norm
 
+from uavctl.arrays import Array
 from uavctl.smpc.answer import Preview
 from uavctl.smpc.nominal import ControlProblem, lqr
 from uavctl.smpc.qp import OPEN, SOFT, QuadraticProgram
 
-Array = NDArray[np.float64]
 ROUNDS, MOST_ROUNDS = 2, 3
 
 

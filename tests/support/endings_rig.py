@@ -29,6 +29,7 @@ from logs.recording.summary import summarise
 from logs.report import flight_page as report
 from sim.autopilot.profile import SIMULATED
 from sim.simulation import Peers
+from uavctl.arrays import SECOND_NS
 from uavctl.cli import fly as fly_cmd
 from uavctl.cli import tune_flights
 from uavctl.cli.app import run
@@ -45,7 +46,6 @@ from uavctl.mavlink.handover_states import HandoverState
 from uavctl.outcome import Cause
 from uavctl.records import Ending, RelayStats
 
-SECOND = 1_000_000_000
 BEGIN_NS = 1  # a tick before the grid
 MAX_FLIGHT_S = 400.0  # of a flight that should have ended long ago
 PRESET = ["--config", "room-hahn-stursberg", "--set", "solver.method=exact"]
@@ -167,14 +167,14 @@ class EndingRig:
         def due(rig: EndingRig) -> bool:
             if rig.is_in(state) and not since:
                 since.append(rig.now_ns)
-            return bool(since) and rig.now_ns - since[0] >= after_s * SECOND
+            return bool(since) and rig.now_ns - since[0] >= after_s * SECOND_NS
 
         self.steps.append((due, do))
         return self
 
     def add_step_after(self, seconds: float, do: Callable[[EndingRig], None]) -> EndingRig:
         """A step so long after the start."""
-        self.steps.append((lambda rig: rig.now_ns >= seconds * SECOND, do))
+        self.steps.append((lambda rig: rig.now_ns >= seconds * SECOND_NS, do))
         return self
 
     def request_status(self) -> None:
@@ -196,7 +196,7 @@ class EndingRig:
     # Time
 
     def wait(self, connections: Mapping[str, Connection], deadline_ns: int) -> list[str]:
-        assert self.now_ns < MAX_FLIGHT_S * SECOND, "the flight does not end"
+        assert self.now_ns < MAX_FLIGHT_S * SECOND_NS, "the flight does not end"
         self.now_ns = max(self.now_ns, deadline_ns)
         self._take_answers()
         while self.steps and self.steps[0][0](self):

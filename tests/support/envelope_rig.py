@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from flight_rig import MS, START_NS, sample
 from msgspec import structs
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.flight.limits import ZERO
 from uavctl.flight.monitors import engaged
 from uavctl.flight.monitors.braking import BrakingState
@@ -29,9 +29,6 @@ from uavctl.flight.monitors.verdict import Action, Cause, Verdict
 from uavctl.flight.supervise import RELEASES
 from uavctl.records import PositionSample, Vec3, VehicleMotion
 
-Array = NDArray[np.float64]
-
-S = 1_000_000_000
 TICK_NS = 50 * MS
 NAN3: Vec3 = (math.nan, math.nan, math.nan)
 PARAMETERS = EnvelopeParameters(

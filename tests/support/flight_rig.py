@@ -8,9 +8,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag, expm
 
+from uavctl.arrays import Array
 from uavctl.flight.controller import Controller
 from uavctl.flight.fallback import FallbackParameters
 from uavctl.flight.kalman import EstimatorParameters
@@ -25,7 +25,6 @@ from uavctl.records import Command, ControlMode, PositionSample, SolveStatus, St
 from uavctl.smpc.answer import NOMINAL, Answer, Preview
 from uavctl.smpc.plant import Plant
 
-Array = NDArray[np.float64]
 Fault = Callable[[Answer], Answer]
 
 MS = 1_000_000

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from sim_rig import INTERVAL, SimRig
 
-Array = NDArray[np.float64]
+from uavctl.arrays import Array
 
 G = 9.80665
 BOOT_S = 20.0  # age of the autopilot at the start

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag, expm, solve_discrete_are
 from scipy.stats import chi2
 
+from uavctl.arrays import Array
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import Answer
 from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec, make_design
@@ -19,8 +19,6 @@ from uavctl.smpc.hahn_stursberg.terminal import make_terminal
 from uavctl.smpc.link import bernoulli
 from uavctl.smpc.plant import AXES, Plant
 from uavctl.smpc.sets import Polytope
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

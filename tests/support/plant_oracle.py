@@ -11,13 +11,11 @@ from dataclasses import dataclass
 
 import cvxpy as cp
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from uavctl.arrays import Array
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec
 from uavctl.smpc.hahn_stursberg.terminal import Terminal
 from uavctl.smpc.link import bernoulli
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from places import DATA
 from scipy.signal import lfilter
 
@@ -17,13 +16,12 @@ from sim.vehicle.battery import BatteryModel
 from sim.vehicle.linear import make_linear_model
 from sim.vehicle.quadrotor import STEP_NS, STEP_S, Quadrotor
 from sim.wind import Wind
+from uavctl.arrays import Array
 from uavctl.config import load_config
 from uavctl.records import Vec3
 
-Array = NDArray[np.float64]
 Autopilot = Literal["px4", "ardupilot"]
 
-S = 1_000_000_000
 MODEL = make_linear_model(load_config("room-hahn-stursberg").plant)
 # The recorded PX4 flew a vehicle with drag of 1 N s/m and 1 kg (SIH_KDV, SIH_MASS), the same along all axes.
 HOVER_SUM_RPS = 4.0 * CRAZYFLIE_2.hover_rps

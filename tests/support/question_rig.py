@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from design_rig import one_axis, paper_plant, spec
 from full_problem import backoff_table, horizons
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.build.controller import build_design
 from uavctl.config import load_config
 from uavctl.smpc.answer import NOMINAL, Answer, Path, Preview
@@ -24,8 +24,6 @@ from uavctl.smpc.hahn_stursberg.mean import MeanProblem, Question
 from uavctl.smpc.hahn_stursberg.policy import Policy, cheapest_policy
 from uavctl.smpc.link import bernoulli
 from uavctl.smpc.sets import Polytope
-
-Array = NDArray[np.float64]
 
 PRESETS = ("paper", "room-hahn-stursberg")
 # For most tests of both, two axes will do for a person who waits.

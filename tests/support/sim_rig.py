@@ -8,9 +8,9 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.simulation import MOCAP, VEHICLE, Peers
+from uavctl.arrays import SECOND_NS
 from uavctl.config import Config, load_config
 
-S = 1_000_000_000
 ACCEL_ONLY = 3135
 ARM, SET_MODE, LAND, TAKE_OFF, INTERVAL = 400, 176, 21, 22, 511
 CALM = ["plant.wind_std_mps2=[1e-9,1e-9,1e-9]", "sim.start_position_m=[0.0,0.0,-1.5]"]
@@ -75,7 +75,7 @@ class SimRig:
         return self.peers.now_ns
 
     def wait(self, seconds: float) -> None:
-        for at_ns, link, data in self.peers.advance(self.now_ns + round(seconds * S)):
+        for at_ns, link, data in self.peers.advance(self.now_ns + round(seconds * SECOND_NS)):
             kept = {VEHICLE: self.seen, MOCAP: self.positions}[link]
             kept.extend((at_ns, msg) for msg in decode(data))
 

@@ -8,15 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from soak_rig import LoopWatch, fly
 
 from sim.simulation import World
+from uavctl.arrays import Array
 from uavctl.build.controller import Prepared
 from uavctl.config import load_config
 from uavctl.records import ControlMode
-
-Array = NDArray[np.float64]
 
 AUTOPILOTS = ("px4", "ardupilot")
 TAKE_OFF_M = 1.2

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from msgspec.structs import replace
 from scipy.linalg import expm, logm
-from synthetic_scene import Array, Scene, box
+from synthetic_scene import Scene, box
 
+from uavctl.arrays import Array
 from uavctl.records import (
     ControlMode,
     Decision,
