@@ -41,7 +41,7 @@ def test_loading_and_solving_loads_neither_matplotlib_nor_cvxpy() -> None:
     assert done.stdout == "[]\n"
 
 
-def test_types_are_told_of_exactly_the_public_names() -> None:
+def test_exactly_the_public_names_have_types() -> None:
     stub = ast.parse((ROOT / "uavctl" / "__init__.pyi").read_text(encoding="utf-8"))
     imports = [node for node in stub.body if isinstance(node, ast.ImportFrom)]
     module_by_name = {str(alias.asname): str(node.module) for node in imports for alias in node.names}
@@ -57,7 +57,7 @@ def test_a_name_that_is_none_is_refused_as_of_any_module() -> None:
 
 
 @pytest.mark.parametrize("name", ["sim.py", "logs/__init__.py"])
-def test_a_module_of_the_same_name_that_hides_ours_is_told(name: str, tmp_path: Path) -> None:
+def test_a_module_of_the_same_name_that_hides_ours_is_reported(name: str, tmp_path: Path) -> None:
     path = tmp_path / name
     path.parent.mkdir(exist_ok=True)
     path.touch()
@@ -143,7 +143,7 @@ def test_a_plan_follows_the_plant() -> None:
     assert np.allclose(moved, answer.states[1:], rtol=0.0, atol=1e-9)
 
 
-def test_the_link_tells_how_long_it_may_be_silent() -> None:
+def test_the_link_gives_the_probability_of_silence() -> None:
     """Independent losses: an age of j or more is j losses in a row."""
     link = uavctl.link(uavctl.load("paper", PAPER, link={"loss": 0.3, "probability": []}))
     assert [link.outage(j) for j in range(1, 5)] == pytest.approx([0.3**j for j in range(1, 5)])
@@ -247,7 +247,7 @@ def test_a_flight_records_the_bytes_that_the_command_line_records(
     assert output["ending"] == {name: getattr(flight.ending, name) for name in flight.ending.__struct_fields__}
 
 
-def test_a_flight_tells_where_the_vehicle_truly_was(tmp_path: Path) -> None:
+def test_a_flight_has_the_true_path(tmp_path: Path) -> None:
     flight = uavctl.fly(uavctl.load("paper", PAPER), tmp_path, seed=3, duration_s=4)
     with flight.recording.path.open("rb") as file:
         truth = [json.loads(message.data) for _, _, message in make_reader(file).iter_messages(topics=["/sim/truth"])]
@@ -330,13 +330,13 @@ FILE = "nothing-here.toml"
         (lambda: uavctl.plot(3), UsageError, "a int has no figure"),  # type: ignore[arg-type]
     ],
 )
-def test_what_is_wrong_is_told_plainly(wrong: Callable[[], object], error: type[Exception], message: str) -> None:
+def test_an_error_is_reported_plainly(wrong: Callable[[], object], error: type[Exception], message: str) -> None:
     with pytest.raises(error) as raised:
         wrong()
     assert message in str(raised.value)
 
 
-def test_a_controller_that_asks_for_no_number_is_told() -> None:
+def test_an_infinite_input_is_reported() -> None:
     from uavctl.errors import UavctlError
 
     with pytest.raises(UavctlError, match="step 0"):

@@ -61,7 +61,7 @@ def test_the_front_page_takes_ten_lines_that_the_page_takes_too() -> None:
     assert len([line for line in front.splitlines() if line]) <= 10
 
 
-def test_the_page_tells_of_every_function() -> None:
+def test_the_page_describes_every_function() -> None:
     text = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
     assert [name for name in uavctl.__all__ if f"`{name}" not in text] == []
 

@@ -208,7 +208,7 @@ BEGAN = datetime(2026, 2, 3, 4, 5, 6, 789000, tzinfo=UTC)
 BEGAN_NS = int(BEGAN.timestamp()) * 10**9 + 789_000_000
 
 
-def test_the_time_of_day_is_told(tmp_path: Path) -> None:
+def test_tables_have_the_time_of_day(tmp_path: Path) -> None:
     path = tmp_path / "real.mcap"
     recorder = SyncRecorder(path)
     recorder.put("/uavctl/header", 5_000_000_000, head(5_000_000_000, BEGAN_NS - 5_000_000_000))

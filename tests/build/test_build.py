@@ -69,7 +69,7 @@ def test_a_controller_holds_the_configuration_s_numbers() -> None:
     ("overrides", "asked"),
     [([], True), (["relay.enabled=true"], False), (['source.messages=["LOCAL_POSITION_NED"]'], False)],
 )
-def test_a_velocity_that_is_made_of_our_positions_is_no_witness(overrides: list[str], asked: bool) -> None:
+def test_a_velocity_from_our_positions_is_not_independent(overrides: list[str], asked: bool) -> None:
     config = load_config("room-hahn-stursberg", overrides)
     assert (
         build_controller(config, build_design(load_config("room-hahn-stursberg"))).position_gate.at_rest_mps > 0.0

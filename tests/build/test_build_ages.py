@@ -101,6 +101,6 @@ def test_what_cannot_be_counted_on_is_refused(overrides: list[str], key: str, me
     assert caught.value.key == key
 
 
-def test_the_other_scheme_says_who_takes_late_bursts() -> None:
+def test_the_other_scheme_names_the_model_for_late_bursts() -> None:
     with pytest.raises(DesignError, match="age-conditioned"):
         build_delayed_link(load_config("paper", [*BURSTS, *LATE]))

@@ -105,7 +105,7 @@ def test_a_link_that_no_position_crosses_in_time_is_refused(overrides: list[str]
         (["link.gap=[1.0]"], r"link\.gap: unknown key \(nearest valid name \"gaps\"\)"),
     ],
 )
-def test_a_link_that_cannot_be_is_told_with_its_place(overrides: list[str], message: str) -> None:
+def test_an_impossible_link_is_reported_with_its_key(overrides: list[str], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         load_config("paper", overrides)
 

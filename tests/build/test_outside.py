@@ -94,7 +94,7 @@ def test_a_module_that_is_not_there(module: str) -> None:
         check_kind(f"{module}_not:Still")
 
 
-def test_only_what_plans_is_told_a_trajectory(module: str) -> None:
+def test_only_planners_get_a_trajectory(module: str) -> None:
     motion = "mission.trajectory={times_s=[0.0, 9.0], positions_m=[[0.0, 0.0, -1.0], [1.0, 0.0, -1.0]]}"
     with pytest.raises(DesignError, match="told no trajectory"):
         build_controller(load_config("room", [motion, f"smpc.controller={module}:Still"]))

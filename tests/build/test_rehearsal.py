@@ -90,7 +90,7 @@ def eight_flown_m(config: Config, drag_1ps: float) -> float:
     return float(distances_m(np.array(watched.positions_m)[flies], wanted).mean())
 
 
-def test_the_cost_of_a_drag_that_nobody_identified_is_rehearsed_and_flown() -> None:
+def test_the_cost_of_an_unidentified_drag_is_rehearsed_and_flown() -> None:
     result = rehearsed(along_eight("room-px4", *WIDE))
     assert result.large_drag_m is not None and result.tracking_m is not None
     assert result.depends_on_drag

@@ -89,7 +89,7 @@ def test_solve_shows_people_a_table(capsys: pytest.CaptureFixture[str]) -> None:
     assert "method exact: optimal" in out and "61669.93" in out and "gap" in out and "v_e" in out
 
 
-def test_solve_says_what_gave_way(capsys: pytest.CaptureFixture[str]) -> None:
+def test_solve_names_relaxed_constraints(capsys: pytest.CaptureFixture[str]) -> None:
     outside = "49,-2,-20,-14"
     answer = document(capsys, "solve", "--config", "paper", "--state", outside)
     assert answer["method"] == "exact" and answer["slack"] > 10
@@ -179,7 +179,7 @@ def test_usage_errors_exit_with_2(capsys: pytest.CaptureFixture[str], arguments:
     assert err
 
 
-def test_help_tells_commands_and_exit_codes(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_lists_commands_and_exit_codes(capsys: pytest.CaptureFixture[str]) -> None:
     code, out, _ = typed(capsys, "--help")
     assert code == 0
     assert re.search(r"Exit codes: 0 \w.*; 1 .*; 2 .* configuration", " ".join(out.split()))
@@ -229,7 +229,7 @@ def test_an_interruption_is_one_line(tmp_path: Path) -> None:
     ("arguments", "message"),
     [(["campaign", "x.toml"], "uavctl[campaign]"), (["replay", "x.mcap"], '"replay"'), (["flyy"], '"fly"')],
 )
-def test_without_the_extras_a_command_says_what_it_needs_and_a_wrong_one_is_refused(
+def test_without_extras_a_command_names_the_missing_one_and_a_wrong_command_is_refused(
     arguments: list[str], message: str
 ) -> None:
     code = "import sys; sys.modules['pyarrow'] = None; from uavctl.cli.app import run; sys.exit(run(sys.argv[1:]))"
@@ -251,12 +251,12 @@ def test_a_place_below_zero_is_taken_with_commas_and_with_spaces(
 @pytest.mark.parametrize(
     ("arguments", "message"), [(["-1", "0"], "write three numbers"), (["1", "0", "-1", "--contrl", "x"], "--contrl")]
 )
-def test_a_place_that_is_none_is_told(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_wrong_position_is_refused(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["ctl", "goto", *arguments]) == 2
     assert message in capsys.readouterr().err
 
 
-def test_progress_is_told_in_lines_where_no_bar_can_be_drawn(capsys: pytest.CaptureFixture[str]) -> None:
+def test_progress_is_printed_in_lines_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
     now_s = 0.0
     with make_progress() as progress:
         progress.get_time = lambda: now_s
@@ -289,7 +289,7 @@ def test_the_manual_is_shown_page_by_page(capsys: pytest.CaptureFixture[str]) ->
     assert run(["docs", "../README"]) == 2
 
 
-def test_the_manual_page_tells_every_command_with_its_options() -> None:
+def test_the_manual_page_lists_every_command_with_its_options() -> None:
     text = (ROOT / "docs" / "uavctl.1").read_text(encoding="utf-8").replace("\\-", "-")
     for heading, option in (
         (".SH UAVCTL LOOPBACK", "--takeoff FLOAT"), (".SH UAVCTL FLY", "--realtime"),

@@ -62,9 +62,7 @@ def file(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_fleet_that_can_be_flown_is_told_with_its_nearest_boxes(
-    file: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_valid_fleet_is_reported_with_its_nearest_boxes(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["fleet", "check", str(file), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert [entry["name"] for entry in document["vehicles"]] == ["west", "east"]
@@ -108,14 +106,14 @@ def test_a_fleet_that_cannot_be_flown_is_refused_with_the_place(
         assert expected_text in error_text
 
 
-def test_a_file_that_is_not_there_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_missing_file_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for command in (["check"], ["status"], ["land"], ["fly", "--out", str(tmp_path / "out")]):
         assert run(["fleet", *command[:1], str(tmp_path / "none.toml"), *command[1:]]) == 2
         assert "none.toml" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
-def test_without_daemons_status_and_land_say_so(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_daemons_status_and_land_fail(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["fleet", "status", str(file), "--json"]) == 1
     assert json.loads(capsys.readouterr().out)["vehicles"] == {"west": None, "east": None}
     assert run(["fleet", "land", str(file)]) == 1
@@ -135,7 +133,7 @@ def member(north: tuple[float, float], east: tuple[float, float]) -> Member:
 
 
 @given(INTERVAL, INTERVAL, INTERVAL, INTERVAL)
-def test_places_in_two_boxes_are_as_far_apart_as_is_said(
+def test_positions_in_two_boxes_are_as_far_apart_as_the_reported_gap(
     north: tuple[float, float],
     east: tuple[float, float],
     other_north: tuple[float, float],

@@ -114,7 +114,7 @@ def test_what_is_wrong_in_a_room_is_named_with_its_line(old: str, new: str, key:
     assert refused.value.problems[0].startswith(f"mine.toml:{text.splitlines().index(new) + 1}: {key}: ")
 
 
-def test_a_key_of_the_base_is_told_with_its_place() -> None:
+def test_a_wrong_key_of_the_base_is_reported_with_its_line() -> None:
     with pytest.raises(ConfigError) as refused:
         parse(written("px4") + "\n[smpc]\nhorizon = 1\n", "mine.toml")
     assert refused.value.problems[0].startswith("mine.toml:")

@@ -84,14 +84,14 @@ def told(capsys: pytest.CaptureFixture[str], arguments: Sequence[str]) -> str:
         ("log infoo x", ["info"]),
     ],
 )
-def test_a_wrong_word_is_told_with_what_was_meant(
+def test_a_wrong_argument_is_reported_with_a_suggestion(
     capsys: pytest.CaptureFixture[str], arguments: str, suggested: list[str]
 ) -> None:
     text = told(capsys, arguments.split())
     assert suggested and all(suggestion in text for suggestion in suggested)
 
 
-def test_a_command_without_overrides_is_not_told_to_set_a_key(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_command_without_overrides_suggests_no_key(capsys: pytest.CaptureFixture[str]) -> None:
     for arguments in ("ctl hold --loss 0.3", "log info x.mcap --loss 0.3", "key show a loss=1"):
         assert "--set" not in told(capsys, arguments.split())
 
@@ -108,7 +108,7 @@ def test_a_command_without_overrides_is_not_told_to_set_a_key(capsys: pytest.Cap
         ("loopback --set", ["--set"], "uavctl loopback [OPTIONS]"),
     ],
 )
-def test_words_too_many_or_too_few_are_told_with_what_the_command_takes(
+def test_too_many_or_too_few_arguments_are_reported_with_the_usage(
     capsys: pytest.CaptureFixture[str], arguments: str, unknown: list[str], takes: str
 ) -> None:
     text = told(capsys, arguments.split())
@@ -117,7 +117,9 @@ def test_words_too_many_or_too_few_are_told_with_what_the_command_takes(
 
 
 @pytest.mark.parametrize("command", ["loopback", "fly"])
-def test_a_positive_height_is_told_with_the_number_to_write(capsys: pytest.CaptureFixture[str], command: str) -> None:
+def test_a_positive_height_is_reported_with_the_number_to_write(
+    capsys: pytest.CaptureFixture[str], command: str
+) -> None:
     assert "-1.1" in told(capsys, [command, "--goto", "1,0,1.1"])
     assert "-1.1" in told(capsys, [command, "--set", "target.position_m=[1,0,1.1]"])
 

@@ -86,7 +86,7 @@ def test_a_fence_that_closes_in_is_kept() -> None:
 
 
 @pytest.mark.slow
-def test_at_a_wall_it_settles_where_the_design_lets_it_rest_and_nothing_gives_way() -> None:
+def test_at_a_wall_it_settles_at_the_rest_limit_without_relaxation() -> None:
     result = lockstep("room", 30.0, "sim.seed=4", "target.position_m=[3.0,1.0,-1.2]")
     rests = compute_rest_limits(build_conditioned(load_config("room")))[0]
     settled = [plan for plan in result.of(Plan) if plan.base_ns > 12e9]

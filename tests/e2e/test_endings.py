@@ -145,7 +145,9 @@ def test_the_pilot_takes_over_and_lands(tmp_path: Path, run_flight: RunFlight) -
 
 
 @pytest.mark.slow
-def test_a_failsafe_that_ended_in_the_climb_is_told_with_what_came_after(tmp_path: Path, run_flight: RunFlight) -> None:
+def test_a_failsafe_that_ended_in_the_climb_is_reported_with_the_later_end(
+    tmp_path: Path, run_flight: RunFlight
+) -> None:
     # The vehicle's own climb is longer than ours, so that its failsafe acts before the controller is in charge.
     rig = EndingRig(tmp_path, "sim.checks.invalid=[[0.2, 1.4]]", "sim.checks.clears=true")
     report = run_flight(rig, Cause.TIME, *TAKE_OFF, "--duration", "15", good=True)
@@ -180,7 +182,7 @@ def test_the_operator_orders_the_landing_in_the_climb(tmp_path: Path, run_flight
 
 
 @pytest.mark.slow
-def test_arming_is_refused_in_the_vehicle_s_words(tmp_path: Path, run_flight: RunFlight) -> None:
+def test_refused_arming_is_reported_with_the_vehicle_s_text(tmp_path: Path, run_flight: RunFlight) -> None:
     poor = ("hand_over.ground_s=4.0", "sim.plant=quadrotor", "sim.quadrotor.charge=0.1")
     report = run_flight(EndingRig(tmp_path, *poor), Cause.NOT_ARMED, *TAKE_OFF)
     assert "low battery" in report.ending["sentence"] and "was not armed" in report.ending["sentence"]
@@ -222,13 +224,13 @@ def test_no_positions_come(tmp_path: Path, run_flight: RunFlight) -> None:
 
 
 @pytest.mark.slow
-def test_no_vehicle_is_heard(tmp_path: Path, run_flight: RunFlight) -> None:
+def test_no_heartbeat_is_received(tmp_path: Path, run_flight: RunFlight) -> None:
     rig = EndingRig(tmp_path, "hand_over.ground_s=4.0")
     rig.is_received = lambda data: False
     run_flight(rig, Cause.NO_VEHICLE, *TAKE_OFF)
 
 
-def test_another_vehicle_is_heard(tmp_path: Path, run_flight: RunFlight) -> None:
+def test_a_second_vehicle_is_received(tmp_path: Path, run_flight: RunFlight) -> None:
     second = mavlink.MAVLink(None, srcSystem=9, srcComponent=1)
     beat = bytes(mavlink.MAVLink_heartbeat_message(2, 12, 29, 4 << 16 | 3 << 24, 3, 3).pack(second))
     rig = EndingRig(tmp_path)
@@ -303,7 +305,7 @@ def test_landing_fails(tmp_path: Path, run_flight: RunFlight) -> None:
 
 @pytest.mark.slow
 @pytest.mark.fault(67)
-def test_a_landing_that_is_long_not_heard_of_is_asked_for_until_it_is(tmp_path: Path, run_flight: RunFlight) -> None:
+def test_a_landing_without_an_answer_is_requested_until_it_is_confirmed(tmp_path: Path, run_flight: RunFlight) -> None:
     rig = EndingRig(tmp_path, "hand_over.land_s=8.0").add_step_in(
         HandoverState.ENGAGED, deafen("COMMAND_LONG"), after_s=2.0
     )
@@ -365,7 +367,7 @@ def test_a_failsafe_ends_a_flight_that_the_pilot_began(tmp_path: Path, run_fligh
 
 
 @pytest.mark.slow
-def test_the_vehicle_starts_anew(tmp_path: Path, run_flight: RunFlight) -> None:
+def test_the_vehicle_restarts(tmp_path: Path, run_flight: RunFlight) -> None:
     def young(rig: EndingRig) -> None:
         mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
         for boot_ms in (100, 150):
@@ -480,7 +482,7 @@ def test_a_second_signal_ends_it_at_once(tmp_path: Path, capsys: pytest.CaptureF
 
 
 @pytest.mark.slow
-def test_a_disk_that_takes_no_more_is_told_with_how_it_ended(
+def test_a_full_disk_is_reported_with_the_ending(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fill(_: EndingRig) -> None:
@@ -499,7 +501,7 @@ def test_a_disk_that_takes_no_more_is_told_with_how_it_ended(
 
 
 @pytest.mark.slow
-def test_an_end_that_is_cut_off_is_told_everywhere(
+def test_a_cut_off_end_is_reported_everywhere(
     tmp_path: Path, run_flight: RunFlight, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # The time of a hand-over is longer than that of any request to land, so it takes a shorter one to be cut off.
@@ -510,7 +512,7 @@ def test_an_end_that_is_cut_off_is_told_everywhere(
 
 
 @pytest.mark.slow
-def test_a_simulated_flight_that_is_still_flying_is_told_everywhere(
+def test_a_simulated_flight_that_is_still_flying_is_reported_everywhere(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     arguments = ["loopback", *PRESET, "--duration", "4", "--out", str(tmp_path), "--json"]
@@ -526,7 +528,7 @@ def test_a_simulated_flight_that_is_still_flying_is_told_everywhere(
 
 
 @pytest.mark.slow
-def test_a_recording_that_does_not_say_for_what_it_waited_is_told_alike(
+def test_a_recording_without_the_awaited_state_has_the_same_ending(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     # As an older daemon left it: nobody flew the vehicle, and there is no last word.
@@ -539,7 +541,7 @@ def test_a_recording_that_does_not_say_for_what_it_waited_is_told_alike(
     assert summary.ending.sentence in read_page_text(tmp_path / "again.html")
 
 
-def test_an_end_that_was_cut_off_says_so() -> None:
+def test_a_cut_off_end_has_its_own_cause() -> None:
     course = FlightCourse(engaged=True, flown=True)
     course.stop(Cause.OPERATOR)
     assert course.ending(over=False).cause == Cause.CUT_OFF and course.ending(over=False).exit_code == 1

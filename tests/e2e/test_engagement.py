@@ -76,15 +76,13 @@ def test_a_flight_from_the_ground_to_a_place_and_back(capsys: pytest.CaptureFixt
     assert code == 0 and json.loads(out)["identical"]
 
 
-def test_a_place_that_is_not_reached_is_told_in_the_exit_code(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_an_unreached_target_has_its_exit_code(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     code, _, err = typed(capsys, "loopback", "--goto=-1,-1,-1", "--duration", "1", "--out", str(tmp_path))
     assert code == 1 and "--goto -1,-1,-1 was not reached" in err
 
 
 @pytest.mark.fault(26)
-def test_a_refused_take_off_is_told_with_the_vehicle_s_reason(
+def test_a_refused_take_off_is_reported_with_the_vehicle_s_reason(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     poor = ["--set", "sim.plant=quadrotor", "--set", "sim.quadrotor.charge=0.1", "--set", "hand_over.ground_s=4"]

@@ -117,7 +117,7 @@ def test_row_4_a_late_packet_ages_from_its_capture_and_the_plan_is_rebased() -> 
 
 
 @pytest.mark.fault(5)
-def test_row_5_a_packet_overtaken_by_a_newer_one_is_no_news_but_improves_the_estimate() -> None:
+def test_row_5_an_overtaken_packet_is_not_a_new_measurement_but_improves_the_estimate() -> None:
     older = sample(boundary_ns(2) - 50 * MS, boundary_ns(3) + 10 * MS, position_m=(0.05, 0.0, 0.0))
     newer = sample(boundary_ns(3) - 60 * MS, boundary_ns(3) - 55 * MS)
     ticks = range(5 * TICKS)

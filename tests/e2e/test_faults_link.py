@@ -72,7 +72,7 @@ def test_row_11_a_truncated_datagram_costs_nothing_else(length: int) -> None:
 
 
 @pytest.mark.fault(11)
-def test_row_11_an_oversized_datagram_is_dropped_and_told() -> None:
+def test_row_11_an_oversized_datagram_is_dropped_and_reported() -> None:
     link = make_link()
     (event,) = events(link.receive(GOOD * 2000, NOW).items)
     assert event.text == "link vehicle: dropped 1 oversize"
@@ -112,7 +112,7 @@ def test_row_12_a_sample_with_such_a_value_counts_as_lost(make: Callable[..., by
 
 
 @pytest.mark.fault(16)
-def test_row_16_a_second_vehicle_is_told_and_ignored() -> None:
+def test_row_16_a_second_vehicle_is_reported_and_ignored() -> None:
     link, ours, second_vehicle = make_link(), Peer(1, 1), Peer(2, 1)
     assert len(statuses(link.receive(ours.heartbeat(), NOW).items)) == 1
     reported_events = []
@@ -207,7 +207,7 @@ OFFSET = 40_000 * SECOND
 
 
 @pytest.mark.fault(19)
-def test_row_19_a_long_round_trip_is_an_answer_and_moves_no_clock_that_short_ones_know() -> None:
+def test_row_19_a_long_round_trip_does_not_move_a_clock_of_short_ones() -> None:
     link = make_link()
     assert reply(link, NOW, OFFSET, round_trip_ns=200 * MS)
     assert offset_after(link, NOW, OFFSET) == OFFSET
@@ -245,7 +245,7 @@ def test_row_19_a_drifting_clock_is_followed() -> None:
 
 
 @pytest.mark.fault(20)
-def test_row_20_a_restarted_source_is_found_and_synchronised_anew() -> None:
+def test_row_20_a_restarted_source_is_found_and_synchronised_again() -> None:
     link = make_link()
     source = Source(link)
     assert len(source.send(50)) == 50
@@ -258,7 +258,7 @@ def test_row_20_a_restarted_source_is_found_and_synchronised_anew() -> None:
 
 
 @pytest.mark.fault(20)
-def test_row_20_the_restart_is_told_once() -> None:
+def test_row_20_the_restart_is_reported_once() -> None:
     link = make_link()
     source = Source(link)
     source.send(50)

@@ -56,7 +56,7 @@ class Flight:
 
 
 @pytest.mark.fault(8)
-def test_px4_that_hears_no_setpoints_leaves_offboard_by_itself_and_we_stop() -> None:
+def test_px4_without_setpoints_leaves_offboard_and_setpoints_stop() -> None:
     flight = Flight()
     assert flight.run(3.0).count(SETPOINT) > 50
     assert flight.truths[-1].mode == "OFFBOARD"
@@ -76,7 +76,7 @@ def test_px4_that_hears_no_setpoints_leaves_offboard_by_itself_and_we_stop() -> 
 
 
 @pytest.mark.fault(8)
-def test_ardupilot_that_hears_no_setpoints_brakes_by_itself() -> None:
+def test_ardupilot_without_setpoints_brakes() -> None:
     flight = Flight('sim.autopilot="ardupilot"', "sim.setpoint_timeout_s=3.0")
     flight.run(1.5)
     assert flight.speed_mps > 0.3

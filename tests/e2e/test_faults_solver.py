@@ -146,7 +146,7 @@ def test_row_24_an_answer_of_the_wrong_shape_does_not_fly(fault: str) -> None:
 
 @pytest.mark.fault(24)
 @pytest.mark.parametrize(("value", "sent"), [(50.0, 2.0), (-1e300, -2.0)])
-def test_row_24_an_input_out_of_range_is_clamped_and_the_record_says_so(value: float, sent: float) -> None:
+def test_row_24_an_input_out_of_range_is_clamped_and_recorded_so(value: float, sent: float) -> None:
     controller, _ = with_faults({3: lambda answer: replace(answer, inputs=np.full_like(answer.inputs, value))})
     output = find_boundaries(run(controller, make_inputs(range(4 * TICKS), make_step_samples())))[3]
     assert output.setpoint is not None

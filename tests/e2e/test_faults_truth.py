@@ -87,9 +87,7 @@ def test_holding_after_an_early_freeze_sends_nothing_that_accelerates(prepared: 
 @pytest.mark.slow
 @pytest.mark.fault(14)
 @pytest.mark.parametrize("seed", [0, 2, 22, 32])
-def test_an_early_freeze_is_no_worse_than_a_blackout_where_the_vehicle_says_nothing_itself(
-    prepared: Prepared, seed: int
-) -> None:
+def test_an_early_freeze_is_no_worse_than_a_blackout_without_vehicle_velocity(prepared: Prepared, seed: int) -> None:
     """The link loses the value when it is new, and so what comes first of it is stale already."""
     config = load_config("room-hahn-stursberg", ["sim.camera.message=vision", "link.loss=0.3", f"sim.seed={seed}"])
     frozen = with_faults(config, FaultConfig(at_s=1.3, kind="frozen", for_s=20.0))
@@ -151,7 +149,7 @@ def test_axes_that_are_others_from_the_start_let_it_go_before_it_has_moved_far(
 @pytest.mark.slow
 @pytest.mark.fault(15, 42)
 @pytest.mark.parametrize("axes", ["turned-90", "mirrored-east"])
-def test_without_a_word_of_the_vehicle_itself_positions_against_setpoints_are_enough(
+def test_without_vehicle_velocity_positions_against_setpoints_are_enough(
     prepared: Prepared, quadrotor: Config, axes: str
 ) -> None:
 

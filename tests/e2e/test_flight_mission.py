@@ -174,7 +174,7 @@ def test_a_fence_that_closes_in_slowly_is_kept_by_every_plan() -> None:
     assert plan.gave_way == ()
 
 
-def test_a_fence_that_shuts_the_vehicle_out_gives_way_is_told_and_left() -> None:
+def test_a_fence_that_shuts_the_vehicle_out_is_relaxed_reported_and_left() -> None:
     memory = flown(12.0, *SHUT_OUT)
     given = [plan for plan in memory.of(Plan) if plan.gave_way]
     assert given
@@ -259,7 +259,7 @@ def test_a_mission_goes_on_where_it_was_after_the_pilot_had_the_vehicle() -> Non
     assert [output.decision.waypoint for output in outputs[::TICKS]] == [1, 2, 2, 2, 3, 4]
 
 
-def test_a_plan_that_gives_way_is_one_event_with_the_worst_and_the_number_of_others() -> None:
+def test_a_relaxed_plan_is_one_event_with_the_worst_relaxation_and_the_number_of_others() -> None:
     given = tuple(GaveWay(constraint="equilibrium", stage=3, index=i, amount=0.1 * (i + 1)) for i in range(3))
     solver = StubSolver(small_plant(), faults={1: lambda answer: replace(answer, gave_way=given)})
     outputs = run(make_controller(solver), make_inputs(range(3 * TICKS), make_step_samples()))
@@ -283,7 +283,7 @@ class ListeningSolver(StubSolver):
 
 
 @pytest.mark.parametrize(("late_steps", "wanted"), [(0, 0), (1, 1), (3, 2)])
-def test_a_late_position_is_told_as_far_as_the_design_counts_with_it(late_steps: int, wanted: int) -> None:
+def test_a_late_position_is_reported_up_to_the_late_steps_of_the_design(late_steps: int, wanted: int) -> None:
     solver = ListeningSolver(small_plant())
     controller = replace(make_controller(solver), late_steps=late_steps)
     run(controller, make_inputs(range(8 * TICKS), make_step_samples(delay_ns=430 * MS)))

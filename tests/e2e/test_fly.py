@@ -122,7 +122,7 @@ def test_a_second_daemon_is_refused_before_it_makes_anything(
 
 
 @pytest.mark.slow
-def test_an_end_that_was_asked_for_leaves_no_word_for_the_next_daemon(flown: Flown) -> None:
+def test_a_requested_end_leaves_no_note_for_the_next_daemon(flown: Flown) -> None:
     """The source neither lands nor disarms; yet the next one on this port is flown like any other."""
     url = next(iter(records(flown[3], Header))).command.split("--vehicle ")[1].split()[0]
     assert not any(lock_path.exists() for lock_path in find_lock_paths(url))
@@ -161,7 +161,7 @@ def test_the_recording_replays_identically(flown: Flown) -> None:
 
 
 @pytest.mark.slow
-def test_sigterm_closes_the_recording_even_when_nothing_was_heard(tmp_path: Path) -> None:
+def test_sigterm_closes_the_recording_even_without_a_vehicle(tmp_path: Path) -> None:
     with daemon(free_port(), tmp_path) as process:
         process.send_signal(signal.SIGTERM)
         process.communicate(timeout=LIMIT_S)
@@ -170,14 +170,14 @@ def test_sigterm_closes_the_recording_even_when_nothing_was_heard(tmp_path: Path
 
 
 @pytest.mark.usefixtures("no_page")
-def test_a_duration_closes_the_recording_even_when_nothing_was_heard(tmp_path: Path, control: str) -> None:
+def test_a_duration_closes_the_recording_even_without_a_vehicle(tmp_path: Path, control: str) -> None:
     url = f"udpin://127.0.0.1:{free_port()}"
     places = ["--out", str(tmp_path / "flight"), "--control", control]
     assert run(["fly", "--vehicle", url, "--mocap", url, "--duration", "0.2", *places]) == 1  # ran, but flew nothing
     assert [*records(tmp_path / "flight" / "flight.mcap", Decision)][-1].mode is ControlMode.STOPPED
 
 
-def test_the_pilot_engages_and_nobody_else(flown: Flown) -> None:
+def test_only_the_pilot_engages(flown: Flown) -> None:
     # The table itself is tested in test_mode; here: nobody but the pilot engaged.
     hand_overs = [e.text for e in records(flown[3], Event) if e.code == "hand-over"]
     assert hand_overs[0].startswith("waiting -> engaged")

@@ -105,7 +105,7 @@ def furthest_m(
 @pytest.mark.parametrize(("lie", "seed"), [("frozen", 3), ("step", 11), ("small", 3), ("ramp", 11)])
 @pytest.mark.fault(58)
 @pytest.mark.fault(59)
-def test_a_lie_that_begins_in_a_blackout_is_found_by_the_vehicles_own_velocity(
+def test_an_inertial_error_from_a_blackout_is_found_by_the_vehicle_velocity(
     autopilot: str, lie: str, seed: int
 ) -> None:
     lied_m, events = furthest_m(autopilot, lie, seed)
@@ -117,7 +117,7 @@ def test_a_lie_that_begins_in_a_blackout_is_found_by_the_vehicles_own_velocity(
 @pytest.mark.slow
 @pytest.mark.fault(59)
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
-def test_a_lie_from_the_start_is_found_in_an_early_silence_too(autopilot: str) -> None:
+def test_an_inertial_error_from_the_start_is_found_in_an_early_blackout(autopilot: str) -> None:
     """No position could yet speak for the vehicle's own velocity: what was sent since the flight began does."""
     for seed in (3, 5):
         lied_m, events = furthest_m(autopilot, "offset", seed, "room", (0.4, 5.4), 0.0)
@@ -127,7 +127,7 @@ def test_a_lie_from_the_start_is_found_in_an_early_silence_too(autopilot: str) -
 @pytest.mark.slow
 @pytest.mark.fault(59)
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
-def test_an_own_velocity_that_falls_silent_makes_nothing_doubted(autopilot: str) -> None:
+def test_a_missing_vehicle_velocity_raises_no_inconsistency(autopilot: str) -> None:
     for seed in (3, 5):
         healthy_m, events = furthest_m(autopilot, "", seed, "room", (2.5, 7.5), silent_s=2.5)
         assert healthy_m < -0.4 and "inertial-doubted" not in events
@@ -135,7 +135,7 @@ def test_an_own_velocity_that_falls_silent_makes_nothing_doubted(autopilot: str)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
-def test_what_does_not_lie_is_not_doubted_and_keeps_further_from_walls(autopilot: str) -> None:
+def test_correct_inertial_data_raise_no_inconsistency_and_keep_further_from_walls(autopilot: str) -> None:
     for seed in (3, 11):
         healthy_m, events = furthest_m(autopilot, "", seed)
         without_m, told_without = furthest_m(autopilot, "none", seed)

@@ -103,7 +103,7 @@ def test_nothing_is_sent_after_the_pilot_took_over_even_if_the_mode_comes_back()
     assert max(s.at_ns for s in rig.memory.of(Setpoint)) < released_ns  # what is recorded is what was sent
 
 
-def test_a_late_tick_sends_no_setpoint_once_the_pilot_s_mode_has_been_heard() -> None:
+def test_a_late_tick_sends_no_setpoint_after_the_pilot_s_mode_is_received() -> None:
     rig = Rig()
     rig.run(40)
     rig.heartbeat(HOLD_MODE, late_ns=20_000_000)  # came after the tick's grid time, before the tick ran
@@ -123,7 +123,7 @@ def test_a_take_over_in_a_backlog_counts_before_anything_goes_out_whatever_comes
 @pytest.mark.slow
 @pytest.mark.fault(50)
 @pytest.mark.parametrize("why", ["overrun", "hung-up"])
-def test_where_the_vehicle_s_words_were_lost_nothing_goes_out_until_it_is_heard_again(why: str) -> None:
+def test_after_lost_messages_nothing_is_sent_until_the_next_heartbeat(why: str) -> None:
     rig = Rig('solver.method="exact"')
     rig.run(40)
     rig.loop.refused("mocap", {why: 3}, rig.tick * TICK_NS)  # of the cameras': nothing that could be the pilot's
@@ -143,7 +143,7 @@ def test_where_the_vehicle_s_words_were_lost_nothing_goes_out_until_it_is_heard_
     assert result.identical, result.first_difference
 
 
-def test_a_vehicle_that_fell_silent_is_told_and_its_landing_goes_out_all_the_same() -> None:
+def test_a_silent_vehicle_is_reported_and_its_landing_is_sent() -> None:
     rig = Rig('solver.method="exact"')
     rig.run(40)
     rig.heartbeat(OFFBOARD)
@@ -153,7 +153,7 @@ def test_a_vehicle_that_fell_silent_is_told_and_its_landing_goes_out_all_the_sam
 
 
 @pytest.mark.fault(50)
-def test_the_first_word_of_a_vehicle_whose_connection_was_lost_is_answered_with_the_landing_that_waits() -> None:
+def test_the_first_message_after_a_lost_connection_is_answered_with_the_pending_landing() -> None:
     rig = Rig('solver.method="exact"')
     rig.run(40)
     rig.heartbeat(OFFBOARD)
@@ -268,7 +268,7 @@ def test_row_31_a_restart_is_disarmed_and_asks_for_nothing() -> None:
 
 
 @pytest.mark.usefixtures("control_may_fail")
-def test_an_order_that_no_hand_over_took_is_not_answered_with_what_the_tick_before_said(
+def test_an_order_that_the_hand_over_did_not_take_is_not_answered_with_the_last_reply(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     rig, hold = Rig(), Command(order=Order.HOLD)
@@ -288,7 +288,7 @@ def test_an_order_that_no_hand_over_took_is_not_answered_with_what_the_tick_befo
 
 
 @pytest.mark.usefixtures("control_may_fail")
-def test_what_the_hand_over_answered_stands_if_its_request_cannot_be_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_reply_of_the_hand_over_stays_if_its_request_cannot_be_sent(monkeypatch: pytest.MonkeyPatch) -> None:
     rig, land = Rig("fallback.brake_s=0.0"), Command(order=Order.LAND)
     rig.run(40)
 
@@ -303,7 +303,7 @@ def test_what_the_hand_over_answered_stands_if_its_request_cannot_be_sent(monkey
 
 
 @pytest.mark.usefixtures("control_may_fail")
-def test_what_fails_in_sending_is_no_failure_of_the_controller() -> None:
+def test_a_failure_to_send_is_not_a_failure_of_the_controller() -> None:
     rig = Rig()
     rig.run(40)
 

@@ -76,7 +76,7 @@ def test_over_udp_the_same_peers_fly_in_real_time(tmp_path: Path, capsys: pytest
     assert document(capsys, "log", "replay", str(tmp_path / "f" / "flight.mcap"))["identical"]
 
 
-def test_the_recording_says_how_it_was_made(flown: Path) -> None:
+def test_the_recording_states_its_origin(flown: Path) -> None:
     header = next(records(flown, Header))
     assert header.seed == 3 and header.design["design_id"] == header.design_id
     assert {"uavctl", "python", "numpy", "clarabel"} <= header.versions.keys()
@@ -100,7 +100,7 @@ def test_a_replay_with_another_cost_decides_otherwise(tmp_path: Path, capsys: py
     assert not result["identical"] and result["first_difference"]
 
 
-def test_the_command_tells_what_the_page_says_first(
+def test_the_command_prints_the_first_line_of_the_page(
     flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     page = tmp_path / "page.html"
@@ -113,7 +113,7 @@ def test_the_command_tells_what_the_page_says_first(
         assert sentence in shown and sentence in text
 
 
-def test_recover_restores_a_cut_file_and_says_so_in_its_exit_code(
+def test_recover_restores_a_cut_file_with_its_exit_code(
     flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     cut, whole = tmp_path / "cut.mcap", tmp_path / "whole.mcap"
@@ -143,7 +143,7 @@ def test_recover_restores_a_cut_file_and_says_so_in_its_exit_code(
         (["sim", "--vehicle", "udpout://127.0.0.1"], 2, "udpout://127.0.0.1"),
     ],
 )
-def test_bad_input_is_told_without_a_traceback(
+def test_bad_input_is_reported_without_a_traceback(
     arguments: list[str], code: int, command_line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
@@ -167,7 +167,7 @@ def test_records_of_a_flight_have_the_types_of_their_topics(flown: Path) -> None
 
 
 @pytest.mark.slow
-def test_a_page_that_cannot_be_written_is_told_and_leaves_the_recording(tmp_path: Path) -> None:
+def test_a_page_that_cannot_be_written_is_reported_and_leaves_the_recording(tmp_path: Path) -> None:
     """Page and process that draws it, without the fixture that keeps it from being drawn."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("uavctl.cli.flying.draw_page", lambda *_: None)
@@ -182,7 +182,7 @@ def test_a_page_that_cannot_be_written_is_told_and_leaves_the_recording(tmp_path
     assert path.read_bytes() == before
 
 
-def test_a_flight_without_its_page_is_told_whole(
+def test_a_flight_without_its_page_has_a_complete_summary(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fails(*_: object) -> None:

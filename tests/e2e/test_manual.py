@@ -101,7 +101,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_what_the_tables_name_is_in_the_manual() -> None:
+def test_the_tables_name_commands_of_the_manual() -> None:
     """A row that nothing needs any more would hide the next command that looks like it."""
     every = [command for page in PAGES for command in find_commands(page)]
     assert [row for row in OMITTED if not any(re.search(row, command) for command in every)] == []
@@ -113,7 +113,7 @@ def test_what_the_tables_name_is_in_the_manual() -> None:
 @pytest.mark.parametrize(
     "page", [page for page in PAGES if page not in PAGES_WITH_OWN_TEST and any(map(is_run, find_commands(page)))]
 )
-def test_a_page_s_commands_do_what_they_say(page: str, shell: ManualShell, flown: Path) -> None:
+def test_the_commands_of_a_page_succeed(page: str, shell: ManualShell, flown: Path) -> None:
     shutil.copytree(flown, shell.folder, dirs_exist_ok=True)
     for command in filter(is_run, find_commands(page)):
         if re.match(r"uavctl init ", command):
@@ -155,7 +155,7 @@ AUTOPILOTS = {"px4": "udpin://0.0.0.0:14540", "ardupilot": "tcp://127.0.0.1:5760
 
 @pytest.mark.manual
 @pytest.mark.parametrize("autopilot", AUTOPILOTS)
-def test_the_first_flight_as_the_page_says(autopilot: str, shell: ManualShell) -> None:
+def test_the_first_flight_of_the_page_succeeds(autopilot: str, shell: ManualShell) -> None:
     def on_page(section: str) -> list[str]:
         lines = [
             shorten_command(line.replace("VEHICLE", AUTOPILOTS[autopilot])) for line in find_commands(FIRST, section)
@@ -195,7 +195,7 @@ def test_the_first_flight_as_the_page_says(autopilot: str, shell: ManualShell) -
 
 
 @pytest.mark.manual
-def test_a_fleet_flies_as_the_page_says(shell: ManualShell) -> None:
+def test_the_fleet_of_the_page_flies(shell: ManualShell) -> None:
     page = "docs/fleet.md"
     (sim,) = find_commands(page, "Try it")
     check, fly, *orders = (order for order in find_commands(page) if order != sim)
@@ -215,7 +215,7 @@ def test_a_fleet_flies_as_the_page_says(shell: ManualShell) -> None:
 
 
 @pytest.mark.manual
-def test_orders_do_what_the_page_says(shell: ManualShell) -> None:
+def test_the_orders_of_the_page_succeed(shell: ManualShell) -> None:
     shell.wait_for_text(shell.start(f"uavctl sim --config room-px4 {LONG_TIMEOUT}"), "system_id")
     accepted = f"--set 'check.accept={json.dumps(TIMED_ITEMS + TIMEOUTS)}'"
     flight = shell.start(f"uavctl fly --config room-px4 --arm --takeoff 1.2 {accepted}")

@@ -142,7 +142,7 @@ def test_sigterm_brakes_hands_over_and_closes_the_recording(air: Scene) -> None:
 
 
 @pytest.mark.slow
-def test_the_service_manager_hears_of_the_flight_and_nothing_of_a_hanging_loop(air: Scene) -> None:
+def test_the_service_manager_gets_the_status_and_no_watchdog_of_a_hanging_loop(air: Scene) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(air.folder / "notify"))
         manager.settimeout(LIMIT_S)
@@ -179,7 +179,7 @@ def test_the_service_manager_hears_of_the_flight_and_nothing_of_a_hanging_loop(a
 
 @pytest.mark.slow
 @pytest.mark.fault(55)
-def test_a_recording_that_is_deleted_while_flying_is_told_at_once_and_in_the_end(air: Scene) -> None:
+def test_a_recording_that_is_deleted_while_flying_is_reported_at_once_and_in_the_end(air: Scene) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(air.folder / "notify"))
         manager.settimeout(LIMIT_S)
@@ -220,7 +220,7 @@ os.{call} = hanging
 @pytest.mark.slow
 @pytest.mark.parametrize("call", ["write", "fsync"])
 @pytest.mark.fault(54)
-def test_a_disk_that_hangs_while_flying_is_told_and_the_flight_goes_on(air: Scene, call: str) -> None:
+def test_a_disk_that_hangs_while_flying_is_reported_and_the_flight_goes_on(air: Scene, call: str) -> None:
     flag = air.folder / "hangs"
     (air.folder / "sitecustomize.py").write_text(HANGING.format(call=call, flag=str(flag)))
     with wait_for_end(air.fly("f", environ={**os.environ, "PYTHONPATH": str(air.folder)})) as process:
@@ -240,7 +240,7 @@ def test_a_disk_that_hangs_while_flying_is_told_and_the_flight_goes_on(air: Scen
 
 
 @pytest.mark.slow
-def test_several_daemons_are_told_apart_by_name(air: Scene) -> None:
+def test_several_daemons_are_distinguished_by_name(air: Scene) -> None:
     with open_scene("sim.seed=3") as second:
         second.control = air.control
         with wait_for_end(air.fly("f")) as first, wait_for_end(second.fly("f")) as two:

@@ -61,7 +61,7 @@ def words(name: str) -> list[str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", EVERY)
-def test_no_recorded_vehicle_is_taken_for_one_that_has_started_anew(name: str) -> None:
+def test_no_recorded_vehicle_counts_as_restarted(name: str) -> None:
     assert len(packets(name)) > 1000
     assert {status.boots for _, status in statuses(name)} == {0}
 
@@ -89,11 +89,11 @@ def test_no_recorded_vehicle_is_taken_for_one_that_has_started_anew(name: str) -
         ),
     ],
 )
-def test_modes_and_failsafes_are_seen_as_they_were(name: str, flown: list[str]) -> None:
+def test_modes_and_failsafes_are_parsed_as_recorded(name: str, flown: list[str]) -> None:
     assert words(name) == flown
 
 
-def test_a_recorded_failsafe_that_holds_is_told_from_a_pilot_who_holds() -> None:
+def test_a_recorded_failsafe_that_holds_is_distinguished_from_a_pilot_who_holds() -> None:
     observed = words(OFFBOARD)
     # Its text comes before the heartbeat with the new mode.
     flown = ["AUTO.TAKEOFF", "AUTO.LOITER", "OFFBOARD", "OFFBOARD, failsafe", "AUTO.LOITER, failsafe"]
@@ -222,7 +222,7 @@ def test_the_rig_s_blackouts_rate_and_delays_are_found(name: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", RELAYED)
-def test_all_but_a_hundredth_of_the_positions_come_as_late_as_the_rig_was_told(name: str) -> None:
+def test_all_but_a_hundredth_of_the_positions_have_the_configured_delay(name: str) -> None:
     """Of one flight only those before its wind: 3 s later, and for 43 s, 7 % of the frames came 50 to 95 ms late."""
     until_s = find_event_times_s(BLOWN, "ORDER set SIH_WIND")[0] if name == BLOWN else np.inf
     until_ns = packets(name)[0].at_ns + until_s * 1e9
@@ -232,12 +232,12 @@ def test_all_but_a_hundredth_of_the_positions_come_as_late_as_the_rig_was_told(n
 
 
 @pytest.mark.fault(59)
-def test_the_loss_of_arducopter_s_long_flight_is_also_the_one_the_rig_was_told() -> None:
+def test_the_loss_of_arducopter_s_long_flight_is_the_configured_one() -> None:
     """On the mean of a long flight; the other four met fewer bursts, by their frames as well."""
     assert link(WIND).loss == pytest.approx(0.3, abs=0.02)
 
 
-def test_what_px4_says_of_itself_is_no_camera_s_though_there_is_more_of_it() -> None:
+def test_positions_of_px4_do_not_count_as_camera_positions_though_they_are_more() -> None:
     kinds = [packet.data[7] | packet.data[8] << 8 for packet in packets(WAYPOINTS) if packet.data[5] in (1, 20)]
     assert kinds.count(331) >= kinds.count(102)  # ODOMETRY, VISION_POSITION_ESTIMATE
     assert link(WAYPOINTS).rate_hz == pytest.approx(40.0, rel=0.01)
@@ -403,7 +403,7 @@ def test_cameras_that_fall_silent_are_found_by_the_longest_gap(name: str, since_
     assert items["position in the room"] == GOOD
 
 
-def test_a_link_that_loses_half_of_the_positions_is_told_at_rest() -> None:
+def test_a_link_that_loses_half_of_the_positions_is_reported_at_rest() -> None:
     """In the first 3 s of WIND its bursts took more than half of the frames."""
     stamps_s = frames(WIND).stamps_s
     assert np.count_nonzero((stamps_s > 0.0) & (stamps_s < 3.0)) < 0.5 * 3.0 * CAMERA_HZ
@@ -487,7 +487,7 @@ def _landed(memory: MemorySink) -> None:
     ],
     ids=lambda value: value if isinstance(value, str) and "-" in value else "",
 )
-def test_the_page_of_each_says_what_matters(
+def test_the_page_of_each_flight_names_its_cause(
     name: str, since_s: float, seconds: float, matters: Callable[[MemorySink], Any], on_the_page: str
 ) -> None:
     memory = watch_records(name, since_s, seconds)
@@ -532,7 +532,7 @@ def test_the_wind_beyond_the_authority_is_met_before_it_has_blown_the_vehicle_ou
 
 
 @pytest.mark.slow
-def test_before_the_wind_nothing_is_said_against_the_same_flight() -> None:
+def test_before_the_wind_the_same_flight_has_no_finding() -> None:
     """In 25 s of hovering, and from the blackout's end to the order of the wind."""
     for since_s, seconds in ((20.0, 25.0), (51.0, 5.6)):
         received = listen(BLOWN, since_s, seconds)
@@ -541,7 +541,7 @@ def test_before_the_wind_nothing_is_said_against_the_same_flight() -> None:
 
 
 @pytest.mark.slow
-def test_a_failsafe_in_the_climb_the_pilot_and_the_order_are_each_told_at_their_time() -> None:
+def test_a_failsafe_in_the_climb_the_pilot_and_the_order_are_reported_at_their_times() -> None:
     """Its client had let go for good in the climb, so OFFBOARD is waited for until the operator's order."""
     patient = ("hand_over.engage_s=60.0", "hand_over.tries=100")
     take_off, engage = Command(order=Order.TAKE_OFF, height_m=1.2), Command(order=Order.ENGAGE)

@@ -44,7 +44,7 @@ def test_flights_with_everything_amiss_replay_bit_for_bit(tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-def test_a_flight_whose_replay_differs_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_flight_whose_replay_differs_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     memory = 0
 
     def forgetful(*given: float) -> tuple[tuple[float, float, float], tuple[str, ...]]:

@@ -59,7 +59,7 @@ def is_setpoint(data: bytes) -> bool:
 
 
 @pytest.mark.slow
-def test_a_px4_that_hears_no_order_once_it_climbs_is_found_hovering(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_px4_that_receives_no_order_in_the_climb_is_found_hovering(monkeypatch: pytest.MonkeyPatch) -> None:
     """It has its positions, and holds its height in AUTO.TAKEOFF."""
     flights: list[TakeOffRig] = []
 
@@ -86,7 +86,7 @@ def test_a_px4_that_hears_no_order_once_it_climbs_is_found_hovering(monkeypatch:
 
 
 @pytest.mark.slow
-def test_an_ardupilot_that_hears_no_setpoint_hovers_whatever_the_hand_over_takes_it_for() -> None:
+def test_an_ardupilot_without_setpoints_hovers_in_any_hand_over_state() -> None:
     flight = TakeOffRig("ardupilot", *RELAYED).relayed().take_off()
     flight.run(30.0, until=HandoverState.ENGAGED).run(1.0)
     assert judge_outcome(flight) == "engaged"

@@ -73,7 +73,7 @@ def test_px4_is_flown_before_it_has_climbed_to_its_own_height() -> None:
 
 
 @pytest.mark.fault(26)
-def test_a_refusal_to_arm_ends_it_with_the_vehicle_s_own_words() -> None:
+def test_a_refusal_to_arm_ends_it_with_the_vehicle_s_text() -> None:
     flight = TakeOffRig("px4", "hand_over.ground_s=6.0", "sim.plant=quadrotor", "sim.quadrotor.charge=0.1").take_off()
     flight.run(12.0, until=HandoverState.FAILED)
     assert "low battery" in flight.loop.failure and "TEMPORARILY_REJECTED" in flight.loop.failure
@@ -170,7 +170,7 @@ def test_a_climb_that_never_ends_is_ended_by_landing() -> None:
 
 
 @pytest.mark.fault(20)
-def test_a_vehicle_that_starts_anew_is_not_flown_on() -> None:
+def test_a_restarted_vehicle_gets_no_setpoints() -> None:
     flight = TakeOffRig("px4").take_off().run(6.0)
     mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     for boot_ms in (100, 150):
@@ -182,7 +182,7 @@ def test_a_vehicle_that_starts_anew_is_not_flown_on() -> None:
     }
 
 
-def test_an_ardupilot_without_gps_is_told_a_place_on_the_globe_and_one_with_gps_is_not() -> None:
+def test_only_an_ardupilot_without_gps_gets_a_global_origin() -> None:
     with_gps = TakeOffRig("ardupilot").take_off().run(4.0)
     assert not with_gps.sent("SET_GPS_GLOBAL_ORIGIN")
     relayed = ["relay.enabled=true", "sim.camera.rate_hz=20.0", "link.loss=0.0"]
@@ -195,7 +195,7 @@ def test_an_ardupilot_without_gps_is_told_a_place_on_the_globe_and_one_with_gps_
     assert (origins[0][1].latitude, origins[0][1].altitude) == (473977420, 488000)
 
 
-def test_without_an_order_no_place_on_the_globe_is_told() -> None:
+def test_without_an_order_no_global_origin_is_sent() -> None:
     flight = TakeOffRig("ardupilot")
     for name, value in ARDUPILOT_EXTERNAL.items():
         flight.peers.autopilot.parameters.set(name, value)

@@ -25,7 +25,7 @@ SEEDS = 10
 @pytest.mark.fault(60, 61)
 @BOTH
 @pytest.mark.parametrize("seed", range(SEEDS))
-def test_what_took_off_is_engaged_or_landed_and_who_did_not_is_told_why(autopilot: str, seed: int) -> None:
+def test_a_vehicle_that_took_off_is_engaged_or_landed_and_a_refusal_has_a_reason(autopilot: str, seed: int) -> None:
     flight = is_troubled(autopilot, seed)
     what = judge_at_limit(flight)
     assert what != "hovers", (flight.state, flight.texts)
@@ -36,7 +36,7 @@ def test_what_took_off_is_engaged_or_landed_and_who_did_not_is_told_why(autopilo
 
 @pytest.mark.slow
 @pytest.mark.fault(61)
-def test_px4_whose_failsafe_ends_in_the_climb_arrives_and_a_replay_says_so_too() -> None:
+def test_px4_whose_failsafe_ends_in_the_climb_arrives_and_its_replay_agrees() -> None:
     more = ["sim.checks.invalid=[[0.2, 1.4]]", "sim.checks.clears=true", "sim.checks.flicker_s=1.0"]
     flight = TakeOffRig("px4", *RELAYED, *more).relayed()
     assert judge_at_limit(flight) == "engaged" and not flight.loop.failure
@@ -49,7 +49,7 @@ def test_px4_whose_failsafe_ends_in_the_climb_arrives_and_a_replay_says_so_too()
 
 
 @pytest.mark.fault(61)
-def test_a_person_is_told_on_the_console_what_the_hand_over_has_to_tell() -> None:
+def test_the_console_prints_the_notices_of_the_hand_over() -> None:
     flight = (
         TakeOffRig("px4", *RELAYED, "sim.checks.invalid=[[0.2, 1.4]]", "sim.checks.clears=true").relayed().take_off()
     )
@@ -91,7 +91,7 @@ def test_the_operator_s_end_lands_what_is_in_the_air_with_positions_until_the_gr
 
 @pytest.mark.slow
 @pytest.mark.fault(25, 63)
-def test_the_pilot_s_stick_in_the_climb_is_told_and_keeps_positions_until_the_ground() -> None:
+def test_the_pilot_s_stick_in_the_climb_is_reported_and_positions_go_on_until_the_ground() -> None:
     flight = TakeOffRig("px4", *RELAYED).relayed().take_off()
     flight.run(30.0, until=HandoverState.CLIMBING)
     flight.run(6.0)  # its rotors have spun up
@@ -108,7 +108,7 @@ def test_the_pilot_s_stick_in_the_climb_is_told_and_keeps_positions_until_the_gr
 
 @pytest.mark.fault(62)
 @BOTH
-def test_orders_of_where_to_fly_are_refused_while_it_is_not_we_who_fly(autopilot: str) -> None:
+def test_orders_to_fly_are_refused_unless_the_controller_is_engaged(autopilot: str) -> None:
     flight = TakeOffRig(autopilot)
     moves = (Order.GOTO, Order.HOLD, Order.RESUME)
     assert all(flight.loop.explain_refusal(order) for order in moves)

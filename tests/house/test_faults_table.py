@@ -61,7 +61,7 @@ def test_the_page_has_every_row_in_order_and_complete() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("row", NUMBERS)
-def test_a_row_is_shown_where_the_page_says(row: int) -> None:
+def test_each_row_has_its_tests_in_the_named_files(row: int) -> None:
     shown_by = all_marked()[row]
     assert shown_by, f"no test is marked with fault({row})"
     named = set(re.findall(r"`(\w+)`", rows_of_page()[row][2]))

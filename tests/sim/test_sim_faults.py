@@ -205,7 +205,7 @@ def test_the_command_serves_a_file_of_faults_at_a_multiple_of_real_time(
     assert run(["sim", *links, "--faults", str(tmp_path / "nowhere.toml")]) == 2
 
 
-def test_a_file_that_is_not_there_is_told(tmp_path: Path) -> None:
+def test_a_missing_file_is_reported(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="cannot be read"):
         add_faults(config(), tmp_path / "nowhere.toml", find_fault_problems)
 
