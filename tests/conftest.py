@@ -84,13 +84,13 @@ def _pages_are_drawn_here(monkeypatch: pytest.MonkeyPatch) -> None:
     """
 
     def draw(path: Path, summary: FlightSummary, page: Path) -> None:
-        from report_rig import unwritten
+        from report_rig import omit_figures
 
         from logs.recording.flight import FlightData
         from logs.recording.reader import read
         from logs.report.flight_page import write_report
 
-        with unwritten():
+        with omit_figures():
             write_report(FlightData.from_records(read(path), path), summary, page)
 
     monkeypatch.setattr("uavctl.cli.flying.draw_page", draw)

@@ -22,7 +22,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "support"))
 
-from attack_rig import attacks, stalls  # the tests' own
+from attack_rig import run_attacks, run_stalls  # the tests' own
 from attacker import BELIEVED_UNSIGNED, WORDS
 
 MOST_CPU = 0.15  # processor seconds a second of one sender
@@ -58,7 +58,7 @@ def _attacks(given: argparse.Namespace) -> tuple[list[dict[str, Any]], list[str]
     either = {"yes": (True,), "no": (False,), "both": (False, True)}
     rows, wrong = [], []
     for signed, listed, senders in product(either[given.signed], either[given.listed], given.senders):
-        for row in attacks(
+        for row in run_attacks(
             # Those that end a flight come last.
             sorted(given.kinds, key=lambda kind: kind in BELIEVED_UNSIGNED),
             seconds=given.seconds,
@@ -90,7 +90,7 @@ def _wrong(row: dict[str, Any]) -> list[str]:
 
 def _stalls(given: argparse.Namespace) -> tuple[list[dict[str, Any]], list[str]]:
     rows, wrong = [], []
-    for row in stalls(given.runs, given.seed, given.telemetry_hz, signed=given.signed == "yes"):
+    for row in run_stalls(given.runs, given.seed, given.telemetry_hz, signed=given.signed == "yes"):
         rows.append(row)
         _tell(row)
         if row["setpoints"]:

@@ -24,7 +24,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from logs.recording.tlog import read_tlog
 from sim.simulation import Peers
-from uavctl.build.controller import build_controller, design_of
+from uavctl.build.controller import build_controller, build_flight_design
 from uavctl.config import Config, load_config
 from uavctl.errors import UavctlError
 from uavctl.lab.identify.history import FlightHistory, read_recorded_history, read_tlog_history
@@ -195,7 +195,7 @@ def simulated(autopilot: str, *overrides: str, ends_s: float = LONGEST_S) -> Wat
     """The same, of the simulator."""
     config = load_config(f"room-{autopilot}", [*AS_RECORDED, f"sim.autopilot={autopilot}", *overrides])
     sink, truth = _Sink(), []
-    loop = ControlLoop(config, build_controller(config, design_of(config)), sink, lambda: 0)
+    loop = ControlLoop(config, build_controller(config, build_flight_design(config)), sink, lambda: 0)
     peers = Peers(config, 0, airborne=False)
     for name, value in EXTERNAL_ONLY[config.sim.autopilot].items():
         peers.autopilot.parameters.set(name, value)

@@ -26,7 +26,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT / "tests" / "support"), str(ROOT)]
 os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
-from config_mutants import CONFIG, RECORDING, Case, Mutants, bases, toml_document  # noqa: E402 - the tests' own
+from config_mutants import CONFIG, RECORDING, Case, Mutants, load_bases, toml_document  # noqa: E402 - the tests' own
 
 LIMIT_S = 5.0
 LIMIT_MB = 500
@@ -158,7 +158,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--only", help="one case, as in config/17 or line/3; its folder is kept")
     given = parser.parse_args(arguments)
     _import_all()
-    mutants = Mutants(given.seed, bases())
+    mutants = Mutants(given.seed, load_bases())
     make = {"config": mutants.config, "line": mutants.command_line}
     top = Path(tempfile.mkdtemp(prefix="fuzz-config-"))
     recording = _record(top)
@@ -219,7 +219,7 @@ def _import_all() -> None:
 
 def _record(top: Path) -> str:
     """A recording for the commands that read one."""
-    files = {CONFIG: "\n".join(toml_document(bases()["paper"])) + "\n"}
+    files = {CONFIG: "\n".join(toml_document(load_bases()["paper"])) + "\n"}
     words = ["loopback", "--config", CONFIG, "--duration", "5", "--out", "flight"]
     found = run(Case(words, dict(files)), top / "recorded", "")
     assert found.code == 0, found.text

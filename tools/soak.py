@@ -34,11 +34,11 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "support"))
 
 from chaos import soak_core
-from soak_faults import Batch, fly_faults  # the tests' own
+from soak_faults import FlightBatch, fly_faults  # the tests' own
 from soak_mission import AUTOPILOTS, MISSION, MissionFlight, fly_mission, summary
 from soak_pairs import TrueFlight, fly_pair
-from soak_replay import Replayed, replayed, replayed_apart, tally
-from soak_rig import prepared_for
+from soak_replay import ReplayedFlight, replay_in_process, replay_seed, tally_flights
+from soak_rig import prepare_room
 from soak_take_off import TakeOff, fly_take_off, tally_take_offs
 
 PROCESSES = 2
@@ -79,7 +79,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def missions(seeds: Sequence[int], out: Path) -> list[MissionFlight]:
     """Fly missions of both autopilots in this process; those that went wrong again, recorded."""
-    prepared = prepared_for(*MISSION)
+    prepared = prepare_room(*MISSION)
     flights = [fly_mission(prepared, autopilot, seed) for autopilot in AUTOPILOTS for seed in seeds]
     for flight in flights:
         if not flight.good:
@@ -87,14 +87,14 @@ def missions(seeds: Sequence[int], out: Path) -> list[MissionFlight]:
     return flights
 
 
-def faults(first: int, hours: float, out: Path) -> Batch:
+def faults(first: int, hours: float, out: Path) -> FlightBatch:
     """Fly with faults in this process."""
-    return fly_faults(prepared_for(), first, hours, WARM_UP, out)
+    return fly_faults(prepare_room(), first, hours, WARM_UP, out)
 
 
 def pairs(seeds: Sequence[int], out: Path) -> list[TrueFlight]:
     """Fly pairs of faults in this process; those that went wrong again, recorded."""
-    prepared = prepared_for()
+    prepared = prepare_room()
     flights = [fly_pair(prepared, seed) for seed in seeds]
     for flight in flights:
         if flight.wrong:
@@ -196,24 +196,24 @@ def _core(pool: ProcessPoolExecutor, given: argparse.Namespace) -> tuple[dict[st
     return report, not report["late"] and not report["unsound"]
 
 
-def replays(seed: int, out: Path) -> Replayed:
+def replays(seed: int, out: Path) -> ReplayedFlight:
     """Fly and replay a seed, every tenth in a process of its own too; the recording of a difference is kept."""
-    found = replayed(seed, out)
+    found = replay_seed(seed, out)
     if found.result.identical and seed % APART_EVERY == 0:
-        found = replace(found, apart=replayed_apart(found.path))
-    if found.good:
+        found = replace(found, process_difference=replay_in_process(found.path))
+    if found.is_identical:
         shutil.rmtree(found.path.parent)
     return found
 
 
 def _replays(pool: ProcessPoolExecutor, given: argparse.Namespace) -> tuple[dict[str, object], bool]:
     waiting = [pool.submit(replays, seed, given.out) for seed in range(given.first, given.first + given.seeds)]
-    found: list[Replayed] = []
+    found: list[ReplayedFlight] = []
     for done in as_completed(waiting):
         found.append(done.result())
         sys.stderr.write(f"\r{len(found)} of {given.seeds} flights ")
     sys.stderr.write("\n")
-    return tally(found), all(one.good for one in found)
+    return tally_flights(found), all(one.is_identical for one in found)
 
 
 _SCENARIOS = {

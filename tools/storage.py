@@ -34,12 +34,12 @@ from pathlib import Path
 os.environ["OPENBLAS_NUM_THREADS"] = "1"  # the process is forked, so it may have no threads
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "support"))
 
-from cost_rig import cost, flown_ticks  # the tests' own
-from cut_rig import NAME, Cuts, alike, refused
-from flip_rig import Flips
-from kill_rig import KINDS, LOG, Killed, kill_once, truth
-from operation_rig import ended, scene
-from report_rig import unpaged
+from cost_rig import flown_ticks, measure_cost  # the tests' own
+from cut_rig import NAME, Cuts, check_cut, check_refusal
+from flip_rig import FlipTest
+from kill_rig import KINDS, LOG, KillResult, kill_once, truth
+from operation_rig import open_scene, wait_for_end
+from report_rig import omit_pages
 
 from uavctl.cli.app import run
 
@@ -76,7 +76,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _kills(first: int, runs: int) -> tuple[dict[str, str], dict[str, object]]:
     items = truth()
-    found: list[Killed] = []
+    found: list[KillResult] = []
     for seed in range(first, first + runs):
         with tempfile.TemporaryDirectory(prefix="uavctl-kill-") as folder:
             found.append(kill_once(Path(folder), KINDS[seed % len(KINDS)], seed, items))
@@ -86,7 +86,7 @@ def _kills(first: int, runs: int) -> tuple[dict[str, str], dict[str, object]]:
     return wrong, {"runs": runs, "chunk_bytes": LOG.chunk_bytes, **report}
 
 
-def _figures(found: Sequence[Killed]) -> dict[str, int]:
+def _figures(found: Sequence[KillResult]) -> dict[str, int]:
     """Sums and extremes of the runs of one kind."""
     return {
         "runs": len(found),
@@ -104,18 +104,18 @@ def _flips() -> tuple[dict[str, str], dict[str, object]]:
     report: dict[str, object] = {}
     for state in ("finished", "torn"):
         with tempfile.TemporaryDirectory(prefix="uavctl-flip-") as folder:
-            flips = Flips(Path(folder), finished=state == "finished")
-            refused = 0
+            flips = FlipTest(Path(folder), finished=state == "finished")
+            check_refusal = 0
             for position in range(len(flips.data)):
                 _tell(f"{state}: {position} of {len(flips.data)}")
                 flips.flip(position, 1 << position % 8)
                 try:
-                    refused += flips.read()
+                    check_refusal += flips.read()
                     flips.look()
                     flips.recover()
                 except AssertionError as error:
                     wrong[f"{state}, byte {position}"] = repr(error)
-            report[state] = {"bytes": len(flips.data), "refused": refused}
+            report[state] = {"bytes": len(flips.data), "refused": check_refusal}
     return wrong, report
 
 
@@ -124,7 +124,7 @@ def _costs(runs: int, seconds: float) -> tuple[dict[str, str], dict[str, object]
     found: list[dict[str, float]] = []
     for _ in range(runs):
         with tempfile.TemporaryDirectory(prefix="uavctl-cost-") as folder:
-            found.append(cost(Path(folder), ticks, seconds))
+            found.append(measure_cost(Path(folder), ticks, seconds))
         _tell(f"{len(found)} of {runs}")
     wrong = {str(number): "records dropped" for number, one in enumerate(found) if one["dropped"]}
     report = {key: round(statistics.median(one[key] for one in found), 2) for key in found[0]}
@@ -135,12 +135,12 @@ def _cuts(seed: int, runs: int) -> tuple[dict[str, str], dict[str, object]]:
     wrong: dict[str, str] = {}
     with tempfile.TemporaryDirectory(prefix="uavctl-cuts-") as flown:
         words = ["loopback", *FLIGHT, "--duration", "5", "--out", flown, "--json"]
-        with unpaged(), redirect_stdout(io.StringIO()):
+        with omit_pages(), redirect_stdout(io.StringIO()):
             run(words)
         cuts = Cuts(Path(flown) / NAME)
-        for number, (file, size) in enumerate(cuts.drawn(runs, seed), 1):
+        for number, (file, size) in enumerate(cuts.draw_cuts(runs, seed), 1):
             with tempfile.TemporaryDirectory(prefix="uavctl-cut-") as folder:
-                text = cuts.wrong(Path(folder), file, size)
+                text = cuts.find_problem(Path(folder), file, size)
             if text:
                 wrong[f"file {file + 1}, {size} bytes"] = text
             _tell(f"{number} of {runs}")
@@ -152,7 +152,7 @@ def _killed_flights(first: int, runs: int) -> tuple[dict[str, str], dict[str, ob
     wrong: dict[str, str] = {}
     decisions = files = nothing = 0
     for seed in range(first, first + runs):
-        with scene() as air, ended(air.fly("f", *FLIGHT)) as process:
+        with open_scene() as air, wait_for_end(air.fly("f", *FLIGHT)) as process:
             assert process.stderr is not None
             while "recording to" not in process.stderr.readline():
                 assert process.poll() is None, "the daemon does not start"
@@ -162,10 +162,10 @@ def _killed_flights(first: int, runs: int) -> tuple[dict[str, str], dict[str, ob
             left = [*(air.folder / "f").glob("*.mcap")]
             files = max(files, len(left))
             if any(one.stat().st_size for one in left):
-                text, compared = alike(air.folder / "f", ended=False)
+                text, compared = check_cut(air.folder / "f", ended=False)
                 decisions += compared
             else:
-                text = refused(air.folder / "f")
+                text = check_refusal(air.folder / "f")
                 nothing += 1
         if text:
             wrong[str(seed)] = text

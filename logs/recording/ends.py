@@ -14,7 +14,7 @@ from logs.recording.disk import check_free_space, remove_empty_folders
 from logs.recording.recorder import RecorderStatus
 from logs.recording.topics import HEADER
 from uavctl.account import report_lost_records
-from uavctl.build.controller import Prepared, cpu, record_of, versions
+from uavctl.build.controller import Prepared, collect_versions, make_design_record, read_cpu_model
 from uavctl.clock import VIRTUAL_ZERO_UTC_NS
 from uavctl.config.load import dump_config
 from uavctl.records import Ending, Header, Sink
@@ -62,9 +62,9 @@ def put_header(
         command=shlex.join(["uavctl", *sys.argv[1:]]) if command is None else command,
         config_toml=dump_config(config),
         design_id=design.design_id,
-        design=record_of(design),
-        versions=versions(config.smpc.controller),
-        cpu=cpu(),
+        design=make_design_record(design),
+        versions=collect_versions(config.smpc.controller),
+        cpu=read_cpu_model(),
         zero_utc_ns=zero_utc_ns,
         platform=platform.platform(),
     )

@@ -12,7 +12,7 @@ from logs.recording.flight import FlightData
 from logs.recording.summary import count
 from logs.report.statistics import Share, autocorrelation, estimate_share, two_sided_quantile
 from uavctl.arrays import Array
-from uavctl.build.link import build_ages, build_delayed_link, promised
+from uavctl.build.link import build_ages, build_delayed_link, compute_promised_probability
 from uavctl.config import Config
 from uavctl.errors import DesignError
 from uavctl.event_codes import EventCode
@@ -133,7 +133,7 @@ def _compute_promises(config: Config | None) -> tuple[float | None, tuple[float,
             )
         else:
             model = build_delayed_link(config)
-            ages, promised_new = model.age(_STATIONARY_STEPS)[_STATIONARY_STEPS], promised(model)
+            ages, promised_new = model.age(_STATIONARY_STEPS)[_STATIONARY_STEPS], compute_promised_probability(model)
     except DesignError:
         return None, ()
     relevant = ages[: np.flatnonzero(ages > _NEGLIGIBLE_SHARE)[-1] + 1].tolist()

@@ -41,14 +41,14 @@ def test_loading_and_solving_loads_neither_matplotlib_nor_cvxpy() -> None:
     assert done.stdout == "[]\n"
 
 
-def test_types_are_told_of_exactly_the_public_names() -> None:
+def test_exactly_the_public_names_have_types() -> None:
     stub = ast.parse((ROOT / "uavctl" / "__init__.pyi").read_text(encoding="utf-8"))
     imports = [node for node in stub.body if isinstance(node, ast.ImportFrom)]
-    told = {str(alias.asname): str(node.module) for node in imports for alias in node.names}
-    assert sorted(told) == sorted(uavctl.__all__)
-    for name, module in told.items():
+    module_by_name = {str(alias.asname): str(node.module) for node in imports for alias in node.names}
+    assert sorted(module_by_name) == sorted(uavctl.__all__)
+    for name, module in module_by_name.items():
         assert getattr(uavctl, name) is getattr(sys.modules[module], name)
-    assert set(told) <= set(dir(uavctl))
+    assert set(module_by_name) <= set(dir(uavctl))
 
 
 def test_a_name_that_is_none_is_refused_as_of_any_module() -> None:
@@ -57,7 +57,7 @@ def test_a_name_that_is_none_is_refused_as_of_any_module() -> None:
 
 
 @pytest.mark.parametrize("name", ["sim.py", "logs/__init__.py"])
-def test_a_module_of_the_same_name_that_hides_ours_is_told(name: str, tmp_path: Path) -> None:
+def test_a_module_of_the_same_name_that_hides_ours_is_reported(name: str, tmp_path: Path) -> None:
     path = tmp_path / name
     path.parent.mkdir(exist_ok=True)
     path.touch()
@@ -125,16 +125,16 @@ def test_a_configuration_can_be_changed_again_and_read_from_a_file(tmp_path: Pat
 def test_a_decision_is_that_of_the_command_line(
     config: str, state: list[float], typed: tuple[str, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    given = dict(one.split("=") for one in typed)
+    given = dict(setting.split("=") for setting in typed)
     answer = uavctl.solve(uavctl.load(config, given), state)
-    words = [word for one in typed for word in ("--set", one)]
-    run(["solve", "--config", config, "--state", ",".join(map(str, state)), "--json", *words])
-    told = json.loads(capsys.readouterr().out)
-    assert told["status"] == answer.status.value == SolveStatus.OPTIMAL
+    arguments = [argument for setting in typed for argument in ("--set", setting)]
+    run(["solve", "--config", config, "--state", ",".join(map(str, state)), "--json", *arguments])
+    output = json.loads(capsys.readouterr().out)
+    assert output["status"] == answer.status.value == SolveStatus.OPTIMAL
     for name in ("inputs", "states", "backoff_x", "backoff_u", "reference"):
-        assert told[name] == getattr(answer, name).tolist()
+        assert output[name] == getattr(answer, name).tolist()
     for name in ("cost", "slack", "offset", "iterations", "method"):
-        assert told[name] == getattr(answer, name)
+        assert output[name] == getattr(answer, name)
 
 
 def test_a_plan_follows_the_plant() -> None:
@@ -143,7 +143,7 @@ def test_a_plan_follows_the_plant() -> None:
     assert np.allclose(moved, answer.states[1:], rtol=0.0, atol=1e-9)
 
 
-def test_the_link_tells_how_long_it_may_be_silent() -> None:
+def test_the_link_gives_the_probability_of_silence() -> None:
     """Independent losses: an age of j or more is j losses in a row."""
     link = uavctl.link(uavctl.load("paper", PAPER, link={"loss": 0.3, "probability": []}))
     assert [link.outage(j) for j in range(1, 5)] == pytest.approx([0.3**j for j in range(1, 5)])
@@ -165,14 +165,14 @@ def test_a_stepped_controller_does_as_a_simulated_run_did(kind: str) -> None:
 
 def test_controllers_meet_the_same_draws() -> None:
     config = uavctl.load("room", link={"loss": 0.5})
-    ours, theirs, other = (
+    ours, theirs, other_seed = (
         uavctl.simulate(config, kind, runs=4, steps=20, seed=seed)
         for kind, seed in (("smpc", 1), ("lqg", 1), ("lqg", 2))
     )
     assert np.array_equal(ours.age_steps, theirs.age_steps)
-    assert not np.array_equal(other.age_steps, theirs.age_steps)
+    assert not np.array_equal(other_seed.age_steps, theirs.age_steps)
     plant = uavctl.plant(config)
-    moved = [one.states[:, 1:] - one.states[:, :-1] @ plant.a.T - one.inputs @ plant.b.T for one in (ours, theirs)]
+    moved = [runs.states[:, 1:] - runs.states[:, :-1] @ plant.a.T - runs.inputs @ plant.b.T for runs in (ours, theirs)]
     assert np.allclose(moved[0], moved[1], rtol=0.0, atol=1e-9)
     assert np.abs(moved[0]).max() > 1e-3
     longer = uavctl.simulate(config, "lqg", runs=2, steps=25, seed=1)
@@ -205,7 +205,7 @@ def test_simulated_runs_are_those_of_a_campaign(
     assert run(["campaign", str(spec), "--out", str(tmp_path / "out"), "--workers", "1", "--json"]) == 0
     capsys.readouterr()
     table = pq.read_table(tmp_path / "out" / "runs.parquet")
-    found = uavctl.simulate(
+    result = uavctl.simulate(
         uavctl.load("room", {"link.loss": 0.5}),
         kind,
         runs=runs,
@@ -213,9 +213,9 @@ def test_simulated_runs_are_those_of_a_campaign(
         seed=9,
         measured=measured,  # type: ignore[arg-type]
     )
-    assert found.cost.sum(axis=1).tolist() == table["cost"].to_pylist()
-    assert found.state_violated.sum(axis=1).tolist() == table["state_violations"].to_pylist()
-    assert found.age_steps.max(axis=1).tolist() == table["max_age"].to_pylist()
+    assert result.cost.sum(axis=1).tolist() == table["cost"].to_pylist()
+    assert result.state_violated.sum(axis=1).tolist() == table["state_violations"].to_pylist()
+    assert result.age_steps.max(axis=1).tolist() == table["max_age"].to_pylist()
 
 
 _MEASURED = ("/uavctl/header", "/uavctl/timing", "/plot/timing", "/uavctl/recorder")
@@ -224,8 +224,10 @@ _MEASURED = ("/uavctl/header", "/uavctl/timing", "/plot/timing", "/uavctl/record
 def recorded(path: Path) -> list[tuple[str, int, bytes]]:
     """All messages by mcap's own reader, but what is measured with a clock, and when it was."""
     with path.open("rb") as file:
-        found = [(channel.topic, one.log_time, one.data) for _, channel, one in make_reader(file).iter_messages()]
-    return [one for one in found if one[0] not in _MEASURED]
+        results = [
+            (channel.topic, message.log_time, message.data) for _, channel, message in make_reader(file).iter_messages()
+        ]
+    return [message for message in results if message[0] not in _MEASURED]
 
 
 @pytest.mark.parametrize(("name", "more"), [("paper", PAPER), ("room", {"link.loss": 0.4})])
@@ -233,24 +235,24 @@ def test_a_flight_records_the_bytes_that_the_command_line_records(
     name: str, more: dict[str, object], tmp_path: Path, capsys: pytest.CaptureFixture[str], no_page: None
 ) -> None:
     flight = uavctl.fly(uavctl.load(name, more), tmp_path / "python", seed=3, duration_s=3)
-    words = [word for key, value in more.items() for word in ("--set", f"{key}={value}")]
+    arguments = [argument for key, value in more.items() for argument in ("--set", f"{key}={value}")]
     out = ["--out", str(tmp_path / "typed")]
-    assert run(["loopback", "--config", name, *words, "--seed", "3", "--duration", "3", "--json", *out]) == 0
-    told = json.loads(capsys.readouterr().out)
+    assert run(["loopback", "--config", name, *arguments, "--seed", "3", "--duration", "3", "--json", *out]) == 0
+    output = json.loads(capsys.readouterr().out)
     assert flight.recording.path == tmp_path / "python" / "flight.mcap"
-    ours, theirs = recorded(flight.recording.path), recorded(Path(told["recording"]))
+    ours, theirs = recorded(flight.recording.path), recorded(Path(output["recording"]))
     assert len(ours) > 100
     assert {topic for topic, _, _ in ours} >= {"/uavctl/decision", "/uavctl/step_input", "/uavctl/end"}
     assert ours == theirs
-    assert told["ending"] == {name: getattr(flight.ending, name) for name in flight.ending.__struct_fields__}
+    assert output["ending"] == {name: getattr(flight.ending, name) for name in flight.ending.__struct_fields__}
 
 
-def test_a_flight_tells_where_the_vehicle_truly_was(tmp_path: Path) -> None:
+def test_a_flight_has_the_true_path(tmp_path: Path) -> None:
     flight = uavctl.fly(uavctl.load("paper", PAPER), tmp_path, seed=3, duration_s=4)
     with flight.recording.path.open("rb") as file:
-        truth = [json.loads(one.data) for _, _, one in make_reader(file).iter_messages(topics=["/sim/truth"])]
-    assert flight.position_m.tolist() == [one["position_m"] for one in truth]
-    assert flight.velocity_mps.tolist() == [one["velocity_mps"] for one in truth]
+        truth = [json.loads(message.data) for _, _, message in make_reader(file).iter_messages(topics=["/sim/truth"])]
+    assert flight.position_m.tolist() == [truth_record["position_m"] for truth_record in truth]
+    assert flight.velocity_mps.tolist() == [truth_record["velocity_mps"] for truth_record in truth]
     assert np.allclose(np.diff(flight.time_s), flight.config.plant.dt_s)
     assert flight.config == flight.recording.config
     assert flight.config.sim.seed == 3
@@ -266,7 +268,7 @@ def test_a_flight_from_python_has_its_page_and_its_figure(tmp_path: Path) -> Non
     for what in (flight, flight.recording):
         (ax,) = uavctl.plot(what).axes
         drawn = [np.asarray(line.get_xydata()) for line in ax.lines]
-        assert any(np.allclose(one[-1], flight.position_m[-1, [1, 0]]) for one in drawn if len(one) > 1)
+        assert any(np.allclose(line[-1], flight.position_m[-1, [1, 0]]) for line in drawn if len(line) > 1)
 
 
 def test_a_figure_shows_the_plan() -> None:
@@ -282,17 +284,17 @@ def test_a_figure_of_runs_shows_paths_target_and_limits() -> None:
     for number, (ax, place) in enumerate(zip(axes, config.target.position_m, strict=True)):
         drawn = [np.asarray(line.get_ydata()) for line in ax.lines]
         path = np.median(runs.states[:, :, 3 * number], axis=0)
-        assert any(len(one) == len(path) and np.allclose(one, path) for one in drawn)
-        levels = [float(one[0]) for one in drawn if len(one) and np.allclose(one, one[0])]
+        assert any(len(line) == len(path) and np.allclose(line, path) for line in drawn)
+        levels = [float(line[0]) for line in drawn if len(line) and np.allclose(line, line[0])]
         for level in (place, config.sets.state_lower[3 * number], config.sets.state_upper[3 * number]):
-            assert any(level == pytest.approx(one) for one in levels)
+            assert any(level == pytest.approx(drawn_level) for drawn_level in levels)
 
 
 FILE = "nothing-here.toml"
 
 
 @pytest.mark.parametrize(
-    ("wrong", "error", "told"),
+    ("wrong", "error", "message"),
     [
         (lambda: uavctl.load("rom"), ConfigError, 'nearest valid name "room"'),
         (lambda: uavctl.load(Path(FILE)), ConfigError, FILE),
@@ -328,13 +330,13 @@ FILE = "nothing-here.toml"
         (lambda: uavctl.plot(3), UsageError, "a int has no figure"),  # type: ignore[arg-type]
     ],
 )
-def test_what_is_wrong_is_told_plainly(wrong: Callable[[], object], error: type[Exception], told: str) -> None:
+def test_an_error_is_reported_plainly(wrong: Callable[[], object], error: type[Exception], message: str) -> None:
     with pytest.raises(error) as raised:
         wrong()
-    assert told in str(raised.value)
+    assert message in str(raised.value)
 
 
-def test_a_controller_that_asks_for_no_number_is_told() -> None:
+def test_an_infinite_input_is_reported() -> None:
     from uavctl.errors import UavctlError
 
     with pytest.raises(UavctlError, match="step 0"):
@@ -375,10 +377,10 @@ def test_a_flight_may_begin_on_the_ground_as_the_command_line_s_does(
 ) -> None:
     given = uavctl.load("room", {"link.loss": 0.3})
     flight = uavctl.fly(given, tmp_path / "python", seed=3, duration_s=18, take_off_m=1.0, goto=(0.5, 0.0, -1.1))
-    words = "loopback --set link.loss=0.3 --seed 3 --duration 18 --arm --takeoff 1.0 --goto 0.5,0,-1.1 --json --out"
-    assert run([*words.split(), str(tmp_path / "typed")]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert recorded(flight.recording.path) == recorded(Path(told["recording"]))
+    arguments = "loopback --set link.loss=0.3 --seed 3 --duration 18 --arm --takeoff 1.0 --goto 0.5,0,-1.1 --json --out"
+    assert run([*arguments.split(), str(tmp_path / "typed")]) == 0
+    output = json.loads(capsys.readouterr().out)
+    assert recorded(flight.recording.path) == recorded(Path(output["recording"]))
     heights_m = -flight.position_m[:, 2]
     assert heights_m[0] == 0.0 and heights_m.max() > 0.9 and heights_m[-1] < 0.05
     assert np.hypot(flight.position_m[:, 0] - 0.5, flight.position_m[:, 1]).min() < 0.1

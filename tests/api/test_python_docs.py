@@ -34,12 +34,12 @@ def source(cell: Any) -> str:
 
 
 def printed(cell: Any) -> str:
-    return "".join(one.text for one in cell.outputs if one.output_type == "stream" and one.name == "stdout")
+    return "".join(output.text for output in cell.outputs if output.output_type == "stream" and output.name == "stdout")
 
 
 def kinds(cell: Any) -> set[str]:
     """Kinds of what a cell shows beside text."""
-    return {kind for one in cell.outputs if one.output_type != "stream" for kind in one.get("data", {})}
+    return {kind for output in cell.outputs if output.output_type != "stream" for kind in output.get("data", {})}
 
 
 def public(code: str) -> list[str]:
@@ -61,7 +61,7 @@ def test_the_front_page_takes_ten_lines_that_the_page_takes_too() -> None:
     assert len([line for line in front.splitlines() if line]) <= 10
 
 
-def test_the_page_tells_of_every_function() -> None:
+def test_the_page_describes_every_function() -> None:
     text = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
     assert [name for name in uavctl.__all__ if f"`{name}" not in text] == []
 
@@ -77,28 +77,28 @@ def test_the_page_runs_as_written(
     ours, theirs = names["ours"], names["theirs"]
     assert isinstance(ours, uavctl.Runs) and isinstance(theirs, uavctl.Runs)
     assert ours.state_violated.mean() <= 0.05 and theirs.state_violated.mean() >= 0.2
-    told = capsys.readouterr().out.splitlines()
+    output = capsys.readouterr().out.splitlines()
     # The front page says these figures, and that they cost more.
     text = " ".join((ROOT / "README.md").read_text(encoding="utf-8").split())
-    assert f"`{told[0]}`" in text
+    assert f"`{output[0]}`" in text
     assert ours.cost.sum(axis=1).mean() > theirs.cost.sum(axis=1).mean()
     assert (tmp_path / "path.png").read_bytes().startswith(b"\x89PNG")
     assert isinstance(names["page"], Path)
     assert names["page"].exists()
-    assert told[1].startswith("Still flying.")
-    assert told[-1].startswith("--set link.los=0.3: link.los: unknown key")
+    assert output[1].startswith("Still flying.")
+    assert output[-1].startswith("--set link.los=0.3: link.los: unknown key")
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_is_whole_and_public(path: Path) -> None:
     nbformat.validate(nbformat.read(path, as_version=4))
-    found = cells(path)
-    assert len(found) >= 5
-    assert [cell.execution_count for cell in found] == list(range(1, len(found) + 1))
-    assert all(cell.outputs for cell in found)
-    assert not [one for cell in found for one in cell.outputs if one.output_type == "error"]
-    assert any("image/png" in kinds(cell) for cell in found)
-    code = "\n".join(map(source, found))
+    result = cells(path)
+    assert len(result) >= 5
+    assert [cell.execution_count for cell in result] == list(range(1, len(result) + 1))
+    assert all(cell.outputs for cell in result)
+    assert not [output for cell in result for output in cell.outputs if output.output_type == "error"]
+    assert any("image/png" in kinds(cell) for cell in result)
+    code = "\n".join(map(source, result))
     assert set(public(code)) <= set(uavctl.__all__)
     assert "_" not in {name[0] for name in re.findall(r"\.(\w+)", code)}
     text = path.read_text(encoding="utf-8")

@@ -27,37 +27,43 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 def messages(path: Path, topic: str) -> list[tuple[float, bytes]]:
     """Times [s] since the first message of the file, and bytes, by mcap's own reader."""
     with path.open("rb") as file:
-        found = [(channel.topic, one.log_time, one.data) for _, channel, one in make_reader(file).iter_messages()]
-    begun = next(at_ns for name, at_ns, _ in found if name == "/uavctl/header")
-    return [((at_ns - begun) * 1e-9, data) for name, at_ns, data in found if name == topic]
+        results = [
+            (channel.topic, message.log_time, message.data) for _, channel, message in make_reader(file).iter_messages()
+        ]
+    begun = next(at_ns for name, at_ns, _ in results if name == "/uavctl/header")
+    return [((at_ns - begun) * 1e-9, data) for name, at_ns, data in results if name == topic]
 
 
 def cells(value: object, name: str) -> dict[str, object]:
     """A JSON value by the columns that docs/recordings.md says it has; lists of records are counted."""
     if isinstance(value, dict):
-        return {key: cell for part, one in value.items() for key, cell in cells(one, f"{name}.{part}").items()}
-    if isinstance(value, list) and any(isinstance(one, dict) for one in value):
+        return {
+            key: cell
+            for part, field_value in value.items()
+            for key, cell in cells(field_value, f"{name}.{part}").items()
+        }
+    if isinstance(value, list) and any(isinstance(entry, dict) for entry in value):
         return {name: len(value)}
     if isinstance(value, list):
         marks = "xyz" if name.endswith(("_m", "_mps", "_mps2", "_rad")) and len(value) == 3 else range(len(value))
         each = zip(marks, value, strict=True)
-        return {key: cell for mark, one in each for key, cell in cells(one, f"{name}_{mark}").items()}
+        return {key: cell for mark, entry in each for key, cell in cells(entry, f"{name}_{mark}").items()}
     return {name: value}
 
 
 NON_FINITE = {"NaN": float("nan"), "Infinity": float("inf"), "-Infinity": float("-inf")}
 
 
-def same(one: object, other: object) -> bool:
-    other = NON_FINITE.get(other, other) if isinstance(one, float) and isinstance(other, str) else other
-    return one == other or (one != one and other != other)
+def same(first: object, second: object) -> bool:
+    second = NON_FINITE.get(second, second) if isinstance(first, float) and isinstance(second, str) else second
+    return first == second or (first != first and second != second)
 
 
-def agree(rows: list[dict[str, Any]], told: list[tuple[float, bytes]]) -> int:
+def agree(rows: list[dict[str, Any]], records: list[tuple[float, bytes]]) -> int:
     """Look at every cell; how many of them were compared."""
-    assert len(rows) == len(told)
+    assert len(rows) == len(records)
     compared = 0
-    for row, (time_s, data) in zip(rows, told, strict=True):
+    for row, (time_s, data) in zip(rows, records, strict=True):
         assert row["time_s"] == pytest.approx(time_s, abs=1e-9)
         want = cells(json.loads(data), "")
         for name, cell in want.items():
@@ -66,7 +72,7 @@ def agree(rows: list[dict[str, Any]], told: list[tuple[float, bytes]]) -> int:
                 compared += 1
             else:  # an empty list, or null where others have a record
                 assert cell in (None, 0), name
-        spare = {name for name, cell in row.items() if cell is not None} - {one.removeprefix(".") for one in want}
+        spare = {name for name, cell in row.items() if cell is not None} - {name.removeprefix(".") for name in want}
         assert all(name in ("log_time_ns", "time_s", "utc") or row[name] == 0 for name in spare), spare
     return compared
 
@@ -76,9 +82,9 @@ TOPICS = ("/uavctl/decision", "/uavctl/estimate", "/uavctl/setpoint", "/sim/trut
 
 @pytest.mark.parametrize("topic", TOPICS)
 def test_tables_hold_what_mcap_reads(flown: Recording, topic: str) -> None:
-    told = messages(flown.path, topic)
+    records = messages(flown.path, topic)
     rows = flown.arrow(topic).to_pylist()
-    assert agree(rows, told) > 4 * len(told)
+    assert agree(rows, records) > 4 * len(records)
     assert undated(flown.polars(topic).to_dicts()) == undated(rows)
 
 
@@ -96,41 +102,49 @@ def test_pandas_holds_it_too_and_whole_numbers_stay_whole(flown: Recording, topi
     for name in table.column_names:
         want = table[name].to_pylist()
         cells = [None if cell is pd.NA else cell for cell in frame[name].tolist()]  # type: ignore[attr-defined]
-        for one, other in zip(want, cells, strict=True):
-            assert one == other or (one is None and other != other) or (one != one and other != other), name
+        for wanted_cell, cell in zip(want, cells, strict=True):
+            assert (
+                wanted_cell == cell
+                or (wanted_cell is None and cell != cell)
+                or (wanted_cell != wanted_cell and cell != cell)
+            ), name
         if str(table.schema.field(name).type) == "int64":
             assert str(frame[name].dtype) == "Int64"
 
 
 def test_lists_within_are_tables(flown: Recording) -> None:
-    told = [sample for _, data in messages(flown.path, "/uavctl/step_input") for sample in json.loads(data)["samples"]]
+    records = [
+        sample for _, data in messages(flown.path, "/uavctl/step_input") for sample in json.loads(data)["samples"]
+    ]
     rows = flown.arrow("/uavctl/step_input.samples").to_pylist()
-    assert [[row[f"position_m_{axis}"] for axis in "xyz"] for row in rows] == [one["position_m"] for one in told]
+    assert [[row[f"position_m_{axis}"] for axis in "xyz"] for row in rows] == [
+        record["position_m"] for record in records
+    ]
     assert flown.arrow("/uavctl/step_input").num_rows > len({row["row"] for row in rows}) > 5
     assert flown.arrow("/uavctl/step_input.commands").num_rows == 0
 
 
 def test_raw_bytes_are_a_table(flown: Recording) -> None:
-    told = messages(flown.path, "/raw/vehicle/out")
+    records = messages(flown.path, "/raw/vehicle/out")
     rows = flown.arrow("/raw/vehicle/out").to_pylist()
-    assert [row["data"] for row in rows] == [data for _, data in told]
-    assert flown.polars("/raw/vehicle/out")["data"].to_list() == [data for _, data in told]
+    assert [row["data"] for row in rows] == [data for _, data in records]
+    assert flown.polars("/raw/vehicle/out")["data"].to_list() == [data for _, data in records]
 
 
 def test_topics_are_those_that_mcap_counts(flown: Recording) -> None:
     with flown.path.open("rb") as file:
         summary = make_reader(file).get_summary()
     assert summary is not None
-    held = {one.topic for one in summary.channels.values()}
-    assert {one for one in flown.topics if "." not in one} == {
-        one for one in held if one.startswith(("/uavctl", "/sim", "/raw"))
+    held = {channel.topic for channel in summary.channels.values()}
+    assert {topic for topic in flown.topics if "." not in topic} == {
+        topic for topic in held if topic.startswith(("/uavctl", "/sim", "/raw"))
     }
     for topic in flown.topics:
         flown.arrow(topic)
 
 
 @pytest.mark.parametrize(
-    ("topic", "told"),
+    ("topic", "records"),
     [
         ("/uavctl/decison", 'nearest valid name "/uavctl/decision"'),
         ("decision", "there are /raw/mocap/in"),
@@ -140,10 +154,10 @@ def test_topics_are_those_that_mcap_counts(flown: Recording) -> None:
         ("", "is not in it"),
     ],
 )
-def test_a_topic_that_is_not_there(flown: Recording, topic: str, told: str) -> None:
+def test_a_topic_that_is_not_there(flown: Recording, topic: str, records: str) -> None:
     with pytest.raises(RecordingError) as raised:
         flown.arrow(topic)
-    assert told in str(raised.value)
+    assert records in str(raised.value)
 
 
 def test_a_torn_recording_is_refused_and_read_when_asked(flown: Recording, tmp_path: Path) -> None:
@@ -194,7 +208,7 @@ BEGAN = datetime(2026, 2, 3, 4, 5, 6, 789000, tzinfo=UTC)
 BEGAN_NS = int(BEGAN.timestamp()) * 10**9 + 789_000_000
 
 
-def test_the_time_of_day_is_told(tmp_path: Path) -> None:
+def test_tables_have_the_time_of_day(tmp_path: Path) -> None:
     path = tmp_path / "real.mcap"
     recorder = SyncRecorder(path)
     recorder.put("/uavctl/header", 5_000_000_000, head(5_000_000_000, BEGAN_NS - 5_000_000_000))

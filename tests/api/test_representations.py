@@ -20,9 +20,15 @@ ROOM_STATE = [0, 0, 0, 0, 0, 0, -1, 0, 0]
 def test_printed_objects_are_a_few_lines(tmp_path: Path) -> None:
     room = uavctl.load("room")
     plan = uavctl.solve(room, ROOM_STATE)
-    for one in (room, plan, uavctl.plant(room), uavctl.controller(room), uavctl.simulate(room, "lqg", runs=2, steps=3)):
-        assert len(repr(one).splitlines()) <= 4
-        assert len(repr(one)) < 500
+    for value in (
+        room,
+        plan,
+        uavctl.plant(room),
+        uavctl.controller(room),
+        uavctl.simulate(room, "lqg", runs=2, steps=3),
+    ):
+        assert len(repr(value).splitlines()) <= 4
+        assert len(repr(value)) < 500
     assert plan.status.value in repr(plan)
     assert f"{plan.inputs[0, 0]:.4g} m/s²" in repr(plan)
 

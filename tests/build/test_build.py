@@ -69,7 +69,7 @@ def test_a_controller_holds_the_configuration_s_numbers() -> None:
     ("overrides", "asked"),
     [([], True), (["relay.enabled=true"], False), (['source.messages=["LOCAL_POSITION_NED"]'], False)],
 )
-def test_a_velocity_that_is_made_of_our_positions_is_no_witness(overrides: list[str], asked: bool) -> None:
+def test_a_velocity_from_our_positions_is_not_independent(overrides: list[str], asked: bool) -> None:
     config = load_config("room-hahn-stursberg", overrides)
     assert (
         build_controller(config, build_design(load_config("room-hahn-stursberg"))).position_gate.at_rest_mps > 0.0
@@ -88,8 +88,8 @@ def test_every_preset_can_be_flown(preset: str) -> None:
 
 
 def test_another_likelihood_is_another_design() -> None:
-    one, other = load_config("paper"), load_config("paper", ["smpc.delta_x=0.94"])
-    assert build_design(one).design_id != build_design(other).design_id
+    first, second = load_config("paper"), load_config("paper", ["smpc.delta_x=0.94"])
+    assert build_design(first).design_id != build_design(second).design_id
 
 
 @pytest.mark.parametrize(

@@ -6,8 +6,8 @@ from functools import cache
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.build.controller import build_conditioned
 from uavctl.build.link import build_ages, build_delayed_link
 from uavctl.config import Config, load_config
@@ -15,7 +15,6 @@ from uavctl.errors import DesignError
 from uavctl.lab.campaign.arrivals import compute_newest_captures
 from uavctl.lab.campaign.draws import draw
 
-Array = NDArray[np.float64]
 RUNS, STEPS, OLDEST = 20_000, 80, 12
 
 BURSTS = ["link.model=gilbert-elliott", "link.burst_enter=0.142857", "link.burst_leave=0.333333"]
@@ -58,15 +57,15 @@ def test_ages_are_those_of_the_campaign_s_link(name: str) -> None:
         # Runs are independent: five standard deviations of a share, of one run at least where there is chance in it.
         spread = max(expected * (1.0 - expected), 1.0 / RUNS) if 1e-12 < expected < 1.0 - 1e-12 else 0.0
         assert abs(share - expected) <= 5.0 * np.sqrt(spread / RUNS) + 1e-9, steps
-    assert build_conditioned(given, flown=False).solver.risk.beyond == model.outage(60)
+    assert build_conditioned(given, for_flight=False).solver.risk.beyond == model.outage(60)
 
 
 @pytest.mark.parametrize("loss", [0.3, 0.8])
 def test_a_channel_without_memory_has_the_ages_of_independent_losses(loss: float) -> None:
     chain = ["link.model=gilbert-elliott", f"link.loss={loss}", f"link.burst_loss={loss}", "link.burst_enter=0.3"]
-    one, other = (build_ages(config(*LATE, *given)) for given in (chain, [f"link.loss={loss}"]))
+    first, second = (build_ages(config(*LATE, *given)) for given in (chain, [f"link.loss={loss}"]))
     for steps in range(OLDEST):
-        assert one.outage(steps) == pytest.approx(other.outage(steps), rel=1e-12)
+        assert first.outage(steps) == pytest.approx(second.outage(steps), rel=1e-12)
 
 
 def test_several_positions_of_a_step_come_one_after_the_other() -> None:
@@ -103,6 +102,6 @@ def test_what_cannot_be_counted_on_is_refused(overrides: list[str], key: str, me
     assert caught.value.key == key
 
 
-def test_the_other_scheme_says_who_takes_late_bursts() -> None:
+def test_the_other_scheme_names_the_model_for_late_bursts() -> None:
     with pytest.raises(DesignError, match="age-conditioned"):
         build_delayed_link(load_config("paper", [*BURSTS, *LATE]))

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from sim.channel import Channel
 from uavctl.build.controller import build_design, build_spec
-from uavctl.build.link import Packets, build_link, packets_per_step, promised
+from uavctl.build.link import PacketCounts, build_link, compute_promised_probability, count_packets_per_step
 from uavctl.config import Config, load_config
 from uavctl.errors import ConfigError, DesignError
 
@@ -46,21 +46,21 @@ STEP_NS = 1_000_000_000
 )
 def test_the_link_s_probability_counts_samples_that_are_in_time(preset: str, overrides: list[str], p: float) -> None:
     config = load_config(preset, overrides)
-    assert promised(build_link(config)) == pytest.approx(p, abs=1e-12)
-    assert 1.0 - build_spec(config).link.outage(1) >= promised(build_link(config)) - 1e-15
+    assert compute_promised_probability(build_link(config)) == pytest.approx(p, abs=1e-12)
+    assert 1.0 - build_spec(config).link.outage(1) >= compute_promised_probability(build_link(config)) - 1e-15
 
 
 @pytest.mark.parametrize(
     ("overrides", "packets"),
     [
-        (["source.rate_hz=0"], Packets(1, 0)),
-        (["source.rate_hz=20"], Packets(2, 2)),
-        (["source.rate_hz=20", "link.jitter_s=0", "link.delay_s=0"], Packets(4, 0)),
-        (["source.rate_hz=100"], Packets(13, 7)),
+        (["source.rate_hz=0"], PacketCounts(1, 0)),
+        (["source.rate_hz=20"], PacketCounts(2, 2)),
+        (["source.rate_hz=20", "link.jitter_s=0", "link.delay_s=0"], PacketCounts(4, 0)),
+        (["source.rate_hz=100"], PacketCounts(13, 7)),
     ],
 )
-def test_packets_of_a_step_that_come_too_late_are_not_counted_on(overrides: list[str], packets: Packets) -> None:
-    assert packets_per_step(load_config("room-hahn-stursberg", overrides)) == packets
+def test_packets_of_a_step_that_come_too_late_are_not_counted_on(overrides: list[str], packets: PacketCounts) -> None:
+    assert count_packets_per_step(load_config("room-hahn-stursberg", overrides)) == packets
 
 
 def test_what_a_design_for_the_whole_flight_counts_on_is_the_least_of_what_is_ahead() -> None:
@@ -105,7 +105,7 @@ def test_a_link_that_no_position_crosses_in_time_is_refused(overrides: list[str]
         (["link.gap=[1.0]"], r"link\.gap: unknown key \(nearest valid name \"gaps\"\)"),
     ],
 )
-def test_a_link_that_cannot_be_is_told_with_its_place(overrides: list[str], message: str) -> None:
+def test_an_impossible_link_is_reported_with_its_key(overrides: list[str], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         load_config("paper", overrides)
 

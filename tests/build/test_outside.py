@@ -11,7 +11,7 @@ import pytest
 from baseline_rig import problem
 
 import uavctl.build.outside as outside
-from uavctl.build.controller import build_controller, build_problem, design_of
+from uavctl.build.controller import build_controller, build_flight_design, build_problem
 from uavctl.config import load_config
 from uavctl.errors import DesignError
 from uavctl.lab.campaign.spec import check_kind, make_controller
@@ -60,9 +60,9 @@ def test_a_class_of_the_working_directory_is_found(module: str) -> None:
 
 
 def test_an_entry_point_has_a_short_name(module: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    point = EntryPoint("still", f"{module}:Still", outside.GROUP)
-    monkeypatch.setattr(outside, "entry_points", lambda group: (point,) if group == outside.GROUP else ())
-    assert outside.installed() == ("still",)
+    point = EntryPoint("still", f"{module}:Still", outside.ENTRY_POINT_GROUP)
+    monkeypatch.setattr(outside, "entry_points", lambda group: (point,) if group == outside.ENTRY_POINT_GROUP else ())
+    assert outside.list_installed() == ("still",)
     check_kind("still")
     with pytest.raises(DesignError, match='nearest valid name "still"'):
         check_kind("stil")
@@ -70,23 +70,23 @@ def test_an_entry_point_has_a_short_name(module: str, monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize(
-    ("name", "told"),
+    ("name", "message"),
     [("Nothing", "AttributeError"), ("Half", "no act"), ("Resting", "no begin"), ("Broken", "no gain")],
 )
-def test_what_a_campaign_cannot_ask_is_refused_with_the_reason(module: str, name: str, told: str) -> None:
-    with pytest.raises(DesignError, match=told) as found:
+def test_what_a_campaign_cannot_ask_is_refused_with_the_reason(module: str, name: str, message: str) -> None:
+    with pytest.raises(DesignError, match=message) as caught:
         make_controller(f"{module}:{name}", problem("paper"))
-    assert found.value.key == "kind"
+    assert caught.value.key == "kind"
 
 
 @pytest.mark.parametrize(
-    ("name", "told"), [("Nothing", "AttributeError"), ("Half", "plan or with begin and act"), ("Broken", "no gain")]
+    ("name", "message"), [("Nothing", "AttributeError"), ("Half", "plan or with begin and act"), ("Broken", "no gain")]
 )
-def test_what_cannot_fly_is_refused_with_the_reason(module: str, name: str, told: str) -> None:
+def test_what_cannot_fly_is_refused_with_the_reason(module: str, name: str, message: str) -> None:
     config = load_config("room", [f"smpc.controller={module}:{name}"])
-    with pytest.raises(DesignError, match=told) as found:
-        outside.flown_outside(config, build_problem(config))
-    assert found.value.key == "smpc.controller"
+    with pytest.raises(DesignError, match=message) as caught:
+        outside.build_outside_solver(config, build_problem(config))
+    assert caught.value.key == "smpc.controller"
 
 
 def test_a_module_that_is_not_there(module: str) -> None:
@@ -94,7 +94,7 @@ def test_a_module_that_is_not_there(module: str) -> None:
         check_kind(f"{module}_not:Still")
 
 
-def test_only_what_plans_is_told_a_trajectory(module: str) -> None:
+def test_only_planners_get_a_trajectory(module: str) -> None:
     motion = "mission.trajectory={times_s=[0.0, 9.0], positions_m=[[0.0, 0.0, -1.0], [1.0, 0.0, -1.0]]}"
     with pytest.raises(DesignError, match="told no trajectory"):
         build_controller(load_config("room", [motion, f"smpc.controller={module}:Still"]))
@@ -106,7 +106,7 @@ def test_only_what_plans_is_told_a_trajectory(module: str) -> None:
 )
 def test_it_takes_the_place_of_either_scheme_and_keeps_its_design(module: str, name: str, preset: str) -> None:
     config = load_config(preset, [f"smpc.controller={module}:{name}"])
-    design = design_of(config)
+    design = build_flight_design(config)
     controller = build_controller(config, design)
     target = design.target
     answer = controller.solver.solve(0, target, target)
@@ -118,14 +118,14 @@ def test_it_takes_the_place_of_either_scheme_and_keeps_its_design(module: str, n
 def test_its_identity_changes_with_its_code_and_with_nothing_else(
     module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    first = outside.controller_id(f"{module}:Resting")
-    assert first.startswith(f"{module}:Resting ") and first == outside.controller_id(f"{module}:Resting")
+    first = outside.compute_controller_id(f"{module}:Resting")
+    assert first.startswith(f"{module}:Resting ") and first == outside.compute_controller_id(f"{module}:Resting")
     (tmp_path / f"{module}.py").write_text(MODULE + "\n")
-    assert outside.controller_id(f"{module}:Resting") != first
+    assert outside.compute_controller_id(f"{module}:Resting") != first
     package = tmp_path / f"{module}_package"
     package.mkdir()
     (package / "__init__.py").write_text("")
     (package / "inner.py").write_text(MODULE)
-    before = outside.controller_id(f"{package.name}.inner:Resting")
+    before = outside.compute_controller_id(f"{package.name}.inner:Resting")
     (package / "__init__.py").write_text("# another file of the package\n")
-    assert outside.controller_id(f"{package.name}.inner:Resting") != before
+    assert outside.compute_controller_id(f"{package.name}.inner:Resting") != before

@@ -39,20 +39,20 @@ def along_eight(preset: str, *overrides: str) -> Config:
 
 def test_long_bursts_relax_most_plans_in_rehearsal_and_flight() -> None:
     config = load_config("room", (*LONG, "duration_s=12"))
-    found = rehearsed(config)
-    assert found.relaxes
-    assert found.constraint.endswith("velocity")
-    assert found.relaxed == pytest.approx(flown(config), abs=0.15)
-    assert found.relaxed > 0.5
+    result = rehearsed(config)
+    assert result.relaxes
+    assert result.constraint.endswith("velocity")
+    assert result.relaxed == pytest.approx(flown(config), abs=0.15)
+    assert result.relaxed > 0.5
 
 
 @pytest.mark.parametrize("preset", ["room", "room-px4", "room-ardupilot"])
 @pytest.mark.parametrize("link", [(), SHORT])
 def test_presets_and_short_bursts_pass(preset: str, link: tuple[str, ...]) -> None:
-    found = rehearsed(load_config(preset, link))
-    assert not found.relaxes
-    assert not found.sentences
-    assert not found.hint
+    result = rehearsed(load_config(preset, link))
+    assert not result.relaxes
+    assert not result.sentences
+    assert not result.hint
 
 
 def test_an_eight_that_the_inputs_do_not_allow_strays_by_its_figure() -> None:
@@ -91,17 +91,17 @@ def eight_flown_m(config: Config, drag_1ps: float) -> float:
     return float(compute_distances_m(np.array(watched.positions_m)[flies], wanted).mean())
 
 
-def test_the_cost_of_a_drag_that_nobody_identified_is_rehearsed_and_flown() -> None:
-    found = rehearsed(along_eight("room-px4", *WIDE))
-    assert found.large_drag_m is not None and found.tracking_m is not None
-    assert found.depends_on_drag
-    assert found.large_drag_m > 5.0 * found.tracking_m
+def test_the_cost_of_an_unidentified_drag_is_rehearsed_and_flown() -> None:
+    result = rehearsed(along_eight("room-px4", *WIDE))
+    assert result.large_drag_m is not None and result.tracking_m is not None
+    assert result.depends_on_drag
+    assert result.large_drag_m > 5.0 * result.tracking_m
     flown_m = eight_flown_m(along_eight("room-px4", *WIDE, "sim.plant=linear"), LARGE_DRAG_1PS)
-    assert found.large_drag_m == pytest.approx(flown_m, rel=0.25)  # a flight has losses, noise and a bias, too
+    assert result.large_drag_m == pytest.approx(flown_m, rel=0.25)  # a flight has losses, noise and a bias, too
 
 
 def test_an_identified_large_drag_needs_no_second_figure() -> None:
-    found = rehearsed(along_eight("room-px4", *WIDE, f"plant.drag_1ps={[LARGE_DRAG_1PS] * 3}"))
-    assert found.large_drag_m is None
-    assert not found.depends_on_drag
-    assert not found.sentences
+    result = rehearsed(along_eight("room-px4", *WIDE, f"plant.drag_1ps={[LARGE_DRAG_1PS] * 3}"))
+    assert result.large_drag_m is None
+    assert not result.depends_on_drag
+    assert not result.sentences

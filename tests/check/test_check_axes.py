@@ -7,7 +7,7 @@ import re
 import struct
 
 import pytest
-from check_rig import Checked, Hand, S, look, twisted
+from check_rig import CheckResult, HandMotion, S, run_check, transform_cameras
 from mavlink_rig import packets, read
 
 from uavctl.check.axes import check_axes, has_vehicle_position
@@ -45,15 +45,19 @@ def around(at_s: float) -> tuple[float, float, float] | None:
     return [(0.0, 0.0, -push), (push, 0.0, 0.0), (0.0, push, 0.0)][axis]
 
 
-def moving(*wrong: str, autopilot: str, matrix: list[list[float]] | None = None, more: tuple[str, ...] = ()) -> Checked:
+def moving(
+    *wrong: str, autopilot: str, matrix: list[list[float]] | None = None, more: tuple[str, ...] = ()
+) -> CheckResult:
     setup = [f"sim.autopilot={autopilot}", ALOFT, *more]
-    return look(setup, wrong, seconds=6.5, airborne=True, setpoints=around, twist=twisted(matrix or scaled(1.0)))
+    return run_check(
+        setup, wrong, seconds=6.5, airborne=True, setpoints=around, twist=transform_cameras(matrix or scaled(1.0))
+    )
 
 
 @BOTH
 def test_a_right_set_up_is_good_once_it_has_moved(autopilot: str) -> None:
     found = moving(autopilot=autopilot)
-    assert found.bad == []
+    assert found.bad_items == []
     assert found["axes"].state is ItemState.GOOD and "moved" in found["axes"].value
 
 
@@ -61,14 +65,14 @@ def test_a_right_set_up_is_good_once_it_has_moved(autopilot: str) -> None:
 @pytest.mark.parametrize("setup", ["frame.convention=enu", "frame.yaw_deg=40", "frame.origin_m=[1.0,-2.0,0.5]"])
 def test_a_right_set_up_with_a_frame_of_its_own_is_good(autopilot: str, setup: str) -> None:
     found = moving(autopilot=autopilot, more=(setup,))
-    assert found.bad == [] and found["axes"].state is ItemState.GOOD
+    assert found.bad_items == [] and found["axes"].state is ItemState.GOOD
 
 
 @BOTH
 @pytest.mark.parametrize("place", [ORIGIN, AWAY])
 def test_a_right_set_up_at_rest_is_not_refused_and_what_cannot_be_seen_is_told(autopilot: str, place: str) -> None:
-    found = look([f"sim.autopilot={autopilot}", place])
-    assert found.bad == []
+    found = run_check([f"sim.autopilot={autopilot}", place])
+    assert found.bad_items == []
     axes = found["axes"]
     assert axes.state is ItemState.UNDETERMINED and "up is taken for down" in axes.value and axes.hint
     assert ("ENU" in axes.value) == (place is ORIGIN)
@@ -127,7 +131,7 @@ def test_a_wrong_unit_or_a_mirror_is_named_when_it_moves(autopilot: str, matrix:
     "wrong", ["frame.convention=enu", "frame.yaw_deg=90", "frame.yaw_deg=180", "frame.yaw_deg=-30"]
 )
 def test_a_wrong_frame_is_caught_at_rest_off_the_origin(autopilot: str, wrong: str) -> None:
-    found = look([f"sim.autopilot={autopilot}", AWAY], [wrong])
+    found = run_check([f"sim.autopilot={autopilot}", AWAY], [wrong])
     assert found["axes"].state is ItemState.BAD
 
 
@@ -136,7 +140,7 @@ def test_a_wrong_frame_is_caught_at_rest_off_the_origin(autopilot: str, wrong: s
 @pytest.mark.parametrize("matrix", [scaled(1000.0), scaled(100.0), scaled(0.01), *MIRRORED.values(), Y_UP, FLU])
 def test_a_wrong_unit_or_a_mirror_is_caught_at_rest_off_the_origin(autopilot: str, matrix: list[list[float]]) -> None:
     more = "estimator.max_position_m=1e5"
-    found = look([f"sim.autopilot={autopilot}", AWAY, more], twist=twisted(matrix))
+    found = run_check([f"sim.autopilot={autopilot}", AWAY, more], twist=transform_cameras(matrix))
     assert found["axes"].state is ItemState.BAD
 
 
@@ -144,7 +148,7 @@ def test_a_wrong_unit_or_a_mirror_is_caught_at_rest_off_the_origin(autopilot: st
 @BOTH
 def test_at_rest_on_the_origin_the_noise_tells_the_unit(autopilot: str) -> None:
     more = "estimator.max_position_m=1e5"
-    found = look([f"sim.autopilot={autopilot}", ORIGIN, more], twist=twisted(scaled(1000.0)))
+    found = run_check([f"sim.autopilot={autopilot}", ORIGIN, more], twist=transform_cameras(scaled(1000.0)))
     assert found["position noise"].state is ItemState.BAD and "millimetres" in found["position noise"].hint
 
 
@@ -159,25 +163,25 @@ def test_at_rest_on_the_origin_the_attitude_tells_a_turned_frame(
     autopilot: str, right: str, wrong: str, message: str
 ) -> None:
     setup = [f"sim.autopilot={autopilot}", ORIGIN, right, f"sim.camera.message={message}"]
-    assert look(setup)["heading"].state is ItemState.GOOD
+    assert run_check(setup)["heading"].state is ItemState.GOOD
     declared = message == "odometry" and "enu" in right  # it says so itself, and is believed
-    assert (look(setup, [wrong])["heading"].state is ItemState.BAD) == (not declared)
+    assert (run_check(setup, [wrong])["heading"].state is ItemState.BAD) == (not declared)
 
 
 def test_cameras_that_see_another_body_are_caught() -> None:
     setup = ["sim.autopilot=px4", ALOFT, "sim.camera.swapped=[[0.0,99.0]]", "sim.camera.other_body_m=[0.0,0.0,-1.0]"]
-    found = look(setup, seconds=6.5, airborne=True, setpoints=around)
+    found = run_check(setup, seconds=6.5, airborne=True, setpoints=around)
     assert found["axes"].state is ItemState.BAD and "m for the cameras" in found["axes"].value
 
 
 def test_a_vehicle_that_counts_from_elsewhere_is_told_apart_by_its_movement() -> None:
-    hand = Hand("check.same_origin=false", own=True)
+    hand = HandMotion("check.same_origin=false", has_estimate=True)
     hand.follow()
-    assert hand.done()["axes"].state is ItemState.GOOD
-    hand = Hand("check.same_origin=false", own=True)
+    assert hand.is_done()["axes"].state is ItemState.GOOD
+    hand = HandMotion("check.same_origin=false", has_estimate=True)
     hand.matrix = DOWN
     hand.follow()
-    assert "up is taken for down" in hand.done()["axes"].value
+    assert "up is taken for down" in hand.is_done()["axes"].value
 
 
 @pytest.mark.fault(15)
@@ -190,14 +194,14 @@ def test_a_level_attitude_is_meant_if_the_vehicle_takes_its_heading_from_it(
 ) -> None:
     """At rest on the origin: a source that is level to the north to the last bit, as simulators are."""
     for fuses in (False, True):
-        hand = Hand(*wrong, own=True)
+        hand = HandMotion(*wrong, has_estimate=True)
         hand.place = [0.0, 0.0, -0.05]
         if fuses:
             (as_float,) = struct.unpack("<f", struct.pack("<i", 11))
-            hand.rest(1.2)
-            hand.tell(hand.vehicle.send("param_value", b"EKF2_EV_CTRL", as_float, 6, 1, 0))
-        hand.rest(3.0)
-        assert hand.done()["heading"].state is (want if fuses else ItemState.UNDETERMINED)
+            hand.hold(1.2)
+            hand.report(hand.vehicle.send("param_value", b"EKF2_EV_CTRL", as_float, 6, 1, 0))
+        hand.hold(3.0)
+        assert hand.is_done()["heading"].state is (want if fuses else ItemState.UNDETERMINED)
 
 
 # --- without a position of its own, a hand moves it -----------------------------------------------------------------
@@ -205,12 +209,12 @@ def test_a_level_attitude_is_meant_if_the_vehicle_takes_its_heading_from_it(
 
 @pytest.mark.parametrize("heading_deg", [0.0, 35.0, -120.0])
 def test_three_movements_along_the_body_show_every_axis(heading_deg: float) -> None:
-    hand = Hand(heading_rad=math.radians(heading_deg), move=True)
+    hand = HandMotion(heading_rad=math.radians(heading_deg), move=True)
     hand.follow()
-    found = hand.done()
+    found = hand.is_done()
     assert found["axes"].state is ItemState.GOOD and found["movements"].state is ItemState.GOOD
     assert found["own position"].state is ItemState.UNDETERMINED
-    assert found.bad == []
+    assert found.bad_items == []
 
 
 @pytest.mark.fault(15)
@@ -228,41 +232,41 @@ def test_three_movements_along_the_body_show_every_axis(heading_deg: float) -> N
     ],
 )
 def test_movements_name_a_wrong_set_up(matrix: list[list[float]], told: str) -> None:
-    hand = Hand("estimator.max_position_m=1e5", move=True)
+    hand = HandMotion("estimator.max_position_m=1e5", move=True)
     hand.matrix = matrix
     hand.follow()
-    found = hand.done()
+    found = hand.is_done()
     assert found["axes"].state is ItemState.BAD and told in found["axes"].value
 
 
 def test_prompts_that_are_not_followed_fail_the_guided_check() -> None:
-    hand = Hand(move=True)
-    hand.rest(2.0)
+    hand = HandMotion(move=True)
+    hand.hold(2.0)
     hand.carry(0.0, 0.0, -0.5)
-    assert hand.done()["movements"].state is ItemState.BAD
-    hand.rest(70.0)  # two prompts run out
-    found = hand.done()
+    assert hand.is_done()["movements"].state is ItemState.BAD
+    hand.hold(70.0)  # two prompts run out
+    found = hand.is_done()
     assert "missing: nose, right" in found["movements"].value
 
 
 def test_nobody_is_asked_to_touch_an_armed_vehicle() -> None:
-    hand = Hand(move=True)
-    hand.rest(1.2, armed=True)
-    hand.rest(4.0, armed=True)
+    hand = HandMotion(move=True)
+    hand.hold(1.2, armed=True)
+    hand.hold(4.0, armed=True)
     assert hand.flight.prompt == ""
-    assert hand.done()["armed"].state is ItemState.NOTE
+    assert hand.is_done()["armed"].state is ItemState.NOTE
 
 
 def test_positions_of_the_vehicle_itself_need_no_frame() -> None:
     setup = ['source.messages=["LOCAL_POSITION_NED"]', "daemon.mocap=udpin://0.0.0.0:14540"]
-    found = look(setup)
-    assert found["axes"].state is ItemState.GOOD and found.bad == []
+    found = run_check(setup)
+    assert found["axes"].state is ItemState.GOOD and found.bad_items == []
 
 
 # --- recorded: ArduCopter on its built-in simulated cameras, moving ---------------------------------------------------
 
 
-def recorded(*wrong: str) -> Checked:
+def recorded(*wrong: str) -> CheckResult:
     same = "udpin://0.0.0.0:14540"
     overrides = [f"daemon.vehicle={same}", f"daemon.mocap={same}", "link.loss=0.0", *wrong]
     flight, begun_ns, at_ns = Preflight(load_config("room-hahn-stursberg", overrides), make_links, 0), 0, 0
@@ -273,7 +277,7 @@ def recorded(*wrong: str) -> Checked:
             break
         if data[5] != 255:  # not the client of then
             flight.receive("vehicle", data, at_ns)
-    return Checked(flight, at_ns)
+    return CheckResult(flight, at_ns)
 
 
 def test_a_recorded_flight_is_a_right_example() -> None:
@@ -337,7 +341,7 @@ def test_a_recorded_px4_at_rest_over_a_lossy_link_has_a_position_and_its_origin_
             flags.append(read(data)[0].flags)
         flight.receive("vehicle", data, at_ns)
     assert flags == [0x1EF, 0xEF][: len(flags)] and len(flags) == (1 if seconds < 1.0 else 2)
-    own = Checked(flight, at_ns)["own position"]
+    own = CheckResult(flight, at_ns)["own position"]
     assert own.state is ItemState.GOOD
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from loopback_rig import Memory
+from loopback_rig import MemorySink
 from patience import LIMIT_S
 
 from logs.recording.info import read_info
@@ -255,7 +255,7 @@ def test_prompts_are_told_once_each_and_the_guided_check_ends_too() -> None:
 
 
 def test_what_was_found_goes_into_the_recording() -> None:
-    memory = Memory()
+    memory = MemorySink()
     items = [make_item(each, each, "value", "want", "hint") for each in ItemState]
     record_items(memory, items, 7)
     assert [(one.at_ns, one.name, one.state) for one in memory.of(Checked)] == [(7, each, each) for each in ItemState]
@@ -265,7 +265,7 @@ def test_what_was_found_goes_into_the_recording() -> None:
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 def test_parameters_that_were_told_go_into_the_recording(autopilot: str, tmp_path: Path) -> None:
     bench, told = Bench(f"sim.autopilot={autopilot}"), ParameterReader()
-    bench.run(4.0, told=told)
+    bench.run(4.0, parameters=told)
     recorder = SyncRecorder(tmp_path / "flight.mcap")
     record_parameters(recorder, told, 7)
     recorder.close()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
-from check_rig import Checked, Hand, S, look
+from check_rig import CheckResult, HandMotion, S, run_check
 from hypothesis import given
 from hypothesis import strategies as st
 from mavlink_rig import MS, Peer
@@ -24,12 +24,12 @@ from uavctl.records import Outgoing, to_nobody
 BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 
 
-def state(found: Checked, name: str) -> ItemState:
+def state(found: CheckResult, name: str) -> ItemState:
     return found[name].state
 
 
 def test_every_item_has_a_want_and_every_one_that_is_not_good_says_what_to_do() -> None:
-    for found in (look(), look(["sim.autopilot=ardupilot"]), look(wrong=["frame.yaw_deg=90"])):
+    for found in (run_check(), run_check(["sim.autopilot=ardupilot"]), run_check(wrong=["frame.yaw_deg=90"])):
         for one in found.items.values():
             assert one.name and one.value and one.want
             assert bool(one.hint) == (one.state is not ItemState.GOOD)
@@ -40,8 +40,8 @@ def test_every_item_has_a_want_and_every_one_that_is_not_good_says_what_to_do() 
 
 
 def test_no_positions_at_all() -> None:
-    found = look(["sim.camera.occluded=[[0.0,99.0]]"])
-    assert found.bad == ["positions"]
+    found = run_check(["sim.camera.occluded=[[0.0,99.0]]"])
+    assert found.bad_items == ["positions"]
     assert "none" in found["positions"].value and "is the source running" in found["positions"].hint
 
 
@@ -57,13 +57,13 @@ def test_on_a_shared_link_the_vehicle_s_own_estimate_is_offered(shared: bool) ->
 
 
 def test_positions_that_are_refused_are_told_by_reason() -> None:
-    found = look(["source.system_id=99"])
+    found = run_check(["source.system_id=99"])
     assert "system-id" in found["positions"].value
 
 
 @pytest.mark.parametrize(("rate_hz", "good"), [(20.0, True), (21.0, True), (25.0, False)])
 def test_the_rate_is_that_of_the_cameras_whatever_the_link_loses(rate_hz: float, good: bool) -> None:
-    found = look(["link.loss=0.3"], [f"source.rate_hz={rate_hz}"], seconds=10.0)
+    found = run_check(["link.loss=0.3"], [f"source.rate_hz={rate_hz}"], seconds=10.0)
     assert found["position rate"].value.startswith("20 Hz captured")
     assert found["position rate"].ok == good
 
@@ -71,38 +71,40 @@ def test_the_rate_is_that_of_the_cameras_whatever_the_link_loses(rate_hz: float,
 def test_more_loss_than_the_design_counts_on_fails_and_chance_does_not() -> None:
     for seed in range(8):
         more = ["link.loss=0.3", f"sim.seed={seed}", "sim.camera.rate_hz=5.0"]
-        assert look(more, seconds=8.0)["position loss"].ok
-    assert not look(["link.loss=0.5", "sim.camera.rate_hz=5.0"], ["link.loss=0.1"], seconds=8.0)["position loss"].ok
+        assert run_check(more, seconds=8.0)["position loss"].ok
+    assert not run_check(["link.loss=0.5", "sim.camera.rate_hz=5.0"], ["link.loss=0.1"], seconds=8.0)[
+        "position loss"
+    ].ok
     # Four positions a step: the design's one of them is there far more often.
-    assert look(["link.loss=0.3"], ["link.loss=0.1"], seconds=8.0)["position loss"].ok
-    assert state(look(wrong=["link.model=gilbert-elliott"]), "position loss") is ItemState.NOTE
+    assert run_check(["link.loss=0.3"], ["link.loss=0.1"], seconds=8.0)["position loss"].ok
+    assert state(run_check(wrong=["link.model=gilbert-elliott"]), "position loss") is ItemState.NOTE
 
 
 def test_an_age_beyond_the_design_is_told_and_one_beyond_a_step_fails() -> None:
-    slow = look(["link.jitter_s=0.12"], ["link.jitter_s=0.02", "link.delay_s=0.0"])
+    slow = run_check(["link.jitter_s=0.12"], ["link.jitter_s=0.02", "link.delay_s=0.0"])
     assert state(slow, "position age") is ItemState.NOTE
-    late = look(["link.jitter_s=0.4"], ["link.jitter_s=0.02"])
+    late = run_check(["link.jitter_s=0.4"], ["link.jitter_s=0.02"])
     assert state(late, "position age") is ItemState.BAD
     # Plans of the other scheme count with every age up to the horizon.
-    planned = look(["link.jitter_s=0.4"], ["link.jitter_s=0.02", "smpc.scheme=age-conditioned"])
+    planned = run_check(["link.jitter_s=0.4"], ["link.jitter_s=0.02", "smpc.scheme=age-conditioned"])
     assert state(planned, "position age") is ItemState.NOTE
 
 
 def test_a_gap_as_long_as_the_horizon_fails() -> None:
-    found = look(["sim.camera.occluded=[[2.0,4.6]]"])
+    found = run_check(["sim.camera.occluded=[[2.0,4.6]]"])
     assert not found["longest gap"].ok
-    stopped = look(["sim.camera.occluded=[[3.0,99.0]]"])
+    stopped = run_check(["sim.camera.occluded=[[3.0,99.0]]"])
     assert not stopped["longest gap"].ok  # also a gap that has not ended
 
 
 def test_noise_beyond_the_filter_s_belief_fails() -> None:
-    assert look()["position noise"].ok
-    assert not look(["sim.camera.noise_std_m=0.03"])["position noise"].ok
+    assert run_check()["position noise"].ok
+    assert not run_check(["sim.camera.noise_std_m=0.03"])["position noise"].ok
 
 
 @pytest.mark.fault(14)
 def test_a_frozen_pose_is_told() -> None:
-    found = look(["sim.camera.frozen=[[1.0,99.0]]"])
+    found = run_check(["sim.camera.frozen=[[1.0,99.0]]"])
     assert state(found, "position stuck") is ItemState.UNDETERMINED and "Move the body" in found["position stuck"].hint
 
 
@@ -111,11 +113,11 @@ def test_a_frozen_pose_is_told() -> None:
     ("scale", "told"), [((1000.0, 1000.0, 1000.0), "millimetres"), ((1.0, 1.0, -1.0), "is up negative")]
 )
 def test_a_vehicle_outside_the_room_is_told_why(scale: tuple[float, float, float], told: str) -> None:
-    hand = Hand("estimator.max_position_m=1e5")
+    hand = HandMotion("estimator.max_position_m=1e5")
     hand.place = [1.2, 0.4, -1.0]
     hand.matrix = [[scale[0], 0, 0], [0, scale[1], 0], [0, 0, scale[2]]]
-    hand.rest(4.0)
-    place = hand.done()["position in the room"]
+    hand.hold(4.0)
+    place = hand.is_done()["position in the room"]
     assert not place.ok and told in place.hint
 
 
@@ -123,19 +125,19 @@ def test_a_vehicle_outside_the_room_is_told_why(scale: tuple[float, float, float
 
 
 def test_clocks_that_are_answered_show_round_trip_and_drift() -> None:
-    found = look(seconds=8.0)
+    found = run_check(seconds=8.0)
     assert state(found, "vehicle clock") is ItemState.GOOD and "drift +0 ppm" in found["vehicle clock"].value
     assert state(found, "source clock") is ItemState.NOTE  # the simulated cameras answer nothing
 
 
-class Answering(Hand):
+class Answering(HandMotion):
     """A vehicle that answers TIMESYNC late, or by a clock that drifts."""
 
     delay_ns, drift = 0, 0.0
 
     def rest(self, seconds: float, *, armed: bool = False) -> None:
         for _ in range(round(seconds * 20)):
-            super().rest(0.05, armed=armed)
+            super().hold(0.05, armed=armed)
 
     def answer(self) -> None:
         outgoing: list[Outgoing] = []
@@ -159,25 +161,25 @@ def test_clock_trouble_is_told(delay_ms: int, drift: float, told: str) -> None:
         hand.at_ns += 950 * MS
         hand.flight.receive("vehicle", hand.vehicle.heartbeat(), hand.at_ns)
         hand.answer()
-    clock = hand.done()["vehicle clock"]
+    clock = hand.is_done()["vehicle clock"]
     assert told in clock.value
     assert clock.state is (ItemState.GOOD if told == "0 rejected" else ItemState.NOTE)
 
 
 def test_the_relay_cannot_do_without_the_vehicle_s_clock() -> None:
-    hand = Hand("relay.enabled=true")
-    hand.rest(4.0)
-    assert not hand.done()["vehicle clock"].ok
+    hand = HandMotion("relay.enabled=true")
+    hand.hold(4.0)
+    assert not hand.is_done()["vehicle clock"].ok
 
 
 def test_two_sources_of_one_id_are_found_by_their_stamps() -> None:
-    hand = Hand()
-    hand.rest(2.0)
+    hand = HandMotion()
+    hand.hold(2.0)
     for n in range(40):
         hand.at_ns += 50 * MS
         for _ in range(2):
             hand.flight.receive("mocap", hand.cameras.vision(10**9 + n * 50_000, 0.3, 0.2, 0.0), hand.at_ns)
-    assert not hand.done()["source clock"].ok
+    assert not hand.is_done()["source clock"].ok
 
 
 # --- vehicle ---------------------------------------------------------------------------------------------------------
@@ -186,37 +188,37 @@ def test_two_sources_of_one_id_are_found_by_their_stamps() -> None:
 def test_no_vehicle() -> None:
     config = load_config("room-hahn-stursberg")
     flight = Preflight(config, make_links, 0)
-    found = Checked(flight, S)
-    assert {"vehicle", "positions"} <= set(found.bad)
+    found = CheckResult(flight, S)
+    assert {"vehicle", "positions"} <= set(found.bad_items)
 
 
 def test_an_autopilot_that_is_not_known_fails() -> None:
-    hand = Hand()
+    hand = HandMotion()
     hand.flight.receive("vehicle", hand.vehicle.heartbeat(autopilot=8), 0)
-    assert not Checked(hand.flight, S)["vehicle"].ok
+    assert not CheckResult(hand.flight, S)["vehicle"].ok
 
 
 def test_a_vehicle_that_fell_silent_fails() -> None:
-    hand = Hand()
-    hand.rest(2.0)
-    assert not Checked(hand.flight, hand.at_ns + 4 * S)["vehicle"].ok
+    hand = HandMotion()
+    hand.hold(2.0)
+    assert not CheckResult(hand.flight, hand.at_ns + 4 * S)["vehicle"].ok
 
 
 @pytest.mark.fault(16)
 def test_a_second_vehicle_on_the_link_fails() -> None:
-    hand = Hand()
-    hand.rest(2.0)
+    hand = HandMotion()
+    hand.hold(2.0)
     hand.flight.receive("vehicle", Peer(2, 1).heartbeat(), hand.at_ns)
-    assert not hand.done()["other vehicles"].ok
+    assert not hand.is_done()["other vehicles"].ok
 
 
 def test_the_battery_is_judged_only_if_a_limit_is_given() -> None:
-    assert state(look(), "battery") is ItemState.GOOD
-    assert state(look(wrong=["check.battery_v=14.0"]), "battery") is ItemState.BAD
+    assert state(run_check(), "battery") is ItemState.GOOD
+    assert state(run_check(wrong=["check.battery_v=14.0"]), "battery") is ItemState.BAD
 
 
 def test_armed_and_in_the_air_are_told() -> None:
-    found = look(airborne=True)
+    found = run_check(airborne=True)
     assert (state(found, "armed"), state(found, "landed")) == (ItemState.NOTE, ItemState.NOTE)
 
 
@@ -335,10 +337,10 @@ def test_only_bad_items_forbid_arming_and_accepted_ones_do_not() -> None:
 
 def test_the_heading_of_a_turned_body_is_a_mean_of_directions() -> None:
     """Angles near 180 degrees must not average to 0."""
-    hand = Hand(heading_rad=math.pi)
-    hand.rest(3.0)
-    assert state(hand.done(), "heading") is ItemState.UNDETERMINED  # the hand's cameras tell no attitude
-    found = look(["frame.yaw_deg=10.0"], ["frame.yaw_deg=-170.0"])
+    hand = HandMotion(heading_rad=math.pi)
+    hand.hold(3.0)
+    assert state(hand.is_done(), "heading") is ItemState.UNDETERMINED  # the hand's cameras tell no attitude
+    found = run_check(["frame.yaw_deg=10.0"], ["frame.yaw_deg=-170.0"])
     assert state(found, "heading") is ItemState.BAD and "180" in found["heading"].value
 
 
@@ -349,8 +351,8 @@ def test_with_the_relay_the_check_itself_gives_the_vehicle_its_position(autopilo
             assert peers.autopilot.parameters.set(name, value), name
 
     more = ["relay.enabled=true", "frame.yaw_deg=20", "sim.camera.rate_hz=30.0", "sim.plant=quadrotor"]
-    found = look([f"sim.autopilot={autopilot}", *more], prepare=prepare, seconds=8.0)
-    assert not found.bad
+    found = run_check([f"sim.autopilot={autopilot}", *more], prepare=prepare, seconds=8.0)
+    assert not found.bad_items
     assert state(found, "relay") is ItemState.GOOD and state(found, "own position") is ItemState.GOOD
     # What the vehicle believes because we told it shows nothing of our axes.
     assert state(found, "axes") is ItemState.UNDETERMINED and "ENU" in found["axes"].value
@@ -360,22 +362,22 @@ def test_with_the_relay_the_check_itself_gives_the_vehicle_its_position(autopilo
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 3e38, -3e38, 1e-45])
 @pytest.mark.parametrize("autopilot", [3, 12])
 def test_absurd_values_of_a_vehicle_never_raise(autopilot: int, value: float) -> None:
-    hand = Hand(own=True)
-    hand.rest(2.0)
-    hand.tell(hand.vehicle.heartbeat(autopilot=autopilot, custom_mode=4))
+    hand = HandMotion(has_estimate=True)
+    hand.hold(2.0)
+    hand.report(hand.vehicle.heartbeat(autopilot=autopilot, custom_mode=4))
     for name in list_parameters(autopilot):
         for kind in (2, 6, 9):
-            hand.tell(hand.vehicle.send("param_value", name.encode(), value, kind, 9, 3))
+            hand.report(hand.vehicle.send("param_value", name.encode(), value, kind, 9, 3))
     for n in range(20):
         hand.at_ns += 50 * MS
         boot_ms = hand.at_ns // MS + 20_000
-        hand.tell(hand.vehicle.local_position(boot_ms, value, value, value))
-        hand.tell(hand.vehicle.send("attitude", boot_ms, value, value, value, 0.0, 0.0, 0.0))
+        hand.report(hand.vehicle.local_position(boot_ms, value, value, value))
+        hand.report(hand.vehicle.send("attitude", boot_ms, value, value, value, 0.0, 0.0, 0.0))
         where = (value if math.isfinite(value) else 0.0, 0.0, 0.0)
         attitude = [value, 0.0, 0.0, 1.0]
         data = hand.cameras.send("att_pos_mocap", 10**10 + n * 50_000, attitude, *where, [math.nan] * 21)
         hand.flight.receive("mocap", data, hand.at_ns)
-    assert hand.done().items
+    assert hand.is_done().items
 
 
 @pytest.mark.slow

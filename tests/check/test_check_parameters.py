@@ -9,10 +9,10 @@ from itertools import product
 import msgspec
 import numpy as np
 import pytest
-from check_rig import Checked, Hand, look
+from check_rig import CheckResult, HandMotion, run_check
 from hypothesis import given
 from hypothesis import strategies as st
-from manual_rig import blocks, keys
+from manual_rig import find_blocks, parse_keys
 from mavlink_rig import packets, read
 from places import ROOT
 
@@ -29,12 +29,12 @@ from uavctl.loop import make_links
 BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 
 
-def with_parameters(autopilot: str, *more: str, **values: float) -> Checked:
+def with_parameters(autopilot: str, *more: str, **values: float) -> CheckResult:
     def prepare(peers: Peers) -> None:
         for name, value in values.items():
             assert peers.autopilot.parameters.set(name, value), name
 
-    return look([f"sim.autopilot={autopilot}", *more], prepare=prepare, seconds=4.0)
+    return run_check([f"sim.autopilot={autopilot}", *more], prepare=prepare, seconds=4.0)
 
 
 @BOTH
@@ -186,20 +186,20 @@ def test_the_recorded_vehicle_stays_guided_for_8_s_after_its_last_position() -> 
 def test_px4_s_own_climb_is_to_end_in_the_room_and_not_before_ours(
     altitude_m: float, take_off_m: float | None, want: ItemState
 ) -> None:
-    hand = Hand()
+    hand = HandMotion()
     hand.flight = Preflight(hand.config, make_links, 0, take_off_m=take_off_m)
-    hand.rest(2.0)
-    hand.tell(hand.vehicle.send("param_value", b"MIS_TAKEOFF_ALT", altitude_m, 9, 9, 3))
-    found = hand.done()["MIS_TAKEOFF_ALT"]
+    hand.hold(2.0)
+    hand.report(hand.vehicle.send("param_value", b"MIS_TAKEOFF_ALT", altitude_m, 9, 9, 3))
+    found = hand.is_done()["MIS_TAKEOFF_ALT"]
     assert found.state is want
     assert "2.5 m, the room" in found.want and (take_off_m is None or f"{take_off_m:g} m, --takeoff" in found.want)
 
 
 def test_parameters_that_are_never_told_do_not_forbid_a_flight() -> None:
-    hand = Hand()
-    hand.rest(7.0)
-    found = hand.done()
-    assert found["COM_OBL_RC_ACT"].state is ItemState.UNDETERMINED and not found.bad
+    hand = HandMotion()
+    hand.hold(7.0)
+    found = hand.is_done()
+    assert found["COM_OBL_RC_ACT"].state is ItemState.UNDETERMINED and not found.bad_items
 
 
 def is_wanted(want: str, value: float, told: dict[str, float]) -> bool:
@@ -267,7 +267,10 @@ ROOMS: list[tuple[str, str, list[str]]] = [
             ("12x9x4", []),
             (
                 "5x5x2.7",
-                [f"{table}.{key}={value}" for table, key, value in keys(blocks("docs/first-flight.md", "toml")[0])],
+                [
+                    f"{table}.{key}={value}"
+                    for table, key, value in parse_keys(find_blocks("docs/first-flight.md", "toml")[0])
+                ],
             ),
         )
     ],

@@ -33,14 +33,14 @@ def document(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, A
     code, out, _ = typed(capsys, *arguments, "--json")
     assert code == 0
     assert out.count("\n") == 1  # one document, on a line of its own
-    found: dict[str, Any] = json.loads(out)
-    name = re.fullmatch(r"uavctl/([a-z/-]+)/[1-9][0-9]*", found.pop("schema"))
+    document: dict[str, Any] = json.loads(out)
+    name = re.fullmatch(r"uavctl/([a-z/-]+)/[1-9][0-9]*", document.pop("schema"))
     assert name is not None and name[1] == arguments[0]
-    return found
+    return document
 
 
 @pytest.mark.parametrize(
-    ("arguments", "kind", "code", "told"),
+    ("arguments", "kind", "code", "message"),
     [
         (("log", "info", "there/is/none.mcap"), "RecordingError", 1, "none.mcap"),
         (("solve", "--config", "paper", "--state=1,2"), "UsageError", 2, "give 4 numbers"),
@@ -50,14 +50,14 @@ def document(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, A
     ],
 )
 def test_an_error_is_a_document_too(
-    capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], kind: str, code: int, told: str
+    capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], kind: str, code: int, message: str
 ) -> None:
     without, _, _ = typed(capsys, *arguments)
     ended, out, err = typed(capsys, *arguments, "--json")
-    found = json.loads(out)
+    document = json.loads(out)
     assert (ended, without) == (code, code) and out.count("\n") == 1
-    assert told in found.pop("message") and told in err
-    assert found == {"schema": "uavctl/error/1", "type": kind, "exit_code": code}
+    assert message in document.pop("message") and message in err
+    assert document == {"schema": "uavctl/error/1", "type": kind, "exit_code": code}
 
 
 def test_every_command_names_its_document() -> None:
@@ -89,7 +89,7 @@ def test_solve_shows_people_a_table(capsys: pytest.CaptureFixture[str]) -> None:
     assert "method exact: optimal" in out and "61669.93" in out and "gap" in out and "v_e" in out
 
 
-def test_solve_says_what_gave_way(capsys: pytest.CaptureFixture[str]) -> None:
+def test_solve_names_relaxed_constraints(capsys: pytest.CaptureFixture[str]) -> None:
     outside = "49,-2,-20,-14"
     answer = document(capsys, "solve", "--config", "paper", "--state", outside)
     assert answer["method"] == "exact" and answer["slack"] > 10
@@ -107,16 +107,16 @@ def test_a_state_that_is_none_is_refused(capsys: pytest.CaptureFixture[str], sta
 
 
 def test_design_shows_assumption_4_with_figures(capsys: pytest.CaptureFixture[str]) -> None:
-    found = document(capsys, "design", "--config", "paper")
+    result = document(capsys, "design", "--config", "paper")
     assert {
         "tau", "delays", "alpha", "gamma_x", "gamma_u", "spectral_radius", "assumptions", "design_id",
         "wall_s",
-    } <= found.keys()  # fmt: skip
-    assert (found["tau"], found["delays"]) == (4, [5] * 12)
-    assert found["spectral_radius"] == pytest.approx(0.9714, abs=5e-5)
-    assert [check["item"] for check in found["assumptions"]] == ["4.1", "4.2", "4.3", "4.4", "4.5"]
-    assert all(check["ok"] and {"value", "limit"} <= check.keys() for check in found["assumptions"])
-    assert found["assumptions"][0]["value"] == pytest.approx(1 - 0.3**5)
+    } <= result.keys()  # fmt: skip
+    assert (result["tau"], result["delays"]) == (4, [5] * 12)
+    assert result["spectral_radius"] == pytest.approx(0.9714, abs=5e-5)
+    assert [check["item"] for check in result["assumptions"]] == ["4.1", "4.2", "4.3", "4.4", "4.5"]
+    assert all(check["ok"] and {"value", "limit"} <= check.keys() for check in result["assumptions"])
+    assert result["assumptions"][0]["value"] == pytest.approx(1 - 0.3**5)
     code, out, _ = typed(capsys, "design", "--config", "paper")
     assert code == 0
     assert "Assumption 4" in out and "0.9976" in out
@@ -151,19 +151,19 @@ def test_a_wrong_configuration_is_refused(capsys: pytest.CaptureFixture[str], tm
     name = key.partition(".")[2]
     lines = enumerate(file.read_text(encoding="utf-8").splitlines(), 1)
     line = next(number for number, content in lines if content.startswith(f"{name} ="))
-    (told,) = [each for each in err.splitlines() if f"{file}:{line}: {key}: " in each]
-    assert reason in told
-    assert todo in told.partition(reason)[2] or todo in told
+    (error_line,) = [each for each in err.splitlines() if f"{file}:{line}: {key}: " in each]
+    assert reason in error_line
+    assert todo in error_line.partition(reason)[2] or todo in error_line
     assert "Traceback" not in err
 
 
 def test_overrides_repeat_and_their_errors_name_them(capsys: pytest.CaptureFixture[str]) -> None:
-    found = document(
+    result = document(
         capsys, "design", "--config", "paper", "--set", "smpc.tau=3", "--set", "schedule.delays=4",
         "--set", "smpc.delta_x=0.9", "--set", "sets.state_lower=[-90, -20, -90, -20]",
         "--set", "sets.state_upper=[90, 20, 90, 20]", "--set", "solver.method=exact",
     )  # fmt: skip
-    assert (found["tau"], found["delays"]) == (3, [4] * 12)
+    assert (result["tau"], result["delays"]) == (3, [4] * 12)
     code, out, err = typed(capsys, "design", "--set", "link.los=0.3", "--set", "smpc.tau=0")
     assert (code, out) == (2, "")
     assert "--set link.los=0.3: link.los: unknown key" in err
@@ -179,7 +179,7 @@ def test_usage_errors_exit_with_2(capsys: pytest.CaptureFixture[str], arguments:
     assert err
 
 
-def test_help_tells_commands_and_exit_codes(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_lists_commands_and_exit_codes(capsys: pytest.CaptureFixture[str]) -> None:
     code, out, _ = typed(capsys, "--help")
     assert code == 0
     assert re.search(r"Exit codes: 0 \w.*; 1 .*; 2 .* configuration", " ".join(out.split()))
@@ -226,16 +226,18 @@ def test_an_interruption_is_one_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("arguments", "message"),
     [(["campaign", "x.toml"], "uavctl[campaign]"), (["replay", "x.mcap"], '"replay"'), (["flyy"], '"fly"')],
 )
-def test_without_the_extras_a_command_says_what_it_needs_and_a_wrong_one_is_refused(
-    words: list[str], told: str
+def test_without_extras_a_command_names_the_missing_one_and_a_wrong_command_is_refused(
+    arguments: list[str], message: str
 ) -> None:
     code = "import sys; sys.modules['pyarrow'] = None; from uavctl.cli.app import run; sys.exit(run(sys.argv[1:]))"
-    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, cwd=ROOT, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code, *arguments], capture_output=True, text=True, cwd=ROOT, check=False
+    )
     assert done.returncode == 2 and done.stdout == ""
-    assert told in done.stderr and done.stderr.startswith("error:") and done.stderr.count("\n") == 1
+    assert message in done.stderr and done.stderr.startswith("error:") and done.stderr.count("\n") == 1
 
 
 @pytest.mark.parametrize("place", [["-1,0,-1"], ["-1", "0", "-1"], ["-1.5", "-0.5", "-1e0"]])
@@ -247,14 +249,14 @@ def test_a_place_below_zero_is_taken_with_commas_and_with_spaces(
 
 
 @pytest.mark.parametrize(
-    ("words", "told"), [(["-1", "0"], "write three numbers"), (["1", "0", "-1", "--contrl", "x"], "--contrl")]
+    ("arguments", "message"), [(["-1", "0"], "write three numbers"), (["1", "0", "-1", "--contrl", "x"], "--contrl")]
 )
-def test_a_place_that_is_none_is_told(words: list[str], told: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["ctl", "goto", *words]) == 2
-    assert told in capsys.readouterr().err
+def test_a_wrong_position_is_refused(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["ctl", "goto", *arguments]) == 2
+    assert message in capsys.readouterr().err
 
 
-def test_progress_is_told_in_lines_where_no_bar_can_be_drawn(capsys: pytest.CaptureFixture[str]) -> None:
+def test_progress_is_printed_in_lines_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
     now_s = 0.0
     with make_progress() as progress:
         progress.get_time = lambda: now_s
@@ -287,7 +289,7 @@ def test_the_manual_is_shown_page_by_page(capsys: pytest.CaptureFixture[str]) ->
     assert run(["docs", "../README"]) == 2
 
 
-def test_the_manual_page_tells_every_command_with_its_options() -> None:
+def test_the_manual_page_lists_every_command_with_its_options() -> None:
     text = (ROOT / "docs" / "uavctl.1").read_text(encoding="utf-8").replace("\\-", "-")
     for heading, option in (
         (".SH UAVCTL LOOPBACK", "--takeoff FLOAT"), (".SH UAVCTL FLY", "--realtime"),

@@ -19,8 +19,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
-from operation_rig import PATIENT_DAEMON, PATIENT_VEHICLE, ended, port
-from patience import until
+from operation_rig import PATIENT_DAEMON, PATIENT_VEHICLE, reserve_port, wait_for_end
+from patience import wait_until
 from places import ROOT, without_pages
 
 from sim.server import VehicleSetup, serve_all
@@ -62,13 +62,11 @@ def file(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_fleet_that_can_be_flown_is_told_with_its_nearest_boxes(
-    file: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_valid_fleet_is_reported_with_its_nearest_boxes(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["fleet", "check", str(file), "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert [one["name"] for one in found["vehicles"]] == ["west", "east"]
-    assert found["nearest_m"] == pytest.approx(EAST[0] - WEST[1])
+    document = json.loads(capsys.readouterr().out)
+    assert [entry["name"] for entry in document["vehicles"]] == ["west", "east"]
+    assert document["nearest_m"] == pytest.approx(EAST[0] - WEST[1])
 
 
 def test_the_example_is_that_of_the_page_and_can_be_flown(capsys: pytest.CaptureFixture[str]) -> None:
@@ -79,7 +77,7 @@ def test_the_example_is_that_of_the_page_and_can_be_flown(capsys: pytest.Capture
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "expected_texts"),
     [
         (HEAD + entry("a", WEST, A) + entry("b", (-0.2, 2.5), B), ("a and b", "0.20 m apart", "spacing_m")),
         (HEAD + entry("a", WEST, A) + entry("b", (-1.0, 2.5), B), ("overlap by 0.60 m",)),
@@ -96,31 +94,31 @@ def test_the_example_is_that_of_the_page_and_can_be_flown(capsys: pytest.Capture
     ],
 )
 def test_a_fleet_that_cannot_be_flown_is_refused_with_the_place(
-    tmp_path: Path, text: str, words: tuple[str, ...]
+    tmp_path: Path, text: str, expected_texts: tuple[str, ...]
 ) -> None:
     path = tmp_path / "fleet.toml"
     path.write_text(text)
     with pytest.raises(ConfigError) as caught:
         read_fleet(path)
-    told = str(caught.value)
-    assert "fleet.toml:" in told
-    for word in words:
-        assert word in told
+    error_text = str(caught.value)
+    assert "fleet.toml:" in error_text
+    for expected_text in expected_texts:
+        assert expected_text in error_text
 
 
-def test_a_file_that_is_not_there_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_missing_file_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for command in (["check"], ["status"], ["land"], ["fly", "--out", str(tmp_path / "out")]):
         assert run(["fleet", *command[:1], str(tmp_path / "none.toml"), *command[1:]]) == 2
         assert "none.toml" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
-def test_without_daemons_status_and_land_say_so(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_daemons_status_and_land_fail(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["fleet", "status", str(file), "--json"]) == 1
     assert json.loads(capsys.readouterr().out)["vehicles"] == {"west": None, "east": None}
     assert run(["fleet", "land", str(file)]) == 1
-    told = capsys.readouterr().err
-    assert "west: land not reached" in told and "east: land not reached" in told
+    output = capsys.readouterr().err
+    assert "west: land not reached" in output and "east: land not reached" in output
 
 
 INTERVAL = st.tuples(st.floats(-5, 5), st.floats(0.01, 3)).map(lambda one: (one[0], one[0] + one[1]))
@@ -135,7 +133,7 @@ def member(north: tuple[float, float], east: tuple[float, float]) -> Member:
 
 
 @given(INTERVAL, INTERVAL, INTERVAL, INTERVAL)
-def test_places_in_two_boxes_are_as_far_apart_as_is_said(
+def test_positions_in_two_boxes_are_as_far_apart_as_the_reported_gap(
     north: tuple[float, float],
     east: tuple[float, float],
     other_north: tuple[float, float],
@@ -144,10 +142,10 @@ def test_places_in_two_boxes_are_as_far_apart_as_is_said(
     """By the corners, and where boxes overlap along an axis by a place that both have there."""
     apart_m = compute_gap_m(member(north, east), member(other_north, other_east))
     nearest = [
-        min((abs(a - b) for a, b in product(one, other)), default=0.0)
-        if one[1] < other[0] or other[1] < one[0]
+        min((abs(a - b) for a, b in product(state, other_state)), default=0.0)
+        if state[1] < other_state[0] or other_state[1] < state[0]
         else 0.0
-        for one, other in ((north, other_north), (east, other_east))
+        for state, other_state in ((north, other_north), (east, other_east))
     ]
     assert max(apart_m, 0.0) == pytest.approx(max(nearest))
 
@@ -158,9 +156,9 @@ def flying() -> Iterator[tuple[Path, dict[str, list[Truth]], subprocess.Popen[st
     truths: dict[str, list[Truth]] = {"west": [], "east": []}
     done, seats, tables = threading.Event(), [], []
     for number, (name, limits) in enumerate({"west": WEST, "east": EAST}.items()):
-        with port() as one, port() as other:
-            ports = int(one.getsockname()[1]), int(other.getsockname()[1])
-        vehicle, mocap = (f"127.0.0.1:{one}" for one in ports)
+        with reserve_port() as first, reserve_port() as second:
+            ports = int(first.getsockname()[1]), int(second.getsockname()[1])
+        vehicle, mocap = (f"127.0.0.1:{number}" for number in ports)
         start = f"sim.start_position_m=[0,{sum(limits) / 2},-1]"
         config = load_config("room-px4", [PATIENT_VEHICLE, start, f"sim.system_id={number + 1}"])
         seats.append(VehicleSetup(config, f"udpout://{vehicle}", f"udpout://{mocap}", truths[name].append))
@@ -179,11 +177,13 @@ def flying() -> Iterator[tuple[Path, dict[str, list[Truth]], subprocess.Popen[st
             fleet = subprocess.Popen(
                 [*command, "--json"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=environ
             )
-            with ended(fleet):
+            with wait_for_end(fleet):
                 # Nobody would fly them while the daemons begin.
-                until(lambda: all(one["pid"] for one in status(path)), "both daemons listen", pause_s=0.5)
+                wait_until(lambda: all(health["pid"] for health in status(path)), "both daemons listen", pause_s=0.5)
                 peers.start()
-                until(lambda: all(one["mode"] == "track" for one in status(path)), "both are flown", pause_s=0.5)
+                wait_until(
+                    lambda: all(health["mode"] == "track" for health in status(path)), "both are flown", pause_s=0.5
+                )
                 yield path, truths, fleet
         finally:
             done.set()
@@ -192,14 +192,14 @@ def flying() -> Iterator[tuple[Path, dict[str, list[Truth]], subprocess.Popen[st
 
 
 def status(path: Path) -> list[dict[str, Any]]:
-    found = []
-    for one in read_fleet(path).members:
+    results = []
+    for fleet_member in read_fleet(path).members:
         try:
-            health = send_request(ControlRequest(ask="status"), path.parent / "c", one.daemon).status
+            health = send_request(ControlRequest(ask="status"), path.parent / "c", fleet_member.daemon).status
         except NotReachedError:
             health = None
-        found.append({"mode": None, "pid": 0} if health is None else {"mode": health.mode, "pid": health.pid})
-    return found
+        results.append({"mode": None, "pid": 0} if health is None else {"mode": health.mode, "pid": health.pid})
+    return results
 
 
 @pytest.mark.slow
@@ -218,12 +218,12 @@ def test_all_land_together_and_have_never_been_near_each_other(how: str) -> None
         else:
             fleet.kill()
         for name in lands:
-            until(lambda name=name: any(one.mode == "AUTO.LAND" for one in truths[name]), f"{name} lands")  # type: ignore[misc]
-        until(lambda: fleet.poll() is not None, "the end")
+            wait_until(lambda name=name: any(truth.mode == "AUTO.LAND" for truth in truths[name]), f"{name} lands")  # type: ignore[misc]
+        wait_until(lambda: fleet.poll() is not None, "the end")
     places = zip(truths["west"], truths["east"], strict=False)
-    flown = [(one.position_m, other.position_m) for one, other in places if one.mode == other.mode == "OFFBOARD"]
+    flown = [(west.position_m, east.position_m) for west, east in places if west.mode == east.mode == "OFFBOARD"]
     assert len(flown) > 5
-    assert min(max(abs(a - b) for a, b in zip(one[:2], other[:2], strict=True)) for one, other in flown) >= SPACING_M
+    assert min(max(abs(a - b) for a, b in zip(west[:2], east[:2], strict=True)) for west, east in flown) >= SPACING_M
 
 
 def test_a_daemon_that_refuses_to_arm_ends_with_its_own_exit_code(
@@ -234,10 +234,10 @@ def test_a_daemon_that_refuses_to_arm_ends_with_its_own_exit_code(
     monkeypatch.setenv(FOLDER_VARIABLE, str(short))
     path = tmp_path / "fleet.toml"
     path.write_text(HEAD + entry("west", WEST, "udpin://127.0.0.1:0", "udpin://127.0.0.1:0", "check.seconds=0.2"))
-    (one,) = read_fleet(path).members
-    flight = FleetFlight(one, ["--arm", "--takeoff", "1.2", "--out", str(tmp_path / "out")])
+    (fleet_member,) = read_fleet(path).members
+    flight = FleetFlight(fleet_member, ["--arm", "--takeoff", "1.2", "--out", str(tmp_path / "out")])
     flight.start()
-    until(lambda: not flight.is_running(), "the end of the daemon")
+    wait_until(lambda: not flight.is_running(), "the end of the daemon")
     flight.join_output()
     flight.request_end()
     assert flight.exit_code == 1

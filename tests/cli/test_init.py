@@ -8,7 +8,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from uavctl.build.controller import design_of
+from uavctl.build.controller import build_flight_design
 from uavctl.cli.app import run
 from uavctl.cli.init import WALL_M, format_room, parse_sizes
 from uavctl.cli.sim import DEFAULT_VEHICLE_URLS
@@ -26,7 +26,7 @@ def test_the_file_has_a_dozen_keys_and_is_the_room(autopilot: str, tmp_path: Pat
     path = tmp_path / "mine.toml"
     assert run(["init", "--autopilot", autopilot, "--room", "8x4x3", "--out", str(path)]) == 0
     table = tomllib.loads(path.read_text())
-    assert sum(len(one) if isinstance(one, dict) else 1 for one in table.values()) <= 16
+    assert sum(len(value) if isinstance(value, dict) else 1 for value in table.values()) <= 16
     config = load(str(path)).config
     assert get_position_limits_m(config) == {
         "north": (-4.0 + WALL_M, 4.0 - WALL_M),
@@ -35,7 +35,7 @@ def test_the_file_has_a_dozen_keys_and_is_the_room(autopilot: str, tmp_path: Pat
     }
     assert config.name == "mine"
     assert config.sim.autopilot == autopilot
-    assert design_of(config).plant.axes == ("north", "east", "down")
+    assert build_flight_design(config).plant.axes == ("north", "east", "down")
     for axis, (low, high) in get_position_limits_m(config).items():
         place = ("north", "east", "down").index(axis)
         assert low < config.target.position_m[place] < high
@@ -45,9 +45,12 @@ def test_the_file_has_a_dozen_keys_and_is_the_room(autopilot: str, tmp_path: Pat
 
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 def test_the_vehicle_of_the_file_is_the_simulated_one(autopilot: str) -> None:
-    own = urlsplit(parse(written(autopilot), "mine.toml").config.daemon.vehicle)
+    file_url = urlsplit(parse(written(autopilot), "mine.toml").config.daemon.vehicle)
     simulated = urlsplit(DEFAULT_VEHICLE_URLS[autopilot].split(",")[0])
-    assert (own.scheme, simulated.scheme) in {("udpin", "udpout"), ("tcp", "tcpin")} and own.port == simulated.port
+    assert (file_url.scheme, simulated.scheme) in {
+        ("udpin", "udpout"),
+        ("tcp", "tcpin"),
+    } and file_url.port == simulated.port
 
 
 def test_it_overwrites_nothing(tmp_path: Path) -> None:
@@ -63,7 +66,7 @@ def test_it_writes_to_standard_output(capsys: pytest.CaptureFixture[str], tmp_pa
 
 
 @pytest.mark.parametrize(
-    "words",
+    "arguments",
     [
         *(["--room", room] for room in ("6x5", "0x5x2", "-1x5x2", "nanx5x2", "infx5x2", "6x5x2x1", "", "1e9x5x2")),
         ["--room", "0.6x5x2.5"],
@@ -73,26 +76,26 @@ def test_it_writes_to_standard_output(capsys: pytest.CaptureFixture[str], tmp_pa
         ["--out", "/no/such/folder/mine.toml"],
     ],
 )  # fmt: skip
-def test_what_cannot_be_is_refused(words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_is_refused(arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    assert run(["init", *words]) == 2
+    assert run(["init", *arguments]) == 2
     assert not list(tmp_path.iterdir())
 
 
 def test_the_smallest_side_that_is_named_can_be_flown_in(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["init", "--room", "0.7x5x2.5", "--out", "-"]) == 2
-    least = capsys.readouterr().err.partition("at least ")[2].partition(" m")[0]
-    assert run(["init", "--room", f"{least}x5x2.5", "--out", "-"]) == 0
+    min_side = capsys.readouterr().err.partition("at least ")[2].partition(" m")[0]
+    assert run(["init", "--room", f"{min_side}x5x2.5", "--out", "-"]) == 0
 
 
 def test_limits_as_lists_beside_a_room_are_refused_with_both_lines() -> None:
     text = written("px4") + "\n[sets]\nstate_lower = [-1.0]\n"
     with pytest.raises(ConfigError) as refused:
         parse(text, "mine.toml")
-    (told,) = refused.value.problems
+    (problem,) = refused.value.problems
     lines = text.splitlines()
-    assert told.startswith(f"mine.toml:{lines.index('[sets]') + 1}: sets: ")
-    assert f"line {lines.index('[room]') + 1} " in told
+    assert problem.startswith(f"mine.toml:{lines.index('[sets]') + 1}: sets: ")
+    assert f"line {lines.index('[room]') + 1} " in problem
 
 
 @pytest.mark.parametrize(
@@ -111,7 +114,7 @@ def test_what_is_wrong_in_a_room_is_named_with_its_line(old: str, new: str, key:
     assert refused.value.problems[0].startswith(f"mine.toml:{text.splitlines().index(new) + 1}: {key}: ")
 
 
-def test_a_key_of_the_base_is_told_with_its_place() -> None:
+def test_a_wrong_key_of_the_base_is_reported_with_its_line() -> None:
     with pytest.raises(ConfigError) as refused:
         parse(written("px4") + "\n[smpc]\nhorizon = 1\n", "mine.toml")
     assert refused.value.problems[0].startswith("mine.toml:")

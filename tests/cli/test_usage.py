@@ -22,7 +22,7 @@ from uavctl.cli.usage import EXAMPLES, format_example, list_commands
 from uavctl.config.load import find_keys
 from uavctl.frames import suggest_height_sign
 
-COMMANDS = {" ".join(chain): one for chain, one in list_commands(app)}
+COMMANDS = {" ".join(chain): command for chain, command in list_commands(app)}
 EXIT_CODES = "130 interrupted"  # told once, by `uavctl --help`
 
 
@@ -44,26 +44,26 @@ def test_help_ends_with_an_example_of_the_command_and_names_all_its_arguments(co
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_an_example_is_understood_and_is_of_its_command(command: str) -> None:
-    words = shlex.split(EXAMPLES[command].partition(" >")[0])
-    assert words[:1] == ["uavctl"] and words[1:][: len(command.split())] == command.split()
-    app.parse_args(words[1:], exit_on_error=False, print_error=False)
+    arguments = shlex.split(EXAMPLES[command].partition(" >")[0])
+    assert arguments[:1] == ["uavctl"] and arguments[1:][: len(command.split())] == command.split()
+    app.parse_args(arguments[1:], exit_on_error=False, print_error=False)
 
 
 def test_examples_are_of_commands_that_there_are() -> None:
     assert EXAMPLES.keys() == COMMANDS.keys()
 
 
-def told(capsys: pytest.CaptureFixture[str], words: Sequence[str]) -> str:
+def told(capsys: pytest.CaptureFixture[str], arguments: Sequence[str]) -> str:
     """The message of a command line that is refused."""
-    assert run([*words, "--json"]) == 2
-    found = json.loads(capsys.readouterr().out)
-    assert found["type"] in ("UsageError", "ConfigError")
-    text: str = found["message"]
+    assert run([*arguments, "--json"]) == 2
+    document = json.loads(capsys.readouterr().out)
+    assert document["type"] in ("UsageError", "ConfigError")
+    text: str = document["message"]
     return text
 
 
 @pytest.mark.parametrize(
-    ("words", "suggested"),
+    ("arguments", "suggested"),
     [
         ("loopback --loss 0.3", ["--set link.loss=0.3"]),
         ("loopback --loss=0.3", ["--set link.loss=0.3"]),
@@ -84,20 +84,20 @@ def told(capsys: pytest.CaptureFixture[str], words: Sequence[str]) -> str:
         ("log infoo x", ["info"]),
     ],
 )
-def test_a_wrong_word_is_told_with_what_was_meant(
-    capsys: pytest.CaptureFixture[str], words: str, suggested: list[str]
+def test_a_wrong_argument_is_reported_with_a_suggestion(
+    capsys: pytest.CaptureFixture[str], arguments: str, suggested: list[str]
 ) -> None:
-    text = told(capsys, words.split())
-    assert suggested and all(one in text for one in suggested)
+    text = told(capsys, arguments.split())
+    assert suggested and all(suggestion in text for suggestion in suggested)
 
 
-def test_a_command_without_overrides_is_not_told_to_set_a_key(capsys: pytest.CaptureFixture[str]) -> None:
-    for words in ("ctl hold --loss 0.3", "log info x.mcap --loss 0.3", "key show a loss=1"):
-        assert "--set" not in told(capsys, words.split())
+def test_a_command_without_overrides_suggests_no_key(capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments in ("ctl hold --loss 0.3", "log info x.mcap --loss 0.3", "key show a loss=1"):
+        assert "--set" not in told(capsys, arguments.split())
 
 
 @pytest.mark.parametrize(
-    ("words", "unknown", "takes"),
+    ("arguments", "unknown", "takes"),
     [
         ("ctl hold a b", ["a", "b"], "uavctl ctl hold [OPTIONS]"),
         ("log info a b", ["b"], "uavctl log info [OPTIONS] FLIGHT"),
@@ -108,16 +108,18 @@ def test_a_command_without_overrides_is_not_told_to_set_a_key(capsys: pytest.Cap
         ("loopback --set", ["--set"], "uavctl loopback [OPTIONS]"),
     ],
 )
-def test_words_too_many_or_too_few_are_told_with_what_the_command_takes(
-    capsys: pytest.CaptureFixture[str], words: str, unknown: list[str], takes: str
+def test_too_many_or_too_few_arguments_are_reported_with_the_usage(
+    capsys: pytest.CaptureFixture[str], arguments: str, unknown: list[str], takes: str
 ) -> None:
-    text = told(capsys, words.split())
-    assert takes in text and all(one in text for one in unknown)
+    text = told(capsys, arguments.split())
+    assert takes in text and all(argument in text for argument in unknown)
     assert "Unused Tokens" not in text
 
 
 @pytest.mark.parametrize("command", ["loopback", "fly"])
-def test_a_positive_height_is_told_with_the_number_to_write(capsys: pytest.CaptureFixture[str], command: str) -> None:
+def test_a_positive_height_is_reported_with_the_number_to_write(
+    capsys: pytest.CaptureFixture[str], command: str
+) -> None:
     assert "-1.1" in told(capsys, [command, "--goto", "1,0,1.1"])
     assert "-1.1" in told(capsys, [command, "--set", "target.position_m=[1,0,1.1]"])
 
@@ -136,18 +138,20 @@ def extras() -> set[str]:
     """Modules of the optional packages, but for those of development."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     names = {
-        one.partition(">")[0].strip().lower()
+        distribution.partition(">")[0].strip().lower()
         for extra, needed in project["optional-dependencies"].items()
         if extra != "dev"
-        for one in needed
+        for distribution in needed
     }
     modules = packages_distributions()
-    return {module for module, of in modules.items() if names & {one.lower() for one in of}} | {"dask"}
+    return {module for module, of in modules.items() if names & {distribution.lower() for distribution in of}} | {
+        "dask"
+    }
 
 
 def test_without_any_extra_every_help_and_every_refusal_works(tmp_path: Path) -> None:
-    found = extras()
-    assert {"pyarrow", "pandas", "polars", "distributed", "foxglove", "natnet", "qtm_rt", "pyulog"} <= found
+    result = extras()
+    assert {"pyarrow", "pandas", "polars", "distributed", "foxglove", "natnet", "qtm_rt", "pyulog"} <= result
     lines = [[*command.split(), "--help"] for command in COMMANDS]
     lines += [["-v"], ["--json"], ["--unknown"], ["loopback", "--unknown"], ["--version"], ["--install-completion"]]
     needs = {
@@ -157,7 +161,7 @@ def test_without_any_extra_every_help_and_every_refusal_works(tmp_path: Path) ->
         "qualisys": ["check", "--mocap", "qualisys://127.0.0.1/drone", "--seconds", "0.1"],
     }
     program = (
-        f"import json, sys\nfor name in {sorted(found)}: sys.modules[name] = None\n"
+        f"import json, sys\nfor name in {sorted(result)}: sys.modules[name] = None\n"
         "from uavctl.cli.app import run\ncodes = []\n"
         "for words in json.loads(sys.argv[1]):\n"
         "    try: codes.append(run(words))\n"

@@ -87,8 +87,8 @@ LONG = "x" * 170  # as a path may be
 )
 def test_a_table_that_goes_to_a_file_is_whole(table: RenderableType, capsys: pytest.CaptureFixture[str]) -> None:
     DEFAULTS.show("table", {}, lambda: table)
-    told = capsys.readouterr().out
-    assert LONG in told and "two words" in told and "…" not in told
+    output = capsys.readouterr().out
+    assert LONG in output and "two words" in output and "…" not in output
 
 
 def test_a_table_with_room_keeps_the_usual_width_in_a_file(capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from config_mutants import CONFIG, Case, Mutants, bases, ranges
+from config_mutants import CONFIG, Case, Mutants, find_ranges, load_bases
 
 from uavctl.cli.app import run
 from uavctl.config import Config, dump_config, load, load_config, parse
@@ -143,7 +143,7 @@ def test_a_longest_trace_and_motion_still_make_a_configuration_that_can_be_read_
 
 
 def test_every_number_has_a_range() -> None:
-    found = dict(ranges(Config))
+    found = dict(find_ranges(Config))
     assert len(found) > 90
     unbounded = [path for path, (low, high, _) in found.items() if not -1e16 < low < high < 1e16]
     assert unbounded == []
@@ -287,7 +287,7 @@ def quick(words: list[str]) -> list[str]:
 def test_a_slice_of_spoilt_configurations_ends_in_an_answer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    mutants, codes = Mutants(SEED, bases()), set()
+    mutants, codes = Mutants(SEED, load_bases()), set()
     for number in range(CONFIGS):
         case, folder = mutants.config(number), tmp_path / str(number)
         folder.mkdir()
@@ -303,7 +303,7 @@ def test_a_slice_of_spoilt_configurations_ends_in_an_answer(
 def test_a_slice_of_spoilt_command_lines_ends_in_an_answer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    mutants, codes = Mutants(SEED, bases()), set()
+    mutants, codes = Mutants(SEED, load_bases()), set()
     for number in range(LINES):
         case, folder = mutants.command_line(number), tmp_path / str(number)
         if case.words[0] in ("design", "solve", "log", "ctl", "key"):

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from itertools import pairwise
 
 import pytest
-from daemon_rig import DT_NS, SECOND, TICK_NS, Bench
+from daemon_rig import DT_NS, SECOND, TICK_NS, DaemonRig
 from loopback_rig import make_loop
 from mavlink_rig import OFFBOARD, Peer
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -19,7 +19,7 @@ from uavctl.records import ControlMode, Datagram, Decision, Event, LinkStats, Ou
 
 
 def test_it_flies_records_its_timing_and_hands_over_at_the_end() -> None:
-    bench = Bench()
+    bench = DaemonRig()
     bench.fly(duration_s=8.0)
     decisions = bench.memory.of(Decision)
     assert [d.tick for d in decisions] == list(range(len(decisions)))
@@ -36,7 +36,7 @@ def timesync(ts1_ns: int) -> bytes:
     return bytes(mavlink.MAVLink_timesync_message(0, ts1_ns).pack(mavlink.MAVLink(None, 1, 1)))
 
 
-def answers(bench: Bench) -> list[tuple[int, int, int]]:
+def answers(bench: DaemonRig) -> list[tuple[int, int, int]]:
     """(time of sending, tc1, ts1) of the answers to requests of `timesync`."""
     found = []
     for record in bench.memory.of(Datagram):
@@ -50,7 +50,7 @@ def answers(bench: Bench) -> list[tuple[int, int, int]]:
 
 
 def test_who_asks_for_the_time_is_answered_before_the_next_tick_and_a_replay_says_the_same() -> None:
-    bench = Bench('solver.method="exact"')
+    bench = DaemonRig('solver.method="exact"')
     times = [SECOND + n * 17_000_000 + 123 for n in range(100)]
     bench.arrives = [(at_ns, timesync(-n - 1)) for n, at_ns in enumerate(times)]
     bench.fly(duration_s=3.0)
@@ -62,7 +62,7 @@ def test_who_asks_for_the_time_is_answered_before_the_next_tick_and_a_replay_say
 
 @pytest.mark.slow
 def test_a_flood_of_such_questions_is_answered_in_part_and_costs_no_tick() -> None:
-    calm, flooded = Bench(), Bench()
+    calm, flooded = DaemonRig(), DaemonRig()
     calm.fly(duration_s=2.0)
     flooded.arrives = [(SECOND + n * 500_000, timesync(-n - 1)) for n in range(2000)]
     flooded.fly(duration_s=2.0)
@@ -72,7 +72,7 @@ def test_a_flood_of_such_questions_is_answered_in_part_and_costs_no_tick() -> No
 
 
 def test_words_of_the_vehicle_are_told_a_person_as_they_come_and_once() -> None:
-    bench = Bench('solver.method="exact"')
+    bench = DaemonRig('solver.method="exact"')
     at_ns = SECOND + 17_000_123
     bench.arrives = [(at_ns, Peer(1, 1).send("statustext", 2, b"PreArm: no"))]
     bench.fly(duration_s=1.5, stop_limit_s=0.0)
@@ -81,7 +81,7 @@ def test_words_of_the_vehicle_are_told_a_person_as_they_come_and_once() -> None:
 
 
 def test_a_connection_that_is_lost_is_told_a_person() -> None:
-    bench = Bench('solver.method="exact"')
+    bench = DaemonRig('solver.method="exact"')
     bench.connections["vehicle"].refused["hung-up"] += 1
     bench.connections["mocap"].refused["went-silent"] += 1
     bench.connections["mocap"].refused["not-listed"] += 1  # counted, and no word for the console
@@ -91,7 +91,7 @@ def test_a_connection_that_is_lost_is_told_a_person() -> None:
 
 @pytest.mark.fault(21)
 def test_row_21_an_oversleeping_loop_counts_what_it_missed_and_sends_no_burst() -> None:
-    bench = Bench()
+    bench = DaemonRig()
     bench.oversleep[DT_NS + 40 * TICK_NS] = 7 * TICK_NS + 3_000_000
     bench.fly(duration_s=4.0)
     missed = {d.tick: d.missed_ticks for d in bench.memory.of(Decision) if d.missed_ticks}
@@ -105,7 +105,7 @@ def test_row_21_an_oversleeping_loop_counts_what_it_missed_and_sends_no_burst() 
 
 @pytest.mark.fault(34)
 def test_row_34_a_stop_in_flight_brakes_then_lands() -> None:
-    bench = Bench()
+    bench = DaemonRig()
     assert bench.fly(stop_at_s=2.5)
     modes = [d.mode for d in bench.memory.of(Decision)]
     begun = next(i for i, m in enumerate(modes) if m is ControlMode.BRAKE)
@@ -115,19 +115,19 @@ def test_row_34_a_stop_in_flight_brakes_then_lands() -> None:
 
 
 def test_the_hand_over_is_cut_off_after_its_limit() -> None:
-    bench = Bench("fallback.brake_gain_1ps=0.001", "fallback.brake_s=100.0")
+    bench = DaemonRig("fallback.brake_gain_1ps=0.001", "fallback.brake_s=100.0")
     assert bench.fly(stop_at_s=2.5, stop_limit_s=3.0)
     assert 5.4 * SECOND <= bench.now_ns <= 5.7 * SECOND
 
 
 def test_an_end_that_nobody_asked_for_is_told_apart() -> None:
-    bench = Bench("sim.camera.occluded=[[1.5,99.0]]", "fallback.hold_s=0.5")
+    bench = DaemonRig("sim.camera.occluded=[[1.5,99.0]]", "fallback.hold_s=0.5")
     assert bench.fly(duration_s=60.0) is False
     assert bench.now_ns < 30 * SECOND and bench.peers.autopilot.mode_name == "AUTO.LAND"
 
 
 def test_a_closed_vehicle_link_ends_the_flight_with_what_to_do() -> None:
-    bench = Bench()
+    bench = DaemonRig()
     bench.connections["vehicle"].closed = True
     with pytest.raises(UavctlError, match="closed by the other side"):
         bench.fly()
@@ -137,12 +137,12 @@ def test_a_closed_vehicle_link_ends_the_flight_with_what_to_do() -> None:
 ON_HOLD = (4 << 16) | (3 << 24)
 
 
-def setpoint_times(bench: Bench) -> list[int]:
+def setpoint_times(bench: DaemonRig) -> list[int]:
     """When setpoints went out on the wire."""
     return [at_ns for at_ns, name in bench.connections["vehicle"].words if name == "SET_POSITION_TARGET_LOCAL_NED"]
 
 
-class Stalled(Bench):
+class Stalled(DaemonRig):
     """The daemon stands still from the third second on; meanwhile the vehicle speaks, and the pilot takes over.
 
     Args:
@@ -222,7 +222,7 @@ def test_where_the_system_kept_the_oldest_words_only_nothing_goes_out_until_the_
 
 @pytest.mark.fault(50)
 def test_a_backlog_that_is_never_read_to_its_end_lets_nothing_out() -> None:
-    bench = Bench()
+    bench = DaemonRig()
     bench.connections["vehicle"].has_unread = True
     bench.fly(duration_s=3.0, stop_limit_s=0.0)
     assert {name for _, name in bench.connections["vehicle"].words} <= {"TIMESYNC"}  # answers alone
@@ -231,7 +231,7 @@ def test_a_backlog_that_is_never_read_to_its_end_lets_nothing_out() -> None:
 
 
 def test_how_long_a_controller_of_another_package_takes_is_judged_and_a_replay_is_told() -> None:
-    bench = Bench('smpc.controller="outside_controllers:Regulates"')
+    bench = DaemonRig('smpc.controller="outside_controllers:Regulates"')
     watch_ns = 0
 
     def stopwatch() -> int:  # each tick's two looks at it are a tick and a millisecond apart from two seconds on

@@ -6,7 +6,7 @@ import math
 
 import msgspec
 import pytest
-from loopback_rig import Memory, shared_loop
+from loopback_rig import MemorySink, shared_loop
 
 from sim.simulation import Peers
 from uavctl.cli.ctl import describe_relay
@@ -22,7 +22,7 @@ class Flight:
 
     def __init__(self, name: str = "room-hahn-stursberg", *overrides: str) -> None:
         config = load_config(name, overrides)
-        self.loop = shared_loop(config, Memory())
+        self.loop = shared_loop(config, MemorySink())
         self.peers = Peers(config, 0)
         self.lines: list[str] = []
         self.dropped = 0

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from user_rig import OTHER, as_other, shared_folder
+from user_rig import OTHER, run_as_other_user, shared_folder
 
 from uavctl.daemon import runtime_folder
 from uavctl.daemon.lock import find_lock_paths, lock_vehicle
@@ -155,11 +155,11 @@ def test_another_user_can_neither_rewrite_nor_hold_a_lock(machine: Path) -> None
     with lock_vehicle(URL):
         paths = find_lock_paths(URL)
         assert [stat.S_IMODE(path.stat().st_mode) for path in paths] == [0o600]
-        second = as_other(flies)
+        second = run_as_other_user(flies)
         if OTHER == ME:  # the same user: there is one daemon
             assert second.startswith(f"VehicleTakenError: {URL}: process {os.getpid()} flies this vehicle already")
         else:  # who it is cannot be kept out by a lock, and cannot keep us out
-            assert second == "flies, too" and as_other(does) == "refused"
+            assert second == "flies, too" and run_as_other_user(does) == "refused"
     with lock_vehicle(URL):
         assert not is_private_folder(machine / "tmp")
 

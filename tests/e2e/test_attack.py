@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import pytest
-from attack_rig import stalls
+from attack_rig import run_stalls
 
 
 @pytest.mark.slow
 @pytest.mark.fault(49)
 def test_a_daemon_that_was_stopped_sends_nothing_to_a_vehicle_that_the_pilot_has() -> None:
-    assert [row["setpoints"] for row in stalls(1, 3, 600.0, signed=True)] == [0]
+    assert [row["setpoints"] for row in run_stalls(1, 3, 600.0, signed=True)] == [0]

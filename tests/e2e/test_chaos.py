@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from chaos import runs, soak_core
+from chaos import run_ticks, soak_core
 
 from uavctl.event_codes import EventCode
 from uavctl.records import ControlMode, Vec3
@@ -33,7 +33,7 @@ def test_every_setpoint_is_finite_bounded_and_slew_limited_with_faults_of_all_ki
 @pytest.mark.slow
 def test_the_random_flights_see_every_mode_refusal_and_answer() -> None:
     modes, codes = set(), set()
-    for _, output, _ in runs(np.random.default_rng(1), 10_000, orders=True):
+    for _, output, _ in run_ticks(np.random.default_rng(1), 10_000, orders=True):
         modes.add(output.decision.mode)
         codes |= {event.code for event in output.events}
     assert modes == set(ControlMode)

@@ -6,7 +6,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-from take_off_rig import GOAL, RELAYED, Flight
+from take_off_rig import GOAL, RELAYED, TakeOffRig
 
 from logs.recording.reader import records
 from uavctl.cli.app import run
@@ -25,11 +25,11 @@ CASES = pytest.mark.parametrize(
 @cache
 def climbs_at_s(autopilot: str) -> float:
     """When the same flight without a fault begins its climb."""
-    flight = Flight(autopilot, *RELAYED).relayed().take_off().run(60.0, until=HandoverState.CLIMBING)
+    flight = TakeOffRig(autopilot, *RELAYED).relayed().take_off().run(60.0, until=HandoverState.CLIMBING)
     return flight.now_ns * 1e-9
 
 
-def furthest(flight: Flight) -> tuple[float, float]:
+def furthest(flight: TakeOffRig) -> tuple[float, float]:
     """Fly to the end; how far from its start the true vehicle came to the side, and how high [m]."""
     flight.take_off()
     side_m = height_m = 0.0
@@ -55,7 +55,7 @@ def test_another_body_s_positions_do_not_carry_a_climbing_vehicle_off(
     begin_s = climbs_at_s(autopilot) + after_s
     swapped = f"sim.camera.swapped=[[{begin_s:.2f},{begin_s + 60.0:.2f}]]"
     side_m, height_m = furthest(
-        Flight(autopilot, *RELAYED, swapped, f"sim.camera.other_body_m={list(other_m)}").relayed()
+        TakeOffRig(autopilot, *RELAYED, swapped, f"sim.camera.other_body_m={list(other_m)}").relayed()
     )
     assert side_m < SIDE_M and height_m < CEILING_M
 
@@ -68,7 +68,7 @@ def test_positions_that_are_wrong_for_an_instant_land_it_and_are_there_again_for
 ) -> None:
     """Without positions from then on PX4, its velocity led astray, rose for minutes and went 1.4 km."""
     begin_s = climbs_at_s(autopilot) + after_s
-    flight = Flight(
+    flight = TakeOffRig(
         autopilot,
         *RELAYED,
         "estimator.inertial_std_mps2=0.2",
@@ -87,7 +87,7 @@ def test_positions_that_are_wrong_for_an_instant_land_it_and_are_there_again_for
 @pytest.mark.parametrize("silence", ["sim.camera.frozen", "link.blackout"])
 def test_a_climb_without_positions_ends_below_the_ceiling(autopilot: str, after_s: float, silence: str) -> None:
     begin_s = climbs_at_s(autopilot) + after_s
-    flight = Flight(autopilot, *RELAYED, f"{silence}=[[{begin_s:.2f},{begin_s + 60.0:.2f}]]").relayed()
+    flight = TakeOffRig(autopilot, *RELAYED, f"{silence}=[[{begin_s:.2f},{begin_s + 60.0:.2f}]]").relayed()
     side_m, height_m = furthest(flight)
     assert side_m < SIDE_M and height_m < CEILING_M
 
@@ -95,7 +95,7 @@ def test_a_climb_without_positions_ends_below_the_ceiling(autopilot: str, after_
 @pytest.mark.slow
 @pytest.mark.fault(66)
 def test_px4_s_own_climb_to_another_height_ends_at_the_ceiling() -> None:
-    flight = Flight("px4", "sim.plant=quadrotor").run(2.0)
+    flight = TakeOffRig("px4", "sim.plant=quadrotor").run(2.0)
     assert flight.peers.autopilot.parameters.set("MIS_TAKEOFF_ALT", 8.0)
     flight.take_off(2.4)
     _, height_m = furthest(flight)
@@ -104,15 +104,15 @@ def test_px4_s_own_climb_to_another_height_ends_at_the_ceiling() -> None:
 
 def flown(folder: Path, seed: int, seconds: float, *settings: str) -> tuple[int, float]:
     """Exit code of a loopback flight of an ArduPilot with GPS, and how far outside the true vehicle was at most [m]."""
-    words = [word for one in settings for word in ("--set", one)]
+    arguments = [argument for setting in settings for argument in ("--set", setting)]
     code = run(["loopback", "--config", "room-ardupilot", "--arm", "--takeoff", "1.2", "--seed", str(seed),
-                "--duration", str(seconds), "--out", str(folder), "--json", *words])  # fmt: skip
+                "--duration", str(seconds), "--out", str(folder), "--json", *arguments])  # fmt: skip
     config = load_config("room-ardupilot")
     sides = [(config.sets.state_lower[i], config.sets.state_upper[i]) for i in get_position_index(config.plant)]
     beyond = [
         max(low - place, place - high)
-        for one in records(folder / "flight.mcap", Truth)
-        for (low, high), place in zip(sides, one.position_m, strict=True)
+        for truth in records(folder / "flight.mcap", Truth)
+        for (low, high), place in zip(sides, truth.position_m, strict=True)
     ]
     return code, max(beyond)
 

@@ -7,7 +7,7 @@ from functools import cache, partial
 
 import numpy as np
 import pytest
-from loopback_rig import Memory, flight, lockstep, make_loop
+from loopback_rig import MemorySink, flight, lockstep, make_loop
 
 from logs.recording.flight import FlightData
 from logs.recording.replay import replay
@@ -21,7 +21,7 @@ LONG = range(4)  # seeds of flights of 200 steps
 
 
 @cache
-def paper_flight(seed: int, steps: int) -> Memory:
+def paper_flight(seed: int, steps: int) -> MemorySink:
     return lockstep("paper", float(steps), f"sim.seed={seed}")
 
 
@@ -55,8 +55,8 @@ def test_paper_costs_what_the_paper_s_example_costs() -> None:
         entries = paper_flight(seed, 200 if seed in LONG else 50).entries
         first = FlightData.from_records(entry for entry in entries if entry[1] < 50_000_000_000)
         flights.append(summarise(first, wall_s=1.0))
-    assert {one.steps for one in flights} == {50}
-    assert np.mean([one.cost for one in flights]) == pytest.approx(56.2e3, rel=0.03)
+    assert {flight.steps for flight in flights} == {50}
+    assert np.mean([flight.cost for flight in flights]) == pytest.approx(56.2e3, rel=0.03)
 
 
 def test_the_true_state_follows_the_plant_and_the_applied_inputs() -> None:
@@ -139,8 +139,8 @@ def test_plans_are_optimal_and_certified() -> None:
         assert abs(plan.gap) < 1e-6
         wanted = exact.solve(plan.seq, np.array(plan.states[0]), design.target)
         assert plan.cost == pytest.approx(wanted.cost, rel=1e-7)
-        most = np.abs(design.input_set.b).max()
-        assert np.array(plan.inputs) + plan.bias == pytest.approx(wanted.inputs, abs=2e-3 * most)
+        max_input = np.abs(design.input_set.b).max()
+        assert np.array(plan.inputs) + plan.bias == pytest.approx(wanted.inputs, abs=2e-3 * max_input)
     assert {plan.method for plan in plans} == {"frozen", "exact"}
 
 

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from loopback_rig import Memory, lockstep, make_loop
+from loopback_rig import MemorySink, lockstep, make_loop
 
 from logs.recording.replay import replay
-from uavctl.build.controller import build_conditioned, build_design, resting
+from uavctl.build.controller import build_conditioned, build_design, compute_rest_limits
 from uavctl.cli.app import run as main
 from uavctl.config import load_config
 from uavctl.lab.campaign.controllers import build_from_recipe, draw_conditions
@@ -25,12 +25,12 @@ FENCE = 'fence=[{state="north",side="upper",times_s=[6,14],values=[3.0,1.2]}]'
 
 
 @pytest.fixture(scope="module")
-def flight() -> Memory:
+def flight() -> MemorySink:
     return lockstep("room", 30.0, "sim.seed=4")
 
 
 @pytest.mark.slow
-def test_a_flight_arrives_on_plans_of_the_scheme(flight: Memory) -> None:
+def test_a_flight_arrives_on_plans_of_the_scheme(flight: MemorySink) -> None:
     plans = flight.of(Plan)
     assert {plan.method for plan in plans} == {METHOD}
     assert {plan.status for plan in plans} == {SolveStatus.OPTIMAL}
@@ -45,11 +45,11 @@ def test_without_inertial_data_the_setpoints_play_the_plans_out() -> None:
     """What is decided at a boundary is the plan's input of that step."""
     flight = lockstep("room", 20.0, "sim.seed=4", "estimator.inertial_std_mps2=0")
     plans = {plan.seq: plan for plan in flight.of(Plan)}
-    played = [one for one in flight.of(Decision) if one.boundary and one.plan_index]
+    played = [decision for decision in flight.of(Decision) if decision.boundary and decision.plan_index]
     assert len(played) > 10
-    for one in played:
-        assert one.plan_seq is not None and one.plan_index is not None
-        assert len(plans[one.plan_seq].inputs) > one.plan_index
+    for decision in played:
+        assert decision.plan_seq is not None and decision.plan_index is not None
+        assert len(plans[decision.plan_seq].inputs) > decision.plan_index
 
 
 def test_what_is_planned_has_arrived_by_the_end_of_its_step() -> None:
@@ -57,14 +57,17 @@ def test_what_is_planned_has_arrived_by_the_end_of_its_step() -> None:
     flight = lockstep("room-hahn-stursberg", 16.0, SCHEME, "sim.seed=4")
     config = load_config("room-hahn-stursberg")
     ticks = round(config.plant.dt_s / config.daemon.tick_s)
-    plans, setpoints = {plan.seq: plan for plan in flight.of(Plan)}, {one.at_ns: one for one in flight.of(Setpoint)}
+    plans, setpoints = (
+        {plan.seq: plan for plan in flight.of(Plan)},
+        {setpoint.at_ns: setpoint for setpoint in flight.of(Setpoint)},
+    )
     moving = 0
-    for one in flight.of(Decision):
-        if one.tick % ticks != ticks - 1 or one.plan_seq is None or one.plan_index is None:
+    for decision in flight.of(Decision):
+        if decision.tick % ticks != ticks - 1 or decision.plan_seq is None or decision.plan_index is None:
             continue
-        moving += bool(setpoints[one.at_ns - round(config.daemon.tick_s * 1e9)].limited)
-        planned = plans[one.plan_seq].inputs[one.plan_index]
-        assert setpoints[one.at_ns].accel_mps2 == pytest.approx(planned, abs=1e-6)
+        moving += bool(setpoints[decision.at_ns - round(config.daemon.tick_s * 1e9)].limited)
+        planned = plans[decision.plan_seq].inputs[decision.plan_index]
+        assert setpoints[decision.at_ns].accel_mps2 == pytest.approx(planned, abs=1e-6)
     assert moving > 2
 
 
@@ -75,21 +78,21 @@ def test_a_flight_replays_bit_for_bit() -> None:
 
 @pytest.mark.slow
 def test_a_fence_that_closes_in_is_kept() -> None:
-    found = lockstep("room", 20.0, FENCE, "target.position_m=[1.5,1.0,-1.2]")
-    assert max(truth.position_m[0] for truth in found.of(Truth) if truth.at_ns > 14e9) < 1.2
-    last = found.of(Plan)[-1]
+    result = lockstep("room", 20.0, FENCE, "target.position_m=[1.5,1.0,-1.2]")
+    assert max(truth.position_m[0] for truth in result.of(Truth) if truth.at_ns > 14e9) < 1.2
+    last = result.of(Plan)[-1]
     assert last.reference[0] < 1.2  # the target itself is outside
     assert np.array(last.backoff_x)[1:4, 0].min() > 0.0
 
 
 @pytest.mark.slow
-def test_at_a_wall_it_settles_where_the_design_lets_it_rest_and_nothing_gives_way() -> None:
-    found = lockstep("room", 30.0, "sim.seed=4", "target.position_m=[3.0,1.0,-1.2]")
-    rests = resting(build_conditioned(load_config("room")))[0]
-    settled = [plan for plan in found.of(Plan) if plan.base_ns > 12e9]
+def test_at_a_wall_it_settles_at_the_rest_limit_without_relaxation() -> None:
+    result = lockstep("room", 30.0, "sim.seed=4", "target.position_m=[3.0,1.0,-1.2]")
+    rests = compute_rest_limits(build_conditioned(load_config("room")))[0]
+    settled = [plan for plan in result.of(Plan) if plan.base_ns > 12e9]
     assert [plan.reference[0] for plan in settled] == pytest.approx([rests] * len(settled), abs=0.03)
     assert sum(bool(plan.gave_way) for plan in settled) <= 0.05 * len(settled)
-    places = [truth.position_m[0] for truth in found.of(Truth) if truth.at_ns > 12e9]
+    places = [truth.position_m[0] for truth in result.of(Truth) if truth.at_ns > 12e9]
     assert np.mean(places) == pytest.approx(settled[-1].reference[0], abs=0.04)
     assert max(places) < 3.0
 
@@ -97,7 +100,7 @@ def test_at_a_wall_it_settles_where_the_design_lets_it_rest_and_nothing_gives_wa
 def test_a_design_may_rest_nearer_to_the_walls() -> None:
     config = load_config("room")
     conditioned, design = build_conditioned(config), build_design(load_config("room-hahn-stursberg"))
-    ours, theirs = resting(conditioned), resting(design)
+    ours, theirs = compute_rest_limits(conditioned), compute_rest_limits(design)
     rows = [int(np.flatnonzero((design.state_set.c == row).all(axis=1))[0]) for row in np.eye(9)[[0, 3, 6]]]
     assert (ours[rows] > theirs[rows] + 0.1).all()
     # What it says is where a plan rests, in the middle of the other walls.
@@ -148,9 +151,9 @@ def test_a_campaign_flies_it_where_the_printed_design_is_refused(tmp_path: Path)
     for cell in others:
         assert cell.recipe is not None and cell.recipe.design is None
         meets = draw_conditions(cell.setting, 0, 40)
-        found = simulate(meets.world, build_from_recipe(cell.recipe), meets.newest_captures, meets.disturbances)
-        assert not found.failed.any()
-        costs.append(found.cost.sum(axis=1).mean())
+        result = simulate(meets.world, build_from_recipe(cell.recipe), meets.newest_captures, meets.disturbances)
+        assert not result.failed.any()
+        costs.append(result.cost.sum(axis=1).mean())
     assert describe_cell(others[0])["promised_x"] == pytest.approx(0.05)
     assert describe_cell(others[1])["promised_x"] is None
     assert max(costs) < 1.03 * min(costs)
@@ -173,11 +176,11 @@ def test_a_campaign_s_links_carry_one_position_a_step(tmp_path: Path) -> None:
 
 def test_design_shows_the_risk_of_each_age(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["design", "--config", "paper", "--set", SCHEME, "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["scheme"] == METHOD
-    weights = np.array(found["weights"])
-    for budgets in (found["budgets"], found["budgets_in_transit"]):
-        assert weights @ np.array(budgets) + found["beyond"] == pytest.approx(0.05)
+    document = json.loads(capsys.readouterr().out)
+    assert document["scheme"] == METHOD
+    weights = np.array(document["weights"])
+    for budgets in (document["budgets"], document["budgets_in_transit"]):
+        assert weights @ np.array(budgets) + document["beyond"] == pytest.approx(0.05)
     assert main(["design", "--config", "paper", "--set", SCHEME]) == 0
     assert "upper limit of east position" in capsys.readouterr().out
 

@@ -15,8 +15,8 @@ pytestmark = pytest.mark.usefixtures("no_page")
 FLOOR = ["--set", "sim.start_position_m=[0.0,0.0,-0.7]"]
 
 
-def typed(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:
-    code = run(list(words))
+def typed(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
+    code = run(list(arguments))
     out, err = capsys.readouterr()
     return code, out, " ".join(err.split())
 
@@ -24,7 +24,7 @@ def typed(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, st
 @pytest.mark.fault(33)
 @pytest.mark.parametrize("command", ["fly", "loopback"])
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("arguments", "message"),
     [
         (["--arm"], "--arm needs --takeoff"),
         (["--takeoff", "1.2"], "--takeoff needs --arm"),
@@ -44,48 +44,57 @@ def test_what_cannot_be_is_refused_before_anything_is_made_or_sent(
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
     command: str,
-    words: list[str],
-    told: str,
+    arguments: list[str],
+    message: str,
 ) -> None:
     monkeypatch.delattr("uavctl.build.controller.build_solver")
-    code, out, err = typed(capsys, command, *words, "--out", str(tmp_path / "flight"))
-    assert code == 2 and told in err and not out
+    code, out, err = typed(capsys, command, *arguments, "--out", str(tmp_path / "flight"))
+    assert code == 2 and message in err and not out
     assert not list(tmp_path.rglob("*.mcap"))
 
 
 @pytest.mark.slow
 def test_a_flight_from_the_ground_to_a_place_and_back(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    words = ["--arm", "--takeoff", "1.2", "--goto", "1.5,1,-1.2", "--duration", "12", "--json", "--out", str(tmp_path)]
-    code, out, err = typed(capsys, "loopback", *words, *FLOOR)
+    arguments = [
+        "--arm",
+        "--takeoff",
+        "1.2",
+        "--goto",
+        "1.5,1,-1.2",
+        "--duration",
+        "12",
+        "--json",
+        "--out",
+        str(tmp_path),
+    ]
+    code, out, err = typed(capsys, "loopback", *arguments, *FLOOR)
     assert code == 0, err
     assert json.loads(out)["steps"] > 30
-    told = [event.text for event in records(tmp_path / "flight.mcap", Event) if event.code == "hand-over"]
-    assert told[-1].startswith("settling -> done")
+    texts = [event.text for event in records(tmp_path / "flight.mcap", Event) if event.code == "hand-over"]
+    assert texts[-1].startswith("settling -> done")
     code, out, _ = typed(capsys, "log", "replay", str(tmp_path / "flight.mcap"), "--json")
     assert code == 0 and json.loads(out)["identical"]
 
 
-def test_a_place_that_is_not_reached_is_told_in_the_exit_code(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_an_unreached_target_has_its_exit_code(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     code, _, err = typed(capsys, "loopback", "--goto=-1,-1,-1", "--duration", "1", "--out", str(tmp_path))
     assert code == 1 and "--goto -1,-1,-1 was not reached" in err
 
 
 @pytest.mark.fault(26)
-def test_a_refused_take_off_is_told_with_the_vehicle_s_reason(
+def test_a_refused_take_off_is_reported_with_the_vehicle_s_reason(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     poor = ["--set", "sim.plant=quadrotor", "--set", "sim.quadrotor.charge=0.1", "--set", "hand_over.ground_s=4"]
-    words = ["--arm", "--takeoff", "1.2", "--duration", "20", "--out", str(tmp_path), *poor, *FLOOR]
-    code, _, err = typed(capsys, "loopback", *words)
+    arguments = ["--arm", "--takeoff", "1.2", "--duration", "20", "--out", str(tmp_path), *poor, *FLOOR]
+    code, _, err = typed(capsys, "loopback", *arguments)
     assert code == 1 and "low battery" in err and "TEMPORARILY_REJECTED" in err
 
 
 @pytest.mark.slow
 def test_the_same_way_over_real_sockets(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    words = ["--udp", "--arm", "--takeoff", "1", "--goto", "0.3,0.3,-1", "--duration", "9", "--out", str(tmp_path)]
-    code, _, err = typed(capsys, "loopback", *words, *FLOOR)
+    arguments = ["--udp", "--arm", "--takeoff", "1", "--goto", "0.3,0.3,-1", "--duration", "9", "--out", str(tmp_path)]
+    code, _, err = typed(capsys, "loopback", *arguments, *FLOOR)
     assert code == 0, err
-    told = [event.text for event in records(tmp_path / "flight.mcap", Event) if event.code == "hand-over"]
-    assert told[-1].startswith("settling -> done")
+    texts = [event.text for event in records(tmp_path / "flight.mcap", Event) if event.code == "hand-over"]
+    assert texts[-1].startswith("settling -> done")

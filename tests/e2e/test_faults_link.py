@@ -72,7 +72,7 @@ def test_row_11_a_truncated_datagram_costs_nothing_else(length: int) -> None:
 
 
 @pytest.mark.fault(11)
-def test_row_11_an_oversized_datagram_is_dropped_and_told() -> None:
+def test_row_11_an_oversized_datagram_is_dropped_and_reported() -> None:
     link = make_link()
     (event,) = events(link.receive(GOOD * 2000, NOW).items)
     assert event.text == "link vehicle: dropped 1 oversize"
@@ -82,10 +82,12 @@ def test_row_11_an_oversized_datagram_is_dropped_and_told() -> None:
 @pytest.mark.fault(10, 11)
 def test_rows_10_and_11_are_reported_once_a_second() -> None:
     link = make_link()
-    told = [event for n in range(1000) for event in events(link.receive(flip(GOOD, 160), NOW + n * 5 * MS).items)]
-    assert len(told) == 5
-    assert {event.severity for event in told} == {Severity.WARNING}
-    assert sum(event.count for event in told) == 1 + 4 * 200
+    reported_events = [
+        event for n in range(1000) for event in events(link.receive(flip(GOOD, 160), NOW + n * 5 * MS).items)
+    ]
+    assert len(reported_events) == 5
+    assert {event.severity for event in reported_events} == {Severity.WARNING}
+    assert sum(event.count for event in reported_events) == 1 + 4 * 200
     assert link.stats(NOW).bad == {"crc": 1000}
 
 
@@ -98,11 +100,11 @@ def test_rows_10_and_11_are_reported_once_a_second() -> None:
 @pytest.mark.parametrize("make", [CAMERA.vision, Peer(1, 1).local_position])
 def test_row_12_a_sample_with_such_a_value_counts_as_lost(make: Callable[..., bytes], axis: str, value: float) -> None:
     link = make_link(source=SourceConfig(messages=("VISION_POSITION_ESTIMATE", "LOCAL_POSITION_NED")))
-    found = samples(link.receive(make(9, **{axis: value}), NOW).items)
-    assert [find_refusal(one, NOW, build_estimator(load_config("room-hahn-stursberg"))) for one in found] == [
+    result = samples(link.receive(make(9, **{axis: value}), NOW).items)
+    assert [find_refusal(item, NOW, build_estimator(load_config("room-hahn-stursberg"))) for item in result] == [
         "sample-invalid"
-    ] * len(found)
-    assert bool(found) == math.isfinite(value)
+    ] * len(result)
+    assert bool(result) == math.isfinite(value)
     assert sum(link.stats(NOW).bad.values()) == 1
 
 
@@ -110,15 +112,15 @@ def test_row_12_a_sample_with_such_a_value_counts_as_lost(make: Callable[..., by
 
 
 @pytest.mark.fault(16)
-def test_row_16_a_second_vehicle_is_told_and_ignored() -> None:
-    link, ours, other = make_link(), Peer(1, 1), Peer(2, 1)
+def test_row_16_a_second_vehicle_is_reported_and_ignored() -> None:
+    link, ours, second_vehicle = make_link(), Peer(1, 1), Peer(2, 1)
     assert len(statuses(link.receive(ours.heartbeat(), NOW).items)) == 1
-    told = []
+    reported_events = []
     for n in range(10):
-        items = link.receive(other.heartbeat(), NOW + n * 200 * MS).items
+        items = link.receive(second_vehicle.heartbeat(), NOW + n * 200 * MS).items
         assert statuses(items) == []
-        told += events(items)
-    assert [(event.code, event.severity) for event in told] == [("second-vehicle", Severity.ERROR)] * 2
+        reported_events += events(items)
+    assert [(event.code, event.severity) for event in reported_events] == [("second-vehicle", Severity.ERROR)] * 2
     assert link.stats(NOW).bad == {"second-vehicle": 10}
     assert read(link.encode_request(RequestKind.LAND, 0.0))[0].target_system == 1
     assert len(statuses(link.receive(ours.heartbeat(), NOW).items)) == 1
@@ -205,7 +207,7 @@ OFFSET = 40_000 * SECOND
 
 
 @pytest.mark.fault(19)
-def test_row_19_a_long_round_trip_is_an_answer_and_moves_no_clock_that_short_ones_know() -> None:
+def test_row_19_a_long_round_trip_does_not_move_a_clock_of_short_ones() -> None:
     link = make_link()
     assert reply(link, NOW, OFFSET, round_trip_ns=200 * MS)
     assert offset_after(link, NOW, OFFSET) == OFFSET
@@ -243,7 +245,7 @@ def test_row_19_a_drifting_clock_is_followed() -> None:
 
 
 @pytest.mark.fault(20)
-def test_row_20_a_restarted_source_is_found_and_synchronised_anew() -> None:
+def test_row_20_a_restarted_source_is_found_and_synchronised_again() -> None:
     link = make_link()
     source = Source(link)
     assert len(source.send(50)) == 50
@@ -256,14 +258,14 @@ def test_row_20_a_restarted_source_is_found_and_synchronised_anew() -> None:
 
 
 @pytest.mark.fault(20)
-def test_row_20_the_restart_is_told_once() -> None:
+def test_row_20_the_restart_is_reported_once() -> None:
     link = make_link()
     source = Source(link)
     source.send(50)
-    told = []
+    reported_events = []
     for n in range(20):
-        told += events(link.receive(CAMERA.vision(40_000 * (n + 1)), source.at_ns + (n + 1) * 40 * MS).items)
-    assert [event.code for event in told].count("clock-resync") == 1
+        reported_events += events(link.receive(CAMERA.vision(40_000 * (n + 1)), source.at_ns + (n + 1) * 40 * MS).items)
+    assert [event.code for event in reported_events].count("clock-resync") == 1
 
 
 @pytest.mark.fault(20)

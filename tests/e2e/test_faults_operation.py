@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from loopback_rig import Memory, shared_loop
+from loopback_rig import MemorySink, shared_loop
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import decode
 
@@ -20,7 +20,7 @@ class Flight:
 
     def __init__(self, *overrides: str) -> None:
         config = load_config("room-hahn-stursberg", ['solver.method="exact"', "link.loss=0.0", *overrides])
-        self.memory = Memory()
+        self.memory = MemorySink()
         self.loop = shared_loop(config, self.memory)
         self.truths: list[Truth] = []
         self.peers = Peers(config, 0, on_truth=self.truths.append)
@@ -38,17 +38,17 @@ class Flight:
                     self.loop.receive(link, data, arrival_ns)
             outgoing: list[Outgoing] = []
             self.ticked = self.loop.tick(self._tick, at_ns, outgoing.append)
-            for one in outgoing:
-                if one.link == "vehicle":
-                    sent += [message.get_type() for message in decode(one.data)]
-                if uplink or one.link != "vehicle":
-                    self.peers.receive(one.link, one.data, at_ns)
+            for datagram in outgoing:
+                if datagram.link == "vehicle":
+                    sent += [message.get_type() for message in decode(datagram.data)]
+                if uplink or datagram.link != "vehicle":
+                    self.peers.receive(datagram.link, datagram.data, at_ns)
             self.modes.append(self.ticked.decision.mode)
             self._tick += 1
         return sent
 
     def outgoing(self) -> list[Datagram]:
-        return [one for one in self.memory.of(Datagram) if one.outgoing]
+        return [datagram for datagram in self.memory.of(Datagram) if datagram.outgoing]
 
     @property
     def speed_mps(self) -> float:
@@ -56,7 +56,7 @@ class Flight:
 
 
 @pytest.mark.fault(8)
-def test_px4_that_hears_no_setpoints_leaves_offboard_by_itself_and_we_stop() -> None:
+def test_px4_without_setpoints_leaves_offboard_and_setpoints_stop() -> None:
     flight = Flight()
     assert flight.run(3.0).count(SETPOINT) > 50
     assert flight.truths[-1].mode == "OFFBOARD"
@@ -67,14 +67,16 @@ def test_px4_that_hears_no_setpoints_leaves_offboard_by_itself_and_we_stop() -> 
     # Nothing is streamed any more, and no mode is asked for: not even once the way is free again.
     since = len(flight.outgoing())
     assert SETPOINT not in flight.run(5.0)
-    commands = [one for d in flight.outgoing()[since:] for one in decode(d.data) if one.get_type() == "COMMAND_LONG"]
-    assert {one.command for one in commands} <= {mavlink.MAV_CMD_SET_MESSAGE_INTERVAL}
+    commands = [
+        message for d in flight.outgoing()[since:] for message in decode(d.data) if message.get_type() == "COMMAND_LONG"
+    ]
+    assert {command.command for command in commands} <= {mavlink.MAV_CMD_SET_MESSAGE_INTERVAL}
     assert flight.modes[-1] is ControlMode.WAIT
     assert any(event.code == "hand-over" and "engaged -> released" in event.text for event in flight.memory.of(Event))
 
 
 @pytest.mark.fault(8)
-def test_ardupilot_that_hears_no_setpoints_brakes_by_itself() -> None:
+def test_ardupilot_without_setpoints_brakes() -> None:
     flight = Flight('sim.autopilot="ardupilot"', "sim.setpoint_timeout_s=3.0")
     flight.run(1.5)
     assert flight.speed_mps > 0.3
@@ -124,6 +126,8 @@ def test_setpoints_die_with_the_control_loop() -> None:
             flight.loop.receive(link, data, arrival_ns)
     assert len(flight.memory.of(Setpoint)) == before
     # Who asks for the time is answered as long as anybody listens, and that is all.
-    late = [message for one in flight.outgoing() if one.at_ns > 60 * TICK_NS for message in decode(one.data)]
-    assert {message.get_type() for message in late} == {"TIMESYNC"}
+    late_messages = [
+        message for datagram in flight.outgoing() if datagram.at_ns > 60 * TICK_NS for message in decode(datagram.data)
+    ]
+    assert {message.get_type() for message in late_messages} == {"TIMESYNC"}
     assert flight.truths[-1].mode != "OFFBOARD"

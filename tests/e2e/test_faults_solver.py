@@ -13,13 +13,13 @@ from flight_rig import (
     Fault,
     StubSolver,
     assert_sound,
-    boundaries,
     boundary_ns,
-    codes,
-    flown,
-    inputs_of,
+    find_boundaries,
+    list_codes,
+    list_plan_steps,
     make_controller,
-    one_a_step,
+    make_inputs,
+    make_step_samples,
     run,
     sample,
     small_plant,
@@ -62,9 +62,9 @@ SOLVER_FAULTS: dict[str, tuple[Fault, SolveStatus]] = {
 def test_row_22_the_old_plan_plays_out_when_a_solve_fails_and_the_ending_is_recorded(fault: str) -> None:
     inject, status = SOLVER_FAULTS[fault]
     controller, _ = with_faults({3: inject, 4: inject})
-    outputs = run(controller, inputs_of(range(6 * TICKS), one_a_step()))
-    assert flown(outputs) == [(0, 0), (1, 0), (2, 0), (2, 1), (2, 2), (5, 0)]
-    for output in boundaries(outputs)[3:5]:
+    outputs = run(controller, make_inputs(range(6 * TICKS), make_step_samples()))
+    assert list_plan_steps(outputs) == [(0, 0), (1, 0), (2, 0), (2, 1), (2, 2), (5, 0)]
+    for output in find_boundaries(outputs)[3:5]:
         assert (output.decision.solve, output.decision.news, output.decision.age_steps) == (status, True, 0)
         assert output.plan is None
         assert [(event.severity, event.code) for event in output.events] == [
@@ -77,33 +77,33 @@ def test_row_22_the_old_plan_plays_out_when_a_solve_fails_and_the_ending_is_reco
 def test_row_22_a_plan_that_no_solve_renews_is_flown_to_its_end_and_not_beyond() -> None:
     inject, status = SOLVER_FAULTS["infeasible"]
     controller, _ = with_faults(dict.fromkeys(range(3, 12), inject))
-    outputs = run(controller, inputs_of(range(14 * TICKS), one_a_step()))
-    assert flown(outputs)[2:7] == [(2, 0), (2, 1), (2, 2), (2, 3), (None, None)]
-    fallen = boundaries(outputs)[6]
+    outputs = run(controller, make_inputs(range(14 * TICKS), make_step_samples()))
+    assert list_plan_steps(outputs)[2:7] == [(2, 0), (2, 1), (2, 2), (2, 3), (None, None)]
+    fallen = find_boundaries(outputs)[6]
     assert (fallen.decision.age_steps, fallen.decision.solve) == (0, status)
     assert fallen.decision.mode in FALLBACK
     # Samples keep coming: from the third on a solve is tried at each boundary, and the first good one flies.
-    solves = [output.decision.solve for output in boundaries(outputs)[7:13]]
+    solves = [output.decision.solve for output in find_boundaries(outputs)[7:13]]
     assert solves == [None, None, status, status, status, SolveStatus.OPTIMAL]
-    assert flown(outputs)[12:] == [(12, 0), (13, 0)]
+    assert list_plan_steps(outputs)[12:] == [(12, 0), (13, 0)]
 
 
 @pytest.mark.fault(22)
 def test_row_22_a_programming_error_is_not_hidden() -> None:
     controller, _ = with_faults({0: raising(AttributeError("a bug"))})
     with pytest.raises(AttributeError):
-        run(controller, inputs_of(range(1), one_a_step()))
+        run(controller, make_inputs(range(1), make_step_samples()))
 
 
 @pytest.mark.fault(23)
 @pytest.mark.parametrize("offset", [-1, 1, -4])
 def test_row_23_an_answer_to_another_question_is_discarded(offset: int) -> None:
     controller, _ = with_faults({3: lambda answer: replace(answer, seq=answer.seq + offset)})
-    outputs = run(controller, inputs_of(range(5 * TICKS), one_a_step()))
-    assert flown(outputs) == [(0, 0), (1, 0), (2, 0), (2, 1), (4, 0)]
-    late = boundaries(outputs)[3]
-    assert (late.decision.solve, late.plan) == (SolveStatus.LATE, None)
-    assert codes(late) == {"solve-late": 1}
+    outputs = run(controller, make_inputs(range(5 * TICKS), make_step_samples()))
+    assert list_plan_steps(outputs) == [(0, 0), (1, 0), (2, 0), (2, 1), (4, 0)]
+    late_output = find_boundaries(outputs)[3]
+    assert (late_output.decision.solve, late_output.plan) == (SolveStatus.LATE, None)
+    assert list_codes(late_output) == {"solve-late": 1}
 
 
 def spoiled(name: str, value: float) -> Fault:
@@ -120,9 +120,9 @@ def spoiled(name: str, value: float) -> Fault:
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_row_24_an_optimal_answer_that_is_not_finite_does_not_fly(name: str, value: float) -> None:
     controller, _ = with_faults({3: spoiled(name, value)})
-    outputs = run(controller, inputs_of(range(5 * TICKS), one_a_step()))
-    assert flown(outputs) == [(0, 0), (1, 0), (2, 0), (2, 1), (4, 0)]
-    assert boundaries(outputs)[3].decision.solve is SolveStatus.FAILED
+    outputs = run(controller, make_inputs(range(5 * TICKS), make_step_samples()))
+    assert list_plan_steps(outputs) == [(0, 0), (1, 0), (2, 0), (2, 1), (4, 0)]
+    assert find_boundaries(outputs)[3].decision.solve is SolveStatus.FAILED
     assert_sound(outputs)
 
 
@@ -139,16 +139,16 @@ WRONG_SHAPES: dict[str, Fault] = {
 @pytest.mark.parametrize("fault", WRONG_SHAPES)
 def test_row_24_an_answer_of_the_wrong_shape_does_not_fly(fault: str) -> None:
     controller, _ = with_faults({3: WRONG_SHAPES[fault]})
-    outputs = run(controller, inputs_of(range(4 * TICKS), one_a_step()))
-    assert boundaries(outputs)[3].decision.solve is SolveStatus.FAILED
-    assert flown(outputs)[3] == (2, 1)
+    outputs = run(controller, make_inputs(range(4 * TICKS), make_step_samples()))
+    assert find_boundaries(outputs)[3].decision.solve is SolveStatus.FAILED
+    assert list_plan_steps(outputs)[3] == (2, 1)
 
 
 @pytest.mark.fault(24)
 @pytest.mark.parametrize(("value", "sent"), [(50.0, 2.0), (-1e300, -2.0)])
-def test_row_24_an_input_out_of_range_is_clamped_and_the_record_says_so(value: float, sent: float) -> None:
+def test_row_24_an_input_out_of_range_is_clamped_and_recorded_so(value: float, sent: float) -> None:
     controller, _ = with_faults({3: lambda answer: replace(answer, inputs=np.full_like(answer.inputs, value))})
-    output = boundaries(run(controller, inputs_of(range(4 * TICKS), one_a_step())))[3]
+    output = find_boundaries(run(controller, make_inputs(range(4 * TICKS), make_step_samples())))[3]
     assert output.setpoint is not None
     assert output.setpoint.accel_mps2 == (sent, 0.0, 0.0)
     assert output.setpoint.limited == ("clamp-north",)
@@ -172,7 +172,7 @@ def test_row_24_every_setpoint_is_sound_under_random_faults_of_all_kinds() -> No
             samples.append(sample(captured_ns, received_ns, (float(values[0]), float(values[1]), float(values[2]))))
     ticks = [tick for tick in range(steps * TICKS) if rng.random() < 0.95]
     controller = make_controller(StubSolver(small_plant(("north", "east")), faults=faults), land=False)
-    outputs = run(controller, inputs_of(ticks, samples))
+    outputs = run(controller, make_inputs(ticks, samples))
     assert_sound(outputs)
     assert {output.decision.mode for output in outputs} >= {TRACK, ControlMode.BRAKE}
     limited = {name for output in outputs if output.setpoint is not None for name in output.setpoint.limited}

@@ -9,11 +9,11 @@ import threading
 from pathlib import Path
 
 import pytest
-from flip_rig import Flips
-from loopback_rig import Memory, header, make_loop
+from flip_rig import FlipTest
+from loopback_rig import MemorySink, header, make_loop
 from mcap.reader import make_reader
 from places import ROOT
-from recording_fakes import Clock, Disk, Item, flight, own, record_flight, stored_byte
+from recording_fakes import Clock, Disk, Item, drop_recorder_notes, flight, record_flight, stored_byte
 
 from logs.recording.disk import DiskFile, OutputFile
 from logs.recording.info import read_info
@@ -51,10 +51,10 @@ class FullFrom:
 def assert_segments_begin_once(path: Path) -> None:
     """Each file has one header, and one note of why it was begun, however often that was tried."""
     for file in segment_files(path):
-        found = [item for item in scan(file) if isinstance(item, RecordedMessage)]
-        assert [item.definition.topic for item in found].count("/uavctl/header") == 1
-        assert found[0].definition.topic == "/uavctl/header"
-        assert sum(b"after a failed write" in item.data for item in found) == (file != path)
+        results = [item for item in scan(file) if isinstance(item, RecordedMessage)]
+        assert [item.definition.topic for item in results].count("/uavctl/header") == 1
+        assert results[0].definition.topic == "/uavctl/header"
+        assert sum(b"after a failed write" in item.data for item in results) == (file != path)
 
 
 @pytest.mark.fault(29)
@@ -70,7 +70,7 @@ def test_29_disk_full_at_every_operation_loses_nothing(tmp_path: Path, again_aft
         status = recorder.close()
         if disk.operations <= number + again_after:
             break  # every operation has had its turn
-        assert own(list(read(path))) == items, number
+        assert drop_recorder_notes(list(read(path))) == items, number
         assert_segments_begin_once(path)
         assert 1 <= status.failures <= 2
         assert "No space left" in status.reason
@@ -93,7 +93,7 @@ def test_29_disk_stays_full_then_has_room_again(tmp_path: Path) -> None:
         clock, full = Clock(), FullFrom(first)
         recorder = SyncRecorder(path, LogConfig(chunk_bytes=1024), open_file=Disk(full).open, clock=clock)
         fly(recorder, clock, items)
-        on_disk = own(list(read(path))) if list(path.parent.iterdir()) else []
+        on_disk = drop_recorder_notes(list(read(path))) if list(path.parent.iterdir()) else []
         assert on_disk == items[: len(on_disk)]  # all that was written is readable meanwhile
         status = recorder.status()
         assert not status.ok
@@ -102,7 +102,7 @@ def test_29_disk_stays_full_then_has_room_again(tmp_path: Path) -> None:
         clock.now_s += 10.0
         recorder.put(*extra)
         assert recorder.close().ok
-        assert own(list(read(path))) == [*items, extra]
+        assert drop_recorder_notes(list(read(path))) == [*items, extra]
         assert_segments_begin_once(path)
 
 
@@ -118,7 +118,7 @@ def test_29_queue_is_bounded_while_the_disk_is_full(tmp_path: Path) -> None:
     full.first = sys.maxsize
     clock.now_s += 10.0
     final = recorder.close()
-    got = own(list(read(path)))
+    got = drop_recorder_notes(list(read(path)))
     assert len(got) + final.dropped == len(items)
     assert got == [item for item in items if item in got]
     assert list(records(path, RecorderNote))[-1].dropped == final.dropped == read_info(path).dropped
@@ -128,7 +128,7 @@ def test_29_queue_is_bounded_while_the_disk_is_full(tmp_path: Path) -> None:
 def test_29_a_flight_on_a_full_disk_flies_as_without_one(tmp_path: Path) -> None:
     config = load_config("paper", ["duration_s=2.0"])
     design = build_design(config)
-    memory, full = Memory(), Memory()
+    memory, full = MemorySink(), MemorySink()
     recorder = SyncRecorder(tmp_path / "flight.mcap", open_file=Disk(FullFrom(3)).open)
 
     class Both:
@@ -141,7 +141,7 @@ def test_29_a_flight_on_a_full_disk_flies_as_without_one(tmp_path: Path) -> None
         World(config, make_loop(config, sink, design)).run(2.0)
     assert not recorder.close().ok
     assert full.entries == memory.entries
-    on_disk = own(list(read(tmp_path / "flight.mcap")))
+    on_disk = drop_recorder_notes(list(read(tmp_path / "flight.mcap")))
     assert on_disk == memory.entries[: len(on_disk)] and on_disk
 
 
@@ -182,7 +182,7 @@ def test_30_slow_disk_never_holds_up_the_caller(tmp_path: Path) -> None:
     disk.released.set()
     final = recorder.close(timeout_s=30.0)
     assert (final.waiting, final.dropped) == (0, 300)
-    assert own(list(read(path))) == items[:101]
+    assert drop_recorder_notes(list(read(path))) == items[:101]
     assert read_info(path).dropped == 300
 
 
@@ -234,7 +234,7 @@ def test_31_what_the_disk_lacks_is_at_most_a_second_old(tmp_path: Path) -> None:
         fly(recorder, clock, items[:killed])
         cut = tmp_path / "cut.mcap"
         cut.write_bytes(path.read_bytes()[: synced[0]])  # power fails: nothing else is there
-        got = own(list(read(cut)))
+        got = drop_recorder_notes(list(read(cut)))
         assert got == items[: len(got)]
         assert killed - len(got) <= 11  # 0.1 s apart
 
@@ -253,15 +253,15 @@ def readable(path: Path) -> tuple[list[Item], bool]:
             got.append(item)  # kept when it raises
     except RecordingError as error:
         assert str(path) in str(error)
-        return own(got), True
-    return own(got), False
+        return drop_recorder_notes(got), True
+    return drop_recorder_notes(got), False
 
 
 @pytest.mark.slow
 @pytest.mark.fault(32)
 @pytest.mark.parametrize("finished", [True, False])
 def test_32_a_flipped_byte_anywhere_is_never_a_wrong_value(tmp_path: Path, finished: bool) -> None:
-    flips = Flips(tmp_path, finished=finished)
+    flips = FlipTest(tmp_path, finished=finished)
     refused = 0
     for position in range(len(flips.data)):
         flips.flip(position, 1 << position % 8)
@@ -283,11 +283,11 @@ def test_32_other_chunks_stay_readable(tmp_path: Path) -> None:
     for offset in offsets:
         for position in (offset, offset + 3, offset + 8, offset + 33, offset + 60):
             path.write_bytes(flipped(data, position, 4))
-            found = list(scan(path))
-            assert [item for item in found if isinstance(item, RecordedMessage)] == [
+            result = list(scan(path))
+            assert [item for item in result if isinstance(item, RecordedMessage)] == [
                 item for item in whole if item.offset != offset
             ]
-            assert [(item.offset, item.torn) for item in found if isinstance(item, Damage)] == [(offset, False)]
+            assert [(item.offset, item.torn) for item in result if isinstance(item, Damage)] == [(offset, False)]
 
 
 @pytest.mark.fault(32)
@@ -307,7 +307,7 @@ def test_32_damage_between_the_chunks_is_refused_after_all_messages(tmp_path: Pa
             assert got == items if position >= at + 15 else got == items[: len(got)]
             out.unlink(missing_ok=True)
             result = recover(path, out)
-            assert own(list(read(out))) == items
+            assert drop_recorder_notes(list(read(out))) == items
             assert result.messages_lost == 0
             # after the last chunk nothing tells whether there was another one
             assert result.lossless or chunk is summary.chunk_indexes[-1]

@@ -7,9 +7,9 @@ from dataclasses import replace as changed
 import pytest
 from msgspec.structs import replace
 from soak_pairs import OUTSIDE_M, SPEED_MPS, WORLDS, TrueFlight, fly_pair, fly_true
-from soak_rig import prepared_for
+from soak_rig import prepare_room
 
-from uavctl.build.controller import Prepared, design_of, prepare
+from uavctl.build.controller import Prepared, build_flight_design, prepare
 from uavctl.config import Config, load_config
 from uavctl.config.sim import FaultConfig
 
@@ -23,7 +23,7 @@ BLACKOUT_AND_M = 0.3
 
 @pytest.fixture(scope="module")
 def prepared() -> Prepared:
-    return prepared_for()
+    return prepare_room()
 
 
 @pytest.fixture(params=WORLDS, ids=[f"{plant}-{autopilot}" for plant, autopilot in WORLDS])
@@ -47,7 +47,7 @@ def quadrotor(request: pytest.FixtureRequest) -> Config:
 @pytest.fixture(scope="module")
 def as_flown() -> Prepared:
     config = load_config("room")
-    return prepare(config, design_of(config))
+    return prepare(config, build_flight_design(config))
 
 
 def with_faults(config: Config, *faults: FaultConfig) -> Config:
@@ -87,9 +87,7 @@ def test_holding_after_an_early_freeze_sends_nothing_that_accelerates(prepared: 
 @pytest.mark.slow
 @pytest.mark.fault(14)
 @pytest.mark.parametrize("seed", [0, 2, 22, 32])
-def test_an_early_freeze_is_no_worse_than_a_blackout_where_the_vehicle_says_nothing_itself(
-    prepared: Prepared, seed: int
-) -> None:
+def test_an_early_freeze_is_no_worse_than_a_blackout_without_vehicle_velocity(prepared: Prepared, seed: int) -> None:
     """The link loses the value when it is new, and so what comes first of it is stale already."""
     config = load_config("room-hahn-stursberg", ["sim.camera.message=vision", "link.loss=0.3", f"sim.seed={seed}"])
     frozen = with_faults(config, FaultConfig(at_s=1.3, kind="frozen", for_s=20.0))
@@ -112,7 +110,7 @@ def test_an_early_freeze_is_no_worse_than_a_blackout_where_the_vehicle_says_noth
         (FaultConfig(at_s=2.0, kind="frame", name="turned-180"), MOVED_M),
         (FaultConfig(at_s=5.0, kind="drift", velocity_mps=(0.0, 0.0, 0.3)), MOVED_M),
     ],
-    ids=lambda one: f"{one.kind}-{one.at_s}" if isinstance(one, FaultConfig) else "",
+    ids=lambda value: f"{value.kind}-{value.at_s}" if isinstance(value, FaultConfig) else "",
 )
 def test_as_delivered_the_preset_stays_near_the_room_too(
     as_flown: Prepared, autopilot: str, fault: FaultConfig, moved_m: float
@@ -151,7 +149,7 @@ def test_axes_that_are_others_from_the_start_let_it_go_before_it_has_moved_far(
 @pytest.mark.slow
 @pytest.mark.fault(15, 42)
 @pytest.mark.parametrize("axes", ["turned-90", "mirrored-east"])
-def test_without_a_word_of_the_vehicle_itself_positions_against_setpoints_are_enough(
+def test_without_vehicle_velocity_positions_against_setpoints_are_enough(
     prepared: Prepared, quadrotor: Config, axes: str
 ) -> None:
 

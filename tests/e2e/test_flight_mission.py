@@ -8,11 +8,21 @@ from functools import cache, partial
 import msgspec
 import numpy as np
 import pytest
-from flight_rig import MS, TICKS, StubSolver, codes, inputs_of, make_controller, one_a_step, run, small_plant, vehicle
-from loopback_rig import Memory, flight, lockstep, make_loop
-from numpy.typing import NDArray
-from report_rig import unwritten
-from told_numbers import numbers_in
+from flight_rig import (
+    MS,
+    TICKS,
+    StubSolver,
+    list_codes,
+    make_controller,
+    make_inputs,
+    make_step_samples,
+    run,
+    small_plant,
+    vehicle,
+)
+from loopback_rig import MemorySink, flight, lockstep, make_loop
+from report_rig import omit_figures
+from told_numbers import find_numbers
 
 from logs.recording.replay import replay
 from logs.recording.summary import compute_box, compute_position_errors_m, list_summary_rows, summarise
@@ -20,6 +30,7 @@ from logs.report.flight_page import render_report
 from logs.report.headline import derive_headline
 from logs.report.summary_text import describe_flight
 from logs.report.verdicts import judge_flight
+from uavctl.arrays import Array
 from uavctl.build.controller import build_design
 from uavctl.cause import Cause
 from uavctl.config import load_config
@@ -27,8 +38,6 @@ from uavctl.config.load import dump_config
 from uavctl.flight.mission import Waypoint
 from uavctl.records import ControlMode, Decision, Event, GaveWay, Plan, Truth
 from uavctl.smpc.answer import NOMINAL, Answer, Preview
-
-Array = NDArray[np.float64]
 
 PLACES_M = ((1.5, 1.0, -1.2), (-1.0, 1.2, -0.9), (0.0, -1.0, -1.5))
 HOLD_S, ACCEPT_M = 2.0, 0.3
@@ -56,14 +65,18 @@ def as_waypoints(seconds: float) -> tuple[str]:
 
 
 @cache
-def flown(seconds: float, *overrides: str) -> Memory:
+def flown(seconds: float, *overrides: str) -> MemorySink:
     return lockstep("room-hahn-stursberg", seconds, *overrides)
 
 
-def steps(memory: Memory) -> list[tuple[Decision, Truth]]:
+def steps(memory: MemorySink) -> list[tuple[Decision, Truth]]:
     """Decisions at boundaries with the truth of that moment."""
     truths = {truth.at_ns: truth for truth in memory.of(Truth)}
-    return [(one, truths[one.at_ns]) for one in memory.of(Decision) if one.boundary and one.at_ns in truths]
+    return [
+        (decision, truths[decision.at_ns])
+        for decision in memory.of(Decision)
+        if decision.boundary and decision.at_ns in truths
+    ]
 
 
 def distance_m(decision: Decision, truth: Truth) -> float:
@@ -71,7 +84,7 @@ def distance_m(decision: Decision, truth: Truth) -> float:
     return float(np.linalg.norm(np.array(truth.state)[[0, 3, 6]] - np.array(decision.target)[[0, 3, 6]]))
 
 
-def beyond_limits(memory: Memory) -> tuple[Array, Array]:
+def beyond_limits(memory: MemorySink) -> tuple[Array, Array]:
     """How far each state was beyond each limit, and how far it may be as the plan flown to it told: mostly not at all.
 
     State limits share one price: a fence that shuts the vehicle out may make it faster than it should be, too. A limit
@@ -79,15 +92,15 @@ def beyond_limits(memory: Memory) -> tuple[Array, Array]:
     """
     room = build_design(load_config("room-hahn-stursberg")).state_set
     plans = {plan.seq: plan for plan in memory.of(Plan)}
-    told = steps(memory)
-    beyond = np.array([truth.state for _, truth in told[1:]]) @ room.c.T - room.b
+    decided_steps = steps(memory)
+    beyond = np.array([truth.state for _, truth in decided_steps[1:]]) @ room.c.T - room.b
     given = np.zeros_like(beyond)
-    for row, (decision, _) in zip(given, told[:-1], strict=True):
+    for row, (decision, _) in zip(given, decided_steps[:-1], strict=True):
         if decision.plan_seq is not None and decision.plan_index is not None:
-            for way in plans[decision.plan_seq].gave_way:
-                if way.constraint == "state" and way.stage == decision.plan_index + 1:
-                    backoff = plans[decision.plan_seq].backoff_x[way.stage][way.index]
-                    row[way.index] = way.amount + backoff
+            for relaxation in plans[decision.plan_seq].gave_way:
+                if relaxation.constraint == "state" and relaxation.stage == decision.plan_index + 1:
+                    backoff = plans[decision.plan_seq].backoff_x[relaxation.stage][relaxation.index]
+                    row[relaxation.index] = relaxation.amount + backoff
     return beyond, given
 
 
@@ -114,18 +127,18 @@ def test_a_mission_is_flown_and_replayed_bit_for_bit(seconds: float, overrides: 
 
 
 def test_waypoints_are_visited_in_their_order_and_held_for_their_time() -> None:
-    told = steps(flown(22.0, *WAYPOINTS))
-    numbers = [decision.waypoint for decision, _ in told if decision.target is not None]
+    decided_steps = steps(flown(22.0, *WAYPOINTS))
+    numbers = [decision.waypoint for decision, _ in decided_steps if decision.target is not None]
     assert numbers == sorted(numbers, key=lambda number: -1 if number is None else number)
     assert set(numbers) == {0, 1, 2}
     for number, place in enumerate(PLACES_M):
-        there = [(d, t) for d, t in told if d.waypoint == number]
-        assert all(np.array(d.target)[[0, 3, 6]].tolist() == list(place) for d, _ in there)
+        at_waypoint = [(d, t) for d, t in decided_steps if d.waypoint == number]
+        assert all(np.array(d.target)[[0, 3, 6]].tolist() == list(place) for d, _ in at_waypoint)
         # Arrived as the estimate says, so the truth is near by what the estimate is off at most.
-        arrived = next(d.at_ns for d, t in there if distance_m(d, t) < ACCEPT_M + 0.15)
-        assert there[-1][0].at_ns - arrived >= (HOLD_S - 0.4) * 1e9
-        assert min(distance_m(d, t) for d, t in there) < 0.15
-    assert np.mean([distance_m(d, t) for d, t in told[-10:]]) < 0.2
+        arrived = next(d.at_ns for d, t in at_waypoint if distance_m(d, t) < ACCEPT_M + 0.15)
+        assert at_waypoint[-1][0].at_ns - arrived >= (HOLD_S - 0.4) * 1e9
+        assert min(distance_m(d, t) for d, t in at_waypoint) < 0.15
+    assert np.mean([distance_m(d, t) for d, t in decided_steps[-10:]]) < 0.2
 
 
 @pytest.mark.slow
@@ -133,7 +146,7 @@ def test_a_trajectory_is_followed_far_closer_than_by_chasing_its_samples() -> No
     """Both after 5 s, in which the vehicle comes from the corner."""
     circling, chasing = flown(22.0, *as_trajectory(20.0)), flown(22.0, *as_waypoints(20.0))
 
-    def middle(memory: Memory) -> list[tuple[Decision, Truth]]:
+    def middle(memory: MemorySink) -> list[tuple[Decision, Truth]]:
         return [(d, t) for d, t in steps(memory) if 5e9 <= d.at_ns <= 20e9]
 
     wanted = {decision.at_ns: decision for decision, _ in middle(circling)}
@@ -154,18 +167,18 @@ def test_a_fence_that_closes_in_slowly_is_kept_by_every_plan() -> None:
         fence_m = np.interp(decision.at_ns * 1e-9 - begun_s, [5.0, 15.0], [3.0, 0.9])
         assert truth.state[0] <= fence_m
     # It does what it can: as near to the target as the fence and its reserve let it.
-    late = [truth.state[0] for decision, truth in steps(memory) if decision.at_ns > 18e9]
-    assert 0.2 < np.mean(late) < 0.9
+    late_positions = [truth.state[0] for decision, truth in steps(memory) if decision.at_ns > 18e9]
+    assert 0.2 < np.mean(late_positions) < 0.9
     plan = memory.of(Plan)[-1]
     assert plan.offset > 0.5
     assert plan.gave_way == ()
 
 
-def test_a_fence_that_shuts_the_vehicle_out_gives_way_is_told_and_left() -> None:
+def test_a_fence_that_shuts_the_vehicle_out_is_relaxed_reported_and_left() -> None:
     memory = flown(12.0, *SHUT_OUT)
     given = [plan for plan in memory.of(Plan) if plan.gave_way]
     assert given
-    assert {"state", "equilibrium"} <= {one.constraint for plan in given for one in plan.gave_way}
+    assert {"state", "equilibrium"} <= {relaxation.constraint for plan in given for relaxation in plan.gave_way}
     events = [event for event in memory.of(Event) if event.code == "gave-way"]
     assert [event.at_ns for event in events] == [plan.base_ns for plan in given]
     assert {event.text.split(" by ")[0] for event in events} >= {"upper limit of north position gave way"}
@@ -177,7 +190,7 @@ def test_a_fence_that_shuts_the_vehicle_out_gives_way_is_told_and_left() -> None
 
 
 @pytest.mark.slow
-@unwritten()
+@omit_figures()
 def test_the_report_shows_the_target_of_the_moment_and_the_moving_limit() -> None:
     data = flight(flown(22.0, *WAYPOINTS))
     times_s, targets = data.targets
@@ -185,7 +198,7 @@ def test_the_report_shows_the_target_of_the_moment_and_the_moving_limit() -> Non
     assert {tuple(target[[0, 3, 6]].tolist()) for target in targets} == set(PLACES_M)
     html = render_report(data, summarise(data, wall_s=1.0))
     (sentence,) = [text for text in describe_flight(data, summarise(data, wall_s=1.0)) if "set out" in text]
-    assert numbers_in(sentence)[::2] == [2.0, 3.0]  # waypoints, each with its time
+    assert find_numbers(sentence)[::2] == [2.0, 3.0]  # waypoints, each with its time
     assert sentence.replace("&", "&amp;") in html
     assert compute_position_errors_m(data)[-1] < 0.3
     fenced = flight(flown(22.0, *FENCE))
@@ -200,11 +213,11 @@ def test_the_report_shows_the_target_of_the_moment_and_the_moving_limit() -> Non
     assert render_report(moving, summary).startswith("<!DOCTYPE html>")
     assert summary.trajectory and "Distance from trajectory" in dict(list_summary_rows(summary))
     assert "Distance from target" in dict(list_summary_rows(summarise(data, wall_s=1.0)))
-    told = describe_flight(moving, summary)
-    (sentence,) = [text for text in told if "follow a trajectory" in text]
-    assert not any("from the target" in text or "waypoint" in text for text in told)
+    description = describe_flight(moving, summary)
+    (sentence,) = [text for text in description if "follow a trajectory" in text]
+    assert not any("from the target" in text or "waypoint" in text for text in description)
     # 40 chords of the circle, one a sample, of which each is cut into pieces of a step.
-    length_m, begun_s, ended_s = numbers_in(sentence)
+    length_m, begun_s, ended_s = find_numbers(sentence)
     error_m = compute_position_errors_m(moving)
     assert length_m == pytest.approx(2 * 2 * np.pi * 0.9, rel=0.01)
     assert ended_s - begun_s == pytest.approx(20.0, abs=0.5)
@@ -225,7 +238,7 @@ def test_a_step_beyond_a_fence_counts_as_outside_the_limits() -> None:
 
 
 def test_time_counts_from_the_first_decision_with_a_vehicle_that_takes_setpoints() -> None:
-    inputs = inputs_of(range(6 * TICKS), one_a_step(), status=lambda tick: vehicle(external=tick > 2 * TICKS))
+    inputs = make_inputs(range(6 * TICKS), make_step_samples(), status=lambda tick: vehicle(external=tick > 2 * TICKS))
     outputs = run(make_controller(), inputs)
     begun = 3 * TICKS
     assert {(output.decision.target, output.decision.waypoint) for output in outputs[:begun]} == {(None, None)}
@@ -237,21 +250,21 @@ def test_a_mission_goes_on_where_it_was_after_the_pilot_had_the_vehicle() -> Non
     controller = make_controller()
     leave_at_once = tuple(Waypoint(np.zeros(3), hold_ns=0) for _ in range(9))
     controller = replace(controller, mission=replace(controller.mission, waypoints=leave_at_once))
-    inputs = inputs_of(range(6 * TICKS), one_a_step(), status=lambda tick: vehicle(external=tick not in away))
+    inputs = make_inputs(range(6 * TICKS), make_step_samples(), status=lambda tick: vehicle(external=tick not in away))
     outputs = run(controller, inputs)
     assert {outputs[tick].decision.mode for tick in away} == {ControlMode.WAIT}
     assert [output.decision.waypoint for output in outputs[::TICKS]] == [1, 2, 2, 2, 3, 4]
 
 
-def test_a_plan_that_gives_way_is_one_event_with_the_worst_and_the_number_of_others() -> None:
+def test_a_relaxed_plan_is_one_event_with_the_worst_relaxation_and_the_number_of_others() -> None:
     given = tuple(GaveWay(constraint="equilibrium", stage=3, index=i, amount=0.1 * (i + 1)) for i in range(3))
     solver = StubSolver(small_plant(), faults={1: lambda answer: replace(answer, relaxed=given)})
-    outputs = run(make_controller(solver), inputs_of(range(3 * TICKS), one_a_step()))
-    told = [(number, output) for number, output in enumerate(outputs) if "gave-way" in codes(output)]
-    assert [number for number, _ in told] == [TICKS]
-    (event,) = [event for event in told[0][1].events if event.code == "gave-way"]
+    outputs = run(make_controller(solver), make_inputs(range(3 * TICKS), make_step_samples()))
+    relaxed_outputs = [(number, output) for number, output in enumerate(outputs) if "gave-way" in list_codes(output)]
+    assert [number for number, _ in relaxed_outputs] == [TICKS]
+    (event,) = [event for event in relaxed_outputs[0][1].events if event.code == "gave-way"]
     assert event.text == "rest was missed by 0.3 of state 2 in stage 3; so did 2 others"
-    plan = told[0][1].plan
+    plan = relaxed_outputs[0][1].plan
     assert plan is not None and plan.gave_way == given
 
 
@@ -267,8 +280,8 @@ class ListeningSolver(StubSolver):
 
 
 @pytest.mark.parametrize(("late_steps", "wanted"), [(0, 0), (1, 1), (3, 2)])
-def test_a_late_position_is_told_as_far_as_the_design_counts_with_it(late_steps: int, wanted: int) -> None:
+def test_a_late_position_is_reported_up_to_the_late_steps_of_the_design(late_steps: int, wanted: int) -> None:
     solver = ListeningSolver(small_plant())
     controller = replace(make_controller(solver), late_steps=late_steps)
-    run(controller, inputs_of(range(8 * TICKS), one_a_step(delay_ns=430 * MS)))
+    run(controller, make_inputs(range(8 * TICKS), make_step_samples(delay_ns=430 * MS)))
     assert {preview.age for preview in solver.told} == {wanted}

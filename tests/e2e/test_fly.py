@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 from loopback_rig import make_loop
-from operation_rig import ended
+from operation_rig import wait_for_end
 from places import TESTS, without_pages
 
 from logs.recording.reader import read, records
@@ -41,9 +41,9 @@ def control() -> Iterator[str]:
 
 
 def free_port() -> int:
-    with socket.socket(type=socket.SOCK_DGRAM) as one:
-        one.bind(("127.0.0.1", 0))
-        return int(one.getsockname()[1])
+    with socket.socket(type=socket.SOCK_DGRAM) as sock:
+        sock.bind(("127.0.0.1", 0))
+        return int(sock.getsockname()[1])
 
 
 @contextmanager
@@ -53,7 +53,7 @@ def daemon(port: int, out: Path, *options: str) -> Iterator[subprocess.Popen[str
     process = subprocess.Popen(
         [*command, *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=without_pages()
     )
-    with ended(process):
+    with wait_for_end(process):
         assert process.stderr is not None
         for line in process.stderr:
             if "recording to" in line:
@@ -84,11 +84,11 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], dic
     # It holds for as long as the pause lasts, also where the machine makes it longer.
     with (
         daemon(port, out, "--set", "fallback.hold_s=60", "--set", "fallback.blind_hold_s=60") as process,
-        source(port) as seen,
+        source(port) as observed,
     ):
         process.send_signal(signal.SIGINT)
         summary, _ = process.communicate(timeout=LIMIT_S)
-        return seen, json.loads(summary), process.returncode, out / "flight.mcap"
+        return observed, json.loads(summary), process.returncode, out / "flight.mcap"
 
 
 Flown = tuple[dict[str, Any], dict[str, Any], int, Path]
@@ -96,36 +96,36 @@ Flown = tuple[dict[str, Any], dict[str, Any], int, Path]
 
 @pytest.mark.slow
 def test_a_foreign_source_gets_acceleration_setpoints_and_is_flown_to_the_target(flown: Flown) -> None:
-    seen, summary, code, _ = flown
+    observed, summary, code, _ = flown
     assert (code, summary["ended"]) == (1, "landing has failed")  # the source knows no landing
-    assert seen["setpoints"] >= 240  # a source in whose pause none came would never have got to its end
-    assert seen["masks"] == [3135]  # acceleration only, vehicles.md
-    assert 0.1 < seen["largest_mps2"] <= 2.0 + 1e-6
-    assert seen["position_m"] == pytest.approx(load_config("room").target.position_m, abs=0.15)
-    assert summary["received"] > 0.5 * seen["poses"] and summary["lost"] is None
+    assert observed["setpoints"] >= 240  # a source in whose pause none came would never have got to its end
+    assert observed["masks"] == [3135]  # acceleration only, vehicles.md
+    assert 0.1 < observed["largest_mps2"] <= 2.0 + 1e-6
+    assert observed["position_m"] == pytest.approx(load_config("room").target.position_m, abs=0.15)
+    assert summary["received"] > 0.5 * observed["poses"] and summary["lost"] is None
 
 
 @pytest.mark.fault(35)
 def test_a_second_daemon_is_refused_before_it_makes_anything(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, control: str
 ) -> None:
-    monkeypatch.delattr("uavctl.cli.fly.design_of")
+    monkeypatch.delattr("uavctl.cli.fly.build_flight_design")
     url = f"udpin://127.0.0.1:{free_port()}"
-    words = ["fly", "--vehicle", url, "--control", control, "--out", str(tmp_path / "flight")]
+    arguments = ["fly", "--vehicle", url, "--control", control, "--out", str(tmp_path / "flight")]
     with lock_vehicle(url):
-        assert run(words) == 1
+        assert run(arguments) == 1
     assert "flies this vehicle already" in " ".join(capsys.readouterr().err.split())
     with open_listener(Path(control), make_daemon_name(load_config("room", [f'daemon.vehicle="{url}"']))):
-        assert run(words) == 1
+        assert run(arguments) == 1
     assert "is running" in " ".join(capsys.readouterr().err.split())
-    assert not list(tmp_path.rglob("*.mcap")) and not any(one.exists() for one in find_lock_paths(url))
+    assert not list(tmp_path.rglob("*.mcap")) and not any(lock_path.exists() for lock_path in find_lock_paths(url))
 
 
 @pytest.mark.slow
-def test_an_end_that_was_asked_for_leaves_no_word_for_the_next_daemon(flown: Flown) -> None:
+def test_a_requested_end_leaves_no_note_for_the_next_daemon(flown: Flown) -> None:
     """The source neither lands nor disarms; yet the next one on this port is flown like any other."""
     url = next(iter(records(flown[3], Header))).command.split("--vehicle ")[1].split()[0]
-    assert not any(one.exists() for one in find_lock_paths(url))
+    assert not any(lock_path.exists() for lock_path in find_lock_paths(url))
 
 
 def test_age_rises_in_the_pause_fallback_at_h_recovery_after(flown: Flown) -> None:
@@ -161,7 +161,7 @@ def test_the_recording_replays_identically(flown: Flown) -> None:
 
 
 @pytest.mark.slow
-def test_sigterm_closes_the_recording_even_when_nothing_was_heard(tmp_path: Path) -> None:
+def test_sigterm_closes_the_recording_even_without_a_vehicle(tmp_path: Path) -> None:
     with daemon(free_port(), tmp_path) as process:
         process.send_signal(signal.SIGTERM)
         process.communicate(timeout=LIMIT_S)
@@ -170,14 +170,14 @@ def test_sigterm_closes_the_recording_even_when_nothing_was_heard(tmp_path: Path
 
 
 @pytest.mark.usefixtures("no_page")
-def test_a_duration_closes_the_recording_even_when_nothing_was_heard(tmp_path: Path, control: str) -> None:
+def test_a_duration_closes_the_recording_even_without_a_vehicle(tmp_path: Path, control: str) -> None:
     url = f"udpin://127.0.0.1:{free_port()}"
     places = ["--out", str(tmp_path / "flight"), "--control", control]
     assert run(["fly", "--vehicle", url, "--mocap", url, "--duration", "0.2", *places]) == 1  # ran, but flew nothing
     assert [*records(tmp_path / "flight" / "flight.mcap", Decision)][-1].mode is ControlMode.STOPPED
 
 
-def test_the_pilot_engages_and_nobody_else(flown: Flown) -> None:
+def test_only_the_pilot_engages(flown: Flown) -> None:
     # The table itself is tested in test_mode; here: nobody but the pilot engaged.
     hand_overs = [e.text for e in records(flown[3], Event) if e.code == "hand-over"]
     assert hand_overs[0].startswith("waiting -> engaged")
@@ -189,8 +189,8 @@ def test_without_room_on_the_disk_nothing_is_flown(
     url = f"udpin://127.0.0.1:{free_port()}"
     places = ["--out", str(tmp_path / "f"), "--control", control]
     assert run(["fly", "--vehicle", url, "--mocap", url, "--set", f"log.free_bytes={10**15}", *places]) == 1
-    told = " ".join(capsys.readouterr().err.split())
-    assert "log.free_bytes" in told and "make room" in told
+    output = " ".join(capsys.readouterr().err.split())
+    assert "log.free_bytes" in output and "make room" in output
     assert not list(tmp_path.rglob("*.mcap"))
 
 
@@ -201,6 +201,6 @@ def test_a_port_in_use_is_refused_with_what_to_do(
         taken.bind(("127.0.0.1", 0))
         url = f"udpin://127.0.0.1:{taken.getsockname()[1]}"
         assert run(["fly", "--vehicle", url, "--out", str(tmp_path), "--control", control]) == 2
-    told = capsys.readouterr().err
-    assert url in told and "Traceback" not in told
+    output = capsys.readouterr().err
+    assert url in output and "Traceback" not in output
     assert not list(tmp_path.iterdir())

@@ -66,14 +66,14 @@ def furthest_m(
             f"link.blackout=[[{blackout_s[0]}, {blackout_s[1]}]]",
         ],
     )
-    told = Told()
+    events = Told()
     believed = load_config(preset, design)
-    watched = TrackedFlyer(ControlLoop(believed, get_cached_controller(believed), told, lambda: 0))
+    watched = TrackedFlyer(ControlLoop(believed, get_cached_controller(believed), events, lambda: 0))
     world = World(flown, watched)
     vehicle, sensors = world.peers.vehicle, world.peers.autopilot.inertial
-    streams, own = world.peers.autopilot.telemetry.streams, mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED
-    says = streams[own]
-    streams[own] = lambda at_ns: says(at_ns) if at_ns < silent_s * 1e9 else None
+    streams, position_message_id = world.peers.autopilot.telemetry.streams, mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED
+    says = streams[position_message_id]
+    streams[position_message_id] = lambda at_ns: says(at_ns) if at_ns < silent_s * 1e9 else None
 
     watched.get_position = lambda: vehicle.position_m
     measure, kept = sensors.measure, []
@@ -97,7 +97,7 @@ def furthest_m(
     world.run(flown.duration_s)
     times, where = np.array(watched.times_s), np.array(watched.positions_m)
     beyond = compute_excess_m(where, *get_room_limits(flown))
-    return float(beyond[(times >= blackout_s[0]) & (times <= blackout_s[1])].max()), frozenset(told.codes)
+    return float(beyond[(times >= blackout_s[0]) & (times <= blackout_s[1])].max()), frozenset(events.codes)
 
 
 @pytest.mark.slow
@@ -105,39 +105,39 @@ def furthest_m(
 @pytest.mark.parametrize(("lie", "seed"), [("frozen", 3), ("step", 11), ("small", 3), ("ramp", 11)])
 @pytest.mark.fault(58)
 @pytest.mark.fault(59)
-def test_a_lie_that_begins_in_a_blackout_is_found_by_the_vehicles_own_velocity(
+def test_an_inertial_error_from_a_blackout_is_found_by_the_vehicle_velocity(
     autopilot: str, lie: str, seed: int
 ) -> None:
-    lied_m, told = furthest_m(autopilot, lie, seed)
+    lied_m, events = furthest_m(autopilot, lie, seed)
     without_m, _ = furthest_m(autopilot, "none", seed)
     assert lied_m < 0.0 and lied_m < without_m + 0.2
-    assert told & {"inertial-doubted", "inertial-silent"}
+    assert events & {"inertial-doubted", "inertial-silent"}
 
 
 @pytest.mark.slow
 @pytest.mark.fault(59)
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
-def test_a_lie_from_the_start_is_found_in_an_early_silence_too(autopilot: str) -> None:
+def test_an_inertial_error_from_the_start_is_found_in_an_early_blackout(autopilot: str) -> None:
     """No position could yet speak for the vehicle's own velocity: what was sent since the flight began does."""
     for seed in (3, 5):
-        lied_m, told = furthest_m(autopilot, "offset", seed, "room", (0.4, 5.4), 0.0)
-        assert lied_m < 0.1 and "inertial-doubted" in told
+        lied_m, events = furthest_m(autopilot, "offset", seed, "room", (0.4, 5.4), 0.0)
+        assert lied_m < 0.1 and "inertial-doubted" in events
 
 
 @pytest.mark.slow
 @pytest.mark.fault(59)
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
-def test_an_own_velocity_that_falls_silent_makes_nothing_doubted(autopilot: str) -> None:
+def test_a_missing_vehicle_velocity_raises_no_inconsistency(autopilot: str) -> None:
     for seed in (3, 5):
-        healthy_m, told = furthest_m(autopilot, "", seed, "room", (2.5, 7.5), silent_s=2.5)
-        assert healthy_m < -0.4 and "inertial-doubted" not in told
+        healthy_m, events = furthest_m(autopilot, "", seed, "room", (2.5, 7.5), silent_s=2.5)
+        assert healthy_m < -0.4 and "inertial-doubted" not in events
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
-def test_what_does_not_lie_is_not_doubted_and_keeps_further_from_walls(autopilot: str) -> None:
+def test_correct_inertial_data_raise_no_inconsistency_and_keep_further_from_walls(autopilot: str) -> None:
     for seed in (3, 11):
-        healthy_m, told = furthest_m(autopilot, "", seed)
+        healthy_m, events = furthest_m(autopilot, "", seed)
         without_m, told_without = furthest_m(autopilot, "none", seed)
         assert healthy_m < without_m + 0.1
-        assert not (told | told_without) & {"inertial-doubted", "inertial-silent"}
+        assert not (events | told_without) & {"inertial-doubted", "inertial-silent"}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from loopback_rig import Memory, make_loop, shared_loop
+from loopback_rig import MemorySink, make_loop, shared_loop
 from mavlink_rig import Peer
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import decode
@@ -30,7 +30,7 @@ class Rig:
 
     def __init__(self, *overrides: str) -> None:
         self.config = load_config("room-hahn-stursberg", overrides)
-        self.memory = Memory()
+        self.memory = MemorySink()
         self.loop = shared_loop(self.config, self.memory)
         self.peers = Peers(self.config, 0)
         self.tick = 0
@@ -51,11 +51,11 @@ class Rig:
             ticked = self.loop.tick(self.tick, at_ns, outgoing.append, stop=stop)
             self.mode, self.answers = ticked.decision.mode, ticked.answers
             self.notices = [event.code for event in ticked.notices]
-            for one in outgoing:
-                if one.link == "vehicle":
-                    sent += [message.get_type() for message in decode(one.data) if not asks_for_a_stream(message)]
+            for datagram in outgoing:
+                if datagram.link == "vehicle":
+                    sent += [message.get_type() for message in decode(datagram.data) if not asks_for_a_stream(message)]
                 if listening:
-                    self.peers.receive(one.link, one.data, at_ns)
+                    self.peers.receive(datagram.link, datagram.data, at_ns)
             self.tick += 1
         return sent
 
@@ -93,7 +93,7 @@ def test_nothing_is_sent_after_the_pilot_took_over_even_if_the_mode_comes_back()
     assert max(s.at_ns for s in rig.memory.of(Setpoint)) < released_ns  # what is recorded is what was sent
 
 
-def test_a_late_tick_sends_no_setpoint_once_the_pilot_s_mode_has_been_heard() -> None:
+def test_a_late_tick_sends_no_setpoint_after_the_pilot_s_mode_is_received() -> None:
     rig = Rig()
     rig.run(40)
     rig.heartbeat(HOLD_MODE, late_ns=20_000_000)  # came after the tick's grid time, before the tick ran
@@ -113,14 +113,14 @@ def test_a_take_over_in_a_backlog_counts_before_anything_goes_out_whatever_comes
 @pytest.mark.slow
 @pytest.mark.fault(50)
 @pytest.mark.parametrize("why", ["overrun", "hung-up"])
-def test_where_the_vehicle_s_words_were_lost_nothing_goes_out_until_it_is_heard_again(why: str) -> None:
+def test_after_lost_messages_nothing_is_sent_until_the_next_heartbeat(why: str) -> None:
     rig = Rig('solver.method="exact"')
     rig.run(40)
     rig.loop.refused("mocap", {why: 3}, rig.tick * TICK_NS)  # of the cameras': nothing that could be the pilot's
     assert rig.run(5, deaf=True).count(SETPOINT) == 5
     rig.heartbeat(OFFBOARD)
-    told = rig.loop.refused("vehicle", {why: 3}, rig.tick * TICK_NS)
-    assert [event.code for event in told] == ["hung-up"] * (why == "hung-up")  # a person at the console is told
+    reported = rig.loop.refused("vehicle", {why: 3}, rig.tick * TICK_NS)
+    assert [event.code for event in reported] == ["hung-up"] * (why == "hung-up")  # a person at the console is told
     silent = rig.run(20, deaf=True)
     assert not {SETPOINT, LAND} & set(silent)
     rig.heartbeat(OFFBOARD, late_ns=1)
@@ -133,17 +133,17 @@ def test_where_the_vehicle_s_words_were_lost_nothing_goes_out_until_it_is_heard_
     assert result.identical, result.first_difference
 
 
-def test_a_vehicle_that_fell_silent_is_told_and_its_landing_goes_out_all_the_same() -> None:
+def test_a_silent_vehicle_is_reported_and_its_landing_is_sent() -> None:
     rig = Rig('solver.method="exact"')
     rig.run(40)
     rig.heartbeat(OFFBOARD)
-    told = rig.loop.refused("vehicle", {"went-silent": 1}, rig.tick * TICK_NS)
-    assert [event.code for event in told] == ["went-silent"]
+    reported = rig.loop.refused("vehicle", {"went-silent": 1}, rig.tick * TICK_NS)
+    assert [event.code for event in reported] == ["went-silent"]
     assert LAND in rig.run(70, stop=True, deaf=True)  # no word of a pilot's was lost: it said nothing
 
 
 @pytest.mark.fault(50)
-def test_the_first_word_of_a_vehicle_whose_connection_was_lost_is_answered_with_the_landing_that_waits() -> None:
+def test_the_first_message_after_a_lost_connection_is_answered_with_the_pending_landing() -> None:
     rig = Rig('solver.method="exact"')
     rig.run(40)
     rig.heartbeat(OFFBOARD)
@@ -163,8 +163,8 @@ def test_of_a_flood_of_positions_a_tick_looks_at_the_newest() -> None:
     rig.run(1, deaf=True)
     newest = rig.memory.of(StepInput)[-1].samples
     assert len(newest) == MAX_SAMPLES and newest[-1].received_ns == rig.tick * TICK_NS - TICK_NS - 1
-    assert [one.received_ns for one in newest] == sorted(one.received_ns for one in newest)
-    assert [one.source for one in newest].count("VISION_POSITION_ESTIMATE 17/19") == 1
+    assert [sample.received_ns for sample in newest] == sorted(sample.received_ns for sample in newest)
+    assert [sample.source for sample in newest].count("VISION_POSITION_ESTIMATE 17/19") == 1
 
 
 def test_a_silent_vehicle_is_braked_and_held_for_a_while_and_then_left_to_its_own_failsafe() -> None:
@@ -177,8 +177,8 @@ def test_a_silent_vehicle_is_braked_and_held_for_a_while_and_then_left_to_its_ow
     assert {s.source for s in rig.memory.of(Setpoint)[-60:]} <= {SetpointSource.BRAKE, SetpointSource.HOLD}
     rig.run(100, deaf=True)  # fallback.brake_s and hold_s are over
     assert SETPOINT not in rig.run(50, deaf=True)
-    told = [e.text for e in rig.memory.of(Event) if e.code == "heartbeat"]
-    assert len(told) == 1 and "lost" in told[0]
+    reported = [e.text for e in rig.memory.of(Event) if e.code == "heartbeat"]
+    assert len(reported) == 1 and "lost" in reported[0]
 
 
 def test_a_long_blackout_ends_in_a_landing_that_the_vehicle_obeys() -> None:
@@ -202,7 +202,7 @@ def test_landing_is_asked_for_again_by_the_heartbeats_and_five_times_at_most() -
         sent += rig.run(1, deaf=True, listening=False)
     assert sent.count(LAND) == 5
     commands = [(d.at_ns, decode(d.data)[0]) for d in rig.memory.of(Datagram) if d.outgoing]
-    asked = [at_ns for at_ns, one in commands if one.get_type() == LAND and not asks_for_a_stream(one)]
+    asked = [at_ns for at_ns, message in commands if message.get_type() == LAND and not asks_for_a_stream(message)]
     first, *again = [at_ns // 50_000_000 for at_ns in asked]
     # Right after the first heartbeat that comes a second later; the next ones come with the heartbeats.
     expected = next(beat for beat in beats if beat >= first + 20)
@@ -258,7 +258,7 @@ def test_row_31_a_restart_is_disarmed_and_asks_for_nothing() -> None:
 
 
 @pytest.mark.usefixtures("control_may_fail")
-def test_an_order_that_no_hand_over_took_is_not_answered_with_what_the_tick_before_said(
+def test_an_order_that_the_hand_over_did_not_take_is_not_answered_with_the_last_reply(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     rig, hold = Rig(), Command(order=Order.HOLD)
@@ -278,7 +278,7 @@ def test_an_order_that_no_hand_over_took_is_not_answered_with_what_the_tick_befo
 
 
 @pytest.mark.usefixtures("control_may_fail")
-def test_what_the_hand_over_answered_stands_if_its_request_cannot_be_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_reply_of_the_hand_over_stays_if_its_request_cannot_be_sent(monkeypatch: pytest.MonkeyPatch) -> None:
     rig, land = Rig("fallback.brake_s=0.0"), Command(order=Order.LAND)
     rig.run(40)
 
@@ -293,7 +293,7 @@ def test_what_the_hand_over_answered_stands_if_its_request_cannot_be_sent(monkey
 
 
 @pytest.mark.usefixtures("control_may_fail")
-def test_what_fails_in_sending_is_no_failure_of_the_controller() -> None:
+def test_a_failure_to_send_is_not_a_failure_of_the_controller() -> None:
     rig = Rig()
     rig.run(40)
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from report_rig import unpaged, unwritten
+from report_rig import omit_figures, omit_pages
 from udp_rig import assert_in_order, fly_over_udp
 
 import uavctl
@@ -33,39 +33,50 @@ KEYS = {
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("flights") / "one"
-    with unpaged():
+    with omit_pages():
         small_chunks = ("--set", "log.chunk_bytes=16384")
-        words = ["loopback", "--config", "paper", "--duration", "12", "--seed", "3", "--out", str(out), *small_chunks]
-        assert run(words) == 0
+        arguments = [
+            "loopback",
+            "--config",
+            "paper",
+            "--duration",
+            "12",
+            "--seed",
+            "3",
+            "--out",
+            str(out),
+            *small_chunks,
+        ]
+        assert run(arguments) == 0
     return out / "flight.mcap"
 
 
 def document(capsys: pytest.CaptureFixture[str], *arguments: str, code: int = 0) -> dict[str, Any]:
     assert run([*arguments, "--json"]) == code
-    found: dict[str, Any] = json.loads(capsys.readouterr().out)
-    return found
+    document: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return document
 
 
 @pytest.mark.slow
 def test_loopback_sums_up_in_the_documented_keys(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    found = document(capsys, "loopback", "--config", "paper", "--duration", "8", "--out", str(tmp_path / "f"))
-    assert found.keys() >= KEYS
-    assert (found["steps"], found["slack_used"], found["input_violations"]) == (8, 0, 0)
-    assert found["received"] + found["lost"] == 8
-    assert Path(found["report"]).read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
+    result = document(capsys, "loopback", "--config", "paper", "--duration", "8", "--out", str(tmp_path / "f"))
+    assert result.keys() >= KEYS
+    assert (result["steps"], result["slack_used"], result["input_violations"]) == (8, 0, 0)
+    assert result["received"] + result["lost"] == 8
+    assert Path(result["report"]).read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
 
 
 @pytest.mark.slow
 def test_over_udp_the_same_peers_fly_in_real_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    found = fly_over_udp(tmp_path / "f", lambda truths: len(truths) >= 19, "--config", "room-hahn-stursberg")
-    assert found["steps"] >= 15
+    result = fly_over_udp(tmp_path / "f", lambda truths: len(truths) >= 19, "--config", "room-hahn-stursberg")
+    assert result["steps"] >= 15
     # Not its states: where the machine stood still, the vehicle flew on as it was told last.
-    assert found["input_violations"] == found["recorder_dropped"] == 0
+    assert result["input_violations"] == result["recorder_dropped"] == 0
     assert_in_order(tmp_path / "f" / "flight.mcap", 200_000_000)
     assert document(capsys, "log", "replay", str(tmp_path / "f" / "flight.mcap"))["identical"]
 
 
-def test_the_recording_says_how_it_was_made(flown: Path) -> None:
+def test_the_recording_states_its_origin(flown: Path) -> None:
     header = next(records(flown, Header))
     assert header.seed == 3 and header.design["design_id"] == header.design_id
     assert {"uavctl", "python", "numpy", "clarabel"} <= header.versions.keys()
@@ -75,7 +86,7 @@ def test_the_recording_says_how_it_was_made(flown: Path) -> None:
 def test_replay_is_identical_and_info_counts(flown: Path, capsys: pytest.CaptureFixture[str]) -> None:
     replayed = document(capsys, "log", "replay", str(flown))
     assert replayed["identical"] and replayed["decisions"] == 120 and replayed["first_difference"] is None
-    topics = {one["topic"]: one["messages"] for one in document(capsys, "log", "info", str(flown))["topics"]}
+    topics = {entry["topic"]: entry["messages"] for entry in document(capsys, "log", "info", str(flown))["topics"]}
     assert topics["/uavctl/decision"] == topics["/uavctl/step_input"] == 120
     assert topics["/sim/truth"] == 12 and topics["/raw/vehicle/out"] > 120
 
@@ -85,33 +96,33 @@ def test_a_replay_with_another_cost_decides_otherwise(tmp_path: Path, capsys: py
     document(capsys, "loopback", "--config", "paper", "--duration", "4", "--out", str(tmp_path / "f"))
     flight = str(tmp_path / "f" / "flight.mcap")
     assert document(capsys, "log", "replay", flight)["identical"]
-    found = document(capsys, "log", "replay", flight, "--set", "cost.input=[1.0, 1.0]", code=1)
-    assert not found["identical"] and found["first_difference"]
+    result = document(capsys, "log", "replay", flight, "--set", "cost.input=[1.0, 1.0]", code=1)
+    assert not result["identical"] and result["first_difference"]
 
 
-def test_the_command_tells_what_the_page_says_first(
+def test_the_command_prints_the_first_line_of_the_page(
     flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     page = tmp_path / "page.html"
-    with unwritten():
+    with omit_figures():
         main = document(capsys, "log", "report", str(flown), "--out", str(page))["headline"]
         text = " ".join(unescape(re.sub(r"<[^>]+>", " ", page.read_text(encoding="utf-8"))).split())
         assert run(["log", "report", str(flown), "--out", str(page)]) == 0
     shown = " ".join(capsys.readouterr().out.split())
-    for told in (main["text"], *main["why"]):
-        assert told in shown and told in text
+    for sentence in (main["text"], *main["why"]):
+        assert sentence in shown and sentence in text
 
 
-def test_recover_restores_a_cut_file_and_says_so_in_its_exit_code(
+def test_recover_restores_a_cut_file_with_its_exit_code(
     flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     cut, whole = tmp_path / "cut.mcap", tmp_path / "whole.mcap"
     data = flown.read_bytes()
     cut.write_bytes(data[: len(data) // 2] + b"\x05")  # begins a record, wherever the half of it ends
-    found = document(capsys, "log", "recover", str(cut), str(whole), code=3)
+    result = document(capsys, "log", "recover", str(cut), str(whole), code=3)
     # the clean file has one message more: the recorder's note of where it comes from
-    assert found["lost_bytes"] > 0 and found["messages"] + 1 == sum(
-        isinstance(one, RecordedMessage) for one in walk(whole)
+    assert result["lost_bytes"] > 0 and result["messages"] + 1 == sum(
+        isinstance(entry, RecordedMessage) for entry in walk(whole)
     )
     # a prefix of what was recorded, to the record; what is made for viewers is no record
     kept = list(read(whole))
@@ -120,7 +131,7 @@ def test_recover_restores_a_cut_file_and_says_so_in_its_exit_code(
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "words"),
+    ("arguments", "code", "command_line"),
     [
         (["log", "info", "nowhere.mcap"], 1, "no such recording"),
         (["log", "replay", "nowhere.tlog"], 1, "no such recording"),
@@ -132,14 +143,14 @@ def test_recover_restores_a_cut_file_and_says_so_in_its_exit_code(
         (["sim", "--vehicle", "udpout://127.0.0.1"], 2, "udpout://127.0.0.1"),
     ],
 )
-def test_bad_input_is_told_without_a_traceback(
-    arguments: list[str], code: int, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+def test_bad_input_is_reported_without_a_traceback(
+    arguments: list[str], code: int, command_line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     monkeypatch.chdir(tmp_path)
     assert run(arguments) == code
-    told = capsys.readouterr()
-    assert words in (told.err + told.out).replace("\n", " ")
+    output = capsys.readouterr()
+    assert command_line in (output.err + output.out).replace("\n", " ")
 
 
 @pytest.mark.usefixtures("no_page")
@@ -156,7 +167,7 @@ def test_records_of_a_flight_have_the_types_of_their_topics(flown: Path) -> None
 
 
 @pytest.mark.slow
-def test_a_page_that_cannot_be_written_is_told_and_leaves_the_recording(tmp_path: Path) -> None:
+def test_a_page_that_cannot_be_written_is_reported_and_leaves_the_recording(tmp_path: Path) -> None:
     """Page and process that draws it, without the fixture that keeps it from being drawn."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("uavctl.cli.flying.draw_page", lambda *_: None)
@@ -171,7 +182,7 @@ def test_a_page_that_cannot_be_written_is_told_and_leaves_the_recording(tmp_path
     assert path.read_bytes() == before
 
 
-def test_a_flight_without_its_page_is_told_whole(
+def test_a_flight_without_its_page_has_a_complete_summary(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fails(*_: object) -> None:
@@ -179,10 +190,10 @@ def test_a_flight_without_its_page_is_told_whole(
 
     monkeypatch.setattr("uavctl.cli.flying.draw_page", fails)
     assert run(["loopback", "--config", "room", "--duration", "1", "--out", str(tmp_path), "--json"]) == 0
-    told = capsys.readouterr()
-    found = json.loads(told.out)
-    assert found["report"] is None and Path(found["recording"]).exists()
-    assert "no room" in told.err
+    output = capsys.readouterr()
+    document = json.loads(output.out)
+    assert document["report"] is None and Path(document["recording"]).exists()
+    assert "no room" in output.err
 
 
 def test_what_flies_loads_nothing_that_draws() -> None:

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from manual_rig import PAGES, Desk, blocks, commands, desk, edited, keys
+from manual_rig import PAGES, ManualShell, apply_block, find_blocks, find_commands, open_shell, parse_keys
 from places import DATA, ROOT
 
 from uavctl.cli.init import format_room, parse_sizes
@@ -24,7 +24,7 @@ VALUES = {
     "CAMERAS": "udpin://0.0.0.0:14560",
 }
 # What is typed otherwise so that all of it takes minutes, not hours: (pattern, in its place).
-SHORTER = (
+SHORTENED = (
     (r"--runs 200(000)?\b", "--runs 2"),
     (r"^(uavctl campaign docs/campaigns/\w+\.toml)(?!.*--runs)", r"\1 --runs 2"),
     (r"^(uavctl paper)(?!.*--runs)", r"\1 --runs 2 --steps 20"),
@@ -33,7 +33,7 @@ SHORTER = (
     (r"^(uavctl fly .*) --duration 120", r"\1 --duration 6"),
 )
 # What is not typed, and why.
-NOT_TYPED = {
+OMITTED = {
     r"^make |^\. \.venv": "sets up an environment: continuous integration is a `make test-all`",
     r"--move$": "a person has to move the body",
     r"^uavctl fly \.\.\.": "the dots are the reader's",
@@ -45,49 +45,57 @@ NOT_TYPED = {
     r"^python -c .*systemd": "prints the path of a file of the installed package",
 }
 # Pages whose commands belong to each other: walked below, or in test_extending.py.
-WALKED = {"docs/first-flight.md", "docs/fleet.md", "docs/operation.md", "docs/extending.md"}
+PAGES_WITH_OWN_TEST = {"docs/first-flight.md", "docs/fleet.md", "docs/operation.md", "docs/extending.md"}
 TOML_OF_OTHERS = {"docs/extending.md", "docs/fleet.md"}  # campaigns, packages, fleets: tests of their own
-FLIES = """uavctl ctl status --json | grep -q '"mode":"track"'"""
+FLIGHT_TRACKS = """uavctl ctl status --json | grep -q '"mode":"track"'"""
 # The machine may stand still for a while: what a check then finds, and a setpoint timeout, are not the manual's. That
 # the vehicle's own timeout passes is seen in step 6, and in tests/check in virtual time.
-OF_TIME = ["vehicle", "position rate", "position age", "longest gap", "position loss", "vehicle clock", "source clock"]
+TIMED_ITEMS = [
+    "vehicle",
+    "position rate",
+    "position age",
+    "longest gap",
+    "position loss",
+    "vehicle clock",
+    "source clock",
+]
 READER_S = 3.0  # a reader watches the vehicle after an order; `identify` needs 5 s of flight
 TIMEOUTS = ["COM_OF_LOSS_T", "GUID_TIMEOUT"]
-PATIENT = "--set sim.setpoint_timeout_s=600.0"
+LONG_TIMEOUT = "--set sim.setpoint_timeout_s=600.0"
 ROOM_START = '--set sim.camera.rate_hz=25 --set "sim.start_position_m=[0,0,-0.1]"'
 
 
-def typed(command: str) -> str:
+def shorten_command(command: str) -> str:
     """What is typed for a command."""
     for name, value in VALUES.items():
         command = command.replace(name, value)
-    for pattern, instead in SHORTER:
+    for pattern, instead in SHORTENED:
         command = re.sub(pattern, instead, command)
     return command
 
 
-def is_typed(command: str) -> bool:
-    return not any(re.search(pattern, command) for pattern in NOT_TYPED)
+def is_run(command: str) -> bool:
+    return not any(re.search(pattern, command) for pattern in OMITTED)
 
 
 @pytest.fixture
-def at_desk(tmp_path: Path) -> Iterator[Desk]:
-    with desk(tmp_path) as one:
-        yield one
+def shell(tmp_path: Path) -> Iterator[ManualShell]:
+    with open_shell(tmp_path) as shell:
+        yield shell
 
 
 @pytest.fixture(scope="session")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Files that pages take for granted: flights by the names that they have there, other people's recordings."""
     folder = tmp_path_factory.mktemp("flown")
-    with desk(tmp_path_factory.mktemp("desk")) as one:
-        ways = "mission.waypoints=[[1.5,1.0,-1.2],[-1.5,-1.0,-0.8],[1.5,-1.0,-1.4]]"
-        flight = f"uavctl loopback --config room-px4 --duration 40 --out flights/NAME --set '{ways}'"
-        one.run(flight)
-        one.run("uavctl identify flights/NAME/flight.mcap")
+    with open_shell(tmp_path_factory.mktemp("desk")) as shell:
+        waypoints = "mission.waypoints=[[1.5,1.0,-1.2],[-1.5,-1.0,-0.8],[1.5,-1.0,-1.4]]"
+        flight = f"uavctl loopback --config room-px4 --duration 40 --out flights/NAME --set '{waypoints}'"
+        shell.run(flight)
+        shell.run("uavctl identify flights/NAME/flight.mcap")
         for name in ("A", "B"):
-            one.run(f"uavctl loopback --duration 8 --out flights/{name}")
-        shutil.move(one.folder / "flights", folder / "flights")
+            shell.run(f"uavctl loopback --duration 8 --out flights/{name}")
+        shutil.move(shell.folder / "flights", folder / "flights")
     shutil.copy(folder / "flights/NAME/flight.mcap", folder / "FLIGHT")
     shutil.copy(folder / "flights/NAME/identified.toml", folder / "identified.toml")
     shutil.copy(DATA / "arducopter-vicon-loop.tlog", folder / "somebody-elses.tlog")
@@ -95,49 +103,51 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_what_the_tables_name_is_in_the_manual() -> None:
+def test_the_tables_name_commands_of_the_manual() -> None:
     """A row that nothing needs any more would hide the next command that looks like it."""
-    every = [command for page in PAGES for command in commands(page)]
-    assert [row for row in NOT_TYPED if not any(re.search(row, command) for command in every)] == []
+    every = [command for page in PAGES for command in find_commands(page)]
+    assert [row for row in OMITTED if not any(re.search(row, command) for command in every)] == []
     assert [row for row in VALUES if not any(row in command for command in every)] == []
-    assert [row for row, _ in SHORTER if not any(re.search(row, command) for command in every)] == []
+    assert [row for row, _ in SHORTENED if not any(re.search(row, command) for command in every)] == []
 
 
 @pytest.mark.manual
-@pytest.mark.parametrize("page", [page for page in PAGES if page not in WALKED and any(map(is_typed, commands(page)))])
-def test_a_page_s_commands_do_what_they_say(page: str, at_desk: Desk, flown: Path) -> None:
-    shutil.copytree(flown, at_desk.folder, dirs_exist_ok=True)
-    for command in filter(is_typed, commands(page)):
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if page not in PAGES_WITH_OWN_TEST and any(map(is_run, find_commands(page)))]
+)
+def test_the_commands_of_a_page_succeed(page: str, shell: ManualShell, flown: Path) -> None:
+    shutil.copytree(flown, shell.folder, dirs_exist_ok=True)
+    for command in filter(is_run, find_commands(page)):
         if re.match(r"uavctl init ", command):
-            (at_desk.folder / "my-room.toml").unlink()
+            (shell.folder / "my-room.toml").unlink()
         if re.match(r"uavctl fly ", command):
             if page == "README.md":  # it flies what stands there
-                at_desk.until_said(at_desk.start("uavctl sim --config my-room.toml"), "system_id")
-            flight = at_desk.start(typed(command))
-            at_desk.until_good("uavctl ctl status")
-            at_desk.stop(flight)
-            assert flight.returncode == 1, at_desk.said(flight)  # nobody switched to it: nothing was flown
+                shell.wait_for_text(shell.start("uavctl sim --config my-room.toml"), "system_id")
+            flight = shell.start(shorten_command(command))
+            shell.wait_for_success("uavctl ctl status")
+            shell.stop(flight)
+            assert flight.returncode == 1, shell.read_output(flight)  # nobody switched to it: nothing was flown
         else:
-            at_desk.run(typed(command))
+            shell.run(shorten_command(command))
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if page not in TOML_OF_OTHERS and blocks(page, "toml")])
+@pytest.mark.parametrize("page", [page for page in PAGES if page not in TOML_OF_OTHERS and find_blocks(page, "toml")])
 def test_a_page_s_configurations_load(page: str) -> None:
     """Each block overrides a preset, or what `uavctl init` writes; one with a plant's matrices stands for itself."""
-    for block in blocks(page, "toml"):
-        found = keys(block)
-        overrides = [f"{table}.{key}={value.split('   #')[0]}" for table, key, value in found]
+    for block in find_blocks(page, "toml"):
+        result = parse_keys(block)
+        overrides = [f"{table}.{key}={value.split('   #')[0]}" for table, key, value in result]
         assert overrides
-        if any((table, key) == ("plant", "a") for table, key, _ in found):
+        if any((table, key) == ("plant", "a") for table, key, _ in result):
             parse(block, page)
-        elif any(table == "room" for table, _, _ in found):
+        elif any(table == "room" for table, _, _ in result):
             parse(format_room(parse_sizes("5x5x2.7"), "px4", page), page, overrides)
         else:
             load_config("room-px4", overrides)
 
 
 def test_the_page_of_fleets_shows_its_example() -> None:
-    (shown,) = blocks("docs/fleet.md", "toml")
+    (shown,) = find_blocks("docs/fleet.md", "toml")
     assert shown == (ROOT / "docs/examples/duo.toml").read_text(encoding="utf-8")
 
 
@@ -147,70 +157,72 @@ AUTOPILOTS = {"px4": "udpin://0.0.0.0:14540", "ardupilot": "tcp://127.0.0.1:5760
 
 @pytest.mark.manual
 @pytest.mark.parametrize("autopilot", AUTOPILOTS)
-def test_the_first_flight_as_the_page_says(autopilot: str, at_desk: Desk) -> None:
+def test_the_first_flight_of_the_page_succeeds(autopilot: str, shell: ManualShell) -> None:
     def on_page(section: str) -> list[str]:
-        lines = [typed(one.replace("VEHICLE", AUTOPILOTS[autopilot])) for one in commands(FIRST, section)]
-        return [line.replace("--autopilot px4", f"--autopilot {autopilot}") for line in lines if is_typed(line)]
+        lines = [
+            shorten_command(line.replace("VEHICLE", AUTOPILOTS[autopilot])) for line in find_commands(FIRST, section)
+        ]
+        return [line.replace("--autopilot px4", f"--autopilot {autopilot}") for line in lines if is_run(line)]
 
     init, design = on_page("1. ")
-    at_desk.run(init)
-    room = at_desk.folder / "my-room.toml"
+    shell.run(init)
+    room = shell.folder / "my-room.toml"
     for section in ("1. ", "2. "):
-        for block in blocks(FIRST, "toml", section):
-            room.write_text(edited(room.read_text(), block))
-        at_desk.run(design)
+        for block in find_blocks(FIRST, "toml", section):
+            room.write_text(apply_block(room.read_text(), block))
+        shell.run(design)
     (sim,) = on_page("From an empty room")
     assert ROOM_START in sim
-    vehicle = at_desk.start(sim)
-    at_desk.until_said(vehicle, "system_id")
-    own = room.read_text()
-    room.write_text(edited(own, f"[check]\naccept = {json.dumps(OF_TIME)}\n"))
+    vehicle = shell.start(sim)
+    shell.wait_for_text(vehicle, "system_id")
+    room_text = room.read_text()
+    room.write_text(apply_block(room_text, f"[check]\naccept = {json.dumps(TIMED_ITEMS)}\n"))
     (check,) = on_page("6. ")
-    assert "check: ready" in at_desk.run(check)
+    assert "check: ready" in shell.run(check)
     (dry,) = on_page("7. ")
-    at_desk.run(dry, code=1)  # nothing was flown
-    at_desk.stop(vehicle)
-    at_desk.until_said(at_desk.start(f"{sim} {PATIENT}"), "system_id")
-    room.write_text(edited(own, f"[check]\naccept = {json.dumps(OF_TIME + TIMEOUTS)}\n"))
+    shell.run(dry, code=1)  # nothing was flown
+    shell.stop(vehicle)
+    shell.wait_for_text(shell.start(f"{sim} {LONG_TIMEOUT}"), "system_id")
+    room.write_text(apply_block(room_text, f"[check]\naccept = {json.dumps(TIMED_ITEMS + TIMEOUTS)}\n"))
     fly, *orders = on_page("9. ")
-    flight = at_desk.start(f"{fly} --out flights/NAME")
-    at_desk.until_good(FLIES)
+    flight = shell.start(f"{fly} --out flights/NAME")
+    shell.wait_for_success(FLIGHT_TRACKS)
     for order in orders:
-        at_desk.run(order)
+        shell.run(order)
         time.sleep(READER_S)
-    at_desk.ends(flight, fly)
+    shell.wait_for_end(flight, fly)
     for command in on_page("10. "):
         if command.startswith("uavctl fly"):
             command += " --duration 15"
-        at_desk.run(command)
+        shell.run(command)
 
 
 @pytest.mark.manual
-def test_a_fleet_flies_as_the_page_says(at_desk: Desk) -> None:
+def test_the_fleet_of_the_page_flies(shell: ManualShell) -> None:
     page = "docs/fleet.md"
-    (sim,) = commands(page, "Try it")
-    check, fly, *orders = (one for one in commands(page) if one != sim)
-    at_desk.run(check)
-    duo = at_desk.folder / "duo.toml"
-    accepted = f"check.accept={json.dumps(OF_TIME + TIMEOUTS)}"
+    (sim,) = find_commands(page, "Try it")
+    check, fly, *orders = (order for order in find_commands(page) if order != sim)
+    shell.run(check)
+    duo = shell.folder / "duo.toml"
+    accepted = f"check.accept={json.dumps(TIMED_ITEMS + TIMEOUTS)}"
     duo.write_text(duo.read_text().replace("set = [", f"set = [\n  {json.dumps(accepted)},"))
-    at_desk.until_said(at_desk.start(f"{sim} {PATIENT}"), "system_id 2")
-    flight = at_desk.start(fly)
-    at_desk.until_good(FLIES.replace("--json", "--json --vehicle 14540"))
-    at_desk.until_good(FLIES.replace("--json", "--json --vehicle 14541"))
-    status, land, one = orders
-    at_desk.run(status)
-    at_desk.until_good(one)
-    at_desk.run(land)
-    at_desk.ends(flight, fly)
+    shell.wait_for_text(shell.start(f"{sim} {LONG_TIMEOUT}"), "system_id 2")
+    flight = shell.start(fly)
+    shell.wait_for_success(FLIGHT_TRACKS.replace("--json", "--json --vehicle 14540"))
+    shell.wait_for_success(FLIGHT_TRACKS.replace("--json", "--json --vehicle 14541"))
+    status, land, wait_order = orders
+    shell.run(status)
+    shell.wait_for_success(wait_order)
+    shell.run(land)
+    shell.wait_for_end(flight, fly)
 
 
 @pytest.mark.manual
-def test_orders_do_what_the_page_says(at_desk: Desk) -> None:
-    at_desk.until_said(at_desk.start(f"uavctl sim --config room-px4 {PATIENT}"), "system_id")
-    accepted = f"--set 'check.accept={json.dumps(OF_TIME + TIMEOUTS)}'"
-    flight = at_desk.start(f"uavctl fly --config room-px4 --arm --takeoff 1.2 {accepted}")
-    at_desk.until_good(FLIES)
-    for order in filter(is_typed, commands("docs/operation.md")):
-        at_desk.run(order, code=1 if order == "uavctl ctl engage" else 0)
-    at_desk.ends(flight, "fly")
+def test_the_orders_of_the_page_succeed(shell: ManualShell) -> None:
+    shell.wait_for_text(shell.start(f"uavctl sim --config room-px4 {LONG_TIMEOUT}"), "system_id")
+    accepted = f"--set 'check.accept={json.dumps(TIMED_ITEMS + TIMEOUTS)}'"
+    flight = shell.start(f"uavctl fly --config room-px4 --arm --takeoff 1.2 {accepted}")
+    shell.wait_for_success(FLIGHT_TRACKS)
+    for order in filter(is_run, find_commands("docs/operation.md")):
+        shell.run(order, code=1 if order == "uavctl ctl engage" else 0)
+    shell.wait_for_end(flight, "fly")

@@ -15,8 +15,8 @@ from importlib.resources import files
 from itertools import groupby
 
 import pytest
-from operation_rig import Scene, ended, scene
-from patience import LIMIT_S, until
+from operation_rig import Scene, open_scene, wait_for_end
+from patience import LIMIT_S, wait_until
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import decode
 
@@ -27,13 +27,13 @@ from uavctl.records import ControlMode, Datagram, Decision, Order, StepInput
 
 @pytest.fixture
 def air() -> Iterator[Scene]:
-    with scene() as found:
-        yield found
+    with open_scene() as result:
+        yield result
 
 
 def wait_for_flight(air: Scene) -> None:
     """Until the daemon tracks."""
-    until(lambda: air.ctl("status")[0] == 0 and air.status()["mode"] == "track", "the daemon tracks")
+    wait_until(lambda: air.ctl("status")[0] == 0 and air.status()["mode"] == "track", "the daemon tracks")
 
 
 def decisions(air: Scene, out: str = "f") -> list[Decision]:
@@ -44,28 +44,30 @@ def decisions(air: Scene, out: str = "f") -> list[Decision]:
 @pytest.mark.fault(35)
 def test_orders_are_answered_with_the_decision_and_a_second_daemon_is_refused(air: Scene) -> None:
     assert air.ctl("status")[0] == 1 and "start one with `uavctl fly`" in air.ctl("status")[2]
-    with ended(air.fly("f")) as process:
+    with wait_for_end(air.fly("f")) as process:
         wait_for_flight(air)
 
-        with ended(air.fly("second")) as second:
-            _, told = second.communicate(timeout=LIMIT_S)
-        assert second.returncode == 1 and f"process {process.pid} flies this vehicle already" in told
+        with wait_for_end(air.fly("second")) as second:
+            _, errors = second.communicate(timeout=LIMIT_S)
+        assert second.returncode == 1 and f"process {process.pid} flies this vehicle already" in errors
         assert not list((air.folder / "second").glob("*"))
 
-        code, _, told = air.ctl("goto", "-1,0.5,-1.4")
-        assert code == 0 and told.startswith("goto accepted")
-        code, told, _ = air.ctl("goto", "9,0,-1", "--json")
-        assert code == 1 and "north 9 m is outside" in json.loads(told)["text"]
+        code, _, errors = air.ctl("goto", "-1,0.5,-1.4")
+        assert code == 0 and errors.startswith("goto accepted")
+        code, errors, _ = air.ctl("goto", "9,0,-1", "--json")
+        assert code == 1 and "north 9 m is outside" in json.loads(errors)["text"]
         assert air.ctl("goto", "1,2")[0] == 2 and air.ctl("goto", "nan,0,-1")[0] == 2
-        code, _, told = air.ctl("hold", "--vehicle", "another")
-        assert code == 1 and "no daemon named like 'another'" in told
+        code, _, errors = air.ctl("hold", "--vehicle", "another")
+        assert code == 1 and "no daemon named like 'another'" in errors
         name = air.status()["name"]
         # obeyed at the next boundary that has news: which one, the lossy link decides
-        until(lambda: air.status()["target_m"] == {"north": -1.0, "east": 0.5, "down": -1.4}, "the order is obeyed")
+        wait_until(
+            lambda: air.status()["target_m"] == {"north": -1.0, "east": 0.5, "down": -1.4}, "the order is obeyed"
+        )
         assert air.status()["recorder"]["ok"]
-        until(lambda: (air.status()["vehicle"] or {}).get("armed", False), "a vehicle in flight is shown")
+        wait_until(lambda: (air.status()["vehicle"] or {}).get("armed", False), "a vehicle in flight is shown")
         assert air.ctl("land", "--vehicle", name)[0] == 0
-        until(lambda: air.has_landed, "the vehicle lands")
+        wait_until(lambda: air.has_landed, "the vehicle lands")
         process.communicate(timeout=LIMIT_S)
     ordered = [c.order for i in records(air.folder / "f" / "flight.mcap", StepInput) for c in i.commands]
     assert ordered == [Order.GOTO, Order.LAND]  # what was refused at the socket never reached a tick
@@ -75,39 +77,41 @@ def test_orders_are_answered_with_the_decision_and_a_second_daemon_is_refused(ai
 @pytest.mark.slow
 @pytest.mark.fault(31)
 def test_after_sigkill_nothing_is_sent_and_the_vehicle_s_own_failsafe_acts(air: Scene) -> None:
-    with ended(air.fly("f")) as process:
+    with wait_for_end(air.fly("f")) as process:
         wait_for_flight(air)
         # What is on the disk once stays there: the last second at most may be lost.
-        until(lambda: ControlMode.TRACK in [one.mode for one in decisions(air)], "the flight is on the disk")
+        wait_until(
+            lambda: ControlMode.TRACK in [decision.mode for decision in decisions(air)], "the flight is on the disk"
+        )
         kept = len(decisions(air))
         assert air.mode == "OFFBOARD"
         process.send_signal(signal.SIGKILL)
         process.wait(LIMIT_S)
-    spoken = air.tap.spoken_by_now()
+    spoken = air.tap.read_frames()
     air.tap.set_parameter("COM_OF_LOSS_T", 1.0)  # PX4's own value
-    until(lambda: air.mode != "OFFBOARD", "the failsafe")
+    wait_until(lambda: air.mode != "OFFBOARD", "the failsafe")
     air.tap.set_parameter("COM_OF_LOSS_T", 600.0)
-    until(lambda: max(map(abs, air.truths[-1].velocity_mps)) < 0.3, "the failsafe brings it to rest")
-    air.wait_on_board(3.0)
-    assert air.tap.spoken_by_now() == spoken
+    wait_until(lambda: max(map(abs, air.truths[-1].velocity_mps)) < 0.3, "the failsafe brings it to rest")
+    air.wait_for_flight(3.0)
+    assert air.tap.read_frames() == spoken
     assert len(decisions(air)) >= kept
-    with ended(air.fly("again")) as process:  # lock and socket of the dead one do not stand in the way
-        until(lambda: air.ctl("status")[0] == 0, "the next daemon answers")
-        until(lambda: air.status()["age_s"] is not None and bool(air.status()["vehicle"]), "it hears all it needs")
-        air.wait_on_board(1.0)
+    with wait_for_end(air.fly("again")) as process:  # lock and socket of the dead one do not stand in the way
+        wait_until(lambda: air.ctl("status")[0] == 0, "the next daemon answers")
+        wait_until(lambda: air.status()["age_s"] is not None and bool(air.status()["vehicle"]), "it hears all it needs")
+        air.wait_for_flight(1.0)
         assert air.mode != "OFFBOARD"  # to which PX4 would return by itself if setpoints came again
         assert air.ctl("engage")[0] == 0
         wait_for_flight(air)
         process.send_signal(signal.SIGINT)
-        _, told = process.communicate(timeout=LIMIT_S)
-    assert "left the vehicle in flight" in told and "uavctl ctl engage" in told
+        _, errors = process.communicate(timeout=LIMIT_S)
+    assert "left the vehicle in flight" in errors and "uavctl ctl engage" in errors
     orders = [c.order for i in records(air.folder / "again" / "flight.mcap", StepInput) for c in i.commands]
     assert orders == [Order.STAND_BY, Order.ENGAGE]
     sent = [
         message.get_type()
-        for one in records(air.folder / "again" / "flight.mcap", Datagram)
-        if one.outgoing
-        for message in decode(one.data)
+        for datagram in records(air.folder / "again" / "flight.mcap", Datagram)
+        if datagram.outgoing
+        for message in decode(datagram.data)
         if message.get_type() == "SET_POSITION_TARGET_LOCAL_NED"
         or getattr(message, "command", 0) == mavlink.MAV_CMD_DO_SET_MODE
     ]
@@ -117,10 +121,12 @@ def test_after_sigkill_nothing_is_sent_and_the_vehicle_s_own_failsafe_acts(air: 
 @pytest.mark.slow
 @pytest.mark.fault(34)
 def test_sigterm_brakes_hands_over_and_closes_the_recording(air: Scene) -> None:
-    with ended(air.fly("f")) as process:
+    with wait_for_end(air.fly("f")) as process:
         wait_for_flight(air)
         assert air.ctl("goto", "-1,0.5,-1.4")[0] == 0  # wherever it is by now
-        until(lambda: max(map(abs, air.truths[-1].velocity_mps)) > 0.3, "it moves, so that there is something to brake")
+        wait_until(
+            lambda: max(map(abs, air.truths[-1].velocity_mps)) > 0.3, "it moves, so that there is something to brake"
+        )
         process.send_signal(signal.SIGTERM)
         summary, _ = process.communicate(timeout=LIMIT_S)
     assert process.returncode == 0 and json.loads(summary)["recording"].endswith("flight.mcap")
@@ -129,29 +135,29 @@ def test_sigterm_brakes_hands_over_and_closes_the_recording(air: Scene) -> None:
     last = len(modes) - modes[::-1].index(ControlMode.TRACK)
     assert modes[last:][:3] == [ControlMode.BRAKE, ControlMode.HOLD, ControlMode.LAND]
     assert (air.folder / "f" / "flight.mcap").read_bytes().endswith(b"\x89MCAP0\r\n")
-    until(lambda: air.has_landed, "the vehicle lands")
-    spoken = air.tap.spoken_by_now()
-    air.wait_on_board(1.0)
-    assert air.tap.spoken_by_now() == spoken
+    wait_until(lambda: air.has_landed, "the vehicle lands")
+    spoken = air.tap.read_frames()
+    air.wait_for_flight(1.0)
+    assert air.tap.read_frames() == spoken
 
 
 @pytest.mark.slow
-def test_the_service_manager_hears_of_the_flight_and_nothing_of_a_hanging_loop(air: Scene) -> None:
+def test_the_service_manager_gets_the_status_and_no_watchdog_of_a_hanging_loop(air: Scene) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(air.folder / "notify"))
         manager.settimeout(LIMIT_S)
         environ = {**os.environ, "NOTIFY_SOCKET": str(air.folder / "notify"), "WATCHDOG_USEC": "400000"}
-        heard: list[str] = []
+        received: list[str] = []
 
         def hear(enough: Callable[[], bool]) -> None:
             def heard_enough() -> bool:
-                heard.append(manager.recv(4096).decode())
+                received.append(manager.recv(4096).decode())
                 return enough()
 
-            until(heard_enough, "what the manager is to be told", pause_s=0.0)
+            wait_until(heard_enough, "what the manager is to be told", pause_s=0.0)
 
-        with ended(air.fly("f", environ=environ)) as process:
-            hear(lambda: heard.count("WATCHDOG=1") > 10 and any("OFFBOARD armed" in one for one in heard))
+        with wait_for_end(air.fly("f", environ=environ)) as process:
+            hear(lambda: received.count("WATCHDOG=1") > 10 and any("OFFBOARD armed" in text for text in received))
             process.send_signal(signal.SIGSTOP)
             manager.settimeout(1.0)
             with pytest.raises(TimeoutError):
@@ -164,34 +170,36 @@ def test_the_service_manager_hears_of_the_flight_and_nothing_of_a_hanging_loop(a
             process.send_signal(signal.SIGCONT)
             manager.settimeout(LIMIT_S)
             process.send_signal(signal.SIGINT)
-            hear(lambda: heard[-1] == "STOPPING=1")
-            _, told = process.communicate(timeout=LIMIT_S)
-    assert heard[0] == "READY=1"
-    lines = [line.removeprefix("STATUS=") for line in heard if line.startswith("STATUS=")]
-    assert lines[0] in told  # the health line of a daemon without a terminal
+            hear(lambda: received[-1] == "STOPPING=1")
+            _, errors = process.communicate(timeout=LIMIT_S)
+    assert received[0] == "READY=1"
+    lines = [line.removeprefix("STATUS=") for line in received if line.startswith("STATUS=")]
+    assert lines[0] in errors  # the health line of a daemon without a terminal
 
 
 @pytest.mark.slow
 @pytest.mark.fault(55)
-def test_a_recording_that_is_deleted_while_flying_is_told_at_once_and_in_the_end(air: Scene) -> None:
+def test_a_recording_that_is_deleted_while_flying_is_reported_at_once_and_in_the_end(air: Scene) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(air.folder / "notify"))
         manager.settimeout(LIMIT_S)
-        with ended(air.fly("f", environ={**os.environ, "NOTIFY_SOCKET": str(air.folder / "notify")})) as process:
+        with wait_for_end(air.fly("f", environ={**os.environ, "NOTIFY_SOCKET": str(air.folder / "notify")})) as process:
             wait_for_flight(air)
             assert air.status()["recorder"]["ok"]
             shutil.rmtree(air.folder / "f")
-            until(lambda: not air.status()["recorder"]["ok"], "the loss is seen")
-            found = air.status()["recorder"]
-            assert found["dropped"] > 0 and found["reason"].startswith("flight.mcap deleted")
+            wait_until(lambda: not air.status()["recorder"]["ok"], "the loss is seen")
+            result = air.status()["recorder"]
+            assert result["dropped"] > 0 and result["reason"].startswith("flight.mcap deleted")
             assert "in trouble, " in air.ctl("status")[1]
-            until(lambda: b"flight.mcap deleted" in manager.recv(4096), "the service manager hears of it", pause_s=0.0)
+            wait_until(
+                lambda: b"flight.mcap deleted" in manager.recv(4096), "the service manager hears of it", pause_s=0.0
+            )
             process.send_signal(signal.SIGINT)
-            _, told = process.communicate(timeout=LIMIT_S)
+            _, errors = process.communicate(timeout=LIMIT_S)
     assert process.returncode == 1
-    why = found["reason"]
-    assert f"warning: recording in trouble: {why}" in told  # as it happened
-    assert f"({why})" in told and "Traceback" not in told  # at the end
+    why = result["reason"]
+    assert f"warning: recording in trouble: {why}" in errors  # as it happened
+    assert f"({why})" in errors and "Traceback" not in errors  # at the end
     rest = list(records(air.folder / "f" / "flight-2.mcap", Decision))
     assert rest[-1].mode is not ControlMode.TRACK and rest[0].tick > 0  # up to its end it goes on in a new folder
 
@@ -212,38 +220,38 @@ os.{call} = hanging
 @pytest.mark.slow
 @pytest.mark.parametrize("call", ["write", "fsync"])
 @pytest.mark.fault(54)
-def test_a_disk_that_hangs_while_flying_is_told_and_the_flight_goes_on(air: Scene, call: str) -> None:
+def test_a_disk_that_hangs_while_flying_is_reported_and_the_flight_goes_on(air: Scene, call: str) -> None:
     flag = air.folder / "hangs"
     (air.folder / "sitecustomize.py").write_text(HANGING.format(call=call, flag=str(flag)))
-    with ended(air.fly("f", environ={**os.environ, "PYTHONPATH": str(air.folder)})) as process:
+    with wait_for_end(air.fly("f", environ={**os.environ, "PYTHONPATH": str(air.folder)})) as process:
         wait_for_flight(air)
         flag.touch()
-        until(lambda: not air.status()["recorder"]["ok"], "the disk's hanging is seen")
-        found = air.status()
-        assert found["mode"] == "track" and found["recorder"]["dropped"] == 0
-        assert f"last written {found['recorder']['unwritten_s']:.1f} s ago" in found["recorder"]["reason"]
+        wait_until(lambda: not air.status()["recorder"]["ok"], "the disk's hanging is seen")
+        result = air.status()
+        assert result["mode"] == "track" and result["recorder"]["dropped"] == 0
+        assert f"last written {result['recorder']['unwritten_s']:.1f} s ago" in result["recorder"]["reason"]
         flag.unlink()
-        until(lambda: bool(air.status()["recorder"]["ok"]), "all is written")
+        wait_until(lambda: bool(air.status()["recorder"]["ok"]), "all is written")
         flag.touch()
         process.send_signal(signal.SIGINT)
-        _, told = process.communicate(timeout=LIMIT_S)
-    assert process.returncode == 1 and "Traceback" not in told
-    assert re.search(r"records \(.* last written \d+\.\d s ago", told.replace("\n", " "))
+        _, errors = process.communicate(timeout=LIMIT_S)
+    assert process.returncode == 1 and "Traceback" not in errors
+    assert re.search(r"records \(.* last written \d+\.\d s ago", errors.replace("\n", " "))
 
 
 @pytest.mark.slow
-def test_several_daemons_are_told_apart_by_name(air: Scene) -> None:
-    with scene("sim.seed=3") as other:
-        other.control = air.control
-        with ended(air.fly("f")) as one, ended(other.fly("f")) as two:
-            until(lambda: len([*air.control.iterdir()] if air.control.exists() else []) == 2, "both listen")
-            until(lambda: "several daemons run" in air.ctl("status")[2], "both answer")
+def test_several_daemons_are_distinguished_by_name(air: Scene) -> None:
+    with open_scene("sim.seed=3") as second:
+        second.control = air.control
+        with wait_for_end(air.fly("f")) as first, wait_for_end(second.fly("f")) as two:
+            wait_until(lambda: len([*air.control.iterdir()] if air.control.exists() else []) == 2, "both listen")
+            wait_until(lambda: "several daemons run" in air.ctl("status")[2], "both answer")
             names = [path.stem for path in air.control.iterdir()]
             pids = set()
             for name in names:
-                until(lambda name=name: air.ctl("status", "--vehicle", name)[0] == 0, name)  # type: ignore[misc]
+                wait_until(lambda name=name: air.ctl("status", "--vehicle", name)[0] == 0, name)  # type: ignore[misc]
                 pids.add(json.loads(air.ctl("status", "--vehicle", name, "--json")[1])["pid"])
-            assert pids == {one.pid, two.pid}
+            assert pids == {first.pid, two.pid}
 
 
 def test_a_unit_of_systemd_s_comes_with_the_package() -> None:

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 from msgspec.structs import replace
-from soak_pairs import SPEED_MPS, WORLDS, beyond_m
-from soak_rig import Watch, fly
+from soak_pairs import SPEED_MPS, WORLDS, compute_outside_m
+from soak_rig import LoopWatch, fly
 
 from sim.simulation import World
-from uavctl.build.controller import Prepared, design_of, prepare
+from uavctl.build.controller import Prepared, build_flight_design, prepare
 from uavctl.cause import Cause
 from uavctl.cli.app import run
 from uavctl.config import Config, load_config
@@ -30,7 +30,7 @@ TRUE_WORLDS = pytest.mark.parametrize(("plant", "autopilot"), [world for world i
 @pytest.fixture(scope="module")
 def ready() -> Callable[[str], Prepared]:
     """Makes preset `room` with a controller of the module; the design is made once."""
-    design = design_of(load_config("room"))
+    design = build_flight_design(load_config("room"))
 
     def make(name: str) -> Prepared:
         return prepare(load_config("room", [f"smpc.controller={MODULE}:{name}"]), design)
@@ -53,32 +53,32 @@ class Seen:
 def flown(prepared: Prepared, plant: str, autopilot: str, took_ns: int = 0, path: Path | None = None) -> Seen:
     """Fly from the air, until it has landed if it has to; `took_ns`: time of plans after two seconds."""
     config = in_world(prepared.config, plant, autopilot)
-    seen = Seen()
+    observed = Seen()
 
-    def look(world: World, watch: Watch, at_ns: int) -> None:
-        seen.place_m = world.peers.vehicle.position_m
-        seen.outside_m = max(seen.outside_m, beyond_m(config, seen.place_m))
-        seen.speed_mps = max(seen.speed_mps, math.hypot(*world.peers.vehicle.velocity_mps))
+    def look(world: World, watch: LoopWatch, at_ns: int) -> None:
+        observed.place_m = world.peers.vehicle.position_m
+        observed.outside_m = max(observed.outside_m, compute_outside_m(config, observed.place_m))
+        observed.speed_mps = max(observed.speed_mps, math.hypot(*world.peers.vehicle.velocity_mps))
         assert watch.ticked is not None
-        seen.modes.add(watch.ticked.decision.mode)
-        seen.ending = watch.loop.ending
+        observed.modes.add(watch.ticked.decision.mode)
+        observed.ending = watch.loop.ending
         if took_ns and at_ns > 2_000_000_000 and watch.ticked.decision.solve is not None:
             watch.loop.answered(took_ns)
 
-    seen.wrong = tuple(fly(prepared, config, look, path=path, lands=True).wrong)
-    return seen
+    observed.wrong = tuple(fly(prepared, config, look, path=path, lands=True).wrong)
+    return observed
 
 
 def in_world(config: Config, plant: str, autopilot: str) -> Config:
     return replace(config, duration_s=WAY_S, sim=replace(config.sim, plant=plant, autopilot=autopilot, seed=3))
 
 
-def assert_let_go(seen: Seen, words: str) -> None:
+def assert_let_go(observed: Seen, arguments: str) -> None:
     """It never left the room, was never fast, and the end says why."""
-    assert seen.wrong == () and seen.outside_m <= 0.0 and seen.speed_mps <= SPEED_MPS
-    assert seen.ending is not None and seen.ending.exit_code == 1 and not seen.ending.as_ordered
-    assert seen.ending.code == Cause.FALLBACK_LANDED and words in seen.ending.sentence
-    assert ControlMode.BRAKE in seen.modes
+    assert observed.wrong == () and observed.outside_m <= 0.0 and observed.speed_mps <= SPEED_MPS
+    assert observed.ending is not None and observed.ending.exit_code == 1 and not observed.ending.as_ordered
+    assert observed.ending.code == Cause.FALLBACK_LANDED and arguments in observed.ending.sentence
+    assert ControlMode.BRAKE in observed.modes
 
 
 def replays(path: Path, capsys: pytest.CaptureFixture[str]) -> bool:
@@ -109,9 +109,11 @@ def test_what_one_prints_is_no_part_of_the_document(tmp_path: Path, capsys: pyte
 @pytest.mark.parametrize(("plant", "autopilot"), WORLDS)
 def test_a_good_one_flies_to_the_target(ready: Callable[[str], Prepared], plant: str, autopilot: str) -> None:
     prepared = ready("Regulates")
-    seen = flown(prepared, plant, autopilot)
-    assert seen.wrong == () and seen.outside_m <= 0.0 and seen.modes <= {ControlMode.WAIT, ControlMode.TRACK}
-    assert math.dist(seen.place_m, prepared.config.target.position_m) < 0.15
+    observed = flown(prepared, plant, autopilot)
+    assert (
+        observed.wrong == () and observed.outside_m <= 0.0 and observed.modes <= {ControlMode.WAIT, ControlMode.TRACK}
+    )
+    assert math.dist(observed.place_m, prepared.config.target.position_m) < 0.15
 
 
 @pytest.mark.fault(69)
@@ -121,9 +123,9 @@ def test_a_good_one_flies_to_the_target(ready: Callable[[str], Prepared], plant:
 def test_one_that_fails_never_leaves_the_room(
     ready: Callable[[str], Prepared], name: str, plant: str, autopilot: str
 ) -> None:
-    told = {"NotFinite": "not finite", "WrongShape": "shape", "Leaves": "raised SystemExit: 0"}
-    words = told.get(name, "raised ZeroDivisionError: no gain")
-    assert_let_go(flown(ready(name), plant, autopilot), words)
+    reasons = {"NotFinite": "not finite", "WrongShape": "shape", "Leaves": "raised SystemExit: 0"}
+    arguments = reasons.get(name, "raised ZeroDivisionError: no gain")
+    assert_let_go(flown(ready(name), plant, autopilot), arguments)
 
 
 @pytest.mark.fault(69)
@@ -148,12 +150,12 @@ def test_one_that_is_late_never_leaves_the_room_and_replays(
 def test_one_that_flies_at_a_wall_is_braked_while_it_can_be(
     ready: Callable[[str], Prepared], plant: str, autopilot: str
 ) -> None:
-    seen = flown(ready("Beyond"), plant, autopilot)
-    assert seen.wrong == () and seen.outside_m <= 0.3 and seen.speed_mps <= SPEED_MPS
+    observed = flown(ready("Beyond"), plant, autopilot)
+    assert observed.wrong == () and observed.outside_m <= 0.3 and observed.speed_mps <= SPEED_MPS
     # The envelope may have its say while it brakes.
     assert (
-        seen.ending is not None
-        and seen.ending.code in (Cause.FALLBACK_LANDED, Cause.LET_GO)
-        and seen.ending.exit_code == 1
+        observed.ending is not None
+        and observed.ending.code in (Cause.FALLBACK_LANDED, Cause.LET_GO)
+        and observed.ending.exit_code == 1
     )
-    assert ControlMode.BRAKE in seen.modes and ControlMode.HOLD in seen.modes
+    assert ControlMode.BRAKE in observed.modes and ControlMode.HOLD in observed.modes

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from take_off_rig import RELAYED, SECOND, Flight
+from take_off_rig import RELAYED, SECOND, TakeOffRig
 
 from uavctl.cause import Cause
 from uavctl.mavlink.handover_states import HandoverState
@@ -21,14 +21,14 @@ FENCES = {
 }
 
 
-def flying(autopilot: str, *more: str, **parameters: float) -> Flight:
-    flight = Flight(autopilot, *RELAYED, *more).relayed()
+def flying(autopilot: str, *more: str, **parameters: float) -> TakeOffRig:
+    flight = TakeOffRig(autopilot, *RELAYED, *more).relayed()
     for name, value in parameters.items():
         assert flight.peers.autopilot.parameters.set(name, value)
     return flight.take_off().run(40.0, until=HandoverState.ENGAGED)
 
 
-def until_it_is_down(flight: Flight, seconds: float) -> None:
+def until_it_is_down(flight: TakeOffRig, seconds: float) -> None:
     """The vehicle ends on the ground, disarmed, and the flight is over."""
     flight.run(seconds, until=HandoverState.DONE)
     assert flight.loop.finished
@@ -58,7 +58,7 @@ def test_the_vehicle_s_own_fence_ends_the_flight_on_the_ground(autopilot: str, m
 @pytest.mark.parametrize("dark_s", [6.0, 15.0])
 def test_px4_s_blind_descent_is_a_failsafe_and_positions_go_on_as_soon_as_they_are_back(dark_s: float) -> None:
     from_s, height_m = 30.0, 2.4
-    flight = Flight("px4", *RELAYED, f"link.blackout=[[{from_s}, {from_s + dark_s}]]", GOAL).relayed()
+    flight = TakeOffRig("px4", *RELAYED, f"link.blackout=[[{from_s}, {from_s + dark_s}]]", GOAL).relayed()
     flight.peers.autopilot.parameters.set("MIS_TAKEOFF_ALT", height_m)
     flight.take_off(height_m).run(from_s - 1.0, until=HandoverState.ENGAGED)
     descent: list[int] = []
@@ -75,6 +75,6 @@ def test_px4_s_blind_descent_is_a_failsafe_and_positions_go_on_as_soon_as_they_a
     poses = [at_ns for at_ns, _ in flight.sent("VISION_POSITION_ESTIMATE") if at_ns > back_ns]
     if descent[-1] > back_ns + SECOND:  # it is still in its failsafe then
         assert flight.loop.ending.code == Cause.FAILSAFE_LANDED
-        assert poses[0] - back_ns < SECOND and len([one for one in poses if one < descent[-1]]) > 20
+        assert poses[0] - back_ns < SECOND and len([pose for pose in poses if pose < descent[-1]]) > 20
     else:
         assert dark_s > 10.0

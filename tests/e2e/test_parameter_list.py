@@ -7,21 +7,21 @@ import random
 import pytest
 from loopback_rig import make_loop
 from sim_rig import decode
-from take_off_rig import Flight
+from take_off_rig import TakeOffRig
 
 from logs.recording.parameters import ParameterReader, count_parameters
 from logs.recording.replay import replay
 from sim.autopilot.parameters import TABLES
+from uavctl.arrays import SECOND_NS
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.mavlink.messages import ParamValue
 from uavctl.mavlink.stream_requests import MAX_READ_ROUNDS, MAX_TRIES, READS_PER_BATCH, ParameterDownload
 from uavctl.records import Datagram
 
-SECOND = 1_000_000_000
 BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 
 
-def read(flight: Flight) -> ParameterReader:
+def read(flight: TakeOffRig) -> ParameterReader:
     reader = ParameterReader()
     for datagram in flight.memory.of(Datagram):
         reader.take(datagram)
@@ -38,13 +38,13 @@ def value(index: int, count: int) -> ParamValue:
 
 @BOTH
 def test_a_lossy_link_loses_none(autopilot: str) -> None:
-    flight, dice = Flight(autopilot), random.Random(4)
+    flight, dice = TakeOffRig(autopilot), random.Random(4)
     flight.hears = lambda data: not asks(data) or dice.random() > 0.3
     flight.told = lambda data: not asks(data) or dice.random() > 0.3
     flight.run(15.0)
-    found = read(flight)
-    assert TABLES[autopilot].keys() <= found.parameters().keys()
-    assert found.count == count_parameters(found.parameters()) == len(TABLES[autopilot])
+    result = read(flight)
+    assert TABLES[autopilot].keys() <= result.parameters().keys()
+    assert result.count == count_parameters(result.parameters()) == len(TABLES[autopilot])
     assert flight.sent("PARAM_REQUEST_READ")  # some were lost
     before = len(flight.sent("PARAM_REQUEST_LIST")), len(flight.sent("PARAM_REQUEST_READ"))
     flight.run(5.0)
@@ -53,7 +53,7 @@ def test_a_lossy_link_loses_none(autopilot: str) -> None:
 
 
 def test_a_vehicle_that_never_answers_is_asked_a_few_times() -> None:
-    flight = Flight("px4")
+    flight = TakeOffRig("px4")
     flight.hears = lambda data: not asks(data)
     flight.run(15.0)
     assert len(flight.sent("PARAM_REQUEST_LIST")) == MAX_TRIES and not flight.sent("PARAM_REQUEST_READ")
@@ -61,7 +61,7 @@ def test_a_vehicle_that_never_answers_is_asked_a_few_times() -> None:
 
 @BOTH
 def test_nothing_is_asked_once_it_is_armed(autopilot: str) -> None:
-    flight = Flight(autopilot)
+    flight = TakeOffRig(autopilot)
     flight.told = lambda data: not asks(data)
     flight.take_off().run(10.0, until=HandoverState.CLIMBING)
     armed_ns = flight.now_ns
@@ -73,7 +73,7 @@ def test_nothing_is_asked_once_it_is_armed(autopilot: str) -> None:
 
 
 def test_it_can_be_left_out() -> None:
-    flight = Flight("px4", "daemon.parameters=false").run(3.0)
+    flight = TakeOffRig("px4", "daemon.parameters=false").run(3.0)
     assert not flight.sent("PARAM_REQUEST_LIST")
 
 
@@ -81,11 +81,11 @@ def test_the_lost_ones_are_asked_for_at_a_bounded_rate_and_not_for_ever() -> Non
     asking, asked = ParameterDownload(), []
     assert asking.due(0, armed=False) == (-1,)
     asking.handle_message(value(0, 1001))  # and of the others none comes, ever
-    for at_ns in range(0, 400 * SECOND, SECOND // 20):
+    for at_ns in range(0, 400 * SECOND_NS, SECOND_NS // 20):
         asked += [(at_ns, index) for index in asking.due(at_ns, armed=False)]
     assert sorted(index for _, index in asked) == sorted(MAX_READ_ROUNDS * [*range(1, 1001)])
-    for begin in range(0, 200 * SECOND, SECOND):
-        assert sum(begin <= at < begin + SECOND for at, _ in asked) <= 5 * READS_PER_BATCH
+    for begin in range(0, 200 * SECOND_NS, SECOND_NS):
+        assert sum(begin <= at < begin + SECOND_NS for at, _ in asked) <= 5 * READS_PER_BATCH
 
 
 def test_the_list_is_waited_for_while_it_comes_and_armed_ends_it_for_good() -> None:
@@ -93,10 +93,10 @@ def test_the_list_is_waited_for_while_it_comes_and_armed_ends_it_for_good() -> N
     assert asking.due(0, armed=False) == (-1,)
     for index in range(0, 40, 2):
         asking.handle_message(value(index, 41))
-        assert asking.due((index + 1) * SECOND // 10, armed=False) == ()
-    assert asking.due(5 * SECOND, armed=False) == tuple(range(1, 20, 2))
-    assert asking.due(6 * SECOND, armed=True) == ()
-    assert asking.due(7 * SECOND, armed=False) == ()
+        assert asking.due((index + 1) * SECOND_NS // 10, armed=False) == ()
+    assert asking.due(5 * SECOND_NS, armed=False) == tuple(range(1, 20, 2))
+    assert asking.due(6 * SECOND_NS, armed=True) == ()
+    assert asking.due(7 * SECOND_NS, armed=False) == ()
 
 
 def test_what_is_no_place_in_a_list_counts_for_nothing() -> None:

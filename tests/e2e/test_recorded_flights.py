@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from loopback_rig import Memory
+from loopback_rig import MemorySink
 from numpy.typing import NDArray
 from recorded_rig import (
     AT_REST,
@@ -19,19 +19,19 @@ from recorded_rig import (
     OF_OTHERS,
     OWN_ESTIMATE,
     RELAYED,
-    Listened,
-    checked,
-    config_of,
+    LoopRecord,
     events,
-    listened,
+    find_event_times_s,
+    listen,
+    load_flight_config,
+    make_page_data,
     packets,
-    page_of,
-    seen_s,
+    run_check,
     statuses,
     truth,
-    watched,
+    watch_records,
 )
-from report_rig import words_of
+from report_rig import read_page_text
 
 from uavctl.config import load_config
 from uavctl.lab.identify.fit import choose_dead_time
@@ -48,12 +48,12 @@ GPS_TRUTH = "arducopter-gps"
 
 def words(name: str) -> list[str]:
     """What the vehicle was seen to be, as it changed."""
-    seen: list[str] = []
+    observed: list[str] = []
     for _, status in statuses(name):
-        one = f"{status.mode}{'' if status.armed else ', disarmed'}{', failsafe' if status.failsafe else ''}"
-        if not seen or seen[-1] != one:
-            seen.append(one)
-    return seen
+        text = f"{status.mode}{'' if status.armed else ', disarmed'}{', failsafe' if status.failsafe else ''}"
+        if not observed or observed[-1] != text:
+            observed.append(text)
+    return observed
 
 
 # --- the vehicle's own words -------------------------------------------------------------------------------------
@@ -61,7 +61,7 @@ def words(name: str) -> list[str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", EVERY)
-def test_no_recorded_vehicle_is_taken_for_one_that_has_started_anew(name: str) -> None:
+def test_no_recorded_vehicle_counts_as_restarted(name: str) -> None:
     assert len(packets(name)) > 1000
     assert {status.boots for _, status in statuses(name)} == {0}
 
@@ -89,15 +89,15 @@ def test_no_recorded_vehicle_is_taken_for_one_that_has_started_anew(name: str) -
         ),
     ],
 )
-def test_modes_and_failsafes_are_seen_as_they_were(name: str, flown: list[str]) -> None:
+def test_modes_and_failsafes_are_parsed_as_recorded(name: str, flown: list[str]) -> None:
     assert words(name) == flown
 
 
-def test_a_recorded_failsafe_that_holds_is_told_from_a_pilot_who_holds() -> None:
-    seen = words(OFFBOARD)
+def test_a_recorded_failsafe_that_holds_is_distinguished_from_a_pilot_who_holds() -> None:
+    observed = words(OFFBOARD)
     # Its text comes before the heartbeat with the new mode.
     flown = ["AUTO.TAKEOFF", "AUTO.LOITER", "OFFBOARD", "OFFBOARD, failsafe", "AUTO.LOITER, failsafe"]
-    assert seen[2:7] == flown and "OFFBOARD" in seen[7:]
+    assert observed[2:7] == flown and "OFFBOARD" in observed[7:]
 
 
 # --- clocks ------------------------------------------------------------------------------------------------------
@@ -107,18 +107,18 @@ def test_a_recorded_failsafe_that_holds_is_told_from_a_pilot_who_holds() -> None
 def test_the_client_s_exchange_foretells_the_vehicle_s_clock_until_the_next_answer(name: str) -> None:
     """To half of the longest round trip that counts; simulated clocks run up to 3.4 % slow, and unevenly."""
     exchange, trips, off_ms = TimesyncExchange(), TimesyncClock(10_000_000_000), []
-    for one in packets(name):
-        for trip in exchange.take(one.data, one.at_ns, outgoing=one.outgoing):
-            foretold = trips.offset_ns(one.at_ns)
-            measured = (trip.sent_ns + one.at_ns) // 2 - trip.remote_ns
-            if trips.add_answer(trip.sent_ns, trip.remote_ns, one.at_ns) and foretold is not None:
+    for packet in packets(name):
+        for trip in exchange.take(packet.data, packet.at_ns, outgoing=packet.outgoing):
+            foretold = trips.offset_ns(packet.at_ns)
+            measured = (trip.sent_ns + packet.at_ns) // 2 - trip.remote_ns
+            if trips.add_answer(trip.sent_ns, trip.remote_ns, packet.at_ns) and foretold is not None:
                 off_ms.append(abs(measured - foretold) * 1e-6)
     assert len(off_ms) > 40
     assert np.median(off_ms) < (3.0 if name in OF_OTHERS else 5.0)
 
 
 def history(name: str) -> FlightHistory:
-    return read_tlog_history(packets(name), config_of(name))
+    return read_tlog_history(packets(name), load_flight_config(name))
 
 
 @pytest.mark.parametrize(("name", "most_ms"), [(GPS, 10.0), (OFFBOARD, 20.0)])
@@ -142,8 +142,8 @@ def test_the_cameras_delays_are_those_of_the_simulator() -> None:
 
 
 def link(name: str) -> LinkFit:
-    found = history(name)
-    return fit_link(found.positions, found.losses)
+    result = history(name)
+    return fit_link(result.positions, result.losses)
 
 
 CAMERA_HZ = 40.0
@@ -173,15 +173,15 @@ def frames(name: str) -> Frames:
     """What the rig sent and what of it came: nothing of `identify` is asked."""
     first_ns = packets(name)[0].at_ns
     arrivals_ns: dict[int, int] = {}
-    for one in packets(name):
-        if one.data[5] == 20 and one.data[7] == 102:
-            arrivals_ns.setdefault(1000 * int.from_bytes(one.data[10:18], "little"), one.at_ns)
+    for packet in packets(name):
+        if packet.data[5] == 20 and packet.data[7] == 102:
+            arrivals_ns.setdefault(1000 * int.from_bytes(packet.data[10:18], "little"), packet.at_ns)
     stamps_s = (np.array(sorted(arrivals_ns)) - first_ns) * 1e-9
     dark = np.zeros(stamps_s.size, dtype=np.bool_)
     dark_s = 0.0
-    for begin_s, words in events(name):
-        if words.startswith(BLACKOUT):
-            length_s = float(words.removeprefix(BLACKOUT))
+    for begin_s, arguments in events(name):
+        if arguments.startswith(BLACKOUT):
+            length_s = float(arguments.removeprefix(BLACKOUT))
             dark |= (stamps_s > begin_s) & (stamps_s < begin_s + length_s)
             dark_s += length_s
     # A late rig stamps late, but catches up: single spacings are off by up to half a period, the count is not.
@@ -200,45 +200,47 @@ def frames(name: str) -> Frames:
 )
 def test_the_loss_found_is_that_of_the_frames_that_are_missing(name: str, lost: float) -> None:
     """Within 0.5 % of the frames'; all but one flight met fewer bursts than make 30 %."""
-    found, true = link(name), frames(name)
+    result, true = link(name), frames(name)
     assert true.within <= 1
     assert true.lost == pytest.approx(lost, abs=0.001)
-    assert found.loss == pytest.approx(true.lost, abs=0.005)
-    assert 0.01 < found.loss_std < 0.05
-    assert found.bursts
+    assert result.loss == pytest.approx(true.lost, abs=0.005)
+    assert 0.01 < result.loss_std < 0.05
+    assert result.bursts
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", RELAYED)
 def test_the_rig_s_blackouts_rate_and_delays_are_found(name: str) -> None:
-    found, true = link(name), frames(name)
-    assert len(found.outages_s) == len(seen_s(name, BLACKOUT))
-    assert all(length_s == pytest.approx(4.0, abs=0.3) for length_s in found.outages_s)
-    assert found.rate_hz == pytest.approx(CAMERA_HZ, rel=0.01)
-    assert found.delay_s == pytest.approx(QUICKEST_S, abs=0.002)
-    assert found.delay_quantiles_s[3] == pytest.approx(SLOWEST_S - 0.05 * (SLOWEST_S - QUICKEST_S), abs=0.010)
-    assert found.delay_quantiles_s[4] == pytest.approx(float(np.quantile(true.delays_s, 0.99)), abs=0.002)
+    result, true = link(name), frames(name)
+    assert len(result.outages_s) == len(find_event_times_s(name, BLACKOUT))
+    assert all(length_s == pytest.approx(4.0, abs=0.3) for length_s in result.outages_s)
+    assert result.rate_hz == pytest.approx(CAMERA_HZ, rel=0.01)
+    assert result.delay_s == pytest.approx(QUICKEST_S, abs=0.002)
+    assert result.delay_quantiles_s[3] == pytest.approx(SLOWEST_S - 0.05 * (SLOWEST_S - QUICKEST_S), abs=0.010)
+    assert result.delay_quantiles_s[4] == pytest.approx(float(np.quantile(true.delays_s, 0.99)), abs=0.002)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", RELAYED)
-def test_all_but_a_hundredth_of_the_positions_come_as_late_as_the_rig_was_told(name: str) -> None:
+def test_all_but_a_hundredth_of_the_positions_have_the_configured_delay(name: str) -> None:
     """Of one flight only those before its wind: 3 s later, and for 43 s, 7 % of the frames came 50 to 95 ms late."""
-    until_s = seen_s(BLOWN, "ORDER set SIH_WIND")[0] if name == BLOWN else np.inf
+    until_s = find_event_times_s(BLOWN, "ORDER set SIH_WIND")[0] if name == BLOWN else np.inf
     until_ns = packets(name)[0].at_ns + until_s * 1e9
-    found = read_tlog_history([one for one in packets(name) if one.at_ns < until_ns], config_of(name))
-    late_s = fit_link(found.positions, found.losses).delay_quantiles_s[4]
+    result = read_tlog_history(
+        [packet for packet in packets(name) if packet.at_ns < until_ns], load_flight_config(name)
+    )
+    late_s = fit_link(result.positions, result.losses).delay_quantiles_s[4]
     assert late_s == pytest.approx(SLOWEST_S - 0.01 * (SLOWEST_S - QUICKEST_S), abs=0.010)
 
 
 @pytest.mark.fault(59)
-def test_the_loss_of_arducopter_s_long_flight_is_also_the_one_the_rig_was_told() -> None:
+def test_the_loss_of_arducopter_s_long_flight_is_the_configured_one() -> None:
     """On the mean of a long flight; the other four met fewer bursts, by their frames as well."""
     assert link(WIND).loss == pytest.approx(0.3, abs=0.02)
 
 
-def test_what_px4_says_of_itself_is_no_camera_s_though_there_is_more_of_it() -> None:
-    kinds = [one.data[7] | one.data[8] << 8 for one in packets(WAYPOINTS) if one.data[5] in (1, 20)]
+def test_positions_of_px4_do_not_count_as_camera_positions_though_they_are_more() -> None:
+    kinds = [packet.data[7] | packet.data[8] << 8 for packet in packets(WAYPOINTS) if packet.data[5] in (1, 20)]
     assert kinds.count(331) >= kinds.count(102)  # ODOMETRY, VISION_POSITION_ESTIMATE
     assert link(WAYPOINTS).rate_hz == pytest.approx(40.0, rel=0.01)
 
@@ -247,12 +249,12 @@ def test_what_px4_says_of_itself_is_no_camera_s_though_there_is_more_of_it() -> 
 @pytest.mark.parametrize("name", RELAYED)
 def test_positions_are_captured_where_the_vehicle_truly_was(name: str) -> None:
     """The truth is 0.1 s apart, the cameras' noise 2 mm."""
-    found, rows = history(name), truth(name)
+    result, rows = history(name), truth(name)
     first_s = _first_capture_s(name)
-    at_s = found.positions.times_s + first_s
+    at_s = result.positions.times_s + first_s
     inside = (at_s > rows[0, 0]) & (at_s < rows[-1, 0])
     off = [
-        np.interp(at_s[inside], rows[:, 0], rows[:, 1 + axis]) - found.positions.positions_m[inside, axis]
+        np.interp(at_s[inside], rows[:, 0], rows[:, 1 + axis]) - result.positions.positions_m[inside, axis]
         for axis in range(2)
     ]
     assert np.median(np.hypot(*off)) < 0.05
@@ -261,9 +263,9 @@ def test_positions_are_captured_where_the_vehicle_truly_was(name: str) -> None:
 def _first_capture_s(name: str) -> float:
     """Stamp of the first position, which is of the recorder's clock, since the first packet."""
     stamps = [
-        int.from_bytes(one.data[10:18], "little") * 1000
-        for one in packets(name)
-        if one.data[5] == 20 and one.data[7] == 102
+        int.from_bytes(packet.data[10:18], "little") * 1000
+        for packet in packets(name)
+        if packet.data[5] == 20 and packet.data[7] == 102
     ]
     return (min(stamps) - packets(name)[0].at_ns) * 1e-9
 
@@ -272,11 +274,11 @@ def _first_capture_s(name: str) -> float:
 def test_px4_s_response_is_that_of_its_own_log_though_its_clock_ran_slow() -> None:
     """By its log: dead time and lag together 0.24 and 0.32 s, drag 0.97 and 1.08 1/s, gain 0.98 and 1.10."""
     config = load_config("room-hahn-stursberg", ["daemon.mocap=tlog", "daemon.vehicle=tlog", OWN_ESTIMATE])
-    found = identify(read_tlog_history(packets(OFFBOARD), config), config, lambda: None).result
-    together_s = [found.candidates[0].dead_time_s + one.lag_s for one in found.response[:2]]
+    result = identify(read_tlog_history(packets(OFFBOARD), config), config, lambda: None).result
+    together_s = [result.candidates[0].dead_time_s + axis.lag_s for axis in result.response[:2]]
     assert together_s == pytest.approx([0.24, 0.32], abs=0.09)
-    assert [one.drag_1ps for one in found.response[:2]] == pytest.approx([0.974, 1.080], abs=0.1)
-    assert [one.r2 > 0.99 for one in found.response[:2]] == [True, True]
+    assert [axis.drag_1ps for axis in result.response[:2]] == pytest.approx([0.974, 1.080], abs=0.1)
+    assert [axis.r2 > 0.99 for axis in result.response[:2]] == [True, True]
 
 
 STEP_RAMP_S = 1.0 / 5.0  # which ArduPilot makes of a step of 1 m/s² at PSC_JERK_XY 5
@@ -292,15 +294,15 @@ def test_arducopter_s_response_to_steps_is_that_of_its_own_log() -> None:
     """
     config = load_config("room-hahn-stursberg", ["daemon.mocap=tlog", "daemon.vehicle=tlog", OWN_ESTIMATE])
     boot_ns, estimates = _own_estimates(GPS)
-    steps = read_tlog_history([one for one in packets(GPS) if one.at_ns < boot_ns + 87.4e9], config)
+    steps = read_tlog_history([packet for packet in packets(GPS) if packet.at_ns < boot_ns + 87.4e9], config)
     flown = make_fitted_stretches(steps, config)
-    found = choose_dead_time(flown, (0, 1), get_candidate_models(steps, config)[0][:2], lambda: None)
-    assert found.name == "drag-lag" and sum(one.length_s for one in flown) > 30.0
+    result = choose_dead_time(flown, (0, 1), get_candidate_models(steps, config)[0][:2], lambda: None)
+    assert result.name == "drag-lag" and sum(stretch.length_s for stretch in flown) > 30.0
     for axis, gain, drag_1ps in ((0, 1.027, 0.009), (1, 1.026, 0.011)):
-        fit = found.fits[axis]
+        fit = result.fits[axis]
         late_s = _lateness_s(estimates, axis, (55.4, 71.4) if axis == 0 else (71.4, 87.4))
         assert 0.0 < late_s < 0.06
-        as_sent_s = found.dead_time_s + fit.value("lag_s") + 0.5 * STEP_RAMP_S - late_s
+        as_sent_s = result.dead_time_s + fit.value("lag_s") + 0.5 * STEP_RAMP_S - late_s
         assert as_sent_s == pytest.approx(0.18, abs=GRID_S)
         assert fit.value("gain") == pytest.approx(gain, abs=0.02)
         assert fit.value("drag_1ps") == pytest.approx(drag_1ps, abs=0.01)
@@ -309,10 +311,10 @@ def test_arducopter_s_response_to_steps_is_that_of_its_own_log() -> None:
 def _own_estimates(name: str) -> tuple[int, NDArray[np.float64]]:
     """When the autopilot booted [ns], and rows of its own estimate: time since then [s], position [m]."""
     boot_ns, rows = 0, []
-    for one in packets(name):
-        if not one.outgoing and one.data[7:10] == b"\x20\x00\x00":  # LOCAL_POSITION_NED, zeros at its end cut
-            boot_ms, *position_m = struct.unpack("<I3f", one.data[10:-2].ljust(16, b"\0")[:16])
-            boot_ns = boot_ns or one.at_ns - 1_000_000 * boot_ms
+    for packet in packets(name):
+        if not packet.outgoing and packet.data[7:10] == b"\x20\x00\x00":  # LOCAL_POSITION_NED, zeros at its end cut
+            boot_ms, *position_m = struct.unpack("<I3f", packet.data[10:-2].ljust(16, b"\0")[:16])
+            boot_ns = boot_ns or packet.at_ns - 1_000_000 * boot_ms
             rows.append((boot_ms * 1e-3, *position_m))
     return boot_ns, np.array(rows)
 
@@ -322,7 +324,7 @@ def _lateness_s(estimates: NDArray[np.float64], axis: int, span_s: tuple[float, 
     rows = truth(GPS_TRUTH)
     part = estimates[(estimates[:, 0] > span_s[0]) & (estimates[:, 0] < span_s[1])]
     tried_s = np.arange(-0.1, 0.2, 0.005)
-    apart = [part[:, 1 + axis] - np.interp(part[:, 0] - one, rows[:, 0], rows[:, 1 + axis]) for one in tried_s]
+    apart = [part[:, 1 + axis] - np.interp(part[:, 0] - shift_s, rows[:, 0], rows[:, 1 + axis]) for shift_s in tried_s]
     return float(tried_s[np.argmin(np.std(apart, axis=1))])
 
 
@@ -332,7 +334,7 @@ GOOD, NOTE, BAD = "good", "note", "bad"
 
 
 @pytest.mark.parametrize(
-    ("name", "since_s", "seconds"),
+    ("name", "get_flight_time_s", "seconds"),
     [
         (AT_REST, 0.0, 3.4),
         (WAYPOINTS, 10.0, 10.0),
@@ -345,8 +347,8 @@ GOOD, NOTE, BAD = "good", "note", "bad"
 def test_a_good_set_up_passes_the_check_over_a_link_that_loses_in_bursts(
     name: str, since_s: float, seconds: float
 ) -> None:
-    items = checked(name, since_s, seconds)
-    assert [one for one, state in items.items() if state == BAD] == []
+    items = run_check(name, since_s, seconds)
+    assert [name for name, state in items.items() if state == BAD] == []
     assert items["own position"] == GOOD
     assert items["position loss"] == GOOD
     assert items["position in the room"] == GOOD
@@ -374,45 +376,45 @@ def test_parameters_that_another_client_read_are_judged_as_that_flight_was_set_u
     name: str, seconds: float, noted: list[str], good: list[str]
 ) -> None:
     """At rest before the flight. TIMESYNC is noted of each: it was the other client's that was answered."""
-    items = checked(name, 0.0, seconds)
+    items = run_check(name, 0.0, seconds)
     # An ArduPilot's 3 s, as shipped, are more than a room holds; so is PX4's second at the preset's 4 m/s².
     timeout = "COM_OF_LOSS_T" if name == OFFBOARD else "GUID_TIMEOUT"
-    assert [one for one, state in items.items() if state == BAD] == [timeout]
-    assert {one: items[one] for one in noted} == dict.fromkeys(noted, NOTE)
-    assert {one: items[one] for one in good} == dict.fromkeys(good, GOOD)
+    assert [name for name, state in items.items() if state == BAD] == [timeout]
+    assert {name: items[name] for name in noted} == dict.fromkeys(noted, NOTE)
+    assert {name: items[name] for name in good} == dict.fromkeys(good, GOOD)
     standing = ["vehicle", "armed", "landed", "position rate", "position loss", "position in the room"]
-    assert {one: items[one] for one in standing} == dict.fromkeys(standing, GOOD)
+    assert {name: items[name] for name in standing} == dict.fromkeys(standing, GOOD)
     assert items["vehicle clock"] == NOTE
 
 
-@pytest.mark.parametrize(("name", "since_s"), [(GPS, 60.0), (OFFBOARD, 28.0)])
+@pytest.mark.parametrize(("name", "get_flight_time_s"), [(GPS, 60.0), (OFFBOARD, 28.0)])
 def test_a_vehicle_that_flies_above_the_room_is_found_out_of_it(name: str, since_s: float) -> None:
     """Both took off to 5 m."""
-    lower, _ = get_room_limits(config_of(name))
+    lower, _ = get_room_limits(load_flight_config(name))
     assert lower[2] > -5.0
-    items = checked(name, since_s, 10.0)
-    assert [one for one, state in items.items() if state == BAD] == ["position in the room"]
+    items = run_check(name, since_s, 10.0)
+    assert [name for name, state in items.items() if state == BAD] == ["position in the room"]
     assert (items["armed"], items["landed"], items["position loss"]) == (NOTE, NOTE, GOOD)
 
 
-@pytest.mark.parametrize(("name", "since_s"), [(VICON, 84.0), (WIND, 44.0)])
+@pytest.mark.parametrize(("name", "get_flight_time_s"), [(VICON, 84.0), (WIND, 44.0)])
 def test_cameras_that_fall_silent_are_found_by_the_longest_gap(name: str, since_s: float) -> None:
     """VICON's for good, 86.4 s after the boot, WIND's for the 4 s that were ordered."""
-    items = checked(name, since_s, 8.0)
+    items = run_check(name, since_s, 8.0)
     assert items["longest gap"] == BAD
     assert items["position in the room"] == GOOD
 
 
-def test_a_link_that_loses_half_of_the_positions_is_told_at_rest() -> None:
+def test_a_link_that_loses_half_of_the_positions_is_reported_at_rest() -> None:
     """In the first 3 s of WIND its bursts took more than half of the frames."""
     stamps_s = frames(WIND).stamps_s
     assert np.count_nonzero((stamps_s > 0.0) & (stamps_s < 3.0)) < 0.5 * 3.0 * CAMERA_HZ
-    assert checked(WIND, 0.0, 3.0)["position loss"] == BAD
+    assert run_check(WIND, 0.0, 3.0)["position loss"] == BAD
 
 
 def test_a_px4_whose_position_is_not_valid_yet_is_not_called_bad() -> None:
     """RELEASED arms at 1.77 s and takes until 3.2 s to have one: then the origins are compared, before nothing is."""
-    before, after = checked(RELEASED, 0.0, 1.6), checked(RELEASED, 2.0, 1.6)
+    before, after = run_check(RELEASED, 0.0, 1.6), run_check(RELEASED, 2.0, 1.6)
     assert (before["own position"], after["own position"]) == ("undetermined", GOOD)
     assert (before["armed"], after["armed"]) == (GOOD, NOTE)
     assert BAD not in (*before.values(), *after.values())
@@ -420,62 +422,62 @@ def test_a_px4_whose_position_is_not_valid_yet_is_not_called_bad() -> None:
 
 def test_a_px4_at_rest_has_a_position_of_its_own() -> None:
     """It says CONST_POS_MODE of itself, which is no want of one."""
-    assert checked(AT_REST, 0.0, 3.4)["own position"] == GOOD
+    assert run_check(AT_REST, 0.0, 3.4)["own position"] == GOOD
 
 
 def test_a_turned_frame_is_found_in_the_recorded_flight() -> None:
-    items = checked(WAYPOINTS, 10.0, 10.0, "frame.yaw_deg=90.0")
+    items = run_check(WAYPOINTS, 10.0, 10.0, "frame.yaw_deg=90.0")
     assert items["axes"] == BAD
 
 
 # --- hand-over and page ------------------------------------------------------------------------------------------
 
 
-def told(memory: Memory) -> list[str]:
+def told(memory: MemorySink) -> list[str]:
     return [event.text for event in memory.of(Event) if event.code == "hand-over"]
 
 
-def codes(memory: Memory) -> list[str]:
+def codes(memory: MemorySink) -> list[str]:
     return [event.code for event in memory.of(Event)]
 
 
-def _lost(memory: Memory) -> None:
+def _lost(memory: MemorySink) -> None:
     decisions = memory.of(Decision)
-    assert any(one.mode is not ControlMode.TRACK for one in decisions)
+    assert any(decision.mode is not ControlMode.TRACK for decision in decisions)
     assert "fallback-brake" in codes(memory)
 
 
-def _pilot(memory: Memory) -> None:
+def _pilot(memory: MemorySink) -> None:
     assert any("-> released (LOITER" in text for text in told(memory))
 
 
-def _rest(memory: Memory) -> None:
+def _rest(memory: MemorySink) -> None:
     assert "vehicle-reboot" not in codes(memory)
     assert any("REJECTED" in event.text for event in memory.of(Event))
 
 
-def _land(memory: Memory) -> None:
+def _land(memory: MemorySink) -> None:
     assert any("-> unclear (AUTO.LAND" in text for text in told(memory))
 
 
-def _failsafe(memory: Memory) -> None:
+def _failsafe(memory: MemorySink) -> None:
     texts = [event.text for event in memory.of(Event) if event.code == "vehicle-text"]
     assert any(text.startswith("EKF Failsafe") for text in texts)
 
 
-def _silent(memory: Memory) -> None:
+def _silent(memory: MemorySink) -> None:
     texts = [event.text for event in memory.of(Event) if event.code == "vehicle-text"]
     assert "Failsafe activated" in texts
 
 
-def _landed(memory: Memory) -> None:
+def _landed(memory: MemorySink) -> None:
     texts = [event.text for event in memory.of(Event) if event.code == "vehicle-text"]
     assert "Disarming motors" in texts
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "since_s", "seconds", "matters", "on_the_page"),
+    ("name", "get_flight_time_s", "seconds", "matters", "on_the_page"),
     [
         (WIND, 40.0, 12.0, _lost, "positions did not come back"),
         (PILOT, 10.0, 8.0, _pilot, "LOITER"),
@@ -485,41 +487,45 @@ def _landed(memory: Memory) -> None:
         (OFFBOARD, 70.0, 12.0, _silent, "Failsafe activated"),
         (GPS, 107.0, 20.0, _landed, "Disarming motors"),
     ],
-    ids=lambda one: one if isinstance(one, str) and "-" in one else "",
+    ids=lambda value: value if isinstance(value, str) and "-" in value else "",
 )
-def test_the_page_of_each_says_what_matters(
-    name: str, since_s: float, seconds: float, matters: Callable[[Memory], Any], on_the_page: str
+def test_the_page_of_each_flight_names_its_cause(
+    name: str, since_s: float, seconds: float, matters: Callable[[MemorySink], Any], on_the_page: str
 ) -> None:
-    memory = watched(name, since_s, seconds)
+    memory = watch_records(name, since_s, seconds)
     matters(memory)
-    page = words_of(page_of(memory))
+    page = read_page_text(make_page_data(memory))
     assert on_the_page in " ".join(page.text)
     assert page.plots
 
 
-def times_s(heard: Listened, begin: str, code: str = "hand-over") -> list[float]:
+def times_s(received: LoopRecord, begin: str, code: str = "hand-over") -> list[float]:
     """When events of a code came whose texts begin so, since the first packet [s]."""
-    found = heard.memory.of(Event)
-    return [heard.since_s(one.at_ns) for one in found if one.code == code and one.text.startswith(begin)]
+    result = received.memory.of(Event)
+    return [
+        received.get_flight_time_s(event.at_ns)
+        for event in result
+        if event.code == code and event.text.startswith(begin)
+    ]
 
 
 def test_the_wind_beyond_the_authority_is_met_before_it_has_blown_the_vehicle_out_of_the_room() -> None:
     """The real flight stayed in mode `track`, without a word, until it was 24 m outside."""
-    heard = listened(BLOWN, 50.0, 12.0)
-    ordered_s = seen_s(BLOWN, "ORDER set SIH_WIND")[0]
-    (noticed_s,) = times_s(heard, "", "envelope-response")
+    received = listen(BLOWN, 50.0, 12.0)
+    ordered_s = find_event_times_s(BLOWN, "ORDER set SIH_WIND")[0]
+    (noticed_s,) = times_s(received, "", "envelope-response")
     assert noticed_s == pytest.approx(57.65, abs=0.01)
     assert noticed_s - ordered_s == pytest.approx(0.95, abs=0.1)
-    (landing_s,) = times_s(heard, "engaged -> landing")
+    (landing_s,) = times_s(received, "engaged -> landing")
     assert 0.0 < landing_s - noticed_s < 0.11
-    assert codes(heard.memory).index("envelope-response") < codes(heard.memory).index("fallback-land")
+    assert codes(received.memory).index("envelope-response") < codes(received.memory).index("fallback-land")
 
     # What the console, the exit code and the page say of it: the reason is the envelope's own.
-    (reason,) = [one.text for one in heard.memory.of(Event) if one.code == "envelope-response"]
-    assert heard.loop.let_go == reason and reason in heard.loop.ending.sentence
-    assert heard.loop.ending.exit_code == 1
-    assert [one.text for one in heard.notices if "engaged -> landing" in one.text]
-    assert reason in " ".join(words_of(page_of(heard.memory)).text)
+    (reason,) = [event.text for event in received.memory.of(Event) if event.code == "envelope-response"]
+    assert received.loop.let_go == reason and reason in received.loop.ending.sentence
+    assert received.loop.ending.exit_code == 1
+    assert [notice.text for notice in received.notices if "engaged -> landing" in notice.text]
+    assert reason in " ".join(read_page_text(make_page_data(received.memory)).text)
 
     rows = truth(BLOWN)
     where_m = np.array([np.interp(noticed_s, rows[:, 0], rows[:, 1 + axis]) for axis in range(2)])
@@ -528,41 +534,41 @@ def test_the_wind_beyond_the_authority_is_met_before_it_has_blown_the_vehicle_ou
 
 
 @pytest.mark.slow
-def test_before_the_wind_nothing_is_said_against_the_same_flight() -> None:
+def test_before_the_wind_the_same_flight_has_no_finding() -> None:
     """In 25 s of hovering, and from the blackout's end to the order of the wind."""
     for since_s, seconds in ((20.0, 25.0), (51.0, 5.6)):
-        heard = listened(BLOWN, since_s, seconds)
-        assert not heard.loop.let_go and not heard.notices
-        assert not [code for code in codes(heard.memory) if code.startswith(("envelope", "fallback"))]
+        received = listen(BLOWN, since_s, seconds)
+        assert not received.loop.let_go and not received.notices
+        assert not [code for code in codes(received.memory) if code.startswith(("envelope", "fallback"))]
 
 
 @pytest.mark.slow
-def test_a_failsafe_in_the_climb_the_pilot_and_the_order_are_each_told_at_their_time() -> None:
+def test_a_failsafe_in_the_climb_the_pilot_and_the_order_are_reported_at_their_times() -> None:
     """Its client had let go for good in the climb, so OFFBOARD is waited for until the operator's order."""
     patient = ("hand_over.engage_s=60.0", "hand_over.tries=100")
     take_off, engage = Command(order=Order.TAKE_OFF, height_m=1.2), Command(order=Order.ENGAGE)
-    ordered_s = seen_s(RELEASED, "ORDER mark engage")[0]
-    heard = listened(RELEASED, 0.0, 66.0, *patient, orders=[(1.45, take_off), (ordered_s, engage)])
-    pilot_s = seen_s(RELEASED, "MODE 3/0")
+    ordered_s = find_event_times_s(RELEASED, "ORDER mark engage")[0]
+    received = listen(RELEASED, 0.0, 66.0, *patient, orders=[(1.45, take_off), (ordered_s, engage)])
+    pilot_s = find_event_times_s(RELEASED, "MODE 3/0")
     passages = {
-        "climbing -> failsafe (AUTO.LAND": seen_s(RELEASED, "MODE 4/6"),
-        "failsafe -> climbing (AUTO.TAKEOFF": seen_s(RELEASED, "MODE 4/2")[1:],
+        "climbing -> failsafe (AUTO.LAND": find_event_times_s(RELEASED, "MODE 4/6"),
+        "failsafe -> climbing (AUTO.TAKEOFF": find_event_times_s(RELEASED, "MODE 4/2")[1:],
         "engaging -> released (POSCTL": pilot_s[:1],
         "released -> returning (POSCTL": [ordered_s],
-        "returning -> engaged": seen_s(RELEASED, "MODE 6/0"),
+        "returning -> engaged": find_event_times_s(RELEASED, "MODE 6/0"),
         "landing -> released (POSCTL": pilot_s[1:],
     }
     for begin, at_s in passages.items():
-        assert times_s(heard, begin) == pytest.approx(at_s, abs=0.15), begin
+        assert times_s(received, begin) == pytest.approx(at_s, abs=0.15), begin
     # The vehicle took the order: it is to the pilot, at 62.4 s, that it refuses OFFBOARD, on his own connection.
-    answers_s = times_s(heard, "DO_SET_MODE: ACCEPTED", "command-ack")
+    answers_s = times_s(received, "DO_SET_MODE: ACCEPTED", "command-ack")
     assert ordered_s < answers_s[-1] < ordered_s + 0.5
-    assert seen_s(RELEASED, "ACK 176 result 1")[0] > pilot_s[1]
-    assert not any("REJECTED" in one.text or "DENIED" in one.text for one in heard.memory.of(Event))
+    assert find_event_times_s(RELEASED, "ACK 176 result 1")[0] > pilot_s[1]
+    assert not any("REJECTED" in event.text or "DENIED" in event.text for event in received.memory.of(Event))
 
-    noticed = " ".join(one.text for one in heard.notices)
+    noticed = " ".join(notice.text for notice in received.notices)
     assert all(begin in noticed for begin in passages if "failsafe" in begin or "released (" in begin)
-    on_the_page = " ".join(words_of(page_of(heard.memory)).text)
+    on_the_page = " ".join(read_page_text(make_page_data(received.memory)).text)
     assert all(begin in on_the_page for begin in passages)
 
 

@@ -32,6 +32,6 @@ def test_a_recording_of_before_replays_identically(
     path = tmp_path / "flight.mcap"
     path.write_bytes(lzma.decompress((FOLDER / f"{name}.mcap.xz").read_bytes()))
     assert run(["log", "replay", str(path), "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["identical"] and found["decisions_differing"] == 0
-    assert found["compared"] > RECORDINGS[name]
+    document = json.loads(capsys.readouterr().out)
+    assert document["identical"] and document["decisions_differing"] == 0
+    assert document["compared"] > RECORDINGS[name]

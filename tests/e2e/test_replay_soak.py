@@ -6,8 +6,8 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-from draw_flight import drawn
-from soak_replay import replayed, tally
+from draw_flight import draw_flight
+from soak_replay import replay_seed, tally_flights
 
 from logs.recording.reader import segment_files
 
@@ -16,9 +16,9 @@ SEEDS = (0, 5, 13, 14, 15)  # quick ones that together have what is asked for be
 
 @pytest.mark.slow
 def test_flights_with_everything_amiss_replay_bit_for_bit(tmp_path: Path) -> None:
-    found = [replayed(seed, tmp_path) for seed in SEEDS]
-    assert {one.seed: one.result.first_difference for one in found if not one.good} == {}
-    had = {word for one in found for word in one.words}
+    results = [replay_seed(seed, tmp_path) for seed in SEEDS]
+    assert {flight.seed: flight.result.first_difference for flight in results if not flight.is_identical} == {}
+    had = {label for flight in results for label in flight.labels}
     assert {
         "px4",
         "ardupilot",
@@ -34,17 +34,17 @@ def test_flights_with_everything_amiss_replay_bit_for_bit(tmp_path: Path) -> Non
         "reboot",
         "one connection",
     } <= had
-    seen = Counter[str]()
-    for one in found:
-        seen.update(one.seen)
-    assert {f"Decision {mode}" for mode in ("wait", "track", "brake", "hold", "land", "stopped")} <= seen.keys()
-    assert max(len(segment_files(one.path)) for one in found) > 1
-    report = tally(found)
+    observed = Counter[str]()
+    for flight in results:
+        observed.update(flight.record_counts)
+    assert {f"Decision {mode}" for mode in ("wait", "track", "brake", "hold", "land", "stopped")} <= observed.keys()
+    assert max(len(segment_files(flight.path)) for flight in results) > 1
+    report = tally_flights(results)
     assert (report["replayed"], report["identical"], report["wrong"]) == (len(SEEDS), len(SEEDS), {})
 
 
 @pytest.mark.slow
-def test_a_flight_whose_replay_differs_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_flight_whose_replay_differs_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     memory = 0
 
     def forgetful(*given: float) -> tuple[tuple[float, float, float], tuple[str, ...]]:
@@ -54,13 +54,13 @@ def test_a_flight_whose_replay_differs_is_told(tmp_path: Path, monkeypatch: pyte
         return (1e-9 * memory, 0.0, 0.0), ()
 
     monkeypatch.setattr("uavctl.flight.act.limit_setpoint", forgetful)
-    found = replayed(SEEDS[0], tmp_path)
-    assert not found.good
-    report = tally([found])
+    result = replay_seed(SEEDS[0], tmp_path)
+    assert not result.is_identical
+    report = tally_flights([result])
     assert report["identical"] == 0
     wrong = report["wrong"]
     assert isinstance(wrong, dict) and wrong[str(SEEDS[0])]["topic"] == "/uavctl/decision"
 
 
 def test_a_seed_draws_the_same_flight_each_time() -> None:
-    assert drawn(15) == drawn(15) != drawn(0)
+    assert draw_flight(15) == draw_flight(15) != draw_flight(0)

@@ -12,11 +12,11 @@ from pathlib import Path
 import pytest
 from places import ROOT
 from sim_rig import LAND, SET_MODE, decode
-from soak_faults import FLIGHT_S, drawn, fly_faults
+from soak_faults import FLIGHT_S, draw_world, fly_faults
 from soak_mission import AUTOPILOTS, MISSION, fly_mission, summary
-from soak_rig import prepared_for
-from soak_take_off import fly_take_off, outcome, tally_take_offs
-from take_off_rig import RELAYED, Flight
+from soak_rig import prepare_room
+from soak_take_off import fly_take_off, judge_outcome, tally_take_offs
+from take_off_rig import RELAYED, TakeOffRig
 
 from logs.recording.reader import read
 from uavctl.build.controller import Prepared
@@ -28,20 +28,20 @@ TOOL = ROOT / "tools" / "soak.py"
 
 @pytest.fixture(scope="module")
 def faulty() -> Prepared:
-    return prepared_for()
+    return prepare_room()
 
 
 @pytest.mark.slow
 def test_a_mission_of_each_autopilot_touches_no_wall_and_ends_on_the_floor() -> None:
-    prepared = prepared_for(*MISSION)
+    prepared = prepare_room(*MISSION)
     flights = [fly_mission(prepared, autopilot, 1) for autopilot in AUTOPILOTS]
     for flight in flights:
         assert flight.good, flight
         assert flight.clearance_m > 0.1
         assert len(flight.legs) == 4
         assert max(leg.plan_rms_m for leg in flight.legs) < 0.2
-    found = summary([flights[0], replace(flights[1], seed=2, clearance_m=-0.1, landed=False)])
-    assert (found["touched"], found["landed"], found["worst"]) == (1, 1, f"seed 2, {flights[1].nearest}")
+    result = summary([flights[0], replace(flights[1], seed=2, clearance_m=-0.1, landed=False)])
+    assert (result["touched"], result["landed"], result["worst"]) == (1, 1, f"seed 2, {flights[1].nearest}")
 
 
 @pytest.mark.slow
@@ -49,9 +49,9 @@ def test_a_take_off_of_each_autopilot_and_a_judge_that_finds_what_hovers() -> No
     flights = [fly_take_off(autopilot, 1) for autopilot in AUTOPILOTS]
     assert all(flight.reached and not flight.wrong for flight in flights), flights
     hovering = replace(flights[0], what="hovers", seed=2, wrong=("nobody has it in the air",))
-    found = tally_take_offs([*flights, hovering])
-    assert (found["take_offs"], found["engaged"], found["hovers"]) == (3, 3, 1)
-    assert list(found["wrong"]) == ["2"]  # type: ignore[call-overload]
+    result = tally_take_offs([*flights, hovering])
+    assert (result["take_offs"], result["engaged"], result["hovers"]) == (3, 3, 1)
+    assert list(result["wrong"]) == ["2"]  # type: ignore[call-overload]
 
 
 def is_setpoint(data: bytes) -> bool:
@@ -59,12 +59,12 @@ def is_setpoint(data: bytes) -> bool:
 
 
 @pytest.mark.slow
-def test_a_px4_that_hears_no_order_once_it_climbs_is_found_hovering(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_px4_that_receives_no_order_in_the_climb_is_found_hovering(monkeypatch: pytest.MonkeyPatch) -> None:
     """It has its positions, and holds its height in AUTO.TAKEOFF."""
-    flights: list[Flight] = []
+    flights: list[TakeOffRig] = []
 
-    def deaf(*_: str | int) -> Flight:
-        flight = Flight("px4", *RELAYED, "sim.seed=1").relayed()
+    def deaf(*_: str | int) -> TakeOffRig:
+        flight = TakeOffRig("px4", *RELAYED, "sim.seed=1").relayed()
         flight.peers.autopilot.parameters.set("MIS_TAKEOFF_ALT", 1.2)
         flight.hears = lambda data: not (is_order(data) or is_setpoint(data)) or "climbing" not in flight.states
         flights.append(flight)
@@ -73,27 +73,27 @@ def test_a_px4_that_hears_no_order_once_it_climbs_is_found_hovering(monkeypatch:
     def is_order(data: bytes) -> bool:
         return any(getattr(message, "command", 0) in (SET_MODE, LAND) for message in decode(data))
 
-    monkeypatch.setattr("soak_take_off.troubled", deaf)
+    monkeypatch.setattr("soak_take_off.make_troubled_rig", deaf)
     monkeypatch.setattr("soak_take_off.LANDING_S", 30.0)
-    found = fly_take_off("px4", 1)
+    result = fly_take_off("px4", 1)
     (flight,) = flights
     assert flight.peers.autopilot.mode_name == "AUTO.TAKEOFF"
     assert flight.peers.vehicle.position_m[2] == pytest.approx(-1.2, abs=0.2)
-    assert found.what == "hovers"
-    assert any("not flown" in text for text in found.wrong)
-    assert any("nobody has it" in text for text in found.wrong)
-    assert tally_take_offs([found])["hovers"] == 1
+    assert result.what == "hovers"
+    assert any("not flown" in text for text in result.wrong)
+    assert any("nobody has it" in text for text in result.wrong)
+    assert tally_take_offs([result])["hovers"] == 1
 
 
 @pytest.mark.slow
-def test_an_ardupilot_that_hears_no_setpoint_hovers_whatever_the_hand_over_takes_it_for() -> None:
-    flight = Flight("ardupilot", *RELAYED).relayed().take_off()
+def test_an_ardupilot_without_setpoints_hovers_in_any_hand_over_state() -> None:
+    flight = TakeOffRig("ardupilot", *RELAYED).relayed().take_off()
     flight.run(30.0, until=HandoverState.ENGAGED).run(1.0)
-    assert outcome(flight) == "engaged"
-    flight = Flight("ardupilot", *RELAYED).relayed().take_off()
+    assert judge_outcome(flight) == "engaged"
+    flight = TakeOffRig("ardupilot", *RELAYED).relayed().take_off()
     flight.hears = lambda data: not is_setpoint(data)
     flight.run(30.0, until=HandoverState.ENGAGED).run(1.0)
-    assert outcome(flight) == "hovers"
+    assert judge_outcome(flight) == "hovers"
 
 
 @pytest.mark.slow
@@ -106,12 +106,12 @@ def test_flights_with_random_faults_have_no_findings(faulty: Prepared) -> None:
 
 
 def test_the_faults_of_many_seeds_are_of_every_kind_and_the_same_each_time() -> None:
-    configs = [drawn(seed) for seed in range(60)]
+    configs = [draw_world(seed) for seed in range(60)]
     kinds = {fault.kind for config in configs for fault in config.sim.fault}
     assert kinds == {"blackout", "held", "uplink_blackout", "occluded", "swapped", "frozen", "wind"}
     assert {config.sim.autopilot for config in configs} == {"px4", "ardupilot"}
     assert max(fault.at_s for config in configs for fault in config.sim.fault) < FLIGHT_S
-    assert drawn(7) == configs[7]
+    assert draw_world(7) == configs[7]
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from types import FrameType
 from typing import TypeVar
 
 import pytest
-from loopback_rig import Memory, make_loop
+from loopback_rig import MemorySink, make_loop
 from places import ROOT
 
 from sim.simulation import World
@@ -31,7 +31,7 @@ class Watched:
     """A loop whose calls are watched; implements `uavctl.records.Flyer`."""
 
     loop: ControlLoop
-    memory: Memory
+    memory: MemorySink
     positions: list[frozenset[str]] = field(default_factory=list)
     planning: list[frozenset[str]] = field(default_factory=list)
     at_s: float = 0.0
@@ -49,8 +49,8 @@ class Watched:
         kinds = {type(record) for _, _, record in self.memory.entries[before:]}
         if Plan in kinds and LinkStats not in kinds and self.at_s > WARM_S:  # counters of a second are not of the tick
             self.planning.append(files)
-        for one in outgoing:
-            send(one)
+        for datagram in outgoing:
+            send(datagram)
 
 
 def crossed(call: Callable[[], T]) -> tuple[T, frozenset[str]]:
@@ -64,18 +64,18 @@ def crossed(call: Callable[[], T]) -> tuple[T, frozenset[str]]:
     gc.disable()  # what other tests left would be tidied up in its own files' names
     sys.setprofile(watch)
     try:
-        found = call()
+        result = call()
     finally:
         sys.setprofile(None)
         gc.enable()
     places = (name.removeprefix(f"{ROOT}/") for name in files if name.startswith(f"{ROOT}/"))
-    return found, frozenset(place for place in places if place.startswith(("uavctl/", "sim/", "logs/")))
+    return result, frozenset(place for place in places if place.startswith(("uavctl/", "sim/", "logs/")))
 
 
 @pytest.fixture(scope="module")
 def watched() -> Watched:
     config = load_config("room-px4")
-    memory = Memory()
+    memory = MemorySink()
     flyer = Watched(make_loop(config, memory), memory)
     World(config, flyer).run(5.0)
     return flyer

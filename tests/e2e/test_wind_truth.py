@@ -67,10 +67,10 @@ class _Flyer(TrackedFlyer):
         self.craft: Quadrotor | None = None
 
     def tick(self, tick: int, at_ns: int, send: Send) -> None:
-        def noting(one: Outgoing) -> None:
-            if one.data[7:10] in POSES:
+        def noting(outgoing: Outgoing) -> None:
+            if outgoing.data[7:10] in POSES:
                 self.relayed_s.append(at_ns * 1e-9)
-            send(one)
+            send(outgoing)
 
         if self.craft is not None and at_ns >= BEGINS_S * 1e9:
             north, east, down = (value / DRAG_1PS for value in self.push_mps2)
@@ -93,8 +93,8 @@ def blown(autopilot: str, push_mps2: Vec3, *overrides: str, seed: int = 3, over_
             *overrides,
         ],
     )
-    told = _Told()
-    flyer = _Flyer(ControlLoop(config, get_cached_controller(config), told, lambda: 0), push_mps2)
+    events = _Told()
+    flyer = _Flyer(ControlLoop(config, get_cached_controller(config), events, lambda: 0), push_mps2)
     world = World(config, flyer)
     craft = world.peers.vehicle
     assert isinstance(craft, Quadrotor)
@@ -110,9 +110,9 @@ def blown(autopilot: str, push_mps2: Vec3, *overrides: str, seed: int = 3, over_
     goals = (config.target.position_m, *config.mission.waypoints)
     off = np.linalg.norm(where - np.array(goals[-1]), axis=1)
     lower, upper = get_room_limits(config)
-    let_go = [event.at_ns * 1e-9 for event in told.events if event.code in RELEASES]
+    let_go = [event.at_ns * 1e-9 for event in events.events if event.code in RELEASES]
     return Blown(
-        codes=[event.code for event in told.events],
+        codes=[event.code for event in events.events],
         from_target_m=float(off[times > over_s - 1.0].max()),
         worst_m=float(off[times > BEGINS_S].max()),
         beyond_m=float(compute_excess_m(where[-1:, :2], lower[:2], upper[:2])[0]),
@@ -203,11 +203,11 @@ def watched(*, feels: bool) -> tuple[MonitorState, str | None, float]:
     setpoint: Vec3 | None = None
     acts, samples = ZERO, list[PositionSample]()
     begin_ns = now_ns = packets(STEADY)[0].at_ns
-    for one in packets(STEADY):
-        if one.at_ns >= now_ns + TICK_NS:
+    for packet in packets(STEADY):
+        if packet.at_ns >= now_ns + TICK_NS:
             now_ns += TICK_NS
             if setpoint is not None:
-                seen = Observation(
+                observed = Observation(
                     at_ns=now_ns,
                     samples=tuple(samples),
                     sent_mps2=acts,
@@ -217,15 +217,15 @@ def watched(*, feels: bool) -> tuple[MonitorState, str | None, float]:
                     braking=False,
                     inertial_mps2=felt if feels else None,
                 )
-                watching, breach = update(watching, seen, parameters)
+                watching, breach = update(watching, observed, parameters)
                 if breach.cause is not None:
                     return watching, breach.cause, (now_ns - begin_ns) * 1e-9
             acts, samples = setpoint or ZERO, []
-        if one.outgoing:
-            (frame,) = scan_frames(one.data, final=True).frames
+        if packet.outgoing:
+            (frame,) = scan_frames(packet.data, final=True).frames
             setpoint = struct.unpack_from("<3f", frame.data, SETPOINT_ACCEL)
             continue
-        for item in link.receive(one.data, one.at_ns).items:
+        for item in link.receive(packet.data, packet.at_ns).items:
             if isinstance(item, PositionSample):
                 samples.append(item)
             elif isinstance(item, VehicleMotion):

@@ -18,9 +18,9 @@ from flight_rig import (
     StubSolver,
     drag_lag_generator,
     estimator_parameters,
-    inputs_of,
     make_controller,
-    moving,
+    make_inputs,
+    make_motion_samples,
     run,
     sample,
     small_plant,
@@ -193,7 +193,7 @@ def test_plans_leave_room_for_it_and_what_is_flown_keeps_the_input_limits() -> N
 
 def test_a_plan_is_shifted_by_it_and_says_so() -> None:
     controller = make_controller(bias_drift=0.3, bias_max=MOST)
-    outputs = run(controller, inputs_of(range(8 * TICKS), moving(7)))
+    outputs = run(controller, make_inputs(range(8 * TICKS), make_motion_samples(7)))
     plans = [output.plan for output in outputs if output.plan is not None]
     assert any(abs(plan.bias[0]) > 1e-3 for plan in plans)
     for plan in plans:
@@ -211,7 +211,9 @@ class Steady(StubSolver):
 
 def test_the_fallback_brakes_and_holds_against_it() -> None:
     controller = make_controller(Steady(small_plant()), bias_drift=0.3, bias_max=MOST)
-    outputs = run(controller, inputs_of(range(160), moving(20)))  # 0.2 m/s² are asked for, and nothing comes of it
+    outputs = run(
+        controller, make_inputs(range(160), make_motion_samples(20))
+    )  # 0.2 m/s² are asked for, and nothing comes of it
     seen = {ControlMode.BRAKE: 0, ControlMode.HOLD: 0}
     lately: list[float] = []  # of the last 3 s of positions: what has been there all the time
     for output in outputs:
@@ -233,7 +235,7 @@ def test_the_fallback_brakes_and_holds_against_it() -> None:
 
 def test_without_it_nothing_is_estimated_shifted_or_left_free() -> None:
     controller = make_controller()
-    outputs = run(controller, inputs_of(range(5 * TICKS), moving(4)))
+    outputs = run(controller, make_inputs(range(5 * TICKS), make_motion_samples(4)))
     assert all(output.estimate is None or output.estimate.bias == () for output in outputs)
     assert all(output.plan is None or output.plan.bias == () for output in outputs)
     config = load_config("paper")

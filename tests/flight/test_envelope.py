@@ -8,25 +8,13 @@ from dataclasses import FrozenInstanceError, replace
 
 import numpy as np
 import pytest
-from envelope_rig import (
-    AT_NS,
-    PARAMETERS,
-    TICK_NS,
-    Array,
-    just_less,
-    just_more,
-    look,
-    monitors,
-    motion,
-    seen,
-    update,
-    vec3,
-)
+from envelope_rig import AT_NS, PARAMETERS, TICK_NS, just_less, just_more, look, monitors, motion, seen, update, vec3
 from flight_rig import MS, START_NS, drag_lag_generator, sample
 from msgspec import structs
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
+from uavctl.arrays import Array
 from uavctl.flight.limits import ZERO
 from uavctl.flight.monitors.acceleration import compute_lean_mps2
 from uavctl.flight.monitors.engaged import INITIAL
@@ -132,7 +120,7 @@ def braked(speeds: Iterator[tuple[int, float | None]], *, ends: Sequence[int] = 
     for at_ms, speed in speeds:
         at_ns = START_NS + at_ms * MS
         own = None if speed is None else motion((0.6 * speed, 0.0, -0.8 * speed), at_ns)
-        ours = structs.replace(seen(at_ns, own=own), braking=at_ms not in ends)
+        ours = structs.replace(seen(at_ns, vehicle_motion=own), braking=at_ms not in ends)
         watching, breach = update(watching, ours, PARAMETERS)
         if breach is not None:
             found.append((at_ms, breach))
@@ -165,7 +153,7 @@ def test_braking_has_to_show(speeds: list[tuple[int, float | None]], ends: tuple
 @pytest.mark.parametrize(("for_ns", "breached"), [(10**9 - 1, False), (10**9, True), (10**9 + 1, True)])
 def test_braking_has_a_second_to_show(for_ns: int, breached: bool) -> None:
     for north, fast in ((0.3, False), (just_more(0.3), True)):
-        ours = structs.replace(seen(AT_NS, own=motion((north, 0.0, 0.0), AT_NS)), braking=True)
+        ours = structs.replace(seen(AT_NS, vehicle_motion=motion((north, 0.0, 0.0), AT_NS)), braking=True)
         _, breach = update(monitors(braking=(AT_NS - for_ns, 0.0)), ours, PARAMETERS)
         assert (breach is not None) == (breached and fast)
 
@@ -181,7 +169,9 @@ def test_positions_that_come_back_correct_its_own_velocity_and_begin_braking_ane
         at_ns = START_NS + now_ms * MS
         taken = () if silent and 0 < now_ms < 1500 else (sample(at_ns, at_ns, ZERO),)
         own = motion((0.1 if now_ms < 1500 else 0.9, 0.0, 0.0), at_ns)
-        watching, breach = update(watching, structs.replace(seen(at_ns, *taken, own=own), braking=True), parameters)
+        watching, breach = update(
+            watching, structs.replace(seen(at_ns, *taken, vehicle_motion=own), braking=True), parameters
+        )
         if breach is not None:
             assert breach.cause == Cause.BRAKING
             breaches.append(now_ms)
@@ -238,7 +228,7 @@ def test_the_lean_is_held_against_what_was_told_along_the_floor(accel: Vec3, lev
     """It is level, or leans 1.5 m/s² east."""
     roll = 0.0 if level else math.atan(1.5 / 9.81)
     own = VehicleMotion(attitude_rad=(roll, 0.0, 0.0), attitude_ns=AT_NS)
-    _, breach = look((0.0, 0.0, 4.0), accel=accel, own=own)
+    _, breach = look((0.0, 0.0, 4.0), accel=accel, vehicle_motion=own)
     assert breach is not None and breach.text.endswith(words)
 
 
@@ -263,7 +253,7 @@ def test_a_breach_tells_whether_the_vehicle_leans_as_it_was_told(
     if lean is not None:  # a lean forwards is a negative pitch
         pitch = -math.atan(lean[0] / 9.81)
         own = VehicleMotion(attitude_rad=(math.atan(lean[1] / 9.81 * math.cos(pitch)), pitch, 0.0), attitude_ns=AT_NS)
-    _, breach = look(unexplained, accel=(1.0, 0.0, 0.0), own=own)
+    _, breach = look(unexplained, accel=(1.0, 0.0, 0.0), vehicle_motion=own)
     assert breach is not None and breach.cause == Cause.RESPONSE
     north, east, down = unexplained
     assert f"({north:.1f}, {east:.1f}, {down:.1f}) m/s²" in breach.text and "(1.0, 0.0, 0.0) m/s²" in breach.text
@@ -354,7 +344,7 @@ def fly(
             said = camera(t, x[0]) + rng.normal(scale=0.003, size=3)
             words = motion(vec3(x[1] + rng.normal(scale=0.02, size=3)), at_ns) if own else None
             watching, breach = update(
-                watching, seen(at_ns, sample(at_ns, None, vec3(said)), sent=sent, own=words), parameters
+                watching, seen(at_ns, sample(at_ns, None, vec3(said)), sent=sent, vehicle_motion=words), parameters
             )
             if breach is not None:
                 return t, far_m, breach.cause
@@ -371,7 +361,7 @@ def turned(degrees: float) -> Camera:
     return lambda t, truth: matrix @ truth
 
 
-@pytest.mark.parametrize("own", [False, True])
+@pytest.mark.parametrize("vehicle_motion", [False, True])
 @pytest.mark.parametrize("drag_1ps", [0.0, 0.3, 1.0])
 def test_a_vehicle_that_flies_as_it_is_told_is_quiet(drag_1ps: float, own: bool) -> None:
     assert fly(lambda t, truth: truth, drag_1ps=drag_1ps, own=own) is None
@@ -383,7 +373,7 @@ def test_a_vehicle_that_flew_on_while_we_missed_ticks_is_no_contradiction() -> N
         assert fly(lambda t, truth: truth, own=True, stall=range(begins, begins + 13)) is None
 
 
-@pytest.mark.parametrize("own", [False, True])
+@pytest.mark.parametrize("vehicle_motion", [False, True])
 @pytest.mark.parametrize(
     "camera",
     [

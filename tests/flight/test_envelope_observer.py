@@ -18,7 +18,6 @@ from envelope_rig import (
     NAN3,
     PARAMETERS,
     TICK_NS,
-    S,
     changed,
     is_inertial_inconsistent,
     is_prediction_inconsistent,
@@ -37,6 +36,7 @@ from flight_rig import MS, START_NS, sample
 from msgspec import structs
 from scipy.linalg import expm
 
+from uavctl.arrays import SECOND_NS
 from uavctl.flight.limits import ZERO
 from uavctl.flight.monitors.engaged import INITIAL, MonitorState
 from uavctl.flight.monitors.observation import Observation
@@ -226,7 +226,9 @@ def test_an_acceleration_beyond_the_bound_has_to_persist_and_a_plain_one_has_not
 )
 def test_clean_is_what_nothing_speaks_against(unexplained_mps2: float, off_m: float, apart: bool, clean: bool) -> None:
     known = offsets(0.3) if apart else {}
-    watching, _ = look((unexplained_mps2, 0.0, 0.0), off_m=off_m, own=AT_REST, clean_ns=START_NS - 5, **known)
+    watching, _ = look(
+        (unexplained_mps2, 0.0, 0.0), off_m=off_m, vehicle_motion=AT_REST, clean_ns=START_NS - 5, **known
+    )
     assert (watching.velocity.apart_ns is not None) == apart
     assert watching.clean_ns == (AT_NS if clean else START_NS - 5)
 
@@ -277,7 +279,9 @@ def test_an_innovation_at_its_bound_is_not_clipped() -> None:
         assert watching.acceleration.clipped == (clipped,)
 
 
-@pytest.mark.parametrize(("since_ns", "counts"), [(40 * MS, True), (40 * MS - 1, False), (0, False), (-S, False)])
+@pytest.mark.parametrize(
+    ("since_ns", "counts"), [(40 * MS, True), (40 * MS - 1, False), (0, False), (-SECOND_NS, False)]
+)
 def test_positions_that_are_late_or_close_to_one_another_say_nothing_new(since_ns: int, counts: bool) -> None:
     watching, _ = update(INITIAL, seen(START_NS, sample(START_NS)), PARAMETERS)
     at_ns = START_NS + 80 * MS
@@ -292,7 +296,9 @@ def test_a_stamp_after_the_arrival_counts_as_the_arrival() -> None:
     assert watching.motion.observer is not None and watching.motion.observer.at_ns == START_NS - MS
 
 
-@pytest.mark.parametrize(("silent_ns", "anew"), [(3 * S, True), (3 * S + MS, True), (3 * S - 1, False)])
+@pytest.mark.parametrize(
+    ("silent_ns", "anew"), [(3 * SECOND_NS, True), (3 * SECOND_NS + MS, True), (3 * SECOND_NS - 1, False)]
+)
 def test_after_a_long_silence_the_observer_begins_anew(silent_ns: int, anew: bool) -> None:
     watching, _ = update(INITIAL, seen(START_NS, sample(START_NS)), PARAMETERS)
     watching = changed(watching, clipped=(True, True), over_ns=START_NS, clean_ns=1)
@@ -318,13 +324,13 @@ def test_what_was_sent_is_remembered_for_three_seconds_and_no_longer() -> None:
         watching, _ = update(watching, seen(at_ns, sent=sent), PARAMETERS)
         if not all_sent or all_sent[-1][1] != sent:
             all_sent.append((at_ns - TICK_NS if n else at_ns, sent))
-        old = [one for one in all_sent if one[0] <= at_ns - 3 * S]
-        assert watching.motion.sent == (*old[-1:], *(one for one in all_sent if one[0] > at_ns - 3 * S))
+        old = [one for one in all_sent if one[0] <= at_ns - 3 * SECOND_NS]
+        assert watching.motion.sent == (*old[-1:], *(one for one in all_sent if one[0] > at_ns - 3 * SECOND_NS))
         assert watching.motion.tick_ns == at_ns
 
 
 def test_of_what_was_sent_earlier_only_the_last_still_acts() -> None:
-    sent = tuple((AT_NS - 5 * S + n * S, (float(n), 0.0, 0.0)) for n in range(5))
+    sent = tuple((AT_NS - 5 * SECOND_NS + n * SECOND_NS, (float(n), 0.0, 0.0)) for n in range(5))
     watching, _ = update(monitors(tick_ns=START_NS, sent=sent), seen(AT_NS + 1, sent=sent[-1][1]), PARAMETERS)
     assert watching.motion.sent == sent[2:]
 
@@ -336,7 +342,7 @@ def test_a_flight_that_began_before_its_first_position_has_the_velocity_that_was
     watching, sent = INITIAL, (1.0, -0.5, 0.0)
     for n in range(21):
         watching, _ = update(watching, seen(START_NS + n * TICK_NS, sent=sent), PARAMETERS)
-    at_ns = START_NS + S
+    at_ns = START_NS + SECOND_NS
     watching, breach = update(watching, seen(at_ns, sample(at_ns, at_ns, (7.0, 8.0, -9.0)), sent=sent), PARAMETERS)
     assert breach is None and watching.motion.observer is not None
     left = [math.exp(-1.0 / lag_s) for lag_s in PARAMETERS.lag_s]
@@ -407,7 +413,7 @@ def test_an_acceleration_of_just_so_many_standard_deviations_is_none() -> None:
 def told(velocity: Vec3, predicted: Vec3, **known: object) -> tuple[MonitorState, Observation]:
     """Half a second into a flight by what was sent, the vehicle's word, and a prediction."""
     watching = changed(monitors(tick_ns=AT_NS, began_ns=AT_NS - 500 * MS), **known)
-    return watching, structs.replace(seen(AT_NS, own=motion(velocity, AT_NS)), velocity_mps=predicted)
+    return watching, structs.replace(seen(AT_NS, vehicle_motion=motion(velocity, AT_NS)), velocity_mps=predicted)
 
 
 @pytest.mark.parametrize(
@@ -431,8 +437,8 @@ def test_who_speaks_for_the_vehicle_s_own_velocity(
 
 def test_what_was_sent_is_a_witness_for_ten_seconds() -> None:
     watching, tick = told(ZERO, (9.0, 0.0, 0.0))
-    assert trusted_velocity(changed(watching, began_ns=AT_NS - 10 * S), tick, 0.0, PARAMETERS) == ZERO
-    assert trusted_velocity(changed(watching, began_ns=AT_NS - 10 * S - 1), tick, 0.0, PARAMETERS) is None
+    assert trusted_velocity(changed(watching, began_ns=AT_NS - 10 * SECOND_NS), tick, 0.0, PARAMETERS) == ZERO
+    assert trusted_velocity(changed(watching, began_ns=AT_NS - 10 * SECOND_NS - 1), tick, 0.0, PARAMETERS) is None
     assert trusted_velocity(changed(watching, began_ns=None), tick, 0.0, PARAMETERS) is None
 
 
@@ -471,7 +477,7 @@ def test_a_witness_is_who_agreed_with_positions_and_still_speaks() -> None:
     words, agreed = motion(velocity, AT_NS), monitors(apart_mps=0.1)
     assert find_confirmed_velocity(agreed, words, AT_NS) == velocity
     assert find_confirmed_velocity(agreed, None, AT_NS) is None
-    assert find_confirmed_velocity(agreed, words, AT_NS + 60 * S) is None
+    assert find_confirmed_velocity(agreed, words, AT_NS + 60 * SECOND_NS) is None
     assert find_confirmed_velocity(changed(agreed, is_contradicted=True), words, AT_NS) is None
     assert find_confirmed_velocity(monitors(), words, AT_NS) is None  # no position has been compared with it
 
@@ -494,7 +500,7 @@ def test_what_was_sent_acts_behind_the_lag_from_tick_to_tick() -> None:
 
 
 def test_what_is_recorded_of_it_is_plain_numbers() -> None:
-    watching, _ = look((0.1, 0.2, -0.9), own=AT_REST, **offsets(0.1))
+    watching, _ = look((0.1, 0.2, -0.9), vehicle_motion=AT_REST, **offsets(0.1))
     assert [type(watching.acceleration.unexplained_mps2), type(watching.velocity.apart_mps)] == [float, float]
 
 
@@ -588,7 +594,7 @@ def test_what_time_it_is_makes_no_difference() -> None:
     """The same flights under a clock whose zero is long after them, and under one whose zero is as they begin."""
     found: set[Cause | None] = set()
     for seed in range(6):
-        by_ns = MS - START_NS if seed % 3 == 2 else -1000 * S
+        by_ns = MS - START_NS if seed % 3 == 2 else -1000 * SECOND_NS
         rng, at_ns = np.random.default_rng(seed), START_NS + 1
         one = two = INITIAL
         tick = seen(at_ns)

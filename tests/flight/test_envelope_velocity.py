@@ -13,8 +13,6 @@ from envelope_rig import (
     LOOK_NS,
     NAN3,
     PARAMETERS,
-    Array,
-    S,
     changed,
     just_less,
     just_more,
@@ -31,6 +29,7 @@ from flight_rig import MS, START_NS, sample
 from msgspec import structs
 from scipy.optimize import minimize_scalar
 
+from uavctl.arrays import SECOND_NS, Array
 from uavctl.flight.limits import ZERO
 from uavctl.flight.monitors.engaged import INITIAL, MonitorState
 from uavctl.flight.monitors.observer import Observer
@@ -56,7 +55,7 @@ def test_how_far_apart_two_velocities_are_is_a_line_through_what_is_between_them
         if captured_ns > ticks_ns[0] and (not taken or captured_ns - taken[-1][0] >= 40 * MS):
             distance = [np.interp(captured_ns, ticks_ns, axis) for axis in np.array(flown).T]
             taken.append((captured_ns, np.array(one.position_m) - distance))
-        watching, _ = update(watching, seen(at_ns, one, own=motion(vec3(velocity), at_ns)), parameters)
+        watching, _ = update(watching, seen(at_ns, one, vehicle_motion=motion(vec3(velocity), at_ns)), parameters)
         if not taken or taken[-1][0] != captured_ns:
             continue
         window = [one for one in taken if one[0] > captured_ns - 1200 * MS]
@@ -77,7 +76,7 @@ def test_how_far_apart_two_velocities_are_is_a_line_through_what_is_between_them
             options={"xatol": 1e-9},
         )
         assert watching.velocity.apart_mps == pytest.approx(left.fun, rel=1e-6)
-    kept = [at for at in ticks_ns if at > at_ns - 3 * S]
+    kept = [at for at in ticks_ns if at > at_ns - 3 * SECOND_NS]
     assert [at for at, _ in watching.motion.vehicle_path] == kept
 
 
@@ -94,7 +93,7 @@ def test_how_far_apart_two_velocities_are_is_a_line_through_what_is_between_them
 def test_velocities_are_compared_over_three_positions_and_part_of_the_window(
     spans_ns: tuple[int, ...], compared: bool
 ) -> None:
-    watching, _ = look(ZERO, own=AT_REST, **offsets(0.125, spans_ns=spans_ns, apart_mps=9.0, apart_ns=1))
+    watching, _ = look(ZERO, vehicle_motion=AT_REST, **offsets(0.125, spans_ns=spans_ns, apart_mps=9.0, apart_ns=1))
     assert watching.velocity.apart_mps == (pytest.approx(0.125) if compared else None)
     assert watching.velocity.apart_ns is None
     assert not watching.velocity.is_contradicted
@@ -110,7 +109,7 @@ def turning(accel: Vec3, slope: Vec3) -> tuple[float | None, bool]:
     nodes_ns = (times_ns[0] - 1, *times_ns, AT_NS - 1)
     way = tuple((at, 0.5 * ((at - AT_NS) * 1e-9) ** 2 * np.array(accel)) for at in nodes_ns)
     lines = tuple((at, (at - AT_NS) * 1e-9 * np.array(slope)) for at in times_ns)
-    watching, _ = look(ZERO, own=AT_REST, vehicle_path=way, offsets=lines)
+    watching, _ = look(ZERO, vehicle_motion=AT_REST, vehicle_path=way, offsets=lines)
     return watching.velocity.apart_mps, watching.velocity.is_contradicted
 
 
@@ -139,7 +138,7 @@ def test_where_the_way_is_not_known_all_of_a_difference_counts() -> None:
         way = tuple(
             (at, np.array([((at - AT_NS) * 1e-9) ** 2, 0.0, 0.0])) for at in (begins_ns - 1, times_ns[1], AT_NS - 1)
         )
-        watching, _ = look(ZERO, own=AT_REST, vehicle_path=way, offsets=lines)
+        watching, _ = look(ZERO, vehicle_motion=AT_REST, vehicle_path=way, offsets=lines)
         assert watching.velocity.apart_mps == pytest.approx(0.2 if begins_ns > times_ns[0] else 0.0, abs=5e-3)
 
 
@@ -147,12 +146,12 @@ def test_where_the_observer_begins_anew_a_contradiction_has_to_persist() -> None
     """A position that comes three seconds late may still be compared with those before."""
     captured_ns = AT_NS - 2900 * MS
     state = monitors(
-        observer=Observer(AT_NS - 3 * S, np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)),
+        observer=Observer(AT_NS - 3 * SECOND_NS, np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)),
         tick_ns=START_NS,
         vehicle_path=((captured_ns - 50 * MS, np.zeros(3)), (START_NS, np.zeros(3))),
         offsets=tuple((captured_ns - ns * MS, np.array([-0.3e-3 * ns, 0.0, 0.0])) for ns in (500, 250)),
     )
-    watching, breach = update(state, seen(AT_NS, sample(captured_ns, AT_NS), own=AT_REST), PARAMETERS)
+    watching, breach = update(state, seen(AT_NS, sample(captured_ns, AT_NS), vehicle_motion=AT_REST), PARAMETERS)
     assert watching.velocity.apart_mps == pytest.approx(0.3) and watching.velocity.is_contradicted
     assert watching.velocity.apart_ns == captured_ns
     assert breach is not None and breach.text.endswith("and none has come since")
@@ -171,7 +170,7 @@ def test_where_the_observer_begins_anew_a_contradiction_has_to_persist() -> None
 def test_velocities_that_contradicted_each_other_and_then_no_position_comes(
     since_ns: int | None, breached: bool
 ) -> None:
-    _, breach = update(monitors(apart_ns=since_ns, tick_ns=START_NS), seen(AT_NS, own=AT_REST), PARAMETERS)
+    _, breach = update(monitors(apart_ns=since_ns, tick_ns=START_NS), seen(AT_NS, vehicle_motion=AT_REST), PARAMETERS)
     assert (None if breach is None else breach.cause) == (Cause.VELOCITY if breached else None)
     assert breach is None or breach.text.endswith("and none has come since")
 
@@ -183,13 +182,19 @@ def creeping(off_m: float, age_ns: int, *, before: int = 0) -> tuple[MonitorStat
     """A position now, where the vehicle's own way had another place so long before the middle of the offsets."""
     known = offsets(0.0, spans_ns=(256 * MS, 512 * MS))
     middle_ns = AT_NS - 256 * MS
-    older = tuple((middle_ns - age_ns - n * S, np.zeros(3)) for n in range(before, 0, -1))
+    older = tuple((middle_ns - age_ns - n * SECOND_NS, np.zeros(3)) for n in range(before, 0, -1))
     places = (*older, (middle_ns - age_ns, np.array([0.0, -off_m, 0.0])))
-    return look(ZERO, own=AT_REST, places=places, **known)
+    return look(ZERO, vehicle_motion=AT_REST, places=places, **known)
 
 
 @pytest.mark.parametrize(
-    ("age_ns", "within_m"), [(S, 0.25 * 2.16), (5 * S, 0.25 * 2.8), (30 * S - 1, 0.25 * 6.8), (30 * S, math.inf)]
+    ("age_ns", "within_m"),
+    [
+        (SECOND_NS, 0.25 * 2.16),
+        (5 * SECOND_NS, 0.25 * 2.8),
+        (30 * SECOND_NS - 1, 0.25 * 6.8),
+        (30 * SECOND_NS, math.inf),
+    ],
 )
 def test_positions_may_leave_the_vehicles_own_way_by_so_much(age_ns: int, within_m: float) -> None:
     for off_m, breached in ((min(within_m, 99.0) - 1e-6, False), (within_m + 1e-6, True)):
@@ -204,59 +209,66 @@ def test_positions_may_leave_the_vehicles_own_way_by_so_much(age_ns: int, within
 def test_positions_may_leave_the_vehicles_own_way_by_just_so_much() -> None:
     within_m = (2.0 + 0.16) * PARAMETERS.disagreement_mps
     for off_m, breached in ((within_m, False), (just_more(within_m), True)):
-        _, breach = creeping(off_m, S)
+        _, breach = creeping(off_m, SECOND_NS)
         assert (breach is not None) == breached
 
 
 def test_any_place_of_the_way_that_is_too_far_off_is_enough() -> None:
-    _, breach = creeping(9.0, S, before=3)
+    _, breach = creeping(9.0, SECOND_NS, before=3)
     assert breach is not None and breach.text.endswith("in 1 s")
 
 
-@pytest.mark.parametrize(("age_ns", "kept"), [(S - 1, 1), (S, 2), (30 * S - 1, 2), (30 * S, 1), (31 * S, 1)])
+@pytest.mark.parametrize(
+    ("age_ns", "kept"),
+    [(SECOND_NS - 1, 1), (SECOND_NS, 2), (30 * SECOND_NS - 1, 2), (30 * SECOND_NS, 1), (31 * SECOND_NS, 1)],
+)
 def test_a_place_of_the_way_is_remembered_each_second_for_half_a_minute(age_ns: int, kept: int) -> None:
     watching, breach = creeping(0.0, age_ns)
     assert breach is None
     assert len(watching.velocity.places) == kept
-    if kept == 2 or age_ns >= 30 * S:
+    if kept == 2 or age_ns >= 30 * SECOND_NS:
         at_ns, place = watching.velocity.places[-1]
         assert at_ns == AT_NS - 256 * MS and isinstance(at_ns, int)
         np.testing.assert_allclose(place, ZERO, atol=1e-12)
 
 
 def test_a_place_of_the_way_is_remembered_a_second_after_the_last_one() -> None:
-    watching, _ = creeping(0.0, S // 2, before=5)
+    watching, _ = creeping(0.0, SECOND_NS // 2, before=5)
     assert len(watching.velocity.places) == 6
 
 
 def test_the_place_of_the_way_is_the_mean_of_the_offsets() -> None:
-    watching, _ = look(ZERO, own=AT_REST, **offsets(0.125, spans_ns=(100 * MS, 500 * MS)))
+    watching, _ = look(ZERO, vehicle_motion=AT_REST, **offsets(0.125, spans_ns=(100 * MS, 500 * MS)))
     ((at_ns, place),) = watching.velocity.places
     assert at_ns == AT_NS - 200 * MS
     np.testing.assert_allclose(place, (-0.125 * 0.2, 0.0, 0.0), atol=1e-12)
 
 
 def test_over_a_gap_the_way_is_not_compared() -> None:
-    places = ((START_NS - S, (9.0, 0.0, 0.0)),)
+    places = ((START_NS - SECOND_NS, (9.0, 0.0, 0.0)),)
     for spans_ns, kept in (((100 * MS,), True), ((1200 * MS,), False)):
-        watching, breach = look(ZERO, own=AT_REST, places=places, **offsets(0.0, spans_ns=spans_ns))
+        watching, breach = look(ZERO, vehicle_motion=AT_REST, places=places, **offsets(0.0, spans_ns=spans_ns))
         assert breach is None
         assert watching.velocity.places == (places if kept else ())
     silent, _ = look(ZERO, places=places, **offsets(0.0))
-    missed, _ = look(ZERO, own=AT_REST, places=places, **offsets(0.0, vehicle_path=((AT_NS - 301 * MS, np.zeros(3)),)))
+    missed, _ = look(
+        ZERO, vehicle_motion=AT_REST, places=places, **offsets(0.0, vehicle_path=((AT_NS - 301 * MS, np.zeros(3)),))
+    )
     assert silent.velocity.places == missed.velocity.places == ()
     state = monitors(vehicle_path=((START_NS, np.zeros(3)),), places=places)  # the way is not known so early
-    early, _ = update(state, seen(AT_NS, sample(START_NS, AT_NS), own=AT_REST), PARAMETERS)
+    early, _ = update(state, seen(AT_NS, sample(START_NS, AT_NS), vehicle_motion=AT_REST), PARAMETERS)
     assert not early.velocity.offsets and not early.velocity.places
 
 
 def test_velocities_that_contradict_each_other_are_told_before_ways_that_do() -> None:
-    places = ((START_NS - S, (9.0, 0.0, 0.0)),)
-    _, breach = look(ZERO, own=AT_REST, places=places, **offsets(9.0))
+    places = ((START_NS - SECOND_NS, (9.0, 0.0, 0.0)),)
+    _, breach = look(ZERO, vehicle_motion=AT_REST, places=places, **offsets(9.0))
     assert breach is not None and breach.text.startswith("positions move otherwise")
 
 
-@pytest.mark.parametrize(("for_ns", "answered"), [(None, False), (2 * S - 1, False), (2 * S, True), (3 * S, True)])
+@pytest.mark.parametrize(
+    ("for_ns", "answered"), [(None, False), (2 * SECOND_NS - 1, False), (2 * SECOND_NS, True), (3 * SECOND_NS, True)]
+)
 def test_positions_have_answered_after_two_seconds_of_a_flight(for_ns: int | None, answered: bool) -> None:
     watching = monitors(tick_ns=AT_NS, began_ns=None if for_ns is None else AT_NS - for_ns)
     assert watching.confirms_positions == answered
@@ -290,7 +302,7 @@ def test_velocities_that_contradict_each_other_have_to_persist_unless_it_is_plai
     s = LOOK_NS * 1e-9
     place = s * -(s * unexplained_mps2) + 0.5 * s * s * unexplained_mps2
     known = offsets(EXACT_MPS, place_m=place, apart_ns=apart_ns)
-    watching, breach = look((unexplained_mps2, 0.0, 0.0), own=AT_REST, parameters=parameters, **known)
+    watching, breach = look((unexplained_mps2, 0.0, 0.0), vehicle_motion=AT_REST, parameters=parameters, **known)
     assert watching.velocity.apart_mps == EXACT_MPS
     assert watching.velocity.apart_ns == since_ns
     assert watching.velocity.is_contradicted == (since_ns is not None)
@@ -300,21 +312,21 @@ def test_velocities_that_contradict_each_other_have_to_persist_unless_it_is_plai
 def test_the_way_is_known_between_ticks_and_not_before_the_first() -> None:
     for captured_ns, known in ((START_NS, False), (START_NS + 1, True), (AT_NS, True)):
         state = monitors(vehicle_path=((START_NS, np.zeros(3)),))
-        watching, _ = update(state, seen(AT_NS, sample(captured_ns, AT_NS), own=AT_REST), PARAMETERS)
+        watching, _ = update(state, seen(AT_NS, sample(captured_ns, AT_NS), vehicle_motion=AT_REST), PARAMETERS)
         assert [at for at, _ in watching.velocity.offsets] == [captured_ns] * known
 
 
 def test_the_way_is_not_known_after_the_last_tick() -> None:
     way = tuple((START_NS - n * MS, np.zeros(3)) for n in range(300, -1, -1))
     after = sample(AT_NS + 1, AT_NS + 1)
-    watching, _ = update(monitors(vehicle_path=way), seen(AT_NS, after, own=AT_REST), PARAMETERS)
+    watching, _ = update(monitors(vehicle_path=way), seen(AT_NS, after, vehicle_motion=AT_REST), PARAMETERS)
     assert len(watching.motion.vehicle_path) == 302 and watching.velocity.offsets == ()
 
 
 def test_the_way_is_remembered_for_three_seconds() -> None:
-    way = tuple((at, np.zeros(3)) for at in (AT_NS - 3 * S, AT_NS - 3 * S + 1, START_NS))
-    watching, _ = update(monitors(vehicle_path=way), seen(AT_NS, own=AT_REST), PARAMETERS)
-    assert [at for at, _ in watching.motion.vehicle_path] == [AT_NS - 3 * S + 1, START_NS, AT_NS]
+    way = tuple((at, np.zeros(3)) for at in (AT_NS - 3 * SECOND_NS, AT_NS - 3 * SECOND_NS + 1, START_NS))
+    watching, _ = update(monitors(vehicle_path=way), seen(AT_NS, vehicle_motion=AT_REST), PARAMETERS)
+    assert [at for at, _ in watching.motion.vehicle_path] == [AT_NS - 3 * SECOND_NS + 1, START_NS, AT_NS]
 
 
 @pytest.mark.parametrize(
@@ -331,17 +343,17 @@ def test_the_way_is_remembered_for_three_seconds() -> None:
     ],
 )
 def test_a_vehicle_that_says_nothing_of_late_is_not_compared(words: VehicleMotion | None, known: bool) -> None:
-    watching, _ = look(ZERO, own=words, **offsets(0.125))
+    watching, _ = look(ZERO, vehicle_motion=words, **offsets(0.125))
     assert (watching.velocity.apart_mps is not None) == (len(watching.velocity.offsets) == 3) == known
     assert len(watching.motion.vehicle_path) == (3 if known else 0)
-    ours = structs.replace(seen(AT_NS, own=words), velocity_mps=ZERO)
+    ours = structs.replace(seen(AT_NS, vehicle_motion=words), velocity_mps=ZERO)
     assert (trusted_velocity(watching, ours, 0.0, PARAMETERS) is not None) == known
 
 
 @pytest.mark.parametrize(("gap_ns", "known"), [(300 * MS, True), (300 * MS + 1, False)])
 def test_how_far_it_flew_in_ticks_that_were_missed_is_not_known(gap_ns: int, known: bool) -> None:
     before = offsets(0.0, vehicle_path=((AT_NS - gap_ns, np.array([1.0, 2.0, 3.0])),))
-    watching, _ = look(ZERO, own=motion((1.0, 0.0, 0.0), AT_NS), **before)
+    watching, _ = look(ZERO, vehicle_motion=motion((1.0, 0.0, 0.0), AT_NS), **before)
     assert watching.motion.vehicle_path[-1][0] == AT_NS
     assert watching.motion.vehicle_path[-1][1].tolist() == ([1.0 + 0.3, 2.0, 3.0] if known else [0.0, 0.0, 0.0])
     assert [at for at, _ in watching.motion.vehicle_path[:-1]] == [AT_NS - gap_ns] * known
@@ -349,7 +361,7 @@ def test_how_far_it_flew_in_ticks_that_were_missed_is_not_known(gap_ns: int, kno
 
 
 @pytest.mark.parametrize(
-    ("own", "known", "age_s", "contradicted", "believed"),
+    ("vehicle_motion", "known", "age_s", "contradicted", "believed"),
     [
         ((0.25, 0.0, 0.0), ZERO, 0.0, False, True),
         ((just_more(0.25), 0.0, 0.0), ZERO, 0.0, False, False),
@@ -366,7 +378,7 @@ def test_how_far_it_flew_in_ticks_that_were_missed_is_not_known(gap_ns: int, kno
 def test_which_own_velocity_may_be_braked_on(
     own: Vec3, known: Vec3, age_s: float, contradicted: bool, believed: bool
 ) -> None:
-    ours = structs.replace(seen(AT_NS, own=motion(own, AT_NS)), velocity_mps=known)
+    ours = structs.replace(seen(AT_NS, vehicle_motion=motion(own, AT_NS)), velocity_mps=known)
     watching = monitors(is_contradicted=contradicted)
     assert trusted_velocity(watching, ours, age_s, PARAMETERS) == (own if believed else None)
 
@@ -393,7 +405,7 @@ def test_the_first_second_of_positions_after_a_silence_corrects_the_vehicle_s_ow
         moves = back_ms <= now_ms < back_ms + for_ms
         own = motion((1.5 * PARAMETERS.disagreement_mps if moves else 0.0, 0.0, 0.0), at_ns)
         taken = () if 3000 < now_ms < back_ms else (sample(at_ns, at_ns, ZERO),)
-        watching, breach = update(watching, seen(at_ns, *taken, own=own), parameters)
+        watching, breach = update(watching, seen(at_ns, *taken, vehicle_motion=own), parameters)
         if breach is not None:
             assert breach.cause == Cause.VELOCITY
             found_ms.append(now_ms - back_ms)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from flight_rig import MS, TICKS, boundary_ns, inputs_of, make_controller, run, sample
+from flight_rig import MS, TICKS, boundary_ns, make_controller, make_inputs, run, sample
 
 from uavctl.flight.tick import TickOutput
 
@@ -12,7 +12,7 @@ STEPS = 120
 def outputs(lost: set[int]) -> list[TickOutput]:
     """A flight with one position 10 ms before each boundary, but for those of the steps `lost`."""
     samples = [sample(boundary_ns(k) - 10 * MS, boundary_ns(k) - 5 * MS) for k in range(STEPS) if k not in lost]
-    return run(make_controller(), inputs_of(range(STEPS * TICKS), samples))
+    return run(make_controller(), make_inputs(range(STEPS * TICKS), samples))
 
 
 def test_each_boundary_after_the_first_position_counts_once() -> None:

@@ -21,7 +21,7 @@ from flight_rig import (
     drag_lag_generator,
     estimator_parameters,
     make_controller,
-    one_a_step,
+    make_step_samples,
     sample,
     small_plant,
     stub_inputs,
@@ -412,7 +412,7 @@ def boundaries(told: list[TickOutput]) -> list[Decision]:
 
 
 def test_inertial_data_are_news_between_positions_and_the_age_goes_on() -> None:
-    samples = one_a_step(lost=(3, 4, 6, 7), steps=10)
+    samples = make_step_samples(lost=(3, 4, 6, 7), steps=10)
     felt_ones = boundaries(ticks_of(controller_that_feels(), samples, feels=True, count=10 * TICKS))
     unfelt = boundaries(ticks_of(controller_that_feels(), samples, feels=False, count=10 * TICKS))
     assert [one.age_steps for one in felt_ones] == [one.age_steps for one in unfelt]
@@ -423,7 +423,7 @@ def test_inertial_data_are_news_between_positions_and_the_age_goes_on() -> None:
 
 
 def test_a_solver_that_does_not_count_the_age_gets_no_plan_without_a_position() -> None:
-    samples = one_a_step(lost=(3, 4), steps=6)
+    samples = make_step_samples(lost=(3, 4), steps=6)
     controller = replace(controller_that_feels(), late_steps=0)
     for one in boundaries(ticks_of(controller, samples, feels=True, count=6 * TICKS)):
         assert one.plan_index in (None, one.age_steps)
@@ -432,7 +432,7 @@ def test_a_solver_that_does_not_count_the_age_gets_no_plan_without_a_position() 
 def test_a_plan_begins_where_its_first_input_acts() -> None:
     dead_ns = 80 * MS
     controller = controller_that_feels(dead_ns, bias_drift=0.0, bias_max=0.0)
-    told = ticks_of(controller, one_a_step(steps=6), feels=True, count=6 * TICKS)
+    told = ticks_of(controller, make_step_samples(steps=6), feels=True, count=6 * TICKS)
     plans = [one.plan for one in told if one.plan is not None]
     assert [plan.seq for plan in plans] == list(range(6))
     for plan in plans:

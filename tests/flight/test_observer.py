@@ -8,9 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from envelope_rig import PARAMETERS, TICK_NS, Array, S, update, vec3
+from envelope_rig import PARAMETERS, TICK_NS, update, vec3
 from flight_rig import MS, START_NS, sample
 
+from uavctl.arrays import SECOND_NS, Array
 from uavctl.flight.monitors.acceleration import describe_acceleration, describe_push
 from uavctl.flight.monitors.engaged import INITIAL, MonitorState, continue_unengaged
 from uavctl.flight.monitors.observation import Observation
@@ -194,10 +195,10 @@ def test_a_silence_of_inertial_data_goes_on_with_the_wind_that_they_showed() -> 
 def test_the_way_is_the_double_integral_of_its_spans() -> None:
     """Constant, then none, then another acceleration: closed forms."""
     way = extend_path((), START_NS, (2.0, 0.0, 0.0), 0)
-    way = extend_path(way, START_NS + 1 * S, (0.0, 0.0, 0.0), 0)
-    way = extend_path(way, START_NS + 2 * S, (0.0, -1.0, 0.0), 0)
+    way = extend_path(way, START_NS + 1 * SECOND_NS, (0.0, 0.0, 0.0), 0)
+    way = extend_path(way, START_NS + 2 * SECOND_NS, (0.0, -1.0, 0.0), 0)
     rest = np.zeros((3, 3))
-    moved = move_along(way, rest, START_NS, START_NS + 3 * S)
+    moved = move_along(way, rest, START_NS, START_NS + 3 * SECOND_NS)
     np.testing.assert_allclose(moved, [(1.0 + 4.0, -0.5, 0.0), (2.0, -1.0, 0.0), (0.0, 0.0, 0.0)])
     begun = np.array([(1.0, 0.0, 0.0), (0.5, 0.0, 0.0), (0.0, 0.0, 4.0)])
     later = move_along(way, begun, START_NS + 500 * MS, START_NS + 1500 * MS)
@@ -211,10 +212,10 @@ def test_spans_that_ended_before_the_horizon_are_dropped_and_change_nothing() ->
     short: tuple[InertialSpan, ...] = ()
     for n in range(200):
         at_ns, accel = START_NS + n * TICK_NS, rng.normal(size=3)
-        whole, short = extend_path(whole, at_ns, accel, 0), extend_path(short, at_ns, accel, at_ns - S)
-    assert len(whole) == 200 and len(short) == S // TICK_NS + 1
+        whole, short = extend_path(whole, at_ns, accel, 0), extend_path(short, at_ns, accel, at_ns - SECOND_NS)
+    assert len(whole) == 200 and len(short) == SECOND_NS // TICK_NS + 1
     mean = rng.normal(size=(3, 3))
-    since, until = at_ns - S + 7 * MS, at_ns + 20 * MS
+    since, until = at_ns - SECOND_NS + 7 * MS, at_ns + 20 * MS
     np.testing.assert_array_equal(move_along(whole, mean, since, until), move_along(short, mean, since, until))
 
 

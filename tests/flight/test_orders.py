@@ -12,14 +12,14 @@ from flight_rig import (
     TICKS,
     StubSolver,
     assert_sound,
-    boundaries,
-    codes,
-    inputs_of,
+    find_boundaries,
+    list_codes,
+    list_modes,
     make_controller,
-    modes,
-    moving,
-    one_a_step,
-    room_of,
+    make_inputs,
+    make_motion_samples,
+    make_room,
+    make_step_samples,
     run,
     small_plant,
     vehicle,
@@ -44,7 +44,7 @@ def goto(*position_m: float) -> Command:
 
 def places(outputs: list[TickOutput]) -> list[float | None]:
     """North of the target at each boundary."""
-    return [None if one.decision.target is None else one.decision.target[0] for one in boundaries(outputs)]
+    return [None if one.decision.target is None else one.decision.target[0] for one in find_boundaries(outputs)]
 
 
 def answers(output: TickOutput) -> list[tuple[str, str]]:
@@ -56,7 +56,7 @@ def answers(output: TickOutput) -> list[tuple[str, str]]:
 
 
 def between(first_m: float, second_m: float, hold_ns: int = 0, land: bool = False) -> Controller:
-    """The small plant with two waypoints; the vehicle of `one_a_step` stays at 0."""
+    """The small plant with two waypoints; the vehicle of `make_step_samples` stays at 0."""
     controller = make_controller()
     waypoints = tuple(Waypoint(np.array([place, 0.0, 0.0]), hold_ns) for place in (first_m, second_m))
     return replace(controller, mission=replace(controller.mission, waypoints=waypoints, accept_m=0.2, land=land))
@@ -64,15 +64,15 @@ def between(first_m: float, second_m: float, hold_ns: int = 0, land: bool = Fals
 
 def test_goto_flies_to_a_place_and_stays_until_the_mission_is_resumed() -> None:
     commands = {6: (goto(3.0, 9.0, 9.0),), 4 * TICKS: (RESUME,)}
-    outputs = run(between(1.0, 2.0), inputs_of(range(6 * TICKS), one_a_step(), commands=commands))
+    outputs = run(between(1.0, 2.0), make_inputs(range(6 * TICKS), make_step_samples(), commands=commands))
     assert places(outputs) == [1.0, 1.0, 3.0, 3.0, 1.0, 1.0]
-    assert [one.decision.waypoint for one in boundaries(outputs)] == [0, 0, None, None, 0, 0]
+    assert [one.decision.waypoint for one in find_boundaries(outputs)] == [0, 0, None, None, 0, 0]
     assert outputs[2 * TICKS].decision.reason == "news: a new plan, as ordered: goto (3, 9, 9) m"
     assert outputs[4 * TICKS].decision.reason == "news: a new plan, as ordered: resume"
     assert answers(outputs[6]) == [
         (EventCode.ORDER_ACCEPTED, "goto (3, 9, 9) m")
     ]  # axes that the plant has not are ignored
-    assert set(modes(outputs)) == {TRACK}
+    assert set(list_modes(outputs)) == {TRACK}
 
 
 @pytest.mark.parametrize(
@@ -86,9 +86,9 @@ def test_goto_flies_to_a_place_and_stays_until_the_mission_is_resumed() -> None:
     ],
 )
 def test_a_place_where_it_may_not_rest_is_refused_and_the_mission_goes_on(position_m: Vec3 | None, reason: str) -> None:
-    plain = run(between(1.0, 2.0), inputs_of(range(4 * TICKS), one_a_step()))
+    plain = run(between(1.0, 2.0), make_inputs(range(4 * TICKS), make_step_samples()))
     commands = {6: (Command(order=Order.GOTO, position_m=position_m),)}
-    outputs = run(between(1.0, 2.0), inputs_of(range(4 * TICKS), one_a_step(), commands=commands))
+    outputs = run(between(1.0, 2.0), make_inputs(range(4 * TICKS), make_step_samples(), commands=commands))
     assert answers(outputs[6]) == [(EventCode.ORDER_REFUSED, reason)]
     assert outputs[6].events[0].severity is Severity.WARNING
     assert [one.decision for one in outputs] == [one.decision for one in plain]
@@ -97,16 +97,20 @@ def test_a_place_where_it_may_not_rest_is_refused_and_the_mission_goes_on(positi
 
 @pytest.mark.parametrize("edge_m", [5.0, -5.0])
 def test_the_edge_of_the_box_itself_is_flown_to(edge_m: float) -> None:
-    outputs = run(between(1.0, 2.0), inputs_of(range(3 * TICKS), one_a_step(), commands={6: (goto(edge_m, 0, 0),)}))
+    outputs = run(
+        between(1.0, 2.0), make_inputs(range(3 * TICKS), make_step_samples(), commands={6: (goto(edge_m, 0, 0),)})
+    )
     assert places(outputs)[-1] == edge_m
 
 
 def test_hold_stays_where_the_vehicle_comes_to_rest_inside_the_box() -> None:
     for speed_mps, room_m in ((1.0, 5.0), (1.0, 0.7)):
         controller = make_controller()
-        inside = replace(room_of(controller.plant), lower=np.array([-room_m]), upper=np.array([room_m]))
+        inside = replace(make_room(controller.plant), lower=np.array([-room_m]), upper=np.array([room_m]))
         controller = replace(controller, mission=replace(controller.mission, room=inside))
-        outputs = run(controller, inputs_of(range(5 * TICKS), moving(5, speed_mps), commands={9: (STAY,)}))
+        outputs = run(
+            controller, make_inputs(range(5 * TICKS), make_motion_samples(5, speed_mps), commands={9: (STAY,)})
+        )
         estimate = outputs[3 * TICKS].estimate
         assert estimate is not None
         # The rig's room says: half a second of the speed further.
@@ -117,7 +121,7 @@ def test_hold_stays_where_the_vehicle_comes_to_rest_inside_the_box() -> None:
 
 def test_the_last_of_several_orders_counts_and_each_is_answered() -> None:
     commands = {5: (goto(1.0, 0, 0), goto(9.0, 0, 0), goto(2.0, 0, 0)), 6: (ENGAGE,), 7: (goto(3.0, 0, 0),)}
-    outputs = run(between(0.5, 0.6), inputs_of(range(3 * TICKS), one_a_step(), commands=commands))
+    outputs = run(between(0.5, 0.6), make_inputs(range(3 * TICKS), make_step_samples(), commands=commands))
     assert [code for code, _ in answers(outputs[5])] == [
         EventCode.ORDER_ACCEPTED,
         EventCode.ORDER_REFUSED,
@@ -129,20 +133,27 @@ def test_the_last_of_several_orders_counts_and_each_is_answered() -> None:
 
 def test_an_order_waits_for_news_and_for_the_way_back_from_the_fallback() -> None:
     lost = [2, 3]
-    outputs = run(between(1.0, 2.0), inputs_of(range(5 * TICKS), one_a_step(lost), commands={6: (goto(3.0, 0, 0),)}))
+    outputs = run(
+        between(1.0, 2.0), make_inputs(range(5 * TICKS), make_step_samples(lost), commands={6: (goto(3.0, 0, 0),)})
+    )
     assert places(outputs) == [1.0, 1.0, 1.0, 1.0, 3.0]
     gone = range(1, 8)
-    outputs = run(between(1.0, 2.0), inputs_of(range(12 * TICKS), one_a_step(gone), commands={30: (goto(3.0, 0, 0),)}))
+    outputs = run(
+        between(1.0, 2.0), make_inputs(range(12 * TICKS), make_step_samples(gone), commands={30: (goto(3.0, 0, 0),)})
+    )
     assert places(outputs) == [1.0] * 10 + [3.0] * 2
-    assert modes(boundaries(outputs)) == [TRACK] * 4 + [HOLD] * 6 + [TRACK] * 2
+    assert list_modes(find_boundaries(outputs)) == [TRACK] * 4 + [HOLD] * 6 + [TRACK] * 2
 
 
 def test_orders_before_the_flight_are_flown_from_its_first_plan_on() -> None:
     status = {True: vehicle(), False: vehicle(external=False)}
     outputs = run(
         between(1.0, 2.0),
-        inputs_of(
-            range(4 * TICKS), one_a_step(), commands={0: (goto(3.0, 0, 0),)}, status=lambda tick: status[tick >= TICKS]
+        make_inputs(
+            range(4 * TICKS),
+            make_step_samples(),
+            commands={0: (goto(3.0, 0, 0),)},
+            status=lambda tick: status[tick >= TICKS],
         ),
     )
     assert places(outputs) == [None, 3.0, 3.0, 3.0]
@@ -152,23 +163,23 @@ def test_a_waypoint_left_half_way_is_held_for_its_whole_time_afterwards() -> Non
     hold_ns = 400_000_000  # two steps
     commands = {TICKS: (goto(3.0, 0, 0),), 4 * TICKS: (RESUME,)}
     controller = between(0.0, 2.0, hold_ns=hold_ns)
-    outputs = run(controller, inputs_of(range(8 * TICKS), one_a_step(), commands=commands))
+    outputs = run(controller, make_inputs(range(8 * TICKS), make_step_samples(), commands=commands))
     assert places(outputs) == [0.0, 3.0, 3.0, 3.0, 0.0, 0.0, 0.0, 2.0]
 
 
 @pytest.mark.parametrize(("commands", "tick"), [({3: (RESUME,)}, 3), ({3: (STAY,), 8: (RESUME,), 13: (RESUME,)}, 13)])
 def test_what_was_not_left_is_not_resumed(commands: dict[int, tuple[Command, ...]], tick: int) -> None:
-    outputs = run(between(1.0, 2.0), inputs_of(range(5 * TICKS), one_a_step(), commands=commands))
+    outputs = run(between(1.0, 2.0), make_inputs(range(5 * TICKS), make_step_samples(), commands=commands))
     assert answers(outputs[tick]) == [(EventCode.ORDER_REFUSED, "resume: the mission was not left")]
 
 
 @pytest.mark.parametrize("configured", [True, False])
 def test_land_brakes_and_lands_whatever_the_fallback_is_configured_to(configured: bool) -> None:
-    samples = moving(49)
-    outputs = run(make_controller(land=configured), inputs_of(range(100), samples, commands={10: (DOWN,)}))
+    samples = make_motion_samples(49)
+    outputs = run(make_controller(land=configured), make_inputs(range(100), samples, commands={10: (DOWN,)}))
     assert answers(outputs[10]) == [(EventCode.ORDER_ACCEPTED, "land")]
-    ends = modes(outputs).index(LAND)
-    assert modes(outputs) == [TRACK] * 10 + [BRAKE] * (ends - 11) + [HOLD, LAND] + [STOPPED] * (99 - ends)
+    ends = list_modes(outputs).index(LAND)
+    assert list_modes(outputs) == [TRACK] * 10 + [BRAKE] * (ends - 11) + [HOLD, LAND] + [STOPPED] * (99 - ends)
     assert 11 < ends <= 52  # brake_s = 2 s
     assert [tick for tick, output in enumerate(outputs) if output.land] == [ends]
     assert {event.severity for event in outputs[10].events} == {Severity.INFO}
@@ -177,14 +188,14 @@ def test_land_brakes_and_lands_whatever_the_fallback_is_configured_to(configured
 
 def test_on_the_way_down_other_orders_are_refused() -> None:
     commands = {10: (DOWN,), 11: (goto(1.0, 0, 0), STAY), 12: (RESUME,), 90: (DOWN,)}
-    outputs = run(make_controller(), inputs_of(range(100), moving(49), commands=commands))
+    outputs = run(make_controller(), make_inputs(range(100), make_motion_samples(49), commands=commands))
     assert [text for _, text in answers(outputs[11])] == [
         "goto (1, 0, 0) m: the vehicle is on its way down",
         "hold: the vehicle is on its way down",
     ]
     assert answers(outputs[12])[0][0] == EventCode.ORDER_REFUSED
     assert answers(outputs[90]) == [(EventCode.ORDER_REFUSED, "land: the vehicle has been handed over")]
-    assert STOPPED in modes(outputs)
+    assert STOPPED in list_modes(outputs)
 
 
 @pytest.mark.parametrize(
@@ -196,19 +207,24 @@ def test_on_the_way_down_other_orders_are_refused() -> None:
     ],
 )
 def test_what_is_not_flown_is_not_landed(status: VehicleStatus | None, reason: str) -> None:
-    outputs = run(make_controller(), inputs_of(range(8), one_a_step(), commands={4: (DOWN,)}, status=lambda _: status))
+    outputs = run(
+        make_controller(), make_inputs(range(8), make_step_samples(), commands={4: (DOWN,)}, status=lambda _: status)
+    )
     assert answers(outputs[4]) == [(EventCode.ORDER_REFUSED, reason)]
-    assert set(modes(outputs)) == {WAIT}
+    assert set(list_modes(outputs)) == {WAIT}
 
 
 def test_a_landing_ordered_while_the_vehicle_is_silent_waits_until_it_is_heard() -> None:
     silent = range(8, 60)
-    inputs = inputs_of(
-        range(70), moving(49), commands={20: (DOWN,)}, status=lambda tick: None if tick in silent else vehicle()
+    inputs = make_inputs(
+        range(70),
+        make_motion_samples(49),
+        commands={20: (DOWN,)},
+        status=lambda tick: None if tick in silent else vehicle(),
     )
     outputs = run(make_controller(land=False), inputs)
     assert answers(outputs[20]) == [(EventCode.ORDER_ACCEPTED, "land")]
-    assert modes(outputs).index(LAND) == 60
+    assert list_modes(outputs).index(LAND) == 60
     muted = [tick for tick, one in enumerate(outputs) if one.setpoint is None]
     assert muted == list(range(muted[0], 70))  # from where landing was due on
 
@@ -216,40 +232,40 @@ def test_a_landing_ordered_while_the_vehicle_is_silent_waits_until_it_is_heard()
 @pytest.mark.parametrize("order", [goto(3.0, 0, 0), STAY])
 def test_losing_every_position_ends_an_order_to_stay_too(order: Command) -> None:
     lost = range(6, 999)
-    outputs = run(make_controller(), inputs_of(range(60 * TICKS), one_a_step(lost), commands={9: (order,)}))
+    outputs = run(make_controller(), make_inputs(range(60 * TICKS), make_step_samples(lost), commands={9: (order,)}))
     falls = (5 + HORIZON) * TICKS
-    assert modes(outputs)[:falls] == [TRACK] * falls
-    assert modes(outputs)[falls] in (BRAKE, HOLD)
-    assert modes(outputs).index(LAND) <= falls + 40 + 60  # brake_s = 2 s, hold_s = 3 s
-    assert modes(outputs)[-1] is STOPPED
+    assert list_modes(outputs)[:falls] == [TRACK] * falls
+    assert list_modes(outputs)[falls] in (BRAKE, HOLD)
+    assert list_modes(outputs).index(LAND) <= falls + 40 + 60  # brake_s = 2 s, hold_s = 3 s
+    assert list_modes(outputs)[-1] is STOPPED
 
 
 def test_a_mission_may_end_in_landing_after_the_last_waypoint_s_time() -> None:
     controller = between(0.0, 0.1, hold_ns=400_000_000, land=True)
-    outputs = run(controller, inputs_of(range(9 * TICKS), one_a_step()))
+    outputs = run(controller, make_inputs(range(9 * TICKS), make_step_samples()))
     # Arrives at once, two steps there; then a step to the next, which is as near, and two steps there.
     lands = 5 * TICKS
     assert outputs[lands].decision.reason == "the mission is over: landing"
-    assert modes(outputs)[:lands] == [TRACK] * lands
-    assert modes(outputs).index(LAND) == modes(outputs).index(HOLD) + 1
-    assert modes(outputs)[-1] is STOPPED
-    held = run(between(0.0, 0.1, hold_ns=400_000_000), inputs_of(range(9 * TICKS), one_a_step()))
-    assert set(modes(held)) == {TRACK}
+    assert list_modes(outputs)[:lands] == [TRACK] * lands
+    assert list_modes(outputs).index(LAND) == list_modes(outputs).index(HOLD) + 1
+    assert list_modes(outputs)[-1] is STOPPED
+    held = run(between(0.0, 0.1, hold_ns=400_000_000), make_inputs(range(9 * TICKS), make_step_samples()))
+    assert set(list_modes(held)) == {TRACK}
 
 
 def test_an_order_puts_the_landing_at_the_end_off() -> None:
     controller = between(0.0, 0.1, land=True)
     commands = {1: (goto(1.0, 0, 0),), 6 * TICKS: (RESUME,)}
-    outputs = run(controller, inputs_of(range(12 * TICKS), one_a_step(), commands=commands))
-    assert modes(outputs)[: 6 * TICKS] == [TRACK] * 6 * TICKS
-    assert LAND in modes(outputs)
+    outputs = run(controller, make_inputs(range(12 * TICKS), make_step_samples(), commands=commands))
+    assert list_modes(outputs)[: 6 * TICKS] == [TRACK] * 6 * TICKS
+    assert LAND in list_modes(outputs)
 
 
 def test_a_plant_that_cannot_rest_everywhere_is_not_sent_anywhere() -> None:
     controller = make_controller()
     controller = replace(controller, mission=replace(controller.mission, room=None))
     commands = {3: (goto(1.0, 0, 0), STAY)}
-    outputs = run(controller, inputs_of(range(2 * TICKS), one_a_step(), commands=commands))
+    outputs = run(controller, make_inputs(range(2 * TICKS), make_step_samples(), commands=commands))
     reason = "there are places where this plant cannot rest"
     assert answers(outputs[3]) == [
         (EventCode.ORDER_REFUSED, f"goto (1, 0, 0) m: {reason}"),
@@ -259,7 +275,7 @@ def test_a_plant_that_cannot_rest_everywhere_is_not_sent_anywhere() -> None:
 
 def test_orders_and_their_answers_are_replayed_bit_for_bit() -> None:
     commands = {6: (goto(3.0, 0, 0),), 11: (STAY,), 17: (RESUME,), 40: (DOWN,)}
-    inputs = inputs_of(range(20 * TICKS), moving(80), commands=commands)
+    inputs = make_inputs(range(20 * TICKS), make_motion_samples(80), commands=commands)
     assert run(make_controller(), inputs) == run(make_controller(StubSolver(small_plant())), inputs)
 
 
@@ -295,5 +311,5 @@ def test_a_configured_flight_knows_where_it_may_rest(preset: str) -> None:
 
 
 def test_events_of_orders_are_told_before_what_they_bring_about() -> None:
-    outputs = run(make_controller(), inputs_of(range(20), moving(9), commands={10: (DOWN,)}))
-    assert list(codes(outputs[10])) == [EventCode.ORDER_ACCEPTED, "fallback-brake"]
+    outputs = run(make_controller(), make_inputs(range(20), make_motion_samples(9), commands={10: (DOWN,)}))
+    assert list(list_codes(outputs[10])) == [EventCode.ORDER_ACCEPTED, "fallback-brake"]

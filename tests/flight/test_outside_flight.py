@@ -10,13 +10,13 @@ from flight_rig import (
     TICK_NS,
     TICKS,
     StubSolver,
-    boundaries,
-    codes,
-    inputs_of,
+    find_boundaries,
+    list_codes,
+    list_modes,
     make_controller,
-    modes,
-    moving,
-    one_a_step,
+    make_inputs,
+    make_motion_samples,
+    make_step_samples,
     run,
     small_plant,
     vehicle,
@@ -52,13 +52,13 @@ def timed(inputs: list[StepInput], took_ns: dict[int, int]) -> list[StepInput]:
 
 def test_one_that_fails_is_braked_at_once_told_once_and_landed() -> None:
     solver = StubSolver(small_plant(), faults={8: failed})
-    outputs = run(flown_by(solver), inputs_of(range(120), moving(40)))
+    outputs = run(flown_by(solver), make_inputs(range(120), make_motion_samples(40)))
     fell = outputs[8 * TICKS]
     assert fell.decision.mode is ControlMode.BRAKE and fell.decision.reason == WHY
     assert fell.decision.solve is SolveStatus.FAILED
-    assert set(codes(fell)) == {CONTROLLER_FAULT, "fallback-brake"}
+    assert set(list_codes(fell)) == {CONTROLLER_FAULT, "fallback-brake"}
     assert told(outputs) == [WHY]
-    after = modes(outputs[8 * TICKS :])
+    after = list_modes(outputs[8 * TICKS :])
     assert ControlMode.TRACK not in after and after[-1] is ControlMode.STOPPED
     assert [one.land for one in outputs].count(True) == 1
     assert solver.asked[-1][0] == 8
@@ -67,7 +67,7 @@ def test_one_that_fails_is_braked_at_once_told_once_and_landed() -> None:
 def test_it_is_not_asked_again_when_the_pilot_gives_the_vehicle_back() -> None:
     solver = StubSolver(small_plant(), faults={8: failed})
     away = range(8 * TICKS + 2, 12 * TICKS)
-    inputs = inputs_of(range(120), moving(40), status=lambda tick: vehicle(external=tick not in away))
+    inputs = make_inputs(range(120), make_motion_samples(40), status=lambda tick: vehicle(external=tick not in away))
     outputs = run(flown_by(solver), inputs)
     assert outputs[away[0]].decision.mode is ControlMode.WAIT
     back = outputs[12 * TICKS]
@@ -77,8 +77,8 @@ def test_it_is_not_asked_again_when_the_pilot_gives_the_vehicle_back() -> None:
 
 def test_a_plan_of_ours_that_fails_plays_out_as_before() -> None:
     solver = StubSolver(small_plant(), faults={8: lambda one: Answer.failed(one.seq, SolveStatus.FAILED, "x")})
-    outputs = run(make_controller(solver), inputs_of(range(60), one_a_step()))
-    assert set(modes(boundaries(outputs)[1:])) == {ControlMode.TRACK} and not told(outputs)
+    outputs = run(make_controller(solver), make_inputs(range(60), make_step_samples()))
+    assert set(list_modes(find_boundaries(outputs)[1:])) == {ControlMode.TRACK} and not told(outputs)
     assert solver.asked[-1][0] == 14
 
 
@@ -94,11 +94,11 @@ def test_a_plan_of_ours_that_fails_plays_out_as_before() -> None:
     ],
 )
 def test_one_that_is_late_too_often_or_far_too_late_is_braked(took_ns: dict[int, int], ends_in: int | None) -> None:
-    inputs = timed(inputs_of(range(60), one_a_step()), took_ns)
+    inputs = timed(make_inputs(range(60), make_step_samples()), took_ns)
     outputs = run(flown_by(StubSolver(small_plant())), inputs)
-    fell = [n for n, mode in enumerate(modes(outputs)) if mode is ControlMode.BRAKE]
+    fell = [n for n, mode in enumerate(list_modes(outputs)) if mode is ControlMode.BRAKE]
     assert fell[:1] == ([] if ends_in is None else [ends_in])
     assert len(told(outputs)) == (0 if ends_in is None else 1)
     if ends_in is not None:
         assert outputs[ends_in].decision.reason == told(outputs)[0]
-        assert ControlMode.TRACK not in modes(outputs[ends_in:])
+        assert ControlMode.TRACK not in list_modes(outputs[ends_in:])

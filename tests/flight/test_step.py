@@ -16,10 +16,10 @@ from flight_rig import (
     TICKS,
     StubSolver,
     boundary_ns,
-    inputs_of,
+    list_modes,
     make_controller,
-    modes,
-    one_a_step,
+    make_inputs,
+    make_step_samples,
     run,
     sample,
     small_plant,
@@ -35,8 +35,8 @@ WAIT, TRACK, BRAKE = ControlMode.WAIT, ControlMode.TRACK, ControlMode.BRAKE
 
 def test_plans_at_the_first_boundary_with_a_position_and_holds_the_input_until_the_next() -> None:
     controller = make_controller()
-    outputs = run(controller, inputs_of(range(2 * TICKS), one_a_step()))
-    assert modes(outputs) == [TRACK] * 2 * TICKS
+    outputs = run(controller, make_inputs(range(2 * TICKS), make_step_samples()))
+    assert list_modes(outputs) == [TRACK] * 2 * TICKS
     for tick, output in enumerate(outputs):
         number = tick // TICKS
         decision, setpoint = output.decision, output.setpoint
@@ -54,7 +54,7 @@ def test_plans_at_the_first_boundary_with_a_position_and_holds_the_input_until_t
 
 def test_a_plan_starts_from_the_estimate_at_the_boundary_and_says_where_it_comes_from() -> None:
     solver = StubSolver(small_plant())
-    output = run(make_controller(solver), inputs_of(range(1), one_a_step()))[0]
+    output = run(make_controller(solver), make_inputs(range(1), make_step_samples()))[0]
     plan, estimate = output.plan, output.estimate
     assert plan is not None
     assert estimate is not None
@@ -64,8 +64,8 @@ def test_a_plan_starts_from_the_estimate_at_the_boundary_and_says_where_it_comes
 
 
 def test_nothing_is_sent_before_the_first_position() -> None:
-    outputs = run(make_controller(), inputs_of(range(TICKS), []))
-    assert modes(outputs) == [WAIT] * TICKS
+    outputs = run(make_controller(), make_inputs(range(TICKS), []))
+    assert list_modes(outputs) == [WAIT] * TICKS
     for output in outputs:
         decision = output.decision
         assert (output.setpoint, output.estimate, decision.input, decision.age_steps) == (None, None, None, None)
@@ -81,8 +81,10 @@ def test_nothing_is_sent_before_the_first_position() -> None:
 )
 def test_a_vehicle_that_takes_no_setpoints_gets_a_neutral_stream(status: VehicleStatus | None, reason: str) -> None:
     solver = StubSolver(small_plant())
-    outputs = run(make_controller(solver), inputs_of(range(3 * TICKS), one_a_step(), status=lambda tick: status))
-    assert modes(outputs) == [WAIT] * 3 * TICKS
+    outputs = run(
+        make_controller(solver), make_inputs(range(3 * TICKS), make_step_samples(), status=lambda tick: status)
+    )
+    assert list_modes(outputs) == [WAIT] * 3 * TICKS
     assert {output.decision.reason for output in outputs} == {reason}
     for output in outputs:
         assert output.setpoint is not None
@@ -94,10 +96,10 @@ def test_engages_at_a_boundary_and_lets_go_at_once() -> None:
     external = range(2, 2 * TICKS + 1)
     outputs = run(
         make_controller(),
-        inputs_of(range(3 * TICKS), one_a_step(), status=lambda tick: vehicle(external=tick in external)),
+        make_inputs(range(3 * TICKS), make_step_samples(), status=lambda tick: vehicle(external=tick in external)),
     )
     want = [WAIT] * TICKS + [TRACK] * (TICKS + 1) + [WAIT] * (TICKS - 1)
-    assert modes(outputs) == want
+    assert list_modes(outputs) == want
     assert outputs[2].decision.reason == "waits for the next boundary"
     assert [event.code for event in outputs[2 * TICKS + 1].events] == ["disengaged"]
 
@@ -106,10 +108,10 @@ def test_a_missed_boundary_is_decided_in_the_next_tick_as_it_would_have_been_the
     solver = StubSolver(small_plant())
     punctual, late = make_controller(), make_controller(solver)
     after_the_boundary = sample(boundary_ns(2) + 10 * MS, position_m=(0.3, 0.0, 0.0))
-    samples = [*one_a_step(), after_the_boundary]
+    samples = [*make_step_samples(), after_the_boundary]
     missing = [tick for tick in range(3 * TICKS) if tick != 2 * TICKS]
-    on_time = run(punctual, inputs_of(range(3 * TICKS), samples))
-    outputs = {output.decision.tick: output for output in run(late, inputs_of(missing, samples))}
+    on_time = run(punctual, make_inputs(range(3 * TICKS), samples))
+    outputs = {output.decision.tick: output for output in run(late, make_inputs(missing, samples))}
     output, other = outputs[2 * TICKS + 1], on_time[2 * TICKS]
     assert output.decision.boundary
     assert output.plan is not None
@@ -123,15 +125,15 @@ def test_a_missed_boundary_is_decided_in_the_next_tick_as_it_would_have_been_the
 
 def test_a_flight_may_begin_between_boundaries() -> None:
     first = 5 * TICKS + 1
-    samples = [sample(START_NS + first * TICK_NS - 10 * MS), *one_a_step()]
-    outputs = run(make_controller(), inputs_of(range(first, first + TICKS), [samples[0], *samples[7:]]))
-    assert modes(outputs) == [WAIT] * (TICKS - 1) + [TRACK]
+    samples = [sample(START_NS + first * TICK_NS - 10 * MS), *make_step_samples()]
+    outputs = run(make_controller(), make_inputs(range(first, first + TICKS), [samples[0], *samples[7:]]))
+    assert list_modes(outputs) == [WAIT] * (TICKS - 1) + [TRACK]
     assert outputs[0].decision.reason.startswith("no position")
 
 
 def test_the_estimator_knows_the_input_after_the_last_gate() -> None:
     solver = StubSolver(small_plant(), faults={0: lambda answer: replace(answer, inputs=answer.inputs * 0.0 + 50.0)})
-    outputs = run(make_controller(solver), inputs_of(range(TICKS + 1), [sample(START_NS, velocity_mps=(0, 0, 0))]))
+    outputs = run(make_controller(solver), make_inputs(range(TICKS + 1), [sample(START_NS, velocity_mps=(0, 0, 0))]))
     begin, end = outputs[0].estimate, outputs[TICKS].estimate
     assert begin is not None
     assert end is not None
@@ -151,13 +153,13 @@ def test_the_same_inputs_give_the_same_bits_from_a_rebuilt_controller_too() -> N
         for n in range(60)
         if rng.random() < 0.5
     ]
-    inputs = inputs_of(range(60 * TICKS), samples)
+    inputs = make_inputs(range(60 * TICKS), samples)
     solver = StubSolver(small_plant(("north", "east")))
     controller = make_controller(solver, land=False)
     rebuilt = pickle.loads(pickle.dumps(controller))
     once, again, other = run(controller, inputs), run(controller, inputs), run(rebuilt, inputs)
     assert once == again == other
-    assert {TRACK, BRAKE} <= set(modes(once))
+    assert {TRACK, BRAKE} <= set(list_modes(once))
 
 
 def test_ticks_must_divide_the_step_and_the_target_must_fit() -> None:

@@ -14,11 +14,11 @@ from flight_rig import (
     TICK_NS,
     TICKS,
     StubSolver,
-    inputs_of,
+    list_modes,
     make_controller,
-    modes,
-    moving,
-    one_a_step,
+    make_inputs,
+    make_motion_samples,
+    make_step_samples,
     run,
     sample,
     small_plant,
@@ -50,11 +50,11 @@ def controller() -> Controller:
 def fly(ours: Controller, status: VehicleStatus | None, position_m: Vec3 = MILLIMETRES) -> list[ControlMode]:
     times_ns = [START_NS + n * 2 * TICK_NS for n in range(N_TICKS // 2)]
     said = [sample(at_ns, position_m=position_m) for at_ns in times_ns]
-    outputs = run(ours, inputs_of(range(N_TICKS), said, status=lambda tick: status))
+    outputs = run(ours, make_inputs(range(N_TICKS), said, status=lambda tick: status))
     found = [event.code for output in outputs for event in output.events if event.code == Cause.OUTSIDE]
-    assert len(found) == (ControlMode.LAND in modes(outputs))
+    assert len(found) == (ControlMode.LAND in list_modes(outputs))
     assert sum(output.land for output in outputs) == len(found)
-    return modes(outputs)
+    return list_modes(outputs)
 
 
 @pytest.mark.fault(45)
@@ -70,18 +70,19 @@ def test_whoever_waits_in_the_air_for_a_position_that_can_be_lands() -> None:
 @pytest.mark.parametrize("wrong", [(5,), (5, 6)])
 def test_whoever_flies_brakes_at_the_second_position_in_a_row_that_cannot_be(wrong: tuple[int, ...]) -> None:
     said = [
-        replace(one, position_m=MILLIMETRES) if step in wrong else one for step, one in enumerate(one_a_step(steps=14))
+        replace(one, position_m=MILLIMETRES) if step in wrong else one
+        for step, one in enumerate(make_step_samples(steps=14))
     ]
-    outputs = run(controller(), inputs_of(range(14 * TICKS), said))
-    braked = [tick for tick, mode in enumerate(modes(outputs)) if mode is ControlMode.BRAKE]
+    outputs = run(controller(), make_inputs(range(14 * TICKS), said))
+    braked = [tick for tick, mode in enumerate(list_modes(outputs)) if mode is ControlMode.BRAKE]
     if len(wrong) == 1:
         assert not braked
         return
     assert braked[0] == 6 * TICKS
     assert outputs[braked[0]].decision.reason.startswith("positions are further out")
-    assert modes(outputs)[-1] is ControlMode.TRACK  # they are believed again
-    plain = run(make_controller(), inputs_of(range(14 * TICKS), said))
-    assert ControlMode.BRAKE not in modes(plain)  # without an envelope both count as lost
+    assert list_modes(outputs)[-1] is ControlMode.TRACK  # they are believed again
+    plain = run(make_controller(), make_inputs(range(14 * TICKS), said))
+    assert ControlMode.BRAKE not in list_modes(plain)  # without an envelope both count as lost
 
 
 @pytest.mark.parametrize(
@@ -108,11 +109,11 @@ def test_where_nothing_tells_whether_it_drifts_it_is_not_held_for_long(
 ) -> None:
     ours = controller()
     ours = changed(ours, fallback=changed(ours.fallback, hold_s=hold_s, blind_hold_s=0.5))
-    inputs = inputs_of(range(140), one_a_step(lost=range(4, 1000)))
+    inputs = make_inputs(range(140), make_step_samples(lost=range(4, 1000)))
     if tells:
         inputs = [replace(inp, motion=motion((0.0, 0.0, 0.0), inp.at_ns)) for inp in inputs]
     outputs = run(ours, inputs)
-    seen = modes(outputs)
+    seen = list_modes(outputs)
     assert seen.count(ControlMode.HOLD) == held_s * 1e9 / TICK_NS
     landed = outputs[seen.index(ControlMode.LAND)].decision
     assert f"held for {held_s:.1f} s" in landed.reason and "landing" in landed.reason
@@ -129,7 +130,7 @@ def test_once_positions_were_taken_back_plans_are_made_anew_until_the_slew_limit
         return replace(intake, clean_ns=START_NS + 3 * DT_NS - 60 * MS) if tick == 4 * TICKS + 1 else intake
 
     solver = StubSolver(small_plant(), 20)
-    inputs = inputs_of(range(12 * TICKS), moving(3))
+    inputs = make_inputs(range(12 * TICKS), make_motion_samples(3))
     run(make_controller(solver, horizon=20), inputs)
     asked = [number for number, _ in solver.asked]
     assert asked == [0, 1, 2, 3]  # as there is news
@@ -199,7 +200,7 @@ def climbing(accel_mps2: Vec3 | None) -> list[str]:
     """What is held against positions that leap 0.6 m about, of an armed vehicle that others fly; with what it feels."""
     ours = changed(make_controller(), envelope=changed(PARAMETERS, axes=(True, False, False), disagreement_mps=1e3))
     said = [sample(START_NS + n * 2 * TICK_NS, position_m=(0.6 * (n // 10 % 2), 0.0, 0.0)) for n in range(N_TICKS // 2)]
-    given = inputs_of(range(N_TICKS), said, status=lambda tick: vehicle(external=False))
+    given = make_inputs(range(N_TICKS), said, status=lambda tick: vehicle(external=False))
     felt = () if accel_mps2 is None else (InertialSample(at_ns=START_NS, accel_mps2=accel_mps2),)
     outputs = run(ours, [replace(one, inertial=felt) for one in given])
     return [output.unsafe_to_climb for output in outputs]

@@ -14,13 +14,13 @@ from flight_rig import (
     START_NS,
     TICKS,
     StubSolver,
-    boundaries,
     boundary_ns,
-    inputs_of,
+    find_boundaries,
+    list_modes,
     make_controller,
-    modes,
-    moving,
-    one_a_step,
+    make_inputs,
+    make_motion_samples,
+    make_step_samples,
     run,
     sample,
     small_plant,
@@ -34,20 +34,20 @@ WAIT, TRACK, BRAKE, HOLD, LAND, STOPPED = ControlMode
 
 @pytest.mark.fault(3)
 def test_fallback_brakes_holds_and_lands_once_each_in_its_time() -> None:
-    outputs = run(make_controller(), inputs_of(range(220), moving(0)))
-    begins = {mode: modes(outputs).index(mode) for mode in (TRACK, BRAKE, HOLD, LAND, STOPPED)}
+    outputs = run(make_controller(), make_inputs(range(220), make_motion_samples(0)))
+    begins = {mode: list_modes(outputs).index(mode) for mode in (TRACK, BRAKE, HOLD, LAND, STOPPED)}
     assert begins[TRACK] == 0
     assert begins[BRAKE] == HORIZON * TICKS
     assert begins[HOLD] <= begins[BRAKE] + 40  # brake_s = 2 s
     assert begins[LAND] == begins[HOLD] + 60  # hold_s = 3 s
     assert begins[STOPPED] == begins[LAND] + 1
-    assert modes(outputs) == sorted(modes(outputs), key=[TRACK, BRAKE, HOLD, LAND, STOPPED].index)
+    assert list_modes(outputs) == sorted(list_modes(outputs), key=[TRACK, BRAKE, HOLD, LAND, STOPPED].index)
     assert [tick for tick, output in enumerate(outputs) if output.land] == [begins[LAND]]
     assert all((output.setpoint is None) == (tick >= begins[LAND]) for tick, output in enumerate(outputs))
 
 
 def test_braking_takes_the_predicted_velocity_to_zero() -> None:
-    outputs = run(make_controller(), inputs_of(range(220), moving(0)))
+    outputs = run(make_controller(), make_inputs(range(220), make_motion_samples(0)))
     braking = [output for output in outputs if output.decision.mode is BRAKE]
     for output in braking:
         assert output.estimate is not None
@@ -65,15 +65,15 @@ def test_braking_takes_the_predicted_velocity_to_zero() -> None:
 @pytest.mark.fault(3)
 def test_without_landing_it_holds_on_and_recovers_however_late() -> None:
     silent = range(1, 100)
-    outputs = run(make_controller(land=False), inputs_of(range(105 * TICKS), one_a_step(lost=silent)))
-    assert modes(boundaries(outputs))[60:] == [HOLD] * 42 + [TRACK] * 3
+    outputs = run(make_controller(land=False), make_inputs(range(105 * TICKS), make_step_samples(lost=silent)))
+    assert list_modes(find_boundaries(outputs))[60:] == [HOLD] * 42 + [TRACK] * 3
 
 
 @pytest.mark.fault(9)
 def test_recovers_with_a_new_plan_at_the_third_fresh_sample_in_a_row() -> None:
     lost = [*range(1, 6), *range(8, 12), 13]  # four lost in a row break it, one does not
-    outputs = boundaries(run(make_controller(), inputs_of(range(17 * TICKS), one_a_step(lost))))
-    assert modes(outputs) == [TRACK] * 4 + [HOLD] * 11 + [TRACK] * 2  # at rest: nothing to brake
+    outputs = find_boundaries(run(make_controller(), make_inputs(range(17 * TICKS), make_step_samples(lost))))
+    assert list_modes(outputs) == [TRACK] * 4 + [HOLD] * 11 + [TRACK] * 2  # at rest: nothing to brake
     assert [output.decision.fresh for output in outputs[4:16]] == [0, 0, 1, 2, 2, 2, 2, 0, 1, 1, 2, 3]
     recovered = outputs[15]
     assert recovered.plan is not None
@@ -85,18 +85,18 @@ def test_recovers_with_a_new_plan_at_the_third_fresh_sample_in_a_row() -> None:
 def test_a_late_sample_is_not_a_fresh_one() -> None:
     late_ns = HORIZON * DT_NS // 3
     old = [sample(boundary_ns(n) - 50 * MS, boundary_ns(n) - 50 * MS + late_ns) for n in range(6, 20)]
-    samples = [*one_a_step(steps=1), *old]
-    outputs = boundaries(run(make_controller(land=False), inputs_of(range(20 * TICKS), samples)))
-    assert TRACK not in modes(outputs)[4:]
+    samples = [*make_step_samples(steps=1), *old]
+    outputs = find_boundaries(run(make_controller(land=False), make_inputs(range(20 * TICKS), samples)))
+    assert TRACK not in list_modes(outputs)[4:]
     assert {output.decision.fresh for output in outputs[4:]} == {0}
 
 
 def test_recovers_with_a_camera_slower_than_a_step() -> None:
     seen_ns = [START_NS + n * 333_333_333 for n in range(20) if not 3 < n < 9]  # 3 Hz; none after 1 s, until 3 s
     samples = [sample(at_ns, at_ns + 20 * MS) for at_ns in seen_ns]
-    outputs = boundaries(run(make_controller(), inputs_of(range(30 * TICKS), samples)))
+    outputs = find_boundaries(run(make_controller(), make_inputs(range(30 * TICKS), samples)))
     # The third one, of 3.67 s, is there at the boundary of 3.8 s.
-    assert [mode is TRACK for mode in modes(outputs)[1:]] == [True] * 8 + [False] * 10 + [True] * 11
+    assert [mode is TRACK for mode in list_modes(outputs)[1:]] == [True] * 8 + [False] * 10 + [True] * 11
 
 
 # With a phase of 20 ms a tick takes the sample 230 ms after its capture.
@@ -104,9 +104,9 @@ def test_recovers_with_a_camera_slower_than_a_step() -> None:
 def test_recovers_over_a_link_that_is_always_one_step_late(phase_ms: int, falls: int, recovers: int) -> None:
     seen_ns = [boundary_ns(n) + phase_ms * MS for n in range(30) if not 2 < n < 9]
     samples = [sample(at_ns, at_ns + 190 * MS) for at_ns in seen_ns]
-    outputs = boundaries(run(make_controller(), inputs_of(range(20 * TICKS), samples)))
+    outputs = find_boundaries(run(make_controller(), make_inputs(range(20 * TICKS), samples)))
     want = [True] * (falls - 2) + [False] * (recovers - falls) + [True] * (20 - recovers)
-    assert [mode is TRACK for mode in modes(outputs)[2:]] == want
+    assert [mode is TRACK for mode in list_modes(outputs)[2:]] == want
 
 
 def silent_in(ticks: range) -> Callable[[int], VehicleStatus | None]:
@@ -116,12 +116,12 @@ def silent_in(ticks: range) -> Callable[[int], VehicleStatus | None]:
 @pytest.mark.fault(27)
 def test_a_vehicle_that_falls_silent_in_flight_is_braked_and_held_and_flown_again_when_it_is_back() -> None:
     silent = range(10, 30)
-    outputs = run(make_controller(), inputs_of(range(40), moving(60, 0.5), status=silent_in(silent)))
-    assert modes(outputs)[:11] == [TRACK] * 10 + [BRAKE]
+    outputs = run(make_controller(), make_inputs(range(40), make_motion_samples(60, 0.5), status=silent_in(silent)))
+    assert list_modes(outputs)[:11] == [TRACK] * 10 + [BRAKE]
     assert "no vehicle" in outputs[10].decision.reason
-    assert set(modes(outputs)[10:30]) <= {BRAKE, HOLD}
+    assert set(list_modes(outputs)[10:30]) <= {BRAKE, HOLD}
     assert all(one.setpoint is not None for one in outputs)
-    assert modes(outputs)[-5:] == [TRACK] * 5
+    assert list_modes(outputs)[-5:] == [TRACK] * 5
 
 
 @pytest.mark.fault(27)
@@ -129,12 +129,15 @@ def test_a_vehicle_that_falls_silent_in_flight_is_braked_and_held_and_flown_agai
 def test_a_vehicle_that_was_silent_for_longer_than_it_is_held_lands_though_positions_are_there(
     heard_again: int,
 ) -> None:
-    outputs = run(make_controller(), inputs_of(range(170), moving(60, 0.5), status=silent_in(range(10, heard_again))))
+    outputs = run(
+        make_controller(),
+        make_inputs(range(170), make_motion_samples(60, 0.5), status=silent_in(range(10, heard_again))),
+    )
     muted = next(tick for tick, one in enumerate(outputs) if one.setpoint is None)
     assert 10 + 60 <= muted <= 10 + 40 + 60 + 1  # hold_s = 3 s after at most brake_s = 2 s
-    assert set(modes(outputs)[muted:heard_again]) == {HOLD}
+    assert set(list_modes(outputs)[muted:heard_again]) == {HOLD}
     assert all(one.setpoint is None for one in outputs[muted:])
-    assert modes(outputs)[heard_again : heard_again + 2] == [LAND, STOPPED]
+    assert list_modes(outputs)[heard_again : heard_again + 2] == [LAND, STOPPED]
     assert [tick for tick, one in enumerate(outputs) if one.land] == [heard_again]
 
 
@@ -144,9 +147,9 @@ def test_the_fallback_s_time_runs_on_while_the_vehicle_is_silent(heard_again: in
     # The speed does not matter: a brake that is not sent does not slow down, and brake_s = 2 s ends it at tick 56.
     parameters = replace(make_controller().fallback, brake_gain_1ps=0.0)
     controller = replace(make_controller(), fallback=parameters)
-    outputs = run(controller, inputs_of(range(140), moving(0), status=silent_in(range(17, heard_again))))
+    outputs = run(controller, make_inputs(range(140), make_motion_samples(0), status=silent_in(range(17, heard_again))))
     want = [TRACK] * 16 + [BRAKE] * 40 + [HOLD] * (lands - 56) + [LAND]
-    assert modes(outputs) == want + [STOPPED] * (140 - len(want))
+    assert list_modes(outputs) == want + [STOPPED] * (140 - len(want))
     assert [tick for tick, output in enumerate(outputs) if output.land] == [lands]
 
 
@@ -154,24 +157,26 @@ def test_the_fallback_s_time_runs_on_while_the_vehicle_is_silent(heard_again: in
     ("silent", "recovers"), [(range(5 * TICKS, 6 * TICKS + 1), 8), (range(8 * TICKS, 8 * TICKS + 1), 9)]
 )
 def test_silence_of_the_vehicle_is_no_way_round_the_fresh_samples(silent: range, recovers: int) -> None:
-    inputs = inputs_of(range(11 * TICKS), one_a_step(lost=range(1, 6)), status=silent_in(silent))
+    inputs = make_inputs(range(11 * TICKS), make_step_samples(lost=range(1, 6)), status=silent_in(silent))
     outputs = run(make_controller(), inputs)
-    assert modes(boundaries(outputs)) == [TRACK] * 4 + [HOLD] * (recovers - 4) + [TRACK] * (11 - recovers)
+    assert list_modes(find_boundaries(outputs)) == [TRACK] * 4 + [HOLD] * (recovers - 4) + [TRACK] * (11 - recovers)
     assert all("no vehicle" in outputs[tick].decision.reason for tick in silent)
 
 
 @pytest.mark.parametrize("status", [vehicle(armed=False), vehicle(external=False)])
 def test_the_pilot_ends_the_fallback(status: VehicleStatus) -> None:
     taken_over = range(5 * TICKS, 6 * TICKS)
-    inputs = inputs_of(
-        range(8 * TICKS), one_a_step(lost=range(1, 6)), status=lambda tick: status if tick in taken_over else vehicle()
+    inputs = make_inputs(
+        range(8 * TICKS),
+        make_step_samples(lost=range(1, 6)),
+        status=lambda tick: status if tick in taken_over else vehicle(),
     )
-    assert modes(boundaries(run(make_controller(), inputs))) == [TRACK] * 4 + [HOLD, WAIT] + [TRACK] * 2
+    assert list_modes(find_boundaries(run(make_controller(), inputs))) == [TRACK] * 4 + [HOLD, WAIT] + [TRACK] * 2
 
 
 def test_without_any_plan_the_fallback_takes_over_at_once() -> None:
     solver = StubSolver(small_plant(), faults={0: lambda answer: replace(answer, status=SolveStatus.INFEASIBLE)})
-    outputs = run(make_controller(solver), inputs_of(range(1), moving(0)))
+    outputs = run(make_controller(solver), make_inputs(range(1), make_motion_samples(0)))
     assert outputs[0].decision.mode is BRAKE
     assert outputs[0].decision.reason == "no plan is left to fly"
 
@@ -180,13 +185,13 @@ def test_without_any_plan_the_fallback_takes_over_at_once() -> None:
 @pytest.mark.parametrize("land", [True, False])
 def test_operator_stop_brakes_then_hands_over_and_never_flies_a_plan_again(land: bool) -> None:
     stop = 10
-    inputs = inputs_of(range(200), moving(49), stop_from=stop)
+    inputs = make_inputs(range(200), make_motion_samples(49), stop_from=stop)
     # The request may be a single tick: it is remembered.
     inputs[stop + 1 :] = [msgspec.structs.replace(inp, stop=False) for inp in inputs[stop + 1 :]]
     outputs = run(make_controller(land=land), inputs)
-    after = modes(outputs)[stop:]
+    after = list_modes(outputs)[stop:]
     ends = after.index(LAND if land else STOPPED)
-    assert modes(outputs)[:stop] == [TRACK] * stop
+    assert list_modes(outputs)[:stop] == [TRACK] * stop
     assert after[:ends] == [BRAKE] * (ends - 1) + [HOLD]
     assert 1 < ends <= 42  # 2 s of braking, and a tick until what it left is gone
     last = outputs[stop + ends - 1].setpoint
@@ -199,14 +204,14 @@ def test_operator_stop_brakes_then_hands_over_and_never_flies_a_plan_again(land:
 
 @pytest.mark.fault(34)
 def test_operator_stop_without_a_vehicle_to_hand_over_only_stops() -> None:
-    outputs = run(make_controller(), inputs_of(range(6), one_a_step(), stop_from=2, status=lambda tick: None))
-    assert modes(outputs) == [WAIT, WAIT, STOPPED, STOPPED, STOPPED, STOPPED]
+    outputs = run(make_controller(), make_inputs(range(6), make_step_samples(), stop_from=2, status=lambda tick: None))
+    assert list_modes(outputs) == [WAIT, WAIT, STOPPED, STOPPED, STOPPED, STOPPED]
     assert not any(output.land for output in outputs)
     assert [output.setpoint is None for output in outputs] == [False] * 2 + [True] * 4
 
 
 @pytest.mark.fault(34)
 def test_operator_stop_before_the_first_position_hands_over_in_the_next_tick() -> None:
-    outputs = run(make_controller(), inputs_of(range(5), [], stop_from=2))
-    assert modes(outputs) == [WAIT, WAIT, HOLD, LAND, STOPPED]
+    outputs = run(make_controller(), make_inputs(range(5), [], stop_from=2))
+    assert list_modes(outputs) == [WAIT, WAIT, HOLD, LAND, STOPPED]
     assert [output.land for output in outputs] == [False, False, False, True, False]

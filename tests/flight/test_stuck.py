@@ -16,9 +16,9 @@ from flight_rig import (
     START_NS,
     TICK_NS,
     StubSolver,
-    codes,
+    list_codes,
+    list_modes,
     make_controller,
-    modes,
     sample,
     small_plant,
     vehicle,
@@ -85,7 +85,7 @@ def fly(
 
 
 def frozen(outputs: list[TickOutput]) -> list[int]:
-    return [tick for tick, one in enumerate(outputs) if "sample-frozen" in codes(one)]
+    return [tick for tick, one in enumerate(outputs) if "sample-frozen" in list_codes(one)]
 
 
 def each(change: Callable[[float], float], truth: Vec3) -> Vec3:
@@ -134,9 +134,9 @@ def test_row_14_a_noisy_source_that_freezes_in_hover_counts_as_lost_at_the_third
     assert max(age or 0 for age in ages[:freezes]) <= 1
     if every == 1:  # 8 steps: the age reaches H, and positions come back
         assert max(age or 0 for age in ages) >= HORIZON
-        assert set(modes(outputs)[:freezes]) == {TRACK}
-        assert ControlMode.HOLD in modes(outputs)[freezes:] or ControlMode.BRAKE in modes(outputs)[freezes:]
-        assert modes(outputs)[-1] is TRACK
+        assert set(list_modes(outputs)[:freezes]) == {TRACK}
+        assert ControlMode.HOLD in list_modes(outputs)[freezes:] or ControlMode.BRAKE in list_modes(outputs)[freezes:]
+        assert list_modes(outputs)[-1] is TRACK
 
 
 @pytest.mark.fault(14)
@@ -145,10 +145,10 @@ def test_row_14_a_value_that_stands_still_while_the_plan_moves_counts_as_lost(ca
     freezes = 90  # 2 s before it has to be found
     still = fly(camera, want=there_and_back, gust=0.0)
     assert frozen(still) == []
-    assert set(modes(still)) == {TRACK}
+    assert set(list_modes(still)) == {TRACK}
     outputs = fly(freezing(camera, range(freezes, 9999)), want=there_and_back, gust=0.0)
     assert freezes < frozen(outputs)[0] <= freezes + 40
-    assert TRACK not in modes(outputs)[freezes + 40 + (HORIZON + 1) * TICKS :]
+    assert TRACK not in list_modes(outputs)[freezes + 40 + (HORIZON + 1) * TICKS :]
 
 
 @pytest.mark.fault(14)
@@ -168,7 +168,7 @@ def test_row_14_cameras_that_round_and_a_gusty_hover_raise_no_alarm(to_m: float,
     for std_m in (0.0, to_m / 10, to_m):
         outputs = fly(rounded(noisy(seed, std_m), to_m), seed=seed, steps=100)
         assert frozen(outputs) == []
-        assert set(modes(outputs)) == {TRACK}
+        assert set(list_modes(outputs)) == {TRACK}
 
 
 @pytest.mark.fault(14)

@@ -17,11 +17,11 @@ from uavctl.cli.common import Common
 
 def flights() -> list[str]:
     """Every `uavctl loopback` of a block of commands."""
-    found = []
+    results = []
     for page in ("README.md", "docs/quick-start.md"):
         for block in re.findall(r"^```sh\n(.*?)^```", (ROOT / page).read_text(encoding="utf-8"), re.M | re.S):
-            found += [line for line in block.splitlines() if line.startswith("uavctl loopback")]
-    return found
+            results += [line for line in block.splitlines() if line.startswith("uavctl loopback")]
+    return results
 
 
 def test_the_pages_have_such_commands() -> None:
@@ -30,9 +30,11 @@ def test_the_pages_have_such_commands() -> None:
 
 @pytest.mark.parametrize("line", flights())
 def test_a_design_can_be_made_of_each(line: str) -> None:
-    words = shlex.split(line, comments=True)
+    arguments = shlex.split(line, comments=True)
     given = [
-        (words[place], words[place + 1]) for place in range(len(words) - 1) if words[place] in ("--set", "--config")
+        (arguments[place], arguments[place + 1])
+        for place in range(len(arguments) - 1)
+        if arguments[place] in ("--set", "--config")
     ]
     config = next((value for name, value in given if name == "--config"), "room-hahn-stursberg")
     overrides = tuple(value for name, value in given if name == "--set")
@@ -43,7 +45,7 @@ def test_lists_are_quoted_as_shells_want_them() -> None:
     """Some shells take brackets for a pattern of file names."""
     pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]
     bare = re.compile(r"(?:--set|--link) (?=[^'\"\s])[^\s`]*\[")
-    assert [(page.name, one) for page in pages for one in bare.findall(page.read_text(encoding="utf-8"))] == []
+    assert [(page.name, command) for page in pages for command in bare.findall(page.read_text(encoding="utf-8"))] == []
 
 
 def test_a_command_for_one_recording_is_not_given_all_of_them() -> None:
@@ -63,13 +65,13 @@ def test_what_people_expect_has_a_command_in_each_of_its_rows() -> None:
     assert {shlex.split(command)[0] for command in expected()} <= {"uavctl", "pytest", "make"}
 
 
-@pytest.mark.parametrize("command", [one for one in expected() if one.startswith("uavctl ")])
+@pytest.mark.parametrize("command", [command for command in expected() if command.startswith("uavctl ")])
 def test_an_expectation_s_command_is_understood(command: str) -> None:
     app.parse_args(shlex.split(command)[1:], exit_on_error=False, print_error=False)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", [one for one in expected() if one.startswith("pytest ")])
+@pytest.mark.parametrize("command", [command for command in expected() if command.startswith("pytest ")])
 def test_an_expectation_s_tests_are_there(command: str) -> None:
-    words = [sys.executable, "-m", *shlex.split(command), "--collect-only", "-n", "0", "-p", "no:cacheprovider"]
-    assert subprocess.run(words, cwd=ROOT, stdout=subprocess.DEVNULL, check=False).returncode == 0
+    arguments = [sys.executable, "-m", *shlex.split(command), "--collect-only", "-n", "0", "-p", "no:cacheprovider"]
+    assert subprocess.run(arguments, cwd=ROOT, stdout=subprocess.DEVNULL, check=False).returncode == 0

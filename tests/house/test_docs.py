@@ -18,10 +18,10 @@ def test_a_page_is_up_to_date(page: Path) -> None:
     assert page.read_text(encoding="utf-8") == PAGES[page](), "run `make docs`"
 
 
-def test_the_drawing_has_every_way_once() -> None:
+def test_the_drawing_has_every_transition_once() -> None:
     lines = drawing().splitlines()
-    ways = {(before, after) for (before, _), (after, _) in TRANSITIONS.items() if before is not after}
-    assert sum("-->" in line for line in lines) == len(ways) + 3  # the beginning, two ends
+    transitions = {(before, after) for (before, _), (after, _) in TRANSITIONS.items() if before is not after}
+    assert sum("-->" in line for line in lines) == len(transitions) + 3  # the beginning, two ends
     assert "    RELEASED --> RETURNING: engage" in lines
 
 

@@ -34,13 +34,17 @@ class Recipe:
     tree: Path  # the packages, changed as it says
     work: Path  # where its files lie and its commands run
 
-    def run(self, words: str) -> str:
+    def run(self, arguments: str) -> str:
         """One of its commands, to a good end; what it printed."""
-        words = words.replace("uavctl ", f"{sys.executable} -m uavctl ", 1) if words.startswith("uavctl ") else words
-        words = re.sub(r"^python ", f"{sys.executable} ", words)
+        arguments = (
+            arguments.replace("uavctl ", f"{sys.executable} -m uavctl ", 1)
+            if arguments.startswith("uavctl ")
+            else arguments
+        )
+        arguments = re.sub(r"^python ", f"{sys.executable} ", arguments)
         environment = without_pages({**os.environ, "PYTHONPATH": str(self.tree), "PYTHONSAFEPATH": "1"})
         done = subprocess.run(
-            ["sh", "-c", words],
+            ["sh", "-c", arguments],
             cwd=self.work,
             env=environment,
             capture_output=True,
@@ -93,15 +97,15 @@ def walk(title: str, folder: Path) -> tuple[Recipe, list[str], int]:
 @pytest.mark.slow
 def test_a_controller_flies_in_flight_campaign_and_what_if_without_an_edit(tmp_path: Path) -> None:
     recipe, commands, touched = walk("A controller", tmp_path)
-    own, replay, flight, again, campaign = commands
+    install, replay, flight, again, campaign = commands
     assert touched == 0
-    told = json.loads(recipe.run(f"{own} --json"))
-    assert set(told["methods"]) == {"mine:Careful"}
+    document = json.loads(recipe.run(f"{install} --json"))
+    assert set(document["methods"]) == {"mine:Careful"}
     assert json.loads(recipe.run(f"{replay} --json"))["identical"]
     recipe.run(flight)
     assert json.loads(recipe.run(f"{again} --json"))["controller"] == "mine:Careful"
-    told = json.loads(recipe.run(f"{campaign} --runs 20 --json"))
-    cells = {cell["controller"]: cell for cell in told["cells"]}
+    document = json.loads(recipe.run(f"{campaign} --runs 20 --json"))
+    cells = {cell["controller"]: cell for cell in document["cells"]}
     assert cells["careful"]["runs"] == 20
     assert cells["careful"]["failed"] == 0
     assert cells["careful"]["cost"] > cells["ours"]["cost"]  # half of the regulator arrives late
@@ -140,8 +144,8 @@ def test_a_topic_is_recorded_and_read(tmp_path: Path) -> None:
 def test_a_fault_happens(tmp_path: Path) -> None:
     recipe, (flight,), touched = walk("A fault", tmp_path)
     assert touched == 2
-    told = json.loads(recipe.run(f"{flight} --json"))
-    amiss = {truth.at_ns: truth.faults for truth in records(recipe.work / told["recording"], Truth)}
+    document = json.loads(recipe.run(f"{flight} --json"))
+    amiss = {truth.at_ns: truth.faults for truth in records(recipe.work / document["recording"], Truth)}
     assert amiss[min(amiss)] == ()
     assert amiss[max(amiss)] == ("calm",)
 
@@ -150,8 +154,8 @@ def test_a_fault_happens(tmp_path: Path) -> None:
 def test_a_monitor_releases_the_vehicle(tmp_path: Path) -> None:
     recipe, (flight,), touched = walk("A monitor", tmp_path)
     assert touched == 4
-    told = json.loads(recipe.run(f"{flight} --json || test $? = 1"))
-    events = list(records(recipe.work / told["recording"], Event))
+    document = json.loads(recipe.run(f"{flight} --json || test $? = 1"))
+    events = list(records(recipe.work / document["recording"], Event))
     (released,) = [event for event in events if event.code == "envelope-speed"]
     landed = next(event for event in events if event.code == "fallback-land")
     assert landed.at_ns - released.at_ns < 1_000_000_000

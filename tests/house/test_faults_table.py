@@ -20,7 +20,7 @@ def marked(source: str) -> list[tuple[int, str]]:
     Raises:
         ValueError: A row that is not in the table, or a mark on what pytest does not run.
     """
-    found = []
+    results = []
     for function in ast.walk(ast.parse(source)):
         if not isinstance(function, ast.FunctionDef):
             continue
@@ -30,8 +30,8 @@ def marked(source: str) -> list[tuple[int, str]]:
             rows = [ast.literal_eval(argument) for argument in mark.args]
             if not function.name.startswith("test_") or not rows or not set(rows) <= set(NUMBERS):
                 raise ValueError(f"{function.name}: {ast.unparse(mark)} on line {mark.lineno} marks no row by a test")
-            found += [(row, function.name) for row in rows]
-    return found
+            results += [(row, function.name) for row in rows]
+    return results
 
 
 @cache
@@ -61,7 +61,7 @@ def test_the_page_has_every_row_in_order_and_complete() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("row", NUMBERS)
-def test_a_row_is_shown_where_the_page_says(row: int) -> None:
+def test_each_row_has_its_tests_in_the_named_files(row: int) -> None:
     shown_by = all_marked()[row]
     assert shown_by, f"no test is marked with fault({row})"
     named = set(re.findall(r"`(\w+)`", rows_of_page()[row][2]))

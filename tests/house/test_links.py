@@ -41,8 +41,8 @@ def test_every_page_is_reachable_from_the_index() -> None:
     reached, todo = {index}, [index]
     while todo:
         page = todo.pop()
-        found = {(page.parent / link.partition("#")[0]).resolve() for link in links(page)}
-        new = {one for one in found if one.suffix == ".md" and one.exists()} - reached
+        result = {(page.parent / link.partition("#")[0]).resolve() for link in links(page)}
+        new = {path for path in result if path.suffix == ".md" and path.exists()} - reached
         reached |= new
         todo += new
     assert {page.name for page in (ROOT / "docs").glob("*.md")} <= {page.name for page in reached}

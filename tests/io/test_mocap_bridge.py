@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from patience import LIMIT_S, until
+from patience import LIMIT_S, wait_until
 from places import ROOT
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -83,7 +83,7 @@ def test_a_body_reaches_uavctl_as_it_is_seen_and_the_clock_is_told(tmp_path: Pat
 
 def test_a_body_that_is_not_seen_is_named_with_those_that_are(tmp_path: Path) -> None:
     with bridge("kite", tmp_path) as (_, told):
-        until(lambda: told.read_text(encoding="utf-8").endswith("\n"), "a word on what is missing")
+        wait_until(lambda: told.read_text(encoding="utf-8").endswith("\n"), "a word on what is missing")
         assert told.read_text(encoding="utf-8") == "no body 'kite'; seen: drone, table\n"
 
 

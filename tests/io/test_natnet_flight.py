@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from natnet_server import Body, Server
 from numpy.typing import NDArray
-from operation_rig import Scene, ended, scene
-from patience import LIMIT_S, until
+from operation_rig import Scene, open_scene, wait_for_end
+from patience import LIMIT_S, wait_until
 from sim_rig import decode
 
 from logs.recording.reader import records
@@ -55,19 +55,19 @@ def seen_by_motive(air: Scene) -> Iterator[Server]:
 
 @pytest.mark.slow
 def test_it_flies_on_a_body_of_motive_s_and_replays_without_it() -> None:
-    with scene("sim.camera.rate_hz=60.0", "link.loss=0.0", "link.delay_s=0.0", "link.jitter_s=0.0") as air:
+    with open_scene("sim.camera.rate_hz=60.0", "link.loss=0.0", "link.delay_s=0.0", "link.jitter_s=0.0") as air:
         recording = air.folder / "f" / "flight.mcap"
 
         def tracking() -> int:
             return sum(one.mode is ControlMode.TRACK for one in records(recording, Decision))
 
-        with seen_by_motive(air) as server, ended(air.fly("f")) as process:
-            until(recording.exists, "it records")
-            until(lambda: tracking() > 40 and moved_m(air) > 0.5, "it flies, and has gone some way")
+        with seen_by_motive(air) as server, wait_for_end(air.fly("f")) as process:
+            wait_until(recording.exists, "it records")
+            wait_until(lambda: tracking() > 40 and moved_m(air) > 0.5, "it flies, and has gone some way")
             process.send_signal(signal.SIGINT)
             _, told = process.communicate(timeout=LIMIT_S)
         assert process.returncode == 0, told
-        until(lambda: air.has_landed, "the vehicle lands")
+        wait_until(lambda: air.has_landed, "the vehicle lands")
         samples = [one for step in records(recording, StepInput) for one in step.samples]
         assert {one.source for one in samples} == {"ODOMETRY 246/197"}
         # The body was where the vehicle went, whatever the clocks say.

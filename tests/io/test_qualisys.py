@@ -10,7 +10,7 @@ from contextlib import closing
 from typing import Any
 
 import pytest
-from patience import until
+from patience import wait_until
 from qtm_server import UPTIME_US, QtmBody, QtmServer, command, frame, packet, parameters
 from scipy.spatial.transform import Rotation
 
@@ -156,15 +156,17 @@ def test_a_body_becomes_positions_and_a_lost_connection_is_made_again() -> None:
             found.extend(positions(connection))
             return len(found) > 5
 
-        until(came, "positions come")
+        wait_until(came, "positions come")
         assert found[0].position_m == pytest.approx((1.0, -2.0, -3.0), abs=1e-6)
         assert found[0].stamp_us > UPTIME_US and found[0].name == "ODOMETRY"
         server.hang_up()
-        until(lambda: server.connections == 2, "it connects again")
+        wait_until(lambda: server.connections == 2, "it connects again")
         positions(connection)
         found.clear()
-        until(came, "positions come again")
-        until(lambda: not connection.receive() or connection.refused["connection-lost"] == 1, "the loss is counted")
+        wait_until(came, "positions come again")
+        wait_until(
+            lambda: not connection.receive() or connection.refused["connection-lost"] == 1, "the loss is counted"
+        )
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,8 @@ from typing import Any
 
 import msgspec
 import pytest
-from daemon_rig import Bench, Wire
-from loopback_rig import Memory, make_loop
+from daemon_rig import DaemonRig, PeerConnection
+from loopback_rig import MemorySink, make_loop
 from mavlink_rig import Peer
 from signing_rig import EPOCH_S, KEY, OFFSET_NS, OTHER_KEY, SECOND, STAMP, SignedPeer, frames, make_signing, sign
 
@@ -29,7 +29,7 @@ from uavctl.records import ControlMode, Datagram, Decision, Event, LinkStats, Re
 VEHICLE_ON_HOLD = {"custom_mode": (4 << 16) | (3 << 24)}
 
 
-class SignedWire(Wire):
+class SignedWire(PeerConnection):
     """The simulated peers, who sign what they say; and an attacker on the same wire."""
 
     def __init__(self, bench: AttackBench, name: str, link_id: int) -> None:
@@ -71,7 +71,7 @@ class SignedWire(Wire):
         super().send(plain)
 
 
-class AttackBench(Bench):
+class AttackBench(DaemonRig):
     """The daemon's cycle behind doors."""
 
     def __init__(self) -> None:
@@ -107,13 +107,13 @@ class Flood(AttackBench):
         return [*flood[:500], *genuine, *flood[500:]]
 
 
-def flown(bench: Bench, duration_s: float = 2.5) -> list[Any]:
+def flown(bench: DaemonRig, duration_s: float = 2.5) -> list[Any]:
     """What was decided and sent: equal for equal flights."""
     bench.fly(duration_s=duration_s, stop_limit_s=0.0)
     return [bench.memory.of(kind) for kind in (Decision, Setpoint)]
 
 
-def refused(bench: Bench) -> Counter[str]:
+def refused(bench: DaemonRig) -> Counter[str]:
     total: Counter[str] = Counter()
     for record in bench.memory.of(Refused):
         total.update(record.counts)
@@ -122,7 +122,7 @@ def refused(bench: Bench) -> Counter[str]:
 
 @pytest.fixture(scope="module")
 def plain_flight() -> list[Any]:
-    return flown(Bench())
+    return flown(DaemonRig())
 
 
 def test_a_signed_flight_is_the_same_flight(plain_flight: list[Any]) -> None:
@@ -184,7 +184,7 @@ def test_who_signs_nothing_is_never_flown() -> None:
     bench = AttackBench()
     bench.connections = {
         name: SignedConnection(
-            Wire(bench, name), FrameAuthenticator(bench.signing(0), stream=False), now=lambda: bench.now_ns
+            PeerConnection(bench, name), FrameAuthenticator(bench.signing(0), stream=False), now=lambda: bench.now_ns
         )
         for name in ("vehicle", "mocap")
     }
@@ -351,7 +351,7 @@ def test_a_flood_that_holds_nothing_is_taken_by_the_handful() -> None:
         return list(connections)
 
     fly(
-        make_loop(config, Memory()),
+        make_loop(config, MemorySink()),
         {"vehicle": Canned([]), "mocap": Canned([])},
         Ticker(50_000_000, 200_000_000, lambda: now_ns[0]),
         lambda: False,

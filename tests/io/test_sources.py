@@ -18,7 +18,7 @@ from pathlib import Path
 
 import pytest
 from natnet_server import UPTIME_S, Body, Server
-from patience import LIMIT_S, until
+from patience import LIMIT_S, wait_until
 
 from uavctl.config import Config, load_config
 from uavctl.config.connections import find_security_warnings
@@ -58,14 +58,14 @@ class Desk:
         self.samples: list[PositionSample] = []
         self.link = make_link(config)
 
-    def until(self, done: Callable[[], bool]) -> None:
+    def wait_until(self, done: Callable[[], bool]) -> None:
         """Serve until something holds; fails after `LIMIT_S`."""
 
         def served() -> bool:
             self.turn()
             return done()
 
-        until(served, "what the daemon is to be told", pause_s=0.0)
+        wait_until(served, "what the daemon is to be told", pause_s=0.0)
 
     def turn(self) -> None:
         select.select([self.connection], [], [], 0.02)
@@ -105,9 +105,9 @@ def test_a_body_becomes_samples_as_old_as_their_exposure_and_replays() -> None:
     with Server([OTHER, DRONE], latency_s=0.03) as server, closing(open_source(url(server))) as connection:
         desk = Desk(connection, config)
         # An answer that was long under way tells less than the next ones.
-        desk.until(lambda: desk.link.stats(0).clock_source == "timesync" and abs(off_ns(desk.link)) < 5e6)
+        desk.wait_until(lambda: desk.link.stats(0).clock_source == "timesync" and abs(off_ns(desk.link)) < 5e6)
         assert server.echo_answers > 0
-        desk.until(lambda: len(desk.samples) > 20 and min(map(age_ns, desk.samples[-20:])) >= 25_000_000)
+        desk.wait_until(lambda: len(desk.samples) > 20 and min(map(age_ns, desk.samples[-20:])) >= 25_000_000)
         sample = desk.samples[-1]
         # Y up: forward 1, right 2, down -1.5; turned by 90 degrees: north -2, east 1.
         assert sample.position_m == pytest.approx((-2.0, 1.0, -1.5))
@@ -128,28 +128,28 @@ def test_a_lost_body_gives_nothing_and_is_counted_until_it_is_back() -> None:
     body = drone()
     with Server([OTHER, body]) as server, closing(open_source(url(server))) as connection:
         desk = Desk(connection, load_config("room-hahn-stursberg"))
-        desk.until(lambda: bool(desk.samples))
+        desk.wait_until(lambda: bool(desk.samples))
         body.tracked = False
-        desk.until(lambda: connection.refused["untracked"] > 20)
+        desk.wait_until(lambda: connection.refused["untracked"] > 20)
         lost = len(desk.samples)
         for _ in range(20):
             desk.turn()
         assert len(desk.samples) == lost
         body.tracked = True
-        desk.until(lambda: len(desk.samples) > lost)
+        desk.wait_until(lambda: len(desk.samples) > lost)
 
 
 @pytest.mark.slow
 def test_a_server_that_went_is_asked_until_it_is_back() -> None:
     with Server([DRONE]) as server, closing(open_source(url(server))) as connection:
         desk = Desk(connection, load_config("room-hahn-stursberg"))
-        desk.until(lambda: bool(desk.samples))
+        desk.wait_until(lambda: bool(desk.samples))
         server.__exit__()
-        desk.until(lambda: connection.refused["server-silent"] > 0)
+        desk.wait_until(lambda: connection.refused["server-silent"] > 0)
         assert not connection.closed
         lost = len(desk.samples)
         with Server([drone(number=9)], port=server.port) as other:  # another number for the same body
-            desk.until(lambda: len(desk.samples) > lost)
+            desk.wait_until(lambda: len(desk.samples) > lost)
             assert 0 in other.heard
         server.__enter__()
 
@@ -163,7 +163,7 @@ def test_a_group_is_joined() -> None:
         closing(open_source(url(server) + "?interface=127.0.0.1")) as connection,
     ):
         desk = Desk(connection, load_config("room-hahn-stursberg"))
-        desk.until(lambda: len(desk.samples) > 3)
+        desk.wait_until(lambda: len(desk.samples) > 3)
 
 
 def test_the_process_ends_with_the_daemon_and_the_connection_with_the_process() -> None:
@@ -177,13 +177,13 @@ def test_the_process_ends_with_the_daemon_and_the_connection_with_the_process() 
             process.stdout.readline()
             child = child_of(process.pid, HOST)
             process.kill()
-        until(lambda: not running(child), "the process ends")
+        wait_until(lambda: not running(child), "the process ends")
 
         with closing(open_source(url(server))) as connection:
             desk = Desk(connection, load_config("room-hahn-stursberg"))
-            desk.until(lambda: bool(desk.samples))
+            desk.wait_until(lambda: bool(desk.samples))
             os.kill(child_of(os.getpid(), HOST), signal.SIGKILL)
-            desk.until(lambda: connection.closed)
+            desk.wait_until(lambda: connection.closed)
             connection.send(b"to nobody")
             assert connection.send_errors == 1
 
@@ -265,7 +265,7 @@ def test_a_daemon_that_does_not_read_finds_the_newest_and_how_many_were_dropped(
             for number in range(1, 501):
                 server.sendto(b"%d" % number, client)
                 if number % 50 == 0:  # the kernel's buffer must not be what drops
-                    until(lambda number=number: camera.taken == number, "all are taken")  # type: ignore[misc]
+                    wait_until(lambda number=number: camera.taken == number, "all are taken")  # type: ignore[misc]
             ours.settimeout(LIMIT_S)
             assert ours.recv(65536) == READY  # before the position that the same datagram gave
             stamps: list[int] = []
@@ -329,4 +329,4 @@ def test_the_daemon_opens_it_by_its_configuration() -> None:
         )
         with open_links(config) as connections:
             desk = Desk(connections["mocap"], config)
-            desk.until(lambda: bool(desk.samples))
+            desk.wait_until(lambda: bool(desk.samples))

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 
 import pytest
-from patience import LIMIT_S, until
+from patience import LIMIT_S, wait_until
 from transport_rig import FRAME, LIMIT_NS, Clock, port_of
 
 from uavctl.errors import ConnectionSpecError
@@ -185,7 +185,7 @@ def test_tcp_calls_a_peer_again_that_has_hung_up_and_never_waits_for_it() -> Non
             connection.send(half)
         peer.close()
     with closing(connection):
-        until(lambda: connection.receive() == [] and bool(connection.refused), "the end is noticed")
+        wait_until(lambda: connection.receive() == [] and bool(connection.refused), "the end is noticed")
         for _ in range(3):  # nobody listens
             clock[0] += RETRY_NS
             assert connection.receive() == [] and wait({"it": connection}, time.monotonic_ns()) == []
@@ -200,7 +200,7 @@ def test_tcp_calls_a_peer_again_that_has_hung_up_and_never_waits_for_it() -> Non
             peer, _ = server.accept()
             with peer:
                 peer.settimeout(LIMIT_S)
-                until(lambda: connection.receive() == [] and connection.filenos() != (), "the connection stands")
+                wait_until(lambda: connection.receive() == [] and connection.filenos() != (), "the connection stands")
                 peer.sendall(FRAME)
                 assert b"".join(arrived(connection, len(FRAME))) == FRAME
                 connection.send(FRAME)
@@ -230,7 +230,7 @@ def test_tcp_makes_a_connection_again_that_has_fallen_silent() -> None:
                         pass
             for again in (2, 3):  # the next one is given as long
                 clock[0] += RETRY_NS
-                until(lambda: connection.receive() == [] and connection.filenos() != (), "the connection stands")
+                wait_until(lambda: connection.receive() == [] and connection.filenos() != (), "the connection stands")
                 peer, _ = server.accept()
                 with peer:
                     clock[0] += PEER_SILENCE_NS

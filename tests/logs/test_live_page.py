@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from view_rig import flown
+from view_rig import fly_view
 
 from logs.live import HOST, MOST_PAGES, FlightScene, LiveScene, serve_live_page
 from logs.recording.design_view import read_design
@@ -53,7 +53,7 @@ def states(answer: http.client.HTTPResponse, count: int) -> list[Any]:
 def test_it_shows_what_the_records_say() -> None:
     """At each decision of a recorded flight, beside the records themselves."""
     seen, newest, shown = FlightScene(), dict[type[Record], Any](), 0
-    for _, _, record in flown().entries:
+    for _, _, record in fly_view().entries:
         seen.add_record(record)
         newest[type(record)] = record
         if not isinstance(record, Decision):
@@ -83,7 +83,7 @@ def test_it_shows_what_the_records_say() -> None:
 
 def test_there_is_nothing_to_see_before_the_first_decision() -> None:
     seen = FlightScene()
-    for _, _, record in flown().entries:
+    for _, _, record in fly_view().entries:
         if isinstance(record, Decision):
             break
         seen.add_record(record)
@@ -92,7 +92,7 @@ def test_there_is_nothing_to_see_before_the_first_decision() -> None:
 
 def test_newest_messages_come_first_and_old_ones_go() -> None:
     seen = FlightScene()
-    rows = [record for _, _, record in flown().entries if isinstance(record, Header | Decision)]
+    rows = [record for _, _, record in fly_view().entries if isinstance(record, Header | Decision)]
     for record in rows[:2]:
         seen.add_record(record)
     for number in range(100):

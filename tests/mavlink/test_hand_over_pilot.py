@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from hand_over_rig import ACCEPTED, DENIED, LAND, SECOND, Rig
+from hand_over_rig import ACCEPTED, DENIED, LAND, SECOND, HandoverRig
 
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.mavlink.requests import RequestKind
@@ -11,13 +11,13 @@ from uavctl.mavlink.requests import RequestKind
 LANDING_MODE = {"px4": "AUTO.LAND", "ardupilot": "LAND"}
 
 
-def settling(autopilot: str, *, failing: bool = False) -> Rig:
+def settling(autopilot: str, *, failing: bool = False) -> HandoverRig:
     """A flight of ours that lands, its landing shown."""
-    rig = Rig(autopilot).to(HandoverState.CLIMBING)
-    rig.be(landed=False)
+    rig = HandoverRig(autopilot).advance_to(HandoverState.CLIMBING)
+    rig.report_status(landed=False)
     rig.tick(commands=(LAND,))
     rig.answer(ACCEPTED)
-    rig.be(mode=LANDING_MODE[autopilot], failsafe=failing)
+    rig.report_status(mode=LANDING_MODE[autopilot], failsafe=failing)
     rig.tick()
     assert rig.is_in(HandoverState.SETTLING)
     return rig
@@ -39,34 +39,34 @@ def test_once_a_landing_is_shown_any_other_mode_is_the_pilot_s(autopilot: str, m
     rig = settling(autopilot)
     asked = len(rig.asked)
     rig.run(0.3)
-    rig.be(mode=mode)
+    rig.report_status(mode=mode)
     rig.run(70.0)
     assert rig.is_in(HandoverState.RELEASED) and len(rig.asked) == asked
 
 
 def test_a_failsafe_that_only_seemed_to_land_for_us_is_asked_again() -> None:
     rig = settling("px4", failing=True)
-    rig.be(mode="AUTO.TAKEOFF", failsafe=False)
+    rig.report_status(mode="AUTO.TAKEOFF", failsafe=False)
     rig.run(3.0)
-    assert rig.is_in(HandoverState.LANDING) and rig.asked_last(RequestKind.LAND)
+    assert rig.is_in(HandoverState.LANDING) and rig.last_request(RequestKind.LAND)
 
 
-def engaged(autopilot: str) -> Rig:
+def engaged(autopilot: str) -> HandoverRig:
     """A flight of ours in the mode that takes setpoints."""
-    rig = Rig(autopilot)
-    rig.to(HandoverState.CLIMBING).be(landed=False)
+    rig = HandoverRig(autopilot)
+    rig.advance_to(HandoverState.CLIMBING).report_status(landed=False)
     rig.tick(estimated_height_m=1.9)
-    rig.be(mode="OFFBOARD" if autopilot == "px4" else "GUIDED")
+    rig.report_status(mode="OFFBOARD" if autopilot == "px4" else "GUIDED")
     rig.run(1.0, until=HandoverState.ENGAGED)
     return rig
 
 
-def landing(autopilot: str) -> Rig:
+def landing(autopilot: str) -> HandoverRig:
     """A flight of ours that is asked to land, from the mode that takes setpoints."""
     rig = engaged(autopilot)
     rig.tick(is_landing_requested=True)
     rig.tick(is_landing_requested=False)
-    assert rig.is_in(HandoverState.LANDING) and rig.asked_last(RequestKind.LAND)
+    assert rig.is_in(HandoverState.LANDING) and rig.last_request(RequestKind.LAND)
     return rig
 
 
@@ -78,7 +78,7 @@ def test_after_landing_was_granted_another_mode_is_the_pilot_s(autopilot: str, m
     asked = len(rig.asked)
     rig.run(0.4)  # heartbeats of before may still be under way
     assert rig.is_in(HandoverState.LANDING)
-    rig.be(mode=mode)
+    rig.report_status(mode=mode)
     rig.run(10.0)
     assert rig.is_in(HandoverState.RELEASED) and len(rig.asked) == asked
 
@@ -96,7 +96,7 @@ def test_the_mode_of_before_is_the_pilot_s_once_landing_would_have_shown() -> No
 
 @pytest.mark.fault(68)
 def test_a_mode_that_was_granted_and_is_not_there_is_not_asked_for_over_the_pilot() -> None:
-    rig = Rig("px4").to(HandoverState.MODE)
+    rig = HandoverRig("px4").advance_to(HandoverState.MODE)
     rig.answer(ACCEPTED)
     rig.run(10.0)
     assert rig.is_in(HandoverState.FAILED) and len(rig.asked) == 1
@@ -104,8 +104,8 @@ def test_a_mode_that_was_granted_and_is_not_there_is_not_asked_for_over_the_pilo
 
 @pytest.mark.fault(68)
 def test_px4_s_hold_while_it_stands_armed_is_the_pilot_s() -> None:
-    rig = Rig("px4").to(HandoverState.CLIMBING)
-    rig.be(mode="AUTO.LOITER", stick=True)
+    rig = HandoverRig("px4").advance_to(HandoverState.CLIMBING)
+    rig.report_status(mode="AUTO.LOITER", stick=True)
     rig.tick()
     assert rig.is_in(HandoverState.RELEASED)
 
@@ -113,8 +113,8 @@ def test_px4_s_hold_while_it_stands_armed_is_the_pilot_s() -> None:
 @pytest.mark.fault(68)
 @pytest.mark.parametrize(("autopilot", "mode"), [("px4", "POSCTL"), ("ardupilot", "LOITER")])
 def test_the_pilot_s_mode_before_arming_ends_the_take_off_on_the_ground(autopilot: str, mode: str) -> None:
-    rig = Rig(autopilot).to(HandoverState.MODE)
-    rig.be(mode=mode)
+    rig = HandoverRig(autopilot).advance_to(HandoverState.MODE)
+    rig.report_status(mode=mode)
     rig.run(10.0)
     assert rig.is_in(HandoverState.DONE) and "-> released" in rig.codes("hand-over")[-2]
     assert {ask for _, ask in rig.asked} == {RequestKind.TAKE_OFF_MODE}
@@ -122,11 +122,11 @@ def test_the_pilot_s_mode_before_arming_ends_the_take_off_on_the_ground(autopilo
 
 @pytest.mark.fault(68)
 def test_px4_s_hold_on_the_ground_is_no_end_of_a_climb() -> None:
-    rig = Rig().to(HandoverState.ARMING)
-    rig.be(mode="AUTO.LOITER", stick=True)
+    rig = HandoverRig().advance_to(HandoverState.ARMING)
+    rig.report_status(mode="AUTO.LOITER", stick=True)
     rig.tick()
     assert rig.is_in(HandoverState.RELEASED)
-    rig.be(armed=True)
+    rig.report_status(armed=True)
     rig.run(30.0)
     assert rig.is_in(HandoverState.RELEASED)
 
@@ -134,15 +134,15 @@ def test_px4_s_hold_on_the_ground_is_no_end_of_a_climb() -> None:
 @pytest.mark.fault(66)
 @pytest.mark.parametrize("state", [HandoverState.CLIMBING, HandoverState.ENGAGING])
 def test_a_climb_by_positions_that_cannot_be_is_broken_off(state: HandoverState) -> None:
-    rig = Rig("ardupilot").to(state)
+    rig = HandoverRig("ardupilot").advance_to(state)
     assert rig.is_in(state)
     rig.tick(climb_hazard="it is 0.7 m beyond the limit of down")
-    assert rig.is_in(HandoverState.LANDING) and rig.asked_last(RequestKind.LAND)
+    assert rig.is_in(HandoverState.LANDING) and rig.last_request(RequestKind.LAND)
     assert rig.codes("refused") == ["the climb is broken off: it is 0.7 m beyond the limit of down"]
 
 
 def test_nothing_is_broken_off_while_nothing_climbs() -> None:
-    rig = Rig().to(HandoverState.ENGAGED)
+    rig = HandoverRig().advance_to(HandoverState.ENGAGED)
     rig.tick(climb_hazard="it is 0.7 m beyond the limit of down")
     assert rig.is_in(HandoverState.ENGAGED) and not rig.codes("refused")
 
@@ -156,17 +156,17 @@ def test_an_end_that_comes_with_the_pilot_s_switch_asks_for_nothing(
 ) -> None:
     if state is not HandoverState.ENGAGED and mode == "AUTO.LOITER":
         mode = "ALTCTL"  # PX4's hold is where its climb ends
-    rig = Rig(autopilot).to(HandoverState.CLIMBING)
-    rig.be(landed=False)
+    rig = HandoverRig(autopilot).advance_to(HandoverState.CLIMBING)
+    rig.report_status(landed=False)
     if state is not HandoverState.CLIMBING:
         rig.tick(estimated_height_m=1.9)
     if state is HandoverState.ENGAGED:
-        rig.be(mode="OFFBOARD" if autopilot == "px4" else "GUIDED")
+        rig.report_status(mode="OFFBOARD" if autopilot == "px4" else "GUIDED")
         rig.run(1.0, until=HandoverState.ENGAGED)
     assert rig.is_in(state)
     rig.run(0.5)
     asked = len(rig.asked)
-    rig.be(mode=mode, stick=True)
+    rig.report_status(mode=mode, stick=True)
     if end == "controller":
         rig.tick(is_landing_requested=True, has_setpoint=False)
     elif end == "time":
@@ -181,24 +181,24 @@ def test_an_end_that_comes_with_the_pilot_s_switch_asks_for_nothing(
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 def test_what_is_armed_for_a_take_off_is_asked_to_land_until_it_is_disarmed(autopilot: str) -> None:
     """It refuses, on the ground, and would climb by itself once nobody asks any more."""
-    rig = Rig(autopilot).to(HandoverState.CLIMBING)
+    rig = HandoverRig(autopilot).advance_to(HandoverState.CLIMBING)
     rig.tick(commands=(LAND,))
     for _ in range(100):
         rig.answer(DENIED, RequestKind.LAND)
         rig.run(0.3)
     assert rig.is_in(HandoverState.LANDING) and not rig.hand_over.is_finished
     assert rig.asked[-1][0] > rig.view.at_ns - 2 * SECOND
-    rig.be(armed=False)
+    rig.report_status(armed=False)
     rig.run(1.0)
     assert rig.is_in(HandoverState.DONE)
 
 
 @pytest.mark.parametrize("ours", [True, False])
 def test_a_climb_that_is_told_late_does_not_keep_the_controller_from_watching_what_it_flies(ours: bool) -> None:
-    rig = Rig("ardupilot").to(HandoverState.CLIMBING if ours else HandoverState.READY)
+    rig = HandoverRig("ardupilot").advance_to(HandoverState.CLIMBING if ours else HandoverState.READY)
     if ours:
         rig.tick(estimated_height_m=1.9)
-    rig.be(mode="GUIDED", armed=True, landed=False, own_climb=True)
+    rig.report_status(mode="GUIDED", armed=True, landed=False, own_climb=True)
     rig.run(1.0, until=HandoverState.ENGAGED)
     flown = rig.hand_over.select_controlled_status(rig.view.at_ns, rig.vehicle)
     assert flown is not None and flown.own_climb is not ours  # of another one's climb nobody knows when it ends

@@ -16,7 +16,7 @@ from hand_over_rig import (
     REJECTED,
     SECOND,
     TAKE_OFF,
-    Rig,
+    HandoverRig,
     ack,
 )
 
@@ -33,7 +33,7 @@ from uavctl.records import Command, Order
 
 @pytest.mark.fault(26)
 def test_a_temporary_refusal_is_asked_again_in_bounds_then_told_with_the_vehicle_s_words() -> None:
-    rig = Rig("ardupilot", HandOverConfig(ground_s=30.0, tries=4)).to(HandoverState.ARMING)
+    rig = HandoverRig("ardupilot", HandOverConfig(ground_s=30.0, tries=4)).advance_to(HandoverState.ARMING)
     for _ in range(4):
         rig.run(2.0) if len(rig.asked) > 2 else None
         rig.answer(FAILED, RequestKind.ARM, text="PreArm: VisOdom: not healthy")
@@ -45,20 +45,20 @@ def test_a_temporary_refusal_is_asked_again_in_bounds_then_told_with_the_vehicle
     assert rig.hand_over.failure.startswith(
         'arming: the vehicle answered FAILED, "PreArm: VisOdom: not healthy" (asked 4'
     )
-    assert rig.asked_last(RequestKind.DISARM)  # it may have been granted after all
+    assert rig.last_request(RequestKind.DISARM)  # it may have been granted after all
 
 
 @pytest.mark.fault(26)
 @pytest.mark.parametrize(("result", "why"), [(DENIED, "DENIED"), (3, "UNSUPPORTED")], ids=["denied", "unsupported"])
 def test_a_final_refusal_is_not_asked_again(result: int, why: str) -> None:
-    rig = Rig().to(HandoverState.MODE)
+    rig = HandoverRig().advance_to(HandoverState.MODE)
     rig.answer(result)
     assert rig.is_in(HandoverState.FAILED) and why in rig.hand_over.failure and len(rig.asked) == 1
 
 
 @pytest.mark.fault(26)
 def test_no_answer_is_told_as_that() -> None:
-    rig = Rig(config=HandOverConfig(tries=3, answer_s=1.0)).to(HandoverState.MODE)
+    rig = HandoverRig(config=HandOverConfig(tries=3, answer_s=1.0)).advance_to(HandoverState.MODE)
     rig.run(3.2)
     assert rig.is_in(HandoverState.FAILED) and "did not answer" in rig.hand_over.failure
     times = [at_ns for at_ns, _ in rig.asked]
@@ -66,7 +66,7 @@ def test_no_answer_is_told_as_that() -> None:
 
 
 def test_accepted_but_never_done_is_told_as_that() -> None:
-    rig = Rig(config=HandOverConfig(ground_s=10.0)).to(HandoverState.MODE)
+    rig = HandoverRig(config=HandOverConfig(ground_s=10.0)).advance_to(HandoverState.MODE)
     rig.answer(ACCEPTED)
     rig.run(2.9)
     assert len(rig.asked) == 1  # heartbeats come once a second: no hurry
@@ -75,14 +75,14 @@ def test_accepted_but_never_done_is_told_as_that() -> None:
 
 
 def test_an_unknown_result_is_told_by_number() -> None:
-    rig = Rig(config=HandOverConfig(tries=1)).to(HandoverState.MODE)
+    rig = HandoverRig(config=HandOverConfig(tries=1)).advance_to(HandoverState.MODE)
     rig.answer(77)
     rig.run(3.0)
     assert "answered 77" in rig.hand_over.failure
 
 
 def test_in_progress_is_waited_for() -> None:
-    rig = Rig().to(HandoverState.MODE)
+    rig = HandoverRig().advance_to(HandoverState.MODE)
     for _ in range(5):
         rig.answer(IN_PROGRESS)
         rig.run(1.5)
@@ -90,30 +90,30 @@ def test_in_progress_is_waited_for() -> None:
 
 
 def test_answers_to_others_and_chatter_change_nothing() -> None:
-    rig = Rig().to(HandoverState.MODE)
+    rig = HandoverRig().advance_to(HandoverState.MODE)
     rig.tick(ack(DENIED, RequestKind.LAND), StatusText(system=1, component=1, severity=6, text="chatter"))
     assert rig.is_in(HandoverState.MODE)
-    rig = Rig().to(HandoverState.READY)
+    rig = HandoverRig().advance_to(HandoverState.READY)
     rig.tick(ack(DENIED, RequestKind.ARM), commands=(TAKE_OFF,))
     assert rig.is_in(HandoverState.MODE)
 
 
 @pytest.mark.fault(26)
 def test_a_climb_that_does_not_come_ends_in_a_landing_and_a_failure() -> None:
-    rig = Rig("ardupilot", HandOverConfig(climb_s=5.0)).to(HandoverState.CLIMBING)
+    rig = HandoverRig("ardupilot", HandOverConfig(climb_s=5.0)).advance_to(HandoverState.CLIMBING)
     rig.answer(ACCEPTED)
     rig.run(5.2)
-    assert rig.is_in(HandoverState.LANDING) and rig.asked_last(RequestKind.LAND)
+    assert rig.is_in(HandoverState.LANDING) and rig.last_request(RequestKind.LAND)
     assert [ask for _, ask in rig.asked].count(RequestKind.TAKE_OFF) == 1  # asked again, it would begin again
-    rig.be(mode="LAND")
+    rig.report_status(mode="LAND")
     rig.tick()
-    rig.be(armed=False)
+    rig.report_status(armed=False)
     rig.tick()
     assert rig.is_in(HandoverState.DONE) and "take-off" in rig.hand_over.failure
 
 
 def test_height_counts_by_fresh_positions_only() -> None:
-    rig = Rig("px4").to(HandoverState.CLIMBING)
+    rig = HandoverRig("px4").advance_to(HandoverState.CLIMBING)
     rig.tick(estimated_height_m=3.0, arming_refusal="the newest position is 2.0 s old")
     assert rig.is_in(HandoverState.CLIMBING)
     rig.tick(estimated_height_m=None, arming_refusal="")
@@ -124,7 +124,7 @@ def test_height_counts_by_fresh_positions_only() -> None:
 
 @pytest.mark.fault(26)
 def test_offboard_that_is_refused_in_the_climb_ends_in_a_landing() -> None:
-    rig = Rig("px4").to(HandoverState.ENGAGING)
+    rig = HandoverRig("px4").advance_to(HandoverState.ENGAGING)
     for _ in range(20):
         rig.answer(REJECTED, RequestKind.EXTERNAL_MODE)
         rig.run(0.25)
@@ -136,8 +136,8 @@ def test_offboard_that_is_refused_in_the_climb_ends_in_a_landing() -> None:
 @pytest.mark.fault(26)
 @pytest.mark.parametrize("state", [HandoverState.CLIMBING, HandoverState.ENGAGING])
 def test_a_vehicle_that_disarms_itself_on_the_way_ends_it(state: HandoverState) -> None:
-    rig = Rig("ardupilot" if state is HandoverState.CLIMBING else "px4").to(state)
-    rig.be(armed=False)
+    rig = HandoverRig("ardupilot" if state is HandoverState.CLIMBING else "px4").advance_to(state)
+    rig.report_status(armed=False)
     rig.tick()
     assert rig.is_in(HandoverState.FAILED) and "disarmed itself" in rig.hand_over.failure
 
@@ -157,15 +157,15 @@ def test_a_vehicle_that_disarms_itself_on_the_way_ends_it(state: HandoverState) 
 )
 @pytest.mark.fault(25)
 def test_the_pilot_may_take_over_at_any_time(state: HandoverState, mode: str, armed: bool) -> None:
-    rig = Rig("px4").to(state)
-    rig.be(mode=mode, armed=armed, stick=True)
+    rig = HandoverRig("px4").advance_to(state)
+    rig.report_status(mode=mode, armed=armed, stick=True)
     told = rig.tick()
     assert (rig.state, told.setpoint_mode, told.request) == (HandoverState.RELEASED, NOTHING, None)
 
 
 @pytest.mark.fault(25)
 def test_a_heartbeat_of_before_the_grant_is_no_pilot_and_a_later_one_is() -> None:
-    rig = Rig("px4").to(HandoverState.ENGAGING)
+    rig = HandoverRig("px4").advance_to(HandoverState.ENGAGING)
     rig.answer(ACCEPTED)
     granted_ns = rig.view.at_ns
     while rig.view.at_ns < granted_ns + GRACE_NS:
@@ -198,13 +198,13 @@ def test_a_heartbeat_of_before_the_grant_is_no_pilot_and_a_later_one_is() -> Non
 def test_the_operator_stops_on_the_way(
     state: HandoverState, after: HandoverState, ask: RequestKind | None, how: str
 ) -> None:
-    rig = Rig().to(state)
+    rig = HandoverRig().advance_to(state)
     told = rig.tick(is_stop_requested=True) if how == "stop" else rig.tick(commands=(LAND,))
     assert (rig.state, told.request, told.setpoint_mode) == (after, ask, NOTHING)
 
 
 def test_an_arming_that_is_stopped_is_over_when_a_later_heartbeat_says_disarmed() -> None:
-    rig = Rig().to(HandoverState.ARMING)
+    rig = HandoverRig().advance_to(HandoverState.ARMING)
     rig.mute = True
     rig.tick(is_stop_requested=True)
     rig.tick()
@@ -216,7 +216,7 @@ def test_an_arming_that_is_stopped_is_over_when_a_later_heartbeat_says_disarmed(
 
 @pytest.mark.fault(34)
 def test_landing_is_asked_for_once_a_second_five_times_at_most() -> None:
-    rig = Rig().to(HandoverState.LANDING)
+    rig = HandoverRig().advance_to(HandoverState.LANDING)
     rig.run(10.0)
     times = [at_ns for at_ns, ask in rig.asked if ask is RequestKind.LAND]
     assert [b - a for a, b in pairwise(times)] == [SECOND] * 4
@@ -241,8 +241,8 @@ def test_landing_is_asked_for_once_a_second_five_times_at_most() -> None:
     ],
 )
 def test_a_reboot_disengages(state: HandoverState, after: HandoverState) -> None:
-    rig = Rig().to(state)
-    rig.be(boots=1)
+    rig = HandoverRig().advance_to(state)
+    rig.report_status(boots=1)
     told = rig.tick()
     assert (rig.state, told.setpoint_mode) == (after, NOTHING)
     if after is not state:
@@ -252,8 +252,8 @@ def test_a_reboot_disengages(state: HandoverState, after: HandoverState) -> None
 
 
 def test_a_reboot_before_we_listened_is_none() -> None:
-    rig = Rig()
-    rig.be(boots=3)
+    rig = HandoverRig()
+    rig.report_status(boots=3)
     rig.tick()
     assert rig.is_in(HandoverState.READY) and not rig.codes("refused")
 
@@ -262,7 +262,7 @@ def test_a_reboot_before_we_listened_is_none() -> None:
     "state", [HandoverState.MODE, HandoverState.CLIMBING, HandoverState.ENGAGING, HandoverState.SETTLING]
 )
 def test_silence_on_the_way_changes_nothing_until_time_is_up(state: HandoverState) -> None:
-    rig = Rig(config=HandOverConfig(ground_s=8.0, climb_s=8.0, engage_s=8.0, land_s=8.0)).to(state)
+    rig = HandoverRig(config=HandOverConfig(ground_s=8.0, climb_s=8.0, engage_s=8.0, land_s=8.0)).advance_to(state)
     rig.mute = True
     rig.run(5.0)
     assert rig.is_in(state)
@@ -272,7 +272,7 @@ def test_silence_on_the_way_changes_nothing_until_time_is_up(state: HandoverStat
 
 @pytest.mark.parametrize("height_m", [None, 0.0, -1.0, float("nan")])
 def test_a_climb_to_nowhere_is_refused(height_m: float | None) -> None:
-    rig = Rig().to(HandoverState.READY)
+    rig = HandoverRig().advance_to(HandoverState.READY)
     told = rig.tick(commands=(Command(order=Order.TAKE_OFF, height_m=height_m),))
     assert [event.code for event in told.events] == [EventCode.ORDER_REFUSED] and rig.hand_over.height_m == 0.0
     assert rig.is_in(HandoverState.READY) and not rig.hand_over.is_ordered_flight

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import pytest
-from hand_over_rig import ENGAGE, FLY, NEUTRAL, NOTHING, SECOND, STAND_BY, TAKE_OFF, Rig
+from hand_over_rig import ENGAGE, FLY, NEUTRAL, NOTHING, SECOND, STAND_BY, TAKE_OFF, HandoverRig
 from hand_over_rig import TICK_NS as RIG_TICK_NS
-from loopback_rig import Memory, make_loop
+from loopback_rig import MemorySink, make_loop
 from msgspec.structs import replace
 
 from logs.recording.replay import replay
@@ -21,14 +21,14 @@ from uavctl.records import Command, ControlMode, Decision, Order, Setpoint
 TICK_NS = 50_000_000
 
 
-def restarted(autopilot: str = "px4", **fields: object) -> Rig:
+def restarted(autopilot: str = "px4", **fields: object) -> HandoverRig:
     """A hand-over that stands by before the vehicle is heard, which then says this of itself."""
-    rig = Rig(autopilot)
+    rig = HandoverRig(autopilot)
     vehicle, rig.vehicle = rig.vehicle, None
     told = rig.tick(commands=(STAND_BY,))
     assert [event.code for event in told.events] == [EventCode.ORDER_ACCEPTED] and rig.is_in(HandoverState.WAITING)
     rig.vehicle = vehicle
-    rig.be(**fields)
+    rig.report_status(**fields)
     return rig
 
 
@@ -50,7 +50,7 @@ def test_a_vehicle_that_was_left_in_flight_gets_nothing_until_ordered(autopilot:
     assert told.setpoint_mode is NEUTRAL and [ask for _, ask in rig.asked] == (
         [] if external else [RequestKind.EXTERNAL_MODE]
     )
-    rig.be(mode="OFFBOARD" if autopilot == "px4" else "GUIDED")
+    rig.report_status(mode="OFFBOARD" if autopilot == "px4" else "GUIDED")
     assert rig.tick().setpoint_mode is FLY
 
 
@@ -58,7 +58,7 @@ def test_a_vehicle_that_was_left_in_flight_gets_nothing_until_ordered(autopilot:
 def test_one_that_has_landed_and_disarmed_meanwhile_is_a_vehicle_like_any_other() -> None:
     rig = restarted(armed=False)
     assert rig.tick().setpoint_mode is NEUTRAL and rig.is_in(HandoverState.READY)
-    rig.be(armed=True, landed=False, mode="OFFBOARD")  # the pilot took off, and switched
+    rig.report_status(armed=True, landed=False, mode="OFFBOARD")  # the pilot took off, and switched
     assert rig.tick().setpoint_mode is FLY
 
 
@@ -71,10 +71,10 @@ def test_an_ordered_take_off_does_not_follow_a_flight_that_was_left() -> None:
 
 
 def test_once_the_vehicle_is_heard_it_is_too_late_to_stand_by() -> None:
-    rig = Rig().to(HandoverState.READY)
+    rig = HandoverRig().advance_to(HandoverState.READY)
     told = rig.tick(commands=(STAND_BY,))
     assert [event.code for event in told.events] == [EventCode.ORDER_REFUSED]
-    rig.be(armed=True, landed=False, mode="OFFBOARD")
+    rig.report_status(armed=True, landed=False, mode="OFFBOARD")
     assert rig.tick().setpoint_mode is FLY
 
 
@@ -82,14 +82,14 @@ FLOWN_NS = 100 * SECOND
 SINCE = Command(order=Order.STAND_BY, flown_ns=FLOWN_NS)
 
 
-def found_armed(up_s: float | None, at_ns: int) -> Rig:
+def found_armed(up_s: float | None, at_ns: int) -> HandoverRig:
     """A hand-over that stands by, with a vehicle that is found armed and may tell since when it has been up."""
-    rig = Rig()
+    rig = HandoverRig()
     vehicle, rig.vehicle = rig.vehicle, None
     rig.view = replace(rig.view, at_ns=at_ns - 2 * RIG_TICK_NS)
     rig.tick(commands=(SINCE,))
     rig.vehicle = vehicle
-    rig.be(armed=True, landed=False, mode="OFFBOARD")
+    rig.report_status(armed=True, landed=False, mode="OFFBOARD")
     rig.tick(uptime_s=up_s)
     return rig
 
@@ -150,8 +150,8 @@ class Air:
         self._tick = round(begins_s * 1e9) // TICK_NS
         self.peers = Peers(self.config, self._tick * TICK_NS)
 
-    def begin(self, *orders: Command) -> tuple[ControlLoop, Memory]:
-        memory = Memory()
+    def begin(self, *orders: Command) -> tuple[ControlLoop, MemorySink]:
+        memory = MemorySink()
         loop = make_loop(self.config, memory)
         for order in orders:
             loop.order(order)

@@ -7,7 +7,7 @@ from statistics import median
 from typing import Any
 
 import pytest
-from indoors_rig import Indoors
+from indoors_rig import IndoorsRig
 from mavlink_rig import MS, SECOND, read
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import Client
@@ -143,7 +143,7 @@ def test_nothing_unsound_is_ever_sent(pose: Pose) -> None:
 
 @BOTH
 def test_a_vehicle_without_gps_gets_its_position_through_us_and_may_be_armed(name: str) -> None:
-    rig = Indoors(name)
+    rig = IndoorsRig(name)
     rig.peers.receive("vehicle", Client().pack(mavlink.MAVLink_set_gps_global_origin_message(1, 0, 0, 0)), 0)
     rig.run(6.0)
     estimator = rig.peers.autopilot.estimator
@@ -152,7 +152,7 @@ def test_a_vehicle_without_gps_gets_its_position_through_us_and_may_be_armed(nam
     assert len(list(rig.relayed())) > 90  # and every one is in the recording
 
 
-def moved_by_us(rig: Indoors) -> float:
+def moved_by_us(rig: IndoorsRig) -> float:
     """By what PX4 moves stamps after TIMESYNC: half of (its request's time + its time of arrival) - our time.
 
     The vehicle is reached in the moment of sending here.
@@ -168,7 +168,7 @@ def moved_by_us(rig: Indoors) -> float:
 
 @BOTH
 def test_the_stamp_is_the_time_of_capture_in_the_vehicle_s_clock(name: str) -> None:
-    rig = Indoors(name, "clock.latency_s=0.03")
+    rig = IndoorsRig(name, "clock.latency_s=0.03")
     rig.run(4.0)
     moved_us = moved_by_us(rig) if name == "px4" else 0.0  # ArduPilot takes stamps as they are
     ages_ms = [(at_ns + UPTIME_NS) / MS - (message.usec + moved_us) / 1000 for at_ns, message in rig.relayed()]
@@ -178,7 +178,7 @@ def test_the_stamp_is_the_time_of_capture_in_the_vehicle_s_clock(name: str) -> N
 
 @pytest.mark.slow
 def test_px4_moves_stamps_once_its_timesync_has_converged() -> None:
-    rig = Indoors("px4", "sim.camera.latency_s=0.05", "clock.latency_s=0.05")
+    rig = IndoorsRig("px4", "sim.camera.latency_s=0.05", "clock.latency_s=0.05")
     estimator, ages_ms = rig.peers.autopilot.estimator, list[float]()
     age_ns = estimator._age_ns
 
@@ -197,7 +197,7 @@ def test_px4_moves_stamps_once_its_timesync_has_converged() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "external"), [("px4", "OFFBOARD"), ("ardupilot", "GUIDED")])
 def test_a_vehicle_that_the_pilot_took_off_lands_by_our_positions_to_the_end(name: str, external: str) -> None:
-    rig = Indoors(name, "sim.start_position_m=[0.0, 0.0, -0.1]")
+    rig = IndoorsRig(name, "sim.start_position_m=[0.0, 0.0, -0.1]")
     rig.peers.receive("vehicle", Client().pack(mavlink.MAVLink_set_gps_global_origin_message(1, 0, 0, 0)), 0)
     rig.run(8.0)
     rig.pilot_flies(external)
@@ -210,7 +210,7 @@ def test_a_vehicle_that_the_pilot_took_off_lands_by_our_positions_to_the_end(nam
 
 
 def test_without_the_relay_a_vehicle_that_the_pilot_took_off_is_left_as_soon_as_it_lands() -> None:
-    rig = Indoors("px4", "sim.start_position_m=[0.0, 0.0, -0.1]", "relay.enabled=false")
+    rig = IndoorsRig("px4", "sim.start_position_m=[0.0, 0.0, -0.1]", "relay.enabled=false")
     for parameter in ("SYS_HAS_GPS", "EKF2_GPS_CTRL", "SYS_HAS_MAG", "EKF2_BARO_CTRL"):
         assert rig.peers.autopilot.parameters.set(parameter, 7.0 if parameter == "EKF2_GPS_CTRL" else 1.0)
     assert rig.peers.autopilot.parameters.set("EKF2_MAG_TYPE", 0.0)
@@ -222,20 +222,20 @@ def test_without_the_relay_a_vehicle_that_the_pilot_took_off_is_left_as_soon_as_
 
 
 def test_frozen_cameras_are_not_passed_on() -> None:
-    rig = Indoors("px4", "sim.camera.frozen=[[3.0, 10.0]]")
+    rig = IndoorsRig("px4", "sim.camera.frozen=[[3.0, 10.0]]")
     rig.run(8.0)
     late = [at_ns for at_ns, _ in rig.relayed() if at_ns > 4.5 * SECOND]
     assert late == []
 
 
 def test_without_the_relay_nothing_is_sent() -> None:
-    rig = Indoors("px4", "relay.enabled=false")
+    rig = IndoorsRig("px4", "relay.enabled=false")
     rig.run(3.0)
     assert list(rig.relayed()) == []
 
 
 def test_the_clocks_are_recorded_once_a_second() -> None:
-    rig = Indoors("px4")
+    rig = IndoorsRig("px4")
     rig.run(5.0)
     stats = [one for one in rig.memory.of(LinkStats) if one.link == "vehicle"]
     assert len(stats) == 5

@@ -8,7 +8,7 @@ from bisect import bisect_left
 from itertools import pairwise
 
 import pytest
-from indoors_rig import Delay, Indoors
+from indoors_rig import Delay, IndoorsRig
 from mavlink_rig import MS, SECOND
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import Client
@@ -65,14 +65,14 @@ LINKS: Flights = {
 }
 
 
-def ready(name: str, delay: Delay, *more: str) -> Indoors:
-    rig = Indoors(name, "sim.start_position_m=[0.0, 0.0, -0.1]", *more, delay=delay)
+def ready(name: str, delay: Delay, *more: str) -> IndoorsRig:
+    rig = IndoorsRig(name, "sim.start_position_m=[0.0, 0.0, -0.1]", *more, delay=delay)
     rig.peers.receive("vehicle", Client().pack(mavlink.MAVLink_set_gps_global_origin_message(1, 0, 0, 0)), 0)
     rig.run(8.0)
     return rig
 
 
-def assert_they_flow(rig: Indoors, from_s: float, off_s: float) -> None:
+def assert_they_flow(rig: IndoorsRig, from_s: float, off_s: float) -> None:
     """Without a gap, and with stamps of the capture in the vehicle's clock; PX4 moves stamps itself."""
     sent = [(at_ns, message) for at_ns, message in rig.relayed() if at_ns > from_s * SECOND]
     times = [at_ns for at_ns, _ in sent]

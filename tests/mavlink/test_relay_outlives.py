@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
-from take_off_rig import RELAYED, Flight
+from take_off_rig import RELAYED, TakeOffRig
 
 from uavctl import loop as control
 from uavctl.cause import Cause
@@ -26,8 +26,8 @@ SECOND = 1_000_000_000
 LAND_S = 2.0
 
 
-def airborne(autopilot: str, *overrides: str, until: HandoverState = HandoverState.ENGAGED) -> Flight:
-    flight = Flight(autopilot, *RELAYED, *overrides).relayed().take_off()
+def airborne(autopilot: str, *overrides: str, until: HandoverState = HandoverState.ENGAGED) -> TakeOffRig:
+    flight = TakeOffRig(autopilot, *RELAYED, *overrides).relayed().take_off()
     flight.run(40.0, until=until)
     return flight.run(5.0)  # the rotors spin up first, for as long as 4.2 s
 
@@ -47,11 +47,11 @@ def failing(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
     return lambda: broken.append(True)
 
 
-def poses_after(flight: Flight, at_ns: int) -> list[int]:
+def poses_after(flight: TakeOffRig, at_ns: int) -> list[int]:
     return [sent_ns for sent_ns, _ in flight.sent(POSE) if sent_ns > at_ns]
 
 
-def is_down(flight: Flight) -> bool:
+def is_down(flight: TakeOffRig) -> bool:
     return flight.peers.autopilot.vehicle.landed and not flight.peers.autopilot.pilot.is_armed
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from loopback_rig import Memory, make_loop
+from loopback_rig import MemorySink, make_loop
 from mavlink_rig import Peer, events, make_link, packets
 
 from uavctl.cli.live_line import REPEAT_NS, MessageFilter, describe_wait
@@ -50,7 +50,7 @@ def test_different_words_are_each_said_and_what_is_no_refusal_is_not() -> None:
 
 @pytest.mark.fault(26)
 def test_a_recorded_refusal_reaches_the_console_as_it_is_heard() -> None:
-    loop = make_loop(load_config("room-hahn-stursberg"), Memory())
+    loop = make_loop(load_config("room-hahn-stursberg"), MemorySink())
     message_filter = MessageFilter()
     lines: dict[str, float] = {}
     begun_ns = 0

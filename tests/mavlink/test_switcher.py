@@ -6,7 +6,7 @@ from itertools import product
 from typing import Any
 
 import pytest
-from hand_over_rig import ENGAGE, LAND, NOTHING, Rig
+from hand_over_rig import ENGAGE, LAND, NOTHING, HandoverRig
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavctl.config.connections import HandOverConfig
@@ -257,14 +257,14 @@ def test_a_fence_that_is_told_without_words_and_an_order_of_a_ground_station() -
 # What the hand-over does
 
 
-def engaged(autopilot: str) -> Rig:
-    rig = Rig(autopilot, HandOverConfig(climb_s=10.0)).to(HandoverState.ENGAGING)
-    rig.be(mode=EXTERNAL[autopilot], landed=False)
+def engaged(autopilot: str) -> HandoverRig:
+    rig = HandoverRig(autopilot, HandOverConfig(climb_s=10.0)).advance_to(HandoverState.ENGAGING)
+    rig.report_status(mode=EXTERNAL[autopilot], landed=False)
     rig.run(1.0, until=HandoverState.ENGAGED)
     return rig
 
 
-def landings(rig: Rig) -> int:
+def landings(rig: HandoverRig) -> int:
     return sum(ask is RequestKind.LAND for _, ask in rig.asked)
 
 
@@ -273,15 +273,15 @@ def landings(rig: Rig) -> int:
 def test_unknown_in_a_mode_that_flies_by_itself_is_landed_in_bounded_time_unless_a_stick_moves(autopilot: str) -> None:
     home = "AUTO.RTL" if autopilot == "px4" else "RTL"
     rig = engaged(autopilot)
-    rig.be(mode=home)
+    rig.report_status(mode=home)
     rig.run(9.0)
     assert rig.is_in(HandoverState.UNCLEAR) and not landings(rig) and rig.hand_over.is_busy
     rig.run(2.0)
     assert landings(rig)
     pilots = engaged(autopilot)
-    pilots.be(mode=home)
+    pilots.report_status(mode=home)
     pilots.run(5.0)
-    pilots.be(stick=True)
+    pilots.report_status(stick=True)
     pilots.run(60.0)
     assert pilots.is_in(HandoverState.RELEASED) and not landings(pilots)
 
@@ -289,12 +289,12 @@ def test_unknown_in_a_mode_that_flies_by_itself_is_landed_in_bounded_time_unless
 @pytest.mark.fault(28, 61)
 def test_word_of_the_fence_that_comes_after_its_mode_counts() -> None:
     rig = engaged("ardupilot")
-    rig.be(mode="RTL")
+    rig.report_status(mode="RTL")
     rig.tick()
-    rig.be(fence=True, said="Max Alt fence breached")
+    rig.report_status(fence=True, said="Max Alt fence breached")
     rig.tick()
     assert rig.is_in(HandoverState.FAILSAFE) and "Max Alt fence breached" in rig.codes("hand-over")[-1]
-    rig.be(fence=False, said="", mode="LAND", failsafe=True)
+    rig.report_status(fence=False, said="", mode="LAND", failsafe=True)
     rig.run(3.0)
     assert rig.is_in(HandoverState.FAILSAFE) and not landings(rig)
 
@@ -304,12 +304,12 @@ def test_px4_s_descend_while_landing_is_asked_for_is_a_landing() -> None:
     rig = engaged("px4")
     rig.tick(is_landing_requested=True)
     rig.tick(is_landing_requested=False)
-    rig.be(mode="AUTO.DESCEND", failsafe=True)
+    rig.report_status(mode="AUTO.DESCEND", failsafe=True)
     rig.run(3.0)
     assert rig.is_in(HandoverState.LANDING) and landings(rig) > 1  # not for us: it is asked on
     rig.answer(0, RequestKind.LAND)
     assert rig.is_in(HandoverState.SETTLING)
-    rig.be(armed=False, mode="OFFBOARD", failsafe=False)
+    rig.report_status(armed=False, mode="OFFBOARD", failsafe=False)
     rig.tick()
     assert rig.is_in(HandoverState.DONE)
 
@@ -323,9 +323,9 @@ def test_whoever_it_was_nothing_flies_it_and_by_order_only_is_it_asked_for(autop
     modes = [*sorted(set(profile.mode_choices) - {profile.external_mode} - profile.climb_modes), "MODE_99"]
     words: tuple[dict[str, Any], ...] = ({}, {"failsafe": True}, {"fence": True, "said": "Circle fence breached"})
     for state, mode, stick, said in product(states, modes, (False, True), words):
-        rig = engaged(autopilot) if state is HandoverState.ENGAGED else Rig(autopilot).to(state)
+        rig = engaged(autopilot) if state is HandoverState.ENGAGED else HandoverRig(autopilot).advance_to(state)
         asked = len(rig.asked)
-        rig.be(mode=mode, stick=stick, landed=False, **said)
+        rig.report_status(mode=mode, stick=stick, landed=False, **said)
         sent = {rig.tick().setpoint_mode for _ in range(80)}
         assert sent == {NOTHING} and len(rig.asked) == asked, (state, mode, stick, said)
         assert rig.is_in(HandoverState.RELEASED, HandoverState.FAILSAFE, HandoverState.UNCLEAR), (
@@ -339,11 +339,11 @@ def test_whoever_it_was_nothing_flies_it_and_by_order_only_is_it_asked_for(autop
 
 
 def test_the_operator_s_orders_count_while_it_is_unknown() -> None:
-    rig = Rig("px4").to(HandoverState.UNCLEAR)
-    rig.be(landed=False)
+    rig = HandoverRig("px4").advance_to(HandoverState.UNCLEAR)
+    rig.report_status(landed=False)
     rig.tick(commands=(LAND,))
     assert rig.is_in(HandoverState.LANDING)
-    rig = Rig("px4").to(HandoverState.UNCLEAR)
-    rig.be(landed=False)
+    rig = HandoverRig("px4").advance_to(HandoverState.UNCLEAR)
+    rig.report_status(landed=False)
     rig.tick(commands=(ENGAGE,))
     assert rig.is_in(HandoverState.RETURNING)

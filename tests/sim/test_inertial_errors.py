@@ -8,13 +8,26 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from inertial_rig import FIRST, NAMES, QUADROTOR, QUATERNION, SECOND, Array, G, InertialRecord, ask, recorded, si, wave
+from inertial_rig import (
+    FIRST,
+    NAMES,
+    QUADROTOR,
+    QUATERNION,
+    SECOND,
+    G,
+    InertialRecord,
+    convert_to_si,
+    make_velocity_wave,
+    record_flight,
+    request_streams,
+)
 from quadrotor_rig import quadrotor, run
-from sim_rig import Bench, bench
+from sim_rig import SimRig, make_rig
 
 from sim.autopilot.inertial import DRIFT_S, ERRORS, GaussMarkov, Imu, InertialErrors, InertialSensors, draw_normals
 from sim.vehicle.interface import rotate_to_ned
 from sim.vehicle.quadrotor import Quadrotor
+from uavctl.arrays import Array
 from uavctl.config import load_config
 from uavctl.errors import ConfigError
 
@@ -120,23 +133,23 @@ def test_all_errors_grow_by_the_configured_factor(name: str) -> None:
     assert e.scale(3.0).wander_rad == pytest.approx(3.0 * e.wander_rad)
     tilts = []
     for errors in (1, 3):
-        one = bench(name, QUADROTOR, "sim.seed=4", f"sim.inertial.errors={errors}")
-        tilts.append(recorded(one, name, 2.0).turned_by)
+        one = make_rig(name, QUADROTOR, "sim.seed=4", f"sim.inertial.errors={errors}")
+        tilts.append(record_flight(one, name, 2.0).attitude_error)
     assert tilts[1] == pytest.approx(3.0 * tilts[0], abs=1e-4)
 
 
 def flights(name: str, count: int) -> list[InertialRecord]:
     made = []
     for seed in range(count):
-        one = bench(name, QUADROTOR, f"sim.seed={seed}")
-        one.send(one.client.velocity(*wave(0.0)))
-        made.append(recorded(one, name, 10.0))
+        one = make_rig(name, QUADROTOR, f"sim.seed={seed}")
+        one.send(one.client.velocity(*make_velocity_wave(0.0)))
+        made.append(record_flight(one, name, 10.0))
     return made
 
 
 def quantiles(records: list[InertialRecord], seconds: float) -> tuple[float, float]:
     """Median and 90 % of where dead reckoning ends off [m]."""
-    off: Array = np.concatenate([record.reckoned(seconds) for record in records])
+    off: Array = np.concatenate([record.dead_reckoning_error_m(seconds) for record in records])
     return float(np.median(off)), float(np.quantile(off, 0.9))
 
 
@@ -176,7 +189,7 @@ def test_ardupilot_dead_reckons_worse_by_what_its_message_keeps(
 @BOTH
 def test_the_attitude_told_in_flight_errs_by_a_third_of_a_degree(name: str, request: pytest.FixtureRequest) -> None:
     records: list[InertialRecord] = request.getfixturevalue(name)
-    turns = np.degrees(np.concatenate([record.turned_by for record in records]))
+    turns = np.degrees(np.concatenate([record.attitude_error for record in records]))
     assert 0.3 < math.sqrt(np.mean(np.sum(turns[:, :2] ** 2, axis=1))) < 1.0
     assert np.abs(turns).max() < 2.0
 
@@ -203,8 +216,8 @@ def test_the_second_unit_has_errors_of_its_own(name: str) -> None:
     assert first.force_mps2 != second.force_mps2
 
 
-def streams(one: Bench, *kinds: int) -> list[bytes]:
-    ask(one, *kinds)
+def streams(one: SimRig, *kinds: int) -> list[bytes]:
+    request_streams(one, *kinds)
     one.wait(3.0)
     return [bytes(msg.get_msgbuf()) for _, msg in one.seen]
 
@@ -212,7 +225,7 @@ def streams(one: Bench, *kinds: int) -> list[bytes]:
 @BOTH
 def test_a_seed_gives_the_same_bytes_and_another_seed_others(name: str) -> None:
     kinds = (FIRST[name], QUATERNION, *((SECOND,) if name == "ardupilot" else ()))
-    one, again, other = (streams(bench(name, QUADROTOR, f"sim.seed={seed}"), *kinds) for seed in (3, 3, 4))
+    one, again, other = (streams(make_rig(name, QUADROTOR, f"sim.seed={seed}"), *kinds) for seed in (3, 3, 4))
     assert one == again
     assert one != other
 
@@ -220,16 +233,16 @@ def test_a_seed_gives_the_same_bytes_and_another_seed_others(name: str) -> None:
 @BOTH
 def test_who_asks_for_no_inertial_data_gets_the_same_bytes_whatever_their_errors(name: str) -> None:
     for plant in ("sim.plant=linear", QUADROTOR):
-        exact, wrong = (streams(bench(name, plant, f"sim.inertial.errors={e}"), QUATERNION) for e in (0, 10))
+        exact, wrong = (streams(make_rig(name, plant, f"sim.inertial.errors={e}"), QUATERNION) for e in (0, 10))
         assert exact == wrong
 
 
 @BOTH
 def test_on_the_linear_plant_the_attitude_errs_with_the_inertial_data(name: str) -> None:
-    one = bench(name)
-    record = recorded(one, name, 3.0)
+    one = make_rig(name)
+    record = record_flight(one, name, 3.0)
     assert np.array_equal(record.true_attitude, np.tile([1.0, 0.0, 0.0, 0.0], (len(record.time_s), 1)))
-    tilt = np.degrees(np.linalg.norm(record.turned_by[:, :2], axis=1))
+    tilt = np.degrees(np.linalg.norm(record.attitude_error[:, :2], axis=1))
     assert 0.01 < tilt.mean() < 2.0
     off = record.force[1:-1] - (record.true_acceleration - [0.0, 0.0, G])
     assert np.abs(off.mean(axis=0)).max() < 0.25
@@ -241,7 +254,7 @@ def test_on_the_linear_plant_the_attitude_errs_with_the_inertial_data(name: str)
 
 def drifted(name: str, seed: int, *more: str) -> float:
     """How far ten seconds of zero acceleration lead off [m]."""
-    one = bench(name, QUADROTOR, f"sim.seed={seed}", *more)
+    one = make_rig(name, QUADROTOR, f"sim.seed={seed}", *more)
     one.stream(10.0, 0.0, 0.0, 0.0)
     return math.hypot(*one.peers.vehicle.position_m[:2])
 
@@ -254,7 +267,7 @@ def test_flying_by_it_px4_drifts_open_loop_and_ardupilot_holds() -> None:
 
 
 def test_who_flies_by_it_tells_it_from_the_start() -> None:
-    one = bench("px4", QUADROTOR, FLOWN)
+    one = make_rig("px4", QUADROTOR, FLOWN)
     one.wait(2.0)
     told, vehicle = one.of("ATTITUDE_QUATERNION")[-1], one.peers.vehicle
     assert isinstance(vehicle, Quadrotor)
@@ -269,7 +282,7 @@ def test_the_linear_plant_cannot_fly_by_it() -> None:
 
 def test_first_messages_are_those_of_the_first_unit() -> None:
     for name, kind in FIRST.items():
-        one = bench(name, "sim.inertial.errors=0", airborne=False)
-        ask(one, kind)
+        one = make_rig(name, "sim.inertial.errors=0", airborne=False)
+        request_streams(one, kind)
         one.wait(0.1)
-        assert si(one.of(NAMES[kind])[-1])[2] == pytest.approx(-G)
+        assert convert_to_si(one.of(NAMES[kind])[-1])[2] == pytest.approx(-G)

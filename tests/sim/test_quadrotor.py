@@ -5,13 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from quadrotor_rig import BOTH, Array, Autopilot, allowing, gusty, quadrotor, run, steady, tilt
+from quadrotor_rig import BOTH, Autopilot, allowing, gusty, quadrotor, run, steady, tilt
 from scipy.optimize import fsolve
 
 from sim.vehicle.airframe import AIR_DENSITY_KGPM3, CRAZYFLIE_2, GRAVITY_MPS2
 from sim.vehicle.battery import BatteryModel
 from sim.vehicle.loops import REFERENCE_ACCEL_MPS2, TUNINGS
 from sim.vehicle.quadrotor import STEP_NS, STEP_S
+from uavctl.arrays import Array
 
 
 @pytest.mark.parametrize("autopilot", BOTH)

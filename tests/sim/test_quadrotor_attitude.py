@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from quadrotor_rig import HOVER_SUM_RPS, Array, quadrotor, run
+from quadrotor_rig import HOVER_SUM_RPS, quadrotor, run
 from scipy.linalg import expm
 
 from sim.vehicle.airframe import CRAZYFLIE_2, GRAVITY_MPS2
@@ -12,6 +12,7 @@ from sim.vehicle.attitude_loop import YAW_INTEGRAL_1PS2, YAW_RATE_GAIN_1PS, Atti
 from sim.vehicle.quadrotor import STEP_S
 from sim.vehicle.rigid_body import LEVEL, Body, BodyState, integrate_step, rotate_attitude
 from sim.vehicle.rotors import Rotors
+from uavctl.arrays import Array
 from uavctl.records import Vec3
 
 DRAG_1PS = CRAZYFLIE_2.rotor_drag_kg[0] * HOVER_SUM_RPS / CRAZYFLIE_2.mass_kg  # at hover

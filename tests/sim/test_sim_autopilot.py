@@ -4,8 +4,9 @@ import math
 from itertools import pairwise
 
 import pytest
-from sim_rig import ARM, INTERVAL, LAND, SET_MODE, TAKE_OFF, Bench, S, bench, flying, heartbeat
+from sim_rig import ARM, INTERVAL, LAND, SET_MODE, TAKE_OFF, SimRig, make_rig, read_flight_state, read_heartbeat
 
+from uavctl.arrays import SECOND_NS
 from uavctl.config import load_config
 
 OFFBOARD = (1, 6, 0)
@@ -16,7 +17,7 @@ OFFBOARD = (1, 6, 0)
     ("autopilot", "number", "base", "custom"), [("px4", 12, 145, 6 << 16), ("ardupilot", 3, 217, 4)]
 )
 def test_airborne_start_and_telemetry_rates(autopilot: str, number: int, base: int, custom: int) -> None:
-    one = bench(autopilot)
+    one = make_rig(autopilot)
     one.wait(0.0)
     first = one.of("HEARTBEAT")[0]
     assert (first.autopilot, first.base_mode, first.custom_mode) == (number, base, custom)
@@ -33,15 +34,15 @@ def test_airborne_start_and_telemetry_rates(autopilot: str, number: int, base: i
 
 def test_ground_start_is_disarmed_and_on_the_floor() -> None:
     for autopilot, base, custom in (("px4", 29, 4 << 16 | 3 << 24), ("ardupilot", 81, 0)):
-        one = bench(autopilot, airborne=False)
-        message = heartbeat(one)
+        one = make_rig(autopilot, airborne=False)
+        message = read_heartbeat(one)
         assert (message.base_mode, message.custom_mode, message.system_status) == (base, custom, 3)
         assert one.of("EXTENDED_SYS_STATE")[-1].landed_state == 1
         assert one.peers.vehicle.position_m == (0.0, 0.0, 0.0)
 
 
 def test_timesync_is_answered_in_its_own_clock() -> None:
-    one = bench("px4")
+    one = make_rig("px4")
     one.wait(1.5)
     (answer,) = one.send(one.client.timesync(123_456_789))
     assert (answer.tc1, answer.ts1) == (21_500_000_000, 123_456_789)
@@ -49,7 +50,7 @@ def test_timesync_is_answered_in_its_own_clock() -> None:
 
 
 def test_a_stream_can_be_asked_for_stopped_and_reset() -> None:
-    one = bench("ardupilot")
+    one = make_rig("ardupilot")
 
     def in_a_second() -> int:
         before = len(one.of("LOCAL_POSITION_NED"))
@@ -72,20 +73,20 @@ def test_a_stream_can_be_asked_for_stopped_and_reset() -> None:
 @pytest.mark.parametrize("mask", [3135, 2111])
 @pytest.mark.parametrize(("autopilot", "frame"), [("px4", 1), ("ardupilot", 1), ("ardupilot", 7)])
 def test_acceleration_setpoints_are_flown(autopilot: str, frame: int, mask: int) -> None:
-    one = bench(autopilot)
+    one = make_rig(autopilot)
     one.send(one.client.setpoint(1.0, -0.5, 0.25, mask=mask, frame=frame))
-    assert flying(one) == (1.0, -0.5, 0.25)
+    assert read_flight_state(one) == (1.0, -0.5, 0.25)
     one.wait(0.5)
-    assert flying(one) == (1.0, -0.5, 0.25)
+    assert read_flight_state(one) == (1.0, -0.5, 0.25)
     assert one.texts == []
 
 
 @pytest.mark.parametrize("ignored", [0x40, 0x80, 0x100])
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 def test_one_ignored_acceleration_axis_means_stop(autopilot: str, ignored: int) -> None:
-    one = bench(autopilot, "sim.start_velocity_mps=[1.0,0.0,0.0]")
+    one = make_rig(autopilot, "sim.start_velocity_mps=[1.0,0.0,0.0]")
     one.send(one.client.setpoint(1.0, 1.0, 1.0, mask=3135 | ignored))
-    assert flying(one) == (-2.0, -0.0, -0.0)
+    assert read_flight_state(one) == (-2.0, -0.0, -0.0)
     for _ in range(50):
         one.send(one.client.setpoint(1.0, 1.0, 1.0, mask=3135 | ignored))
         one.wait(0.1)
@@ -94,37 +95,37 @@ def test_one_ignored_acceleration_axis_means_stop(autopilot: str, ignored: int) 
 
 
 def test_the_force_bit_is_refused_by_px4_and_dropped_by_ardupilot() -> None:
-    one = bench("px4")
+    one = make_rig("px4")
     one.send(one.client.setpoint(1.0, 0.0, 0.0, mask=3135 | 0x200))
-    assert flying(one) == (0.0, 0.0, 0.0)
+    assert read_flight_state(one) == (0.0, 0.0, 0.0)
     assert one.texts == ["force setpoint not supported"]
-    one = bench("ardupilot")
+    one = make_rig("ardupilot")
     one.send(one.client.setpoint(1.0, 0.0, 0.0, mask=3135 | 0x200))
-    assert flying(one) == (1.0, 0.0, 0.0)
+    assert read_flight_state(one) == (1.0, 0.0, 0.0)
     assert one.texts == []
 
 
 def test_other_frames_stop_ardupilot_and_are_refused_by_px4() -> None:
-    one = bench("ardupilot", "sim.start_velocity_mps=[1.0,0.0,0.0]")
+    one = make_rig("ardupilot", "sim.start_velocity_mps=[1.0,0.0,0.0]")
     one.send(one.client.setpoint(1.0, 0.0, 0.0, frame=20))
-    assert flying(one)[0] == -2.0
-    one = bench("px4")
+    assert read_flight_state(one)[0] == -2.0
+    one = make_rig("px4")
     one.send(one.client.setpoint(1.0, 0.0, 0.0, frame=7))
-    assert flying(one) == (0.0, 0.0, 0.0)
+    assert read_flight_state(one) == (0.0, 0.0, 0.0)
     assert one.texts == ["setpoint refused: frame 7"]
 
 
 def test_setpoints_for_another_system_are_not_mine() -> None:
-    one = bench("px4")
+    one = make_rig("px4")
     one.send(one.client.setpoint(1.0, 0.0, 0.0, system=2))
-    assert flying(one) == (0.0, 0.0, 0.0)
+    assert read_flight_state(one) == (0.0, 0.0, 0.0)
     one.send(one.client.setpoint(1.0, 0.0, 0.0, system=0))
-    assert flying(one) == (1.0, 0.0, 0.0)
+    assert read_flight_state(one) == (1.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_a_setpoint_that_is_no_number_kills_ardupilot_and_stops_px4(value: float) -> None:
-    one = bench("ardupilot")
+    one = make_rig("ardupilot")
     one.send(one.client.setpoint(1.0, value, 0.0))
     assert one.peers.autopilot.mode_name == "CRASHED"
     assert one.peers.autopilot.pilot.crash_reason == "a setpoint was not a number"
@@ -133,10 +134,10 @@ def test_a_setpoint_that_is_no_number_kills_ardupilot_and_stops_px4(value: float
     assert one.send(one.client.timesync(1)) == []
     assert len(one.seen) == before
     assert len(one.positions) > 10  # the cameras live on
-    one = bench("px4")
+    one = make_rig("px4")
     one.send(one.client.setpoint(1.0, value, 0.0))
     assert one.peers.autopilot.mode_name == "OFFBOARD"
-    assert flying(one) == (0.0, 0.0, 0.0)
+    assert read_flight_state(one) == (0.0, 0.0, 0.0)
 
 
 # Silence
@@ -144,46 +145,46 @@ def test_a_setpoint_that_is_no_number_kills_ardupilot_and_stops_px4(value: float
 
 def test_the_timeout_counts_from_the_first_setpoint() -> None:
     for autopilot in ("px4", "ardupilot"):
-        one = bench(autopilot)
+        one = make_rig(autopilot)
         one.wait(20.0)
         assert one.peers.autopilot.mode_name in ("OFFBOARD", "GUIDED")
-        assert flying(one) == (0.0, 0.0, 0.0)
+        assert read_flight_state(one) == (0.0, 0.0, 0.0)
 
 
 def test_px4_holds_after_silence_and_comes_back_with_the_stream() -> None:
-    one = bench("px4", "sim.setpoint_timeout_s=1.0")
+    one = make_rig("px4", "sim.setpoint_timeout_s=1.0")
     one.stream(1.0, 1.0, 0.0, 0.0)  # the last one at 0.9 s
     one.wait(0.899)
     assert one.peers.autopilot.mode_name == "OFFBOARD"
-    assert flying(one) == (1.0, 0.0, 0.0)
+    assert read_flight_state(one) == (1.0, 0.0, 0.0)
     one.wait(0.001)
     assert one.peers.autopilot.mode_name == "AUTO.LOITER"
     assert [(at_ns, msg.severity, msg.text) for at_ns, msg in one.seen if msg.get_type() == "STATUSTEXT"] == [
-        (19 * S // 10, 2, "Failsafe activated")
+        (19 * SECOND_NS // 10, 2, "Failsafe activated")
     ]
-    message = heartbeat(one)
+    message = read_heartbeat(one)
     assert (message.base_mode, message.custom_mode, message.system_status) == (157, 4 << 16 | 3 << 24, 5)
     one.wait(5.0)
     assert one.speed_mps < 0.01
     one.send(one.client.setpoint(0.5, 0.0, 0.0))
     assert one.peers.autopilot.mode_name == "OFFBOARD"
-    assert flying(one) == (0.5, 0.0, 0.0)
+    assert read_flight_state(one) == (0.5, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(("autopilot", "parameter"), [("px4", "COM_OF_LOSS_T"), ("ardupilot", "GUID_TIMEOUT")])
 def test_the_silence_that_counts_is_the_autopilot_s_own_unless_configured(autopilot: str, parameter: str) -> None:
-    assert bench(autopilot).peers.autopilot.parameters[parameter] == pytest.approx(0.7)
-    one = bench(autopilot, "sim.setpoint_timeout_s=0.5", "plant.drag_1ps=[0.0,0.0,0.0]")
+    assert make_rig(autopilot).peers.autopilot.parameters[parameter] == pytest.approx(0.7)
+    one = make_rig(autopilot, "sim.setpoint_timeout_s=0.5", "plant.drag_1ps=[0.0,0.0,0.0]")
     assert one.peers.autopilot.parameters[parameter] == 0.5
     one.stream(1.0, 1.0, 0.0, 0.0)  # the last one at 0.9 s
     one.wait(0.399)
-    assert flying(one) == (1.0, 0.0, 0.0)
+    assert read_flight_state(one) == (1.0, 0.0, 0.0)
     one.wait(0.002)
-    assert flying(one)[0] < 0.0  # it brakes
+    assert read_flight_state(one)[0] < 0.0  # it brakes
 
 
 def test_px4_does_not_come_back_by_itself_from_a_hold_that_was_asked_for() -> None:
-    one = bench("px4")
+    one = make_rig("px4")
     one.stream(1.0, 0.5, 0.0, 0.0)
     assert one.ask(SET_MODE, 1, 4, 3) == 0
     one.stream(1.0, 0.5, 0.0, 0.0)
@@ -192,14 +193,14 @@ def test_px4_does_not_come_back_by_itself_from_a_hold_that_was_asked_for() -> No
 
 def test_ardupilot_keeps_the_last_acceleration_then_brakes_and_stays_guided() -> None:
     shipped = "sim.setpoint_timeout_s=3.0"
-    one = bench("ardupilot", shipped, "plant.drag_1ps=[0.0,0.0,0.0]", "plant.lag_s=[0.25,0.25,0.25]")
+    one = make_rig("ardupilot", shipped, "plant.drag_1ps=[0.0,0.0,0.0]", "plant.lag_s=[0.25,0.25,0.25]")
     one.stream(2.0, 1.0, 0.0, 0.0)  # the last one at 1.9 s
     one.wait(2.8)
-    assert flying(one) == (1.0, 0.0, 0.0)
+    assert read_flight_state(one) == (1.0, 0.0, 0.0)
     # without drag v = t - T (1 - exp(-t/T)), T = 0.25 s, at 4.8 s
     assert one.speed_mps == pytest.approx(4.8 - 0.25, abs=1e-6)
     one.wait(0.11)
-    assert flying(one)[0] == pytest.approx(-2.5)
+    assert read_flight_state(one)[0] == pytest.approx(-2.5)
     one.wait(0.5)
     before = one.speed_mps
     one.wait(0.5)
@@ -209,17 +210,17 @@ def test_ardupilot_keeps_the_last_acceleration_then_brakes_and_stays_guided() ->
     assert one.peers.autopilot.mode_name == "GUIDED"
     assert one.texts == []
     one.send(one.client.setpoint(1.0, 0.0, 0.0))
-    assert flying(one) == (1.0, 0.0, 0.0)
+    assert read_flight_state(one) == (1.0, 0.0, 0.0)
 
 
 # Commands
 
 
 def test_set_mode_message_is_acknowledged_as_each_autopilot_does() -> None:
-    one = bench("px4")
+    one = make_rig("px4")
     (ack,) = one.send(one.client.set_mode(4 << 16 | 3 << 24))
     assert (ack.command, ack.result, one.peers.autopilot.mode_name) == (176, 0, "AUTO.LOITER")
-    one = bench("ardupilot")
+    one = make_rig("ardupilot")
     (ack,) = one.send(one.client.set_mode(17))
     assert (ack.command, ack.result, one.peers.autopilot.mode_name) == (11, 0, "BRAKE")
     (ack,) = one.send(one.client.set_mode(99))
@@ -229,7 +230,7 @@ def test_set_mode_message_is_acknowledged_as_each_autopilot_does() -> None:
 
 
 def test_modes_that_do_not_exist_are_refused() -> None:
-    one = bench("px4")
+    one = make_rig("px4")
     for params in ((1, 9, 0), (1, math.nan, 0), (math.inf, 4, 3), (1, -4, 3), (1, 4, 1e30)):
         assert one.ask(SET_MODE, *params) == 2
     assert one.ask(SET_MODE, 0, 4, 3) == 3
@@ -237,7 +238,7 @@ def test_modes_that_do_not_exist_are_refused() -> None:
 
 
 def test_unknown_commands_are_unsupported_and_those_for_others_ignored() -> None:
-    one = bench("px4")
+    one = make_rig("px4")
     assert one.ask(246, 1) == 3
     assert one.send(one.client.command(LAND, system=9)) == []
     assert one.peers.autopilot.mode_name == "OFFBOARD"
@@ -245,7 +246,7 @@ def test_unknown_commands_are_unsupported_and_those_for_others_ignored() -> None
 
 def test_disarming_in_the_air_is_refused_even_if_forced() -> None:
     for autopilot, result in (("px4", 2), ("ardupilot", 4)):
-        one = bench(autopilot)
+        one = make_rig(autopilot)
         assert one.ask(ARM, 0) == result
         assert one.ask(ARM, 0, 21196) == result
         assert one.peers.autopilot.pilot.is_armed
@@ -253,18 +254,18 @@ def test_disarming_in_the_air_is_refused_even_if_forced() -> None:
 
 
 def test_arming_and_disarming_on_the_floor() -> None:
-    one = bench("px4", airborne=False)
+    one = make_rig("px4", airborne=False)
     assert one.ask(ARM, 2) == 3
     assert one.ask(ARM, math.nan) == 3
     assert one.ask(ARM, 1) == 0
     assert one.texts == ["Armed by external command"]
-    assert heartbeat(one).base_mode == 157
+    assert read_heartbeat(one).base_mode == 157
     one.stream(1.0, 0.0, 0.0, -1.0)
     assert one.ask(SET_MODE, *OFFBOARD) == 0
     one.stream(1.0, 0.0, 0.0, -1.0)
     assert one.peers.vehicle.position_m == (0.0, 0.0, 0.0)  # armed but landed: setpoints do not lift it
     assert one.ask(ARM, 0) == 0
-    assert heartbeat(one).base_mode == 17
+    assert read_heartbeat(one).base_mode == 17
 
 
 @pytest.mark.parametrize("command", ["command", "mode"])
@@ -275,7 +276,7 @@ def test_landing_descends_touches_and_disarms(command: str) -> None:
     ):
         if (autopilot, command) == ("px4", "command"):  # as recorded
             landed = ["Landing at current position", *landed]
-        one = bench(autopilot, "sim.start_velocity_mps=[1.0,-0.5,0.0]")
+        one = make_rig(autopilot, "sim.start_velocity_mps=[1.0,-0.5,0.0]")
         assert one.ask(LAND) == 0 if command == "command" else one.ask(SET_MODE, *mode) == 0
         one.wait(2.0)
         assert one.of("EXTENDED_SYS_STATE")[-1].landed_state == 4
@@ -287,12 +288,12 @@ def test_landing_descends_touches_and_disarms(command: str) -> None:
         one.wait(2.0)
         assert one.texts == [*landed, disarmed]
         assert not one.peers.autopilot.pilot.is_armed
-        assert heartbeat(one).base_mode & 128 == 0
+        assert read_heartbeat(one).base_mode & 128 == 0
         assert one.of("EXTENDED_SYS_STATE")[-1].landed_state == 1
 
 
 def test_setpoints_do_not_stop_a_landing() -> None:
-    one = bench("px4")
+    one = make_rig("px4")
     one.stream(1.0, 0.0, 0.0, 0.0)
     assert one.ask(LAND) == 0
     one.stream(8.0, 0.0, 0.0, -1.0)
@@ -300,16 +301,16 @@ def test_setpoints_do_not_stop_a_landing() -> None:
 
 
 def test_a_landing_can_be_called_off() -> None:
-    one = bench("ardupilot")
+    one = make_rig("ardupilot")
     assert one.ask(LAND) == 0
     one.wait(1.0)
     assert one.ask(SET_MODE, 1, 4) == 0
     one.send(one.client.setpoint(0.5, 0.0, -0.5))
-    assert flying(one) == (0.5, 0.0, -0.5)
+    assert read_flight_state(one) == (0.5, 0.0, -0.5)
 
 
 def test_px4_takes_off_by_mode_and_then_holds() -> None:
-    one = bench("px4", airborne=False)
+    one = make_rig("px4", airborne=False)
     assert one.ask(SET_MODE, 1, 4, 2) == 0
     one.wait(1.0)
     assert one.peers.vehicle.position_m[2] == 0.0
@@ -323,7 +324,7 @@ def test_px4_takes_off_by_mode_and_then_holds() -> None:
 
 
 def test_ardupilot_takes_off_in_guided_only_and_then_takes_setpoints() -> None:
-    one = bench("ardupilot", airborne=False)
+    one = make_rig("ardupilot", airborne=False)
     assert one.ask(TAKE_OFF, 0, 0, 0, 0, 0, 0, 1.5) == 4
     assert one.ask(ARM, 1) == 0
     assert one.ask(TAKE_OFF, 0, 0, 0, 0, 0, 0, 1.5) == 4
@@ -332,11 +333,11 @@ def test_ardupilot_takes_off_in_guided_only_and_then_takes_setpoints() -> None:
     one.wait(8.0)
     assert one.peers.vehicle.position_m[2] == pytest.approx(-1.5, abs=0.15)
     one.send(one.client.setpoint(0.5, 0.0, 0.0))
-    assert flying(one) == (0.5, 0.0, 0.0)
+    assert read_flight_state(one) == (0.5, 0.0, 0.0)
 
 
 def test_without_a_vertical_axis_take_off_and_landing_take_a_fixed_time() -> None:
-    one = Bench(load_config("paper"), airborne=False)
+    one = SimRig(load_config("paper"), airborne=False)
     assert one.ask(SET_MODE, 1, 4, 2) == 0
     assert one.ask(ARM, 1) == 0
     one.wait(6.0)

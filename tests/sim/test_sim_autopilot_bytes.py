@@ -5,21 +5,21 @@ import random
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from sim_rig import ARM, INTERVAL, LAND, SET_MODE, TAKE_OFF, Client, bench, decode, flying
+from sim_rig import ARM, INTERVAL, LAND, SET_MODE, TAKE_OFF, Client, decode, make_rig, read_flight_state
 
 
 def test_one_bad_datagram_does_not_spoil_the_next() -> None:
-    one = bench("px4")
+    one = make_rig("px4")
     good = one.client.setpoint(1.0, 0.0, 0.0)
     for bad in (good[:20], b"\xfd" * 50, b"\xfd\xff\x00", b"", b"\xfe"):
         one.send(bad)
         one.send(good)
-        assert flying(one) == (1.0, 0.0, 0.0)
+        assert read_flight_state(one) == (1.0, 0.0, 0.0)
         one.send(one.client.setpoint(0.0, 0.0, 0.0))
 
 
 def test_two_messages_in_one_datagram_are_both_read() -> None:
-    one = bench("px4")
+    one = make_rig("px4")
     answers = one.send(one.client.timesync(1) + one.client.command(LAND))
     assert [msg.get_type() for msg in answers] == ["TIMESYNC", "COMMAND_ACK", "STATUSTEXT"]
 
@@ -60,7 +60,7 @@ def mutants(seed: int, n: int) -> list[bytes]:
 @pytest.mark.slow
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 def test_damaged_datagrams_neither_raise_nor_change_anything(autopilot: str) -> None:
-    one = bench(autopilot)
+    one = make_rig(autopilot)
     one.stream(0.5, 0.0, 0.0, 0.0)
     mode = one.peers.autopilot.mode_name
     bad = [data for data in mutants(17, 20_000) if not readable(data)]
@@ -72,7 +72,7 @@ def test_damaged_datagrams_neither_raise_nor_change_anything(autopilot: str) -> 
             one.wait(0.05)
     assert one.peers.autopilot.mode_name == mode
     assert one.peers.autopilot.pilot.is_armed
-    assert flying(one) == (0.0, 0.0, 0.0)
+    assert read_flight_state(one) == (0.0, 0.0, 0.0)
     assert one.of("COMMAND_ACK") == []
 
 
@@ -105,7 +105,7 @@ def test_well_formed_messages_with_any_content_never_raise(autopilot: str) -> No
     rng, client = random.Random(23), Client()
     modes = set()
     for start in range(30):
-        one = bench(autopilot, airborne=start % 2 == 0)
+        one = make_rig(autopilot, airborne=start % 2 == 0)
         for i in range(200):
             data = any_message(rng, client)
             assert readable(data)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 from sim_rig import decode
-from take_off_rig import Flight
+from take_off_rig import TakeOffRig
 
 from sim.autopilot.checks import PreflightChecks
 from uavctl.config import load_config
@@ -15,7 +15,7 @@ from uavctl.mavlink.handover_states import HandoverState
 UNINIT, STANDBY, ACTIVE, CRITICAL = 0, 3, 4, 5
 
 
-def statuses(flight: Flight, seconds: float) -> list[int]:
+def statuses(flight: TakeOffRig, seconds: float) -> list[int]:
     """The system status of the vehicle's heartbeats."""
     found: list[int] = []
 
@@ -30,16 +30,16 @@ def statuses(flight: Flight, seconds: float) -> list[int]:
 
 @pytest.mark.fault(60)
 def test_px4_stands_by_only_while_its_checks_pass_and_ardupilot_always() -> None:
-    px4 = statuses(Flight("px4", "sim.checks.flicker_s=1.0"), 30.0)
+    px4 = statuses(TakeOffRig("px4", "sim.checks.flicker_s=1.0"), 30.0)
     assert set(px4) == {UNINIT, STANDBY} and px4.count(UNINIT) > 4
-    assert set(statuses(Flight("px4"), 5.0)) == {STANDBY}
-    assert set(statuses(Flight("ardupilot", "sim.checks.flicker_s=1.0"), 30.0)) == {STANDBY}
+    assert set(statuses(TakeOffRig("px4"), 5.0)) == {STANDBY}
+    assert set(statuses(TakeOffRig("ardupilot", "sim.checks.flicker_s=1.0"), 30.0)) == {STANDBY}
 
 
 @pytest.mark.fault(60)
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 def test_while_they_fail_it_does_not_arm_and_says_why(autopilot: str) -> None:
-    flight = Flight(autopilot, "sim.checks.flicker_s=1.0").take_off()
+    flight = TakeOffRig(autopilot, "sim.checks.flicker_s=1.0").take_off()
     flight.run(60.0, until=HandoverState.CLIMBING)
     refused = [event for event in flight.texts if "COMPONENT_ARM_DISARM: " in event and "ACCEPTED" not in event]
     assert bool(refused) == any("system health" in text or "Internal errors" in text for text in flight.texts)
@@ -49,7 +49,7 @@ def test_while_they_fail_it_does_not_arm_and_says_why(autopilot: str) -> None:
 def test_px4_is_back_in_its_take_off_when_its_position_is_valid_again_where_that_is_asked_for(
     clears: bool, after: str
 ) -> None:
-    flight = Flight("px4", "sim.checks.invalid=[[0.5, 1.5]]", f"sim.checks.clears={str(clears).lower()}").take_off()
+    flight = TakeOffRig("px4", "sim.checks.invalid=[[0.5, 1.5]]", f"sim.checks.clears={str(clears).lower()}").take_off()
     flight.run(10.0, until=HandoverState.CLIMBING)
     said = statuses(flight, 1.4)
     assert flight.peers.autopilot.mode_name == "AUTO.LAND" and CRITICAL in said
@@ -58,7 +58,7 @@ def test_px4_is_back_in_its_take_off_when_its_position_is_valid_again_where_that
 
 
 def test_nothing_is_drawn_or_looked_at_unless_asked_for() -> None:
-    autopilot = Flight("px4").peers.autopilot
+    autopilot = TakeOffRig("px4").peers.autopilot
     assert isinstance(autopilot._checks, PreflightChecks) and autopilot._checks.next_ns is None
     assert ChecksConfig() == load_config("room").sim.checks
 

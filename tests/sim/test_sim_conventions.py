@@ -6,9 +6,10 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from recorded_rig import packets
-from sim_rig import ARM, LAND, SET_MODE, TAKE_OFF, Bench, S, bench, decode, heartbeat
+from sim_rig import ARM, LAND, SET_MODE, TAKE_OFF, SimRig, decode, make_rig, read_heartbeat
 
 from sim.autopilot.parameters import TABLES
+from uavctl.arrays import SECOND_NS
 
 GUIDED, OFFBOARD, HOLD, BRAKE = (1, 4, 0), (1, 6, 0), (1, 4, 3), (1, 17, 0)
 RADIO, FENCE = 1 << 16, 1 << 20  # MAV_SYS_STATUS_SENSOR_RC_RECEIVER, MAV_SYS_STATUS_GEOFENCE
@@ -16,17 +17,17 @@ STICK = 'sim.fault=[{at_s=50.0, kind="mode", name="POSCTL"}]'
 BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 
 
-def target(one: Bench, seconds: float = 1.0) -> Any:
+def target(one: SimRig, seconds: float = 1.0) -> Any:
     """The last one told; it goes out every second."""
     one.wait(seconds)
     return one.of("POSITION_TARGET_LOCAL_NED")[-1]
 
 
 def test_px4_tells_its_target_always_and_what_is_not_set_is_no_number() -> None:
-    one = bench("px4", airborne=False)
+    one = make_rig("px4", airborne=False)
     told = target(one)
     assert (told.type_mask, told.afz) == (63, 100.0) and math.isnan(told.x) and math.isnan(told.vx)
-    one = bench("px4")
+    one = make_rig("px4")
     one.stream(1.5, 0.5, 0.0, 0.0)
     told = target(one, 0.0)
     assert (told.type_mask, told.afx) == (63, 0.5) and math.isnan(told.vx)
@@ -40,7 +41,7 @@ def test_px4_tells_its_target_always_and_what_is_not_set_is_no_number() -> None:
 
 
 def test_ardupilot_tells_its_target_when_guided_and_what_is_not_set_is_zero() -> None:
-    one = bench("ardupilot", airborne=False)
+    one = make_rig("ardupilot", airborne=False)
     one.wait(2.0)
     assert one.of("POSITION_TARGET_LOCAL_NED") == []
     assert one.ask(SET_MODE, *GUIDED) == 0
@@ -64,28 +65,28 @@ def test_ardupilot_tells_its_target_when_guided_and_what_is_not_set_is_zero() ->
 
 
 def test_px4_asks_for_the_time_ten_times_a_second_and_ardupilot_does_not() -> None:
-    one = bench("px4")
+    one = make_rig("px4")
     one.wait(0.95)
     asked = [(at_ns, msg) for at_ns, msg in one.seen if msg.get_type() == "TIMESYNC"]
-    assert [(msg.tc1, msg.ts1) for _, msg in asked] == [(0, at_ns + 20 * S) for at_ns, _ in asked]
+    assert [(msg.tc1, msg.ts1) for _, msg in asked] == [(0, at_ns + 20 * SECOND_NS) for at_ns, _ in asked]
     assert len(asked) == 10
     assert one.send(one.client.timesync(5, tc1=7)) == []  # the answer needs none
-    one = bench("ardupilot")
+    one = make_rig("ardupilot")
     one.wait(1.0)
     assert one.of("TIMESYNC") == []
 
 
 def test_armed_on_the_floor_px4_is_active_and_ardupilot_stands_by() -> None:
     for autopilot, status in (("px4", 4), ("ardupilot", 3)):
-        one = bench(autopilot, airborne=False)
-        assert heartbeat(one).system_status == 3
+        one = make_rig(autopilot, airborne=False)
+        assert read_heartbeat(one).system_status == 3
         assert one.ask(ARM, 1) == 0
-        assert heartbeat(one).system_status == status
+        assert read_heartbeat(one).system_status == status
 
 
 @BOTH
 def test_the_landed_state_says_what_kind_of_vehicle_it_is_and_the_estimate_that_it_is_good(autopilot: str) -> None:
-    one = bench(autopilot)
+    one = make_rig(autopilot)
     one.wait(1.0)
     ardupilot = autopilot == "ardupilot"
     assert one.of("EXTENDED_SYS_STATE")[-1].vtol_state == (3 if ardupilot else 0)
@@ -96,7 +97,7 @@ def test_the_landed_state_says_what_kind_of_vehicle_it_is_and_the_estimate_that_
 
 @BOTH
 def test_a_changed_parameter_is_told_with_its_index_by_px4_alone(autopilot: str) -> None:
-    one = bench(autopilot)
+    one = make_rig(autopilot)
     name = {"px4": "COM_OF_LOSS_T", "ardupilot": "GUID_TIMEOUT"}[autopilot]
     (told,) = one.send(one.client.pack(mavlink.MAVLink_param_set_message(1, 1, name.encode(), 2.0, 9)))
     assert (told.param_id, told.param_value) == (name, 2.0)
@@ -107,7 +108,7 @@ def test_a_changed_parameter_is_told_with_its_index_by_px4_alone(autopilot: str)
     ("autopilot", "more", "there"), [("ardupilot", (), True), ("px4", (), False), ("px4", (STICK,), True)]
 )
 def test_a_client_sees_whether_there_is_a_stick(autopilot: str, more: tuple[str, ...], there: bool) -> None:
-    one = bench(autopilot, *more)
+    one = make_rig(autopilot, *more)
     one.wait(9.95)
     status = one.of("SYS_STATUS")[-1]
     bits = {
@@ -129,7 +130,7 @@ def test_a_client_sees_whether_there_is_a_stick(autopilot: str, more: tuple[str,
 
 def test_with_a_stick_px4_leaves_the_end_of_the_stream_to_it() -> None:
     for more, mode in (((), "OFFBOARD"), ((STICK,), "POSCTL")):
-        one = bench("px4", *more)
+        one = make_rig("px4", *more)
         one.peers.autopilot.parameters.set("COM_OBL_RC_ACT", 0)
         one.stream(1.0, 0.5, 0.0, 0.0)
         one.wait(5.0)
@@ -140,7 +141,7 @@ def test_with_a_stick_px4_leaves_the_end_of_the_stream_to_it() -> None:
 
 def test_only_px4_says_that_it_has_landed() -> None:
     for autopilot, says in (("px4", True), ("ardupilot", False)):
-        one = bench(autopilot)
+        one = make_rig(autopilot)
         assert one.ask(LAND) == 0
         one.wait(8.0)
         assert ("Landing detected" in one.texts) is says
@@ -149,7 +150,7 @@ def test_only_px4_says_that_it_has_landed() -> None:
 
 @BOTH
 def test_a_quadrotor_flown_onto_the_floor_has_landed_and_disarms(autopilot: str) -> None:
-    one = bench(autopilot, "sim.plant=quadrotor", "sim.start_position_m=[0.0,0.0,-1.0]")
+    one = make_rig(autopilot, "sim.plant=quadrotor", "sim.start_position_m=[0.0,0.0,-1.0]")
     one.stream(6.0, 0.0, 0.0, 0.5)
     assert one.of("EXTENDED_SYS_STATE")[-1].landed_state == 1
     assert one.peers.read_truth().position_m[2] == pytest.approx(0.0, abs=0.02)
@@ -167,6 +168,6 @@ def test_the_fence_that_nobody_set_is_told_as_it_was_recorded(autopilot: str, re
         return tuple(bool(getattr(status, f"onboard_control_sensors_{mask}") & FENCE) for mask in masks)
 
     real = [msg for packet in packets(recording) for msg in decode(packet.data) if msg.get_type() == "SYS_STATUS"]
-    one = bench(autopilot)
+    one = make_rig(autopilot)
     one.wait(2.0)
     assert {told(status) for status in one.of("SYS_STATUS")} == {told(status) for status in real}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
-from sim_rig import CALM, bench
+from sim_rig import CALM, make_rig
 
 from sim.simulation import Peers
 from sim.vehicle.interface import ControlledPlant, compute_heading_rad, rotate_to_ned
@@ -58,7 +58,7 @@ def test_an_error_of_what_it_believes_moves_where_it_stays() -> None:
 
 
 def test_setpoints_of_position_and_velocity_fly_the_linear_plant() -> None:
-    one = bench("ardupilot", DRAG)
+    one = make_rig("ardupilot", DRAG)
     one.send(one.client.position(1.0, 0.0, -2.0))
     one.wait(10.0)
     assert one.peers.vehicle.position_m == pytest.approx((1.0, 0.0, -2.0), abs=0.02)

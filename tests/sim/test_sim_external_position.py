@@ -8,8 +8,9 @@ from itertools import pairwise
 import pytest
 from autopilot_rig import GUIDED, Flight, Name
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from sim_rig import ARM, SET_MODE, S
+from sim_rig import ARM, SET_MODE
 
+from uavctl.arrays import SECOND_NS
 from uavctl.lab.position_loop import EXTERNAL_ONLY
 
 BOTH = pytest.mark.parametrize("name", ["px4", "ardupilot"])
@@ -230,7 +231,7 @@ def test_with_gps_external_positions_change_nothing() -> None:
     one.wait(1.0)
     local = one.of("LOCAL_POSITION_NED")[-1]
     assert math.dist((local.x, local.y, local.z), one.vehicle.position_m) < 0.05
-    assert one.now_ns == S
+    assert one.now_ns == SECOND_NS
 
 
 def test_back_on_gps_the_error_is_gone() -> None:

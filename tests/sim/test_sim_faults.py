@@ -9,7 +9,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from sim_rig import Bench, decode
+from sim_rig import SimRig, decode
 
 from sim.faults import find_fault_problems
 from sim.simulation import MOCAP, VEHICLE, Peers
@@ -54,7 +54,7 @@ def test_faults_are_added_to_the_spans_that_there_are_already() -> None:
 
 
 def test_the_steady_wind_changes_at_its_time_and_carries_the_vehicle_away() -> None:
-    one = Bench(config('at_s=2, kind="wind", velocity_mps=[0.0, 4.0, 0.0]', plant="quadrotor"))
+    one = SimRig(config('at_s=2, kind="wind", velocity_mps=[0.0, 4.0, 0.0]', plant="quadrotor"))
     assert isinstance(one.peers.vehicle, Quadrotor)
     one.wait(1.99)
     assert one.peers.vehicle.wind_mps == (0.0, 0.0, 0.0)
@@ -101,7 +101,7 @@ def test_a_parameter_changes_at_its_time() -> None:
 
 @pytest.mark.parametrize(("autopilot", "mode"), [("px4", "POSCTL"), ("ardupilot", "LOITER")])
 def test_the_pilot_takes_the_vehicle_with_the_stick(autopilot: str, mode: str) -> None:
-    one = Bench(config(f'at_s=1.0, kind="mode", name="{mode}"', autopilot=autopilot))
+    one = SimRig(config(f'at_s=1.0, kind="mode", name="{mode}"', autopilot=autopilot))
     external = one.peers.autopilot.mode_name
     one.stream(0.9, 0.5, 0.0, 0.0)
     assert one.peers.autopilot.mode_name == external
@@ -205,7 +205,7 @@ def test_the_command_serves_a_file_of_faults_at_a_multiple_of_real_time(
     assert run(["sim", *links, "--faults", str(tmp_path / "nowhere.toml")]) == 2
 
 
-def test_a_file_that_is_not_there_is_told(tmp_path: Path) -> None:
+def test_a_missing_file_is_reported(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="cannot be read"):
         add_faults(config(), tmp_path / "nowhere.toml", find_fault_problems)
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from patience import LIMIT_S, until
+from patience import LIMIT_S, wait_until
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from sim_rig import LAND, Bench, Client, bench, decode
+from sim_rig import LAND, Client, SimRig, decode, make_rig
 
 from sim.fleet import make_fleet
 from sim.server import Ready, VehicleSetup, serve_all
@@ -130,7 +130,7 @@ def test_two_vehicles_are_seen_with_their_ids_and_a_command_to_the_second_moves_
     assert opened.wait(LIMIT_S)
     stations = [Station(one) for one in readies]
     try:
-        until(lambda: all(told), "time has begun")
+        wait_until(lambda: all(told), "time has begun")
         for i, one in enumerate(stations):
             one.send(one.client.timesync(1))
             assert one.hear("HEARTBEAT").get_srcSystem() == i + 1
@@ -141,13 +141,13 @@ def test_two_vehicles_are_seen_with_their_ids_and_a_command_to_the_second_moves_
             stations[1].hear("LOCAL_POSITION_NED")
             return told[1][-1].input[:2] == (1.0, 0.0)
 
-        until(obeyed, "the second one flies the setpoint")
+        wait_until(obeyed, "the second one flies the setpoint")
         for one in stations:
             one.send(one.client.command(LAND, system=2))
         ack = stations[1].hear("COMMAND_ACK")
         assert (ack.get_srcSystem(), ack.command, ack.result) == (2, LAND, 0)
         external = told[0][0].mode
-        until(lambda: told[1][-1].mode != external, "the second one lands")
+        wait_until(lambda: told[1][-1].mode != external, "the second one lands")
     finally:
         stop.set()
         thread.join(LIMIT_S)
@@ -160,8 +160,8 @@ def test_two_vehicles_are_seen_with_their_ids_and_a_command_to_the_second_moves_
     assert east[1] - east[0] == pytest.approx(1.0)
 
 
-def second(autopilot: str) -> Bench:
-    return bench(autopilot, "sim.system_id=2", airborne=False)
+def second(autopilot: str) -> SimRig:
+    return make_rig(autopilot, "sim.system_id=2", airborne=False)
 
 
 @pytest.mark.parametrize(("autopilot", "name"), [("px4", "MAV_SYS_ID"), ("ardupilot", "SYSID_THISMAV")])

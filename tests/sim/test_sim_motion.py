@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from autopilot_rig import Flight, Name
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from quadrotor_rig import S, quadrotor, run
+from quadrotor_rig import quadrotor, run
 
 from sim.autopilot.profile import SIMULATED
 from sim.autopilot.setpoints import IGNORE_ACCEL, IGNORE_VELOCITY, ParsedSetpoint, SetpointKind, parse_setpoint
 from sim.vehicle.interface import LEVEL
 from sim.vehicle.quadrotor import Quadrotor
+from uavctl.arrays import SECOND_NS
 from uavctl.lab.position_loop import EXTERNAL_ONLY
 from uavctl.records import Vec3
 
@@ -105,4 +106,4 @@ def test_who_begins_in_the_air_may_count_as_aligned_and_flies_on_external_positi
     assert 0.0 < np.linalg.norm(off) < 0.02
     one.external = None
     one.wait(8.0)
-    assert not one.autopilot.estimator.is_position_valid and one.now_ns > 13 * S - 1
+    assert not one.autopilot.estimator.is_position_valid and one.now_ns > 13 * SECOND_NS - 1

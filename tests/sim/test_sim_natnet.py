@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 
 import natnet
 import pytest
-from patience import until
+from patience import wait_until
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from scipy.spatial.transform import Rotation
 
@@ -51,7 +51,7 @@ class Talk:
         where = urlsplit(port.url)
         self._to = where.hostname, where.port
         self._said_ns = 0
-        until(self._introduced, "it names its bodies")
+        wait_until(self._introduced, "it names its bodies")
 
     def _introduced(self) -> bool:
         self._said_ns += 500_000_000
@@ -110,7 +110,7 @@ def test_while_nothing_is_seen_the_body_is_not_tracked_and_what_is_damaged_is_lo
         talk.hear()
         return talk.camera.dropped[UNTRACKED] > 0
 
-    until(untracked, "a frame without the body")
+    wait_until(untracked, "a frame without the body")
     assert talk.told == []
 
 
@@ -169,7 +169,7 @@ def heard(url: str, enough: Callable[[list[Any]], bool]) -> tuple[list[Any], lis
             client.update_sync()
             return bool(described) and enough(frames)
 
-        until(came, "frames come")
+        wait_until(came, "frames come")
     return frames, described
 
 
@@ -180,7 +180,7 @@ def test_the_client_of_another_package_sees_where_each_simulated_vehicle_is() ->
     over, urls = threading.Event(), list[str]()
     thread = served(seats, over, urls)
     try:
-        until(lambda: len(urls) == 2, "both serve")
+        wait_until(lambda: len(urls) == 2, "both serve")
         for url, east_m in zip(urls, (-1.0, 0.0), strict=True):
             frames, described = heard(url, lambda frames: any(one.rigid_bodies[0].tracking_valid for one in frames))
             (body,) = described[0].rigid_bodies
@@ -204,14 +204,14 @@ def test_the_daemon_s_own_source_has_them_where_the_vehicle_was(up: str) -> None
     thread = served(seats, over, urls)
     seen: list[Any] = []
     try:
-        until(lambda: len(urls) == 1, "it serves")
+        wait_until(lambda: len(urls) == 1, "it serves")
         source = open_source(urls[0])
 
         def came() -> bool:
             seen.extend(msg for data, _ in source.receive() for msg in decode(data).messages)
             return len(seen) > 20 and len(truths) > 3
 
-        until(came, "positions come")
+        wait_until(came, "positions come")
         source.close()
     finally:
         over.set()

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import pytest
-from sim_rig import Client, S, decode
+from sim_rig import Client, decode
 
 from sim.simulation import MOCAP, VEHICLE, Peers
+from uavctl.arrays import SECOND_NS
 from uavctl.config import load_config
 
 
@@ -21,11 +22,11 @@ def test_a_flight_that_begins_in_the_air_begins_with_a_known_position(airborne: 
 
 def test_nothing_that_is_sent_reaches_the_vehicle_in_an_uplink_blackout_and_what_it_says_goes_on() -> None:
     config = load_config("room-hahn-stursberg", ["link.uplink_blackout=[[1.0, 2.0]]", "sim.autopilot=ardupilot"])
-    peers, client = Peers(config, 3 * S), Client()
+    peers, client = Peers(config, 3 * SECOND_NS), Client()
     answered: list[int] = []
     told: list[int] = []
     for tenth in range(30):
-        at_ns = 3 * S + tenth * S // 10
+        at_ns = 3 * SECOND_NS + tenth * SECOND_NS // 10
         peers.receive(VEHICLE, client.timesync(tenth + 1), at_ns)
         kinds = [msg for _, link, data in peers.advance(at_ns + 1) if link == VEHICLE for msg in decode(data)]
         answered += [msg.ts1 - 1 for msg in kinds if msg.get_type() == "TIMESYNC"]

@@ -8,8 +8,8 @@ from typing import Literal
 
 import numpy as np
 import pytest
-from loopback_rig import Memory, flight, lockstep
-from sim_rig import ARM, TAKE_OFF, Bench
+from loopback_rig import MemorySink, flight, lockstep
+from sim_rig import ARM, TAKE_OFF, SimRig
 from soak_mission import LINK
 from udp_rig import assert_in_order, fly_over_udp
 
@@ -31,7 +31,7 @@ HIGH = [
 ]  # fmt: skip
 
 
-def rough(autopilot: str, seconds: float, *more: str) -> Memory:
+def rough(autopilot: str, seconds: float, *more: str) -> MemorySink:
     return lockstep("room-hahn-stursberg", seconds, QUADROTOR, *GUSTS, *LINK, f"sim.autopilot={autopilot}", *more)
 
 
@@ -101,7 +101,7 @@ def test_its_battery_begins_with_the_charge_asked_for() -> None:
 
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 def test_it_takes_off_and_lands(autopilot: Literal["px4", "ardupilot"]) -> None:
-    one = Bench(load_config("room-hahn-stursberg", [QUADROTOR, f"sim.autopilot={autopilot}"]), airborne=False)
+    one = SimRig(load_config("room-hahn-stursberg", [QUADROTOR, f"sim.autopilot={autopilot}"]), airborne=False)
     assert one.peers.read_truth().position_m == (-2.4, -1.9, 0.0)
     one.wait(30.0)
     if autopilot == "px4":

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import pytest
-from patience import LIMIT_S, until
+from patience import LIMIT_S, wait_until
 from sim_rig import Client, decode
 
 from sim.ports import open_port, split_frames
@@ -76,7 +76,7 @@ def udp() -> tuple[socket.socket, str]:
     return sock, f"udpout://127.0.0.1:{sock.getsockname()[1]}"
 
 
-def listen(sock: socket.socket, until: Any, limit: int = 2000) -> list[Any]:
+def listen(sock: socket.socket, wait_until: Any, limit: int = 2000) -> list[Any]:
     """Messages from a socket until one of them is what is waited for."""
     got: list[Any] = []
     for _ in range(limit):
@@ -84,7 +84,7 @@ def listen(sock: socket.socket, until: Any, limit: int = 2000) -> list[Any]:
         for msg in decode(data):
             msg.sender = sender
             got.append(msg)
-            if until(msg):
+            if wait_until(msg):
                 return got
     raise AssertionError("waited in vain")
 
@@ -120,7 +120,7 @@ def test_udp_vehicle_and_cameras_send_to_the_client_and_obey_it() -> None:
             listen(vehicle, is_a("LOCAL_POSITION_NED"))
             return bool(served.truths) and served.truths[-1].input == (1.0, 0.0, 0.0)
 
-        until(obeyed, "the setpoint is flown")
+        wait_until(obeyed, "the setpoint is flown")
         told = served.truths.copy()  # time goes on
         assert len(told) > moving
         assert [one.at_ns for one in told] == [served.ready.start_ns + k * S // 5 for k in range(len(told))]

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 from patience import LIMIT_S
-from sim_rig import Client, bench
+from sim_rig import Client, make_rig
 
 from sim.autopilot.profile import ARDUPILOT
 from sim.ports import UdpPort, open_port
@@ -27,7 +27,7 @@ def heard(stream: bytes, size: int) -> tuple[int, int]:
 
 def packets(count: int) -> list[bytes]:
     """Heartbeats of a vehicle."""
-    one = bench("ardupilot")
+    one = make_rig("ardupilot")
     client = Client()
     beat = one.of("HEARTBEAT")[0]
     return [client.pack(beat) for _ in range(count)]

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 from patience import LIMIT_S
 from rich.console import Console
-from sim_rig import bench
+from sim_rig import make_rig
 
 from sim.server import VehicleSetup, serve_all
 from sim.simulation import VehicleSnapshot
@@ -87,7 +87,7 @@ def test_the_line_tells_the_same() -> None:
 
 
 def test_a_look_tells_what_the_vehicle_does() -> None:
-    one = bench(
+    one = make_rig(
         "px4",
         "sim.camera.phase_s=0",
         "link.loss=0",

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from sim_rig import Client, S, decode
+from sim_rig import Client, decode
 
 from sim.simulation import MOCAP, VEHICLE, Peers, World
+from uavctl.arrays import SECOND_NS
 from uavctl.config import load_config
 from uavctl.records import Outgoing, Received, Send, Truth, Vec3, to_nobody
 
@@ -61,12 +62,12 @@ def test_the_first_decision_of_preset_paper_knows_the_first_sample_and_a_heartbe
 
 
 def test_ticks_lie_on_the_grid_and_see_only_what_has_arrived() -> None:
-    flyer, _, _ = fly("room-hahn-stursberg", 4.0, start_ns=3 * S)
-    assert flyer.ticks == [(n, 3 * S + n * 50 * MS) for n in range(80)]
+    flyer, _, _ = fly("room-hahn-stursberg", 4.0, start_ns=3 * SECOND_NS)
+    assert flyer.ticks == [(n, 3 * SECOND_NS + n * 50 * MS) for n in range(80)]
     arrivals = [at_ns for _, at_ns, _, _ in flyer.got]
     assert arrivals == sorted(arrivals)
     for ticks_before, at_ns, _, _ in flyer.got:
-        grid_ns = 3 * S + (ticks_before or 0) * 50 * MS
+        grid_ns = 3 * SECOND_NS + (ticks_before or 0) * 50 * MS
         assert grid_ns - 50 * MS < at_ns <= grid_ns
 
 
@@ -74,7 +75,7 @@ def test_positions_come_late_by_the_channels_delay() -> None:
     flyer, truths, world = fly("room-hahn-stursberg", 20.0)
     samples = flyer.messages(MOCAP)
     for _, at_ns, msg in samples:
-        captured_ns = msg.usec * 1000 - 4000 * S
+        captured_ns = msg.usec * 1000 - 4000 * SECOND_NS
         assert captured_ns % (200 * MS) == 100 * MS
         assert 30 * MS <= at_ns - captured_ns <= 70 * MS
     counters = world.peers.channel.counters
@@ -93,7 +94,7 @@ def test_truth_of_a_boundary_is_the_state_there_and_the_input_from_there() -> No
         return float(np.float32(north)), float(np.float32(east)), 0.0
 
     _, truths, _ = fly("paper", 30.0, script=script)
-    assert [one.at_ns for one in truths] == [k * S for k in range(30)]
+    assert [one.at_ns for one in truths] == [k * SECOND_NS for k in range(30)]
     np.testing.assert_allclose([one.input for one in truths], inputs, rtol=1e-6)
     plant = load_config("paper").plant
     a, b, e = (np.array(rows) for rows in (plant.a, plant.b, plant.e))
@@ -150,7 +151,7 @@ def test_answers_come_back_on_the_wire_and_the_cameras_listen_to_nothing() -> No
     World(load_config("room-hahn-stursberg", ["link.loss=0"]), flyer).run(1.0)
     answers = [(n, at_ns, msg) for n, at_ns, msg in flyer.messages(VEHICLE) if msg.get_type() == "TIMESYNC" and msg.tc1]
     assert [(n, at_ns, msg.ts1, msg.tc1) for n, at_ns, msg in answers] == [
-        (n + 1, n * 50 * MS, n * 50 * MS + 1, n * 50 * MS + 20 * S) for n in range(19)
+        (n + 1, n * 50 * MS, n * 50 * MS + 1, n * 50 * MS + 20 * SECOND_NS) for n in range(19)
     ]
     assert {msg.get_type() for _, _, msg in flyer.messages(MOCAP)} == {"VISION_POSITION_ESTIMATE"}
 
@@ -194,7 +195,7 @@ def test_time_missed_is_caught_up_as_if_nothing_had_been_missed(autopilot: str) 
         peers = Peers(config, 0, on_truth=truths.append)
         peers.receive(VEHICLE, Client().setpoint(1.0, 0.5, 0.0), 1 * MS)
         for n in range(steps):
-            got += peers.advance(1 * MS + (n + 1) * 5 * S // steps)
+            got += peers.advance(1 * MS + (n + 1) * 5 * SECOND_NS // steps)
     assert told[0] == told[1]
     assert due[0] == due[1]
     assert len(told[0]) == 26

@@ -70,7 +70,7 @@ def test_the_order_and_the_company_of_states_change_nothing() -> None:
 
 @pytest.mark.slow
 def test_late_positions_are_answered_by_the_late_design() -> None:
-    design = small(late=1)
+    design = small(late_steps=1)
     solver = ShortcutSolver(design)
     one, rng = ShortcutDecider(solver, design.target), np.random.default_rng(19)
     x = np.array([uniform(design, rng) for _ in range(10)])

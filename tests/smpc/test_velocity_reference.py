@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from quadrotor_rig import S, quadrotor, steady
+from quadrotor_rig import quadrotor, steady
 from scipy.integrate import solve_ivp
 
 from sim.vehicle.linear import make_linear_model
 from sim.wind import Wind
-from uavctl.arrays import Array
+from uavctl.arrays import SECOND_NS, Array
 from uavctl.build.controller import build_plant
 from uavctl.cli.app import run as main
 from uavctl.config import load_config
@@ -207,7 +207,7 @@ def flown(plant: Plant, wind: Wind, plan: list[tuple[float, float]], delay_s: fl
     ours, theirs = [], []
     for step, (now, then) in enumerate(zip(inputs, delayed, strict=True)):
         vehicle.accelerate((float(now), 0.0, 0.0))
-        vehicle.advance(round((step + 1) * DT * S))
+        vehicle.advance(round((step + 1) * DT * SECOND_NS))
         x = plant.a @ x + plant.b @ [then]
         ours.append(x[0])
         theirs.append(vehicle.position_m[0])

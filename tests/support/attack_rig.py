@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from mavlink_rig import OFFBOARD, Peer
-from operation_rig import port
+from operation_rig import reserve_port
 from patience import LIMIT_S
 from places import without_pages
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -36,8 +36,8 @@ SETPOINT, COMMAND = 84, 76
 ARMED, DISARMED = 129, 1  # base modes with a mode of the autopilot's own
 POSITIONS_HZ = 20.0
 NOISE_M = 0.003
-STARTS_S = 120.0
-TOLD_NS = 1_100_000_000  # what was refused is told once a second
+START_LIMIT_S = 120.0
+REPORT_PERIOD_NS = 1_100_000_000  # what was refused is told once a second
 _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 
@@ -52,11 +52,11 @@ class FakeVehicle:
     """
 
     def __init__(self, vehicle_port: int, mocap_port: int, *, signed: bool, telemetry_hz: float) -> None:
-        self._vehicle, self._cameras = port(), port()
+        self._vehicle, self._cameras = reserve_port(), reserve_port()
         self._vehicle.connect(("127.0.0.1", vehicle_port))
         self._cameras.connect(("127.0.0.1", mocap_port))
-        for one in (self._vehicle, self._cameras):
-            one.setblocking(False)
+        for connection in (self._vehicle, self._cameras):
+            connection.setblocking(False)
         stamp = int((time.time() - EPOCH_S) * SECOND)
         self._voice: Peer = SignedPeer(KEY, stamp) if signed else Peer()
         self._eyes: Peer = SignedPeer(KEY, stamp, 4, 17, 18) if signed else Peer(17, 18)
@@ -93,15 +93,15 @@ class FakeVehicle:
         self._move(now_s)
         if now_s >= self._next["beat"]:
             self._next["beat"] = now_s + 1.0
-            self.beat()
+            self.send_heartbeat()
         while now_s >= self._next["telemetry"]:
             self._next["telemetry"] = max(self._next["telemetry"] + self._period_s, now_s - 0.1)
-            self._send(self._vehicle, self._telemetry())
+            self._send(self._vehicle, self._send_telemetry())
         if now_s >= self._next["position"]:
             self._next["position"] = now_s + 1.0 / POSITIONS_HZ
-            self._send(self._cameras, self._eyes.vision(int(now_s * 1e6), *self._place()))
+            self._send(self._cameras, self._eyes.vision(int(now_s * 1e6), *self._measure_position()))
 
-    def beat(self) -> None:
+    def send_heartbeat(self) -> None:
         """Tell the mode."""
         self._send(self._vehicle, self._voice.heartbeat(self.mode, ARMED if self.armed else DISARMED))
 
@@ -110,7 +110,7 @@ class FakeVehicle:
         self.mode = POSITION_CONTROL
         self._accel = (0.0, 0.0, 0.0)
         self.velocity = [0.0, 0.0, 0.0]
-        self.beat()
+        self.send_heartbeat()
 
     def listen(self) -> None:
         """Take what has come."""
@@ -119,14 +119,14 @@ class FakeVehicle:
                 data = self._vehicle.recv(2048)
             except (BlockingIOError, ConnectionRefusedError):
                 break
-            self._hear(data)
+            self._receive(data)
         while True:
             try:
                 self._cameras.recv(2048)
             except (BlockingIOError, ConnectionRefusedError):
                 break
 
-    def _hear(self, data: bytes) -> None:
+    def _receive(self, data: bytes) -> None:
         message_id = int.from_bytes(data[7:10], "little")
         payload = data[10 : 10 + data[1]].ljust(53, b"\0")
         if message_id == SETPOINT:
@@ -139,19 +139,19 @@ class FakeVehicle:
             if command == mavlink.MAV_CMD_DO_SET_MODE:
                 _, main, sub = struct.unpack_from("<3f", payload)
                 self.mode = int(main) << 16 | int(sub) << 24
-                self.beat()
+                self.send_heartbeat()
             self._send(self._vehicle, self._voice.send("command_ack", command, 0))
 
-    def _telemetry(self) -> bytes:
+    def _send_telemetry(self) -> bytes:
         self._number += 1
         boot_ms = int(time.monotonic() * 1e3) % 2**32
         if self._number % 10:
             return self._voice.send("attitude", boot_ms, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         return self._voice.send("local_position_ned", boot_ms, *self.position, *self.velocity)
 
-    def _place(self) -> tuple[float, float, float]:
+    def _measure_position(self) -> tuple[float, float, float]:
         """Where it is, with the cameras' noise: positions that are all the same count as stuck."""
-        north, east, down = (one + self._chance.gauss(0.0, NOISE_M) for one in self.position)
+        north, east, down = (coordinate + self._chance.gauss(0.0, NOISE_M) for coordinate in self.position)
         return north, east, down
 
     def _move(self, now_s: float) -> None:
@@ -180,19 +180,19 @@ class Window:
         sent: Datagrams of the attackers.
     """
 
-    begun_ns: int
-    ended_ns: int
+    begin_ns: int
+    end_ns: int
     cpu_s: float
     largest_gap_s: float
     sent: int = 0
 
     @property
     def seconds(self) -> float:
-        return (self.ended_ns - self.begun_ns) * 1e-9
+        return (self.end_ns - self.begin_ns) * 1e-9
 
 
 @dataclass
-class Told:
+class AttackReport:
     """The same from the recording."""
 
     ticks: int = 0
@@ -201,14 +201,14 @@ class Told:
     refused: Counter[str] = field(default_factory=Counter)
 
 
-class Flight:
+class DaemonFlight:
     """One flight of a daemon."""
 
     def __init__(self, folder: Path, *, signed: bool, listed: bool, telemetry_hz: float = 350.0) -> None:
         self.folder = folder
-        with port() as one, port() as other:
-            self.vehicle_port, self.mocap_port = int(one.getsockname()[1]), int(other.getsockname()[1])
-        urls = [f"udpin://127.0.0.1:{one}" for one in (self.vehicle_port, self.mocap_port)]
+        with reserve_port() as first, reserve_port() as second:
+            self.vehicle_port, self.mocap_port = int(first.getsockname()[1]), int(second.getsockname()[1])
+        urls = [f"udpin://127.0.0.1:{reserve_port}" for reserve_port in (self.vehicle_port, self.mocap_port)]
         options = ["--vehicle", urls[0], "--mocap", urls[1], "--set", "clock.latency_s=0.0"]
         if not listed:
             options += ["--set", 'security.allow=["127.0.0.1"]']
@@ -239,7 +239,7 @@ class Flight:
             assert self.process.poll() is None, self.log.read_text(encoding="utf-8")
             return self.vehicle.setpoints >= begun + 20
 
-        assert self.vehicle.run(STARTS_S, streams), self.log.read_text(encoding="utf-8")
+        assert self.vehicle.run(START_LIMIT_S, streams), self.log.read_text(encoding="utf-8")
         self.vehicle.run(2.0)
 
     def cpu_s(self) -> float:
@@ -247,15 +247,15 @@ class Flight:
         fields = Path(f"/proc/{self.process.pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
         return (int(fields[11]) + int(fields[12])) / _TICKS_PER_S
 
-    def watch(self, seconds: float) -> Window:
+    def measure(self, seconds: float) -> Window:
         """Fly on, and measure."""
-        begun_ns, cpu_s, first = time.monotonic_ns(), self.cpu_s(), len(self.vehicle.setpoint_s)
+        begin_ns, cpu_s, first = time.monotonic_ns(), self.cpu_s(), len(self.vehicle.setpoint_s)
         self.vehicle.run(seconds)
-        times = [begun_ns * 1e-9, *self.vehicle.setpoint_s[first:], time.monotonic()]
+        times = [begin_ns * 1e-9, *self.vehicle.setpoint_s[first:], time.monotonic()]
         gap_s = max(after - before for before, after in pairwise(times))
-        return Window(begun_ns, time.monotonic_ns(), self.cpu_s() - cpu_s, gap_s)
+        return Window(begin_ns, time.monotonic_ns(), self.cpu_s() - cpu_s, gap_s)
 
-    def under(
+    def attack(
         self, kind: str, seconds: float, *, senders: int, listed: bool, per_s: float, cameras: bool = False
     ) -> Window:
         """The same under attack."""
@@ -263,25 +263,27 @@ class Flight:
         began.unlink(missing_ok=True)
         to = self.mocap_port if cameras else self.vehicle_port
         script = Path(__file__).with_name("attacker.py")
-        words = [kind, str(to), "--source", "127.0.0.1" if listed else "127.0.0.2", "--per-s", str(per_s)]
+        arguments = [kind, str(to), "--source", "127.0.0.1" if listed else "127.0.0.2", "--per-s", str(per_s)]
         rest = ["--senders", str(senders), "--seconds", str(seconds + 0.5), "--log", str(began)]
-        with subprocess.Popen([sys.executable, str(script), *words, *rest], stdout=subprocess.PIPE, text=True) as one:
+        with subprocess.Popen(
+            [sys.executable, str(script), *arguments, *rest], stdout=subprocess.PIPE, text=True
+        ) as process:
             try:
                 assert self.vehicle.run(LIMIT_S, began.exists), "the attacker does not begin"
                 self.vehicle.run(0.3)
-                window = self.watch(seconds)
-                self.vehicle.run(LIMIT_S, lambda: one.poll() is not None)
-                window.sent = int(one.communicate(timeout=LIMIT_S)[0])
+                window = self.measure(seconds)
+                self.vehicle.run(LIMIT_S, lambda: process.poll() is not None)
+                window.sent = int(process.communicate(timeout=LIMIT_S)[0])
             finally:
-                if one.poll() is None:
-                    one.kill()
+                if process.poll() is None:
+                    process.kill()
         return window
 
-    def engage(self) -> bool:
+    def order_engage(self) -> bool:
         """Order it to take the vehicle up again; whether it did."""
         ask = [sys.executable, "-m", "uavctl", "ctl", "engage", "--control", str(self.folder / "c")]
-        with subprocess.Popen(ask, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=self._environ) as one:
-            self.vehicle.run(LIMIT_S, lambda: one.poll() is not None)
+        with subprocess.Popen(ask, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=self._environ) as process:
+            self.vehicle.run(LIMIT_S, lambda: process.poll() is not None)
         before = self.vehicle.setpoints
         return self.vehicle.run(5.0, lambda: self.vehicle.mode == OFFBOARD and self.vehicle.setpoints > before + 20)
 
@@ -299,52 +301,52 @@ class Flight:
             os.kill(self.process.pid, signal.SIGCONT)
         woke_s = time.monotonic()
         vehicle.run(2.0)
-        late = vehicle.setpoint_s[len(vehicle.setpoint_s) - (vehicle.setpoints - before) :]
-        return len(late), (late[-1] - woke_s if late else 0.0)
+        late_s = vehicle.setpoint_s[len(vehicle.setpoint_s) - (vehicle.setpoints - before) :]
+        return len(late_s), (late_s[-1] - woke_s if late_s else 0.0)
 
     def end(self) -> None:
         """End the flight: the vehicle is disarmed, and there is nothing to hand over."""
         self.vehicle.armed = False
-        self.vehicle.beat()
+        self.vehicle.send_heartbeat()
         self.process.send_signal(signal.SIGTERM)
         self.vehicle.run(LIMIT_S, lambda: self.process.poll() is not None)
 
-    def told(self, window: Window) -> Told:
+    def read_report(self, window: Window) -> AttackReport:
         """What the recording says of a part."""
-        found = Told()
+        result = AttackReport()
         mode = ControlMode.TRACK
         for _, at_ns, record in read(self.folder / "f" / "flight.mcap"):
-            if isinstance(record, Refused) and window.begun_ns <= at_ns <= window.ended_ns + TOLD_NS:
-                found.refused.update(record.counts)
-            elif isinstance(record, Decision) and window.begun_ns <= at_ns <= window.ended_ns:
-                found.ticks += 1 + record.missed_ticks
-                found.missed += record.missed_ticks
-                found.fallbacks += mode is ControlMode.TRACK and record.mode is not mode
+            if isinstance(record, Refused) and window.begin_ns <= at_ns <= window.end_ns + REPORT_PERIOD_NS:
+                result.refused.update(record.counts)
+            elif isinstance(record, Decision) and window.begin_ns <= at_ns <= window.end_ns:
+                result.ticks += 1 + record.missed_ticks
+                result.missed += record.missed_ticks
+                result.fallbacks += mode is ControlMode.TRACK and record.mode is not mode
                 mode = record.mode
-        return found
+        return result
 
     def recorder_dropped(self) -> int:
         """Records that the recorder could not keep."""
-        notes = [one for _, _, one in read(self.folder / "f" / "flight.mcap") if isinstance(one, RecorderNote)]
+        notes = [record for _, _, record in read(self.folder / "f" / "flight.mcap") if isinstance(record, RecorderNote)]
         return notes[-1].dropped if notes else -1
 
 
 @contextmanager
-def flight(*, signed: bool, listed: bool, telemetry_hz: float = 350.0) -> Iterator[Flight]:
+def run_flight(*, signed: bool, listed: bool, telemetry_hz: float = 350.0) -> Iterator[DaemonFlight]:
     """A flight as long as the block lasts."""
     with tempfile.TemporaryDirectory(prefix="uavctl-attack-") as folder:
-        one = Flight(Path(folder), signed=signed, listed=listed, telemetry_hz=telemetry_hz)
+        rig = DaemonFlight(Path(folder), signed=signed, listed=listed, telemetry_hz=telemetry_hz)
         try:
-            one.wait_until_it_flies()
-            yield one
+            rig.wait_until_it_flies()
+            yield rig
         finally:
-            if one.process.poll() is None:
-                one.process.kill()
-            one.process.communicate()
-            one.vehicle.close()
+            if rig.process.poll() is None:
+                rig.process.kill()
+            rig.process.communicate()
+            rig.vehicle.close()
 
 
-def attacks(
+def run_attacks(
     kinds: list[str], *, seconds: float, senders: int, listed: bool, signed: bool, per_s: float, cameras: bool = False
 ) -> Iterator[dict[str, Any]]:
     """One flight with attacks of all kinds, one after the other; what each cost beside the calm part.
@@ -358,21 +360,21 @@ def attacks(
         per_s: datagrams a second of each sender.
         cameras: the cameras' port is attacked, not the vehicle's.
     """
-    with flight(signed=signed, listed=listed) as one:
-        calm = one.watch(2.0 * seconds)
+    with run_flight(signed=signed, listed=listed) as rig:
+        calm = rig.measure(2.0 * seconds)
         windows = {}
         for kind in kinds:
-            windows[kind] = one.under(kind, seconds, senders=senders, listed=listed, per_s=per_s, cameras=cameras)
-            alive = one.process.poll() is None
+            windows[kind] = rig.attack(kind, seconds, senders=senders, listed=listed, per_s=per_s, cameras=cameras)
+            alive = rig.process.poll() is None
             if not alive:
                 break
-            one.vehicle.run(1.0)
-        if one.process.poll() is None:
-            one.end()
-        quiet, dropped = one.told(calm), one.recorder_dropped()
+            rig.vehicle.run(1.0)
+        if rig.process.poll() is None:
+            rig.end()
+        quiet, dropped = rig.read_report(calm), rig.recorder_dropped()
         base = calm.cpu_s / calm.seconds
         for kind, window in windows.items():
-            told = one.told(window)
+            report = rig.read_report(window)
             yield {
                 "kind": kind,
                 "senders": senders,
@@ -382,26 +384,26 @@ def attacks(
                 "sent_per_s": round(window.sent / (window.seconds + 0.8)),
                 "cpu_calm": round(base, 3),
                 "cpu_added": round(window.cpu_s / window.seconds - base, 3),
-                "missed": told.missed,
-                "ticks": told.ticks,
+                "missed": report.missed,
+                "ticks": report.ticks,
                 "missed_calm": quiet.missed,
                 "ticks_calm": quiet.ticks,
                 "largest_gap_s": round(window.largest_gap_s, 3),
-                "fallbacks": told.fallbacks,
+                "fallbacks": report.fallbacks,
                 "records_dropped": dropped,
-                "refused": dict(told.refused),
+                "refused": dict(report.refused),
             }
 
 
-def stalls(runs: int, seed: int, telemetry_hz: float, *, signed: bool = False) -> Iterator[dict[str, Any]]:
+def run_stalls(runs: int, seed: int, telemetry_hz: float, *, signed: bool = False) -> Iterator[dict[str, Any]]:
     """Stop a daemon again and again while the pilot takes over; what came after it woke."""
     chance = random.Random(seed)
-    with flight(signed=signed, listed=True, telemetry_hz=telemetry_hz) as one:
+    with run_flight(signed=signed, listed=True, telemetry_hz=telemetry_hz) as rig:
         for number in range(runs):
-            one.vehicle.run(0.3 + chance.random())
+            rig.vehicle.run(0.3 + chance.random())
             seconds = chance.uniform(0.3, 2.5)
-            count, last_s = one.stop(seconds)
+            count, last_s = rig.stop(seconds)
             yield {"run": number, "stall_s": round(seconds, 3), "setpoints": count, "last_s": round(last_s, 3)}
-            if number + 1 < runs and not one.engage():
-                text = one.log.read_text(encoding="utf-8")
+            if number + 1 < runs and not rig.order_engage():
+                text = rig.log.read_text(encoding="utf-8")
                 raise AssertionError(f"it does not take the vehicle up again: {json.dumps(text[-500:])}")

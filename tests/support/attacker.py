@@ -1,6 +1,6 @@
 """Flooders, forgers and replayers in a process of their own: `python tests/support/attacker.py --help`.
 
-Each kind is the worst datagram of its sort that fits into `LARGEST` bytes, or a small one where the name says so.
+Each kind is the worst datagram of its sort of at most `MAX_DATAGRAM_BYTES` bytes, or a small one by its name.
 """
 
 from __future__ import annotations
@@ -19,38 +19,38 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from signing_rig import EPOCH_S, KEY, OTHER_KEY, SECOND, SignedPeer, seal
 
 BATCH_S = 0.001
-FRESH_S = 0.004  # signed words are made anew so often: making them is slower than sending
-LARGEST = 4096
-MANY = 500
+STAMP_PERIOD_S = 0.004  # signed words are made anew so often: making them is slower than sending
+MAX_DATAGRAM_BYTES = 4096
+MAX_FRAMES = 500
 STRANGER, COMPONENT = 99, 1
 
-Say = Callable[[], bytes]
+MakeDatagram = Callable[[], bytes]
 """Gives the next datagram."""
 
 
-def packed(words: Iterator[bytes]) -> bytes:
+def pack_frames(arguments: Iterator[bytes]) -> bytes:
     """As many whole frames as fit into one datagram."""
     data = b""
-    for word in words:
-        if len(data) + len(word) > LARGEST:
+    for argument in arguments:
+        if len(data) + len(argument) > MAX_DATAGRAM_BYTES:
             break
-        data += word
+        data += argument
     return data
 
 
-def repeated(pattern: bytes) -> bytes:
-    return pattern * (LARGEST // len(pattern))
+def repeat_frame(pattern: bytes) -> bytes:
+    return pattern * (MAX_DATAGRAM_BYTES // len(pattern))
 
 
-def _cycle(make: Callable[[int], bytes]) -> Say:
+def _cycle(make: Callable[[int], bytes]) -> MakeDatagram:
     """Made before: the attacker is to be fast."""
-    return itertools.cycle([make(n) for n in range(MANY)]).__next__
+    return itertools.cycle([make(n) for n in range(MAX_FRAMES)]).__next__
 
 
-def _full(word: Callable[[int], bytes]) -> Say:
+def _full(make_packet: Callable[[int], bytes]) -> MakeDatagram:
     """Datagrams full of a frame whose number goes up."""
     number = itertools.count()
-    return _cycle(lambda _: packed(word(next(number)) for _ in itertools.count()))
+    return _cycle(lambda _: pack_frames(make_packet(next(number)) for _ in itertools.count()))
 
 
 def _from(number: int) -> Peer:
@@ -62,9 +62,9 @@ def _stamp() -> int:
     return int((time.time() - EPOCH_S) * SECOND)
 
 
-def _signed(word: Callable[[], bytes], key: bytes, link_id: int, ahead: int) -> Say:
+def _signed(make_packet: Callable[[], bytes], key: bytes, link_id: int, ahead: int) -> MakeDatagram:
     """Datagrams full of one frame, signed anew every few milliseconds with stamps that go up."""
-    plain = word()
+    plain = make_packet()
     body = bytearray(plain[:-2])
     body[2] |= mavlink.MAVLINK_IFLAG_SIGNED
     (message_id,) = struct.unpack("<I", plain[7:10] + b"\0")
@@ -77,8 +77,8 @@ def _signed(word: Callable[[], bytes], key: bytes, link_id: int, ahead: int) -> 
     def say() -> bytes:
         nonlocal data, made_s
         now_s = time.monotonic()
-        if now_s - made_s > FRESH_S:
-            count = LARGEST // (len(whole) + 13)
+        if now_s - made_s > STAMP_PERIOD_S:
+            count = MAX_DATAGRAM_BYTES // (len(whole) + 13)
             data = b"".join(seal(whole, next(stamps), key, link_id) for _ in range(count))
             made_s = now_s
         return data
@@ -105,10 +105,10 @@ def _ack(number: int) -> bytes:
 def _pair(_: int) -> bytes:
     """A datagram of frames within the body of broken ones: each is found by its own search."""
     inner = Peer(STRANGER).heartbeat() * 12
-    return repeated(bytes((0xFD, len(inner), 0, 0, 0, 9, 9, 30, 0, 0)) + inner + b"\0\0")
+    return repeat_frame(bytes((0xFD, len(inner), 0, 0, 0, 9, 9, 30, 0, 0)) + inner + b"\0\0")
 
 
-WORDS: dict[str, Callable[[], Say]] = {
+WORDS: dict[str, Callable[[], MakeDatagram]] = {
     # one frame, or less
     "byte": lambda: _cycle(lambda _: b"x"),
     "heartbeat": lambda: _cycle(lambda _: Peer().heartbeat(custom_mode=3 << 16)),  # the vehicle's own, unsigned
@@ -134,16 +134,16 @@ WORDS: dict[str, Callable[[], Say]] = {
     "genuine-positions": lambda: _signed(_short_vision, KEY, 5, 0),
     # bytes that make a scanner search
     "tiny": lambda: _full(lambda n: Peer(STRANGER).send("heartbeat", 0, 0, 0, 0, 0, 0, v1=False)),
-    "tiny-unknown": lambda: _cycle(lambda _: repeated(bytes((0xFD, 0, 0, 0, 0, 9, 9, 0x60, 0xEA, 0, 0, 0)))),
-    "tiny-unknown-1": lambda: _cycle(lambda _: repeated(bytes((0xFE, 0, 0, 9, 9, 3, 0, 0)))),
-    "markers": lambda: _cycle(lambda _: b"\xfd" * LARGEST),
-    "markers-1": lambda: _cycle(lambda _: b"\xfe" * LARGEST),  # each promises 254 bytes of DEBUG
-    "long-promises": lambda: _cycle(lambda _: repeated(bytes((0xFD, 255, 0, 0, 0, 9, 9, 30, 0, 0)))),
-    "long-promises-1": lambda: _cycle(lambda _: repeated(bytes((0xFE, 255, 0, 9, 9, 30)))),
-    "signed-promises": lambda: _cycle(lambda _: repeated(bytes((0xFD, 255, 1, 0, 0, 9, 9, 30, 0, 0)))),
+    "tiny-unknown": lambda: _cycle(lambda _: repeat_frame(bytes((0xFD, 0, 0, 0, 0, 9, 9, 0x60, 0xEA, 0, 0, 0)))),
+    "tiny-unknown-1": lambda: _cycle(lambda _: repeat_frame(bytes((0xFE, 0, 0, 9, 9, 3, 0, 0)))),
+    "markers": lambda: _cycle(lambda _: b"\xfd" * MAX_DATAGRAM_BYTES),
+    "markers-1": lambda: _cycle(lambda _: b"\xfe" * MAX_DATAGRAM_BYTES),  # each promises 254 bytes of DEBUG
+    "long-promises": lambda: _cycle(lambda _: repeat_frame(bytes((0xFD, 255, 0, 0, 0, 9, 9, 30, 0, 0)))),
+    "long-promises-1": lambda: _cycle(lambda _: repeat_frame(bytes((0xFE, 255, 0, 9, 9, 30)))),
+    "signed-promises": lambda: _cycle(lambda _: repeat_frame(bytes((0xFD, 255, 1, 0, 0, 9, 9, 30, 0, 0)))),
     "frames-in-frames": lambda: _cycle(_pair),
     "incomplete": lambda: _cycle(lambda _: b"\xfd\xff" + bytes(5) + b"\x1e\0\0" + bytes(200)),
-    "noise": lambda: _cycle(lambda n: hashlib.shake_128(b"%d" % n).digest(LARGEST)),
+    "noise": lambda: _cycle(lambda n: hashlib.shake_128(b"%d" % n).digest(MAX_DATAGRAM_BYTES)),
 }
 
 
@@ -152,7 +152,7 @@ BELIEVED_UNSIGNED = frozenset({"heartbeat", "one-source"})
 
 
 def flood(
-    say: Say,
+    say: MakeDatagram,
     to: tuple[str, int],
     source: str,
     per_s: float,
@@ -174,9 +174,9 @@ def flood(
     say()
     sent = 0
     sockets = [socket.socket(type=socket.SOCK_DGRAM) for _ in range(senders)]
-    for one in sockets:
-        one.bind((source, 0))
-        one.setblocking(False)
+    for sock in sockets:
+        sock.bind((source, 0))
+        sock.setblocking(False)
     if log is not None:
         log.touch()
     begun_s = time.monotonic()
@@ -185,9 +185,9 @@ def flood(
         due = min(due, sent + 20)  # a machine that was asleep sends no burst
         for _ in range(due - sent):
             data = say()
-            for one in sockets:
+            for sock in sockets:
                 try:
-                    one.sendto(data, to)
+                    sock.sendto(data, to)
                 except OSError:
                     continue
         behind = int(now_s * per_s) - due
@@ -195,8 +195,8 @@ def flood(
             begun_s += behind / per_s
         sent = due
         time.sleep(BATCH_S)
-    for one in sockets:
-        one.close()
+    for sock in sockets:
+        sock.close()
     return sent * senders
 
 

@@ -9,11 +9,12 @@ from typing import Any, Literal
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from quadrotor_rig import WITH_SIH_DRAG, quadrotor, steady
-from sim_rig import ARM, TAKE_OFF, Client, S, decode
+from sim_rig import ARM, TAKE_OFF, Client, decode
 
 from sim.autopilot.autopilot import Autopilot
 from sim.vehicle.interface import compute_heading_rad
 from sim.vehicle.quadrotor import Quadrotor
+from uavctl.arrays import SECOND_NS
 from uavctl.config import load_config
 from uavctl.records import Vec3
 
@@ -53,11 +54,11 @@ class Flight:
         return messages
 
     def wait(self, seconds: float) -> None:
-        end_ns = self.now_ns + round(seconds * S)
+        end_ns = self.now_ns + round(seconds * SECOND_NS)
         while True:
             times = [self.autopilot.next_ns, self._coming[0][0] if self._coming else None]
             times.append(self._next_ns if self.external else None)
-            at_ns = max(min((one for one in times if one is not None), default=end_ns), self.now_ns)
+            at_ns = max(min((time_ns for time_ns in times if time_ns is not None), default=end_ns), self.now_ns)
             if at_ns > end_ns:
                 break
             self.vehicle.advance(at_ns)
@@ -74,10 +75,10 @@ class Flight:
         self.vehicle.advance(end_ns)
 
     def _capture(self, at_ns: int) -> None:
-        self._next_ns = at_ns + round(S / self.external_hz)
+        self._next_ns = at_ns + round(SECOND_NS / self.external_hz)
         assert self.external is not None
         data = self.client.pack(external(self.external, at_ns // 1000 + 4_467_000_000, self.vehicle))
-        self._coming.append((at_ns + round(S * self._rng.uniform(*self.delays_s)), data))
+        self._coming.append((at_ns + round(SECOND_NS * self._rng.uniform(*self.delays_s)), data))
         self._coming.sort()
 
     def send(self, data: bytes) -> list[Any]:

@@ -11,6 +11,7 @@ from design_rig import spec
 from numpy.typing import NDArray
 from plant_cases import NAMED, spec_of
 
+from uavctl.arrays import Array
 from uavctl.lab.campaign.world import LinearWorld, Trajectories, simulate
 from uavctl.smpc.baselines import CascadedPid, HoldLast, Lqg, PacketisedPredictive, PidGains, WorstCaseDelay, ZeroOnLoss
 from uavctl.smpc.batch import BatchController, Information
@@ -18,7 +19,6 @@ from uavctl.smpc.hahn_stursberg.design import DesignSpec
 from uavctl.smpc.nominal import ControlProblem
 from uavctl.smpc.sets import Polytope
 
-Array = NDArray[np.float64]
 Counts = NDArray[np.intp]
 PAPER_START = np.array([35.0, -2.0, -20.0, -4.0])
 

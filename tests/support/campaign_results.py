@@ -17,11 +17,11 @@ _LISTS = dict.fromkeys(("ages", "outside"), pa.list_(pa.int64()))
 _TYPES = {"error": pa.string(), **_LISTS, "cell": pa.int32(), "run": pa.int64()}
 
 
-def cell(index: int, controller: str, kind: str = "lqg", link: str = "30 %", **told: Any) -> dict[str, Any]:
+def cell(index: int, controller: str, kind: str = "lqg", link: str = "30 %", **fields: Any) -> dict[str, Any]:
     """A cell of `campaign.json`."""
     promised = {"promised_x": 0.05, "promised_u": 0.1} if kind == "smpc" else {}
     names = {"disturbance": "as modelled", "plant": "as modelled", "design_id": None, "refused": ""}
-    return {"index": index, "controller": controller, "kind": kind, "link": link, **names, **promised, **told}
+    return {"index": index, "controller": controller, "kind": kind, "link": link, **names, **promised, **fields}
 
 
 def runs(index: int, cost: Sequence[float], **columns: Sequence[Any]) -> list[dict[str, Any]]:
@@ -40,8 +40,8 @@ def write(folder: Path, cells: Sequence[Mapping[str, Any]], rows: Sequence[Mappi
     """A finished campaign."""
     folder.mkdir(parents=True, exist_ok=True)
     count = max((row["run"] for row in rows), default=0) + 1
-    told = {"version": 1, "name": "by hand", "uavctl_version": "9.9", "master": 7, "runs": count, "steps": STEPS}
-    (folder / "campaign.json").write_bytes(msgspec.json.encode({**told, "cells": list(cells)}))
+    document = {"version": 1, "name": "by hand", "uavctl_version": "9.9", "master": 7, "runs": count, "steps": STEPS}
+    (folder / "campaign.json").write_bytes(msgspec.json.encode({**document, "cells": list(cells)}))
     fields = [(name, _TYPES.get(name, pa.float64())) for name in (rows or runs(0, [1.0]))[0]]
     pq.write_table(pa.Table.from_pylist([dict(row) for row in rows], schema=pa.schema(fields)), folder / "runs.parquet")
     return folder

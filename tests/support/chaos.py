@@ -22,8 +22,8 @@ from flight_rig import (
     small_plant,
     vehicle,
 )
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.flight.controller import Controller
 from uavctl.flight.monitors.outliers import GateParameters
 from uavctl.flight.tick import TickOutput, make_initial_state
@@ -31,15 +31,13 @@ from uavctl.flight.tick import tick as run_tick
 from uavctl.records import Command, ControlMode, Order, PositionSample, SolveStatus, StepInput, VehicleStatus
 from uavctl.smpc.answer import NOMINAL, Answer, Preview
 
-Array = NDArray[np.float64]
-
 LIMITS, SLEW = (2.0, 2.0, 1.5), 100.0 * TICK_NS * 1e-9
 ODD = (math.nan, math.inf, -math.inf, 1e9, 1e300, 999.0, -0.0)
 FLOWN = (ControlMode.TRACK, ControlMode.BRAKE, ControlMode.HOLD)
 
 
 @dataclass
-class Count:
+class ChaosCounts:
     """What came of a run.
 
     Attributes:
@@ -114,17 +112,17 @@ class World:
         if kind == 1:
             place[0] += float(rng.choice([-2.0, 2.0]))
         received_ns = at_ns + int(rng.integers(0, DT_NS))
-        one = sample(at_ns + (2 * DT_NS if kind == 2 else 0), received_ns, (place[0], place[1], place[2]))
-        self._waiting += [one] * (2 if kind == 3 else 1)
+        new_sample = sample(at_ns + (2 * DT_NS if kind == 2 else 0), received_ns, (place[0], place[1], place[2]))
+        self._waiting += [new_sample] * (2 if kind == 3 else 1)
 
     def arrived(self, at_ns: int) -> tuple[PositionSample, ...]:
         """What has come in by a tick."""
-        here = tuple(one for one in self._waiting if one.received_ns <= at_ns)
-        self._waiting = [one for one in self._waiting if one.received_ns > at_ns]
-        return here
+        arrived_samples = tuple(sample for sample in self._waiting if sample.received_ns <= at_ns)
+        self._waiting = [sample for sample in self._waiting if sample.received_ns > at_ns]
+        return arrived_samples
 
 
-def runs(rng: np.random.Generator, ticks: int, orders: bool) -> Iterator[tuple[StepInput, TickOutput, bool]]:
+def run_ticks(rng: np.random.Generator, ticks: int, orders: bool) -> Iterator[tuple[StepInput, TickOutput, bool]]:
     """Inputs and outputs of that many ticks, and whether a flight begins; a new one follows each hand-over."""
     done = 0
     while done < ticks:
@@ -156,10 +154,10 @@ def runs(rng: np.random.Generator, ticks: int, orders: bool) -> Iterator[tuple[S
             begins, done = False, done + 1
 
 
-def soak_core(ticks: int, seed: int, *, orders: bool = True) -> Count:
+def soak_core(ticks: int, seed: int, *, orders: bool = True) -> ChaosCounts:
     """Fly for that many ticks and count what must not happen."""
-    count, before, mode, age = Count(), (0.0, 0.0, 0.0), ControlMode.WAIT, 0
-    for _, output, begins in runs(np.random.default_rng(seed), ticks, orders):
+    count, before, mode, age = ChaosCounts(), (0.0, 0.0, 0.0), ControlMode.WAIT, 0
+    for _, output, begins in run_ticks(np.random.default_rng(seed), ticks, orders):
         if begins:
             count.flights, before, mode, age = count.flights + 1, (0.0, 0.0, 0.0), ControlMode.WAIT, 0
         decision, setpoint = output.decision, output.setpoint

@@ -22,22 +22,22 @@ TICK_NS, S = 50_000_000, 1_000_000_000
 CALM = ("plant.wind_std_mps2=[1e-9,1e-9,1e-9]", "sim.camera.rate_hz=20.0", "link.loss=0.0")
 
 
-class Checked:
+class CheckResult:
     """The items of a check, and the check itself."""
 
     def __init__(self, flight: Preflight, at_ns: int) -> None:
         self.flight = flight
-        self.items = {one.name: one for one in flight.make_items(at_ns)}
+        self.items = {item.name: item for item in flight.make_items(at_ns)}
 
     def __getitem__(self, name: str) -> Item:
         return self.items[name]
 
     @property
-    def bad(self) -> list[str]:
-        return [name for name, one in self.items.items() if one.state is ItemState.BAD]
+    def bad_items(self) -> list[str]:
+        return [name for name, item in self.items.items() if item.state is ItemState.BAD]
 
 
-def look(
+def run_check(
     overrides: Sequence[str] = (),
     wrong: Sequence[str] = (),
     *,
@@ -46,7 +46,7 @@ def look(
     setpoints: Callable[[float], tuple[float, float, float] | None] = lambda _: None,
     twist: Callable[[bytes], bytes] = lambda data: data,
     prepare: Callable[[Peers], None] = lambda _: None,
-) -> Checked:
+) -> CheckResult:
     """Check the simulated peers.
 
     Args:
@@ -72,10 +72,10 @@ def look(
         accel = setpoints(at_ns * 1e-9)
         if accel is not None:
             peers.receive(VEHICLE, client.setpoint(*accel), at_ns)
-    return Checked(flight, ticks * TICK_NS)
+    return CheckResult(flight, ticks * TICK_NS)
 
 
-def twisted(matrix: Sequence[Sequence[float]]) -> Callable[[bytes], bytes]:
+def transform_cameras(matrix: Sequence[Sequence[float]]) -> Callable[[bytes], bytes]:
     """Cameras whose positions are multiplied by a matrix on their way: a unit, a mirror, other axes."""
 
     def twist(data: bytes) -> bytes:
@@ -90,52 +90,54 @@ def twisted(matrix: Sequence[Sequence[float]]) -> Callable[[bytes], bytes]:
     return twist
 
 
-class Hand:
+class HandMotion:
     """A body in a hand, with a vehicle on it that knows its attitude, and a position of its own if it is told to.
 
     Speaks through pymavlink alone; `place` is the truth in local NED, `matrix` what the cameras make of it.
     """
 
-    def __init__(self, *overrides: str, heading_rad: float = 0.0, own: bool = False, move: bool = False) -> None:
+    def __init__(
+        self, *overrides: str, heading_rad: float = 0.0, has_estimate: bool = False, move: bool = False
+    ) -> None:
         self.config = load_config("room-hahn-stursberg", [*CALM, *overrides])
         self.flight = Preflight(self.config, make_links, 0, move=move)
         self.vehicle, self.cameras = Peer(1, 1), Peer(17, 18)
-        self.heading_rad, self.own = heading_rad, own
+        self.heading_rad, self.own = heading_rad, has_estimate
         self.place = [0.3, 0.2, -0.02]
         self.matrix = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
         self.at_ns = 0
         self._random = random.Random(1)
 
-    def rest(self, seconds: float, *, armed: bool = False) -> None:
+    def hold(self, seconds: float, *, armed: bool = False) -> None:
         for _ in range(round(seconds * 20)):
             self.at_ns += 50_000_000
             if self.at_ns % S == 0:
-                self.tell(self.vehicle.heartbeat(base_mode=209 if armed else 81, custom_mode=4 << 16 | 3 << 24))
+                self.report(self.vehicle.heartbeat(base_mode=209 if armed else 81, custom_mode=4 << 16 | 3 << 24))
             boot_ms = self.at_ns // 1_000_000 + 20_000
-            self.tell(self.vehicle.send("attitude", boot_ms, 0.01, 0.0, self.heading_rad, 0.0, 0.0, 0.0))
+            self.report(self.vehicle.send("attitude", boot_ms, 0.01, 0.0, self.heading_rad, 0.0, 0.0, 0.0))
             if self.own:
-                self.tell(self.vehicle.local_position(boot_ms, *self.place))
-            seen = [sum(a * b for a, b in zip(row, self.place, strict=True)) for row in self.matrix]
-            x, y, z = (value + self._random.gauss(0.0, 0.003) for value in seen)
+                self.report(self.vehicle.local_position(boot_ms, *self.place))
+            observed = [sum(a * b for a, b in zip(row, self.place, strict=True)) for row in self.matrix]
+            x, y, z = (value + self._random.gauss(0.0, 0.003) for value in observed)
             self.flight.receive("mocap", self.cameras.vision(self.at_ns // 1000 + 10**9, x, y, z), self.at_ns)
             self.flight.tick(0, self.at_ns, to_nobody)
 
-    def carry(self, *way: float) -> None:
+    def carry(self, *displacement_m: float) -> None:
         """Carry it along a way in 1 s, and hold it for 1.5 s."""
         for _ in range(20):
-            self.place = [a + b / 20 for a, b in zip(self.place, way, strict=True)]
-            self.rest(0.05)
-        self.rest(1.5)
+            self.place = [a + b / 20 for a, b in zip(self.place, displacement_m, strict=True)]
+            self.hold(0.05)
+        self.hold(1.5)
 
     def follow(self) -> None:
         """Do what is asked, rightly."""
         c, s = 0.5 * math.cos(self.heading_rad), 0.5 * math.sin(self.heading_rad)
-        self.rest(2.0)
-        for way in ((0.0, 0.0, -0.5), (c, s, 0.0), (-s, c, 0.0)):
-            self.carry(*way)
+        self.hold(2.0)
+        for displacement_m in ((0.0, 0.0, -0.5), (c, s, 0.0), (-s, c, 0.0)):
+            self.carry(*displacement_m)
 
-    def done(self) -> Checked:
-        return Checked(self.flight, self.at_ns)
+    def is_done(self) -> CheckResult:
+        return CheckResult(self.flight, self.at_ns)
 
-    def tell(self, data: bytes) -> None:
+    def report(self, data: bytes) -> None:
         self.flight.receive("vehicle", data, self.at_ns)

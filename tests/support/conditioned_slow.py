@@ -5,14 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import norm
 
+from uavctl.arrays import Array
 from uavctl.smpc.answer import Preview
 from uavctl.smpc.nominal import ControlProblem, lqr
 from uavctl.smpc.qp import OPEN, SOFT, QuadraticProgram
 
-Array = NDArray[np.float64]
 ROUNDS, MOST_ROUNDS = 2, 3
 
 
@@ -32,21 +31,21 @@ def first_side(given: ControlProblem, side: float, sent: Array) -> Array:
 
 def met(given: ControlProblem, sides: Array) -> Array:
     """Sides (H, m_x) of the state rows; where those of opposite rows cross, both are in the middle."""
-    c, found = given.state_set.c, sides.copy()
+    c, result = given.state_set.c, sides.copy()
     for i in range(len(c)):
         for j in np.flatnonzero((c[:i] == -c[i]).all(axis=1)):
-            found[:, np.array([i, j])] -= 0.5 * np.minimum(sides[:, i] + sides[:, j], 0.0)[:, None]
-    return found
+            result[:, np.array([i, j])] -= 0.5 * np.minimum(sides[:, i] + sides[:, j], 0.0)[:, None]
+    return result
 
 
 def deviations(given: ControlProblem, cov: Array | None) -> Array:
     """Standard deviations (H, m_x) from the definition."""
-    plant, found = given.plant, []
+    plant, results = given.plant, []
     spread = np.zeros((plant.n_x, plant.n_x)) if cov is None else cov
     for _ in range(given.horizon):
         spread = plant.a @ spread @ plant.a.T + plant.e @ plant.w @ plant.e.T
-        found.append(np.sqrt(np.diagonal(given.state_set.c @ spread @ given.state_set.c.T)))
-    return np.array(found)
+        results.append(np.sqrt(np.diagonal(given.state_set.c @ spread @ given.state_set.c.T)))
+    return np.array(results)
 
 
 def plan_slowly(
@@ -79,14 +78,14 @@ def plan_slowly(
     change = np.concatenate([d @ of_u[:1], d @ np.diff(of_u, axis=0)])
     hard, room = [given.input_set.c @ of_u], [given.input_set.b - given.input_set.c @ hold - hard_of(given, of_u)]
     if np.isfinite(side):
-        at, most = np.zeros((steps, len(d))), np.full((steps, len(d)), side)
+        at, upper_limits = np.zeros((steps, len(d))), np.full((steps, len(d)), side)
         at[0] = -d @ hold
-        most[0] = OPEN
+        upper_limits[0] = OPEN
         if preview.sent is not None:
             at[0] += d @ preview.sent
-            most[0] = first_side(given, side, preview.sent)
+            upper_limits[0] = first_side(given, side, preview.sent)
         hard += [change, -change]
-        room += [most + at - change[:, :, 0], most - at + change[:, :, 0]]
+        room += [upper_limits + at - change[:, :, 0], upper_limits - at + change[:, :, 0]]
     of_hard, room_u = np.concatenate(hard, axis=1).reshape(-1, n + 1), np.concatenate(room, axis=1).ravel()
     rows = np.ascontiguousarray(np.vstack([rows_x.reshape(-1, n + 1), of_hard])[:, 1:])
     soft = np.arange(len(rows)) < room_x.size
@@ -100,9 +99,9 @@ def plan_slowly(
 
     def solved(backoff: Array) -> Array:
         upper = np.append(met(given, room_x - backoff).ravel(), room_u)
-        found = program.solve(linear, np.minimum(upper, OPEN), np.full(len(rows), -OPEN))
-        assert found is not None
-        return found[0]
+        result = program.solve(linear, np.minimum(upper, OPEN), np.full(len(rows), -OPEN))
+        assert result is not None
+        return result[0]
 
     sigma, budgets = deviations(given, preview.cov), budgets[np.minimum(np.arange(steps) + preview.age, steps - 1)]
     backoff = norm.isf(np.minimum(budgets / sigma.shape[1], 0.5))[:, None] * sigma

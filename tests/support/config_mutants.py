@@ -162,38 +162,40 @@ def toml_document(table: dict[str, Any], path: str = "") -> Iterator[str]:
     lists = {
         key: value
         for key, value in table.items()
-        if isinstance(value, list) and value and all(isinstance(one, dict) for one in value)
+        if isinstance(value, list) and value and all(isinstance(entry, dict) for entry in value)
     }
     yield from (f"{key} = {toml_text(value)}" for key, value in table.items() if key not in tables and key not in lists)
     for key, value in tables.items():
         yield f"[{path}{key}]"
         yield from toml_document(value, f"{path}{key}.")
     for key, listed in lists.items():
-        for one in listed:
+        for entry in listed:
             yield f"[[{path}{key}]]"
-            yield from toml_document(one, f"{path}{key}.")
+            yield from toml_document(entry, f"{path}{key}.")
 
 
-def leaves(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+def find_leaf_paths(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
     """Path of everything in a document, tables and lists too."""
     if path:
         yield path
     if isinstance(value, dict | list):
         inner: Any = value.items() if isinstance(value, dict) else enumerate(value)
-        for key, one in inner:
-            yield from leaves(one, (*path, key))
+        for key, value in inner:
+            yield from find_leaf_paths(value, (*path, key))
 
 
-def ranges(section: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], tuple[float, float, bool]]]:
+def find_ranges(
+    section: Any, path: tuple[str, ...] = ()
+) -> Iterator[tuple[tuple[str, ...], tuple[float, float, bool]]]:
     """Least and largest number that a key takes, and whether it is a whole one, by the key's path; of lists too."""
-    for one in msgspec.structs.fields(section):
-        here = (*path, one.encode_name)
-        if isinstance(one.type, type) and issubclass(one.type, msgspec.Struct):
-            yield from ranges(one.type, here)
+    for section_field in msgspec.structs.fields(section):
+        key_path = (*path, section_field.encode_name)
+        if isinstance(section_field.type, type) and issubclass(section_field.type, msgspec.Struct):
+            yield from find_ranges(section_field.type, key_path)
         else:
-            found = next(_numbers(one.type), None)
-            if found is not None:
-                yield here, found
+            result = next(_numbers(section_field.type), None)
+            if result is not None:
+                yield key_path, result
 
 
 def _numbers(annotation: Any, metas: tuple[Any, ...] = ()) -> Iterator[tuple[float, float, bool]]:
@@ -209,16 +211,16 @@ def _numbers(annotation: Any, metas: tuple[Any, ...] = ()) -> Iterator[tuple[flo
             yield from _numbers(argument)
 
 
-def within(rng: random.Random, low: float, high: float, whole: bool) -> float:
+def draw_within(rng: random.Random, low: float, high: float, whole: bool) -> float:
     """A number that a key takes: an end of its range, or anything between, small ones as often as large ones."""
-    least = max(low, 1e-9) if low >= 0 else min(1e-9, high)
-    value = rng.choice((low, high, math.exp(rng.uniform(math.log(least), math.log(max(high, 2 * least))))))
+    min_value = max(low, 1e-9) if low >= 0 else min(1e-9, high)
+    value = rng.choice((low, high, math.exp(rng.uniform(math.log(min_value), math.log(max(high, 2 * min_value))))))
     if low < 0 < value:
         value *= rng.choice((1, -1))
     return round(value) if whole else value
 
 
-def nested(depth: int, brackets: str) -> str:
+def nest_value(depth: int, brackets: str) -> str:
     """A value in many brackets."""
     return "[" * depth + "]" * depth if brackets == "[" else "{a=" * depth + "1" + "}" * depth
 
@@ -226,16 +228,16 @@ def nested(depth: int, brackets: str) -> str:
 class Mutants:
     """Cases by number."""
 
-    def __init__(self, seed: int, bases: dict[str, dict[str, Any]]) -> None:
+    def __init__(self, seed: int, load_bases: dict[str, dict[str, Any]]) -> None:
         """Make cases of a seed.
 
         Args:
             seed: The seed.
-            bases: Name -> valid configuration as a table, with every key in it.
+            load_bases: Name -> valid configuration as a table, with every key in it.
         """
         self._seed = seed
-        self._bases = bases
-        self._ranges = dict(ranges(Config))
+        self._bases = load_bases
+        self._ranges = dict(find_ranges(Config))
 
     def config(self, number: int) -> Case:
         """A spoilt configuration, or a spoilt file beside one, under some command."""
@@ -264,33 +266,36 @@ class Mutants:
         rng = random.Random(f"{self._seed}/line/{number}")
         case = Case([], {CONFIG: "\n".join(toml_document(self._bases["paper"])) + "\n", "pipe": None})
         table = self._bases["paper"]
-        words = self._any_command(rng, "paper", table, case)
-        if words[0] not in ("campaign", "paper", "log", "ctl", "key"):
-            words += ["--set", "solver.method=exact"]
+        arguments = self._any_command(rng, "paper", table, case)
+        if arguments[0] not in ("campaign", "paper", "log", "ctl", "key"):
+            arguments += ["--set", "solver.method=exact"]
         for _ in range(rng.choice((1, 1, 1, 2, 3))):
-            at = rng.randrange(1, len(words) + 1)
+            at = rng.randrange(1, len(arguments) + 1)
             how = rng.choice(("value", "value", "value", "insert", "drop", "twice", "swap"))
-            word = rng.choice(WORDS)
+            argument = rng.choice(WORDS)
             if how == "value":
-                options = [i for i in range(1, len(words)) if words[i - 1].startswith("--")] or [len(words) - 1]
+                options = [i for i in range(1, len(arguments)) if arguments[i - 1].startswith("--")] or [
+                    len(arguments) - 1
+                ]
                 at = rng.choice(options)
-                words[at] = word
+                arguments[at] = argument
             elif how == "insert":
-                words.insert(at, word)
-            elif how == "drop" and len(words) > 2:
-                del words[at - 1]
+                arguments.insert(at, argument)
+            elif how == "drop" and len(arguments) > 2:
+                del arguments[at - 1]
             elif how == "twice":
-                words.insert(at, words[at - 1])
+                arguments.insert(at, arguments[at - 1])
             else:
-                other = rng.randrange(len(words))
-                words[at - 1], words[other] = words[other], words[at - 1]
-            case.note.append(f"{how} {at} {word[:20]!r}")
-        for i, word in enumerate(words[1:], 1):  # long work that is asked for is not refused, so not asked for
-            if words[i - 1] in LONG_OPTIONS and 4.0 < _number(word) < 1e7:
-                words[i] = "1e300"
+                other_index = rng.randrange(len(arguments))
+                arguments[at - 1], arguments[other_index] = arguments[other_index], arguments[at - 1]
+            case.note.append(f"{how} {at} {argument[:20]!r}")
+        for i, argument in enumerate(arguments[1:], 1):  # long work that is asked for is not refused, so not asked for
+            if arguments[i - 1] in LONG_OPTIONS and 4.0 < _number(argument) < 1e7:
+                arguments[i] = "1e300"
         # A process cannot be given these in a word.
         case.words = [
-            word.replace("\x00", "").encode("utf-8", "surrogateescape").decode("utf-8", "replace") for word in words
+            argument.replace("\x00", "").encode("utf-8", "surrogateescape").decode("utf-8", "replace")
+            for argument in arguments
         ]
         return case
 
@@ -302,7 +307,7 @@ class Mutants:
         return self._spoil_text(rng, "\n".join(toml_document(table)) + "\n", case)
 
     def _spoil_value(self, rng: random.Random, table: dict[str, Any], case: Case) -> None:
-        paths = [path for path in leaves(table) if len(path) > 1 or rng.random() < 0.2]
+        paths = [path for path in find_leaf_paths(table) if len(path) > 1 or rng.random() < 0.2]
         if rng.random() < 0.7:  # sections of many keys leave others that matter as much
             section = rng.choice(sorted({str(path[0]) for path in paths}))
             paths = [path for path in paths if path[0] == section]
@@ -314,7 +319,7 @@ class Mutants:
         how, new = self._other(rng, value)
         known = self._ranges.get(tuple(key for key in path if isinstance(key, str)))
         if known is not None and isinstance(value, int | float) and rng.random() < 0.7:
-            new = within(rng, *known)
+            new = draw_within(rng, *known)
             how = f"within {new:g}"
         case.note.append(f"{'.'.join(map(str, path))}: {how}")
         if how == "deleted" and isinstance(holder, dict):
@@ -341,9 +346,9 @@ class Mutants:
             return f"text {str(new)[:20]!r}", new
         if isinstance(value, list):
             how = rng.choice(("longer", "shorter", "much longer", "odd", "nested", "bigger", "shifted"))
-            if how == "shifted" and all(isinstance(one, int | float) for one in value):
+            if how == "shifted" and all(isinstance(number, int | float) for number in value):
                 offset = rng.choice((-3.0, -0.7, 0.7, 3.0))  # limits that leave zero out, targets beyond a wall
-                return f"shifted by {offset:g}", [one + offset for one in value]
+                return f"shifted by {offset:g}", [number + offset for number in value]
             if how in ("bigger", "shifted"):
                 factor = rng.choice((*FACTORS, 1e9, 1e200))
                 return f"times {factor:g}", _scaled(value, factor)
@@ -379,14 +384,14 @@ class Mutants:
                 rng.choice(("\x00", "=", "[", "]]", "x", '"""', "a.b.c = 1", "ü = 1", "[a]\n[a]", "x = 1e", "\ufeff")),
             )
         elif how == "nest":
-            lines.insert(at, f"deep = {nested(rng.choice((20, 200, 5000, 100_000)), rng.choice('[{'))}")
+            lines.insert(at, f"deep = {nest_value(rng.choice((20, 200, 5000, 100_000)), rng.choice('[{'))}")
         elif how == "huge":
             lines.insert(at, f'huge = "{"a" * rng.choice((100_000, 10_000_000))}"')
         elif how == "keys":
             lines.insert(at, "\n".join(f"key{i} = {i}" for i in range(rng.choice((1000, 50_000)))))
         elif how == "tables":
-            one = '[[fence]]\nstate = "north"\nside = "upper"\ntimes_s = [0.0]\nvalues = [2.0]\n'
-            lines.append(one * rng.choice((100, 5000)))
+            fence_text = '[[fence]]\nstate = "north"\nside = "upper"\ntimes_s = [0.0]\nvalues = [2.0]\n'
+            lines.append(fence_text * rng.choice((100, 5000)))
         elif how == "dotted":
             lines.insert(at, f"{'a.' * rng.choice((50, 5000))}b = 1")
         else:
@@ -398,9 +403,9 @@ class Mutants:
 
     def _override(self, rng: random.Random, table: dict[str, Any], case: Case) -> str:
         """A spoilt `key.path=value`."""
-        other = copy.deepcopy(table)
-        path = rng.choice([path for path in leaves(table) if all(isinstance(key, str) for key in path)])
-        holder: Any = other
+        other_table = copy.deepcopy(table)
+        path = rng.choice([path for path in find_leaf_paths(table) if all(isinstance(key, str) for key in path)])
+        holder: Any = other_table
         for key in path[:-1]:
             holder = holder[key]
         how = rng.choice(("value",) * 6 + ("nest", "no value", "deep key", "odd key", "quotes", "two"))
@@ -410,7 +415,7 @@ class Mutants:
         quote = rng.choice(('"', '"""', "'", "[1,", "{a=", "#", "1 # 2", "1\n2=3"))
         text = {
             "value": f"{name}={value}",
-            "nest": f"{name}={nested(rng.choice((100, 5000, 30_000)), rng.choice('[{'))}",
+            "nest": f"{name}={nest_value(rng.choice((100, 5000, 30_000)), rng.choice('[{'))}",
             "no value": rng.choice((name, f"{name}=", "=", "=1", "")),
             "deep key": f"{'a.' * rng.choice((5, 2000, 30_000))}b=1",
             "odd key": f"{name}{tail}={value}",
@@ -430,8 +435,8 @@ class Mutants:
         content: str | bytes | None = "\n".join(rows)
         name = TRACE if kind == "trace" else MOTION
         if how == "long":
-            many = rng.choice((1000, 30_000, 500_000))
-            content = "\n".join(f"{0.1 * i:.1f},0.5,0.5,-1.0" if kind == "motion" else "0.02" for i in range(many))
+            row_count = rng.choice((1000, 30_000, 500_000))
+            content = "\n".join(f"{0.1 * i:.1f},0.5,0.5,-1.0" if kind == "motion" else "0.02" for i in range(row_count))
         elif how == "wide":
             rows[at] += ",1" * rng.choice((1, 100_000))
         elif how == "word":
@@ -581,28 +586,28 @@ class Mutants:
         return ["log", "whatif", RECORDING, "--out", "again"]
 
 
-def _number(word: str) -> float:
+def _number(text: str) -> float:
     try:
-        return float(word)
+        return float(text)
     except ValueError:
         return 0.0
 
 
 def _scaled(value: Any, factor: float) -> Any:
     if isinstance(value, list):
-        return [_scaled(one, factor) for one in value]
+        return [_scaled(number, factor) for number in value]
     return value * factor if isinstance(value, int | float) and not isinstance(value, bool) else value
 
 
-def bases() -> dict[str, dict[str, Any]]:
+def load_bases() -> dict[str, dict[str, Any]]:
     """Both presets with every key, and the first one with a mission, a fence and a fault."""
-    found = {name: tomllib.loads(dump_config(load_config(name))) for name in ("paper", "room-hahn-stursberg")}
-    for table in found.values():
+    result = {name: tomllib.loads(dump_config(load_config(name))) for name in ("paper", "room-hahn-stursberg")}
+    for table in result.values():
         table["security"]["require"] = ["vehicle", "mocap"]
     mission = [
         "mission.waypoints=[[1, 1, -1], [0, 0, -1]]",
         "fence=[{state='north', side='upper', times_s=[0.0, 5.0], values=[2.9, 2.5]}]",
         "sim.fault=[{at_s=0.5, kind='blackout', for_s=0.3}]",
     ]
-    found["mission"] = tomllib.loads(dump_config(load_config("room-hahn-stursberg", mission)))
-    return found
+    result["mission"] = tomllib.loads(dump_config(load_config("room-hahn-stursberg", mission)))
+    return result

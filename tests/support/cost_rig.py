@@ -24,7 +24,7 @@ TICK_S = 0.05
 SWEPT = 1_000_000  # floats that are touched between ticks, so that caches hold as little as after a decision
 
 
-class Nothing:
+class NullSink:
     """Takes records and does nothing: what calling and measuring cost by themselves."""
 
     def put(self, topic: str, at_ns: int, record: Record) -> None:
@@ -41,19 +41,19 @@ def flown_ticks() -> list[list[Item]]:
     return ticks
 
 
-def cost(folder: Path, ticks: list[list[Item]], seconds: float) -> dict[str, float]:
+def measure_cost(folder: Path, ticks: list[list[Item]], seconds: float) -> dict[str, float]:
     """Put so many seconds of ticks, every other one into a sink that does nothing.
 
     Returns:
         Wall times [us] of a record and of a tick's records, median and 99th percentile; with `empty_`, those of the
         sink that does nothing. The clock's own time is in all of them. `dropped`, `records` and `ticks` were recorded.
     """
-    recorder, nothing = Recorder(folder / "flight.mcap", derived_topics=DerivedTopics(ViewBuilder())), Nothing()
+    recorder, nothing = Recorder(folder / "flight.mcap", derived_topics=DerivedTopics(ViewBuilder())), NullSink()
     with _as_in_flight():
-        found = _measured({"": recorder, "empty_": nothing}, ticks, round(seconds / TICK_S))
+        result = _measured({"": recorder, "empty_": nothing}, ticks, round(seconds / TICK_S))
     status = recorder.close()
     assert status.waiting == 0, "the disk hangs"
-    return {**found, "dropped": status.dropped + status.refused}
+    return {**result, "dropped": status.dropped + status.refused}
 
 
 def _measured(sinks: dict[str, Sink], ticks: list[list[Item]], count: int) -> dict[str, float]:
@@ -68,13 +68,13 @@ def _measured(sinks: dict[str, Sink], ticks: list[list[Item]], count: int) -> di
         spent = [_timed(sink, item) for item in items]
         each_ns[name] += spent
         tick_ns[name].append(sum(spent))
-    found: dict[str, float] = {"records": len(each_ns[""]), "ticks": len(tick_ns[""])}
+    result: dict[str, float] = {"records": len(each_ns[""]), "ticks": len(tick_ns[""])}
     for name in sinks:
         for what, times_ns in (("record", each_ns[name]), ("tick", tick_ns[name])):
             p50, p99 = np.percentile(times_ns, (50, 99)) / 1e3
-            found |= {f"{name}{what}_p50_us": float(p50), f"{name}{what}_p99_us": float(p99)}
-        found[f"{name}record_mean_us"] = float(np.mean(each_ns[name])) / 1e3
-    return found
+            result |= {f"{name}{what}_p50_us": float(p50), f"{name}{what}_p99_us": float(p99)}
+        result[f"{name}record_mean_us"] = float(np.mean(each_ns[name])) / 1e3
+    return result
 
 
 def _timed(sink: Sink, item: Item) -> int:

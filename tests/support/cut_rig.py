@@ -60,38 +60,38 @@ class Cuts:
         self._sizes = [file.stat().st_size for file in self.files]
         self.straddled = 0
 
-    def places(self) -> list[tuple[int, int]]:
+    def cut_points(self) -> list[tuple[int, int]]:
         """File and size of every cut beside the end of a chunk, of its index, and around what is not a chunk."""
-        offsets = {(one.file, offset) for one in self.chunks for offset in (one.end, one.indexed)}
+        offsets = {(chunk.file, offset) for chunk in self.chunks for offset in (chunk.end, chunk.indexed)}
         near = {(file, offset + by) for file, offset in offsets for by in (-1, 0, 1)}
         for file, size in enumerate(self._sizes):
-            last = max(one.indexed for one in self.chunks if one.file == file)
+            last = max(chunk.indexed for chunk in self.chunks if chunk.file == file)
             others = (0, 1, 8, 9, (last + size) // 2, size - 40, size - 9, size - 8, size - 1, size)
             near |= {(file, at) for at in others}
         return sorted(near)
 
-    def drawn(self, count: int, seed: int) -> list[tuple[int, int]]:
+    def draw_cuts(self, count: int, seed: int) -> list[tuple[int, int]]:
         """File and size of so many cuts, each byte of the recording as likely as any other."""
         dice = random.Random(seed)
         files = dice.choices(range(len(self.files)), self._sizes, k=count)
         return [(file, dice.randrange(self._sizes[file])) for file in files]
 
-    def wrong(self, folder: Path, file: int, size: int) -> str:
+    def find_problem(self, folder: Path, file: int, size: int) -> str:
         """What is wrong with the recording whose file of this number is cut to `size` bytes; nothing if all is well."""
         for whole in self.files[:file]:
             shutil.copy(whole, folder)
         (folder / self.files[file].name).write_bytes(self.files[file].read_bytes()[:size])
-        whole_chunks = [one for one in self.chunks if (one.file, one.end) <= (file, size)]
+        whole_chunks = [chunk for chunk in self.chunks if (chunk.file, chunk.end) <= (file, size)]
         at_the_end = file == len(self.files) - 1 and size == self._sizes[file]
         if not whole_chunks:
-            return refused(folder)
+            return check_refusal(folder)
         last = whole_chunks[-1]
         self.straddled += last.ticks > last.decisions
-        text, decisions = alike(folder, ended=at_the_end or last == self.chunks[-1])
+        text, decisions = check_cut(folder, ended=at_the_end or last == self.chunks[-1])
         return text or ("" if decisions == last.decisions else f"{decisions} of {last.decisions} decisions compared")
 
 
-def alike(folder: Path, *, ended: bool) -> tuple[str, int]:
+def check_cut(folder: Path, *, ended: bool) -> tuple[str, int]:
     """What is wrong with how a cut recording is recovered and replayed, and how many decisions are compared.
 
     Args:
@@ -99,36 +99,36 @@ def alike(folder: Path, *, ended: bool) -> tuple[str, int]:
         ended: The recorder's last word is in it.
     """
     flight, out = folder / NAME, folder / "recovered.mcap"
-    code, told, errors = _run("log", "recover", str(flight), str(out))
+    code, output, errors = _run("log", "recover", str(flight), str(out))
     if code not in (0, 3):
         return f"recover: {code}, {errors}", 0
-    if (told["ended"], code) != (ended, 0 if not told["lost_bytes"] + told["messages_lost"] else 3):
-        return f"recover: {code}, {told}", 0
-    found = set()
+    if (output["ended"], code) != (ended, 0 if not output["lost_bytes"] + output["messages_lost"] else 3):
+        return f"recover: {code}, {output}", 0
+    result = set()
     for path in (flight, out):
-        code, told, errors = _run("log", "replay", str(path))
-        if (code, told.get("identical")) != (0, True):
-            return f"{path.name}: {code}, {told or errors}", 0
+        code, output, errors = _run("log", "replay", str(path))
+        if (code, output.get("identical")) != (0, True):
+            return f"{path.name}: {code}, {output or errors}", 0
         if path == out and ("recovered from flight.mcap: " in errors and "its end is missing" in errors) is ended:
             return f"{path.name}: {errors or 'not said to be cut'}", 0
-        found.add((int(told["decisions"]), int(told["compared"])))
-    return "" if len(found) == 1 else f"recovered it is another recording: {found}", min(found)[0]
+        result.add((int(output["decisions"]), int(output["compared"])))
+    return "" if len(result) == 1 else f"recovered it is another recording: {result}", min(result)[0]
 
 
-def refused(folder: Path) -> str:
+def check_refusal(folder: Path) -> str:
     """What is wrong with how a recording is refused that holds nothing, not even its header."""
-    for words in (("replay",), ("recover", str(folder / "recovered.mcap"))):
-        code, told, errors = _run("log", words[0], str(folder / NAME), *words[1:])
-        if code != 1 or told.get("exit_code") != code or not errors.startswith("error: ") or errors.count("\n") != 1:
-            return f"{words[0]} of nothing: {code}, {told}, {errors}"
-    return f"{words[0]} left a file" if (folder / "recovered.mcap").exists() else ""
+    for arguments in (("replay",), ("recover", str(folder / "recovered.mcap"))):
+        code, output, errors = _run("log", arguments[0], str(folder / NAME), *arguments[1:])
+        if code != 1 or output.get("exit_code") != code or not errors.startswith("error: ") or errors.count("\n") != 1:
+            return f"{arguments[0]} of nothing: {code}, {output}, {errors}"
+    return f"{arguments[0]} left a file" if (folder / "recovered.mcap").exists() else ""
 
 
-def _run(*words: str) -> tuple[int, dict[str, int | bool], str]:
+def _run(*arguments: str) -> tuple[int, dict[str, int | bool], str]:
     """Exit code, JSON document and standard error of a command."""
     out, errors = io.StringIO(), io.StringIO()
     with redirect_stdout(out), redirect_stderr(errors):
-        code = run([*words, "--json"])
+        code = run([*arguments, "--json"])
     return code, json.loads(out.getvalue() or "{}"), _plain(errors.getvalue())
 
 
@@ -145,9 +145,13 @@ def _chunks(files: tuple[Path, ...]) -> Iterator[Chunk]:
             summary = make_reader(file).get_summary()
             assert summary is not None, path
             file.seek(0)
-            chunks = [one for one in StreamReader(file, emit_chunks=True).records if isinstance(one, records.Chunk)]
+            chunks = [
+                record for record in StreamReader(file, emit_chunks=True).records if isinstance(record, records.Chunk)
+            ]
         for index, chunk in zip(summary.chunk_indexes, chunks, strict=True):
             held = breakup_chunk(chunk, validate_crc=True)
-            counts.update(summary.channels[one.channel_id].topic for one in held if isinstance(one, records.Message))
+            counts.update(
+                summary.channels[record.channel_id].topic for record in held if isinstance(record, records.Message)
+            )
             end = index.chunk_start_offset + index.chunk_length
             yield Chunk(number, end, end + index.message_index_length, counts[TICK], counts[DECISION])

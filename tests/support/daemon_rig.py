@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 
-from loopback_rig import Memory, shared_loop
+from loopback_rig import MemorySink, shared_loop
 from sim_rig import decode
 
 from sim.simulation import Peers
@@ -17,17 +17,17 @@ from uavctl.io.base import Connection
 TICK_NS, DT_NS, SECOND = 50_000_000, 200_000_000, 1_000_000_000
 
 
-class Bench:
+class DaemonRig:
     """Virtual time with the simulated peers behind the daemon's connections."""
 
     def __init__(self, *overrides: str) -> None:
         self.config = load_config("room-hahn-stursberg", overrides)
-        self.memory = Memory()
+        self.memory = MemorySink()
         self.loop = shared_loop(self.config, self.memory)
         self.now_ns = 1
         self.peers = Peers(self.config, DT_NS)
         self.arrived: dict[str, list[tuple[bytes, int]]] = {"vehicle": [], "mocap": []}
-        self.connections = {name: Wire(self, name) for name in self.arrived}
+        self.connections = {name: PeerConnection(self, name) for name in self.arrived}
         self.told: list[tuple[str, int]] = []  # words for a person, and when they were told
         self.arrives: list[tuple[int, bytes]] = []  # what comes between ticks
         self.oversleep: dict[int, int] = {}  # deadline -> how much later the sleep ends
@@ -59,10 +59,10 @@ class Bench:
         )
 
 
-class Wire:
+class PeerConnection:
     """A connection to the simulated peers."""
 
-    def __init__(self, bench: Bench, name: str) -> None:
+    def __init__(self, bench: DaemonRig, name: str) -> None:
         self.url, self.closed, self.send_errors, self.receive_errors = f"test://{name}", False, 0, 0
         self._bench, self._name = bench, name
         self.answered: list[int] = []

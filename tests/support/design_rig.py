@@ -8,14 +8,11 @@ from importlib.resources import files
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from uavctl.smpc.hahn_stursberg.design import DesignSpec
 from uavctl.smpc.link import bernoulli
 from uavctl.smpc.plant import Plant, drag_lag
 from uavctl.smpc.sets import Polytope
-
-Array = NDArray[np.float64]
 
 
 def preset(name: str) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from uavctl.build.controller import Prepared, design_of, prepare
+from uavctl.build.controller import Prepared, build_flight_design, prepare
 from uavctl.config import Config, load_config
 from uavctl.errors import ConfigError, DesignError
 
@@ -35,7 +35,7 @@ def draw_controller(rng: np.random.Generator, seed: int) -> Config:
     for _ in range(TRIES):
         try:
             config = load_config(*_controller(rng))
-            design_of(config)
+            build_flight_design(config)
         except (ConfigError, DesignError):
             continue
         return config
@@ -46,7 +46,7 @@ def _controller(rng: np.random.Generator) -> tuple[str, list[str]]:
     """Preset and overrides of design, solver, estimator and fallback; not all of them fit together."""
     name = str(rng.choice(["room-hahn-stursberg", "paper"], p=[0.7, 0.3]))
     horizon = int(rng.integers(7, 15))
-    said = {
+    settings = {
         "smpc.horizon": horizon,
         "smpc.tau": int(rng.integers(2, 6)),
         "smpc.delta_x": rng.uniform(0.85, 0.97),
@@ -65,22 +65,24 @@ def _controller(rng: np.random.Generator) -> tuple[str, list[str]]:
     rule = str(rng.choice(rules))
     if rule in ("fixed", "list"):
         delays = rng.integers(3, 7)
-        said["schedule.delays"] = delays if rule == "fixed" else [int(delays)] * (horizon - 2) + [int(delays) + 1] * 2
+        settings["schedule.delays"] = (
+            delays if rule == "fixed" else [int(delays)] * (horizon - 2) + [int(delays) + 1] * 2
+        )
     else:
-        said["schedule.rule"] = rule
+        settings["schedule.rule"] = rule
         width = 9 if name == "room-hahn-stursberg" else 4
-        said["schedule.search_states"] = [[0.0] * width, [0.5] + [0.0] * (width - 1)]
-    said |= _believed_link(rng)
+        settings["schedule.search_states"] = [[0.0] * width, [0.5] + [0.0] * (width - 1)]
+    settings |= _believed_link(rng)
     method = str(rng.choice(["exact", "printed"], p=[0.8, 0.2]))
-    said["solver.method"] = method
-    said["risk.estimate"] = "exact" if method == "printed" else rng.choice(["exact", "innovations"])
+    settings["solver.method"] = method
+    settings["risk.estimate"] = "exact" if method == "printed" else rng.choice(["exact", "innovations"])
     if name == "room-hahn-stursberg" and method == "exact" and rng.uniform() < 0.3:
-        said |= {"schedule.late": int(rng.integers(1, 3)), "link.delay_s": rng.uniform(0.0, 0.3)}
+        settings |= {"schedule.late": int(rng.integers(1, 3)), "link.delay_s": rng.uniform(0.0, 0.3)}
     if name == "room-hahn-stursberg" and rng.uniform() < 0.4:
-        said |= {"estimator.bias_drift": 0.0, "estimator.bias_max": 0.0}
+        settings |= {"estimator.bias_drift": 0.0, "estimator.bias_max": 0.0}
     if name == "room-hahn-stursberg" and rng.uniform() < 0.3:
-        said |= {"plant.drag_1ps": [float(rng.uniform(0.05, 0.4))] * 3, "plant.lag_s": [0.25, 0.25, 0.3]}
-    return name, [f"{key}={value}" for key, value in said.items()]
+        settings |= {"plant.drag_1ps": [float(rng.uniform(0.05, 0.4))] * 3, "plant.lag_s": [0.25, 0.25, 0.3]}
+    return name, [f"{key}={value}" for key, value in settings.items()]
 
 
 def _believed_link(rng: np.random.Generator) -> dict[str, object]:
@@ -103,15 +105,15 @@ def _believed_link(rng: np.random.Generator) -> dict[str, object]:
 
 
 @lru_cache(maxsize=2)
-def prepared_of(config: Config) -> Prepared:
+def prepare_config(config: Config) -> Prepared:
     """What flies with a drawn configuration."""
-    return prepare(config, design_of(config))
+    return prepare(config, build_flight_design(config))
 
 
-def fits(config: Config) -> bool:
+def is_mission_feasible(config: Config) -> bool:
     """Whether the mission can be flown with this design: there is rest at its places."""
     try:
-        prepared_of(config)
+        prepare_config(config)
     except DesignError:
         return False
     return True

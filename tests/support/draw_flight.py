@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from draw_controller import draw_controller, fits
+from draw_controller import draw_controller, is_mission_feasible
 from msgspec.structs import replace
 
 from sim.autopilot.profile import SIMULATED
@@ -18,7 +18,7 @@ SPANS = ("blackout", "held", "uplink_blackout", "occluded", "swapped", "frozen")
 
 
 @dataclass(frozen=True)
-class Drawn:
+class FlightDraw:
     """What a seed draws.
 
     Attributes:
@@ -29,7 +29,7 @@ class Drawn:
         orders: Of the operator, each with the tick before which it comes.
         stop_tick: From when on the operator asks for the hand-over; None never.
         skipped: Ticks that the loop oversleeps.
-        late: Ticks that run when what arrives up to the next one is there.
+        late_ticks: Ticks that run when what arrives up to the next one is there.
         noise: Share of the ticks before which a stranger's datagram comes.
         reboot_step: Step Δt at which the vehicle starts anew; None never.
         signed: Whether there are doors on both connections.
@@ -43,17 +43,17 @@ class Drawn:
     orders: tuple[tuple[int, Command], ...]
     stop_tick: int | None
     skipped: frozenset[int]
-    late: frozenset[int]
+    late_ticks: frozenset[int]
     noise: float
     reboot_step: int | None
     signed: bool
     viewers: bool
 
     @property
-    def words(self) -> tuple[str, ...]:
+    def labels(self) -> tuple[str, ...]:
         """What it has, for a count of what many seeds have covered."""
         config = self.config
-        said = {
+        is_present = {
             f"preset {config.name}": True,
             f"simulated {config.sim.plant}": True,
             config.sim.autopilot: True,
@@ -75,17 +75,17 @@ class Drawn:
             "orders": bool(self.orders),
             "stop": self.stop_tick is not None,
             "missed ticks": bool(self.skipped),
-            "late ticks": bool(self.late),
+            "late ticks": bool(self.late_ticks),
             "strangers": self.noise > 0.0,
             "reboot": self.reboot_step is not None,
             "signed": self.signed,
             "viewers": self.viewers,
-            **{f"fault {one.kind}": True for one in config.sim.fault},
+            **{f"fault {fault.kind}": True for fault in config.sim.fault},
         }
-        return tuple(word for word, is_so in said.items() if is_so)
+        return tuple(label for label, is_so in is_present.items() if is_so)
 
 
-def drawn(seed: int) -> Drawn:
+def draw_flight(seed: int) -> FlightDraw:
     """The flight of a seed."""
     rng = np.random.default_rng(seed)
     config = draw_controller(rng, seed)
@@ -98,8 +98,8 @@ def drawn(seed: int) -> Drawn:
     if takes_off:
         low = replace(config.sim, start_position_m=(*config.sim.start_position_m[:2], -0.05))
         config = replace(config, sim=low)
-    skipped, late = _ticks(rng, ticks, 0.4), _ticks(rng, ticks, 0.4)
-    return Drawn(
+    skipped, late_ticks = _ticks(rng, ticks, 0.4), _ticks(rng, ticks, 0.4)
+    return FlightDraw(
         config=config,
         link=_true_link(rng, config, calm),
         start_ns=int(rng.integers(0, 10**6)) * round(config.plant.dt_s * 1e9),
@@ -107,7 +107,7 @@ def drawn(seed: int) -> Drawn:
         orders=_orders(rng, config, ticks),
         stop_tick=int(rng.integers(ticks // 2, ticks)) if rng.uniform() < 0.25 else None,
         skipped=skipped,
-        late=late - skipped,
+        late_ticks=late_ticks - skipped,
         noise=float(rng.choice([0.0, 0.3])),
         reboot_step=int(rng.integers(steps // 3, steps)) if rng.uniform() < 0.15 else None,
         signed=bool(rng.uniform() < 0.3 and per_step > 1),
@@ -200,7 +200,7 @@ def _faults(
     """About one in so many seconds."""
     kinds = [*SPANS, "mode", "parameter", *(("wind", "battery") if plant == "quadrotor" else ())]
     weights = np.array([0.3 if kind == "mode" else 1.0 for kind in kinds])
-    found = []
+    results = []
     for at_s in np.sort(rng.uniform(0.0, flight_s, rng.poisson(flight_s / every_s))).tolist():
         kind = str(rng.choice(kinds, p=weights / weights.sum()))
         fault = FaultConfig(at_s=at_s, kind=kind)  # type: ignore[arg-type]  # one of them
@@ -215,8 +215,8 @@ def _faults(
         else:
             name = "COM_OF_LOSS_T" if autopilot == "px4" else "GUID_TIMEOUT"
             fault = replace(fault, name=name, value=float(rng.uniform(0.5, 3.0)))
-        found.append(fault)
-    return tuple(found)
+        results.append(fault)
+    return tuple(results)
 
 
 def _mission(rng: np.random.Generator, config: Config) -> Config:
@@ -240,7 +240,7 @@ def _mission(rng: np.random.Generator, config: Config) -> Config:
     overrides = ["fence=[{state='north', side='upper', times_s=[2.0, 6.0], values=[3.0, 2.2]}]"] if fenced else []
     fence = load_config("room-hahn-stursberg", overrides).fence
     moved = replace(config, mission=mission, fence=fence)
-    return moved if fits(moved) else config
+    return moved if is_mission_feasible(moved) else config
 
 
 def _place(rng: np.random.Generator, config: Config) -> Vec3:
@@ -252,7 +252,7 @@ def _place(rng: np.random.Generator, config: Config) -> Vec3:
 
 def _orders(rng: np.random.Generator, config: Config, ticks: int) -> tuple[tuple[int, Command], ...]:
     """A few orders of the operator, in the midst of it."""
-    found = []
+    results = []
     for tick in np.sort(rng.integers(0, ticks, rng.poisson(1.5))).tolist():
         order = rng.choice([Order.GOTO, Order.HOLD, Order.RESUME, Order.LAND, Order.ENGAGE, Order.TAKE_OFF])
         command = Command(
@@ -260,8 +260,8 @@ def _orders(rng: np.random.Generator, config: Config, ticks: int) -> tuple[tuple
             position_m=_place(rng, config) if order == Order.GOTO else None,
             height_m=1.0 if order == Order.TAKE_OFF else None,
         )
-        found.append((tick, command))
-    return tuple(found)
+        results.append((tick, command))
+    return tuple(results)
 
 
 def _ticks(rng: np.random.Generator, ticks: int, share: float) -> frozenset[int]:

@@ -29,6 +29,7 @@ from logs.recording.summary import summarise
 from logs.report import flight_page as report
 from sim.autopilot.profile import SIMULATED
 from sim.simulation import Peers
+from uavctl.arrays import SECOND_NS
 from uavctl.cause import Cause
 from uavctl.cli import fly as fly_cmd
 from uavctl.cli import tune_flights
@@ -45,21 +46,20 @@ from uavctl.loop import ControlLoop
 from uavctl.mavlink.handover_states import HandoverState
 from uavctl.records import Ending, RelayStats
 
-SECOND = 1_000_000_000
-BEGUN_NS = 1  # a tick before the grid
-LONGEST_S = 400.0  # of a flight that should have ended long ago
+BEGIN_NS = 1  # a tick before the grid
+MAX_FLIGHT_S = 400.0  # of a flight that should have ended long ago
 PRESET = ["--config", "room-hahn-stursberg", "--set", "solver.method=exact"]
 ON_THE_FLOOR = ("sim.start_position_m=[0.0,0.0,-0.7]",)
 TAKE_OFF = ("--arm", "--takeoff", "1.2")
-Step = tuple[Callable[["Endings"], bool], Callable[["Endings"], None]]
+Step = tuple[Callable[["EndingRig"], bool], Callable[["EndingRig"], None]]
 
 
-class Line:
+class PeerConnection:
     """A connection to the simulated peers."""
 
     has_known_sender, has_unread, send_errors, receive_errors = True, False, 0, 0
 
-    def __init__(self, rig: Endings, name: str) -> None:
+    def __init__(self, rig: EndingRig, name: str) -> None:
         self.url, self.closed = f"test://{name}", False
         self._rig, self._name = rig, name
         self.arrived: list[tuple[bytes, int]] = []
@@ -86,14 +86,14 @@ class Line:
 
     def send(self, data: bytes) -> None:
         self._rig.sent.append((self._rig.now_ns, data))
-        if self._rig.hears(data):
+        if self._rig.is_delivered(data):
             self._rig.peers.receive(self._name, data, self._rig.now_ns)
 
     def close(self) -> None:
         self.closed = True
 
 
-class Sync(SyncRecorder):
+class DiskRecorder(SyncRecorder):
     """A recorder without a thread, on a disk that may take no more.
 
     Attributes:
@@ -103,18 +103,18 @@ class Sync(SyncRecorder):
     full = False
 
     def __init__(self, *given: Any, **more: Any) -> None:
-        super().__init__(*given, open_file=Disk(lambda _: Sync.full).open, **more)
+        super().__init__(*given, open_file=Disk(lambda _: DiskRecorder.full).open, **more)
 
     def catch_up(self) -> None:
         pass
 
 
-class Endings:
+class EndingRig:
     """One flight of the command, with what the test does on the way: each step once its time has come.
 
     Attributes:
-        hears: Whether the vehicle hears a datagram of ours.
-        told: Whether we hear one of the vehicle's.
+        is_delivered: Whether the vehicle hears a datagram of ours.
+        is_received: Whether we hear one of the vehicle's.
         sent: Each datagram of ours, with its time.
         steps: (when, what) in their order.
         statuses: What `uavctl ctl status --json` has answered.
@@ -131,20 +131,20 @@ class Endings:
         self.overrides = (*(() if airborne else ON_THE_FLOOR), *overrides)
         settings = [*self.overrides, 'solver.method="exact"', *peers]
         self.config = load_config(preset, settings)
-        self.folder, self.now_ns = folder, BEGUN_NS
-        self.peers = Peers(self.config, BEGUN_NS, airborne=airborne)
+        self.folder, self.now_ns = folder, BEGIN_NS
+        self.peers = Peers(self.config, BEGIN_NS, airborne=airborne)
         self.peers.autopilot.pilot.has_radio = True  # the pilot is there, with his stick
-        self.lines = {"vehicle": Line(self, "vehicle"), "mocap": Line(self, "mocap")}
-        self.hears: Callable[[bytes], bool] = lambda data: True
-        self.told: Callable[[bytes], bool] = lambda data: True
+        self.lines = {"vehicle": PeerConnection(self, "vehicle"), "mocap": PeerConnection(self, "mocap")}
+        self.is_delivered: Callable[[bytes], bool] = lambda data: True
+        self.is_received: Callable[[bytes], bool] = lambda data: True
         self.sent: list[tuple[int, bytes]] = []
         self.steps: list[Step] = []
         self.statuses: list[dict[str, Any]] = []
         self.listener: socket.socket | None = None
-        self._asking: list[subprocess.Popen[str]] = []
+        self._status_processes: list[subprocess.Popen[str]] = []
         self.loop: ControlLoop | None = None
-        self.watch: HealthMonitor | None = None
-        self.notified: list[str] = []
+        self.health_monitor: HealthMonitor | None = None
+        self.notified_texts: list[str] = []
 
     # What a step may look at, and do
 
@@ -152,58 +152,58 @@ class Endings:
         return self.loop is not None and self.loop.handover_state is state
 
     @property
-    def flying(self) -> ControlLoop:
+    def active_loop(self) -> ControlLoop:
         assert self.loop is not None
         return self.loop
 
-    def stick(self, mode: str) -> None:
+    def switch_mode(self, mode: str) -> None:
         kind = SIMULATED[self.config.sim.autopilot]
         self.peers.autopilot.pilot.change_mode(kind.get_mode(mode), self.now_ns)
 
-    def at(self, state: HandoverState, do: Callable[[Endings], None], *, after_s: float = 0.0) -> Endings:
+    def add_step_in(self, state: HandoverState, do: Callable[[EndingRig], None], *, after_s: float = 0.0) -> EndingRig:
         """A step once the hand-over has been in a state for a while."""
         since: list[int] = []
 
-        def due(rig: Endings) -> bool:
+        def due(rig: EndingRig) -> bool:
             if rig.is_in(state) and not since:
                 since.append(rig.now_ns)
-            return bool(since) and rig.now_ns - since[0] >= after_s * SECOND
+            return bool(since) and rig.now_ns - since[0] >= after_s * SECOND_NS
 
         self.steps.append((due, do))
         return self
 
-    def after(self, seconds: float, do: Callable[[Endings], None]) -> Endings:
+    def add_step_after(self, seconds: float, do: Callable[[EndingRig], None]) -> EndingRig:
         """A step so long after the start."""
-        self.steps.append((lambda rig: rig.now_ns >= seconds * SECOND, do))
+        self.steps.append((lambda rig: rig.now_ns >= seconds * SECOND_NS, do))
         return self
 
-    def ask_status(self) -> None:
+    def request_status(self) -> None:
         """Ask the daemon as an operator does, in a process beside it; its answer comes with one of the next ticks."""
         assert self.listener is not None
         folder = Path(self.listener.getsockname()).parent
-        words = [sys.executable, "-m", "uavctl", "ctl", "status", "--json", "--control", str(folder)]
-        self._asking.append(subprocess.Popen(words, stdout=subprocess.PIPE, text=True))
+        arguments = [sys.executable, "-m", "uavctl", "ctl", "status", "--json", "--control", str(folder)]
+        self._status_processes.append(subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True))
         assert select.select([self.listener], [], [], LIMIT_S)[0], "nobody has asked"
 
     def _take_answers(self) -> None:
-        for process in list(self._asking):
+        for process in list(self._status_processes):
             with suppress(subprocess.TimeoutExpired):
                 out, _ = process.communicate(timeout=0.02)  # time stands still meanwhile, for it and the flight
-                self._asking.remove(process)
+                self._status_processes.remove(process)
                 assert process.returncode == 0
                 self.statuses.append(json.loads(out))
 
     # Time
 
     def wait(self, connections: Mapping[str, Connection], deadline_ns: int) -> list[str]:
-        assert self.now_ns < LONGEST_S * SECOND, "the flight does not end"
+        assert self.now_ns < MAX_FLIGHT_S * SECOND_NS, "the flight does not end"
         self.now_ns = max(self.now_ns, deadline_ns)
         self._take_answers()
         while self.steps and self.steps[0][0](self):
             self.steps.pop(0)[1](self)
         if self.now_ns > self.peers.now_ns:
             for at_ns, link, data in self.peers.advance(self.now_ns):
-                if link == "mocap" or self.told(data):
+                if link == "mocap" or self.is_received(data):
                     self.lines[link].arrived.append((data, at_ns))
         return [name for name, line in self.lines.items() if line.arrived]
 
@@ -213,80 +213,80 @@ class Endings:
         return fly(loop, *given, **more, wait_for=self.wait, now=lambda: self.now_ns)
 
 
-def interrupt(rig: Endings) -> None:
+def interrupt(rig: EndingRig) -> None:
     """Ctrl-C."""
     signal.raise_signal(signal.SIGINT)
 
 
-def words_of(page: Path) -> str:
+def read_page_text(page: Path) -> str:
     """The text of a page."""
     return " ".join(html.unescape(re.sub(r"<[^>]*>", " ", page.read_text())).split())
 
 
-class Told:
+class EndingReport:
     """How a flight ended, as every place tells it."""
 
-    def __init__(self, rig: Endings, code: int, out: str, err: str) -> None:
+    def __init__(self, rig: EndingRig, code: int, out: str, err: str) -> None:
         self.code = code
         self.summary: dict[str, Any] = json.loads(out) if out else {}
         self.console = " ".join(err.split())
         self.path = rig.folder / "flight.mcap"
         self.records = [record for _, _, record in read(self.path)]
-        self.recorded = [one for one in self.records if isinstance(one, Ending)]
+        self.recorded_endings = [record for record in self.records if isinstance(record, Ending)]
         page = self.path.with_suffix(".html")
-        self.page = words_of(page) if page.exists() else ""
-        health = None if rig.watch is None else rig.watch.make_health()
+        self.page = read_page_text(page) if page.exists() else ""
+        health = None if rig.health_monitor is None else rig.health_monitor.make_health()
         self.status = "" if health is None else health.ending
         self.relay = None if health is None else health.relay
-        self.notified = rig.notified
+        self.notified_texts = rig.notified_texts
 
     @property
     def ending(self) -> dict[str, Any]:
-        found: dict[str, Any] = self.summary["ending"]
-        return found
+        document: dict[str, Any] = self.summary["ending"]
+        return document
 
-    def agrees(self) -> None:
+    def assert_agreement(self) -> None:
         """All places have the one sentence, and the exit code goes with it."""
         sentence = self.ending["sentence"]
         assert f"ended: {sentence}" in self.console
         if self.ending["code"] != Cause.ENDED_IN_AIR:  # then nobody can ask any more when it is known
             assert self.status == sentence, (self.status, sentence)
-        assert self.notified[-1] == f"ended: {sentence}"
-        self._agrees_on_the_relay()
+        assert self.notified_texts[-1] == f"ended: {sentence}"
+        self._assert_relay_agreement()
         assert sentence in self.page
         assert self.ending["exit_code"] == self.code == (0 if self.ending["as_ordered"] else 1)
         assert self.ending["cause"] == self.summary["ended"]
-        assert [one.sentence for one in self.recorded] == [sentence]
+        assert [ending.sentence for ending in self.recorded_endings] == [sentence]
         again = summarise(FlightData.from_records(read(self.path)), wall_s=None)
         assert (again.ending.sentence, again.ending.exit_code) == (sentence, self.code)
 
-    def _agrees_on_the_relay(self) -> None:
+    def _assert_relay_agreement(self) -> None:
         """The positions for the vehicle are counted alike in status, summary, recording and on the page."""
-        (recorded,) = self.recorded
+        (recorded,) = self.recorded_endings
         assert recorded.relay == self.ending["relay"]
         assert (self.relay is not None) == bool(recorded.relay)
         if self.relay is None:
             return
         count, kept = self.relay.sent, sum(self.relay.kept.values())
-        assert [int(one) for one in re.findall(r"\d+(?= positions| back)", recorded.relay)] == [count, kept]
+        assert [int(number) for number in re.findall(r"\d+(?= positions| back)", recorded.relay)] == [count, kept]
         assert self.relay.last_s is not None and self.relay.last_s < 5.0
-        stats = [one for one in self.records if isinstance(one, RelayStats)]
+        stats = [record for record in self.records if isinstance(record, RelayStats)]
         assert stats and stats[-1].sent <= count and stats[-1].alone == self.relay.alone
         assert f"relay: {recorded.relay}" in self.console and recorded.relay in self.page
 
 
 @contextmanager
-def in_virtual_time(rig: Endings) -> Iterator[None]:
+def use_virtual_time(rig: EndingRig) -> Iterator[None]:
     """The command's clock, connections and threads in our hands."""
 
     @contextmanager
-    def open_links(*given: object) -> Iterator[dict[str, Line]]:
+    def open_links(*given: object) -> Iterator[dict[str, PeerConnection]]:
         yield rig.lines
 
     class Watched(HealthMonitor):
         def __init__(self, *given: Any) -> None:
             super().__init__(*given)
-            rig.watch = self
+            rig.health_monitor = self
 
     @contextmanager
     def open_listener(*given: Any) -> Iterator[socket.socket]:
@@ -301,28 +301,28 @@ def in_virtual_time(rig: Endings) -> Iterator[None]:
         patch.setattr(fly_cmd, "open_listener", open_listener)
         patch.setattr(fly_cmd, "run_daemon", rig.fly)
         patch.setattr(fly_cmd, "Ticker", lambda tick_ns, dt_ns: Ticker(tick_ns, dt_ns, lambda: rig.now_ns))
-        patch.setattr(fly_cmd, "Recorder", Sync)
+        patch.setattr(fly_cmd, "Recorder", DiskRecorder)
         patch.setattr("uavctl.cli.check.check_before_arming", lambda *_: ())
         patch.setattr("uavctl.cli.services.HealthMonitor", Watched)
-        patch.setattr(Notifier, "send_status", lambda _, text: rig.notified.append(text))
+        patch.setattr(Notifier, "send_status", lambda _, text: rig.notified_texts.append(text))
         patch.setattr(report, "_make_sections", lambda *given: [report._make_summary_section(*given)])  # no drawings
-        patch.setattr(Sync, "full", False)
+        patch.setattr(DiskRecorder, "full", False)
         yield
 
 
-def flown(rig: Endings, capsys: pytest.CaptureFixture[str], *words: str) -> Told:
+def fly_command(rig: EndingRig, capsys: pytest.CaptureFixture[str], *arguments: str) -> EndingReport:
     """Type `uavctl fly` and look at what has become of it."""
-    with socket.socket(type=socket.SOCK_DGRAM) as one:
-        one.bind(("127.0.0.1", 0))
-        url = f"udpin://127.0.0.1:{one.getsockname()[1]}"
+    with socket.socket(type=socket.SOCK_DGRAM) as sock:
+        sock.bind(("127.0.0.1", 0))
+        url = f"udpin://127.0.0.1:{sock.getsockname()[1]}"
     for path in find_lock_paths(url):  # what a daemon of another test has left on this port
         path.unlink(missing_ok=True)
-    sets = [word for setting in rig.overrides for word in ("--set", setting)]
+    sets = [argument for setting in rig.overrides for argument in ("--set", setting)]
     places = ["--vehicle", url, "--out", str(rig.folder), "--json"]
     try:
         # A folder with a short name: a socket's path has 107 bytes.
-        with in_virtual_time(rig), tempfile.TemporaryDirectory(prefix="uavctl-") as control:
-            code = run(["fly", *PRESET, *sets, *places, "--control", control, *words])
+        with use_virtual_time(rig), tempfile.TemporaryDirectory(prefix="uavctl-") as control:
+            code = run(["fly", *PRESET, *sets, *places, "--control", control, *arguments])
     except SystemExit as ended:
         code = int(ended.code or 0)
     finally:
@@ -330,9 +330,9 @@ def flown(rig: Endings, capsys: pytest.CaptureFixture[str], *words: str) -> Told
             path.unlink(missing_ok=True)
     out, err = capsys.readouterr()
     assert (rig.folder / "flight.mcap").exists(), err
-    return Told(rig, code, out, err)
+    return EndingReport(rig, code, out, err)
 
 
-def is_a(kind: str) -> Callable[[bytes], bool]:
+def is_message(kind: str) -> Callable[[bytes], bool]:
     """Whether a datagram is of a kind of message."""
     return lambda data: any(message.get_type() == kind for message in decode(data))

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from flight_rig import MS, START_NS, sample
 from msgspec import structs
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.flight.limits import ZERO
 from uavctl.flight.monitors import engaged
 from uavctl.flight.monitors.braking import BrakingState
@@ -29,9 +29,6 @@ from uavctl.flight.monitors.verdict import Action, Cause, Verdict
 from uavctl.flight.supervise import RELEASES
 from uavctl.records import PositionSample, Vec3, VehicleMotion
 
-Array = NDArray[np.float64]
-
-S = 1_000_000_000
 TICK_NS = 50 * MS
 NAN3: Vec3 = (math.nan, math.nan, math.nan)
 PARAMETERS = EnvelopeParameters(
@@ -128,9 +125,17 @@ def motion(velocity_mps: Vec3, at_ns: int) -> VehicleMotion:
     return VehicleMotion(velocity_mps=velocity_mps, velocity_ns=at_ns)
 
 
-def seen(at_ns: int, *samples: PositionSample, sent: Vec3 = ZERO, own: VehicleMotion | None = None) -> Observation:
+def seen(
+    at_ns: int, *samples: PositionSample, sent: Vec3 = ZERO, vehicle_motion: VehicleMotion | None = None
+) -> Observation:
     return Observation(
-        at_ns=at_ns, samples=samples, sent_mps2=sent, position_m=None, velocity_mps=NAN3, motion=own, braking=False
+        at_ns=at_ns,
+        samples=samples,
+        sent_mps2=sent,
+        position_m=None,
+        velocity_mps=NAN3,
+        motion=vehicle_motion,
+        braking=False,
     )
 
 
@@ -143,7 +148,7 @@ def look(
     velocity: Vec3 = ZERO,
     *,
     off_m: float = 0.0,
-    own: VehicleMotion | None = None,
+    vehicle_motion: VehicleMotion | None = None,
     accel: Vec3 = ZERO,
     parameters: EnvelopeParameters = PARAMETERS,
     **known: Any,
@@ -156,7 +161,11 @@ def look(
     )
     watching = changed(monitors(observer=observer, tick_ns=START_NS, sent=((START_NS, accel),)), **known)
     position = s * begun + 0.5 * s * s * (np.array(accel) + d) + np.array([off_m, 0.0, 0.0])
-    return update(watching, seen(AT_NS, sample(AT_NS, AT_NS, vec3(position)), sent=accel, own=own), parameters)
+    return update(
+        watching,
+        seen(AT_NS, sample(AT_NS, AT_NS, vec3(position)), sent=accel, vehicle_motion=vehicle_motion),
+        parameters,
+    )
 
 
 def just_more(value: float) -> float:

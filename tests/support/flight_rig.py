@@ -8,9 +8,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag, expm
 
+from uavctl.arrays import Array
 from uavctl.flight.controller import Controller
 from uavctl.flight.fallback import FallbackParameters
 from uavctl.flight.kalman import EstimatorParameters
@@ -25,7 +25,6 @@ from uavctl.records import Command, ControlMode, PositionSample, SolveStatus, St
 from uavctl.smpc.answer import NOMINAL, Answer, Preview
 from uavctl.smpc.plant import Plant
 
-Array = NDArray[np.float64]
 Fault = Callable[[Answer], Answer]
 
 MS = 1_000_000
@@ -48,11 +47,11 @@ def drag_lag_generator(drag: float, lag: float) -> Array:
 def small_plant(axes: tuple[str, ...] = ("north",), wind_std: float = 0.15, dt_s: float = DT_NS * 1e-9) -> Plant:
     """Drag-lag axes from the matrix exponential, independent of the project's own plants."""
     n = len(axes)
-    one = expm(drag_lag_generator(0.3, 0.25) * dt_s)
+    axis_matrix = expm(drag_lag_generator(0.3, 0.25) * dt_s)
     return Plant(
-        a=block_diag(*[one[:3, :3]] * n),
-        b=block_diag(*[one[:3, 4:5]] * n),
-        e=block_diag(*[one[:3, 3:4]] * n),
+        a=block_diag(*[axis_matrix[:3, :3]] * n),
+        b=block_diag(*[axis_matrix[:3, 4:5]] * n),
+        e=block_diag(*[axis_matrix[:3, 3:4]] * n),
         w=np.eye(n) * wind_std**2,
         dt_s=dt_s,
         axes=axes,
@@ -74,7 +73,7 @@ def estimator_parameters(**changes: Any) -> EstimatorParameters:
     return replace(base, **changes)
 
 
-def answer_of(plant: Plant, seq: int, x: Array, inputs: Array, status: SolveStatus = SolveStatus.OPTIMAL) -> Answer:
+def make_answer(plant: Plant, seq: int, x: Array, inputs: Array, status: SolveStatus = SolveStatus.OPTIMAL) -> Answer:
     states = [x]
     for u in inputs:
         states.append(plant.a @ states[-1] + plant.b @ u)
@@ -108,7 +107,7 @@ class StubSolver:
 
     def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:
         self.asked.append((seq, x))
-        answer = answer_of(self.plant, seq, x, stub_inputs(seq, self.horizon, self.plant.n_u))
+        answer = make_answer(self.plant, seq, x, stub_inputs(seq, self.horizon, self.plant.n_u))
         fault = self.faults.get(seq)
         return answer if fault is None else fault(answer)
 
@@ -137,7 +136,7 @@ def make_controller(
         horizon=horizon,
         solver=solver or StubSolver(plant, horizon),
         mission=make_hold_mission(
-            np.zeros(plant.n_x), plant.position_index, np.zeros(0), horizon=horizon, dt_ns=DT_NS, room=room_of(plant)
+            np.zeros(plant.n_x), plant.position_index, np.zeros(0), horizon=horizon, dt_ns=DT_NS, room=make_room(plant)
         ),
         names=names_of((), plant.n_x, plant.axes, plant.position_index, plant.velocity_index),
         estimator=estimator_parameters(**changes),
@@ -150,7 +149,7 @@ def make_controller(
     )
 
 
-def room_of(plant: Plant, half_m: float = 5.0) -> Room:
+def make_room(plant: Plant, half_m: float = 5.0) -> Room:
     """Places up to `half_m` from the middle; from a speed v it comes to rest v / 2 further."""
     n = len(plant.axes)
     rest, stop = np.zeros((n, plant.n_x)), np.zeros((n, plant.n_x))
@@ -188,14 +187,14 @@ def boundary_ns(number: int) -> int:
     return START_NS + number * DT_NS
 
 
-def one_a_step(lost: Iterable[int] = (), steps: int = 1000, delay_ns: int = 20 * MS) -> list[PositionSample]:
+def make_step_samples(lost: Iterable[int] = (), steps: int = 1000, delay_ns: int = 20 * MS) -> list[PositionSample]:
     """A sample 50 ms before each boundary (arriving before it), but for those of the lost steps."""
     missing = set(lost)
     kept = [number for number in range(steps) if number not in missing]
     return [sample(boundary_ns(number) - 50 * MS, boundary_ns(number) - 50 * MS + delay_ns) for number in kept]
 
 
-def moving(step: int, speed_mps: float = 1.0) -> list[PositionSample]:
+def make_motion_samples(step: int, speed_mps: float = 1.0) -> list[PositionSample]:
     """One sample at each boundary up to `step` that shows a steady motion, then none."""
     return [
         sample(boundary_ns(n), position_m=(speed_mps * 0.2 * n, 0, 0), velocity_mps=(speed_mps, 0, 0))
@@ -203,7 +202,7 @@ def moving(step: int, speed_mps: float = 1.0) -> list[PositionSample]:
     ]
 
 
-def inputs_of(
+def make_inputs(
     ticks: Iterable[int],
     samples: Iterable[PositionSample],
     *,
@@ -212,7 +211,7 @@ def inputs_of(
     status: Callable[[int], VehicleStatus | None] = lambda tick: vehicle(),
 ) -> list[StepInput]:
     """Tick inputs: every sample in the first tick after its arrival; left-out ticks count as missed."""
-    waiting = sorted(samples, key=lambda one: one.received_ns)
+    waiting = sorted(samples, key=lambda received: received.received_ns)
     result: list[StepInput] = []
     place, before = 0, None
     for tick in ticks:
@@ -244,20 +243,20 @@ def run(controller: Controller, inputs: Iterable[StepInput], state: ControlState
     return outputs
 
 
-def boundaries(outputs: list[TickOutput]) -> list[TickOutput]:
+def find_boundaries(outputs: list[TickOutput]) -> list[TickOutput]:
     return [output for output in outputs if output.decision.boundary]
 
 
-def modes(outputs: list[TickOutput]) -> list[ControlMode]:
+def list_modes(outputs: list[TickOutput]) -> list[ControlMode]:
     return [output.decision.mode for output in outputs]
 
 
-def flown(outputs: list[TickOutput]) -> list[tuple[int | None, int | None]]:
+def list_plan_steps(outputs: list[TickOutput]) -> list[tuple[int | None, int | None]]:
     """(plan, index) at each boundary."""
-    return [(output.decision.plan_seq, output.decision.plan_index) for output in boundaries(outputs)]
+    return [(output.decision.plan_seq, output.decision.plan_index) for output in find_boundaries(outputs)]
 
 
-def codes(output: TickOutput) -> dict[str, int]:
+def list_codes(output: TickOutput) -> dict[str, int]:
     return {event.code: event.count for event in output.events}
 
 

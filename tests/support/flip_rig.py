@@ -10,7 +10,7 @@ from unittest import mock
 import msgspec
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
-from recording_fakes import HEADER, Clock, Item, flight, own
+from recording_fakes import HEADER, Clock, Item, drop_recorder_notes, flight
 
 from logs.recording.info import RecordingInfo, read_info
 from logs.recording.reader import RecordedMessage, header, read, scan
@@ -23,7 +23,7 @@ from uavctl.errors import RecordingError
 DATA_END = b"\x0f\x04\0\0\0\0\0\0\0"
 
 
-class Flips:
+class FlipTest:
     """A small recording whose bytes are flipped one by one; each method raises AssertionError where a reader errs.
 
     Args:
@@ -51,7 +51,7 @@ class Flips:
         offsets = [item.offset for item in scan(self._path) if isinstance(item, RecordedMessage)]
         self._most = max(Counter(offsets).values())  # messages in one chunk
         self._info = read_info(self._path)
-        assert own(list(read(self._path))) == self._items and len(set(offsets)) > 3
+        assert drop_recorder_notes(list(read(self._path))) == self._items and len(set(offsets)) > 3
 
     def flip(self, position: int, mask: int) -> None:
         """Write the recording with one byte changed."""
@@ -69,7 +69,7 @@ class Flips:
         except RecordingError as error:
             assert str(self._path) in str(error)
             refused = True
-        got = own(got)
+        got = drop_recorder_notes(got)
         assert got == self._items[: len(got)]
         if self._finished:
             assert refused
@@ -81,24 +81,24 @@ class Flips:
         """Header and info: the truth, or nothing, and damage is told."""
         with contextlib.suppress(RecordingError):
             assert header(self._path) == HEADER
-        found = read_info(self._path)
-        assert found.origin in (self._info.origin, None)
-        assert found.start_ns >= self._info.start_ns and found.end_ns <= self._info.end_ns
+        result = read_info(self._path)
+        assert result.origin in (self._info.origin, None)
+        assert result.start_ns >= self._info.start_ns and result.end_ns <= self._info.end_ns
         if self._finished:
-            assert found.damage
-        lost = set(self._info.attachments) - set(found.attachments)
-        assert set(found.attachments) <= set(self._info.attachments) and (found.damage or not lost)
-        if found.messages == self._info.messages:
-            assert _without_state(found) == _without_state(self._info)
+            assert result.damage
+        lost = set(self._info.attachments) - set(result.attachments)
+        assert set(result.attachments) <= set(self._info.attachments) and (result.damage or not lost)
+        if result.messages == self._info.messages:
+            assert _without_state(result) == _without_state(self._info)
         else:
-            assert found.damage and self._info.messages - found.messages <= self._most
+            assert result.damage and self._info.messages - result.messages <= self._most
 
     def recover(self) -> None:
         """Recover: all but one chunk, losses told, and a file that is right in every part."""
         self._out.unlink(missing_ok=True)
         result = recover(self._path, self._out)
         entries = list(read(self._out))
-        kept = own(entries)
+        kept = drop_recorder_notes(entries)
         assert kept == [item for item in self._items if item in kept]
         assert len(self._items) - len(kept) <= self._most
         assert len(kept) == len(self._items) or not result.lossless
@@ -106,15 +106,17 @@ class Flips:
         _check_parts(self._out, entries)
 
 
-def _without_state(found: RecordingInfo) -> RecordingInfo:
-    segments = tuple(msgspec.structs.replace(one, finished=False) for one in found.segments)
-    return msgspec.structs.replace(found, finished=False, damage=(), segments=segments, attachments=())
+def _without_state(result: RecordingInfo) -> RecordingInfo:
+    segments = tuple(msgspec.structs.replace(segment, finished=False) for segment in result.segments)
+    return msgspec.structs.replace(result, finished=False, damage=(), segments=segments, attachments=())
 
 
 def _check_parts(path: Path, entries: list[Item]) -> None:
     """Statistics, channels, schemas and index of a file, by the format's own readers, are those of its messages."""
     with path.open("rb") as file:
-        linear = [one for one in StreamReader(file, validate_crcs=True).records if type(one).__name__ == "Message"]
+        linear = [
+            record for record in StreamReader(file, validate_crcs=True).records if type(record).__name__ == "Message"
+        ]
         file.seek(0)
         reader = make_reader(file, validate_crcs=True)
         summary = reader.get_summary()
@@ -127,7 +129,7 @@ def _check_parts(path: Path, entries: list[Item]) -> None:
     assert (statistics.chunk_count, statistics.channel_count) == (len(summary.chunk_indexes), len(summary.channels))
     topics = Counter(topic for topic, _, _ in entries)
     assert {summary.channels[key].topic: n for key, n in statistics.channel_message_counts.items()} == topics
-    assert [(channel.topic, one.log_time) for _, channel, one in indexed] == [entry[:2] for entry in entries]
+    assert [(channel.topic, message.log_time) for _, channel, message in indexed] == [entry[:2] for entry in entries]
     for schema, channel, _ in indexed:
         wanted = get_definition(channel.topic)
         assert channel.message_encoding == wanted.encoding

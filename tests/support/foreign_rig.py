@@ -63,5 +63,5 @@ def flown(packets: tuple[TlogPacket, ...]) -> ForeignReplay:
 
 
 @cache
-def by_tlog(name: str) -> ForeignReplay:
+def replay_as_tlog(name: str) -> ForeignReplay:
     return flown(read_tlog(DATA / name).packets)

@@ -64,7 +64,7 @@ def main(port: int, target_m: list[float]) -> None:
     parser = mavlink.MAVLink(None)
     parser.robust_parsing = True
     next_pose = next_heartbeat = time.monotonic()
-    vehicle, told = Vehicle(next_pose), False
+    vehicle, is_reported = Vehicle(next_pose), False
     while True:
         now = time.monotonic()
         vehicle.move(now)
@@ -86,8 +86,8 @@ def main(port: int, target_m: list[float]) -> None:
         select.select([sock], [], [], WAIT_S)
         for message in drain(sock, parser):
             vehicle.fly(message)
-        if not told and vehicle.is_over(target_m):
-            told = True
+        if not is_reported and vehicle.is_over(target_m):
+            is_reported = True
             sys.stdout.write(json.dumps(seen(vehicle)) + "\n")
             sys.stdout.flush()
 
@@ -114,14 +114,14 @@ def send(sock: socket.socket, out: mavlink.MAVLink, message: mavlink.MAVLink_mes
 def drain(sock: socket.socket, parser: mavlink.MAVLink) -> list[mavlink.MAVLink_message]:
     """Acceleration setpoints that have arrived."""
     sock.setblocking(False)
-    found = []
+    results = []
     try:
         while True:
             for message in parser.parse_buffer(sock.recv(2048)) or []:
                 if message.get_type() == "SET_POSITION_TARGET_LOCAL_NED":
-                    found.append(message)
+                    results.append(message)
     except (BlockingIOError, ConnectionRefusedError):
-        return found
+        return results
 
 
 if __name__ == "__main__":

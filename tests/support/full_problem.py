@@ -6,12 +6,10 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.horizon import Component, Horizon, decompose, horizon_of
-
-Array = NDArray[np.float64]
 
 
 @cache
@@ -66,8 +64,8 @@ class Margins:
     def worst(self) -> Array:
         """Least margin of each plan (n,), but for the soft state rows."""
         parts = (self.inputs, self.place, self.hold, self.lmi(), self.rest)
-        least: Array = np.array([part.reshape(len(part), -1).min(axis=1) for part in parts]).min(axis=0)
-        return least
+        min_margins: Array = np.array([part.reshape(len(part), -1).min(axis=1) for part in parts]).min(axis=0)
+        return min_margins
 
 
 def margins(
@@ -130,6 +128,6 @@ def backoff_table(design: Design, part: Component, i: int, thetas: Array) -> Arr
     every = [np.zeros((n, horizon.n_theta)) for _, horizon in horizons(design)]
     every[i] = thetas
     still = np.zeros((n, design.plant.n_x))
-    found = margins(design, gains(design, every), still, np.zeros((n, design.horizon, design.plant.n_u)), still)
-    parts = (found.backoff_x[:, :, part.rows_x], found.backoff_u[:, :, part.rows_u])
+    result = margins(design, gains(design, every), still, np.zeros((n, design.horizon, design.plant.n_u)), still)
+    parts = (result.backoff_x[:, :, part.rows_x], result.backoff_u[:, :, part.rows_u])
     return np.concatenate([backoffs.reshape(n, -1) for backoffs in parts], axis=1)

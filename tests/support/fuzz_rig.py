@@ -14,7 +14,7 @@ from collections import Counter
 from typing import Any, Literal
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from sim_rig import Bench, bench, decode
+from sim_rig import SimRig, decode, make_rig
 
 from sim.autopilot.parameters import TABLES
 
@@ -50,10 +50,10 @@ PER_SESSION = 500
 
 def letters(form: str) -> list[str]:
     """One format letter for every value of a struct format; strings keep their length."""
-    found: list[str] = []
+    result: list[str] = []
     for count, letter in re.findall(r"(\d*)([a-zA-Z])", form):
-        found += [count + letter] if letter == "s" else [letter] * int(count or 1)
-    return found
+        result += [count + letter] if letter == "s" else [letter] * int(count or 1)
+    return result
 
 
 class Mutants:
@@ -97,7 +97,7 @@ class Mutants:
             "type_mask": (3135, 2111, 0xDF8, 0xDC7, 3135 | 0x40, 3135 | 0x200, 0xFFFF),
             "param_index": (-1, 0, 5, 4000),
             "param_type": (9, 9, 6, 2, 4),
-            "param_id": tuple(one.encode() for one in self._names),
+            "param_id": tuple(parameter_name.encode() for parameter_name in self._names),
             "start_stop": (0, 1),
             "req_stream_id": (0, 6, 10),
             "frame_id": (20, 1),
@@ -140,9 +140,9 @@ class Mutants:
         return b"\xfd" + header + payload + crc.to_bytes(2, "little")
 
 
-def snapshot(one: Bench) -> dict[str, Any]:
+def snapshot(rig: SimRig) -> dict[str, Any]:
     """All that a message could change and a client could notice."""
-    autopilot, vehicle = one.peers.autopilot, one.peers.vehicle
+    autopilot, vehicle = rig.peers.autopilot, rig.peers.vehicle
     pilot = autopilot.pilot
     return {
         "mode": pilot.mode.name,
@@ -181,7 +181,7 @@ class Judge:
         self._name = autopilot
         self._mutants = Mutants(seed, autopilot)
         self._sent = 0
-        self._one = bench(autopilot, airborne=True)
+        self._one = make_rig(autopilot, airborne=True)
         self._known: dict[str, Any] | None = None  # the last snapshot, while nothing else has happened
         self.results: Counter[int] = Counter()
         self.changed: Counter[tuple[str, str]] = Counter()
@@ -192,7 +192,7 @@ class Judge:
             if self._sent % PER_SESSION == 0:
                 session = self._sent // PER_SESSION
                 plant = "sim.plant=quadrotor" if session % 3 else "sim.plant=linear"
-                self._one = bench(self._name, plant, airborne=session % 2 == 0)
+                self._one = make_rig(self._name, plant, airborne=session % 2 == 0)
                 self._known = None
             self._sent += 1
             if self._sent % 20 == 0:
@@ -206,7 +206,7 @@ class Judge:
         (msg,) = decode(data)
         before = self._known or snapshot(self._one)
         peers = self._one.peers  # time stands still: what follows is of this message alone
-        answers = [one for out in peers.autopilot.receive(data, peers.now_ns) for one in decode(out)]
+        answers = [message for out in peers.autopilot.receive(data, peers.now_ns) for message in decode(out)]
         after = self._known = snapshot(self._one)
         kind = msg.get_type()
         changed = {part for part in before if before[part] != after[part]}
@@ -216,7 +216,7 @@ class Judge:
             assert answers == [] and not changed, (str(msg), changed)
             return
         if kind in ANSWERED and before["crashed"] is None:
-            acks = [one.result for one in answers if one.get_type() == "COMMAND_ACK"]
+            acks = [answer.result for answer in answers if answer.get_type() == "COMMAND_ACK"]
             assert len(acks) == 1, (str(msg), answers)
             self.results[acks[0]] += 1
             allowed = allowed if acks == [0] else set()

@@ -24,7 +24,7 @@ TAKE_OFF, ENGAGE, LAND, STAND_BY = (
 NOTHING, NEUTRAL, FLY = SetpointMode.NOTHING, SetpointMode.NEUTRAL, SetpointMode.SETPOINTS
 
 
-class Rig:
+class HandoverRig:
     """A hand-over and a vehicle whose words are put into its mouth; it says every tick who it is, unless it is mute."""
 
     def __init__(self, autopilot: str = "px4", config: HandOverConfig | None = None) -> None:
@@ -42,7 +42,7 @@ class Rig:
     def state(self) -> HandoverState:
         return self.hand_over.state
 
-    def be(self, **fields: object) -> None:
+    def report_status(self, **fields: object) -> None:
         """Change what the vehicle says of itself."""
         assert self.vehicle is not None
         mode = fields.get("mode", self.vehicle.mode)
@@ -52,21 +52,23 @@ class Rig:
     def is_in(self, *states: HandoverState) -> bool:
         return self.state in states
 
-    def asked_last(self, ask: RequestKind) -> bool:
+    def last_request(self, ask: RequestKind) -> bool:
         return self.asked[-1][1] is ask
 
     def tick(
-        self, *heard: CommandAck | StatusText, commands: tuple[Command, ...] = (), **fields: object
+        self, *received: CommandAck | StatusText, commands: tuple[Command, ...] = (), **fields: object
     ) -> HandoverOutput:
         at_ns = self.view.at_ns + TICK_NS
         if self.vehicle is not None and not self.mute:
             self.vehicle = replace(self.vehicle, at_ns=at_ns)
-        self.view = replace(self.view, at_ns=at_ns, vehicle=self.vehicle, messages=heard, commands=commands, **fields)
-        told = self.hand_over.update(self.view)
-        if told.request is not None:
-            self.asked.append((at_ns, told.request))
-        self.events += told.events
-        return told
+        self.view = replace(
+            self.view, at_ns=at_ns, vehicle=self.vehicle, messages=received, commands=commands, **fields
+        )
+        requests = self.hand_over.update(self.view)
+        if requests.request is not None:
+            self.asked.append((at_ns, requests.request))
+        self.events += requests.events
+        return requests
 
     def run(self, seconds: float, *, until: HandoverState | None = None) -> None:
         for _ in range(round(seconds * SECOND) // TICK_NS):
@@ -77,10 +79,10 @@ class Rig:
 
     def answer(self, result: int, ask: RequestKind | None = None, text: str = "") -> HandoverOutput:
         """The vehicle answers the last request, or this one."""
-        words = (StatusText(system=1, component=1, severity=2, text=text),) if text else ()
-        return self.tick(ack(result, ask or self.asked[-1][1]), *words)
+        arguments = (StatusText(system=1, component=1, severity=2, text=text),) if text else ()
+        return self.tick(ack(result, ask or self.asked[-1][1]), *arguments)
 
-    def to(self, state: HandoverState) -> Rig:
+    def advance_to(self, state: HandoverState) -> HandoverRig:
         """Go on the usual way as far as a state, with a vehicle that does what it is asked for."""
         px4 = self.vehicle is not None and self.vehicle.autopilot == "px4"
         if state is HandoverState.WAITING:
@@ -99,17 +101,17 @@ class Rig:
             )
             and not self.view.commands
         ):
-            self.be(armed=True, landed=False, mode="OFFBOARD" if px4 else "GUIDED")
+            self.report_status(armed=True, landed=False, mode="OFFBOARD" if px4 else "GUIDED")
             self.tick()
             return self._beyond(state)
         self.tick(commands=(TAKE_OFF,))
         if state is HandoverState.MODE:
             return self
-        self.be(mode="AUTO.TAKEOFF" if px4 else "GUIDED")
+        self.report_status(mode="AUTO.TAKEOFF" if px4 else "GUIDED")
         self.tick()
         if state is HandoverState.ARMING:
             return self
-        self.be(armed=True)
+        self.report_status(armed=True)
         self.tick()
         if state is HandoverState.CLIMBING:
             return self
@@ -117,7 +119,7 @@ class Rig:
             self.fail()
             return self
         if state is HandoverState.UNCLEAR:
-            self.be(mode="AUTO.RTL" if px4 else "RTL")
+            self.report_status(mode="AUTO.RTL" if px4 else "RTL")
             self.tick()
             return self
         self.tick(estimated_height_m=1.9)
@@ -126,12 +128,12 @@ class Rig:
     def fail(self, mode: str = "") -> HandoverOutput:
         """A failsafe of the vehicle's own lands it, or chooses this mode."""
         px4 = self.vehicle is not None and self.vehicle.autopilot == "px4"
-        self.be(mode=mode or ("AUTO.LAND" if px4 else "LAND"), failsafe=True)
+        self.report_status(mode=mode or ("AUTO.LAND" if px4 else "LAND"), failsafe=True)
         return self.tick()
 
-    def _beyond(self, state: HandoverState) -> Rig:
+    def _beyond(self, state: HandoverState) -> HandoverRig:
         if state in (HandoverState.RELEASED, HandoverState.RETURNING):
-            self.be(mode="POSCTL")
+            self.report_status(mode="POSCTL")
             self.tick()
         if state is HandoverState.RETURNING:
             self.tick(commands=(ENGAGE,))
@@ -139,7 +141,7 @@ class Rig:
             self.tick(is_landing_requested=True)
             self.view = replace(self.view, is_landing_requested=False)
         if state is HandoverState.SETTLING:
-            self.be(mode="AUTO.LAND")
+            self.report_status(mode="AUTO.LAND")
             self.tick()
         return self
 

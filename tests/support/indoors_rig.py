@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
-from loopback_rig import Memory, shared_loop
+from loopback_rig import MemorySink, shared_loop
 from mavlink_rig import MS, read
 
 from sim.autopilot.profile import SIMULATED
@@ -20,13 +20,13 @@ from uavctl.records import Datagram, Outgoing, Received
 Delay = Callable[[float, bytes, bool], float | None]
 
 
-def at_once(at_s: float, data: bytes, up: bool) -> float | None:
+def deliver_now(at_s: float, data: bytes, up: bool) -> float | None:
     """Take no time on the way, and lose nothing."""
     del at_s, data, up
     return 0.0
 
 
-class Indoors:
+class IndoorsRig:
     """The whole loop, and a vehicle on the floor that knows its position only through us.
 
     Args:
@@ -35,7 +35,7 @@ class Indoors:
         delay: of time, datagram, and whether it goes up to the vehicle: what it takes on the way [s]; None: it is lost.
     """
 
-    def __init__(self, name: str, *more: str, delay: Delay = at_once) -> None:
+    def __init__(self, name: str, *more: str, delay: Delay = deliver_now) -> None:
         self.config = load_config(
             "room-hahn-stursberg",
             [
@@ -50,7 +50,7 @@ class Indoors:
                 *more,
             ],
         )
-        self.memory = Memory()
+        self.memory = MemorySink()
         self.loop = shared_loop(self.config, self.memory)
         self.peers = Peers(self.config, 0, airborne=False)
         for parameter, value in EXTERNAL_ONLY[name].items():

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from sim_rig import INTERVAL, Bench
+from sim_rig import INTERVAL, SimRig
 
-Array = NDArray[np.float64]
+from uavctl.arrays import Array
 
 G = 9.80665
 BOOT_S = 20.0  # age of the autopilot at the start
@@ -22,7 +21,7 @@ NAMES = {HIGHRES: "HIGHRES_IMU", RAW: "RAW_IMU", SECOND: "SCALED_IMU2"}
 QUADROTOR = "sim.plant=quadrotor"
 
 
-def turning(q: Array) -> Array:
+def make_rotations(q: Array) -> Array:
     """Matrices (n, 3, 3) that turn body axes into NED, of quaternions (n, 4)."""
     w, x, y, z = q.T
     rows = [
@@ -34,7 +33,7 @@ def turning(q: Array) -> Array:
     return np.moveaxis(matrices, 2, 0)
 
 
-def si(msg: Any) -> tuple[float, ...]:
+def convert_to_si(msg: Any) -> tuple[float, ...]:
     """Specific force [m/s²] and body rates [rad/s] of an inertial message of either autopilot."""
     force, rates = (msg.xacc, msg.yacc, msg.zacc), (msg.xgyro, msg.ygyro, msg.zgyro)
     if msg.get_type() == "HIGHRES_IMU":
@@ -57,8 +56,8 @@ class InertialRecord:
     @property
     def acceleration(self) -> Array:
         """Acceleration in NED by what was told."""
-        told: Array = np.einsum("nij,nj->ni", turning(self.attitude), self.force) + np.array([0.0, 0.0, G])
-        return told
+        accel_mps2: Array = np.einsum("nij,nj->ni", make_rotations(self.attitude), self.force) + np.array([0.0, 0.0, G])
+        return accel_mps2
 
     @property
     def true_acceleration(self) -> Array:
@@ -67,13 +66,13 @@ class InertialRecord:
         return change / (2.0 * PERIOD_S)
 
     @property
-    def turned_by(self) -> Array:
+    def attitude_error(self) -> Array:
         """Rotation vector from the true attitude to that told, about body axes [rad]."""
-        wrong = np.einsum("nji,njk->nik", turning(self.true_attitude), turning(self.attitude))
+        wrong = np.einsum("nji,njk->nik", make_rotations(self.true_attitude), make_rotations(self.attitude))
         pairs = ((2, 1), (0, 2), (1, 0))
         return 0.5 * np.stack([wrong[:, i, j] - wrong[:, j, i] for i, j in pairs], axis=1)
 
-    def reckoned(self, seconds: float) -> Array:
+    def dead_reckoning_error_m(self, seconds: float) -> Array:
         """Horizontal distances by which dead reckoning from the true state ends off, begun every half second."""
         n, every, h = round(seconds / PERIOD_S), round(0.5 / PERIOD_S), PERIOD_S
         off = []
@@ -86,34 +85,34 @@ class InertialRecord:
         return np.array(off)
 
 
-def ask(one: Bench, *kinds: int, period_s: float = PERIOD_S) -> None:
+def request_streams(rig: SimRig, *kinds: int, period_s: float = PERIOD_S) -> None:
     """Ask for streams."""
     for kind in kinds:
-        assert one.ask(INTERVAL, kind, round(1e6 * period_s)) == 0
+        assert rig.ask(INTERVAL, kind, round(1e6 * period_s)) == 0
 
 
-def wave(t: float) -> tuple[float, float, float]:
+def make_velocity_wave(t: float) -> tuple[float, float, float]:
     """A velocity that never settles [m/s]."""
     return math.sin(0.9 * t), 0.8 * math.cos(0.6 * t), 0.2 * math.sin(0.4 * t)
 
 
-def recorded(
-    one: Bench, name: str, seconds: float, velocity: Callable[[float], tuple[float, ...]] = wave
+def record_flight(
+    rig: SimRig, name: str, seconds: float, velocity: Callable[[float], tuple[float, ...]] = make_velocity_wave
 ) -> InertialRecord:
     """Fly velocities and keep what is told every 20 ms of the first unit and of the attitude."""
-    ask(one, FIRST[name], QUATERNION)
-    truth, first = [], len(one.seen)
+    request_streams(rig, FIRST[name], QUATERNION)
+    truth, first = [], len(rig.seen)
     for i in range(round(seconds / PERIOD_S)):
-        vehicle = one.peers.vehicle
+        vehicle = rig.peers.vehicle
         truth.append((*vehicle.attitude, *vehicle.position_m, *vehicle.velocity_mps))
         if i % 5 == 0:
-            one.send(one.client.velocity(*velocity(i * PERIOD_S)))
-        one.wait(PERIOD_S)
-    seen = [msg for _, msg in one.seen[first:]]
-    inertial = [msg for msg in seen if msg.get_type() == NAMES[FIRST[name]]][: len(truth)]
-    turns = [msg for msg in seen if msg.get_type() == "ATTITUDE_QUATERNION"][: len(truth)]
+            rig.send(rig.client.velocity(*velocity(i * PERIOD_S)))
+        rig.wait(PERIOD_S)
+    observed = [msg for _, msg in rig.seen[first:]]
+    inertial = [msg for msg in observed if msg.get_type() == NAMES[FIRST[name]]][: len(truth)]
+    turns = [msg for msg in observed if msg.get_type() == "ATTITUDE_QUATERNION"][: len(truth)]
     assert len(inertial) == len(turns) == len(truth)
-    measured, rows = np.array([si(msg) for msg in inertial]), np.array(truth)
+    measured, rows = np.array([convert_to_si(msg) for msg in inertial]), np.array(truth)
     return InertialRecord(
         time_s=np.array([msg.time_usec for msg in inertial]) * 1e-6 - BOOT_S,
         force=measured[:, :3],

@@ -13,7 +13,7 @@ from unittest.mock import patch
 
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
-from recording_fakes import Item, flight, own
+from recording_fakes import Item, drop_recorder_notes, flight
 
 from logs.recording.disk import make_segment_path
 from logs.recording.reader import read, segment_files
@@ -33,7 +33,7 @@ MESSAGE_HEAD = 31  # bytes that a message has in a chunk besides its own
 
 
 @dataclass(frozen=True)
-class Killed:
+class KillResult:
     """What one kill left.
 
     Attributes:
@@ -60,7 +60,7 @@ class Killed:
         return self.put - self.taken
 
 
-def kill_once(folder: Path, kind: str, seed: int, items: list[Item]) -> Killed:
+def kill_once(folder: Path, kind: str, seed: int, items: list[Item]) -> KillResult:
     """Record in a process of its own, kill it at a moment that `seed` draws, and look at what it left.
 
     The caller has no other threads, since it is forked.
@@ -106,15 +106,15 @@ def _put_all(recorder: SyncRecorder | Recorder, items: list[Item], counts: memor
         time.sleep(1.0)
 
 
-def _look(folder: Path, kind: str, put: int, taken: int, items: list[Item]) -> Killed:
+def _look(folder: Path, kind: str, put: int, taken: int, items: list[Item]) -> KillResult:
     path, out = folder / "flight.mcap", folder / "out.mcap"
     files, kept, wrong = 0, 0, ""
     if path.exists() and path.stat().st_size:
         files = len(segment_files(path))
-        direct = own(list(read(path)))
+        direct = drop_recorder_notes(list(read(path)))
         kept = len(direct)
         recover(path, out)
-        restored = own(list(read(out)))
+        restored = drop_recorder_notes(list(read(out)))
         if direct != items[:kept] or restored != direct:
             wrong = "a record differs"
         elif _independent(out) != len(list(read(out))):
@@ -126,13 +126,13 @@ def _look(folder: Path, kind: str, put: int, taken: int, items: list[Item]) -> K
     lost = [len(encode(record)) + MESSAGE_HEAD for _, _, record in items[kept:taken]]
     if sum(lost) > LOG.chunk_bytes:  # they cannot all have been in the open chunk
         wrong = f"{len(lost)} records, {sum(lost)} bytes lost"
-    return Killed(kind, put, taken, kept, sum(lost), files, wrong)
+    return KillResult(kind, put, taken, kept, sum(lost), files, wrong)
 
 
 def _independent(out: Path) -> int:
     """Messages of a recovered file by the format's own reader, each chunk's checksum looked at."""
     with out.open("rb") as file:
-        return sum(type(one).__name__ == "Message" for one in StreamReader(file, validate_crcs=True).records)
+        return sum(type(record).__name__ == "Message" for record in StreamReader(file, validate_crcs=True).records)
 
 
 def truth() -> list[Item]:

@@ -44,18 +44,19 @@ class Viewer:
 
     def channels(self, wanted: set[str]) -> dict[str, dict[str, Any]]:
         """Read until all wanted topics are offered."""
-        found: dict[str, dict[str, Any]] = {}
-        while not wanted <= found.keys():
+        channels: dict[str, dict[str, Any]] = {}
+        while not wanted <= channels.keys():
             opcode, data = self._frame()
             if opcode == TEXT:
-                told = json.loads(data)
-                found |= {one["topic"]: one for one in told.get("channels", ()) if told["op"] == "advertise"}
-        return found
+                document = json.loads(data)
+                if document["op"] == "advertise":
+                    channels |= {channel["topic"]: channel for channel in document["channels"]}
+        return channels
 
     def subscribe(self, channels: dict[str, dict[str, Any]]) -> None:
         """Ask for all messages of these topics."""
-        wanted = [{"id": one["id"], "channelId": one["id"]} for one in channels.values()]
-        self.topics |= {int(one["id"]): topic for topic, one in channels.items()}
+        wanted = [{"id": channel["id"], "channelId": channel["id"]} for channel in channels.values()]
+        self.topics |= {int(channel["id"]): topic for topic, channel in channels.items()}
         self._send(json.dumps({"op": "subscribe", "subscriptions": wanted}).encode())
 
     def messages(self) -> Iterator[tuple[str, int, bytes]]:

@@ -9,7 +9,7 @@ import msgspec
 
 from logs.recording.flight import FlightData
 from sim.simulation import World
-from uavctl.build.controller import build_controller, design_of, record_of
+from uavctl.build.controller import build_controller, build_flight_design, make_design_record
 from uavctl.config import Config, load_config
 from uavctl.config.load import dump_config
 from uavctl.flight.controller import Controller
@@ -20,7 +20,7 @@ from uavctl.smpc.conditioned.planner import AnyDesign
 R = TypeVar("R", bound=Record)
 
 
-class Memory:
+class MemorySink:
     """Sink that keeps everything, in order."""
 
     def __init__(self) -> None:
@@ -37,7 +37,7 @@ def make_loop(config: Config, sink: Sink, design: AnyDesign | None = None) -> Co
     return ControlLoop(config, build_controller(config, design), sink, lambda: 0)
 
 
-def shared(config: Config) -> tuple[AnyDesign, Controller]:
+def share_flight(config: Config) -> tuple[AnyDesign, Controller]:
     """Design and controller, made once for flights that differ in length and simulator alone.
 
     A flight leaves nothing in its controller; a replay, which makes one of its own, would find out.
@@ -47,20 +47,20 @@ def shared(config: Config) -> tuple[AnyDesign, Controller]:
 
 @lru_cache(maxsize=8)
 def _made(config: Config) -> tuple[AnyDesign, Controller]:
-    design = design_of(config)
+    design = build_flight_design(config)
     return design, build_controller(config, design)
 
 
 def shared_loop(config: Config, sink: Sink) -> ControlLoop:
-    """The loop of a flight whose controller others fly with too, see `shared`; `make_loop` makes one of its own."""
-    return ControlLoop(config, shared(config)[1], sink, lambda: 0)
+    """Return a loop with a controller that is shared, see `share_flight`; `make_loop` makes a new one."""
+    return ControlLoop(config, share_flight(config)[1], sink, lambda: 0)
 
 
-def lockstep(name: str, duration_s: float, *overrides: str) -> Memory:
+def lockstep(name: str, duration_s: float, *overrides: str) -> MemorySink:
     """Fly a preset in virtual time."""
     config = load_config(name, [f"duration_s={duration_s}", *overrides])
-    design, controller = shared(config)
-    memory = Memory()
+    design, controller = share_flight(config)
+    memory = MemorySink()
     memory.put("/uavctl/header", 0, header(config, design))
     loop = ControlLoop(config, controller, memory, lambda: 0)
     World(config, loop, on_truth=lambda truth: memory.put("/sim/truth", truth.at_ns, truth)).run(duration_s)
@@ -75,11 +75,11 @@ def header(config: Config, design: AnyDesign) -> Header:
         command="test",
         config_toml=dump_config(config),
         design_id=design.design_id,
-        design=record_of(design),
+        design=make_design_record(design),
         versions={},
         cpu="",
     )
 
 
-def flight(memory: Memory) -> FlightData:
+def flight(memory: MemorySink) -> FlightData:
     return FlightData.from_records(memory.entries)

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from patience import until
+from patience import wait_until
 from places import ROOT
 
 PAGES = ("README.md", *sorted(f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md")))
@@ -24,7 +24,7 @@ _TABLE = re.compile(r"^\[(\w+)\]\n((?:(?!^\[).*\n?)*)", re.M)
 LIMIT_S = 300.0  # for what is stuck
 
 
-def blocks(page: str, language: str, section: str = "") -> list[str]:
+def find_blocks(page: str, language: str, section: str = "") -> list[str]:
     """Blocks of a page in a language, or those of the section whose heading begins so."""
     text = (ROOT / page).read_text(encoding="utf-8")
     if section:
@@ -34,81 +34,81 @@ def blocks(page: str, language: str, section: str = "") -> list[str]:
     ]
 
 
-def commands(page: str, section: str = "") -> list[str]:
+def find_commands(page: str, section: str = "") -> list[str]:
     """Commands of a page in their order, without comments; a line that goes on in the next one is one command."""
-    lines = "\n".join(blocks(page, "sh", section)).replace("\\\n", " ").splitlines()
+    lines = "\n".join(find_blocks(page, "sh", section)).replace("\\\n", " ").splitlines()
     return [command for line in lines if (command := re.sub(r"\s+# .*", "", line).strip())]
 
 
-def keys(block: str) -> list[tuple[str, str, str]]:
+def parse_keys(block: str) -> list[tuple[str, str, str]]:
     """Table, key and value of each line of a TOML block."""
-    found = []
+    results = []
     for table, body in _TABLE.findall(block):
         parts = (line.partition("=") for line in body.splitlines() if "=" in line)
-        found += [(table, key.strip(), value.strip()) for key, _, value in parts]
-    return found
+        results += [(table, key.strip(), value.strip()) for key, _, value in parts]
+    return results
 
 
-def edited(text: str, block: str) -> str:
+def apply_block(text: str, block: str) -> str:
     """Change the lines of a configuration as a block says, where the table is there; else add it."""
-    for table, key, value in keys(block):
-        line, found = f"{key} = {value}\n", re.search(rf"^\[{table}\]\n(?:(?!^\[).*\n?)*", text, re.M)
-        if found is None:
+    for table, key, value in parse_keys(block):
+        line, result = f"{key} = {value}\n", re.search(rf"^\[{table}\]\n(?:(?!^\[).*\n?)*", text, re.M)
+        if result is None:
             text += f"\n[{table}]\n{line}"
             continue
         old = re.compile(rf"^{key} = (\[\n(?:.*\n)*?\]|.*)\n", re.M)
-        new, count = old.subn(line.replace("\\", r"\\"), found[0], count=1)
-        new = new if count else found[0].replace(f"[{table}]\n", f"[{table}]\n{line}", 1)
-        text = text[: found.start()] + new + text[found.end() :]
+        new, count = old.subn(line.replace("\\", r"\\"), result[0], count=1)
+        new = new if count else result[0].replace(f"[{table}]\n", f"[{table}]\n{line}", 1)
+        text = text[: result.start()] + new + text[result.end() :]
     return text
 
 
 @dataclass
-class Desk:
+class ManualShell:
     """A folder like a checkout, and a shell in it; the network is its own, or the default ports are locked."""
 
     folder: Path
     network: tuple[str, ...]
     environment: dict[str, str]
-    open: list[subprocess.Popen[bytes]] = field(default_factory=list)
+    processes: list[subprocess.Popen[bytes]] = field(default_factory=list)
 
     def start(self, command: str) -> subprocess.Popen[bytes]:
         """Begin a command."""
-        log = (self.folder / f"log-{len(self.open)}").open("wb")
+        log = (self.folder / f"log-{len(self.processes)}").open("wb")
         process = subprocess.Popen(
             [*self.network, "sh", "-c", f"exec {command}" if command.startswith("uavctl ") else command],
             cwd=self.folder, env=self.environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
         )  # fmt: skip
         log.close()
-        self.open.append(process)
+        self.processes.append(process)
         return process
 
-    def said(self, process: subprocess.Popen[bytes]) -> str:
+    def read_output(self, process: subprocess.Popen[bytes]) -> str:
         """What a command has written."""
-        return (self.folder / f"log-{self.open.index(process)}").read_text(errors="replace")
+        return (self.folder / f"log-{self.processes.index(process)}").read_text(errors="replace")
 
-    def ends(self, process: subprocess.Popen[bytes], command: str, code: int = 0) -> str:
+    def wait_for_end(self, process: subprocess.Popen[bytes], command: str, code: int = 0) -> str:
         """Wait for the end of a command; what it wrote."""
-        found = process.wait(LIMIT_S)
-        assert found == code, f"{command}: exit code {found}, not {code}\n{self.said(process)}"
-        return self.said(process)
+        result = process.wait(LIMIT_S)
+        assert result == code, f"{command}: exit code {result}, not {code}\n{self.read_output(process)}"
+        return self.read_output(process)
 
     def run(self, command: str, code: int = 0) -> str:
         """Type a command, and wait for its end."""
-        return self.ends(self.start(command), command, code)
+        return self.wait_for_end(self.start(command), command, code)
 
-    def until_said(self, process: subprocess.Popen[bytes], text: str) -> None:
+    def wait_for_text(self, process: subprocess.Popen[bytes], text: str) -> None:
         """Wait until a command has written something."""
 
-        def said() -> bool:
-            assert process.poll() is None or text in self.said(process), self.said(process)
-            return text in self.said(process)
+        def read_output() -> bool:
+            assert process.poll() is None or text in self.read_output(process), self.read_output(process)
+            return text in self.read_output(process)
 
-        until(said, f"it says {text!r}")
+        wait_until(read_output, f"it says {text!r}")
 
-    def until_good(self, command: str) -> None:
+    def wait_for_success(self, command: str) -> None:
         """Type a command again and again, until it ends well."""
-        until(lambda: self.start(command).wait(LIMIT_S) == 0, command, pause_s=0.5)
+        wait_until(lambda: self.start(command).wait(LIMIT_S) == 0, command, pause_s=0.5)
 
     def stop(self, process: subprocess.Popen[bytes]) -> None:
         """Press Ctrl-C."""
@@ -139,7 +139,7 @@ def _network() -> Iterator[tuple[str, ...]]:
 
 
 @contextmanager
-def desk(folder: Path) -> Iterator[Desk]:
+def open_shell(folder: Path) -> Iterator[ManualShell]:
     """A desk with a checkout's folders on it; what was begun there and still runs is ended."""
     for name in ("uavctl", "docs", "tools", "sim", "logs"):
         (folder / name).symlink_to(ROOT / name)
@@ -155,14 +155,14 @@ def desk(folder: Path) -> Iterator[Desk]:
         }  # fmt: skip
         (folder / ".venv").mkdir()
         shutil.copytree(Path(short) / "bin", folder / ".venv/bin", symlinks=True)
-        one = Desk(folder, network, environment)
+        shell = ManualShell(folder, network, environment)
         try:
-            yield one
+            yield shell
         finally:
-            for process in one.open:
+            for process in shell.processes:
                 if process.poll() is None:
                     process.send_signal(signal.SIGINT)
-            for process in one.open:
+            for process in shell.processes:
                 try:
                     process.wait(20.0)
                 except subprocess.TimeoutExpired:

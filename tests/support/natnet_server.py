@@ -35,8 +35,8 @@ def message(kind: int, payload: bytes) -> bytes:
     return struct.pack("<HH", kind, len(payload)) + payload
 
 
-def text(words: str) -> bytes:
-    return words.encode() + b"\0"
+def text(arguments: str) -> bytes:
+    return arguments.encode() + b"\0"
 
 
 def server_info(
@@ -51,14 +51,14 @@ def server_info(
 def descriptions(bodies: list[Body], version: tuple[int, int]) -> bytes:
     described = []
     for body in bodies:
-        one = text(body.name) + struct.pack("<ii3f", body.number, -1, 0.0, 0.0, 0.0)
+        data = text(body.name) + struct.pack("<ii3f", body.number, -1, 0.0, 0.0, 0.0)
         if version >= (4, 2):
-            one += struct.pack("<4f", 0.0, 0.0, 0.0, 1.0)
-        one += struct.pack("<i3fi", 1, 0.01, 0.02, 0.03, 7)  # one marker: place, label
+            data += struct.pack("<4f", 0.0, 0.0, 0.0, 1.0)
+        data += struct.pack("<i3fi", 1, 0.01, 0.02, 0.03, 7)  # one marker: place, label
         if version >= (4, 0):
-            one += text("Marker 1")
-        size = struct.pack("<i", len(one)) if version >= (4, 1) else b""
-        described.append(struct.pack("<i", 1) + size + one)
+            data += text("Marker 1")
+        size = struct.pack("<i", len(data)) if version >= (4, 1) else b""
+        described.append(struct.pack("<i", 1) + size + data)
     return message(5, struct.pack("<i", len(described)) + b"".join(described))
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from patience import LIMIT_S, until
+from patience import LIMIT_S, wait_until
 from places import without_pages
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import Client
@@ -35,21 +35,21 @@ PATIENT_DAEMON = ("fallback.hold_s=60.0", "fallback.blind_hold_s=60.0", "hand_ov
 MARK = b"the test's own mark"
 
 
-def port() -> socket.socket:
+def reserve_port() -> socket.socket:
     """A UDP socket on a free port of this machine."""
-    one = socket.socket(type=socket.SOCK_DGRAM)
-    one.bind(("127.0.0.1", 0))
-    return one
+    sock = socket.socket(type=socket.SOCK_DGRAM)
+    sock.bind(("127.0.0.1", 0))
+    return sock
 
 
-class Tap:
+class VehicleTap:
     """Sits between vehicle and daemon, hands everything on, and counts what the daemon says."""
 
     def __init__(self, daemon_port: int) -> None:
         self.spoken = 0  # datagrams of the daemon's
         self._marked = threading.Event()
         self._daemon = ("127.0.0.1", daemon_port)
-        self._ours, self._theirs = port(), port()
+        self._ours, self._theirs = reserve_port(), reserve_port()
         self.vehicle_port = int(self._theirs.getsockname()[1])
         self._vehicle: Any = None
         self._done = threading.Event()
@@ -74,11 +74,11 @@ class Tap:
                 if self._vehicle is not None:
                     self._theirs.sendto(data, self._vehicle)
 
-    def spoken_by_now(self) -> int:
+    def read_frames(self) -> int:
         """How much the daemon has said, with what waits in the socket's queue: a mark put behind it has come out."""
         self._marked.clear()
-        with port() as here:
-            here.sendto(MARK, self._ours.getsockname())
+        with reserve_port() as port_number:
+            port_number.sendto(MARK, self._ours.getsockname())
         assert self._marked.wait(LIMIT_S)
         return self.spoken
 
@@ -97,10 +97,10 @@ class Tap:
 class Scene:
     """A simulated vehicle that flies, and what a daemon needs to fly it."""
 
-    def __init__(self, folder: Path, tap: Tap, vehicle_port: int, mocap_port: int) -> None:
+    def __init__(self, folder: Path, tap: VehicleTap, vehicle_port: int, mocap_port: int) -> None:
         self.folder, self.tap, self.control = folder, tap, folder / "control"
         self.truths: list[Truth] = []
-        self.vehicle, self.mocap = (f"udpin://127.0.0.1:{one}" for one in (vehicle_port, mocap_port))
+        self.vehicle, self.mocap = (f"udpin://127.0.0.1:{port_number}" for port_number in (vehicle_port, mocap_port))
 
     @property
     def mode(self) -> str:
@@ -109,17 +109,17 @@ class Scene:
     @property
     def has_landed(self) -> bool:
         """Whether it has been landing; once disarmed, a PX4 takes up the mode of before."""
-        return any(one.mode == "AUTO.LAND" for one in self.truths)
+        return any(truth.mode == "AUTO.LAND" for truth in self.truths)
 
-    def wait_on_board(self, seconds: float) -> None:
+    def wait_for_flight(self, seconds: float) -> None:
         """Let some of the vehicle's own time go by."""
         end_ns = self.truths[-1].at_ns + round(seconds * 1e9)
-        until(lambda: self.truths[-1].at_ns >= end_ns, f"{seconds:g} s on board")
+        wait_until(lambda: self.truths[-1].at_ns >= end_ns, f"{seconds:g} s on board")
 
     def fly(self, out: str, *options: str, environ: dict[str, str] | None = None) -> subprocess.Popen[str]:
         """The daemon, ready to fly or already over."""
         urls = ["--vehicle", self.vehicle, "--mocap", self.mocap]
-        patience = [word for setting in PATIENT_DAEMON for word in ("--set", setting)]
+        patience = [argument for setting in PATIENT_DAEMON for argument in ("--set", setting)]
         command = [sys.executable, "-m", "uavctl", "fly", *urls, *patience, "--json"]
         places = ["--out", str(self.folder / out), "--control", str(self.control)]
         return subprocess.Popen(
@@ -132,25 +132,25 @@ class Scene:
 
     def ctl(self, *arguments: str) -> tuple[int, str, str]:
         """Exit code, standard output and error of `uavctl ctl`."""
-        out, told = io.StringIO(), io.StringIO()
-        with redirect_stdout(out), redirect_stderr(told):
+        out, errors = io.StringIO(), io.StringIO()
+        with redirect_stdout(out), redirect_stderr(errors):
             code = run(["ctl", *arguments, "--control", str(self.control)])
-        return code, out.getvalue(), told.getvalue()
+        return code, out.getvalue(), errors.getvalue()
 
     def status(self) -> dict[str, Any]:
-        found: dict[str, Any] = json.loads(self.ctl("status", "--json")[1])
-        return found
+        document: dict[str, Any] = json.loads(self.ctl("status", "--json")[1])
+        return document
 
 
 @contextmanager
-def scene(*overrides: str) -> Iterator[Scene]:
+def open_scene(*overrides: str) -> Iterator[Scene]:
     """A simulated vehicle in the air, as long as the block lasts."""
-    with port() as one, port() as other, tempfile.TemporaryDirectory(prefix="uavctl-") as folder:
-        vehicle_port, mocap_port = int(one.getsockname()[1]), int(other.getsockname()[1])
-        one.close()
-        other.close()
-        tap = Tap(vehicle_port)
-        found = Scene(Path(folder), tap, vehicle_port, mocap_port)
+    with reserve_port() as first, reserve_port() as second, tempfile.TemporaryDirectory(prefix="uavctl-") as folder:
+        vehicle_port, mocap_port = int(first.getsockname()[1]), int(second.getsockname()[1])
+        first.close()
+        second.close()
+        tap = VehicleTap(vehicle_port)
+        result = Scene(Path(folder), tap, vehicle_port, mocap_port)
         done = threading.Event()
         config = load_config("room", [PATIENT_VEHICLE, *overrides])
 
@@ -162,7 +162,7 @@ def scene(*overrides: str) -> Iterator[Scene]:
                 duration_s=None,
                 airborne=True,
                 on_ready=lambda _: None,
-                on_truth=found.truths.append,
+                on_truth=result.truths.append,
                 stop=done.is_set,
             )
 
@@ -171,17 +171,17 @@ def scene(*overrides: str) -> Iterator[Scene]:
         try:
             with pytest.MonkeyPatch.context() as patch:
                 patch.setattr("uavctl.cli.ctl.ANSWER_LIMIT_S", LIMIT_S)
-                yield found
+                yield result
         finally:
             done.set()
             peers.join()
             tap.close()
-            for path in find_lock_paths(found.vehicle):
+            for path in find_lock_paths(result.vehicle):
                 path.unlink(missing_ok=True)  # the port's next vehicle was not left in flight
 
 
 @contextmanager
-def ended(process: subprocess.Popen[str]) -> Iterator[subprocess.Popen[str]]:
+def wait_for_end(process: subprocess.Popen[str]) -> Iterator[subprocess.Popen[str]]:
     """End a process with the block, if it has not ended by itself."""
     try:
         yield process

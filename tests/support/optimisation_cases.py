@@ -6,14 +6,12 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec, make_design
 from uavctl.smpc.link import bernoulli
 from uavctl.smpc.plant import Plant, drag_lag
 from uavctl.smpc.sets import Polytope
-
-Array = NDArray[np.float64]
 
 START = np.array([35.0, -2.0, -20.0, -4.0])
 ORIGIN = np.zeros(4)

@@ -5,12 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.smpc.nominal import ControlProblem, lqr
 from uavctl.smpc.outside import PlanRequest
-
-Array = NDArray[np.float64]
 
 
 class Regulates:

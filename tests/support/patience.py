@@ -8,11 +8,11 @@ from collections.abc import Callable
 LIMIT_S = 60.0  # for what is stuck, not for what is slow: a machine may have much else to do
 
 
-def until(holds: Callable[[], bool], what: str, *, pause_s: float = 0.02) -> None:
+def wait_until(condition: Callable[[], bool], what: str, *, pause_s: float = 0.02) -> None:
     """Wait until something holds.
 
     Args:
-        holds: asked again and again, at least once.
+        condition: asked again and again, at least once.
         what: what is waited for, in words.
         pause_s: between two questions; 0 if the question itself waits.
 
@@ -20,6 +20,6 @@ def until(holds: Callable[[], bool], what: str, *, pause_s: float = 0.02) -> Non
         AssertionError: it does not within `LIMIT_S`.
     """
     end_s = time.monotonic() + LIMIT_S
-    while not holds():
+    while not condition():
         assert time.monotonic() < end_s, f"{what}: not within {LIMIT_S:g} s"
         time.sleep(pause_s)

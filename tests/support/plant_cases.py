@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag, expm, solve_discrete_are
 from scipy.stats import chi2
 
+from uavctl.arrays import Array
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import Answer
 from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec, make_design
@@ -19,8 +19,6 @@ from uavctl.smpc.hahn_stursberg.terminal import make_terminal
 from uavctl.smpc.link import bernoulli
 from uavctl.smpc.plant import AXES, Plant
 from uavctl.smpc.sets import Polytope
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -268,9 +266,9 @@ def case_of(shape: Shape) -> Case:
     solver = ConicSolver(design)
     rng = np.random.default_rng(shape.seed + 1000)
     size = np.array([min(2.0, *room) for room in zip(*_reach(spec), strict=True)])
-    way = rng.uniform(0.3, 1.0, size.size) * rng.choice([-1.0, 1.0], size.size) * size
+    displacement = rng.uniform(0.3, 1.0, size.size) * rng.choice([-1.0, 1.0], size.size) * size
     for share in 0.9 * 0.6 ** np.arange(12):
-        x = design.target + share * way
+        x = design.target + share * displacement
         answer = solver.solve(0, x, design.target)
         if kept(answer):
             return Case(design, spec, solver, x, answer)

@@ -11,13 +11,11 @@ from dataclasses import dataclass
 
 import cvxpy as cp
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from uavctl.arrays import Array
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,23 +119,23 @@ def margins(design: Design, solver: ConicSolver, x: Array) -> dict[str, float]:
         enter[:, t] = plant.e
         mean.append(plant.a @ mean[-1] + plant.b @ answer.inputs[t])
         effect.append(plant.a @ effect[-1] + plant.b @ gain[t].reshape(plant.n_u, -1) + enter.reshape(plant.n_x, -1))
-    least = {"state": np.inf, "input": np.inf}
+    min_margin = {"state": np.inf, "input": np.inf}
     for t in range(1, H + 1):
         for c, b in zip(design.state_set.c, design.state_set.b, strict=True):
             backoff = design.kappa_x[t] * np.linalg.norm(c @ effect[t] @ root)
-            least["state"] = min(least["state"], (b - c @ mean[t] - backoff) / abs(b))
+            min_margin["state"] = min(min_margin["state"], (b - c @ mean[t] - backoff) / abs(b))
     for t in range(H):
         for c, b in zip(design.input_set.c, design.input_set.b, strict=True):
             backoff = design.kappa_u[t] * np.linalg.norm(c @ gain[t].reshape(plant.n_u, -1) @ root)
-            least["input"] = min(least["input"], (b - c @ answer.inputs[t] - backoff) / abs(b))
+            min_margin["input"] = min(min_margin["input"], (b - c @ answer.inputs[t] - backoff) / abs(b))
     std = np.sqrt(np.maximum(np.diagonal(design.terminal.sigma_xi), 0.0))
     std = np.where(std > 1e-9 * std.max(), std, 1.0)
     xi = np.vstack(effect[H - tau :]) @ root / std[:, None]
-    least["terminal covariance"] = float(
+    min_margin["terminal covariance"] = float(
         np.linalg.eigvalsh(design.terminal.sigma_xi / np.outer(std, std) - xi @ xi.T)[0]
     )
-    least["terminal mean"] = -float(np.abs(np.array(mean[H - tau :]) - design.target).max())
-    return least
+    min_margin["terminal mean"] = -float(np.abs(np.array(mean[H - tau :]) - design.target).max())
+    return min_margin
 
 
 def _norm(moved: Array, still: Array, theta: cp.Variable) -> cp.Expression | float:

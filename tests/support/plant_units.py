@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec
 from uavctl.smpc.hahn_stursberg.terminal import Terminal
 from uavctl.smpc.link import bernoulli
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import Polytope
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,24 +103,24 @@ def design_in_units(design: Design, units: Units) -> Design:
         terminal_weight=design.terminal_weight,
         max_iterations=design.max_iterations,
     )
-    other = in_units(spec, units)
+    scaled_spec = in_units(spec, units)
     xi, z = np.tile(s, terminal.tau + 1), np.concatenate([s, np.tile(u, terminal.tau)])
     return replace(
         design,
-        plant=other.plant,
-        state_set=other.state_set,
-        input_set=other.input_set,
-        q_x=other.q_x,
-        q_u=other.q_u,
+        plant=scaled_spec.plant,
+        state_set=scaled_spec.state_set,
+        input_set=scaled_spec.input_set,
+        q_x=scaled_spec.q_x,
+        q_u=scaled_spec.q_u,
         target=design.target * s,
         estimate_cov=s[:, None] * design.estimate_cov * s,
-        slack_linear=other.slack_linear,
-        slack_quadratic=other.slack_quadratic,
-        offset_weight=other.offset_weight,
-        terminal_weight=other.terminal_weight,
+        slack_linear=scaled_spec.slack_linear,
+        slack_quadratic=scaled_spec.slack_quadratic,
+        offset_weight=scaled_spec.offset_weight,
+        terminal_weight=scaled_spec.terminal_weight,
         terminal=Terminal(
             tau=terminal.tau,
-            k=other.k_tau,
+            k=scaled_spec.k_tau,
             a_cl=xi[:, None] * terminal.a_cl / xi,
             e_xi=xi[:, None] * terminal.e_xi / units.disturbance,
             sigma_xi=xi[:, None] * terminal.sigma_xi * xi,

@@ -17,8 +17,8 @@ def packet(kind: int, payload: bytes) -> bytes:
     return struct.pack("<II", 8 + len(payload), kind) + payload
 
 
-def command(words: str, kind: int = 1) -> bytes:
-    return packet(kind, words.encode() + b"\0")
+def command(arguments: str, kind: int = 1) -> bytes:
+    return packet(kind, arguments.encode() + b"\0")
 
 
 def parameters(names: list[str]) -> bytes:
@@ -43,9 +43,9 @@ class QtmBody:
 
 def frame(number: int, at_us: int, bodies: list[QtmBody]) -> bytes:
     component = struct.pack("<ihh", len(bodies), 0, 0) + b"".join(body.packed() for body in bodies)
-    other = struct.pack("<IIi", 12, 17, 0)  # a time code of no entries goes before
+    time_code = struct.pack("<IIi", 12, 17, 0)  # a time code of no entries goes before
     component = struct.pack("<II", 8 + len(component), 5) + component
-    return packet(3, struct.pack("<qII", at_us, number, 2) + other + component)
+    return packet(3, struct.pack("<qII", at_us, number, 2) + time_code + component)
 
 
 @dataclass
@@ -103,10 +103,10 @@ class QtmServer:
             except TimeoutError:
                 pass
             while len(rest) >= 8 and len(rest) >= (size := int.from_bytes(rest[:4], "little")):
-                words, rest = rest[8:size].rstrip(b"\0").decode(), rest[size:]
-                self.heard.append(words)
-                streams = streams or words == "StreamFrames AllFrames 6D"
-                client.sendall(self._answer(words))
+                arguments, rest = rest[8:size].rstrip(b"\0").decode(), rest[size:]
+                self.heard.append(arguments)
+                streams = streams or arguments == "StreamFrames AllFrames 6D"
+                client.sendall(self._answer(arguments))
             if streams:
                 number += 1
                 at_us = UPTIME_US + time.monotonic_ns() // 1000
@@ -114,7 +114,7 @@ class QtmServer:
                 client.sendall(whole[:31])  # in pieces
                 client.sendall(whole[31:])
 
-    def _answer(self, words: str) -> bytes:
-        if words.startswith("Version"):
+    def _answer(self, arguments: str) -> bytes:
+        if arguments.startswith("Version"):
             return command(self.refuses, 0) if self.refuses else command("Version set to 1.25")
-        return parameters([body.name for body in self.bodies]) if words == "GetParameters 6D" else b""
+        return parameters([body.name for body in self.bodies]) if arguments == "GetParameters 6D" else b""

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from places import DATA
 from scipy.signal import lfilter
 
@@ -17,13 +16,12 @@ from sim.vehicle.battery import BatteryModel
 from sim.vehicle.linear import make_linear_model
 from sim.vehicle.quadrotor import STEP_NS, STEP_S, Quadrotor
 from sim.wind import Wind
+from uavctl.arrays import Array
 from uavctl.config import load_config
 from uavctl.records import Vec3
 
-Array = NDArray[np.float64]
 Autopilot = Literal["px4", "ardupilot"]
 
-S = 1_000_000_000
 MODEL = make_linear_model(load_config("room-hahn-stursberg").plant)
 # The recorded PX4 flew a vehicle with drag of 1 N s/m and 1 kg (SIH_KDV, SIH_MASS), the same along all axes.
 HOVER_SUM_RPS = 4.0 * CRAZYFLIE_2.hover_rps
@@ -79,7 +77,7 @@ class Record:
     ) -> Array:
         """The same setpoints flown by a simulated vehicle that starts like the recorded one; brakes in the pause."""
         first = self.truth[np.searchsorted(self.truth[:, 0], start_s)]
-        one = vehicle((0.0, 0.0, float(first[1])), (float(first[2]), float(first[3]), float(first[4])))
+        quadrotor_model = vehicle((0.0, 0.0, float(first[1])), (float(first[2]), float(first[3]), float(first[4])))
         times = [float(t) for t in self.setpoints[:, 0]]
         coming = int(np.searchsorted(self.setpoints[:, 0], start_s, side="right")) - 1
         braking = False
@@ -88,13 +86,13 @@ class Record:
             now_s = start_s + k * STEP_S
             while coming < len(times) and times[coming] <= now_s:
                 north, east, down = self.setpoints[coming, 1:].tolist()
-                one.accelerate((north, east, down))
+                quadrotor_model.accelerate((north, east, down))
                 coming += 1
             if pause[0] <= now_s < pause[1] and not braking:
-                one.brake()
+                quadrotor_model.brake()
                 braking = True
-            rows.append((now_s, one.position_m[2], *one.velocity_mps))
-            one.advance((k + 1) * STEP_NS)
+            rows.append((now_s, quadrotor_model.position_m[2], *quadrotor_model.velocity_mps))
+            quadrotor_model.advance((k + 1) * STEP_NS)
         return np.array(rows)
 
 

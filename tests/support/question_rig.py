@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from design_rig import one_axis, paper_plant, spec
 from full_problem import backoff_table, horizons
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.build.controller import build_design
 from uavctl.config import load_config
 from uavctl.smpc.answer import NOMINAL, Answer, Path, Preview
@@ -24,8 +24,6 @@ from uavctl.smpc.hahn_stursberg.mean import MeanProblem, Question
 from uavctl.smpc.hahn_stursberg.policy import Policy, cheapest_policy
 from uavctl.smpc.link import bernoulli
 from uavctl.smpc.sets import Polytope
-
-Array = NDArray[np.float64]
 
 PRESETS = ("paper", "room-hahn-stursberg")
 # For most tests of both, two axes will do for a person who waits.
@@ -51,8 +49,8 @@ class Case:
     @cached_property
     def policies(self) -> list[Policy]:
         """The frozen policy of each component."""
-        found = [cheapest_policy(problem, self.design.max_iterations) for problem in self.problems]
-        return [policy for policy in found if policy is not None]
+        results = [cheapest_policy(problem, self.design.max_iterations) for problem in self.problems]
+        return [policy for policy in results if policy is not None]
 
     @cached_property
     def exact(self) -> list[PartSolver]:
@@ -174,25 +172,25 @@ def limits(design: Design) -> Array:
 
 def fence(design: Design, axis: int, at: float) -> Array:
     """Upper limit of a position at every stage."""
-    found = limits(design)
-    found[:, design.state_set.c[:, design.plant.position_index[axis]] > 0.0] = at
-    return found
+    result = limits(design)
+    result[:, design.state_set.c[:, design.plant.position_index[axis]] > 0.0] = at
+    return result
 
 
 def hard_questions(design: Design) -> list[Asked]:
     rng = np.random.default_rng(61)
     lower, upper = bounds(design)
-    home, found = design.target, []
+    home, results = design.target, []
     for boxes in (1.5, 3.0, 10.0, 100.0):
-        found += [Asked(f"{boxes} boxes away", uniform(design, rng, boxes), home) for _ in range(6)]
-    found += [Asked("target out of reach", uniform(design, rng), equilibrium(design, rng, 50.0)) for _ in range(6)]
+        results += [Asked(f"{boxes} boxes away", uniform(design, rng, boxes), home) for _ in range(6)]
+    results += [Asked("target out of reach", uniform(design, rng), equilibrium(design, rng, 50.0)) for _ in range(6)]
     for _ in range(6):
         x = uniform(design, rng)
         at = x[design.plant.position_index[0]] - rng.uniform(0.1, 0.3) * (upper - lower)[0]
-        found.append(Asked("fence that shuts the drone out", x, home, Preview(limits=fence(design, 0, at))))
+        results.append(Asked("fence that shuts the drone out", x, home, Preview(limits=fence(design, 0, at))))
     shut = -np.abs(limits(design))
-    found.append(Asked("no place left", home, home, Preview(limits=shut)))
-    return found
+    results.append(Asked("no place left", home, home, Preview(limits=shut)))
+    return results
 
 
 # --- a mean under a given policy, in another solver -------------------------------------------------------------------
@@ -222,25 +220,25 @@ def mean_optimum(problem: MeanProblem, question: Question, backoff: Array) -> fl
 # --- the policy that an answer stands for ----------------------------------------------------------------------------
 
 
-def flown(one: Case, ask: Asked, answer: Answer) -> list[Array]:
+def flown(question_case: Case, ask: Asked, answer: Answer) -> list[Array]:
     """Gains (n_θ,) of each component that an answer stands for: the frozen or the exact ones, by its back-offs."""
-    return [_flown(one, i, ask, answer) for i in range(len(one.components))]
+    return [_flown(question_case, i, ask, answer) for i in range(len(question_case.components))]
 
 
-def _flown(one: Case, i: int, ask: Asked, answer: Answer) -> Array:
-    part = one.components[i]
-    told = np.concatenate([answer.backoff_x[:, part.rows_x].ravel(), answer.backoff_u[:, part.rows_u].ravel()])
-    for theta in (one.policies[i].theta, exact_gains(one, i, ask)):
-        table = backoff_table(one.design, part, i, theta[None])[0]
-        if np.allclose(told, table, rtol=1e-9, atol=1e-9 * told.max()):
+def _flown(question_case: Case, i: int, ask: Asked, answer: Answer) -> Array:
+    part = question_case.components[i]
+    backoffs = np.concatenate([answer.backoff_x[:, part.rows_x].ravel(), answer.backoff_u[:, part.rows_u].ravel()])
+    for theta in (question_case.policies[i].theta, exact_gains(question_case, i, ask)):
+        table = backoff_table(question_case.design, part, i, theta[None])[0]
+        if np.allclose(backoffs, table, rtol=1e-9, atol=1e-9 * backoffs.max()):
             return theta
     raise AssertionError("no policy has the answer's back-offs")
 
 
-def exact_gains(one: Case, i: int, ask: Asked) -> Array:
+def exact_gains(question_case: Case, i: int, ask: Asked) -> Array:
     """Gains (n_θ,) of the exact program's answer for a component."""
-    part = one.components[i]
-    for program in (one.exact[i]._exact, one.exact[i]._missing):
+    part = question_case.components[i]
+    for program in (question_case.exact[i]._exact, question_case.exact[i]._missing):
         solution = program.conic.solve(program.parameters(ask.x[part.states], ask.target[part.states], ask.preview))
         if solution.status == "Solved":
             break
@@ -265,6 +263,6 @@ def small_spec() -> DesignSpec:
     )
 
 
-def small(late: int = 0) -> Design:
+def small(late_steps: int = 0) -> Design:
     asked = small_spec()
-    return with_late(make_design(asked), asked, late)
+    return with_late(make_design(asked), asked, late_steps)

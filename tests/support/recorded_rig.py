@@ -11,7 +11,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from loopback_rig import Memory, header, shared
+from loopback_rig import MemorySink, header, share_flight
 from numpy.typing import NDArray
 from places import DATA
 
@@ -58,81 +58,81 @@ def events(name: str) -> tuple[tuple[float, str], ...]:
     """What an observer saw and told the rig to do: seconds since the first packet, and his words."""
     text = lzma.decompress((FLIGHTS / f"{name}-events.txt.xz").read_bytes()).decode()
     rows = (line.split(maxsplit=1) for line in text.splitlines())
-    return tuple((float(time), words) for time, words in rows)
+    return tuple((float(time), arguments) for time, arguments in rows)
 
 
-def seen_s(name: str, begin: str) -> list[float]:
+def find_event_times_s(name: str, begin: str) -> list[float]:
     """When the observer saw or did what begins so [s]."""
-    return [time_s for time_s, words in events(name) if words.startswith(begin)]
+    return [time_s for time_s, arguments in events(name) if arguments.startswith(begin)]
 
 
-def config_of(name: str, *overrides: str) -> Config:
+def load_flight_config(name: str, *overrides: str) -> Config:
     """The preset of the autopilot that flew, on one link."""
     preset = "room-px4" if name.startswith("px4") else "room-ardupilot"
-    own = () if name in RELAYED or name in (AT_REST, OF_OTHERS[1]) else (OWN_ESTIMATE,)
-    return load_config(preset, ["daemon.mocap=tlog", "daemon.vehicle=tlog", *own, *overrides])
+    estimate_overrides = () if name in RELAYED or name in (AT_REST, OF_OTHERS[1]) else (OWN_ESTIMATE,)
+    return load_config(preset, ["daemon.mocap=tlog", "daemon.vehicle=tlog", *estimate_overrides, *overrides])
 
 
-def checked(name: str, since_s: float, seconds: float, *overrides: str) -> dict[str, str]:
+def run_check(name: str, since_s: float, seconds: float, *overrides: str) -> dict[str, str]:
     """State of each item of a check that listens to a part of a recording."""
     whole = packets(name)
     begin_ns = whole[0].at_ns + round(since_s * SECOND)
-    flight = Preflight(config_of(name, *overrides), make_links, begin_ns)
+    flight = Preflight(load_flight_config(name, *overrides), make_links, begin_ns)
     tick = 0
-    for one in _between(whole, begin_ns, begin_ns + round(seconds * SECOND)):
-        while begin_ns + tick * TICK_NS <= one.at_ns:
+    for datagram in _between(whole, begin_ns, begin_ns + round(seconds * SECOND)):
+        while begin_ns + tick * TICK_NS <= datagram.at_ns:
             flight.tick(tick, begin_ns + tick * TICK_NS, to_nobody)
             tick += 1
-        flight.receive(VEHICLE, one.data, one.at_ns)
-    return {one.name: one.state.value for one in flight.make_items(begin_ns + tick * TICK_NS)}
+        flight.receive(VEHICLE, datagram.data, datagram.at_ns)
+    return {item.name: item.state.value for item in flight.make_items(begin_ns + tick * TICK_NS)}
 
 
 @dataclass(frozen=True)
-class Listened:
+class LoopRecord:
     """A control loop that heard a part of a recording, and what it recorded; nobody flew its setpoints."""
 
     name: str
     loop: ControlLoop
-    memory: Memory
+    memory: MemorySink
     news: list[Event]
     notices: list[Event]
 
-    def since_s(self, at_ns: int) -> float:
+    def get_flight_time_s(self, at_ns: int) -> float:
         """Time since the recording's first packet [s]."""
         return (at_ns - packets(self.name)[0].at_ns) * 1e-9
 
 
-def listened(
+def listen(
     name: str, since_s: float = 0.0, seconds: float = 1e9, *overrides: str, orders: Sequence[tuple[float, Command]] = ()
-) -> Listened:
+) -> LoopRecord:
     """Let a control loop hear a part of a recording; `orders` are an operator's, by time since the first packet [s]."""
     whole = packets(name)
     begin_ns = whole[0].at_ns + round(since_s * SECOND)
-    config, memory = config_of(name, "solver.method=exact", *overrides), Memory()
-    design, controller = shared(config)
+    config, memory = load_flight_config(name, "solver.method=exact", *overrides), MemorySink()
+    design, controller = share_flight(config)
     memory.put("/uavctl/header", begin_ns, header(config, design))
     loop, tick = ControlLoop(config, controller, memory, lambda: 0), 0
     news: list[Event] = []
     notices: list[Event] = []
     waiting = deque((whole[0].at_ns + round(time_s * SECOND), command) for time_s, command in orders)
-    for one in _between(whole, begin_ns, begin_ns + round(seconds * SECOND)):
-        while (now_ns := begin_ns + tick * TICK_NS) < one.at_ns:
+    for datagram in _between(whole, begin_ns, begin_ns + round(seconds * SECOND)):
+        while (now_ns := begin_ns + tick * TICK_NS) < datagram.at_ns:
             while waiting and waiting[0][0] <= now_ns:
                 assert loop.order(waiting.popleft()[1])
             ticked = loop.tick(tick, now_ns, to_nobody)
             news += ticked.news
             notices += ticked.notices
             tick += 1
-        news += loop.receive(VEHICLE, one.data, one.at_ns).news
-    return Listened(name, loop, memory, news, notices)
+        news += loop.receive(VEHICLE, datagram.data, datagram.at_ns).news
+    return LoopRecord(name, loop, memory, news, notices)
 
 
-def watched(name: str, since_s: float = 0.0, seconds: float = 1e9, *overrides: str) -> Memory:
+def watch_records(name: str, since_s: float = 0.0, seconds: float = 1e9, *overrides: str) -> MemorySink:
     """What the control loop records of a part of a recording that it only listens to."""
-    return listened(name, since_s, seconds, *overrides).memory
+    return listen(name, since_s, seconds, *overrides).memory
 
 
-def page_of(memory: Memory) -> FlightData:
+def make_page_data(memory: MemorySink) -> FlightData:
     """The flight as a page reads it."""
     return FlightData.from_records(memory.entries)
 
@@ -140,10 +140,19 @@ def page_of(memory: Memory) -> FlightData:
 def statuses(name: str) -> list[tuple[float, VehicleStatus]]:
     """What a link makes of the vehicle's words, with times since the first packet [s]."""
     whole = packets(name)
-    link = make_links(config_of(name))[VEHICLE]
-    heard = ((one, item) for one in whole if not one.outgoing for item in link.receive(one.data, one.at_ns).items)
-    return [((one.at_ns - whole[0].at_ns) * 1e-9, item) for one, item in heard if isinstance(item, VehicleStatus)]
+    link = make_links(load_flight_config(name))[VEHICLE]
+    received = (
+        (datagram, item)
+        for datagram in whole
+        if not datagram.outgoing
+        for item in link.receive(datagram.data, datagram.at_ns).items
+    )
+    return [
+        ((datagram.at_ns - whole[0].at_ns) * 1e-9, item)
+        for datagram, item in received
+        if isinstance(item, VehicleStatus)
+    ]
 
 
 def _between(whole: Sequence[TlogPacket], since_ns: int, until_ns: int) -> Iterator[TlogPacket]:
-    return (one for one in whole if since_ns <= one.at_ns <= until_ns and not one.outgoing)
+    return (datagram for datagram in whole if since_ns <= datagram.at_ns <= until_ns and not datagram.outgoing)

@@ -33,9 +33,11 @@ HEADER = Header(
 Item = tuple[str, int, Record]
 
 
-def as_recorded(items: Sequence[Item]) -> list[Item]:
+def round_records(items: Sequence[Item]) -> list[Item]:
     """Return records as a recording gives them back: of a plan's matrices it has four digits."""
-    return [(topic, at_ns, round_plan(one) if isinstance(one, Plan) else one) for topic, at_ns, one in items]
+    return [
+        (topic, at_ns, round_plan(record) if isinstance(record, Plan) else record) for topic, at_ns, record in items
+    ]
 
 
 def stored_byte(path: Path, needle: bytes) -> int:
@@ -46,15 +48,15 @@ def stored_byte(path: Path, needle: bytes) -> int:
 
 def stored_chunks(data: bytes) -> list[tuple[int, int, bytes]]:
     """Offset and length of each chunk's stored content, and that content, by the format's own reader."""
-    found, at = [], MAGIC_SIZE
+    result, at = [], MAGIC_SIZE
     while at + 9 <= len(data) and data[at] != Opcode.DATA_END:
         length = int.from_bytes(data[at + 1 : at + 9], "little")
         if data[at] == Opcode.CHUNK:
             chunk = Chunk.read(ReadDataStream(BytesIO(data[at + 9 : at + 9 + length])))
             content = ZstdDecompressor().decompress(chunk.data) if chunk.compression else chunk.data
-            found.append((at + 9 + length - len(chunk.data), len(chunk.data), content))
+            result.append((at + 9 + length - len(chunk.data), len(chunk.data), content))
         at += 9 + length
-    return found
+    return result
 
 
 def flight(count: int) -> list[Item]:
@@ -78,7 +80,7 @@ def flight(count: int) -> list[Item]:
     return items
 
 
-def own(items: list[Item]) -> list[Item]:
+def drop_recorder_notes(items: list[Item]) -> list[Item]:
     """Without the recorder's own notes."""
     return [item for item in items if item[0] != "/uavctl/recorder"]
 

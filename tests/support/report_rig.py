@@ -20,7 +20,7 @@ from uavctl.records import Record
 VOID = {"meta", "br", "hr", "img", "link", "input"}
 
 
-class Walk(HTMLParser):
+class HtmlWalk(HTMLParser):
     """Checks nesting, and collects what the tests ask about."""
 
     def __init__(self) -> None:
@@ -58,8 +58,8 @@ class Walk(HTMLParser):
         self.text.append(data)
 
 
-def walk(html: str) -> Walk:
-    parser = Walk()
+def walk_html(html: str) -> HtmlWalk:
+    parser = HtmlWalk()
     parser.feed(html)
     parser.close()
     assert parser.open == []
@@ -72,12 +72,12 @@ def data(scene: Scene, duration_s: float, keep: Callable[[Record], bool] = lambd
     return FlightData.from_records(items)
 
 
-def html_of(flight: FlightData) -> str:
+def make_html(flight: FlightData) -> str:
     return render_report(flight, summarise(flight, wall_s=1.0))
 
 
 @contextmanager
-def unwritten() -> Iterator[None]:
+def omit_figures() -> Iterator[None]:
     """Figures are drawn, and left out of the page: most of its time, for tests of what it says."""
 
     def empty(figure: Figure, out: io.StringIO, **options: object) -> None:
@@ -89,21 +89,21 @@ def unwritten() -> Iterator[None]:
 
 
 @contextmanager
-def unpaged() -> Iterator[None]:
+def omit_pages() -> Iterator[None]:
     """Flights without a page, as fixture `no_page` has it, for what a module's tests share."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("uavctl.cli.flying.draw_page", lambda *_: None)
         yield
 
 
-def words_of(flight: FlightData) -> Walk:
+def read_page_text(flight: FlightData) -> HtmlWalk:
     """The page without its figures."""
-    with unwritten():
-        return walk(html_of(flight))
+    with omit_figures():
+        return walk_html(make_html(flight))
 
 
 @contextmanager
-def drawn() -> Iterator[dict[str, Figure]]:
+def collect_figures() -> Iterator[dict[str, Figure]]:
     """Figures by their titles, in place of their SVG."""
     figures: dict[str, Figure] = {}
 

@@ -8,9 +8,9 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.simulation import MOCAP, VEHICLE, Peers
+from uavctl.arrays import SECOND_NS
 from uavctl.config import Config, load_config
 
-S = 1_000_000_000
 ACCEL_ONLY = 3135
 ARM, SET_MODE, LAND, TAKE_OFF, INTERVAL = 400, 176, 21, 22, 511
 CALM = ["plant.wind_std_mps2=[1e-9,1e-9,1e-9]", "sim.start_position_m=[0.0,0.0,-1.5]"]
@@ -60,7 +60,7 @@ class Client:
         return self.pack(mavlink.MAVLink_set_mode_message(1, base, custom))
 
 
-class Bench:
+class SimRig:
     """Peers in virtual time with a client at the vehicle's link; messages are kept as (at_ns, message)."""
 
     def __init__(self, config: Config, *, airborne: bool = True) -> None:
@@ -75,7 +75,7 @@ class Bench:
         return self.peers.now_ns
 
     def wait(self, seconds: float) -> None:
-        for at_ns, link, data in self.peers.advance(self.now_ns + round(seconds * S)):
+        for at_ns, link, data in self.peers.advance(self.now_ns + round(seconds * SECOND_NS)):
             kept = {VEHICLE: self.seen, MOCAP: self.positions}[link]
             kept.extend((at_ns, msg) for msg in decode(data))
 
@@ -110,16 +110,16 @@ class Bench:
         return math.hypot(*self.peers.vehicle.velocity_mps)
 
 
-def bench(autopilot: str, *overrides: str, airborne: bool = True) -> Bench:
-    return Bench(
+def make_rig(autopilot: str, *overrides: str, airborne: bool = True) -> SimRig:
+    return SimRig(
         load_config("room-hahn-stursberg", [*CALM, f"sim.autopilot={autopilot}", *overrides]), airborne=airborne
     )
 
 
-def flying(one: Bench) -> tuple[float, ...]:
-    return tuple(one.peers.vehicle.input.tolist())
+def read_flight_state(rig: SimRig) -> tuple[float, ...]:
+    return tuple(rig.peers.vehicle.input.tolist())
 
 
-def heartbeat(one: Bench) -> Any:
-    one.wait(1.0)
-    return one.of("HEARTBEAT")[-1]
+def read_heartbeat(rig: SimRig) -> Any:
+    rig.wait(1.0)
+    return rig.of("HEARTBEAT")[-1]

@@ -21,7 +21,7 @@ LONGEST_SPAN_S = 6.0
 PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 
 
-def drawn(seed: int, flight_s: float = FLIGHT_S) -> Config:
+def draw_world(seed: int, flight_s: float = FLIGHT_S) -> Config:
     """The world of a flight: another link than the design counts on, another plant, and things that happen to it."""
     rng = np.random.default_rng(seed)
     plant = str(rng.choice(["linear", "quadrotor"], p=[0.7, 0.3]))
@@ -69,7 +69,7 @@ def _faults(rng: np.random.Generator, plant: str, flight_s: float) -> tuple[Faul
 
 
 @dataclass(frozen=True)
-class Batch:
+class FlightBatch:
     """What a run of flights came to.
 
     Attributes:
@@ -93,7 +93,7 @@ class Batch:
 
 def fly_faults(
     prepared: Prepared, first: int, hours: float, warm_up: int, out: Path | None = None, flight_s: float = FLIGHT_S
-) -> Batch:
+) -> FlightBatch:
     """Fly until so many hours are over, each flight from its own seed; those with findings are flown again, recorded.
 
     Args:
@@ -110,11 +110,11 @@ def fly_faults(
     flights, ticks, begun_bytes, spent_s = 0, 0, 0, 0.0
     while spent_s < hours * 3600.0 or flights <= warm_up:
         seed = first + flights
-        found, flown = _flight(prepared, drawn(seed, flight_s), None)
-        if found:
-            wrong[seed] = found
+        result, flown = _flight(prepared, draw_world(seed, flight_s), None)
+        if result:
+            wrong[seed] = result
             if out is not None:
-                _flight(prepared, drawn(seed, flight_s), out / f"faults-{seed}.mcap")
+                _flight(prepared, draw_world(seed, flight_s), out / f"faults-{seed}.mcap")
         flights += 1
         for mode, count in flown.items():
             modes[mode] = modes.get(mode, 0) + count
@@ -124,7 +124,7 @@ def fly_faults(
         if flights == warm_up:
             begun_bytes = memory_bytes()
     grown = memory_bytes() - begun_bytes
-    return Batch(first, flights, ticks * tick_s / 3600.0, ticks, modes, wrong, grown)
+    return FlightBatch(first, flights, ticks * tick_s / 3600.0, ticks, modes, wrong, grown)
 
 
 def _flight(prepared: Prepared, config: Config, path: Path | None) -> tuple[tuple[str, ...], dict[str, int]]:

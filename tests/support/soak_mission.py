@@ -8,15 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
-from soak_rig import Watch, fly
+from soak_rig import LoopWatch, fly
 
 from sim.simulation import World
+from uavctl.arrays import Array
 from uavctl.build.controller import Prepared
 from uavctl.config import load_config
 from uavctl.records import ControlMode
-
-Array = NDArray[np.float64]
 
 AUTOPILOTS = ("px4", "ardupilot")
 TAKE_OFF_M = 1.2
@@ -118,7 +116,7 @@ class _Ground:
         self.away: dict[int, list[float]] = {}
         self._of_plan: Sequence[Sequence[float]] = ()
 
-    def look(self, world: World, watch: Watch, at_ns: int) -> None:
+    def look(self, world: World, watch: LoopWatch, at_ns: int) -> None:
         """After a tick."""
         decision = None if watch.ticked is None else watch.ticked.decision
         place = np.array(world.peers.vehicle.position_m)
@@ -174,7 +172,7 @@ def fly_mission(prepared: Prepared, autopilot: str, seed: int, path: Path | None
     ground = _Ground(prepared)
     worlds: list[World] = []
 
-    def look(world: World, watch: Watch, at_ns: int) -> None:
+    def look(world: World, watch: LoopWatch, at_ns: int) -> None:
         worlds[:] = [world]
         ground.look(world, watch, at_ns)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from msgspec.structs import replace
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from soak_rig import Watch, fly
+from soak_rig import LoopWatch, fly
 
 from sim.cameras import AXES
 from sim.simulation import World
@@ -53,7 +53,7 @@ class TrueFlight:
     wrong: tuple[str, ...]
 
 
-def beyond_m(config: Config, position_m: Vec3) -> float:
+def compute_outside_m(config: Config, position_m: Vec3) -> float:
     """How far a position is beyond walls and ceiling; the floor is the simulator's own."""
     lower = [config.sets.state_lower[3 * i] for i in range(3)]
     upper = [*(config.sets.state_upper[3 * i] for i in range(2)), math.inf]
@@ -77,7 +77,7 @@ def fly_true(
     ended = ""
     worlds: list[World] = []
 
-    def look(world: World, watch: Watch, at_ns: int) -> None:
+    def look(world: World, watch: LoopWatch, at_ns: int) -> None:
         nonlocal outside_m, speed_mps, moved_m, hold_mps2, start, ended
         if not worlds:
             worlds.append(world)
@@ -85,7 +85,7 @@ def fly_true(
                 silence_motion(world)
         place = world.peers.vehicle.position_m
         decision = None if watch.ticked is None else watch.ticked.decision
-        outside_m = max(outside_m, beyond_m(config, place))
+        outside_m = max(outside_m, compute_outside_m(config, place))
         pilot = world.peers.autopilot
         if pilot.pilot.is_armed:  # disarmed, a PX4 takes up the mode of before
             ended = pilot.mode_name
@@ -125,7 +125,7 @@ def _told(fault: FaultConfig) -> str:
     return f"{what} at {fault.at_s:.2f} s" + (f" for {fault.for_s:.1f} s" if fault.for_s else "")
 
 
-def drawn_pair(seed: int) -> Config:
+def draw_pair(seed: int) -> Config:
     """A world with two faults at random moments; each of the four worlds in turn."""
     rng = np.random.default_rng([seed, 14])
     plant, autopilot = WORLDS[seed % len(WORLDS)]
@@ -165,4 +165,4 @@ def _drawn_fault(rng: np.random.Generator, plant: str) -> FaultConfig:
 
 def fly_pair(prepared: Prepared, seed: int, path: Path | None = None) -> TrueFlight:
     """Fly a drawn pair."""
-    return fly_true(prepared, drawn_pair(seed), path)
+    return fly_true(prepared, draw_pair(seed), path)

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-from draw_controller import prepared_of
-from draw_flight import Drawn, drawn
+from draw_controller import prepare_config
+from draw_flight import FlightDraw, draw_flight
 from msgspec.structs import replace
 from signing_rig import KEY, OFFSET_NS
 
@@ -22,6 +22,7 @@ from logs.recording.recorder import DerivedTopics, SyncRecorder
 from logs.recording.replay import ReplayResult
 from logs.recording.views import ViewBuilder
 from sim.simulation import Peers, World
+from uavctl.arrays import SECOND_NS
 from uavctl.build.controller import Prepared
 from uavctl.cli.replays import replay_flight
 from uavctl.config import Config
@@ -30,10 +31,8 @@ from uavctl.mavlink.framing import scan_frames
 from uavctl.mavlink.signing import FrameAuthenticator, FrameSigner, SigningKey, SigningTimestamps
 from uavctl.records import Command, Order, Received, Record, Send, Sink
 
-SECOND_NS = 1_000_000_000
 
-
-class Doors:
+class SignatureChannel:
     """Signatures put on and taken off again, with what the channel has damaged left damaged."""
 
     def __init__(self, links: tuple[str, ...]) -> None:
@@ -42,14 +41,14 @@ class Doors:
         self.gates = {name: FrameAuthenticator(FrameSigner(key, 7, ours, OFFSET_NS), stream=False) for name in links}
         self.told: dict[str, Counter[str]] = {name: Counter() for name in links}
 
-    def take(self, link: str, data: bytes, at_ns: int) -> bytes:
+    def accept(self, link: str, data: bytes, at_ns: int) -> bytes:
         """What of a datagram passes."""
-        found = scan_frames(data, final=True)
-        if found.frames and not found.bad:
-            data = b"".join(self.peers[link].sign_frame(frame.data, at_ns) for frame in found.frames)
+        result = scan_frames(data, final=True)
+        if result.frames and not result.bad:
+            data = b"".join(self.peers[link].sign_frame(frame.data, at_ns) for frame in result.frames)
         return self.gates[link].verify_frames(data, at_ns)
 
-    def tell(self, loop: ControlLoop, at_ns: int) -> None:
+    def take_refused(self, loop: ControlLoop, at_ns: int) -> None:
         """What did not, since this was last told."""
         for name, gate in self.gates.items():
             new = gate.refused - self.told[name]
@@ -59,7 +58,7 @@ class Doors:
 
 
 @dataclass
-class Rig:
+class ReplayRig:
     """The loop as the world sees it, with all that a plan has happen to it.
 
     Attributes:
@@ -69,7 +68,7 @@ class Rig:
         missed: Ticks missed since the last one.
     """
 
-    plan: Drawn
+    plan: FlightDraw
     prepared: Prepared
     sink: Sink
     missed: int = 0
@@ -81,7 +80,7 @@ class Rig:
         config = self.plan.config
         self.loop = ControlLoop(config, self.prepared.controller, self.sink, lambda: 0)
         self._links = ("vehicle",) if config.daemon.vehicle == config.daemon.mocap else ("vehicle", "mocap")
-        self._doors = Doors(self._links) if self.plan.signed else None
+        self._doors = SignatureChannel(self._links) if self.plan.signed else None
         self._rng = np.random.default_rng((config.sim.seed, 1))
         self._heard: list[bytes] = []
 
@@ -89,7 +88,7 @@ class Rig:
         """Take a datagram."""
         self._heard = [*self._heard[-20:], data]
         if self._doors is not None:
-            data = self._doors.take(link, data, at_ns)
+            data = self._doors.accept(link, data, at_ns)
             if not data:
                 return Received((), False, False)
         return self.loop.receive(link, data, at_ns)
@@ -106,16 +105,16 @@ class Rig:
             self._stranger(at_ns)
         if tick in plan.skipped:
             self.missed += 1
-        elif tick in plan.late:
+        elif tick in plan.late_ticks:
             self._late.append((tick, at_ns))
         else:
-            for one, its_ns in [*self._late, (tick, at_ns)]:
-                stop = self.stop or (plan.stop_tick is not None and one >= plan.stop_tick)
-                self.loop.tick(one, its_ns, send, self.missed, stop=stop)
+            for past_tick, its_ns in [*self._late, (tick, at_ns)]:
+                stop = self.stop or (plan.stop_tick is not None and past_tick >= plan.stop_tick)
+                self.loop.tick(past_tick, its_ns, send, self.missed, stop=stop)
                 self.missed = 0
             self._late.clear()
         if self._doors is not None and at_ns % SECOND_NS == 0:
-            self._doors.tell(self.loop, at_ns)
+            self._doors.take_refused(self.loop, at_ns)
         self._reboot(tick + 1)
 
     def _stranger(self, at_ns: int) -> None:
@@ -143,38 +142,38 @@ class Rig:
         world.peers = Peers(_in(plan), at_ns, airborne=False, shared_link=len(self._links) == 1)
 
 
-def _in(plan: Drawn) -> Config:
+def _in(plan: FlightDraw) -> Config:
     return replace(plan.config, link=plan.link)
 
 
 @dataclass(frozen=True)
-class Replayed:
+class ReplayedFlight:
     """A flight and its replay.
 
     Attributes:
         seed: Of the flight.
         path: Its recording.
-        words: What it had; see `Drawn.words`.
+        labels: What it had; see `Drawn.words`.
         result: What the replay found.
-        seen: Modes, solves and events that the flight had, each with a count.
+        record_counts: Modes, solves and events that the flight had, each with a count.
         files: Files of the recording.
         flight_s: Virtual time flown [s].
-        apart: What `uavctl log replay` in a process of its own says otherwise; empty if nothing, or not asked.
+        process_difference: Difference by `uavctl log replay` in a process of its own; empty without one.
     """
 
     seed: int
     path: Path
-    words: tuple[str, ...]
+    labels: tuple[str, ...]
     result: ReplayResult
-    seen: Counter[str]
+    record_counts: Counter[str]
     files: int
     flight_s: float
-    apart: str = ""
+    process_difference: str = ""
 
     @property
-    def good(self) -> bool:
+    def is_identical(self) -> bool:
         """Whether nothing differs."""
-        return self.result.identical and not self.apart
+        return self.result.identical and not self.process_difference
 
 
 class _Seen:
@@ -192,15 +191,15 @@ class _Seen:
         self.inner.put(topic, at_ns, record)
 
 
-def record(seed: int, path: Path) -> tuple[Drawn, Counter[str]]:
+def record(seed: int, path: Path) -> tuple[FlightDraw, Counter[str]]:
     """Fly a seed's flight into the new recording `path`."""
-    plan = drawn(seed)
-    config, prepared = plan.config, prepared_of(plan.config)
+    plan = draw_flight(seed)
+    config, prepared = plan.config, prepare_config(plan.config)
     recorder = SyncRecorder(path, config.log, derived_topics=DerivedTopics(ViewBuilder()) if plan.viewers else None)
     sink = _Seen(recorder)
     try:
         put_header(recorder, prepared, started_ns=plan.start_ns)
-        rig = Rig(plan, prepared, sink)
+        rig = ReplayRig(plan, prepared, sink)
         rig.world = World(
             _in(plan),
             rig,
@@ -218,40 +217,42 @@ def record(seed: int, path: Path) -> tuple[Drawn, Counter[str]]:
     return plan, sink.count
 
 
-def replayed(seed: int, folder: Path) -> Replayed:
+def replay_seed(seed: int, folder: Path) -> ReplayedFlight:
     """Fly a seed's flight into a recording, and replay it from the recording alone."""
     path = folder / f"{seed}" / "flight.mcap"
-    plan, seen = record(seed, path)
-    found = read_info(path)
-    return Replayed(seed, path, plan.words, replay_flight(path).result, seen, len(found.files), found.duration_s)
+    plan, observed = record(seed, path)
+    result = read_info(path)
+    return ReplayedFlight(
+        seed, path, plan.labels, replay_flight(path).result, observed, len(result.files), result.duration_s
+    )
 
 
-def replayed_apart(path: Path) -> str:
+def replay_in_process(path: Path) -> str:
     """What a replay in a process of its own finds; empty if all is identical."""
     command = [sys.executable, "-m", "uavctl", "log", "replay", str(path), "--json"]
     ended = subprocess.run(command, capture_output=True, text=True, check=False)
     return "" if ended.returncode == 0 else ended.stdout or ended.stderr
 
 
-def tally(found: Iterable[Replayed]) -> dict[str, object]:
+def tally_flights(result: Iterable[ReplayedFlight]) -> dict[str, object]:
     """Figures of many flights."""
-    flights = sorted(found, key=lambda one: one.seed)
-    words, seen = Counter[str](), Counter[str]()
-    for one in flights:
-        words.update(one.words)
-        seen.update(one.seen)
+    flights = sorted(result, key=lambda flight_result: flight_result.seed)
+    arguments, observed = Counter[str](), Counter[str]()
+    for flight in flights:
+        arguments.update(flight.labels)
+        observed.update(flight.record_counts)
     return {
         "replayed": len(flights),
-        "identical": sum(one.good for one in flights),
-        "decisions": sum(one.result.decisions for one in flights),
-        "records": sum(one.result.compared for one in flights),
-        "in_several_files": sum(one.files > 1 for one in flights),
-        "virtual_s": round(sum(one.flight_s for one in flights), 1),
-        "had": dict(sorted(words.items())),
-        "seen": dict(sorted(seen.items())),
+        "identical": sum(flight.is_identical for flight in flights),
+        "decisions": sum(flight.result.decisions for flight in flights),
+        "records": sum(flight.result.compared for flight in flights),
+        "in_several_files": sum(flight.files > 1 for flight in flights),
+        "virtual_s": round(sum(flight.flight_s for flight in flights), 1),
+        "had": dict(sorted(arguments.items())),
+        "seen": dict(sorted(observed.items())),
         "wrong": {
-            str(one.seed): one.apart or msgspec.to_builtins(one.result.first_difference)
-            for one in flights
-            if not one.good
+            str(flight.seed): flight.process_difference or msgspec.to_builtins(flight.result.first_difference)
+            for flight in flights
+            if not flight.is_identical
         },
     }

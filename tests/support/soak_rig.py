@@ -10,7 +10,7 @@ from pathlib import Path
 from logs.recording.ends import put_header
 from logs.recording.recorder import SyncRecorder
 from sim.simulation import World
-from uavctl.build.controller import Prepared, design_of, prepare
+from uavctl.build.controller import Prepared, build_flight_design, prepare
 from uavctl.config import Config, load_config
 from uavctl.daemon.engagement import compute_stop_limit_s
 from uavctl.loop import ControlLoop
@@ -34,14 +34,14 @@ ALARMS = ("envelope-", "sample-jump", "sample-frozen")
 MOST_FINDINGS = 20  # of one flight: the first ones tell
 
 
-def prepared_for(*overrides: str) -> Prepared:
+def prepare_room(*overrides: str) -> Prepared:
     """Design and controller of preset `room`."""
     config = load_config("room-hahn-stursberg", overrides)
-    return prepare(config, design_of(config))
+    return prepare(config, build_flight_design(config))
 
 
 @dataclass
-class Watch:
+class LoopWatch:
     """The loop as the world sees it; holds on to what a tick decided, and what was wrong with it.
 
     Attributes:
@@ -117,16 +117,16 @@ class Watch:
         now = (0.0, 0.0, 0.0) if self._setpoint is None else self._setpoint.accel_mps2
         # The one leap that there is: level at once, where what is seen cannot be.
         level = now == (0.0, 0.0, 0.0) and any("envelope-" in alarm for alarm in self.alarms)
-        most = limits.slew_mps3 * self.prepared.controller.tick_ns * 1e-9
+        max_slew_mps2 = limits.slew_mps3 * self.prepared.controller.tick_ns * 1e-9
         for axis, (before, after, bound) in enumerate(zip(self._before, now, limits.accel_mps2, strict=True)):
             if not math.isfinite(after) or abs(after) > bound:
                 self.wrong.append(f"{when}: setpoint {after} m/s² of axis {axis} is beyond {bound}")
-            elif self._setpoint is not None and abs(after - before) > most + 1e-9 and not level:
+            elif self._setpoint is not None and abs(after - before) > max_slew_mps2 + 1e-9 and not level:
                 self.wrong.append(f"{when}: setpoint of axis {axis} leaps from {before} to {after} m/s²")
         self._before = now
 
 
-class Nowhere:
+class NullSink:
     """A sink that keeps nothing."""
 
     def put(self, topic: str, at_ns: int, record: Record) -> None:
@@ -136,12 +136,12 @@ class Nowhere:
 def fly(
     prepared: Prepared,
     config: Config,
-    after_tick: Callable[[World, Watch, int], None] = lambda *_: None,
+    after_tick: Callable[[World, LoopWatch, int], None] = lambda *_: None,
     *,
     take_off_m: float | None = None,
     path: Path | None = None,
     lands: bool = False,
-) -> Watch:
+) -> LoopWatch:
     """Fly in virtual time until it is over, on the ground where it took off.
 
     Args:
@@ -155,8 +155,8 @@ def fly(
     recorder = None if path is None else SyncRecorder(path, config.log)
     if recorder is not None:
         put_header(recorder, prepared, started_ns=0)
-    sink: Sink = recorder or Nowhere()
-    watch = Watch(prepared, sink, lambda at_ns: after_tick(world, watch, at_ns), take_off_m)
+    sink: Sink = recorder or NullSink()
+    watch = LoopWatch(prepared, sink, lambda at_ns: after_tick(world, watch, at_ns), take_off_m)
     world = World(
         config, watch, on_truth=lambda truth: sink.put("/sim/truth", truth.at_ns, truth), airborne=take_off_m is None
     )

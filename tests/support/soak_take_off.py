@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_rig import Client
-from take_off_rig import RELAYED, Flight
+from take_off_rig import RELAYED, TakeOffRig
 
 from uavctl.mavlink.handover_states import HandoverState
 
@@ -40,7 +40,7 @@ class TakeOff:
         what: What had become of the true vehicle: engaged, refused, landed; or what must not be.
         reached: Whether it had been engaged at any time.
         seconds: When that was so.
-        told: What the console had said of it.
+        texts: What the console had said of it.
         sentence: How it ended.
         wrong: What it did and should not have.
     """
@@ -50,12 +50,12 @@ class TakeOff:
     what: str
     reached: bool
     seconds: float
-    told: tuple[str, ...]
+    texts: tuple[str, ...]
     sentence: str
     wrong: tuple[str, ...]
 
 
-def troubled(autopilot: str, seed: int) -> Flight:
+def make_troubled_rig(autopilot: str, seed: int) -> TakeOffRig:
     """A take-off with checks that flicker, and a position that is not valid for a while after arming.
 
     PX4 says all that it says unasked, and climbs to the height of the order by itself, as the guide has it set. With
@@ -66,7 +66,7 @@ def troubled(autopilot: str, seed: int) -> Flight:
         rng.uniform(0.0, rng.choice([1.5, 6.0])),
         rng.choice([0.3, 1.2, 2.5, 8.0]) * rng.uniform(0.7, 1.3),
     )
-    flight = Flight(
+    flight = TakeOffRig(
         autopilot,
         *RELAYED,
         "sim.streams=onboard",
@@ -82,7 +82,7 @@ def troubled(autopilot: str, seed: int) -> Flight:
     return flight
 
 
-def outcome(flight: Flight) -> str:
+def judge_outcome(flight: TakeOffRig) -> str:
     """What has become of the true vehicle; `hovers` is what must not be."""
     up_m, pilot = -flight.peers.vehicle.position_m[2], flight.peers.autopilot.pilot
     if not pilot.is_armed and flight.peers.autopilot.vehicle.landed:
@@ -91,7 +91,7 @@ def outcome(flight: Flight) -> str:
     return "engaged" if flight.is_in(HandoverState.ENGAGED) and obeys and up_m > LOW_M else "hovers"
 
 
-def flown(flight: Flight) -> str:
+def judge_at_limit(flight: TakeOffRig) -> str:
     """The outcome by the limit; a flight that has ended is over."""
     flight.take_off(HEIGHT_M)
     to_come_s = max((end_s for _, end_s in flight.config.sim.checks.invalid), default=0.0)  # from arming on
@@ -102,34 +102,34 @@ def flown(flight: Flight) -> str:
         flight.run(1.0)
         armed_s += flight.peers.autopilot.pilot.is_armed
         engaged_s = engaged_s + 1.0 if flight.is_in(HandoverState.ENGAGED) else 0.0
-    return outcome(flight)
+    return judge_outcome(flight)
 
 
 def fly_take_off(autopilot: str, seed: int) -> TakeOff:
     """Fly one and judge it; what is still on its way down at the limit is looked at until it is there."""
-    flight = troubled(autopilot, seed)
-    what = flown(flight)
+    flight = make_troubled_rig(autopilot, seed)
+    what = judge_at_limit(flight)
     seconds, wrong = flight.now_ns * 1e-9, []
-    told = tuple(event.text for event in flight.notices)
+    texts = tuple(event.text for event in flight.notices)
     if what == "hovers":
         while not flight.loop.finished and flight.now_ns * 1e-9 < seconds + LANDING_S and what == "hovers":
             flight.run(1.0)
-            what = outcome(flight)
+            what = judge_outcome(flight)
         wrong.append(f"it was in the air and not flown at {seconds:.0f} s; then: {what}")
     if what == "hovers":
         wrong.append(f"nobody has it in the air ({flight.state})")
-    if what != "engaged" and not (told and flight.loop.account.end_sentence):
+    if what != "engaged" and not (texts and flight.loop.account.end_sentence):
         wrong.append("nobody was told why")
     if flight.state not in ATTENDED and flight.peers.autopilot.pilot.is_armed:
         wrong.append(f"it was left armed ({flight.state})")
     reached = flight.loop.account.was_engaged
-    return TakeOff(autopilot, seed, what, reached, round(seconds, 1), told, flight.loop.ending.sentence, tuple(wrong))
+    return TakeOff(autopilot, seed, what, reached, round(seconds, 1), texts, flight.loop.ending.sentence, tuple(wrong))
 
 
 def tally_take_offs(flights: Sequence[TakeOff]) -> dict[str, object]:
     """The figures of one autopilot's take-offs."""
-    found = Counter(flight.what for flight in flights)
-    late = max(flights, key=lambda flight: flight.seconds)
+    result = Counter(flight.what for flight in flights)
+    latest_flight = max(flights, key=lambda flight: flight.seconds)
     over = [flight.sentence for flight in flights if flight.what != "engaged"]
     causes = Counter(sentence.partition(":")[0].partition(";")[0] for sentence in over)
     return {
@@ -137,10 +137,10 @@ def tally_take_offs(flights: Sequence[TakeOff]) -> dict[str, object]:
         "engaged": sum(flight.reached for flight in flights),
         "landed_again": sum(flight.reached and flight.what == "landed" for flight in flights),
         "landed": sum(not flight.reached and flight.what == "landed" for flight in flights),
-        "refused": found["refused"],
-        "hovers": found["hovers"],
-        "latest_s": late.seconds,
-        "latest_seed": late.seed,
+        "refused": result["refused"],
+        "hovers": result["hovers"],
+        "latest_s": latest_flight.seconds,
+        "latest_seed": latest_flight.seed,
         "ended": dict(causes.most_common()),
         "wrong": {str(flight.seed): [*flight.wrong, flight.sentence] for flight in flights if flight.wrong},
     }

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from msgspec.structs import replace
 from scipy.linalg import expm, logm
-from synthetic_scene import Array, Scene, box
+from synthetic_scene import Scene, box
 
+from uavctl.arrays import Array
 from uavctl.records import (
     ControlMode,
     Decision,
@@ -66,21 +67,21 @@ def fly(
         if tick % round(1.0 / scene.tick_s) == 0:
             yield "/uavctl/vehicle", at_ns, replace(heartbeat, at_ns=at_ns)
         boundary = tick % per_step == 0
-        heard = boundary and (step == 0 or rng.random() > 0.3)
+        received = boundary and (step == 0 or rng.random() > 0.3)
         if blackout is not None and blackout[0] <= tick * scene.tick_s < blackout[1]:
-            heard = False
-        lost += boundary and not heard
+            received = False
+        lost += boundary and not received
         captured_ns = at_ns - round(CAPTURE_DELAY_S * 1e9)
-        samples = (_sample(scene, x, captured_ns, at_ns, step, rng),) if heard else ()
+        samples = (_sample(scene, x, captured_ns, at_ns, step, rng),) if received else ()
         yield "/uavctl/step_input", at_ns, StepInput(tick=tick, at_ns=at_ns, samples=samples)
-        solved = boundary and _decide(pilot, scene, x, at_ns, step, heard)
+        solved = boundary and _decide(pilot, scene, x, at_ns, step, received)
         if boundary:
             u = _input(pilot, scene)
             w = rng.normal(0.0, scene.noise_std)
         if solved and pilot.plan is not None:
             yield "/uavctl/plan", at_ns, pilot.plan
         yield "/sim/truth", at_ns, _truth(scene, x, u, at_ns, step + 1, lost)
-        yield from _spoken(scene, pilot, u, tick, step, at_ns, boundary, heard, solved)
+        yield from _spoken(scene, pilot, u, tick, step, at_ns, boundary, received, solved)
         yield (
             "/uavctl/timing",
             at_ns,
@@ -118,15 +119,15 @@ def _substep(scene: Scene, parts: int) -> tuple[Array, Array, Array]:
     return root[:n, :n], root[:n, n : n + m], root[:n, n + m :]
 
 
-def _decide(pilot: _Pilot, scene: Scene, x: Array, at_ns: int, step: int, heard: bool) -> bool:
+def _decide(pilot: _Pilot, scene: Scene, x: Array, at_ns: int, step: int, received: bool) -> bool:
     """Advance the pilot by a step; True when it solved."""
-    pilot.age = 0 if heard else pilot.age + 1
-    pilot.fresh = pilot.fresh + 1 if heard else 0
+    pilot.age = 0 if received else pilot.age + 1
+    pilot.fresh = pilot.fresh + 1 if received else 0
     pilot.falling = pilot.age >= 12 or (pilot.falling and pilot.fresh < 3)
     pilot.index += 1
-    if heard:
+    if received:
         pilot.mean = x.copy()
-    if heard and not pilot.falling:
+    if received and not pilot.falling:
         pilot.plan, pilot.index = _plan(scene, pilot.mean, at_ns, step), 0
         return True
     return False
@@ -211,7 +212,15 @@ def _truth(scene: Scene, x: Array, u: Array, at_ns: int, sent: int, lost: int) -
 
 
 def _spoken(
-    scene: Scene, pilot: _Pilot, u: Array, tick: int, step: int, at_ns: int, boundary: bool, heard: bool, solved: bool
+    scene: Scene,
+    pilot: _Pilot,
+    u: Array,
+    tick: int,
+    step: int,
+    at_ns: int,
+    boundary: bool,
+    received: bool,
+    solved: bool,
 ) -> Iterator[Item]:
     """Estimate, decision and events of a tick."""
     n = len(pilot.mean)
@@ -242,7 +251,7 @@ def _spoken(
             input=tuple(u.tolist()),
             fresh=pilot.fresh,
             missed_ticks=0,
-            accepted=int(heard),
+            accepted=int(received),
             rejected=0,
             reason="age reached the horizon" if pilot.falling else "plan",
         ),

@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import expm, solve_discrete_are
 
-Array = NDArray[np.float64]
+from uavctl.arrays import Array
 
 
 @dataclass(frozen=True)

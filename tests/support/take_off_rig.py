@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from loopback_rig import Memory, header, shared
+from loopback_rig import MemorySink, header, share_flight
 from sim_rig import decode
 
 from sim.autopilot.profile import SIMULATED
@@ -34,13 +34,13 @@ GOAL = (1.5, 1.0, -1.2)
 ON_THE_FLOOR = ["sim.start_position_m=[0.0,0.0,-0.7]", f"mission.waypoints=[{list(GOAL)}]", "mission.accept_m=0.3"]
 
 
-class Flight:
+class TakeOffRig:
     """The loop and the peers; between them the test may change, drop or add what is said."""
 
     def __init__(self, autopilot: str, *overrides: str) -> None:
         self.config = load_config("room-hahn-stursberg", [*ON_THE_FLOOR, f"sim.autopilot={autopilot}", *overrides])
-        self.memory = Memory()
-        design, controller = shared(self.config)
+        self.memory = MemorySink()
+        design, controller = share_flight(self.config)
         self.memory.put("/uavctl/header", 0, header(self.config, design))
         self.loop = ControlLoop(self.config, controller, self.memory, lambda: 0)
         self.peers = Peers(self.config, 0, airborne=False)
@@ -62,17 +62,17 @@ class Flight:
     def is_in(self, *states: HandoverState) -> bool:
         return self.state in states
 
-    def relayed(self) -> Flight:
+    def relayed(self) -> TakeOffRig:
         """The vehicle's own estimator gets no position but ours."""
         for name, value in EXTERNAL_ONLY[self.config.sim.autopilot].items():
             assert self.peers.autopilot.parameters.set(name, value)
         return self
 
-    def take_off(self, height_m: float = 1.2) -> Flight:
+    def take_off(self, height_m: float = 1.2) -> TakeOffRig:
         self.loop.order(Command(order=Order.TAKE_OFF, height_m=height_m))
         return self
 
-    def run(self, seconds: float, *, stop: bool = False, until: HandoverState | None = None) -> Flight:
+    def run(self, seconds: float, *, stop: bool = False, until: HandoverState | None = None) -> TakeOffRig:
         for _ in range(round(seconds * SECOND) // TICK_NS):
             if self.state is until:
                 return self
@@ -85,9 +85,9 @@ class Flight:
         assert until is None or self.state is until, (self.state, self.texts)
         return self
 
-    def _send(self, one: Outgoing) -> None:
-        if self.hears(one.data):
-            self.peers.receive(one.link, one.data, self.now_ns)
+    def _send(self, outgoing: Outgoing) -> None:
+        if self.hears(outgoing.data):
+            self.peers.receive(outgoing.link, outgoing.data, self.now_ns)
 
     def stick(self, mode: str) -> None:
         """The pilot changes the mode."""
@@ -96,8 +96,8 @@ class Flight:
 
     @property
     def states(self) -> list[str]:
-        told = [event.text for event in self.memory.of(Event) if event.code == "hand-over"]
-        return [text.split(" -> ")[1].split(" (")[0] for text in told]
+        texts = [event.text for event in self.memory.of(Event) if event.code == "hand-over"]
+        return [text.split(" -> ")[1].split(" (")[0] for text in texts]
 
     @property
     def texts(self) -> list[str]:
@@ -105,8 +105,8 @@ class Flight:
 
     def sent(self, kind: str) -> list[tuple[int, Any]]:
         """(time, message) of what went to the vehicle."""
-        found = [d for d in self.memory.of(Datagram) if d.outgoing and d.link == "vehicle"]
-        return [(d.at_ns, m) for d in found for m in decode(d.data) if m.get_type() == kind]
+        results = [d for d in self.memory.of(Datagram) if d.outgoing and d.link == "vehicle"]
+        return [(d.at_ns, m) for d in results for m in decode(d.data) if m.get_type() == kind]
 
     def commands(self) -> list[int]:
         """Numbers of the commands that were sent, but for streams."""

@@ -5,6 +5,6 @@ from __future__ import annotations
 import re
 
 
-def numbers_in(text: str) -> list[float]:
+def find_numbers(text: str) -> list[float]:
     """Return the numbers of a text in its order; a minus counts only where nothing stands before it."""
-    return [float(one.replace("−", "-")) for one in re.findall(r"(?<![\w.])[-−]?\d+(?:\.\d+)?", text)]
+    return [float(number.replace("−", "-")) for number in re.findall(r"(?<![\w.])[-−]?\d+(?:\.\d+)?", text)]

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from endings_rig import ON_THE_FLOOR, TAKE_OFF, Endings, in_virtual_time
+from endings_rig import ON_THE_FLOOR, TAKE_OFF, EndingRig, use_virtual_time
 from sim_rig import decode
 
 from uavctl.cli.app import run
@@ -26,14 +26,14 @@ VEHICLE = "udpin://127.0.0.1:1"  # never opened: the connections are the rig's
 FLIES = frozenset({"SET_POSITION_TARGET_LOCAL_NED", "SET_ATTITUDE_TARGET", "COMMAND_LONG", "COMMAND_INT", "SET_MODE"})
 
 
-def typed(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
+def run_command(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
     """Exit code, standard output and standard error."""
     code = run(arguments)
     output = capsys.readouterr()
     return code, output.out, output.err
 
 
-def words(folder: Path, *more: str) -> list[str]:
+def make_arguments(folder: Path, *more: str) -> list[str]:
     """A run of preset `room` on the simulated quadrotor."""
     return ["tune", "room", BOX, "--folder", str(folder), "--loopback", "--seed", "1", "--set", START, *more]
 
@@ -48,36 +48,36 @@ def short_flights() -> Iterator[None]:
 
 
 @dataclass(frozen=True)
-class Tuned:
+class TuneResult:
     """What one call of the command left.
 
     Attributes:
         code: Its exit code.
         document: Of `--json`; empty where there was none.
-        told: Standard error.
+        is_received: Standard error.
         rig: The flight, if there was one.
         folder: Of the run.
     """
 
     code: int
     document: dict[str, Any]
-    told: str
-    rig: Endings
+    console_text: str
+    rig: EndingRig
     folder: Path
 
-    def flies_after(self, at_ns: int) -> list[str]:
+    def find_motion_commands(self, at_ns: int) -> list[str]:
         """What we sent after a time that makes a vehicle move, or asks it for anything."""
-        found = [message for sent_ns, data in self.rig.sent if sent_ns > at_ns for message in decode(data)]
-        asks = [one for one in found if getattr(one, "command", None) != REQUEST_STREAM]
-        return [name for one in asks if (name := one.get_type()) in FLIES]
+        results = [message for sent_ns, data in self.rig.sent if sent_ns > at_ns for message in decode(data)]
+        asks = [message for message in results if getattr(message, "command", None) != REQUEST_STREAM]
+        return [name for message in asks if (name := message.get_type()) in FLIES]
 
 
-def real_rig(*overrides: str) -> Endings:
+def real_rig(*overrides: str) -> EndingRig:
     """The simulated peers behind the connections of a real vehicle."""
-    return Endings(Path(), "sim.plant=quadrotor", *overrides, preset="room")
+    return EndingRig(Path(), "sim.plant=quadrotor", *overrides, preset="room")
 
 
-def fly_real(rig: Endings, folder: Path, *more: str, enter: str | type[BaseException] = "") -> Tuned:
+def fly_real(rig: EndingRig, folder: Path, *more: str, enter: str | type[BaseException] = "") -> TuneResult:
     """Type `uavctl tune` of a real vehicle, armed by us; `enter` is what is typed when it asks."""
 
     def readline() -> str:
@@ -85,13 +85,13 @@ def fly_real(rig: Endings, folder: Path, *more: str, enter: str | type[BaseExcep
             return enter
         raise enter
 
-    sets = [word for setting in (*ON_THE_FLOOR, "sim.plant=quadrotor") for word in ("--set", setting)]
+    sets = [argument for setting in (*ON_THE_FLOOR, "sim.plant=quadrotor") for argument in ("--set", setting)]
     arguments = ["tune", "room", BOX, "--folder", str(folder), "--vehicle", VEHICLE, *sets, *TAKE_OFF, "--json", *more]
     out, err = io.StringIO(), io.StringIO()
     try:
         with (
             pytest.MonkeyPatch.context() as patch,
-            in_virtual_time(rig),
+            use_virtual_time(rig),
             short_flights(),
             # A folder with a short name: a socket's path has 107 bytes.
             tempfile.TemporaryDirectory(prefix="uavctl-") as control,
@@ -105,4 +105,4 @@ def fly_real(rig: Endings, folder: Path, *more: str, enter: str | type[BaseExcep
         for path in find_lock_paths(VEHICLE):
             path.unlink(missing_ok=True)
     text = out.getvalue()
-    return Tuned(code, json.loads(text) if text else {}, err.getvalue(), rig, folder)
+    return TuneResult(code, json.loads(text) if text else {}, err.getvalue(), rig, folder)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from patience import LIMIT_S, until
+from patience import LIMIT_S, wait_until
 from places import without_pages
 
 from logs.recording.reader import records
@@ -31,7 +31,9 @@ def fly_over_udp(out: Path, enough: Callable[[list[Truth]], bool], *options: str
         assert process.poll() is None, "it ended by itself"
         if not recording.exists():
             return False
-        planned = sum(one.boundary and one.mode is ControlMode.TRACK for one in records(recording, Decision))
+        planned = sum(
+            decision.boundary and decision.mode is ControlMode.TRACK for decision in records(recording, Decision)
+        )
         truths = list(records(recording, Truth))
         return planned >= 15 and bool(truths) and enough(truths)
 
@@ -39,23 +41,23 @@ def fly_over_udp(out: Path, enough: Callable[[list[Truth]], bool], *options: str
         [*command, *PATIENT, *options], stdout=subprocess.PIPE, text=True, env=without_pages()
     ) as process:
         try:
-            until(seen, "it flies")
+            wait_until(seen, "it flies")
             process.send_signal(signal.SIGINT)
-            told, _ = process.communicate(timeout=LIMIT_S)
+            output, _ = process.communicate(timeout=LIMIT_S)
         finally:
             process.kill()
     assert process.returncode == 0
-    found: dict[str, Any] = json.loads(told)
-    return found
+    document: dict[str, Any] = json.loads(output)
+    return document
 
 
 def assert_in_order(recording: Path, dt_ns: int) -> None:
     """No tick and no step is unaccounted for, and what the vehicle flew is what it was told."""
     decisions, truths = list(records(recording, Decision)), list(records(recording, Truth))
-    assert sum(1 + one.missed_ticks for one in decisions) == decisions[-1].tick + 1
+    assert sum(1 + decision.missed_ticks for decision in decisions) == decisions[-1].tick + 1
     assert {after.at_ns - before.at_ns for before, after in pairwise(truths)} == {dt_ns}
-    told = np.array([(0.0, 0.0, 0.0), *(one.accel_mps2 for one in records(recording, Setpoint))])
-    flown = np.unique([one.input for one in truths], axis=0)
+    setpoints = np.array([(0.0, 0.0, 0.0), *(setpoint.accel_mps2 for setpoint in records(recording, Setpoint))])
+    flown = np.unique([truth.input for truth in truths], axis=0)
     assert flown.any()
-    for one in flown:
-        assert np.abs(told - one).max(axis=1).min() < 1e-6
+    for applied in flown:
+        assert np.abs(setpoints - applied).max(axis=1).min() < 1e-6

@@ -40,11 +40,11 @@ class UlogWriter:
         self._definitions += message("I", self._keyed(f"char[{len(text)}]", name) + text.encode())
 
     def parameter(self, kind: str, name: str, value: float, *, later: bool = False) -> None:
-        told = message("P", self._keyed(kind, name) + struct.pack(f"<{CODES[kind]}", value))
+        data = message("P", self._keyed(kind, name) + struct.pack(f"<{CODES[kind]}", value))
         if later:
-            self._data += told
+            self._data += data
         else:
-            self._definitions += told
+            self._definitions += data
 
     def text(self, severity: int, at_us: int, text: str) -> None:
         self._data += message("L", struct.pack("<cQ", str(severity).encode(), at_us) + text.encode())

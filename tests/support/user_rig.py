@@ -14,7 +14,7 @@ NOBODY = 65_534
 OTHER = NOBODY if os.geteuid() == 0 else os.geteuid()
 
 
-def as_other(does: Callable[[], str]) -> str:
+def run_as_other_user(does: Callable[[], str]) -> str:
     """What a function of a process of the other user's gives, or the name of the error that it raises."""
     reading, writing = os.pipe()
     with warnings.catch_warnings():
@@ -34,8 +34,8 @@ def as_other(does: Callable[[], str]) -> str:
             os.write(writing, text.encode())
             os._exit(0)
     os.close(writing)
-    with os.fdopen(reading) as told:
-        text = told.read()
+    with os.fdopen(reading) as pipe:
+        text = pipe.read()
     os.waitpid(child, 0)
     return text
 

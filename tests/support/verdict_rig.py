@@ -6,15 +6,14 @@ from collections.abc import Callable
 
 import numpy as np
 from loopback_rig import header
-from numpy.typing import NDArray
 
 from logs.recording.flight import FlightData
+from uavctl.arrays import Array
 from uavctl.build.controller import build_design, build_estimator, build_plant
 from uavctl.config import Config, load_config
 from uavctl.flight.kalman import make_kalman
 from uavctl.records import ControlMode, Decision, PositionSample, Record, StepInput, VehicleStatus
 
-Array = NDArray[np.float64]
 VEHICLE = VehicleStatus(at_ns=0, autopilot="px4", armed=True, mode="OFFBOARD", external=True)
 CAPTURED_NS = 30_000_000  # into each step
 ARRIVED_NS = 40_000_000  # later
@@ -30,7 +29,7 @@ def plain(_step: int, w: Array) -> Array:
     return w
 
 
-def as_modelled(
+def simulate_model(
     config: Config,
     steps: int,
     *,
@@ -71,12 +70,12 @@ def as_modelled(
         coming.append(u)
         acting = coming.pop(0)
         f, g = kalman.propagation.over(CAPTURED_NS)
-        seen = (f @ z + g @ acting)[kalman.measured_index[: len(kalman.axes)]] + rng.normal(
+        observed = (f @ z + g @ acting)[kalman.measured_index[: len(kalman.axes)]] + rng.normal(
             0.0, believed.position_std_m, 3
         )
         if step == 0 or rng.random() >= loss:
             stamp_ns = begun_ns + CAPTURED_NS + late_ns
-            waiting = [sample(seen, stamp_ns, stamp_ns + ARRIVED_NS, step, believed.position_std_m)]
+            waiting = [sample(observed, stamp_ns, stamp_ns + ARRIVED_NS, step, believed.position_std_m)]
         f, g = kalman.propagation.over(dt_ns)
         state = (f @ z + g @ acting)[: kalman.n_x]
     return FlightData.from_records(items)

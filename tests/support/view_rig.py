@@ -7,7 +7,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from loopback_rig import Memory, lockstep
+from loopback_rig import MemorySink, lockstep
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
@@ -19,12 +19,12 @@ SECONDS = 6.0
 
 
 @cache
-def flown() -> Memory:
+def fly_view() -> MemorySink:
     """Six seconds in the room, with times as a shell measures them."""
     memory = lockstep("room-hahn-stursberg", SECONDS, "solver.method=exact")
-    for one in memory.of(Decision):
-        timing = Timing(tick=one.tick, at_ns=one.at_ns, lateness_ns=1500, step_ns=250_000, send_ns=400_000)
-        memory.put("/uavctl/timing", one.at_ns, timing)
+    for decision in memory.of(Decision):
+        timing = Timing(tick=decision.tick, at_ns=decision.at_ns, lateness_ns=1500, step_ns=250_000, send_ns=400_000)
+        memory.put("/uavctl/timing", decision.at_ns, timing)
     memory.entries.sort(key=lambda entry: entry[1])
     return memory
 
@@ -32,14 +32,14 @@ def flown() -> Memory:
 def record(path: Path) -> Path:
     """The flight's file."""
     recorder = SyncRecorder(path, derived_topics=DerivedTopics(ViewBuilder()))
-    for entry in flown().entries:
+    for entry in fly_view().entries:
         recorder.put(*entry)
     status = recorder.close()
     assert status.ok and not status.unseen
     return path
 
 
-def protobuf(path: Path) -> Iterator[tuple[str, str, int, Any]]:
+def read_protobuf(path: Path) -> Iterator[tuple[str, str, int, Any]]:
     """Topic, schema name, log time and decoded message of each protobuf message, through the reader of others."""
     with path.open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-from loopback_rig import Memory, header, lockstep, shared
+from loopback_rig import MemorySink, header, lockstep, share_flight
 
 from uavctl.config import Config, load_config
 from uavctl.lab.whatif.flight import (
@@ -29,39 +29,39 @@ Case = tuple[str, float, tuple[str, ...]]
 WIRE = 1e-5
 
 
-def config_of(case: Case, *changes: str) -> Config:
+def load_case_config(case: Case, *changes: str) -> Config:
     name, duration_s, overrides = case
     return load_config(name, [f"duration_s={duration_s}", *overrides, *changes])
 
 
 @cache
-def flown(case: Case, *changes: str) -> Memory:
+def fly_case(case: Case, *changes: str) -> MemorySink:
     name, duration_s, overrides = case
     return lockstep(name, duration_s, *overrides, *changes)
 
 
 @cache
 def history(case: Case) -> RecordedFlight:
-    return make_recorded_flight(flown(case).entries, config_of(case), "recording")
+    return make_recorded_flight(fly_case(case).entries, load_case_config(case), "recording")
 
 
-def again(case: Case, *changes: str, other: OtherLink | None = None) -> tuple[Memory, ReflownFlight]:
-    config, memory = config_of(case, *changes), Memory()
-    design, controller = shared(config)
+def fly_again(case: Case, *changes: str, other_link: OtherLink | None = None) -> tuple[MemorySink, ReflownFlight]:
+    config, memory = load_case_config(case, *changes), MemorySink()
+    design, controller = share_flight(config)
     memory.put("/uavctl/header", 0, header(config, design))
-    response = make_response(history(case), config_of(case).plant)
-    course = refly(history(case), config, controller, response, memory, lambda: 0, other)
+    response = make_response(history(case), load_case_config(case).plant)
+    course = refly(history(case), config, controller, response, memory, lambda: 0, other_link)
     return memory, course
 
 
-def far(some: Memory, others: Memory) -> float:
+def compute_differences(some: MemorySink, others: MemorySink) -> float:
     """Largest difference of the true states, and of the inputs that acted."""
     left, right = some.of(Truth), others.of(Truth)
-    assert [one.at_ns for one in left] == [one.at_ns for one in right]
-    states = np.array([one.state for one in left]) - np.array([one.state for one in right])
-    inputs = np.array([one.input for one in left]) - np.array([one.input for one in right])
+    assert [decision.at_ns for decision in left] == [decision.at_ns for decision in right]
+    states = np.array([decision.state for decision in left]) - np.array([decision.state for decision in right])
+    inputs = np.array([decision.input for decision in left]) - np.array([decision.input for decision in right])
     return float(max(np.abs(states).max(), np.abs(inputs).max()))
 
 
-def stripped(case: Case, kind: type[Record]) -> list[Entry]:
-    return [entry for entry in flown(case).entries if not isinstance(entry[2], kind)]
+def strip_recording(case: Case, kind: type[Record]) -> list[Entry]:
+    return [entry for entry in fly_case(case).entries if not isinstance(entry[2], kind)]

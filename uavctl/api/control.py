@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sim.faults import check_fault_support
-from uavctl.build.controller import build_plant, build_problem, build_solver, design_of
+from uavctl.arrays import Array
+from uavctl.build.controller import build_flight_design, build_plant, build_problem, build_solver
 from uavctl.build.link import build_ages
 from uavctl.config import Config, dump_config, parse
 from uavctl.config import load as load_file
@@ -35,34 +36,33 @@ if TYPE_CHECKING:
 
     from uavctl.lab.campaign.controllers import CellSetting, Recipe
 
-Array = NDArray[np.float64]
 Source = Config | str | Path
 
 
 def load(source: Source = "room", overrides: Mapping[str, object] | None = None, /, **keys: object) -> Config:
-    """Load a configuration: a preset's name, a TOML file, or one that is there, with some keys given anew.
+    """Load a configuration from a preset, a TOML file or another configuration, with some keys changed.
 
     Args:
-        source: What it is made from.
+        source: Name of a preset, path of a TOML file, or a configuration.
         overrides: Values by dotted key, as in `{"link.loss": 0.3}`.
         keys: Values of keys at the top, and tables of them, as in `duration_s=10, link={"loss": 0.3}`.
 
     Raises:
         ConfigError: With all problems found, one a line.
-        UsageError: The overrides are no mapping.
+        UsageError: The overrides are not a mapping.
     """
     if not isinstance(overrides, Mapping | None):
         raise UsageError(f'{overrides!r} does not say which key is to differ; give {{"link.loss": 0.3}}')
-    given = tuple(format_overrides({**(overrides or {}), **keys}))
+    overrides_text = tuple(format_overrides({**(overrides or {}), **keys}))
     if isinstance(source, Config):
-        loaded = parse(dump_config(source), source.name, given)
+        loaded = parse(dump_config(source), source.name, overrides_text)
     else:
-        loaded = load_file(str(source), given)
+        loaded = load_file(str(source), overrides_text)
     check_fault_support(loaded)
     return loaded.config
 
 
-def loaded(source: Source) -> Config:
+def resolve_config(source: Source) -> Config:
     """Return a configuration, loaded if a name or a file is given."""
     return source if isinstance(source, Config) else load(source)
 
@@ -72,9 +72,9 @@ def plant(config: Source) -> Plant:
 
     Raises:
         ConfigError: The configuration is wrong.
-        DesignError: It is no plant.
+        DesignError: Its plant is not valid.
     """
-    return build_plant(loaded(config))
+    return build_plant(resolve_config(config))
 
 
 def link(config: Source) -> AgeModel:
@@ -84,11 +84,11 @@ def link(config: Source) -> AgeModel:
         ConfigError: The configuration is wrong.
         DesignError: No position can be counted on.
     """
-    return build_ages(loaded(config))
+    return build_ages(resolve_config(config))
 
 
 class Signal(NamedTuple):
-    """A state or an input: its name, its unit (empty where that is not known), and the column of tables."""
+    """A state or an input: its name, its unit (empty if unknown), and the column of tables."""
 
     name: str
     unit: str
@@ -98,21 +98,21 @@ class Signal(NamedTuple):
 _SUFFIXES = {"m": "_m", "m/s": "_mps", "m/s²": "_mps2"}
 
 
-def signals(config: Config) -> tuple[tuple[Signal, ...], tuple[Signal, ...]]:
+def list_signals(config: Config) -> tuple[tuple[Signal, ...], tuple[Signal, ...]]:
     """Return the states and the inputs of a configuration's plant, in order."""
-    of = build_plant(config)
-    states = names_of((), of.n_x, of.axes, of.position_index, of.velocity_index, of.extra_states).states
+    model = build_plant(config)
+    states = names_of((), model.n_x, model.axes, model.position_index, model.velocity_index, model.extra_states).states
     unit = "" if config.plant.model == "matrices" else "m/s²"
-    inputs = [(f"{axis} input", unit) for axis in of.axes] or [(f"input {i}", "") for i in range(of.n_u)]
-    made = (
-        tuple(Signal(name, unit, re.sub(r"\W+", "_", name) + _SUFFIXES.get(unit, "")) for name, unit in given)
-        for given in (states, inputs)
+    inputs = [(f"{axis} input", unit) for axis in model.axes] or [(f"input {i}", "") for i in range(model.n_u)]
+    signal_groups = (
+        tuple(Signal(name, unit, re.sub(r"\W+", "_", name) + _SUFFIXES.get(unit, "")) for name, unit in named_units)
+        for named_units in (states, inputs)
     )
-    return next(made), next(made)
+    return next(signal_groups), next(signal_groups)
 
 
-def limits_of(config: Config) -> tuple[list[tuple[float, float]], list[tuple[float, float]]]:
-    """Return lower and upper limit of each state and of each input; infinite where there is none."""
+def get_limits(config: Config) -> tuple[list[tuple[float, float]], list[tuple[float, float]]]:
+    """Return lower and upper limit of each state and of each input; infinite without a limit."""
     sets = config.sets
     states = list(zip(sets.state_lower, sets.state_upper, strict=True))
     return states, list(zip(sets.input_lower, sets.input_upper, strict=True))
@@ -120,23 +120,23 @@ def limits_of(config: Config) -> tuple[list[tuple[float, float]], list[tuple[flo
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Plan(Answer):
-    """The answer of `solve`, with the configuration that it was asked for."""
+    """The answer of `solve`, with its configuration."""
 
     config: Config = field(kw_only=True)
 
     def __repr__(self) -> str:
-        """Return a few lines: how it ended, and the first input with its units."""
+        """Return a few lines: the status, and the first input with its units."""
         text = super().__repr__()
         if not self.inputs.size:
             return text
-        _, inputs = signals(self.config)
-        begins = ", ".join(
-            f"{one.name} {value:.4g} {one.unit}".rstrip() for one, value in zip(inputs, self.inputs[0], strict=True)
+        _, inputs = list_signals(self.config)
+        first_input = ", ".join(
+            f"{signal.name} {value:.4g} {signal.unit}".rstrip()
+            for signal, value in zip(inputs, self.inputs[0], strict=True)
         )
-        ahead_s = len(self.inputs) * self.config.plant.dt_s
-        return (
-            f"{text.partition(chr(10))[0]}\n  first input: {begins}\n  looks {ahead_s:g} s ahead ({self.config.name})"
-        )
+        horizon_s = len(self.inputs) * self.config.plant.dt_s
+        first_line, _, _ = text.partition("\n")
+        return f"{first_line}\n  first input: {first_input}\n  looks {horizon_s:g} s ahead ({self.config.name})"
 
 
 def solve(config: Source, state: ArrayLike, target: ArrayLike | None = None) -> Plan:
@@ -145,50 +145,50 @@ def solve(config: Source, state: ArrayLike, target: ArrayLike | None = None) -> 
     The solver of a configuration is kept for the next call.
 
     Args:
-        config: What is flown, and with which scheme.
+        config: The configuration, with plant and scheme.
         state: State now (n_x,), axis by axis.
         target: Equilibrium to go to (n_x,); None: the configured one.
 
     Raises:
         ConfigError: The configuration is wrong.
         DesignError: There is no design.
-        UsageError: The state is none of this plant.
+        UsageError: The state is not one of this plant.
     """
-    found = loaded(config)
-    design, solver = _solver(found)
+    loaded = resolve_config(config)
+    design, solver = _build_cached_solver(loaded)
     n_x = design.plant.n_x
-    wanted = design.target if target is None else state_of(target, n_x)
-    answer = solver.solve(0, state_of(state, n_x), wanted)
-    return Plan(**{one.name: getattr(answer, one.name) for one in fields(Answer)}, config=found)
+    target_state = design.target if target is None else make_state(target, n_x)
+    answer = solver.solve(0, make_state(state, n_x), target_state)
+    return Plan(**{entry.name: getattr(answer, entry.name) for entry in fields(Answer)}, config=loaded)
 
 
 @lru_cache(maxsize=8)
-def _solver(config: Config) -> tuple[AnyDesign, Solver]:
-    design = design_of(config)
+def _build_cached_solver(config: Config) -> tuple[AnyDesign, Solver]:
+    design = build_flight_design(config)
     return design, build_solver(design, config)
 
 
-def state_of(given: ArrayLike, n_x: int) -> Array:
-    """Return a state (n_x,) that a person gave.
+def make_state(value: ArrayLike, n_x: int) -> Array:
+    """Return a state (n_x,) from the value of a caller.
 
     Raises:
         UsageError: It is not n_x finite numbers.
     """
     try:
-        state = np.array(given, dtype=np.float64)
+        state = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):
         state = np.empty(0)
     if state.shape != (n_x,) or not np.isfinite(state).all():
-        raise UsageError(f"{given!r} is not a state of this plant; give {n_x} finite numbers")
+        raise UsageError(f"{value!r} is not a state of this plant; give {n_x} finite numbers")
     return state
 
 
 class SteppedController:
-    """A controller of one run that is asked step by step; implements nothing but what a loop of your own needs.
+    """Controller of one run that is called step by step, for a loop of your own.
 
     Args:
         controller: The controller.
-        problem: What it is made for; its input limits are the actuators'.
+        problem: Its control problem; the input limits are those of the actuators.
     """
 
     def __init__(self, controller: BatchController, problem: ControlProblem) -> None:
@@ -209,37 +209,39 @@ class SteppedController:
         """Return the input (n_u,) that acts in the next step, within the actuators' limits.
 
         Args:
-            state: State (n_x,) that a packet tells; None where none has come.
-            age_steps: How many steps ago it was captured; older ones than are known change nothing.
+            state: State (n_x,) of a packet; None if no packet has come.
+            age_steps: Steps since its capture; a packet older than the newest one changes nothing.
 
         Raises:
-            UsageError: The first state is missing, it is none of this plant, or older than the run.
-            UavctlError: The controller asked for numbers that are not finite.
+            UsageError: The first state is missing, not one of this plant, or older than the run.
+            UavctlError: The input of the controller is not finite.
         """
         step, plant = len(self._inputs), self.problem.plant
         if not 0 <= age_steps <= step:
             raise UsageError(f"a packet of step {step} cannot be {age_steps} steps old; give 0 to {step}")
         if state is not None:
-            told = state_of(state, plant.n_x)
+            reported_state = make_state(state, plant.n_x)
             if step - age_steps > self._newest:
-                self._newest, self._state = step - age_steps, told
+                self._newest, self._state = step - age_steps, reported_state
         elif not step:
             raise UsageError("the first step needs a state: a controller has to know where it begins")
-        acted = np.array(self._inputs).reshape(1, step, plant.n_u)
-        news = Information(step, np.array([self._newest]), self._state[np.newaxis], acted)
-        with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is told
-            asked = self._controller.act(news)[0]
-        if not np.isfinite(asked).all():
-            raise UavctlError(f"the controller asks for {asked} in step {step}; is the state far beyond the limits?")
-        self._inputs.append(np.clip(asked, *self.problem.input_set.bounds))
+        applied = np.array(self._inputs).reshape(1, step, plant.n_u)
+        measurement = Information(step, np.array([self._newest]), self._state[np.newaxis], applied)
+        with np.errstate(over="ignore", invalid="ignore"):  # an infinite input is reported below
+            requested = self._controller.act(measurement)[0]
+        if not np.isfinite(requested).all():
+            raise UavctlError(
+                f"the controller asks for {requested} in step {step}; is the state far beyond the limits?"
+            )
+        self._inputs.append(np.clip(requested, *self.problem.input_set.bounds))
         return self._inputs[-1].copy()
 
 
 def controller(config: Source, kind: str = "smpc") -> SteppedController:
-    """Return a controller to be stepped in a loop of your own, told states that may be lost.
+    """Return a controller to be stepped in a loop of your own, with states that may be lost.
 
     Args:
-        config: What it is made for.
+        config: The configuration of its problem.
         kind: `smpc`, a baseline of campaigns (`lqg`, `mean-qp` …), an entry point, or `module:Class`.
 
     Raises:
@@ -248,55 +250,58 @@ def controller(config: Source, kind: str = "smpc") -> SteppedController:
     """
     from uavctl.lab.campaign.controllers import build_from_recipe
 
-    found = loaded(config)
-    recipe, _ = cell_of(found, kind)
-    return SteppedController(build_from_recipe(recipe), build_problem(found))
+    loaded = resolve_config(config)
+    recipe, _ = make_cell(loaded, kind)
+    return SteppedController(build_from_recipe(recipe), build_problem(loaded))
 
 
-def cell_of(config: Config, kind: str, **spec: object) -> tuple[Recipe, CellSetting]:
-    """Return the one cell of a campaign: the recipe of a controller, and what its runs meet.
+def make_cell(config: Config, kind: str, **spec: object) -> tuple[Recipe, CellSetting]:
+    """Return the single cell of a campaign: the recipe of a controller, and the setting of its runs.
 
     Args:
-        config: What is flown, and believed.
+        config: Configuration of the runs, and of the model of the controller.
         kind: Kind of the controller.
         spec: Further keys of the campaign, as docs/campaign-keys.md has them.
 
     Raises:
-        ConfigError: The configuration is none that campaigns fly.
+        ConfigError: Campaigns do not fly this configuration.
         UsageError: A key of the campaign is wrong.
         DesignError: There is no such controller.
     """
     from uavctl.lab.campaign.controllers import CellSetting, make_recipe
     from uavctl.lab.campaign.spec import CampaignSpec, compose, find_plant_problems
 
-    given = {"name": "python", "config": config.name, "controller": [{"name": kind, "kind": kind}], **spec}
+    document = {"name": "python", "config": config.name, "controller": [{"name": kind, "kind": kind}], **spec}
     try:
-        campaign = msgspec.convert(given, CampaignSpec)
+        campaign = msgspec.convert(document, CampaignSpec)
     except msgspec.ValidationError as error:
         raise UsageError(f"{error}; docs/campaign-keys.md says what is possible") from error
-    wrong = tuple(
-        f"{one.key}: {one.reason}; load it with {one.todo}" for one in find_plant_problems(config, (), "config")
+    problems = tuple(
+        f"{problem.key}: {problem.reason}; load it with {problem.todo}"
+        for problem in find_plant_problems(config, (), "config")
     )
-    if wrong:
-        raise ConfigError(wrong)
-    base = msgspec.structs.replace(config, mission=MissionConfig(), fence=())  # runs go to the target alone
-    made = compose(campaign, dump_config(base))
-    believed = made.get_believed_link(0, 0)
-    recipe = make_recipe(made.get_tuned_controller(0, believed), made.believed_configs[0, believed], campaign)
+    if problems:
+        raise ConfigError(problems)
+    base = msgspec.structs.replace(config, mission=MissionConfig(), fence=())  # a run only goes to the target
+    cells = compose(campaign, dump_config(base))
+    believed_link = cells.get_believed_link(0, 0)
+    recipe = make_recipe(
+        cells.get_tuned_controller(0, believed_link), cells.believed_configs[0, believed_link], campaign
+    )
     setting = CellSetting(
-        campaign, made.base, made.flown_plants[0].plant, made.flown_links[0].link, campaign.disturbance[0]
+        campaign, cells.base, cells.flown_plants[0].plant, cells.flown_links[0].link, campaign.disturbance[0]
     )
     return recipe, setting
 
 
-_ARRAYS = ("states", "inputs", "age", "cost", "state_violated", "input_violated", "failed")
+_RUN_ARRAYS = ("states", "inputs", "age", "cost", "state_violated", "input_violated", "failed")
 
 
 @dataclass(frozen=True, eq=False)
 class Runs:
-    """N runs of T steps of one controller; run i of a seed meets the same whoever flies."""
+    """N runs of T steps of one controller; run i of a seed has equal disturbances and losses for every controller."""
 
-    config: Config  # what was flown
+    config: Config
     controller: str  # kind of the controller
     seed: int  # of the draws
     time_s: Array  # (T+1,), of the states
@@ -309,42 +314,46 @@ class Runs:
     failed: NDArray[np.bool_]  # whether a run ended in numbers that are not finite (N,)
 
     def __repr__(self) -> str:
-        """Return two lines: what was flown, and what it came to."""
+        """Return two lines: the runs, and their figures."""
         runs, steps = self.cost.shape
-        good = ~self.failed
-        cost = f"{self.cost[good].sum(axis=1).mean():.6g}" if good.any() else "none, all failed"
+        is_good = ~self.failed
+        outside = self.state_violated[is_good].mean() if is_good.any() else 0.0
+        cost = f"{self.cost[is_good].sum(axis=1).mean():.6g}" if is_good.any() else "none, all failed"
         failed = f", {int(self.failed.sum())} failed" if self.failed.any() else ""
         return (
             f"{runs} runs of {steps} steps by {self.controller} on {self.config.name}, seed {self.seed}{failed}\n"
-            f"  mean cost {cost}, outside the state limits {self.state_violated[good].mean() if good.any() else 0:.2%} "
+            f"  mean cost {cost}, outside the state limits {outside:.2%} "
             f"of the time, oldest position {int(self.age_steps.max(initial=0))} steps"
         )
 
     def _columns(self) -> dict[str, list[Any]]:
-        """One row for each run and step; the last state of a run has no input, age or cost, the first no verdict."""
-        (runs, steps), (states, inputs) = self.cost.shape, signals(self.config)
-        before, after = np.arange(steps + 1) < steps, np.arange(steps + 1) > 0
+        """Make columns of one row for each run and step.
 
-        def spread(values: NDArray[Any], where: NDArray[np.bool_]) -> list[Any]:
+        The last state of a run has no input, age or cost, the first no verdict.
+        """
+        (runs, steps), (states, inputs) = self.cost.shape, list_signals(self.config)
+        has_input, has_verdict = np.arange(steps + 1) < steps, np.arange(steps + 1) > 0
+
+        def spread(values: NDArray[Any], has_value: NDArray[np.bool_]) -> list[Any]:
             cells = np.full((runs, steps + 1), None, dtype=object)
-            cells[:, where] = values
+            cells[:, has_value] = values
             return list(cells.ravel())
 
-        found: dict[str, list[Any]] = {
+        table: dict[str, list[Any]] = {
             "run": np.repeat(np.arange(runs), steps + 1).tolist(),
             "step": np.tile(np.arange(steps + 1), runs).tolist(),
             "time_s": np.tile(self.time_s, runs).tolist(),
         }
-        found |= {one.column: self.states[:, :, i].ravel().tolist() for i, one in enumerate(states)}
-        found |= {one.column: spread(self.inputs[:, :, i], before) for i, one in enumerate(inputs)}
-        for name, values, where in (
-            ("age_steps", self.age_steps, before),
-            ("cost", self.cost, before),
-            ("state_violated", self.state_violated, after),
-            ("input_violated", self.input_violated, before),
+        table |= {signal.column: self.states[:, :, i].ravel().tolist() for i, signal in enumerate(states)}
+        table |= {signal.column: spread(self.inputs[:, :, i], has_input) for i, signal in enumerate(inputs)}
+        for name, values, has_value in (
+            ("age_steps", self.age_steps, has_input),
+            ("cost", self.cost, has_input),
+            ("state_violated", self.state_violated, has_verdict),
+            ("input_violated", self.input_violated, has_input),
         ):
-            found[name] = spread(values, where)
-        return found | {"failed": np.repeat(self.failed, steps + 1).tolist()}
+            table[name] = spread(values, has_value)
+        return table | {"failed": np.repeat(self.failed, steps + 1).tolist()}
 
     def to_pandas(self) -> pandas.DataFrame:
         """Return one table, a row for each run and step: `run`, `step`, `time_s`, states, inputs, age and cost.
@@ -355,11 +364,11 @@ class Runs:
         need("pandas", "pandas")
         import pandas as pd
 
-        kinds = {"age_steps": "Int64", "state_violated": "boolean", "input_violated": "boolean"}
+        column_types = {"age_steps": "Int64", "state_violated": "boolean", "input_violated": "boolean"}
         columns = self._columns()
-        _, inputs = signals(self.config)
-        kinds |= dict.fromkeys(("cost", *(one.column for one in inputs)), "float64")
-        return pd.DataFrame({name: pd.Series(cells, dtype=kinds.get(name)) for name, cells in columns.items()})
+        _, inputs = list_signals(self.config)
+        column_types |= dict.fromkeys(("cost", *(signal.column for signal in inputs)), "float64")
+        return pd.DataFrame({name: pd.Series(cells, dtype=column_types.get(name)) for name, cells in columns.items()})
 
     def to_polars(self) -> polars.DataFrame:
         """Return the same table as a polars frame.
@@ -408,12 +417,14 @@ def simulate(
     from uavctl.lab.campaign.spec import CHUNK
     from uavctl.lab.campaign.tasks import Task, fly_task
 
-    found = loaded(config)
-    begin = () if start is None else tuple(state_of(start, build_plant(found).n_x).tolist())
-    recipe, setting = cell_of(found, controller, runs=runs, steps=steps, master=seed, start=begin, measured=measured)
+    loaded = resolve_config(config)
+    start_state = () if start is None else tuple(make_state(start, build_plant(loaded).n_x).tolist())
+    recipe, setting = make_cell(
+        loaded, controller, runs=runs, steps=steps, master=seed, start=start_state, measured=measured
+    )
     task = Task(0, 0, runs, setting, recipe)
     parts = [fly_task(task, first, min(CHUNK, runs - first))[0] for first in range(0, runs, CHUNK)]
 
-    arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS}
+    arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _RUN_ARRAYS}
     arrays["age_steps"] = arrays.pop("age")
-    return Runs(found, controller, seed, np.arange(steps + 1, dtype=np.float64) * found.plant.dt_s, **arrays)
+    return Runs(loaded, controller, seed, np.arange(steps + 1, dtype=np.float64) * loaded.plant.dt_s, **arrays)

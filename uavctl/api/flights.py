@@ -18,8 +18,9 @@ from logs.recording.flight import FlightData
 from logs.recording.reader import header, lacks_end, records
 from logs.recording.reader import read as read_records
 from logs.recording.summary import FlightSummary, summarise
-from uavctl.api.control import Array, Plan, Runs, Signal, Source, limits_of, load, loaded, signals
-from uavctl.build.controller import build_problem, design_of, prepare
+from uavctl.api.control import Plan, Runs, Signal, Source, get_limits, list_signals, load, resolve_config
+from uavctl.arrays import Array
+from uavctl.build.controller import build_flight_design, build_problem, prepare
 from uavctl.config import Config
 from uavctl.config.load import parse_recorded
 from uavctl.daemon.engagement import Engagement, check_places, compute_stop_limit_s, make_goto_keys
@@ -38,14 +39,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Recording:
-    """A recording whose topics can be had as tables; they are read from the disk when they are asked for.
+    """A recording with its topics as tables; a table is read from the disk on request.
 
     Every table has `log_time_ns`, `time_s` (since the first record) and, since version 0.2, `utc`; then the record's
     own fields, with their units in their names.
     """
 
     path: Path  # its first file
-    topics: tuple[str, ...]  # those it holds, and lists of records within them, as `/uavctl/step_input.samples`
+    topics: tuple[str, ...]  # its topics, and lists of records within them, as `/uavctl/step_input.samples`
 
     def __repr__(self) -> str:
         """Return one line; `topics` are the tables."""
@@ -92,8 +93,8 @@ class Recording:
         import pandas as pd
 
         table = self.arrow(topic)
-        kinds = {"int64": pd.Int64Dtype(), "bool": pd.BooleanDtype()}
-        frame: pandas.DataFrame = table.to_pandas(types_mapper=lambda kind: kinds.get(str(kind)))
+        column_types = {"int64": pd.Int64Dtype(), "bool": pd.BooleanDtype()}
+        frame: pandas.DataFrame = table.to_pandas(types_mapper=lambda arrow_type: column_types.get(str(arrow_type)))
         return frame
 
     def polars(self, topic: str) -> polars.DataFrame:
@@ -136,19 +137,19 @@ def read(path: str | Path, *, torn: bool = False) -> Recording:
         RecordingError: There is none, it is damaged, or it has no end and `torn` is not set.
     """
     path = Path(path)
-    cut = lacks_end(path)
-    if cut and not torn:
+    end_problem = lacks_end(path)
+    if end_problem and not torn:
         raise RecordingError(
-            f"{path}: {cut}; read(path, torn=True) reads it as far as it goes, `uavctl log recover` restores it"
+            f"{path}: {end_problem}; read(path, torn=True) reads it as far as it goes, `uavctl log recover` restores it"
         )
     return Recording(path, list_tables(path))
 
 
 @dataclass(frozen=True, eq=False)
 class Flight:
-    """A simulated flight: how it ended, its recording, and where the vehicle truly was."""
+    """A simulated flight: its ending, its recording, and the true path of the vehicle."""
 
-    config: Config  # what was flown
+    config: Config
     ending: Ending  # cause, sentence, whether as ordered, exit code
     recording: Recording
     time_s: Array  # (n,), of the true path: every Δt
@@ -156,7 +157,7 @@ class Flight:
     velocity_mps: Array  # true velocity (n, 3), local NED
 
     def __repr__(self) -> str:
-        """Return three lines: configuration and length, how it ended, recording."""
+        """Return three lines: configuration and length, ending, recording."""
         flown_s = self.time_s[-1] - self.time_s[0] if len(self.time_s) else 0.0
         return (
             f"flight of {self.config.name}, {flown_s:g} s\n  ended: {self.ending.sentence}\n"
@@ -176,7 +177,7 @@ def fly(
     """Fly the simulated vehicle in virtual time, as `uavctl loopback` does; the same seed gives the same flight.
 
     Args:
-        config: What is flown.
+        config: The configuration.
         out: Folder of the recording; None: a new one below `flights/`.
         seed: Seed of every random draw; None: `sim.seed`.
         duration_s: Length [s]; None: that of the configuration.
@@ -190,19 +191,19 @@ def fly(
         RecordingError: The recording cannot be written, or is there already.
         UsageError: The flight is shorter than a tick, or the vehicle may not rest where it is to climb or go.
     """
-    given = {"sim.seed": seed, "duration_s": duration_s, **({} if goto is None else make_goto_keys(goto))}
+    keys = {"sim.seed": seed, "duration_s": duration_s, **({} if goto is None else make_goto_keys(goto))}
     if take_off_m is not None and not take_off_m > 0:
         raise UsageError(f"take_off_m {take_off_m}: give a height above the ground [m]")
-    found = load(loaded(config), {key: value for key, value in given.items() if value is not None})
-    check_length(found)
-    design = design_of(found)
-    engagement = Engagement(found, take_off_m=take_off_m, goto=goto is not None)
-    check_places(found, design, take_off_m, engagement.goal)
-    prepared = prepare(found, design)
-    with create_recording(None if out is None else Path(out), found.name, found.log.free_bytes) as path:
+    flight_config = load(resolve_config(config), {key: value for key, value in keys.items() if value is not None})
+    check_length(flight_config)
+    design = build_flight_design(flight_config)
+    engagement = Engagement(flight_config, take_off_m=take_off_m, goto=goto is not None)
+    check_places(flight_config, design, take_off_m, engagement.goal)
+    prepared = prepare(flight_config, design)
+    with create_recording(None if out is None else Path(out), flight_config.name, flight_config.log.free_bytes) as path:
         flight = LockstepFlight(prepared, path, command="uavctl.fly")
         engagement.begin(flight.loop)
-        landing_s = None if take_off_m is None else compute_stop_limit_s(found, takes_off=True)
+        landing_s = None if take_off_m is None else compute_stop_limit_s(flight_config, takes_off=True)
         try:
             flight.fly(lambda _: True, observer=engagement, landing_s=landing_s)
         except Exception as error:
@@ -212,12 +213,12 @@ def fly(
             status = flight.close()
     truth = tuple(records(path, Truth))
     return Flight(
-        config=found,
+        config=flight_config,
         ending=describe_ending(flight.loop.ending, status),
         recording=read(path, torn=True),
-        time_s=np.array([one.at_ns for one in truth]) * 1e-9,
-        position_m=np.array([one.position_m for one in truth]).reshape(-1, 3),
-        velocity_mps=np.array([one.velocity_mps for one in truth]).reshape(-1, 3),
+        time_s=np.array([sample.at_ns for sample in truth]) * 1e-9,
+        position_m=np.array([sample.position_m for sample in truth]).reshape(-1, 3),
+        velocity_mps=np.array([sample.velocity_mps for sample in truth]).reshape(-1, 3),
     )
 
 
@@ -231,14 +232,14 @@ def plot(what: Plan | Runs | Flight | Recording) -> Figure:
     has no axes), and between which two values nine in ten runs are. Flight: the path from above and from the side.
 
     Raises:
-        UsageError: It is nothing that has a figure.
+        UsageError: It has no figure.
         RecordingError: Nothing was flown in the recording.
     """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8.0, 3.2), layout="constrained")
     if isinstance(what, Plan):
-        _draw_answer(figure, what)
+        _draw_plan(figure, what)
     elif isinstance(what, Runs):
         _draw_runs(figure, what)
     elif isinstance(what, Flight):
@@ -250,62 +251,65 @@ def plot(what: Plan | Runs | Flight | Recording) -> Figure:
     return figure
 
 
-_PANELS = 3  # in a row
-_MOST_PANELS = 12
+_PANELS_PER_ROW = 3
+_MAX_PANELS = 12
 
 
 class _Panel(NamedTuple):
-    """Signals that share a panel: its title and unit, and (label, values (…, T), limits, target) of each."""
+    """Panel of several signals: title, unit, and (label, values (…, T), limits, target) of each signal."""
 
     title: str
     unit: str
     rows: list[tuple[str, Array, tuple[float, float], float | None]]
 
 
-def _panels(
-    given: Sequence[Signal], values: Array, limits: Sequence[tuple[float, float]], target: Array | None
+def _group_panels(
+    signals: Sequence[Signal], values: Array, limits: Sequence[tuple[float, float]], target: Array | None
 ) -> list[_Panel]:
-    """Put signals of a kind into one panel, those of an own plant each into its own."""
-    found: dict[str, _Panel] = {}
-    for i, one in enumerate(given):
-        axis, _, kind = one.name.partition(" ")
-        key = kind if axis in AXES else one.name
-        panel = found.setdefault(key, _Panel(key, one.unit, []))
-        label = axis if axis in AXES else one.name
+    """Group signals of a kind into one panel; each signal of a plant without axes has its own."""
+    panels: dict[str, _Panel] = {}
+    for i, signal in enumerate(signals):
+        axis, _, kind = signal.name.partition(" ")
+        key = kind if axis in AXES else signal.name
+        panel = panels.setdefault(key, _Panel(key, signal.unit, []))
+        label = axis if axis in AXES else signal.name
         panel.rows.append((label, values[..., i], limits[i], None if target is None else float(target[i])))
-    return list(found.values())
+    return list(panels.values())
 
 
-def _draw_answer(figure: Figure, plan: Plan) -> None:
+def _draw_plan(figure: Figure, plan: Plan) -> None:
     if not plan.inputs.size:
         raise UsageError(f"there is no plan to draw: {plan!r}")
-    (states, inputs), (low_x, low_u) = signals(plan.config), limits_of(plan.config)
-    panels = [*_panels(states, plan.states, low_x, plan.reference), *_panels(inputs, plan.inputs, low_u, None)]
-    for ax, panel in _grid(figure, panels, "time ahead [s]"):
+    (states, inputs), (state_limits, input_limits) = list_signals(plan.config), get_limits(plan.config)
+    panels = [
+        *_group_panels(states, plan.states, state_limits, plan.reference),
+        *_group_panels(inputs, plan.inputs, input_limits, None),
+    ]
+    for ax, panel in _make_grid(figure, panels, "time ahead [s]"):
         for number, (label, values, limits, target) in enumerate(panel.rows):
             time_s = plan.config.plant.dt_s * np.arange(len(values))
-            held = "steps-post" if len(values) < len(plan.states) else "default"
-            ax.plot(time_s, values, color=f"C{number}", label=label, drawstyle=held)
+            drawstyle = "steps-post" if len(values) < len(plan.states) else "default"
+            ax.plot(time_s, values, color=f"C{number}", label=label, drawstyle=drawstyle)
             _draw_limits(ax, limits, target, f"C{number}")
-        _explain(ax, panel)
+        _add_legend(ax, panel)
 
 
 def _draw_runs(figure: Figure, runs: Runs) -> None:
     if runs.failed.all():
         raise UsageError(f"there is no run to draw: {runs!r}")
-    problem, (states, _), (limits, _) = build_problem(runs.config), signals(runs.config), limits_of(runs.config)
-    shown = list(problem.plant.position_index) or list(range(problem.plant.n_x))
+    problem, (states, _), (limits, _) = build_problem(runs.config), list_signals(runs.config), get_limits(runs.config)
+    state_indices = list(problem.plant.position_index) or list(range(problem.plant.n_x))
     panels = [
         _Panel(states[i].name, states[i].unit, [("median", runs.states[:, :, i], limits[i], float(problem.target[i]))])
-        for i in shown
+        for i in state_indices
     ]
-    for ax, panel in _grid(figure, panels, "time [s]"):
-        ((label, values, sides, target),) = panel.rows
+    for ax, panel in _make_grid(figure, panels, "time [s]"):
+        ((label, values, limits_of_state, target),) = panel.rows
         low, middle, high = np.quantile(values[~runs.failed], _QUANTILES, axis=0)
         ax.fill_between(runs.time_s, low, high, alpha=0.25, lw=0, label="nine in ten runs")
         ax.plot(runs.time_s, middle, label=label)
-        _draw_limits(ax, sides, target, "C3")
-        _explain(ax, panel)
+        _draw_limits(ax, limits_of_state, target, "C3")
+        _add_legend(ax, panel)
 
 
 def _draw_limits(ax: Axes, limits: tuple[float, float], target: float | None, colour: str) -> None:
@@ -316,21 +320,21 @@ def _draw_limits(ax: Axes, limits: tuple[float, float], target: float | None, co
         ax.axhline(target, ls=":", lw=1.0, color=colour)
 
 
-def _explain(ax: Axes, panel: _Panel) -> None:
+def _add_legend(ax: Axes, panel: _Panel) -> None:
     ax.plot([], [], ls="--", lw=1.0, color="0.4", label="limit")
     if any(target is not None for *_, target in panel.rows):
         ax.plot([], [], ls=":", lw=1.0, color="0.4", label="target")
     ax.legend(fontsize="x-small")
 
 
-def _grid(figure: Figure, panels: Sequence[_Panel], x_label: str) -> Iterator[tuple[Axes, _Panel]]:
+def _make_grid(figure: Figure, panels: Sequence[_Panel], x_label: str) -> Iterator[tuple[Axes, _Panel]]:
     """Yield axes for the first panels, a few in a row, with title, unit and time."""
-    shown = panels[:_MOST_PANELS]
-    columns = min(_PANELS, len(shown))
+    shown = panels[:_MAX_PANELS]
+    columns = min(_PANELS_PER_ROW, len(shown))
     rows = -(-len(shown) // columns)
     figure.set_size_inches(3.4 * columns + 0.6, 2.9 * rows)
-    for place, panel in enumerate(shown, 1):
-        ax = figure.add_subplot(rows, columns, place)
+    for position, panel in enumerate(shown, 1):
+        ax = figure.add_subplot(rows, columns, position)
         unit = f" [{panel.unit}]" if panel.unit else ""
         ax.set(title=panel.title.capitalize(), xlabel=x_label, ylabel=f"{panel.title}{unit}")
         ax.grid(visible=True, alpha=0.3)
@@ -343,14 +347,14 @@ def _draw_path(figure: Figure, recording: Recording) -> None:
     views = [("From above", ("east", "north"))]
     if "down" in recording.data.design.axes:
         views.append(("From the south", ("east", "down")))
-    for place, (title, shown) in enumerate(views, 1):
-        names = ["height" if axis == "down" else axis for axis in shown]
-        ax = _axes(figure, len(views), place, title, f"{names[0]} [m]", f"{names[1]} [m]")
-        draw_path(ax, recording.data, shown)
+    for position, (title, view_axes) in enumerate(views, 1):
+        names = ["height" if axis == "down" else axis for axis in view_axes]
+        ax = _add_axes(figure, len(views), position, title, f"{names[0]} [m]", f"{names[1]} [m]")
+        draw_path(ax, recording.data, view_axes)
 
 
-def _axes(figure: Figure, count: int, place: int, title: str, x_label: str, y_label: str) -> Axes:
-    ax = figure.add_subplot(1, count, place)
+def _add_axes(figure: Figure, count: int, position: int, title: str, x_label: str, y_label: str) -> Axes:
+    ax = figure.add_subplot(1, count, position)
     ax.set(title=title, xlabel=x_label, ylabel=y_label)
     ax.grid(visible=True, alpha=0.3)
     return ax

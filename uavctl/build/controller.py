@@ -1,4 +1,4 @@
-"""Composition: a configuration's numbers become plant, design, solver and controller; and its provenance."""
+"""Composition of plant, design, solver and controller from a configuration, and the versions that made it."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from uavctl import __version__
 from uavctl.arithmetic import ARITHMETIC
-from uavctl.build.link import build_ages, build_delayed_link, late_steps, promised
-from uavctl.build.mission import build_mission, build_names, build_rests
-from uavctl.build.outside import controller_id, decider_id, flown_outside
-from uavctl.build.rest import check_axes, resting_target
+from uavctl.arrays import SECOND_NS, Array
+from uavctl.build.link import build_ages, build_delayed_link, compute_late_steps, compute_promised_probability
+from uavctl.build.mission import build_mission, build_names, build_rest_limits
+from uavctl.build.outside import build_outside_solver, compute_code_id, compute_controller_id
+from uavctl.build.rest import check_axes, compute_rest_target
 from uavctl.config.checks import get_position_limits_m
 from uavctl.config.types import Config
 from uavctl.errors import DesignError
@@ -42,35 +42,33 @@ from uavctl.smpc.nominal import ControlProblem
 from uavctl.smpc.plant import AXES, Plant, VelocityReferenceAxis, drag_lag, velocity_reference
 from uavctl.smpc.sets import Polytope
 
-# The paper's scheme is loaded only where it is flown: loading it takes a tenth of the time of all else.
+# The paper's scheme is loaded only if it flies: loading it takes a tenth of the time of all other imports.
 if TYPE_CHECKING:
     from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec
 
-NANOSECONDS = 1e9
-
 Value = TypeVar("Value")
 
-# Where `[envelope]` says nothing; the figures of false alarms are in docs/soak.md.
-AT_REST_MPS = 0.1  # noise of a vehicle's own velocity at rest, and a little
-LEAST_OUTSIDE_M = 0.5
-LEAST_UNEXPLAINED_MPS2, ENVELOPE_SIGMA = 1.5, 6.0
-DISAGREES_S = 0.17
-LEAST_WINDOW_S = 1.2
+# Defaults of `[envelope]`; docs/soak.md has the figures of false alarms.
+AT_REST_MPS = 0.1  # above the noise of a vehicle's velocity at rest
+MIN_OUTSIDE_M = 0.5
+MIN_UNEXPLAINED_MPS2, ENVELOPE_SIGMA = 1.5, 6.0
+DISAGREEMENT_TIME_S = 0.17
+MIN_WINDOW_S = 1.2
 
 
 def build_plant(config: Config) -> Plant:
-    """The plant (1).
+    """Build the plant (1).
 
     Raises:
-        DesignError: The matrices are no sampled continuous plant.
+        DesignError: The matrices are not those of a sampled continuous plant.
     """
     plant = config.plant
     if plant.model == "drag-lag":
         return drag_lag(plant.drag_1ps, plant.lag_s, plant.gain, plant.wind_std_mps2, plant.dt_s, plant.axes)
     if plant.model == "velocity-reference":
-        numbers = (getattr(plant, key) for key in VelocityReferenceAxis._fields)
+        columns = (getattr(plant, key) for key in VelocityReferenceAxis._fields)
         return velocity_reference(
-            [VelocityReferenceAxis(*one) for one in zip(*numbers, strict=True)], plant.dt_s, plant.axes
+            [VelocityReferenceAxis(*column) for column in zip(*columns, strict=True)], plant.dt_s, plant.axes
         )
     a, b, e, w, accel = (
         np.array(rows, dtype=np.float64) for rows in (plant.a, plant.b, plant.e, plant.w, plant.accel_per_input)
@@ -90,10 +88,10 @@ def build_plant(config: Config) -> Plant:
     )
 
 
-def start_state(config: Config, plant: Plant) -> NDArray[np.float64]:
-    """State (n_x,) in which the simulator starts."""
+def make_start_state(config: Config, plant: Plant) -> Array:
+    """Return the state (n_x,) in which the simulator starts."""
     if not plant.axes:
-        return resting_target(config, plant)[0]
+        return compute_rest_target(config, plant)[0]
     state = plant.equilibrium(config.sim.start_position_m)
     for axis, index in zip(plant.axes, plant.velocity_index, strict=True):
         state[index] = config.sim.start_velocity_mps[AXES.index(axis)]
@@ -101,7 +99,7 @@ def start_state(config: Config, plant: Plant) -> NDArray[np.float64]:
 
 
 def build_spec(config: Config) -> DesignSpec:
-    """Return the specification that the configuration gives for a design.
+    """Build the specification of a design.
 
     Raises:
         DesignError: A key of scheme `hahn-stursberg` is missing; see also `build_plant` and `build_delayed_link`.
@@ -109,21 +107,21 @@ def build_spec(config: Config) -> DesignSpec:
     from uavctl.smpc.hahn_stursberg.design import DesignSpec
 
     smpc, schedule, sets = config.smpc, config.schedule, config.sets
-    tau, plant = needed(smpc.tau, "smpc.tau"), build_plant(config)
-    # Assumption 4.1 covers ages up to τ: one more, for the rarer gaps and for those that came before.
-    form = None if config.risk.estimate == "exact" else _innovations(config, plant, tau + 1)
+    tau, plant = require_value(smpc.tau, "smpc.tau"), build_plant(config)
+    # Assumption 4.1 covers ages up to τ. One more loss covers the rarer gaps and earlier ones.
+    form = None if config.risk.estimate == "exact" else _build_innovations(config, plant, tau + 1)
     return DesignSpec(
         plant=plant if form is None else form.plant,
         state_set=Polytope.from_box(sets.state_lower, sets.state_upper),
-        input_set=_planned_inputs(config),
+        input_set=_build_planned_inputs(config),
         q_x=np.diag(config.cost.state),
         q_u=np.diag(config.cost.input),
         horizon=smpc.horizon,
         tau=tau,
         delta_x=smpc.delta_x,
-        delta_u=needed(smpc.delta_u, "smpc.delta_u"),
-        delta_tau=needed(smpc.delta_tau, "smpc.delta_tau"),
-        k_tau=np.array(needed(smpc.k_tau, "smpc.k_tau"), dtype=np.float64),
+        delta_u=require_value(smpc.delta_u, "smpc.delta_u"),
+        delta_tau=require_value(smpc.delta_tau, "smpc.delta_tau"),
+        k_tau=np.array(require_value(smpc.k_tau, "smpc.k_tau"), dtype=np.float64),
         link=build_delayed_link(config),
         target_m=config.target.position_m,
         rule=schedule.rule,
@@ -133,7 +131,7 @@ def build_spec(config: Config) -> DesignSpec:
         allocation=config.risk.allocation,
         slack_linear=smpc.slack_linear,
         slack_quadratic=smpc.slack_quadratic,
-        offset_weight=needed(smpc.offset_weight, "smpc.offset_weight"),
+        offset_weight=require_value(smpc.offset_weight, "smpc.offset_weight"),
         terminal_weight=smpc.terminal_weight,
         max_iterations=config.solver.max_iterations,
         joint=schedule.joint,
@@ -141,11 +139,11 @@ def build_spec(config: Config) -> DesignSpec:
     )
 
 
-def needed(value: Value | None, key: str) -> Value:
-    """The value of a key that scheme `age-conditioned` does without.
+def require_value(value: Value | None, key: str) -> Value:
+    """Return the value of a key that scheme `age-conditioned` does not need.
 
     Raises:
-        DesignError: It is not there.
+        DesignError: It is missing.
     """
     if value is None:
         raise DesignError(key, "is missing, and what is asked for needs it", "add it, as the presets have it")
@@ -153,14 +151,14 @@ def needed(value: Value | None, key: str) -> Value:
 
 
 def build_problem(config: Config) -> ControlProblem:
-    """The control problem of a configuration, without a scheme.
+    """Build the control problem of a configuration, without a scheme.
 
     Raises:
-        DesignError: The plant is none, or cannot rest at the target.
+        DesignError: The plant is not valid, or cannot rest at the target.
     """
     plant, sets = build_plant(config), config.sets
     q_x, q_u = np.diag(config.cost.state), np.diag(config.cost.input)
-    target, u_target = resting_target(config, plant)
+    target, u_target = compute_rest_target(config, plant)
     return ControlProblem(
         plant=plant,
         state_set=Polytope.from_box(sets.state_lower, sets.state_upper),
@@ -175,82 +173,80 @@ def build_problem(config: Config) -> ControlProblem:
     )
 
 
-def build_conditioned(
-    config: Config, *, flown: bool = True, cov: NDArray[np.float64] | None = None
-) -> ConditionedDesign:
-    """Return the design that flights of the scheme with risk conditioned on the age are planned with.
+def build_conditioned(config: Config, *, for_flight: bool = True, cov: Array | None = None) -> ConditionedDesign:
+    """Build the design of the scheme with risk conditioned on the age.
 
     Args:
-        flown: Whether the flight's own filter estimates, biases included, and the last gate limits how fast what is
-            planned may change; in a campaign neither is there.
-        cov: Covariance (n_x, n_x) of the estimate's error after a position, where none is lost, if it is not flown;
-            None: what the configuration says of it.
+        for_flight: Whether the flight's filter estimates, biases included, and the last gate limits the slew of the
+            inputs; a campaign has neither.
+        cov: Covariance (n_x, n_x) of the estimate's error after a position without losses, in a campaign; None: as
+            configured.
 
     Raises:
         DesignError: See `build_problem`, `build_ages`, `ConditionedSolver` and `innovation_form`.
     """
-    problem = replace(build_problem(config), input_set=_planned_inputs(config))
-    flown = flown and bool(config.plant.axes)
-    link, allowed = build_ages(config), 1.0 - config.smpc.delta_x
-    slew_mps3 = config.limits.slew_mps3 if flown else math.inf
-    plant, estimator, seen = problem.plant, config.estimator, None
-    if flown and estimator.bias_drift:
-        seen = add_bias(plant, estimator.bias_drift, force=estimator.inertial_std_mps2 > 0.0)
-    if cov is None and flown:
-        cov = _settled(config, plant)
+    problem = replace(build_problem(config), input_set=_build_planned_inputs(config))
+    for_flight = for_flight and bool(config.plant.axes)
+    link, max_risk = build_ages(config), 1.0 - config.smpc.delta_x
+    slew_mps3 = config.limits.slew_mps3 if for_flight else math.inf
+    plant, estimator, estimator_plant = problem.plant, config.estimator, None
+    if for_flight and estimator.bias_drift:
+        estimator_plant = add_bias(plant, estimator.bias_drift, force=estimator.inertial_std_mps2 > 0.0)
+    if cov is None and for_flight:
+        cov = _compute_settled_covariance(config, plant)
     elif cov is None:
         exact = config.risk.estimate == "exact"
-        cov = np.zeros((plant.n_x,) * 2) if exact else _innovations(config, plant, 0).estimate_cov
-    solver = ConditionedSolver(problem, link, allowed, slew_mps3=slew_mps3, cov=cov, seen=seen)
-    return ConditionedDesign(solver, cov, conditioned_id(problem, link, allowed, slew_mps3, cov, seen))
+        cov = np.zeros((plant.n_x,) * 2) if exact else _build_innovations(config, plant, 0).estimate_cov
+    solver = ConditionedSolver(problem, link, max_risk, slew_mps3=slew_mps3, cov=cov, seen=estimator_plant)
+    return ConditionedDesign(solver, cov, conditioned_id(problem, link, max_risk, slew_mps3, cov, estimator_plant))
 
 
-def _planned_inputs(config: Config) -> Polytope:
-    """U of the plans: what is flown against a bias of up to bias_max stays free, and both together keep the limits."""
+def _build_planned_inputs(config: Config) -> Polytope:
+    """Build the input set of the plans: the limits less bias_max, which is free for the compensation of a bias."""
     free = config.estimator.bias_max
     lower, upper = (np.array(side) for side in (config.sets.input_lower, config.sets.input_upper))
     return Polytope.from_box((lower + free).tolist(), (upper - free).tolist())
 
 
-def _innovations(config: Config, plant: Plant, losses: int) -> InnovationForm:
-    """The plant as the configured filter sees it, and what that does not know after so many losses in a row."""
+def _build_innovations(config: Config, plant: Plant, losses: int) -> InnovationForm:
+    """Build the innovation form of the plant for the configured filter, and its error after `losses` in a row."""
     estimator = config.estimator
-    age_s = _position_age_s(config)
+    age_s = _compute_position_age_s(config)
     return innovation_form(plant, estimator.position_std_m, age_s, losses, estimator.bias_drift)
 
 
-def _position_age_s(config: Config) -> float:
-    """Age of a step's position at its end, up to a step [s]."""
+def _compute_position_age_s(config: Config) -> float:
+    """Return the age of a step's position at the end of the step, at most a step [s]."""
     link, dt_s = config.link, config.plant.dt_s
-    # It may be from the very beginning of the step, unless others follow it.
-    since_s = 1.0 / config.source.rate_hz if config.source.rate_hz else dt_s
-    return min(dt_s, since_s + link.delay_s + link.jitter_s)
+    # It may be captured at the beginning of the step, unless later ones follow.
+    capture_age_s = 1.0 / config.source.rate_hz if config.source.rate_hz else dt_s
+    return min(dt_s, capture_age_s + link.delay_s + link.jitter_s)
 
 
-def _settled(config: Config, plant: Plant) -> NDArray[np.float64]:
-    """Return the filter's error covariance where a plan begins, with a position and inertial data in every step."""
-    dt_ns = round(plant.dt_s * NANOSECONDS)
+def _compute_settled_covariance(config: Config, plant: Plant) -> Array:
+    """Compute the filter's error covariance at the begin of a plan, with a position and inertial data in every step."""
+    dt_ns = round(plant.dt_s * SECOND_NS)
     kalman = make_kalman(plant, build_estimator(config), dt_ns)
-    dead_ns = round(config.plant.dead_time_s * NANOSECONDS)
-    return settle_covariance(kalman, dt_ns, round(_position_age_s(config) * NANOSECONDS), dead_ns)
+    dead_ns = round(config.plant.dead_time_s * SECOND_NS)
+    return settle_covariance(kalman, dt_ns, round(_compute_position_age_s(config) * SECOND_NS), dead_ns)
 
 
-def design_of(config: Config) -> AnyDesign:
-    """Return the design that a flight is planned with, by `smpc.scheme`.
+def build_flight_design(config: Config) -> AnyDesign:
+    """Build the design of a flight, by `smpc.scheme`.
 
     Raises:
-        DesignError: There is none, naming key, reason and what to do.
+        DesignError: There is none; the error has key, reason and advice.
     """
     return build_conditioned(config) if config.is_age_conditioned else build_design(config)
 
 
 def build_design(config: Config) -> Design:
-    """The design of scheme `hahn-stursberg`, and those for late positions, checked against Assumption 4.
+    """Build the design of scheme `hahn-stursberg`, and those for late positions, and check them against Assumption 4.
 
-    Its schedule is checked for being fast enough too.
+    The duration of a decision with its schedule is checked, too.
 
     Raises:
-        DesignError: There is none, naming key, reason and what to do.
+        DesignError: There is none; the error has key, reason and advice.
     """
     from uavctl.smpc.hahn_stursberg.design import make_design
     from uavctl.smpc.hahn_stursberg.exact import check_schedule, optimal_cost, with_late
@@ -258,20 +254,17 @@ def build_design(config: Config) -> Design:
     spec = build_spec(config)
     design = make_design(spec, optimal_cost)
     check_schedule(design)
-    return with_late(design, spec, late_steps(config))
+    return with_late(design, spec, compute_late_steps(config))
 
 
 def build_solver(design: AnyDesign, config: Config) -> Solver:
-    """The solver of a design: `smpc.controller`, that of scheme `age-conditioned`, or the one of `solver.method`.
-
-    Args:
-        config: The configuration that it is made from.
+    """Build the solver of a design: `smpc.controller`, that of scheme `age-conditioned`, or by `solver.method`.
 
     Raises:
         DesignError: The design does not fit the solver.
     """
     if config.smpc.controller:
-        return flown_outside(config, build_problem(config))
+        return build_outside_solver(config, build_problem(config))
     if isinstance(design, ConditionedDesign):
         return design.solver
     if config.solver.method == "exact":
@@ -291,13 +284,13 @@ def build_solver(design: AnyDesign, config: Config) -> Solver:
     return PrintedSolver(design)
 
 
-def resting(design: AnyDesign) -> NDArray[np.float64]:
-    """Right sides (m_x,) of the state rows, less what a plan of the scheme keeps from them that rests."""
-    return design.rests if isinstance(design, ConditionedDesign) else build_rests(design)
+def compute_rest_limits(design: AnyDesign) -> Array:
+    """Return the right sides (m_x,) of the state rows, less the back-offs of a plan at rest."""
+    return design.rests if isinstance(design, ConditionedDesign) else build_rest_limits(design)
 
 
-def record_of(design: AnyDesign) -> dict[str, object]:
-    """A design of either scheme as plain numbers."""
+def make_design_record(design: AnyDesign) -> dict[str, object]:
+    """Return a design of either scheme as plain numbers."""
     if isinstance(design, ConditionedDesign):
         return conditioned_record(design)
     from uavctl.smpc.hahn_stursberg.design import design_record
@@ -305,9 +298,13 @@ def record_of(design: AnyDesign) -> dict[str, object]:
     return design_record(design)
 
 
-def _promised(config: Config) -> float:
-    """The least probability of news in a step that plans count on."""
-    return 1.0 - build_ages(config).outage(1) if config.is_age_conditioned else promised(build_delayed_link(config))
+def _compute_min_probability(config: Config) -> float:
+    """Return the least probability of a new position in a step that plans count on."""
+    return (
+        1.0 - build_ages(config).outage(1)
+        if config.is_age_conditioned
+        else compute_promised_probability(build_delayed_link(config))
+    )
 
 
 def build_estimator(config: Config) -> EstimatorParameters:
@@ -322,76 +319,78 @@ def build_estimator(config: Config) -> EstimatorParameters:
         max_velocity_mps=estimator.max_velocity_mps,
         bias_drift=estimator.bias_drift,
         bias_max=estimator.bias_max,
-        bias_bounds=_bias_bounds(config),
+        bias_bounds=_compute_bias_bounds(config),
         inertial_std_mps2=estimator.inertial_std_mps2,
         inertial_bias_mps2=estimator.inertial_bias_mps2,
         inertial_bias_s=estimator.inertial_bias_s,
     )
 
 
-def _bias_bounds(config: Config) -> tuple[float, ...]:
-    """Return how much of each input may be spent against a bias: a share of its authority, at least `bias_max`."""
+def _compute_bias_bounds(config: Config) -> tuple[float, ...]:
+    """Return the bound of each input's bias: a share of the input's half range, at least `bias_max`."""
     sets, estimator = config.sets, config.estimator
-    half = [0.5 * (high - low) for low, high in zip(sets.input_lower, sets.input_upper, strict=True)]
-    return tuple(max(estimator.bias_max, estimator.bias_share * each) for each in half)
+    half_ranges = [0.5 * (high - low) for low, high in zip(sets.input_lower, sets.input_upper, strict=True)]
+    return tuple(max(estimator.bias_max, estimator.bias_share * half_range) for half_range in half_ranges)
 
 
 def build_envelope(config: Config, plant: Plant) -> EnvelopeParameters:
-    """Return the bounds of what is possible in flight, by the limits, the plant and the last gate."""
-    envelope, limits, walls = config.envelope, config.limits, get_position_limits_m(config)
-    lower, upper = map(list, zip(*(walls.get(axis, (-math.inf, math.inf)) for axis in AXES), strict=True))
-    room = [high - low for low, high in zip(lower, upper, strict=True)]
-    outside = [envelope.outside_m or max(0.1 * size if math.isfinite(size) else 0.0, LEAST_OUTSIDE_M) for size in room]
-    # What one step's disturbance does to a velocity, as an acceleration over the step.
-    spread = plant.e[list(plant.velocity_index)] @ plant.w @ plant.e[list(plant.velocity_index)].T
-    std_mps2 = float(np.sqrt(np.diagonal(spread).max())) / plant.dt_s
-    unexplained = envelope.unexplained_mps2 or max(ENVELOPE_SIGMA * std_mps2, LEAST_UNEXPLAINED_MPS2)
-    lags: dict[str, float] = {}
+    """Build the bounds of possible motion in flight, by the limits, the plant and the last gate."""
+    envelope, limits, position_limits = config.envelope, config.limits, get_position_limits_m(config)
+    lower, upper = map(list, zip(*(position_limits.get(axis, (-math.inf, math.inf)) for axis in AXES), strict=True))
+    sizes_m = [high - low for low, high in zip(lower, upper, strict=True)]
+    outside_m = [
+        envelope.outside_m or max(0.1 * size if math.isfinite(size) else 0.0, MIN_OUTSIDE_M) for size in sizes_m
+    ]
+    # Velocity change by one step's disturbance, as an acceleration over the step: E W E' / dt².
+    velocity_cov = plant.e[list(plant.velocity_index)] @ plant.w @ plant.e[list(plant.velocity_index)].T
+    std_mps2 = float(np.sqrt(np.diagonal(velocity_cov).max())) / plant.dt_s
+    unexplained_mps2 = envelope.unexplained_mps2 or max(ENVELOPE_SIGMA * std_mps2, MIN_UNEXPLAINED_MPS2)
+    lags_s: dict[str, float] = {}
     if config.plant.lag_s:
-        dead_s = config.plant.dead_time_s
-        lags.update((axis, dead_s + lag_s) for axis, lag_s in zip(plant.axes, config.plant.lag_s, strict=True))
+        dead_time_s = config.plant.dead_time_s
+        lags_s.update((axis, dead_time_s + lag_s) for axis, lag_s in zip(plant.axes, config.plant.lag_s, strict=True))
     return EnvelopeParameters(
         axes=tuple(axis in plant.axes for axis in AXES),
-        lower_m=_vec3(lower),
-        upper_m=_vec3(upper),
-        outside_m=_vec3(outside),
+        lower_m=_make_vec3(lower),
+        upper_m=_make_vec3(upper),
+        outside_m=_make_vec3(outside_m),
         brake_mps2=limits.accel_mps2,
-        lag_s=_vec3([lags.get(axis, 0.0) for axis in AXES]),
-        unexplained_mps2=unexplained,
-        disagreement_mps=envelope.disagreement_mps or DISAGREES_S * unexplained,
-        window_ns=round(max(LEAST_WINDOW_S, 4.0 * plant.dt_s) * NANOSECONDS),
+        lag_s=_make_vec3([lags_s.get(axis, 0.0) for axis in AXES]),
+        unexplained_mps2=unexplained_mps2,
+        disagreement_mps=envelope.disagreement_mps or DISAGREEMENT_TIME_S * unexplained_mps2,
+        window_ns=round(max(MIN_WINDOW_S, 4.0 * plant.dt_s) * SECOND_NS),
         begins_mps=config.estimator.initial_std,
     )
 
 
-def _has_own_velocity(config: Config) -> bool:
-    """Whether the vehicle's velocity is another witness than our positions, as far as we know."""
+def _has_independent_velocity(config: Config) -> bool:
+    """Return whether the vehicle's velocity is known to be independent of our positions."""
     return not config.relay.enabled and "LOCAL_POSITION_NED" not in config.source.messages
 
 
-def _vec3(values: list[float]) -> Vec3:
+def _make_vec3(values: list[float]) -> Vec3:
     north, east, down = values
     return north, east, down
 
 
 def build_controller(config: Config, design: AnyDesign | None = None) -> Controller:
-    """Everything constant that a control tick needs; the design is made if it is not given.
+    """Build the controller: all constants of a control tick; the design is built if it is not given.
 
     Raises:
         DesignError: There is no design.
     """
     check_axes(config)
-    design = design_of(config) if design is None else design
+    design = build_flight_design(config) if design is None else design
     estimator, fallback, limits = config.estimator, config.fallback, config.limits
     plant, outside = build_plant(config), config.smpc.controller
     return Controller(
-        plant=plant,  # the design's own may be the one that the estimator makes of it
+        plant=plant,  # the plant of the design may be the one of the estimator
         design_id=design.design_id,
         horizon=design.horizon,
         solver=build_solver(design, config),
-        mission=build_mission(config, design, resting(design)),
+        mission=build_mission(config, design, compute_rest_limits(design)),
         names=build_names(design),
-        link=LinkEstimateParameters(promised=_promised(config)),
+        link=LinkEstimateParameters(promised=_compute_min_probability(config)),
         outside=outside,
         late_steps=design.horizon if outside or isinstance(design, ConditionedDesign) else len(design.late),
         envelope=build_envelope(config, plant),
@@ -409,51 +408,53 @@ def build_controller(config: Config, design: AnyDesign | None = None) -> Control
         position_gate=GateParameters(
             sigma=estimator.gate_sigma,
             margin_m=estimator.gate_m,
-            jump_ns=round(fallback.jump_s * NANOSECONDS),
-            at_rest_mps=AT_REST_MPS if _has_own_velocity(config) else 0.0,
+            jump_ns=round(fallback.jump_s * SECOND_NS),
+            at_rest_mps=AT_REST_MPS if _has_independent_velocity(config) else 0.0,
         ),
-        dt_ns=round(config.plant.dt_s * NANOSECONDS),
-        tick_ns=round(config.daemon.tick_s * NANOSECONDS),
-        dead_ns=round(config.plant.dead_time_s * NANOSECONDS),
+        dt_ns=round(config.plant.dt_s * SECOND_NS),
+        tick_ns=round(config.daemon.tick_s * SECOND_NS),
+        dead_ns=round(config.plant.dead_time_s * SECOND_NS),
     )
 
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """Controller that is ready to fly, and what it is made from."""
+    """Controller that is ready to fly, with its configuration and design."""
 
-    config: Config  # the configuration
-    design: AnyDesign  # its design
-    controller: Controller  # the controller
+    config: Config
+    design: AnyDesign
+    controller: Controller
 
 
 def prepare(config: Config, design: AnyDesign) -> Prepared:
     """Make the controller of a design.
 
     Raises:
-        DesignError: The configuration asks for what the design cannot do.
+        DesignError: The design does not fit the configuration.
     """
     return Prepared(config, design, build_controller(config, design))
 
 
-# What decides a flight's last bits beside its configuration: code, libraries, arithmetic.
-
-CONTROLLER = "controller"  # under which the one of another package stands among the versions
+CONTROLLER = "controller"  # name of another package's controller among the versions
 ARITHMETIC_NAME = "arithmetic"
 _LIBRARIES = ("numpy", "scipy", "clarabel", "daqp", "pymavlink", "msgspec", "mcap")
 
 
-def versions(controller: str) -> dict[str, str]:
-    """Return the versions of code and libraries that decisions depend on; `controller`: one of another package."""
-    found = {name: metadata.version(name) for name in _LIBRARIES}
+def collect_versions(controller: str) -> dict[str, str]:
+    """Return the versions of code, libraries and arithmetic that decide the last bits of a flight.
+
+    Args:
+        controller: Controller of another package; empty without one.
+    """
+    libraries = {name: metadata.version(name) for name in _LIBRARIES}
     if controller:
-        found[CONTROLLER] = controller_id(controller)
-    own = {"uavctl": __version__, "code": decider_id(), "python": platform.python_version()}
-    return {**own, ARITHMETIC_NAME: ARITHMETIC, **found}
+        libraries[CONTROLLER] = compute_controller_id(controller)
+    base = {"uavctl": __version__, "code": compute_code_id(), "python": platform.python_version()}
+    return {**base, ARITHMETIC_NAME: ARITHMETIC, **libraries}
 
 
-def cpu() -> str:
-    """Return the CPU type: without portable arithmetic the last bits of decisions depend on it."""
+def read_cpu_model() -> str:
+    """Read the CPU type: without portable arithmetic the last bits of decisions depend on it."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:

@@ -1,4 +1,4 @@
-"""Composition: a configuration's mission becomes the flight's."""
+"""Composition of the mission: waypoints or a trajectory, and fences, from a configuration."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uavctl.arrays import SECOND_NS, Array
 from uavctl.config.mission import FenceConfig, TrajectoryConfig
 from uavctl.config.types import Config
 from uavctl.errors import DesignError
@@ -22,46 +22,47 @@ if TYPE_CHECKING:
     from uavctl.smpc.hahn_stursberg.design import Design
 
 
-Array = NDArray[np.float64]
-
-NANOSECONDS = 1e9
 _ROUNDING = 1e-9
 
 
-def build_mission(config: Config, design: AnyDesign, rests: Array) -> Mission:
-    """Waypoints or trajectory, and fences; without any, `target.position_m` is held.
+def build_mission(config: Config, design: AnyDesign, rest_limits: Array) -> Mission:
+    """Build waypoints or a trajectory, and fences; without any, `target.position_m` is held.
 
     Args:
-        rests: Right sides (m_x,) of the state rows, less what a plan keeps from them that rests.
+        rest_limits: Right sides (m_x,) of the state rows, less the back-offs of a plan at rest.
 
     Raises:
-        DesignError: The plant cannot rest or move there, or a fence limits what has no limit.
+        DesignError: The plant cannot rest or move there, or a fence limits a state without a limit.
     """
-    given, plant = config.mission, design.plant
+    mission_config, plant = config.mission, design.plant
     mission = make_hold_mission(
         design.target,
         plant.position_index,
         design.state_set.b,
         horizon=design.horizon,
-        dt_ns=round(plant.dt_s * NANOSECONDS),
-        room=_resting(design, rests),
+        dt_ns=round(plant.dt_s * SECOND_NS),
+        room=_build_room(design, rest_limits),
     )
-    if given.waypoints:
-        holds_s = given.hold_s if isinstance(given.hold_s, tuple) else (given.hold_s,) * len(given.waypoints)
-        waypoints = tuple(
-            Waypoint(plant.equilibrium(place), round(hold_s * NANOSECONDS))
-            for place, hold_s in zip(given.waypoints, holds_s, strict=True)
+    if mission_config.waypoints:
+        holds_s = (
+            mission_config.hold_s
+            if isinstance(mission_config.hold_s, tuple)
+            else (mission_config.hold_s,) * len(mission_config.waypoints)
         )
-        mission = replace(mission, waypoints=waypoints, accept_m=given.accept_m)
+        waypoints = tuple(
+            Waypoint(plant.equilibrium(position_m), round(hold_s * SECOND_NS))
+            for position_m, hold_s in zip(mission_config.waypoints, holds_s, strict=True)
+        )
+        mission = replace(mission, waypoints=waypoints, accept_m=mission_config.accept_m)
     return replace(
         mission,
-        trajectory=build_trajectory(given.trajectory, design, rests, config.plant.dead_time_s)
-        if given.trajectory.times_s
+        trajectory=build_trajectory(mission_config.trajectory, design, rest_limits, config.plant.dead_time_s)
+        if mission_config.trajectory.times_s
         else None,
-        dead_ns=round(config.plant.dead_time_s * NANOSECONDS),
-        fences=tuple(_fence(number, one, design, rests) for number, one in enumerate(config.fence)),
-        land=given.then == "land",
-        lead_ns=round(config.envelope.lead_s * NANOSECONDS),
+        dead_ns=round(config.plant.dead_time_s * SECOND_NS),
+        fences=tuple(_build_fence(number, fence, design, rest_limits) for number, fence in enumerate(config.fence)),
+        land=mission_config.then == "land",
+        lead_ns=round(config.envelope.lead_s * SECOND_NS),
     )
 
 
@@ -78,77 +79,85 @@ def build_names(design: AnyDesign) -> Names:
     )
 
 
-def build_trajectory(given: TrajectoryConfig, design: AnyDesign, rests: Array, dead_s: float = 0.0) -> Trajectory:
+def build_trajectory(
+    trajectory_config: TrajectoryConfig, design: AnyDesign, rest_limits: Array, dead_s: float = 0.0
+) -> Trajectory:
     """Sample a trajectory each Δt and make the plant follow it; one horizon of rest is added at its end.
 
-    Its rows begin `dead_s` after its time zero: there begins what is sent then. For `rests` see `build_mission`.
+    Its rows begin `dead_s` after its time zero: an input that is sent then acts from there on.
+
+    Args:
+        rest_limits: See `build_mission`.
 
     Raises:
         DesignError: The motion leaves the state limits.
     """
-    positions, velocities = wanted_positions(given, design, dead_s)
-    motion = follow_positions(design.plant, positions, velocities)
+    positions_m, velocities_mps = sample_trajectory(trajectory_config, design, dead_s)
+    motion = follow_positions(design.plant, positions_m, velocities_mps)
     _check_limits(motion, design)
-    places = resting_places(design.plant, design.state_set, rests)
-    return plan_along(design.plant, motion, design.horizon, design.settles, *places)
+    rest_range = compute_rest_range(design.plant, design.state_set, rest_limits)
+    return plan_along(design.plant, motion, design.horizon, design.settles, *rest_range)
 
 
-def wanted_positions(given: TrajectoryConfig, design: AnyDesign, dead_s: float) -> tuple[Array, Array | None]:
+def sample_trajectory(
+    trajectory_config: TrajectoryConfig, design: AnyDesign, dead_s: float
+) -> tuple[Array, Array | None]:
     """Return positions (n, 3) [m] and velocities (n, 3) [m/s] of a trajectory each Δt, a horizon of rest at its end.
 
     A line between samples has no velocities: None.
     """
-    dt_s, times_s, places = design.plant.dt_s, np.array(given.times_s), np.array(given.positions_m)
+    dt_s, times_s, positions_m = (
+        design.plant.dt_s,
+        np.array(trajectory_config.times_s),
+        np.array(trajectory_config.positions_m),
+    )
     last_s = dt_s * np.ceil(times_s[-1] / dt_s - _ROUNDING)
     grid_s = dead_s + dt_s * np.arange(round(last_s / dt_s) + design.horizon + 1)
     within_s = np.clip(grid_s, times_s[0], times_s[-1])
-    moves = ((grid_s >= times_s[0]) & (grid_s < times_s[-1]))[:, None]
-    if given.interpolation == "linear":
-        return np.column_stack([np.interp(within_s, times_s, column) for column in places.T]), None
-    from scipy.interpolate import (
-        CubicHermiteSpline,  # takes long to load, and few flights need it
-        CubicSpline,  # takes long to load, and few flights need it
-    )
+    is_moving = ((grid_s >= times_s[0]) & (grid_s < times_s[-1]))[:, None]
+    if trajectory_config.interpolation == "linear":
+        return np.column_stack([np.interp(within_s, times_s, column) for column in positions_m.T]), None
+    from scipy.interpolate import CubicHermiteSpline, CubicSpline  # loads long, and few flights need it
 
     spline = (
-        CubicHermiteSpline(times_s, places, np.array(given.velocities_mps))
-        if given.velocities_mps
-        else CubicSpline(times_s, places)
+        CubicHermiteSpline(times_s, positions_m, np.array(trajectory_config.velocities_mps))
+        if trajectory_config.velocities_mps
+        else CubicSpline(times_s, positions_m)
     )
-    return spline(within_s), spline(within_s, nu=1) * moves
+    return spline(within_s), spline(within_s, nu=1) * is_moving
 
 
-def build_rests(design: Design) -> Array:
-    """Right sides (m_x,) of the state rows, less the back-offs of the design's terminal set."""
+def build_rest_limits(design: Design) -> Array:
+    """Return the right sides (m_x,) of the state rows, less the back-offs of the design's terminal set."""
     from uavctl.smpc.hahn_stursberg.horizon import decompose
     from uavctl.smpc.hahn_stursberg.program import terminal_backoff_x
 
-    rests = design.state_set.b.copy()
+    rest_limits = design.state_set.b.copy()
     for part in decompose(design):
-        rests[part.rows_x] -= terminal_backoff_x(design, part)
-    return rests
+        rest_limits[part.rows_x] -= terminal_backoff_x(design, part)
+    return rest_limits
 
 
-def _resting(design: AnyDesign, rests: Array) -> Room | None:
+def _build_room(design: AnyDesign, rest_limits: Array) -> Room | None:
     try:
-        places = resting_places(design.plant, design.state_set, rests)
-        return make_room(design.plant, design.settles, *places)
+        rest_range = compute_rest_range(design.plant, design.state_set, rest_limits)
+        return make_room(design.plant, design.settles, *rest_range)
     except DesignError:
         return None
 
 
-def resting_places(plant: Plant, state_set: Polytope, rests: Array) -> tuple[Array, Array]:
-    """Least and largest place to rest at of each axis [m], by the right sides (m_x,) at rest."""
+def compute_rest_range(plant: Plant, state_set: Polytope, rest_limits: Array) -> tuple[Array, Array]:
+    """Return the least and the largest position at rest of each axis [m], by the right sides (m_x,) at rest."""
     index = plant.position_index
     lower, upper = np.full(len(index), -np.inf), np.full(len(index), np.inf)
-    for c, side in zip(state_set.c, rests, strict=True):
-        (used,) = np.nonzero(c)
-        if used.size == 1 and used[0] in index:
-            axis, place = index.index(int(used[0])), side / c[used[0]]
-            if c[used[0]] > 0:
-                upper[axis] = min(upper[axis], place)
+    for c, limit in zip(state_set.c, rest_limits, strict=True):
+        (used_states,) = np.nonzero(c)
+        if used_states.size == 1 and used_states[0] in index:
+            axis, limit_m = index.index(int(used_states[0])), limit / c[used_states[0]]
+            if c[used_states[0]] > 0:
+                upper[axis] = min(upper[axis], limit_m)
             else:
-                lower[axis] = max(lower[axis], place)
+                lower[axis] = max(lower[axis], limit_m)
     return lower, upper
 
 
@@ -165,37 +174,37 @@ def _check_limits(motion: PlantMotion, design: AnyDesign) -> None:
         )
 
 
-def _fence(number: int, given: FenceConfig, design: AnyDesign, rests: Array) -> Fence:
+def _build_fence(number: int, fence_config: FenceConfig, design: AnyDesign, rest_limits: Array) -> Fence:
     key, plant = f"fence[{number}]", design.plant
-    axis = given.state
+    axis = fence_config.state
     state = plant.position_index[plant.axes.index(axis)] if isinstance(axis, str) else axis
-    sign = 1.0 if given.side == "upper" else -1.0
-    alone = np.flatnonzero((design.state_set.c != 0).sum(axis=1) == 1)
-    rows = [int(row) for row in alone if sign * design.state_set.c[row, state] > 0]
+    sign = 1.0 if fence_config.side == "upper" else -1.0
+    single_state_rows = np.flatnonzero((design.state_set.c != 0).sum(axis=1) == 1)
+    rows = [int(row) for row in single_state_rows if sign * design.state_set.c[row, state] > 0]
     if not rows:
         raise DesignError(
             f"{key}.side",
-            f"the {given.side} side of state {state} has no limit that could close in",
-            f"give sets.state_{given.side}[{state}] a finite limit, further out",
+            f"the {fence_config.side} side of state {state} has no limit that could close in",
+            f"give sets.state_{fence_config.side}[{state}] a finite limit, further out",
         )
     row = rows[0]
-    right = abs(design.state_set.c[row, state]) * sign * np.array(given.values)
-    _check_room(key, row, float(right.min()), design, rests)
-    return Fence(row=row, times_ns=np.array(given.times_s) * NANOSECONDS, values=right)
+    row_limits = abs(design.state_set.c[row, state]) * sign * np.array(fence_config.values)
+    _check_room(key, row, float(row_limits.min()), design, rest_limits)
+    return Fence(row=row, times_ns=np.array(fence_config.times_s) * SECOND_NS, values=row_limits)
 
 
-def _check_room(key: str, row: int, least: float, design: AnyDesign, rests: Array) -> None:
-    """Check that a limit leaves room for plans at rest, if its state is the same at every place, as a velocity is."""
+def _check_room(key: str, row: int, min_limit: float, design: AnyDesign, rest_limits: Array) -> None:
+    """Check that a limit leaves room for plans at rest, if its state is equal at every position, as a velocity is."""
     plant = design.plant
-    # Weights choose among the inputs that hold a place, and not among the places.
+    # Weights choose among the inputs that hold a position, not among the positions.
     weights = np.eye(plant.n_x), np.eye(plant.n_u)
-    places = find_equilibria(plant.a, plant.b, *weights, np.array(plant.position_index, dtype=np.intp)).x_eq
-    if np.any(design.state_set.c[row] @ places):
+    equilibrium_states = find_equilibria(plant.a, plant.b, *weights, np.array(plant.position_index, dtype=np.intp)).x_eq
+    if np.any(design.state_set.c[row] @ equilibrium_states):
         return
-    needed = float(design.state_set.b[row] - rests[row])
-    if least < needed:
+    needed = float(design.state_set.b[row] - rest_limits[row])
+    if min_limit < needed:
         raise DesignError(
             f"{key}.values",
-            f"{least:.3g} is less than the {needed:.3g} that plans keep from it at rest",
+            f"{min_limit:.3g} is less than the {needed:.3g} that plans keep from it at rest",
             "keep the limit further out",
         )

@@ -1,8 +1,8 @@
-"""Identity of our code by hashes, and classes of other packages: how they are found, made, and told apart.
+"""Identity of our code by hashes, and controllers of other packages: how they are found, made and identified.
 
-A controller is made with the `ControlProblem` that it is to solve (plant, limits, weights, target, horizon). What flies
-has `plan(request)` (`uavctl.smpc.outside.FlightPlanner`); what campaigns ask has `begin(runs)` and `act(news)`, once a
-step for all runs together (`uavctl.smpc.batch.BatchController`), and can fly too. docs/extending.md has both in full.
+A controller is made with its `ControlProblem` (plant, limits, weights, target, horizon). A controller of flights has
+`plan(request)` (`uavctl.smpc.outside.FlightPlanner`). A controller of campaigns has `begin(runs)` and `act(news)`, once
+a step for all runs together (`uavctl.smpc.batch.BatchController`), and can fly too. docs/extending.md has both in full.
 """
 
 from __future__ import annotations
@@ -16,9 +16,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TypeVar, cast
 
-import numpy as np
-from numpy.typing import NDArray
-
+from uavctl.arrays import Array
 from uavctl.config import Config
 from uavctl.config.load import find_nearest
 from uavctl.errors import RAISED, DesignError, in_words
@@ -29,87 +27,92 @@ from uavctl.smpc.plant import digest
 
 
 @cache
-def decider_id() -> str:
-    """Hash of the code that a flight's records come from: from bytes to estimate, plan, decision and bytes again."""
+def compute_code_id() -> str:
+    """Return the hash of the code that makes a flight's records: from bytes to estimate, plan, decision and bytes."""
     return digest(
-        tuple(sources_of(f"uavctl{name}") for name in ("", ".build", ".config", ".flight", ".mavlink", ".smpc"))
+        tuple(read_sources(f"uavctl{name}") for name in ("", ".build", ".config", ".flight", ".mavlink", ".smpc"))
     )
 
 
-def sources_of(package: str) -> tuple[tuple[str, bytes], ...]:
-    """Names and contents of a package's modules, and of those of the packages in it; of `uavctl` only its own."""
-    found = []
+def read_sources(package: str) -> tuple[tuple[str, bytes], ...]:
+    """Return names and contents of a package's modules and subpackages; of `uavctl` only its own modules."""
+    sources = []
     for entry in resources.files(package).iterdir():
         if entry.name.endswith(".py"):
-            found.append((f"{package}.{entry.name}", entry.read_bytes()))
+            sources.append((f"{package}.{entry.name}", entry.read_bytes()))
         elif package != "uavctl" and (entry / "__init__.py").is_file():
-            found.extend(sources_of(f"{package}.{entry.name}"))
-    return tuple(sorted(found))
+            sources.extend(read_sources(f"{package}.{entry.name}"))
+    return tuple(sorted(sources))
 
 
-GROUP = "uavctl.controllers"
-KEY = "smpc.controller"
-PLANS, ACTS = ("plan",), ("begin", "act")
+ENTRY_POINT_GROUP = "uavctl.controllers"
+CONTROLLER_KEY = "smpc.controller"
+PLAN_METHODS, BATCH_METHODS = ("plan",), ("begin", "act")
 _ID_LENGTH = 12
 
 Made = TypeVar("Made")
 
 
-def installed(but: Collection[str] = ()) -> tuple[str, ...]:
+def list_installed(exclude: Collection[str] = ()) -> tuple[str, ...]:
     """Return the names of the controllers that installed packages offer."""
-    return tuple(sorted({point.name for point in entry_points(group=GROUP)} - set(but)))
+    return tuple(sorted({point.name for point in entry_points(group=ENTRY_POINT_GROUP)} - set(exclude)))
 
 
-def controller_class(
-    name: str, key: str, kinds: tuple[tuple[str, ...], ...], others: Collection[str] = ()
+def load_controller_class(
+    name: str, key: str, kinds: tuple[tuple[str, ...], ...], known_names: Collection[str] = ()
 ) -> Callable[[ControlProblem], object]:
     """Return the class of a controller of another package; modules of the working directory count.
 
     Args:
         name: Its entry point, or `module:Class`.
-        key: The key that names it.
-        kinds: The methods that it has to have: all of one of these.
-        others: Names of ours that the key may have instead.
+        key: Key of the configuration that names it.
+        kinds: Sets of methods; it needs all methods of one set.
+        known_names: Names of our controllers, which the key may have instead.
 
     Raises:
-        DesignError: Nothing has that name, it cannot be imported, or it is no controller.
+        DesignError: Nothing has that name, it cannot be imported, or it is not a controller.
     """
-    points = [point for point in entry_points(group=GROUP) if point.name == name]
-    where = points[0].value if points else name
-    module, colon, attribute = where.partition(":")
+    entry_point_list = [point for point in entry_points(group=ENTRY_POINT_GROUP) if point.name == name]
+    location = entry_point_list[0].value if entry_point_list else name
+    module, colon, attribute = location.partition(":")
     if not colon:
-        names = (*others, *installed(others))
-        known = f"one of {', '.join(names)}, or module:Class" if names else "module:Class, or install its package"
-        raise DesignError(key, f'there is no controller "{name}"{find_nearest(name, names)}', f"give {known}")
-    here = str(Path.cwd())
-    if here not in sys.path:  # as the interpreter does for scripts; workers of a campaign get the same list
-        sys.path.append(here)
+        names = (*known_names, *list_installed(known_names))
+        choices = f"one of {', '.join(names)}, or module:Class" if names else "module:Class, or install its package"
+        raise DesignError(key, f'there is no controller "{name}"{find_nearest(name, names)}', f"give {choices}")
+    working_folder = str(Path.cwd())
+    if working_folder not in sys.path:  # as for scripts; workers of a campaign get the same list
+        sys.path.append(working_folder)
     try:
-        made = getattr(import_module(module), attribute)
+        controller_class = getattr(import_module(module), attribute)
     except RAISED as error:
         raise DesignError(
             key,
             f'controller "{name}" cannot be imported ({in_words(error)})',
             "install its package, or start uavctl in the folder of its module",
         ) from error
-    lacking = min(([one for one in kind if not callable(getattr(made, one, None))] for kind in kinds), key=len)
-    if not callable(made) or lacking:
+    missing = min(
+        ([method for method in kind if not callable(getattr(controller_class, method, None))] for kind in kinds),
+        key=len,
+    )
+    if not callable(controller_class) or missing:
         raise DesignError(
             key,
-            f'"{where}" is no controller: it has no {" and no ".join(lacking) or "way to be made"}',
+            f'"{location}" is no controller: it has no {" and no ".join(missing) or "way to be made"}',
             f"give a class with {' or with '.join(' and '.join(kind) for kind in kinds)}, as docs/extending.md shows",
         )
-    return cast(Callable[[ControlProblem], object], made)
+    return cast(Callable[[ControlProblem], object], controller_class)
 
 
-def make(made: Callable[[ControlProblem], object], name: str, key: str, problem: ControlProblem) -> object:
-    """Make a controller for a problem.
+def create_controller(
+    controller_class: Callable[[ControlProblem], object], name: str, key: str, problem: ControlProblem
+) -> object:
+    """Create a controller for a problem.
 
     Raises:
         DesignError: Its class does not take the problem.
     """
     try:
-        return made(problem)
+        return controller_class(problem)
     except DesignError:
         raise
     except RAISED as error:
@@ -120,40 +123,44 @@ def make(made: Callable[[ControlProblem], object], name: str, key: str, problem:
         ) from error
 
 
-def flown_outside(config: Config, problem: ControlProblem) -> OutsideSolver:
+def build_outside_solver(config: Config, problem: ControlProblem) -> OutsideSolver:
     """Return the solver of the controller that `smpc.controller` names.
 
     Raises:
-        DesignError: There is none that can fly this problem.
+        DesignError: It cannot fly this problem.
     """
     name = config.smpc.controller
-    made = controller_class(name, KEY, (PLANS, ACTS))
-    if callable(getattr(made, "plan", None)):
-        return OutsideSolver(name, problem, cast(FlightPlanner, make(made, name, KEY, problem)))
+    controller_class = load_controller_class(name, CONTROLLER_KEY, (PLAN_METHODS, BATCH_METHODS))
+    if callable(getattr(controller_class, "plan", None)):
+        return OutsideSolver(
+            name, problem, cast(FlightPlanner, create_controller(controller_class, name, CONTROLLER_KEY, problem))
+        )
     if config.mission.trajectory.times_s:
         raise DesignError(
-            KEY, f'controller "{name}" is told no trajectory', "give it plan(request), or fly waypoints instead"
+            CONTROLLER_KEY,
+            f'controller "{name}" is told no trajectory',
+            "give it plan(request), or fly waypoints instead",
         )
-    make(made, name, KEY, problem)  # what cannot be made is refused here, not in flight
+    create_controller(controller_class, name, CONTROLLER_KEY, problem)  # a failure is raised here, not in flight
 
-    def to(target: NDArray[np.float64]) -> tuple[ControlProblem, BatchController]:
-        there = retarget(problem, target)
-        return there, cast(BatchController, made(there))
+    def make_target_controller(target: Array) -> tuple[ControlProblem, BatchController]:
+        target_problem = retarget(problem, target)
+        return target_problem, cast(BatchController, controller_class(target_problem))
 
-    return OutsideSolver(name, problem, SilencePlanner(to))
+    return OutsideSolver(name, problem, SilencePlanner(make_target_controller))
 
 
-def controller_id(name: str) -> str:
+def compute_controller_id(name: str) -> str:
     """Return the name of a controller with a hash of the sources of its package, or of its module.
 
     Raises:
-        DesignError: See `controller_class`.
+        DesignError: See `load_controller_class`.
     """
-    made = controller_class(name, KEY, (PLANS, ACTS))
-    top = made.__module__.partition(".")[0]
-    if hasattr(sys.modules[top], "__path__"):
-        code: object = sources_of(top)
+    controller_class = load_controller_class(name, CONTROLLER_KEY, (PLAN_METHODS, BATCH_METHODS))
+    package = controller_class.__module__.partition(".")[0]
+    if hasattr(sys.modules[package], "__path__"):
+        sources: object = read_sources(package)
     else:
-        path = inspect.getsourcefile(sys.modules[top])
-        code = Path(path).read_bytes() if path is not None and Path(path).is_file() else b""
-    return f"{name} {digest((code,))[:_ID_LENGTH]}"
+        path = inspect.getsourcefile(sys.modules[package])
+        sources = Path(path).read_bytes() if path is not None and Path(path).is_file() else b""
+    return f"{name} {digest((sources,))[:_ID_LENGTH]}"

@@ -1,11 +1,11 @@
-"""Rehearsal of a mission before a flight: the closed loop of the plan's own model, without noise or disturbance.
+"""Rehearsal of a mission before a flight: the closed loop of the planner's model, without noise or disturbance.
 
 x(k+1) = A x(k) + B u(k), where u(k) is the first input of the plan from x(k). Each plan has the age of information that
-the configured link gives: the ages of all steps together have the link's long-run shares. So what goes wrong here is
-the configuration's fault alone: limits that leave a plan nothing, or a motion that needs more than the inputs.
+the configured link gives: the ages of all steps together have the link's long-run shares. So a problem here has its
+cause in the configuration: limits that leave a plan no room, or a motion that needs more than the inputs.
 
 A trajectory is rehearsed a second time on a vehicle with more drag than the model: x(k+1) = A' x(k) + B' u(k). The
-figure is what a drag that nobody has identified may cost. A figure of eight with drag 1.0 and a model of 0.24 1/s is
+figure is the cost of a drag that was not identified. A figure of eight with drag 1.0 and a model of 0.24 1/s is
 rehearsed 0.12 m off in the mean, and flown 0.13 m off without inertial data, 0.10 m with them.
 """
 
@@ -16,8 +16,9 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from uavctl.build.controller import build_plant, start_state
-from uavctl.build.mission import wanted_positions
+from uavctl.arrays import Array
+from uavctl.build.controller import build_plant, make_start_state
+from uavctl.build.mission import sample_trajectory
 from uavctl.config.types import Config
 from uavctl.flight.controller import Controller
 from uavctl.flight.mission import Mission, advance_mission, make_question
@@ -26,9 +27,7 @@ from uavctl.smpc.answer import Preview
 from uavctl.smpc.conditioned.planner import ConditionedDesign
 from uavctl.smpc.plant import AXES, Plant
 
-Array = NDArray[np.float64]
-
-MOST_STEPS = 2400  # two minutes at steps of 0.05 s; a step takes milliseconds
+MAX_STEPS = 2400  # two minutes at steps of 0.05 s; a step takes milliseconds
 # Multiples of the golden ratio modulo 1 fill [0, 1) evenly in any number of steps (Weyl's equidistribution).
 _GOLDEN = 0.5 * (5.0**0.5 - 1.0)
 # Drag of PX4's own simulated vehicle (SIH) [1/s], four times that of the preset: the largest of any recorded flight.
@@ -40,13 +39,13 @@ _NOTED_SHARE = 0.5
 class RehearsalResult(msgspec.Struct, frozen=True, kw_only=True):
     """Outcome of a rehearsed mission; tracking figures are None where the mission has no trajectory."""
 
-    seconds: float  # that were rehearsed
+    seconds: float  # rehearsed time [s]
     plans: int
-    allowed: float  # 1 - delta_x: more relaxed plans than this are the configuration's fault
-    relaxed: float  # share of plans in which a constraint gave way
-    constraint: str  # that gave way most; empty where none did
+    allowed: float  # 1 - delta_x: a larger share of relaxed plans is a problem of the configuration
+    relaxed: float  # share of plans with a relaxed constraint
+    constraint: str  # the most relaxed one; empty if none is
     unit: str  # of this constraint
-    amount: float  # by which it gave way at most
+    amount: float  # largest relaxation
     ahead_s: float  # stage of that plan, with the age of its information [s]
     accept_m: float  # tracking error that is accepted
     tracking_m: float | None = None  # distance from where the trajectory is at the time, mean
@@ -61,7 +60,7 @@ class RehearsalResult(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def relaxes(self) -> bool:
-        """Whether more plans relax a constraint than states may be outside of their limits."""
+        """Whether more plans relax a constraint than states may be outside their limits."""
         return self.relaxed > self.allowed
 
     @property
@@ -76,148 +75,152 @@ class RehearsalResult(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def depends_on_drag(self) -> bool:
-        """Whether a large drag that nobody has identified costs a good part of the accepted distance."""
+        """Whether a large drag that was not identified costs a large part of the accepted distance."""
         return self.large_drag_max_m is not None and self.large_drag_max_m > _NOTED_SHARE * self.accept_m
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What is wrong, in sentences with figures; empty where nothing is."""
-        found = []
+        """Problems, as sentences with figures; empty if there is none."""
+        texts = []
         if self.relaxes:
-            found.append(
+            texts.append(
                 f"{self.relaxed:.0%} of the plans relax a constraint without any disturbance ({self.allowed:.0%} may "
                 f"be outside): the {self.constraint} by up to {self.amount:.2g} {self.unit}".rstrip()
                 + f", for positions that are {self.ahead_s:.1f} s old"
             )
         if self.saturates:
-            found.append(
+            texts.append(
                 f"the trajectory asks for {self.asked_mps2:.1f} m/s² at {self.asked_s:.1f} s, the inputs leave "
                 f"{self.left_mps2:.1f} m/s²"
             )
         if self.strays or self.saturates:
-            found.append(
+            texts.append(
                 f"the model is up to {self.tracking_max_m:.2f} m from the trajectory ({self.tracking_m:.2f} m in the "
                 f"mean), mission.accept_m is {self.accept_m:g} m"
             )
         elif self.depends_on_drag:
-            found.append(
+            texts.append(
                 f"with the configured drag of {self.drag_1ps:g} 1/s the model is {self.tracking_m:.3f} m from the "
                 f"trajectory in the mean; with a drag of {LARGE_DRAG_1PS:g} 1/s it is {self.large_drag_m:.2f} m, "
                 f"{self.large_drag_max_m:.2f} m at most"
             )
-        return tuple(found)
+        return tuple(texts)
 
     @property
     def hint(self) -> str:
-        """What to do; empty where nothing is wrong."""
-        found = []
+        """What to do; empty without a problem."""
+        texts = []
         if self.relaxes:
-            found.append(
+            texts.append(
                 "the back-offs for old positions leave no room: improve the link, widen [sets], lower smpc.delta_x or "
                 "the plant's wind_std_mps2"
             )
         if self.strays or self.saturates:
-            found.append("fly the trajectory slower, or widen sets.input_* and limits.accel_mps2 if the vehicle can")
+            texts.append("fly the trajectory slower, or widen sets.input_* and limits.accel_mps2 if the vehicle can")
         elif self.depends_on_drag:
-            found.append("measure the vehicle's drag with `uavctl tune`, or with `uavctl identify` from a recording")
-        return "; ".join(found)
+            texts.append("measure the vehicle's drag with `uavctl tune`, or with `uavctl identify` from a recording")
+        return "; ".join(texts)
 
 
 def rehearse(config: Config, design: ConditionedDesign, controller: Controller) -> RehearsalResult:
     """Fly the mission on the plan's own model: a trajectory to its end, else `duration_s`."""
-    found, passed = _fly(config, design, controller, design.plant)
+    result, positions_m = _fly_mission(config, design, controller, design.plant)
     if controller.mission.trajectory is None:
-        return found
-    found = _tracked(found, config, design, controller.mission, passed)
-    least = min(config.plant.drag_1ps, default=LARGE_DRAG_1PS)
-    if least >= LARGE_DRAG_1PS:
-        return found
-    large = tuple(max(LARGE_DRAG_1PS, drag) for drag in config.plant.drag_1ps)
-    plant = build_plant(replace(config, plant=replace(config.plant, drag_1ps=large)))
-    off = _distances(config, design, _fly(config, design, controller, plant)[1])
-    return replace(found, drag_1ps=least, large_drag_m=float(off.mean()), large_drag_max_m=float(off.max()))
+        return result
+    result = _add_tracking(result, config, design, controller.mission, positions_m)
+    min_drag_1ps = min(config.plant.drag_1ps, default=LARGE_DRAG_1PS)
+    if min_drag_1ps >= LARGE_DRAG_1PS:
+        return result
+    large_drags_1ps = tuple(max(LARGE_DRAG_1PS, drag) for drag in config.plant.drag_1ps)
+    plant = build_plant(replace(config, plant=replace(config.plant, drag_1ps=large_drags_1ps)))
+    distances_m = _compute_distances(config, design, _fly_mission(config, design, controller, plant)[1])
+    return replace(
+        result, drag_1ps=min_drag_1ps, large_drag_m=float(distances_m.mean()), large_drag_max_m=float(distances_m.max())
+    )
 
 
-def _fly(
+def _fly_mission(
     config: Config, design: ConditionedDesign, controller: Controller, vehicle: Plant
 ) -> tuple[RehearsalResult, Array]:
-    """Fly the mission on a vehicle; the result without tracking figures, and the positions passed (steps, axes)."""
+    """Fly the mission on a vehicle; return the result without tracking figures, and positions (steps, axes) [m]."""
     mission, plant, dt_ns = controller.mission, design.plant, controller.dt_ns
     motion, index = mission.trajectory, list(plant.position_index)
-    x = _start(config, design, mission)
-    lates = _lates(config, design)
-    steps = min(MOST_STEPS, round(config.duration_s / plant.dt_s) if motion is None else len(motion.states))
-    sent, state = np.zeros(plant.n_u), None
+    x = _make_rehearsal_start(config, design, mission)
+    late_steps = _sample_late_steps(config, design)
+    steps = min(MAX_STEPS, round(config.duration_s / plant.dt_s) if motion is None else len(motion.states))
+    last_input, state = np.zeros(plant.n_u), None
     worst, ahead_s, relaxed = ("", "", 0.0), 0.0, 0
-    passed: list[Array] = []
+    positions_m: list[Array] = []
     for k in range(steps):
-        state = advance_mission(mission, state, _vector(x), k * dt_ns)
+        state = advance_mission(mission, state, _make_vector(x), k * dt_ns)
         target, preview = make_question(mission, state, k * dt_ns)
-        late = int(lates[k])
-        ahead = Preview(limits=preview.limits, path=preview.path, age=late, cov=design.estimate_cov, sent=sent)
-        answer = design.solver.solve(k, x, target, ahead)
-        passed.append(x[index])
+        late = int(late_steps[k])
+        request = Preview(limits=preview.limits, path=preview.path, age=late, cov=design.estimate_cov, sent=last_input)
+        answer = design.solver.solve(k, x, target, request)
+        positions_m.append(x[index])
         relaxed += bool(answer.relaxed)
-        for one in answer.relaxed:
-            name, unit, size = controller.names.rows[one.index] if one.constraint == "state" else ("slew", "m/s²", 1.0)
-            if one.amount / size > worst[2]:
-                worst, ahead_s = (name, unit, one.amount / size), (late + one.stage) * plant.dt_s
-        sent = answer.inputs[0] if len(answer.inputs) else sent
-        x = vehicle.a @ x + vehicle.b @ sent
-    found = RehearsalResult(
-        seconds=round(len(passed) * plant.dt_s, 6),
-        plans=len(passed),
+        for relaxation in answer.relaxed:
+            name, unit, size = (
+                controller.names.rows[relaxation.index] if relaxation.constraint == "state" else ("slew", "m/s²", 1.0)
+            )
+            if relaxation.amount / size > worst[2]:
+                worst, ahead_s = (name, unit, relaxation.amount / size), (late + relaxation.stage) * plant.dt_s
+        last_input = answer.inputs[0] if len(answer.inputs) else last_input
+        x = vehicle.a @ x + vehicle.b @ last_input
+    result = RehearsalResult(
+        seconds=round(len(positions_m) * plant.dt_s, 6),
+        plans=len(positions_m),
         allowed=round(1.0 - config.smpc.delta_x, 9),
-        relaxed=relaxed / max(1, len(passed)),
+        relaxed=relaxed / max(1, len(positions_m)),
         constraint=worst[0],
         unit=worst[1],
         amount=worst[2],
         ahead_s=ahead_s,
         accept_m=config.mission.accept_m,
     )
-    return found, np.array(passed)
+    return result, np.array(positions_m)
 
 
-def _tracked(
-    found: RehearsalResult, config: Config, design: ConditionedDesign, mission: Mission, passed: Array
+def _add_tracking(
+    result: RehearsalResult, config: Config, design: ConditionedDesign, mission: Mission, positions_m: Array
 ) -> RehearsalResult:
     """Return a rehearsal with the figures of its trajectory."""
     assert mission.trajectory is not None
     plant, motion = design.plant, mission.trajectory
-    off = _distances(config, design, passed)
+    distances_m = _compute_distances(config, design, positions_m)
     low, high = (plant.accel_per_input * side for side in design.solver.problem.input_set.bounds)
-    asked = plant.accel_per_input * motion.path_inputs[:, 0]
-    left = np.where(asked < 0.0, -low, high)
-    step, axis = np.unravel_index(int((np.abs(asked) - left).argmax()), asked.shape)
+    asked_mps2 = plant.accel_per_input * motion.path_inputs[:, 0]
+    left_mps2 = np.where(asked_mps2 < 0.0, -low, high)
+    step, axis = np.unravel_index(int((np.abs(asked_mps2) - left_mps2).argmax()), asked_mps2.shape)
     return replace(
-        found,
-        tracking_m=float(off.mean()),
-        tracking_max_m=float(off.max()),
-        tracking_max_s=round(int(off.argmax()) * plant.dt_s, 6),
-        asked_mps2=float(abs(asked[step, axis])),
+        result,
+        tracking_m=float(distances_m.mean()),
+        tracking_max_m=float(distances_m.max()),
+        tracking_max_s=round(int(distances_m.argmax()) * plant.dt_s, 6),
+        asked_mps2=float(abs(asked_mps2[step, axis])),
         asked_s=round(int(step) * plant.dt_s, 6),
-        left_mps2=float(left[step, axis]),
+        left_mps2=float(left_mps2[step, axis]),
     )
 
 
-def _distances(config: Config, design: ConditionedDesign, passed: Array) -> Array:
-    """Return the distance (steps,) of each position passed from where the trajectory is at the time [m]."""
+def _compute_distances(config: Config, design: ConditionedDesign, positions_m: Array) -> Array:
+    """Return the distance (steps,) of each position from the trajectory at its time [m]."""
     assert config.mission.trajectory is not None
-    wanted, _ = wanted_positions(config.mission.trajectory, design, config.plant.dead_time_s)
+    wanted_m, _ = sample_trajectory(config.mission.trajectory, design, config.plant.dead_time_s)
     columns = [AXES.index(axis) for axis in design.plant.axes]
-    off: Array = np.linalg.norm(passed - wanted[: len(passed), columns], axis=1)
-    return off
+    distances_m: Array = np.linalg.norm(positions_m - wanted_m[: len(positions_m), columns], axis=1)
+    return distances_m
 
 
-def _start(config: Config, design: ConditionedDesign, mission: Mission) -> Array:
-    """Return the state (n_x,) to begin with, at rest where a plan may rest."""
+def _make_rehearsal_start(config: Config, design: ConditionedDesign, mission: Mission) -> Array:
+    """Return the first state (n_x,), at rest where a plan may rest."""
     if mission.trajectory is not None:
         return np.array(mission.trajectory.states[0])
-    begins = start_state(config, design.plant)
-    return np.array(begins if mission.room is None else mission.room.stopped(_vector(begins)))
+    start_state = make_start_state(config, design.plant)
+    return np.array(start_state if mission.room is None else mission.room.stopped(_make_vector(start_state)))
 
 
-def _lates(config: Config, design: ConditionedDesign) -> NDArray[np.intp]:
+def _sample_late_steps(config: Config, design: ConditionedDesign) -> NDArray[np.intp]:
     """Return the age of the position that each plan is made from [steps].
 
     With inertial data a plan is made in every step, so its position has any age of the link. Without them a plan is
@@ -225,10 +228,10 @@ def _lates(config: Config, design: ConditionedDesign) -> NDArray[np.intp]:
     """
     weights = design.solver.risk.weights
     if not config.estimator.inertial_std_mps2:
-        return np.full(MOST_STEPS, int(weights.argmax()))
+        return np.full(MAX_STEPS, int(weights.argmax()))
     shares = np.cumsum(weights) / weights.sum()
-    return np.searchsorted(shares, (0.5 + _GOLDEN * np.arange(MOST_STEPS)) % 1.0)
+    return np.searchsorted(shares, (0.5 + _GOLDEN * np.arange(MAX_STEPS)) % 1.0)
 
 
-def _vector(x: Array) -> Vector:
+def _make_vector(x: Array) -> Vector:
     return tuple(x.tolist())

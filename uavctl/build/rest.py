@@ -1,25 +1,23 @@
-"""Composition: where the plant of a configuration is to rest, with which input."""
+"""Composition of the target: the state in which a plant is to rest, and the input that holds it."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uavctl.arrays import Array
 from uavctl.config.types import Config
 from uavctl.errors import DesignError
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import find_equilibria
 
-Array = NDArray[np.float64]
-
 _ROUNDING = 1e-9
 
 
 def check_axes(config: Config) -> None:
-    """See that a plant's states are known to be positions and velocities, which a flight has to do with.
+    """Check that the configuration names the positions and velocities of a plant, as a flight needs.
 
     Raises:
-        DesignError: They are not.
+        DesignError: It does not.
     """
     if not config.plant.axes:
         raise DesignError(
@@ -31,39 +29,39 @@ def check_axes(config: Config) -> None:
         )
 
 
-def resting_target(config: Config, plant: Plant) -> tuple[Array, Array]:
-    """The state (n_x,) to go to, and the input (n_u,) that holds it, which is within its limits.
+def compute_rest_target(config: Config, plant: Plant) -> tuple[Array, Array]:
+    """Return the target state (n_x,), and the input (n_u,) within its limits that holds it.
 
-    A plant without axes goes to its origin, or where that is not within the limits, to the middle of what is.
+    The target of a plant without axes is its origin, or the middle of the limits if the origin is outside.
 
     Raises:
         DesignError: The plant cannot rest there, or nowhere within its limits.
     """
     sets = config.sets
-    rests = find_equilibria(
+    rest_set = find_equilibria(
         plant.a, plant.b, np.diag(config.cost.state), np.diag(config.cost.input), np.array(plant.position_index, int)
     )
     state = plant.equilibrium(config.target.position_m)
     low_x, high_x, low_u, high_u = map(
         np.array, (sets.state_lower, sets.state_upper, sets.input_lower, sets.input_upper)
     )
-    u = rests.u_eq @ state[rests.held]
-    if not plant.axes and not (_within(state, low_x, high_x) and _within(u, low_u, high_u)):
-        middle = _middle(
-            np.vstack([rests.x_eq, rests.u_eq]), np.concatenate([low_x, low_u]), np.concatenate([high_x, high_u])
+    u = rest_set.u_eq @ state[rest_set.held]
+    if not plant.axes and not (_is_within(state, low_x, high_x) and _is_within(u, low_u, high_u)):
+        middle = _find_middle(
+            np.vstack([rest_set.x_eq, rest_set.u_eq]), np.concatenate([low_x, low_u]), np.concatenate([high_x, high_u])
         )
         if middle is not None:
-            state, u = rests.x_eq @ middle, rests.u_eq @ middle
-    for i, held in enumerate(u.tolist()):
-        if not _within(held, low_u[i], high_u[i]):
+            state, u = rest_set.x_eq @ middle, rest_set.u_eq @ middle
+    for i, held_input in enumerate(u.tolist()):
+        if not _is_within(held_input, low_u[i], high_u[i]):
             raise DesignError(
-                f"sets.input_{'lower' if held < low_u[i] else 'upper'}[{i}]",
-                f"the input that holds the target is {held:.3g}, and [{low_u[i]:g}, {high_u[i]:g}] leaves it out",
+                f"sets.input_{'lower' if held_input < low_u[i] else 'upper'}[{i}]",
+                f"the input that holds the target is {held_input:.3g}, and [{low_u[i]:g}, {high_u[i]:g}] leaves it out",
                 "give limits that have it between them"
-                if not rests.u_eq[i].any()
+                if not rest_set.u_eq[i].any()
                 else "give limits that have it between them, or another target",
             )
-    if not _within(state, low_x, high_x):
+    if not _is_within(state, low_x, high_x):
         i = int(np.argmax(~((state >= low_x) & (state <= high_x))))
         raise DesignError(
             f"sets.state_lower[{i}]",
@@ -74,24 +72,24 @@ def resting_target(config: Config, plant: Plant) -> tuple[Array, Array]:
     return state, u
 
 
-def _within(value: float | Array, low: Array, high: Array) -> bool:
+def _is_within(value: float | Array, low: Array, high: Array) -> bool:
     size = _ROUNDING * (1.0 + np.abs(value))
     return bool(np.all((value >= low - size) & (value <= high + size)))
 
 
-def _middle(rows: Array, low: Array, high: Array) -> Array | None:
-    """The y with the largest least share s of the room that low + s (high - low) / 2 <= rows y <= … keep free.
+def _find_middle(rows: Array, low: Array, high: Array) -> Array | None:
+    """Return the y with the largest margin s: low + s (high - low) / 2 <= rows y <= high - s (high - low) / 2.
 
-    An open side counts as one unit wide; None if there is no y within all limits.
+    An open side counts as one unit wide; None if no y is within all limits.
     """
     from scipy.optimize import linprog
 
     if not rows.shape[1]:
         return None
-    room = np.where(np.isfinite(high - low), (high - low) / 2.0, 1.0)
-    c = np.vstack([np.column_stack([rows, room]), np.column_stack([-rows, room])])
-    sides = np.concatenate([high, -low])
-    kept = np.isfinite(sides)
-    aim = np.append(np.zeros(rows.shape[1]), -1.0)
-    found = linprog(aim, c[kept], sides[kept], bounds=[(None, None)] * rows.shape[1] + [(0.0, 1.0)])
-    return None if found.status or found.x is None else np.asarray(found.x[:-1])
+    half_widths = np.where(np.isfinite(high - low), (high - low) / 2.0, 1.0)
+    c = np.vstack([np.column_stack([rows, half_widths]), np.column_stack([-rows, half_widths])])
+    limits = np.concatenate([high, -low])
+    is_finite = np.isfinite(limits)
+    objective = np.append(np.zeros(rows.shape[1]), -1.0)
+    result = linprog(objective, c[is_finite], limits[is_finite], bounds=[(None, None)] * rows.shape[1] + [(0.0, 1.0)])
+    return None if result.status or result.x is None else np.asarray(result.x[:-1])

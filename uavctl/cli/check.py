@@ -20,7 +20,7 @@ from rich.text import Text
 
 from logs.recording.parameters import ParameterReader, make_parameter_records
 from logs.recording.topics import PARAMETER
-from uavctl.build.controller import Prepared, build_controller, design_of
+from uavctl.build.controller import Prepared, build_controller, build_flight_design
 from uavctl.build.rehearsal import rehearse
 from uavctl.build.rest import check_axes
 from uavctl.check.findings import Item, ItemState, describe_item, find_refusals, judge_item, make_item
@@ -241,7 +241,7 @@ def make_mission_items(config: Config, prepared: Prepared | None = None) -> tupl
     """
     if not config.is_age_conditioned or config.smpc.controller:
         return ()
-    design = design_of(config) if prepared is None else prepared.design
+    design = build_flight_design(config) if prepared is None else prepared.design
     controller = build_controller(config, design) if prepared is None else prepared.controller
     assert isinstance(design, ConditionedDesign)
     result = rehearse(config, design, controller)

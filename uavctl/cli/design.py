@@ -18,10 +18,10 @@ from uavctl.build.controller import (
     build_conditioned,
     build_controller,
     build_design,
+    build_flight_design,
     build_solver,
     build_spec,
-    design_of,
-    start_state,
+    make_start_state,
 )
 from uavctl.build.mission import build_names
 from uavctl.build.rehearsal import RehearsalResult, rehearse
@@ -50,7 +50,7 @@ def report_gains(common: Common) -> int:
     begin_s = time.perf_counter()
     with locate_design_errors(loaded), make_message_console().status("synthesis and designs"):
         spec = build_spec(loaded.config)
-        comparison = compare_gains(spec, start_state(loaded.config, spec.plant))
+        comparison = compare_gains(spec, make_start_state(loaded.config, spec.plant))
     document = {
         **msgspec.to_builtins(comparison),
         "k_tau": comparison.after.k_tau,
@@ -224,7 +224,7 @@ def solve(
     """Solve one decision problem, towards the configured target."""
     loaded = common.with_overrides([] if method is None else [f"solver.method={method}"]).load()
     with locate_design_errors(loaded):
-        design = design_of(loaded.config)
+        design = build_flight_design(loaded.config)
         x = parse_state(state, design.plant.n_x)
         solver = build_solver(design, loaded.config)
     begin_s = time.perf_counter()
@@ -255,6 +255,7 @@ def make_solve_document(answer: Answer, solve_us: float) -> dict[str, object]:
     """Return the answer for --json; infinite values (no plan, no lower bound) are null."""
     document: dict[str, object] = msgspec.to_builtins(answer, enc_hook=lambda array: array.tolist())
     del document["seq"]
+    document["gave_way"] = document.pop("relaxed")  # the key that it has in recordings, too
     return {**document, "solve_us": solve_us}
 
 

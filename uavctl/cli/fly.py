@@ -13,7 +13,7 @@ from logs.recording.parameters import ParameterReader
 from logs.recording.recorder import Recorder
 from logs.recording.summary import FlightSummary, make_summary_table
 from logs.recording.topics import ENDED
-from uavctl.build.controller import design_of, prepare
+from uavctl.build.controller import build_flight_design, prepare
 from uavctl.check.findings import Item
 from uavctl.cli.common import (
     DEFAULTS,
@@ -139,7 +139,7 @@ def fly_daemon(
         create_recording(out, config.name, config.log.free_bytes) as path,
     ):
         with locate_design_errors(loaded):
-            design = design_of(config)
+            design = build_flight_design(config)
             check_places(config, design, take_off_m, engagement.goal)
             prepared = prepare(config, design)
         # Loaded late: it takes an eighth of the loading time of `fly`.

@@ -18,7 +18,7 @@ from logs.recording.disk import FileKind, detect_kind, refuse_recording_path, wr
 from logs.recording.reader import header, lacks_end, read
 from logs.recording.senders import choose_vehicle, get_system_id
 from logs.recording.tlog import read_tlog
-from uavctl.build.controller import design_of
+from uavctl.build.controller import build_flight_design
 from uavctl.cli.common import DEFAULTS, Common, System, check_readable, make_progress, warn
 from uavctl.config import Config
 from uavctl.config.load import dump_config, parse
@@ -93,7 +93,7 @@ def _read_history(flight: Path, common: Common, system: int | None) -> tuple[Fli
 def find_design_warnings(config: Config) -> tuple[str, ...]:
     """Return a warning if the identified configuration has no design; else nothing."""
     try:
-        design_of(config)
+        build_flight_design(config)
     except DesignError as error:
         return (f"no design yet with this plant and link: {error}; for another gain: `uavctl design --synthesize`",)
     return ()

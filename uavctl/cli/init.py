@@ -11,14 +11,14 @@ from typing import Annotated, Literal
 import numpy as np
 from cyclopts import Parameter
 
-from uavctl.build.controller import LEAST_OUTSIDE_M, design_of, resting
-from uavctl.build.mission import resting_places
+from uavctl.build.controller import MIN_OUTSIDE_M, build_flight_design, compute_rest_limits
+from uavctl.build.mission import compute_rest_range
 from uavctl.check.parameters import compute_max_accel_mps2
 from uavctl.cli.common import print_message
 from uavctl.config import parse
 from uavctl.errors import UsageError
 
-WALL_M = LEAST_OUTSIDE_M  # from a limit of the vehicle's centre to the wall; the envelope allows as much
+WALL_M = MIN_OUTSIDE_M  # from a limit of the vehicle's centre to the wall; the envelope allows as much
 TIMEOUT_S = 0.7  # COM_OF_LOSS_T and GUID_TIMEOUT of docs/first-flight.md: longest time of the last acceleration
 MAX_ACCEL_MPS2 = {"px4": 4.0, "ardupilot": 2.0}  # of the presets
 SIMULATED_VEHICLES = {"px4": "udpin://0.0.0.0:14540", "ardupilot": "tcp://127.0.0.1:5760"}  # as of `uavctl sim`
@@ -153,8 +153,8 @@ def _check_fits(sizes_m: tuple[float, float, float], autopilot: str) -> None:
     """
     length, width, height = (max(size_m, _WIDE_SIDE_M) for size_m in sizes_m)  # a room of this size always has a design
     config = parse(format_room((length, width, height), autopilot, "room"), "room").config
-    design = design_of(config)
-    lower_m, upper_m = resting_places(design.plant, design.state_set, resting(design))
+    design = build_flight_design(config)
+    lower_m, upper_m = compute_rest_range(design.plant, design.state_set, compute_rest_limits(design))
     needed_m = np.array((length, width, height)) - (upper_m - lower_m) + MIN_FLIGHT_M
     short_sides = [
         f"a {name} of {size_m:g} m (at least {math.ceil(need_m / _ROUND_UP_M) * _ROUND_UP_M:.1f} m)"

@@ -21,7 +21,7 @@ from logs.recording.recorder import DerivedTopics, Recorder
 from logs.recording.summary import FlightSummary, make_summary_table
 from logs.recording.topics import ENDED
 from sim.server import Ready, serve_in_child
-from uavctl.build.controller import Prepared, design_of, prepare
+from uavctl.build.controller import Prepared, build_flight_design, prepare
 from uavctl.cli.common import (
     DEFAULTS,
     SEED,
@@ -126,7 +126,7 @@ def fly_simulated(
     config = _use_loopback_ports(loaded.config) if udp else loaded.config
     check_length(config)
     with locate_design_errors(loaded):
-        design = design_of(config)
+        design = build_flight_design(config)
     engagement = Engagement(config, take_off_m=take_off_m, goto=goto, follower=follower)
     with open_viewers(view_port) as viewers, create_recording(out, config.name, config.log.free_bytes) as path:
         with locate_design_errors(loaded):

@@ -11,7 +11,7 @@ from cyclopts import Parameter
 
 from logs.recording.summary import count
 from logs.recording.tlog import TlogPacket, replay_tlog
-from uavctl.build.controller import design_of, prepare
+from uavctl.build.controller import build_flight_design, prepare
 from uavctl.cli.common import DEFAULTS, Common, Flight, System, locate_design_errors, warn
 from uavctl.cli.replay_table import make_foreign_table, make_replay_table
 from uavctl.cli.replays import read_foreign_vehicle, replay_flight
@@ -69,7 +69,7 @@ def _replay_foreign(flight: Path, recorded: tuple[TlogPacket, ...], common: Comm
     loaded = common.with_overrides(("daemon.mocap=tlog", "daemon.vehicle=tlog")).load()
     config = loaded.config
     with locate_design_errors(loaded):
-        prepared = prepare(config, design_of(config))
+        prepared = prepare(config, build_flight_design(config))
     # The setpoints of another program flew it, so our envelope would reject its motion.
     controller = replace(prepared.controller, envelope=None)
     packets = ((packet.at_ns, packet.data) for packet in recorded if not packet.outgoing)

@@ -17,8 +17,16 @@ from logs.recording.replay import replay as replay_recording
 from logs.recording.senders import choose_vehicle
 from logs.recording.tlog import TlogPacket
 from uavctl.arithmetic import ARITHMETIC, OWN, without_choice
-from uavctl.build.controller import ARITHMETIC_NAME, CONTROLLER, Prepared, cpu, design_of, prepare, versions
-from uavctl.build.outside import KEY
+from uavctl.build.controller import (
+    ARITHMETIC_NAME,
+    CONTROLLER,
+    Prepared,
+    build_flight_design,
+    collect_versions,
+    prepare,
+    read_cpu_model,
+)
+from uavctl.build.outside import CONTROLLER_KEY
 from uavctl.cli import restart_process
 from uavctl.cli.common import locate_design_errors, warn
 from uavctl.config import Config, LoadedConfig
@@ -37,9 +45,9 @@ def make_recorded_controller(flight: Path, config: Config) -> Prepared:
         RecordingError: The controller of another package flew, and it is not installed.
     """
     try:
-        return prepare(config, design_of(config))
+        return prepare(config, build_flight_design(config))
     except DesignError as error:
-        if error.key != KEY:
+        if error.key != CONTROLLER_KEY:
             raise
         flown_controller = header(flight).versions.get(CONTROLLER, config.smpc.controller)
         raise RecordingError(
@@ -55,7 +63,7 @@ def make_changed_controller(loaded: LoadedConfig) -> Prepared:
         ConfigError: The configuration leaves no design.
     """
     with locate_design_errors(loaded):
-        return prepare(loaded.config, design_of(loaded.config))
+        return prepare(loaded.config, build_flight_design(loaded.config))
 
 
 class ChangedKey(msgspec.Struct, frozen=True, kw_only=True):
@@ -186,7 +194,7 @@ def match_arithmetic(recorded: Header) -> None:
 
     This is the case if numpy was loaded before `uavctl`, or if the user chose it.
     """
-    if recorded.versions.get(ARITHMETIC_NAME) == OWN and ARITHMETIC != OWN and recorded.cpu == cpu():
+    if recorded.versions.get(ARITHMETIC_NAME) == OWN and ARITHMETIC != OWN and recorded.cpu == read_cpu_model():
         restart_process(without_choice(os.environ))
 
 
@@ -197,10 +205,10 @@ def find_other_versions(recorded: Header, controller: str) -> tuple[str, ...]:
         controller: Controller of another package that flew; empty if none did.
     """
     try:
-        here_versions = versions(controller)
+        here_versions = collect_versions(controller)
     except DesignError:  # the controller of another package is not installed
-        here_versions = versions("")
-    here, there = {**here_versions, "cpu": cpu()}, {**recorded.versions, "cpu": recorded.cpu}
+        here_versions = collect_versions("")
+    here, there = {**here_versions, "cpu": read_cpu_model()}, {**recorded.versions, "cpu": recorded.cpu}
     if here[ARITHMETIC_NAME] != OWN and here[ARITHMETIC_NAME] == there.get(ARITHMETIC_NAME):
         there["cpu"] = here["cpu"]  # portable arithmetic does not depend on the processor
     return tuple(

@@ -21,7 +21,7 @@ from logs.recording.disk import write_atomically
 from logs.recording.flight import FlightData
 from logs.recording.reader import header, lacks_end, read
 from logs.recording.summary import summarise
-from uavctl.build.controller import design_of
+from uavctl.build.controller import build_flight_design
 from uavctl.cause import Cause
 from uavctl.cli.common import (
     SEED,
@@ -254,7 +254,7 @@ class _FlightSettings:
             return cls(tuned_config, None, flight, simulated, take_off_m)
         assert box is not None
         safe_box = parse_box(box)
-        design = design_of(config)
+        design = build_flight_design(config)
         mission_config = add_excitation(config, design, safe_box, lands=lands)
         if take_off_m is not None:
             check_start(safe_box, (0.0, 0.0, -take_off_m), "--takeoff", (DOWN,))

@@ -9,7 +9,7 @@ from pathlib import Path
 from msgspec.structs import replace
 
 from uavctl.arrays import Array
-from uavctl.build.controller import Prepared, build_problem, design_of, prepare
+from uavctl.build.controller import Prepared, build_flight_design, build_problem, prepare
 from uavctl.cli.common import locate_design_errors
 from uavctl.config import Config, LoadedConfig, load
 from uavctl.config.checks import get_dimensions
@@ -106,7 +106,7 @@ def make_baseline_controller(loaded: LoadedConfig, kind: str, start: Array) -> P
     spec = ControllerSpec(name=kind, kind=kind)
     campaign = CampaignSpec(name="what-if", config=config.name, controller=(spec,), start=tuple(start.tolist()))
     with locate_design_errors(loaded):
-        prepared = prepare(config, design_of(config))
+        prepared = prepare(config, build_flight_design(config))
         recipe = make_recipe(spec, config, campaign)
 
     def make(target: Array) -> tuple[ControlProblem, BatchController]:

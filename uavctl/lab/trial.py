@@ -18,8 +18,8 @@ from scipy.interpolate import CubicHermiteSpline
 
 from sim.simulation import World
 from uavctl.arrays import Array
-from uavctl.build.controller import build_conditioned, build_controller, build_plant, resting
-from uavctl.build.mission import build_rests, resting_places
+from uavctl.build.controller import build_conditioned, build_controller, build_plant, compute_rest_limits
+from uavctl.build.mission import build_rest_limits, compute_rest_range
 from uavctl.config import Config, load_config, parse
 from uavctl.config.checks import get_position_limits_m
 from uavctl.config.mission import TrajectoryConfig
@@ -250,7 +250,9 @@ def compute_usable_share(config: Config, design: AnyDesign) -> float:
     Raises:
         DesignError: There is no such scheme.
     """
-    return _compute_volume_share(config, *resting_places(design.plant, design.state_set, resting(design)))
+    return _compute_volume_share(
+        config, *compute_rest_range(design.plant, design.state_set, compute_rest_limits(design))
+    )
 
 
 def compute_exact_usable_share(config: Config, design: Design | None) -> float:
@@ -260,10 +262,14 @@ def compute_exact_usable_share(config: Config, design: Design | None) -> float:
         DesignError: There is no such scheme.
     """
     if design is not None:
-        return _compute_volume_share(config, *resting_places(design.plant, design.state_set, build_rests(design)))
+        return _compute_volume_share(
+            config, *compute_rest_range(design.plant, design.state_set, build_rest_limits(design))
+        )
     n_x = build_plant(config).n_x
-    conditioned = build_conditioned(config, flown=False, cov=np.zeros((n_x, n_x)))
-    return _compute_volume_share(config, *resting_places(conditioned.plant, conditioned.state_set, conditioned.rests))
+    conditioned = build_conditioned(config, for_flight=False, cov=np.zeros((n_x, n_x)))
+    return _compute_volume_share(
+        config, *compute_rest_range(conditioned.plant, conditioned.state_set, conditioned.rests)
+    )
 
 
 def _compute_volume_share(config: Config, rest_lower: Array, rest_upper: Array) -> float:

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 from campaign_results import cell, runs, write
-from report_rig import unwritten
-from told_numbers import numbers_in
+from report_rig import omit_figures
+from told_numbers import find_numbers
 
 from logs.report.page import render_legend
 from logs.report.run_statistics import PairedDifference
@@ -101,9 +101,9 @@ def test_a_cheaper_baseline_is_named_with_the_limits_that_it_breaks(tmp_path: Pa
         "yes",
     )
     costs, limits = describe_briefly(verdict.comparisons[0]).split(", ")
-    assert numbers_in(costs) == [3.0] and "less" in costs and "more often" in limits
+    assert find_numbers(costs) == [3.0] and "less" in costs and "more often" in limits
     (sentence,) = describe_verdict(verdict)
-    assert numbers_in(sentence)[-5:] == [2.0, 0.0, 30.0, 0.0, 10.0]  # states, SMPC's, inputs, SMPC's; allowed
+    assert find_numbers(sentence)[-5:] == [2.0, 0.0, 30.0, 0.0, 10.0]  # states, SMPC's, inputs, SMPC's; allowed
     assert "inputs (10 %)" in sentence and "caution" not in sentence and "chance" not in sentence
 
 
@@ -122,7 +122,7 @@ def test_a_rate_above_the_allowance_is_never_reported_as_within_it(tmp_path: Pat
     assert rate is not None and interval is not None and interval[0] <= 0.1 < rate
     safer = replace(one, inputs=PairedDifference(mean=-rate, low=-rate, high=-rate, runs=3))
     (sentence,) = describe_verdict(replace(verdict, comparisons=(safer,)))
-    assert numbers_in(sentence)[-3:] == [28.0, 0.0, 10.0]  # inputs, SMPC's; allowed
+    assert find_numbers(sentence)[-3:] == [28.0, 0.0, 10.0]  # inputs, SMPC's; allowed
     assert "10 % allowed for inputs" in sentence and "chance" in sentence and "caution" not in sentence
 
 
@@ -144,11 +144,11 @@ def test_the_promise_is_judged_by_the_measured_rates(
 ) -> None:
     rows = runs(0, SMPC[: len(hits)].tolist(), state_violations=hits)
     folder = write(tmp_path, [cell(0, "ours", "smpc")], rows)
-    with unwritten():
+    with omit_figures():
         text = text_of(write_report(folder))
     word = "Promise kept" if len(cells) == 1 and rate <= 5.0 else "Perhaps too often" if chance else "Promise broken"
     (first,) = re.findall(rf"{word}: (.*?allowed)", text)
-    assert numbers_in(first) == [*cells, rate, 5.0]
+    assert find_numbers(first) == [*cells, rate, 5.0]
 
 
 def test_a_better_baseline_is_reported(tmp_path: Path) -> None:
@@ -163,7 +163,7 @@ def test_cheaper_at_a_higher_violation_rate_is_not_outright(tmp_path: Path) -> N
     verdict = judged(tmp_path, runs(1, (SMPC * 1.1).tolist()), worse)
     assert (verdict.is_unmatched, verdict.is_better_than_all, verdict.is_beaten) == (True, False, False)
     costs, limits = describe_briefly(verdict.comparisons[0]).split(", ")
-    assert numbers_in(costs) == [10.0] and "more" in costs and "better" in limits
+    assert find_numbers(costs) == [10.0] and "more" in costs and "better" in limits
 
 
 def test_costs_without_a_significant_difference_are_no(tmp_path: Path) -> None:
@@ -207,9 +207,9 @@ def test_the_page_lists_cells_and_results(grid: Path) -> None:
         assert label in text
     reported = list(describe_outcome(CampaignView.make(read_results(grid))))
     assert all(sentence in text for sentence in reported)
-    assert numbers_in(reported[0])[:2] == [480.0, 50.0]  # runs, steps
-    assert numbers_in(reported[1]) == [4.0] and "no design" in reported[1]
-    assert numbers_in(reported[3]) == [4.0, 4.0, 0.0, 0.0]  # SMPC best at its rate, of so many; outright; beaten
+    assert find_numbers(reported[0])[:2] == [480.0, 50.0]  # runs, steps
+    assert find_numbers(reported[1]) == [4.0] and "no design" in reported[1]
+    assert find_numbers(reported[3]) == [4.0, 4.0, 0.0, 0.0]  # SMPC best at its rate, of so many; outright; beaten
     assert 'name = "by hand"' in text
     assert "lqg <b>" in text
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from campaign_rig import cells, controller
-from patience import LIMIT_S, until
+from patience import LIMIT_S, wait_until
 
 from uavctl.errors import UsageError
 from uavctl.lab.campaign import pool
@@ -59,7 +59,7 @@ def test_workers_end_with_their_parent_however_it_ends(tmp_path: Path) -> None:
     worker = int(parent.stdout.readline())
     parent.kill()
     parent.communicate(timeout=LIMIT_S)
-    until(lambda: not _runs(worker), "the worker ends with its parent")
+    wait_until(lambda: not _runs(worker), "the worker ends with its parent")
 
 
 def test_workers_with_other_versions_or_threads_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:

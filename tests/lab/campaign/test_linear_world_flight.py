@@ -8,7 +8,7 @@ from heapq import heappush
 
 import numpy as np
 import pytest
-from loopback_rig import Memory, make_loop
+from loopback_rig import MemorySink, make_loop
 from msgspec.structs import replace
 
 from sim import simulation
@@ -134,9 +134,9 @@ def as_flown(start: Array) -> Config:
     )
 
 
-def in_lockstep(run: Run) -> Memory:
+def in_lockstep(run: Run) -> MemorySink:
     """The same run by controller, MAVLink and simulated autopilot."""
-    config, memory = as_flown(run.start), Memory()
+    config, memory = as_flown(run.start), MemorySink()
     assert build_design(config).design_id == DESIGN.design_id
     loop = make_loop(config, memory, DESIGN)
     with pytest.MonkeyPatch.context() as patch:

@@ -11,7 +11,7 @@ from loopback_rig import lockstep
 
 from sim.channel import Channel
 from uavctl.arrays import Array
-from uavctl.build.link import build_delayed_link, build_link, promised
+from uavctl.build.link import build_delayed_link, build_link, compute_promised_probability
 from uavctl.config import load, load_config
 from uavctl.config.load import dump_config, parse
 from uavctl.errors import ConfigError, DesignError
@@ -145,7 +145,7 @@ def test_the_design_counts_the_trace_s_own_runs_and_late_packets_as_lost() -> No
 
 
 def test_a_trace_without_losses_promises_everything() -> None:
-    assert promised(build_link(load_config("paper", [*PAPER, listed((0.01, 0.02))]))) == 1.0
+    assert compute_promised_probability(build_link(load_config("paper", [*PAPER, listed((0.01, 0.02))]))) == 1.0
 
 
 def test_runs_beyond_the_longest_that_a_chain_has_are_cut() -> None:

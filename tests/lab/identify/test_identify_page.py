@@ -119,9 +119,9 @@ def test_the_refusal_of_a_design_is_on_the_page(
 
     setpoints = SetpointHistory(np.zeros(1), np.zeros((1, 3)), np.ones(1, dtype=bool))
     history = FlightHistory(setpoints, make_positions(), np.zeros(0, dtype=np.int64))
-    monkeypatch.setattr(identify_cmd, "_history", lambda *_: (history, load_config("room-hahn-stursberg")))
+    monkeypatch.setattr(identify_cmd, "_read_history", lambda *_: (history, load_config("room-hahn-stursberg")))
     monkeypatch.setattr(identify_cmd, "identify", lambda *_: make_identification(HARDLY))
-    monkeypatch.setattr(identify_cmd, "design_of", refused)
+    monkeypatch.setattr(identify_cmd, "build_flight_design", refused)
     assert identify_cmd.identify_command(tmp_path / "flight.mcap") == 0
     texts = sentences((tmp_path / "identified.html").read_text(encoding="utf-8"))
     shown = " ".join(capsys.readouterr().out.split())

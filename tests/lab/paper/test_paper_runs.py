@@ -8,7 +8,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from uavctl.arrays import Array
-from uavctl.build.controller import build_design, build_plant, start_state
+from uavctl.build.controller import build_design, build_plant, make_start_state
 from uavctl.config import load_config
 from uavctl.lab.campaign.arrivals import compute_newest_captures
 from uavctl.lab.campaign.draws import draw
@@ -126,7 +126,7 @@ def test_longer_campaigns_begin_with_the_same_runs(setup: Setup) -> None:
 
 
 def test_the_start_is_the_printed_one(setup: Setup) -> None:
-    assert start_state(setup.config, setup.design.plant).tolist() == [35.0, -2.0, -20.0, -4.0]
+    assert make_start_state(setup.config, setup.design.plant).tolist() == [35.0, -2.0, -20.0, -4.0]
 
 
 def test_moments_of_parts_are_those_of_all() -> None:

@@ -12,7 +12,7 @@ import pytest
 from loopback_rig import lockstep
 
 from logs.recording.flight import FlightData
-from uavctl.build.controller import design_of
+from uavctl.build.controller import build_flight_design
 from uavctl.config import Config, load_config
 from uavctl.errors import UsageError
 from uavctl.lab.identify.history import read_recorded_history
@@ -56,7 +56,7 @@ def test_an_invalid_box_is_refused(text: str) -> None:
 @pytest.mark.parametrize("preset", ["room", "room-px4", "room-ardupilot"])
 def test_each_axis_is_stepped_by_itself_well_inside_the_box(preset: str) -> None:
     config = load_config(preset, ("sim.plant=quadrotor",))
-    tuned = add_excitation(config, design_of(config), BOX, lands=False)
+    tuned = add_excitation(config, build_flight_design(config), BOX, lands=False)
     points = np.array(tuned.mission.waypoints)
     assert np.all(points > np.array(BOX.lower) + 0.1) and np.all(points < np.array(BOX.upper) - 0.1)
     steps = np.abs(np.diff(points, axis=0))
@@ -74,19 +74,19 @@ def test_each_axis_is_stepped_by_itself_well_inside_the_box(preset: str) -> None
 def test_a_box_outside_the_room_is_refused_by_its_axis() -> None:
     config = room()
     with pytest.raises(UsageError, match=r"east: .* -2\.5 to 2\.5 m") as refused:
-        add_excitation(config, design_of(config), parse_box("-1,-3,-2,1,1,-0.4"), lands=False)
+        add_excitation(config, build_flight_design(config), parse_box("-1,-3,-2,1,1,-0.4"), lands=False)
     assert "north" not in str(refused.value)
 
 
 def test_a_fence_of_the_configuration_counts_as_a_wall() -> None:
     config = room('fence=[{state="north",side="upper",times_s=[0.0,5.0],values=[2.0,1.0]}]')
     with pytest.raises(UsageError, match=r"north: .* to 1 m"):
-        add_excitation(config, design_of(config), BOX, lands=False)
+        add_excitation(config, build_flight_design(config), BOX, lands=False)
 
 
 def test_a_box_that_is_too_small_says_how_large_it_must_be() -> None:
     config = room()
-    design = design_of(config)
+    design = build_flight_design(config)
     with pytest.raises(UsageError) as refused:
         add_excitation(config, design, parse_box("-0.2,-1,-2,0.2,1,-0.4"), lands=False)
     identification = re.search(r"north: .* at least ([\d.]+) m", str(refused.value))

@@ -14,7 +14,7 @@ import sim.vehicle.quadrotor as quadrotor
 from sim import simulation
 from sim.simulation import World
 from sim.vehicle.airframe import CRAZYFLIE_2
-from uavctl.build.controller import build_controller, design_of
+from uavctl.build.controller import build_controller, build_flight_design
 from uavctl.config import Config, load_config
 from uavctl.lab.trial import FlightCounts, compute_excess_m
 from uavctl.lab.tune.box_monitor import MIN_REPEAT_SHARE, BoxMonitor
@@ -54,7 +54,7 @@ def fly(
     assert defaults is not None
     patch.setitem(defaults, "airframe", replace(CRAZYFLIE_2, rotor_drag_kg=(front, right, down)))
     patch.setattr(simulation, "Quadrotor", type("True", (TrueVehicle,), {"gain": gain, "lag_s": lag_s}))
-    excited = add_excitation(config, design_of(config), box, lands=False)
+    excited = add_excitation(config, build_flight_design(config), box, lands=False)
     loop = ControlLoop(excited, build_controller(excited), FlightCounts(), lambda: 0)
     monitor, beyond = BoxMonitor(excited, box), [-np.inf]
     sides = np.array(box.lower), np.array(box.upper)
@@ -143,7 +143,7 @@ class Orders:
 @pytest.fixture(params=["room-px4", "room-ardupilot"])
 def orders(request: pytest.FixtureRequest) -> Orders:
     config = load_config(request.param, ("sim.plant=quadrotor",))
-    return Orders(add_excitation(config, design_of(config), BOX, lands=True), BOX)
+    return Orders(add_excitation(config, build_flight_design(config), BOX, lands=True), BOX)
 
 
 def test_a_flight_that_stays_inside_gets_no_order(orders: Orders) -> None:
@@ -240,7 +240,7 @@ def test_an_order_of_an_operator_ends_the_monitor(orders: Orders, order: Order) 
 @pytest.mark.parametrize("preset", ["room", "room-px4", "room-ardupilot"])
 def test_each_axis_begins_with_its_smaller_steps(preset: str) -> None:
     config = load_config(preset, ("sim.plant=quadrotor",))
-    points = np.array(add_excitation(config, design_of(config), BOX, lands=False).mission.waypoints)
+    points = np.array(add_excitation(config, build_flight_design(config), BOX, lands=False).mission.waypoints)
     steps = np.abs(np.diff(points, axis=0))
     for axis in range(3):
         is_single_axis = (steps[:, axis] > 0.0) & (np.delete(steps, axis, axis=1).max(axis=1) == 0.0)

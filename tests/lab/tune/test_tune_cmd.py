@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from tune_rig import BOX, START, short_flights, typed, words
+from tune_rig import BOX, START, make_arguments, run_command, short_flights
 
 from logs.recording.reader import header, segment_files
 from uavctl.cli import loopback as loopback_cmd
@@ -41,7 +41,7 @@ def finished_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A whole run, its recordings in several files."""
     folder = tmp_path_factory.mktemp("tune") / "run"
     with short_flights():
-        assert run(words(folder, "--set", "log.segment_bytes=1000000")) == 0
+        assert run(make_arguments(folder, "--set", "log.segment_bytes=1000000")) == 0
     return folder
 
 
@@ -55,7 +55,7 @@ def begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder = tmp_path / "begun"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tune_cmd, "fly_once", pressed)
-        assert run(words(folder, "--set", "log.segment_bytes=1000000")) == tune_cmd.INTERRUPTED
+        assert run(make_arguments(folder, "--set", "log.segment_bytes=1000000")) == tune_cmd.INTERRUPTED
     monkeypatch.setattr(tune_cmd, "fly_once", lambda *_, **__: pytest.fail("flown"))
     return folder
 
@@ -106,7 +106,9 @@ def test_every_figure_of_the_page_has_a_text_alternative(finished_run: Path) -> 
 def test_a_run_that_is_done_flies_no_more(finished_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     stamp = (finished_run / STATE_FILE).read_bytes()
     with short_flights():
-        code, out, _ = typed(capsys, *words(finished_run, "--set", "log.segment_bytes=1000000", "--json"))
+        code, out, _ = run_command(
+            capsys, *make_arguments(finished_run, "--set", "log.segment_bytes=1000000", "--json")
+        )
     assert code == 0
     document = json.loads(out)
     assert document["config"] == str(finished_run / TUNED_FILE) and document["stopped"] == ""
@@ -134,7 +136,7 @@ def test_a_run_continues_after_the_last_complete_step(
     (folder / TUNED_FILE).write_bytes((finished_run / TUNED_FILE).read_bytes())
     monkeypatch.setattr(tune_cmd, "fly_once", lambda *_, **__: pytest.fail("flown again"))
     with short_flights():
-        code, _, _ = typed(capsys, *words(folder, "--set", "log.segment_bytes=1000000"))
+        code, _, _ = run_command(capsys, *make_arguments(folder, "--set", "log.segment_bytes=1000000"))
     assert code == 0
     again = json.loads((folder / STATE_FILE).read_text())["comparison"]
     assert again["new_errors"] == state["comparison"]["new_errors"]
@@ -142,7 +144,7 @@ def test_a_run_continues_after_the_last_complete_step(
 
 
 def test_another_configuration_is_refused_by_its_key(begun: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code, out, err = typed(capsys, *words(begun))
+    code, out, err = run_command(capsys, *make_arguments(begun))
     assert (code, out) == (2, "")
     assert "log.segment_bytes" in err
 
@@ -159,13 +161,13 @@ def test_the_pilots_stick_stops_the_run_and_the_next_try_is_a_new_flight(
         raise KeyboardInterrupt
 
     with short_flights():
-        code, out, err = typed(capsys, *words(folder, "--set", PILOT, "--json"))
+        code, out, err = run_command(capsys, *make_arguments(folder, "--set", PILOT, "--json"))
         document = json.loads(out)
         assert code == document["exit_code"] == tune_cmd.PILOT
         assert document["before"] == "" and document["config"] is None
         assert "pilot" in document["stopped"].lower() and str(folder) in err
         monkeypatch.setattr(tune_cmd, "fly_once", pressed)
-        assert run(words(folder, "--set", PILOT)) == tune_cmd.INTERRUPTED
+        assert run(make_arguments(folder, "--set", PILOT)) == tune_cmd.INTERRUPTED
     assert (folder / BEFORE_FOLDER / "flight.mcap").exists() and tries == [folder / f"{BEFORE_FOLDER}-2"]
     assert not (folder / TUNED_FILE).exists()
 
@@ -182,7 +184,7 @@ def test_ctrl_c_ends_the_flight_and_the_run(
     monkeypatch.setattr(loopback_cmd, "stop_on_signals", pressed)
     folder = tmp_path / "run"
     with short_flights():
-        code, out, _ = typed(capsys, *words(folder, "--json"))
+        code, out, _ = run_command(capsys, *make_arguments(folder, "--json"))
     document = json.loads(out)
     assert code == document["exit_code"] == tune_cmd.INTERRUPTED
     assert document["before"] == "" and "operator" in document["stopped"]
@@ -202,7 +204,7 @@ def test_a_recording_takes_the_place_of_the_first_flight(
 
     monkeypatch.setattr(tune_cmd, "fly_once", pressed)
     arguments = ["tune", "room", "--flight", str(flight), "--folder", str(folder), "--loopback", "--set", START]
-    code, out, _ = typed(capsys, *arguments, "--json")
+    code, out, _ = run_command(capsys, *arguments, "--json")
     assert code == tune_cmd.INTERRUPTED
     document = json.loads(out)
     assert Path(document["before"]) == flight.absolute() and document["config"] == str(folder / TUNED_FILE)
@@ -232,7 +234,7 @@ def test_invalid_arguments_are_refused_before_a_folder_is_made(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], more: tuple[str, ...], text: str
 ) -> None:
     folder = tmp_path / "run"
-    code, out, err = typed(capsys, "tune", "room", "--folder", str(folder), *more)
+    code, out, err = run_command(capsys, "tune", "room", "--folder", str(folder), *more)
     assert (code, out) == (2, "")
     assert text in err
     assert not folder.exists()
@@ -266,7 +268,7 @@ def no_flight(monkeypatch: pytest.MonkeyPatch) -> None:
 def again(capsys: pytest.CaptureFixture[str], folder: Path) -> tuple[int, str, str]:
     """The same command on a folder."""
     with short_flights():
-        return typed(capsys, *words(folder, "--set", "log.segment_bytes=1000000", "--json"))
+        return run_command(capsys, *make_arguments(folder, "--set", "log.segment_bytes=1000000", "--json"))
 
 
 @pytest.mark.slow
@@ -362,7 +364,7 @@ def test_a_recording_without_a_flight_is_refused_before_a_folder_is_made(
 ) -> None:
     flight, folder = tmp_path / "f.mcap", tmp_path / "run"
     flight.write_bytes(content)
-    code, out, err = typed(capsys, "tune", "room", "--flight", str(flight), "--folder", str(folder), "--loopback")
+    code, out, err = run_command(capsys, "tune", "room", "--flight", str(flight), "--folder", str(folder), "--loopback")
     assert (code, out) == (1, "") and str(flight) in " ".join(err.split())
     assert not folder.exists() and flight.read_bytes() == content
 
@@ -372,7 +374,7 @@ def test_a_folder_that_cannot_be_made_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], below: str
 ) -> None:
     (tmp_path / "file").write_text("mine")
-    code, out, err = typed(capsys, *words(tmp_path / below))
+    code, out, err = run_command(capsys, *make_arguments(tmp_path / below))
     assert (code, out) == (2, "") and "--folder" in err
     assert (tmp_path / "file").read_text() == "mine"
 
@@ -387,7 +389,7 @@ def test_corners_in_any_order_are_one_box() -> None:
 def test_a_run_on_the_simulated_ardupilot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "run"
     with short_flights():
-        code, out, _ = typed(capsys, *words(folder, "--set", "sim.autopilot=ardupilot", "--json"))
+        code, out, _ = run_command(capsys, *make_arguments(folder, "--set", "sim.autopilot=ardupilot", "--json"))
     document = json.loads(out)
     assert (code, document["stopped"]) == (0, "")
     comparison = document["comparison"]

@@ -5,8 +5,21 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 import pytest
-from loopback_rig import Memory, flight, header
-from whatif_rig import EXACT, PAPER, QUADROTOR, ROOM, WIRE, Case, again, config_of, far, flown, history, stripped
+from loopback_rig import MemorySink, flight, header
+from whatif_rig import (
+    EXACT,
+    PAPER,
+    QUADROTOR,
+    ROOM,
+    WIRE,
+    Case,
+    compute_differences,
+    fly_again,
+    fly_case,
+    history,
+    load_case_config,
+    strip_recording,
+)
 
 from logs.recording.topics import encode
 from sim.vehicle.linear import LinearVehicle, make_linear_model
@@ -29,13 +42,13 @@ from uavctl.records import Datagram, Decision, Plan, PositionSample, Record, Set
 @pytest.mark.slow
 @pytest.mark.parametrize("case", [PAPER, ROOM, QUADROTOR], ids=["paper", "room", "quadrotor"])
 def test_nothing_changed_is_the_recorded_flight_bit_for_bit(case: Case) -> None:
-    memory, course = again(case)
+    memory, course = fly_again(case)
     for kind in (StepInput, Decision, Plan, Setpoint, Datagram, Truth):
-        reproduced, recorded = memory.of(kind), flown(case).of(kind)
+        reproduced, recorded = memory.of(kind), fly_case(case).of(kind)
         assert len(reproduced) == len(recorded) > 0
         assert [encode(record) for record in reproduced] == [encode(record) for record in recorded]
     assert course.deviation.first_acting_ns is None and course.ended == "the recording ends"
-    result = compare_reproduction(flight(flown(case)), flight(memory))
+    result = compare_reproduction(flight(fly_case(case)), flight(memory))
     assert result.identical and result.largest_state == result.largest_input == 0.0
 
 
@@ -53,10 +66,10 @@ def test_nothing_changed_is_the_recorded_flight_bit_for_bit(case: Case) -> None:
 def test_the_what_if_equals_a_flight_with_the_changed_configuration(
     case: Case, changes: tuple[str, ...], min_difference: float
 ) -> None:
-    memory, _ = again(case, *changes)
-    real = flown(case, *changes)
-    assert far(memory, flown(case)) > min_difference  # it is another flight than the recorded one
-    assert far(memory, real) < WIRE
+    memory, _ = fly_again(case, *changes)
+    real = fly_case(case, *changes)
+    assert compute_differences(memory, fly_case(case)) > min_difference  # it is another flight than the recorded one
+    assert compute_differences(memory, real) < WIRE
     ages = [[decision.age_steps for decision in side.of(Decision)] for side in (memory, real)]
     assert ages[0] == ages[1]
 
@@ -64,26 +77,28 @@ def test_the_what_if_equals_a_flight_with_the_changed_configuration(
 @pytest.mark.slow
 def test_another_link_loses_the_same_positions_as_in_a_flight() -> None:
     changes = ("link.loss=0.1", "schedule.delays=5")
-    other = SimulatedLink(history(PAPER), config_of(PAPER, *changes).link, config_of(PAPER).sim.seed, 0.0)
-    memory, _ = again(PAPER, *changes, other=other)
-    real = flown(PAPER, *changes)
-    assert memory.of(Truth)[-1].lost == real.of(Truth)[-1].lost != flown(PAPER).of(Truth)[-1].lost
+    other = SimulatedLink(history(PAPER), load_case_config(PAPER, *changes).link, load_case_config(PAPER).sim.seed, 0.0)
+    memory, _ = fly_again(PAPER, *changes, other_link=other)
+    real = fly_case(PAPER, *changes)
+    assert memory.of(Truth)[-1].lost == real.of(Truth)[-1].lost != fly_case(PAPER).of(Truth)[-1].lost
     assert memory.of(Truth)[-1].sent == real.of(Truth)[-1].sent
     ages = [[decision.age_steps for decision in side.of(Decision)] for side in (memory, real)]
     assert ages[0] == ages[1]
-    assert far(memory, real) < WIRE  # the cameras of `paper` see at the boundaries, where the truth is recorded
+    assert (
+        compute_differences(memory, real) < WIRE
+    )  # the cameras of `paper` see at the boundaries, where the truth is recorded
 
 
 @pytest.mark.slow
 def test_another_link_restores_lost_positions_between_the_boundaries_to_a_millimetre() -> None:
     quiet: Case = ("room-hahn-stursberg", 8.0, (*EXACT, "sim.camera.noise_std_m=0.0"))
     change = "link.loss=0.1"
-    other = SimulatedLink(history(quiet), config_of(quiet, change).link, config_of(quiet).sim.seed, 0.0)
-    memory, _ = again(quiet, change, other=other)
-    real = flown(quiet, change)
-    assert memory.of(Truth)[-1].lost == real.of(Truth)[-1].lost < flown(quiet).of(Truth)[-1].lost
-    assert far(memory, flown(quiet)) > 0.05
-    assert far(memory, real) < 2e-3
+    other = SimulatedLink(history(quiet), load_case_config(quiet, change).link, load_case_config(quiet).sim.seed, 0.0)
+    memory, _ = fly_again(quiet, change, other_link=other)
+    real = fly_case(quiet, change)
+    assert memory.of(Truth)[-1].lost == real.of(Truth)[-1].lost < fly_case(quiet).of(Truth)[-1].lost
+    assert compute_differences(memory, fly_case(quiet)) > 0.05
+    assert compute_differences(memory, real) < 2e-3
 
 
 def test_lost_positions_are_restored_in_order() -> None:
@@ -98,8 +113,8 @@ def test_lost_positions_are_restored_in_order() -> None:
 
 
 def test_a_link_that_loses_all_ends_in_the_fallback() -> None:
-    link = msgspec.structs.replace(config_of(ROOM).link, blackout=((1.0, 100.0),))
-    memory, course = again(ROOM, other=SimulatedLink(history(ROOM), link, 1, 0.0))
+    link = msgspec.structs.replace(load_case_config(ROOM).link, blackout=((1.0, 100.0),))
+    memory, course = fly_again(ROOM, other_link=SimulatedLink(history(ROOM), link, 1, 0.0))
     assert {decision.mode.value for decision in memory.of(Decision)} >= {"track", "brake"}
     assert "landing" in course.ended or course.ended == "the recording ends"
     assert memory.of(Truth)[-1].lost > 0
@@ -108,13 +123,13 @@ def test_a_link_that_loses_all_ends_in_the_fallback() -> None:
 @pytest.mark.slow
 def test_the_fit_shows_the_model_error_of_a_quadrotor() -> None:
     change = "target.position_m=[0.5, 0.5, -1.0]"
-    memory, _ = again(QUADROTOR, change)
-    real = flight(flown(QUADROTOR, change))
-    moved = compute_max_distance_m(flight(flown(QUADROTOR)), real)
+    memory, _ = fly_again(QUADROTOR, change)
+    real = flight(fly_case(QUADROTOR, change))
+    moved = compute_max_distance_m(flight(fly_case(QUADROTOR)), real)
     wrong = compute_max_distance_m(flight(memory), real)
     assert moved > 0.5 and 1e-3 < wrong < 0.2 * moved
     fits = [
-        fit_model(history(case), make_response(history(case), config_of(case).plant), "own")
+        fit_model(history(case), make_response(history(case), load_case_config(case).plant), "own")
         for case in (ROOM, QUADROTOR)
     ]
     assert all(fit.r2 is not None and fit.moves > 20 for fit in fits)
@@ -123,7 +138,7 @@ def test_the_fit_shows_the_model_error_of_a_quadrotor() -> None:
 
 
 def test_the_deviation_is_the_difference_of_two_vehicles_in_the_same_wind() -> None:
-    config = config_of(ROOM)
+    config = load_case_config(ROOM)
     one, other = (LinearVehicle(config, np.random.SeedSequence(3), 0) for _ in range(2))
     departure = Deviation(VehicleResponse(one.model))
     assert departure.first_acting_ns is None
@@ -159,7 +174,7 @@ def test_the_deviation_is_the_difference_of_two_vehicles_in_the_same_wind() -> N
 
 
 def test_a_setpoint_acts_after_the_dead_time() -> None:
-    model = make_linear_model(config_of(ROOM).plant)
+    model = make_linear_model(load_case_config(ROOM).plant)
     at_once, delayed = Deviation(VehicleResponse(model)), Deviation(VehicleResponse(model, 120_000_000))
     for at_ns, accel in ((0, (1.0, -0.5, 0.2)), (50_000_000, (0.3, 0.0, -0.1)), (900_000_000, (0.0, 0.0, 0.0))):
         at_once.steer(at_ns, accel)
@@ -179,20 +194,20 @@ def test_too_few_positions_and_no_setpoints_are_refused() -> None:
     def blind(record: Record) -> Record:
         return msgspec.structs.replace(record, samples=()) if isinstance(record, StepInput) else record
 
-    nothing = [(topic, at_ns, blind(record)) for topic, at_ns, record in flown(PAPER).entries]
+    nothing = [(topic, at_ns, blind(record)) for topic, at_ns, record in fly_case(PAPER).entries]
     with pytest.raises(RecordingError, match=r"^a: .* 0 positions .* at least 2"):
-        make_recorded_flight(nothing, config_of(PAPER), "a")
+        make_recorded_flight(nothing, load_case_config(PAPER), "a")
     with pytest.raises(RecordingError, match="never took a setpoint"):
-        make_recorded_flight(stripped(PAPER, Setpoint), config_of(PAPER), "a")
+        make_recorded_flight(strip_recording(PAPER, Setpoint), load_case_config(PAPER), "a")
     with pytest.raises(RecordingError, match="no decision"):
-        make_recorded_flight(stripped(PAPER, Decision), config_of(PAPER), "a")
+        make_recorded_flight(strip_recording(PAPER, Decision), load_case_config(PAPER), "a")
 
 
 def test_a_recorded_flight_that_ends_early_ends_the_comparison() -> None:
     end_ns = 12_000_000_000
-    cut = [entry for entry in flown(PAPER).entries if not (isinstance(entry[2], Setpoint) and entry[1] > end_ns)]
-    memory = Memory()
-    config = config_of(PAPER)
+    cut = [entry for entry in fly_case(PAPER).entries if not (isinstance(entry[2], Setpoint) and entry[1] > end_ns)]
+    memory = MemorySink()
+    config = load_case_config(PAPER)
     shortened = make_recorded_flight(cut, config, "x")
     response = make_response(shortened, config.plant)
     course = refly(shortened, config, build_controller(config), response, memory, lambda: 0)
@@ -202,10 +217,10 @@ def test_a_recorded_flight_that_ends_early_ends_the_comparison() -> None:
 
 
 def test_bytes_of_a_stream_are_read_in_whole_frames_wherever_they_are_cut() -> None:
-    config = config_of(PAPER, "daemon.mocap=tcp:127.0.0.1:1")
+    config = load_case_config(PAPER, "daemon.mocap=tcp:127.0.0.1:1")
     cut: list[Entry] = []
     remaining = b""
-    for topic, at_ns, record in flown(PAPER).entries:
+    for topic, at_ns, record in fly_case(PAPER).entries:
         if isinstance(record, Datagram) and record.link == "mocap" and not record.outgoing:
             data = remaining + record.data
             cut.append((topic, at_ns, msgspec.structs.replace(record, data=data[:-7])))
@@ -213,7 +228,7 @@ def test_bytes_of_a_stream_are_read_in_whole_frames_wherever_they_are_cut() -> N
         else:
             cut.append((topic, at_ns, record))
     datagrams = [
-        datagram.data for datagram in flown(PAPER).of(Datagram) if datagram.link == "mocap" and not datagram.outgoing
+        datagram.data for datagram in fly_case(PAPER).of(Datagram) if datagram.link == "mocap" and not datagram.outgoing
     ]
     read = [
         one.data
@@ -235,13 +250,13 @@ def test_captures_know_the_simulated_cameras_clock() -> None:
 
 @pytest.mark.slow
 def test_without_the_truth_estimates_and_a_spline_take_its_place() -> None:
-    config = config_of(ROOM)
-    blind = make_recorded_flight(stripped(ROOM, Truth), config, "x")
+    config = load_case_config(ROOM)
+    blind = make_recorded_flight(strip_recording(ROOM, Truth), config, "x")
     controller, response = build_controller(config), make_response(blind, config.plant)
-    same, other = Memory(), Memory()
+    same, other = MemorySink(), MemorySink()
     refly(blind, config, controller, response, same, lambda: 0)
     assert [encode(decision) for decision in same.of(Decision)] == [
-        encode(decision) for decision in flown(ROOM).of(Decision)
+        encode(decision) for decision in fly_case(ROOM).of(Decision)
     ]
     link = msgspec.structs.replace(config.link, loss=0.0)
     refly(blind, config, controller, response, other, lambda: 0, SimulatedLink(blind, link, 2, 0.005))

@@ -6,8 +6,8 @@ import dataclasses
 
 import numpy as np
 import pytest
-from loopback_rig import Memory
-from whatif_rig import PAPER, config_of, far, flown, history
+from loopback_rig import MemorySink
+from whatif_rig import PAPER, compute_differences, fly_case, history, load_case_config
 
 from uavctl.build.controller import build_controller, build_problem
 from uavctl.lab.campaign.controllers import BaselineSolver, build_from_recipe, make_recipe
@@ -20,7 +20,7 @@ from uavctl.smpc.batch import Information
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["lqg", "packetised", "hold-last", "zero-on-loss", "pid", "worst-case-delay"])
 def test_a_baseline_s_plan_is_its_behaviour_without_measurements(kind: str) -> None:
-    config = config_of(PAPER)
+    config = load_case_config(PAPER)
     spec = ControllerSpec(name=kind, kind=kind)
     campaign = CampaignSpec(name="x", config="paper", controller=(spec,))
     recipe = make_recipe(spec, config, campaign)
@@ -48,12 +48,12 @@ def test_a_baseline_s_plan_is_its_behaviour_without_measurements(kind: str) -> N
 
 
 def test_a_baseline_flies_and_its_plans_name_it() -> None:
-    config = config_of(PAPER)
+    config = load_case_config(PAPER)
     spec = ControllerSpec(name="lqg", kind="lqg")
     recipe = make_recipe(spec, config, CampaignSpec(name="x", config="paper", controller=(spec,)))
     controller = build_controller(config)
     solver = BaselineSolver("lqg", lambda target: (build_problem(config), build_from_recipe(recipe)))
-    memory = Memory()
+    memory = MemorySink()
     refly(
         history(PAPER),
         config,
@@ -63,6 +63,6 @@ def test_a_baseline_flies_and_its_plans_name_it() -> None:
         lambda: 0,
     )
     assert {plan.method for plan in memory.of(Plan)} == {"lqg"}
-    assert far(memory, flown(PAPER)) > 0.5
+    assert compute_differences(memory, fly_case(PAPER)) > 0.5
     last = memory.of(Truth)[-1]
     assert np.abs(last.position_m).max() < 5.0  # it has come to the target all the same

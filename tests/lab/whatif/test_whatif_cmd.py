@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 from places import DATA
-from report_rig import unpaged, unwritten
+from report_rig import omit_figures, omit_pages
 
 from logs.recording.reader import header
 from uavctl.cli.app import run
@@ -28,7 +28,7 @@ def typed(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("flown")
     text = ["loopback", "--config", "paper", "--set", "solver.method=exact", "--duration", "20", "--out", str(folder)]
-    with unpaged():
+    with omit_pages():
         assert run(text) == 0
     return folder / "flight.mcap"
 
@@ -36,7 +36,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def no_figures() -> Iterator[None]:
     """For flights whose pages nobody reads."""
-    with unpaged(), unwritten():
+    with omit_pages(), omit_figures():
         yield
 
 

@@ -11,9 +11,9 @@ import msgspec
 import numpy as np
 import pytest
 from inertial_rig import ATTITUDE, HIGHRES, QUATERNION
-from loopback_rig import Memory
+from loopback_rig import MemorySink
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from whatif_rig import Case, again, config_of, flown, history
+from whatif_rig import Case, fly_again, fly_case, history, load_case_config
 
 from logs.recording.topics import encode
 from uavctl.arrays import Array
@@ -119,7 +119,7 @@ def test_the_controller_reads_the_added_acceleration(
     autopilot: int, quaternion: bool, kind: str, resolution: float
 ) -> None:
     speaker = Speaker(autopilot)
-    frames = InertialFrames(config_of(LINEAR).daemon)
+    frames = InertialFrames(load_case_config(LINEAR).daemon)
     recorded, other = (VehicleMonitor(lambda _: None, (245, 191), inertial=True) for _ in range(2))
     read: tuple[list[InertialSample], list[InertialSample]] = ([], [])
     sent_frames = [speaker.beat()]
@@ -138,7 +138,7 @@ def test_the_controller_reads_the_added_acceleration(
 
 
 def test_frames_that_cannot_be_rewritten_are_dropped_once_the_courses_differ() -> None:
-    speaker, frames = Speaker(), InertialFrames(config_of(LINEAR).daemon)
+    speaker, frames = Speaker(), InertialFrames(load_case_config(LINEAR).daemon)
 
     def heard(frame: RawFrame, at_ms: int, by: Vec3 | None = BY) -> bool:
         return bool(frames.rewrite(frame, at_ms * 1_000_000, by))
@@ -160,9 +160,9 @@ def test_frames_that_cannot_be_rewritten_are_dropped_once_the_courses_differ() -
 @pytest.mark.slow
 @pytest.mark.parametrize("case", [PX4, ARDUPILOT], ids=["px4", "ardupilot"])
 def test_nothing_changed_is_the_recorded_flight_bit_for_bit(case: Case) -> None:
-    memory, course = again(case)
+    memory, course = fly_again(case)
     for kind in (StepInput, Decision, Plan, Setpoint, Datagram, Truth):
-        reproduced, recorded = memory.of(kind), flown(case).of(kind)
+        reproduced, recorded = memory.of(kind), fly_case(case).of(kind)
         assert len(reproduced) == len(recorded) > 0
         assert [encode(record) for record in reproduced] == [encode(record) for record in recorded]
     assert sum(len(step_input.inertial) for step_input in memory.of(StepInput)) > 500
@@ -173,9 +173,9 @@ def test_nothing_changed_is_the_recorded_flight_bit_for_bit(case: Case) -> None:
 @pytest.mark.parametrize("case", [LINEAR, LINEAR_ARDUPILOT], ids=["px4", "ardupilot"])
 @pytest.mark.parametrize("change", [ELSEWHERE, "cost.input=[3.0, 3.0, 3.0]"], ids=["target", "cost"])
 def test_on_the_linear_plant_rewritten_inertial_data_equal_those_of_a_flight(case: Case, change: str) -> None:
-    memory, course = again(case, change)
-    real = flown(case, change)
-    feels, truly, recorded = (felt(side) for side in (memory, real, flown(case)))
+    memory, course = fly_again(case, change)
+    real = fly_case(case, change)
+    feels, truly, recorded = (felt(side) for side in (memory, real, fly_case(case)))
     assert feels.shape == truly.shape == recorded.shape and course.inertial_dropped <= 1  # one before any attitude
     assert np.abs(recorded - truly).max() > 0.25  # the recorded ones would have been wrong
     # The attitude that is told errs by a few thousandths, and RAW_IMU is rounded twice, to 0.01 m/s². Plans are made of
@@ -202,15 +202,17 @@ def test_the_what_if_of_a_quadrotor_holds_as_a_flight_does(case: Case, change: s
     max_error_m = 0.04
     other = None
     if change.startswith("link."):
-        before = config_of(case).sim
-        other = SimulatedLink(history(case), config_of(case, change).link, before.seed, before.camera.noise_std_m)
-    memory, course = again(case, change, other=other)
-    real = flown(case, change)
-    place = target or config_of(case).target.position_m
+        before = load_case_config(case).sim
+        other = SimulatedLink(
+            history(case), load_case_config(case, change).link, before.seed, before.camera.noise_std_m
+        )
+    memory, course = fly_again(case, change, other_link=other)
+    real = fly_case(case, change)
+    place = target or load_case_config(case).target.position_m
     assert not inertial_events(real) and not inertial_events(memory)
     assert 0.9 < hold_m(memory, place) / hold_m(real, place) < 1.1
     assert hold_m(memory, place) < 0.02
-    assert largest_m(memory, real) < max_error_m < largest_m(real, flown(case)) + max_error_m
+    assert largest_m(memory, real) < max_error_m < largest_m(real, fly_case(case)) + max_error_m
     assert course.inertial_moved > 500 and course.inertial_dropped <= 1
 
 
@@ -225,10 +227,10 @@ def test_without_an_attitude_inertial_data_are_dropped_and_positions_continue() 
 
     entries = [
         (topic, at_ns, msgspec.structs.replace(one, data=blind(one.data)) if isinstance(one, Datagram) else one)
-        for topic, at_ns, one in flown(PX4).entries
+        for topic, at_ns, one in fly_case(PX4).entries
     ]
-    config, memory = config_of(PX4, ELSEWHERE), Memory()
-    recorded = make_recorded_flight(entries, config_of(PX4), "x")
+    config, memory = load_case_config(PX4, ELSEWHERE), MemorySink()
+    recorded = make_recorded_flight(entries, load_case_config(PX4), "x")
     course = refly(recorded, config, build_controller(config), make_response(recorded, config.plant), memory, lambda: 0)
     assert course.inertial_moved == 0 and course.inertial_dropped > 500
     came = [
@@ -246,26 +248,26 @@ def test_without_an_attitude_inertial_data_are_dropped_and_positions_continue() 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", [PX4, ARDUPILOT], ids=["px4", "ardupilot"])
 def test_the_dead_time_belongs_to_the_model(case: Case) -> None:
-    response = make_response(history(case), config_of(case).plant)
-    assert response.dead_time_ns == round(config_of(case).plant.dead_time_s * 1e9) > 0
+    response = make_response(history(case), load_case_config(case).plant)
+    assert response.dead_time_ns == round(load_case_config(case).plant.dead_time_s * 1e9) > 0
     delayed, at_once = (
         fit_model(history(case), candidate, "own") for candidate in (response, VehicleResponse(response.model))
     )
     assert delayed.rms_m is not None and at_once.rms_m is not None
     assert delayed.rms_m < at_once.rms_m and delayed.moves > 250
-    assert make_response(history(LINEAR), config_of(LINEAR).plant).dead_time_ns == 0
+    assert make_response(history(LINEAR), load_case_config(LINEAR).plant).dead_time_ns == 0
 
 
-def inertial_events(memory: Memory) -> Counter[str]:
+def inertial_events(memory: MemorySink) -> Counter[str]:
     return Counter(event.code for event in memory.of(Event) if event.code.startswith("inertial-"))
 
 
-def felt(memory: Memory) -> Array:
+def felt(memory: MemorySink) -> Array:
     """Accelerations (n, 3) that the controller read of inertial data."""
     return np.array([sample.accel_mps2 for step_input in memory.of(StepInput) for sample in step_input.inertial])
 
 
-def velocities(memory: Memory) -> Array:
+def velocities(memory: MemorySink) -> Array:
     """The vehicle's own velocities (n, 3), as ticks knew them."""
     return np.array(
         [
@@ -276,13 +278,13 @@ def velocities(memory: Memory) -> Array:
     )
 
 
-def hold_m(memory: Memory, place: Vec3) -> float:
+def hold_m(memory: MemorySink, place: Vec3) -> float:
     """Distance of the true positions from a place, root mean square."""
     positions = [truth.position_m for truth in memory.of(Truth) if truth.at_ns >= HOLDS_FROM_NS]
     return float(np.sqrt(np.mean(np.sum(np.square(np.array(positions) - np.array(place)), axis=1))))
 
 
-def largest_m(first_memory: Memory, other_memory: Memory) -> float:
+def largest_m(first_memory: MemorySink, other_memory: MemorySink) -> float:
     """Largest distance of the true positions."""
     return max(
         math.dist(a.position_m, b.position_m)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
-from report_rig import data, drawn
+from report_rig import collect_figures, data
 from synthetic_scene import room
 
 from logs.recording.flight import FlightData
@@ -36,7 +36,7 @@ def other(recorded: FlightData) -> FlightData:
 def figures(recorded: FlightData, other: FlightData) -> tuple[dict[str, Axes], str]:
     """The page's axes by their titles, and its text."""
     summary = summarise(recorded, wall_s=None)
-    with drawn() as drawings:
+    with collect_figures() as drawings:
         text = render_what_if_page(worse_link(summary), recorded, other)
     return {title: figure.axes[0] for title, figure in drawings.items()}, text
 

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from loopback_rig import Memory, lockstep, make_loop, shared_loop
+from loopback_rig import MemorySink, lockstep, make_loop, shared_loop
 from recording_fakes import stored_chunks
-from report_rig import unpaged
+from report_rig import omit_pages
 
 from logs.recording.reader import lacks_end, records, segment_files
 from logs.recording.replay import MAKERS, FieldNames, ReplayResult, leaves, replay
@@ -25,17 +25,17 @@ TICK = 57  # in which the rule of a test changes
 
 
 @pytest.fixture(scope="module")
-def flown() -> Memory:
+def flown() -> MemorySink:
     return lockstep("paper", 12.0)
 
 
-def replayed(flown: Memory, *overrides: str) -> ReplayResult:
+def replayed(flown: MemorySink, *overrides: str) -> ReplayResult:
     config = load_config("paper", overrides)
     return replay(flown.entries, partial(shared_loop, config), ignored=MAKERS)
 
 
 @pytest.mark.slow
-def test_a_changed_rule_is_found_in_its_tick_and_followed(flown: Memory, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_changed_rule_is_found_in_its_tick_and_followed(flown: MemorySink, monkeypatch: pytest.MonkeyPatch) -> None:
     calls = 0
 
     def pushed(want: Vec3, before: Vec3, tick_s: float, limits: LimitsParameters) -> tuple[Vec3, tuple[str, ...]]:
@@ -82,7 +82,7 @@ def test_a_changed_back_off_is_found_in_the_first_plan_that_differs() -> None:
 
 
 @pytest.mark.slow
-def test_of_another_solver_what_it_decides_is_compared_and_not_its_name(flown: Memory) -> None:
+def test_of_another_solver_what_it_decides_is_compared_and_not_its_name(flown: MemorySink) -> None:
     config = load_config("paper", ["solver.method=printed"])
     named = replay(flown.entries, partial(make_loop, config)).first_difference
     unnamed = replayed(flown, "solver.method=printed").first_difference
@@ -91,18 +91,18 @@ def test_of_another_solver_what_it_decides_is_compared_and_not_its_name(flown: M
     assert "method" not in {one.field for one in replayed(flown, "solver.method=printed").course}
 
 
-def test_what_does_not_reach_the_loop_changes_nothing(flown: Memory) -> None:
+def test_what_does_not_reach_the_loop_changes_nothing(flown: MemorySink) -> None:
     assert replayed(flown, "sim.seed=99", "log.queue=100").identical
 
 
-def test_another_reading_of_the_same_bytes_is_told_as_that(flown: Memory) -> None:
+def test_another_reading_of_the_same_bytes_is_told_as_that(flown: MemorySink) -> None:
     first = replayed(flown, "frame.yaw_deg=90").first_difference
     assert first is not None and first.topic == "/uavctl/step_input" and first.unit == "m"
     assert first.field == "samples[0].position_m[0]" and first.meaning == "north"
     assert "parser, clock or frame" in first.stage
 
 
-def test_a_record_on_one_side_is_named(flown: Memory) -> None:
+def test_a_record_on_one_side_is_named(flown: MemorySink) -> None:
     entries = [entry for entry in flown.entries if not isinstance(entry[2], Event)]
     result = replay(entries, partial(make_loop, load_config("paper")))
     first = result.first_difference
@@ -162,7 +162,7 @@ SMALL = ("--config", "paper", "--set", "solver.method=printed", "--set", "log.se
 @pytest.fixture(scope="module")
 def rotated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("rotated")
-    with unpaged():
+    with omit_pages():
         assert run(["loopback", *SMALL, "--duration", "25", "--out", str(folder), "--json"]) == 0
     assert len(segment_files(folder / "flight.mcap")) > 2
     return folder

@@ -14,9 +14,9 @@ import pyarrow.parquet
 import pytest
 from mcap.reader import make_reader
 from pymavlink import mavutil  # type: ignore[attr-defined]
-from recording_fakes import HEADER, Clock, flight, own
-from report_rig import unpaged
-from view_rig import flown, protobuf
+from recording_fakes import HEADER, Clock, drop_recorder_notes, flight
+from report_rig import omit_pages
+from view_rig import fly_view, read_protobuf
 
 from logs.recording.export import TableFormat, export_tables
 from logs.recording.info import read_info
@@ -56,7 +56,7 @@ def others_see(path: Path) -> list[tuple[str, int, int, bytes]]:
 
 def test_others_see_utc_and_we_our_clock(tmp_path: Path) -> None:
     path = record(tmp_path / "flight.mcap")
-    assert own(list(read(path))) == ITEMS
+    assert drop_recorder_notes(list(read(path))) == ITEMS
     seen = [(topic, at_ns) for topic, at_ns, _, _ in others_see(path) if topic != "/uavctl/recorder"]
     assert seen == [(topic, at_ns + ZERO_NS) for topic, at_ns, _ in ITEMS]
     assert all(log_time == publish_time for _, log_time, publish_time, _ in others_see(path))
@@ -82,9 +82,9 @@ def test_later_files_and_recovered_ones_have_the_same_times(tmp_path: Path) -> N
     assert len(files) > 2
     later = [one for file in files for one in others_see(Path(file))]
     assert all(log_time >= ZERO_NS for _, log_time, _, _ in later)
-    assert own(list(read(path))) == ITEMS
+    assert drop_recorder_notes(list(read(path))) == ITEMS
     recover(path, tmp_path / "out.mcap")
-    assert own(list(read(tmp_path / "out.mcap"))) == ITEMS
+    assert drop_recorder_notes(list(read(tmp_path / "out.mcap"))) == ITEMS
     seen = [(topic, log_time - ZERO_NS) for topic, log_time, _, _ in others_see(tmp_path / "out.mcap")]
     assert [one for one in seen if one[0] != "/uavctl/recorder"] == [(topic, at_ns) for topic, at_ns, _ in ITEMS]
     assert {one.zero_utc_ns for one in walk(path) if hasattr(one, "zero_utc_ns")} == {ZERO_NS}
@@ -103,13 +103,15 @@ def test_stamps_within_views_are_those_of_the_file(tmp_path: Path) -> None:
     recorder = SyncRecorder(
         path, derived_topics=DerivedTopics(ViewBuilder(), lambda _, at_ns, __: watched.append(at_ns))
     )
-    for topic, at_ns, one in flown().entries:
+    for topic, at_ns, one in fly_view().entries:
         recorder.put(
             topic, at_ns, msgspec.structs.replace(one, zero_utc_ns=ZERO_NS) if isinstance(one, Header) else one
         )
     assert recorder.close().ok
     stamped = ("/view/estimate", "/view/truth", "/view/target", "/view/frame/vehicle", "/view/plan")
-    found = [(log_time, one.timestamp.ToNanoseconds()) for name, _, log_time, one in protobuf(path) if name in stamped]
+    found = [
+        (log_time, one.timestamp.ToNanoseconds()) for name, _, log_time, one in read_protobuf(path) if name in stamped
+    ]
     assert len(found) > 100 and all(log_time == stamp for log_time, stamp in found)
     assert min(watched) >= ZERO_NS  # a live view has the file's times
 
@@ -117,7 +119,7 @@ def test_stamps_within_views_are_those_of_the_file(tmp_path: Path) -> None:
 def test_an_exported_tlog_has_the_same_times(tmp_path: Path) -> None:
     path = tmp_path / "flight.mcap"
     recorder = SyncRecorder(path)
-    for topic, at_ns, one in flown().entries:
+    for topic, at_ns, one in fly_view().entries:
         recorder.put(
             topic, at_ns, msgspec.structs.replace(one, zero_utc_ns=ZERO_NS) if isinstance(one, Header) else one
         )
@@ -128,14 +130,14 @@ def test_an_exported_tlog_has_the_same_times(tmp_path: Path) -> None:
     while (message := log.recv_match()) is not None:
         stamps.append(round(message._timestamp * 1e6))
     log.close()
-    wanted = sorted(one.at_ns + ZERO_NS for one in flown().of(Datagram) if one.link == "vehicle")
+    wanted = sorted(one.at_ns + ZERO_NS for one in fly_view().of(Datagram) if one.link == "vehicle")
     assert len(stamps) == len(wanted)
     assert all(abs(stamp - at_ns // 1000) <= 1 for stamp, at_ns in zip(stamps, wanted, strict=True))
 
 
 def test_the_same_flight_in_virtual_time_has_the_same_records(tmp_path: Path) -> None:
     for name in ("a", "b"):
-        with unpaged():
+        with omit_pages():
             arguments = ["--config", "paper", "--set", "solver.method=exact", "--duration", "2", "--json"]
             assert run(["loopback", *arguments, "--out", str(tmp_path / name)]) == 0
     first, second = (

@@ -69,7 +69,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A real flight, and after it values that are hard to write."""
     path = tmp_path_factory.mktemp("flown") / "flight.mcap"
     recorder = SyncRecorder(path)
-    for item in (*view_rig.flown().entries, *ODD):
+    for item in (*view_rig.fly_view().entries, *ODD):
         recorder.put(*item)
     assert recorder.close().ok
     return path
@@ -306,7 +306,7 @@ def test_progress_sees_every_message_and_knows_their_number(tmp_path: Path, file
     recorder = SyncRecorder(
         path, LogConfig(segment_bytes=segment_bytes, chunk_bytes=16384), derived_topics=DerivedTopics(ViewBuilder())
     )
-    for entry in view_rig.flown().entries:
+    for entry in view_rig.fly_view().entries:
         recorder.put(*entry)
     assert recorder.close().ok and len(segment_files(path)) == files
     whole = sum(1 for _ in good_messages(path))

@@ -49,7 +49,7 @@ def incoming(packets: Sequence[bytes], link: str = "vehicle") -> list[tuple[int,
 def test_mavlogdump_finds_every_packet(tmp_path: Path) -> None:
     flight = view_rig.record(tmp_path / "flight.mcap")
     exported = export_tlog(flight, tmp_path / "a.tlog")
-    sent = [(record.link, record.outgoing) for record in view_rig.flown().of(Datagram)]
+    sent = [(record.link, record.outgoing) for record in view_rig.fly_view().of(Datagram)]
     assert exported.packets == dict(sorted(Counter(raw_topic(link, outgoing=out) for link, out in sent).items()))
     assert exported.left_out_bytes == 0
     dumped = subprocess.run(
@@ -62,7 +62,7 @@ def test_mavlogdump_finds_every_packet(tmp_path: Path) -> None:
     lines = [json.loads(line) for line in dumped.stdout.splitlines()]
     assert len(lines) == len(sent) > 200
     wanted: Counter[str] = Counter()
-    for record in view_rig.flown().of(Datagram):
+    for record in view_rig.fly_view().of(Datagram):
         (message,) = mavlink.MAVLink(None).parse_buffer(record.data) or []
         wanted[message.get_type()] += 1
     assert Counter(line["meta"]["type"] for line in lines) == wanted
@@ -76,7 +76,7 @@ def test_our_own_replay_takes_it(tmp_path: Path, capsys: pytest.CaptureFixture[s
     capsys.readouterr()
     assert run(["log", "replay", str(tmp_path / "flight.tlog"), "--set", "solver.method=exact", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
-    came = [record for record in view_rig.flown().of(Datagram) if not record.outgoing]
+    came = [record for record in view_rig.fly_view().of(Datagram) if not record.outgoing]
     assert found["datagrams"] == len(came)
     assert found["positions"] == sum(record.link == "mocap" for record in came)
 

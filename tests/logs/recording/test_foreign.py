@@ -7,7 +7,7 @@ import struct
 from pathlib import Path
 
 import pytest
-from foreign_rig import TLOGS, by_tlog, flown, rows_of, write
+from foreign_rig import TLOGS, flown, replay_as_tlog, rows_of, write
 from loopback_rig import lockstep, make_loop
 from mcap.writer import CompressionType
 from places import DATA
@@ -53,7 +53,7 @@ def test_every_layout_of_the_file(tmp_path: Path, compression: CompressionType, 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", TLOGS[:2])
 def test_the_same_bytes_in_a_tlog_and_in_an_mcap_fly_the_same(tmp_path: Path, name: str) -> None:
-    assert flown(read_mcap(write(tmp_path / "a.mcap", rows_of(name))).packets) == by_tlog(name)
+    assert flown(read_mcap(write(tmp_path / "a.mcap", rows_of(name))).packets) == replay_as_tlog(name)
 
 
 def test_several_frames_in_a_message_are_so_many_packets(tmp_path: Path) -> None:
@@ -194,8 +194,8 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     ]
     assert run(arguments) == 0
     document = json.loads(capsys.readouterr().out)
-    assert document["positions"] == by_tlog(TLOGS[0]).positions
-    assert document["solves"] == by_tlog(TLOGS[0]).solves
+    assert document["positions"] == replay_as_tlog(TLOGS[0]).positions
+    assert document["solves"] == replay_as_tlog(TLOGS[0]).solves
     assert run([*arguments, "--topic", "/other"]) == 2
     assert "/other" in capsys.readouterr().err
     other = write(tmp_path / "b.mcap", [("/imu", "json", 1, b"{}")])

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from foreign_rig import TLOGS, Row, by_tlog, flown, write
+from foreign_rig import TLOGS, Row, flown, replay_as_tlog, write
 from mcap_ros1._vendor.genpy.dynamic import generate_dynamic
 from mcap_ros1.writer import Writer as Ros1Writer
 from mcap_ros2.writer import Writer as Ros2Writer
@@ -113,7 +113,7 @@ def test_each_frame_is_unwrapped_byte_by_byte(tmp_path: Path, name: str, encodin
 def test_it_flies_as_the_tlog_does(tmp_path: Path) -> None:
     """The packets of either encoding are the same, as is shown above: a flight of one is enough."""
     path = WRITERS["cdr"][0](tmp_path / "a.mcap", list(read_tlog(DATA / TLOGS[0]).packets))
-    assert flown(read_mcap(path).packets) == by_tlog(TLOGS[0])
+    assert flown(read_mcap(path).packets) == replay_as_tlog(TLOGS[0])
 
 
 @pytest.mark.parametrize("encoding", WRITERS)

@@ -7,7 +7,7 @@ import struct
 from pathlib import Path
 
 import pytest
-from foreign_rig import TLOGS, Row, by_tlog, flown, rows_of, write
+from foreign_rig import TLOGS, Row, flown, replay_as_tlog, rows_of, write
 from places import DATA
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -54,7 +54,7 @@ def test_reads_of_any_size_hold_the_same_frames(tmp_path: Path, name: str, sizes
 def test_a_serial_line_flies_as_the_tlog_does(tmp_path: Path) -> None:
     pieces, _ = pieces_of(TLOGS[0], (1, 60), seed=3)
     by_pieces = flown(read_mcap(write(tmp_path / "a.mcap", [("/serial", "", at, data) for at, data in pieces])).packets)
-    whole = by_tlog(TLOGS[0])
+    whole = replay_as_tlog(TLOGS[0])
     # A frame is there when its last byte is: the same positions, each where the next read begins at the latest.
     assert (by_pieces.positions, by_pieces.datagrams) == (whole.positions, whole.datagrams)
     assert by_pieces.solves["optimal"] > 20
@@ -147,9 +147,9 @@ def test_two_vehicles_on_one_channel(tmp_path: Path) -> None:
     ]
     mixed = sorted([*rows, *beats], key=lambda row: row[2])
     result = flown(read_mcap(write(tmp_path / "a.mcap", mixed)).packets)
-    assert result.positions == by_tlog(TLOGS[0]).positions
+    assert result.positions == replay_as_tlog(TLOGS[0]).positions
     assert result.left_out["second-vehicle"] == len(beats)
-    assert "second-vehicle" not in by_tlog(TLOGS[0]).left_out
+    assert "second-vehicle" not in replay_as_tlog(TLOGS[0]).left_out
 
 
 def test_log_times_that_go_back_a_little_are_put_in_order(tmp_path: Path) -> None:
@@ -173,7 +173,7 @@ def test_a_leap_of_the_clock_is_told_and_time_goes_on(tmp_path: Path, leap_s: in
     assert [one.at_ns for one in found.packets] == [
         row[2] - (gap_ns if at >= 400 else 0) for at, row in enumerate(rows)
     ]
-    assert flown(found.packets).positions == by_tlog(TLOGS[0]).positions
+    assert flown(found.packets).positions == replay_as_tlog(TLOGS[0]).positions
 
 
 def test_stamps_of_zero(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from live_rig import Viewer
 from places import without_pages
-from view_rig import flown
+from view_rig import fly_view
 
 from logs.recording.derived_topics import VIEWS
 from logs.recording.reader import read, records
@@ -64,10 +64,12 @@ def tell(watch: Watcher, at_ns: int, data: bytes = b"{}") -> None:
 @pytest.mark.slow
 def test_a_viewer_gets_every_topic_with_its_schema(tmp_path: Path) -> None:
     ports: list[int] = []
-    told = {topic for topic, _, _ in flown().entries if not topic.startswith("/raw/")} | {view.name for view in VIEWS}
+    told = {topic for topic, _, _ in fly_view().entries if not topic.startswith("/raw/")} | {
+        view.name for view in VIEWS
+    }
     with live_view(0, on_open=ports.append) as watch:
         recorder = Recorder(tmp_path / "a.mcap", derived_topics=DerivedTopics(ViewBuilder(), watch))
-        for entry in flown().entries:
+        for entry in fly_view().entries:
             recorder.put(*entry)
         assert recorder.close().ok
         with Viewer(ports[0]) as viewer:
@@ -98,7 +100,7 @@ def test_a_stalled_viewer_holds_nothing_up_and_the_oldest_messages_go(tmp_path: 
             recorder = Recorder(tmp_path / "a.mcap", derived_topics=DerivedTopics(ViewBuilder(), watch))
 
             def fly() -> None:
-                for entry in flown().entries:
+                for entry in fly_view().entries:
                     recorder.put(*entry)
                 for number in range(10 * BACKLOG):
                     tell(watch, 2 + number, large)
@@ -115,7 +117,7 @@ def test_a_stalled_viewer_holds_nothing_up_and_the_oldest_messages_go(tmp_path: 
                 if at_ns == 1 + 10 * BACKLOG:
                     break
     assert len(got) < 9 * BACKLOG  # most of it was dropped, and the newest came
-    assert len([*read(tmp_path / "a.mcap")]) >= len(flown().entries)
+    assert len([*read(tmp_path / "a.mcap")]) >= len(fly_view().entries)
 
 
 def test_the_end_does_not_wait_for_a_stalled_viewer() -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from recording_fakes import Clock, Disk, as_recorded, flight, own
-from view_rig import flown, record
+from recording_fakes import Clock, Disk, drop_recorder_notes, flight, round_records
+from view_rig import fly_view, record
 
 from logs.recording.derived_topics import VIEWS
 from logs.recording.info import read_info
@@ -22,14 +22,14 @@ from uavctl.records import Estimate, Record
 
 def test_the_records_read_back_as_if_there_were_no_views(tmp_path: Path) -> None:
     path = record(tmp_path / "flight.mcap")
-    assert own(list(read(path))) == as_recorded(flown().entries)
+    assert drop_recorder_notes(list(read(path))) == round_records(fly_view().entries)
     found = read_info(path)
     assert found.finished and not found.missing and not found.refused
     assert sum(is_view(one.topic) for one in found.topics) == len(VIEWS)
 
 
 def test_a_disk_full_at_every_operation_loses_neither_records_nor_views(tmp_path: Path) -> None:
-    items = flown().entries[:120]
+    items = fly_view().entries[:120]
     whole = tmp_path / "whole.mcap"
     recorder = SyncRecorder(whole, derived_topics=DerivedTopics(ViewBuilder()))
     for item in items:
@@ -53,7 +53,7 @@ def test_a_disk_full_at_every_operation_loses_neither_records_nor_views(tmp_path
         status = recorder.close()
         if disk.operations <= number:
             break
-        assert status.ok and own(list(read(path))) == as_recorded(items), number
+        assert status.ok and drop_recorder_notes(list(read(path))) == round_records(items), number
         messages = [m for file in segment_files(path) for m in scan(file) if isinstance(m, RecordedMessage)]
         assert [m.data for m in messages if is_view(m.definition.topic)] == want
         number += 1
@@ -67,8 +67,8 @@ def test_a_torn_file_is_recovered_with_its_views(tmp_path: Path) -> None:
     recover(cut, tmp_path / "again.mcap")
     views = {one.topic for one in read_info(tmp_path / "again.mcap").topics if is_view(one.topic)}
     assert len(views) > len(VIEWS) - 3
-    kept = own(list(read(tmp_path / "again.mcap")))
-    assert kept == as_recorded(flown().entries[: len(kept)]) and len(kept) > 100
+    kept = drop_recorder_notes(list(read(tmp_path / "again.mcap")))
+    assert kept == round_records(fly_view().entries[: len(kept)]) and len(kept) > 100
 
 
 def test_what_has_no_view_is_recorded_and_counted(tmp_path: Path) -> None:
@@ -78,7 +78,7 @@ def test_what_has_no_view_is_recorded_and_counted(tmp_path: Path) -> None:
         recorder.put(*item)
     status = recorder.close()
     assert (status.ok, status.unseen, status.refused) == (True, 1, 0)
-    assert own(list(read(tmp_path / "flight.mcap"))) == flight(30)
+    assert drop_recorder_notes(list(read(tmp_path / "flight.mcap"))) == flight(30)
     last = [*records(tmp_path / "flight.mcap", RecorderNote)][-1]
     assert last.text.startswith("end; 1 without views: Header: the header's design cannot be used")
 
@@ -87,12 +87,12 @@ def test_what_has_no_view_is_recorded_and_counted(tmp_path: Path) -> None:
 def test_a_view_that_fails_once_is_there_again_with_the_next_record(tmp_path: Path, error: type[Exception]) -> None:
     class Failing(ViewBuilder):
         def derive(self, at_ns: int, record: Record) -> list[tuple[str, bytes]]:
-            if isinstance(record, Estimate) and record.at_ns == flown().of(Estimate)[5].at_ns:
+            if isinstance(record, Estimate) and record.at_ns == fly_view().of(Estimate)[5].at_ns:
                 raise error("no")
             return super().derive(at_ns, record)
 
     recorder = Recorder(tmp_path / "flight.mcap", derived_topics=DerivedTopics(Failing()))
-    for item in flown().entries:
+    for item in fly_view().entries:
         recorder.put(*item)
     status = recorder.close()
     assert (status.ok, status.unseen) == (True, 1)
@@ -108,7 +108,7 @@ def test_who_watches_sees_each_message_once_in_order(tmp_path: Path) -> None:
 
     path = tmp_path / "flight.mcap"
     recorder = SyncRecorder(path, derived_topics=DerivedTopics(ViewBuilder(), watch))
-    for item in flown().entries:
+    for item in fly_view().entries:
         recorder.put(*item)
     recorder.close()
     written = [(m.definition.topic, m.at_ns, m.data) for m in scan(path) if isinstance(m, RecordedMessage)]

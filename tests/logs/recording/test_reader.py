@@ -3,7 +3,17 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from recording_fakes import HEADER, Clock, Disk, Item, flight, own, record_flight, stored_byte, write_two_segments
+from recording_fakes import (
+    HEADER,
+    Clock,
+    Disk,
+    Item,
+    drop_recorder_notes,
+    flight,
+    record_flight,
+    stored_byte,
+    write_two_segments,
+)
 
 from logs.recording.disk import DiskFile
 from logs.recording.reader import header, read, records, segment_files
@@ -51,7 +61,7 @@ def test_cut_anywhere_it_reads_to_the_last_whole_chunk(tmp_path: Path) -> None:
     counts = []
     for size in range(len(data)):
         cut.write_bytes(data[:size])
-        got = own(list(read(cut)))
+        got = drop_recorder_notes(list(read(cut)))
         assert got == items[: len(got)]
         counts.append(len(got))
     assert counts == sorted(counts)
@@ -63,7 +73,7 @@ def test_segments_read_as_one(tmp_path: Path) -> None:
     path = tmp_path / "flight.mcap"
     write_two_segments(path)
     assert [file.name for file in segment_files(path)] == ["flight.mcap", "flight-2.mcap"]
-    assert own(list(read(path))) == flight(100)
+    assert drop_recorder_notes(list(read(path))) == flight(100)
     # the second alone has the header too
     assert header(tmp_path / "flight-2.mcap") == HEADER
 
@@ -77,7 +87,7 @@ def test_missing_segment_is_noticed(tmp_path: Path) -> None:
         clock.now_s += 0.1
         recorder.put(topic, at_ns, record)
     recorder.close()
-    assert own(list(read(path))) == flight(200)
+    assert drop_recorder_notes(list(read(path))) == flight(200)
     (tmp_path / "flight-2.mcap").unlink()
     with pytest.raises(RecordingError, match="is a segment file gone"):
         list(read(path))
@@ -112,7 +122,7 @@ def test_other_recording_with_such_a_name_is_not_taken_in(tmp_path: Path) -> Non
     items = record_flight(path, 10)
     record_flight(tmp_path / "flight-2.mcap", 20)
     assert segment_files(path) == (path,)
-    assert own(list(read(path))) == items
+    assert drop_recorder_notes(list(read(path))) == items
 
 
 def test_damaged_chunk_is_named_and_refused(tmp_path: Path) -> None:

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from patience import until
-from recording_fakes import Clock, Disk, as_recorded, flight, own
-from view_rig import flown
+from patience import wait_until
+from recording_fakes import Clock, Disk, drop_recorder_notes, flight, round_records
+from view_rig import fly_view
 
 import logs.recording.recorder as recorder_module
 from logs.recording.derived_topics import LOG
@@ -38,7 +38,7 @@ def test_thread_writes_what_was_put_in_order(tmp_path: Path) -> None:
     for topic, at_ns, record in flight(500):
         recorder.put(topic, at_ns, record)
     status = recorder.close()
-    assert own(list(read(path))) == flight(500)
+    assert drop_recorder_notes(list(read(path))) == flight(500)
     assert status == recorder.close()
     assert status.ok
     assert (status.written, status.waiting, status.dropped, status.refused) == (503, 0, 0, 0)
@@ -53,7 +53,7 @@ def test_the_thread_catches_up_when_it_is_asked_to(tmp_path: Path, monkeypatch: 
     for count, (topic, at_ns, record) in enumerate(flight(5), start=1):
         recorder.put(topic, at_ns, record)
         recorder.catch_up()
-        until(lambda: not recorder._queue, f"record {count} is taken")
+        wait_until(lambda: not recorder._queue, f"record {count} is taken")
     assert recorder.close().written == 5 + 3  # its notes
 
 
@@ -76,11 +76,11 @@ def test_disk_has_everything_after_each_second(tmp_path: Path) -> None:
     items = flight(30)
     for topic, at_ns, record in items[:-1]:
         recorder.put(topic, at_ns, record)
-    assert own(list(read(path))) == items[:1]  # the header goes out at once
+    assert drop_recorder_notes(list(read(path))) == items[:1]  # the header goes out at once
     clock.now_s = 1.0
     before = disk.operations
     recorder.put(*items[-1])
-    assert own(list(read(path))) == items
+    assert drop_recorder_notes(list(read(path))) == items
     assert disk.operations == before + 2  # one write, one sync
     assert recorder.status().waiting == 0
     recorder.close()
@@ -102,7 +102,7 @@ def test_refused_records_are_counted_and_told(tmp_path: Path) -> None:
     assert not status.ok
     assert status.refused == 6
     assert "Event" in status.refusal
-    assert own(list(read(path))) == [("/uavctl/event", 2**64 - 1, EVENT), ("/raw/vehicle/in", 1, raw)]
+    assert drop_recorder_notes(list(read(path))) == [("/uavctl/event", 2**64 - 1, EVENT), ("/raw/vehicle/in", 1, raw)]
     notes = list(records(path, RecorderNote))
     assert notes[-1].refused == 6
     assert any("records lost" in note.text for note in notes)
@@ -178,7 +178,7 @@ def test_all_that_waits_is_written_before_anything_is_made_for_viewers(tmp_path:
 
     class Looking:
         def derive(self, at_ns: int, record: Record) -> list[tuple[str, bytes]]:
-            on_disk.append(len(own(list(read(path)))))
+            on_disk.append(len(drop_recorder_notes(list(read(path)))))
             return []
 
     items = flight(RECORDS)
@@ -189,7 +189,7 @@ def test_all_that_waits_is_written_before_anything_is_made_for_viewers(tmp_path:
         recorder.put(*item)
     released.set()
     assert recorder.close().ok
-    assert own(list(read(path))) == items
+    assert drop_recorder_notes(list(read(path))) == items
     assert on_disk[0] == 1
     assert on_disk[1] > RECORDS - 1024 // 31  # but for the open chunk
     assert len(on_disk) == len(items)
@@ -210,14 +210,14 @@ def test_views_that_a_rest_overtakes_are_written_after_it(tmp_path: Path) -> Non
     journal.drain(0, len(items))  # the file is closed before anything is made
     assert journal.status().reason and len(journal.views_due) == len(items)
     journal.finish()
-    assert own(list(read(path))) == items
+    assert drop_recorder_notes(list(read(path))) == items
     files = [[one for one in scan(file) if isinstance(one, RecordedMessage)] for file in segment_files(path)]
     assert [sum(one.definition.topic == LOG for one in file) for file in files] == [0, 10]
 
 
 @pytest.mark.fault(29)
 def test_29_disk_full_at_every_operation_of_the_writing_thread_loses_neither_records_nor_views(tmp_path: Path) -> None:
-    items = flown().entries[:120]
+    items = fly_view().entries[:120]
     views: list[bytes] = []
     number = 0
     while True:
@@ -235,7 +235,7 @@ def test_29_disk_full_at_every_operation_of_the_writing_thread_loses_neither_rec
         status = recorder.close(timeout_s=30.0)
         if 0 < disk.operations < number:
             break
-        assert status.ok and own(list(read(path))) == as_recorded(items), number
+        assert status.ok and drop_recorder_notes(list(read(path))) == round_records(items), number
         messages = [one for file in segment_files(path) for one in scan(file) if isinstance(one, RecordedMessage)]
         shown = [one.data for one in messages if is_view(one.definition.topic)]
         views = views or shown

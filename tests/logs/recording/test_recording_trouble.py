@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from patience import until
-from recording_fakes import Clock, flight, own
+from patience import wait_until
+from recording_fakes import Clock, drop_recorder_notes, flight
 
 from logs.recording.disk import DiskFile, OutputFile
 from logs.recording.reader import read
@@ -69,7 +69,7 @@ def hung(path: Path, disk: Hanging, clock: Clock) -> Recorder:
     recorder = Recorder(path, open_file=disk.open, free=disk.free, clock=clock)
     recorder.put(*ITEMS[0])
     if disk.operation != "open":
-        until(lambda: recorder.status().written > 0, "the header is written")
+        wait_until(lambda: recorder.status().written > 0, "the header is written")
         disk.armed.set()
     clock.now_s = 2.0
     for item in ITEMS[1:]:
@@ -98,7 +98,7 @@ def test_a_disk_that_hangs_is_told_by_the_age_of_the_last_completed_write(tmp_pa
         recorder.put(*ITEMS[-1])
         return recorder.status().ok
 
-    until(well, "what waited is written")
+    wait_until(well, "what waited is written")
     assert recorder.close(60.0).ok
 
 
@@ -152,7 +152,7 @@ def test_a_file_that_is_taken_away_is_told_and_another_one_begun(tmp_path: Path,
     final = recorder.close()
     assert not final.ok and final.reason == "flight.mcap deleted, moved or replaced"
     assert final.segments == (str(path.with_name("flight-2.mcap")),)
-    kept = own(list(read(path.with_name("flight-2.mcap"))))[1:]  # its header is the flight's
+    kept = drop_recorder_notes(list(read(path.with_name("flight-2.mcap"))))[1:]  # its header is the flight's
     assert kept == ITEMS[-len(kept) :] and len(kept) > 180
     lost = len(ITEMS) - len(kept)
     assert lost < final.gone <= lost + 2  # and the recorder's own notes

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
-from recording_fakes import flight, own, record_flight, stored_byte, write_two_segments
+from recording_fakes import drop_recorder_notes, flight, record_flight, stored_byte, write_two_segments
 
 from logs.recording.disk import DiskFile
 from logs.recording.info import read_info
@@ -34,7 +34,7 @@ def test_segments_become_one_file(tmp_path: Path) -> None:
     write_two_segments(path)
     result = recover(path, out)
     assert result.lossless
-    assert own(list(read(out))) == flight(100)
+    assert drop_recorder_notes(list(read(out))) == flight(100)
 
 
 @pytest.mark.parametrize("number", [0, 20, 56])
@@ -43,7 +43,7 @@ def test_one_bad_chunk_costs_only_its_messages(tmp_path: Path, number: int) -> N
     items = record_flight(path, 57)
     flip(path, stored_byte(path, b"started_utc" if number == 0 else f"number {number}".encode()))
     result = recover(path, out)
-    got = own(list(read(out)))
+    got = drop_recorder_notes(list(read(out)))
     lost = [item for item in items if item not in got]
     assert got == [item for item in items if item not in lost]
     assert lost == items[items.index(lost[0]) :][: len(lost)]  # neighbours
@@ -71,7 +71,7 @@ def test_damaged_index_loses_nothing(tmp_path: Path) -> None:
     assert result.chunks_bad == 1
     assert result.lossless
     assert not any("cannot be counted" in text for text in result.damage)
-    assert own(list(read(out))) == flight(30)
+    assert drop_recorder_notes(list(read(out))) == flight(30)
 
 
 def test_torn_end_counts_as_loss(tmp_path: Path) -> None:
@@ -83,7 +83,7 @@ def test_torn_end_counts_as_loss(tmp_path: Path) -> None:
     assert (result.finished, result.lossless, result.chunks_bad) == (False, False, 1)
     assert 0 < result.lost_bytes < 1100
     assert "cannot be counted" in result.damage[-1]
-    got = own(list(read(out)))
+    got = drop_recorder_notes(list(read(out)))
     assert got == flight(30)[: len(got)]
 
 

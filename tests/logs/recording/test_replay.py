@@ -7,7 +7,7 @@ from functools import partial
 
 import msgspec
 import pytest
-from loopback_rig import Memory, lockstep, make_loop, shared_loop
+from loopback_rig import MemorySink, lockstep, make_loop, shared_loop
 from places import DATA
 
 from logs.recording.replay import replay
@@ -20,18 +20,18 @@ from uavctl.records import Datagram, Decision, Event, Plan, Setpoint, StepInput
 
 
 @pytest.fixture(scope="module")
-def flown() -> Memory:
+def flown() -> MemorySink:
     return lockstep("paper", 20.0)
 
 
-def test_an_untouched_recording_is_identical(flown: Memory) -> None:
+def test_an_untouched_recording_is_identical(flown: MemorySink) -> None:
     result = replay(flown.entries, lambda sink: make_loop(load_config("paper"), sink))
     assert result.identical and result.first_difference is None
     assert result.decisions == 200
     assert result.compared > 3 * result.decisions
 
 
-def test_one_changed_bit_of_a_decision_is_found_and_shown(flown: Memory) -> None:
+def test_one_changed_bit_of_a_decision_is_found_and_shown(flown: MemorySink) -> None:
     at = next(i for i, (_, _, r) in enumerate(flown.entries) if isinstance(r, Decision) and r.tick == 57)
     topic, at_ns, record = flown.entries[at]
     assert isinstance(record, Decision) and record.input is not None
@@ -48,7 +48,7 @@ def test_one_changed_bit_of_a_decision_is_found_and_shown(flown: Memory) -> None
 
 
 @pytest.mark.slow
-def test_a_recording_is_compared_by_its_bytes_and_by_what_they_say_where_these_are_others(flown: Memory) -> None:
+def test_a_recording_is_compared_by_its_bytes_and_by_what_they_say_where_these_are_others(flown: MemorySink) -> None:
     written = [(topic, at_ns, encode(record)) for topic, at_ns, record in flown.entries]
     replayed = partial(replay, make_loop=lambda sink: shared_loop(load_config("paper"), sink))
     whole = replayed(flown.entries)
@@ -68,13 +68,13 @@ def test_a_recording_is_compared_by_its_bytes_and_by_what_they_say_where_these_a
     assert (result.decisions, result.compared, result.decisions_differing) == (whole.decisions, whole.compared, 1)
 
 
-def test_a_topic_that_nobody_knows_is_told(flown: Memory) -> None:
+def test_a_topic_that_nobody_knows_is_told(flown: MemorySink) -> None:
     written = [(topic, at_ns, encode(record)) for topic, at_ns, record in flown.entries]
     with pytest.raises(RecordingError, match="topic /uavctl/later is not known to this version"):
         replay([*written, ("/uavctl/later", 7, b"{}")], lambda sink: shared_loop(load_config("paper"), sink))
 
 
-def test_a_changed_controller_is_found_at_its_first_differing_plan(flown: Memory) -> None:
+def test_a_changed_controller_is_found_at_its_first_differing_plan(flown: MemorySink) -> None:
     other = load_config("paper", ["cost.input=[0.2, 0.1]", "solver.method=exact"])
     result = replay(flown.entries, lambda sink: shared_loop(other, sink))
     first = result.first_difference
@@ -82,7 +82,7 @@ def test_a_changed_controller_is_found_at_its_first_differing_plan(flown: Memory
     assert first.at_ns == flown.of(Plan)[0].base_ns
 
 
-def test_a_lost_datagram_is_found(flown: Memory) -> None:
+def test_a_lost_datagram_is_found(flown: MemorySink) -> None:
     position = next(
         i
         for i, (_, _, r) in enumerate(flown.entries)
@@ -95,7 +95,7 @@ def test_a_lost_datagram_is_found(flown: Memory) -> None:
 
 
 @pytest.mark.slow
-def test_what_the_loop_says_beyond_the_recording_is_found(flown: Memory) -> None:
+def test_what_the_loop_says_beyond_the_recording_is_found(flown: MemorySink) -> None:
     for kind in (Plan, Setpoint, Event):
         poorer = [entry for entry in flown.entries if not isinstance(entry[2], kind)]
         result = replay(poorer, lambda sink: shared_loop(load_config("paper"), sink))
@@ -103,7 +103,7 @@ def test_what_the_loop_says_beyond_the_recording_is_found(flown: Memory) -> None
         assert result.first_difference.recorded == "nothing"
 
 
-def test_a_torn_recording_may_lack_the_end_of_its_last_tick_only(flown: Memory) -> None:
+def test_a_torn_recording_may_lack_the_end_of_its_last_tick_only(flown: MemorySink) -> None:
     last = max(i for i, (_, _, r) in enumerate(flown.entries) if isinstance(r, StepInput))
     torn = flown.entries[: last + 1]
     build = partial(make_loop, load_config("paper"))
@@ -111,7 +111,7 @@ def test_a_torn_recording_may_lack_the_end_of_its_last_tick_only(flown: Memory) 
     assert not replay(torn, build).identical
 
 
-def test_a_recording_without_a_decision_is_not_identical(flown: Memory) -> None:
+def test_a_recording_without_a_decision_is_not_identical(flown: MemorySink) -> None:
     result = replay(flown.entries[:1], lambda sink: shared_loop(load_config("paper"), sink))
     assert not result.identical and result.decisions == 0
 

@@ -13,7 +13,7 @@ import pytest
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from loopback_rig import header as made_header
 from mcap.reader import make_reader
-from recording_fakes import HEADER, Clock, Disk, Item, flight, own
+from recording_fakes import HEADER, Clock, Disk, Item, drop_recorder_notes, flight
 
 from logs.recording.derived_topics import LOG
 from logs.recording.disk import DiskFile, FreeSpaceMonitor
@@ -55,7 +55,7 @@ def test_a_file_of_its_size_is_closed_and_the_next_one_goes_on(tmp_path: Path) -
     files = segment_files(path)
     assert status.ok and (status.failures, status.reason) == (0, "")
     assert status.segments == tuple(map(str, files)) and len(files) > 4
-    assert own(list(read(path))) == items
+    assert drop_recorder_notes(list(read(path))) == items
     for file in files:
         with file.open("rb") as stream:  # closed in order: the format's own reader has its index
             reader = make_reader(stream, validate_crcs=True)
@@ -78,7 +78,7 @@ def test_a_file_of_its_size_is_closed_and_the_next_one_goes_on(tmp_path: Path) -
         "end",
     ]
     assert recover(path, out).lossless
-    assert own(list(read(out))) == items
+    assert drop_recorder_notes(list(read(out))) == items
     found = read_info(path)
     assert [one.file for one in found.segments] == list(found.files)
     assert sum(one.messages for one in found.segments) == status.written
@@ -121,7 +121,7 @@ def test_29_disk_full_at_every_operation_loses_nothing_when_files_change(tmp_pat
         status = recorder.close()
         if disk.operations <= number:
             break
-        assert own(list(read(path))) == items, number
+        assert drop_recorder_notes(list(read(path))) == items, number
         assert status.ok and status.failures == 1
         number += 1
     assert number > 30
@@ -138,7 +138,7 @@ def test_what_every_file_repeats_does_not_count_to_its_size(tmp_path: Path) -> N
     for item in items:
         recorder.put(*item)
     recorder.close()
-    assert own(list(read(path))) == items
+    assert drop_recorder_notes(list(read(path))) == items
     assert 2 <= len(segment_files(path)) < len(items) // 5
 
 
@@ -234,7 +234,7 @@ def test_29_recording_rests_before_the_disk_is_full_and_goes_on_when_there_is_ro
     clock.now_s += 1.0
     fly(recorder, clock, items[300:])
     final = recorder.close()
-    got = own(list(read(path)))
+    got = drop_recorder_notes(list(read(path)))
     assert got == [item for item in items if item in got]
     assert got[-90:] == items[-90:]
     assert len(items) - len(got) == final.dropped == read_info(path).dropped > 0
@@ -254,10 +254,10 @@ def test_29_what_waited_in_a_rest_is_written_at_the_end(tmp_path: Path) -> None:
     fly(recorder, clock, items[:20])
     room.free = 0
     fly(recorder, clock, items[20:])
-    assert len(own(list(read(path)))) < 35
+    assert len(drop_recorder_notes(list(read(path)))) < 35
     status = recorder.close()
     assert status.ok
-    assert own(list(read(path))) == items
+    assert drop_recorder_notes(list(read(path))) == items
 
 
 @pytest.mark.fault(29)
@@ -296,13 +296,13 @@ def test_32_a_flipped_byte_in_a_later_file_is_refused_or_restored(tmp_path: Path
                 list(read(path))
             restored = tmp_path / "restored.mcap"
             result = recover(path, restored)
-            left = own(list(read(restored)))
+            left = drop_recorder_notes(list(read(restored)))
             restored.unlink()
             assert left == [item for item in items if item in left], position
             # The chunk with the repeated header has a note of the recorder too, which may be all that is lost.
             assert result.damage and (left == items or not result.lossless), position
         file.write_bytes(data)
-    assert own(list(read(path))) == items
+    assert drop_recorder_notes(list(read(path))) == items
 
 
 def test_a_warning_that_cannot_come_is_refused() -> None:

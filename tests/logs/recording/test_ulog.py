@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from report_rig import walk
+from report_rig import walk_html
 from ulog_writer import MAGIC, UlogWriter
 
 from logs.recording.ulog import read_ulog
@@ -113,7 +113,7 @@ def test_the_document_and_the_page_tell_them(path: Path, capsys: pytest.CaptureF
     assert any("0.20 s" in note and "0.12 s" in note for note in found["notes"])
     assert any("MPC_XY_P" in note and "1.5" in note for note in found["notes"])
     assert found["messages"]["vehicle_status"] == 3
-    seen = walk(path.with_suffix(".html").read_text(encoding="utf-8"))
+    seen = walk_html(path.with_suffix(".html").read_text(encoding="utf-8"))
     assert {"path-above", "attitude-yaw", "age-0"} <= set(seen.ids)
     assert "<b>low & slow</b>" in seen.text and "OFFBOARD" in seen.text and "0.75" in seen.text
 

@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 from mcap.reader import make_reader
-from report_rig import unpaged
+from report_rig import omit_pages
 from rerun.chunk import McapReader
-from view_rig import protobuf
+from view_rig import read_protobuf
 
 from logs.recording.derived_topics import VIEWS
 from logs.recording.info import read_info
@@ -40,7 +40,7 @@ DRAWN = {
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("viewers")
     # What `make fly` types, but for its length.
-    with unpaged():
+    with omit_pages():
         assert (
             run(
                 ["loopback", "--udp", "--config", "room-hahn-stursberg", "--duration", "8", "--out", str(out), "--json"]
@@ -53,7 +53,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def decoded(recording: Path) -> dict[str, list[tuple[str, int, Any]]]:
     found: defaultdict[str, list[tuple[str, int, Any]]] = defaultdict(list)
-    for topic, schema, at_ns, message in protobuf(recording):
+    for topic, schema, at_ns, message in read_protobuf(recording):
         found[topic].append((schema, at_ns, message))
     return found
 

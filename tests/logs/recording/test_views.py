@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 from loopback_rig import lockstep
-from view_rig import flown
+from view_rig import fly_view
 
 from logs.recording.derived_topics import VIEWS
 from logs.recording.design_view import DesignView, read_design
@@ -40,7 +40,7 @@ def views(*records: Record, maker: ViewBuilder | None = None) -> Found:
     """Messages by topic, of these records or of the whole flight."""
     maker = maker or ViewBuilder()
     found: Found = {name: [] for name in KINDS}
-    entries = [(getattr(one, "at_ns", 0), one) for one in records] or [(at, one) for _, at, one in flown().entries]
+    entries = [(getattr(one, "at_ns", 0), one) for one in records] or [(at, one) for _, at, one in fly_view().entries]
     for at_ns, record in entries:
         for topic, data in maker.derive(at_ns, record):
             found[topic].append((at_ns, KINDS[topic].FromString(data)))
@@ -54,7 +54,7 @@ def found() -> Found:
 
 @pytest.fixture(scope="module")
 def design() -> DesignView:
-    return read_design(flown().of(Header)[0])
+    return read_design(fly_view().of(Header)[0])
 
 
 def place(vector: Any) -> Vec3:
@@ -66,7 +66,7 @@ def seconds(stamp: Any) -> int:
 
 
 def test_each_topic_has_as_many_messages_as_its_records(found: Found) -> None:
-    memory = flown()
+    memory = fly_view()
     ticks, plans = memory.of(Decision), [p for p in memory.of(Plan) if p.status is SolveStatus.OPTIMAL]
     boundaries = [one for one in ticks if one.boundary]
     counts = {topic: len(messages) for topic, messages in found.items()}
@@ -82,7 +82,7 @@ def test_each_topic_has_as_many_messages_as_its_records(found: Found) -> None:
 
 
 def test_plans_that_come_quickly_are_not_all_drawn() -> None:
-    header, plan = flown().of(Header)[0], next(p for p in flown().of(Plan) if p.status is SolveStatus.OPTIMAL)
+    header, plan = fly_view().of(Header)[0], next(p for p in fly_view().of(Plan) if p.status is SolveStatus.OPTIMAL)
     maker = ViewBuilder()
     maker.derive(0, header)
     times_ns = [n * 50_000_000 for n in range(40)]
@@ -92,13 +92,13 @@ def test_plans_that_come_quickly_are_not_all_drawn() -> None:
 
 
 def test_positions_are_those_of_the_records(found: Found, design: DesignView) -> None:
-    for (_, message), estimate in zip(found["/view/estimate"], flown().of(Estimate), strict=True):
+    for (_, message), estimate in zip(found["/view/estimate"], fly_view().of(Estimate), strict=True):
         assert place(message.pose.position) == design.position_of(estimate.mean)
         assert (message.frame_id, seconds(message.timestamp)) == ("ned", estimate.at_ns)
-    samples = [sample for one in flown().of(StepInput) for sample in one.samples]
+    samples = [sample for one in fly_view().of(StepInput) for sample in one.samples]
     for (_, message), sample in zip(found["/view/measured"], samples, strict=True):
         assert (place(message.pose.position), seconds(message.timestamp)) == (sample.position_m, sample.captured_ns)
-    (_, plan), one = found["/view/plan"][0], next(p for p in flown().of(Plan) if p.status is SolveStatus.OPTIMAL)
+    (_, plan), one = found["/view/plan"][0], next(p for p in fly_view().of(Plan) if p.status is SolveStatus.OPTIMAL)
     assert [place(pose.position) for pose in plan.poses] == [design.position_of(state) for state in one.states]
 
 
@@ -145,7 +145,7 @@ def test_an_open_side_is_drawn_near_the_target(design: DesignView) -> None:
 
 
 def test_a_plan_s_ellipsoids_are_its_back_offs(design: DesignView) -> None:
-    plan = next(p for p in flown().of(Plan) if p.status is SolveStatus.OPTIMAL)
+    plan = next(p for p in fly_view().of(Plan) if p.status is SolveStatus.OPTIMAL)
     scene = {entity.id: entity for entity in draw_plan(0, design, plan, None).entities}
     box = design.state_box
     for sphere, state, backoff in zip(scene["predicted spread"].spheres, plan.states, plan.backoff_x, strict=True):
@@ -158,11 +158,11 @@ def test_a_plan_s_ellipsoids_are_its_back_offs(design: DesignView) -> None:
 
 
 def test_the_estimate_s_ellipsoid_holds_95_percent(design: DesignView) -> None:
-    plan = next(p for p in flown().of(Plan) if p.status is SolveStatus.OPTIMAL)
+    plan = next(p for p in fly_view().of(Plan) if p.status is SolveStatus.OPTIMAL)
     rng = np.random.default_rng(4)
     root = rng.normal(size=(9, 9))
     cov = root @ root.T
-    estimate = msgspec.structs.replace(flown().of(Estimate)[0], cov=tuple(map(tuple, cov.tolist())))
+    estimate = msgspec.structs.replace(fly_view().of(Estimate)[0], cov=tuple(map(tuple, cov.tolist())))
     scene = {entity.id: entity for entity in draw_plan(0, design, plan, estimate).entities}
     (sphere,) = scene["estimate, 95 %"].spheres
     turn = sphere.pose.orientation
@@ -179,30 +179,30 @@ def test_the_estimate_s_ellipsoid_holds_95_percent(design: DesignView) -> None:
 
 
 def test_plots_have_the_numbers_of_the_records(found: Found, design: DesignView) -> None:
-    for (_, age), decision in zip(found["/plot/age"], flown().of(Decision), strict=True):
+    for (_, age), decision in zip(found["/plot/age"], fly_view().of(Decision), strict=True):
         want = math.nan if decision.age_steps is None else decision.age_steps
         assert age.age_steps == pytest.approx(want, nan_ok=True)
         assert (age.mode, age.limit_steps, age.news) == (decision.mode.value, design.horizon, decision.news)
     rows = dict(zip(design.c_u, design.b_u, strict=True))
     lower_down = -next(limit for row, limit in rows.items() if row[2] < 0)
     upper_north = next(limit for row, limit in rows.items() if row[0] > 0)
-    for (_, plot), decision in zip(found["/plot/input"], flown().of(Decision), strict=True):
+    for (_, plot), decision in zip(found["/plot/input"], fly_view().of(Decision), strict=True):
         want_u = decision.input or (math.nan,) * 3
         assert (plot.chosen.north, plot.chosen.east, plot.chosen.down) == pytest.approx(want_u, nan_ok=True)
         assert (plot.lower.down, plot.upper.north) == pytest.approx((lower_down, upper_north))
         assert (plot.lower.down, plot.upper.north) == pytest.approx((-1.5, 2.0))  # of the preset: what may be flown
-    for (_, plot), estimate in zip(found["/plot/state"], flown().of(Estimate), strict=True):
+    for (_, plot), estimate in zip(found["/plot/state"], fly_view().of(Estimate), strict=True):
         assert plot.position_std_m.east == pytest.approx(math.sqrt(estimate.cov[3][3]))
     _, timing = found["/plot/timing"][0]
     assert (timing.lateness_us, timing.step_us, timing.send_us) == (1.5, 250.0, 400.0)
     assert math.isnan(timing.capture_to_send_ms)
-    aged = {estimate.at_ns: estimate.age_s for estimate in flown().of(Estimate)}
+    aged = {estimate.at_ns: estimate.age_s for estimate in fly_view().of(Estimate)}
     shown = {at_ns: age.age_s for at_ns, age in found["/plot/age"] if at_ns in aged}
     assert shown == pytest.approx(aged)
 
 
 def test_the_link_is_green_with_news_amber_in_silence_red_in_the_fallback(design: DesignView) -> None:
-    header, decision = flown().of(Header)[0], next(d for d in flown().of(Decision) if d.boundary)
+    header, decision = fly_view().of(Header)[0], next(d for d in fly_view().of(Decision) if d.boundary)
     cases = {
         "news": msgspec.structs.replace(decision, mode=ControlMode.TRACK, news=True, age_steps=1),
         "silence": msgspec.structs.replace(decision, mode=ControlMode.TRACK, news=False, age_steps=4),
@@ -217,7 +217,7 @@ def test_the_link_is_green_with_news_amber_in_silence_red_in_the_fallback(design
 
 
 def test_events_keep_their_severity_and_count() -> None:
-    header = flown().of(Header)[0]
+    header = fly_view().of(Header)[0]
     events = [Event(at_ns=n, severity=one, code="c", text="t", count=1 + n) for n, one in enumerate(Severity)]
     lines = [message for _, message in views(header, *events)["/view/log"]]
     assert [line.Level.Name(line.level) for line in lines] == ["INFO", "WARNING", "ERROR"]
@@ -226,7 +226,7 @@ def test_events_keep_their_severity_and_count() -> None:
 
 def test_paths_are_those_of_the_last_twenty_seconds() -> None:
     maker = ViewBuilder()
-    header, truth, decision = flown().of(Header)[0], flown().of(Truth)[0], flown().of(Decision)[0]
+    header, truth, decision = fly_view().of(Header)[0], fly_view().of(Truth)[0], fly_view().of(Decision)[0]
     maker.derive(0, header)
     for tenth in range(500):
         at_ns = tenth * 100_000_000
@@ -238,7 +238,7 @@ def test_paths_are_those_of_the_last_twenty_seconds() -> None:
 
 
 def test_a_plan_that_failed_is_in_the_plot_only() -> None:
-    header, plan = flown().of(Header)[0], flown().of(Plan)[0]
+    header, plan = fly_view().of(Header)[0], fly_view().of(Plan)[0]
     failed = msgspec.structs.replace(plan, status=SolveStatus.FAILED, states=(), inputs=(), backoff_x=())
     made = {topic: messages for topic, messages in views(header, failed).items() if messages}
     assert made.keys() == {"/view/frames", "/view/scene/room", "/plot/solve"}
@@ -246,15 +246,15 @@ def test_a_plan_that_failed_is_in_the_plot_only() -> None:
 
 
 def test_nothing_is_made_before_a_header() -> None:
-    assert not any(views(*flown().of(Estimate)[:3], *flown().of(Event)).values())
+    assert not any(views(*fly_view().of(Estimate)[:3], *fly_view().of(Event)).values())
 
 
 def test_a_design_that_cannot_be_used_is_told() -> None:
-    header = msgspec.structs.replace(flown().of(Header)[0], design={"gamma_x": [1.0]})
+    header = msgspec.structs.replace(fly_view().of(Header)[0], design={"gamma_x": [1.0]})
     maker = ViewBuilder()
     with pytest.raises(RecordingError, match="design cannot be used"):
         maker.derive(0, header)
-    assert maker.derive(1, flown().of(Estimate)[0]) == []
+    assert maker.derive(1, fly_view().of(Estimate)[0]) == []
 
 
 def test_a_plant_in_the_plane_has_no_number_for_the_third_axis() -> None:

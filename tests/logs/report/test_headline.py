@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from loopback_rig import lockstep
 from mavlink_rig import make_link
-from recorded_rig import RELAYED, listened, page_of, truth
-from report_rig import drawn
+from recorded_rig import RELAYED, listen, make_page_data, truth
+from report_rig import collect_figures
 from synthetic_flight import fly
 from synthetic_scene import room
 
@@ -197,7 +197,7 @@ def test_crosses_are_on_the_axis_that_is_outside_only(flight: FlightData) -> Non
 
 def test_the_place_is_marked_in_each_view_of_the_path(flight: FlightData) -> None:
     def marked(flight: FlightData) -> list[list[str]]:
-        with drawn() as figures:
+        with collect_figures() as figures:
             list(draw_path_views(flight))
             draw_path_3d(flight)
         texts = [[text.get_text() for text in figure.axes[0].texts] for figure in figures.values()]
@@ -286,7 +286,7 @@ def test_a_fence_that_closes_in_is_drawn_and_named() -> None:
 def test_a_recorded_flight_that_was_blown_away_is_told_by_its_positions() -> None:
     """PX4's own simulator, in a wind that its pilot had not ordered for; its truth was recorded beside it."""
     since_s, lasted_s = 50.0, 12.0
-    headline = head(page_of(listened(BLOWN, since_s, lasted_s).memory))
+    headline = head(make_page_data(listen(BLOWN, since_s, lasted_s).memory))
     beyond_m, wall, at_s = went(headline.text)
     rows = truth(BLOWN)
     true_m = [float(np.interp(since_s + at_s, rows[:, 0], rows[:, 1 + axis])) for axis in range(3)]

@@ -12,9 +12,9 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from loopback_rig import Memory, lockstep
+from loopback_rig import MemorySink, lockstep
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from report_rig import unwritten, walk
+from report_rig import omit_figures, walk_html
 from rich.console import Console
 
 from logs.recording.flight import FlightData
@@ -31,12 +31,12 @@ EXACT = "solver.method=exact"
 
 
 @pytest.fixture(scope="module")
-def base() -> Memory:
+def base() -> MemorySink:
     return lockstep("room-hahn-stursberg", SECONDS, EXACT)
 
 
 @pytest.fixture(scope="module")
-def other() -> Memory:
+def other() -> MemorySink:
     return lockstep("room-hahn-stursberg", SECONDS, EXACT, "sim.seed=3", "link.loss=0.25")
 
 
@@ -53,7 +53,7 @@ def figures(comparison: FlightComparison) -> dict[str, Figure]:
     return {figure.key: figure for figure in comparison.figures}
 
 
-def test_the_same_flight_says_so(base: Memory, tmp_path: Path) -> None:
+def test_the_same_flight_says_so(base: MemorySink, tmp_path: Path) -> None:
     # another day: another start, other computing times
     again = []
     for topic, at_ns, entry in base.entries:
@@ -71,7 +71,7 @@ def test_the_same_flight_says_so(base: Memory, tmp_path: Path) -> None:
     assert all(figure.differences == (0,) for figure in comparison.figures if figure.group not in ("time", "recording"))
 
 
-def test_parameters_that_differ_have_dotted_names(base: Memory, other: Memory, tmp_path: Path) -> None:
+def test_parameters_that_differ_have_dotted_names(base: MemorySink, other: MemorySink, tmp_path: Path) -> None:
     a, b = record(tmp_path / "a.mcap", base.entries), record(tmp_path / "b.mcap", other.entries)
     comparison = compare_flights(load_flights([a, b]))
     differing = {entry.key: entry.values for entry in comparison.parameters}
@@ -80,7 +80,7 @@ def test_parameters_that_differ_have_dotted_names(base: Memory, other: Memory, t
     assert differing.keys() == {"sim.seed", "link.loss", "design_id"}
 
 
-def test_header_and_versions_count_as_parameters(base: Memory, tmp_path: Path) -> None:
+def test_header_and_versions_count_as_parameters(base: MemorySink, tmp_path: Path) -> None:
     changed = [
         (
             topic,
@@ -102,7 +102,7 @@ def test_header_and_versions_count_as_parameters(base: Memory, tmp_path: Path) -
     assert any("different processors" in note for note in comparison.notes)
 
 
-def test_parameters_of_the_vehicle_are_compared(base: Memory, tmp_path: Path) -> None:
+def test_parameters_of_the_vehicle_are_compared(base: MemorySink, tmp_path: Path) -> None:
     def with_parameters(**told: float) -> list[tuple[str, int, Record]]:
         mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
         messages = [
@@ -121,7 +121,7 @@ def test_parameters_of_the_vehicle_are_compared(base: Memory, tmp_path: Path) ->
     assert sum("A 2, B 3, C 0" in note for note in comparison.notes) == 1
 
 
-def test_tables_of_a_list_are_compared_one_by_one(base: Memory, tmp_path: Path) -> None:
+def test_tables_of_a_list_are_compared_one_by_one(base: MemorySink, tmp_path: Path) -> None:
     def with_waypoints(count: int) -> list[tuple[str, int, Record]]:
         text = "".join(f"\n[[mission.waypoint]]\nat = [{number}.0]\n" for number in range(count)) + "\n[a]\nb = inf\n"
         return [
@@ -134,7 +134,7 @@ def test_tables_of_a_list_are_compared_one_by_one(base: Memory, tmp_path: Path) 
     assert [(entry.key, entry.values) for entry in comparison.parameters] == [("mission.waypoint[1].at", (None, [1.0]))]
 
 
-def test_figures_are_the_summaries(base: Memory, other: Memory, tmp_path: Path) -> None:
+def test_figures_are_the_summaries(base: MemorySink, other: MemorySink, tmp_path: Path) -> None:
     a, b = record(tmp_path / "a.mcap", base.entries), record(tmp_path / "b.mcap", other.entries)
     comparison = figures(compare_flights(load_flights([a, b])))
     first, second = (summarise(FlightData.from_records(memory.entries), wall_s=None) for memory in (base, other))
@@ -148,7 +148,7 @@ def test_figures_are_the_summaries(base: Memory, other: Memory, tmp_path: Path) 
     assert comparison["loss"].values[0] == pytest.approx(first.lost / (first.received + first.lost))  # type: ignore[operator]
 
 
-def test_where_they_part(base: Memory, tmp_path: Path) -> None:
+def test_where_they_part(base: MemorySink, tmp_path: Path) -> None:
     at = next(i for i, (_, _, r) in enumerate(base.entries) if isinstance(r, Decision) and r.tick == 57)
     topic, at_ns, entry = base.entries[at]
     assert isinstance(entry, Decision) and entry.input is not None
@@ -163,7 +163,7 @@ def test_where_they_part(base: Memory, tmp_path: Path) -> None:
     assert parting.first == repr(entry.input[0]) and parting.other != parting.first
 
 
-def test_a_torn_one_is_compared_up_to_its_end(base: Memory, tmp_path: Path) -> None:
+def test_a_torn_one_is_compared_up_to_its_end(base: MemorySink, tmp_path: Path) -> None:
     a = record(tmp_path / "a.mcap", base.entries)
     torn = tmp_path / "b.mcap"
     torn.write_bytes(a.read_bytes()[: a.stat().st_size // 2])
@@ -182,7 +182,7 @@ def shown(comparison: FlightComparison, width: int) -> str:
 
 
 @pytest.mark.parametrize("width", [80, 120])
-def test_people_are_shown_every_figure(width: int, base: Memory, other: Memory, tmp_path: Path) -> None:
+def test_people_are_shown_every_figure(width: int, base: MemorySink, other: MemorySink, tmp_path: Path) -> None:
     paths = [record(tmp_path / "a.mcap", base.entries), record(tmp_path / "b.mcap", other.entries)]
     comparison = compare_flights(load_flights([*paths, *paths]))
     text = shown(comparison, width)
@@ -195,7 +195,7 @@ def test_people_are_shown_every_figure(width: int, base: Memory, other: Memory, 
         assert heading in text
 
 
-def test_command(base: Memory, other: Memory, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command(base: MemorySink, other: MemorySink, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     a, b = record(tmp_path / "a.mcap", base.entries), record(tmp_path / "b.mcap", other.entries)
     page = tmp_path / "c.html"
     assert run(["log", "compare", str(a), str(b), "--out", str(page), "--json"]) == 0
@@ -206,7 +206,7 @@ def test_command(base: Memory, other: Memory, tmp_path: Path, capsys: pytest.Cap
     for part in ('id="path-above"', 'id="position-north"', 'id="age"', "sim.seed", "distance from target"):
         assert part in text
     assert not re.search(r"<script[^>]+src|https?://", text.replace("http://www.w3.org/", ""))
-    seen = walk(text)
+    seen = walk_html(text)
     assert "How alike they are" in seen.text
     assert any(cell.startswith("−") for cell in seen.text)
     assert not any(re.fullmatch(r"-[\d.e]+", cell) for cell in seen.text)
@@ -214,11 +214,13 @@ def test_command(base: Memory, other: Memory, tmp_path: Path, capsys: pytest.Cap
     assert "Parameters that differ" in capsys.readouterr().out
 
 
-def test_a_page_of_many_flights_has_tables_that_paper_can_hold(base: Memory, other: Memory, tmp_path: Path) -> None:
+def test_a_page_of_many_flights_has_tables_that_paper_can_hold(
+    base: MemorySink, other: MemorySink, tmp_path: Path
+) -> None:
     paths = [record(tmp_path / "a.mcap", base.entries), record(tmp_path / "b.mcap", other.entries)]
     loaded = load_flights([*paths, *paths, paths[0]])
     comparison = compare_flights(loaded)
-    with unwritten():
+    with omit_figures():
         page = render_comparison(comparison, loaded)
     heads = [re.findall(r"<th>|<th class=\"number\">", head) for head in re.findall(r"<thead>.*?</thead>", page)]
     assert max(map(len, heads)) <= 8
@@ -227,7 +229,7 @@ def test_a_page_of_many_flights_has_tables_that_paper_can_hold(base: Memory, oth
     assert page.count(">positions received<") == 2
 
 
-def test_refusals(base: Memory, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_refusals(base: MemorySink, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     a = record(tmp_path / "a.mcap", base.entries)
     assert run(["log", "compare", str(a)]) == 2
     capsys.readouterr()

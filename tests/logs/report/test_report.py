@@ -10,7 +10,7 @@ from pathlib import Path
 import msgspec
 import pytest
 from loopback_rig import lockstep
-from report_rig import data, html_of, unwritten, walk, words_of
+from report_rig import data, make_html, omit_figures, read_page_text, walk_html
 from synthetic_flight import fly
 from synthetic_scene import Scene, paper, room
 
@@ -44,12 +44,12 @@ def room_flight() -> FlightData:
 
 @pytest.fixture(scope="module")
 def room_html(room_flight: FlightData) -> str:
-    return html_of(room_flight)
+    return make_html(room_flight)
 
 
 @pytest.mark.slow
 def test_every_plot_is_there_and_says_what_it_shows(room_html: str) -> None:
-    seen = walk(room_html)
+    seen = walk_html(room_html)
     assert set(seen.plots) == ROOM_PLOTS
     assert all(len(label) > 20 for label in seen.plots.values())
     assert seen.lang == "en"
@@ -61,7 +61,7 @@ def test_sections_are_these_in_this_order(judged_html: str) -> None:
 
 
 def test_nothing_comes_from_outside(room_html: str) -> None:
-    seen = walk(room_html)
+    seen = walk_html(room_html)
     assert not seen.tags & {"link", "img", "iframe", "object"}
     assert room_html.count("<script") == 1 and "<script>" in room_html  # its own, without a source
     assert all(reference.startswith("#") for reference in seen.references)
@@ -69,7 +69,7 @@ def test_nothing_comes_from_outside(room_html: str) -> None:
 
 
 def test_references_within_the_page_are_met(room_html: str) -> None:
-    ids = set(walk(room_html).ids)
+    ids = set(walk_html(room_html).ids)
     used = set(re.findall(r'(?:href="#|url\(#)([\w-]+)', room_html))
     assert used
     assert used <= ids
@@ -94,7 +94,7 @@ def test_colours_follow_the_page(room_html: str) -> None:
 
 def test_story_is_true_of_the_flight(room_flight: FlightData, room_html: str) -> None:
     s = summarise(room_flight, wall_s=1.0)
-    text = " ".join(walk(room_html).text)
+    text = " ".join(walk_html(room_html).text)
     assert f"{s.steps} steps;" in text
     assert f"{s.lost} lost" in text
     assert "took over once" in text
@@ -104,31 +104,31 @@ def test_story_is_true_of_the_flight(room_flight: FlightData, room_html: str) ->
 def test_text_of_others_is_escaped() -> None:
     hostile = 'name = "<script>alert(1)</script>"\nnote = "</pre><img src=x> $\\\\frac$"\n'
     flight = FlightData.from_records(fly(paper(), 3.0, config_toml=hostile))
-    page = html_of(flight)
-    seen = walk(page)
+    page = make_html(flight)
+    seen = walk_html(page)
     assert "img" not in seen.tags and page.count("<script") == 1  # the page's own
     assert "<script>alert(1)</script>" in " ".join(seen.text)
 
 
 def test_a_damaged_configuration_is_still_shown() -> None:
-    seen = words_of(FlightData.from_records(fly(paper(), 3.0, config_toml="name = = 1")))
+    seen = read_page_text(FlightData.from_records(fly(paper(), 3.0, config_toml="name = = 1")))
     assert "name = = 1" in " ".join(seen.text)
 
 
 @pytest.mark.slow
 def test_same_flight_same_page(room_flight: FlightData, room_html: str) -> None:
-    assert html_of(room_flight) == room_html
+    assert make_html(room_flight) == room_html
 
 
 @pytest.fixture(scope="module")
 def judged_html() -> str:
     memory = lockstep("room-hahn-stursberg", 14.0, "solver.method=exact", "link.blackout=[[6, 8]]")
-    return html_of(FlightData.from_records(memory.entries))
+    return make_html(FlightData.from_records(memory.entries))
 
 
 @pytest.mark.slow
 def test_a_flight_of_ours_is_judged(judged_html: str) -> None:
-    seen = walk(judged_html)
+    seen = walk_html(judged_html)
     verdicts = {f"{kind}-{axis}" for kind in ("error", "white") for axis in ("north", "east", "down")}
     assert set(seen.plots) >= verdicts | {"coverage", "link-estimate"}
     text = " ".join(seen.text)
@@ -145,7 +145,7 @@ def test_a_flight_of_ours_is_judged(judged_html: str) -> None:
 
 
 def test_a_flight_of_unknown_configuration_is_judged_as_far_as_it_goes(room_html: str) -> None:
-    text = " ".join(walk(room_html).text)
+    text = " ".join(walk_html(room_html).text)
     assert "model cannot be run again" in text
     assert "not known any more" in text
 
@@ -154,14 +154,14 @@ def test_slack_is_drawn(room_flight: FlightData) -> None:
     some = list(room_flight.flown_plans.values())[:2]
     gave = [msgspec.structs.replace(plan, slack=slack) for plan, slack in zip(some, (0.2, 0.1), strict=True)]
     plans = (*gave, *(plan for plan in room_flight.plans if plan.seq not in {plan.seq for plan in gave}))
-    seen = words_of(dataclasses.replace(room_flight, plans=plans))
+    seen = read_page_text(dataclasses.replace(room_flight, plans=plans))
     assert "plan-slack" in seen.plots
     assert "2 flown with slack" in " ".join(seen.text)
 
 
 def test_checks_before_arming_are_listed(room_flight: FlightData) -> None:
     check = Checked(at_ns=0, name="battery", state="good", value="15.2 V", want="above 14 V", hint="")
-    text = " ".join(words_of(dataclasses.replace(room_flight, checks=(check,))).text)
+    text = " ".join(read_page_text(dataclasses.replace(room_flight, checks=(check,))).text)
     assert "Checked before arming" in text and "above 14 V" in text
 
 
@@ -179,19 +179,19 @@ def test_paths_are_written_short(drawn: str, short: str) -> None:
 
 @pytest.mark.slow
 def test_ten_minutes_stay_below_a_megabyte_and_a_half() -> None:
-    page = html_of(FlightData.from_records(fly(room(), 600.0, blackout=(30.0, 40.0))))
+    page = make_html(FlightData.from_records(fly(room(), 600.0, blackout=(30.0, 40.0))))
     assert len(page.encode()) < 1_500_000
 
 
 def test_two_axes_have_no_side_view() -> None:
-    plots = set(words_of(data(paper(), 30.0)).plots)
+    plots = set(read_page_text(data(paper(), 30.0)).plots)
     assert "path-above" in plots
     assert "path-side" not in plots
 
 
 def test_without_truth_the_page_says_estimate() -> None:
     flight = data(room(), 8.0, lambda record: not isinstance(record, Truth))
-    seen = words_of(flight)
+    seen = read_page_text(flight)
     text = " ".join(seen.text)
     assert "true state is unknown" in text
     assert "position lost" not in text
@@ -200,21 +200,21 @@ def test_without_truth_the_page_says_estimate() -> None:
 
 def test_without_plans_there_is_nothing_to_compare() -> None:
     flight = data(room(), 4.0, lambda record: not isinstance(record, Plan))
-    seen = words_of(flight)
+    seen = read_page_text(flight)
     assert "No plan was flown" in " ".join(seen.text)
     assert not any(key.startswith("plan-") and key != "plan-index" for key in seen.plots)
 
 
 def test_without_timing_it_says_so() -> None:
     flight = data(room(), 4.0, lambda record: not isinstance(record, Timing))
-    seen = words_of(flight)
+    seen = read_page_text(flight)
     assert "No times were measured" in " ".join(seen.text)
     assert "time-late" not in seen.plots
 
 
 @pytest.mark.parametrize("scene", [room(), paper()], ids=["room", "paper"])
 def test_one_tick(scene: Scene) -> None:
-    seen = words_of(data(scene, scene.tick_s))
+    seen = read_page_text(data(scene, scene.tick_s))
     assert "1 step;" in " ".join(seen.text)
     assert not any(key.startswith(("state-", "input-")) for key in seen.plots)  # one value is no plot
 
@@ -224,7 +224,7 @@ def test_virtual_time_has_no_plot_of_lateness() -> None:
         return msgspec.structs.replace(record, lateness_ns=0) if isinstance(record, Timing) else record
 
     items = [(t, at, punctual(r)) for t, at, r in fly(room(), 2.0)]
-    seen = words_of(FlightData.from_records(items))
+    seen = read_page_text(FlightData.from_records(items))
     assert "time-decision" in seen.plots
     assert "time-late" not in seen.plots
     text = " ".join(seen.text)
@@ -241,7 +241,7 @@ def test_a_flight_that_only_waited() -> None:
 
     kept = (Decision, Timing)
     items = [(t, at, waiting(r)) for t, at, r in fly(room(), 2.0) if isinstance(r, kept) or t == "/uavctl/header"]
-    text = " ".join(words_of(FlightData.from_records(items)).text)
+    text = " ".join(read_page_text(FlightData.from_records(items)).text)
     assert "no position yet." in text  # with its reason
 
 
@@ -253,8 +253,8 @@ def test_an_estimate_that_is_no_number_is_left_out_of_the_drawing() -> None:
         return record
 
     items = [(t, at, spoil(r)) for t, at, r in fly(room(), 4.0) if not isinstance(r, Truth)]
-    page = html_of(FlightData.from_records(items))
-    walk(page)
+    page = make_html(FlightData.from_records(items))
+    walk_html(page)
     for path in re.findall(r' d="([^"]*)"', page):
         assert "nan" not in path
 
@@ -276,14 +276,14 @@ def test_positions_that_were_refused_are_not_drawn() -> None:
 
 def test_report_is_written_as_utf8(tmp_path: Path, room_flight: FlightData) -> None:
     out = tmp_path / "flight.html"
-    with unwritten():
+    with omit_figures():
         write_report(room_flight, summarise(room_flight, wall_s=1.0), out)
-        assert out.read_text(encoding="utf-8") == html_of(room_flight)
+        assert out.read_text(encoding="utf-8") == make_html(room_flight)
 
 
 def test_a_page_that_cannot_be_written_is_told(tmp_path: Path, room_flight: FlightData) -> None:
     out = tmp_path / "missing" / "flight.html"
-    with unwritten(), pytest.raises(RecordingError) as told:
+    with omit_figures(), pytest.raises(RecordingError) as told:
         write_report(room_flight, summarise(room_flight, wall_s=1.0), out)
     assert str(told.value).startswith(f"{out}: cannot be written (No such file")
 

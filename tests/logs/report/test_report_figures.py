@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 from loopback_rig import lockstep
-from report_rig import data, drawn, words_of
+from report_rig import collect_figures, data, read_page_text
 from synthetic_scene import room
 
 from logs.recording.flight import FlightData
@@ -54,7 +54,7 @@ def test_the_reserve_is_drawn_as_long_as_a_plan_is_flown(flight: FlightData) -> 
     decisions = tuple(
         msgspec.structs.replace(d, plan_seq=last.seq) if d.at_ns >= silent else d for d in flight.decisions
     )
-    with drawn() as figures:
+    with collect_figures() as figures:
         list(plots.draw_axes_over_time(dataclasses.replace(flight, decisions=decisions)))
     for figure in figures.values():
         bands = figure.axes[0].collections
@@ -63,7 +63,7 @@ def test_the_reserve_is_drawn_as_long_as_a_plan_is_flown(flight: FlightData) -> 
 
 def test_what_is_too_small_to_count_is_no_slack(flight: FlightData) -> None:
     tiny = tuple(msgspec.structs.replace(plan, slack=1e-9, terminal_miss=1e-9) for plan in flight.plans)
-    seen = words_of(dataclasses.replace(flight, plans=tiny))
+    seen = read_page_text(dataclasses.replace(flight, plans=tiny))
     assert "plan-slack" not in seen.plots
     assert "No plan that was flown gave way" in " ".join(seen.text)
 
@@ -72,7 +72,7 @@ def test_what_is_too_small_to_count_is_no_slack(flight: FlightData) -> None:
 def test_small_slack_fills_its_drawing(flight: FlightData, slack: float) -> None:
     two = {plan.seq for plan in list(flight.flown_plans.values())[:2]}
     plans = tuple(msgspec.structs.replace(plan, slack=slack) if plan.seq in two else plan for plan in flight.plans)
-    with drawn() as figures:
+    with collect_figures() as figures:
         list(plan_figures.draw_certificates(dataclasses.replace(flight, plans=plans)))
     low, high = figures["What gave way in plans flown"].axes[0].get_ylim()
     assert low <= 0.0 and slack < high < 2 * slack
@@ -81,7 +81,7 @@ def test_small_slack_fills_its_drawing(flight: FlightData, slack: float) -> None
 def test_gaps_that_are_alike_still_have_a_scale(flight: FlightData) -> None:
     gaps = np.geomspace(1.5e-9, 4e-9, len(flight.plans))
     plans = tuple(msgspec.structs.replace(plan, gap=gap) for plan, gap in zip(flight.plans, gaps, strict=True))
-    with drawn() as figures:
+    with collect_figures() as figures:
         list(plan_figures.draw_certificates(dataclasses.replace(flight, plans=plans)))
     ax = figures["Certified gap"].axes[0]
     low, high = ax.get_ylim()
@@ -98,13 +98,13 @@ def test_arrivals_without_delay_are_not_drawn(flight: FlightData) -> None:
         for step in flight.step_inputs
     )
     quick = dataclasses.replace(flight, step_inputs=inputs)
-    with drawn() as figures:
+    with collect_figures() as figures:
         list(link_figures.draw_link_in_flight(quick, judge_link(quick, None)))
     assert "Capture to arrival, by the stamps" not in figures  # one value is no plot
 
 
 def test_a_short_flight_is_not_said_to_prove_anything(short: FlightData) -> None:
-    seen = words_of(short)
+    seen = read_page_text(short)
     text = " ".join(seen.text)
     assert "too few to judge" in text
     assert "where a right model stays" not in text  # a legend without a figure
@@ -140,7 +140,7 @@ def part_of(flight: FlightData, from_tick: int) -> FlightData:
 
 
 def test_a_part_of_a_flight_says_so(flight: FlightData) -> None:
-    seen = words_of(part_of(flight, 80)).text
+    seen = read_page_text(part_of(flight, 80)).text
     text = " ".join(seen)
     assert "Flight “room”, a part" in text and "a part of a flight" in text
     begins = [line for line in seen if "tick 80" in line]
@@ -166,7 +166,7 @@ def test_a_recording_that_is_not_all_of_the_flight_says_so(
     flight: FlightData, last: str, told: str, breaks_off: bool
 ) -> None:
     cut = dataclasses.replace(flight, notes=(note("begin"), note(last)))
-    text = " ".join(words_of(cut).text)
+    text = " ".join(read_page_text(cut).text)
     assert told in text
     assert ("The recording breaks off." in text) is breaks_off
     assert ("breaks off" in text) is breaks_off
@@ -175,7 +175,7 @@ def test_a_recording_that_is_not_all_of_the_flight_says_so(
 def test_a_later_file_has_its_own_figures(flight: FlightData) -> None:
     part = dataclasses.replace(part_of(flight, 80), notes=(note("goes on after flight.mcap", 2), note("end", 2)))
     found, whole = summarise(part, wall_s=None), summarise(flight, wall_s=None)
-    text = " ".join(words_of(part).text)
+    text = " ".join(read_page_text(part).text)
     assert "file 2 of a flight" in text and "tick 80, 4 s into" in text
     first, last = part.truths[0], part.truths[-1]
     assert found.lost is not None
@@ -190,19 +190,19 @@ def test_a_part_that_waits_first_tells_when_it_was_taken_over(flight: FlightData
     def wait(decision: Decision) -> Decision:
         return msgspec.structs.replace(decision, mode=ControlMode.WAIT) if decision.tick < 90 else decision
 
-    text = " ".join(words_of(dataclasses.replace(part, decisions=tuple(map(wait, part.decisions)))).text)
+    text = " ".join(read_page_text(dataclasses.replace(part, decisions=tuple(map(wait, part.decisions)))).text)
     assert "took over 0.5 s after" in text
 
 
 @pytest.mark.slow
 def test_a_whole_flight_is_no_part(flight: FlightData) -> None:
-    assert "art of a flight" not in " ".join(words_of(flight).text)
+    assert "art of a flight" not in " ".join(read_page_text(flight).text)
 
 
 def test_without_truth_nothing_is_drawn_in_its_colour(flight: FlightData) -> None:
     def key(flight: FlightData) -> tuple[set[str], list[str]]:
         """Colours of the lines of the path in three dimensions, and what the small picture explains."""
-        with drawn() as figures:
+        with collect_figures() as figures:
             draw_path_3d(flight)
             draw_overview(flight)
         deep = {str(line.get_color()) for line in figures[""].axes[0].lines if line.get_marker() == "None"}

@@ -7,7 +7,7 @@ import dataclasses
 import msgspec
 import numpy as np
 import pytest
-from report_rig import words_of
+from report_rig import read_page_text
 from synthetic_flight import fly
 from synthetic_scene import room
 
@@ -50,7 +50,7 @@ def ended_in(
         if at_ns is not None:
             event = Event(at_ns=at_ns, severity=Severity.INFO, code=code, text="", subject=subject)
             items.append(("/uavctl/event", at_ns, event))
-    return " ".join(words_of(FlightData.from_records(items)).text)
+    return " ".join(read_page_text(FlightData.from_records(items)).text)
 
 
 HAND_OVER = {40: ControlMode.BRAKE, 50: ControlMode.HOLD, 51: ControlMode.LAND, 52: ControlMode.STOPPED}
@@ -139,7 +139,7 @@ def test_the_shortest_delay_is_what_the_configuration_takes_it_to_be(latency_s: 
         clock_drift_ppm=None,
         clock_rejected=0,
     )
-    text = " ".join(words_of(dataclasses.replace(found, links=(stats,))).text)
+    text = " ".join(read_page_text(dataclasses.replace(found, links=(stats,))).text)
     taken = "30 ms (clock.latency_s)" in text
     short = "short of the quickest" in text
     assert (taken, short) == (latency_s > 0.0, latency_s == 0.0)
@@ -149,7 +149,7 @@ def test_the_ways_to_a_plan_and_slack_are_explained_where_they_stand() -> None:
     found = FlightData.from_records(fly(room(), 4.0))
     ways = ("frozen", "mixture", "exact")
     plans = tuple(msgspec.structs.replace(plan, method=ways[at % 2]) for at, plan in enumerate(found.plans))
-    text = " ".join(words_of(dataclasses.replace(found, plans=plans)).text)
+    text = " ".join(read_page_text(dataclasses.replace(found, plans=plans)).text)
     assert [f"“{way}”: with " in text for way in ways] == [True, True, False]
     assert "Slack is" in text
 

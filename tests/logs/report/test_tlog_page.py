@@ -14,7 +14,7 @@ import view_rig
 from places import DATA
 from pymavlink import mavutil  # type: ignore[attr-defined]
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from report_rig import walk
+from report_rig import walk_html
 
 from logs.recording.mavlink_flight import MavlinkFlight, read_flight
 from logs.recording.tlog import export_tlog
@@ -56,7 +56,7 @@ def copter(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_path_is_that_of_the_flight(flight: MavlinkFlight) -> None:
-    memory = view_rig.flown()
+    memory = view_rig.fly_view()
     samples = [sample for step in memory.of(StepInput) for sample in step.samples]
     (sent,) = flight.sent.values()
     # single floats on the wire, and what came after the last tick is in no record
@@ -147,14 +147,14 @@ def test_the_page_shows_what_the_vehicle_says(tmp_path: Path, capsys: pytest.Cap
     found = json.loads(capsys.readouterr().out)
     assert found["schema"] == "uavctl/log/report-tlog/1" and found["report"] == str(tmp_path / "a.html")
     assert [(text["severity"], text["text"]) for text in found["texts"]] == [("error", "<b>crash & burn</b>")]
-    seen = walk((tmp_path / "a.html").read_text(encoding="utf-8"))
+    seen = walk_html((tmp_path / "a.html").read_text(encoding="utf-8"))
     assert "<b>crash & burn</b>" in seen.text and "GUIDED" in seen.text
     assert run(["log", "info", str(path)]) == 0
     assert "HEARTBEAT of system 1" in capsys.readouterr().out
 
 
 def test_the_page_draws_what_there_is(flight: MavlinkFlight) -> None:
-    ids = set(walk(render_tlog_page(flight)).ids)
+    ids = set(walk_html(render_tlog_page(flight)).ids)
     axes = {f"{what}-{axis}" for what in ("position", "velocity") for axis in ("north", "east", "down")}
     assert {"path-above", "path-side", "age-0", *axes} <= ids
 

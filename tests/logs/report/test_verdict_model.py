@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from loopback_rig import lockstep
 from numpy.typing import NDArray
-from verdict_rig import as_modelled, room
+from verdict_rig import room, simulate_model
 
 from logs.recording.flight import FlightData
 from logs.report.innovations import FilterReplay, InnovationSamples, compute_innovations
@@ -103,7 +103,7 @@ def test_ellipsoids_are_counted_by_the_time_ahead() -> None:
 @pytest.mark.parametrize("seed", [1, 2])  # by chance one flight in fifty is refuted
 def test_a_flight_of_the_model_itself_passes(seed: int) -> None:
     config = room()
-    flight = as_modelled(config, 1200, seed=seed)
+    flight = simulate_model(config, 1200, seed=seed)
     verdict = judge_flight(flight).verdicts.model
     assert verdict is not None and not verdict.refuted
     assert [axis_verdict.count for axis_verdict in verdict.axes] == [len(flight.samples) - 6] * 3
@@ -112,7 +112,7 @@ def test_a_flight_of_the_model_itself_passes(seed: int) -> None:
 
 
 def test_gusts_of_twice_the_size_are_found() -> None:
-    verdict = judge_flight(as_modelled(room(), 600, seed=2, noise=lambda _, w: 2.0 * w)).verdicts.model
+    verdict = judge_flight(simulate_model(room(), 600, seed=2, noise=lambda _, w: 2.0 * w)).verdicts.model
     assert verdict is not None
     assert all(axis_verdict.variance_refuted and axis_verdict.variance > 2.0 for axis_verdict in verdict.axes)
     assert any(lead.refuted and lead.inside.rate < 0.9 for lead in verdict.leads)
@@ -126,7 +126,7 @@ def test_gusts_that_last_are_found() -> None:
         last = np.asarray(0.9 * last + np.sqrt(1.0 - 0.81) * w)
         return last
 
-    verdict = judge_flight(as_modelled(room(), 1200, seed=3, noise=lasting)).verdicts.model
+    verdict = judge_flight(simulate_model(room(), 1200, seed=3, noise=lasting)).verdicts.model
     assert verdict is not None
     assert all(axis_verdict.whiteness_refuted for axis_verdict in verdict.axes)
 
@@ -149,15 +149,15 @@ def test_the_filter_is_the_flights_own() -> None:
 
 def test_what_is_sent_acts_after_the_dead_time() -> None:
     config = load_config("room-hahn-stursberg", ("solver.method=exact", "plant.dead_time_s=0.2"))
-    right = judge_flight(as_modelled(config, 800, seed=1, dead_steps=1)).verdicts.model
-    wrong = judge_flight(as_modelled(config, 800, seed=1)).verdicts.model
+    right = judge_flight(simulate_model(config, 800, seed=1, dead_steps=1)).verdicts.model
+    wrong = judge_flight(simulate_model(config, 800, seed=1)).verdicts.model
     assert right is not None and not right.refuted
     assert wrong is not None and all(axis.has_larger_errors for axis in wrong.axes)
 
 
 def test_positions_while_others_fly_do_not_count() -> None:
     config = room()
-    whole = as_modelled(config, 200, seed=5)
+    whole = simulate_model(config, 200, seed=5)
     half_ns = 100 * whole.design.dt_ns
     handed = tuple(
         msgspec.structs.replace(decision, mode=ControlMode.STOPPED) if decision.at_ns >= half_ns else decision

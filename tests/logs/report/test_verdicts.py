@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from synthetic_flight import Item, fly
 from synthetic_scene import room
-from verdict_rig import as_modelled
 from verdict_rig import room as room_config
+from verdict_rig import simulate_model
 
 from logs.recording.flight import FlightData
 from logs.report.statistics import estimate_share
@@ -100,7 +100,7 @@ def link_config(**link: object) -> Config:
 
 
 def test_news_and_ages_by_hand() -> None:
-    found = as_modelled(room_config(), 400, seed=1)
+    found = simulate_model(room_config(), 400, seed=1)
     ages = [d.age_steps or 0 for d in found.steps.decisions]
     verdict = judge_link(found, room_config())
     assert (verdict.news.hits, verdict.news.trials) == (ages.count(0), 400)
@@ -114,13 +114,13 @@ def test_news_and_ages_by_hand() -> None:
 
 
 def test_a_link_worse_than_promised_is_found() -> None:
-    verdict = judge_link(as_modelled(room_config(), 600, seed=2, loss=0.5), room_config())
+    verdict = judge_link(simulate_model(room_config(), 600, seed=2, loss=0.5), room_config())
     assert verdict.refuted
     assert "fewer than promised" in verdict.text
 
 
 def test_bursts_are_found_where_losses_are_taken_for_independent() -> None:
-    found = as_modelled(room_config(), 600, seed=3, loss=0.0)
+    found = simulate_model(room_config(), 600, seed=3, loss=0.0)
     blocks = [0 if (step // 12) % 4 else step % 12 + 1 for step in range(600)]
     held = tuple(msgspec.structs.replace(d, age_steps=blocks[d.step]) for d in found.decisions)
     verdict = judge_link(dataclasses.replace(found, decisions=held), room_config())
@@ -131,7 +131,7 @@ def test_bursts_are_found_where_losses_are_taken_for_independent() -> None:
 
 
 def test_delays_against_those_configured() -> None:
-    found = as_modelled(room_config(), 100, seed=4)  # 40 ms, configured are 30 to 70
+    found = simulate_model(room_config(), 100, seed=4)  # 40 ms, configured are 30 to 70
     good = judge_link(found, room_config()).delay
     short = judge_link(found, link_config(delay_s=0.01, jitter_s=0.02)).delay
     assert good is not None and short is not None and good.late is not None and short.late is not None
@@ -143,7 +143,7 @@ def test_delays_against_those_configured() -> None:
 
 @pytest.mark.parametrize(("loss", "code", "said"), [(0.3, "link-bursts", 1), (0.3, "wind", 0), (0.5, "link-bursts", 0)])
 def test_a_warning_in_flight_that_the_verdict_does_not_share_is_explained(loss: float, code: str, said: int) -> None:
-    found = as_modelled(room_config(), 600, seed=2, loss=loss)
+    found = simulate_model(room_config(), 600, seed=2, loss=loss)
     event = Event(at_ns=0, severity=Severity.WARNING, code=code, text="")
     verdict = judge_link(dataclasses.replace(found, events=(event,)), room_config())
     assert verdict.refuted == (loss == 0.5)
@@ -248,7 +248,7 @@ def test_a_configuration_that_cannot_be_read_leaves_the_rest() -> None:
 
 
 def test_verdicts_survive_json() -> None:
-    verdicts = judge_flight(as_modelled(room_config(), 100, seed=6)).verdicts
+    verdicts = judge_flight(simulate_model(room_config(), 100, seed=6)).verdicts
     assert msgspec.json.decode(msgspec.json.encode(verdicts), type=Verdicts) == verdicts
 
 

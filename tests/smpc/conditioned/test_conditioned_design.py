@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from logs.recording.design_view import read_design
 from logs.recording.reader import header, read
 from logs.recording.recorder import SyncRecorder
-from uavctl.build.controller import build_conditioned, design_of, record_of, resting
+from uavctl.build.controller import build_conditioned, build_flight_design, compute_rest_limits, make_design_record
 from uavctl.cli.app import run as main
 from uavctl.config import dump_config, load_config
 from uavctl.config.types import ScheduleConfig, SmpcConfig
@@ -36,7 +36,7 @@ def _no_other_design(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("design.make_design", "design.design_record", "design.assembled", "exact.check_schedule"):
         monkeypatch.setattr(f"uavctl.smpc.hahn_stursberg.{name}", refuse)
     monkeypatch.setattr("uavctl.smpc.hahn_stursberg.exact.with_late", refuse)
-    monkeypatch.setattr("uavctl.build.controller.build_rests", refuse)
+    monkeypatch.setattr("uavctl.build.controller.build_rest_limits", refuse)
 
 
 def quick(folder: Path) -> str:
@@ -99,7 +99,7 @@ def test_a_link_that_no_horizon_bridges_is_refused_by_the_scheme_s_own_error(
 
 def test_the_name_is_of_what_the_answers_depend_on() -> None:
     def name(*overrides: str) -> str:
-        return design_of(load_config("room-hahn-stursberg", [SCHEME, *overrides])).design_id
+        return build_flight_design(load_config("room-hahn-stursberg", [SCHEME, *overrides])).design_id
 
     same = [
         "target.position_m=[0,0,-1]",
@@ -120,9 +120,9 @@ def test_the_name_is_of_what_the_answers_depend_on() -> None:
 def test_the_solver_that_says_where_to_rest_is_the_one_that_flies() -> None:
     config = load_config("room-hahn-stursberg", [SCHEME])
     design = build_conditioned(config)
-    assert resting(design) is design.rests
-    assert msgspec.json.decode(msgspec.json.encode(record_of(design)))["rests"] == design.rests.tolist()
-    exact = build_conditioned(config, flown=False, cov=np.zeros((9, 9)))
+    assert compute_rest_limits(design) is design.rests
+    assert msgspec.json.decode(msgspec.json.encode(make_design_record(design)))["rests"] == design.rests.tolist()
+    exact = build_conditioned(config, for_flight=False, cov=np.zeros((9, 9)))
     assert (exact.rests >= design.rests).all() and (exact.rests > design.rests).any()
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from cut_rig import NAME, Cuts
-from report_rig import unpaged
+from report_rig import omit_pages
 
 from uavctl.build.controller import Prepared
 from uavctl.cli.app import run
@@ -22,7 +22,7 @@ SMALL = ("--config", "paper", "--set", "solver.method=exact", "--set", "log={seg
 @pytest.fixture(scope="module")
 def cuts(tmp_path_factory: pytest.TempPathFactory) -> Cuts:
     folder = tmp_path_factory.mktemp("flown")
-    with unpaged():
+    with omit_pages():
         assert run(["loopback", *SMALL, "--duration", "4", "--out", str(folder), "--json"]) == 0
     return Cuts(folder / NAME)
 
@@ -44,7 +44,7 @@ def all_wrong(cuts: Cuts, places: list[tuple[int, int]]) -> dict[tuple[int, int]
     found = {}
     for place in places:
         with tempfile.TemporaryDirectory() as folder:
-            found[place] = cuts.wrong(Path(folder), *place)
+            found[place] = cuts.find_problem(Path(folder), *place)
     return {place: text for place, text in found.items() if text}
 
 
@@ -55,7 +55,7 @@ def thinned(cuts: Cuts) -> list[tuple[int, int]]:
         chunks = [one for one in cuts.chunks if one.file == file]
         within.append(range(chunks[0].indexed + 2, chunks[-1].end - 1))
     # 5 has no factor in common with 6, and is less: no chunk is left out.
-    return [(file, size) for i, (file, size) in enumerate(cuts.places()) if i % 5 == 0 or size not in within[file]]
+    return [(file, size) for i, (file, size) in enumerate(cuts.cut_points()) if i % 5 == 0 or size not in within[file]]
 
 
 @pytest.mark.slow
@@ -69,4 +69,4 @@ def test_cut_beside_the_end_of_every_chunk(cuts: Cuts) -> None:
 @pytest.mark.fault(52)
 @pytest.mark.parametrize("number", [6, pytest.param(20, marks=pytest.mark.slow)])
 def test_cut_anywhere(cuts: Cuts, number: int) -> None:
-    assert all_wrong(cuts, cuts.drawn(number, seed=1)) == {}
+    assert all_wrong(cuts, cuts.draw_cuts(number, seed=1)) == {}

@@ -11,14 +11,14 @@ import cvxpy as cp
 import numpy as np
 import pytest
 from design_rig import one_axis, paper_plant, spec
-from loopback_rig import Memory, flight, lockstep, make_loop
+from loopback_rig import MemorySink, flight, lockstep, make_loop
 from optimisation_cases import paper_spec
 from scipy.linalg import solve_discrete_lyapunov
 
 from logs.recording.replay import replay
 from uavctl.arrays import Array
 from uavctl.build.controller import build_conditioned, build_design, build_solver
-from uavctl.build.link import build_delayed_link, late_steps
+from uavctl.build.link import build_delayed_link, compute_late_steps
 from uavctl.config import Config, load_config
 from uavctl.errors import DesignError
 from uavctl.records import Decision, Plan, SolveStatus
@@ -208,7 +208,7 @@ def test_delays_of_a_step_and_more_ask_for_late_designs(
     overrides: list[str], steps: int, tail: list[float] | None
 ) -> None:
     config = load_config("room-hahn-stursberg", ["link.loss=0.1", *overrides])
-    assert late_steps(config) == steps
+    assert compute_late_steps(config) == steps
     link = build_delayed_link(config)
     if tail is None:
         assert link.outage(1) == pytest.approx(0.1)
@@ -311,12 +311,12 @@ LATE = ("link.delay_s=0.25", "link.loss=0.1", "clock.latency_s=0.25", "envelope.
 
 
 @pytest.fixture(scope="module")
-def late_flight() -> Memory:
+def late_flight() -> MemorySink:
     return lockstep("room-hahn-stursberg", 12.0, *LATE)
 
 
 @pytest.mark.slow
-def test_a_flight_on_late_positions_plans_with_their_age(late_flight: Memory) -> None:
+def test_a_flight_on_late_positions_plans_with_their_age(late_flight: MemorySink) -> None:
     config = load_config("room-hahn-stursberg", list(LATE))
     design = build_design(config)
     solver = ShortcutSolver(design)
@@ -336,7 +336,7 @@ def test_a_flight_on_late_positions_plans_with_their_age(late_flight: Memory) ->
 
 
 @pytest.mark.slow
-def test_a_flight_on_late_positions_keeps_its_limits(late_flight: Memory) -> None:
+def test_a_flight_on_late_positions_keeps_its_limits(late_flight: MemorySink) -> None:
     config = load_config("room-hahn-stursberg", list(LATE))
     lower, upper = np.array(config.sets.state_lower), np.array(config.sets.state_upper)
     data = flight(late_flight)
@@ -348,6 +348,6 @@ def test_a_flight_on_late_positions_keeps_its_limits(late_flight: Memory) -> Non
 
 
 @pytest.mark.slow
-def test_a_flight_on_late_positions_replays(late_flight: Memory) -> None:
+def test_a_flight_on_late_positions_replays(late_flight: MemorySink) -> None:
     config = load_config("room-hahn-stursberg", ["duration_s=12.0", *LATE])
     assert replay(late_flight.entries, lambda sink: make_loop(config, sink)).identical

@@ -259,7 +259,7 @@ def test_a_position_later_than_the_design_knows_fails() -> None:
 
 @pytest.mark.slow
 def test_late_positions_have_policies_of_their_own_that_agree_with_the_exact_program() -> None:
-    design = small(late=1)
+    design = small(late_steps=1)
     solver, exact = ShortcutSolver(design), ConicSolver(design)
     rng = np.random.default_rng(71)
     costs, methods = [], Counter[str]()

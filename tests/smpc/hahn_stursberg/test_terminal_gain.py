@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from design_rig import spec
 
-from uavctl.build.controller import start_state
+from uavctl.build.controller import make_start_state
 from uavctl.cli.app import run
 from uavctl.config import load
 from uavctl.lab.terminal_gain import compare_gains
@@ -60,8 +60,8 @@ def test_a_gain_that_no_design_can_be_made_with_is_replaced() -> None:
 def test_the_simulator_s_start() -> None:
     paper = load("paper")
     given = spec("paper")
-    np.testing.assert_array_equal(start_state(paper.config, given.plant), START)
-    room = start_state(
+    np.testing.assert_array_equal(make_start_state(paper.config, given.plant), START)
+    room = make_start_state(
         load("room-hahn-stursberg", ("sim.start_velocity_mps=[0.1, 0.2, 0.3]",)).config,
         spec("room-hahn-stursberg").plant,
     )

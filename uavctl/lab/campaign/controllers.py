@@ -25,8 +25,8 @@ from uavctl.build.controller import (
     build_plant,
     build_problem,
     build_solver,
-    needed,
-    start_state,
+    make_start_state,
+    require_value,
 )
 from uavctl.build.rest import check_axes
 from uavctl.config import Config
@@ -159,7 +159,7 @@ def get_start_state(spec: CampaignSpec, base: Config) -> Array:
     if spec.start_box:
         middle: Array = np.array(spec.start_box, dtype=np.float64).mean(axis=0)
         return middle
-    return start_state(base, build_plant(base))
+    return make_start_state(base, build_plant(base))
 
 
 def _draw_start_states(setting: CellSetting, first: int, runs: int) -> Array:
@@ -247,8 +247,10 @@ def build_from_recipe(recipe: Recipe) -> BatchController:
     if recipe.kind == "worst-case-delay":
         plant, allocation = problem.plant, config.risk.allocation
         kappa_x = kappa(config.smpc.delta_x, plant.n_x, len(problem.state_set.b), allocation)
-        kappa_u = kappa(needed(config.smpc.delta_u, "smpc.delta_u"), plant.n_u, len(problem.input_set.b), allocation)
-        return WorstCaseDelay(problem, needed(config.smpc.tau, "smpc.tau"), kappa_x, kappa_u)
+        kappa_u = kappa(
+            require_value(config.smpc.delta_u, "smpc.delta_u"), plant.n_u, len(problem.input_set.b), allocation
+        )
+        return WorstCaseDelay(problem, require_value(config.smpc.tau, "smpc.tau"), kappa_x, kappa_u)
     if recipe.kind == "pid" and recipe.gains is not None:
         return CascadedPid(problem, recipe.gains)
     return make_controller(recipe.kind, problem)
@@ -276,7 +278,7 @@ def _build_smpc(recipe: Recipe) -> BatchSmpc:
     config, design, plant = recipe.config, recipe.design, build_plant(recipe.config)
     brake_gain_1ps = config.fallback.brake_gain_1ps
     if config.is_age_conditioned:
-        conditioned, steps = build_conditioned(config, flown=False, cov=recipe.cov).solver, config.smpc.horizon
+        conditioned, steps = build_conditioned(config, for_flight=False, cov=recipe.cov).solver, config.smpc.horizon
         return BatchSmpc(
             ConditionedDecider(conditioned, conditioned.problem.target), plant, steps, steps, brake_gain_1ps
         )

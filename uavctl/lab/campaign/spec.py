@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from uavctl.build.outside import ACTS, controller_class, make
+from uavctl.build.outside import BATCH_METHODS, create_controller, load_controller_class
 from uavctl.config import Config, Source, dump_config, load, parse, presets
 from uavctl.config.checks import get_dimensions
 from uavctl.config.document import (
@@ -48,7 +48,7 @@ def check_kind(kind: str) -> None:
     Raises:
         DesignError: Nothing has that name, it cannot be imported, or it is no controller.
     """
-    controller_class(kind, KIND_KEY, (ACTS,), KINDS)
+    load_controller_class(kind, KIND_KEY, (BATCH_METHODS,), KINDS)
 
 
 def make_controller(kind: str, problem: ControlProblem) -> BatchController:
@@ -57,7 +57,8 @@ def make_controller(kind: str, problem: ControlProblem) -> BatchController:
     Raises:
         DesignError: There is none, or its class does not take the problem.
     """
-    return cast(BatchController, make(controller_class(kind, KIND_KEY, (ACTS,), KINDS), kind, KIND_KEY, problem))
+    controller_class = load_controller_class(kind, KIND_KEY, (BATCH_METHODS,), KINDS)
+    return cast(BatchController, create_controller(controller_class, kind, KIND_KEY, problem))
 
 
 TRUE_LINK = "true"  # a controller that believes in the link it flies on

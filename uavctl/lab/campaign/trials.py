@@ -17,7 +17,7 @@ from msgspec import Meta
 
 from logs.report.statistics import replace_infinite
 from uavctl import __version__
-from uavctl.build.controller import build_controller, design_of
+from uavctl.build.controller import build_controller, build_flight_design
 from uavctl.config import Config, dump_config, load, load_config, parse
 from uavctl.config.document import MAX_SEED, ConfigProblem, Section
 from uavctl.config.load import parse_toml
@@ -231,7 +231,7 @@ def _make_pilot(spec: TrialSpec, controller: TrialControllerSpec, autopilot: Aut
 
 def _make_design(config: Config) -> tuple[str | None, float | None, str]:
     try:
-        design = design_of(config)
+        design = build_flight_design(config)
         build_controller(config, design)
         return design.design_id, compute_usable_share(config, design), ""
     except DesignError as error:

@@ -14,7 +14,7 @@ import numpy as np
 
 from logs.report.run_statistics import clopper_pearson
 from uavctl.arrays import Array
-from uavctl.build.controller import build_problem, build_spec, needed
+from uavctl.build.controller import build_problem, build_spec, require_value
 from uavctl.lab.paper.runs import LIKELIHOOD, MAX_DRAWN, Flights, Setup, Totals, fly_runs, get_axis_planes
 from uavctl.smpc.baselines import Lqg, WorstCaseDelay
 from uavctl.smpc.hahn_stursberg.design import Design, kappa
@@ -347,7 +347,7 @@ def _format_percents(shares: Sequence[float]) -> str:
 def fly_worst_case(setup: Setup, seed: int, runs: int, steps: int) -> WorstCase:
     """Fly an MPC for a constant delay of τ, with the likelihoods of the constraints themselves."""
     design, smpc = setup.design, setup.config.smpc
-    tau, delta_u = design.terminal.tau, needed(smpc.delta_u, "smpc.delta_u")
+    tau, delta_u = design.terminal.tau, require_value(smpc.delta_u, "smpc.delta_u")
     controller = WorstCaseDelay(
         build_problem(setup.config),
         tau,
@@ -430,7 +430,7 @@ def assess(setup: Setup, note: str, flights: Flights, seed: int) -> VariantResul
         worst_case=fly_worst_case(setup, seed, first_runs, steps),
         claims=[],
     )
-    delta_u = needed(config.smpc.delta_u, "smpc.delta_u")
+    delta_u = require_value(config.smpc.delta_u, "smpc.delta_u")
     claims = make_claims(result, link.outage(1), design.horizon, config.smpc.delta_x, delta_u)
     return msgspec.structs.replace(result, claims=claims)
 

@@ -20,7 +20,7 @@ from scipy.ndimage import map_coordinates, spline_filter
 from scipy.special import roots_hermitenorm
 
 from uavctl.arrays import Array
-from uavctl.build.controller import build_design, build_spec, start_state
+from uavctl.build.controller import build_design, build_spec, make_start_state
 from uavctl.config import load
 from uavctl.errors import ConfigError, DesignError, UavctlError
 from uavctl.lab.bench.timing import TimedCase, compute_median, time_cases
@@ -202,7 +202,7 @@ def _try_design(tau: int, name: str, overrides: tuple[str, ...], on_step: Report
         schedule=name,
         delays=list(design.schedule.delays),
         gamma_h=float(design.schedule.gamma_x[-1]),
-        cost=optimal_cost(design, start_state(config, design.plant)),
+        cost=optimal_cost(design, make_start_state(config, design.plant)),
         refused="",
     )
 

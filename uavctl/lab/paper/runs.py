@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from logs.report.statistics import chi2_quantile
 from uavctl.arrays import Array
-from uavctl.build.controller import build_plant, build_problem, start_state
+from uavctl.build.controller import build_plant, build_problem, make_start_state
 from uavctl.config import Config
 from uavctl.errors import UavctlError
 from uavctl.lab.campaign.arrivals import compute_newest_captures
@@ -124,7 +124,7 @@ def fly_runs(
         q_u=problem.q_u,
         target=problem.target,
         u_target=problem.u_target,
-        start=np.tile(start_state(config, plant), (len(runs), 1)),
+        start=np.tile(make_start_state(config, plant), (len(runs), 1)),
     )
     disturbances = draws.normal @ np.linalg.cholesky(plant.w).T
     return simulate(
