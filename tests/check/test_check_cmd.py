@@ -265,7 +265,7 @@ def test_what_was_found_goes_into_the_recording() -> None:
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 def test_parameters_that_were_told_go_into_the_recording(autopilot: str, tmp_path: Path) -> None:
     bench, told = Bench(f"sim.autopilot={autopilot}"), ParameterReader()
-    bench.run(4.0, told=told)
+    bench.run(4.0, parameters=told)
     recorder = SyncRecorder(tmp_path / "flight.mcap")
     record_parameters(recorder, told, 7)
     recorder.close()

@@ -22,7 +22,7 @@ from flight_rig import (
 )
 from loopback_rig import MemorySink, flight, lockstep, make_loop
 from report_rig import omit_figures
-from told_numbers import find_numbers
+from text_numbers import find_numbers
 
 from logs.recording.replay import replay
 from logs.recording.summary import compute_box, compute_position_errors_m, list_summary_rows, summarise

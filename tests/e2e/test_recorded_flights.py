@@ -332,7 +332,7 @@ GOOD, NOTE, BAD = "good", "note", "bad"
 
 
 @pytest.mark.parametrize(
-    ("name", "get_flight_time_s", "seconds"),
+    ("name", "since_s", "seconds"),
     [
         (AT_REST, 0.0, 3.4),
         (WAYPOINTS, 10.0, 10.0),
@@ -385,7 +385,7 @@ def test_parameters_that_another_client_read_are_judged_as_that_flight_was_set_u
     assert items["vehicle clock"] == NOTE
 
 
-@pytest.mark.parametrize(("name", "get_flight_time_s"), [(GPS, 60.0), (OFFBOARD, 28.0)])
+@pytest.mark.parametrize(("name", "since_s"), [(GPS, 60.0), (OFFBOARD, 28.0)])
 def test_a_vehicle_that_flies_above_the_room_is_found_out_of_it(name: str, since_s: float) -> None:
     """Both took off to 5 m."""
     lower, _ = room_of(load_flight_config(name))
@@ -395,7 +395,7 @@ def test_a_vehicle_that_flies_above_the_room_is_found_out_of_it(name: str, since
     assert (items["armed"], items["landed"], items["position loss"]) == (NOTE, NOTE, GOOD)
 
 
-@pytest.mark.parametrize(("name", "get_flight_time_s"), [(VICON, 84.0), (WIND, 44.0)])
+@pytest.mark.parametrize(("name", "since_s"), [(VICON, 84.0), (WIND, 44.0)])
 def test_cameras_that_fall_silent_are_found_by_the_longest_gap(name: str, since_s: float) -> None:
     """VICON's for good, 86.4 s after the boot, WIND's for the 4 s that were ordered."""
     items = run_check(name, since_s, 8.0)
@@ -475,7 +475,7 @@ def _landed(memory: MemorySink) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "get_flight_time_s", "seconds", "matters", "on_the_page"),
+    ("name", "since_s", "seconds", "matters", "on_the_page"),
     [
         (WIND, 40.0, 12.0, _lost, "positions did not come back"),
         (PILOT, 10.0, 8.0, _pilot, "LOITER"),

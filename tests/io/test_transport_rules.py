@@ -178,7 +178,7 @@ def test_no_checksum_and_no_hash_is_taken_more_often_than_was_counted(
 
     real: Callable[..., bool] = framing._is_checksum_right
     monkeypatch.setattr(framing, "_is_checksum_right", fits)
-    monkeypatch.setattr("attacker.MANY", 3)
+    monkeypatch.setattr("attacker.MAX_FRAMES", 3)
     say = WORDS[kind]()
     for _ in range(3):
         data = say()

@@ -204,7 +204,7 @@ def test_a_recording_takes_the_place_of_the_first_flight(
 
 
 @pytest.mark.parametrize(
-    ("more", "console_text"),
+    ("more", "told"),
     [
         ((), "--flight"),
         ((BOX, "--flight", "f.mcap"), "--box"),
