@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 LONGEST = (
     "test_manual", "test_tune_cmd", "test_endings", "test_operation", "test_faults_truth", "test_take_off_failsafes",
     "test_tune_real", "test_closed_loop", "test_soak", "test_properties", "test_whatif_inertial", "test_conditioned",
-    "test_recorded_flights", "test_extending", "test_relay_outlives", "test_tune", "test_inertial_lies",
+    "test_recorded_flights", "test_extending", "test_relay_outlives", "test_tune", "test_inertial_faults",
     "test_campaign_cmd", "test_general_plants", "test_identify", "test_faults_storage", "test_bias", "test_python_docs",
     "test_inertial_errors", "test_late", "test_whatif", "test_fly", "test_report", "test_loopback", "test_cuts",
     "test_foreign_stream", "test_engagement", "test_check_cmd", "test_conic", "test_campaign_docs",

@@ -221,7 +221,7 @@ def test_simulated_runs_are_those_of_a_campaign(
 _MEASURED = ("/uavctl/header", "/uavctl/timing", "/plot/timing", "/uavctl/recorder")
 
 
-def recorded(path: Path) -> list[tuple[str, int, bytes]]:
+def read_messages(path: Path) -> list[tuple[str, int, bytes]]:
     """All messages by mcap's own reader, but what is measured with a clock, and when it was."""
     with path.open("rb") as file:
         results = [
@@ -240,7 +240,7 @@ def test_a_flight_records_the_bytes_that_the_command_line_records(
     assert run(["loopback", "--config", name, *arguments, "--seed", "3", "--duration", "3", "--json", *out]) == 0
     output = json.loads(capsys.readouterr().out)
     assert flight.recording.path == tmp_path / "python" / "flight.mcap"
-    ours, theirs = recorded(flight.recording.path), recorded(Path(output["recording"]))
+    ours, theirs = read_messages(flight.recording.path), read_messages(Path(output["recording"]))
     assert len(ours) > 100
     assert {topic for topic, _, _ in ours} >= {"/uavctl/decision", "/uavctl/step_input", "/uavctl/end"}
     assert ours == theirs
@@ -380,7 +380,7 @@ def test_a_flight_may_begin_on_the_ground_as_the_command_line_s_does(
     arguments = "loopback --set link.loss=0.3 --seed 3 --duration 18 --arm --takeoff 1.0 --goto 0.5,0,-1.1 --json --out"
     assert run([*arguments.split(), str(tmp_path / "typed")]) == 0
     output = json.loads(capsys.readouterr().out)
-    assert recorded(flight.recording.path) == recorded(Path(output["recording"]))
+    assert read_messages(flight.recording.path) == read_messages(Path(output["recording"]))
     heights_m = -flight.position_m[:, 2]
     assert heights_m[0] == 0.0 and heights_m.max() > 0.9 and heights_m[-1] < 0.05
     assert np.hypot(flight.position_m[:, 0] - 0.5, flight.position_m[:, 1]).min() < 0.1

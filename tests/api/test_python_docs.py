@@ -18,7 +18,7 @@ PAGES = ("docs/python.md", "README.md")
 NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
 
 
-def blocks(page: str) -> list[str]:
+def find_blocks(page: str) -> list[str]:
     """Python of a page, block by block."""
     return re.findall(r"^```python\n(.*?)^```", (ROOT / page).read_text(encoding="utf-8"), re.M | re.S)
 
@@ -28,21 +28,21 @@ def cells(path: Path) -> list[Any]:
     return [cell for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]
 
 
-def source(cell: Any) -> str:
+def read_source(cell: Any) -> str:
     """Python of a cell, without magic lines."""
     return "\n".join(line for line in cell.source.splitlines() if not line.startswith("%"))
 
 
-def printed(cell: Any) -> str:
+def get_printed_text(cell: Any) -> str:
     return "".join(output.text for output in cell.outputs if output.output_type == "stream" and output.name == "stdout")
 
 
-def kinds(cell: Any) -> set[str]:
+def find_output_kinds(cell: Any) -> set[str]:
     """Kinds of what a cell shows beside text."""
     return {kind for output in cell.outputs if output.output_type != "stream" for kind in output.get("data", {})}
 
 
-def public(code: str) -> list[str]:
+def find_public_names(code: str) -> list[str]:
     """Names of uavctl that code uses."""
     attributes = (node for node in ast.walk(ast.parse(code)) if isinstance(node, ast.Attribute))
     return [node.attr for node in attributes if isinstance(node.value, ast.Name) and node.value.id == "uavctl"]
@@ -50,14 +50,14 @@ def public(code: str) -> list[str]:
 
 @pytest.mark.parametrize("page", PAGES)
 def test_pages_name_only_what_is_there(page: str) -> None:
-    used = public("\n".join(blocks(page)))
+    used = find_public_names("\n".join(find_blocks(page)))
     assert len(used) >= 5
     assert set(used) <= set(uavctl.__all__)
 
 
 def test_the_front_page_takes_ten_lines_that_the_page_takes_too() -> None:
-    (front,) = blocks("README.md")
-    assert front == blocks("docs/python.md")[0]
+    (front,) = find_blocks("README.md")
+    assert front == find_blocks("docs/python.md")[0]
     assert len([line for line in front.splitlines() if line]) <= 10
 
 
@@ -72,7 +72,7 @@ def test_the_page_runs_as_written(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
-    for block in blocks("docs/python.md"):
+    for block in find_blocks("docs/python.md"):
         exec(compile(block, "docs/python.md", "exec"), names)
     ours, theirs = names["ours"], names["theirs"]
     assert isinstance(ours, uavctl.Runs) and isinstance(theirs, uavctl.Runs)
@@ -97,9 +97,9 @@ def test_a_notebook_is_whole_and_public(path: Path) -> None:
     assert [cell.execution_count for cell in result] == list(range(1, len(result) + 1))
     assert all(cell.outputs for cell in result)
     assert not [output for cell in result for output in cell.outputs if output.output_type == "error"]
-    assert any("image/png" in kinds(cell) for cell in result)
-    code = "\n".join(map(source, result))
-    assert set(public(code)) <= set(uavctl.__all__)
+    assert any("image/png" in find_output_kinds(cell) for cell in result)
+    code = "\n".join(map(read_source, result))
+    assert set(find_public_names(code)) <= set(uavctl.__all__)
     assert "_" not in {name[0] for name in re.findall(r"\.(\w+)", code)}
     text = path.read_text(encoding="utf-8")
     assert str(ROOT) not in text
@@ -123,5 +123,5 @@ def test_a_notebook_prints_what_it_printed(path: Path, tmp_path: Path, monkeypat
     book = nbformat.read(path, as_version=4)
     NotebookClient(book, timeout=600, resources={"metadata": {"path": str(tmp_path)}}).execute()
     after = [cell for cell in book.cells if cell.cell_type == "code"]
-    assert [printed(cell) for cell in after] == [printed(cell) for cell in before]
-    assert [kinds(cell) for cell in after] == [kinds(cell) for cell in before]
+    assert [get_printed_text(cell) for cell in after] == [get_printed_text(cell) for cell in before]
+    assert [find_output_kinds(cell) for cell in after] == [find_output_kinds(cell) for cell in before]

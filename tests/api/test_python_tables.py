@@ -24,7 +24,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     return uavctl.fly(config, tmp_path_factory.mktemp("flown"), seed=2, duration_s=3).recording
 
 
-def messages(path: Path, topic: str) -> list[tuple[float, bytes]]:
+def read_messages(path: Path, topic: str) -> list[tuple[float, bytes]]:
     """Times [s] since the first message of the file, and bytes, by mcap's own reader."""
     with path.open("rb") as file:
         results = [
@@ -34,41 +34,41 @@ def messages(path: Path, topic: str) -> list[tuple[float, bytes]]:
     return [((at_ns - begun) * 1e-9, data) for name, at_ns, data in results if name == topic]
 
 
-def cells(value: object, name: str) -> dict[str, object]:
+def flatten_cells(value: object, name: str) -> dict[str, object]:
     """A JSON value by the columns that docs/recordings.md says it has; lists of records are counted."""
     if isinstance(value, dict):
         return {
             key: cell
             for part, field_value in value.items()
-            for key, cell in cells(field_value, f"{name}.{part}").items()
+            for key, cell in flatten_cells(field_value, f"{name}.{part}").items()
         }
     if isinstance(value, list) and any(isinstance(entry, dict) for entry in value):
         return {name: len(value)}
     if isinstance(value, list):
         marks = "xyz" if name.endswith(("_m", "_mps", "_mps2", "_rad")) and len(value) == 3 else range(len(value))
         each = zip(marks, value, strict=True)
-        return {key: cell for mark, entry in each for key, cell in cells(entry, f"{name}_{mark}").items()}
+        return {key: cell for mark, entry in each for key, cell in flatten_cells(entry, f"{name}_{mark}").items()}
     return {name: value}
 
 
 NON_FINITE = {"NaN": float("nan"), "Infinity": float("inf"), "-Infinity": float("-inf")}
 
 
-def same(first: object, second: object) -> bool:
+def is_same(first: object, second: object) -> bool:
     second = NON_FINITE.get(second, second) if isinstance(first, float) and isinstance(second, str) else second
     return first == second or (first != first and second != second)
 
 
-def agree(rows: list[dict[str, Any]], records: list[tuple[float, bytes]]) -> int:
+def count_equal_cells(rows: list[dict[str, Any]], records: list[tuple[float, bytes]]) -> int:
     """Look at every cell; how many of them were compared."""
     assert len(rows) == len(records)
     compared = 0
     for row, (time_s, data) in zip(rows, records, strict=True):
         assert row["time_s"] == pytest.approx(time_s, abs=1e-9)
-        want = cells(json.loads(data), "")
+        want = flatten_cells(json.loads(data), "")
         for name, cell in want.items():
             if name.removeprefix(".") in row:
-                assert same(row[name.removeprefix(".")], cell), name
+                assert is_same(row[name.removeprefix(".")], cell), name
                 compared += 1
             else:  # an empty list, or null where others have a record
                 assert cell in (None, 0), name
@@ -82,13 +82,13 @@ TOPICS = ("/uavctl/decision", "/uavctl/estimate", "/uavctl/setpoint", "/sim/trut
 
 @pytest.mark.parametrize("topic", TOPICS)
 def test_tables_hold_what_mcap_reads(flown: Recording, topic: str) -> None:
-    records = messages(flown.path, topic)
+    records = read_messages(flown.path, topic)
     rows = flown.arrow(topic).to_pylist()
-    assert agree(rows, records) > 4 * len(records)
-    assert undated(flown.polars(topic).to_dicts()) == undated(rows)
+    assert count_equal_cells(rows, records) > 4 * len(records)
+    assert drop_dates(flown.polars(topic).to_dicts()) == drop_dates(rows)
 
 
-def undated(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def drop_dates(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Rows without the date, which Python holds to a microsecond only."""
     return [{name: cell for name, cell in row.items() if name != "utc"} for row in rows]
 
@@ -101,8 +101,8 @@ def test_pandas_holds_it_too_and_whole_numbers_stay_whole(flown: Recording, topi
     assert list(frame.columns) == table.column_names
     for name in table.column_names:
         want = table[name].to_pylist()
-        cells = [None if cell is pd.NA else cell for cell in frame[name].tolist()]  # type: ignore[attr-defined]
-        for wanted_cell, cell in zip(want, cells, strict=True):
+        flatten_cells = [None if cell is pd.NA else cell for cell in frame[name].tolist()]  # type: ignore[attr-defined]
+        for wanted_cell, cell in zip(want, flatten_cells, strict=True):
             assert (
                 wanted_cell == cell
                 or (wanted_cell is None and cell != cell)
@@ -114,7 +114,7 @@ def test_pandas_holds_it_too_and_whole_numbers_stay_whole(flown: Recording, topi
 
 def test_lists_within_are_tables(flown: Recording) -> None:
     records = [
-        sample for _, data in messages(flown.path, "/uavctl/step_input") for sample in json.loads(data)["samples"]
+        sample for _, data in read_messages(flown.path, "/uavctl/step_input") for sample in json.loads(data)["samples"]
     ]
     rows = flown.arrow("/uavctl/step_input.samples").to_pylist()
     assert [[row[f"position_m_{axis}"] for axis in "xyz"] for row in rows] == [
@@ -125,7 +125,7 @@ def test_lists_within_are_tables(flown: Recording) -> None:
 
 
 def test_raw_bytes_are_a_table(flown: Recording) -> None:
-    records = messages(flown.path, "/raw/vehicle/out")
+    records = read_messages(flown.path, "/raw/vehicle/out")
     rows = flown.arrow("/raw/vehicle/out").to_pylist()
     assert [row["data"] for row in rows] == [data for _, data in records]
     assert flown.polars("/raw/vehicle/out")["data"].to_list() == [data for _, data in records]
@@ -197,7 +197,7 @@ def test_simulate_without_pyarrow_names_its_extra(monkeypatch: pytest.MonkeyPatc
         uavctl.simulate("room")
 
 
-def head(started_ns: int, zero_utc_ns: int | None) -> Header:
+def make_header(started_ns: int, zero_utc_ns: int | None) -> Header:
     return Header(
         started_ns=started_ns, started_utc="", seed=1, command="", config_toml="", design_id="", design={},
         versions={}, cpu="", zero_utc_ns=zero_utc_ns,
@@ -211,7 +211,7 @@ BEGAN_NS = int(BEGAN.timestamp()) * 10**9 + 789_000_000
 def test_tables_have_the_time_of_day(tmp_path: Path) -> None:
     path = tmp_path / "real.mcap"
     recorder = SyncRecorder(path)
-    recorder.put("/uavctl/header", 5_000_000_000, head(5_000_000_000, BEGAN_NS - 5_000_000_000))
+    recorder.put("/uavctl/header", 5_000_000_000, make_header(5_000_000_000, BEGAN_NS - 5_000_000_000))
     for after_ms in (250, 1500):
         at_ns = 5_000_000_000 + after_ms * 1_000_000
         recorder.put("/uavctl/event", at_ns, Event(at_ns=at_ns, severity=Severity.INFO, code="a", text="b"))

@@ -37,20 +37,20 @@ LINKS = {
 }  # fmt: skip
 
 
-def config(*overrides: str) -> Config:
+def make_config(*overrides: str) -> Config:
     return load_config("paper", ["smpc.scheme=age-conditioned", "smpc.horizon=60", *overrides])
 
 
 @cache
-def chances() -> Array:
+def compute_chances() -> Array:
     return draw(17, 0, RUNS, STEPS, 1).link
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", LINKS)
 def test_ages_are_those_of_the_campaign_s_link(name: str) -> None:
-    given = config(*LINKS[name])
-    age = STEPS - 1 - compute_newest_captures(given.link, 1.0, chances())[:, -1]
+    given = make_config(*LINKS[name])
+    age = STEPS - 1 - compute_newest_captures(given.link, 1.0, compute_chances())[:, -1]
     model = build_ages(given)
     for steps in range(OLDEST):
         share, expected = float(np.mean(age >= steps)), model.outage(steps)
@@ -63,7 +63,7 @@ def test_ages_are_those_of_the_campaign_s_link(name: str) -> None:
 @pytest.mark.parametrize("loss", [0.3, 0.8])
 def test_a_channel_without_memory_has_the_ages_of_independent_losses(loss: float) -> None:
     chain = ["link.model=gilbert-elliott", f"link.loss={loss}", f"link.burst_loss={loss}", "link.burst_enter=0.3"]
-    first, second = (build_ages(config(*LATE, *given)) for given in (chain, [f"link.loss={loss}"]))
+    first, second = (build_ages(make_config(*LATE, *given)) for given in (chain, [f"link.loss={loss}"]))
     for steps in range(OLDEST):
         assert first.outage(steps) == pytest.approx(second.outage(steps), rel=1e-12)
 
@@ -71,7 +71,7 @@ def test_a_channel_without_memory_has_the_ages_of_independent_losses(loss: float
 def test_several_positions_of_a_step_come_one_after_the_other() -> None:
     """A chain without memory at 2 Hz, by hand: each position with the time that it has had."""
     chain = ["link.model=gilbert-elliott", "link.loss=0.4", "link.burst_loss=0.4", "link.burst_enter=0.3"]
-    model = build_ages(config(*chain, *LATE, "source.rate_hz=2"))
+    model = build_ages(make_config(*chain, *LATE, "source.rate_hz=2"))
     had_s = np.array([[0.0, 0.5], [1.0, 1.5], [2.0, 2.5]])
     gone = (0.4 + 0.6 * np.clip((2.5 - had_s) / 2.0, 0.0, 1.0)).prod(axis=1)
     assert [model.outage(steps) for steps in range(4)] == pytest.approx([1.0, *np.cumprod(gone)])
@@ -79,8 +79,8 @@ def test_several_positions_of_a_step_come_one_after_the_other() -> None:
 
 @pytest.mark.slow
 def test_losses_known_ahead_count_as_the_worst_of_them_in_every_step() -> None:
-    given = config("link.probability=[0.4, 0.9, 0.6]")
-    known = compute_newest_captures(given.link, 1.0, chances())
+    given = make_config("link.probability=[0.4, 0.9, 0.6]")
+    known = compute_newest_captures(given.link, 1.0, compute_chances())
     model = build_ages(given)
     for step in (1, 2, 5, 40):
         for steps in range(1, 6):
@@ -98,7 +98,7 @@ def test_losses_known_ahead_count_as_the_worst_of_them_in_every_step() -> None:
 )
 def test_what_cannot_be_counted_on_is_refused(overrides: list[str], key: str, message: str) -> None:
     with pytest.raises(DesignError, match=message) as caught:
-        build_ages(config(*overrides))
+        build_ages(make_config(*overrides))
     assert caught.value.key == key
 
 

@@ -115,7 +115,7 @@ def test_rounded_shares_are_taken_as_they_are_meant() -> None:
     assert build_link(config).outage(1) == pytest.approx(0.5)
 
 
-def arrivals(config: Config, packets: int, seed: int) -> NDArray[np.bool_]:
+def simulate_arrivals(config: Config, packets: int, seed: int) -> NDArray[np.bool_]:
     """Which packets the simulated channel lets through, one each second."""
     channel = Channel(config.link, np.random.SeedSequence(seed), 0, STEP_NS)
     for n in range(packets):
@@ -139,7 +139,7 @@ def arrivals(config: Config, packets: int, seed: int) -> NDArray[np.bool_]:
 def test_the_model_counts_on_what_the_simulated_channel_does(overrides: list[str], rate_hz: int) -> None:
     config = load_config("paper", [*overrides, f"source.rate_hz={rate_hz}"])
     link, packets = build_link(config), max(1, rate_hz)
-    steps = np.asarray(arrivals(config, 60_000, seed=3).reshape(-1, packets).any(axis=1), dtype=np.bool_)
+    steps = np.asarray(simulate_arrivals(config, 60_000, seed=3).reshape(-1, packets).any(axis=1), dtype=np.bool_)
     base = np.flatnonzero(steps[:-8])
     count = len(base)
     for lost in range(1, 6):
@@ -156,7 +156,7 @@ def test_the_model_counts_on_what_the_simulated_channel_does(overrides: list[str
 
 def test_the_simulated_channel_follows_the_probabilities_step_by_step() -> None:
     config = load_config("paper", ["link.probability=[0.0, 1.0, 0.25, 0.75]"])
-    through = np.mean([arrivals(config, 6, seed) for seed in range(2000)], axis=0)
+    through = np.mean([simulate_arrivals(config, 6, seed) for seed in range(2000)], axis=0)
     expected = np.array([0.0, 1.0, 0.25, 0.75, 0.75, 0.75])
     assert np.all(np.abs(through - expected) <= 5.0 * np.sqrt(expected * (1.0 - expected) / 2000))
 

@@ -45,7 +45,7 @@ class Half:
 
 
 @pytest.fixture
-def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+def module_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     """A module in the working directory, under a name that no other test has imported."""
     name = f"still_{tmp_path.name}"
     (tmp_path / f"{name}.py").write_text(MODULE)
@@ -54,13 +54,13 @@ def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     return name
 
 
-def test_a_class_of_the_working_directory_is_found(module: str) -> None:
-    check_kind(f"{module}:Still")
-    assert type(make_controller(f"{module}:Still", problem("paper"))).__name__ == "Still"
+def test_a_class_of_the_working_directory_is_found(module_name: str) -> None:
+    check_kind(f"{module_name}:Still")
+    assert type(make_controller(f"{module_name}:Still", problem("paper"))).__name__ == "Still"
 
 
-def test_an_entry_point_has_a_short_name(module: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    point = EntryPoint("still", f"{module}:Still", outside.ENTRY_POINT_GROUP)
+def test_an_entry_point_has_a_short_name(module_name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    point = EntryPoint("still", f"{module_name}:Still", outside.ENTRY_POINT_GROUP)
     monkeypatch.setattr(outside, "entry_points", lambda group: (point,) if group == outside.ENTRY_POINT_GROUP else ())
     assert outside.list_installed() == ("still",)
     check_kind("still")
@@ -73,56 +73,58 @@ def test_an_entry_point_has_a_short_name(module: str, monkeypatch: pytest.Monkey
     ("name", "message"),
     [("Nothing", "AttributeError"), ("Half", "no act"), ("Resting", "no begin"), ("Broken", "no gain")],
 )
-def test_what_a_campaign_cannot_ask_is_refused_with_the_reason(module: str, name: str, message: str) -> None:
+def test_what_a_campaign_cannot_ask_is_refused_with_the_reason(module_name: str, name: str, message: str) -> None:
     with pytest.raises(DesignError, match=message) as caught:
-        make_controller(f"{module}:{name}", problem("paper"))
+        make_controller(f"{module_name}:{name}", problem("paper"))
     assert caught.value.key == "kind"
 
 
 @pytest.mark.parametrize(
     ("name", "message"), [("Nothing", "AttributeError"), ("Half", "plan or with begin and act"), ("Broken", "no gain")]
 )
-def test_what_cannot_fly_is_refused_with_the_reason(module: str, name: str, message: str) -> None:
-    config = load_config("room", [f"smpc.controller={module}:{name}"])
+def test_what_cannot_fly_is_refused_with_the_reason(module_name: str, name: str, message: str) -> None:
+    config = load_config("room", [f"smpc.controller={module_name}:{name}"])
     with pytest.raises(DesignError, match=message) as caught:
         outside.build_outside_solver(config, build_problem(config))
     assert caught.value.key == "smpc.controller"
 
 
-def test_a_module_that_is_not_there(module: str) -> None:
+def test_a_module_that_is_not_there(module_name: str) -> None:
     with pytest.raises(DesignError, match="ModuleNotFoundError"):
-        check_kind(f"{module}_not:Still")
+        check_kind(f"{module_name}_not:Still")
 
 
-def test_only_planners_get_a_trajectory(module: str) -> None:
+def test_only_planners_get_a_trajectory(module_name: str) -> None:
     motion = "mission.trajectory={times_s=[0.0, 9.0], positions_m=[[0.0, 0.0, -1.0], [1.0, 0.0, -1.0]]}"
     with pytest.raises(DesignError, match="told no trajectory"):
-        build_controller(load_config("room", [motion, f"smpc.controller={module}:Still"]))
-    assert build_controller(load_config("room", [motion, f"smpc.controller={module}:Resting"])).mission.trajectory
+        build_controller(load_config("room", [motion, f"smpc.controller={module_name}:Still"]))
+    assert build_controller(load_config("room", [motion, f"smpc.controller={module_name}:Resting"])).mission.trajectory
 
 
 @pytest.mark.parametrize(
     ("name", "preset"), [("Still", "room"), ("Resting", "room"), ("Resting", "room-hahn-stursberg")]
 )
-def test_it_takes_the_place_of_either_scheme_and_keeps_its_design(module: str, name: str, preset: str) -> None:
-    config = load_config(preset, [f"smpc.controller={module}:{name}"])
+def test_it_takes_the_place_of_either_scheme_and_keeps_its_design(module_name: str, name: str, preset: str) -> None:
+    config = load_config(preset, [f"smpc.controller={module_name}:{name}"])
     design = build_flight_design(config)
     controller = build_controller(config, design)
     target = design.target
     answer = controller.solver.solve(0, target, target)
-    assert answer.status is SolveStatus.OPTIMAL and answer.method == f"{module}:{name}"
+    assert answer.status is SolveStatus.OPTIMAL and answer.method == f"{module_name}:{name}"
     np.testing.assert_allclose(answer.states, np.tile(target, (design.horizon + 1, 1)), atol=1e-12)
     assert controller.late_steps == design.horizon and controller.design_id == design.design_id
 
 
 def test_its_identity_changes_with_its_code_and_with_nothing_else(
-    module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    module_name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    first = outside.compute_controller_id(f"{module}:Resting")
-    assert first.startswith(f"{module}:Resting ") and first == outside.compute_controller_id(f"{module}:Resting")
-    (tmp_path / f"{module}.py").write_text(MODULE + "\n")
-    assert outside.compute_controller_id(f"{module}:Resting") != first
-    package = tmp_path / f"{module}_package"
+    first = outside.compute_controller_id(f"{module_name}:Resting")
+    assert first.startswith(f"{module_name}:Resting ") and first == outside.compute_controller_id(
+        f"{module_name}:Resting"
+    )
+    (tmp_path / f"{module_name}.py").write_text(MODULE + "\n")
+    assert outside.compute_controller_id(f"{module_name}:Resting") != first
+    package = tmp_path / f"{module_name}_package"
     package.mkdir()
     (package / "__init__.py").write_text("")
     (package / "inner.py").write_text(MODULE)

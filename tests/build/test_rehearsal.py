@@ -19,19 +19,19 @@ LONG = (*BURSTS, "link.burst_enter=0.05", "link.burst_leave=0.1")  # a burst las
 SHORT = (*BURSTS, "link.burst_enter=0.05", "link.burst_leave=0.5")
 
 
-def rehearsed(config: Config) -> RehearsalResult:
+def rehearse_preset(config: Config) -> RehearsalResult:
     design = build_conditioned(config)
     return rehearse(config, design, build_controller(config, design))
 
 
-def flown(config: Config) -> float:
+def fly_relaxed_share(config: Config) -> float:
     """Share of the plans of a simulated flight that relaxed a constraint."""
     tally = FlightCounts()
     World(config, ControlLoop(config, build_controller(config), tally, lambda: 0)).run(config.duration_s)
     return tally.gave_way / tally.plans
 
 
-def along_eight(preset: str, *overrides: str) -> Config:
+def make_eight(preset: str, *overrides: str) -> Config:
     config = load_config(preset, overrides)
     replace = msgspec.structs.replace
     return replace(config, mission=replace(config.mission, trajectory=make_figure_eight()))
@@ -39,17 +39,17 @@ def along_eight(preset: str, *overrides: str) -> Config:
 
 def test_long_bursts_relax_most_plans_in_rehearsal_and_flight() -> None:
     config = load_config("room", (*LONG, "duration_s=12"))
-    result = rehearsed(config)
+    result = rehearse_preset(config)
     assert result.relaxes
     assert result.constraint.endswith("velocity")
-    assert result.relaxed == pytest.approx(flown(config), abs=0.15)
+    assert result.relaxed == pytest.approx(fly_relaxed_share(config), abs=0.15)
     assert result.relaxed > 0.5
 
 
 @pytest.mark.parametrize("preset", ["room", "room-px4", "room-ardupilot"])
 @pytest.mark.parametrize("link", [(), SHORT])
 def test_presets_and_short_bursts_pass(preset: str, link: tuple[str, ...]) -> None:
-    result = rehearsed(load_config(preset, link))
+    result = rehearse_preset(load_config(preset, link))
     assert not result.relaxes
     assert not result.sentences
     assert not result.hint
@@ -57,7 +57,7 @@ def test_presets_and_short_bursts_pass(preset: str, link: tuple[str, ...]) -> No
 
 def test_an_eight_that_the_inputs_do_not_allow_strays_by_its_figure() -> None:
     wide, narrow = (
-        rehearsed(along_eight("room-px4", f"sets.input_lower=[-{m},-{m},-1.5]", f"sets.input_upper=[{m},{m},1.5]"))
+        rehearse_preset(make_eight("room-px4", f"sets.input_lower=[-{m},-{m},-1.5]", f"sets.input_upper=[{m},{m},1.5]"))
         for m in (4.0, 1.0)
     )
     assert not wide.strays
@@ -72,7 +72,7 @@ def test_an_eight_that_the_inputs_do_not_allow_strays_by_its_figure() -> None:
 WIDE = ("sets.input_lower=[-4,-4,-1.5]", "sets.input_upper=[4,4,1.5]", "limits.accel_mps2=[4,4,1.5]")
 
 
-def eight_flown_m(config: Config, drag_1ps: float) -> float:
+def fly_eight_error_m(config: Config, drag_1ps: float) -> float:
     """Mean distance from the figure of eight in the linear simulator, with a vehicle of that drag."""
     replace = msgspec.structs.replace
     assert config.mission.trajectory is not None
@@ -92,16 +92,16 @@ def eight_flown_m(config: Config, drag_1ps: float) -> float:
 
 
 def test_the_cost_of_an_unidentified_drag_is_rehearsed_and_flown() -> None:
-    result = rehearsed(along_eight("room-px4", *WIDE))
+    result = rehearse_preset(make_eight("room-px4", *WIDE))
     assert result.large_drag_m is not None and result.tracking_m is not None
     assert result.depends_on_drag
     assert result.large_drag_m > 5.0 * result.tracking_m
-    flown_m = eight_flown_m(along_eight("room-px4", *WIDE, "sim.plant=linear"), LARGE_DRAG_1PS)
+    flown_m = fly_eight_error_m(make_eight("room-px4", *WIDE, "sim.plant=linear"), LARGE_DRAG_1PS)
     assert result.large_drag_m == pytest.approx(flown_m, rel=0.25)  # a flight has losses, noise and a bias, too
 
 
 def test_an_identified_large_drag_needs_no_second_figure() -> None:
-    result = rehearsed(along_eight("room-px4", *WIDE, f"plant.drag_1ps={[LARGE_DRAG_1PS] * 3}"))
+    result = rehearse_preset(make_eight("room-px4", *WIDE, f"plant.drag_1ps={[LARGE_DRAG_1PS] * 3}"))
     assert result.large_drag_m is None
     assert not result.depends_on_drag
     assert not result.sentences

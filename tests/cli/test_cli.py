@@ -23,20 +23,20 @@ PRESET = ROOT / "uavctl" / "presets" / "paper.toml"
 STATE = "35,-2,-20,-4"
 
 
-def typed(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
+def run_command(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
     code = run(arguments)
     output = capsys.readouterr()
     return code, output.out, output.err
 
 
-def document(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]:
-    code, out, _ = typed(capsys, *arguments, "--json")
+def run_document(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]:
+    code, out, _ = run_command(capsys, *arguments, "--json")
     assert code == 0
     assert out.count("\n") == 1  # one document, on a line of its own
-    document: dict[str, Any] = json.loads(out)
-    name = re.fullmatch(r"uavctl/([a-z/-]+)/[1-9][0-9]*", document.pop("schema"))
+    run_document: dict[str, Any] = json.loads(out)
+    name = re.fullmatch(r"uavctl/([a-z/-]+)/[1-9][0-9]*", run_document.pop("schema"))
     assert name is not None and name[1] == arguments[0]
-    return document
+    return run_document
 
 
 @pytest.mark.parametrize(
@@ -52,12 +52,12 @@ def document(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, A
 def test_an_error_is_a_document_too(
     capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], kind: str, code: int, message: str
 ) -> None:
-    without, _, _ = typed(capsys, *arguments)
-    ended, out, err = typed(capsys, *arguments, "--json")
-    document = json.loads(out)
+    without, _, _ = run_command(capsys, *arguments)
+    ended, out, err = run_command(capsys, *arguments, "--json")
+    run_document = json.loads(out)
     assert (ended, without) == (code, code) and out.count("\n") == 1
-    assert message in document.pop("message") and message in err
-    assert document == {"schema": "uavctl/error/1", "type": kind, "exit_code": code}
+    assert message in run_document.pop("message") and message in err
+    assert run_document == {"schema": "uavctl/error/1", "type": kind, "exit_code": code}
 
 
 def test_every_command_names_its_document() -> None:
@@ -70,7 +70,7 @@ def test_every_command_names_its_document() -> None:
 
 
 def test_solve_gives_the_paper_s_cost(capsys: pytest.CaptureFixture[str]) -> None:
-    answer = document(capsys, "solve", "--config", "paper", "--state", STATE)
+    answer = run_document(capsys, "solve", "--config", "paper", "--state", STATE)
     assert {
         "status", "cost", "cost_lower", "gap", "inputs", "states", "backoff_x", "backoff_u", "slack", "method",
         "solve_us",
@@ -84,30 +84,30 @@ def test_solve_gives_the_paper_s_cost(capsys: pytest.CaptureFixture[str]) -> Non
 
 
 def test_solve_shows_people_a_table(capsys: pytest.CaptureFixture[str]) -> None:
-    code, out, _ = typed(capsys, "solve", "--config", "paper", "--method", "exact", "--state", STATE)
+    code, out, _ = run_command(capsys, "solve", "--config", "paper", "--method", "exact", "--state", STATE)
     assert code == 0
     assert "method exact: optimal" in out and "61669.93" in out and "gap" in out and "v_e" in out
 
 
 def test_solve_names_relaxed_constraints(capsys: pytest.CaptureFixture[str]) -> None:
     outside = "49,-2,-20,-14"
-    answer = document(capsys, "solve", "--config", "paper", "--state", outside)
+    answer = run_document(capsys, "solve", "--config", "paper", "--state", outside)
     assert answer["method"] == "exact" and answer["slack"] > 10
     assert {"constraint", "stage", "index", "amount"} == answer["gave_way"][0].keys()
-    code, out, _ = typed(capsys, "solve", "--config", "paper", "--state", outside)
+    code, out, _ = run_command(capsys, "solve", "--config", "paper", "--state", outside)
     assert code == 0
     assert "lower limit of east position" in out and "gave way" in out
 
 
 @pytest.mark.parametrize("state", ["1,2", "1,2,3,x", "1,2,3,nan", ""])
 def test_a_state_that_is_none_is_refused(capsys: pytest.CaptureFixture[str], state: str) -> None:
-    code, out, err = typed(capsys, "solve", "--config", "paper", f"--state={state}")
+    code, out, err = run_command(capsys, "solve", "--config", "paper", f"--state={state}")
     assert (code, out) == (2, "")
     assert "give 4 numbers" in err
 
 
 def test_design_shows_assumption_4_with_figures(capsys: pytest.CaptureFixture[str]) -> None:
-    result = document(capsys, "design", "--config", "paper")
+    result = run_document(capsys, "design", "--config", "paper")
     assert {
         "tau", "delays", "alpha", "gamma_x", "gamma_u", "spectral_radius", "assumptions", "design_id",
         "wall_s",
@@ -117,7 +117,7 @@ def test_design_shows_assumption_4_with_figures(capsys: pytest.CaptureFixture[st
     assert [check["item"] for check in result["assumptions"]] == ["4.1", "4.2", "4.3", "4.4", "4.5"]
     assert all(check["ok"] and {"value", "limit"} <= check.keys() for check in result["assumptions"])
     assert result["assumptions"][0]["value"] == pytest.approx(1 - 0.3**5)
-    code, out, _ = typed(capsys, "design", "--config", "paper")
+    code, out, _ = run_command(capsys, "design", "--config", "paper")
     assert code == 0
     assert "Assumption 4" in out and "0.9976" in out
 
@@ -146,7 +146,7 @@ def test_a_wrong_configuration_is_refused(capsys: pytest.CaptureFixture[str], tm
     assert text.count(old) == 1
     file = tmp_path / "mine.toml"
     file.write_text(text.replace(old, new), encoding="utf-8")
-    code, out, err = typed(capsys, "design", "--config", str(file), "--json")
+    code, out, err = run_command(capsys, "design", "--config", str(file), "--json")
     assert (code, json.loads(out)["type"]) == (2, "ConfigError")
     name = key.partition(".")[2]
     lines = enumerate(file.read_text(encoding="utf-8").splitlines(), 1)
@@ -158,13 +158,13 @@ def test_a_wrong_configuration_is_refused(capsys: pytest.CaptureFixture[str], tm
 
 
 def test_overrides_repeat_and_their_errors_name_them(capsys: pytest.CaptureFixture[str]) -> None:
-    result = document(
+    result = run_document(
         capsys, "design", "--config", "paper", "--set", "smpc.tau=3", "--set", "schedule.delays=4",
         "--set", "smpc.delta_x=0.9", "--set", "sets.state_lower=[-90, -20, -90, -20]",
         "--set", "sets.state_upper=[90, 20, 90, 20]", "--set", "solver.method=exact",
     )  # fmt: skip
     assert (result["tau"], result["delays"]) == (3, [4] * 12)
-    code, out, err = typed(capsys, "design", "--set", "link.los=0.3", "--set", "smpc.tau=0")
+    code, out, err = run_command(capsys, "design", "--set", "link.los=0.3", "--set", "smpc.tau=0")
     assert (code, out) == (2, "")
     assert "--set link.los=0.3: link.los: unknown key" in err
     assert "--set smpc.tau=0: smpc.tau: " in err and ">= 1, got 0" in err
@@ -174,13 +174,13 @@ def test_overrides_repeat_and_their_errors_name_them(capsys: pytest.CaptureFixtu
     "arguments", [("desgn",), ("solve",), ("design", "--confg", "paper"), ("solve", "--method", "x")]
 )
 def test_usage_errors_exit_with_2(capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...]) -> None:
-    code, out, err = typed(capsys, *arguments)
+    code, out, err = run_command(capsys, *arguments)
     assert (code, out) == (2, "")
     assert err
 
 
 def test_help_lists_commands_and_exit_codes(capsys: pytest.CaptureFixture[str]) -> None:
-    code, out, _ = typed(capsys, "--help")
+    code, out, _ = run_command(capsys, "--help")
     assert code == 0
     assert re.search(r"Exit codes: 0 \w.*; 1 .*; 2 .* configuration", " ".join(out.split()))
     for name in ("loopback", "fly", "sim", "design", "solve", "bench", "log"):

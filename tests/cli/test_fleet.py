@@ -36,7 +36,9 @@ SPACING_M = 0.5
 WEST, EAST = (-2.5, -0.4), (0.4, 2.5)  # the vehicles' limits, east
 
 
-def entry(name: str, east_m: tuple[float, float], link: str, mocap: str = "udpin://127.0.0.1:0", *more: str) -> str:
+def make_entry(
+    name: str, east_m: tuple[float, float], link: str, mocap: str = "udpin://127.0.0.1:0", *more: str
+) -> str:
     """A vehicle's table."""
     low, high = east_m
     settings = [
@@ -56,16 +58,16 @@ HEAD = f"spacing_m = {SPACING_M}\n"
 
 
 @pytest.fixture
-def file(tmp_path: Path) -> Path:
+def fleet_file(tmp_path: Path) -> Path:
     path = tmp_path / "fleet.toml"
-    path.write_text(HEAD + entry("west", WEST, A) + entry("east", EAST, B))
+    path.write_text(HEAD + make_entry("west", WEST, A) + make_entry("east", EAST, B))
     return path
 
 
-def test_a_valid_fleet_is_reported_with_its_nearest_boxes(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["fleet", "check", str(file), "--json"]) == 0
+def test_a_valid_fleet_is_reported_with_its_nearest_boxes(fleet_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["fleet", "check", str(fleet_file), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
-    assert [entry["name"] for entry in document["vehicles"]] == ["west", "east"]
+    assert [make_entry["name"] for make_entry in document["vehicles"]] == ["west", "east"]
     assert document["nearest_m"] == pytest.approx(EAST[0] - WEST[1])
 
 
@@ -79,16 +81,16 @@ def test_the_example_is_that_of_the_page_and_can_be_flown(capsys: pytest.Capture
 @pytest.mark.parametrize(
     ("text", "expected_texts"),
     [
-        (HEAD + entry("a", WEST, A) + entry("b", (-0.2, 2.5), B), ("a and b", "0.20 m apart", "spacing_m")),
-        (HEAD + entry("a", WEST, A) + entry("b", (-1.0, 2.5), B), ("overlap by 0.60 m",)),
-        (HEAD + entry("a", WEST, A) + entry("a", EAST, B), ("two vehicles are named a",)),
-        (HEAD + entry("a", WEST, A) + entry("b", EAST, A), ("one link", A)),
+        (HEAD + make_entry("a", WEST, A) + make_entry("b", (-0.2, 2.5), B), ("a and b", "0.20 m apart", "spacing_m")),
+        (HEAD + make_entry("a", WEST, A) + make_entry("b", (-1.0, 2.5), B), ("overlap by 0.60 m",)),
+        (HEAD + make_entry("a", WEST, A) + make_entry("a", EAST, B), ("two vehicles are named a",)),
+        (HEAD + make_entry("a", WEST, A) + make_entry("b", EAST, A), ("one link", A)),
         (HEAD, ("vehicle",)),
-        (entry("a", WEST, A), ("spacing_m",)),
-        ("spacing_m = 0\n" + entry("a", WEST, A), ("spacing_m",)),
-        (HEAD + entry("a", WEST, A) + "wings = 2\n", ("wings",)),
-        (HEAD + entry("a b", WEST, A), ("name",)),
-        (HEAD + entry("a", WEST, A, "", "link.loss=2"), ("a", "link.loss")),
+        (make_entry("a", WEST, A), ("spacing_m",)),
+        ("spacing_m = 0\n" + make_entry("a", WEST, A), ("spacing_m",)),
+        (HEAD + make_entry("a", WEST, A) + "wings = 2\n", ("wings",)),
+        (HEAD + make_entry("a b", WEST, A), ("name",)),
+        (HEAD + make_entry("a", WEST, A, "", "link.loss=2"), ("a", "link.loss")),
         (HEAD + '[[vehicle]]\nname = "a"\nconfig = "rom"\n', ("rom",)),
         ("spacing_m = \n", ("fleet.toml:1",)),
     ],
@@ -113,10 +115,10 @@ def test_a_missing_file_is_reported(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert not (tmp_path / "out").exists()
 
 
-def test_without_daemons_status_and_land_fail(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["fleet", "status", str(file), "--json"]) == 1
+def test_without_daemons_status_and_land_fail(fleet_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["fleet", "status", str(fleet_file), "--json"]) == 1
     assert json.loads(capsys.readouterr().out)["vehicles"] == {"west": None, "east": None}
-    assert run(["fleet", "land", str(file)]) == 1
+    assert run(["fleet", "land", str(fleet_file)]) == 1
     output = capsys.readouterr().err
     assert "west: land not reached" in output and "east: land not reached" in output
 
@@ -125,7 +127,7 @@ INTERVAL = st.tuples(st.floats(-5, 5), st.floats(0.01, 3)).map(lambda one: (one[
 BASE = load_config("room-px4")
 
 
-def member(north: tuple[float, float], east: tuple[float, float]) -> Member:
+def make_member(north: tuple[float, float], east: tuple[float, float]) -> Member:
     lower, upper = list(BASE.sets.state_lower), list(BASE.sets.state_upper)
     (lower[0], upper[0]), (lower[3], upper[3]) = north, east
     sets = replace(BASE.sets, state_lower=tuple(lower), state_upper=tuple(upper))
@@ -140,7 +142,7 @@ def test_positions_in_two_boxes_are_as_far_apart_as_the_reported_gap(
     other_east: tuple[float, float],
 ) -> None:
     """By the corners, and where boxes overlap along an axis by a place that both have there."""
-    apart_m = compute_gap_m(member(north, east), member(other_north, other_east))
+    apart_m = compute_gap_m(make_member(north, east), make_member(other_north, other_east))
     nearest = [
         min((abs(a - b) for a, b in product(state, other_state)), default=0.0)
         if state[1] < other_state[0] or other_state[1] < state[0]
@@ -151,7 +153,7 @@ def test_positions_in_two_boxes_are_as_far_apart_as_the_reported_gap(
 
 
 @contextmanager
-def flying() -> Iterator[tuple[Path, dict[str, list[Truth]], subprocess.Popen[str]]]:
+def fly_fleet() -> Iterator[tuple[Path, dict[str, list[Truth]], subprocess.Popen[str]]]:
     """Two simulated vehicles in the air, flown by `uavctl fleet fly`; with their true places."""
     truths: dict[str, list[Truth]] = {"west": [], "east": []}
     done, seats, tables = threading.Event(), [], []
@@ -162,7 +164,7 @@ def flying() -> Iterator[tuple[Path, dict[str, list[Truth]], subprocess.Popen[st
         start = f"sim.start_position_m=[0,{sum(limits) / 2},-1]"
         config = load_config("room-px4", [PATIENT_VEHICLE, start, f"sim.system_id={number + 1}"])
         seats.append(VehicleSetup(config, f"udpout://{vehicle}", f"udpout://{mocap}", truths[name].append))
-        tables.append(entry(name, limits, f"udpin://{vehicle}", f"udpin://{mocap}", *PATIENT_DAEMON))
+        tables.append(make_entry(name, limits, f"udpin://{vehicle}", f"udpin://{mocap}", *PATIENT_DAEMON))
     peers = threading.Thread(
         target=serve_all,
         args=(seats,),
@@ -179,10 +181,14 @@ def flying() -> Iterator[tuple[Path, dict[str, list[Truth]], subprocess.Popen[st
             )
             with wait_for_end(fleet):
                 # Nobody would fly them while the daemons begin.
-                wait_until(lambda: all(health["pid"] for health in status(path)), "both daemons listen", pause_s=0.5)
+                wait_until(
+                    lambda: all(health["pid"] for health in read_status(path)), "both daemons listen", pause_s=0.5
+                )
                 peers.start()
                 wait_until(
-                    lambda: all(health["mode"] == "track" for health in status(path)), "both are flown", pause_s=0.5
+                    lambda: all(health["mode"] == "track" for health in read_status(path)),
+                    "both are flown",
+                    pause_s=0.5,
                 )
                 yield path, truths, fleet
         finally:
@@ -191,7 +197,7 @@ def flying() -> Iterator[tuple[Path, dict[str, list[Truth]], subprocess.Popen[st
                 peers.join()
 
 
-def status(path: Path) -> list[dict[str, Any]]:
+def read_status(path: Path) -> list[dict[str, Any]]:
     results = []
     for fleet_member in read_fleet(path).members:
         try:
@@ -206,14 +212,14 @@ def status(path: Path) -> list[dict[str, Any]]:
 @pytest.mark.fault(70)
 @pytest.mark.parametrize("how", ["ctrl-c", "order", "a daemon is killed", "the fleet is killed"])
 def test_all_land_together_and_have_never_been_near_each_other(how: str) -> None:
-    with flying() as (path, truths, fleet):
+    with fly_fleet() as (path, truths, fleet):
         lands = set(truths)
         if how == "ctrl-c":
             fleet.send_signal(signal.SIGINT)
         elif how == "order":
             assert run(["fleet", "land", str(path), "--control", str(path.parent / "c")]) == 0
         elif how == "a daemon is killed":
-            os.kill(status(path)[0]["pid"], signal.SIGKILL)
+            os.kill(read_status(path)[0]["pid"], signal.SIGKILL)
             lands = {"east"}
         else:
             fleet.kill()
@@ -233,7 +239,7 @@ def test_a_daemon_that_refuses_to_arm_ends_with_its_own_exit_code(
     short = tmp_path_factory.mktemp("c")  # a socket's path has 107 bytes at most
     monkeypatch.setenv(FOLDER_VARIABLE, str(short))
     path = tmp_path / "fleet.toml"
-    path.write_text(HEAD + entry("west", WEST, "udpin://127.0.0.1:0", "udpin://127.0.0.1:0", "check.seconds=0.2"))
+    path.write_text(HEAD + make_entry("west", WEST, "udpin://127.0.0.1:0", "udpin://127.0.0.1:0", "check.seconds=0.2"))
     (fleet_member,) = read_fleet(path).members
     flight = FleetFlight(fleet_member, ["--arm", "--takeoff", "1.2", "--out", str(tmp_path / "out")])
     flight.start()

@@ -17,7 +17,7 @@ from uavctl.config.checks import get_position_limits_m
 from uavctl.errors import ConfigError, UsageError
 
 
-def written(autopilot: str, room: str = "6x5x2.5") -> str:
+def write_room(autopilot: str, room: str = "6x5x2.5") -> str:
     return format_room(parse_sizes(room), autopilot, "mine.toml")
 
 
@@ -45,7 +45,7 @@ def test_the_file_has_a_dozen_keys_and_is_the_room(autopilot: str, tmp_path: Pat
 
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 def test_the_vehicle_of_the_file_is_the_simulated_one(autopilot: str) -> None:
-    file_url = urlsplit(parse(written(autopilot), "mine.toml").config.daemon.vehicle)
+    file_url = urlsplit(parse(write_room(autopilot), "mine.toml").config.daemon.vehicle)
     simulated = urlsplit(DEFAULT_VEHICLE_URLS[autopilot].split(",")[0])
     assert (file_url.scheme, simulated.scheme) in {
         ("udpin", "udpout"),
@@ -89,7 +89,7 @@ def test_the_smallest_side_that_is_named_can_be_flown_in(capsys: pytest.CaptureF
 
 
 def test_limits_as_lists_beside_a_room_are_refused_with_both_lines() -> None:
-    text = written("px4") + "\n[sets]\nstate_lower = [-1.0]\n"
+    text = write_room("px4") + "\n[sets]\nstate_lower = [-1.0]\n"
     with pytest.raises(ConfigError) as refused:
         parse(text, "mine.toml")
     (problem,) = refused.value.problems
@@ -108,7 +108,7 @@ def test_limits_as_lists_beside_a_room_are_refused_with_both_lines() -> None:
     ],
 )
 def test_what_is_wrong_in_a_room_is_named_with_its_line(old: str, new: str, key: str) -> None:
-    text = written("px4").replace(old, new)
+    text = write_room("px4").replace(old, new)
     with pytest.raises(ConfigError) as refused:
         parse(text, "mine.toml")
     assert refused.value.problems[0].startswith(f"mine.toml:{text.splitlines().index(new) + 1}: {key}: ")
@@ -116,15 +116,15 @@ def test_what_is_wrong_in_a_room_is_named_with_its_line(old: str, new: str, key:
 
 def test_a_wrong_key_of_the_base_is_reported_with_its_line() -> None:
     with pytest.raises(ConfigError) as refused:
-        parse(written("px4") + "\n[smpc]\nhorizon = 1\n", "mine.toml")
+        parse(write_room("px4") + "\n[smpc]\nhorizon = 1\n", "mine.toml")
     assert refused.value.problems[0].startswith("mine.toml:")
     with pytest.raises(ConfigError) as refused:
-        parse(written("px4") + "\n[plant]\ndrag_1ps = [0.1]\n\n[sim.camera]\nrate_hz = 20.0\n", "mine.toml")
+        parse(write_room("px4") + "\n[plant]\ndrag_1ps = [0.1]\n\n[sim.camera]\nrate_hz = 20.0\n", "mine.toml")
     assert "mine.toml" in refused.value.problems[0]
 
 
 def test_overrides_reach_names_and_lists() -> None:
-    config = parse(written("px4"), "mine.toml", ["room.speed_mps=0.8", "sets.input_lower=[-1.5,-1.5,-1.5]"]).config
+    config = parse(write_room("px4"), "mine.toml", ["room.speed_mps=0.8", "sets.input_lower=[-1.5,-1.5,-1.5]"]).config
     assert config.sets.state_upper[1] == 0.8
     assert config.sets.input_lower == (-1.5, -1.5, -1.5)
 
@@ -136,4 +136,4 @@ def test_a_room_whose_sizes_are_not_lengths() -> None:
 
 def test_a_base_that_is_no_preset_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"mine\.toml:\d+: base: "):
-        parse(written("px4").replace('"room-px4"', '"room-pix4"'), "mine.toml")
+        parse(write_room("px4").replace('"room-px4"', '"room-pix4"'), "mine.toml")

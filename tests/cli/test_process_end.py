@@ -16,7 +16,7 @@ sys.stdout.write('{"ok": true}')
 """
 
 
-def end_code(end: str) -> tuple[int, str]:
+def run_program(end: str) -> tuple[int, str]:
     """Exit code and standard output of the program, to whose standard input nobody writes."""
     with subprocess.Popen(
         [sys.executable, "-c", PROGRAM.replace("{end}", end)],
@@ -31,5 +31,5 @@ def end_code(end: str) -> tuple[int, str]:
 
 
 def test_a_thread_that_waits_for_input_changes_no_exit_code() -> None:
-    assert end_code("sys.exit(3)")[0] < 0  # the interpreter's own end is an abort
-    assert end_code("cli._end_process(3)") == (3, '{"ok": true}')
+    assert run_program("sys.exit(3)")[0] < 0  # the interpreter's own end is an abort
+    assert run_program("cli._end_process(3)") == (3, '{"ok": true}')

@@ -26,7 +26,7 @@ COMMANDS = {" ".join(chain): command for chain, command in list_commands(app)}
 EXIT_CODES = "130 interrupted"  # told once, by `uavctl --help`
 
 
-def help_of(command: str) -> str:
+def read_help(command: str) -> str:
     console = Console(file=StringIO(), width=200)
     app.help_print(command.split(), console=console)
     assert isinstance(console.file, StringIO)
@@ -35,7 +35,7 @@ def help_of(command: str) -> str:
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_ends_with_an_example_of_the_command_and_names_all_its_arguments(command: str) -> None:
-    text = help_of(command)
+    text = read_help(command)
     assert text.rstrip().endswith(EXAMPLES[command])
     assert "[ARGS" not in text
     assert (EXIT_CODES in text) == (command == "")
@@ -53,7 +53,7 @@ def test_examples_are_of_commands_that_there_are() -> None:
     assert EXAMPLES.keys() == COMMANDS.keys()
 
 
-def told(capsys: pytest.CaptureFixture[str], arguments: Sequence[str]) -> str:
+def refuse(capsys: pytest.CaptureFixture[str], arguments: Sequence[str]) -> str:
     """The message of a command line that is refused."""
     assert run([*arguments, "--json"]) == 2
     document = json.loads(capsys.readouterr().out)
@@ -87,13 +87,13 @@ def told(capsys: pytest.CaptureFixture[str], arguments: Sequence[str]) -> str:
 def test_a_wrong_argument_is_reported_with_a_suggestion(
     capsys: pytest.CaptureFixture[str], arguments: str, suggested: list[str]
 ) -> None:
-    text = told(capsys, arguments.split())
+    text = refuse(capsys, arguments.split())
     assert suggested and all(suggestion in text for suggestion in suggested)
 
 
 def test_a_command_without_overrides_suggests_no_key(capsys: pytest.CaptureFixture[str]) -> None:
     for arguments in ("ctl hold --loss 0.3", "log info x.mcap --loss 0.3", "key show a loss=1"):
-        assert "--set" not in told(capsys, arguments.split())
+        assert "--set" not in refuse(capsys, arguments.split())
 
 
 @pytest.mark.parametrize(
@@ -111,7 +111,7 @@ def test_a_command_without_overrides_suggests_no_key(capsys: pytest.CaptureFixtu
 def test_too_many_or_too_few_arguments_are_reported_with_the_usage(
     capsys: pytest.CaptureFixture[str], arguments: str, unknown: list[str], takes: str
 ) -> None:
-    text = told(capsys, arguments.split())
+    text = refuse(capsys, arguments.split())
     assert takes in text and all(argument in text for argument in unknown)
     assert "Unused Tokens" not in text
 
@@ -120,8 +120,8 @@ def test_too_many_or_too_few_arguments_are_reported_with_the_usage(
 def test_a_positive_height_is_reported_with_the_number_to_write(
     capsys: pytest.CaptureFixture[str], command: str
 ) -> None:
-    assert "-1.1" in told(capsys, [command, "--goto", "1,0,1.1"])
-    assert "-1.1" in told(capsys, [command, "--set", "target.position_m=[1,0,1.1]"])
+    assert "-1.1" in refuse(capsys, [command, "--goto", "1,0,1.1"])
+    assert "-1.1" in refuse(capsys, [command, "--set", "target.position_m=[1,0,1.1]"])
 
 
 @pytest.mark.parametrize(
@@ -134,7 +134,7 @@ def test_up_is_hinted_at_only_where_it_would_be_inside(axis: str, value_m: float
     assert suggest_height_sign("down", 1.1, -2.5, 2.0) == ""  # a room that goes below its origin
 
 
-def extras() -> set[str]:
+def find_extra_modules() -> set[str]:
     """Modules of the optional packages, but for those of development."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     names = {
@@ -150,7 +150,7 @@ def extras() -> set[str]:
 
 
 def test_without_any_extra_every_help_and_every_refusal_works(tmp_path: Path) -> None:
-    result = extras()
+    result = find_extra_modules()
     assert {"pyarrow", "pandas", "polars", "distributed", "foxglove", "natnet", "qtm_rt", "pyulog"} <= result
     lines = [[*command.split(), "--help"] for command in COMMANDS]
     lines += [["-v"], ["--json"], ["--unknown"], ["loopback", "--unknown"], ["--version"], ["--install-completion"]]

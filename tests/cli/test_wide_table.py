@@ -18,20 +18,20 @@ from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver
 
 
-def printed(renderable: RenderableType, width: int) -> list[str]:
+def print_table(renderable: RenderableType, width: int) -> list[str]:
     out = io.StringIO()
     Console(file=out, width=width).print(renderable)
     return out.getvalue().splitlines()
 
 
-def cells(lines: list[str]) -> list[list[str]]:
+def parse_cells(lines: list[str]) -> list[list[str]]:
     """Rows with cells, headings too."""
     rows = [line.replace("┃", "│").split("│")[1:-1] for line in lines if "│" in line or "┃" in line]
     return [[cell.strip() for cell in row] for row in rows]
 
 
 @cache
-def room() -> tuple[Answer, Design]:
+def find_width() -> tuple[Answer, Design]:
     design = build_design(load_config("room-hahn-stursberg"))
     x = design.target + np.tile([0.3, -0.1, 0.0], 3)
     return ConicSolver(design).solve(0, x, design.target), design
@@ -39,10 +39,10 @@ def room() -> tuple[Answer, Design]:
 
 @pytest.mark.parametrize(("width", "tables"), [(200, 1), (80, 2), (60, 4), (30, 8)])
 def test_a_plan_fits_its_terminal_stage_by_stage(width: int, tables: int) -> None:
-    answer, design = room()
-    lines = printed(make_plan_table(answer, design), width)
+    answer, design = find_width()
+    lines = print_table(make_plan_table(answer, design), width)
     assert max(map(len, lines)) <= width
-    rows = cells(lines)
+    rows = parse_cells(lines)
     count = design.horizon + 2  # with the heading
     assert len(rows) == tables * count
     parts = [rows[i * count : (i + 1) * count] for i in range(tables)]
@@ -64,7 +64,7 @@ def test_groups_stay_together_where_they_fit() -> None:
     groups = [[Column(name, ["12345"]) for name in names] for names in ("abc", "def", "g")]
     # A column takes 8 characters, the first one 4, and the last border 1.
     headings = {
-        width: [row for row in cells(printed(WideTable(first, groups), width)) if row[0] == "t"]
+        width: [row for row in parse_cells(print_table(WideTable(first, groups), width)) if row[0] == "t"]
         for width in (61, 60, 53, 29, 28)
     }
     assert headings[61] == [["t", *"abcdefg"]]

@@ -23,13 +23,13 @@ CASES = pytest.mark.parametrize(
 
 
 @cache
-def climbs_at_s(autopilot: str) -> float:
+def find_climb_time_s(autopilot: str) -> float:
     """When the same flight without a fault begins its climb."""
     flight = TakeOffRig(autopilot, *RELAYED).relayed().take_off().run(60.0, until=HandoverState.CLIMBING)
     return flight.now_ns * 1e-9
 
 
-def furthest(flight: TakeOffRig) -> tuple[float, float]:
+def fly_to_end(flight: TakeOffRig) -> tuple[float, float]:
     """Fly to the end; how far from its start the true vehicle came to the side, and how high [m]."""
     flight.take_off()
     side_m = height_m = 0.0
@@ -52,9 +52,9 @@ def furthest(flight: TakeOffRig) -> tuple[float, float]:
 def test_another_body_s_positions_do_not_carry_a_climbing_vehicle_off(
     autopilot: str, after_s: float, other_m: tuple[float, float, float]
 ) -> None:
-    begin_s = climbs_at_s(autopilot) + after_s
+    begin_s = find_climb_time_s(autopilot) + after_s
     swapped = f"sim.camera.swapped=[[{begin_s:.2f},{begin_s + 60.0:.2f}]]"
-    side_m, height_m = furthest(
+    side_m, height_m = fly_to_end(
         TakeOffRig(autopilot, *RELAYED, swapped, f"sim.camera.other_body_m={list(other_m)}").relayed()
     )
     assert side_m < SIDE_M and height_m < CEILING_M
@@ -67,7 +67,7 @@ def test_positions_that_are_wrong_for_an_instant_land_it_and_are_there_again_for
     autopilot: str, after_s: float
 ) -> None:
     """Without positions from then on PX4, its velocity led astray, rose for minutes and went 1.4 km."""
-    begin_s = climbs_at_s(autopilot) + after_s
+    begin_s = find_climb_time_s(autopilot) + after_s
     flight = TakeOffRig(
         autopilot,
         *RELAYED,
@@ -77,7 +77,7 @@ def test_positions_that_are_wrong_for_an_instant_land_it_and_are_there_again_for
         f"sim.camera.swapped=[[{begin_s:.2f},{begin_s + 0.2:.2f}]]",
         "sim.camera.other_body_m=[0.0,0.0,0.0]",
     ).relayed()
-    side_m, height_m = furthest(flight)
+    side_m, height_m = fly_to_end(flight)
     assert side_m < GOAL[0] + 0.3 and height_m < CEILING_M  # one that takes no harm flies to its goal
 
 
@@ -86,9 +86,9 @@ def test_positions_that_are_wrong_for_an_instant_land_it_and_are_there_again_for
 @CASES
 @pytest.mark.parametrize("silence", ["sim.camera.frozen", "link.blackout"])
 def test_a_climb_without_positions_ends_below_the_ceiling(autopilot: str, after_s: float, silence: str) -> None:
-    begin_s = climbs_at_s(autopilot) + after_s
+    begin_s = find_climb_time_s(autopilot) + after_s
     flight = TakeOffRig(autopilot, *RELAYED, f"{silence}=[[{begin_s:.2f},{begin_s + 60.0:.2f}]]").relayed()
-    side_m, height_m = furthest(flight)
+    side_m, height_m = fly_to_end(flight)
     assert side_m < SIDE_M and height_m < CEILING_M
 
 
@@ -98,11 +98,11 @@ def test_px4_s_own_climb_to_another_height_ends_at_the_ceiling() -> None:
     flight = TakeOffRig("px4", "sim.plant=quadrotor").run(2.0)
     assert flight.peers.autopilot.parameters.set("MIS_TAKEOFF_ALT", 8.0)
     flight.take_off(2.4)
-    _, height_m = furthest(flight)
+    _, height_m = fly_to_end(flight)
     assert height_m < CEILING_M + 0.5
 
 
-def flown(folder: Path, seed: int, seconds: float, *settings: str) -> tuple[int, float]:
+def fly_with_gps(folder: Path, seed: int, seconds: float, *settings: str) -> tuple[int, float]:
     """Exit code of a loopback flight of an ArduPilot with GPS, and how far outside the true vehicle was at most [m]."""
     arguments = [argument for setting in settings for argument in ("--set", setting)]
     code = run(["loopback", "--config", "room-ardupilot", "--arm", "--takeoff", "1.2", "--seed", str(seed),
@@ -122,7 +122,7 @@ def flown(folder: Path, seed: int, seconds: float, *settings: str) -> tuple[int,
 @pytest.mark.parametrize("frame", ["mirrored-north", "mirrored-east", "turned-180", "turned-270"])
 def test_a_wrong_frame_is_found_from_the_first_tick_on_that_flies_on_it(tmp_path: Path, frame: str) -> None:
     """ArduPilot tells once a second whether it climbs; until then nothing was held against what was sent: 1.8 m out."""
-    code, beyond_m = flown(tmp_path, 9855, 10.1, f'sim.fault=[{{kind="frame",at_s=0.0,name="{frame}"}}]')
+    code, beyond_m = fly_with_gps(tmp_path, 9855, 10.1, f'sim.fault=[{{kind="frame",at_s=0.0,name="{frame}"}}]')
     assert code == 1 and beyond_m < 1.0
 
 
@@ -131,5 +131,5 @@ def test_a_wrong_frame_is_found_from_the_first_tick_on_that_flies_on_it(tmp_path
 def test_a_healthy_climb_is_not_let_go_for_a_watch_that_began_in_its_midst(
     tmp_path: Path, seed: int, settings: tuple[str, ...]
 ) -> None:
-    code, beyond_m = flown(tmp_path, seed, 14.0, *settings)
+    code, beyond_m = fly_with_gps(tmp_path, seed, 14.0, *settings)
     assert code == 0 and beyond_m < 0.1  # it lands on the floor, which is a side

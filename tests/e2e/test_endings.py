@@ -59,25 +59,25 @@ def run_flight(capsys: pytest.CaptureFixture[str]) -> RunFlight:
     return fly
 
 
-def order(what: Order) -> Callable[[EndingRig], None]:
+def make_order(what: Order) -> Callable[[EndingRig], None]:
     def do(rig: EndingRig) -> None:
         rig.active_loop.order(Command(order=what))
 
     return do
 
 
-def stick(mode: str) -> Callable[[EndingRig], None]:
+def make_switch(mode: str) -> Callable[[EndingRig], None]:
     return lambda rig: rig.switch_mode(mode)
 
 
-def fail(mode: Role) -> Callable[[EndingRig], None]:
+def start_failsafe(mode: Role) -> Callable[[EndingRig], None]:
     """A failsafe of the vehicle's own."""
     return lambda rig: rig.peers.autopilot.pilot.enter_failsafe(
         SIMULATED[rig.config.sim.autopilot].get_mode_by_role(mode), rig.now_ns
     )
 
 
-def deafen(kind: str) -> Callable[[EndingRig], None]:
+def drop_messages(kind: str) -> Callable[[EndingRig], None]:
     """From now on the vehicle hears no message of a kind."""
 
     def do(rig: EndingRig) -> None:
@@ -87,7 +87,7 @@ def deafen(kind: str) -> Callable[[EndingRig], None]:
     return do
 
 
-def hear(rig: EndingRig) -> None:
+def deliver_messages(rig: EndingRig) -> None:
     """From now on the vehicle hears everything again."""
     rig.is_delivered = lambda data: True
 
@@ -104,7 +104,7 @@ def test_the_mission_is_over(tmp_path: Path, run_flight: RunFlight) -> None:
 
 @pytest.mark.slow
 def test_the_operator_orders_the_landing(tmp_path: Path, run_flight: RunFlight) -> None:
-    rig = EndingRig(tmp_path).add_step_in(HandoverState.ENGAGED, order(Order.LAND), after_s=2.0)
+    rig = EndingRig(tmp_path).add_step_in(HandoverState.ENGAGED, make_order(Order.LAND), after_s=2.0)
     run_flight(rig, Cause.LANDED_AS_ORDERED, *TAKE_OFF, good=True)
 
 
@@ -132,7 +132,9 @@ def test_its_time_is_over(tmp_path: Path, run_flight: RunFlight) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("autopilot", "mode"), [("px4", "POSCTL"), ("ardupilot", "LOITER")])
 def test_the_pilot_takes_over(tmp_path: Path, run_flight: RunFlight, autopilot: str, mode: str) -> None:
-    rig = EndingRig(tmp_path, f"sim.autopilot={autopilot}").add_step_in(HandoverState.ENGAGED, stick(mode), after_s=2.0)
+    rig = EndingRig(tmp_path, f"sim.autopilot={autopilot}").add_step_in(
+        HandoverState.ENGAGED, make_switch(mode), after_s=2.0
+    )
     rig.add_step_in(HandoverState.RELEASED, interrupt, after_s=3.0)
     report = run_flight(rig, Cause.PILOT, *TAKE_OFF, good=True)
     assert f"in the air, in mode {mode}" in report.ending["sentence"]
@@ -140,8 +142,8 @@ def test_the_pilot_takes_over(tmp_path: Path, run_flight: RunFlight, autopilot: 
 
 @pytest.mark.slow
 def test_the_pilot_takes_over_and_lands(tmp_path: Path, run_flight: RunFlight) -> None:
-    rig = EndingRig(tmp_path, airborne=True).add_step_in(HandoverState.ENGAGED, stick("POSCTL"), after_s=2.0)
-    rig.add_step_in(HandoverState.RELEASED, stick("AUTO.LAND"), after_s=1.0)
+    rig = EndingRig(tmp_path, airborne=True).add_step_in(HandoverState.ENGAGED, make_switch("POSCTL"), after_s=2.0)
+    rig.add_step_in(HandoverState.RELEASED, make_switch("AUTO.LAND"), after_s=1.0)
     run_flight(rig, Cause.PILOT_LANDED, good=True)
 
 
@@ -160,7 +162,7 @@ def test_a_failsafe_that_ended_in_the_climb_is_reported_with_the_later_end(
 
 @pytest.mark.slow
 def test_the_pilot_takes_over_in_the_climb(tmp_path: Path, run_flight: RunFlight) -> None:
-    rig = EndingRig(tmp_path).add_step_in(HandoverState.CLIMBING, stick("POSCTL"), after_s=0.6)
+    rig = EndingRig(tmp_path).add_step_in(HandoverState.CLIMBING, make_switch("POSCTL"), after_s=0.6)
     rig.add_step_in(HandoverState.RELEASED, interrupt, after_s=2.0)
     report = run_flight(rig, Cause.PILOT, *TAKE_OFF)
     assert "before the controller" in report.ending["sentence"]
@@ -176,7 +178,7 @@ def test_the_operator_ends_it_in_the_climb(tmp_path: Path, run_flight: RunFlight
 @pytest.mark.slow
 def test_the_operator_orders_the_landing_in_the_climb(tmp_path: Path, run_flight: RunFlight) -> None:
     run_flight(
-        EndingRig(tmp_path).add_step_in(HandoverState.CLIMBING, order(Order.LAND), after_s=0.5),
+        EndingRig(tmp_path).add_step_in(HandoverState.CLIMBING, make_order(Order.LAND), after_s=0.5),
         Cause.NOT_ENGAGED,
         *TAKE_OFF,
     )
@@ -214,7 +216,7 @@ def test_the_climb_takes_too_long(tmp_path: Path, run_flight: RunFlight) -> None
 @pytest.mark.slow
 def test_the_mode_that_takes_setpoints_is_refused(tmp_path: Path, run_flight: RunFlight) -> None:
     rig = EndingRig(tmp_path, "hand_over.engage_s=3.0")
-    rig.add_step_in(HandoverState.CLIMBING, deafen("SET_POSITION_TARGET_LOCAL_NED"))
+    rig.add_step_in(HandoverState.CLIMBING, drop_messages("SET_POSITION_TARGET_LOCAL_NED"))
     report = run_flight(rig, Cause.SETPOINTS_REFUSED, *TAKE_OFF)
     assert "landed and disarmed" in report.ending["sentence"]
 
@@ -298,7 +300,7 @@ def test_the_fallback_lets_it_go(tmp_path: Path, run_flight: RunFlight, argument
 @pytest.mark.slow
 def test_landing_fails(tmp_path: Path, run_flight: RunFlight) -> None:
     rig = EndingRig(tmp_path, "hand_over.land_s=2.0").add_step_in(
-        HandoverState.ENGAGED, deafen("COMMAND_LONG"), after_s=2.0
+        HandoverState.ENGAGED, drop_messages("COMMAND_LONG"), after_s=2.0
     )
     report = run_flight(rig, Cause.LANDING_FAILED, *TAKE_OFF, "--duration", "9")
     assert "in the air" in report.ending["sentence"]
@@ -308,9 +310,9 @@ def test_landing_fails(tmp_path: Path, run_flight: RunFlight) -> None:
 @pytest.mark.fault(67)
 def test_a_landing_without_an_answer_is_requested_until_it_is_confirmed(tmp_path: Path, run_flight: RunFlight) -> None:
     rig = EndingRig(tmp_path, "hand_over.land_s=8.0").add_step_in(
-        HandoverState.ENGAGED, deafen("COMMAND_LONG"), after_s=2.0
+        HandoverState.ENGAGED, drop_messages("COMMAND_LONG"), after_s=2.0
     )
-    rig.add_step_in(HandoverState.LANDING, hear, after_s=12.0)
+    rig.add_step_in(HandoverState.LANDING, deliver_messages, after_s=12.0)
     report = run_flight(rig, Cause.TIME_OVER, *TAKE_OFF, "--duration", "9", good=True)
     assert "landed and disarmed" in report.ending["sentence"] and "asked on" in report.console
 
@@ -347,21 +349,21 @@ def test_the_envelope_lets_it_go(tmp_path: Path, run_flight: RunFlight) -> None:
 
 @pytest.mark.slow
 def test_a_failsafe_of_the_vehicle_s_own_lands_it(tmp_path: Path, run_flight: RunFlight) -> None:
-    rig = EndingRig(tmp_path).add_step_in(HandoverState.ENGAGED, fail(Role.LAND), after_s=2.0)
+    rig = EndingRig(tmp_path).add_step_in(HandoverState.ENGAGED, start_failsafe(Role.LAND), after_s=2.0)
     run_flight(rig, Cause.FAILSAFE_LANDED, *TAKE_OFF)
 
 
 @pytest.mark.slow
 def test_a_failsafe_of_the_vehicle_s_own_hovers_and_does_not_end(tmp_path: Path, run_flight: RunFlight) -> None:
     rig = EndingRig(tmp_path, "hand_over.climb_s=8.0")
-    rig.add_step_in(HandoverState.ENGAGED, deafen("SET_POSITION_TARGET_LOCAL_NED"), after_s=2.0)
+    rig.add_step_in(HandoverState.ENGAGED, drop_messages("SET_POSITION_TARGET_LOCAL_NED"), after_s=2.0)
     report = run_flight(rig, Cause.VEHICLE_FAILSAFE, *TAKE_OFF)
     assert "not ended in 8 s" in report.ending["sentence"] and "landed and disarmed" in report.ending["sentence"]
 
 
 @pytest.mark.slow
 def test_a_failsafe_ends_a_flight_that_the_pilot_began(tmp_path: Path, run_flight: RunFlight) -> None:
-    rig = EndingRig(tmp_path, airborne=True).add_step_in(HandoverState.ENGAGED, fail(Role.HOLD), after_s=2.0)
+    rig = EndingRig(tmp_path, airborne=True).add_step_in(HandoverState.ENGAGED, start_failsafe(Role.HOLD), after_s=2.0)
     rig.add_step_in(HandoverState.RELEASED, interrupt, after_s=2.0)
     report = run_flight(rig, Cause.VEHICLE_FAILSAFE)
     assert "in the air" in report.ending["sentence"]
@@ -431,12 +433,12 @@ def test_the_controller_fails_and_the_relay_goes_on(
 def test_the_operator_is_answered_while_the_relay_goes_on_alone(tmp_path: Path, run_flight: RunFlight) -> None:
     rig = EndingRig(tmp_path, "relay.enabled=true", "sim.plant=quadrotor")
     rig.add_step_in(HandoverState.ENGAGED, EndingRig.request_status, after_s=1.0).add_step_in(
-        HandoverState.ENGAGED, stick("POSCTL"), after_s=2.0
+        HandoverState.ENGAGED, make_switch("POSCTL"), after_s=2.0
     )
     rig.add_step_in(HandoverState.RELEASED, interrupt, after_s=1.0).add_step_in(
         HandoverState.RELEASED, EndingRig.request_status, after_s=3.0
     )
-    rig.add_step_in(HandoverState.RELEASED, stick("AUTO.LAND"), after_s=5.0).add_step_in(
+    rig.add_step_in(HandoverState.RELEASED, make_switch("AUTO.LAND"), after_s=5.0).add_step_in(
         HandoverState.RELEASED, EndingRig.request_status, after_s=6.0
     )
     report = run_flight(rig, Cause.PILOT, *TAKE_OFF, good=True)
@@ -511,7 +513,7 @@ def test_a_cut_off_end_is_reported_everywhere(
 ) -> None:
     # The time of a hand-over is longer than that of any request to land, so it takes a shorter one to be cut off.
     monkeypatch.setattr(engagement, "LANDING_S", 1.0)
-    rig = EndingRig(tmp_path, airborne=True).add_step_in(HandoverState.ENGAGED, deafen("COMMAND_LONG"))
+    rig = EndingRig(tmp_path, airborne=True).add_step_in(HandoverState.ENGAGED, drop_messages("COMMAND_LONG"))
     report = run_flight(rig.add_step_in(HandoverState.ENGAGED, interrupt, after_s=3.0), Cause.ENDED_IN_AIR)
     assert (
         CAUSES[Cause.ENDED_BY_OPERATOR].phrase in report.ending["sentence"]

@@ -15,7 +15,7 @@ pytestmark = pytest.mark.usefixtures("no_page")
 FLOOR = ["--set", "sim.start_position_m=[0.0,0.0,-0.7]"]
 
 
-def typed(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
+def run_loopback(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
     code = run(list(arguments))
     out, err = capsys.readouterr()
     return code, out, " ".join(err.split())
@@ -48,7 +48,7 @@ def test_what_cannot_be_is_refused_before_anything_is_made_or_sent(
     message: str,
 ) -> None:
     monkeypatch.delattr("uavctl.build.controller.build_solver")
-    code, out, err = typed(capsys, command, *arguments, "--out", str(tmp_path / "flight"))
+    code, out, err = run_loopback(capsys, command, *arguments, "--out", str(tmp_path / "flight"))
     assert code == 2 and message in err and not out
     assert not list(tmp_path.rglob("*.mcap"))
 
@@ -67,17 +67,17 @@ def test_a_flight_from_the_ground_to_a_place_and_back(capsys: pytest.CaptureFixt
         "--out",
         str(tmp_path),
     ]
-    code, out, err = typed(capsys, "loopback", *arguments, *FLOOR)
+    code, out, err = run_loopback(capsys, "loopback", *arguments, *FLOOR)
     assert code == 0, err
     assert json.loads(out)["steps"] > 30
     texts = [event.text for event in records(tmp_path / "flight.mcap", Event) if event.code == "hand-over"]
     assert texts[-1].startswith("settling -> done")
-    code, out, _ = typed(capsys, "log", "replay", str(tmp_path / "flight.mcap"), "--json")
+    code, out, _ = run_loopback(capsys, "log", "replay", str(tmp_path / "flight.mcap"), "--json")
     assert code == 0 and json.loads(out)["identical"]
 
 
 def test_an_unreached_target_has_its_exit_code(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    code, _, err = typed(capsys, "loopback", "--goto=-1,-1,-1", "--duration", "1", "--out", str(tmp_path))
+    code, _, err = run_loopback(capsys, "loopback", "--goto=-1,-1,-1", "--duration", "1", "--out", str(tmp_path))
     assert code == 1 and "--goto -1,-1,-1 was not reached" in err
 
 
@@ -87,14 +87,14 @@ def test_a_refused_take_off_is_reported_with_the_vehicle_s_reason(
 ) -> None:
     poor = ["--set", "sim.plant=quadrotor", "--set", "sim.quadrotor.charge=0.1", "--set", "hand_over.ground_s=4"]
     arguments = ["--arm", "--takeoff", "1.2", "--duration", "20", "--out", str(tmp_path), *poor, *FLOOR]
-    code, _, err = typed(capsys, "loopback", *arguments)
+    code, _, err = run_loopback(capsys, "loopback", *arguments)
     assert code == 1 and "low battery" in err and "TEMPORARILY_REJECTED" in err
 
 
 @pytest.mark.slow
 def test_the_same_way_over_real_sockets(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     arguments = ["--udp", "--arm", "--takeoff", "1", "--goto", "0.3,0.3,-1", "--duration", "9", "--out", str(tmp_path)]
-    code, _, err = typed(capsys, "loopback", *arguments, *FLOOR)
+    code, _, err = run_loopback(capsys, "loopback", *arguments, *FLOOR)
     assert code == 0, err
     texts = [event.text for event in records(tmp_path / "flight.mcap", Event) if event.code == "hand-over"]
     assert texts[-1].startswith("settling -> done")

@@ -173,23 +173,23 @@ def test_row_7_a_backlog_burst_is_one_solve_with_the_newest() -> None:
     assert (burst.decision.mode, burst.decision.plan_seq) == (TRACK, 4)
 
 
-def bad(**changes: object) -> Callable[[PositionSample], PositionSample]:
+def make_bad_sample(**changes: object) -> Callable[[PositionSample], PositionSample]:
     return lambda position_sample: msgspec.structs.replace(position_sample, **changes)
 
 
 BAD_SAMPLES = {
-    "nan": bad(position_m=(math.nan, 0.0, 0.0)),
-    "inf": bad(position_m=(0.0, math.inf, 0.0)),
-    "minus inf": bad(position_m=(0.0, 0.0, -math.inf)),
-    "absurd": bad(position_m=(1000.1, 0.0, 0.0)),
-    "huge": bad(position_m=(1e308, 0.0, 0.0)),
-    "velocity nan": bad(velocity_mps=(0.0, math.nan, 0.0)),
-    "velocity absurd": bad(velocity_mps=(0.0, 0.0, -100.1)),
-    "std zero": bad(std_m=0.0),
-    "std negative": bad(std_m=-1.0),
-    "std nan": bad(std_m=math.nan),
-    "std inf": bad(std_m=math.inf),
-    "std huge": bad(std_m=1e200),
+    "nan": make_bad_sample(position_m=(math.nan, 0.0, 0.0)),
+    "inf": make_bad_sample(position_m=(0.0, math.inf, 0.0)),
+    "minus inf": make_bad_sample(position_m=(0.0, 0.0, -math.inf)),
+    "absurd": make_bad_sample(position_m=(1000.1, 0.0, 0.0)),
+    "huge": make_bad_sample(position_m=(1e308, 0.0, 0.0)),
+    "velocity nan": make_bad_sample(velocity_mps=(0.0, math.nan, 0.0)),
+    "velocity absurd": make_bad_sample(velocity_mps=(0.0, 0.0, -100.1)),
+    "std zero": make_bad_sample(std_m=0.0),
+    "std negative": make_bad_sample(std_m=-1.0),
+    "std nan": make_bad_sample(std_m=math.nan),
+    "std inf": make_bad_sample(std_m=math.inf),
+    "std huge": make_bad_sample(std_m=1e200),
 }
 
 

@@ -32,7 +32,7 @@ CAMERA = Peer(17, 18)
 GOOD = CAMERA.vision(1_000_000)
 
 
-def flip(data: bytes, bit: int) -> bytes:
+def flip_byte(data: bytes, bit: int) -> bytes:
     return data[: bit // 8] + bytes((data[bit // 8] ^ 1 << bit % 8,)) + data[bit // 8 + 1 :]
 
 
@@ -57,7 +57,7 @@ class Source:
 @pytest.mark.parametrize("bit", range(len(GOOD) * 8))
 def test_row_10_one_flipped_bit_costs_one_sample_and_the_next_is_read(bit: int) -> None:
     link = make_link()
-    assert samples(link.receive(flip(GOOD, bit), NOW).items) == []
+    assert samples(link.receive(flip_byte(GOOD, bit), NOW).items) == []
     assert len(samples(link.receive(GOOD, NOW + MS).items)) == 1
     assert sum(link.stats(NOW).bad.values()) == 1
 
@@ -83,7 +83,7 @@ def test_row_11_an_oversized_datagram_is_dropped_and_reported() -> None:
 def test_rows_10_and_11_are_reported_once_a_second() -> None:
     link = make_link()
     reported_events = [
-        event for n in range(1000) for event in events(link.receive(flip(GOOD, 160), NOW + n * 5 * MS).items)
+        event for n in range(1000) for event in events(link.receive(flip_byte(GOOD, 160), NOW + n * 5 * MS).items)
     ]
     assert len(reported_events) == 5
     assert {event.severity for event in reported_events} == {Severity.WARNING}
@@ -186,7 +186,7 @@ def test_row_18_our_own_boot_clock_wraps() -> None:
         assert struct.unpack_from("<I", data, 10)[0] == want
 
 
-def reply(link: MavlinkConnection, at_ns: int, offset_ns: int, round_trip_ns: int = 2 * MS) -> bool:
+def answer_timesync(link: MavlinkConnection, at_ns: int, offset_ns: int, round_trip_ns: int = 2 * MS) -> bool:
     """Answer the request of `at_ns` if there is one, as a peer whose clock is `offset_ns` behind ours."""
     for data in link.due(at_ns):
         raw = mavlink.MAVLink(None).decode(bytearray(data))
@@ -197,7 +197,7 @@ def reply(link: MavlinkConnection, at_ns: int, offset_ns: int, round_trip_ns: in
     return False
 
 
-def offset_after(link: MavlinkConnection, at_ns: int, offset_ns: int) -> int | None:
+def compute_offset(link: MavlinkConnection, at_ns: int, offset_ns: int) -> int | None:
     """The offset that a sample of `at_ns` is mapped with."""
     link.receive(CAMERA.vision((at_ns - offset_ns) // 1000), at_ns + 50 * MS)
     return link.stats(NOW).clock_offset_ns
@@ -209,26 +209,26 @@ OFFSET = 40_000 * SECOND
 @pytest.mark.fault(19)
 def test_row_19_a_long_round_trip_does_not_move_a_clock_of_short_ones() -> None:
     link = make_link()
-    assert reply(link, NOW, OFFSET, round_trip_ns=200 * MS)
-    assert offset_after(link, NOW, OFFSET) == OFFSET
+    assert answer_timesync(link, NOW, OFFSET, round_trip_ns=200 * MS)
+    assert compute_offset(link, NOW, OFFSET) == OFFSET
     for n in range(1, 4):
-        assert reply(link, NOW + n * SECOND, OFFSET + 40 * MS, round_trip_ns=2 * MS)
-    assert offset_after(link, NOW + 3 * SECOND, OFFSET) == pytest.approx(OFFSET + 40 * MS, abs=MS)
+        assert answer_timesync(link, NOW + n * SECOND, OFFSET + 40 * MS, round_trip_ns=2 * MS)
+    assert compute_offset(link, NOW + 3 * SECOND, OFFSET) == pytest.approx(OFFSET + 40 * MS, abs=MS)
     for n in range(4, 8):
-        assert reply(link, NOW + n * SECOND, OFFSET, round_trip_ns=200 * MS)
-    assert offset_after(link, NOW + 7 * SECOND, OFFSET) == pytest.approx(OFFSET + 40 * MS, abs=20 * MS)
+        assert answer_timesync(link, NOW + n * SECOND, OFFSET, round_trip_ns=200 * MS)
+    assert compute_offset(link, NOW + 7 * SECOND, OFFSET) == pytest.approx(OFFSET + 40 * MS, abs=20 * MS)
 
 
 @pytest.mark.fault(19)
 def test_row_19_deviating_answers_are_dropped_until_five_agree() -> None:
     link = make_link()
-    assert reply(link, NOW, OFFSET)
-    assert offset_after(link, NOW, OFFSET) == OFFSET
+    assert answer_timesync(link, NOW, OFFSET)
+    assert compute_offset(link, NOW, OFFSET) == OFFSET
     for n in range(1, 5):
-        assert reply(link, NOW + n * SECOND, OFFSET + 300 * MS)
-        assert offset_after(link, NOW + n * SECOND, OFFSET) == OFFSET
+        assert answer_timesync(link, NOW + n * SECOND, OFFSET + 300 * MS)
+        assert compute_offset(link, NOW + n * SECOND, OFFSET) == OFFSET
     assert link.stats(NOW).bad == {"timesync": 4}
-    assert reply(link, NOW + 5 * SECOND, OFFSET - 300 * MS)
+    assert answer_timesync(link, NOW + 5 * SECOND, OFFSET - 300 * MS)
     assert link.stats(NOW).bad == {"timesync": 4}  # the fifth in a row is believed
 
 
@@ -238,8 +238,8 @@ def test_row_19_a_drifting_clock_is_followed() -> None:
     for n in range(600):
         at_ns = NOW + n * SECOND
         offset = OFFSET + round(n * SECOND * drift)
-        assert reply(link, at_ns, offset)
-        got = offset_after(link, at_ns, offset)
+        assert answer_timesync(link, at_ns, offset)
+        got = compute_offset(link, at_ns, offset)
         assert got is not None
         assert abs(got - offset) < MS
 
@@ -316,7 +316,7 @@ NASTY = tuple(struct.pack("<f", value) for value in (math.nan, math.inf, -math.i
 )
 
 
-def sealed(data: bytes, crc_extra: int) -> bytes:
+def seal_frame(data: bytes, crc_extra: int) -> bytes:
     """A version 2 frame with its length and checksum made right."""
     body = data[1:10] + data[10:-2]
     body = bytes((len(data) - 12,)) + body[1:]
@@ -325,7 +325,7 @@ def sealed(data: bytes, crc_extra: int) -> bytes:
     return data[:1] + body + struct.pack("<H", crc.crc)
 
 
-def mutate(data: bytes, numbers: random.Random) -> bytes:
+def mutate_frame(data: bytes, numbers: random.Random) -> bytes:
     """A seed with bytes of its payload, its length or its sender changed, and sealed again."""
     crc_extra = mavlink.mavlink_map[int.from_bytes(data[7:10], "little")].crc_extra
     frame = bytearray(data)
@@ -345,10 +345,10 @@ def mutate(data: bytes, numbers: random.Random) -> bytes:
                 frame[at:at] = numbers.randbytes(numbers.randint(1, 40))
         if len(frame) < 13:
             break
-    return sealed(bytes(frame), crc_extra)
+    return seal_frame(bytes(frame), crc_extra)
 
 
-def fuzz(link: MavlinkConnection, count: int, seed: int) -> Counter[str]:
+def fuzz_link(link: MavlinkConnection, count: int, seed: int) -> Counter[str]:
     """Give mutated messages to a link and check what comes out; counts by kind."""
     numbers = random.Random(seed)
     kinds: Counter[str] = Counter()
@@ -356,13 +356,13 @@ def fuzz(link: MavlinkConnection, count: int, seed: int) -> Counter[str]:
     for _ in range(count):
         at_ns += numbers.randrange(20 * MS)
         link.due(at_ns)
-        for item in link.receive(mutate(numbers.choice(SEEDS)(at_ns // 1000), numbers), at_ns).items:
-            check(item)
+        for item in link.receive(mutate_frame(numbers.choice(SEEDS)(at_ns // 1000), numbers), at_ns).items:
+            check_samples(item)
             kinds[type(item).__name__] += 1
     return kinds
 
 
-def check(item: Item) -> None:
+def check_samples(item: Item) -> None:
     """What every sample keeps, whatever came in."""
     if isinstance(item, PositionSample):
         assert all(map(math.isfinite, (*item.position_m, *(item.velocity_mps or ()))))
@@ -384,7 +384,7 @@ def test_mutated_messages_raise_nothing() -> None:
         )
     )
     link.receive(VEHICLE.heartbeat(), NOW)
-    kinds = fuzz(link, 20_000, seed=1)
+    kinds = fuzz_link(link, 20_000, seed=1)
     stats = link.stats(NOW)
     assert stats.messages == 20_001  # all of them reach the handlers
     assert "crc" not in stats.bad
@@ -397,7 +397,7 @@ def test_mutated_messages_raise_nothing() -> None:
 def test_the_fuzzer_finds_a_planted_bug(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(codec, "_is_finite", lambda *values: True)
     with pytest.raises((AssertionError, ValueError, OverflowError)):
-        fuzz(make_link(), 20_000, seed=1)
+        fuzz_link(make_link(), 20_000, seed=1)
 
 
 def test_random_bytes_cost_nothing_but_themselves() -> None:

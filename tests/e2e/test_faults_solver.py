@@ -33,11 +33,11 @@ TRACK = ControlMode.TRACK
 FALLBACK = (ControlMode.BRAKE, ControlMode.HOLD)
 
 
-def ending(status: SolveStatus) -> Fault:
+def find_ending(status: SolveStatus) -> Fault:
     return lambda answer: Answer.failed(answer.seq, status, answer.method)
 
 
-def raising(error: Exception) -> Fault:
+def make_raising_solver(error: Exception) -> Fault:
     def fail(answer: Answer) -> Answer:
         raise error
 
@@ -45,15 +45,15 @@ def raising(error: Exception) -> Fault:
 
 
 SOLVER_FAULTS: dict[str, tuple[Fault, SolveStatus]] = {
-    "infeasible": (ending(SolveStatus.INFEASIBLE), SolveStatus.INFEASIBLE),
-    "inaccurate": (ending(SolveStatus.INACCURATE), SolveStatus.INACCURATE),
-    "iteration limit": (ending(SolveStatus.ITERATION_LIMIT), SolveStatus.ITERATION_LIMIT),
-    "failed": (ending(SolveStatus.FAILED), SolveStatus.FAILED),
-    "overflow": (raising(OverflowError("too large")), SolveStatus.FAILED),
-    "division": (raising(ZeroDivisionError()), SolveStatus.FAILED),
-    "value": (raising(ValueError("NaN in the data")), SolveStatus.FAILED),
-    "singular": (raising(np.linalg.LinAlgError("singular matrix")), SolveStatus.FAILED),
-    "binding": (raising(RuntimeError("solver")), SolveStatus.FAILED),
+    "infeasible": (find_ending(SolveStatus.INFEASIBLE), SolveStatus.INFEASIBLE),
+    "inaccurate": (find_ending(SolveStatus.INACCURATE), SolveStatus.INACCURATE),
+    "iteration limit": (find_ending(SolveStatus.ITERATION_LIMIT), SolveStatus.ITERATION_LIMIT),
+    "failed": (find_ending(SolveStatus.FAILED), SolveStatus.FAILED),
+    "overflow": (make_raising_solver(OverflowError("too large")), SolveStatus.FAILED),
+    "division": (make_raising_solver(ZeroDivisionError()), SolveStatus.FAILED),
+    "value": (make_raising_solver(ValueError("NaN in the data")), SolveStatus.FAILED),
+    "singular": (make_raising_solver(np.linalg.LinAlgError("singular matrix")), SolveStatus.FAILED),
+    "binding": (make_raising_solver(RuntimeError("solver")), SolveStatus.FAILED),
 }
 
 
@@ -90,7 +90,7 @@ def test_row_22_a_plan_that_no_solve_renews_is_flown_to_its_end_and_not_beyond()
 
 @pytest.mark.fault(22)
 def test_row_22_a_programming_error_is_not_hidden() -> None:
-    controller, _ = with_faults({0: raising(AttributeError("a bug"))})
+    controller, _ = with_faults({0: make_raising_solver(AttributeError("a bug"))})
     with pytest.raises(AttributeError):
         run(controller, make_inputs(range(1), make_step_samples()))
 
@@ -106,7 +106,7 @@ def test_row_23_an_answer_to_another_question_is_discarded(offset: int) -> None:
     assert list_codes(late_output) == {"solve-late": 1}
 
 
-def spoiled(name: str, value: float) -> Fault:
+def make_spoiled_solver(name: str, value: float) -> Fault:
     def fault(answer: Answer) -> Answer:
         arrays = {"inputs": answer.inputs.copy(), "states": answer.states.copy(), "reference": answer.reference.copy()}
         arrays[name].flat[-1] = value
@@ -119,7 +119,7 @@ def spoiled(name: str, value: float) -> Fault:
 @pytest.mark.parametrize("name", ["inputs", "states", "reference"])
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_row_24_an_optimal_answer_that_is_not_finite_does_not_fly(name: str, value: float) -> None:
-    controller, _ = with_faults({3: spoiled(name, value)})
+    controller, _ = with_faults({3: make_spoiled_solver(name, value)})
     outputs = run(controller, make_inputs(range(5 * TICKS), make_step_samples()))
     assert list_plan_steps(outputs) == [(0, 0), (1, 0), (2, 0), (2, 1), (4, 0)]
     assert find_boundaries(outputs)[3].decision.solve is SolveStatus.FAILED
@@ -160,7 +160,7 @@ def test_row_24_every_setpoint_is_sound_under_random_faults_of_all_kinds() -> No
     rng = np.random.default_rng(24)
     steps = 1500
     pool: list[Fault] = [inject for inject, _ in SOLVER_FAULTS.values()]
-    pool += [spoiled("inputs", value) for value in (math.nan, 1e300, -40.0, 3.0)]
+    pool += [make_spoiled_solver("inputs", value) for value in (math.nan, 1e300, -40.0, 3.0)]
     pool += [lambda answer: replace(answer, seq=answer.seq - 1)]
     faults = {n: pool[int(rng.integers(len(pool)))] for n in range(steps) if rng.random() < 0.4}
     samples = []

@@ -32,13 +32,13 @@ COUNT = 60
 TOOL = ROOT / "tools" / "storage.py"
 
 
-def fly(recorder: SyncRecorder, clock: Clock, items: list[Item]) -> None:
+def fly_to_disk(recorder: SyncRecorder, clock: Clock, items: list[Item]) -> None:
     for topic, at_ns, record in items:
         clock.now_s += 0.1
         recorder.put(topic, at_ns, record)
 
 
-class FullFrom:
+class FullDisk:
     """A disk that is full from one operation on."""
 
     def __init__(self, first: int) -> None:
@@ -66,7 +66,7 @@ def test_29_disk_full_at_every_operation_loses_nothing(tmp_path: Path, again_aft
         path = tmp_path / f"at{number}" / "flight.mcap"
         clock, disk = Clock(), Disk({number, number + again_after}.__contains__)
         recorder = SyncRecorder(path, LogConfig(chunk_bytes=1024), open_file=disk.open, clock=clock)
-        fly(recorder, clock, items)
+        fly_to_disk(recorder, clock, items)
         status = recorder.close()
         if disk.operations <= number + again_after:
             break  # every operation has had its turn
@@ -85,14 +85,14 @@ def test_29_disk_stays_full_then_has_room_again(tmp_path: Path) -> None:
     items = flight(COUNT)
     extra: Item = ("/uavctl/event", 9 * 10**9, Event(at_ns=9 * 10**9, severity=Severity.INFO, code="late", text=""))
     clock, disk = Clock(), Disk()
-    fly(
+    fly_to_disk(
         SyncRecorder(tmp_path / "all.mcap", LogConfig(chunk_bytes=1024), open_file=disk.open, clock=clock), clock, items
     )
     for first in range(disk.operations):
         path = tmp_path / f"from{first}" / "flight.mcap"
-        clock, full = Clock(), FullFrom(first)
+        clock, full = Clock(), FullDisk(first)
         recorder = SyncRecorder(path, LogConfig(chunk_bytes=1024), open_file=Disk(full).open, clock=clock)
-        fly(recorder, clock, items)
+        fly_to_disk(recorder, clock, items)
         on_disk = drop_recorder_notes(list(read(path))) if list(path.parent.iterdir()) else []
         assert on_disk == items[: len(on_disk)]  # all that was written is readable meanwhile
         status = recorder.status()
@@ -110,9 +110,9 @@ def test_29_disk_stays_full_then_has_room_again(tmp_path: Path) -> None:
 def test_29_queue_is_bounded_while_the_disk_is_full(tmp_path: Path) -> None:
     path = tmp_path / "flight.mcap"
     items = flight(COUNT)
-    clock, full = Clock(), FullFrom(4)
+    clock, full = Clock(), FullDisk(4)
     recorder = SyncRecorder(path, LogConfig(chunk_bytes=1024, queue=16), open_file=Disk(full).open, clock=clock)
-    fly(recorder, clock, items)
+    fly_to_disk(recorder, clock, items)
     status = recorder.status()
     assert status.dropped > 0
     full.first = sys.maxsize
@@ -129,7 +129,7 @@ def test_29_a_flight_on_a_full_disk_flies_as_without_one(tmp_path: Path) -> None
     config = load_config("paper", ["duration_s=2.0"])
     design = build_design(config)
     memory, full = MemorySink(), MemorySink()
-    recorder = SyncRecorder(tmp_path / "flight.mcap", open_file=Disk(FullFrom(3)).open)
+    recorder = SyncRecorder(tmp_path / "flight.mcap", open_file=Disk(FullDisk(3)).open)
 
     class Both:
         def put(self, topic: str, at_ns: int, record: Record) -> None:
@@ -231,7 +231,7 @@ def test_31_what_the_disk_lacks_is_at_most_a_second_old(tmp_path: Path) -> None:
                 synced[0] = path.stat().st_size
 
         recorder = SyncRecorder(path, open_file=Synced, clock=clock)
-        fly(recorder, clock, items[:killed])
+        fly_to_disk(recorder, clock, items[:killed])
         cut = tmp_path / "cut.mcap"
         cut.write_bytes(path.read_bytes()[: synced[0]])  # power fails: nothing else is there
         got = drop_recorder_notes(list(read(cut)))
@@ -239,13 +239,13 @@ def test_31_what_the_disk_lacks_is_at_most_a_second_old(tmp_path: Path) -> None:
         assert killed - len(got) <= 11  # 0.1 s apart
 
 
-def flipped(data: bytes, position: int, bit: int) -> bytes:
+def flip_byte(data: bytes, position: int, bit: int) -> bytes:
     copy = bytearray(data)
     copy[position] ^= 1 << bit
     return bytes(copy)
 
 
-def readable(path: Path) -> tuple[list[Item], bool]:
+def read_records(path: Path) -> tuple[list[Item], bool]:
     """What `read` gives before it ends or refuses, and whether it refused."""
     got: list[Item] = []
     try:
@@ -282,7 +282,7 @@ def test_32_other_chunks_stay_readable(tmp_path: Path) -> None:
     assert len(offsets) > 8
     for offset in offsets:
         for position in (offset, offset + 3, offset + 8, offset + 33, offset + 60):
-            path.write_bytes(flipped(data, position, 4))
+            path.write_bytes(flip_byte(data, position, 4))
             result = list(scan(path))
             assert [item for item in result if isinstance(item, RecordedMessage)] == [
                 item for item in whole if item.offset != offset
@@ -301,8 +301,8 @@ def test_32_damage_between_the_chunks_is_refused_after_all_messages(tmp_path: Pa
     for chunk in summary.chunk_indexes:
         at = chunk.chunk_start_offset + chunk.chunk_length  # the first index record after it
         for position in (at, at + 1, at + 2, at + 7, at + 12, at + 20):
-            path.write_bytes(flipped(data, position, 4))
-            got, stopped = readable(path)
+            path.write_bytes(flip_byte(data, position, 4))
+            got, stopped = read_records(path)
             assert stopped
             assert got == items if position >= at + 15 else got == items[: len(got)]
             out.unlink(missing_ok=True)
@@ -319,7 +319,7 @@ def test_32_damaged_last_chunk_of_an_unfinished_file_is_no_torn_end(tmp_path: Pa
     record_flight(path, 30)
     data = path.read_bytes()
     end = data.rindex(b"\x0f\x04\0\0\0\0\0\0\0")
-    path.write_bytes(flipped(data[:end], stored_byte(path, b"number 29"), 0))
-    got, stopped = readable(path)
+    path.write_bytes(flip_byte(data[:end], stored_byte(path, b"number 29"), 0))
+    got, stopped = read_records(path)
     assert stopped
     assert 0 < len(got) < 31

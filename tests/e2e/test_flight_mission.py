@@ -22,7 +22,7 @@ from flight_rig import (
 )
 from loopback_rig import MemorySink, flight, lockstep, make_loop
 from report_rig import omit_figures
-from told_numbers import find_numbers
+from text_numbers import find_numbers
 
 from logs.recording.replay import replay
 from logs.recording.summary import compute_box, compute_position_errors_m, list_summary_rows, summarise
@@ -46,7 +46,7 @@ FENCE = ('fence=[{state="north",side="upper",times_s=[5,15],values=[3.0,0.9]}]',
 SHUT_OUT = ('fence=[{state="north",side="upper",times_s=[7,7.2],values=[3.0,-0.5]}]',)
 
 
-def circle(seconds: float) -> list[list[float]]:
+def make_circle(seconds: float) -> list[list[float]]:
     """Samples each half second: 0.9 m around the middle of the room in 10 s."""
     angle = 2 * np.pi * np.arange(0.0, seconds + 0.1, 0.5) / 10.0
     places: list[list[float]] = np.column_stack(
@@ -55,21 +55,21 @@ def circle(seconds: float) -> list[list[float]]:
     return places
 
 
-def as_trajectory(seconds: float) -> tuple[str]:
-    places = circle(seconds)
+def format_trajectory(seconds: float) -> tuple[str]:
+    places = make_circle(seconds)
     return (f"mission.trajectory={{times_s={(0.5 * np.arange(len(places))).tolist()},positions_m={places}}}",)
 
 
-def as_waypoints(seconds: float) -> tuple[str]:
-    return (f"mission.waypoints={circle(seconds)}",)
+def format_waypoints(seconds: float) -> tuple[str]:
+    return (f"mission.waypoints={make_circle(seconds)}",)
 
 
 @cache
-def flown(seconds: float, *overrides: str) -> MemorySink:
+def fly_mission(seconds: float, *overrides: str) -> MemorySink:
     return lockstep("room-hahn-stursberg", seconds, *overrides)
 
 
-def steps(memory: MemorySink) -> list[tuple[Decision, Truth]]:
+def list_steps(memory: MemorySink) -> list[tuple[Decision, Truth]]:
     """Decisions at boundaries with the truth of that moment."""
     truths = {truth.at_ns: truth for truth in memory.of(Truth)}
     return [
@@ -79,12 +79,12 @@ def steps(memory: MemorySink) -> list[tuple[Decision, Truth]]:
     ]
 
 
-def distance_m(decision: Decision, truth: Truth) -> float:
+def compute_distance_m(decision: Decision, truth: Truth) -> float:
     assert decision.target is not None
     return float(np.linalg.norm(np.array(truth.state)[[0, 3, 6]] - np.array(decision.target)[[0, 3, 6]]))
 
 
-def beyond_limits(memory: MemorySink) -> tuple[Array, Array]:
+def compute_excess(memory: MemorySink) -> tuple[Array, Array]:
     """How far each state was beyond each limit, and how far it may be as the plan flown to it told: mostly not at all.
 
     State limits share one price: a fence that shuts the vehicle out may make it faster than it should be, too. A limit
@@ -92,7 +92,7 @@ def beyond_limits(memory: MemorySink) -> tuple[Array, Array]:
     """
     room = build_design(load_config("room-hahn-stursberg")).state_set
     plans = {plan.seq: plan for plan in memory.of(Plan)}
-    decided_steps = steps(memory)
+    decided_steps = list_steps(memory)
     beyond = np.array([truth.state for _, truth in decided_steps[1:]]) @ room.c.T - room.b
     given = np.zeros_like(beyond)
     for row, (decision, _) in zip(given, decided_steps[:-1], strict=True):
@@ -106,7 +106,7 @@ def beyond_limits(memory: MemorySink) -> tuple[Array, Array]:
 
 CASES = [
     pytest.param(22.0, WAYPOINTS, id="waypoints"),
-    pytest.param(22.0, as_trajectory(20.0), id="circle"),
+    pytest.param(22.0, format_trajectory(20.0), id="circle"),
     pytest.param(22.0, FENCE, id="fence"),
     pytest.param(12.0, SHUT_OUT, id="shut out"),
 ]
@@ -115,10 +115,10 @@ CASES = [
 @pytest.mark.slow
 @pytest.mark.parametrize(("seconds", "overrides"), CASES)
 def test_a_mission_is_flown_and_replayed_bit_for_bit(seconds: float, overrides: tuple[str, ...]) -> None:
-    memory = flown(seconds, *overrides)
+    memory = fly_mission(seconds, *overrides)
     summary = summarise(flight(memory), wall_s=1.0)
     assert (summary.input_violations, summary.failed_solves, summary.fallbacks) == (0, 0, 0)
-    beyond, given = beyond_limits(memory)
+    beyond, given = compute_excess(memory)
     assert (beyond <= given).all()
     assert overrides == SHUT_OUT or not given.any()
     config = load_config("room-hahn-stursberg", [f"duration_s={seconds}", *overrides])
@@ -127,7 +127,7 @@ def test_a_mission_is_flown_and_replayed_bit_for_bit(seconds: float, overrides: 
 
 
 def test_waypoints_are_visited_in_their_order_and_held_for_their_time() -> None:
-    decided_steps = steps(flown(22.0, *WAYPOINTS))
+    decided_steps = list_steps(fly_mission(22.0, *WAYPOINTS))
     numbers = [decision.waypoint for decision, _ in decided_steps if decision.target is not None]
     assert numbers == sorted(numbers, key=lambda number: -1 if number is None else number)
     assert set(numbers) == {0, 1, 2}
@@ -135,23 +135,23 @@ def test_waypoints_are_visited_in_their_order_and_held_for_their_time() -> None:
         at_waypoint = [(d, t) for d, t in decided_steps if d.waypoint == number]
         assert all(np.array(d.target)[[0, 3, 6]].tolist() == list(place) for d, _ in at_waypoint)
         # Arrived as the estimate says, so the truth is near by what the estimate is off at most.
-        arrived = next(d.at_ns for d, t in at_waypoint if distance_m(d, t) < ACCEPT_M + 0.15)
+        arrived = next(d.at_ns for d, t in at_waypoint if compute_distance_m(d, t) < ACCEPT_M + 0.15)
         assert at_waypoint[-1][0].at_ns - arrived >= (HOLD_S - 0.4) * 1e9
-        assert min(distance_m(d, t) for d, t in at_waypoint) < 0.15
-    assert np.mean([distance_m(d, t) for d, t in decided_steps[-10:]]) < 0.2
+        assert min(compute_distance_m(d, t) for d, t in at_waypoint) < 0.15
+    assert np.mean([compute_distance_m(d, t) for d, t in decided_steps[-10:]]) < 0.2
 
 
 @pytest.mark.slow
 def test_a_trajectory_is_followed_far_closer_than_by_chasing_its_samples() -> None:
     """Both after 5 s, in which the vehicle comes from the corner."""
-    circling, chasing = flown(22.0, *as_trajectory(20.0)), flown(22.0, *as_waypoints(20.0))
+    circling, chasing = fly_mission(22.0, *format_trajectory(20.0)), fly_mission(22.0, *format_waypoints(20.0))
 
     def middle(memory: MemorySink) -> list[tuple[Decision, Truth]]:
-        return [(d, t) for d, t in steps(memory) if 5e9 <= d.at_ns <= 20e9]
+        return [(d, t) for d, t in list_steps(memory) if 5e9 <= d.at_ns <= 20e9]
 
     wanted = {decision.at_ns: decision for decision, _ in middle(circling)}
-    following = [distance_m(d, t) for d, t in middle(circling)]
-    behind = [distance_m(wanted[d.at_ns], t) for d, t in middle(chasing) if d.at_ns in wanted]
+    following = [compute_distance_m(d, t) for d, t in middle(circling)]
+    behind = [compute_distance_m(wanted[d.at_ns], t) for d, t in middle(chasing) if d.at_ns in wanted]
     assert np.mean(following) < 0.15
     assert np.max(following) < 0.4
     assert np.mean(behind) > 3.0 * np.mean(following)
@@ -159,15 +159,15 @@ def test_a_trajectory_is_followed_far_closer_than_by_chasing_its_samples() -> No
 
 
 def test_a_fence_that_closes_in_slowly_is_kept_by_every_plan() -> None:
-    memory = flown(22.0, *FENCE)
+    memory = fly_mission(22.0, *FENCE)
     data = flight(memory)
     assert summarise(data, wall_s=1.0).slack_used == 0
     begun_s = data.targets[0][0]
-    for decision, truth in steps(memory):
+    for decision, truth in list_steps(memory):
         fence_m = np.interp(decision.at_ns * 1e-9 - begun_s, [5.0, 15.0], [3.0, 0.9])
         assert truth.state[0] <= fence_m
     # It does what it can: as near to the target as the fence and its reserve let it.
-    late_positions = [truth.state[0] for decision, truth in steps(memory) if decision.at_ns > 18e9]
+    late_positions = [truth.state[0] for decision, truth in list_steps(memory) if decision.at_ns > 18e9]
     assert 0.2 < np.mean(late_positions) < 0.9
     plan = memory.of(Plan)[-1]
     assert plan.offset > 0.5
@@ -175,7 +175,7 @@ def test_a_fence_that_closes_in_slowly_is_kept_by_every_plan() -> None:
 
 
 def test_a_fence_that_shuts_the_vehicle_out_is_relaxed_reported_and_left() -> None:
-    memory = flown(12.0, *SHUT_OUT)
+    memory = fly_mission(12.0, *SHUT_OUT)
     given = [plan for plan in memory.of(Plan) if plan.gave_way]
     assert given
     assert {"state", "equilibrium"} <= {relaxation.constraint for plan in given for relaxation in plan.gave_way}
@@ -192,7 +192,7 @@ def test_a_fence_that_shuts_the_vehicle_out_is_relaxed_reported_and_left() -> No
 @pytest.mark.slow
 @omit_figures()
 def test_the_report_shows_the_target_of_the_moment_and_the_moving_limit() -> None:
-    data = flight(flown(22.0, *WAYPOINTS))
+    data = flight(fly_mission(22.0, *WAYPOINTS))
     times_s, targets = data.targets
     assert len(times_s) == len(targets) == len({*times_s.tolist()})
     assert {tuple(target[[0, 3, 6]].tolist()) for target in targets} == set(PLACES_M)
@@ -201,13 +201,13 @@ def test_the_report_shows_the_target_of_the_moment_and_the_moving_limit() -> Non
     assert find_numbers(sentence)[::2] == [2.0, 3.0]  # waypoints, each with its time
     assert sentence.replace("&", "&amp;") in html
     assert compute_position_errors_m(data)[-1] < 0.3
-    fenced = flight(flown(22.0, *FENCE))
+    fenced = flight(fly_mission(22.0, *FENCE))
     begun_s = fenced.targets[0][0]
     lower, upper = compute_box(fenced, begun_s + np.array([0.0, 10.0, 100.0]))
     assert upper[:, 0].tolist() == pytest.approx([3.0, 1.95, 0.9])
     assert lower[:, 0].tolist() == [-3.0] * 3
     assert render_report(fenced, summarise(fenced, wall_s=1.0)).startswith("<!DOCTYPE html>")
-    moving = flight(flown(22.0, *as_trajectory(20.0)))
+    moving = flight(fly_mission(22.0, *format_trajectory(20.0)))
     assert moving.moving_target and not data.moving_target
     summary = summarise(moving, wall_s=1.0)
     assert render_report(moving, summary).startswith("<!DOCTYPE html>")
@@ -226,7 +226,7 @@ def test_the_report_shows_the_target_of_the_moment_and_the_moving_limit() -> Non
 
 
 def test_a_step_beyond_a_fence_counts_as_outside_the_limits() -> None:
-    data = flight(flown(22.0, *WAYPOINTS))
+    data = flight(fly_mission(22.0, *WAYPOINTS))
     assert summarise(data, wall_s=1.0).state_violations == 0
     fence = 'fence=[{state="north",side="upper",times_s=[0],values=[1.0]}]'
     header = msgspec.structs.replace(data.header, config_toml=dump_config(load_config("room-hahn-stursberg", [fence])))

@@ -25,7 +25,7 @@ TICK_NS = 50_000_000
 OFFBOARD, HOLD_MODE, LAND_MODE = 6 << 16, (4 << 16) | (3 << 24), (4 << 16) | (6 << 24)
 
 
-class Rig:
+class LoopRig:
     """The loop against the simulated peers; the vehicle's heartbeats can be replaced by ones of our own."""
 
     def __init__(self, *overrides: str) -> None:
@@ -53,7 +53,7 @@ class Rig:
             self.notices = [event.code for event in ticked.notices]
             for datagram in outgoing:
                 if datagram.link == "vehicle":
-                    sent += [message.get_type() for message in decode(datagram.data) if not asks_for_a_stream(message)]
+                    sent += [message.get_type() for message in decode(datagram.data) if not is_stream_request(message)]
                 if listening:
                     self.peers.receive(datagram.link, datagram.data, at_ns)
             self.tick += 1
@@ -67,7 +67,7 @@ class Rig:
         self.loop.receive("vehicle", message.pack(self._mav), self.tick * TICK_NS + late_ns)
 
 
-def asks_for_a_stream(message: Any) -> bool:
+def is_stream_request(message: Any) -> bool:
     return bool(message.get_type() == "COMMAND_LONG" and message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL)
 
 
@@ -75,14 +75,14 @@ SETPOINT, LAND = "SET_POSITION_TARGET_LOCAL_NED", "COMMAND_LONG"
 
 
 def test_an_armed_vehicle_in_its_external_mode_gets_one_setpoint_a_tick() -> None:
-    rig = Rig()
+    rig = LoopRig()
     rig.run(4)  # the first position is under way
     assert rig.run(100).count(SETPOINT) == 100
     assert rig.mode is ControlMode.TRACK
 
 
 def test_nothing_is_sent_after_the_pilot_took_over_even_if_the_mode_comes_back() -> None:
-    rig = Rig()
+    rig = LoopRig()
     rig.run(40)
     rig.heartbeat(HOLD_MODE)
     after = rig.run(1, deaf=True)
@@ -94,7 +94,7 @@ def test_nothing_is_sent_after_the_pilot_took_over_even_if_the_mode_comes_back()
 
 
 def test_a_late_tick_sends_no_setpoint_after_the_pilot_s_mode_is_received() -> None:
-    rig = Rig()
+    rig = LoopRig()
     rig.run(40)
     rig.heartbeat(HOLD_MODE, late_ns=20_000_000)  # came after the tick's grid time, before the tick ran
     assert SETPOINT not in rig.run(2, deaf=True)
@@ -102,7 +102,7 @@ def test_a_late_tick_sends_no_setpoint_after_the_pilot_s_mode_is_received() -> N
 
 @pytest.mark.fault(49)
 def test_a_take_over_in_a_backlog_counts_before_anything_goes_out_whatever_comes_behind_it() -> None:
-    rig = Rig()
+    rig = LoopRig()
     rig.run(40)
     for n in range(500):  # what a stall has kept; the tick's own time is before all of it
         rig.heartbeat(HOLD_MODE if n == 250 else OFFBOARD, late_ns=20_000_000 + n)
@@ -114,7 +114,7 @@ def test_a_take_over_in_a_backlog_counts_before_anything_goes_out_whatever_comes
 @pytest.mark.fault(50)
 @pytest.mark.parametrize("why", ["overrun", "hung-up"])
 def test_after_lost_messages_nothing_is_sent_until_the_next_heartbeat(why: str) -> None:
-    rig = Rig('solver.method="exact"')
+    rig = LoopRig('solver.method="exact"')
     rig.run(40)
     rig.loop.refused("mocap", {why: 3}, rig.tick * TICK_NS)  # of the cameras': nothing that could be the pilot's
     assert rig.run(5, deaf=True).count(SETPOINT) == 5
@@ -134,7 +134,7 @@ def test_after_lost_messages_nothing_is_sent_until_the_next_heartbeat(why: str) 
 
 
 def test_a_silent_vehicle_is_reported_and_its_landing_is_sent() -> None:
-    rig = Rig('solver.method="exact"')
+    rig = LoopRig('solver.method="exact"')
     rig.run(40)
     rig.heartbeat(OFFBOARD)
     reported = rig.loop.refused("vehicle", {"went-silent": 1}, rig.tick * TICK_NS)
@@ -144,7 +144,7 @@ def test_a_silent_vehicle_is_reported_and_its_landing_is_sent() -> None:
 
 @pytest.mark.fault(50)
 def test_the_first_message_after_a_lost_connection_is_answered_with_the_pending_landing() -> None:
-    rig = Rig('solver.method="exact"')
+    rig = LoopRig('solver.method="exact"')
     rig.run(40)
     rig.heartbeat(OFFBOARD)
     rig.loop.refused("vehicle", {"hung-up": 1}, rig.tick * TICK_NS)
@@ -155,7 +155,7 @@ def test_the_first_message_after_a_lost_connection_is_answered_with_the_pending_
 
 @pytest.mark.fault(48)
 def test_of_a_flood_of_positions_a_tick_looks_at_the_newest() -> None:
-    rig = Rig()
+    rig = LoopRig()
     rig.run(40)
     cameras = Peer(17, 18), Peer(17, 19)
     for n in range(1000):
@@ -168,7 +168,7 @@ def test_of_a_flood_of_positions_a_tick_looks_at_the_newest() -> None:
 
 
 def test_a_silent_vehicle_is_braked_and_held_for_a_while_and_then_left_to_its_own_failsafe() -> None:
-    rig = Rig()
+    rig = LoopRig()
     rig.run(40)
     assert rig.run(55, deaf=True).count(SETPOINT) == 55  # not silent yet: heartbeats come once a second
     rig.run(10, deaf=True)
@@ -182,7 +182,7 @@ def test_a_silent_vehicle_is_braked_and_held_for_a_while_and_then_left_to_its_ow
 
 
 def test_a_long_blackout_ends_in_a_landing_that_the_vehicle_obeys() -> None:
-    rig = Rig("link.blackout=[[3.0, 100.0]]")
+    rig = LoopRig("link.blackout=[[3.0, 100.0]]")
     sent = rig.run(400)
     assert sent.count(LAND) == 1
     assert not rig.peers.autopilot.pilot.is_armed and rig.peers.vehicle.position_m[2] == 0.0
@@ -191,7 +191,7 @@ def test_a_long_blackout_ends_in_a_landing_that_the_vehicle_obeys() -> None:
 
 
 def test_landing_is_asked_for_again_by_the_heartbeats_and_five_times_at_most() -> None:
-    rig = Rig("link.blackout=[[3.0, 100.0]]")
+    rig = LoopRig("link.blackout=[[3.0, 100.0]]")
     # The vehicle does not hear us: it stays in OFFBOARD, as far as its heartbeats tell.
     sent = rig.run(60)
     beats: list[int] = []
@@ -202,7 +202,7 @@ def test_landing_is_asked_for_again_by_the_heartbeats_and_five_times_at_most() -
         sent += rig.run(1, deaf=True, listening=False)
     assert sent.count(LAND) == 5
     commands = [(d.at_ns, decode(d.data)[0]) for d in rig.memory.of(Datagram) if d.outgoing]
-    asked = [at_ns for at_ns, message in commands if message.get_type() == LAND and not asks_for_a_stream(message)]
+    asked = [at_ns for at_ns, message in commands if message.get_type() == LAND and not is_stream_request(message)]
     first, *again = [at_ns // 50_000_000 for at_ns in asked]
     # Right after the first heartbeat that comes a second later; the next ones come with the heartbeats.
     expected = next(beat for beat in beats if beat >= first + 20)
@@ -211,7 +211,7 @@ def test_landing_is_asked_for_again_by_the_heartbeats_and_five_times_at_most() -
 
 
 def test_landing_is_not_asked_for_again_once_the_vehicle_lands() -> None:
-    rig = Rig("link.blackout=[[3.0, 100.0]]")
+    rig = LoopRig("link.blackout=[[3.0, 100.0]]")
     sent = rig.run(60)
     while LAND not in sent:
         if rig.tick % 10 == 0:
@@ -222,7 +222,7 @@ def test_landing_is_not_asked_for_again_once_the_vehicle_lands() -> None:
 
 
 def test_the_operator_s_stop_brakes_sends_zero_and_asks_for_landing() -> None:
-    rig = Rig()
+    rig = LoopRig()
     rig.run(30)  # on its way, at speed
     sent = rig.run(200, stop=True)
     setpoints = rig.memory.of(Setpoint)
@@ -234,7 +234,7 @@ def test_the_operator_s_stop_brakes_sends_zero_and_asks_for_landing() -> None:
 
 
 def test_without_landing_the_stop_ends_with_zero_and_asks_for_nothing() -> None:
-    rig = Rig("fallback.land=false", "fallback.brake_s=0.2")
+    rig = LoopRig("fallback.land=false", "fallback.brake_s=0.2")
     rig.run(30)
     sent = rig.run(100, stop=True)
     assert LAND not in sent and rig.loop.finished
@@ -242,7 +242,7 @@ def test_without_landing_the_stop_ends_with_zero_and_asks_for_nothing() -> None:
 
 
 def test_row_31_a_restart_is_disarmed_and_asks_for_nothing() -> None:
-    after = Rig()  # nothing of a killed daemon is left for the next one
+    after = LoopRig()  # nothing of a killed daemon is left for the next one
     sent: list[str] = []
     for _ in range(100):
         if after.tick % 10 == 0:
@@ -261,7 +261,7 @@ def test_row_31_a_restart_is_disarmed_and_asks_for_nothing() -> None:
 def test_an_order_that_the_hand_over_did_not_take_is_not_answered_with_the_last_reply(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    rig, hold = Rig(), Command(order=Order.HOLD)
+    rig, hold = LoopRig(), Command(order=Order.HOLD)
     rig.run(40)
     assert rig.loop.order(hold)
     rig.run(1)
@@ -279,7 +279,7 @@ def test_an_order_that_the_hand_over_did_not_take_is_not_answered_with_the_last_
 
 @pytest.mark.usefixtures("control_may_fail")
 def test_the_reply_of_the_hand_over_stays_if_its_request_cannot_be_sent(monkeypatch: pytest.MonkeyPatch) -> None:
-    rig, land = Rig("fallback.brake_s=0.0"), Command(order=Order.LAND)
+    rig, land = LoopRig("fallback.brake_s=0.0"), Command(order=Order.LAND)
     rig.run(40)
 
     def faulty(link: MavlinkConnection, setpoint: Setpoint) -> bytes:
@@ -294,7 +294,7 @@ def test_the_reply_of_the_hand_over_stays_if_its_request_cannot_be_sent(monkeypa
 
 @pytest.mark.usefixtures("control_may_fail")
 def test_a_failure_to_send_is_not_a_failure_of_the_controller() -> None:
-    rig = Rig()
+    rig = LoopRig()
     rig.run(40)
 
     def send(outgoing: Outgoing) -> None:

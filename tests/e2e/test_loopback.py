@@ -51,15 +51,15 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out / "flight.mcap"
 
 
-def document(capsys: pytest.CaptureFixture[str], *arguments: str, code: int = 0) -> dict[str, Any]:
+def run_document(capsys: pytest.CaptureFixture[str], *arguments: str, code: int = 0) -> dict[str, Any]:
     assert run([*arguments, "--json"]) == code
-    document: dict[str, Any] = json.loads(capsys.readouterr().out)
-    return document
+    run_document: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return run_document
 
 
 @pytest.mark.slow
 def test_loopback_sums_up_in_the_documented_keys(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    result = document(capsys, "loopback", "--config", "paper", "--duration", "8", "--out", str(tmp_path / "f"))
+    result = run_document(capsys, "loopback", "--config", "paper", "--duration", "8", "--out", str(tmp_path / "f"))
     assert result.keys() >= KEYS
     assert (result["steps"], result["slack_used"], result["input_violations"]) == (8, 0, 0)
     assert result["received"] + result["lost"] == 8
@@ -73,7 +73,7 @@ def test_over_udp_the_same_peers_fly_in_real_time(tmp_path: Path, capsys: pytest
     # Not its states: where the machine stood still, the vehicle flew on as it was told last.
     assert result["input_violations"] == result["recorder_dropped"] == 0
     assert_in_order(tmp_path / "f" / "flight.mcap", 200_000_000)
-    assert document(capsys, "log", "replay", str(tmp_path / "f" / "flight.mcap"))["identical"]
+    assert run_document(capsys, "log", "replay", str(tmp_path / "f" / "flight.mcap"))["identical"]
 
 
 def test_the_recording_states_its_origin(flown: Path) -> None:
@@ -84,19 +84,19 @@ def test_the_recording_states_its_origin(flown: Path) -> None:
 
 
 def test_replay_is_identical_and_info_counts(flown: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    replayed = document(capsys, "log", "replay", str(flown))
+    replayed = run_document(capsys, "log", "replay", str(flown))
     assert replayed["identical"] and replayed["decisions"] == 120 and replayed["first_difference"] is None
-    topics = {entry["topic"]: entry["messages"] for entry in document(capsys, "log", "info", str(flown))["topics"]}
+    topics = {entry["topic"]: entry["messages"] for entry in run_document(capsys, "log", "info", str(flown))["topics"]}
     assert topics["/uavctl/decision"] == topics["/uavctl/step_input"] == 120
     assert topics["/sim/truth"] == 12 and topics["/raw/vehicle/out"] > 120
 
 
 @pytest.mark.usefixtures("no_page")
 def test_a_replay_with_another_cost_decides_otherwise(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    document(capsys, "loopback", "--config", "paper", "--duration", "4", "--out", str(tmp_path / "f"))
+    run_document(capsys, "loopback", "--config", "paper", "--duration", "4", "--out", str(tmp_path / "f"))
     flight = str(tmp_path / "f" / "flight.mcap")
-    assert document(capsys, "log", "replay", flight)["identical"]
-    result = document(capsys, "log", "replay", flight, "--set", "cost.input=[1.0, 1.0]", code=1)
+    assert run_document(capsys, "log", "replay", flight)["identical"]
+    result = run_document(capsys, "log", "replay", flight, "--set", "cost.input=[1.0, 1.0]", code=1)
     assert not result["identical"] and result["first_difference"]
 
 
@@ -105,7 +105,7 @@ def test_the_command_prints_the_first_line_of_the_page(
 ) -> None:
     page = tmp_path / "page.html"
     with omit_figures():
-        main = document(capsys, "log", "report", str(flown), "--out", str(page))["headline"]
+        main = run_document(capsys, "log", "report", str(flown), "--out", str(page))["headline"]
         text = " ".join(unescape(re.sub(r"<[^>]+>", " ", page.read_text(encoding="utf-8"))).split())
         assert run(["log", "report", str(flown), "--out", str(page)]) == 0
     shown = " ".join(capsys.readouterr().out.split())
@@ -119,7 +119,7 @@ def test_recover_restores_a_cut_file_with_its_exit_code(
     cut, whole = tmp_path / "cut.mcap", tmp_path / "whole.mcap"
     data = flown.read_bytes()
     cut.write_bytes(data[: len(data) // 2] + b"\x05")  # begins a record, wherever the half of it ends
-    result = document(capsys, "log", "recover", str(cut), str(whole), code=3)
+    result = run_document(capsys, "log", "recover", str(cut), str(whole), code=3)
     # the clean file has one message more: the recorder's note of where it comes from
     assert result["lost_bytes"] > 0 and result["messages"] + 1 == sum(
         isinstance(entry, RecordedMessage) for entry in walk(whole)
@@ -127,7 +127,7 @@ def test_recover_restores_a_cut_file_with_its_exit_code(
     # a prefix of what was recorded, to the record; what is made for viewers is no record
     kept = list(read(whole))
     assert kept[:-1] == list(read(flown))[: len(kept) - 1] and len(kept) > 100
-    assert document(capsys, "log", "recover", str(flown), str(tmp_path / "same.mcap"))["lost_bytes"] == 0
+    assert run_document(capsys, "log", "recover", str(flown), str(tmp_path / "same.mcap"))["lost_bytes"] == 0
 
 
 @pytest.mark.parametrize(
@@ -191,8 +191,8 @@ def test_a_flight_without_its_page_has_a_complete_summary(
     monkeypatch.setattr("uavctl.cli.flying.draw_page", fails)
     assert run(["loopback", "--config", "room", "--duration", "1", "--out", str(tmp_path), "--json"]) == 0
     output = capsys.readouterr()
-    document = json.loads(output.out)
-    assert document["report"] is None and Path(document["recording"]).exists()
+    run_document = json.loads(output.out)
+    assert run_document["report"] is None and Path(run_document["recording"]).exists()
     assert "no room" in output.err
 
 

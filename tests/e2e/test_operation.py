@@ -36,7 +36,7 @@ def wait_for_flight(air: Scene) -> None:
     wait_until(lambda: air.ctl("status")[0] == 0 and air.status()["mode"] == "track", "the daemon tracks")
 
 
-def decisions(air: Scene, out: str = "f") -> list[Decision]:
+def read_decisions(air: Scene, out: str = "f") -> list[Decision]:
     return list(records(air.folder / out / "flight.mcap", Decision))
 
 
@@ -81,9 +81,10 @@ def test_after_sigkill_nothing_is_sent_and_the_vehicle_s_own_failsafe_acts(air: 
         wait_for_flight(air)
         # What is on the disk once stays there: the last second at most may be lost.
         wait_until(
-            lambda: ControlMode.TRACK in [decision.mode for decision in decisions(air)], "the flight is on the disk"
+            lambda: ControlMode.TRACK in [decision.mode for decision in read_decisions(air)],
+            "the flight is on the disk",
         )
-        kept = len(decisions(air))
+        kept = len(read_decisions(air))
         assert air.mode == "OFFBOARD"
         process.send_signal(signal.SIGKILL)
         process.wait(LIMIT_S)
@@ -94,7 +95,7 @@ def test_after_sigkill_nothing_is_sent_and_the_vehicle_s_own_failsafe_acts(air: 
     wait_until(lambda: max(map(abs, air.truths[-1].velocity_mps)) < 0.3, "the failsafe brings it to rest")
     air.wait_for_flight(3.0)
     assert air.tap.read_frames() == spoken
-    assert len(decisions(air)) >= kept
+    assert len(read_decisions(air)) >= kept
     with wait_for_end(air.fly("again")) as process:  # lock and socket of the dead one do not stand in the way
         wait_until(lambda: air.ctl("status")[0] == 0, "the next daemon answers")
         wait_until(lambda: air.status()["age_s"] is not None and bool(air.status()["vehicle"]), "it hears all it needs")
@@ -131,7 +132,7 @@ def test_sigterm_brakes_hands_over_and_closes_the_recording(air: Scene) -> None:
         summary, _ = process.communicate(timeout=LIMIT_S)
     assert process.returncode == 0 and json.loads(summary)["recording"].endswith("flight.mcap")
     # From the last plan on: a machine that stood still may have made it brake before.
-    modes = [mode for mode, _ in groupby(decision.mode for decision in decisions(air))]
+    modes = [mode for mode, _ in groupby(decision.mode for decision in read_decisions(air))]
     last = len(modes) - modes[::-1].index(ControlMode.TRACK)
     assert modes[last:][:3] == [ControlMode.BRAKE, ControlMode.HOLD, ControlMode.LAND]
     assert (air.folder / "f" / "flight.mcap").read_bytes().endswith(b"\x89MCAP0\r\n")

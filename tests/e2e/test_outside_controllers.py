@@ -28,7 +28,7 @@ TRUE_WORLDS = pytest.mark.parametrize(("plant", "autopilot"), [world for world i
 
 
 @pytest.fixture(scope="module")
-def ready() -> Callable[[str], Prepared]:
+def prepare_controller() -> Callable[[str], Prepared]:
     """Makes preset `room` with a controller of the module; the design is made once."""
     design = build_flight_design(load_config("room"))
 
@@ -39,7 +39,7 @@ def ready() -> Callable[[str], Prepared]:
 
 
 @dataclass
-class Seen:
+class TruthLog:
     """The true vehicle in a flight."""
 
     outside_m: float = -math.inf
@@ -50,10 +50,10 @@ class Seen:
     wrong: tuple[str, ...] = ()
 
 
-def flown(prepared: Prepared, plant: str, autopilot: str, took_ns: int = 0, path: Path | None = None) -> Seen:
+def fly_module(prepared: Prepared, plant: str, autopilot: str, took_ns: int = 0, path: Path | None = None) -> TruthLog:
     """Fly from the air, until it has landed if it has to; `took_ns`: time of plans after two seconds."""
-    config = in_world(prepared.config, plant, autopilot)
-    observed = Seen()
+    config = fly_in_world(prepared.config, plant, autopilot)
+    observed = TruthLog()
 
     def look(world: World, watch: LoopWatch, at_ns: int) -> None:
         observed.place_m = world.peers.vehicle.position_m
@@ -69,11 +69,11 @@ def flown(prepared: Prepared, plant: str, autopilot: str, took_ns: int = 0, path
     return observed
 
 
-def in_world(config: Config, plant: str, autopilot: str) -> Config:
+def fly_in_world(config: Config, plant: str, autopilot: str) -> Config:
     return replace(config, duration_s=WAY_S, sim=replace(config.sim, plant=plant, autopilot=autopilot, seed=3))
 
 
-def assert_let_go(observed: Seen, arguments: str) -> None:
+def assert_let_go(observed: TruthLog, arguments: str) -> None:
     """It never left the room, was never fast, and the end says why."""
     assert observed.wrong == () and observed.outside_m <= 0.0 and observed.speed_mps <= SPEED_MPS
     assert observed.ending is not None and observed.ending.exit_code == 1 and not observed.ending.as_ordered
@@ -81,7 +81,7 @@ def assert_let_go(observed: Seen, arguments: str) -> None:
     assert ControlMode.BRAKE in observed.modes
 
 
-def replays(path: Path, capsys: pytest.CaptureFixture[str]) -> bool:
+def assert_replay(path: Path, capsys: pytest.CaptureFixture[str]) -> bool:
     capsys.readouterr()
     run(["log", "replay", str(path), "--json"])
     return bool(json.loads(capsys.readouterr().out)["identical"])
@@ -89,11 +89,11 @@ def replays(path: Path, capsys: pytest.CaptureFixture[str]) -> bool:
 
 @pytest.mark.fault(69)
 def test_one_that_fails_brakes_within_the_room_and_replays(
-    ready: Callable[[str], Prepared], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    prepare_controller: Callable[[str], Prepared], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "flight.mcap"
-    assert_let_go(flown(ready("NotFinite"), "linear", "px4", path=path), "not finite")
-    assert replays(path, capsys)
+    assert_let_go(fly_module(prepare_controller("NotFinite"), "linear", "px4", path=path), "not finite")
+    assert assert_replay(path, capsys)
 
 
 def test_what_one_prints_is_no_part_of_the_document(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -107,9 +107,11 @@ def test_what_one_prints_is_no_part_of_the_document(tmp_path: Path, capsys: pyte
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("plant", "autopilot"), WORLDS)
-def test_a_good_one_flies_to_the_target(ready: Callable[[str], Prepared], plant: str, autopilot: str) -> None:
-    prepared = ready("Regulates")
-    observed = flown(prepared, plant, autopilot)
+def test_a_good_one_flies_to_the_target(
+    prepare_controller: Callable[[str], Prepared], plant: str, autopilot: str
+) -> None:
+    prepared = prepare_controller("Regulates")
+    observed = fly_module(prepared, plant, autopilot)
     assert (
         observed.wrong == () and observed.outside_m <= 0.0 and observed.modes <= {ControlMode.WAIT, ControlMode.TRACK}
     )
@@ -121,11 +123,11 @@ def test_a_good_one_flies_to_the_target(ready: Callable[[str], Prepared], plant:
 @TRUE_WORLDS
 @pytest.mark.parametrize("name", FAILING)
 def test_one_that_fails_never_leaves_the_room(
-    ready: Callable[[str], Prepared], name: str, plant: str, autopilot: str
+    prepare_controller: Callable[[str], Prepared], name: str, plant: str, autopilot: str
 ) -> None:
     reasons = {"NotFinite": "not finite", "WrongShape": "shape", "Leaves": "raised SystemExit: 0"}
     arguments = reasons.get(name, "raised ZeroDivisionError: no gain")
-    assert_let_go(flown(ready(name), plant, autopilot), arguments)
+    assert_let_go(fly_module(prepare_controller(name), plant, autopilot), arguments)
 
 
 @pytest.mark.fault(69)
@@ -133,7 +135,7 @@ def test_one_that_fails_never_leaves_the_room(
 @TRUE_WORLDS
 @pytest.mark.parametrize("took_ns", [60_000_000, 700_000_000])
 def test_one_that_is_late_never_leaves_the_room_and_replays(
-    ready: Callable[[str], Prepared],
+    prepare_controller: Callable[[str], Prepared],
     took_ns: int,
     plant: str,
     autopilot: str,
@@ -141,16 +143,16 @@ def test_one_that_is_late_never_leaves_the_room_and_replays(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     path = tmp_path / "flight.mcap"
-    assert_let_go(flown(ready("Regulates"), plant, autopilot, took_ns, path), "too late")
-    assert replays(path, capsys)
+    assert_let_go(fly_module(prepare_controller("Regulates"), plant, autopilot, took_ns, path), "too late")
+    assert assert_replay(path, capsys)
 
 
 @pytest.mark.slow
 @TRUE_WORLDS
 def test_one_that_flies_at_a_wall_is_braked_while_it_can_be(
-    ready: Callable[[str], Prepared], plant: str, autopilot: str
+    prepare_controller: Callable[[str], Prepared], plant: str, autopilot: str
 ) -> None:
-    observed = flown(ready("Beyond"), plant, autopilot)
+    observed = fly_module(prepare_controller("Beyond"), plant, autopilot)
     assert observed.wrong == () and observed.outside_m <= 0.3 and observed.speed_mps <= SPEED_MPS
     # The envelope may have its say while it brakes.
     assert (

@@ -21,14 +21,14 @@ FENCES = {
 }
 
 
-def flying(autopilot: str, *more: str, **parameters: float) -> TakeOffRig:
+def start_flight(autopilot: str, *more: str, **parameters: float) -> TakeOffRig:
     flight = TakeOffRig(autopilot, *RELAYED, *more).relayed()
     for name, value in parameters.items():
         assert flight.peers.autopilot.parameters.set(name, value)
     return flight.take_off().run(40.0, until=HandoverState.ENGAGED)
 
 
-def until_it_is_down(flight: TakeOffRig, seconds: float) -> None:
+def fly_to_ground(flight: TakeOffRig, seconds: float) -> None:
     """The vehicle ends on the ground, disarmed, and the flight is over."""
     flight.run(seconds, until=HandoverState.DONE)
     assert flight.loop.finished
@@ -39,14 +39,14 @@ def until_it_is_down(flight: TakeOffRig, seconds: float) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("autopilot", "mode"), FENCES)
 def test_the_vehicle_s_own_fence_ends_the_flight_on_the_ground(autopilot: str, mode: str) -> None:
-    flight = flying(autopilot, "hand_over.climb_s=15.0", **FENCES[autopilot, mode])
+    flight = start_flight(autopilot, "hand_over.climb_s=15.0", **FENCES[autopilot, mode])
     flight.run(1.0)
     flight.loop.order(Command(order=Order.GOTO, position_m=(1.5, 1.0, -2.0)))
     flight.run(20.0, until=HandoverState.FAILSAFE)
     assert flight.peers.autopilot.mode_name == mode
     assert -flight.peers.vehicle.position_m[2] < 1.7 + 0.5
     taken_ns = flight.now_ns
-    until_it_is_down(flight, 60.0)
+    fly_to_ground(flight, 60.0)
     assert not flight.setpoints_between(taken_ns, flight.now_ns)
     ending = flight.loop.ending
     assert ending.code in (Cause.VEHICLE_FENCE, Cause.FENCE_LANDED) and ending.exit_code == 1, ending

@@ -21,28 +21,28 @@ from uavctl.records import Datagram
 BOTH = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 
 
-def read(flight: TakeOffRig) -> ParameterReader:
+def read_parameters(flight: TakeOffRig) -> ParameterReader:
     reader = ParameterReader()
     for datagram in flight.memory.of(Datagram):
         reader.take(datagram)
     return reader
 
 
-def asks(data: bytes) -> bool:
+def list_requests(data: bytes) -> bool:
     return any(m.get_type().startswith("PARAM_") for m in decode(data))
 
 
-def value(index: int, count: int) -> ParamValue:
+def get_value(index: int, count: int) -> ParamValue:
     return ParamValue(system=1, component=1, name=f"P{index}", cast=0.0, bytewise=0.0, index=index, count=count)
 
 
 @BOTH
 def test_a_lossy_link_loses_none(autopilot: str) -> None:
     flight, dice = TakeOffRig(autopilot), random.Random(4)
-    flight.hears = lambda data: not asks(data) or dice.random() > 0.3
-    flight.told = lambda data: not asks(data) or dice.random() > 0.3
+    flight.hears = lambda data: not list_requests(data) or dice.random() > 0.3
+    flight.told = lambda data: not list_requests(data) or dice.random() > 0.3
     flight.run(15.0)
-    result = read(flight)
+    result = read_parameters(flight)
     assert TABLES[autopilot].keys() <= result.parameters().keys()
     assert result.count == count_parameters(result.parameters()) == len(TABLES[autopilot])
     assert flight.sent("PARAM_REQUEST_READ")  # some were lost
@@ -54,7 +54,7 @@ def test_a_lossy_link_loses_none(autopilot: str) -> None:
 
 def test_a_vehicle_that_never_answers_is_asked_a_few_times() -> None:
     flight = TakeOffRig("px4")
-    flight.hears = lambda data: not asks(data)
+    flight.hears = lambda data: not list_requests(data)
     flight.run(15.0)
     assert len(flight.sent("PARAM_REQUEST_LIST")) == MAX_TRIES and not flight.sent("PARAM_REQUEST_READ")
 
@@ -62,7 +62,7 @@ def test_a_vehicle_that_never_answers_is_asked_a_few_times() -> None:
 @BOTH
 def test_nothing_is_asked_once_it_is_armed(autopilot: str) -> None:
     flight = TakeOffRig(autopilot)
-    flight.told = lambda data: not asks(data)
+    flight.told = lambda data: not list_requests(data)
     flight.take_off().run(10.0, until=HandoverState.CLIMBING)
     armed_ns = flight.now_ns
     flight.run(6.0)
@@ -80,7 +80,7 @@ def test_it_can_be_left_out() -> None:
 def test_the_lost_ones_are_asked_for_at_a_bounded_rate_and_not_for_ever() -> None:
     asking, asked = ParameterDownload(), []
     assert asking.due(0, armed=False) == (-1,)
-    asking.handle_message(value(0, 1001))  # and of the others none comes, ever
+    asking.handle_message(get_value(0, 1001))  # and of the others none comes, ever
     for at_ns in range(0, 400 * SECOND_NS, SECOND_NS // 20):
         asked += [(at_ns, index) for index in asking.due(at_ns, armed=False)]
     assert sorted(index for _, index in asked) == sorted(MAX_READ_ROUNDS * [*range(1, 1001)])
@@ -92,7 +92,7 @@ def test_the_list_is_waited_for_while_it_comes_and_armed_ends_it_for_good() -> N
     asking = ParameterDownload()
     assert asking.due(0, armed=False) == (-1,)
     for index in range(0, 40, 2):
-        asking.handle_message(value(index, 41))
+        asking.handle_message(get_value(index, 41))
         assert asking.due((index + 1) * SECOND_NS // 10, armed=False) == ()
     assert asking.due(5 * SECOND_NS, armed=False) == tuple(range(1, 20, 2))
     assert asking.due(6 * SECOND_NS, armed=True) == ()
@@ -101,6 +101,6 @@ def test_the_list_is_waited_for_while_it_comes_and_armed_ends_it_for_good() -> N
 
 def test_what_is_no_place_in_a_list_counts_for_nothing() -> None:
     asking = ParameterDownload()
-    for odd in (value(65_535, 3), value(60_000, 65_535)):
+    for odd in (get_value(65_535, 3), get_value(60_000, 65_535)):
         asking.handle_message(odd)
     assert asking.due(0, armed=False) == (-1,)

@@ -46,7 +46,7 @@ WIND, PILOT, BLOWN, RELEASED, WAYPOINTS = RELAYED
 GPS_TRUTH = "arducopter-gps"
 
 
-def words(name: str) -> list[str]:
+def describe_statuses(name: str) -> list[str]:
     """What the vehicle was seen to be, as it changed."""
     observed: list[str] = []
     for _, status in statuses(name):
@@ -90,11 +90,11 @@ def test_no_recorded_vehicle_counts_as_restarted(name: str) -> None:
     ],
 )
 def test_modes_and_failsafes_are_parsed_as_recorded(name: str, flown: list[str]) -> None:
-    assert words(name) == flown
+    assert describe_statuses(name) == flown
 
 
 def test_a_recorded_failsafe_that_holds_is_distinguished_from_a_pilot_who_holds() -> None:
-    observed = words(OFFBOARD)
+    observed = describe_statuses(OFFBOARD)
     # Its text comes before the heartbeat with the new mode.
     flown = ["AUTO.TAKEOFF", "AUTO.LOITER", "OFFBOARD", "OFFBOARD, failsafe", "AUTO.LOITER, failsafe"]
     assert observed[2:7] == flown and "OFFBOARD" in observed[7:]
@@ -117,7 +117,7 @@ def test_the_client_s_exchange_foretells_the_vehicle_s_clock_until_the_next_answ
     assert np.median(off_ms) < (3.0 if name in OF_OTHERS else 5.0)
 
 
-def history(name: str) -> FlightHistory:
+def load_history(name: str) -> FlightHistory:
     return read_tlog_history(packets(name), load_flight_config(name))
 
 
@@ -126,14 +126,14 @@ def test_the_vehicle_s_own_estimate_comes_within_milliseconds_though_its_clock_r
     name: str, most_ms: float
 ) -> None:
     """PX4's simulated clock lost 1.5 s in 113 s: with one offset for all of it, delays were 0.1 to 0.3 s."""
-    delays_ms = 1e3 * history(name).positions.delays_s
+    delays_ms = 1e3 * load_history(name).positions.delays_s
     assert np.median(delays_ms) < 5.0
     assert np.quantile(delays_ms, 0.95) < most_ms
 
 
 def test_the_cameras_delays_are_those_of_the_simulator() -> None:
     """25 to 142 ms, of which the shortest is configured (30 ms): the simulator's clock is not the answers'."""
-    delays_ms = 1e3 * history(VICON).positions.delays_s
+    delays_ms = 1e3 * load_history(VICON).positions.delays_s
     low, middle, high = np.quantile(delays_ms, [0.05, 0.5, 0.95])
     assert (low, middle, high) == pytest.approx((34.0, 80.0, 124.0), abs=10.0)
 
@@ -141,8 +141,8 @@ def test_the_cameras_delays_are_those_of_the_simulator() -> None:
 # --- identify ----------------------------------------------------------------------------------------------------
 
 
-def link(name: str) -> LinkFit:
-    result = history(name)
+def make_flight_link(name: str) -> LinkFit:
+    result = load_history(name)
     return fit_link(result.positions, result.losses)
 
 
@@ -169,7 +169,7 @@ class Frames:
 
 
 @cache
-def frames(name: str) -> Frames:
+def read_frames(name: str) -> Frames:
     """What the rig sent and what of it came: nothing of `identify` is asked."""
     first_ns = packets(name)[0].at_ns
     arrivals_ns: dict[int, int] = {}
@@ -200,7 +200,7 @@ def frames(name: str) -> Frames:
 )
 def test_the_loss_found_is_that_of_the_frames_that_are_missing(name: str, lost: float) -> None:
     """Within 0.5 % of the frames'; all but one flight met fewer bursts than make 30 %."""
-    result, true = link(name), frames(name)
+    result, true = make_flight_link(name), read_frames(name)
     assert true.within <= 1
     assert true.lost == pytest.approx(lost, abs=0.001)
     assert result.loss == pytest.approx(true.lost, abs=0.005)
@@ -211,7 +211,7 @@ def test_the_loss_found_is_that_of_the_frames_that_are_missing(name: str, lost: 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", RELAYED)
 def test_the_rig_s_blackouts_rate_and_delays_are_found(name: str) -> None:
-    result, true = link(name), frames(name)
+    result, true = make_flight_link(name), read_frames(name)
     assert len(result.outages_s) == len(find_event_times_s(name, BLACKOUT))
     assert all(length_s == pytest.approx(4.0, abs=0.3) for length_s in result.outages_s)
     assert result.rate_hz == pytest.approx(CAMERA_HZ, rel=0.01)
@@ -236,20 +236,20 @@ def test_all_but_a_hundredth_of_the_positions_have_the_configured_delay(name: st
 @pytest.mark.fault(59)
 def test_the_loss_of_arducopter_s_long_flight_is_the_configured_one() -> None:
     """On the mean of a long flight; the other four met fewer bursts, by their frames as well."""
-    assert link(WIND).loss == pytest.approx(0.3, abs=0.02)
+    assert make_flight_link(WIND).loss == pytest.approx(0.3, abs=0.02)
 
 
 def test_positions_of_px4_do_not_count_as_camera_positions_though_they_are_more() -> None:
     kinds = [packet.data[7] | packet.data[8] << 8 for packet in packets(WAYPOINTS) if packet.data[5] in (1, 20)]
     assert kinds.count(331) >= kinds.count(102)  # ODOMETRY, VISION_POSITION_ESTIMATE
-    assert link(WAYPOINTS).rate_hz == pytest.approx(40.0, rel=0.01)
+    assert make_flight_link(WAYPOINTS).rate_hz == pytest.approx(40.0, rel=0.01)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", RELAYED)
 def test_positions_are_captured_where_the_vehicle_truly_was(name: str) -> None:
     """The truth is 0.1 s apart, the cameras' noise 2 mm."""
-    result, rows = history(name), truth(name)
+    result, rows = load_history(name), truth(name)
     first_s = _first_capture_s(name)
     at_s = result.positions.times_s + first_s
     inside = (at_s > rows[0, 0]) & (at_s < rows[-1, 0])
@@ -334,7 +334,7 @@ GOOD, NOTE, BAD = "good", "note", "bad"
 
 
 @pytest.mark.parametrize(
-    ("name", "get_flight_time_s", "seconds"),
+    ("name", "since_s", "seconds"),
     [
         (AT_REST, 0.0, 3.4),
         (WAYPOINTS, 10.0, 10.0),
@@ -387,7 +387,7 @@ def test_parameters_that_another_client_read_are_judged_as_that_flight_was_set_u
     assert items["vehicle clock"] == NOTE
 
 
-@pytest.mark.parametrize(("name", "get_flight_time_s"), [(GPS, 60.0), (OFFBOARD, 28.0)])
+@pytest.mark.parametrize(("name", "since_s"), [(GPS, 60.0), (OFFBOARD, 28.0)])
 def test_a_vehicle_that_flies_above_the_room_is_found_out_of_it(name: str, since_s: float) -> None:
     """Both took off to 5 m."""
     lower, _ = get_room_limits(load_flight_config(name))
@@ -397,7 +397,7 @@ def test_a_vehicle_that_flies_above_the_room_is_found_out_of_it(name: str, since
     assert (items["armed"], items["landed"], items["position loss"]) == (NOTE, NOTE, GOOD)
 
 
-@pytest.mark.parametrize(("name", "get_flight_time_s"), [(VICON, 84.0), (WIND, 44.0)])
+@pytest.mark.parametrize(("name", "since_s"), [(VICON, 84.0), (WIND, 44.0)])
 def test_cameras_that_fall_silent_are_found_by_the_longest_gap(name: str, since_s: float) -> None:
     """VICON's for good, 86.4 s after the boot, WIND's for the 4 s that were ordered."""
     items = run_check(name, since_s, 8.0)
@@ -407,7 +407,7 @@ def test_cameras_that_fall_silent_are_found_by_the_longest_gap(name: str, since_
 
 def test_a_link_that_loses_half_of_the_positions_is_reported_at_rest() -> None:
     """In the first 3 s of WIND its bursts took more than half of the frames."""
-    stamps_s = frames(WIND).stamps_s
+    stamps_s = read_frames(WIND).stamps_s
     assert np.count_nonzero((stamps_s > 0.0) & (stamps_s < 3.0)) < 0.5 * 3.0 * CAMERA_HZ
     assert run_check(WIND, 0.0, 3.0)["position loss"] == BAD
 
@@ -433,31 +433,31 @@ def test_a_turned_frame_is_found_in_the_recorded_flight() -> None:
 # --- hand-over and page ------------------------------------------------------------------------------------------
 
 
-def told(memory: MemorySink) -> list[str]:
+def find_texts(memory: MemorySink) -> list[str]:
     return [event.text for event in memory.of(Event) if event.code == "hand-over"]
 
 
-def codes(memory: MemorySink) -> list[str]:
+def list_codes(memory: MemorySink) -> list[str]:
     return [event.code for event in memory.of(Event)]
 
 
 def _lost(memory: MemorySink) -> None:
     decisions = memory.of(Decision)
     assert any(decision.mode is not ControlMode.TRACK for decision in decisions)
-    assert "fallback-brake" in codes(memory)
+    assert "fallback-brake" in list_codes(memory)
 
 
 def _pilot(memory: MemorySink) -> None:
-    assert any("-> released (LOITER" in text for text in told(memory))
+    assert any("-> released (LOITER" in text for text in find_texts(memory))
 
 
 def _rest(memory: MemorySink) -> None:
-    assert "vehicle-reboot" not in codes(memory)
+    assert "vehicle-reboot" not in list_codes(memory)
     assert any("REJECTED" in event.text for event in memory.of(Event))
 
 
 def _land(memory: MemorySink) -> None:
-    assert any("-> unclear (AUTO.LAND" in text for text in told(memory))
+    assert any("-> unclear (AUTO.LAND" in text for text in find_texts(memory))
 
 
 def _failsafe(memory: MemorySink) -> None:
@@ -477,7 +477,7 @@ def _landed(memory: MemorySink) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "get_flight_time_s", "seconds", "matters", "on_the_page"),
+    ("name", "since_s", "seconds", "matters", "on_the_page"),
     [
         (WIND, 40.0, 12.0, _lost, "positions did not come back"),
         (PILOT, 10.0, 8.0, _pilot, "LOITER"),
@@ -499,7 +499,7 @@ def test_the_page_of_each_flight_names_its_cause(
     assert page.plots
 
 
-def times_s(received: LoopRecord, begin: str, code: str = "hand-over") -> list[float]:
+def find_code_times_s(received: LoopRecord, begin: str, code: str = "hand-over") -> list[float]:
     """When events of a code came whose texts begin so, since the first packet [s]."""
     result = received.memory.of(Event)
     return [
@@ -513,12 +513,12 @@ def test_the_wind_beyond_the_authority_is_met_before_it_has_blown_the_vehicle_ou
     """The real flight stayed in mode `track`, without a word, until it was 24 m outside."""
     received = listen(BLOWN, 50.0, 12.0)
     ordered_s = find_event_times_s(BLOWN, "ORDER set SIH_WIND")[0]
-    (noticed_s,) = times_s(received, "", "envelope-response")
+    (noticed_s,) = find_code_times_s(received, "", "envelope-response")
     assert noticed_s == pytest.approx(57.65, abs=0.01)
     assert noticed_s - ordered_s == pytest.approx(0.95, abs=0.1)
-    (landing_s,) = times_s(received, "engaged -> landing")
+    (landing_s,) = find_code_times_s(received, "engaged -> landing")
     assert 0.0 < landing_s - noticed_s < 0.11
-    assert codes(received.memory).index("envelope-response") < codes(received.memory).index("fallback-land")
+    assert list_codes(received.memory).index("envelope-response") < list_codes(received.memory).index("fallback-land")
 
     # What the console, the exit code and the page say of it: the reason is the envelope's own.
     (reason,) = [event.text for event in received.memory.of(Event) if event.code == "envelope-response"]
@@ -539,7 +539,7 @@ def test_before_the_wind_the_same_flight_has_no_finding() -> None:
     for since_s, seconds in ((20.0, 25.0), (51.0, 5.6)):
         received = listen(BLOWN, since_s, seconds)
         assert not received.loop.let_go and not received.notices
-        assert not [code for code in codes(received.memory) if code.startswith(("envelope", "fallback"))]
+        assert not [code for code in list_codes(received.memory) if code.startswith(("envelope", "fallback"))]
 
 
 @pytest.mark.slow
@@ -559,9 +559,9 @@ def test_a_failsafe_in_the_climb_the_pilot_and_the_order_are_reported_at_their_t
         "landing -> released (POSCTL": pilot_s[1:],
     }
     for begin, at_s in passages.items():
-        assert times_s(received, begin) == pytest.approx(at_s, abs=0.15), begin
+        assert find_code_times_s(received, begin) == pytest.approx(at_s, abs=0.15), begin
     # The vehicle took the order: it is to the pilot, at 62.4 s, that it refuses OFFBOARD, on his own connection.
-    answers_s = times_s(received, "DO_SET_MODE: ACCEPTED", "command-ack")
+    answers_s = find_code_times_s(received, "DO_SET_MODE: ACCEPTED", "command-ack")
     assert ordered_s < answers_s[-1] < ordered_s + 0.5
     assert find_event_times_s(RELEASED, "ACK 176 result 1")[0] > pilot_s[1]
     assert not any("REJECTED" in event.text or "DENIED" in event.text for event in received.memory.of(Event))

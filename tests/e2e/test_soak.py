@@ -27,7 +27,7 @@ TOOL = ROOT / "tools" / "soak.py"
 
 
 @pytest.fixture(scope="module")
-def faulty() -> Prepared:
+def faulty_controller() -> Prepared:
     return prepare_room()
 
 
@@ -97,8 +97,8 @@ def test_an_ardupilot_without_setpoints_hovers_in_any_hand_over_state() -> None:
 
 
 @pytest.mark.slow
-def test_flights_with_random_faults_have_no_findings(faulty: Prepared) -> None:
-    batch = fly_faults(faulty, 0, 0.03, warm_up=1, flight_s=60.0)
+def test_flights_with_random_faults_have_no_findings(faulty_controller: Prepared) -> None:
+    batch = fly_faults(faulty_controller, 0, 0.03, warm_up=1, flight_s=60.0)
     assert not batch.wrong
     assert batch.flights >= 2
     assert batch.ticks == sum(batch.modes.values()) > 2000
@@ -119,20 +119,20 @@ def test_the_faults_of_many_seeds_are_of_every_kind_and_the_same_each_time() -> 
     ("planted", "text"), [((2.1, 0.0, 0.0), "beyond"), ((math.nan, 0.0, 0.0), "not finite"), ((1.9, 0.0, 0.0), "leaps")]
 )
 def test_a_planted_setpoint_is_found_and_its_flight_recorded(
-    faulty: Prepared, planted: Vec3, text: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    faulty_controller: Prepared, planted: Vec3, text: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr("uavctl.flight.act.limit_setpoint", lambda *_: (planted, ()))
-    batch = fly_faults(faulty, 3, 1e-6, warm_up=0, out=tmp_path, flight_s=2.0)
+    batch = fly_faults(faulty_controller, 3, 1e-6, warm_up=0, out=tmp_path, flight_s=2.0)
     assert any(text in finding for finding in batch.wrong[3])
     assert any(isinstance(record, Truth) for _, _, record in read(tmp_path / "faults-3.mcap"))
 
 
-def test_an_exception_is_a_finding(faulty: Prepared, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_exception_is_a_finding(faulty_controller: Prepared, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*_: object) -> None:
         raise ZeroDivisionError("planted")
 
     monkeypatch.setattr("uavctl.flight.act.limit_setpoint", broken)
-    assert fly_faults(faulty, 3, 1e-6, warm_up=0).wrong == {3: ("ZeroDivisionError: planted",)}
+    assert fly_faults(faulty_controller, 3, 1e-6, warm_up=0).wrong == {3: ("ZeroDivisionError: planted",)}
 
 
 @pytest.mark.slow

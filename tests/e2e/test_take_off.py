@@ -21,7 +21,7 @@ SET_MODE, ARM, TAKE_OFF, LAND = 176, 400, 22, 21
 ARDUPILOT_EXTERNAL = {"GPS1_TYPE": 0, "VISO_TYPE": 1, "EK3_SRC1_POSXY": 6, "EK3_SRC1_POSZ": 6, "EK3_SRC1_YAW": 6}
 
 
-def heartbeat(system: int) -> bytes:
+def make_heartbeat(system: int) -> bytes:
     mav = mavlink.MAVLink(None, srcSystem=system, srcComponent=1)
     return bytes(mavlink.MAVLink_heartbeat_message(2, 12, 29, 4 << 16 | 3 << 24, 3, 3).pack(mav))
 
@@ -92,7 +92,7 @@ def test_nothing_is_armed_without_fresh_positions(autopilot: str) -> None:
 @pytest.mark.fault(16)
 def test_a_second_vehicle_on_the_link_refuses_arming() -> None:
     flight = TakeOffRig("px4").run(0.5)
-    flight.loop.receive("vehicle", heartbeat(9), flight.now_ns)
+    flight.loop.receive("vehicle", make_heartbeat(9), flight.now_ns)
     flight.run(1.2).take_off().run(1.0)
     assert flight.is_in(HandoverState.FAILED) and "another vehicle" in flight.loop.failure
     assert flight.commands() == []

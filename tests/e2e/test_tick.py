@@ -27,7 +27,7 @@ WARM_S = 1.0  # what is done once in a flight is done by then
 
 
 @dataclass
-class Watched:
+class WatchedLoop:
     """A loop whose calls are watched; implements `uavctl.records.Flyer`."""
 
     loop: ControlLoop
@@ -37,7 +37,7 @@ class Watched:
     at_s: float = 0.0
 
     def receive(self, link: str, data: bytes, at_ns: int) -> Received:
-        received, files = crossed(lambda: self.loop.receive(link, data, at_ns))
+        received, files = trace_call(lambda: self.loop.receive(link, data, at_ns))
         if received.from_source and self.at_s > WARM_S:
             self.positions.append(files)
         return received
@@ -45,7 +45,7 @@ class Watched:
     def tick(self, tick: int, at_ns: int, send: Send) -> None:
         before, self.at_s = len(self.memory.entries), at_ns * 1e-9
         outgoing: list[Outgoing] = []
-        _, files = crossed(lambda: self.loop.tick(tick, at_ns, outgoing.append))
+        _, files = trace_call(lambda: self.loop.tick(tick, at_ns, outgoing.append))
         kinds = {type(record) for _, _, record in self.memory.entries[before:]}
         if Plan in kinds and LinkStats not in kinds and self.at_s > WARM_S:  # counters of a second are not of the tick
             self.planning.append(files)
@@ -53,7 +53,7 @@ class Watched:
             send(datagram)
 
 
-def crossed(call: Callable[[], T]) -> tuple[T, frozenset[str]]:
+def trace_call(call: Callable[[], T]) -> tuple[T, frozenset[str]]:
     """What a call gives, and the product's files in which a function was called meanwhile."""
     files: set[str] = set()
 
@@ -73,17 +73,17 @@ def crossed(call: Callable[[], T]) -> tuple[T, frozenset[str]]:
 
 
 @pytest.fixture(scope="module")
-def watched() -> Watched:
+def watched_loop() -> WatchedLoop:
     config = load_config("room-px4")
     memory = MemorySink()
-    flyer = Watched(make_loop(config, memory), memory)
+    flyer = WatchedLoop(make_loop(config, memory), memory)
     World(config, flyer).run(5.0)
     return flyer
 
 
-def test_a_position_crosses_few_files(watched: Watched) -> None:
-    assert len(watched.positions) > 30
-    assert max(map(len, watched.positions)) <= 12
+def test_a_position_crosses_few_files(watched_loop: WatchedLoop) -> None:
+    assert len(watched_loop.positions) > 30
+    assert max(map(len, watched_loop.positions)) <= 12
 
 
 def test_the_phases_run_in_the_order_that_the_page_draws() -> None:
@@ -94,12 +94,12 @@ def test_the_phases_run_in_the_order_that_the_page_draws() -> None:
     assert modules == [f"uavctl.flight.{name}" for name, _ in drawn]
 
 
-def test_planning_ticks_were_watched(watched: Watched) -> None:
-    assert len(watched.planning) > 30
+def test_planning_ticks_were_watched(watched_loop: WatchedLoop) -> None:
+    assert len(watched_loop.planning) > 30
 
 
 @pytest.mark.parametrize(("title", "of"), [("A position", "positions"), ("A planning tick", "planning")])
-def test_the_page_draws_what_is_crossed(watched: Watched, title: str, of: str) -> None:
+def test_the_page_draws_what_is_crossed(watched_loop: WatchedLoop, title: str, of: str) -> None:
     (section,) = re.findall(rf"^## {title}\n(.*?)(?=^## |\Z)", PAGE, re.MULTILINE | re.DOTALL)
     drawn = set(re.findall(r"uavctl/\S+\.py", section))
-    assert frozenset().union(*getattr(watched, of)) == drawn
+    assert frozenset().union(*getattr(watched_loop, of)) == drawn

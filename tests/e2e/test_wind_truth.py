@@ -34,7 +34,7 @@ SETPOINT_ACCEL = 10 + 28  # of SET_POSITION_TARGET_LOCAL_NED: header, time, posi
 
 
 @dataclass
-class Blown:
+class WindResult:
     """What a flight in wind came to."""
 
     codes: list[str]  # of its events
@@ -47,7 +47,7 @@ class Blown:
     mode: str
 
 
-class _Told:
+class EventLog:
     def __init__(self) -> None:
         self.events: list[Event] = []
 
@@ -57,7 +57,7 @@ class _Told:
             self.events.append(record)
 
 
-class _Flyer(TrackedFlyer):
+class WindFlyer(TrackedFlyer):
     """Notes when poses go to the vehicle, and lets the wind blow at its time."""
 
     def __init__(self, flyer: ControlLoop, push_mps2: Vec3) -> None:
@@ -79,7 +79,7 @@ class _Flyer(TrackedFlyer):
         super().tick(tick, at_ns, noting)
 
 
-def blown(autopilot: str, push_mps2: Vec3, *overrides: str, seed: int = 3, over_s: float = OVER_S) -> Blown:
+def fly_in_wind(autopilot: str, push_mps2: Vec3, *overrides: str, seed: int = 3, over_s: float = OVER_S) -> WindResult:
     """A vehicle at rest at the preset's target; the wind pushes it with so much while it stands still."""
     config = load_config(
         f"room-{autopilot}",
@@ -93,8 +93,8 @@ def blown(autopilot: str, push_mps2: Vec3, *overrides: str, seed: int = 3, over_
             *overrides,
         ],
     )
-    events = _Told()
-    flyer = _Flyer(ControlLoop(config, get_cached_controller(config), events, lambda: 0), push_mps2)
+    events = EventLog()
+    flyer = WindFlyer(ControlLoop(config, get_cached_controller(config), events, lambda: 0), push_mps2)
     world = World(config, flyer)
     craft = world.peers.vehicle
     assert isinstance(craft, Quadrotor)
@@ -111,7 +111,7 @@ def blown(autopilot: str, push_mps2: Vec3, *overrides: str, seed: int = 3, over_
     off = np.linalg.norm(where - np.array(goals[-1]), axis=1)
     lower, upper = get_room_limits(config)
     let_go = [event.at_ns * 1e-9 for event in events.events if event.code in RELEASES]
-    return Blown(
+    return WindResult(
         codes=[event.code for event in events.events],
         from_target_m=float(off[times > over_s - 1.0].max()),
         worst_m=float(off[times > BEGINS_S].max()),
@@ -136,7 +136,7 @@ def blown(autopilot: str, push_mps2: Vec3, *overrides: str, seed: int = 3, over_
 )
 @pytest.mark.fault(71)
 def test_a_wind_that_the_vehicle_can_hold_is_held(autopilot: str, push_mps2: Vec3) -> None:
-    flight = blown(autopilot, push_mps2)
+    flight = fly_in_wind(autopilot, push_mps2)
     assert flight.let_go_s is None and not RELEASES & set(flight.codes)
     assert flight.from_target_m < NEAR_M and flight.worst_m < 1.0
     assert max(flight.relayed_s) > OVER_S - 0.5
@@ -147,7 +147,7 @@ def test_a_wind_that_the_vehicle_can_hold_is_held(autopilot: str, push_mps2: Vec
 @pytest.mark.fault(71)
 @pytest.mark.fault(72)
 def test_a_wind_that_it_cannot_hold_lets_it_land_by_its_positions(autopilot: str) -> None:
-    flight = blown(autopilot, (6.0, 0.0, 0.0))
+    flight = fly_in_wind(autopilot, (6.0, 0.0, 0.0))
     assert flight.let_go_s is not None and set(flight.codes) & {Cause.OUTSIDE, Cause.BRAKING}
     assert not OF_POSITIONS & set(flight.codes) and STRONG_PUSH in flight.codes
     after = [at_s for at_s in flight.relayed_s if flight.let_go_s < at_s < flight.let_go_s + 3.0]
@@ -172,7 +172,7 @@ TURN_S = 9.0  # when it turns at the second waypoint
 def test_a_blackout_in_wind_is_flown_through(autopilot: str, push_mps2: Vec3, overrides: tuple[str, ...]) -> None:
     """Positions that come back correct the vehicle's own velocity: that it moves, or does not brake, is not so."""
     dark = f"link.blackout=[[{TURN_S}, {TURN_S + 4.0}]]"
-    flight = blown(autopilot, push_mps2, dark, *overrides, over_s=21.0)
+    flight = fly_in_wind(autopilot, push_mps2, dark, *overrides, over_s=21.0)
     assert "fallback-brake" in flight.codes and flight.let_go_s is None
     assert flight.from_target_m < NEAR_M and flight.furthest_beyond_m < 0.0
 
@@ -183,7 +183,7 @@ def test_a_blackout_in_wind_is_flown_through(autopilot: str, push_mps2: Vec3, ov
 @pytest.mark.fault(71)
 def test_positions_that_turn_in_a_wind_are_found_and_held_back(autopilot: str) -> None:
     turns = 'sim.fault=[{at_s=8.0, kind="frame", name="turned-90"}]'
-    flight = blown(autopilot, (1.5, 0.0, 0.0), turns)
+    flight = fly_in_wind(autopilot, (1.5, 0.0, 0.0), turns)
     assert "fallback-land" in flight.codes
     assert max(flight.relayed_s) < 8.5
 
@@ -195,7 +195,7 @@ TICK_NS = 50_000_000
 NO_VELOCITY: Vec3 = (math.nan, math.nan, math.nan)
 
 
-def watched(*, feels: bool) -> tuple[MonitorState, str | None, float]:
+def watch_envelope(*, feels: bool) -> tuple[MonitorState, str | None, float]:
     """The envelope's state, breach, and time [s] at the end of the recording, or where it finds a breach."""
     config = load_config("room-px4", ["daemon.mocap=tlog", "daemon.vehicle=tlog", "relay.enabled=true"])
     parameters, link = build_envelope(config, build_plant(config)), make_links(config)[VEHICLE]
@@ -238,8 +238,8 @@ def watched(*, feels: bool) -> tuple[MonitorState, str | None, float]:
 @pytest.mark.fault(71)
 def test_a_recorded_wind_that_px4_held_is_no_false_position_by_its_inertial_data() -> None:
     """Its client of then looked at positions and setpoints alone, and let it go after 13.4 s."""
-    blind, code, at_s = watched(feels=False)
+    blind, code, at_s = watch_envelope(feels=False)
     assert code == Cause.RESPONSE and at_s == pytest.approx(13.4, abs=0.1) and not blind.acceleration.is_pushed
-    felt, none, end_s = watched(feels=True)
+    felt, none, end_s = watch_envelope(feels=True)
     assert none is None and end_s >= at_s
     assert felt.acceleration.is_pushed and felt.motion.push_mps2[0] == pytest.approx(-1.7, abs=0.3)

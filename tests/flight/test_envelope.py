@@ -361,7 +361,7 @@ def turned(degrees: float) -> Camera:
     return lambda t, truth: matrix @ truth
 
 
-@pytest.mark.parametrize("vehicle_motion", [False, True])
+@pytest.mark.parametrize("own", [False, True])
 @pytest.mark.parametrize("drag_1ps", [0.0, 0.3, 1.0])
 def test_a_vehicle_that_flies_as_it_is_told_is_quiet(drag_1ps: float, own: bool) -> None:
     assert fly(lambda t, truth: truth, drag_1ps=drag_1ps, own=own) is None
@@ -373,7 +373,7 @@ def test_a_vehicle_that_flew_on_while_we_missed_ticks_is_no_contradiction() -> N
         assert fly(lambda t, truth: truth, own=True, stall=range(begins, begins + 13)) is None
 
 
-@pytest.mark.parametrize("vehicle_motion", [False, True])
+@pytest.mark.parametrize("own", [False, True])
 @pytest.mark.parametrize(
     "camera",
     [

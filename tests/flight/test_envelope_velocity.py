@@ -361,7 +361,7 @@ def test_how_far_it_flew_in_ticks_that_were_missed_is_not_known(gap_ns: int, kno
 
 
 @pytest.mark.parametrize(
-    ("vehicle_motion", "known", "age_s", "contradicted", "believed"),
+    ("own", "known", "age_s", "contradicted", "believed"),
     [
         ((0.25, 0.0, 0.0), ZERO, 0.0, False, True),
         ((just_more(0.25), 0.0, 0.0), ZERO, 0.0, False, False),

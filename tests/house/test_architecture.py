@@ -22,25 +22,25 @@ TYPES: dict[str, type[Contract]] = {"layers": LayersContract, "forbidden": Forbi
 
 
 @pytest.fixture(scope="module")
-def graph() -> grimp.ImportGraph:
+def import_graph() -> grimp.ImportGraph:
     configure()
     return grimp.build_graph(*SETTINGS["root_packages"], include_external_packages=True, cache_dir=None)
 
 
-def broken(graph: grimp.ImportGraph) -> set[str]:
+def find_broken_contracts(import_graph: grimp.ImportGraph) -> set[str]:
     """Names of the contracts that the graph breaks."""
     session = {key: value for key, value in SETTINGS.items() if key != "contracts"}
     names = set()
     for settings in SETTINGS["contracts"]:
         options: dict[str, Any] = {key: value for key, value in settings.items() if key not in ("name", "type")}
         contract = TYPES[settings["type"]](settings["name"], session, options)
-        if not contract.check(deepcopy(graph), verbose=False).kept:
+        if not contract.check(deepcopy(import_graph), verbose=False).kept:
             names.add(settings["name"].partition(":")[0])
     return names
 
 
-def test_the_tree_keeps_every_contract(graph: grimp.ImportGraph) -> None:
-    assert broken(graph) == set()
+def test_the_tree_keeps_every_contract(import_graph: grimp.ImportGraph) -> None:
+    assert find_broken_contracts(import_graph) == set()
 
 
 @pytest.mark.parametrize(
@@ -71,19 +71,19 @@ def test_the_tree_keeps_every_contract(graph: grimp.ImportGraph) -> None:
     ],
 )
 def test_one_planted_import_breaks_its_contract(
-    graph: grimp.ImportGraph, importer: str, imported: str, contract: str
+    import_graph: grimp.ImportGraph, importer: str, imported: str, contract: str
 ) -> None:
-    planted = deepcopy(graph)
+    planted = deepcopy(import_graph)
     planted.add_import(importer=importer, imported=imported)
-    assert contract in broken(planted)
+    assert contract in find_broken_contracts(planted)
 
 
-def test_an_indirect_import_counts(graph: grimp.ImportGraph) -> None:
-    planted = deepcopy(graph)
+def test_an_indirect_import_counts(import_graph: grimp.ImportGraph) -> None:
+    planted = deepcopy(import_graph)
     # Neither step is forbidden by itself: the frames are below the core, and only the core must not know sockets.
     planted.add_import(importer="uavctl.smpc", imported="uavctl.frames")
     planted.add_import(importer="uavctl.frames", imported="socket")
-    assert "The control core is pure" in broken(planted)
+    assert "The control core is pure" in find_broken_contracts(planted)
 
 
 def test_a_folder_of_the_package_s_name_does_not_hide_it(tmp_path: Path) -> None:

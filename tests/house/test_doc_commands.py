@@ -15,7 +15,7 @@ from uavctl.cli.app import app
 from uavctl.cli.common import Common
 
 
-def flights() -> list[str]:
+def find_loopbacks() -> list[str]:
     """Every `uavctl loopback` of a block of commands."""
     results = []
     for page in ("README.md", "docs/quick-start.md"):
@@ -25,10 +25,10 @@ def flights() -> list[str]:
 
 
 def test_the_pages_have_such_commands() -> None:
-    assert len(flights()) >= 6
+    assert len(find_loopbacks()) >= 6
 
 
-@pytest.mark.parametrize("line", flights())
+@pytest.mark.parametrize("line", find_loopbacks())
 def test_a_design_can_be_made_of_each(line: str) -> None:
     arguments = shlex.split(line, comments=True)
     given = [
@@ -54,24 +54,24 @@ def test_a_command_for_one_recording_is_not_given_all_of_them() -> None:
         assert not bare.search((ROOT / page).read_text(encoding="utf-8"))
 
 
-def expected() -> list[str]:
+def find_expected_commands() -> list[str]:
     """The command of each row of what people expect."""
     page = (ROOT / "docs" / "expectations.md").read_text(encoding="utf-8")
     return [re.findall(r"`([^`]+)`", row)[-1] for row in re.findall(r"^\| \d+ \|.*$", page, re.M)]
 
 
 def test_what_people_expect_has_a_command_in_each_of_its_rows() -> None:
-    assert len(expected()) == 28
-    assert {shlex.split(command)[0] for command in expected()} <= {"uavctl", "pytest", "make"}
+    assert len(find_expected_commands()) == 28
+    assert {shlex.split(command)[0] for command in find_expected_commands()} <= {"uavctl", "pytest", "make"}
 
 
-@pytest.mark.parametrize("command", [command for command in expected() if command.startswith("uavctl ")])
+@pytest.mark.parametrize("command", [command for command in find_expected_commands() if command.startswith("uavctl ")])
 def test_an_expectation_s_command_is_understood(command: str) -> None:
     app.parse_args(shlex.split(command)[1:], exit_on_error=False, print_error=False)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", [command for command in expected() if command.startswith("pytest ")])
+@pytest.mark.parametrize("command", [command for command in find_expected_commands() if command.startswith("pytest ")])
 def test_an_expectation_s_tests_are_there(command: str) -> None:
     arguments = [sys.executable, "-m", *shlex.split(command), "--collect-only", "-n", "0", "-p", "no:cacheprovider"]
     assert subprocess.run(arguments, cwd=ROOT, stdout=subprocess.DEVNULL, check=False).returncode == 0

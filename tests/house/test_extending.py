@@ -56,7 +56,7 @@ class Recipe:
         return done.stdout
 
 
-def change(tree: Path, text: str) -> int:
+def apply_changes(tree: Path, text: str) -> int:
     """Make the changes of a block; how many files the tree has more or otherwise."""
     first, _, body = text.partition("\n")
     path = tree / first.removeprefix("--- ")
@@ -71,7 +71,7 @@ def change(tree: Path, text: str) -> int:
     return 1
 
 
-def walk(title: str, folder: Path) -> tuple[Recipe, list[str], int]:
+def run_recipe(title: str, folder: Path) -> tuple[Recipe, list[str], int]:
     """Copy the packages and make the changes of a recipe: itself, its commands, and how many files it touched."""
     (section,) = re.findall(rf"^## {title}\n(.*?)(?=^## |\Z)", PAGE, re.MULTILINE | re.DOTALL)
     recipe = Recipe(BLOCK.findall(section), folder / "tree", folder / "work")
@@ -83,7 +83,7 @@ def walk(title: str, folder: Path) -> tuple[Recipe, list[str], int]:
     for language, text in recipe.blocks:
         named = re.match(r"# (\S+\.\w+)\n", text)
         if language == "diff":
-            touched += change(recipe.tree, text)
+            touched += apply_changes(recipe.tree, text)
         elif language == "sh":
             commands += text.splitlines()
         elif named:
@@ -96,7 +96,7 @@ def walk(title: str, folder: Path) -> tuple[Recipe, list[str], int]:
 
 @pytest.mark.slow
 def test_a_controller_flies_in_flight_campaign_and_what_if_without_an_edit(tmp_path: Path) -> None:
-    recipe, commands, touched = walk("A controller", tmp_path)
+    recipe, commands, touched = run_recipe("A controller", tmp_path)
     install, replay, flight, again, campaign = commands
     assert touched == 0
     document = json.loads(recipe.run(f"{install} --json"))
@@ -119,7 +119,7 @@ def test_the_example_package_has_what_the_page_shows(block: str, module: str) ->
 
 @pytest.mark.slow
 def test_the_example_package_is_installed_tested_and_known_by_its_names(tmp_path: Path) -> None:
-    recipe, _, _ = walk("A controller", tmp_path)
+    recipe, _, _ = run_recipe("A controller", tmp_path)
     (recipe.work / "mine.py").unlink()
     package, site = tmp_path / "own-parts", tmp_path / "site"
     shutil.copytree(EXAMPLE, package, ignore=shutil.ignore_patterns("__pycache__"))
@@ -129,12 +129,12 @@ def test_the_example_package_is_installed_tested_and_known_by_its_names(tmp_path
     recipe.run(f"python -m pytest -q -n 0 -p no:cacheprovider {package / 'tests'}")
     flight = "uavctl loopback --config room --duration 6 --set smpc.controller=careful --out own --json"
     assert set(json.loads(recipe.run(flight))["methods"]) == {"careful"}
-    assert heard(recipe, "lines://127.0.0.1:{port}/drone") == [1.5, -2.0, -1.0]
+    assert receive_position(recipe, "lines://127.0.0.1:{port}/drone") == [1.5, -2.0, -1.0]
 
 
 @pytest.mark.slow
 def test_a_topic_is_recorded_and_read(tmp_path: Path) -> None:
-    recipe, (script, info), touched = walk("A topic", tmp_path)
+    recipe, (script, info), touched = run_recipe("A topic", tmp_path)
     assert touched == 2
     assert recipe.run(script) == "[0.25]\n"
     assert "/uavctl/distance" in recipe.run(info)
@@ -142,7 +142,7 @@ def test_a_topic_is_recorded_and_read(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_fault_happens(tmp_path: Path) -> None:
-    recipe, (flight,), touched = walk("A fault", tmp_path)
+    recipe, (flight,), touched = run_recipe("A fault", tmp_path)
     assert touched == 2
     document = json.loads(recipe.run(f"{flight} --json"))
     amiss = {truth.at_ns: truth.faults for truth in records(recipe.work / document["recording"], Truth)}
@@ -152,7 +152,7 @@ def test_a_fault_happens(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_monitor_releases_the_vehicle(tmp_path: Path) -> None:
-    recipe, (flight,), touched = walk("A monitor", tmp_path)
+    recipe, (flight,), touched = run_recipe("A monitor", tmp_path)
     assert touched == 4
     document = json.loads(recipe.run(f"{flight} --json || test $? = 1"))
     events = list(records(recipe.work / document["recording"], Event))
@@ -161,7 +161,7 @@ def test_a_monitor_releases_the_vehicle(tmp_path: Path) -> None:
     assert landed.at_ns - released.at_ns < 1_000_000_000
 
 
-class Server(threading.Thread):
+class LineServer(threading.Thread):
     """A server of lines on loopback: a body at rest, and its clock."""
 
     def __init__(self) -> None:
@@ -198,10 +198,10 @@ print(found[0].position_m)
 """
 
 
-def heard(recipe: Recipe, url: str) -> list[float]:
+def receive_position(recipe: Recipe, url: str) -> list[float]:
     """The first position that comes of a server's."""
     (recipe.work / "hear.py").write_text(SCRIPT)
-    server = Server()
+    server = LineServer()
     server.start()
     try:
         place = recipe.run(f"python hear.py {url.format(port=server.port)}")
@@ -211,9 +211,9 @@ def heard(recipe: Recipe, url: str) -> list[float]:
 
 
 def test_a_position_source_is_a_class(tmp_path: Path) -> None:
-    recipe, commands, touched = walk("A position source", tmp_path)
+    recipe, commands, touched = run_recipe("A position source", tmp_path)
     assert (touched, commands) == (0, [])
-    assert heard(recipe, "lines:Lines://127.0.0.1:{port}/drone") == [1.5, -2.0, -1.0]
+    assert receive_position(recipe, "lines:Lines://127.0.0.1:{port}/drone") == [1.5, -2.0, -1.0]
     with pytest.raises(AssertionError, match="does the server run there"):
         recipe.run("python hear.py lines:Lines://127.0.0.1:9/drone")
     with pytest.raises(AssertionError, match=r"cannot be made \(ModuleNotFoundError"):
@@ -221,6 +221,6 @@ def test_a_position_source_is_a_class(tmp_path: Path) -> None:
 
 
 def test_an_autopilot_is_a_row(tmp_path: Path) -> None:
-    recipe, (script,), touched = walk("An autopilot", tmp_path)
+    recipe, (script,), touched = run_recipe("An autopilot", tmp_path)
     assert touched == 1
     assert recipe.run(script) == "generic ('COMPANION', True) ('LAND', False)\n"

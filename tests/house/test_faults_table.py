@@ -14,7 +14,7 @@ PAGE = TESTS.parent / "docs" / "faults.md"
 NUMBERS = range(1, 73)
 
 
-def marked(source: str) -> list[tuple[int, str]]:
+def find_marked_tests(source: str) -> list[tuple[int, str]]:
     """(row, function) of every test in a file that is marked with a row; parsed, not run.
 
     Raises:
@@ -35,17 +35,17 @@ def marked(source: str) -> list[tuple[int, str]]:
 
 
 @cache
-def all_marked() -> dict[int, set[str]]:
+def find_marking_files() -> dict[int, set[str]]:
     """The files, without `.py`, that show each row."""
     files: dict[int, set[str]] = defaultdict(set)
     for path in sorted(TESTS.rglob("test_*.py")):
-        for row, _ in marked(path.read_text(encoding="utf-8")):
+        for row, _ in find_marked_tests(path.read_text(encoding="utf-8")):
             files[row].add(path.stem)
     return files
 
 
 @cache
-def rows_of_page() -> dict[int, tuple[str, ...]]:
+def read_rows() -> dict[int, tuple[str, ...]]:
     """Cells of each row: fault, reaction, shown in."""
     lines = PAGE.read_text(encoding="utf-8").splitlines()
     rows = [re.split(r"\s*\|\s*", line.strip("| ")) for line in lines if re.match(r"\| \d+ \|", line)]
@@ -54,7 +54,7 @@ def rows_of_page() -> dict[int, tuple[str, ...]]:
 
 
 def test_the_page_has_every_row_in_order_and_complete() -> None:
-    rows = rows_of_page()
+    rows = read_rows()
     assert list(rows) == list(NUMBERS)
     assert all(len(cells) == 3 and all(cells) for cells in rows.values())
 
@@ -62,17 +62,17 @@ def test_the_page_has_every_row_in_order_and_complete() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("row", NUMBERS)
 def test_each_row_has_its_tests_in_the_named_files(row: int) -> None:
-    shown_by = all_marked()[row]
+    shown_by = find_marking_files()[row]
     assert shown_by, f"no test is marked with fault({row})"
-    named = set(re.findall(r"`(\w+)`", rows_of_page()[row][2]))
+    named = set(re.findall(r"`(\w+)`", read_rows()[row][2]))
     assert named
     assert named <= shown_by, f"row {row} is shown by {sorted(shown_by)}"
 
 
 def test_marks_are_found_as_pytest_finds_them() -> None:
     text = '@pytest.mark.parametrize("x", [1])\n@pytest.mark.fault(3, 4)\ndef test_a(): ...\n# @pytest.mark.fault(5)\n'
-    assert marked(text) == [(3, "test_a"), (4, "test_a")]
-    assert marked("class TestIt:\n    @pytest.mark.fault(7)\n    def test_b(self): ...") == [(7, "test_b")]
+    assert find_marked_tests(text) == [(3, "test_a"), (4, "test_a")]
+    assert find_marked_tests("class TestIt:\n    @pytest.mark.fault(7)\n    def test_b(self): ...") == [(7, "test_b")]
     for wrong in ("@pytest.mark.fault(99)\ndef test_a(): ...", "@pytest.mark.fault(1)\ndef helper(): ..."):
         with pytest.raises(ValueError, match="marks no row"):
-            marked(wrong)
+            find_marked_tests(wrong)

@@ -14,12 +14,12 @@ LINK = re.compile(r"(?<!\\)\[[^\]]*\]\(([^)\s]+)\)")
 CODE = re.compile(r"^```.*?^```$|`[^`\n]*`", re.MULTILINE | re.DOTALL)
 
 
-def links(page: Path) -> list[str]:
+def find_links(page: Path) -> list[str]:
     return [link for link in LINK.findall(CODE.sub("", page.read_text(encoding="utf-8"))) if "://" not in link]
 
 
 @cache
-def anchors(page: Path) -> frozenset[str]:
+def find_anchors(page: Path) -> frozenset[str]:
     """The anchors that a page's headings make, as GitHub and most renderers do."""
     text = CODE.sub(lambda code: code[0].strip("`") if "\n" not in code[0] else "", page.read_text(encoding="utf-8"))
     headings = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
@@ -28,12 +28,12 @@ def anchors(page: Path) -> frozenset[str]:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_links_lead_somewhere(page: Path) -> None:
-    for link in links(page):
+    for link in find_links(page):
         name, _, anchor = link.partition("#")
         target = (page.parent / name).resolve() if name else page
         assert target.exists(), link
         if anchor and target.suffix == ".md":
-            assert anchor in anchors(target), link
+            assert anchor in find_anchors(target), link
 
 
 def test_every_page_is_reachable_from_the_index() -> None:
@@ -41,7 +41,7 @@ def test_every_page_is_reachable_from_the_index() -> None:
     reached, todo = {index}, [index]
     while todo:
         page = todo.pop()
-        result = {(page.parent / link.partition("#")[0]).resolve() for link in links(page)}
+        result = {(page.parent / link.partition("#")[0]).resolve() for link in find_links(page)}
         new = {path for path in result if path.suffix == ".md" and path.exists()} - reached
         reached |= new
         todo += new
@@ -51,5 +51,5 @@ def test_every_page_is_reachable_from_the_index() -> None:
 def test_a_link_to_nowhere_is_found(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     page.write_text("# A `name` of it\n\n[x](#a-name-of-it) [y](none.md) `[z](code.md)`\n")
-    assert links(page) == ["#a-name-of-it", "none.md"]
-    assert anchors(page) == {"a-name-of-it"}
+    assert find_links(page) == ["#a-name-of-it", "none.md"]
+    assert find_anchors(page) == {"a-name-of-it"}

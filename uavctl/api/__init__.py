@@ -5,23 +5,23 @@ from pathlib import Path
 
 from uavctl.errors import UsageError
 
-_HOME = Path(__file__).parents[2]
+_PACKAGE_FOLDER = Path(__file__).parents[2]
 
 
-def _find_siblings() -> None:
+def _check_siblings() -> None:
     """See that `sim` and `logs`, names that anybody may give a module, are those installed with this package.
 
     Raises:
         UsageError: Another module hides one of them.
     """
     for name in ("sim", "logs"):
-        found = find_spec(name)
-        where = None if found is None or found.origin is None else Path(found.origin)
-        if where is None or where.resolve().parents[1] != _HOME.resolve():
+        spec = find_spec(name)
+        origin = None if spec is None or spec.origin is None else Path(spec.origin)
+        if origin is None or origin.resolve().parents[1] != _PACKAGE_FOLDER.resolve():
             raise UsageError(
-                f"module {name} is {where or 'missing'}, not the one of uavctl in {_HOME}; "
+                f"module {name} is {origin or 'missing'}, not the one of uavctl in {_PACKAGE_FOLDER}; "
                 "rename it, or start Python in another folder"
             )
 
 
-_find_siblings()
+_check_siblings()

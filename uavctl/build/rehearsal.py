@@ -154,8 +154,10 @@ def _fly_mission(
     for k in range(steps):
         state = advance_mission(mission, state, _make_vector(x), k * dt_ns)
         target, preview = make_question(mission, state, k * dt_ns)
-        late = int(late_steps[k])
-        request = Preview(limits=preview.limits, path=preview.path, age=late, cov=design.estimate_cov, sent=last_input)
+        age_steps = int(late_steps[k])
+        request = Preview(
+            limits=preview.limits, path=preview.path, age=age_steps, cov=design.estimate_cov, sent=last_input
+        )
         answer = design.solver.solve(k, x, target, request)
         positions_m.append(x[index])
         relaxed += bool(answer.relaxed)
@@ -164,7 +166,7 @@ def _fly_mission(
                 controller.names.rows[relaxation.index] if relaxation.constraint == "state" else ("slew", "m/s²", 1.0)
             )
             if relaxation.amount / size > worst[2]:
-                worst, ahead_s = (name, unit, relaxation.amount / size), (late + relaxation.stage) * plant.dt_s
+                worst, ahead_s = (name, unit, relaxation.amount / size), (age_steps + relaxation.stage) * plant.dt_s
         last_input = answer.inputs[0] if len(answer.inputs) else last_input
         x = vehicle.a @ x + vehicle.b @ last_input
     result = RehearsalResult(

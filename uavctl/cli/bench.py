@@ -32,8 +32,8 @@ def report_loop(common: Common, seconds: float, runs: int) -> int:
     with make_progress(auto_refresh=False) as progress:
         task = progress.add_task("")
 
-        def report(what: str, done: int, total: int) -> None:
-            progress.update(task, description=what, completed=done, total=total, refresh=True)
+        def report(stage: str, done: int, total: int) -> None:
+            progress.update(task, description=stage, completed=done, total=total, refresh=True)
 
         result = run_loop_bench(common.load().config, options, seconds, runs, report)
     common.show("bench/loop", result, lambda: render_loop(result))

@@ -159,9 +159,9 @@ TakeOff = Annotated[
 ]
 
 
-def make_key_overrides(**given: str | float | None) -> list[str]:
+def make_key_overrides(**values_by_key: str | float | None) -> list[str]:
     """Return overrides of the keys that have a value; `__` stands for the dot in a key."""
-    values = {key.replace("__", "."): value for key, value in given.items() if value is not None}
+    values = {key.replace("__", "."): value for key, value in values_by_key.items() if value is not None}
     return [f'{key}="{value}"' if isinstance(value, str) else f"{key}={value}" for key, value in values.items()]
 
 
@@ -177,7 +177,7 @@ def make_table(
     title: str,
     headings: Sequence[str],
     rows: Iterable[Iterable[RenderableType]],
-    left: Collection[str] | None = None,
+    left_headings: Collection[str] | None = None,
     *,
     fold: bool = False,
     lines: bool = False,
@@ -186,13 +186,13 @@ def make_table(
 
     Args:
         rows: Cells; a `Text` has a style.
-        left: Headings of the columns that are set flush left, the others right; the first alone if None.
+        left_headings: Headings of the columns that are set flush left, the others right; the first alone if None.
         fold: Whether a cell that is too wide continues in the next line; else it is cut.
         lines: Whether a line is drawn between the rows.
     """
     table = Table(title=title or None, title_justify="left", show_lines=lines)
     for heading in headings:
-        flush_left = heading in (headings[:1] if left is None else left)
+        flush_left = heading in (headings[:1] if left_headings is None else left_headings)
         table.add_column(heading, justify="left" if flush_left else "right", overflow="fold" if fold else "ellipsis")
     for row in rows:
         table.add_row(*(Text(cell) if isinstance(cell, str) else cell for cell in row))

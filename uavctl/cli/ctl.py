@@ -53,7 +53,7 @@ def goto(*place: Annotated[str, Parameter(allow_leading_hyphen=True)], choice: D
     Args:
         place: north,east,down, or each for itself.
     """
-    return _send_order(ControlRequest(ask="goto", position_m=_parse_place(",".join(place))), choice)
+    return _send_order(ControlRequest(ask="goto", position_m=_parse_position(",".join(place))), choice)
 
 
 OrderName = Literal["hold", "resume", "land", "engage"]
@@ -87,11 +87,11 @@ def status(*, choice: DaemonChoice = ANY_DAEMON) -> int:
     return 0
 
 
-def _parse_place(text: str) -> Vec3:
+def _parse_position(text: str) -> Vec3:
     try:
         north, east, down = map(float, text.split(","))
     except ValueError:
-        unknown = [word for word in text.split(",") if word.startswith("--")]
+        unknown = [argument for argument in text.split(",") if argument.startswith("--")]
         if unknown:
             raise UsageError(f'Unknown option: "{unknown[0]}"; see uavctl ctl goto --help') from None
         raise UsageError(f"goto {text}: write three numbers, north,east,down [m], as in 2,1,-2") from None

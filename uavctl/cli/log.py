@@ -94,8 +94,8 @@ def _choose_tlog_path(flight: Path, out: Path | None) -> Path:
 def _show_progress() -> Iterator[Watch]:
     with make_progress() as progress:
 
-        def watch(records: Iterable[RecordedMessage], total: int | None, what: str) -> Iterable[RecordedMessage]:
-            return progress.track(records, total=total, description=what)
+        def watch(records: Iterable[RecordedMessage], total: int | None, description: str) -> Iterable[RecordedMessage]:
+            return progress.track(records, total=total, description=description)
 
         yield watch
 
@@ -153,8 +153,10 @@ def _list_facts(info: RecordingInfo) -> Iterator[str]:
     for note in info.notes:
         yield f"{note.at_s:.1f} s: {note.text}"
     for link in info.connections:
-        left_out = {what: counts for what, counts in (("bad", link.bad), ("refused", link.refused)) if counts}
-        lost = "".join(f"; {what}: {format_counts(dict(sorted(counts.items())))}" for what, counts in left_out.items())
+        left_out = {reason: counts for reason, counts in (("bad", link.bad), ("refused", link.refused)) if counts}
+        lost = "".join(
+            f"; {reason}: {format_counts(dict(sorted(counts.items())))}" for reason, counts in left_out.items()
+        )
         yield (
             f"connection {link.link}: {link.datagrams} datagrams, {link.messages} messages, "
             f"{link.samples} positions{lost}"

@@ -186,8 +186,8 @@ def render_paper(
 def _format_cell(claim: Claim | None) -> Text:
     if claim is None:
         return Text("")
-    word, style = {True: ("yes: ", "green"), False: ("no: ", "red"), None: ("", "")}[claim.holds]
-    return Text.assemble((word, style), claim.measured)
+    prefix, style = {True: ("yes: ", "green"), False: ("no: ", "red"), None: ("", "")}[claim.holds]
+    return Text.assemble((prefix, style), claim.measured)
 
 
 def _describe_costs(result: VariantResult) -> str:

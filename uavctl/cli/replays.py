@@ -205,14 +205,14 @@ def find_other_versions(recorded: Header, controller: str) -> tuple[str, ...]:
         controller: Controller of another package that flew; empty if none did.
     """
     try:
-        here_versions = collect_versions(controller)
+        versions = collect_versions(controller)
     except DesignError:  # the controller of another package is not installed
-        here_versions = collect_versions("")
-    here, there = {**here_versions, "cpu": read_cpu_model()}, {**recorded.versions, "cpu": recorded.cpu}
-    if here[ARITHMETIC_NAME] != OWN and here[ARITHMETIC_NAME] == there.get(ARITHMETIC_NAME):
-        there["cpu"] = here["cpu"]  # portable arithmetic does not depend on the processor
+        versions = collect_versions("")
+    installed, recorded_versions = {**versions, "cpu": read_cpu_model()}, {**recorded.versions, "cpu": recorded.cpu}
+    if installed[ARITHMETIC_NAME] != OWN and installed[ARITHMETIC_NAME] == recorded_versions.get(ARITHMETIC_NAME):
+        recorded_versions["cpu"] = installed["cpu"]  # portable arithmetic does not depend on the processor
     return tuple(
-        f"recorded with {name} {there.get(name, 'unknown')}, here is {here.get(name, 'none')}"
-        for name in sorted(here.keys() | there.keys())
-        if here.get(name) != there.get(name)
+        f"recorded with {name} {recorded_versions.get(name, 'unknown')}, here is {installed.get(name, 'none')}"
+        for name in sorted(installed.keys() | recorded_versions.keys())
+        if installed.get(name) != recorded_versions.get(name)
     )

@@ -117,8 +117,10 @@ def render_progress(progress: TuneProgress, folder: Path) -> RenderableType:
     return Group(*parts)
 
 
-def _make_text_table(title: str, headings: Sequence[str], rows: Iterable[Sequence[str]], left: Sequence[str]) -> Table:
-    return make_table(title, headings, rows, left, fold=True)
+def _make_text_table(
+    title: str, headings: Sequence[str], rows: Iterable[Sequence[str]], left_headings: Sequence[str]
+) -> Table:
+    return make_table(title, headings, rows, left_headings, fold=True)
 
 
 FAILED, INTERRUPTED, PILOT = 1, 130, 4  # exit codes: a flight failed, Ctrl-C, the pilot has taken over
@@ -178,7 +180,7 @@ def tune(
     check_tunable(loaded.config)
     with locate_design_errors(loaded):
         settings = _FlightSettings.check(loaded.config, box, flight, simulated=loopback, take_off_m=take_off_m)
-    asked = TuneSettings(
+    options = TuneSettings(
         box=""
         if settings.box is None
         else ",".join(f"{coordinate:g}" for coordinate in (*settings.box.lower, *settings.box.upper)),
@@ -187,7 +189,7 @@ def tune(
         take_off_m=take_off_m,
     )
     with lock_run(folder):
-        run = _TuneRun(TuneFolder.open(folder, loaded.config, asked), loaded.config, settings, yes=yes or loopback)
+        run = _TuneRun(TuneFolder.open(folder, loaded.config, options), loaded.config, settings, yes=yes or loopback)
         try:
             code, stop_reason = run.run()
         except KeyboardInterrupt:  # outside of a flight, which handles it itself

@@ -77,7 +77,9 @@ def explain_error(error: CycloptsError, arguments: Sequence[str], app: App) -> s
         return describe_unknown_command(error.unused_tokens[0], _find_command(app, chain), ("uavctl", *chain))
     if isinstance(error, UnusedCliTokensError) and error.unused_tokens:
         unused = list(error.unused_tokens)
-        settings = [text for word in unused for text in _find_settings(*_split_option(word), error)][:MAX_SUGGESTED]
+        settings = [text for argument in unused for text in _find_settings(*_split_option(argument), error)][
+            :MAX_SUGGESTED
+        ]
         hint = f"write {' or '.join(settings)}" if settings else format_usage_line(app, chain)
         return f"{' '.join(['uavctl', *chain])} does not understand {_quote(unused)}; {hint}"
     if isinstance(error, MissingArgumentError) and error.argument is not None:
@@ -85,28 +87,32 @@ def explain_error(error: CycloptsError, arguments: Sequence[str], app: App) -> s
     return str(error)
 
 
-def describe_unknown_command(word: str, app: App, chain: Iterable[str]) -> str:
+def describe_unknown_command(argument: str, app: App, chain: Iterable[str]) -> str:
     """Return a message on an unknown command, with a similar one, or all of them."""
     names = [name for name in app if not name.startswith("-")]
-    matches = get_close_matches(word, names, 1)
+    matches = get_close_matches(argument, names, 1)
     hint = f' Did you mean "{matches[0]}"?' if matches else f" Commands are {', '.join(names)}."
     prefix = " ".join(chain)
-    return f'Unknown command "{word}".{hint}' if prefix == "uavctl" else f'Unknown command "{word}" of {prefix}.{hint}'
+    return (
+        f'Unknown command "{argument}".{hint}'
+        if prefix == "uavctl"
+        else f'Unknown command "{argument}" of {prefix}.{hint}'
+    )
 
 
-def describe_unknown_option(word: str, names: Iterable[str]) -> str:
+def describe_unknown_option(argument: str, names: Iterable[str]) -> str:
     """Return a message on an unknown option, with similar ones."""
-    bare = word.lstrip("-").lower()
-    known = {name.lstrip("-").lower(): name for name in names if name.startswith("--")}
-    matches = [name for text, name in known.items() if bare and text.startswith(bare)]
-    matches = matches or [known[text] for text in get_close_matches(bare, known, 1)]
+    bare = argument.lstrip("-").lower()
+    name_by_text = {name.lstrip("-").lower(): name for name in names if name.startswith("--")}
+    matches = [name for text, name in name_by_text.items() if bare and text.startswith(bare)]
+    matches = matches or [name_by_text[text] for text in get_close_matches(bare, name_by_text, 1)]
     hint = f" Did you mean {' or '.join(matches[:MAX_SUGGESTED])}?" if matches else ""
-    return f"Unknown option: {word}.{hint}"
+    return f"Unknown option: {argument}.{hint}"
 
 
 def _describe_missing(error: MissingArgumentError) -> str:
     assert error.argument is not None
-    unknown = [word for word in error.unused_tokens or () if word.startswith("--")]
+    unknown = [argument for argument in error.unused_tokens or () if argument.startswith("--")]
     if error.keyword or error.argument.tokens:
         return f"{error.keyword or error.argument.name} needs a value"
     name = error.argument.name
@@ -124,8 +130,8 @@ def format_usage_line(app: App, chain: Sequence[str]) -> str:
 
 
 def _find_command(app: App, chain: Sequence[str]) -> App:
-    for word in chain:
-        app = app[word]
+    for argument in chain:
+        app = app[argument]
     return app
 
 
@@ -143,8 +149,8 @@ def _explain_unknown_option(error: UnknownOptionError, arguments: Sequence[str])
     return text if text.endswith("?") else f"{text} See {' '.join(['uavctl', *(error.command_chain or ())])} --help"
 
 
-def _split_option(word: str) -> tuple[str, str]:
-    name, _, value = word.partition("=")
+def _split_option(argument: str) -> tuple[str, str]:
+    name, _, value = argument.partition("=")
     return name, value
 
 
@@ -152,8 +158,8 @@ def _find_settings(name: str, value: str, error: CycloptsError) -> list[str]:
     """Return `--set KEY=VALUE` for each configuration key with this name, if the command takes them."""
     if SET not in _list_options(error):
         return []
-    given = value or "VALUE"
-    return [f"{SET} {shlex.quote(f'{key}={given}')}" for key in find_keys(name)]
+    value_text = value or "VALUE"
+    return [f"{SET} {shlex.quote(f'{key}={value_text}')}" for key in find_keys(name)]
 
 
 def _list_options(error: CycloptsError) -> list[str]:

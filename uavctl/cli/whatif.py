@@ -205,11 +205,11 @@ def _show_progress() -> Progress:
     return make_progress(TaskProgressColumn(), TimeElapsedColumn())
 
 
-def _make_watch(progress: Progress, what: str) -> EntryObserver:
+def _make_watch(progress: Progress, description: str) -> EntryObserver:
     """Return a function that shows a progress bar of a flight through the entries of a recording."""
 
     def watch(entries: Iterable[Entry]) -> Iterable[Entry]:
-        return progress.track(entries, description=what)
+        return progress.track(entries, description=description)
 
     return watch
 

@@ -58,7 +58,7 @@ def change_config(
     return dataclasses.replace(loaded, config=changed)
 
 
-def check_plant(plant: PlantConfig, recorded: PlantConfig, what: str) -> None:
+def check_plant(plant: PlantConfig, recorded: PlantConfig, label: str) -> None:
     """Refuse a plant whose state differs in kind from that of the recording.
 
     Raises:
@@ -72,7 +72,7 @@ def check_plant(plant: PlantConfig, recorded: PlantConfig, what: str) -> None:
             f"{n_x} states, {n_u} inputs, axes {', '.join(axes)} and steps of {dt_s:g} s"
             for n_x, n_u, axes, dt_s in shapes
         ]
-        raise UsageError(f"{what} has {kinds[0]}, the recorded flight {kinds[1]}; give one of the same kind")
+        raise UsageError(f"{label} has {kinds[0]}, the recorded flight {kinds[1]}; give one of the same kind")
 
 
 def choose_plant(path: Path | None, before: Config) -> tuple[PlantConfig, str]:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from campaign_results import cell, runs, write
 from report_rig import omit_figures
-from told_numbers import find_numbers
+from text_numbers import find_numbers
 
 from logs.report.page import render_legend
 from logs.report.run_statistics import PairedDifference

@@ -20,7 +20,7 @@ BLACKOUT_S = (5.0, 9.0)
 GUSTS = ("sim.wind.velocity_mps=[0.6, -0.36, 0.0]", "sim.wind.gust_wind_mps=3.0")
 
 
-class Told:
+class EventCodeSink:
     """A sink that keeps the codes of events."""
 
     def __init__(self) -> None:
@@ -33,7 +33,7 @@ class Told:
 
 
 @lru_cache
-def furthest_m(
+def measure_excess_m(
     autopilot: str,
     lie: str,
     seed: int,
@@ -66,7 +66,7 @@ def furthest_m(
             f"link.blackout=[[{blackout_s[0]}, {blackout_s[1]}]]",
         ],
     )
-    events = Told()
+    events = EventCodeSink()
     believed = load_config(preset, design)
     watched = TrackedFlyer(ControlLoop(believed, get_cached_controller(believed), events, lambda: 0))
     world = World(flown, watched)
@@ -108,8 +108,8 @@ def furthest_m(
 def test_an_inertial_error_from_a_blackout_is_found_by_the_vehicle_velocity(
     autopilot: str, lie: str, seed: int
 ) -> None:
-    lied_m, events = furthest_m(autopilot, lie, seed)
-    without_m, _ = furthest_m(autopilot, "none", seed)
+    lied_m, events = measure_excess_m(autopilot, lie, seed)
+    without_m, _ = measure_excess_m(autopilot, "none", seed)
     assert lied_m < 0.0 and lied_m < without_m + 0.2
     assert events & {"inertial-doubted", "inertial-silent"}
 
@@ -120,7 +120,7 @@ def test_an_inertial_error_from_a_blackout_is_found_by_the_vehicle_velocity(
 def test_an_inertial_error_from_the_start_is_found_in_an_early_blackout(autopilot: str) -> None:
     """No position could yet speak for the vehicle's own velocity: what was sent since the flight began does."""
     for seed in (3, 5):
-        lied_m, events = furthest_m(autopilot, "offset", seed, "room", (0.4, 5.4), 0.0)
+        lied_m, events = measure_excess_m(autopilot, "offset", seed, "room", (0.4, 5.4), 0.0)
         assert lied_m < 0.1 and "inertial-doubted" in events
 
 
@@ -129,7 +129,7 @@ def test_an_inertial_error_from_the_start_is_found_in_an_early_blackout(autopilo
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 def test_a_missing_vehicle_velocity_raises_no_inconsistency(autopilot: str) -> None:
     for seed in (3, 5):
-        healthy_m, events = furthest_m(autopilot, "", seed, "room", (2.5, 7.5), silent_s=2.5)
+        healthy_m, events = measure_excess_m(autopilot, "", seed, "room", (2.5, 7.5), silent_s=2.5)
         assert healthy_m < -0.4 and "inertial-doubted" not in events
 
 
@@ -137,7 +137,7 @@ def test_a_missing_vehicle_velocity_raises_no_inconsistency(autopilot: str) -> N
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 def test_correct_inertial_data_raise_no_inconsistency_and_keep_further_from_walls(autopilot: str) -> None:
     for seed in (3, 11):
-        healthy_m, events = furthest_m(autopilot, "", seed)
-        without_m, told_without = furthest_m(autopilot, "none", seed)
+        healthy_m, events = measure_excess_m(autopilot, "", seed)
+        without_m, told_without = measure_excess_m(autopilot, "none", seed)
         assert healthy_m < without_m + 0.1
         assert not (events | told_without) & {"inertial-doubted", "inertial-silent"}
