@@ -193,16 +193,16 @@ def build_conditioned(
     flown = flown and bool(config.plant.axes)
     link, allowed = build_ages(config), 1.0 - config.smpc.delta_x
     slew_mps3 = config.limits.slew_mps3 if flown else math.inf
-    plant, estimator, seen = problem.plant, config.estimator, None
+    plant, estimator, filter_plant = problem.plant, config.estimator, None
     if flown and estimator.bias_drift:
-        seen = add_bias(plant, estimator.bias_drift, force=estimator.inertial_std_mps2 > 0.0)
+        filter_plant = add_bias(plant, estimator.bias_drift, force=estimator.inertial_std_mps2 > 0.0)
     if cov is None and flown:
         cov = _settled(config, plant)
     elif cov is None:
         exact = config.risk.estimate == "exact"
         cov = np.zeros((plant.n_x,) * 2) if exact else _innovations(config, plant, 0).estimate_cov
-    solver = ConditionedSolver(problem, link, allowed, slew_mps3=slew_mps3, cov=cov, seen=seen)
-    return ConditionedDesign(solver, cov, conditioned_id(problem, link, allowed, slew_mps3, cov, seen))
+    solver = ConditionedSolver(problem, link, allowed, slew_mps3=slew_mps3, cov=cov, filter_plant=filter_plant)
+    return ConditionedDesign(solver, cov, conditioned_id(problem, link, allowed, slew_mps3, cov, filter_plant))
 
 
 def _planned_inputs(config: Config) -> Polytope:
@@ -293,7 +293,7 @@ def build_solver(design: AnyDesign, config: Config) -> Solver:
 
 def resting(design: AnyDesign) -> NDArray[np.float64]:
     """Right sides (m_x,) of the state rows, less what a plan of the scheme keeps from them that rests."""
-    return design.rests if isinstance(design, ConditionedDesign) else build_rests(design)
+    return design.rest_limits if isinstance(design, ConditionedDesign) else build_rests(design)
 
 
 def record_of(design: AnyDesign) -> dict[str, object]:

@@ -90,7 +90,7 @@ def build_trajectory(given: TrajectoryConfig, design: AnyDesign, rests: Array, d
     motion = follow_positions(design.plant, positions, velocities)
     _check_limits(motion, design)
     places = resting_places(design.plant, design.state_set, rests)
-    return plan_along(design.plant, motion, design.horizon, design.settles, *places)
+    return plan_along(design.plant, motion, design.horizon, design.rest_stage, *places)
 
 
 def wanted_positions(given: TrajectoryConfig, design: AnyDesign, dead_s: float) -> tuple[Array, Array | None]:
@@ -132,7 +132,7 @@ def build_rests(design: Design) -> Array:
 def _resting(design: AnyDesign, rests: Array) -> Room | None:
     try:
         places = resting_places(design.plant, design.state_set, rests)
-        return make_room(design.plant, design.settles, *places)
+        return make_room(design.plant, design.rest_stage, *places)
     except DesignError:
         return None
 

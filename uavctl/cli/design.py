@@ -139,7 +139,7 @@ def conditioned_picture(made: ConditionedDesign, name: str, found: RehearsalResu
     """Return tables of ages with their risk, and of where a plan may rest; and what is wrong with the mission."""
     title = f"Risk by the age of information, design {made.design_id} of {name}"
     ages = columns(title, ("age [steps]", "probability", "may be outside", "far from limits"), (), ())
-    risk, transit, problem = made.solver.risk, made.solver.risk_in_transit, made.solver.problem
+    risk, transit, problem = made.solver.risk, made.solver.transit_risk, made.solver.problem
     left = 1.0 - np.cumsum(risk.weights)
     told = min(problem.horizon, 1 + int(np.count_nonzero(left > _RARE)))
     for age in range(told):
@@ -149,13 +149,15 @@ def conditioned_picture(made: ConditionedDesign, name: str, found: RehearsalResu
         rest = f"{risk.weights[told:].sum():.3g}"
         both = (f"up to {spread.budgets[-1]:.2%}" for spread in (risk, transit))
         ages.add_row(f"{told + 1} to {problem.horizon}", rest, *both)
-    ages.add_row(f"> {problem.horizon}", f"{risk.beyond:.3g}", "counts in full", "counts in full")
+    ages.add_row(f"> {problem.horizon}", f"{risk.older_probability:.3g}", "counts in full", "counts in full")
     names = build_names(made)
     # A row of one entry limits -x from below where the entry is negative.
     sizes = problem.state_set.c.sum(axis=1)
     rows = (
         (row, f"{side / size:.3g}", f"{rest / size:.3g}", unit)
-        for (row, unit, _), size, side, rest in zip(names.rows, sizes, problem.state_set.b, made.rests, strict=True)
+        for (row, unit, _), size, side, rest in zip(
+            names.rows, sizes, problem.state_set.b, made.rest_limits, strict=True
+        )
     )
     headings = ("limit", "at", "rests up to", "unit")
     wrong = [] if found is None or not found.sentences else [*found.sentences, found.hint]

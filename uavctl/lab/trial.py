@@ -349,7 +349,7 @@ def usable_seen(config: Config, design: Design | None) -> float:
         return _volume_share(config, *resting_places(design.plant, design.state_set, build_rests(design)))
     n_x = build_plant(config).n_x
     exact = build_conditioned(config, flown=False, cov=np.zeros((n_x, n_x)))
-    return _volume_share(config, *resting_places(exact.plant, exact.state_set, exact.rests))
+    return _volume_share(config, *resting_places(exact.plant, exact.state_set, exact.rest_limits))
 
 
 def _volume_share(config: Config, least: Array, most: Array) -> float:

@@ -50,7 +50,7 @@ def test_who_is_never_near_has_no_time_and_a_steady_distance_is_held() -> None:
 def test_the_room_that_can_be_used_is_that_between_the_places_to_rest() -> None:
     config = load_config("room-hahn-stursberg", ["smpc.scheme=age-conditioned"])
     exact = build_conditioned(config, flown=False, cov=np.zeros((9, 9)))
-    assert usable_seen(config, None) == pytest.approx(share(exact.rests))
+    assert usable_seen(config, None) == pytest.approx(share(exact.rest_limits))
     design = build_design(CONFIG)
     assert usable_seen(CONFIG, design) == pytest.approx(share(build_rests(design)))
     assert usable_seen(CONFIG, design) < usable_seen(config, None) < 1.0

@@ -18,8 +18,8 @@ from uavctl.records import SolveStatus
 from uavctl.smpc.answer import NOMINAL, Answer, Path, Preview
 from uavctl.smpc.baselines import PacketisedPredictive
 from uavctl.smpc.batch import BatchSmpc
-from uavctl.smpc.conditioned.backoffs import SELDOM, age_risk, equal_risk
-from uavctl.smpc.conditioned.planner import METHOD, MOST_SHIFTING, ConditionedDecider, ConditionedSolver
+from uavctl.smpc.conditioned.backoffs import RARE_SHARE, spread_risk, spread_risk_equally
+from uavctl.smpc.conditioned.planner import MAX_SHIFT_ITERATIONS, METHOD, ConditionedDecider, ConditionedSolver
 from uavctl.smpc.link import bernoulli, gilbert_elliott
 from uavctl.smpc.nominal import ControlProblem, lqr
 
@@ -140,11 +140,11 @@ def test_no_short_cut_changes_the_answer(
         x, target = where(given, rng)
         preview = draw_preview(kind, given, rng)
         answer = solver.solve(seq, x, target, preview)
-        if answer.iterations > MOST_SHIFTING:
+        if answer.iterations > MAX_SHIFT_ITERATIONS:
             continue  # it has ended its rounds early
         compared += 1
         slow = plan_slowly(
-            given, solver.risk_towards(target, preview).shares, x, answer.reference, preview, SLEW_MPS3[name]
+            given, solver.select_risk(target, preview).shares, x, answer.reference, preview, SLEW_MPS3[name]
         )
         assert answer.inputs == pytest.approx(slow.inputs, abs=1e-6)
         assert answer.slack == pytest.approx(slow.slack, abs=1e-6)
@@ -173,7 +173,7 @@ def test_a_plan_without_slack_spends_no_more_than_the_budget_of_each_age(name: s
         assert (answer.inputs @ given.input_set.c.T <= given.input_set.b + 1e-12).all()
         if answer.slack == 0.0:
             kept += 1
-            assert (spent(given, answer, cov) <= solver.risk_towards(target).shares + 1e-9).all()
+            assert (spent(given, answer, cov) <= solver.select_risk(target).shares + 1e-9).all()
             assert not answer.relaxed
         else:
             assert sum(way.amount for way in answer.relaxed) == pytest.approx(answer.slack, abs=1e-3)
@@ -181,14 +181,14 @@ def test_a_plan_without_slack_spends_no_more_than_the_budget_of_each_age(name: s
 
 
 def test_the_weights_are_those_of_the_age() -> None:
-    risk = age_risk(LINK, np.linspace(1.0, 3.0, 12), ALLOWED)
+    risk = spread_risk(LINK, np.linspace(1.0, 3.0, 12), ALLOWED)
     assert risk.weights == pytest.approx((1.0 - LOSS) * LOSS ** np.arange(12))
-    assert risk.beyond == pytest.approx(LOSS**12)
+    assert risk.older_probability == pytest.approx(LOSS**12)
     assert risk.weights @ risk.budgets == pytest.approx(ALLOWED - LOSS**12)
     assert (np.diff(risk.budgets) >= 0.0).all()
     assert risk.budgets.max() <= 0.5
     bursts = gilbert_elliott(enter=0.1, leave=0.4, good_loss=0.05, bad_loss=0.9)
-    weights = age_risk(bursts, np.ones(40), ALLOWED).weights
+    weights = spread_risk(bursts, np.ones(40), ALLOWED).weights
     older = [bursts.outage(age) for age in range(41)]
     assert weights == pytest.approx(-np.diff(older))
 
@@ -197,7 +197,7 @@ def test_the_weights_are_those_of_the_age() -> None:
 def test_the_risk_is_spread_so_that_priced_back_offs_are_least(price: float) -> None:
     """No shift of risk from one age to another lowers Σ π_t^h β_t."""
     sigma = np.array([0.4, 0.9, 1.5, 2.2, 3.0])
-    risk = age_risk(bernoulli(np.array([0.6])), sigma, 0.08, price)
+    risk = spread_risk(bernoulli(np.array([0.6])), sigma, 0.08, price)
     priced = risk.weights**price
 
     def paid(budgets: Array) -> float:
@@ -210,15 +210,15 @@ def test_the_risk_is_spread_so_that_priced_back_offs_are_least(price: float) -> 
             moved[j] -= 1e-4 / risk.weights[j]
             if i != j and moved.max() < 0.5 and moved.min() > 0.0:
                 assert paid(moved) > paid(risk.budgets) - 1e-9
-    assert risk.weights @ risk.budgets == pytest.approx(0.08 - risk.beyond)
+    assert risk.weights @ risk.budgets == pytest.approx(0.08 - risk.older_probability)
 
 
 def test_where_two_rows_share_the_risk_no_age_is_kept_away_by_it() -> None:
     """At 10 % loss, ages of ten steps are all but never met: they take as much risk as rows can, in corners too."""
     rare = bernoulli(np.array([0.9]))
-    alone, shared = (age_risk(rare, np.linspace(0.4, 5.6, 12), ALLOWED, corner=n) for n in (1, 2))
+    alone, shared = (spread_risk(rare, np.linspace(0.4, 5.6, 12), ALLOWED, corner=n) for n in (1, 2))
     for risk in (alone, shared):
-        assert risk.weights @ risk.budgets == pytest.approx(ALLOWED - risk.beyond)
+        assert risk.weights @ risk.budgets == pytest.approx(ALLOWED - risk.older_probability)
     assert alone.budgets[-1] == pytest.approx(0.5)
     assert shared.budgets[-1] == pytest.approx(1.0)
     given = problem("paper")
@@ -230,12 +230,12 @@ def test_where_two_rows_share_the_risk_no_age_is_kept_away_by_it() -> None:
 def test_in_transit_the_ages_share_alike_but_for_those_that_hardly_come() -> None:
     """Every age that keeps something back has the same risk, and all of what is allowed is used up."""
     for loss in (0.1, 0.3, 0.8):
-        risk = equal_risk(bernoulli(np.array([1.0 - loss])), 32, ALLOWED, corner=2)
-        assert risk.weights @ risk.budgets == pytest.approx(ALLOWED - risk.beyond)
+        risk = spread_risk_equally(bernoulli(np.array([1.0 - loss])), 32, ALLOWED, corner=2)
+        assert risk.weights @ risk.budgets == pytest.approx(ALLOWED - risk.older_probability)
         counts = np.isfinite(risk.shares)
         assert np.ptp(risk.budgets[counts]) == 0.0
         assert (np.diff(counts.astype(int)) <= 0).all()
-        left = SELDOM * (ALLOWED - risk.beyond)
+        left = RARE_SHARE * (ALLOWED - risk.older_probability)
         assert risk.weights[~counts].sum() <= left
         assert risk.weights[~counts].sum() + risk.weights[counts][-1] > left  # one more would be too many
 
@@ -253,23 +253,23 @@ def test_which_spread_a_plan_has_goes_by_the_place_alone(name: str) -> None:
             key=lambda i: margin[i],
         )
         target = given.target + share * margin[row] * given.state_set.c[row] / np.vdot(*[given.state_set.c[row]] * 2)
-        chosen = solver.risk_towards(target)
+        chosen = solver.select_risk(target)
         for kind in ("covariance", "sent"):  # the first is late, too
-            assert solver.risk_towards(target, draw_preview(kind, given, rng)) is chosen
-        told.append(chosen is solver.risk_in_transit)
+            assert solver.select_risk(target, draw_preview(kind, given, rng)) is chosen
+        told.append(chosen is solver.transit_risk)
         assert told[-1] or chosen is solver.risk
     assert told[0]
     assert not told[-1]
     assert (np.diff(np.array(told, dtype=int)) <= 0).all()
-    assert solver.risk_towards(given.target, draw_preview("path", given, rng)) is solver.risk
+    assert solver.select_risk(given.target, draw_preview("path", given, rng)) is solver.risk
     narrow = np.tile(given.state_set.b - margin, (given.horizon + 1, 1))  # a fence that has come to the target
-    assert solver.risk_towards(given.target, replace(NOMINAL, limits=narrow)) is solver.risk
+    assert solver.select_risk(given.target, replace(NOMINAL, limits=narrow)) is solver.risk
 
 
 @pytest.mark.parametrize(("loss", "steps"), [(0.9, 12), (0.5, 3)])
 def test_a_horizon_that_silence_outlasts_is_refused(loss: float, steps: int) -> None:
     with pytest.raises(DesignError, match=rf"smpc.horizon: positions are {steps} steps old or more in"):
-        age_risk(bernoulli(np.array([1.0 - loss])), np.ones(steps), ALLOWED)
+        spread_risk(bernoulli(np.array([1.0 - loss])), np.ones(steps), ALLOWED)
 
 
 def test_a_state_that_no_input_reaches_is_refused() -> None:

@@ -120,10 +120,10 @@ def test_the_name_is_of_what_the_answers_depend_on() -> None:
 def test_the_solver_that_says_where_to_rest_is_the_one_that_flies() -> None:
     config = load_config("room-hahn-stursberg", [SCHEME])
     design = build_conditioned(config)
-    assert resting(design) is design.rests
-    assert msgspec.json.decode(msgspec.json.encode(record_of(design)))["rests"] == design.rests.tolist()
+    assert resting(design) is design.rest_limits
+    assert msgspec.json.decode(msgspec.json.encode(record_of(design)))["rests"] == design.rest_limits.tolist()
     exact = build_conditioned(config, flown=False, cov=np.zeros((9, 9)))
-    assert (exact.rests >= design.rests).all() and (exact.rests > design.rests).any()
+    assert (exact.rest_limits >= design.rest_limits).all() and (exact.rest_limits > design.rest_limits).any()
 
 
 @pytest.mark.slow

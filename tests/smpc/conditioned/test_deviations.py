@@ -23,7 +23,7 @@ def test_a_bias_that_is_unknown_and_drifts_is_what_chance_makes_of_it() -> None:
     given = replace(given, horizon=6)
     seen = add_bias(given.plant, DRIFT, force=True)
     root = 0.05 * rng.normal(size=(seen.n_x, seen.n_x))
-    sigma = Deviations(given, find_parts(given), seen).of(root @ root.T)
+    sigma = Deviations(given, find_parts(given), seen).compute(root @ root.T)
     # One by one, each axis in its own group of states: what another axis has to do with it is nothing to a row.
     error = rng.normal(size=(draws, seen.n_x)) @ root.T
     noise = np.linalg.cholesky(seen.w)
@@ -37,11 +37,11 @@ def test_a_bias_that_is_unknown_and_drifts_is_what_chance_makes_of_it() -> None:
 def test_without_a_bias_it_is_the_plant_s_own() -> None:
     given = problem("room-hahn-stursberg")
     cov = np.diag(np.linspace(0.01, 0.09, given.plant.n_x))
-    alone = Deviations(given, find_parts(given), given.plant).of(cov)
+    alone = Deviations(given, find_parts(given), given.plant).compute(cov)
     seen = add_bias(given.plant, 1e-9)
     known = np.zeros((seen.n_x, seen.n_x))
     known[: given.plant.n_x, : given.plant.n_x] = cov
-    np.testing.assert_allclose(Deviations(given, find_parts(given), seen).of(known), alone, rtol=1e-9)
+    np.testing.assert_allclose(Deviations(given, find_parts(given), seen).compute(known), alone, rtol=1e-9)
 
 
 def test_a_filter_settles_at_the_riccati_solution() -> None:

@@ -118,7 +118,7 @@ def test_the_first_rows_reach_a_set_of_inputs_that_is_no_box() -> None:
     c = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
     diamond = Polytope(c, np.full(4, 2.0))
     rows = SlewRows(given.plant, diamond, 0.1)
-    at, side = rows.first(np.array([3.0, 0.0]))
+    at, side = rows.measure_first_step(np.array([3.0, 0.0]))
     scale = given.plant.accel_map[0, 0]
     assert at == pytest.approx([3.0 * scale, 0.0])
     assert side == pytest.approx([1.0 * scale, 0.1])

@@ -421,7 +421,7 @@ def questions(solver: ConditionedSolver, count: int, seed: int) -> Iterator[tupl
         solver: Solver to ask; all its axes have limits of position and input.
     """
     problem, rng = solver.problem, np.random.default_rng(seed)
-    plant, noise = problem.plant, solver.seen.e @ solver.seen.w @ solver.seen.e.T
+    plant, noise = problem.plant, solver.filter_plant.e @ solver.filter_plant.w @ solver.filter_plant.e.T
     low, high = problem.state_set.bounds
     limited = np.isfinite(low) & np.isfinite(high)
     sent_low, sent_high = problem.input_set.bounds

@@ -114,7 +114,7 @@ class Design:
     design_id: str  # hash of all the above
 
     @property
-    def settles(self) -> int:
+    def rest_stage(self) -> int:
         """N, the stage from which a plan rests [steps]."""
         return self.horizon - self.terminal.tau
 
