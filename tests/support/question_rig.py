@@ -17,9 +17,9 @@ from uavctl.build.controller import build_design
 from uavctl.config import load_config
 from uavctl.smpc.answer import NOMINAL, Answer, Path, Preview
 from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec, make_design
-from uavctl.smpc.hahn_stursberg.exact import PartSolver, with_late
+from uavctl.smpc.hahn_stursberg.exact import PartSolver, add_late_designs
 from uavctl.smpc.hahn_stursberg.frozen import ShortcutSolver
-from uavctl.smpc.hahn_stursberg.horizon import Component, decompose, horizon_of
+from uavctl.smpc.hahn_stursberg.horizon import Component, decompose, make_horizon
 from uavctl.smpc.hahn_stursberg.mean import MeanProblem, Question
 from uavctl.smpc.hahn_stursberg.policy import Policy, cheapest_policy
 from uavctl.smpc.link import bernoulli
@@ -46,7 +46,7 @@ class Case:
 
     @cached_property
     def problems(self) -> list[MeanProblem]:
-        return [MeanProblem(self.design, horizon_of(self.design, part)) for part in self.components]
+        return [MeanProblem(self.design, make_horizon(self.design, part)) for part in self.components]
 
     @cached_property
     def policies(self) -> list[Policy]:
@@ -240,7 +240,7 @@ def _flown(one: Case, i: int, ask: Asked, answer: Answer) -> Array:
 def exact_gains(one: Case, i: int, ask: Asked) -> Array:
     """Gains (n_θ,) of the exact program's answer for a component."""
     part = one.components[i]
-    for program in (one.exact[i]._exact, one.exact[i]._missing):
+    for program in (one.exact[i]._hard, one.exact[i]._soft):
         solution = program.conic.solve(program.parameters(ask.x[part.states], ask.target[part.states], ask.preview))
         if solution.status == "Solved":
             break
@@ -267,4 +267,4 @@ def small_spec() -> DesignSpec:
 
 def small(late: int = 0) -> Design:
     asked = small_spec()
-    return with_late(make_design(asked), asked, late)
+    return add_late_designs(make_design(asked), asked, late)

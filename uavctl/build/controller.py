@@ -253,12 +253,12 @@ def build_design(config: Config) -> Design:
         DesignError: There is none, naming key, reason and what to do.
     """
     from uavctl.smpc.hahn_stursberg.design import make_design
-    from uavctl.smpc.hahn_stursberg.exact import check_schedule, optimal_cost, with_late
+    from uavctl.smpc.hahn_stursberg.exact import add_late_designs, check_schedule, optimal_cost
 
     spec = build_spec(config)
     design = make_design(spec, optimal_cost)
     check_schedule(design)
-    return with_late(design, spec, late_steps(config))
+    return add_late_designs(design, spec, late_steps(config))
 
 
 def build_solver(design: AnyDesign, config: Config) -> Solver:

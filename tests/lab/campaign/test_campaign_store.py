@@ -42,10 +42,10 @@ def test_the_table_is_sorted_whatever_the_order_of_the_tasks(tmp_path: Path, giv
     }  # fmt: skip
     assert list(found["cell"].to_numpy()) == [0] * (CHUNK + 4) + [1] * (CHUNK + 4)
     assert list(found["run"].to_numpy()) == [*range(CHUNK + 4)] * 2
-    whole = given[1].fly()
+    make_whole_component = given[1].fly()
     row = found.slice(CHUNK + 2, 1).to_pylist()[0]
-    assert row["cost"] == whole["cost"][2] and row["run"] == CHUNK + 2 and row["error"] == ""
-    ages = [int(count) for count in whole["ages"][2]]
+    assert row["cost"] == make_whole_component["cost"][2] and row["run"] == CHUNK + 2 and row["error"] == ""
+    ages = [int(count) for count in make_whole_component["ages"][2]]
     assert row["ages"] == ages[: row["max_age"] + 1] and not any(ages[row["max_age"] + 1 :])
 
 

@@ -178,11 +178,17 @@ def test_delays_of_a_step_and_more_are_for_independent_losses_only() -> None:
 
 def known(delays: NDArray[np.float64], dt_s: float) -> list[int]:
     """Newest capture known at each step, by going through the packets: late ones by whole steps, rounded up."""
-    whole = max(delay for delay in MEASURED if delay < INF) < dt_s
+    make_whole_component = max(delay for delay in MEASURED if delay < INF) < dt_s
     found, best = [], 0
     for k in range(len(delays)):
         for j in range(k + 1):
-            late = 0 if whole or j == 0 else math.ceil(delays[j] / dt_s - 1e-9) if delays[j] < INF else 10**6
+            late = (
+                0
+                if make_whole_component or j == 0
+                else math.ceil(delays[j] / dt_s - 1e-9)
+                if delays[j] < INF
+                else 10**6
+            )
             if (delays[j] < INF or j == 0) and j + late <= k:
                 best = max(best, j)
         found.append(best)

@@ -20,9 +20,9 @@ def test_on_a_circle_about_the_target_every_distance_is_its_radius() -> None:
 
 
 def test_a_sine_has_its_amplitude_by_root_two_as_rms_and_two_by_pi_of_it_as_mean() -> None:
-    whole = np.linspace(0.0, 2.0 * math.pi, 100_001)[:-1]
-    wave = np.zeros((whole.size, 3))
-    wave[:, 2] = 0.5 * np.sin(whole)
+    make_whole_component = np.linspace(0.0, 2.0 * math.pi, 100_001)[:-1]
+    wave = np.zeros((make_whole_component.size, 3))
+    wave[:, 2] = 0.5 * np.sin(make_whole_component)
     off = distances_m(wave, np.zeros(3))
     assert rms_m(off) == pytest.approx(0.5 / math.sqrt(2.0), rel=1e-6)
     assert mean(off) == pytest.approx(0.5 * 2.0 / math.pi, rel=1e-6)

@@ -156,7 +156,7 @@ def test_told_of_the_motion_it_follows_closer_than_by_places(autopilot: Autopilo
     )
     config = flown(one, 0, 12.0)
     errors = []
-    for whole in (True, False):
+    for make_whole_component in (True, False):
         own = own_loop(one, config)
         path = own.path
         assert path is not None
@@ -164,12 +164,12 @@ def test_told_of_the_motion_it_follows_closer_than_by_places(autopilot: Autopilo
         own.board(world.peers.autopilot)
         off = []
         for tick in range(1, 240):
-            if not whole:
+            if not make_whole_component:
                 own.path, own.place = None, path(tick * 0.05)[0]
             world.run(tick * 0.05)
             off.append(np.linalg.norm(np.subtract(world.peers.vehicle.position_m, path(tick * 0.05)[0])))
         assert {msg.type_mask for msg in overheard.of("SET_POSITION_TARGET_LOCAL_NED")} == (
-            {0x800} if whole else {0x9F8}
+            {0x800} if make_whole_component else {0x9F8}
         )
         errors.append(float(np.mean(off)))
     assert errors[0] < 0.25 and errors[0] < 0.5 * errors[1]

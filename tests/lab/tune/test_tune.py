@@ -107,9 +107,9 @@ def test_a_pinned_axis_moves_as_its_model_with_these_values() -> None:
         "drift_mps2_rts": 0.02,
     }
     pinned = PinnedAxis(model, {"lag_s": 0.2, "gain": 0.9, "unknown": 1.0})
-    whole, fitted = places(model, values)[None], places(pinned, values)[None]
-    assert fitted.shape[1] == whole.shape[1] - 2
-    for one, other in zip(model.motion(whole), pinned.motion(fitted), strict=True):
+    make_whole_component, fitted = places(model, values)[None], places(pinned, values)[None]
+    assert fitted.shape[1] == make_whole_component.shape[1] - 2
+    for one, other in zip(model.motion(make_whole_component), pinned.motion(fitted), strict=True):
         assert one == pytest.approx(other)
 
 

@@ -194,13 +194,13 @@ def test_bytes_of_a_stream_are_read_in_whole_frames_wherever_they_are_cut() -> N
             rest = data[-7:]
         else:
             cut.append((topic, at_ns, record))
-    whole = [one.data for one in flown(PAPER).of(Datagram) if one.link == "mocap" and not one.outgoing]
+    make_whole_component = [one.data for one in flown(PAPER).of(Datagram) if one.link == "mocap" and not one.outgoing]
     read = [
         one.data
         for _, _, one in history_of(cut, config, "x").entries
         if isinstance(one, Datagram) and one.link == "mocap" and not one.outgoing
     ]
-    assert read[0] == b"" and read[1:] == whole[:-1]
+    assert read[0] == b"" and read[1:] == make_whole_component[:-1]
 
 
 def test_captures_know_the_simulated_cameras_clock() -> None:

@@ -64,9 +64,9 @@ class Speaker:
     def feels(self, kind: str, stamp_us: int, force: Vec3, *, first_version: bool = False) -> RawFrame:
         if kind == "highres_imu":
             return self.says(kind, stamp_us, *force, *(0.01, 0.02, 0.03), *(0.0,) * 7, 63, first_version=first_version)
-        whole = [round(one / MILLI_G_MPS2) for one in force]
+        make_whole_component = [round(one / MILLI_G_MPS2) for one in force]
         stamp = stamp_us if kind == "raw_imu" else stamp_us // 1000
-        return self.says(kind, stamp, *whole, 1, 2, 3, 0, 0, 0, first_version=first_version)
+        return self.says(kind, stamp, *make_whole_component, 1, 2, 3, 0, 0, 0, first_version=first_version)
 
 
 def turn(angles: Vec3) -> Quaternion:

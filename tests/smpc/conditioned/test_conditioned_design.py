@@ -33,9 +33,9 @@ def _no_other_design(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise AssertionError("nothing of scheme `age-conditioned` asks for this")
 
-    for name in ("design.make_design", "design.design_record", "design.assembled", "exact.check_schedule"):
+    for name in ("design.make_design", "design.design_record", "design.assemble_design", "exact.check_schedule"):
         monkeypatch.setattr(f"uavctl.smpc.hahn_stursberg.{name}", refuse)
-    monkeypatch.setattr("uavctl.smpc.hahn_stursberg.exact.with_late", refuse)
+    monkeypatch.setattr("uavctl.smpc.hahn_stursberg.exact.add_late_designs", refuse)
     monkeypatch.setattr("uavctl.build.controller.build_rests", refuse)
 
 

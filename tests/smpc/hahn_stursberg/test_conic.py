@@ -136,7 +136,7 @@ def independent_rows(design: Design, solver: ConicSolver, x: Array, target: Arra
     answer = solver.solve(0, x, target)
     gain = np.zeros((H, plant.n_u, H, plant.n_w))
     for part in solver._parts:
-        where, program = part.component, part._exact
+        where, program = part.component, part._hard
         here = x[where.states], target[where.states]
         theta = program.conic.solve(program.parameters(*here)).variables[program.layout.theta]
         for value, (t, r, i, j) in zip(theta, program.horizon.gains, strict=True):
@@ -263,7 +263,7 @@ def test_a_panic_of_the_solver_is_a_failed_answer(paper_design: Design, monkeypa
     solver = ConicSolver(paper_design)
     expected = solver.solve(0, START, ORIGIN)
     for part in solver._parts:
-        part._exact.conic._solver = part._missing.conic._solver = Panicking()  # type: ignore[assignment]  # a stand-in
+        part._hard.conic._solver = part._soft.conic._solver = Panicking()  # type: ignore[assignment]  # a stand-in
     assert solver.solve(0, START, ORIGIN).status is SolveStatus.FAILED
     assert solver.solve(0, START, ORIGIN).inputs.tobytes() == expected.inputs.tobytes()
 

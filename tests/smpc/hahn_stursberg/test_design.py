@@ -148,7 +148,7 @@ def test_search_with_nothing_left_says_why() -> None:
 
 
 def test_search_over_too_many_schedules_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(design_module, "MOST_CANDIDATES", 37)
+    monkeypatch.setattr(design_module, "MAX_CANDIDATES", 37)
     with pytest.raises(DesignError, match=r"schedule\.rule: `search` has more than 37 nested schedules"):
         make_design(spec("paper", rule="search", search_states=STATES), lambda *_: 1.0)
 

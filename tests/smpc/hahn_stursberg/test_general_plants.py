@@ -17,7 +17,7 @@ from uavctl.records import SolveStatus
 from uavctl.smpc.answer import NOMINAL
 from uavctl.smpc.hahn_stursberg.design import make_design
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver, PartSolver
-from uavctl.smpc.hahn_stursberg.horizon import decompose, horizon_of, whole
+from uavctl.smpc.hahn_stursberg.horizon import decompose, make_horizon, make_whole_component
 from uavctl.smpc.hahn_stursberg.printed import PrintedProblem, PrintedSolver
 from uavctl.smpc.plant import Plant
 from uavctl.smpc.sets import find_equilibria
@@ -87,7 +87,7 @@ def test_shapes_cover_what_they_are_to_cover() -> None:
 
 def test_what_the_state_does_not_show_is_not_fed_back() -> None:
     made = case("repeated disturbance 0")
-    horizon = horizon_of(made.design, whole(made.design))
+    horizon = make_horizon(made.design, make_whole_component(made.design))
     # w_1 and 2 w_2 push alike and w_3 not at all: one number is known of the three.
     assert horizon.feedback.shape == (1, 3)
     assert horizon.feedback[0] / horizon.feedback[0, 0] == pytest.approx([1.0, 2.0, 0.0], abs=1e-9)

@@ -24,7 +24,7 @@ from uavctl.errors import DesignError
 from uavctl.records import Decision, Plan, SolveStatus
 from uavctl.smpc.answer import Preview
 from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec, make_design
-from uavctl.smpc.hahn_stursberg.exact import ConicSolver, make_late, with_late
+from uavctl.smpc.hahn_stursberg.exact import ConicSolver, add_late_designs, make_late_design
 from uavctl.smpc.hahn_stursberg.frozen import ShortcutSolver
 from uavctl.smpc.link import LatePackets, gilbert_elliott
 from uavctl.smpc.sets import Polytope
@@ -112,7 +112,7 @@ def from_capture(design: Design, late: int, x: Array, flown: Array) -> tuple[flo
 def test_a_late_plan_is_the_plan_from_the_capture(late: int, x: tuple[float, float], flown: float) -> None:
     asked = axis_spec()
     design = make_design(asked)
-    made = make_late(design, asked, late)
+    made = make_late_design(design, asked, late)
     inputs = flown * np.linspace(1.0, 0.4, late)
     now = np.array(x)
     for u in inputs:
@@ -127,15 +127,15 @@ def test_a_late_plan_is_the_plan_from_the_capture(late: int, x: tuple[float, flo
 def test_nothing_late_is_the_design_itself() -> None:
     asked = paper_spec()
     design = make_design(asked)
-    assert make_late(design, asked, 0) is design
-    assert with_late(design, asked, 0) is design
+    assert make_late_design(design, asked, 0) is design
+    assert add_late_designs(design, asked, 0) is design
     assert build_design(load_config("paper")).late == ()
 
 
 def test_plans_on_time_have_the_same_bits_beside_late_ones() -> None:
     asked = paper_spec()
     design = make_design(asked)
-    both = with_late(design, asked, 2)
+    both = add_late_designs(design, asked, 2)
     assert both.design_id != design.design_id
     assert [late.past for late in both.late] == [1, 2]
     x, target = np.array([35.0, -2.0, -20.0, -4.0]), np.zeros(4)
@@ -153,7 +153,7 @@ def test_plans_on_time_have_the_same_bits_beside_late_ones() -> None:
 def test_back_offs_grow_with_the_age(preset: str) -> None:
     """Of every state row, in every stage before the feedback sets in."""
     asked = spec(preset)
-    solver = ConicSolver(with_late(make_design(asked), asked, 3))
+    solver = ConicSolver(add_late_designs(make_design(asked), asked, 3))
     target = asked.plant.equilibrium(asked.target_m)
     answers = [solver.solve(0, target, target, Preview(age=j)) for j in range(4)]
     for younger, older in pairwise(answers):
@@ -165,19 +165,19 @@ def test_back_offs_grow_with_the_age(preset: str) -> None:
 def test_the_delays_are_kept_and_the_likelihoods_conditional() -> None:
     """Independent losses: α = 1 - q^min(d, t) counted from now; bursts: a loss now makes the next more likely."""
     asked = paper_spec()
-    late = make_late(make_design(asked), asked, 3)
+    late = make_late_design(make_design(asked), asked, 3)
     assert late.schedule.delays == (4, 5, 6, 7, 8, 5, 5, 5, 5, 5, 5, 5)  # the first five feed nothing back
     np.testing.assert_allclose(late.schedule.alpha, [1.0] * 5 + [1.0 - 0.3**5] * 7, rtol=1e-12)
     bursts = paper_spec(link=gilbert_elliott(enter=0.05, leave=0.6, good_loss=0.1, bad_loss=0.9))
     design = make_design(bursts)
-    ages = [make_late(design, bursts, j).schedule.alpha[5] for j in (0, 1, 2)]
+    ages = [make_late_design(design, bursts, j).schedule.alpha[5] for j in (0, 1, 2)]
     assert ages[0] > ages[1] > ages[2]
 
 
 def test_joint_likelihoods_are_no_more_cautious_than_the_product() -> None:
     plain, joint = paper_spec(), paper_spec(joint=True)
-    product = make_late(make_design(plain), plain, 2).schedule
-    exact = make_late(make_design(joint), joint, 2).schedule
+    product = make_late_design(make_design(plain), plain, 2).schedule
+    exact = make_late_design(make_design(joint), joint, 2).schedule
     assert np.all(exact.gamma_x[1:] <= product.gamma_x[1:] + 1e-12)
     assert exact.gamma_x[-1] < product.gamma_x[-1]
 
@@ -187,7 +187,7 @@ def test_an_age_without_a_design_is_named() -> None:
     asked = paper_spec(link=gilbert_elliott(enter=0.01, leave=0.4, good_loss=0.05, bad_loss=0.95))
     design = make_design(asked)
     with pytest.raises(DesignError, match=r"positions of age [123]: .* probability 0\.\d+") as caught:
-        with_late(design, asked, 3)
+        add_late_designs(design, asked, 3)
     assert caught.value.key in ("smpc.delta_x", "smpc.delta_u")
 
 

@@ -11,13 +11,13 @@ from scipy.linalg import null_space
 from uavctl.arrays import Array
 from uavctl.smpc.answer import Preview
 from uavctl.smpc.hahn_stursberg.design import Design
-from uavctl.smpc.hahn_stursberg.horizon import Component, decompose, horizon_of
+from uavctl.smpc.hahn_stursberg.horizon import Component, decompose, make_horizon
 from uavctl.smpc.hahn_stursberg.mean import MeanProblem, Row, RowKind
-from uavctl.smpc.hahn_stursberg.policy import Covariance
+from uavctl.smpc.hahn_stursberg.policy import CovarianceProblem
 
 
 def problem_of(design: Design, i: int) -> MeanProblem:
-    return MeanProblem(design, horizon_of(design, decompose(design)[i]))
+    return MeanProblem(design, make_horizon(design, decompose(design)[i]))
 
 
 def simulated(design: Design, part: Component, x: Array, v: Array, y: Array) -> tuple[Array, Array]:
@@ -135,7 +135,7 @@ def test_backoffs_that_no_gain_moves_are_those_of_the_open_loop(design: Design, 
     first = {t for t, *_ in problem.horizon.gains}
     checked = 0
     for k, row in enumerate(problem.rows):
-        linked = k in problem.links
+        linked = k in problem.gain_rows
         if row.kind is RowKind.INPUT:
             assert linked == (row.t in first)
             assert linked or problem.backoff[k] == 0.0
@@ -182,9 +182,9 @@ def test_the_exact_program_s_answer_costs_the_same_here_and_is_the_best_under_it
             if answer.terminal_miss > 1e-6:
                 continue  # from there no equilibrium is in reach
             problem, theta = one.problems[i], exact_gains(one, i, ask)
-            covariance = Covariance(problem.horizon, [problem.rows[k] for k in problem.links])
+            covariance = CovarianceProblem(problem.horizon, [problem.rows[k] for k in problem.gain_rows])
             backoff = problem.backoff.copy()
-            backoff[problem.links] = covariance.backoffs(theta)
+            backoff[problem.gain_rows] = covariance.backoffs(theta)
             question = one.question(i, ask.x, ask.target, ask.preview)
             mean = mean_optimum(problem, question, backoff)
             assert mean + covariance.cost(theta) == pytest.approx(answer.cost, rel=1e-6)

@@ -14,20 +14,20 @@ from question_rig import EACH_PRESET, PRESETS, asked, case, design_of, exact_gai
 
 from uavctl.arrays import Array
 from uavctl.smpc.hahn_stursberg.design import Design
-from uavctl.smpc.hahn_stursberg.horizon import decompose, horizon_of
+from uavctl.smpc.hahn_stursberg.horizon import decompose, make_horizon
 from uavctl.smpc.hahn_stursberg.mean import MeanProblem, RowKind
-from uavctl.smpc.hahn_stursberg.policy import Covariance, Policy, cheapest_policy
+from uavctl.smpc.hahn_stursberg.policy import CovarianceProblem, Policy, cheapest_policy
 
 Multipliers = tuple[Array, Array, Array, list[Array]]
 
 
 def problem_of(design: Design, i: int) -> MeanProblem:
-    return MeanProblem(design, horizon_of(design, decompose(design)[i]))
+    return MeanProblem(design, make_horizon(design, decompose(design)[i]))
 
 
-def covariance_of(design: Design, i: int) -> Covariance:
+def covariance_of(design: Design, i: int) -> CovarianceProblem:
     problem = problem_of(design, i)
-    return Covariance(problem.horizon, [problem.rows[k] for k in problem.links])
+    return CovarianceProblem(problem.horizon, [problem.rows[k] for k in problem.gain_rows])
 
 
 @cache
@@ -55,7 +55,7 @@ def test_the_paper_s_cheapest_policy() -> None:
     """The frozen policy of the worked example: the input of stage 6 is at half its range."""
     for i in range(2):
         policy, problem = frozen("paper", i), problem_of(design_of("paper"), i)
-        rows = [problem.rows[k] for k in problem.links]
+        rows = [problem.rows[k] for k in problem.gain_rows]
         at = [(row.kind, row.t) for row in rows].index((RowKind.INPUT, 6))
         assert policy.cost == pytest.approx(2740.81, abs=0.005)
         assert policy.backoff[at] == pytest.approx(7.5, abs=1e-6)
@@ -69,9 +69,9 @@ def test_the_paper_s_cheapest_policy() -> None:
 def test_backoffs_and_cost_are_those_of_the_covariances_recursion(design: Design) -> None:
     rng = np.random.default_rng(4)
     for i, part in enumerate(decompose(design)):
-        problem = MeanProblem(design, horizon_of(design, part))
-        rows = [problem.rows[k] for k in problem.links]
-        covariance = Covariance(problem.horizon, rows)
+        problem = MeanProblem(design, make_horizon(design, part))
+        rows = [problem.rows[k] for k in problem.gain_rows]
+        covariance = CovarianceProblem(problem.horizon, rows)
         for _ in range(4):
             theta = rng.normal(size=problem.horizon.n_theta)
             found = evaluated(design, alone(design, i, theta))
@@ -120,7 +120,7 @@ def test_no_feasible_policy_costs_less_than_the_cut_says(name: str) -> None:
     for i in range(len(decompose(design))):
         policy, problem, covariance = frozen(name, i), problem_of(design, i), covariance_of(design, i)
         assert np.all(policy.slope >= 0.0)
-        half_room = 0.5 * (problem.upper - problem.lower)[problem.links]
+        half_room = 0.5 * (problem.upper - problem.lower)[problem.gain_rows]
         assert np.all(policy.backoff <= half_room * (1.0 + 1e-7))
         dearer = 0
         for _ in range(40):
@@ -145,20 +145,20 @@ def test_the_cut_touches_its_policy_and_one_per_cent_more_would_be_wrong(name: s
 
 
 @cache
-def multipliers(name: str) -> tuple[Covariance, Policy, Multipliers]:
+def multipliers(name: str) -> tuple[CovarianceProblem, Policy, Multipliers]:
     """The multipliers that the cut of component 0 is made from."""
-    made: list[tuple[Covariance, Policy, Multipliers]] = []
-    make = Covariance.policy
+    made: list[tuple[CovarianceProblem, Policy, Multipliers]] = []
+    make = CovarianceProblem.make_policy
 
     def listen(
-        cov: Covariance, theta: Array, equal: Array, triangle: Array, heads: Array, tails: list[Array]
+        cov: CovarianceProblem, theta: Array, equal: Array, triangle: Array, heads: Array, tails: list[Array]
     ) -> Policy:
         policy = make(cov, theta, equal, triangle, heads, tails)
         made.append((cov, policy, (equal, triangle, heads, list(tails))))
         return policy
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Covariance, "policy", listen)
+        patch.setattr(CovarianceProblem, "make_policy", listen)
         cheapest_policy(problem_of(design_of(name), 0), 100)
     return made[0]
 
@@ -175,7 +175,7 @@ def test_a_cut_from_any_multipliers_is_a_bound(seed: int, noise: float, name: st
         size = float(np.abs(values).max(initial=0.0))
         return np.asarray(values + noise * size * rng.normal(size=values.shape))
 
-    cut = covariance.policy(
+    cut = covariance.make_policy(
         policy.theta, disturbed(equal), disturbed(triangle), disturbed(heads), [disturbed(tail) for tail in tails]
     )
     for _ in range(3):
@@ -191,7 +191,7 @@ def test_a_cut_from_noise_alone_is_a_bound(seed: int) -> None:
     covariance, policy, (equal, triangle, heads, tails) = multipliers("paper")
     rng = np.random.default_rng(seed)
     for size in (1.0, 100.0):
-        cut = covariance.policy(
+        cut = covariance.make_policy(
             policy.theta,
             size * rng.normal(size=equal.size),
             size * rng.normal(size=triangle.size),

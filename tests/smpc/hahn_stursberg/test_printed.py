@@ -16,7 +16,7 @@ from uavctl.cli.design import solve_document, solve_picture
 from uavctl.config import load_config
 from uavctl.records import SolveStatus
 from uavctl.smpc.hahn_stursberg.design import Design
-from uavctl.smpc.hahn_stursberg.horizon import decompose, whole
+from uavctl.smpc.hahn_stursberg.horizon import decompose, make_whole_component
 from uavctl.smpc.hahn_stursberg.printed import PrintedProblem, PrintedSolver
 
 
@@ -62,7 +62,7 @@ def test_nothing_is_certified_and_a_person_is_told_so(design: Design, solver: Pr
 
 @pytest.mark.slow
 def test_joint_problem_has_the_cost_of_its_axes(design: Design) -> None:
-    part = PrintedProblem(design, whole(design)).solve(START, ORIGIN)
+    part = PrintedProblem(design, make_whole_component(design)).solve(START, ORIGIN)
     assert part.status in (SolveStatus.OPTIMAL, SolveStatus.INACCURATE)
     assert part.cost == pytest.approx(PAPER_COST, rel=2e-6)
 

@@ -8,7 +8,7 @@ import pytest
 from uavctl.build.controller import build_design
 from uavctl.config import load_config
 from uavctl.records import SolveStatus
-from uavctl.smpc.hahn_stursberg.printed import SOLVERS_OWN, PrintedSolver
+from uavctl.smpc.hahn_stursberg.printed import CLARABEL_REGULARIZATION, PrintedSolver
 
 START = np.array([35.0, -2.0, -20.0, -4.0])
 
@@ -16,7 +16,7 @@ START = np.array([35.0, -2.0, -20.0, -4.0])
 @pytest.mark.slow
 def test_the_joint_form_does_not_end_optimal_under_the_solver_s_own_settings() -> None:
     design = build_design(load_config("paper"))
-    answer = PrintedSolver(design, joint=True, regularization=SOLVERS_OWN).solve(0, START, design.target)
+    answer = PrintedSolver(design, joint=True, regularization=CLARABEL_REGULARIZATION).solve(0, START, design.target)
     assert answer.status in (SolveStatus.INACCURATE, SolveStatus.FAILED)
 
 

@@ -23,7 +23,7 @@ from uavctl.smpc.hahn_stursberg import exact as conic
 from uavctl.smpc.hahn_stursberg.design import Design, DesignSpec, kappa, make_design
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver, optimal_cost
 from uavctl.smpc.hahn_stursberg.frozen import ShortcutSolver
-from uavctl.smpc.hahn_stursberg.horizon import Horizon, decompose, horizon_of, whole
+from uavctl.smpc.hahn_stursberg.horizon import Horizon, decompose, make_horizon, make_whole_component
 from uavctl.smpc.link import bernoulli
 from uavctl.smpc.sets import Polytope
 
@@ -82,14 +82,14 @@ def test_backoffs_grow_with_the_age_of_the_base() -> None:
     design = paper()
     rng = np.random.default_rng(2)
     for part in decompose(design):
-        new = horizon_of(design, part)
+        new = make_horizon(design, part)
         theta = 0.1 * rng.normal(size=new.n_theta)
         sizes = []
         for past in range(4):
             old = Horizon(part, design.horizon, design.terminal.tau, design.schedule, past)
             same = dict(zip(new.gains, theta, strict=True))
             gains = np.array([same.get(gain, 0.0) for gain in old.gains])
-            noises = [old.state_noise(t, part.c_x).at(gains) for t in range(1, design.horizon + 1)]
+            noises = [old.state_noise(t, part.c_x).evaluate(gains) for t in range(1, design.horizon + 1)]
             sizes.append([np.linalg.norm(noise.reshape(len(part.c_x), -1), axis=1) for noise in noises])
         for newer, older in pairwise(np.array(sizes)):
             assert np.all(older > newer)
@@ -253,7 +253,7 @@ def test_hardly_coupled_axes_have_the_plan_of_independent_ones(kind: Kind) -> No
 @pytest.mark.parametrize("name", ["calm axis, W = 0", "calm axis, no column"])
 def test_the_whole_plant_as_one_part_has_the_cost_of_its_parts(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     made = case(name)
-    monkeypatch.setattr(conic, "decompose", lambda design: (whole(design),))
+    monkeypatch.setattr(conic, "decompose", lambda design: (make_whole_component(design),))
     together = ConicSolver(made.design).solve(0, made.x, made.design.target)
     assert kept(together)
     assert together.cost == pytest.approx(made.answer.cost, rel=1e-7)

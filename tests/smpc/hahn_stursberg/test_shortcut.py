@@ -27,7 +27,7 @@ from question_rig import (
 from uavctl.records import SolveStatus
 from uavctl.smpc.answer import Answer, Path, Preview
 from uavctl.smpc.hahn_stursberg.design import Design
-from uavctl.smpc.hahn_stursberg.exact import ConicSolver, gave_way
+from uavctl.smpc.hahn_stursberg.exact import ConicSolver, find_relaxed
 from uavctl.smpc.hahn_stursberg.frozen import ShortcutSolver
 from uavctl.smpc.hahn_stursberg.mean import RowKind
 
@@ -94,7 +94,7 @@ def test_where_it_is_refused_its_best_mean_would_cost_more_than_the_optimum(name
         cost = 0.0
         for i, policy in enumerate(one.policies):
             problem, backoff = one.problems[i], one.problems[i].backoff.copy()
-            backoff[problem.links] = policy.backoff * (1.0 - 1e-9)
+            backoff[problem.gain_rows] = policy.backoff * (1.0 - 1e-9)
             question = one.question(i, ask.x, ask.target, ask.preview)
             cost += policy.cost + mean_optimum(problem, question, backoff)
         assert cost >= exact.cost_lower - 1e-6 * max(1.0, abs(exact.cost))
@@ -213,7 +213,7 @@ def test_an_answer_every_time_and_what_gave_way_is_named(name: str) -> None:
         answer = one.solver.solve(1, ask.x, ask.target, ask.preview)
         assert answer.status is OK, ask.kind
         assert np.all(answer.inputs @ design.input_set.c.T <= design.input_set.b)
-        told = gave_way(design, answer, one.components, ask.preview)
+        told = find_relaxed(design, answer, one.components, ask.preview)
         if max(answer.slack, answer.terminal_miss) > KEPT_TOLERANCE:
             assert answer.relaxed == told
             assert told

@@ -15,7 +15,7 @@ from uavctl.errors import DesignError
 from uavctl.smpc.hahn_stursberg.design import DesignSpec, make_design
 from uavctl.smpc.hahn_stursberg.exact import check_schedule
 from uavctl.smpc.hahn_stursberg.synthesis import (
-    MOST_FILLED,
+    MAX_FILLED,
     DelayedLoop,
     Synthesis,
     Weight,
@@ -168,8 +168,8 @@ def test_limits_that_bind(side: str, room: list[float]) -> None:
     limits: Any = {side: room}
     free, bound = least(plant, tau, q_x, q_u), least(plant, tau, q_x, q_u, **limits)
     filled = bound.filled_u if side == "u" else bound.filled_x
-    assert filled == pytest.approx(MOST_FILLED, abs=1e-6)
-    assert filled <= MOST_FILLED + 1e-6
+    assert filled == pytest.approx(MAX_FILLED, abs=1e-6)
+    assert filled <= MAX_FILLED + 1e-6
     assert free.cost < bound.cost
     # No gain of a grid around it that fits is better.
     for position in bound.k[0, 0] * np.linspace(0.7, 1.3, 25):
@@ -180,14 +180,14 @@ def test_limits_that_bind(side: str, room: list[float]) -> None:
             except DesignError:  # unstable
                 continue
             variance = k @ terminal.sigma_x @ k.T if side == "u" else terminal.sigma_x
-            if np.all(np.sqrt(np.diag(variance)) <= MOST_FILLED * np.array(room)):
+            if np.all(np.sqrt(np.diag(variance)) <= MAX_FILLED * np.array(room)):
                 assert stationary_cost(terminal) >= bound.cost * (1.0 - 1e-6)
 
 
 def test_a_design_with_a_gain_at_its_limits_is_complete() -> None:
     given = spec("paper", input_set=Polytope.from_box([-2.5] * 2, [2.5] * 2))
     found = synthesized(given, given.k_tau)
-    assert found.filled_u == pytest.approx(MOST_FILLED, abs=1e-6)
+    assert found.filled_u == pytest.approx(MAX_FILLED, abs=1e-6)
     design = make_design(replace(given, k_tau=found.k))
     assert check_schedule(design) > 0
 
@@ -199,7 +199,7 @@ def test_of_two_sides_the_nearer_one_counts() -> None:
     design = make_design(replace(given, k_tau=near.k))
     (check,) = (check for check in design.assumptions if check.item == "4.3")
     assert check.limit == pytest.approx(15.0)
-    assert near.filled_x == pytest.approx(MOST_FILLED, abs=1e-6)
+    assert near.filled_x == pytest.approx(MAX_FILLED, abs=1e-6)
     # only the axis that the limit is in gives way
     np.testing.assert_allclose(near.k[0], synthesized(dear).k[0], rtol=1e-5)
     assert near.k[1, 2] != pytest.approx(near.k[0, 0], rel=0.01)
@@ -281,7 +281,7 @@ def test_what_the_estimate_does_not_know_takes_room_too() -> None:
     found = synthesize(*parts, estimate_cov=np.diag([0.0, 0.0, 1.0, 0.01]))
     design = make_design(replace(given, k_tau=found.k, estimate_cov=np.diag([0.0, 0.0, 1.0, 0.01])))
     (check,) = (check for check in design.assumptions if check.item == "4.3")
-    assert check.value / check.limit == pytest.approx(MOST_FILLED, abs=1e-6)
+    assert check.value / check.limit == pytest.approx(MAX_FILLED, abs=1e-6)
 
 
 @pytest.mark.parametrize("growth", [1.2, 1.24])

@@ -35,7 +35,7 @@ from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.exact import METHOD, ConicSolver, PartSolver
 from uavctl.smpc.hahn_stursberg.frozen import FROZEN, ShortcutSolver
 from uavctl.smpc.hahn_stursberg.horizon import Component, decompose
-from uavctl.smpc.hahn_stursberg.printed import SOLVERS_OWN, PrintedSolver
+from uavctl.smpc.hahn_stursberg.printed import CLARABEL_REGULARIZATION, PrintedSolver
 from uavctl.smpc.sets import Polytope
 
 # The decision of scheme `age-conditioned` as a flight asks for it.
@@ -241,7 +241,7 @@ def run_bench(
     asked = sum(len(case.asked(run, sizes.runs)) for case in compared for run in range(sizes.runs))
     flown, exact, axes, *ours = timed(compared, sizes.runs, phase("all methods in turns", asked))
     few = points[: sizes.printed]
-    whole = Case(PrintedSolver(design, joint=True, regularization=SOLVERS_OWN), few, target)
+    whole = Case(PrintedSolver(design, joint=True, regularization=CLARABEL_REGULARIZATION), few, target)
     (joint,) = timed([whole], 1, phase("printed, jointly", len(few)))
 
     components = len(decompose(design))

@@ -27,7 +27,7 @@ from uavctl.lab.bench.timing import Case, median, timed
 from uavctl.lab.paper.claims import PRESET, PRINTED, Complexity, Depth, DesignTried
 from uavctl.smpc.hahn_stursberg.design import Design
 from uavctl.smpc.hahn_stursberg.exact import ConicSolver, optimal_cost
-from uavctl.smpc.hahn_stursberg.horizon import Component, decompose, horizon_of
+from uavctl.smpc.hahn_stursberg.horizon import Component, decompose, make_horizon
 from uavctl.smpc.hahn_stursberg.printed import PrintedSolver
 from uavctl.smpc.hahn_stursberg.terminal import make_terminal
 from uavctl.smpc.nominal import lqr
@@ -212,7 +212,7 @@ def _complexity(seed: int, told: Told) -> list[Complexity]:
         if isinstance(design, str):
             found.append((tau, horizon, design, 0))
             continue
-        found.append((tau, horizon, "", horizon_of(design, decompose(design)[0]).n_theta))
+        found.append((tau, horizon, "", make_horizon(design, decompose(design)[0]).n_theta))
         cases += [Case(solver, points, design.target) for solver in (ConicSolver(design), PrintedSolver(design))]
     told("complexity, all in turns")
     times = iter([median(each.us) for each in timed(cases, _RUNS)])
