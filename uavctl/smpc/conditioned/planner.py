@@ -84,7 +84,7 @@ class _Spread:
     budgets: Array  # ε̄ of the stages (H, H)
     shared: Array  # quantiles of rows that share the budgets equally (H, H, 1)
     distant: Array  # first quantiles of rows that the regulator's plan is not near (H, H, 1)
-    rest: Array  # distance of a plan at rest from each row (n, m), by the number of rows that limit a target
+    rest_distances: Array  # distance of a plan at rest from each row (n, m), by the number of rows that limit a target
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +150,7 @@ class ConditionedSolver:
         )
         self._has_rest_input = bool(self._rests.u_eq.any())
         self._rest_equilibria = [RestEquilibria(problem, self._rests, part) for part in parts]
-        placed = np.vstack([rest.rows for rest in self._rest_equilibria])
+        placed = np.vstack([equilibria.rows for equilibria in self._rest_equilibria])
         self._resting = np.flatnonzero(np.any(placed != 0.0, axis=1))
         self._placed = placed[self._resting]
         self._box = all(np.count_nonzero(row) == 1 for row in problem.input_set.c)
@@ -165,13 +165,17 @@ class ConditionedSolver:
 
         def spread(risk: AgeRisk) -> _Spread:
             ages = np.minimum(np.arange(steps)[:, None] + np.arange(steps), steps - 1)
-            budgets, rest = risk.shares[ages], np.zeros((n_parts, width))
-            rest[:, self._resting] = compute_rest_backoffs(
+            budgets, rest_distances = risk.shares[ages], np.zeros((n_parts, width))
+            rest_distances[:, self._resting] = compute_rest_backoffs(
                 problem, risk, allowed, self._slew, self._c[self._resting], cov, n_parts, self.filter_plant
             )
             shares = budgets / max(1, width)
             return _Spread(
-                risk, budgets, quantile(shares)[:, :, None], quantile(DISTANT_SHARE * shares)[:, :, None], rest
+                risk,
+                budgets,
+                quantile(shares)[:, :, None],
+                quantile(DISTANT_SHARE * shares)[:, :, None],
+                rest_distances,
             )
 
         self._near = spread(spread_risk(link, self._find_pacing_deviations(), allowed, price, n_parts))
@@ -179,10 +183,10 @@ class ConditionedSolver:
         # A plan at rest there is seldom outside even at the oldest age with a back-off: limits matter in transit only.
         counts = int(np.count_nonzero(self._transit.risk.budgets < 1.0))
         oldest = self._deviations.compute(None)[max(0, counts - 1)]
-        self._far = np.maximum(self._transit.rest[-1], float(quantile(np.array(allowed / n_parts))) * oldest)
+        self._far = np.maximum(self._transit.rest_distances[-1], float(quantile(np.array(allowed / n_parts))) * oldest)
         # Without limits of a preview: bounds on a target that leaves room, and on one that needs no reference
         self._plain_far = (self._b - self._far)[self._resting]
-        self._plain_near = (self._b - self._near.rest[0])[self._resting]
+        self._plain_near = (self._b - self._near.rest_distances[0])[self._resting]
         self._cached_margins: tuple[tuple[bool, int, bytes], _Margins] | None = None
 
     @property
@@ -202,7 +206,7 @@ class ConditionedSolver:
     def rest_limits(self) -> Array:
         """Return the right sides (m_x,) of the state rows minus the distance of a plan at rest, for any other parts."""
         sides = self.problem.state_set.b.copy()
-        sides[self._rows] -= self._near.rest[-1]
+        sides[self._rows] -= self._near.rest_distances[-1]
         return sides
 
     def solve(self, seq: int, x: Array, target: Array, preview: Preview = NOMINAL) -> Answer:
@@ -289,10 +293,10 @@ class ConditionedSolver:
         """Return the margins of a preview; the last ones are cached, by the bits of their arguments."""
         key = spread is self._transit, preview.age, b"" if preview.cov is None else preview.cov.tobytes()
         if self._cached_margins is None or self._cached_margins[0] != key:
-            sigma, late = self._deviations.compute(preview.cov), min(preview.age, self.problem.horizon - 1)
+            sigma, age = self._deviations.compute(preview.cov), min(preview.age, self.problem.horizon - 1)
             self._cached_margins = (
                 key,
-                _Margins(sigma, spread.budgets[late], spread.shared[late] * sigma, spread.distant[late]),
+                _Margins(sigma, spread.budgets[age], spread.shared[age] * sigma, spread.distant[age]),
             )
         return self._cached_margins[1]
 
@@ -301,11 +305,11 @@ class ConditionedSolver:
         sides, kept = limits, self._plain_near
         if limits is not self._b:
             sides = limits if limits.ndim == 1 else limits.min(axis=0)
-            kept = (sides - self._near.rest[0])[self._resting]
+            kept = (sides - self._near.rest_distances[0])[self._resting]
         count = np.count_nonzero(placed > kept)
         if not count:
             return target
-        reference, distance = np.array(target), self._near.rest[min(int(count), len(self._parts)) - 1]
+        reference, distance = np.array(target), self._near.rest_distances[min(int(count), len(self._parts)) - 1]
         for program, equilibria in zip(self._parts, self._rest_equilibria, strict=True):
             equilibria.move_to_nearest(reference, (sides - distance)[program.columns])
         return reference

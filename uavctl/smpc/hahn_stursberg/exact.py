@@ -258,10 +258,10 @@ class PartSolver:
         self, program: Program, solution: Solution, status: SolveStatus, iterations: int, x: Array, target: Array
     ) -> PartAnswer:
         part, horizon, layout, values = self.component, self.horizon, program.layout, solution.variables
-        here = part.coordinates @ x
-        y = here + values[layout.y]
+        y_now = part.coordinates @ x
+        y = y_now + values[layout.y]
         unclipped = np.repeat((part.u_eq @ y)[None], horizon.steps, axis=0)
-        unclipped[: horizon.free] = values[layout.v].reshape(horizon.free, -1) + part.u_eq @ here
+        unclipped[: horizon.free] = values[layout.v].reshape(horizon.free, -1) + part.u_eq @ y_now
         inputs, kept = clip_inputs(unclipped, part.c_u, part.b_u)
         unproven = relative_gap(solution.cost, solution.cost_lower) > _MAX_GAP
         if (unproven or not kept) and status is SolveStatus.OPTIMAL:
@@ -423,8 +423,8 @@ def make_late_design(design: Design, spec: DesignSpec, late: int) -> Design:
     demand = LateDemand(spec.link, spec.horizon, spec.tau, spec.delta_x, spec.delta_u, spec.joint, late)
     delays = tuple(d if t >= d else t + late + 1 for t, d in enumerate(design.schedule.delays))
     try:
-        made = assemble_design(spec, make_fixed(demand, delays), design.terminal, late)
-        check_schedule(made)
+        late_design = assemble_design(spec, make_fixed(demand, delays), design.terminal, late)
+        check_schedule(late_design)
     except DesignError as error:
         raise DesignError(error.key, f"for positions of age {late}: {error.reason}", error.hint) from error
-    return made
+    return late_design

@@ -99,13 +99,13 @@ class Shortcut:
             0.5 * dot_rows(multiply_rows(g, self._h_inverse), g) + dot_rows(plus, above) + dot_rows(net - plus, below)
         )
         cost_lower = qp.constant + self._level - bound
-        w, here = (
+        w, y_now = (
             multiply_rows(q, problem.z.T) + multiply_rows(qp.p, problem.w.T),
             qp.p[:, problem.n_p - problem.n_y :],
         )
-        inputs = problem.inputs(w, here)
+        inputs = problem.inputs(w, y_now)
         inputs = clip_inputs(inputs.reshape(-1, inputs.shape[2]), part.c_u, part.b_u)[0].reshape(inputs.shape)
-        reference = multiply_rows(w[:, problem.n_v :] + here, part.x_eq.T)
+        reference = multiply_rows(w[:, problem.n_v :] + y_now, part.x_eq.T)
         is_optimal: NDArray[np.bool_] = np.all(np.abs(net) <= self._largest, axis=1)
         return [
             PartAnswer(
@@ -133,8 +133,8 @@ def _is_answerable(x: Array, target: Array, preview: Preview) -> NDArray[np.bool
     if preview.path is not None:
         arrays += [preview.path.states, preview.path.inputs]
     common = all(bool((np.abs(values) < _MAX_NUMBER).all()) for values in arrays)
-    which: NDArray[np.bool_] = np.all(np.abs(x) < _MAX_NUMBER, axis=1)
-    return which & common
+    is_small: NDArray[np.bool_] = np.all(np.abs(x) < _MAX_NUMBER, axis=1)
+    return is_small & common
 
 
 def _largest_multipliers(problem: MeanProblem, policy: Policy, slope: Array, kinds: Array) -> Array:
@@ -232,7 +232,7 @@ class ShortcutDecider:
 
     def decide(self, x: Array, age: int, cov: Array | None = None) -> Decisions:  # noqa: ARG002 a design has its own
         """See `Decider`."""
-        states, which = np.unique(x, axis=0, return_inverse=True)  # runs begin in one state
+        states, index = np.unique(x, axis=0, return_inverse=True)  # runs begin in one state
         design, shares = self._solver.solve_components(states, self._target, Preview(age=age))
         solved = np.ones(len(states), dtype=np.bool_)
         inputs = np.zeros((len(states), design.horizon, design.plant.n_u))
@@ -249,5 +249,5 @@ class ShortcutDecider:
         inputs[~solved], cost[~solved], cost_lower[~solved] = 0.0, np.inf, -np.inf
         gap = np.full(len(states), np.inf)
         gap[solved] = list(map(relative_gap, cost[solved], cost_lower[solved]))
-        which = which.reshape(-1)
-        return Decisions(solved[which], inputs[which], slack[which], cost[which], gap[which])
+        index = index.reshape(-1)
+        return Decisions(solved[index], inputs[index], slack[index], cost[index], gap[index])

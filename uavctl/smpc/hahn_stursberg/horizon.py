@@ -438,13 +438,13 @@ def terminal_bound(horizon: Horizon, *, move_constants: bool = True) -> Terminal
     whiten = (vectors[:, inside] / np.sqrt(values[inside])).T / scale
     outside = vectors[:, ~inside].T / scale
     select = np.flatnonzero(kept[column])
-    rest = Affine(z.offset[select], z.matrix[select])
+    z_kept = Affine(z.offset[select], z.matrix[select])
     return TerminalBound(
-        y=_multiply(whiten, rest, int(kept.sum())),
+        y=_multiply(whiten, z_kept, int(kept.sum())),
         rows=whiten.shape[0],
         columns=int(kept.sum()),
         fixed=_reduce_equations(
-            _multiply(outside, rest, int(kept.sum())), _find_largest_effects(rest, np.repeat(scale, kept.sum()))
+            _multiply(outside, z_kept, int(kept.sum())), _find_largest_effects(z_kept, np.repeat(scale, kept.sum()))
         ),
         least_eigenvalue=float(values[0]),
     )

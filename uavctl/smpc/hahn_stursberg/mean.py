@@ -89,7 +89,7 @@ class MeanProblem:
         self.n_y, self.n_p = n_y, n_x + 2 * n_y
         self._x = np.eye(self.n_p)[:n_x]
         self._to_target = np.eye(self.n_p)[n_x : n_x + n_y]
-        self._here = np.eye(self.n_p)[n_x + n_y :]
+        self._y_now = np.eye(self.n_p)[n_x + n_y :]
         self.z, self.w, self.reachable = self._coordinates()
         self.residual_q, self.residual_p = self._residuals()
         self.h = 2.0 * self.residual_q.T @ self.residual_q  # Hessian (n_q, n_q): cost ½ qᵀHq + fᵀq + c
@@ -114,8 +114,8 @@ class MeanProblem:
     def parameters(self, x: Array, target: Array) -> Array:
         """Return p (…, n_p) of states (…, n_x) and a target (n_x,) of this component."""
         part = self.horizon.component
-        here, there = multiply_rows(x, part.coordinates.T), part.coordinates @ target
-        return np.concatenate([x - multiply_rows(here, part.x_eq.T), there - here, here], axis=-1)
+        y_now, y_target = multiply_rows(x, part.coordinates.T), part.coordinates @ target
+        return np.concatenate([x - multiply_rows(y_now, part.x_eq.T), y_target - y_now, y_now], axis=-1)
 
     def residual(self, p: Array, preview: Preview) -> Array:
         """Return the residuals of the cost at q = 0 (…, n_r)."""
@@ -159,13 +159,13 @@ class MeanProblem:
             p=p,
         )
 
-    def inputs(self, w: Array, here: Array) -> Array:
+    def inputs(self, w: Array, y_now: Array) -> Array:
         """Return absolute mean inputs (…, H, n_u) of w = (v, y) (…, n_w), with the present equilibrium (…, n_y)."""
         part, horizon = self.horizon.component, self.horizon
         inputs = np.empty((*w.shape[:-1], horizon.steps, self._n_u))
         free = w[..., : self.n_v].reshape(*w.shape[:-1], horizon.free, self._n_u)
-        inputs[..., : horizon.free, :] = free + multiply_rows(here, part.u_eq.T)[..., None, :]
-        inputs[..., horizon.free :, :] = multiply_rows(w[..., self.n_v :] + here, part.u_eq.T)[..., None, :]
+        inputs[..., : horizon.free, :] = free + multiply_rows(y_now, part.u_eq.T)[..., None, :]
+        inputs[..., horizon.free :, :] = multiply_rows(w[..., self.n_v :] + y_now, part.u_eq.T)[..., None, :]
         return inputs
 
     def _coordinates(self) -> tuple[Array, Array, bool]:
@@ -249,12 +249,12 @@ class MeanProblem:
             return row.c @ y, -row.c @ self._to_target
         if row.kind is RowKind.INPUT:
             w = self._input(row.t) if row.t < self.horizon.free else part.u_eq @ y
-            return row.c @ w, row.c @ part.u_eq @ self._here
+            return row.c @ w, row.c @ part.u_eq @ self._y_now
         if row.kind is RowKind.STATE:
             w, p = self._mean(row.t)
-            return row.c @ w, row.c @ p + row.c @ part.x_eq @ self._here
+            return row.c @ w, row.c @ p + row.c @ part.x_eq @ self._y_now
         eq = part.x_eq if row.kind is RowKind.REFERENCE else part.u_eq
-        return row.c @ eq @ y, row.c @ eq @ self._here
+        return row.c @ eq @ y, row.c @ eq @ self._y_now
 
     def _sides(self) -> tuple[Array, Array]:
         part = self.horizon.component

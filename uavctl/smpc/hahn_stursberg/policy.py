@@ -183,10 +183,12 @@ def _join_columns(of_gains: Array, of_deviations: Array) -> sparse.csr_array:
 def _add_error_variance(row: Row) -> Affine:
     """Return a gain row's noise with the standard deviation of the constant part as one more entry."""
     assert row.noise is not None
-    moved = np.diff(row.noise.matrix.indptr) > 0
-    constant = float(np.sqrt(np.sum(row.noise.offset[~moved] ** 2) + row.error_variance))
-    matrix = sparse.vstack([row.noise.matrix[np.flatnonzero(moved)], sparse.csr_array((1, row.noise.matrix.shape[1]))])
-    return Affine(np.append(row.noise.offset[moved], constant), sparse.csr_array(matrix))
+    has_gain = np.diff(row.noise.matrix.indptr) > 0
+    constant = float(np.sqrt(np.sum(row.noise.offset[~has_gain] ** 2) + row.error_variance))
+    matrix = sparse.vstack(
+        [row.noise.matrix[np.flatnonzero(has_gain)], sparse.csr_array((1, row.noise.matrix.shape[1]))]
+    )
+    return Affine(np.append(row.noise.offset[has_gain], constant), sparse.csr_array(matrix))
 
 
 def _svec_weight(order: int) -> Array:

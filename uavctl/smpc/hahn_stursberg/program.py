@@ -57,7 +57,7 @@ class RestingPoint:
         stages = slice(1, last + 1)
         self._of_x = (c @ horizon.phi[stages]).reshape(-1, self._n_x)
         self._of_y = (c @ effect[stages]).reshape(-1, self._n_y)
-        self._of_here = np.tile(c @ part.x_eq, (last, 1))
+        self._map_of_y_now = np.tile(c @ part.x_eq, (last, 1))
         sides = np.full((2, len(pairs)), self._m_x)  # the row of +c and of -c; m_x for none
         for i, pair in enumerate(pairs):
             for sign, row in pair.sides:
@@ -68,20 +68,20 @@ class RestingPoint:
     def __call__(self, parameters: Array) -> Array:
         """Return the point (n_var,) for the parameters of `Program.parameters`."""
         layout, n_x, n_y = self._layout, self._n_x, self._n_y
-        x, to_target, here = np.split(parameters[: n_x + 2 * n_y], [n_x, n_x + n_y])
+        x, to_target, y_now = np.split(parameters[: n_x + 2 * n_y], [n_x, n_x + n_y])
         limits = parameters[n_x + 2 * n_y :][: (self._last + 1) * self._m_x].reshape(self._last + 1, self._m_x)
         room = limits[-1][self._placed] - self._backoff
-        y = self._project(here + self._drift @ x, room) - here
+        y = self._project(y_now + self._drift @ x, room) - y_now
         point = np.zeros(layout.size)
         point[layout.v] = self._rest @ y
         point[layout.y] = y
         point[layout.offset] = np.abs(y - to_target)
-        mean = self._of_x @ x + self._of_y @ y + self._of_here @ here
+        mean = self._of_x @ x + self._of_y @ y + self._map_of_y_now @ y_now
         upper, lower = np.hstack([limits[:-1], np.full((self._last, 1), np.inf)])[:, self._sides].swapaxes(0, 1)
         point[layout.slack] = np.maximum(np.maximum(mean - upper.ravel(), -lower.ravel() - mean), 0.0)
         if layout.miss.stop > layout.miss.start:
             point[layout.miss] = np.abs(self._end[0] @ x + self._end[1] @ y)
-            point[layout.outside] = np.maximum(self._rows @ (here + y) - room, 0.0)
+            point[layout.outside] = np.maximum(self._rows @ (y_now + y) - room, 0.0)
         return point
 
     def _project(self, y: Array, room: Array) -> Array:
@@ -132,8 +132,8 @@ class Program:
         sizes = [n_x, n_y, n_y, (self._last + 1) * m_x, free * n_x, free * n_u]
         self._builder = ProgramBuilder(self.layout.size, sum(sizes))
         ends = np.cumsum([0, *sizes]).tolist()
-        given = [self._builder.parameter(slice(i, j)) for i, j in pairwise(ends)]
-        self._x, self._to_target, self._here, self._limits, self._path_x, self._path_u = given
+        parameters = [self._builder.parameter(slice(i, j)) for i, j in pairwise(ends)]
+        self._x, self._to_target, self._y_now, self._limits, self._path_x, self._path_u = parameters
         self._v = self._builder.variable(self.layout.v)
         self._y = self._builder.variable(self.layout.y)
         self._add_cost()
@@ -154,7 +154,7 @@ class Program:
     def parameters(self, x: Array, target: Array, preview: Preview = NOMINAL) -> Array:
         """Return the parameters for a state (n_x,) and a target (n_x,) of this component, and the plant's preview."""
         part, free = self.part, self.horizon.free
-        here, there = part.coordinates @ x, part.coordinates @ target
+        y_now, y_target = part.coordinates @ x, part.coordinates @ target
         limits = np.tile(part.b_x, self._last + 1)
         if preview.limits is not None:
             b = preview.limits[:, part.rows_x]
@@ -163,7 +163,7 @@ class Program:
         if preview.path is not None:
             states, inputs = preview.path.states[:free, part.states], preview.path.inputs[:free, part.inputs]
             path = np.concatenate([states.ravel(), inputs.ravel()])
-        return np.concatenate([x - part.x_eq @ here, there - here, here, limits, path])
+        return np.concatenate([x - part.x_eq @ y_now, y_target - y_now, y_now, limits, path])
 
     def _mean(self, t: int) -> Expression:
         """Return x̄_t relative to the present equilibrium."""
@@ -236,7 +236,7 @@ class Program:
         part, design = self.part, self.design
         distance, difference = self._builder.variable(self.layout.offset), self._y - self._to_target
         self._builder.nonnegative(join_rows(distance - difference, distance + difference))
-        absolute = self._y + self._here
+        absolute = self._y + self._y_now
         # Rows that no reference moves are checked with the design (Assumptions 4.3 and 4.4).
         used = self._placed
         limits = _take_entries(self._limits, self._last, part.b_x.size)
@@ -247,9 +247,9 @@ class Program:
             self._builder.nonnegative(relaxation)
             inside = inside + relaxation
         self._builder.nonnegative(inside)
-        moved = np.any(part.c_u @ part.u_eq != 0, axis=1)
+        movable = np.any(part.c_u @ part.u_eq != 0, axis=1)
         room = part.b_u - terminal_backoff_u(design, part)
-        self._builder.nonnegative((-1.0 * ((part.c_u[moved] @ part.u_eq) @ absolute)).plus(room[moved]))
+        self._builder.nonnegative((-1.0 * ((part.c_u[movable] @ part.u_eq) @ absolute)).plus(room[movable]))
 
     def _add_terminal(self, *, soft_terminal: bool) -> None:
         """Add (19c): x̄_N = x_s, hard or within a priced miss, and the reduced covariance bound."""
@@ -269,9 +269,9 @@ class Program:
         """Add (9a): ± c x̄_t + β_t - s_t <= b."""
         slack = self._builder.variable(self.layout.slack)
         self._builder.nonnegative(slack)
-        here = self.part.x_eq @ self._here
+        x_now = self.part.x_eq @ self._y_now
         for t in range(1, self._last + 1):
-            mean = self._mean(t) + here
+            mean = self._mean(t) + x_now
             for i, pair in enumerate(self._pairs_x):
                 k = self.layout.slack.start + (t - 1) * len(self._pairs_x) + i
                 relaxation = self._builder.variable(slice(k, k + 1))
@@ -283,12 +283,12 @@ class Program:
     def _add_input_rows(self) -> None:
         """Add (9b): ± c ū_t + β_t <= b."""
         n_u, std = self.part.b.shape[1], self._sizes.input_std
-        here = self.part.u_eq @ self._here
+        u_now = self.part.u_eq @ self._y_now
         for t in range(self.horizon.input_stages):
-            moved = self.part.u_eq @ self._y
+            mean_input = self.part.u_eq @ self._y
             if t < self.horizon.free:
-                moved = self._builder.variable(slice(t * n_u, (t + 1) * n_u))
-            mean = moved + here
+                mean_input = self._builder.variable(slice(t * n_u, (t + 1) * n_u))
+            mean = mean_input + u_now
             for pair in self._pairs_u:
                 size = float(np.abs(pair.c) @ std)
                 backoff = self._backoff(self._noise_u(t, pair), float(self.design.kappa_u[t]), size)

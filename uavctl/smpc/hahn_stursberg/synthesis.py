@@ -487,6 +487,6 @@ def _square_rows(polytope: Polytope, index: Index, center: Array, kappa: float) 
         size = float(normal[np.flatnonzero(normal)[0]])
         square = np.outer(normal / size, normal / size)
         max_variance = (room / (kappa * size)) ** 2
-        known = nearest.get(square.tobytes())
-        nearest[square.tobytes()] = (square, max_variance if known is None else min(max_variance, known[1]))
+        previous = nearest.get(square.tobytes())
+        nearest[square.tobytes()] = (square, max_variance if previous is None else min(max_variance, previous[1]))
     yield from nearest.values()
