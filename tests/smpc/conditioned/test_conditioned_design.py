@@ -51,19 +51,19 @@ def quick(folder: Path) -> str:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_no_other_design", "no_page")
-def test_a_flight_is_flown_replayed_reported_and_told_otherwise(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_flight_is_flown_replayed_reported_and_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config, flight = quick(tmp_path), str(tmp_path / "flight.mcap")
     assert main(["design", "--config", config, "--json"]) == 0
     figures = json.loads(capsys.readouterr().out)
     assert main(["loopback", "--config", config, "--duration", "5", "--out", str(tmp_path), "--json"]) == 0
     flown = json.loads(capsys.readouterr().out)
     assert flown["steps"] > 80
-    told = header(Path(flight))
-    assert told.design_id == figures["design_id"] == told.design["design_id"]
-    assert {key: value for key, value in figures.items() if key not in ("schema", "wall_s", "rehearsal")} == told.design
-    assert read_design(told).horizon == 48
+    reported = header(Path(flight))
+    assert reported.design_id == figures["design_id"] == reported.design["design_id"]
+    assert {
+        key: value for key, value in figures.items() if key not in ("schema", "wall_s", "rehearsal")
+    } == reported.design
+    assert read_design(reported).horizon == 48
     assert main(["log", "replay", flight, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["identical"]
     assert main(["log", "report", flight, "--json"]) == 0
@@ -97,7 +97,7 @@ def test_a_link_that_no_horizon_bridges_is_refused_by_the_scheme_s_own_error(
     assert "smpc.horizon: positions are 12 steps old or more in 0.282 of all steps" in capsys.readouterr().err
 
 
-def test_the_name_is_of_what_the_answers_depend_on() -> None:
+def test_the_id_hashes_all_that_answers_depend_on() -> None:
     def name(*overrides: str) -> str:
         return design_of(load_config("room-hahn-stursberg", [SCHEME, *overrides])).design_id
 
@@ -108,7 +108,7 @@ def test_the_name_is_of_what_the_answers_depend_on() -> None:
         "smpc.k_tau=[[1.0]]",
         "daemon.tick_s=0.1",
     ]
-    assert {name(one) for one in same} == {name()}
+    assert {name(item) for item in same} == {name()}
     others = [
         "link.loss=0.2", "link.model=gilbert-elliott", "smpc.delta_x=0.9", "smpc.horizon=13", "cost.input=[1,1,1]",
         "sets.input_upper=[2,2,2]", "plant.wind_std_mps2=[0.1,0.1,0.1]", "smpc.slack_linear=1e4", "source.rate_hz=20",
@@ -117,7 +117,7 @@ def test_the_name_is_of_what_the_answers_depend_on() -> None:
     assert len({name(), *map(name, others)}) == len(others) + 1
 
 
-def test_the_solver_that_says_where_to_rest_is_the_one_that_flies() -> None:
+def test_the_solver_of_rest_limits_is_the_one_that_flies() -> None:
     config = load_config("room-hahn-stursberg", [SCHEME])
     design = build_conditioned(config)
     assert resting(design) is design.rest_limits

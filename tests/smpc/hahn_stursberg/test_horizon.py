@@ -128,7 +128,7 @@ def test_reduced_terminal_condition_has_the_sign_of_the_full_one(case: tuple[Des
     assert max(sizes) > 1.0
 
 
-def test_feedback_of_what_the_terminal_law_does_not_know_is_refused() -> None:
+def test_feedback_of_disturbances_unknown_to_the_terminal_law_is_refused() -> None:
     design = paper()
     short = replace(design.schedule, delays=(5,) * 11 + (3,))
     with pytest.raises(DesignError, match=r"schedule\.delays: delay 3 in stage 11"):
@@ -146,7 +146,7 @@ def test_independent_axes_are_components_with_their_own_rows() -> None:
     assert north.u_eq == pytest.approx(np.zeros((1, 1)), abs=1e-12)
 
 
-def test_anything_that_couples_axes_joins_them() -> None:
+def test_any_coupling_joins_axes() -> None:
     correlated = paper(plant=paper_plant(w=np.array([[0.6, 0.1], [0.1, 0.6]])))
     weights = np.diag([10.0, 0.1, 10.0, 0.1])
     weights[0, 2] = weights[2, 0] = 1.0

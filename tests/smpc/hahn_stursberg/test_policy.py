@@ -38,17 +38,17 @@ def frozen(name: str, i: int) -> Policy:
     return policy
 
 
-def alone(design: Design, i: int, theta: Array) -> list[Array]:
+def single(design: Design, i: int, theta: Array) -> list[Array]:
     """Gains (1, n_θ) of every component: `theta` for component i, no feedback for the others."""
-    every = [np.zeros((1, horizon.n_theta)) for _, horizon in horizons(design)]
-    every[i] = theta[None]
-    return every
+    samples = [np.zeros((1, horizon.n_theta)) for _, horizon in horizons(design)]
+    samples[i] = theta[None]
+    return samples
 
 
-def evaluated(design: Design, every: list[Array]) -> Margins:
+def evaluated(design: Design, samples: list[Array]) -> Margins:
     """All that (19) says of the gains."""
     still, inputs = np.zeros((1, design.plant.n_x)), np.zeros((1, design.horizon, design.plant.n_u))
-    return margins(design, gains(design, every), still, inputs, still)
+    return margins(design, gains(design, samples), still, inputs, still)
 
 
 def test_the_paper_s_cheapest_policy() -> None:
@@ -74,47 +74,47 @@ def test_backoffs_and_cost_are_those_of_the_covariances_recursion(design: Design
         covariance = CovarianceProblem(problem.horizon, rows)
         for _ in range(4):
             theta = rng.normal(size=problem.horizon.n_theta)
-            found = evaluated(design, alone(design, i, theta))
+            result = evaluated(design, single(design, i, theta))
             others = sum(horizon.c_0 for k, (_, horizon) in enumerate(horizons(design)) if k != i)
-            wanted = [
-                (found.backoff_x if row.kind is RowKind.STATE else found.backoff_u)[
+            expected = [
+                (result.backoff_x if row.kind is RowKind.STATE else result.backoff_u)[
                     0, row.t, (part.rows_x if row.kind is RowKind.STATE else part.rows_u)[max(row.upper, row.lower)]
                 ]
                 for row in rows
             ]
-            assert covariance.backoffs(theta) == pytest.approx(np.array(wanted), rel=1e-9)
-            assert covariance.cost(theta) == pytest.approx(found.covariance[0] - others, rel=1e-9)
+            assert covariance.backoffs(theta) == pytest.approx(np.array(expected), rel=1e-9)
+            assert covariance.cost(theta) == pytest.approx(result.covariance[0] - others, rel=1e-9)
 
 
 @cache
 def pool(name: str, i: int) -> Array:
     """The frozen gains of a component, and the exact program's for a few questions."""
-    one, rng = case(name), np.random.default_rng(9)
-    asks = [asked(one.design, "near" if k % 3 == 0 else "uniform", rng) for k in range(8)]
-    return np.array([frozen(name, i).theta, *(exact_gains(one, i, ask) for ask in asks)])
+    item, rng = case(name), np.random.default_rng(9)
+    asks = [asked(item.design, "near" if k % 3 == 0 else "uniform", rng) for k in range(8)]
+    return np.array([frozen(name, i).theta, *(exact_gains(item, i, question) for question in asks)])
 
 
 def feasible(name: str, i: int, rng: np.random.Generator) -> Array:
     """Gains that keep the terminal condition: a mixture, or from there any way up to the boundary."""
-    design, every = design_of(name), pool(name, i)
-    theta = np.array(rng.dirichlet(np.full(len(every), 0.5)) @ every)
-    away = rng.normal(size=theta.size) * np.abs(theta).max() * rng.choice([0.0, 0.01, 1.0, 30.0])
-    while np.abs(away).max() > 1e-9 and not keeps(design, i, theta + away):
-        away = 0.5 * away
-    return np.asarray(theta + away) if keeps(design, i, theta + away) else theta
+    design, samples = design_of(name), pool(name, i)
+    theta = np.array(rng.dirichlet(np.full(len(samples), 0.5)) @ samples)
+    offset = rng.normal(size=theta.size) * np.abs(theta).max() * rng.choice([0.0, 0.01, 1.0, 30.0])
+    while np.abs(offset).max() > 1e-9 and not keeps(design, i, theta + offset):
+        offset = 0.5 * offset
+    return np.asarray(theta + offset) if keeps(design, i, theta + offset) else theta
 
 
 def keeps(design: Design, i: int, theta: Array) -> bool:
     """Whether a component's gains keep (19c); the others' margin is not looked at."""
     part, _ = horizons(design)[i]
     xi = np.concatenate([k * design.plant.n_x + part.states for k in range(design.terminal.tau + 1)])
-    values = evaluated(design, alone(design, i, theta)).terminal[0][np.ix_(xi, xi)]
+    values = evaluated(design, single(design, i, theta)).terminal[0][np.ix_(xi, xi)]
     return bool(np.linalg.eigvalsh(values)[0] >= -1e-9 * np.linalg.norm(part.sigma_xi, 2))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", EACH_PRESET)
-def test_no_feasible_policy_costs_less_than_the_cut_says(name: str) -> None:
+def test_no_feasible_policy_costs_less_than_the_cut(name: str) -> None:
     """And none within half the room of every row costs less than the frozen one."""
     design, rng = design_of(name), np.random.default_rng(10)
     for i in range(len(decompose(design))):

@@ -48,7 +48,7 @@ def test_plan_of_both_axes(solver: PrintedSolver) -> None:
     assert np.all(answer.backoff_u[:5] == 0.0)
 
 
-def test_nothing_is_certified_and_a_person_is_told_so(design: Design, solver: PrintedSolver) -> None:
+def test_nothing_is_certified_and_the_text_says_so(design: Design, solver: PrintedSolver) -> None:
     answer = solver.solve(0, START, ORIGIN)
     assert (answer.status, answer.cost_lower, answer.gap) == (SolveStatus.OPTIMAL, -np.inf, np.inf)
     shown = json.loads(msgspec.json.encode(solve_document(answer, 1.0)))
@@ -78,7 +78,7 @@ def test_numbers_that_are_not_finite_fail(solver: PrintedSolver) -> None:
 
 
 @pytest.mark.parametrize("scale", [1e8, 1e20, 1e160, 1e300])
-def test_absurd_numbers_give_no_plan_and_no_exception(solver: PrintedSolver, scale: float) -> None:
+def test_extreme_numbers_give_no_plan_and_no_exception(solver: PrintedSolver, scale: float) -> None:
     answer = solver.solve(0, START * scale, ORIGIN)
     assert answer.status in (SolveStatus.FAILED, SolveStatus.INFEASIBLE)
     assert answer.inputs.size == 0
@@ -110,7 +110,7 @@ def test_an_interrupt_is_no_breakdown(solver: PrintedSolver, monkeypatch: pytest
 
 
 @pytest.mark.slow
-def test_iteration_limit_is_told() -> None:
+def test_iteration_limit_is_reported() -> None:
     assert PrintedSolver(paper(max_iterations=3)).solve(0, START, ORIGIN).status is SolveStatus.ITERATION_LIMIT
 
 

@@ -23,7 +23,7 @@ def test_the_ellipsoid_holds_the_whole_likelihood(gamma: float) -> None:
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.9, -0.99])
-def test_half_spaces_hold_whatever_the_correlation(correlation: float) -> None:
+def test_half_spaces_hold_for_any_correlation(correlation: float) -> None:
     """Boole: at most the sum of the single risks is lost, and they add up to 1 - gamma."""
     gamma, rows = 0.9, 4
     factor = kappa(gamma, 2, rows, "halfspace")

@@ -69,13 +69,13 @@ def enumerated(horizon: int, tau: int, q: float) -> Iterator[tuple[tuple[int, ..
 
 
 @pytest.mark.parametrize("gamma_max", [1.0, 0.985])
-def test_nested_schedules_are_those_of_a_blind_enumeration(gamma_max: float) -> None:
+def test_nested_schedules_are_those_of_a_full_enumeration(gamma_max: float) -> None:
     horizon, tau = 9, 3
     gammas = {delays: 0.95 / np.prod(alpha) for delays, alpha in enumerated(horizon, tau, 0.3)}
     expected = {delays for delays, gamma in gammas.items() if gamma < 1.0 and gamma <= gamma_max}
-    found = [schedule.delays for schedule in list_nested(demand(tau, horizon), gamma_max)]
-    assert set(found) == expected
-    assert len(found) == len(expected) > 1
+    result = [schedule.delays for schedule in list_nested(demand(tau, horizon), gamma_max)]
+    assert set(result) == expected
+    assert len(result) == len(expected) > 1
 
 
 def test_nested_schedules_use_ever_newer_information() -> None:
@@ -119,7 +119,7 @@ def test_short_horizon_feeds_nothing_back() -> None:
         (4, demand(tau=3), r"smpc\.delta_x: 0\.95 is out of reach: .* 0\.9370"),
     ],
 )
-def test_a_schedule_that_cannot_be_is_refused(delays: int | list[int], given: ScheduleDemand, message: str) -> None:
+def test_an_impossible_schedule_is_refused(delays: int | list[int], given: ScheduleDemand, message: str) -> None:
     with pytest.raises(DesignError, match=message):
         make_fixed(given, delays)
 
@@ -167,12 +167,12 @@ def test_joint_likelihood_is_the_sum_over_all_patterns_of_losses(delays: tuple[i
         assert usable[t] == pytest.approx(all_usable(delays[: t + 1], 0.3), rel=1e-12)
 
 
-def test_joint_nested_schedules_are_those_of_a_blind_enumeration() -> None:
+def test_joint_nested_schedules_are_those_of_a_full_enumeration() -> None:
     horizon, tau, q = 10, 3, 0.3
     expected = {delays for delays, _ in enumerated(horizon, tau, q) if 0.95 / all_usable(delays, q) <= 0.985}
-    found = {schedule.delays for schedule in list_nested(demand(tau, horizon, joint=True), 0.985)}
-    assert found == expected
-    assert {schedule.delays for schedule in list_nested(demand(tau, horizon), 0.985)} < found
+    result = {schedule.delays for schedule in list_nested(demand(tau, horizon, joint=True), 0.985)}
+    assert result == expected
+    assert {schedule.delays for schedule in list_nested(demand(tau, horizon), 0.985)} < result
 
 
 @hypothesis_given(
@@ -188,7 +188,7 @@ def test_the_product_never_exceeds_the_joint_probability_of_independent_losses(
 
 @hypothesis_given(st.floats(0.75, 1.0), st.floats(0.75, 1.0), st.booleans())
 def test_a_better_link_never_asks_for_more(p: float, other: float, joint: bool) -> None:
-    worse, better = (make_fixed(demand(p=one, joint=joint), 5) for one in sorted((p, other)))
+    worse, better = (make_fixed(demand(p=item, joint=joint), 5) for item in sorted((p, other)))
     assert np.all(better.alpha >= worse.alpha - 1e-12)
     assert np.all(better.gamma_x <= worse.gamma_x + 1e-12)
     assert np.all(better.gamma_u <= worse.gamma_u + 1e-12)
