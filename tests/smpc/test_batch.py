@@ -1,4 +1,4 @@
-"""The SMPC of many runs: its plans against those of the solver that flies, and runs that do not touch each other."""
+"""The SMPC of many runs: its plans against those of the flying solver, and independent runs."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_answers_are_those_that_fly_bit_for_bit() -> None:
 
 
 class Counting:
-    """A solver without a plan that counts how often it is asked."""
+    """Solver without a plan that counts its questions."""
 
     def __init__(self) -> None:
         self.count = 0

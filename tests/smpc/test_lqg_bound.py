@@ -1,4 +1,4 @@
-"""The bound of the unlimited problem: closed forms, least squares, and what simulations cost."""
+"""The cost bound without limits: closed forms, least squares, and simulated costs."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def growing(factor: float) -> Plant:
 
 
 def prices(plant: Plant, q_x: Array, q_u: Array) -> tuple[float, Array, Array]:
-    """What is paid for a state that is known, the price M of not knowing it, and E W E'."""
+    """Return the cost of a known state, the weight M of its error, and E W E'."""
     best = lqr(plant, q_x, q_u)
     spread = plant.e @ plant.w @ plant.e.T
     price = plant.a.T @ best.p @ plant.a + q_x - best.p  # = A'PB (R + B'PB)^-1 B'PA, by Riccati's equation

@@ -1,4 +1,4 @@
-"""A controller of another package as a solver: what it is told, what of its answer flies, and what is refused."""
+"""A controller of another package as a solver: its request, its answer, and faults."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from uavctl.smpc.outside import OutsideSolver, PlanRequest, SilencePlanner, reta
 
 
 class Saying:
-    """Answers as it is told to, and keeps what it was asked."""
+    """Returns given answers, and keeps its requests."""
 
     def __init__(self, say: Callable[[PlanRequest], Any]) -> None:
         self.say, self.asked = say, list[PlanRequest]()

@@ -1,4 +1,4 @@
-"""Plant and sets: closed forms, the semigroup of sub-steps, and what is refused."""
+"""Plant and sets: closed forms, the semigroup of sub-steps, and refusals."""
 
 from __future__ import annotations
 

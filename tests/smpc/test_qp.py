@@ -1,4 +1,4 @@
-"""The quadratic programs against CVXPY, and their bits."""
+"""Quadratic programs against CVXPY, and their bits."""
 
 from __future__ import annotations
 

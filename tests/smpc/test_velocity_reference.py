@@ -1,4 +1,4 @@
-"""The plant of an autopilot that holds a velocity: its equations, the simulated autopilot, and what is refused."""
+"""The plant of an autopilot that holds a velocity: its equations, the simulated autopilot, and refusals."""
 
 from __future__ import annotations
 
@@ -127,14 +127,14 @@ def test_every_such_plant_has_a_motion_within_the_step(
 
 
 def test_the_force_gains_its_drift_in_a_second() -> None:
-    """However long the steps are: what the disturbance adds to the sum a + f in each adds up."""
+    """For any step, the variances of the changes of a + f add up."""
     for dt_s in (0.05, 0.2):
         plant = velocity_reference([AXIS], dt_s, ("north",))
         assert np.sqrt(plant.w[2, 2] * dt_s**2 / dt_s) == pytest.approx(AXIS.force_drift_mps2_rts)
 
 
 def test_a_steady_force_is_held_without_an_input() -> None:
-    """It carries the vehicle away and back to where the reference is: the integral has learnt it."""
+    """A force moves the vehicle away and back to the reference: the integral compensates it."""
     plant = held()
     x = observed(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.5]))
     offset = []
@@ -165,7 +165,7 @@ def test_positions_observe_all_states() -> None:
 
 
 def test_a_filter_of_positions_keeps_correcting_the_reference() -> None:
-    """Whatever moved it: the covariance of its lead settles, and the error of an estimate dies out."""
+    """The covariance of the lead settles, and the error of an estimate vanishes."""
     plant, noise_m = held(), 0.003
     cov, shows = np.eye(STATES_PER_AXIS), np.eye(STATES_PER_AXIS)[:1]
     for _ in range(round(60.0 / DT)):
@@ -234,7 +234,7 @@ def test_the_simulated_ardupilot_flies_like_the_plant() -> None:
 
 
 def test_the_simulated_ardupilot_holds_against_wind_like_the_plant() -> None:
-    """Air that moves at 1 m/s pushes with drag times 1 m/s: a force from the first moment on, and it is learnt."""
+    """Air at 1 m/s pushes with drag times 1 m/s: a force from the start, which the integral compensates."""
     plant = held(drag_1ps=0.23, lag_s=0.1)
     vehicle, _ = flown(plant, steady((1.0, 0.0, 0.0)), [(6.0, 0.0)], 0.0)
     x, outcome = observed(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.23])), []

@@ -1,4 +1,4 @@
-"""What holds for every baseline: mirrored states, runs that do not meet, begin, and any plant."""
+"""Properties of all baselines: mirrored states, independent runs, `begin`, and any plant."""
 
 from __future__ import annotations
 

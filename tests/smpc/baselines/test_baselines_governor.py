@@ -1,4 +1,4 @@
-"""The governor and the mean QP: what they keep, and where they are the regulator."""
+"""The governor and the mean QP: their margins, and where they equal the regulator."""
 
 from __future__ import annotations
 

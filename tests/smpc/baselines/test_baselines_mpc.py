@@ -1,4 +1,4 @@
-"""The baselines' MPC: the regulator where no row is met, CVXPY's optimum elsewhere."""
+"""MPC of the baselines: the regulator where no row is active, the optimum of CVXPY elsewhere."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ def only(**values: float) -> PidGains:
 
 
 def heard(controller: CascadedPid, states: list[list[float]]) -> Array:
-    """What is asked for (T, 2) when each state is heard at once."""
+    """Return the inputs (T, 2) when each state is known at once."""
     controller.begin(1)
     inputs = np.zeros((1, len(states), 2))
     return np.array(

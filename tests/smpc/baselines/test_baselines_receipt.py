@@ -1,4 +1,4 @@
-"""Silence filled in three ways, on news written by hand."""
+"""Three inputs in silence, with positions given by hand."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_a_position_that_is_not_newer_makes_no_plan() -> None:
 
 
 def test_a_late_position_is_predicted_with_the_inputs_since() -> None:
-    """Pushed by inputs that nobody asked for, the late position of step 1 leads to the state of step 3."""
+    """With inputs of another controller, the late position of step 1 leads to the state of step 3."""
     case = problem("paper")
     fed, mpc = Fed(case, PacketisedPredictive(case), PAPER_START), BatchMpc(case)
     for _ in range(3):

@@ -1,4 +1,4 @@
-"""MPC for the worst-case delay: what it knows, and how much room it leaves."""
+"""MPC for the worst-case delay: its information and its back-offs."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ DELAY = 4
 
 
 def asked_in(case: ControlProblem, states: Array, newest: NDArray[np.intp], inputs: Array) -> Array:
-    """What is asked for in each step (T, n_u) along a trajectory that goes its own way."""
+    """Return the inputs of each step (T, n_u) along a given trajectory."""
     controller = WorstCaseDelay(case, DELAY, 1.0, 1.0)
     controller.begin(1)
     return np.array(
@@ -46,7 +46,7 @@ def test_only_positions_older_than_the_delay_have_an_effect() -> None:
 
 
 def test_without_limits_it_is_the_regulator_on_the_delayed_prediction() -> None:
-    """All positions arrive at once, and it flies as LQG does that gets them `DELAY` steps late."""
+    """With all positions at once it flies like an LQG that gets them `DELAY` steps late."""
     case = unlimited(problem("paper"))
     steps, disturbances = 40, noise(case, 5, 40, 3)
     at_once = np.tile(np.arange(steps), (5, 1))

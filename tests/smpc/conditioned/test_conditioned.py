@@ -1,4 +1,4 @@
-"""Risk conditioned on the age: against the same problem in CVXPY, against its own promise, against chance."""
+"""Risk conditioned on the age: against the same problem in CVXPY, its allowed risk, and simulations."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def near(case: ControlProblem, rng: np.random.Generator) -> tuple[Array, Array]:
 def test_no_short_cut_changes_the_answer(
     name: str, where: Callable[[ControlProblem, np.random.Generator], tuple[Array, Array]], kind: str
 ) -> None:
-    """Against every row in one program for the whole plant, solved anew in every round."""
+    """Reference: all rows in one program for the whole plant, solved from the start in each round."""
     case, rng = problem(name), np.random.default_rng(6)
     solver = ConditionedSolver(case, LINK, ALLOWED, slew_mps3=SLEW_MPS3[name])
     compared = 0
@@ -242,7 +242,7 @@ def test_in_transit_the_ages_share_equally_except_rare_ones() -> None:
 
 @pytest.mark.parametrize("name", ["paper", "room-hahn-stursberg"])
 def test_the_spread_of_a_plan_depends_on_the_target_alone(name: str) -> None:
-    """Neither the state, its covariance, how late it was nor what was sent may choose: those go with the age."""
+    """State, covariance, age and last input must not change it: they depend on the age."""
     case, rng = problem(name), np.random.default_rng(14)
     solver = ConditionedSolver(case, LINK, ALLOWED)
     margin, reported = case.state_set.margin(case.target), []

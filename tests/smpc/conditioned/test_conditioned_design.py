@@ -1,4 +1,4 @@
-"""Scheme `age-conditioned` without the other one's design: its own name, figures and start, from flight to replay."""
+"""Scheme `age-conditioned` without a design of the other scheme: id, figures and start, from flight to replay."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ QUICK = [SCHEME, "plant.dt_s=0.05", "daemon.tick_s=0.01", "source.rate_hz=50", "
 
 @pytest.fixture
 def _no_other_design(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whoever makes a design of scheme `hahn-stursberg` fails."""
+    """Making a design of scheme `hahn-stursberg` fails."""
 
     def refuse(*_: object) -> None:
         raise AssertionError("nothing of scheme `age-conditioned` asks for this")
@@ -131,7 +131,7 @@ def test_the_solver_of_rest_limits_is_the_one_that_flies() -> None:
 def test_a_recording_under_the_name_of_the_other_design_replays(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """As they were made before the scheme had a design of its own."""
+    """Recordings from before the scheme had its own design."""
     assert main([*FLOWN, "--duration", "3", "--out", str(tmp_path)]) == 0
     old = tmp_path / "old.mcap"
     recorder = SyncRecorder(old, load_config("room-hahn-stursberg").log)

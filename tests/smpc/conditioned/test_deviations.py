@@ -1,4 +1,4 @@
-"""What a plan counts as unknown, with the bias that the flight's filter estimates: against chance, and in flight."""
+"""Deviations of a plan, with the bias of the flight's filter: against simulations, and in flight."""
 
 from __future__ import annotations
 

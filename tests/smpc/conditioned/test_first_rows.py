@@ -1,4 +1,4 @@
-"""Which rows a program begins with changes how long it takes, and not what comes out."""
+"""First active rows change the number of iterations, not the result."""
 
 from __future__ import annotations
 

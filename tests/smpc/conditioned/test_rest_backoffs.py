@@ -1,4 +1,4 @@
-"""What plans that rest keep from a limit: against draws of what new plans begin from, and in closed loop."""
+"""Distances of resting plans from a limit: against drawn starts of new plans, and in closed loop."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def distances(link: AgeModel, steps: int, cov: Array | None = None, slew_mps3: f
 @pytest.mark.parametrize("loss", [0.1, 0.3, 0.6, 0.9])
 @pytest.mark.parametrize("noisy", [False, True])
 def test_the_share_of_new_plans_with_slack_is_the_design_share(loss: float, noisy: bool) -> None:
-    """Gaps, news and a full brake are drawn and flown one by one, and each stage is held against its back-off."""
+    """Gaps, positions and a full brake are drawn and simulated, and each stage is compared with its back-off."""
     steps, rng, draws = steps_for(loss), np.random.default_rng(8), 40_000
     case = replace(problem("paper"), horizon=steps)
     plant = case.plant
@@ -95,7 +95,7 @@ def test_sharing_estimate_errors_and_a_slow_gate_need_more_distance() -> None:
 
 
 def test_late_positions_are_counted_from_their_capture() -> None:
-    """Positions that are always a step late: a plan begins with what one shows of a step before."""
+    """With positions always a step late, a plan starts from the state of the step before."""
     case = problem("paper")
 
     class Late:

@@ -1,4 +1,4 @@
-"""Slew rows: what they bound, what gives way, and that a plan is always there."""
+"""Slew rows: their bounds, relaxed rows, and a plan from every state."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_every_state_has_a_plan_within_the_slew_limit(name: str, slew_mps3: floa
 
 
 def test_a_plan_ends_at_rest_when_the_gate_has_limited_it() -> None:
-    """A plan that is played out through the gate, tick by tick, ends at nearly the velocity that it believes in."""
+    """A plan that is played out through the gate, tick by tick, ends near its predicted velocity."""
     case = problem("room-hahn-stursberg")
     plant, ticks = case.plant, 4
     x, target = plant.equilibrium((-2.0, -1.5, -0.8)), plant.equilibrium((1.5, 1.0, -1.2))

@@ -1,4 +1,4 @@
-"""The exact program: the paper's numbers, every constraint evaluated independently, and the life beyond (19)."""
+"""The exact program: the paper's numbers, each constraint evaluated independently, and the extensions of (19)."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_one_axis_has_36_variables_besides_reference_slacks_and_backoffs(paper_d
 def test_agrees_with_the_printed_problem_on_100_feasible_states_of_an_axis(
     paper_design: Design, paper_solver: ConicSolver
 ) -> None:
-    """50 states of the plane: the axes are problems of their own."""
+    """50 states of the plane: the axes are independent problems."""
     rng = np.random.default_rng(4)
     problems = [PrintedProblem(paper_design, component) for component in decompose(paper_design)]
     feasible, worst = 0, 0.0

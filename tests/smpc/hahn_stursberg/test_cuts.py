@@ -1,4 +1,4 @@
-"""A recording that ends anywhere is recovered and replays alike up to there."""
+"""A recording that is cut at any byte is recovered and replays identically up to there."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def cuts(tmp_path_factory: pytest.TempPathFactory) -> Cuts:
 
 @pytest.fixture(autouse=True, scope="module")
 def _designed_once(cuts: Cuts) -> Iterator[None]:
-    """All cuts are of one flight, and a flight leaves nothing in its controller: a replay would find out."""
+    """All cuts are of one flight. A flight leaves no state in its controller; a replay would show it."""
 
     @lru_cache
     def flyer(config: Config) -> Prepared:

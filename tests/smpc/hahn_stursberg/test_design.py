@@ -1,4 +1,4 @@
-"""Designs: the presets' figures, risk allocation, search, identity, and what is refused."""
+"""Designs: figures of the presets, risk allocation, search, hash, and refusals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which schedules can meet the terminal condition, and what a state costs."""
+"""Margin of the terminal condition by schedule, and the optimal cost of a state."""
 
 from __future__ import annotations
 

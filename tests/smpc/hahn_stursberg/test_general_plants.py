@@ -1,4 +1,4 @@
-"""Plants of every shape: the exact program against the problem written down again, and what redundancy comes to."""
+"""Plants of many shapes: the exact program against the problem written again, and redundancy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Innovations form: the same open-loop statistics as plant and filter, and honest back-offs."""
+"""Innovations form: the open-loop statistics of plant and filter, and back-offs that keep their risk."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def one_axis(wind_std_mps2: float) -> Plant:
 
 
 def coupled() -> Plant:
-    """Two axes that drag at one another, with correlated gusts."""
+    """Two coupled axes, with correlated gusts."""
     plant = drag_lag([0.3, 0.4], [0.25, 0.2], [1.0, 1.0], [0.15, 0.1], 0.2, ("north", "east"))
     a = plant.a.copy()
     a[1, 4] = a[4, 1] = 0.02
@@ -103,7 +103,7 @@ def test_open_loop_covariance_is_that_of_the_state(plant: Plant, age_s: float) -
 
 
 def arrivals(loss: float, steps: int, phase_ns: int, seed: int) -> tuple[list[Belief], list[int], Array]:
-    """The real filter on the room's plant with lost positions: beliefs at boundaries with news, and the true states."""
+    """Run the flight's filter on the room's plant with lost positions: beliefs after positions, and true states."""
     rng = np.random.default_rng(seed)
     real = kalman(ROOM)
     first, second = ROOM.transition((STEP_NS - phase_ns) / 1e9), ROOM.transition(phase_ns / 1e9)

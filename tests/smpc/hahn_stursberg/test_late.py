@@ -242,7 +242,7 @@ CAMERAS = [
 
 @pytest.mark.parametrize("overrides", CAMERAS)
 def test_the_age_counts_all_positions_of_a_step_that_a_delay_lets_through(overrides: list[str]) -> None:
-    """With one captured at each boundary, the longest way, it is the age that comes about."""
+    """With one position at each boundary and the longest delay, the model is the age in flight."""
     config = load_config("room-hahn-stursberg", ["smpc.scheme=age-conditioned", *overrides])
     link, measured = build_delayed_link(config), silent(config, 0.0, 6)
     promised = np.array([link.outage(step) for step in range(7)])
@@ -274,7 +274,7 @@ def test_no_age_is_more_frequent_than_by_design(overrides: list[str], phase: flo
 @pytest.mark.parametrize("phase", [0.0, 0.3, 0.8])
 @pytest.mark.parametrize("overrides", CAMERAS)
 def test_younger_positions_than_by_design_use_no_more_risk(overrides: list[str], phase: float) -> None:
-    """A link's model is of the longest ways: the budget of an age that it has not must not be a licence."""
+    """The model has the longest delays: an age that it excludes must not get a larger budget."""
     config = load_config("room-hahn-stursberg", ["smpc.scheme=age-conditioned", "smpc.horizon=48", *overrides])
     risk = build_conditioned(config).solver.risk
     measured = silent(config, phase, 12)

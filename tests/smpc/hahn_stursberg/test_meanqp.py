@@ -1,4 +1,4 @@
-"""The mean half of the decision problem against a simulation of means, and against the exact program."""
+"""The mean part of the decision problem against a simulation of means, and against the exact program."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def simulated(design: Design, part: Component, x: Array, v: Array, y: Array) -> 
 
 
 def placed(row: Row, part: Component, states: Array, inputs: Array, y: Array, there: Array) -> float:
-    """What a row limits, in the simulated mean."""
+    """Return the limited value of a row in the simulated mean."""
     what = {
         RowKind.INPUT: inputs[min(row.t, len(inputs) - 1)],
         RowKind.STATE: states[row.t],
@@ -174,7 +174,7 @@ def test_limits_that_move_are_those_of_each_stage_and_the_least_of_the_last_ones
 @pytest.mark.slow
 @pytest.mark.parametrize("name", EACH_PRESET)
 def test_the_exact_program_s_answer_costs_the_same_here_and_is_the_best_under_its_policy(name: str) -> None:
-    """Back-offs of the exact gains, the mean solved by another solver: the exact optimum, whatever is known ahead."""
+    """With back-offs of the exact gains, another solver of the mean finds the exact optimum, for every preview."""
     design = design_of(name)
     case = Case(design)
     checked = 0

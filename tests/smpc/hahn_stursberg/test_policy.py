@@ -1,4 +1,4 @@
-"""The frozen policy and its cut: the paper's, its optimality, and bounds that hold for every M."""
+"""The frozen policy and its cut: the paper's example, optimality, and bounds for all gains."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def single(design: Design, i: int, theta: Array) -> list[Array]:
 
 
 def evaluated(design: Design, samples: list[Array]) -> Margins:
-    """All that (19) says of the gains."""
+    """Return the constraints of (19) on the gains."""
     still, inputs = np.zeros((1, design.plant.n_x)), np.zeros((1, design.horizon, design.plant.n_u))
     return margins(design, gains(design, samples), still, inputs, still)
 
@@ -95,7 +95,7 @@ def pool(name: str, i: int) -> Array:
 
 
 def feasible(name: str, i: int, rng: np.random.Generator) -> Array:
-    """Gains that keep the terminal condition: a mixture, or from there any way up to the boundary."""
+    """Gains that keep the terminal condition: a mixture, or a random step from it up to the boundary."""
     design, samples = design_of(name), pool(name, i)
     theta = np.array(rng.dirichlet(np.full(len(samples), 0.5)) @ samples)
     offset = rng.normal(size=theta.size) * np.abs(theta).max() * rng.choice([0.0, 0.01, 1.0, 30.0])
@@ -105,7 +105,7 @@ def feasible(name: str, i: int, rng: np.random.Generator) -> Array:
 
 
 def keeps(design: Design, i: int, theta: Array) -> bool:
-    """Whether a component's gains keep (19c); the others' margin is not looked at."""
+    """Return whether a component's gains keep (19c); other components are ignored."""
     part, _ = horizons(design)[i]
     xi = np.concatenate([k * design.plant.n_x + part.states for k in range(design.terminal.tau + 1)])
     values = evaluated(design, single(design, i, theta)).terminal[0][np.ix_(xi, xi)]
@@ -115,7 +115,7 @@ def keeps(design: Design, i: int, theta: Array) -> bool:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", EACH_PRESET)
 def test_no_feasible_policy_costs_less_than_the_cut(name: str) -> None:
-    """And none within half the room of every row costs less than the frozen one."""
+    """No policy within half the room of every row costs less than the frozen one."""
     design, rng = design_of(name), np.random.default_rng(10)
     for i in range(len(decompose(design))):
         policy, problem, covariance = frozen(name, i), problem_of(design, i), covariance_of(design, i)
@@ -167,7 +167,7 @@ def multipliers(name: str) -> tuple[CovarianceProblem, Policy, Multipliers]:
 @given(st.integers(0, 10_000), st.sampled_from([0.0, 1e-6, 1e-3, 0.1, 1.0]), st.sampled_from(PRESETS))
 @settings(max_examples=60, derandomize=True)
 def test_a_cut_from_any_multipliers_is_a_bound(seed: int, noise: float, name: str) -> None:
-    """Solver errors of any size only loosen it; cones and stationarity are left on purpose."""
+    """Solver errors of any size only loosen it; the multipliers violate cones and stationarity on purpose."""
     covariance, policy, (equal, triangle, heads, tails) = multipliers(name)
     rng = np.random.default_rng(seed)
 

@@ -1,4 +1,4 @@
-"""What is known ahead: a path, limits that move, and what gives way; against the same problem written in CVXPY."""
+"""Previews: a path, moving limits, and relaxed constraints; against the same problem in CVXPY."""
 
 from __future__ import annotations
 
@@ -185,7 +185,7 @@ def test_a_path_that_the_plant_can_fly_to_rest_is_flown_exactly() -> None:
 
 
 def check_told(design: Design, answer: Answer, limits: Array) -> None:
-    """What gave way is what the means and back-offs themselves say, row by row."""
+    """Relaxed constraints are those that means and back-offs violate, row by row."""
     rest = design.horizon - design.terminal.tau
     means = motion(design, answer.states[0], answer.inputs)
     assert answer.states == pytest.approx(means, rel=1e-9, abs=1e-9)
@@ -231,7 +231,7 @@ def test_a_fence_around_another_place_has_an_answer_and_is_reported() -> None:
 
 
 def test_an_empty_fence_has_an_answer_and_is_reported() -> None:
-    """Upper limit below the lower one: no place to rest is left."""
+    """Upper limit below the lower one: there is no place to rest."""
     design, solver = paper_case()
     limits = np.minimum(closing(design, 0, 1, np.full(13, -10.0)), closing(design, 0, -1, np.full(13, 5.0)))
     answer = solver.solve(0, START, ORIGIN, Preview(limits=limits))

@@ -1,4 +1,4 @@
-"""Problem (19) as printed: the paper's numbers, and honest endings."""
+"""Problem (19) as printed: the paper's numbers, and status values."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How the joint problem as printed ends in a general solver: recorded, because it decides what is compared."""
+"""Status of the joint problem as printed in a general solver, which decides what can be compared."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every solver's answers have in common, whatever the numbers: one seeded sample each.
+"""Properties of all solvers' answers on seeded random samples.
 
 A comparison of two optima uses both bounds, `cost_lower` of the one that may not be the larger, so that it holds for
 solvers that certify a gap as well as for exact ones.
@@ -78,7 +78,7 @@ def test_backoffs_grow_with_the_age_of_the_information(kind: Kind) -> None:
 
 
 def test_backoffs_grow_with_the_age_of_the_base() -> None:
-    """With the same gains on the disturbances since now, every older base knows less."""
+    """With the same gains on the disturbances since now, an older base has less information."""
     design = paper()
     rng = np.random.default_rng(2)
     for part in decompose(design):

@@ -1,4 +1,4 @@
-"""Redundant inputs: Assumption 4.4 is checked at the rest input that plans use, the cheapest, and at no other."""
+"""Redundant inputs: Assumption 4.4 is checked at the cheapest rest input, which plans use."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Units change nothing, tolerances mean what they say, and far states have answers."""
+"""Units change nothing, tolerances hold, and far states have answers."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ def test_a_target_far_away_is_approached() -> None:
 
 
 def test_a_hard_answer_is_the_same_for_any_origin(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The origin that large numbers are relative to is no part of the problem."""
+    """The origin of large numbers is not part of the problem."""
     made = case("coupled 0")
     monkeypatch.setattr("uavctl.smpc.sets._USUAL_SIZES", 0.0)
     shifted = ConicSolver(made.design).solve(0, made.x, made.design.target)

@@ -1,4 +1,4 @@
-"""Schedules: (6), (7), the counts of nested schedules, and what is refused."""
+"""Schedules: (6), (7), the numbers of nested schedules, and refusals."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_number_of_nested_schedules(tau: int, count: int, kept: int) -> None:
 
 
 def enumerated(horizon: int, tau: int, q: float) -> Iterator[tuple[tuple[int, ...], Array]]:
-    """Delays and α of every schedule with information that never gets older and α > 0.95, written down blindly."""
+    """Delays and α of every schedule with information that never gets older and α > 0.95, by full enumeration."""
     free = horizon - tau
     for newest in product(*[range(-1, t) for t in range(free)]):
         newest_all = [*newest, *(t - tau - 1 for t in range(free, horizon))]

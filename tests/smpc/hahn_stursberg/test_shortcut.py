@@ -1,4 +1,4 @@
-"""Decisions as flown: the exact optimum, feasible for the full problem, the same bits, never an exception."""
+"""Decisions in flight: the exact optimum, feasible for the full problem, the same bits, no exceptions."""
 
 from __future__ import annotations
 
@@ -160,7 +160,7 @@ def test_the_policy_flown_keeps_every_constraint_of_the_full_problem(name: str) 
 
 @pytest.mark.parametrize("name", EACH_PRESET)
 def test_a_violated_constraint_fails_the_check(name: str) -> None:
-    """Gains a tenth larger, or a mean that is moved, are found out."""
+    """Gains a tenth larger, or a shifted mean, fail the check."""
     tested = case(name)
     ask, answer, _ = next(
         result for result in answered(name) if result[1].method == "exact" and result[1].terminal_miss < KEPT_TOLERANCE

@@ -1,4 +1,4 @@
-"""Synthesis of the terminal gain: known optima, gradients, grids, limits that bind, and what is refused."""
+"""Synthesis of the terminal gain: known optima, gradients, grids, active limits, and refusals."""
 
 from __future__ import annotations
 

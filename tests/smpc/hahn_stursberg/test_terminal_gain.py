@@ -1,4 +1,4 @@
-"""The terminal gains beside one another, as functions and as they are typed."""
+"""Comparison of terminal gains, by functions and by commands."""
 
 from __future__ import annotations
 
